@@ -11,14 +11,13 @@ from typing import Annotated
 import tyro
 
 from progdf.errors import ProgdfError
-from progdf.formats.load_report import format_count, group_digits
 from progdf.formats.ply import save_ply_checked
 from progdf.formats.scene_file import load_scene, scene_name
 from progdf.gaussians import Gaussians
 from progdf.io.atomic import check_not_an_input
 from progdf.metrics.image import NO_DIFFERENCE
 from progdf.scene.strays import clean, find_strays, picture_difference
-from progdf.terminal import print_line
+from progdf.terminal import format_count, group_digits, print_line
 
 from .options import absent_option, parse_options
 

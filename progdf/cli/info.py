@@ -14,7 +14,6 @@ import tyro
 
 from progdf.errors import ProgdfError
 from progdf.field.baked import BakedField
-from progdf.formats.load_report import file_size, format_count, group_digits
 from progdf.formats.scene_file import load_scene_with_report, scene_file, scene_format
 from progdf.gaussians import ZERO
 from progdf.gdf.file import read_gdf
@@ -25,7 +24,7 @@ from progdf.io.json_values import convert_json, decode_json
 from progdf.scene.stats import survey
 from progdf.scene.strays import find_strays
 from progdf.scene.up_axis import UpChoice, find_up
-from progdf.terminal import print_line
+from progdf.terminal import file_size, format_count, group_digits, print_line
 
 from .options import absent_option, parse_options
 

@@ -41,35 +41,26 @@ Rows = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class RebindOptions:
-    """Carry an edit over to the same scene in another file or format.
-
-    Args:
-        edit: the .gdf file
-        source: the scene that it was made for
-        target: the same scene in another file
-        out: the .gdf file to write
-    """
+    """Carry an edit over to the same scene in another file or format."""
 
     edit: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="EDIT.gdf")]
+    """the .gdf file"""
     source: Annotated[Path, tyro.conf.arg(name="from", metavar="SCENE")]
+    """the scene that it was made for"""
     target: Annotated[Path, tyro.conf.arg(name="to", metavar="SCENE")]
+    """the same scene in another file"""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="NEW.gdf")]
+    """the .gdf file to write"""
 
 
 @dataclass(frozen=True)
 class Match:
-    """Which Gaussian of A each one of B is.
+    """Which Gaussian of A each one of B is."""
 
-    Args:
-        rows: row of A for each row of B. [N] int64
-        matched: share of B's rows that are where and as A's are, 0..1
-        once: share of B's rows whose row of A no other has
-        median, p95: distance between the two, in the median size of a Gaussian of A
-    """
-
-    rows: Rows
-    matched: float
-    once: float
+    rows: Rows  # row of A for each row of B. [N] int64
+    matched: float  # share of B's rows that are where and as A's are, 0..1
+    once: float  # share of B's rows whose row of A no other has
+    # median, p95: distance between the two, in the median size of a Gaussian of A
     median: float
     p95: float
 

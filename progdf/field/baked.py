@@ -102,19 +102,14 @@ class BakePlan:
 
 @dataclass(frozen=True)
 class NeuralForm:
-    """What a file keeps of a neural field.
+    """What a file keeps of a neural field."""
 
-    Args:
-        network: the trained network
-        plan: how it is baked
-        rows_sha256: of the members' raw values that the network looks at; "" where it sees places alone
-        error: what baking costs: "rms", relative, and with pictures "psnr_mean", "psnr_worst",
-            dB, between the network, pinned, and what was baked of it
-    """
-
-    network: NeuralField
-    plan: BakePlan
+    network: NeuralField  # the trained network
+    plan: BakePlan  # how it is baked
+    # of the members' raw values that the network looks at; "" where it sees places alone
     rows_sha256: str = ""
+    # what baking costs: "rms", relative, and with pictures "psnr_mean", "psnr_worst", dB, between the
+    # network, pinned, and what was baked of it
     error: Mapping[str, float] | None = None
 
 

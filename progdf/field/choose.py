@@ -80,17 +80,11 @@ class Field(Protocol):
 
 @dataclass(frozen=True)
 class Candidate:
-    """A field and its error against the trajectory.
+    """A field and its error against the trajectory."""
 
-    Args:
-        field: the field
-        curve: PSNR at `sample_strengths()`, dB
-        label: what it is, e.g. "separable (means 2, sh0 3)"
-    """
-
-    field: BakedField
-    curve: tuple[float, ...]
-    label: str
+    field: BakedField  # the field
+    curve: tuple[float, ...]  # PSNR at `sample_strengths()`, dB
+    label: str  # what it is, e.g. "separable (means 2, sh0 3)"
 
     @property
     def worst(self) -> float:
@@ -150,19 +144,12 @@ class FieldEvaluator:
 
 @dataclass(frozen=True)
 class FieldChoice:
-    """What was chosen and why.
+    """What was chosen and why."""
 
-    Args:
-        best: the field
-        met: whether it reaches what was asked of it: the target, or the budget where there is no target
-        tried: everything that was looked at
-        why: in words, as "the smallest of 6 that reach 40 dB"
-    """
-
-    best: Candidate
-    met: bool
-    tried: tuple[Candidate, ...]
-    why: str = ""
+    best: Candidate  # the field
+    met: bool  # whether it reaches what was asked of it: the target, or the budget where there is no target
+    tried: tuple[Candidate, ...]  # everything that was looked at
+    why: str = ""  # in words, as "the smallest of 6 that reach 40 dB"
 
 
 def choose_field(
@@ -384,19 +371,12 @@ def expected_worst(seen: RenderedTrajectories, path: Sequence[Mapping[str, int]]
 
 @dataclass(frozen=True)
 class RenderedTrajectories:
-    """What straightening each attribute changes in the pictures.
+    """What straightening each attribute changes in the pictures."""
 
-    Args:
-        trajectories: by attribute
-        gram: inner products of these changes over pixels and colors. [A,T,A,T] float64
-        values: numbers that each inner product sums over
-        channels: width of a packed row
-    """
-
-    trajectories: Mapping[str, AttributeTrajectory]
-    gram: Tensor
-    values: int
-    channels: int
+    trajectories: Mapping[str, AttributeTrajectory]  # by attribute
+    gram: Tensor  # inner products of these changes over pixels and colors. [A,T,A,T] float64
+    values: int  # numbers that each inner product sums over
+    channels: int  # width of a packed row
 
     def modes(self, emphasis: Tensor) -> Modes:
         """Each attribute's best bases, when the snapshots count as `emphasis` says. [T] float64, > 0"""

@@ -39,30 +39,22 @@ _LIMIT = 4.0  # standard deviations within which the inputs are kept
 
 @dataclass(frozen=True)
 class NeuralShape:
-    """Everything that says how a network is laid out and read.
+    """Everything that says how a network is laid out and read."""
 
-    Args:
-        width, layers: of the hidden layers
-        attributes: those that move; only they have outputs
-        channels: width of a packed row, 14 or 14 + 3K
-        inputs: "position" is the paper's; "own" adds what the Gaussian looks like and where it ends, and
-            has the network describe only how the way there bends
-        code: numbers in each Gaussian's learned code
-        bins: how many the slider has (paper: k = 10)
-        hard: the paper's bins, in which H(s) is constant, see `hard_bin`; else it is linear between bins + 1
-            nodes, node 0 being 0
-        frequencies: of the positional encoding, doubling from a period of twice the box
-    """
-
+    # width, layers: of the hidden layers
     width: int
     layers: int
-    attributes: tuple[str, ...]
-    channels: int
+    attributes: tuple[str, ...]  # those that move; only they have outputs
+    channels: int  # width of a packed row, 14 or 14 + 3K
+    # "position" is the paper's; "own" adds what the Gaussian looks like and where it ends, and has the
+    # network describe only how the way there bends
     inputs: Inputs = "own"
-    code: int = 0
-    bins: int = 10
+    code: int = 0  # numbers in each Gaussian's learned code
+    bins: int = 10  # how many the slider has (paper: k = 10)
+    # the paper's bins, in which H(s) is constant, see `hard_bin`; else it is linear between bins + 1 nodes,
+    # node 0 being 0
     hard: bool = False
-    frequencies: int = 8
+    frequencies: int = 8  # of the positional encoding, doubling from a period of twice the box
 
     def __post_init__(self) -> None:
         for what, value, low, high in (
@@ -126,24 +118,16 @@ class NeuralShape:
 class NeuralField:
     """A trained network and what it needs beside the scene.
 
-    Args:
-        shape: its layout
-        tensors: `shape.weights()` in float16 or float32, `shape.frame()` in float32
-        end: the recorded offset at s = 1 of the columns that move. [M,c] float32
-        codes: learned codes, as stored. [M,code] int8
-        code_step: what one unit of a code is worth. [code] float32
-        recorded: strengths of the recorded snapshots, for the slider's ticks
-
     Raises:
         ValueError: a tensor is absent or has another shape or type.
     """
 
-    shape: NeuralShape
-    tensors: Mapping[str, Tensor]
-    end: Tensor
-    codes: Tensor
-    code_step: Tensor
-    recorded: tuple[float, ...] = ()
+    shape: NeuralShape  # its layout
+    tensors: Mapping[str, Tensor]  # `shape.weights()` in float16 or float32, `shape.frame()` in float32
+    end: Tensor  # the recorded offset at s = 1 of the columns that move. [M,c] float32
+    codes: Tensor  # learned codes, as stored. [M,code] int8
+    code_step: Tensor  # what one unit of a code is worth. [code] float32
+    recorded: tuple[float, ...] = ()  # strengths of the recorded snapshots, for the slider's ticks
 
     def __post_init__(self) -> None:
         shape = self.shape

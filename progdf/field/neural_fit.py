@@ -58,27 +58,16 @@ _WARMUP = 50  # steps
 
 @dataclass(frozen=True)
 class NeuralSettings:
-    """What to train and for how long.
+    """What to train and for how long."""
 
-    Args:
-        size: "tiny" and "small" take up to a minute on two cores, "paper" a quarter of an hour
-        inputs: see `NeuralShape`
-        code: numbers in each Gaussian's learned code; a byte each in the file
-        bins: "smooth", or "hard" as the paper's
-        steps: 0 is what the size needs
-        batch: members drawn in each step; 0 is what the size needs
-        rate: largest learning rate; 0 is what the size needs
-        seed: of the first weights and of what is drawn
-    """
-
-    size: Size = "tiny"
-    inputs: Inputs = "own"
-    code: int = 0
-    bins: Bins = "smooth"
-    steps: int = 0
-    batch: int = 0
-    rate: float = 0.0
-    seed: int = 0
+    size: Size = "tiny"  # "tiny" and "small" take up to a minute on two cores, "paper" a quarter of an hour
+    inputs: Inputs = "own"  # see `NeuralShape`
+    code: int = 0  # numbers in each Gaussian's learned code; a byte each in the file
+    bins: Bins = "smooth"  # "smooth", or "hard" as the paper's
+    steps: int = 0  # 0 is what the size needs
+    batch: int = 0  # members drawn in each step; 0 is what the size needs
+    rate: float = 0.0  # largest learning rate; 0 is what the size needs
+    seed: int = 0  # of the first weights and of what is drawn
 
     def resolve(self) -> NeuralSettings:
         """The same with every 0 replaced by the size's own value."""

@@ -27,18 +27,12 @@ LEVELS = 127
 
 @dataclass(frozen=True)
 class AttributeTrajectory:
-    """One attribute's trajectory beside its full offset.
+    """One attribute's trajectory beside its full offset."""
 
-    Args:
-        offsets: recorded offsets. [T,M,c] float32
-        weights: how much an error of each number shows, ≥ 0. [M,c] float32
-        lead: a_0 at the snapshots, the best share of the full offset; 0 first, 1 last. [T] float32
-        gram: weighted inner products of what a_0 times the full offset leaves at the snapshots. [T,T] float64
-    """
-
-    offsets: Tensor
-    weights: Tensor
-    amplitude: Tensor
+    offsets: Tensor  # recorded offsets. [T,M,c] float32
+    weights: Tensor  # how much an error of each number shows, ≥ 0. [M,c] float32
+    amplitude: Tensor  # a_0 at the snapshots, the best share of the full offset; 0 first, 1 last. [T] float32
+    # weighted inner products of what a_0 times the full offset leaves at the snapshots. [T,T] float64
     gram: Tensor
 
     @property

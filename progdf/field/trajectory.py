@@ -42,22 +42,15 @@ _NEEDED = {name for name, _, _ in _NEEDED_FORMS}
 
 @dataclass(frozen=True)
 class Trajectory:
-    """S recordings of the members' offsets along the slider.
+    """S recordings of the members' offsets along the slider."""
 
-    Args:
-        s: slider value of each recording, ascending, first 0, last 1. [S] float32
-        offsets: raw-space offsets; row 0 is zero, the last equals `end` in half precision. [S,M,C] float16
-        end: the offset at s = 1, exact; the edited scene is original + end in float32. [M,C] float32
-        steps: optimizer steps done at each recording. [S] int64
-        stage_ends: recording at which each stage ends, ascending, the last S − 1
-        strengths: what the editor was asked for, of each stage; `s[stage_ends]` is where that is
-    """
-
-    s: Tensor
+    s: Tensor  # slider value of each recording, ascending, first 0, last 1. [S] float32
+    # raw-space offsets; row 0 is zero, the last equals `end` in half precision. [S,M,C] float16
     offsets: Tensor
-    end: Tensor
-    steps: Tensor
-    stage_ends: tuple[int, ...]
+    end: Tensor  # the offset at s = 1, exact; the edited scene is original + end in float32. [M,C] float32
+    steps: Tensor  # optimizer steps done at each recording. [S] int64
+    stage_ends: tuple[int, ...]  # recording at which each stage ends, ascending, the last S − 1
+    # what the editor was asked for, of each stage; `s[stage_ends]` is where that is
     strengths: tuple[float, ...]
 
     def __len__(self) -> int:

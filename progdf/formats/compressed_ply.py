@@ -17,7 +17,7 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.sh import C0
 
-from .ply_file import PlyFile
+from .ply import PlyFile
 
 _CHUNK = 256
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")

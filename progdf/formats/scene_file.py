@@ -30,10 +30,8 @@ from progdf.terminal import escape_text
 from . import gaussforge_child
 from .compressed_ply import is_compressed, read_compressed_ply
 from .ksplat import read_ksplat
-from .load_report import LoadReport
-from .ply import load_ply_with_report
-from .ply_file import read_header
-from .repair import repair
+from .ply import load_ply_with_report, read_header
+from .repair import LoadReport, repair
 
 FORMATS = ("ply", "spz", "splat", "ksplat", "sog")
 """What a scene may be, by the ending of its name; a compressed .ply is a .ply."""

@@ -8,8 +8,6 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from filelock import FileLock, Timeout
-
 from progdf.errors import ProgdfError
 
 from .atomic import write_error
@@ -38,6 +36,8 @@ def hold_lock(path: Path, wait_s: float = 0.0) -> Iterator[None]:
         ProgdfError: it cannot be made or written. A file system without locks is none of this: nothing is
             held then.
     """
+    from filelock import FileLock, Timeout  # asyncio, which most commands do without
+
     if path.is_symlink():
         raise ProgdfError(f"{path} is a link, which is not followed; remove the link")
     if os.path.isfile(path) and not os.access(path, os.W_OK):

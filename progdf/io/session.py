@@ -38,15 +38,10 @@ _LARGEST = 64 << 20  # bytes; a session is a few kilobytes, painted strengths a 
 
 
 class FileRef(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A file that a session needs.
+    """A file that a session needs."""
 
-    Args:
-        file: as written, with forward slashes; relative to the session's folder
-        sha256: of the file's bytes, lower-case hexadecimal
-    """
-
-    file: str
-    sha256: str
+    file: str  # as written, with forward slashes; relative to the session's folder
+    sha256: str  # of the file's bytes, lower-case hexadecimal
 
     def __post_init__(self) -> None:
         if not self.file or "\0" in self.file:
@@ -58,19 +53,12 @@ class FileRef(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class SessionFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a session file holds, its state as plain JSON values.
+    """What a session file holds, its state as plain JSON values."""
 
-    Args:
-        scene: the .ply
-        edits: the .gdf files, in the order in which layers count them
-        view: the state on screen
-        snapshots: states that were kept
-    """
-
-    scene: FileRef
-    edits: tuple[FileRef, ...] = ()
-    view: dict[str, Any] = {}
-    snapshots: tuple[dict[str, Any], ...] = ()
+    scene: FileRef  # the .ply
+    edits: tuple[FileRef, ...] = ()  # the .gdf files, in the order in which layers count them
+    view: dict[str, Any] = {}  # the state on screen
+    snapshots: tuple[dict[str, Any], ...] = ()  # states that were kept
 
 
 def relative_name(path: Path, folder: Path) -> str:

@@ -29,7 +29,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from progdf.errors import ProgdfError
-from progdf.formats.load_report import format_count, format_place
 from progdf.gaussians import Gaussians
 from progdf.io.npy import open_npy
 from progdf.region import (
@@ -43,6 +42,7 @@ from progdf.region import (
     union,
     whole_scene,
 )
+from progdf.terminal import format_count, format_place
 
 from .neighborhood import Neighborhood
 from .region_parts import LARGEST, PARTS, STEPS, read_numbers, read_part, read_step, shorten

@@ -61,25 +61,15 @@ _SYMMETRIC = (0, 3, 4, 3, 1, 5, 4, 5, 2)  # where a stretch's numbers stand in i
 
 @dataclass(frozen=True)
 class ControlPoints:
-    """Where a region is held, and who follows whom.
+    """Where a region is held, and who follows whom."""
 
-    Args:
-        rows: the members that lie there. [P] int64
-        points: their places. [P,3]
-        part: connected part each lies in. [P] int64
-        nearest: those that each member follows, of its own part. [M,K] int64
-        weights: how much, adding up to 1. [M,K]
-        links: pairs of neighbors, which are to move alike. [L,2] int64
-        spacing: median distance of neighbors, world units, > 0
-    """
-
-    rows: Tensor
-    points: Tensor
-    part: Tensor
-    nearest: Tensor
-    weights: Tensor
-    links: Tensor
-    spacing: float
+    rows: Tensor  # the members that lie there. [P] int64
+    points: Tensor  # their places. [P,3]
+    part: Tensor  # connected part each lies in. [P] int64
+    nearest: Tensor  # those that each member follows, of its own part. [M,K] int64
+    weights: Tensor  # how much, adding up to 1. [M,K]
+    links: Tensor  # pairs of neighbors, which are to move alike. [L,2] int64
+    spacing: float  # median distance of neighbors, world units, > 0
 
     def __len__(self) -> int:
         return len(self.points)

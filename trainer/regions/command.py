@@ -13,7 +13,6 @@ from torch import Tensor
 
 from progdf.camera import Camera, intrinsics, look_at
 from progdf.errors import ProgdfError
-from progdf.formats.load_report import format_count, group_digits
 from progdf.formats.scene_file import load_scene
 from progdf.gaussians import Gaussians
 from progdf.io.cameras import load_cameras, read_camera
@@ -24,6 +23,7 @@ from progdf.scene.bounds import front_direction
 from progdf.scene.region_spec import parse_region
 from progdf.scene.subject import fit_eye, subject_rows
 from progdf.scene.up_axis import find_up
+from progdf.terminal import format_count, group_digits
 from trainer.option_checks import check_ranges
 from trainer.views.view import render_colors, seen_colors, with_near_plane
 

@@ -8,12 +8,11 @@ from dataclasses import replace
 from progdf.cli.options import parse_options
 from progdf.compose.reference import compose_layers
 from progdf.errors import ProgdfError
-from progdf.formats.load_report import format_count
 from progdf.formats.ply import save_ply_checked
 from progdf.formats.scene_file import scene_format
 from progdf.gaussians import ZERO
 from progdf.io.atomic import check_not_an_input
-from progdf.terminal import print_line
+from progdf.terminal import format_count, print_line
 from progdf.torch_threads import one_thread
 from viewer.camera.view_camera import first_camera
 from viewer.files.document import empty
