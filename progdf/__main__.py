@@ -18,9 +18,9 @@ from types import FrameType
 from typing import NoReturn
 
 from progdf.io.atomic import atomic_write, disk_full
-from progdf.io.user_folders import state_folder
 
 from .errors import ProgdfError
+from .io.atomic import state_folder
 from .terminal import PrintableFormatter, escape_text
 
 COMMANDS: dict[str, tuple[str, str]] = {

@@ -14,9 +14,8 @@ from torch import Tensor
 
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import fingerprint
-from progdf.io.atomic import atomic_write
+from progdf.io.atomic import atomic_write, state_folder
 from progdf.io.json_values import decode_json
-from progdf.io.user_folders import state_folder
 
 MOST = 200
 """Scenes that are remembered; the oldest go."""

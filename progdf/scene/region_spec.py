@@ -30,7 +30,7 @@ from torch import Tensor
 
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
-from progdf.io.npy import open_npy
+from progdf.io.tensors import open_npy
 from progdf.region import (
     Region,
     difference,

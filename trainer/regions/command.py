@@ -17,7 +17,7 @@ from progdf.formats.scene_file import load_scene
 from progdf.gaussians import Gaussians
 from progdf.io.cameras import load_cameras, read_camera
 from progdf.io.images import write_image
-from progdf.io.npy import save_npy
+from progdf.io.tensors import save_npy
 from progdf.region import Region
 from progdf.scene.bounds import front_direction
 from progdf.scene.region_spec import parse_region

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from progdf.errors import ProgdfError
 from progdf.gdf.file import Gdf
-from progdf.io.npy import open_npy
+from progdf.io.tensors import open_npy
 from viewer.state import layers as stack
 from viewer.state.paint import encode
 from viewer.state.view_state import OVERSHOOT, LayerState

@@ -15,10 +15,9 @@ from PIL.PngImagePlugin import PngInfo
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.gaussians import ZERO, Origin
-from progdf.io.atomic import atomic_write
+from progdf.io.atomic import atomic_write, pictures_folder
 from progdf.io.cameras import kind_of_cameras, load_cameras, save_cameras
 from progdf.io.session import SUFFIX
-from progdf.io.user_folders import pictures_folder
 from viewer.jobs.run_files import takes_files
 from viewer.state.view_state import ViewState
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from progdf.io.atomic import atomic_write
-from progdf.io.user_folders import state_folder
+from progdf.io.atomic import atomic_write, state_folder
 
 from .autosave import session_of
 

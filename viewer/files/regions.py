@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from progdf.errors import ProgdfError
-from progdf.io.npy import save_npy
+from progdf.io.tensors import save_npy
 from viewer.jobs.run_files import edits_folder
 from viewer.state import selection
 from viewer.state.selection import SUFFIX, NamedRegion, SelectionState, unpack

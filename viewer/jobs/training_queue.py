@@ -9,7 +9,7 @@ from contextlib import ExitStack, suppress
 from dataclasses import replace
 
 from progdf.errors import ProgdfError
-from progdf.io.locks import LockedError
+from progdf.io.atomic import LockedError
 
 from . import run_files
 from .child import Child

@@ -19,8 +19,8 @@ from progdf.gdf.file import load_gdf
 from progdf.io.atomic import atomic_write, is_temporary
 from progdf.io.cameras import load_cameras
 from progdf.io.images import open_picture
-from progdf.io.npy import open_npy
 from progdf.io.session import read_session, sha256
+from progdf.io.tensors import open_npy
 from tests.helpers.full_disk import files_up_to, refuse_temporary_files
 from tests.helpers.refused import refusal
 

@@ -13,12 +13,12 @@ import filelock
 import pytest
 
 from progdf.errors import ProgdfError
-from progdf.io.locks import LOCK, LockedError, hold_lock, is_locked
+from progdf.io.atomic import LOCK, LockedError, hold_lock, is_locked
 
 HOLDER = """
 import sys, time
 from pathlib import Path
-from progdf.io.locks import hold_lock
+from progdf.io.atomic import hold_lock
 with hold_lock(Path(sys.argv[1])):
     print("held", flush=True)
     time.sleep(600)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from progdf.io.npy import open_npy
+from progdf.io.tensors import open_npy
 from tests.helpers.hostile import NPY_HEADERS, npy
 from tests.helpers.refused import refusal
 

@@ -9,7 +9,7 @@ import moderngl
 
 from progdf.demo_scenes import SKY
 from progdf.errors import ProgdfError
-from progdf.io.user_folders import state_folder
+from progdf.io.atomic import state_folder
 from viewer.app.application import failure_line
 from viewer.files import small_pictures
 from viewer.gl.present import picture_texture
