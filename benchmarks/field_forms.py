@@ -87,7 +87,7 @@ def baked_forms(course: KnownEdit) -> list[Form]:
         measure(
             "keyframes, int8",
             lambda c=count: (  # type: ignore[misc]
-                fit_keyframes(strengths, offsets, c, rest_type=torch.int8), f"{c} keyframes, int8"
+                fit_keyframes(strengths, offsets, c, basis_type=torch.int8), f"{c} keyframes, int8"
             ),
         )  # fmt: skip
         size = found[-1].bytes_per_member

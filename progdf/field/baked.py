@@ -18,7 +18,7 @@ from progdf.interpolation import find_segment, interpolate
 
 from .neural import NeuralField
 
-REST_TYPES = (torch.int8, torch.float16, torch.float32)
+BASIS_TYPES = (torch.int8, torch.float16, torch.float32)
 """How bases 1..R may be stored."""
 
 MOST_KNOTS, MOST_RANK = 257, 16
@@ -45,7 +45,7 @@ class AttributeBases:
             )
         members, width = self.end_offset.shape
         ranks = self.residual_basis.shape[0]
-        if self.residual_basis.dtype not in REST_TYPES:
+        if self.residual_basis.dtype not in BASIS_TYPES:
             raise ValueError(
                 f"residual_basis is {self.residual_basis.dtype}, expected int8, float16 or float32"
             )

@@ -186,10 +186,10 @@ def choose_field(
     evaluator = evaluator or FieldEvaluator(strengths, offsets, render)
     if kind == "lossless":
         everything = fit_lossless(strengths, offsets, recorded)
-        found = evaluator.candidate(everything, f"all {len(strengths)} snapshots")
+        candidate = evaluator.candidate(everything, f"all {len(strengths)} snapshots")
         fits = budget is None or everything.bytes_per_member <= budget
-        met = fits and (not math.isfinite(target) or found.worst >= target)
-        return FieldChoice(found, met, (found,), "nothing is left out")
+        met = fits and (not math.isfinite(target) or candidate.worst >= target)
+        return FieldChoice(candidate, met, (candidate,), "nothing is left out")
     if kind == "keyframes":
         tried = _even_keyframes(strengths, offsets, target, budget, evaluator, recorded)
     else:
@@ -258,9 +258,9 @@ def _grow_fields(
             if evaluate(high).worst < target + SPARE:
                 break
             i = (low + high) // 2  # the prediction asks for too much
-        found = evaluate(i)
-        correction = found.worst - expected[i]
-        low, high = (low, i) if found.worst >= target else (i, high)
+        candidate = evaluate(i)
+        correction = candidate.worst - expected[i]
+        low, high = (low, i) if candidate.worst >= target else (i, high)
     return list(tried.values())
 
 
@@ -279,7 +279,7 @@ def _separable(
     """
     ticks = tuple(strengths.tolist() if recorded is None else recorded)
     label = ", ".join(f"{name} {rank}" for name, rank in ranks.items() if rank) or "rank 0"
-    found = []
+    candidates = []
     for modes in (
         emphasize_modes(seen, ranks),
         {n: principal_modes(c.gram) for n, c in seen.trajectories.items()},
@@ -289,10 +289,10 @@ def _separable(
             for name, trajectory in seen.trajectories.items()
         }
         field = BakedField("separable", strengths.float(), attributes, seen.channels, ticks)
-        found.append(evaluator.candidate(field, f"separable ({label})"))
-        if found[-1].worst >= enough or not any(ranks.values()):
+        candidates.append(evaluator.candidate(field, f"separable ({label})"))
+        if candidates[-1].worst >= enough or not any(ranks.values()):
             break
-    return max(found, key=lambda candidate: candidate.worst)
+    return max(candidates, key=lambda candidate: candidate.worst)
 
 
 def _even_keyframes(
@@ -380,23 +380,23 @@ class RenderedTrajectories:
 
     def modes(self, emphasis: Tensor) -> Modes:
         """Each attribute's best bases, when the snapshots count as `emphasis` says. [T] float64, > 0"""
-        found = {}
+        modes = {}
         for i, (name, trajectory) in enumerate(self.trajectories.items()):
             seen = self.gram[i, :, i]
             parameters = float(trajectory.gram.diagonal().sum())
             share = UNSEEN * float(seen.diagonal().sum()) / parameters if parameters > 0 else 0.0
-            found[name] = principal_modes(seen + share * trajectory.gram, emphasis)
-        return found
+            modes[name] = principal_modes(seen + share * trajectory.gram, emphasis)
+        return modes
 
     def mse(self, modes: Modes, ranks: Mapping[str, int]) -> Tensor:
         """Expected mean squared error of the pictures at each snapshot. [T] float64"""
         snapshots = self.gram.shape[1]
-        left = torch.eye(snapshots, dtype=torch.float64).repeat(len(self.trajectories), 1, 1)
+        remaining = torch.eye(snapshots, dtype=torch.float64).repeat(len(self.trajectories), 1, 1)
         for i, name in enumerate(self.trajectories):
             mix, table = (part[:, : ranks.get(name, 0)] for part in modes[name])
-            left[i] -= table @ mix.T  # row t: what remains there, as a sum of the rows of pixels
-        half = torch.einsum("ats,asbu->atbu", left, self.gram)
-        return torch.einsum("atbu,btu->t", half, left).clamp(min=0) / self.values
+            remaining[i] -= table @ mix.T  # row t: what remains there, as a sum of the rows of pixels
+        half = torch.einsum("ats,asbu->atbu", remaining, self.gram)
+        return torch.einsum("atbu,btu->t", half, remaining).clamp(min=0) / self.values
 
 
 def render_trajectories(offsets: Tensor, weights: Tensor, render: Render) -> RenderedTrajectories:
@@ -429,7 +429,7 @@ def render_trajectories(offsets: Tensor, weights: Tensor, render: Render) -> Ren
     gram = torch.zeros(len(attributes), snapshots, len(attributes), snapshots, dtype=torch.float64)
     if not attributes or snapshots < 3:
         return RenderedTrajectories(trajectories, gram, 1, offsets.shape[2])
-    rows = torch.cat([torch.stack([*own, still]) for own in changes])
+    rows = torch.cat([torch.stack([*pixel_rows, still]) for pixel_rows in changes])
     products = (rows @ rows.T).double().reshape(len(attributes), len(looked), len(attributes), len(looked))
     gram = torch.einsum("ts,asbu,vu->atbv", spread, products, spread)
     return RenderedTrajectories(trajectories, gram, max(1, rows.shape[1]), offsets.shape[2])
@@ -466,13 +466,13 @@ def rendered_importance(offsets: Tensor, render: Render, seed: int = 0) -> dict[
     """
     draws = torch.Generator().manual_seed(seed)
     middle = offsets[len(offsets) // 2].float()
-    found = {}
+    importance = {}
     with torch.no_grad():
         expected = render(middle)
         for name, columns in moving_attributes(offsets).items():
             spread = float(offsets[1:, :, columns].float().square().mean().sqrt())
             moved = middle.clone()
             moved[:, columns] += 0.1 * spread * torch.randn(moved[:, columns].shape, generator=draws)
-            found[name] = float((render(moved) - expected).square().mean()) if len(expected) else 1.0
-    total = sum(found.values())
-    return {name: value / total if total > 0 else 1.0 / len(found) for name, value in found.items()}
+            importance[name] = float((render(moved) - expected).square().mean()) if len(expected) else 1.0
+    total = sum(importance.values())
+    return {name: value / total if total > 0 else 1.0 / len(importance) for name, value in importance.items()}

@@ -16,7 +16,7 @@ def fit_keyframes(
     offsets: Tensor,
     count: int,
     recorded: Sequence[float] | None = None,
-    rest_type: torch.dtype = torch.float32,
+    basis_type: torch.dtype = torch.float32,
 ) -> BakedField:
     """Keep the `count` snapshots nearest to even strengths (even visible change in a re-timed trajectory).
 
@@ -25,7 +25,7 @@ def fit_keyframes(
         offsets: raw offsets of the members; the first row is 0, the last the recorded end. [T,M,C] float32
         count: snapshots kept, both ends among them, ≥ 2; as many as there are or more keeps all
         recorded: strengths for the slider's ticks; `strengths` when None
-        rest_type: float32 keeps the snapshots exactly; int8 what each differs from s times the end
+        basis_type: float32 keeps the snapshots exactly; int8 what each differs from s times the end
 
     Returns:
         A field with those snapshots as knots; attributes that never move are absent.
@@ -41,7 +41,7 @@ def fit_keyframes(
     if count >= len(strengths):
         rows = torch.arange(len(strengths))
     inner_strengths = strengths[rows].double()[1:-1]
-    straight = inner_strengths if rest_type == torch.int8 else torch.zeros_like(inner_strengths)
+    straight = inner_strengths if basis_type == torch.int8 else torch.zeros_like(inner_strengths)
     table = torch.zeros(len(rows), len(rows) - 1)
     table[1:-1, 0], table[-1, 0] = straight.float(), 1.0
     table[1:-1, 1:] = torch.eye(len(rows) - 2)
@@ -49,11 +49,11 @@ def fit_keyframes(
     for name, columns in moving_attributes(offsets).items():
         full = offsets[-1, :, columns].contiguous()
         inner = offsets[rows[1:-1]][:, :, columns]
-        if rest_type != torch.int8 and torch.equal(inner.to(rest_type).float(), inner):
+        if basis_type != torch.int8 and torch.equal(inner.to(basis_type).float(), inner):
             # as it is: a unit of another size would round it
-            basis, scale = inner.to(rest_type), torch.ones(len(inner), full.shape[1])
+            basis, scale = inner.to(basis_type), torch.ones(len(inner), full.shape[1])
         else:
-            basis, scale = quantize_bases(inner - straight.float()[:, None, None] * full, rest_type)
+            basis, scale = quantize_bases(inner - straight.float()[:, None, None] * full, basis_type)
         attributes[name] = AttributeBases(full, basis, scale, table.clone())
     ticks = strengths.tolist() if recorded is None else recorded
     return BakedField("keyframes", strengths[rows].float(), attributes, offsets.shape[2], tuple(ticks))

@@ -82,12 +82,12 @@ class NeuralShape:
     @property
     def outputs(self) -> dict[str, slice]:
         """Where each attribute lies in the network's output."""
-        found, start = {}, 0
+        outputs, start = {}, 0
         for name in self.attributes:
             width = attribute_slices(self.channels)[name]
-            found[name] = slice(start, start + width.stop - width.start)
-            start = found[name].stop
-        return found
+            outputs[name] = slice(start, start + width.stop - width.start)
+            start = outputs[name].stop
+        return outputs
 
     @property
     def seen(self) -> int:
@@ -136,18 +136,18 @@ class NeuralField:
             raise ValueError(f"the network's tensors are not those of {shape.layers} layers")
         for name, size in expected.items():
             types = (torch.float16, torch.float32) if name in shape.weights() else (torch.float32,)
-            found = self.tensors[name]
-            if tuple(found.shape) != size or found.dtype not in types:
-                raise ValueError(f"{name} is {list(found.shape)} {found.dtype}, expected {list(size)}")
+            tensor = self.tensors[name]
+            if tuple(tensor.shape) != size or tensor.dtype not in types:
+                raise ValueError(f"{name} is {list(tensor.shape)} {tensor.dtype}, expected {list(size)}")
         members = self.end.shape[0] if self.end.ndim else 0
-        for name, found, size, dtype in (
+        for name, tensor, size, dtype in (
             ("end", self.end, (members, len(shape.columns)), torch.float32),
             ("codes", self.codes, (members, shape.code), torch.int8),
             ("code_step", self.code_step, (shape.code,), torch.float32),
         ):
-            if tuple(found.shape) != size or found.dtype != dtype:
+            if tuple(tensor.shape) != size or tensor.dtype != dtype:
                 raise ValueError(
-                    f"{name} is {list(found.shape)} {found.dtype}, expected {list(size)} {dtype}"
+                    f"{name} is {list(tensor.shape)} {tensor.dtype}, expected {list(size)} {dtype}"
                 )
 
     @property
@@ -163,8 +163,8 @@ class NeuralField:
     @property
     def stored_bytes(self) -> int:
         """Bytes on disk, names and header left out."""
-        kept = [*self.tensors.values(), self.end, self.codes, self.code_step]
-        return sum(tensor.numel() * tensor.element_size() for tensor in kept)
+        stored = [*self.tensors.values(), self.end, self.codes, self.code_step]
+        return sum(tensor.numel() * tensor.element_size() for tensor in stored)
 
     @property
     def bytes_per_member(self) -> float:
@@ -210,9 +210,9 @@ class BoundField:
 
 def encode(shape: NeuralShape, frame: Mapping[str, Tensor], rows: Tensor, end: Tensor) -> Tensor:
     """What the network sees of the Gaussians. [M,≥14], [M,c] -> [M,seen]"""
-    place = (rows[:, :3] - frame["center"]) / frame["extent"]
-    waves = place[:, None, :] * (math.pi / 2 * 2.0 ** torch.arange(shape.frequencies))[:, None]
-    parts = [place, waves.sin().flatten(1), waves.cos().flatten(1)]
+    position = (rows[:, :3] - frame["center"]) / frame["extent"]
+    waves = position[:, None, :] * (math.pi / 2 * 2.0 ** torch.arange(shape.frequencies))[:, None]
+    parts = [position, waves.sin().flatten(1), waves.cos().flatten(1)]
     if shape.inputs == "own":
         look = (appearance(rows, end) - frame["look_mean"]) / frame["look_spread"]
         parts.append(look.clamp(-_LIMIT, _LIMIT))

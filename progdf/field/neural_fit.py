@@ -41,7 +41,7 @@ class PictureLoss(Protocol):
         """In how many views."""
         ...
 
-    def __call__(self, found: Tensor, recorded: Tensor, view: int) -> Tensor:
+    def __call__(self, offsets: Tensor, recorded: Tensor, view: int, /) -> Tensor:
         """Packed offsets of the field and those recorded at the same strength. [M,C], [M,C] -> []"""
         ...
 
@@ -109,8 +109,8 @@ class NeuralFit:
         for tensor in self._learned.values():
             tensor.requires_grad_()
         self._adam = torch.optim.Adam(list(self._learned.values()), lr=self.settings.rate, fused=True)
-        shown = channel_weights(visibility, len(rows), 1)[:, 0]
-        self._shown = shown / shown.mean().clamp_min(1e-12)
+        visible = channel_weights(visibility, len(rows), 1)[:, 0]
+        self._shown = visible / visible.mean().clamp_min(1e-12)
         self._importance = torch.full((len(self.shape.columns),), 1.0 / len(self.shape.columns))
         self._end = torch.zeros(len(rows), len(self.shape.columns))
         self._told = torch.zeros(0)
@@ -131,12 +131,12 @@ class NeuralFit:
         self._end = offsets[-1][:, columns].float()
         before = self._frame["spread"]
         after = before.clone()
-        for name, place in self.shape.outputs.items():
-            own = offsets[1:][:, :, columns[place]].float()
-            power = (own.square().mean(dim=(0, 2)) * self._shown).mean()
-            after[place] = float(power.sqrt().clamp_min(1e-12))
+        for name, outputs in self.shape.outputs.items():
+            trajectory = offsets[1:][:, :, columns[outputs]].float()
+            power = (trajectory.square().mean(dim=(0, 2)) * self._shown).mean()
+            after[outputs] = float(power.sqrt().clamp_min(1e-12))
             if importance is not None:
-                self._importance[place] = importance.get(name, 0.0) / (place.stop - place.start)
+                self._importance[outputs] = importance.get(name, 0.0) / (outputs.stop - outputs.start)
         self._importance /= self._importance.sum().clamp_min(1e-30)
         if self.steps:
             with torch.no_grad():
@@ -206,9 +206,9 @@ class NeuralFit:
         snapshot = int(torch.randint(1, len(strengths), (1,), generator=self._draws))
         view = int(torch.randint(pictures.views, (1,), generator=self._draws))
         rows = torch.arange(len(self._rows))
-        found = self._answer(rows, strengths[snapshot].expand(len(rows)))
+        moved_columns = self._answer(rows, strengths[snapshot].expand(len(rows)))
         recorded = offsets[snapshot].float()
-        moved = torch.zeros_like(recorded).index_copy(1, self.shape.columns, found)
+        moved = torch.zeros_like(recorded).index_copy(1, self.shape.columns, moved_columns)
         return pictures(moved, recorded, view)
 
     def _answer(self, rows: Tensor, s: Tensor) -> Tensor:
@@ -225,13 +225,13 @@ class NeuralFit:
 
     def capture_state(self) -> dict[str, Tensor]:
         """Everything that the next steps depend on, by name; the snapshots aside."""
-        kept = {f"learned.{name}": tensor.detach() for name, tensor in self._learned.items()}
-        kept |= {f"frame.{name}": tensor for name, tensor in self._frame.items()}
-        kept |= {"end": self._end, "importance": self._importance, "steps": torch.tensor(self.steps)}
+        state = {f"learned.{name}": tensor.detach() for name, tensor in self._learned.items()}
+        state |= {f"frame.{name}": tensor for name, tensor in self._frame.items()}
+        state |= {"end": self._end, "importance": self._importance, "steps": torch.tensor(self.steps)}
         for name, tensor in self._learned.items():
             for what, moment in self._adam.state[tensor].items():
-                kept[f"adam.{name}.{what}"] = moment
-        return kept | {"draws": self._draws.get_state()}
+                state[f"adam.{name}.{what}"] = moment
+        return state | {"draws": self._draws.get_state()}
 
     def restore(self, saved: Mapping[str, Tensor]) -> None:
         """Take over what `capture_state` gave, of a fit made with the same arguments."""
@@ -258,8 +258,8 @@ class NeuralFit:
             [torch.arange(p.start, p.stop) for n, p in shape.outputs.items() if n in self.shape.outputs]
         )
         for name, tensor in self._learned.items():
-            found = saved[f"learned.{name}"]
-            tensor.data.copy_(found[rows] if name.startswith("heads.") else found)
+            source = saved[f"learned.{name}"]
+            tensor.data.copy_(source[rows] if name.startswith("heads.") else source)
         self._frame["spread"] = saved["frame.spread"][rows].clone()
         self.steps = 1  # from here on, `scale_to` keeps what the network answers
 

@@ -69,8 +69,8 @@ class PlyFile:
 
     def columns(self, element: str) -> dict[str, str]:
         """numpy's type of each property that is no list, by name; of an element that is not there nothing."""
-        found = self.layout[element].properties if element in self.layout else ()
-        return {p.name: p.val_dtype for p in found if not isinstance(p, PlyListProperty)}
+        properties = self.layout[element].properties if element in self.layout else ()
+        return {p.name: p.val_dtype for p in properties if not isinstance(p, PlyListProperty)}
 
     def rows(self, *names: str) -> tuple[list[npt.NDArray[np.void]], int]:
         """The rows of elements, of a binary file memory-mapped, and the bytes behind the file's last row.
@@ -86,7 +86,7 @@ class PlyFile:
             self._check_lists(element, element.name in names)
         try:
             with np.errstate(over="ignore"):
-                found, after = self._text_rows(last) if self.layout.text else self._binary_rows(last)
+                rows, after = self._text_rows(last) if self.layout.text else self._binary_rows(last)
         except OSError as error:
             raise open_error(self.path, error) from None
         except (PlyElementParseError, ValueError, OverflowError, MemoryError) as error:
@@ -98,11 +98,11 @@ class PlyFile:
                 f"{self.path} {what}; it is truncated or damaged: copy or export it again"
             ) from None
         lists_follow = any(_has_lists(element) for element in elements[last:])
-        return [found[name] for name in names], 0 if lists_follow else after
+        return [rows[name] for name in names], 0 if lists_follow else after
 
-    def _check_lists(self, element: PlyElement, wanted: bool) -> None:
+    def _check_lists(self, element: PlyElement, is_needed: bool) -> None:
         name, lists = element.name, _has_lists(element)
-        if lists and wanted:
+        if lists and is_needed:
             raise ProgdfError(
                 f"{self.path} has a list among its {name} properties; export it as a plain 3DGS .ply"
             )
@@ -114,14 +114,14 @@ class PlyFile:
 
     def _binary_rows(self, last: int) -> tuple[dict[str, npt.NDArray[np.void]], int]:
         with _Stream(self, last) as stream:
-            found = {element.name: element.data for element in PlyData.read(stream)}
+            rows = {element.name: element.data for element in PlyData.read(stream)}
             following = self.layout.elements[last:]
-            rest = sum(self.counts[element.name] * _row_bytes(element) for element in following)
-            return found, self.size - stream.tell() - rest
+            bytes_after = sum(self.counts[element.name] * _row_bytes(element) for element in following)
+            return rows, self.size - stream.tell() - bytes_after
 
     def _text_rows(self, last: int) -> tuple[dict[str, npt.NDArray[np.void]], int]:
         """By numpy, which reads text many times as fast as plyfile."""
-        found = {}
+        rows = {}
         with self.path.open("rb") as file:
             file.seek(self.length)
             for i, element in enumerate(self.layout):
@@ -131,10 +131,10 @@ class PlyFile:
                 if len(lines) < self.counts[element.name]:
                     raise PlyElementParseError("early end-of-file", element)
                 if not _has_lists(element):
-                    found[element.name] = np.loadtxt(lines, element.dtype(), comments=None, ndmin=1)
-                    if len(found[element.name]) < len(lines):
+                    rows[element.name] = np.loadtxt(lines, element.dtype(), comments=None, ndmin=1)
+                    if len(rows[element.name]) < len(lines):
                         raise ValueError("an empty row")
-            return found, len(file.read().strip())
+            return rows, len(file.read().strip())
 
 
 class _Stream(io.FileIO):
@@ -174,37 +174,37 @@ def read_header(path: str | os.PathLike[str]) -> PlyFile:
         raise ProgdfError(f"{path} has a header without 'end_header'; the file is truncated or not a .ply")
     text = start[: end.start()].decode("ascii", "replace").encode("ascii", "replace").decode()
     lines = [" ".join(line.split()) for line in text.split("\n")[:-1]]
-    said = [_RENDERING.get(line[8:].lower()) for line in lines if line.startswith("comment ")]
+    renderings = [_RENDERING.get(line[8:].lower()) for line in lines if line.startswith("comment ")]
     header = ["comment" if line.startswith(_SKIPPED) or not line else line for line in lines]
-    counts = [found for line in header if (found := _ELEMENT.fullmatch(line))]
+    counts = [match for line in header if (match := _ELEMENT.fullmatch(line))]
     empty = [_ELEMENT.sub(r"\g<1>0", line) for line in header]
     try:
         layout = PlyData.read(io.BytesIO("\n".join([*empty, "end_header", ""]).encode()))
     except (PlyParseError, ValueError, OverflowError, MemoryError) as error:
         raise ProgdfError(f"{path} has a broken header: {str(error)[:100]}; export it again") from None
-    rows = {element.name: int(found[2]) for element, found in zip(layout, counts, strict=False)}
+    rows = {element.name: int(match[2]) for element, match in zip(layout, counts, strict=False)}
     if len(rows) < len(layout.elements):
         raise ProgdfError(f"{path} has a broken header: counts are digits; export it again")
-    antialiased = next((known for known in reversed(said) if known is not None), False)
+    antialiased = next((known for known in reversed(renderings) if known is not None), False)
     ply = PlyFile(Path(path), layout, rows, tuple(header), end.end(), size, antialiased)
     _check_counts(ply)
     return ply
 
 
 def _check_counts(ply: PlyFile) -> None:
-    room = ply.size - ply.length
+    remaining = ply.size - ply.length
     for element in ply.layout:
         # an ascii value takes at least a digit and a separator; the file's last separator may be missing
         text, count = ply.layout.text, ply.counts[element.name]
         least = 2 * len(element.properties) if text else _row_bytes(element)
-        if count * least > room + text:
+        if count * least > remaining + text:
             what = "Gaussians" if element.name == "vertex" else f"rows of '{element.name}'"
             raise ProgdfError(
                 f"{ply.path} declares {count} {what} of {'at least ' if text else ''}{least} bytes but "
-                f"has room for {max(room, 0) // least}, so it is truncated or its header is wrong; "
+                f"has room for {max(remaining, 0) // least}, so it is truncated or its header is wrong; "
                 f"copy or export it again"
             )
-        room -= count * least
+        remaining -= count * least
 
 
 def _has_lists(element: PlyElement) -> bool:
@@ -249,8 +249,8 @@ def load_ply(path: str | os.PathLike[str]) -> Gaussians:
 def load_ply_with_report(path: str | os.PathLike[str]) -> tuple[Gaussians, LoadReport]:
     """As `load_ply`, with the report of what the file held and what was repaired."""
     ply = read_header(path)
-    rest = _check_properties(ply)
-    columns = {**GEOMETRY, "shN": tuple(f"f_rest_{i}" for i in range(rest))}
+    sh_count = _check_properties(ply)
+    columns = {**GEOMETRY, "shN": tuple(f"f_rest_{i}" for i in range(sh_count))}
     (rows,), trailing = ply.rows("vertex")
     scene, counts = repair(replace(_gaussians(rows, columns), antialiased=ply.antialiased))
     used = {column for names in columns.values() for column in names}
@@ -344,16 +344,16 @@ def _check_properties(ply: PlyFile) -> int:
     missing = [column for names in GEOMETRY.values() for column in names if column not in present]
     if missing:
         raise ProgdfError(f"{ply.path} {_describe(ply, missing)}")
-    rest = sum(column.startswith("f_rest_") for column in present)
-    absent = next((f"f_rest_{i}" for i in range(rest) if f"f_rest_{i}" not in present), None)
-    if rest not in _SH_REST or absent:
+    sh_count = sum(column.startswith("f_rest_") for column in present)
+    absent = next((f"f_rest_{i}" for i in range(sh_count) if f"f_rest_{i}" not in present), None)
+    if sh_count not in _SH_REST or absent:
         raise ProgdfError(
-            f"{ply.path} has {rest} f_rest properties{f' without {absent}' if absent else ''}; "
+            f"{ply.path} has {sh_count} f_rest properties{f' without {absent}' if absent else ''}; "
             f"expected 0, 9, 24, 45 or 72: export it again"
         )
     if not ply.counts["vertex"]:
         raise ProgdfError(f"{ply.path} holds 0 Gaussians; a scene needs at least one: export it again")
-    return rest
+    return sh_count
 
 
 def _describe(ply: PlyFile, missing: list[str]) -> str:
@@ -391,10 +391,10 @@ def _gaussians(rows: npt.NDArray[np.void], columns: dict[str, tuple[str, ...]]) 
             ):  # what is beyond float32 becomes ±inf: repaired
                 table = np.stack([block[name].astype(np.float32) for name in names], axis=1)
         for key, array in arrays.items():
-            found: npt.NDArray[Any] = table[:, index[key]]
+            values: npt.NDArray[Any] = table[:, index[key]]
             if key == "shN":  # channel-major in the file, rgb innermost here
-                found = found.reshape(len(block), 3, bands).transpose(0, 2, 1)
-            array[first : first + _BLOCK_ROWS] = found
+                values = values.reshape(len(block), 3, bands).transpose(0, 2, 1)
+            array[first : first + _BLOCK_ROWS] = values
     places = [rows[name] for name in columns["means"]]
     if np.result_type(np.float32, *places) == np.float64:
         arrays["means"] = np.stack(places, axis=1).astype(np.float64)

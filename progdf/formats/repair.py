@@ -44,9 +44,9 @@ def repair(scene: Gaussians) -> tuple[Gaussians, dict[str, Any]]:
     Means in the world, of either floating type, become float32 relative to an origin; unusable numbers are
     replaced, quaternions get unit length. Tensors that need nothing are passed on, not copied.
     """
-    near, found = _move_to_origin(scene)
+    near, moved = _move_to_origin(scene)
     repaired, counts = _replace_unusable(near)
-    return repaired, {**found, **counts}
+    return repaired, {**moved, **counts}
 
 
 def find_origin(means: Tensor, log_scales: Tensor) -> Origin:
@@ -88,12 +88,12 @@ def _move_to_origin(scene: Gaussians) -> tuple[Gaussians, dict[str, Any]]:
         return replace(scene, means=world.float()), {}
     moved = world.double() - torch.tensor(origin, dtype=torch.float64)
     near = replace(scene, means=moved.float(), origin=origin)
-    found: dict[str, Any] = {"origin": origin}
+    counts: dict[str, Any] = {"origin": origin}
     if bool(((world.float() == world) | world.isnan()).all()):
-        found["distinct"] = tuple(
+        counts["distinct"] = tuple(
             len(torch.unique(column)) if at else 0 for at, column in zip(origin, world.unbind(1), strict=True)
         )
-    return near, found
+    return near, counts
 
 
 def _replace_unusable(scene: Gaussians) -> tuple[Gaussians, dict[str, int]]:
@@ -240,13 +240,13 @@ class LoadReport:
         if not self.distinct:
             return ""
         step = max(2.0 ** (math.frexp(at)[1] - 24) for at in self.origin if at)
-        left = ", ".join(
+        counts = ", ".join(
             f"{group_digits(count)} distinct {axis}"
             for axis, count in zip("xyz", self.distinct, strict=True)
             if count
         )
         return (
-            f"positions are float32, which has steps of {step:.2g} so far from 0: {left} are left of "
+            f"positions are float32, which has steps of {step:.2g} so far from 0: {counts} are left of "
             f"{format_count(self.count)}; export the scene near 0, or with x, y, z as doubles"
         )
 

@@ -104,10 +104,10 @@ def load_scene_with_report(path: str | os.PathLike[str]) -> tuple[Gaussians, Loa
         scene, level = read_ksplat(path)
         return _repair(path, scene, f".ksplat, level {level}")
     scene, report = _through_gaussforge(path, kind)
-    told, antialiased = f".{kind}", False
+    description, antialiased = f".{kind}", False
     if kind == "spz":
         version, antialiased = _spz_header(path)
-        scene, told = rotate_about_x(scene), f".spz {version}, turned from y up to y down"
+        scene, description = rotate_about_x(scene), f".spz {version}, turned from y up to y down"
     elif kind == "sog":
         meta = _sog_meta(path) or {}
         antialiased = meta.get("model") == "antialiased" or meta.get("antialias") is True
@@ -115,7 +115,7 @@ def load_scene_with_report(path: str | os.PathLike[str]) -> tuple[Gaussians, Loa
         report,
         file=scene_name(path),
         file_bytes=_size(path),
-        format=told,
+        format=description,
         antialiased=antialiased,
         origin=scene.origin,
     )
@@ -135,8 +135,8 @@ def rotate_about_x(scene: Gaussians) -> Gaussians:
     )
 
 
-def _repair(path: Path, found: Gaussians, kind: str) -> tuple[Gaussians, LoadReport]:
-    scene, counts = repair(found)
+def _repair(path: Path, stored: Gaussians, kind: str) -> tuple[Gaussians, LoadReport]:
+    scene, counts = repair(stored)
     repairs: dict[str, Any] = dict(counts)
     report = LoadReport(
         file=scene_name(path),
@@ -188,10 +188,10 @@ def _reason(status: int, stderr: bytes) -> str:
         name = signal.Signals(-status).name if -status in set(signal.Signals) else str(-status)
         return "ran out of its time" if name in ("SIGXCPU", "SIGKILL") else f"crashed ({name})"
     lines = stderr.decode("utf-8", "replace").strip().splitlines()
-    said = escape_text(lines[-1] if lines else "")
-    if "bad_alloc" in said or said.startswith("MemoryError"):
+    message = escape_text(lines[-1] if lines else "")
+    if "bad_alloc" in message or message.startswith("MemoryError"):
         return "wanted more memory than such a file can need"
-    return f"said: {said[:160]}" if said else "said nothing"
+    return f"said: {message[:160]}" if message else "said nothing"
 
 
 def _read_error(path: Path, kind: str, why: str) -> ProgdfError:

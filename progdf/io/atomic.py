@@ -125,10 +125,10 @@ def _create(path: Path, mode: int | None) -> None:
 def _copy_into(target: Path) -> Iterator[Path]:
     """A temporary file whose bytes go into a pipe or a device in the end."""
     with tempfile.TemporaryDirectory(prefix="progdf-") as folder:
-        whole = Path(folder) / f"whole{target.suffix}"
-        whole.touch()
-        yield whole
-        with whole.open("rb") as source, target.open("wb") as sink:
+        buffer = Path(folder) / f"whole{target.suffix}"
+        buffer.touch()
+        yield buffer
+        with buffer.open("rb") as source, target.open("wb") as sink:
             shutil.copyfileobj(source, sink)
 
 
@@ -321,13 +321,13 @@ def is_private(folder: Path) -> bool:
     """Whether nobody but the user could have put something into a folder."""
     if sys.platform == "win32":
         return True
-    found = folder.lstat()
-    return found.st_uid == os.getuid() and not folder.is_symlink() and not found.st_mode & 0o022
+    status = folder.lstat()
+    return status.st_uid == os.getuid() and not folder.is_symlink() and not status.st_mode & 0o022
 
 
-def _folder(found: Path) -> Path:
+def _folder(path: Path) -> Path:
     try:
         Path.home()
     except RuntimeError:  # no HOME, and the system does not know the user
         return temporary_folder()
-    return found
+    return path

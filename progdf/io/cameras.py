@@ -107,22 +107,22 @@ def _read(where: str, entry: object, kind: type[_T]) -> _T:
 def own_camera(file: str, index: int, entry: object) -> Camera:
     """An entry that `save_cameras` wrote."""
     where = f"camera {index} of {file}"
-    found = _read(where, entry, _Own)
-    viewmat = _rigid(where, torch.tensor(found.viewmat, dtype=torch.float64))
-    K = torch.tensor(found.K, dtype=torch.float64)
-    return _camera(where, viewmat, K, found.width, found.height, found.name, found.lens or None)
+    camera = _read(where, entry, _Own)
+    viewmat = _rigid(where, torch.tensor(camera.viewmat, dtype=torch.float64))
+    K = torch.tensor(camera.K, dtype=torch.float64)
+    return _camera(where, viewmat, K, camera.width, camera.height, camera.name, camera.lens or None)
 
 
 def inria_camera(file: str, index: int, entry: object) -> Camera:
     """`rotation` and `position` are camera to world, OpenCV axes; the principal point is the center."""
     where = f"camera {index} of {file}"
-    found = _read(where, entry, _Inria)
+    camera = _read(where, entry, _Inria)
     c2w = torch.eye(4, dtype=torch.float64)
-    c2w[:3, :3] = torch.tensor(found.rotation, dtype=torch.float64)
-    c2w[:3, 3] = torch.tensor(found.position, dtype=torch.float64)
-    width, height = found.width, found.height
-    K = _intrinsics(found.fx, found.fy, 0.5 * width, 0.5 * height)
-    return _camera(where, _world_to_camera(where, c2w), K, width, height, found.img_name)
+    c2w[:3, :3] = torch.tensor(camera.rotation, dtype=torch.float64)
+    c2w[:3, 3] = torch.tensor(camera.position, dtype=torch.float64)
+    width, height = camera.width, camera.height
+    K = _intrinsics(camera.fx, camera.fy, 0.5 * width, 0.5 * height)
+    return _camera(where, _world_to_camera(where, c2w), K, width, height, camera.img_name)
 
 
 def nerfstudio_camera(file: str, index: int, shared: Mapping[str, Any], entry: object, path: Path) -> Camera:
@@ -299,35 +299,35 @@ def cameras_beside(path: Path, origin: Origin = ZERO) -> list[Camera]:
 
 def _from_folder(folder: Path) -> list[Camera]:
     """The one thing in a folder that holds cameras."""
-    found = [folder / name for name in _FILES if (folder / name).is_file()]
+    files = [folder / name for name in _FILES if (folder / name).is_file()]
     model = find_model(folder)
     if model is not None:
-        found.append(model)
-    if not found:
+        files.append(model)
+    if not files:
         raise ProgdfError(
             f"{folder} holds no cameras; give a COLMAP model (cameras.bin and images.bin, also in sparse/0), "
             "a cameras.json or a transforms.json"
         )
-    if len(found) > 1:
+    if len(files) > 1:
         raise ProgdfError(
-            f"{folder} holds cameras in {' and in '.join(str(place) for place in found)}; "
+            f"{folder} holds cameras in {' and in '.join(str(file) for file in files)}; "
             "name the ones that belong to the scene"
         )
-    return load_model(found[0]) if found[0] == model else _from_file(found[0])
+    return load_model(files[0]) if files[0] == model else _from_file(files[0])
 
 
 def _from_file(path: str | os.PathLike[str]) -> list[Camera]:
     name = os.fspath(path)
     if Path(path).name in _MODEL_FILES and (model := find_model(Path(path).parent)):
         return load_model(model)
-    found = read_file(path)
-    if found.startswith(_PNG):
+    data = read_file(path)
+    if data.startswith(_PNG):
         camera = _carried_camera(path)
         if camera is None:
             raise ProgdfError(f"{name} carries no camera; give a picture that progdf render wrote")
         return [camera]
     try:
-        content = decode_json(found)
+        content = decode_json(data)
     except ValueError as error:
         raise ProgdfError(
             f"{name} is not JSON ({error}); give a cameras.json, a transforms.json or a file of saved cameras"
@@ -384,9 +384,9 @@ def _from_content(name: str, content: Any, path: Path) -> list[Camera]:
 
 def kind_of_cameras(path: str | os.PathLike[str]) -> str:
     """ "own" for a file that `save_cameras` wrote, "other" for anything else."""
-    found = read_file(path)
+    data = read_file(path)
     try:
-        content = json.loads(found)
+        content = json.loads(data)
     except (ValueError, RecursionError):
         return "other"
     return "own" if isinstance(content, dict) and content.get("format") == _FORMAT else "other"

@@ -67,11 +67,11 @@ def relative_name(path: Path, folder: Path) -> str:
     Raises:
         ProgdfError: its name is not UTF-8, which JSON cannot hold.
     """
-    whole = path.resolve()
+    resolved = path.resolve()
     try:
-        name = os.path.relpath(whole, folder.resolve())
+        name = os.path.relpath(resolved, folder.resolve())
     except ValueError:  # another drive
-        name = str(whole)
+        name = str(resolved)
     try:
         name.encode()
     except UnicodeEncodeError:
@@ -96,7 +96,7 @@ def write_session(path: Path, session: SessionFile) -> None:
     """
     text = json.dumps({MARK: VERSION} | plain(session), indent=2, ensure_ascii=False, allow_nan=False)
     # short lists of numbers on one line; a text holds no line break of its own, so none is hit
-    text = re.sub(r"\[\n\s+([^\[\]{}\"]*?)\n\s+\]", lambda found: f"[{' '.join(found[1].split())}]", text)
+    text = re.sub(r"\[\n\s+([^\[\]{}\"]*?)\n\s+\]", lambda match: f"[{' '.join(match[1].split())}]", text)
     with atomic_write(path) as temporary_file:
         temporary_file.write_text(text + "\n", encoding="utf-8")
 
@@ -138,7 +138,7 @@ def verify_files(path: Path, session: SessionFile) -> tuple[Path, tuple[Path, ..
     Raises:
         ProgdfError: one is missing or has changed.
     """
-    found = []
+    files = []
     for ref in (session.scene, *session.edits):
         folder = path.resolve().parent
         file, beside = ref.path(folder), folder / PureWindowsPath(ref.file).name
@@ -153,8 +153,8 @@ def verify_files(path: Path, session: SessionFile) -> tuple[Path, tuple[Path, ..
                 f"{path.name} was saved with another {file.name} than {file} holds now; "
                 "put that file back or save a new session"
             )
-        found.append(file)
-    return found[0], tuple(found[1:])
+        files.append(file)
+    return files[0], tuple(files[1:])
 
 
 def sha256(path: Path) -> str:

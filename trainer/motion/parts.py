@@ -92,11 +92,11 @@ def _join_strays(labels: Tensor, centroids: Tensor, counts: Tensor, least: float
     roots, part = torch.unique(labels, return_inverse=True)
     sizes = torch.zeros(len(roots), dtype=torch.int64).index_add(0, part, counts)
     order = sizes.argsort(descending=True, stable=True)
-    kept = max(1, int((sizes >= least).sum()))
+    count = max(1, int((sizes >= least).sum()))
     number = torch.empty_like(order)
     number[order] = torch.arange(len(order))
     part = number[part]
-    stray, firm = (part >= kept).nonzero()[:, 0], (part < kept).nonzero()[:, 0]
+    stray, firm = (part >= count).nonzero()[:, 0], (part < count).nonzero()[:, 0]
     if len(stray):
         part[stray] = part[firm[torch.from_numpy(cKDTree(centroids[firm]).query(centroids[stray])[1])]]
     return part
@@ -133,10 +133,10 @@ class GroupSearch:
         best, least = start, self.distance(targets, start)
         missed = _MISSED * least
         for wide in (False, True):
-            found = self._search(targets, start, wide, on_step)
-            distance = self.distance(targets, found)
+            motion = self._search(targets, start, wide, on_step)
+            distance = self.distance(targets, motion)
             if distance < least:
-                best, least = found, distance
+                best, least = motion, distance
             if least < missed:
                 break
         return best

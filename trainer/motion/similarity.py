@@ -128,11 +128,11 @@ def _move_geometry(rows: Tensor, parts: Parts, motion: Motion) -> Tensor:
 def interpolate_motion(a: Motion, b: Motion, share: float) -> Motion:
     """The way from one motion to another: shift and log-scale straight, the turn along the great circle."""
     start = turn_quats(a.turn)
-    rest = quat_turns(multiply_quats(turn_quats(-a.turn), turn_quats(b.turn)))
+    remaining = quat_turns(multiply_quats(turn_quats(-a.turn), turn_quats(b.turn)))
     return Motion(
         torch.lerp(a.shift, b.shift, share),
         torch.lerp(a.log_scale, b.log_scale, share),
-        quat_turns(multiply_quats(start, turn_quats(share * rest))),
+        quat_turns(multiply_quats(start, turn_quats(share * remaining))),
     )
 
 

@@ -88,28 +88,28 @@ def make_control_points(means: Tensor, part: Tensor, count: int) -> ControlPoint
     weights = torch.zeros(len(means), _NEAREST)
     for index, size in enumerate(torch.bincount(part).tolist()):
         mine = (part == index).nonzero()[:, 0]
-        wanted = min(size, max(1, round(count * size / len(means))))
-        chosen = mine[farthest_points(means[mine], wanted)]
-        near = min(_NEAREST, wanted)
+        points = min(size, max(1, round(count * size / len(means))))
+        chosen = mine[farthest_points(means[mine], points)]
+        near = min(_NEAREST, points)
         distances = torch.cdist(means[mine], means[chosen])
-        found = distances.topk(min(near + 1, wanted), dim=1, largest=False)
+        neighbors = distances.topk(min(near + 1, points), dim=1, largest=False)
         # down to zero at the next farther one, so that nothing jumps where one takes the place of another
-        reach = 1.01 * found.values[:, -1:].clamp_min(1e-9)
-        share = (1 - found.values[:, :near] / reach).clamp_min(1e-6).square()
-        nearest[mine, :near] = begun + found.indices[:, :near]
+        reach = 1.01 * neighbors.values[:, -1:].clamp_min(1e-9)
+        share = (1 - neighbors.values[:, :near] / reach).clamp_min(1e-6).square()
+        nearest[mine, :near] = begun + neighbors.indices[:, :near]
         weights[mine, :near] = share / share.sum(dim=1, keepdim=True)
-        around = min(_LINKS, wanted - 1)
-        own = torch.cdist(means[chosen], means[chosen])
-        others = own.topk(around + 1, dim=1, largest=False).indices[:, 1:]
-        ones = torch.arange(wanted)[:, None].expand_as(others)
+        around = min(_LINKS, points - 1)
+        spacings = torch.cdist(means[chosen], means[chosen])
+        others = spacings.topk(around + 1, dim=1, largest=False).indices[:, 1:]
+        ones = torch.arange(points)[:, None].expand_as(others)
         links.append(begun + torch.stack([ones, others], dim=2).reshape(-1, 2))
         rows.append(chosen)
-        part_of.append(torch.full((wanted,), index))
-        begun += wanted
+        part_of.append(torch.full((points,), index))
+        begun += points
     at, pairs = torch.cat(rows), torch.cat(links)
-    apart = (means[at[pairs[:, 0]]] - means[at[pairs[:, 1]]]).norm(dim=1)
+    gaps = (means[at[pairs[:, 0]]] - means[at[pairs[:, 1]]]).norm(dim=1)
     alone = (means - means.mean(dim=0)).norm(dim=1)
-    spacing = float((apart if len(apart) else alone).median())
+    spacing = float((gaps if len(gaps) else alone).median())
     return ControlPoints(at, means[at], torch.cat(part_of), nearest, weights, pairs, max(spacing, 1e-9))
 
 
@@ -234,10 +234,10 @@ def warp_rows(original: Tensor, control: ControlPoints, motion: WarpMotion) -> T
 
 def interpolate_warp(a: WarpMotion, b: WarpMotion, share: float) -> WarpMotion:
     """The way from one motion to another: shift and stretch straight, turns along the great circle."""
-    rest = quat_turns(multiply_quats(turn_quats(-a.turn), turn_quats(b.turn)))
+    remaining = quat_turns(multiply_quats(turn_quats(-a.turn), turn_quats(b.turn)))
     return WarpMotion(
         torch.lerp(a.shift, b.shift, share),
-        quat_turns(multiply_quats(turn_quats(a.turn), turn_quats(share * rest))),
+        quat_turns(multiply_quats(turn_quats(a.turn), turn_quats(share * remaining))),
         torch.lerp(a.stretch, b.stretch, share),
     )
 
@@ -334,15 +334,19 @@ class WarpSearch:
         def loss_in(values: Tensor, view: int, step: int) -> Tensor:
             motion = motion_of(values)
             rows = warp_rows(self.original, control, motion)
-            held = _RIGID * disagreement(control, motion) + _STIFF * motion.stretch.square().sum(dim=1).mean()
-            return view_distance(self.crops[view], rows, targets[view], wide=step < widening) + held
+            penalty = (
+                _RIGID * disagreement(control, motion) + _STIFF * motion.stretch.square().sum(dim=1).mean()
+            )
+            return view_distance(self.crops[view], rows, targets[view], wide=step < widening) + penalty
 
         def rates_at(step: int) -> Tensor:
             return falling(max(0, step - widening), self.steps - widening) * rates
 
         values = torch.cat([start.shift / size, start.turn, start.stretch], dim=1)
-        found = descend(values, loss_in, rates_at, self.steps, len(self.crops), self.seed, _DAMPING, on_step)
-        return motion_of(found)
+        settled = descend(
+            values, loss_in, rates_at, self.steps, len(self.crops), self.seed, _DAMPING, on_step
+        )
+        return motion_of(settled)
 
 
 def disagreement(control: ControlPoints, motion: WarpMotion) -> Tensor:

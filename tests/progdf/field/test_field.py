@@ -24,25 +24,25 @@ from progdf.gaussians import ATTRIBUTES, attribute_slices
 from tests.helpers.edits import at_snapshots, curved_field, curved_trajectory, linear_pictures
 
 EVERYTHING = dict.fromkeys(ATTRIBUTES, 2)
-REST_TYPES = [torch.int8, torch.float16, torch.float32]
+BASIS_TYPES = [torch.int8, torch.float16, torch.float32]
 
 
 # ---- both kinds
 
 
-@pytest.mark.parametrize("rest_type", REST_TYPES)
-def test_the_ends_of_a_separable_field_are_exact(rest_type: torch.dtype) -> None:
+@pytest.mark.parametrize("basis_type", BASIS_TYPES)
+def test_the_ends_of_a_separable_field_are_exact(basis_type: torch.dtype) -> None:
     strengths, offsets = curved_trajectory(50, channels=14 + 24)
-    field = fit_separable(strengths, offsets, EVERYTHING, rest_type=rest_type)
+    field = fit_separable(strengths, offsets, EVERYTHING, basis_type=basis_type)
     assert not bool(field.offsets(0.0).any())
     assert torch.equal(field.offsets(1.0), offsets[-1])
 
 
-@pytest.mark.parametrize("rest_type", REST_TYPES)
+@pytest.mark.parametrize("basis_type", BASIS_TYPES)
 @pytest.mark.parametrize("count", [2, 3, 4, 9, 40])
-def test_the_ends_of_a_keyframe_field_are_exact(rest_type: torch.dtype, count: int) -> None:
+def test_the_ends_of_a_keyframe_field_are_exact(basis_type: torch.dtype, count: int) -> None:
     strengths, offsets = curved_trajectory(50)
-    field = fit_keyframes(strengths, offsets, count, rest_type=rest_type)
+    field = fit_keyframes(strengths, offsets, count, basis_type=basis_type)
     assert not bool(field.offsets(0.0).any())
     assert torch.equal(field.offsets(1.0), offsets[-1])
 
@@ -105,7 +105,7 @@ def test_what_is_no_trajectory_is_refused(strengths: Tensor, offsets: Tensor, me
 
 def test_a_trajectory_of_two_bends_is_exact_with_two_bases() -> None:
     strengths, offsets = curved_trajectory(80)
-    field = fit_separable(strengths, offsets, EVERYTHING, rest_type=torch.float32)
+    field = fit_separable(strengths, offsets, EVERYTHING, basis_type=torch.float32)
     assert torch.allclose(at_snapshots(field, strengths), offsets, atol=1e-5)
 
 

@@ -25,7 +25,7 @@ def test_two_keyframes_are_the_straight_way_at_fourteen_floats() -> None:
 def test_int8_keyframes_spend_their_levels_on_the_bend() -> None:
     strengths, bend = curved_trajectory(30)
     straight = 1000 * strengths[:, None, None]
-    field = fit_keyframes(strengths, straight + bend, 9, rest_type=torch.int8)
+    field = fit_keyframes(strengths, straight + bend, 9, basis_type=torch.int8)
     error = (at_snapshots(field, strengths) - straight - bend).abs().max()
     assert float(error) < 2 * float(bend.abs().max()) / 127
 

@@ -80,9 +80,9 @@ def test_an_edit_comes_back_as_it_was_saved(shirt: Gdf, saved: Path, scene: Gaus
     assert same(load_gdf(saved, scene), shirt)
 
 
-@pytest.mark.parametrize("rest_type", [torch.int8, torch.float16, torch.float32])
-def test_every_storage_type_survives(scene: Gaussians, tmp_path: Path, rest_type: torch.dtype) -> None:
-    edit = edit_of(scene, some_rows(scene, 9), curved_field(9, rest_type=rest_type))
+@pytest.mark.parametrize("basis_type", [torch.int8, torch.float16, torch.float32])
+def test_every_storage_type_survives(scene: Gaussians, tmp_path: Path, basis_type: torch.dtype) -> None:
+    edit = edit_of(scene, some_rows(scene, 9), curved_field(9, basis_type=basis_type))
     save_gdf(tmp_path / "a.gdf", edit)
     assert same(load_gdf(tmp_path / "a.gdf"), edit)
 
