@@ -14,6 +14,7 @@ from typing import Annotated, Any
 import msgspec
 import numpy as np
 import safetensors
+import safetensors.numpy
 import safetensors.torch
 import torch
 from torch import Tensor
@@ -23,7 +24,6 @@ from progdf.field.baked import AttributeBases, BakedField, BakePlan, NeuralForm
 from progdf.field.neural import NeuralField, NeuralShape
 from progdf.gaussians import ATTRIBUTES
 from progdf.io.json_values import convert_json, decode_json
-from progdf.io.tensors import METADATA, tensor_bytes
 from progdf.region import Region
 
 FORMAT = 2
@@ -33,6 +33,7 @@ MOST_GAUSSIANS = 1 << 26
 """A header that claims a larger scene is not believed: the score would take gigabytes."""
 
 _MOST_HEADER = 1 << 24  # bytes; a report takes a few kB, and JSON of 100 MB could become a gigabyte
+_METADATA = "progdf"  # the one key: the library writes several in an order that differs from run to run
 _PARTS = ("end_offset", "residual_basis", "scale", "coefficients")  # of `AttributeBases`
 _NETWORK = "network."
 _END_CORRECTION = "end_correction."
@@ -96,7 +97,9 @@ class _Format1(msgspec.Struct):
 def pack_file(header: GdfHeader, tensors: Mapping[str, Tensor]) -> bytes:
     """The bytes of a .gdf file; the header gets its checksum. Tensors lie on the CPU, row by row."""
     sha256 = checksum(_encode(header), tensors)
-    return tensor_bytes(tensors, _encode(msgspec.structs.replace(header, sha256=sha256)))
+    arrays = {name: tensor.numpy() for name, tensor in tensors.items()}
+    text = _encode(msgspec.structs.replace(header, sha256=sha256))
+    return safetensors.numpy.save(arrays, {_METADATA: text})
 
 
 def unpack_file(content: bytes, name: str) -> tuple[GdfHeader, dict[str, Tensor]]:
@@ -110,7 +113,7 @@ def unpack_file(content: bytes, name: str) -> tuple[GdfHeader, dict[str, Tensor]
         raise ProgdfError(f"{name} is not a .gdf file; give one that progdf train or progdf fit has written")
     try:
         tensors: dict[str, Tensor] = safetensors.torch.load(content)
-        text = (decode_json(content[8 : 8 + size]).get("__metadata__") or {}).get(METADATA)
+        text = (decode_json(content[8 : 8 + size]).get("__metadata__") or {}).get(_METADATA)
     except (safetensors.SafetensorError, ValueError, KeyError, RuntimeError, OverflowError):
         raise ProgdfError(f"{name} is truncated or damaged; copy it again or make it again") from None
     if text is None:

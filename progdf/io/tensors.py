@@ -69,13 +69,8 @@ def write_tensors(
     if checksum:
         metadata = {**metadata, _CHECKSUM: _checksum(metadata, tensors)}
     text = msgspec.json.encode(dict(sorted(metadata.items()))).decode()
-    path.write_bytes(tensor_bytes(tensors, text))
-
-
-def tensor_bytes(tensors: Mapping[str, Tensor], text: str) -> bytes:
-    """A safetensors file of CPU tensors, with one JSON text as its metadata."""
     arrays = {name: tensor.detach().contiguous().numpy() for name, tensor in tensors.items()}
-    return save(arrays, {METADATA: text})
+    path.write_bytes(save(arrays, {METADATA: text}))
 
 
 def read_tensors(path: Path, names: Collection[str] = ()) -> tuple[dict[str, Tensor], dict[str, str]]:

@@ -13,7 +13,7 @@ import safetensors.torch
 import torch
 
 from progdf.gdf.header import checksum
-from progdf.io.tensors import tensor_bytes, write_tensors
+from progdf.io.tensors import write_tensors
 from tests.helpers.hostile import JSON_TEXTS
 
 VALUES: list[Any] = [
@@ -155,7 +155,7 @@ def signed_gdf(header: Any, tensors: dict[str, torch.Tensor]) -> bytes:
     """A .gdf file of these, its checksum made to fit: a wrong writer's."""
     if isinstance(header, dict):
         header = {**header, "sha256": checksum(json.dumps({**header, "sha256": ""}), tensors)}
-    return tensor_bytes(tensors, json.dumps(header))
+    return safetensors.torch.save(tensors, {"progdf": json.dumps(header)})
 
 
 def changed_gdf(content: bytes) -> Change:
