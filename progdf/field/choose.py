@@ -405,7 +405,7 @@ def render_trajectories(offsets: Tensor, weights: Tensor, render: Render) -> Ren
     Args:
         offsets: [T,M,C] float32, the first row 0
         weights: how much an error of each number shows, ≥ 0. [M,C]
-        render: called 1 + (1 + A)·(T − 2) times at most, where T counts no more than `MOST_SNAPSHOTS`
+        render: called (1 + A)·(T − 2) times at most, where T counts no more than `MOST_SNAPSHOTS`
     """
     attributes = moving_attributes(offsets)
     trajectories = {
@@ -413,23 +413,22 @@ def render_trajectories(offsets: Tensor, weights: Tensor, render: Render) -> Ren
         for name, columns in attributes.items()
     }
     snapshots = len(offsets)
+    if not attributes or snapshots < 3:
+        gram = torch.zeros(len(attributes), snapshots, len(attributes), snapshots, dtype=torch.float64)
+        return RenderedTrajectories(trajectories, gram, 1, offsets.shape[2])
     looked = _rendered_snapshots(snapshots)
+    changes: list[list[Tensor]] = [[] for _ in attributes]
     with torch.no_grad():
-        original = render(offsets[0])
-        stride = _stride(original)
-        still = torch.zeros_like(original[::stride].flatten())
-        changes = [[still] for _ in attributes]
         for t in looked[1:-1]:
             pixels = render(offsets[t])
+            stride = max(1, -(-len(pixels) // MOST_PIXELS))
             for i, (name, columns) in enumerate(attributes.items()):
                 straight = offsets[t].clone()
                 straight[:, columns] = trajectories[name].amplitude[t] * offsets[-1, :, columns]
                 changes[i].append((pixels - render(straight))[::stride].flatten())
+    still = torch.zeros_like(changes[0][0])
     spread = _interpolation_weights(looked, snapshots)
-    gram = torch.zeros(len(attributes), snapshots, len(attributes), snapshots, dtype=torch.float64)
-    if not attributes or snapshots < 3:
-        return RenderedTrajectories(trajectories, gram, 1, offsets.shape[2])
-    rows = torch.cat([torch.stack([*pixel_rows, still]) for pixel_rows in changes])
+    rows = torch.cat([torch.stack([still, *pixel_rows, still]) for pixel_rows in changes])
     products = (rows @ rows.T).double().reshape(len(attributes), len(looked), len(attributes), len(looked))
     gram = torch.einsum("ts,asbu,vu->atbv", spread, products, spread)
     return RenderedTrajectories(trajectories, gram, max(1, rows.shape[1]), offsets.shape[2])
@@ -451,10 +450,6 @@ def _interpolation_weights(looked: Sequence[int], snapshots: int) -> Tensor:
         share = (inner - a).double() / (b - a)
         shares[inner, column], shares[inner, column + 1] = 1.0 - share, share
     return shares
-
-
-def _stride(pixels: Tensor) -> int:
-    return max(1, -(-len(pixels) // MOST_PIXELS))
 
 
 def rendered_importance(offsets: Tensor, render: Render, seed: int = 0) -> dict[str, float]:
