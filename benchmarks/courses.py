@@ -16,8 +16,7 @@ from progdf.compose.composer import Composer
 from progdf.compose.layers import Layer
 from progdf.demo_scenes import AnalyticEdit
 from progdf.field import BakedField, FieldEvaluator
-from progdf.field.evaluate import Field
-from progdf.field.rendered import Render
+from progdf.field.choose import Field, Render
 from progdf.gaussians import Gaussians, pack
 from progdf.gdf.file import Gdf, fingerprint
 from progdf.metrics.image import decibels

@@ -17,7 +17,7 @@ from torch import Tensor
 from progdf.camera import Camera, look_at
 from progdf.errors import ProgdfError
 from progdf.field import BakedField
-from progdf.field.evaluate import sample_strengths
+from progdf.field.choose import sample_strengths
 from trainer.editors import VIEW_BY_VIEW, make_editor
 from trainer.evaluate.opened import FADE, KEYFRAMES, SLIDER, OpenedRun, open_run
 from trainer.fit.evaluate import Evaluator, make_evaluator

@@ -91,7 +91,7 @@ def field_table(forms: Sequence[Form]) -> Table:
         rows=tuple(rows),
         note=f"Bear of {BEAR} Gaussians, {SNAPSHOTS} snapshots, against the true course; recorded edits "
         "against the recording. 13 slider values, views that no choice has seen, pixels that the edit "
-        "changes. Keyframes lie where pictures bend. For networks see python -m benchmarks networks. "
+        "changes. Keyframes lie at even strengths. For networks see python -m benchmarks networks. "
         f"{_at_same_bytes(forms)}",
     )
 

@@ -9,9 +9,7 @@ from dataclasses import dataclass
 import torch
 
 from progdf.field import BakedField, choose_field, fit_keyframes
-from progdf.field.choose import separable_within
-from progdf.field.keyframes import bending_snapshots
-from progdf.field.rendered import picture_gram, render_trajectories
+from progdf.field.choose import render_trajectories, separable_within
 from progdf.field.separable import channel_weights
 
 from .courses import KnownEdit, edit_of, step_ms
@@ -77,31 +75,21 @@ def baked_forms(course: KnownEdit) -> list[Form]:
         )  # fmt: skip
         return found[-1]
 
-    begin = time.perf_counter()
-    gram = picture_gram(offsets, course.look)
-    looked = time.perf_counter() - begin
-    kept = {count: bending_snapshots(strengths, gram, count) for count in {2, 4, 9, *COUNTS}}
     for count in (2, 4, 9):
         measure(
             "keyframes, float32",
-            lambda c=count: (  # type: ignore[misc]
-                fit_keyframes(strengths, offsets, c, kept=kept[c]), f"{c} keyframes, float32"
-            ),
-            looked,
-        )  # fmt: skip
+            lambda c=count: (fit_keyframes(strengths, offsets, c), f"{c} keyframes, float32"),  # type: ignore[misc]
+        )
     begin = time.perf_counter()
     courses = render_trajectories(offsets, channel_weights(weights, *offsets.shape[1:]), course.look)
     straightened = time.perf_counter() - begin
     for count in COUNTS:
-        for between in ("linear", "cubic"):
-            name = "keyframes, int8" if between == "linear" else "cubic keyframes, int8"
-            measure(
-                name,
-                lambda c=count, b=between, n=name: (  # type: ignore[misc]
-                    fit_keyframes(strengths, offsets, c, None, torch.int8, kept[c], b), f"{c} {n}"
-                ),
-                looked,
-            )  # fmt: skip
+        measure(
+            "keyframes, int8",
+            lambda c=count: (  # type: ignore[misc]
+                fit_keyframes(strengths, offsets, c, basis_type=torch.int8), f"{c} keyframes, int8"
+            ),
+        )  # fmt: skip
         size = found[-1].bytes_per_member
         measure(
             "joint SVD",

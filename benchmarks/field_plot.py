@@ -16,7 +16,6 @@ STYLES: dict[str, tuple[tuple[int, int, int], str]] = {
     "separable": ((34, 84, 180), "disc"),
     "joint SVD": ((150, 70, 160), "diamond"),
     "keyframes, int8": ((214, 96, 36), "square"),
-    "cubic keyframes, int8": ((196, 158, 28), "triangle"),
     "keyframes, float32": ((150, 140, 130), "ring"),
     "auto": (INK, "star"),
 }

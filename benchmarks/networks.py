@@ -28,7 +28,7 @@ from progdf.field import (
     fit_keyframes,
     fit_neural,
 )
-from progdf.field.evaluate import Field
+from progdf.field.choose import Field
 from progdf.field.neural_fit import NeuralFit
 from progdf.field.separable import moving_attributes
 from progdf.gaussians import Gaussians, pack

@@ -18,9 +18,10 @@ from types import FrameType
 from typing import NoReturn
 
 from progdf.io.atomic import atomic_write, disk_full
-from progdf.io.user_folders import state_folder
 
-from .errors import PrintableFormatter, ProgdfError, escape_text
+from .errors import ProgdfError
+from .io.atomic import state_folder
+from .terminal import PrintableFormatter, escape_text
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "demo": ("trainer.pipeline.demo:main", "make a scene, train its edits, write previews, open the window"),
@@ -33,12 +34,8 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "render": ("viewer.commands.render:render", "write a picture, a sweep or a sheet without a window"),
     "rebind": ("progdf.cli.rebind:main", "carry an edit over to the same scene in another file or format"),
     "edit": ("progdf.cli.edit:main", "write a scene again without strays"),
-    "export": ("viewer.commands.render:export", "write the edited scene as a 3DGS .ply file"),
-    "check": (
-        "progdf.cli.check:main",
-        "report what a scene holds, what had to be repaired and what is stray",
-    ),
-    "info": ("progdf.cli.info:main", "tell what a scene or a .gdf holds, with its error report"),
+    "export": ("viewer.commands.cli:export", "write the edited scene as a 3DGS .ply file"),
+    "info": ("progdf.cli.info:main", "show the contents of a scene or .gdf, repairs, strays and errors"),
 }
 HIDDEN = {"preview": "trainer.preview:serve"}
 """Commands that the window runs, and nobody types."""

@@ -8,6 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from progdf.quaternions import normalize_quats
+
 ATTRIBUTES = ("means", "log_scales", "quats", "logit_opacities", "sh0", "shN")
 """Attribute names in the order in which offsets are packed; see `attribute_slices`."""
 
@@ -120,18 +122,6 @@ class Gaussians:
             new = packed[:, channels].reshape(-1, *old.shape[1:])
             changed[name] = old.index_copy(0, rows, new.to(old.dtype))
         return replace(self, **changed)
-
-
-def normalize_quats(quats: Tensor) -> Tensor:
-    """Unit quaternions; a length under 1e-12 of the type's range gives the identity. [N,4] -> [N,4]"""
-    largest = quats.abs().amax(dim=-1, keepdim=True)
-    usable = (largest > 0) & largest.isfinite()
-    # dividing by the largest component first keeps 1e-30 and 1e30 from under- and overflowing when squared
-    safe = torch.where(usable, quats / torch.where(usable, largest, torch.ones_like(largest)), 0.0)
-    identity = torch.zeros_like(quats)
-    identity[..., 0] = 1.0
-    length = safe.norm(dim=-1, keepdim=True)
-    return torch.where(usable, safe / torch.where(usable, length, torch.ones_like(length)), identity)
 
 
 def attribute_slices(channels: int) -> dict[str, slice]:

@@ -1,9 +1,14 @@
-"""Real spherical harmonics up to degree 4, with the signs and order of the 3DGS .ply file."""
+"""Real spherical harmonics with the signs and order of the 3DGS .ply file: values and rotation."""
 
 from __future__ import annotations
 
+import math
+from functools import cache
+
 import torch
 from torch import Tensor
+
+from progdf.quaternions import rotate_vectors
 
 C0 = 0.28209479177387814
 _C1 = 0.4886025119029199
@@ -17,6 +22,9 @@ _C3 = (
     1.445305721320277,
     -0.5900435899266435,
 )
+
+_SAMPLES = 20  # directions, at least as many as basis functions
+_CHUNK = 1 << 14  # Gaussians that are turned at once
 
 
 def sh0_to_rgb(sh0: Tensor) -> Tensor:
@@ -71,3 +79,63 @@ def shade(degree: int, directions: Tensor, sh: Tensor) -> Tensor:
     """Color seen along `directions`: max(0, Σ basis·sh + 0.5). [N,3], [N,≥(degree+1)²,3] -> [N,3]"""
     weights = basis(degree, directions)
     return ((weights[..., None] * sh[:, : weights.shape[-1]]).sum(dim=1) + 0.5).clamp_min(0.0)
+
+
+def rotate_bands(shN: Tensor, quats: Tensor) -> Tensor:
+    """Higher bands of Gaussians that turn: what was seen along d is then seen along the turned d.
+
+    Args:
+        shN: bands 1 to d; band 4, which is not shown, stays. [N,K,3]
+        quats: unit quaternions. [N,4]
+    """
+    return shN + rotation_change(shN, quats)
+
+
+def rotation_change(shN: Tensor, quats: Tensor, part: Tensor | None = None) -> Tensor:
+    """What a turn adds to higher bands, exactly 0 where nothing turns; no gradient of the turn.
+
+    Args:
+        shN: see `rotate_bands`. [N,K,3]
+        quats: unit quaternions, [N,4], or [P,4] of parts
+        part: which part each Gaussian belongs to. [N] int64
+
+    Returns:
+        [N,K,3]
+    """
+    degree = min(3, math.isqrt(shN.shape[1] + 1) - 1)
+    change = torch.zeros_like(shN)
+    if not degree:
+        return change
+    count = (degree + 1) ** 2 - 1
+    matrices = torch.cat([_wigner_change(degree, chunk) for chunk in torch.split(quats.detach(), _CHUNK)]).to(
+        shN
+    )
+    matrices = matrices if part is None else matrices[part]
+    return torch.cat([matrices @ shN[:, :count], change[:, count:]], dim=1)
+
+
+def rotate_about_x(shN: Tensor) -> Tensor:
+    """Higher bands after half a turn about x, bit for bit but for signs. [N,K,3]"""
+    degree = math.isqrt(shN.shape[1] + 1) - 1
+    # a basis function of order m changes its sign with y for m < 0, and with z for l + m odd
+    signs = [(-1.0) ** (l + m + (m < 0)) for l in range(1, degree + 1) for m in range(-l, l + 1)]
+    return shN * torch.tensor(signs)[:, None]
+
+
+def _wigner_change(degree: int, quats: Tensor) -> Tensor:
+    """The Wigner matrices of bands 1 to `degree`, less the identity. [N,4] -> [N,K,K] float64"""
+    directions, inverse = _samples(degree)
+    back = quats.double() * torch.tensor([1.0, -1.0, -1.0, -1.0], dtype=torch.float64)
+    turned = rotate_vectors(directions[None], back[:, None])
+    seen = basis(degree, turned) - basis(degree, directions)
+    return inverse @ seen[..., 1:]
+
+
+@cache
+def _samples(degree: int) -> tuple[Tensor, Tensor]:
+    """Directions, and the bands from the colors seen along them. [J,3], [K,J] float64"""
+    z = 1.0 - (2.0 * torch.arange(_SAMPLES, dtype=torch.float64) + 1.0) / _SAMPLES
+    angle = torch.arange(_SAMPLES, dtype=torch.float64) * math.pi * (3.0 - math.sqrt(5.0))
+    radius = (1.0 - z * z).sqrt()
+    directions = torch.stack([radius * angle.cos(), radius * angle.sin(), z], dim=1)
+    return directions, torch.linalg.pinv(basis(degree, directions))[1:]

@@ -31,8 +31,8 @@ ENTRY_POINT = ROOT / "progdf" / "__main__.py"  # the table of commands knows all
 
 # Inside a package a folder, or a file beside the folders, imports only from those before it.
 ORDER = {
-    "progdf": """gaussians sh errors torch_threads region camera interpolation color metrics
-        demo_scenes io rasterize field formats gdf scene compose cli __init__ __main__""",
+    "progdf": """quaternions sh gaussians terminal errors torch_threads region camera interpolation
+        color metrics demo_scenes io rasterize field formats gdf scene compose cli __init__ __main__""",
     "trainer": """__init__ options presets option_checks store views editors segmenters setup regions
         motion optimize fit report plan preview pipeline evaluate cli""",
     "viewer": "__init__ camera gl jobs state render files pictures ui panel select app commands",
@@ -65,13 +65,11 @@ def place(path: Path) -> str:
 
 
 def imported_modules(source: str, module: str, is_package: bool) -> list[tuple[int, str]]:
-    """Line and absolute name of everything imported, but for what only type checkers import."""
+    """Line and absolute name of everything imported, by type checkers too."""
     found: list[tuple[int, str]] = []
     home = module.split(".") if is_package else module.split(".")[:-1]
 
     def visit(node: ast.AST) -> None:
-        if isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING"):
-            return
         if isinstance(node, ast.Import):
             found.extend((node.lineno, alias.name) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -180,11 +178,15 @@ def test_the_tests_of_imports_see_cycles_and_upward_imports() -> None:
     files = {
         Path("progdf/a/one.py"): "from progdf.b.two import x\n",
         Path("progdf/b/two.py"): "def f():\n    from ..a import one\n",
-        Path("progdf/b/three.py"): "if TYPE_CHECKING:\n    from progdf.c.four import y\n",
         Path("progdf/c/four.py"): "from progdf.b import three\n",
     }
     assert set(import_cycle(import_graph(files))) == {"progdf.a.one", "progdf.b.two"}
     assert upward_imports("progdf", ["b", "a", "c"], files) == ["progdf.b.two imports progdf.a.one"]
+    files = {
+        Path("progdf/b/three.py"): "if TYPE_CHECKING:\n    from progdf.c.four import y\n",
+        Path("progdf/c/four.py"): "from progdf.b import three\n",
+    }
+    assert set(import_cycle(import_graph(files))) == {"progdf.b.three", "progdf.c.four"}, "type checkers' too"
 
 
 def unsafe_starts(source: str, where: str) -> list[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from progdf.cli.options import parse_options
-from progdf.errors import print_line
+from progdf.terminal import print_line
 from trainer.evaluate.options import EvaluateOptions
 from trainer.regions.options import RegionOptions, ViewsOptions
 

@@ -141,7 +141,7 @@ class TrainOptions:
     pictures that do; stages: s is the editor's own strength, even in between; time: the optimizer's. auto:
     even, but stages where folder: has pictures of several strengths."""
     field: FieldKind = "auto"
-    """Kind of field; auto keeps the smallest separable or keyframe one that meets --target-psnr; lossless
+    """Kind of field; auto keeps the smallest separable one that meets --target-psnr; lossless
     keeps every recording."""
     size: Size = NETWORK_OPTIONS["size"]
     """neural: numbers in the network, 17 thousand, .5 million or 6 million (paper, a quarter of an hour)."""
@@ -175,7 +175,7 @@ class FitOptions:
     run: tyro.conf.Positional[Path]
     """Folder that progdf train wrote."""
     field: FieldKind = "auto"
-    """Kind of field; auto keeps the smallest separable or keyframe one that meets --target-psnr; lossless
+    """Kind of field; auto keeps the smallest separable one that meets --target-psnr; lossless
     keeps every recording."""
     size: Size = NETWORK_OPTIONS["size"]
     """neural: numbers in the network, 17 thousand, .5 million or 6 million (paper, a quarter of an hour)."""

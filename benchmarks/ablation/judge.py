@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 
 from progdf.field import BakedField, fit_keyframes
-from progdf.field.remap import identity_remap
+from progdf.field.baked import identity_remap
 from progdf.field.trajectory import Trajectory
 from progdf.interpolation import interpolate_at
 from progdf.metrics.slider import slider_statistics

@@ -10,16 +10,16 @@ from typing import Annotated
 
 import tyro
 
-from progdf.errors import ProgdfError, print_line
-from progdf.formats.load_report import format_count, group_digits
+from progdf.errors import ProgdfError
 from progdf.formats.ply import save_ply_checked
 from progdf.formats.scene_file import load_scene, scene_name
 from progdf.gaussians import Gaussians
 from progdf.io.atomic import check_not_an_input
 from progdf.metrics.image import NO_DIFFERENCE
 from progdf.scene.strays import clean, find_strays, picture_difference
+from progdf.terminal import format_count, group_digits, print_line
 
-from .options import parse_options
+from .options import absent_option, parse_options
 
 
 @dataclass(frozen=True)
@@ -32,9 +32,9 @@ class EditOptions:
         clean: leave out floaters, needles, giants and what is too transparent to be drawn
     """
 
-    scene: Annotated[Path, tyro.conf.Positional]
+    scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT.ply")]
-    clean: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    clean: Annotated[bool, tyro.conf.FlagCreatePairsOff, absent_option(None)] = False
 
 
 def main(argv: Sequence[str]) -> int:

@@ -1,8 +1,9 @@
-"""`progdf info FILE`: what a scene, an edit or a camera file holds, recognized by its content."""
+"""`progdf info FILE`: the contents of a scene, an edit, a session or a camera file."""
 
 from __future__ import annotations
 
 import os
+import shlex
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,18 +12,21 @@ from typing import Annotated, Any
 import msgspec
 import tyro
 
-from progdf.errors import ProgdfError, print_line
-from progdf.formats.load_report import file_size, format_count, group_digits
+from progdf.errors import ProgdfError
+from progdf.field.baked import BakedField
 from progdf.formats.scene_file import load_scene_with_report, scene_file, scene_format
 from progdf.gaussians import ZERO
-from progdf.gdf.header import GdfHead, read_head
+from progdf.gdf.file import read_gdf
 from progdf.io import session as session_file
 from progdf.io.atomic import read_file
 from progdf.io.cameras import load_cameras
 from progdf.io.json_values import convert_json, decode_json
 from progdf.scene.stats import survey
+from progdf.scene.strays import find_strays
+from progdf.scene.up_axis import UpChoice, find_up
+from progdf.terminal import file_size, format_count, group_digits, print_line
 
-from .options import parse_options
+from .options import absent_option, parse_options
 
 TIMELINE_MARK = "progdf_timeline"
 """The first key of every timeline file of the window, which identifies its kind."""
@@ -30,26 +34,37 @@ TIMELINE_MARK = "progdf_timeline"
 
 @dataclass(frozen=True)
 class InfoOptions:
-    """Tell what a scene, a .gdf edit, a session or a camera file holds, an edit with its error report.
+    """Show the contents of a scene, a .gdf edit, a session or a camera file. Nothing is written.
+
+    Of a scene, also what had to be repaired to load it, and its strays; of an edit, its error report.
 
     Args:
-        file: the file; its content decides what it is, not its name
+        file: its content decides what it is, not its name
+        cameras: of the scene, which tell the up axis
+        up: the axis of the scene that is up
     """
 
-    file: Annotated[Path, tyro.conf.Positional]
+    file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
+    cameras: Annotated[Path | None, absent_option("CAMERAS", "those beside the file")] = None
+    up: UpChoice = "auto"
 
 
 def main(argv: Sequence[str]) -> int:
-    """Print what the file holds. Raises ProgdfError for a file that is none of ours or is broken."""
-    path = parse_options(InfoOptions, argv, "progdf info").file
-    for line in describe(path):
+    """Print the contents. Raises ProgdfError for a file that is none of ours or cannot be loaded."""
+    options = parse_options(InfoOptions, argv, "progdf info")
+    for line in describe(options.file, options.cameras, options.up):
         print_line(line)
     return 0
 
 
-def describe(path: Path) -> Iterable[str]:
-    """What a file holds, line by line; see `kind_of`."""
-    return _DESCRIBE[kind_of(path)](path)
+def describe(path: Path, cameras: Path | None = None, up: UpChoice = "auto") -> Iterable[str]:
+    """The contents of a file, line by line, see `kind_of`; `cameras` and `up` are for scenes."""
+    kind = kind_of(path)
+    if kind == "scene":
+        return _scene_lines(path, cameras, up)
+    if cameras is not None or up != "auto":
+        raise ProgdfError(f"{path} is no scene; leave --cameras and --up out")
+    return _DESCRIBE[kind](path)
 
 
 def kind_of(path: str | os.PathLike[str]) -> str:
@@ -75,23 +90,29 @@ def kind_of(path: str | os.PathLike[str]) -> str:
     raise ProgdfError(f"{path} is not a file progdf knows; give a scene, a .gdf edit or a camera file")
 
 
-def _scene_lines(path: Path) -> Iterator[str]:
+def _scene_lines(path: Path, cameras: Path | None, up: UpChoice) -> Iterator[str]:
     scene, report = load_scene_with_report(path)
+    views = [] if cameras is None else load_cameras(cameras, scene.origin)
     yield from report.lines()
-    yield from survey(scene).lines()
+    yield from survey(scene, find_up(scene, views, up, path)).lines()
+    strays = find_strays(scene)
+    if len(strays.rows):
+        clean = f"progdf edit {shlex.quote(str(path))} --clean -o CLEAN.ply leaves them out"
+        yield f"strays: {strays.describe()}; {clean}"
 
 
 def _edit_lines(path: Path) -> Iterator[str]:
-    gdf = read_head(path)
-    members, count = gdf.members, gdf.scene.count
-    yield f"{path.name}: the edit '{gdf.name}', {file_size(gdf.size)}"
+    gdf = read_gdf(path)
+    size, members, count = path.stat().st_size, len(gdf.region), gdf.scene.count
+    yield f"{path.name}: the edit '{gdf.name}', {file_size(size)}"
     if gdf.instruction:
         yield f"asked for: {gdf.instruction}"
     yield f"scene: {format_count(count)}, fingerprint {gdf.scene.means_sha256[:12]}"
-    yield f"region: {gdf.region}, {format_count(members)} ({members / max(1, count):.1%})"
-    whole = f"{gdf.size / max(1, members):.4g} with the header"
-    sizes = f"{gdf.bytes_per_member:.4g} bytes per Gaussian, {whole}"
-    yield f"field: {gdf.field.kind}, {sizes}, {_describe_field(gdf)}"
+    yield f"region: {gdf.region.name}, {format_count(members)} ({members / max(1, count):.1%})"
+    sizes = (
+        f"{gdf.field.bytes_per_member:.4g} bytes per Gaussian, {size / max(1, members):.4g} with the header"
+    )
+    yield f"field: {gdf.field.kind}, {sizes}, {_describe_field(gdf.field)}"
     if gdf.field.recorded:
         yield f"recorded: {len(gdf.field.recorded)} snapshots"
     for head, content in (("option", gdf.options), ("report", gdf.report)):
@@ -134,17 +155,22 @@ class _Timeline(msgspec.Struct):
     keys: list[_Key] = []
 
 
-def _describe_field(gdf: GdfHead) -> str:
+def _describe_field(field: BakedField) -> str:
     """What a field is made of."""
+    form = field.origin
+    ranks = {name: len(bases.residual_basis) for name, bases in field.attributes.items()}
     # the first is the offset at strength 1 as it was recorded, see `AttributeBases.end_offset`
-    bases = ", ".join(f"{name} 1 exact + {count - 1} fitted" for name, count in gdf.bases().items())
-    network = gdf.field.network
-    if network is None:
-        return f"{gdf.knots} knots; bases: {bases or 'none, nothing moves'}"
-    error = ", ".join(f"{name} {value:.4g}" for name, value in network.bake_error.items())
+    bases = ", ".join(
+        f"{name} 1 exact + {rank} fitted" for name, rank in (form.plan.ranks if form else ranks).items()
+    )
+    if form is None:
+        return f"{len(field.knots)} knots; bases: {bases or 'none, nothing moves'}"
+    network = form.network
+    error = ", ".join(f"{name} {value:.4g}" for name, value in (form.error or {}).items())
     return (
-        f"{group_digits(gdf.parameters)} numbers in {network.shape.layers} layers of "
-        f"{network.shape.width}; baked at {gdf.knots} knots with bases: {bases}; baking costs: {error}"
+        f"{group_digits(network.parameters)} numbers in {network.shape.layers} layers of "
+        f"{network.shape.width}; baked at {len(form.plan.knots)} knots with bases: {bases}; "
+        f"baking costs: {error}"
     )
 
 
@@ -157,7 +183,6 @@ def _camera_lines(path: Path) -> Iterator[str]:
 
 
 _DESCRIBE = {
-    "scene": _scene_lines,
     "gdf": _edit_lines,
     "session": _session_lines,
     "timeline": _timeline_lines,

@@ -6,13 +6,18 @@ import contextlib
 import io
 import re
 from collections.abc import Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import tyro
 
 from progdf.errors import ProgdfError
 
 _Options = TypeVar("_Options")
+
+
+def absent_option(metavar: str | None, absent: str = "") -> Any:
+    """How help shows an option that may be left out: its value's name, and what happens then."""
+    return tyro.conf.arg(metavar=metavar, help_behavior_hint=f"(default: {absent})" if absent else "")
 
 
 def parse_options(
@@ -29,28 +34,28 @@ def parse_options(
     Raises:
         ProgdfError: an option is missing, unknown or of the wrong kind, in one line.
     """
-    said = io.StringIO()
+    errors = io.StringIO()
     argv = _join_negative_values(argv)
     try:
-        with contextlib.redirect_stderr(said):
+        with contextlib.redirect_stderr(errors):
             if default is None:
                 return tyro.cli(kind, args=argv, prog=command)
             return tyro.cli(kind, args=argv, prog=command, default=default)
     except SystemExit as leaving:
         if not leaving.code:
             raise
-        raise ProgdfError(f"{_short_message(said.getvalue())}; see {command} --help") from None
+        raise ProgdfError(f"{_short_message(errors.getvalue())}; see {command} --help") from None
 
 
 def _join_negative_values(argv: Sequence[str]) -> list[str]:
     """`--up -y` as `--up=-y`, and so with --orbit: what begins with a minus would be taken for an option."""
-    found: list[str] = []
+    joined: list[str] = []
     for argument in argv:
-        if found and found[-1] in ("--up", "--orbit"):
-            found[-1] += f"={argument}"
+        if joined and joined[-1] in ("--up", "--orbit"):
+            joined[-1] += f"={argument}"
         else:
-            found.append(argument)
-    return found
+            joined.append(argument)
+    return joined
 
 
 def _short_message(box: str) -> str:
@@ -62,6 +67,6 @@ def _short_message(box: str) -> str:
     lines = [line.strip("│ \t") for line in text.splitlines()]
     parts = "\n".join(line for line in lines if not line.startswith(("╭", "╰")))
     sections = re.split(r"^[─-]{4,}$", parts, flags=re.MULTILINE)
-    said = " ".join(sections[0 if "╭" in text else 1 % len(sections)].split())
-    said = re.sub(r"'None', |, 'None'", "", said).rstrip(".")  # None: the option left out
-    return said or "the options cannot be read"
+    message = " ".join(sections[0 if "╭" in text else 1 % len(sections)].split())
+    message = re.sub(r"'None', |, 'None'", "", message).rstrip(".")  # None: the option left out
+    return message or "the options cannot be read"

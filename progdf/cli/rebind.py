@@ -17,7 +17,7 @@ import tyro
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from progdf.errors import ProgdfError, print_line
+from progdf.errors import ProgdfError
 from progdf.field.baked import AttributeBases, BakedField
 from progdf.formats.scene_file import load_scene, rotate_about_x, scene_name
 from progdf.gaussians import BASE_CHANNELS, Gaussians
@@ -25,6 +25,7 @@ from progdf.gdf.file import Gdf, fingerprint, load_gdf, save_gdf
 from progdf.io.atomic import check_not_an_input
 from progdf.region import Region
 from progdf.sh import sh0_to_rgb
+from progdf.terminal import print_line
 
 from .options import parse_options
 
@@ -40,35 +41,26 @@ Rows = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class RebindOptions:
-    """Carry an edit over to the same scene in another file or format.
-
-    Args:
-        edit: the .gdf file
-        source: the scene that it was made for
-        target: the same scene in another file
-        out: the .gdf file to write
-    """
+    """Carry an edit over to the same scene in another file or format."""
 
     edit: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="EDIT.gdf")]
+    """the .gdf file"""
     source: Annotated[Path, tyro.conf.arg(name="from", metavar="SCENE")]
+    """the scene that it was made for"""
     target: Annotated[Path, tyro.conf.arg(name="to", metavar="SCENE")]
+    """the same scene in another file"""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="NEW.gdf")]
+    """the .gdf file to write"""
 
 
 @dataclass(frozen=True)
 class Match:
-    """Which Gaussian of A each one of B is.
+    """Which Gaussian of A each one of B is."""
 
-    Args:
-        rows: row of A for each row of B. [N] int64
-        matched: share of B's rows that are where and as A's are, 0..1
-        once: share of B's rows whose row of A no other has
-        median, p95: distance between the two, in the median size of a Gaussian of A
-    """
-
-    rows: Rows
-    matched: float
-    once: float
+    rows: Rows  # row of A for each row of B. [N] int64
+    matched: float  # share of B's rows that are where and as A's are, 0..1
+    once: float  # share of B's rows whose row of A no other has
+    # median, p95: distance between the two, in the median size of a Gaussian of A
     median: float
     p95: float
 
@@ -93,9 +85,9 @@ def main(argv: Sequence[str]) -> int:
             f"{options.target} {why}: {match.matched:.0%} of its Gaussians are found in {options.source}, "
             f"{_LEAST_MATCHED:.0%} are needed; give the same scene"
         )
-    found = rebind_edit(gdf, a, b, match)
-    save_gdf(options.out, found)
-    print_line(f"wrote {options.out}: {len(found.region)} members, {len(gdf.region)} in the original")
+    rebound = rebind_edit(gdf, a, b, match)
+    save_gdf(options.out, rebound)
+    print_line(f"wrote {options.out}: {len(rebound.region)} members, {len(gdf.region)} in the original")
     return 0
 
 
@@ -114,16 +106,16 @@ def match_scenes(a: Gaussians, b: Gaussians) -> Match:
     costs = (distances / typical) ** 2 + (color / _COLOR) ** 2 + shape**2 + (opacity / _COLOR) ** 2
     chosen = _assign_rows(candidates, costs, len(a))
     rows = np.take_along_axis(candidates, chosen[:, None], 1)[:, 0]
-    apart = np.take_along_axis(distances, chosen[:, None], 1)[:, 0]
-    near = apart <= np.maximum(sizes[rows], typical)
+    distance = np.take_along_axis(distances, chosen[:, None], 1)[:, 0]
+    near = distance <= np.maximum(sizes[rows], typical)
     alike = np.take_along_axis(color, chosen[:, None], 1)[:, 0] <= _COLOR
     taken = np.bincount(rows, minlength=len(a))
     return Match(
         rows=rows,
         matched=float((near & alike).mean()),
         once=float((taken[rows] == 1).mean()),
-        median=float(np.median(apart)) / typical,
-        p95=float(np.quantile(apart, 0.95)) / typical,
+        median=float(np.median(distance)) / typical,
+        p95=float(np.quantile(distance, 0.95)) / typical,
     )
 
 
@@ -132,24 +124,24 @@ def rebind_edit(gdf: Gdf, a: Gaussians, b: Gaussians, match: Match) -> Gdf:
     members = gdf.region.members.numpy()
     if not len(members):
         raise ProgdfError(f"{gdf.name} has no members; train it again")
-    place = np.searchsorted(members, match.rows).clip(max=len(members) - 1)
-    mine = np.flatnonzero(members[place] == match.rows)
+    index = np.searchsorted(members, match.rows).clip(max=len(members) - 1)
+    mine = np.flatnonzero(members[index] == match.rows)
     if not len(mine):
         raise ProgdfError(f"no member of {gdf.name} is in the other scene; give the same scene")
-    rows, source = torch.from_numpy(mine), torch.from_numpy(place[mine])
+    rows, source = torch.from_numpy(mine), torch.from_numpy(index[mine])
     of_a = torch.from_numpy(match.rows)
     # q and −q are one rotation, but not with the same offset
     flipped = (a.quats[of_a[rows]] * b.quats[rows]).sum(dim=1) < 0
     attributes = {}
     for name, bases in gdf.field.attributes.items():
-        full, rest, step = bases.end_offset[source], bases.residual_basis[:, source], bases.scale
+        full, basis, step = bases.end_offset[source], bases.residual_basis[:, source], bases.scale
         if name == "quats":
             full = torch.where(flipped[:, None], -full, full)
-            rest = torch.where(flipped[None, :, None], -rest, rest)
+            basis = torch.where(flipped[None, :, None], -basis, basis)
         elif name == "shN":
-            full, rest, step = (_fit_bands(tensor, 3 * b.shN.shape[1]) for tensor in (full, rest, step))
+            full, basis, step = (_fit_bands(tensor, 3 * b.shN.shape[1]) for tensor in (full, basis, step))
         if full.shape[1]:
-            attributes[name] = AttributeBases(full, rest, step, bases.coefficients)
+            attributes[name] = AttributeBases(full, basis, step, bases.coefficients)
     field = BakedField(
         kind="separable" if gdf.field.origin is not None else gdf.field.kind,
         knots=gdf.field.knots,
@@ -172,19 +164,19 @@ def _assign_rows(candidates: Rows, costs: NDArray[np.float64], count: int) -> Ro
     the cheapest. [N,k] -> [N]"""
     chosen = np.full(len(candidates), -1)
     free = np.ones(count, bool)
-    left = np.arange(len(candidates))
+    open_rows = np.arange(len(candidates))
     for _ in range(candidates.shape[1]):
-        open_costs = np.where(free[candidates[left]], costs[left], np.inf)
+        open_costs = np.where(free[candidates[open_rows]], costs[open_rows], np.inf)
         best = open_costs.argmin(axis=1)
-        cost = open_costs[np.arange(len(left)), best]
-        wanted = candidates[left, best]
-        order = np.lexsort((cost, wanted))
+        cost = open_costs[np.arange(len(open_rows)), best]
+        cheapest = candidates[open_rows, best]
+        order = np.lexsort((cost, cheapest))
         order = order[np.isfinite(cost[order])]
-        winners = order[np.unique(wanted[order], return_index=True)[1]]
-        chosen[left[winners]] = best[winners]
-        free[wanted[winners]] = False
-        left = np.delete(left, winners)
-    chosen[left] = costs[left].argmin(axis=1)
+        winners = order[np.unique(cheapest[order], return_index=True)[1]]
+        chosen[open_rows[winners]] = best[winners]
+        free[cheapest[winners]] = False
+        open_rows = np.delete(open_rows, winners)
+    chosen[open_rows] = costs[open_rows].argmin(axis=1)
     return chosen
 
 

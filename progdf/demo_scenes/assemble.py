@@ -13,7 +13,8 @@ from torch import Tensor
 from progdf.camera import Camera
 from progdf.color.edits import parse_color
 from progdf.errors import ProgdfError
-from progdf.gaussians import ATTRIBUTES, Gaussians, normalize_quats
+from progdf.gaussians import ATTRIBUTES, Gaussians
+from progdf.quaternions import matrix_quats
 from progdf.sh import rgb_to_sh0
 from progdf.torch_threads import one_thread
 
@@ -267,27 +268,7 @@ def _place_gaussians(
     hair = torch.tensor(pelt.hair) * h + torch.tensor([pelt.length, 0.0, 0.0])
     scales = torch.where(up > 0, hair, flat) * torch.exp(0.12 * torch.randn(n, 3, generator=random))
     height = pelt.lift * hair[:, :1] * up + 0.06 * h * torch.randn(n, 1, generator=random)
-    return at.points + height * at.normals, _quats(frame), scales.log()
-
-
-def _quats(frames: Tensor) -> Tensor:
-    """Rotation matrices as quaternions wxyz, by the largest of the four components. [N,3,3] -> [N,4]"""
-    m = frames
-    x, y, z = m[:, 0, 0], m[:, 1, 1], m[:, 2, 2]
-    a, b, c = m[:, 2, 1], m[:, 0, 2], m[:, 1, 0]
-    d, e, f = m[:, 1, 2], m[:, 2, 0], m[:, 0, 1]
-    candidates = torch.stack(
-        [
-            torch.stack([1 + x + y + z, a - d, b - e, c - f], 1),
-            torch.stack([a - d, 1 + x - y - z, c + f, b + e], 1),
-            torch.stack([b - e, c + f, 1 - x + y - z, a + d], 1),
-            torch.stack([c - f, b + e, a + d, 1 - x - y + z], 1),
-        ],
-        dim=1,
-    )
-    best = torch.stack([1 + x + y + z, 1 + x - y - z, 1 - x + y - z, 1 - x - y + z], 1).argmax(1)
-    quats = candidates[torch.arange(len(m)), best]
-    return normalize_quats(quats)
+    return at.points + height * at.normals, matrix_quats(frame), scales.log()
 
 
 def _concatenate(pieces: Sequence[Gaussians]) -> Gaussians:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from .bake import NeuralForm, bake_network
-from .baked import AttributeBases, BakedField
-from .choose import FieldChoice, choose_field
-from .evaluate import Candidate, FieldEvaluator
+from .bake import bake_network
+from .baked import AttributeBases, BakedField, NeuralForm
+from .choose import Candidate, FieldChoice, FieldEvaluator, choose_field
 from .keyframes import fit_keyframes, fit_lossless
 from .neural import NeuralField
-from .neural_fit import NeuralSettings
-from .neural_training import fit_neural
+from .neural_fit import NeuralSettings, fit_neural
 from .separable import fit_separable
 
 __all__ = [

@@ -8,37 +8,34 @@ s = 1 the recorded end without any rounding.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from progdf.gaussians import attribute_slices
-from progdf.interpolation import find_segment
+from progdf.interpolation import find_segment, interpolate
 
-if TYPE_CHECKING:
-    from .bake import NeuralForm
+from .neural import NeuralField
 
-REST_TYPES = (torch.int8, torch.float16, torch.float32)
+BASIS_TYPES = (torch.int8, torch.float16, torch.float32)
 """How bases 1..R may be stored."""
+
+MOST_KNOTS, MOST_RANK = 257, 16
+"""Of a network that is baked."""
+
+_NEAR = 1 / 80
+"""A knot of a remap so close to a field's is not worth a row of coefficients."""
 
 
 @dataclass(frozen=True)
 class AttributeBases:
-    """One attribute's bases for M members of c channels each.
+    """One attribute's bases for M members of c channels each."""
 
-    Args:
-        end_offset: basis 0, the offset at s = 1, raw space. [M,c] float32
-        residual_basis: bases 1..R as stored. [R,M,c] int8, float16 or float32
-        scale: what one unit of `residual_basis` is worth, per basis and channel. [R,c] float32
-        coefficients: a_k at the field's knots; row 0 is all 0, the last row is 1, 0, …, 0. [S,1+R] float32
-    """
-
-    end_offset: Tensor
-    residual_basis: Tensor
-    scale: Tensor
-    coefficients: Tensor
+    end_offset: Tensor  # basis 0, the offset at s = 1, raw space. [M,c] float32
+    residual_basis: Tensor  # bases 1..R as stored. [R,M,c] int8, float16 or float32
+    scale: Tensor  # what one unit of `residual_basis` is worth, per basis and channel. [R,c] float32
+    coefficients: Tensor  # a_k at the knots; row 0 all 0, the last row 1, 0, …, 0. [S,1+R] float32
 
     def __post_init__(self) -> None:
         if self.end_offset.ndim != 2 or self.residual_basis.ndim != 3:
@@ -48,7 +45,7 @@ class AttributeBases:
             )
         members, width = self.end_offset.shape
         ranks = self.residual_basis.shape[0]
-        if self.residual_basis.dtype not in REST_TYPES:
+        if self.residual_basis.dtype not in BASIS_TYPES:
             raise ValueError(
                 f"residual_basis is {self.residual_basis.dtype}, expected int8, float16 or float32"
             )
@@ -82,24 +79,50 @@ class AttributeBases:
 
 
 @dataclass(frozen=True)
+class BakePlan:
+    """How a field is baked, so that every load gives the same."""
+
+    knots: Tensor  # strengths at which the field is evaluated, ascending from 0 to 1. [S] float32
+    ranks: Mapping[str, int]  # bases beside the full offset, by attribute
+    # share of the error at the end that is added at each knot, by attribute, 0 first, 1 last. [S] float32
+    end_correction: Mapping[str, Tensor]
+
+    def __post_init__(self) -> None:
+        if self.knots.ndim != 1 or not 2 <= len(self.knots) <= MOST_KNOTS:
+            raise ValueError(f"a bake at knots {list(self.knots.shape)}, expected 2 to {MOST_KNOTS}")
+        for name, rank in self.ranks.items():
+            if not 0 <= rank <= MOST_RANK:
+                raise ValueError(f"a bake of {name} with {rank} bases, expected 0 to {MOST_RANK}")
+        for name, share in self.end_correction.items():
+            if share.shape != self.knots.shape or share.dtype != torch.float32:
+                raise ValueError(
+                    f"the end correction of {name} is {list(share.shape)}, expected {len(self.knots)} knots"
+                )
+
+
+@dataclass(frozen=True)
+class NeuralForm:
+    """What a file keeps of a neural field."""
+
+    network: NeuralField  # the trained network
+    plan: BakePlan  # how it is baked
+    # of the members' raw values that the network looks at; "" where it sees places alone
+    rows_sha256: str = ""
+    # what baking costs: "rms", relative, and with pictures "psnr_mean", "psnr_worst", dB, between the
+    # network, pinned, and what was baked of it
+    error: Mapping[str, float] | None = None
+
+
+@dataclass(frozen=True)
 class BakedField:
-    """A field ready to run, for the members it was made for.
+    """A field ready to run, for the members it was made for."""
 
-    Args:
-        kind: what it was made as: "separable", "keyframes" or "neural"
-        knots: strengths at which the coefficients are given, ascending, first 0, last 1. [S] float32
-        attributes: bases by attribute name (see gaussians.ATTRIBUTES); one that does not move is absent
-        channels: width of a packed row, 14, or 14 + 3K when shN moves
-        recorded: strengths of the recorded snapshots, for the slider's ticks
-        origin: the network that it was baked from and that a file keeps in its place; None: it is kept itself
-    """
-
-    kind: str
-    knots: Tensor
-    attributes: Mapping[str, AttributeBases]
-    channels: int
-    recorded: tuple[float, ...] = ()
-    origin: NeuralForm | None = None
+    kind: str  # "separable", "keyframes" or "neural"
+    knots: Tensor  # strengths at which the coefficients are given, ascending, first 0, last 1. [S] float32
+    attributes: Mapping[str, AttributeBases]  # by name, see `ATTRIBUTES`; one that does not move is absent
+    channels: int  # of a packed row: 14, or 14 + 3K when shN moves
+    recorded: tuple[float, ...] = ()  # strengths of the recorded snapshots, for the slider's ticks
+    origin: NeuralForm | None = None  # the network that it was baked from and that a file stores instead
 
     def __post_init__(self) -> None:
         if self.knots.ndim != 1 or self.knots.dtype != torch.float32:
@@ -177,3 +200,64 @@ class BakedField:
         for name in self.attributes:
             packed[:, slices[name]] = self.attribute_offsets(name, s)
         return packed
+
+
+@dataclass(frozen=True)
+class SliderRemap:
+    """Where on a new slider the strengths of the old one lie, linear between knots."""
+
+    old: Tensor  # ascending from 0 to 1. [K] float64
+    new: Tensor  # the same strengths on the new slider, ascending from 0 to 1. [K] float64
+
+    def __post_init__(self) -> None:
+        if self.old.shape != self.new.shape:
+            raise ValueError(f"{list(self.old.shape)} old knots for {list(self.new.shape)} new ones")
+        for knots in (self.old, self.new):
+            if float(knots[0]) != 0.0 or float(knots[-1]) != 1.0 or bool((knots.diff() <= 0).any()):
+                raise ValueError("the knots of a remap must ascend from 0 to 1")
+
+    def __call__(self, s: Tensor) -> Tensor:
+        """New strengths of old ones, 0..1; both ends exact. [n] -> [n] float64"""
+        return interpolate(s.double(), self.old, self.new)
+
+    def at(self, s: float) -> float:
+        """The same of one strength."""
+        return float(self(torch.tensor([s], dtype=torch.float64)))
+
+
+def identity_remap() -> SliderRemap:
+    """The slider remap that changes nothing."""
+    ends = torch.tensor([0.0, 1.0], dtype=torch.float64)
+    return SliderRemap(ends, ends)
+
+
+def remap_slider(field: BakedField, remap: SliderRemap) -> BakedField:
+    """The field under another slider: its knots move, and where the remap bends far from any, one is added.
+
+    No base is touched: the bytes per member are the same, and so are both ends, bit for bit.
+
+    Args:
+        field: no network, whose slider is learned
+        remap: from the field's strengths to the wanted ones
+
+    Raises:
+        ValueError: the field is a network's.
+    """
+    if field.origin is not None:
+        raise ValueError("a network's slider is its own; only separable and keyframe fields take another")
+    old = field.knots.double()
+    far = (remap.old[:, None] - old).abs().amin(dim=1) > _NEAR
+    knots = torch.cat([old, remap.old[far]]).sort().values
+    moved = remap(knots).float()
+    distinct = torch.ones(len(knots), dtype=torch.bool)
+    distinct[1:] = moved.diff() > 0  # single precision may close a gap
+    distinct[:-1] &= moved[:-1] < 1.0
+    distinct[-1] = True
+    attributes = {
+        name: replace(
+            bases, coefficients=torch.stack([field.coefficients(name, float(s)) for s in knots[distinct]])
+        )
+        for name, bases in field.attributes.items()
+    }
+    ticks = remap(torch.tensor(field.recorded, dtype=torch.float64)).tolist()
+    return replace(field, knots=moved[distinct], attributes=attributes, recorded=tuple(ticks))

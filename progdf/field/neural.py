@@ -39,30 +39,22 @@ _LIMIT = 4.0  # standard deviations within which the inputs are kept
 
 @dataclass(frozen=True)
 class NeuralShape:
-    """Everything that says how a network is laid out and read.
+    """Everything that says how a network is laid out and read."""
 
-    Args:
-        width, layers: of the hidden layers
-        attributes: those that move; only they have outputs
-        channels: width of a packed row, 14 or 14 + 3K
-        inputs: "position" is the paper's; "own" adds what the Gaussian looks like and where it ends, and
-            has the network describe only how the way there bends
-        code: numbers in each Gaussian's learned code
-        bins: how many the slider has (paper: k = 10)
-        hard: the paper's bins, in which H(s) is constant, see `hard_bin`; else it is linear between bins + 1
-            nodes, node 0 being 0
-        frequencies: of the positional encoding, doubling from a period of twice the box
-    """
-
+    # width, layers: of the hidden layers
     width: int
     layers: int
-    attributes: tuple[str, ...]
-    channels: int
+    attributes: tuple[str, ...]  # those that move; only they have outputs
+    channels: int  # width of a packed row, 14 or 14 + 3K
+    # "position" is the paper's; "own" adds what the Gaussian looks like and where it ends, and has the
+    # network describe only how the way there bends
     inputs: Inputs = "own"
-    code: int = 0
-    bins: int = 10
+    code: int = 0  # numbers in each Gaussian's learned code
+    bins: int = 10  # how many the slider has (paper: k = 10)
+    # the paper's bins, in which H(s) is constant, see `hard_bin`; else it is linear between bins + 1 nodes,
+    # node 0 being 0
     hard: bool = False
-    frequencies: int = 8
+    frequencies: int = 8  # of the positional encoding, doubling from a period of twice the box
 
     def __post_init__(self) -> None:
         for what, value, low, high in (
@@ -90,12 +82,12 @@ class NeuralShape:
     @property
     def outputs(self) -> dict[str, slice]:
         """Where each attribute lies in the network's output."""
-        found, start = {}, 0
+        outputs, start = {}, 0
         for name in self.attributes:
             width = attribute_slices(self.channels)[name]
-            found[name] = slice(start, start + width.stop - width.start)
-            start = found[name].stop
-        return found
+            outputs[name] = slice(start, start + width.stop - width.start)
+            start = outputs[name].stop
+        return outputs
 
     @property
     def seen(self) -> int:
@@ -126,24 +118,16 @@ class NeuralShape:
 class NeuralField:
     """A trained network and what it needs beside the scene.
 
-    Args:
-        shape: its layout
-        tensors: `shape.weights()` in float16 or float32, `shape.frame()` in float32
-        end: the recorded offset at s = 1 of the columns that move. [M,c] float32
-        codes: learned codes, as stored. [M,code] int8
-        code_step: what one unit of a code is worth. [code] float32
-        recorded: strengths of the recorded snapshots, for the slider's ticks
-
     Raises:
         ValueError: a tensor is absent or has another shape or type.
     """
 
-    shape: NeuralShape
-    tensors: Mapping[str, Tensor]
-    end: Tensor
-    codes: Tensor
-    code_step: Tensor
-    recorded: tuple[float, ...] = ()
+    shape: NeuralShape  # its layout
+    tensors: Mapping[str, Tensor]  # `shape.weights()` in float16 or float32, `shape.frame()` in float32
+    end: Tensor  # the recorded offset at s = 1 of the columns that move. [M,c] float32
+    codes: Tensor  # learned codes, as stored. [M,code] int8
+    code_step: Tensor  # what one unit of a code is worth. [code] float32
+    recorded: tuple[float, ...] = ()  # strengths of the recorded snapshots, for the slider's ticks
 
     def __post_init__(self) -> None:
         shape = self.shape
@@ -152,18 +136,18 @@ class NeuralField:
             raise ValueError(f"the network's tensors are not those of {shape.layers} layers")
         for name, size in expected.items():
             types = (torch.float16, torch.float32) if name in shape.weights() else (torch.float32,)
-            found = self.tensors[name]
-            if tuple(found.shape) != size or found.dtype not in types:
-                raise ValueError(f"{name} is {list(found.shape)} {found.dtype}, expected {list(size)}")
+            tensor = self.tensors[name]
+            if tuple(tensor.shape) != size or tensor.dtype not in types:
+                raise ValueError(f"{name} is {list(tensor.shape)} {tensor.dtype}, expected {list(size)}")
         members = self.end.shape[0] if self.end.ndim else 0
-        for name, found, size, dtype in (
+        for name, tensor, size, dtype in (
             ("end", self.end, (members, len(shape.columns)), torch.float32),
             ("codes", self.codes, (members, shape.code), torch.int8),
             ("code_step", self.code_step, (shape.code,), torch.float32),
         ):
-            if tuple(found.shape) != size or found.dtype != dtype:
+            if tuple(tensor.shape) != size or tensor.dtype != dtype:
                 raise ValueError(
-                    f"{name} is {list(found.shape)} {found.dtype}, expected {list(size)} {dtype}"
+                    f"{name} is {list(tensor.shape)} {tensor.dtype}, expected {list(size)} {dtype}"
                 )
 
     @property
@@ -179,8 +163,8 @@ class NeuralField:
     @property
     def stored_bytes(self) -> int:
         """Bytes on disk, names and header left out."""
-        kept = [*self.tensors.values(), self.end, self.codes, self.code_step]
-        return sum(tensor.numel() * tensor.element_size() for tensor in kept)
+        stored = [*self.tensors.values(), self.end, self.codes, self.code_step]
+        return sum(tensor.numel() * tensor.element_size() for tensor in stored)
 
     @property
     def bytes_per_member(self) -> float:
@@ -226,9 +210,9 @@ class BoundField:
 
 def encode(shape: NeuralShape, frame: Mapping[str, Tensor], rows: Tensor, end: Tensor) -> Tensor:
     """What the network sees of the Gaussians. [M,≥14], [M,c] -> [M,seen]"""
-    place = (rows[:, :3] - frame["center"]) / frame["extent"]
-    waves = place[:, None, :] * (math.pi / 2 * 2.0 ** torch.arange(shape.frequencies))[:, None]
-    parts = [place, waves.sin().flatten(1), waves.cos().flatten(1)]
+    position = (rows[:, :3] - frame["center"]) / frame["extent"]
+    waves = position[:, None, :] * (math.pi / 2 * 2.0 ** torch.arange(shape.frequencies))[:, None]
+    parts = [position, waves.sin().flatten(1), waves.cos().flatten(1)]
     if shape.inputs == "own":
         look = (appearance(rows, end) - frame["look_mean"]) / frame["look_spread"]
         parts.append(look.clamp(-_LIMIT, _LIMIT))

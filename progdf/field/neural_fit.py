@@ -8,7 +8,7 @@ snapshot drawn at random. Weighting by what shows is worth 3.5 dB (robot recolor
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import linear
 
+from .choose import Render, rendered_importance
 from .neural import (
     LAYOUT,
     Bins,
@@ -29,7 +30,7 @@ from .neural import (
     encode,
     offsets_of_answer,
 )
-from .separable import LEVELS, channel_weights
+from .separable import LEVELS, channel_weights, check_trajectory, moving_attributes
 
 
 class PictureLoss(Protocol):
@@ -40,7 +41,7 @@ class PictureLoss(Protocol):
         """In how many views."""
         ...
 
-    def __call__(self, found: Tensor, recorded: Tensor, view: int) -> Tensor:
+    def __call__(self, offsets: Tensor, recorded: Tensor, view: int, /) -> Tensor:
         """Packed offsets of the field and those recorded at the same strength. [M,C], [M,C] -> []"""
         ...
 
@@ -57,27 +58,16 @@ _WARMUP = 50  # steps
 
 @dataclass(frozen=True)
 class NeuralSettings:
-    """What to train and for how long.
+    """What to train and for how long."""
 
-    Args:
-        size: "tiny" and "small" take up to a minute on two cores, "paper" a quarter of an hour
-        inputs: see `NeuralShape`
-        code: numbers in each Gaussian's learned code; a byte each in the file
-        bins: "smooth", or "hard" as the paper's
-        steps: 0 is what the size needs
-        batch: members drawn in each step; 0 is what the size needs
-        rate: largest learning rate; 0 is what the size needs
-        seed: of the first weights and of what is drawn
-    """
-
-    size: Size = "tiny"
-    inputs: Inputs = "own"
-    code: int = 0
-    bins: Bins = "smooth"
-    steps: int = 0
-    batch: int = 0
-    rate: float = 0.0
-    seed: int = 0
+    size: Size = "tiny"  # "tiny" and "small" take up to a minute on two cores, "paper" a quarter of an hour
+    inputs: Inputs = "own"  # see `NeuralShape`
+    code: int = 0  # numbers in each Gaussian's learned code; a byte each in the file
+    bins: Bins = "smooth"  # "smooth", or "hard" as the paper's
+    steps: int = 0  # 0 is what the size needs
+    batch: int = 0  # members drawn in each step; 0 is what the size needs
+    rate: float = 0.0  # largest learning rate; 0 is what the size needs
+    seed: int = 0  # of the first weights and of what is drawn
 
     def resolve(self) -> NeuralSettings:
         """The same with every 0 replaced by the size's own value."""
@@ -119,8 +109,8 @@ class NeuralFit:
         for tensor in self._learned.values():
             tensor.requires_grad_()
         self._adam = torch.optim.Adam(list(self._learned.values()), lr=self.settings.rate, fused=True)
-        shown = channel_weights(visibility, len(rows), 1)[:, 0]
-        self._shown = shown / shown.mean().clamp_min(1e-12)
+        visible = channel_weights(visibility, len(rows), 1)[:, 0]
+        self._shown = visible / visible.mean().clamp_min(1e-12)
         self._importance = torch.full((len(self.shape.columns),), 1.0 / len(self.shape.columns))
         self._end = torch.zeros(len(rows), len(self.shape.columns))
         self._told = torch.zeros(0)
@@ -141,12 +131,12 @@ class NeuralFit:
         self._end = offsets[-1][:, columns].float()
         before = self._frame["spread"]
         after = before.clone()
-        for name, place in self.shape.outputs.items():
-            own = offsets[1:][:, :, columns[place]].float()
-            power = (own.square().mean(dim=(0, 2)) * self._shown).mean()
-            after[place] = float(power.sqrt().clamp_min(1e-12))
+        for name, outputs in self.shape.outputs.items():
+            trajectory = offsets[1:][:, :, columns[outputs]].float()
+            power = (trajectory.square().mean(dim=(0, 2)) * self._shown).mean()
+            after[outputs] = float(power.sqrt().clamp_min(1e-12))
             if importance is not None:
-                self._importance[place] = importance.get(name, 0.0) / (place.stop - place.start)
+                self._importance[outputs] = importance.get(name, 0.0) / (outputs.stop - outputs.start)
         self._importance /= self._importance.sum().clamp_min(1e-30)
         if self.steps:
             with torch.no_grad():
@@ -216,9 +206,9 @@ class NeuralFit:
         snapshot = int(torch.randint(1, len(strengths), (1,), generator=self._draws))
         view = int(torch.randint(pictures.views, (1,), generator=self._draws))
         rows = torch.arange(len(self._rows))
-        found = self._answer(rows, strengths[snapshot].expand(len(rows)))
+        moved_columns = self._answer(rows, strengths[snapshot].expand(len(rows)))
         recorded = offsets[snapshot].float()
-        moved = torch.zeros_like(recorded).index_copy(1, self.shape.columns, found)
+        moved = torch.zeros_like(recorded).index_copy(1, self.shape.columns, moved_columns)
         return pictures(moved, recorded, view)
 
     def _answer(self, rows: Tensor, s: Tensor) -> Tensor:
@@ -235,13 +225,13 @@ class NeuralFit:
 
     def capture_state(self) -> dict[str, Tensor]:
         """Everything that the next steps depend on, by name; the snapshots aside."""
-        kept = {f"learned.{name}": tensor.detach() for name, tensor in self._learned.items()}
-        kept |= {f"frame.{name}": tensor for name, tensor in self._frame.items()}
-        kept |= {"end": self._end, "importance": self._importance, "steps": torch.tensor(self.steps)}
+        state = {f"learned.{name}": tensor.detach() for name, tensor in self._learned.items()}
+        state |= {f"frame.{name}": tensor for name, tensor in self._frame.items()}
+        state |= {"end": self._end, "importance": self._importance, "steps": torch.tensor(self.steps)}
         for name, tensor in self._learned.items():
             for what, moment in self._adam.state[tensor].items():
-                kept[f"adam.{name}.{what}"] = moment
-        return kept | {"draws": self._draws.get_state()}
+                state[f"adam.{name}.{what}"] = moment
+        return state | {"draws": self._draws.get_state()}
 
     def restore(self, saved: Mapping[str, Tensor]) -> None:
         """Take over what `capture_state` gave, of a fit made with the same arguments."""
@@ -268,8 +258,8 @@ class NeuralFit:
             [torch.arange(p.start, p.stop) for n, p in shape.outputs.items() if n in self.shape.outputs]
         )
         for name, tensor in self._learned.items():
-            found = saved[f"learned.{name}"]
-            tensor.data.copy_(found[rows] if name.startswith("heads.") else found)
+            source = saved[f"learned.{name}"]
+            tensor.data.copy_(source[rows] if name.startswith("heads.") else source)
         self._frame["spread"] = saved["frame.spread"][rows].clone()
         self.steps = 1  # from here on, `scale_to` keeps what the network answers
 
@@ -308,3 +298,56 @@ def _initial_weights(shape: NeuralShape, draws: torch.Generator) -> dict[str, Te
         else:
             weights[name] = torch.zeros(size)
     return weights
+
+
+def fit_neural(
+    strengths: Tensor,
+    offsets: Tensor,
+    rows: Tensor,
+    settings: NeuralSettings | None = None,
+    visibility: Tensor | None = None,
+    render: Render | None = None,
+    pictures: PictureLoss | None = None,
+    recorded: tuple[float, ...] | None = None,
+    on_step: Callable[[int, float], None] | None = None,
+) -> NeuralField:
+    """Train a neural field on a finished trajectory.
+
+    Args:
+        strengths: of the snapshots, ascending from 0 to 1. [T]
+        offsets: raw offsets of the members; the first row is 0, the last the recorded end. [T,M,C] float32
+        rows: raw values of the members before the edit, packed. [M,≥14]
+        settings: see NeuralSettings
+        visibility: how much each member shows. [M]; None is evenly
+        render: of a few views; tells how much each attribute shows. None weighs all numbers alike
+        pictures: the loss is of these instead of offsets
+        recorded: strengths for the slider's ticks; `strengths` when None
+        on_step: progress: steps done, loss
+
+    Raises:
+        ValueError: no trajectory, or one that moves nothing.
+    """
+    check_trajectory(strengths, offsets)
+    attributes = tuple(moving_attributes(offsets))
+    if not attributes:
+        raise ValueError("nothing moves, so there is nothing for a network to learn")
+    fit = NeuralFit(rows, offsets.shape[2], attributes, settings or NeuralSettings(), visibility)
+    fit.scale_to(offsets, rendered_importance(offsets, render) if render is not None else None)
+    train_network(fit, strengths, offsets, fit.settings.steps, pictures, on_step)
+    return fit.field(tuple(strengths.tolist()) if recorded is None else recorded)
+
+
+def train_network(
+    fit: NeuralFit,
+    strengths: Tensor,
+    offsets: Tensor,
+    steps: int,
+    pictures: PictureLoss | None = None,
+    on_step: Callable[[int, float], None] | None = None,
+) -> None:
+    """Take `steps` steps with a rate that falls to 0 along half a cosine."""
+    for done in range(steps):
+        factor = 0.5 * (1.0 + math.cos(math.pi * done / steps))
+        loss = fit.step(strengths, offsets, factor, pictures)
+        if on_step is not None:
+            on_step(done + 1, loss)

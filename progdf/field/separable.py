@@ -27,26 +27,20 @@ LEVELS = 127
 
 @dataclass(frozen=True)
 class AttributeTrajectory:
-    """One attribute's trajectory beside its full offset.
+    """One attribute's trajectory beside its full offset."""
 
-    Args:
-        offsets: recorded offsets. [T,M,c] float32
-        weights: how much an error of each number shows, ≥ 0. [M,c] float32
-        lead: a_0 at the snapshots, the best share of the full offset; 0 first, 1 last. [T] float32
-        gram: weighted inner products of what a_0 times the full offset leaves at the snapshots. [T,T] float64
-    """
-
-    offsets: Tensor
-    weights: Tensor
-    amplitude: Tensor
+    offsets: Tensor  # recorded offsets. [T,M,c] float32
+    weights: Tensor  # how much an error of each number shows, ≥ 0. [M,c] float32
+    amplitude: Tensor  # a_0 at the snapshots, the best share of the full offset; 0 first, 1 last. [T] float32
+    # weighted inner products of what a_0 times the full offset leaves at the snapshots. [T,T] float64
     gram: Tensor
 
     @property
     def residual(self) -> Tensor:
         """What a_0 times the full offset leaves; 0 at both ends. [T,M,c]"""
-        left = torch.addcmul(self.offsets, self.amplitude[:, None, None], self.offsets[-1], value=-1)
-        left[[0, -1]] = 0.0
-        return left
+        residual = torch.addcmul(self.offsets, self.amplitude[:, None, None], self.offsets[-1], value=-1)
+        residual[[0, -1]] = 0.0
+        return residual
 
 
 def check_trajectory(strengths: Tensor, offsets: Tensor) -> None:
@@ -125,44 +119,46 @@ def principal_modes(gram: Tensor, emphasis: Tensor | None = None) -> tuple[Tenso
 
 
 def store_attribute(
-    trajectory: AttributeTrajectory, mix: Tensor, rest_type: torch.dtype = torch.int8
+    trajectory: AttributeTrajectory, mix: Tensor, basis_type: torch.dtype = torch.int8
 ) -> AttributeBases:
     """Bases as stored, with coefficients solved for them as they are stored.
 
     Args:
         trajectory: the attribute's trajectory
         mix: how each basis beside the full offset is mixed from what that leaves. [T,R]
-        rest_type: int8, float16 or float32
+        basis_type: int8, float16 or float32
     """
     full = trajectory.offsets[-1].contiguous()
     exact = (mix.T.float() @ trajectory.residual.flatten(1)).reshape(-1, *full.shape)
-    rest, step = quantize_bases(exact, rest_type)
-    table = solve_coefficients(trajectory.offsets, full, rest.float() * step[:, None], trajectory.weights)
-    return AttributeBases(full, rest, step, table)
+    residual_basis, step = quantize_bases(exact, basis_type)
+    table = solve_coefficients(
+        trajectory.offsets, full, residual_basis.float() * step[:, None], trajectory.weights
+    )
+    return AttributeBases(full, residual_basis, step, table)
 
 
-def quantize_bases(exact: Tensor, rest_type: torch.dtype) -> tuple[Tensor, Tensor]:
+def quantize_bases(exact: Tensor, basis_type: torch.dtype) -> tuple[Tensor, Tensor]:
     """Bases in their stored type, and what one unit is worth. [R,M,c] -> [R,M,c], [R,c] float32"""
     largest = exact.abs().amax(dim=1) if exact.shape[1] else exact.new_zeros(exact.shape[0], exact.shape[2])
-    if rest_type == torch.int8:
+    if basis_type == torch.int8:
         step = largest / LEVELS
         step = torch.where(step > 0, step, torch.ones_like(step))
         return (exact / step[:, None]).round().clamp(-LEVELS, LEVELS).to(torch.int8), step
     step = torch.where(largest > 0, largest, torch.ones_like(largest))  # keeps float16 away from its limits
-    return (exact / step[:, None]).to(rest_type), step
+    return (exact / step[:, None]).to(basis_type), step
 
 
-def solve_coefficients(offsets: Tensor, full: Tensor, rest: Tensor, weights: Tensor) -> Tensor:
+def solve_coefficients(offsets: Tensor, full: Tensor, residual_basis: Tensor, weights: Tensor) -> Tensor:
     """Least squares for a_0 … a_R at every snapshot; both ends are given, not solved. [T,1+R] float32
 
     Args:
         offsets: [T,M,c]
         full: basis 0. [M,c]
-        rest: bases 1..R in real units. [R,M,c]
+        residual_basis: bases 1..R in real units. [R,M,c]
         weights: [M,c]
     """
     root = weights.sqrt().flatten()
-    columns = torch.cat([full[None], rest]).flatten(1) * root
+    columns = torch.cat([full[None], residual_basis]).flatten(1) * root
     scale = columns.norm(dim=1).clamp(min=1e-30)
     columns = columns / scale[:, None]
     rows = offsets.flatten(1) * root
@@ -183,7 +179,7 @@ def fit_separable(
     ranks: Mapping[str, int],
     weights: Tensor | None = None,
     recorded: Sequence[float] | None = None,
-    rest_type: torch.dtype = torch.int8,
+    basis_type: torch.dtype = torch.int8,
 ) -> BakedField:
     """The separable field of a trajectory with given ranks.
 
@@ -193,7 +189,7 @@ def fit_separable(
         ranks: number of bases beside the full offset, by attribute; 0 where not named
         weights: how much an error shows: visibility [M] or sensitivity [M,C]; None is evenly
         recorded: strengths for the slider's ticks; `strengths` when None
-        rest_type: how bases 1..R are stored: int8, float16 or float32
+        basis_type: how bases 1..R are stored: int8, float16 or float32
 
     Returns:
         A field with the snapshots as nodes; attributes that never move are absent.
@@ -205,7 +201,7 @@ def fit_separable(
     spread = channel_weights(weights, offsets.shape[1], offsets.shape[2])
     attributes = {
         name: _fit_attribute(
-            fit_amplitude(offsets[:, :, columns], spread[:, columns]), ranks.get(name, 0), rest_type
+            fit_amplitude(offsets[:, :, columns], spread[:, columns]), ranks.get(name, 0), basis_type
         )
         for name, columns in moving_attributes(offsets).items()
     }
@@ -213,6 +209,6 @@ def fit_separable(
     return BakedField("separable", strengths.float(), attributes, offsets.shape[2], tuple(ticks))
 
 
-def _fit_attribute(trajectory: AttributeTrajectory, rank: int, rest_type: torch.dtype) -> AttributeBases:
+def _fit_attribute(trajectory: AttributeTrajectory, rank: int, basis_type: torch.dtype) -> AttributeBases:
     mix, _ = principal_modes(trajectory.gram)
-    return store_attribute(trajectory, mix[:, :rank], rest_type)
+    return store_attribute(trajectory, mix[:, :rank], basis_type)

@@ -42,22 +42,15 @@ _NEEDED = {name for name, _, _ in _NEEDED_FORMS}
 
 @dataclass(frozen=True)
 class Trajectory:
-    """S recordings of the members' offsets along the slider.
+    """S recordings of the members' offsets along the slider."""
 
-    Args:
-        s: slider value of each recording, ascending, first 0, last 1. [S] float32
-        offsets: raw-space offsets; row 0 is zero, the last equals `end` in half precision. [S,M,C] float16
-        end: the offset at s = 1, exact; the edited scene is original + end in float32. [M,C] float32
-        steps: optimizer steps done at each recording. [S] int64
-        stage_ends: recording at which each stage ends, ascending, the last S − 1
-        strengths: what the editor was asked for, of each stage; `s[stage_ends]` is where that is
-    """
-
-    s: Tensor
+    s: Tensor  # slider value of each recording, ascending, first 0, last 1. [S] float32
+    # raw-space offsets; row 0 is zero, the last equals `end` in half precision. [S,M,C] float16
     offsets: Tensor
-    end: Tensor
-    steps: Tensor
-    stage_ends: tuple[int, ...]
+    end: Tensor  # the offset at s = 1, exact; the edited scene is original + end in float32. [M,C] float32
+    steps: Tensor  # optimizer steps done at each recording. [S] int64
+    stage_ends: tuple[int, ...]  # recording at which each stage ends, ascending, the last S − 1
+    # what the editor was asked for, of each stage; `s[stage_ends]` is where that is
     strengths: tuple[float, ...]
 
     def __len__(self) -> int:
@@ -111,9 +104,9 @@ def load_trajectory(path: Path) -> tuple[Trajectory, dict[str, Tensor], dict[str
     """
     tensors, about = _read(path)
     for name, dtype, sides in _NEEDED_FORMS:
-        found = tensors[name]
-        if found.dtype != dtype or found.ndim != sides:
-            raise _damage_error(path, f"{name} is {list(found.shape)} {found.dtype}")
+        tensor = tensors[name]
+        if tensor.dtype != dtype or tensor.ndim != sides:
+            raise _damage_error(path, f"{name} is {list(tensor.shape)} {tensor.dtype}")
     trajectory = Trajectory(
         tensors.pop("s"),
         tensors.pop("offsets"),
@@ -159,18 +152,20 @@ def _read(path: Path, names: Sequence[str] = ()) -> tuple[dict[str, Tensor], dic
         raise _damage_error(path, error) from error
 
 
-def _check(path: Path, found: Trajectory) -> None:
-    s, shape = found.s, found.offsets.shape
+def _check(path: Path, trajectory: Trajectory) -> None:
+    s, shape = trajectory.s, trajectory.offsets.shape
     fits = s.ndim == 1 and len(s) >= 2 and len(shape) == 3 and len(s) == shape[0]
-    if not fits or found.end.shape != shape[1:]:
+    if not fits or trajectory.end.shape != shape[1:]:
         raise _damage_error(path, "its tensors do not fit each other")
     if float(s[0]) != 0.0 or float(s[-1]) != 1.0 or not bool((s.diff() > 0).all()):
         raise _damage_error(path, "its slider values do not ascend from 0 to 1")
-    ends = found.stage_ends
+    ends = trajectory.stage_ends
     ascend = all(before < after for before, after in pairwise((0, *ends)))
-    if not ends or len(ends) != len(found.strengths) or not ascend or ends[-1] != len(s) - 1:
+    if not ends or len(ends) != len(trajectory.strengths) or not ascend or ends[-1] != len(s) - 1:
         raise _damage_error(path, "its stages do not fit its recordings")
-    if len(found.steps) != len(s) or not bool(found.offsets.isfinite().all() & found.end.isfinite().all()):
+    if len(trajectory.steps) != len(s) or not bool(
+        trajectory.offsets.isfinite().all() & trajectory.end.isfinite().all()
+    ):
         raise _damage_error(path, "it has numbers that are not finite, or not one step a recording")
 
 

@@ -17,7 +17,7 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.sh import C0
 
-from .ply_file import PlyFile
+from .ply import PlyFile
 
 _CHUNK = 256
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
@@ -49,8 +49,8 @@ def read_compressed_ply(ply: PlyFile) -> Gaussians:
     if "sh" in counts and (counts["sh"] != count or len(sh) not in _SH_REST):
         raise ProgdfError(f"{name} has an element 'sh' that does not fit its Gaussians; export it again")
     ranged = [_XYZ, _SCALES, *([_RGB] if "min_r" in chunk else [])]
-    wanted = [f"{edge}_{name}" for names in ranged for name in names for edge in ("min", "max")]
-    missing = [n for n in wanted if n not in chunk] + [n for n in _PACKED if vertex.get(n) != "u4"]
+    needed = [f"{edge}_{name}" for names in ranged for name in names for edge in ("min", "max")]
+    missing = [n for n in needed if n not in chunk] + [n for n in _PACKED if vertex.get(n) != "u4"]
     if missing:
         raise ProgdfError(f"{name} is a compressed .ply without {missing[0]}; export it again")
     (ranges, packed, *bands), _ = ply.rows("chunk", "vertex", *(["sh"] if sh else []))
@@ -63,7 +63,7 @@ def read_compressed_ply(ply: PlyFile) -> Gaussians:
     higher = np.zeros((count, 0, 3), np.float32)
     if bands:
         higher = _higher_bands(name, bands[0], len(sh))
-    found = {
+    arrays = {
         "means": _dequantize(ranges, at, _unorm(position, (21, 11, 0), (11, 10, 11)), _XYZ),
         "quats": _quats(rotation),
         "log_scales": _dequantize(ranges, at, _unorm(scale, (21, 11, 0), (11, 10, 11)), _SCALES),
@@ -72,7 +72,7 @@ def read_compressed_ply(ply: PlyFile) -> Gaussians:
         "shN": higher,
     }
     tensors: dict[str, Any] = {
-        key: torch.from_numpy(np.ascontiguousarray(v, np.float32)) for key, v in found.items()
+        key: torch.from_numpy(np.ascontiguousarray(v, np.float32)) for key, v in arrays.items()
     }
     return Gaussians(**tensors, antialiased=ply.antialiased)
 

@@ -55,10 +55,10 @@ def main(kind: str, source: str, target: str, memory: int, output: int, seconds:
                 resource.setrlimit(limit, (most, most))
     path = Path(source)
     content = _bundle(path) if path.name.lower() == "meta.json" else path.read_bytes()
-    found = gaussforge.GaussForge().convert(content, kind, "ply")
-    if "data" not in found:
-        raise ValueError(str(found.get("error", "it gives no scene")))
-    Path(target).write_bytes(found["data"])
+    converted = gaussforge.GaussForge().convert(content, kind, "ply")
+    if "data" not in converted:
+        raise ValueError(str(converted.get("error", "it gives no scene")))
+    Path(target).write_bytes(converted["data"])
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ bytes. Colors and opacities are bytes; SH stands band by band, channel-major wit
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -29,22 +29,19 @@ _LEAST_SCALE = 2e-9
 Floats = npt.NDArray[np.float32]
 
 
-@dataclass(frozen=True)
-class _Section:
-    """A section's header, and where its parts begin in the file."""
-
-    rows: int
-    bucket_size: int
-    full_buckets: int
-    degree: int
-    block: float
-    quantum: int
-    sizes_at: int
-    partial_buckets: int
-    centers_at: int
-    buckets: int
-    bucket_bytes: int
-    rows_at: int
+_SECTION_FIELDS = {
+    "rows": ("<u4", 0),
+    "most_rows": ("<u4", 4),
+    "bucket_size": ("<u4", 8),
+    "buckets": ("<u4", 12),
+    "block": ("<f4", 16),
+    "bucket_bytes": ("<u2", 20),
+    "quantum": ("<u4", 24),
+    "full_buckets": ("<u4", 32),
+    "partial_buckets": ("<u4", 36),
+    "degree": ("<u2", 40),
+}
+"""Types and places in a section's header."""
 
 
 def is_ksplat(start: bytes) -> bool:
@@ -68,79 +65,60 @@ def read_ksplat(path: str | os.PathLike[str]) -> tuple[Gaussians, int]:
     low, high = (float(np.frombuffer(content, "<f4", 1, at)[0]) for at in (36, 40))
     sh_range = (low or -1.5, high or 1.5)
     at, parts = _HEADER + sections * _SECTION, []
-    for k in range(sections):
-        head = _HEADER + k * _SECTION
-        if not _number(content, head, "<u4") and not _number(content, head + 4, "<u4"):
+    for head in range(_HEADER, _HEADER + sections * _SECTION, _SECTION):
+        fields = _SECTION_FIELDS.items()
+        section = {name: np.frombuffer(content, t, 1, head + o).item() for name, (t, o) in fields}
+        if not section["rows"] and not section["most_rows"]:
             continue
-        section, row, at = _section(path, content, head, level, at)
-        parts.append(_rows(path, content, section, row, level, sh_range))
+        if section["degree"] > 3:
+            raise _damage_error(path)
+        row = _row_layout(level, section["degree"])
+        centers_at = at + 4 * section["partial_buckets"]
+        rows_at = centers_at + section["bucket_bytes"] * section["buckets"]
+        end = rows_at + row.itemsize * section["most_rows"]
+        if end > len(content) or section["rows"] > section["most_rows"]:
+            raise _damage_error(path)
+        rows = np.frombuffer(content, row, section["rows"], rows_at)
+        centers = _centers(path, content, section, at, centers_at) if level else None
+        parts.append(_unpack(rows, section, centers, level, sh_range))
+        at = end
     count = sum(len(part["means"]) for part in parts)
     if not count or count != _number(content, 16, "<u4"):
         raise _damage_error(path)
     most = max(part["shN"].shape[1] for part in parts)
     for part in parts:
         part["shN"] = np.pad(part["shN"], ((0, 0), (0, most - part["shN"].shape[1]), (0, 0)))
-    whole = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    arrays = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     tensors: dict[str, Any] = {
-        name: torch.from_numpy(np.ascontiguousarray(v, np.float32)) for name, v in whole.items()
+        name: torch.from_numpy(np.ascontiguousarray(v, np.float32)) for name, v in arrays.items()
     }
     return Gaussians(**tensors), level
 
 
-def _section(
-    path: str | os.PathLike[str], content: bytes, head: int, level: int, at: int
-) -> tuple[_Section, np.dtype[np.void], int]:
-    """A section's header, the layout of its rows, and where the next section begins."""
-    degree = _number(content, head + 40, "<u2")
-    if degree > 3:
-        raise _damage_error(path)
+def _row_layout(level: int, degree: int) -> np.dtype[np.void]:
     small = [("xyz", "<u2", 3), ("scale", "<f2", 3), ("quat", "<f2", 4), ("rgba", "u1", 4)]
     large = [("xyz", "<f4", 3), ("scale", "<f4", 3), ("quat", "<f4", 4), ("rgba", "u1", 4)]
-    row = np.dtype([*(small if level else large), ("sh", _SH_TYPES[level], _SH_REST[degree])])
-    partial, buckets = _number(content, head + 36, "<u4"), _number(content, head + 12, "<u4")
-    bucket_bytes = _number(content, head + 20, "<u2")
-    rows_at = at + 4 * partial + bucket_bytes * buckets
-    end = rows_at + row.itemsize * _number(content, head + 4, "<u4")
-    rows = _number(content, head, "<u4")
-    if end > len(content) or rows > _number(content, head + 4, "<u4"):
-        raise _damage_error(path)
-    section = _Section(
-        rows=rows,
-        bucket_size=_number(content, head + 8, "<u4"),
-        full_buckets=_number(content, head + 32, "<u4"),
-        degree=degree,
-        block=float(np.frombuffer(content, "<f4", 1, head + 16)[0]),
-        quantum=_number(content, head + 24, "<u4") or 32767,
-        sizes_at=at,
-        partial_buckets=partial,
-        centers_at=at + 4 * partial,
-        buckets=buckets,
-        bucket_bytes=bucket_bytes,
-        rows_at=rows_at,
-    )
-    return section, row, end
+    return np.dtype([*(small if level else large), ("sh", _SH_TYPES[level], _SH_REST[degree])])
 
 
-def _rows(
-    path: str | os.PathLike[str],
-    content: bytes,
-    section: _Section,
-    row: np.dtype[np.void],
+def _unpack(
+    rows: npt.NDArray[np.void],
+    section: Mapping[str, Any],
+    centers: Floats | None,
     level: int,
     sh_range: tuple[float, float],
 ) -> dict[str, Floats]:
-    rows = np.frombuffer(content, row, section.rows, section.rows_at)
     means: Floats = rows["xyz"].astype(np.float32)
-    if level:
-        inside = (means - section.quantum) * (section.block / 2 / section.quantum)
-        means = np.asarray(inside + _centers(path, content, section), np.float32)
+    if centers is not None:
+        quantum = section["quantum"] or 32767
+        means = np.asarray((means - quantum) * (section["block"] / 2 / quantum) + centers, np.float32)
     scales = rows["scale"].astype(np.float32)
     share = rows["rgba"].astype(np.float32) / 255
-    sh = rows["sh"].astype(np.float32).reshape(section.rows, -1)
+    sh = rows["sh"].astype(np.float32).reshape(len(rows), -1)
     if level == 2:
         sh = np.asarray(sh_range[0] + sh / 255 * (sh_range[1] - sh_range[0]), np.float32)
-    bands = [sh[:, 3 * (l * l - 1) : 3 * ((l + 1) ** 2 - 1)] for l in range(1, section.degree + 1)]
-    higher = [band.reshape(section.rows, 3, -1).transpose(0, 2, 1) for band in bands]
+    bands = [sh[:, 3 * (l * l - 1) : 3 * ((l + 1) ** 2 - 1)] for l in range(1, section["degree"] + 1)]
+    higher = [band.reshape(len(rows), 3, -1).transpose(0, 2, 1) for band in bands]
     with np.errstate(divide="ignore", invalid="ignore"):
         logits = np.log(share[:, 3]) - np.log1p(-share[:, 3])
         log_scales = np.log(np.where(scales == 0, np.float32(_LEAST_SCALE), scales))
@@ -150,24 +128,25 @@ def _rows(
         "log_scales": log_scales,
         "logit_opacities": logits,
         "sh0": (share[:, :3] - 0.5) / np.float32(C0),
-        "shN": np.concatenate([np.zeros((section.rows, 0, 3), np.float32), *higher], axis=1),
+        "shN": np.concatenate([np.zeros((len(rows), 0, 3), np.float32), *higher], axis=1),
     }
 
 
-def _centers(path: str | os.PathLike[str], content: bytes, section: _Section) -> Floats:
+def _centers(
+    path: str | os.PathLike[str], content: bytes, section: Mapping[str, Any], sizes_at: int, centers_at: int
+) -> Floats:
     """The center of each row's bucket: full buckets first, then those whose sizes are in the file. [N,3]"""
-    sizes = np.frombuffer(content, "<u4", section.partial_buckets, section.sizes_at).astype(np.int64)
-    full = section.full_buckets * section.bucket_size
-    ends = np.concatenate([[full], full + np.cumsum(sizes)])
-    index = np.arange(section.rows)
-    later = section.full_buckets + np.searchsorted(ends[1:], index, side="right")
-    bucket = np.where(index < full, index // max(section.bucket_size, 1), later)
-    if section.bucket_bytes < 12 or (section.rows and int(bucket.max()) >= section.buckets):
+    sizes = np.frombuffer(content, "<u4", section["partial_buckets"], sizes_at).astype(np.int64)
+    full_rows = section["full_buckets"] * section["bucket_size"]
+    ends = np.concatenate([[full_rows], full_rows + np.cumsum(sizes)])
+    index = np.arange(section["rows"])
+    later = section["full_buckets"] + np.searchsorted(ends[1:], index, side="right")
+    bucket = np.where(index < full_rows, index // max(section["bucket_size"], 1), later)
+    if section["bucket_bytes"] < 12 or (len(index) and int(bucket.max()) >= section["buckets"]):
         raise _damage_error(path)
-    kind = np.dtype({"names": ["xyz"], "formats": [("<f4", 3)], "itemsize": section.bucket_bytes})
-    centers = np.frombuffer(content, kind, section.buckets, section.centers_at)["xyz"]
-    found: Floats = centers[bucket]
-    return found
+    kind = np.dtype({"names": ["xyz"], "formats": [("<f4", 3)], "itemsize": section["bucket_bytes"]})
+    centers: Floats = np.frombuffer(content, kind, section["buckets"], centers_at)["xyz"][bucket]
+    return centers
 
 
 def _number(content: bytes, at: int, kind: str) -> int:

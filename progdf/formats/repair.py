@@ -1,18 +1,21 @@
-"""Gaussians that can be drawn: every number finite and in range, near the origin, every row in its place.
+"""Scenes made drawable, every number finite and near the origin, and the report of what that took.
 
 What cannot be used is made invisible rather than dropped, because labels and .gdf files count on row indices.
 """
 
 from __future__ import annotations
 
+import logging
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from progdf.gaussians import ZERO, Gaussians, Origin, normalize_quats
+from progdf.gaussians import ZERO, Gaussians, Origin
+from progdf.quaternions import normalize_quats
+from progdf.terminal import file_size, format_count, group_digits
 
 LARGEST_MEAN = 1e18
 LARGEST_LOG_SCALE = 40.0
@@ -41,9 +44,9 @@ def repair(scene: Gaussians) -> tuple[Gaussians, dict[str, Any]]:
     Means in the world, of either floating type, become float32 relative to an origin; unusable numbers are
     replaced, quaternions get unit length. Tensors that need nothing are passed on, not copied.
     """
-    near, found = _move_to_origin(scene)
+    near, moved = _move_to_origin(scene)
     repaired, counts = _replace_unusable(near)
-    return repaired, {**found, **counts}
+    return repaired, {**moved, **counts}
 
 
 def find_origin(means: Tensor, log_scales: Tensor) -> Origin:
@@ -85,12 +88,12 @@ def _move_to_origin(scene: Gaussians) -> tuple[Gaussians, dict[str, Any]]:
         return replace(scene, means=world.float()), {}
     moved = world.double() - torch.tensor(origin, dtype=torch.float64)
     near = replace(scene, means=moved.float(), origin=origin)
-    found: dict[str, Any] = {"origin": origin}
+    counts: dict[str, Any] = {"origin": origin}
     if bool(((world.float() == world) | world.isnan()).all()):
-        found["distinct"] = tuple(
+        counts["distinct"] = tuple(
             len(torch.unique(column)) if at else 0 for at, column in zip(origin, world.unbind(1), strict=True)
         )
-    return near, found
+    return near, counts
 
 
 def _replace_unusable(scene: Gaussians) -> tuple[Gaussians, dict[str, int]]:
@@ -171,3 +174,117 @@ def _within(tensor: Tensor, least: float, most: float) -> bool:
         return True
     low, high = (float(edge) for edge in tensor.aminmax())
     return least <= low and high <= most and -torch.inf < low and high < torch.inf
+
+
+_log = logging.getLogger(__name__)
+
+_EXPLAINED = {
+    "filter_3D": "filter_3D (Mip-Splatting's: fuse it into the scales and opacities for the exact look)"
+}
+
+
+@dataclass(frozen=True)
+class LoadReport:
+    """What a .ply held, what was repaired, what was left out. Counts are rows (Gaussians)."""
+
+    file: str  # the file's name
+    file_bytes: int  # its size
+    format: str  # "binary little-endian", "binary big-endian" or "ascii"
+    count: int  # Gaussians N; loading never drops or adds a row
+    sh_degree: int  # 0..4
+    antialiased: bool = False  # it says that it was trained with Mip-Splatting's 2D filter
+    origin: Origin = ZERO  # what the means are kept relative to, see `repair.find_origin`
+    # how many different x, y and z there are, of positions that were float32 far from 0; 0 on an axis that is
+    # near 0, () where nothing was lost
+    distinct: tuple[int, ...] = ()
+    hidden: int = 0  # rows made invisible because a number was unusable; the next five say which number
+    bad_means: int = 0  # NaN, infinite or beyond ±1e18
+    bad_scales: int = 0  # NaN, infinite or beyond e^40
+    bad_quats: int = 0  # NaN or infinite
+    bad_opacities: int = 0  # NaN
+    bad_colors: int = 0  # NaN or infinite f_dc
+    bad_sh: int = 0  # NaN or infinite f_rest; only the broken coefficients become 0, the row stays visible
+    flat_scales: int = 0  # −inf log-scale (an exactly flat Gaussian), made a very thin one
+    opaque: int = 0  # +inf opacity, made a finite one that looks the same
+    transparent: int = 0  # −inf opacity, made a finite one that looks the same
+    zero_quats: int = 0  # |q| < 1e-6, taken as no rotation
+    scaled_quats: int = 0  # quaternions that were not of unit length and were divided by it
+    ignored_properties: tuple[str, ...] = ()  # vertex properties that 3DGS does not have
+    ignored_elements: tuple[tuple[str, int], ...] = ()  # tables other than vertex, with their row counts
+    trailing_bytes: int = 0  # bytes after the last row
+
+    @property
+    def repairs(self) -> tuple[str, ...]:
+        """One phrase for each kind of repair that changed what is shown or could be noticed."""
+        reasons = (
+            (self.bad_means, "NaN, infinite or absurd position"),
+            (self.bad_scales, "NaN, infinite or absurd scale"),
+            (self.bad_quats, "NaN or infinite rotation"),
+            (self.bad_opacities, "NaN opacity"),
+            (self.bad_colors, "NaN or infinite color"),
+        )
+        hidden = ", ".join(f"{group_digits(rows)} with {what}" for rows, what in reasons if rows)
+        phrases = (
+            (self.hidden, f"made invisible: {hidden}"),
+            (self.bad_sh, "with NaN or infinite SH coefficients, which were set to 0"),
+            (self.flat_scales, "with a log-scale of −inf, made very thin"),
+            (self.opaque, "with an opacity of +inf, made finite and just as opaque"),
+            (self.transparent, "with an opacity of −inf, made finite and just as invisible"),
+            (self.zero_quats, "with a zero quaternion, taken as no rotation"),
+        )
+        return tuple(f"{format_count(rows)} {what}" for rows, what in phrases if rows)
+
+    @property
+    def lost(self) -> str:
+        """What cannot be repaired, "" for nothing: positions that float32 has rounded."""
+        if not self.distinct:
+            return ""
+        step = max(2.0 ** (math.frexp(at)[1] - 24) for at in self.origin if at)
+        counts = ", ".join(
+            f"{group_digits(count)} distinct {axis}"
+            for axis, count in zip("xyz", self.distinct, strict=True)
+            if count
+        )
+        return (
+            f"positions are float32, which has steps of {step:.2g} so far from 0: {counts} are left of "
+            f"{format_count(self.count)}; export the scene near 0, or with x, y, z as doubles"
+        )
+
+    @property
+    def ignored(self) -> tuple[str, ...]:
+        """One phrase for each part of the file that was not used."""
+        phrases = []
+        if self.ignored_properties:
+            phrases.append(f"properties {', '.join(_EXPLAINED.get(p, p) for p in self.ignored_properties)}")
+        phrases += [f"element '{name}' ({format_count(rows, 'row')})" for name, rows in self.ignored_elements]
+        if self.trailing_bytes:
+            phrases.append(f"{format_count(self.trailing_bytes, 'byte')} after the last row")
+        return tuple(phrases)
+
+    def log(self) -> None:
+        """Warn of what was repaired, and of what was lost."""
+        for phrase in self.repairs:
+            _log.warning("%s: repaired: %s", self.file, phrase)
+        if self.lost:
+            _log.warning("%s: %s", self.file, self.lost)
+
+    def lines(self) -> list[str]:
+        """The report for a person, a line per fact."""
+        sh = f"SH degree {self.sh_degree}"
+        if self.sh_degree == 4:
+            sh += " (band 4 is kept, and not shown)"
+        lines = [
+            f"{self.file}: {format_count(self.count)}, {sh}, {self.format}, {file_size(self.file_bytes)}",
+            *(f"ignored: {phrase}" for phrase in self.ignored),
+        ]
+        if self.antialiased:
+            lines.append("trained anti-aliased (mip), and drawn so")
+        if self.scaled_quats:
+            lines.append(
+                f"normalized: {format_count(self.scaled_quats, 'quaternion')} of another length than 1"
+            )
+        if self.origin != ZERO:
+            lines.append(f"origin: {' '.join(f'{at:.17g}' for at in self.origin)}, as it lies far from 0")
+        if self.lost:
+            lines.append(f"lost: {self.lost}")
+        return lines + [f"repaired: {phrase}" for phrase in self.repairs or ("nothing",)]

@@ -20,18 +20,18 @@ from typing import Any
 
 import torch
 
-from progdf.errors import ProgdfError, escape_text
+from progdf import sh
+from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.io.atomic import read_file
 from progdf.io.json_values import decode_json
+from progdf.terminal import escape_text
 
 from . import gaussforge_child
 from .compressed_ply import is_compressed, read_compressed_ply
 from .ksplat import read_ksplat
-from .load_report import LoadReport
-from .ply import load_ply_with_report
-from .ply_file import read_header
-from .repair import repair
+from .ply import load_ply_with_report, read_header
+from .repair import LoadReport, repair
 
 FORMATS = ("ply", "spz", "splat", "ksplat", "sog")
 """What a scene may be, by the ending of its name; a compressed .ply is a .ply."""
@@ -104,10 +104,10 @@ def load_scene_with_report(path: str | os.PathLike[str]) -> tuple[Gaussians, Loa
         scene, level = read_ksplat(path)
         return _repair(path, scene, f".ksplat, level {level}")
     scene, report = _through_gaussforge(path, kind)
-    told, antialiased = f".{kind}", False
+    description, antialiased = f".{kind}", False
     if kind == "spz":
         version, antialiased = _spz_header(path)
-        scene, told = rotate_about_x(scene), f".spz {version}, turned from y up to y down"
+        scene, description = rotate_about_x(scene), f".spz {version}, turned from y up to y down"
     elif kind == "sog":
         meta = _sog_meta(path) or {}
         antialiased = meta.get("model") == "antialiased" or meta.get("antialias") is True
@@ -115,7 +115,7 @@ def load_scene_with_report(path: str | os.PathLike[str]) -> tuple[Gaussians, Loa
         report,
         file=scene_name(path),
         file_bytes=_size(path),
-        format=told,
+        format=description,
         antialiased=antialiased,
         origin=scene.origin,
     )
@@ -125,21 +125,18 @@ def load_scene_with_report(path: str | os.PathLike[str]) -> tuple[Gaussians, Loa
 def rotate_about_x(scene: Gaussians) -> Gaussians:
     """The scene after half a turn about x: y up and z towards the viewer become y down and z away from it."""
     turn = torch.tensor([1.0, -1.0, -1.0])
-    degree = scene.sh_degree
-    # a basis function of order m changes its sign with y for m < 0, and with z for l + m odd
-    signs = [(-1.0) ** (l + m + (m < 0)) for l in range(1, degree + 1) for m in range(-l, l + 1)]
     x, y, z = scene.origin
     return replace(
         scene,
         means=scene.means * turn,
         origin=(x, 0.0 - y, 0.0 - z),
         quats=scene.quats * torch.tensor([1.0, 1.0, -1.0, -1.0]),
-        shN=scene.shN * torch.tensor(signs)[:, None],
+        shN=sh.rotate_about_x(scene.shN),
     )
 
 
-def _repair(path: Path, found: Gaussians, kind: str) -> tuple[Gaussians, LoadReport]:
-    scene, counts = repair(found)
+def _repair(path: Path, stored: Gaussians, kind: str) -> tuple[Gaussians, LoadReport]:
+    scene, counts = repair(stored)
     repairs: dict[str, Any] = dict(counts)
     report = LoadReport(
         file=scene_name(path),
@@ -191,10 +188,10 @@ def _reason(status: int, stderr: bytes) -> str:
         name = signal.Signals(-status).name if -status in set(signal.Signals) else str(-status)
         return "ran out of its time" if name in ("SIGXCPU", "SIGKILL") else f"crashed ({name})"
     lines = stderr.decode("utf-8", "replace").strip().splitlines()
-    said = escape_text(lines[-1] if lines else "")
-    if "bad_alloc" in said or said.startswith("MemoryError"):
+    message = escape_text(lines[-1] if lines else "")
+    if "bad_alloc" in message or message.startswith("MemoryError"):
         return "wanted more memory than such a file can need"
-    return f"said: {said[:160]}" if said else "said nothing"
+    return f"said: {message[:160]}" if message else "said nothing"
 
 
 def _read_error(path: Path, kind: str, why: str) -> ProgdfError:

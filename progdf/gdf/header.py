@@ -1,60 +1,60 @@
-"""What a .gdf file says of itself before its tensors are read: enough to list it and to refuse it.
+"""The contents of a .gdf file: one JSON header in the safetensors metadata, and the tensors.
 
-A few kB at the file's beginning: the header and the table of tensors, with a SHA-256 of both. What the
-tensors hold is checked when they are read (`file.load_gdf`), before anything of them is used.
+The header ends with one SHA-256 of its own text without that sum, and of every tensor's name, type, shape and
+bytes: a file that is not exactly what was saved is refused. Nothing in it is ever executed.
 """
 
 from __future__ import annotations
 
 import hashlib
-import math
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import msgspec
+import numpy as np
+import safetensors
+import safetensors.numpy
+import safetensors.torch
+import torch
+from torch import Tensor
 
 from progdf.errors import ProgdfError
-from progdf.field.neural import NeuralShape
-from progdf.io.atomic import check_regular, open_error
+from progdf.field.baked import AttributeBases, BakedField, BakePlan, NeuralForm
+from progdf.field.neural import NeuralField, NeuralShape
+from progdf.gaussians import ATTRIBUTES
 from progdf.io.json_values import convert_json, decode_json
-from progdf.io.tensors import METADATA
+from progdf.region import Region
 
-FORMAT = 1
+FORMAT = 2
 """The version of the file format."""
 
 MOST_GAUSSIANS = 1 << 26
 """A header that claims a larger scene is not believed: the score would take gigabytes."""
 
-_MOST_HEADER = (
-    1 << 24
-)  # bytes; a report takes a few kilobytes, a gigabyte could be made of a hundred megabytes
-_Type = Literal["F64", "I64", "F32", "I32", "F16", "I16", "I8", "U8", "BOOL"]
-_BYTES: Mapping[_Type, int] = {
-    "F64": 8,
-    "I64": 8,
-    "F32": 4,
-    "I32": 4,
-    "F16": 2,
-    "I16": 2,
-    "I8": 1,
-    "U8": 1,
-    "BOOL": 1,
+_MOST_HEADER = 1 << 24  # bytes; a report takes a few kB, and JSON of 100 MB could become a gigabyte
+_METADATA = "progdf"  # the one key: the library writes several in an order that differs from run to run
+_PARTS = ("end_offset", "residual_basis", "scale", "coefficients")  # of `AttributeBases`
+_NETWORK = "network."
+_END_CORRECTION = "end_correction."
+_RENAMED = {  # parts of tensors' names in format 1
+    "nodes": "knots",
+    "full": "end_offset",
+    "rest": "residual_basis",
+    "step": "scale",
+    "pull": "end_correction",
 }
 
 
-@dataclass(frozen=True)
-class SceneFingerprint:
-    """What binds a .gdf to its scene: number of Gaussians, SHA-256 of the world means (float32 bytes)."""
+class SceneFingerprint(msgspec.Struct, frozen=True):
+    """What binds a .gdf to its scene."""
 
-    count: int
-    means_sha256: str
+    count: int  # Gaussians
+    means_sha256: str  # of the world means, float32
 
 
-class NetworkTable(msgspec.Struct, frozen=True):
-    """A network in a header: its layout, how many bases each attribute is baked to, and what that costs."""
+class NetworkHeader(msgspec.Struct, frozen=True):
+    """A network that a file keeps, how many bases each attribute is baked to, and what baking costs."""
 
     shape: NeuralShape
     ranks: dict[str, int]
@@ -62,236 +62,257 @@ class NetworkTable(msgspec.Struct, frozen=True):
     bake_error: dict[str, float]
 
 
-class FieldTable(msgspec.Struct, frozen=True):
-    """A field in a header, see `BakedField`; `network` where one is kept in its place."""
+class FieldHeader(msgspec.Struct, frozen=True):
+    """A field, see `BakedField`; `network` where one is kept in its place."""
 
     kind: str
     channels: int
     attributes: list[str]
     recorded: list[float]
-    network: NetworkTable | None = None
+    network: NetworkHeader | None = None
 
 
-class _Header(msgspec.Struct, frozen=True):
+class GdfHeader(msgspec.Struct, frozen=True):
     """The JSON header."""
 
-    format: int
     name: str
-    region: str
     instruction: str
     scene: SceneFingerprint
-    field: FieldTable
+    region: str
+    members: Annotated[int, msgspec.Meta(ge=0)]
+    field: FieldHeader
     options: dict[str, Any]
     report: dict[str, Any]
-    members: Annotated[int, msgspec.Meta(ge=0)]
+    format: int = FORMAT
+    sha256: str = ""
 
 
-class _Signed(msgspec.Struct, frozen=True):
-    """The metadata: the JSON header as it is in the file, and the checksums."""
+class _Format1(msgspec.Struct):
+    """The metadata of format 1: the header as its own text, and the checksum beside it."""
 
     header: msgspec.Raw
-    header_sha256: str
     sha256: str
 
 
-class _Tensor(msgspec.Struct, frozen=True):
-    """A tensor in the table of a safetensors file."""
-
-    dtype: _Type
-    shape: Annotated[list[Annotated[int, msgspec.Meta(ge=0)]], msgspec.Meta(max_length=8)]
-    data_offsets: tuple[int, int]
-
-    def __post_init__(self) -> None:
-        first, last = self.data_offsets
-        if not 0 <= first <= last or last - first != math.prod(self.shape) * _BYTES[self.dtype]:
-            raise ValueError(f"{self.dtype} {self.shape} does not take the bytes {first} to {last}")
+def pack_file(header: GdfHeader, tensors: Mapping[str, Tensor]) -> bytes:
+    """The bytes of a .gdf file; the header gets its checksum. Tensors lie on the CPU, row by row."""
+    sha256 = checksum(_encode(header), tensors)
+    arrays = {name: tensor.numpy() for name, tensor in tensors.items()}
+    text = _encode(msgspec.structs.replace(header, sha256=sha256))
+    return safetensors.numpy.save(arrays, {_METADATA: text})
 
 
-@dataclass(frozen=True)
-class GdfHead:
-    """An edit without its numbers.
-
-    Args:
-        path, size: the file, and its bytes
-        text: the JSON header as stored in the file
-        sha256: of the whole: header and tensors
-        tensors: shape and type of each, as safetensors calls it
-        name, region, instruction: the layer's, the region's, and what was asked for
-        members: Gaussians of the region
-        scene: the scene it was made for
-        field: kind, channels, attributes …, see `field_packing.pack_field`
-        options, report: of the training, JSON values
-    """
-
-    path: Path
-    size: int
-    text: str
-    sha256: str
-    tensors: Mapping[str, tuple[tuple[int, ...], _Type]]
-    name: str
-    region: str
-    instruction: str
-    members: int
-    scene: SceneFingerprint
-    field: FieldTable
-    options: Mapping[str, Any]
-    report: Mapping[str, Any]
-
-    @property
-    def bytes_per_member(self) -> float:
-        """Bytes of the field's numbers that grow with the members, for one; of a network, its share."""
-        if self.field.network is not None:
-            kept = [name for name in self.tensors if _of_network(name)]
-        else:
-            kept = [name for name in self.tensors if name.endswith((".full", ".rest"))]
-        stored = sum(self.numbers(name) * _BYTES[self.tensors[name][1]] for name in kept)
-        return stored / max(1, self.members)
-
-    @property
-    def parameters(self) -> int:
-        """Learned numbers of a network, its codes included."""
-        learned = ("network.control", "network.layers.", "network.heads.")
-        return sum(self.numbers(name) for name in self.tensors if name.startswith(learned) or name == "codes")
-
-    @property
-    def knots(self) -> int:
-        """At how many strengths the coefficients are given."""
-        return self.numbers("nodes")
-
-    def bases(self) -> dict[str, int]:
-        """How many bases each attribute has, the full offset included."""
-        if self.field.network is not None:
-            return {name: 1 + rank for name, rank in self.field.network.ranks.items()}
-        return {name: 1 + self.tensors[f"{name}.rest"][0][0] for name in self.field.attributes}
-
-    def numbers(self, tensor: str) -> int:
-        """How many numbers a tensor holds."""
-        return math.prod(self.tensors[tensor][0])
-
-
-def _of_network(tensor: str) -> bool:
-    return tensor.startswith("network.") or tensor in ("end", "codes", "code_step")
-
-
-def read_head(path: str | os.PathLike[str]) -> GdfHead:
-    """Open a .gdf: read its header, and see that it and the file's length are what was saved.
+def unpack_file(content: bytes, name: str) -> tuple[GdfHeader, dict[str, Tensor]]:
+    """The inverse of `pack_file`, of older formats too.
 
     Raises:
-        ProgdfError: it is no .gdf, from a newer version, truncated, or its header is damaged.
+        ProgdfError: it is no .gdf, from a newer version, truncated, damaged or inconsistent.
     """
-    check_regular(path)
+    size = int.from_bytes(content[:8], "little")
+    if not 2 <= size <= _MOST_HEADER or content[8:9] != b"{":
+        raise ProgdfError(f"{name} is not a .gdf file; give one that progdf train or progdf fit has written")
     try:
-        with Path(path).open("rb") as file:
-            start = file.read(9)
-            size = int.from_bytes(start[:8], "little")
-            length = os.fstat(file.fileno()).st_size
-            name = Path(path).name
-            if len(start) < 9 or not 2 <= size <= _MOST_HEADER or start[8:9] != b"{":
-                raise ProgdfError(
-                    f"{name} is not a .gdf file; give one that progdf train or progdf fit has written"
-                )
-            if 8 + size > length:
-                raise ProgdfError(
-                    f"{name} is truncated: {length} bytes are less than its header; copy it again"
-                )
-            header = start[8:] + file.read(size - 1)
-    except OSError as error:
-        raise open_error(path, error) from error
-    return _head(Path(path), length, header)
-
-
-def _head(path: Path, length: int, header: bytes) -> GdfHead:
-    name = path.name
-    try:
-        outer = decode_json(header)
-        metadata = (
-            convert_json(outer.pop("__metadata__", {}), dict[str, str]) if isinstance(outer, dict) else {}
-        )
-        table = convert_json(outer, dict[str, _Tensor])
-    except ValueError:
-        raise damage_error(name) from None
-    if METADATA not in metadata:
+        tensors: dict[str, Tensor] = safetensors.torch.load(content)
+        text = (decode_json(content[8 : 8 + size]).get("__metadata__") or {}).get(_METADATA)
+    except (safetensors.SafetensorError, ValueError, KeyError, RuntimeError, OverflowError):
+        raise ProgdfError(f"{name} is truncated or damaged; copy it again or make it again") from None
+    if text is None:
         raise ProgdfError(
             f"{name} is a safetensors file, but not a .gdf; give one that progdf train has written"
         )
+    damage = ProgdfError(f"{name} is damaged (checksum mismatch); copy it again or make it again")
     try:
-        signed = msgspec.json.decode(metadata[METADATA], type=_Signed)
-        text = bytes(signed.header).decode()
-        content = decode_json(text)
-        version = convert_json(content["format"], int)
-    except (msgspec.MsgspecError, ValueError, KeyError, TypeError):
-        raise damage_error(name) from None
+        value = decode_json(text)
+        if older := "header" in value:
+            old = msgspec.json.decode(text, type=_Format1)
+            signed, sha256 = bytes(old.header).decode(), old.sha256
+            value = decode_json(signed) | {"sha256": sha256}
+        else:
+            sha256 = convert_json(value["sha256"], str)
+            signed = text.replace(sha256, "")
+        version = convert_json(value["format"], int)
+        intact = checksum(signed, tensors) == sha256 and version == (1 if older else FORMAT)
+    except (msgspec.MsgspecError, ValueError, KeyError, TypeError, RuntimeError):
+        raise damage from None
     if version > FORMAT:
         raise ProgdfError(f"{name} has format {version}, this progdf reads format {FORMAT}; update progdf")
-    needed = 8 + len(header) + max((tensor.data_offsets[1] for tensor in table.values()), default=0)
-    if needed > length:
-        raise ProgdfError(
-            f"{name} is truncated: it has {length} of {needed} bytes; copy it again or make it again"
-        )
-    tensors = {key: (tuple(tensor.shape), tensor.dtype) for key, tensor in table.items()}
-    if version < FORMAT or signed.header_sha256 != head_checksum(text, tensors):
-        raise damage_error(name)
+    if not intact:
+        raise damage
+    if older:
+        tensors = {".".join(_RENAMED.get(p, p) for p in key.split(".")): t for key, t in tensors.items()}
     try:
-        found = convert_json(content, _Header)
-        if found.field.network is not None:
-            strange = set(content["field"]["network"]["shape"]) - {part.name for part in fields(NeuralShape)}
-            if strange:  # of a later version, perhaps, which reads the network in another way
-                raise ValueError(f"the network has an unknown {min(strange)}")
-        _check(found, tensors)
+        # a key that is unknown may be of a later version, which reads the file in another way
+        return convert_json(value, GdfHeader, closed=True), tensors
     except ValueError as error:
         raise contradiction_error(name, error) from error
-    return GdfHead(
-        path=path,
-        size=length,
-        text=text,
-        sha256=signed.sha256,
-        tensors=tensors,
-        name=found.name,
-        region=found.region,
-        instruction=found.instruction,
-        members=found.members,
-        scene=found.scene,
-        field=found.field,
-        options=found.options,
-        report=found.report,
-    )
 
 
-def _check(header: _Header, tensors: Mapping[str, tuple[tuple[int, ...], _Type]]) -> None:
-    """Whether the header fits the table of tensors, as far as they determine the file."""
-    if not 0 <= header.scene.count <= MOST_GAUSSIANS:
-        raise ValueError(f"a scene of {header.scene.count} Gaussians")
-    sides = {"nodes": 1}
-    if header.field.network is None:
-        for name in header.field.attributes:
-            sides |= {f"{name}.full": 2, f"{name}.rest": 3, f"{name}.step": 2, f"{name}.coefficients": 2}
-    else:
-        sides |= {"end": 2}
-    for name, count in sides.items():
-        if name not in tensors or len(tensors[name][0]) != count:
-            raise ValueError(f"it has no tensor {name} of {count} sides")
-    rows = {tensors[name][0][0] for name in sides if name.endswith((".full", "end"))}
-    if any(count != header.members for count in rows) or header.members > header.scene.count:
-        raise ValueError(
-            f"the header has {header.members} members of {header.scene.count}, the tensors {sorted(rows)}"
-        )
-
-
-def head_checksum(text: str, tensors: Mapping[str, tuple[tuple[int, ...], str]]) -> str:
-    """SHA-256 of the JSON header and of every tensor's name, type and shape."""
-    digest = hashlib.sha256(text.encode("utf-8", "surrogatepass"))
+def checksum(text: str, tensors: Mapping[str, Tensor]) -> str:
+    """SHA-256 of a header's text without its checksum, and of tensors."""
+    digest = hashlib.sha256(text.encode())
     for name in sorted(tensors):
-        shape, dtype = tensors[name]
-        digest.update(f"\n{name} {dtype} {list(shape)}\n".encode("utf-8", "surrogatepass"))
+        tensor = tensors[name]
+        digest.update(f"\n{name} {tensor.dtype} {list(tensor.shape)}\n".encode())
+        digest.update(tensor.reshape(-1).view(torch.uint8).numpy().data)
     return digest.hexdigest()
-
-
-def damage_error(name: str) -> ProgdfError:
-    """The line for a file that is not what was saved."""
-    return ProgdfError(f"{name} is damaged (checksum mismatch); copy it again or make it again")
 
 
 def contradiction_error(name: str, error: Exception) -> ProgdfError:
     """The line for a file whose parts do not fit each other."""
     reason = " ".join(str(error).split()) or type(error).__name__
     return ProgdfError(f"{name} is inconsistent ({reason}); make it again with progdf train")
+
+
+def _encode(header: GdfHeader) -> str:
+    return msgspec.json.encode(header, enc_hook=_to_json).decode()
+
+
+def _to_json(value: Any) -> str | float:
+    return float(value) if isinstance(value, float) else os.fspath(value)
+
+
+def pack_field(field: BakedField) -> tuple[FieldHeader, dict[str, Tensor]]:
+    """A field's part of the header, and its tensors; of a baked network, the network."""
+    header = FieldHeader(field.kind, field.channels, list(field.attributes), list(field.recorded))
+    if field.origin is None:
+        tensors = {"knots": field.knots}
+        for name, bases in field.attributes.items():
+            tensors |= {f"{name}.{part}": getattr(bases, part) for part in _PARTS}
+        return header, tensors
+    form = field.origin
+    network, plan = form.network, form.plan
+    tensors = {_NETWORK + name: tensor for name, tensor in network.tensors.items()}
+    tensors |= {"knots": plan.knots, "end": network.end}
+    tensors |= {_END_CORRECTION + name: share for name, share in plan.end_correction.items()}
+    if network.shape.code:
+        tensors |= {"codes": network.codes, "code_step": network.code_step}
+    part = NetworkHeader(network.shape, dict(plan.ranks), form.rows_sha256, dict(form.error or {}))
+    return msgspec.structs.replace(header, network=part), tensors
+
+
+def unpack_field(header: FieldHeader, tensors: Mapping[str, Tensor]) -> BakedField:
+    """The inverse of `pack_field`; of a network, a field that is not baked yet and moves nothing.
+
+    Raises:
+        ValueError, KeyError, TypeError: the parts do not fit each other.
+    """
+    recorded = tuple(header.recorded)
+    for name in header.attributes:
+        if name not in ATTRIBUTES:
+            raise ValueError(f"unknown attribute {name}")
+    if header.network is None:
+        attributes = {
+            name: AttributeBases(**{part: tensors[f"{name}.{part}"] for part in _PARTS})
+            for name in header.attributes
+        }
+        return BakedField(header.kind, tensors["knots"], attributes, header.channels, recorded)
+    shape, end = header.network.shape, tensors["end"]
+    if shape.channels != header.channels:
+        raise ValueError(f"the network has {shape.channels} channels, the field {header.channels}")
+    network = NeuralField(
+        shape,
+        {name.removeprefix(_NETWORK): t for name, t in tensors.items() if name.startswith(_NETWORK)},
+        end,
+        tensors.get("codes", torch.zeros(len(end), 0, dtype=torch.int8)),
+        tensors.get("code_step", torch.zeros(0)),
+        recorded,
+    )
+    correction = {
+        name.removeprefix(_END_CORRECTION): t
+        for name, t in tensors.items()
+        if name.startswith(_END_CORRECTION)
+    }
+    plan = BakePlan(tensors["knots"], header.network.ranks, correction)
+    form = NeuralForm(network, plan, header.network.rows_sha256, header.network.bake_error)
+    return BakedField("neural", torch.tensor([0.0, 1.0]), {}, header.channels, recorded, form)
+
+
+def pack_region(region: Region) -> dict[str, Tensor]:
+    """A region's tensors: rows as bits, runs or numbers; the score as 8 bits where it is soft.
+
+    The score is kept to 1/255, and only where that differs from 1 for members and 0 for all others.
+    """
+    members = region.members.cpu().numpy()
+    count = len(region.score)
+    levels = (region.score.cpu().float().clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+    crisp = np.zeros(count, np.uint8)
+    crisp[members] = 255
+    soft = np.flatnonzero(levels != crisp)
+    tensors = _pack_rows("members", members, count)
+    if len(soft):
+        tensors |= _pack_rows("score", soft, count)
+        tensors["score.levels"] = torch.from_numpy(levels[soft])
+    return tensors
+
+
+def unpack_region(
+    name: str, tensors: Mapping[str, Tensor], count: int, expected: int | None = None
+) -> Region:
+    """The inverse of `pack_region` for a scene of `count` Gaussians; with how many members, if it is known.
+
+    Raises:
+        ValueError, KeyError: the tensors do not describe rows of that scene.
+    """
+    members = _unpack_rows("members", tensors, count, expected)
+    score = torch.zeros(count)
+    score[members] = 1.0
+    if "score.levels" in tensors:
+        levels = tensors["score.levels"]
+        soft = _unpack_rows("score", tensors, count, levels.numel())
+        if levels.dtype != torch.uint8 or levels.shape != soft.shape:
+            raise ValueError(f"{len(soft)} soft scores have levels {list(levels.shape)} {levels.dtype}")
+        score[soft] = levels.float() / 255
+    return Region(name, members, score)
+
+
+def _pack_rows(key: str, rows: np.ndarray, count: int) -> dict[str, Tensor]:
+    """Sorted unique rows below `count`: `.bits` [⌈N/8⌉], `.runs` [R,2] first and length, or `.rows` [M]."""
+    breaks = np.flatnonzero(np.diff(rows) != 1) + 1
+    starts = np.concatenate([rows[:1], rows[breaks]])
+    ends = np.concatenate([rows[breaks - 1], rows[-1:]])
+    sizes = {"runs": 8 * len(starts), "rows": 4 * len(rows), "bits": (count + 7) // 8}
+    stored: np.ndarray
+    shortest = min(sizes, key=lambda form: sizes[form])
+    if shortest == "runs":
+        stored = np.stack([starts, ends - starts + 1], axis=1).astype(np.int32)
+    elif shortest == "rows":
+        stored = rows.astype(np.int32)
+    else:
+        mask = np.zeros(count, np.bool_)
+        mask[rows] = True
+        stored = np.packbits(mask)
+    return {f"{key}.{shortest}": torch.from_numpy(stored)}
+
+
+def _unpack_rows(key: str, tensors: Mapping[str, Tensor], count: int, expected: int | None) -> Tensor:
+    """Sorted, unique and within the scene, or a ValueError; as many as expected, checked beforehand,
+    as eight bytes of a run can name millions. [M] int64"""
+    if f"{key}.bits" in tensors:
+        bits = tensors[f"{key}.bits"]
+        if bits.dtype != torch.uint8 or list(bits.shape) != [(count + 7) // 8]:
+            raise ValueError(f"{key}.bits is {list(bits.shape)} {bits.dtype} for {count} Gaussians")
+        mask = np.unpackbits(bits.numpy())
+        if mask[count:].any():
+            raise ValueError(f"{key}.bits names rows beyond {count}")
+        return torch.from_numpy(np.flatnonzero(mask[:count]).astype(np.int64))
+    if f"{key}.runs" in tensors:
+        runs = tensors[f"{key}.runs"]
+        if runs.dtype != torch.int32 or runs.ndim != 2 or runs.shape[1] != 2:
+            raise ValueError(f"{key}.runs is {list(runs.shape)} {runs.dtype}")
+        starts, lengths = runs.numpy().astype(np.int64).T
+        ends = starts + lengths
+        if len(runs) and (
+            (lengths < 1).any() or starts[0] < 0 or ends[-1] > count or (starts[1:] < ends[:-1]).any()
+        ):
+            raise ValueError(f"{key}.runs leave the scene or overlap")
+        if expected is not None and int(lengths.sum()) != expected:
+            raise ValueError(f"{key}.runs name {int(lengths.sum())} rows of {expected}")
+        before = np.repeat(np.cumsum(lengths) - lengths, lengths)
+        return torch.from_numpy(np.repeat(starts, lengths) + np.arange(int(lengths.sum())) - before)
+    rows = tensors[f"{key}.rows"]
+    if rows.dtype != torch.int32 or rows.ndim != 1:
+        raise ValueError(f"{key}.rows is {list(rows.shape)} {rows.dtype}")
+    indices = rows.numpy().astype(np.int64)
+    if len(indices) and (indices[0] < 0 or indices[-1] >= count or (np.diff(indices) <= 0).any()):
+        raise ValueError(f"{key}.rows are not sorted rows of the scene")
+    return torch.from_numpy(indices)

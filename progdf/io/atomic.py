@@ -1,8 +1,9 @@
-"""Files that are whole or absent: written to a temporary file, renamed when they are complete."""
+"""Files that are whole or absent, locks between processes, and the folders of the user."""
 
 from __future__ import annotations
 
 import errno
+import getpass
 import os
 import platform
 import re
@@ -15,6 +16,8 @@ import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
+
+from platformdirs import user_cache_path, user_pictures_path, user_state_path
 
 from progdf.errors import ProgdfError
 
@@ -53,9 +56,8 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
         target = Path(os.path.realpath(target))
     if not target.parent.is_dir():
         raise ProgdfError(f"the folder {target.parent} does not exist; create it first")
-    remove_abandoned(target.parent)
     # the suffix stays, as some writers (Pillow, numpy) choose the format by it
-    temporary_file = target.parent / f"{_temporary_name()}{target.suffix}"
+    temporary_file = _temporary_path(target.parent, target.suffix)
     try:
         _create(temporary_file, target.stat().st_mode & 0o777 if target.exists() else None)
     except OSError as error:
@@ -80,14 +82,14 @@ def temporary_subfolder(folder: Path) -> Path:
     Raises:
         OSError: it cannot be made.
     """
-    remove_abandoned(folder)
-    made = folder / _temporary_name()
+    made = _temporary_path(folder)
     made.mkdir()
     return made
 
 
-def _temporary_name() -> str:
-    return f".progdf-{_HOST}-{os.getpid()}-{secrets.token_hex(4)}"
+def _temporary_path(folder: Path, suffix: str = "") -> Path:
+    remove_abandoned(folder)
+    return folder / f".progdf-{_HOST}-{os.getpid()}-{secrets.token_hex(4)}{suffix}"
 
 
 def replace_file(path: Path, target: Path) -> None:
@@ -123,10 +125,10 @@ def _create(path: Path, mode: int | None) -> None:
 def _copy_into(target: Path) -> Iterator[Path]:
     """A temporary file whose bytes go into a pipe or a device in the end."""
     with tempfile.TemporaryDirectory(prefix="progdf-") as folder:
-        whole = Path(folder) / f"whole{target.suffix}"
-        whole.touch()
-        yield whole
-        with whole.open("rb") as source, target.open("wb") as sink:
+        buffer = Path(folder) / f"whole{target.suffix}"
+        buffer.touch()
+        yield buffer
+        with buffer.open("rb") as source, target.open("wb") as sink:
             shutil.copyfileobj(source, sink)
 
 
@@ -141,27 +143,24 @@ def is_temporary(name: str) -> bool:
 
 
 def remove_abandoned(folder: Path) -> None:
-    """Remove what processes that were killed left in a folder while they wrote; of other machines, what is a
-    day old."""
+    """Remove what killed processes left in a folder; of other machines and on Windows, what is a day old."""
     with suppress(OSError), os.scandir(folder) as entries:
         for entry in entries:
-            found = _TEMPORARY.fullmatch(entry.name)
-            if found is None or entry.is_symlink():
-                continue
+            name = _TEMPORARY.fullmatch(entry.name)
             with suppress(OSError):
-                if found["host"] == _HOST and sys.platform != "win32":
-                    abandoned = not _is_running(int(found["process"]))
-                else:
-                    abandoned = time.time() - entry.stat(follow_symlinks=False).st_mtime > _A_DAY
-                if abandoned and entry.is_dir(follow_symlinks=False):
+                if name is None or entry.is_symlink() or _is_in_use(name, entry):
+                    continue
+                if entry.is_dir():
                     shutil.rmtree(entry.path, ignore_errors=True)
-                elif abandoned and entry.is_file(follow_symlinks=False):
+                elif entry.is_file():
                     os.unlink(entry.path)
 
 
-def _is_running(process: int) -> bool:
+def _is_in_use(name: re.Match[str], entry: os.DirEntry[str]) -> bool:
+    if name["host"] != _HOST or sys.platform == "win32":
+        return time.time() - entry.stat().st_mtime <= _A_DAY
     try:
-        os.kill(process, 0)
+        os.kill(int(name["process"]), 0)
     except ProcessLookupError:
         return False
     except (PermissionError, OverflowError):
@@ -235,3 +234,100 @@ def open_error(path: str | os.PathLike[str], error: OSError | ValueError) -> Pro
     if isinstance(error, IsADirectoryError) or Path(path).is_dir():
         return ProgdfError(f"{path} is a folder; give the name of a file in it")
     return ProgdfError(f"{path} cannot be read ({error.strerror or error}); check its permissions")
+
+
+LOCK = "run.lock"
+"""Of the folder of a training, locked while it is trained."""
+
+_NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.ENOTSUP, errno.EOPNOTSUPP)
+"""Said by file systems that have none."""
+
+
+class LockedError(ProgdfError):
+    """Another process holds the lock."""
+
+
+@contextmanager
+def hold_lock(path: Path, wait_s: float = 0.0) -> Iterator[None]:
+    """Hold the lock of this file meanwhile. The file alone means nothing: it stays, and a copy is not locked.
+
+    Args:
+        path: the file; made where there is none, in a folder that exists
+        wait_s: how long to wait for another process
+
+    Raises:
+        LockedError: another process holds it.
+        ProgdfError: it cannot be made or written. A file system without locks is none of this: nothing is
+            held then.
+    """
+    from filelock import FileLock, Timeout  # asyncio, which most commands do without
+
+    if path.is_symlink():
+        raise ProgdfError(f"{path} is a link, which is not followed; remove the link")
+    if os.path.isfile(path) and not os.access(path, os.W_OK):
+        with suppress(OSError):
+            path.chmod(0o644)  # a copy of one from a read-only place
+    lock = FileLock(path)
+    try:
+        lock.acquire(timeout=wait_s)
+    except Timeout:
+        raise LockedError(f"{path} is locked by another process; wait for it") from None
+    except NotImplementedError:  # filelock before 4, for ENOSYS
+        pass
+    except OSError as error:
+        if error.errno not in _NO_LOCKS:
+            raise write_error(path, error) from error
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def is_locked(path: Path) -> bool:
+    """Whether a process holds the lock of this file; nothing is written where there is none."""
+    if not os.path.isfile(path):  # nor where it may not be looked at
+        return False
+    try:
+        with hold_lock(path):
+            return False
+    except LockedError:
+        return True
+    except ProgdfError:  # who cannot write here cannot hold it either
+        return False
+
+
+def cache_folder() -> Path:
+    """For what can be made again: %LOCALAPPDATA%, ~/Library/Caches or $XDG_CACHE_HOME."""
+    return _folder(user_cache_path("progdf", appauthor=False, opinion=False))
+
+
+def state_folder() -> Path:
+    """For what is remembered from one time to the next: %LOCALAPPDATA%, ~/Library or $XDG_STATE_HOME."""
+    return _folder(user_state_path("progdf", appauthor=False))
+
+
+def pictures_folder() -> Path:
+    """The user's own pictures, as the desktop calls the folder."""
+    return _folder(user_pictures_path())
+
+
+def temporary_folder() -> Path:
+    """One of the user's own where temporary files are, for who has no home or may not write there."""
+    who = str(os.getuid()) if hasattr(os, "getuid") else getpass.getuser()
+    return Path(tempfile.gettempdir()) / f"progdf-{who}"
+
+
+def is_private(folder: Path) -> bool:
+    """Whether nobody but the user could have put something into a folder."""
+    if sys.platform == "win32":
+        return True
+    status = folder.lstat()
+    return status.st_uid == os.getuid() and not folder.is_symlink() and not status.st_mode & 0o022
+
+
+def _folder(path: Path) -> Path:
+    try:
+        Path.home()
+    except RuntimeError:  # no HOME, and the system does not know the user
+        return temporary_folder()
+    return path

@@ -56,9 +56,9 @@ class _Image(msgspec.Struct):
 
 def find_model(folder: Path) -> Path | None:
     """The sparse model in a folder: itself, sparse/0, sparse, 0 or colmap/sparse/0; None where none is."""
-    for place in _PLACES:
-        if _suffix(folder / place):
-            return folder / place
+    for name in _PLACES:
+        if _suffix(folder / name):
+            return folder / name
     return None
 
 

@@ -27,8 +27,8 @@ def main(folder: str, memory: int, seconds: int) -> None:
             resource.setrlimit(resource.RLIMIT_AS, (most, most))
         resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    found = pycolmap.Reconstruction(folder)
-    images = [image for _, image in sorted(found.images.items()) if image.has_pose]
+    model = pycolmap.Reconstruction(folder)
+    images = [image for _, image in sorted(model.images.items()) if image.has_pose]
     table = [
         {
             "name": image.name,

@@ -1,4 +1,4 @@
-"""Contact sheets: pictures in a grid, with words at the rows and columns that can be read at any size."""
+"""Pictures as files: read upright in 8 bits, written whole; and contact sheets of them."""
 
 from __future__ import annotations
 
@@ -22,6 +22,208 @@ from .atomic import atomic_write, check_regular, make_folder
 
 _PAPER, _INK, _PALE_INK = (250, 249, 246), (38, 36, 34), (118, 113, 107)
 _Font = ImageFont.FreeTypeFont | ImageFont.ImageFont
+
+FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "GIF")
+"""Pictures that are read; others of Pillow's many formats are programs, or need one."""
+
+MOST_PIXELS = 1 << 26
+"""67 million, more than cameras have: a picture of a few kilobytes can claim billions."""
+
+
+_TURNS = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_270,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_90,
+}
+"""What puts a picture upright, by its EXIF orientation; from 5 on width and height change places."""
+
+_BYTES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "RGBa", "CMYK", "YCbCr", "HSV")
+"""Pillow's modes of 8 bits a channel, or less."""
+
+_BITS, _INTERPRETATION, _WHITE_IS_ZERO = 258, 262, 0  # tags of TIFF
+
+
+def open_picture(
+    path: str | os.PathLike[str], proportions: tuple[int, int] | None = None, calibrated: bool = False
+) -> Image.Image:
+    """A picture from a file, upright, in any mode of 8 bits a channel, any size up to `MOST_PIXELS`.
+
+    Args:
+        path: the file
+        proportions: width and height of which it must be a multiple (to 2 %); found out before it is unpacked
+        calibrated: it is a photograph of a camera whose pixels are known: what is stored turned is refused
+
+    Raises:
+        ProgdfError: it is missing, no picture, too large, of other proportions, or its numbers have no white.
+    """
+    with _open(path) as picture:
+        stored = _orientation(picture)
+        _check_proportions(path, _upright_size(picture, stored), proportions)
+        picture.load()
+        # Pillow turns a .tiff itself; a .png may say how it is stored behind its pixels
+        turn = _orientation(picture, loaded=True)
+        if calibrated and (stored > 1 or turn > 1):
+            raise _turned(path, max(stored, turn))
+        upright = _to_bytes(path, picture)
+        upright = upright.transpose(_TURNS[turn]) if turn in _TURNS else upright.copy()
+        _check_proportions(path, upright.size, proportions)
+        return upright
+
+
+def picture_size(path: str | os.PathLike[str], calibrated: bool = False) -> tuple[int, int]:
+    """Width and height of a picture that is upright. Arguments and errors are those of `open_picture`."""
+    with _open(path) as picture:
+        stored = _orientation(picture)
+        if calibrated and stored >= 5:
+            raise _turned(path, stored)
+        return _upright_size(picture, stored)
+
+
+def _orientation(picture: Image.Image, loaded: bool = False) -> int:
+    """The EXIF orientation, 1 (upright) to 8; of a .png that is not loaded only where it stands first."""
+    if isinstance(picture, PngImageFile) and not loaded and "exif" not in picture.info:
+        return 1  # Pillow would unpack it to look
+    orientation = picture.getexif().get(ExifTags.Base.Orientation)
+    return orientation if orientation in _TURNS else 1
+
+
+def _upright_size(picture: Image.Image, orientation: int) -> tuple[int, int]:
+    """Width and height once it is upright."""
+    # Pillow's own size of a .tiff is that of one version as stored, of another upright
+    tags = getattr(picture, "tag_v2", {})
+    width, height = int(tags.get(256, picture.width)), int(tags.get(257, picture.height))
+    return (height, width) if orientation >= 5 else (width, height)
+
+
+def _check_proportions(
+    path: str | os.PathLike[str], size: tuple[int, int], proportions: tuple[int, int] | None
+) -> None:
+    if proportions is not None and abs(size[0] * proportions[1] / (size[1] * proportions[0]) - 1) > 0.02:
+        raise ProgdfError(
+            f"{path} is {size[0]}x{size[1]} pixels, its view {proportions[0]}x{proportions[1]}; "
+            "keep the proportions of the original view"
+        )
+
+
+def _turned(path: str | os.PathLike[str], orientation: int) -> ProgdfError:
+    return ProgdfError(
+        f"{path} is stored turned (EXIF orientation {orientation}), and nothing says whether its camera was "
+        "calibrated before or after turning it; save it upright, without that tag"
+    )
+
+
+def _to_bytes(path: str | os.PathLike[str], picture: Image.Image) -> Image.Image:
+    """The picture in 8 bits a channel; Pillow's own conversion of 16 cuts all above 255."""
+    if picture.mode in _BYTES:
+        return picture
+    # Pillow had a mode of 32 bits for .png files of 16
+    if not picture.mode.startswith("I;16") and (picture.mode, picture.format) != ("I", "PNG"):
+        numbers = picture.mode in ("I", "F")
+        kind = (
+            "32-bit or floating-point numbers, which have no white" if numbers else f"{picture.mode} colors"
+        )
+        raise ProgdfError(f"{path} holds {kind}; save it in gray or RGB with 8 or 16 bits per channel")
+    stored, tags = np.asarray(picture), getattr(picture, "tag_v2", {})
+    shades = np.arange(1 << 16) / ((1 << tags.get(_BITS, (16,))[0]) - 1)
+    if tags.get(_INTERPRETATION) == _WHITE_IS_ZERO:
+        shades = 1.0 - shades
+    gray = Image.fromarray((shades.clip(0.0, 1.0) * 255.0).round().astype(np.uint8)[stored])
+    if isinstance(clear := picture.info.get("transparency"), int):
+        gray.putalpha(Image.fromarray(np.where(stored == clear, 0, 255).astype(np.uint8)))
+    return gray
+
+
+def picture_text(path: str | os.PathLike[str], key: str) -> str | None:
+    """A text that a .png carries under `key`, before its pixels or behind them; None where there is none.
+
+    Raises ProgdfError as `open_picture` does.
+    """
+    with _open(path) as picture:
+        if not isinstance(picture, PngImageFile):
+            return None
+        text = picture.text.get(key)
+        return None if text is None else str(text)
+
+
+def save_as(path: str | os.PathLike[str]) -> Callable[[Tensor], Tensor]:
+    """What saving leaves of an image [H,W,3] 0..1, in the way in which a file was saved: by a JPEG's tables
+    and subsampling, else in 8 bits. Raises ProgdfError as `open_picture` does."""
+    with _open(path) as picture:
+        lossy = isinstance(picture, JpegImageFile) and picture.mode == "RGB"
+        tables = dict(picture.quantization) if lossy else {}  # type: ignore[attr-defined]
+        sampling = get_sampling(picture) if lossy else 0
+
+    def save(image: Tensor) -> Tensor:
+        saved = to_picture(image)
+        if tables:
+            file = io.BytesIO()
+            saved.save(file, "JPEG", qtables=tables, subsampling=max(sampling, 0))
+            saved = Image.open(file)
+        return torch.from_numpy(np.asarray(saved, dtype=np.float32) / 255.0)
+
+    return save
+
+
+@contextmanager
+def _open(path: str | os.PathLike[str]) -> Iterator[Image.Image]:
+    check_regular(path)
+    try:
+        with warnings.catch_warnings():
+            # the limit here is lower than Pillow's; what is damaged is read or refused, not both
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            warnings.simplefilter("ignore", UserWarning)
+            with Image.open(path, formats=FORMATS) as opened:
+                width, height = opened.size
+                if width * height > MOST_PIXELS:
+                    raise ProgdfError(f"{path} has {width}x{height} pixels, too many; scale it down")
+                yield opened
+    except ProgdfError:
+        raise
+    except Exception as error:  # every format's reader raises its own when a file is damaged
+        reason = "it does not exist" if isinstance(error, FileNotFoundError) else type(error).__name__
+        raise ProgdfError(f"{path} cannot be read as a picture ({reason}); save it as PNG") from error
+
+
+def flatten_onto(picture: Image.Image, color: str, size: tuple[int, int] | None = None) -> Image.Image:
+    """The picture without transparency, on a paper of one color, scaled to `size`. RGB"""
+    if not picture.has_transparency_data:
+        plain = picture.convert("RGB")
+        return plain if size in (None, plain.size) else plain.resize(size, Image.Resampling.LANCZOS)
+    paper = Image.new("RGBA", picture.size, color)
+    paper.alpha_composite(picture.convert("RGBA"))
+    return flatten_onto(paper.convert("RGB"), color, size)
+
+
+def to_picture(image: Tensor) -> Image.Image:
+    """[H,W,3], 0..1 (what lies outside is cut) -> 8-bit picture, rounded."""
+    return Image.fromarray((image.detach().clamp(0, 1) * 255.0).round().to(torch.uint8).cpu().numpy())
+
+
+def write_image(path: str | os.PathLike[str], image: Tensor) -> None:
+    """Write an image [H,W,3], 0..1, in the format of the file's ending; the folder is made if need be."""
+    make_folder(Path(path).parent)
+    with atomic_write(path) as temporary_file:
+        # zlib's level 2 takes half the time of Pillow's own 6 for files 5 % larger
+        to_picture(image).save(temporary_file, compress_level=2)
+
+
+def read_picture(path: Path, size: tuple[int, int] | None = None, calibrated: bool = False) -> Tensor:
+    """Read a picture as [H,W,3] float32 0..1; transparency counts as white.
+
+    Args:
+        path: the file
+        size: width and height to scale to
+        calibrated: see `open_picture`
+
+    Raises:
+        ProgdfError: as `open_picture`, whose proportions are those of `size`.
+    """
+    picture = flatten_onto(open_picture(path, size, calibrated), "white", size)
+    return torch.from_numpy(np.asarray(picture, dtype=np.float32) / 255.0)
 
 
 def contact_sheet(
@@ -98,194 +300,6 @@ def contact_sheet(
     return torch.from_numpy(np.asarray(page, dtype=np.float32) / 255.0)
 
 
-FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "GIF")
-"""Pictures that are read; others of Pillow's many formats are programs, or need one."""
-
-MOST_PIXELS = 1 << 26
-"""67 million, more than cameras have: a picture of a few kilobytes can claim billions."""
-
-
-_TURNS = {
-    2: Image.Transpose.FLIP_LEFT_RIGHT,
-    3: Image.Transpose.ROTATE_180,
-    4: Image.Transpose.FLIP_TOP_BOTTOM,
-    5: Image.Transpose.TRANSPOSE,
-    6: Image.Transpose.ROTATE_270,
-    7: Image.Transpose.TRANSVERSE,
-    8: Image.Transpose.ROTATE_90,
-}
-"""What puts a picture upright, by its EXIF orientation; from 5 on width and height change places."""
-
-_BYTES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "RGBa", "CMYK", "YCbCr", "HSV")
-"""Pillow's modes of 8 bits a channel, or less."""
-
-_BITS, _INTERPRETATION, _WHITE_IS_ZERO = 258, 262, 0  # tags of TIFF
-
-
-def open_picture(
-    path: str | os.PathLike[str], proportions: tuple[int, int] | None = None, calibrated: bool = False
-) -> Image.Image:
-    """A picture from a file, upright, in any mode of 8 bits a channel, any size up to `MOST_PIXELS`.
-
-    Args:
-        path: the file
-        proportions: width and height of which it must be a multiple (to 2 %); found out before it is unpacked
-        calibrated: it is a photograph of a camera whose pixels are known: what is stored turned is refused
-
-    Raises:
-        ProgdfError: it is missing, no picture, too large, of other proportions, or its numbers have no white.
-    """
-    with _open(path) as picture:
-        stored = _orientation(picture)
-        _check_proportions(path, _upright_size(picture, stored), proportions)
-        picture.load()
-        # Pillow turns a .tiff itself; a .png may say how it is stored behind its pixels
-        turn = _orientation(picture, loaded=True)
-        if calibrated and (stored > 1 or turn > 1):
-            raise _turned(path, max(stored, turn))
-        upright = _to_bytes(path, picture)
-        upright = upright.transpose(_TURNS[turn]) if turn in _TURNS else upright.copy()
-        _check_proportions(path, upright.size, proportions)
-        return upright
-
-
-def picture_size(path: str | os.PathLike[str], calibrated: bool = False) -> tuple[int, int]:
-    """Width and height of a picture that is upright. Arguments and errors are those of `open_picture`."""
-    with _open(path) as picture:
-        stored = _orientation(picture)
-        if calibrated and stored >= 5:
-            raise _turned(path, stored)
-        return _upright_size(picture, stored)
-
-
-def _orientation(picture: Image.Image, loaded: bool = False) -> int:
-    """The EXIF orientation, 1 (upright) to 8; of a .png that is not loaded only where it stands first."""
-    if isinstance(picture, PngImageFile) and not loaded and "exif" not in picture.info:
-        return 1  # Pillow would unpack it to look
-    found = picture.getexif().get(ExifTags.Base.Orientation)
-    return found if found in _TURNS else 1
-
-
-def _upright_size(picture: Image.Image, orientation: int) -> tuple[int, int]:
-    """Width and height once it is upright."""
-    # Pillow's own size of a .tiff is that of one version as stored, of another upright
-    tags = getattr(picture, "tag_v2", {})
-    width, height = int(tags.get(256, picture.width)), int(tags.get(257, picture.height))
-    return (height, width) if orientation >= 5 else (width, height)
-
-
-def _check_proportions(
-    path: str | os.PathLike[str], size: tuple[int, int], proportions: tuple[int, int] | None
-) -> None:
-    if proportions is not None and abs(size[0] * proportions[1] / (size[1] * proportions[0]) - 1) > 0.02:
-        raise ProgdfError(
-            f"{path} is {size[0]}x{size[1]} pixels, its view {proportions[0]}x{proportions[1]}; "
-            "keep the proportions of the original view"
-        )
-
-
-def _turned(path: str | os.PathLike[str], orientation: int) -> ProgdfError:
-    return ProgdfError(
-        f"{path} is stored turned (EXIF orientation {orientation}), and nothing says whether its camera was "
-        "calibrated before or after turning it; save it upright, without that tag"
-    )
-
-
-def _to_bytes(path: str | os.PathLike[str], picture: Image.Image) -> Image.Image:
-    """The picture in 8 bits a channel; Pillow's own conversion of 16 cuts all above 255."""
-    if picture.mode in _BYTES:
-        return picture
-    # Pillow had a mode of 32 bits for .png files of 16
-    if not picture.mode.startswith("I;16") and (picture.mode, picture.format) != ("I", "PNG"):
-        numbers = picture.mode in ("I", "F")
-        kind = (
-            "32-bit or floating-point numbers, which have no white" if numbers else f"{picture.mode} colors"
-        )
-        raise ProgdfError(f"{path} holds {kind}; save it in gray or RGB with 8 or 16 bits per channel")
-    stored, tags = np.asarray(picture), getattr(picture, "tag_v2", {})
-    shades = np.arange(1 << 16) / ((1 << tags.get(_BITS, (16,))[0]) - 1)
-    if tags.get(_INTERPRETATION) == _WHITE_IS_ZERO:
-        shades = 1.0 - shades
-    gray = Image.fromarray((shades.clip(0.0, 1.0) * 255.0).round().astype(np.uint8)[stored])
-    if isinstance(clear := picture.info.get("transparency"), int):
-        gray.putalpha(Image.fromarray(np.where(stored == clear, 0, 255).astype(np.uint8)))
-    return gray
-
-
-def picture_text(path: str | os.PathLike[str], key: str) -> str | None:
-    """A text that a .png carries under `key`, before its pixels or behind them; None where there is none.
-
-    Raises ProgdfError as `open_picture` does.
-    """
-    with _open(path) as picture:
-        if not isinstance(picture, PngImageFile):
-            return None
-        found = picture.text.get(key)
-        return None if found is None else str(found)
-
-
-def save_as(path: str | os.PathLike[str]) -> Callable[[Tensor], Tensor]:
-    """What saving leaves of an image [H,W,3] 0..1, in the way in which a file was saved: by a JPEG's tables
-    and subsampling, else in 8 bits. Raises ProgdfError as `open_picture` does."""
-    with _open(path) as picture:
-        lossy = isinstance(picture, JpegImageFile) and picture.mode == "RGB"
-        tables = dict(picture.quantization) if lossy else {}  # type: ignore[attr-defined]
-        sampling = get_sampling(picture) if lossy else 0
-
-    def save(image: Tensor) -> Tensor:
-        saved = to_picture(image)
-        if tables:
-            file = io.BytesIO()
-            saved.save(file, "JPEG", qtables=tables, subsampling=max(sampling, 0))
-            saved = Image.open(file)
-        return torch.from_numpy(np.asarray(saved, dtype=np.float32) / 255.0)
-
-    return save
-
-
-@contextmanager
-def _open(path: str | os.PathLike[str]) -> Iterator[Image.Image]:
-    check_regular(path)
-    try:
-        with warnings.catch_warnings():
-            # the limit here is lower than Pillow's; what is damaged is read or refused, not both
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            warnings.simplefilter("ignore", UserWarning)
-            with Image.open(path, formats=FORMATS) as opened:
-                width, height = opened.size
-                if width * height > MOST_PIXELS:
-                    raise ProgdfError(f"{path} has {width}x{height} pixels, too many; scale it down")
-                yield opened
-    except ProgdfError:
-        raise
-    except Exception as error:  # every format's reader raises its own when a file is damaged
-        reason = "it does not exist" if isinstance(error, FileNotFoundError) else type(error).__name__
-        raise ProgdfError(f"{path} cannot be read as a picture ({reason}); save it as PNG") from error
-
-
-def flatten_onto(picture: Image.Image, color: str, size: tuple[int, int] | None = None) -> Image.Image:
-    """The picture without transparency, on a paper of one color, scaled to `size`. RGB"""
-    if not picture.has_transparency_data:
-        plain = picture.convert("RGB")
-        return plain if size in (None, plain.size) else plain.resize(size, Image.Resampling.LANCZOS)
-    paper = Image.new("RGBA", picture.size, color)
-    paper.alpha_composite(picture.convert("RGBA"))
-    return flatten_onto(paper.convert("RGB"), color, size)
-
-
-def to_picture(image: Tensor) -> Image.Image:
-    """[H,W,3], 0..1 (what lies outside is cut) -> 8-bit picture, rounded."""
-    return Image.fromarray((image.detach().clamp(0, 1) * 255.0).round().to(torch.uint8).cpu().numpy())
-
-
-def write_image(path: str | os.PathLike[str], image: Tensor) -> None:
-    """Write an image [H,W,3], 0..1, in the format of the file's ending; the folder is made if need be."""
-    make_folder(Path(path).parent)
-    with atomic_write(path) as temporary_file:
-        # zlib's level 2 takes half the time of Pillow's own 6 for files 5 % larger
-        to_picture(image).save(temporary_file, compress_level=2)
-
-
 def _font(size: int) -> _Font:
     return ImageFont.load_default(size=size)
 
@@ -296,18 +310,3 @@ def _label_width(label: str, font: _Font, small: _Font) -> int:
 
 def _width(line: str, font: _Font) -> int:
     return round(font.getlength(line))
-
-
-def read_picture(path: Path, size: tuple[int, int] | None = None, calibrated: bool = False) -> Tensor:
-    """Read a picture as [H,W,3] float32 0..1; transparency counts as white.
-
-    Args:
-        path: the file
-        size: width and height to scale to
-        calibrated: see `open_picture`
-
-    Raises:
-        ProgdfError: as `open_picture`, whose proportions are those of `size`.
-    """
-    picture = flatten_onto(open_picture(path, size, calibrated), "white", size)
-    return torch.from_numpy(np.asarray(picture, dtype=np.float32) / 255.0)

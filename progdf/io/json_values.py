@@ -56,12 +56,12 @@ def convert_json(value: object, kind: type[_T], closed: bool = False) -> _T:
         ValueError: it is something else; the message says where, what was found and what was expected.
     """
     try:
-        found = msgspec.convert(value, kind, dec_hook=_path)
+        converted = msgspec.convert(value, kind, dec_hook=_path)
     except msgspec.ValidationError as error:
         raise ValueError(_explain(str(error), value)) from None
     if closed:
-        _refuse_unknown(value, plain(found), "")
-    return found
+        _refuse_unknown(value, plain(converted), "")
+    return converted
 
 
 def read_json(path: Path, kind: type[_T]) -> _T:
@@ -129,12 +129,12 @@ def _check(value: object, depth: int) -> None:
 
 def _explain(text: str, value: Any) -> str:
     """An error of msgspec's that begins with the place's name and what is there."""
-    text, _, place = text.replace("`", "").partition(" - at $")
-    for name, index in re.findall(r"\.([^.\[]+)|\[(\d+)\]", place.partition("[...")[0]):
+    text, _, where = text.replace("`", "").partition(" - at $")
+    for name, index in re.findall(r"\.([^.\[]+)|\[(\d+)\]", where.partition("[...")[0]):
         value = value[name or int(index)]
     text = re.sub(r"str matching regex '\^(\(.*\)).*'", r"one of \1", text[0].lower() + text[1:])
     text = text.replace("float that's a multiple of 1.0", "a whole number")
-    at = place.removeprefix(".") or "it"
+    at = where.removeprefix(".") or "it"
     return f"{at} is {value!r:.40}, {text}" if text.startswith("expected") else f"{at}: {text}"
 
 
@@ -145,5 +145,5 @@ def _refuse_unknown(value: Any, known: Any, at: str) -> None:
                 raise ValueError(f"{at}{key} is unknown")
             _refuse_unknown(part, known[key], f"{at}{key}.")
     elif isinstance(value, list):
-        for i, (part, own) in enumerate(zip(value, known, strict=True)):
-            _refuse_unknown(part, own, f"{at[:-1]}[{i}].")
+        for i, (part, item) in enumerate(zip(value, known, strict=True)):
+            _refuse_unknown(part, item, f"{at[:-1]}[{i}].")

@@ -38,15 +38,10 @@ _LARGEST = 64 << 20  # bytes; a session is a few kilobytes, painted strengths a 
 
 
 class FileRef(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A file that a session needs.
+    """A file that a session needs."""
 
-    Args:
-        file: as written, with forward slashes; relative to the session's folder
-        sha256: of the file's bytes, lower-case hexadecimal
-    """
-
-    file: str
-    sha256: str
+    file: str  # as written, with forward slashes; relative to the session's folder
+    sha256: str  # of the file's bytes, lower-case hexadecimal
 
     def __post_init__(self) -> None:
         if not self.file or "\0" in self.file:
@@ -58,19 +53,12 @@ class FileRef(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class SessionFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a session file holds, its state as plain JSON values.
+    """What a session file holds, its state as plain JSON values."""
 
-    Args:
-        scene: the .ply
-        edits: the .gdf files, in the order in which layers count them
-        view: the state on screen
-        snapshots: states that were kept
-    """
-
-    scene: FileRef
-    edits: tuple[FileRef, ...] = ()
-    view: dict[str, Any] = {}
-    snapshots: tuple[dict[str, Any], ...] = ()
+    scene: FileRef  # the .ply
+    edits: tuple[FileRef, ...] = ()  # the .gdf files, in the order in which layers count them
+    view: dict[str, Any] = {}  # the state on screen
+    snapshots: tuple[dict[str, Any], ...] = ()  # states that were kept
 
 
 File = TypeVar("File", bound=SessionFile)
@@ -82,11 +70,11 @@ def relative_name(path: Path, folder: Path) -> str:
     Raises:
         ProgdfError: its name is not UTF-8, which JSON cannot hold.
     """
-    whole = path.resolve()
+    resolved = path.resolve()
     try:
-        name = os.path.relpath(whole, folder.resolve())
+        name = os.path.relpath(resolved, folder.resolve())
     except ValueError:  # another drive
-        name = str(whole)
+        name = str(resolved)
     try:
         name.encode()
     except UnicodeEncodeError:
@@ -111,7 +99,7 @@ def write_session(path: Path, session: SessionFile) -> None:
     """
     text = json.dumps({MARK: VERSION} | plain(session), indent=2, ensure_ascii=False, allow_nan=False)
     # short lists of numbers on one line; a text holds no line break of its own, so none is hit
-    text = re.sub(r"\[\n\s+([^\[\]{}\"]*?)\n\s+\]", lambda found: f"[{' '.join(found[1].split())}]", text)
+    text = re.sub(r"\[\n\s+([^\[\]{}\"]*?)\n\s+\]", lambda match: f"[{' '.join(match[1].split())}]", text)
     with atomic_write(path) as temporary_file:
         temporary_file.write_text(text + "\n", encoding="utf-8")
 
@@ -153,7 +141,7 @@ def verify_files(path: Path, session: SessionFile) -> tuple[Path, tuple[Path, ..
     Raises:
         ProgdfError: one is missing or has changed.
     """
-    found = []
+    files = []
     for ref in (session.scene, *session.edits):
         folder = path.resolve().parent
         file, beside = ref.path(folder), folder / PureWindowsPath(ref.file).name
@@ -168,8 +156,8 @@ def verify_files(path: Path, session: SessionFile) -> tuple[Path, tuple[Path, ..
                 f"{path.name} was saved with another {file.name} than {file} holds now; "
                 "put that file back or save a new session"
             )
-        found.append(file)
-    return found[0], tuple(found[1:])
+        files.append(file)
+    return files[0], tuple(files[1:])
 
 
 def sha256(path: Path) -> str:

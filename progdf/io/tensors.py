@@ -1,20 +1,29 @@
-"""Safetensors files whose bytes depend on what is in them and on nothing else.
+"""Files of numbers: safetensors whose bytes depend on what is in them alone, and .npy.
 
-The library writes several metadata in an order that differs from run to run, so all of them are one JSON text
-in one key. It knows nothing of damaged numbers: a checksum of everything may be among the metadata.
+The safetensors library writes several metadata in an order that differs from run to run, so all of them are
+one JSON text in one key. It knows nothing of damaged numbers: a checksum may be among the metadata.
 """
 
 from __future__ import annotations
 
+import io
+import os
 import zlib
 from collections.abc import Collection, Mapping
 from pathlib import Path
+from typing import Any
 
 import msgspec
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from safetensors import safe_open
 from safetensors.numpy import save
 from torch import Tensor
+
+from progdf.errors import ProgdfError
+
+from .atomic import atomic_write, check_regular, open_error
 
 METADATA = "progdf"
 """The one key of a file's metadata."""
@@ -43,17 +52,14 @@ def table_of(tensors: Mapping[str, Tensor]) -> dict[str, tuple[tuple[int, ...], 
 
 
 def write_tensors(
-    path: Path,
-    tensors: Mapping[str, Tensor],
-    metadata: Mapping[str, str | msgspec.Raw],
-    checksum: bool = False,
+    path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str], checksum: bool = False
 ) -> None:
     """Write a safetensors file.
 
     Args:
         path: where to; see `atomic.atomic_write` for a file that is whole or absent
         tensors: by name, of the types in the table above; on the CPU
-        metadata: texts, or JSON as it is, by name
+        metadata: texts by name
         checksum: add one of everything, which `read_tensors` compares
 
     Raises:
@@ -62,13 +68,9 @@ def write_tensors(
     """
     if checksum:
         metadata = {**metadata, _CHECKSUM: _checksum(metadata, tensors)}
+    text = msgspec.json.encode(dict(sorted(metadata.items()))).decode()
     arrays = {name: tensor.detach().contiguous().numpy() for name, tensor in tensors.items()}
-    path.write_bytes(save(arrays, pack_metadata(metadata)))
-
-
-def pack_metadata(metadata: Mapping[str, str | msgspec.Raw]) -> dict[str, str]:
-    """Texts, or JSON as it is, by name, as the one text that a file's metadata have."""
-    return {METADATA: msgspec.json.encode(dict(sorted(metadata.items()))).decode()}
+    path.write_bytes(save(arrays, {METADATA: text}))
 
 
 def read_tensors(path: Path, names: Collection[str] = ()) -> tuple[dict[str, Tensor], dict[str, str]]:
@@ -101,3 +103,39 @@ def _checksum(metadata: Mapping[str, object], tensors: Mapping[str, Tensor]) -> 
             tensors[name].detach().contiguous().reshape(-1).view(torch.uint8).numpy().data, sum_
         )
     return f"{sum_:08x}"
+
+
+def open_npy(path: str | os.PathLike[str], what: str = "numbers") -> NDArray[Any]:
+    """The array of a .npy file, of whole numbers, fractions or bools; its bytes are read when they are used.
+
+    Args:
+        path: the file
+        what: its numbers are, for the message
+
+    Raises:
+        ProgdfError: no such file, or none that `numpy.save` wrote of numbers.
+    """
+    check_regular(path)
+    try:
+        array: NDArray[Any] = np.lib.format.open_memmap(path, mode="r")
+    except OSError as error:
+        raise open_error(path, error) from None
+    except Exception:  # numpy reads the header as a Python literal, and raises whatever that raises
+        raise ProgdfError(
+            f"{path} is not a readable .npy file of {what}; save them with numpy.save"
+        ) from None
+    if array.dtype.kind not in "fiub":
+        raise ProgdfError(f"{path} holds {array.dtype.name}, not {what}; save them with numpy.save")
+    return array
+
+
+def save_npy(path: str | os.PathLike[str], array: NDArray[Any]) -> None:
+    """Write an array, whole or not at all.
+
+    Raises:
+        ProgdfError: see `atomic_write`.
+    """
+    stored = io.BytesIO()
+    np.save(stored, array)
+    with atomic_write(path) as temporary_file:
+        temporary_file.write_bytes(stored.getvalue())

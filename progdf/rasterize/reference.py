@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from progdf.camera import Camera
-from progdf.gaussians import normalize_quats
+from progdf.quaternions import normalize_quats, rotation_matrices
 from progdf.sh import shade
 
 from .conventions import (
@@ -284,14 +284,3 @@ def simplify(
         rgb = shade(view.sh_degree, direction, rgb)
     found = ActivatedGaussians(means[rows], quats[rows], sizes, opacity, rgb)
     return found.each(Tensor.float), rows
-
-
-def rotation_matrices(unit_quats: Tensor) -> Tensor:
-    """Rotation matrices of unit quaternions wxyz. [N,4] -> [N,3,3]"""
-    w, x, y, z = unit_quats.unbind(1)
-    entries = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    return torch.stack(entries, dim=1).reshape(-1, 3, 3)

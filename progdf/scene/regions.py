@@ -32,10 +32,9 @@ from torch import Tensor
 from progdf.camera import Camera
 from progdf.color.oklab import srgb_to_oklab
 from progdf.errors import ProgdfError
-from progdf.formats.load_report import format_count, format_place
 from progdf.gaussians import ZERO, Gaussians
 from progdf.io.cameras import read_camera
-from progdf.io.npy import open_npy
+from progdf.io.tensors import open_npy
 from progdf.region import (
     Region,
     difference,
@@ -47,6 +46,7 @@ from progdf.region import (
     union,
     whole_scene,
 )
+from progdf.terminal import format_count, format_place
 
 from .neighbors import Neighborhood, grow_along_surface
 from .selection import (

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import torch
 
-from progdf.formats.load_report import format_place
 from progdf.gaussians import Gaussians
+from progdf.terminal import format_place
 
 from .bounds import is_surrounding, scene_sphere
 from .up_axis import UpAxis, find_up

@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from progdf.camera import Camera
-from progdf.formats.load_report import format_count, group_digits
 from progdf.gaussians import Gaussians
 from progdf.metrics.image import decibels
+from progdf.quaternions import rotation_matrices
 from progdf.rasterize.cpu.parallel import threads
 from progdf.rasterize.engines import render
-from progdf.rasterize.reference import rotation_matrices
+from progdf.terminal import format_count, group_digits
 
 from .orbit_rig import orbit_rig
 

@@ -8,18 +8,18 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from progdf.camera import Camera
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import fingerprint
-from progdf.io.atomic import atomic_write
+from progdf.io.atomic import atomic_write, state_folder
 from progdf.io.cameras import cameras_beside
 from progdf.io.json_values import decode_json
-from progdf.io.user_folders import state_folder
 
 from .bounds import drop_background, front_direction, long_axes, normals_of, scene_sphere
 
@@ -60,9 +60,6 @@ def _read() -> dict[str, object]:
 def _place() -> Path:
     return state_folder() / "up_axes.json"
 
-
-if TYPE_CHECKING:
-    from progdf.camera import Camera
 
 Axis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
 UpChoice = Literal["auto", "+x", "-x", "+y", "-y", "+z", "-z"]

@@ -34,7 +34,7 @@ def run(*arguments: str) -> None:
 
 def commands() -> None:
     run("info", "bear.ply")
-    run("check", "bear.ply")
+    run("info", "bear.ply")
     run("render", "bear.ply", "--size=64x48", "--engine=cpu", "--out=a.png")
     run("train", "bear.ply", "--out=run", f"--region={EARS}", *TRAIN)
     run("info", "run/run.gdf")

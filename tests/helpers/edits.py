@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from progdf.field import BakedField, fit_separable
-from progdf.field.rendered import Render
+from progdf.field.choose import Render
 from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians, attribute_slices
 from progdf.gdf.file import Gdf, fingerprint
 from progdf.region import Region
@@ -42,11 +42,11 @@ def curved_field(
     channels: int = BASE_CHANNELS,
     moving: Collection[str] = ATTRIBUTES,
     rank: int = 2,
-    rest_type: torch.dtype = torch.int8,
+    basis_type: torch.dtype = torch.int8,
 ) -> BakedField:
     """A separable field of `curved_trajectory`."""
     strengths, offsets = curved_trajectory(members, seed, channels, moving)
-    return fit_separable(strengths, offsets, dict.fromkeys(ATTRIBUTES, rank), rest_type=rest_type)
+    return fit_separable(strengths, offsets, dict.fromkeys(ATTRIBUTES, rank), basis_type=basis_type)
 
 
 def at_snapshots(field: BakedField, strengths: Tensor) -> Tensor:

@@ -30,7 +30,7 @@ from progdf.gdf.file import load_gdf, save_gdf
 from progdf.io.cameras import load_cameras, save_cameras
 from progdf.io.images import read_picture
 from progdf.io.json_values import plain
-from progdf.io.npy import open_npy
+from progdf.io.tensors import open_npy
 from tests.helpers.edits import curved_field, edit_of, some_rows
 from tests.helpers.fuzz_changes import Change, changed_bytes, changed_gdf, changed_json, changed_parts
 from tests.helpers.fuzz_folders import COSTLY, more_inputs

@@ -12,8 +12,8 @@ from typing import Any
 import safetensors.torch
 import torch
 
-from progdf.gdf.file import file_metadata
-from progdf.io.tensors import pack_metadata, write_tensors
+from progdf.gdf.header import checksum
+from progdf.io.tensors import write_tensors
 from tests.helpers.hostile import JSON_TEXTS
 
 VALUES: list[Any] = [
@@ -145,18 +145,29 @@ def changed_tensors(rng: random.Random, tensors: dict[str, torch.Tensor]) -> dic
     return tensors
 
 
+def header_of(content: bytes) -> Any:
+    """The JSON header of a .gdf file, its checksum left out."""
+    size = int.from_bytes(content[:8], "little")
+    return json.loads(json.loads(content[8 : 8 + size])["__metadata__"]["progdf"]) | {"sha256": ""}
+
+
+def signed_gdf(header: Any, tensors: dict[str, torch.Tensor]) -> bytes:
+    """A .gdf file of these, its checksum made to fit: a wrong writer's."""
+    if isinstance(header, dict):
+        header = {**header, "sha256": checksum(json.dumps({**header, "sha256": ""}), tensors)}
+    return safetensors.torch.save(tensors, {"progdf": json.dumps(header)})
+
+
 def changed_gdf(content: bytes) -> Change:
     """An edit with another header or other tensors, signed as if progdf had written it."""
-    size = int.from_bytes(content[:8], "little")
-    header = json.loads(json.loads(content[8 : 8 + size])["__metadata__"]["progdf"])["header"]
+    header = header_of(content)
     tensors = safetensors.torch.load(content)
 
     def change(rng: random.Random, path: Path) -> None:
-        text = json.dumps(changed_value(rng, header) if rng.random() < 0.7 else header)
+        value = changed_value(rng, header) if rng.random() < 0.7 else header
         found = changed_tensors(rng, tensors) if rng.random() < 0.5 else tensors
         found = {name: tensor.contiguous() for name, tensor in found.items()}
-        metadata = pack_metadata(file_metadata(text, found))
-        path.write_bytes(safetensors.torch.save(found, metadata))
+        path.write_bytes(signed_gdf(value, found))
 
     return change
 

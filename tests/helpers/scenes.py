@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from progdf.camera import Camera, intrinsics, look_at
-from progdf.gaussians import Gaussians, normalize_quats
+from progdf.gaussians import Gaussians
+from progdf.quaternions import normalize_quats
 from tests.helpers.draws import Draws
 
 

@@ -11,8 +11,7 @@ import torch
 
 from progdf.__main__ import main
 from progdf.compose.reference import Layer, compose_layers
-from progdf.formats.ply import load_ply, load_ply_with_report, save_ply
-from progdf.formats.ply_file import read_header
+from progdf.formats.ply import load_ply, load_ply_with_report, read_header, save_ply
 from progdf.gaussians import Gaussians, pack
 from progdf.rasterize import alpha_weights, render
 from progdf.region import Region
@@ -61,7 +60,7 @@ def test_a_comment_says_that_a_scene_is_antialiased(tmp_path: Path, comment: byt
 
 def test_check_says_it_and_never_shows_a_comment(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = with_comment(tmp_path / "scene.ply", b"antialiased 1\ncomment \x1b]0;pwned\x07")
-    assert main(["check", str(path)]) == 0
+    assert main(["info", str(path)]) == 0
     said = capsys.readouterr().out
     assert "trained anti-aliased (mip), and drawn so" in said
     assert "\x1b" not in said

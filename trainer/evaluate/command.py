@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from progdf.errors import ProgdfError, print_line
+from progdf.errors import ProgdfError
 from progdf.io.atomic import make_folder
 from progdf.io.images import write_image
+from progdf.terminal import print_line
 from trainer.optimize.losses import Perceptual, perceptual_loss
 from trainer.pipeline.threads import use_threads
 from trainer.report.clip import Texts

@@ -11,9 +11,7 @@ import torch
 from torch import Tensor
 
 from progdf.field import BakedField, Candidate, FieldEvaluator, choose_field, fit_keyframes
-from progdf.field.choose import Kind
-from progdf.field.evaluate import SAMPLES
-from progdf.field.rendered import MOST_SNAPSHOTS
+from progdf.field.choose import MOST_SNAPSHOTS, SAMPLES, Kind
 from progdf.field.separable import moving_attributes
 from progdf.field.trajectory import Trajectory
 from progdf.gaussians import BASE_CHANNELS, Gaussians, attribute_slices
@@ -63,7 +61,7 @@ def fit_field(
         choosing: held-out views, which have the last word on the choice
         reporting: other held-out views, on which the chosen field's errors are taken
         weights: how visible each member is. [M]
-        kind: "auto" tries separable and keyframe fields, the others only their kind
+        kind: see `choose_field`
         target_psnr: dB; where none reaches it, the best is kept and `met` is false
         budget: bytes a member; the best field within it is kept, whatever the target is
     """
@@ -91,7 +89,7 @@ def expected_looks(trajectory: Trajectory, kind: Kind) -> int:
     """About how often `fit_field` looks at its views, for a progress bar."""
     snapshots = min(len(trajectory), MOST_SNAPSHOTS)
     moving = len(moving_attributes(trajectory.offsets))
-    ranks = snapshots if kind == "keyframes" else (1 + moving) * snapshots
+    ranks = 0 if kind == "keyframes" else (1 + moving) * snapshots
     candidates = 1 if kind == "lossless" else 6
     return ranks + SAMPLES * (3 + candidates + len(BASELINES))
 

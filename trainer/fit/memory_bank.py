@@ -16,8 +16,8 @@ from itertools import accumulate
 import torch
 from torch import Tensor
 
+from progdf.field.choose import Render, rendered_importance
 from progdf.field.neural_fit import NeuralFit, PictureLoss
-from progdf.field.rendered import Render, rendered_importance
 from progdf.field.separable import moving_attributes
 from progdf.interpolation import interpolate_at
 from trainer.store.state import Saved

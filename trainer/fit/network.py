@@ -14,11 +14,9 @@ from torch import Tensor
 
 from progdf.errors import ProgdfError
 from progdf.field import BakedField, NeuralSettings, bake_network
-from progdf.field.evaluate import FieldEvaluator
+from progdf.field.choose import FieldEvaluator, rendered_importance
 from progdf.field.neural import Bins, Inputs, NeuralShape, Size
-from progdf.field.neural_fit import EFFORT, NeuralFit
-from progdf.field.neural_training import train_network
-from progdf.field.rendered import rendered_importance
+from progdf.field.neural_fit import EFFORT, NeuralFit, train_network
 from progdf.field.separable import moving_attributes
 from progdf.field.trajectory import Trajectory
 from progdf.gaussians import BASE_CHANNELS, attribute_slices, pack

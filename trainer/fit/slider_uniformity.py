@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from progdf.field import BakedField
-from progdf.field.remap import SliderRemap, identity_remap, remap_slider
+from progdf.field.baked import SliderRemap, identity_remap, remap_slider
 from progdf.gaussians import BASE_CHANNELS, pack
 from progdf.interpolation import interpolate, interpolate_at
 from trainer.editors import COSTLY_DIAL, check_editor

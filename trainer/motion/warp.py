@@ -1,67 +1,146 @@
-"""Warps of a region: control points that shift, turn and stretch, and members that follow those near them.
+"""Warps of a region: control points that shift, turn and stretch, members that follow, and their search.
 
 Embedded deformation (Sumner, Schmid and Pauly 2007). Control point k takes what lies at x to
 A_k (x − c_k) + c_k + t_k with A_k = R_k exp(S_k); a member blends its nearest control points' maps by smooth
 weights, which do not change while it moves. So each member has one affine map of its own, x → J x + b, and
 what it learns besides is carried along and can be carried back.
+
+The search begins where parts that move as wholes have come, with few control points, then more. Neighboring
+ones are held to each other's motion, as rigidly as the views allow, so that what no view shows follows what
+they show.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
-from progdf.gaussians import BASE_CHANNELS, attribute_slices, normalize_quats
-
-from .control_points import ControlPoints
-from .similarity import (
-    Motion,
-    Parts,
+from progdf.gaussians import BASE_CHANNELS, attribute_slices
+from progdf.quaternions import (
     matrix_turns,
     multiply_quats,
-    quat_matrices,
+    normalize_quats,
     quat_turns,
-    rotate,
+    rotate_vectors,
     turn_quats,
 )
+from trainer.views.crops import CropScene
 
-_COLUMNS = attribute_slices(BASE_CHANNELS)
-_MOVING = slice(0, _COLUMNS["quats"].stop)  # means, log-scales and quaternions come first in a packed row
+from .parts import OnStep, descend, falling, mean_distance, view_distance
+from .similarity import (
+    GEOMETRY,
+    Motion,
+    Parts,
+    carry_look,
+    carry_offsets,
+    interpolate_motion,
+    local_offsets,
+    split_geometry,
+)
+
+LEVELS = (6, 18, 54)
+"""Control points of each level, coarse to fine."""
+
+_FOLLOWERS = 8  # members a control point has at least, in the mean
+_RATES = (0.04, 0.02, 0.015)  # a step of shift in spacings of the level, of turn in radians, of stretch
+_WIDE = 0.4  # share of the coarsest level's steps that see the pictures blurred only
+_RIGID = 0.05  # weight of what neighbors disagree by, squared, in squares of their spacing
+_STIFF = 0.002  # weight of the stretch, squared
+_DAMPING = 0.1  # see `descend`
+_NEAREST = 4  # control points that a member follows
+_LINKS = 6  # neighbors that a control point is held to
+_QUATS = attribute_slices(BASE_CHANNELS)["quats"]
 _SYMMETRIC = (0, 3, 4, 3, 1, 5, 4, 5, 2)  # where a stretch's numbers stand in its matrix, row by row
 
 
 @dataclass(frozen=True)
-class WarpMotion:
-    """What each of P control points does.
+class ControlPoints:
+    """Where a region is held, and who follows whom."""
+
+    rows: Tensor  # the members that lie there. [P] int64
+    points: Tensor  # their places. [P,3]
+    part: Tensor  # connected part each lies in. [P] int64
+    nearest: Tensor  # those that each member follows, of its own part. [M,K] int64
+    weights: Tensor  # how much, adding up to 1. [M,K]
+    links: Tensor  # pairs of neighbors, which are to move alike. [L,2] int64
+    spacing: float  # median distance of neighbors, world units, > 0
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+def make_control_points(means: Tensor, part: Tensor, count: int) -> ControlPoints:
+    """Spread control points over a region, farthest first; the same for the same means.
 
     Args:
-        shift: world units. [P,3]
-        turn: rotation vector, axis times angle in radians. [P,3]
-        stretch: logarithm of the stretch, applied before the turn: xx yy zz xy xz yz. [P,6]
+        means: centers of the members. [M,3]
+        part: connected part of each, see `connected_parts`. [M] int64
+        count: control points in all, at most one a member; parts share them by size, at least one each
     """
+    rows, part_of, links, begun = [], [], [], 0
+    nearest = torch.zeros(len(means), _NEAREST, dtype=torch.int64)
+    weights = torch.zeros(len(means), _NEAREST)
+    for index, size in enumerate(torch.bincount(part).tolist()):
+        mine = (part == index).nonzero()[:, 0]
+        points = min(size, max(1, round(count * size / len(means))))
+        chosen = mine[farthest_points(means[mine], points)]
+        near = min(_NEAREST, points)
+        distances = torch.cdist(means[mine], means[chosen])
+        neighbors = distances.topk(min(near + 1, points), dim=1, largest=False)
+        # down to zero at the next farther one, so that nothing jumps where one takes the place of another
+        reach = 1.01 * neighbors.values[:, -1:].clamp_min(1e-9)
+        share = (1 - neighbors.values[:, :near] / reach).clamp_min(1e-6).square()
+        nearest[mine, :near] = begun + neighbors.indices[:, :near]
+        weights[mine, :near] = share / share.sum(dim=1, keepdim=True)
+        around = min(_LINKS, points - 1)
+        spacings = torch.cdist(means[chosen], means[chosen])
+        others = spacings.topk(around + 1, dim=1, largest=False).indices[:, 1:]
+        ones = torch.arange(points)[:, None].expand_as(others)
+        links.append(begun + torch.stack([ones, others], dim=2).reshape(-1, 2))
+        rows.append(chosen)
+        part_of.append(torch.full((points,), index))
+        begun += points
+    at, pairs = torch.cat(rows), torch.cat(links)
+    gaps = (means[at[pairs[:, 0]]] - means[at[pairs[:, 1]]]).norm(dim=1)
+    alone = (means - means.mean(dim=0)).norm(dim=1)
+    spacing = float((gaps if len(gaps) else alone).median())
+    return ControlPoints(at, means[at], torch.cat(part_of), nearest, weights, pairs, max(spacing, 1e-9))
 
-    shift: Tensor
-    turn: Tensor
-    stretch: Tensor
+
+def farthest_points(means: Tensor, count: int) -> Tensor:
+    """Rows that lie far from each other: first the one farthest from the middle. [M,3] -> [count] int64"""
+    distance = (means - means.mean(dim=0)).square().sum(dim=1)
+    chosen = [int(distance.argmax())]
+    distance = (means - means[chosen[0]]).square().sum(dim=1)
+    for _ in range(count - 1):
+        chosen.append(int(distance.argmax()))
+        distance = torch.minimum(distance, (means - means[chosen[-1]]).square().sum(dim=1))
+    return torch.tensor(chosen)
+
+
+@dataclass(frozen=True)
+class WarpMotion:
+    """What each of P control points does."""
+
+    shift: Tensor  # world units. [P,3]
+    turn: Tensor  # rotation vector, axis times angle in radians. [P,3]
+    stretch: Tensor  # logarithm of the stretch, applied before the turn: xx yy zz xy xz yz. [P,6]
 
 
 @dataclass(frozen=True)
 class MemberMaps:
-    """Each member's own map x → J x + b, and how it turns and grows.
+    """Each member's own map x → J x + b, and how it turns and grows."""
 
-    Args:
-        matrix: J. [M,3,3]
-        shift: b. [M,3]
-        turn: unit quaternion. [M,4]
-        growth: of its log-scales, along its own axes. [M,3]
-    """
-
-    matrix: Tensor
-    shift: Tensor
-    turn: Tensor
-    growth: Tensor
+    matrix: Tensor  # J. [M,3,3]
+    shift: Tensor  # b. [M,3]
+    turn: Tensor  # unit quaternion. [M,4]
+    growth: Tensor  # of its log-scales, along its axes. [M,3]
 
     def carry(self, original: Tensor, offsets: Tensor) -> Tensor:
         """Offsets within the moved frames -> offsets from the original; differentiable.
@@ -73,26 +152,28 @@ class MemberMaps:
         Returns:
             Raw-space offsets; opacity's and color's are the given ones. [M,C]
         """
-        rows = original[:, _MOVING]
-        means, log_scales, quats = _split(rows + offsets[:, _MOVING])
+        rows = original[:, GEOMETRY]
+        means, log_scales, quats = split_geometry(rows + offsets[:, GEOMETRY])
         moved = [
             (self.matrix @ means[..., None])[..., 0] + self.shift,
             log_scales + self.growth,
             multiply_quats(self.turn, quats),
         ]
-        return torch.cat([torch.cat(moved, dim=1) - rows, offsets[:, _MOVING.stop :]], dim=1)
+        look = carry_look(original, offsets, self.turn)
+        return torch.cat([torch.cat(moved, dim=1) - rows, look], dim=1)
 
     def carry_back(self, original: Tensor, offsets: Tensor) -> Tensor:
         """The inverse of `carry`. [M,C] -> [M,C]"""
-        rows = original[:, _MOVING]
-        means, log_scales, quats = _split(rows + offsets[:, _MOVING])
+        rows = original[:, GEOMETRY]
+        means, log_scales, quats = split_geometry(rows + offsets[:, GEOMETRY])
         back = self.turn * self.turn.new_tensor([1.0, -1.0, -1.0, -1.0])
-        own = [
+        local = [
             torch.linalg.solve(self.matrix, (means - self.shift)[..., None])[..., 0],
             log_scales - self.growth,
             multiply_quats(back, quats),
         ]
-        return torch.cat([torch.cat(own, dim=1) - rows, offsets[:, _MOVING.stop :]], dim=1)
+        look = carry_look(original, offsets, back)
+        return torch.cat([torch.cat(local, dim=1) - rows, look], dim=1)
 
 
 def rest_warp(control: ControlPoints) -> WarpMotion:
@@ -106,7 +187,7 @@ def warp_of_parts(control: ControlPoints, parts: Parts, motion: Motion) -> WarpM
     part = control.part
     size, turn = motion.log_scale[part, None], motion.turn[part]
     arm = control.points - parts.centers[part]
-    moved = parts.centers[part] + motion.shift[part] + size.exp() * rotate(arm, turn_quats(turn))
+    moved = parts.centers[part] + motion.shift[part] + size.exp() * rotate_vectors(arm, turn_quats(turn))
     nothing = torch.zeros_like(size)
     return WarpMotion(moved - control.points, turn, torch.cat([size] * 3 + [nothing] * 3, dim=1))
 
@@ -126,7 +207,7 @@ def transfer_warp(control: ControlPoints, motion: WarpMotion, other: ControlPoin
 
 def affine_maps(control: ControlPoints, motion: WarpMotion) -> tuple[Tensor, Tensor]:
     """Each control point's own map x → A x + b: A [P,3,3], b [P,3]; differentiable."""
-    affine = quat_matrices(turn_quats(motion.turn)) @ _stretches(motion)
+    affine = _turned_axes(turn_quats(motion.turn)) @ _stretches(motion)
     return affine, motion.shift + control.points - (affine @ control.points[..., None])[..., 0]
 
 
@@ -139,7 +220,7 @@ def map_members(original: Tensor, control: ControlPoints, motion: WarpMotion) ->
     # not numbers[nearest], whose gradient is summed up by threads in any order
     followed = numbers.index_select(0, control.nearest.flatten()).view(*control.nearest.shape, -1)
     blended = (control.weights[..., None] * followed).sum(dim=1)
-    axes = quat_matrices(normalize_quats(original[:, _COLUMNS["quats"]]))
+    axes = _turned_axes(normalize_quats(original[:, _QUATS]))
     growth = (blended[:, 12:21].reshape(-1, 3, 3) @ axes).norm(dim=1).log()
     turn = torch.nn.functional.normalize(blended[:, 21:], dim=1)
     return MemberMaps(blended[:, :9].reshape(-1, 3, 3), blended[:, 9:12], turn, growth)
@@ -153,10 +234,10 @@ def warp_rows(original: Tensor, control: ControlPoints, motion: WarpMotion) -> T
 
 def interpolate_warp(a: WarpMotion, b: WarpMotion, share: float) -> WarpMotion:
     """The way from one motion to another: shift and stretch straight, turns along the great circle."""
-    rest = quat_turns(multiply_quats(turn_quats(-a.turn), turn_quats(b.turn)))
+    remaining = quat_turns(multiply_quats(turn_quats(-a.turn), turn_quats(b.turn)))
     return WarpMotion(
         torch.lerp(a.shift, b.shift, share),
-        quat_turns(multiply_quats(turn_quats(a.turn), turn_quats(share * rest))),
+        quat_turns(multiply_quats(turn_quats(a.turn), turn_quats(share * remaining))),
         torch.lerp(a.stretch, b.stretch, share),
     )
 
@@ -172,6 +253,186 @@ def _stretches(motion: WarpMotion) -> Tensor:
     return stretches
 
 
-def _split(rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Means [M,3], log-scales [M,3] and quaternions [M,4] of packed rows."""
-    return rows[:, _COLUMNS["means"]], rows[:, _COLUMNS["log_scales"]], rows[:, _COLUMNS["quats"]]
+def _turned_axes(quats: Tensor) -> Tensor:
+    """The axes of Gaussians, as columns. Unit quaternions [M,4] -> [M,3,3]"""
+    axes = torch.eye(3).to(quats)
+    return torch.stack([rotate_vectors(axis.expand(len(quats), 3), quats) for axis in axes], dim=2)
+
+
+@dataclass(frozen=True)
+class WarpSearch:
+    """What control points are fitted to, and how long."""
+
+    original: Tensor  # raw member rows. [M,C]
+    part: Tensor  # connected part of each member. [M] int64
+    crops: Sequence[CropScene]  # the training views
+    steps: int = 120  # of each level, each in one view
+    seed: int = 0  # of the order of the views
+
+    @cached_property
+    def levels(self) -> tuple[ControlPoints, ...]:
+        """Coarse to fine; the last are those of the motions that are found."""
+        means = self.original[:, attribute_slices(self.original.shape[1])["means"]]
+        counts = sorted({min(count, max(1, len(means) // _FOLLOWERS)) for count in LEVELS})
+        return tuple(make_control_points(means, self.part, count) for count in counts)
+
+    def find_first(
+        self, targets: Sequence[Tensor], start: WarpMotion, on_step: OnStep | None = None
+    ) -> WarpMotion:
+        """The motion that brings the views close to their targets, from a coarse one to a fine one.
+
+        Args:
+            targets: the edited box of each view. [h,w,3] each
+            start: of the coarsest control points
+            on_step: progress: steps done of one level; each counts from 1 again
+
+        Raises:
+            FloatingPointError: the loss is no longer finite.
+        """
+        motion = start
+        for level, control in enumerate(self.levels):
+            if level:
+                motion = transfer_warp(self.levels[level - 1], motion, control)
+            motion = self._descend(control, targets, motion, 0.0 if level else _WIDE, on_step)
+        return motion
+
+    def find_next(
+        self,
+        targets: Sequence[Tensor],
+        before: WarpMotion,
+        further: float,
+        on_step: OnStep | None = None,
+    ) -> WarpMotion:
+        """The same for a strength `further` times as large as that of the motion `before`."""
+        control = self.levels[-1]
+        start = min(
+            (before, extrapolate_warp(before, further)),
+            key=lambda motion: self.distance(targets, motion),
+        )
+        return self._descend(control, targets, start, 0.0, on_step)
+
+    def distance(self, targets: Sequence[Tensor], motion: WarpMotion) -> float:
+        """Mean distance of all views from their targets, at full sharpness and blurred."""
+        return mean_distance(self.crops, warp_rows(self.original, self.levels[-1], motion), targets)
+
+    def _descend(
+        self,
+        control: ControlPoints,
+        targets: Sequence[Tensor],
+        start: WarpMotion,
+        wide: float,
+        on_step: OnStep | None,
+    ) -> WarpMotion:
+        size = control.spacing
+        shift, turn, stretch = _RATES
+        rates = torch.tensor([shift] * 3 + [turn] * 3 + [stretch] * 6)
+        widening = round(wide * self.steps)
+
+        def motion_of(values: Tensor) -> WarpMotion:
+            return WarpMotion(values[:, :3] * size, values[:, 3:6], values[:, 6:])
+
+        def loss_in(values: Tensor, view: int, step: int) -> Tensor:
+            motion = motion_of(values)
+            rows = warp_rows(self.original, control, motion)
+            penalty = (
+                _RIGID * disagreement(control, motion) + _STIFF * motion.stretch.square().sum(dim=1).mean()
+            )
+            return view_distance(self.crops[view], rows, targets[view], wide=step < widening) + penalty
+
+        def rates_at(step: int) -> Tensor:
+            return falling(max(0, step - widening), self.steps - widening) * rates
+
+        values = torch.cat([start.shift / size, start.turn, start.stretch], dim=1)
+        settled = descend(
+            values, loss_in, rates_at, self.steps, len(self.crops), self.seed, _DAMPING, on_step
+        )
+        return motion_of(settled)
+
+
+def disagreement(control: ControlPoints, motion: WarpMotion) -> Tensor:
+    """How far from each other neighbors would take one another, mean square, in squares of their spacing."""
+    if not len(control.links):
+        return motion.shift.new_zeros(())
+    a, b = control.links.unbind(1)
+    affine, shift = affine_maps(control, motion)
+    goes = control.points + motion.shift
+    error = (affine[a] @ control.points[b][..., None])[..., 0] + shift[a] - goes[b]
+    return error.square().sum(dim=1).mean() / control.spacing**2
+
+
+class Placement(Protocol):
+    """A motion of all members of a region."""
+
+    def carry(self, original: Tensor, offsets: Tensor) -> Tensor:
+        """Offsets within the moved frames -> offsets from the original; differentiable. [M,C] -> [M,C]"""
+        ...
+
+    def carry_back(self, original: Tensor, offsets: Tensor) -> Tensor:
+        """The inverse of `carry`. [M,C] -> [M,C]"""
+        ...
+
+    def lines(self) -> list[str]:
+        """What the log says of it."""
+        ...
+
+
+@dataclass(frozen=True)
+class PartsPlacement:
+    """Parts that have moved as wholes."""
+
+    parts: Parts
+    motion: Motion
+
+    def carry(self, original: Tensor, offsets: Tensor) -> Tensor:
+        """See `Placement`."""
+        return carry_offsets(original, offsets, self.parts, self.motion)
+
+    def carry_back(self, original: Tensor, offsets: Tensor) -> Tensor:
+        """See `Placement`."""
+        return local_offsets(original, offsets, self.parts, self.motion)
+
+    def lines(self) -> list[str]:
+        """Where each part went, in its own sizes."""
+        motion, sizes = self.motion, self.parts.sizes
+        return [
+            f"part {index}, {int((self.parts.part == index).sum())} Gaussians: moved by "
+            f"{float(motion.shift[index].norm() / sizes[index]):.2f} of its size, turned by "
+            f"{math.degrees(float(motion.turn[index].norm())):.0f} degrees, "
+            f"{math.exp(float(motion.log_scale[index])):.2f} times as large"
+            for index in range(len(sizes))
+        ]
+
+
+@dataclass(frozen=True)
+class WarpPlacement:
+    """A region that was bent by control points."""
+
+    control: ControlPoints
+    motion: WarpMotion
+
+    def carry(self, original: Tensor, offsets: Tensor) -> Tensor:
+        """See `Placement`."""
+        return map_members(original, self.control, self.motion).carry(original, offsets)
+
+    def carry_back(self, original: Tensor, offsets: Tensor) -> Tensor:
+        """See `Placement`."""
+        return map_members(original, self.control, self.motion).carry_back(original, offsets)
+
+    def lines(self) -> list[str]:
+        """How far the control points went, in their spacings."""
+        shift = self.motion.shift.norm(dim=1) / self.control.spacing
+        turn, stretch = self.motion.turn.norm(dim=1), self.motion.stretch[:, :3]
+        return [
+            f"bent by {len(self.control)} control points: moved by up to {float(shift.max()):.2f} of their "
+            f"spacing, turned by up to {math.degrees(float(turn.max())):.0f} degrees, stretched "
+            f"{math.exp(float(stretch.min())):.2f} to {math.exp(float(stretch.max())):.2f} times"
+        ]
+
+
+def between(a: Placement, b: Placement, share: float) -> Placement:
+    """On the way from one placement to another of the same kind."""
+    if isinstance(a, PartsPlacement) and isinstance(b, PartsPlacement):
+        return PartsPlacement(a.parts, interpolate_motion(a.motion, b.motion, share))
+    assert isinstance(a, WarpPlacement)
+    assert isinstance(b, WarpPlacement)
+    return WarpPlacement(a.control, interpolate_warp(a.motion, b.motion, share))

@@ -17,13 +17,18 @@ import torch
 from torch import Tensor
 
 from progdf.gaussians import attribute_slices
-from trainer.motion.descent import OnStep
-from trainer.motion.part_search import GroupSearch
-from trainer.motion.parts import connected_parts
-from trainer.motion.placement import PartsPlacement, Placement, WarpPlacement, between
+from trainer.motion.parts import GroupSearch, OnStep, connected_parts
 from trainer.motion.similarity import Motion, Parts, make_parts
-from trainer.motion.warp import WarpMotion, rest_warp, warp_of_parts
-from trainer.motion.warp_search import WarpSearch
+from trainer.motion.warp import (
+    PartsPlacement,
+    Placement,
+    WarpMotion,
+    WarpPlacement,
+    WarpSearch,
+    between,
+    rest_warp,
+    warp_of_parts,
+)
 from trainer.views.crops import CropScene, render_all
 
 from .pgs import TargetStage, visible_way

@@ -21,7 +21,7 @@ from progdf.camera import Camera
 from progdf.cli.options import parse_options
 from progdf.compose.reference import Layer, compose_layers
 from progdf.demo_scenes import DemoScene, bear, paint_panda, room
-from progdf.errors import ProgdfError, print_line
+from progdf.errors import ProgdfError
 from progdf.formats.ply import load_ply, save_ply
 from progdf.gdf.file import Gdf, load_gdf
 from progdf.io.atomic import atomic_write, make_folder
@@ -29,6 +29,7 @@ from progdf.io.cameras import save_cameras
 from progdf.io.images import contact_sheet, read_picture, to_picture, write_image
 from progdf.io.picture_camera import camera_chunk
 from progdf.rasterize import render
+from progdf.terminal import print_line
 from trainer.option_checks import check_ranges
 from trainer.options import LARGEST_SEED, MOST_THREADS, TrainOptions
 from trainer.plan import Plan, make_plan

@@ -12,13 +12,13 @@ from torch import Tensor
 
 from progdf.compose.reference import Layer, compose_layers
 from progdf.errors import ProgdfError
-from progdf.field.remap import identity_remap
+from progdf.field.baked import identity_remap
 from progdf.field.trajectory import Trajectory, load_trajectory
-from progdf.formats.load_report import file_size, format_count
 from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians, pack
 from progdf.gdf.file import Gdf, fingerprint, load_gdf, save_gdf
 from progdf.io.images import write_image
 from progdf.io.json_values import convert_json, decode_json, plain
+from progdf.terminal import file_size, format_count
 from trainer.editors.pictures import picture_background
 from trainer.fit.evaluate import Evaluator, make_evaluator
 from trainer.fit.fit import evaluate_field, expected_looks, fit_field, visibility

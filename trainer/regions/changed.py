@@ -21,12 +21,12 @@ from torch.nn.functional import interpolate
 
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
-from progdf.formats.load_report import format_count
 from progdf.gaussians import Gaussians
 from progdf.io.images import save_as
 from progdf.rasterize import alpha_weights
 from progdf.region import Region
 from progdf.sh import sh0_to_rgb
+from progdf.terminal import format_count
 from trainer.editors.pictures import STEP, STILL, lay_over, move_image, read_change
 from trainer.setup.training_setup import quantize_image
 from trainer.views.view import fit_size, with_near_plane

@@ -13,17 +13,17 @@ from torch import Tensor
 
 from progdf.camera import Camera, intrinsics, look_at
 from progdf.errors import ProgdfError
-from progdf.formats.load_report import format_count, group_digits
 from progdf.formats.scene_file import load_scene
 from progdf.gaussians import Gaussians
 from progdf.io.cameras import load_cameras, read_camera
 from progdf.io.images import write_image
-from progdf.io.npy import save_npy
+from progdf.io.tensors import save_npy
 from progdf.region import Region
 from progdf.scene.bounds import front_direction
 from progdf.scene.regions import parse_region
 from progdf.scene.subject import fit_eye, subject_rows
 from progdf.scene.up_axis import find_up
+from progdf.terminal import format_count, group_digits
 from trainer.option_checks import check_ranges
 from trainer.views.view import render_colors, seen_colors, with_near_plane
 

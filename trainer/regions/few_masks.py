@@ -14,9 +14,9 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
-from progdf.formats.load_report import format_count
 from progdf.gaussians import Gaussians
 from progdf.scene.neighbors import nearest_rows
+from progdf.terminal import format_count
 
 FEW = 8
 """Masks up to which a region is cleaned; exact ones from 12 views would lose a thin scarf's edge to it."""

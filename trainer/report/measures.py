@@ -13,13 +13,13 @@ from torch import Tensor
 
 from progdf.errors import ProgdfError
 from progdf.field import BakedField
-from progdf.field.evaluate import sample_strengths
-from progdf.field.remap import SliderRemap
+from progdf.field.baked import SliderRemap
+from progdf.field.choose import sample_strengths
 from progdf.field.trajectory import Trajectory
-from progdf.formats.load_report import format_count, group_digits
 from progdf.gaussians import Gaussians
 from progdf.metrics.slider import SliderStatistics, slider_statistics
 from progdf.rasterize import alpha_weights, render
+from progdf.terminal import format_count, group_digits
 from trainer.fit.evaluate import Evaluator
 from trainer.fit.fit import Fitted, choice_figures, field_figures, stored_numbers
 from trainer.optimize.losses import Perceptual

@@ -10,7 +10,7 @@ from PIL import Image
 from torch import Tensor
 
 from progdf.field import BakedField
-from progdf.field.evaluate import sample_strengths
+from progdf.field.choose import sample_strengths
 from progdf.io.images import contact_sheet, to_picture
 from trainer.fit.evaluate import Evaluator
 from trainer.optimize.objective import Losses

@@ -19,8 +19,9 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from progdf.errors import ProgdfError, escape_text
+from progdf.errors import ProgdfError
 from progdf.io.atomic import atomic_write
+from progdf.terminal import escape_text
 
 from .state import Saved
 

@@ -23,10 +23,9 @@ from torch import Tensor
 
 from progdf.errors import ProgdfError
 from progdf.field.trajectory import FILE_NAME
-from progdf.io.atomic import atomic_write, is_temporary, remove_abandoned
+from progdf.io.atomic import LOCK, LockedError, atomic_write, hold_lock, is_temporary, remove_abandoned
 from progdf.io.images import read_picture, write_image
 from progdf.io.json_values import decode_json
-from progdf.io.locks import LOCK, LockedError, hold_lock
 
 from .picture_list import add_pictures, remove_pictures_but_of
 from .state import StateFolder

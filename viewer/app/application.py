@@ -13,7 +13,7 @@ from typing import Protocol
 
 from progdf import __version__
 from progdf.errors import ProgdfError
-from progdf.io.user_folders import state_folder
+from progdf.io.atomic import state_folder
 from viewer.files.document import Document
 from viewer.state.snapshots import SliderSnapshot
 from viewer.state.view_state import ViewState

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from imgui_bundle import imgui
 
-from progdf.errors import escape_text
+from progdf.terminal import escape_text
 from viewer.state.workspace import Dialog
 from viewer.ui.context import PALETTE, SMALL_PX, UiContext
 from viewer.ui.overlay import Area

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from progdf.errors import ProgdfError
-from progdf.formats.load_report import group_digits
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf, load_gdf
 from progdf.metrics.image import NO_DIFFERENCE
 from progdf.scene.strays import Strays, clean, find_strays, picture_difference
+from progdf.terminal import group_digits
 from progdf.torch_threads import all_threads
 from viewer.state import layers as stack
 from viewer.state import selection

@@ -19,7 +19,7 @@ from progdf.cli.options import parse_options
 from progdf.color.edits import parse_color
 from progdf.errors import ProgdfError
 from progdf.gdf.file import Gdf
-from progdf.io.npy import open_npy
+from progdf.io.tensors import open_npy
 from progdf.scene.up_axis import UpChoice
 from viewer.camera.up_axis import Vec3, up_of
 from viewer.camera.view_camera import with_up

@@ -16,8 +16,7 @@ from PIL import Image
 
 from progdf.camera import Camera
 from progdf.compose.reference import compose_layers
-from progdf.errors import ProgdfError, print_line
-from progdf.formats.load_report import format_count
+from progdf.errors import ProgdfError
 from progdf.formats.ply import save_ply_checked
 from progdf.formats.scene_file import scene_format
 from progdf.gaussians import ZERO, Gaussians
@@ -25,6 +24,7 @@ from progdf.gdf.file import Gdf
 from progdf.io.atomic import atomic_write, check_not_an_input
 from progdf.io.cameras import read_camera
 from progdf.io.picture_camera import camera_chunk
+from progdf.terminal import format_count, print_line
 from progdf.torch_threads import one_thread
 from viewer.camera.up_axis import Vec3
 from viewer.camera.view_camera import (

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import torch
 
-from progdf.errors import escape_text
 from progdf.formats.scene_file import load_scene, scene_file, scene_name
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf, load_gdf
 from progdf.scene.neighbors import Neighborhood
+from progdf.terminal import escape_text
 from progdf.torch_threads import all_threads
 from viewer.camera.up_axis import SceneUp, find_scene_up
 from viewer.camera.view_camera import bounds_of, first_camera, fit, fit_all

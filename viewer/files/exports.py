@@ -23,11 +23,10 @@ from PIL.PngImagePlugin import PngInfo
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.gaussians import ZERO, Origin
-from progdf.io.atomic import atomic_write
+from progdf.io.atomic import atomic_write, pictures_folder
 from progdf.io.cameras import kind_of_cameras, load_cameras, save_cameras
-from progdf.io.npy import save_npy
 from progdf.io.session import SUFFIX
-from progdf.io.user_folders import pictures_folder
+from progdf.io.tensors import save_npy
 from viewer.jobs.training import edits_folder, takes_files
 from viewer.state import selection
 from viewer.state.selection import SUFFIX as REGION_SUFFIX

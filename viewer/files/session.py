@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from progdf.errors import ProgdfError, escape_text
+from progdf.errors import ProgdfError
 from progdf.io.atomic import replace_file
 from progdf.io.session import (
     SUFFIX,
@@ -25,6 +25,7 @@ from progdf.io.session import (
     verify_files,
     write_session,
 )
+from progdf.terminal import escape_text
 from viewer.camera.up_axis import Vec3
 from viewer.camera.view_camera import move_camera
 from viewer.state import paint

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from progdf.errors import ProgdfError
-from progdf.io.atomic import atomic_write
+from progdf.io.atomic import atomic_write, state_folder
 from progdf.io.images import flatten_onto, open_picture
-from progdf.io.user_folders import state_folder
 
 from .session import session_of
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import ClassVar, Literal
 
 from progdf.errors import ProgdfError
-from progdf.io.locks import LockedError
+from progdf.io.atomic import LockedError
 
 from .child import Child, Progress, last_line
 from .training import EditOrder

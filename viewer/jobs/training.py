@@ -29,11 +29,18 @@ from progdf.errors import ProgdfError
 from progdf.field.keyframes import fit_lossless
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf, fingerprint
-from progdf.io.atomic import atomic_write, is_portable, make_folder
+from progdf.io.atomic import (
+    LOCK,
+    LockedError,
+    atomic_write,
+    hold_lock,
+    is_locked,
+    is_portable,
+    make_folder,
+    state_folder,
+)
 from progdf.io.json_values import convert_json, plain, read_json
-from progdf.io.locks import LOCK, LockedError, hold_lock, is_locked
 from progdf.io.tensors import read_tensors
-from progdf.io.user_folders import state_folder
 from progdf.region import Region
 
 from .child import Progress

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from imgui_bundle import imgui
 
-from progdf.errors import escape_text
+from progdf.terminal import escape_text
 from viewer.state.view_state import ViewState
 from viewer.ui.context import Icon, UiContext
 from viewer.ui.widgets import elide, icon_button, menu, tip

@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from progdf.errors import escape_text
 from progdf.gaussians import ZERO, Origin
 from progdf.scene.neighbors import Neighborhood
 from progdf.scene.selection import Mask
+from progdf.terminal import escape_text
 from viewer.camera.named_views import Glide, glide_on
 from viewer.camera.view_camera import Bounds, Fit, ViewCamera, keep_camera
 from viewer.jobs.job_queue import DeliverOptions, Job

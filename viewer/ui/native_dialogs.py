@@ -14,7 +14,7 @@ from pathlib import Path
 
 from imgui_bundle import portable_file_dialogs as dialogs
 
-from progdf.errors import escape_text
+from progdf.terminal import escape_text
 from viewer.state.workspace import Dialog
 
 PROGRAMS = ("zenity", "kdialog", "qarma", "matedialog")

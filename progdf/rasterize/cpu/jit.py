@@ -23,8 +23,7 @@ from typing import Any, TypeVar
 from filelock import FileLock
 
 from progdf.errors import ProgdfError
-from progdf.io.atomic import atomic_write
-from progdf.io.user_folders import cache_folder, is_private, temporary_folder
+from progdf.io.atomic import atomic_write, cache_folder, is_private, temporary_folder
 
 try:
     import numba

@@ -53,7 +53,7 @@ def test_an_unknown_command_is_one_line_that_names_the_known_ones(capsys: pytest
     assert "train" in stderr_of(capsys, "trian")
 
 
-@pytest.mark.parametrize("command", ["check", "info", "render", "export", "train", "fit", "view"])
+@pytest.mark.parametrize("command", ["info", "render", "export", "train", "fit", "view"])
 def test_a_missing_file_is_one_line_and_exit_2(
     command: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
@@ -73,8 +73,8 @@ def test_a_full_disk_says_what_to_do(
     def full(argv: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr("progdf.cli.check.main", full)
-    assert "free some space" in stderr_of(capsys, "check", "scene.ply")
+    monkeypatch.setattr("progdf.cli.info.main", full)
+    assert "free some space" in stderr_of(capsys, "info", "scene.ply")
 
 
 @pytest.mark.parametrize("command", sorted(COMMANDS))
@@ -167,9 +167,9 @@ def test_a_mistake_of_ours_is_one_line_and_a_file_with_the_details(
     def wrong(argv: object) -> None:
         raise IndexError("list index\nout of range")
 
-    monkeypatch.setattr("progdf.cli.check.main", wrong)
+    monkeypatch.setattr("progdf.cli.info.main", wrong)
     monkeypatch.setattr("progdf.__main__.state_folder", lambda: tmp_path / "progdf")
-    assert main(["check", "scene.ply"]) == 70
+    assert main(["info", "scene.ply"]) == 70
     told = capsys.readouterr().err
     assert told.count("\n") == 1
     assert told.startswith("progdf: internal error in progdf (IndexError: list index out of range); ")
@@ -195,12 +195,12 @@ def test_too_little_memory_is_one_line(
     def large(argv: object) -> None:
         raise error
 
-    monkeypatch.setattr("progdf.cli.check.main", large)
-    assert "out of memory; " in stderr_of(capsys, "check", "scene.ply")
+    monkeypatch.setattr("progdf.cli.info.main", large)
+    assert "out of memory; " in stderr_of(capsys, "info", "scene.ply")
 
 
 @pytest.mark.usefixtures("default_signals")
-@pytest.mark.parametrize("command", ["check", "view"])
+@pytest.mark.parametrize("command", ["info", "view"])
 @pytest.mark.parametrize("number", ["SIGTERM", "SIGHUP"])
 def test_a_signal_that_ends_a_command_takes_its_temporary_files_along(
     command: str,
@@ -214,8 +214,8 @@ def test_a_signal_that_ends_a_command_takes_its_temporary_files_along(
             temporary_file.write_text("half")
             os.kill(os.getpid(), getattr(signal, number))
 
-    monkeypatch.setattr("progdf.cli.check.main", writing)
-    monkeypatch.setattr("viewer.commands.render.view", writing)
+    monkeypatch.setattr("progdf.cli.info.main", writing)
+    monkeypatch.setattr("viewer.commands.cli.view", writing)
     assert main([command, "scene.ply"]) == 130
     assert capsys.readouterr().err == "progdf: interrupted\n"
     assert not list(tmp_path.iterdir())
@@ -264,10 +264,10 @@ def test_control_characters_of_own_arguments_are_escaped(
 
 
 def test_a_signal_that_is_ignored_stays_ignored(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("progdf.cli.check.main", lambda argv: os.kill(os.getpid(), signal.SIGHUP))
+    monkeypatch.setattr("progdf.cli.info.main", lambda argv: os.kill(os.getpid(), signal.SIGHUP))
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup does
     try:
-        assert main(["check", "scene.ply"]) == 0
+        assert main(["info", "scene.ply"]) == 0
     finally:
         signal.signal(signal.SIGHUP, before)
 

@@ -250,9 +250,9 @@ def wardrobe(scene: Gaussians, shirt: Gdf, hat: Gdf) -> list[Gdf]:
     """Overlapping edits of every storage type: int8, one member of float32, everything in float16 with SH."""
     channels = 14 + 9
     single = edit_of(
-        scene, some_rows(scene, 1, 5), curved_field(1, 5, channels, rest_type=torch.float32), "pin"
+        scene, some_rows(scene, 1, 5), curved_field(1, 5, channels, basis_type=torch.float32), "pin"
     )
-    night = curved_field(len(scene), 6, channels, ("means", "quats", "shN"), rest_type=torch.float16)
+    night = curved_field(len(scene), 6, channels, ("means", "quats", "shN"), basis_type=torch.float16)
     return [shirt, hat, single, edit_of(scene, torch.arange(len(scene)), night, "night")]
 
 

@@ -7,8 +7,9 @@ import torch
 from torch import Tensor
 
 from progdf.field import bake_network
-from progdf.field.bake import BakePlan, NeuralForm, bake_nodes
-from progdf.field.evaluate import FieldEvaluator, sample_strengths
+from progdf.field.bake import bake_form, bake_nodes
+from progdf.field.baked import BakePlan, NeuralForm
+from progdf.field.choose import FieldEvaluator, sample_strengths
 from tests.helpers.edits import curved_trajectory
 from tests.helpers.networks import FORMS, MEMBERS, baked, network, rows
 
@@ -70,7 +71,7 @@ def test_a_form_refuses_other_numbers_of_members() -> None:
     form = baked().origin
     assert isinstance(form, NeuralForm)
     with pytest.raises(ValueError, match="expected 40"):
-        form.bake(rows()[:39])
+        bake_form(form, rows()[:39])
 
 
 def test_a_looser_bake_has_fewer_bases() -> None:

@@ -9,9 +9,8 @@ import torch
 from torch import Tensor
 
 from progdf.field import NeuralSettings, bake_network, fit_neural
-from progdf.field.neural_fit import NeuralFit
-from progdf.field.neural_training import train_network
-from progdf.field.rendered import rendered_importance
+from progdf.field.choose import rendered_importance
+from progdf.field.neural_fit import NeuralFit, train_network
 from tests.helpers.edits import curved_trajectory
 from tests.helpers.networks import MEMBERS, SHORT, members, rows, scene, smooth_trajectory
 

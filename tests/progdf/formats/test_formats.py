@@ -24,8 +24,8 @@ from progdf.formats import scene_file as formats
 from progdf.formats.ply import load_ply
 from progdf.formats.scene_file import load_scene, load_scene_with_report, rotate_about_x, scene_format
 from progdf.gaussians import Gaussians
+from progdf.quaternions import rotation_matrices
 from progdf.rasterize import render
-from progdf.rasterize.reference import rotation_matrices
 from progdf.sh import rgb_to_sh0, shade
 from tests.helpers.refused import refusal
 from tests.helpers.scene_files import write_compressed_ply, write_ksplat, write_scene
@@ -131,7 +131,7 @@ def test_an_unpacked_sog_opens_by_its_folder_and_by_its_table(tmp_path: Path) ->
         scene, report = load_scene_with_report(path)
         assert torch.equal(scene.means, expected.means)
         assert report.file == "robot"
-    assert main(["check", str(folder)]) == 0
+    assert main(["info", str(folder)]) == 0
 
 
 def test_a_sog_that_names_files_elsewhere_is_refused(tmp_path: Path) -> None:

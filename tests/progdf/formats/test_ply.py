@@ -1,19 +1,26 @@
-"""The .ply files of the wild: every valid variant gives the same scene, and what is saved comes back."""
+"""The .ply files of the wild: valid variants give the same scene, anything else is refused in one line."""
 
 from __future__ import annotations
 
+import io
+import resource
+import struct
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from plyfile import PlyData
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+from plyfile import PlyData, PlyElement
 
 import progdf
 from progdf.errors import ProgdfError
 from progdf.formats.ply import load_ply, load_ply_with_report, save_ply
+from progdf.gaussians import ATTRIBUTES
 from tests.helpers.ply_files import (
+    COUNT,
     as_type,
     assert_same,
     camera_element,
@@ -23,6 +30,7 @@ from tests.helpers.ply_files import (
     with_extra,
     write,
 )
+from tests.helpers.refused import refusal
 from tests.helpers.scenes import random_gaussians
 
 VARIANTS: dict[str, tuple[Callable[[dict[str, np.ndarray]], dict[str, np.ndarray]], dict[str, object]]] = {
@@ -140,3 +148,220 @@ def test_real_files_of_every_sh_degree_share_their_bands(degree: int, shared_dat
     assert scene.sh_degree == degree
     shared = min(base.shN.shape[1], scene.shN.shape[1])
     assert torch.equal(scene.shN[:, :shared], base.shN[:, :shared])
+
+
+def lacking(*names: str) -> dict[str, np.ndarray]:
+    return {name: values for name, values in table_of(scene_of()).items() if name not in names}
+
+
+@pytest.mark.parametrize(
+    ("lost", "said"),
+    [
+        (("opacity",), "opacity"),
+        (("scale_2",), "2D Gaussians"),
+        (("rot_0", "rot_1", "rot_2", "rot_3"), "rot_0, rot_1, rot_2, rot_3"),
+        (("f_rest_44",), "44 f_rest"),
+        (("f_rest_7",), "without f_rest_7"),
+        (("f_dc_1",), "f_dc_1"),
+        (("z",), "z"),
+    ],
+)
+def test_a_missing_property_is_named(lost: tuple[str, ...], said: str, tmp_path: Path) -> None:
+    assert said in refusal(load_ply, write(tmp_path / "scene.ply", lacking(*lost)))
+
+
+def test_a_gap_in_the_sh_properties_is_named(tmp_path: Path) -> None:
+    columns = {("f_rest_45" if k == "f_rest_44" else k): v for k, v in table_of(scene_of()).items()}
+    assert "without f_rest_44" in refusal(load_ply, write(tmp_path / "scene.ply", columns))
+
+
+def test_an_element_after_the_gaussians_must_fit_behind_them(tmp_path: Path) -> None:
+    path = write(tmp_path / "scene.ply", table_of(scene_of()), after=[camera_element()])
+    path.write_bytes(path.read_bytes().replace(b"camera 1", b"camera 2"))
+    assert "declares 2 rows of 'camera'" in refusal(load_ply, path)
+
+
+def test_other_kinds_of_file_are_called_by_their_name(tmp_path: Path) -> None:
+    columns = {name: values for name, values in table_of(scene_of()).items() if name in "xyz"}
+    path = tmp_path / "scene.ply"
+    assert "mesh" in refusal(load_ply, write(path, columns, after=[face_element()]))
+    assert "point cloud" in refusal(load_ply, write(path, columns))
+    packed = {"x": columns["x"], "packed_position": np.zeros(COUNT, np.uint32)}
+    assert "compressed" in refusal(load_ply, write(path, packed))
+    for content, said in (
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345678\n", "git lfs pull"),
+        (b"hello\n", "not a .ply"),
+        (b"", "0 bytes"),
+        (b"\x1f\x8b\x08\x00", "gzip"),
+        (b"PK\x03\x04", "zip"),
+        (b"<!DOCTYPE html>", "web page"),
+        (b"ply\nformat ascii 1.0\n", "end_header"),
+        (b"ply\nend_header\n", "format"),
+        (b"ply\nformat ascii 1.0\nend_header\n", "vertex"),
+        (b"ply\nformat ascii 2.0\nend_header\n", "line 2: expected version"),
+        (b"ply\nformat ascii 1.0\nelement vertex -1\nend_header\n", "broken header"),
+        (
+            b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty int x\nend_header\n",
+            "same name",
+        ),
+    ):
+        path.write_bytes(content)
+        assert said in refusal(load_ply, path)
+
+
+def test_a_missing_file_and_a_folder_are_one_line(tmp_path: Path) -> None:
+    assert "does not exist" in refusal(load_ply, tmp_path / "nowhere.ply")
+    assert "folder" in refusal(load_ply, tmp_path)
+
+
+def test_zero_gaussians_are_refused_on_both_ways(tmp_path: Path) -> None:
+    save_ply(tmp_path / "scene.ply", scene_of())
+    content = (tmp_path / "scene.ply").read_bytes().replace(b"vertex 50\n", b"vertex 0\n")
+    (tmp_path / "scene.ply").write_bytes(content[: content.index(b"end_header\n") + 11])
+    assert "0 Gaussians" in refusal(load_ply, tmp_path / "scene.ply")
+    with pytest.raises(ProgdfError, match="no Gaussians"):
+        save_ply(tmp_path / "none.ply", scene_of()[:0])
+    assert not (tmp_path / "none.ply").exists()
+
+
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize("kept", [0.999, 0.5, 0.3])
+def test_a_file_cut_short_is_refused(text: bool, kept: float, tmp_path: Path) -> None:
+    path = write(tmp_path / "scene.ply", table_of(scene_of()), text=text)
+    content = path.read_bytes()
+    path.write_bytes(content[: int(kept * len(content))])
+    assert "truncated" in refusal(load_ply, path)
+
+
+@pytest.mark.parametrize("count", [b"51", b"2000000000", b"9999999999999999999", b"9" * 5000])
+@pytest.mark.parametrize("text", [False, True])
+def test_a_false_count_is_refused_and_allocates_nothing(count: bytes, text: bool, tmp_path: Path) -> None:
+    path = write(tmp_path / "scene.ply", table_of(scene_of()), text=text, before=[camera_element()])
+    content = path.read_bytes()
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    path.write_bytes(content.replace(b"vertex 50", b"vertex " + count))
+    refusal(load_ply, path)
+    path.write_bytes(content.replace(b"camera 1", b"camera " + count))
+    refusal(load_ply, path)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # kB
+
+
+@pytest.mark.parametrize(("kind", "length"), [("uint", 4_000_000_000), ("int", -1)])
+def test_a_list_of_impossible_length_is_refused(kind: str, length: int, tmp_path: Path) -> None:
+    path = tmp_path / "scene.ply"
+    save_ply(path, scene_of())
+    head, body = path.read_bytes().split(b"element vertex", 1)
+    face = b"element face 1\nproperty list %s double corners\n" % kind.encode()
+    columns, rows = body.split(b"end_header\n", 1)
+    content = (
+        head
+        + face
+        + b"element vertex"
+        + columns
+        + b"end_header\n"
+        + struct.pack("<i" if length < 0 else "<I", length)
+        + rows
+    )
+    path.write_bytes(content)
+    assert "ends within" in refusal(load_ply, path)
+
+
+def test_words_between_the_numbers_are_refused(tmp_path: Path) -> None:
+    path = write(tmp_path / "scene.ply", table_of(scene_of(0)), text=True)
+    lines = path.read_bytes().split(b"\n")
+    lines[-3] = lines[-3].replace(b" ", b" ?", 1)
+    path.write_bytes(b"\n".join(lines))
+    assert "no number, at row" in refusal(load_ply, path)
+
+
+def test_a_number_longer_than_any_costs_no_memory(tmp_path: Path) -> None:
+    path = write(tmp_path / "scene.ply", table_of(scene_of(0)), text=True)
+    lines = path.read_bytes().split(b"\n")
+    lines[-3] = lines[-3].replace(b" ", b" " + b"1" * 400_000, 1)
+    path.write_bytes(b"\n".join(lines))
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    assert "at row 48" in refusal(load_ply, path)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # kB
+
+
+def test_millions_of_lists_before_the_vertices_are_refused_and_not_stepped_over(tmp_path: Path) -> None:
+    path = tmp_path / "scene.ply"
+    save_ply(path, scene_of())
+    head, body = path.read_bytes().split(b"element vertex", 1)
+    columns, rows = body.split(b"end_header\n", 1)
+    face = b"element face 2000000\nproperty list uchar uchar corners\nelement vertex"
+    path.write_bytes(head + face + columns + b"end_header\n" + b"\0" * 2_000_000 + rows)
+    assert "vertices first" in refusal(load_ply, path)
+
+
+def test_a_million_million_rows_of_nothing_cost_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "scene.ply"
+    save_ply(path, scene_of())
+    content = path.read_bytes().replace(b"element vertex", b"element a 1000000000000\nelement vertex")
+    path.write_bytes(content)
+    assert len(load_ply(path)) == COUNT
+    path.write_bytes(content.replace(b"binary_little_endian", b"ascii"))
+    assert "truncated" in refusal(load_ply, path)
+
+
+def test_a_header_is_looked_through_once(tmp_path: Path) -> None:
+    """A million bytes of elements or properties: compared with one another, they would take minutes."""
+    path = tmp_path / "scene.ply"
+    for what in (b"element a%d 0\n", b"property float a%d\n"):
+        lines = b"".join(what % i for i in range(20_000))
+        path.write_bytes(b"ply\nformat ascii 1.0\nelement b 0\n" + lines + b"end_header\n")
+        assert "no element 'vertex'" in refusal(load_ply, path)
+
+
+def base_bytes() -> bytes:
+    buffer = io.BytesIO()
+    columns = with_extra("label", "u1", 5)(table_of(scene_of(1, count=8)))
+    rows = np.empty(8, [(name, values.dtype) for name, values in columns.items()])
+    for name, values in columns.items():
+        rows[name] = values
+    PlyData([camera_element(), face_element(), PlyElement.describe(rows, "vertex")], byte_order="<").write(
+        buffer
+    )
+    return buffer.getvalue()
+
+
+BASE = base_bytes()
+
+
+@settings(max_examples=400, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    flips=st.lists(st.tuples(st.integers(0, len(BASE) - 1), st.integers(0, 255)), max_size=6),
+    kept=st.one_of(st.just(len(BASE)), st.integers(0, len(BASE))),
+)
+@example(flips=[(BASE.index(b"face 2") + 5, ord("9"))], kept=len(BASE))
+def test_a_damaged_file_loads_to_finite_numbers_or_is_refused(
+    flips: list[tuple[int, int]], kept: int, tmp_path: Path
+) -> None:
+    content = bytearray(BASE)
+    for place, value in flips:
+        content[place] = value
+    path = tmp_path / "fuzz.ply"
+    path.write_bytes(bytes(content[:kept]))
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    try:
+        scene = load_ply(path)
+    except ProgdfError as refused:
+        scene, message = None, str(refused)
+    if scene is None:
+        assert "\n" not in message
+    else:
+        assert all(bool(getattr(scene, name).isfinite().all()) for name in ATTRIBUTES)
+        torch.testing.assert_close(scene.quats.norm(dim=1), torch.ones(len(scene)))
+        assert bool(scene.scales.isfinite().all())
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100_000  # kB
+
+
+BROKEN = (
+    *("empty", "git_lfs_pointer", "huge_count", "mesh", "not_ply", "truncated"),
+    *("missing_f_rest_44", "missing_opacity", "missing_rot", "missing_scale2_2dgs"),
+)
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_real_broken_files_are_refused_in_one_line(name: str, shared_data: Path) -> None:
+    refusal(load_ply, shared_data / "weird" / f"{name}.ply")

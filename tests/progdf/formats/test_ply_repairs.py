@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from progdf.formats.load_report import LoadReport
 from progdf.formats.ply import load_ply, load_ply_with_report
-from progdf.formats.repair import INVISIBLE_LOGIT, OPAQUE_LOGIT
+from progdf.formats.repair import INVISIBLE_LOGIT, OPAQUE_LOGIT, LoadReport
 from progdf.gaussians import ATTRIBUTES, Gaussians
 from tests.helpers.ply_files import COUNT, assert_same, camera_element, scene_of, table_of, with_extra, write
 

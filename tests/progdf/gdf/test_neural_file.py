@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,12 +15,13 @@ from torch import Tensor
 from progdf.compose.layers import Layer
 from progdf.compose.reference import compose_layers
 from progdf.errors import ProgdfError
+from progdf.field import bake_network
 from progdf.gaussians import ATTRIBUTES, pack
-from progdf.gdf.file import Gdf, file_metadata, load_gdf, save_gdf
-from progdf.gdf.header import read_head
-from progdf.io.tensors import pack_metadata
+from progdf.gdf.file import Gdf, load_gdf, read_gdf, save_gdf
 from tests.helpers.edits import edit_of
+from tests.helpers.fuzz_changes import header_of, signed_gdf
 from tests.helpers.networks import FORMS, MEMBERS, baked, members, rows, scene
+from tests.helpers.scenes import random_gaussians
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -62,13 +62,24 @@ def test_the_file_holds_the_network_and_not_what_is_baked_of_it(saved: Path, edi
     content = saved.read_bytes()
     names = set(safetensors.torch.load(content))
     assert {"network.layers.0.weight", "codes", "end"} < names
-    assert not any(name.endswith(".rest") for name in names)
+    assert not any(name.endswith(".residual_basis") for name in names)
+
+
+def test_a_network_of_format_1_is_read_and_baked() -> None:
+    made_for = random_gaussians(60, seed=1, sh_degree=1)
+    old = load_gdf(Path(__file__).parent / "format_1" / "network.gdf", made_for)
+    form = old.field.origin
+    assert form is not None
+    assert form.network.codes[:, 0].tolist() == [1, 2, 3, -4, 5, 6]
+    fresh = bake_network(form.network, pack(made_for[old.region.members]))
+    for s in (0.0, 0.4, 1.0):
+        torch.testing.assert_close(old.field.offsets(s), fresh.offsets(s), rtol=1e-4, atol=1e-5)
 
 
 def test_a_network_needs_its_scene(saved: Path) -> None:
     with pytest.raises(ProgdfError, match=r"shirt\.gdf keeps a neural field, .*; load it with the scene"):
         load_gdf(saved)
-    assert read_head(saved).field.network is not None
+    assert read_gdf(saved).field.origin is not None
 
 
 def test_another_scene_is_refused_before_anything_is_baked(saved: Path) -> None:
@@ -88,32 +99,20 @@ def test_a_network_that_sees_places_alone_does_not_mind_other_colors(tmp_path: P
     load_gdf(tmp_path / "a.gdf", replace(scene(), sh0=scene().sh0 + 1))
 
 
-def _header(path: Path) -> dict[str, object]:
-    content = path.read_bytes()
-    size = int.from_bytes(content[:8], "little")
-    header: dict[str, object] = json.loads(json.loads(content[8 : 8 + size])["__metadata__"]["progdf"])[
-        "header"
-    ]
-    return header
-
-
 def rewritten(
     saved: Path, tmp_path: Path, network: dict[str, object], tensors: dict[str, Tensor | None]
 ) -> Path:
     """The file with other values, its checksum made to fit: a wrong writer's."""
-    header = _header(saved)
-    described = header["field"]
-    assert isinstance(described, dict)
-    described["network"] |= network
+    header = header_of(saved.read_bytes())
+    header["field"]["network"] |= network
     kept = safetensors.torch.load(saved.read_bytes())
     for name, tensor in tensors.items():
         if tensor is None:
             del kept[name]
         else:
             kept[name] = tensor
-    text = json.dumps(header)
     path = tmp_path / "shirt.gdf"
-    path.write_bytes(safetensors.torch.save(kept, pack_metadata(file_metadata(text, kept))))
+    path.write_bytes(signed_gdf(header, kept))
     return path
 
 
@@ -148,9 +147,9 @@ LAYOUT = {
         ({}, {"network.heads.weight": None}),
         ({}, {"network.extent": torch.zeros(())}),
         ({}, {"network.spread": torch.full((6,), float("nan"))}),
-        ({}, {"nodes": torch.linspace(0, 1, 100_000)}),
-        ({}, {"nodes": torch.linspace(0, 2, 41)}),
-        ({}, {"pull.means": torch.zeros(7)}),
+        ({}, {"knots": torch.linspace(0, 1, 100_000)}),
+        ({}, {"knots": torch.linspace(0, 2, 41)}),
+        ({}, {"end_correction.means": torch.zeros(7)}),
     ],
 )
 def test_a_network_that_contradicts_itself_is_refused(

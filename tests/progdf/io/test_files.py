@@ -1,26 +1,28 @@
-"""Outputs are whole or absent."""
+"""Outputs are whole or absent; a lock is held by one process, and let go of when it ends."""
 
 from __future__ import annotations
 
 import errno
 import os
+import shutil
 import signal
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import filelock
 import pytest
 
 from progdf.cli.info import kind_of
 from progdf.errors import ProgdfError
 from progdf.formats.scene_file import load_scene
 from progdf.gdf.file import load_gdf
-from progdf.io.atomic import atomic_write, is_temporary
+from progdf.io.atomic import LOCK, LockedError, atomic_write, hold_lock, is_locked, is_temporary
 from progdf.io.cameras import load_cameras
 from progdf.io.images import open_picture
-from progdf.io.npy import open_npy
 from progdf.io.session import SessionFile, read_session, sha256
+from progdf.io.tensors import open_npy
 from tests.helpers.full_disk import files_up_to, refuse_temporary_files
 from tests.helpers.refused import refusal
 
@@ -219,3 +221,82 @@ def test_a_name_as_long_as_names_can_be_is_written(tmp_path: Path) -> None:
     with atomic_write(path) as temporary_file:
         temporary_file.write_text("whole")
     assert path.read_text() == "whole"
+
+
+HOLDER = """
+import sys, time
+from pathlib import Path
+from progdf.io.atomic import hold_lock
+with hold_lock(Path(sys.argv[1])):
+    print("held", flush=True)
+    time.sleep(600)
+"""
+
+
+def test_a_lock_is_let_go_of_when_its_process_is_killed(tmp_path: Path) -> None:
+    path = tmp_path / LOCK
+    holder = subprocess.Popen([sys.executable, "-P", "-c", HOLDER, str(path)], stdout=subprocess.PIPE)
+    try:
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == b"held\n"
+        assert is_locked(path)
+        with pytest.raises(LockedError), hold_lock(path):
+            pass
+    finally:
+        holder.send_signal(signal.SIGKILL)
+        holder.communicate()
+    assert path.is_file(), "the file stays"
+    assert not is_locked(path)
+    with hold_lock(path):
+        assert is_locked(path), "of this process too"
+
+
+def test_the_copy_of_a_folder_that_is_locked_is_not_locked(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    with hold_lock(tmp_path / "run" / LOCK):
+        shutil.copytree(tmp_path / "run", tmp_path / "copy")
+        copied = tmp_path / "copy" / LOCK
+        copied.chmod(0o444)  # as from a read-only place
+        assert not is_locked(copied)
+        with hold_lock(copied):
+            assert is_locked(copied)
+
+
+def test_asking_for_a_lock_writes_nothing(tmp_path: Path) -> None:
+    assert not is_locked(tmp_path / LOCK)
+    assert not is_locked(tmp_path / "nowhere" / LOCK)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_cannot_be_written_is_not_locked_and_cannot_be_held(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / LOCK).touch()
+
+    refusal = [errno.EROFS]
+
+    def refuse(self: filelock.FileLock, timeout: float | None = None) -> None:
+        raise OSError(refusal[0], "no")
+
+    monkeypatch.setattr(filelock.FileLock, "acquire", refuse)
+    for refusal[0] in (errno.EROFS, errno.EACCES, errno.ENOSPC):
+        assert not is_locked(tmp_path / LOCK)
+        with (
+            pytest.raises(ProgdfError, match=r"run\.lock cannot be written \(no\); "),
+            hold_lock(tmp_path / LOCK),
+        ):
+            pass
+    refusal[0] = errno.ENOLCK  # a file system without locks: one trains there as before there were any
+    with hold_lock(tmp_path / LOCK):
+        assert not is_locked(tmp_path / LOCK)
+
+
+def test_a_link_in_the_place_of_a_lock_is_not_followed(tmp_path: Path) -> None:
+    (tmp_path / "private").write_text("mine")
+    (tmp_path / "private").chmod(0o400)
+    (tmp_path / LOCK).symlink_to(tmp_path / "private")
+    with pytest.raises(ProgdfError, match="is a link"), hold_lock(tmp_path / LOCK):
+        pass
+    assert not is_locked(tmp_path / LOCK)
+    assert (tmp_path / "private").read_text() == "mine"
+    assert (tmp_path / "private").stat().st_mode & 0o777 == 0o400

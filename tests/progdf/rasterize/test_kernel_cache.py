@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from filelock import FileLock
 
-from progdf.io import user_folders
+from progdf.io import atomic
 from progdf.rasterize.cpu import jit
 
 SOURCE = """
@@ -105,7 +105,7 @@ def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The user's folder among temporary files, where there is no other."""
     monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    return user_folders.temporary_folder()
+    return atomic.temporary_folder()
 
 
 def homeless() -> Path:
@@ -118,7 +118,7 @@ def test_without_a_home_the_kernels_are_kept_among_temporary_files(
     monkeypatch.setattr("pathlib.Path.home", homeless)
     assert temporary in jit.find_cache_folder().parents
     assert jit.find_cache_folder() == jit.find_cache_folder(), "not a folder a process"
-    assert user_folders.state_folder() == temporary
+    assert atomic.state_folder() == temporary
 
 
 def test_where_the_cache_cannot_be_written_all_processes_share_one_elsewhere(

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from progdf.gaussians import Gaussians
-from progdf.rasterize.reference import rotation_matrices
+from progdf.quaternions import rotation_matrices
 from progdf.scene.bounds import front_direction, is_surrounding, normals_of
 from progdf.scene.orbit_rig import orbit_rig
 from progdf.scene.up_axis import guess_up

@@ -142,7 +142,7 @@ def test_edit_writes_a_scene_without_strays_and_says_what_that_changes(
     scene, _ = littered()
     save_ply("dirty.ply", scene)
     before = Path("dirty.ply").read_bytes()
-    assert "progdf edit dirty.ply --clean -o CLEAN.ply leaves them out" in run(capsys, "check", "dirty.ply")
+    assert "progdf edit dirty.ply --clean -o CLEAN.ply leaves them out" in run(capsys, "info", "dirty.ply")
     told = run(capsys, "edit", "dirty.ply", "--clean", "-o", "clean.ply").splitlines()
     assert told[0].startswith("clean: 23 of 3 023 Gaussians left out: ")
     assert told[1].startswith("pictures from all around: ")
@@ -153,7 +153,7 @@ def test_edit_writes_a_scene_without_strays_and_says_what_that_changes(
     again = run(capsys, "edit", "clean.ply", "--clean", "-o", "again.ply").splitlines()
     assert again == ["clean: there are no strays", "wrote again.ply: 3 000 Gaussians"]
     assert Path("again.ply").read_bytes() == Path("clean.ply").read_bytes()
-    assert "strays" not in run(capsys, "check", "clean.ply")
+    assert "strays" not in run(capsys, "info", "clean.ply")
 
 
 def test_an_edit_is_carried_over_to_the_cleaned_scene(

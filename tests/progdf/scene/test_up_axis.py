@@ -164,7 +164,7 @@ def test_check_prints_boxes_to_paste_and_the_up_axis(
     save_cameras(tmp_path / "c.json", level)
 
     def said(*options: str) -> list[str]:
-        assert main(["check", str(tmp_path / "a.ply"), *options]) == 0
+        assert main(["info", str(tmp_path / "a.ply"), *options]) == 0
         return capsys.readouterr().out.splitlines()
 
     lines = said()

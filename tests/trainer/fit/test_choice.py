@@ -6,8 +6,7 @@ import torch
 from torch import Tensor
 
 from progdf.field import Candidate, FieldEvaluator, choose_field, fit_separable
-from progdf.field.choose import pick_candidate, separable_within
-from progdf.field.rendered import render_trajectories
+from progdf.field.choose import pick_candidate, render_trajectories, separable_within
 from tests.helpers.edits import curved_field, curved_trajectory, linear_pictures
 
 
@@ -26,11 +25,14 @@ def test_every_snapshot_is_not_enough_where_the_course_between_them_is_another()
     assert not chosen.met
 
 
-def test_curves_are_tried_where_keyframes_are_asked_for() -> None:
+def test_keyframes_are_added_until_the_target_is_met_or_the_budget_spent() -> None:
     strengths, offsets = curved_trajectory(20, snapshots=17)
-    chosen = choose_field(strengths, offsets, linear_pictures(20, 14), kind="keyframes", target=50.0)
-    assert any("cubic" in c.label for c in chosen.tried)
-    assert any("cubic" not in c.label and c.label.endswith("keyframes") for c in chosen.tried)
+    shown = linear_pictures(20, 14)
+    chosen = choose_field(strengths, offsets, shown, kind="keyframes", target=30.0)
+    assert chosen.met
+    assert len(chosen.best.field.knots) == max(len(c.field.knots) for c in chosen.tried)
+    small = choose_field(strengths, offsets, shown, kind="keyframes", target=90.0, budget=14 * 6)
+    assert [c.label for c in small.tried] == ["2 keyframes", "3 keyframes", "4 keyframes"]
 
 
 def test_numbers_choose_the_bases_where_pictures_are_the_worse_guide() -> None:

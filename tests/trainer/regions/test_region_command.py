@@ -12,12 +12,12 @@ from PIL import Image
 from progdf.__main__ import main
 from progdf.demo_scenes import DemoScene
 from progdf.errors import ProgdfError
-from progdf.formats.load_report import format_count
 from progdf.formats.ply import save_ply
 from progdf.io.cameras import load_cameras, save_cameras
 from progdf.region import from_mask
 from progdf.scene.orbit_rig import orbit_rig
 from progdf.scene.regions import parse_region
+from progdf.terminal import format_count
 from tests.helpers.demo_scenes import bear
 from trainer.regions.command import picture
 from trainer.regions.from_pictures import RegionSettings, region_kinds

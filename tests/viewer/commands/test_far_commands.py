@@ -110,12 +110,12 @@ def test_an_edit_that_moves_all_and_so_the_origin_is_exported_too(run: Run) -> N
 def test_check_says_the_origin_of_a_far_scene_and_what_floats_have_lost(
     run: Run, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run("check", "far.ply") == 0
+    assert run("info", "far.ply") == 0
     lines = capsys.readouterr().out.splitlines()
     assert "origin: 1000000 2000000 -500000, as it lies far from 0" in lines
     assert not [line for line in lines if line.startswith("lost")]
     write(folder / "floats.ply", as_type("f4")(moved_columns(bear_stack(800).scene, FAR)))
-    assert run("check", "floats.ply") == 0
+    assert run("info", "floats.ply") == 0
     assert any(
         line.startswith("lost: positions are float32, which has steps of 0.12 so far from 0: ")
         for line in capsys.readouterr().out.splitlines()

@@ -13,7 +13,8 @@ from PIL import Image
 from progdf.__main__ import main
 from progdf.compose.layers import Gains
 from progdf.formats.ply import load_ply
-from progdf.gaussians import ATTRIBUTES, normalize_quats
+from progdf.gaussians import ATTRIBUTES
+from progdf.quaternions import normalize_quats
 from tests.helpers.sessions import full_view
 from tests.helpers.ui_rig import bear
 from viewer.files import document, session

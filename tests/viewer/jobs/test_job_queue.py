@@ -13,7 +13,7 @@ import pytest
 from progdf.errors import ProgdfError
 from progdf.formats.ply import save_ply
 from progdf.gdf.file import load_gdf
-from progdf.io.locks import LOCK, LockedError, hold_lock
+from progdf.io.atomic import LOCK, LockedError, hold_lock
 from tests.helpers.count import Count
 from tests.helpers.demo_scenes import bear
 from viewer.jobs import child, job_queue, training

@@ -9,8 +9,8 @@ from pathlib import Path
 from imgui_bundle import imgui
 
 from progdf import __version__
-from progdf.errors import escape_text
 from progdf.io.session import SUFFIX
+from progdf.terminal import escape_text
 from viewer.camera.view_camera import ViewCamera
 from viewer.jobs.job_queue import FORMAT_NAMES, FORMATS, FPS, SIZES, DeliverOptions
 from viewer.state.view_state import ViewState

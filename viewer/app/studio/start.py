@@ -10,7 +10,7 @@ import torch
 
 from progdf.demo_scenes import SKY
 from progdf.errors import ProgdfError
-from progdf.io.user_folders import state_folder
+from progdf.io.atomic import state_folder
 from progdf.scene import up_axis
 from progdf.scene.up_axis import direction_name
 from viewer.camera.up_axis import Vec3

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from progdf.field import BakedField, fit_separable
-from progdf.field.remap import SliderRemap, identity_remap, remap_slider
+from progdf.field.baked import SliderRemap, identity_remap, remap_slider
 
 CHANNELS = 14
 

@@ -1,4 +1,4 @@
-"""`progdf check` and `progdf info`: what a person reads about a file."""
+"""`progdf info`: what a person reads about a file."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import torch
 from PIL import Image
 
 from progdf.__main__ import main
-from progdf.formats.load_report import format_count
 from progdf.formats.ply import load_ply, save_ply
 from progdf.gaussians import Gaussians
 from progdf.io.cameras import save_cameras
 from progdf.scene.orbit_rig import orbit_rig
 from progdf.scene.stats import survey
+from progdf.terminal import format_count
 from tests.helpers.scenes import random_gaussians
 from tests.helpers.stacks import bear_stack
 
@@ -49,17 +49,17 @@ def error_of(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     return captured.err
 
 
-def test_check_says_how_many_and_that_nothing_was_repaired(
+def test_info_says_how_many_and_that_nothing_was_repaired(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     save_ply(tmp_path / "scene.ply", tidy(1200))
-    lines = lines_of(capsys, "check", str(tmp_path / "scene.ply"))
+    lines = lines_of(capsys, "info", str(tmp_path / "scene.ply"))
     assert lines[0] == "scene.ply: 1 200 Gaussians, SH degree 0, binary little-endian, 82.0 kB"
     assert "repaired: nothing" in lines
     assert not [line for line in lines if line.startswith(("ignored", "normalized", "odd"))]
 
 
-def test_check_names_every_repair(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_names_every_repair(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "scene.ply"
     scene = tidy()
     scene.means[3] = FAR
@@ -68,13 +68,13 @@ def test_check_names_every_repair(tmp_path: Path, capsys: pytest.CaptureFixture[
     save_ply(path, scene)
     far, nan = (torch.tensor(value).numpy().tobytes() for value in (FAR, float("nan")))
     path.write_bytes(path.read_bytes().replace(far, nan))
-    lines = lines_of(capsys, "check", str(path))
+    lines = lines_of(capsys, "info", str(path))
     assert "repaired: 2 Gaussians made invisible: 2 with NaN, infinite or absurd position" in lines
     assert "repaired: 1 Gaussian with a zero quaternion, taken as no rotation" in lines
     assert "repaired: nothing" not in lines
 
 
-def test_check_points_at_strays_and_at_the_command_that_leaves_them_out(
+def test_info_points_at_strays_and_at_the_command_that_leaves_them_out(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     scene = tidy()
@@ -82,7 +82,7 @@ def test_check_points_at_strays_and_at_the_command_that_leaves_them_out(
     scene.log_scales[1:4, 0] = torch.tensor(20.0).log()
     scene.logit_opacities[4:9] = -9.0
     save_ply(tmp_path / "scene.ply", scene)
-    line = lines_of(capsys, "check", str(tmp_path / "scene.ply"))[-1]
+    line = lines_of(capsys, "info", str(tmp_path / "scene.ply"))[-1]
     assert line.startswith("strays: 4 giants, ")
     assert ", 5 too transparent to be drawn; progdf edit " in line
 
@@ -98,11 +98,10 @@ def test_the_survey_is_about_the_bulk_of_the_scene() -> None:
     assert not found.surrounding
 
 
-def test_check_of_a_broken_file_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_of_a_broken_file_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "scene.ply"
     save_ply(path, tidy())
     path.write_bytes(path.read_bytes()[:-10])
-    assert "truncated" in error_of(capsys, "check", str(path))
     assert "truncated" in error_of(capsys, "info", str(path))
 
 
@@ -140,6 +139,18 @@ def test_info_of_an_edit_tells_its_scene_region_field_and_errors(
     assert {"report: field.psnr_worst 46.91", "report: edit.clip_direction not measured"} <= set(lines)
 
 
+def test_cameras_and_up_are_for_scenes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    save_ply(tmp_path / "scene.ply", tidy())
+    save_cameras(tmp_path / "c.json", orbit_rig(tidy(), 3, 64, 48))
+    told = lines_of(capsys, "info", str(tmp_path / "scene.ply"), "--cameras", str(tmp_path / "c.json"))
+    assert any(line.startswith("up: ") for line in told)
+    assert any(
+        line.startswith("up: +z")
+        for line in lines_of(capsys, "info", str(tmp_path / "scene.ply"), "--up", "+z")
+    )
+    assert "is no scene" in error_of(capsys, "info", str(tmp_path / "c.json"), "--up", "+z")
+
+
 def test_info_of_anything_else_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "picture.jpg").write_bytes(b"\xff\xd8\xff\xe0")
     assert "is not a file progdf knows" in error_of(capsys, "info", str(tmp_path / "picture.jpg"))
@@ -158,13 +169,12 @@ def test_every_real_file_is_described_or_refused_in_one_line(
     files = sorted(shared_data.glob("*/*.ply"))
     assert files
     for path in files:
-        for command in ("check", "info"):
-            status = main([command, str(path)])
-            captured = capsys.readouterr()
-            if status == 0:
-                assert captured.err == ""
-                assert captured.out.startswith(f"{path.name}: {format_count(len(load_ply(path)))}, ")
-            else:
-                assert status == 2
-                assert captured.out == ""
-                assert captured.err.count("\n") == 1
+        status = main(["info", str(path)])
+        captured = capsys.readouterr()
+        if status == 0:
+            assert captured.err == ""
+            assert captured.out.startswith(f"{path.name}: {format_count(len(load_ply(path)))}, ")
+        else:
+            assert status == 2
+            assert captured.out == ""
+            assert captured.err.count("\n") == 1

@@ -1,0 +1,57 @@
+"""Higher SH bands turn with their Gaussians."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from progdf.quaternions import multiply_quats, normalize_quats, rotate_vectors
+from progdf.sh import rotate_about_x, rotate_bands, rotation_change, shade
+from tests.helpers.draws import Draws
+
+COUNT = 200
+
+
+def turns(seed: int = 0) -> torch.Tensor:
+    return normalize_quats(Draws(seed).normal(COUNT, 4))
+
+
+def bands(degree: int) -> torch.Tensor:
+    return 0.3 * Draws(1).normal(COUNT, (degree + 1) ** 2 - 1, 3)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_what_was_seen_along_a_direction_is_seen_along_the_turned_one(degree: int) -> None:
+    quats, shN = turns(), bands(degree)
+    sh0 = 2.0 * torch.ones(COUNT, 1, 3)  # so that nothing is clamped at 0
+    directions = torch.nn.functional.normalize(Draws(2).normal(COUNT, 3), dim=1)
+    before = shade(degree, directions.double(), torch.cat([sh0, shN], dim=1).double())
+    turned = rotate_vectors(directions.double(), quats.double())
+    after = shade(degree, turned, torch.cat([sh0, rotate_bands(shN, quats)], dim=1).double())
+    torch.testing.assert_close(after, before, rtol=0.0, atol=1e-6)
+
+
+def test_one_turn_after_another_is_their_product() -> None:
+    first, second, shN = turns(3), turns(4), bands(3)
+    there = rotate_bands(rotate_bands(shN, first), second)
+    torch.testing.assert_close(there, rotate_bands(shN, multiply_quats(second, first)), rtol=0.0, atol=2e-6)
+
+
+def test_without_a_turn_nothing_changes_and_band_4_never_does() -> None:
+    rest = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).expand(COUNT, 4)
+    assert not bool(rotation_change(bands(3), rest).any())
+    change = rotation_change(0.3 * Draws(1).normal(COUNT, 24, 3), turns())
+    assert bool(change[:, :15].any())
+    assert not bool(change[:, 15:].any())
+
+
+def test_parts_turn_their_members() -> None:
+    part = torch.arange(COUNT) % 3
+    expected = rotation_change(bands(2), turns()[:3][part])
+    assert torch.equal(rotation_change(bands(2), turns()[:3], part), expected)
+
+
+def test_half_a_turn_about_x_changes_signs_only() -> None:
+    half = torch.tensor([[0.0, 1.0, 0.0, 0.0]]).expand(COUNT, 4)
+    torch.testing.assert_close(rotate_about_x(bands(3)), rotate_bands(bands(3), half), rtol=0.0, atol=1e-6)
+    assert torch.equal(rotate_about_x(bands(3)).abs(), bands(3).abs())
