@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from progdf.gaussians import Gaussians
-from progdf.rasterize.cpu.parallel import threads
+from progdf.threads import threads
 
 from .selection import Floats, Mask, alike_in_color
 

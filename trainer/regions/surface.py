@@ -12,11 +12,11 @@ from torch import Tensor
 from progdf.camera import Camera
 from progdf.gaussians import Gaussians
 from progdf.rasterize import render
-from progdf.rasterize.cpu.parallel import threads
 from progdf.rasterize.reference import rotation_matrices
 from progdf.scene.bounds import normals_of, scene_sphere
 from progdf.scene.neighbors import nearest_rows
 from progdf.sh import sh0_to_rgb
+from progdf.threads import threads
 
 _NEIGHBORS = 96
 _ROUNDS = 100

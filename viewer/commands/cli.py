@@ -14,7 +14,7 @@ from progdf.formats.scene_file import scene_format
 from progdf.gaussians import ZERO
 from progdf.io.atomic import check_not_an_input
 from progdf.terminal import print_line
-from progdf.torch_threads import one_thread
+from progdf.threads import one_thread
 from viewer.camera.view_camera import first_camera
 from viewer.files.document import empty
 from viewer.state.layers import visible_layers

@@ -20,7 +20,7 @@ from progdf.gdf.file import Gdf
 from progdf.io.atomic import atomic_write, check_not_an_input
 from progdf.io.picture_camera import camera_chunk
 from progdf.terminal import print_line
-from progdf.torch_threads import one_thread
+from progdf.threads import one_thread
 from viewer.files import timeline_file
 from viewer.pictures import film, timeline_film
 from viewer.pictures.compare_labels import draw_labels
