@@ -164,10 +164,10 @@ def render(
 
     Args:
         gaussians: raw parameters, or activated ones, which gradients then are to; of spherical harmonics the
-            bands 0 to 3 are shown. A scene that was trained anti-aliased is drawn so
+            bands 0 to 3 are drawn. A scene that was trained anti-aliased is drawn so
         camera: the view, and the depth at and below which nothing is drawn
         background: rgb behind everything. [3]
-        colors: take the place of the Gaussians' own: rgb [N,3], or SH coefficients [N,K,3]
+        colors: in place of the Gaussians' own: rgb [N,3], or SH coefficients [N,K,3]
         crop: draw only this window, with the full image's conventions; equals the slice of the full image
             bit for bit. Gaussians that do not touch it cost next to nothing
         grad_rows: only these rows get gradients, all others zero; takes much less time where they are few.
@@ -176,7 +176,7 @@ def render(
             type
 
     Returns:
-        Image, transmittance and what the projection found: float32 of "cpu", of "reference" the means' type.
+        Image, transmittance and what the projection yields: float32 of "cpu", of "reference" the means' type.
 
     Raises:
         ValueError: a shape does not fit, the crop is empty or leaves the image, the engine is unknown,

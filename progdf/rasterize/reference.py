@@ -109,12 +109,12 @@ def project(gaussians: ActivatedGaussians, view: RasterView) -> tuple[ReferenceS
     extents = radius[:, None] * torch.stack([a + DILATION, c + DILATION], dim=1).detach().sqrt()
     low, high = (means2d - extents).detach(), (means2d + extents).detach()
     x0, y0, x1, y1 = view.crop
-    shown = (high[:, 0] >= x0) & (low[:, 0] <= x1) & (high[:, 1] >= y0) & (low[:, 1] <= y1)
-    shown = shown & (opacity.detach() >= ALPHA_MIN) & colored[rows]
+    inside = (high[:, 0] >= x0) & (low[:, 0] <= x1) & (high[:, 1] >= y0) & (low[:, 1] <= y1)
+    inside = inside & (opacity.detach() >= ALPHA_MIN) & colored[rows]
     depths = torch.zeros_like(opacities).index_copy(0, rows, z).detach().float()
     # float32 depth, ties by index: what a viewer can sort by, and the same in every engine
     order = z.detach().float().argsort(stable=True)
-    order = order[shown[order]]
+    order = order[inside[order]]
     if sh_degree is None:
         rgb = colors[rows[order]]
     else:

@@ -104,17 +104,17 @@ def lines_behind(image: Array, transmittance: Array, lines: Array, clear: float)
         clear: radius in that disc within which a line has not begun to fade, < 1
     """
     most = 2 * len(lines) * (max(transmittance.shape) + 1)
-    places, before = np.empty((most, 2), np.int32), np.empty((most, 3), np.float32)
-    count = _draw_lines(lines, clear, image, transmittance, places, before)
+    pixels, before = np.empty((most, 2), np.int32), np.empty((most, 3), np.float32)
+    count = _draw_lines(lines, clear, image, transmittance, pixels, before)
     try:
         yield
     finally:
-        _restore(image, places[:count], before)
+        _restore(image, pixels[:count], before)
 
 
 @kernel(cache=True, fast=True)
 def _draw_lines(
-    lines: Array, clear: float, image: Array, through: Array, places: Array, before: Array
+    lines: Array, clear: float, image: Array, through: Array, pixels: Array, before: Array
 ) -> int:
     """Gives how many pixels were changed: which, and what they were."""
     height, width = through.shape
@@ -139,8 +139,8 @@ def _draw_lines(
             )  # in the world, where it is not as in the picture
             u = lines[i, 6] + along * (lines[i, 8] - lines[i, 6])
             v = lines[i, 7] + along * (lines[i, 9] - lines[i, 7])
-            left = lines[i, 13] * min((1.0 - np.sqrt(u * u + v * v)) / (1.0 - clear), 1.0)
-            if not left > 0.0:
+            strength = lines[i, 13] * min((1.0 - np.sqrt(u * u + v * v)) / (1.0 - clear), 1.0)
+            if not strength > 0.0:
                 continue
             beside = (x0 + at * dx if steep else y0 + at * dy) - 0.5
             low = int(np.floor(beside))
@@ -148,10 +148,10 @@ def _draw_lines(
                 column, row = (low + side, pixel) if steep else (pixel, low + side)
                 if column < 0 or column >= width or row < 0 or row >= height:
                     continue
-                share = left * (beside - low if side == 1 else 1.0 - beside + low) * through[row, column]
+                share = strength * (beside - low if side == 1 else 1.0 - beside + low) * through[row, column]
                 if not share > 0.0:
                     continue
-                places[count, 0], places[count, 1] = row, column
+                pixels[count, 0], pixels[count, 1] = row, column
                 for c in range(3):
                     under = image[row, column, c]
                     before[count, c] = under
@@ -170,9 +170,9 @@ def _cut(start: float, way: float, size: float, first: float, last: float) -> tu
 
 
 @kernel(cache=True)
-def _restore(image: Array, places: Array, before: Array) -> None:
+def _restore(image: Array, pixels: Array, before: Array) -> None:
     """The last first, as lines cross."""
-    for k in range(len(places)):
-        i = len(places) - 1 - k
+    for k in range(len(pixels)):
+        i = len(pixels) - 1 - k
         for c in range(3):
-            image[places[i, 0], places[i, 1], c] = before[i, c]
+            image[pixels[i, 0], pixels[i, 1], c] = before[i, c]

@@ -4,12 +4,12 @@ After Cook, Halstead, Planck, Ryu: Stochastic simplification of aggregate detail
 
 - a Gaussian weighs its opacity times the area that the fine picture shows of it, and matters by that and by
   what reaches it of the light (the optical depth before it, added up in a grid of cells and slices of depth);
-- beyond the budget one of importance w is kept with probability p = min(1, w / t); which ones, a number
+- beyond the budget one of importance w is drawn with probability p = min(1, w / t); which ones, a number
   decides that stays with each, so that nothing flickers while the camera moves;
-- one that is kept stands for those of its weight that are not: by more opacity, and only where it has no more
-  to give by a larger area, since that blurs outlines; where the scene is dense by no more area than covers:
-  there the others hide what is missing;
-- the dilation, wider in a coarse picture, is taken off the size, and what is left of it off the opacity.
+- one that is drawn stands for those of its weight that are not: by more opacity, and only where it has no
+  more to give by a larger area, since that blurs outlines; where the scene is dense by no more area than
+  covers: there the others hide what is missing;
+- the dilation, wider in a coarse picture, is taken off the size, and the remainder off the opacity.
 
 The plain version is in tests/helpers/plain_simplification.py.
 """
@@ -84,7 +84,7 @@ class Chosen(NamedTuple):
 
     rows: Array  # their indices. [M] int32
     weights: Array  # importance of each. [N] float32
-    places: Array  # in the flat grid, where there is a weight. [N] int32
+    cells: Array  # in the flat grid, where there is a weight. [N] int32
     density: Array  # optical depth of each slice of the flat grid. float32
     threshold: float  # of a weight; a lighter one stands for several
     dilation: float  # of the fine picture, in pixels of the coarse one
@@ -107,21 +107,21 @@ def simplify(
     means, quats, scales, opacities, colors = (tensor.detach().numpy() for tensor in gaussians.tensors)
     scene = Scene(means, quats, scales, opacities, colors if colors.ndim == 3 else colors[:, None])
     view, dilation = make_pinhole(RasterView.of(camera, gaussians)), DILATION / pixels**2
-    weights, places = np.empty(len(means), np.float32), np.empty(len(means), np.int32)
-    density = _weigh_all(scene, view, dilation, weights, places)
+    weights, cells = np.empty(len(means), np.float32), np.empty(len(means), np.int32)
+    density = _weigh_all(scene, view, dilation, weights, cells)
     threshold = 0.0
     if np.count_nonzero(weights) > budget:
         before, light = np.empty_like(density), np.empty_like(density)
         light_at(density, before, light)
-        threshold = _hide_all(weights, places, light.ravel(), budget)
+        threshold = _hide_all(weights, cells, light.ravel(), budget)
         rows = _choose_all(weights, threshold)
     else:
         rows = np.flatnonzero(weights).astype(np.int32)
-    chosen = Chosen(rows, weights, places, density.ravel(), threshold, dilation)
+    chosen = Chosen(rows, weights, cells, density.ravel(), threshold, dilation)
     out = Scene(*(np.empty((len(rows), width), np.float32) for width in (3, 4, 3, 1, 3)))
     share_gaussians(lambda begin, end: _take(begin, end, chosen, scene, view, out, np.empty(16)), len(rows))
-    turned, sizes, covers, shown = map(torch.from_numpy, out[1:])
-    return ActivatedGaussians(torch.from_numpy(out.means), turned, sizes, covers[:, 0], shown)
+    out_means, out_quats, out_scales, out_opacities, rgb = map(torch.from_numpy, out)
+    return ActivatedGaussians(out_means, out_quats, out_scales, out_opacities[:, 0], rgb)
 
 
 @kernel(cache=True)
@@ -164,22 +164,22 @@ def find_threshold(counts: Array, sums: Array, budget: int) -> float:
     if above[0] <= budget:
         return 0.0
     below = np.concatenate([[0.0], np.cumsum(sums)])
-    kept = above[:-1] + below[:-1] / _EDGES  # falls with the edge
-    at = min(int(np.flatnonzero(kept >= budget)[-1]), _BINS - 2)
+    expected = above[:-1] + below[:-1] / _EDGES  # falls with the edge
+    at = min(int(np.flatnonzero(expected >= budget)[-1]), _BINS - 2)
     # between two edges, or it would jump from one to the next while the camera moves
-    share = (kept[at] - budget) / max(kept[at] - kept[at + 1], 1e-9)
+    share = (expected[at] - budget) / max(expected[at] - expected[at + 1], 1e-9)
     return float(_EDGES[at] * (_EDGES[at + 1] / _EDGES[at]) ** share)
 
 
-def _weigh_all(scene: Scene, view: Pinhole, dilation: float, weights: Array, places: Array) -> Array:
-    """Weights and places of all Gaussians, as `_weigh`, and the optical depth of all slices."""
+def _weigh_all(scene: Scene, view: Pinhole, dilation: float, weights: Array, cells: Array) -> Array:
+    """Weights and cells of all Gaussians, as `_weigh`, and the optical depth of all slices."""
     count, shape = len(weights), (-(-view.window[3] // CELL), -(-view.window[2] // CELL), SLICES)
     chunks = threads()
     cuts = [count * chunk // chunks for chunk in range(chunks + 1)]
 
     def weigh(chunk: int) -> Array:
         density = np.zeros(math.prod(shape), np.float32)
-        _weigh(cuts[chunk], cuts[chunk + 1], scene, view, dilation, weights, places, density)
+        _weigh(cuts[chunk], cuts[chunk + 1], scene, view, dilation, weights, cells, density)
         return density
 
     first, *others = run_chunks(weigh, chunks)
@@ -188,12 +188,12 @@ def _weigh_all(scene: Scene, view: Pinhole, dilation: float, weights: Array, pla
     return first.reshape(shape)
 
 
-def _hide_all(weights: Array, places: Array, light: Array, budget: int) -> float:
+def _hide_all(weights: Array, cells: Array, light: Array, budget: int) -> float:
     """Take from the weights what others hide; the threshold of the budget."""
 
     def hide(begin: int, end: int) -> tuple[Array, Array]:
         counts, sums = np.zeros(_BINS, np.int64), np.zeros(_BINS)
-        _hide(begin, end, weights, places, light, counts, sums)
+        _hide(begin, end, weights, cells, light, counts, sums)
         return counts, sums
 
     counts, sums = zip(*share_gaussians(hide, len(weights)), strict=True)
@@ -210,7 +210,7 @@ def _choose_all(weights: Array, threshold: float) -> Array:
 
 @kernel(contract=True, cache=True)
 def _weigh(
-    begin: int, end: int, scene: Scene, camera: Pinhole, dilation: float, weights: Array, places: Array,
+    begin: int, end: int, scene: Scene, camera: Pinhole, dilation: float, weights: Array, cells: Array,
     density: Array,
 ) -> None:  # fmt: skip
     """Weigh Gaussians begin … end − 1.
@@ -218,11 +218,11 @@ def _weigh(
     Args:
         dilation: of the fine picture, in pixels of this one
         weights: out, opacity times area in pixels; 0 for what the window does not show. [N] float32
-        places: out, of that in the flat grid, where there is a weight. [N] int32
-        density: its optical depth is added here, see `places`. float32
+        cells: out, index of each in the flat grid, where there is a weight. [N] int32
+        density: its optical depth is added here, see `cells`. float32
     """
     x1, y1 = float(camera.window[2]), float(camera.window[3])
-    focal, share, cells = camera.fx * camera.fy, _FULL_TURN / (CELL * CELL), 1.0 / CELL
+    focal, share, scale = camera.fx * camera.fy, _FULL_TURN / (CELL * CELL), 1.0 / CELL
     columns = -(-camera.window[2] // CELL)
     for i in range(begin, end):
         weights[i] = 0.0
@@ -237,30 +237,33 @@ def _weigh(
         more = 0.0 if camera.antialiased else dilation
         area = math.sqrt((longest2 + more) * (middle2 + more))
         weights[i] = min(scene.opacities[i] * area, _MOST)
-        column, row = int(min(max(px, 0.0), x1 - 1.0) * cells), int(min(max(py, 0.0), y1 - 1.0) * cells)
+        column, row = (
+            int(min(max(px, 0.0), x1 - 1.0) * scale),
+            int(min(max(py, 0.0), y1 - 1.0) * scale),
+        )
         # of the logarithm of the depth, nearly
         at: Number = (np.float32(z / camera.near).view(np.int32) - _ONE) >> _SLICE_SHIFT
-        places[i] = (row * columns + column) * SLICES + min(max(at, 0), SLICES - 1)
-        density[places[i]] += weights[i] * share
+        cells[i] = (row * columns + column) * SLICES + min(max(at, 0), SLICES - 1)
+        density[cells[i]] += weights[i] * share
 
 
 @kernel(cache=True)
 def _hide(
-    begin: int, end: int, weights: Array, places: Array, light: Array, counts: Array, sums: Array
+    begin: int, end: int, weights: Array, cells: Array, light: Array, counts: Array, sums: Array
 ) -> None:
-    """Take from the weights of Gaussians begin … end − 1 what does not reach their places of the light; count
+    """Take from the weights of Gaussians begin … end − 1 what does not reach their cells of the light; count
     them and add them up by bins of their bits."""
     for i in range(begin, end):
         if weights[i] > 0.0:
-            weights[i] *= light[places[i]]
-            place = np.float32(weights[i]).view(np.int32) >> _SHIFT
-            counts[place] += 1
-            sums[place] += weights[i]
+            weights[i] *= light[cells[i]]
+            bin_index = np.float32(weights[i]).view(np.int32) >> _SHIFT
+            counts[bin_index] += 1
+            sums[bin_index] += weights[i]
 
 
 @kernel(cache=True)
 def _choose(begin: int, end: int, weights: Array, threshold: float, rows: Array) -> int:
-    """Which of the Gaussians begin … end − 1 are kept, into `rows`; how many."""
+    """Which of the Gaussians begin … end − 1 are drawn, into `rows`; how many."""
     at = 0
     for i in range(begin, end):
         lot = i * GOLDEN
@@ -274,7 +277,7 @@ def _choose(begin: int, end: int, weights: Array, threshold: float, rows: Array)
 def _take(
     begin: int, end: int, chosen: Chosen, scene: Scene, camera: Pinhole, out: Scene, basis: Array
 ) -> None:
-    """Take the chosen Gaussians of places begin … end − 1 as they are drawn."""
+    """Take the chosen Gaussians begin … end − 1 as they are drawn."""
     eye, dilation = camera_center(camera), chosen.dilation
     for at in range(begin, end):
         i, ahead = chosen.rows[at], chosen.rows[min(at + _AHEAD, end - 1)]
@@ -285,7 +288,7 @@ def _take(
         seen = footprint(camera, scene, i)
         opacity, stands_for = np.float64(scene.opacities[i]), chosen.threshold / chosen.weights[i]
         denser = max(min(stands_for, ALPHA_MAX / opacity), 1.0)
-        enough = min(DENSE / max(chosen.density[chosen.places[i]], 1e-6), 1.0)
+        enough = min(DENSE / max(chosen.density[chosen.cells[i]], 1e-6), 1.0)
         larger = min(max(enough * stands_for / denser, 1.0), MOST_TIMES)
         # the coarse picture's dilation instead of the fine one's: off the size, as far as that goes
         more = (larger * dilation - DILATION) / (camera.fx * camera.fy * seen.inv_z * seen.inv_z)

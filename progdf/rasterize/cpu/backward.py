@@ -211,7 +211,7 @@ def new_scratch() -> GradientScratch:
 
 @kernel(contract=True, cache=True)
 def project_backward(
-    begin: int, end: int, scene: Scene, camera: Pinhole, offsets: Array, sums: Array, wanted: Array,
+    begin: int, end: int, scene: Scene, camera: Pinhole, offsets: Array, sums: Array, grad_mask: Array,
     gradients: Scene, by_camera: Array, scratch: GradientScratch,
 ) -> None:  # fmt: skip
     """Gradients of `project`, which has the same first arguments.
@@ -219,7 +219,7 @@ def project_backward(
     Args:
         offsets: first row of `sums` of each Gaussian. [N+1] int32
         sums: see `blend_backward`. [I,9] float32
-        wanted: rows whose gradients are filled in, the others' are zero; [0]: all. [N] bool
+        grad_mask: rows whose gradients are filled in, the others' are zero; [0]: all. [N] bool
         gradients: out
         by_camera: out, each block's part of the camera's gradient; zero on entry. [blocks,CAMERA] float64
     """
@@ -230,7 +230,7 @@ def project_backward(
     gradients.colors[begin:end] = 0.0
     eye, total = camera_center(camera), scratch.total
     for i in range(begin, end):
-        if offsets[i] == offsets[i + 1] or (wanted.size > 0 and not wanted[i]):
+        if offsets[i] == offsets[i + 1] or (grad_mask.size > 0 and not grad_mask[i]):
             continue
         total[:] = 0.0
         for slot in range(offsets[i], offsets[i + 1]):

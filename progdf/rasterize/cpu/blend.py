@@ -1,7 +1,7 @@
 """Kernels: blend the splats of each tile front to back, and their gradients, back to front.
 
-The support of a splat is found first, as spans of pixels, row by row, so that the loops over pixels are plain
-runs of eight. The backward pass leaves one row of sums for each (splat, tile) intersection: the color's
+First the support of a splat is worked out, as spans of pixels, row by row: the loops over pixels are then
+plain runs of eight. The backward pass leaves one row of sums for each (splat, tile) intersection: the color's
 gradient (3), and for g = alpha · dL/dalpha the moments Σg, Σg·u, Σg·v, Σg·u², Σg·uv, Σg·v². In the
 whitened coordinates u, v they stay of the size of the result however thin the Gaussian is; in pixels they
 would cancel. Then what Gaussians weigh in the pixels (w = αT), summed up or as lists.
@@ -88,11 +88,11 @@ ZERO: Number = np.float32(0.0)
 ONE: Number = np.float32(1.0)
 EIGHT: Number = np.float32(WIDTH)
 _E1, _E2, _E3, _E4, _E5, _E6 = (np.float32(factor) for factor in _POLYNOMIAL)
-# planes of the forward pass's state: transmittance (negative: the pixel is done), rgb, place in the tile's
+# planes of the forward pass's state: transmittance (negative: the pixel is done), rgb, index in the tile's
 # list of the last contributor (-1: none; float32 holds it exactly up to 2^24)
 _R, _G, _B, _LAST = (PLANE * np.uint64(k) for k in (1, 2, 3, 4))
 # and of the backward pass's: transmittance after the current splat; what lies behind it, times the gradient;
-# the image's gradient (3); place of the last contributor
+# the image's gradient (3); index of the last contributor
 _BEHIND, _G0, _G1, _G2, _DEEPEST = (PLANE * np.uint64(k) for k in (1, 2, 3, 4, 5))
 
 
@@ -150,33 +150,33 @@ def find_spans(
     """
     low, high = np.float64(bounds[0]), np.float64(bounds[2])
     shapes, colors = splats.shapes, splats.colors
-    for place in range(begin, end):
-        prefetch(shapes, members[place])
-        prefetch(colors, members[place])
-    for place in range(begin, end):
-        at = np.uint64(place - begin) * SPLAT
-        s = members[place]
+    for index in range(begin, end):
+        prefetch(shapes, members[index])
+        prefetch(colors, members[index])
+    for index in range(begin, end):
+        at = np.uint64(index - begin) * SPLAT
+        s = members[index]
         mx, my = shapes[s, MX] - x - 0.5, shapes[s, MY] - y - 0.5
         slope, l11 = shapes[s, SLOPE], shapes[s, L11]
         inv_l11, l22, r2 = shapes[s, INV_L11], shapes[s, L22], shapes[s, R2]
         for row in range(np.uint64(TILE_H)):
             dy = np.float64(np.int32(row)) - my
             v = l22 * dy
-            rest = r2 - v * v
+            remaining = r2 - v * v
             center = mx - slope * dy
-            half = np.sqrt(max(rest, 0.0)) * inv_l11
+            half = np.sqrt(max(remaining, 0.0)) * inv_l11
             start = max(np.ceil(center - half), low)
             stop = min(np.floor(center + half) + 1.0, high)
             # counting from the peak keeps u = l11·(column − center) free of cancellation in float32; far
             # peaks (needles, giants) lie where l11 is small
             peak = min(max(np.floor(center + 0.5), -65536.0), 65536.0)
-            start, stop = min(start, high), max(stop, low) if rest >= 0.0 else low
+            start, stop = min(start, high), max(stop, low) if remaining >= 0.0 else low
             batch[at + BEGIN + row] = start
             batch[at + START + row] = start - peak
             batch[at + STOP + row] = stop - peak
             batch[at + U_PEAK + row] = l11 * (peak - center)
             batch[at + V + row] = v
-            batch[at + TOP + row] = rest + LOG2_ALPHA_MIN
+            batch[at + TOP + row] = remaining + LOG2_ALPHA_MIN
         batch[at + FIRST] = max(np.ceil(my - shapes[s, EXTENT_Y]), np.float64(bounds[1]))
         batch[at + END] = min(np.floor(my + shapes[s, EXTENT_Y]) + 1.0, np.float64(bounds[3]))
         batch[at + STEP] = l11
@@ -185,7 +185,7 @@ def find_spans(
 
 @kernel(fast=True, inline=True)
 def row_span(batch: Array, splat: Number, row: Number) -> tuple[Number, Number, Number, Number, Number]:
-    """Where a row of a splat begins and ends, from its peak; its place in a tile's plane; u_peak and top."""
+    """Where a row of a splat begins and ends, from its peak; its index in a tile's plane; u_peak and top."""
     begin = np.uint64(np.int32(batch[splat + BEGIN + row]))
     return (
         batch[splat + START + row], batch[splat + STOP + row], row * np.uint64(TILE_W) + begin,
@@ -208,7 +208,7 @@ class Picture(NamedTuple):
 
 
 @kernel(fast=True, inline=True)
-def _blend_row(state: Array, batch: Array, splat: Number, row: Number, place: Number) -> None:
+def _blend_row(state: Array, batch: Array, splat: Number, row: Number, index: Number) -> None:
     """Blend one row of a splat into a tile's state; `splat` is where its spans begin."""
     start, stop, p, u_peak, top = row_span(batch, splat, row)
     step, red, green, blue = step_and_color(batch, splat)
@@ -226,7 +226,7 @@ def _blend_row(state: Array, batch: Array, splat: Number, row: Number, place: Nu
         store(state, p + _R, load(state, p + _R) + weight * red)
         store(state, p + _G, load(state, p + _G) + weight * green)
         store(state, p + _B, load(state, p + _B) + weight * blue)
-        store(state, p + _LAST, select(weight > ZERO, place, load(state, p + _LAST)))
+        store(state, p + _LAST, select(weight > ZERO, index, load(state, p + _LAST)))
         p += np.uint64(WIDTH)
         offset += EIGHT
         start += EIGHT
@@ -254,7 +254,7 @@ def _is_done(state: Array, row: int, bounds: Array) -> Number:
 def _blend_tile(
     state: Array, x: int, y: int, members: Array, splats: Splats, bounds: Array, batch: Array
 ) -> None:
-    """Blend a tile; state is [5·PLANE] float32, set up here, the rest as in `find_spans`."""
+    """Blend a tile; state is [5·PLANE] float32, set up here, all else as in `find_spans`."""
     plane = np.int64(PLANE)
     state[:plane] = ONE
     state[plane : 4 * plane] = ZERO
@@ -262,10 +262,10 @@ def _blend_tile(
     for begin in range(0, members.size, BATCH):
         end = min(begin + BATCH, members.size)
         find_spans(members, begin, end, splats, x, y, bounds, batch)
-        for place in range(begin, end):
-            splat = np.uint64(place - begin) * SPLAT
+        for index in range(begin, end):
+            splat = np.uint64(index - begin) * SPLAT
             for line in range(np.int32(batch[splat + FIRST]), np.int32(batch[splat + END])):
-                _blend_row(state, batch, splat, np.uint64(line), np.float32(place))
+                _blend_row(state, batch, splat, np.uint64(line), np.float32(index))
         if not _skip_done_rows(state, bounds):
             break
 
@@ -300,7 +300,7 @@ def blend(
 
 @kernel(fast=True, inline=True)
 def _blend_splat_backward(
-    state: Array, batch: Array, splat: Number, place: Number, sums: Array, slot: Number
+    state: Array, batch: Array, splat: Number, index: Number, sums: Array, slot: Number
 ) -> None:
     """Take one splat off a tile's state and write its row of `sums`; `splat` is where its spans begin."""
     step, red, green, blue = step_and_color(batch, splat)
@@ -312,19 +312,19 @@ def _blend_splat_backward(
         offset = start + lane_indices()
         while start < stop:
             u = u_peak + step * offset
-            covered = (offset < stop) & (place <= load(state, p + _DEEPEST))
+            covered = (offset < stop) & (index <= load(state, p + _DEEPEST))
             raw = select(covered, exp2(top - u * u), ZERO)
             alpha = select(raw < MOST, raw, MOST)
             inverse = ONE / (ONE - alpha)
             before = load(state, p) * inverse
             g0, g1, g2 = load(state, p + _G0), load(state, p + _G1), load(state, p + _G2)
-            shown = red * g0 + green * g1 + blue * g2
+            front = red * g0 + green * g1 + blue * g2
             behind = load(state, p + _BEHIND)
             weight = alpha * before
-            g = alpha * (before * shown - behind * inverse)
+            g = alpha * (before * front - behind * inverse)
             g = select(raw <= MOST, g, ZERO)
             store(state, p, before)
-            store(state, p + _BEHIND, behind + weight * shown)
+            store(state, p + _BEHIND, behind + weight * front)
             s_r += weight * g0
             s_g += weight * g1
             s_b += weight * g2
@@ -344,8 +344,8 @@ def _blend_splat_backward(
 
 
 @kernel(fast=True, inline=True)
-def _restore_behind(state: Array, batch: Array, splat: Number, place: Number) -> None:
-    """As `_blend_splat_backward` for a splat whose own gradient nobody wants."""
+def _restore_behind(state: Array, batch: Array, splat: Number, index: Number) -> None:
+    """As `_blend_splat_backward` for a splat that gets no gradient."""
     step, red, green, blue = step_and_color(batch, splat)
     for line in range(np.int32(batch[splat + FIRST]), np.int32(batch[splat + END])):
         row = np.uint64(line)
@@ -353,13 +353,13 @@ def _restore_behind(state: Array, batch: Array, splat: Number, place: Number) ->
         offset = start + lane_indices()
         while start < stop:
             u = u_peak + step * offset
-            covered = (offset < stop) & (place <= load(state, p + _DEEPEST))
+            covered = (offset < stop) & (index <= load(state, p + _DEEPEST))
             alpha = select(covered, exp2(top - u * u), ZERO)
             alpha = select(alpha < MOST, alpha, MOST)
             before = load(state, p) / (ONE - alpha)
-            shown = red * load(state, p + _G0) + green * load(state, p + _G1) + blue * load(state, p + _G2)
+            front = red * load(state, p + _G0) + green * load(state, p + _G1) + blue * load(state, p + _G2)
             store(state, p, before)
-            store(state, p + _BEHIND, load(state, p + _BEHIND) + alpha * before * shown)
+            store(state, p + _BEHIND, load(state, p + _BEHIND) + alpha * before * front)
             p += np.uint64(WIDTH)
             offset += EIGHT
             start += EIGHT
@@ -368,41 +368,41 @@ def _restore_behind(state: Array, batch: Array, splat: Number, place: Number) ->
 @kernel(fast=True)
 def _blend_tile_backward(
     state: Array, x: int, y: int, members: Array, slots: Array, splats: Splats, bounds: Array, batch: Array,
-    sums: Array, wanted: Array,
+    sums: Array, grad_mask: Array,
 ) -> None:  # fmt: skip
-    """Take the splats off a tile, last contributor first; state: six planes, the rest as in `find_spans`."""
+    """Take the splats off a tile, last contributor first; state: six planes, all else as in `find_spans`."""
     plane = np.int64(PLANE)
     deepest: Number = -ONE
     for p in range(5 * plane, 6 * plane):
         deepest = max(deepest, state[p])
     drawn: Number = np.int64(deepest) + 1
-    for place in range(drawn, members.size):
+    for index in range(drawn, members.size):
         for k in range(SUMS):
-            sums[slots[place], k] = ZERO
+            sums[slots[index], k] = ZERO
     for group in range((drawn + BATCH - 1) // BATCH - 1, -1, -1):
         begin: Number = group * BATCH
         end: Number = min(begin + BATCH, drawn)
         find_spans(members, begin, end, splats, x, y, bounds, batch)
-        for place in range(end - 1, begin - 1, -1):
-            splat = np.uint64(place - begin) * SPLAT
-            if wanted.size == 0 or wanted[members[place]]:
-                _blend_splat_backward(state, batch, splat, np.float32(place), sums, slots[place])
+        for index in range(end - 1, begin - 1, -1):
+            splat = np.uint64(index - begin) * SPLAT
+            if grad_mask.size == 0 or grad_mask[members[index]]:
+                _blend_splat_backward(state, batch, splat, np.float32(index), sums, slots[index])
             else:
-                _restore_behind(state, batch, splat, np.float32(place))
+                _restore_behind(state, batch, splat, np.float32(index))
 
 
 @kernel(cache=True)
 def blend_backward(
     begin: int, end: int, scratch: TileScratch, splats: Splats, lists: TileLists, camera: Pinhole,
-    background: Array, out: Picture, gradients: Picture, wanted: Array, sums: Array,
+    background: Array, out: Picture, gradients: Picture, grad_mask: Array, sums: Array,
 ) -> None:  # fmt: skip
     """Gradients of `blend`, which has the same first arguments.
 
     Args:
         out: what `blend` made; the image is not read
-        gradients: of the loss to the image and the transmittance; the rest is not read
-        wanted: rows whose gradients are wanted; [0]: all. [N] bool
-        sums: out, a row for each slot; not set where nobody wants it. [I,9] float32
+        gradients: of the loss to the image and the transmittance; no more of it is read
+        grad_mask: rows that get gradients; [0]: all. [N] bool
+        sums: out, a row for each slot; not set where `grad_mask` is not. [I,9] float32
     """
     plane = np.int64(PLANE)
     state, batch, bounds = scratch
@@ -430,7 +430,7 @@ def blend_backward(
                 state[p + _BEHIND + k] = state[p + k] * behind
         listed = slice(lists.starts[tile], lists.starts[tile + 1])
         _blend_tile_backward(
-            state, x, y, lists.members[listed], lists.slots[listed], splats, bounds, batch, sums, wanted
+            state, x, y, lists.members[listed], lists.slots[listed], splats, bounds, batch, sums, grad_mask
         )
 
 
@@ -511,8 +511,8 @@ def accumulate_weights(
         for first in range(lists.starts[tile], lists.starts[tile + 1], BATCH):
             last = min(first + BATCH, lists.starts[tile + 1])
             find_spans(lists.members, first, last, splats, x, y, bounds, batch)
-            for place in range(first, last):
-                _add_weights(state, batch, np.uint64(place - first) * SPLAT, sums[lists.slots[place]])
+            for index in range(first, last):
+                _add_weights(state, batch, np.uint64(index - first) * SPLAT, sums[lists.slots[index]])
 
 
 @kernel(contract=True, inline=True)
@@ -520,7 +520,7 @@ def _list_tile(
     tile: int, splats: Splats, rows: Array, camera: Pinhole, members: Array, through: Array, write: bool,
     run: int, entry: int, out: Runs,
 ) -> tuple[int, int]:  # fmt: skip
-    """One tile's runs and entries, written from places `run` and `entry` on; the places one past the last."""
+    """One tile's runs and entries, written from `run` and `entry` on; those one past the last."""
     x, y = tile_corner(camera, tile)
     left, right = max(0, camera.window[0] - x), min(TILE_W, camera.window[2] - x)
     top, bottom = max(0, camera.window[1] - y), min(TILE_H, camera.window[3] - y)
@@ -534,11 +534,11 @@ def _list_tile(
         begun = entry
         for i in range(first, end):
             v = shape[L22] * (i - my)
-            rest = shape[R2] - v * v
-            if rest < 0.0:
+            remaining = shape[R2] - v * v
+            if remaining < 0.0:
                 continue
             center = mx - shape[SLOPE] * (i - my)
-            half = math.sqrt(rest) * shape[INV_L11]
+            half = math.sqrt(remaining) * shape[INV_L11]
             start = max(math.ceil(center - half), left)
             stop = min(math.floor(center + half) + 1, right)
             for j in range(start, stop):
@@ -546,7 +546,7 @@ def _list_tile(
                 if before < 0.0:  # the pixel is done
                     continue
                 u = shape[L11] * (j - center)
-                alpha = min(np.exp2(np.float32(rest - u * u) + _LOG2_ALPHA_MIN), MOST)
+                alpha = min(np.exp2(np.float32(remaining - u * u) + _LOG2_ALPHA_MIN), MOST)
                 after = before * (ONE - alpha)
                 if after <= LEAST:
                     through[i * TILE_W + j] = -before
@@ -567,19 +567,19 @@ def _list_tile(
 @kernel(cache=True)
 def list_weights(
     begin: int, end: int, scratch: TileScratch, splats: Splats, lists: TileLists, camera: Pinhole,
-    rows: Array, write: bool, places: Array, out: Runs,
+    rows: Array, write: bool, cursors: Array, out: Runs,
 ) -> None:  # fmt: skip
     """List what the splats weigh in tiles begin … end − 1.
 
     Args:
         rows: the row under which a Gaussian is listed, −1: not at all. [N] int32
         write: whether to fill the lists, or only to count
-        places: runs and entries of each tile, out; where they begin if `write`. [tiles,2] int64
+        cursors: runs and entries of each tile, out; where they begin if `write`. [tiles,2] int64
         out: where `write`
     """
     for tile in range(begin, end):
-        run, entry = (places[tile, 0], places[tile, 1]) if write else (0, 0)
+        run, entry = (cursors[tile, 0], cursors[tile, 1]) if write else (0, 0)
         members = lists.members[lists.starts[tile] : lists.starts[tile + 1]]
         run, entry = _list_tile(tile, splats, rows, camera, members, scratch.state, write, run, entry, out)
         if not write:
-            places[tile, 0], places[tile, 1] = run, entry
+            cursors[tile, 0], cursors[tile, 1] = run, entry

@@ -56,7 +56,7 @@ MOST_INTERSECTIONS = 100_000_000
 
 _LEAST_TILES = 4  # fewer are not worth a call
 _CHUNKS = 4  # for each thread: tiles take unequally long
-TILE_ROOM = 8  # tiles of a Gaussian that there is room for; where chunks have more, these are found twice
+TILE_ROOM = 8  # tiles of a Gaussian that there is room for; where chunks have more, these are listed twice
 _ALL = np.empty(0, np.bool_)
 
 
@@ -65,11 +65,11 @@ def rasterize(
 ) -> tuple[Tensor, Tensor, RasterInfo]:
     """See `progdf.rasterize.render`."""
     inputs = [to_float32(tensor) for tensor in (*gaussians.tensors, background)]
-    found: list[Array] = []
+    projected: list[Array] = []
     image, transmittance = _Rasterize.apply(  # type: ignore[no-untyped-call]
-        make_pinhole(view), grad_rows, found, *inputs, view.viewmat, view.K
+        make_pinhole(view), grad_rows, projected, *inputs, view.viewmat, view.K
     )
-    return image, transmittance, RasterInfo(*map(torch.from_numpy, found))
+    return image, transmittance, RasterInfo(*map(torch.from_numpy, projected))
 
 
 def make_pinhole(view: RasterView) -> Pinhole:
@@ -172,7 +172,7 @@ def _project_and_bin(scene: Scene, camera: Pinhole, with_slots: bool) -> tuple[S
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, camera: Pinhole, grad_rows: Tensor | None, found: list[Array], *tensors: Tensor
+        ctx: Any, camera: Pinhole, grad_rows: Tensor | None, projected: list[Array], *tensors: Tensor
     ) -> tuple[Tensor, Tensor]:
         *arrays, background = (tensor.numpy(force=True) for tensor in tensors[:6])
         if camera.degree < 0:
@@ -181,9 +181,9 @@ class _Rasterize(torch.autograd.Function):
         out = _new_picture(camera)
         splats, lists = _project_and_bin(scene, camera, any(ctx.needs_input_grad))
         share_tiles(blend, camera, splats, lists, camera, background, out)
-        found[:] = splats.means2d, splats.depths, splats.visible
+        projected[:] = splats.means2d, splats.depths, splats.visible
         ctx.set_materialize_grads(False)
-        ctx.kept = camera, grad_rows, scene, background, splats, lists, out
+        ctx.forward_pass = camera, grad_rows, scene, background, splats, lists, out
         results = torch.from_numpy(out.image), torch.from_numpy(out.transmittance)
         ctx.save_for_backward(*tensors, results[1])
         return results
@@ -191,10 +191,10 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        camera, grad_rows, scene, background, splats, lists, out = ctx.kept
+        camera, grad_rows, scene, background, splats, lists, out = ctx.forward_pass
         viewmat, K = ctx.saved_tensors[6:8]  # and that none of them has been changed since is checked
         by_out = Picture(_array(grads[0], out.image), _array(grads[1], out.transmittance), out.last)
-        wanted = _wanted_rows(len(scene.means), grad_rows)
+        grad_mask = _gradient_mask(len(scene.means), grad_rows)
         gradients = Scene(*(np.empty(array.shape, np.float32) for array in scene))
         sums = np.empty((len(lists.members), SUMS), np.float32)
 
@@ -202,11 +202,11 @@ class _Rasterize(torch.autograd.Function):
 
         def backward_chunk(begin: int, end: int) -> None:
             project_backward(
-                begin, end, scene, camera, lists.offsets, sums, wanted, gradients, by_camera,
+                begin, end, scene, camera, lists.offsets, sums, grad_mask, gradients, by_camera,
                 new_backward_scratch(),
             )  # fmt: skip
 
-        share_tiles(blend_backward, camera, splats, lists, camera, background, out, by_out, wanted, sums)
+        share_tiles(blend_backward, camera, splats, lists, camera, background, out, by_out, grad_mask, sums)
         share_gaussians(backward_chunk, len(scene.means))
         results: list[Tensor | None] = [torch.from_numpy(array) for array in gradients]
         if camera.degree < 0:
@@ -237,13 +237,13 @@ def _camera_gradients(parts: Array, viewmat: Tensor, K: Tensor) -> tuple[Tensor,
     return torch.from_numpy(by_viewmat).to(viewmat), torch.from_numpy(by_K).to(K)
 
 
-def _wanted_rows(count: int, grad_rows: Tensor | None) -> Array:
-    """Which rows want gradients; [0] where all do. [N] bool"""
+def _gradient_mask(count: int, grad_rows: Tensor | None) -> Array:
+    """Which rows get gradients; [0] where all do. [N] bool"""
     if grad_rows is None:
         return _ALL
-    wanted = np.zeros(count, np.bool_)
-    wanted[grad_rows.numpy(force=True)] = True
-    return wanted
+    grad_mask = np.zeros(count, np.bool_)
+    grad_mask[grad_rows.numpy(force=True)] = True
+    return grad_mask
 
 
 def _background_gradient(transmittance: Array, grad_image: Array) -> Tensor:
@@ -300,8 +300,8 @@ def color_map(gaussians: ActivatedGaussians, camera: Camera, crop: Crop, rows: T
     counts = np.zeros((len(lists.starts) - 1, 2), np.int64)
     share_tiles(list_weights, pinhole, splats, lists, pinhole, listed, False, counts, _new_runs(0, 0))
     runs = _new_runs(*counts.sum(axis=0).tolist())
-    places = np.cumsum(counts, axis=0) - counts
-    share_tiles(list_weights, pinhole, splats, lists, pinhole, listed, True, places, runs)
+    cursors = np.cumsum(counts, axis=0) - counts
+    share_tiles(list_weights, pinhole, splats, lists, pinhole, listed, True, cursors, runs)
     x0, y0, x1, y1 = crop
     return ColorMap(len(rows), (y1 - y0, x1 - x0), runs)
 

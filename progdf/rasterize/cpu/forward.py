@@ -409,7 +409,7 @@ def bin_splats(order: Array, tiles: Array, counts: Array, tile_count: int, with_
         order: rows of the splats, nearest first. [V] int32
         tiles, counts: of all rows, see `find_tiles`. [I], [N]
         tile_count: of the window
-        with_slots: whether `TileLists.slots` is wanted
+        with_slots: whether `TileLists.slots` is needed
     """
     offsets = np.zeros(len(counts) + 1, np.int32)
     np.cumsum(counts, out=offsets[1:])
@@ -422,16 +422,16 @@ def bin_splats(order: Array, tiles: Array, counts: Array, tile_count: int, with_
 
 
 @kernel(cache=True)
-def _fill(order: Array, tiles: Array, offsets: Array, places: Array, members: Array, slots: Array) -> None:
-    """Put the splats into the lists of their tiles. places: where the next of each tile goes; used up."""
+def _fill(order: Array, tiles: Array, offsets: Array, cursors: Array, members: Array, slots: Array) -> None:
+    """Put the splats into the lists of their tiles. cursors: where the next of each tile goes; used up."""
     last = order.size - 1
     for k in range(order.size):
         prefetch(offsets, order[min(k + 2 * _AHEAD, last)])
         prefetch(tiles, offsets[order[min(k + _AHEAD, last)]])
         i = order[k]
         for slot in range(offsets[i], offsets[i + 1]):
-            at = places[tiles[slot]]
-            places[tiles[slot]] = at + 1
+            at = cursors[tiles[slot]]
+            cursors[tiles[slot]] = at + 1
             members[at] = i
             if slots.size > 0:
                 slots[at] = slot

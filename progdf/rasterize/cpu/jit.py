@@ -56,13 +56,9 @@ _first_call = threading.Lock()
 
 
 def kernel(
-    *,
-    fast: bool = False,
-    contract: bool = False,
-    cache: bool = False,
-    inline: bool = False,
+    *, fast: bool = False, contract: bool = False, cache: bool = False, inline: bool = False,
     allocates: bool = False,
-) -> Callable[[_F], _F]:
+) -> Callable[[_F], _F]:  # fmt: skip
     """Compile a function with numba; it releases the interpreter's lock.
 
     Args:
@@ -77,14 +73,8 @@ def kernel(
     flags = FAST if fast else {"contract"} if contract else False
 
     def compile_now(function: _F) -> _F:
-        compiled: _F = numba.njit(
-            fastmath=flags,
-            cache=cache,
-            nogil=True,
-            error_model="numpy",
-            forceinline=inline,
-            _nrt=allocates,
-        )(function)
+        options = {"nogil": True, "error_model": "numpy", "forceinline": inline, "_nrt": allocates}
+        compiled: _F = numba.njit(fastmath=flags, cache=cache, **options)(function)
         return compiled
 
     return _compile_when_called(compile_now) if cache else compile_now
@@ -142,10 +132,10 @@ def find_cache_folder() -> Path:
     named = os.environ.get("NUMBA_CACHE_DIR")
     root = Path(named) if named else cache_folder() / "kernels"
     temporary = temporary_folder()
-    for place in (root, temporary / "kernels"):
-        folder = place / _source_version()
+    for base in (root, temporary / "kernels"):
+        folder = base / _source_version()
         try:
-            if place.parent == temporary:
+            if base.parent == temporary:
                 temporary.mkdir(mode=0o700, exist_ok=True)
                 if not is_private(temporary):  # machine code of somebody else's is not run
                     continue
