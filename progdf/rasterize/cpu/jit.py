@@ -91,7 +91,7 @@ def _compile_when_called(compile_now: Callable[[_F], _F]) -> Callable[[_F], _F]:
                 made = compiled or _with_cache_folder(compile_now, function)
                 try:
                     result = made(*arguments)
-                except Exception as error:  # whatever a damaged file raises
+                except Exception as error:  # whatever a file that was cut short raises
                     log.warning("the kernels in %s are compiled anew (%s)", kernel_cache(), error)
                     for path in kernel_cache().rglob("*.nb[ic]"):
                         path.unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""The cache of compiled kernels, whose damage costs a compilation; eight numbers at once, as in numpy."""
+"""The cache of compiled kernels, where a cut file costs a compilation; eight numbers at once, as in numpy."""
 
 from __future__ import annotations
 
@@ -67,7 +67,9 @@ def twice(cache: Path) -> Callable[[float], float]:
 
 @pytest.mark.parametrize("suffix", [".nbi", ".nbc"])
 @pytest.mark.parametrize("share", [0.0, 0.5])
-def test_a_damaged_file_is_dropped_and_compiled_anew(suffix: str, share: float, cache: Path) -> None:
+def test_a_file_that_was_cut_short_is_dropped_and_compiled_anew(
+    suffix: str, share: float, cache: Path
+) -> None:
     assert twice(cache)(4) == 8
     (file,) = cache.rglob(f"*{suffix}")
     content = file.read_bytes()
