@@ -21,8 +21,8 @@ from progdf.gaussians import Gaussians, pack
 from progdf.gdf.file import Gdf, fingerprint
 from progdf.metrics.image import decibels
 from progdf.rasterize import alpha_weights, render, set_threads
-from progdf.rasterize.cpu.parallel import threads
 from progdf.region import from_mask
+from progdf.threads import threads
 
 AT_SNAPSHOTS = 6
 """Snapshots at which fields are judged beside the strengths between them."""

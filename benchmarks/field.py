@@ -25,7 +25,7 @@ from progdf.gaussians import ATTRIBUTES, Gaussians, pack
 from progdf.gdf.file import Gdf
 from progdf.io.atomic import atomic_write
 from progdf.rasterize import set_threads
-from progdf.rasterize.cpu.parallel import threads
+from progdf.threads import threads
 
 from .courses import KnownEdit, edit_of, known_edit, milliseconds, processor_milliseconds
 from .field_forms import Form, baked_forms

@@ -29,17 +29,11 @@ INPUTS = ("means", "quats", "scales", "opacities", "colors")
 
 @dataclass(frozen=True)
 class RasterCase:
-    """A random cloud in front of a camera.
+    """A random cloud in front of a camera."""
 
-    Args:
-        count: Gaussians
-        size: width and height of the image, pixels
-        baseline: whether torch can do it in the memory of a small machine
-    """
-
-    count: int
-    size: int
-    baseline: bool = True
+    count: int  # Gaussians
+    size: int  # width and height of the image, pixels
+    baseline: bool = True  # whether torch can do it in the memory of a small machine
 
 
 CASES = (RasterCase(2_000, 128), RasterCase(20_000, 256), RasterCase(100_000, 512, baseline=False))
@@ -47,10 +41,10 @@ CASES = (RasterCase(2_000, 128), RasterCase(20_000, 256), RasterCase(100_000, 51
 
 @dataclass(frozen=True)
 class Duel:
-    """Times of forward + backward on so many threads, ms: the cpu engine's (medians) and torch's by round."""
+    """Times of forward + backward on so many threads, ms, by round."""
 
     threads: int
-    ours: list[float]
+    ours: list[float]  # the cpu engine's, medians
     torch: list[float]
 
     @property
@@ -61,21 +55,14 @@ class Duel:
 
 @dataclass(frozen=True)
 class RasterTimes:
-    """Times of one case in ms, one entry a round, and errors against float64.
-
-    Args:
-        forward, both: the cpu engine without and with the backward pass, on all threads
-        duels: against the tiled torch renderer, on all threads and on one; empty where it is left out
-        image_error: largest difference of a color
-        gradient_errors: largest difference over the largest gradient, by input
-    """
+    """Times of one case in ms, one entry a round, and errors against float64."""
 
     case: RasterCase
-    forward: list[float]
-    both: list[float]
-    duels: list[Duel]
-    image_error: float
-    gradient_errors: dict[str, float]
+    forward: list[float]  # the cpu engine on all threads
+    both: list[float]  # and with the backward pass
+    duels: list[Duel]  # against the tiled torch renderer, on all threads and on one; empty where not run
+    image_error: float  # largest difference of a color
+    gradient_errors: dict[str, float]  # largest difference over the largest gradient, by input
 
     @property
     def ratio(self) -> float:
@@ -172,8 +159,8 @@ def measure(case: RasterCase, rounds: int = 9, torch_rounds: int = 3) -> RasterT
     with torch.set_grad_enabled(case.baseline):
         _, exact, exact_gradients = draw(inputs, camera, "reference", torch.float64, backward=case.baseline)
     errors = {
-        name: float((found - expected).abs().max() / expected.abs().max())
-        for name, found, expected in zip(INPUTS, gradients, exact_gradients, strict=False)
+        name: float((gradient - expected).abs().max() / expected.abs().max())
+        for name, gradient, expected in zip(INPUTS, gradients, exact_gradients, strict=False)
     }
     image_error = float((image - exact).abs().max())
     return RasterTimes(case, forward, both, duels, image_error, errors)

@@ -31,8 +31,8 @@ ENTRY_POINT = ROOT / "progdf" / "__main__.py"  # the table of commands knows all
 
 # Inside a package a folder, or a file beside the folders, imports only from those before it.
 ORDER = {
-    "progdf": """quaternions sh gaussians terminal errors torch_threads region camera interpolation
-        color metrics demo_scenes io rasterize field formats gdf scene compose cli __init__ __main__""",
+    "progdf": """quaternions sh gaussians terminal errors threads region camera interpolation color metrics
+        demo_scenes io rasterize field formats gdf scene compose cli __init__ __main__""",
     "trainer": """__init__ options presets option_checks store views editors segmenters setup regions
         motion optimize fit report plan preview pipeline evaluate cli""",
     "viewer": "__init__ camera gl jobs state render files pictures ui panel select app commands",

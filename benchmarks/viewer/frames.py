@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from benchmarks.table import Table
 from progdf.formats.ply import save_ply
 from progdf.metrics.image import psnr
-from progdf.torch_threads import one_thread
+from progdf.threads import one_thread
 from viewer.camera.view_camera import first_camera
 from viewer.files import document as documents
 from viewer.panel.panel import WIDTH_PX

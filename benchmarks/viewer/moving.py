@@ -21,7 +21,7 @@ from benchmarks.table import Table
 from progdf.demo_scenes import bear
 from progdf.gaussians import Gaussians
 from progdf.metrics.image import psnr
-from progdf.torch_threads import one_thread
+from progdf.threads import one_thread
 from viewer.camera.view_camera import first_camera
 from viewer.render.dynamic_resolution import COARSE
 from viewer.render.engine import ViewEngine

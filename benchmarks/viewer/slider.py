@@ -20,7 +20,7 @@ from benchmarks.table import Table
 from progdf.gaussians import Gaussians
 from progdf.metrics.image import psnr
 from progdf.rasterize import render
-from progdf.torch_threads import one_thread
+from progdf.threads import one_thread
 from viewer.camera.view_camera import first_camera, to_camera
 from viewer.render.engine import ViewEngine
 from viewer.render.headless import headless_context

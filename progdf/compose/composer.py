@@ -20,7 +20,7 @@ from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.gdf.file import Gdf, verify
 from progdf.interpolation import Segment, find_segment
 from progdf.rasterize.cpu.jit import kernel
-from progdf.rasterize.cpu.parallel import run_chunks
+from progdf.threads import run_chunks
 
 from .layers import KINDS, Effects, Layer, changed_edits, check_numbers, check_weights, effects_of
 from .reference import coverage

@@ -16,7 +16,7 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.quaternions import matrix_quats
 from progdf.sh import rgb_to_sh0
-from progdf.torch_threads import one_thread
+from progdf.threads import one_thread
 
 from .light import OUTDOORS, Daylight, develop, irradiance, linear_from_srgb, view_dependent_light
 from .surface import Part, Samples, sample

@@ -1,7 +1,7 @@
 """The differentiable rasterizer: one signature, several engines.
 
 `reference` is plain torch, slow, in any floating type: the oracle. `cpu` is numba, fast, with an analytic
-backward. The conventions both follow are in `conventions.py`; beyond those numbers:
+backward. The conventions both follow are at the head of `engines.py`; beyond those numbers:
 
 - the support of a Gaussian is exactly {alpha ≥ 1/255}, whatever the tile size;
 - the near plane cuts at camera z > `near`; order is camera z in float32, ties by index;
@@ -10,9 +10,9 @@ backward. The conventions both follow are in `conventions.py`; beyond those numb
 identity.
 """
 
-from .conventions import RasterInfo
-from .cpu.parallel import set_threads
-from .engines import ENGINES, ActivatedGaussians, Crop, Rendering, activate, alpha_weights, render
+from progdf.threads import set_threads
+
+from .engines import ENGINES, ActivatedGaussians, Crop, RasterInfo, Rendering, activate, alpha_weights, render
 
 __all__ = [
     "ENGINES",

@@ -1,10 +1,17 @@
-"""Drawing a scene, and the engines that can: one signature, a line each."""
+"""Drawing a scene and its depth: the conventions, and the engines behind one signature.
+
+    depth = Σ w z / Σ w,  alpha = Σ w,  w = αT,  z: camera z of a Gaussian's center
+
+The expected depth, as gsplat's "ED": of a surface half covered by another it lies between the two. There is
+no kernel of its own: the scene is painted with (z, 1, 0) and drawn on black, so the depth has the picture's
+weights, whichever engine draws.
+"""
 
 from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from math import isqrt
 from typing import NamedTuple, Protocol, cast
@@ -14,8 +21,25 @@ from torch import Tensor
 
 from progdf.camera import Camera
 from progdf.gaussians import Gaussians
+from progdf.sh import rgb_to_sh0
 
-from .conventions import RasterInfo
+DILATION = 0.3
+"""Added to the diagonal of the 2D covariance, px² (Kerbl 2023, gsplat)."""
+
+ALPHA_MAX = 0.99
+"""Alpha is clamped here; where it is, its gradient is zero (Kerbl 2023)."""
+
+ALPHA_MIN = 1.0 / 255.0
+"""A Gaussian contributes to a pixel exactly where its alpha is at least this."""
+
+TRANSMITTANCE_MIN = 1e-4
+"""A Gaussian that would bring the transmittance to this or below is left out, and the pixel is done."""
+
+FRUSTUM_MARGIN = 0.3
+"""x/z and y/z in the Jacobian are clamped to the frustum plus this share of tan(fov/2) on each side."""
+
+ANTIALIAS_FLOOR = 0.005
+"""Least det(before dilation) / det(after) that the antialias option takes the root of."""
 
 Crop = tuple[int, int, int, int]
 """A window x0, y0, x1, y1 in pixels of the full image; x1 and y1 are one past the last."""
@@ -23,25 +47,18 @@ Crop = tuple[int, int, int, int]
 ENGINES = {"reference": "progdf.rasterize.reference", "cpu": "progdf.rasterize.cpu.engine"}
 """Engine name -> module that is a `RasterEngine`, imported when first used."""
 
+_DRAWN_SH = 16  # coefficients that a picture shows; one that is not finite hides its Gaussian
+
 
 class ActivatedGaussians(NamedTuple):
-    """N Gaussians in activated units, as they are drawn.
+    """N Gaussians in activated units, as they are drawn."""
 
-    Args:
-        means: centers, world units. [N,3]
-        quats: rotations wxyz, any nonzero length. [N,4]
-        scales: standard deviations, world units, ≥ 0. [N,3]
-        opacities: 0..1. [N]
-        colors: rgb [N,3], or spherical-harmonic coefficients [N,K,3], K = (degree+1)²
-        antialiased: scale opacities by sqrt(det/dilated det) of the 2D covariance (Mip-Splatting)
-    """
-
-    means: Tensor
-    quats: Tensor
-    scales: Tensor
-    opacities: Tensor
-    colors: Tensor
-    antialiased: bool = False
+    means: Tensor  # centers, world units. [N,3]
+    quats: Tensor  # rotations wxyz, any nonzero length. [N,4]
+    scales: Tensor  # standard deviations, world units, ≥ 0. [N,3]
+    opacities: Tensor  # 0..1. [N]
+    colors: Tensor  # rgb [N,3], or spherical-harmonic coefficients [N,K,3], K = (degree+1)²
+    antialiased: bool = False  # scale opacities by sqrt(det/dilated det) of the 2D covariance (Mip-Splatting)
 
     @property
     def tensors(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
@@ -116,19 +133,20 @@ def get_engine(name: str) -> RasterEngine:
     return cast(RasterEngine, importlib.import_module(ENGINES[name]))
 
 
+@dataclass(frozen=True)
+class RasterInfo:
+    """What the projection yields, not differentiable."""
+
+    means2d: Tensor  # centers in pixels; 0 for a Gaussian not in front of the near plane or not finite. [N,2]
+    depths: Tensor  # camera z, world units; 0 likewise. [N] float32
+    visible: Tensor  # the box around its {alpha ≥ 1/255} touches the window that was rendered. [N] bool
+
+
 class Rendering(NamedTuple):
-    """A scene as a camera sees it.
+    """A scene as a camera sees it. H and W are those of the window where there is a crop."""
 
-    Args:
-        image: rgb, 0..1 as far as the colors are; not clamped. [H,W,3]
-        transmittance: share of the background that shines through, 0..1. [H,W]
-        info: what the projection found
-
-    H and W are those of the window where there is a crop.
-    """
-
-    image: Tensor
-    transmittance: Tensor
+    image: Tensor  # rgb, 0..1 as far as the colors are; not clamped. [H,W,3]
+    transmittance: Tensor  # share of the background that shines through, 0..1. [H,W]
     info: RasterInfo
 
 
@@ -146,10 +164,10 @@ def render(
 
     Args:
         gaussians: raw parameters, or activated ones, which gradients then are to; of spherical harmonics the
-            bands 0 to 3 are shown. A scene that was trained anti-aliased is drawn so
+            bands 0 to 3 are drawn. A scene that was trained anti-aliased is drawn so
         camera: the view, and the depth at and below which nothing is drawn
         background: rgb behind everything. [3]
-        colors: take the place of the Gaussians' own: rgb [N,3], or SH coefficients [N,K,3]
+        colors: in place of the Gaussians' own: rgb [N,3], or SH coefficients [N,K,3]
         crop: draw only this window, with the full image's conventions; equals the slice of the full image
             bit for bit. Gaussians that do not touch it cost next to nothing
         grad_rows: only these rows get gradients, all others zero; takes much less time where they are few.
@@ -158,7 +176,7 @@ def render(
             type
 
     Returns:
-        Image, transmittance and what the projection found: float32 of "cpu", of "reference" the means' type.
+        Image, transmittance and what the projection yields: float32 of "cpu", of "reference" the means' type.
 
     Raises:
         ValueError: a shape does not fit, the crop is empty or leaves the image, the engine is unknown,
@@ -228,3 +246,35 @@ def _check_crop(crop: Crop | None, camera: Camera) -> None:
     x0, y0, x1, y1 = crop
     if not (0 <= x0 < x1 <= camera.width and 0 <= y0 < y1 <= camera.height):
         raise ValueError(f"crop {crop} is empty or leaves the image of {camera.width}x{camera.height} pixels")
+
+
+class Depth(NamedTuple):
+    """What `render_depth` draws."""
+
+    depth: Tensor  # camera z, world units; 0 where nothing is drawn. [H,W]
+    alpha: Tensor  # 1 − transmittance, 0..1. [H,W]
+
+
+def render_depth(
+    gaussians: Gaussians, camera: Camera, engine: str = "cpu", crop: Crop | None = None
+) -> Depth:
+    """Draw the depth of a scene, differentiable as the picture is. Arguments as of `progdf.render`."""
+    painted = paint_depth(gaussians, camera)
+    return depth_of(render(painted, camera, (0.0, 0.0, 0.0), crop=crop, engine=engine).image)
+
+
+def paint_depth(gaussians: Gaussians, camera: Camera) -> Gaussians:
+    """The scene in the colors (camera z, 1, 0), to be drawn on black from this camera by any engine."""
+    viewmat = camera.viewmat.double()
+    z = (gaussians.means.double() @ viewmat[2, :3] + viewmat[2, 3]).to(gaussians.means)
+    colors = torch.stack([z, torch.ones_like(z), torch.zeros_like(z)], dim=1)
+    finite = gaussians.sh[:, :_DRAWN_SH].isfinite().flatten(1).all(1)
+    sh0 = torch.where(finite[:, None], rgb_to_sh0(colors), torch.nan)
+    return replace(gaussians, sh0=sh0, shN=gaussians.shN[:, :0])
+
+
+def depth_of(image: Tensor) -> Depth:
+    """What a picture of a scene painted by `paint_depth` shows. [H,W,≥2]"""
+    weighted, alpha = image[..., 0], image[..., 1]
+    drawn = alpha > 0
+    return Depth(torch.where(drawn, weighted / torch.where(drawn, alpha, 1.0), 0.0), alpha)

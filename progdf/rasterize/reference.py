@@ -6,51 +6,40 @@ Conventions: Kerbl et al. 2023 (3D Gaussian Splatting) with the choices listed i
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from progdf.camera import Camera
 from progdf.quaternions import normalize_quats, rotation_matrices
 from progdf.sh import shade
 
-from .conventions import (
+from .engines import (
     ALPHA_MAX,
     ALPHA_MIN,
     ANTIALIAS_FLOOR,
     DILATION,
     FRUSTUM_MARGIN,
-    GOLDEN,
-    SIMPLIFY,
     TRANSMITTANCE_MIN,
+    ActivatedGaussians,
+    Crop,
     RasterInfo,
+    RasterView,
 )
-from .engines import ActivatedGaussians, Crop, RasterView
 
 TILE = 16
 
 
 @dataclass(frozen=True)
 class ReferenceSplats:
-    """The V Gaussians that a window shows, nearest first.
+    """The V Gaussians that a window shows, nearest first."""
 
-    Args:
-        rows: their indices. [V] int64
-        means2d: centers in pixels. [V,2]
-        whitening: L with σ = ½|Lᵀd|² for a pixel offset d: l11, l21, l22. [V,3]
-        opacities: activated, antialias included. [V]
-        colors: rgb. [V,3]
-        extents: half sides of the box around {alpha ≥ 1/255}, pixels. [V,2]
-    """
-
-    rows: Tensor
-    means2d: Tensor
-    whitening: Tensor
-    opacities: Tensor
-    colors: Tensor
-    extents: Tensor
+    rows: Tensor  # their indices. [V] int64
+    means2d: Tensor  # centers in pixels. [V,2]
+    whitening: Tensor  # L with σ = ½|Lᵀd|² for a pixel offset d: l11, l21, l22. [V,3]
+    opacities: Tensor  # activated, antialias included. [V]
+    colors: Tensor  # rgb. [V,3]
+    extents: Tensor  # half sides of the box around {alpha ≥ 1/255}, pixels. [V,2]
 
 
 def rasterize(
@@ -107,7 +96,7 @@ def project(gaussians: ActivatedGaussians, view: RasterView) -> tuple[ReferenceS
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     means2d = torch.stack([fx * x / z + cx, fy * y / z + cy], dim=1)
 
-    a, b, c, det0 = _covariances(points[front], normalize_quats(quats[rows]), scales[rows], view)
+    a, b, c, det0 = covariances(points[front], normalize_quats(quats[rows]), scales[rows], view)
     det = det0 + DILATION * (a + c) + DILATION**2
     opacity = opacities[rows]
     if view.antialiased:
@@ -120,12 +109,12 @@ def project(gaussians: ActivatedGaussians, view: RasterView) -> tuple[ReferenceS
     extents = radius[:, None] * torch.stack([a + DILATION, c + DILATION], dim=1).detach().sqrt()
     low, high = (means2d - extents).detach(), (means2d + extents).detach()
     x0, y0, x1, y1 = view.crop
-    shown = (high[:, 0] >= x0) & (low[:, 0] <= x1) & (high[:, 1] >= y0) & (low[:, 1] <= y1)
-    shown = shown & (opacity.detach() >= ALPHA_MIN) & colored[rows]
+    inside = (high[:, 0] >= x0) & (low[:, 0] <= x1) & (high[:, 1] >= y0) & (low[:, 1] <= y1)
+    inside = inside & (opacity.detach() >= ALPHA_MIN) & colored[rows]
     depths = torch.zeros_like(opacities).index_copy(0, rows, z).detach().float()
     # float32 depth, ties by index: what a viewer can sort by, and the same in every engine
     order = z.detach().float().argsort(stable=True)
-    order = order[shown[order]]
+    order = order[inside[order]]
     if sh_degree is None:
         rgb = colors[rows[order]]
     else:
@@ -189,7 +178,7 @@ def alpha_weights(gaussians: ActivatedGaussians, view: RasterView, mask: Tensor)
     return totals
 
 
-def _covariances(
+def covariances(
     points: Tensor, unit_quats: Tensor, scales: Tensor, view: RasterView
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Covariances [[a, b], [b, c]] in pixels before the dilation, and their determinants. All float64.
@@ -212,75 +201,3 @@ def _covariances(
     # ac − b² cancels for needles; the cross product does not
     det0 = torch.linalg.cross(p0, p1).square().sum(1)
     return a, b, c, det0
-
-
-def simplify(
-    gaussians: ActivatedGaussians, camera: Camera, budget: int, pixels: int = 1
-) -> tuple[ActivatedGaussians, Tensor]:
-    """See `progdf.rasterize.simplification.simplify`; and which of the Gaussians these are. [M] int64
-
-    Every number is that of the fast one but for rounding; the threshold is sought by halving.
-    """
-    rules, dilation = SIMPLIFY, DILATION / pixels**2
-    view = RasterView.of(camera, gaussians)
-    means, quats, scales, opacities, colors = (tensor.double() for tensor in gaussians.tensors)
-    rotation, translation = camera.viewmat[:3, :3].double(), camera.viewmat[:3, 3].double()
-    points = means @ rotation.T + translation
-    x, y, z = points.unbind(1)
-    fx, fy, cx, cy = (float(camera.K[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    px, py = fx * x / z + cx, fy * y / z + cy
-    longest = scales.abs().max(1).values / z
-    drawn = (z > camera.near) & (opacities >= ALPHA_MIN)
-    for place, extent, focal, center, side in (
-        (px, x / z, fx, cx, camera.width), (py, y / z, fy, cy, camera.height),
-    ):  # fmt: skip
-        margin = FRUSTUM_MARGIN * 0.5 * side / focal
-        tangent = extent.clamp(-(center / focal + margin), (side - center) / focal + margin)
-        reach2 = 1.001 * -2.0 * math.log(ALPHA_MIN) * ((focal * longest) ** 2 * (1 + tangent**2) + DILATION)
-        drawn &= torch.maximum(-place, place - side).clamp_min(0.0) ** 2 <= reach2
-    rows = drawn.nonzero()[:, 0]
-    px, py, z, opacities = px[rows], py[rows], z[rows], opacities[rows]
-    squares = scales[rows].square().sort(1).values[:, 1:] * (fx * fy / z**2)[:, None]
-    weights = opacities * (squares + (0.0 if gaussians.antialiased else dilation)).prod(1).sqrt()
-    shape = (-(-camera.height // rules.cell), -(-camera.width // rules.cell), rules.slices)
-    bits = (z / camera.near).float().view(torch.int32) - torch.tensor(1.0).view(torch.int32)
-    cells = (
-        py.clamp(0, camera.height - 1).long() // rules.cell,
-        px.clamp(0, camera.width - 1).long() // rules.cell,
-        (bits >> 19).long().clamp(0, rules.slices - 1),
-    )
-    density = torch.zeros(shape, dtype=torch.double)
-    density.index_put_(cells, weights * (2.0 * math.pi / rules.cell**2), accumulate=True)
-    threshold = 0.0
-    if len(rows) > budget:
-        before = density.cumsum(2) - density
-        before = -torch.nn.functional.max_pool2d(-before.permute(2, 0, 1), 3, 1, 1).permute(1, 2, 0)
-        weights = weights * (-before[cells]).exp().clamp_min(rules.least_light)
-        low, high = 0.0, float(weights.sum()) / budget
-        for _ in range(100):
-            threshold = 0.5 * (low + high)
-            fewer = float((weights / threshold).clamp_max(1.0).sum()) < budget
-            low, high = (low, threshold) if fewer else (threshold, high)
-    kept = weights >= threshold * (rows.double() * GOLDEN % 1.0)
-    rows, weights, z, dense, opacities = (
-        values[kept] for values in (rows, weights, z, density[cells], opacities)
-    )
-    stands_for = threshold / weights
-    denser = torch.minimum(stands_for, ALPHA_MAX / opacities).clamp_min(1.0)
-    enough = (rules.dense / dense.clamp_min(1e-6)).clamp_max(1.0)
-    larger = (enough * stands_for / denser).clamp(1.0, rules.most_times)
-    a, _, c, det0 = _covariances(points[rows], normalize_quats(quats[rows]), scales[rows], view)
-    fine = det0 + dilation * (a + c) + dilation**2
-    more = (larger * dilation - DILATION) * z**2 / (fx * fy)
-    sizes = (larger[:, None] * scales[rows] ** 2 + more[:, None]).clamp_min(0.0).sqrt()
-    a, _, c, det = _covariances(points[rows], normalize_quats(quats[rows]), sizes, view)
-    coarse = det + DILATION * (a + c) + DILATION**2
-    opacity = opacities * denser * larger * (fine / coarse).sqrt()
-    if gaussians.antialiased:
-        opacity = opacity * (det0 / fine).clamp_min(ANTIALIAS_FLOOR).sqrt()
-    rgb = colors[rows]
-    if view.sh_degree is not None:
-        direction = torch.nn.functional.normalize(means[rows] + rotation.T @ translation, dim=1, eps=1e-300)
-        rgb = shade(view.sh_degree, direction, rgb)
-    found = ActivatedGaussians(means[rows], quats[rows], sizes, opacity, rgb)
-    return found.each(Tensor.float), rows

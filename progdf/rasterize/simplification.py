@@ -4,14 +4,14 @@ After Cook, Halstead, Planck, Ryu: Stochastic simplification of aggregate detail
 
 - a Gaussian weighs its opacity times the area that the fine picture shows of it, and matters by that and by
   what reaches it of the light (the optical depth before it, added up in a grid of cells and slices of depth);
-- beyond the budget one of importance w is kept with probability p = min(1, w / t); which ones, a number
+- beyond the budget one of importance w is drawn with probability p = min(1, w / t); which ones, a number
   decides that stays with each, so that nothing flickers while the camera moves;
-- one that is kept stands for those of its weight that are not: by more opacity, and only where it has no more
-  to give by a larger area, since that blurs outlines; where the scene is dense by no more area than covers:
-  there the others hide what is missing;
-- the dilation, wider in a coarse picture, is taken off the size, and what is left of it off the opacity.
+- one that is drawn stands for those of its weight that are not: by more opacity, and only where it has no
+  more to give by a larger area, since that blurs outlines; where the scene is dense by no more area than
+  covers: there the others hide what is missing;
+- the dilation, wider in a coarse picture, is taken off the size, and the remainder off the opacity.
 
-`reference.simplify` is the plain version.
+The plain version is in tests/helpers/plain_simplification.py.
 """
 
 from __future__ import annotations
@@ -24,18 +24,50 @@ import torch
 from numpy.typing import NDArray
 
 from progdf.camera import Camera
+from progdf.threads import run_chunks, threads
 
-from .conventions import ALPHA_MAX, ANTIALIAS_FLOOR, DILATION, GOLDEN, SIMPLIFY
 from .cpu.engine import make_pinhole, share_gaussians
-from .cpu.jit import Number, compilation, kernel
-from .cpu.parallel import run_chunks, threads
-from .cpu.project import Pinhole, Scene, camera_center, cross, footprint, largest_extents, shade_splat, vec
-from .cpu.project import times as by_components
-from .cpu.shading import dot
-from .cpu.simd import prefetch
-from .engines import ActivatedGaussians, RasterView
+from .cpu.forward import (
+    Pinhole,
+    Scene,
+    camera_center,
+    cross,
+    dot,
+    footprint,
+    largest_extents,
+    shade_splat,
+    times,
+    vec,
+)
+from .cpu.jit import Number, kernel, prefetch
+from .engines import (
+    ALPHA_MAX,
+    ANTIALIAS_FLOOR,
+    DILATION,
+    ActivatedGaussians,
+    RasterView,
+)  # fmt: skip
 
 Array = NDArray[Any]
+
+CELL = 8
+"""Side of a cell of the grid in which optical depth is added up, pixels. This and the next four are from
+seven real scenes of a million (docs/experiments.md, The viewer)."""
+
+SLICES = 224
+"""Of a cell's depth from the near plane on, sixteen to a factor of two."""
+
+LEAST_LIGHT = 0.05
+"""Share of a hidden one's importance that remains, as cells know nothing of gaps."""
+
+MOST_TIMES = 5.0
+"""As much of its area one takes that stands for others, at most."""
+
+DENSE = 8.0
+"""Optical depth of a slice beyond which there is no need of more area."""
+
+GOLDEN = 0.6180339887498949
+"""Multiples of it, less the whole ones, are spread evenly however many are taken: the lots."""
 
 _ONE = int(np.float32(1.0).view(np.int32))
 _SLICE_SHIFT = 19  # of a float's bits: sixteen slices for a factor of two
@@ -48,27 +80,14 @@ _FULL_TURN = 2.0 * math.pi  # ∫ exp(−r²/2)
 
 
 class Chosen(NamedTuple):
-    """Which Gaussians of N are drawn, and how.
+    """Which Gaussians of N are drawn, and how."""
 
-    Args:
-        rows: they. [M] integers
-        weights: what each matters. [N] float32
-        places: in the flat grid, where there is a weight. [N] int32
-        density: optical depth of each slice of the flat grid. float32
-        threshold: of a weight; a lighter one stands for several
-        dilation: of the fine picture, in pixels of the coarse one
-        dense: optical depth of a slice that covers
-        most_times: as much of its area one takes at most
-    """
-
-    rows: Array
-    weights: Array
-    places: Array
-    density: Array
-    threshold: float
-    dilation: float
-    dense: float
-    most_times: float
+    rows: Array  # their indices. [M] int32
+    weights: Array  # importance of each. [N] float32
+    cells: Array  # in the flat grid, where there is a weight. [N] int32
+    density: Array  # optical depth of each slice of the flat grid. float32
+    threshold: float  # of a weight; a lighter one stands for several
+    dilation: float  # of the fine picture, in pixels of the coarse one
 
 
 def simplify(
@@ -87,38 +106,33 @@ def simplify(
     """
     means, quats, scales, opacities, colors = (tensor.detach().numpy() for tensor in gaussians.tensors)
     scene = Scene(means, quats, scales, opacities, colors if colors.ndim == 3 else colors[:, None])
-    view, dilation, rules = make_pinhole(RasterView.of(camera, gaussians)), DILATION / pixels**2, SIMPLIFY
-    with compilation("simplification", 5):
-        weights, places = np.empty(len(means), np.float32), np.empty(len(means), np.int32)
-        density = _weigh_all(scene, view, dilation, weights, places)
-        threshold = 0.0
-        if np.count_nonzero(weights) > budget:
-            before, light = np.empty_like(density), np.empty_like(density)
-            light_at(density, before, light, rules.least_light)
-            threshold = _hide_all(weights, places, light.ravel(), budget)
-            rows = _choose_all(weights, threshold)
-        else:
-            rows = np.flatnonzero(weights).astype(np.int32)
-        chosen = Chosen(
-            rows, weights, places, density.ravel(), threshold, dilation, rules.dense, rules.most_times
-        )
-        out = Scene(*(np.empty((len(rows), width), np.float32) for width in (3, 4, 3, 1, 3)))
-        share_gaussians(
-            lambda begin, end: _take(begin, end, chosen, scene, view, out, np.empty(16)), len(rows)
-        )
-    turned, sizes, covers, shown = map(torch.from_numpy, out[1:])
-    return ActivatedGaussians(torch.from_numpy(out.means), turned, sizes, covers[:, 0], shown)
+    view, dilation = make_pinhole(RasterView.of(camera, gaussians)), DILATION / pixels**2
+    weights, cells = np.empty(len(means), np.float32), np.empty(len(means), np.int32)
+    density = _weigh_all(scene, view, dilation, weights, cells)
+    threshold = 0.0
+    if np.count_nonzero(weights) > budget:
+        before, light = np.empty_like(density), np.empty_like(density)
+        light_at(density, before, light)
+        threshold = _hide_all(weights, cells, light.ravel(), budget)
+        rows = _choose_all(weights, threshold)
+    else:
+        rows = np.flatnonzero(weights).astype(np.int32)
+    chosen = Chosen(rows, weights, cells, density.ravel(), threshold, dilation)
+    out = Scene(*(np.empty((len(rows), width), np.float32) for width in (3, 4, 3, 1, 3)))
+    share_gaussians(lambda begin, end: _take(begin, end, chosen, scene, view, out, np.empty(16)), len(rows))
+    out_means, out_quats, out_scales, out_opacities, rgb = map(torch.from_numpy, out)
+    return ActivatedGaussians(out_means, out_quats, out_scales, out_opacities[:, 0], rgb)
 
 
 @kernel(cache=True)
-def light_at(density: Array, before: Array, light: Array, least: float) -> None:
+def light_at(density: Array, before: Array, light: Array) -> None:
     """What is left of the light at each slice in which something lies, by what is before it in its cell and
     in those around it, the least.
 
     Args:
         density: optical depth of each slice. [rows,columns,slices] float32
         before: scratch of that shape
-        light: out, `least` .. 1. The same shape
+        light: out, `LEAST_LIGHT` .. 1. The same shape
     """
     rows, columns, slices = density.shape
     for y in range(rows):
@@ -137,7 +151,7 @@ def light_at(density: Array, before: Array, light: Array, least: float) -> None:
                         light[y, x, k] = min(light[y, x, k], before[v, u, k])
             for k in range(slices):
                 if density[y, x, k] > 0.0:
-                    light[y, x, k] = max(math.exp(-light[y, x, k]), least)
+                    light[y, x, k] = max(math.exp(-light[y, x, k]), LEAST_LIGHT)
 
 
 def find_threshold(counts: Array, sums: Array, budget: int) -> float:
@@ -150,26 +164,22 @@ def find_threshold(counts: Array, sums: Array, budget: int) -> float:
     if above[0] <= budget:
         return 0.0
     below = np.concatenate([[0.0], np.cumsum(sums)])
-    kept = above[:-1] + below[:-1] / _EDGES  # falls with the edge
-    at = min(int(np.flatnonzero(kept >= budget)[-1]), _BINS - 2)
+    expected = above[:-1] + below[:-1] / _EDGES  # falls with the edge
+    at = min(int(np.flatnonzero(expected >= budget)[-1]), _BINS - 2)
     # between two edges, or it would jump from one to the next while the camera moves
-    share = (kept[at] - budget) / max(kept[at] - kept[at + 1], 1e-9)
+    share = (expected[at] - budget) / max(expected[at] - expected[at + 1], 1e-9)
     return float(_EDGES[at] * (_EDGES[at + 1] / _EDGES[at]) ** share)
 
 
-def _weigh_all(scene: Scene, view: Pinhole, dilation: float, weights: Array, places: Array) -> Array:
-    """Weights and places of all Gaussians, as `_weigh`, and the optical depth of all slices."""
-    size, count = SIMPLIFY.cell, len(weights)
-    shape = (-(-view.window[3] // size), -(-view.window[2] // size), SIMPLIFY.slices)
+def _weigh_all(scene: Scene, view: Pinhole, dilation: float, weights: Array, cells: Array) -> Array:
+    """Weights and cells of all Gaussians, as `_weigh`, and the optical depth of all slices."""
+    count, shape = len(weights), (-(-view.window[3] // CELL), -(-view.window[2] // CELL), SLICES)
     chunks = threads()
     cuts = [count * chunk // chunks for chunk in range(chunks + 1)]
 
     def weigh(chunk: int) -> Array:
         density = np.zeros(math.prod(shape), np.float32)
-        _weigh(
-            cuts[chunk], cuts[chunk + 1], scene, view, dilation, size, SIMPLIFY.slices, weights, places,
-            density,
-        )  # fmt: skip
+        _weigh(cuts[chunk], cuts[chunk + 1], scene, view, dilation, weights, cells, density)
         return density
 
     first, *others = run_chunks(weigh, chunks)
@@ -178,12 +188,12 @@ def _weigh_all(scene: Scene, view: Pinhole, dilation: float, weights: Array, pla
     return first.reshape(shape)
 
 
-def _hide_all(weights: Array, places: Array, light: Array, budget: int) -> float:
+def _hide_all(weights: Array, cells: Array, light: Array, budget: int) -> float:
     """Take from the weights what others hide; the threshold of the budget."""
 
     def hide(begin: int, end: int) -> tuple[Array, Array]:
         counts, sums = np.zeros(_BINS, np.int64), np.zeros(_BINS)
-        _hide(begin, end, weights, places, light, counts, sums)
+        _hide(begin, end, weights, cells, light, counts, sums)
         return counts, sums
 
     counts, sums = zip(*share_gaussians(hide, len(weights)), strict=True)
@@ -200,22 +210,20 @@ def _choose_all(weights: Array, threshold: float) -> Array:
 
 @kernel(contract=True, cache=True)
 def _weigh(
-    begin: int, end: int, scene: Scene, camera: Pinhole, dilation: float, size: int, slices: int,
-    weights: Array, places: Array, density: Array,
+    begin: int, end: int, scene: Scene, camera: Pinhole, dilation: float, weights: Array, cells: Array,
+    density: Array,
 ) -> None:  # fmt: skip
     """Weigh Gaussians begin … end − 1.
 
     Args:
         dilation: of the fine picture, in pixels of this one
-        size: side of a cell, pixels
-        slices: of depth
         weights: out, opacity times area in pixels; 0 for what the window does not show. [N] float32
-        places: out, of that in the flat grid, where there is a weight. [N] int32
-        density: its optical depth is added here, see `places`. float32
+        cells: out, index of each in the flat grid, where there is a weight. [N] int32
+        density: its optical depth is added here, see `cells`. float32
     """
     x1, y1 = float(camera.window[2]), float(camera.window[3])
-    focal, share, cells = camera.fx * camera.fy, _FULL_TURN / (size * size), 1.0 / size
-    columns = -(-camera.window[2] // size)
+    focal, share, scale = camera.fx * camera.fy, _FULL_TURN / (CELL * CELL), 1.0 / CELL
+    columns = -(-camera.window[2] // CELL)
     for i in range(begin, end):
         weights[i] = 0.0
         usable, px, py, z, wide2, high2 = largest_extents(camera, scene, i)
@@ -229,30 +237,33 @@ def _weigh(
         more = 0.0 if camera.antialiased else dilation
         area = math.sqrt((longest2 + more) * (middle2 + more))
         weights[i] = min(scene.opacities[i] * area, _MOST)
-        column, row = int(min(max(px, 0.0), x1 - 1.0) * cells), int(min(max(py, 0.0), y1 - 1.0) * cells)
+        column, row = (
+            int(min(max(px, 0.0), x1 - 1.0) * scale),
+            int(min(max(py, 0.0), y1 - 1.0) * scale),
+        )
         # of the logarithm of the depth, nearly
         at: Number = (np.float32(z / camera.near).view(np.int32) - _ONE) >> _SLICE_SHIFT
-        places[i] = (row * columns + column) * slices + min(max(at, 0), slices - 1)
-        density[places[i]] += weights[i] * share
+        cells[i] = (row * columns + column) * SLICES + min(max(at, 0), SLICES - 1)
+        density[cells[i]] += weights[i] * share
 
 
 @kernel(cache=True)
 def _hide(
-    begin: int, end: int, weights: Array, places: Array, light: Array, counts: Array, sums: Array
+    begin: int, end: int, weights: Array, cells: Array, light: Array, counts: Array, sums: Array
 ) -> None:
-    """Take from the weights of Gaussians begin … end − 1 what does not reach their places of the light; count
+    """Take from the weights of Gaussians begin … end − 1 what does not reach their cells of the light; count
     them and add them up by bins of their bits."""
     for i in range(begin, end):
         if weights[i] > 0.0:
-            weights[i] *= light[places[i]]
-            place = np.float32(weights[i]).view(np.int32) >> _SHIFT
-            counts[place] += 1
-            sums[place] += weights[i]
+            weights[i] *= light[cells[i]]
+            bin_index = np.float32(weights[i]).view(np.int32) >> _SHIFT
+            counts[bin_index] += 1
+            sums[bin_index] += weights[i]
 
 
 @kernel(cache=True)
 def _choose(begin: int, end: int, weights: Array, threshold: float, rows: Array) -> int:
-    """Which of the Gaussians begin … end − 1 are kept, into `rows`; how many."""
+    """Which of the Gaussians begin … end − 1 are drawn, into `rows`; how many."""
     at = 0
     for i in range(begin, end):
         lot = i * GOLDEN
@@ -266,7 +277,7 @@ def _choose(begin: int, end: int, weights: Array, threshold: float, rows: Array)
 def _take(
     begin: int, end: int, chosen: Chosen, scene: Scene, camera: Pinhole, out: Scene, basis: Array
 ) -> None:
-    """Take the chosen Gaussians of places begin … end − 1 as they are drawn."""
+    """Take the chosen Gaussians begin … end − 1 as they are drawn."""
     eye, dilation = camera_center(camera), chosen.dilation
     for at in range(begin, end):
         i, ahead = chosen.rows[at], chosen.rows[min(at + _AHEAD, end - 1)]
@@ -277,8 +288,8 @@ def _take(
         seen = footprint(camera, scene, i)
         opacity, stands_for = np.float64(scene.opacities[i]), chosen.threshold / chosen.weights[i]
         denser = max(min(stands_for, ALPHA_MAX / opacity), 1.0)
-        enough = min(chosen.dense / max(chosen.density[chosen.places[i]], 1e-6), 1.0)
-        larger = min(max(enough * stands_for / denser, 1.0), chosen.most_times)
+        enough = min(DENSE / max(chosen.density[chosen.cells[i]], 1e-6), 1.0)
+        larger = min(max(enough * stands_for / denser, 1.0), MOST_TIMES)
         # the coarse picture's dilation instead of the fine one's: off the size, as far as that goes
         more = (larger * dilation - DILATION) / (camera.fx * camera.fy * seen.inv_z * seen.inv_z)
         a, b, c = vec(scene.scales, i)
@@ -286,7 +297,7 @@ def _take(
             math.sqrt(max(larger * a * a + more, 0.0)), math.sqrt(max(larger * b * b + more, 0.0)),
             math.sqrt(max(larger * c * c + more, 0.0)),
         )  # fmt: skip
-        p0, p1 = by_components(seen.turned0, size), by_components(seen.turned1, size)
+        p0, p1 = times(seen.turned0, size), times(seen.turned1, size)
         normal = cross(p0, p1)
         fine = seen.det0 + dilation * (seen.a + seen.c) + dilation * dilation
         coarse = dot(normal, normal) + DILATION * (dot(p0, p0) + dot(p1, p1)) + DILATION * DILATION

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from progdf.gaussians import Gaussians
-from progdf.rasterize.cpu.parallel import threads
+from progdf.threads import threads
 
 from .selection import Floats, Mask, alike_in_color
 

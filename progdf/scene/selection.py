@@ -20,8 +20,8 @@ from progdf.camera import Camera
 from progdf.color.oklab import srgb_to_oklab
 from progdf.gaussians import Gaussians
 from progdf.rasterize import render
-from progdf.rasterize.cpu.parallel import StoppedError, stopped_by
 from progdf.sh import sh0_to_rgb
+from progdf.threads import StoppedError, stopped_by
 
 Mask = NDArray[np.bool_]
 Floats = NDArray[np.float32]

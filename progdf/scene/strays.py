@@ -17,9 +17,9 @@ from progdf.camera import Camera
 from progdf.gaussians import Gaussians
 from progdf.metrics.image import decibels
 from progdf.quaternions import rotation_matrices
-from progdf.rasterize.cpu.parallel import threads
 from progdf.rasterize.engines import render
 from progdf.terminal import format_count, group_digits
+from progdf.threads import threads
 
 from .orbit_rig import orbit_rig
 

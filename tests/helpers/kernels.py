@@ -13,9 +13,9 @@ import torch
 from progdf.compose.composer import Composer
 from progdf.compose.layers import Layer
 from progdf.rasterize import ActivatedGaussians, activate, alpha_weights, render
-from progdf.rasterize.color_maps import color_map
+from progdf.rasterize.cpu.engine import color_map
 from progdf.rasterize.simplification import simplify
-from progdf.rasterize.lines import lines_behind
+from progdf.rasterize.screen import lines_behind
 from tests.helpers.edits import curved_field, edit_of, some_rows
 from tests.helpers.scenes import ball, front_camera
 

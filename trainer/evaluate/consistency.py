@@ -12,7 +12,7 @@ from torch.nn.functional import grid_sample
 from progdf.camera import Camera
 from progdf.gaussians import Gaussians
 from progdf.metrics.image import psnr
-from progdf.rasterize.depth import Depth, render_depth
+from progdf.rasterize.engines import Depth, render_depth
 from trainer.fit.evaluate import Evaluator
 from trainer.optimize.losses import Perceptual
 from trainer.views.view import crop, make_view, render_view

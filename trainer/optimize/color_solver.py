@@ -1,6 +1,6 @@
 """Edits of colors alone: all views at once, each member by the step that its own weight asks for.
 
-While nothing moves, every training view is linear in the members' colors (`progdf.rasterize.color_maps`), but
+While nothing moves, every training view is linear in the members' colors (`progdf.rasterize.cpu.engine`), but
 for the clamps at black and white. So a stage is a least-squares problem. It is solved by accelerated gradient
 descent (Nesterov 1983), each member's step divided by a bound of its curvature, Σ w·m over its pixels (SIRT
 in tomography): a member that is a hundredth of a pixel gets its answer as a large one does, and nothing
@@ -19,10 +19,9 @@ import torch
 from torch import Tensor
 
 from progdf.gaussians import attribute_slices, unpack
-from progdf.rasterize.color_maps import ColorMap, color_map
-from progdf.rasterize.cpu.parallel import threads
+from progdf.rasterize.cpu.engine import ColorMap, color_map
 from progdf.sh import basis
-from progdf.torch_threads import one_thread
+from progdf.threads import one_thread, threads
 from trainer.views.crops import CropScene
 
 from .losses import l1

@@ -23,9 +23,9 @@ from torch import Tensor
 from progdf.color.edits import typical_color
 from progdf.color.oklab import bend_of, interpolate_colors
 from progdf.gaussians import Gaussians, unpack
-from progdf.rasterize.color_maps import ColorMap
+from progdf.rasterize.cpu.engine import ColorMap
 from progdf.sh import C0, sh0_to_rgb
-from progdf.torch_threads import one_thread
+from progdf.threads import one_thread
 from trainer.regions.lift import HIDDEN, bare_weight
 from trainer.regions.surface import covered_rows, surface_likeness
 from trainer.views.crops import CropScene

@@ -11,7 +11,7 @@ from torch import Tensor
 from progdf.camera import Camera
 from progdf.gaussians import Gaussians
 from progdf.rasterize import alpha_weights
-from progdf.rasterize.conventions import ALPHA_MIN
+from progdf.rasterize.engines import ALPHA_MIN
 from progdf.region import Region
 from trainer.options import LiftRule
 

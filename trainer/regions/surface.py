@@ -13,10 +13,10 @@ from progdf.camera import Camera
 from progdf.gaussians import Gaussians
 from progdf.quaternions import rotation_matrices
 from progdf.rasterize import render
-from progdf.rasterize.cpu.parallel import threads
 from progdf.scene.bounds import normals_of, scene_sphere
 from progdf.scene.neighbors import nearest_rows
 from progdf.sh import sh0_to_rgb
+from progdf.threads import threads
 
 _NEIGHBORS = 96
 _ROUNDS = 100

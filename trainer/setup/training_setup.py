@@ -16,10 +16,10 @@ from progdf.gaussians import Gaussians
 from progdf.io.cameras import load_cameras
 from progdf.io.images import write_image
 from progdf.io.picture_camera import up_in_picture
-from progdf.rasterize.cpu.parallel import threads
 from progdf.region import Region
 from progdf.scene.bounds import is_surrounding
 from progdf.scene.up_axis import UpAxis, find_up, up_from_json
+from progdf.threads import threads
 from trainer.editors.base import EditKind, ImageEditor
 from trainer.editors.pictures import picture_cameras
 from trainer.editors.procedural import ColorEditor

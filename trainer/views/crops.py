@@ -18,9 +18,9 @@ from torch import Tensor
 from progdf.camera import Camera
 from progdf.gaussians import ATTRIBUTES, Gaussians, attribute_slices, unpack
 from progdf.rasterize import ActivatedGaussians, Crop, Rendering, activate, render
-from progdf.rasterize.color_maps import ColorMap, color_map
-from progdf.rasterize.cpu.parallel import threads
+from progdf.rasterize.cpu.engine import ColorMap, color_map
 from progdf.sh import C0, basis
+from progdf.threads import threads
 
 from .tiles import live_pixels, live_tiles, may_reach
 from .view import seen_colors

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from progdf.camera import Camera
 from progdf.rasterize import Crop
-from progdf.rasterize.cpu.bin import TILE_H, TILE_W
+from progdf.rasterize.cpu.forward import TILE_H, TILE_W
 
 _SUPPORT = 2 * 5.55
 """Most squared Mahalanobis distance at which alpha ≥ 1/255: 2 ln 255, rounded up."""

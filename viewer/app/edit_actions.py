@@ -14,7 +14,7 @@ from progdf.gdf.file import Gdf, load_gdf
 from progdf.metrics.image import NO_DIFFERENCE
 from progdf.scene.strays import Strays, clean, find_strays, picture_difference
 from progdf.terminal import group_digits
-from progdf.torch_threads import all_threads
+from progdf.threads import all_threads
 from viewer.state import layers as stack
 from viewer.state import selection
 from viewer.state.view_state import ViewState

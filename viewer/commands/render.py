@@ -25,7 +25,7 @@ from progdf.io.atomic import atomic_write, check_not_an_input
 from progdf.io.cameras import read_camera
 from progdf.io.picture_camera import camera_chunk
 from progdf.terminal import format_count, print_line
-from progdf.torch_threads import one_thread
+from progdf.threads import one_thread
 from viewer.camera.up_axis import Vec3
 from viewer.camera.view_camera import (
     FARTHEST,

@@ -15,7 +15,7 @@ from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf, load_gdf
 from progdf.scene.neighbors import Neighborhood
 from progdf.terminal import escape_text
-from progdf.torch_threads import all_threads
+from progdf.threads import all_threads
 from viewer.camera.up_axis import SceneUp, find_scene_up
 from viewer.camera.view_camera import bounds_of, first_camera, fit, fit_all
 from viewer.state.layer_facts import layer_rows

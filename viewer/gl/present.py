@@ -6,7 +6,7 @@ import moderngl
 import numpy as np
 from numpy.typing import NDArray
 
-from progdf.rasterize.screen_bytes import fill_screen
+from progdf.rasterize.screen import fill_screen
 
 from .programs import load_program
 

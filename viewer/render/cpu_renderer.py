@@ -17,11 +17,10 @@ from numpy.typing import NDArray
 from progdf.camera import Camera
 from progdf.gaussians import Gaussians
 from progdf.rasterize import ActivatedGaussians, render
-from progdf.rasterize.cpu.parallel import stopped_by
-from progdf.rasterize.lines import lines_behind
-from progdf.rasterize.screen_bytes import fill_screen
+from progdf.rasterize.screen import fill_screen, lines_behind
 from progdf.rasterize.simplification import simplify
 from progdf.sh import C0
+from progdf.threads import stopped_by
 from viewer.camera.up_axis import Vec3
 from viewer.gl.layout import SPLATS_PER_ROW
 from viewer.gl.present import ScreenCopy

@@ -15,8 +15,7 @@ from progdf.camera import Camera
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
 from progdf.rasterize import reference
-from progdf.rasterize.conventions import ALPHA_MAX, ALPHA_MIN
-from progdf.rasterize.engines import RasterView, activate
+from progdf.rasterize.engines import ALPHA_MAX, ALPHA_MIN, RasterView, activate
 from viewer.camera.up_axis import Vec3
 from viewer.state.layers import is_visible
 from viewer.state.view_state import ViewState

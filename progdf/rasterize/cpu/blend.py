@@ -1,67 +1,239 @@
-"""Kernel: blend the splats of each tile front to back."""
+"""Kernels: blend the splats of each tile front to back, and their gradients, back to front.
+
+First the support of a splat is worked out, as spans of pixels, row by row: the loops over pixels are then
+plain runs of eight. The backward pass leaves one row of sums for each (splat, tile) intersection: the color's
+gradient (3), and for g = alpha · dL/dalpha the moments Σg, Σg·u, Σg·v, Σg·u², Σg·uv, Σg·v². In the
+whitened coordinates u, v they stay of the size of the result however thin the Gaussian is; in pixels they
+would cancel. Then what Gaussians weigh in the pixels (w = αT), summed up or as lists.
+"""
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from . import spans
-from .bin import TILE_W, TileLists
-from .jit import Number, kernel
-from .project import Pinhole, Splats
-from .simd import WIDTH, lane_indices, load, select, store
+from progdf.rasterize.engines import ALPHA_MAX, ALPHA_MIN, TRANSMITTANCE_MIN
+
+from .forward import (
+    EXTENT_Y,
+    INV_L11,
+    L11,
+    L22,
+    MX,
+    MY,
+    R2,
+    SLOPE,
+    TILE_H,
+    TILE_W,
+    Pinhole,
+    Splats,
+    TileLists,
+)  # fmt: skip
+from .jit import (
+    WIDTH,
+    Number,
+    Vector,
+    broadcast,
+    kernel,
+    lane_indices,
+    lane_sum,
+    lane_sums,
+    ldexp,
+    load,
+    prefetch,
+    select,
+    store,
+    truncate,
+)  # fmt: skip
 
 Array = NDArray[Any]
 
-_ZERO: Number = np.float32(0.0)
-_ONE: Number = np.float32(1.0)
-# planes of the state: transmittance (negative: the pixel is done), rgb, place in the tile's list of the last
-# contributor (-1: none; float32 holds it exactly up to 2^24)
-_G, _B, _LAST = spans.PLANE * np.uint64(2), spans.PLANE * np.uint64(3), spans.PLANE * np.uint64(4)
+SUMS = 9
+"""Numbers of one intersection's row in the backward pass."""
+
+PLANE = np.uint64(TILE_W * TILE_H + WIDTH)
+"""A tile's state is planes of this many float32 in one buffer. Pixels are worked on in groups of eight, from
+the first of a row that a splat covers; the surplus is masked, and in a tile's last row it is the padding of
+the plane."""
+
+LOG2_ALPHA_MIN = math.log2(ALPHA_MIN)
+
+# 2^x on [-1, 0], exact at 0, largest relative error 2.0e-9 before rounding (fitted by reweighted least
+# squares)
+_POLYNOMIAL = (
+    0.6931470643273044, 0.240224367820186, 0.05549075707783424, 0.009579179674631904, 0.0012747482964304813,
+    0.00010902322854050052,
+)  # fmt: skip
+
+BATCH = 32
+"""Splats whose spans are found at once: the pixel loops then branch on numbers that are long known."""
+
+BEGIN, START, STOP, U_PEAK, V, TOP = (np.uint64(TILE_H * field) for field in range(6))
+"""Fields of a splat's spans, one number a row of the tile: first column from the tile's left edge; that and
+one past the last, from the column nearest to the row's peak (none where the second is not the greater); u at
+that column, so that u = u_peak + l11 · (column − peak); v; log2 of alpha where u is 0."""
+
+FIRST, END, STEP, RED, GREEN, BLUE = (np.uint64(6 * TILE_H + k) for k in range(6))
+"""Then one number each: first row and one past the last, from the tile's top; l11; color."""
+
+SPLAT = np.uint64(64)
+"""float32 numbers from one splat's spans to the next one's."""
+
+MOST: Number = np.float32(ALPHA_MAX)
+LEAST: Number = np.float32(TRANSMITTANCE_MIN)
+ZERO: Number = np.float32(0.0)
+ONE: Number = np.float32(1.0)
+EIGHT: Number = np.float32(WIDTH)
+_E1, _E2, _E3, _E4, _E5, _E6 = (np.float32(factor) for factor in _POLYNOMIAL)
+# planes of the forward pass's state: transmittance (negative: the pixel is done), rgb, index in the tile's
+# list of the last contributor (-1: none; float32 holds it exactly up to 2^24)
+_R, _G, _B, _LAST = (PLANE * np.uint64(k) for k in (1, 2, 3, 4))
+# and of the backward pass's: transmittance after the current splat; what lies behind it, times the gradient;
+# the image's gradient (3); index of the last contributor
+_BEHIND, _G0, _G1, _G2, _DEEPEST = (PLANE * np.uint64(k) for k in (1, 2, 3, 4, 5))
+
+
+class TileScratch(NamedTuple):
+    """What a thread works in, tile by tile."""
+
+    state: Array  # planes of pixels; what each holds is the kernel's. float32
+    batch: Array  # spans of a batch. float32
+    bounds: Array  # left, top, right, bottom of what is drawn of a tile, from its first pixel. [4] int64
+
+
+def new_scratch() -> TileScratch:
+    """Room for six planes and a batch."""
+    batch = np.empty(BATCH * int(SPLAT), np.float32)
+    return TileScratch(np.empty(6 * int(PLANE), np.float32), batch, np.empty(4, np.int64))
+
+
+@kernel(fast=True, inline=True)
+def exp2(x: Vector) -> Vector:
+    """2^x for -126 ≤ x ≤ 0; anything for other lanes."""
+    n = truncate(x)
+    f = x - n
+    p = _E4 + f * (_E5 + f * _E6)
+    p = ONE + f * (_E1 + f * (_E2 + f * (_E3 + f * p)))
+    return ldexp(p, n)
+
+
+@kernel(inline=True)
+def tile_corner(camera: Pinhole, tile: int) -> tuple[int, int]:
+    """A tile's first pixel in the full image."""
+    x = (camera.grid[0] + tile % camera.grid[2]) * TILE_W
+    return x, (camera.grid[1] + tile // camera.grid[2]) * TILE_H
+
+
+@kernel(inline=True)
+def tile_bounds(camera: Pinhole, x: int, y: int, bounds: Array) -> None:
+    """left, top, right, bottom of a tile's part in the window, from the tile's first pixel (x, y)."""
+    bounds[0], bounds[1] = max(0, camera.window[0] - x), max(0, camera.window[1] - y)
+    bounds[2], bounds[3] = min(TILE_W, camera.window[2] - x), min(TILE_H, camera.window[3] - y)
+
+
+@kernel(fast=True, inline=True)
+def find_spans(
+    members: Array, begin: Number, end: Number, splats: Splats, x: int, y: int, bounds: Array, batch: Array
+) -> None:
+    """Where some splats of a tile are at least 1/255, row by row, decided in float64.
+
+    Args:
+        members: rows of the tile's splats. [I] int32
+        begin, end: which of them, at most BATCH
+        splats: see `project`
+        x, y: the tile's first pixel in the full image
+        bounds: left, top, right, bottom of what to look at, from (x, y). [4] int64
+        batch: out
+    """
+    low, high = np.float64(bounds[0]), np.float64(bounds[2])
+    shapes, colors = splats.shapes, splats.colors
+    for index in range(begin, end):
+        prefetch(shapes, members[index])
+        prefetch(colors, members[index])
+    for index in range(begin, end):
+        at = np.uint64(index - begin) * SPLAT
+        s = members[index]
+        mx, my = shapes[s, MX] - x - 0.5, shapes[s, MY] - y - 0.5
+        slope, l11 = shapes[s, SLOPE], shapes[s, L11]
+        inv_l11, l22, r2 = shapes[s, INV_L11], shapes[s, L22], shapes[s, R2]
+        for row in range(np.uint64(TILE_H)):
+            dy = np.float64(np.int32(row)) - my
+            v = l22 * dy
+            remaining = r2 - v * v
+            center = mx - slope * dy
+            half = np.sqrt(max(remaining, 0.0)) * inv_l11
+            start = max(np.ceil(center - half), low)
+            stop = min(np.floor(center + half) + 1.0, high)
+            # counting from the peak keeps u = l11·(column − center) free of cancellation in float32; far
+            # peaks (needles, giants) lie where l11 is small
+            peak = min(max(np.floor(center + 0.5), -65536.0), 65536.0)
+            start, stop = min(start, high), max(stop, low) if remaining >= 0.0 else low
+            batch[at + BEGIN + row] = start
+            batch[at + START + row] = start - peak
+            batch[at + STOP + row] = stop - peak
+            batch[at + U_PEAK + row] = l11 * (peak - center)
+            batch[at + V + row] = v
+            batch[at + TOP + row] = remaining + LOG2_ALPHA_MIN
+        batch[at + FIRST] = max(np.ceil(my - shapes[s, EXTENT_Y]), np.float64(bounds[1]))
+        batch[at + END] = min(np.floor(my + shapes[s, EXTENT_Y]) + 1.0, np.float64(bounds[3]))
+        batch[at + STEP] = l11
+        batch[at + RED], batch[at + GREEN], batch[at + BLUE] = colors[s, 0], colors[s, 1], colors[s, 2]
+
+
+@kernel(fast=True, inline=True)
+def row_span(batch: Array, splat: Number, row: Number) -> tuple[Number, Number, Number, Number, Number]:
+    """Where a row of a splat begins and ends, from its peak; its index in a tile's plane; u_peak and top."""
+    begin = np.uint64(np.int32(batch[splat + BEGIN + row]))
+    return (
+        batch[splat + START + row], batch[splat + STOP + row], row * np.uint64(TILE_W) + begin,
+        batch[splat + U_PEAK + row], batch[splat + TOP + row],
+    )  # fmt: skip
+
+
+@kernel(fast=True, inline=True)
+def step_and_color(batch: Array, splat: Number) -> tuple[Number, Number, Number, Number]:
+    """l11; red, green, blue."""
+    return batch[splat + STEP], batch[splat + RED], batch[splat + GREEN], batch[splat + BLUE]
 
 
 class Picture(NamedTuple):
-    """The window as it is drawn.
+    """The window as it is drawn."""
 
-    Args:
-        image, transmittance: [h,w,3], [h,w] float32
-        last: place in the tile's list of each pixel's last contributor, -1 if none. [h,w] float32
-    """
-
-    image: Array
-    transmittance: Array
-    last: Array
+    image: Array  # [h,w,3] float32
+    transmittance: Array  # [h,w] float32
+    last: Array  # index in the tile's list of each pixel's last contributor, -1 if none. [h,w] float32
 
 
 @kernel(fast=True, inline=True)
-def _blend_row(state: Array, batch: Array, splat: Number, row: Number, place: Number) -> None:
+def _blend_row(state: Array, batch: Array, splat: Number, row: Number, index: Number) -> None:
     """Blend one row of a splat into a tile's state; `splat` is where its spans begin."""
-    start, stop, p, u_peak, top = spans.row_span(batch, splat, row)
-    step, red, green, blue = spans.step_and_color(batch, splat)
+    start, stop, p, u_peak, top = row_span(batch, splat, row)
+    step, red, green, blue = step_and_color(batch, splat)
     offset = start + lane_indices()
     while start < stop:
         u = u_peak + step * offset
-        alpha = spans.exp2(top - u * u)
-        alpha = select(alpha < spans.MOST, alpha, spans.MOST)
-        alpha = select(offset < stop, alpha, _ZERO)
+        alpha = exp2(top - u * u)
+        alpha = select(alpha < MOST, alpha, MOST)
+        alpha = select(offset < stop, alpha, ZERO)
         before = load(state, p)
-        after = before * (spans.ONE - alpha)
-        taken = after > spans.LEAST
-        weight = select(taken, alpha * before, _ZERO)
-        store(state, p, select(taken, after, select(before < _ZERO, before, _ZERO - before)))
-        store(state, p + spans.PLANE, load(state, p + spans.PLANE) + weight * red)
+        after = before * (ONE - alpha)
+        taken = after > LEAST
+        weight = select(taken, alpha * before, ZERO)
+        store(state, p, select(taken, after, select(before < ZERO, before, ZERO - before)))
+        store(state, p + _R, load(state, p + _R) + weight * red)
         store(state, p + _G, load(state, p + _G) + weight * green)
         store(state, p + _B, load(state, p + _B) + weight * blue)
-        store(state, p + _LAST, select(weight > _ZERO, place, load(state, p + _LAST)))
+        store(state, p + _LAST, select(weight > ZERO, index, load(state, p + _LAST)))
         p += np.uint64(WIDTH)
-        offset += spans.EIGHT
-        start += spans.EIGHT
+        offset += EIGHT
+        start += EIGHT
 
 
 @kernel(fast=True, inline=True)
-def _leave_out_done_rows(state: Array, bounds: Array) -> Number:
+def _skip_done_rows(state: Array, bounds: Array) -> Number:
     """Take rows whose pixels are all done off `bounds`, from above and below; whether any row is left."""
     while bounds[1] < bounds[3] and _is_done(state, bounds[1], bounds):
         bounds[1] += 1
@@ -72,45 +244,45 @@ def _leave_out_done_rows(state: Array, bounds: Array) -> Number:
 
 @kernel(fast=True, inline=True)
 def _is_done(state: Array, row: int, bounds: Array) -> Number:
-    highest = _ZERO
+    highest = ZERO
     for j in range(np.uint64(bounds[0]), np.uint64(bounds[2])):
         highest = max(highest, state[np.uint64(row) * np.uint64(TILE_W) + j])
-    return highest <= _ZERO
+    return highest <= ZERO
 
 
 @kernel(fast=True)
 def _blend_tile(
     state: Array, x: int, y: int, members: Array, splats: Splats, bounds: Array, batch: Array
 ) -> None:
-    """Blend a tile; state is [5·spans.PLANE] float32, set up here, the rest as in `find_spans`."""
-    plane = np.int64(spans.PLANE)
-    state[:plane] = _ONE
-    state[plane : 4 * plane] = _ZERO
-    state[4 * plane : 5 * plane] = -_ONE
-    for begin in range(0, members.size, spans.BATCH):
-        end = min(begin + spans.BATCH, members.size)
-        spans.find_spans(members, begin, end, splats, x, y, bounds, batch)
-        for place in range(begin, end):
-            splat = np.uint64(place - begin) * spans.SPLAT
-            for line in range(np.int32(batch[splat + spans.FIRST]), np.int32(batch[splat + spans.END])):
-                _blend_row(state, batch, splat, np.uint64(line), np.float32(place))
-        if not _leave_out_done_rows(state, bounds):
+    """Blend a tile; state is [5·PLANE] float32, set up here, all else as in `find_spans`."""
+    plane = np.int64(PLANE)
+    state[:plane] = ONE
+    state[plane : 4 * plane] = ZERO
+    state[4 * plane : 5 * plane] = -ONE
+    for begin in range(0, members.size, BATCH):
+        end = min(begin + BATCH, members.size)
+        find_spans(members, begin, end, splats, x, y, bounds, batch)
+        for index in range(begin, end):
+            splat = np.uint64(index - begin) * SPLAT
+            for line in range(np.int32(batch[splat + FIRST]), np.int32(batch[splat + END])):
+                _blend_row(state, batch, splat, np.uint64(line), np.float32(index))
+        if not _skip_done_rows(state, bounds):
             break
 
 
 @kernel(cache=True)
 def blend(
-    begin: int, end: int, scratch: spans.TileScratch, splats: Splats, lists: TileLists, camera: Pinhole,
+    begin: int, end: int, scratch: TileScratch, splats: Splats, lists: TileLists, camera: Pinhole,
     background: Array, out: Picture,
 ) -> None:  # fmt: skip
     """Blend tiles begin … end − 1 into the picture. background: [3] float32"""
     state, batch, bounds = scratch
     for tile in range(begin, end):
-        x, y = spans.tile_corner(camera, tile)
-        spans.tile_bounds(camera, x, y, bounds)
+        x, y = tile_corner(camera, tile)
+        tile_bounds(camera, x, y, bounds)
         members = lists.members[lists.starts[tile] : lists.starts[tile + 1]]
         _blend_tile(state, x, y, members, splats, bounds, batch)
-        spans.tile_bounds(camera, x, y, bounds)  # blending narrowed it
+        tile_bounds(camera, x, y, bounds)  # blending narrowed it
         left, width = np.uint64(x + bounds[0] - camera.window[0]), np.uint64(bounds[2] - bounds[0])
         for row in range(np.uint64(bounds[1]), np.uint64(bounds[3])):
             i = np.uint64(y - camera.window[1]) + row
@@ -121,6 +293,293 @@ def blend(
                 out.last[i, left + k] = state[p + _LAST + k]
             for k in range(width):
                 through = abs(state[p + k])
-                out.image[i, left + k, 0] = state[p + spans.PLANE + k] + through * background[0]
+                out.image[i, left + k, 0] = state[p + _R + k] + through * background[0]
                 out.image[i, left + k, 1] = state[p + _G + k] + through * background[1]
                 out.image[i, left + k, 2] = state[p + _B + k] + through * background[2]
+
+
+@kernel(fast=True, inline=True)
+def _blend_splat_backward(
+    state: Array, batch: Array, splat: Number, index: Number, sums: Array, slot: Number
+) -> None:
+    """Take one splat off a tile's state and write its row of `sums`; `splat` is where its spans begin."""
+    step, red, green, blue = step_and_color(batch, splat)
+    s_r = s_g = s_b = s_0 = s_u = s_v = s_uu = s_uv = s_vv = broadcast(ZERO)
+    for line in range(np.int32(batch[splat + FIRST]), np.int32(batch[splat + END])):
+        row = np.uint64(line)
+        start, stop, p, u_peak, top = row_span(batch, splat, row)
+        v = batch[splat + V + row]
+        offset = start + lane_indices()
+        while start < stop:
+            u = u_peak + step * offset
+            covered = (offset < stop) & (index <= load(state, p + _DEEPEST))
+            raw = select(covered, exp2(top - u * u), ZERO)
+            alpha = select(raw < MOST, raw, MOST)
+            inverse = ONE / (ONE - alpha)
+            before = load(state, p) * inverse
+            g0, g1, g2 = load(state, p + _G0), load(state, p + _G1), load(state, p + _G2)
+            front = red * g0 + green * g1 + blue * g2
+            behind = load(state, p + _BEHIND)
+            weight = alpha * before
+            g = alpha * (before * front - behind * inverse)
+            g = select(raw <= MOST, g, ZERO)
+            store(state, p, before)
+            store(state, p + _BEHIND, behind + weight * front)
+            s_r += weight * g0
+            s_g += weight * g1
+            s_b += weight * g2
+            g_u, g_v = g * u, g * v
+            s_0 += g
+            s_u += g_u
+            s_v += g_v
+            s_uu += g_u * u
+            s_uv += g_u * v
+            s_vv += g_v * v
+            p += np.uint64(WIDTH)
+            offset += EIGHT
+            start += EIGHT
+    at = np.uint64(slot) * np.uint64(SUMS)
+    store(sums, at, lane_sums(s_r, s_g, s_b, s_0, s_u, s_v, s_uu, s_uv))
+    sums[slot, 8] = lane_sum(s_vv)
+
+
+@kernel(fast=True, inline=True)
+def _restore_behind(state: Array, batch: Array, splat: Number, index: Number) -> None:
+    """As `_blend_splat_backward` for a splat that gets no gradient."""
+    step, red, green, blue = step_and_color(batch, splat)
+    for line in range(np.int32(batch[splat + FIRST]), np.int32(batch[splat + END])):
+        row = np.uint64(line)
+        start, stop, p, u_peak, top = row_span(batch, splat, row)
+        offset = start + lane_indices()
+        while start < stop:
+            u = u_peak + step * offset
+            covered = (offset < stop) & (index <= load(state, p + _DEEPEST))
+            alpha = select(covered, exp2(top - u * u), ZERO)
+            alpha = select(alpha < MOST, alpha, MOST)
+            before = load(state, p) / (ONE - alpha)
+            front = red * load(state, p + _G0) + green * load(state, p + _G1) + blue * load(state, p + _G2)
+            store(state, p, before)
+            store(state, p + _BEHIND, load(state, p + _BEHIND) + alpha * before * front)
+            p += np.uint64(WIDTH)
+            offset += EIGHT
+            start += EIGHT
+
+
+@kernel(fast=True)
+def _blend_tile_backward(
+    state: Array, x: int, y: int, members: Array, slots: Array, splats: Splats, bounds: Array, batch: Array,
+    sums: Array, grad_mask: Array,
+) -> None:  # fmt: skip
+    """Take the splats off a tile, last contributor first; state: six planes, all else as in `find_spans`."""
+    plane = np.int64(PLANE)
+    deepest: Number = -ONE
+    for p in range(5 * plane, 6 * plane):
+        deepest = max(deepest, state[p])
+    drawn: Number = np.int64(deepest) + 1
+    for index in range(drawn, members.size):
+        for k in range(SUMS):
+            sums[slots[index], k] = ZERO
+    for group in range((drawn + BATCH - 1) // BATCH - 1, -1, -1):
+        begin: Number = group * BATCH
+        end: Number = min(begin + BATCH, drawn)
+        find_spans(members, begin, end, splats, x, y, bounds, batch)
+        for index in range(end - 1, begin - 1, -1):
+            splat = np.uint64(index - begin) * SPLAT
+            if grad_mask.size == 0 or grad_mask[members[index]]:
+                _blend_splat_backward(state, batch, splat, np.float32(index), sums, slots[index])
+            else:
+                _restore_behind(state, batch, splat, np.float32(index))
+
+
+@kernel(cache=True)
+def blend_backward(
+    begin: int, end: int, scratch: TileScratch, splats: Splats, lists: TileLists, camera: Pinhole,
+    background: Array, out: Picture, gradients: Picture, grad_mask: Array, sums: Array,
+) -> None:  # fmt: skip
+    """Gradients of `blend`, which has the same first arguments.
+
+    Args:
+        out: what `blend` made; the image is not read
+        gradients: of the loss to the image and the transmittance; no more of it is read
+        grad_mask: rows that get gradients; [0]: all. [N] bool
+        sums: out, a row for each slot; not set where `grad_mask` is not. [I,9] float32
+    """
+    plane = np.int64(PLANE)
+    state, batch, bounds = scratch
+    by_image, by_transmittance = gradients.image, gradients.transmittance
+    for tile in range(begin, end):
+        x, y = tile_corner(camera, tile)
+        state[:plane] = ONE
+        state[plane : 5 * plane] = ZERO
+        state[5 * plane :] = -ONE
+        tile_bounds(camera, x, y, bounds)
+        left, width = np.uint64(x + bounds[0] - camera.window[0]), np.uint64(bounds[2] - bounds[0])
+        for row in range(np.uint64(bounds[1]), np.uint64(bounds[3])):
+            i = np.uint64(y - camera.window[1]) + row
+            p = row * np.uint64(TILE_W) + np.uint64(bounds[0])
+            for k in range(width):
+                state[p + _G0 + k] = by_image[i, left + k, 0]
+                state[p + _G1 + k] = by_image[i, left + k, 1]
+                state[p + _G2 + k] = by_image[i, left + k, 2]
+            for k in range(width):
+                state[p + k] = out.transmittance[i, left + k]
+                state[p + _DEEPEST + k] = out.last[i, left + k]
+            for k in range(width):
+                behind = state[p + _G0 + k] * background[0] + state[p + _G1 + k] * background[1]
+                behind += state[p + _G2 + k] * background[2] + by_transmittance[i, left + k]
+                state[p + _BEHIND + k] = state[p + k] * behind
+        listed = slice(lists.starts[tile], lists.starts[tile + 1])
+        _blend_tile_backward(
+            state, x, y, lists.members[listed], lists.slots[listed], splats, bounds, batch, sums, grad_mask
+        )
+
+
+WEIGHT_SUMS = 4
+"""Numbers of one intersection: Σ w·m, Σ m, Σ w, n."""
+
+_LOG2_ALPHA_MIN: Number = np.float32(LOG2_ALPHA_MIN)
+
+
+class Runs(NamedTuple):
+    """What each of M Gaussians weighs in each pixel of a window, run by run of one Gaussian in one tile."""
+
+    rows: Array  # the Gaussian of each run, 0..M−1. [R] int32
+    starts: Array  # first entry of each run, and the number of entries. [R+1] int64
+    pixels: Array  # of each entry, in the window, row by row. [E] int32
+    weights: Array  # αT of each entry. [E] float32
+
+
+@kernel(fast=True, inline=True)
+def _add_weights(state: Array, batch: Array, splat: Number, out: Array) -> None:
+    """Blend one splat's transmittance into a tile and add its weights to `out`.
+
+    Args:
+        state: transmittance (negative: the pixel is done) and mask. [2·PLANE] float32
+        batch, splat: the spans of a batch, and where the splat's begin
+        out: [4] float64
+    """
+    inside = within = weights = pixels = broadcast(ZERO)
+    step = batch[splat + STEP]
+    for line in range(np.int32(batch[splat + FIRST]), np.int32(batch[splat + END])):
+        row = np.uint64(line)
+        start, stop, p, u_peak, top = row_span(batch, splat, row)
+        offset = start + lane_indices()
+        while start < stop:
+            u = u_peak + step * offset
+            covered = offset < stop
+            alpha = select(covered, exp2(top - u * u), ZERO)
+            alpha = select(alpha < MOST, alpha, MOST)
+            before, mask = load(state, p), load(state, p + PLANE)
+            after = before * (ONE - alpha)
+            taken = covered & (after > LEAST)
+            weight = select(taken, alpha * before, ZERO)
+            done = select(before < ZERO, before, ZERO - before)
+            store(state, p, select(covered, select(taken, after, done), before))
+            inside += weight * mask
+            within += select(taken, mask, ZERO)
+            weights += weight
+            pixels += select(taken, ONE, ZERO)
+            p += np.uint64(WIDTH)
+            offset += EIGHT
+            start += EIGHT
+    out[0] += lane_sum(inside)
+    out[1] += lane_sum(within)
+    out[2] += lane_sum(weights)
+    out[3] += lane_sum(pixels)
+
+
+@kernel(cache=True)
+def accumulate_weights(
+    begin: int, end: int, scratch: TileScratch, splats: Splats, lists: TileLists, camera: Pinhole,
+    mask: Array, sums: Array,
+) -> None:  # fmt: skip
+    """Add up the weights of every (splat, tile) intersection in tiles begin … end − 1.
+
+    Args:
+        mask: of the full image. [H,W] float32
+        sums: out, a row for each slot, zero on entry. [I,4] float64
+    """
+    plane = np.int64(PLANE)
+    state, batch, bounds = scratch
+    for tile in range(begin, end):
+        x, y = tile_corner(camera, tile)
+        state[: 2 * plane] = ONE
+        tile_bounds(camera, x, y, bounds)
+        for row in range(bounds[1], bounds[3]):
+            for column in range(bounds[0], bounds[2]):
+                state[plane + row * TILE_W + column] = mask[y + row, x + column]
+        for first in range(lists.starts[tile], lists.starts[tile + 1], BATCH):
+            last = min(first + BATCH, lists.starts[tile + 1])
+            find_spans(lists.members, first, last, splats, x, y, bounds, batch)
+            for index in range(first, last):
+                _add_weights(state, batch, np.uint64(index - first) * SPLAT, sums[lists.slots[index]])
+
+
+@kernel(contract=True, inline=True)
+def _list_tile(
+    tile: int, splats: Splats, rows: Array, camera: Pinhole, members: Array, through: Array, write: bool,
+    run: int, entry: int, out: Runs,
+) -> tuple[int, int]:  # fmt: skip
+    """One tile's runs and entries, written from `run` and `entry` on; those one past the last."""
+    x, y = tile_corner(camera, tile)
+    left, right = max(0, camera.window[0] - x), min(TILE_W, camera.window[2] - x)
+    top, bottom = max(0, camera.window[1] - y), min(TILE_H, camera.window[3] - y)
+    width = camera.window[2] - camera.window[0]
+    through[: TILE_H * TILE_W] = ONE
+    for s in members:
+        shape = splats.shapes[s]
+        mx, my = shape[MX] - x - 0.5, shape[MY] - y - 0.5
+        first = max(math.ceil(my - shape[EXTENT_Y]), top)
+        end = min(math.floor(my + shape[EXTENT_Y]) + 1, bottom)
+        begun = entry
+        for i in range(first, end):
+            v = shape[L22] * (i - my)
+            remaining = shape[R2] - v * v
+            if remaining < 0.0:
+                continue
+            center = mx - shape[SLOPE] * (i - my)
+            half = math.sqrt(remaining) * shape[INV_L11]
+            start = max(math.ceil(center - half), left)
+            stop = min(math.floor(center + half) + 1, right)
+            for j in range(start, stop):
+                before = through[i * TILE_W + j]
+                if before < 0.0:  # the pixel is done
+                    continue
+                u = shape[L11] * (j - center)
+                alpha = min(np.exp2(np.float32(remaining - u * u) + _LOG2_ALPHA_MIN), MOST)
+                after = before * (ONE - alpha)
+                if after <= LEAST:
+                    through[i * TILE_W + j] = -before
+                    continue
+                through[i * TILE_W + j] = after
+                if rows[s] >= 0:
+                    if write:
+                        out.pixels[entry] = (y - camera.window[1] + i) * width + x - camera.window[0] + j
+                        out.weights[entry] = alpha * before
+                    entry += 1
+        if entry > begun:
+            if write:
+                out.rows[run], out.starts[run] = rows[s], begun
+            run += 1
+    return run, entry
+
+
+@kernel(cache=True)
+def list_weights(
+    begin: int, end: int, scratch: TileScratch, splats: Splats, lists: TileLists, camera: Pinhole,
+    rows: Array, write: bool, cursors: Array, out: Runs,
+) -> None:  # fmt: skip
+    """List what the splats weigh in tiles begin … end − 1.
+
+    Args:
+        rows: the row under which a Gaussian is listed, −1: not at all. [N] int32
+        write: whether to fill the lists, or only to count
+        cursors: runs and entries of each tile, out; where they begin if `write`. [tiles,2] int64
+        out: where `write`
+    """
+    for tile in range(begin, end):
+        run, entry = (cursors[tile, 0], cursors[tile, 1]) if write else (0, 0)
+        members = lists.members[lists.starts[tile] : lists.starts[tile + 1]]
+        run, entry = _list_tile(tile, splats, rows, camera, members, scratch.state, write, run, entry, out)
+        if not write:
+            cursors[tile, 0], cursors[tile, 1] = run, entry

@@ -1,4 +1,4 @@
-"""The fast engine: numba kernels behind one `torch.autograd.Function`.
+"""The fast engine: numba kernels behind one `torch.autograd.Function`, and color maps.
 
 Projection is computed in float64, pixels in float32, whatever the type of the inputs; results are float32.
 The image and the gradients are the same bits in every run and for every number of threads.
@@ -7,6 +7,7 @@ The image and the gradients are the same bits in every run and for every number 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cache
 from typing import Any, TypeVar
 
@@ -15,20 +16,37 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from progdf.camera import Camera
 from progdf.errors import ProgdfError
-from progdf.rasterize.conventions import FRUSTUM_MARGIN, RasterInfo
-from progdf.rasterize.engines import ActivatedGaussians, RasterView
+from progdf.rasterize.engines import FRUSTUM_MARGIN, ActivatedGaussians, Crop, RasterInfo, RasterView
+from progdf.threads import run_chunks, threads
 
-from . import weights
-from .bin import TILE_H, TILE_W, TileLists, bin_splats, depth_order, find_tiles
-from .blend import Picture, blend
-from .blend_backward import SUMS, blend_backward
-from .jit import compilation
-from .parallel import run_chunks, threads
-from .project import Pinhole, Scene, Splats, project
-from .project_backward import BLOCK, CAMERA, project_backward
-from .project_backward import new_scratch as project_backward_scratch
-from .spans import new_scratch
+from .backward import BLOCK, CAMERA, project_backward
+from .backward import new_scratch as new_backward_scratch
+from .blend import (
+    SUMS,
+    WEIGHT_SUMS,
+    Picture,
+    Runs,
+    accumulate_weights,
+    blend,
+    blend_backward,
+    list_weights,
+    new_scratch,
+)  # fmt: skip
+from .forward import (
+    TILE_H,
+    TILE_W,
+    Pinhole,
+    Scene,
+    Splats,
+    TileLists,
+    bin_splats,
+    depth_order,
+    find_tiles,
+    project,
+)  # fmt: skip
+from .jit import kernel
 
 Array = NDArray[Any]
 _T = TypeVar("_T")
@@ -38,7 +56,7 @@ MOST_INTERSECTIONS = 100_000_000
 
 _LEAST_TILES = 4  # fewer are not worth a call
 _CHUNKS = 4  # for each thread: tiles take unequally long
-TILE_ROOM = 8  # tiles of a Gaussian that there is room for; where chunks have more, these are found twice
+TILE_ROOM = 8  # tiles of a Gaussian that there is room for; where chunks have more, these are listed twice
 _ALL = np.empty(0, np.bool_)
 
 
@@ -47,24 +65,11 @@ def rasterize(
 ) -> tuple[Tensor, Tensor, RasterInfo]:
     """See `progdf.rasterize.render`."""
     inputs = [to_float32(tensor) for tensor in (*gaussians.tensors, background)]
-    found: list[Array] = []
+    projected: list[Array] = []
     image, transmittance = _Rasterize.apply(  # type: ignore[no-untyped-call]
-        make_pinhole(view), grad_rows, found, *inputs, view.viewmat, view.K
+        make_pinhole(view), grad_rows, projected, *inputs, view.viewmat, view.K
     )
-    return image, transmittance, RasterInfo(*map(torch.from_numpy, found))
-
-
-def alpha_weights(gaussians: ActivatedGaussians, view: RasterView, mask: Tensor) -> Tensor:
-    """See `progdf.rasterize.alpha_weights`."""
-    with compilation("weights", 4):
-        camera = make_pinhole(view)
-        splats, lists = bin_view(gaussians, camera)
-        sums = np.zeros((len(lists.members), weights.SUMS))
-        inside = to_float32(mask).numpy()
-        share_tiles(weights.accumulate_weights, camera, splats, lists, camera, inside, sums)
-        totals = np.zeros((len(gaussians.means), weights.SUMS))
-        weights.sum_slots(lists.offsets, sums, totals)
-    return torch.from_numpy(totals.astype(np.float32))
+    return image, transmittance, RasterInfo(*map(torch.from_numpy, projected))
 
 
 def make_pinhole(view: RasterView) -> Pinhole:
@@ -167,19 +172,18 @@ def _project_and_bin(scene: Scene, camera: Pinhole, with_slots: bool) -> tuple[S
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, camera: Pinhole, grad_rows: Tensor | None, found: list[Array], *tensors: Tensor
+        ctx: Any, camera: Pinhole, grad_rows: Tensor | None, projected: list[Array], *tensors: Tensor
     ) -> tuple[Tensor, Tensor]:
         *arrays, background = (tensor.numpy(force=True) for tensor in tensors[:6])
         if camera.degree < 0:
             arrays[4] = arrays[4].reshape(-1, 1, 3)
         scene = Scene(*arrays)
         out = _new_picture(camera)
-        with compilation("forward", 12):
-            splats, lists = _project_and_bin(scene, camera, any(ctx.needs_input_grad))
-            share_tiles(blend, camera, splats, lists, camera, background, out)
-        found[:] = splats.means2d, splats.depths, splats.visible
+        splats, lists = _project_and_bin(scene, camera, any(ctx.needs_input_grad))
+        share_tiles(blend, camera, splats, lists, camera, background, out)
+        projected[:] = splats.means2d, splats.depths, splats.visible
         ctx.set_materialize_grads(False)
-        ctx.kept = camera, grad_rows, scene, background, splats, lists, out
+        ctx.forward_pass = camera, grad_rows, scene, background, splats, lists, out
         results = torch.from_numpy(out.image), torch.from_numpy(out.transmittance)
         ctx.save_for_backward(*tensors, results[1])
         return results
@@ -187,10 +191,10 @@ class _Rasterize(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        camera, grad_rows, scene, background, splats, lists, out = ctx.kept
+        camera, grad_rows, scene, background, splats, lists, out = ctx.forward_pass
         viewmat, K = ctx.saved_tensors[6:8]  # and that none of them has been changed since is checked
         by_out = Picture(_array(grads[0], out.image), _array(grads[1], out.transmittance), out.last)
-        wanted = _wanted_rows(len(scene.means), grad_rows)
+        grad_mask = _gradient_mask(len(scene.means), grad_rows)
         gradients = Scene(*(np.empty(array.shape, np.float32) for array in scene))
         sums = np.empty((len(lists.members), SUMS), np.float32)
 
@@ -198,13 +202,12 @@ class _Rasterize(torch.autograd.Function):
 
         def backward_chunk(begin: int, end: int) -> None:
             project_backward(
-                begin, end, scene, camera, lists.offsets, sums, wanted, gradients, by_camera,
-                project_backward_scratch(),
+                begin, end, scene, camera, lists.offsets, sums, grad_mask, gradients, by_camera,
+                new_backward_scratch(),
             )  # fmt: skip
 
-        with compilation("backward", 5):
-            share_tiles(blend_backward, camera, splats, lists, camera, background, out, by_out, wanted, sums)
-            share_gaussians(backward_chunk, len(scene.means))
+        share_tiles(blend_backward, camera, splats, lists, camera, background, out, by_out, grad_mask, sums)
+        share_gaussians(backward_chunk, len(scene.means))
         results: list[Tensor | None] = [torch.from_numpy(array) for array in gradients]
         if camera.degree < 0:
             results[4] = torch.from_numpy(gradients.colors.reshape(-1, 3))
@@ -234,15 +237,113 @@ def _camera_gradients(parts: Array, viewmat: Tensor, K: Tensor) -> tuple[Tensor,
     return torch.from_numpy(by_viewmat).to(viewmat), torch.from_numpy(by_K).to(K)
 
 
-def _wanted_rows(count: int, grad_rows: Tensor | None) -> Array:
-    """Which rows want gradients; [0] where all do. [N] bool"""
+def _gradient_mask(count: int, grad_rows: Tensor | None) -> Array:
+    """Which rows get gradients; [0] where all do. [N] bool"""
     if grad_rows is None:
         return _ALL
-    wanted = np.zeros(count, np.bool_)
-    wanted[grad_rows.numpy(force=True)] = True
-    return wanted
+    grad_mask = np.zeros(count, np.bool_)
+    grad_mask[grad_rows.numpy(force=True)] = True
+    return grad_mask
 
 
 def _background_gradient(transmittance: Array, grad_image: Array) -> Tensor:
     per_channel = (grad_image * transmittance[..., None]).astype(np.float64).sum(axis=(0, 1))
     return torch.from_numpy(per_channel.astype(np.float32))
+
+
+def alpha_weights(gaussians: ActivatedGaussians, view: RasterView, mask: Tensor) -> Tensor:
+    """See `progdf.rasterize.alpha_weights`."""
+    camera = make_pinhole(view)
+    splats, lists = bin_view(gaussians, camera)
+    sums = np.zeros((len(lists.members), WEIGHT_SUMS))
+    inside = to_float32(mask).numpy()
+    share_tiles(accumulate_weights, camera, splats, lists, camera, inside, sums)
+    totals = np.zeros((len(gaussians.means), WEIGHT_SUMS))
+    sum_slots(lists.offsets, sums, totals)
+    return torch.from_numpy(totals.astype(np.float32))
+
+
+@dataclass(frozen=True)
+class ColorMap:
+    """What each of M Gaussians weighs in each pixel of a window: αT, for as long as nothing moves."""
+
+    count: int  # M
+    size: tuple[int, int]  # height and width of the window
+    runs: Runs
+
+    def picture(self, colors: Tensor) -> Tensor:
+        """Σ αT·c of every pixel, on black. [M,3] -> [h,w,3]"""
+        image = np.zeros((self.size[0] * self.size[1], 3), np.float32)
+        add_images(self.runs, to_float32(colors).numpy(), image)
+        return torch.from_numpy(image).view(*self.size, 3)
+
+    def gradient(self, image: Tensor) -> Tensor:
+        """The transpose: Σ αT·g of every Gaussian. [h,w,3] -> [M,3]"""
+        colors = np.zeros((self.count, 3), np.float32)
+        add_gradients(self.runs, to_float32(image).numpy().reshape(-1, 3), colors)
+        return torch.from_numpy(colors)
+
+
+def color_map(gaussians: ActivatedGaussians, camera: Camera, crop: Crop, rows: Tensor) -> ColorMap:
+    """List what some Gaussians weigh in a window of a view, as `render` draws it.
+
+    Args:
+        gaussians: all N that are drawn; their colors are not read
+        camera: the view
+        crop: x0, y0, x1, y1 of the window
+        rows: which of the N Gaussians, distinct. [M] int64
+    """
+    pinhole = make_pinhole(RasterView.of(camera, gaussians, crop))
+    listed = np.full(len(gaussians.means), -1, np.int32)
+    listed[rows.numpy()] = np.arange(len(rows), dtype=np.int32)
+    splats, lists = bin_view(gaussians, pinhole)
+    counts = np.zeros((len(lists.starts) - 1, 2), np.int64)
+    share_tiles(list_weights, pinhole, splats, lists, pinhole, listed, False, counts, _new_runs(0, 0))
+    runs = _new_runs(*counts.sum(axis=0).tolist())
+    cursors = np.cumsum(counts, axis=0) - counts
+    share_tiles(list_weights, pinhole, splats, lists, pinhole, listed, True, cursors, runs)
+    x0, y0, x1, y1 = crop
+    return ColorMap(len(rows), (y1 - y0, x1 - x0), runs)
+
+
+def _new_runs(runs: int, entries: int) -> Runs:
+    starts = np.full(runs + 1, entries, np.int64)
+    return Runs(np.empty(runs, np.int32), starts, np.empty(entries, np.int32), np.empty(entries, np.float32))
+
+
+@kernel(fast=True, cache=True)
+def add_images(runs: Runs, colors: Array, image: Array) -> None:
+    """image += Σ w·c. colors: [M,3] float32; image: [h·w,3] float32"""
+    for run in range(runs.rows.size):
+        row = runs.rows[run]
+        red, green, blue = colors[row, 0], colors[row, 1], colors[row, 2]
+        for k in range(runs.starts[run], runs.starts[run + 1]):
+            p, w = runs.pixels[k], runs.weights[k]
+            image[p, 0] += w * red
+            image[p, 1] += w * green
+            image[p, 2] += w * blue
+
+
+@kernel(fast=True, cache=True)
+def add_gradients(runs: Runs, gradient: Array, by_colors: Array) -> None:
+    """by_colors += Σ w·g. gradient: of the image, [h·w,3] float32; by_colors: [M,3] float32"""
+    for run in range(runs.rows.size):
+        red = green = blue = np.float32(0.0)
+        for k in range(runs.starts[run], runs.starts[run + 1]):
+            p, w = runs.pixels[k], runs.weights[k]
+            red += w * gradient[p, 0]
+            green += w * gradient[p, 1]
+            blue += w * gradient[p, 2]
+        row = runs.rows[run]
+        by_colors[row, 0] += red
+        by_colors[row, 1] += green
+        by_colors[row, 2] += blue
+
+
+@kernel(cache=True)
+def sum_slots(offsets: Array, sums: Array, totals: Array) -> None:
+    """Add up each Gaussian's intersections in their fixed order. totals: out, [N,4] float64, zero on entry"""
+    for i in range(totals.shape[0]):
+        for slot in range(offsets[i], offsets[i + 1]):
+            for k in range(WEIGHT_SUMS):
+                totals[i, k] += sums[slot, k]

@@ -1,20 +1,23 @@
-"""How the kernels are compiled: flags, the cache on disk, the message of a cold start."""
+"""How the kernels are compiled: flags, the cache on disk; and eight float32 at once, as a type of numba's.
+
+numba has no vector type, and whether LLVM turns a loop into vector code, and in which order it adds up, is
+LLVM's choice: with plain loops a forward and backward pass takes 1.7 times as long, and its bits differ from
+processor to processor. A `Vector` is LLVM's <8 x float>: one AVX register, two of SSE's or NEON's. Arithmetic
+and comparisons are Python's own, lane by lane, with the float flags of the kernel around them; a float32
+beside a vector counts as eight equal ones.
+"""
 
 from __future__ import annotations
 
 import atexit
 import hashlib
-import json
 import logging
+import operator
 import os
-import pickle
-import pickletools
 import shutil
 import tempfile
 import threading
-import zlib
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from collections.abc import Callable
 from functools import cache as once
 from functools import wraps
 from pathlib import Path
@@ -23,11 +26,15 @@ from typing import Any, TypeVar
 from filelock import FileLock
 
 from progdf.errors import ProgdfError
-from progdf.io.atomic import atomic_write, cache_folder, is_private, temporary_folder
+from progdf.io.atomic import cache_folder, is_private, temporary_folder
 
 try:
     import numba
-    from numba import config
+    from llvmlite import ir
+    from numba import config, types
+    from numba.core import cgutils
+    from numba.core.typing.templates import AbstractTemplate, builtin_registry, signature
+    from numba.extending import intrinsic, lower_builtin, models, register_model
 except Exception as error:  # it reads its settings on import, and raises whatever is wrong with them
     raise ProgdfError(
         f"numba cannot be loaded ({type(error).__name__}: {error}); check the variables NUMBA_…, and "
@@ -45,120 +52,13 @@ Number = Any
 """A number inside a kernel, of the type numba infers: python's int and float cannot say float32 or uint64."""
 
 _F = TypeVar("_F", bound=Callable[..., Any])
-_compiling_lock, _building_lock = threading.RLock(), threading.Lock()
-_ready: set[str] = set()  # stages whose marker was seen
-
-
-def _source_version() -> str:
-    """Of all files that kernels are made of: numba's cache notices neither changed constants nor changed
-    imported functions."""
-    digest = hashlib.sha256(numba.__version__.encode())
-    package = Path(__file__).parents[2]
-    for path in sorted([*package.glob("rasterize/**/*.py"), *package.glob("compose/*.py")]):
-        digest.update(path.read_bytes())
-    return digest.hexdigest()[:16]
-
-
-def find_cache_folder() -> Path:
-    """A folder that this user may write, for this version of the kernels; never in the source tree."""
-    named = os.environ.get("NUMBA_CACHE_DIR")
-    root = Path(named) if named else cache_folder() / "kernels"
-    temporary = temporary_folder()
-    for place in (root, temporary / "kernels"):
-        folder = place / _source_version()
-        try:
-            if place.parent == temporary:
-                temporary.mkdir(mode=0o700, exist_ok=True)
-                if not is_private(temporary):  # machine code of somebody else's is not run
-                    continue
-            folder.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryFile(dir=folder):
-                return folder
-        except OSError:
-            continue
-    log.warning("%s cannot be written; the kernels are compiled anew in every process", root)
-    folder = Path(tempfile.mkdtemp(prefix="progdf-kernels-"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    return folder
-
-
-_SUMS = "checksums.json"
-
-
-def record_cache(folder: Path) -> None:
-    """Write down what the cache holds, for `drop_damaged`; where that cannot be written nothing happens."""
-    with suppress(OSError, ProgdfError):
-        sums = _checksums(folder)
-        if sums != _read_record(folder):
-            with atomic_write(folder / _SUMS) as temporary_file:
-                temporary_file.write_text(json.dumps(sums, indent=0), encoding="utf-8")
-
-
-def drop_damaged(folder: Path) -> bool:
-    """Remove the files of the cache that are damaged; whether there were any.
-
-    numba would fail over them at every call, or run what is in them. Files that were not recorded are of a
-    process at work, or of one that was killed; of these, and of indices that have grown, those are dropped
-    that end too early.
-    """
-    recorded, damaged = _read_record(folder), []
-    with suppress(OSError):
-        for name, checksum in _checksums(folder).items():
-            known = recorded.get(name)
-            if known != checksum and ((known and name.endswith(".nbc")) or not _is_whole(folder / name)):
-                damaged.append(folder / name)
-        for path in [*damaged, *(folder.glob("*.ready") if damaged else ())]:
-            path.unlink(missing_ok=True)
-    return bool(damaged)
-
-
-def _is_whole(path: Path) -> bool:
-    """Whether numba can take a file apart: an index is two pickles, machine code is one."""
-    try:
-        with path.open("rb") as file:
-            if path.suffix == ".nbi":
-                pickle.load(file)
-                pickle.loads(file.read())
-            else:
-                for _ in pickletools.genops(file.read()):
-                    pass
-    except Exception:  # whatever a damaged pickle raises
-        return False
-    return True
-
-
-def _checksums(folder: Path) -> dict[str, int]:
-    """CRC-32 of the files of machine code, and of the indices that list them."""
-    files = [path for path in folder.rglob("*.nb[ic]") if path.is_file()]
-    return {path.relative_to(folder).as_posix(): zlib.crc32(path.read_bytes()) for path in files}
-
-
-def _read_record(folder: Path) -> dict[str, int]:
-    try:
-        found = json.loads((folder / _SUMS).read_bytes())
-    except (OSError, ValueError, RecursionError):
-        return {}
-    return found if isinstance(found, dict) else {}
-
-
-@once
-def kernel_cache() -> Path:
-    """The folder of compiled kernels, made and checked when the first kernel is needed."""
-    folder = find_cache_folder()
-    if drop_damaged(folder):
-        log.warning("kernels kept in %s were damaged and are compiled anew", folder)
-    atexit.register(record_cache, folder)
-    return folder
+_first_call = threading.Lock()
 
 
 def kernel(
-    *,
-    fast: bool = False,
-    contract: bool = False,
-    cache: bool = False,
-    inline: bool = False,
+    *, fast: bool = False, contract: bool = False, cache: bool = False, inline: bool = False,
     allocates: bool = False,
-) -> Callable[[_F], _F]:
+) -> Callable[[_F], _F]:  # fmt: skip
     """Compile a function with numba; it releases the interpreter's lock.
 
     Args:
@@ -173,14 +73,8 @@ def kernel(
     flags = FAST if fast else {"contract"} if contract else False
 
     def compile_now(function: _F) -> _F:
-        compiled: _F = numba.njit(
-            fastmath=flags,
-            cache=cache,
-            nogil=True,
-            error_model="numpy",
-            forceinline=inline,
-            _nrt=allocates,
-        )(function)
+        options = {"nogil": True, "error_model": "numpy", "forceinline": inline, "_nrt": allocates}
+        compiled: _F = numba.njit(fastmath=flags, cache=cache, **options)(function)
         return compiled
 
     return _compile_when_called(compile_now) if cache else compile_now
@@ -190,13 +84,25 @@ def _compile_when_called(compile_now: Callable[[_F], _F]) -> Callable[[_F], _F]:
     def decorate(function: _F) -> _F:
         compiled: _F | None = None
 
+        def call_first(*arguments: Any) -> Any:
+            """Load or compile it: one process at a time, as two would write the same files."""
+            nonlocal compiled
+            with _first_call, FileLock(kernel_cache() / "compiling.lock"):
+                made = compiled or _with_cache_folder(compile_now, function)
+                try:
+                    result = made(*arguments)
+                except Exception as error:  # whatever a file that was cut short raises
+                    log.warning("the kernels in %s are compiled anew (%s)", kernel_cache(), error)
+                    for path in kernel_cache().rglob("*.nb[ic]"):
+                        path.unlink(missing_ok=True)
+                    made = _with_cache_folder(compile_now, function)
+                    result = made(*arguments)
+            compiled = made
+            return result
+
         @wraps(function)
         def call(*arguments: Any) -> Any:
-            nonlocal compiled
-            if compiled is None:
-                with _building_lock:
-                    compiled = compiled or _with_cache_folder(compile_now, function)
-            return compiled(*arguments)
+            return compiled(*arguments) if compiled is not None else call_first(*arguments)
 
         return call  # type: ignore[return-value]
 
@@ -212,34 +118,221 @@ def _with_cache_folder(compile_now: Callable[[_F], _F], function: _F) -> _F:
         config.CACHE_DIR = before
 
 
-def compilation(stage: str, seconds: int) -> AbstractContextManager[None]:
-    """Say it when the kernels that run in this context have yet to be compiled.
-
-    Args:
-        stage: names the kernels, to tell a cold start from a warm one
-        seconds: about how long these take to compile
-    """
-    return nullcontext() if stage in _ready else _first_run(stage, seconds)
-
-
-@contextmanager
-def _first_run(stage: str, seconds: int) -> Iterator[None]:
-    marker = kernel_cache() / f"{stage}.ready"
-    with _compiling_lock, nullcontext() if marker.exists() else compile_lock():
-        cold = not marker.exists()
-        if cold:
-            log.warning(
-                "compiling the rasterizer's %s kernels (about %d s, once per machine)", stage, seconds
-            )
-        yield
-        if cold:
-            record_cache(kernel_cache())
-            with suppress(OSError):
-                marker.touch()
-        _ready.add(stage)
-
-
 @once
-def compile_lock() -> FileLock:
-    """Between processes: two that compile the same kernel would replace each other's files."""
-    return FileLock(kernel_cache() / "compiling.lock")
+def kernel_cache() -> Path:
+    """The folder of compiled kernels, made when the first kernel is needed."""
+    folder = find_cache_folder()
+    if not any(folder.rglob("*.nbi")):
+        log.warning("compiling the rasterizer's kernels (about 20 s, once per machine)")
+    return folder
+
+
+def find_cache_folder() -> Path:
+    """A folder that this user may write, for this version of the kernels; never in the source tree."""
+    named = os.environ.get("NUMBA_CACHE_DIR")
+    root = Path(named) if named else cache_folder() / "kernels"
+    temporary = temporary_folder()
+    for base in (root, temporary / "kernels"):
+        folder = base / _source_version()
+        try:
+            if base.parent == temporary:
+                temporary.mkdir(mode=0o700, exist_ok=True)
+                if not is_private(temporary):  # machine code of somebody else's is not run
+                    continue
+            folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=folder):
+                return folder
+        except OSError:
+            continue
+    log.warning("%s cannot be written; the kernels are compiled anew in every process", root)
+    folder = Path(tempfile.mkdtemp(prefix="progdf-kernels-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder
+
+
+def _source_version() -> str:
+    """Of all files that kernels are made of: numba's cache notices neither changed constants nor changed
+    imported functions."""
+    digest = hashlib.sha256(numba.__version__.encode())
+    package = Path(__file__).parents[2]
+    for path in sorted(
+        [*package.glob("rasterize/**/*.py"), *package.glob("compose/*.py"), package / "sh.py"]
+    ):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+Vector = Any
+"""Inside a kernel: eight float32."""
+
+Mask = Any
+"""Inside a kernel: eight booleans."""
+
+WIDTH = 8
+"""Lanes of a vector."""
+
+_FLOATS = ir.VectorType(ir.FloatType(), WIDTH)
+_INTS = ir.VectorType(ir.IntType(32), WIDTH)
+_BOOLS = ir.VectorType(ir.IntType(1), WIDTH)
+
+
+def select(mask: Mask, a: Vector, b: Vector) -> Vector:
+    """a where the mask holds, b elsewhere, lane by lane."""
+
+
+def broadcast(value: Any) -> Vector:
+    """Eight times a float32."""
+
+
+def lane_indices() -> Vector:
+    """0, 1, …, 7"""
+
+
+def lane_sums(a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: Any, h: Any) -> Vector:
+    """The sum of the lanes of each of eight vectors, as a vector; always added up in the same order."""
+
+
+def lane_sum(value: Vector) -> Any:
+    """The sum of the lanes, as `lane_sums` adds them up."""
+
+
+def truncate(value: Vector) -> Vector:
+    """Each lane without what follows the point, |value| < 2³¹."""
+
+
+def ldexp(value: Vector, exponent: Vector) -> Vector:
+    """value · 2^exponent where the exponent is whole and the result a normal number."""
+
+
+class _VectorType(types.Type):  # type: ignore[misc]
+    """numba's name for a vector of LLVM's."""
+
+    def __init__(self, name: str, vector: ir.VectorType) -> None:
+        super().__init__(name=name)
+        self.vector = vector
+
+
+@register_model(_VectorType)
+class _VectorModel(models.PrimitiveModel):  # type: ignore[misc]
+    def __init__(self, manager: Any, kind: Any) -> None:
+        super().__init__(manager, kind, kind.vector)
+
+
+_vector, _mask, _single = _VectorType("Vector", _FLOATS), _VectorType("Mask", _BOOLS), types.float32
+
+
+def _broadcast(builder: ir.IRBuilder, value: ir.Value) -> ir.Value:
+    """Eight times the same where it is one number."""
+    if isinstance(value.type, ir.VectorType):
+        return value
+    vector = ir.Constant(_FLOATS, ir.Undefined)
+    single = builder.insert_element(vector, value, ir.Constant(ir.IntType(32), 0))
+    return builder.shuffle_vector(single, vector, ir.Constant(_INTS, [0] * WIDTH))
+
+
+def _define(
+    function: Callable[..., Any], arguments: tuple[types.Type, ...], result: types.Type,
+    emit: Callable[..., ir.Value],
+) -> None:  # fmt: skip
+    """Teach numba a function or an operator for arguments of exactly these types; `emit` gets vectors."""
+
+    class _Template(AbstractTemplate):  # type: ignore[misc]
+        key = function
+
+        def generic(self, args: Any, kws: Any) -> Any:
+            return signature(result, *args) if args == arguments else None
+
+    builtin_registry.register_global(function, types.Function(_Template))
+
+    @lower_builtin(function, *arguments)  # type: ignore[untyped-decorator]
+    def lower(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
+        return emit(builder, *(_broadcast(builder, value) for value in args))
+
+
+def _add_shuffled(b: ir.IRBuilder, x: ir.Value, y: ir.Value, first: list[int], second: list[int]) -> ir.Value:
+    """Lanes `first` of x and y, laid end to end, plus lanes `second`."""
+    kind = ir.VectorType(ir.IntType(32), len(first))
+    return b.fadd(*(b.shuffle_vector(x, y, ir.Constant(kind, lanes)) for lanes in (first, second)))
+
+
+def _lane_sums(b: ir.IRBuilder, *vectors: ir.Value) -> ir.Value:
+    for part in (8, 4, 2):  # so many lanes belong to one sum; its halves are added up
+        low = [k for k in range(2 * WIDTH) if k % part < part // 2]
+        high = [k + part // 2 for k in low]
+        pairs = zip(vectors[::2], vectors[1::2], strict=True)
+        vectors = tuple(_add_shuffled(b, x, y, low, high) for x, y in pairs)
+    return vectors[0]
+
+
+def _lane_sum(b: ir.IRBuilder, vector: ir.Value) -> ir.Value:
+    for half in (4, 2, 1):
+        vector = _add_shuffled(b, vector, vector, list(range(half)), list(range(half, 2 * half)))
+    return b.extract_element(vector, ir.Constant(ir.IntType(32), 0))
+
+
+def _ldexp(b: ir.IRBuilder, value: ir.Value, exponent: ir.Value) -> ir.Value:
+    shift = b.shl(b.fptosi(exponent, _INTS), ir.Constant(_INTS, [23] * WIDTH))
+    return b.bitcast(b.add(b.bitcast(value, _INTS), shift), _FLOATS)
+
+
+for _pair in ((_vector, _vector), (_vector, _single), (_single, _vector)):
+    _define(operator.add, _pair, _vector, lambda b, x, y: b.fadd(x, y))
+    _define(operator.iadd, _pair, _vector, lambda b, x, y: b.fadd(x, y))
+    _define(operator.sub, _pair, _vector, lambda b, x, y: b.fsub(x, y))
+    _define(operator.mul, _pair, _vector, lambda b, x, y: b.fmul(x, y))
+    _define(operator.truediv, _pair, _vector, lambda b, x, y: b.fdiv(x, y))
+    _define(operator.lt, _pair, _mask, lambda b, x, y: b.fcmp_ordered("<", x, y))
+    _define(operator.le, _pair, _mask, lambda b, x, y: b.fcmp_ordered("<=", x, y))
+    _define(operator.gt, _pair, _mask, lambda b, x, y: b.fcmp_ordered(">", x, y))
+for _pair in ((_vector, _vector), (_vector, _single), (_single, _vector), (_single, _single)):
+    _define(select, (_mask, *_pair), _vector, lambda b, mask, x, y: b.select(mask, x, y))
+_define(operator.and_, (_mask, _mask), _mask, lambda b, x, y: b.and_(x, y))
+_define(broadcast, (_single,), _vector, lambda b, x: x)
+_define(lane_indices, (), _vector, lambda b: ir.Constant(_FLOATS, [float(lane) for lane in range(WIDTH)]))
+_define(lane_sums, (_vector,) * WIDTH, _vector, _lane_sums)
+_define(lane_sum, (_vector,), _single, _lane_sum)
+_define(truncate, (_vector,), _vector, lambda b, x: b.sitofp(b.fptosi(x, _INTS), _FLOATS))
+_define(ldexp, (_vector, _vector), _vector, _ldexp)
+
+
+def _pointer(context: Any, builder: ir.IRBuilder, sig: Any, array: ir.Value, at: ir.Value) -> ir.Value:
+    data = context.make_array(sig.args[0])(context, builder, array).data
+    return builder.bitcast(builder.gep(data, [at]), _FLOATS.as_pointer())
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def load(typingctx: Any, array: Any, at: Any) -> Any:
+    """array[at : at + 8] of a contiguous float32 array; nothing is checked. at: uint64"""
+
+    def generate(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
+        return builder.load(_pointer(context, builder, sig, *args), align=4)
+
+    return _vector(array, types.uint64), generate
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def store(typingctx: Any, array: Any, at: Any, value: Any) -> Any:
+    """array[at : at + 8] = value; as `load`."""
+
+    def generate(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
+        builder.store(args[2], _pointer(context, builder, sig, *args[:2]), align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, types.uint64, _vector), generate
+
+
+@intrinsic  # type: ignore[untyped-decorator]
+def prefetch(typingctx: Any, array: Any, row: Any) -> Any:
+    """Have the first 64 bytes of a row fetched before they are asked for; no harm where it does not exist."""
+
+    def generate(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
+        fields = context.make_array(sig.args[0])(context, builder, args[0])
+        byte, number = ir.IntType(8).as_pointer(), ir.IntType(32)
+        kind = ir.FunctionType(ir.VoidType(), [byte, number, number, number])
+        function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0i8")
+        offset = builder.mul(builder.extract_value(fields.strides, 0), args[1])
+        address = builder.gep(builder.bitcast(fields.data, byte), [offset])
+        builder.call(function, [address, number(0), number(3), number(1)])  # to read, to be kept, data
+        return context.get_dummy_value()
+
+    return types.void(array, types.int64), generate

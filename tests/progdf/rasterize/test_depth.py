@@ -9,7 +9,7 @@ import torch
 
 from progdf.gaussians import Gaussians
 from progdf.rasterize import ENGINES, render
-from progdf.rasterize.depth import render_depth
+from progdf.rasterize.engines import render_depth
 from tests.helpers.drawn import CASES
 from tests.helpers.scenes import concatenate, front_camera, one_gaussian, orbit_camera, random_gaussians
 

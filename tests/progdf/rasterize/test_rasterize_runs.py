@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +12,7 @@ import torch
 
 from progdf.errors import ProgdfError
 from progdf.rasterize import ActivatedGaussians, activate, alpha_weights, render, set_threads
+from progdf.rasterize.cpu.forward import depth_order
 from tests.helpers.drawn import INPUTS, Drawn, draw
 from tests.helpers.scenes import front_camera, one_gaussian, orbit_camera, random_gaussians
 
@@ -28,7 +28,7 @@ def test_bits_do_not_depend_on_the_run_the_number_of_threads_or_the_room_for_til
     scene, camera = random_gaussians(4000, seed=6, sh_degree=1), orbit_camera(128, 96)
     first = draw(scene, camera, "cpu")
     monkeypatch.setattr(engine, "TILE_ROOM", room)
-    for threads in (1, 1, 2, 3, 7):
+    for threads in (1, 1, 2, 3, 7, 16):
         set_threads(threads)
         again = draw(scene, camera, "cpu")
         assert torch.equal(again.image, first.image)
@@ -114,19 +114,20 @@ def test_inputs_changed_in_place_before_the_backward_pass_are_noticed() -> None:
         image.sum().backward()  # type: ignore[no-untyped-call]
 
 
-def test_a_cold_start_says_once_that_it_compiles(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    from progdf.rasterize.cpu import jit
-
-    monkeypatch.setattr(jit, "kernel_cache", lambda: tmp_path)
-    with caplog.at_level(logging.WARNING, logger="progdf"):
-        for _ in range(2):
-            with jit.compilation("test", 9):
-                pass
-    assert [record.getMessage() for record in caplog.records] == [
-        "compiling the rasterizer's test kernels (about 9 s, once per machine)"
-    ]
+@pytest.mark.parametrize("count", [0, 1, 1000, 200_000])
+@pytest.mark.parametrize("values", ["equal", "many", "of all sizes"])
+def test_depth_order_is_numpys_stable_sort(count: int, values: str) -> None:
+    rng = np.random.default_rng(0)
+    kinds = {
+        "equal": [3.0],
+        "many": np.linspace(0.02, 90.0, 5000),
+        "of all sizes": np.geomspace(1e-38, 3e38, 999),
+    }
+    depths = rng.choice(np.asarray(kinds[values], np.float32), count)
+    visible = rng.random(count) < 0.9
+    rows = np.flatnonzero(visible)
+    expected = rows[np.argsort(depths[visible], kind="stable")]
+    np.testing.assert_array_equal(depth_order(depths, visible), expected)
 
 
 def test_the_kernels_are_cached_outside_the_source_tree() -> None:

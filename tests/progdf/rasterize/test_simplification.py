@@ -8,8 +8,9 @@ import pytest
 import torch
 
 from progdf.camera import Camera
-from progdf.rasterize import ActivatedGaussians, activate, reference, render
+from progdf.rasterize import ActivatedGaussians, activate, render
 from progdf.rasterize.simplification import simplify
+from tests.helpers.plain_simplification import plain_simplify
 from tests.helpers.scenes import front_camera, orbit_camera, random_gaussians
 
 WIDTH, HEIGHT, PIXELS = 120, 80, 2
@@ -31,7 +32,7 @@ def cloud(count: int, size: float = 0.25, antialiased: bool = False) -> Activate
 def test_the_fast_one_keeps_the_plain_ones_gaussians(budget: int, antialiased: bool) -> None:
     scene, camera = cloud(4000, antialiased=antialiased), coarse(orbit_camera(WIDTH, HEIGHT))
     found = simplify(scene, camera, budget, PIXELS)
-    expected, rows = reference.simplify(scene, camera, budget, PIXELS)
+    expected, rows = plain_simplify(scene, camera, budget, PIXELS)
     row_of = {tuple(mean): row for row, mean in enumerate(scene.means.tolist())}
     ours = torch.tensor([row_of[tuple(mean)] for mean in found.means.tolist()])
     both = torch.isin(ours, rows), torch.isin(rows, ours)

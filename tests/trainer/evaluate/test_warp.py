@@ -11,7 +11,7 @@ from progdf.camera import Camera, look_at
 from progdf.gaussians import Gaussians
 from progdf.metrics.image import psnr
 from progdf.rasterize import render
-from progdf.rasterize.depth import Depth
+from progdf.rasterize.engines import Depth
 from progdf.sh import rgb_to_sh0
 from tests.helpers.scenes import concatenate, front_camera
 from trainer.evaluate.consistency import SeenDepth, see_depth, warp_view

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from progdf.gaussians import Gaussians, pack
 from progdf.rasterize import ActivatedGaussians, render
-from progdf.rasterize.cpu.bin import TILE_H, TILE_W
+from progdf.rasterize.cpu.forward import TILE_H, TILE_W
 from tests.helpers.scenes import front_camera, hard_cases, orbit_camera, random_gaussians
 from tests.helpers.trained import WHITE, small
 from trainer.views.crops import CropScene, crop_scene, render_all

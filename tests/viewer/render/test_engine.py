@@ -243,5 +243,5 @@ def test_timings_add_up() -> None:
 
 def test_the_early_stop_is_the_only_rule_that_gl_leaves_out() -> None:
     """Named here so that a change of the constant meets the tolerances above: 0.01 = 1e-4 / (1 - 0.99)."""
-    conventions = importlib.import_module("progdf.rasterize.conventions")
+    conventions = importlib.import_module("progdf.rasterize.engines")
     assert pytest.approx(0.01) == conventions.TRANSMITTANCE_MIN / (1.0 - conventions.ALPHA_MAX)

@@ -17,7 +17,7 @@ from progdf.camera import Camera
 from progdf.formats.ply import load_ply
 from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.rasterize import render
-from progdf.rasterize.depth import depth_of, paint_depth, render_depth
+from progdf.rasterize.engines import depth_of, paint_depth, render_depth
 from progdf.scene.orbit_rig import orbit_rig
 from tests.helpers.demo_scenes import bear
 from tests.helpers.scenes import front_camera, hard_cases, one_gaussian, orbit_camera, random_gaussians

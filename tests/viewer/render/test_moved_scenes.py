@@ -16,7 +16,7 @@ from progdf.formats.scene_file import load_scene
 from progdf.gaussians import Gaussians
 from progdf.io.cameras import load_cameras, save_cameras
 from progdf.rasterize import render
-from progdf.rasterize.depth import render_depth
+from progdf.rasterize.engines import render_depth
 from progdf.scene.orbit_rig import orbit_rig
 from progdf.scene.regions import parse_region
 from progdf.scene.stats import survey

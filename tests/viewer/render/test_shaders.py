@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from progdf.gaussians import ATTRIBUTES
-from progdf.rasterize import conventions
+from progdf.rasterize import engines
 from viewer.gl import programs
 from viewer.gl.layout import (
     GRID_LINE,
@@ -80,7 +80,7 @@ def test_the_shaders_constants_are_the_rasterizers() -> None:
     assert len(found) == 5
     for name, value in found.items():
         numerator, _, denominator = value.partition("/")
-        assert float(numerator) / float(denominator or 1) == getattr(conventions, name), name
+        assert float(numerator) / float(denominator or 1) == getattr(engines, name), name
 
 
 def test_every_attribute_has_its_own_components_of_a_texture() -> None:

@@ -1,22 +1,53 @@
-"""How many threads the kernels run on, and the pool that they share."""
+"""On how many threads torch and the kernels work, and the thread pool that the kernels share.
+
+Where torch is asked for hundreds of small things a second, its threads wait for each other at every one, and
+spin against the rasterizer's: an edit of one picture was solved in 5.2 s on two threads and in 2.6 on one.
+So it works on one, but where it has much to do at once.
+"""
 
 from __future__ import annotations
 
-import ctypes
 import itertools
 import os
-import sys
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from functools import cache
 from typing import TypeVar
 
+import torch
+
 _T = TypeVar("_T")
+
+MOST_THREADS = torch.get_num_threads()
+
 _thread_count: int | None = None
-_left = threading.local()
 _stops = threading.local()
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Let torch work on one thread meanwhile; also as a decorator."""
+    with _torch_threads(1):
+        yield
+
+
+@contextmanager
+def all_threads() -> Iterator[None]:
+    """Let torch work on as many threads as when the program began: for networks that are baked."""
+    with _torch_threads(MOST_THREADS):
+        yield
+
+
+@contextmanager
+def _torch_threads(count: int) -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def set_threads(count: int | None) -> None:
@@ -36,12 +67,12 @@ def threads() -> int:
 
 
 class StoppedError(Exception):
-    """Nobody wants the result any more."""
+    """Raised when the result was cancelled."""
 
 
 @contextmanager
 def stopped_by(event: threading.Event) -> Iterator[None]:
-    """Let what this thread does be given up, between two chunks, once the event is set: StoppedError."""
+    """Cancel what this thread does, between two chunks, once the event is set: StoppedError."""
     _stops.event = event
     try:
         yield
@@ -53,71 +84,35 @@ def run_chunks(kernel: Callable[[int], _T], chunks: int) -> list[_T]:
     """Call `kernel(chunk)` for chunks 0, 1, …, each once, on this thread and those of the pool.
 
     A pool thread that has not begun when this one has run out of chunks is not waited for: waking one takes
-    50 µs, as long as a small kernel. Kernels release the interpreter's lock.
+    50 µs, as long as a small kernel. Kernels release the interpreter's lock. numba's own parallel loops are
+    no replacement: see docs/experiments.md, The rasterizer's threads.
 
     Returns:
         what the calls returned, by chunk
     """
     stop: threading.Event | None = getattr(_stops, "event", None)
-
-    def run(chunk: int) -> _T:
-        if stop is not None and stop.is_set():
-            raise StoppedError
-        return kernel(chunk)
-
-    if min(threads(), chunks) <= 1:
-        return [run(chunk) for chunk in range(chunks)]
-    results: dict[int, _T] = {}
-    following = itertools.count()
-    core = _current_core()
+    following, results = itertools.count(), {}
 
     def work() -> None:
         while (chunk := next(following)) < chunks:
-            results[chunk] = run(chunk)
+            if stop is not None and stop.is_set():
+                raise StoppedError
+            results[chunk] = kernel(chunk)
 
-    def work_elsewhere() -> None:
-        _leave(core)
-        work()
-
-    others = [_pool().submit(work_elsewhere) for _ in range(min(threads(), chunks) - 1)]
+    others = [_pool().submit(work) for _ in range(min(threads(), chunks) - 1)]
     try:
         work()
     finally:
-        begun = [other for other in others if not other.cancel()]
-        wait(begun)
-    for other in begun:
+        started = [other for other in others if not other.cancel()]
+        wait(started)
+    for other in started:
         other.result()  # raises what was raised there
     return [results[chunk] for chunk in range(chunks)]
 
 
-def _leave(core: int) -> None:
-    """Keep this thread off a core.
-
-    A virtual machine's idle cores look busy to Linux, which therefore wakes a thread on the core of the one
-    that wakes it: both would share it for up to two ticks, 8 ms, while the other core idles.
-    """
-    if sys.platform == "linux" and core >= 0 and getattr(_left, "core", None) != core:
-        others = os.sched_getaffinity(os.getpid()) - {core}
-        if others:
-            with suppress(OSError):  # a container may forbid it
-                os.sched_setaffinity(0, others)
-        _left.core = core
-
-
-@cache
-def _find_getcpu() -> Callable[[], int]:
-    """glibc's sched_getcpu; elsewhere a function that returns −1."""
-    found = getattr(ctypes.PyDLL(None), "sched_getcpu", None) if sys.platform == "linux" else None
-    return found or (lambda: -1)
-
-
-def _current_core() -> int:
-    return _find_getcpu()()
-
-
 @cache
 def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(max(1, _cores() - 1), thread_name_prefix="rasterize")
+    return ThreadPoolExecutor(max(1, _cores() - 1), thread_name_prefix="kernels")
 
 
 if hasattr(os, "register_at_fork"):  # a forked process has its parent's pool without the threads

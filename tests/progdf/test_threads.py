@@ -8,12 +8,9 @@ import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
-import numpy as np
 import pytest
 
-from progdf.rasterize import set_threads
-from progdf.rasterize.cpu.bin import depth_order
-from progdf.rasterize.cpu.parallel import StoppedError, run_chunks, stopped_by
+from progdf.threads import StoppedError, run_chunks, set_threads, stopped_by
 
 pytestmark = pytest.mark.usefixtures("two_threads")
 
@@ -94,28 +91,12 @@ def test_a_forked_process_gets_threads_of_its_own() -> None:
 
 
 def test_python_ends_after_threads_have_drawn() -> None:
-    code = "from progdf.rasterize.cpu.parallel import *; set_threads(2); run_chunks(print, 4)"
+    code = "from progdf.threads import *; set_threads(2); run_chunks(print, 4)"
     assert subprocess.run([sys.executable, "-c", code], timeout=600, check=False).returncode == 0
 
 
-@pytest.mark.parametrize("count", [0, 1, 1000, 200_000])
-@pytest.mark.parametrize("values", ["equal", "many", "of all sizes"])
-def test_depth_order_is_numpys_stable_sort(count: int, values: str) -> None:
-    rng = np.random.default_rng(0)
-    kinds = {
-        "equal": [3.0],
-        "many": np.linspace(0.02, 90.0, 5000),
-        "of all sizes": np.geomspace(1e-38, 3e38, 999),
-    }
-    depths = rng.choice(np.asarray(kinds[values], np.float32), count)
-    visible = rng.random(count) < 0.9
-    rows = np.flatnonzero(visible)
-    expected = rows[np.argsort(depths[visible], kind="stable")]
-    np.testing.assert_array_equal(depth_order(depths, visible), expected)
-
-
 @pytest.mark.parametrize("count", [1, 2])
-def test_what_nobody_wants_any_more_is_given_up_between_two_chunks(count: int) -> None:
+def test_what_was_cancelled_stops_between_two_chunks(count: int) -> None:
     set_threads(count)
     stop, done = threading.Event(), []
 
@@ -126,19 +107,4 @@ def test_what_nobody_wants_any_more_is_given_up_between_two_chunks(count: int) -
     with stopped_by(stop), pytest.raises(StoppedError):
         run_chunks(one, 100)
     assert len(done) <= count
-    assert run_chunks(lambda chunk: chunk, 3) == [0, 1, 2], "the next one is wanted"
-
-
-@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="threads cannot be placed here")
-@pytest.mark.skipif(len(getattr(os, "sched_getaffinity", lambda _: ())(0)) < 2, reason="one core")
-def test_pool_threads_stay_off_a_core_of_the_caller_and_the_caller_stays_free() -> None:
-    cores = os.sched_getaffinity(0)
-    met = threading.Barrier(2, timeout=60)
-
-    def allowed(_: int) -> set[int]:
-        met.wait()
-        return os.sched_getaffinity(0)
-
-    found = run_chunks(allowed, 2)
-    assert sorted(map(len, found)) == [len(cores) - 1, len(cores)]
-    assert os.sched_getaffinity(0) == cores
+    assert run_chunks(lambda chunk: chunk, 3) == [0, 1, 2], "the next one goes on"

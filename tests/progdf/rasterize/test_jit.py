@@ -1,18 +1,29 @@
-"""Eight numbers at once inside kernels do what numpy does to arrays of eight."""
+"""The cache of compiled kernels, where a cut file costs a compilation; eight numbers at once, as in numpy."""
 
 from __future__ import annotations
 
+import importlib.util
+import logging
+import os
+import threading
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from filelock import FileLock
 from numpy.typing import NDArray
 
-from progdf.rasterize.cpu.jit import Number, kernel
-from progdf.rasterize.cpu.simd import (
+from progdf.io import atomic
+from progdf.rasterize.cpu import jit
+from progdf.rasterize.cpu.blend import exp2
+from progdf.rasterize.cpu.jit import (
     WIDTH,
+    Number,
     Vector,
     broadcast,
+    kernel,
     lane_indices,
     lane_sum,
     lane_sums,
@@ -22,9 +33,119 @@ from progdf.rasterize.cpu.simd import (
     store,
     truncate,
 )
-from progdf.rasterize.cpu.spans import exp2
 
 Array = NDArray[Any]
+
+SOURCE = """
+from progdf.rasterize.cpu.jit import kernel
+
+@kernel(cache=True)
+def twice(number):
+    return 2 * number
+"""
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    folder = tmp_path / "cache"
+    folder.mkdir()
+    monkeypatch.setattr(jit, "kernel_cache", lambda: folder)
+    (tmp_path / "kernels.py").write_text(SOURCE)
+    return folder
+
+
+def twice(cache: Path) -> Callable[[float], float]:
+    """The kernel as a new process has it: compiled, or from the cache."""
+    spec = importlib.util.spec_from_file_location("kernels", cache.parent / "kernels.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    found: Callable[[float], float] = module.twice
+    return found
+
+
+@pytest.mark.parametrize("suffix", [".nbi", ".nbc"])
+@pytest.mark.parametrize("share", [0.0, 0.5])
+def test_a_file_that_was_cut_short_is_dropped_and_compiled_anew(
+    suffix: str, share: float, cache: Path
+) -> None:
+    assert twice(cache)(4) == 8
+    (file,) = cache.rglob(f"*{suffix}")
+    content = file.read_bytes()
+    file.write_bytes(content[: int(share * len(content))])
+    assert twice(cache)(4) == 8
+    assert file.read_bytes()
+    assert twice(cache)(4) == 8
+
+
+def test_a_cold_cache_says_once_that_it_compiles(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    with caplog.at_level(logging.WARNING, logger="progdf"):
+        first = jit.kernel_cache.__wrapped__()
+        (first / "some.nbi").touch()
+        assert jit.kernel_cache.__wrapped__() == first
+    assert [record.getMessage() for record in caplog.records] == [
+        "compiling the rasterizer's kernels (about 20 s, once per machine)"
+    ]
+
+
+@pytest.fixture
+def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The user's folder among temporary files, where there is no other."""
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    return atomic.temporary_folder()
+
+
+def homeless() -> Path:
+    raise RuntimeError("Could not determine home directory.")
+
+
+def test_without_a_home_the_kernels_are_kept_among_temporary_files(
+    temporary: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pathlib.Path.home", homeless)
+    assert temporary in jit.find_cache_folder().parents
+    assert jit.find_cache_folder() == jit.find_cache_folder(), "not a folder a process"
+    assert atomic.state_folder() == temporary
+
+
+def test_where_the_cache_cannot_be_written_all_processes_share_one_elsewhere(
+    temporary: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
+    monkeypatch.setenv("LOCALAPPDATA", str(tmp_path / "file"))
+    monkeypatch.setattr("pathlib.Path.home", lambda: tmp_path / "file")
+    folder = jit.find_cache_folder()
+    assert temporary in folder.parents
+    assert folder == jit.find_cache_folder()
+
+
+def test_a_temporary_folder_that_others_may_write_to_is_not_used(
+    temporary: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("pathlib.Path.home", homeless)
+    temporary.mkdir()
+    temporary.chmod(0o777)
+    folder = jit.find_cache_folder()
+    assert temporary not in folder.parents
+    assert os.stat(folder).st_mode & 0o077 == 0
+
+
+def test_a_second_process_waits_for_the_kernels_that_another_compiles(cache: Path) -> None:
+    """Both would write the same files."""
+    results: list[float] = []
+    drawing = threading.Thread(target=lambda: results.append(twice(cache)(4)))
+    with FileLock(cache / "compiling.lock"):
+        drawing.start()
+        drawing.join(0.3)
+        assert not results
+    drawing.join(60.0)
+    assert results == [8]
 
 
 def numbers(seed: int, rows: int = 1) -> Array:

@@ -14,23 +14,28 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from progdf.rasterize.conventions import ANTIALIAS_FLOOR, DILATION
+from progdf.rasterize.engines import ANTIALIAS_FLOOR, DILATION
+from progdf.sh import _C1, _C2, _C3
 
-from .blend_backward import SUMS
-from .jit import kernel
-from .project import (
+from .blend import SUMS
+from .forward import (
     UNIT,
     Footprint,
     Pinhole,
     Scene,
+    Vec,
     blend2,
     camera_center,
     cross,
+    dot,
+    fill_basis,
     footprint,
+    row_times,
     times,
     vec,
+    view_direction,
 )  # fmt: skip
-from .shading import Vec, dot, row_times, shade_backward
+from .jit import kernel
 
 Array = NDArray[Any]
 
@@ -41,6 +46,78 @@ CAMERA = 16
 
 BLOCK = 1024
 """Gaussians whose parts of the camera's gradient are added up first: the same for every number of threads."""
+
+
+@kernel()
+def fill_basis_gradient(degree: int, x: float, y: float, z: float, slopes: Array) -> None:
+    """Derivatives of the basis functions by x, y and z. slopes: out, [16,3] float64, zero on entry"""
+    if degree >= 1:
+        slopes[1, 1] = -_C1
+        slopes[2, 2] = _C1
+        slopes[3, 0] = -_C1
+    if degree >= 2:
+        slopes[4, 0], slopes[4, 1] = _C2[0] * y, _C2[0] * x
+        slopes[5, 1], slopes[5, 2] = _C2[1] * z, _C2[1] * y
+        slopes[6, 0], slopes[6, 1], slopes[6, 2] = -2 * _C2[2] * x, -2 * _C2[2] * y, 4 * _C2[2] * z
+        slopes[7, 0], slopes[7, 2] = _C2[3] * z, _C2[3] * x
+        slopes[8, 0], slopes[8, 1] = 2 * _C2[4] * x, -2 * _C2[4] * y
+    if degree >= 3:
+        xx, yy, zz = x * x, y * y, z * z
+        slopes[9, 0], slopes[9, 1] = 6 * _C3[0] * x * y, 3 * _C3[0] * (xx - yy)
+        slopes[10, 0], slopes[10, 1], slopes[10, 2] = _C3[1] * y * z, _C3[1] * x * z, _C3[1] * x * y
+        slopes[11, 0] = -2 * _C3[2] * x * y
+        slopes[11, 1] = _C3[2] * (4 * zz - xx - 3 * yy)
+        slopes[11, 2] = 8 * _C3[2] * y * z
+        slopes[12, 0], slopes[12, 1] = -6 * _C3[3] * x * z, -6 * _C3[3] * y * z
+        slopes[12, 2] = _C3[3] * (6 * zz - 3 * xx - 3 * yy)
+        slopes[13, 0] = _C3[4] * (4 * zz - 3 * xx - yy)
+        slopes[13, 1] = -2 * _C3[4] * x * y
+        slopes[13, 2] = 8 * _C3[4] * x * z
+        slopes[14, 0], slopes[14, 1] = 2 * _C3[5] * x * z, -2 * _C3[5] * y * z
+        slopes[14, 2] = _C3[5] * (xx - yy)
+        slopes[15, 0], slopes[15, 1] = 3 * _C3[6] * (xx - yy), -6 * _C3[6] * x * y
+
+
+@kernel(contract=True)
+def shade_backward(
+    i: int, colors: Array, degree: int, point: Vec, eye: Vec, gradient: Vec, basis: Array, slopes: Array,
+    out: Array,
+) -> Vec:  # fmt: skip
+    """Gradients of Gaussian i's color max(0, Σ basis·sh + 0.5).
+
+    Args:
+        i: row of `colors` and `out`
+        colors: SH coefficients. [N,K,3] float32
+        degree: 0..3
+        point, eye: its center and the camera's, world axes
+        gradient: to the clamped color
+        basis, slopes: scratch. [16], [16,3] float64, `slopes` zero where no derivative is ever written
+        out: gradient to the coefficients. [N,K,3] float32
+
+    Returns:
+        The gradient to point − eye.
+    """
+    x, y, z, inverse = view_direction(point, eye)
+    fill_basis(degree, x, y, z, basis)
+    fill_basis_gradient(degree, x, y, z, slopes)
+    bands = (degree + 1) ** 2
+    red = green = blue = 0.5
+    for k in range(bands):
+        red += basis[k] * colors[i, k, 0]
+        green += basis[k] * colors[i, k, 1]
+        blue += basis[k] * colors[i, k, 2]
+    g0 = gradient[0] if red >= 0.0 else 0.0
+    g1 = gradient[1] if green >= 0.0 else 0.0
+    g2 = gradient[2] if blue >= 0.0 else 0.0
+    dx = dy = dz = 0.0
+    for k in range(bands):
+        out[i, k, 0], out[i, k, 1], out[i, k, 2] = basis[k] * g0, basis[k] * g1, basis[k] * g2
+        along = g0 * colors[i, k, 0] + g1 * colors[i, k, 1] + g2 * colors[i, k, 2]
+        dx += slopes[k, 0] * along
+        dy += slopes[k, 1] * along
+        dz += slopes[k, 2] * along
+    radial = dx * x + dy * y + dz * z
+    return (dx - radial * x) * inverse, (dy - radial * y) * inverse, (dz - radial * z) * inverse
 
 
 @kernel(contract=True, inline=True)
@@ -120,7 +197,7 @@ def _set(rows: Array, i: int, value: Vec) -> None:
 
 
 class GradientScratch(NamedTuple):
-    """What a thread works in: see `shading.shade_backward`; sums of a Gaussian's intersections, [9]."""
+    """What a thread works in: see `shade_backward`; sums of a Gaussian's intersections, [9]."""
 
     basis: Array
     slopes: Array
@@ -134,7 +211,7 @@ def new_scratch() -> GradientScratch:
 
 @kernel(contract=True, cache=True)
 def project_backward(
-    begin: int, end: int, scene: Scene, camera: Pinhole, offsets: Array, sums: Array, wanted: Array,
+    begin: int, end: int, scene: Scene, camera: Pinhole, offsets: Array, sums: Array, grad_mask: Array,
     gradients: Scene, by_camera: Array, scratch: GradientScratch,
 ) -> None:  # fmt: skip
     """Gradients of `project`, which has the same first arguments.
@@ -142,7 +219,7 @@ def project_backward(
     Args:
         offsets: first row of `sums` of each Gaussian. [N+1] int32
         sums: see `blend_backward`. [I,9] float32
-        wanted: rows whose gradients are filled in, the others' are zero; [0]: all. [N] bool
+        grad_mask: rows whose gradients are filled in, the others' are zero; [0]: all. [N] bool
         gradients: out
         by_camera: out, each block's part of the camera's gradient; zero on entry. [blocks,CAMERA] float64
     """
@@ -153,7 +230,7 @@ def project_backward(
     gradients.colors[begin:end] = 0.0
     eye, total = camera_center(camera), scratch.total
     for i in range(begin, end):
-        if offsets[i] == offsets[i + 1] or (wanted.size > 0 and not wanted[i]):
+        if offsets[i] == offsets[i + 1] or (grad_mask.size > 0 and not grad_mask[i]):
             continue
         total[:] = 0.0
         for slot in range(offsets[i], offsets[i + 1]):

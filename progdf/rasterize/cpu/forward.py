@@ -1,0 +1,446 @@
+"""Kernels: project and shade the Gaussians that the window shows, in float64, and sort them into its tiles.
+
+A projected Gaussian ("splat") is eight float64, one cache line, in units in which alpha = 2^-(u² + v²) ·
+opacity: u = l11 · (dx + slope · dy) and v = l22 · dy for a pixel at offset (dx, dy) from the center. l is the
+Cholesky factor of the conic times sqrt(log2(e) / 2), so the exponent cannot become positive however thin the
+Gaussian is. Harmonics have the signs and the order of `progdf.sh`. The splats of a tile are in the order of
+depth, whatever the number of threads.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from progdf.rasterize.engines import ALPHA_MIN, ANTIALIAS_FLOOR, DILATION
+from progdf.sh import _C1, _C2, _C3, C0
+
+from .jit import kernel, prefetch
+
+Array = NDArray[Any]
+Vec = tuple[float, float, float]
+
+TILE_W, TILE_H = 64, 8
+"""Pixels of a tile. Wide: a row of a tile is what the pixel loops vectorize over."""
+
+_AHEAD = 8  # splats whose tiles are fetched before it is their turn: they lie far apart
+
+MX, MY, SLOPE, L11, INV_L11, L22, R2, EXTENT_Y = range(8)
+"""Columns of a splat: center in pixels, shape, u² + v² at alpha = 1/255, half height in pixels."""
+
+UNIT = math.sqrt(0.5 * math.log2(math.e))
+"""u and v per standard deviation."""
+
+_PER_UNIT, _PER_ALPHA_MIN = 1.0 / UNIT, 1.0 / ALPHA_MIN
+_CUT_RADIUS2 = 2.0 * math.log(1.0 / ALPHA_MIN)  # squared Mahalanobis distance where an opaque one ends
+
+
+class Scene(NamedTuple):
+    """Activated parameters of N Gaussians, or the gradients to them; C-contiguous float32."""
+
+    means: Array  # [N,3]
+    quats: Array  # wxyz. [N,4]
+    scales: Array  # [N,3]
+    opacities: Array  # [N]
+    colors: Array  # rgb [N,1,3] where the pinhole's degree is -1, else SH coefficients [N,K,3]
+
+
+class Pinhole(NamedTuple):
+    """A camera and what is drawn of its image, as kernels take them."""
+
+    rows: tuple[Vec, Vec, Vec]  # of the rotation, world → camera
+    shift: Vec  # translation, world → camera
+    fx: float  # pixels, as the next three
+    fy: float
+    cx: float
+    cy: float
+    limits_x: tuple[float, float]  # least and largest x/z in the Jacobian
+    limits_y: tuple[float, float]
+    near: float  # least camera z, world units
+    window: tuple[int, int, int, int]  # x0, y0, x1, y1 of what is drawn, pixels
+    grid: tuple[int, int, int, int]  # first tile column and row of the window, and how many there are
+    degree: int  # of spherical harmonics, -1 for rgb
+    antialiased: bool  # see `progdf.rasterize.render`
+
+
+class Splats(NamedTuple):
+    """What projection yields, by the Gaussians' rows."""
+
+    means2d: Array  # centers in pixels; 0 for what cannot be drawn. [N,2] float32
+    depths: Array  # camera z; 0 likewise. [N] float32
+    visible: Array  # whether one is a splat; where not, the next two are not set. [N] bool
+    shapes: Array  # the columns above. [N,8] float64
+    colors: Array  # rgb, opacity with antialias included. [N,4] float32
+
+
+class Footprint(NamedTuple):
+    """A Gaussian seen by a camera."""
+
+    x: float  # camera coordinates
+    y: float
+    inv_z: float
+    tan_x: float  # x/z, clamped
+    tan_y: float
+    free_x: bool  # whether it was inside the limits
+    free_y: bool
+    quat: tuple[float, float, float, float]  # unit, wxyz
+    inv_length: float  # 1 / length of the quaternion as given; 0 where it is replaced by the identity
+    rotation: tuple[Vec, Vec, Vec]  # rows
+    a0: Vec  # rows of Jacobian · world → camera
+    a1: Vec
+    turned0: Vec  # a0 in the Gaussian's own axes
+    turned1: Vec
+    p0: Vec  # x components of its three axes in pixels
+    p1: Vec  # y components
+    a: float  # 2D covariance before the dilation: p0·p0
+    b: float  # p0·p1
+    c: float  # p1·p1
+    normal: Vec  # p0 × p1
+    det0: float  # determinant before the dilation
+    det: float  # after it
+
+
+class TileLists(NamedTuple):
+    """The splats of each tile, nearest first."""
+
+    starts: Array  # where each tile's list begins. [tiles+1] int64
+    members: Array  # rows of the splats, tile after tile. [I] int32
+    # of each member, its index in an order by row, so that what belongs to one Gaussian can be added up in
+    # one fixed order. [I] int32, or [0] where it is not needed
+    slots: Array
+    offsets: Array  # first slot of each Gaussian. [N+1] int32
+
+
+@kernel(contract=True, inline=True)
+def dot(a: Vec, b: Vec) -> float:
+    """a·b"""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@kernel(contract=True, inline=True)
+def row_times(a: Vec, rows: tuple[Vec, Vec, Vec]) -> Vec:
+    """aᵀM for a matrix given by rows."""
+    return (
+        a[0] * rows[0][0] + a[1] * rows[1][0] + a[2] * rows[2][0],
+        a[0] * rows[0][1] + a[1] * rows[1][1] + a[2] * rows[2][1],
+        a[0] * rows[0][2] + a[1] * rows[1][2] + a[2] * rows[2][2],
+    )
+
+
+@kernel(inline=True)
+def view_direction(point: Vec, eye: Vec) -> tuple[float, float, float, float]:
+    """Unit vector from the eye to a point, world axes, and 1/distance (zeros at the eye itself)."""
+    x, y, z = point[0] - eye[0], point[1] - eye[1], point[2] - eye[2]
+    squared = x * x + y * y + z * z
+    inverse = 1.0 / math.sqrt(squared) if squared > 0.0 else 0.0
+    return x * inverse, y * inverse, z * inverse, inverse
+
+
+@kernel()
+def fill_basis(degree: int, x: float, y: float, z: float, basis: Array) -> None:
+    """Values of the (degree+1)² real basis functions in direction x, y, z. basis: out, [16] float64"""
+    basis[0] = C0
+    if degree >= 1:
+        basis[1] = -_C1 * y
+        basis[2] = _C1 * z
+        basis[3] = -_C1 * x
+    if degree >= 2:
+        xx, yy, zz = x * x, y * y, z * z
+        basis[4] = _C2[0] * x * y
+        basis[5] = _C2[1] * y * z
+        basis[6] = _C2[2] * (2 * zz - xx - yy)
+        basis[7] = _C2[3] * x * z
+        basis[8] = _C2[4] * (xx - yy)
+        if degree >= 3:
+            basis[9] = _C3[0] * y * (3 * xx - yy)
+            basis[10] = _C3[1] * x * y * z
+            basis[11] = _C3[2] * y * (4 * zz - xx - yy)
+            basis[12] = _C3[3] * z * (2 * zz - 3 * xx - 3 * yy)
+            basis[13] = _C3[4] * x * (4 * zz - xx - yy)
+            basis[14] = _C3[5] * z * (xx - yy)
+            basis[15] = _C3[6] * x * (xx - 3 * yy)
+
+
+@kernel(contract=True, inline=True)
+def cross(a: Vec, b: Vec) -> Vec:
+    """a × b"""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@kernel(contract=True, inline=True)
+def blend2(s: float, a: Vec, t: float, b: Vec) -> Vec:
+    """s·a + t·b"""
+    return s * a[0] + t * b[0], s * a[1] + t * b[1], s * a[2] + t * b[2]
+
+
+@kernel(contract=True, inline=True)
+def times(a: Vec, b: Vec) -> Vec:
+    """Product by components."""
+    return a[0] * b[0], a[1] * b[1], a[2] * b[2]
+
+
+@kernel(inline=True)
+def vec(rows: Array, i: int) -> Vec:
+    """Row i of an [N,3] array."""
+    return np.float64(rows[i, 0]), np.float64(rows[i, 1]), np.float64(rows[i, 2])
+
+
+@kernel(inline=True)
+def camera_center(camera: Pinhole) -> Vec:
+    """−RᵀT"""
+    turned = row_times(camera.shift, camera.rows)
+    return -turned[0], -turned[1], -turned[2]
+
+
+@kernel(contract=True, inline=True)
+def _unit_quat(w: float, x: float, y: float, z: float) -> tuple[float, float, float, float, float]:
+    """Unit quaternion and 1/length; the identity and 0 where it is zero or not finite."""
+    total = abs(w) + abs(x) + abs(y) + abs(z)
+    if not (total > 0.0 and total < np.inf):
+        return 1.0, 0.0, 0.0, 0.0, 0.0
+    inverse = 1.0 / math.sqrt(w * w + x * x + y * y + z * z)
+    return w * inverse, x * inverse, y * inverse, z * inverse, inverse
+
+
+@kernel(contract=True, inline=True)
+def _rotation_rows(w: float, x: float, y: float, z: float) -> tuple[Vec, Vec, Vec]:
+    """Rows of the rotation by a unit quaternion."""
+    return (
+        (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
+        (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
+        (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)),
+    )
+
+
+@kernel(contract=True, inline=True)
+def footprint(camera: Pinhole, scene: Scene, i: int) -> Footprint:
+    """Project Gaussian i, which is in front of the camera."""
+    mean, scale = vec(scene.means, i), vec(scene.scales, i)
+    x, y = dot(camera.rows[0], mean) + camera.shift[0], dot(camera.rows[1], mean) + camera.shift[1]
+    inv_z = 1.0 / (dot(camera.rows[2], mean) + camera.shift[2])
+    ratio_x, ratio_y = x * inv_z, y * inv_z
+    tan_x = min(max(ratio_x, camera.limits_x[0]), camera.limits_x[1])
+    tan_y = min(max(ratio_y, camera.limits_y[0]), camera.limits_y[1])
+    jx, jy = camera.fx * inv_z, camera.fy * inv_z
+    a0 = blend2(jx, camera.rows[0], -jx * tan_x, camera.rows[2])
+    a1 = blend2(jy, camera.rows[1], -jy * tan_y, camera.rows[2])
+    qw, qx, qy, qz, inv_length = _unit_quat(
+        np.float64(scene.quats[i, 0]), np.float64(scene.quats[i, 1]),
+        np.float64(scene.quats[i, 2]), np.float64(scene.quats[i, 3]),
+    )  # fmt: skip
+    rotation = _rotation_rows(qw, qx, qy, qz)
+    turned0, turned1 = row_times(a0, rotation), row_times(a1, rotation)
+    p0, p1 = times(turned0, scale), times(turned1, scale)
+    a, b, c = dot(p0, p0), dot(p0, p1), dot(p1, p1)
+    # ac − b² cancels for needles (4 % wrong at 1000 px in float32); the cross product does not
+    normal = cross(p0, p1)
+    det0 = dot(normal, normal)
+    return Footprint(
+        x, y, inv_z, tan_x, tan_y, tan_x == ratio_x, tan_y == ratio_y, (qw, qx, qy, qz), inv_length, rotation,
+        a0, a1, turned0, turned1, p0, p1, a, b, c, normal, det0,
+        det0 + DILATION * (a + c) + DILATION * DILATION,
+    )  # fmt: skip
+
+
+@kernel(contract=True, inline=True)
+def largest_extents(camera: Pinhole, scene: Scene, i: int) -> tuple[bool, float, float, float, float, float]:
+    """A bound of a Gaussian's support that needs no covariance.
+
+    Returns:
+        whether it can be drawn at all; its center in pixels and camera z; the squares of half the sides of a
+        box around it in pixels
+    """
+    mean, scale, opacity = vec(scene.means, i), vec(scene.scales, i), np.float64(scene.opacities[i])
+    z = dot(camera.rows[2], mean) + camera.shift[2]
+    total = abs(mean[0]) + abs(mean[1]) + abs(mean[2]) + abs(scale[0]) + abs(scale[1]) + abs(scale[2])
+    if not (z > camera.near and opacity >= ALPHA_MIN and total + opacity < np.inf):
+        return False, 0.0, 0.0, 0.0, 0.0, 0.0
+    inv_z = 1.0 / z
+    tan_x = (dot(camera.rows[0], mean) + camera.shift[0]) * inv_z
+    tan_y = (dot(camera.rows[1], mean) + camera.shift[1]) * inv_z
+    px, py = camera.fx * tan_x + camera.cx, camera.fy * tan_y + camera.cy
+    tan_x = min(max(tan_x, camera.limits_x[0]), camera.limits_x[1])
+    tan_y = min(max(tan_y, camera.limits_y[0]), camera.limits_y[1])
+    # ln x ≤ x − 1; 1.001: the viewmat's rotation is one only within rounding
+    radius2 = 1.001 * (_CUT_RADIUS2 + 2.0 * max(opacity - 1.0, 0.0))
+    largest = max(abs(scale[0]), max(abs(scale[1]), abs(scale[2]))) * inv_z
+    jx, jy = camera.fx * largest, camera.fy * largest
+    wide2 = radius2 * (jx * jx * (1.0 + tan_x * tan_x) + DILATION)
+    high2 = radius2 * (jy * jy * (1.0 + tan_y * tan_y) + DILATION)
+    return True, px, py, z, wide2, high2
+
+
+@kernel(contract=True, inline=True)
+def shade_splat(scene: Scene, i: int, degree: int, eye: Vec, basis: Array) -> Vec:
+    """The color of a Gaussian; basis: scratch, [16] float64"""
+    if degree < 0:
+        return vec(scene.colors[i], 0)
+    dx, dy, dz, _ = view_direction(vec(scene.means, i), eye)
+    fill_basis(degree, dx, dy, dz, basis)
+    red = green = blue = 0.5
+    for band in range((degree + 1) ** 2):
+        red += basis[band] * scene.colors[i, band, 0]
+        green += basis[band] * scene.colors[i, band, 1]
+        blue += basis[band] * scene.colors[i, band, 2]
+    return red, green, blue
+
+
+@kernel(contract=True, cache=True)
+def project(begin: int, end: int, scene: Scene, camera: Pinhole, splats: Splats, basis: Array) -> None:
+    """Project Gaussians begin … end − 1.
+
+    Args:
+        splats: out, rows begin … end − 1
+        basis: scratch. [16] float64
+    """
+    eye = camera_center(camera)
+    window = camera.window
+    x0, y0, x1, y1 = float(window[0]), float(window[1]), float(window[2]), float(window[3])
+    for i in range(begin, end):
+        usable, px, py, z, wide2, high2 = largest_extents(camera, scene, i)
+        splats.means2d[i, 0], splats.means2d[i, 1], splats.depths[i] = px, py, z
+        splats.visible[i] = False
+        out_x, out_y = max(max(x0 - px, px - x1), 0.0), max(max(y0 - py, py - y1), 0.0)
+        if not (usable and out_x * out_x <= wide2 and out_y * out_y <= high2):
+            continue
+        seen = footprint(camera, scene, i)
+        opacity = np.float64(scene.opacities[i])
+        if camera.antialiased:
+            opacity = opacity * math.sqrt(max(ANTIALIAS_FLOOR, seen.det0 / seen.det))
+        sigma_x, sigma_y = math.sqrt(seen.a + DILATION), math.sqrt(seen.c + DILATION)
+        px, py = camera.fx * seen.x * seen.inv_z + camera.cx, camera.fy * seen.y * seen.inv_z + camera.cy
+        r2 = max(0.0, math.log2(opacity * _PER_ALPHA_MIN))
+        radius = math.sqrt(r2) * _PER_UNIT
+        extent_x, extent_y = radius * sigma_x, radius * sigma_y
+        in_x = px + extent_x >= x0 and px - extent_x <= x1
+        if not (opacity >= ALPHA_MIN and in_x and py + extent_y >= y0 and py - extent_y <= y1):
+            continue
+        red, green, blue = shade_splat(scene, i, camera.degree, eye, basis)
+        if not abs(red) + abs(green) + abs(blue) < np.inf:
+            continue
+        if camera.degree >= 0:
+            red, green, blue = max(0.0, red), max(0.0, green), max(0.0, blue)
+        splats.visible[i] = True
+        root, inv_sigma_y = math.sqrt(seen.det), 1.0 / sigma_y
+        shape, color = splats.shapes[i], splats.colors[i]
+        shape[MX], shape[MY] = px, py
+        shape[SLOPE] = -(seen.b * inv_sigma_y * inv_sigma_y)
+        shape[L11], shape[INV_L11] = UNIT * sigma_y / root, root * inv_sigma_y * _PER_UNIT
+        shape[L22], shape[R2], shape[EXTENT_Y] = UNIT * inv_sigma_y, r2, extent_y
+        color[0], color[1], color[2], color[3] = red, green, blue, opacity
+
+
+@kernel(contract=True, inline=True)
+def _tile_columns(
+    shape: Array, side: float, top: float, bottom: float, left: float, right: float
+) -> tuple[int, int]:
+    """First tile column and one past the last that a splat may touch in the pixel rows top..bottom.
+
+    Columns count from the left edge of the full image; left, right: the window's. The bound is exact up to
+    1e-6 px: within a band of rows the support's left edge is farthest out where its leftmost point is, or at
+    the band's nearest row. side: dy of that point.
+    """
+    low, high = top + 0.5 - shape[MY], bottom + 0.5 - shape[MY]
+    left_at, right_at = min(max(side, low), high), min(max(-side, low), high)
+    v, w = shape[L22] * left_at, shape[L22] * right_at
+    outermost = shape[MX] - shape[SLOPE] * left_at - math.sqrt(max(0.0, shape[R2] - v * v)) * shape[INV_L11]
+    first = max(np.ceil(outermost - 0.5 - 1e-6), left)
+    outermost = shape[MX] - shape[SLOPE] * right_at + math.sqrt(max(0.0, shape[R2] - w * w)) * shape[INV_L11]
+    last = min(np.floor(outermost - 0.5 + 1e-6), right - 1.0)
+    if not first <= last:
+        return 0, 0
+    return int(first) // TILE_W, int(last) // TILE_W + 1
+
+
+@kernel(contract=True, cache=True)
+def find_tiles(begin: int, end: int, splats: Splats, camera: Pinhole, tiles: Array, counts: Array) -> int:
+    """The tiles that the splats of rows begin … end − 1 meet.
+
+    Args:
+        tiles: out, one splat's after the other's, as far as there is room. int32
+        counts: out, the number of each row's tiles. [N] int32
+
+    Returns:
+        how many there are
+    """
+    window = camera.window
+    x0, y0, x1, y1 = float(window[0]), float(window[1]), float(window[2]), float(window[3])
+    at = 0
+    for i in range(begin, end):
+        counts[i] = 0
+        if not splats.visible[i]:
+            continue
+        shape = splats.shapes[i]
+        mx, my, high, slope = shape[MX], shape[MY], shape[EXTENT_Y], shape[SLOPE]
+        inclined = slope / (shape[L22] * shape[L22])
+        variance = shape[INV_L11] * shape[INV_L11] + slope * inclined
+        wide = math.sqrt(shape[R2] * variance)
+        # pixel rows and columns whose centers it may touch
+        top = max(np.ceil(my - high - 0.5 - 1e-6), y0)
+        bottom = min(np.floor(my + high - 0.5 + 1e-6), y1 - 1.0)
+        first = max(np.ceil(mx - wide - 0.5 - 1e-6), x0)
+        last = min(np.floor(mx + wide - 0.5 + 1e-6), x1 - 1.0)
+        if not (top <= bottom and first <= last):
+            continue
+        left, right = int(first) // TILE_W, int(last) // TILE_W + 1
+        narrow, side = right == left + 1, inclined * wide / variance
+        before = at
+        for row in range(int(top) // TILE_H, int(bottom) // TILE_H + 1):
+            if not narrow:
+                edge = float(row * TILE_H)
+                upper, lower = max(top, edge), min(bottom, edge + (TILE_H - 1.0))
+                left, right = _tile_columns(shape, side, upper, lower, x0, x1)
+            base = (row - camera.grid[1]) * camera.grid[2] - camera.grid[0]
+            for column in range(left, right):
+                if at < tiles.size:
+                    tiles[at] = base + column
+                at += 1
+        counts[i] = at - before
+    return at
+
+
+def bin_splats(order: Array, tiles: Array, counts: Array, tile_count: int, with_slots: bool) -> TileLists:
+    """List the splats of each tile. On one thread: shared by two it takes as long.
+
+    Args:
+        order: rows of the splats, nearest first. [V] int32
+        tiles, counts: of all rows, see `find_tiles`. [I], [N]
+        tile_count: of the window
+        with_slots: whether `TileLists.slots` is needed
+    """
+    offsets = np.zeros(len(counts) + 1, np.int32)
+    np.cumsum(counts, out=offsets[1:])
+    starts = np.zeros(tile_count + 1, np.int64)
+    np.cumsum(np.bincount(tiles, minlength=tile_count), out=starts[1:])
+    members = np.empty(len(tiles), np.int32)
+    slots = np.empty(len(tiles) if with_slots else 0, np.int32)
+    _fill(order, tiles, offsets, starts[:-1].copy(), members, slots)
+    return TileLists(starts, members, slots, offsets)
+
+
+@kernel(cache=True)
+def _fill(order: Array, tiles: Array, offsets: Array, cursors: Array, members: Array, slots: Array) -> None:
+    """Put the splats into the lists of their tiles. cursors: where the next of each tile goes; used up."""
+    last = order.size - 1
+    for k in range(order.size):
+        prefetch(offsets, order[min(k + 2 * _AHEAD, last)])
+        prefetch(tiles, offsets[order[min(k + _AHEAD, last)]])
+        i = order[k]
+        for slot in range(offsets[i], offsets[i + 1]):
+            at = cursors[tiles[slot]]
+            cursors[tiles[slot]] = at + 1
+            members[at] = i
+            if slots.size > 0:
+                slots[at] = slot
+
+
+def depth_order(depths: NDArray[np.float32], visible: NDArray[np.bool_]) -> NDArray[Any]:
+    """The rows of visible Gaussians, nearest first, ties by row. depths: > 0. [N], [N] -> [V] int32"""
+    rows = np.flatnonzero(visible)
+    bits = depths[rows].view(np.uint32)  # positive floats sort as their bits
+    keys = (bits.astype(np.uint64) << np.uint64(32)) | rows.astype(np.uint64)
+    keys.sort()  # all different, so any sort is stable
+    return (keys & np.uint64(0xFFFF_FFFF)).astype(np.int32)
