@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 from imgui_bundle import imgui
 
-from viewer.camera import controls
 from viewer.ui.context import PALETTE, SMALL_PX, UiContext
+from viewer.ui.keys import TOPICS
 
 MOUSE_HELP = (
     ("Left drag", "orbit; with Alt also while a tool is on"),
@@ -28,17 +28,6 @@ MOUSE_HELP = (
 )
 
 _MAC = (("Cmd", "does what Ctrl does here; shortcuts take both"),)
-
-TOPICS = (
-    ("Layers", "focus:1"),
-    ("View", "fly"),
-    ("Edits", "blend"),
-    ("Brush", "brush"),
-    ("Select", "select_tool:box"),
-    ("Timeline", "play"),
-    ("Window and files", "help"),
-)
-"""Each with the action of its first key in `controls.KEYS`; it goes on to the next one's first."""
 
 _ROW, _BETWEEN = 1.24, 0.7  # in sizes of the small text: from row to row, and above a heading
 COLUMN_PX, _MARGIN_PX = 322.0, 14.0  # at 1×
@@ -60,12 +49,10 @@ class Topic:
 
 def topics() -> tuple[Topic, ...]:
     """Everything that can be done, each once."""
-    starts = [next(i for i, key in enumerate(controls.KEYS) if key.action == first) for _, first in TOPICS]
-    ends = [min((s for s in starts if s > start), default=len(controls.KEYS)) for start in starts]
-    keys = (_describe_keys(controls.KEYS[start:end]) for start, end in zip(starts, ends, strict=True))
-    named = zip((name for name, _ in TOPICS), keys, strict=True)
-    return Topic("Mouse", MOUSE_HELP + (_MAC if sys.platform == "darwin" else ())), *(
-        Topic(name, rows) for name, rows in named
+    mouse = Topic("Mouse", MOUSE_HELP + (_MAC if sys.platform == "darwin" else ()))
+    return mouse, *(
+        Topic(name, tuple((key.listed or key.chord, key.help) for key in keys if key.help))
+        for name, keys in TOPICS.items()
     )
 
 
@@ -134,26 +121,6 @@ def _pack(shown: Sequence[Topic], height: float) -> list[list[Topic]]:
             found.append([topic])
     return found
 
-
-def _describe_keys(keys: Sequence[controls.KeyBinding]) -> tuple[tuple[str, str], ...]:
-    """Chord and help of every key that has a help text, in the words of a person."""
-    return tuple((_NAMES.get(key.chord, key.chord), key.help) for key in keys if key.help)
-
-
-_NAMES = {
-    "1": "1–9",
-    "Right": "← →",
-    "Escape": "Esc",
-    "Num1": "Numpad 1 3 7",
-    "Alt+Down": "Alt+↑ ↓",
-    "]": "[ ]",
-    "R": "R L P U",
-    "J": "Shift+R J I",
-    "Ctrl+]": "Ctrl+[ ]",
-    ".": ", .",
-    "Ctrl+C": "Ctrl+C, V, R",
-    "Shift+.": "Shift+, .",
-}
 
 _OVER_ALL = (
     imgui.WindowFlags_.no_title_bar.value

@@ -11,7 +11,6 @@ import moderngl
 from progdf.io.picture_camera import camera_chunk
 from viewer.camera.view_camera import to_camera
 from viewer.files import exports
-from viewer.panel.snapshot_cards import SnapshotCard
 from viewer.pictures.compare_labels import draw_labels
 from viewer.pictures.compare_view import Comparer
 from viewer.pictures.thumbnails import Thumbnails
@@ -156,16 +155,13 @@ class Canvas:
         said = exports.picture(folder, title, pixels, chunk)
         return f"{said}; change it in any program, and drop it here" if to_change else said
 
-    def cards(
-        self, kept: tuple[SliderSnapshot, ...], view: ViewState
-    ) -> tuple[tuple[SnapshotCard, ...], bool]:
-        """The snapshots as the panel shows them, and whether the picture of one is still to be drawn."""
-        if not kept:
+    def thumbnails(
+        self, snapshots: tuple[SliderSnapshot, ...], view: ViewState
+    ) -> tuple[tuple[int, ...], bool]:
+        """GL names of the snapshots' pictures, the original's first, and whether one is still to be drawn."""
+        if not snapshots:
             return (), False
-        all_kept = with_original(kept, view)
-        textures, missing = self._thumbnails.update(all_kept, view)
-        cards = (SnapshotCard(s.name, texture) for s, texture in zip(all_kept, textures, strict=True))
-        return tuple(cards), missing
+        return self._thumbnails.update(with_original(snapshots, view), view)
 
     def release(self) -> None:
         """Give back all but the engine."""

@@ -14,7 +14,7 @@ from viewer.ui.overlay import Area
 
 REACH_PX = 8.0  # at 1×: so near to the divider the mouse grips it
 DIVIDER = "divider"
-"""The name of its drag, beside those of `controls.DRAGS`."""
+"""The name of its drag, beside those of `keys.DRAGS`."""
 
 
 def near(view: ViewState, area: Area, ui: UiContext) -> bool:

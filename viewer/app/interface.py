@@ -9,13 +9,10 @@ from pathlib import Path
 from imgui_bundle import imgui
 
 from viewer.panel import brush, panel, timeline_bar
-from viewer.panel.new_edit_form import FormInput
-from viewer.panel.snapshot_cards import SnapshotCard, SnapshotSlider
 from viewer.pictures.compare_labels import Labels
 from viewer.select import outline
-from viewer.state import history, snapshots, workspace
+from viewer.state import history, workspace
 from viewer.state.actions import GLIDES, perform
-from viewer.state.recordings import obstacle
 from viewer.state.workspace import Workspace
 from viewer.ui import axis_gizmo, overlay
 from viewer.ui.pointer import PointerContext
@@ -29,70 +26,19 @@ from .studio.up_strip import UpStrip
 def panels(
     work: Workspace,
     pointer: PointerContext,
-    cards: tuple[SnapshotCard, ...],
-    reveal: bool,
+    textures: Sequence[int],
     preview: tuple[str, bool],
-    recent: Sequence[Path] = (),
+    recent: Sequence[Path],
+    reveal: bool,
 ) -> Workspace:
-    """The panel and, where it is shown, the timeline.
-
-    Args:
-        cards: of the snapshots
-        reveal: scroll to the focused layer
-        preview: what is said of the picture of a new edit, and whether it failed
-        recent: files opened before, the last one first
-    """
-    facts, past = pointer.facts, work.past
-    shown = panel.PanelInput(
-        workspace.UNSAVED * workspace.has_unsaved(work) + facts.title,
-        facts.count,
-        facts.rows,
-        work.focus,
-        history.next_undo(past),
-        history.next_redo(past),
-        reveal,
-        work.active_slider,
-        work.renaming,
-        cards,
-        obstacle(facts.recordings),
-        work.form if work.form_open else None,
-        _form_input(work, facts.count, preview),
-        work.jobs,
-        work.deliveries,
-        recent,
-        work.selected,
-        work.search,
-        work.searching,
-        _snapshot_slider(work, pointer) if cards else SnapshotSlider(),
-        work.cards_fit,
-    )
-    result = panel.draw(work.view, shown, pointer.ui)
-    work = replace(work, view=result.state, focus=result.focus, renaming=result.renaming)
-    form = result.form or work.form
-    work = replace(work, overlap=result.overlap, pointed=result.pointed, form=form)
-    work = replace(
-        work, search=result.search, searching=False, cards_fit=result.cards_fit, form_opening=False
-    )
-    work = perform_actions(work, result.actions, pointer)
+    """The panel and, where it is shown, the timeline. Arguments as of `panel.draw`."""
+    actions: list[str] = []
+    work = panel.draw(work, pointer.facts, textures, preview, recent, reveal, pointer.ui, actions)
+    work = perform_actions(work, actions, pointer)
     if work.player.shown:
         asked = timeline_bar.draw(work.view.timeline, work.player, pointer.area, pointer.ui)
         work = perform_actions(work, asked, pointer)
     return work
-
-
-def _snapshot_slider(work: Workspace, pointer: PointerContext) -> SnapshotSlider:
-    """Which two snapshots there is a slider between, and where it stands."""
-    view, kept = work.view, snapshots.with_original(work.snapshots, work.view)
-    current = snapshots.is_blend(view, kept, lambda gdf: pointer.facts.rows[gdf].count)
-    compared = snapshots.compare_sides(work.snapshots, view) is not None
-    return SnapshotSlider(*snapshots.pair_of(kept, view.pair), view.pair.share, current, compared)
-
-
-def _form_input(work: Workspace, count: int, preview: tuple[str, bool]) -> FormInput:
-    """What the form of a new edit offers."""
-    selection = work.view.selection
-    regions = tuple((region.name, region.count) for region in selection.regions)
-    return FormInput(count, selection.count, regions, *preview, work.form_opening)
 
 
 def over_picture(

@@ -16,8 +16,6 @@ import moderngl
 from imgui_bundle import imgui
 
 from progdf.errors import ProgdfError
-from viewer.camera import inputs
-from viewer.camera.inputs import NO_KEYS, Keys, Taps
 from viewer.files import exports as saved_files
 from viewer.gl.present import read_rgb
 from viewer.panel import new_edit_form, panel
@@ -32,6 +30,19 @@ from viewer.state.workspace import Dialog, SceneFacts
 from viewer.ui import overlay
 from viewer.ui.context import UiContext
 from viewer.ui.frame_pacer import FramePacer
+from viewer.ui.keys import (
+    NO_KEYS,
+    Keys,
+    Taps,
+    cancels_drag,
+    fly_by_keys,
+    has_pending_input,
+    holds_original,
+    is_flying,
+    is_repeating,
+    requested_actions,
+    tapped_actions,
+)
 from viewer.ui.pointer import PointerContext
 
 from . import interface, mouse
@@ -134,9 +145,9 @@ class MainView:
     def next_frame_delay(self) -> float | None:
         """Seconds the window may wait for an event before the next `frame`; None: for ever."""
         self.ui.make_current()
-        if not self._resting and (inputs.has_pending_input() or self.opening):
+        if not self._resting and (has_pending_input() or self.opening):
             return 0.0
-        waits = [FLIGHT_S] if inputs.is_flying(self._keys) or self._taps.since else []
+        waits = [FLIGHT_S] if is_flying(self._keys) or self._taps.since else []
         if self.work.glide is not None:
             waits.append(0.0)
         if self.work.message is not None:
@@ -225,7 +236,7 @@ class MainView:
         before = self.work
         self._keys = self._pending.take(keys)
         self._handle_input(seconds)
-        if not imgui.is_any_item_active() and self._tool.drag is None and not inputs.is_repeating(keys):
+        if not imgui.is_any_item_active() and self._tool.drag is None and not is_repeating(keys):
             self.work = workspace.record_undo(self.work)
         if self.work.view.layers != before.view.layers:
             self.work = replace(self.work, before=False)
@@ -259,7 +270,7 @@ class MainView:
         return overlay.Area(max(display.x - wide, 1.0), max(display.y, 1.0))
 
     def _handle_input(self, seconds: float) -> None:
-        off = inputs.cancels_drag(self._keys, self._tool.drag)
+        off = cancels_drag(self._keys, self._tool.drag)
         if off:
             self._cancel_drag()
         view, asks = self.work.view, self._takes_keys()
@@ -273,12 +284,12 @@ class MainView:
             self._keys = replace(self._keys, pressed=())
             self.request("keep_up")
         flies = view.camera.mode == "fly"
-        self._taps, tapped = inputs.tapped_actions(self._taps, self._keys, self._clock, flies)
+        self._taps, tapped = tapped_actions(self._taps, self._keys, self._clock, flies)
         if asks:  # no key is a shortcut or flies
             self._taps, tapped = Taps(), []
             self._keys = Keys(self._keys.pressed)
         self._keys = self._taps.without(self._keys)
-        for action in (*inputs.requested_actions(self._keys), *tapped):
+        for action in (*requested_actions(self._keys), *tapped):
             if self.at_start and action not in start_page.KEYS:
                 continue
             if not asks or action == "window_picture":  # which shows what is open, and changes nothing
@@ -287,18 +298,18 @@ class MainView:
             for action in start_page.draw(self.recent_files, self.ui):
                 self._perform(action)
             return
-        if inputs.is_flying(self._keys):
-            flown = inputs.fly(self.work.view.camera, self._keys, seconds, self.facts.bounds.radius)
+        if is_flying(self._keys):
+            flown = fly_by_keys(self.work.view.camera, self._keys, seconds, self.facts.bounds.radius)
             self.work = workspace.with_camera(self.work, flown)
         if self.work.view.panel:
             several = len(layer_selection.selected_layers(self.work)) > 1
             reveal = self._revealed != (self.work.focus, several)
             with self._guarded():
-                cards, missing = self.canvas.cards(self.work.snapshots, self.work.view)
+                textures, missing = self.canvas.thumbnails(self.work.snapshots, self.work.view)
                 if missing:
                     self.wake()
                 self.work = interface.panels(
-                    self.work, self._pointer(), cards, reveal, self.preview_said, self.recent
+                    self.work, self._pointer(), textures, self.preview_said, self.recent, reveal
                 )
             self._revealed = self.work.focus, several
         if not off:  # else the right button has said all it was pressed for
@@ -341,14 +352,14 @@ class MainView:
 
     @property
     def _shows_original(self) -> bool:
-        return self.work.before or inputs.holds_original(self._keys)
+        return self.work.before or holds_original(self._keys)
 
     def _is_held(self) -> bool:
         """Whether the user holds something that moves the picture, or a film plays."""
         if self._tool.drag is not None or imgui.is_any_item_active() or imgui.get_io().mouse_wheel:
             return True
         moves = self.work.player.playing or self.work.glide is not None
-        return moves or inputs.is_flying(self._keys) or inputs.is_repeating(self._keys)
+        return moves or is_flying(self._keys) or is_repeating(self._keys)
 
     def _draw_overlays(self) -> None:
         """What is drawn over the picture; where some of it goes away, another frame follows."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 from imgui_bundle import imgui
 
-from viewer.camera import controls, inputs
+from viewer.camera import controls
 from viewer.camera.named_views import AXES, look_at_view
 from viewer.camera.view_camera import ViewCamera
 from viewer.panel import brush
@@ -20,6 +20,7 @@ from viewer.state.view_state import Brush, SelectTool, ViewState
 from viewer.state.workspace import Workspace
 from viewer.ui import axis_gizmo
 from viewer.ui.context import UiContext
+from viewer.ui.keys import any_button_down, modifier, started_drag
 from viewer.ui.pointer import PointerContext
 
 from . import compare_overlay
@@ -32,7 +33,7 @@ class MouseTool:
     """What the mouse holds.
 
     Args:
-        drag: one of `controls.DRAGS`, `compare_overlay.DIVIDER`, `brush.DRAG`, `hand.DRAG` or
+        drag: one of `keys.DRAGS`, `compare_overlay.DIVIDER`, `brush.DRAG`, `hand.DRAG` or
             `axis_gizmo.DRAG`; None while it holds nothing
         stroke: of the brush, from its first drag on
         gesture: of the tool that selects; of a polygon also between its clicks
@@ -64,7 +65,7 @@ def handle_mouse(tool: MouseTool, work: Workspace, pointer: PointerContext) -> t
         tool = replace(tool, gesture=gesture)
     if tool.drag == axis_gizmo.DRAG and imgui.is_mouse_released(0) and not _has_traveled(pointer.ui):
         work = _look_along(work, tool.axis)
-    if not inputs.any_button_down():
+    if not any_button_down():
         tool = replace(tool, drag=None, settings=(work.view.select, work.view.brush))
     if io.want_capture_mouse:
         return tool, work
@@ -86,7 +87,7 @@ def handle_mouse(tool: MouseTool, work: Workspace, pointer: PointerContext) -> t
     camera = work.view.camera
     if imgui.is_mouse_double_clicked(0):
         return tool, workspace.with_camera(work, _pick_pivot(camera, pointer))
-    tool = replace(tool, drag=inputs.started_drag(camera.mode) or tool.drag)
+    tool = replace(tool, drag=started_drag(camera.mode) or tool.drag)
     if io.mouse_wheel:
         work = workspace.with_camera(work, controls.zoom(camera, io.mouse_wheel, pointer.facts.bounds.radius))
     return tool, work
@@ -143,7 +144,7 @@ def _begin_stroke(tool: MouseTool, work: Workspace, pointer: PointerContext) -> 
     if reason or work.focus is None:
         return tool, workspace.with_message(work, f"Cannot paint: {reason}", pointer.now, error=True)
     layer, held = work.view.layers[work.focus], work.view.brush
-    mode = paint.mode_while(held.mode, inputs.modifier())
+    mode = paint.mode_while(held.mode, modifier())
     gdf = pointer.engine.gdfs[layer.gdf]
     stroke = paint.begin_stroke(layer.paint, gdf, pointer.surface, held.through, mode)
     return _paint(MouseTool(brush.DRAG, stroke), work, pointer)

@@ -7,8 +7,7 @@ from dataclasses import replace
 
 from imgui_bundle import imgui
 
-from viewer.camera import inputs
-from viewer.camera.inputs import Keys, Press
+from viewer.ui.keys import Keys, Press, has_reached_imgui, opens_text
 
 OPENING_FRAMES = 4
 """From the wish for a text field until imgui gives it the keyboard."""
@@ -30,8 +29,8 @@ class PendingKeys:
     def take(self, keys: Keys) -> Keys:
         """The keys of one frame that imgui has come to; call once a frame."""
         pressed = (*self._waiting, *keys.pressed)
-        count = 0 if self.opening else sum(1 for _ in itertools.takewhile(inputs.has_reached_imgui, pressed))
-        opener = next((i for i, press in enumerate(pressed[:count]) if inputs.opens_text(press)), None)
+        count = 0 if self.opening else sum(1 for _ in itertools.takewhile(has_reached_imgui, pressed))
+        opener = next((i for i, press in enumerate(pressed[:count]) if opens_text(press)), None)
         self._frames += 1
         if opener is not None:
             count, self._asked_at = opener + 1, self._frames

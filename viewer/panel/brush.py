@@ -11,20 +11,21 @@ from viewer.render import highlight
 from viewer.state import layers as stack
 from viewer.state.view_state import BRUSH_MODES, LARGEST_PX, SMALLEST_PX, Brush, ViewState
 from viewer.ui.context import PALETTE, SMALL_PX, Icon, UiContext, u32
+from viewer.ui.keys import shortcut
 from viewer.ui.widgets import choice, icon_button, label, tip, value_slider
 from viewer.ui.widgets import section as heading
 
 DRAG = "brush"
-"""What a left drag does while the brush is active, beside those of `controls.DRAGS`."""
+"""What a left drag does while the brush is active, beside those of `keys.DRAGS`."""
 
 NAMES = {"add": "Add", "erase": "Erase", "smooth": "Smooth"}
 WHOLE = (
-    ("Clear", "paint_clear", "Set all weights to 0 (Backspace)"),
-    ("Fill", "paint_fill", "Set all weights to 1 (Shift+Backspace)"),
-    ("Invert", "paint_invert", "Swap what is painted and what is not (Ctrl+I)"),
-    ("Feather", "paint_feather", "Soften the edges of the paint; repeat for more (Shift+X)"),
+    ("Clear", "paint_clear", "Set all weights to 0"),
+    ("Fill", "paint_fill", "Set all weights to 1"),
+    ("Invert", "paint_invert", f"Swap what is painted and what is not ({shortcut('invert')})"),
+    ("Feather", "paint_feather", "Soften the edges of the paint; repeat for more"),
 )
-"""Buttons for all of a layer's paint: name, action of `controls.KEYS`, tip."""
+"""Buttons for all of a layer's paint: name, action of `keys.KEYS`, tip."""
 
 
 def obstacle(view: ViewState, focus: int | None) -> str:
@@ -39,22 +40,22 @@ def obstacle(view: ViewState, focus: int | None) -> str:
     return ""
 
 
-def section(view: ViewState, focus: int | None, ui: UiContext) -> tuple[ViewState, str]:
-    """The brush's controls; the changed state and an action of `controls.KEYS` asked for, or ""."""
-    column, brush, action = 82.0 * ui.scale, view.brush, ""
+def section(view: ViewState, focus: int | None, ui: UiContext, actions: list[str]) -> ViewState:
+    """The brush's controls."""
+    column, brush = 82.0 * ui.scale, view.brush
     imgui.dummy(imgui.ImVec2(0.0, 4.0 * ui.scale))
     heading("Paint", ui)
     label("Brush", column)
     mode = choice("brush mode", tuple(NAMES[m] for m in BRUSH_MODES), BRUSH_MODES.index(brush.mode), ui)
-    tip("Brush mode (X). While painting, Ctrl inverts and Shift smooths")
+    tip(f"Brush mode ({shortcut('brush_mode')}). While painting, Ctrl inverts and Shift smooths")
     if mode is not None:
         brush = replace(brush, mode=BRUSH_MODES[mode])
     label("Radius", column)
     radius = value_slider("##radius", brush.radius, (SMALLEST_PX, LARGEST_PX), "%.0f px", Brush.radius, ui)
-    tip("Brush radius ([ and ])")
+    tip(f"Brush radius ({shortcut('brush_radius:0.8')} and {shortcut('brush_radius:1.25')})")
     label("Softness", column)
     softness = value_slider("##softness", brush.softness, (0.0, 1.0), "%.2f", Brush.softness, ui)
-    tip("Brush softness (Shift+[ and ])")
+    tip(f"Brush softness ({shortcut('brush_softness:-0.1')} and ])")
     label("Flow", column)
     flow = value_slider("##flow", brush.flow, (0.0, 1.0), "%.2f", Brush.flow, ui)
     tip("How far one stroke goes; strokes over each other go further")
@@ -66,13 +67,14 @@ def section(view: ViewState, focus: int | None, ui: UiContext) -> tuple[ViewStat
     brush = replace(brush, radius=radius, softness=softness, flow=flow, value=value)
     label("Depth", column)
     depth = choice("depth", ("Front", "Through"), int(brush.through), ui)
-    tip("Paint only the front surface, or everything under the brush (Shift+B)")
+    tip("Paint only the front surface, or everything under the brush", "brush_through")
     if depth is not None:
         brush = replace(brush, through=bool(depth))
     label("Weights", column)
     colors = choice("weights", ("Tint", "Colors"), int(brush.weights), ui)
     tip(
-        "Tint lightly what has less than all of the edit, or show all weights from blue (0) to yellow (1) (C)"
+        "Tint lightly what has less than all of the edit, or show all weights from blue (0) to yellow (1)",
+        "brush_weights",
     )
     if colors is not None:
         brush = replace(brush, weights=bool(colors))
@@ -85,15 +87,15 @@ def section(view: ViewState, focus: int | None, ui: UiContext) -> tuple[ViewStat
     imgui.push_style_var(
         imgui.StyleVar_.frame_padding.value, imgui.ImVec2(0.0, imgui.get_style().frame_padding.y)
     )
-    for wide, (text, asks, keys) in zip(texts, WHOLE, strict=True):
-        if imgui.button(f"{text}##{asks}", imgui.ImVec2(wide + spare / len(WHOLE), 0.0)):
-            action = asks
-        tip(keys)
+    for wide, (text, action, help_) in zip(texts, WHOLE, strict=True):
+        if imgui.button(f"{text}##{action}", imgui.ImVec2(wide + spare / len(WHOLE), 0.0)):
+            actions.append(action)
+        tip(help_, action)
         imgui.same_line(0.0, 4.0 * ui.scale)
     imgui.pop_style_var()
     imgui.end_disabled()
     imgui.new_line()
-    return replace(view, brush=brush), action
+    return replace(view, brush=brush)
 
 
 def _legend(column: float, ui: UiContext) -> None:
@@ -118,7 +120,7 @@ def _legend(column: float, ui: UiContext) -> None:
 def toggle(view: ViewState, ui: UiContext) -> bool:
     """The button that takes the brush up and puts it down; True when pressed."""
     pressed = icon_button("brush", Icon.BRUSH, ui, dim=not view.brush.active)
-    tip("Paint the strength of the selected layer (B)")
+    tip("Paint the strength of the selected layer", "brush")
     return pressed
 
 

@@ -11,10 +11,11 @@ from viewer.panel.layer_card import COMPACT_PX, SLIDER_PX, SLIM_PX
 from viewer.state import layers as stack
 from viewer.state.view_state import LayerGroup, ViewState
 from viewer.ui.context import PALETTE, Icon, UiContext, u32
+from viewer.ui.keys import shortcut
 from viewer.ui.widgets import elide, grip, icon_button, menu, right_edge, tip, typed_name
 
 _MENU = "menu of a group"
-_ITEMS = (("Rename…", ""), ("Select layers", ""), ("Ungroup", "Ctrl+Shift+G"))
+_ITEMS = (("Rename…", ""), ("Select layers", ""), ("Ungroup", "ungroup"))
 
 
 def draw(
@@ -109,7 +110,9 @@ def _name(
     imgui.get_window_draw_list().add_text(corner, u32(color), elide(group.name, room))
     imgui.pop_font()
     with menu(_MENU, ui) as is_open:
-        chosen = [name for name, keys in _ITEMS if is_open and imgui.menu_item(name, keys, False)[0]]
+        chosen = [
+            name for name, action in _ITEMS if is_open and imgui.menu_item(name, shortcut(action), False)[0]
+        ]
     if chosen == ["Rename…"]:
         storage.set_bool(naming, True)
     elif chosen:

@@ -7,45 +7,47 @@ from collections.abc import Sequence
 from imgui_bundle import imgui
 
 from viewer.panel import strength_slider
-from viewer.panel.layer_card import Cards
 from viewer.state import layers as stack
 from viewer.state.layer_selection import master_strength
 from viewer.state.view_state import ViewState
+from viewer.state.workspace import Workspace, is_compact
 from viewer.ui.context import PALETTE, SMALL_PX, Icon, UiContext, u32
+from viewer.ui.keys import shortcut
 from viewer.ui.widgets import icon_button, right_edge, section, tip
 
 MASTER_PX = 20.0  # of its slider, at 1×
 UNSEARCHED = 6
 """Layers that one finds without a search."""
 _BUTTONS = (
-    ("Group", "group", "Put them into a group with a switch and a strength of its own (Ctrl+G)"),
-    ("Copy", "copy_values", "Copy their strengths and gains, as text (Ctrl+C)"),
-    ("Paste", "paste_values", "Paste copied strengths and gains (Ctrl+V)"),
-    ("Reset", "reset", "Strengths to 0, gains to 1 (Ctrl+R)"),
+    ("Group", "group", "Put them into a group with a switch and a strength of its own"),
+    ("Copy", "copy_values", "Copy their strengths and gains, as text"),
+    ("Paste", "paste_values", "Paste copied strengths and gains"),
+    ("Reset", "reset", "Strengths to 0, gains to 1"),
 )
 
 
-def search(state: ViewState, cards: Cards, ui: UiContext, actions: list[str]) -> str:
+def search(work: Workspace, ui: UiContext, actions: list[str]) -> str:
     """The field of the search and the switch of compact rows, where there are many layers; what is typed."""
-    if not (len(state.layers) > UNSEARCHED or cards.searching or cards.search):
-        return cards.search
+    if not (len(work.view.layers) > UNSEARCHED or work.searching or work.search):
+        return work.search
+    compact = is_compact(work)
     side, gap = imgui.get_frame_height(), 4.0 * ui.scale
-    buttons = 1 + bool(cards.search)
+    buttons = 1 + bool(work.search)
     imgui.set_next_item_width(imgui.get_content_region_avail().x - buttons * (side + gap))
-    if cards.searching:
+    if work.searching:
         imgui.set_keyboard_focus_here()
     flags = imgui.InputTextFlags_.escape_clears_all.value | imgui.InputTextFlags_.auto_select_all.value
-    _, text = imgui.input_text_with_hint("##search", "Search by name, region, group", cards.search, flags)
-    tip("Only layers with all these words (Ctrl+F). Esc: show all")
-    if cards.search:
+    _, text = imgui.input_text_with_hint("##search", "Search by name, region, group", work.search, flags)
+    tip(f"Only layers with all these words ({shortcut('search')}). Esc: show all")
+    if work.search:
         imgui.same_line(0.0, gap)
         if icon_button("clear", Icon.CLOSE, ui):
             text = ""
         tip("Show all layers")
     imgui.same_line(0.0, gap)
-    if icon_button("cards", Icon.FULL if cards.compact else Icon.COMPACT, ui, dim=False):
+    if icon_button("cards", Icon.FULL if compact else Icon.COMPACT, ui, dim=False):
         actions.append("cards")
-    tip("Whole cards (Alt+G)" if cards.compact else "Compact rows (Alt+G)")
+    tip("Whole cards" if compact else "Compact rows", "cards")
     return str(text)
 
 
@@ -74,7 +76,7 @@ def selection(state: ViewState, chosen: Sequence[int], ui: UiContext, actions: l
             imgui.same_line(0.0, gap)
         if imgui.button(f"{name}##layers", imgui.ImVec2(wide[i], 0.0)):
             actions.append(action)
-        tip(help_)
+        tip(help_, action)
     imgui.pop_font()
     imgui.pop_style_var()
     value, most = master_strength(state, chosen), stack.largest_strength(state)

@@ -13,12 +13,14 @@ from imgui_bundle import imgui
 
 from progdf.compose.reference import BLENDS
 from viewer.panel import group_row, layer_bar
-from viewer.panel.layer_card import Cards, draw_card
+from viewer.panel.layer_card import draw_card
 from viewer.state import layers as stack
-from viewer.state.layer_selection import filter_layers
+from viewer.state.layer_facts import LayerRow
+from viewer.state.layer_selection import filter_layers, selected_layers
 from viewer.state.view_state import OVERSHOOT, LayerGroup, ViewState
-from viewer.state.workspace import Pointed
+from viewer.state.workspace import Workspace, is_compact
 from viewer.ui.context import PALETTE, UiContext, u32
+from viewer.ui.keys import shortcut
 from viewer.ui.widgets import (
     drop_down,
     right_edge,
@@ -39,73 +41,47 @@ BLEND_HELP = {
 
 @dataclass(frozen=True)
 class _Row:
-    """A card in the list, or the row over a group.
+    """A card in the list, or the row over a group."""
 
-    Args:
-        top, bottom: window pixels
-        layers: places of what is dragged with it, in `ViewState.layers`
-        group: its own, or that of its layer
-        heads: it is the row over a group
-    """
-
-    top: float
+    top: float  # window pixels
     bottom: float
-    layers: tuple[int, ...]
-    group: str
-    heads: bool = False
+    layers: tuple[int, ...]  # places of what is dragged with it, in `ViewState.layers`
+    group: str  # its own, or that of its layer
+    heads: bool = False  # it is the row over a group
 
 
-@dataclass(frozen=True)
-class CardsResult:
-    """What became of the state: the focused layer, the one being renamed, those asked about.
-
-    `actions`: those of the cards' menus, as in `actions.perform`; `search`: the words that are looked for.
-    """
-
-    state: ViewState
-    focus: int | None
-    renaming: int | None = None
-    overlap: int | None = None
-    pointed: Pointed | None = None
-    actions: tuple[str, ...] = ()
-    search: str = ""
-
-
-def heading(state: ViewState, form_open: bool, ui: UiContext) -> tuple[ViewState, str]:
-    """The heading of the stack: a new edit, overshoot, and the blend rule where there is something to blend.
-
-    The action that was asked for comes with the state, "" for none.
-    """
+def heading(state: ViewState, form_open: bool, ui: UiContext, actions: list[str]) -> ViewState:
+    """The heading of the stack: a new edit, overshoot, and the blend rule where layers can overlap."""
     right = right_edge()
     section("Edits", ui)
     imgui.same_line(0.0, 8.0 * ui.scale)
-    action = _new_button(form_open)
+    _new_button(form_open, actions)
     if not state.layers:
-        return state, action
+        return state
     combo = 118.0 * ui.scale if len(state.layers) > 1 else 0.0
     wide = 40.0 * ui.scale
     imgui.same_line(right - combo - wide - (6.0 * ui.scale if combo else 0.0))
     state = _overshoot(state, wide)
     if not combo:
-        return state, action
+        return state
     imgui.same_line(right - combo)
     imgui.set_next_item_width(combo)
     titles, now = [blend.capitalize() for blend in BLENDS], BLENDS.index(state.blend)
-    help_ = "Where edits overlap (M): " + BLEND_HELP[state.blend]
+    help_ = f"Where edits overlap ({shortcut('blend')}): " + BLEND_HELP[state.blend]
     pressed = drop_down(
         "##blend", titles[now], titles, now, ui, help_, [BLEND_HELP[blend] for blend in BLENDS]
     )
-    return state if pressed is None else replace(state, blend=BLENDS[pressed]), action
+    return state if pressed is None else replace(state, blend=BLENDS[pressed])
 
 
-def _new_button(form_open: bool) -> str:
+def _new_button(form_open: bool, actions: list[str]) -> None:
     imgui.push_style_color(
         imgui.Col_.button, imgui.ImVec4(*(PALETTE.accent_dark if form_open else PALETTE.field))
     )
-    pressed = imgui.button("+ New##edit")
+    if imgui.button("+ New##edit"):
+        actions.append("new_edit")
     imgui.pop_style_color()
-    tip("New edit (Ctrl+N): choose a region and an editor, see it, train it")
-    return "new_edit" if pressed else ""
+    tip(f"New edit ({shortcut('new_edit')}): choose a region and an editor, see it, train it")
 
 
 def _overshoot(state: ViewState, width: float) -> ViewState:
@@ -120,61 +96,72 @@ def _overshoot(state: ViewState, width: float) -> ViewState:
         state = stack.with_overshoot(state, not on)
     imgui.pop_style_var()
     imgui.pop_style_color(2)
-    tip(f"Overshoot to {OVERSHOOT:g} (O): extrapolates past the trained range")
+    tip(f"Overshoot to {OVERSHOOT:g} ({shortcut('overshoot')}): extrapolates past the trained range")
     return state
 
 
-def draw(state: ViewState, cards: Cards, ui: UiContext, expected: bool = False) -> CardsResult:
-    """All cards, under the rows of their groups. `expected`: layers are about to come."""
-    if not state.layers and not expected:
+def draw(
+    work: Workspace, rows: Sequence[LayerRow], reveal: bool, ui: UiContext, actions: list[str]
+) -> Workspace:
+    """All cards, under the rows of their groups.
+
+    Args:
+        rows: one per .gdf, indexed by `LayerState.gdf`
+        reveal: scroll to the focused layer, and to what is cut of the selected ones
+    """
+    if not (work.view.layers or work.jobs or work.deliveries or work.form_open):
         imgui.push_text_wrap_pos(0.0)
-        imgui.text_disabled("No edits yet. Make one (Ctrl+N), or drop a .gdf file on the window.")
+        imgui.text_disabled(
+            f"No edits yet. Make one ({shortcut('new_edit')}), or drop a .gdf file on the window."
+        )
         imgui.pop_text_wrap_pos()
-    focus, renaming, overlap = cards.focus, None, None
-    pointed: Pointed | None = None
-    actions: list[str] = []
-    search = layer_bar.search(state, cards, ui, actions) if state.layers else ""
-    texts = [f"{row.region} {row.instruction}" for row in cards.rows]
-    found = filter_layers(state, texts, search)[::-1]  # as seen: the top layer, which is the last one, first
-    dragged, gesture = -1, ""  # one of the rows, and what the hand does with it
-    rows: list[_Row] = []
-    visible = {layer.name for layer in stack.visible_layers(state)}
-    group = ""
-    for i in found:
-        layer = state.layers[i]
+    work = replace(
+        work,
+        overlap=None,
+        pointed=None,
+        search=layer_bar.search(work, ui, actions) if work.view.layers else "",
+        searching=False,
+    )
+    texts = [f"{row.region} {row.instruction}" for row in rows]
+    # as seen: the top layer, which is the last one, first
+    listed = filter_layers(work.view, texts, work.search)[::-1]
+    focus, group = work.focus, ""
+    dragged, gesture = -1, ""  # one of the lines, and what the hand does with it
+    lines: list[_Row] = []
+    visible = {layer.name for layer in stack.visible_layers(work.view)}
+    for i in listed:
+        layer = work.view.layers[i]
         if layer.group and layer.group != group:
             top = imgui.get_cursor_screen_pos().y
-            state, drag = _group(state, layer.group, ui, actions)
-            dragged, gesture = (len(rows), drag) if drag in _DRAGS else (dragged, gesture)
-            layers = tuple(at for at, other in enumerate(state.layers) if other.group == layer.group)
-            rows.append(_Row(top, imgui.get_item_rect_max().y, layers, layer.group, heads=True))
-            _tighten(cards, ui)
+            view, drag = _group(work.view, layer.group, ui, actions)
+            work = replace(work, view=view)
+            dragged, gesture = (len(lines), drag) if drag in _DRAGS else (dragged, gesture)
+            layers = tuple(at for at, other in enumerate(view.layers) if other.group == layer.group)
+            lines.append(_Row(top, imgui.get_item_rect_max().y, layers, layer.group, heads=True))
+            _tighten(work, ui)
         group = layer.group
-        if group in state.collapsed and not search:
+        if group in work.view.collapsed and not work.search:
             continue
-        inset = INSET_PX * ui.scale * bool(group)
         top, left = imgui.get_cursor_screen_pos().y, imgui.get_cursor_pos_x()
-        imgui.set_cursor_pos_x(left + inset)
-        card = draw_card(state, i, layer.name in visible, cards, ui)
-        state = card.state
-        dragged, gesture = (len(rows), card.drag) if card.drag in _DRAGS else (dragged, gesture)
-        rows.append(_Row(top, imgui.get_item_rect_max().y, (i,), group))
-        _tighten(cards, ui)
-        cut = layer.gdf in cards.selected and imgui.is_item_visible()
-        if cards.reveal and (cards.focus == i or cut):
+        imgui.set_cursor_pos_x(left + INSET_PX * ui.scale * bool(group))
+        work, touch = draw_card(work, i, layer.name in visible, rows, ui, actions)
+        dragged, gesture = (len(lines), touch.drag) if touch.drag in _DRAGS else (dragged, gesture)
+        lines.append(_Row(top, imgui.get_item_rect_max().y, (i,), group))
+        _tighten(work, ui)
+        cut = layer.gdf in work.selected and imgui.is_item_visible()
+        if reveal and (work.focus == i or cut):
             imgui.internal.scroll_to_item(imgui.internal.ScrollFlags_.keep_visible_edge_y.value)
-        focus = i if card.touched and card.press in ("", "one", "keep") else focus
-        if card.press and (cards.selected or card.press in ("toggle", "range")):
-            actions.append(f"press_layer:{card.press}:{i}:{','.join(str(i) for i in found)}")
-        renaming = i if card.renaming else renaming
-        overlap = i if card.overlap else overlap
-        pointed = ("layer", i) if card.pointed else pointed
-        actions += [card.action] if card.action else []
-    if state.layers and not found:
+        focus = i if touch.touched and touch.press in ("", "one", "keep") else focus
+        if touch.press and (work.selected or touch.press in ("toggle", "range")):
+            actions.append(f"press_layer:{touch.press}:{i}:{','.join(str(i) for i in listed)}")
+    if work.view.layers and not listed:
         small("No layer has these words", PALETTE.dim)
+    if work.renaming is not None and not any(l.layers == (work.renaming,) and not l.heads for l in lines):
+        work = replace(work, renaming=None)
     if gesture:
-        state, focus = _drag(state, focus, cards, rows, dragged, gesture, ui)
-    return CardsResult(state, focus, renaming, overlap, pointed, tuple(actions), search)
+        view, focus = _drag(work, focus, lines, dragged, gesture, ui)
+        work = replace(work, view=view)
+    return replace(work, focus=focus)
 
 
 def _group(state: ViewState, name: str, ui: UiContext, actions: list[str]) -> tuple[ViewState, str]:
@@ -185,24 +172,17 @@ def _group(state: ViewState, name: str, ui: UiContext, actions: list[str]) -> tu
     return group_row.draw(state, group, sum(layer.group == name for layer in state.layers), ui, actions)
 
 
-def _tighten(cards: Cards, ui: UiContext) -> None:
+def _tighten(work: Workspace, ui: UiContext) -> None:
     """Compact rows lie closer together."""
-    if cards.compact:
+    if is_compact(work):
         imgui.set_cursor_pos_y(imgui.get_cursor_pos_y() - 3.0 * ui.scale)
 
 
 def _drag(
-    state: ViewState,
-    focus: int | None,
-    cards: Cards,
-    rows: Sequence[_Row],
-    dragged: int,
-    gesture: str,
-    ui: UiContext,
+    work: Workspace, focus: int | None, rows: Sequence[_Row], dragged: int, gesture: str, ui: UiContext
 ) -> tuple[ViewState, int | None]:
     """The state and the focused layer after a drag of a row: all selected layers go with one of them."""
-    layers = rows[dragged].layers
-    chosen = tuple(i for i, l in enumerate(state.layers) if i == cards.focus or l.gdf in cards.selected)
+    state, layers, chosen = work.view, rows[dragged].layers, selected_layers(work)
     if not rows[dragged].heads and layers[0] in chosen:
         layers = chosen
     y, place, group = _nearest_gap(state, rows, layers, rows[dragged].heads, imgui.get_mouse_pos().y)

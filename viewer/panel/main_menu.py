@@ -9,52 +9,53 @@ from imgui_bundle import imgui
 
 from progdf.terminal import escape_text
 from viewer.state.view_state import ViewState
+from viewer.state.workspace import Workspace, is_compact
 from viewer.ui.context import Icon, UiContext
+from viewer.ui.keys import shortcut
 from viewer.ui.widgets import elide, icon_button, menu, tip
 
 NAME = "main menu"
 MOST_PX = 360.0
-_FILES = (("Open…", "Ctrl+O", "open"),)
-_SAVES = (("Save", "Ctrl+S", "save"), ("Save as…", "Ctrl+Shift+S", "save_as"))
+_FILES = (("Open…", "open"),)
+_SAVES = (("Save", "save"), ("Save as…", "save_as"))
 _MAKES = (
-    ("New edit", "Ctrl+N", "new_edit"),
-    ("Take this view", "Ctrl+F2", "take_view"),
-    ("Hide strays", "", "hide_strays"),
-    ("Export .ply…", "Ctrl+E", "export"),
-    ("Render picture…", "Ctrl+P", "render_picture"),
-    ("Render film…", "Ctrl+Shift+P", "render_film"),
+    ("New edit", "new_edit"),
+    ("Take this view", "take_view"),
+    ("Hide strays", "hide_strays"),
+    ("Export .ply…", "export"),
+    ("Render picture…", "render_picture"),
+    ("Render film…", "render_film"),
 )
 _VIEWS = (
-    ("Front", "Numpad 1", "look:front"),
-    ("Back", "Ctrl+Numpad 1", "look:back"),
-    ("Right", "Numpad 3", "look:right"),
-    ("Left", "Ctrl+Numpad 3", "look:left"),
-    ("Top", "Numpad 7", "look:top"),
-    ("Bottom", "Ctrl+Numpad 7", "look:bottom"),
+    ("Front", "look:front"),
+    ("Back", "look:back"),
+    ("Right", "look:right"),
+    ("Left", "look:left"),
+    ("Top", "look:top"),
+    ("Bottom", "look:bottom"),
 )
 _LAYERS = (
-    ("Select all", "Ctrl+Alt+A", "select_layers"),
-    ("Search", "Ctrl+F", "search"),
-    ("Group", "Ctrl+G", "group"),
-    ("Ungroup", "Ctrl+Shift+G", "ungroup"),
-    ("Copy values", "Ctrl+C", "copy_values"),
-    ("Paste values", "Ctrl+V", "paste_values"),
-    ("Reset", "Ctrl+R", "reset"),
-    ("Reset all", "Ctrl+Shift+R", "reset_all"),
+    ("Select all", "select_layers"),
+    ("Search", "search"),
+    ("Group", "group"),
+    ("Ungroup", "ungroup"),
+    ("Copy values", "copy_values"),
+    ("Paste values", "paste_values"),
+    ("Reset", "reset"),
+    ("Reset all", "reset_all"),
 )
-_FRAMES = (("Frame", "F", "frame"), ("Home", "Shift+F", "home"))
-_HELP = (("Shortcuts", "F1", "help"), ("About", "", "about"), ("Quit", "Ctrl+Q", "quit"))
+_FRAMES = (("Frame", "frame"), ("Home", "home"))
+_HELP = (("Shortcuts", "help"), ("About", "about"), ("Quit", "quit"))
 
 
-def button(recent: Sequence[Path], view: ViewState, compact: bool, ui: UiContext) -> list[str]:
-    """The button at the right of the present line, and its menu while it is open; what was chosen.
+def button(work: Workspace, recent: Sequence[Path], ui: UiContext, actions: list[str]) -> None:
+    """The button at the right of the present line, and its menu while it is open.
 
-    `compact`: layers are shown as rows of one line.
+    `recent`: files opened before, the last one first.
     """
     if icon_button("menu", Icon.BARS, ui):
         imgui.open_popup(NAME)
     tip("Menu")
-    actions: list[str] = []
     with menu(NAME, ui) as is_open:
         if is_open:
             actions += _items(_FILES)
@@ -63,15 +64,14 @@ def button(recent: Sequence[Path], view: ViewState, compact: bool, ui: UiContext
             imgui.separator()
             actions += _items(_MAKES)
             imgui.separator()
-            actions += _view(view)
-            actions += _layers(view, compact)
+            actions += _view(work.view)
+            actions += _layers(work)
             imgui.separator()
             actions += _items(_HELP)
-    return actions
 
 
-def _items(items: Sequence[tuple[str, str, str]]) -> list[str]:
-    return [action for name, keys, action in items if imgui.menu_item(name, keys, False)[0]]
+def _items(items: Sequence[tuple[str, str]]) -> list[str]:
+    return [action for name, action in items if imgui.menu_item(name, shortcut(action), False)[0]]
 
 
 def _view(view: ViewState) -> list[str]:
@@ -81,18 +81,18 @@ def _view(view: ViewState) -> list[str]:
         imgui.separator()
         actions += _items(_FRAMES)
         imgui.separator()
-        shown = (("Ground grid", "Shift+G", "grid", view.grid), ("Axes", "", "axes", view.axes))
-        actions += [action for name, keys, action, on in shown if imgui.menu_item(name, keys, on)[0]]
+        for name, action, on in (("Ground grid", "grid", view.grid), ("Axes", "axes", view.axes)):
+            actions += [action] * bool(imgui.menu_item(name, shortcut(action), on)[0])
         imgui.end_menu()
     return actions
 
 
-def _layers(view: ViewState, compact: bool) -> list[str]:
+def _layers(work: Workspace) -> list[str]:
     actions: list[str] = []
-    if imgui.begin_menu("Layers", bool(view.layers)):
+    if imgui.begin_menu("Layers", bool(work.view.layers)):
         actions += _items(_LAYERS)
         imgui.separator()
-        actions += ["cards"] * bool(imgui.menu_item("Compact rows", "Alt+G", compact)[0])
+        actions += ["cards"] * bool(imgui.menu_item("Compact rows", shortcut("cards"), is_compact(work))[0])
         imgui.end_menu()
     return actions
 

@@ -1,23 +1,22 @@
-"""The panel: draws a state, returns the changed state. imgui only: no scene, no GL, no files."""
+"""The panel: draws a workspace, returns the changed one. imgui only: no scene, no GL, no files."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 from imgui_bundle import imgui
 
-from viewer.camera import view_camera as turntable
 from viewer.camera.up_axis import Vec3
-from viewer.camera.view_camera import ViewCamera
-from viewer.jobs.delivery import Delivery
-from viewer.jobs.new_edit import NewEdit
-from viewer.jobs.training_job import TrainingJob
-from viewer.state.layer_facts import LayerRow
-from viewer.state.view_state import AGAINST, COMPARE_MODES, MOST_AMPLIFIED, Comparison, ViewState, cards_shown
-from viewer.state.workspace import Pointed
+from viewer.camera.view_camera import ViewCamera, axes, with_up
+from viewer.state import history
+from viewer.state.layer_selection import selected_layers
+from viewer.state.recordings import obstacle
+from viewer.state.view_state import AGAINST, COMPARE_MODES, MOST_AMPLIFIED, Comparison, ViewState
+from viewer.state.workspace import UNSAVED, SceneFacts, Workspace, has_unsaved
 from viewer.ui.context import PALETTE, Icon, UiContext
+from viewer.ui.keys import shortcut
 from viewer.ui.widgets import (
     choice,
     elide,
@@ -42,8 +41,6 @@ from . import (
     snapshot_cards,
     training_cards,
 )
-from .new_edit_form import FormInput
-from .snapshot_cards import SnapshotCard, SnapshotSlider
 
 WIDTH_PX = 300.0  # at 1×
 
@@ -57,141 +54,61 @@ UPS: tuple[tuple[str, Vec3], ...] = (
 )
 
 
-@dataclass(frozen=True)
-class PanelInput:
-    """What the panel shows besides the state.
-
-    Args:
-        title: the scene's name, after a dot where there are unsaved changes
-        count: Gaussians in the scene
-        rows: one per .gdf, indexed by `LayerState.gdf`
-        focus: the focused layer, an index into `state.layers`, or None
-        undo, redo: what they would take and bring back, "" for nothing
-        reveal: scroll to the focused layer
-        snapshots: the original and what was kept
-        active_slider: which of `layers.SLIDERS` of the focused layer the arrow keys move
-        renaming: the layer whose name is being typed, or None
-        unrecorded: why there is nothing recorded to compare with, "" where there is
-        form: of a new edit; None while it is closed
-        form_input: what that form shows
-        jobs: what is being trained
-        deliveries: what is being exported and rendered
-        recent: files opened before, the last one first
-        selected, search, searching: as in `Cards`
-        snapshot_slider: between two snapshots
-        cards_fit: as in the last frame's `PanelResult`
-    """
-
-    title: str
-    count: int
-    rows: Sequence[LayerRow]
-    focus: int | None = None
-    undo: str = ""
-    redo: str = ""
-    reveal: bool = False
-    active_slider: str = "strength"
-    renaming: int | None = None
-    snapshots: tuple[SnapshotCard, ...] = ()
-    unrecorded: str = ""
-    form: NewEdit | None = None
-    form_input: FormInput = FormInput()
-    jobs: Sequence[TrainingJob] = ()
-    deliveries: Sequence[Delivery] = ()
-    recent: Sequence[Path] = ()
-    selected: frozenset[int] = frozenset()
-    search: str = ""
-    searching: bool = False
-    snapshot_slider: SnapshotSlider = SnapshotSlider()
-    cards_fit: bool = True
-
-
-@dataclass(frozen=True)
-class PanelResult:
-    """The changed state, the focused layer, the one being renamed, and the actions asked for.
-
-    `overlap`: the layer of which to show what it shares with the others, while the mouse rests on that line;
-    `pointed`: what else it rests on that the picture shows; `search`: what layers are filtered by;
-    `cards_fit`: whether there is room for a whole card of each layer.
-    Actions are named as in `controls.KEYS`.
-    """
-
-    state: ViewState
-    focus: int | None
-    actions: tuple[str, ...] = ()
-    renaming: int | None = None
-    overlap: int | None = None
-    pointed: Pointed | None = None
-    form: NewEdit | None = None
-    search: str = ""
-    cards_fit: bool = True
-
-
 def width(ui: UiContext) -> float:
     """The panel's width in window pixels."""
     return WIDTH_PX * ui.scale
 
 
-def draw(state: ViewState, shown: PanelInput, ui: UiContext) -> PanelResult:
-    """Draw the panel along the right edge of the display, between `imgui.new_frame` and `imgui.render`."""
+def draw(
+    work: Workspace,
+    facts: SceneFacts,
+    textures: Sequence[int],
+    preview: tuple[str, bool],
+    recent: Sequence[Path],
+    reveal: bool,
+    ui: UiContext,
+    actions: list[str],
+) -> Workspace:
+    """Draw the panel along the right edge of the display, between `imgui.new_frame` and `imgui.render`.
+
+    Args:
+        work: what it shows and changes
+        facts: of the open scene
+        textures: GL names of the snapshots' pictures, that of the original first; 0 before one is drawn
+        preview: what is said of the picture of a new edit, and whether it failed
+        recent: files opened before, the last one first
+        reveal: scroll to the focused layer
+        ui: fonts and scale
+        actions: takes those that were asked for, see `perform`
+    """
     display = imgui.get_io().display_size
     imgui.set_next_window_pos(imgui.ImVec2(display.x - width(ui), 0.0))
     imgui.set_next_window_size(imgui.ImVec2(width(ui), display.y))
-    flags = imgui.WindowFlags_
-    imgui.begin(
-        "panel",
-        None,
-        flags.no_decoration.value
-        | flags.no_move.value
-        | flags.no_saved_settings.value
-        | flags.no_bring_to_front_on_focus.value
-        | flags.no_nav.value
-        | flags.no_scroll_with_mouse.value,
-    )
-    actions: list[str] = []
-    actions += _title(state, shown, ui)
+    imgui.begin("panel", None, _FLAGS)
+    _title(work, facts, recent, ui, actions)
     footer = imgui.get_frame_height() + imgui.get_style().item_spacing.y * 2
-    chosen = [i for i, l in enumerate(state.layers) if i == shown.focus or l.gdf in shown.selected]
     room = imgui.get_content_region_avail().y - footer - layer_cards.HEADING_PX * ui.scale
-    fit = len(state.layers) * layer_card.CARD_PX * ui.scale <= room
-    _begin_body(footer + layer_bar.selection_height(chosen, ui))
-    state, asked = layer_cards.heading(state, shown.form is not None, ui)
-    actions += [asked] if asked else []
-    form = shown.form
-    if form is not None:
-        form, asked = new_edit_form.draw(form, shown.form_input, ui)
-        actions += [asked] if asked else []
-    actions += training_cards.draw(shown.jobs, ui)
-    actions += training_cards.draw_deliveries(shown.deliveries, ui)
-    cards = layer_card.Cards(
-        shown.rows,
-        shown.focus,
-        shown.reveal,
-        shown.active_slider,
-        shown.renaming,
-        shown.selected,
-        cards_shown(state, fit) == "compact",
-        shown.search,
-        shown.searching,
-    )
-    expected = bool(shown.jobs or shown.deliveries) or form is not None
-    drawn = layer_cards.draw(state, cards, ui, expected)
-    state, focus = drawn.state, drawn.focus
-    actions += drawn.actions
-    if state.brush.active:
-        state, asked = brush.section(state, focus, ui)
-        actions += [asked] if asked else []
-    state, selected = selection_section.draw(state, ui, actions)
-    region = selection_section.draw_regions(state.selection.regions, ui, actions)
-    state = _view(state, shown.unrecorded, len(shown.snapshots) > 1, ui, actions)
-    snapshot_cards.draw(shown.snapshots, shown.snapshot_slider, ui, actions)
+    work = replace(work, cards_fit=len(work.view.layers) * layer_card.CARD_PX * ui.scale <= room)
+    selected = selected_layers(work)
+    _begin_body(footer + layer_bar.selection_height(selected, ui))
+    work = replace(work, view=layer_cards.heading(work.view, work.form_open, ui, actions))
+    work = new_edit_form.draw(work, facts.count, preview, ui, actions)
+    training_cards.draw(work.jobs, ui, actions)
+    training_cards.draw_deliveries(work.deliveries, ui, actions)
+    work = layer_cards.draw(work, facts.rows, reveal, ui, actions)
+    view, pointed = work.view, work.pointed
+    if view.brush.active:
+        view = brush.section(view, work.focus, ui, actions)
+    view, under = selection_section.draw(view, ui, actions)
+    pointed = pointed or under or selection_section.draw_regions(view.selection.regions, ui, actions)
+    view = _view(view, obstacle(facts.recordings), len(textures) > 1, ui, actions)
+    work = replace(work, view=view, pointed=pointed)
+    snapshot_cards.draw(work, facts.rows, textures, ui, actions)
     _end_body()
-    layer_bar.selection(state, chosen, ui, actions)
-    _footer(state, shown, ui, actions)
+    layer_bar.selection(work.view, selected, ui, actions)
+    _footer(work, ui, actions)
     imgui.end()
-    pointed = drawn.pointed or selected or region
-    return PanelResult(
-        state, focus, tuple(actions), drawn.renaming, drawn.overlap, pointed, form, drawn.search, fit
-    )
+    return work
 
 
 def _begin_body(footer: float) -> None:
@@ -220,20 +137,21 @@ def _end_body() -> None:
     imgui.get_state_storage().set_bool(imgui.get_id("overflows"), overflows)
 
 
-def _title(state: ViewState, shown: PanelInput, ui: UiContext) -> list[str]:
-    """The scene's name and size, and the menu at the right of both; what was chosen there."""
+def _title(
+    work: Workspace, facts: SceneFacts, recent: Sequence[Path], ui: UiContext, actions: list[str]
+) -> None:
+    """The scene's name, after a dot where there are unsaved changes, its size, and the menu at the right."""
     at, side = imgui.get_cursor_pos(), imgui.get_frame_height()
     imgui.push_font(ui.fonts.bold, 0.0)
     room = imgui.get_content_region_avail().x
-    imgui.text(elide(shown.title, room - side))
+    imgui.text(elide(UNSAVED * has_unsaved(work) + facts.title, room - side))
     imgui.pop_font()
-    small(f"{group_digits(shown.count)} splats", PALETTE.dim, room - side)
-    below, compact = imgui.get_cursor_pos(), cards_shown(state, shown.cards_fit) == "compact"
+    small(f"{group_digits(facts.count)} splats", PALETTE.dim, room - side)
+    below = imgui.get_cursor_pos()
     imgui.set_cursor_pos(imgui.ImVec2(at.x + room - side, at.y - 2.0 * ui.scale))
-    actions = main_menu.button(shown.recent, state, compact, ui)
+    main_menu.button(work, recent, ui, actions)
     imgui.set_cursor_pos(below)
     imgui.dummy(imgui.ImVec2(0.0, 2.0 * ui.scale))
-    return actions
 
 
 def _view(state: ViewState, unrecorded: str, kept: bool, ui: UiContext, actions: list[str]) -> ViewState:
@@ -243,16 +161,16 @@ def _view(state: ViewState, unrecorded: str, kept: bool, ui: UiContext, actions:
     camera = state.camera
     label("Navigate", column)
     mode = choice("mode", ("Orbit", "Fly"), ("orbit", "fly").index(camera.mode), ui)
-    tip("Orbit around a pivot, or fly (V)")
+    tip("Orbit around a pivot, or fly", "fly")
     if mode is not None:
         camera = replace(camera, mode=("orbit", "fly")[mode])
     label("Up axis", column)
-    ups = (*UPS, ("View", turntable.axes(camera).up))
+    ups = (*UPS, ("View", axes(camera).up))
     current = next((i for i, (_, up) in enumerate(UPS) if up == camera.up), len(UPS))
     chosen = choice("up", tuple(name for name, _ in ups), current, ui)
     tip("Up axis of the scene. View: use the current view's up direction")
     if chosen is not None:
-        camera = turntable.with_up(camera, ups[chosen][1])
+        camera = with_up(camera, ups[chosen][1])
     label("FOV", column)
     imgui.set_next_item_width(-1.0)
     changed, fov_y = imgui.slider_float("##fov", camera.fov_y, 10.0, 110.0, "%.0f°", _ALWAYS_CLAMP)
@@ -269,11 +187,11 @@ def _view(state: ViewState, unrecorded: str, kept: bool, ui: UiContext, actions:
     half = (imgui.get_content_region_avail().x - 6.0 * ui.scale) / 2
     if imgui.button(f"{Icon.FRAME}  Frame", imgui.ImVec2(half, 0.0)):
         actions.append("frame")
-    tip("Frame the selection, the focused layer, or the scene (F)")
+    tip("Frame the selection, the focused layer, or the scene", "frame")
     imgui.same_line(0.0, 6.0 * ui.scale)
     if imgui.button(f"{Icon.HOME}  Home", imgui.ImVec2(half, 0.0)):
         actions.append("home")
-    tip("Reset the view (Shift+F)")
+    tip("Reset the view", "home")
     return replace(state, camera=camera, background=background, compare=comparison)
 
 
@@ -284,7 +202,8 @@ def _comparison(shown: Comparison, unrecorded: str, kept: bool, column: float, u
     """
     label("Compare", column)
     chosen = choice("compare", ("Off", "Side", "Split", "Diff"), COMPARE_MODES.index(shown.mode), ui)
-    tip("Side by side (Y), split view (Shift+Y), or amplified difference (D)")
+    beside, split = shortcut("beside"), shortcut("split")
+    tip(f"Side by side ({beside}), split view ({split}), or amplified difference", "difference")
     if chosen is not None:
         shown = replace(shown, mode=COMPARE_MODES[chosen])
     if shown.mode == "off" and not kept:
@@ -293,10 +212,10 @@ def _comparison(shown: Comparison, unrecorded: str, kept: bool, column: float, u
     off = {i for i, no in ((1, unrecorded), (2, not kept)) if no}
     against = None if shown.mode == "off" else AGAINST.index(shown.against)
     chosen = choice("against", ("Original", "Recorded", "A | B"), 0 if against in off else against, ui, off)
-    told = f"\nNo recording: {unrecorded}" if unrecorded else ""
+    recorded, pair = shortcut("against"), shortcut("compare_snapshots")
     tip(
-        "Compare with the original, with what training recorded (Alt+Y), or snapshot A with B (Shift+F3)"
-        + told
+        f"Compare with the original, with what training recorded ({recorded}), or snapshot A with B ({pair})"
+        + (f"\nNo recording: {unrecorded}" if unrecorded else "")
     )
     if chosen is not None:
         mode = "split" if shown.mode == "off" else shown.mode
@@ -314,35 +233,41 @@ def _comparison(shown: Comparison, unrecorded: str, kept: bool, column: float, u
     return shown
 
 
+_FLAGS = (
+    imgui.WindowFlags_.no_decoration.value
+    | imgui.WindowFlags_.no_move.value
+    | imgui.WindowFlags_.no_saved_settings.value
+    | imgui.WindowFlags_.no_bring_to_front_on_focus.value
+    | imgui.WindowFlags_.no_nav.value
+    | imgui.WindowFlags_.no_scroll_with_mouse.value
+)
 _ALWAYS_CLAMP = imgui.SliderFlags_.always_clamp.value
 _LOGARITHMIC = _ALWAYS_CLAMP | imgui.SliderFlags_.logarithmic.value
 
 
-def _footer(state: ViewState, shown: PanelInput, ui: UiContext, actions: list[str]) -> None:
+def _footer(work: Workspace, ui: UiContext, actions: list[str]) -> None:
     imgui.separator()
     right = right_edge()
-    for action, icon, key, change in (
-        ("undo", Icon.UNDO, "Ctrl+Z", shown.undo),
-        ("redo", Icon.REDO, "Ctrl+Shift+Z", shown.redo),
+    for action, icon, change in (
+        ("undo", Icon.UNDO, history.next_undo(work.past)),
+        ("redo", Icon.REDO, history.next_redo(work.past)),
     ):
         imgui.begin_disabled(not change)
         if icon_button(action, icon, ui):
             actions.append(action)
         imgui.end_disabled()
-        tip(f"{action.capitalize()}{change and ': '}{change} ({key})")
+        tip(f"{action.capitalize()}{change and ': '}{change}", action)
         imgui.same_line()
-    if state.layers and brush.toggle(state, ui):
+    if work.view.layers and brush.toggle(work.view, ui):
         actions.append("brush")
-    side = imgui.get_frame_height()
-    imgui.same_line(right - 3 * side - 12.0 * ui.scale)
-    if icon_button("timeline", Icon.FILM, ui):
-        actions.append("timeline")
-    tip("Timeline: animate the camera and the strengths (T)")
-    imgui.same_line(0.0, 6.0 * ui.scale)
-    if icon_button("picture", Icon.PICTURE, ui):
-        actions.append("picture")
-    tip("Save the image as PNG (F2)")
-    imgui.same_line(0.0, 6.0 * ui.scale)
-    if icon_button("help", Icon.HELP, ui):
-        actions.append("help")
-    tip("Keyboard and mouse shortcuts (F1)")
+    side, gap = imgui.get_frame_height(), 6.0 * ui.scale
+    imgui.same_line(right - 3 * side - 2 * gap)
+    for action, icon, help_ in (
+        ("timeline", Icon.FILM, "Timeline: animate the camera and the strengths"),
+        ("picture", Icon.PICTURE, "Save the image as PNG"),
+        ("help", Icon.HELP, "Keyboard and mouse shortcuts"),
+    ):
+        if icon_button(action, icon, ui):
+            actions.append(action)
+        tip(help_, action)
+        imgui.same_line(0.0, gap)

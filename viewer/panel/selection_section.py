@@ -10,6 +10,7 @@ from viewer.state.selection import NamedRegion
 from viewer.state.view_state import LARGEST_PX, SELECT_MODES, SMALLEST_PX, SelectTool, ViewState
 from viewer.state.workspace import Pointed
 from viewer.ui.context import PALETTE, SMALL_PX, Icon, UiContext, u32
+from viewer.ui.keys import shortcut
 from viewer.ui.widgets import (
     choice,
     elide,
@@ -26,27 +27,27 @@ from viewer.ui.widgets import (
 )
 
 _TOOLS = (
-    ("box", Icon.BOX, "Box (R)"),
-    ("lasso", Icon.LASSO, "Lasso (L)"),
-    ("polygon", Icon.POLYGON, "Polygon (P): click its corners; Enter or a double click closes it"),
-    ("brush", Icon.SELECT_BRUSH, "Brush (U)"),
-    ("sphere", Icon.SPHERE, "Sphere (Shift+R): drag from its center on a surface"),
-    ("flood", Icon.FLOOD, "Flood (J): click a surface; what is connected and alike in color"),
-    ("color", Icon.COLOR, "Color (I): click; everything that is alike in color"),
+    ("box", Icon.BOX, "Box", ""),
+    ("lasso", Icon.LASSO, "Lasso", ""),
+    ("polygon", Icon.POLYGON, "Polygon", ": click its corners; Enter or a double click closes it"),
+    ("brush", Icon.SELECT_BRUSH, "Brush", ""),
+    ("sphere", Icon.SPHERE, "Sphere", ": drag from its center on a surface"),
+    ("flood", Icon.FLOOD, "Flood", ": click a surface; what is connected and alike in color"),
+    ("color", Icon.COLOR, "Color", ": click; everything that is alike in color"),
 )
 _MODES = "Shift adds, Ctrl subtracts, both intersect"
 _OPERATIONS = (
     (
-        ("Grow", "select_grow", "Add the neighbors (Ctrl+])"),
-        ("Shrink", "select_shrink", "Drop what borders on others (Ctrl+[)"),
+        ("Grow", "select_grow", "Add the neighbors"),
+        ("Shrink", "select_shrink", "Drop what borders on others"),
         ("Smooth", "select_smooth", "Straighten the border, drop strays, fill holes"),
         ("Largest", "select_largest", "Keep only the largest connected part"),
     ),
     (
-        ("Invert", "select_invert", "Select everything else (Ctrl+I)"),
-        ("None", "select_none", "Select nothing (Ctrl+Shift+A)"),
-        ("Hide", "hide_selected", "Hide the selection (Ctrl+H)"),
-        ("Isolate", "isolate", "Hide everything else (Ctrl+Shift+H)"),
+        ("Invert", "select_invert", f"Select everything else ({shortcut('invert')})"),
+        ("None", "select_none", "Select nothing"),
+        ("Hide", "hide_selected", "Hide the selection"),
+        ("Isolate", "isolate", "Hide everything else"),
     ),
 )
 _MENU = "menu of a region"
@@ -60,10 +61,10 @@ def draw(state: ViewState, ui: UiContext, actions: list[str]) -> tuple[ViewState
     section("Select", ui)
     side, gap = imgui.get_frame_height(), 1.0 * ui.scale
     imgui.same_line(right - len(_TOOLS) * (side + gap) + gap)
-    for tool, icon, help_ in _TOOLS:
+    for tool, icon, name, how in _TOOLS:
         if _lit_button(tool, icon, state.select.tool == tool, ui):
             actions.append(f"select_tool:{tool}")
-        tip(f"{help_}\n{_MODES}")
+        tip(f"{name} ({shortcut(f'select_tool:{tool}')}){how}\n{_MODES}")
         imgui.same_line(0.0, gap)
     imgui.new_line()
     held, count = state.select, state.selection.count
@@ -86,7 +87,7 @@ def draw(state: ViewState, ui: UiContext, actions: list[str]) -> tuple[ViewState
                 imgui.same_line(0.0, gap)
             if imgui.button(f"{name}##{action}", imgui.ImVec2(each, 0.0)):
                 actions.append(action)
-            tip(help_)
+            tip(help_, action)
     imgui.pop_style_var()
     _save(len(state.selection.regions), ui, actions)
     imgui.end_disabled()
@@ -104,20 +105,21 @@ def _options(held: SelectTool, ui: UiContext) -> SelectTool:
     if held.tool not in ("sphere", "flood"):
         label("Depth", column)
         through = choice("select depth", ("Front", "Through"), int(held.through), ui)
-        tip("Select only the front surface, or everything behind it too (N)")
+        tip("Select only the front surface, or everything behind it too", "select_through")
         if through is not None:
             held = replace(held, through=bool(through))
     if held.tool == "brush":
         label("Radius", column)
         ends = (SMALLEST_PX, LARGEST_PX)
         radius = value_slider("##select radius", held.radius, ends, "%.0f px", SelectTool.radius, ui)
-        tip("Brush radius ([ and ])")
+        tip(f"Brush radius ({shortcut('brush_radius:0.8')} and {shortcut('brush_radius:1.25')})")
         held = replace(held, radius=radius)
     if held.tool in ("flood", "color"):
         label("Tolerance", column)
         ends = (0.01, 1.0)
         tolerance = value_slider("##tolerance", held.tolerance, ends, "%.2f", SelectTool.tolerance, ui)
-        tip("How unlike the clicked color a color may be ([ and ]). The last click follows it")
+        keys = f"{shortcut('brush_radius:0.8')} and {shortcut('brush_radius:1.25')}"
+        tip(f"How unlike the clicked color a color may be ({keys}). The last click follows it")
         held = replace(held, tolerance=tolerance)
     return held
 
@@ -130,7 +132,7 @@ def _hidden(state: ViewState, ui: UiContext, actions: list[str]) -> None:
         imgui.same_line(right - imgui.calc_text_size(name).x - 2 * imgui.get_style().frame_padding.x)
         if imgui.small_button(f"{name}##hidden"):
             actions.append("show_hidden")
-        tip("Show all splats again (Alt+H)")
+        tip("Show all splats again", "show_all")
 
 
 def _save(regions: int, ui: UiContext, actions: list[str]) -> None:

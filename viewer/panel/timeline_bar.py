@@ -14,6 +14,7 @@ from viewer.state import timeline as tl
 from viewer.state.playback import Player
 from viewer.state.view_state import FASTEST, LONGEST, Timeline
 from viewer.ui.context import PALETTE, SMALL_PX, UiContext, u32
+from viewer.ui.keys import shortcut
 from viewer.ui.overlay import Area
 from viewer.ui.widgets import icon_button, is_released, tip
 
@@ -82,18 +83,19 @@ def _buttons(timeline: Timeline, player: Player, frame: int, actions: list[str],
     if icon_button("play", icon, ui):
         actions.append("play")
     imgui.end_disabled()
-    tip("Play or pause (Space)" if len(timeline.keys) > 1 else "Set at least two keyframes to play")
+    can_play = len(timeline.keys) > 1
+    tip(*("Play or pause", "play") if can_play else ("Set at least two keyframes to play",))
     imgui.same_line(0.0, gap)
     on_key = tl.key_at(timeline, frame) is not None
     if icon_button("key", icons.ICON_FA_DIAMOND, ui):
         actions.append("key")
-    tip("Update keyframe (K)" if on_key else "Insert keyframe: camera and all strengths (K)")
+    tip("Update keyframe" if on_key else "Insert keyframe: camera and all strengths", "key")
     imgui.same_line(0.0, gap)
     imgui.begin_disabled(not on_key)
     if icon_button("drop_key", icons.ICON_FA_TRASH_CAN, ui, dim=not on_key):
         actions.append("drop_key")
     imgui.end_disabled()
-    tip("Delete keyframe (Del)")
+    tip("Delete keyframe", "drop_key")
     imgui.same_line(0.0, 10.0 * ui.scale)
 
 
@@ -104,11 +106,11 @@ def _settings(timeline: Timeline, frame: int, actions: list[str], ui: UiContext)
     if imgui.button(f"{easing.capitalize()}##easing", imgui.ImVec2(62.0 * ui.scale, 0.0)):
         actions.append("easing")
     imgui.end_disabled()
-    tip("Interpolation after the keyframe at or before the playhead: smooth, linear or hold (Shift+K)")
+    tip("Interpolation after the keyframe at or before the playhead: smooth, linear or hold", "easing")
     imgui.same_line(0.0, gap)
     if icon_button("ping_pong", icons.ICON_FA_RIGHT_LEFT, ui, dim=not timeline.ping_pong):
         actions.append("ping_pong")
-    tip("Ping-pong (Alt+K): " + ("on" if timeline.ping_pong else "off"))
+    tip(f"Ping-pong ({shortcut('ping_pong')}): " + ("on" if timeline.ping_pong else "off"))
     imgui.same_line(0.0, gap)
     for name, now, most, unit, what in (
         ("length", timeline.length, LONGEST, "f", "Length in frames"),
@@ -126,7 +128,7 @@ def _settings(timeline: Timeline, frame: int, actions: list[str], ui: UiContext)
     if icon_button("timeline_file", icons.ICON_FA_FILE_EXPORT, ui, dim=not timeline.keys):
         actions.append("timeline_file")
     imgui.end_disabled()
-    tip("Save the timeline for `progdf render --timeline` (Ctrl+K)")
+    tip("Save the timeline for `progdf render --timeline`", "timeline_file")
 
 
 def _ruler(timeline: Timeline, frame: int, wide: float, actions: list[str], ui: UiContext) -> None:

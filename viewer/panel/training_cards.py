@@ -17,20 +17,17 @@ STARVED = "Waits for the processor"
 _MENU = "menu of a training"
 
 
-def draw(jobs: Sequence[TrainingJob], ui: UiContext) -> list[str]:
-    """One card a run, the next one at the bottom; the actions that were asked for."""
-    actions: list[str] = []
+def draw(jobs: Sequence[TrainingJob], ui: UiContext, actions: list[str]) -> None:
+    """One card a run, the next one at the bottom."""
     for job in jobs:
         if job.status != "done" or job.warning:
             imgui.push_id(job.number)
             actions += _card(_job_row(job), job.number, ui)
             imgui.pop_id()
-    return actions
 
 
-def draw_deliveries(deliveries: Sequence[Delivery], ui: UiContext) -> list[str]:
+def draw_deliveries(deliveries: Sequence[Delivery], ui: UiContext, actions: list[str]) -> None:
     """The same for what is being exported and rendered."""
-    actions: list[str] = []
     for delivery in deliveries:
         share = delivery.done / delivery.total if delivery.total else 0.0
         left = delivery.seconds_left
@@ -52,7 +49,6 @@ def draw_deliveries(deliveries: Sequence[Delivery], ui: UiContext) -> list[str]:
         row = _Row(delivery.title, str(delivery.out), word, share, line, failed, not failed, (stop,))
         actions += _card(row, delivery.number, ui)
         imgui.pop_id()
-    return actions
 
 
 @dataclass(frozen=True)

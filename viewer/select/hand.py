@@ -7,17 +7,17 @@ from dataclasses import replace
 from imgui_bundle import imgui
 
 from progdf.scene.selection import Mask, combine
-from viewer.camera.inputs import Keys
 from viewer.state import history, selection
 from viewer.state.selection import unpack
 from viewer.state.workspace import Workspace
+from viewer.ui.keys import Keys
 from viewer.ui.pointer import PointerContext
 
 from . import gesture as gestures
 from .gesture import Click, Gesture
 
 DRAG = "select"
-"""What a left drag does while a tool selects, beside those of `controls.DRAGS`."""
+"""What a left drag does while a tool selects, beside those of `keys.DRAGS`."""
 
 _TRAVEL_PX = 3.0  # at 1×: what moves no further is a click
 _CLOSE_PX = 9.0  # at 1×: a click so near to a polygon's first corner closes it

@@ -20,13 +20,14 @@ from viewer.state import comparison as compare
 from viewer.state import history, layer_selection, paint, playback, selection, snapshots
 from viewer.state import layers as stack
 from viewer.state.history import History
-from viewer.state.view_state import ViewState, cards_shown, next_resolution_mode
+from viewer.state.view_state import ViewState, next_resolution_mode
 from viewer.state.workspace import (
     REQUESTS,
     SceneFacts,
     Workspace,
     change_focused,
     focus_layer,
+    is_compact,
     loses_strengths,
     with_camera,
     with_layers_of,
@@ -37,7 +38,7 @@ FEATHER = 0.1
 
 
 def perform(workspace: Workspace, action: str, facts: SceneFacts, aspect: float = 1.0) -> Workspace:
-    """The workspace after an action of `controls.KEYS`.
+    """The workspace after an action of `keys.KEYS`.
 
     Args:
         action: its name, with an argument after a colon where it has one
@@ -201,10 +202,9 @@ def _rename_group(workspace: Workspace, argument: str) -> Workspace:
 
 def _toggle_cards(workspace: Workspace, _: str) -> Workspace:
     """Rows of one line for cards, or back; by themselves where they would be so anyway."""
-    shown = cards_shown(workspace.view, workspace.cards_fit)
-    wanted = "full" if shown == "compact" else "compact"
-    alone = "full" if workspace.cards_fit else "compact"
-    return replace(workspace, view=replace(workspace.view, cards="auto" if wanted == alone else wanted))
+    compact = not is_compact(workspace)
+    cards = "auto" if compact != workspace.cards_fit else "compact" if compact else "full"
+    return replace(workspace, view=replace(workspace.view, cards=cards))
 
 
 def _blend(workspace: Workspace, _: str) -> Workspace:

@@ -249,11 +249,6 @@ def on_another_scene(view: ViewState, camera: ViewCamera) -> ViewState:
     )
 
 
-def cards_shown(view: ViewState, fit: bool) -> str:
-    """ "full" or "compact": how the panel shows layers, where whole cards `fit` or do not."""
-    return view.cards if view.cards != "auto" else "full" if fit else "compact"
-
-
 def next_resolution_mode(view: ViewState) -> ViewState:
     """The state with the next of `RESOLUTION_MODES`."""
     following = RESOLUTION_MODES.index(view.dynamic_resolution) + 1

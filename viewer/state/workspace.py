@@ -276,6 +276,12 @@ def focus_layer(workspace: Workspace, index: int) -> Workspace:
     return replace(workspace, focus=index, selected=frozenset()) if found else workspace
 
 
+def is_compact(workspace: Workspace) -> bool:
+    """Whether the panel shows layers as rows of one line: where the person says so, or cards do not fit."""
+    view = workspace.view
+    return view.cards == "compact" or (view.cards == "auto" and not workspace.cards_fit)
+
+
 def change_focused(workspace: Workspace, change: Callable[[ViewState, int], ViewState]) -> Workspace:
     """With the focused layer changed, if one is; `change` gets its index."""
     if workspace.focus is None:

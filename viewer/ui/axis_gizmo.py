@@ -14,7 +14,7 @@ from .context import Rgba, UiContext, u32
 from .overlay import Area
 
 DRAG = "axes"
-"""The name of its drag, beside those of `controls.DRAGS`."""
+"""The name of its drag, beside those of `keys.DRAGS`."""
 
 LENGTH_PX, BALL_PX, MARGIN_PX = 34.0, 9.5, 10.0  # at 1×
 LETTER_PX = 13.0

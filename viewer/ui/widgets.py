@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from imgui_bundle import imgui
 
 from .context import PALETTE, SMALL_PX, Rgba, UiContext, u32
+from .keys import shortcut
 
 TYPING_S = 1.0
 """Between two letters of one word, at most, in a list."""
@@ -86,11 +87,14 @@ def accent_button(text: str, size: imgui.ImVec2) -> bool:
     return bool(pressed)
 
 
-def tip(text: str) -> None:
-    """What the last item does, told when the mouse rests on it."""
+def tip(text: str, action: str = "") -> None:
+    """What the last item does, shown when the mouse rests on it; with the shortcut of an action."""
     flags = imgui.HoveredFlags_
-    if imgui.is_item_hovered(flags.for_tooltip.value | flags.allow_when_disabled.value):
-        imgui.set_tooltip(text)
+    # no_nav_override: the tip of a field that merely has the keyboard would cover the next row
+    shown = flags.for_tooltip.value | flags.allow_when_disabled.value | flags.no_nav_override.value
+    if imgui.is_item_hovered(shown):
+        chord = shortcut(action)
+        imgui.set_tooltip(f"{text} ({chord})" if chord else text)
 
 
 def icon_button(name: str, icon: str, ui: UiContext, dim: bool = False) -> bool:

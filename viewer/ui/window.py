@@ -20,13 +20,12 @@ import glfw
 import moderngl
 
 from progdf.errors import ProgdfError
-from viewer.camera import controls
-from viewer.camera.inputs import Keys, Press, next_event_id
+from viewer.ui.keys import FLY_KEYS, HELD_ORIGINAL, Keys, Press, next_event_id
 
 from .double_clicks import DoubleClicks
 
 LEAST = (640, 400)
-_FLY_KEYS = {name: getattr(glfw, f"KEY_{name}") for name in controls.FLY_KEYS}
+_FLY_KEYS = {name: getattr(glfw, f"KEY_{name}") for name in FLY_KEYS}
 KEY_NAMES = {
     **{getattr(glfw, f"KEY_{c}"): c for c in "ABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789"},
     **{getattr(glfw, f"KEY_F{i}"): f"F{i}" for i in range(1, 13)},
@@ -34,7 +33,7 @@ KEY_NAMES = {
         getattr(glfw, f"KEY_{name.upper()}"): name
         for name in ("Left", "Right", "Up", "Down", "Escape", "Tab", "Enter", "Backspace", "Space", "Delete")
     },
-    glfw.KEY_BACKSLASH: controls.HELD_ORIGINAL,
+    glfw.KEY_BACKSLASH: HELD_ORIGINAL,
     glfw.KEY_LEFT_BRACKET: "[",
     glfw.KEY_RIGHT_BRACKET: "]",
     glfw.KEY_COMMA: ",",
@@ -267,7 +266,7 @@ def key_name(key: int, scancode: int) -> str:
 
 
 def chord(name: str, mods: int) -> str:
-    """A key with its modifiers, as in `controls.KEYS`; on a Mac, Command does what Ctrl does elsewhere."""
+    """A key with its modifiers, as in `keys.KEYS`; on a Mac, Command does what Ctrl does elsewhere."""
     ctrl = glfw.MOD_CONTROL | (glfw.MOD_SUPER if sys.platform == "darwin" else 0)
     held = (("Ctrl+", ctrl), ("Shift+", glfw.MOD_SHIFT), ("Alt+", glfw.MOD_ALT))
     return "".join(prefix for prefix, bit in held if mods & bit) + name

@@ -9,8 +9,8 @@ from imgui_bundle import imgui
 
 from tests.helpers.ui_rig import Rig, rig
 from viewer.app import bindings
-from viewer.camera import controls
 from viewer.ui.context import SMALL_PX
+from viewer.ui.keys import KEYS
 
 SMALLEST = (1024, 640)
 
@@ -18,7 +18,7 @@ SMALLEST = (1024, 640)
 def test_every_key_that_has_a_help_text_is_listed_once_under_a_topic() -> None:
     listed = [does for topic in bindings.topics() for _, does in topic.rows]
     assert sorted(listed) == sorted(
-        [does for _, does in bindings.MOUSE_HELP] + [key.help for key in controls.KEYS if key.help]
+        [does for _, does in bindings.MOUSE_HELP] + [key.help for key in KEYS if key.help]
     )
     assert all(topic.rows for topic in bindings.topics())
 

@@ -17,12 +17,12 @@ from progdf.scene.up_axis import find_up
 from tests.helpers.null_app import null_app, press
 from tests.helpers.scenes import random_gaussians
 from tests.helpers.ui_rig import bear, first_view, rig
-from viewer.camera.inputs import Keys, Press
 from viewer.camera.view_camera import axes, first_camera, with_up
 from viewer.files.document import load
 from viewer.state import history, selection
 from viewer.state.view_state import ViewState
 from viewer.ui import axis_gizmo
+from viewer.ui.keys import Keys, Press
 
 pytestmark = pytest.mark.gl
 CENTER = 340.0 - 56.5  # of the axes, from the left; and 56.5 from above

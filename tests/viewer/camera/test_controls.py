@@ -22,6 +22,7 @@ from viewer.state.actions import perform
 from viewer.state.layer_facts import LayerRow
 from viewer.state.view_state import LayerState, ViewState
 from viewer.state.workspace import SceneFacts
+from viewer.ui.keys import FLY_KEYS, KEYS, drag_for
 
 AXES: tuple[Vec3, ...] = ((0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1), (1, 0, 0), (-1, 0, 0))
 RADII = st.sampled_from([1e-3, 0.1, 1.0, 30.0, 1e4])
@@ -208,19 +209,19 @@ def test_a_stalled_frame_does_not_throw_the_flight_far_away() -> None:
 
 
 def test_a_drag_means_what_the_table_says() -> None:
-    assert controls.drag_for("left", "", "orbit") == "orbit"
-    assert controls.drag_for("middle", "Shift", "orbit") == "pan"
-    assert controls.drag_for("middle", "Ctrl", "fly") == "dolly"
-    assert controls.drag_for("right", "", "orbit") == "pan"
-    assert controls.drag_for("right", "", "fly") == "look"
-    assert controls.drag_for("left", "Alt", "fly") == "orbit"
-    assert controls.drag_for("right", "Alt", "orbit") is None
+    assert drag_for("left", "", "orbit") == "orbit"
+    assert drag_for("middle", "Shift", "orbit") == "pan"
+    assert drag_for("middle", "Ctrl", "fly") == "dolly"
+    assert drag_for("right", "", "orbit") == "pan"
+    assert drag_for("right", "", "fly") == "look"
+    assert drag_for("left", "Alt", "fly") == "orbit"
+    assert drag_for("right", "Alt", "orbit") is None
 
 
 def test_no_key_is_bound_twice_and_only_what_is_tapped_is_also_a_flight_key() -> None:
-    chords = [key.chord for key in controls.KEYS]
+    chords = [key.chord for key in KEYS]
     assert len(chords) == len(set(chords))
-    assert not {key.chord for key in controls.KEYS if not key.tap} & set(controls.FLY_KEYS)
+    assert not {key.chord for key in KEYS if not key.tap} & set(FLY_KEYS)
 
 
 def test_every_bound_key_has_its_action_with_layers_and_without() -> None:
@@ -228,7 +229,7 @@ def test_every_bound_key_has_its_action_with_layers_and_without() -> None:
     facts = SceneFacts("bear.ply", 3, Bounds(), (row,))
     for layers in ((), (LayerState(0, "scarf", 0.5),)):
         work = workspace.new_workspace(ViewState(layers=layers))
-        for key in controls.KEYS:
+        for key in KEYS:
             after = perform(work, key.action, facts)
             assert usable(after.view.camera)
             assert all(0.0 <= layer.strength <= 1.0 for layer in after.view.layers)

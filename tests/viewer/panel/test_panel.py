@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import pytest
 from imgui_bundle import imgui
@@ -40,14 +40,8 @@ class Hand:
 
     def frame(self) -> None:
         imgui.new_frame()
-        past = self.work.past
-        shown = panel.PanelInput(
-            FACTS.title, FACTS.count, FACTS.rows, self.work.focus, len(past.past), len(past.future)
-        )
-        result = panel.draw(self.work.view, shown, self.ui)
+        self.work = panel.draw(self.work, FACTS, (), ("", False), (), False, self.ui, self.actions)
         imgui.render()
-        self.work = replace(self.work, view=result.state, focus=result.focus)
-        self.actions += result.actions
         if not imgui.is_any_item_active():
             self.work = workspace.record_undo(self.work)
 

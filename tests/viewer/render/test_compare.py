@@ -121,7 +121,7 @@ def test_equal_pictures_have_no_difference() -> None:
 
 @pytest.mark.gl
 def test_backslash_shows_the_whole_original_over_any_comparison(hand: Rig) -> None:
-    from viewer.camera.inputs import Keys
+    from viewer.ui.keys import Keys
 
     original = whole(0.0, 0.0)
     for chord in ("Shift+Y", "D"):
@@ -187,7 +187,7 @@ def test_y_shows_two_pictures_that_turn_together_and_can_be_picked_in(hand: Rig,
 
 @pytest.mark.gl
 def test_a_tap_of_backslash_stays_with_the_original_until_the_next_or_a_slider_moves(hand: Rig) -> None:
-    from viewer.camera.inputs import Keys, Press
+    from viewer.ui.keys import Keys, Press
 
     edited = hand.picture()
     hand.key("\\")
@@ -206,7 +206,7 @@ def test_a_tap_of_backslash_stays_with_the_original_until_the_next_or_a_slider_m
 
 @pytest.mark.gl
 def test_d_flies_where_it_is_held_and_is_the_difference_where_it_is_tapped(hand: Rig) -> None:
-    from viewer.camera.inputs import Keys, Press
+    from viewer.ui.keys import Keys, Press
 
     camera = hand.main_view.work.view.camera
     down = Keys(held=frozenset("D"), fly=frozenset("D"))

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from progdf.cli.info import kind_of
 from progdf.errors import ProgdfError
-from viewer.camera import controls, tween
+from viewer.camera import tween
 from viewer.camera.view_camera import Bounds, ViewCamera, axes, cross, dot, to_camera
 from viewer.files import timeline_file
 from viewer.state import history, playback, timeline, workspace
@@ -22,6 +22,7 @@ from viewer.state.layer_facts import LayerRow
 from viewer.state.playback import Player
 from viewer.state.view_state import Keyframe, LayerState, Timeline, ViewState
 from viewer.state.workspace import SceneFacts, Workspace
+from viewer.ui.keys import KEYS
 
 LAYERS = (LayerState(0, "scarf", 0.2), LayerState(1, "ears", 0.4))
 FACTS = SceneFacts("bear.ply", 3, Bounds(), (LayerRow(3, (0.5,) * 3, (), "", Bounds()),) * 2)
@@ -288,7 +289,7 @@ def test_history_restores_the_timeline_with_the_rest() -> None:
 
 
 def test_every_action_of_the_timeline_that_a_key_names_exists() -> None:
-    named = {key.action.partition(":")[0] for key in controls.KEYS}
+    named = {key.action.partition(":")[0] for key in KEYS}
     assert {"key", "drop_key", "play", "step", "jump", "easing", "ping_pong", "timeline"} <= named
     assert set(playback.ACTIONS) <= set(ACTIONS)
 
