@@ -15,8 +15,8 @@ from progdf.gdf.file import Gdf, load_gdf
 from progdf.metrics.image import NO_DIFFERENCE
 from progdf.scene.strays import Strays, clean, find_strays, picture_difference
 from progdf.torch_threads import all_threads
-from viewer.state import layers as stack
 from viewer.state import selection
+from viewer.state.layers import add_layer, duplicate_layer, replace_edit
 from viewer.state.view_state import ViewState
 from viewer.state.workspace import focus_layer
 
@@ -40,7 +40,7 @@ class EditActions:
             ProgdfError: the file is missing, broken, or was made for another scene.
         """
         gdf = self._load(path)
-        view = stack.add_layer(self._app.main_view.work.view, self._open(gdf, path), gdf.name)
+        view = add_layer(self._app.main_view.work.view, self._open(gdf, path), gdf.name)
         self._apply(view, len(view.layers) - 1)
 
     def duplicate(self, index: int) -> None:
@@ -48,7 +48,7 @@ class EditActions:
         document, view = self._app.document, self._app.main_view.work.view
         gdf = view.layers[index].gdf
         path = document.gdf_paths[gdf] if gdf < len(document.gdf_paths) else None
-        self._apply(stack.duplicate_layer(view, index, self._open(document.gdfs[gdf], path)), index + 1)
+        self._apply(duplicate_layer(view, index, self._open(document.gdfs[gdf], path)), index + 1)
 
     def replace(self, index: int, path: Path) -> None:
         """Another edit in a layer's place.
@@ -58,7 +58,7 @@ class EditActions:
         """
         gdf = self._load(path)
         view = self._app.main_view.work.view
-        self._apply(stack.replace_edit(view, index, self._open(gdf, path), gdf.name), index)
+        self._apply(replace_edit(view, index, self._open(gdf, path), gdf.name), index)
 
     def layer(self, index: str) -> int:
         """The layer that a request is about: the focused one where none is named.

@@ -21,7 +21,7 @@ from viewer.files.typed_paths import parse_path, session_file
 from viewer.state import workspace
 from viewer.state.view_state import on_another_scene
 from viewer.state.workspace import Dialog
-from viewer.ui import native_dialogs as native
+from viewer.ui import native_dialogs
 
 from . import view_actions
 from .application import Application, error_details, failure_line, log_error
@@ -41,7 +41,7 @@ class FileActions:
         self._app, self.path, self._memory = app, path, memory
         self.session_autosave = SessionAutosave()
         self._put_off: set[Path] = set()  # autosaves that were found and are to be decided about later
-        self._browser = native.Browser()
+        self._browser = native_dialogs.Browser()
         self._edits = EditActions(app)
         opened = app.document
         app.main_view.recent = self._remember(*(file for file in (opened.path, path) if file is not None))
@@ -92,7 +92,7 @@ class FileActions:
         asked = self._browser.poll(main_view.work.dialog)
         if asked is not None and asked != main_view.work.dialog:
             main_view.ask(asked)
-        return native.POLL_S if self._browser.on_screen else None
+        return native_dialogs.POLL_S if self._browser.on_screen else None
 
     @property
     def has_unsaved(self) -> bool:

@@ -16,7 +16,7 @@ import moderngl
 from imgui_bundle import imgui
 
 from progdf.errors import ProgdfError
-from viewer.files import exports as saved_files
+from viewer.files import exports
 from viewer.gl.present import read_rgb
 from viewer.panel import new_edit_form, panel
 from viewer.render.engine import ViewEngine, drawn_size
@@ -409,7 +409,7 @@ class MainView:
 
     def _save_files(self, screen: moderngl.Framebuffer, size: tuple[int, int]) -> None:
         """Serve the requests for files that the main view can make by itself."""
-        known = (*saved_files.REQUESTS, "copy_values", "paste_values")
+        known = (*exports.REQUESTS, "copy_values", "paste_values")
         served = [request for request in self.work.requests if request in known]
         left = tuple(request for request in self.work.requests if request not in served)
         self.work = replace(self.work, requests=left)
@@ -427,9 +427,9 @@ class MainView:
             self.work, what = layer_selection.paste_values(self.work, imgui.get_clipboard_text())
             return f"Pasted strength and gains to {what}"
         if request == "timeline_file":
-            return saved_files.timeline(self.pictures, title, view, self.facts.origin)
+            return exports.timeline(self.pictures, title, view, self.facts.origin)
         if request == "window_picture":
-            return saved_files.picture(self.pictures, title, read_rgb(screen, size))
+            return exports.picture(self.pictures, title, read_rgb(screen, size))
         taken = request == "take_view"
         seen = self.work.view if taken else view
         return self.canvas.save(self.pictures, title, seen, self._pointer().size, taken)

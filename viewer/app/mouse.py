@@ -13,8 +13,8 @@ from viewer.panel import brush
 from viewer.render.picking import layer_at, seen_at, surface_point
 from viewer.select import hand
 from viewer.select.gesture import Click, Gesture
-from viewer.state import layers as stack
 from viewer.state import paint, workspace
+from viewer.state.layers import with_paint
 from viewer.state.paint import Stroke
 from viewer.state.view_state import Brush, SelectTool, ViewState
 from viewer.state.workspace import Workspace
@@ -157,7 +157,7 @@ def _paint(tool: MouseTool, work: Workspace, pointer: PointerContext) -> tuple[M
         return tool, work
     density = imgui.get_io().display_framebuffer_scale.x * pointer.ui.scale
     stroke = paint.extend_stroke(tool.stroke, *pointer.cursor, view.brush, density)
-    painted = stack.with_paint(view, focus, paint.apply_stroke(stroke, view.brush, density))
+    painted = with_paint(view, focus, paint.apply_stroke(stroke, view.brush, density))
     return replace(tool, stroke=stroke), replace(work, view=painted)
 
 

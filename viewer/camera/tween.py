@@ -16,9 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pyrr import matrix33, quaternion
 
-from viewer.camera import view_camera as turntable
 from viewer.camera.up_axis import Vec3
-from viewer.camera.view_camera import ViewCamera
+from viewer.camera.view_camera import ViewCamera, axes, look_along
 
 EASINGS = ("smooth", "linear", "hold")
 Point = tuple[int, str, float]
@@ -96,12 +95,12 @@ def _slerp(placed: ViewCamera, here: ViewCamera, there: ViewCamera, share: float
     """`placed` with an orientation between two others; its up axis is what is up in the picture then."""
     between = quaternion.normalize(quaternion.slerp(_orientation(here), _orientation(there), share))
     _, up, back = matrix33.create_from_quaternion(between)
-    return turntable.look_along(replace(placed, up=_vec3(up)), _vec3(back))
+    return look_along(replace(placed, up=_vec3(up)), _vec3(back))
 
 
 def _orientation(camera: ViewCamera) -> NDArray[np.float64]:
     """The picture's axes as a unit quaternion, xyzw as pyrr has them. [4]"""
-    picture = turntable.axes(camera)
+    picture = axes(camera)
     rows = np.array([picture.right, picture.up, picture.back], dtype=np.float64)
     turned: NDArray[np.float64] = quaternion.create_from_matrix(rows)
     return turned

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from progdf.errors import ProgdfError
 from progdf.gdf.file import Gdf
 from progdf.io.npy import open_npy
-from viewer.state import layers as stack
+from viewer.state.layers import SLIDERS, with_slider_value
 from viewer.state.paint import encode
 from viewer.state.view_state import OVERSHOOT, LayerState
 
@@ -47,7 +47,7 @@ def stack_of(
     layers = {layer.name: layer for layer in layers_of(gdfs, settings, most, unset)}
     for text in gains:
         name, kind, gain = _gain(text, gdfs)
-        layers[name] = stack.with_slider_value(layers[name], kind, gain)
+        layers[name] = with_slider_value(layers[name], kind, gain)
     for name in solo:
         known_edit(name, gdfs, "--solo")
         layers[name] = replace(layers[name], solo=True)
@@ -82,7 +82,7 @@ def _weights(path: Path, gdf: Gdf) -> NDArray[np.float32]:
 
 def _gain(text: str, gdfs: Sequence[Gdf]) -> tuple[str, str, float]:
     """Name, kind and number of `NAME:KIND=G`."""
-    kinds = stack.SLIDERS[1:]
+    kinds = SLIDERS[1:]
     right = f"write NAME:KIND=G, for example {gdfs[0].name if gdfs else 'NAME'}:color=0.5"
     left, equals, number = text.rpartition("=")
     name, colon, kind = left.rpartition(":")

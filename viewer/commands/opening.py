@@ -13,7 +13,7 @@ from viewer.camera.up_axis import Vec3, up_of
 from viewer.camera.view_camera import with_up
 from viewer.files import document, session
 from viewer.files.document import Document
-from viewer.state import layers as stack
+from viewer.state.layers import largest_strength
 from viewer.state.snapshots import SliderSnapshot
 from viewer.state.view_state import ViewState
 
@@ -138,7 +138,7 @@ def _session(options: StackOptions) -> OpenStack:
     settings = [
         f"{found.layer(name)}{equals}{s}" for name, equals, s in (t.rpartition("=") for t in options.set)
     ]
-    strengths = arguments.strengths_of(kept.view.layers, settings, stack.largest_strength(kept.view))
+    strengths = arguments.strengths_of(kept.view.layers, settings, largest_strength(kept.view))
     layers = (replace(l, strength=strengths.get(l.name, l.strength)) for l in kept.view.layers)
     view = replace(kept.view, layers=tuple(layers), blend=options.blend or kept.view.blend)
     if _up_option(options) != "auto":  # else the session's own

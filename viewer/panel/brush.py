@@ -8,12 +8,11 @@ from itertools import pairwise
 from imgui_bundle import imgui
 
 from viewer.render import highlight
-from viewer.state import layers as stack
+from viewer.state.layers import is_visible
 from viewer.state.view_state import BRUSH_MODES, LARGEST_PX, SMALLEST_PX, Brush, ViewState
 from viewer.ui.context import PALETTE, SMALL_PX, Icon, UiContext, u32
 from viewer.ui.keys import shortcut
-from viewer.ui.widgets import choice, icon_button, label, tip, value_slider
-from viewer.ui.widgets import section as heading
+from viewer.ui.widgets import choice, icon_button, label, section, tip, value_slider
 
 DRAG = "brush"
 """What a left drag does while the brush is active, beside those of `keys.DRAGS`."""
@@ -35,16 +34,16 @@ def obstacle(view: ViewState, focus: int | None) -> str:
     layer = view.layers[focus]
     if layer.locked:
         return f"{layer.name} is locked; press Shift+L to unlock it"
-    if not stack.is_visible(view, layer):
+    if not is_visible(view, layer):
         return f"{layer.name} is hidden; press H to show it"
     return ""
 
 
-def section(view: ViewState, focus: int | None, ui: UiContext, actions: list[str]) -> ViewState:
+def draw(view: ViewState, focus: int | None, ui: UiContext, actions: list[str]) -> ViewState:
     """The brush's controls."""
     column, brush = 82.0 * ui.scale, view.brush
     imgui.dummy(imgui.ImVec2(0.0, 4.0 * ui.scale))
-    heading("Paint", ui)
+    section("Paint", ui)
     label("Brush", column)
     mode = choice("brush mode", tuple(NAMES[m] for m in BRUSH_MODES), BRUSH_MODES.index(brush.mode), ui)
     tip(f"Brush mode ({shortcut('brush_mode')}). While painting, Ctrl inverts and Shift smooths")

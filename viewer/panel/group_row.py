@@ -8,7 +8,7 @@ from imgui_bundle import imgui
 
 from viewer.panel import strength_slider
 from viewer.panel.layer_card import COMPACT_PX, SLIDER_PX, SLIM_PX
-from viewer.state import layers as stack
+from viewer.state.layers import change_group, toggle_collapsed
 from viewer.state.view_state import LayerGroup, ViewState
 from viewer.ui.context import PALETTE, Icon, UiContext, u32
 from viewer.ui.keys import shortcut
@@ -30,11 +30,11 @@ def draw(
     imgui.begin_group()
     right = right_edge() - COMPACT_PX * scale
     if _fold(folded, ui):
-        state = stack.toggle_collapsed(state, group.name)
+        state = toggle_collapsed(state, group.name)
     tip("List its layers, or not")
     imgui.same_line(0.0, 0.0)
     if icon_button("eye", Icon.SHOWN if group.enabled else Icon.HIDDEN, ui, dim=not group.enabled):
-        state = stack.change_group(state, group.name, lambda old: replace(old, enabled=not old.enabled))
+        state = change_group(state, group.name, lambda old: replace(old, enabled=not old.enabled))
     tip("Show or hide the group")
     imgui.same_line(0.0, 4.0 * scale)
     number = f"{group.strength:.2f}"
@@ -64,7 +64,7 @@ def draw(
     imgui.pop_id()
     if strength == group.strength:
         return state, gesture
-    return stack.change_group(state, group.name, lambda old: replace(old, strength=strength)), gesture
+    return change_group(state, group.name, lambda old: replace(old, strength=strength)), gesture
 
 
 def _fold(folded: bool, ui: UiContext) -> bool:

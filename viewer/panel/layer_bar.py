@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from imgui_bundle import imgui
 
 from viewer.panel import strength_slider
-from viewer.state import layers as stack
 from viewer.state.layer_selection import master_strength
+from viewer.state.layers import largest_strength
 from viewer.state.view_state import ViewState
 from viewer.state.workspace import Workspace, is_compact
 from viewer.ui.context import PALETTE, SMALL_PX, Icon, UiContext, u32
@@ -79,7 +79,7 @@ def selection(state: ViewState, chosen: Sequence[int], ui: UiContext, actions: l
         tip(help_, action)
     imgui.pop_font()
     imgui.pop_style_var()
-    value, most = master_strength(state, chosen), stack.largest_strength(state)
+    value, most = master_strength(state, chosen), largest_strength(state)
     number = imgui.calc_text_size(f"{value:.3f}").x
     imgui.begin_disabled(all(state.layers[i].locked for i in chosen))
     at = imgui.get_cursor_screen_pos()

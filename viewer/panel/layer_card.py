@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 
 from imgui_bundle import imgui
 
-from viewer.panel import layer_details as layer_fold
 from viewer.panel import strength_slider
-from viewer.state import layers as stack
+from viewer.panel.layer_details import draw
 from viewer.state.layer_facts import LayerRow
+from viewer.state.layers import change_layer, largest_strength, rename_layer, toggle_details, toggle_solo
 from viewer.state.view_state import LayerState, ViewState
 from viewer.state.workspace import Workspace, is_compact
 from viewer.ui.context import PALETTE, Icon, Rgba, UiContext, u32
@@ -75,7 +75,7 @@ def draw_card(
     scale, p, compact = ui.scale, PALETTE, is_compact(work)
     layer, focused = work.view.layers[index], work.focus == index
     selected = focused or layer.gdf in work.selected
-    row, most = rows[layer.gdf], stack.largest_strength(work.view)
+    row, most = rows[layer.gdf], largest_strength(work.view)
     imgui.push_id(index)
     canvas = imgui.get_window_draw_list()
     clip = canvas.get_clip_rect_min(), canvas.get_clip_rect_max()
@@ -107,7 +107,7 @@ def draw_card(
         work = _foot(work, index, row, ui)
     if layer.gdf in work.view.unfolded:
         active_slider = work.active_slider if focused else None
-        unfolded = layer_fold.draw(work.view.layers[index], row, active_slider, most, ui)
+        unfolded = draw(work.view.layers[index], row, active_slider, most, ui)
         work = _change_layer(work, index, lambda _: unfolded)
         if compact:
             imgui.dummy(imgui.ImVec2(0.0, 2.0 * scale))
@@ -143,7 +143,7 @@ def _begin_card(selected: bool, compact: bool, scale: float) -> None:
 
 
 def _change_layer(work: Workspace, index: int, change: Callable[[LayerState], LayerState]) -> Workspace:
-    return replace(work, view=stack.change_layer(work.view, index, change))
+    return replace(work, view=change_layer(work.view, index, change))
 
 
 def _press(named: bool) -> str:
@@ -206,7 +206,7 @@ def _head(
     right, gap = right_edge(), 4.0 * scale if compact else imgui.get_style().item_spacing.x
     if icon_button("eye", Icon.SHOWN if layer.enabled else Icon.HIDDEN, ui, dim=not active):
         if imgui.get_io().key_alt:
-            work = replace(work, view=stack.toggle_solo(work.view, index))
+            work = replace(work, view=toggle_solo(work.view, index))
         else:
             work = _change_layer(work, index, lambda old: replace(old, enabled=not old.enabled))
     tip(f"Show or hide ({shortcut('hide')}). Alt+click: solo")
@@ -249,7 +249,7 @@ def _name(
     if work.renaming == index:
         text = typed_name(layer.name, room)
         if text is not None:
-            work = replace(work, renaming=None, view=stack.rename_layer(work.view, index, text))
+            work = replace(work, renaming=None, view=rename_layer(work.view, index, text))
         return work, CardTouch()
     x, y = imgui.get_cursor_screen_pos()
     imgui.invisible_button("name", imgui.ImVec2(max(room, 1.0), imgui.get_frame_height()))
@@ -293,15 +293,15 @@ def _foot(work: Workspace, index: int, row: LayerRow, ui: UiContext) -> Workspac
     view = work.view
     imgui.same_line(right - 4 * wide)
     if small_toggle("solo", "S", layer.solo, wide, ui):
-        view = stack.toggle_solo(view, index)
+        view = toggle_solo(view, index)
     tip("Solo: show only soloed layers", "solo")
     imgui.same_line(right - 3 * wide)
     if small_toggle("lock", Icon.LOCKED if layer.locked else Icon.UNLOCKED, layer.locked, wide, ui):
-        view = stack.change_layer(view, index, lambda old: replace(old, locked=not old.locked))
+        view = change_layer(view, index, lambda old: replace(old, locked=not old.locked))
     tip("Lock strength, gains and paint", "lock")
     imgui.same_line(right - 2 * wide)
     if small_toggle("fold", Icon.GAINS, layer.gdf in view.unfolded, wide, ui):
-        view = stack.toggle_details(view, index)
+        view = toggle_details(view, index)
     tip("Show gains and the curve of visible change", "fold")
     imgui.same_line(right - wide)
     if small_toggle("menu", Icon.MENU, False, wide, ui):

@@ -14,9 +14,9 @@ from imgui_bundle import imgui
 from progdf.compose.reference import BLENDS
 from viewer.panel import group_row, layer_bar
 from viewer.panel.layer_card import draw_card
-from viewer.state import layers as stack
 from viewer.state.layer_facts import LayerRow
 from viewer.state.layer_selection import filter_layers, selected_layers
+from viewer.state.layers import move_layers, visible_layers, with_overshoot
 from viewer.state.view_state import OVERSHOOT, LayerGroup, ViewState
 from viewer.state.workspace import Workspace, is_compact
 from viewer.ui.context import PALETTE, UiContext, u32
@@ -93,7 +93,7 @@ def _overshoot(state: ViewState, width: float) -> ViewState:
         imgui.push_style_color(slot, imgui.ImVec4(*color))
     imgui.push_style_var(imgui.StyleVar_.frame_padding, imgui.ImVec2(0.0, imgui.get_style().frame_padding.y))
     if imgui.button(f"{OVERSHOOT:g}##overshoot", imgui.ImVec2(width, 0.0)):
-        state = stack.with_overshoot(state, not on)
+        state = with_overshoot(state, not on)
     imgui.pop_style_var()
     imgui.pop_style_color(2)
     tip(f"Overshoot to {OVERSHOOT:g} ({shortcut('overshoot')}): extrapolates past the trained range")
@@ -128,7 +128,7 @@ def draw(
     focus, group = work.focus, ""
     dragged, gesture = -1, ""  # one of the lines, and what the hand does with it
     lines: list[_Row] = []
-    visible = {layer.name for layer in stack.visible_layers(work.view)}
+    visible = {layer.name for layer in visible_layers(work.view)}
     for i in listed:
         layer = work.view.layers[i]
         if layer.group and layer.group != group:
@@ -186,7 +186,7 @@ def _drag(
     if not rows[dragged].heads and layers[0] in chosen:
         layers = chosen
     y, place, group = _nearest_gap(state, rows, layers, rows[dragged].heads, imgui.get_mouse_pos().y)
-    moved = stack.move_layers(state, layers, place, group)
+    moved = move_layers(state, layers, place, group)
     if gesture == "dragged":
         _show_place(y if moved.layers != state.layers else None, bool(group), layers, rows, ui)
         return state, focus

@@ -6,14 +6,14 @@ from collections.abc import Sequence
 
 from imgui_bundle import imgui
 
-from viewer.state import layers as stack
 from viewer.state.layer_facts import STEPS, LayerRow
+from viewer.state.layers import SLIDERS, slider_value, with_slider_value
 from viewer.state.view_state import LayerState
 from viewer.ui.context import PALETTE, SMALL_PX, UiContext, u32
 from viewer.ui.widgets import label, tip, value_slider
 
 CURVE_PX = 52.0  # at 1×
-GAINS = stack.SLIDERS[1:]
+GAINS = SLIDERS[1:]
 
 
 def draw(
@@ -44,14 +44,14 @@ def _gain(layer: LayerState, kind: str, moves: bool, active: bool, ui: UiContext
     if active:
         imgui.pop_style_color()
     imgui.begin_disabled(not moves)
-    value = stack.slider_value(layer, kind)
+    value = slider_value(layer, kind)
     new = value_slider(f"##{kind}", value, (0.0, 1.0), "%.2f", 1.0, ui)
     imgui.end_disabled()
     if moves:
         tip(f"How much of the {kind} change is applied (Tab, then arrow keys). Double-click: reset to 1")
     else:
         tip(f"This edit does not change the {kind}")
-    return layer if new == value else stack.with_slider_value(layer, kind, new)
+    return layer if new == value else with_slider_value(layer, kind, new)
 
 
 def value_at(curve: Sequence[float], strength: float) -> float:

@@ -98,7 +98,7 @@ def draw(
     work = layer_cards.draw(work, facts.rows, reveal, ui, actions)
     view, pointed = work.view, work.pointed
     if view.brush.active:
-        view = brush.section(view, work.focus, ui, actions)
+        view = brush.draw(view, work.focus, ui, actions)
     view, under = selection_section.draw(view, ui, actions)
     pointed = pointed or under or selection_section.draw_regions(view.selection.regions, ui, actions)
     view = _view(view, obstacle(facts.recordings), len(textures) > 1, ui, actions)

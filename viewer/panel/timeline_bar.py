@@ -10,8 +10,8 @@ import math
 from imgui_bundle import icons_fontawesome_6 as icons
 from imgui_bundle import imgui
 
-from viewer.state import timeline as tl
 from viewer.state.playback import Player
+from viewer.state.timeline import EASINGS, key_at, key_before
 from viewer.state.view_state import FASTEST, LONGEST, Timeline
 from viewer.ui.context import PALETTE, SMALL_PX, UiContext, u32
 from viewer.ui.keys import shortcut
@@ -86,7 +86,7 @@ def _buttons(timeline: Timeline, player: Player, frame: int, actions: list[str],
     can_play = len(timeline.keys) > 1
     tip(*("Play or pause", "play") if can_play else ("Set at least two keyframes to play",))
     imgui.same_line(0.0, gap)
-    on_key = tl.key_at(timeline, frame) is not None
+    on_key = key_at(timeline, frame) is not None
     if icon_button("key", icons.ICON_FA_DIAMOND, ui):
         actions.append("key")
     tip("Update keyframe" if on_key else "Insert keyframe: camera and all strengths", "key")
@@ -102,7 +102,7 @@ def _buttons(timeline: Timeline, player: Player, frame: int, actions: list[str],
 def _settings(timeline: Timeline, frame: int, actions: list[str], ui: UiContext) -> None:
     gap = 4.0 * ui.scale
     imgui.begin_disabled(not timeline.keys)
-    easing = tl.key_before(timeline, frame).easing if timeline.keys else tl.EASINGS[0]
+    easing = key_before(timeline, frame).easing if timeline.keys else EASINGS[0]
     if imgui.button(f"{easing.capitalize()}##easing", imgui.ImVec2(62.0 * ui.scale, 0.0)):
         actions.append("easing")
     imgui.end_disabled()
@@ -152,7 +152,7 @@ def _ruler(timeline: Timeline, frame: int, wide: float, actions: list[str], ui: 
         moved = imgui.get_mouse_drag_delta(0, 3.0 * scale).x != 0.0 or imgui.is_item_deactivated()
         if held < 0 and to != frame:
             actions.append(f"seek:{to}")
-        elif held >= 0 and moved and to != held and tl.key_at(timeline, to) is None:
+        elif held >= 0 and moved and to != held and key_at(timeline, to) is None:
             actions.append(f"move_key:{held}>{to}")
             storage.set_int(slot, to)
     if under is not None:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from progdf.errors import ProgdfError
-from progdf.io import images as pictures
+from progdf.io import images
 from progdf.io.atomic import is_temporary, temporary_subfolder, write_error
 from viewer.state.view_state import ViewState
 
@@ -67,8 +67,8 @@ def grid(down: str, across: str, draw: Draw, view: ViewState) -> Pixels:
 
 
 def _sheet(rows: list[list[Pixels]], row_labels: list[str], column_labels: list[str]) -> Pixels:
-    images = [[torch.from_numpy(picture).float() / 255.0 for picture in row] for row in rows]
-    return to_pixels(pictures.contact_sheet(images, row_labels, column_labels).numpy())
+    tensors = [[torch.from_numpy(picture).float() / 255.0 for picture in row] for row in rows]
+    return to_pixels(images.contact_sheet(tensors, row_labels, column_labels).numpy())
 
 
 def write_gif(path: Path, frames: Iterable[Pixels]) -> None:

@@ -11,7 +11,7 @@ from PIL import Image
 
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
-from progdf.io import images as pictures
+from progdf.io import images
 from progdf.io.atomic import atomic_write
 from viewer.camera.view_camera import to_camera
 from viewer.render.engine import ViewEngine
@@ -71,7 +71,7 @@ def sheet(shown: Timeline, view: ViewState, still: Camera, engine: ViewEngine, c
     said = [f"frame {number}, {number / shown.fps:.2f} s" for number in numbers]
     columns = math.ceil(math.sqrt(len(numbers)))
     rows = range(0, len(numbers), columns)
-    page = pictures.contact_sheet(
+    page = images.contact_sheet(
         [drawn[i : i + columns] for i in rows], notes=[said[i : i + columns] for i in rows]
     )
     return film.to_pixels(page.numpy())

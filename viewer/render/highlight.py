@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from progdf.gdf.file import Gdf
-from viewer.state import layers as stack
 from viewer.state import paint
+from viewer.state.layers import is_visible
 from viewer.state.selection import NOBODY, Color, unpack
 from viewer.state.view_state import ViewState
 from viewer.state.workspace import Pointed
@@ -89,7 +89,7 @@ def requested_highlight(
         return Highlight(region=view.layers[index].gdf)
     if view.brush.active:
         layer = None if focus is None or focus >= len(view.layers) else view.layers[focus]
-        if layer is None or not stack.is_visible(view, layer):
+        if layer is None or not is_visible(view, layer):
             return None
         return Highlight(layer.gdf, layer.paint, thin=not view.brush.weights)
     tinted = [

@@ -13,8 +13,7 @@ from viewer.state.workspace import Workspace
 from viewer.ui.keys import Keys
 from viewer.ui.pointer import PointerContext
 
-from . import gesture as gestures
-from .gesture import Click, Gesture
+from .gesture import Click, Gesture, begin, clicked, enclosed, extend
 
 DRAG = "select"
 """What a left drag does while a tool selects, beside those of `keys.DRAGS`."""
@@ -41,9 +40,7 @@ def press(gesture: Gesture | None, work: Workspace, pointer: PointerContext) -> 
         if imgui.is_mouse_double_clicked(0) or _is_near(gesture, pointer):
             return finish(gesture, work, pointer)
         return replace(gesture, path=(*gesture.path, at)), work
-    begun_at = gestures.begin(
-        tool.tool, mode(tool.mode), view.selection.members, at, pointer.surface, tool.through
-    )
+    begun_at = begin(tool.tool, mode(tool.mode), view.selection.members, at, pointer.surface, tool.through)
     return (None, work) if begun_at is None else follow(begun_at, work, pointer)
 
 
@@ -77,7 +74,7 @@ def adjust(click: Click | None, work: Workspace, pointer: PointerContext) -> tup
 def _click(click: Click, work: Workspace, pointer: PointerContext) -> tuple[Click, Workspace]:
     """What a click selects by the tool as it is now."""
     options = work.view.select.tolerance, work.view.select.through
-    found = gestures.clicked(click.tool, click.at, click.surface, *options, pointer.facts.neighborhood)
+    found = clicked(click.tool, click.at, click.surface, *options, pointer.facts.neighborhood)
     if found is not None:
         work = _apply(click, work, found, pointer)
     return replace(click, options=options, after=work.view.selection.members), work
@@ -88,7 +85,7 @@ def follow(gesture: Gesture, work: Workspace, pointer: PointerContext) -> Held:
     if gesture.tool == "polygon":
         return gesture, work
     density = imgui.get_io().display_framebuffer_scale.x * pointer.ui.scale
-    gesture = gestures.extend(gesture, pointer.cursor, work.view.select.radius * density)
+    gesture = extend(gesture, pointer.cursor, work.view.select.radius * density)
     if gesture.tool in ("brush", "sphere"):
         work = _apply(gesture, work, _enclosed(gesture, work, pointer), pointer)
     return gesture, work
@@ -135,7 +132,7 @@ def _is_near(gesture: Gesture, pointer: PointerContext) -> bool:
 
 
 def _enclosed(gesture: Gesture, work: Workspace, pointer: PointerContext) -> Mask:
-    return gestures.enclosed(gesture, pointer.surface, work.view.select.through)
+    return enclosed(gesture, pointer.surface, work.view.select.through)
 
 
 def _apply(gesture: Gesture | Click, work: Workspace, found: Mask, pointer: PointerContext) -> Workspace:

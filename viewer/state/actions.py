@@ -16,10 +16,19 @@ from viewer.camera import controls
 from viewer.camera.named_views import look_at_view
 from viewer.camera.view_camera import FARTHEST
 from viewer.jobs.new_edit import ALL, CHANGED, SELECTION, TYPED
-from viewer.state import comparison as compare
 from viewer.state import history, layer_selection, paint, playback, selection, snapshots
-from viewer.state import layers as stack
+from viewer.state.comparison import toggle_against, toggle_mode, toggle_snapshots
 from viewer.state.history import History
+from viewer.state.layers import (
+    SLIDERS,
+    change_group,
+    change_layer,
+    index_of,
+    show_all,
+    toggle_details,
+    with_overshoot,
+    with_paint,
+)
 from viewer.state.view_state import ViewState, next_resolution_mode
 from viewer.state.workspace import (
     REQUESTS,
@@ -95,12 +104,12 @@ def _look(workspace: Workspace, name: str) -> Workspace:
 
 def _focus(workspace: Workspace, number: str) -> Workspace:
     """By its number, counted from 1 at the top of the panel's list."""
-    return focus_layer(workspace, stack.index_of(workspace.view, int(number) - 1))
+    return focus_layer(workspace, index_of(workspace.view, int(number) - 1))
 
 
 def _toggle(workspace: Workspace, number: str) -> Workspace:
-    index = stack.index_of(workspace.view, int(number) - 1)
-    view = stack.change_layer(workspace.view, index, lambda layer: replace(layer, enabled=not layer.enabled))
+    index = index_of(workspace.view, int(number) - 1)
+    view = change_layer(workspace.view, index, lambda layer: replace(layer, enabled=not layer.enabled))
     return replace(workspace, view=view)
 
 
@@ -109,7 +118,7 @@ def _select_slider(workspace: Workspace, by: int, facts: SceneFacts) -> Workspac
     if workspace.focus is None:
         return workspace
     view, gdf = workspace.view, workspace.view.layers[workspace.focus].gdf
-    sliders = [slider for slider in stack.SLIDERS if slider in ("strength", *facts.rows[gdf].kinds)]
+    sliders = [slider for slider in SLIDERS if slider in ("strength", *facts.rows[gdf].kinds)]
     place = sliders.index(workspace.active_slider) if workspace.active_slider in sliders else 0
     slider = sliders[(place + by) % len(sliders)]
     if slider != "strength" and gdf not in view.unfolded:
@@ -137,11 +146,11 @@ def _repaint(workspace: Workspace, how: str, facts: SceneFacts) -> Workspace:
         row = facts.rows[layer.gdf]
         if how == "paint_feather":
             width = max(FEATHER * row.bounds.radius, FARTHEST**-1)
-            return stack.with_paint(view, index, paint.feather(layer.paint, row.points, width))
+            return with_paint(view, index, paint.feather(layer.paint, row.points, width))
         if how == "paint_invert":
-            return stack.with_paint(view, index, paint.invert(layer.paint, row.count))
+            return with_paint(view, index, paint.invert(layer.paint, row.count))
         even = np.full(row.count, how == "paint_fill", np.float32)
-        return stack.with_paint(view, index, paint.encode(even))
+        return with_paint(view, index, paint.encode(even))
 
     return change_focused(workspace, change)
 
@@ -189,7 +198,7 @@ def _step_back(workspace: Workspace, _: str) -> Workspace:
 
 
 def _show_all(workspace: Workspace, _: str) -> Workspace:
-    view = stack.show_all(workspace.view)
+    view = show_all(workspace.view)
     return replace(workspace, view=replace(view, selection=selection.show_all(view.selection)))
 
 
@@ -197,7 +206,7 @@ def _rename_group(workspace: Workspace, argument: str) -> Workspace:
     """`INDEX:NAME`, of `view.groups`"""
     index, _, name = argument.partition(":")
     old, view = workspace.view.groups[int(index)].name, workspace.view
-    return replace(workspace, view=stack.change_group(view, old, lambda group: replace(group, name=name)))
+    return replace(workspace, view=change_group(view, old, lambda group: replace(group, name=name)))
 
 
 def _toggle_cards(workspace: Workspace, _: str) -> Workspace:
@@ -296,7 +305,7 @@ ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
     "solo": lambda workspace, _: layer_selection.switch_selected(workspace, "solo"),
     "show_all": _show_all,
     "lock": lambda workspace, _: layer_selection.switch_selected(workspace, "locked"),
-    "fold": lambda workspace, _: change_focused(workspace, stack.toggle_details),
+    "fold": lambda workspace, _: change_focused(workspace, toggle_details),
     "rename": _rename,
     "remove": layer_selection.remove,
     "press_layer": layer_selection.press,
@@ -322,7 +331,7 @@ ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
     "brush_softness": lambda w, by: _change_brush(
         w, softness=paint.softness(w.view.brush.softness + float(by))
     ),
-    "overshoot": lambda w, _: replace(w, view=stack.with_overshoot(w.view, not w.view.overshoot)),
+    "overshoot": lambda w, _: replace(w, view=with_overshoot(w.view, not w.view.overshoot)),
     "snapshot": lambda w, _: replace(w, snapshots=snapshots.take(w.snapshots, w.view)),
     "restore": _restore,
     "forget": lambda w, at: replace(w, snapshots=snapshots.remove(w.snapshots, int(at) - 1)),
@@ -337,11 +346,11 @@ ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
     "axes": lambda w, _: replace(w, view=replace(w.view, axes=not w.view.axes)),
     "help": lambda workspace, _: replace(workspace, help=not workspace.help),
     "before": lambda w, _: replace(w, before=not w.before),
-    "beside": lambda w, _: replace(w, view=compare.toggle_mode(w.view, "beside")),
-    "split": lambda w, _: replace(w, view=compare.toggle_mode(w.view, "split")),
-    "difference": lambda w, _: replace(w, view=compare.toggle_mode(w.view, "difference")),
-    "against": lambda w, _: replace(w, view=compare.toggle_against(w.view)),
-    "compare_snapshots": lambda w, _: replace(w, view=compare.toggle_snapshots(w.view)),
+    "beside": lambda w, _: replace(w, view=toggle_mode(w.view, "beside")),
+    "split": lambda w, _: replace(w, view=toggle_mode(w.view, "split")),
+    "difference": lambda w, _: replace(w, view=toggle_mode(w.view, "difference")),
+    "against": lambda w, _: replace(w, view=toggle_against(w.view)),
+    "compare_snapshots": lambda w, _: replace(w, view=toggle_snapshots(w.view)),
     "dynamic_resolution": lambda w, _: replace(w, view=next_resolution_mode(w.view)),
     "new_edit": _new_edit,
     "overlay": lambda w, _: replace(w, view=replace(w.view, overlay=not w.view.overlay)),

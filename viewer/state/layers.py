@@ -77,7 +77,7 @@ def slider_value(layer: LayerState, slider: str) -> float:
     return layer.strength if slider == "strength" else float(getattr(layer.gains, slider))
 
 
-def nudge(view: ViewState, index: int, slider: str, by: float) -> ViewState:
+def nudge_slider(view: ViewState, index: int, slider: str, by: float) -> ViewState:
     """One layer's slider a step further."""
 
     def step(layer: LayerState) -> LayerState:
@@ -242,7 +242,7 @@ def move_to_group(view: ViewState, indices: Collection[int], name: str) -> ViewS
     return tidy_groups(replace(view, layers=(*rest[:at], *moved, *rest[at:])))
 
 
-def ungroup(view: ViewState, names: Collection[str]) -> ViewState:
+def dissolve_groups(view: ViewState, names: Collection[str]) -> ViewState:
     """The layers of these groups by themselves, as they showed within them."""
     groups = {group.name: group for group in view.groups if group.name in names}
 

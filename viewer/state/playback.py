@@ -8,7 +8,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from . import timeline as tl
+from .timeline import (
+    EASINGS,
+    key_before,
+    move_key,
+    neighbor,
+    set_easing,
+    set_length,
+    state_at,
+    with_fps,
+    with_key,
+    without_key,
+)
 from .view_state import Timeline, ViewState
 
 LEAST_KEYS = 2
@@ -61,7 +72,7 @@ def perform(view: ViewState, player: Player, action: str) -> tuple[ViewState, Pl
     after = replace(after, frame=max(0, min(after.frame, timeline.length)))
     view = replace(view, timeline=timeline)
     if after.frame != player.frame:
-        view = tl.state_at(timeline, after.frame, view, LEAST_KEYS)
+        view = state_at(timeline, after.frame, view, LEAST_KEYS)
     return view, after
 
 
@@ -74,17 +85,17 @@ def _step_frames(timeline: Timeline, frame: int, backwards: bool, steps: int) ->
 
 
 def _key(view: ViewState, player: Player, _: str) -> tuple[Timeline, Player]:
-    return tl.with_key(view.timeline, player.frame, view), replace(player, shown=True)
+    return with_key(view.timeline, player.frame, view), replace(player, shown=True)
 
 
 def _drop_key(view: ViewState, player: Player, _: str) -> tuple[Timeline, Player]:
-    return tl.without_key(view.timeline, player.frame), player
+    return without_key(view.timeline, player.frame), player
 
 
 def _move_key(view: ViewState, player: Player, places: str) -> tuple[Timeline, Player]:
     """`FROM>TO`; the playhead goes with the key."""
     frame, _, to = places.partition(">")
-    moved = tl.move_key(view.timeline, int(frame), int(to))
+    moved = move_key(view.timeline, int(frame), int(to))
     went = moved is not view.timeline
     return moved, replace(player, frame=int(to), playing=False, part=0.0) if went else player
 
@@ -104,7 +115,7 @@ def _step(view: ViewState, player: Player, by: str) -> tuple[Timeline, Player]:
 
 
 def _jump(view: ViewState, player: Player, way: str) -> tuple[Timeline, Player]:
-    return view.timeline, _at(player, tl.neighbor(view.timeline, player.frame, int(way)))
+    return view.timeline, _at(player, neighbor(view.timeline, player.frame, int(way)))
 
 
 def _at(player: Player, frame: int) -> Player:
@@ -115,9 +126,9 @@ def _easing(view: ViewState, player: Player, wanted: str) -> tuple[Timeline, Pla
     """Of the key that decides at the playhead; the next one of the list where none is named."""
     if not view.timeline.keys:
         return view.timeline, player
-    now = tl.key_before(view.timeline, player.frame).easing
-    after = wanted or tl.EASINGS[(tl.EASINGS.index(now) + 1) % len(tl.EASINGS)]
-    return tl.set_easing(view.timeline, player.frame, after), player
+    now = key_before(view.timeline, player.frame).easing
+    after = wanted or EASINGS[(EASINGS.index(now) + 1) % len(EASINGS)]
+    return set_easing(view.timeline, player.frame, after), player
 
 
 def _ping_pong(view: ViewState, player: Player, _: str) -> tuple[Timeline, Player]:
@@ -140,7 +151,7 @@ ACTIONS: dict[str, Callable[[ViewState, Player, str], tuple[Timeline, Player]]] 
     "jump": _jump,
     "easing": _easing,
     "ping_pong": _ping_pong,
-    "length": lambda view, player, frames: (tl.set_length(view.timeline, int(frames)), player),
-    "fps": lambda view, player, fps: (tl.with_fps(view.timeline, int(fps)), player),
+    "length": lambda view, player, frames: (set_length(view.timeline, int(frames)), player),
+    "fps": lambda view, player, fps: (with_fps(view.timeline, int(fps)), player),
     "timeline": _bar,
 }

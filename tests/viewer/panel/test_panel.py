@@ -8,8 +8,7 @@ from dataclasses import dataclass, field
 import pytest
 from imgui_bundle import imgui
 
-from viewer.camera import view_camera as turntable
-from viewer.camera.view_camera import Bounds, ViewCamera
+from viewer.camera.view_camera import Bounds, ViewCamera, axes
 from viewer.panel import panel
 from viewer.panel.strength_slider import parse_strength
 from viewer.state import history, workspace
@@ -270,9 +269,9 @@ def test_an_up_axis_button_rolls_the_camera_upright() -> None:
 
 def test_what_is_up_in_the_picture_can_become_the_up_axis() -> None:
     hand = hand_on(ViewState())
-    before = turntable.axes(hand.work.view.camera)
+    before = axes(hand.work.view.camera)
     hand.click(SIZE[0] - 30, 247)
-    after = turntable.axes(hand.work.view.camera)
+    after = axes(hand.work.view.camera)
     assert hand.work.view.camera.elevation == pytest.approx(0.0)
     for old, new in ((before.up, after.up), (before.right, after.right)):
         assert new == pytest.approx(old), "the picture does not turn"

@@ -18,7 +18,7 @@ from progdf.metrics.image import psnr
 from tests.helpers.divided import BANNER, SIZE, beside_line
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from viewer.camera.view_camera import half_camera, to_camera
-from viewer.state import comparison as compare
+from viewer.state.comparison import toggle_mode
 from viewer.state.view_state import Comparison, ViewState
 from viewer.state.workspace import Dialog
 
@@ -234,10 +234,10 @@ def test_d_flies_where_it_is_held_and_is_the_difference_where_it_is_tapped(hand:
 
 def test_each_mode_goes_on_and_off_and_takes_over_from_the_other() -> None:
     view = ViewState()
-    split = compare.toggle_mode(view, "split")
+    split = toggle_mode(view, "split")
     assert split.compare.mode == "split"
-    assert compare.toggle_mode(split, "split") == view
-    assert compare.toggle_mode(split, "difference").compare.mode == "difference"
+    assert toggle_mode(split, "split") == view
+    assert toggle_mode(split, "difference").compare.mode == "difference"
 
 
 @pytest.fixture

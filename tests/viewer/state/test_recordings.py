@@ -25,8 +25,8 @@ from tests.helpers.stacks import recording_of
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from viewer.pictures import compare_labels
 from viewer.render.engine import ViewEngine
-from viewer.state import comparison as compare
 from viewer.state import recordings
+from viewer.state.comparison import toggle_against, toggle_mode
 from viewer.state.recordings import RecordingFile
 from viewer.state.view_state import Comparison, ViewState
 
@@ -284,10 +284,10 @@ def test_a_recording_is_shown_where_the_field_shows_it(runs: list[Path]) -> None
 
 
 def test_against_the_recording_goes_on_with_a_split_and_back_to_the_original() -> None:
-    on = compare.toggle_against(ViewState())
+    on = toggle_against(ViewState())
     assert on.compare == Comparison("split", against="recorded")
-    assert compare.toggle_against(on).compare == Comparison("split")
-    apart = compare.toggle_mode(on, "difference")
+    assert toggle_against(on).compare == Comparison("split")
+    apart = toggle_mode(on, "difference")
     assert apart.compare == Comparison("difference", against="recorded")
 
 
