@@ -18,7 +18,7 @@ from viewer.files.document import Document
 from viewer.gl.present import read_rgb
 from viewer.panel import panel
 from viewer.render.engine import ViewEngine
-from viewer.render.headless import headless_context
+from viewer.render.gl_renderer import headless_context
 from viewer.state.view_state import LayerState, ViewState
 from viewer.ui.keys import NO_KEYS, Keys, Press
 

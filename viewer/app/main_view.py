@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
@@ -20,19 +20,18 @@ from viewer.files import exports
 from viewer.gl.present import read_rgb
 from viewer.panel import new_edit_form, panel
 from viewer.render.engine import ViewEngine, drawn_size
-from viewer.render.surfaces import Surfaces
-from viewer.select import hand
-from viewer.state import comparison, layer_selection, playback, workspace
-from viewer.state.recordings import RecordingFile
+from viewer.render.picking import Surfaces
+from viewer.state import actions, layer_selection, timeline, workspace
+from viewer.state.facts import RecordingFile
 from viewer.state.snapshots import SliderSnapshot, compare_sides
 from viewer.state.view_state import LayerState, ViewState
 from viewer.state.workspace import Dialog, SceneFacts
 from viewer.ui import overlay
 from viewer.ui.context import UiContext
-from viewer.ui.frame_pacer import FramePacer
 from viewer.ui.keys import (
     NO_KEYS,
     Keys,
+    PendingKeys,
     Taps,
     cancels_drag,
     fly_by_keys,
@@ -45,13 +44,55 @@ from viewer.ui.keys import (
 )
 from viewer.ui.pointer import PointerContext
 
-from . import interface, mouse
+from . import interface, mouse, select_tool
 from .canvas import Canvas
 from .mouse import MouseTool
-from .pending_keys import PendingKeys
 from .studio import cover, start_page
 from .studio.cover import Cover
 from .studio.up_strip import UpStrip
+
+SETTLE_FRAMES = 3  # imgui takes a frame or two until hovering and layout have followed an event
+LINGER_S = 0.65
+"""Seconds after which a resting mouse gets its tooltip: a little more than imgui's own two delays."""
+
+
+class FramePacer:
+    """Counts frames, and seconds of rest, since the last event."""
+
+    def __init__(self) -> None:
+        self._unsettled = SETTLE_FRAMES
+        self._rest_left: float | None = LINGER_S  # None: the tooltip has had its frames
+
+    def wake(self) -> None:
+        """Something happened."""
+        self._unsettled, self._rest_left = SETTLE_FRAMES, LINGER_S
+
+    def rest(self) -> None:
+        """Nothing can be drawn, as the window is minimized."""
+        self._unsettled, self._rest_left = 0, None
+
+    def step(self, seconds: float) -> None:
+        """A frame begins, so long after the last one."""
+        if self._unsettled > 0:
+            self._unsettled -= 1
+        elif self._rest_left is not None:
+            self._rest_left -= seconds
+            if self._rest_left <= 0.0:
+                # imgui counts the delay up in this frame, opens the tooltip unseen in the next one to measure
+                # it, and shows it in the one after
+                self._unsettled, self._rest_left = SETTLE_FRAMES, None
+
+    def next_frame_delay(self, others: Sequence[float]) -> float | None:
+        """Seconds until the next frame is due without an event, or None: none is.
+
+        Args:
+            others: seconds until something else wants a frame
+        """
+        if self._unsettled > 0:
+            return 0.0
+        waits = [*others] if self._rest_left is None else [*others, self._rest_left]
+        return min(waits, default=None)
+
 
 FLIGHT_S = 1 / 60  # between frames while flying
 
@@ -125,9 +166,9 @@ class MainView:
         """
         self.canvas.release()
         self.surfaces.drop()
-        found = (*facts.recordings, *(RecordingFile() for _ in live))
+        recordings = (*facts.recordings, *(RecordingFile() for _ in live))
         self.engine, self.facts, self.live = engine, facts, live
-        self.canvas = Canvas(self.context, engine, found, self.canvas)
+        self.canvas = Canvas(self.context, engine, recordings, self.canvas)
         self.wake()
 
     def change(self, view: ViewState) -> None:
@@ -135,9 +176,9 @@ class MainView:
         self.work = workspace.record_undo(replace(self.work, view=view))
         self.wake()
 
-    def restart(self, view: ViewState, kept: tuple[SliderSnapshot, ...] = ()) -> None:
+    def restart(self, view: ViewState, snapshots: tuple[SliderSnapshot, ...] = ()) -> None:
         """A new state and snapshots, with nothing to undo, nothing in the hand or over the picture."""
-        self.work = workspace.new_workspace(view, kept)
+        self.work = workspace.new_workspace(view, snapshots)
         self._tool, self._taps = MouseTool(), Taps()
         self.cover, self.up_strip, self.preview_said = None, None, ("", False)
         self.wake()
@@ -154,7 +195,7 @@ class MainView:
             waits.append(max(self.work.message.until - self._clock, 0.0))
         sharpens = self.canvas.next_frame_delay(self._clock)
         waits += [] if sharpens is None else [sharpens]
-        film = playback.next_frame_delay(self.work.player, self.work.view.timeline)
+        film = timeline.next_frame_delay(self.work.player, self.work.view.timeline)
         return self._pace.next_frame_delay(waits if film is None else [*waits, film])
 
     def is_due(self) -> bool:
@@ -241,15 +282,15 @@ class MainView:
         if self.work.view.layers != before.view.layers:
             self.work = replace(self.work, before=False)
         if self.work != before:
-            view = comparison.end_at_edit(before.view, self.work.view)
+            view = actions.end_at_edit(before.view, self.work.view)
             self.work = replace(self.work, view=view)
             self.wake()
 
     def _draw_picture(self, screen: moderngl.Framebuffer) -> None:
-        shown, area = self._shown_view(), self._pointer().size
-        self.canvas.comparer.sides = compare_sides(self.work.snapshots, shown)
-        asked = (self.work.overlap, self.work.pointed) if shown.panel else (None, None)
-        self.canvas.draw(shown, screen, area, self._is_held(), self._clock, self.work.focus, *asked)
+        view, area = self._shown_view(), self._pointer().size
+        self.canvas.comparer.sides = compare_sides(self.work.snapshots, view)
+        pointed = (self.work.overlap, self.work.pointed) if view.panel else (None, None)
+        self.canvas.draw(view, screen, area, self._is_held(), self._clock, self.work.focus, *pointed)
         if self.canvas.pixels == 1 and not self._is_held():
             self._pointer().look_ahead()
 
@@ -275,7 +316,7 @@ class MainView:
             self._cancel_drag()
         view, asks = self.work.view, self._takes_keys()
         if not asks:
-            gesture, self.work, self._keys = hand.take_keys(
+            gesture, self.work, self._keys = select_tool.take_keys(
                 self._tool.gesture, self.work, self._pointer(), self._keys
             )
             self._tool = replace(self._tool, gesture=gesture)
@@ -372,10 +413,10 @@ class MainView:
         with self._guarded():
             if self.cover is not None and not original:
                 cover.draw(self.cover, self.work.view, pointer.size, pointer.area, self.ui)
-        said = self.canvas.comparer.labels(self.work.view)
+        labels = self.canvas.comparer.labels(self.work.view)
         figures = self.figures() if self.work.view.overlay else []
         self.work = interface.over_picture(
-            self.work, pointer, self._tool, said, figures, original, self.up_strip
+            self.work, pointer, self._tool, labels, figures, original, self.up_strip
         )
         gone = (before.dialog, self.work.dialog), (before.message, self.work.message)
         if any(was is not None and now is None for was, now in gone):

@@ -9,8 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-from .up_axis import Vec3
-from .view_camera import FARTHEST, ViewCamera, add_scaled, axes, eye, look_from, unit
+from .view_camera import FARTHEST, Vec3, ViewCamera, add_scaled, axes, eye, look_from, unit
 
 DEGREES_PER_PIXEL = 0.3
 ZOOM_PER_STEP = 0.12  # of the distance, per wheel step

@@ -14,9 +14,9 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
 from progdf.io.cameras import read_camera
-from viewer.camera.up_axis import Vec3
 from viewer.camera.view_camera import (
     FARTHEST,
+    Vec3,
     ViewCamera,
     bounds_of,
     first_camera,

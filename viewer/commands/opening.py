@@ -9,8 +9,7 @@ from pathlib import Path
 
 from progdf.cli.info import kind_of
 from progdf.errors import ProgdfError
-from viewer.camera.up_axis import Vec3, up_of
-from viewer.camera.view_camera import with_up
+from viewer.camera.view_camera import Vec3, up_of, with_up
 from viewer.files import document, session
 from viewer.files.document import Document
 from viewer.state.layers import largest_strength

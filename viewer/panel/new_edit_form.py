@@ -25,13 +25,14 @@ from viewer.ui.keys import shortcut
 from viewer.ui.widgets import (
     accent_button,
     card,
-    choice,
+    choice_row,
     drop_down,
     elide,
     group_digits,
     icon_button,
     label,
     right_edge,
+    slider_row,
     small,
     tip,
     value_slider,
@@ -96,16 +97,12 @@ def _content(work: Workspace, count: int, preview: tuple[str, bool], ui: UiConte
     form = _region(form, selection, count, column, ui)
     form = _editor(form, column, ui)
     form = _settings(form, column, ui)
-    label("Name", column)
-    imgui.set_next_item_width(-1.0)
     if work.form_opening:
         imgui.set_keyboard_focus_here()
-    form = replace(form, name=_text("##name", form.suggested_name, form.name))
+    form = replace(form, name=_text_row("Name", form.suggested_name, form.name, column))
     tip("Name of the layer and of its file")
-    label("Quality", column)
-    pressed = choice("quality", ("Draft", "Full"), 0 if form.quick else 1, ui)
-    tip("A draft takes a third of the time")
-    form = form if pressed is None else replace(form, quick=pressed == 0)
+    qualities, help_ = {True: "Draft", False: "Full"}, "A draft takes a third of the time"
+    form = replace(form, quick=choice_row("Quality", qualities, form.quick, column, ui, help_))
     form = _preview(form, preview, column, ui)
     error = form.error or missing_package(form.choice)
     if error:
@@ -145,10 +142,7 @@ def _region(form: NewEdit, selection: SelectionState, count: int, column: float,
     pressed = drop_down("##region", title, titles, now, ui, "What may change")
     form = form if pressed is None else replace(form, region=offered[pressed], error="")
     if form.region == TYPED:
-        imgui.dummy(imgui.ImVec2(0.0, 0.0))
-        imgui.same_line(column)
-        imgui.set_next_item_width(-1.0)
-        form = replace(form, typed_region=_text("##spec", "sphere:0,0,0,1", form.typed_region))
+        form = replace(form, typed_region=_text_row("", "sphere:0,0,0,1", form.typed_region, column))
         tip("As progdf train --region: labels:FILE.npy:ID, box:…, sphere:…, file:ROWS.npy; join by + -")
     return form
 
@@ -174,32 +168,25 @@ def _settings(form: NewEdit, column: float, ui: UiContext) -> NewEdit:
             imgui.set_next_item_width(-1.0)
             changed, (red, green, blue) = imgui.color_edit3("##color", list(form.color), hex_only)
             form = replace(form, color=(red, green, blue)) if changed else form
-            label("Path", column)
-            pressed = choice("path", ("Straight", "Hues"), int(form.through_hues), ui)
-            tip("Between original and color: the direct way, or around the color wheel")
-            form = form if pressed is None else replace(form, through_hues=pressed == 1)
+            paths = {False: "Straight", True: "Hues"}
+            help_ = "Between original and color: the direct way, or around the color wheel"
+            form = replace(form, through_hues=choice_row("Path", paths, form.through_hues, column, ui, help_))
         case "amount":
-            label("Amount", column)
-            form = replace(form, amount=value_slider("##amount", form.amount, (0.05, 0.98), "%.2f", 0.7, ui))
-            tip("Share of the light that is taken away")
+            help_ = "Share of the light that is taken away"
+            amount = slider_row("Amount", form.amount, (0.05, 0.98), 0.7, column, ui, help_)
+            form = replace(form, amount=amount)
         case "style":
             label("Style", column)
             form = _style(form, ui)
         case "sentence":
-            label("Text", column)
-            imgui.set_next_item_width(-1.0)
-            form = replace(form, sentence=_text("##sentence", "turn him into a statue", form.sentence))
+            form = replace(form, sentence=_text_row("Text", "turn him into a statue", form.sentence, column))
             tip("Needs a model on this machine; see progdf train --help")
         case "pictures":
-            label("Pictures", column)
-            imgui.set_next_item_width(-1.0)
-            form = replace(form, pictures=_text("##pictures", "A.png, B.png", form.pictures))
+            form = replace(form, pictures=_text_row("Pictures", "A.png, B.png", form.pictures, column))
             taken = f"One or a few pictures that were taken here ({shortcut('take_view')})"
             tip(f"{taken} and changed in any program")
         case "folder":
-            label("Folder", column)
-            imgui.set_next_item_width(-1.0)
-            form = replace(form, folder=_text("##folder", "FOLDER", form.folder))
+            form = replace(form, folder=_text_row("Folder", "FOLDER", form.folder, column))
             tip("Pictures of the training views, edited by any program; see progdf views")
     return form
 
@@ -246,8 +233,11 @@ def _preview(form: NewEdit, preview: tuple[str, bool], column: float, ui: UiCont
     return form
 
 
-def _text(name: str, hint: str, text: str) -> str:
-    return str(imgui.input_text_with_hint(name, hint, text)[1])
+def _text_row(title: str, hint: str, text: str, column: float) -> str:
+    """A text field to the end of its line, with its name at the left."""
+    label(title, column)
+    imgui.set_next_item_width(-1.0)
+    return str(imgui.input_text_with_hint(f"##text of {title}", hint, text)[1])
 
 
 def _effort(form: NewEdit) -> str:

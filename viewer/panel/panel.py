@@ -8,39 +8,126 @@ from pathlib import Path
 
 from imgui_bundle import imgui
 
-from viewer.camera.up_axis import Vec3
-from viewer.camera.view_camera import ViewCamera, axes, with_up
+from progdf.terminal import escape_text
+from viewer.camera.view_camera import Vec3, ViewCamera, axes, with_up
 from viewer.state import history
+from viewer.state.facts import obstacle
 from viewer.state.layer_selection import selected_layers
-from viewer.state.recordings import obstacle
 from viewer.state.view_state import AGAINST, COMPARE_MODES, MOST_AMPLIFIED, Comparison, ViewState
-from viewer.state.workspace import UNSAVED, SceneFacts, Workspace, has_unsaved
+from viewer.state.workspace import UNSAVED, SceneFacts, Workspace, has_unsaved, is_compact
 from viewer.ui.context import PALETTE, Icon, UiContext
 from viewer.ui.keys import shortcut
 from viewer.ui.widgets import (
     choice,
+    choice_row,
     elide,
     group_digits,
     icon_button,
     is_double_clicked,
     label,
+    menu,
     right_edge,
     section,
     small,
     tip,
 )
 
-from . import (
-    brush,
-    layer_bar,
-    layer_card,
-    layer_cards,
-    main_menu,
-    new_edit_form,
-    selection_section,
-    snapshot_cards,
-    training_cards,
+from . import card, cards, new_edit_form, snapshot_cards, tools, training_cards
+
+NAME = "main menu"
+MOST_PX = 360.0
+_FILES = (("Open…", "open"),)
+_SAVES = (("Save", "save"), ("Save as…", "save_as"))
+_MAKES = (
+    ("New edit", "new_edit"),
+    ("Take this view", "take_view"),
+    ("Hide strays", "hide_strays"),
+    ("Export .ply…", "export"),
+    ("Render picture…", "render_picture"),
+    ("Render film…", "render_film"),
 )
+_VIEWS = (
+    ("Front", "look:front"),
+    ("Back", "look:back"),
+    ("Right", "look:right"),
+    ("Left", "look:left"),
+    ("Top", "look:top"),
+    ("Bottom", "look:bottom"),
+)
+_LAYERS = (
+    ("Select all", "select_layers"),
+    ("Search", "search"),
+    ("Group", "group"),
+    ("Ungroup", "ungroup"),
+    ("Copy values", "copy_values"),
+    ("Paste values", "paste_values"),
+    ("Reset", "reset"),
+    ("Reset all", "reset_all"),
+)
+_FRAMES = (("Frame", "frame"), ("Home", "home"))
+_HELP = (("Shortcuts", "help"), ("About", "about"), ("Quit", "quit"))
+
+
+def _menu_button(work: Workspace, recent: Sequence[Path], ui: UiContext, actions: list[str]) -> None:
+    """The button at the right of the present line, and its menu while it is open.
+
+    `recent`: files opened before, the last one first.
+    """
+    if icon_button("menu", Icon.BARS, ui):
+        imgui.open_popup(NAME)
+    tip("Menu")
+    with menu(NAME, ui) as is_open:
+        if is_open:
+            actions += _items(_FILES)
+            actions += _recent(recent, ui)
+            actions += _items(_SAVES)
+            imgui.separator()
+            actions += _items(_MAKES)
+            imgui.separator()
+            actions += _view_menu(work.view)
+            actions += _layers_menu(work)
+            imgui.separator()
+            actions += _items(_HELP)
+
+
+def _items(items: Sequence[tuple[str, str]]) -> list[str]:
+    return [action for name, action in items if imgui.menu_item(name, shortcut(action), False)[0]]
+
+
+def _view_menu(view: ViewState) -> list[str]:
+    actions: list[str] = []
+    if imgui.begin_menu("View"):
+        actions += _items(_VIEWS)
+        imgui.separator()
+        actions += _items(_FRAMES)
+        imgui.separator()
+        for name, action, on in (("Ground grid", "grid", view.grid), ("Axes", "axes", view.axes)):
+            actions += [action] * bool(imgui.menu_item(name, shortcut(action), on)[0])
+        imgui.end_menu()
+    return actions
+
+
+def _layers_menu(work: Workspace) -> list[str]:
+    actions: list[str] = []
+    if imgui.begin_menu("Layers", bool(work.view.layers)):
+        actions += _items(_LAYERS)
+        imgui.separator()
+        actions += ["cards"] * bool(imgui.menu_item("Compact rows", shortcut("cards"), is_compact(work))[0])
+        imgui.end_menu()
+    return actions
+
+
+def _recent(recent: Sequence[Path], ui: UiContext) -> list[str]:
+    actions: list[str] = []
+    if imgui.begin_menu("Recent", bool(recent)):
+        for i, path in enumerate(recent):
+            name = elide(escape_text(path.name), MOST_PX * ui.scale)
+            if imgui.menu_item(f"{name}##{i}", "", False)[0]:
+                actions.append(f"open_file:{path}")
+            tip(escape_text(str(path)))
+        imgui.end_menu()
+    return actions
+
 
 WIDTH_PX = 300.0  # at 1×
 
@@ -87,25 +174,25 @@ def draw(
     imgui.begin("panel", None, _FLAGS)
     _title(work, facts, recent, ui, actions)
     footer = imgui.get_frame_height() + imgui.get_style().item_spacing.y * 2
-    room = imgui.get_content_region_avail().y - footer - layer_cards.HEADING_PX * ui.scale
-    work = replace(work, cards_fit=len(work.view.layers) * layer_card.CARD_PX * ui.scale <= room)
+    room = imgui.get_content_region_avail().y - footer - cards.HEADING_PX * ui.scale
+    work = replace(work, cards_fit=len(work.view.layers) * card.CARD_PX * ui.scale <= room)
     selected = selected_layers(work)
-    _begin_body(footer + layer_bar.selection_height(selected, ui))
-    work = replace(work, view=layer_cards.heading(work.view, work.form_open, ui, actions))
+    _begin_body(footer + cards.selection_height(selected, ui))
+    work = replace(work, view=cards.heading(work.view, work.form_open, ui, actions))
     work = new_edit_form.draw(work, facts.count, preview, ui, actions)
     training_cards.draw(work.jobs, ui, actions)
     training_cards.draw_deliveries(work.deliveries, ui, actions)
-    work = layer_cards.draw(work, facts.rows, reveal, ui, actions)
+    work = cards.draw(work, facts.rows, reveal, ui, actions)
     view, pointed = work.view, work.pointed
     if view.brush.active:
-        view = brush.draw(view, work.focus, ui, actions)
-    view, under = selection_section.draw(view, ui, actions)
-    pointed = pointed or under or selection_section.draw_regions(view.selection.regions, ui, actions)
+        view = tools.draw_brush(view, work.focus, ui, actions)
+    view, under = tools.draw(view, ui, actions)
+    pointed = pointed or under or tools.draw_regions(view.selection.regions, ui, actions)
     view = _view(view, obstacle(facts.recordings), len(textures) > 1, ui, actions)
     work = replace(work, view=view, pointed=pointed)
     snapshot_cards.draw(work, facts.rows, textures, ui, actions)
     _end_body()
-    layer_bar.selection(work.view, selected, ui, actions)
+    cards.draw_selection(work.view, selected, ui, actions)
     _footer(work, ui, actions)
     imgui.end()
     return work
@@ -149,21 +236,20 @@ def _title(
     small(f"{group_digits(facts.count)} splats", PALETTE.dim, room - side)
     below = imgui.get_cursor_pos()
     imgui.set_cursor_pos(imgui.ImVec2(at.x + room - side, at.y - 2.0 * ui.scale))
-    main_menu.button(work, recent, ui, actions)
+    _menu_button(work, recent, ui, actions)
     imgui.set_cursor_pos(below)
     imgui.dummy(imgui.ImVec2(0.0, 2.0 * ui.scale))
 
 
-def _view(state: ViewState, unrecorded: str, kept: bool, ui: UiContext, actions: list[str]) -> ViewState:
+def _view(
+    state: ViewState, unrecorded: str, has_snapshots: bool, ui: UiContext, actions: list[str]
+) -> ViewState:
     imgui.dummy(imgui.ImVec2(0.0, 4.0 * ui.scale))
     section("View", ui)
     column = 82.0 * ui.scale
     camera = state.camera
-    label("Navigate", column)
-    mode = choice("mode", ("Orbit", "Fly"), ("orbit", "fly").index(camera.mode), ui)
-    tip("Orbit around a pivot, or fly", "fly")
-    if mode is not None:
-        camera = replace(camera, mode=("orbit", "fly")[mode])
+    modes, help_ = {"orbit": "Orbit", "fly": "Fly"}, "Orbit around a pivot, or fly"
+    camera = replace(camera, mode=choice_row("Navigate", modes, camera.mode, column, ui, help_, "fly"))
     label("Up axis", column)
     ups = (*UPS, ("View", axes(camera).up))
     current = next((i for i, (_, up) in enumerate(UPS) if up == camera.up), len(UPS))
@@ -182,7 +268,7 @@ def _view(state: ViewState, unrecorded: str, kept: bool, ui: UiContext, actions:
     picker = imgui.ColorEditFlags_.no_inputs.value | imgui.ColorEditFlags_.no_alpha.value
     changed, (red, green, blue) = imgui.color_edit3("##background", list(state.background), picker)
     background = (red, green, blue) if changed else state.background
-    comparison = _comparison(state.compare, unrecorded, kept, column, ui)
+    comparison = _comparison(state.compare, unrecorded, has_snapshots, column, ui)
     label("Show", column)
     half = (imgui.get_content_region_avail().x - 6.0 * ui.scale) / 2
     if imgui.button(f"{Icon.FRAME}  Frame", imgui.ImVec2(half, 0.0)):
@@ -195,22 +281,24 @@ def _view(state: ViewState, unrecorded: str, kept: bool, ui: UiContext, actions:
     return replace(state, camera=camera, background=background, compare=comparison)
 
 
-def _comparison(shown: Comparison, unrecorded: str, kept: bool, column: float, ui: UiContext) -> Comparison:
+def _comparison(
+    compare: Comparison, unrecorded: str, has_snapshots: bool, column: float, ui: UiContext
+) -> Comparison:
     """Off, beside each other or subtracted; with the original, what was recorded, or two snapshots.
 
-    `unrecorded`: why nothing is recorded; `kept`: whether there are snapshots.
+    `unrecorded`: why nothing is recorded; `has_snapshots`: whether there are snapshots.
     """
     label("Compare", column)
-    chosen = choice("compare", ("Off", "Side", "Split", "Diff"), COMPARE_MODES.index(shown.mode), ui)
+    chosen = choice("compare", ("Off", "Side", "Split", "Diff"), COMPARE_MODES.index(compare.mode), ui)
     beside, split = shortcut("beside"), shortcut("split")
     tip(f"Side by side ({beside}), split view ({split}), or amplified difference", "difference")
     if chosen is not None:
-        shown = replace(shown, mode=COMPARE_MODES[chosen])
-    if shown.mode == "off" and not kept:
-        return shown
+        compare = replace(compare, mode=COMPARE_MODES[chosen])
+    if compare.mode == "off" and not has_snapshots:
+        return compare
     label("Against", column)  # also while nothing is compared where there are snapshots: theirs lie below it
-    off = {i for i, no in ((1, unrecorded), (2, not kept)) if no}
-    against = None if shown.mode == "off" else AGAINST.index(shown.against)
+    off = {i for i, no in ((1, unrecorded), (2, not has_snapshots)) if no}
+    against = None if compare.mode == "off" else AGAINST.index(compare.against)
     chosen = choice("against", ("Original", "Recorded", "A | B"), 0 if against in off else against, ui, off)
     recorded, pair = shortcut("against"), shortcut("compare_snapshots")
     tip(
@@ -218,19 +306,19 @@ def _comparison(shown: Comparison, unrecorded: str, kept: bool, column: float, u
         + (f"\nNo recording: {unrecorded}" if unrecorded else "")
     )
     if chosen is not None:
-        mode = "split" if shown.mode == "off" else shown.mode
-        shown = replace(shown, mode=mode, against=AGAINST[chosen])
-    if shown.mode == "difference":
+        mode = "split" if compare.mode == "off" else compare.mode
+        compare = replace(compare, mode=mode, against=AGAINST[chosen])
+    if compare.mode == "difference":
         label("Amplify", column)
         imgui.set_next_item_width(-1.0)
         changed, times = imgui.slider_float(
-            "##amplify", shown.amplify, 1.0, MOST_AMPLIFIED, "× %.0f", _LOGARITHMIC
+            "##amplify", compare.amplify, 1.0, MOST_AMPLIFIED, "× %.0f", _LOGARITHMIC
         )
         if is_double_clicked():
             changed, times = True, Comparison.amplify
-        shown = replace(shown, amplify=float(round(times))) if changed else shown
+        compare = replace(compare, amplify=float(round(times))) if changed else compare
         tip(f"Gain of the difference. Double-click: reset to × {Comparison.amplify:g}")
-    return shown
+    return compare
 
 
 _FLAGS = (
@@ -258,7 +346,7 @@ def _footer(work: Workspace, ui: UiContext, actions: list[str]) -> None:
         imgui.end_disabled()
         tip(f"{action.capitalize()}{change and ': '}{change}", action)
         imgui.same_line()
-    if work.view.layers and brush.toggle(work.view, ui):
+    if work.view.layers and tools.brush_button(work.view, ui):
         actions.append("brush")
     side, gap = imgui.get_frame_height(), 6.0 * ui.scale
     imgui.same_line(right - 3 * side - 2 * gap)

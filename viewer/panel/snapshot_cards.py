@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 from imgui_bundle import imgui
 
-from viewer.panel import strength_slider
-from viewer.state.layer_facts import LayerRow
+from viewer.state.facts import LayerRow
 from viewer.state.snapshots import compare_sides, is_blend, pair_of, with_original
 from viewer.state.workspace import Workspace
 from viewer.ui.context import PALETTE, SMALL_PX, Icon, UiContext, u32
@@ -25,6 +24,8 @@ from viewer.ui.widgets import (
     tip,
     typed_name,
 )
+
+from . import slider
 
 COLUMNS = 3
 _MENU = "menu of a snapshot"
@@ -118,7 +119,7 @@ def _slider(cards: _Cards, work: Workspace, current: bool, ui: UiContext, action
             actions.append(f"choose_snapshot:{slot}:{cards.names[pressed]}")
     number = imgui.calc_text_size("0.00").x
     at, room = imgui.get_cursor_screen_pos(), imgui.get_content_region_avail().x - number - 8.0 * ui.scale
-    share = strength_slider.draw(
+    share = slider.draw(
         "##blend snapshots",
         work.view.pair.share,
         (0.0, 0.5, 1.0),

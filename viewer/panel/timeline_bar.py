@@ -1,6 +1,6 @@
 """The timeline along the lower edge of the picture: keys and playhead to drag, and its few settings.
 
-It changes nothing itself: it returns actions of `playback.ACTIONS`, as keys do.
+It changes nothing itself: it returns actions of `timeline.ACTIONS`, as keys do.
 """
 
 from __future__ import annotations
@@ -10,8 +10,7 @@ import math
 from imgui_bundle import icons_fontawesome_6 as icons
 from imgui_bundle import imgui
 
-from viewer.state.playback import Player
-from viewer.state.timeline import EASINGS, key_at, key_before
+from viewer.state.timeline import EASINGS, Player, key_at, key_before
 from viewer.state.view_state import FASTEST, LONGEST, Timeline
 from viewer.ui.context import PALETTE, SMALL_PX, UiContext, u32
 from viewer.ui.keys import shortcut
@@ -157,7 +156,7 @@ def _ruler(timeline: Timeline, frame: int, wide: float, actions: list[str], ui: 
             storage.set_int(slot, to)
     if under is not None:
         imgui.set_mouse_cursor(imgui.MouseCursor_.resize_ew.value)
-    _paint(timeline, frame, start, span, top, tall, under, lit, ui)
+    _paint(timeline, frame, start, span, top, top + tall - 6.0 * scale, under, ui)
 
 
 def _key_under(timeline: Timeline, start: float, span: float, mouse: float, scale: float) -> int | None:
@@ -173,13 +172,11 @@ def _paint(
     start: float,
     span: float,
     top: float,
-    tall: float,
+    line: float,
     under: int | None,
-    lit: bool,
     ui: UiContext,
 ) -> None:
     canvas, p, scale = imgui.get_window_draw_list(), PALETTE, ui.scale
-    line = top + tall - 6.0 * scale
     thin = max(1.0, scale)
     canvas.add_line(imgui.ImVec2(start, line), imgui.ImVec2(start + span, line), u32(p.faint), thin)
     _paint_numbers(timeline, frame, start, span, top, line, ui)

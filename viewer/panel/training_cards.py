@@ -31,17 +31,17 @@ def draw_deliveries(deliveries: Sequence[Delivery], ui: UiContext, actions: list
     for delivery in deliveries:
         share = delivery.done / delivery.total if delivery.total else 0.0
         left = delivery.seconds_left
-        said = (
+        words = (
             [f"frame {delivery.done} of {delivery.total}"]
             if delivery.total
             else [delivery.note or "Starting"]
         )
-        said += [f"{duration(left)} left"] if left is not None else []
-        said = [STARVED] if delivery.starved else said
-        said = [f"For {delivery.elsewhere}", *said] if delivery.elsewhere else said
+        words += [f"{duration(left)} left"] if left is not None else []
+        words = [STARVED] if delivery.starved else words
+        words = [f"For {delivery.elsewhere}", *words] if delivery.elsewhere else words
         failed = delivery.status == "failed"
         line = (
-            delivery.error if failed else "Stopping" if delivery.status == "stopping" else "  ·  ".join(said)
+            delivery.error if failed else "Stopping" if delivery.status == "stopping" else "  ·  ".join(words)
         )
         stop = ("Close", "stop_delivery", "") if failed else ("Stop", "stop_delivery", "Nothing is written")
         word = "Failed" if failed else f"{100 * share:.0f} %" if share else ""
@@ -69,14 +69,14 @@ class _Row:
 def _job_row(job: TrainingJob) -> _Row:
     order, failed = job.order, job.status == "failed" or bool(job.warning)
     about = f"{order.name}\n{order.editor} on {order.region}\n{order.out}"
-    said = (
+    line = (
         (job.error or job.warning)
         if failed
         else f"For {job.elsewhere}  ·  " * bool(job.elsewhere) + _said(job)
     )
     runs = job.status == "running" and not job.starved
     items = ("Show log…", "run_log", True), ("Discard…", "ask_discard", job.status in ("stopped", "failed"))
-    row = _Row(order.name, about, _status(job), job.progress.share, said, failed, runs, _buttons(job))
+    row = _Row(order.name, about, _status(job), job.progress.share, line, failed, runs, _buttons(job))
     return row if job.status == "queued" else replace(row, menu=items)
 
 

@@ -13,13 +13,13 @@ import numpy as np
 
 from progdf.compose.layers import BLENDS
 from viewer.camera import controls
-from viewer.camera.named_views import look_at_view
 from viewer.camera.view_camera import FARTHEST
+from viewer.camera.views import look_at_view
 from viewer.jobs.new_edit import ALL, CHANGED, SELECTION, TYPED
-from viewer.state import history, layer_selection, paint, playback, selection, snapshots
-from viewer.state.comparison import toggle_against, toggle_mode, toggle_snapshots
-from viewer.state.history import History
-from viewer.state.layers import (
+
+from . import history, layer_selection, paint, selection, snapshots, timeline
+from .history import History
+from .layers import (
     SLIDERS,
     change_group,
     change_layer,
@@ -29,8 +29,8 @@ from viewer.state.layers import (
     with_overshoot,
     with_paint,
 )
-from viewer.state.view_state import ViewState, next_resolution_mode
-from viewer.state.workspace import (
+from .view_state import ViewState, next_resolution_mode
+from .workspace import (
     REQUESTS,
     SceneFacts,
     Workspace,
@@ -41,6 +41,40 @@ from viewer.state.workspace import (
     with_camera,
     with_layers_of,
 )
+
+
+def toggle_mode(view: ViewState, mode: str) -> ViewState:
+    """`mode` on, or off where it was on."""
+    mode = "off" if view.compare.mode == mode else mode
+    return replace(view, compare=replace(view.compare, mode=mode))
+
+
+def toggle_against(view: ViewState) -> ViewState:
+    """Against the recording instead of the original, or back; where nothing is compared, side by side."""
+    compare = view.compare
+    if compare.mode == "off":
+        return replace(view, compare=replace(compare, mode="split", against="recorded"))
+    against = "original" if compare.against == "recorded" else "recorded"
+    return replace(view, compare=replace(compare, against=against))
+
+
+def toggle_snapshots(view: ViewState) -> ViewState:
+    """One snapshot against the other, or what was on the screen before; where nothing is compared, split."""
+    compare = view.compare
+    if compare.against == "snapshots" and compare.mode != "off":
+        return replace(view, compare=replace(compare, mode="off", against="original"))
+    mode = "split" if compare.mode == "off" else compare.mode
+    return replace(view, compare=replace(compare, mode=mode, against="snapshots"))
+
+
+def end_at_edit(before: ViewState, view: ViewState) -> ViewState:
+    """No comparison of snapshots any more where layers have changed: one shall see what one does."""
+    edited = (view.layers, view.groups, view.blend) != (before.layers, before.groups, before.blend)
+    compare = view.compare
+    if not edited or compare.mode == "off" or compare.against != "snapshots":
+        return view
+    return replace(view, compare=replace(compare, mode="off", against="original"))
+
 
 FEATHER = 0.1
 """How wide "feather" makes the edges of a layer's paint, share of the radius of its region."""
@@ -119,8 +153,8 @@ def _select_slider(workspace: Workspace, by: int, facts: SceneFacts) -> Workspac
         return workspace
     view, gdf = workspace.view, workspace.view.layers[workspace.focus].gdf
     sliders = [slider for slider in SLIDERS if slider in ("strength", *facts.rows[gdf].kinds)]
-    place = sliders.index(workspace.active_slider) if workspace.active_slider in sliders else 0
-    slider = sliders[(place + by) % len(sliders)]
+    at = sliders.index(workspace.active_slider) if workspace.active_slider in sliders else 0
+    slider = sliders[(at + by) % len(sliders)]
     if slider != "strength" and gdf not in view.unfolded:
         view = replace(view, unfolded=(*view.unfolded, gdf))
     return replace(workspace, active_slider=slider, view=view)
@@ -224,8 +258,8 @@ def _blend(workspace: Workspace, _: str) -> Workspace:
 def _back(workspace: Workspace, past: History) -> Workspace:
     if past is workspace.past:
         return workspace
-    kept = past.present
-    workspace = replace(workspace, past=past, snapshots=kept.snapshots, renaming=None)
+    entry = past.present
+    workspace = replace(workspace, past=past, snapshots=entry.snapshots, renaming=None)
     return with_layers_of(workspace, history.apply_present(workspace.view, past))
 
 
@@ -233,7 +267,7 @@ def _timeline_action(name: str) -> Callable[[Workspace, str], Workspace]:
     """An action of the timeline."""
 
     def act(workspace: Workspace, argument: str) -> Workspace:
-        view, player = playback.perform(workspace.view, workspace.player, f"{name}:{argument}")
+        view, player = timeline.perform(workspace.view, workspace.player, f"{name}:{argument}")
         past = history.follow_camera(workspace.past, workspace.view, view)
         if loses_strengths(workspace, view):  # an entry of its own, or part of what is done to the keys
             past = past if name == "move_key" else history.record(past, view, workspace.snapshots)
@@ -246,24 +280,24 @@ def _timeline_action(name: str) -> Callable[[Workspace, str], Workspace]:
 
 def _restore(workspace: Workspace, index: str) -> Workspace:
     """Back to a snapshot, counted as the panel shows them: 0 is the original."""
-    kept = snapshots.with_original(workspace.snapshots, workspace.view)
-    if not 0 <= int(index) < len(kept):
+    listed = snapshots.with_original(workspace.snapshots, workspace.view)
+    if not 0 <= int(index) < len(listed):
         return workspace
-    return with_layers_of(workspace, snapshots.restore(workspace.view, kept[int(index)]))
+    return with_layers_of(workspace, snapshots.restore(workspace.view, listed[int(index)]))
 
 
 def _name_snapshot(workspace: Workspace, argument: str) -> Workspace:
     """`INDEX:NAME`; the pair that is blended follows."""
     index, _, name = argument.partition(":")
-    old, kept = workspace.snapshots, snapshots.rename(workspace.snapshots, int(index) - 1, name)
-    was, now, pair = old[int(index) - 1].name, kept[int(index) - 1].name, workspace.view.pair
+    old, new = workspace.snapshots, snapshots.rename(workspace.snapshots, int(index) - 1, name)
+    was, now, pair = old[int(index) - 1].name, new[int(index) - 1].name, workspace.view.pair
     pair = replace(pair, a=now if pair.a == was else pair.a, b=now if pair.b == was else pair.b)
-    return replace(workspace, snapshots=kept, view=replace(workspace.view, pair=pair))
+    return replace(workspace, snapshots=new, view=replace(workspace.view, pair=pair))
 
 
 def _move_snapshot(workspace: Workspace, argument: str) -> Workspace:
     """`INDEX:TO`"""
-    index, to = (int(place) - 1 for place in argument.split(":"))
+    index, to = (int(number) - 1 for number in argument.split(":"))
     return replace(workspace, snapshots=snapshots.move(workspace.snapshots, index, to))
 
 
@@ -276,8 +310,8 @@ def _choose_snapshot(workspace: Workspace, argument: str) -> Workspace:
 def _blend_snapshots(workspace: Workspace, share: str, facts: SceneFacts) -> Workspace:
     if not workspace.snapshots:
         return workspace
-    kept = snapshots.with_original(workspace.snapshots, workspace.view)
-    view = snapshots.blend(workspace.view, kept, float(share), lambda gdf: facts.rows[gdf].count)
+    listed = snapshots.with_original(workspace.snapshots, workspace.view)
+    view = snapshots.blend(workspace.view, listed, float(share), lambda gdf: facts.rows[gdf].count)
     return with_layers_of(workspace, view)
 
 
@@ -355,5 +389,5 @@ ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
     "new_edit": _new_edit,
     "overlay": lambda w, _: replace(w, view=replace(w.view, overlay=not w.view.overlay)),
     "panel": lambda w, _: replace(w, view=replace(w.view, panel=not w.view.panel)),
-    **{name: _timeline_action(name) for name in playback.ACTIONS},
+    **{name: _timeline_action(name) for name in timeline.ACTIONS},
 }

@@ -49,18 +49,18 @@ def press(workspace: Workspace, argument: str) -> Workspace:
             with commas, as a range is of what one sees
     """
     how, at, listed = argument.split(":")
-    index, shown = int(at), [int(i) for i in listed.split(",") if i]
+    index, rows = int(at), [int(i) for i in listed.split(",") if i]
     layers, focus = workspace.view.layers, workspace.focus
     chosen = selected_layers(workspace)
     if how == "range" and focus is not None:
         low, high = sorted((focus, index))
-        return replace(workspace, selected=frozenset(layers[i].gdf for i in shown if low <= i <= high))
+        return replace(workspace, selected=frozenset(layers[i].gdf for i in rows if low <= i <= high))
     if how == "toggle" and index in chosen:
-        rest = [i for i in chosen if i != index]
-        if not rest:
+        remaining = [i for i in chosen if i != index]
+        if not remaining:
             return workspace
-        near = min(rest, key=lambda i: abs(i - index)) if focus == index else focus
-        return replace(workspace, focus=near, selected=frozenset(layers[i].gdf for i in rest))
+        near = min(remaining, key=lambda i: abs(i - index)) if focus == index else focus
+        return replace(workspace, focus=near, selected=frozenset(layers[i].gdf for i in remaining))
     if how == "toggle":
         return replace(workspace, focus=index, selected=frozenset(layers[i].gdf for i in (*chosen, index)))
     if how == "keep" and index in chosen:

@@ -5,6 +5,7 @@ The list of shortcuts, menus and tips name keys by `shortcut`.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, replace
 
 from imgui_bundle import imgui
@@ -224,17 +225,11 @@ _BUTTONS = (("left", 0), ("right", 1), ("middle", 2))
 
 @dataclass(frozen=True)
 class Press:
-    """A key that went down, with the modifiers that were held just then.
+    """A key that went down, with the modifiers that were held just then."""
 
-    Args:
-        chord: as in `KEYS`
-        again: it went down before and is held
-        event_id: its place among imgui's input events (see `has_reached_imgui`); −1 is before all
-    """
-
-    chord: str
-    again: bool = False
-    event_id: int = -1
+    chord: str  # as in `KEYS`
+    again: bool = False  # it went down before and is held
+    event_id: int = -1  # its place among imgui's input events (see `has_reached_imgui`); −1 is before all
 
 
 @dataclass(frozen=True)
@@ -242,16 +237,11 @@ class Keys:
     """What the keyboard did since the last frame.
 
     Not taken from imgui: it merges the events of a slow frame, and the Ctrl of a quick Ctrl+Z would be lost.
-
-    Args:
-        pressed: in their order
-        held: names of the keys that are down, as in the chords of `KEYS`
-        fly: which of `FLY_KEYS` are down, by their physical place
     """
 
-    pressed: tuple[Press, ...] = ()
-    held: frozenset[str] = frozenset()
-    fly: frozenset[str] = frozenset()
+    pressed: tuple[Press, ...] = ()  # in their order
+    held: frozenset[str] = frozenset()  # names of the keys that are down, as in the chords of `KEYS`
+    fly: frozenset[str] = frozenset()  # which of `FLY_KEYS` are down, by their physical place
 
 
 NO_KEYS = Keys()
@@ -378,3 +368,32 @@ def fly_by_keys(camera: ViewCamera, keys: Keys, seconds: float, radius: float) -
     right, up, ahead = (sum(FLY_KEYS[key][i] for key in keys.fly) for i in range(3))
     pace = 10.0 if io.key_shift else 0.1 if io.key_alt else 1.0
     return controls.fly(camera, right, up, ahead, seconds, radius, pace)
+
+
+OPENING_FRAMES = 4
+"""From the wish for a text field until imgui gives it the keyboard."""
+
+
+class PendingKeys:
+    """Hands keys on in step with imgui; while a text field opens they wait for it."""
+
+    def __init__(self) -> None:
+        self._waiting: tuple[Press, ...] = ()
+        self._frames = 0
+        self._asked_at = -OPENING_FRAMES  # the frame in which a text field was last asked for
+
+    @property
+    def opening(self) -> bool:
+        """Whether a text field was asked for and has no keyboard yet."""
+        return self._frames - self._asked_at < OPENING_FRAMES and not imgui.get_io().want_text_input
+
+    def take(self, keys: Keys) -> Keys:
+        """The keys of one frame that imgui has come to; call once a frame."""
+        pressed = (*self._waiting, *keys.pressed)
+        count = 0 if self.opening else sum(1 for _ in itertools.takewhile(has_reached_imgui, pressed))
+        opener = next((i for i, press in enumerate(pressed[:count]) if opens_text(press)), None)
+        self._frames += 1
+        if opener is not None:
+            count, self._asked_at = opener + 1, self._frames
+        self._waiting = pressed[count:]
+        return replace(keys, pressed=pressed[:count])

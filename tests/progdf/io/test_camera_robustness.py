@@ -18,10 +18,10 @@ from tests.helpers.demo_scenes import bear, room
 from tests.helpers.stacks import bear_stack
 from tests.helpers.ui_rig import first_view, rig
 from viewer.camera import controls
-from viewer.camera.up_axis import Vec3
 from viewer.camera.view_camera import (
     FILL,
     Bounds,
+    Vec3,
     ViewCamera,
     axes,
     bounds_of,
@@ -31,7 +31,7 @@ from viewer.camera.view_camera import (
 )
 from viewer.files.document import Document
 from viewer.render.engine import ViewEngine
-from viewer.render.renderers import Image
+from viewer.render.gl_renderer import Image
 from viewer.state import workspace
 from viewer.state.actions import perform
 from viewer.state.view_state import ViewState

@@ -17,7 +17,7 @@ from viewer.jobs.delivery import DeliverOptions, Delivery
 from viewer.jobs.new_edit import TYPED, NewEdit
 from viewer.jobs.training_job import EditOrder, Progress, TrainingJob
 from viewer.render.engine import ViewEngine
-from viewer.render.headless import headless_context
+from viewer.render.gl_renderer import headless_context
 from viewer.state.view_state import ViewState
 from viewer.state.workspace import Dialog
 

@@ -14,7 +14,7 @@ from tests.helpers.stacks import many_edits
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from viewer.app.studio.up_strip import UpChoice, UpStrip
 from viewer.panel import panel
-from viewer.render.timings import FrameTimings
+from viewer.render.dynamic_resolution import FrameTimings
 from viewer.state import selection
 from viewer.state.selection import SelectionState
 from viewer.state.view_state import Brush, LayerGroup, LayerState, ViewState

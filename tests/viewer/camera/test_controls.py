@@ -14,9 +14,9 @@ from progdf.camera import Camera, intrinsics, look_at
 from tests.helpers.demo_scenes import bear
 from tests.helpers.scenes import random_gaussians
 from viewer.camera import controls
-from viewer.camera.up_axis import Vec3
 from viewer.camera.view_camera import (
     Bounds,
+    Vec3,
     ViewCamera,
     add_scaled,
     axes,
@@ -31,7 +31,7 @@ from viewer.camera.view_camera import (
 )
 from viewer.state import workspace
 from viewer.state.actions import perform
-from viewer.state.layer_facts import LayerRow
+from viewer.state.facts import LayerRow
 from viewer.state.view_state import LayerState, ViewState
 from viewer.state.workspace import SceneFacts
 from viewer.ui.keys import FLY_KEYS, KEYS, drag_for

@@ -10,10 +10,10 @@ from imgui_bundle import imgui
 
 from viewer.camera.view_camera import Bounds, ViewCamera, axes
 from viewer.panel import panel
-from viewer.panel.strength_slider import parse_strength
+from viewer.panel.slider import parse_strength
 from viewer.state import history, workspace
 from viewer.state.actions import perform
-from viewer.state.layer_facts import LayerRow
+from viewer.state.facts import LayerRow
 from viewer.state.view_state import LayerState, ViewState
 from viewer.state.workspace import SceneFacts, Workspace
 from viewer.ui import widgets

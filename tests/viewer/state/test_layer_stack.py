@@ -22,10 +22,10 @@ from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from viewer.camera.view_camera import eye, to_camera
 from viewer.commands.layer_arguments import stack_of
 from viewer.panel import panel
-from viewer.panel.layer_details import value_at
-from viewer.panel.strength_slider import parse_strength
-from viewer.state import layer_facts, timeline
-from viewer.state.layer_facts import layer_rows
+from viewer.panel.card import value_at
+from viewer.panel.slider import parse_strength
+from viewer.state import facts, timeline
+from viewer.state.facts import layer_rows
 from viewer.state.layers import (
     LONGEST_NAME,
     SLIDERS,
@@ -345,19 +345,19 @@ def test_rows_know_what_they_share_and_what_their_gains_scale() -> None:
 def test_the_curve_begins_at_nothing_reaches_all_at_one_and_goes_beyond() -> None:
     made = bear()
     curve = layer_rows(made.scene, made.gdfs)[1].curve()
-    assert len(curve) == round(OVERSHOOT * layer_facts.STEPS) + 1
-    assert (curve[0], curve[layer_facts.STEPS]) == (0.0, 1.0)
+    assert len(curve) == round(OVERSHOOT * facts.STEPS) + 1
+    assert (curve[0], curve[facts.STEPS]) == (0.0, 1.0)
     assert curve[-1] > 1.0
-    assert value_at(curve, 0.5) == curve[layer_facts.STEPS // 2]
+    assert value_at(curve, 0.5) == curve[facts.STEPS // 2]
     assert value_at((0.0, 1.0), 0.01) == pytest.approx(0.2)
     assert value_at((0.0, 1.0), 5.0) == 1.0
 
 
 def test_a_large_region_is_measured_by_a_part_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
     made = bear()
-    whole = layer_facts.visible_changes(made.scene, made.gdfs[0])
-    monkeypatch.setattr(layer_facts, "MOST_MEMBERS", len(made.gdfs[0].region) // 2)
-    assert layer_facts.visible_changes(made.scene, made.gdfs[0]) == pytest.approx(whole, abs=0.1)
+    whole = facts.visible_changes(made.scene, made.gdfs[0])
+    monkeypatch.setattr(facts, "MOST_MEMBERS", len(made.gdfs[0].region) // 2)
+    assert facts.visible_changes(made.scene, made.gdfs[0]) == pytest.approx(whole, abs=0.1)
 
 
 @pytest.fixture(scope="module")

@@ -10,8 +10,7 @@ import torch
 
 from progdf.scene import known_ups
 from progdf.scene.up_axis import direction_name
-from viewer.camera.up_axis import Vec3
-from viewer.camera.view_camera import first_camera
+from viewer.camera.view_camera import Vec3, first_camera
 from viewer.gl.present import picture_texture
 from viewer.pictures.film import to_pixels
 from viewer.render.engine import ViewEngine

@@ -1,4 +1,4 @@
-"""One layer in the panel: eye, name, strength, slider, and what unfolds below it."""
+"""One layer in the panel: eye, name, strength, slider, and below it the curve of its change and its gains."""
 
 from __future__ import annotations
 
@@ -7,26 +7,126 @@ from dataclasses import dataclass, replace
 
 from imgui_bundle import imgui
 
-from viewer.panel import strength_slider
-from viewer.panel.layer_details import draw
-from viewer.state.layer_facts import LayerRow
-from viewer.state.layers import change_layer, largest_strength, rename_layer, toggle_details, toggle_solo
+from viewer.state.facts import STEPS, LayerRow
+from viewer.state.layers import (
+    SLIDERS,
+    change_layer,
+    largest_strength,
+    rename_layer,
+    slider_value,
+    toggle_details,
+    toggle_solo,
+    with_slider_value,
+)
 from viewer.state.view_state import LayerState, ViewState
 from viewer.state.workspace import Workspace, is_compact
-from viewer.ui.context import PALETTE, Icon, Rgba, UiContext, u32
+from viewer.ui.context import PALETTE, SMALL_PX, Icon, Rgba, UiContext, u32
 from viewer.ui.keys import shortcut
 from viewer.ui.widgets import (
     elide,
     grip,
     group_digits,
     icon_button,
+    label,
     menu,
     right_edge,
     small,
     small_toggle,
+    swatch,
     tip,
     typed_name,
+    value_slider,
 )
+
+from . import slider
+
+CURVE_PX = 52.0  # at 1×
+GAINS = SLIDERS[1:]
+
+
+def draw_details(
+    layer: LayerState, row: LayerRow, active_slider: str | None, most: float, ui: UiContext
+) -> LayerState:
+    """Draw the curve and the gains.
+
+    Args:
+        layer: what they show
+        row: of its .gdf
+        active_slider: what the arrow keys move; None where they move another layer
+        most: the upper end of the strength
+        ui: fonts and scale
+    """
+    _curve(row, layer.strength, most, ui)
+    imgui.begin_disabled(layer.locked)
+    for kind in GAINS:
+        layer = _gain(layer, kind, kind in row.kinds, kind == active_slider, ui)
+    imgui.end_disabled()
+    return layer
+
+
+def _gain(layer: LayerState, kind: str, moves: bool, active: bool, ui: UiContext) -> LayerState:
+    """One gain: a slider as the others of the panel."""
+    if active:
+        imgui.push_style_color(imgui.Col_.text_disabled, imgui.ImVec4(*PALETTE.accent))
+    label(kind.capitalize(), 84.0 * ui.scale)
+    if active:
+        imgui.pop_style_color()
+    imgui.begin_disabled(not moves)
+    value = slider_value(layer, kind)
+    new = value_slider(f"##{kind}", value, (0.0, 1.0), "%.2f", 1.0, ui)
+    imgui.end_disabled()
+    if moves:
+        tip(f"How much of the {kind} change is applied (Tab, then arrow keys). Double-click: reset to 1")
+    else:
+        tip(f"This edit does not change the {kind}")
+    return layer if new == value else with_slider_value(layer, kind, new)
+
+
+def value_at(curve: Sequence[float], strength: float) -> float:
+    """The curve at a strength, linear between its points; its last value beyond them."""
+    step = max(strength, 0.0) * STEPS
+    low = min(int(step), len(curve) - 1)
+    high = min(low + 1, len(curve) - 1)
+    return curve[low] + (curve[high] - curve[low]) * min(step - low, 1.0)
+
+
+def _curve(row: LayerRow, strength: float, most: float, ui: UiContext) -> None:
+    """Visible change over the strength, under the slider's track and to its measure."""
+    curve = row.curve()[: round(most * STEPS) + 1]
+    if not curve:
+        return
+    scale, p = ui.scale, PALETTE
+    left, top = imgui.get_cursor_screen_pos()
+    width, height = imgui.get_content_region_avail().x, CURVE_PX * scale
+    imgui.dummy(imgui.ImVec2(width, height))
+    tip(
+        "Visible change against strength, measured in small renders of this region; 1 is the full edit."
+        f"\nTicks: {len(row.recorded)} recorded snapshots."
+    )
+    canvas, radius = imgui.get_window_draw_list(), 7.0 * scale
+    start, span = left + radius, (width - 2 * radius) / most
+    foot, rise = top + height - 4.0 * scale, (height - 10.0 * scale) / max(1.0, *curve)
+    canvas.add_rect_filled(
+        imgui.ImVec2(left, top), imgui.ImVec2(left + width, top + height), u32(p.panel), 4 * scale
+    )
+    if most > 1.0:
+        beyond = imgui.ImVec2(start + span, top), imgui.ImVec2(left + width, top + height)
+        canvas.add_rect_filled(*beyond, u32((*p.warning_dark[:3], 0.35)), 4 * scale)
+    for tick in row.recorded:
+        x = round(start + tick * span) + 0.5
+        ends = imgui.ImVec2(x, foot - 6 * scale), imgui.ImVec2(x, foot)
+        canvas.add_line(*ends, u32(p.faint), max(1.0, scale))
+    canvas.add_line(imgui.ImVec2(start, foot), imgui.ImVec2(start + most * span, foot), u32(p.line), scale)
+    for i in range(len(curve) - 1):
+        a, b = (imgui.ImVec2(start + j / STEPS * span, foot - curve[j] * rise) for j in (i, i + 1))
+        canvas.add_line(a, b, u32(p.warning if i >= STEPS else p.accent), 1.5 * scale)
+    share = value_at(curve, strength)
+    at = imgui.ImVec2(start + strength * span, foot - share * rise)
+    canvas.add_circle_filled(at, 4.5 * scale, u32(p.panel))
+    canvas.add_circle_filled(at, 3.0 * scale, u32(p.handle))
+    corner = imgui.ImVec2(round(left + 6 * scale), round(top + 3 * scale))
+    canvas.add_text(ui.fonts.regular, SMALL_PX * scale, corner, u32(p.dim), f"change {100 * share:.0f} %")
+
 
 TOGGLE_PX = 24.0
 CARD_PX = 97.0  # a whole card with what is between two, at 1×
@@ -87,7 +187,7 @@ def draw_card(
         imgui.same_line(right - SLIDER_PX * scale - _number_width(layer, compact) - 6.0 * scale)
         imgui.set_cursor_pos_y(imgui.get_cursor_pos_y() + (imgui.get_frame_height() - SLIM_PX * scale) / 2)
     imgui.begin_disabled(layer.locked)
-    strength = strength_slider.draw(
+    strength = slider.draw(
         "##strength",
         layer.strength,
         row.recorded,
@@ -96,7 +196,7 @@ def draw_card(
         fill=p.accent if selected else p.accent_dark,
         active=active,
         most=most,
-        height=SLIM_PX if compact else strength_slider.HEIGHT_PX,
+        height=SLIM_PX if compact else slider.HEIGHT_PX,
     )
     touched = touch.touched or imgui.is_item_active()
     imgui.end_disabled()
@@ -107,7 +207,7 @@ def draw_card(
         work = _foot(work, index, row, ui)
     if layer.gdf in work.view.unfolded:
         active_slider = work.active_slider if focused else None
-        unfolded = draw(work.view.layers[index], row, active_slider, most, ui)
+        unfolded = draw_details(work.view.layers[index], row, active_slider, most, ui)
         work = _change_layer(work, index, lambda _: unfolded)
         if compact:
             imgui.dummy(imgui.ImVec2(0.0, 2.0 * scale))
@@ -211,7 +311,7 @@ def _head(
             work = _change_layer(work, index, lambda old: replace(old, enabled=not old.enabled))
     tip(f"Show or hide ({shortcut('hide')}). Alt+click: solo")
     imgui.same_line(0.0, gap)
-    _swatch(row.swatch, active, ui)
+    swatch(row.swatch, 1.0 if active else 0.35, True, ui)
     imgui.same_line(0.0, gap)
     number_width = _number_width(layer, compact)
     room = right - number_width - 10 * scale - imgui.get_cursor_pos_x()
@@ -220,7 +320,7 @@ def _head(
     imgui.same_line(right - number_width)
     imgui.dummy(imgui.ImVec2(number_width, imgui.get_frame_height()))
     if imgui.is_item_clicked() and not layer.locked:
-        strength_slider.start_typing("##strength")
+        slider.start_typing("##strength")
     tip(*("Locked", "lock") if layer.locked else ("Click to type a value",))
     return work, touch
 
@@ -308,15 +408,3 @@ def _foot(work: Workspace, index: int, row: LayerRow, ui: UiContext) -> Workspac
         imgui.open_popup(_MENU)
     tip("Rename, duplicate, replace or delete (right-click)")
     return work if view is work.view else replace(work, view=view)
-
-
-def _swatch(color: tuple[float, float, float], active: bool, ui: UiContext) -> None:
-    side = 12.0 * ui.scale
-    x, y = imgui.get_cursor_screen_pos()
-    top = y + (imgui.get_frame_height() - side) / 2
-    imgui.dummy(imgui.ImVec2(side, imgui.get_frame_height()))
-    rgba: Rgba = (*color, 1.0 if active else 0.35)
-    canvas = imgui.get_window_draw_list()
-    corners = imgui.ImVec2(x, top), imgui.ImVec2(x + side, top + side)
-    canvas.add_rect_filled(*corners, u32(rgba), 3 * ui.scale)
-    canvas.add_rect(*corners, u32(PALETTE.line), 3 * ui.scale)

@@ -1,18 +1,28 @@
-"""The panel's parts "Select" and "Regions": the tools, what is done with the selection, and kept ones."""
+"""The panel's parts for selecting and painting: tools, operations, regions, and the brush."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 from imgui_bundle import imgui
 
+from viewer.render import highlight
+from viewer.state.layers import is_visible
 from viewer.state.selection import NamedRegion
-from viewer.state.view_state import LARGEST_PX, SELECT_MODES, SMALLEST_PX, SelectTool, ViewState
+from viewer.state.view_state import (
+    LARGEST_PX,
+    SELECT_MODES,
+    SMALLEST_PX,
+    Brush,
+    SelectTool,
+    ViewState,
+)
 from viewer.state.workspace import Pointed
 from viewer.ui.context import PALETTE, SMALL_PX, Icon, UiContext, u32
 from viewer.ui.keys import shortcut
 from viewer.ui.widgets import (
-    choice,
+    choice_row,
     elide,
     group_digits,
     icon_button,
@@ -20,7 +30,9 @@ from viewer.ui.widgets import (
     menu,
     right_edge,
     section,
+    slider_row,
     small,
+    swatch,
     tip,
     typed_name,
     value_slider,
@@ -50,6 +62,9 @@ _OPERATIONS = (
         ("Isolate", "isolate", "Hide everything else"),
     ),
 )
+COLUMN_PX = 82.0  # at 1×: where what a row chooses begins
+_DEPTHS = {False: "Front", True: "Through"}
+_SIZE_KEYS = f"{shortcut('brush_radius:0.8')} and {shortcut('brush_radius:1.25')}"
 _MENU = "menu of a region"
 _ITEMS = ("Select", "Add to selection", "Subtract from selection", "Rename…", "Delete")
 
@@ -96,30 +111,22 @@ def draw(state: ViewState, ui: UiContext, actions: list[str]) -> tuple[ViewState
 
 def _options(held: SelectTool, ui: UiContext) -> SelectTool:
     """How the tool selects."""
-    column = 82.0 * ui.scale
-    label("Mode", column)
-    mode = choice("select mode", ("New", "Add", "Sub", "And"), SELECT_MODES.index(held.mode), ui)
-    tip(f"What becomes of the present selection.\n{_MODES}")
-    if mode is not None:
-        held = replace(held, mode=SELECT_MODES[mode])
+    column = COLUMN_PX * ui.scale
+    modes = dict(zip(SELECT_MODES, ("New", "Add", "Sub", "And"), strict=True))
+    help_ = f"What becomes of the present selection.\n{_MODES}"
+    held = replace(held, mode=choice_row("Mode", modes, held.mode, column, ui, help_))
     if held.tool not in ("sphere", "flood"):
-        label("Depth", column)
-        through = choice("select depth", ("Front", "Through"), int(held.through), ui)
-        tip("Select only the front surface, or everything behind it too", "select_through")
-        if through is not None:
-            held = replace(held, through=bool(through))
+        help_ = "Select only the front surface, or everything behind it too"
+        through = choice_row("Depth", _DEPTHS, held.through, column, ui, help_, "select_through")
+        held = replace(held, through=through)
     if held.tool == "brush":
-        label("Radius", column)
-        ends = (SMALLEST_PX, LARGEST_PX)
-        radius = value_slider("##select radius", held.radius, ends, "%.0f px", SelectTool.radius, ui)
-        tip(f"Brush radius ({shortcut('brush_radius:0.8')} and {shortcut('brush_radius:1.25')})")
+        ends, help_ = (SMALLEST_PX, LARGEST_PX), f"Brush radius ({_SIZE_KEYS})"
+        radius = slider_row("Radius", held.radius, ends, SelectTool.radius, column, ui, help_, "%.0f px")
         held = replace(held, radius=radius)
     if held.tool in ("flood", "color"):
-        label("Tolerance", column)
         ends = (0.01, 1.0)
-        tolerance = value_slider("##tolerance", held.tolerance, ends, "%.2f", SelectTool.tolerance, ui)
-        keys = f"{shortcut('brush_radius:0.8')} and {shortcut('brush_radius:1.25')}"
-        tip(f"How unlike the clicked color a color may be ({keys}). The last click follows it")
+        help_ = f"How unlike the clicked color a color may be ({_SIZE_KEYS}). The last click follows it"
+        tolerance = slider_row("Tolerance", held.tolerance, ends, SelectTool.tolerance, column, ui, help_)
         held = replace(held, tolerance=tolerance)
     return held
 
@@ -185,13 +192,8 @@ def _row(index: int, region: NamedRegion, ui: UiContext, actions: list[str]) -> 
         actions.append(f"show_region:{index}")
     tip("Tint this region in the picture")
     imgui.same_line()
-    x, y = imgui.get_cursor_screen_pos()
-    side, tall = 12.0 * scale, imgui.get_frame_height()
-    top = y + (tall - side) / 2
-    corners = imgui.ImVec2(x, top), imgui.ImVec2(x + side, top + side)
-    canvas = imgui.get_window_draw_list()
-    canvas.add_rect_filled(*corners, u32((*region.color, 1.0)), 3 * scale)
-    imgui.dummy(imgui.ImVec2(side, tall))
+    swatch(region.color, 1.0, False, ui)
+    tall, canvas = imgui.get_frame_height(), imgui.get_window_draw_list()
     imgui.same_line()
     count = group_digits(region.count)
     imgui.push_font(None, SMALL_PX)
@@ -237,3 +239,114 @@ def _chosen(ui: UiContext) -> str:
     with menu(_MENU, ui) as is_open:
         chosen = [name for name in _ITEMS if is_open and imgui.menu_item(name, "", False)[0]]
     return chosen[0] if chosen else ""
+
+
+PAINT_DRAG = "brush"
+"""What a left drag does while the brush is active, beside those of `keys.DRAGS`."""
+
+NAMES = {"add": "Add", "erase": "Erase", "smooth": "Smooth"}
+WHOLE = (
+    ("Clear", "paint_clear", "Set all weights to 0"),
+    ("Fill", "paint_fill", "Set all weights to 1"),
+    ("Invert", "paint_invert", f"Swap what is painted and what is not ({shortcut('invert')})"),
+    ("Feather", "paint_feather", "Soften the edges of the paint; repeat for more"),
+)
+"""Buttons for all of a layer's paint: name, action of `keys.KEYS`, tip."""
+
+
+def paint_obstacle(view: ViewState, focus: int | None) -> str:
+    """Why the brush cannot paint now, one line; empty where it can."""
+    if focus is None or focus >= len(view.layers):
+        return "no layer is selected; click one, or press 1–9"
+    layer = view.layers[focus]
+    if layer.locked:
+        return f"{layer.name} is locked; press Shift+L to unlock it"
+    if not is_visible(view, layer):
+        return f"{layer.name} is hidden; press H to show it"
+    return ""
+
+
+def draw_brush(view: ViewState, focus: int | None, ui: UiContext, actions: list[str]) -> ViewState:
+    """The brush's controls."""
+    column, brush = COLUMN_PX * ui.scale, view.brush
+    imgui.push_id("brush")
+    imgui.dummy(imgui.ImVec2(0.0, 4.0 * ui.scale))
+    section("Paint", ui)
+    help_ = f"Brush mode ({shortcut('brush_mode')}). While painting, Ctrl inverts and Shift smooths"
+    brush = replace(brush, mode=choice_row("Brush", NAMES, brush.mode, column, ui, help_))
+    ends, help_ = (SMALLEST_PX, LARGEST_PX), f"Brush radius ({_SIZE_KEYS})"
+    radius = slider_row("Radius", brush.radius, ends, Brush.radius, column, ui, help_, "%.0f px")
+    help_ = f"Brush softness ({shortcut('brush_softness:-0.1')} and ])"
+    softness = slider_row("Softness", brush.softness, (0.0, 1.0), Brush.softness, column, ui, help_)
+    help_ = "How far one stroke goes; strokes over each other go further"
+    flow = slider_row("Flow", brush.flow, (0.0, 1.0), Brush.flow, column, ui, help_)
+    label("Value", column)
+    imgui.begin_disabled(brush.mode != "add")
+    value = value_slider("##value", brush.value, (0.0, 1.0), "%.2f", Brush.value, ui)
+    imgui.end_disabled()
+    tip("The share of the edit that Add paints")
+    help_ = "Paint only the front surface, or everything under the brush"
+    through = choice_row("Depth", _DEPTHS, brush.through, column, ui, help_, "brush_through")
+    help_ = "Tint lightly what has less than all of the edit, or show all weights from blue (0) to yellow (1)"
+    weights = choice_row(
+        "Weights", {False: "Tint", True: "Colors"}, brush.weights, column, ui, help_, "brush_weights"
+    )
+    brush = replace(
+        brush, radius=radius, softness=softness, flow=flow, value=value, through=through, weights=weights
+    )
+    if brush.weights:
+        _legend(column, ui)
+    label("Layer", column)
+    imgui.begin_disabled(focus is None or view.layers[focus].locked)
+    texts = [imgui.calc_text_size(text).x for text, *_ in WHOLE]
+    spare = imgui.get_content_region_avail().x - 4.0 * (len(WHOLE) - 1) * ui.scale - sum(texts)
+    imgui.push_style_var(
+        imgui.StyleVar_.frame_padding.value, imgui.ImVec2(0.0, imgui.get_style().frame_padding.y)
+    )
+    for wide, (text, action, help_) in zip(texts, WHOLE, strict=True):
+        if imgui.button(f"{text}##{action}", imgui.ImVec2(wide + spare / len(WHOLE), 0.0)):
+            actions.append(action)
+        tip(help_, action)
+        imgui.same_line(0.0, 4.0 * ui.scale)
+    imgui.pop_style_var()
+    imgui.end_disabled()
+    imgui.new_line()
+    imgui.pop_id()
+    return replace(view, brush=brush)
+
+
+def _legend(column: float, ui: UiContext) -> None:
+    """The ramp of the weights with its ends named."""
+    imgui.set_cursor_pos_x(column)
+    left, top = imgui.get_cursor_screen_pos()
+    width, height, size = imgui.get_content_region_avail().x, 10.0 * ui.scale, SMALL_PX * ui.scale
+    canvas = imgui.get_window_draw_list()
+    for (start, a), (end, b) in pairwise(highlight.RAMP):
+        low, high = (u32(highlight.rgba(color)) for color in (a, b))
+        corners = imgui.ImVec2(left + start * width, top), imgui.ImVec2(left + end * width, top + height)
+        canvas.add_rect_filled_multi_color(*corners, low, high, high, low)
+    imgui.push_font(None, SMALL_PX)
+    wide = imgui.calc_text_size("1").x
+    imgui.pop_font()
+    for x, text in ((left, "0"), (left + width - wide, "1")):
+        at = imgui.ImVec2(round(x), round(top + height + 2.0 * ui.scale))
+        canvas.add_text(ui.fonts.regular, size, at, u32(PALETTE.dim), text)
+    imgui.dummy(imgui.ImVec2(width, height + size + 2.0 * ui.scale))
+
+
+def brush_button(view: ViewState, ui: UiContext) -> bool:
+    """The button that takes the brush up and puts it down; True when pressed."""
+    pressed = icon_button("brush", Icon.BRUSH, ui, dim=not view.brush.active)
+    tip("Paint the strength of the selected layer", "brush")
+    return pressed
+
+
+def draw_ring(view: ViewState, ui: UiContext) -> None:
+    """The brush at the cursor: its edge, and inside which its touch is full."""
+    brush, mouse = view.brush, imgui.get_mouse_pos()
+    canvas, radius = imgui.get_background_draw_list(), brush.radius * ui.scale
+    inner = radius * (1.0 - brush.softness)
+    for size, alpha in ((radius, 1.0), (inner, 0.45)):
+        if size > 2.0 * ui.scale:
+            canvas.add_circle(mouse, size, u32((0.0, 0.0, 0.0, 0.5 * alpha)), 0, 3.0 * ui.scale)
+            canvas.add_circle(mouse, size, u32((*PALETTE.handle[:3], alpha)), 0, 1.25 * ui.scale)
