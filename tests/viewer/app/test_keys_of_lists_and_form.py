@@ -231,3 +231,13 @@ def question(hand: Rig) -> DeliverOptions:
     assert hand.main_view.work.dialog is not None
     assert hand.main_view.work.dialog.options is not None
     return hand.main_view.work.dialog.options
+
+
+def test_a_field_that_merely_has_the_keyboard_covers_no_other_row_with_its_tip(hand: Rig) -> None:
+    hand.move(300.0, 300.0)
+    strike(hand, "Ctrl+N")
+    for _ in range(4):
+        strike(hand, "Tab")
+        hand.rest()
+        tooltip = imgui.internal.find_window_by_name("##Tooltip_00")
+        assert tooltip is None or not tooltip.active
