@@ -7,10 +7,10 @@ not from a cross product with the view direction.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Protocol
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -117,11 +117,8 @@ class Axes:
     back: Vec3
 
 
-class Fit(Protocol):
-    """Gives the camera of the same direction whose picture something fills."""
-
-    def __call__(self, camera: ViewCamera, aspect: float) -> ViewCamera:
-        """`aspect`: width / height of the picture"""
+Fit = Callable[[ViewCamera, float], ViewCamera]
+"""Gives the camera of the same direction whose picture, of this width / height, something fills."""
 
 
 def keep_camera(camera: ViewCamera, aspect: float) -> ViewCamera:

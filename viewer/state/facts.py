@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -39,25 +39,8 @@ MOST_MEMBERS = 20_000
 _FROM = (20.0, 200.0)  # degrees around the scene: from before and behind
 
 
-class Curve(Protocol):
-    """Gives the visible change at 0, 1/`STEPS`, … up to `OVERSHOOT`, as shares of that at 1."""
-
-    def __call__(self) -> Sequence[float]: ...
-
-
-def flat() -> Sequence[float]:
-    """The curve of an edit of which nothing is known."""
-    return ()
-
-
-def curve_of(scene: Gaussians, gdf: Gdf) -> Curve:
-    """The curve of one edit, drawn when it is first asked for."""
-
-    @cache
-    def measure() -> Sequence[float]:
-        return visible_changes(scene, gdf)
-
-    return measure
+Curve = Callable[[], Sequence[float]]
+"""Gives the visible change at 0, 1/`STEPS`, … up to `OVERSHOOT`, as shares of that at 1."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +55,7 @@ class LayerRow:
     # per edit, in their order: how many Gaussians of this one are also in it (in itself: all)
     shared: tuple[int, ...] = ()
     kinds: frozenset[str] = frozenset(KINDS.values())  # which gains of `Gains` have something to scale
-    curve: Curve = flat  # the visible change over the strength, measured when it is first asked for
+    curve: Curve = tuple  # the visible change over the strength, measured when it is first asked for
     # centers of its members in the original, world units. [M,3] float32
     points: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 3), np.float32), compare=False)
     fit: Fit = keep_camera  # gives the camera that frames this layer
@@ -94,7 +77,7 @@ def _row(scene: Gaussians, gdf: Gdf, gdfs: Sequence[Gdf]) -> LayerRow:
         bounds=bounds_of(scene[members]),
         shared=tuple(_in_both(gdf, other) for other in gdfs),
         kinds=frozenset(KINDS[name] for name in gdf.field.attributes),
-        curve=curve_of(scene, gdf),
+        curve=cache(lambda: visible_changes(scene, gdf)),
         points=scene.means[members].numpy(),
         fit=lambda camera, aspect: fit(camera, scene[members], aspect),
         region=gdf.region.name,
