@@ -1,7 +1,7 @@
 #version 330 core
 // A line of the grid on the ground: a strip of two triangles in the plane of the picture, as wide everywhere.
 //
-// Reads   per line GRID_LINE of viewer/gl/layout.py; gl_VertexID: its corner; picture: for its size.
+// Reads   per line GRID_LINE of viewer/gl/scene_textures.py; gl_VertexID: its corner; picture: for its size.
 // Writes  gl_Position; from_line: distance from the middle of the line, pixels; cell: place in the grid, where the
 //         lines have faded at 1; ink: color of the line, and its share.
 

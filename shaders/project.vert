@@ -3,7 +3,7 @@
 //
 // Reads   splat: which Gaussian, in drawing order (farthest first); the raw scene (include/raw_splats.glsl);
 //         the camera: OpenCV axes (x right, y down, z forward), lengths in world units, intrinsics in pixels.
-// Writes  viewer/gl/layout.py: PROJECTED, in pixels of the picture, x right and y down from the upper left corner:
+// Writes  viewer/gl/scene_textures.py: PROJECTED, in pixels of the picture, x right and y down from the upper left corner:
 //         alpha(d) = opacity · 2^−(u² + v²), u = l11 · (d.x + slope · d.y), v = l22 · d.y, d = pixel − center.
 //         r2 is u² + v² at alpha = 1/255, and negative where nothing is to be drawn.
 //

@@ -1,7 +1,7 @@
 #version 330 core
 // One triangle around one projected Gaussian: an instance is a Gaussian, a vertex one of three corners.
 //
-// Reads   viewer/gl/layout.py: PROJECTED (see project.vert), in pixels of the picture, y down.
+// Reads   viewer/gl/scene_textures.py: PROJECTED (see project.vert), in pixels of the picture, y down.
 // Writes  gl_Position in clip space; picture y down is clip y up, so row 0 of the framebuffer is the picture's
 //         first row and gl_FragCoord.xy is the pixel position itself.
 

@@ -161,7 +161,7 @@ def _write_difference(name: str, expected: np.ndarray, found: np.ndarray) -> Non
 def software_gpu() -> None:
     """Goldens hold for one renderer of splats, text and lines; another differs in the last bits."""
     from progdf.errors import ProgdfError
-    from viewer.render.headless import headless_context, is_software
+    from viewer.render.gl_renderer import headless_context, is_software
 
     try:
         context = headless_context()
@@ -176,7 +176,7 @@ def software_gpu() -> None:
 @pytest.fixture(scope="module")
 def ctx() -> Iterator[moderngl.Context]:
     """An OpenGL context without a window."""
-    from viewer.render.headless import headless_context
+    from viewer.render.gl_renderer import headless_context
 
     context = headless_context()
     yield context

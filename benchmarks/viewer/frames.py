@@ -29,7 +29,7 @@ from viewer.files import document as documents
 from viewer.panel.panel import WIDTH_PX
 from viewer.render.dynamic_resolution import COARSE, REST_S
 from viewer.render.engine import ViewEngine
-from viewer.render.headless import headless_context
+from viewer.render.gl_renderer import headless_context
 from viewer.state.view_state import ViewState
 
 from . import display as bench_display

@@ -25,7 +25,7 @@ from progdf.threads import one_thread
 from viewer.camera.view_camera import first_camera
 from viewer.render.dynamic_resolution import COARSE
 from viewer.render.engine import ViewEngine
-from viewer.render.headless import headless_context
+from viewer.render.gl_renderer import headless_context
 from viewer.state.view_state import ViewState
 
 from .mouse import Mouse

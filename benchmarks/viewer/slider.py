@@ -22,9 +22,9 @@ from progdf.metrics.image import psnr
 from progdf.rasterize import render
 from progdf.threads import one_thread
 from viewer.camera.view_camera import first_camera, to_camera
+from viewer.render.dynamic_resolution import FrameTimings
 from viewer.render.engine import ViewEngine
-from viewer.render.headless import headless_context
-from viewer.render.timings import FrameTimings
+from viewer.render.gl_renderer import headless_context
 from viewer.state.view_state import LayerState, ViewState
 
 from .mouse import SIZE, Mouse, slider_at

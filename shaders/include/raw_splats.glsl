@@ -1,6 +1,6 @@
 // The scene on the GPU: raw (pre-activation) attributes, one texel a Gaussian in each texture, row after row.
 //
-// Reads the textures below, filled from viewer/gl/layout.py: SPLAT_TEXTURES; a test compares the two.
+// Reads the textures below, filled from viewer/gl/scene_textures.py: SPLAT_TEXTURES; a test compares the two.
 // Gives `texel_of(splat)`: where a Gaussian lies in all of them.
 
 uniform sampler2D mean_logit;     // mean.xyz in world units, logit_opacity

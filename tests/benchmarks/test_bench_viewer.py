@@ -28,7 +28,7 @@ from tests.helpers.demo_scenes import bear
 from viewer.camera.view_camera import bounds_of, first_camera
 from viewer.render import engine
 from viewer.render.engine import ViewEngine
-from viewer.render.headless import headless_context
+from viewer.render.gl_renderer import headless_context
 from viewer.state.view_state import LayerState, ViewState
 
 SIZE = (160, 400)

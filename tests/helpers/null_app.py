@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from viewer.app.app import App
-from viewer.camera.inputs import Keys, Press
 from viewer.files.document import Document
 from viewer.state.view_state import ViewState
+from viewer.ui.keys import Keys, Press
 
 
 @contextmanager

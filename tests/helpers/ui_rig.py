@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 
 from tests.helpers.stacks import Stack, bear_stack
 from viewer.app.main_view import MainView
-from viewer.camera.inputs import NO_KEYS, Keys, Press
 from viewer.camera.view_camera import first_camera
 from viewer.files.document import Document
 from viewer.gl.present import read_rgb
 from viewer.panel import panel
 from viewer.render.engine import ViewEngine
-from viewer.render.headless import headless_context
+from viewer.render.gl_renderer import headless_context
 from viewer.state.view_state import LayerState, ViewState
+from viewer.ui.keys import NO_KEYS, Keys, Press
 
 STEP_S = 1.0 / 60.0
 BACKGROUND = (0.749, 0.847, 0.945)
@@ -116,7 +116,7 @@ class Rig:
         self.settle()
 
     def key(self, chord: str) -> None:
-        """Press a chord of `controls.KEYS` and let go."""
+        """Press a chord of `keys.KEYS` and let go."""
         name = chord.rpartition("+")[2]
         self.main_view.wake()
         self.frame(keys=Keys((Press(chord),), frozenset({name})))

@@ -20,8 +20,7 @@ from viewer.state.view_state import LayerState, ViewState
 from viewer.ui.window import Window, interruptible
 
 from .application import error_details, error_line, log_error
-from .edit_actions import StrayActions
-from .file_actions import FileActions
+from .file_actions import FileActions, StrayActions
 from .main_view import MainView
 from .studio.deliver import DeliverActions
 from .studio.preview import PreviewActions
@@ -138,9 +137,9 @@ class App:
             (type(error), [(at.filename, at.lineno) for at in traceback.extract_tb(error.__traceback__)])
         )
         frame, now = self.main_view.frames, time.perf_counter()
-        before, said = self._failures.get(where, (-2, 0.0))
-        goes_on = frame - before <= 1 and now - said < SAY_AGAIN_S
-        self._failures[where] = frame, said if goes_on else now
+        before, told_at = self._failures.get(where, (-2, 0.0))
+        goes_on = frame - before <= 1 and now - told_at < SAY_AGAIN_S
+        self._failures[where] = frame, told_at if goes_on else now
         if goes_on:
             return  # what fails in each frame asks for no further one
         line, details = error_line(error), ""

@@ -7,25 +7,76 @@ from dataclasses import replace
 from pathlib import Path
 
 import moderngl
+import numpy as np
 
+from progdf.errors import ProgdfError
 from progdf.io.picture_camera import camera_chunk
-from viewer.camera.view_camera import to_camera
+from viewer.camera.view_camera import ViewCamera, to_camera
 from viewer.files import exports
-from viewer.panel.snapshot_cards import SnapshotCard
-from viewer.pictures.compare_labels import draw_labels
-from viewer.pictures.compare_view import Comparer
-from viewer.pictures.thumbnails import Thumbnails
+from viewer.gl.present import picture_texture
+from viewer.pictures.compare import Comparer, draw_labels
+from viewer.pictures.film import to_pixels
 from viewer.render import dynamic_resolution, highlight
+from viewer.render.dynamic_resolution import FrameTimings
 from viewer.render.engine import ViewEngine
-from viewer.render.renderers import Image
-from viewer.render.timings import FrameTimings
+from viewer.render.gl_renderer import Image
+from viewer.state.facts import RecordingFile
 from viewer.state.layers import shown_edits
-from viewer.state.recordings import RecordingFile
 from viewer.state.selection import NOBODY
-from viewer.state.snapshots import SliderSnapshot, with_original
-from viewer.state.view_state import ViewState
+from viewer.state.snapshots import SliderSnapshot, restore, with_original
+from viewer.state.view_state import Comparison, ViewState
 from viewer.state.workspace import Pointed, original
 from viewer.ui.context import PALETTE
+
+SIZE = (168, 126)
+"""Pixels of a small picture."""
+
+
+class Thumbnails:
+    """The pictures of the snapshots on show.
+
+    Args:
+        ctx: where textures live
+        engine: draws them; stays the caller's
+    """
+
+    def __init__(self, ctx: moderngl.Context, engine: ViewEngine) -> None:
+        self._ctx, self._engine = ctx, engine
+        self._made: dict[tuple[object, ViewCamera], moderngl.Texture] = {}
+
+    def update(self, snapshots: Sequence[SliderSnapshot], view: ViewState) -> tuple[tuple[int, ...], bool]:
+        """Texture names of the snapshots, 0 where one is not drawn yet, and whether any is missing.
+
+        One is drawn a call, so that a session of many does not stop the hand.
+        """
+        keys = [_key(i, snapshot) for i, snapshot in enumerate(snapshots)]
+        for key in [key for key in self._made if key not in keys]:
+            self._made.pop(key).release()
+        for i, key in enumerate(keys):
+            if key not in self._made:
+                self._made[key] = self._draw(i, snapshots[i], view)
+                break
+        missing = any(key not in self._made for key in keys)
+        return tuple(self._made[key].glo if key in self._made else 0 for key in keys), missing
+
+    def release(self) -> None:
+        for texture in self._made.values():
+            texture.release()
+        self._made.clear()
+
+    def _draw(self, index: int, snapshot: SliderSnapshot, view: ViewState) -> moderngl.Texture:
+        edited = replace(view, layers=()) if index == 0 else restore(view, snapshot)
+        target = replace(edited, camera=snapshot.camera, compare=Comparison())
+        try:
+            pixels = to_pixels(self._engine.image(target, SIZE))
+        except ProgdfError:  # an edit that is not open
+            pixels = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
+        return picture_texture(self._ctx, pixels)
+
+
+def _key(index: int, snapshot: SliderSnapshot) -> tuple[object, ViewCamera]:
+    """What decides the picture; the original has no edit, however its layers are active."""
+    return (snapshot.edit if index else None), snapshot.camera
 
 
 class Canvas:
@@ -42,10 +93,10 @@ class Canvas:
         self,
         context: moderngl.Context,
         engine: ViewEngine,
-        found: Sequence[RecordingFile] = (),
+        recordings: Sequence[RecordingFile] = (),
         last: Canvas | None = None,
     ) -> None:
-        self.comparer = Comparer(engine, context, found)
+        self.comparer = Comparer(engine, context, recordings)
         self._thumbnails = Thumbnails(context, engine)
         self.timings = FrameTimings()
         """Of the picture on screen."""
@@ -94,14 +145,14 @@ class Canvas:
         self.comparer.engine.highlight = highlight.requested_highlight(
             view, focus, overlap, pointed, self._sliding
         )
-        wanted = aim, edits, self.comparer.engine.highlight
-        shown, self._begun = self.pictures_drawn or self._follows, None
-        if mode != "off" and shown and dynamic_resolution.takes_long(before, self._resolution):
-            moves = turned or (held and self._awaited not in (None, wanted))
+        target = aim, edits, self.comparer.engine.highlight
+        has_picture, self._begun = self.pictures_drawn or self._follows, None
+        if mode != "off" and has_picture and dynamic_resolution.takes_long(before, self._resolution):
+            moves = turned or (held and self._awaited not in (None, target))
             if moves or not self.comparer.prepare(view, size):
                 stays = not moves and before.pixels == 1 and view.compare.mode == "off"
                 self._resolution = dynamic_resolution.wait(self._resolution, now, coarsely=not stays)
-                self._awaited, self._begun = wanted, None if moves else (view, size)
+                self._awaited, self._begun = target, None if moves else (view, size)
                 if stays:
                     self.comparer.engine.show_last(view, screen, size)
                     return
@@ -153,19 +204,16 @@ class Canvas:
         camera = to_camera(view.camera, image.shape[1], image.shape[0])
         origin = self.comparer.engine.scene.origin
         chunk = camera_chunk(camera, shown_edits(view), origin, view.camera.up)
-        said = exports.picture(folder, title, pixels, chunk)
-        return f"{said}; change it in any program, and drop it here" if to_change else said
+        line = exports.picture(folder, title, pixels, chunk)
+        return f"{line}; change it in any program, and drop it here" if to_change else line
 
-    def cards(
-        self, kept: tuple[SliderSnapshot, ...], view: ViewState
-    ) -> tuple[tuple[SnapshotCard, ...], bool]:
-        """The snapshots as the panel shows them, and whether the picture of one is still to be drawn."""
-        if not kept:
+    def thumbnails(
+        self, snapshots: tuple[SliderSnapshot, ...], view: ViewState
+    ) -> tuple[tuple[int, ...], bool]:
+        """GL names of the snapshots' pictures, the original's first, and whether one is still to be drawn."""
+        if not snapshots:
             return (), False
-        all_kept = with_original(kept, view)
-        textures, missing = self._thumbnails.update(all_kept, view)
-        cards = (SnapshotCard(s.name, texture) for s, texture in zip(all_kept, textures, strict=True))
-        return tuple(cards), missing
+        return self._thumbnails.update(with_original(snapshots, view), view)
 
     def release(self) -> None:
         """Give back all but the engine."""

@@ -6,11 +6,14 @@ until it is saved: the file actions takes that question away.
 
 from __future__ import annotations
 
+import shutil
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from imgui_bundle import imgui
+from imgui_bundle import portable_file_dialogs as dialogs
 
 from progdf.terminal import escape_text
 from viewer.state.workspace import Dialog
@@ -111,12 +114,12 @@ def draw(dialog: Dialog, recent: Sequence[Path], pressed: Sequence[str], ui: UiC
     imgui.set_next_window_size(imgui.ImVec2(min(WIDTH_PX * ui.scale, area.width - 2 * margin), 0.0))
     flags = imgui.WindowFlags_
     fixed = flags.no_move.value | flags.no_nav.value
-    shown = flags.no_decoration.value | flags.no_saved_settings.value | fixed
+    flags_of_popup = flags.no_decoration.value | flags.no_saved_settings.value | fixed
     imgui.push_style_var(imgui.StyleVar_.window_rounding, 6.0 * ui.scale)
     imgui.push_style_var(imgui.StyleVar_.window_padding, imgui.ImVec2(16.0 * ui.scale, 14.0 * ui.scale))
     imgui.push_style_color(imgui.Col_.modal_window_dim_bg, imgui.ImVec4(0.0, 0.0, 0.0, 0.45))
     answer = Answer(dialog)
-    if imgui.begin_popup_modal(_POPUP, None, shown)[0]:
+    if imgui.begin_popup_modal(_POPUP, None, flags_of_popup)[0]:
         answer = _content(dialog, recent, pressed, ui, area.height - margin)
         if answer.dialog is None:
             imgui.close_current_popup()
@@ -154,9 +157,9 @@ def _content(
     more, gap = 36.0 * ui.scale, 6.0 * ui.scale
     imgui.set_next_item_width(-more - gap)
     flags = 0 if dialog.error else imgui.InputTextFlags_.auto_select_all.value
-    shown = escape_text(dialog.text)
-    _, text = imgui.input_text("##path", shown, flags)
-    text = dialog.text if text == shown else text  # a name that is not UTF-8 stays the file's own
+    escaped = escape_text(dialog.text)
+    _, text = imgui.input_text("##path", escaped, flags)
+    text = dialog.text if text == escaped else text  # a name that is not UTF-8 stays the file's own
     dialog = replace(dialog, text=text)
     imgui.same_line(0.0, gap)
     imgui.begin_disabled(dialog.choosing)
@@ -308,3 +311,78 @@ def _buttons(names: Sequence[str], ui: UiContext) -> str | None:
             pressed = name
         imgui.pop_style_color()
     return pressed
+
+
+PROGRAMS = ("zenity", "kdialog", "qarma", "matedialog")
+"""Any of them shows a dialog on Linux. Without one the library answers as if the person had canceled, so it
+is looked for here; the path field always stays."""
+
+POLL_S = 0.05
+"""How often to look whether the person has chosen."""
+
+_OPEN = [
+    "Scenes, edits, sessions, cameras",
+    "*.ply *.spz *.splat *.ksplat *.sog *.gdf *.json",
+    "All files",
+    "*",
+]
+_SAVE = ["Sessions", "*.json", "All files", "*"]
+
+
+def obstacle() -> str:
+    """Why no dialog can be shown, in one line; "" where one can."""
+    if sys.platform in ("win32", "darwin") or any(shutil.which(program) for program in PROGRAMS):
+        return ""
+    return f"No file dialog is installed ({PROGRAMS[0]} or {PROGRAMS[1]}); type the path"
+
+
+class Browser:
+    """The dialog of the desktop beside a question of ours, one at a time. `close` it before it is dropped:
+    the library would wait for the person."""
+
+    def __init__(self) -> None:
+        self._shown: dialogs.open_file | dialogs.save_file | None = None
+
+    @property
+    def on_screen(self) -> bool:
+        """Whether a dialog is shown, and worth another look after `POLL_S`."""
+        return self._shown is not None
+
+    def open(self, dialog: Dialog, near: Path) -> Dialog:
+        """The question while the desktop's dialog is shown, or with the reason why there is none.
+
+        Args:
+            dialog: one that asks for a path
+            near: a file beside which to begin where none is typed
+        """
+        if missing := obstacle():
+            return replace(dialog, notice=missing)
+        self.close()
+        path = Path(dialog.text or near).expanduser().absolute()
+        if dialog.kind in ("open", "replace"):
+            folder = path if path.is_dir() else path.parent
+            self._shown = dialogs.open_file("Open", escape_text(f"{folder}/"), _OPEN)
+        else:
+            filters = _SAVE if dialog.kind == "save" else ["All files", "*"]
+            self._shown = dialogs.save_file("Save", escape_text(str(path)), filters)
+        return replace(
+            dialog, choosing=True, notice="Choose a file in the system dialog, or type a path here"
+        )
+
+    def poll(self, dialog: Dialog | None) -> Dialog | None:
+        """The question after a look at the dialog: with the file, if one was chosen. Does not wait."""
+        if self._shown is None or dialog is None or not dialog.choosing:
+            self.close()  # the question was answered without it
+            return dialog
+        if not self._shown.ready(0):
+            return dialog
+        answer: Sequence[str] | str = self._shown.result()
+        path = answer if isinstance(answer, str) else next(iter(answer), "")
+        self._shown = None
+        return replace(dialog, choosing=False, notice="", chosen=path)
+
+    def close(self) -> None:
+        """Take the dialog away, answered or not."""
+        if self._shown is not None and not self._shown.ready(0):
+            self._shown.kill()
+        self._shown = None

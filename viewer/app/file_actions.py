@@ -6,24 +6,226 @@ Everything that goes wrong here is one line in the window; the work stays as it 
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
+from progdf.camera import Camera
 from progdf.cli.info import kind_of
 from progdf.errors import ProgdfError
-from viewer.camera.view_camera import first_camera
+from progdf.gaussians import Gaussians
+from progdf.gdf.file import Gdf, load_gdf
+from progdf.io.cameras import load_cameras
+from progdf.io.picture_camera import edits_in_picture, find_picture_camera
+from progdf.metrics.image import NO_DIFFERENCE
+from progdf.scene.strays import Strays, clean, find_strays, picture_difference
+from progdf.terminal import group_digits
+from progdf.threads import all_threads
+from viewer.camera.view_camera import first_camera, from_camera, to_camera
 from viewer.files import document as documents
-from viewer.files import exports, session
+from viewer.files import exports, session, timeline_file
 from viewer.files.session import SessionAutosave, WindowSession, session_file
 from viewer.files.user_files import parse_path, read_recent, remember_recent
-from viewer.state import workspace
-from viewer.state.view_state import on_another_scene
-from viewer.state.workspace import Dialog
-from viewer.ui import native_dialogs as native
+from viewer.jobs.training import with_picture
+from viewer.state import selection, workspace
+from viewer.state.layers import add_layer, duplicate_layer, replace_edit
+from viewer.state.timeline import Player
+from viewer.state.view_state import ViewState, on_another_scene
+from viewer.state.workspace import Dialog, focus_layer, with_camera
 
-from . import view_actions
+from . import dialogs
 from .application import Application, error_details, failure_line, log_error
-from .edit_actions import EditActions
+from .main_view import MainView
+
+PICTURES = (".png", ".jpg", ".jpeg", ".webp")
+"""Endings of what `edit_picture` takes."""
+
+
+def look_through(main_view: MainView, path: Path) -> None:
+    """Take the first camera of a file.
+
+    Raises:
+        ProgdfError: it holds none.
+    """
+    _take_camera(main_view, load_cameras(path, main_view.facts.origin)[0])
+    main_view.show_message(f"Looking through the first camera of {path.name}")
+
+
+def edit_picture(main_view: MainView, path: Path) -> None:
+    """Put a picture that was changed into the form of a new edit, and look from where it was taken.
+
+    Raises:
+        ProgdfError: it is no picture, its camera is not found, or it was taken with edits on.
+    """
+    camera = find_picture_camera(path, origin=main_view.facts.origin)
+    if edits := edits_in_picture(path):
+        raise ProgdfError(f"{path.name} was taken with edits on ({edits}); take the view with Ctrl+F2")
+    _take_camera(main_view, camera)
+    work = main_view.work
+    main_view.work = replace(work, form=with_picture(work.form, path, work.form_open), form_open=True)
+
+
+def _take_camera(main_view: MainView, camera: Camera) -> None:
+    seen = from_camera(main_view.work.view.camera, camera, main_view.facts.bounds)
+    main_view.work = with_camera(main_view.work, seen)
+
+
+def keep_camera(app: Application, session: Path | None) -> None:
+    """Add the view on screen to the cameras kept beside the session, or the scene.
+
+    Raises:
+        ProgdfError: see `exports.camera`.
+    """
+    main_view = app.main_view
+    beside = session or app.document.path or main_view.pictures / app.document.title
+    camera = to_camera(main_view.work.view.camera, *main_view.picture_size)
+    path, count = exports.camera(beside, camera, main_view.facts.origin)
+    main_view.show_message(
+        f"Saved as camera {count} in {path.resolve()}; use it with progdf train … --cameras {path.name}"
+    )
+
+
+def open_timeline(main_view: MainView, path: Path) -> None:
+    """The keys of a file take the place of those there are; undo brings them back.
+
+    Raises:
+        ProgdfError: see `timeline_file.load`.
+    """
+    view = main_view.work.view
+    main_view.change(replace(view, timeline=timeline_file.load(path, view.layers, main_view.facts.origin)))
+    main_view.work = replace(main_view.work, player=Player(shown=True))
+    main_view.show_message(f"Opened {path.name}; press Space to play it")
+
+
+class EditActions:
+    """Changes of the stack that undo takes back.
+
+    Args:
+        app: the window
+    """
+
+    def __init__(self, app: Application) -> None:
+        self._app = app
+
+    def add(self, path: Path) -> None:
+        """An edit on top, at full strength, so that one sees what came.
+
+        Raises:
+            ProgdfError: the file is missing, broken, or was made for another scene.
+        """
+        gdf = self._load(path)
+        view = add_layer(self._app.main_view.work.view, self._open(gdf, path), gdf.name)
+        self._apply(view, len(view.layers) - 1)
+
+    def duplicate(self, index: int) -> None:
+        """A copy of a layer above it, with an edit of its own: the timeline and undo tell edits apart."""
+        document, view = self._app.document, self._app.main_view.work.view
+        gdf = view.layers[index].gdf
+        path = document.gdf_paths[gdf] if gdf < len(document.gdf_paths) else None
+        self._apply(duplicate_layer(view, index, self._open(document.gdfs[gdf], path)), index + 1)
+
+    def replace(self, index: int, path: Path) -> None:
+        """Another edit in a layer's place.
+
+        Raises:
+            ProgdfError: as for `add`.
+        """
+        gdf = self._load(path)
+        view = self._app.main_view.work.view
+        self._apply(replace_edit(view, index, self._open(gdf, path), gdf.name), index)
+
+    def layer(self, index: str) -> int:
+        """The layer that a request is about: the focused one where none is named.
+
+        Raises:
+            ProgdfError: there is none.
+        """
+        work = self._app.main_view.work
+        chosen = int(index) if index else work.focus
+        if chosen is None or not 0 <= chosen < len(work.view.layers):
+            raise ProgdfError("no layer is selected; click one first")
+        return chosen
+
+    def _load(self, path: Path) -> Gdf:
+        with all_threads():
+            return load_gdf(path, self._app.document.scene)
+
+    def _open(self, gdf: Gdf, path: Path | None) -> int:
+        """Have one more edit open; its index."""
+        document = self._app.document
+        renamed = replace(gdf, name=document.free_name(gdf.name))
+        known = path is not None and len(document.gdf_paths) == len(document.gdfs)
+        paths = (*document.gdf_paths, path) if known and path is not None else ()
+        self._app.show(replace(document, gdfs=(*document.gdfs, renamed), gdf_paths=paths))
+        return len(document.gdfs)
+
+    def _apply(self, view: ViewState, focus: int) -> None:
+        """The changed stack, and the layer that it is about."""
+        main_view = self._app.main_view
+        main_view.change(view)
+        main_view.work = focus_layer(main_view.work, focus)
+
+
+class StrayActions:
+    """Hides what a capture left where nothing is, when it is asked to. `close` it with the window.
+
+    Args:
+        app: the window
+    """
+
+    def __init__(self, app: Application) -> None:
+        self._app = app
+        self._worker = ThreadPoolExecutor(1, thread_name_prefix="strays")
+        self._search: Future[tuple[Strays, float]] | None = None
+        self._scene: Gaussians | None = None  # that is searched
+
+    def handle(self, request: str) -> bool:
+        """Begin to look for strays, which takes seconds; False where something else is asked for."""
+        if request != "hide_strays":
+            return False
+        if self._search is None:
+            self._scene = self._app.document.scene
+            self._search = self._worker.submit(_search, self._scene)
+            self._app.main_view.show_message("Looking for strays …")
+        return True
+
+    def poll(self) -> float | None:
+        """Hide what was found; seconds until the next look, None for ever."""
+        if self._search is None:
+            return None
+        if not self._search.done():
+            return _POLL_S
+        search, self._search = self._search, None
+        if self._scene is self._app.document.scene:  # else another one was opened meanwhile
+            self._hide(*search.result())
+        return None
+
+    def close(self) -> None:
+        """Nobody waits for what is still looked for."""
+        self._worker.shutdown(wait=False, cancel_futures=True)
+
+    def _hide(self, strays: Strays, db: float) -> None:
+        main_view, count = self._app.main_view, len(self._app.document.scene)
+        if not len(strays.rows):
+            main_view.show_message("There are no strays")
+            return
+        view, mask = main_view.work.view, np.zeros(count, bool)
+        mask[strays.rows] = True
+        main_view.change(replace(view, selection=selection.hide(view.selection, mask)))
+        change = "no pixel differs" if db >= NO_DIFFERENCE else f"{db:.1f} dB to the pictures before"
+        main_view.show_message(
+            f"Hid {group_digits(len(strays.rows))} strays ({strays.describe()}): {change}; Alt+H shows them"
+        )
+
+
+def _search(scene: Gaussians) -> tuple[Strays, float]:
+    strays = find_strays(scene)
+    return strays, picture_difference(scene, clean(scene, strays))[0] if len(strays.rows) else NO_DIFFERENCE
+
+
+_POLL_S = 0.1
 
 
 class FileActions:
@@ -39,7 +241,7 @@ class FileActions:
         self._app, self.path, self._memory = app, path, memory
         self.session_autosave = SessionAutosave()
         self._put_off: set[Path] = set()  # autosaves that were found and are to be decided about later
-        self._browser = native.Browser()
+        self._browser = dialogs.Browser()
         self._edits = EditActions(app)
         opened = app.document
         app.main_view.recent = self._remember(*(file for file in (opened.path, path) if file is not None))
@@ -50,8 +252,8 @@ class FileActions:
         if name in ("save", "save_as"):
             self._save_where(argument, ask=name == "save_as")
         elif name in ("save_to", "overwrite"):
-            asked = self._app.main_view.work.dialog
-            self._save_to(argument, asked.then if asked else "", overwrite=name == "overwrite")
+            dialog = self._app.main_view.work.dialog
+            self._save_to(argument, dialog.then if dialog else "", overwrite=name == "overwrite")
         elif name == "open":
             self._app.main_view.ask(Dialog("open"))
         elif name == "browse":
@@ -59,7 +261,7 @@ class FileActions:
         elif name == "open_file":
             self._report_errors(lambda: self.open(parse_path(argument)))
         elif name == "camera":
-            self._report_errors(lambda: view_actions.keep_camera(self._app, self.path))
+            self._report_errors(lambda: keep_camera(self._app, self.path))
         elif name == "discard":
             self._report_errors(self._discard)
         elif name == "restore_autosave":
@@ -87,10 +289,10 @@ class FileActions:
             Seconds until it has to be called again; None if no such dialog is on screen.
         """
         main_view = self._app.main_view
-        asked = self._browser.poll(main_view.work.dialog)
-        if asked is not None and asked != main_view.work.dialog:
-            main_view.ask(asked)
-        return native.POLL_S if self._browser.on_screen else None
+        dialog = self._browser.poll(main_view.work.dialog)
+        if dialog is not None and dialog != main_view.work.dialog:
+            main_view.ask(dialog)
+        return dialogs.POLL_S if self._browser.on_screen else None
 
     @property
     def has_unsaved(self) -> bool:
@@ -102,7 +304,7 @@ class FileActions:
         changed picture goes into the form of a new edit."""
 
         def open_kind() -> None:
-            picture = path.suffix.lower() in view_actions.PICTURES
+            picture = path.suffix.lower() in PICTURES
             self._open(path, "picture" if picture else kind_of(path))
 
         self._report_errors(open_kind)
@@ -140,9 +342,9 @@ class FileActions:
         if not self.has_unsaved:
             self.session_autosave.stop()
             return None
-        kept = workspace.worth_saving(self._app.main_view.work)
+        unsaved = workspace.worth_saving(self._app.main_view.work)
         try:
-            wait = self.session_autosave.wait(now, kept, self._autosave_base, self._write)
+            wait = self.session_autosave.wait(now, unsaved, self._autosave_base, self._write)
         except (ProgdfError, OSError) as error:
             self._app.main_view.show_message(f"Autosave failed: {error}", error=True)
             return None
@@ -153,8 +355,8 @@ class FileActions:
         try:
             if not self.has_unsaved:
                 return "nothing was unsaved"
-            kept = workspace.worth_saving(self._app.main_view.work)
-            path = self.session_autosave.write(kept, self._autosave_base, self._write)
+            unsaved = workspace.worth_saving(self._app.main_view.work)
+            path = self.session_autosave.write(unsaved, self._autosave_base, self._write)
             return f"unsaved work is kept in {path}"
         except Exception as error:  # what is wrong may be the work itself
             log_error(error_details(error), self._memory)
@@ -172,13 +374,13 @@ class FileActions:
         if self._app.main_view.at_start and kind in ("picture", "cameras", "timeline", "gdf"):
             raise ProgdfError(f"{path.name} belongs to a scene; open that first")
         if kind == "picture":
-            view_actions.edit_picture(self._app.main_view, path)
+            edit_picture(self._app.main_view, path)
             return
         if kind == "cameras":
-            view_actions.look_through(self._app.main_view, path)
+            look_through(self._app.main_view, path)
             return
         if kind == "timeline":
-            view_actions.open_timeline(self._app.main_view, path)
+            open_timeline(self._app.main_view, path)
             return
         if kind == "gdf":
             self._edits.add(path)
@@ -214,8 +416,8 @@ class FileActions:
         """Ask what becomes of work that was left unsaved the last time, of the latest first."""
         if self._app.document.path is None:
             return
-        found = session.find_autosaves(self._session_name(), numbered=self.path is None)
-        left = [path for path in found if path != self.session_autosave.path and path not in self._put_off]
+        paths = session.find_autosaves(self._session_name(), numbered=self.path is None)
+        left = [path for path in paths if path != self.session_autosave.path and path not in self._put_off]
         if left:
             self._put_off.add(left[0])  # if it is not decided now
             self._app.main_view.ask(Dialog("restore", str(left[0])))
@@ -244,11 +446,10 @@ class FileActions:
             raise ProgdfError(f"{opened.title} was not opened from a file; save the scene first")
         folder = (self.path or opened.path or Path()).resolve().parent
         view, total = main_view.work.view, len(opened.scene)
-        kept = exports.keep_region(view.selection, name, folder, total)
-        main_view.change(replace(view, selection=kept))
-        main_view.show_message(
-            f"Saved {kept.regions[-1].path}; train it with --region file:{kept.regions[-1].path.name}"
-        )
+        selection = exports.keep_region(view.selection, name, folder, total)
+        main_view.change(replace(view, selection=selection))
+        path = selection.regions[-1].path
+        main_view.show_message(f"Saved {path}; train it with --region file:{path.name}")
 
     def _rename_region(self, index: str, name: str) -> None:
         view, total = self._app.main_view.work.view, len(self._app.document.scene)

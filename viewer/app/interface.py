@@ -2,103 +2,173 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from imgui_bundle import imgui
 
-from viewer.panel import brush, panel, timeline_bar
-from viewer.panel.new_edit_form import FormInput
-from viewer.panel.snapshot_cards import SnapshotCard, SnapshotSlider
-from viewer.pictures.compare_labels import Labels
-from viewer.select import outline
-from viewer.state import history, snapshots, workspace
+from viewer.panel import panel, timeline_bar, tools
+from viewer.pictures.compare import Labels
+from viewer.state import history, workspace
 from viewer.state.actions import GLIDES, perform
-from viewer.state.recordings import obstacle
 from viewer.state.workspace import Workspace
-from viewer.ui import axis_gizmo, overlay
+from viewer.ui import overlay
+from viewer.ui.context import PALETTE, SMALL_PX, UiContext
+from viewer.ui.keys import TOPICS
 from viewer.ui.pointer import PointerContext
 
-from . import bindings, compare_overlay, dialogs, mouse
+from . import dialogs, mouse, select_tool
 from .mouse import MouseTool
 from .studio import pages
 from .studio.pages import UpStrip
+
+MOUSE_HELP = (
+    ("Left drag", "orbit; with Alt also while a tool is on"),
+    ("Middle drag", "orbit; with Shift pan, with Ctrl dolly"),
+    ("Right drag", "pan; in fly mode look around"),
+    ("Wheel", "zoom"),
+    ("Click", "select the layer under the cursor"),
+    ("Double-click", "set the orbit pivot"),
+    ("Axes", "click an end to look from there"),
+    ("W A S D Q E", "fly; Shift faster, Alt slower"),
+    ("Shift on a slider", "fine adjustment"),
+    ("Ctrl+click a slider", "type a value"),
+    ("Double-click a slider", "reset it"),
+    ("Right-click", "menu of a layer or snapshot"),
+    ("Esc, right-click", "cancel a drag"),
+)
+
+_MAC = (("Cmd", "does what Ctrl does here; shortcuts take both"),)
+
+_ROW, _BETWEEN = 1.24, 0.7  # in sizes of the small text: from row to row, and above a heading
+COLUMN_PX, _MARGIN_PX = 322.0, 14.0  # at 1×
+_MOST_COLUMNS = 3
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A heading, and under it what does what."""
+
+    name: str
+    rows: tuple[tuple[str, str], ...]
+
+    @property
+    def height(self) -> float:
+        """With its heading, in rows."""
+        return len(self.rows) + 1 + _BETWEEN / _ROW
+
+
+def topics() -> tuple[Topic, ...]:
+    """Everything that can be done, each once."""
+    mouse = Topic("Mouse", MOUSE_HELP + (_MAC if sys.platform == "darwin" else ()))
+    return mouse, *(
+        Topic(name, tuple((key.listed or key.chord, key.help) for key in keys if key.help))
+        for name, keys in TOPICS.items()
+    )
+
+
+def columns(topics: Sequence[Topic], count: int) -> list[list[Topic]]:
+    """The topics in their order in at most `count` columns, the longest as short as it can be."""
+    spans = ((i, j) for i in range(len(topics)) for j in range(i + 1, len(topics) + 1))
+    heights = {sum(topic.height for topic in topics[i:j]) for i, j in spans}
+    return next(packed for height in sorted(heights) if len(packed := _pack(topics, height)) <= count)
+
+
+def draw_bindings(room: imgui.ImVec2, ui: UiContext) -> None:
+    """The list in the middle of a `room` at the upper left; it scrolls where it is longer than that."""
+    margin, wide = _MARGIN_PX * ui.scale, COLUMN_PX * ui.scale
+    count = max(1, min(_MOST_COLUMNS, int((room.x - 2 * margin) / wide)))
+    packed = columns(topics(), count)
+    needed = max(sum(topic.height for topic in column) for column in packed) * _ROW * SMALL_PX * ui.scale
+    size = imgui.ImVec2(min(len(packed) * wide + 2 * margin, room.x), min(needed + 2 * margin, room.y))
+    imgui.set_next_window_pos(imgui.ImVec2((room.x - size.x) / 2, (room.y - size.y) / 2))
+    imgui.set_next_window_size(size)
+    imgui.push_style_color(imgui.Col_.window_bg, imgui.ImVec4(*PALETTE.scrim[:3], 0.97))
+    imgui.push_style_var(imgui.StyleVar_.window_rounding, 6.0 * ui.scale)
+    imgui.push_style_var(imgui.StyleVar_.window_padding, imgui.ImVec2(margin, margin))
+    imgui.push_style_var(imgui.StyleVar_.item_spacing, imgui.ImVec2(8.0 * ui.scale, 0.0))
+    imgui.begin("bindings", None, _OVER_ALL)
+    imgui.internal.bring_window_to_display_front(imgui.internal.get_current_window())
+    left, top = imgui.get_cursor_pos_x(), imgui.get_cursor_pos_y()
+    for i, column in enumerate(packed):
+        _column(column, left + i * wide, top, ui)
+    imgui.end()
+    imgui.pop_style_var(3)
+    imgui.pop_style_color()
+
+
+def _column(topics: Sequence[Topic], left: float, top: float, ui: UiContext) -> None:
+    step = SMALL_PX * ui.scale
+    imgui.push_font(None, SMALL_PX)
+    wide = max(imgui.calc_text_size(chord).x for topic in topics for chord, _ in topic.rows) + 14.0 * ui.scale
+    y = top - _BETWEEN * step
+    for topic in topics:
+        y += _BETWEEN * step
+        imgui.set_cursor_pos(imgui.ImVec2(left, y))
+        _heading(topic.name, ui)
+        for chord, does in topic.rows:
+            y += _ROW * step
+            imgui.set_cursor_pos(imgui.ImVec2(left, y))
+            imgui.text(chord)
+            imgui.set_cursor_pos(imgui.ImVec2(left + wide, y))
+            imgui.text_disabled(does)
+        y += _ROW * step
+    imgui.pop_font()
+
+
+def _heading(name: str, ui: UiContext) -> None:
+    imgui.push_font(ui.fonts.bold, SMALL_PX)
+    imgui.text_colored(imgui.ImVec4(*PALETTE.accent), name)
+    imgui.pop_font()
+
+
+def _pack(topics: Sequence[Topic], height: float) -> list[list[Topic]]:
+    """Columns of at most this height, filled one after the other; too long a topic stands alone."""
+    packed: list[list[Topic]] = []
+    for topic in topics:
+        if packed and sum(t.height for t in (*packed[-1], topic)) <= height:
+            packed[-1].append(topic)
+        else:
+            packed.append([topic])
+    return packed
+
+
+_OVER_ALL = (
+    imgui.WindowFlags_.no_title_bar.value
+    | imgui.WindowFlags_.no_resize.value
+    | imgui.WindowFlags_.no_collapse.value
+    | imgui.WindowFlags_.no_saved_settings.value
+    | imgui.WindowFlags_.no_focus_on_appearing.value
+    | imgui.WindowFlags_.no_nav.value
+    | imgui.WindowFlags_.no_move.value
+)
 
 
 def panels(
     work: Workspace,
     pointer: PointerContext,
-    cards: tuple[SnapshotCard, ...],
-    reveal: bool,
+    textures: Sequence[int],
     preview: tuple[str, bool],
-    recent: Sequence[Path] = (),
+    recent: Sequence[Path],
+    reveal: bool,
 ) -> Workspace:
-    """The panel and, where it is shown, the timeline.
-
-    Args:
-        cards: of the snapshots
-        reveal: scroll to the focused layer
-        preview: what is said of the picture of a new edit, and whether it failed
-        recent: files opened before, the last one first
-    """
-    facts, past = pointer.facts, work.past
-    shown = panel.PanelInput(
-        workspace.UNSAVED * workspace.has_unsaved(work) + facts.title,
-        facts.count,
-        facts.rows,
-        work.focus,
-        history.next_undo(past),
-        history.next_redo(past),
-        reveal,
-        work.active_slider,
-        work.renaming,
-        cards,
-        obstacle(facts.recordings),
-        work.form if work.form_open else None,
-        _form_input(work, facts.count, preview),
-        work.jobs,
-        recent,
-        work.selected,
-        work.search,
-        work.searching,
-        _snapshot_slider(work, pointer) if cards else SnapshotSlider(),
-        work.cards_fit,
-    )
-    result = panel.draw(work.view, shown, pointer.ui)
-    work = replace(work, view=result.state, focus=result.focus, renaming=result.renaming)
-    form = result.form or work.form
-    work = replace(work, overlap=result.overlap, pointed=result.pointed, form=form)
-    work = replace(
-        work, search=result.search, searching=False, cards_fit=result.cards_fit, form_opening=False
-    )
-    work = perform_actions(work, result.actions, pointer)
+    """The panel and, where it is shown, the timeline. Arguments as of `panel.draw`."""
+    actions: list[str] = []
+    work = panel.draw(work, pointer.facts, textures, preview, recent, reveal, pointer.ui, actions)
+    work = perform_actions(work, actions, pointer)
     if work.player.shown:
-        asked = timeline_bar.draw(work.view.timeline, work.player, pointer.area, pointer.ui)
-        work = perform_actions(work, asked, pointer)
+        requested = timeline_bar.draw(work.view.timeline, work.player, pointer.area, pointer.ui)
+        work = perform_actions(work, requested, pointer)
     return work
-
-
-def _snapshot_slider(work: Workspace, pointer: PointerContext) -> SnapshotSlider:
-    """Which two snapshots there is a slider between, and where it stands."""
-    view, kept = work.view, snapshots.with_original(work.snapshots, work.view)
-    current = snapshots.is_blend(view, kept, lambda gdf: pointer.facts.rows[gdf].count)
-    compared = snapshots.compare_sides(work.snapshots, view) is not None
-    return SnapshotSlider(*snapshots.pair_of(kept, view.pair), view.pair.share, current, compared)
-
-
-def _form_input(work: Workspace, count: int, preview: tuple[str, bool]) -> FormInput:
-    """What the form of a new edit offers."""
-    selection = work.view.selection
-    regions = tuple((region.name, region.count) for region in selection.regions)
-    return FormInput(count, selection.count, regions, *preview, work.form_opening)
 
 
 def over_picture(
     work: Workspace,
     pointer: PointerContext,
     held: MouseTool,
-    said: Labels,
+    labels: Labels,
     figures: Sequence[tuple[str, str]],
     original: bool,
     strip: UpStrip | None = None,
@@ -107,22 +177,22 @@ def over_picture(
 
     Args:
         held: what the mouse holds
-        said: over the comparison on screen
+        labels: over the comparison on screen
         figures: of the table of timings
         original: the key that shows it is held
         strip: asks which way is up
     """
     area, ui, view = pointer.area, pointer.ui, work.view
     io = imgui.get_io()
-    on_axes = not io.want_capture_mouse and bool(axis_gizmo.under(view, area, ui))
+    on_axes = not io.want_capture_mouse and bool(overlay.axis_under(view, area, ui))
     if view.brush.active and not (io.want_capture_mouse or io.key_alt or on_axes):
-        brush.ring(view, ui)
-    axis_gizmo.draw(view, area, on_axes or held.drag == axis_gizmo.DRAG, ui)
-    outline.draw(held.gesture, view, ui, pointer.left)
+        tools.draw_ring(view, ui)
+    overlay.draw_axes(view, area, on_axes or held.drag == overlay.AXES_DRAG, ui)
+    select_tool.draw_gesture(held.gesture, view, ui, pointer.left)
     if original:
         overlay.banner("Original", area, ui)
     else:
-        compare_overlay.draw(view, said, area, mouse.grips_divider(held, view, pointer), ui)
+        mouse.draw_comparison(view, labels, area, mouse.grips_divider(held, view, pointer), ui)
     if view.overlay:
         overlay.table(figures, ui)
     free = imgui.get_io().display_size
@@ -140,7 +210,7 @@ def over_picture(
         elif clicked == "close" or pointer.now >= line.until:
             work = replace(work, message=None)
     if work.help:
-        bindings.draw(free, ui)
+        draw_bindings(free, ui)
     return work
 
 

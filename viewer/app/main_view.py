@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
@@ -16,30 +16,82 @@ import moderngl
 from imgui_bundle import imgui
 
 from progdf.errors import ProgdfError
-from viewer.camera import inputs
-from viewer.camera.inputs import NO_KEYS, Keys, Taps
-from viewer.files import exports as saved_files
+from viewer.files import exports
 from viewer.gl.present import read_rgb
 from viewer.panel import new_edit_form, panel
 from viewer.render.engine import ViewEngine, drawn_size
-from viewer.render.surfaces import Surfaces
-from viewer.select import hand
-from viewer.state import comparison, layer_selection, playback, workspace
-from viewer.state.recordings import RecordingFile
+from viewer.render.picking import Surfaces
+from viewer.state import actions, layer_selection, timeline, workspace
+from viewer.state.facts import RecordingFile
 from viewer.state.snapshots import SliderSnapshot, compare_sides
 from viewer.state.view_state import LayerState, ViewState
 from viewer.state.workspace import Dialog, SceneFacts
 from viewer.ui import overlay
 from viewer.ui.context import UiContext
-from viewer.ui.frame_pacer import FramePacer
+from viewer.ui.keys import (
+    NO_KEYS,
+    Keys,
+    PendingKeys,
+    Taps,
+    cancels_drag,
+    fly_by_keys,
+    has_pending_input,
+    holds_original,
+    is_flying,
+    is_repeating,
+    requested_actions,
+    tapped_actions,
+)
 from viewer.ui.pointer import PointerContext
 
-from . import interface, mouse
+from . import interface, mouse, select_tool
 from .canvas import Canvas
 from .mouse import MouseTool
-from .pending_keys import PendingKeys
 from .studio import pages
 from .studio.pages import Cover, UpStrip
+
+SETTLE_FRAMES = 3  # imgui takes a frame or two until hovering and layout have followed an event
+LINGER_S = 0.65
+"""Seconds after which a resting mouse gets its tooltip: a little more than imgui's own two delays."""
+
+
+class FramePacer:
+    """Counts frames, and seconds of rest, since the last event."""
+
+    def __init__(self) -> None:
+        self._unsettled = SETTLE_FRAMES
+        self._rest_left: float | None = LINGER_S  # None: the tooltip has had its frames
+
+    def wake(self) -> None:
+        """Something happened."""
+        self._unsettled, self._rest_left = SETTLE_FRAMES, LINGER_S
+
+    def rest(self) -> None:
+        """Nothing can be drawn, as the window is minimized."""
+        self._unsettled, self._rest_left = 0, None
+
+    def step(self, seconds: float) -> None:
+        """A frame begins, so long after the last one."""
+        if self._unsettled > 0:
+            self._unsettled -= 1
+        elif self._rest_left is not None:
+            self._rest_left -= seconds
+            if self._rest_left <= 0.0:
+                # imgui counts the delay up in this frame, opens the tooltip unseen in the next one to measure
+                # it, and shows it in the one after
+                self._unsettled, self._rest_left = SETTLE_FRAMES, None
+
+    def next_frame_delay(self, others: Sequence[float]) -> float | None:
+        """Seconds until the next frame is due without an event, or None: none is.
+
+        Args:
+            others: seconds until something else wants a frame
+        """
+        if self._unsettled > 0:
+            return 0.0
+        waits = [*others] if self._rest_left is None else [*others, self._rest_left]
+        return min(waits, default=None)
+
 
 FLIGHT_S = 1 / 60  # between frames while flying
 
@@ -113,9 +165,9 @@ class MainView:
         """
         self.canvas.release()
         self.surfaces.drop()
-        found = (*facts.recordings, *(RecordingFile() for _ in live))
+        recordings = (*facts.recordings, *(RecordingFile() for _ in live))
         self.engine, self.facts, self.live = engine, facts, live
-        self.canvas = Canvas(self.context, engine, found, self.canvas)
+        self.canvas = Canvas(self.context, engine, recordings, self.canvas)
         self.wake()
 
     def change(self, view: ViewState) -> None:
@@ -123,9 +175,9 @@ class MainView:
         self.work = workspace.record_undo(replace(self.work, view=view))
         self.wake()
 
-    def restart(self, view: ViewState, kept: tuple[SliderSnapshot, ...] = ()) -> None:
+    def restart(self, view: ViewState, snapshots: tuple[SliderSnapshot, ...] = ()) -> None:
         """A new state and snapshots, with nothing to undo, nothing in the hand or over the picture."""
-        self.work = workspace.new_workspace(view, kept)
+        self.work = workspace.new_workspace(view, snapshots)
         self._tool, self._taps = MouseTool(), Taps()
         self.cover, self.up_strip, self.preview_said = None, None, ("", False)
         self.wake()
@@ -133,16 +185,16 @@ class MainView:
     def next_frame_delay(self) -> float | None:
         """Seconds the window may wait for an event before the next `frame`; None: for ever."""
         self.ui.make_current()
-        if not self._resting and (inputs.has_pending_input() or self.opening):
+        if not self._resting and (has_pending_input() or self.opening):
             return 0.0
-        waits = [FLIGHT_S] if inputs.is_flying(self._keys) or self._taps.since else []
+        waits = [FLIGHT_S] if is_flying(self._keys) or self._taps.since else []
         if self.work.glide is not None:
             waits.append(0.0)
         if self.work.message is not None:
             waits.append(max(self.work.message.until - self._clock, 0.0))
         sharpens = self.canvas.next_frame_delay(self._clock)
         waits += [] if sharpens is None else [sharpens]
-        film = playback.next_frame_delay(self.work.player, self.work.view.timeline)
+        film = timeline.next_frame_delay(self.work.player, self.work.view.timeline)
         return self._pace.next_frame_delay(waits if film is None else [*waits, film])
 
     def is_due(self) -> bool:
@@ -224,20 +276,20 @@ class MainView:
         before = self.work
         self._keys = self._pending.take(keys)
         self._handle_input(seconds)
-        if not imgui.is_any_item_active() and self._tool.drag is None and not inputs.is_repeating(keys):
+        if not imgui.is_any_item_active() and self._tool.drag is None and not is_repeating(keys):
             self.work = workspace.record_undo(self.work)
         if self.work.view.layers != before.view.layers:
             self.work = replace(self.work, before=False)
         if self.work != before:
-            view = comparison.end_at_edit(before.view, self.work.view)
+            view = actions.end_at_edit(before.view, self.work.view)
             self.work = replace(self.work, view=view)
             self.wake()
 
     def _draw_picture(self, screen: moderngl.Framebuffer) -> None:
-        shown, area = self._shown_view(), self._pointer().size
-        self.canvas.comparer.sides = compare_sides(self.work.snapshots, shown)
-        asked = (self.work.overlap, self.work.pointed) if shown.panel else (None, None)
-        self.canvas.draw(shown, screen, area, self._is_held(), self._clock, self.work.focus, *asked)
+        view, area = self._shown_view(), self._pointer().size
+        self.canvas.comparer.sides = compare_sides(self.work.snapshots, view)
+        pointed = (self.work.overlap, self.work.pointed) if view.panel else (None, None)
+        self.canvas.draw(view, screen, area, self._is_held(), self._clock, self.work.focus, *pointed)
         if self.canvas.pixels == 1 and not self._is_held():
             self._pointer().look_ahead()
 
@@ -258,12 +310,12 @@ class MainView:
         return overlay.Area(max(display.x - wide, 1.0), max(display.y, 1.0))
 
     def _handle_input(self, seconds: float) -> None:
-        off = inputs.cancels_drag(self._keys, self._tool.drag)
+        off = cancels_drag(self._keys, self._tool.drag)
         if off:
             self._cancel_drag()
         view, asks = self.work.view, self._takes_keys()
         if not asks:
-            gesture, self.work, self._keys = hand.take_keys(
+            gesture, self.work, self._keys = select_tool.take_keys(
                 self._tool.gesture, self.work, self._pointer(), self._keys
             )
             self._tool = replace(self._tool, gesture=gesture)
@@ -272,12 +324,12 @@ class MainView:
             self._keys = replace(self._keys, pressed=())
             self.request("keep_up")
         flies = view.camera.mode == "fly"
-        self._taps, tapped = inputs.tapped_actions(self._taps, self._keys, self._clock, flies)
+        self._taps, tapped = tapped_actions(self._taps, self._keys, self._clock, flies)
         if asks:  # no key is a shortcut or flies
             self._taps, tapped = Taps(), []
             self._keys = Keys(self._keys.pressed)
         self._keys = self._taps.without(self._keys)
-        for action in (*inputs.requested_actions(self._keys), *tapped):
+        for action in (*requested_actions(self._keys), *tapped):
             if self.at_start and action not in pages.KEYS:
                 continue
             if not asks or action == "window_picture":  # which shows what is open, and changes nothing
@@ -286,18 +338,18 @@ class MainView:
             for action in pages.draw_start_page(self.recent_files, self.ui):
                 self._perform(action)
             return
-        if inputs.is_flying(self._keys):
-            flown = inputs.fly(self.work.view.camera, self._keys, seconds, self.facts.bounds.radius)
+        if is_flying(self._keys):
+            flown = fly_by_keys(self.work.view.camera, self._keys, seconds, self.facts.bounds.radius)
             self.work = workspace.with_camera(self.work, flown)
         if self.work.view.panel:
             several = len(layer_selection.selected_layers(self.work)) > 1
             reveal = self._revealed != (self.work.focus, several)
             with self._guarded():
-                cards, missing = self.canvas.cards(self.work.snapshots, self.work.view)
+                textures, missing = self.canvas.thumbnails(self.work.snapshots, self.work.view)
                 if missing:
                     self.wake()
                 self.work = interface.panels(
-                    self.work, self._pointer(), cards, reveal, self.preview_said, self.recent
+                    self.work, self._pointer(), textures, self.preview_said, self.recent, reveal
                 )
             self._revealed = self.work.focus, several
         if not off:  # else the right button has said all it was pressed for
@@ -340,14 +392,14 @@ class MainView:
 
     @property
     def _shows_original(self) -> bool:
-        return self.work.before or inputs.holds_original(self._keys)
+        return self.work.before or holds_original(self._keys)
 
     def _is_held(self) -> bool:
         """Whether the user holds something that moves the picture, or a film plays."""
         if self._tool.drag is not None or imgui.is_any_item_active() or imgui.get_io().mouse_wheel:
             return True
         moves = self.work.player.playing or self.work.glide is not None
-        return moves or inputs.is_flying(self._keys) or inputs.is_repeating(self._keys)
+        return moves or is_flying(self._keys) or is_repeating(self._keys)
 
     def _draw_overlays(self) -> None:
         """What is drawn over the picture; where some of it goes away, another frame follows."""
@@ -360,10 +412,10 @@ class MainView:
         with self._guarded():
             if self.cover is not None and not original:
                 pages.draw_cover(self.cover, self.work.view, pointer.size, pointer.area, self.ui)
-        said = self.canvas.comparer.labels(self.work.view)
+        labels = self.canvas.comparer.labels(self.work.view)
         figures = self.figures() if self.work.view.overlay else []
         self.work = interface.over_picture(
-            self.work, pointer, self._tool, said, figures, original, self.up_strip
+            self.work, pointer, self._tool, labels, figures, original, self.up_strip
         )
         gone = (before.dialog, self.work.dialog), (before.message, self.work.message)
         if any(was is not None and now is None for was, now in gone):
@@ -397,7 +449,7 @@ class MainView:
 
     def _save_files(self, screen: moderngl.Framebuffer, size: tuple[int, int]) -> None:
         """Serve the requests for files that the main view can make by itself."""
-        known = (*saved_files.REQUESTS, "copy_values", "paste_values")
+        known = (*exports.REQUESTS, "copy_values", "paste_values")
         served = [request for request in self.work.requests if request in known]
         left = tuple(request for request in self.work.requests if request not in served)
         self.work = replace(self.work, requests=left)
@@ -415,9 +467,9 @@ class MainView:
             self.work, what = layer_selection.paste_values(self.work, imgui.get_clipboard_text())
             return f"Pasted strength and gains to {what}"
         if request == "timeline_file":
-            return saved_files.timeline(self.pictures, title, view, self.facts.origin)
+            return exports.timeline(self.pictures, title, view, self.facts.origin)
         if request == "window_picture":
-            return saved_files.picture(self.pictures, title, read_rgb(screen, size))
+            return exports.picture(self.pictures, title, read_rgb(screen, size))
         taken = request == "take_view"
         seen = self.work.view if taken else view
         return self.canvas.save(self.pictures, title, seen, self._pointer().size, taken)

@@ -6,48 +6,135 @@ from dataclasses import dataclass, replace
 
 from imgui_bundle import imgui
 
-from viewer.camera import controls, inputs
-from viewer.camera.named_views import AXES, look_at_view
+from viewer.camera import controls
 from viewer.camera.view_camera import ViewCamera
-from viewer.panel import brush
+from viewer.camera.views import AXES, look_at_view
+from viewer.panel import tools
+from viewer.pictures.compare import Labels
 from viewer.render.picking import layer_at, seen_at, surface_point
-from viewer.select import hand
-from viewer.select.gesture import Click, Gesture
-from viewer.state import layers as stack
 from viewer.state import paint, workspace
+from viewer.state.layers import with_paint
 from viewer.state.paint import Stroke
 from viewer.state.view_state import Brush, SelectTool, ViewState
 from viewer.state.workspace import Workspace
-from viewer.ui import axis_gizmo
-from viewer.ui.context import UiContext
+from viewer.ui import overlay
+from viewer.ui.context import PALETTE, SMALL_PX, UiContext, u32
+from viewer.ui.keys import any_button_down, modifier, started_drag
+from viewer.ui.overlay import Area
 from viewer.ui.pointer import PointerContext
 
-from . import compare_overlay
+from . import select_tool
+from .select_tool import Click, Gesture
+
+REACH_PX = 8.0  # at 1×: so near to the divider the mouse grips it
+DIVIDER = "divider"
+"""The name of its drag, beside those of `keys.DRAGS`."""
+
+
+def near_divider(view: ViewState, area: Area, ui: UiContext) -> bool:
+    """Whether the mouse is where a press grips the divider; the cursor then says so."""
+    if view.compare.mode != "split":
+        return False
+    mouse = imgui.get_io().mouse_pos
+    within = abs(mouse.x - view.compare.divider * area.width) <= REACH_PX * ui.scale
+    return within and 0.0 <= mouse.y < area.height
+
+
+def move_divider(view: ViewState, area: Area) -> ViewState:
+    """The divider under the mouse, never out of the picture."""
+    return place_divider(view, max(0.0, min(1.0, imgui.get_io().mouse_pos.x / area.width)))
+
+
+def place_divider(view: ViewState, divider: float) -> ViewState:
+    """The divider at this share of the picture's width, 0..1."""
+    return replace(view, compare=replace(view.compare, divider=divider))
+
+
+def show_grip() -> None:
+    """The cursor of something that moves sideways."""
+    imgui.set_mouse_cursor(imgui.MouseCursor_.resize_ew.value)
+
+
+def draw_comparison(view: ViewState, labels: Labels, area: Area, held: bool, ui: UiContext) -> None:
+    """Divider and labels, or the line over a difference; and why it is not what was asked for.
+
+    Args:
+        labels: the words
+        held: the mouse holds the divider, or is over it
+    """
+    if view.compare.mode == "difference":
+        overlay.banner(labels.line, area, ui)
+    if view.compare.mode == "split":
+        _divider(view.compare.divider, labels, area, held, ui)
+        _knob(round(view.compare.divider * area.width), area.height / 2, held, ui)
+    if view.compare.mode == "beside":
+        _divider(0.5, labels, area, False, ui)
+    if view.compare.mode != "off" and labels.notice:
+        overlay.banner(labels.notice, area, ui, row=1)
+
+
+def _divider(share: float, labels: Labels, area: Area, held: bool, ui: UiContext) -> None:
+    x = round(share * area.width)
+    canvas = imgui.get_background_draw_list()
+    canvas.push_clip_rect(imgui.ImVec2(0.0, 0.0), imgui.ImVec2(area.width, area.height), False)
+    ink = u32(PALETTE.accent if held else PALETTE.handle)
+    top, bottom = imgui.ImVec2(x, 0.0), imgui.ImVec2(x, area.height)
+    canvas.add_line(top, bottom, u32(PALETTE.scrim), 3.0 * ui.scale)
+    canvas.add_line(top, bottom, ink, 1.5 * ui.scale)
+    _tag(canvas, x, labels.left, True, ui)
+    _tag(canvas, x, labels.right, False, ui)
+    canvas.pop_clip_rect()
+
+
+def _knob(x: float, y: float, held: bool, ui: UiContext) -> None:
+    """A round grip with an arrow to either side."""
+    s, canvas = ui.scale, imgui.get_background_draw_list()
+    ink = u32(PALETTE.accent if held else PALETTE.handle)
+    canvas.add_circle_filled(imgui.ImVec2(x, y), 12.0 * s, u32(PALETTE.scrim))
+    canvas.add_circle(imgui.ImVec2(x, y), 12.0 * s, ink, 0, 1.5 * s)
+    for way in (-1.0, 1.0):
+        canvas.add_triangle_filled(
+            imgui.ImVec2(x + way * 7.5 * s, y),
+            imgui.ImVec2(x + way * 3.0 * s, y - way * 4.0 * s),
+            imgui.ImVec2(x + way * 3.0 * s, y + way * 4.0 * s),
+            ink,
+        )
+
+
+def _tag(canvas: imgui.ImDrawList, x: float, text: str, left: bool, ui: UiContext) -> None:
+    s = ui.scale
+    imgui.push_font(ui.fonts.regular, SMALL_PX)
+    wide = imgui.calc_text_size(text).x
+    imgui.pop_font()
+    pad, gap, size = 8.0 * s, 10.0 * s, SMALL_PX * s
+    start = x - gap - wide - 2 * pad if left else x + gap
+    corner = imgui.ImVec2(start, 14.0 * s)
+    canvas.add_rect_filled(
+        corner,
+        imgui.ImVec2(start + wide + 2 * pad, 14.0 * s + size + pad),
+        u32(PALETTE.scrim),
+        5.0 * s,
+    )
+    at = imgui.ImVec2(round(start + pad), round(14.0 * s + pad / 2))
+    canvas.add_text(ui.fonts.regular, size, at, u32(PALETTE.text), text)
+
 
 CLICK_PX = 3.0  # a press that moves no further, at 1×, is a click
 
 
 @dataclass(frozen=True)
 class MouseTool:
-    """What the mouse holds.
+    """What the mouse holds."""
 
-    Args:
-        drag: one of `controls.DRAGS`, `compare_overlay.DIVIDER`, `brush.DRAG`, `hand.DRAG` or
-            `axis_gizmo.DRAG`; None while it holds nothing
-        stroke: of the brush, from its first drag on
-        gesture: of the tool that selects; of a polygon also between its clicks
-        click: the last of a tool that selects by one, while it follows the tool's tolerance
-        divider: where that of a split stood when it was gripped, share of the picture's width
-        axis: the end of an axis that was pressed, of `named_views.AXES`, or another part of the axes
-        settings: of the tools that select and paint, as they were before a button was pressed
-    """
-
+    # one of `keys.DRAGS`, `DIVIDER`, `PAINT_DRAG`, `SELECT_DRAG` or `AXES_DRAG`; None while it holds nothing
     drag: str | None = None
-    stroke: Stroke | None = None
-    gesture: Gesture | None = None
+    stroke: Stroke | None = None  # of the brush, from its first drag on
+    gesture: Gesture | None = None  # of the tool that selects; of a polygon also between its clicks
+    # the last of a tool that selects by one, while it follows the tool's tolerance
     click: Click | None = None
-    divider: float = 0.5
-    axis: str = ""
+    divider: float = 0.5  # where that of a split stood when it was gripped, share of the picture's width
+    axis: str = ""  # the end of an axis that was pressed, of `AXES`, or another part of the axes
+    # of the tools that select and paint, as they were before a button was pressed
     settings: tuple[SelectTool, Brush] | None = None
 
 
@@ -55,38 +142,38 @@ def handle_mouse(tool: MouseTool, work: Workspace, pointer: PointerContext) -> t
     """What the mouse did in this frame, as imgui's io has it."""
     io = imgui.get_io()
     tool, work = _drag(tool, work, pointer)
-    click, work = hand.adjust(tool.click, work, pointer)
+    click, work = select_tool.adjust(tool.click, work, pointer)
     tool = replace(tool, click=click)
     if imgui.is_mouse_released(0) and tool.drag in ("orbit", "look") and not _has_traveled(pointer.ui):
         work = _focus_picked_layer(work, pointer)
-    if tool.drag == hand.DRAG and imgui.is_mouse_released(0) and tool.gesture is not None:
-        gesture, work = hand.release(tool.gesture, work, pointer)
+    if tool.drag == select_tool.SELECT_DRAG and imgui.is_mouse_released(0) and tool.gesture is not None:
+        gesture, work = select_tool.release(tool.gesture, work, pointer)
         tool = replace(tool, gesture=gesture)
-    if tool.drag == axis_gizmo.DRAG and imgui.is_mouse_released(0) and not _has_traveled(pointer.ui):
+    if tool.drag == overlay.AXES_DRAG and imgui.is_mouse_released(0) and not _has_traveled(pointer.ui):
         work = _look_along(work, tool.axis)
-    if not inputs.any_button_down():
+    if not any_button_down():
         tool = replace(tool, drag=None, settings=(work.view.select, work.view.brush))
     if io.want_capture_mouse:
         return tool, work
     if grips_divider(tool, work.view, pointer):
-        compare_overlay.show_grip()
+        show_grip()
         if imgui.is_mouse_clicked(0):
-            return MouseTool(compare_overlay.DIVIDER, divider=work.view.compare.divider), work
-    axis, plain = axis_gizmo.under(work.view, pointer.area, pointer.ui), not io.key_alt
+            return MouseTool(DIVIDER, divider=work.view.compare.divider), work
+    axis, plain = overlay.axis_under(work.view, pointer.area, pointer.ui), not io.key_alt
     if axis and imgui.is_mouse_clicked(0):
-        return replace(tool, drag=axis_gizmo.DRAG, axis=axis), work
+        return replace(tool, drag=overlay.AXES_DRAG, axis=axis), work
     if work.view.brush.active and plain and imgui.is_mouse_clicked(0):
         return _begin_stroke(tool, work, pointer)
     if work.view.select.tool in ("flood", "color") and plain and imgui.is_mouse_clicked(0):
-        click, work = hand.click(work, pointer)
-        return MouseTool(hand.DRAG, click=click), work
+        click, work = select_tool.click(work, pointer)
+        return MouseTool(select_tool.SELECT_DRAG, click=click), work
     if work.view.select.tool and plain and imgui.is_mouse_clicked(0):
-        gesture, work = hand.press(tool.gesture, work, pointer)
-        return replace(tool, drag=hand.DRAG, gesture=gesture), work
+        gesture, work = select_tool.press(tool.gesture, work, pointer)
+        return replace(tool, drag=select_tool.SELECT_DRAG, gesture=gesture), work
     camera = work.view.camera
     if imgui.is_mouse_double_clicked(0):
         return tool, workspace.with_camera(work, _pick_pivot(camera, pointer))
-    tool = replace(tool, drag=inputs.started_drag(camera.mode) or tool.drag)
+    tool = replace(tool, drag=started_drag(camera.mode) or tool.drag)
     if io.mouse_wheel:
         work = workspace.with_camera(work, controls.zoom(camera, io.mouse_wheel, pointer.facts.bounds.radius))
     return tool, work
@@ -99,33 +186,33 @@ def cancel_drag(tool: MouseTool, work: Workspace) -> Workspace:
     if tool.settings is not None:
         select, brush_settings = tool.settings
         work = replace(work, view=replace(work.view, select=select, brush=brush_settings))
-    if tool.drag != compare_overlay.DIVIDER:
+    if tool.drag != DIVIDER:
         return work
-    return replace(work, view=compare_overlay.place_divider(work.view, tool.divider))
+    return replace(work, view=place_divider(work.view, tool.divider))
 
 
 def grips_divider(tool: MouseTool, view: ViewState, pointer: PointerContext) -> bool:
     """Whether the divider of a split is in the tool, or under it."""
     if tool.drag is not None:
-        return tool.drag == compare_overlay.DIVIDER
+        return tool.drag == DIVIDER
     over = imgui.get_io().want_capture_mouse
-    return not over and compare_overlay.near(view, pointer.area, pointer.ui)
+    return not over and near_divider(view, pointer.area, pointer.ui)
 
 
 def _drag(tool: MouseTool, work: Workspace, pointer: PointerContext) -> tuple[MouseTool, Workspace]:
     """What is held follows the mouse."""
     io, scale = imgui.get_io(), pointer.ui.scale
     dx, dy = io.mouse_delta.x / scale, io.mouse_delta.y / scale
-    if tool.drag == compare_overlay.DIVIDER:
-        return tool, replace(work, view=compare_overlay.move_divider(work.view, pointer.area))
-    if tool.drag == brush.DRAG:
+    if tool.drag == DIVIDER:
+        return tool, replace(work, view=move_divider(work.view, pointer.area))
+    if tool.drag == tools.PAINT_DRAG:
         return _paint(tool, work, pointer)
-    if tool.drag == hand.DRAG:
+    if tool.drag == select_tool.SELECT_DRAG:
         if tool.gesture is None:
             return tool, work
-        gesture, work = hand.follow(tool.gesture, work, pointer)
+        gesture, work = select_tool.follow(tool.gesture, work, pointer)
         return replace(tool, gesture=gesture), work
-    if tool.drag == axis_gizmo.DRAG:
+    if tool.drag == overlay.AXES_DRAG:
         camera = work.view.camera
         turned = controls.orbit(camera, dx, dy) if _has_traveled(pointer.ui) else camera
         return tool, workspace.with_camera(work, turned)
@@ -139,14 +226,14 @@ def _drag(tool: MouseTool, work: Workspace, pointer: PointerContext) -> tuple[Mo
 
 def _begin_stroke(tool: MouseTool, work: Workspace, pointer: PointerContext) -> tuple[MouseTool, Workspace]:
     """The brush comes down on the focused layer, or says why it cannot."""
-    reason = brush.obstacle(work.view, work.focus)
+    reason = tools.paint_obstacle(work.view, work.focus)
     if reason or work.focus is None:
         return tool, workspace.with_message(work, f"Cannot paint: {reason}", pointer.now, error=True)
     layer, held = work.view.layers[work.focus], work.view.brush
-    mode = paint.mode_while(held.mode, inputs.modifier())
+    mode = paint.mode_while(held.mode, modifier())
     gdf = pointer.engine.gdfs[layer.gdf]
     stroke = paint.begin_stroke(layer.paint, gdf, pointer.surface, held.through, mode)
-    return _paint(MouseTool(brush.DRAG, stroke), work, pointer)
+    return _paint(MouseTool(tools.PAINT_DRAG, stroke), work, pointer)
 
 
 def _paint(tool: MouseTool, work: Workspace, pointer: PointerContext) -> tuple[MouseTool, Workspace]:
@@ -156,7 +243,7 @@ def _paint(tool: MouseTool, work: Workspace, pointer: PointerContext) -> tuple[M
         return tool, work
     density = imgui.get_io().display_framebuffer_scale.x * pointer.ui.scale
     stroke = paint.extend_stroke(tool.stroke, *pointer.cursor, view.brush, density)
-    painted = stack.with_paint(view, focus, paint.apply_stroke(stroke, view.brush, density))
+    painted = with_paint(view, focus, paint.apply_stroke(stroke, view.brush, density))
     return replace(tool, stroke=stroke), replace(work, view=painted)
 
 

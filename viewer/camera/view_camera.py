@@ -7,9 +7,10 @@ not from a cross product with the view direction.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, Protocol
+from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -17,11 +18,61 @@ from msgspec import Meta
 
 from progdf.camera import Camera, intrinsics
 from progdf.gaussians import Gaussians
+from progdf.gdf.file import Gdf
 from progdf.io.json_values import one_of
 from progdf.scene.bounds import scene_sphere
 from progdf.scene.subject import fit_eye, is_room, richest_turn, standpoint, subject_rows
+from progdf.scene.up_axis import find_up, up_from_json
 
-from .up_axis import Vec3, up_of
+Vec3 = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class SceneUp:
+    """The world direction that is up, unit length, whether that is certain, and what else it may be."""
+
+    direction: Vec3
+    certain: bool
+    candidates: tuple[Vec3, ...] = ()  # the likeliest first
+    reason: str = ""  # for a person; "" of an edit that knew
+
+
+def up_of(
+    scene: Gaussians,
+    gdfs: Sequence[Gdf] = (),
+    axis: str = "auto",
+    cameras: Sequence[Camera] = (),
+) -> Vec3:
+    """The direction of `find_scene_up`."""
+    return find_scene_up(scene, gdfs, axis, cameras).direction
+
+
+def find_scene_up(
+    scene: Gaussians,
+    gdfs: Sequence[Gdf] = (),
+    axis: str = "auto",
+    cameras: Sequence[Camera] = (),
+    path: Path | None = None,
+) -> SceneUp:
+    """Which way is up.
+
+    Args:
+        scene: the original
+        gdfs: its edits, whose training may have known
+        axis: an axis, or "auto"
+        cameras: given with the scene
+        path: its file
+    """
+    trained = (up_from_json(gdf.report.get("up")) for gdf in gdfs) if axis == "auto" else ()
+    known = next((up for up in trained if up is not None), None)
+    guess = find_up(scene, cameras, axis, path) if known is None and len(scene) else None
+    if guess is not None:
+        known = guess.direction
+    x, y, z = (0.0, 1.0, 0.0) if known is None else (float(c) for c in known)
+    reason = "" if guess is None else f"{guess.name}, {guess.reason}"
+    others = () if guess is None else tuple((a, b, c) for a, b, c in (up.tolist() for up in guess.candidates))
+    return SceneUp((x, y, z), guess is None or guess.certain, others, reason)
+
 
 FARTHEST = 1e9  # world units: float32 matrices stay finite with plenty to spare
 
@@ -30,25 +81,16 @@ _Number = Annotated[float, Meta(ge=-FARTHEST, le=FARTHEST)]
 
 @dataclass(frozen=True)
 class ViewCamera:
-    """Where one looks from: a turntable around `pivot`, or a free flight with the same numbers.
+    """Where one looks from: a turntable around `pivot`, or a free flight with the same numbers."""
 
-    Args:
-        pivot: what the camera turns around, world units
-        distance: from the pivot to the eye, world units, > 0
-        azimuth: degrees around `up`
-        elevation: degrees above the plane normal to `up`, −90..90
-        fov_y: vertical field of view, degrees
-        up: unit vector that is up in the picture
-        mode: "orbit" or "fly"
-    """
-
-    pivot: tuple[_Number, _Number, _Number] = (0.0, 0.0, 0.0)
-    distance: Annotated[float, Meta(gt=0.0, le=FARTHEST)] = 5.0
-    azimuth: _Number = 0.0
+    pivot: tuple[_Number, _Number, _Number] = (0.0, 0.0, 0.0)  # what the camera turns around, world units
+    distance: Annotated[float, Meta(gt=0.0, le=FARTHEST)] = 5.0  # from the pivot to the eye, world units, > 0
+    azimuth: _Number = 0.0  # degrees around `up`
+    # degrees above the plane normal to `up`, −90..90
     elevation: Annotated[float, Meta(ge=-90.0, le=90.0)] = 15.0
-    fov_y: Annotated[float, Meta(ge=1.0, le=179.0)] = 45.0
-    up: tuple[_Number, _Number, _Number] = (0.0, 1.0, 0.0)
-    mode: Annotated[str, one_of(("orbit", "fly"))] = "orbit"
+    fov_y: Annotated[float, Meta(ge=1.0, le=179.0)] = 45.0  # vertical field of view, degrees
+    up: tuple[_Number, _Number, _Number] = (0.0, 1.0, 0.0)  # unit vector that is up in the picture
+    mode: Annotated[str, one_of(("orbit", "fly"))] = "orbit"  # "orbit" or "fly"
 
 
 FILL = 0.72
@@ -75,11 +117,8 @@ class Axes:
     back: Vec3
 
 
-class Fit(Protocol):
-    """Gives the camera of the same direction whose picture something fills."""
-
-    def __call__(self, camera: ViewCamera, aspect: float) -> ViewCamera:
-        """`aspect`: width / height of the picture"""
+Fit = Callable[[ViewCamera, float], ViewCamera]
+"""Gives the camera of the same direction whose picture, of this width / height, something fills."""
 
 
 def keep_camera(camera: ViewCamera, aspect: float) -> ViewCamera:
@@ -236,24 +275,24 @@ def frame(camera: ViewCamera, bounds: Bounds, aspect: float = 1.0) -> ViewCamera
     return replace(camera, pivot=bounds.center, distance=1.05 * bounds.radius / math.sin(half))
 
 
-def fit(camera: ViewCamera, shown: Gaussians, aspect: float = 1.0) -> ViewCamera:
+def fit(camera: ViewCamera, scene: Gaussians, aspect: float = 1.0) -> ViewCamera:
     """The same direction, with these Gaussians filling `FILL` of the tighter side of the picture.
 
     Args:
-        shown: of none at all, the surroundings of the origin are framed
+        scene: of none at all, the surroundings of the origin are framed
         aspect: width / height of the picture
     """
-    if not len(shown):
-        return frame(camera, bounds_of(shown), aspect)
+    if not len(scene):
+        return frame(camera, bounds_of(scene), aspect)
     picture = axes(camera)
     tangent = math.tan(math.radians(camera.fov_y) / 2)
     frame_axes = torch.tensor([picture.right, picture.up, picture.back], dtype=torch.float64)
-    radius = 2 * float(shown.log_scales.amax(dim=1).median().exp())
-    found = fit_eye(shown.means, radius, frame_axes, (FILL * tangent * aspect, FILL * tangent))
-    x, y, z = (float(c) for c in found)
-    depth = dot((x, y, z), picture.back) - float((shown.means.double() @ frame_axes[2]).median())
+    radius = 2 * float(scene.log_scales.amax(dim=1).median().exp())
+    position = fit_eye(scene.means, radius, frame_axes, (FILL * tangent * aspect, FILL * tangent))
+    x, y, z = (float(c) for c in position)
+    depth = dot((x, y, z), picture.back) - float((scene.means.double() @ frame_axes[2]).median())
     if not (math.isfinite(x + y + z) and 0.0 < depth < FARTHEST):
-        return frame(camera, bounds_of(shown), aspect)
+        return frame(camera, bounds_of(scene), aspect)
     return replace(camera, pivot=add_scaled((x, y, z), (-depth, picture.back)), distance=depth)
 
 
@@ -296,9 +335,9 @@ def first_camera(
     if is_room(scene, axis):
         eye_at, target = (tuple(at.tolist()) for at in standpoint(scene, axis))
         return look_from(replace(camera, fov_y=max(fov_y, INSIDE_FOV)), eye_at, target)
-    shown = scene[subject_rows(scene, axis)]
-    azimuth = camera.azimuth + richest_turn(shown, axis, camera.azimuth, camera.elevation)
-    return fit(replace(camera, azimuth=azimuth), shown, aspect)
+    subject = scene[subject_rows(scene, axis)]
+    azimuth = camera.azimuth + richest_turn(subject, axis, camera.azimuth, camera.elevation)
+    return fit(replace(camera, azimuth=azimuth), subject, aspect)
 
 
 def from_camera(camera: ViewCamera, seen: Camera, bounds: Bounds) -> ViewCamera:

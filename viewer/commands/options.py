@@ -21,8 +21,7 @@ from progdf.errors import ProgdfError
 from progdf.gdf.file import Gdf
 from progdf.io.tensors import open_npy
 from progdf.scene.up_axis import UpChoice
-from viewer.camera.up_axis import Vec3, up_of
-from viewer.camera.view_camera import with_up
+from viewer.camera.view_camera import Vec3, up_of, with_up
 from viewer.files import document, session
 from viewer.files.document import Document
 from viewer.state import layers as stacks

@@ -26,9 +26,9 @@ from progdf.io.cameras import read_camera
 from progdf.io.picture_camera import camera_chunk
 from progdf.terminal import format_count, print_line
 from progdf.threads import one_thread
-from viewer.camera.up_axis import Vec3
 from viewer.camera.view_camera import (
     FARTHEST,
+    Vec3,
     ViewCamera,
     bounds_of,
     first_camera,
@@ -39,12 +39,11 @@ from viewer.camera.view_camera import (
 )
 from viewer.files import timeline_file
 from viewer.files.document import empty
-from viewer.pictures import film, timeline_film
-from viewer.pictures.compare_labels import draw_labels
-from viewer.pictures.compare_view import Comparer
+from viewer.pictures import film
+from viewer.pictures.compare import Comparer, draw_labels
 from viewer.render.engine import ViewEngine
-from viewer.render.headless import headless_context
-from viewer.state import recordings, timeline
+from viewer.render.gl_renderer import headless_context
+from viewer.state import facts, timeline
 from viewer.state.layers import shown_edits, visible_layers
 from viewer.state.paint import layer_of
 from viewer.state.snapshots import compare_sides
@@ -128,7 +127,7 @@ def render(argv: Sequence[str]) -> int:
     if options.timeline is not None:
         keys, count = _keys(options, opened), _count(options.sheet)
         with _engine(scene, gdfs, options) as engine:
-            print_line(timeline_film.write(options.out, keys, view, camera, engine, count, _say_frames()))
+            print_line(film.write(options.out, keys, view, camera, engine, count, _say_frames()))
         return 0
     swept = _swept_layers(options, opened)
     with _engine(scene, gdfs, options) as engine:
@@ -187,7 +186,7 @@ def _render_still(
             picture.save(temporary_file, pnginfo=camera_chunk(camera, shown_edits(view), origin, opened.up))
         return ""
     where = opened.document.recordings()
-    missing = recordings.obstacle(where)
+    missing = facts.obstacle(where)
     if view.compare.mode != "off" and view.compare.against == "recorded" and missing:
         raise ProgdfError(
             f"there is nothing recorded to compare with: {missing}; give the .gdf in its run folder"
@@ -209,7 +208,7 @@ def _render_still(
             return f"PSNR of edited against original {comparer.psnr:.2f} dB"
         if comparer.sides is not None:
             return "PSNR of snapshot {1} against {0} {2:.2f} dB".format(*comparer.sides.names, comparer.psnr)
-        recorded = recordings.describe(view, engine.gdfs, comparer.recordings)
+        recorded = facts.describe(view, engine.gdfs, comparer.recordings)
         return f"PSNR of the field against what was recorded {comparer.psnr:.2f} dB ({recorded})"
     finally:
         comparer.release()
@@ -252,8 +251,8 @@ def _count(sheet: str | None) -> int:
     """How many pictures of a film a contact sheet shall show; 0 where none was asked for."""
     if sheet is None:
         return 0
-    if not (sheet.isdecimal() and len(sheet) < 9) or not 1 <= int(sheet) <= timeline_film.MOST_SHOWN:
-        most = timeline_film.MOST_SHOWN
+    if not (sheet.isdecimal() and len(sheet) < 9) or not 1 <= int(sheet) <= film.MOST_SHOWN:
+        most = film.MOST_SHOWN
         raise ProgdfError(f"--sheet {sheet} is not a number of pictures; give one from 1 to {most}")
     return int(sheet)
 
@@ -301,7 +300,7 @@ def _engine(scene: Gaussians, gdfs: Sequence[Gdf], options: RenderOptions) -> It
             ctx.release()
 
 
-def _say_frames() -> timeline_film.Advance:
+def _say_frames() -> film.Advance:
     """Tells a log, now and then, how far a film is; terminals see the result soon enough."""
     last = time.monotonic()
 
@@ -322,7 +321,7 @@ def _check_output(options: RenderOptions) -> None:
         raise ProgdfError(f"--{given[0]} and --{given[1]} cannot be combined; give only one of them")
     films = options.timeline is not None and options.sheet is None
     if films:
-        timeline_film.check_output(options.out)
+        film.check_output(options.out)
     if options.sweep is not None and suffix not in (".gif", ".mp4"):
         raise ProgdfError(f"{options.out} cannot hold an animation; --sweep writes a .gif or an .mp4")
     moves = options.sweep is not None or films

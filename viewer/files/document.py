@@ -16,10 +16,8 @@ from progdf.gdf.file import Gdf, load_gdf
 from progdf.scene.neighbors import Neighborhood
 from progdf.terminal import escape_text
 from progdf.threads import all_threads
-from viewer.camera.up_axis import SceneUp, find_scene_up
-from viewer.camera.view_camera import bounds_of, first_camera, fit, fit_all
-from viewer.state.layer_facts import layer_rows
-from viewer.state.recordings import RecordingFile, find_recording
+from viewer.camera.view_camera import SceneUp, bounds_of, find_scene_up, first_camera, fit, fit_all
+from viewer.state.facts import RecordingFile, find_recording, layer_rows
 from viewer.state.workspace import SceneFacts
 
 

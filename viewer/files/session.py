@@ -26,8 +26,7 @@ from progdf.io.session import (
     write_session,
 )
 from progdf.terminal import escape_text
-from viewer.camera.up_axis import Vec3
-from viewer.camera.view_camera import move_camera
+from viewer.camera.view_camera import Vec3, move_camera
 from viewer.state import paint
 from viewer.state.selection import SUFFIX as REGION_SUFFIX
 from viewer.state.selection import check as check_selection

@@ -28,8 +28,7 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import ZERO, Origin
 from progdf.io.atomic import atomic_write, read_file
 from progdf.io.json_values import convert_json, decode_json, plain
-from viewer.camera.up_axis import Vec3
-from viewer.camera.view_camera import ViewCamera, move_camera
+from viewer.camera.view_camera import Vec3, ViewCamera, move_camera
 from viewer.state.view_state import Easing, Fps, Frame, Keyframe, LayerState, Length, Strength, Timeline
 
 VERSION = 1

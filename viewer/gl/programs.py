@@ -23,15 +23,10 @@ class ShaderError(RuntimeError):
 
 @dataclass(frozen=True)
 class Source:
-    """One stage's GLSL.
+    """One stage's GLSL."""
 
-    Args:
-        text: everything included, with #line directives that keep file and line
-        files: file names by the number that the driver's messages use
-    """
-
-    text: str
-    files: tuple[str, ...]
+    text: str  # everything included, with #line directives that keep file and line
+    files: tuple[str, ...]  # file names by the number that the driver's messages use
 
 
 def load_source(name: str) -> Source:
@@ -92,10 +87,10 @@ def _first_line(log: str, vertex: str, fragment: str | None, sources: list[Sourc
     complaints = []
     for line in log.splitlines():
         for pattern in _LOCATIONS:
-            found = pattern.match(line.strip())
-            if found and int(found["file"]) < len(stage.files):
-                name = stage.files[int(found["file"])]
-                complaints.append(f"shaders/{name}:{found['line']}: {found['text']}")
+            match = pattern.match(line.strip())
+            if match and int(match["file"]) < len(stage.files):
+                name = stage.files[int(match["file"])]
+                complaints.append(f"shaders/{name}:{match['line']}: {match['text']}")
                 break
     names = vertex if fragment is None else f"{vertex} + {fragment}"
     return "\n".join([f"{names} does not compile here", *(complaints or [log.strip()])])

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 from progdf.camera import Camera
 from progdf.gaussians import Gaussians
 
-from .layout import ORDER, PROJECTED, SHOWN_SH
 from .programs import load_program
-from .scene_textures import HighlightTexture, SplatTextures
+from .scene_textures import GRID_LINE, ORDER, PROJECTED, SHOWN_SH, HighlightTexture, SplatTextures
 
 Rgb = tuple[float, float, float]
 
@@ -74,9 +73,9 @@ class SplatRenderer:
     def upload(self, scene: Gaussians) -> int:
         """Take a whole scene; gives the bytes sent. The order has to be set anew."""
         count, coefficients = len(scene), min(int(scene.shN.shape[1]), SHOWN_SH)
-        wanted = (count, coefficients)
+        size = (count, coefficients)
         held = self._scene
-        if held is None or (held.count, held.sh_coefficients) != wanted:
+        if held is None or (held.count, held.sh_coefficients) != size:
             self._release_scene()
             self._scene = SplatTextures(self.ctx, count, coefficients)
             self._buffers = self._make_buffers(max(count, 1))
@@ -97,7 +96,7 @@ class SplatRenderer:
             self._highlights = None
 
     def set_order(self, order: NDArray[np.uint32]) -> None:
-        """Which Gaussians are drawn, farthest first; see `viewer.render.depth_sort`."""
+        """Which Gaussians are drawn, farthest first; see `viewer.render.gl_renderer`."""
         assert self._buffers is not None, "upload comes first"
         self._drawn = len(order)
         if self._drawn:
@@ -195,3 +194,50 @@ def _set_camera(program: moderngl.Program, camera: Camera) -> None:
     program["eye_low"] = tuple(eye - high)
     program["intrinsics"] = (K[0, 0], K[1, 1], K[0, 2], K[1, 2])
     program["size"] = (float(camera.width), float(camera.height))
+
+
+class GridPass:
+    """Draws lines behind the splats of a picture that is already in a framebuffer.
+
+    Args:
+        ctx: to draw in
+    """
+
+    def __init__(self, ctx: moderngl.Context) -> None:
+        self._ctx = ctx
+        self._program = load_program(ctx, "grid.vert", "grid.frag")
+        self._lines = ctx.buffer(reserve=GRID_LINE.itemsize, dynamic=True)
+        content = (self._lines, f"{vertex_format(GRID_LINE)}/i", *(GRID_LINE.names or ()))
+        self._vao = ctx.vertex_array(self._program, [content])
+
+    def draw(
+        self,
+        lines: NDArray[np.void],
+        picture: moderngl.Texture,
+        framebuffer: moderngl.Framebuffer,
+        size: tuple[int, int],
+        left: int = 0,
+    ) -> None:
+        """Draw into the lower `size` pixels of `framebuffer` from the column `left` on.
+
+        Args:
+            lines: of `GRID_LINE`, in pixels of the picture. [L]
+            picture: what is there; its alpha is what the scene covers of a pixel
+        """
+        if not len(lines):
+            return
+        self._lines.orphan(lines.nbytes)
+        self._lines.write(np.ascontiguousarray(lines))
+        framebuffer.use()
+        self._ctx.viewport = (left, 0, *size)
+        self._ctx.enable_only(moderngl.BLEND)
+        self._ctx.blend_equation = moderngl.FUNC_ADD, moderngl.FUNC_ADD
+        ways = (moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA, moderngl.ZERO, moderngl.ONE)
+        self._ctx.blend_func = ways  # type: ignore[assignment]  # its annotation forgets that alpha has its own
+        picture.use(0)
+        self._program["picture"], self._program["shown_size"], self._program["left"] = 0, size, left
+        self._vao.render(moderngl.TRIANGLE_STRIP, vertices=4, instances=len(lines))
+
+    def release(self) -> None:
+        for held in (self._vao, self._lines, self._program):
+            held.release()

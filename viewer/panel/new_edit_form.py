@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from imgui_bundle import imgui
 
@@ -19,17 +18,21 @@ from viewer.jobs.training import (
     missing_package,
     with_editor,
 )
+from viewer.state.selection import SelectionState
+from viewer.state.workspace import Workspace
 from viewer.ui.context import PALETTE, Icon, UiContext
+from viewer.ui.keys import shortcut
 from viewer.ui.widgets import (
     accent_button,
     card,
-    choice,
+    choice_row,
     drop_down,
     elide,
     group_digits,
     icon_button,
     label,
     right_edge,
+    slider_row,
     small,
     tip,
     value_slider,
@@ -39,46 +42,35 @@ from viewer.ui.widgets import (
 COLUMN_PX = 66.0
 
 
-@dataclass(frozen=True)
-class FormInput:
-    """What the form shows besides its own state.
+def draw(
+    work: Workspace, count: int, preview: tuple[str, bool], ui: UiContext, actions: list[str]
+) -> Workspace:
+    """The form, if it is open. Tab goes through it, Enter trains, Escape closes it.
 
     Args:
         count: Gaussians in the scene
-        selected: how many of them are selected
-        regions: names and sizes of the regions that were kept
-        picture: what the editor's picture is at: "", a word such as "drawing", or why there is none
-        failed: `picture` says why there is none
-        opening: the form was just opened, and takes the keyboard
+        preview: what the editor's picture is at: "", a word such as "drawing", or why there is none; and
+            whether that is so
     """
-
-    count: int = 0
-    selected: int = 0
-    regions: Sequence[tuple[str, int]] = ()
-    picture: str = ""
-    failed: bool = False
-    opening: bool = False
-
-
-def draw(form: NewEdit, shown: FormInput, ui: UiContext) -> tuple[NewEdit, str]:
-    """The form as the hand leaves it, and what was asked for: "train", "new_edit" to close it, or "".
-
-    Tab goes through it, Enter trains, Escape closes it.
-    """
+    if not work.form_open:
+        return work
     with card(_NAME, PALETTE.card_focused, ui, nav=True):
         storage, listed = imgui.get_state_storage(), imgui.get_id("a list is open")
-        mine = imgui.is_window_focused() and not storage.get_bool(
-            listed
-        )  # else Enter and Escape are the list's
+        # else Enter and Escape are the list's
+        mine = imgui.is_window_focused() and not storage.get_bool(listed)
         closes = mine and imgui.is_key_pressed(imgui.Key.escape, False)
         trains = mine and any(imgui.is_key_pressed(key, False) for key in _ENTER)
         if mine and not imgui.get_io().want_text_input:
             for key in _ENTER:  # presses no button and opens no list
                 imgui.internal.set_key_owner(key, listed)
-        if not closes:  # a field would take back what was typed
-            form, action = _content(form, shown, ui)
+        if closes:  # without the fields, which would take back what was typed
+            actions.append("new_edit")
+        else:
+            form, action = _content(work, count, preview, ui)
+            actions += ["train"] if trains else [action] if action else []
+            work = replace(work, form=form, form_opening=False)
         storage.set_bool(listed, imgui.is_popup_open("", imgui.PopupFlags_.any_popup.value))
-    return form, "new_edit" if closes else "train" if trains else action
+    return work
 
 
 _NAME, _ENTER = "new edit", (imgui.Key.enter, imgui.Key.keypad_enter)
@@ -90,8 +82,9 @@ def has_keyboard() -> bool:
     return window is not None and window.was_active and f"/{_NAME}_" in window.name
 
 
-def _content(form: NewEdit, shown: FormInput, ui: UiContext) -> tuple[NewEdit, str]:
-    action, right = "", right_edge()
+def _content(work: Workspace, count: int, preview: tuple[str, bool], ui: UiContext) -> tuple[NewEdit, str]:
+    """The form as the hand leaves it, and what was asked for: "train", "new_edit" to close it, or ""."""
+    form, selection, action, right = work.form, work.view.selection, "", right_edge()
     imgui.push_font(ui.fonts.bold, 0.0)
     imgui.align_text_to_frame_padding()
     imgui.text("New edit")
@@ -99,22 +92,18 @@ def _content(form: NewEdit, shown: FormInput, ui: UiContext) -> tuple[NewEdit, s
     imgui.same_line(right - imgui.get_frame_height())
     if icon_button("close form", Icon.CLOSE, ui, dim=True):
         action = "new_edit"
-    tip("Close (Ctrl+N). What is being trained goes on")
+    tip(f"Close ({shortcut('new_edit')}). What is being trained goes on")
     column = COLUMN_PX * ui.scale
-    form = _region(form, shown, column, ui)
+    form = _region(form, selection, count, column, ui)
     form = _editor(form, column, ui)
     form = _settings(form, column, ui)
-    label("Name", column)
-    imgui.set_next_item_width(-1.0)
-    if shown.opening:
+    if work.form_opening:
         imgui.set_keyboard_focus_here()
-    form = replace(form, name=_text("##name", form.suggested_name, form.name))
+    form = replace(form, name=_text_row("Name", form.suggested_name, form.name, column))
     tip("Name of the layer and of its file")
-    label("Quality", column)
-    pressed = choice("quality", ("Draft", "Full"), 0 if form.quick else 1, ui)
-    tip("A draft takes a third of the time")
-    form = form if pressed is None else replace(form, quick=pressed == 0)
-    form = _preview(form, shown, column, ui)
+    qualities, help_ = {True: "Draft", False: "Full"}, "A draft takes a third of the time"
+    form = replace(form, quick=choice_row("Quality", qualities, form.quick, column, ui, help_))
+    form = _preview(form, preview, column, ui)
     error = form.error or missing_package(form.choice)
     if error:
         wrapped(error, PALETTE.error)
@@ -126,14 +115,14 @@ def _content(form: NewEdit, shown: FormInput, ui: UiContext) -> tuple[NewEdit, s
     return form, action
 
 
-def region_title(region: str, shown: FormInput) -> str:
+def _region_title(region: str, selection: SelectionState, count: int) -> str:
     """A region in the list, with how much it holds."""
-    sizes = dict(shown.regions)
+    sizes = {known.name: known.count for known in selection.regions}
     match region:
         case "all":
-            return f"Whole scene  ·  {group_digits(shown.count)}"
+            return f"Whole scene  ·  {group_digits(count)}"
         case "selection":
-            return f"Selection  ·  {group_digits(shown.selected)}"
+            return f"Selection  ·  {group_digits(selection.count)}"
         case "changed":
             return "Where they differ"
         case "typed":
@@ -141,22 +130,19 @@ def region_title(region: str, shown: FormInput) -> str:
     return f"{region}  ·  {group_digits(sizes.get(region, 0))}"
 
 
-def _region(form: NewEdit, shown: FormInput, column: float, ui: UiContext) -> NewEdit:
+def _region(form: NewEdit, selection: SelectionState, count: int, column: float, ui: UiContext) -> NewEdit:
     label("Region", column)
     imgui.set_next_item_width(-1.0)
     room = imgui.get_content_region_avail().x - 2 * imgui.get_frame_height()
-    offered = [SELECTION] * bool(shown.selected) + [name for name, _ in shown.regions] + [ALL, TYPED]
+    offered = [SELECTION] * bool(selection.count) + [known.name for known in selection.regions] + [ALL, TYPED]
     offered = [CHANGED] * (form.choice.kind == "pictures") + offered
-    titles = [region_title(region, shown) for region in offered]
+    titles = [_region_title(region, selection, count) for region in offered]
     now = offered.index(form.region) if form.region in offered else None
-    title = elide(region_title(form.region, shown), room)
+    title = elide(_region_title(form.region, selection, count), room)
     pressed = drop_down("##region", title, titles, now, ui, "What may change")
     form = form if pressed is None else replace(form, region=offered[pressed], error="")
     if form.region == TYPED:
-        imgui.dummy(imgui.ImVec2(0.0, 0.0))
-        imgui.same_line(column)
-        imgui.set_next_item_width(-1.0)
-        form = replace(form, typed_region=_text("##spec", "sphere:0,0,0,1", form.typed_region))
+        form = replace(form, typed_region=_text_row("", "sphere:0,0,0,1", form.typed_region, column))
         tip("As progdf train --region: labels:FILE.npy:ID, box:…, sphere:…, file:ROWS.npy; join by + -")
     return form
 
@@ -178,35 +164,29 @@ def _settings(form: NewEdit, column: float, ui: UiContext) -> NewEdit:
         case "color":
             label("Color", column)
             flags = imgui.ColorEditFlags_
-            shown = flags.display_hex.value | flags.no_label.value
+            hex_only = flags.display_hex.value | flags.no_label.value
             imgui.set_next_item_width(-1.0)
-            changed, (red, green, blue) = imgui.color_edit3("##color", list(form.color), shown)
+            changed, (red, green, blue) = imgui.color_edit3("##color", list(form.color), hex_only)
             form = replace(form, color=(red, green, blue)) if changed else form
-            label("Path", column)
-            pressed = choice("path", ("Straight", "Hues"), int(form.through_hues), ui)
-            tip("Between original and color: the direct way, or around the color wheel")
-            form = form if pressed is None else replace(form, through_hues=pressed == 1)
+            paths = {False: "Straight", True: "Hues"}
+            help_ = "Between original and color: the direct way, or around the color wheel"
+            form = replace(form, through_hues=choice_row("Path", paths, form.through_hues, column, ui, help_))
         case "amount":
-            label("Amount", column)
-            form = replace(form, amount=value_slider("##amount", form.amount, (0.05, 0.98), "%.2f", 0.7, ui))
-            tip("Share of the light that is taken away")
+            help_ = "Share of the light that is taken away"
+            amount = slider_row("Amount", form.amount, (0.05, 0.98), 0.7, column, ui, help_)
+            form = replace(form, amount=amount)
         case "style":
             label("Style", column)
             form = _style(form, ui)
         case "sentence":
-            label("Text", column)
-            imgui.set_next_item_width(-1.0)
-            form = replace(form, sentence=_text("##sentence", "turn him into a statue", form.sentence))
+            form = replace(form, sentence=_text_row("Text", "turn him into a statue", form.sentence, column))
             tip("Needs a model on this machine; see progdf train --help")
         case "pictures":
-            label("Pictures", column)
-            imgui.set_next_item_width(-1.0)
-            form = replace(form, pictures=_text("##pictures", "A.png, B.png", form.pictures))
-            tip("One or a few pictures that were taken here (Ctrl+F2) and changed in any program")
+            form = replace(form, pictures=_text_row("Pictures", "A.png, B.png", form.pictures, column))
+            taken = f"One or a few pictures that were taken here ({shortcut('take_view')})"
+            tip(f"{taken} and changed in any program")
         case "folder":
-            label("Folder", column)
-            imgui.set_next_item_width(-1.0)
-            form = replace(form, folder=_text("##folder", "FOLDER", form.folder))
+            form = replace(form, folder=_text_row("Folder", "FOLDER", form.folder, column))
             tip("Pictures of the training views, edited by any program; see progdf views")
     return form
 
@@ -229,7 +209,7 @@ def _style(form: NewEdit, ui: UiContext) -> NewEdit:
     return replace(form, style=order[at % len(order)])
 
 
-def _preview(form: NewEdit, shown: FormInput, column: float, ui: UiContext) -> NewEdit:
+def _preview(form: NewEdit, preview: tuple[str, bool], column: float, ui: UiContext) -> NewEdit:
     """The strength of the editor's own picture, and whether it is shown."""
     if not form.choice.pictured:
         if form.choice.kind != "pictures":
@@ -245,15 +225,19 @@ def _preview(form: NewEdit, shown: FormInput, column: float, ui: UiContext) -> N
     form = replace(form, strength=value_slider("##strength", form.strength, (0.0, 1.0), "%.2f", 1.0, ui))
     imgui.end_disabled()
     tip("Strength of the preview. Training learns all strengths")
-    if form.preview and shown.failed:
-        wrapped(shown.picture, PALETTE.error)
+    state, failed = preview
+    if form.preview and failed:
+        wrapped(state, PALETTE.error)
     else:
-        small(shown.picture or " ", PALETTE.dim)  # always a line, so that nothing below moves
+        small(state or " ", PALETTE.dim)  # always a line, so that nothing below moves
     return form
 
 
-def _text(name: str, hint: str, text: str) -> str:
-    return str(imgui.input_text_with_hint(name, hint, text)[1])
+def _text_row(title: str, hint: str, text: str, column: float) -> str:
+    """A text field to the end of its line, with its name at the left."""
+    label(title, column)
+    imgui.set_next_item_width(-1.0)
+    return str(imgui.input_text_with_hint(f"##text of {title}", hint, text)[1])
 
 
 def _effort(form: NewEdit) -> str:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from imgui_bundle import imgui
 
-from viewer.panel import strength_slider
+from viewer.state.facts import LayerRow
+from viewer.state.snapshots import compare_sides, is_blend, pair_of, with_original
+from viewer.state.workspace import Workspace
 from viewer.ui.context import PALETTE, SMALL_PX, Icon, UiContext, u32
+from viewer.ui.keys import shortcut
 from viewer.ui.widgets import (
     drop_down,
     elide,
@@ -20,6 +24,8 @@ from viewer.ui.widgets import (
     tip,
     typed_name,
 )
+
+from . import slider
 
 COLUMNS = 3
 _MENU = "menu of a snapshot"
@@ -34,33 +40,24 @@ _ITEMS = (
 
 
 @dataclass(frozen=True)
-class SnapshotCard:
-    """One snapshot as the panel shows it. `texture`: its GL name, 0 before it is drawn"""
+class _Cards:
+    """The snapshots as they are drawn, the original first."""
 
-    name: str
-    texture: int = 0
+    names: Sequence[str]
+    textures: Sequence[int]  # GL names of their pictures, 0 before they are drawn
+    a: int  # places of the two that the slider lies between
+    b: int
 
 
-@dataclass(frozen=True)
-class SnapshotSlider:
-    """The slider between two snapshots.
+def draw(
+    work: Workspace, rows: Sequence[LayerRow], textures: Sequence[int], ui: UiContext, actions: list[str]
+) -> None:
+    """Draw the section.
 
     Args:
-        a, b: places of the two among the cards
-        share: where it stands, 0 at A
-        current: what is on screen is what it made
-        compared: the two are compared in the picture
+        rows: one per .gdf, indexed by `LayerState.gdf`
+        textures: GL names of the pictures, that of the original first
     """
-
-    a: int = 0
-    b: int = 0
-    share: float = 0.0
-    current: bool = False
-    compared: bool = False
-
-
-def draw(cards: tuple[SnapshotCard, ...], slider: SnapshotSlider, ui: UiContext, actions: list[str]) -> None:
-    """Draw the section; what was asked for goes into `actions`. The first card is the original."""
     imgui.dummy(imgui.ImVec2(0.0, 4.0 * ui.scale))
     right = right_edge()
     section("Snapshots", ui)
@@ -69,22 +66,24 @@ def draw(cards: tuple[SnapshotCard, ...], slider: SnapshotSlider, ui: UiContext,
     imgui.same_line(right - wide)
     if imgui.button(f"{name}##snapshot"):
         actions.append("snapshot")
-    tip("Save the current sliders as a snapshot (F3); click a snapshot to restore it")
-    if len(cards) < 2:
+    tip(f"Save the current sliders as a snapshot ({shortcut('snapshot')}); click a snapshot to restore it")
+    if len(textures) < 2:
         return
-    _slider(cards, slider, ui, actions)
+    snapshots = with_original(work.snapshots, work.view)
+    cards = _Cards([s.name for s in snapshots], textures, *pair_of(snapshots, work.view.pair))
+    current = is_blend(work.view, snapshots, lambda gdf: rows[gdf].count)
+    _slider(cards, work, current, ui, actions)
     gap = 6.0 * ui.scale
     each = (imgui.get_content_region_avail().x - (COLUMNS - 1) * gap) / COLUMNS
     start, dragged = imgui.get_cursor_screen_pos(), ""
-    for i, card in enumerate(cards):
+    for i in range(len(textures)):
         if i % COLUMNS:
             imgui.same_line(0.0, gap)
-        badge = "A" * (i == slider.a) + "B" * (i == slider.b)
-        dragged = _card(i, card, badge, each, len(cards), ui, actions) or dragged
+        dragged = _card(i, cards, each, ui, actions) or dragged
     if dragged:
         mouse, tall = imgui.get_mouse_pos(), 0.75 * each + SMALL_PX * ui.scale + 2 * gap
         column = max(0, min(COLUMNS - 1, int((mouse.x - start.x) / (each + gap))))
-        to = max(1, min(len(cards) - 1, COLUMNS * max(0, int((mouse.y - start.y) / tall)) + column))
+        to = max(1, min(len(textures) - 1, COLUMNS * max(0, int((mouse.y - start.y) / tall)) + column))
         kind, _, index = dragged.partition(":")
         if kind == "dropped" and to != int(index):
             actions.append(f"move_snapshot:{index}:{to}")
@@ -96,50 +95,50 @@ def draw(cards: tuple[SnapshotCard, ...], slider: SnapshotSlider, ui: UiContext,
             )
 
 
-def _slider(
-    cards: tuple[SnapshotCard, ...], slider: SnapshotSlider, ui: UiContext, actions: list[str]
-) -> None:
-    """Which two, whether they are compared, and where between them the picture stands."""
+def _slider(cards: _Cards, work: Workspace, current: bool, ui: UiContext, actions: list[str]) -> None:
+    """Which two, whether they are compared, and where between them the picture stands.
+
+    `current`: what is on screen is what the slider made.
+    """
+    compared = compare_sides(work.snapshots, work.view) is not None
     side, gap = imgui.get_frame_height(), 4.0 * ui.scale
     wide = (imgui.get_content_region_avail().x - side - 2 * gap) / 2
-    for slot, chosen in (("a", slider.a), ("b", slider.b)):
+    for slot, chosen in (("a", cards.a), ("b", cards.b)):
         if slot == "b":
             imgui.same_line(0.0, gap)
-            if icon_button("compare snapshots", Icon.SPLIT, ui, dim=not slider.compared):
+            if icon_button("compare snapshots", Icon.SPLIT, ui, dim=not compared):
                 actions.append("compare_snapshots")
-            tip("Compare A with B in the picture (Shift+F3)")
+            tip("Compare A with B in the picture", "compare_snapshots")
             imgui.same_line(0.0, gap)
         imgui.set_next_item_width(wide)
-        label = f"{slot.upper()}   {cards[chosen].name}"
+        label = f"{slot.upper()}   {cards.names[chosen]}"
         room = wide - side - 2 * imgui.get_style().frame_padding.x
         help_ = f"Snapshot {slot.upper()}, the {'left' if slot == 'a' else 'right'} end of the slider below"
-        titles = [card.name for card in cards]
-        pressed = drop_down(f"##snapshot {slot}", elide(label, room), titles, chosen, ui, help_)
+        pressed = drop_down(f"##snapshot {slot}", elide(label, room), cards.names, chosen, ui, help_)
         if pressed is not None:
-            actions.append(f"choose_snapshot:{slot}:{titles[pressed]}")
+            actions.append(f"choose_snapshot:{slot}:{cards.names[pressed]}")
     number = imgui.calc_text_size("0.00").x
     at, room = imgui.get_cursor_screen_pos(), imgui.get_content_region_avail().x - number - 8.0 * ui.scale
-    share = strength_slider.draw(
+    share = slider.draw(
         "##blend snapshots",
-        slider.share,
+        work.view.pair.share,
         (0.0, 0.5, 1.0),
         room,
         ui.scale,
         PALETTE.accent,
-        slider.current,
+        current,
         help_="Blend from A to B. Ctrl+click: type a value. Shift+drag: fine adjustment.",
     )
     corner = imgui.ImVec2(at.x + room + 8.0 * ui.scale, at.y)
-    color = PALETTE.text if slider.current else PALETTE.dim
+    color = PALETTE.text if current else PALETTE.dim
     imgui.get_window_draw_list().add_text(corner, u32(color), f"{share:.2f}")
-    if share != slider.share:
+    if share != work.view.pair.share:
         actions.append(f"blend_snapshots:{share!r}")
 
 
-def _card(
-    index: int, card: SnapshotCard, badge: str, wide: float, count: int, ui: UiContext, actions: list[str]
-) -> str:
+def _card(index: int, cards: _Cards, wide: float, ui: UiContext, actions: list[str]) -> str:
     """One picture with its name; "dragged:INDEX" while it is moved, "dropped:INDEX" where it is let go."""
+    name, badge = cards.names[index], "A" * (index == cards.a) + "B" * (index == cards.b)
     imgui.push_id(index)
     imgui.begin_group()
     at = imgui.get_cursor_screen_pos()
@@ -157,15 +156,15 @@ def _card(
     )
     if imgui.is_item_clicked(imgui.MouseButton_.right.value):
         imgui.open_popup(_MENU)
-    item, renaming = _menu(index, count, ui), imgui.get_id("renaming")
+    item, renaming = _menu(index, len(cards.names), ui), imgui.get_id("renaming")
     if item == "Rename…":
         imgui.get_state_storage().set_bool(renaming, True)
     elif item.startswith("Move"):
         actions.append(f"move_snapshot:{index}:{index + (1 if item == 'Move right' else -1)}")
     elif item:
-        actions.append(dict(_ITEMS)[item] + (str(index) if item == "Delete" else card.name))
+        actions.append(dict(_ITEMS)[item] + (str(index) if item == "Delete" else name))
     canvas, end = imgui.get_window_draw_list(), imgui.ImVec2(at.x + wide, at.y + tall)
-    picture(card.texture, at, end, 4.0 * ui.scale)
+    picture(cards.textures[index], at, end, 4.0 * ui.scale)
     if hovered or dragged:
         canvas.add_rect(at, end, u32(PALETTE.accent), 4.0 * ui.scale, 2.0 * ui.scale)
     imgui.push_font(ui.fonts.bold, SMALL_PX)
@@ -174,11 +173,11 @@ def _card(
     imgui.pop_font()
     imgui.push_font(None, SMALL_PX)
     if imgui.get_state_storage().get_bool(renaming):
-        name = typed_name(card.name, wide)
-        imgui.get_state_storage().set_bool(renaming, name is None)
-        actions += [f"name_snapshot:{index}:{name}"] if name else []
+        typed = typed_name(name, wide)
+        imgui.get_state_storage().set_bool(renaming, typed is None)
+        actions += [f"name_snapshot:{index}:{typed}"] if typed else []
     else:
-        imgui.text_disabled(elide(card.name, wide))
+        imgui.text_disabled(elide(name, wide))
         left = imgui.MouseButton_.left.value
         if index and imgui.is_item_hovered() and imgui.is_mouse_double_clicked(left):
             imgui.get_state_storage().set_bool(renaming, True)

@@ -1,6 +1,6 @@
 """The timeline along the lower edge of the picture: keys and playhead to drag, and its few settings.
 
-It changes nothing itself: it returns actions of `playback.ACTIONS`, as keys do.
+It changes nothing itself: it returns actions of `timeline.ACTIONS`, as keys do.
 """
 
 from __future__ import annotations
@@ -10,10 +10,10 @@ import math
 from imgui_bundle import icons_fontawesome_6 as icons
 from imgui_bundle import imgui
 
-from viewer.state import timeline as tl
-from viewer.state.playback import Player
+from viewer.state.timeline import EASINGS, Player, key_at, key_before
 from viewer.state.view_state import FASTEST, LONGEST, Timeline
 from viewer.ui.context import PALETTE, SMALL_PX, UiContext, u32
+from viewer.ui.keys import shortcut
 from viewer.ui.overlay import Area
 from viewer.ui.widgets import icon_button, is_released, tip
 
@@ -82,33 +82,34 @@ def _buttons(timeline: Timeline, player: Player, frame: int, actions: list[str],
     if icon_button("play", icon, ui):
         actions.append("play")
     imgui.end_disabled()
-    tip("Play or pause (Space)" if len(timeline.keys) > 1 else "Set at least two keyframes to play")
+    can_play = len(timeline.keys) > 1
+    tip(*("Play or pause", "play") if can_play else ("Set at least two keyframes to play",))
     imgui.same_line(0.0, gap)
-    on_key = tl.key_at(timeline, frame) is not None
+    on_key = key_at(timeline, frame) is not None
     if icon_button("key", icons.ICON_FA_DIAMOND, ui):
         actions.append("key")
-    tip("Update keyframe (K)" if on_key else "Insert keyframe: camera and all strengths (K)")
+    tip("Update keyframe" if on_key else "Insert keyframe: camera and all strengths", "key")
     imgui.same_line(0.0, gap)
     imgui.begin_disabled(not on_key)
     if icon_button("drop_key", icons.ICON_FA_TRASH_CAN, ui, dim=not on_key):
         actions.append("drop_key")
     imgui.end_disabled()
-    tip("Delete keyframe (Del)")
+    tip("Delete keyframe", "drop_key")
     imgui.same_line(0.0, 10.0 * ui.scale)
 
 
 def _settings(timeline: Timeline, frame: int, actions: list[str], ui: UiContext) -> None:
     gap = 4.0 * ui.scale
     imgui.begin_disabled(not timeline.keys)
-    easing = tl.key_before(timeline, frame).easing if timeline.keys else tl.EASINGS[0]
+    easing = key_before(timeline, frame).easing if timeline.keys else EASINGS[0]
     if imgui.button(f"{easing.capitalize()}##easing", imgui.ImVec2(62.0 * ui.scale, 0.0)):
         actions.append("easing")
     imgui.end_disabled()
-    tip("Interpolation after the keyframe at or before the playhead: smooth, linear or hold (Shift+K)")
+    tip("Interpolation after the keyframe at or before the playhead: smooth, linear or hold", "easing")
     imgui.same_line(0.0, gap)
     if icon_button("ping_pong", icons.ICON_FA_RIGHT_LEFT, ui, dim=not timeline.ping_pong):
         actions.append("ping_pong")
-    tip("Ping-pong (Alt+K): " + ("on" if timeline.ping_pong else "off"))
+    tip(f"Ping-pong ({shortcut('ping_pong')}): " + ("on" if timeline.ping_pong else "off"))
     imgui.same_line(0.0, gap)
     for name, now, most, unit, what in (
         ("length", timeline.length, LONGEST, "f", "Length in frames"),
@@ -126,7 +127,7 @@ def _settings(timeline: Timeline, frame: int, actions: list[str], ui: UiContext)
     if icon_button("timeline_file", icons.ICON_FA_FILE_EXPORT, ui, dim=not timeline.keys):
         actions.append("timeline_file")
     imgui.end_disabled()
-    tip("Save the timeline for `progdf render --timeline` (Ctrl+K)")
+    tip("Save the timeline for `progdf render --timeline`", "timeline_file")
 
 
 def _ruler(timeline: Timeline, frame: int, wide: float, actions: list[str], ui: UiContext) -> None:
@@ -150,12 +151,12 @@ def _ruler(timeline: Timeline, frame: int, wide: float, actions: list[str], ui: 
         moved = imgui.get_mouse_drag_delta(0, 3.0 * scale).x != 0.0 or imgui.is_item_deactivated()
         if held < 0 and to != frame:
             actions.append(f"seek:{to}")
-        elif held >= 0 and moved and to != held and tl.key_at(timeline, to) is None:
+        elif held >= 0 and moved and to != held and key_at(timeline, to) is None:
             actions.append(f"move_key:{held}>{to}")
             storage.set_int(slot, to)
     if under is not None:
         imgui.set_mouse_cursor(imgui.MouseCursor_.resize_ew.value)
-    _paint(timeline, frame, start, span, top, tall, under, lit, ui)
+    _paint(timeline, frame, start, span, top, top + tall - 6.0 * scale, under, ui)
 
 
 def _key_under(timeline: Timeline, start: float, span: float, mouse: float, scale: float) -> int | None:
@@ -171,13 +172,11 @@ def _paint(
     start: float,
     span: float,
     top: float,
-    tall: float,
+    line: float,
     under: int | None,
-    lit: bool,
     ui: UiContext,
 ) -> None:
     canvas, p, scale = imgui.get_window_draw_list(), PALETTE, ui.scale
-    line = top + tall - 6.0 * scale
     thin = max(1.0, scale)
     canvas.add_line(imgui.ImVec2(start, line), imgui.ImVec2(start + span, line), u32(p.faint), thin)
     _paint_numbers(timeline, frame, start, span, top, line, ui)

@@ -18,15 +18,13 @@ _MENU = "menu of a training"
 _UNWRITTEN = "Nothing is written"
 
 
-def draw(jobs: Sequence[Job], ui: UiContext) -> list[str]:
-    """One card a job, the next one at the bottom; the actions that were asked for."""
-    actions: list[str] = []
+def draw(jobs: Sequence[Job], ui: UiContext, actions: list[str]) -> None:
+    """One card a job, the next one at the bottom."""
     for job in jobs:
         if job.status != "done" or job.warning:
             imgui.push_id(job.number)
             actions += _card(_job_row(job), job.number, ui)
             imgui.pop_id()
-    return actions
 
 
 @dataclass(frozen=True)

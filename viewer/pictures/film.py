@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import math
 import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -14,10 +15,14 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
+from progdf.camera import Camera
 from progdf.errors import ProgdfError
-from progdf.io import images as pictures
-from progdf.io.atomic import is_temporary, temporary_subfolder, write_error
-from viewer.state.view_state import ViewState
+from progdf.io import images
+from progdf.io.atomic import atomic_write, is_temporary, temporary_subfolder, write_error
+from viewer.camera.view_camera import to_camera
+from viewer.render.engine import ViewEngine
+from viewer.state import timeline
+from viewer.state.view_state import Timeline, ViewState
 
 Pixels = NDArray[np.uint8]
 Draw = Callable[[ViewState], Pixels]
@@ -39,8 +44,8 @@ def with_strengths(view: ViewState, strengths: dict[str, float]) -> ViewState:
         replace(l, strength=strengths[l.name], enabled=True) if l.name in strengths else l
         for l in view.layers
     )
-    shown = {layer.group for layer in moved if layer.name in strengths}
-    groups = tuple(replace(group, enabled=group.enabled or group.name in shown) for group in view.groups)
+    enabled = {layer.group for layer in moved if layer.name in strengths}
+    groups = tuple(replace(group, enabled=group.enabled or group.name in enabled) for group in view.groups)
     return replace(view, layers=moved, groups=groups)
 
 
@@ -67,8 +72,8 @@ def grid(down: str, across: str, draw: Draw, view: ViewState) -> Pixels:
 
 
 def _sheet(rows: list[list[Pixels]], row_labels: list[str], column_labels: list[str]) -> Pixels:
-    images = [[torch.from_numpy(picture).float() / 255.0 for picture in row] for row in rows]
-    return to_pixels(pictures.contact_sheet(images, row_labels, column_labels).numpy())
+    tensors = [[torch.from_numpy(picture).float() / 255.0 for picture in row] for row in rows]
+    return to_pixels(images.contact_sheet(tensors, row_labels, column_labels).numpy())
 
 
 def write_gif(path: Path, frames: Iterable[Pixels]) -> None:
@@ -79,9 +84,9 @@ def write_gif(path: Path, frames: Iterable[Pixels]) -> None:
         frames: from one end of the slider to the other. [H,W,3] each
     """
     indexed = _quantize(frames)
-    shown = indexed + indexed[-2:0:-1]
+    there_and_back = indexed + indexed[-2:0:-1]
     rests = {0, len(indexed) - 1}
-    _save_gif(path, shown, [HOLD_MS if i in rests else FRAME_MS for i in range(len(shown))])
+    _save_gif(path, there_and_back, [HOLD_MS if i in rests else FRAME_MS for i in range(len(there_and_back))])
 
 
 def write_film(path: Path, frames: Iterable[Pixels], frames_per_second: int) -> None:
@@ -176,8 +181,8 @@ def write_mp4(path: Path, frames: Iterable[Pixels], frames_per_second: int = 20)
     """A film there and back again, H.264; the codec wants even sides, so an odd last row is doubled."""
     there = list(frames)
     hold = round(HOLD_MS * frames_per_second / 1000)
-    shown = [there[0]] * hold + there[1:-1] + [there[-1]] * hold + there[-2:0:-1]
-    _encode_mp4(path, shown, frames_per_second)
+    there_and_back = [there[0]] * hold + there[1:-1] + [there[-1]] * hold + there[-2:0:-1]
+    _encode_mp4(path, there_and_back, frames_per_second)
 
 
 def _encode_mp4(path: Path, frames: Iterable[Pixels], frames_per_second: int) -> None:
@@ -199,3 +204,104 @@ def _encode_mp4(path: Path, frames: Iterable[Pixels], frames_per_second: int) ->
         writer.send(np.ascontiguousarray(even))
     if writer is not None:
         writer.close()
+
+
+Advance = Callable[[int, int], None]
+
+MOST_SHOWN = 100
+"""Pictures of a contact sheet."""
+
+
+def check_output(out: Path) -> None:
+    """Raises ProgdfError where `out` is neither a film nor a place for a folder of frames."""
+    suffix = out.suffix.lower()
+    if suffix not in (".gif", ".mp4", ""):
+        raise ProgdfError(
+            f"{out} cannot hold a film; --timeline writes a .gif, an .mp4 or a folder of frames"
+        )
+    if not suffix:
+        check_sequence(out)
+
+
+def frames(
+    keys: Timeline, view: ViewState, still: Camera, engine: ViewEngine, numbers: Iterable[int]
+) -> Iterator[Pixels]:
+    """The pictures of some frames. [H,W,3] each
+
+    Args:
+        keys: the keys
+        view: what no key says: background, blend, edits that do not move
+        still: gives the size, and the camera where no key has one
+        engine: draws
+        numbers: of the frames
+    """
+    for frame in numbers:
+        state = timeline.state_at(keys, frame, view)
+        moving = timeline.camera_at(keys, frame) is not None
+        camera = to_camera(state.camera, still.width, still.height) if moving else still
+        yield to_pixels(engine.image(state, camera=camera))
+
+
+def sheet_frames(keys: Timeline, count: int) -> list[int]:
+    """At most `count` frames from the first to the last, evenly; a way back shows none that are new."""
+    steps = max(count - 1, 1)
+    return sorted({round(i * keys.length / steps) for i in range(count)})
+
+
+def sheet(keys: Timeline, view: ViewState, still: Camera, engine: ViewEngine, count: int) -> Pixels:
+    """A contact sheet of `count` frames, row by row, each with its number and its time. [H,W,3]"""
+    numbers = sheet_frames(keys, count)
+    drawn = [
+        torch.from_numpy(picture).float() / 255.0 for picture in frames(keys, view, still, engine, numbers)
+    ]
+    notes = [f"frame {number}, {number / keys.fps:.2f} s" for number in numbers]
+    columns = math.ceil(math.sqrt(len(numbers)))
+    rows = range(0, len(numbers), columns)
+    page = images.contact_sheet(
+        [drawn[i : i + columns] for i in rows], notes=[notes[i : i + columns] for i in rows]
+    )
+    return to_pixels(page.numpy())
+
+
+def write(
+    out: Path,
+    keys: Timeline,
+    view: ViewState,
+    still: Camera,
+    engine: ViewEngine,
+    count: int = 0,
+    advance: Advance | None = None,
+) -> str:
+    """Write the film: .gif, .mp4, or a folder of .png files; or a contact sheet of `count` frames.
+
+    `advance` hears how many frames of how many are drawn.
+
+    Returns:
+        A line that tells what was written.
+
+    Raises:
+        ProgdfError: see `check_output`.
+    """
+    size = f"{still.width}x{still.height}"
+    if count:
+        page = sheet(keys, view, still, engine, count)
+        with atomic_write(out) as temporary_file:
+            Image.fromarray(page).save(temporary_file)
+        count = len(sheet_frames(keys, count))
+        return f"wrote {out} ({count} pictures of {size}, drawn by {engine.draws_with})"
+    check_output(out)
+    total = sum(1 for _ in timeline.film_frames(keys))
+    drawn = _counted(frames(keys, view, still, engine, timeline.film_frames(keys)), total, advance)
+    if out.suffix:
+        with atomic_write(out) as temporary_file:
+            write_film(temporary_file, drawn, keys.fps)
+    else:
+        write_sequence(out, drawn)
+    return f"wrote {out} ({total} frames of {size}, {keys.fps} a second, drawn by {engine.draws_with})"
+
+
+def _counted(drawn: Iterable[Pixels], total: int, advance: Advance | None) -> Iterator[Pixels]:
+    for done, picture in enumerate(drawn, 1):
+        yield picture
+        if advance is not None:
+            advance(done, total)

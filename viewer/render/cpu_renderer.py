@@ -21,14 +21,13 @@ from progdf.rasterize.screen import fill_screen, lines_behind
 from progdf.rasterize.simplification import simplify
 from progdf.sh import C0
 from progdf.threads import stopped_by
-from viewer.camera.up_axis import Vec3
-from viewer.gl.layout import SPLATS_PER_ROW
+from viewer.camera.view_camera import Vec3
 from viewer.gl.present import ScreenCopy
-from viewer.gl.scene_textures import row_runs
+from viewer.gl.scene_textures import SPLATS_PER_ROW, row_runs
 
+from .gl_renderer import Renderer
 from .ground_grid import CLEAR, Lines
 from .highlight import HIDDEN
-from .renderers import Renderer
 
 Image = NDArray[np.float32]
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from .timings import FrameTimings
-
 SLOW_MS = 40.0
 """What a picture may take before "auto" halves its sides: 25 pictures a second."""
 
@@ -28,20 +26,15 @@ COARSE = 2
 
 @dataclass(frozen=True)
 class DynamicResolution:
-    """How pictures are drawn while the hand is on something, and what is known of their cost.
+    """How pictures are drawn while the hand is on something, and what is known of their cost."""
 
-    Args:
-        pixels: of the window that one pixel drawn covers, each way: 1 or `COARSE`
-        rest_at: when to draw in full, seconds on the main view's clock; None while the picture is in full
-        camera_ms: what the last two whole pictures in full took; one alone may have waited for something
-        slider_ms: the same of the last two steps of a slider, within this grip
-        coarse_ms: what the last coarse picture took; a slider's step in full that takes no longer stays so
-    """
-
-    pixels: int = 1
+    pixels: int = 1  # of the window that one pixel drawn covers, each way: 1 or `COARSE`
+    # when to draw in full, seconds on the main view's clock; None while the picture is in full
     rest_at: float | None = None
+    # what the last two whole pictures in full took; one alone may have waited for something
     camera_ms: tuple[float, ...] = ()
-    slider_ms: tuple[float, ...] = ()
+    slider_ms: tuple[float, ...] = ()  # the same of the last two steps of a slider, within this grip
+    # what the last coarse picture took; a slider's step in full that takes no longer stays so
     coarse_ms: float = 0.0
 
 
@@ -100,3 +93,19 @@ def _slow(pictures_ms: tuple[float, ...], least: float = SLOW_MS) -> bool:
 def next_frame_delay(known: DynamicResolution, now: float) -> float | None:
     """Seconds until the picture has to be drawn in full; None where it is."""
     return None if known.rest_at is None else max(known.rest_at - now, 0.0)
+
+
+@dataclass(frozen=True)
+class FrameTimings:
+    """Where the time of one picture went: wall clock, milliseconds, the GPU's work waited for."""
+
+    compose_ms: float = 0.0  # strengths → attributes, by the CPU
+    upload_ms: float = 0.0  # attributes → where they are drawn from
+    sort_ms: float = 0.0  # depth order (the CPU rasterizer sorts within `draw_ms`)
+    draw_ms: float = 0.0  # the picture
+    changed: int = 0  # Gaussians whose attributes were composed anew
+    drawn: int = 0  # Gaussians in front of the camera; all of them where the CPU rasterizer draws
+
+    @property
+    def total_ms(self) -> float:
+        return self.compose_ms + self.upload_ms + self.sort_ms + self.draw_ms

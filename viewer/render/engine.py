@@ -21,19 +21,16 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
 from progdf.scene.bounds import near_plane
-from viewer.camera.up_axis import Vec3
-from viewer.camera.view_camera import bounds_of, half_camera, to_camera
-from viewer.render.timings import FrameTimings
+from viewer.camera.view_camera import Vec3, bounds_of, half_camera, to_camera
 from viewer.state.layers import visible_layers
 from viewer.state.paint import layer_of
 from viewer.state.view_state import ViewState
 
 from .cpu_renderer import CpuRenderer
-from .depth_sort import back_to_front
+from .dynamic_resolution import FrameTimings
+from .gl_renderer import GlRenderer, Image, Renderer, back_to_front, is_software
 from .ground_grid import GroundPlane, Lines, grid_lines, ground_plane
-from .headless import is_software
 from .highlight import Highlight, highlight_colors
-from .renderers import GlRenderer, Image, Renderer
 
 DRAWS = ("auto", "gl", "cpu")
 
@@ -110,8 +107,8 @@ class ViewEngine:
 
     def needs_draw(self, view: ViewState, size: tuple[int, int], camera: Camera | None = None) -> bool:
         """Whether `view` at `size` (width, height in pixels) is another picture than the last one."""
-        wanted = self._describe_picture(view, camera or to_camera(view.camera, *size))
-        return replace(wanted, highlight=_with_hidden(self.highlight, view)) != self._picture
+        target = self._describe_picture(view, camera or to_camera(view.camera, *size))
+        return replace(target, highlight=_with_hidden(self.highlight, view)) != self._picture
 
     def draw(
         self,
@@ -206,20 +203,20 @@ class ViewEngine:
     ) -> FrameTimings:
         """Do what lies between the last picture and this one."""
         highlight = _with_hidden(highlight, view)
-        wanted = replace(self._describe_picture(view, camera), highlight=highlight)
-        if wanted == self._picture:
+        target = replace(self._describe_picture(view, camera), highlight=highlight)
+        if target == self._picture:
             return FrameTimings(drawn=self.timings.drawn)
-        compose_ms, upload_ms, changed = self._compose(wanted.edits)
+        compose_ms, upload_ms, changed = self._compose(target.edits)
         highlight_ms = self._apply_highlight(highlight)
         started = time.perf_counter()
         camera = replace(camera, near=self.near)
-        if self.renderer.wants_order and self._ordered_for != wanted.viewmat:
+        if self.renderer.wants_order and self._ordered_for != target.viewmat:
             self.order = back_to_front(self.composer.gaussians.means.numpy(), camera)
-            self._ordered_for = wanted.viewmat
+            self._ordered_for = target.viewmat
         sorted_at = time.perf_counter()
         self.renderer.draw(camera, view.background, self.order, pixels)
         drawn_at = time.perf_counter()
-        self._picture = wanted
+        self._picture = target
         return FrameTimings(
             compose_ms,
             upload_ms + highlight_ms,

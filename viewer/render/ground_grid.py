@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from progdf.camera import Camera
 from progdf.gaussians import Gaussians
 from progdf.scene.subject import ground_height
-from viewer.camera.up_axis import Vec3
-from viewer.camera.view_camera import add_scaled, bounds_of, cross, dot, front, unit
-from viewer.gl.layout import GRID_LINE
+from viewer.camera.view_camera import Vec3, add_scaled, bounds_of, cross, dot, front, unit
+from viewer.gl.scene_textures import GRID_LINE
 
 HALF = 10
 """Cells from the middle to where the lines have faded."""
@@ -32,20 +31,13 @@ Lines = NDArray[np.void]
 
 @dataclass(frozen=True)
 class GroundPlane:
-    """A plane with two axes in it.
+    """A plane with two axes in it."""
 
-    Args:
-        origin: the point of it that lies under or over the world's origin
-        across, ahead: its axes, unit vectors
-        middle: of the grid along these, cells from `origin`
-        cell: side of a square, world units
-    """
-
-    origin: Vec3
-    across: Vec3
+    origin: Vec3  # the point of it that lies under or over the world's origin
+    across: Vec3  # across, ahead: its axes, unit vectors
     ahead: Vec3
-    middle: tuple[int, int]
-    cell: float
+    middle: tuple[int, int]  # of the grid along these, cells from `origin`
+    cell: float  # side of a square, world units
 
 
 def ground_plane(scene: Gaussians, up: Vec3) -> GroundPlane:
@@ -54,9 +46,9 @@ def ground_plane(scene: Gaussians, up: Vec3) -> GroundPlane:
     height = ground_height(scene, torch.tensor(up)) if len(scene) else 0.0
     ahead = front(up)
     across = cross(up, ahead)
-    wanted = bounds.radius / _CELLS_PER_RADIUS
-    power = 10.0 ** math.floor(math.log10(wanted))
-    cell = power * next(step for step in (10, 5, 2, 1) if step * power <= 1.0001 * wanted)
+    side = bounds.radius / _CELLS_PER_RADIUS
+    power = 10.0 ** math.floor(math.log10(side))
+    cell = power * next(step for step in (10, 5, 2, 1) if step * power <= 1.0001 * side)
     middle = round(dot(bounds.center, across) / cell), round(dot(bounds.center, ahead) / cell)
     return GroundPlane(add_scaled((0.0, 0.0, 0.0), (height, up)), across, ahead, middle, cell)
 
@@ -81,13 +73,13 @@ def grid_lines(plane: GroundPlane, camera: Camera, background: Vec3) -> Lines:
     cut = (nearest - starts[:, 2]) / np.where(run == 0.0, 1.0, run)
     first = np.where(starts[:, 2] < nearest, cut, 0.0)[:, None]
     last = np.where(ends[:, 2] < nearest, cut, 1.0)[:, None]
-    shown = np.maximum(starts[:, 2], ends[:, 2]) > nearest
+    in_front = np.maximum(starts[:, 2], ends[:, 2]) > nearest
     way, drift = ends - starts, cells[:, 2:] - cells[:, :2]
     lines = np.zeros(len(cells), GRID_LINE)
     for at, share in ((0, first), (1, last)):
-        place = starts + share * way
-        depth = np.maximum(place[:, 2], nearest)
-        lines["ends"][:, 2 * at : 2 * at + 2] = place[:, :2] / depth[:, None] * K[[0, 1], [0, 1]] + K[:2, 2]
+        points = starts + share * way
+        depth = np.maximum(points[:, 2], nearest)
+        lines["ends"][:, 2 * at : 2 * at + 2] = points[:, :2] / depth[:, None] * K[[0, 1], [0, 1]] + K[:2, 2]
         lines["depths"][:, at] = depth
         lines["cells"][:, 2 * at : 2 * at + 2] = (cells[:, :2] + share * drift) / HALF
     normal = np.cross(*axes) / plane.cell**2
@@ -99,8 +91,8 @@ def grid_lines(plane: GroundPlane, camera: Camera, background: Vec3) -> Lines:
         color = _axis_color(axis)
         if color is not None:
             lines["color"][of][numbers[of] == 0.0] = (*color, _AXIS * alpha)
-    found: Lines = lines[shown]
-    return found
+    visible: Lines = lines[in_front]
+    return visible
 
 
 def _line_color(background: Vec3) -> Vec3:

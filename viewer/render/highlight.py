@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from progdf.gdf.file import Gdf
-from viewer.state import layers as stack
 from viewer.state import paint
+from viewer.state.layers import is_visible
 from viewer.state.selection import NOBODY, Color, unpack
 from viewer.state.view_state import ViewState
 from viewer.state.workspace import Pointed
@@ -39,25 +39,18 @@ Bytes = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class Highlight:
-    """What to show over the scene.
+    """What to show over the scene."""
 
-    Args:
-        gdf: an edit whose members show their weights, as `LayerState.gdf` counts; None for none
-        paint: its weights, as `paint.encode` writes them
-        others: edits of which to show, in place of weights, the members that they share with this one
-        thin: only a tint over what has less than all of the edit
-        tinted: packed masks, their colors and shares of 255, later ones over earlier ones
-        region: an edit whose members are tinted as one, or None
-        hidden: packed mask of what is not drawn
-    """
-
+    # an edit whose members show their weights, as `LayerState.gdf` counts; None for none
     gdf: int | None = None
-    paint: str = paint.FULL
+    paint: str = paint.FULL  # its weights, as `paint.encode` writes them
+    # edits of which to show, in place of weights, the members that they share with this one
     others: tuple[int, ...] = ()
-    thin: bool = False
+    thin: bool = False  # only a tint over what has less than all of the edit
+    # packed masks, their colors and shares of 255, later ones over earlier ones
     tinted: tuple[tuple[bytes, Color, int], ...] = ()
-    region: int | None = None
-    hidden: bytes = NOBODY
+    region: int | None = None  # an edit whose members are tinted as one, or None
+    hidden: bytes = NOBODY  # packed mask of what is not drawn
 
 
 def requested_highlight(
@@ -89,7 +82,7 @@ def requested_highlight(
         return Highlight(region=view.layers[index].gdf)
     if view.brush.active:
         layer = None if focus is None or focus >= len(view.layers) else view.layers[focus]
-        if layer is None or not stack.is_visible(view, layer):
+        if layer is None or not is_visible(view, layer):
             return None
         return Highlight(layer.gdf, layer.paint, thin=not view.brush.weights)
     tinted = [
@@ -97,9 +90,9 @@ def requested_highlight(
         for i, region in enumerate(state.regions)
         if region.visible or (kind, index) == ("region", i)
     ]
-    asked = bool(view.select.tool) or kind == "selection"
-    if state.count and (asked or (view.panel and not sliding)):
-        tinted.append((state.members, SELECTED, TINT if asked else TRACE))
+    strong = bool(view.select.tool) or kind == "selection"
+    if state.count and (strong or (view.panel and not sliding)):
+        tinted.append((state.members, SELECTED, TINT if strong else TRACE))
     return Highlight(tinted=tuple(tinted)) if tinted else None
 
 
@@ -143,8 +136,8 @@ def highlight_colors(highlight: Highlight, gdfs: Sequence[Gdf], total: int) -> B
             colors[members, :3] = np.round(255.0 * np.array(rgba(SHARED)[:3]))
             colors[members, 3] = round(255 * SHARE)
         else:
-            found = paint.decode(highlight.paint, len(members))
-            weights = np.ones(len(members), np.float32) if found is None else found.numpy()
+            decoded = paint.decode(highlight.paint, len(members))
+            weights = np.ones(len(members), np.float32) if decoded is None else decoded.numpy()
             colors[members, :3] = ramp_colors(weights)
             shares = THIN * (1.0 - weights) if highlight.thin else np.full_like(weights, SHARE)
             colors[members, 3] = np.round(255.0 * shares)

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 import torch
@@ -16,7 +18,8 @@ from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
 from progdf.rasterize import reference
 from progdf.rasterize.engines import ALPHA_MAX, ALPHA_MIN, RasterView, activate
-from viewer.camera.up_axis import Vec3
+from progdf.scene.selection import Surface
+from viewer.camera.view_camera import Vec3
 from viewer.state.layers import is_visible
 from viewer.state.view_state import ViewState
 
@@ -27,17 +30,12 @@ LEAST_SHARE = 0.25  # of what one sees at a pixel must be a layer's own before a
 
 @dataclass(frozen=True)
 class Seen:
-    """What one sees at a pixel, nearest first.
+    """What one sees at a pixel, nearest first."""
 
-    Args:
-        rows: indices of the Gaussians. [M] int64
-        shares: the part of the pixel's color that each gives; with the background's share they make 1. [M]
-        depths: in front of the camera, world units. [M]
-    """
-
-    rows: NDArray[np.int64]
+    rows: NDArray[np.int64]  # indices of the Gaussians. [M] int64
+    # the part of the pixel's color that each gives; with the background's share they make 1. [M]
     shares: NDArray[np.float64]
-    depths: NDArray[np.float64]
+    depths: NDArray[np.float64]  # in front of the camera, world units. [M]
 
 
 def surface_point(scene: Gaussians, camera: Camera, x: float, y: float, near: float = 1e-4) -> Vec3 | None:
@@ -84,8 +82,8 @@ def layer_at(view: ViewState, gdfs: Sequence[Gdf], seen: Seen) -> int | None:
         members = gdfs[layer.gdf].region.members.numpy()  # sorted
         if not len(members):
             continue
-        own = members[np.searchsorted(members, seen.rows).clip(max=len(members) - 1)] == seen.rows
-        share = float(seen.shares[own].sum())
+        inside = members[np.searchsorted(members, seen.rows).clip(max=len(members) - 1)] == seen.rows
+        share = float(seen.shares[inside].sum())
         ranked = is_visible(view, layer), share
         if share >= LEAST_SHARE and ranked >= best:
             best, chosen = ranked, i
@@ -137,3 +135,51 @@ def _alphas(
     alphas = splats.opacities * torch.exp(-0.5 * ((l11 * dx + l21 * dy).square() + (l22 * dy).square()))
     alphas = torch.where(alphas >= ALPHA_MIN, alphas.clamp_max(ALPHA_MAX), 0.0)
     return rows[splats.rows.numpy()], alphas.numpy()
+
+
+MANY = 100_000
+"""Gaussians below which nothing is worked out ahead: it takes a hand's tenth of a second at once."""
+
+
+class Surfaces:
+    """The surface of the picture at rest."""
+
+    def __init__(self) -> None:
+        self._key: object = None
+        self._surface: Surface | None = None
+        self._colors = False
+
+    def at(self, key: object) -> Surface | None:
+        """That of a picture if it was looked at ahead, or is just being."""
+        return self._surface if key == self._key else None
+
+    def look(self, key: object, make: Callable[[], Surface], colors: bool) -> bool:
+        """Look at the surface of another picture, unless it is the last one's; whether it is another.
+
+        Args:
+            key: what decides it
+            make: gives it; it must stay as it is
+            colors: whether colors will be asked for as well
+        """
+        if (key, colors) == (self._key, self._colors):
+            return False
+        self.drop()
+        self._key, self._colors, self._surface = key, colors, make()
+        beside(self._surface.prepare, colors)
+        return True
+
+    def drop(self) -> None:
+        """Forget it."""
+        if self._surface is not None:
+            self._surface.drop()
+        self._key = self._surface = None
+
+
+def beside(work: Callable[..., object], *arguments: object) -> None:
+    """Do it in another thread, after what was to be done there before."""
+    _worker().submit(work, *arguments)
+
+
+@cache
+def _worker() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(1, thread_name_prefix="ahead")

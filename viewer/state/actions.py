@@ -13,31 +13,75 @@ import numpy as np
 
 from progdf.compose.layers import BLENDS
 from viewer.camera import controls
-from viewer.camera.named_views import look_at_view
 from viewer.camera.view_camera import FARTHEST
+from viewer.camera.views import look_at_view
 from viewer.jobs.training import ALL, CHANGED, SELECTION, TYPED
-from viewer.state import comparison as compare
-from viewer.state import history, layer_selection, paint, playback, selection, snapshots
-from viewer.state import layers as stack
-from viewer.state.history import History
-from viewer.state.view_state import ViewState, cards_shown, next_resolution_mode
-from viewer.state.workspace import (
+
+from . import history, layer_selection, paint, selection, snapshots, timeline
+from .history import History
+from .layers import (
+    SLIDERS,
+    change_group,
+    change_layer,
+    index_of,
+    show_all,
+    toggle_details,
+    with_overshoot,
+    with_paint,
+)
+from .view_state import ViewState, next_resolution_mode
+from .workspace import (
     REQUESTS,
     SceneFacts,
     Workspace,
     change_focused,
     focus_layer,
+    is_compact,
     loses_strengths,
     with_camera,
     with_layers_of,
 )
+
+
+def toggle_mode(view: ViewState, mode: str) -> ViewState:
+    """`mode` on, or off where it was on."""
+    mode = "off" if view.compare.mode == mode else mode
+    return replace(view, compare=replace(view.compare, mode=mode))
+
+
+def toggle_against(view: ViewState) -> ViewState:
+    """Against the recording instead of the original, or back; where nothing is compared, side by side."""
+    compare = view.compare
+    if compare.mode == "off":
+        return replace(view, compare=replace(compare, mode="split", against="recorded"))
+    against = "original" if compare.against == "recorded" else "recorded"
+    return replace(view, compare=replace(compare, against=against))
+
+
+def toggle_snapshots(view: ViewState) -> ViewState:
+    """One snapshot against the other, or what was on the screen before; where nothing is compared, split."""
+    compare = view.compare
+    if compare.against == "snapshots" and compare.mode != "off":
+        return replace(view, compare=replace(compare, mode="off", against="original"))
+    mode = "split" if compare.mode == "off" else compare.mode
+    return replace(view, compare=replace(compare, mode=mode, against="snapshots"))
+
+
+def end_at_edit(before: ViewState, view: ViewState) -> ViewState:
+    """No comparison of snapshots any more where layers have changed: one shall see what one does."""
+    edited = (view.layers, view.groups, view.blend) != (before.layers, before.groups, before.blend)
+    compare = view.compare
+    if not edited or compare.mode == "off" or compare.against != "snapshots":
+        return view
+    return replace(view, compare=replace(compare, mode="off", against="original"))
+
 
 FEATHER = 0.1
 """How wide "feather" makes the edges of a layer's paint, share of the radius of its region."""
 
 
 def perform(workspace: Workspace, action: str, facts: SceneFacts, aspect: float = 1.0) -> Workspace:
-    """The workspace after an action of `controls.KEYS`.
+    """The workspace after an action of `keys.KEYS`.
 
     Args:
         action: its name, with an argument after a colon where it has one
@@ -94,12 +138,12 @@ def _look(workspace: Workspace, name: str) -> Workspace:
 
 def _focus(workspace: Workspace, number: str) -> Workspace:
     """By its number, counted from 1 at the top of the panel's list."""
-    return focus_layer(workspace, stack.index_of(workspace.view, int(number) - 1))
+    return focus_layer(workspace, index_of(workspace.view, int(number) - 1))
 
 
 def _toggle(workspace: Workspace, number: str) -> Workspace:
-    index = stack.index_of(workspace.view, int(number) - 1)
-    view = stack.change_layer(workspace.view, index, lambda layer: replace(layer, enabled=not layer.enabled))
+    index = index_of(workspace.view, int(number) - 1)
+    view = change_layer(workspace.view, index, lambda layer: replace(layer, enabled=not layer.enabled))
     return replace(workspace, view=view)
 
 
@@ -108,9 +152,9 @@ def _select_slider(workspace: Workspace, by: int, facts: SceneFacts) -> Workspac
     if workspace.focus is None:
         return workspace
     view, gdf = workspace.view, workspace.view.layers[workspace.focus].gdf
-    sliders = [slider for slider in stack.SLIDERS if slider in ("strength", *facts.rows[gdf].kinds)]
-    place = sliders.index(workspace.active_slider) if workspace.active_slider in sliders else 0
-    slider = sliders[(place + by) % len(sliders)]
+    sliders = [slider for slider in SLIDERS if slider in ("strength", *facts.rows[gdf].kinds)]
+    at = sliders.index(workspace.active_slider) if workspace.active_slider in sliders else 0
+    slider = sliders[(at + by) % len(sliders)]
     if slider != "strength" and gdf not in view.unfolded:
         view = replace(view, unfolded=(*view.unfolded, gdf))
     return replace(workspace, active_slider=slider, view=view)
@@ -136,11 +180,11 @@ def _repaint(workspace: Workspace, how: str, facts: SceneFacts) -> Workspace:
         row = facts.rows[layer.gdf]
         if how == "paint_feather":
             width = max(FEATHER * row.bounds.radius, FARTHEST**-1)
-            return stack.with_paint(view, index, paint.feather(layer.paint, row.points, width))
+            return with_paint(view, index, paint.feather(layer.paint, row.points, width))
         if how == "paint_invert":
-            return stack.with_paint(view, index, paint.invert(layer.paint, row.count))
+            return with_paint(view, index, paint.invert(layer.paint, row.count))
         even = np.full(row.count, how == "paint_fill", np.float32)
-        return stack.with_paint(view, index, paint.encode(even))
+        return with_paint(view, index, paint.encode(even))
 
     return change_focused(workspace, change)
 
@@ -188,7 +232,7 @@ def _step_back(workspace: Workspace, _: str) -> Workspace:
 
 
 def _show_all(workspace: Workspace, _: str) -> Workspace:
-    view = stack.show_all(workspace.view)
+    view = show_all(workspace.view)
     return replace(workspace, view=replace(view, selection=selection.show_all(view.selection)))
 
 
@@ -196,15 +240,14 @@ def _rename_group(workspace: Workspace, argument: str) -> Workspace:
     """`INDEX:NAME`, of `view.groups`"""
     index, _, name = argument.partition(":")
     old, view = workspace.view.groups[int(index)].name, workspace.view
-    return replace(workspace, view=stack.change_group(view, old, lambda group: replace(group, name=name)))
+    return replace(workspace, view=change_group(view, old, lambda group: replace(group, name=name)))
 
 
 def _toggle_cards(workspace: Workspace, _: str) -> Workspace:
     """Rows of one line for cards, or back; by themselves where they would be so anyway."""
-    shown = cards_shown(workspace.view, workspace.cards_fit)
-    wanted = "full" if shown == "compact" else "compact"
-    alone = "full" if workspace.cards_fit else "compact"
-    return replace(workspace, view=replace(workspace.view, cards="auto" if wanted == alone else wanted))
+    compact = not is_compact(workspace)
+    cards = "auto" if compact != workspace.cards_fit else "compact" if compact else "full"
+    return replace(workspace, view=replace(workspace.view, cards=cards))
 
 
 def _blend(workspace: Workspace, _: str) -> Workspace:
@@ -215,8 +258,8 @@ def _blend(workspace: Workspace, _: str) -> Workspace:
 def _back(workspace: Workspace, past: History) -> Workspace:
     if past is workspace.past:
         return workspace
-    kept = past.present
-    workspace = replace(workspace, past=past, snapshots=kept.snapshots, renaming=None)
+    entry = past.present
+    workspace = replace(workspace, past=past, snapshots=entry.snapshots, renaming=None)
     return with_layers_of(workspace, history.apply_present(workspace.view, past))
 
 
@@ -224,7 +267,7 @@ def _timeline_action(name: str) -> Callable[[Workspace, str], Workspace]:
     """An action of the timeline."""
 
     def act(workspace: Workspace, argument: str) -> Workspace:
-        view, player = playback.perform(workspace.view, workspace.player, f"{name}:{argument}")
+        view, player = timeline.perform(workspace.view, workspace.player, f"{name}:{argument}")
         past = history.follow_camera(workspace.past, workspace.view, view)
         if loses_strengths(workspace, view):  # an entry of its own, or part of what is done to the keys
             past = past if name == "move_key" else history.record(past, view, workspace.snapshots)
@@ -237,24 +280,24 @@ def _timeline_action(name: str) -> Callable[[Workspace, str], Workspace]:
 
 def _restore(workspace: Workspace, index: str) -> Workspace:
     """Back to a snapshot, counted as the panel shows them: 0 is the original."""
-    kept = snapshots.with_original(workspace.snapshots, workspace.view)
-    if not 0 <= int(index) < len(kept):
+    listed = snapshots.with_original(workspace.snapshots, workspace.view)
+    if not 0 <= int(index) < len(listed):
         return workspace
-    return with_layers_of(workspace, snapshots.restore(workspace.view, kept[int(index)]))
+    return with_layers_of(workspace, snapshots.restore(workspace.view, listed[int(index)]))
 
 
 def _name_snapshot(workspace: Workspace, argument: str) -> Workspace:
     """`INDEX:NAME`; the pair that is blended follows."""
     index, _, name = argument.partition(":")
-    old, kept = workspace.snapshots, snapshots.rename(workspace.snapshots, int(index) - 1, name)
-    was, now, pair = old[int(index) - 1].name, kept[int(index) - 1].name, workspace.view.pair
+    old, new = workspace.snapshots, snapshots.rename(workspace.snapshots, int(index) - 1, name)
+    was, now, pair = old[int(index) - 1].name, new[int(index) - 1].name, workspace.view.pair
     pair = replace(pair, a=now if pair.a == was else pair.a, b=now if pair.b == was else pair.b)
-    return replace(workspace, snapshots=kept, view=replace(workspace.view, pair=pair))
+    return replace(workspace, snapshots=new, view=replace(workspace.view, pair=pair))
 
 
 def _move_snapshot(workspace: Workspace, argument: str) -> Workspace:
     """`INDEX:TO`"""
-    index, to = (int(place) - 1 for place in argument.split(":"))
+    index, to = (int(number) - 1 for number in argument.split(":"))
     return replace(workspace, snapshots=snapshots.move(workspace.snapshots, index, to))
 
 
@@ -267,8 +310,8 @@ def _choose_snapshot(workspace: Workspace, argument: str) -> Workspace:
 def _blend_snapshots(workspace: Workspace, share: str, facts: SceneFacts) -> Workspace:
     if not workspace.snapshots:
         return workspace
-    kept = snapshots.with_original(workspace.snapshots, workspace.view)
-    view = snapshots.blend(workspace.view, kept, float(share), lambda gdf: facts.rows[gdf].count)
+    listed = snapshots.with_original(workspace.snapshots, workspace.view)
+    view = snapshots.blend(workspace.view, listed, float(share), lambda gdf: facts.rows[gdf].count)
     return with_layers_of(workspace, view)
 
 
@@ -296,7 +339,7 @@ ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
     "solo": lambda workspace, _: layer_selection.switch_selected(workspace, "solo"),
     "show_all": _show_all,
     "lock": lambda workspace, _: layer_selection.switch_selected(workspace, "locked"),
-    "fold": lambda workspace, _: change_focused(workspace, stack.toggle_details),
+    "fold": lambda workspace, _: change_focused(workspace, toggle_details),
     "rename": _rename,
     "remove": layer_selection.remove,
     "press_layer": layer_selection.press,
@@ -322,7 +365,7 @@ ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
     "brush_softness": lambda w, by: _change_brush(
         w, softness=paint.softness(w.view.brush.softness + float(by))
     ),
-    "overshoot": lambda w, _: replace(w, view=stack.with_overshoot(w.view, not w.view.overshoot)),
+    "overshoot": lambda w, _: replace(w, view=with_overshoot(w.view, not w.view.overshoot)),
     "snapshot": lambda w, _: replace(w, snapshots=snapshots.take(w.snapshots, w.view)),
     "restore": _restore,
     "forget": lambda w, at: replace(w, snapshots=snapshots.remove(w.snapshots, int(at) - 1)),
@@ -337,14 +380,14 @@ ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
     "axes": lambda w, _: replace(w, view=replace(w.view, axes=not w.view.axes)),
     "help": lambda workspace, _: replace(workspace, help=not workspace.help),
     "before": lambda w, _: replace(w, before=not w.before),
-    "beside": lambda w, _: replace(w, view=compare.toggle_mode(w.view, "beside")),
-    "split": lambda w, _: replace(w, view=compare.toggle_mode(w.view, "split")),
-    "difference": lambda w, _: replace(w, view=compare.toggle_mode(w.view, "difference")),
-    "against": lambda w, _: replace(w, view=compare.toggle_against(w.view)),
-    "compare_snapshots": lambda w, _: replace(w, view=compare.toggle_snapshots(w.view)),
+    "beside": lambda w, _: replace(w, view=toggle_mode(w.view, "beside")),
+    "split": lambda w, _: replace(w, view=toggle_mode(w.view, "split")),
+    "difference": lambda w, _: replace(w, view=toggle_mode(w.view, "difference")),
+    "against": lambda w, _: replace(w, view=toggle_against(w.view)),
+    "compare_snapshots": lambda w, _: replace(w, view=toggle_snapshots(w.view)),
     "dynamic_resolution": lambda w, _: replace(w, view=next_resolution_mode(w.view)),
     "new_edit": _new_edit,
     "overlay": lambda w, _: replace(w, view=replace(w.view, overlay=not w.view.overlay)),
     "panel": lambda w, _: replace(w, view=replace(w.view, panel=not w.view.panel)),
-    **{name: _timeline_action(name) for name in playback.ACTIONS},
+    **{name: _timeline_action(name) for name in timeline.ACTIONS},
 }

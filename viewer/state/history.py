@@ -8,8 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
-from viewer.camera.up_axis import Vec3
-from viewer.camera.view_camera import ViewCamera, with_up
+from viewer.camera.view_camera import Vec3, ViewCamera, with_up
 
 from .selection import SelectionState
 from .view_state import Blend, LayerGroup, LayerState, SnapshotPair, Timeline, ViewState
@@ -41,17 +40,11 @@ class Look:
 
 @dataclass(frozen=True)
 class HistoryEntry:
-    """What one entry brings back.
+    """What one entry brings back."""
 
-    Args:
-        edit: the part of the state
-        look: as a person set it last
-        snapshots: those there were, see snapshots.py, which is built on this module
-    """
-
-    edit: Edit
-    look: Look = Look()
-    snapshots: tuple[Any, ...] = ()
+    edit: Edit  # the part of the state
+    look: Look = Look()  # as a person set it last
+    snapshots: tuple[Any, ...] = ()  # those there were, see snapshots.py, which is built on this module
 
 
 @dataclass(frozen=True)
@@ -66,15 +59,11 @@ class History:
 
 
 def edit_of(state: ViewState) -> Edit:
-    return Edit(
-        state.layers,
-        state.blend,
-        state.overshoot,
-        state.timeline,
-        state.selection,
-        state.groups,
-        state.pair,
-    )
+    return Edit(**_edited(state))
+
+
+def _edited(part: ViewState | Edit) -> dict[str, Any]:
+    return {field.name: getattr(part, field.name) for field in fields(Edit)}
 
 
 def look_of(state: ViewState) -> Look:
@@ -154,16 +143,7 @@ def _take_changes(look: Look, before: Look, after: Look) -> Look:
 
 def apply_edit(state: ViewState, edit: Edit) -> ViewState:
     """`state` edited as in `edit`, seen from where it is."""
-    return replace(
-        state,
-        layers=edit.layers,
-        blend=edit.blend,
-        overshoot=edit.overshoot,
-        timeline=edit.timeline,
-        selection=edit.selection,
-        groups=edit.groups,
-        pair=edit.pair,
-    )
+    return replace(state, **_edited(edit))
 
 
 def apply_present(state: ViewState, history: History) -> ViewState:

@@ -16,7 +16,16 @@ from progdf.compose.layers import Gains
 from progdf.errors import ProgdfError
 from progdf.io.json_values import convert_json, decode_json, plain
 
-from . import layers as stack
+from .layers import (
+    dissolve_groups,
+    group_layers,
+    largest_strength,
+    move_to_group,
+    nudge_slider,
+    remove_layer,
+    step_layers,
+    with_slider_value,
+)
 from .view_state import Blend, LayerState, Strength, ViewState
 from .workspace import Workspace
 
@@ -40,18 +49,18 @@ def press(workspace: Workspace, argument: str) -> Workspace:
             with commas, as a range is of what one sees
     """
     how, at, listed = argument.split(":")
-    index, shown = int(at), [int(i) for i in listed.split(",") if i]
+    index, rows = int(at), [int(i) for i in listed.split(",") if i]
     layers, focus = workspace.view.layers, workspace.focus
     chosen = selected_layers(workspace)
     if how == "range" and focus is not None:
         low, high = sorted((focus, index))
-        return replace(workspace, selected=frozenset(layers[i].gdf for i in shown if low <= i <= high))
+        return replace(workspace, selected=frozenset(layers[i].gdf for i in rows if low <= i <= high))
     if how == "toggle" and index in chosen:
-        rest = [i for i in chosen if i != index]
-        if not rest:
+        remaining = [i for i in chosen if i != index]
+        if not remaining:
             return workspace
-        near = min(rest, key=lambda i: abs(i - index)) if focus == index else focus
-        return replace(workspace, focus=near, selected=frozenset(layers[i].gdf for i in rest))
+        near = min(remaining, key=lambda i: abs(i - index)) if focus == index else focus
+        return replace(workspace, focus=near, selected=frozenset(layers[i].gdf for i in remaining))
     if how == "toggle":
         return replace(workspace, focus=index, selected=frozenset(layers[i].gdf for i in (*chosen, index)))
     if how == "keep" and index in chosen:
@@ -82,7 +91,7 @@ def set_master(workspace: Workspace, strength: float) -> Workspace:
     all at 0 rise together.
     """
     chosen, view = selected_layers(workspace), workspace.view
-    upper = stack.largest_strength(view)
+    upper = largest_strength(view)
     strength = min(upper, max(0.0, strength))
     before = {layer.gdf: layer.strength for layer in workspace.past.present.edit.layers}
     base = {i: before.get(view.layers[i].gdf, view.layers[i].strength) for i in chosen}
@@ -91,9 +100,7 @@ def set_master(workspace: Workspace, strength: float) -> Workspace:
     def scale(index: int) -> float:
         return strength if not most else min(upper, base[index] / most * strength)
 
-    return change_selected(
-        workspace, lambda i, layer: stack.with_slider_value(layer, "strength", scale(i), upper)
-    )
+    return change_selected(workspace, lambda i, layer: with_slider_value(layer, "strength", scale(i), upper))
 
 
 def change_selected(workspace: Workspace, change: Callable[[int, LayerState], LayerState]) -> Workspace:
@@ -120,7 +127,7 @@ def nudge(workspace: Workspace, by: float) -> Workspace:
         return set_master(workspace, round(master_strength(workspace.view, chosen) + by, 6))
     view = workspace.view
     for i in chosen:
-        view = stack.nudge(view, i, slider, by)
+        view = nudge_slider(view, i, slider, by)
     return replace(workspace, view=view)
 
 
@@ -141,7 +148,7 @@ def reset(workspace: Workspace, everything: bool) -> Workspace:
 def move(workspace: Workspace, by: int) -> Workspace:
     """The selected layers up (−1) or down in the panel's list; the focus goes with them."""
     chosen = selected_layers(workspace)
-    return _with_focus(workspace, stack.step_layers(workspace.view, chosen, -by)) if chosen else workspace
+    return _with_focus(workspace, step_layers(workspace.view, chosen, -by)) if chosen else workspace
 
 
 def remove(workspace: Workspace, index: str) -> Workspace:
@@ -152,7 +159,7 @@ def remove(workspace: Workspace, index: str) -> Workspace:
         return workspace
     view, gone = workspace.view, chosen if at in chosen else (at,)
     for i in reversed(gone):
-        view = stack.remove_layer(view, i)
+        view = remove_layer(view, i)
     focus = max(gone[0] - 1, 0) if view.layers else None
     return replace(workspace, view=view, focus=focus, selected=frozenset(), renaming=None, overlap=None)
 
@@ -203,7 +210,7 @@ def paste_values(workspace: Workspace, text: str) -> tuple[Workspace, str]:
         copied = convert_json(decode_json(text), CopiedValues, closed=True)
     except ValueError:
         raise ProgdfError("the clipboard holds no values of layers; copy some with Ctrl+C first") from None
-    view, upper = workspace.view, stack.largest_strength(workspace.view)
+    view, upper = workspace.view, largest_strength(workspace.view)
     if len(copied.layers) == 1:
         taken = {view.layers[i].name: copied.layers[0] for i in selected_layers(workspace)}
     else:
@@ -229,7 +236,7 @@ def _name_layers(names: Sequence[str]) -> str:
 def group(workspace: Workspace, name: str) -> Workspace:
     """The selected layers as a new group, or at the bottom of the one of this name."""
     view, chosen = workspace.view, selected_layers(workspace)
-    grouped = stack.move_to_group(view, chosen, name) if name else stack.group_layers(view, chosen)
+    grouped = move_to_group(view, chosen, name) if name else group_layers(view, chosen)
     return _with_focus(workspace, grouped)
 
 
@@ -237,7 +244,7 @@ def ungroup(workspace: Workspace, name: str) -> Workspace:
     """A group, or those of the selected layers, dissolved."""
     view = workspace.view
     names = {name} if name else {view.layers[i].group for i in selected_layers(workspace)}
-    return replace(workspace, view=stack.ungroup(view, names - {""}))
+    return replace(workspace, view=dissolve_groups(view, names - {""}))
 
 
 def _with_focus(workspace: Workspace, view: ViewState) -> Workspace:

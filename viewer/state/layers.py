@@ -24,7 +24,7 @@ def visible_layers(view: ViewState) -> tuple[LayerState, ...]:
     """
     groups = {group.name: group for group in view.groups}
     alone = tuple(layer for layer in view.layers if layer.solo)
-    shown = alone or tuple(
+    visible = alone or tuple(
         layer
         for layer in view.layers
         if layer.enabled and (layer.group not in groups or groups[layer.group].enabled)
@@ -32,13 +32,13 @@ def visible_layers(view: ViewState) -> tuple[LayerState, ...]:
     factors = {name: group.strength for name, group in groups.items() if group.strength != 1.0}
     return tuple(
         replace(layer, strength=layer.strength * factors[layer.group]) if layer.group in factors else layer
-        for layer in shown
+        for layer in visible
     )
 
 
 def is_visible(view: ViewState, layer: LayerState) -> bool:
     """Whether a layer of `view` takes part."""
-    return any(shown.name == layer.name for shown in visible_layers(view))
+    return any(visible.name == layer.name for visible in visible_layers(view))
 
 
 def shown_edits(view: ViewState) -> list[str]:
@@ -77,7 +77,7 @@ def slider_value(layer: LayerState, slider: str) -> float:
     return layer.strength if slider == "strength" else float(getattr(layer.gains, slider))
 
 
-def nudge(view: ViewState, index: int, slider: str, by: float) -> ViewState:
+def nudge_slider(view: ViewState, index: int, slider: str, by: float) -> ViewState:
     """One layer's slider a step further."""
 
     def step(layer: LayerState) -> LayerState:
@@ -95,15 +95,15 @@ def move_layers(view: ViewState, indices: Collection[int], at: int, group: str =
     Args:
         group: which they join; "" for none, but a group all of whose layers move stays one
     """
-    rest = [layer for i, layer in enumerate(view.layers) if i not in indices]
-    left = {layer.group for layer in rest}
+    remaining = [layer for i, layer in enumerate(view.layers) if i not in indices]
+    left = {layer.group for layer in remaining}
     moved = [
         replace(l, group=group or (l.group if l.group not in left else ""))
         for i, l in enumerate(view.layers)
         if i in indices
     ]
     below = sum(i not in indices for i in range(at))
-    return tidy_groups(replace(view, layers=(*rest[:below], *moved, *rest[below:])))
+    return tidy_groups(replace(view, layers=(*remaining[:below], *moved, *remaining[below:])))
 
 
 def step_layers(view: ViewState, indices: Collection[int], by: int) -> ViewState:
@@ -115,15 +115,15 @@ def step_layers(view: ViewState, indices: Collection[int], by: int) -> ViewState
     past = max(indices) + 1 if by > 0 else min(indices) - 1
     if not 0 <= past < len(view.layers):
         return view
-    rest = {i: layer.group for i, layer in enumerate(view.layers) if i not in indices}
-    own = {view.layers[i].group for i in indices}
-    if "" not in own and not own & {*rest.values()}:
-        while past + by in rest and rest[past + by] == rest[past] != "":
+    remaining = {i: layer.group for i, layer in enumerate(view.layers) if i not in indices}
+    groups = {view.layers[i].group for i in indices}
+    if "" not in groups and not groups & {*remaining.values()}:
+        while past + by in remaining and remaining[past + by] == remaining[past] != "":
             past += by
     at = past + 1 if by > 0 else past
-    below = next((rest[i] for i in range(at - 1, -1, -1) if i in rest), "")
-    above = next((rest[i] for i in range(at, len(view.layers)) if i in rest), "")
-    joined = below if below == above or {below} == own else above if {above} == own else ""
+    below = next((remaining[i] for i in range(at - 1, -1, -1) if i in remaining), "")
+    above = next((remaining[i] for i in range(at, len(view.layers)) if i in remaining), "")
+    joined = below if below == above or {below} == groups else above if {above} == groups else ""
     return move_layers(view, indices, at, joined)
 
 
@@ -224,25 +224,27 @@ def group_layers(view: ViewState, indices: Collection[int], name: str = "Group")
     while free in taken:
         free, number = f"{name} {number}", number + 1
     members = [replace(view.layers[i], group=free) for i in sorted(indices)]
-    rest = [layer for i, layer in enumerate(view.layers) if i not in indices]
+    remaining = [layer for i, layer in enumerate(view.layers) if i not in indices]
     at = sum(i not in indices for i in range(max(indices)))
-    if 0 < at < len(rest) and rest[at - 1].group and rest[at - 1].group == rest[at].group:
-        at = max(i + 1 for i, layer in enumerate(rest) if layer.group == rest[at].group)  # not into a group
-    layers = (*rest[:at], *members, *rest[at:])
+    if 0 < at < len(remaining) and remaining[at - 1].group and remaining[at - 1].group == remaining[at].group:
+        at = max(
+            i + 1 for i, layer in enumerate(remaining) if layer.group == remaining[at].group
+        )  # not into a group
+    layers = (*remaining[:at], *members, *remaining[at:])
     return tidy_groups(replace(view, layers=layers, groups=(*view.groups, LayerGroup(free))))
 
 
 def move_to_group(view: ViewState, indices: Collection[int], name: str) -> ViewState:
     """These layers at the bottom of a group there is."""
     moved = [replace(view.layers[i], group=name) for i in sorted(indices) if view.layers[i].group != name]
-    rest = [layer for i, layer in enumerate(view.layers) if i not in indices or layer.group == name]
-    at = next((i for i, layer in enumerate(rest) if layer.group == name), None)
+    remaining = [layer for i, layer in enumerate(view.layers) if i not in indices or layer.group == name]
+    at = next((i for i, layer in enumerate(remaining) if layer.group == name), None)
     if at is None:
         return view
-    return tidy_groups(replace(view, layers=(*rest[:at], *moved, *rest[at:])))
+    return tidy_groups(replace(view, layers=(*remaining[:at], *moved, *remaining[at:])))
 
 
-def ungroup(view: ViewState, names: Collection[str]) -> ViewState:
+def dissolve_groups(view: ViewState, names: Collection[str]) -> ViewState:
     """The layers of these groups by themselves, as they showed within them."""
     groups = {group.name: group for group in view.groups if group.name in names}
 
@@ -262,21 +264,21 @@ def change_group(view: ViewState, name: str, change: Callable[[LayerGroup], Laye
     if old is None:
         return view
     new = change(old)
-    wanted = " ".join(new.name.split())[:LONGEST_NAME]
-    if not wanted or any(group.name == wanted for group in view.groups if group is not old):
-        wanted = name
+    free = " ".join(new.name.split())[:LONGEST_NAME]
+    if not free or any(group.name == free for group in view.groups if group is not old):
+        free = name
     return replace(
         view,
-        layers=tuple(replace(l, group=wanted) if l.group == name else l for l in view.layers),
-        groups=tuple(replace(new, name=wanted) if group is old else group for group in view.groups),
-        collapsed=tuple(wanted if collapsed == name else collapsed for collapsed in view.collapsed),
+        layers=tuple(replace(l, group=free) if l.group == name else l for l in view.layers),
+        groups=tuple(replace(new, name=free) if group is old else group for group in view.groups),
+        collapsed=tuple(free if collapsed == name else collapsed for collapsed in view.collapsed),
     )
 
 
 def toggle_collapsed(view: ViewState, name: str) -> ViewState:
     """The layers of a group listed, or not."""
-    rest = tuple(collapsed for collapsed in view.collapsed if collapsed != name)
-    return replace(view, collapsed=rest if name in view.collapsed else (*rest, name))
+    remaining = tuple(collapsed for collapsed in view.collapsed if collapsed != name)
+    return replace(view, collapsed=remaining if name in view.collapsed else (*remaining, name))
 
 
 def tidy_groups(view: ViewState) -> ViewState:

@@ -32,22 +32,15 @@ Floats = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Stroke:
-    """A stroke under way.
+    """A stroke under way."""
 
-    Args:
-        before: weights when it began, 0..1. [M]
-        places: where each member is in the picture, pixels, and f·log(depth), so that neighbors are as far
-            apart as they look; NaN where the brush cannot reach it. [M,3]
-        reached: largest touch of the brush so far, 0..1. [M]
-        mode: of `BRUSH_MODES`
-        last: where the brush was last, pixels
-    """
-
-    before: Floats
+    before: Floats  # weights when it began, 0..1. [M]
+    # where each member is in the picture, pixels, and f·log(depth), so that neighbors are as far apart as
+    # they look; NaN where the brush cannot reach it. [M,3]
     places: Floats
-    reached: Floats
-    mode: str = "erase"
-    last: tuple[float, float] | None = None
+    reached: Floats  # largest touch of the brush so far, 0..1. [M]
+    mode: str = "erase"  # of `BRUSH_MODES`
+    last: tuple[float, float] | None = None  # where the brush was last, pixels
 
 
 def next_mode(mode: str) -> str:
@@ -62,14 +55,14 @@ def mode_while(mode: str, modifier: str) -> str:
     return {"add": "erase", "erase": "add"}.get(mode, mode) if modifier == "Ctrl" else mode
 
 
-def radius(wanted: float) -> float:
+def radius(pixels: float) -> float:
     """A radius that a hand can use."""
-    return min(LARGEST_PX, max(SMALLEST_PX, round(wanted, 1)))
+    return min(LARGEST_PX, max(SMALLEST_PX, round(pixels, 1)))
 
 
-def softness(wanted: float) -> float:
+def softness(share: float) -> float:
     """A softness, 0..1."""
-    return min(1.0, max(0.0, round(wanted, 3)))
+    return min(1.0, max(0.0, round(share, 3)))
 
 
 def encode(weights: Floats) -> str:
@@ -245,5 +238,5 @@ def near_mean(points: Floats, values: Floats, width: float) -> Floats:
     corners = np.unique(cells, return_inverse=True)[1].reshape(cells.shape)
     given = np.bincount(corners.ravel(), shares.ravel())[corners]
     total = np.bincount(corners.ravel(), (shares * values[:, None]).ravel())[corners]
-    found: Floats = (shares * (total / np.maximum(given, _LEAST))).sum(1).astype(np.float32)
-    return np.clip(found, values.min(), values.max())
+    means: Floats = (shares * (total / np.maximum(given, _LEAST))).sum(1).astype(np.float32)
+    return np.clip(means, values.min(), values.max())

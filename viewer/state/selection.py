@@ -46,39 +46,24 @@ COLORS: tuple[Color, ...] = (
 
 @dataclass(frozen=True)
 class NamedRegion:
-    """A selection that was kept.
+    """A selection that was kept."""
 
-    Args:
-        name: no two regions share one
-        path: its file, for `progdf train --region file:PATH`
-        members: its packed mask
-        count: of its members
-        color: of its swatch and its tint
-        visible: the picture shows it tinted
-    """
-
-    name: str
-    path: Path
-    members: bytes
-    count: Annotated[int, Meta(ge=0)]
-    color: Color = COLORS[0]
-    visible: bool = False
+    name: str  # no two regions share one
+    path: Path  # its file, for `progdf train --region file:PATH`
+    members: bytes  # its packed mask
+    count: Annotated[int, Meta(ge=0)]  # of its members
+    color: Color = COLORS[0]  # of its swatch and its tint
+    visible: bool = False  # the picture shows it tinted
 
 
 @dataclass(frozen=True)
 class SelectionState:
-    """The present selection, what is hidden, and the regions; undo knows all of it.
+    """The present selection, what is hidden, and the regions; undo knows all of it."""
 
-    Args:
-        members: packed mask of what is selected
-        count: of these
-        hidden: packed mask of what is not drawn and cannot be selected
-        regions: in the order of the panel's rows
-    """
-
-    members: bytes = NOBODY
-    count: Annotated[int, Meta(ge=0)] = 0
-    hidden: bytes = NOBODY
+    members: bytes = NOBODY  # packed mask of what is selected
+    count: Annotated[int, Meta(ge=0)] = 0  # of these
+    hidden: bytes = NOBODY  # packed mask of what is not drawn and cannot be selected
+    # in the order of the panel's rows
     regions: Annotated[tuple[NamedRegion, ...], Meta(max_length=MOST_REGIONS)] = ()
 
 
@@ -173,8 +158,8 @@ def _change_region(state: SelectionState, name: str, argument: str, mask: Mask) 
     region = state.regions[int(index)]
     if name == "region":
         return select(state, combine(mask, unpack(region.members, len(mask)), mode or "new"))
-    shown = replace(region, visible=not region.visible)
-    return change_region(state, int(index), shown if name == "show_region" else None)
+    toggled = replace(region, visible=not region.visible)
+    return change_region(state, int(index), toggled if name == "show_region" else None)
 
 
 CHANGES_BY_NEIGHBORS: dict[str, Callable[[Neighborhood, Mask], Mask]] = {
@@ -191,12 +176,10 @@ CHANGES = (
 """Actions on the selection, and `region:INDEX[:MODE]`, `show_region:INDEX`, `forget_region:INDEX`."""
 
 
-def free_name(
-    state: SelectionState, wanted: str, is_taken: Callable[[str], bool] = lambda name: False
-) -> str:
+def free_name(state: SelectionState, text: str, is_taken: Callable[[str], bool] = lambda name: False) -> str:
     """A name on one line, for a file too, with a number where a region has it already, or it is taken."""
-    kept = "".join(c if c.isalnum() or c in " -_." else "_" for c in " ".join(wanted.split()))
-    name = kept.strip(" .")[:LONGEST_NAME].rstrip(" .") or "region"
+    cleaned = "".join(c if c.isalnum() or c in " -_." else "_" for c in " ".join(text.split()))
+    name = cleaned.strip(" .")[:LONGEST_NAME].rstrip(" .") or "region"
     name = name if is_portable(name) else f"region {name}"
     taken, free, number = {region.name.lower() for region in state.regions}, name, 2
     while free.lower() in taken or is_taken(free):
@@ -221,8 +204,8 @@ def change_region(state: SelectionState, index: int, region: NamedRegion | None)
     """With a region in another's place, or None: without it; as it was where there is no such region."""
     if not 0 <= index < len(state.regions):
         return state
-    kept: Sequence[NamedRegion] = () if region is None else (region,)
-    return replace(state, regions=(*state.regions[:index], *kept, *state.regions[index + 1 :]))
+    replacement: Sequence[NamedRegion] = () if region is None else (region,)
+    return replace(state, regions=(*state.regions[:index], *replacement, *state.regions[index + 1 :]))
 
 
 def check(state: SelectionState, total: int) -> None:

@@ -22,17 +22,11 @@ ORIGINAL = "original"
 
 @dataclass(frozen=True)
 class SliderSnapshot:
-    """One kept state.
+    """One kept state."""
 
-    Args:
-        name: under its picture
-        edit: what going back to it restores, as one undo entry
-        camera: where its small picture is taken from
-    """
-
-    name: str
-    edit: Edit
-    camera: ViewCamera = ViewCamera()
+    name: str  # under its picture
+    edit: Edit  # what going back to it restores, as one undo entry
+    camera: ViewCamera = ViewCamera()  # where its small picture is taken from
 
 
 @dataclass(frozen=True)
@@ -59,16 +53,16 @@ def remove(snapshots: Sequence[SliderSnapshot], index: int) -> tuple[SliderSnaps
 def rename(snapshots: Sequence[SliderSnapshot], index: int, name: str) -> tuple[SliderSnapshot, ...]:
     """One under another name, on one line, with a number where it is taken; no name changes nothing."""
     name = " ".join(name.split())[:LONGEST_NAME] or snapshots[index].name
-    taken = {ORIGINAL, *(kept.name for i, kept in enumerate(snapshots) if i != index)}
+    taken = {ORIGINAL, *(other.name for i, other in enumerate(snapshots) if i != index)}
     free = next(n for n in (name, *(f"{name}-{i}" for i in range(2, MOST + 3))) if n not in taken)
     return (*snapshots[:index], replace(snapshots[index], name=free), *snapshots[index + 1 :])
 
 
 def move(snapshots: Sequence[SliderSnapshot], index: int, to: int) -> tuple[SliderSnapshot, ...]:
     """One at another place; the ends stop it."""
-    kept = list(snapshots)
-    kept.insert(max(0, min(to, len(kept) - 1)), kept.pop(index))
-    return tuple(kept)
+    moved = list(snapshots)
+    moved.insert(max(0, min(to, len(moved) - 1)), moved.pop(index))
+    return tuple(moved)
 
 
 def with_original(snapshots: Sequence[SliderSnapshot], view: ViewState) -> tuple[SliderSnapshot, ...]:
@@ -81,24 +75,24 @@ def with_original(snapshots: Sequence[SliderSnapshot], view: ViewState) -> tuple
 
 def restore(view: ViewState, snapshot: SliderSnapshot) -> ViewState:
     """`view` edited as it was then; edits that were opened since stay in the stack, at 0."""
-    kept = {layer.gdf for layer in snapshot.edit.layers}
-    later = tuple(replace(layer, strength=0.0, group="") for layer in view.layers if layer.gdf not in kept)
+    known = {layer.gdf for layer in snapshot.edit.layers}
+    later = tuple(replace(layer, strength=0.0, group="") for layer in view.layers if layer.gdf not in known)
     back = replace(history.apply_edit(view, snapshot.edit), pair=view.pair)
     return replace(back, layers=(*back.layers, *later), timeline=view.timeline, selection=view.selection)
 
 
-def pair_of(kept: Sequence[SliderSnapshot], pair: SnapshotPair) -> tuple[int, int]:
-    """The places of A and B in `kept`, which begins with the original; the last two where none is named."""
-    places = {snapshot.name: i for i, snapshot in reversed(list(enumerate(kept)))}
-    return places.get(pair.a, max(len(kept) - 2, 0)), places.get(pair.b, len(kept) - 1)
+def pair_of(snapshots: Sequence[SliderSnapshot], pair: SnapshotPair) -> tuple[int, int]:
+    """The places of A and B in `snapshots` (the original first); the last two where none is named."""
+    places = {snapshot.name: i for i, snapshot in reversed(list(enumerate(snapshots)))}
+    return places.get(pair.a, max(len(snapshots) - 2, 0)), places.get(pair.b, len(snapshots) - 1)
 
 
 def compare_sides(snapshots: Sequence[SliderSnapshot], view: ViewState) -> SnapshotSides | None:
     """What `view` shows where it compares two snapshots, else None."""
     if view.compare.mode == "off" or view.compare.against != "snapshots" or not snapshots:
         return None
-    kept = with_original(snapshots, view)
-    a, b = (kept[i] for i in pair_of(kept, view.pair))
+    listed = with_original(snapshots, view)
+    a, b = (listed[i] for i in pair_of(listed, view.pair))
     return SnapshotSides(restore(view, a), restore(view, b), (a.name, b.name))
 
 
@@ -109,7 +103,7 @@ def choose(view: ViewState, slot: str, name: str) -> ViewState:
 
 
 def blend(
-    view: ViewState, kept: Sequence[SliderSnapshot], share: float, counts: Callable[[int], int]
+    view: ViewState, snapshots: Sequence[SliderSnapshot], share: float, counts: Callable[[int], int]
 ) -> ViewState:
     """`view` between A and B of its pair: as A at 0, as B at 1, each exactly.
 
@@ -118,16 +112,16 @@ def blend(
     rule and locks cannot lie between: they change half way.
 
     Args:
-        kept: the snapshots with the original
+        snapshots: the snapshots with the original
         counts: gives how many members an edit has
 
     Raises:
         ProgdfError: painted weights do not fit their edit.
     """
     share = min(1.0, max(0.0, share))
-    a, b = pair_of(kept, view.pair)
-    pair = replace(view.pair, a=kept[a].name, b=kept[b].name, share=share)
-    ends = [restore(view, kept[i] if i else _faded(kept[j])) for i, j in ((a, b), (b, a))]
+    a, b = pair_of(snapshots, view.pair)
+    pair = replace(view.pair, a=snapshots[a].name, b=snapshots[b].name, share=share)
+    ends = [restore(view, snapshots[i] if i else _faded(snapshots[j])) for i, j in ((a, b), (b, a))]
     if share in (0.0, 1.0):
         return replace(ends[round(share)], pair=pair)
     near, far = ends if share < 0.5 else ends[::-1]
@@ -141,17 +135,17 @@ def blend(
         _group_between(group, ends, share) if group.name in shared else LayerGroup(group.name)
         for group in near.groups
     )
-    own = [{layer.gdf: layer for layer in end.layers} for end in ends]
+    layers_of = [{layer.gdf: layer for layer in end.layers} for end in ends]
     seen = [{layer.gdf: layer.strength for layer in visible_layers(end)} for end in ends]
 
     def between(layer: LayerState) -> LayerState:
-        first, second = (of.get(layer.gdf, replace(layer, strength=0.0, enabled=False)) for of in own)
-        shown = [layer.gdf in of for of in seen]
+        first, second = (of.get(layer.gdf, replace(layer, strength=0.0, enabled=False)) for of in layers_of)
+        visible = [layer.gdf in of for of in seen]
         strengths = [of.get(layer.gdf, end.strength) for of, end in zip(seen, (first, second), strict=True)]
         if layer.group in shared:
-            shown, strengths = [first.enabled, second.enabled], [first.strength, second.strength]
-        strength = _fade(shown, strengths, share)
-        on = [here and s != 0.0 for here, s in zip(shown, strengths, strict=True)]
+            visible, strengths = [first.enabled, second.enabled], [first.strength, second.strength]
+        strength = _fade(visible, strengths, share)
+        on = [here and s != 0.0 for here, s in zip(visible, strengths, strict=True)]
         if on[0] != on[1]:
             first = second = first if on[0] else second
         gains = {
@@ -160,7 +154,7 @@ def blend(
         }
         weights = paint.blend(first.paint, second.paint, share, counts(layer.gdf))
         return replace(
-            layer, strength=strength, enabled=any(shown), solo=False, gains=Gains(**gains), paint=weights
+            layer, strength=strength, enabled=any(visible), solo=False, gains=Gains(**gains), paint=weights
         )
 
     return replace(
@@ -172,9 +166,9 @@ def blend(
     )
 
 
-def is_blend(view: ViewState, kept: Sequence[SliderSnapshot], counts: Callable[[int], int]) -> bool:
+def is_blend(view: ViewState, snapshots: Sequence[SliderSnapshot], counts: Callable[[int], int]) -> bool:
     """Whether `view` is still what its slider between two snapshots made of it."""
-    made = blend(view, kept, view.pair.share, counts)
+    made = blend(view, snapshots, view.pair.share, counts)
     return (made.layers, made.groups, made.blend) == (view.layers, view.groups, view.blend)
 
 

@@ -9,8 +9,8 @@ from msgspec import Meta
 
 from progdf.compose.layers import BLENDS, Gains
 from progdf.io.json_values import one_of
-from viewer.camera.tween import EASINGS
 from viewer.camera.view_camera import ViewCamera
+from viewer.camera.views import EASINGS
 
 from .selection import SelectionState
 
@@ -40,175 +40,100 @@ Easing = Annotated[str, one_of(EASINGS)]
 
 @dataclass(frozen=True)
 class LayerState:
-    """One layer row: which .gdf (by its place in the engine's list), and how much of it.
+    """One layer row: which .gdf (by its place in the engine's list), and how much of it."""
 
-    Args:
-        gdf: index into the engine's edits
-        name: no two layers of a stack share one
-        strength: 0..1, up to `OVERSHOOT` where the view allows it
-        enabled: the eye; `solo` wins over it
-        gains: how much of each kind of change comes through, 0..1
-        solo: only soloed layers are shown while there are any
-        locked: strength, gains and paint stay as they are
-        paint: a weight per member, as `paint.encode` writes it; empty is 1 everywhere
-        group: the name of the group it is in, "" for none; those of a group lie next to each other
-    """
-
-    gdf: int
-    name: str
-    strength: Strength = 0.0
-    enabled: bool = True
-    gains: Gains = Gains()
-    solo: bool = False
-    locked: bool = False
-    paint: str = ""
-    group: str = ""
+    gdf: int  # index into the engine's edits
+    name: str  # no two layers of a stack share one
+    strength: Strength = 0.0  # 0..1, up to `OVERSHOOT` where the view allows it
+    enabled: bool = True  # the eye; `solo` wins over it
+    gains: Gains = Gains()  # how much of each kind of change comes through, 0..1
+    solo: bool = False  # only soloed layers are shown while there are any
+    locked: bool = False  # strength, gains and paint stay as they are
+    paint: str = ""  # a weight per member, as `paint.encode` writes it; empty is 1 everywhere
+    group: str = ""  # the name of the group it is in, "" for none; those of a group lie next to each other
 
 
 @dataclass(frozen=True)
 class LayerGroup:
-    """Layers that are switched and dimmed together.
+    """Layers that are switched and dimmed together."""
 
-    Args:
-        name: no two groups share one
-        enabled: the eye; a soloed layer is shown all the same
-        strength: what the strengths of its layers are multiplied by
-    """
-
-    name: str
-    enabled: bool = True
-    strength: Share = 1.0
+    name: str  # no two groups share one
+    enabled: bool = True  # the eye; a soloed layer is shown all the same
+    strength: Share = 1.0  # what the strengths of its layers are multiplied by
 
 
 @dataclass(frozen=True)
 class Brush:
-    """What paints the strength of the focused layer.
+    """What paints the strength of the focused layer."""
 
-    Args:
-        active: whether the left mouse button paints
-        radius: pixels at 1×
-        softness: the part of the radius over which its touch fades, 0..1
-        mode: of `BRUSH_MODES`
-        through: also behind the front surface
-        weights: the members of the focused layer show their weights as colors meanwhile; else only a thin
-            tint lies over those that have less than all of the edit
-        flow: how far one stroke goes towards what it gives, 0..1
-        value: the weight that "add" gives, 0..1
-    """
-
-    active: bool = False
-    radius: Annotated[float, Meta(ge=SMALLEST_PX, le=LARGEST_PX)] = 40.0
-    softness: Share = 0.5
-    mode: Annotated[str, one_of(BRUSH_MODES)] = "erase"
-    through: bool = False
+    active: bool = False  # whether the left mouse button paints
+    radius: Annotated[float, Meta(ge=SMALLEST_PX, le=LARGEST_PX)] = 40.0  # pixels at 1×
+    softness: Share = 0.5  # the part of the radius over which its touch fades, 0..1
+    mode: Annotated[str, one_of(BRUSH_MODES)] = "erase"  # of `BRUSH_MODES`
+    through: bool = False  # also behind the front surface
+    # the members of the focused layer show their weights as colors meanwhile; else only a thin tint lies over
+    # those that have less than all of the edit
     weights: bool = False
-    flow: Share = 1.0
-    value: Share = 1.0
+    flow: Share = 1.0  # how far one stroke goes towards what it gives, 0..1
+    value: Share = 1.0  # the weight that "add" gives, 0..1
 
 
 @dataclass(frozen=True)
 class SelectTool:
-    """What selects in the picture.
+    """What selects in the picture."""
 
-    Args:
-        tool: of `SELECT_TOOLS`, "" for none
-        mode: of `SELECT_MODES`; modifiers go before it
-        through: also what lies behind the front surface
-        radius: of the brush, pixels at 1×
-        tolerance: how far colors may be from the one that was clicked, OKLab
-    """
-
-    tool: Annotated[str, one_of(("", *SELECT_TOOLS))] = ""
-    mode: Annotated[str, one_of(SELECT_MODES)] = "new"
-    through: bool = False
-    radius: Annotated[float, Meta(ge=SMALLEST_PX, le=LARGEST_PX)] = 30.0
-    tolerance: Share = 0.08
+    tool: Annotated[str, one_of(("", *SELECT_TOOLS))] = ""  # of `SELECT_TOOLS`, "" for none
+    mode: Annotated[str, one_of(SELECT_MODES)] = "new"  # of `SELECT_MODES`; modifiers go before it
+    through: bool = False  # also what lies behind the front surface
+    radius: Annotated[float, Meta(ge=SMALLEST_PX, le=LARGEST_PX)] = 30.0  # of the brush, pixels at 1×
+    tolerance: Share = 0.08  # how far colors may be from the one that was clicked, OKLab
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """What the edited picture is set against, and how (see comparison.py).
+    """What the edited picture is set against, and how."""
 
-    Args:
-        mode: of `COMPARE_MODES`
-        divider: where the edited side of a split begins, share of the picture's width
-        amplify: what a difference is multiplied by, 1 to 64
-        against: "original", or "recorded": the same strengths as training recorded them, where it did; or
-            "snapshots": A of `ViewState.pair` against its B, whatever the sliders say
-    """
-
-    mode: Annotated[str, one_of(COMPARE_MODES)] = "off"
-    divider: Share = 0.5
+    mode: Annotated[str, one_of(COMPARE_MODES)] = "off"  # of `COMPARE_MODES`
+    divider: Share = 0.5  # where the edited side of a split begins, share of the picture's width
+    # what a difference is multiplied by, 1 to 64
     amplify: Annotated[float, Meta(ge=1.0, le=MOST_AMPLIFIED)] = 4.0
+    # "original", or "recorded": the same strengths as training recorded them, where it did; or "snapshots": A
+    # of `ViewState.pair` against its B, whatever the sliders say
     against: Annotated[str, one_of(AGAINST)] = "original"
 
 
 @dataclass(frozen=True)
 class SnapshotPair:
-    """Two snapshots by their names, "" for the last two there are (see snapshots.py).
+    """Two snapshots by their names, "" for the last two there are (see snapshots.py)."""
 
-    Args:
-        a, b: what is compared, and what lies at the ends of the slider between them
-        share: where that slider was left, 0 at A
-    """
-
-    a: str = ""
+    a: str = ""  # a, b: what is compared, and what lies at the ends of the slider between them
     b: str = ""
-    share: Share = 0.0
+    share: Share = 0.0  # where that slider was left, 0 at A
 
 
 @dataclass(frozen=True)
 class Keyframe:
-    """What the timeline shows at one frame.
+    """What the timeline shows at one frame."""
 
-    Args:
-        frame: from 0
-        strengths: `LayerState.gdf` and its strength
-        camera: None where the film leaves the camera alone
-        easing: how it goes on from here, of `EASINGS`
-    """
-
-    frame: Frame
-    strengths: tuple[tuple[int, Strength], ...] = ()
-    camera: ViewCamera | None = None
-    easing: Easing = "smooth"
+    frame: Frame  # from 0
+    strengths: tuple[tuple[int, Strength], ...] = ()  # `LayerState.gdf` and its strength
+    camera: ViewCamera | None = None  # None where the film leaves the camera alone
+    easing: Easing = "smooth"  # how it goes on from here, of `EASINGS`
 
 
 @dataclass(frozen=True)
 class Timeline:
-    """Keys over frames (see timeline.py).
+    """Keys over frames (see timeline.py)."""
 
-    Args:
-        keys: by rising frames, no two at the same
-        length: the last frame; frame 0 is the first
-        fps: frames per second
-        ping_pong: back again after the last frame
-    """
-
-    keys: tuple[Keyframe, ...] = ()
-    length: Length = 72
-    fps: Fps = 24
-    ping_pong: bool = False
+    keys: tuple[Keyframe, ...] = ()  # by rising frames, no two at the same
+    length: Length = 72  # the last frame; frame 0 is the first
+    fps: Fps = 24  # frames per second
+    ping_pong: bool = False  # back again after the last frame
 
 
 @dataclass(frozen=True)
 class ViewState:
-    """Everything that decides the picture, and what of the panel is open.
-
-    Args:
-        overshoot: sliders go on to `OVERSHOOT`, which extrapolates
-        unfolded: which edits (`LayerState.gdf`) show their gains and curve
-        brush: what paints
-        dynamic_resolution: of `RESOLUTION_MODES`: when the window draws coarsely while something moves
-        selection: what is selected and hidden, and the regions
-        select: what selects
-        grid: the window draws a grid on the ground; pictures and films never have it
-        axes: the window shows where the axes of the world point
-        pair: the snapshots that are compared and blended
-        groups: of layers, in no order
-        collapsed: names of the groups whose layers the panel does not list
-        cards: of `CARD_MODES`
-    """
+    """Everything that decides the picture, and what of the panel is open."""
 
     camera: ViewCamera = ViewCamera()
     layers: tuple[LayerState, ...] = ()
@@ -217,19 +142,20 @@ class ViewState:
     overlay: bool = False
     panel: bool = True
     compare: Comparison = Comparison()
-    overshoot: bool = False
-    unfolded: tuple[int, ...] = ()
-    brush: Brush = Brush()
+    overshoot: bool = False  # sliders go on to `OVERSHOOT`, which extrapolates
+    unfolded: tuple[int, ...] = ()  # which edits (`LayerState.gdf`) show their gains and curve
+    brush: Brush = Brush()  # what paints
     timeline: Timeline = Timeline()
+    # of `RESOLUTION_MODES`: when the window draws coarsely while something moves
     dynamic_resolution: Annotated[str, one_of(RESOLUTION_MODES)] = "auto"
-    selection: SelectionState = SelectionState()
-    select: SelectTool = SelectTool()
-    pair: SnapshotPair = SnapshotPair()
-    grid: bool = False
-    axes: bool = True
-    groups: tuple[LayerGroup, ...] = ()
-    collapsed: tuple[str, ...] = ()
-    cards: Annotated[str, one_of(CARD_MODES)] = "auto"
+    selection: SelectionState = SelectionState()  # what is selected and hidden, and the regions
+    select: SelectTool = SelectTool()  # what selects
+    pair: SnapshotPair = SnapshotPair()  # the snapshots that are compared and blended
+    grid: bool = False  # the window draws a grid on the ground; pictures and films never have it
+    axes: bool = True  # the window shows where the axes of the world point
+    groups: tuple[LayerGroup, ...] = ()  # of layers, in no order
+    collapsed: tuple[str, ...] = ()  # names of the groups whose layers the panel does not list
+    cards: Annotated[str, one_of(CARD_MODES)] = "auto"  # of `CARD_MODES`
 
 
 def on_another_scene(view: ViewState, camera: ViewCamera) -> ViewState:
@@ -247,11 +173,6 @@ def on_another_scene(view: ViewState, camera: ViewCamera) -> ViewState:
         axes=view.axes,
         cards=view.cards,
     )
-
-
-def cards_shown(view: ViewState, fit: bool) -> str:
-    """ "full" or "compact": how the panel shows layers, where whole cards `fit` or do not."""
-    return view.cards if view.cards != "auto" else "full" if fit else "compact"
 
 
 def next_resolution_mode(view: ViewState) -> ViewState:

@@ -13,18 +13,17 @@ from progdf.gaussians import ZERO, Origin
 from progdf.scene.neighbors import Neighborhood
 from progdf.scene.selection import Mask
 from progdf.terminal import escape_text
-from viewer.camera.named_views import Glide, glide_on
 from viewer.camera.view_camera import Bounds, Fit, ViewCamera, keep_camera
+from viewer.camera.views import Glide, glide_on
 from viewer.jobs.job_queue import DeliverOptions, Job
 from viewer.jobs.training import NewEdit
 
-from . import history, playback, timeline
+from . import history, timeline
+from .facts import LayerRow, RecordingFile
 from .history import Edit, History
-from .layer_facts import LayerRow
-from .playback import Player
-from .recordings import RecordingFile
 from .selection import SelectionState
 from .snapshots import SliderSnapshot
+from .timeline import Player
 from .view_state import Comparison, ViewState
 
 MESSAGE_S, ERROR_S, DETAILS_S = 6.0, 15.0, 120.0  # how long a line stays, and one with details to copy
@@ -60,30 +59,19 @@ def _unknown() -> Neighborhood:
 
 @dataclass(frozen=True)
 class SceneFacts:
-    """What does not change while a scene is open.
+    """What does not change while a scene is open."""
 
-    Args:
-        title: the scene's name
-        count: Gaussians in the scene
-        bounds: of the bulk of the scene
-        origin: where in the world the scene and its cameras begin, see `Gaussians.origin`
-        rows: one per .gdf, indexed by `LayerState.gdf`
-        recordings: where each .gdf was recorded, in the same order
-        fit: gives the camera that `frame` takes with nothing selected and no layer focused
-        fit_members: the same for what is selected
-        home: gives the first camera for another up axis, which is the given camera's
-        neighborhood: of the scene's Gaussians, made when it is first asked for
-    """
-
-    title: str
-    count: int
-    bounds: Bounds
-    rows: Sequence[LayerRow]
-    recordings: Sequence[RecordingFile] = ()
-    origin: Origin = ZERO
-    fit: Fit = keep_camera
+    title: str  # the scene's name
+    count: int  # Gaussians in the scene
+    bounds: Bounds  # of the bulk of the scene
+    rows: Sequence[LayerRow]  # one per .gdf, indexed by `LayerState.gdf`
+    recordings: Sequence[RecordingFile] = ()  # where each .gdf was recorded, in the same order
+    origin: Origin = ZERO  # where in the world the scene and its cameras begin, see `Gaussians.origin`
+    fit: Fit = keep_camera  # gives the camera that `frame` takes with nothing selected and no layer focused
+    # the same for what is selected
     fit_members: Callable[[ViewCamera, float, Mask], ViewCamera] = lambda camera, *_: camera
-    home: Fit = keep_camera
+    home: Fit = keep_camera  # gives the first camera for another up axis, which is the given camera's
+    # of the scene's Gaussians, made when it is first asked for
     neighborhood: Callable[[], Neighborhood] = _unknown
 
 
@@ -99,27 +87,16 @@ class Message:
 
 @dataclass(frozen=True)
 class Dialog:
-    """A question that is being asked.
+    """A question that is being asked."""
 
-    Args:
-        kind: of `dialogs.TITLES`
-        text: what stands in the path field; where there is none, the file that the question is about
-        then: the request that was put off for this, "" for none; for "replace" the layer's index
-        notice: a line about the desktop's own dialog, "" for none
-        choosing: that dialog is on screen
-        chosen: the file that was chosen in it
-        error: why the path did not serve, one line, "" where it was not tried
-        options: of a picture or film that is asked for
-    """
-
-    kind: str
-    text: str = ""
-    then: str = ""
-    notice: str = ""
-    choosing: bool = False
-    chosen: str = ""
-    error: str = ""
-    options: DeliverOptions | None = None
+    kind: str  # of `dialogs.TITLES`
+    text: str = ""  # what stands in the path field; where there is none, the file that the question is about
+    then: str = ""  # the request that was put off for this, "" for none; for "replace" the layer's index
+    notice: str = ""  # a line about the desktop's own dialog, "" for none
+    choosing: bool = False  # that dialog is on screen
+    chosen: str = ""  # the file that was chosen in it
+    error: str = ""  # why the path did not serve, one line, "" where it was not tried
+    options: DeliverOptions | None = None  # of a picture or film that is asked for
 
 
 Pointed = tuple[str, int]
@@ -128,67 +105,43 @@ Pointed = tuple[str, int]
 
 @dataclass(frozen=True)
 class Workspace:
-    """The state on screen, how it came about, and what is focused.
+    """The state on screen, how it came about, and what is focused."""
 
-    Args:
-        view: what decides the picture
-        past: undo and redo
-        home: the first camera
-        focus: the focused layer, an index into `view.layers`, or None
-        selected: `LayerState.gdf` of the layers that are selected with it, empty where it is alone
-        search: what the panel's layers are filtered by, "" for all
-        searching: its field was asked for and has no keyboard yet
-        cards_fit: whether the panel has room for a whole card of each layer
-        active_slider: which of `layers.SLIDERS` of the focused layer the arrow keys move
-        renaming: the layer whose name is being typed, or None
-        help: whether the list of bindings is shown
-        message: the line at the bottom, or None
-        snapshots: kept states, without the original
-        saved: what a session file holds of this; None where there is none
-        dialog: the question being asked, or None
-        requests: what the window has still to do, see `REQUESTS`
-        player: the playhead of `view.timeline`
-        overlap: the layer of which the panel asks to see what it shares with the others, or None
-        pointed: what else the mouse rests on in the panel, to be seen in the picture
-        form: of a new edit, as it was last left
-        form_open: whether it is shown
-        form_opening: it was opened and has no keyboard yet
-        jobs: what is being trained, exported and rendered, or waits for that, as the window last looked
-        before: the original is shown, until its key is tapped again or a slider moves
-        glide: the camera on its way to a view that was asked for, or None
-    """
-
-    view: ViewState
-    past: History
-    home: ViewCamera
-    focus: int | None = None
+    view: ViewState  # what decides the picture
+    past: History  # undo and redo
+    home: ViewCamera  # the first camera
+    focus: int | None = None  # the focused layer, an index into `view.layers`, or None
+    # `LayerState.gdf` of the layers that are selected with it, empty where it is alone
     selected: frozenset[int] = frozenset()
-    search: str = ""
-    searching: bool = False
-    cards_fit: bool = True
-    active_slider: str = "strength"
-    renaming: int | None = None
-    help: bool = False
-    message: Message | None = None
-    snapshots: tuple[SliderSnapshot, ...] = ()
+    search: str = ""  # what the panel's layers are filtered by, "" for all
+    searching: bool = False  # its field was asked for and has no keyboard yet
+    cards_fit: bool = True  # whether the panel has room for a whole card of each layer
+    active_slider: str = "strength"  # which of `layers.SLIDERS` of the focused layer the arrow keys move
+    renaming: int | None = None  # the layer whose name is being typed, or None
+    help: bool = False  # whether the list of bindings is shown
+    message: Message | None = None  # the line at the bottom, or None
+    snapshots: tuple[SliderSnapshot, ...] = ()  # kept states, without the original
+    # what a session file holds of this; None where there is none
     saved: tuple[Edit, tuple[SliderSnapshot, ...]] | None = None
-    dialog: Dialog | None = None
-    requests: tuple[str, ...] = ()
-    player: Player = Player()
+    dialog: Dialog | None = None  # the question being asked, or None
+    requests: tuple[str, ...] = ()  # what the window has still to do, see `REQUESTS`
+    player: Player = Player()  # the playhead of `view.timeline`
+    # the layer of which the panel asks to see what it shares with the others, or None
     overlap: int | None = None
-    pointed: Pointed | None = None
-    form: NewEdit = NewEdit()
-    form_open: bool = False
-    form_opening: bool = False
+    pointed: Pointed | None = None  # what else the mouse rests on in the panel, to be seen in the picture
+    form: NewEdit = NewEdit()  # of a new edit, as it was last left
+    form_open: bool = False  # whether it is shown
+    form_opening: bool = False  # it was opened and has no keyboard yet
+    # what is being trained, exported and rendered, or waits for that, as the window last looked
     jobs: tuple[Job, ...] = ()
-    before: bool = False
-    glide: Glide | None = None
+    before: bool = False  # the original is shown, until its key is tapped again or a slider moves
+    glide: Glide | None = None  # the camera on its way to a view that was asked for, or None
 
 
-def new_workspace(view: ViewState, kept: tuple[SliderSnapshot, ...] = ()) -> Workspace:
+def new_workspace(view: ViewState, snapshots: tuple[SliderSnapshot, ...] = ()) -> Workspace:
     """A workspace on a fresh state; the top layer is focused."""
-    past, focus = history.begin(view, kept), len(view.layers) - 1 if view.layers else None
-    return mark_saved(Workspace(view, past, view.camera, focus, snapshots=kept))
+    past, focus = history.begin(view, snapshots), len(view.layers) - 1 if view.layers else None
+    return mark_saved(Workspace(view, past, view.camera, focus, snapshots=snapshots))
 
 
 def worth_saving(workspace: Workspace) -> tuple[Edit, tuple[SliderSnapshot, ...]]:
@@ -246,8 +199,8 @@ def advance(workspace: Workspace, seconds: float) -> Workspace:
     if not workspace.player.playing:
         return workspace
     view = workspace.view
-    player = playback.advance(workspace.player, view.timeline, seconds)
-    view = timeline.state_at(view.timeline, player.frame, view, playback.LEAST_KEYS)
+    player = timeline.advance(workspace.player, view.timeline, seconds)
+    view = timeline.state_at(view.timeline, player.frame, view, timeline.LEAST_KEYS)
     past = history.follow_camera(workspace.past, workspace.view, view)
     if loses_strengths(workspace, view):
         past = history.record(past, view, workspace.snapshots)
@@ -261,7 +214,7 @@ def loses_strengths(workspace: Workspace, after: ViewState) -> bool:
     before, frame = workspace.view, workspace.player.frame
     if after.layers == before.layers or history.edit_of(before) != workspace.past.present.edit:
         return False
-    return timeline.state_at(before.timeline, frame, before, playback.LEAST_KEYS).layers != before.layers
+    return timeline.state_at(before.timeline, frame, before, timeline.LEAST_KEYS).layers != before.layers
 
 
 def with_camera(workspace: Workspace, camera: ViewCamera) -> Workspace:
@@ -278,8 +231,14 @@ def glide_from(workspace: Workspace, start: ViewCamera) -> Workspace:
 
 def focus_layer(workspace: Workspace, index: int) -> Workspace:
     """With another layer focused, and it alone selected; as it was where there is no such layer."""
-    found = 0 <= index < len(workspace.view.layers)
-    return replace(workspace, focus=index, selected=frozenset()) if found else workspace
+    exists = 0 <= index < len(workspace.view.layers)
+    return replace(workspace, focus=index, selected=frozenset()) if exists else workspace
+
+
+def is_compact(workspace: Workspace) -> bool:
+    """Whether the panel shows layers as rows of one line: where the person says so, or cards do not fit."""
+    view = workspace.view
+    return view.cards == "compact" or (view.cards == "auto" and not workspace.cards_fit)
 
 
 def change_focused(workspace: Workspace, change: Callable[[ViewState, int], ViewState]) -> Workspace:

@@ -14,7 +14,7 @@ from progdf.gaussians import Gaussians
 from progdf.scene.selection import Surface
 from viewer.camera.view_camera import ViewCamera, half_camera, half_scale, to_camera
 from viewer.render.engine import ViewEngine
-from viewer.render.surfaces import MANY, Surfaces, beside
+from viewer.render.picking import MANY, Surfaces, beside
 from viewer.state.selection import NOBODY, unpack
 from viewer.state.view_state import ViewState
 from viewer.state.workspace import SceneFacts
@@ -28,26 +28,16 @@ _SURFACE = ("means", "quats", "log_scales", "logit_opacities", "sh0")
 
 @dataclass(frozen=True)
 class PointerContext:
-    """What lies under the mouse in one frame.
+    """What lies under the mouse in one frame."""
 
-    Args:
-        engine: draws the picture
-        facts: of the open scene
-        shown: what the picture shows: the state, or the original while its key is held
-        area: the part of the window that shows it
-        ui: fonts and scale
-        now: seconds on the main view's clock
-        surfaces: what was looked at ahead
-        half: side by side, the one that the mouse is in, or was in when its drag began: 0 left, 1 right
-    """
-
-    engine: ViewEngine
-    facts: SceneFacts
-    shown: ViewState
-    area: Area
-    ui: UiContext
-    now: float
-    surfaces: Surfaces
+    engine: ViewEngine  # draws the picture
+    facts: SceneFacts  # of the open scene
+    shown: ViewState  # what the picture shows: the state, or the original while its key is held
+    area: Area  # the part of the window that shows it
+    ui: UiContext  # fonts and scale
+    now: float  # seconds on the main view's clock
+    surfaces: Surfaces  # what was looked at ahead
+    # side by side, the one that the mouse is in, or was in when its drag began: 0 left, 1 right
     half: int = 0
 
     @property
@@ -107,9 +97,9 @@ class PointerContext:
 
     @property
     def _surface_key(self) -> object:
-        camera, shown = self.camera(self.shown.camera), self.shown
-        place = camera.viewmat.numpy().tobytes(), camera.K.numpy().tobytes(), camera.width, camera.height
-        return self.engine, shown.layers, shown.blend, shown.selection.hidden, place
+        camera, view = self.camera(self.shown.camera), self.shown
+        key = camera.viewmat.numpy().tobytes(), camera.K.numpy().tobytes(), camera.width, camera.height
+        return self.engine, view.layers, view.blend, view.selection.hidden, key
 
     def _copy_surface(self) -> Surface:
         """Of a scene that stays as it is, whatever strengths are drawn."""

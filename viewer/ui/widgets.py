@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from typing import TypeVar
 
 from imgui_bundle import imgui
 
 from .context import PALETTE, SMALL_PX, Rgba, UiContext, u32
+from .keys import shortcut
+
+T = TypeVar("T")
 
 TYPING_S = 1.0
 """Between two letters of one word, at most, in a list."""
@@ -86,11 +90,14 @@ def accent_button(text: str, size: imgui.ImVec2) -> bool:
     return bool(pressed)
 
 
-def tip(text: str) -> None:
-    """What the last item does, told when the mouse rests on it."""
+def tip(text: str, action: str = "") -> None:
+    """What the last item does, shown when the mouse rests on it; with the shortcut of an action."""
     flags = imgui.HoveredFlags_
-    if imgui.is_item_hovered(flags.for_tooltip.value | flags.allow_when_disabled.value):
-        imgui.set_tooltip(text)
+    # no_nav_override: the tip of a field that merely has the keyboard would cover the next row
+    rests = flags.for_tooltip.value | flags.allow_when_disabled.value | flags.no_nav_override.value
+    if imgui.is_item_hovered(rests):
+        chord = shortcut(action)
+        imgui.set_tooltip(f"{text} ({chord})" if chord else text)
 
 
 def icon_button(name: str, icon: str, ui: UiContext, dim: bool = False) -> bool:
@@ -297,6 +304,53 @@ def choice(
     return pressed
 
 
+def choice_row(
+    title: str,
+    options: Mapping[T, str],
+    current: T,
+    column: float,
+    ui: UiContext,
+    help_: str,
+    action: str = "",
+) -> T:
+    """A named row of joined buttons; the value that was chosen of `options`, which give each its text."""
+    label(title, column)
+    values = [*options]
+    pressed = choice(title, [*options.values()], values.index(current), ui)
+    tip(help_, action)
+    return current if pressed is None else values[pressed]
+
+
+def slider_row(
+    title: str,
+    value: float,
+    ends: tuple[float, float],
+    default: float,
+    column: float,
+    ui: UiContext,
+    help_: str,
+    form: str = "%.2f",
+) -> float:
+    """A named slider, see `value_slider`."""
+    label(title, column)
+    value = value_slider(f"##{title}", value, ends, form, default, ui)
+    tip(help_)
+    return value
+
+
+def swatch(color: tuple[float, float, float], alpha: float, edge: bool, ui: UiContext) -> None:
+    """A small square of a color on the present line; `edge`: with a line around it."""
+    side, tall = 12.0 * ui.scale, imgui.get_frame_height()
+    x, y = imgui.get_cursor_screen_pos()
+    top = y + (tall - side) / 2
+    corners = imgui.ImVec2(x, top), imgui.ImVec2(x + side, top + side)
+    imgui.dummy(imgui.ImVec2(side, tall))
+    canvas = imgui.get_window_draw_list()
+    canvas.add_rect_filled(*corners, u32((*color, alpha)), 3 * ui.scale)
+    if edge:
+        canvas.add_rect(*corners, u32(PALETTE.line), 3 * ui.scale)
+
+
 _BUTTON_COLORS = (imgui.Col_.button, imgui.Col_.button_hovered, imgui.Col_.button_active)
 
 
@@ -309,7 +363,7 @@ def elide(text: str, room: float) -> str:
     """The text, shortened with "…" to fit `room` window pixels in the present font."""
     if imgui.calc_text_size(text).x <= room:
         return text
-    kept = text
-    while kept and imgui.calc_text_size(kept + "…").x > room:
-        kept = kept[:-1]
-    return kept.rstrip() + "…"
+    text_so_far = text
+    while text_so_far and imgui.calc_text_size(text_so_far + "…").x > room:
+        text_so_far = text_so_far[:-1]
+    return text_so_far.rstrip() + "…"

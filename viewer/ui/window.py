@@ -3,30 +3,72 @@
 from __future__ import annotations
 
 import ctypes
+import math
 import signal
 import socket
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from imgui_bundle import imgui  # before glfw: it makes glfw load the library that imgui was built with
-
-# isort: split
 import glfw
 import moderngl
+from imgui_bundle import imgui
 
 from progdf.errors import ProgdfError
-from viewer.camera import controls
-from viewer.camera.inputs import Keys, Press, next_event_id
 
-from .double_clicks import DoubleClicks
+from .keys import FLY_KEYS, HELD_ORIGINAL, Keys, Press, next_event_id
+
+LONGEST_S = 0.3
+"""Between the two presses of a double click, as imgui has it."""
+_ALWAYS_S = 1e6
+
+
+class DoubleClicks:
+    """Tells imgui which presses of the left button follow closely on the one before.
+
+    imgui takes one event of a button a frame and measures in frame time: where a frame takes 100 ms, a quick
+    double click is two clicks to it.
+    """
+
+    def __init__(self) -> None:
+        self._last = -math.inf
+        self._waiting: deque[tuple[int, bool]] = deque()  # presses that no frame has taken in yet
+
+    def note_press(self, time: float, unheard: float, event_id: int) -> None:
+        """The button went down.
+
+        Args:
+            time: when the window heard of it, seconds of any clock
+            unheard: seconds before the window listened in which it drew: the press may be so much older
+            event_id: the place of the press among imgui's input events
+        """
+        self._waiting.append((event_id, time - self._last - unheard <= LONGEST_S))
+        self._last = time
+
+    def apply(self) -> None:
+        """Call before `imgui.new_frame`: the press that it takes in counts as noted."""
+        queue = imgui.get_current_context().input_events_queue
+        while self._waiting and (queue.empty() or queue[0].event_id > self._waiting[0][0]):
+            self._waiting.popleft()
+        limit = LONGEST_S
+        if self._waiting:
+            limit = _ALWAYS_S if self._waiting[0][1] else 0.0
+        io = imgui.get_io()
+        io.mouse_double_click_time, io.mouse_single_click_delay = limit, 2.0 * _ALWAYS_S
+
+
+# before glfw: it makes glfw load the library that imgui was built with
+
+# isort: split
+
 
 LEAST = (640, 400)
-_FLY_KEYS = {name: getattr(glfw, f"KEY_{name}") for name in controls.FLY_KEYS}
+_FLY_KEYS = {name: getattr(glfw, f"KEY_{name}") for name in FLY_KEYS}
 KEY_NAMES = {
     **{getattr(glfw, f"KEY_{c}"): c for c in "ABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789"},
     **{getattr(glfw, f"KEY_F{i}"): f"F{i}" for i in range(1, 13)},
@@ -34,7 +76,7 @@ KEY_NAMES = {
         getattr(glfw, f"KEY_{name.upper()}"): name
         for name in ("Left", "Right", "Up", "Down", "Escape", "Tab", "Enter", "Backspace", "Space", "Delete")
     },
-    glfw.KEY_BACKSLASH: controls.HELD_ORIGINAL,
+    glfw.KEY_BACKSLASH: HELD_ORIGINAL,
     glfw.KEY_LEFT_BRACKET: "[",
     glfw.KEY_RIGHT_BRACKET: "]",
     glfw.KEY_COMMA: ",",
@@ -238,9 +280,9 @@ def interruptible() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    heard, told = socket.socketpair()
-    told.setblocking(False)
-    before = signal.set_wakeup_fd(told.fileno(), warn_on_full_buffer=False)
+    heard, sender = socket.socketpair()
+    sender.setblocking(False)
+    before = signal.set_wakeup_fd(sender.fileno(), warn_on_full_buffer=False)
 
     def listen() -> None:
         while heard.recv(1):
@@ -252,22 +294,22 @@ def interruptible() -> Iterator[None]:
         yield
     finally:
         signal.set_wakeup_fd(before)
-        told.close()
+        sender.close()
         listener.join()
         heard.close()
 
 
 def key_name(key: int, scancode: int) -> str:
     """The name of a glfw key in `controls`: letters as the layout has them, others by their place."""
-    place = KEY_NAMES.get(key, "")
-    if len(place) == 1 and place.isalpha():
+    name = KEY_NAMES.get(key, "")
+    if len(name) == 1 and name.isalpha():
         label = glfw.get_key_name(key, scancode) or ""
-        return label.upper() if label.isascii() and label.isalpha() else place
-    return place
+        return label.upper() if label.isascii() and label.isalpha() else name
+    return name
 
 
 def chord(name: str, mods: int) -> str:
-    """A key with its modifiers, as in `controls.KEYS`; on a Mac, Command does what Ctrl does elsewhere."""
+    """A key with its modifiers, as in `keys.KEYS`; on a Mac, Command does what Ctrl does elsewhere."""
     ctrl = glfw.MOD_CONTROL | (glfw.MOD_SUPER if sys.platform == "darwin" else 0)
     held = (("Ctrl+", ctrl), ("Shift+", glfw.MOD_SHIFT), ("Alt+", glfw.MOD_ALT))
     return "".join(prefix for prefix, bit in held if mods & bit) + name

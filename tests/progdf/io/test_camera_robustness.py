@@ -18,12 +18,20 @@ from tests.helpers.demo_scenes import bear, room
 from tests.helpers.stacks import bear_stack
 from tests.helpers.ui_rig import first_view, rig
 from viewer.camera import controls
-from viewer.camera import view_camera as turntable
-from viewer.camera.up_axis import Vec3
-from viewer.camera.view_camera import Bounds, ViewCamera, axes, bounds_of, first_camera, to_camera
+from viewer.camera.view_camera import (
+    FILL,
+    Bounds,
+    Vec3,
+    ViewCamera,
+    axes,
+    bounds_of,
+    first_camera,
+    frame,
+    to_camera,
+)
 from viewer.files.document import Document
 from viewer.render.engine import ViewEngine
-from viewer.render.renderers import Image
+from viewer.render.gl_renderer import Image
 from viewer.state import workspace
 from viewer.state.actions import perform
 from viewer.state.view_state import ViewState
@@ -141,7 +149,7 @@ def test_a_window_of_any_shape_shows_the_whole_scene_when_framed(
     ctx: moderngl.Context, draw: str, size: tuple[int, int]
 ) -> None:
     scene = the_bear()
-    camera = turntable.frame(first_camera(scene), bounds_of(scene), size[0] / size[1])
+    camera = frame(first_camera(scene), bounds_of(scene), size[0] / size[1])
     image = pictured(ctx, scene, draw, camera, size)
     assert image.shape == (size[1], size[0], 3)
     assert np.isfinite(image).all()
@@ -166,7 +174,7 @@ def is_filled(camera: ViewCamera, shown: Gaussians, aspect: float) -> bool:
     """Whether they fill the tighter side of the picture and stand in its middle."""
     left, right, up, down = filled(camera, shown, aspect)
     widest = max(left, right, up, down)  # of centers: Gaussians as large as the ears' here add a third
-    return abs(left - right) < 0.07 and abs(up - down) < 0.07 and 0.45 < widest < turntable.FILL
+    return abs(left - right) < 0.07 and abs(up - down) < 0.07 and 0.45 < widest < FILL
 
 
 @pytest.mark.parametrize("aspect", [0.25, 0.5, 1.0, 4.0])
@@ -200,7 +208,7 @@ def test_f_shows_all_of_a_room_from_outside_and_of_nothing_the_origin() -> None:
     outside = perform(inside, "frame", Document("x", scene).facts()).view.camera
     assert filled(outside, scene, 1.0).max() < 1.0
     nothing = perform(inside, "frame", Document("x", scene[:0]).facts()).view.camera
-    assert nothing == turntable.frame(inside.view.camera, Bounds())
+    assert nothing == frame(inside.view.camera, Bounds())
 
 
 @pytest.mark.parametrize("points", [(400, 900), (1600, 400)])

@@ -20,8 +20,7 @@ from progdf.scene.up_axis import AXES, axis_direction, guess_up
 from tests.helpers.demo_scenes import bear, room
 from tests.helpers.paths import SHARED_DATA
 from tests.helpers.scenes import high_chair, random_gaussians, turned
-from viewer.camera.up_axis import Vec3
-from viewer.camera.view_camera import FILL, first_camera, fit, to_camera
+from viewer.camera.view_camera import FILL, Vec3, first_camera, fit, to_camera
 
 DATA = SHARED_DATA
 UP = torch.tensor([0.0, 1.0, 0.0])

@@ -13,7 +13,7 @@ from tests.helpers.null_app import null_app
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from viewer.app import app as application
 from viewer.files.document import Document
-from viewer.ui.double_clicks import DoubleClicks
+from viewer.ui.window import DoubleClicks
 
 pytestmark = pytest.mark.gl
 

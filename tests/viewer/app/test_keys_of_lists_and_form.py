@@ -10,12 +10,11 @@ import pytest
 from imgui_bundle import imgui
 
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
-from viewer.camera import controls, inputs
-from viewer.camera.inputs import Keys, Press
 from viewer.jobs.job_queue import DeliverOptions
 from viewer.jobs.training import EDITORS
 from viewer.state.selection import NamedRegion
 from viewer.state.workspace import Dialog
+from viewer.ui.keys import KEYS, Keys, Press, next_event_id
 
 pytestmark = pytest.mark.gl
 
@@ -39,7 +38,7 @@ def strike(hand: Rig, chord: str) -> None:
     for down in (True, False):
         for modifier in held:
             hand.io.add_key_event(MODIFIERS[modifier], down)
-        press = Press(chord, event_id=inputs.next_event_id())
+        press = Press(chord, event_id=next_event_id())
         if name in TOKENS:
             hand.io.add_key_event(TOKENS[name], down)
         hand.main_view.wake()
@@ -164,7 +163,7 @@ def test_no_shortcut_acts_while_something_is_open(hand: Rig, what: str) -> None:
         hand.main_view.ask(Dialog("about", "1.0"))
         hand.frame(2)
     left_alone = ("Escape", "Enter", "Tab", "Shift+Tab", "Up", "Down", "Left", "Right", "Space", "Shift+F2")
-    for key in controls.KEYS:
+    for key in KEYS:
         if key.chord in left_alone or key.chord.endswith(("Up", "Down", "Left", "Right")):
             continue
         before = hand.main_view.work
@@ -232,3 +231,13 @@ def question(hand: Rig) -> DeliverOptions:
     assert hand.main_view.work.dialog is not None
     assert hand.main_view.work.dialog.options is not None
     return hand.main_view.work.dialog.options
+
+
+def test_a_field_that_merely_has_the_keyboard_covers_no_other_row_with_its_tip(hand: Rig) -> None:
+    hand.move(300.0, 300.0)
+    strike(hand, "Ctrl+N")
+    for _ in range(4):
+        strike(hand, "Tab")
+        hand.rest()
+        tooltip = imgui.internal.find_window_by_name("##Tooltip_00")
+        assert tooltip is None or not tooltip.active

@@ -10,10 +10,10 @@ import pytest
 from imgui_bundle import imgui
 
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
-from viewer.camera.inputs import Keys, Press
 from viewer.camera.view_camera import axes, eye, fit_subject
 from viewer.state.view_state import LayerState
 from viewer.ui.context import PALETTE
+from viewer.ui.keys import Keys, Press
 
 pytestmark = pytest.mark.gl
 VIEW = (170.0, 270.0)  # the middle of the picture

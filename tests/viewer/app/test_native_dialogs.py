@@ -13,10 +13,10 @@ import pytest
 
 from tests.helpers.null_app import null_app, press
 from tests.helpers.ui_rig import bear, first_view, rig
+from viewer.app import dialogs
 from viewer.app.app import App
 from viewer.files import document, session
 from viewer.state.workspace import Dialog
-from viewer.ui import native_dialogs as native
 
 pytestmark = [
     pytest.mark.gl,
@@ -110,7 +110,7 @@ def test_the_window_goes_on_while_it_is_open_and_takes_it_away_when_it_answers_i
     frames = desktop.app.main_view.frames
     pid = desktop.folder / "pid"
     while not (pid.is_file() and pid.read_text().strip()):
-        assert desktop.app.file_actions.poll_dialog() == native.POLL_S
+        assert desktop.app.file_actions.poll_dialog() == dialogs.POLL_S
         time.sleep(0.01)
     assert question(desktop).choosing
     press(desktop.app, "Ctrl+B")
@@ -150,9 +150,9 @@ def test_without_such_a_program_one_line_says_so_and_the_path_field_stays(
 ) -> None:
     monkeypatch.setenv("PATH", str(desktop.folder / "nothing"))
     press(desktop.app, "Ctrl+S", "Ctrl+B")
-    assert question(desktop).notice == native.obstacle()
-    assert "; type the path" in native.obstacle()
-    assert "\n" not in native.obstacle()
+    assert question(desktop).notice == dialogs.obstacle()
+    assert "; type the path" in dialogs.obstacle()
+    assert "\n" not in dialogs.obstacle()
     assert not question(desktop).choosing
     assert desktop.app.file_actions.poll_dialog() is None
     path = Path(question(desktop).text)

@@ -15,13 +15,13 @@ from tests.helpers.null_app import null_app, press
 from tests.helpers.sessions import bear_files, opened_document
 from tests.helpers.ui_rig import bear, first_view
 from viewer.app import app as application
-from viewer.app import bindings, interface, mouse
+from viewer.app import interface, mouse
 from viewer.app.application import LOG
 from viewer.files import session
-from viewer.panel import layer_card, layer_cards, selection_section, snapshot_cards, timeline_bar
+from viewer.panel import card, cards, snapshot_cards, timeline_bar, tools
 from viewer.state import actions, selection
 from viewer.state.workspace import REQUESTS, Message
-from viewer.ui import axis_gizmo
+from viewer.ui import overlay
 
 pytestmark = pytest.mark.gl
 
@@ -35,14 +35,14 @@ ACTIONS = (
     "next_slider",
 )
 DRAWN = {
-    "a card": (layer_cards, "draw_card"),
-    "the head of a card": (layer_card, "_number"),
-    "the tools": (selection_section, "_lit_button"),
+    "a card": (cards, "draw_card"),
+    "the head of a card": (card, "_number"),
+    "the tools": (tools, "_lit_button"),
     "the snapshots": (snapshot_cards, "draw"),
     "the timeline": (timeline_bar, "draw"),
     "the mouse": (mouse, "_drag"),
-    "the axes": (axis_gizmo, "draw"),
-    "the keys": (bindings, "_column"),
+    "the axes": (overlay, "draw_axes"),
+    "the keys": (interface, "_column"),
 }
 """Parts of a frame, each by what is replaced with something that raises."""
 

@@ -17,12 +17,12 @@ from progdf.scene.up_axis import find_up
 from tests.helpers.null_app import null_app, press
 from tests.helpers.scenes import random_gaussians
 from tests.helpers.ui_rig import bear, first_view, rig
-from viewer.camera.inputs import Keys, Press
 from viewer.camera.view_camera import axes, first_camera, with_up
 from viewer.files.document import load
 from viewer.state import history, selection
 from viewer.state.view_state import ViewState
-from viewer.ui import axis_gizmo
+from viewer.ui import overlay
+from viewer.ui.keys import Keys, Press
 
 pytestmark = pytest.mark.gl
 CENTER = 340.0 - 56.5  # of the axes, from the left; and 56.5 from above
@@ -33,13 +33,13 @@ def test_axes_are_clicked_and_dragged_and_leave_with_the_panel() -> None:
         work = lambda: hand.main_view.work  # noqa: E731
         start = work().view.camera
         picture = axes(start)
-        x = CENTER + axis_gizmo.LENGTH_PX * picture.right[0]
-        y = 56.5 - axis_gizmo.LENGTH_PX * picture.up[0]
+        x = CENTER + overlay.LENGTH_PX * picture.right[0]
+        y = 56.5 - overlay.LENGTH_PX * picture.up[0]
         hand.click(x, y)
         assert axes(work().view.camera).back == pytest.approx((1.0, 0.0, 0.0), abs=1e-9)
         assert (work().view.camera.pivot, work().view.camera.distance) == (start.pivot, start.distance)
         assert work().glide is None
-        hand.click(CENTER, 56.5 - axis_gizmo.LENGTH_PX)
+        hand.click(CENTER, 56.5 - overlay.LENGTH_PX)
         assert (work().view.camera.azimuth, work().view.camera.elevation) == (0.0, 90.0)
         hand.drag((CENTER - 20.0, 70.0), (CENTER + 10.0, 40.0))
         assert work().view.camera.elevation < 90.0
@@ -49,7 +49,7 @@ def test_axes_are_clicked_and_dragged_and_leave_with_the_panel() -> None:
         assert work().view.layers[0].paint == "", "the brush does not paint through them"
         hand.key("F12")
         turned = work().view.camera
-        hand.click(640.0 - 56.5, 56.5 - axis_gizmo.LENGTH_PX)
+        hand.click(640.0 - 56.5, 56.5 - overlay.LENGTH_PX)
         assert work().view.camera == turned
 
 

@@ -8,9 +8,8 @@ import pytest
 from imgui_bundle import imgui
 
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
-from viewer.camera import inputs
-from viewer.camera.inputs import Keys, Press
-from viewer.ui import frame_pacer as pace
+from viewer.app import main_view as pace
+from viewer.ui.keys import Keys, Press, next_event_id
 
 pytestmark = pytest.mark.gl
 
@@ -64,7 +63,7 @@ def type_fast(hand: Rig, text: str, *keys: tuple[imgui.Key, str]) -> None:
         hand.io.add_key_event(getattr(imgui.Key, f"_{letter}", imgui.Key.period), False)
     pressed = []
     for key, chord in keys:
-        pressed.append(Press(chord, event_id=inputs.next_event_id()))
+        pressed.append(Press(chord, event_id=next_event_id()))
         hand.io.add_key_event(key, True)
         hand.io.add_key_event(key, False)
     hand.main_view.wake()

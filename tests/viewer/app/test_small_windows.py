@@ -9,8 +9,7 @@ import pytest
 from imgui_bundle import imgui
 
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
-from viewer.camera import view_camera as turntable
-from viewer.camera.view_camera import ViewCamera
+from viewer.camera.view_camera import ViewCamera, first_camera, fit_subject, with_up
 from viewer.files import user_files
 from viewer.files.document import Document
 from viewer.panel import panel, timeline_bar
@@ -72,7 +71,7 @@ def test_home_is_upright_and_framed_under_another_up_axis() -> None:
         hand.key("Shift+F")
         home = hand.main_view.work.view.camera
         assert home.up == (0.0, 0.0, 1.0)
-        fitted = turntable.fit_subject(home, bear().scene, 400 / 640)
+        fitted = fit_subject(home, bear().scene, 400 / 640)
         assert home.distance == pytest.approx(fitted.distance, rel=1e-4), (
             "as one would frame it under this axis"
         )
@@ -83,11 +82,11 @@ def test_home_is_upright_and_framed_under_another_up_axis() -> None:
 
 
 def turned_by_hand(hand: Rig, up: tuple[float, float, float]) -> None:
-    camera = turntable.with_up(hand.main_view.work.view.camera, up)
+    camera = with_up(hand.main_view.work.view.camera, up)
     hand.main_view.work = workspace.with_camera(hand.main_view.work, replace(camera, azimuth=70.0))
 
 
 def test_the_first_look_under_an_axis_is_the_first_camera_that_has_it() -> None:
     scene = bear().scene
-    first = turntable.first_camera(scene)
+    first = first_camera(scene)
     assert Document("bear.ply", scene).facts().home(ViewCamera(up=first.up), 1.5) == first

@@ -17,7 +17,7 @@ from viewer.jobs.child import Progress
 from viewer.jobs.job_queue import DeliverOptions, Delivery, Job
 from viewer.jobs.training import TYPED, EditOrder, NewEdit
 from viewer.render.engine import ViewEngine
-from viewer.render.headless import headless_context
+from viewer.render.gl_renderer import headless_context
 from viewer.state.view_state import ViewState
 from viewer.state.workspace import Dialog
 

@@ -13,13 +13,13 @@ from imgui_bundle import imgui
 from tests.helpers.stacks import many_edits
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from viewer.app.studio.pages import UpChoice, UpStrip
-from viewer.camera.inputs import Keys
 from viewer.panel import panel
-from viewer.render.timings import FrameTimings
+from viewer.render.dynamic_resolution import FrameTimings
 from viewer.state import selection
 from viewer.state.selection import SelectionState
 from viewer.state.view_state import Brush, LayerGroup, LayerState, ViewState
 from viewer.state.workspace import Dialog
+from viewer.ui.keys import Keys
 
 Compare = Callable[[str, np.ndarray], None]
 

@@ -14,14 +14,27 @@ from progdf.camera import Camera, intrinsics, look_at
 from tests.helpers.demo_scenes import bear
 from tests.helpers.scenes import random_gaussians
 from viewer.camera import controls
-from viewer.camera import view_camera as turntable
-from viewer.camera.up_axis import Vec3
-from viewer.camera.view_camera import Bounds, ViewCamera, axes, cross, dot, eye, to_camera
+from viewer.camera.view_camera import (
+    Bounds,
+    Vec3,
+    ViewCamera,
+    add_scaled,
+    axes,
+    cross,
+    dot,
+    eye,
+    first_camera,
+    frame,
+    to_camera,
+    unit,
+    with_up,
+)
 from viewer.state import workspace
 from viewer.state.actions import perform
-from viewer.state.layer_facts import LayerRow
+from viewer.state.facts import LayerRow
 from viewer.state.view_state import LayerState, ViewState
 from viewer.state.workspace import SceneFacts
+from viewer.ui.keys import FLY_KEYS, KEYS, drag_for
 
 AXES: tuple[Vec3, ...] = ((0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1), (1, 0, 0), (-1, 0, 0))
 RADII = st.sampled_from([1e-3, 0.1, 1.0, 30.0, 1e4])
@@ -34,7 +47,7 @@ def cameras(draw: st.DrawFn, radius: float | None = None) -> ViewCamera:
     """Any camera that the interface can bring about, and slanted up axes from photographs."""
     size = draw(RADII) if radius is None else radius
     slanted = st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda v: math.hypot(*v) > 0.1)
-    up = turntable.unit(draw(st.one_of(st.sampled_from(AXES), slanted)), (0.0, 1.0, 0.0))
+    up = unit(draw(st.one_of(st.sampled_from(AXES), slanted)), (0.0, 1.0, 0.0))
     return ViewCamera(
         pivot=draw(st.tuples(*[st.floats(-3, 3).map(lambda c: c * size)] * 3)),
         distance=size * draw(st.floats(1e-3, 1e2)),
@@ -127,7 +140,7 @@ def test_looking_around_keeps_the_eye_in_its_place(camera: ViewCamera, dx: float
 
 def test_dragging_right_brings_what_was_at_the_left_to_the_middle() -> None:
     camera = ViewCamera(elevation=0.0)
-    left = turntable.add_scaled(camera.pivot, (-1.0, axes(camera).right), (1.0, axes(camera).back))
+    left = add_scaled(camera.pivot, (-1.0, axes(camera).right), (1.0, axes(camera).back))
     before = to_camera(camera, 400, 400).viewmat @ torch.tensor([*left, 1.0])
     after = to_camera(controls.orbit(camera, 60, 0), 400, 400).viewmat @ torch.tensor([*left, 1.0])
     assert before[0] < after[0]
@@ -146,7 +159,7 @@ def test_panning_keeps_the_pivot_under_the_cursor(camera: ViewCamera, dx: float,
 
 @given(cameras(), st.sampled_from(AXES))
 def test_another_up_axis_leaves_the_eye_and_the_pivot(camera: ViewCamera, up: Vec3) -> None:
-    turned = turntable.with_up(camera, up)
+    turned = with_up(camera, up)
     assert turned.up == pytest.approx(up)
     assert turned.pivot == camera.pivot
     assert math.dist(eye(turned), eye(camera)) <= 1e-6 * size_of(camera)
@@ -173,7 +186,7 @@ def test_a_double_click_on_the_eye_itself_still_leaves_a_camera() -> None:
 def test_framing_shows_the_whole_sphere_in_any_window(
     camera: ViewCamera, radius: float, aspect: float
 ) -> None:
-    framed = turntable.frame(camera, Bounds((1.0, 2.0, 3.0), radius), aspect)
+    framed = frame(camera, Bounds((1.0, 2.0, 3.0), radius), aspect)
     half = math.tan(math.radians(camera.fov_y) / 2) * min(1.0, aspect)
     assert radius / framed.distance < math.sin(math.atan(half))
     assert axes(framed) == axes(camera)
@@ -198,7 +211,7 @@ def test_flying_ahead_moves_the_eye_along_the_view_at_the_scenes_pace() -> None:
     camera = ViewCamera(distance=2.0)
     for radius in (1e-3, 1e4):
         flown = controls.fly(camera, 0, 0, 1, seconds=0.05, radius=radius)
-        step = turntable.add_scaled(eye(flown), (-1.0, eye(camera)))
+        step = add_scaled(eye(flown), (-1.0, eye(camera)))
         assert dot(step, axes(camera).back) == pytest.approx(-0.05 * 0.6 * radius, rel=1e-6)
 
 
@@ -208,19 +221,19 @@ def test_a_stalled_frame_does_not_throw_the_flight_far_away() -> None:
 
 
 def test_a_drag_means_what_the_table_says() -> None:
-    assert controls.drag_for("left", "", "orbit") == "orbit"
-    assert controls.drag_for("middle", "Shift", "orbit") == "pan"
-    assert controls.drag_for("middle", "Ctrl", "fly") == "dolly"
-    assert controls.drag_for("right", "", "orbit") == "pan"
-    assert controls.drag_for("right", "", "fly") == "look"
-    assert controls.drag_for("left", "Alt", "fly") == "orbit"
-    assert controls.drag_for("right", "Alt", "orbit") is None
+    assert drag_for("left", "", "orbit") == "orbit"
+    assert drag_for("middle", "Shift", "orbit") == "pan"
+    assert drag_for("middle", "Ctrl", "fly") == "dolly"
+    assert drag_for("right", "", "orbit") == "pan"
+    assert drag_for("right", "", "fly") == "look"
+    assert drag_for("left", "Alt", "fly") == "orbit"
+    assert drag_for("right", "Alt", "orbit") is None
 
 
 def test_no_key_is_bound_twice_and_only_what_is_tapped_is_also_a_flight_key() -> None:
-    chords = [key.chord for key in controls.KEYS]
+    chords = [key.chord for key in KEYS]
     assert len(chords) == len(set(chords))
-    assert not {key.chord for key in controls.KEYS if not key.tap} & set(controls.FLY_KEYS)
+    assert not {key.chord for key in KEYS if not key.tap} & set(FLY_KEYS)
 
 
 def test_every_bound_key_has_its_action_with_layers_and_without() -> None:
@@ -228,7 +241,7 @@ def test_every_bound_key_has_its_action_with_layers_and_without() -> None:
     facts = SceneFacts("bear.ply", 3, Bounds(), (row,))
     for layers in ((), (LayerState(0, "scarf", 0.5),)):
         work = workspace.new_workspace(ViewState(layers=layers))
-        for key in controls.KEYS:
+        for key in KEYS:
             after = perform(work, key.action, facts)
             assert usable(after.view.camera)
             assert all(0.0 <= layer.strength <= 1.0 for layer in after.view.layers)
@@ -237,7 +250,7 @@ def test_every_bound_key_has_its_action_with_layers_and_without() -> None:
 def test_the_first_view_shows_the_whole_bear_upright_with_cameras_and_without() -> None:
     demo = bear(1500)
     for cameras in (demo.cameras, ()):
-        camera = turntable.first_camera(demo.gaussians, cameras, aspect=1.0)
+        camera = first_camera(demo.gaussians, cameras, aspect=1.0)
         assert camera.up == (0.0, 1.0, 0.0), "the axis itself, not what photographs scatter around it"
         built = to_camera(camera, 400, 400)
         figure = demo.gaussians.means[demo.members("body", "head", "ears", "arms", "legs")]
@@ -252,11 +265,11 @@ def test_a_slanted_up_axis_is_kept() -> None:
     tilt = torch.tensor([math.sin(0.2), -math.cos(0.2), 0.0])
     level = look_at(torch.tensor([0.0, 0.0, -4.0]), torch.zeros(3), tilt)
     camera = Camera(level, intrinsics(0.9, 40, 24), 40, 24)
-    assert turntable.first_camera(scene, [camera]).up == pytest.approx(tilt.tolist(), abs=1e-5)
+    assert first_camera(scene, [camera]).up == pytest.approx(tilt.tolist(), abs=1e-5)
 
 
 def test_nothing_at_all_can_still_be_looked_at() -> None:
-    assert usable(turntable.first_camera(random_gaussians(0)))
+    assert usable(first_camera(random_gaussians(0)))
 
 
 def test_toggling_fly_does_not_move_the_picture() -> None:

@@ -220,7 +220,7 @@ def holds(page: np.ndarray, picture: np.ndarray) -> bool:
 
 @pytest.mark.parametrize("count", [1, 2, 7, 30])
 def test_a_contact_sheet_never_shows_a_frame_twice(count: int) -> None:
-    from viewer.pictures.timeline_film import sheet_frames
+    from viewer.pictures.film import sheet_frames
 
     found = sheet_frames(Timeline(length=12, ping_pong=True), count)
     assert len(found) == min(count, 13)

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import pytest
 from imgui_bundle import imgui
 
-from viewer.camera import view_camera as turntable
-from viewer.camera.view_camera import Bounds, ViewCamera
+from viewer.camera.view_camera import Bounds, ViewCamera, axes
 from viewer.panel import panel
-from viewer.panel.strength_slider import parse_strength
+from viewer.panel.slider import parse_strength
 from viewer.state import history, workspace
 from viewer.state.actions import perform
-from viewer.state.layer_facts import LayerRow
+from viewer.state.facts import LayerRow
 from viewer.state.view_state import LayerState, ViewState
 from viewer.state.workspace import SceneFacts, Workspace
 from viewer.ui import widgets
@@ -40,14 +39,8 @@ class Hand:
 
     def frame(self) -> None:
         imgui.new_frame()
-        past = self.work.past
-        shown = panel.PanelInput(
-            FACTS.title, FACTS.count, FACTS.rows, self.work.focus, len(past.past), len(past.future)
-        )
-        result = panel.draw(self.work.view, shown, self.ui)
+        self.work = panel.draw(self.work, FACTS, (), ("", False), (), False, self.ui, self.actions)
         imgui.render()
-        self.work = replace(self.work, view=result.state, focus=result.focus)
-        self.actions += result.actions
         if not imgui.is_any_item_active():
             self.work = workspace.record_undo(self.work)
 
@@ -276,9 +269,9 @@ def test_an_up_axis_button_rolls_the_camera_upright() -> None:
 
 def test_what_is_up_in_the_picture_can_become_the_up_axis() -> None:
     hand = hand_on(ViewState())
-    before = turntable.axes(hand.work.view.camera)
+    before = axes(hand.work.view.camera)
     hand.click(SIZE[0] - 30, 247)
-    after = turntable.axes(hand.work.view.camera)
+    after = axes(hand.work.view.camera)
     assert hand.work.view.camera.elevation == pytest.approx(0.0)
     for old, new in ((before.up, after.up), (before.right, after.right)):
         assert new == pytest.approx(old), "the picture does not turn"

@@ -18,7 +18,7 @@ from progdf.metrics.image import psnr
 from tests.helpers.divided import BANNER, SIZE, beside_line
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from viewer.camera.view_camera import half_camera, to_camera
-from viewer.state import comparison as compare
+from viewer.state.actions import toggle_mode
 from viewer.state.view_state import Comparison, ViewState
 from viewer.state.workspace import Dialog
 
@@ -121,7 +121,7 @@ def test_equal_pictures_have_no_difference() -> None:
 
 @pytest.mark.gl
 def test_backslash_shows_the_whole_original_over_any_comparison(hand: Rig) -> None:
-    from viewer.camera.inputs import Keys
+    from viewer.ui.keys import Keys
 
     original = whole(0.0, 0.0)
     for chord in ("Shift+Y", "D"):
@@ -187,7 +187,7 @@ def test_y_shows_two_pictures_that_turn_together_and_can_be_picked_in(hand: Rig,
 
 @pytest.mark.gl
 def test_a_tap_of_backslash_stays_with_the_original_until_the_next_or_a_slider_moves(hand: Rig) -> None:
-    from viewer.camera.inputs import Keys, Press
+    from viewer.ui.keys import Keys, Press
 
     edited = hand.picture()
     hand.key("\\")
@@ -206,7 +206,7 @@ def test_a_tap_of_backslash_stays_with_the_original_until_the_next_or_a_slider_m
 
 @pytest.mark.gl
 def test_d_flies_where_it_is_held_and_is_the_difference_where_it_is_tapped(hand: Rig) -> None:
-    from viewer.camera.inputs import Keys, Press
+    from viewer.ui.keys import Keys, Press
 
     camera = hand.main_view.work.view.camera
     down = Keys(held=frozenset("D"), fly=frozenset("D"))
@@ -234,10 +234,10 @@ def test_d_flies_where_it_is_held_and_is_the_difference_where_it_is_tapped(hand:
 
 def test_each_mode_goes_on_and_off_and_takes_over_from_the_other() -> None:
     view = ViewState()
-    split = compare.toggle_mode(view, "split")
+    split = toggle_mode(view, "split")
     assert split.compare.mode == "split"
-    assert compare.toggle_mode(split, "split") == view
-    assert compare.toggle_mode(split, "difference").compare.mode == "difference"
+    assert toggle_mode(split, "split") == view
+    assert toggle_mode(split, "difference").compare.mode == "difference"
 
 
 @pytest.fixture

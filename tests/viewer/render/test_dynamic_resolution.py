@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
-from viewer.camera.inputs import Keys, Press
 from viewer.render import dynamic_resolution
-from viewer.render.dynamic_resolution import COARSE, REST_S, SLOW_MS, DynamicResolution
+from viewer.render.dynamic_resolution import COARSE, REST_S, SLOW_MS, DynamicResolution, FrameTimings
 from viewer.render.engine import ViewEngine
-from viewer.render.timings import FrameTimings
+from viewer.ui.keys import Keys, Press
 
 SLOW = FrameTimings(draw_ms=SLOW_MS + 1.0)
 QUICK = FrameTimings(draw_ms=SLOW_MS - 1.0)

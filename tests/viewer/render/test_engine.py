@@ -20,9 +20,9 @@ from tests.helpers.stacks import EARS, SCARF, Stack, view_of
 from viewer.camera.view_camera import to_camera
 from viewer.gl.present import read_rgb
 from viewer.render import engine as engine_module
+from viewer.render.dynamic_resolution import FrameTimings
 from viewer.render.engine import ViewEngine
-from viewer.render.headless import is_software
-from viewer.render.timings import FrameTimings
+from viewer.render.gl_renderer import is_software
 from viewer.state.view_state import LayerState, ViewState
 
 SIZE = (96, 72)

@@ -21,10 +21,9 @@ from progdf.rasterize.engines import depth_of, paint_depth, render_depth
 from progdf.scene.orbit_rig import orbit_rig
 from tests.helpers.demo_scenes import bear
 from tests.helpers.scenes import front_camera, hard_cases, one_gaussian, orbit_camera, random_gaussians
-from viewer.gl.layout import SPLATS_PER_ROW
-from viewer.gl.scene_textures import row_runs
+from viewer.gl.scene_textures import SPLATS_PER_ROW, row_runs
 from viewer.gl.splats import SplatRenderer
-from viewer.render.depth_sort import back_to_front
+from viewer.render.gl_renderer import back_to_front
 
 pytestmark = pytest.mark.gl
 WHITE = (1.0, 1.0, 1.0)

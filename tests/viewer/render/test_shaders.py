@@ -12,14 +12,8 @@ import pytest
 from progdf.gaussians import ATTRIBUTES
 from progdf.rasterize import engines
 from viewer.gl import programs
-from viewer.gl.layout import (
-    GRID_LINE,
-    ORDER,
-    PLACES,
-    PROJECTED,
-    SPLAT_TEXTURES,
-)
 from viewer.gl.programs import ShaderError, load_program, load_source
+from viewer.gl.scene_textures import GRID_LINE, ORDER, PLACES, PROJECTED, SPLAT_TEXTURES
 from viewer.gl.splats import vertex_format
 from viewer.render.ground_grid import CLEAR
 

@@ -11,7 +11,7 @@ from progdf.errors import ProgdfError
 from viewer.camera.view_camera import Bounds
 from viewer.state import layer_selection, layers, workspace
 from viewer.state.actions import perform
-from viewer.state.layer_facts import LayerRow
+from viewer.state.facts import LayerRow
 from viewer.state.view_state import LayerGroup, LayerState, ViewState
 from viewer.state.workspace import SceneFacts, Workspace
 

@@ -21,12 +21,29 @@ from tests.helpers.stacks import Stack, bear_stack
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from viewer.camera.view_camera import eye, to_camera
 from viewer.commands.options import StackOptions, stack_layers
-from viewer.panel import layer_details as layer_fold
 from viewer.panel import panel
-from viewer.panel.strength_slider import parse_strength
-from viewer.state import layer_facts, timeline
-from viewer.state import layers as stack
-from viewer.state.layer_facts import layer_rows
+from viewer.panel.card import value_at
+from viewer.panel.slider import parse_strength
+from viewer.state import facts, timeline
+from viewer.state.facts import layer_rows
+from viewer.state.layers import (
+    LONGEST_NAME,
+    SLIDERS,
+    add_layer,
+    change_layer,
+    largest_strength,
+    move_layers,
+    nudge_slider,
+    rename_layer,
+    replace_edit,
+    show_all,
+    slider_value,
+    step_layers,
+    toggle_solo,
+    visible_layers,
+    with_overshoot,
+    with_slider_value,
+)
 from viewer.state.view_state import OVERSHOOT, LayerState, ViewState
 from viewer.state.workspace import original
 
@@ -89,48 +106,45 @@ def test_the_number_shows_what_the_slider_says_in_the_same_frame(hand: Rig) -> N
 
 
 def test_what_is_alone_shows_though_its_eye_is_closed_and_nothing_else_does() -> None:
-    view = stack.toggle_solo(THREE, 1)
-    view = stack.change_layer(view, 1, lambda layer: LayerState(1, "b", 0.5, enabled=False, solo=True))
-    assert [layer.name for layer in stack.visible_layers(view)] == ["b"]
-    assert [layer.name for layer in stack.visible_layers(stack.toggle_solo(view, 2))] == ["b", "c"]
-    assert stack.visible_layers(stack.show_all(view)) == THREE.layers
+    view = toggle_solo(THREE, 1)
+    view = change_layer(view, 1, lambda layer: LayerState(1, "b", 0.5, enabled=False, solo=True))
+    assert [layer.name for layer in visible_layers(view)] == ["b"]
+    assert [layer.name for layer in visible_layers(toggle_solo(view, 2))] == ["b", "c"]
+    assert visible_layers(show_all(view)) == THREE.layers
 
 
 def test_layers_move_within_the_stack_and_stop_at_its_ends() -> None:
     for at, order in ((0, "bac"), (1, "abc"), (2, "abc"), (3, "acb")):
-        assert "".join(layer.name for layer in stack.move_layers(THREE, (1,), at).layers) == order
+        assert "".join(layer.name for layer in move_layers(THREE, (1,), at).layers) == order
     for at, order in ((0, "acb"), (1, "acb"), (2, "bac"), (3, "bac")):
-        assert "".join(layer.name for layer in stack.move_layers(THREE, (0, 2), at).layers) == order
-    assert stack.step_layers(THREE, (1, 2), 1) == stack.step_layers(THREE, (0,), -1) == THREE
+        assert "".join(layer.name for layer in move_layers(THREE, (0, 2), at).layers) == order
+    assert step_layers(THREE, (1, 2), 1) == step_layers(THREE, (0,), -1) == THREE
 
 
 def test_names_stay_apart_on_one_line_and_never_empty() -> None:
-    assert stack.rename_layer(THREE, 0, " b\n ").layers[0].name == "b-2"
-    assert stack.rename_layer(THREE, 0, "  \t ") == THREE
-    assert stack.rename_layer(THREE, 1, "b") == THREE
-    assert len(stack.rename_layer(THREE, 0, "x" * 500).layers[0].name) == stack.LONGEST_NAME
+    assert rename_layer(THREE, 0, " b\n ").layers[0].name == "b-2"
+    assert rename_layer(THREE, 0, "  \t ") == THREE
+    assert rename_layer(THREE, 1, "b") == THREE
+    assert len(rename_layer(THREE, 0, "x" * 500).layers[0].name) == LONGEST_NAME
 
 
 def test_a_lock_holds_strength_and_gains() -> None:
     locked = LayerState(0, "a", 0.5, locked=True)
-    for active_slider in stack.SLIDERS:
-        assert stack.with_slider_value(locked, active_slider, 0.1) == locked
+    for active_slider in SLIDERS:
+        assert with_slider_value(locked, active_slider, 0.1) == locked
         assert (
-            stack.slider_value(
-                stack.with_slider_value(LayerState(0, "a", 0.5), active_slider, 0.1), active_slider
-            )
-            == 0.1
+            slider_value(with_slider_value(LayerState(0, "a", 0.5), active_slider, 0.1), active_slider) == 0.1
         )
 
 
 def test_without_overshoot_nothing_stands_beyond_one() -> None:
-    over = stack.with_overshoot(THREE, True)
-    assert stack.nudge(over, 0, "strength", 0.6).layers[0].strength == 1.1
-    assert stack.nudge(over, 0, "strength", 9.0).layers[0].strength == OVERSHOOT
-    assert stack.nudge(over, 0, "color", 9.0).layers[0].gains.color == 1.0
-    back = stack.with_overshoot(stack.nudge(over, 0, "strength", 9.0), False)
+    over = with_overshoot(THREE, True)
+    assert nudge_slider(over, 0, "strength", 0.6).layers[0].strength == 1.1
+    assert nudge_slider(over, 0, "strength", 9.0).layers[0].strength == OVERSHOOT
+    assert nudge_slider(over, 0, "color", 9.0).layers[0].gains.color == 1.0
+    back = with_overshoot(nudge_slider(over, 0, "strength", 9.0), False)
     assert back.layers[0].strength == 1.0
-    assert parse_strength("130%", stack.largest_strength(over)) == OVERSHOOT
+    assert parse_strength("130%", largest_strength(over)) == OVERSHOOT
 
 
 def test_the_keys_do_all_that_the_cards_do(hand: Rig) -> None:
@@ -221,8 +235,8 @@ def test_what_is_alone_is_what_one_sees(hand: Rig) -> None:
 
 
 def test_the_original_is_held_also_while_a_layer_is_alone() -> None:
-    view = stack.toggle_solo(THREE, 0)
-    assert stack.visible_layers(original(view)) == ()
+    view = toggle_solo(THREE, 0)
+    assert visible_layers(original(view)) == ()
 
 
 def test_a_locked_slider_does_not_move(hand: Rig) -> None:
@@ -331,19 +345,19 @@ def test_rows_know_what_they_share_and_what_their_gains_scale() -> None:
 def test_the_curve_begins_at_nothing_reaches_all_at_one_and_goes_beyond() -> None:
     made = bear()
     curve = layer_rows(made.scene, made.gdfs)[1].curve()
-    assert len(curve) == round(OVERSHOOT * layer_facts.STEPS) + 1
-    assert (curve[0], curve[layer_facts.STEPS]) == (0.0, 1.0)
+    assert len(curve) == round(OVERSHOOT * facts.STEPS) + 1
+    assert (curve[0], curve[facts.STEPS]) == (0.0, 1.0)
     assert curve[-1] > 1.0
-    assert layer_fold.value_at(curve, 0.5) == curve[layer_facts.STEPS // 2]
-    assert layer_fold.value_at((0.0, 1.0), 0.01) == pytest.approx(0.2)
-    assert layer_fold.value_at((0.0, 1.0), 5.0) == 1.0
+    assert value_at(curve, 0.5) == curve[facts.STEPS // 2]
+    assert value_at((0.0, 1.0), 0.01) == pytest.approx(0.2)
+    assert value_at((0.0, 1.0), 5.0) == 1.0
 
 
 def test_a_large_region_is_measured_by_a_part_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
     made = bear()
-    whole = layer_facts.visible_changes(made.scene, made.gdfs[0])
-    monkeypatch.setattr(layer_facts, "MOST_MEMBERS", len(made.gdfs[0].region) // 2)
-    assert layer_facts.visible_changes(made.scene, made.gdfs[0]) == pytest.approx(whole, abs=0.1)
+    whole = facts.visible_changes(made.scene, made.gdfs[0])
+    monkeypatch.setattr(facts, "MOST_MEMBERS", len(made.gdfs[0].region) // 2)
+    assert facts.visible_changes(made.scene, made.gdfs[0]) == pytest.approx(whole, abs=0.1)
 
 
 @pytest.fixture(scope="module")
@@ -416,7 +430,7 @@ def test_the_top_of_the_list_lies_on_top(hand: Rig) -> None:
     assert hand.main_view.work.focus == 0
     hand.key("Alt+Up")
     assert names(hand) == ["ears", "scarf"]
-    hand.main_view.change(stack.add_layer(hand.main_view.work.view, 0, "new"))
+    hand.main_view.change(add_layer(hand.main_view.work.view, 0, "new"))
     hand.settle()
     click(hand, LEFT + 150, HEADS)
     assert layers(hand)[hand.main_view.work.focus or 0].name == "new"
@@ -470,11 +484,9 @@ def test_a_double_click_on_a_slider_takes_it_back_to_zero(hand: Rig) -> None:
 
 
 def test_a_replaced_layer_keeps_its_place_strength_and_keys(hand: Rig) -> None:
-    view = stack.change_layer(
-        hand.main_view.work.view, 0, lambda layer: LayerState(0, "scarf", 0.3, paint="x")
-    )
+    view = change_layer(hand.main_view.work.view, 0, lambda layer: LayerState(0, "scarf", 0.3, paint="x"))
     view = timeline_with_key(view)
-    after = stack.replace_edit(view, 0, 7, "ears")
+    after = replace_edit(view, 0, 7, "ears")
     assert after.layers[0] == LayerState(7, "ears-2", 0.3)
     assert after.layers[1] == view.layers[1]
     assert dict(after.timeline.keys[0].strengths) == {7: 0.3, 1: 0.5}

@@ -23,11 +23,11 @@ from progdf.metrics.image import psnr
 from tests.helpers.divided import BANNER, SIZE, beside_line
 from tests.helpers.stacks import recording_of
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
-from viewer.pictures import compare_labels
+from viewer.pictures import compare
 from viewer.render.engine import ViewEngine
-from viewer.state import comparison as compare
-from viewer.state import recordings
-from viewer.state.recordings import RecordingFile
+from viewer.state import facts
+from viewer.state.actions import toggle_against, toggle_mode
+from viewer.state.facts import RecordingFile
 from viewer.state.view_state import Comparison, ViewState
 
 AT = 0.4  # a strength between the snapshots at 0.31 and 0.5
@@ -45,7 +45,7 @@ def against_recorded(scarf: float, ears: float, mode: str = "split") -> ViewStat
 def drawn(view: ViewState, recorded: tuple[bool, bool]) -> np.ndarray:
     """The picture of `view` without a comparison, with some edits as they were recorded."""
     gdfs = [
-        replace(gdf, field=recordings.recorded_field(recording_of(gdf))) if kept else gdf
+        replace(gdf, field=facts.recorded_field(recording_of(gdf))) if kept else gdf
         for gdf, kept in zip(bear().gdfs, recorded, strict=True)
     ]
     return ViewEngine(None, bear().scene, gdfs, "cpu").image(replace(view, compare=Comparison()), SIZE)
@@ -68,14 +68,14 @@ def tall(runs: list[Path]) -> Iterator[Rig]:
 
 def test_the_recording_of_an_edit_is_found_in_its_run_folder(runs: list[Path]) -> None:
     for gdf, path in zip(bear().gdfs, runs[1:], strict=True):
-        assert recordings.find_recording(gdf, path) == RecordingFile(path.with_name(FILE_NAME))
+        assert facts.find_recording(gdf, path) == RecordingFile(path.with_name(FILE_NAME))
 
 
 def test_between_two_snapshots_the_recording_goes_straight_as_the_runs_own_errors_are_taken(
     runs: list[Path],
 ) -> None:
     scarf = bear().gdfs[0]
-    found = recordings.load_recorded(scarf, recordings.find_recording(scarf, runs[1]))
+    found = facts.load_recorded(scarf, facts.find_recording(scarf, runs[1]))
     trajectory = recording_of(scarf)
     members = scarf.region.members
     for s in (0.0, 0.31, AT, 0.9, 1.0):
@@ -86,21 +86,21 @@ def test_between_two_snapshots_the_recording_goes_straight_as_the_runs_own_error
 
 def test_an_edit_outside_its_run_folder_has_no_recording(runs: list[Path], tmp_path: Path) -> None:
     shutil.copy(runs[1], tmp_path / "alone.gdf")
-    found = recordings.find_recording(bear().gdfs[0], tmp_path / "alone.gdf")
+    found = facts.find_recording(bear().gdfs[0], tmp_path / "alone.gdf")
     assert (found.path, found.reason) == (None, f"there is no {FILE_NAME} beside alone.gdf")
 
 
 def test_the_recording_of_another_edit_is_not_taken_for_this_ones(runs: list[Path]) -> None:
     ears = bear().gdfs[1]
     save_gdf(runs[1].with_name("ears.gdf"), ears)
-    found = recordings.find_recording(ears, runs[1].with_name("ears.gdf"))
+    found = facts.find_recording(ears, runs[1].with_name("ears.gdf"))
     assert found.path is None
     assert "belongs to another edit" in found.reason
 
 
 def test_a_damaged_recording_is_no_recording_and_says_why(runs: list[Path]) -> None:
     runs[1].with_name(FILE_NAME).write_bytes(b"\x40\x00\x00\x00\x00\x00\x00\x00{broken")
-    found = recordings.find_recording(bear().gdfs[0], runs[1])
+    found = facts.find_recording(bear().gdfs[0], runs[1])
     assert found.path is None
     assert "is damaged" in found.reason
 
@@ -110,7 +110,7 @@ def test_the_words_say_which_snapshots_are_shown_and_which_edits_have_none() -> 
     gdfs = bear().gdfs
 
     def told(scarf: float, ears: float, *found: RecordingFile) -> str:
-        return recordings.describe(first_view(bear(), scarf, ears), gdfs, found)
+        return facts.describe(first_view(bear(), scarf, ears), gdfs, found)
 
     assert told(AT, 0.0, here, here) == "recorded, between 0.31 and 0.5"
     assert told(0.5, 0.0, here, here) == "recorded at 0.5"
@@ -211,7 +211,7 @@ def test_where_nothing_was_recorded_the_original_is_shown_and_the_reason_told() 
     with rig(view) as hand:
         hand.key("Alt+Y")
         said = hand.main_view.canvas.comparer.labels(hand.main_view.work.view)
-        assert said.notice == f"Against the original: {recordings.NO_FILE}"
+        assert said.notice == f"Against the original: {facts.NO_FILE}"
         left = beside_line(hand.picture().astype(float), 170)[0][BANNER:]
         assert np.abs(left - beside_line(original, 170)[0][BANNER:]).max() <= 0.51
         shown = hand.picture()
@@ -253,7 +253,7 @@ def test_a_recording_that_breaks_after_it_was_found_is_no_crash(runs: list[Path]
             path.with_name(FILE_NAME).unlink()
         hand.key("Alt+Y")
         said = hand.main_view.canvas.comparer.labels(hand.main_view.work.view)
-        assert said.left == compare_labels.ORIGINAL
+        assert said.left == compare.ORIGINAL
         assert "does not exist" in said.notice
 
 
@@ -262,7 +262,7 @@ def test_a_recording_that_does_not_fit_its_edit_is_one_line(runs: list[Path]) ->
     extra = {"members": scarf.region.members}
     save_trajectory(runs[1].with_name(FILE_NAME), recording_of(ears), extra, {})
     with pytest.raises(ProgdfError, match="belongs to another edit"):
-        recordings.load_recorded(scarf, RecordingFile(runs[1].with_name(FILE_NAME)))
+        facts.load_recorded(scarf, RecordingFile(runs[1].with_name(FILE_NAME)))
 
 
 def test_another_recording_of_the_same_members_is_not_taken_for_this_ones(runs: list[Path]) -> None:
@@ -270,7 +270,7 @@ def test_another_recording_of_the_same_members_is_not_taken_for_this_ones(runs: 
     other = recording_of(scarf)
     extra = {"members": scarf.region.members}
     save_trajectory(runs[1].with_name(FILE_NAME), replace(other, end=other.end + 1e-6), extra, {})
-    assert "belongs to another edit" in recordings.find_recording(scarf, runs[1]).reason
+    assert "belongs to another edit" in facts.find_recording(scarf, runs[1]).reason
 
 
 def test_a_recording_is_shown_where_the_field_shows_it(runs: list[Path]) -> None:
@@ -279,22 +279,22 @@ def test_a_recording_is_shown_where_the_field_shows_it(runs: list[Path]) -> None
     extra = {"members": scarf.region.members, "score": scarf.region.score}
     early = replace(recorded, s=recorded.s.square())
     save_trajectory(runs[1].with_name(FILE_NAME), early, extra, {})
-    found = recordings.load_recorded(scarf, recordings.find_recording(scarf, runs[1]))
+    found = facts.load_recorded(scarf, facts.find_recording(scarf, runs[1]))
     assert found.field.knots.tolist() == recorded.s.tolist()
 
 
 def test_against_the_recording_goes_on_with_a_split_and_back_to_the_original() -> None:
-    on = compare.toggle_against(ViewState())
+    on = toggle_against(ViewState())
     assert on.compare == Comparison("split", against="recorded")
-    assert compare.toggle_against(on).compare == Comparison("split")
-    apart = compare.toggle_mode(on, "difference")
+    assert toggle_against(on).compare == Comparison("split")
+    apart = toggle_mode(on, "difference")
     assert apart.compare == Comparison("difference", against="recorded")
 
 
 def test_equal_pictures_are_told_as_such_and_figures_that_were_not_taken_are_left_out() -> None:
     split = Comparison("split", against="recorded")
-    assert compare_labels.labels(split, math.inf, "recorded at 0").right == "field · no difference"
-    assert compare_labels.labels(split, math.nan, "recorded at 0").right == "field"
+    assert compare.labels(split, math.inf, "recorded at 0").right == "field · no difference"
+    assert compare.labels(split, math.nan, "recorded at 0").right == "field"
 
 
 def rendered(*options: str) -> np.ndarray:

@@ -13,15 +13,16 @@ from hypothesis import strategies as st
 
 from progdf.cli.info import kind_of
 from progdf.errors import ProgdfError
-from viewer.camera import controls, tween
+from viewer.camera import views
 from viewer.camera.view_camera import Bounds, ViewCamera, axes, cross, dot, to_camera
 from viewer.files import timeline_file
-from viewer.state import history, playback, timeline, workspace
+from viewer.state import history, timeline, workspace
 from viewer.state.actions import ACTIONS, perform
-from viewer.state.layer_facts import LayerRow
-from viewer.state.playback import Player
+from viewer.state.facts import LayerRow
+from viewer.state.timeline import Player
 from viewer.state.view_state import Keyframe, LayerState, Timeline, ViewState
 from viewer.state.workspace import SceneFacts, Workspace
+from viewer.ui.keys import KEYS
 
 LAYERS = (LayerState(0, "scarf", 0.2), LayerState(1, "ears", 0.4))
 FACTS = SceneFacts("bear.ply", 3, Bounds(), (LayerRow(3, (0.5,) * 3, (), "", Bounds()),) * 2)
@@ -45,7 +46,7 @@ def act(work: Workspace, *actions: str) -> Workspace:
 
 
 tracks = st.lists(
-    st.tuples(st.integers(0, 200), st.sampled_from(tween.EASINGS), st.floats(0, 1)),
+    st.tuples(st.integers(0, 200), st.sampled_from(views.EASINGS), st.floats(0, 1)),
     min_size=1,
     max_size=6,
     unique_by=lambda point: point[0],
@@ -53,8 +54,8 @@ tracks = st.lists(
 
 
 @given(tracks, st.floats(-10, 210))
-def test_between_two_keys_a_value_never_leaves_their_range(points: list[tween.Point], frame: float) -> None:
-    found = tween.value(points, frame)
+def test_between_two_keys_a_value_never_leaves_their_range(points: list[views.Point], frame: float) -> None:
+    found = views.value_between(points, frame)
     before = [p for p in points if p[0] <= frame] or points[:1]
     after = [p for p in points if p[0] >= frame] or points[-1:]
     low, high = sorted((before[-1][2], after[0][2]))
@@ -62,13 +63,13 @@ def test_between_two_keys_a_value_never_leaves_their_range(points: list[tween.Po
 
 
 @given(tracks)
-def test_at_a_key_a_value_is_exactly_the_keys(points: list[tween.Point]) -> None:
-    assert [tween.value(points, point[0]) for point in points] == [point[2] for point in points]
+def test_at_a_key_a_value_is_exactly_the_keys(points: list[views.Point]) -> None:
+    assert [views.value_between(points, point[0]) for point in points] == [point[2] for point in points]
 
 
 def test_smooth_leaves_and_comes_gently_and_passes_through_without_a_halt() -> None:
     points = [(0, "smooth", 0.0), (10, "smooth", 0.5), (20, "smooth", 1.0)]
-    steps = [tween.value(points, f + 1) - tween.value(points, f) for f in range(20)]
+    steps = [views.value_between(points, f + 1) - views.value_between(points, f) for f in range(20)]
     assert steps[0] < 0.5 * steps[9]
     assert steps[-1] < 0.5 * steps[10]
     assert steps[9] == pytest.approx(steps[10])
@@ -77,14 +78,14 @@ def test_smooth_leaves_and_comes_gently_and_passes_through_without_a_halt() -> N
 
 def test_smooth_rests_where_the_way_turns_back() -> None:
     points = [(0, "smooth", 0.0), (10, "smooth", 1.0), (20, "smooth", 0.0)]
-    assert 1.0 - tween.value(points, 9.9) < 1e-3
-    assert 1.0 - tween.value(points, 10.1) < 1e-3
+    assert 1.0 - views.value_between(points, 9.9) < 1e-3
+    assert 1.0 - views.value_between(points, 10.1) < 1e-3
 
 
 def test_linear_is_even_and_hold_jumps_at_the_next_key() -> None:
-    assert tween.value([(0, "linear", 0.0), (10, "smooth", 1.0)], 3) == pytest.approx(0.3)
+    assert views.value_between([(0, "linear", 0.0), (10, "smooth", 1.0)], 3) == pytest.approx(0.3)
     held = [(0, "hold", 0.0), (10, "smooth", 1.0)]
-    assert (tween.value(held, 9), tween.value(held, 10)) == (0.0, 1.0)
+    assert (views.value_between(held, 9), views.value_between(held, 10)) == (0.0, 1.0)
 
 
 def test_the_camera_turns_the_shortest_way_and_its_distance_grows_in_proportion() -> None:
@@ -95,7 +96,7 @@ def test_the_camera_turns_the_shortest_way_and_its_distance_grows_in_proportion(
 
 
 def test_turning_on_over_several_keys_goes_more_than_once_around() -> None:
-    assert tween.unwrap([0.0, 170.0, -20.0, 150.0, 0.0]) == [0.0, 170.0, 340.0, 510.0, 360.0]
+    assert views.unwrap([0.0, 170.0, -20.0, 150.0, 0.0]) == [0.0, 170.0, 340.0, 510.0, 360.0]
 
 
 ups = st.sampled_from([(0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1), (1, 0, 0), (0.6, 0.8, 0.0)])
@@ -115,7 +116,7 @@ def test_between_any_two_up_axes_the_picture_turns_along_one_arc(
         ViewCamera(up=here, azimuth=20.0, elevation=10.0),
         ViewCamera(up=there, azimuth=azimuth, elevation=elevation),
     )
-    found = tween.camera([(0, "linear", cameras[0]), (20, "linear", cameras[1])], frame)
+    found = views.camera_between([(0, "linear", cameras[0]), (20, "linear", cameras[1])], frame)
     picture, ends = axes(found), [axes(camera) for camera in cameras]
     assert bool(to_camera(found, 64, 48).viewmat.isfinite().all())
     assert math.dist(cross(picture.right, picture.up), picture.back) < 1e-6
@@ -175,7 +176,7 @@ def test_playing_shows_the_films_frames_in_their_order_at_its_pace(ping_pong: bo
     made = replace(two_keys(length=3), ping_pong=ping_pong, fps=10)
     player, seen = Player(playing=True), [0]
     for _ in range(11):
-        player = playback.advance(player, made, 0.1 + 1e-9)
+        player = timeline.advance(player, made, 0.1 + 1e-9)
         seen.append(player.frame)
     assert seen == (list(timeline.film_frames(made)) * 3)[:12]
 
@@ -184,8 +185,8 @@ def test_a_slow_frame_skips_frames_of_the_film_and_keeps_its_pace() -> None:
     made = replace(two_keys(length=20), fps=10)
     fast, slow = Player(playing=True), Player(playing=True)
     for _ in range(47):
-        fast = playback.advance(fast, made, 0.0155)
-    slow = playback.advance(slow, made, 47 * 0.0155)
+        fast = timeline.advance(fast, made, 0.0155)
+    slow = timeline.advance(slow, made, 47 * 0.0155)
     assert fast.frame == slow.frame == 7
 
 
@@ -268,10 +269,10 @@ def test_one_key_cannot_be_played_and_hiding_the_bar_stops() -> None:
     work = act(workspace.new_workspace(view()), "key", "play")
     assert not work.player.playing
     work = act(workspace.new_workspace(replace(view(), timeline=two_keys())), "play")
-    assert playback.next_frame_delay(work.player, work.view.timeline) == pytest.approx(1 / 24)
+    assert timeline.next_frame_delay(work.player, work.view.timeline) == pytest.approx(1 / 24)
     hidden = act(work, "timeline")
     assert not hidden.player.playing
-    assert playback.next_frame_delay(hidden.player, hidden.view.timeline) is None
+    assert timeline.next_frame_delay(hidden.player, hidden.view.timeline) is None
 
 
 def test_undo_of_a_longer_timeline_leaves_a_playhead_that_still_works() -> None:
@@ -288,9 +289,9 @@ def test_history_restores_the_timeline_with_the_rest() -> None:
 
 
 def test_every_action_of_the_timeline_that_a_key_names_exists() -> None:
-    named = {key.action.partition(":")[0] for key in controls.KEYS}
+    named = {key.action.partition(":")[0] for key in KEYS}
     assert {"key", "drop_key", "play", "step", "jump", "easing", "ping_pong", "timeline"} <= named
-    assert set(playback.ACTIONS) <= set(ACTIONS)
+    assert set(timeline.ACTIONS) <= set(ACTIONS)
 
 
 def test_a_timeline_in_a_file_comes_back_whole_under_its_edits_names(tmp_path: Path) -> None:

@@ -22,8 +22,7 @@ from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.io.json_values import convert_json, decode_json
 from viewer.app.application import Application
-from viewer.camera.up_axis import Vec3
-from viewer.camera.view_camera import ViewCamera, to_camera
+from viewer.camera.view_camera import Vec3, ViewCamera, to_camera
 from viewer.jobs.child import Child
 from viewer.jobs.training import EDITORS, NewEdit
 

@@ -13,8 +13,7 @@ from progdf.errors import ProgdfError
 from progdf.io.atomic import state_folder
 from progdf.scene import up_axis
 from progdf.scene.up_axis import direction_name
-from viewer.camera.up_axis import Vec3
-from viewer.camera.view_camera import first_camera
+from viewer.camera.view_camera import Vec3, first_camera
 from viewer.files.user_files import THUMBNAIL_SIZE, keep_thumbnail, load_thumbnail
 from viewer.gl.present import picture_texture
 from viewer.jobs.job_queue import Delivery, JobQueue

@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import moderngl
 import numpy as np
 import torch
+from PIL import Image as Pillow
+from PIL import ImageDraw, ImageFont
 
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
@@ -21,15 +23,96 @@ from progdf.gdf.file import Gdf
 from progdf.metrics.image import psnr
 from viewer.camera.view_camera import half_camera, to_camera
 from viewer.gl.present import Presenter
+from viewer.render.dynamic_resolution import FrameTimings
 from viewer.render.engine import ViewEngine, drawn_size
-from viewer.render.renderers import Image
-from viewer.render.timings import FrameTimings
-from viewer.state import recordings
-from viewer.state.recordings import RecordingFile
+from viewer.render.gl_renderer import Image
+from viewer.state import facts
+from viewer.state.facts import RecordingFile
 from viewer.state.snapshots import SnapshotSides
-from viewer.state.view_state import ViewState
+from viewer.state.view_state import Comparison, ViewState
 
-from .compare_labels import Labels, column, labels
+from .film import Pixels, to_pixels
+
+ORIGINAL, EDITED, FIELD = "original", "edited", "field"
+_SHADE, _INK = (22, 24, 27), (222, 225, 230)
+_PLAIN = str.maketrans({"×": "x", "–": "-"})  # Pillow's own font has no others
+
+
+@dataclass(frozen=True)
+class Labels:
+    """The words of one comparison."""
+
+    left: str = ORIGINAL  # left, right: the two sides
+    right: str = EDITED
+    line: str = ""  # over a difference
+    notice: str = ""  # why it is not against what was asked for, "" where it is
+
+
+def labels(
+    compare: Comparison,
+    decibels: float,
+    recorded: str = "",
+    obstacle: str = "",
+    names: tuple[str, str] | None = None,
+) -> Labels:
+    """What to say over a comparison.
+
+    Args:
+        compare: what is compared, and how
+        decibels: PSNR of the two pictures; NaN where it was not taken
+        recorded: which snapshots are on the other side, "" for the original
+        obstacle: why the recording was asked for and is not shown
+        names: of the snapshots on the two sides
+    """
+    if math.isinf(decibels):
+        line, figure = "difference: none", " · no difference"
+    else:
+        figure = "" if math.isnan(decibels) else f" · PSNR {decibels:.1f} dB"
+        line = f"difference × {compare.amplify:g}{figure}"
+    if names is not None:
+        return Labels(names[0], names[1] + figure, f"{line} · {names[0]} against {names[1]}")
+    if recorded:
+        return Labels(recorded, FIELD + figure, f"{line} · {recorded}")
+    return Labels(line=line, notice=f"Against the original: {obstacle}" if obstacle else "")
+
+
+def draw_labels(image: Image, compare: Comparison, words: Labels) -> Pixels:
+    """A picture of `Comparer.image` for a file: with the divider and what is on which side."""
+    pixels = to_pixels(image)
+    if compare.mode == "off":
+        return pixels
+    page = Pillow.fromarray(pixels)
+    draw = ImageDraw.Draw(page, "RGBA")
+    if compare.mode == "difference":
+        _tag(draw, page.width / 2, "m", words.line, page.size)
+    else:
+        at = column(compare, page.width)
+        draw.line([(at, 0), (at, page.height)], (*_SHADE, 140), 3)
+        draw.line([(at, 0), (at, page.height)], (255, 255, 255, 255), 1)
+        _tag(draw, at, "r", words.left, page.size)
+        _tag(draw, at, "l", words.right, page.size)
+    return np.asarray(page)
+
+
+def column(compare: Comparison, width: int) -> int:
+    """Where in a picture of this width the edited side begins, pixels."""
+    if compare.mode == "beside":
+        return width // 2
+    return max(0, min(width, round(compare.divider * width)))
+
+
+def _tag(draw: ImageDraw.ImageDraw, x: float, side: str, text: str, size: tuple[int, int]) -> None:
+    """A word at the top: left of x ("r" as it ends there), right of it ("l"), or around it; where it fits."""
+    text = text.translate(_PLAIN)
+    letters = max(11, round(size[1] / 28))
+    font = ImageFont.load_default(size=letters)
+    wide, pad, gap = draw.textlength(text, font), 0.5 * letters, 0.6 * letters
+    left = {"r": x - gap - wide - 2 * pad, "l": x + gap, "m": x - wide / 2 - pad}[side]
+    if left < 0 or left + wide + 2 * pad > size[0]:
+        return
+    box = (left, gap, left + wide + 2 * pad, gap + 1.6 * letters)
+    draw.rounded_rectangle(box, 0.3 * letters, (*_SHADE, 200))
+    draw.text((left + pad, gap + 0.8 * letters), text, _INK, font, anchor="lm")
 
 
 class Comparer:
@@ -42,12 +125,12 @@ class Comparer:
     """
 
     def __init__(
-        self, engine: ViewEngine, ctx: moderngl.Context | None, found: Sequence[RecordingFile] = ()
+        self, engine: ViewEngine, ctx: moderngl.Context | None, recordings: Sequence[RecordingFile] = ()
     ) -> None:
         self.engine = engine
         self.psnr = math.nan
         """Of the last comparison, dB; infinite where nothing differs, NaN where it was not taken."""
-        self.recordings = tuple(found) or (RecordingFile(),) * len(engine.gdfs)
+        self.recordings = tuple(recordings) or (RecordingFile(),) * len(engine.gdfs)
         """Where the edits were recorded; one that turned out to be broken is none."""
         self.sides: SnapshotSides | None = None
         """The snapshots that the next view compares; that view is then `sides.right`."""
@@ -66,8 +149,8 @@ class Comparer:
             return True
         if view.compare.mode == "off":
             return False
-        apart = view.compare.mode == "difference" and self._shown != view.compare.amplify
-        return apart or self._second(view).needs_draw(self._other_view(view), drawn, camera)
+        another = view.compare.mode == "difference" and self._shown != view.compare.amplify
+        return another or self._second(view).needs_draw(self._other_view(view), drawn, camera)
 
     def draw(
         self,
@@ -119,17 +202,17 @@ class Comparer:
 
     def against(self, view: ViewState) -> str:
         """What the picture of `view` is set against, of `AGAINST`: what it asks for, if that exists."""
-        missing = {"recorded": recordings.obstacle(self.recordings), "snapshots": self.sides is None}
+        missing = {"recorded": facts.obstacle(self.recordings), "snapshots": self.sides is None}
         return "original" if missing.get(view.compare.against) else view.compare.against
 
     def labels(self, view: ViewState) -> Labels:
         """What to say over the last comparison, of `view`."""
-        wished, found = view.compare.against, self.against(view)
+        target, against = view.compare.against, self.against(view)
         if self.sides is not None:
             return labels(view.compare, self.psnr, names=self.sides.names)
-        why = {"recorded": recordings.obstacle(self.recordings), "snapshots": "there is no snapshot (F3)"}
-        obstacle = why[wished] if wished != found else ""
-        recorded = recordings.describe(view, self.engine.gdfs, self.recordings) if found == "recorded" else ""
+        why = {"recorded": facts.obstacle(self.recordings), "snapshots": "there is no snapshot (F3)"}
+        obstacle = why[target] if target != against else ""
+        recorded = facts.describe(view, self.engine.gdfs, self.recordings) if against == "recorded" else ""
         return labels(view.compare, self.psnr, recorded, obstacle)
 
     def release(self) -> None:
@@ -154,7 +237,7 @@ class Comparer:
         gdfs, read = [], []
         for gdf, recording in zip(self.engine.gdfs, self.recordings, strict=True):
             try:
-                gdfs.append(recordings.load_recorded(gdf, recording))
+                gdfs.append(facts.load_recorded(gdf, recording))
                 read.append(recording)
             except ProgdfError as error:
                 gdfs.append(gdf)
@@ -168,7 +251,7 @@ class Comparer:
             left = self.sides.left
             return replace(view, layers=left.layers, groups=left.groups, blend=left.blend)
         recorded = self.against(view) == "recorded"
-        return recordings.clamp_to_recorded(view, self.recordings) if recorded else replace(view, layers=())
+        return facts.clamp_to_recorded(view, self.recordings) if recorded else replace(view, layers=())
 
     def _draw_sides(
         self, view: ViewState, framebuffer: moderngl.Framebuffer, size: tuple[int, int], pixels: int
@@ -197,12 +280,12 @@ class Comparer:
     ) -> FrameTimings:
         assert self._ctx is not None, "nothing to show on without a context"
         if self.needs_draw(view, size) or self._texture is None:
-            apart = np.ascontiguousarray(self.image(view, size), np.float32)
+            image = np.ascontiguousarray(self.image(view, size), np.float32)
             if self._texture is None or self._texture.size != size:
                 if self._texture is not None:
                     self._texture.release()
                 self._texture = self._ctx.texture(size, 3, dtype="f4")
-            self._texture.write(apart)
+            self._texture.write(image)
             self._shown = view.compare.amplify
             timings = _add_timings(self.engine.timings, self._second(view).timings)
         else:
@@ -214,8 +297,8 @@ class Comparer:
 
 def difference(other: Image, edited: Image, amplify: float) -> Image:
     """amplify · |edited − other| of what is seen (0..1) of each; black where nothing differs. [H,W,3]"""
-    apart: Image = np.abs(np.clip(edited, 0.0, 1.0) - np.clip(other, 0.0, 1.0)) * np.float32(amplify)
-    return apart
+    image: Image = np.abs(np.clip(edited, 0.0, 1.0) - np.clip(other, 0.0, 1.0)) * np.float32(amplify)
+    return image
 
 
 def _psnr(other: Image, edited: Image) -> float:

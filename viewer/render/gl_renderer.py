@@ -1,4 +1,4 @@
-"""Two ways to draw a scene, one interface: OpenGL, and the CPU rasterizer (cpu_renderer.py)."""
+"""Drawing with OpenGL: a context without a window, the depth sort, and what every renderer does."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from progdf.camera import Camera
+from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
-from viewer.camera.up_axis import Vec3
-from viewer.gl.grid_pass import GridPass
+from viewer.camera.view_camera import Vec3
 from viewer.gl.present import Presenter
-from viewer.gl.splats import SplatRenderer
+from viewer.gl.splats import GridPass, SplatRenderer
 
 from .ground_grid import Lines
 
@@ -49,7 +49,7 @@ class Renderer(Protocol):
         """Make the picture and wait until it is done.
 
         Args:
-            order: farthest first, from `depth_sort.back_to_front`
+            order: farthest first, from `back_to_front`
             pixels: of the picture at rest that one of this one stands for, each way
         """
 
@@ -145,3 +145,53 @@ def _require_picture(thing: T | None) -> T:
     if thing is None:
         raise ValueError("there is no picture yet; draw first")
     return thing
+
+
+SOFTWARE = ("llvmpipe", "softpipe", "swiftshader", "microsoft basic render", "swrast")
+"""Parts of GL_RENDERER, in lower case, of renderers that run on the processor."""
+
+
+def headless_context() -> moderngl.Context:
+    """A GL 3.3 core context of its own, through EGL where there is one. The caller releases it.
+
+    Raises:
+        ProgdfError: this machine has no OpenGL 3.3.
+    """
+    reasons = []
+    for backend in ("egl", None):  # no EGL on Windows and macOS: their own way
+        named = {} if backend is None else {"backend": backend}
+        try:
+            return moderngl.create_context(standalone=True, require=330, **named)  # type: ignore[arg-type]
+        except Exception as error:  # each platform's loader raises its own kind
+            reasons.append(" ".join(str(error).split()))
+    raise ProgdfError(
+        f"there is no OpenGL 3.3 here ({reasons[0]}); install libegl1 and libgl1, or use --engine cpu"
+    )
+
+
+def is_software(ctx: moderngl.Context) -> bool:
+    """Whether the context draws on the processor; then the CPU rasterizer is several times faster."""
+    renderer = str(ctx.info["GL_RENDERER"]).lower()
+    return any(name in renderer for name in SOFTWARE)
+
+
+def back_to_front(means: NDArray[np.float32], camera: Camera) -> NDArray[np.uint32]:
+    """Rows in front of the near plane, farthest first; the exact reverse of (float32 depth, index) ascending.
+
+    Args:
+        means: centers, world units; a row that is not finite is left out. [N,3]
+        camera: only its `viewmat` and `near` count
+
+    Returns:
+        [V] uint32, V ≤ N
+    """
+    row = camera.viewmat[2].double().numpy()
+    # float64 as the CPU engine does: another rounding would swap neighbors
+    with np.errstate(invalid="ignore", over="ignore"):
+        depths = means.astype(np.float64) @ row[:3] + row[3]
+        seen = np.flatnonzero((depths > camera.near) & (depths < np.inf))
+    # positive floats sort like their bits; below them the index makes every key unique
+    bits = depths[seen].astype(np.float32).view(np.uint32)
+    keys = bits.astype(np.uint64) << np.uint64(32) | seen.astype(np.uint64)
+    keys.sort()
+    return np.ascontiguousarray(keys[::-1]).astype(np.uint32)  # the low half is the index

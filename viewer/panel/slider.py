@@ -15,6 +15,7 @@ from viewer.ui.context import PALETTE, Rgba, u32
 from viewer.ui.widgets import is_released, tip
 
 HEIGHT_PX = 25.0  # at 1×, as a text field, so that nothing moves when one types
+RADIUS_PX = 7.0  # of the handle
 FINE = 0.1
 DEFAULT = 0.0
 """The original; where a double click goes."""
@@ -67,7 +68,7 @@ def draw(
     left, top = imgui.get_cursor_screen_pos()
     imgui.invisible_button(label, imgui.ImVec2(width, height * scale))
     hovered, held = imgui.is_item_hovered(), imgui.is_item_active()
-    radius = 7.0 * scale
+    radius = RADIUS_PX * scale
     start, span = left + radius, max(width - 2 * radius, 1.0) / most
     mouse = imgui.get_io().mouse_pos.x
     if imgui.is_item_activated():
@@ -89,7 +90,7 @@ def draw(
         tip(help_)
     color = fill if active else PALETTE.faint
     ticks = ticks if height >= HEIGHT_PX else ()
-    _paint(start, top, span, radius, value, ticks, scale, color, hovered or held, most)
+    _paint((start, top, span), value, ticks, scale, color, hovered or held, most)
     return value
 
 
@@ -122,16 +123,13 @@ def _text_field(label: str, value: float, width: float, most: float) -> float:
     left = imgui.is_item_deactivated()
     if entered or left:
         storage.set_bool(_slot(label, "typing"), False)
-    kept = entered or imgui.is_item_deactivated_after_edit()
-    parsed = parse_strength(text, most) if kept else None
+    accepted = entered or imgui.is_item_deactivated_after_edit()
+    parsed = parse_strength(text, most) if accepted else None
     return value if parsed is None else parsed
 
 
 def _paint(
-    start: float,
-    top: float,
-    span: float,
-    radius: float,
+    track: tuple[float, float, float],
     value: float,
     ticks: Sequence[float],
     scale: float,
@@ -139,7 +137,8 @@ def _paint(
     lit: bool,
     most: float,
 ) -> None:
-    canvas, p = imgui.get_window_draw_list(), PALETTE
+    """Draw it; `track`: where 0 is, its top, and the length of a strength of 1, window pixels."""
+    canvas, p, (start, top, span), radius = imgui.get_window_draw_list(), PALETTE, track, RADIUS_PX * scale
     middle, half = top + radius + 1.0 * scale, 2.0 * scale
     at = start + value * span
     canvas.add_rect_filled(

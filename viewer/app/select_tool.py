@@ -1,0 +1,345 @@
+"""The tools that select in the picture: gestures of the mouse, what they select, and how they are drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from imgui_bundle import imgui
+
+from progdf.scene.neighbors import Neighborhood, grow_along_surface
+from progdf.scene.selection import (
+    Centers,
+    Mask,
+    Surface,
+    alike_in_color,
+    combine,
+    inside_ball,
+    inside_polygon,
+    inside_rectangle,
+    inside_stroke,
+)
+from viewer.camera.view_camera import Vec3
+from viewer.render.picking import Seen, seen_at, surface_point
+from viewer.state import history, selection
+from viewer.state.selection import unpack
+from viewer.state.view_state import ViewState
+from viewer.state.workspace import Workspace
+from viewer.ui.context import PALETTE, UiContext, u32
+from viewer.ui.keys import Keys
+from viewer.ui.pointer import PointerContext
+
+_SEEDS = 0.1  # of a pixel's color that a Gaussian gives to be a seed
+
+Point = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Brushed:
+    """What a brush can reach, and what it has touched."""
+
+    centers: Centers  # of all Gaussians
+    reachable: Mask  # those that are not behind others, or all. [N]
+    touched: Mask  # so far. [N]
+
+
+@dataclass(frozen=True)
+class Gesture:
+    """A selection under way."""
+
+    tool: str  # of `SELECT_TOOLS`
+    mode: str  # of `SELECT_MODES`
+    before: bytes  # what was selected when it began, packed
+    path: tuple[Point, ...]  # where the hand has been, pixels of the picture; the corners of a polygon
+    brushed: Brushed | None = None  # of a brush
+    center: Vec3 | None = None  # of a sphere, world units
+    scale: float = 0.0  # world units per pixel there
+
+    @property
+    def radius(self) -> float:
+        """Of a sphere, world units."""
+        return self.scale * float(np.hypot(*np.subtract(self.path[-1], self.path[0])))
+
+
+@dataclass(frozen=True)
+class Click:
+    """A click of "flood" or "color", which follows its tolerance until something else is selected."""
+
+    tool: str  # of the two
+    mode: str  # of `SELECT_MODES`
+    before: bytes  # what was selected when it came, packed
+    at: Point  # pixels of the picture
+    surface: Surface  # of the scene on screen then
+    options: tuple[float, bool]  # tolerance and depth by which it last selected
+    after: bytes  # what was selected by that, packed
+    recorded: bytes  # what undo knows of it, packed
+
+
+def begin(tool: str, mode: str, before: bytes, at: Point, surface: Surface, through: bool) -> Gesture | None:
+    """What begins where the mouse was pressed; None for a sphere on the background.
+
+    Args:
+        surface: of the scene on screen
+        through: also what lies behind the front surface
+    """
+    gesture = Gesture(tool, mode, before, (at,))
+    if tool == "brush":
+        front = np.isfinite(surface.centers.points[:, 0])
+        if not through:
+            front = surface.front(np.arange(len(front)))
+        return replace(gesture, brushed=Brushed(surface.centers, front, np.zeros(len(front), bool)))
+    if tool == "sphere":
+        camera, center = surface.camera, surface_point(surface.scene, surface.camera, *at)
+        if center is None:
+            return None
+        depth = float(camera.viewmat[2, :3] @ torch.tensor(center, dtype=camera.viewmat.dtype))
+        scale = (depth + float(camera.viewmat[2, 3])) / float(camera.K[0, 0])
+        return replace(gesture, center=center, scale=scale)
+    return gesture
+
+
+def extend(gesture: Gesture, at: Point, radius: float) -> Gesture:
+    """With the hand at another place.
+
+    Args:
+        radius: of a brush, pixels of the picture
+    """
+    if gesture.tool in ("box", "sphere"):
+        return replace(gesture, path=(gesture.path[0], at))
+    if gesture.brushed is not None:
+        brushed = gesture.brushed
+        touched = inside_stroke(brushed.centers.points, (gesture.path[-1], at), radius) & brushed.reachable
+        gesture = replace(gesture, brushed=replace(brushed, touched=brushed.touched | touched))
+    return gesture if at == gesture.path[-1] else replace(gesture, path=(*gesture.path, at))
+
+
+def enclosed(gesture: Gesture, surface: Surface, through: bool) -> Mask:
+    """What the gesture selects as it is. Arguments as of `begin`. [N]"""
+    if gesture.brushed is not None:
+        return gesture.brushed.touched
+    if gesture.center is not None:
+        return inside_ball(surface.scene, gesture.center, gesture.radius)
+    points = surface.centers.points
+    if gesture.tool == "box":
+        mask = inside_rectangle(points, gesture.path[0], gesture.path[-1])
+    else:
+        mask = inside_polygon(points, gesture.path)
+    if not through:
+        rows = np.flatnonzero(mask)
+        mask[rows] = surface.front(rows)
+    return mask
+
+
+def clicked(
+    tool: str,
+    at: Point,
+    surface: Surface,
+    tolerance: float,
+    through: bool,
+    neighborhood: Callable[[], Neighborhood],
+) -> Mask | None:
+    """What a click of "flood" or "color" selects; None on the background. Arguments as of `begin`. [N]"""
+    seen = seen_at(surface.scene, surface.camera, *at)
+    if seen is None:
+        return None
+    colors = surface.colors
+    color = np.average(colors[seen.rows], axis=0, weights=seen.shares)
+    seeds = _seeds(seen)
+    if tool == "flood":
+        return grow_along_surface(neighborhood(), colors, seeds, color, tolerance)
+    mask = alike_in_color(colors, color, tolerance)
+    mask[seeds] = True
+    if not through:
+        rows = np.flatnonzero(mask)
+        mask[rows] = surface.front(rows)
+    return mask
+
+
+def _seeds(seen: Seen) -> np.ndarray:
+    """The Gaussians that make most of what one sees at a pixel."""
+    return seen.rows[seen.shares >= min(_SEEDS, float(seen.shares.max()))]
+
+
+SELECT_DRAG = "select"
+"""What a left drag does while a tool selects, beside those of `keys.DRAGS`."""
+
+_TRAVEL_PX = 3.0  # at 1×: what moves no further is a click
+_CLOSE_PX = 9.0  # at 1×: a click so near to a polygon's first corner closes it
+
+Held = tuple[Gesture | None, Workspace]
+
+
+def mode(chosen: str) -> str:
+    """What is done with what was selected before: Shift adds, Ctrl takes away, both keep what is in both."""
+    io = imgui.get_io()
+    if io.key_shift:
+        return "intersect" if io.key_ctrl else "add"
+    return "subtract" if io.key_ctrl else chosen
+
+
+def press(gesture: Gesture | None, work: Workspace, pointer: PointerContext) -> Held:
+    """The left button went down over the picture."""
+    view, tool = work.view, work.view.select
+    at = pointer.cursor
+    if gesture is not None and gesture.tool == "polygon" == tool.tool:
+        if imgui.is_mouse_double_clicked(0) or _is_near(gesture, pointer):
+            return finish(gesture, work, pointer)
+        return replace(gesture, path=(*gesture.path, at)), work
+    begun_at = begin(tool.tool, mode(tool.mode), view.selection.members, at, pointer.surface, tool.through)
+    return (None, work) if begun_at is None else follow(begun_at, work, pointer)
+
+
+def click(work: Workspace, pointer: PointerContext) -> tuple[Click, Workspace]:
+    """The left button went down over the picture, with a tool that needs no more than that."""
+    tool, before = work.view.select, work.view.selection.members
+    made = Click(
+        tool.tool, mode(tool.mode), before, pointer.cursor, pointer.surface, (0.0, False), before, before
+    )
+    made, work = _click(made, work, pointer)
+    return replace(made, recorded=made.after), work
+
+
+def adjust(click: Click | None, work: Workspace, pointer: PointerContext) -> tuple[Click | None, Workspace]:
+    """The last click again where its tolerance or depth is another, as one change for undo.
+
+    None where something else was selected since, or the tool is another.
+    """
+    tool = work.view.select
+    if click is None or (tool.tool, work.view.selection.members) != (click.tool, click.after):
+        return None, work
+    past = work.past
+    if past.past and past.present.edit.selection.members == click.after != click.recorded:
+        if past.past[-1].edit.selection.members == click.recorded != click.before:
+            work = replace(work, past=history.merge(past))
+        click = replace(click, recorded=click.after)
+    same = click.options == (tool.tolerance, tool.through)
+    return (click, work) if same else _click(click, work, pointer)
+
+
+def _click(click: Click, work: Workspace, pointer: PointerContext) -> tuple[Click, Workspace]:
+    """What a click selects by the tool as it is now."""
+    options = work.view.select.tolerance, work.view.select.through
+    mask = clicked(click.tool, click.at, click.surface, *options, pointer.facts.neighborhood)
+    if mask is not None:
+        work = _apply(click, work, mask, pointer)
+    return replace(click, options=options, after=work.view.selection.members), work
+
+
+def follow(gesture: Gesture, work: Workspace, pointer: PointerContext) -> Held:
+    """The mouse is elsewhere with the button down; brush and sphere select at once."""
+    if gesture.tool == "polygon":
+        return gesture, work
+    density = imgui.get_io().display_framebuffer_scale.x * pointer.ui.scale
+    gesture = extend(gesture, pointer.cursor, work.view.select.radius * density)
+    if gesture.tool in ("brush", "sphere"):
+        work = _apply(gesture, work, _enclosed(gesture, work, pointer), pointer)
+    return gesture, work
+
+
+def release(gesture: Gesture, work: Workspace, pointer: PointerContext) -> Held:
+    """The left button went up; a polygon waits for its next corner."""
+    return (gesture, work) if gesture.tool == "polygon" else finish(gesture, work, pointer)
+
+
+def finish(gesture: Gesture, work: Workspace, pointer: PointerContext) -> Held:
+    """The gesture is over. A click in place of a shape selects nothing, and adds or takes away nothing."""
+    if gesture.tool not in ("box", "lasso", "polygon"):
+        return None, work
+    low, high = map(min, zip(*gesture.path, strict=True)), map(max, zip(*gesture.path, strict=True))
+    small = max(b - a for a, b in zip(low, high, strict=True)) <= _TRAVEL_PX * pointer.ui.scale
+    if not small:
+        return None, _apply(gesture, work, _enclosed(gesture, work, pointer), pointer)
+    return None, _with(work, selection.select_none(work.view.selection)) if gesture.mode == "new" else work
+
+
+def take_keys(
+    gesture: Gesture | None, work: Workspace, pointer: PointerContext, keys: Keys
+) -> tuple[Gesture | None, Workspace, Keys]:
+    """A polygon under way takes Enter, which closes it, and Escape, which drops it; others go on."""
+    pressed = [press.chord for press in keys.pressed]
+    if gesture is None or gesture.tool != "polygon" or imgui.get_io().want_text_input:
+        return gesture, work, keys
+    if work.view.select.tool != "polygon":
+        return None, work, keys
+    if "Enter" in pressed:
+        gesture, work = finish(gesture, work, pointer)
+    elif "Escape" in pressed:
+        gesture = None
+    left = tuple(press for press in keys.pressed if press.chord not in ("Enter", "Escape"))
+    return gesture, work, replace(keys, pressed=left)
+
+
+def _is_near(gesture: Gesture, pointer: PointerContext) -> bool:
+    """Whether the cursor is on the first corner of a polygon."""
+    (x, y), (cx, cy) = gesture.path[0], pointer.cursor
+    reach = _CLOSE_PX * pointer.ui.scale * imgui.get_io().display_framebuffer_scale.x
+    return len(gesture.path) > 2 and (x - cx) ** 2 + (y - cy) ** 2 <= reach * reach
+
+
+def _enclosed(gesture: Gesture, work: Workspace, pointer: PointerContext) -> Mask:
+    return enclosed(gesture, pointer.surface, work.view.select.through)
+
+
+def _apply(gesture: Gesture | Click, work: Workspace, mask: Mask, pointer: PointerContext) -> Workspace:
+    before = unpack(gesture.before, pointer.facts.count)
+    return _with(work, selection.select(work.view.selection, combine(before, mask, gesture.mode)))
+
+
+def _with(work: Workspace, state: selection.SelectionState) -> Workspace:
+    return replace(work, view=replace(work.view, selection=state))
+
+
+_HALO, _LINE = 3.0, 1.25  # widths at 1×
+
+
+def draw_gesture(gesture: Gesture | None, view: ViewState, ui: UiContext, left: int = 0) -> None:
+    """Draw it, in window coordinates; the ring of the brush also between its strokes.
+
+    Args:
+        left: the column in framebuffer pixels at which the picture begins
+    """
+    io, mouse = imgui.get_io(), imgui.get_mouse_pos()
+    over = not io.want_capture_mouse
+    if view.select.tool == "brush" and over:
+        _circle(mouse, view.select.radius * ui.scale, ui)
+    if gesture is None:
+        return
+    density = io.display_framebuffer_scale
+    path = [imgui.ImVec2((x + left) / density.x, y / density.y) for x, y in gesture.path]
+    first, last = path[0], path[-1]
+    if gesture.tool == "box":
+        corners = (imgui.ImVec2(last.x, first.y), last, imgui.ImVec2(first.x, last.y))
+        _line([first, *corners], True, ui)
+    elif gesture.tool == "lasso":
+        _line(path, True, ui)
+    elif gesture.tool == "polygon":
+        _line([*path, mouse] if over else path, False, ui)
+        for corner in path:
+            _dot(corner, ui)
+    elif gesture.tool == "sphere":
+        _circle(first, ((last.x - first.x) ** 2 + (last.y - first.y) ** 2) ** 0.5, ui)
+        _dot(first, ui)
+
+
+def _line(path: Sequence[imgui.ImVec2], closed: bool, ui: UiContext) -> None:
+    canvas = imgui.get_background_draw_list()
+    flags = imgui.ImDrawFlags_.closed.value if closed else 0
+    for color, width in ((_DARK, _HALO), (PALETTE.handle, _LINE)):
+        canvas.add_polyline([*path], u32(color), width * ui.scale, flags)
+
+
+def _circle(center: imgui.ImVec2, radius: float, ui: UiContext) -> None:
+    canvas = imgui.get_background_draw_list()
+    for color, width in ((_DARK, _HALO), (PALETTE.handle, _LINE)):
+        canvas.add_circle(center, radius, u32(color), 0, width * ui.scale)
+
+
+def _dot(center: imgui.ImVec2, ui: UiContext) -> None:
+    canvas = imgui.get_background_draw_list()
+    for color, radius in ((_DARK, 4.5), (PALETTE.handle, 3.0)):
+        canvas.add_circle_filled(center, radius * ui.scale, u32(color))
+
+
+_DARK = (0.0, 0.0, 0.0, 0.5)

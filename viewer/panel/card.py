@@ -1,0 +1,410 @@
+"""One layer in the panel: eye, name, strength, slider, and below it the curve of its change and its gains."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+from imgui_bundle import imgui
+
+from viewer.state.facts import STEPS, LayerRow
+from viewer.state.layers import (
+    SLIDERS,
+    change_layer,
+    largest_strength,
+    rename_layer,
+    slider_value,
+    toggle_details,
+    toggle_solo,
+    with_slider_value,
+)
+from viewer.state.view_state import LayerState, ViewState
+from viewer.state.workspace import Workspace, is_compact
+from viewer.ui.context import PALETTE, SMALL_PX, Icon, Rgba, UiContext, u32
+from viewer.ui.keys import shortcut
+from viewer.ui.widgets import (
+    elide,
+    grip,
+    group_digits,
+    icon_button,
+    label,
+    menu,
+    right_edge,
+    small,
+    small_toggle,
+    swatch,
+    tip,
+    typed_name,
+    value_slider,
+)
+
+from . import slider
+
+CURVE_PX = 52.0  # at 1×
+GAINS = SLIDERS[1:]
+
+
+def draw_details(
+    layer: LayerState, row: LayerRow, active_slider: str | None, most: float, ui: UiContext
+) -> LayerState:
+    """Draw the curve and the gains.
+
+    Args:
+        layer: what they show
+        row: of its .gdf
+        active_slider: what the arrow keys move; None where they move another layer
+        most: the upper end of the strength
+        ui: fonts and scale
+    """
+    _curve(row, layer.strength, most, ui)
+    imgui.begin_disabled(layer.locked)
+    for kind in GAINS:
+        layer = _gain(layer, kind, kind in row.kinds, kind == active_slider, ui)
+    imgui.end_disabled()
+    return layer
+
+
+def _gain(layer: LayerState, kind: str, moves: bool, active: bool, ui: UiContext) -> LayerState:
+    """One gain: a slider as the others of the panel."""
+    if active:
+        imgui.push_style_color(imgui.Col_.text_disabled, imgui.ImVec4(*PALETTE.accent))
+    label(kind.capitalize(), 84.0 * ui.scale)
+    if active:
+        imgui.pop_style_color()
+    imgui.begin_disabled(not moves)
+    value = slider_value(layer, kind)
+    new = value_slider(f"##{kind}", value, (0.0, 1.0), "%.2f", 1.0, ui)
+    imgui.end_disabled()
+    if moves:
+        tip(f"How much of the {kind} change is applied (Tab, then arrow keys). Double-click: reset to 1")
+    else:
+        tip(f"This edit does not change the {kind}")
+    return layer if new == value else with_slider_value(layer, kind, new)
+
+
+def value_at(curve: Sequence[float], strength: float) -> float:
+    """The curve at a strength, linear between its points; its last value beyond them."""
+    step = max(strength, 0.0) * STEPS
+    low = min(int(step), len(curve) - 1)
+    high = min(low + 1, len(curve) - 1)
+    return curve[low] + (curve[high] - curve[low]) * min(step - low, 1.0)
+
+
+def _curve(row: LayerRow, strength: float, most: float, ui: UiContext) -> None:
+    """Visible change over the strength, under the slider's track and to its measure."""
+    curve = row.curve()[: round(most * STEPS) + 1]
+    if not curve:
+        return
+    scale, p = ui.scale, PALETTE
+    left, top = imgui.get_cursor_screen_pos()
+    width, height = imgui.get_content_region_avail().x, CURVE_PX * scale
+    imgui.dummy(imgui.ImVec2(width, height))
+    tip(
+        "Visible change against strength, measured in small renders of this region; 1 is the full edit."
+        f"\nTicks: {len(row.recorded)} recorded snapshots."
+    )
+    canvas, radius = imgui.get_window_draw_list(), 7.0 * scale
+    start, span = left + radius, (width - 2 * radius) / most
+    foot, rise = top + height - 4.0 * scale, (height - 10.0 * scale) / max(1.0, *curve)
+    canvas.add_rect_filled(
+        imgui.ImVec2(left, top), imgui.ImVec2(left + width, top + height), u32(p.panel), 4 * scale
+    )
+    if most > 1.0:
+        beyond = imgui.ImVec2(start + span, top), imgui.ImVec2(left + width, top + height)
+        canvas.add_rect_filled(*beyond, u32((*p.warning_dark[:3], 0.35)), 4 * scale)
+    for tick in row.recorded:
+        x = round(start + tick * span) + 0.5
+        ends = imgui.ImVec2(x, foot - 6 * scale), imgui.ImVec2(x, foot)
+        canvas.add_line(*ends, u32(p.faint), max(1.0, scale))
+    canvas.add_line(imgui.ImVec2(start, foot), imgui.ImVec2(start + most * span, foot), u32(p.line), scale)
+    for i in range(len(curve) - 1):
+        a, b = (imgui.ImVec2(start + j / STEPS * span, foot - curve[j] * rise) for j in (i, i + 1))
+        canvas.add_line(a, b, u32(p.warning if i >= STEPS else p.accent), 1.5 * scale)
+    share = value_at(curve, strength)
+    at = imgui.ImVec2(start + strength * span, foot - share * rise)
+    canvas.add_circle_filled(at, 4.5 * scale, u32(p.panel))
+    canvas.add_circle_filled(at, 3.0 * scale, u32(p.handle))
+    corner = imgui.ImVec2(round(left + 6 * scale), round(top + 3 * scale))
+    canvas.add_text(ui.fonts.regular, SMALL_PX * scale, corner, u32(p.dim), f"change {100 * share:.0f} %")
+
+
+TOGGLE_PX = 24.0
+CARD_PX = 97.0  # a whole card with what is between two, at 1×
+COMPACT_PX, SLIDER_PX, SLIM_PX = 7.0, 92.0, 16.0  # a compact row: its padding, its slider's width and height
+_MENU = "menu of a layer"
+_MENU_ITEMS = (
+    ("Rename…", "rename"),
+    ("Duplicate", "duplicate"),
+    ("Replace…", "replace"),
+    ("", ""),
+    ("Delete", "remove"),
+    ("", ""),
+    ("Copy values", "copy_values"),
+    ("Paste values", "paste_values"),
+    ("Reset values", "reset"),
+    ("", ""),
+    ("Group", "group"),
+    ("Select all layers", "select_layers"),
+    ("Reset all layers", "reset_all"),
+)
+_OF_ONE = ("rename", "duplicate", "replace", "remove")
+"""Actions that are told which layer; the others are about all that are selected."""
+
+
+@dataclass(frozen=True)
+class CardTouch:
+    """What the hand does with one card."""
+
+    touched: bool = False  # it becomes the focused layer, unless `press` says otherwise
+    drag: str = ""  # of its name, see `grip`
+    press: str = ""  # of `layer_selection.PRESSES`; "" where no button went down on it
+    named: bool = False  # the button is down on its name
+
+
+def draw_card(
+    work: Workspace, index: int, active: bool, rows: Sequence[LayerRow], ui: UiContext, actions: list[str]
+) -> tuple[Workspace, CardTouch]:
+    """One card: eye, swatch, name and value; the slider; count and toggles; unfolded, curve and gains.
+
+    Where cards are compact, a row with the eye, the swatch, the name, a short slider and the value.
+
+    Args:
+        active: the layer takes part in the picture
+        rows: one per .gdf, indexed by `LayerState.gdf`
+    """
+    scale, p, compact = ui.scale, PALETTE, is_compact(work)
+    layer, focused = work.view.layers[index], work.focus == index
+    selected = focused or layer.gdf in work.selected
+    row, most = rows[layer.gdf], largest_strength(work.view)
+    imgui.push_id(index)
+    canvas = imgui.get_window_draw_list()
+    clip = canvas.get_clip_rect_min(), canvas.get_clip_rect_max()
+    _begin_card(selected, compact, scale)
+    right = right_edge()
+    work, touch = _head(work, index, row, active, ui)
+    number_at, layer = imgui.get_item_rect_min(), work.view.layers[index]
+    if compact:
+        imgui.same_line(right - SLIDER_PX * scale - _number_width(layer, compact) - 6.0 * scale)
+        imgui.set_cursor_pos_y(imgui.get_cursor_pos_y() + (imgui.get_frame_height() - SLIM_PX * scale) / 2)
+    imgui.begin_disabled(layer.locked)
+    strength = slider.draw(
+        "##strength",
+        layer.strength,
+        row.recorded,
+        SLIDER_PX * scale if compact else imgui.get_content_region_avail().x,
+        scale,
+        fill=p.accent if selected else p.accent_dark,
+        active=active,
+        most=most,
+        height=SLIM_PX if compact else slider.HEIGHT_PX,
+    )
+    touched = touch.touched or imgui.is_item_active()
+    imgui.end_disabled()
+    _number(number_at, strength, active, compact)
+    if strength != layer.strength:  # a new state takes its time, and most cards rest
+        work = _change_layer(work, index, lambda old: replace(old, strength=strength))
+    if not compact:
+        work = _foot(work, index, row, ui)
+    if layer.gdf in work.view.unfolded:
+        active_slider = work.active_slider if focused else None
+        unfolded = draw_details(work.view.layers[index], row, active_slider, most, ui)
+        work = _change_layer(work, index, lambda _: unfolded)
+        if compact:
+            imgui.dummy(imgui.ImVec2(0.0, 2.0 * scale))
+    over = imgui.is_window_hovered(imgui.HoveredFlags_.allow_when_blocked_by_active_item.value)
+    press = _press(touch.named) if over and imgui.is_mouse_clicked(imgui.MouseButton_.left.value) else ""
+    several, alone = len(work.selected) if selected else 0, imgui.get_id("alone")
+    if press:  # one of several may be dragged with the others: a click makes it the only one as it ends
+        imgui.get_state_storage().set_bool(alone, press == "one" and several > 1)
+        press = "keep" if press == "one" and several > 1 else press
+    if touch.drag == "clicked" and imgui.get_state_storage().get_bool(alone):
+        press = "one"
+    down = imgui.is_mouse_down(imgui.MouseButton_.left.value)  # then the right button cancels its drag
+    if over and not down and imgui.is_mouse_clicked(imgui.MouseButton_.right.value):
+        press = "keep"
+        imgui.open_popup(_MENU)
+    _menu(work.view, index, several, ui, actions)
+    if selected:
+        _focus_bar(clip, p.accent if focused else p.accent_dark, scale)
+    imgui.end_child()
+    imgui.pop_style_color()
+    imgui.pop_id()
+    return work, replace(touch, touched=touched or bool(press), press=press)
+
+
+def _begin_card(selected: bool, compact: bool, scale: float) -> None:
+    color = PALETTE.card_focused if selected else PALETTE.card
+    imgui.push_style_color(imgui.Col_.child_bg, imgui.ImVec4(*color))
+    padding = (COMPACT_PX, 0.0) if compact else (10.0, 8.0)
+    imgui.push_style_var(imgui.StyleVar_.window_padding, imgui.ImVec2(*(side * scale for side in padding)))
+    flags = imgui.ChildFlags_.auto_resize_y.value | imgui.ChildFlags_.always_use_window_padding.value
+    imgui.begin_child("card", imgui.ImVec2(0.0, 0.0), flags, imgui.WindowFlags_.no_nav.value)
+    imgui.pop_style_var()  # here, as tips and menus have paddings of their own
+
+
+def _change_layer(work: Workspace, index: int, change: Callable[[LayerState], LayerState]) -> Workspace:
+    return replace(work, view=change_layer(work.view, index, change))
+
+
+def _press(named: bool) -> str:
+    """What the press on the card does to the selection, of `layer_selection.PRESSES`.
+
+    On a button or a slider the modifiers have their own sense.
+    """
+    if imgui.is_any_item_active() and not named:
+        return "keep"
+    io = imgui.get_io()
+    return "toggle" if io.key_ctrl else "range" if io.key_shift else "one"
+
+
+def _menu(state: ViewState, index: int, several: int, ui: UiContext, actions: list[str]) -> None:
+    """What can be done with a layer as a whole.
+
+    Args:
+        several: how many layers are selected with it, 0 for it alone
+    """
+    with menu(_MENU, ui) as is_open:
+        for name, action in _MENU_ITEMS if is_open else ():
+            if action == "group":
+                _group_menu(state, state.layers[index], ui, actions)
+                continue
+            if name == "Delete" and several > 1:
+                name = f"Delete {several} layers"
+            if not name:
+                imgui.separator()
+            elif imgui.menu_item(name, shortcut(action), False)[0]:
+                actions.append(f"{action}:{index}" if action in _OF_ONE else action)
+
+
+def _group_menu(state: ViewState, layer: LayerState, ui: UiContext, actions: list[str]) -> None:
+    if imgui.begin_menu("Group"):
+        if imgui.menu_item("New group", shortcut("group"), False)[0]:
+            actions.append("group")
+        for group in state.groups:
+            name = elide(group.name, 200.0 * ui.scale)
+            if imgui.menu_item(f"{name}##{group.name}", "", group.name == layer.group)[0]:
+                actions.append(f"group:{group.name}")
+        if layer.group and imgui.menu_item("Ungroup", shortcut("ungroup"), False)[0]:
+            actions.append("ungroup")
+        imgui.end_menu()
+
+
+def _focus_bar(clip: tuple[imgui.ImVec2, imgui.ImVec2], color: Rgba, scale: float) -> None:
+    """A stripe along the left edge of the card that is being drawn, in the panel's clip."""
+    canvas, corner = imgui.get_window_draw_list(), imgui.get_window_pos()
+    edge = imgui.ImVec2(corner.x + 3 * scale, corner.y + imgui.get_window_size().y)
+    canvas.push_clip_rect(*clip, False)
+    canvas.add_rect_filled(corner, edge, u32(color), 3 * scale)
+    canvas.pop_clip_rect()
+
+
+def _head(
+    work: Workspace, index: int, row: LayerRow, active: bool, ui: UiContext
+) -> tuple[Workspace, CardTouch]:
+    """Eye, swatch, name, and last the place of the number, which is drawn when the slider has its value."""
+    scale, compact, layer = ui.scale, is_compact(work), work.view.layers[index]
+    right, gap = right_edge(), 4.0 * scale if compact else imgui.get_style().item_spacing.x
+    if icon_button("eye", Icon.SHOWN if layer.enabled else Icon.HIDDEN, ui, dim=not active):
+        if imgui.get_io().key_alt:
+            work = replace(work, view=toggle_solo(work.view, index))
+        else:
+            work = _change_layer(work, index, lambda old: replace(old, enabled=not old.enabled))
+    tip(f"Show or hide ({shortcut('hide')}). Alt+click: solo")
+    imgui.same_line(0.0, gap)
+    swatch(row.swatch, 1.0 if active else 0.35, True, ui)
+    imgui.same_line(0.0, gap)
+    number_width = _number_width(layer, compact)
+    room = right - number_width - 10 * scale - imgui.get_cursor_pos_x()
+    room -= SLIDER_PX * scale if compact else 0.0
+    work, touch = _name(work, index, room, active, ui)
+    imgui.same_line(right - number_width)
+    imgui.dummy(imgui.ImVec2(number_width, imgui.get_frame_height()))
+    if imgui.is_item_clicked() and not layer.locked:
+        slider.start_typing("##strength")
+    tip(*("Locked", "lock") if layer.locked else ("Click to type a value",))
+    return work, touch
+
+
+def _digits(strength: float, compact: bool) -> str:
+    return f"{strength:.2f}" if compact else f"{strength:.3f}"
+
+
+def _number_width(layer: LayerState, compact: bool) -> float:
+    return float(imgui.calc_text_size(_digits(layer.strength, compact)).x)
+
+
+def _number(corner: imgui.ImVec2, strength: float, active: bool, compact: bool) -> None:
+    """The strength in the card's upper right corner; every digit is equally wide."""
+    beyond = PALETTE.warning if strength > 1.0 else PALETTE.text
+    at = imgui.ImVec2(corner.x, corner.y + imgui.get_style().frame_padding.y)
+    text = _digits(strength, compact)
+    imgui.get_window_draw_list().add_text(at, u32(beyond if active else PALETTE.dim), text)
+
+
+def _name(
+    work: Workspace, index: int, room: float, active: bool, ui: UiContext
+) -> tuple[Workspace, CardTouch]:
+    """The name: dragged it moves the card, double-clicked it becomes a text field."""
+    layer = work.view.layers[index]
+    if work.renaming == index:
+        text = typed_name(layer.name, room)
+        if text is not None:
+            work = replace(work, renaming=None, view=rename_layer(work.view, index, text))
+        return work, CardTouch()
+    x, y = imgui.get_cursor_screen_pos()
+    imgui.invisible_button("name", imgui.ImVec2(max(room, 1.0), imgui.get_frame_height()))
+    gesture, named = grip(ui), imgui.is_item_active()
+    at = imgui.ImVec2(x, y + imgui.get_style().frame_padding.y)
+    color, compact = PALETTE.text if active else PALETTE.dim, is_compact(work)
+    marks = f"{Icon.LOCKED} " * (layer.locked and compact) + "S " * (layer.solo and compact)
+    imgui.get_window_draw_list().add_text(at, u32(color), elide(marks + layer.name, room))
+    if imgui.is_item_hovered(imgui.HoveredFlags_.for_tooltip.value):
+        work = replace(work, pointed=("layer", index))  # the picture shows its region
+    tip(f"{layer.name}\nDrag to reorder (Alt+↑ ↓), double-click to rename", "rename")
+    double = imgui.is_mouse_double_clicked(imgui.MouseButton_.left.value) and _press(named) == "one"
+    if imgui.is_item_hovered() and double:
+        return replace(work, renaming=index), CardTouch(touched=True, named=named)
+    return work, CardTouch(drag=gesture, named=named)
+
+
+def _foot(work: Workspace, index: int, row: LayerRow, ui: UiContext) -> Workspace:
+    """Count, overlap and instruction; at the right alone, lock, the fold and the menu."""
+    layer, wide = work.view.layers[index], TOGGLE_PX * ui.scale
+    right, left = right_edge(), imgui.get_cursor_pos_x()
+    overlaps = [
+        (other.name, row.shared[other.gdf])
+        for i, other in enumerate(work.view.layers)
+        if i != index and other.gdf < len(row.shared) and row.shared[other.gdf]
+    ]
+    note = f"{group_digits(row.count)} splats"
+    if len(overlaps) == 1:
+        name, count = overlaps[0]
+        note += f"  ·  {'all' if count == row.count else group_digits(count)} in {name}"
+    elif overlaps:
+        note += f"  ·  overlaps {len(overlaps)} layers"
+    elif row.instruction:
+        note += f"  ·  {row.instruction}"
+    small(note, PALETTE.dim, right - left - 4 * wide - 6.0 * ui.scale)
+    if overlaps and imgui.is_item_hovered(imgui.HoveredFlags_.for_tooltip.value):
+        work = replace(work, overlap=index)
+    shared = [f"{group_digits(count)} of its splats are also in {name}" for name, count in overlaps]
+    shared += ["Highlighted in pink"] if overlaps else []
+    tip("\n".join((f"{group_digits(row.count)} splats", *filter(None, [row.instruction]), *shared)))
+    view = work.view
+    imgui.same_line(right - 4 * wide)
+    if small_toggle("solo", "S", layer.solo, wide, ui):
+        view = toggle_solo(view, index)
+    tip("Solo: show only soloed layers", "solo")
+    imgui.same_line(right - 3 * wide)
+    if small_toggle("lock", Icon.LOCKED if layer.locked else Icon.UNLOCKED, layer.locked, wide, ui):
+        view = change_layer(view, index, lambda old: replace(old, locked=not old.locked))
+    tip("Lock strength, gains and paint", "lock")
+    imgui.same_line(right - 2 * wide)
+    if small_toggle("fold", Icon.GAINS, layer.gdf in view.unfolded, wide, ui):
+        view = toggle_details(view, index)
+    tip("Show gains and the curve of visible change", "fold")
+    imgui.same_line(right - wide)
+    if small_toggle("menu", Icon.MENU, False, wide, ui):
+        imgui.open_popup(_MENU)
+    tip("Rename, duplicate, replace or delete (right-click)")
+    return work if view is work.view else replace(work, view=view)

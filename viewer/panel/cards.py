@@ -1,0 +1,444 @@
+"""The stack of edits in the panel: cards under the rows of their groups, the search, the selected layers."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+from imgui_bundle import imgui
+
+from progdf.compose.reference import BLENDS
+from viewer.state.facts import LayerRow
+from viewer.state.layer_selection import filter_layers, master_strength, selected_layers
+from viewer.state.layers import (
+    change_group,
+    largest_strength,
+    move_layers,
+    toggle_collapsed,
+    visible_layers,
+    with_overshoot,
+)
+from viewer.state.view_state import OVERSHOOT, LayerGroup, ViewState
+from viewer.state.workspace import Workspace, is_compact
+from viewer.ui.context import PALETTE, SMALL_PX, Icon, UiContext, u32
+from viewer.ui.keys import shortcut
+from viewer.ui.widgets import (
+    drop_down,
+    elide,
+    grip,
+    icon_button,
+    menu,
+    right_edge,
+    section,
+    small,
+    tip,
+    typed_name,
+)
+
+from . import slider
+from .card import COMPACT_PX, SLIDER_PX, SLIM_PX, draw_card
+
+MASTER_PX = 20.0  # of its slider, at 1×
+UNSEARCHED = 6
+"""Layers that one finds without a search."""
+_BUTTONS = (
+    ("Group", "group", "Put them into a group with a switch and a strength of its own"),
+    ("Copy", "copy_values", "Copy their strengths and gains, as text"),
+    ("Paste", "paste_values", "Paste copied strengths and gains"),
+    ("Reset", "reset", "Strengths to 0, gains to 1"),
+)
+
+
+def draw_search(work: Workspace, ui: UiContext, actions: list[str]) -> str:
+    """The field of the search and the switch of compact rows, where there are many layers; what is typed."""
+    if not (len(work.view.layers) > UNSEARCHED or work.searching or work.search):
+        return work.search
+    compact = is_compact(work)
+    side, gap = imgui.get_frame_height(), 4.0 * ui.scale
+    buttons = 1 + bool(work.search)
+    imgui.set_next_item_width(imgui.get_content_region_avail().x - buttons * (side + gap))
+    if work.searching:
+        imgui.set_keyboard_focus_here()
+    flags = imgui.InputTextFlags_.escape_clears_all.value | imgui.InputTextFlags_.auto_select_all.value
+    _, text = imgui.input_text_with_hint("##search", "Search by name, region, group", work.search, flags)
+    tip(f"Only layers with all these words ({shortcut('search')}). Esc: show all")
+    if work.search:
+        imgui.same_line(0.0, gap)
+        if icon_button("clear", Icon.CLOSE, ui):
+            text = ""
+        tip("Show all layers")
+    imgui.same_line(0.0, gap)
+    if icon_button("cards", Icon.FULL if compact else Icon.COMPACT, ui, dim=False):
+        actions.append("cards")
+    tip("Whole cards" if compact else "Compact rows", "cards")
+    return str(text)
+
+
+def selection_height(chosen: Sequence[int], ui: UiContext) -> float:
+    """Of `selection`, window pixels; 0 where it is not shown."""
+    if len(chosen) < 2:
+        return 0.0
+    spacing = imgui.get_style().item_spacing.y
+    return (SMALL_PX + 6.0 + MASTER_PX) * ui.scale + 3 * spacing
+
+
+def draw_selection(state: ViewState, chosen: Sequence[int], ui: UiContext, actions: list[str]) -> None:
+    """The strength of several selected layers and what is done with all of them, under the cards."""
+    if len(chosen) < 2:
+        return
+    imgui.separator()
+    right = right_edge()
+    imgui.push_style_var(imgui.StyleVar_.frame_padding, imgui.ImVec2(6.0 * ui.scale, 3.0 * ui.scale))
+    section(f"{len(chosen)} layers", ui)
+    imgui.push_font(None, SMALL_PX)
+    gap = 4.0 * ui.scale
+    wide = [imgui.calc_text_size(name).x + 12.0 * ui.scale for name, _, _ in _BUTTONS]
+    imgui.same_line(right - sum(wide) - gap * (len(wide) - 1))
+    for i, (name, action, help_) in enumerate(_BUTTONS):
+        if i:
+            imgui.same_line(0.0, gap)
+        if imgui.button(f"{name}##layers", imgui.ImVec2(wide[i], 0.0)):
+            actions.append(action)
+        tip(help_, action)
+    imgui.pop_font()
+    imgui.pop_style_var()
+    value, most = master_strength(state, chosen), largest_strength(state)
+    number = imgui.calc_text_size(f"{value:.3f}").x
+    imgui.begin_disabled(all(state.layers[i].locked for i in chosen))
+    at = imgui.get_cursor_screen_pos()
+    room = imgui.get_content_region_avail().x - number - 8.0 * ui.scale
+    help_ = "Strength of all selected layers: that of the strongest; the others keep their proportion to it"
+    new = slider.draw(
+        "##master", value, (), room, ui.scale, PALETTE.accent, most=most, height=MASTER_PX, help_=help_
+    )
+    imgui.end_disabled()
+    corner = imgui.ImVec2(at.x + room + 8.0 * ui.scale, at.y)
+    imgui.get_window_draw_list().add_text(corner, u32(PALETTE.text), f"{new:.3f}")
+    if new != value:
+        actions.append(f"master:{new!r}")
+
+
+_MENU = "menu of a group"
+_ITEMS = (("Rename…", ""), ("Select layers", ""), ("Ungroup", "ungroup"))
+
+
+def draw_group(
+    state: ViewState, group: LayerGroup, count: int, ui: UiContext, actions: list[str]
+) -> tuple[ViewState, str]:
+    """The row of a group of `count` layers; the changed state, and what the hand does with it, see `grip`.
+
+    What was asked for goes into `actions`.
+    """
+    scale, folded = ui.scale, group.name in state.collapsed
+    imgui.push_id(f"group {group.name}")
+    imgui.begin_group()
+    right = right_edge() - COMPACT_PX * scale
+    if _fold(folded, ui):
+        state = toggle_collapsed(state, group.name)
+    tip("List its layers, or not")
+    imgui.same_line(0.0, 0.0)
+    if icon_button("eye", Icon.SHOWN if group.enabled else Icon.HIDDEN, ui, dim=not group.enabled):
+        state = change_group(state, group.name, lambda old: replace(old, enabled=not old.enabled))
+    tip("Show or hide the group")
+    imgui.same_line(0.0, 4.0 * scale)
+    number = f"{group.strength:.2f}"
+    wide = imgui.calc_text_size(number).x
+    slider_at = right - wide - (SLIDER_PX + 6.0) * scale
+    corner, gesture = _group_name(
+        state, group, count, slider_at - 6.0 * scale - imgui.get_cursor_pos_x(), ui, actions
+    )
+    imgui.same_line(slider_at)
+    imgui.set_cursor_pos_y(imgui.get_cursor_pos_y() + (imgui.get_frame_height() - SLIM_PX * scale) / 2)
+    strength = slider.draw(
+        "##factor",
+        group.strength,
+        (),
+        SLIDER_PX * scale,
+        scale,
+        PALETTE.accent_dark,
+        group.enabled,
+        height=SLIM_PX,
+        default=LayerGroup.strength,
+        help_="What the strengths of its layers are multiplied by. Double-click: reset to 1",
+    )
+    number_at = imgui.ImVec2(imgui.get_item_rect_max().x + 6.0 * scale, corner.y)
+    color = u32(PALETTE.text if group.enabled else PALETTE.dim)
+    imgui.get_window_draw_list().add_text(number_at, color, f"{strength:.2f}")
+    imgui.end_group()
+    imgui.pop_id()
+    if strength == group.strength:
+        return state, gesture
+    return change_group(state, group.name, lambda old: replace(old, strength=strength)), gesture
+
+
+def _fold(folded: bool, ui: UiContext) -> bool:
+    """The arrow at the left; True when it was pressed."""
+    wide, tall = 16.0 * ui.scale, imgui.get_frame_height()
+    x, y = imgui.get_cursor_screen_pos()
+    pressed = imgui.invisible_button("fold", imgui.ImVec2(wide, tall))
+    arrow = Icon.FOLDED if folded else Icon.UNFOLDED
+    size = imgui.calc_text_size(arrow)
+    at = imgui.ImVec2(round(x + (wide - size.x) / 2), round(y + (tall - size.y) / 2))
+    color = PALETTE.text if imgui.is_item_hovered() else PALETTE.dim
+    imgui.get_window_draw_list().add_text(at, u32(color), arrow)
+    return bool(pressed)
+
+
+def _group_name(
+    state: ViewState, group: LayerGroup, count: int, room: float, ui: UiContext, actions: list[str]
+) -> tuple[imgui.ImVec2, str]:
+    """The name and its menu; the corner of its text, and what the hand does with it.
+
+    A click selects the layers, a second one renames, a drag moves them.
+    """
+    storage, naming = imgui.get_state_storage(), imgui.get_id("naming")
+    x, y = imgui.get_cursor_screen_pos()
+    corner = imgui.ImVec2(x, y + imgui.get_style().frame_padding.y)
+    if storage.get_bool(naming):
+        name = typed_name(group.name, room)
+        storage.set_bool(naming, name is None)
+        actions += [f"rename_group:{state.groups.index(group)}:{name}"] if name else []
+        return corner, ""
+    imgui.invisible_button("name", imgui.ImVec2(max(room, 1.0), imgui.get_frame_height()))
+    gesture = grip(ui)
+    if gesture == "clicked":
+        actions.append(f"select_layers:{group.name}")
+    hovered = imgui.is_item_hovered()
+    tip(f"{group.name}, {count} layers\nClick to select them, drag to reorder, double-click to rename")
+    if hovered and imgui.is_mouse_double_clicked(imgui.MouseButton_.left.value):
+        storage.set_bool(naming, True)
+    if imgui.is_item_clicked(imgui.MouseButton_.right.value):
+        imgui.open_popup(_MENU)
+    imgui.push_font(ui.fonts.bold, 0.0)
+    color = PALETTE.handle if hovered else PALETTE.text if group.enabled else PALETTE.dim
+    imgui.get_window_draw_list().add_text(corner, u32(color), elide(group.name, room))
+    imgui.pop_font()
+    with menu(_MENU, ui) as is_open:
+        chosen = [
+            name for name, action in _ITEMS if is_open and imgui.menu_item(name, shortcut(action), False)[0]
+        ]
+    if chosen == ["Rename…"]:
+        storage.set_bool(naming, True)
+    elif chosen:
+        actions.append(f"{'ungroup' if chosen == ['Ungroup'] else 'select_layers'}:{group.name}")
+    return corner, gesture
+
+
+HEADING_PX = 34.0  # at 1×: above the cards
+_DRAGS = ("dragged", "dropped")
+INSET_PX = 10.0  # of a group's layers, at 1×
+BLEND_HELP = {
+    "normalized": "Overlapping edits are averaged by weight; never more than a full edit.",
+    "sum": "Overlapping edits add up.",
+    "over": "An edit covers those below it, where and as far as it changes something.",
+}
+
+
+@dataclass(frozen=True)
+class _Row:
+    """A card in the list, or the row over a group."""
+
+    top: float  # window pixels
+    bottom: float
+    layers: tuple[int, ...]  # places of what is dragged with it, in `ViewState.layers`
+    group: str  # its own, or that of its layer
+    heads: bool = False  # it is the row over a group
+
+
+def heading(state: ViewState, form_open: bool, ui: UiContext, actions: list[str]) -> ViewState:
+    """The heading of the stack: a new edit, overshoot, and the blend rule where layers can overlap."""
+    right = right_edge()
+    section("Edits", ui)
+    imgui.same_line(0.0, 8.0 * ui.scale)
+    _new_button(form_open, actions)
+    if not state.layers:
+        return state
+    combo = 118.0 * ui.scale if len(state.layers) > 1 else 0.0
+    wide = 40.0 * ui.scale
+    imgui.same_line(right - combo - wide - (6.0 * ui.scale if combo else 0.0))
+    state = _overshoot(state, wide)
+    if not combo:
+        return state
+    imgui.same_line(right - combo)
+    imgui.set_next_item_width(combo)
+    titles, now = [blend.capitalize() for blend in BLENDS], BLENDS.index(state.blend)
+    help_ = f"Where edits overlap ({shortcut('blend')}): " + BLEND_HELP[state.blend]
+    pressed = drop_down(
+        "##blend", titles[now], titles, now, ui, help_, [BLEND_HELP[blend] for blend in BLENDS]
+    )
+    return state if pressed is None else replace(state, blend=BLENDS[pressed])
+
+
+def _new_button(form_open: bool, actions: list[str]) -> None:
+    imgui.push_style_color(
+        imgui.Col_.button, imgui.ImVec4(*(PALETTE.accent_dark if form_open else PALETTE.field))
+    )
+    if imgui.button("+ New##edit"):
+        actions.append("new_edit")
+    imgui.pop_style_color()
+    tip(f"New edit ({shortcut('new_edit')}): choose a region and an editor, see it, train it")
+
+
+def _overshoot(state: ViewState, width: float) -> ViewState:
+    on = state.overshoot
+    for slot, color in (
+        (imgui.Col_.button, PALETTE.warning_dark if on else PALETTE.field),
+        (imgui.Col_.text, PALETTE.text if on else PALETTE.dim),
+    ):
+        imgui.push_style_color(slot, imgui.ImVec4(*color))
+    imgui.push_style_var(imgui.StyleVar_.frame_padding, imgui.ImVec2(0.0, imgui.get_style().frame_padding.y))
+    if imgui.button(f"{OVERSHOOT:g}##overshoot", imgui.ImVec2(width, 0.0)):
+        state = with_overshoot(state, not on)
+    imgui.pop_style_var()
+    imgui.pop_style_color(2)
+    tip(f"Overshoot to {OVERSHOOT:g} ({shortcut('overshoot')}): extrapolates past the trained range")
+    return state
+
+
+def draw(
+    work: Workspace, rows: Sequence[LayerRow], reveal: bool, ui: UiContext, actions: list[str]
+) -> Workspace:
+    """All cards, under the rows of their groups.
+
+    Args:
+        rows: one per .gdf, indexed by `LayerState.gdf`
+        reveal: scroll to the focused layer, and to what is cut of the selected ones
+    """
+    if not (work.view.layers or work.jobs or work.form_open):
+        imgui.push_text_wrap_pos(0.0)
+        imgui.text_disabled(
+            f"No edits yet. Make one ({shortcut('new_edit')}), or drop a .gdf file on the window."
+        )
+        imgui.pop_text_wrap_pos()
+    work = replace(
+        work,
+        overlap=None,
+        pointed=None,
+        search=draw_search(work, ui, actions) if work.view.layers else "",
+        searching=False,
+    )
+    texts = [f"{row.region} {row.instruction}" for row in rows]
+    # as seen: the top layer, which is the last one, first
+    listed = filter_layers(work.view, texts, work.search)[::-1]
+    focus, group = work.focus, ""
+    dragged, gesture = -1, ""  # one of the lines, and what the hand does with it
+    lines: list[_Row] = []
+    visible = {layer.name for layer in visible_layers(work.view)}
+    for i in listed:
+        layer = work.view.layers[i]
+        if layer.group and layer.group != group:
+            top = imgui.get_cursor_screen_pos().y
+            view, drag = _group(work.view, layer.group, ui, actions)
+            work = replace(work, view=view)
+            dragged, gesture = (len(lines), drag) if drag in _DRAGS else (dragged, gesture)
+            layers = tuple(at for at, other in enumerate(view.layers) if other.group == layer.group)
+            lines.append(_Row(top, imgui.get_item_rect_max().y, layers, layer.group, heads=True))
+            _tighten(work, ui)
+        group = layer.group
+        if group in work.view.collapsed and not work.search:
+            continue
+        top, left = imgui.get_cursor_screen_pos().y, imgui.get_cursor_pos_x()
+        imgui.set_cursor_pos_x(left + INSET_PX * ui.scale * bool(group))
+        work, touch = draw_card(work, i, layer.name in visible, rows, ui, actions)
+        dragged, gesture = (len(lines), touch.drag) if touch.drag in _DRAGS else (dragged, gesture)
+        lines.append(_Row(top, imgui.get_item_rect_max().y, (i,), group))
+        _tighten(work, ui)
+        cut = layer.gdf in work.selected and imgui.is_item_visible()
+        if reveal and (work.focus == i or cut):
+            imgui.internal.scroll_to_item(imgui.internal.ScrollFlags_.keep_visible_edge_y.value)
+        focus = i if touch.touched and touch.press in ("", "one", "keep") else focus
+        if touch.press and (work.selected or touch.press in ("toggle", "range")):
+            actions.append(f"press_layer:{touch.press}:{i}:{','.join(str(i) for i in listed)}")
+    if work.view.layers and not listed:
+        small("No layer has these words", PALETTE.dim)
+    if work.renaming is not None and not any(l.layers == (work.renaming,) and not l.heads for l in lines):
+        work = replace(work, renaming=None)
+    if gesture:
+        view, focus = _drag(work, focus, lines, dragged, gesture, ui)
+        work = replace(work, view=view)
+    return replace(work, focus=focus)
+
+
+def _group(state: ViewState, name: str, ui: UiContext, actions: list[str]) -> tuple[ViewState, str]:
+    """The row of a group, see `draw_group`; one that only its layers know becomes as any other."""
+    group = next((group for group in state.groups if group.name == name), LayerGroup(name))
+    if group not in state.groups:
+        state = replace(state, groups=(*state.groups, group))
+    return draw_group(state, group, sum(layer.group == name for layer in state.layers), ui, actions)
+
+
+def _tighten(work: Workspace, ui: UiContext) -> None:
+    """Compact rows lie closer together."""
+    if is_compact(work):
+        imgui.set_cursor_pos_y(imgui.get_cursor_pos_y() - 3.0 * ui.scale)
+
+
+def _drag(
+    work: Workspace, focus: int | None, rows: Sequence[_Row], dragged: int, gesture: str, ui: UiContext
+) -> tuple[ViewState, int | None]:
+    """The state and the focused layer after a drag of a row: all selected layers go with one of them."""
+    state, layers, chosen = work.view, rows[dragged].layers, selected_layers(work)
+    if not rows[dragged].heads and layers[0] in chosen:
+        layers = chosen
+    y, at, group = _nearest_gap(state, rows, layers, rows[dragged].heads, imgui.get_mouse_pos().y)
+    moved = move_layers(state, layers, at, group)
+    if gesture == "dragged":
+        _show_place(y if moved.layers != state.layers else None, bool(group), layers, rows, ui)
+        return state, focus
+    if focus is not None:
+        name = state.layers[focus].name
+        focus = next(i for i, layer in enumerate(moved.layers) if layer.name == name)
+    return moved, focus
+
+
+def _nearest_gap(
+    state: ViewState, rows: Sequence[_Row], layers: Sequence[int], whole: bool, mouse: float
+) -> tuple[float, int, str]:
+    """Where what is dragged would lie: the line's height, how many layers there are below, the group joined.
+
+    Args:
+        layers: that are dragged
+        whole: as a group, which lies in no other
+        mouse: the hand's height
+    """
+    groups = {state.layers[i].group for i in layers}
+    gap, gaps = imgui.get_style().item_spacing.y / 2, [(rows[0].top, max(rows[0].layers) + 1, "")]
+    for over, row in pairwise(rows):
+        inside = bool(row.group) and over.group == row.group
+        if inside and whole and {row.group} != groups:
+            continue
+        group = row.group if inside else over.group if not over.heads and {over.group} == groups else ""
+        gaps.append((row.top, max(row.layers) + 1, "" if whole else group))
+    last = rows[-1]
+    stays = bool(last.group) and not (whole or last.heads) and {last.group} == groups
+    gaps.append((last.bottom + 2 * gap, min(last.layers), last.group if stays else ""))
+    if stays:  # half a row further down it leaves the group
+        gaps.append((last.bottom + 2 * gap + imgui.get_frame_height() / 2, min(last.layers), ""))
+    y, at, group = min(gaps, key=lambda candidate: abs(candidate[0] - gap - mouse))
+    return y - gap, at, group
+
+
+def _show_place(
+    y: float | None, joins: bool, layers: Collection[int], rows: Sequence[_Row], ui: UiContext
+) -> None:
+    """A veil over what is dragged and a line where it would lie; near an edge the list scrolls."""
+    imgui.set_mouse_cursor(imgui.MouseCursor_.resize_ns)
+    below, canvas = imgui.get_window_draw_list(), imgui.get_foreground_draw_list()  # that is over the cards
+    canvas.push_clip_rect(below.get_clip_rect_min(), below.get_clip_rect_max())
+    left = imgui.get_cursor_screen_pos().x
+    right = left + imgui.get_content_region_avail().x
+    for row in rows:
+        if {*row.layers} <= {*layers}:
+            veil = imgui.ImVec2(left, row.top), imgui.ImVec2(right, row.bottom)
+            canvas.add_rect_filled(*veil, u32((*PALETTE.panel[:3], 0.6)), 6.0 * ui.scale)
+    if y is not None:
+        start = left + INSET_PX * ui.scale * joins
+        ends = imgui.ImVec2(start, y - ui.scale), imgui.ImVec2(right, y + ui.scale)
+        canvas.add_rect_filled(*ends, u32(PALETTE.accent), ui.scale)
+    canvas.pop_clip_rect()
+    mouse, margin, step = imgui.get_mouse_pos().y, 24.0 * ui.scale, 6.0 * ui.scale
+    if mouse < imgui.get_window_pos().y + margin:
+        imgui.set_scroll_y(max(imgui.get_scroll_y() - step, 0.0))
+    elif mouse > imgui.get_window_pos().y + imgui.get_window_height() - margin:
+        imgui.set_scroll_y(min(imgui.get_scroll_y() + step, imgui.get_scroll_max_y()))

@@ -1,0 +1,224 @@
+"""What is known of the open scene's edits: their rows in the panel, and what training recorded of them."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from progdf.compose.layers import KINDS
+from progdf.errors import ProgdfError
+from progdf.field.trajectory import FILE_NAME, load_trajectory, peek_trajectory, recorded_field
+from progdf.gaussians import Gaussians
+from progdf.gdf.file import Gdf
+from progdf.metrics.slider import visible_change
+from progdf.rasterize import render
+from progdf.sh import sh0_to_rgb
+from viewer.camera.view_camera import Bounds, Fit, ViewCamera, bounds_of, fit, frame, keep_camera, to_camera
+
+from .layers import visible_layers
+from .view_state import OVERSHOOT, ViewState
+
+Rgb = tuple[float, float, float]
+
+STEPS = 20
+"""Of the slider from 0 to 1; the curve goes on to `OVERSHOOT` in steps of the same length."""
+
+SIDE_PX = 72
+MOST_MEMBERS = 20_000
+"""Of a larger region every so-manieth Gaussian is drawn, so that a row unfolds in a fraction of a second."""
+
+_FROM = (20.0, 200.0)  # degrees around the scene: from before and behind
+
+
+Curve = Callable[[], Sequence[float]]
+"""Gives the visible change at 0, 1/`STEPS`, … up to `OVERSHOOT`, as shares of that at 1."""
+
+
+@dataclass(frozen=True)
+class LayerRow:
+    """One .gdf as the panel shows it."""
+
+    count: int  # Gaussians in its region
+    swatch: Rgb  # their mean color at full strength, 0..1
+    recorded: tuple[float, ...]  # strengths of the recorded snapshots
+    instruction: str  # what was asked for
+    bounds: Bounds  # of the bulk of its members
+    # per edit, in their order: how many Gaussians of this one are also in it (in itself: all)
+    shared: tuple[int, ...] = ()
+    kinds: frozenset[str] = frozenset(KINDS.values())  # which gains of `Gains` have something to scale
+    curve: Curve = tuple  # the visible change over the strength, measured when it is first asked for
+    # centers of its members in the original, world units. [M,3] float32
+    points: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 3), np.float32), compare=False)
+    fit: Fit = keep_camera  # gives the camera that frames this layer
+    region: str = ""  # its name
+
+
+def layer_rows(scene: Gaussians, gdfs: Sequence[Gdf]) -> tuple[LayerRow, ...]:
+    """One row per .gdf, in their order."""
+    return tuple(_row(scene, gdf, gdfs) for gdf in gdfs)
+
+
+def _row(scene: Gaussians, gdf: Gdf, gdfs: Sequence[Gdf]) -> LayerRow:
+    members = gdf.region.members
+    return LayerRow(
+        count=len(members),
+        swatch=_mean_color(scene, gdf),
+        recorded=gdf.field.recorded,
+        instruction=gdf.instruction,
+        bounds=bounds_of(scene[members]),
+        shared=tuple(_in_both(gdf, other) for other in gdfs),
+        kinds=frozenset(KINDS[name] for name in gdf.field.attributes),
+        curve=cache(lambda: visible_changes(scene, gdf)),
+        points=scene.means[members].numpy(),
+        fit=lambda camera, aspect: fit(camera, scene[members], aspect),
+        region=gdf.region.name,
+    )
+
+
+def _in_both(gdf: Gdf, other: Gdf) -> int:
+    """How many Gaussians two regions share."""
+    members = (gdf.region.members.numpy(), other.region.members.numpy())
+    return len(np.intersect1d(*members, assume_unique=True))
+
+
+def _mean_color(scene: Gaussians, gdf: Gdf) -> Rgb:
+    """Mean of the edited colors, weighted by the original opacities."""
+    members = gdf.region.members
+    if not len(members):
+        return 0.5, 0.5, 0.5
+    sh0 = scene.sh0[members]
+    bases = gdf.field.attributes.get("sh0")
+    if bases is not None:
+        sh0 = sh0 + bases.end_offset
+    weights = scene.opacities[members].nan_to_num()[:, None] + 1e-6
+    color = (sh0_to_rgb(sh0).nan_to_num().clamp(0.0, 1.0) * weights).sum(0) / weights.sum()
+    red, green, blue = (float(c) for c in color)
+    return red, green, blue
+
+
+def visible_changes(scene: Gaussians, gdf: Gdf) -> tuple[float, ...]:
+    """Mean absolute difference of small renders of the region alone, from two sides, to those at 0.
+
+    Args:
+        scene: the original
+        gdf: the edit
+
+    Returns:
+        At 0, 1/`STEPS`, … up to `OVERSHOOT`; 1 at strength 1, or all 0 where the edit shows nothing.
+    """
+    members = gdf.region.members
+    count = round(OVERSHOOT * STEPS) + 1
+    if not len(members):
+        return (0.0,) * count
+    every = -(-len(members) // MOST_MEMBERS)
+    region = scene[members[::every]]
+    bounds = bounds_of(region)
+    cameras = [to_camera(frame(ViewCamera(azimuth=azimuth), bounds), SIDE_PX, SIDE_PX) for azimuth in _FROM]
+
+    def pictures(strength: float) -> list[Tensor]:
+        moved: dict[str, Any] = {}
+        for name in gdf.field.attributes:
+            old: Tensor = getattr(region, name)
+            moved[name] = old + gdf.field.attribute_offsets(name, strength)[::every].reshape(old.shape)
+        edited = replace(region, **moved)
+        with torch.no_grad():
+            return [render(edited, camera, (0.5, 0.5, 0.5)).image for camera in cameras]
+
+    original = pictures(0.0)
+    changes = [visible_change(original, pictures(i / STEPS)) for i in range(count)]
+    whole = changes[STEPS]
+    return tuple(change / whole for change in changes) if whole > 0.0 else (0.0,) * count
+
+
+NO_FILE = "the edit was not opened from a file"
+
+
+@dataclass(frozen=True)
+class RecordingFile:
+    """Where the recording of one edit lies."""
+
+    path: Path | None = None  # its file; None where there is none to show
+    reason: str = ""  # why there is none
+
+
+def find_recording(gdf: Gdf, path: Path) -> RecordingFile:
+    """The recording in the run folder that the edit at `path` lies in, if it is this edit's."""
+    beside = path.with_name(FILE_NAME)
+    if not beside.is_file():
+        return RecordingFile(reason=f"there is no {FILE_NAME} beside {path.name}")
+    try:
+        end, members = peek_trajectory(beside)
+    except ProgdfError as error:
+        return RecordingFile(reason=str(error))
+    field = gdf.field
+    same_end = torch.equal(end, field.offsets(1.0)) if field.attributes else not bool(end.any())
+    if not same_end or not torch.equal(members, gdf.region.members):
+        return RecordingFile(reason=f"the {FILE_NAME} beside {path.name} belongs to another edit")
+    return RecordingFile(beside)
+
+
+def load_recorded(gdf: Gdf, recording: RecordingFile) -> Gdf:
+    """The edit with its recording, where the field shows it, as the field; as it is where there is none.
+
+    Raises:
+        ProgdfError: the file is gone or damaged.
+    """
+    if recording.path is None:
+        return gdf
+    trajectory, s = load_trajectory(recording.path)[0], torch.tensor(gdf.field.recorded, dtype=torch.float32)
+    ascends = len(s) > 1 and float(s[0]) == 0.0 and float(s[-1]) == 1.0 and bool((s.diff() > 0).all())
+    if trajectory.end.shape[0] != len(gdf.region) or len(trajectory) != len(s) or not ascends:
+        raise ProgdfError(f"{recording.path} belongs to another edit; train again")
+    return replace(gdf, field=recorded_field(replace(trajectory, s=s)))
+
+
+def obstacle(recordings: Sequence[RecordingFile]) -> str:
+    """Why there is nothing recorded to compare with; "" where there is."""
+    if any(recording.path is not None for recording in recordings):
+        return ""
+    return (recordings[0].reason or NO_FILE) if recordings else "no edit is open"
+
+
+def clamp_to_recorded(view: ViewState, recordings: Sequence[RecordingFile]) -> ViewState:
+    """`view` with no recorded edit beyond its last snapshot: past 1 nothing was recorded."""
+    layers = (
+        replace(layer, strength=min(layer.strength, 1.0)) if recordings[layer.gdf].path else layer
+        for layer in view.layers
+    )
+    return replace(view, layers=tuple(layers))
+
+
+def describe(view: ViewState, gdfs: Sequence[Gdf], recordings: Sequence[RecordingFile]) -> str:
+    """Which snapshots are shown, and which edits have none: "recorded, between 0.42 and 0.47"."""
+    active = [layer for layer in visible_layers(view) if layer.strength != 0.0]
+    places, fields = {}, []
+    for layer in active:
+        if recordings[layer.gdf].path is None:
+            fields.append(layer.name)
+        else:
+            places[layer.name] = _neighbors(gdfs[layer.gdf].field.recorded, layer.strength)
+    if len(places) < 2 and not fields:
+        ends = [f"{s:.3g}" for s in next(iter(places.values()), (0.0,))]
+        return f"recorded, between {ends[0]} and {ends[1]}" if len(ends) == 2 else f"recorded at {ends[0]}"
+    recorded = [f"{name} {'–'.join(f'{s:.3g}' for s in ends)}" for name, ends in places.items()]
+    parts = (
+        "recorded: " + ", ".join(recorded) if recorded else "",
+        "field: " + ", ".join(fields) if fields else "",
+    )
+    return "; ".join(part for part in parts if part)
+
+
+def _neighbors(nodes: Sequence[float], strength: float) -> tuple[float, ...]:
+    """The snapshot at a strength, or those on either side of it."""
+    right = min(bisect_left(nodes, strength), len(nodes) - 1)
+    exact = nodes[right] <= strength
+    return (nodes[right],) if exact or right == 0 else (nodes[right - 1], nodes[right])
