@@ -106,9 +106,18 @@ def _recorded(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 def words(bear_folder: Path, *more: str) -> list[str]:
     """The command line of `small_run`."""
     options = small_run(bear_folder)
-    names = ("region", "editor", "views", "image_size", "steps", "stages", "field", "threads")
-    names = (*names, "perceptual_weight")
-    pairs = [f"--{name.replace('_', '-')}={getattr(options, name)}" for name in names]
+    values = {
+        "region": options.region.region,
+        "editor": options.editor.editor,
+        "views": options.views.views,
+        "image-size": options.views.image_size,
+        "steps": options.optimize.steps,
+        "stages": options.optimize.stages,
+        "perceptual-weight": options.optimize.perceptual_weight,
+        "field": options.field.field,
+        "threads": options.threads,
+    }
+    pairs = [f"--{name}={value}" for name, value in values.items()]
     return ["train", str(options.scene), "--out=run", *pairs, *more]
 
 

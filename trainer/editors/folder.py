@@ -25,9 +25,8 @@ from progdf.gaussians import Gaussians
 from progdf.io.images import read_picture
 from progdf.lens import undistort
 from progdf.region import Region
+from trainer.options import EditKind, EditorOptions
 from trainer.views.view import View
-
-from .base import EditKind, EditorSettings
 
 _EDITED = "put the edited copies of RUN/views/original/*.png there, under the same names"
 _TAKEN = "put the photographs there, under the names that the cameras have"
@@ -108,7 +107,7 @@ def photograph_folders(what: str) -> tuple[Path, Path | None]:
 
 
 def folder(
-    what: str, scene: Gaussians, region: Region, views: Sequence[View], settings: EditorSettings
+    what: str, scene: Gaussians, region: Region, views: Sequence[View], options: EditorOptions
 ) -> FolderEditor:
     """`folder:DIR`: see the module's head. Every view's picture is looked for before training starts."""
     return _make_editor(folder_of(what), views)
@@ -132,7 +131,7 @@ def _make_editor(root: Path, views: Sequence[View], bent: bool = False) -> Folde
 
 
 def photographs(
-    what: str, scene: Gaussians, region: Region, views: Sequence[View], settings: EditorSettings
+    what: str, scene: Gaussians, region: Region, views: Sequence[View], options: EditorOptions
 ) -> FolderEditor:
     """`photographs:EDITED,ORIGINALS` or `photographs:EDITED`: see the module's head."""
     edited, originals = photograph_folders(what)

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -29,11 +30,11 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.io.images import to_picture
 from progdf.region import Region
+from trainer.options import EditKind, EditorOptions
 from trainer.store.pretrained import BROKEN, check_weights_here, folder_of_model
 from trainer.views.view import View
 
 from .adapters import ADAPTERS, DEFAULT_MODEL, Adapter
-from .base import EditKind, EditorSettings
 from .cache import KeptPictures, Recipe
 
 _MULTIPLE = 32  # pixels: what every pipeline's autoencoder and patches divide
@@ -94,10 +95,10 @@ class InstructEditor:
 
 
 def instruct(
-    what: str, scene: Gaussians, region: Region, views: Sequence[View], settings: EditorSettings
+    what: str, scene: Gaussians, region: Region, views: Sequence[View], options: EditorOptions
 ) -> InstructEditor:
     """`instruct:"…"`: the model and its options are checked now, its weights are loaded when first needed."""
-    model, kind, asked = _resolve_request(what, settings)
+    model, kind, asked = _resolve_request(what, options)
     prompt = asked.prompt
 
     @cache
@@ -113,23 +114,23 @@ def instruct(
         "size": asked.size,
         "seed": asked.seed,
     }
-    graded = settings.graded and asked.guidance > 1.0
+    graded = options.graded and asked.guidance > 1.0
     return InstructEditor(
         lambda picture, guidance: _run_pipeline(pipeline(), asked, picture, guidance),
         asked.guidance,
         recipe,
-        KeptPictures(settings.kept),
+        KeptPictures(options.cache),
         stages=() if graded else (1.0,),
     )
 
 
-def check_instruct(what: str, settings: EditorSettings) -> None:
+def check_instruct(what: str, options: EditorOptions) -> None:
     """What `instruct` and its pipeline would raise, as far as it is to be known without loading a network.
 
     Raises:
         ProgdfError: nothing is said, a package or weights are missing or truncated, an option is not known.
     """
-    model, kind, _ = _resolve_request(what, settings)
+    model, kind, _ = _resolve_request(what, options)
     try:
         folder = folder_of_model(model, "model_index.json")
         parts = json.loads((folder / "model_index.json").read_bytes())
@@ -143,14 +144,33 @@ def check_instruct(what: str, settings: EditorSettings) -> None:
         raise _missing(model) from error
 
 
-def _resolve_request(what: str, settings: EditorSettings) -> tuple[str, str, _Request]:
+def _resolve_request(what: str, options: EditorOptions) -> tuple[str, str, _Request]:
     """The model, its pipeline's class, and what it will be asked."""
     prompt = what.strip().strip("\"'").strip()
     if not prompt:
         raise ProgdfError('instruct: needs an instruction; write instruct:"turn him into Batman"')
-    model = settings.model or DEFAULT_MODEL
+    model = options.model or DEFAULT_MODEL
     kind = pipeline_class(model)
-    return model, kind, _make_request(prompt, model, kind, settings)
+    return model, kind, _make_request(prompt, model, kind, options)
+
+
+def parse_guidance(text: str) -> tuple[float | None, float | None]:
+    """What --guidance says of the sentence and of the picture; None where it says nothing.
+
+    Raises:
+        ProgdfError: it is neither one number nor two.
+    """
+    words = text.split(",") if text else []
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError:
+        numbers = [math.nan]
+    if len(numbers) > 2 or not all(1 <= number <= 100 for number in numbers):
+        raise ProgdfError(
+            f"--guidance must be one or two numbers between 1 and 100, such as 7.5,1.5; got {text}"
+        )
+    sentence, picture = (*numbers, None, None)[:2]
+    return sentence, picture
 
 
 def pipeline_class(model: str) -> str:
@@ -220,10 +240,11 @@ def _run_pipeline(pipeline: Any, asked: _Request, view: Tensor, guidance: float)
     return torch.from_numpy(np.asarray(edited, dtype=np.float32) / 255.0)
 
 
-def _make_request(prompt: str, model: str, kind: str, settings: EditorSettings) -> _Request:
-    """The settings, with the model's own values where nothing was said."""
+def _make_request(prompt: str, model: str, kind: str, options: EditorOptions) -> _Request:
+    """The options, with the model's own values where nothing was said."""
     adapter = ADAPTERS[kind]
-    if settings.image_guidance is not None and "image_guidance" not in adapter.words:
+    guidance, image_guidance = parse_guidance(options.guidance)
+    if image_guidance is not None and "image_guidance" not in adapter.words:
         raise ProgdfError(
             f"{model} does not support guidance of the picture; give --guidance one number, "
             f"or use --model {DEFAULT_MODEL}"
@@ -231,11 +252,11 @@ def _make_request(prompt: str, model: str, kind: str, settings: EditorSettings) 
     return _Request(
         prompt,
         adapter,
-        steps=adapter.steps if settings.steps is None else settings.steps,
-        guidance=adapter.guidance if settings.guidance is None else settings.guidance,
-        image_guidance=adapter.image_guidance if settings.image_guidance is None else settings.image_guidance,
-        size=adapter.size if settings.size is None else settings.size,
-        seed=settings.seed,
+        steps=adapter.steps if options.edit_steps is None else options.edit_steps,
+        guidance=adapter.guidance if guidance is None else guidance,
+        image_guidance=adapter.image_guidance if image_guidance is None else image_guidance,
+        size=adapter.size if options.edit_size is None else options.edit_size,
+        seed=options.seed,
     )
 
 

@@ -30,9 +30,8 @@ from progdf.io.images import picture_size, read_picture, save_as
 from progdf.io.picture_camera import find_picture_camera
 from progdf.rasterize import render
 from progdf.region import Region
+from trainer.options import EditKind, EditorOptions
 from trainer.views.view import BACKGROUND, View, seen_colors
-
-from .base import EditKind, EditorSettings
 
 MOST_PICTURES = 32
 """More are a folder of views: what a handful needs would take long."""
@@ -79,7 +78,7 @@ class PicturesEditor:
 
 
 def pictures(
-    what: str, scene: Gaussians, region: Region, views: Sequence[View], settings: EditorSettings
+    what: str, scene: Gaussians, region: Region, views: Sequence[View], options: EditorOptions
 ) -> PicturesEditor:
     """`pictures:A.png[,B.png…]`: see the module's head; the views are the pictures', in their order."""
     found = [strengths_of(path) for path in picture_paths(what)]

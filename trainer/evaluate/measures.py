@@ -11,7 +11,7 @@ from progdf.metrics.slider import Pictures, slider_statistics
 from trainer.fit.evaluate import Evaluator
 from trainer.fit.slider_uniformity import STEPS
 from trainer.optimize.losses import Perceptual
-from trainer.report.clip import Texts
+from trainer.options import TextOptions
 from trainer.report.curves import ErrorCurve, picture_courses
 from trainer.report.measures import clip_curve
 
@@ -58,7 +58,7 @@ class Evaluation:
     perceptual: str
 
 
-def evaluate_run(opened: OpenedRun, perceptual: Perceptual, texts: Texts) -> Evaluation:
+def evaluate_run(opened: OpenedRun, perceptual: Perceptual, texts: TextOptions) -> Evaluation:
     """Measure a finished run on its held-out views.
 
     Args:
@@ -139,7 +139,7 @@ def _consistency_rows(found: Consistency, lpips: str) -> list[Row]:
     ]
 
 
-def _clip_rows(opened: OpenedRun, texts: Texts) -> list[Row]:
+def _clip_rows(opened: OpenedRun, texts: TextOptions) -> list[Row]:
     course = clip_curve(opened.evaluator, opened.setup.judging, opened.gdf.field, texts)
     along, missing = clip_consistency(opened)
     direction = course.similarity[-1] if course.similarity else None

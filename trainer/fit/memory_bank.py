@@ -116,7 +116,7 @@ class JointTraining:
 
     def capture_state(self) -> Saved:
         """The fit; the bank is made again from the recordings."""
-        return Saved(self.fit.capture_state(), {"banked": len(self.bank)})
+        return Saved(self.fit.capture_state(), {})
 
     def restore(self, saved: Saved) -> None:
         """Take over the fit; `refill` comes after."""

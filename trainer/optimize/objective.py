@@ -11,56 +11,46 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from torch import Tensor
 
-from trainer.options import Norm, Progressive
+from trainer.options import OptimizeOptions, Sharpness
 
 from .losses import Perceptual, l1, progressive_change, sharpness
 
-Sharpness = Literal["hinge", "paper", "off"]
 Losses = Mapping[str, Sequence[float | None]]
 """Columns of equal length, a row per recording: "step", "left", and each term's mean; None where unpaid."""
 
 
-@dataclass(frozen=True)
-class LossWeights:
-    """Which terms there are and what they weigh beside an L1 of 1.
+PROGRESSIVE_WEIGHT = 5.0
+"""λ2 of the paper."""
+SHARPNESS_WEIGHT: Mapping[Sharpness, float] = {"hinge": 0.1, "paper": 1.0}
+"""λ3."""
+
+
+def describe_loss(options: OptimizeOptions, perceptual: str) -> str:
+    """What is minimized, in one line for log and report.
 
     Args:
-        perceptual: weight of the perceptual term; 0 leaves it out
-        perceptual_every: it is paid for every so many steps, ≥ 1
-        progressive: "decay" and "growth" charge for a step's length, see `losses.progressive_change`; the
-            other two are no loss ("warmup" is a learning rate)
-        progressive_weight: λ2
-        sharpness: "hinge" or "paper", see `losses.sharpness`
-        sharpness_weight: λ3
-        progressive_norm: how a step's length is measured
+        options: with nothing left open, see `trainer.resolve.resolve_kind`
+        perceptual: the name of the distance that is really used
     """
-
-    perceptual: float = 0.1
-    perceptual_every: int = 2
-    progressive: Progressive = "off"
-    progressive_weight: float = 5.0
-    sharpness: Sharpness = "off"
-    sharpness_weight: float = 1.0
-    progressive_norm: Norm = "squares"
-
-    def description(self, perceptual: str) -> str:
-        """One line for log and report. `perceptual`: the name of the distance that is really used."""
-        terms = ["L1"]
-        if self.perceptual > 0:
-            often = f" every {self.perceptual_every} steps" if self.perceptual_every > 1 else ""
-            terms.append(f"{self.perceptual:g} {perceptual}{often}")
-        if self.progressive in ("decay", "growth"):
-            terms.append(
-                f"{self.progressive_weight:g} progressive ({self.progressive}, {self.progressive_norm})"
-            )
-        if self.sharpness != "off":
-            terms.append(f"{self.sharpness_weight:g} sharpness ({self.sharpness})")
-        return " + ".join(terms)
+    if options.solver == "pictures":
+        return "squared error, all pictures at once, neighbors tied"
+    if options.solver == "colors":
+        return "squared error, all views at once"
+    terms = ["L1"]
+    if options.perceptual_weight:
+        often = f" every {options.perceptual_every} steps" if options.perceptual_every > 1 else ""
+        terms.append(f"{options.perceptual_weight:g} {perceptual}{often}")
+    if options.progressive in ("decay", "growth"):
+        terms.append(
+            f"{PROGRESSIVE_WEIGHT:g} progressive ({options.progressive}, {options.progressive_norm})"
+        )
+    if options.sharpness in SHARPNESS_WEIGHT:
+        terms.append(f"{SHARPNESS_WEIGHT[options.sharpness]:g} sharpness ({options.sharpness})")
+    return " + ".join(terms)
 
 
 @dataclass(frozen=True)
@@ -93,15 +83,15 @@ class Objective:
 
     Args:
         perceptual: distance whose targets are kept until the stage ends
-        weights: see `LossWeights`
+        options: which terms there are, and what they weigh beside an L1 of 1; nothing is left open
         inside: where each training view's box shows the region without its rim; sharpness is measured
             there. Not needed where sharpness is off. [h,w] bool each
     """
 
     def __init__(
-        self, perceptual: Perceptual, weights: LossWeights, inside: Sequence[Tensor] | None = None
+        self, perceptual: Perceptual, options: OptimizeOptions, inside: Sequence[Tensor] | None = None
     ) -> None:
-        self.weights = weights
+        self._options = options
         self._perceptual = perceptual
         self._inside = inside
 
@@ -111,24 +101,21 @@ class Objective:
 
     def terms(self, moment: Moment) -> dict[str, Tensor]:
         """The terms that this step pays for, weighted. [] each"""
-        weights = self.weights
+        options = self._options
         terms = {"l1": l1(moment.image, moment.target)}
-        if weights.perceptual > 0 and moment.arrived and moment.local % weights.perceptual_every == 0:
+        if options.perceptual_weight and moment.arrived and moment.local % options.perceptual_every == 0:
             distance = self._perceptual(moment.image, moment.target, moment.view)
-            terms["perceptual"] = weights.perceptual * distance
-        if weights.progressive in ("decay", "growth"):
+            terms["perceptual"] = options.perceptual_weight * distance
+        if options.progressive in ("decay", "growth"):
+            grows = options.progressive == "growth"
             change = progressive_change(
-                moment.moved,
-                moment.previous,
-                moment.step,
-                weights.progressive == "growth",
-                weights.progressive_norm,
+                moment.moved, moment.previous, moment.step, grows, options.progressive_norm
             )
-            terms["progressive"] = weights.progressive_weight * change
-        if weights.sharpness != "off":
+            terms["progressive"] = PROGRESSIVE_WEIGHT * change
+        if options.sharpness == "hinge" or options.sharpness == "paper":
             inside = self._inside[moment.view] if self._inside is not None else None
-            lost = sharpness(moment.image, moment.target, weights.sharpness, inside)
-            terms["sharpness"] = weights.sharpness_weight * lost
+            lost = sharpness(moment.image, moment.target, options.sharpness, inside)
+            terms["sharpness"] = SHARPNESS_WEIGHT[options.sharpness] * lost
         return terms
 
 

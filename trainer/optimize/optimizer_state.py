@@ -19,6 +19,9 @@ from trainer.store.state import Saved, generator
 
 from .objective import TermMeans
 
+EPSILON = 0.1
+"""Of the root mean square of an attribute's gradient: Adam's ε where it is raised."""
+
 _ROWS = ("moved", "previous", "average", "first", "second")
 
 
@@ -77,21 +80,21 @@ class PgsState:
         gradient: Tensor,
         rates: Tensor,
         length: float,
-        damped: bool,
+        raised: bool,
         smoothing: float,
         growth: float = math.inf,
     ) -> None:
         """One step of Adam (Kingma and Ba 2015), with a rate per column; the next view is due.
 
         Adam does not know how large a gradient is, so a member that hardly shows would wander as far as one
-        in plain sight. A tenth of the attribute's typical gradient, added below the fraction, keeps it still.
+        in plain sight. A tenth of the attribute's typical gradient, added to ε, keeps it still.
         (docs/experiments.md, Rates and steps).
 
         Args:
             gradient: of the loss in `moved`. [M,C]
             rates: learning rate of each column. [C]
             length: factor to them all
-            damped: see above; False is Adam as printed
+            raised: see above; False is Adam as printed
             smoothing: share that the running mean keeps of itself; it starts exactly at the original
             growth: how many times as large as it was a member may become
         """
@@ -101,9 +104,9 @@ class PgsState:
         mean = self.first / (1 - 0.9**done)
         spread = (self.second / (1 - 0.999**done)).sqrt()
         floor = torch.full_like(rates, 1e-15)
-        if damped:
+        if raised:
             for columns in attribute_slices(len(rates)).values():
-                floor[columns] += 0.1 * spread[:, columns].square().mean().sqrt()
+                floor[columns] += EPSILON * spread[:, columns].square().mean().sqrt()
         with torch.no_grad():
             self.previous.copy_(self.moved)
             self.moved -= length * (rates * mean / (spread + floor))

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from progdf.gaussians import Gaussians, attribute_slices
 from progdf.rasterize import alpha_weights
-from trainer.editors.base import EditKind
+from trainer.options import OptimizeOptions
 from trainer.regions.surface import surface_likeness
 from trainer.setup.training_setup import TrainingSetup
 from trainer.views.view import View
@@ -57,11 +57,11 @@ class UnseenMembers:
         return led
 
 
-def unseen_members_of(setup: TrainingSetup, kind: EditKind) -> UnseenMembers:
+def unseen_members_of(setup: TrainingSetup, optimization: OptimizeOptions) -> UnseenMembers:
     """Those of a run; none unless the edit is one of colors alone."""
-    if kind != "color":
-        nobody = torch.zeros(0, dtype=torch.int64)
-        return UnseenMembers(nobody, nobody[:, None], torch.zeros(0, 1))
+    if optimization.kind != "color":
+        empty = torch.zeros(0, dtype=torch.int64)
+        return UnseenMembers(empty, empty[:, None], torch.zeros(0, 1))
     return find_unseen_members(setup.scene, setup.region.members, setup.train)
 
 

@@ -7,52 +7,91 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from trainer.editors.base import EditKind
-from trainer.option_checks import check_name
-from trainer.plan import Plan
+from progdf.io.json_values import convert_json
+from trainer.options import EditKind, TrainOptions
+from trainer.resolve import check_name
 
 
 @dataclass(frozen=True)
 class RunRecord:
     """What the recording's file tells of the run.
 
-    Args:
-        plan: what was to be done
-        scene: where the scene was
-        held_out: names of the views that the edit was not trained on
-        background: color behind the scene
-        kind: what the edit moves
-        group_steps: of the stage in which parts move as wholes; 0: there was none
-        kind_trial: figures of the trial that found these two, if there was one
-        objective: what was minimized, in words
-        losses: see `Losses`
-        attribute_worth_db: what the edit would lose without each attribute, dB
-        agreement: whether the edited views agree, where that was measured
-        followed: members that took their colors from others
-        up: the axis that is up, and why
-        pictures: changed pictures that it was trained on, and their hashes
-
     Raises:
         ValueError: the losses do not fit each other, or the name is none.
     """
 
-    plan: Plan
-    scene: Path
-    held_out: Sequence[str]
-    background: tuple[float, float, float]
-    kind: EditKind
-    group_steps: int
-    kind_trial: Mapping[str, Any] | None
-    objective: str
-    losses: Mapping[str, Sequence[float | None]]
-    attribute_worth_db: Mapping[str, float]
-    agreement: Mapping[str, Any] | None
-    followed: int
-    up: Mapping[str, Any] | None
-    pictures: Mapping[str, str] = field(default_factory=dict)
+    plan: TrainOptions  # what was to be done, see `recorded_options`
+    scene: Path  # where the scene was
+    held_out: Sequence[str]  # names of the views that the edit was not trained on
+    background: tuple[float, float, float]  # color behind the scene
+    kind: EditKind  # what the edit moves
+    group_steps: int  # of the stage in which parts move as wholes; 0: there was none
+    kind_trial: Mapping[str, Any] | None  # figures of the trial that found these two, if there was one
+    objective: str  # what was minimized, in words
+    losses: Mapping[str, Sequence[float | None]]  # see `Losses`
+    attribute_worth_db: Mapping[str, float]  # what the edit would lose without each attribute, dB
+    agreement: Mapping[str, Any] | None  # whether the edited views agree, where that was measured
+    followed: int  # members that took their colors from others
+    up: Mapping[str, Any] | None  # the axis that is up, and why
+    pictures: Mapping[str, str] = field(default_factory=dict)  # changed pictures, and their hashes
 
     def __post_init__(self) -> None:
         columns = [self.losses.get(name, []) for name in ("step", "left")]
         if not all(columns) or len({len(column) for column in self.losses.values()}) > 1:
             raise ValueError("its losses do not fit each other")
         check_name(self.plan.name)
+
+
+def read_record(about: Mapping[str, Any]) -> RunRecord:
+    """What a recording's file tells of its run.
+
+    Raises:
+        ValueError, KeyError, TypeError: it is no record, or damaged.
+    """
+    return convert_json({**about, "plan": upgrade_plan(about["plan"])}, RunRecord)
+
+
+def upgrade_plan(plan: Mapping[str, Any]) -> Mapping[str, Any]:
+    """JSON values of a recorded plan as `TrainOptions` has them, also where its parts have their older names.
+
+    Raises:
+        ValueError, KeyError, TypeError: it is none.
+    """
+    if "optimization" not in plan:
+        return plan
+    region, editor, views = dict(plan["region"]), dict(plan["editor"]), dict(plan["views"])
+    optimize, field, texts = dict(plan["optimization"]), dict(plan["field"]), plan["texts"]
+    network, segmenter, refinements = field.pop("network"), region.pop("segmenter"), optimize["refinements"]
+    guidance = [editor.pop(name) for name in ("guidance", "image_guidance")]
+    return {
+        "scene": plan["scene"],
+        "out": "",
+        "name": plan["name"],
+        "region": region | segmenter,
+        "editor": editor
+        | {
+            "guidance": ",".join(str(number) for number in guidance if number is not None),
+            "reedit_every": optimize["reedit_every"],
+        },
+        "views": views | {name: views[name] or 0 for name in ("views", "image_size")},
+        "optimize": optimize
+        | {
+            "kind": optimize["kind"] or "auto",
+            "stages": optimize["stages"] or 0,
+            "slider": plan["slider"],
+            "as_printed": optimize["raw"],
+            "color_solver": refinements["solves"],
+            "ema": refinements["averages"],
+            "target_ramp": refinements["ramps"],
+            "propagation": refinements["propagates"],
+        },
+        "field": field
+        | {
+            "size": network["size"],
+            "field_loss": network["loss"],
+            "as_printed": network["inputs"] == "position",
+            "draft": network["draft"],
+            "seed": network["seed"],
+        },
+        "texts": {"text_before": texts["before"], "text_after": texts["after"], "asked": texts["asked"]},
+    }

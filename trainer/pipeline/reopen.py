@@ -13,9 +13,8 @@ from progdf.field.trajectory import Trajectory, load_trajectory
 from progdf.formats.scene_file import load_scene, scene_file
 from progdf.gaussians import Gaussians
 from progdf.io.cameras import load_cameras
-from progdf.io.json_values import convert_json
 from progdf.region import Region
-from trainer.pipeline.record import RunRecord
+from trainer.pipeline.record import RunRecord, read_record
 from trainer.setup.training_setup import TrainingSetup
 from trainer.store.run_folder import RunFolder
 from trainer.views.view import make_view, with_near_plane
@@ -23,20 +22,12 @@ from trainer.views.view import make_view, with_near_plane
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """What a finished run left.
-
-    Args:
-        folder: its folder
-        scene: the original
-        region: what was edited
-        trajectory: what was recorded
-        record: see `RunRecord`
-    """
+    """What a finished run left."""
 
     folder: RunFolder
-    scene: Gaussians
-    region: Region
-    trajectory: Trajectory
+    scene: Gaussians  # the original
+    region: Region  # what was edited
+    trajectory: Trajectory  # what was recorded
     record: RunRecord
 
 
@@ -55,7 +46,7 @@ def reopen_run(root: Path, scene: Path | None = None) -> FinishedRun:
         raise ProgdfError(f"{root} holds no trajectory.safetensors; give a folder that progdf train finished")
     trajectory, extra, about = load_trajectory(folder.trajectory)
     try:
-        record = convert_json(about, RunRecord)
+        record = read_record(about)
         members, score = extra["members"], extra["score"]
         path = scene or record.scene
         if not os.path.isfile(scene_file(path)):

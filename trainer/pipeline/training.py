@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from itertools import pairwise
 
 import torch
@@ -13,33 +13,25 @@ from progdf.errors import ProgdfError
 from progdf.field.trajectory import Trajectory
 from progdf.gaussians import BASE_CHANNELS, pack
 from progdf.scene.bounds import scene_sphere
-from trainer.fit.network import NetworkPlan, begin_joint_training, save_network
+from trainer.fit.memory_bank import JointTraining
+from trainer.fit.network import begin_joint_training, save_network
 from trainer.optimize.color_solver import iterations, make_solver, solve
 from trainer.optimize.groups import Groups, group_path, group_stage, restore_groups
 from trainer.optimize.losses import Perceptual, erode
 from trainer.optimize.objective import Losses, Objective, loss_table
 from trainer.optimize.optimizer_state import PgsState
-from trainer.optimize.pgs import Renewal, TargetStage, learning_rates, optimize
+from trainer.optimize.pgs import OnStep, ParameterSnapshot, Renewal, TargetStage, optimize, pgs_settings
 from trainer.optimize.picture_solver import RECORDINGS, make_picture_solver, solve_pictures
-from trainer.optimize.retime import record, retime, select_recordings, straight_recordings
-from trainer.optimize.settings import Optimization, pgs_settings, resolve_slider
+from trainer.optimize.retime import record, resolve_slider, retime, select_recordings, straight_recordings
 from trainer.optimize.unseen import UnseenMembers
 from trainer.optimize.view_dependence import NEEDED, view_dependence
-from trainer.options import Slider
+from trainer.options import OptimizeOptions, TrainOptions
 from trainer.pipeline.recordings import Recordings
 from trainer.setup.training_setup import Pictures, TrainingSetup, probe_views
 from trainer.store.interrupts import defer_signals
 from trainer.store.progress import RunLog
 from trainer.store.state import PeriodicSave, Resumable, StateFolder
-from trainer.views.crops import (
-    COLORS,
-    GEOMETRY,
-    CropScene,
-    crop_scene,
-    moving_attributes,
-    only_recolors,
-    render_all,
-)
+from trainer.views.crops import COLORS, CropScene, crop_scene, moving_attributes, only_recolors, render_all
 from trainer.views.view import crop
 
 PART = "training"
@@ -48,21 +40,13 @@ PART = "training"
 _TIMED_VIEWS = 4  # in which the slider is timed; 8 or all at full size time it no better
 
 
-@dataclass(frozen=True)
-class JointNetwork:
-    """A network that is trained jointly with the members.
-
-    Args:
-        network: see `NetworkPlan`
-        slider: what slider values will mean
-    """
-
-    network: NetworkPlan
-    slider: Slider
+Way = Callable[[OnStep], Iterator[ParameterSnapshot]]
+"""Optimizes from the state on, and yields recordings."""
 
 
 def optimize_members(
-    optimization: Optimization,
+    options: TrainOptions,
+    optimization: OptimizeOptions,
     setup: TrainingSetup,
     edited: Pictures,
     perceptual: Perceptual,
@@ -70,12 +54,12 @@ def optimize_members(
     log: RunLog,
     renewal: Renewal | None = None,
     unseen_members: UnseenMembers | None = None,
-    network: JointNetwork | None = None,
 ) -> tuple[Trajectory, Losses]:
     """Optimize the members, from the beginning or from the saved state.
 
     Args:
-        optimization: see `Optimization`
+        options: resolved
+        optimization: its part with nothing left open, see `resolve_kind`
         setup: scene, region, views with boxes that hold the edit
         edited: strength → the edited training views, whole
         perceptual: distance of pictures
@@ -83,7 +67,6 @@ def optimize_members(
         log: of the run
         renewal: see `pgs.Renewal`
         unseen_members: members that take their colors from others
-        network: trained jointly with the members
 
     Returns:
         The trajectory, even in time; mean of every loss term, and what is left to the edit, per recording
@@ -92,47 +75,84 @@ def optimize_members(
         ProgdfError: the loss is not finite.
         KeyboardInterrupt: interrupted; the state is saved.
     """
-    scene, members, kind = setup.scene, setup.region.members, optimization.kind
-    bands = optimization.sh != "off" if optimization.few else _trains_bands(optimization, setup, log)
+    scene, members, solver = setup.scene, setup.region.members, optimization.solver
+    bands = _trains_bands(optimization, setup, log)
     original = pack(scene[members], with_shN=scene.sh_degree > 0)
-    rates = learning_rates(kind, original.shape[1], 1.0, optimization.rates)
-    still = not moving_attributes(rates[None], GEOMETRY)
-    back = optimization.refinements.leads_back
-    crops = [crop_scene(scene, members, v.camera, v.box, setup.background, still, back) for v in setup.train]
-    steps = iterations(optimization.steps) if optimization.solves_colors else optimization.steps
-    steps = max(steps, len(edited) + 1)  # each stage is to have one
-    if optimization.few:
-        steps = max(RECORDINGS, 2 * len(edited))
-    stages = [
-        TargetStage(s, [crop(p, v.box) for p, v in zip(pictures, setup.train, strict=True)], steps)
-        for (s, pictures), steps in zip(edited.items(), _steps_by_stage(steps, len(edited)), strict=True)
-    ]
-    groups = None
+    still = optimization.kind == "color" and optimization.rates == "kind"
+    crops = [crop_scene(scene, members, v.camera, v.box, setup.background, still) for v in setup.train]
+    stages, groups = _stages(optimization, setup, edited), None
     if optimization.group_steps:
         groups = _groups(optimization, original, crops, stages, folder, log)
         stages = groups.to_stages(original, crops, stages)
     extent = 2.0 * scene_sphere(scene[members])[1] if groups is None else groups.extent
     settings = pgs_settings(optimization, bands, original.shape[1], extent, len(stages))
-    inside = [erode(crop(view.mask, view.box)) for view in setup.train]
-    objective = Objective(perceptual, optimization.weights, inside)
-    solver = pictures = None
-    if optimization.few:
+    state, recordings = PgsState(original, settings.seed), Recordings(folder, original.shape)
+    way: Way
+    if solver == "pictures":
         with log.stage("weights"):
             pictures = make_picture_solver(scene, members, crops, original, bands)
         log.say(f"{pictures.unseen} members that no picture shows follow their own surface")
-    elif optimization.solves_colors:
+        way = partial(solve_pictures, original, pictures, stages, state)
+    elif solver == "colors":
         with log.stage("weights"):
-            solver = make_solver(crops, original, bands and original.shape[1] > BASE_CHANNELS)
-
-    state, recordings = PgsState(original, settings.seed), Recordings(folder, original.shape)
-    joint = None
-    if network is not None:
-        joint = begin_joint_training(
-            network.network, network.slider, setup, settings.rates, stages, crops, perceptual
+            colors = make_solver(crops, original, bands and original.shape[1] > BASE_CHANNELS)
+        way = partial(solve, original, colors, stages, state, unseen_members=unseen_members)
+    else:
+        inside = [erode(crop(view.mask, view.box)) for view in setup.train]
+        objective, probes = Objective(perceptual, optimization, inside), probe_views(setup)
+        way = partial(
+            optimize, original, crops, probes, stages, objective, settings, state=state, renewal=renewal
         )
+    joint = None
+    if optimization.as_printed and options.field.field == "neural":
+        joint = begin_joint_training(
+            options.field, optimization, setup, settings.rates, stages, crops, perceptual
+        )
+    saver = _record_way(way, sum(stage.steps for stage in stages), state, recordings, joint, folder, log)
+    distances = [made.means["left"] for made in recordings.made]
+    log.say(f"L1 to the finished edit: {distances[0]:.4f} at first, {distances[-1]:.4f} at the end")
+    log.say(f"the state was saved {saver.saves} times, in {saver.seconds:.2f} s")
+    end = stages[-1].place(state.average).clone()
+    snapshots = [(made.step, made.stage, made.ends_stage, made.offsets) for made in recordings.made]
+    if unseen_members is not None and len(unseen_members.places):
+        follow = solver == "colors" or is_no_worse(unseen_members, end, original, crops, stages)
+        if follow and solver != "colors":
+            snapshots = [(a, b, c, unseen_members.propagate(made)) for a, b, c, made in snapshots]
+            end = unseen_members.propagate(end)
+        log.say(_unseen_line(len(unseen_members.places), follow))
+    if groups is not None:
+        ends = [made for made in recordings.made if made.ends_stage]
+        offsets = [*(made.offsets.float() for made in ends[:-1]), end]
+        snapshots = group_path(original, groups, offsets, [made.step for made in ends], settings.snapshots)
+    losses = loss_table([(made.step, made.means) for made in recordings.made])
+    return record(snapshots, end, list(edited)), losses
+
+
+def _stages(optimization: OptimizeOptions, setup: TrainingSetup, edited: Pictures) -> list[TargetStage]:
+    """The strengths to optimize towards, and the steps that each gets."""
+    steps = iterations(optimization.steps) if optimization.solver == "colors" else optimization.steps
+    steps = max(steps, len(edited) + 1)  # each stage is to have one
+    if optimization.solver == "pictures":
+        steps = max(RECORDINGS, 2 * len(edited))
+    return [
+        TargetStage(s, [crop(p, v.box) for p, v in zip(pictures, setup.train, strict=True)], steps)
+        for (s, pictures), steps in zip(edited.items(), _steps_by_stage(steps, len(edited)), strict=True)
+    ]
+
+
+def _record_way(
+    way: Way,
+    steps: int,
+    state: PgsState,
+    recordings: Recordings,
+    joint: JointTraining | None,
+    folder: StateFolder,
+    log: RunLog,
+) -> PeriodicSave:
+    """Go the way to its end, from the saved state on, and a jointly trained network with it."""
     parts: dict[str, Resumable] = {"pgs": state, "recordings": recordings, "log": log}
-    kept = PeriodicSave(folder, PART, parts | ({"field": joint} if joint else {}))
-    if kept.restore():
+    saver = PeriodicSave(folder, PART, parts | ({"field": joint} if joint else {}))
+    if saver.restore():
         if joint is not None:
             joint.refill([(made.step, made.offsets) for made in recordings.made])
         log.say(f"continuing at step {state.step} of {steps}, with {len(recordings.made)} recordings")
@@ -143,59 +163,36 @@ def optimize_members(
                 joint.step()
             advance(step, f"loss to the edit {left:.4f}")
             if stopped():
-                kept.save()
+                saver.save()
                 raise KeyboardInterrupt
-            kept.step_done()
+            saver.step_done()
 
-        if pictures is not None:
-            advance(state.step, "")  # nearly all is done before the first step
-            way_there = solve_pictures(original, pictures, stages, state, step_done)
-        elif solver is not None:
-            way_there = solve(original, solver, stages, state, step_done, unseen_members)
-        else:
-            way_there = optimize(
-                original, crops, probe_views(setup), stages, objective, settings, step_done, state, renewal
-            )
+        advance(state.step, "")  # of a handful of pictures nearly all is done before the first step
         try:
-            for found in way_there:
-                recordings.add(found)
+            for snapshot in way(step_done):
+                recordings.add(snapshot)
                 if joint is not None:
-                    joint.add(found.step, found.offsets)
+                    joint.add(snapshot.step, snapshot.offsets)
         except FloatingPointError as error:
-            kept.save()
+            saver.save()
             raise ProgdfError(
                 f"training failed: {error}; the state before it is kept: fix the edited views and continue "
                 "with --resume, or try --kind style in another folder"
             ) from error
-    kept.save()
+    saver.save()
     if joint is not None:
         save_network(joint, folder)
-    losses = loss_table([(made.step, made.means) for made in recordings.made])
-    left = [made.means["left"] for made in recordings.made]
-    log.say(f"L1 to the finished edit: {left[0]:.4f} at first, {left[-1]:.4f} at the end")
-    log.say(f"the state was saved {kept.saves} times, in {kept.seconds:.2f} s")
-    snapshots = [(made.step, made.stage, made.ends_stage, made.offsets) for made in recordings.made]
-    end = stages[-1].place(state.average).clone()
-    if unseen_members is not None and len(unseen_members.places):
-        count = len(unseen_members.places)
-        if solver is not None:
-            log.say(f"{count} members that no view shows follow their neighbors")
-        elif is_no_worse(unseen_members, end, original, crops, stages):
-            snapshots = [
-                (step, stage, last, unseen_members.propagate(made)) for step, stage, last, made in snapshots
-            ]
-            end = unseen_members.propagate(end)
-            log.say(f"{count} members that no view shows follow their neighbors")
-        else:
-            log.say(
-                f"{count} members that hardly show keep what they learned: "
-                "following their neighbors would take the training views away from the edit"
-            )
-    if groups is not None:
-        ends = [made for made in recordings.made if made.ends_stage]
-        offsets = [*(made.offsets.float() for made in ends[:-1]), end]
-        snapshots = group_path(original, groups, offsets, [made.step for made in ends], settings.snapshots)
-    return record(snapshots, end, list(edited)), losses
+    return saver
+
+
+def _unseen_line(count: int, follow: bool) -> str:
+    """What becomes of the members that no view shows, for the log."""
+    if follow:
+        return f"{count} members that no view shows follow their neighbors"
+    return (
+        f"{count} members that hardly show keep what they learned: "
+        "following their neighbors would take the training views away from the edit"
+    )
 
 
 def is_no_worse(
@@ -214,9 +211,9 @@ def is_no_worse(
     return error(unseen_members.propagate(end)) <= 1.01 * error(end)
 
 
-def _trains_bands(optimization: Optimization, setup: TrainingSetup, log: RunLog) -> bool:
+def _trains_bands(optimization: OptimizeOptions, setup: TrainingSetup, log: RunLog) -> bool:
     """Whether the SH bands beyond DC are trained: a color edit trains them where the region's own show."""
-    if optimization.sh != "auto" or setup.scene.sh_degree == 0:
+    if optimization.sh != "auto" or setup.scene.sh_degree == 0 or optimization.solver == "pictures":
         return optimization.sh != "off"
     change = view_dependence(setup.scene[setup.region.members], [view.camera for view in setup.train])
     needed = change >= NEEDED
@@ -228,7 +225,7 @@ def _trains_bands(optimization: Optimization, setup: TrainingSetup, log: RunLog)
 
 
 def _groups(
-    optimization: Optimization,
+    optimization: OptimizeOptions,
     original: Tensor,
     crops: Sequence[CropScene],
     stages: Sequence[TargetStage],
@@ -239,7 +236,7 @@ def _groups(
     done = folder.load("groups")
     if done is not None:
         return restore_groups(original, done.tensors)
-    steps = optimization.group_steps
+    steps = optimization.group_steps or 0
     try:
         with log.steps("move parts", steps * len(stages)) as advance:
             groups = group_stage(
@@ -262,30 +259,29 @@ def _groups(
 
 
 def retime_trajectory(
-    trajectory: Trajectory, setup: TrainingSetup, slider: Slider, raw: bool, log: RunLog
+    trajectory: Trajectory, setup: TrainingSetup, optimization: OptimizeOptions, log: RunLog
 ) -> Trajectory:
     """Without jitter, and at the slider values where its change is due; every recording is rendered once.
 
     Args:
         trajectory: as recorded
         setup: scene, region, views
-        slider: what slider values mean
-        raw: keep the jitter
+        optimization: what slider values mean, and whether jitter is kept
         log: of the run
     """
     moving = moving_attributes(trajectory.end)
     small = probe_views(setup, _TIMED_VIEWS, still=only_recolors(trajectory.offsets))
-    rows = pack(setup.scene[setup.region.members], with_shN=trajectory.end.shape[1] > BASE_CHANNELS)
-    shown: list[Tensor] = []
+    original = pack(setup.scene[setup.region.members], with_shN=trajectory.end.shape[1] > BASE_CHANNELS)
+    pictures: list[Tensor] = []
     with log.steps("time the slider", len(trajectory)) as advance:
         for i in range(len(trajectory)):
-            images = render_all(small, rows + trajectory.node(i), moving)
-            shown.append(torch.cat([image.flatten() for image in images]))
+            images = render_all(small, original + trajectory.node(i), moving)
+            pictures.append(torch.cat([image.flatten() for image in images]))
             advance(i + 1, "recordings")
-    if not raw:
-        kept = straight_recordings(trajectory, shown)
-        trajectory, shown = select_recordings(trajectory, kept), [shown[i] for i in kept]
-    return retime(trajectory, shown, resolve_slider(slider, trajectory.strengths))
+    if not optimization.as_printed:
+        rows = straight_recordings(trajectory, pictures)
+        trajectory, pictures = select_recordings(trajectory, rows), [pictures[i] for i in rows]
+    return retime(trajectory, pictures, resolve_slider(optimization.slider, trajectory.strengths))
 
 
 def _steps_by_stage(steps: int, stages: int) -> list[int]:

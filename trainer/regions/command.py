@@ -24,11 +24,10 @@ from progdf.scene.bounds import front_direction
 from progdf.scene.region_spec import parse_region
 from progdf.scene.subject import fit_eye, subject_rows
 from progdf.scene.up_axis import find_up
-from trainer.option_checks import check_ranges
+from trainer.options import RegionOptions, ShowRegionOptions, ViewOptions, check_ranges
 from trainer.views.view import render_colors, seen_colors, with_near_plane
 
-from .from_pictures import RegionSettings, region_kinds
-from .options import RegionOptions
+from .from_pictures import RegionRequest, region_kinds
 
 _TINT = torch.tensor([1.0, 0.32, 0.05])
 _TINTED = 0.55
@@ -39,7 +38,7 @@ _FOV, _FILLED = math.radians(45.0), 0.9
 _SIDES = ((20.0, 15.0), (110.0, 15.0), (200.0, 15.0), (290.0, 15.0))
 
 
-def show(options: RegionOptions) -> list[str]:
+def show(options: ShowRegionOptions) -> list[str]:
     """Write what the options ask for; lines on what was found, the last with the region's count.
 
     Raises:
@@ -57,11 +56,10 @@ def show(options: RegionOptions) -> list[str]:
     scene = load_scene(options.scene)
     said: list[str] = []
     with tempfile.TemporaryDirectory() as folder:
-        settings = RegionSettings(
-            options.cameras, 30, lambda: Path(folder), options.lift_rule, options.lift_threshold,
-            up=options.up, scene=options.scene, say=said.append,
-        )  # fmt: skip
-        region = parse_region(options.spec, scene, kinds=region_kinds(settings), say=said.append)
+        masks = RegionOptions(options.spec, options.lift_rule, options.lift_threshold)
+        views = ViewOptions(options.cameras, options.up, scene=options.scene)
+        request = RegionRequest(masks, views, lambda: Path(folder), say=said.append)
+        region = parse_region(options.spec, scene, kinds=region_kinds(request), say=said.append)
     if suffix == ".npy":
         save_npy(options.out, region.members.numpy())
     else:
@@ -87,7 +85,7 @@ def picture(scene: Gaussians, region: Region, camera: Camera) -> Tensor:
     return render_colors(scene, shown, camera, torch.ones(3)).clamp(0.0, 1.0)
 
 
-def _cameras(options: RegionOptions, scene: Gaussians, up: Tensor, size: tuple[int, int]) -> list[Camera]:
+def _cameras(options: ShowRegionOptions, scene: Gaussians, up: Tensor, size: tuple[int, int]) -> list[Camera]:
     if options.camera is not None:
         return [replace(read_camera(options.camera, scene.origin), lens=None)]
     if options.orbit is None:

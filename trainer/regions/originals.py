@@ -15,7 +15,7 @@ from progdf.scene.bounds import is_surrounding
 from progdf.scene.orbit_rig import orbit_rig
 from progdf.scene.region_spec import parse_region
 from progdf.scene.up_axis import find_up
-from trainer.option_checks import check_ranges
+from trainer.options import RegionOptions, ViewOptions, WriteViewsOptions, check_ranges
 from trainer.views.choose import choose_views
 from trainer.views.view import (
     BACKGROUND,
@@ -27,11 +27,10 @@ from trainer.views.view import (
     with_near_plane,
 )
 
-from .from_pictures import RegionSettings, region_kinds
-from .options import ViewsOptions
+from .from_pictures import RegionRequest, region_kinds
 
 
-def write(options: ViewsOptions) -> str:
+def write(options: WriteViewsOptions) -> str:
     """Write OUT/original/NAME.png and OUT/cameras.json; what to do with them, in a line.
 
     Raises:
@@ -46,10 +45,9 @@ def write(options: ViewsOptions) -> str:
     up = find_up(scene, given, options.up, options.scene).direction
     region = None
     if options.region is not None:
-        settings = RegionSettings(
-            options.cameras, options.views, lambda: out / "segmented", up=options.up, scene=options.scene
-        )
-        region = parse_region(options.region, scene, kinds=region_kinds(settings))
+        views = ViewOptions(options.cameras, options.up, options.views, scene=options.scene)
+        request = RegionRequest(RegionOptions(options.region), views, lambda: out / "segmented")
+        region = parse_region(options.region, scene, kinds=region_kinds(request))
     if given:
         # what is drawn is straight, and so are the masks: no lens
         cameras = [replace(fit_size(camera, options.image_size), lens=None) for camera in given]

@@ -23,11 +23,12 @@ from progdf.rasterize import alpha_weights, render
 from trainer.fit.evaluate import Evaluator
 from trainer.fit.fit import Fitted, choice_figures, field_figures, stored_numbers
 from trainer.optimize.losses import Perceptual
+from trainer.options import TextOptions
 from trainer.report.curves import ErrorCurve, against_editor, error_curves
 from trainer.setup.training_setup import TrainingSetup
 from trainer.views.view import View, render_view
 
-from .clip import CLIP_MODEL, Clip, Texts, direction, load_clip, same_features
+from .clip import CLIP_MODEL, Clip, direction, load_clip, same_features
 
 COMPARED = "keyframes2"
 """The baseline whose courses stand beside the field's: what anyone would do first."""
@@ -88,8 +89,7 @@ class Measured:
 
 
 def measure(
-    evaluator: Evaluator,
-    reporting: Evaluator,
+    judges: tuple[Evaluator, Evaluator],
     trajectory: Trajectory,
     fitted: Fitted,
     shown: BakedField,
@@ -100,8 +100,7 @@ def measure(
     """Measure the chosen field beside the compared baseline.
 
     Args:
-        evaluator: all held-out views
-        reporting: those of them on which the field was not chosen
+        judges: all held-out views, and those of them on which the field was not chosen
         trajectory: what was recorded
         fitted: the field and its baselines
         shown: the field as it is shipped
@@ -109,7 +108,7 @@ def measure(
         perceptual: LPIPS, or its stand-in
         clip: measured already, or the reason why not
     """
-    field = fitted.chosen.field
+    (evaluator, reporting), field = judges, fitted.chosen.field
     fields = {"slider": field, COMPARED: fitted.baselines[COMPARED].field}
     slider = slider_statistics(lambda s: evaluator.pictures(shown.offsets(s)), masks=evaluator.pixels)
     samples = sample_strengths()[::_EVERY]
@@ -135,23 +134,25 @@ def expected_measures(trajectory: Trajectory) -> int:
     return 30 + 3 * len(sample_strengths()[::_EVERY]) + 2 * len(trajectory.asked) + 2 * _NODES
 
 
-def clip_curve(evaluator: Evaluator, views: Sequence[View], field: BakedField, texts: Texts) -> Direction:
+def clip_curve(
+    evaluator: Evaluator, views: Sequence[View], field: BakedField, texts: TextOptions
+) -> Direction:
     """CLIP directional similarity of the whole held-out views, or the reason why it is not measured.
 
     Args:
         evaluator: held-out views
         views: the same, whole
         field: what the slider shows
-        texts: see `Texts`
+        texts: see `TextOptions`
     """
-    for text, option in ((texts.before, "--text-before"), (texts.after, "--text-after")):
+    for text, option in ((texts.text_before, "--text-before"), (texts.text_after, "--text-after")):
         if not text.strip():
             return Direction(reason=f"{option} was not given: it takes a text for each end of the slider")
     try:
         clip = load_clip(CLIP_MODEL)
     except ProgdfError as error:
         return Direction(reason=str(error))
-    before, after = clip.texts([texts.before, texts.after])
+    before, after = clip.texts([texts.text_before, texts.text_after])
     if bool(same_features(before, after)):
         return Direction(reason="--text-before and --text-after say the same to CLIP")
     original = clip.pictures([view.image for view in views])

@@ -15,10 +15,8 @@ from torch import Tensor
 
 from progdf.errors import ProgdfError
 from progdf.io.images import to_picture
-from trainer.options import DETECTOR, SAM_MODEL
+from trainer.options import DETECTOR, SAM_MODEL, RegionOptions
 from trainer.store.pretrained import BROKEN, check_weights_here, folder_of_model
-
-from .base import SegmenterSettings
 
 
 @dataclass(frozen=True)
@@ -75,7 +73,7 @@ def normalize_prompt(prompt: str) -> str:
     return f"{words}."
 
 
-def grounded_sam(settings: SegmenterSettings) -> GroundedSam:
+def grounded_sam(options: RegionOptions) -> GroundedSam:
     """Load both networks from this machine.
 
     Raises:
@@ -109,18 +107,18 @@ def grounded_sam(settings: SegmenterSettings) -> GroundedSam:
             raise ProgdfError(_missing(model, option)) from error
 
     finder = load(
-        settings.detector,
+        options.detector,
         "grounding-dino",
         "--detector",
         DETECTOR,
         GroundingDinoForObjectDetection,
         GroundingDinoProcessor,
     )
-    sam_model = load(settings.sam_model, "sam", "--sam-model", SAM_MODEL, SamModel, SamProcessor)
-    return GroundedSam(*finder, *sam_model, settings.box_threshold)
+    sam_model = load(options.sam_model, "sam", "--sam-model", SAM_MODEL, SamModel, SamProcessor)
+    return GroundedSam(*finder, *sam_model, options.box_threshold)
 
 
-def check_grounded_sam(settings: SegmenterSettings) -> None:
+def check_grounded_sam(options: RegionOptions) -> None:
     """What `grounded_sam` would raise, as far as it is to be known without loading a network.
 
     Raises:
@@ -131,8 +129,8 @@ def check_grounded_sam(settings: SegmenterSettings) -> None:
     except ImportError as error:
         raise _import_failure(error) from error
     for model, kind, option, usual in (
-        (settings.detector, "grounding-dino", "--detector", DETECTOR),
-        (settings.sam_model, "sam", "--sam-model", SAM_MODEL),
+        (options.detector, "grounding-dino", "--detector", DETECTOR),
+        (options.sam_model, "sam", "--sam-model", SAM_MODEL),
     ):
         try:
             _check_kind(AutoConfig.from_pretrained(model, local_files_only=True), model, kind, option, usual)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from pathlib import Path
 
 import torch
 
@@ -12,8 +10,7 @@ from progdf.camera import Camera
 from progdf.gaussians import Gaussians
 from progdf.rasterize import alpha_weights
 from progdf.region import Region
-from progdf.scene.up_axis import UpChoice
-from trainer.options import MOST_VIEWS, VIEWS
+from trainer.options import MOST_VIEWS, VIEWS, ViewOptions
 from trainer.views.view import fit_size
 
 SIZES = (256, 320, 384)
@@ -26,30 +23,6 @@ _WELCOME, _BEARABLE = 0.3, 0.5
 """Share of unresolved members up to which a size will do, and above which it is said."""
 
 _LOOK, _LOOKS = 96, 4  # pixels of the views in which members are measured, and how many
-
-
-@dataclass(frozen=True)
-class ViewSettings:
-    """Which views there are.
-
-    Args:
-        cameras: file or folder of cameras; None: a rig that looks at the region
-        up: the axis of the scene that is up
-        views: how many are edited; None: as the members' density asks for
-        image_size: longer side in pixels; None: the same
-        pictures: changed pictures, whose cameras are the views, all of them to train on
-        dense: dense members get more and larger views; what is painted or given picture by picture stays as
-            small as can be, as does a draft
-        scene: its file, beside which there may be cameras that tell which way is up
-    """
-
-    cameras: Path | None = None
-    up: UpChoice = "auto"
-    views: int | None = None
-    image_size: int | None = None
-    dense: bool = True
-    pictures: tuple[Path, ...] = ()
-    scene: Path | None = None
 
 
 def unresolved_share(
@@ -76,7 +49,7 @@ def unresolved_share(
 
 
 def choose_resolution(
-    settings: ViewSettings,
+    options: ViewOptions,
     scene: Gaussians,
     region: Region,
     cameras_of: Callable[[int, int], Sequence[Camera]],
@@ -87,15 +60,15 @@ def choose_resolution(
     ones where the cameras are given and few. Why 40 of 320 and not 30 of 384: docs/experiments.md, Views.
 
     Args:
-        settings: see `ViewSettings`
+        options: see `ViewOptions`
         scene, region: what they look at
         cameras_of: longer side in pixels, number of views -> cameras
     """
-    tried = list(zip(SIZES, (VIEWS, MOST_VIEWS, MOST_VIEWS), strict=True)) if settings.dense else []
-    if settings.dense and settings.cameras is None and settings.views is None:
+    tried = list(zip(SIZES, (VIEWS, MOST_VIEWS, MOST_VIEWS), strict=True)) if options.dense else []
+    if options.dense and options.cameras is None and not options.views:
         tried.pop()
     tried = [
-        (settings.image_size or size, settings.views or views) for size, views in tried or [(SIZES[0], VIEWS)]
+        (options.image_size or size, options.views or views) for size, views in tried or [(SIZES[0], VIEWS)]
     ]
     for size, views in tried:
         cameras = cameras_of(size, views)

@@ -20,9 +20,10 @@ from progdf.rasterize.cpu.parallel import threads
 from progdf.region import Region
 from progdf.scene.bounds import is_surrounding
 from progdf.scene.up_axis import UpAxis, find_up, up_from_json
-from trainer.editors.base import EditKind, ImageEditor
+from trainer.editors.base import ImageEditor
 from trainer.editors.pictures import picture_cameras
 from trainer.editors.procedural import ColorEditor
+from trainer.options import Kind, ViewOptions
 from trainer.store.picture_list import add_pictures
 from trainer.store.progress import Advance
 from trainer.store.run_folder import RunFolder
@@ -39,7 +40,7 @@ from trainer.views.view import (
     with_near_plane,
 )
 
-from .resolution import PICTURE_SIZE, ViewSettings, choose_resolution
+from .resolution import PICTURE_SIZE, choose_resolution
 
 _PROBES = 3
 
@@ -86,7 +87,7 @@ class TrainingSetup:
         return f"{len(self.held_out)} held-out views" if len(self.held_out) > 1 else "one held-out view alone"
 
 
-def make_training_setup(settings: ViewSettings, scene: Gaussians, region: Region) -> TrainingSetup:
+def make_training_setup(options: ViewOptions, scene: Gaussians, region: Region) -> TrainingSetup:
     """The views: those of changed pictures; else the best of the given cameras, or of a rig that looks at the
     region.
 
@@ -94,23 +95,23 @@ def make_training_setup(settings: ViewSettings, scene: Gaussians, region: Region
         ProgdfError: no camera sees the region, or none are given and the scene is one to stand inside.
     """
     background = torch.tensor(BACKGROUND)
-    given = [] if settings.cameras is None else load_cameras(settings.cameras, scene.origin)
-    up = find_up(scene, given, settings.up, settings.scene)
-    if settings.pictures:
-        if settings.up == "auto" and (shown := _up_of_pictures(settings.pictures)) is not None:
+    given = [] if options.cameras is None else load_cameras(options.cameras, scene.origin)
+    up = find_up(scene, given, options.up, options.scene)
+    if options.pictures:
+        if options.up == "auto" and (shown := _up_of_pictures(options.pictures)) is not None:
             up = shown
-        return _picture_setup(settings, scene, region, given, up)
-    if settings.cameras is None and is_surrounding(scene, up.direction):
+        return _picture_setup(options, scene, region, given, up)
+    if options.cameras is None and is_surrounding(scene, up.direction):
         raise ProgdfError(f"the scene {INSIDE}")
 
     def cameras_of(image_size: int, views: int) -> list[Camera]:
-        if settings.cameras is not None:
+        if options.cameras is not None:
             found = [fit_size(camera, image_size) for camera in given]
         else:  # half as many again, as some will find the region hidden
             found = region_rig(scene, region, views + views // 2, image_size, up.direction)
         return with_near_plane(name_cameras(found), scene)
 
-    cameras, views, unresolved = choose_resolution(settings, scene, region, cameras_of)
+    cameras, views, unresolved = choose_resolution(options, scene, region, cameras_of)
     choice = choose_views(scene, region, cameras, views, background)
     train, held_out = split_views(choice, max(1, len(choice.views) // 5))
     notes = [f"up is {up.name}, {up.reason}"]
@@ -132,16 +133,16 @@ def _up_of_pictures(paths: Sequence[Path]) -> UpAxis | None:
 
 
 def _picture_setup(
-    settings: ViewSettings, scene: Gaussians, region: Region, given: Sequence[Camera], up: UpAxis
+    options: ViewOptions, scene: Gaussians, region: Region, given: Sequence[Camera], up: UpAxis
 ) -> TrainingSetup:
     """The views of changed pictures. All are trained on: what one shows no other may."""
-    background, size = torch.tensor(BACKGROUND), settings.image_size or PICTURE_SIZE
-    cameras = [fit_size(camera, size) for camera in picture_cameras(settings.pictures, given, scene.origin)]
+    background, size = torch.tensor(BACKGROUND), options.image_size or PICTURE_SIZE
+    cameras = [fit_size(camera, size) for camera in picture_cameras(options.pictures, given, scene.origin)]
     views = [
         make_view(scene, region, camera, background)
         for camera in with_near_plane(name_cameras(cameras), scene)
     ]
-    for view, path in zip(views, settings.pictures, strict=True):
+    for view, path in zip(views, options.pictures, strict=True):
         if not bool((view.mask > 0).any()):
             raise ProgdfError(f"{path} does not show the region '{region.name}'; leave it out")
     return TrainingSetup(scene, region, views, [], background, [f"up is {up.name}, {up.reason}"], up)
@@ -152,7 +153,7 @@ def editor_strengths(editor: ImageEditor, stages: int) -> tuple[float, ...]:
     return editor.stages or tuple((i + 1) / stages for i in range(stages))
 
 
-def confines_edit(editor: ImageEditor, kind: EditKind) -> bool:
+def confines_edit(editor: ImageEditor, kind: Kind) -> bool:
     """Whether what the editor changed outside the region is put back: unless the edit moves parts."""
     return kind != "geometry" and not editor.confined
 

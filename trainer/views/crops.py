@@ -41,7 +41,6 @@ class CropScene:
         cached: pixels that are drawn [h,w,1] bool, and the original picture [h,w,3], which the others are;
             None where all are drawn
         still: nothing but the members' colors ever differs
-        leads_back: clamps of colors and pixels pass gradients that lead back into range, see `clamp`
     """
 
     camera: Camera
@@ -52,7 +51,6 @@ class CropScene:
     background: Tensor
     cached: tuple[Tensor, Tensor] | None = None
     still: bool = False
-    leads_back: bool = True
 
     @property
     def size(self) -> tuple[int, int]:
@@ -71,10 +69,10 @@ class CropScene:
             moving: attributes whose values differ from the original's; the others are not looked at
 
         Returns:
-            image [h,w,3], 0..1 (see `leads_back`); transmittance [h,w]
+            image [h,w,3], 0..1 (see `clamp_towards`); transmittance [h,w]
         """
         members = unpack(packed, self.member_shN)
-        colors = member_colors(members, self.camera.position, self.leads_back)
+        colors = member_colors(members, self.camera.position)
         if self.still and not colors.requires_grad:
             weighed, others, transmittance = self._linear
             image = others + weighed.picture(colors)
@@ -92,7 +90,7 @@ class CropScene:
         if self.cached is not None:
             live, original = self.cached
             image = torch.where(live, image, original)
-        return (clamp_towards if self.leads_back else torch.clamp)(image, 0.0, 1.0), transmittance
+        return clamp_towards(image, 0.0, 1.0), transmittance
 
     @cached_property
     def _linear(self) -> tuple[ColorMap, Tensor, Tensor]:
@@ -119,18 +117,18 @@ COLORS = ("sh0", "shN")
 """The others."""
 
 
-def member_colors(members: Gaussians, eye: Tensor, leads_back: bool = True) -> Tensor:
-    """SH colors seen from `eye`; a channel clamped at 0 keeps the gradient that would raise it, or not. [M,3]
+def member_colors(members: Gaussians, eye: Tensor) -> Tensor:
+    """SH colors seen from `eye`; a channel clamped at 0 keeps the gradient that would raise it. [M,3]
 
     Directions are constants here: their share of the means' gradient is small and mostly noise.
     """
-    degree, clamp = min(members.sh_degree, 3), clamp_towards if leads_back else torch.clamp
+    degree = min(members.sh_degree, 3)
     if degree == 0:
-        return clamp(members.sh0 * C0 + 0.5, 0.0, float("inf"))
+        return clamp_towards(members.sh0 * C0 + 0.5, 0.0, float("inf"))
     directions = torch.nn.functional.normalize(members.means.detach() - eye, dim=1)
     weights = basis(degree, directions)
     raw = (weights[..., None] * members.sh[:, : weights.shape[1]]).sum(dim=1) + 0.5
-    return clamp(raw, 0.0, float("inf"))
+    return clamp_towards(raw, 0.0, float("inf"))
 
 
 def crop_scene(
@@ -140,7 +138,6 @@ def crop_scene(
     box: Crop,
     background: Tensor,
     still: bool = False,
-    leads_back: bool = True,
 ) -> CropScene:
     """Prepare one view.
 
@@ -152,7 +149,6 @@ def crop_scene(
         background: rgb. [3]
         still: nothing but colors will move, so only the tiles that show a member are drawn, see `tiles`, and
             without gradients a linear map of the members' colors; transmittance is right in these only
-        leads_back: see `CropScene`
     """
     activated = activate(scene, seen_colors(scene, camera))
     kept = render(activated, camera, background, crop=box).info.visible.clone()
@@ -165,7 +161,6 @@ def crop_scene(
         torch.searchsorted(index, members),
         scene.shN[members],
         background,
-        leads_back=leads_back,
     )
     return _keep_live_tiles(replace(whole, still=True)) if still else whole
 

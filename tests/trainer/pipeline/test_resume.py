@@ -21,7 +21,6 @@ from tests.helpers.stopped import OUT, bits, small_run
 from tests.helpers.stopped_runs import NEVER, at_step, gone_on, killed, saved_step, words
 from tests.helpers.trained import train
 from trainer.pipeline.resume import find_run, processor_kind
-from trainer.plan import make_plan
 from trainer.store.state import StateFolder
 
 pytest_plugins = ["tests.helpers.stopped_runs"]
@@ -241,10 +240,10 @@ def test_a_run_that_moves_parts_goes_on_to_the_same_bits(
 def test_what_is_found_in_a_folder_depends_on_the_options(
     bear_folder: Path, uninterrupted: Path, interrupted: Path
 ) -> None:
-    assert find_run(OUT, make_plan(small_run(bear_folder))) == "nothing"
+    assert find_run(small_run(bear_folder)) == "nothing"
     shutil.copytree(interrupted, OUT)
-    assert find_run(OUT, make_plan(small_run(bear_folder))) == "stopped"
-    assert find_run(OUT, make_plan(small_run(bear_folder, seed=1))) == "nothing"
+    assert find_run(small_run(bear_folder)) == "stopped"
+    assert find_run(small_run(bear_folder, seed=1)) == "nothing"
     shutil.rmtree(OUT)
     shutil.copytree(uninterrupted, OUT)
-    assert find_run(OUT, make_plan(small_run(bear_folder))) == "finished"
+    assert find_run(small_run(bear_folder)) == "finished"

@@ -114,6 +114,13 @@ def test_every_line_of_a_plot_is_drawn_in_its_color(scale: str) -> None:
     assert _color_count(picture, LINES[4]) == 0
 
 
+def test_more_lines_than_colors_are_all_drawn() -> None:
+    lines = {str(i): ([0.0, 1.0], [float(i), float(i)]) for i in range(len(LINES) + 2)}
+    all_of_them, first = (draw_plot(Plot("t", dict(list(lines.items())[:n])), 900, 400) for n in (8, 6))
+    for color in LINES[:2]:
+        assert _color_count(all_of_them, color) > 1.2 * _color_count(first, color)
+
+
 def test_gaps_zeros_and_empty_lines_do_not_break_a_plot() -> None:
     holes = ([0.0, 0.5, 1.0], [float("nan"), 0.0, 2.0])
     for scale in ("linear", "log"):
