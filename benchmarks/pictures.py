@@ -21,7 +21,7 @@ from progdf.scene.region_spec import parse_region
 from progdf.scene.up_axis import find_up
 from trainer.editors import make_editor
 from trainer.optimize.color_solver import color_columns
-from trainer.optimize.picture_solver import make_picture_solver
+from trainer.optimize.solve_pictures import make_picture_solver
 from trainer.options import EditorOptions
 from trainer.setup.training_setup import quantize_image
 from trainer.views.crops import crop_scene

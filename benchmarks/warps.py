@@ -25,8 +25,7 @@ from progdf.scene.bounds import scene_sphere
 from trainer.editors import make_editor
 from trainer.fit.evaluate import Evaluator, make_evaluator
 from trainer.optimize.groups import GROUP_STEPS, Groups, group_stage
-from trainer.optimize.losses import erode, perceptual_loss
-from trainer.optimize.objective import Objective
+from trainer.optimize.losses import Objective, erode, perceptual_loss
 from trainer.optimize.pgs import TargetStage, optimize, pgs_settings
 from trainer.options import EditorOptions, OptimizeOptions, RegionOptions, TrainOptions, ViewOptions
 from trainer.pipeline.kind_trial import Approach, approaches, try_approaches

@@ -25,8 +25,7 @@ from progdf.io.atomic import atomic_write, make_folder
 from progdf.io.images import read_picture, write_image
 from progdf.io.json_values import decode_json, plain
 from trainer.fit.fit import drop_idle_attributes
-from trainer.optimize.losses import Perceptual, perceptual_loss
-from trainer.optimize.objective import describe_loss
+from trainer.optimize.losses import Perceptual, describe_loss, perceptual_loss
 from trainer.optimize.unseen import unseen_members_of
 from trainer.options import TrainOptions
 from trainer.pipeline.reopen import reopen_run

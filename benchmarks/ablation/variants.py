@@ -123,7 +123,7 @@ def _other(name: str, what: str, part: str, value: object, of: str = BASE) -> Va
     return Variant(name, what, {f"optimize.{part}": value}, of)
 
 
-_PGS, _EPSILON = "trainer.optimize.pgs", "trainer.optimize.optimizer_state.EPSILON"
+_PGS, _EPSILON = "trainer.optimize.pgs", "trainer.optimize.pgs.EPSILON"
 
 
 def _is_inside(value: Tensor, low: float, high: float, slope: Tensor) -> Tensor:

@@ -18,8 +18,7 @@ from progdf.gaussians import Gaussians, pack
 from progdf.region import Region, from_mask
 from tests.helpers.demo_scenes import bear
 from trainer.editors import make_editor
-from trainer.optimize.losses import GradientL1
-from trainer.optimize.objective import Objective
+from trainer.optimize.losses import GradientL1, Objective
 from trainer.optimize.pgs import PgsSettings, TargetStage, learning_rates
 from trainer.options import EditorOptions, OptimizeOptions, RegionOptions, TrainOptions, with_values
 from trainer.pipeline.fit_and_report import RunResult

@@ -26,8 +26,7 @@ from progdf.torch_threads import one_thread
 from trainer.views.crops import CropScene
 
 from .losses import l1
-from .optimizer_state import PgsState
-from .pgs import OnStep, ParameterSnapshot, TargetStage
+from .pgs import OnStep, ParameterSnapshot, PgsState, TargetStage
 from .unseen import UnseenMembers
 
 STEPS_OF_OTHERS = 8

@@ -21,8 +21,7 @@ from progdf.metrics.image import decibels
 from progdf.scene.bounds import scene_sphere
 from trainer.editors import KIND_UNKNOWN, ImageEditor
 from trainer.optimize.groups import GROUP_STEPS, group_stage
-from trainer.optimize.losses import GradientL1
-from trainer.optimize.objective import Objective
+from trainer.optimize.losses import GradientL1, Objective
 from trainer.optimize.pgs import TargetStage, optimize, pgs_settings
 from trainer.options import EditKind, OptimizeOptions, TrainOptions, with_values
 from trainer.resolve import resolve_kind

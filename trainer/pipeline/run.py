@@ -23,8 +23,7 @@ from trainer.fit.fit import drop_idle_attributes
 from trainer.fit.network import PART as NETWORK
 from trainer.fit.own_path import choose_path
 from trainer.fit.slider_uniformity import equalized_strengths
-from trainer.optimize.losses import Perceptual, perceptual_loss
-from trainer.optimize.objective import describe_loss
+from trainer.optimize.losses import Perceptual, describe_loss, perceptual_loss
 from trainer.optimize.retime import resolve_slider
 from trainer.optimize.unseen import unseen_members_of
 from trainer.options import EditKind, OptimizeOptions, TrainOptions

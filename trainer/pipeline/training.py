@@ -17,14 +17,19 @@ from trainer.fit.memory_bank import JointTraining
 from trainer.fit.network import begin_joint_training, save_network
 from trainer.optimize.color_solver import iterations, make_solver, solve
 from trainer.optimize.groups import Groups, group_path, group_stage, restore_groups
-from trainer.optimize.losses import Perceptual, erode
-from trainer.optimize.objective import Losses, Objective, loss_table
-from trainer.optimize.optimizer_state import PgsState
-from trainer.optimize.pgs import OnStep, ParameterSnapshot, Renewal, TargetStage, optimize, pgs_settings
-from trainer.optimize.picture_solver import RECORDINGS, make_picture_solver, solve_pictures
+from trainer.optimize.losses import Losses, Objective, Perceptual, erode, loss_table
+from trainer.optimize.pgs import (
+    OnStep,
+    ParameterSnapshot,
+    PgsState,
+    Renewal,
+    TargetStage,
+    optimize,
+    pgs_settings,
+)
 from trainer.optimize.retime import record, resolve_slider, retime, select_recordings, straight_recordings
-from trainer.optimize.unseen import UnseenMembers
-from trainer.optimize.view_dependence import NEEDED, view_dependence
+from trainer.optimize.solve_pictures import RECORDINGS, make_picture_solver, solve_pictures
+from trainer.optimize.unseen import NEEDED, UnseenMembers, view_dependence
 from trainer.options import OptimizeOptions, TrainOptions
 from trainer.pipeline.recordings import Recordings
 from trainer.setup.training_setup import Pictures, TrainingSetup, probe_views

@@ -13,7 +13,7 @@ from progdf.field import BakedField
 from progdf.field.evaluate import sample_strengths
 from progdf.io.images import contact_sheet, to_picture
 from trainer.fit.evaluate import Evaluator
-from trainer.optimize.objective import Losses
+from trainer.optimize.losses import Losses
 from trainer.report.curves import ErrorCurve
 from trainer.report.measures import COMPARED, Direction, Measured
 

@@ -27,8 +27,7 @@ from trainer.motion.similarity import (
     move_rows,
 )
 from trainer.optimize.groups import Groups, group_path, group_stage, restore_groups
-from trainer.optimize.losses import GradientL1
-from trainer.optimize.objective import Objective
+from trainer.optimize.losses import GradientL1, Objective
 from trainer.optimize.pgs import PgsSettings, TargetStage, learning_rates, optimize
 from trainer.options import OptimizeOptions
 from trainer.pipeline.run import RunResult

@@ -15,8 +15,20 @@ from progdf.metrics.lpips import Lpips
 from tests.helpers.count import Count
 from tests.helpers.trained import WHITE, small
 from trainer.editors import make_editor
-from trainer.optimize.losses import GradientL1, LpipsLoss, erode, l1, progressive_change, sharpness
-from trainer.optimize.objective import Moment, Objective, TermMeans, describe_loss, loss_table, total_loss
+from trainer.optimize.losses import (
+    GradientL1,
+    LpipsLoss,
+    Moment,
+    Objective,
+    TermMeans,
+    describe_loss,
+    erode,
+    l1,
+    loss_table,
+    progressive_change,
+    sharpness,
+    total_loss,
+)
 from trainer.optimize.pgs import ParameterSnapshot, PgsSettings, TargetStage, learning_rates, optimize
 from trainer.options import EditorOptions, Norm, OptimizeOptions, Progressive
 from trainer.views.crops import crop_scene
@@ -104,8 +116,8 @@ def test_each_term_has_its_name_and_their_sum_is_the_loss() -> None:
 def test_weights_scale_their_terms_and_leave_l1_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     now = moment(image=0.5 * noise(8, 9, 3))
     single = Objective(GradientL1(), ALL_TERMS).terms(now)
-    monkeypatch.setattr("trainer.optimize.objective.PROGRESSIVE_WEIGHT", 10.0)
-    monkeypatch.setattr("trainer.optimize.objective.SHARPNESS_WEIGHT", {"hinge": 0.2})
+    monkeypatch.setattr("trainer.optimize.losses.PROGRESSIVE_WEIGHT", 10.0)
+    monkeypatch.setattr("trainer.optimize.losses.SHARPNESS_WEIGHT", {"hinge": 0.2})
     double = Objective(GradientL1(), replace(ALL_TERMS, perceptual_weight=0.6)).terms(now)
     for name, value in single.items():
         assert float(value.detach()) > 0
@@ -192,7 +204,7 @@ def test_absolutes_of_steps_freeze_the_edit_and_squares_slow_it_down(progressive
 
 
 def test_a_small_weight_of_the_constraint_does_not_hold_the_edit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("trainer.optimize.objective.PROGRESSIVE_WEIGHT", 1e-6)
+    monkeypatch.setattr("trainer.optimize.losses.PROGRESSIVE_WEIGHT", 1e-6)
     slight = paying(progressive="decay", progressive_norm="absolutes")
     assert distance_traveled(slight) > 0.8 * distance_traveled(paying())
 

@@ -16,8 +16,7 @@ from progdf.gdf.file import load_gdf
 from tests.helpers.trained import WHITE, quick_options, small, train
 from trainer.cli import train_options
 from trainer.fit.network import RenderedLoss, network_settings
-from trainer.optimize.losses import GradientL1, l1
-from trainer.optimize.objective import describe_loss
+from trainer.optimize.losses import GradientL1, describe_loss, l1
 from trainer.optimize.pgs import pgs_settings
 from trainer.options import TrainOptions, apply_preset, with_values
 from trainer.pipeline.run import RunResult

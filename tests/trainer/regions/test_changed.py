@@ -25,7 +25,7 @@ from tests.helpers.scenes import random_gaussians
 from tests.helpers.trained import small
 from trainer.editors import make_editor
 from trainer.editors.pictures import read_change
-from trainer.optimize.picture_solver import make_picture_solver
+from trainer.optimize.solve_pictures import make_picture_solver
 from trainer.options import EditorOptions, RegionOptions, ViewOptions
 from trainer.regions.changed import find_change
 from trainer.regions.from_pictures import RegionRequest, region_checks, region_kinds
