@@ -22,8 +22,7 @@ from trainer.editors import PER_VIEW, make_editor
 from trainer.evaluate.opened import FADE, KEYFRAMES, SLIDER, OpenedRun, open_run
 from trainer.fit.evaluate import Evaluator, make_evaluator
 from trainer.optimize.losses import perceptual_loss
-from trainer.report.curves import picture_courses
-from trainer.report.measures import COMPARED
+from trainer.report.measures import COMPARED, picture_courses
 from trainer.views.choose import split_held_out
 from trainer.views.view import make_view
 

@@ -23,7 +23,7 @@ from trainer.editors import make_editor
 from trainer.optimize.color_solver import color_columns
 from trainer.optimize.solve_pictures import make_picture_solver
 from trainer.options import EditorOptions
-from trainer.setup.training_setup import quantize_image
+from trainer.setup import quantize_image
 from trainer.views.crops import crop_scene
 from trainer.views.view import (
     BACKGROUND,

@@ -23,19 +23,19 @@ from progdf.metrics.slider import Pictures
 from progdf.scene.region_spec import parse_region
 from progdf.terminal import print_line
 from trainer.editors import make_editor
+from trainer.evaluate.measures import markdown_table
 from trainer.evaluate.opened import FADE, KEYFRAMES, SLIDER, OpenedRun, open_run
-from trainer.evaluate.table import markdown_table
 from trainer.optimize.losses import Perceptual, perceptual_loss
 from trainer.options import EditorOptions, OptimizeOptions, RegionOptions, TrainOptions, ViewOptions
 from trainer.pipeline.demo import Effort, write_scene
 from trainer.pipeline.resume import find_run
 from trainer.pipeline.run import train
 from trainer.pipeline.threads import use_threads
-from trainer.report.curves import ErrorCurve, picture_courses
+from trainer.report.measures import ErrorCurve, picture_courses
 from trainer.report.plots import Plot
 from trainer.report.report import stack_plots, thumbnail
 from trainer.resolve import resolve
-from trainer.setup.training_setup import make_training_setup
+from trainer.setup import make_training_setup
 from trainer.store.run_folder import write_json
 from trainer.views.view import crop, render_view
 

@@ -30,13 +30,7 @@ from trainer.optimize.pgs import TargetStage, optimize, pgs_settings
 from trainer.options import EditorOptions, OptimizeOptions, RegionOptions, TrainOptions, ViewOptions
 from trainer.pipeline.kind_trial import Approach, approaches, try_approaches
 from trainer.resolve import resolve, resolve_kind
-from trainer.setup.training_setup import (
-    TrainingSetup,
-    make_training_setup,
-    probe_views,
-    quantize_image,
-    widen_views,
-)
+from trainer.setup import TrainingSetup, make_training_setup, probe_views, quantize_image, widen_views
 from trainer.views.crops import CropScene, crop_scene
 from trainer.views.view import View, crop
 

@@ -33,7 +33,7 @@ from trainer.pipeline.threads import use_threads
 from trainer.pipeline.training import optimize_members, retime_trajectory
 from trainer.report.report import SHOWN, best_view, editor_strip, strip
 from trainer.resolve import resolve_kind
-from trainer.setup.training_setup import Pictures, whole_views
+from trainer.setup import Pictures, whole_views
 from trainer.store.interrupts import interrupt_on_signals
 from trainer.store.progress import RunLog
 from trainer.store.run_folder import RunFolder, lock_folder, write_json

@@ -19,7 +19,7 @@ from trainer.fit.slider_uniformity import equalize_slider
 from trainer.optimize.losses import Perceptual
 from trainer.optimize.retime import resolve_slider
 from trainer.options import FieldOptions, TrainOptions
-from trainer.report.curves import against_editor
+from trainer.report.measures import against_editor
 from trainer.report.report import SHOWN
 from trainer.store.progress import RunLog
 from trainer.store.state import StateFolder

@@ -18,7 +18,7 @@ from trainer.fit.fit import visibility
 from trainer.options import QUICK_STAGES, QUICK_STEPS, QUICK_VIEWS, EditKind, TrainOptions, with_values
 from trainer.pipeline.reopen import FinishedRun, render_run_views
 from trainer.report.report import Columns, columns_of
-from trainer.setup.training_setup import (
+from trainer.setup import (
     Pictures,
     TrainingSetup,
     confines_edit,

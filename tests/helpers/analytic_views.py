@@ -28,7 +28,7 @@ from tests.helpers.demo_scenes import bear
 from tests.helpers.paths import SHARED_DATA
 from trainer.options import EditorOptions, OptimizeOptions, RegionOptions, TrainOptions
 from trainer.resolve import resolve
-from trainer.setup.training_setup import make_training_setup
+from trainer.setup import make_training_setup
 
 PLAYBOT = SHARED_DATA / "playbot_31k.ply"
 _EARS, _HANDS = "big ears", (2, 3)

@@ -12,9 +12,8 @@ from trainer.options import EditorOptions
 from trainer.views.view import View
 
 from .base import ImageEditor, RepaintingEditor
-from .folder import folder, folder_of, photograph_folders, photographs
 from .instruct import check_instruct, instruct
-from .pictures import picture_paths, pictures
+from .pictures import folder, folder_of, photograph_folders, photographs, picture_paths, pictures
 from .procedural import darken, night, paint_of, recolor, stops_of, stripes, tint
 from .style import check_style, style
 

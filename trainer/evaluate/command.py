@@ -2,18 +2,117 @@
 
 from __future__ import annotations
 
-from progdf.io.images import write_image
+from collections.abc import Sequence
+
+import torch
+from PIL import Image
+from torch import Tensor
+
+from progdf.io.images import contact_sheet, to_picture, write_image
 from progdf.terminal import print_line
 from trainer.optimize.losses import perceptual_loss
 from trainer.options import EvaluateOptions
 from trainer.pipeline.refit import asked_texts
 from trainer.pipeline.threads import use_threads
+from trainer.report.plots import PAPER, Plot
+from trainer.report.report import (
+    best_view,
+    column_heading,
+    columns_of,
+    editor_strip,
+    shown_view,
+    stack_plots,
+    thumbnail,
+)
 from trainer.store.run_folder import write_json
 
-from .measures import Evaluation, evaluate_run
-from .opened import open_run
-from .picture import evaluation_picture
-from .table import evaluation_json, evaluation_table
+from .consistency import EDITED, UNEDITED, WarpedPair
+from .measures import Evaluation, evaluate_run, evaluation_json, evaluation_table
+from .opened import OpenedRun, open_run
+
+_THUMBNAIL = 240
+_AMPLIFIED = 4
+_SPAN = (0.0, 1.0)
+
+
+def evaluation_picture(opened: OpenedRun, evaluation: Evaluation) -> Tensor:
+    """Thumbnails over curves. -> [H,W,3]"""
+    evaluator = opened.evaluator
+    columns, best = columns_of(opened.trajectory.asked), best_view(evaluator)
+    strips = {
+        name: [thumbnail(pictures(s)[best], _THUMBNAIL) for s, _ in columns]
+        for name, pictures in opened.contenders().items()
+    }
+    strips["the editor"] = editor_strip(evaluator, columns, _THUMBNAIL)
+    sheets = [
+        contact_sheet(
+            list(strips.values()),
+            list(strips),
+            [column_heading(*column) for column in columns],
+            f"{opened.gdf.name}: {opened.run.record.plan.editor.editor}",
+            shown_view(evaluator, len(opened.setup.held_out)),
+        )
+    ]
+    if pairs := evaluation.consistency.pairs:
+        sheets.append(_warp_sheet(max(pairs, key=lambda pair: pair.shared)))
+    return stack_plots(_joined([to_picture(sheet) for sheet in sheets]), _plots(evaluation))
+
+
+def _warp_sheet(pair: WarpedPair) -> Tensor:
+    """A view, another warped onto it, and what differs: of the edited scene and of the original."""
+    depth = pair.depth
+    shown = depth > 0
+    near, far = (float(depth[shown].quantile(q)) if bool(shown.any()) else q for q in (0.02, 0.98))
+    gray = torch.where(shown, 1 - 0.85 * ((depth - near) / max(far - near, 1e-9)).clamp(0, 1), 1.0)
+    rows = []
+    for whose in (EDITED, UNEDITED):
+        view, warped = pair.pictures[whose]
+        difference = 1 - (_AMPLIFIED * (warped - view).abs()).clamp(0, 1)
+        both = torch.where(pair.both[..., None], view, 0.35 * view + 0.65)
+        rows.append([view, both, warped, difference, gray[..., None].expand(-1, -1, 3)])
+    return contact_sheet(
+        [[thumbnail(image, _THUMBNAIL) for image in row] for row in rows],
+        [EDITED, UNEDITED],
+        [pair.target, "what both see", f"{pair.source} warped", f"difference, {_AMPLIFIED} times", "depth"],
+        "One held-out view warped onto another by rendered depth",
+    )
+
+
+def _plots(evaluation: Evaluation) -> list[list[Plot]]:
+    lpips = "LPIPS" if evaluation.perceptual.startswith("lpips") else evaluation.perceptual
+    curves, paths = evaluation.curves, evaluation.paths
+    psnr = {name: (curve.s, curve.psnr) for name, curve in curves.items()}
+    perceptual = {name: (curve.s, curve.lpips) for name, curve in curves.items()}
+    steps = {name: (_middles(len(path.steps)), path.steps) for name, path in paths.items()}
+    change = {name: (_ends(len(path.from_original)), path.from_original) for name, path in paths.items()}
+    return [
+        [
+            Plot("PSNR to the edited views, dB", psnr, "slider", span=_SPAN),
+            Plot(f"{lpips} to the edited views", perceptual, "slider", low=0.0, span=_SPAN),
+        ],
+        [
+            Plot(f"{lpips} between neighboring slider values", steps, "slider", low=0.0, span=_SPAN),
+            Plot(f"{lpips} from the original", change, "slider", low=0.0, span=_SPAN),
+        ],
+    ]
+
+
+def _joined(sheets: Sequence[Image.Image]) -> Image.Image:
+    """Sheets below each other on one page."""
+    page = Image.new("RGB", (max(s.width for s in sheets), sum(s.height for s in sheets)), PAPER)
+    top = 0
+    for sheet in sheets:
+        page.paste(sheet, (0, top))
+        top += sheet.height
+    return page
+
+
+def _middles(count: int) -> list[float]:
+    return [(i + 0.5) / count for i in range(count)]
+
+
+def _ends(count: int) -> list[float]:
+    return [i / (count - 1) for i in range(count)]
 
 
 def evaluate(options: EvaluateOptions) -> Evaluation:

@@ -23,7 +23,7 @@ from progdf.gaussians import BASE_CHANNELS, pack
 from progdf.interpolation import interpolate, interpolate_at
 from trainer.editors import COSTLY_STRENGTHS, check_editor
 from trainer.editors.base import ImageEditor
-from trainer.setup.training_setup import TrainingSetup, probe_views
+from trainer.setup import TrainingSetup, probe_views
 from trainer.store.progress import RunLog
 from trainer.views.crops import GEOMETRY, render_all
 from trainer.views.view import View

@@ -19,7 +19,7 @@ from progdf.rasterize import alpha_weights
 from progdf.sh import basis
 from trainer.options import OptimizeOptions
 from trainer.regions.surface import surface_likeness
-from trainer.setup.training_setup import TrainingSetup
+from trainer.setup import TrainingSetup
 from trainer.views.choose import visible_area
 from trainer.views.view import View
 

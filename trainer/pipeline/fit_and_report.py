@@ -30,7 +30,7 @@ from trainer.options import FieldOptions
 from trainer.pipeline.record import RunRecord
 from trainer.report.measures import PaintTaken, clip_curve, expected_measures, figures, measure, measure_paint
 from trainer.report.report import report_picture
-from trainer.setup.training_setup import TrainingSetup
+from trainer.setup import TrainingSetup
 from trainer.store.progress import RunLog
 from trainer.store.run_folder import RunFolder, read_views, write_json
 from trainer.store.state import Saved

@@ -25,7 +25,7 @@ from trainer.optimize.losses import GradientL1, Objective
 from trainer.optimize.pgs import TargetStage, optimize, pgs_settings
 from trainer.options import EditKind, OptimizeOptions, TrainOptions, with_values
 from trainer.resolve import resolve_kind
-from trainer.setup.training_setup import TrainingSetup
+from trainer.setup import TrainingSetup
 from trainer.store.progress import Advance, RunLog
 from trainer.views.crops import CropScene, crop_scene, render_all
 from trainer.views.view import View, crop, fit_size

@@ -19,7 +19,7 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import pack
 from trainer.editors import RepaintingEditor, make_editor
 from trainer.options import EditorOptions, OptimizeOptions
-from trainer.setup.training_setup import TrainingSetup, confines_edit, quantize_image
+from trainer.setup import TrainingSetup, confines_edit, quantize_image
 from trainer.store.progress import RunLog
 from trainer.store.run_folder import RunFolder
 from trainer.views.view import crop, render_view

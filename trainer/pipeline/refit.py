@@ -10,7 +10,7 @@ from trainer.pipeline.fit_and_report import RunResult, finish_run
 from trainer.pipeline.reopen import render_run_views, reopen_run
 from trainer.pipeline.threads import use_threads
 from trainer.resolve import check_field_options
-from trainer.setup.training_setup import whole_views, widen_views
+from trainer.setup import whole_views, widen_views
 from trainer.store.progress import RunLog
 from trainer.store.run_folder import read_views
 

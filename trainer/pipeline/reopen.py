@@ -15,7 +15,7 @@ from progdf.gaussians import Gaussians
 from progdf.io.cameras import load_cameras
 from progdf.region import Region
 from trainer.pipeline.record import RunRecord, read_record
-from trainer.setup.training_setup import TrainingSetup
+from trainer.setup import TrainingSetup
 from trainer.store.run_folder import RunFolder
 from trainer.views.view import make_view, with_near_plane
 

@@ -18,7 +18,7 @@ from progdf.io.json_values import plain
 from progdf.region import Region
 from progdf.scene.region_spec import parse_region
 from trainer.editors import EXTERNAL, PER_VIEW, make_editor
-from trainer.editors.folder import FolderEditor
+from trainer.editors.pictures import FolderEditor
 from trainer.fit.fit import drop_idle_attributes
 from trainer.fit.network import PART as NETWORK
 from trainer.fit.own_path import choose_path
@@ -31,7 +31,7 @@ from trainer.pipeline.threads import use_threads
 from trainer.regions.from_pictures import region_kinds
 from trainer.report.agreement import Agreement, measure_agreement
 from trainer.resolve import recorded_options, resolve, resolve_kind
-from trainer.setup.training_setup import (
+from trainer.setup import (
     Pictures,
     TrainingSetup,
     confines_edit,

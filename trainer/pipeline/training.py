@@ -13,8 +13,7 @@ from progdf.errors import ProgdfError
 from progdf.field.trajectory import Trajectory
 from progdf.gaussians import BASE_CHANNELS, pack
 from progdf.scene.bounds import scene_sphere
-from trainer.fit.memory_bank import JointTraining
-from trainer.fit.network import begin_joint_training, save_network
+from trainer.fit.network import JointTraining, begin_joint_training, save_network
 from trainer.optimize.color_solver import iterations, make_solver, solve
 from trainer.optimize.groups import Groups, group_path, group_stage, restore_groups
 from trainer.optimize.losses import Losses, Objective, Perceptual, erode, loss_table
@@ -32,7 +31,7 @@ from trainer.optimize.solve_pictures import RECORDINGS, make_picture_solver, sol
 from trainer.optimize.unseen import NEEDED, UnseenMembers, view_dependence
 from trainer.options import OptimizeOptions, TrainOptions
 from trainer.pipeline.recordings import Recordings
-from trainer.setup.training_setup import Pictures, TrainingSetup, probe_views
+from trainer.setup import Pictures, TrainingSetup, probe_views
 from trainer.store.interrupts import defer_signals
 from trainer.store.progress import RunLog
 from trainer.store.state import PeriodicSave, Resumable, StateFolder

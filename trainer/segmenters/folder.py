@@ -21,7 +21,7 @@ from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.io.images import flatten_onto, open_picture
 from progdf.lens import undistort
-from trainer.editors.folder import SUFFIXES
+from trainer.editors.pictures import SUFFIXES
 
 
 def read_masks(folder: Path, cameras: Sequence[Camera], bent: bool = False) -> list[Tensor | None]:

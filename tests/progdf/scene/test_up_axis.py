@@ -31,7 +31,7 @@ from tests.helpers.demo_scenes import bear, room
 from tests.helpers.scenes import ball, high_chair, random_gaussians, turned, upright_turn
 from tests.helpers.stacks import bear_stack
 from trainer.options import ViewOptions
-from trainer.setup.training_setup import make_training_setup
+from trainer.setup import make_training_setup
 from viewer.camera.view_camera import first_camera
 from viewer.commands import opening
 from viewer.commands.options import RenderOptions

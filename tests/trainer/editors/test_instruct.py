@@ -17,8 +17,7 @@ from progdf.errors import ProgdfError
 from tests.helpers.tiny_pipelines import tiny_flux2_klein, tiny_flux_kontext, tiny_instruct_pix2pix
 from tests.helpers.trained import quick_options, small, train, write_bear
 from trainer.editors import make_editor
-from trainer.editors.adapters import ADAPTERS
-from trainer.editors.instruct import InstructEditor
+from trainer.editors.instruct import ADAPTERS, InstructEditor
 from trainer.options import EditorOptions
 
 BATMAN = 'instruct:"turn him into Batman"'

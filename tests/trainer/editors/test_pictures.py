@@ -21,7 +21,7 @@ from tests.helpers.scenes import ball
 from trainer.editors import check_new_editor, make_editor
 from trainer.editors.pictures import background_of, picture_cameras, picture_paths
 from trainer.options import EditorOptions
-from trainer.setup.training_setup import quantize_image
+from trainer.setup import quantize_image
 from trainer.views.view import View, make_view, render_view
 
 WHITE = torch.ones(3)

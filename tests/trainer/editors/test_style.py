@@ -16,7 +16,7 @@ from trainer.editors import make_editor
 from trainer.editors.cache import KeptPictures
 from trainer.editors.style import StyleEditor, cross_fade
 from trainer.options import EditKind, EditorOptions
-from trainer.setup.training_setup import confines_edit
+from trainer.setup import confines_edit
 
 
 def crispness(image: Tensor) -> float:

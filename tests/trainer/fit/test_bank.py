@@ -19,7 +19,7 @@ from progdf.formats.ply import load_ply
 from progdf.gdf.file import load_gdf
 from tests.helpers.edits import curved_trajectory
 from tests.helpers.trained import quick_options
-from trainer.fit.memory_bank import JointTraining, MemoryBank
+from trainer.fit.network import JointTraining, MemoryBank
 from trainer.options import FitOptions, with_values
 from trainer.pipeline.refit import refit
 from trainer.pipeline.run import RunResult

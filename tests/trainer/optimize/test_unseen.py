@@ -13,7 +13,7 @@ from trainer.optimize.pgs import TargetStage
 from trainer.optimize.unseen import UnseenMembers, find_unseen_members, least_shown, unseen_members_of
 from trainer.options import EditKind
 from trainer.pipeline.training import is_no_worse
-from trainer.setup.training_setup import TrainingSetup
+from trainer.setup import TrainingSetup
 from trainer.views.crops import crop_scene, render_all
 from trainer.views.view import View, make_view
 

@@ -19,7 +19,7 @@ from trainer.editors import make_editor
 from trainer.options import EditorOptions, TrainOptions, with_values
 from trainer.pipeline.kind_trial import Approach, Trial, approaches, try_approaches
 from trainer.resolve import resolve
-from trainer.setup.training_setup import TrainingSetup
+from trainer.setup import TrainingSetup
 
 COLOR, STYLE, FREE = Approach("color"), Approach("style"), Approach("geometry")
 IN_PARTS = Approach("geometry", 120)

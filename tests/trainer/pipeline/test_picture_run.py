@@ -25,7 +25,7 @@ from trainer.evaluate.command import evaluate
 from trainer.options import EditorOptions, EvaluateOptions, ViewOptions, with_values
 from trainer.pipeline.run import RunResult
 from trainer.report.measures import PaintTaken, measure_paint
-from trainer.setup.training_setup import make_training_setup
+from trainer.setup import make_training_setup
 from trainer.views.view import View, render_view
 
 SPEC = "recolor:#3060d0"
@@ -41,7 +41,7 @@ def views(folder: Path) -> tuple[View, ...]:
 
 def bear(folder: Path) -> tuple:  # type: ignore[type-arg]
     scene = load_ply(folder / "scene.ply")
-    return scene, parse_region(quick_options(folder).region, scene)
+    return scene, parse_region(quick_options(folder).region.region, scene)
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from trainer.editors.cache import KeptPictures
 from trainer.editors.style import StyleEditor
 from trainer.options import TrainOptions
 from trainer.pipeline.reedit import Reedit
-from trainer.setup.training_setup import TrainingSetup
+from trainer.setup import TrainingSetup
 from trainer.store.progress import RunLog
 
 

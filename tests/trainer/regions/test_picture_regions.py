@@ -26,7 +26,7 @@ from tests.helpers.demo_scenes import bear
 from tests.helpers.tiny_segmenters import tiny_detector, tiny_sam
 from tests.helpers.trained import label_mask, quick_options, train, write_bear
 from trainer import segmenters
-from trainer.editors.folder import FolderEditor
+from trainer.editors.pictures import FolderEditor
 from trainer.options import RegionOptions, ViewOptions, with_values
 from trainer.regions.from_pictures import RegionRequest, region_kinds
 from trainer.segmenters import SEGMENTERS

@@ -20,7 +20,7 @@ from tests.helpers.trained import WHITE, Small, small
 from trainer.fit.evaluate import Evaluator, make_evaluator
 from trainer.fit.fit import drop_idle_attributes
 from trainer.optimize.losses import GradientL1
-from trainer.report.curves import error_curves
+from trainer.report.measures import error_curves
 from trainer.report.plots import LINES, Plot, draw_plot
 from trainer.report.report import best_view, columns_of, editor_strip, strip, thumbnail
 from trainer.store.progress import PeakMemory

@@ -15,7 +15,7 @@ from tests.helpers.demo_scenes import bear
 from tests.helpers.trained import quick_options
 from trainer.options import MOST_VIEWS, VIEWS, ViewOptions
 from trainer.resolve import resolve
-from trainer.setup.resolution import SIZES, choose_resolution
+from trainer.setup import SIZES, choose_resolution
 from trainer.views.view import region_rig
 
 
@@ -36,7 +36,7 @@ def choice(count: int, cameras: int | None = None, **said: object) -> tuple[int,
 @pytest.fixture(autouse=True)
 def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """A tenth of the pixels, so that a small bear is dense."""
-    monkeypatch.setattr("trainer.setup.resolution.SIZES", tuple(size // 10 for size in SIZES))
+    monkeypatch.setattr("trainer.setup.SIZES", tuple(size // 10 for size in SIZES))
 
 
 def test_a_sparse_region_gets_few_small_views() -> None:

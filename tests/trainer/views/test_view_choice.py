@@ -21,7 +21,7 @@ from tests.helpers.demo_scenes import room
 from tests.helpers.scenes import concatenate, front_camera, one_gaussian, orbit_camera, random_gaussians
 from tests.helpers.trained import WHITE, Small, small
 from trainer.options import ViewOptions
-from trainer.setup.training_setup import make_training_setup
+from trainer.setup import make_training_setup
 from trainer.views.choose import (
     ViewChoice,
     choose_views,

@@ -18,7 +18,7 @@ from progdf.scene.bounds import scene_sphere
 from tests.helpers.scenes import ball, concatenate, front_camera, one_gaussian
 from tests.helpers.trained import small
 from trainer.editors import check_new_editor, make_editor
-from trainer.editors.folder import FolderEditor
+from trainer.editors.pictures import FolderEditor
 from trainer.options import EditorOptions
 from trainer.views.view import fit_size, make_view, name_cameras, region_box, region_rig, seen_colors
 
