@@ -27,14 +27,14 @@ from trainer.evaluate.measures import markdown_table
 from trainer.evaluate.opened import FADE, KEYFRAMES, SLIDER, OpenedRun, open_run
 from trainer.optimize.losses import Perceptual, perceptual_loss
 from trainer.options import EditorOptions, OptimizeOptions, RegionOptions, TrainOptions, ViewOptions
-from trainer.pipeline.demo import Effort, write_scene
-from trainer.pipeline.resume import find_run
-from trainer.pipeline.run import train
-from trainer.pipeline.threads import use_threads
 from trainer.report.measures import ErrorCurve, picture_courses
 from trainer.report.plots import Plot
 from trainer.report.report import stack_plots, thumbnail
 from trainer.resolve import resolve
+from trainer.run.demo import Effort, write_scene
+from trainer.run.resume import find_run
+from trainer.run.run import train
+from trainer.run.threads import use_threads
 from trainer.setup import make_training_setup
 from trainer.store.run_folder import write_json
 from trainer.views.view import crop, render_view

@@ -28,8 +28,8 @@ from trainer.optimize.groups import GROUP_STEPS, Groups, group_stage
 from trainer.optimize.losses import Objective, erode, perceptual_loss
 from trainer.optimize.pgs import TargetStage, optimize, pgs_settings
 from trainer.options import EditorOptions, OptimizeOptions, RegionOptions, TrainOptions, ViewOptions
-from trainer.pipeline.kind_trial import Approach, approaches, try_approaches
 from trainer.resolve import resolve, resolve_kind
+from trainer.run.kinds import Approach, approaches, try_approaches
 from trainer.setup import TrainingSetup, make_training_setup, probe_views, quantize_image, widen_views
 from trainer.views.crops import CropScene, crop_scene
 from trainer.views.view import View, crop

@@ -20,7 +20,7 @@ from .options import (
 def train(argv: Sequence[str]) -> int:
     """Run `progdf train`; 0 when the edit is written. Raises ProgdfError for what the user can mend."""
     options = train_options(argv)
-    from trainer.pipeline.run import train as run  # only now: --help and a mistyped option need no torch
+    from trainer.run.run import train as run  # only now: --help and a mistyped option need no torch
 
     run(options)
     return 0
@@ -29,7 +29,7 @@ def train(argv: Sequence[str]) -> int:
 def fit(argv: Sequence[str]) -> int:
     """Run `progdf fit`; 0 when the edit is rewritten. Raises ProgdfError for what the user can mend."""
     options = parse_options(FitOptions, argv, "progdf fit")
-    from trainer.pipeline.refit import refit
+    from trainer.run.refit import refit
 
     refit(options)
     return 0

@@ -28,11 +28,11 @@ from trainer.fit.fit import drop_idle_attributes
 from trainer.optimize.losses import Perceptual, describe_loss, perceptual_loss
 from trainer.optimize.unseen import unseen_members_of
 from trainer.options import TrainOptions
-from trainer.pipeline.reopen import reopen_run
-from trainer.pipeline.threads import use_threads
-from trainer.pipeline.training import optimize_members, retime_trajectory
 from trainer.report.report import SHOWN, best_view, editor_strip, strip
 from trainer.resolve import resolve_kind
+from trainer.run.record import reopen_run
+from trainer.run.threads import use_threads
+from trainer.run.training import optimize_members, retime_trajectory
 from trainer.setup import Pictures, whole_views
 from trainer.store.interrupts import interrupt_on_signals
 from trainer.store.progress import RunLog

@@ -16,8 +16,8 @@ from trainer.editors import make_editor
 from trainer.fit.evaluate import Evaluator, make_evaluator
 from trainer.fit.fit import visibility
 from trainer.options import QUICK_STAGES, QUICK_STEPS, QUICK_VIEWS, EditKind, TrainOptions, with_values
-from trainer.pipeline.reopen import FinishedRun, render_run_views
 from trainer.report.report import Columns, columns_of
+from trainer.run.record import FinishedRun, render_run_views
 from trainer.setup import (
     Pictures,
     TrainingSetup,

@@ -35,8 +35,8 @@ from progdf.gdf.file import load_gdf
 from tests.helpers.blank_plots import blank_plots
 from tests.helpers.trained import quick_options, train, write_bear
 from trainer.options import OptimizeOptions, TrainOptions, apply_preset, with_values
-from trainer.pipeline.reopen import reopen_run
 from trainer.resolve import recorded_options, resolve
+from trainer.run.record import reopen_run
 from trainer.store.run_folder import RunFolder
 
 ONLY = "base,2-keyframes,one-target,slider-time"

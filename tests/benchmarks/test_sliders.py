@@ -10,7 +10,7 @@ from benchmarks.sliders import CASES, STRENGTHS, CaseResult, run_suite, suite_js
 from progdf.demo_scenes import bear_edits
 from tests.helpers.demo_scenes import bear
 from trainer.optimize.losses import GradientL1
-from trainer.pipeline.demo import Effort
+from trainer.run.demo import Effort
 
 _FEW = tuple(case for case in CASES if case.name in ("blue scarf", "tilted ears"))
 _SIZES = {"bear": 1500}

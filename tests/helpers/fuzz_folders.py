@@ -30,8 +30,8 @@ from tests.helpers.scene_files import write_compressed_ply, write_ksplat, write_
 from tests.helpers.scenes import orbit_camera, random_gaussians
 from tests.helpers.trained import quick_options, train, write_bear
 from trainer.options import FitOptions, RegionOptions, TrainOptions, ViewOptions
-from trainer.pipeline.refit import refit
 from trainer.regions.from_pictures import RegionRequest, region_kinds
+from trainer.run.refit import refit
 from trainer.store.state import PeriodicSave
 
 Reader = tuple[str, Callable[[Path], Any], list[Change]]

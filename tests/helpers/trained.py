@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-import trainer.pipeline.run
+import trainer.run.run
 from progdf.camera import Camera
 from progdf.demo_scenes.bear_parts import LABELS
 from progdf.formats.ply import save_ply
@@ -21,7 +21,7 @@ from trainer.editors import make_editor
 from trainer.optimize.losses import GradientL1, Objective
 from trainer.optimize.pgs import PgsSettings, TargetStage, learning_rates
 from trainer.options import EditorOptions, OptimizeOptions, RegionOptions, TrainOptions, with_values
-from trainer.pipeline.fit_and_report import RunResult
+from trainer.run.finish import RunResult
 from trainer.views.choose import choose_views
 from trainer.views.crops import CropScene, crop_scene
 from trainer.views.view import View, crop, region_rig, render_colors
@@ -101,7 +101,7 @@ def quick_options(folder: Path, out: str = "run", part: str = "body", **more: ob
 
 def train(options: TrainOptions, quiet: bool = True) -> RunResult:
     """`progdf train`, with its options."""
-    return trainer.pipeline.run.train(options, quiet)
+    return trainer.run.run.train(options, quiet)
 
 
 def masked_psnr(image: Tensor, target: Tensor, mask: Tensor) -> float:

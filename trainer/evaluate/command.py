@@ -12,8 +12,6 @@ from progdf.io.images import contact_sheet, to_picture, write_image
 from progdf.terminal import print_line
 from trainer.optimize.losses import perceptual_loss
 from trainer.options import EvaluateOptions
-from trainer.pipeline.refit import asked_texts
-from trainer.pipeline.threads import use_threads
 from trainer.report.plots import PAPER, Plot
 from trainer.report.report import (
     best_view,
@@ -24,6 +22,8 @@ from trainer.report.report import (
     stack_plots,
     thumbnail,
 )
+from trainer.run.refit import asked_texts
+from trainer.run.threads import use_threads
 from trainer.store.run_folder import write_json
 
 from .consistency import EDITED, UNEDITED, WarpedPair

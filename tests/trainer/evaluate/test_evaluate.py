@@ -105,7 +105,6 @@ def test_clip_is_asked_where_its_weights_are_there(
 def test_what_cannot_be_measured_is_one_line(
     arguments: list[str], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (tmp_path / "file").write_text("")
     assert main(["evaluate", *(argument.format(tmp=tmp_path) for argument in arguments)]) == 2
     printed = capsys.readouterr().err
     assert words in printed

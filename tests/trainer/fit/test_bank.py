@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-import trainer.pipeline.run
+import trainer.run.run
 from progdf.errors import ProgdfError
 from progdf.field import neural_fit
 from progdf.field.neural_fit import NeuralFit, NeuralSettings
@@ -21,9 +21,9 @@ from tests.helpers.edits import curved_trajectory
 from tests.helpers.trained import quick_options
 from trainer.fit.network import JointTraining, MemoryBank
 from trainer.options import FitOptions, with_values
-from trainer.pipeline.refit import refit
-from trainer.pipeline.run import RunResult
 from trainer.resolve import check_field_options, check_options
+from trainer.run.refit import refit
+from trainer.run.run import RunResult
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -43,7 +43,7 @@ def train_jointly(folder: Path, out: str, resume: bool = False) -> RunResult:
     """A short run whose network sees positions and is trained beside the members."""
     settings = {"steps": 60, "stages": 2, "views": 5, "image_size": 56, "field": "neural", "name": "joint"}
     options = quick_options(folder, out, **settings, as_printed=True, resume=resume)
-    return trainer.pipeline.run.train(options, quiet=True)
+    return trainer.run.run.train(options, quiet=True)
 
 
 @pytest.fixture(scope="module")

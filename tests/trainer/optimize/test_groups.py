@@ -30,7 +30,7 @@ from trainer.optimize.groups import Groups, group_path, group_stage, restore_gro
 from trainer.optimize.losses import GradientL1, Objective
 from trainer.optimize.pgs import PgsSettings, TargetStage, learning_rates, optimize
 from trainer.options import OptimizeOptions
-from trainer.pipeline.run import RunResult
+from trainer.run.run import RunResult
 from trainer.views.crops import CropScene, crop_scene
 from trainer.views.view import crop
 

@@ -12,7 +12,7 @@ from progdf.sh import rgb_to_sh0
 from trainer.optimize.pgs import TargetStage
 from trainer.optimize.unseen import UnseenMembers, find_unseen_members, least_shown, unseen_members_of
 from trainer.options import EditKind
-from trainer.pipeline.training import is_no_worse
+from trainer.run.training import is_no_worse
 from trainer.setup import TrainingSetup
 from trainer.views.crops import crop_scene, render_all
 from trainer.views.view import View, make_view

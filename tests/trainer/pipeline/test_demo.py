@@ -13,8 +13,8 @@ import pytest
 import torch
 from PIL import Image
 
-import trainer.pipeline.resume
-import trainer.pipeline.run
+import trainer.run.resume
+import trainer.run.run
 from progdf import demo_scenes as scenes
 from progdf.__main__ import main
 from progdf.errors import ProgdfError
@@ -28,8 +28,8 @@ from progdf.region import from_labels
 from progdf.scene.region_spec import parse_region
 from tests.helpers import demo_scenes
 from trainer.options import TrainOptions
-from trainer.pipeline import demo
 from trainer.resolve import resolve
+from trainer.run import demo
 
 SIZE = 1500
 
@@ -84,7 +84,7 @@ def commands(monkeypatch: pytest.MonkeyPatch, bear: scenes.DemoScene) -> list[Se
         opened.append(command)
         return SimpleNamespace(returncode=3)
 
-    monkeypatch.setattr(trainer.pipeline.run, "train", train)
+    monkeypatch.setattr(trainer.run.run, "train", train)
     monkeypatch.setattr(subprocess, "run", run)
     return opened
 
@@ -197,15 +197,15 @@ def test_a_demo_that_was_stopped_goes_on_and_one_that_was_not_starts_over(
             raise KeyboardInterrupt("--resume")
 
     here = {"scarf": "finished", "gold": "stopped", "frost": "nothing", "panda": "nothing"}
-    monkeypatch.setattr(trainer.pipeline.run, "train", train)
-    monkeypatch.setattr(trainer.pipeline.resume, "find_run", lambda options: here[options.out.name])
+    monkeypatch.setattr(trainer.run.run, "train", train)
+    monkeypatch.setattr(trainer.run.resume, "find_run", lambda options: here[options.out.name])
     arguments = ["--size", str(SIZE), "--out", str(tmp_path / "demo"), "--no-window"]
     with pytest.raises(KeyboardInterrupt, match="give the same command again to go on"):
         demo.main(arguments)
     assert asked == [("scarf", True), ("gold", True)]
     here["gold"] = "nothing"
     monkeypatch.setattr(
-        trainer.pipeline.run, "train", lambda options: asked.append((options.out.name, options.resume))
+        trainer.run.run, "train", lambda options: asked.append((options.out.name, options.resume))
     )
     with pytest.raises(ProgdfError):  # this training writes nothing
         demo.main(arguments)

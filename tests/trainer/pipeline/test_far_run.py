@@ -19,10 +19,10 @@ from tests.helpers.ply_files import moved_columns, write
 from tests.helpers.trained import quick_options, train
 from trainer.editors.pictures import picture_cameras
 from trainer.options import RegionOptions, ViewOptions, WriteViewsOptions, with_values
-from trainer.pipeline.reopen import render_run_views, reopen_run
-from trainer.pipeline.run import RunResult
 from trainer.regions import originals
 from trainer.regions.from_pictures import RegionRequest, region_kinds
+from trainer.run.record import render_run_views, reopen_run
+from trainer.run.run import RunResult
 
 FAR = (1e6, 2e6, -5e5)
 BOX = (-0.9, -0.9, -0.4, 0.9, 0.9, 0.9)

@@ -17,8 +17,8 @@ from tests.helpers.demo_scenes import bear
 from tests.helpers.trained import WHITE, Small, quick_options, small
 from trainer.editors import make_editor
 from trainer.options import EditorOptions, TrainOptions, with_values
-from trainer.pipeline.kind_trial import Approach, Trial, approaches, try_approaches
 from trainer.resolve import resolve
+from trainer.run.kinds import Approach, Trial, approaches, try_approaches
 from trainer.setup import TrainingSetup
 
 COLOR, STYLE, FREE = Approach("color"), Approach("style"), Approach("geometry")

@@ -13,8 +13,8 @@ from progdf.errors import ProgdfError
 from progdf.io.json_values import convert_json
 from tests.helpers.trained import quick_options
 from trainer.options import TrainOptions
-from trainer.pipeline.record import upgrade_plan
-from trainer.pipeline.resume import find_run
+from trainer.run.record import upgrade_plan
+from trainer.run.resume import find_run
 
 ALL = ("solves", "asks_evenly", "damps", "ramps", "slows", "sizes", "averages", "leads_back", "prunes")
 

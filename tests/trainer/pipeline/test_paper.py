@@ -19,8 +19,8 @@ from trainer.fit.network import RenderedLoss, network_settings
 from trainer.optimize.losses import GradientL1, describe_loss, l1
 from trainer.optimize.pgs import pgs_settings
 from trainer.options import TrainOptions, apply_preset, with_values
-from trainer.pipeline.run import RunResult
 from trainer.resolve import resolve, resolve_kind
+from trainer.run.run import RunResult
 from trainer.views.crops import crop_scene, moving_attributes
 
 

@@ -23,8 +23,8 @@ from tests.helpers.trained import quick_options, train
 from trainer.editors import make_editor
 from trainer.evaluate.command import evaluate
 from trainer.options import EditorOptions, EvaluateOptions, ViewOptions, with_values
-from trainer.pipeline.run import RunResult
 from trainer.report.measures import PaintTaken, measure_paint
+from trainer.run.run import RunResult
 from trainer.setup import make_training_setup
 from trainer.views.view import View, render_view
 

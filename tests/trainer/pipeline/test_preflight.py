@@ -57,7 +57,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     def load(path: object) -> None:
         raise AssertionError("the scene was loaded")
 
-    monkeypatch.setattr("trainer.pipeline.run.load_scene", load)
+    monkeypatch.setattr("trainer.run.run.load_scene", load)
     return tmp_path
 
 

@@ -10,7 +10,7 @@ from typing import get_args
 import pytest
 import torch
 
-import trainer.pipeline.run
+import trainer.run.run
 from progdf.errors import ProgdfError
 from progdf.io.json_values import convert_json, plain
 from trainer.cli import train_options
@@ -24,8 +24,8 @@ from trainer.options import (
     apply_preset,
     with_values,
 )
-from trainer.pipeline.resume import plan_difference
 from trainer.resolve import recorded_options, resolve, resolve_kind
+from trainer.run.resume import plan_difference
 
 ASKED = ("scene.ply", "--out", "run", "--region", "all", "--editor", "night")
 

@@ -14,7 +14,7 @@ import pytest
 import torch
 from PIL import Image
 
-import trainer.pipeline.training
+import trainer.run.training
 from progdf.cli.options import parse_options
 from progdf.compose.reference import Layer, compose_layers
 from progdf.errors import ProgdfError
@@ -27,12 +27,12 @@ from tests.helpers.trained import quick_options, train
 from trainer import cli
 from trainer.evaluate.command import evaluate
 from trainer.options import EvaluateOptions, FitOptions, with_values
-from trainer.pipeline.fit_and_report import load_evaluator
-from trainer.pipeline.refit import refit
-from trainer.pipeline.reopen import render_run_views, reopen_run
-from trainer.pipeline.run import RunResult
 from trainer.report.plots import LINES, draw_plot
 from trainer.resolve import check_options, resolve
+from trainer.run.finish import load_evaluator
+from trainer.run.record import render_run_views, reopen_run
+from trainer.run.refit import refit
+from trainer.run.run import RunResult
 
 
 @pytest.fixture(scope="module")
@@ -262,7 +262,7 @@ def test_an_interrupted_run_leaves_the_earlier_edit_whole(
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(trainer.pipeline.training, "solve", interrupt)
+    monkeypatch.setattr(trainer.run.training, "solve", interrupt)
     with pytest.raises(KeyboardInterrupt, match="with --resume to go on"):
         train(options, quiet=True)
     assert first.gdf.read_bytes() == kept

@@ -21,10 +21,10 @@ from tests.helpers.tiny_clip import tiny_clip
 from tests.helpers.trained import WHITE, quick_options, small, train, write_bear
 from trainer.fit.evaluate import make_evaluator
 from trainer.options import FitOptions, TextOptions, with_values
-from trainer.pipeline.refit import refit
 from trainer.report.clip import Clip, direction, load_clip, square_picture
 from trainer.report.measures import clip_curve
 from trainer.resolve import resolve
+from trainer.run.refit import refit
 
 pytest.importorskip("transformers")
 

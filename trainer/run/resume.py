@@ -22,10 +22,9 @@ from progdf.region import Region
 from trainer.editors.pictures import strengths_of
 from trainer.options import MOST_THREADS, TrainOptions
 from trainer.resolve import recorded_options, resolve
+from trainer.run.record import upgrade_plan
+from trainer.run.threads import count_threads
 from trainer.store.run_folder import RunFolder, begin_log, remove_leftovers
-
-from .record import upgrade_plan
-from .threads import count_threads
 
 _SWITCHES = (
     "NUMBA_CPU_FEATURES", "MKL_ENABLE_INSTRUCTIONS", "MKL_CBWR", "OPENBLAS_CORETYPE", "ONEDNN_MAX_CPU_ISA",

@@ -30,7 +30,7 @@ from trainer.optimize.retime import record, resolve_slider, retime, select_recor
 from trainer.optimize.solve_pictures import RECORDINGS, make_picture_solver, solve_pictures
 from trainer.optimize.unseen import NEEDED, UnseenMembers, view_dependence
 from trainer.options import OptimizeOptions, TrainOptions
-from trainer.pipeline.recordings import Recordings
+from trainer.run.recordings import Recordings
 from trainer.setup import Pictures, TrainingSetup, probe_views
 from trainer.store.interrupts import defer_signals
 from trainer.store.progress import RunLog

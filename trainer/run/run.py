@@ -27,10 +27,12 @@ from trainer.optimize.losses import Perceptual, describe_loss, perceptual_loss
 from trainer.optimize.retime import resolve_slider
 from trainer.optimize.unseen import unseen_members_of
 from trainer.options import EditKind, OptimizeOptions, TrainOptions
-from trainer.pipeline.threads import use_threads
 from trainer.regions.from_pictures import region_kinds
 from trainer.report.agreement import Agreement, measure_agreement
 from trainer.resolve import recorded_options, resolve, resolve_kind
+from trainer.run.kinds import Approach, choose_approach
+from trainer.run.record import RunRecord, read_record
+from trainer.run.threads import use_threads
 from trainer.setup import (
     Pictures,
     TrainingSetup,
@@ -55,10 +57,8 @@ from trainer.store.run_folder import (
 from trainer.views.crops import only_recolors
 from trainer.views.view import BACKGROUND, render_view
 
-from .fit_and_report import RunResult, end_rows, finish_run, load_evaluator, load_result
-from .kind_trial import Approach, choose_approach
+from .finish import RunResult, end_rows, finish_run, load_evaluator, load_result
 from .preflight import check_command, region_request
-from .record import RunRecord, read_record
 from .reedit import reedit
 from .resume import check_exists, decide_resume, explain_stop, load_region, picture_digests
 from .training import optimize_members, retime_trajectory

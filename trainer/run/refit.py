@@ -6,10 +6,10 @@ from dataclasses import replace
 
 from trainer.optimize.losses import perceptual_loss
 from trainer.options import FitOptions, TextOptions
-from trainer.pipeline.fit_and_report import RunResult, finish_run
-from trainer.pipeline.reopen import render_run_views, reopen_run
-from trainer.pipeline.threads import use_threads
 from trainer.resolve import check_field_options
+from trainer.run.finish import RunResult, finish_run
+from trainer.run.record import render_run_views, reopen_run
+from trainer.run.threads import use_threads
 from trainer.setup import whole_views, widen_views
 from trainer.store.progress import RunLog
 from trainer.store.run_folder import read_views

@@ -27,9 +27,9 @@ from trainer.fit.slider_uniformity import equalize_slider
 from trainer.optimize.losses import Perceptual
 from trainer.optimize.retime import resolve_slider
 from trainer.options import FieldOptions
-from trainer.pipeline.record import RunRecord
 from trainer.report.measures import PaintTaken, clip_curve, expected_measures, figures, measure, measure_paint
 from trainer.report.report import report_picture
+from trainer.run.record import RunRecord
 from trainer.setup import TrainingSetup
 from trainer.store.progress import RunLog
 from trainer.store.run_folder import RunFolder, read_views, write_json
