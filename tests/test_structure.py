@@ -33,7 +33,7 @@ ENTRY_POINT = ROOT / "progdf" / "__main__.py"  # the table of commands knows all
 ORDER = {
     "progdf": """gaussians lens sh terminal errors torch_threads region camera interpolation color metrics
         demo_scenes io rasterize field formats gdf scene compose cli __init__ __main__""",
-    "trainer": """__init__ options store views editors resolve segmenters setup regions
+    "trainer": """__init__ options store views editors resolve setup regions
         motion optimize fit report preview run evaluate cli""",
     "viewer": "__init__ camera gl jobs state render files pictures ui panel select app commands",
     "benchmarks": """__init__ courses joint_svd table ablation field_forms rasterizer

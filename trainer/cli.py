@@ -29,7 +29,7 @@ def train(argv: Sequence[str]) -> int:
 def fit(argv: Sequence[str]) -> int:
     """Run `progdf fit`; 0 when the edit is rewritten. Raises ProgdfError for what the user can mend."""
     options = parse_options(FitOptions, argv, "progdf fit")
-    from trainer.run.refit import refit
+    from .run.finish import refit
 
     refit(options)
     return 0
@@ -65,7 +65,7 @@ def region(argv: Sequence[str]) -> int:
 def views(argv: Sequence[str]) -> int:
     """Run `progdf views`; 0 when they are written. Raises ProgdfError for what the user can mend."""
     options = parse_options(WriteViewsOptions, argv, "progdf views")
-    from trainer.regions.originals import write
+    from .regions.command import write
 
     print_line(write(options))
     return 0

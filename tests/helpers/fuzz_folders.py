@@ -31,7 +31,7 @@ from tests.helpers.scenes import orbit_camera, random_gaussians
 from tests.helpers.trained import quick_options, train, write_bear
 from trainer.options import FitOptions, RegionOptions, TrainOptions, ViewOptions
 from trainer.regions.from_pictures import RegionRequest, region_kinds
-from trainer.run.refit import refit
+from trainer.run.finish import refit
 from trainer.store.state import PeriodicSave
 
 Reader = tuple[str, Callable[[Path], Any], list[Change]]

@@ -22,7 +22,7 @@ from trainer.report.report import (
     stack_plots,
     thumbnail,
 )
-from trainer.run.refit import asked_texts
+from trainer.run.finish import asked_texts
 from trainer.run.threads import use_threads
 from trainer.store.run_folder import write_json
 

@@ -25,8 +25,7 @@ from progdf.scene.up_axis import find_up
 from trainer.editors.cache import KeptPictures, Recipe
 from trainer.editors.pictures import picture_paths, rendered_cameras
 from trainer.options import VIEWS, RegionOptions, ViewOptions
-from trainer.segmenters import SEGMENTER_CHECKS, SEGMENTERS, Segmenter
-from trainer.segmenters.folder import read_masks
+from trainer.regions.segment import SEGMENTER_CHECKS, SEGMENTERS, Segmenter
 from trainer.views.view import (
     BACKGROUND,
     INSIDE,
@@ -39,6 +38,7 @@ from trainer.views.view import (
 
 from .changed import LIFTED_AT, changed_region
 from .lift import lift_masks
+from .masks import read_masks
 
 
 @dataclass(frozen=True)

@@ -24,18 +24,21 @@ from trainer.fit.evaluate import Evaluator, make_evaluator
 from trainer.fit.fit import Fitted, evaluate_field, expected_looks, fit_field, visibility
 from trainer.fit.network import NetworkFit, fit_network
 from trainer.fit.slider_uniformity import equalize_slider
-from trainer.optimize.losses import Perceptual
+from trainer.optimize.losses import Perceptual, perceptual_loss
 from trainer.optimize.retime import resolve_slider
-from trainer.options import FieldOptions
+from trainer.options import FieldOptions, FitOptions, TextOptions
 from trainer.report.measures import PaintTaken, clip_curve, expected_measures, figures, measure, measure_paint
 from trainer.report.report import report_picture
-from trainer.run.record import RunRecord
-from trainer.setup import TrainingSetup
+from trainer.resolve import check_field_options
+from trainer.setup import TrainingSetup, whole_views, widen_views
 from trainer.store.progress import RunLog
 from trainer.store.run_folder import RunFolder, read_views, write_json
 from trainer.store.state import Saved
 from trainer.views.crops import only_recolors
 from trainer.views.view import View
+
+from .record import RunRecord, render_run_views, reopen_run
+from .threads import use_threads
 
 _RANK_VIEWS = 4
 _REPORT_ALONE = ("plan", "time", "memory_mb", "memory_by_stage_mb", "curves", "views", "pictures")
@@ -291,3 +294,45 @@ def load_result(folder: RunFolder, name: str, scene: Gaussians, log: RunLog) -> 
     except ValueError as error:
         raise ProgdfError(f"{folder.report} is damaged ({error}); train again without --resume") from error
     return RunResult(folder, path, report, replace(trajectory, s=torch.tensor(gdf.field.recorded)))
+
+
+def refit(options: FitOptions, quiet: bool = False) -> RunResult:
+    """Fit the field of a finished run anew and rewrite its .gdf and report; nothing is optimized.
+
+    Raises:
+        ProgdfError: the folder is no finished run, or its scene is gone or another.
+    """
+    check_field_options(options.field)
+    use_threads(options.threads)
+    run = reopen_run(options.run, options.scene)
+    log = RunLog(run.folder.log, quiet, refits=True)
+    try:
+        with log.stage("views"):
+            setup = render_run_views(run)
+            names = [view.camera.name for view in setup.train]
+            edited = {s: read_views(run.folder, "edited", names, s) for s in run.trajectory.strengths}
+            # what grows beyond the region's boxes is seen as well, or the slider is timed on half of it
+            whole = run.record.plan.optimize.as_printed
+            setup = whole_views(setup) if whole else widen_views(setup, edited)
+        perceptual, warning = perceptual_loss()
+        if warning:
+            log.say(warning)
+        own = run.record.plan
+        field = replace(
+            options.field, as_printed=own.field.as_printed, draft=own.field.draft, seed=own.field.seed
+        )
+        texts = asked_texts(options.texts, own.texts)
+        plan = replace(own, field=field, texts=texts)
+        record = replace(run.record, plan=plan)
+        return finish_run(run.folder, setup, run.trajectory, record, perceptual, log)
+    finally:
+        log.close()
+
+
+def asked_texts(typed: TextOptions, own: TextOptions) -> TextOptions:
+    """What CLIP is asked: the command's own texts, or the run's."""
+    return TextOptions(
+        typed.text_before or own.text_before,
+        typed.text_after or own.text_after,
+        own.asked or bool(typed.text_before or typed.text_after),
+    )

@@ -248,7 +248,7 @@ def test_settings_that_numba_does_not_work_with_are_one_line(monkeypatch: pytest
 @pytest.mark.parametrize(
     ("words", "writer"),
     [
-        (["views", "scene.ply", "--out"], "trainer.regions.originals.write"),
+        (["views", "scene.ply", "--out"], "trainer.regions.command.write"),
         (["region", "scene.ply", "all", "-o"], "trainer.regions.command.show"),
     ],
 )

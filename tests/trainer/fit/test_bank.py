@@ -22,7 +22,7 @@ from tests.helpers.trained import quick_options
 from trainer.fit.network import JointTraining, MemoryBank
 from trainer.options import FitOptions, with_values
 from trainer.resolve import check_field_options, check_options
-from trainer.run.refit import refit
+from trainer.run.finish import refit
 from trainer.run.run import RunResult
 
 

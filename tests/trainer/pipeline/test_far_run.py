@@ -19,7 +19,7 @@ from tests.helpers.ply_files import moved_columns, write
 from tests.helpers.trained import quick_options, train
 from trainer.editors.pictures import picture_cameras
 from trainer.options import RegionOptions, ViewOptions, WriteViewsOptions, with_values
-from trainer.regions import originals
+from trainer.regions import command
 from trainer.regions.from_pictures import RegionRequest, region_kinds
 from trainer.run.record import render_run_views, reopen_run
 from trainer.run.run import RunResult
@@ -78,7 +78,7 @@ def test_a_far_run_is_opened_again_with_its_views(runs: dict[str, RunResult]) ->
 
 def test_masks_over_views_of_a_far_scene_find_their_region(folder: Path, runs: dict[str, RunResult]) -> None:
     scene = load_ply(folder / "far.ply")
-    originals.write(WriteViewsOptions(folder / "far.ply", folder / "drawn", views=4, image_size=64))
+    command.write(WriteViewsOptions(folder / "far.ply", folder / "drawn", views=4, image_size=64))
     for path in sorted((folder / "drawn" / "original").iterdir()):
         picture = read_picture(path)
         mask = (picture.mean(dim=2) < 0.5).float()[..., None].expand(-1, -1, 3)

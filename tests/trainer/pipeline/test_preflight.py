@@ -109,7 +109,7 @@ def test_a_segmenter_that_cannot_be_loaded_is_told_before_the_scene_is(
 ) -> None:
     pytest.importorskip("transformers")
     from trainer.options import RegionOptions
-    from trainer.segmenters.grounded_sam import check_grounded_sam
+    from trainer.regions.segment import check_grounded_sam
 
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(here / "hub"))
     tiny_detector(Path("detector"))

@@ -14,12 +14,12 @@ import pytest
 import torch
 
 import trainer.run.run
-import trainer.run.training
 from progdf.__main__ import main
 from progdf.errors import ProgdfError
 from tests.helpers.stopped import OUT, bits, small_run
 from tests.helpers.stopped_runs import NEVER, at_step, gone_on, killed, saved_step, words
 from tests.helpers.trained import train
+from trainer.run import training
 from trainer.run.resume import find_run, processor_kind
 from trainer.store.state import StateFolder
 
@@ -232,7 +232,7 @@ def test_a_run_that_moves_parts_goes_on_to_the_same_bits(
     def group_stage(*_: object) -> None:
         raise AssertionError("parts looked for again")
 
-    monkeypatch.setattr(trainer.run.training, "group_stage", group_stage)
+    monkeypatch.setattr(training, "group_stage", group_stage)
     train(replace(options, resume=True), quiet=True)
     assert (OUT / "trajectory.safetensors").read_bytes() == expected
 

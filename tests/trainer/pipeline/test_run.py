@@ -14,7 +14,6 @@ import pytest
 import torch
 from PIL import Image
 
-import trainer.run.training
 from progdf.cli.options import parse_options
 from progdf.compose.reference import Layer, compose_layers
 from progdf.errors import ProgdfError
@@ -26,12 +25,12 @@ from progdf.gdf.file import load_gdf
 from tests.helpers.trained import quick_options, train
 from trainer import cli
 from trainer.evaluate.command import evaluate
-from trainer.options import EvaluateOptions, FitOptions, with_values
+from trainer.options import EvaluateOptions, FitOptions, TrainOptions, with_values
 from trainer.report.plots import LINES, draw_plot
 from trainer.resolve import check_options, resolve
-from trainer.run.finish import load_evaluator
+from trainer.run import training
+from trainer.run.finish import load_evaluator, refit
 from trainer.run.record import render_run_views, reopen_run
-from trainer.run.refit import refit
 from trainer.run.run import RunResult
 
 
@@ -262,7 +261,7 @@ def test_an_interrupted_run_leaves_the_earlier_edit_whole(
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(trainer.run.training, "solve", interrupt)
+    monkeypatch.setattr(training, "solve", interrupt)
     with pytest.raises(KeyboardInterrupt, match="with --resume to go on"):
         train(options, quiet=True)
     assert first.gdf.read_bytes() == kept
@@ -325,7 +324,7 @@ def test_the_command_line_sets_every_option_it_is_given(folder: Path) -> None:
     words = (
         f"{folder / 'scene.ply'} --out r --region all --editor night --quick --seed 7 --slider even".split()
     )
-    plan = resolve(parse_options(trainer.options.TrainOptions, words, "progdf train"))
+    plan = resolve(parse_options(TrainOptions, words, "progdf train"))
     assert (plan.optimize.seed, plan.optimize.slider, plan.name) == (7, "even", "r")
     assert (plan.optimize.steps, plan.views.views) == (240, 12)
 

@@ -25,13 +25,11 @@ from progdf.scene.region_spec import parse_region
 from tests.helpers.demo_scenes import bear
 from tests.helpers.tiny_segmenters import tiny_detector, tiny_sam
 from tests.helpers.trained import label_mask, quick_options, train, write_bear
-from trainer import segmenters
 from trainer.editors.pictures import FolderEditor
 from trainer.options import RegionOptions, ViewOptions, with_values
 from trainer.regions.from_pictures import RegionRequest, region_kinds
-from trainer.segmenters import SEGMENTERS
-from trainer.segmenters.folder import read_masks
-from trainer.segmenters.grounded_sam import normalize_prompt
+from trainer.regions.masks import read_masks
+from trainer.regions.segment import SEGMENTERS, normalize_prompt
 from trainer.views.view import View
 
 SIZE, VIEWS = 96, 6
@@ -211,7 +209,7 @@ def reddish(monkeypatch: pytest.MonkeyPatch) -> Asked:
         return (red > green + 0.15) & (red > blue + 0.15)
 
     kinds: dict[str, Callable[[RegionOptions], object]] = {"text": lambda _: segment}
-    monkeypatch.setattr(segmenters, "SEGMENTERS", kinds)
+    monkeypatch.setattr("trainer.regions.segment.SEGMENTERS", kinds)
     monkeypatch.setattr("trainer.regions.from_pictures.SEGMENTERS", kinds)
     monkeypatch.setattr("trainer.regions.from_pictures.SEGMENTER_CHECKS", {"text": lambda settings: None})
     return asked
@@ -303,7 +301,7 @@ def test_the_networks_make_a_mask_of_the_pictures_size(tiny: RegionOptions) -> N
 
 
 def test_boxes_are_in_pixels_of_the_picture(tiny: RegionOptions) -> None:
-    from trainer.segmenters.grounded_sam import grounded_sam
+    from trainer.regions.segment import grounded_sam
 
     picture = Image.new("RGB", (300, 100), "white")
     boxes = grounded_sam(tiny).boxes(picture, "scarf")

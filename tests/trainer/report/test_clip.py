@@ -24,7 +24,7 @@ from trainer.options import FitOptions, TextOptions, with_values
 from trainer.report.clip import Clip, direction, load_clip, square_picture
 from trainer.report.measures import clip_curve
 from trainer.resolve import resolve
-from trainer.run.refit import refit
+from trainer.run.finish import refit
 
 pytest.importorskip("transformers")
 

@@ -6,9 +6,10 @@ Together they are what the paper calls LangSAM. Weights are read from this machi
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -17,6 +18,14 @@ from progdf.errors import ProgdfError
 from progdf.io.images import to_picture
 from trainer.options import DETECTOR, SAM_MODEL, RegionOptions
 from trainer.store.pretrained import BROKEN, check_weights_here, folder_of_model
+
+
+class Segmenter(Protocol):
+    """Finds what a prompt names."""
+
+    def __call__(self, image: Tensor, prompt: str) -> Tensor:
+        """The mask of it, empty where there is none. [H,W,3] 0..1 -> [H,W] bool"""
+        ...
 
 
 @dataclass(frozen=True)
@@ -155,3 +164,10 @@ def _missing(model: str, option: str) -> str:
         f"the weights of {model} are not on this machine or are incomplete; download them with "
         f"'hf download {model}', or give {option} the folder of a saved model"
     )
+
+
+SEGMENTERS: Mapping[str, Callable[[RegionOptions], Segmenter]] = {"text": grounded_sam}
+"""Kind of region → the segmenter behind it, loaded when it is made."""
+
+SEGMENTER_CHECKS: Mapping[str, Callable[[RegionOptions], None]] = {"text": check_grounded_sam}
+"""Kind of region → what raises a ProgdfError where that segmenter cannot be made; it loads no weights."""
