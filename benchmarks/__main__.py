@@ -1,6 +1,7 @@
 """`python -m benchmarks`: run the benchmarks and print their tables, each speed beside its error.
 
-`python -m benchmarks ablate RUN …` trains finished runs again without each part of the method.
+`python -m benchmarks ablate RUN …` trains finished runs again without each part of the method, `python -m
+benchmarks sliders FOLDER` trains edits whose pictures are known at every strength.
 """
 
 from __future__ import annotations
@@ -67,13 +68,17 @@ class BenchOptions:
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run the named benchmarks, or the ablation. Raises ProgdfError for a name that does not exist."""
+    """Run the named benchmarks, the ablation or the sliders; ProgdfError for a name that does not exist."""
     if list(argv[:1]) == ["ablate"]:
         return ablate(argv[1:])
+    if list(argv[:1]) == ["sliders"]:
+        return sliders(argv[1:])
     options = parse_options(BenchOptions, argv, COMMAND)
     for name in options.what:
         if name not in BENCHES:
-            raise ProgdfError(f"unknown benchmark '{name}'; use one of {', '.join((*BENCHES, 'ablate'))}")
+            raise ProgdfError(
+                f"unknown benchmark '{name}'; use one of {', '.join((*BENCHES, 'ablate', 'sliders'))}"
+            )
     if options.plot and options.what and "field" not in options.what:
         raise ProgdfError("--plot is for fields; use python -m benchmarks field")
     trained = ("field", "edits", "networks")
@@ -138,6 +143,14 @@ def ablate(argv: Sequence[str]) -> int:
 
     for ablation in run(parse_options(AblateOptions, argv, f"{COMMAND} ablate")):
         print_table(ablation)
+    return 0
+
+
+def sliders(argv: Sequence[str]) -> int:
+    """Compare sliders with known courses; 0 when done. Raises ProgdfError for what the user can mend."""
+    from .sliders import SliderOptions, run_sliders
+
+    run_sliders(parse_options(SliderOptions, argv, f"{COMMAND} sliders"))
     return 0
 
 

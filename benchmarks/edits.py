@@ -18,12 +18,11 @@ from progdf.camera import Camera, look_at
 from progdf.errors import ProgdfError
 from progdf.field import BakedField
 from progdf.field.choose import sample_strengths
-from trainer.editors import VIEW_BY_VIEW, make_editor
+from trainer.editors import PER_VIEW, make_editor
 from trainer.evaluate.opened import FADE, KEYFRAMES, SLIDER, OpenedRun, open_run
 from trainer.fit.evaluate import Evaluator, make_evaluator
 from trainer.optimize.losses import perceptual_loss
-from trainer.report.curves import picture_courses
-from trainer.report.measures import COMPARED
+from trainer.report.measures import COMPARED, picture_courses
 from trainer.views.choose import split_held_out
 from trainer.views.view import make_view
 
@@ -160,9 +159,9 @@ def far_evaluator(run: OpenedRun) -> Evaluator:
     views = [view for view in views if bool((view.mask > 0.05).any())]
     edited: dict[float, list[Tensor]] = {}
     plan = run.run.record.plan
-    if plan.editor.family not in VIEW_BY_VIEW:
-        settings = plan.editor.settings(run.run.folder.painted)
-        editor = make_editor(plan.editor.editor, scene, region, setup.views, settings)
+    if plan.editor.family not in PER_VIEW:
+        options = replace(plan.editor, cache=run.run.folder.painted)
+        editor = make_editor(options, scene, region, setup.views)
         edited = {s: [editor.edit(view, s) for view in views] for s in run.trajectory.strengths}
     channels = run.trajectory.end.shape[1]
     return make_evaluator(scene, region, views, edited, setup.background, channels)

@@ -21,8 +21,9 @@ from progdf.scene.regions import parse_region
 from progdf.scene.up_axis import find_up
 from trainer.editors import make_editor
 from trainer.optimize.color_solver import color_columns
-from trainer.optimize.picture_solver import make_picture_solver
-from trainer.setup.training_setup import quantize_image
+from trainer.optimize.solve_pictures import make_picture_solver
+from trainer.options import EditorOptions
+from trainer.setup import quantize_image
 from trainer.views.crops import crop_scene
 from trainer.views.view import (
     BACKGROUND,
@@ -67,7 +68,7 @@ def _rows(path: Path, edit: str) -> list[tuple[str, ...]]:
     up, background = find_up(scene, (), "auto").direction, torch.tensor(BACKGROUND)
     cameras = with_near_plane(name_cameras(region_rig(scene, region, RIG, SIZE, up)), scene)
     views = [make_view(scene, region, camera, background) for camera in cameras]
-    editor = make_editor(edit, scene, region, views)
+    editor = make_editor(EditorOptions(edit), scene, region, views)
     center = scene.means[region.members].mean(dim=0)
     toward = torch.stack([camera.position - center for camera in cameras])
     toward = toward / toward.norm(dim=1, keepdim=True)

@@ -8,8 +8,8 @@ import torch
 
 from progdf.field import FieldEvaluator
 from trainer.fit.fit import visibility
-from trainer.pipeline.fit_and_report import load_evaluator
-from trainer.pipeline.reopen import render_run_views, reopen_run
+from trainer.run.finish import load_evaluator
+from trainer.run.record import render_run_views, reopen_run
 from trainer.views.choose import split_held_out
 
 from .courses import KnownEdit

@@ -24,21 +24,13 @@ from progdf.region import Region, from_mask
 from progdf.scene.bounds import scene_sphere
 from trainer.editors import make_editor
 from trainer.fit.evaluate import Evaluator, make_evaluator
-from trainer.optimize.groups import Groups, group_stage
-from trainer.optimize.losses import erode, perceptual_loss
-from trainer.optimize.objective import Objective
-from trainer.optimize.pgs import TargetStage, optimize
-from trainer.optimize.settings import GROUP_STEPS, pgs_settings
-from trainer.options import TrainOptions
-from trainer.pipeline.kind_trial import Approach, approaches, try_approaches
-from trainer.plan import Plan, make_plan, plan_optimization
-from trainer.setup.training_setup import (
-    TrainingSetup,
-    make_training_setup,
-    probe_views,
-    quantize_image,
-    widen_views,
-)
+from trainer.optimize.groups import GROUP_STEPS, Groups, group_stage
+from trainer.optimize.losses import Objective, erode, perceptual_loss
+from trainer.optimize.pgs import TargetStage, optimize, pgs_settings
+from trainer.options import EditorOptions, OptimizeOptions, RegionOptions, TrainOptions, ViewOptions
+from trainer.resolve import resolve, resolve_kind
+from trainer.run.kinds import Approach, approaches, try_approaches
+from trainer.setup import TrainingSetup, make_training_setup, probe_views, quantize_image, widen_views
 from trainer.views.crops import CropScene, crop_scene
 from trainer.views.view import View, crop
 
@@ -73,14 +65,19 @@ def tables(scenes: Sequence[Path] = ()) -> list[Table]:
     Raises:
         ProgdfError: a scene has no labels beside it.
     """
-    plan = make_plan(
+    options = resolve(
         TrainOptions(
-            Path("bear.ply"), Path("run"), "all", "folder:edited", views=VIEWS, image_size=SIZE, steps=STEPS
+            Path("bear.ply"),
+            Path("run"),
+            RegionOptions("all"),
+            EditorOptions("folder:edited"),
+            views=ViewOptions(views=VIEWS, image_size=SIZE),
+            optimize=OptimizeOptions(STEPS),
         )
     )
     rows = [
-        _row(plan, case)
-        for case in [*_bear_cases(plan), *(c for path in scenes for c in _robot_cases(plan, path))]
+        _row(options, case)
+        for case in [*_bear_cases(options), *(c for path in scenes for c in _robot_cases(options, path))]
     ]
     return [
         Table(
@@ -106,7 +103,7 @@ def tables(scenes: Sequence[Path] = ()) -> list[Table]:
     ]
 
 
-def _row(plan: Plan, case: WarpCase) -> tuple[str, ...]:
+def _row(options: TrainOptions, case: WarpCase) -> tuple[str, ...]:
     setup = case.setup
     edited = [case.picture(view) for view in setup.train]
     judge = make_evaluator(
@@ -117,7 +114,7 @@ def _row(plan: Plan, case: WarpCase) -> tuple[str, ...]:
         setup.background,
         14 + 3 * setup.scene.shN.shape[1],
     )
-    trial = try_approaches(plan.optimization, setup, edited, approaches(plan.optimization, setup, edited))
+    trial = try_approaches(options, setup, edited, approaches(options, setup, edited))
     setup = widen_views(setup, {1.0: edited})
     original = judge.original
     nothing = torch.zeros_like(original)
@@ -128,7 +125,7 @@ def _row(plan: Plan, case: WarpCase) -> tuple[str, ...]:
 
     def trained(approach: Approach, groups: Groups | None) -> tuple[str, float]:
         begun = time.process_time()
-        end = _train(plan, setup, crops, targets, original, approach, groups)
+        end = _train(options, setup, crops, targets, original, approach, groups)
         return _psnr(judge, end), time.process_time() - begun
 
     unedited = _psnr(judge, nothing)
@@ -151,7 +148,7 @@ def _row(plan: Plan, case: WarpCase) -> tuple[str, ...]:
 
 
 def _train(
-    plan: Plan,
+    options: TrainOptions,
     setup: TrainingSetup,
     crops: Sequence[CropScene],
     targets: Sequence[Tensor],
@@ -160,14 +157,14 @@ def _train(
     groups: Groups | None,
 ) -> Tensor:
     """The members' offsets at the end."""
-    optimization = plan_optimization(plan.optimization, approach.kind, approach.group_steps)
+    optimization = resolve_kind(options, approach.kind, approach.group_steps)
     stages = [TargetStage(1.0, targets, STEPS)]
     extent = 2.0 * scene_sphere(setup.scene[setup.region.members])[1]
     if groups is not None:
         stages, extent = groups.to_stages(original, crops, stages), groups.extent
     settings = pgs_settings(optimization, True, original.shape[1], extent, 1)
     inside = [erode(crop(view.mask, view.box)) for view in setup.train]
-    objective = Objective(perceptual_loss()[0], optimization.weights, inside)
+    objective = Objective(perceptual_loss()[0], optimization, inside)
     *_, last = optimize(original, crops, probe_views(setup), stages, objective, settings)
     return last.offsets
 
@@ -176,34 +173,36 @@ def _psnr(judge: Evaluator, offsets: Tensor) -> str:
     return f"{judge.psnr(judge.pictures(offsets), judge.edited[1.0]):.1f}"
 
 
-def _bear_cases(plan: Plan) -> list[WarpCase]:
+def _bear_cases(options: TrainOptions) -> list[WarpCase]:
     demo = bear(_BEAR)
     scene = demo.gaussians
     head, body = demo.members("head"), demo.members("body")
     corners = torch.tensor([[0.11, 1.305, 0.56], [-0.11, 1.305, 0.56]])
     columns = column_warps(scene.means[body], demo.up)
-    found = [_case(plan, f"bear's body: {name}", scene, body, edit) for name, edit in columns.items()]
-    found.append(_case(plan, "bear: smile", scene, head, smile_warp(corners, demo.up, 0.08, 0.07)))
-    setup = _setup(plan, scene, body)
+    found = [_case(options, f"bear's body: {name}", scene, body, edit) for name, edit in columns.items()]
+    found.append(_case(options, "bear: smile", scene, head, smile_warp(corners, demo.up, 0.08, 0.07)))
+    setup = _setup(options, scene, body)
     try:
-        editor = make_editor(_STYLE, scene, setup.region, setup.views)
+        editor = make_editor(EditorOptions(_STYLE), scene, setup.region, setup.views)
     except ProgdfError:  # its weights are an extra
         return found
     return [*found, WarpCase(f"bear's body: {_STYLE}", setup, lambda v: quantize_image(editor.edit(v, 1.0)))]
 
 
-def _robot_cases(plan: Plan, path: Path) -> list[WarpCase]:
+def _robot_cases(options: TrainOptions, path: Path) -> list[WarpCase]:
     labels = path.with_name(f"{path.stem}_labels.npy")
     if not labels.is_file():
         raise ProgdfError(f"{labels} does not exist; put the labels of the robot beside {path.name}")
     scene = load_ply(path)
     members = torch.from_numpy(np.isin(np.load(labels), _ROBOT)).nonzero()[:, 0]
     columns = column_warps(scene.means[members], torch.tensor([0.0, -1.0, 0.0]))
-    return [_case(plan, f"{path.stem}: {name}", scene, members, edit) for name, edit in columns.items()]
+    return [_case(options, f"{path.stem}: {name}", scene, members, edit) for name, edit in columns.items()]
 
 
-def _case(plan: Plan, name: str, scene: Gaussians, members: Tensor, edit: AnalyticEdit) -> WarpCase:
-    setup = _setup(plan, scene, members)
+def _case(
+    options: TrainOptions, name: str, scene: Gaussians, members: Tensor, edit: AnalyticEdit
+) -> WarpCase:
+    setup = _setup(options, scene, members)
     edited = edit.apply(scene, members, 1.0)
 
     def picture(view: View) -> Tensor:
@@ -213,8 +212,8 @@ def _case(plan: Plan, name: str, scene: Gaussians, members: Tensor, edit: Analyt
     return WarpCase(name, setup, picture)
 
 
-def _setup(plan: Plan, scene: Gaussians, members: Tensor) -> TrainingSetup:
+def _setup(options: TrainOptions, scene: Gaussians, members: Tensor) -> TrainingSetup:
     mask = torch.zeros(len(scene), dtype=torch.bool)
     mask[members] = True
     region: Region = from_mask("region", mask)
-    return make_training_setup(plan.views, scene, region)
+    return make_training_setup(options.views, scene, region)

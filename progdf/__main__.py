@@ -24,7 +24,7 @@ from .io.atomic import state_folder
 from .terminal import PrintableFormatter, escape_text
 
 COMMANDS: dict[str, tuple[str, str]] = {
-    "demo": ("trainer.pipeline.demo:main", "make a scene, train its edits, write previews, open the window"),
+    "demo": ("trainer.run.demo:main", "make a scene, train its edits, write previews, open the window"),
     "train": ("trainer.cli:train", "edit a region of a scene and write its .gdf file"),
     "region": ("trainer.cli:region", "show or keep which Gaussians a region selects"),
     "views": ("trainer.cli:views", "write views of a scene to draw masks or edits on"),

@@ -33,11 +33,11 @@ ENTRY_POINT = ROOT / "progdf" / "__main__.py"  # the table of commands knows all
 ORDER = {
     "progdf": """quaternions sh gaussians terminal errors threads region camera interpolation color metrics
         demo_scenes io rasterize field formats gdf scene compose cli __init__ __main__""",
-    "trainer": """__init__ options presets option_checks store views editors segmenters setup regions
-        motion optimize fit report plan preview pipeline evaluate cli""",
-    "viewer": "__init__ camera gl jobs state render files pictures ui panel app commands",
+    "trainer": """__init__ options store views editors resolve setup regions
+        motion optimize fit report preview run evaluate cli""",
+    "viewer": "__init__ camera gl jobs state render files pictures ui panel select app commands",
     "benchmarks": """__init__ courses joint_svd table ablation field_forms rasterizer
-        recorded_runs viewer field_plot field edits networks warps pictures __main__""",
+        recorded_runs viewer field_plot field edits networks sliders warps pictures __main__""",
 }
 
 MOST_FILES = 14

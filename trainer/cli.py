@@ -6,27 +6,30 @@ from collections.abc import Sequence
 
 from progdf.cli.options import parse_options
 from progdf.terminal import print_line
-from trainer.evaluate.options import EvaluateOptions
-from trainer.regions.options import RegionOptions, ViewsOptions
 
-from .options import FitOptions, TrainOptions
-from .presets import apply_preset
+from .options import (
+    EvaluateOptions,
+    FitOptions,
+    ShowRegionOptions,
+    TrainOptions,
+    WriteViewsOptions,
+    apply_preset,
+)
 
 
 def train(argv: Sequence[str]) -> int:
     """Run `progdf train`; 0 when the edit is written. Raises ProgdfError for what the user can mend."""
     options = train_options(argv)
-    from trainer.pipeline.run import train as run  # only now: --help and a mistyped option need no torch
-    from trainer.plan import make_plan
+    from trainer.run.run import train as run  # only now: --help and a mistyped option need no torch
 
-    run(make_plan(options), options.out, options.threads, options.resume)
+    run(options)
     return 0
 
 
 def fit(argv: Sequence[str]) -> int:
     """Run `progdf fit`; 0 when the edit is rewritten. Raises ProgdfError for what the user can mend."""
     options = parse_options(FitOptions, argv, "progdf fit")
-    from trainer.pipeline.refit import refit
+    from .run.finish import refit
 
     refit(options)
     return 0
@@ -51,7 +54,7 @@ def train_options(argv: Sequence[str]) -> TrainOptions:
 
 def region(argv: Sequence[str]) -> int:
     """Run `progdf region`; 0 when it is shown or kept. Raises ProgdfError for what the user can mend."""
-    options = parse_options(RegionOptions, argv, "progdf region")
+    options = parse_options(ShowRegionOptions, argv, "progdf region")
     from trainer.regions.command import show
 
     for line in show(options):
@@ -61,8 +64,8 @@ def region(argv: Sequence[str]) -> int:
 
 def views(argv: Sequence[str]) -> int:
     """Run `progdf views`; 0 when they are written. Raises ProgdfError for what the user can mend."""
-    options = parse_options(ViewsOptions, argv, "progdf views")
-    from trainer.regions.originals import write
+    options = parse_options(WriteViewsOptions, argv, "progdf views")
+    from .regions.command import write
 
     print_line(write(options))
     return 0

@@ -1,21 +1,31 @@
-"""The options of `progdf train` and `progdf fit`, as typed."""
+"""The options of the trainer's commands: nested parts, which go down to the functions as they are.
+
+The command line is flat. `Fixed` fields are no option of it: a preset sets them, or `trainer.resolve`.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import tyro
+from tyro.conf import Fixed
 
+from progdf.errors import ProgdfError
 from progdf.field.neural import Size
 from progdf.scene.up_axis import UpChoice
 
+EditKind = Literal["color", "style", "geometry"]
+"""What an edit moves, which chooses learning rates and loss weights (docs/method.md 3)."""
+Kind = Literal["auto", "color", "style", "geometry"]
 Slider = Literal["auto", "even", "stages", "time"]
-"""What slider values mean; auto becomes one of the others (`trainer.optimize.settings.resolve_slider`)."""
+"""What slider values mean; auto becomes one of the others (`resolve_slider`)."""
 Rates = Literal["kind", "3dgs"]
 Progressive = Literal["warmup", "decay", "growth", "off"]
+Sharpness = Literal["kind", "hinge", "paper", "off"]
+Solver = Literal["descent", "colors", "pictures"]
 FieldLoss = Literal["parameters", "pictures"]
 Norm = Literal["squares", "absolutes"]
 LiftRule = Literal["share", "count", "paper"]
@@ -24,12 +34,6 @@ Preset = Literal["default", "paper"]
 
 DETECTOR, SAM_MODEL = "IDEA-Research/grounding-dino-tiny", "facebook/sam-vit-base"
 FieldKind = Literal["auto", "separable", "keyframes", "lossless", "neural"]
-
-NETWORK_OPTIONS: Mapping[str, Any] = {
-    "size": "tiny",
-    "field_loss": "parameters",
-}
-"""Options of a neural field, and what they are where nothing is said."""
 
 MOST_STAGES = 8
 """Strengths that an editor with a strength control is asked for if nobody says how many, at most."""
@@ -46,35 +50,29 @@ STAGE_STEPS = 40
 """A stage needs so many: with fewer each view is seen once or twice, and the next target is there before this
 one is met. `QUICK_STAGES` are asked for then (docs/experiments.md, Stages)."""
 VIEWS, MOST_VIEWS = 30, 40
-"""How many views are edited by default, and how many of a dense region (see `trainer.setup.resolution`)."""
+"""How many views are edited by default, and how many of a dense region (see `trainer.views.setup`)."""
 SMALLEST_VIEW = 32
 """Pixels of a view's longer side, at least."""
 QUICK_STEPS, QUICK_STAGES, QUICK_VIEWS = 240, 4, 12
 
 
+def _absent(metavar: str, instead: str) -> Any:
+    """An option that may be left out, in the help: what it takes, and what happens without it."""
+    return tyro.conf.arg(metavar=metavar, help_behavior_hint=f"(default: {instead})")
+
+
 @dataclass(frozen=True)
-class TrainOptions:
-    """Edit a region of a scene and write its .gdf file.
+class RegionOptions:
+    """What may change."""
 
-    Where a default differs from ProGDF (AAAI 2025), it measured better.
-    """
-
-    scene: tyro.conf.Positional[Path]
-    """The scene: a .ply (also compressed), .spz, .splat, .ksplat or .sog."""
-    out: Path
-    """Folder of the run; created if needed."""
     region: str
     """What may change: all, labels:FILE.npy:ID[,ID], box:x0,y0,z0,x1,y1,z1, sphere:x,y,z,r, masks:DIR (one a
     camera), photomasks:DIR (of photographs), changed (where pictures: differ), text:"the man's shirt"; join
     by + -."""
-    editor: str
-    """recolor:#rrggbb, tint:#rrggbb, stripes:#rrggbb, darken:AMOUNT, night, folder:DIR (edited views),
-    photographs:EDITED,ORIGINALS (of what the cameras took), pictures:A.png[,B.png] (rendered, then changed in
-    any program), style:N (a painting, N from 0 to 25), instruct:"turn him into Batman"."""
     lift_rule: LiftRule = "share"
     """masks, text: a Gaussian's score is the share of its visible weight that lies in the masks, the share of
     its pixels, or the paper's printed sum, which selects nothing at the paper's threshold."""
-    lift_threshold: float | None = None
+    lift_threshold: Annotated[float | None, _absent("FLOAT", "the rule's own")] = None
     """masks, text: minimum score of a member; by default .7 for share, .8 for count and paper."""
     detector: str = DETECTOR
     """text: id or folder of the GroundingDINO that finds objects; download it first."""
@@ -82,23 +80,42 @@ class TrainOptions:
     """text: id or folder of the SAM that outlines them; download it first."""
     box_threshold: float = 0.3
     """text: minimum detection confidence, 0 to 1; a lower one finds more, including false matches."""
-    model: str = ""
+
+
+@dataclass(frozen=True)
+class EditorOptions:
+    """How the views are edited; what is left out is as the editor's model was made for."""
+
+    editor: str
+    """recolor:#rrggbb, tint:#rrggbb, stripes:#rrggbb, darken:AMOUNT, night, folder:DIR (edited views),
+    photographs:EDITED,ORIGINALS (of what the cameras took), pictures:A.png[,B.png] (rendered, then changed in
+    any program), style:N (a painting, N from 0 to 25), instruct:"turn him into Batman"."""
+    model: Annotated[str, _absent("STR", "timbrooks/instruct-pix2pix")] = ""
     """instruct: id or folder of a diffusers pipeline; empty: timbrooks/instruct-pix2pix (the paper's)."""
-    guidance: str = ""
+    guidance: Annotated[str, _absent("NUMBER[,NUMBER]", "the model's own")] = ""
     """instruct: how closely the instruction is followed and, after a comma, the picture, where the model
     supports that; by default the model's own values (paper: 7.5,1.5)."""
-    edit_steps: int | None = None
+    edit_steps: Annotated[int | None, _absent("INT", "the model's own")] = None
     """instruct: denoising steps per picture; by default the model's own number (paper: 20)."""
-    edit_size: int | None = None
+    edit_size: Annotated[int | None, _absent("INT", "the model's own")] = None
     """style, instruct: longer side in pixels at which pictures are painted; larger makes finer strokes."""
     reedit_every: int = 0
     """style, instruct: every N steps, edit the current renders again and train towards those; 0: never."""
-    preset: Preset = "default"
-    """Values of the options below, where the command line gives none: paper is the paper's trainer as it is
-    printed. In Python: trainer.presets.apply_preset."""
-    name: str = ""
-    """Name of the layer and of the .gdf file; the folder's name if empty."""
-    cameras: Path | None = None
+    graded: Fixed[bool] = False  # at several strengths by rising guidance, not the finished edit alone
+    seed: Fixed[int] = 0  # of the noise, the same in every view
+    cache: Fixed[Path | None] = None  # folder in which painted pictures are kept; None keeps nothing
+
+    @property
+    def family(self) -> str:
+        """The kind of editor."""
+        return self.editor.partition(":")[0]
+
+
+@dataclass(frozen=True)
+class ViewOptions:
+    """Which views are edited."""
+
+    cameras: Annotated[Path | None, _absent("PATH", "a rig that looks at the region")] = None
     """cameras.json, transforms.json or the folder of a COLMAP model; without it, a rig that looks at
     the region."""
     up: UpChoice = "auto"
@@ -109,12 +126,21 @@ class TrainOptions:
     image_size: int = 0
     """Longer side of the views in pixels; 0: 256, or up to 384 for an edit of colors whose members are so
     dense that most have less than a pixel."""
+    dense: Fixed[bool] = True  # dense members get more and larger views; not what is painted one by one
+    pictures: Fixed[tuple[Path, ...]] = ()  # changed pictures, whose cameras are the views, all to train on
+    scene: Fixed[Path | None] = None  # its file, beside which there may be cameras that tell which way is up
+
+
+@dataclass(frozen=True)
+class OptimizeOptions:
+    """How the members are optimized."""
+
     steps: int = 800
     """Optimizer steps over all stages (paper: 1500-2000 towards the finished edit alone)."""
-    kind: Literal["auto", "color", "style", "geometry"] = "auto"
+    kind: Kind = "auto"
     """What the edit moves; sets learning rates and loss weights. auto: as the editor knows; for folder:,
     photographs: and instruct: all are tried on a few small views, and the log says which was best."""
-    group_steps: int | None = None
+    group_steps: Annotated[int | None, _absent("INT", "chosen by a trial")] = None
     """geometry: first the connected parts of the region are moved as rigid wholes, in this many steps per
     strength or twice as many; 0: every Gaussian finds its own way, which bends well but smears what moves
     far. By default 120 or 0, whichever a short trial finds better."""
@@ -127,7 +153,7 @@ class TrainOptions:
     """Colors that change with the direction one looks from: trained, and kept where leaving them out would
     cost 0.1 dB (on), left as they are (off), or trained unless the edit is of colors and the region's own
     hardly change with the view (auto)."""
-    perceptual_weight: float | None = None
+    perceptual_weight: Annotated[float | None, _absent("FLOAT", "by the kind of edit")] = None
     """Weight of LPIPS beside L1; by default .3 for style and geometry (paper: 1). An edit of colors is solved
     for, all views at once; a weight makes it descend view by view instead."""
     progressive: Progressive = "off"
@@ -140,58 +166,240 @@ class TrainOptions:
     """Slider values. even: equal steps look equally large, and an editor with a strength control is asked for
     pictures that do; stages: s is the editor's own strength, even in between; time: the optimizer's. auto:
     even, but stages where folder: has pictures of several strengths."""
+    rates: Fixed[Rates] = "kind"  # as the kind of edit needs, or 3DGS's, which hardly move in 600 steps
+    perceptual_every: Fixed[int] = 2  # LPIPS is paid for every so many steps
+    # Of the renders: not less than the target's, or the printed term, which pulls at no pixel but the rim's.
+    sharpness: Fixed[Sharpness] = "kind"
+    # As the paper has it: Adam without a floor, the same rate for all steps and stages, recordings every 100
+    # steps with their jitter, losses of whole pictures, every attribute kept, a network trained jointly.
+    as_printed: Fixed[bool] = False
+    color_solver: Fixed[bool] = True  # an edit of colors is solved for, all views at once, where it can be
+    ema: Fixed[bool] = True  # a running mean of the parameters is recorded, not the bare iterates
+    target_ramp: Fixed[bool] = True  # a stage's target moves from the last stage's pictures to its own
+    propagation: Fixed[bool] = (
+        True  # in an edit of colors, members that no view shows do what their neighbors do
+    )
+    seed: Fixed[int] = 0  # order of the views
+    solver: Fixed[Solver] = "descent"  # filled in once the kind is known, see `resolve_kind`
+
+
+@dataclass(frozen=True)
+class FieldOptions:
+    """Which field is fitted to the recording."""
+
     field: FieldKind = "auto"
     """Kind of field; auto keeps the smallest separable one that meets --target-psnr; lossless
     keeps every recording."""
-    size: Size = NETWORK_OPTIONS["size"]
+    size: Size = "tiny"
     """neural: numbers in the network, 17 thousand, .5 million or 6 million (paper, a quarter of an hour)."""
-    field_loss: FieldLoss = NETWORK_OPTIONS["field_loss"]
+    field_loss: FieldLoss = "parameters"
     """neural: what it is trained on: the recorded offsets, or pictures of them (the paper's L1 + LPIPS and
     sharpness; about .3 s a step with the network of 6 million)."""
     target_psnr: float = 40.0
     """The field's worst PSNR against the recorded trajectory over the slider, on held-out views, dB."""
-    bytes_budget: float | None = None
+    bytes_budget: Annotated[float | None, _absent("FLOAT", "as many as --target-psnr takes")] = None
     """Bytes per Gaussian of the region that the field may take; the best one within is kept, whatever its
     PSNR. Not for neural."""
+    as_printed: Fixed[bool] = (
+        False  # a network sees positions alone, through hard bins of the slider, with no codes
+    )
+    draft: Fixed[bool] = False  # a network takes a third of its steps
+    seed: Fixed[int] = 0  # of its weights and draws
+
+
+@dataclass(frozen=True)
+class TextOptions:
+    """What CLIP is asked; of fit and evaluate the run's own texts, if nothing is given."""
+
+    text_before: Annotated[str, _absent("STR", "none; of fit and evaluate the run's own")] = ""
+    """What the views show before the edit, such as "a bear"; with --text-after, CLIP directional similarity
+    is measured (ViT-L/14; pip install progdf-studio[clip])."""
+    text_after: Annotated[str, _absent("STR", "none; of fit and evaluate the run's own")] = ""
+    """What they show after it, such as "a golden bear"; instruct: its sentence, if nothing is given."""
+    asked: Fixed[bool] = False  # whether a text was given for this; an instruction alone asks for nothing
+
+
+@dataclass(frozen=True)
+@tyro.conf.configure(tyro.conf.OmitArgPrefixes, tyro.conf.SuppressFixed)
+class TrainOptions:
+    """Edit a region of a scene and write its .gdf file.
+
+    Where a default differs from ProGDF (AAAI 2025), it measured better.
+    """
+
+    scene: tyro.conf.Positional[Path]
+    """The scene: a .ply (also compressed), .spz, .splat, .ksplat or .sog."""
+    out: Path
+    """Folder of the run; created if needed."""
+    region: RegionOptions
+    editor: EditorOptions
+    preset: Preset = "default"
+    """Values of the options below, where the command line gives none: paper is the paper's trainer as it is
+    printed. In Python: trainer.options.apply_preset."""
+    name: Annotated[str, _absent("STR", "the folder's name")] = ""
+    """Name of the layer and of the .gdf file; the folder's name if empty."""
+    views: ViewOptions = ViewOptions()
+    optimize: OptimizeOptions = OptimizeOptions()
+    field: FieldOptions = FieldOptions()
+    texts: TextOptions = TextOptions()
     quick: bool = False
     """A draft in a third of the time: 240 steps in 4 stages, 12 views."""
     seed: int = 0
     """Order of the views; the same seed gives the same files."""
     threads: int = 0
     """CPU threads; 0 takes all cores. More threads than idle cores are slower."""
-    text_before: str = ""
-    """What the views show before the edit, such as "a bear"; with --text-after, CLIP directional similarity
-    is measured (ViT-L/14; pip install progdf-studio[clip])."""
-    text_after: str = ""
-    """What they show after it, such as "a golden bear"; instruct: its sentence, if nothing is given."""
     resume: bool = False
     """Continue a run that was stopped in this folder; the result is the same as without the stop."""
 
+    @property
+    def edit(self) -> dict[str, str]:
+        """What identifies the edit: a run folder holds runs of one."""
+        return {
+            "scene": str(self.scene.resolve()),
+            "region": self.region.region,
+            "editor": self.editor.editor,
+        }
+
+
+PRESETS: Mapping[Preset, Mapping[str, Mapping[str, Any]]] = {
+    "default": {},
+    # the trainer of ProGDF (AAAI 2025) as it is printed: docs/method.md, The paper to the letter; but for the
+    # clamps: with 3DGS's own, a sixth of the colors could never change, and the paper is silent
+    "paper": {
+        "region": {"lift_rule": "paper"},
+        "views": {"views": 96, "image_size": 256},
+        "optimize": {
+            "steps": 1500,
+            "stages": 1,
+            "group_steps": 0,
+            "perceptual_weight": 1.0,
+            "progressive": "growth",
+            "progressive_norm": "squares",
+            "sh": "off",
+            "slider": "time",
+            "rates": "3dgs",
+            "perceptual_every": 1,
+            "sharpness": "paper",
+            "as_printed": True,
+            "color_solver": False,
+            "ema": False,
+            "target_ramp": False,
+            "propagation": False,
+        },
+        "field": {"field": "neural", "size": "paper", "field_loss": "pictures", "as_printed": True},
+    },
+}
+"""Values of options that belong together, by part. What the command line says itself goes before them."""
+
+
+def apply_preset(options: TrainOptions, preset: Preset) -> TrainOptions:
+    """The options with a preset's values in the fields that it names; `replace` what should differ."""
+    parts = {part: replace(getattr(options, part), **values) for part, values in PRESETS[preset].items()}
+    return replace(options, preset=preset, **parts)
+
+
+_Options = TypeVar("_Options")
+
+
+def with_values(options: _Options, **values: object) -> _Options:
+    """The options with other values of some fields, each in the part that has it."""
+    changes: dict[str, Any] = {}
+    for name in (field.name for field in fields(options)):  # type: ignore[arg-type]
+        part = getattr(options, name)
+        if is_dataclass(part):
+            inner = {field.name for field in fields(part)} & values.keys()
+            changes[name] = with_values(part, **{key: values[key] for key in inner})
+        elif name in values:
+            changes[name] = values[name]
+    return replace(options, **changes)  # type: ignore[type-var]
+
+
+def check_ranges(*ranges: tuple[str, float | None, float, float]) -> None:
+    """Raises ProgdfError at the first value outside its range.
+
+    Args:
+        ranges: the option, its value or None where it has none, the least and the largest that is right
+    """
+    for option, value, low, high in ranges:
+        if value is not None and not low <= value <= high:
+            raise ProgdfError(f"{option} must be between {low} and {high}, got {value}")
+
 
 @dataclass(frozen=True)
+@tyro.conf.configure(tyro.conf.OmitArgPrefixes, tyro.conf.SuppressFixed)
 class FitOptions:
     """Refit the field of a run to its recorded trajectory; nothing is optimized again."""
 
     run: tyro.conf.Positional[Path]
     """Folder that progdf train wrote."""
-    field: FieldKind = "auto"
-    """Kind of field; auto keeps the smallest separable one that meets --target-psnr; lossless
-    keeps every recording."""
-    size: Size = NETWORK_OPTIONS["size"]
-    """neural: numbers in the network, 17 thousand, .5 million or 6 million (paper, a quarter of an hour)."""
-    field_loss: FieldLoss = NETWORK_OPTIONS["field_loss"]
-    """neural: what it is trained on: the recorded offsets, or pictures of them (the paper's L1 + LPIPS and
-    sharpness; about .3 s a step with the network of 6 million)."""
-    target_psnr: float = 40.0
-    """The field's worst PSNR against the recorded trajectory over the slider, on held-out views, dB."""
-    bytes_budget: float | None = None
-    """Bytes per Gaussian of the region that the field may take; the best one within is kept, whatever its
-    PSNR. Not for neural."""
-    scene: Path | None = None
+    field: FieldOptions = FieldOptions()
+    scene: Annotated[Path | None, _absent("PATH", "where the run found it")] = None
     """Where the scene is now, if it has moved since the run."""
-    text_before: str = ""
-    """As for progdf train; the run's own, if nothing is given."""
-    text_after: str = ""
-    """As for progdf train; the run's own, if nothing is given."""
+    texts: TextOptions = TextOptions()
     threads: int = 0
     """CPU threads; 0 takes all cores."""
+
+
+@dataclass(frozen=True)
+@tyro.conf.configure(tyro.conf.OmitArgPrefixes, tyro.conf.SuppressFixed)
+class EvaluateOptions:
+    """Measure a finished run as papers do: one table, one picture, on views that training has not seen."""
+
+    run: tyro.conf.Positional[Path]
+    """Folder that progdf train wrote."""
+    scene: Annotated[Path | None, _absent("PATH", "where the run found it")] = None
+    """Where the scene is now, if it has moved since the run."""
+    texts: TextOptions = TextOptions()
+    threads: int = 0
+    """CPU threads; 0 takes all cores."""
+
+
+@dataclass(frozen=True)
+class ShowRegionOptions:
+    """Show what a region selects in a scene, or keep it as a file for --region file:MEMBERS.npy."""
+
+    scene: tyro.conf.Positional[Path]
+    """The scene, a 3DGS .ply file."""
+    spec: tyro.conf.Positional[str]
+    """The region, as progdf train --region has it: box:…, lasso:…, masks:DIR, file:MEMBERS.npy, …"""
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """picture.png, in which the region is tinted and the rest is pale; or members.npy, its rows (int64)."""
+    cameras: Annotated[Path | None, _absent("PATH", "none")] = None
+    """masks: their cameras, where DIR holds none; text: views in which to look for it."""
+    camera: Annotated[str | None, _absent("FILE[:INDEX]", "four sides")] = None
+    """Look through a camera of this file, the first where no INDEX is given."""
+    orbit: Annotated[str | None, _absent("AZ,EL[,DISTANCE]", "four sides")] = None
+    """Look from degrees around the scene, degrees above it, world units away (fitting); without camera and
+    orbit the picture shows four sides."""
+    size: Annotated[str, tyro.conf.arg(metavar="WxH")] = "640x480"
+    """Pixels of the picture, or of each side; a camera's own if it is one."""
+    up: UpChoice = "auto"
+    """The axis of the scene that is up."""
+    lift_rule: LiftRule = "share"
+    """masks, text: as for progdf train."""
+    lift_threshold: Annotated[float | None, _absent("FLOAT", "the rule's own")] = None
+    """masks, text: as for progdf train."""
+
+
+@dataclass(frozen=True)
+class WriteViewsOptions:
+    """Write views of a scene and their cameras.json, to draw masks or edits on.
+
+    Draw masks as OUT/NAME.png, white on black, for as many views as you like; then
+    progdf train SCENE --cameras OUT/cameras.json --region masks:OUT
+    """
+
+    scene: tyro.conf.Positional[Path]
+    """The scene, a 3DGS .ply file."""
+    out: Path
+    """Folder for original/NAME.png and cameras.json."""
+    cameras: Annotated[Path | None, _absent("PATH", "a rig around the scene")] = None
+    """cameras.json, transforms.json or the folder of a COLMAP model; without it, a rig around the scene."""
+    region: Annotated[str | None, _absent("STR", "the whole scene")] = None
+    """The rig looks at this region instead of the whole scene."""
+    views: int = 12
+    """How many views, at most; of more cameras, those that differ most."""
+    image_size: int = 768
+    """Longer side of the views in pixels."""
+    up: UpChoice = "auto"
+    """The axis of the scene that is up."""

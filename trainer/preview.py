@@ -32,8 +32,9 @@ from progdf.gaussians import Gaussians
 from progdf.io.images import write_image
 from progdf.region import Region
 from progdf.scene.regions import parse_region
-from trainer.editors import EditorSettings, ImageEditor, check_new_editor, make_editor
-from trainer.regions.from_pictures import RegionSettings, region_kinds
+from trainer.editors import ImageEditor, check_new_editor, make_editor
+from trainer.options import EditorOptions, RegionOptions, ViewOptions
+from trainer.regions.from_pictures import RegionRequest, region_kinds
 from trainer.views.view import View, make_view, with_near_plane
 
 _Row3 = tuple[float, float, float]
@@ -79,12 +80,12 @@ class Previewer:
 
     Args:
         path: the scene's file
-        kept: folder for what a learned editor painted
+        cache: folder for what a learned editor painted
     """
 
-    def __init__(self, path: Path, kept: Path) -> None:
+    def __init__(self, path: Path, cache: Path) -> None:
         self._path, self._scene = path, load_scene(path)
-        self._settings = EditorSettings(kept=kept)
+        self._cache = cache
         self._region = lru_cache(maxsize=4)(self._find_region)
         self._view = lru_cache(maxsize=2)(self._make_view)
         self._editor = lru_cache(maxsize=2)(self._make_editor)
@@ -102,8 +103,8 @@ class Previewer:
         return self._editor(asked.editor, *seen).edit(view, asked.strength)
 
     def _find_region(self, spec: str) -> Region:
-        kinds = region_kinds(RegionSettings(None, 30, _no_masks, quiet=True, scene=self._path))
-        return parse_region(spec, self._scene, kinds=kinds)
+        request = RegionRequest(RegionOptions(spec), ViewOptions(scene=self._path), _no_masks, quiet=True)
+        return parse_region(spec, self._scene, kinds=region_kinds(request))
 
     def _make_view(
         self,
@@ -126,9 +127,10 @@ class Previewer:
         size: tuple[int, int],
         background: _Row3,
     ) -> ImageEditor:
-        check_new_editor(editor, self._settings)
+        options = EditorOptions(editor, cache=self._cache)
+        check_new_editor(options)
         view = self._view(region, viewmat, K, size, background)
-        return make_editor(editor, self._scene, self._region(region), [view], self._settings)
+        return make_editor(options, self._scene, self._region(region), [view])
 
     @property
     def scene(self) -> Gaussians:

@@ -25,14 +25,15 @@ from progdf.io.atomic import atomic_write, make_folder
 from progdf.io.images import read_picture, write_image
 from progdf.io.json_values import decode_json, plain
 from trainer.fit.fit import drop_idle_attributes
-from trainer.optimize.losses import Perceptual, perceptual_loss
+from trainer.optimize.losses import Perceptual, describe_loss, perceptual_loss
 from trainer.optimize.unseen import unseen_members_of
-from trainer.pipeline.reopen import reopen_run
-from trainer.pipeline.threads import use_threads
-from trainer.pipeline.training import JointNetwork, optimize_members, retime_trajectory
-from trainer.plan import Plan, plan_optimization
+from trainer.options import TrainOptions
 from trainer.report.report import SHOWN, best_view, editor_strip, strip
-from trainer.setup.training_setup import Pictures, whole_views
+from trainer.resolve import resolve_kind
+from trainer.run.record import reopen_run
+from trainer.run.threads import use_threads
+from trainer.run.training import optimize_members, retime_trajectory
+from trainer.setup import Pictures, whole_views
 from trainer.store.interrupts import interrupt_on_signals
 from trainer.store.progress import RunLog
 from trainer.store.run_folder import RunFolder, lock_folder, write_json
@@ -43,7 +44,7 @@ from .options import AblateOptions
 from .plot import plot_ablations
 from .setup import AblationSetup, digest_of, edit_at_equal_strengths, make_ablation_setup, run_plan
 from .table import Ablation, Outcome, Row, row_line, sheet_of, table_of
-from .variants import Variant, choose_variants, differing_variants, is_seeded
+from .variants import EQUAL, Variant, choose_variants, differing_variants, is_seeded
 
 _WIDTH = 176  # of a picture in the sheet, pixels
 
@@ -141,15 +142,15 @@ def _run_variant(root: Path, variant: Variant, seed: int, shared: AblationSetup,
     folder.mkdir(exist_ok=True)
     plan = variant.plan(shared.plan, seed)
     perceptual = perceptual_loss()[0]
-    optimization = plan_optimization(plan.optimization, shared.kind, plan.optimization.group_steps or 0)
-    outcome = Outcome(
-        variant.name, variant.what, variant.of, objective=optimization.objective(perceptual.name)
-    )
+    optimization = resolve_kind(plan, shared.kind, plan.optimize.group_steps or 0)
+    objective = describe_loss(optimization, perceptual.name)
+    outcome = Outcome(variant.name, variant.what, variant.of, objective=objective)
     state = _state(root, variant, seed, shared)
     log = RunLog(folder / "log.txt", quiet)
     try:
-        trajectory = _record(plan, shared, perceptual, state, log)
-        field, asked = fit_variant(variant, trajectory, shared, plan, perceptual, state, log)
+        with variant.patched():
+            trajectory = _record(variant, plan, shared, perceptual, state, log)
+            field, asked = fit_variant(variant, trajectory, shared, plan, perceptual, state, log)
     except ProgdfError as error:
         if not isinstance(error.__cause__, FloatingPointError):
             raise
@@ -179,36 +180,37 @@ def _state(root: Path, variant: Variant, seed: int, shared: AblationSetup) -> St
 
 
 def _record(
-    plan: Plan, shared: AblationSetup, perceptual: Perceptual, state: StateFolder, log: RunLog
+    variant: Variant,
+    plan: TrainOptions,
+    shared: AblationSetup,
+    perceptual: Perceptual,
+    state: StateFolder,
+    log: RunLog,
 ) -> Trajectory:
     """The variant's trajectory."""
-    optimization = plan_optimization(plan.optimization, shared.kind, plan.optimization.group_steps or 0)
-    does = optimization.refinements
-    setup = whole_views(shared.setup) if plan.optimization.whole else shared.setup
+    optimization = resolve_kind(plan, shared.kind, plan.optimize.group_steps or 0)
+    setup = whole_views(shared.setup) if optimization.as_printed else shared.setup
     with _count_processor_seconds(state), log.stage("optimize"):
         trajectory, _ = optimize_members(
+            plan,
             optimization,
             setup,
-            _targets(plan, shared),
+            _targets(variant, plan, shared),
             perceptual,
             state,
             log,
-            unseen_members=unseen_members_of(setup, shared.kind) if does.propagates else None,
-            network=JointNetwork(plan.field.network, plan.slider) if plan.field.field == "neural" else None,
+            unseen_members=unseen_members_of(setup, optimization) if optimization.propagation else None,
         )
     choosing, _ = shared.evaluators(trajectory.offsets)[0].halves()
-    trajectory, _ = drop_idle_attributes(trajectory, choosing, does.prunes)
-    return retime_trajectory(trajectory, setup, plan.slider, optimization.raw, log)
+    trajectory, _ = drop_idle_attributes(trajectory, choosing, not optimization.as_printed)
+    return retime_trajectory(trajectory, setup, optimization, log)
 
 
-def _targets(plan: Plan, shared: AblationSetup) -> Pictures:
+def _targets(variant: Variant, plan: TrainOptions, shared: AblationSetup) -> Pictures:
     """The edited views that a variant is trained on."""
-    if plan.optimization.stages == 1:
+    if plan.optimize.stages == 1:
         return {1.0: shared.edited[1.0]}
-    asks_evenly = shared.plan.optimization.refinements.asks_evenly
-    if plan.optimization.refinements.asks_evenly != asks_evenly:
-        return edit_at_equal_strengths(shared)
-    return shared.edited
+    return edit_at_equal_strengths(shared) if variant.name == EQUAL else shared.edited
 
 
 @contextmanager
@@ -272,7 +274,7 @@ def _publish(root: Path, variants: Sequence[Variant], shared: AblationSetup) -> 
     plan, setup, evaluator = shared.plan, shared.setup, shared.evaluator
     size = setup.held_out[0].camera
     note = (
-        f"{plan.editor.editor}, {plan.optimization.steps} steps in {len(shared.edited)} stages, "
+        f"{plan.editor.editor}, {plan.optimize.steps} steps in {len(shared.edited)} stages, "
         f"{len(setup.train)} views to train on and {len(setup.held_out)} "
         f"to measure with, {size.width}x{size.height} pixels, {len(shared.run.region)} members."
     )

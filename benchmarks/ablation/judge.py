@@ -17,9 +17,9 @@ from trainer.fit.network import PART as NETWORK
 from trainer.fit.network import fit_network
 from trainer.fit.slider_uniformity import equalize_slider
 from trainer.optimize.losses import Perceptual
-from trainer.optimize.settings import resolve_slider
-from trainer.plan import Plan
-from trainer.report.curves import against_editor
+from trainer.optimize.retime import resolve_slider
+from trainer.options import FieldOptions, TrainOptions
+from trainer.report.measures import against_editor
 from trainer.report.report import SHOWN
 from trainer.store.progress import RunLog
 from trainer.store.state import StateFolder
@@ -33,7 +33,7 @@ def fit_variant(
     variant: Variant,
     trajectory: Trajectory,
     shared: AblationSetup,
-    plan: Plan,
+    plan: TrainOptions,
     perceptual: Perceptual,
     state: StateFolder,
     log: RunLog,
@@ -45,16 +45,15 @@ def fit_variant(
     evaluator, seen = shared.evaluators(trajectory.offsets)
     remap, (choosing, reporting) = identity_remap(), evaluator.halves()
     if plan.field.field == "neural":
-        begun, network = state.load(NETWORK), plan.field.network
-        weights, setup = shared.weights, shared.setup
+        setup, weights, begun = shared.setup, shared.weights, state.load(NETWORK)
         field = fit_network(
-            trajectory, setup, seen, reporting, weights, network, perceptual, log, begun
+            trajectory, setup, seen, reporting, weights, plan.field, perceptual, log, begun=begun
         ).field
     else:
-        target = shared.plan.field.target_psnr
-        fitted = fit_field(trajectory, seen, choosing, reporting, shared.weights, "auto", target)
+        options = FieldOptions(target_psnr=shared.plan.field.target_psnr)
+        fitted = fit_field(trajectory, seen, choosing, reporting, shared.weights, options)
         field = fitted.chosen.field
-        if resolve_slider(plan.slider, trajectory.strengths) == "even":
+        if resolve_slider(plan.optimize.slider, trajectory.strengths) == "even":
             field, remap = equalize_slider(field, shared.setup)
     return field, {strength: remap.at(s) for s, strength in trajectory.asked}
 

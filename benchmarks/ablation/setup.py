@@ -13,14 +13,12 @@ from torch import Tensor
 from progdf.gaussians import BASE_CHANNELS
 from progdf.io.json_values import plain
 from trainer.editors import make_editor
-from trainer.editors.base import EditKind
 from trainer.fit.evaluate import Evaluator, make_evaluator
 from trainer.fit.fit import visibility
-from trainer.options import QUICK_STAGES, QUICK_STEPS, QUICK_VIEWS
-from trainer.pipeline.reopen import FinishedRun, render_run_views
-from trainer.plan import Plan
+from trainer.options import QUICK_STAGES, QUICK_STEPS, QUICK_VIEWS, EditKind, TrainOptions, with_values
 from trainer.report.report import Columns, columns_of
-from trainer.setup.training_setup import (
+from trainer.run.record import FinishedRun, render_run_views
+from trainer.setup import (
     Pictures,
     TrainingSetup,
     confines_edit,
@@ -56,7 +54,7 @@ class AblationSetup:
     """
 
     run: FinishedRun
-    plan: Plan
+    plan: TrainOptions
     kind: EditKind
     setup: TrainingSetup
     edited: Pictures
@@ -72,15 +70,15 @@ class AblationSetup:
         return self.still if only_recolors(offsets) else (self.evaluator, self.seen)
 
 
-def run_plan(run: FinishedRun) -> Plan:
+def run_plan(run: FinishedRun) -> TrainOptions:
     """The plan of a finished run, with the group steps that it found out."""
     plan = run.record.plan
-    if plan.optimization.group_steps is not None:
+    if plan.optimize.group_steps is not None:
         return plan
-    return replace(plan, optimization=replace(plan.optimization, group_steps=run.record.group_steps))
+    return with_values(plan, group_steps=run.record.group_steps)
 
 
-def make_ablation_setup(run: FinishedRun, plan: Plan, kind: EditKind, quick: bool) -> AblationSetup:
+def make_ablation_setup(run: FinishedRun, plan: TrainOptions, kind: EditKind, quick: bool) -> AblationSetup:
     """The run's views and edited views; for a draft every so manieth of them.
 
     Args:
@@ -93,13 +91,12 @@ def make_ablation_setup(run: FinishedRun, plan: Plan, kind: EditKind, quick: boo
         ProgdfError: an edited view is gone.
     """
     setup, strengths = render_run_views(run), run.trajectory.strengths
-    optimization = replace(plan.optimization, reedit_every=0)
+    plan = with_values(plan, reedit_every=0)
     if quick:
         strengths = tuple(_thin(strengths, QUICK_STAGES))
         train = _thin(setup.train, max(2, QUICK_VIEWS - len(setup.held_out)))
         setup = replace(setup, train=train)
-        steps = min(optimization.steps, QUICK_STEPS)
-        optimization = replace(optimization, steps=steps, stages=len(strengths))
+        plan = with_values(plan, steps=min(plan.optimize.steps, QUICK_STEPS), stages=len(strengths))
     edited = {s: _read_edited(run, setup.train, s) for s in strengths}
     setup = widen_views(setup, edited)
     columns = columns_of(run.trajectory.asked)
@@ -120,7 +117,7 @@ def make_ablation_setup(run: FinishedRun, plan: Plan, kind: EditKind, quick: boo
         digest.update(view.image.numpy().tobytes())
     return AblationSetup(
         run,
-        replace(plan, optimization=optimization),
+        plan,
         kind,
         setup,
         edited,
@@ -136,8 +133,8 @@ def make_ablation_setup(run: FinishedRun, plan: Plan, kind: EditKind, quick: boo
 def edit_at_equal_strengths(shared: AblationSetup) -> Pictures:
     """The training views as the editor has them at as many strengths, these equally far apart."""
     run, setup, plan = shared.run, shared.setup, shared.plan
-    views, settings = [*setup.train, *setup.held_out], plan.editor.settings(run.folder.painted)
-    editor = make_editor(plan.editor.editor, run.scene, run.region, views, settings)
+    options = replace(plan.editor, cache=run.folder.painted)
+    editor = make_editor(options, run.scene, run.region, [*setup.train, *setup.held_out])
     confined = confines_edit(editor, shared.kind)
 
     def picture(view: View, strength: float) -> Tensor:
@@ -153,10 +150,11 @@ def digest_of(shared: AblationSetup, variant: Variant, seed: int, optimization: 
     decides = plain(variant.plan(shared.plan, seed))
     del decides["scene"]  # its pictures are in the setup's digest
     if optimization:
-        del decides["slider"], decides["optimization"]["refinements"]["prunes"]
+        del decides["optimize"]["slider"]
         if decides["field"]["field"] != "neural":
             del decides["field"]
-    told = json.dumps([shared.digest, decides, variant.linear and not optimization], sort_keys=True)
+    name = variant.trains_as if optimization else variant.name  # of which its patches are
+    told = json.dumps([shared.digest, decides, name], sort_keys=True)
     return hashlib.sha256(told.encode()).hexdigest()
 
 

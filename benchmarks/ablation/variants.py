@@ -1,35 +1,38 @@
 """The method without one of its parts, or with another: what `python -m benchmarks ablate` trains again.
 
-A variant differs in one value of the plan from another one, which `of` names: from the run's own options,
-from the same edit descended view by view where those solve for its colors, from the paper's preset, or from
-that with our field in place of its network.
+A variant differs from another one, which `of` names, in one value of the plan or one patch of the trainer's
+modules: from the run's own options, from the same edit descended view by view where those solve for its
+colors, from the paper's preset, or from that with our field in place of its network.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, fields, is_dataclass, replace
-from pathlib import Path
 from typing import Any, TypeVar
+from unittest import mock
+
+import torch
+from torch import Tensor
 
 from progdf.errors import ProgdfError
-from trainer.editors import COSTLY_DIAL, GIVEN
-from trainer.editors.base import EditKind
-from trainer.fit.network import NetworkPlan
-from trainer.optimize.settings import GROUP_STEPS, Optimization, resolve_slider
-from trainer.options import Slider, TrainOptions
-from trainer.plan import Plan, make_plan, plan_optimization
-from trainer.presets import PRESETS, apply_preset
+from trainer.editors import COSTLY_STRENGTHS, EXTERNAL
+from trainer.optimize.groups import GROUP_STEPS
+from trainer.optimize.retime import resolve_slider
+from trainer.options import PRESETS, EditKind, FieldOptions, OptimizeOptions, TrainOptions
+from trainer.resolve import resolve_kind
 
 BASE, LINEAR, EQUAL = "base", "2-keyframes", "equal-strengths"
 DESCENT, PAPER, PAPER_PGS = "descent", "paper", "paper-pgs"
 
-Resolved = tuple[Optimization, Slider, NetworkPlan | None]
+Resolved = tuple[OptimizeOptions, FieldOptions | None, tuple[str, ...]]
 """All that decides a variant's bits, but for what all variants of a run share."""
 
 _T = TypeVar("_T")
 
-_AFTERWARDS = ("slider", "optimization.refinements.prunes")  # the optimization knows nothing of these
+_AFTERWARDS = ("optimize.slider", "trainer.fit.fit._PAYS")  # the optimization knows nothing of these
 
 
 @dataclass(frozen=True)
@@ -42,6 +45,7 @@ class Variant:
         changes: values of the plan in place of the other variant's, by their paths
         of: name of that variant
         linear: the slider goes straight from the original to the end, whatever was recorded
+        patches: what stands in the trainer's modules meanwhile, by its dotted names
         longer: how many times the other variant's steps it takes
     """
 
@@ -50,29 +54,36 @@ class Variant:
     changes: Mapping[str, Any] = field(default_factory=dict)
     of: str = BASE
     linear: bool = False
+    patches: Mapping[str, object] = field(default_factory=dict)
     longer: float = 1.0
 
     @property
     def trains_as(self) -> str:
         """Name of the variant whose optimization it shares."""
-        return self.of if all(path in _AFTERWARDS for path in self.changes) else self.name
+        shares = self.name != EQUAL and all(path in _AFTERWARDS for path in (*self.changes, *self.patches))
+        return self.of if shares else self.name
 
-    def plan(self, own: Plan, seed: int = 0) -> Plan:
+    @contextmanager
+    def patched(self) -> Iterator[None]:
+        """The trainer as this variant has it."""
+        with ExitStack() as stack:
+            for name, value in _all_patches(self).items():
+                stack.enter_context(mock.patch(name, value))
+            yield
+
+    def plan(self, own: TrainOptions, seed: int = 0) -> TrainOptions:
         """The run's plan with what is different. `seed`: is added to the run's own, of views and network"""
         plan = _BY_NAME[self.of].plan(own) if self.of != self.name else own
         for path, value in self.changes.items():
             plan = _put(plan, path, value)
         if self.longer != 1.0:
-            plan = _put(plan, "optimization.steps", round(self.longer * plan.optimization.steps))
-        if not seed:
-            return plan
-        network = replace(plan.field.network, seed=plan.field.network.seed + seed)
-        optimization = replace(plan.optimization, seed=plan.optimization.seed + seed)
-        return replace(plan, optimization=optimization, field=replace(plan.field, network=network))
+            plan = _put(plan, "optimize.steps", round(self.longer * plan.optimize.steps))
+        optimize = replace(plan.optimize, seed=plan.optimize.seed + seed)
+        return replace(plan, optimize=optimize, field=replace(plan.field, seed=plan.field.seed + seed))
 
 
 def plan_values(part: object, at: str = "") -> dict[str, Any]:
-    """All values of a plan by their paths, as "optimization.steps"."""
+    """All values of a plan by their paths, as "optimize.steps"."""
     found: dict[str, Any] = {}
     for name in (entry.name for entry in fields(part)):  # type: ignore[arg-type]
         value = getattr(part, name)
@@ -87,56 +98,72 @@ def _put(part: _T, path: str, value: object) -> _T:
     return replace(part, **{name: inner})  # type: ignore[type-var]
 
 
-_PAPER_STEPS = PRESETS["paper"]["steps"] / TrainOptions.steps
+_PAPER_STEPS = PRESETS["paper"]["optimize"]["steps"] / OptimizeOptions.steps
 """Its steps over ours: a draft shortens both alike."""
 
 
 def _as_printed() -> Mapping[str, Any]:
-    """What the paper's preset asks of optimization, slider and field, but for the number of steps."""
-    options = TrainOptions(Path("scene.ply"), Path("run"), region="all", editor="night")
-    default, paper = plan_values(make_plan(options)), plan_values(make_plan(apply_preset(options, "paper")))
+    """What the paper's preset asks of optimization and field, but for the number of steps."""
+    parts = {"optimize": OptimizeOptions, "field": FieldOptions}
     return {
-        path: value
-        for path, value in paper.items()
-        if value != default[path]
-        and path != "optimization.steps"
-        and path.partition(".")[0] in ("optimization", "slider", "field")
+        f"{part}.{name}": value
+        for part, kind in parts.items()
+        for name, value in PRESETS["paper"][part].items()
+        if name != "steps" and value != getattr(kind, name)
     }
 
 
-def _without(name: str, what: str, part: str, of: str = BASE) -> Variant:
-    """Without one of `Refinements`."""
-    return Variant(name, what, {f"optimization.refinements.{part}": False}, of)
+def _patched(name: str, what: str, path: str, value: object, of: str = BASE) -> Variant:
+    """With something else in one of the trainer's modules."""
+    return Variant(name, what, of=of, patches={path: value})
 
 
 def _other(name: str, what: str, part: str, value: object, of: str = BASE) -> Variant:
-    """With another value of the optimization's plan."""
-    return Variant(name, what, {f"optimization.{part}": value}, of)
+    """With another value of the optimization."""
+    return Variant(name, what, {f"optimize.{part}": value}, of)
 
+
+_PGS, _EPSILON = "trainer.optimize.pgs", "trainer.optimize.pgs.EPSILON"
+
+
+def _is_inside(value: Tensor, low: float, high: float, slope: Tensor) -> Tensor:
+    """`leads_back` of a plain clamp."""
+    return (value >= low) & (value <= high)
+
+
+_PLAIN_CLAMPS = {
+    "trainer.views.crops.clamp_towards": torch.clamp,
+    "trainer.optimize.color_solver.leads_back": _is_inside,
+}
 
 VARIANTS = (
     Variant(BASE, "the run's own options", of=BASE),
     Variant(LINEAR, "a straight line to the same end: 2 keyframes", linear=True),
     _other("one-target", "no stages: towards the finished edit alone", "stages", 1),
-    _without(EQUAL, "asked at equal strengths, not for equal changes", "asks_evenly"),
-    Variant("slider-stages", "the editor's own strengths, even in between", {"slider": "stages"}),
-    Variant("slider-even", "even over the whole slider", {"slider": "even"}),
-    Variant("slider-time", "the optimizer's time", {"slider": "time"}),
+    Variant(EQUAL, "asked at equal strengths, not for equal changes"),
+    Variant("slider-stages", "the editor's own strengths, even in between", {"optimize.slider": "stages"}),
+    Variant("slider-even", "even over the whole slider", {"optimize.slider": "even"}),
+    Variant("slider-time", "the optimizer's time", {"optimize.slider": "time"}),
     _other("no-sh", "view-dependent color left as it is", "sh", "off"),
     _other("with-sh", "view-dependent color trained in any case", "sh", "on"),
-    _without("plain-clamps", "clamps pass no gradient that leads back", "leads_back"),
-    _without("no-propagation", "members that no view shows left alone", "propagates"),
-    _without("no-pruning", "attributes kept that do not pay", "prunes"),
+    Variant("plain-clamps", "clamps pass no gradient that leads back", patches=_PLAIN_CLAMPS),
+    _other("no-propagation", "members that no view shows left alone", "propagation", False),
+    _patched("no-pruning", "attributes kept that do not pay", "trainer.fit.fit._PAYS", -math.inf),
     _other("no-groups", "parts are not moved as wholes first", "group_steps", 0),
-    _without(DESCENT, "view by view, where colors are solved for", "solves"),
+    _other(DESCENT, "view by view, where colors are solved for", "color_solver", False),
     _other("descent-one-target", "no stages", "stages", 1, DESCENT),
     _other("rates-3dgs", "the learning rates of 3DGS", "rates", "3dgs", DESCENT),
-    _without("no-damping", "members that hardly show not held still", "damps", DESCENT),
-    _without("no-interpolation", "a stage's own target from its first step", "ramps", DESCENT),
-    _without("no-slowing", "no short steps at a stage's end", "slows", DESCENT),
-    _without("no-sizing", "steps not sized by a stage's way", "sizes", DESCENT),
-    _without("no-running-mean", "the bare iterates recorded", "averages", DESCENT),
-    _without("descent-plain-clamps", "clamps pass no gradient that leads back", "leads_back", DESCENT),
+    _patched("no-damping", "members that hardly show not held still", _EPSILON, 0.0, DESCENT),
+    _other("no-interpolation", "a stage's own target from its first step", "target_ramp", False, DESCENT),
+    _patched("no-slowing", "no short steps at a stage's end", f"{_PGS}._decay", lambda *_: 1.0, DESCENT),
+    _patched("no-sizing", "steps not sized by a stage's way", f"{_PGS}.REACH", 0.0, DESCENT),
+    _other("no-running-mean", "the bare iterates recorded", "ema", False, DESCENT),
+    Variant(
+        "descent-plain-clamps",
+        "clamps pass no gradient that leads back",
+        of=DESCENT,
+        patches=_PLAIN_CLAMPS,
+    ),
     _other("no-lpips", "L1 alone", "perceptual_weight", 0.0, DESCENT),
     _other("sharpness-off", "no L_render", "sharpness", "off", DESCENT),
     _other("sharpness-hinge", "L_render: as sharp as the target", "sharpness", "hinge", DESCENT),
@@ -150,10 +177,11 @@ VARIANTS = (
         for way, of in (("growth", "progressive-growth"), ("decay", "progressive-decay"))
     ),
     Variant(PAPER, "the paper's preset with its network", _as_printed(), longer=_PAPER_STEPS),
-    Variant(
+    _patched(
         "paper-gdf-no-sharpness",
         "no L_render in the network's loss",
-        {"field.network.sharpness": False},
+        "trainer.fit.network.sharpness",
+        lambda *_: torch.zeros(()),
         PAPER,
     ),
     Variant(PAPER_PGS, "our field in place of the network", {"field.field": "auto"}, PAPER),
@@ -164,7 +192,7 @@ VARIANTS = (
 _BY_NAME = {variant.name: variant for variant in VARIANTS}
 
 
-def differing_variants(plan: Plan, kind: EditKind, stages: int, sh_degree: int) -> list[Variant]:
+def differing_variants(plan: TrainOptions, kind: EditKind, stages: int, sh_degree: int) -> list[Variant]:
     """The variants that differ from a run and from each other.
 
     Args:
@@ -174,7 +202,8 @@ def differing_variants(plan: Plan, kind: EditKind, stages: int, sh_degree: int) 
         sh_degree: of the scene
     """
     staged = ("one-target", "descent-one-target", EQUAL, "slider-stages", "slider-even", "no-interpolation")
-    asked = plan.slider == "even" and plan.editor.family not in (*GIVEN, *COSTLY_DIAL)
+    even = plan.optimize.slider == "even"
+    asked = even and plan.editor.family not in (*EXTERNAL, *COSTLY_STRENGTHS)
     idle = {
         *(() if stages > 1 else staged),
         *(() if asked else (EQUAL,)),
@@ -185,17 +214,17 @@ def differing_variants(plan: Plan, kind: EditKind, stages: int, sh_degree: int) 
     seen: list[Resolved] = []
     found = []
     for variant in VARIANTS:
-        resolved = _resolve(variant.plan(plan), kind, stages)
+        resolved = _resolve(variant, plan, kind, stages)
         if variant.linear or (variant.name not in idle and resolved not in seen):
             found.append(variant)
             seen.append(resolved)
     return found
 
 
-def is_seeded(variant: Variant, plan: Plan, kind: EditKind) -> bool:
+def is_seeded(variant: Variant, plan: TrainOptions, kind: EditKind) -> bool:
     """Whether a seed changes a variant: not where colors are solved for, all views at once."""
-    optimization, _, network = _resolve(variant.plan(plan), kind, 1)
-    return network is not None or not optimization.solves_colors
+    optimization, network, _ = _resolve(variant, plan, kind, 1)
+    return network is not None or optimization.solver == "descent"
 
 
 def choose_variants(variants: Sequence[Variant], only: str) -> list[Variant]:
@@ -214,15 +243,21 @@ def choose_variants(variants: Sequence[Variant], only: str) -> list[Variant]:
     return [variant for variant in variants if not names or variant.name in names]
 
 
-def _resolve(plan: Plan, kind: EditKind, stages: int) -> Resolved:
-    """What a plan comes to; weights that nothing pays are as good as none."""
-    asked = plan.optimization
-    groups = GROUP_STEPS if asked.group_steps is None else asked.group_steps
-    found = plan_optimization(asked, kind, groups)
-    if found.solves_colors:
-        does = replace(found.refinements, damps=True, ramps=True, slows=True, sizes=True, averages=True)
-        found = replace(found, weights=replace(found.weights, perceptual=0.0), refinements=does)
-    else:
-        found = replace(found, refinements=replace(found.refinements, solves=True))
-    network = plan.field.network if plan.field.field == "neural" else None
-    return found, resolve_slider(plan.slider, (1.0,) * stages), network
+def _resolve(variant: Variant, own: TrainOptions, kind: EditKind, stages: int) -> Resolved:
+    """What a variant comes to; what nothing pays for is as good as none."""
+    plan = variant.plan(own)
+    groups = GROUP_STEPS if plan.optimize.group_steps is None else plan.optimize.group_steps
+    slider = resolve_slider(plan.optimize.slider, (1.0,) * stages)
+    optimization = replace(resolve_kind(plan, kind, groups), slider=slider, color_solver=True)
+    changes = (*_all_patches(variant), *([EQUAL] if variant.name == EQUAL else []))
+    if optimization.solver != "descent":
+        optimization = replace(optimization, perceptual_weight=0.0, target_ramp=True, ema=True)
+        changes = tuple(path for path in changes if not path.startswith((_PGS, _EPSILON)))
+    return optimization, plan.field if plan.field.field == "neural" else None, changes
+
+
+def _all_patches(variant: Variant) -> Mapping[str, object]:
+    """A variant's own, and those of the one that it differs from."""
+    if variant.of == variant.name:
+        return variant.patches
+    return {**_all_patches(_BY_NAME[variant.of]), **variant.patches}

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import pkgutil
 import shutil
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -33,11 +34,9 @@ from progdf.formats.ply import load_ply
 from progdf.gdf.file import load_gdf
 from tests.helpers.blank_plots import blank_plots
 from tests.helpers.trained import quick_options, train, write_bear
-from trainer.optimize.settings import Optimization
-from trainer.options import TrainOptions
-from trainer.pipeline.reopen import reopen_run
-from trainer.plan import make_plan
-from trainer.presets import Refinements, apply_preset
+from trainer.options import OptimizeOptions, TrainOptions, apply_preset, with_values
+from trainer.resolve import recorded_options, resolve
+from trainer.run.record import reopen_run
 from trainer.store.run_folder import RunFolder
 
 ONLY = "base,2-keyframes,one-target,slider-time"
@@ -66,14 +65,14 @@ def _nothing_trains(*_: object, **__: object) -> tuple[Trajectory, object]:
 
 
 def _names(options: TrainOptions, *about: object) -> set[str]:
-    return {variant.name for variant in differing_variants(make_plan(options), *about)}  # type: ignore[arg-type]
+    return {variant.name for variant in differing_variants(resolve(options), *about)}  # type: ignore[arg-type]
 
 
 def test_only_what_makes_a_difference_to_the_run_is_tried(options: TrainOptions) -> None:
     color = _names(options, "color", 4, 1)
     assert {"base", "2-keyframes", "one-target", "no-sh", "slider-stages", "descent", "paper"} <= color
     assert not {"progressive-off", "sharpness-off", "slider-even", "no-groups"} & color
-    descended = _names(replace(options, perceptual_weight=0.1), "color", 4, 1)
+    descended = _names(with_values(options, perceptual_weight=0.1), "color", 4, 1)
     assert "no-lpips" in descended
     assert not {"descent", "descent-one-target", "descent-plain-clamps"} & descended, "it descends anyway"
     style = _names(options, "style", 4, 1)
@@ -84,10 +83,10 @@ def test_only_what_makes_a_difference_to_the_run_is_tried(options: TrainOptions)
     assert not {"no-sizing", "no-interpolation"} & geometry
     assert not {"one-target", "slider-stages"} & _names(options, "color", 1, 1)
     assert "no-sh" not in _names(options, "color", 4, 0)
-    without = replace(options, perceptual_weight=0.0, progressive="warmup")
+    without = with_values(options, perceptual_weight=0.0, progressive="warmup")
     assert "no-lpips" not in _names(without, "style", 4, 1)
     assert "progressive-off" in _names(without, "color", 4, 1)
-    pinned = replace(options, slider="stages")
+    pinned = with_values(options, slider="stages")
     assert "equal-strengths" not in _names(pinned, "color", 4, 1), "where no strengths are chosen"
 
 
@@ -96,44 +95,53 @@ def test_a_variant_differs_from_another_in_one_value_of_the_plan(
     variant: Variant, options: TrainOptions
 ) -> None:
     """The paper's preset alone differs in many: it is the preset, but for scene, views and steps."""
-    own = replace(options, sh="auto", progressive="decay", perceptual_weight=0.1)
+    own = with_values(options, sh="auto", progressive="decay", perceptual_weight=0.1)
     other = next(one for one in VARIANTS if one.name == variant.of)
-    now, then = plan_values(variant.plan(make_plan(own))), plan_values(other.plan(make_plan(own)))
+    now, then = plan_values(variant.plan(resolve(own))), plan_values(other.plan(resolve(own)))
     differ = {path for path in now if now[path] != then[path]}
     if variant.name == "paper":
-        preset = plan_values(make_plan(apply_preset(own, "paper")))
-        parts = ("optimization.", "slider", "field.")
-        assert {path for path in now if path.startswith(parts) and now[path] != preset[path]} == {
-            "optimization.steps"
-        }
-        assert now["field.network.size"] == "paper"
-        assert now["optimization.steps"] == round(1500 / 800 * then["optimization.steps"])
-    elif variant.name in ("base", "2-keyframes"):
+        preset = plan_values(resolve(apply_preset(own, "paper")))
+        parts = ("optimize.", "field.")
+        differing = {path for path in now if path.startswith(parts) and now[path] != preset[path]}
+        assert differing == {"optimize.steps"}
+        assert now["field.size"] == "paper"
+        assert now["optimize.steps"] == round(1500 / 800 * then["optimize.steps"])
+    elif variant.name in ("base", "2-keyframes", "equal-strengths"):
         assert not differ
     else:
         assert differ <= set(variant.changes), "only what it says"
-        assert len(variant.changes) == 1
+        assert len(variant.changes) == 1 or (variant.patches and not differ)
 
 
-@pytest.mark.parametrize("part", [entry.name for entry in fields(Refinements)])
+@pytest.mark.parametrize("part", ["color_solver", "ema", "target_ramp", "propagation"])
 def test_every_refinement_has_a_variant_without_it(part: str) -> None:
-    path = f"optimization.refinements.{part}"
-    assert any(variant.changes == {path: False} for variant in VARIANTS)
+    assert any(variant.changes == {f"optimize.{part}": False} for variant in VARIANTS)
+
+
+@pytest.mark.parametrize("variant", [v for v in VARIANTS if v.patches], ids=lambda variant: variant.name)
+def test_what_a_variant_patches_is_there_and_is_put_back(variant: Variant) -> None:
+    def values() -> list[object]:
+        return [pkgutil.resolve_name(name) for name in variant.patches]
+
+    before = values()
+    with variant.patched():
+        assert values() == list(variant.patches.values())
+    assert values() == before
 
 
 def test_a_seed_reaches_what_descends_and_the_network_and_nothing_that_is_solved_for(
     options: TrainOptions,
 ) -> None:
-    plan = make_plan(options)
+    plan = resolve(options)
     seeded = {v.name for v in differing_variants(plan, "color", 4, 1) if is_seeded(v, plan, "color")}
     assert {"descent", "no-lpips", "paper", "paper-pgs"} <= seeded
     assert not {"base", "one-target", "no-sh", "plain-clamps", "equal-strengths"} & seeded
     later = plan_values(next(v for v in VARIANTS if v.name == "paper").plan(plan, 2))
-    assert (later["optimization.seed"], later["field.network.seed"], later["editor.seed"]) == (2, 2, 0)
+    assert (later["optimize.seed"], later["field.seed"], later["editor.seed"]) == (2, 2, 0)
 
 
 def test_an_unknown_variant_and_one_without_effect_are_told_apart(options: TrainOptions) -> None:
-    variants = differing_variants(make_plan(options), "color", 4, 1)
+    variants = differing_variants(resolve(options), "color", 4, 1)
     assert [v.name for v in choose_variants(variants, "no-sh, base")] == ["base", "no-sh"]
     with pytest.raises(ProgdfError, match="'warmup' does not exist; choose of base,"):
         choose_variants(variants, "base,warmup")
@@ -154,8 +162,7 @@ def test_a_file_in_the_place_of_the_ablations_folder_is_one_line(
 
 
 def test_the_plan_of_a_run_is_read_back_as_it_was(options: TrainOptions) -> None:
-    plan = make_plan(options)
-    resolved = replace(plan, optimization=replace(plan.optimization, group_steps=0))
+    resolved = with_values(recorded_options(resolve(options)), group_steps=0)
     assert run_plan(reopen_run(options.out)) == resolved, "with what the run found out"
 
 
@@ -270,9 +277,9 @@ def test_a_draft_thins_strengths_and_steps_and_keeps_its_figures_apart(
 ) -> None:
     copy = tmp_path / "run"
     shutil.copytree(options.out, copy, ignore=shutil.ignore_patterns("ablation"))
-    asked: list[Optimization] = []
+    asked: list[OptimizeOptions] = []
 
-    def noted(wanted: Optimization, *_: object, **__: object) -> object:
+    def noted(_: TrainOptions, wanted: OptimizeOptions, *__: object, **more: object) -> object:
         asked.append(wanted)
         raise ProgdfError("enough") from FloatingPointError("enough")
 
@@ -312,7 +319,7 @@ def test_a_network_is_trained_beside_the_members_and_shipped(
     copy = tmp_path / "run"
     shutil.copytree(options.out, copy, ignore=shutil.ignore_patterns("ablation"))
     paper = next(variant for variant in VARIANTS if variant.name == "paper")
-    small = replace(paper, changes={**paper.changes, "field.network.size": "tiny"})
+    small = replace(paper, changes={**paper.changes, "field.size": "tiny"})
     monkeypatch.setitem(_BY_NAME, "paper", small)
     monkeypatch.setattr(
         "benchmarks.ablation.variants.VARIANTS",

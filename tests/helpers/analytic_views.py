@@ -26,9 +26,9 @@ from progdf.rasterize import render
 from progdf.scene.regions import parse_region
 from tests.helpers.demo_scenes import bear
 from tests.helpers.paths import SHARED_DATA
-from trainer.options import TrainOptions
-from trainer.plan import make_plan
-from trainer.setup.training_setup import make_training_setup
+from trainer.options import EditorOptions, OptimizeOptions, RegionOptions, TrainOptions
+from trainer.resolve import resolve
+from trainer.setup import make_training_setup
 
 PLAYBOT = SHARED_DATA / "playbot_31k.ply"
 _EARS, _HANDS = "big ears", (2, 3)
@@ -88,9 +88,9 @@ def write_analytic_views(
         options: as `train` will be given them; of these, what decides about the views counts
         strengths: ascending, the last 1
     """
-    plan = make_plan(options)
-    region = parse_region(plan.region.region, truth.scene, plan.name)
-    stand = make_training_setup(plan.views, truth.scene, region)
+    options = resolve(options)
+    region = parse_region(options.region.region, truth.scene, options.name)
+    stand = make_training_setup(options.views, truth.scene, region)
     for strength in strengths:
         where = folder if strength == 1.0 else folder / f"{strength:g}"
         edited = truth.edit.apply(truth.scene, region.members, strength)
@@ -127,7 +127,12 @@ def main() -> None:
     scene, region = write_truth(options.out, truth)
     edited = options.out / "edited"
     run = TrainOptions(
-        scene, options.out / options.what, region, f"folder:{edited}", kind="geometry", quick=options.quick
+        scene,
+        options.out / options.what,
+        RegionOptions(region),
+        EditorOptions(f"folder:{edited}"),
+        optimize=OptimizeOptions(kind="geometry"),
+        quick=options.quick,
     )
     write_analytic_views(edited, truth, run, [float(s) for s in options.strengths.split(",")])
     words = ["train", str(scene), "--out", str(run.out), "--region", region, "--editor", run.editor]

@@ -29,9 +29,9 @@ from tests.helpers.hostile import npy as write_npy
 from tests.helpers.scene_files import write_compressed_ply, write_ksplat, write_scene
 from tests.helpers.scenes import orbit_camera, random_gaussians
 from tests.helpers.trained import quick_options, train, write_bear
-from trainer.options import FitOptions, TrainOptions
-from trainer.pipeline.refit import refit
-from trainer.regions.from_pictures import RegionSettings, region_kinds
+from trainer.options import FitOptions, RegionOptions, TrainOptions, ViewOptions
+from trainer.regions.from_pictures import RegionRequest, region_kinds
+from trainer.run.finish import refit
 from trainer.store.state import PeriodicSave
 
 Reader = tuple[str, Callable[[Path], Any], list[Change]]
@@ -122,7 +122,9 @@ def _masks(folder: Path) -> Reader:
     mask = np.full((cameras[0].height, cameras[0].width), 255, np.uint8)
     for i in range(3):
         Image.fromarray(mask).save(folder / "masks" / f"v{i}.png")
-    settings = RegionSettings(folder / "cameras.json", 3, kept=lambda: folder / "kept", quiet=True)
+    settings = RegionRequest(
+        RegionOptions("masks"), ViewOptions(folder / "cameras.json"), lambda: folder / "cache", quiet=True
+    )
 
     def read(path: Path) -> None:
         parse_region(f"masks:{path.parent}", scene, "a", region_kinds(settings))

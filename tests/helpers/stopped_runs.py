@@ -17,7 +17,7 @@ import pytest
 import torch
 from torch import Tensor
 
-import trainer.pipeline.run
+import trainer.run.run
 from progdf.field.trajectory import load_trajectory
 from tests.helpers.paths import ROOT
 from tests.helpers.stopped import OUT, small_run
@@ -88,7 +88,7 @@ def at_step(monkeypatch: pytest.MonkeyPatch, number: int, happens: Callable[[], 
 def gone_on(bear_folder: Path, uninterrupted: Path, **more: object) -> str:
     """Go on to the trajectory, which must be the uninterrupted run's, and no further; the log."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(trainer.pipeline.run, "finish_run", lambda *_: None)
+        patch.setattr(trainer.run.run, "finish_run", lambda *_: None)
         train(replace(small_run(bear_folder, **more), resume=True), quiet=True)
     found, expected = (_recorded(root / "trajectory.safetensors") for root in (OUT, uninterrupted))
     assert found[0].keys() == expected[0].keys()
@@ -106,9 +106,18 @@ def _recorded(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 def words(bear_folder: Path, *more: str) -> list[str]:
     """The command line of `small_run`."""
     options = small_run(bear_folder)
-    names = ("region", "editor", "views", "image_size", "steps", "stages", "field", "threads")
-    names = (*names, "perceptual_weight")
-    pairs = [f"--{name.replace('_', '-')}={getattr(options, name)}" for name in names]
+    values = {
+        "region": options.region.region,
+        "editor": options.editor.editor,
+        "views": options.views.views,
+        "image-size": options.views.image_size,
+        "steps": options.optimize.steps,
+        "stages": options.optimize.stages,
+        "perceptual-weight": options.optimize.perceptual_weight,
+        "field": options.field.field,
+        "threads": options.threads,
+    }
+    pairs = [f"--{name}={value}" for name, value in values.items()]
     return ["train", str(options.scene), "--out=run", *pairs, *more]
 
 

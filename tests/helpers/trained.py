@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-import trainer.pipeline.run
+import trainer.run.run
 from progdf.camera import Camera
 from progdf.demo_scenes.bear import LABELS
 from progdf.formats.ply import save_ply
@@ -18,12 +18,10 @@ from progdf.gaussians import Gaussians, pack
 from progdf.region import Region, from_mask
 from tests.helpers.demo_scenes import bear
 from trainer.editors import make_editor
-from trainer.optimize.losses import GradientL1
-from trainer.optimize.objective import LossWeights, Objective
+from trainer.optimize.losses import GradientL1, Objective
 from trainer.optimize.pgs import PgsSettings, TargetStage, learning_rates
-from trainer.options import TrainOptions
-from trainer.pipeline.fit_and_report import RunResult
-from trainer.plan import make_plan
+from trainer.options import EditorOptions, OptimizeOptions, RegionOptions, TrainOptions, with_values
+from trainer.run.finish import RunResult
 from trainer.views.choose import choose_views
 from trainer.views.crops import CropScene, crop_scene
 from trainer.views.view import View, crop, region_rig, render_colors
@@ -56,12 +54,19 @@ Optimization = tuple[Tensor, list[CropScene], list[CropScene], list[TargetStage]
 
 def course(case: Small, steps: int = 40, **more: object) -> Optimization:
     """What `optimize` needs to recolor a small bear's part in two stages."""
-    editor = make_editor("recolor:#3060d0", case.scene, case.region, case.views)
+    editor = make_editor(EditorOptions("recolor:#3060d0"), case.scene, case.region, case.views)
     original = pack(case.scene[case.region.members], with_shN=True)
     crops = [crop_scene(case.scene, case.region.members, v.camera, v.box, WHITE) for v in case.views]
     stages = [TargetStage(s, [crop(editor.edit(v, s), v.box) for v in case.views], steps) for s in (0.5, 1.0)]
     settings = replace(PgsSettings(learning_rates("color", original.shape[1], 1.0)), **more)  # type: ignore[arg-type]
-    return original, crops, crops[:2], stages, Objective(GradientL1(), LossWeights()), settings
+    return (
+        original,
+        crops,
+        crops[:2],
+        stages,
+        Objective(GradientL1(), OptimizeOptions(perceptual_weight=0.1)),
+        settings,
+    )
 
 
 def label_mask(scene: Gaussians, member: Tensor, camera: Camera) -> Tensor:
@@ -82,10 +87,6 @@ def quick_options(folder: Path, out: str = "run", part: str = "body", **more: ob
     """Options of a run that takes a few seconds on the bear of `write_bear` in `folder`."""
     number = LABELS.index(part)
     settings: dict[str, object] = {
-        "scene": folder / "scene.ply",
-        "out": folder / out,
-        "region": f"labels:{folder / 'labels.npy'}:{number}",
-        "editor": "recolor:#3060d0",
         "views": 10,
         "image_size": 72,
         "steps": 200,
@@ -93,12 +94,14 @@ def quick_options(folder: Path, out: str = "run", part: str = "body", **more: ob
         "threads": 1,
         **more,
     }
-    return TrainOptions(**settings)  # type: ignore[arg-type]
+    region = RegionOptions(f"labels:{folder / 'labels.npy'}:{number}")
+    options = TrainOptions(folder / "scene.ply", folder / out, region, EditorOptions("recolor:#3060d0"))
+    return with_values(options, **settings)
 
 
 def train(options: TrainOptions, quiet: bool = True) -> RunResult:
     """`progdf train`, with its options."""
-    return trainer.pipeline.run.train(make_plan(options), options.out, options.threads, options.resume, quiet)
+    return trainer.run.run.train(options, quiet)
 
 
 def masked_psnr(image: Tensor, target: Tensor, mask: Tensor) -> float:

@@ -8,16 +8,16 @@ from functools import partial
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.region import Region
+from trainer.options import EditorOptions
 from trainer.views.view import View
 
-from .base import EditorSettings, ImageEditor, RepaintingEditor
-from .folder import folder, folder_of, photograph_folders, photographs
+from .base import ImageEditor, RepaintingEditor
 from .instruct import check_instruct, instruct
-from .pictures import picture_paths, pictures
+from .pictures import folder, folder_of, photograph_folders, photographs, picture_paths, pictures
 from .procedural import darken, night, paint_of, recolor, stops_of, stripes, tint
 from .style import check_style, style
 
-Factory = Callable[[str, Gaussians, Region, Sequence[View], EditorSettings], ImageEditor]
+Factory = Callable[[str, Gaussians, Region, Sequence[View], EditorOptions], ImageEditor]
 
 EDITORS: dict[str, Factory] = {
     "recolor": recolor,
@@ -32,18 +32,18 @@ EDITORS: dict[str, Factory] = {
     "instruct": instruct,
 }
 """Kind of editor → its factory, given the text after the colon, the scene, the region, the views
-and the settings of learned editors."""
+and all options of editors."""
 
-VIEW_BY_VIEW = ("folder", "photographs", "style", "instruct")
+PER_VIEW = ("folder", "photographs", "style", "instruct")
 """Kinds whose views are edited one by one, so that nothing makes them agree."""
 
-GIVEN = ("folder", "photographs", "pictures")
+EXTERNAL = ("folder", "photographs", "pictures")
 """Kinds whose pictures were made elsewhere, at the strengths that they were made at."""
 
-UNTOLD = ("folder", "photographs", "instruct")
+KIND_UNKNOWN = ("folder", "photographs", "instruct")
 """Kinds that do not know what their pictures move."""
 
-COSTLY_DIAL = ("instruct",)
+COSTLY_STRENGTHS = ("instruct",)
 """Kinds that paint every strength anew: what a model takes its time for is not done to look around."""
 
 EXAMPLES = (
@@ -81,34 +81,29 @@ def check_editor(spec: str) -> tuple[str, str]:
     return kind, what
 
 
-def check_new_editor(spec: str, settings: EditorSettings) -> None:
-    """ProgdfError if no run can begin with `spec`; one that has begun keeps its views, its folder may go."""
-    kind, what = check_editor(spec)
+def check_new_editor(options: EditorOptions) -> None:
+    """ProgdfError if no run can begin so; one that has begun keeps its views, its folder may go."""
+    kind, what = check_editor(options.editor)
     if kind == "instruct":
-        check_instruct(what, settings)
+        check_instruct(what, options)
     if kind in CHECKS:
         CHECKS[kind](what)
 
 
 def make_editor(
-    spec: str,
-    scene: Gaussians,
-    region: Region,
-    views: Sequence[View],
-    settings: EditorSettings | None = None,
+    options: EditorOptions, scene: Gaussians, region: Region, views: Sequence[View]
 ) -> ImageEditor:
-    """The editor that `spec` names, for one region and its views; ProgdfError says what is wrong with it."""
-    kind, what = check_editor(spec)
-    return EDITORS[kind](what, scene, region, views, settings or EditorSettings())
+    """The editor that the options name, for one region and its views; ProgdfError says what is wrong."""
+    kind, what = check_editor(options.editor)
+    return EDITORS[kind](what, scene, region, views, options)
 
 
 __all__ = [
-    "COSTLY_DIAL",
+    "COSTLY_STRENGTHS",
     "EDITORS",
-    "GIVEN",
-    "UNTOLD",
-    "VIEW_BY_VIEW",
-    "EditorSettings",
+    "EXTERNAL",
+    "KIND_UNKNOWN",
+    "PER_VIEW",
     "ImageEditor",
     "RepaintingEditor",
     "check_editor",

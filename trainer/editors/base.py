@@ -1,42 +1,13 @@
-"""What an image editor must do, and the settings of learned ones."""
+"""What an image editor must do."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Literal, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 from torch import Tensor
 
+from trainer.options import EditKind
 from trainer.views.view import View
-
-EditKind = Literal["color", "style", "geometry"]
-"""What an edit moves, which chooses learning rates and loss weights (docs/method.md 3)."""
-
-
-@dataclass(frozen=True)
-class EditorSettings:
-    """How a learned editor is asked; what is None or empty is as its model was made for.
-
-    Args:
-        model: id on the Hugging Face hub, or folder of a saved pipeline
-        guidance: how closely the instruction is followed, ≥ 1
-        image_guidance: how closely the picture is followed, ≥ 1; not every model has it
-        steps: denoising steps
-        seed: of the noise, the same in every view
-        size: longer side in pixels at which pictures are painted
-        graded: edit at several strengths by rising guidance, not the finished edit alone
-        kept: folder in which painted pictures are kept; None keeps nothing
-    """
-
-    model: str = ""
-    guidance: float | None = None
-    image_guidance: float | None = None
-    steps: int | None = None
-    seed: int = 0
-    size: int | None = None
-    graded: bool = False
-    kept: Path | None = None
 
 
 class ImageEditor(Protocol):

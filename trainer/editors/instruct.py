@@ -13,8 +13,9 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -29,12 +30,112 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.io.images import to_picture
 from progdf.region import Region
+from trainer.options import EditKind, EditorOptions
 from trainer.store.pretrained import BROKEN, check_weights_here, folder_of_model
 from trainer.views.view import View
 
-from .adapters import ADAPTERS, DEFAULT_MODEL, Adapter
-from .base import EditKind, EditorSettings
 from .cache import KeptPictures, Recipe
+
+_FLOW = {
+    "steps": "num_inference_steps",
+    "guidance": "guidance_scale",
+    "width": "width",
+    "height": "height",
+}
+
+
+@dataclass(frozen=True)
+class Adapter:
+    """How one pipeline is asked.
+
+    Args:
+        model: the id of its weights on the Hugging Face hub
+        words: our word → its keyword, of steps, guidance (how closely the instruction is followed),
+            image_guidance (how closely the picture is), width, height, area
+        steps, guidance, image_guidance: the values it was made for
+        size: longer side in pixels at which it was made to paint
+        dtype: of its weights on a CPU
+        always: further arguments of a call
+        loading: further arguments of its from_pretrained
+        needs: packages that it needs besides the extra's
+    """
+
+    model: str
+    words: Mapping[str, str]
+    steps: int
+    guidance: float
+    size: int
+    dtype: torch.dtype
+    image_guidance: float | None = None
+    always: Mapping[str, object] = field(default_factory=dict)
+    loading: Mapping[str, object] = field(default_factory=dict)
+    needs: tuple[str, ...] = ()
+
+    def arguments(
+        self, prompt: str, picture: Image.Image, steps: int, guidance: float, image_guidance: float | None
+    ) -> dict[str, object]:
+        """Keyword arguments of a call, all but its `generator`."""
+        ours = {
+            "steps": steps,
+            "guidance": guidance,
+            "image_guidance": image_guidance,
+            "width": picture.width,
+            "height": picture.height,
+            "area": picture.width * picture.height,
+        }
+        theirs = {word: ours[name] for name, word in self.words.items()}
+        return {"prompt": prompt, "image": picture, **theirs, **self.always}
+
+
+ADAPTERS: dict[str, Adapter] = {
+    # ProGDF's own; the result has the picture's size
+    "StableDiffusionInstructPix2PixPipeline": Adapter(
+        model="timbrooks/instruct-pix2pix",
+        words={
+            "steps": "num_inference_steps",
+            "guidance": "guidance_scale",
+            "image_guidance": "image_guidance_scale",
+        },
+        steps=20,
+        guidance=7.5,
+        image_guidance=1.5,
+        size=512,
+        dtype=torch.float32,
+        loading={"safety_checker": None, "requires_safety_checker": False},
+    ),
+    "FluxKontextPipeline": Adapter(
+        model="black-forest-labs/FLUX.1-Kontext-dev",
+        words={**_FLOW, "area": "max_area"},
+        steps=28,
+        guidance=2.5,
+        size=1024,
+        dtype=torch.bfloat16,
+        # it would scale every picture to about a megapixel; ours comes at the size that was asked for
+        always={"_auto_resize": False},
+    ),
+    "Flux2KleinPipeline": Adapter(
+        model="black-forest-labs/FLUX.2-klein-4B",
+        words=_FLOW,
+        steps=4,
+        guidance=1.0,
+        size=1024,
+        dtype=torch.bfloat16,
+    ),
+    "QwenImageEditPlusPipeline": Adapter(
+        model="Qwen/Qwen-Image-Edit-2509",
+        words={**_FLOW, "guidance": "true_cfg_scale"},
+        steps=40,
+        guidance=4.0,
+        size=1024,
+        dtype=torch.bfloat16,
+        always={"negative_prompt": " "},  # without one it has no guidance at all
+        needs=("torchvision",),
+    ),
+}
+"""Class name in diffusers, as a saved pipeline's model_index.json has it → how it is asked."""
+
+DEFAULT_MODEL = ADAPTERS["StableDiffusionInstructPix2PixPipeline"].model
+
 
 _MULTIPLE = 32  # pixels: what every pipeline's autoencoder and patches divide
 
@@ -94,10 +195,10 @@ class InstructEditor:
 
 
 def instruct(
-    what: str, scene: Gaussians, region: Region, views: Sequence[View], settings: EditorSettings
+    what: str, scene: Gaussians, region: Region, views: Sequence[View], options: EditorOptions
 ) -> InstructEditor:
     """`instruct:"…"`: the model and its options are checked now, its weights are loaded when first needed."""
-    model, kind, asked = _resolve_request(what, settings)
+    model, kind, asked = _resolve_request(what, options)
     prompt = asked.prompt
 
     @cache
@@ -113,23 +214,23 @@ def instruct(
         "size": asked.size,
         "seed": asked.seed,
     }
-    graded = settings.graded and asked.guidance > 1.0
+    graded = options.graded and asked.guidance > 1.0
     return InstructEditor(
         lambda picture, guidance: _run_pipeline(pipeline(), asked, picture, guidance),
         asked.guidance,
         recipe,
-        KeptPictures(settings.kept),
+        KeptPictures(options.cache),
         stages=() if graded else (1.0,),
     )
 
 
-def check_instruct(what: str, settings: EditorSettings) -> None:
+def check_instruct(what: str, options: EditorOptions) -> None:
     """What `instruct` and its pipeline would raise, as far as it is to be known without loading a network.
 
     Raises:
         ProgdfError: nothing is said, a package or weights are missing or truncated, an option is not known.
     """
-    model, kind, _ = _resolve_request(what, settings)
+    model, kind, _ = _resolve_request(what, options)
     try:
         folder = folder_of_model(model, "model_index.json")
         parts = json.loads((folder / "model_index.json").read_bytes())
@@ -143,14 +244,33 @@ def check_instruct(what: str, settings: EditorSettings) -> None:
         raise _missing(model) from error
 
 
-def _resolve_request(what: str, settings: EditorSettings) -> tuple[str, str, _Request]:
+def _resolve_request(what: str, options: EditorOptions) -> tuple[str, str, _Request]:
     """The model, its pipeline's class, and what it will be asked."""
     prompt = what.strip().strip("\"'").strip()
     if not prompt:
         raise ProgdfError('instruct: needs an instruction; write instruct:"turn him into Batman"')
-    model = settings.model or DEFAULT_MODEL
+    model = options.model or DEFAULT_MODEL
     kind = pipeline_class(model)
-    return model, kind, _make_request(prompt, model, kind, settings)
+    return model, kind, _make_request(prompt, model, kind, options)
+
+
+def parse_guidance(text: str) -> tuple[float | None, float | None]:
+    """What --guidance says of the sentence and of the picture; None where it says nothing.
+
+    Raises:
+        ProgdfError: it is neither one number nor two.
+    """
+    words = text.split(",") if text else []
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError:
+        numbers = [math.nan]
+    if len(numbers) > 2 or not all(1 <= number <= 100 for number in numbers):
+        raise ProgdfError(
+            f"--guidance must be one or two numbers between 1 and 100, such as 7.5,1.5; got {text}"
+        )
+    sentence, picture = (*numbers, None, None)[:2]
+    return sentence, picture
 
 
 def pipeline_class(model: str) -> str:
@@ -220,10 +340,11 @@ def _run_pipeline(pipeline: Any, asked: _Request, view: Tensor, guidance: float)
     return torch.from_numpy(np.asarray(edited, dtype=np.float32) / 255.0)
 
 
-def _make_request(prompt: str, model: str, kind: str, settings: EditorSettings) -> _Request:
-    """The settings, with the model's own values where nothing was said."""
+def _make_request(prompt: str, model: str, kind: str, options: EditorOptions) -> _Request:
+    """The options, with the model's own values where nothing was said."""
     adapter = ADAPTERS[kind]
-    if settings.image_guidance is not None and "image_guidance" not in adapter.words:
+    guidance, image_guidance = parse_guidance(options.guidance)
+    if image_guidance is not None and "image_guidance" not in adapter.words:
         raise ProgdfError(
             f"{model} does not support guidance of the picture; give --guidance one number, "
             f"or use --model {DEFAULT_MODEL}"
@@ -231,11 +352,11 @@ def _make_request(prompt: str, model: str, kind: str, settings: EditorSettings) 
     return _Request(
         prompt,
         adapter,
-        steps=adapter.steps if settings.steps is None else settings.steps,
-        guidance=adapter.guidance if settings.guidance is None else settings.guidance,
-        image_guidance=adapter.image_guidance if settings.image_guidance is None else settings.image_guidance,
-        size=adapter.size if settings.size is None else settings.size,
-        seed=settings.seed,
+        steps=adapter.steps if options.edit_steps is None else options.edit_steps,
+        guidance=adapter.guidance if guidance is None else guidance,
+        image_guidance=adapter.image_guidance if image_guidance is None else image_guidance,
+        size=adapter.size if options.edit_size is None else options.edit_size,
+        seed=options.seed,
     )
 
 

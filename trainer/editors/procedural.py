@@ -18,9 +18,8 @@ from progdf.color.oklab import ColorPath, bend_of, interpolate_colors, path_of
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.region import Region
+from trainer.options import EditKind, EditorOptions
 from trainer.views.view import View, render_colors, seen_colors
-
-from .base import EditKind, EditorSettings
 
 _COVER = 0.75  # of the old contrast is lost under a stripe
 _STRIPES = 7  # across the longest side of the region
@@ -85,7 +84,7 @@ class StripesEditor:
 
 
 def recolor(
-    what: str, scene: Gaussians, region: Region, views: Sequence[View], settings: EditorSettings
+    what: str, scene: Gaussians, region: Region, views: Sequence[View], options: EditorOptions
 ) -> ColorEditor:
     """`recolor:#rrggbb[,path=hue]`: another color, the shading kept."""
     (target, path), own = paint_of(what), region_color(views)
@@ -93,7 +92,7 @@ def recolor(
 
 
 def tint(
-    what: str, scene: Gaussians, region: Region, views: Sequence[View], settings: EditorSettings
+    what: str, scene: Gaussians, region: Region, views: Sequence[View], options: EditorOptions
 ) -> ColorEditor:
     """`tint:#rrggbb[,path=hue]`: a wash of color, lightness kept."""
     (target, path), own = paint_of(what), region_color(views)
@@ -101,7 +100,7 @@ def tint(
 
 
 def darken(
-    what: str, scene: Gaussians, region: Region, views: Sequence[View], settings: EditorSettings
+    what: str, scene: Gaussians, region: Region, views: Sequence[View], options: EditorOptions
 ) -> ColorEditor:
     """`darken:AMOUNT`: that share of the light is taken away, 0..1, by default 0.875 (three stops)."""
     stops = stops_of(what, "darken")
@@ -109,7 +108,7 @@ def darken(
 
 
 def night(
-    what: str, scene: Gaussians, region: Region, views: Sequence[View], settings: EditorSettings
+    what: str, scene: Gaussians, region: Region, views: Sequence[View], options: EditorOptions
 ) -> ColorEditor:
     """`night` or `night:AMOUNT`: as `darken`, with colors fading to the blue of moonlight."""
     stops = stops_of(what, "night")
@@ -117,7 +116,7 @@ def night(
 
 
 def stripes(
-    what: str, scene: Gaussians, region: Region, views: Sequence[View], settings: EditorSettings
+    what: str, scene: Gaussians, region: Region, views: Sequence[View], options: EditorOptions
 ) -> StripesEditor:
     """`stripes:#rrggbb[,path=hue]`: seven stripes across the region's longest side, painted in 3D."""
     target, path = paint_of(what)

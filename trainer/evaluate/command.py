@@ -1,80 +1,137 @@
-"""`progdf evaluate`: a finished run's figures in one table and one picture, or the suite of known courses."""
+"""`progdf evaluate`: a finished run's figures in one table and one picture."""
 
 from __future__ import annotations
 
-from progdf.errors import ProgdfError
-from progdf.io.atomic import make_folder
-from progdf.io.images import write_image
+from collections.abc import Sequence
+
+import torch
+from PIL import Image
+from torch import Tensor
+
+from progdf.io.images import contact_sheet, to_picture, write_image
 from progdf.terminal import print_line
-from trainer.optimize.losses import Perceptual, perceptual_loss
-from trainer.pipeline.threads import use_threads
-from trainer.report.clip import Texts
+from trainer.optimize.losses import perceptual_loss
+from trainer.options import EvaluateOptions
+from trainer.report.plots import PAPER, Plot
+from trainer.report.report import (
+    best_view,
+    column_heading,
+    columns_of,
+    editor_strip,
+    shown_view,
+    stack_plots,
+    thumbnail,
+)
+from trainer.run.finish import asked_texts
+from trainer.run.threads import use_threads
 from trainer.store.run_folder import write_json
 
-from .measures import Evaluation, evaluate_run
+from .consistency import EDITED, UNEDITED, WarpedPair
+from .measures import Evaluation, evaluate_run, evaluation_json, evaluation_table
 from .opened import OpenedRun, open_run
-from .options import EvaluateOptions
-from .picture import evaluation_picture
-from .suite import CaseResult, run_suite
-from .suite_report import suite_json, suite_picture, suite_table
-from .table import evaluation_json, evaluation_table
+
+_THUMBNAIL = 240
+_AMPLIFIED = 4
+_SPAN = (0.0, 1.0)
 
 
-def evaluate(options: EvaluateOptions) -> None:
-    """Print a table; write it and its picture: RUN/evaluation.json and .png, of a suite RUN/sliders.*
+def evaluation_picture(opened: OpenedRun, evaluation: Evaluation) -> Tensor:
+    """Thumbnails over curves. -> [H,W,3]"""
+    evaluator = opened.evaluator
+    columns, best = columns_of(opened.trajectory.asked), best_view(evaluator)
+    strips = {
+        name: [thumbnail(pictures(s)[best], _THUMBNAIL) for s, _ in columns]
+        for name, pictures in opened.contenders().items()
+    }
+    strips["the editor"] = editor_strip(evaluator, columns, _THUMBNAIL)
+    sheets = [
+        contact_sheet(
+            list(strips.values()),
+            list(strips),
+            [column_heading(*column) for column in columns],
+            f"{opened.gdf.name}: {opened.run.record.plan.editor.editor}",
+            shown_view(evaluator, len(opened.setup.held_out)),
+        )
+    ]
+    if pairs := evaluation.consistency.pairs:
+        sheets.append(_warp_sheet(max(pairs, key=lambda pair: pair.shared)))
+    return stack_plots(_joined([to_picture(sheet) for sheet in sheets]), _plots(evaluation))
+
+
+def _warp_sheet(pair: WarpedPair) -> Tensor:
+    """A view, another warped onto it, and what differs: of the edited scene and of the original."""
+    depth = pair.depth
+    shown = depth > 0
+    near, far = (float(depth[shown].quantile(q)) if bool(shown.any()) else q for q in (0.02, 0.98))
+    gray = torch.where(shown, 1 - 0.85 * ((depth - near) / max(far - near, 1e-9)).clamp(0, 1), 1.0)
+    rows = []
+    for whose in (EDITED, UNEDITED):
+        view, warped = pair.pictures[whose]
+        difference = 1 - (_AMPLIFIED * (warped - view).abs()).clamp(0, 1)
+        both = torch.where(pair.both[..., None], view, 0.35 * view + 0.65)
+        rows.append([view, both, warped, difference, gray[..., None].expand(-1, -1, 3)])
+    return contact_sheet(
+        [[thumbnail(image, _THUMBNAIL) for image in row] for row in rows],
+        [EDITED, UNEDITED],
+        [pair.target, "what both see", f"{pair.source} warped", f"difference, {_AMPLIFIED} times", "depth"],
+        "One held-out view warped onto another by rendered depth",
+    )
+
+
+def _plots(evaluation: Evaluation) -> list[list[Plot]]:
+    lpips = "LPIPS" if evaluation.perceptual.startswith("lpips") else evaluation.perceptual
+    curves, paths = evaluation.curves, evaluation.paths
+    psnr = {name: (curve.s, curve.psnr) for name, curve in curves.items()}
+    perceptual = {name: (curve.s, curve.lpips) for name, curve in curves.items()}
+    steps = {name: (_middles(len(path.steps)), path.steps) for name, path in paths.items()}
+    change = {name: (_ends(len(path.from_original)), path.from_original) for name, path in paths.items()}
+    return [
+        [
+            Plot("PSNR to the edited views, dB", psnr, "slider", span=_SPAN),
+            Plot(f"{lpips} to the edited views", perceptual, "slider", low=0.0, span=_SPAN),
+        ],
+        [
+            Plot(f"{lpips} between neighboring slider values", steps, "slider", low=0.0, span=_SPAN),
+            Plot(f"{lpips} from the original", change, "slider", low=0.0, span=_SPAN),
+        ],
+    ]
+
+
+def _joined(sheets: Sequence[Image.Image]) -> Image.Image:
+    """Sheets below each other on one page."""
+    page = Image.new("RGB", (max(s.width for s in sheets), sum(s.height for s in sheets)), PAPER)
+    top = 0
+    for sheet in sheets:
+        page.paste(sheet, (0, top))
+        top += sheet.height
+    return page
+
+
+def _middles(count: int) -> list[float]:
+    return [(i + 0.5) / count for i in range(count)]
+
+
+def _ends(count: int) -> list[float]:
+    return [i / (count - 1) for i in range(count)]
+
+
+def evaluate(options: EvaluateOptions) -> Evaluation:
+    """Measure a finished run; print a table, write it and its picture: RUN/evaluation.json and .png.
 
     Raises:
-        ProgdfError: the folder is no finished run, a file of it is damaged, or its scene is gone or another;
-            the suite's folder cannot be written to.
+        ProgdfError: the folder is no finished run, a file of it is damaged, or its scene is gone or another.
     """
     use_threads(options.threads)
-    if options.suite is None:
-        evaluate_folder(options)
-    else:
-        evaluate_suite(options)
-
-
-def evaluate_suite(options: EvaluateOptions) -> list[CaseResult]:
-    """Train and compare the suite's edits in the folder `options.run`."""
-    for name in ("scene", "text_before", "text_after"):
-        if getattr(options, name):
-            raise ProgdfError(f"--{name.replace('_', '-')} is for a run; leave it away with --suite")
-    make_folder(options.run)
-    perceptual = _perceptual()
-    found = run_suite(options.run, perceptual, options.threads, print_line)
-    write_json(options.run / "sliders.json", suite_json(found, perceptual.name))
-    write_image(options.run / "sliders.png", suite_picture(found))
-    _print_table(suite_table(found))
-    print_line(f"wrote {options.run / 'sliders.json'} and sliders.png")
-    return found
-
-
-def evaluate_folder(options: EvaluateOptions) -> Evaluation:
-    """Measure the finished run in the folder `options.run`."""
     opened = open_run(options.run, options.scene)
-    perceptual = _perceptual()
-    found = evaluate_run(opened, perceptual, _texts(opened, options))
-    folder = opened.run.folder
-    write_json(folder.root / "evaluation.json", evaluation_json(found))
-    write_image(folder.root / "evaluation.png", evaluation_picture(opened, found))
-    _print_table(evaluation_table(found))
-    print_line(f"wrote {folder.root / 'evaluation.json'} and evaluation.png")
-    return found
-
-
-def _perceptual() -> Perceptual:
-    measure, warning = perceptual_loss()
+    perceptual, warning = perceptual_loss()
     if warning:
         print_line(warning.replace("training with", "measuring with"))
-    return measure
-
-
-def _print_table(table: str) -> None:
-    for line in table.splitlines():
+    texts = asked_texts(options.texts, opened.run.record.plan.texts)
+    evaluation = evaluate_run(opened, perceptual, texts)
+    folder = opened.run.folder
+    write_json(folder.root / "evaluation.json", evaluation_json(evaluation))
+    write_image(folder.root / "evaluation.png", evaluation_picture(opened, evaluation))
+    for line in evaluation_table(evaluation).splitlines():
         print_line(line)
-
-
-def _texts(opened: OpenedRun, options: EvaluateOptions) -> Texts:
-    """What CLIP is asked: the command's own words, or the run's."""
-    own = opened.run.record.plan.texts
-    return Texts(options.text_before or own.before, options.text_after or own.after, True)
+    print_line(f"wrote {folder.root / 'evaluation.json'} and evaluation.png")
+    return evaluation

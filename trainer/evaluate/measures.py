@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 from progdf.metrics.slider import Pictures, slider_statistics
 from trainer.fit.evaluate import Evaluator
 from trainer.fit.slider_uniformity import STEPS
 from trainer.optimize.losses import Perceptual
-from trainer.report.clip import Texts
-from trainer.report.curves import ErrorCurve, picture_courses
-from trainer.report.measures import clip_curve
+from trainer.options import TextOptions
+from trainer.report.measures import ErrorCurve, clip_curve, picture_courses
 
-from .camera_path import clip_consistency
-from .consistency import Consistency, outside_change, view_consistency
-from .opened import KEYFRAMES, SLIDER, OpenedRun
+from .consistency import EDITOR, UNEDITED, Consistency, clip_consistency, outside_change, view_consistency
+from .opened import FADE, KEYFRAMES, SLIDER, OpenedRun
 
 
 @dataclass(frozen=True)
@@ -58,7 +57,7 @@ class Evaluation:
     perceptual: str
 
 
-def evaluate_run(opened: OpenedRun, perceptual: Perceptual, texts: Texts) -> Evaluation:
+def evaluate_run(opened: OpenedRun, perceptual: Perceptual, texts: TextOptions) -> Evaluation:
     """Measure a finished run on its held-out views.
 
     Args:
@@ -139,7 +138,7 @@ def _consistency_rows(found: Consistency, lpips: str) -> list[Row]:
     ]
 
 
-def _clip_rows(opened: OpenedRun, texts: Texts) -> list[Row]:
+def _clip_rows(opened: OpenedRun, texts: TextOptions) -> list[Row]:
     course = clip_curve(opened.evaluator, opened.setup.judging, opened.gdf.field, texts)
     along, missing = clip_consistency(opened)
     direction = course.similarity[-1] if course.similarity else None
@@ -223,3 +222,43 @@ def slider_path(evaluator: Evaluator, pictures: Pictures, perceptual: Perceptual
     perceptual.forget()
     rises = [b > a for a, b in pairwise(statistics.distances)]
     return SliderPath(statistics.uniformity, sum(rises) / len(rises), tuple(steps), tuple(from_original))
+
+
+COLUMNS = (SLIDER, KEYFRAMES, FADE, EDITOR, UNEDITED)
+
+
+def evaluation_table(evaluation: Evaluation) -> str:
+    """The whole table; what could not be measured says why below it."""
+    rows = [(row.text, *(_cell(row, column) for column in COLUMNS)) for row in evaluation.rows]
+    notes = [f"{row.text}: not measured, {row.missing}" for row in evaluation.rows if row.missing]
+    return "\n".join([markdown_table(("", *COLUMNS), rows), *(["", *notes] if notes else [])])
+
+
+def evaluation_json(evaluation: Evaluation) -> dict[str, Any]:
+    """As evaluation.json has it: rows by name, their figures by column, or why there are none."""
+    rows = {row.name: {"missing": row.missing} if row.missing else _rounded(row) for row in evaluation.rows}
+    curves = {
+        name: {"s": curve.s, "psnr": curve.psnr, "ssim": curve.ssim, "lpips": curve.lpips}
+        for name, curve in evaluation.curves.items()
+    }
+    pairs = [
+        {"source": pair.source, "target": pair.target, "shared": round(pair.shared, 3)}
+        for pair in evaluation.consistency.pairs
+    ]
+    return {"perceptual": evaluation.perceptual, "rows": rows, "pairs": pairs, "against_editor": curves}
+
+
+def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Rows of cells as GitHub Markdown."""
+    lines = ["| " + " | ".join(head) + " |", "|" + " --- |" * len(head)]
+    return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)])
+
+
+def _cell(row: Row, column: str) -> str:
+    value = row.cells.get(column)
+    return "" if value is None else f"{value:.{row.digits}f}"
+
+
+def _rounded(row: Row) -> dict[str, float | None]:
+    digits = row.digits + 2
+    return {name: None if value is None else round(value, digits) for name, value in row.cells.items()}

@@ -18,9 +18,9 @@ from progdf.io.json_values import convert_json, decode_json
 from progdf.metrics.slider import Pictures
 from trainer.fit.evaluate import Evaluator
 from trainer.fit.slider_uniformity import equalize_slider
-from trainer.pipeline.fit_and_report import load_evaluator
-from trainer.pipeline.reopen import FinishedRun, render_run_views, reopen_run
-from trainer.setup.training_setup import TrainingSetup, widen_views
+from trainer.run.finish import load_evaluator
+from trainer.run.record import FinishedRun, render_run_views, reopen_run
+from trainer.setup import TrainingSetup, widen_views
 from trainer.store.run_folder import read_views
 
 SLIDER, KEYFRAMES, FADE = "slider", "2 keyframes", "cross-fade"

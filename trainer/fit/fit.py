@@ -11,11 +11,12 @@ import torch
 from torch import Tensor
 
 from progdf.field import BakedField, Candidate, FieldEvaluator, choose_field, fit_keyframes
-from progdf.field.choose import MOST_SNAPSHOTS, SAMPLES, Kind
+from progdf.field.choose import MOST_SNAPSHOTS, SAMPLES
 from progdf.field.separable import moving_attributes
 from progdf.field.trajectory import Trajectory
 from progdf.gaussians import BASE_CHANNELS, Gaussians, attribute_slices
 from progdf.rasterize import alpha_weights
+from trainer.options import FieldKind, FieldOptions
 from trainer.views.view import View
 
 from .evaluate import Evaluator
@@ -49,9 +50,7 @@ def fit_field(
     choosing: Evaluator,
     reporting: Evaluator,
     weights: Tensor,
-    kind: Kind,
-    target_psnr: float,
-    budget: float | None = None,
+    options: FieldOptions,
 ) -> Fitted:
     """Fit fields and keep the smallest whose worst PSNR over the slider reaches the target, or the best one.
 
@@ -61,19 +60,19 @@ def fit_field(
         choosing: held-out views, which have the last word on the choice
         reporting: other held-out views, on which the chosen field's errors are taken
         weights: how visible each member is. [M]
-        kind: see `choose_field`
-        target_psnr: dB; where none reaches it, the best is kept and `met` is false
-        budget: bytes a member; the best field within it is kept, whatever the target is
+        options: which field; where none reaches the target, the best is kept and `met` is false
     """
     offsets = torch.stack([trajectory.node(i) for i in range(len(trajectory))])
     ticks = tuple(float(s) for s in trajectory.s)
-    target = target_psnr if budget is None else math.inf
+    assert options.field != "neural"
+    budget = options.bytes_budget
+    target = options.target_psnr if budget is None else math.inf
     choice = choose_field(
         trajectory.s,
         offsets,
         seen.counted_pixels,
         weights,
-        kind,
+        options.field,
         target,
         budget,
         evaluator=FieldEvaluator(trajectory.s, offsets, choosing.counted_pixels),
@@ -85,7 +84,7 @@ def fit_field(
     return Fitted(chosen, choice.met, choice.tried, baselines, choice.why)
 
 
-def expected_looks(trajectory: Trajectory, kind: Kind) -> int:
+def expected_looks(trajectory: Trajectory, kind: FieldKind) -> int:
     """About how often `fit_field` looks at its views, for a progress bar."""
     snapshots = min(len(trajectory), MOST_SNAPSHOTS)
     moving = len(moving_attributes(trajectory.offsets))

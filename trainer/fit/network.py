@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import asdict, dataclass
+from itertools import accumulate
 from typing import Any
 
 import torch
@@ -14,24 +15,135 @@ from torch import Tensor
 
 from progdf.errors import ProgdfError
 from progdf.field import BakedField, NeuralSettings, bake_network
-from progdf.field.choose import FieldEvaluator, rendered_importance
-from progdf.field.neural import Bins, Inputs, NeuralShape, Size
-from progdf.field.neural_fit import EFFORT, NeuralFit, train_network
+from progdf.field.choose import FieldEvaluator, Render, rendered_importance
+from progdf.field.neural import NeuralShape
+from progdf.field.neural_fit import EFFORT, NeuralFit, PictureLoss, train_network
 from progdf.field.separable import moving_attributes
 from progdf.field.trajectory import Trajectory
 from progdf.gaussians import BASE_CHANNELS, attribute_slices, pack
+from progdf.interpolation import interpolate_at
 from trainer.optimize.losses import Perceptual, l1, sharpness
 from trainer.optimize.pgs import TargetStage
-from trainer.optimize.settings import resolve_slider
-from trainer.options import FieldLoss, Slider
-from trainer.setup.training_setup import TrainingSetup, probe_views
+from trainer.optimize.retime import resolve_slider
+from trainer.options import FieldOptions, OptimizeOptions
+from trainer.setup import TrainingSetup, probe_views
 from trainer.store.progress import RunLog
 from trainer.store.state import Saved, StateFolder
 from trainer.views.crops import CropScene, crop_scene, render_all
 
 from .evaluate import Evaluator
 from .fit import visibility
-from .memory_bank import JointTraining
+
+MOST = 64
+"""Snapshots that a bank keeps; of more, those go that differ least in time from their neighbors."""
+
+
+class MemoryBank:
+    """Snapshots along the slider, in half precision; the original, at 0, is always among them.
+
+    Args:
+        members, channels: M and C of the offsets
+        most: how many to keep, the original and the newest always, ≥ 3
+    """
+
+    def __init__(self, members: int, channels: int, most: int = MOST) -> None:
+        self._strengths = [0.0]
+        self._offsets = [torch.zeros(members, channels, dtype=torch.float16)]
+        self._most = most
+
+    def __len__(self) -> int:
+        return len(self._strengths)
+
+    def add(self, strength: float, offsets: Tensor) -> None:
+        """Keep one more; its strength is above all others. [M,C]"""
+        if strength <= self._strengths[-1]:
+            raise ValueError(f"a snapshot at {strength} after one at {self._strengths[-1]}")
+        self._strengths.append(strength)
+        self._offsets.append(offsets.detach().half())
+        if len(self) > self._most:
+            s = self._strengths
+            gaps = [s[i + 1] - s[i - 1] for i in range(1, len(self) - 1)]
+            least = 1 + gaps.index(min(gaps))
+            del self._strengths[least], self._offsets[least]
+
+    @property
+    def strengths(self) -> Tensor:
+        """Ascending from 0. [T] float32"""
+        return torch.tensor(self._strengths)
+
+    @property
+    def offsets(self) -> Tensor:
+        """[T,M,C] float16"""
+        return torch.stack(self._offsets)
+
+
+class JointTraining:
+    """A network in joint training with PGS; a `state.Resumable`.
+
+    Args:
+        fit: the network, not yet trained
+        channels: of the recordings
+        strengths, steps: of the stages, in order
+        render: of a few small views, tells how much each attribute shows
+        pictures: the loss is of these instead of offsets
+    """
+
+    def __init__(
+        self,
+        fit: NeuralFit,
+        channels: int,
+        strengths: Sequence[float],
+        steps: Sequence[int],
+        render: Render,
+        pictures: PictureLoss | None = None,
+    ) -> None:
+        self.fit = fit
+        self._channels = channels
+        self._at = torch.tensor([0.0, *strengths], dtype=torch.float64)
+        self._after = torch.tensor([0, *accumulate(steps)], dtype=torch.float64)
+        self._render, self._pictures = render, pictures
+        self.bank = MemoryBank(fit.members, channels)
+        self._strengths, self._offsets = self.bank.strengths, self.bank.offsets
+
+    def strength(self, step: int) -> float:
+        """Where on the slider a step of PGS is for now: even in time within its stage."""
+        return float(interpolate_at(self._after, self._at, step))
+
+    def add(self, step: int, offsets: Tensor) -> None:
+        """A recording of PGS. [M,C]"""
+        self._keep(step, offsets)
+        if moving_attributes(self._offsets):
+            pictures = self._pictures is not None  # which weigh the attributes themselves
+            importance = None if pictures else rendered_importance(self._offsets, self._render)
+            self.fit.scale_to(self._offsets, importance)
+
+    def step(self) -> None:
+        """One step of the field after one of PGS; none before the first recording.
+
+        Raises:
+            FloatingPointError: the field's loss is no longer finite.
+        """
+        if len(self.bank) > 1:
+            self.fit.step(self._strengths, self._offsets, pictures=self._pictures)
+
+    def capture_state(self) -> Saved:
+        """The fit; the bank is made again from the recordings."""
+        return Saved(self.fit.capture_state(), {})
+
+    def restore(self, saved: Saved) -> None:
+        """Take over the fit; `refill` comes after."""
+        self.fit.restore(saved.tensors)
+
+    def refill(self, recordings: Sequence[tuple[int, Tensor]]) -> None:
+        """Fill the bank with what was recorded before the run was stopped: step, offsets [M,C]."""
+        self.bank = MemoryBank(self.fit.members, self._channels)
+        for step, offsets in recordings:
+            self._keep(step, offsets)
+
+    def _keep(self, step: int, offsets: Tensor) -> None:
+        self.bank.add(self.strength(step), offsets)
+        self._strengths, self._offsets = self.bank.strengths, self.bank.offsets
+
 
 PART = "network"
 """Of the saved state: a network that was trained jointly, once the trajectory is recorded."""
@@ -41,28 +153,6 @@ _FINISHING = 0.5
 trained on pictures is left as it is, as in the paper."""
 PICTURE_STEPS = 1500
 """Of a network that is trained on pictures after the recording: as many as the paper's take beside it."""
-
-
-@dataclass(frozen=True)
-class NetworkPlan:
-    """The network of a neural field.
-
-    Args:
-        size, loss: see `TrainOptions.size`, `TrainOptions.field_loss`
-        inputs, bins, code: see `trainer.presets.Constants`
-        draft: a third of the steps
-        seed: of its weights and draws
-        sharpness: whether a loss of pictures has L_render
-    """
-
-    size: Size
-    inputs: Inputs
-    bins: Bins
-    code: int
-    loss: FieldLoss
-    draft: bool
-    seed: int
-    sharpness: bool = True
 
 
 @dataclass(frozen=True)
@@ -88,16 +178,20 @@ class NetworkFit:
         }
 
 
-def network_settings(plan: NetworkPlan) -> NeuralSettings:
-    """What the plan says of the network, as it is trained."""
-    steps = PICTURE_STEPS if plan.loss == "pictures" else EFFORT[plan.size][0]
-    steps = steps // 3 if plan.draft else steps
-    return NeuralSettings(plan.size, plan.inputs, plan.code, plan.bins, steps, seed=plan.seed)
+def network_settings(options: FieldOptions) -> NeuralSettings:
+    """What the options say of the network, as it is trained."""
+    steps = PICTURE_STEPS if options.field_loss == "pictures" else EFFORT[options.size][0]
+    steps = steps // 3 if options.draft else steps
+    if options.as_printed:
+        return NeuralSettings(options.size, "position", 0, "hard", steps, seed=options.seed)
+    # What the Gaussian looks like and where it ends, beside its position: 38 dB instead of 34 at no cost; a
+    # byte each for eight learned numbers, for what its position does not tell; between hard bins edits jump.
+    return NeuralSettings(options.size, "own", 8, "smooth", steps, seed=options.seed)
 
 
 def begin_joint_training(
-    network: NetworkPlan,
-    slider: Slider,
+    options: FieldOptions,
+    optimize: OptimizeOptions,
     setup: TrainingSetup,
     rates: Tensor,
     stages: Sequence[TargetStage],
@@ -107,8 +201,7 @@ def begin_joint_training(
     """The network that is trained jointly with PGS.
 
     Args:
-        network: see `NetworkPlan`
-        slider: what slider values will mean
+        options, optimize: resolved
         setup: scene, region, views
         rates: learning rates of PGS; what has none does not move. [C]
         stages: of PGS
@@ -119,7 +212,7 @@ def begin_joint_training(
     slices = attribute_slices(channels)
     attributes = tuple(name for name, columns in slices.items() if bool((rates[columns] > 0).any()))
     rows = pack(setup.scene[setup.region.members], with_shN=channels > BASE_CHANNELS)
-    settings = network_settings(network)
+    settings = network_settings(options)
     seen = visibility(setup.scene, setup.region.members, setup.train)
     small = probe_views(setup)
 
@@ -129,12 +222,12 @@ def begin_joint_training(
         )
 
     strengths, steps = [stage.strength for stage in stages], [stage.steps for stage in stages]
-    if resolve_slider(slider, strengths) == "even":
+    if resolve_slider(optimize.slider, strengths) == "even":
         strengths = [(i + 1) / len(stages) for i in range(len(stages))]
     fit = NeuralFit(rows, channels, attributes, settings, seen)
     pictures = None
-    if network.loss == "pictures":
-        pictures = RenderedLoss(crops, rows, attributes, perceptual, network.sharpness)
+    if options.field_loss == "pictures":
+        pictures = RenderedLoss(crops, rows, attributes, perceptual)
     return JointTraining(fit, channels, strengths, steps, render, pictures)
 
 
@@ -149,7 +242,7 @@ def fit_network(
     seen: Evaluator,
     reporting: Evaluator,
     weights: Tensor,
-    plan: NetworkPlan,
+    options: FieldOptions,
     perceptual: Perceptual,
     log: RunLog,
     begun: Saved | None = None,
@@ -162,7 +255,7 @@ def fit_network(
         seen: training views, which tell how much each attribute shows
         reporting: held-out views on which errors are taken
         weights: how visible each member is. [M]
-        plan: see `NetworkPlan`
+        options: resolved
         perceptual: for the loss of pictures
         log: of the run
         begun: what `save_network` saved
@@ -175,17 +268,17 @@ def fit_network(
     if not attributes:
         raise ProgdfError("the edit moves nothing that a network could learn; use --field auto")
     rows = pack(setup.scene[setup.region.members])
-    settings = network_settings(plan)
+    settings = network_settings(options)
     fit = NeuralFit(rows, offsets.shape[2], attributes, settings, weights)
     steps = fit.settings.steps
     if begun is not None:
         layout = begun.values["shape"]
         fit.adopt(NeuralShape(**layout | {"attributes": tuple(layout["attributes"])}), begun.tensors)
-        steps = 0 if plan.loss == "pictures" else round(_FINISHING * steps)
+        steps = 0 if options.field_loss == "pictures" else round(_FINISHING * steps)
     fit.scale_to(offsets, rendered_importance(offsets, seen.counted_pixels))
     pictures = None
-    if plan.loss == "pictures" and steps:
-        pictures = _rendered_loss(setup, trajectory, perceptual, plan.sharpness)
+    if options.field_loss == "pictures" and steps:
+        pictures = _rendered_loss(setup, trajectory, perceptual)
     try:
         with log.steps("field", steps) as advance:
             train_network(
@@ -201,14 +294,12 @@ def fit_network(
     )
 
 
-def _rendered_loss(
-    setup: TrainingSetup, trajectory: Trajectory, perceptual: Perceptual, sharpness: bool
-) -> RenderedLoss:
+def _rendered_loss(setup: TrainingSetup, trajectory: Trajectory, perceptual: Perceptual) -> RenderedLoss:
     """The loss of pictures in all training views."""
     members = setup.region.members
     crops = [crop_scene(setup.scene, members, v.camera, v.box, setup.background) for v in setup.train]
     rows = pack(setup.scene[members], with_shN=trajectory.end.shape[1] > BASE_CHANNELS)
-    return RenderedLoss(crops, rows, tuple(moving_attributes(trajectory.end[None])), perceptual, sharpness)
+    return RenderedLoss(crops, rows, tuple(moving_attributes(trajectory.end[None])), perceptual)
 
 
 @dataclass(frozen=True)
@@ -221,14 +312,12 @@ class RenderedLoss:
         rows: raw values of the members before the edit, packed. [M,C]
         moving: attributes that differ from these
         perceptual: LPIPS, or what stands in for it
-        sharpness: whether L_render is paid
     """
 
     crops: Sequence[CropScene]
     rows: Tensor
     moving: Collection[str]
     perceptual: Perceptual
-    sharpness: bool = True
 
     @property
     def views(self) -> int:
@@ -242,4 +331,4 @@ class RenderedLoss:
             expected, _ = crop.render(self.rows + recorded, self.moving)
         image, _ = crop.render(self.rows + found, self.moving)
         predicted = l1(image, expected) + self.perceptual(image, expected)
-        return predicted + sharpness(image, expected, "paper") if self.sharpness else predicted
+        return predicted + sharpness(image, expected, "paper")

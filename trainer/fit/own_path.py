@@ -15,7 +15,7 @@ import torch
 
 from progdf.field.trajectory import Trajectory
 from trainer.editors.base import ImageEditor
-from trainer.setup.training_setup import TrainingSetup
+from trainer.setup import TrainingSetup
 from trainer.views.choose import split_held_out
 
 from .evaluate import make_evaluator

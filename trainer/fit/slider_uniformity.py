@@ -21,9 +21,9 @@ from progdf.field import BakedField
 from progdf.field.baked import SliderRemap, identity_remap, remap_slider
 from progdf.gaussians import BASE_CHANNELS, pack
 from progdf.interpolation import interpolate, interpolate_at
-from trainer.editors import COSTLY_DIAL, check_editor
+from trainer.editors import COSTLY_STRENGTHS, check_editor
 from trainer.editors.base import ImageEditor
-from trainer.setup.training_setup import TrainingSetup, probe_views
+from trainer.setup import TrainingSetup, probe_views
 from trainer.store.progress import RunLog
 from trainer.views.crops import GEOMETRY, render_all
 from trainer.views.view import View
@@ -52,7 +52,7 @@ def equalized_strengths(
         views: of which a few are looked at
         plain: shares of the visible change, ascending, the last 1
     """
-    if editor.stages or len(plain) == 1 or check_editor(spec)[0] in COSTLY_DIAL:
+    if editor.stages or len(plain) == 1 or check_editor(spec)[0] in COSTLY_STRENGTHS:
         return plain
     few = views[:: max(1, len(views) // _ASKED_VIEWS)][:_ASKED_VIEWS]
 

@@ -25,8 +25,7 @@ from progdf.threads import one_thread, threads
 from trainer.views.crops import CropScene
 
 from .losses import l1
-from .optimizer_state import PgsState
-from .pgs import OnStep, ParameterSnapshot, TargetStage
+from .pgs import OnStep, ParameterSnapshot, PgsState, TargetStage
 from .unseen import UnseenMembers
 
 STEPS_OF_OTHERS = 8
@@ -53,14 +52,12 @@ class ColorView:
         others: what all but the members show, unclamped. [h,w,3]
         basis: weight of each trained band in each member's color from here. [M,B]
         original: the members' unclamped colors as they were. [M,3]
-        leads_back: clamps pass gradients that lead back into range
     """
 
     map: ColorMap
     others: Tensor
     basis: Tensor
     original: Tensor
-    leads_back: bool = True
 
     def colors(self, offsets: Tensor) -> Tensor:
         """Unclamped. [M,B,3] -> [M,3]"""
@@ -93,7 +90,6 @@ def color_view(crop: CropScene, original: Tensor, bands: int) -> ColorView:
         picture - weighed.picture(colors.clamp_min(0.0)),
         weights[:, :bands].contiguous(),
         colors,
-        crop.leads_back,
     )
 
 
@@ -113,17 +109,19 @@ class _Pull:
 
 
 def _pull_into_range(view: ColorView, offsets: Tensor, target: Tensor, finished: Tensor) -> _Pull:
-    """A clamp passes what would bring its value back into the range, as `clamp_towards` does, or nothing."""
+    """A clamp passes what would bring its value back into the range, as `clamp_towards` does."""
     raw = view.colors(offsets)
     rendered = view.picture(raw)
     shown = rendered.clamp(0.0, 1.0)
     apart = shown - target
-    passed = (rendered >= 0.0) & (rendered <= 1.0)
-    if view.leads_back:
-        passed = ((rendered >= 0.0) | (apart < 0.0)) & ((rendered <= 1.0) | (apart > 0.0))
-    back = view.map.gradient(apart * passed)
-    back = back * (((raw >= 0.0) | (back < 0.0)) if view.leads_back else raw >= 0.0)
+    back = view.map.gradient(apart * leads_back(rendered, 0.0, 1.0, apart))
+    back = back * leads_back(raw, 0.0, math.inf, back)
     return _Pull(back, float(apart.square().sum()), float(l1(shown, finished)))
+
+
+def leads_back(value: Tensor, low: float, high: float, slope: Tensor) -> Tensor:
+    """Where a clamp passes a gradient: inside, and where descent would bring the value back. [...] bool"""
+    return ((value >= low) | (slope < 0.0)) & ((value <= high) | (slope > 0.0))
 
 
 @dataclass(frozen=True)

@@ -33,8 +33,8 @@ from trainer.views.crops import CropScene, render_all
 
 from .pgs import TargetStage, visible_way
 
-GROWTH = 2.0
-"""How many times a Gaussian may grow beyond its part; larger ones are fog that hides an error."""
+GROUP_STEPS = 120
+"""Steps of the group stage per strength, where parts are moved as wholes."""
 
 # The members' own learning rate is a share of so many part sizes; shorter steps where the parts' motion has
 # left less than `_LEFT` to do, a mean over the pixels that still change, and less than `_REST` of what there
@@ -110,7 +110,7 @@ def group_stage(
     original: Tensor,
     crops: Sequence[CropScene],
     targets: Sequence[Sequence[Tensor]],
-    steps: int = 120,
+    steps: int = GROUP_STEPS,
     seed: int = 0,
     on_step: OnStep | None = None,
     strengths: Sequence[float] = (),

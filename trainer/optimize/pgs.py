@@ -6,7 +6,7 @@ several strengths and the members are optimized towards each in turn. Within a s
 from the last stage's pictures to its own, so that the way between them is short and straight.
 
 Edits of colors alone are solved for instead, all views at once (`color_solver`), unless something is asked
-for that only a descent view by view has (`settings.solves_colors`).
+for that only a descent view by view has (`trainer.resolve.resolve_kind`).
 
 What stages bring is in docs/experiments.md, Stages.
 """
@@ -17,69 +17,236 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
+import msgspec
 import torch
 from torch import Tensor
 
-from progdf.gaussians import attribute_slices
-from trainer.editors.base import EditKind
-from trainer.options import Rates
+from progdf.gaussians import BASE_CHANNELS, attribute_slices
+from progdf.io.json_values import convert_json
+from trainer.options import OptimizeOptions
+from trainer.store.state import Saved, generator
 from trainer.views.crops import CropScene, render_all
 
-from .losses import l1, warmup
-from .objective import Moment, Objective, total_loss
-from .optimizer_state import PgsState
+from .losses import Moment, Objective, TermMeans, l1, total_loss, warmup
 
-# learning rates of 3DGS (Kerbl 2023) for a scene of extent 1
-_RATES_3DGS = {
-    "means": 1.6e-4,
-    "log_scales": 5e-3,
-    "quats": 1e-3,
-    "logit_opacities": 5e-2,
-    "sh0": 2.5e-3,
-    "shN": 1.25e-4,
+EPSILON = 0.1
+"""Of the root mean square of an attribute's gradient: Adam's ε where it is raised."""
+
+_ROWS = ("moved", "previous", "average", "first", "second")
+
+
+class _StateValues(msgspec.Struct):
+    """What `PgsState.capture_state` gives beside tensors."""
+
+    step: int
+    stage: int
+    local: int
+    recorded: int
+    running: float | None
+    means: dict[str, tuple[float, int]]
+    queue: list[int]
+
+
+class PgsState:
+    """The state of one optimization, changed in place by its steps.
+
+    Args:
+        rows: the members' packed raw rows; the state starts exactly at these. [M,C]
+        seed: order of the views
+
+    Attributes:
+        moved: offsets of the members, a leaf that takes gradients. [M,C]
+        previous: the offsets one step earlier. [M,C]
+        average: their running mean, which is what is recorded. [M,C]
+        first, second: Adam's moments. [M,C]
+        pictures: the probes at the last recording. [h,w,3] each; empty before the first step
+        step: steps done
+        stage, local: index of the stage, and steps done in it
+        recorded: how many recordings were made
+        running: running mean of the L1 distance from the finished edit; NaN before the first step
+        means: loss terms since the last recording
+    """
+
+    def __init__(self, rows: Tensor, seed: int = 0) -> None:
+        self.moved = torch.zeros_like(rows, requires_grad=True)
+        self.previous = torch.zeros_like(rows)
+        self.average = torch.zeros_like(rows)
+        self.first, self.second = torch.zeros_like(rows), torch.zeros_like(rows)
+        self.pictures: Sequence[Tensor] = ()
+        self.step = self.stage = self.local = self.recorded = 0
+        self.running = math.nan
+        self.means = TermMeans()
+        self._order = torch.Generator().manual_seed(seed)
+        self._queue: list[int] = []
+
+    def view(self, count: int) -> int:
+        """Index of the view whose turn it is: all of them in random order, again and again."""
+        if not self._queue:
+            self._queue = torch.randperm(count, generator=self._order).tolist()
+        return self._queue[-1]
+
+    def descend(
+        self,
+        gradient: Tensor,
+        rates: Tensor,
+        length: float,
+        raised: bool,
+        smoothing: float,
+        growth: float = math.inf,
+    ) -> None:
+        """One step of Adam (Kingma and Ba 2015), with a rate per column; the next view is due.
+
+        Adam does not know how large a gradient is, so a member that hardly shows would wander as far as one
+        in plain sight. A tenth of the attribute's typical gradient, added to ε, keeps it still.
+        (docs/experiments.md, Rates and steps).
+
+        Args:
+            gradient: of the loss in `moved`. [M,C]
+            rates: learning rate of each column. [C]
+            length: factor to them all
+            raised: see above; False is Adam as printed
+            smoothing: share that the running mean keeps of itself; it starts exactly at the original
+            growth: how many times as large as it was a member may become
+        """
+        done = self.step + 1
+        self.first.lerp_(gradient, 0.1)
+        self.second.lerp_(gradient.square(), 0.001)
+        mean = self.first / (1 - 0.9**done)
+        spread = (self.second / (1 - 0.999**done)).sqrt()
+        floor = torch.full_like(rates, 1e-15)
+        if raised:
+            for columns in attribute_slices(len(rates)).values():
+                floor[columns] += EPSILON * spread[:, columns].square().mean().sqrt()
+        with torch.no_grad():
+            self.previous.copy_(self.moved)
+            self.moved -= length * (rates * mean / (spread + floor))
+            if growth < math.inf:
+                self.moved[:, attribute_slices(len(rates))["log_scales"]].clamp_(max=math.log(growth))
+        self.average.lerp_(self.moved.detach(), 1.0 - min(smoothing, (self.step + 1) / (self.step + 10)))
+        self.step, self.local = done, self.local + 1
+        self._queue.pop()
+
+    def capture_state(self) -> Saved:
+        """See `state.Resumable`."""
+        tensors = {name: getattr(self, name) for name in _ROWS}
+        tensors |= {f"picture{i}": picture for i, picture in enumerate(self.pictures)}
+        tensors["order"] = self._order.get_state()
+        values = {
+            "step": self.step,
+            "stage": self.stage,
+            "local": self.local,
+            "recorded": self.recorded,
+            "running": self.running if self.step else None,
+            "means": {name: list(sums) for name, sums in self.means.sums.items()},
+            "queue": self._queue,
+        }
+        return Saved(tensors, values)
+
+    def restore(self, saved: Saved) -> None:
+        """See `state.Resumable`."""
+        tensors, values = saved.tensors, convert_json(saved.values, _StateValues)
+        with torch.no_grad():
+            for name in _ROWS:
+                getattr(self, name).copy_(tensors[name])
+        self.pictures = [tensors[f"picture{i}"] for i in range(sum(k.startswith("picture") for k in tensors))]
+        self.step, self.stage, self.local = values.step, values.stage, values.local
+        self.recorded = values.recorded
+        self.running = math.nan if values.running is None else values.running
+        self.means.sums = dict(values.means)
+        self._order, self._queue = generator(tensors["order"]), list(values.queue)
+
+
+LEARNING_RATES: Mapping[str, Mapping[str, float]] = {
+    # of 3DGS (Kerbl 2023) for a scene of extent 1
+    "3dgs": {
+        "means": 1.6e-4,
+        "log_scales": 5e-3,
+        "quats": 1e-3,
+        "logit_opacities": 5e-2,
+        "sh0": 2.5e-3,
+        "shN": 1.25e-4,
+    },
+    # By kind of edit: what it needs to arrive within a few hundred steps (docs/method.md 3). A color edit
+    # leaves the geometry alone, which is 1.4 dB better and 11 floats a Gaussian smaller.
+    "color": {"sh0": 7.5e-2, "shN": 3.75e-3},
+    "style": {
+        "means": 3.2e-4,
+        "log_scales": 1e-2,
+        "quats": 2e-3,
+        "logit_opacities": 2e-2,
+        "sh0": 6e-2,
+        "shN": 3e-3,
+    },
+    "geometry": {
+        "means": 1.28e-3,
+        "log_scales": 2e-2,
+        "quats": 8e-3,
+        "logit_opacities": 2e-2,
+        "sh0": 1e-2,
+        "shN": 5e-4,
+    },
 }
-# How many times those an edit needs to arrive within a few hundred steps (docs/method.md 3). A color edit
-# leaves the geometry alone, which is 1.4 dB better and 11 floats a Gaussian smaller.
-_MULTIPLES: dict[EditKind, dict[str, float]] = {
-    "color": {"means": 0, "log_scales": 0, "quats": 0, "logit_opacities": 0, "sh0": 30, "shN": 30},
-    "style": {"means": 2, "log_scales": 2, "quats": 2, "logit_opacities": 0.4, "sh0": 24, "shN": 24},
-    "geometry": {"means": 8, "log_scales": 4, "quats": 8, "logit_opacities": 0.4, "sh0": 4, "shN": 4},
-}
+
+GROWTH = 2.0
+"""How many times a Gaussian may grow beyond its part; larger ones are fog that hides an error."""
+REACH = 0.16
+"""Change of a channel in a stage for which the rates are right, see `PgsSettings.reach`."""
+FALL = 0.35
+"""Share of a stage's steps, its last, in which the learning rate falls; see `PgsSettings.fall`."""
+SNAPSHOTS = 32
+"""Recordings over all stages, about."""
 
 
 @dataclass(frozen=True)
 class PgsSettings:
-    """How the members are optimized.
+    """How the members descend."""
+
+    rates: Tensor  # learning rate of each column of a packed row, raw units. [C]
+    warmup: bool = False  # start with short steps
+    raised: bool = True  # Adam's ε holds members still that hardly show, see `PgsState.descend`
+    ramp: float = 0.6  # share of a stage's steps in which its target moves from the last stage's to its own
+    fall: float = FALL  # share of a stage's steps, its last, in which the rate falls to a tenth; 0: flat
+    # That change which 95 % of the changing pixels stay below; a shorter way gets smaller steps, down to a
+    # quarter, a longer one larger, up to 1.5 times; 0: the same for all. Steps larger than the way needs walk
+    # at random where the views do not resolve single Gaussians: close by, speckles of all colors.
+    reach: float = REACH
+    smoothing: float = 0.9  # share that the recorded running mean keeps of itself; 0: the bare iterates
+    growth: float = math.inf  # how many times a Gaussian may grow, beyond what its stage places it at
+    snapshots: int = SNAPSHOTS  # recordings over all stages, about
+    every: int = 0  # record every so many steps; 0: by visible change
+    seed: int = 0  # order of the views
+
+
+def pgs_settings(
+    options: OptimizeOptions, bands: bool, channels: int, extent: float, stages: int
+) -> PgsSettings:
+    """How a run descends.
 
     Args:
-        rates: learning rate of each column of a packed row, raw units. [C]
-        warmup: start with short steps
-        damped: hold members still that hardly show, see `PgsState.descend`; False is Adam as printed
-        ramp: share of a stage's steps in which its target moves from the last stage's pictures to its own
-        fall: share of a stage's steps, its last, in which the learning rate falls to a tenth; 0: flat
-        reach: change of a channel in a stage for which the rates are right, that which 95 % of the changing
-            pixels stay below; a shorter way gets smaller steps, down to a quarter, a longer one larger, up to
-            1.5 times; 0: the same for all. Steps larger than the way needs walk at random where the views
-            do not resolve single Gaussians, and close by that shows as speckles of all colors
-        smoothing: share that the recorded running mean keeps of itself at each step; 0 records the bare
-            iterates
-        growth: how many times a Gaussian may grow, beyond what its stage places it at
-        snapshots: recordings over all stages, about
-        every: record every so many steps; 0: by visible change
-        seed: order of the views
+        options: with nothing left open, see `trainer.resolve.resolve_kind`
+        bands: whether the SH bands beyond DC are trained
+        channels: columns of a packed row
+        extent: size of what moves, world units
+        stages: how many strengths there are to optimize towards
     """
-
-    rates: Tensor
-    warmup: bool = False
-    damped: bool = True
-    ramp: float = 0.6
-    fall: float = 0.35
-    reach: float = 0.16
-    smoothing: float = 0.9
-    growth: float = math.inf
-    snapshots: int = 32
-    every: int = 0
-    seed: int = 0
+    recolors, printed = options.kind != "geometry", options.as_printed
+    rates = learning_rates("3dgs" if options.rates == "3dgs" else options.kind, channels, extent)
+    if not bands:
+        rates[BASE_CHANNELS:] = 0.0
+    return PgsSettings(
+        rates,
+        warmup=options.progressive == "warmup",
+        raised=not printed,
+        # one target alone is approached slowly: quick steps towards it shine in all colors half way
+        ramp=(0.9 if stages == 1 else 0.6) if recolors and options.target_ramp else 0.0,
+        fall=0.0 if printed else 1.0 if stages == 1 else FALL,
+        reach=REACH if recolors and not printed else 0.0,
+        smoothing=0.9 if options.ema else 0.0,
+        # a run too short for the paper's snapshots still has four
+        every=min(100, max(1, options.steps // 4)) if printed else 0,
+        growth=GROWTH if options.group_steps else math.inf,
+        seed=options.seed,
+    )
 
 
 @dataclass(frozen=True)
@@ -132,20 +299,17 @@ OnStep = Callable[[int, float], None]
 """Called after every step: steps done, running mean of the L1 distance from the finished edit."""
 
 
-def learning_rates(kind: EditKind, channels: int, extent: float, form: Rates = "kind") -> Tensor:
+def learning_rates(kind: str, channels: int, extent: float) -> Tensor:
     """Learning rate of every column of a packed row, [C].
 
     Args:
-        kind: what the edit moves
+        kind: what the edit moves, or 3dgs: all attributes free; see `LEARNING_RATES`
         channels: columns of a packed row
         extent: size of what moves, world units
-        form: "kind": the multiples of 3DGS's rates that the kind needs; "3dgs": those rates as they are, all
-            attributes free
     """
     rates = torch.zeros(channels)
     for name, columns in attribute_slices(channels).items():
-        scale = extent if name == "means" else 1.0
-        rates[columns] = _RATES_3DGS[name] * scale * (_MULTIPLES[kind][name] if form == "kind" else 1.0)
+        rates[columns] = LEARNING_RATES[kind].get(name, 0.0) * (extent if name == "means" else 1.0)
     return rates
 
 
@@ -179,24 +343,17 @@ def optimize(
     Raises:
         FloatingPointError: the loss or its gradient is not finite; the state is that of the step before.
     """
-    moving = {
-        name
-        for name, columns in attribute_slices(original.shape[1]).items()
-        if bool((settings.rates[columns] > 0).any())
-    }
-    if state is None:
-        state = PgsState(original, settings.seed)
+    slices = attribute_slices(original.shape[1])
+    moving = {name for name, columns in slices.items() if bool((settings.rates[columns] > 0).any())}
+    state = PgsState(original, settings.seed) if state is None else state
     if not state.step:
         state.pictures = render_all(probes, original)
     for index in range(state.stage, len(stages)):
         stage = stages[index]
         before = stages[index - 1].targets if index else render_all(crops, original)
         objective.begin_stage()
-        change, _ = visible_way(stage.targets, before)
-        reach = most_change(stage.targets, before) if settings.reach > 0 else 0.0
-        spacing = change * len(stages) / settings.snapshots
-        size = min(1.5, max(0.25, reach / settings.reach)) if settings.reach > 0 else 1.0
-        size = size if stage.length is None else stage.length
+        size = _step_size(stage, before, settings.reach)
+        spacing = visible_way(stage.targets, before)[0] * len(stages) / settings.snapshots
         targets = stage.targets
         while state.local < stage.steps:
             if renewal is not None:
@@ -207,19 +364,15 @@ def optimize(
                     objective.begin_stage()
             view = state.view(len(crops))
             share = (state.local + 1) / max(1.0, settings.ramp * stage.steps)
-            arrived = share >= 1.0
-            target = targets[view] if arrived else torch.lerp(before[view], targets[view], share)
+            target = targets[view] if share >= 1.0 else torch.lerp(before[view], targets[view], share)
             image, _ = crops[view].render(original + stage.place(state.moved), moving)
-            left = float(l1(image.detach(), stages[-1].targets[view]))
-            terms = objective.terms(
-                Moment(image, target, view, state.step, state.local, arrived, state.moved, state.previous)
+            moment = Moment(
+                image, target, view, state.step, state.local, share >= 1.0, state.moved, state.previous
             )
-            gradient = _gradient(terms, state)
-            state.means.add({name: float(term.detach()) for name, term in terms.items()} | {"left": left})
-            state.running = left if math.isnan(state.running) else 0.95 * state.running + 0.05 * left
+            gradient = _gradient(objective, moment, state, stages[-1].targets[view])
             length = size * _rate_factor(settings, state.step, state.local, stage.steps)
             state.descend(
-                gradient, settings.rates, length, settings.damped, settings.smoothing, settings.growth
+                gradient, settings.rates, length, settings.raised, settings.smoothing, settings.growth
             )
 
             last = state.local == stage.steps
@@ -235,8 +388,16 @@ def optimize(
         state.stage, state.local = index + 1, 0
 
 
-def _gradient(terms: Mapping[str, Tensor], state: PgsState) -> Tensor:
-    """Of the terms' sum in the members' offsets. [M,C]"""
+def _step_size(stage: TargetStage, before: Sequence[Tensor], reach: float) -> float:
+    """Factor to the learning rates of a stage, see `TargetStage.length` and `PgsSettings.reach`."""
+    if stage.length is not None:
+        return stage.length
+    return min(1.5, max(0.25, most_change(stage.targets, before) / reach)) if reach > 0 else 1.0
+
+
+def _gradient(objective: Objective, moment: Moment, state: PgsState, finished: Tensor) -> Tensor:
+    """Of the loss in the members' offsets [M,C]; its terms and what is left to `finished` are noted."""
+    terms = objective.terms(moment)
     loss = total_loss(terms)
     if not math.isfinite(float(loss.detach())):
         raise FloatingPointError(f"the loss is {float(loss.detach())} at step {state.step}")
@@ -246,6 +407,9 @@ def _gradient(terms: Mapping[str, Tensor], state: PgsState) -> Tensor:
     assert gradient is not None
     if not math.isfinite(float(gradient.sum())):
         raise FloatingPointError(f"the loss has no finite gradient at step {state.step}")
+    left = float(l1(moment.image.detach(), finished))
+    state.means.add({name: float(term.detach()) for name, term in terms.items()} | {"left": left})
+    state.running = left if math.isnan(state.running) else 0.95 * state.running + 0.05 * left
     return gradient
 
 
@@ -273,8 +437,12 @@ def most_change(targets: Sequence[Tensor], before: Sequence[Tensor]) -> float:
 
 def _rate_factor(settings: PgsSettings, step: int, local: int, steps: int) -> float:
     """Falls at a stage's end, so that it ends near its target; early steps may be short."""
-    factor = min(1.0, 0.1 + 0.9 * (steps - local) / (steps * settings.fall)) if settings.fall > 0 else 1.0
-    return factor * (warmup(step) if settings.warmup else 1.0)
+    return _decay(settings.fall, local, steps) * (warmup(step) if settings.warmup else 1.0)
+
+
+def _decay(fall: float, local: int, steps: int) -> float:
+    """See `PgsSettings.fall`."""
+    return min(1.0, 0.1 + 0.9 * (steps - local) / (steps * fall)) if fall > 0 else 1.0
 
 
 def _mean_distance(a: Sequence[Tensor], b: Sequence[Tensor]) -> float:

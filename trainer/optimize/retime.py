@@ -20,6 +20,13 @@ from trainer.options import Slider
 _LEAST_GAP = 1e-4  # slider values of neighboring recordings stay apart by this
 
 
+def resolve_slider(slider: Slider, strengths: Sequence[float]) -> Slider:
+    """What slider values mean, given the strengths of the stages."""
+    if slider != "auto":
+        return slider
+    return "stages" if len(strengths) > 1 else "even"
+
+
 def record(
     snapshots: Sequence[tuple[int, int, bool, Tensor]], end: Tensor, strengths: Sequence[float]
 ) -> Trajectory:
@@ -62,7 +69,7 @@ def retime(
         samples: chords over the whole slider; a pinned segment has its share, at least 3
     """
     if slider == "auto":
-        raise ValueError("'auto' is not resolved; see settings.resolve_slider")
+        raise ValueError("'auto' is not resolved; see resolve_slider")
     if slider == "time":
         return replace(trajectory, s=_place_between(0.0, 1.0, trajectory.steps.double()).float())
     if slider == "stages":

@@ -13,11 +13,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from progdf.camera import Camera
 from progdf.gaussians import Gaussians, attribute_slices
 from progdf.rasterize import alpha_weights
-from trainer.editors.base import EditKind
+from progdf.sh import basis
+from trainer.options import OptimizeOptions
 from trainer.regions.surface import surface_likeness
-from trainer.setup.training_setup import TrainingSetup
+from trainer.setup import TrainingSetup
+from trainer.views.choose import visible_area
 from trainer.views.view import View
 
 _SEEN = 3.0
@@ -57,11 +60,11 @@ class UnseenMembers:
         return led
 
 
-def unseen_members_of(setup: TrainingSetup, kind: EditKind) -> UnseenMembers:
+def unseen_members_of(setup: TrainingSetup, optimization: OptimizeOptions) -> UnseenMembers:
     """Those of a run; none unless the edit is one of colors alone."""
-    if kind != "color":
-        nobody = torch.zeros(0, dtype=torch.int64)
-        return UnseenMembers(nobody, nobody[:, None], torch.zeros(0, 1))
+    if optimization.kind != "color":
+        empty = torch.zeros(0, dtype=torch.int64)
+        return UnseenMembers(empty, empty[:, None], torch.zeros(0, 1))
     return find_unseen_members(setup.scene, setup.region.members, setup.train)
 
 
@@ -120,3 +123,26 @@ def _find_sources(region: Gaussians, seen: Tensor) -> UnseenMembers:
         decided[rows] = True
     unseen_members = unseen[decided[unseen]]
     return UnseenMembers(unseen_members, sources[unseen_members], weights[unseen_members])
+
+
+NEEDED = 0.04
+"""Color (0..1) by which a region's must change with the view for the bands to pay."""
+
+
+def view_dependence(members: Gaussians, cameras: Sequence[Camera]) -> float:
+    """How much the members' colors change between these cameras: the root mean square, in color 0..1.
+
+    Each member counts as the area that it can cover.
+    """
+    bands = min(members.shN.shape[1], 15)
+    if not bands or not len(members) or len(cameras) < 2:
+        return 0.0
+    degree = min(members.sh_degree, 3)
+    seen = []
+    for camera in cameras:
+        directions = torch.nn.functional.normalize(members.means - camera.position, dim=1)
+        seen.append((basis(degree, directions)[:, 1 : bands + 1, None] * members.shN[:, :bands]).sum(dim=1))
+    colors = torch.stack(seen)
+    change = (colors - colors.mean(dim=0)).square().mean(dim=(0, 2)).double()
+    areas = visible_area(members)
+    return float(((change * areas).sum() / areas.sum().clamp_min(1e-300)).sqrt())

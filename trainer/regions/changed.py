@@ -28,7 +28,7 @@ from progdf.region import Region
 from progdf.sh import sh0_to_rgb
 from progdf.terminal import format_count
 from trainer.editors.pictures import STEP, STILL, lay_over, move_image, read_change
-from trainer.setup.training_setup import quantize_image
+from trainer.setup import quantize_image
 from trainer.views.view import fit_size, with_near_plane
 
 from .few_masks import FEW, connected_pieces

@@ -15,20 +15,31 @@ from progdf.camera import Camera, intrinsics, look_at
 from progdf.errors import ProgdfError
 from progdf.formats.scene_file import load_scene
 from progdf.gaussians import Gaussians
-from progdf.io.cameras import load_cameras, read_camera
+from progdf.io.cameras import load_cameras, read_camera, save_cameras
 from progdf.io.images import write_image
 from progdf.io.tensors import save_npy
-from progdf.region import Region
-from progdf.scene.bounds import front_direction
+from progdf.region import Region, whole_scene
+from progdf.scene.bounds import front_direction, is_surrounding
+from progdf.scene.orbit_rig import orbit_rig
 from progdf.scene.regions import parse_region
 from progdf.scene.subject import fit_eye, subject_rows
 from progdf.scene.up_axis import find_up
 from progdf.terminal import format_count, group_digits
-from trainer.option_checks import check_ranges
-from trainer.views.view import render_colors, seen_colors, with_near_plane
+from trainer.options import RegionOptions, ShowRegionOptions, ViewOptions, WriteViewsOptions, check_ranges
+from trainer.views.choose import choose_views
+from trainer.views.view import (
+    BACKGROUND,
+    INSIDE,
+    fit_size,
+    name_cameras,
+    region_rig,
+    render_colors,
+    render_view,
+    seen_colors,
+    with_near_plane,
+)
 
-from .from_pictures import RegionSettings, region_kinds
-from .options import RegionOptions
+from .from_pictures import RegionRequest, region_kinds
 
 _TINT = torch.tensor([1.0, 0.32, 0.05])
 _TINTED = 0.55
@@ -39,7 +50,7 @@ _FOV, _FILLED = math.radians(45.0), 0.9
 _SIDES = ((20.0, 15.0), (110.0, 15.0), (200.0, 15.0), (290.0, 15.0))
 
 
-def show(options: RegionOptions) -> list[str]:
+def show(options: ShowRegionOptions) -> list[str]:
     """Write what the options ask for; lines on what was found, the last with the region's count.
 
     Raises:
@@ -57,11 +68,10 @@ def show(options: RegionOptions) -> list[str]:
     scene = load_scene(options.scene)
     said: list[str] = []
     with tempfile.TemporaryDirectory() as folder:
-        settings = RegionSettings(
-            options.cameras, 30, lambda: Path(folder), options.lift_rule, options.lift_threshold,
-            up=options.up, scene=options.scene, say=said.append,
-        )  # fmt: skip
-        region = parse_region(options.spec, scene, kinds=region_kinds(settings), say=said.append)
+        masks = RegionOptions(options.spec, options.lift_rule, options.lift_threshold)
+        views = ViewOptions(options.cameras, options.up, scene=options.scene)
+        request = RegionRequest(masks, views, lambda: Path(folder), say=said.append)
+        region = parse_region(options.spec, scene, kinds=region_kinds(request), say=said.append)
     if suffix == ".npy":
         save_npy(options.out, region.members.numpy())
     else:
@@ -87,7 +97,7 @@ def picture(scene: Gaussians, region: Region, camera: Camera) -> Tensor:
     return render_colors(scene, shown, camera, torch.ones(3)).clamp(0.0, 1.0)
 
 
-def _cameras(options: RegionOptions, scene: Gaussians, up: Tensor, size: tuple[int, int]) -> list[Camera]:
+def _cameras(options: ShowRegionOptions, scene: Gaussians, up: Tensor, size: tuple[int, int]) -> list[Camera]:
     if options.camera is not None:
         return [replace(read_camera(options.camera, scene.origin), lens=None)]
     if options.orbit is None:
@@ -144,3 +154,44 @@ def _size(text: str) -> tuple[int, int]:
             f"--size {text} is not a size; write WIDTHxHEIGHT of up to 8192, for example 640x480"
         )
     return int(width), int(height)
+
+
+def write(options: WriteViewsOptions) -> str:
+    """Write OUT/original/NAME.png and OUT/cameras.json; what to do with them, in a line.
+
+    Raises:
+        ProgdfError: scene, cameras or region that do not work, or a folder that has such cameras already.
+    """
+    check_ranges(("--views", options.views, 1, 96), ("--image-size", options.image_size, 32, 4096))
+    out, background = options.out, torch.tensor(BACKGROUND)
+    if (out / "cameras.json").exists() or (out.exists() and not out.is_dir()):
+        raise ProgdfError(f"{out / 'cameras.json'} already exists; give --out another folder")
+    scene = load_scene(options.scene)
+    given = [] if options.cameras is None else load_cameras(options.cameras, scene.origin)
+    up = find_up(scene, given, options.up, options.scene).direction
+    region = None
+    if options.region is not None:
+        views = ViewOptions(options.cameras, options.up, options.views, scene=options.scene)
+        request = RegionRequest(RegionOptions(options.region), views, lambda: out / "segmented")
+        region = parse_region(options.region, scene, kinds=region_kinds(request))
+    if given:
+        # what is drawn is straight, and so are the masks: no lens
+        cameras = [replace(fit_size(camera, options.image_size), lens=None) for camera in given]
+    elif is_surrounding(scene, up):
+        raise ProgdfError(f"{options.scene} {INSIDE}")
+    elif region is not None:
+        cameras = region_rig(scene, region, options.views, options.image_size, up)
+    else:
+        cameras = orbit_rig(scene, options.views, options.image_size, options.image_size, up=up)
+    cameras = with_near_plane(name_cameras(cameras), scene)
+    if len(cameras) > options.views:
+        choice = choose_views(scene, region or whole_scene(scene), cameras, options.views, background)
+        cameras = [view.camera for view in choice.views]
+    for camera in cameras:
+        write_image(out / "original" / f"{camera.name}.png", render_view(scene, camera, background))
+    save_cameras(out / "cameras.json", cameras, scene.origin)
+    return (
+        f"wrote {len(cameras)} views to {out / 'original'}; draw masks (white on black) as "
+        f"{out}/NAME.png for some of them, then progdf train {options.scene} "
+        f"--cameras {out / 'cameras.json'} --region masks:{out} …"
+    )

@@ -21,12 +21,11 @@ from progdf.region import Region
 from progdf.scene.bounds import is_surrounding
 from progdf.scene.orbit_rig import orbit_rig
 from progdf.scene.regions import Check, Kind
-from progdf.scene.up_axis import UpChoice, find_up
+from progdf.scene.up_axis import find_up
 from trainer.editors.cache import KeptPictures, Recipe
 from trainer.editors.pictures import picture_paths, rendered_cameras
-from trainer.options import LiftRule
-from trainer.segmenters import SEGMENTER_CHECKS, SEGMENTERS, Segmenter, SegmenterSettings
-from trainer.segmenters.folder import read_masks
+from trainer.options import VIEWS, RegionOptions, ViewOptions
+from trainer.regions.segment import SEGMENTER_CHECKS, SEGMENTERS, Segmenter
 from trainer.views.view import (
     BACKGROUND,
     INSIDE,
@@ -39,44 +38,30 @@ from trainer.views.view import (
 
 from .changed import LIFTED_AT, changed_region
 from .lift import lift_masks
+from .masks import read_masks
 
 
 @dataclass(frozen=True)
-class RegionSettings:
-    """How masks become a region.
+class RegionRequest:
+    """What pictures are to tell of a region, and where those that are made for it go."""
 
-    Args:
-        cameras: file of cameras, as --cameras; None: a rig around the scene, for masks that are made here
-        views: how many pictures are segmented, at most; without cameras, as many again from nearer
-        rule: see `lift.score`
-        threshold: least score of a member, 0..1; None is the rule's own
-        segmenter: which networks, how sure
-        kept: makes, and names, the folder in which segmented pictures are kept
-        quiet: no progress on the screen
-        up: as --up
-        scene: the scene's file, whose format may say which way is up
-        say: hears in a line each what became of the masks
-        pictures: changed pictures, for the kind `changed`
-    """
+    options: RegionOptions
+    views: ViewOptions  # as many pictures are segmented, at most; without cameras, as many again from nearer
+    cache: Callable[[], Path]  # makes, and names, the folder in which segmented pictures are kept
+    quiet: bool = False  # no progress on the screen
+    say: Callable[[str], None] | None = None  # hears in a line each what became of the masks
 
-    cameras: Path | None
-    views: int
-    kept: Callable[[], Path]
-    rule: LiftRule = "share"
-    threshold: float | None = None
-    segmenter: SegmenterSettings = SegmenterSettings()
-    quiet: bool = False
-    up: UpChoice = "auto"
-    scene: Path | None = None
-    say: Callable[[str], None] | None = None
-    pictures: Sequence[Path] = ()
+    @property
+    def count(self) -> int:
+        """How many pictures are segmented."""
+        return self.views.views or VIEWS
 
     def up_of(self, scene: Gaussians) -> Tensor:
         """The direction that is up in a scene without cameras. [3]"""
-        return find_up(scene, (), self.up, self.scene).direction
+        return find_up(scene, (), self.views.up, self.views.scene).direction
 
 
-def region_kinds(settings: RegionSettings) -> dict[str, Kind]:
+def region_kinds(request: RegionRequest) -> dict[str, Kind]:
     """The kinds of region that pictures tell of, for `parse_region`.
 
     masks:DIR are drawn over straight pictures, as RUN/views/original are; photomasks:DIR over photographs,
@@ -85,61 +70,64 @@ def region_kinds(settings: RegionSettings) -> dict[str, Kind]:
 
     def from_folder(rest: str, scene: Gaussians, bent: bool) -> Region:
         kind = "photomasks" if bent else "masks"
-        folder, file = _mask_folder(kind, rest, settings)
+        folder, file = _mask_folder(kind, rest, request)
         cameras = _cameras(file, scene)
         masks = read_masks(folder, cameras, bent)
         count = sum(mask is not None for mask in masks)
-        if settings.say is not None and count < len(masks):
-            settings.say(f"{count} of {len(masks)} cameras have a mask; the others tell nothing")
-        return _lift(scene, cameras, masks, f"{kind}:{rest}", settings)
+        if request.say is not None and count < len(masks):
+            request.say(f"{count} of {len(masks)} cameras have a mask; the others tell nothing")
+        return _lift(scene, cameras, masks, f"{kind}:{rest}", request)
 
     def from_text(rest: str, scene: Gaussians) -> Region:
         prompt = _prompt(rest)
-        folder = settings.kept() / _slug(prompt)
-        cameras = _segmented_cameras(scene, settings)
-        masks = _segment(scene, cameras, prompt, folder, settings)
-        found = _masks_with_pixels(masks, prompt, settings)
-        if settings.cameras is None:
+        folder = request.cache() / _slug(prompt)
+        cameras = _segmented_cameras(scene, request)
+        masks = _segment(scene, cameras, prompt, folder, request)
+        found = _masks_with_pixels(masks, prompt, request)
+        if request.views.cameras is None:
             # Around the scene a thing may be a few pixels wide: look again from where it fills the picture;
             # with masks of the bear's body a pixel too wide or too narrow, IoU .93 for .61-.68.
-            nearer = _near_cameras(scene, _lift(scene, cameras, found, prompt, settings), settings)
-            masks = [*masks, *_segment(scene, nearer, prompt, folder, settings)]
-            cameras, found = [*cameras, *nearer], _masks_with_pixels(masks, prompt, settings)
+            nearer = _near_cameras(scene, _lift(scene, cameras, found, prompt, request), request)
+            masks = [*masks, *_segment(scene, nearer, prompt, folder, request)]
+            cameras, found = [*cameras, *nearer], _masks_with_pixels(masks, prompt, request)
         # with these the folder is one for masks:DIR, of the same region
         telling = [camera for camera, mask in zip(cameras, found, strict=True) if mask is not None]
         save_cameras(folder / "cameras.json", telling, scene.origin)
-        return _lift(scene, cameras, found, f"text:{prompt}", settings)
+        return _lift(scene, cameras, found, f"text:{prompt}", request)
 
     return {
         "masks": lambda rest, scene: from_folder(rest, scene, bent=False),
         "photomasks": lambda rest, scene: from_folder(rest, scene, bent=True),
         "text": from_text,
         "changed": lambda rest, scene: changed_region(
-            scene, *_changed_pictures(rest, settings, scene.origin), settings.threshold, settings.say
+            scene,
+            *_changed_pictures(rest, request, scene.origin),
+            request.options.lift_threshold,
+            request.say,
         ),
     }
 
 
-def region_checks(settings: RegionSettings) -> dict[str, Check]:
+def region_checks(request: RegionRequest) -> dict[str, Check]:
     """What is to be known of these kinds before the scene is loaded, for `check_region`."""
 
     def of_text(rest: str) -> None:
         _prompt(rest)
-        SEGMENTER_CHECKS["text"](settings.segmenter)
+        SEGMENTER_CHECKS["text"](request.options)
 
     return {
-        "masks": lambda rest: load_cameras(_mask_folder("masks", rest, settings)[1], ZERO),
-        "photomasks": lambda rest: load_cameras(_mask_folder("photomasks", rest, settings)[1], ZERO),
+        "masks": lambda rest: load_cameras(_mask_folder("masks", rest, request)[1], ZERO),
+        "photomasks": lambda rest: load_cameras(_mask_folder("photomasks", rest, request)[1], ZERO),
         "text": of_text,
-        "changed": lambda rest: _changed_pictures(rest, settings, ZERO),
+        "changed": lambda rest: _changed_pictures(rest, request, ZERO),
     }
 
 
 def _changed_pictures(
-    rest: str, settings: RegionSettings, origin: Origin
+    rest: str, request: RegionRequest, origin: Origin
 ) -> tuple[Sequence[Path], Sequence[Camera]]:
     """The pictures of `changed:A.png,B.png`, by default those of the editor, and their cameras."""
-    paths = picture_paths(rest) if rest else settings.pictures
+    paths = picture_paths(rest) if rest else request.views.pictures
     if not paths:
         raise ProgdfError(
             "changed needs pictures: use it with --editor pictures:A.png, or name them, changed:A.png,B.png"
@@ -150,11 +138,11 @@ def _changed_pictures(
                 f"{path} was taken with edits on ({edits}), which would count as changed; take the view "
                 "without them, or name the region with --region"
             )
-    given = [] if settings.cameras is None else load_cameras(settings.cameras, origin)
+    given = [] if request.views.cameras is None else load_cameras(request.views.cameras, origin)
     return paths, rendered_cameras(paths, given, origin)
 
 
-def _mask_folder(kind: str, rest: str, settings: RegionSettings) -> tuple[Path, Path]:
+def _mask_folder(kind: str, rest: str, request: RegionRequest) -> tuple[Path, Path]:
     """The folder of masks, and the file of their cameras."""
     if not rest:
         raise ProgdfError(f"{kind}: needs a folder; write {kind}:DIR with a mask for each camera in DIR")
@@ -164,11 +152,11 @@ def _mask_folder(kind: str, rest: str, settings: RegionSettings) -> tuple[Path, 
     own = folder / "cameras.json"
     if own.is_file():
         return folder, own
-    if settings.cameras is None:
+    if request.views.cameras is None:
         raise ProgdfError(
             f"the masks in {folder} have no cameras; give --cameras, or put a cameras.json beside them"
         )
-    return folder, settings.cameras
+    return folder, request.views.cameras
 
 
 def _prompt(rest: str) -> str:
@@ -183,7 +171,7 @@ def _lift(
     cameras: Sequence[Camera],
     masks: Sequence[Tensor | None],
     name: str,
-    settings: RegionSettings,
+    request: RegionRequest,
 ) -> Region:
     """The region that the masks select; a view without a mask adds nothing."""
     given = [
@@ -191,13 +179,15 @@ def _lift(
     ]
     small = with_near_plane([camera for camera, _ in given], scene)
     scaled = [_scale_mask(mask, camera) for camera, mask in given]
-    region = lift_masks(scene, small, scaled, name, settings.rule, settings.threshold, settings.say)
+    region = lift_masks(
+        scene, small, scaled, name, request.options.lift_rule, request.options.lift_threshold, request.say
+    )
     if not len(region):
         way = "lower --lift-threshold"
-        if settings.rule == "paper":
+        if request.options.lift_rule == "paper":
             way = "far below the printed .8: give --lift-rule share, or lower --lift-threshold"
         raise ProgdfError(
-            f"{name} selects no Gaussian by the rule {settings.rule}; its highest score is "
+            f"{name} selects no Gaussian by the rule {request.options.lift_rule}; its highest score is "
             f"{float(region.score.max()):.2g}, {way}"
         )
     return region
@@ -211,22 +201,22 @@ def _scale_mask(mask: Tensor, camera: Camera) -> Tensor:
     return torch.nn.functional.interpolate(mask.float()[None, None], size=size, mode="area")[0, 0]
 
 
-def _masks_with_pixels(masks: Sequence[Tensor], prompt: str, settings: RegionSettings) -> list[Tensor | None]:
+def _masks_with_pixels(masks: Sequence[Tensor], prompt: str, request: RegionRequest) -> list[Tensor | None]:
     """The masks in which the prompt was found: where it was not, it may still be."""
     found = [mask if bool(mask.any()) else None for mask in masks]
     if all(mask is None for mask in found):
         raise ProgdfError(
             f"'{prompt}' is found in none of {len(masks)} views; rephrase it, or lower "
-            f"--box-threshold (now {settings.segmenter.box_threshold:g})"
+            f"--box-threshold (now {request.options.box_threshold:g})"
         )
     return found
 
 
 def _segment(
-    scene: Gaussians, cameras: Sequence[Camera], prompt: str, folder: Path, settings: RegionSettings
+    scene: Gaussians, cameras: Sequence[Camera], prompt: str, folder: Path, request: RegionRequest
 ) -> list[Tensor]:
     """The prompt's mask in every view; read where it is kept, of the same picture by the same networks."""
-    chosen = settings.segmenter
+    chosen = request.options
     recipe: Recipe = {
         "prompt": prompt,
         "detector": chosen.detector,
@@ -238,31 +228,31 @@ def _segment(
     def paint(image: Tensor) -> Tensor:
         return loaded()(image, prompt).float()[..., None].expand(-1, -1, 3)
 
-    kept = KeptPictures(folder)
+    pictures = KeptPictures(folder)
     masks = []
     views = with_near_plane(cameras, scene)
-    for camera in track(views, description=f"segment '{prompt}'", disable=settings.quiet, transient=True):
+    for camera in track(views, description=f"segment '{prompt}'", disable=request.quiet, transient=True):
         picture = render_view(scene, camera, torch.tensor(BACKGROUND)).clamp(0.0, 1.0)
-        masks.append(kept.picture(camera.name, picture, recipe, paint)[..., 0])
+        masks.append(pictures.picture(camera.name, picture, recipe, paint)[..., 0])
     return masks
 
 
-def _segmented_cameras(scene: Gaussians, settings: RegionSettings) -> list[Camera]:
+def _segmented_cameras(scene: Gaussians, request: RegionRequest) -> list[Camera]:
     """The given cameras, evenly thinned out, or a rig around the scene."""
-    if settings.cameras is not None:
-        offered = _cameras(settings.cameras, scene)
-        count = min(settings.views, len(offered))
+    if request.views.cameras is not None:
+        offered = _cameras(request.views.cameras, scene)
+        count = min(request.count, len(offered))
         taken = [offered[(2 * i + 1) * len(offered) // (2 * count)] for i in range(count)]
         return [replace(fit_size(camera, LIFTED_AT), lens=None) for camera in taken]
-    up = settings.up_of(scene)
+    up = request.up_of(scene)
     if is_surrounding(scene, up):
         raise ProgdfError(f"the scene {INSIDE}")
-    return name_cameras(orbit_rig(scene, settings.views, LIFTED_AT, LIFTED_AT, up=up))
+    return name_cameras(orbit_rig(scene, request.count, LIFTED_AT, LIFTED_AT, up=up))
 
 
-def _near_cameras(scene: Gaussians, region: Region, settings: RegionSettings) -> list[Camera]:
+def _near_cameras(scene: Gaussians, region: Region, request: RegionRequest) -> list[Camera]:
     """A rig that looks at what was found."""
-    rig = region_rig(scene, region, settings.views, LIFTED_AT, settings.up_of(scene))
+    rig = region_rig(scene, region, request.count, LIFTED_AT, request.up_of(scene))
     return [replace(camera, name=f"near_{i:03d}") for i, camera in enumerate(rig)]
 
 

@@ -21,7 +21,7 @@ from torch.nn.functional import interpolate
 
 from progdf.metrics.image import NO_DIFFERENCE, decibels
 from progdf.rasterize import render
-from trainer.setup.training_setup import TrainingSetup
+from trainer.setup import TrainingSetup
 from trainer.views.crops import CropScene, crop_scene
 from trainer.views.view import View, crop
 

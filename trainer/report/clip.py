@@ -34,18 +34,6 @@ _MEAN, _SPREAD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0
 
 
 @dataclass(frozen=True)
-class Texts:
-    """What the pictures show before and after, in words; "" is not given.
-
-    `asked`: whether a text was given for this; an instruction alone asks for nothing.
-    """
-
-    before: str
-    after: str
-    asked: bool = False
-
-
-@dataclass(frozen=True)
 class Clip:
     """CLIP's two networks; make it with `load_clip`.
 

@@ -17,17 +17,106 @@ from progdf.field.baked import SliderRemap
 from progdf.field.choose import sample_strengths
 from progdf.field.trajectory import Trajectory
 from progdf.gaussians import Gaussians
-from progdf.metrics.slider import SliderStatistics, slider_statistics
+from progdf.metrics.slider import Pictures, SliderStatistics, slider_statistics
 from progdf.rasterize import alpha_weights, render
 from progdf.terminal import format_count, group_digits
 from trainer.fit.evaluate import Evaluator
 from trainer.fit.fit import Fitted, choice_figures, field_figures, stored_numbers
 from trainer.optimize.losses import Perceptual
-from trainer.report.curves import ErrorCurve, against_editor, error_curves
-from trainer.setup.training_setup import TrainingSetup
+from trainer.options import TextOptions
+from trainer.setup import TrainingSetup
 from trainer.views.view import View, render_view
 
-from .clip import CLIP_MODEL, Clip, Texts, direction, load_clip, same_features
+from .clip import CLIP_MODEL, Clip, direction, load_clip, same_features
+
+
+@dataclass(frozen=True)
+class ErrorCurve:
+    """Errors of pictures along the slider, over all held-out views.
+
+    Args:
+        s: slider values, ascending
+        psnr: over the pixels that count, dB, at most 99
+        ssim: over the same, at most 1
+        lpips: of the views' boxes, ≥ 0 (or what stands in for LPIPS, see `Evaluator.perceptual`)
+    """
+
+    s: tuple[float, ...]
+    psnr: tuple[float, ...]
+    ssim: tuple[float, ...]
+    lpips: tuple[float, ...]
+
+
+def error_curves(
+    evaluator: Evaluator,
+    fields: Mapping[str, BakedField],
+    strengths: Sequence[float],
+    truth: Pictures,
+    perceptual: Perceptual,
+) -> dict[str, ErrorCurve]:
+    """Each field's errors on held-out views, over the slider; see `picture_courses`."""
+
+    def shown(field: BakedField) -> Pictures:
+        return lambda s: evaluator.pictures(field.offsets(s))
+
+    pictures = {name: shown(field) for name, field in fields.items()}
+    return picture_courses(evaluator, pictures, strengths, truth, perceptual)
+
+
+def picture_courses(
+    evaluator: Evaluator,
+    pictures: Mapping[str, Pictures],
+    strengths: Sequence[float],
+    truth: Pictures,
+    perceptual: Perceptual,
+) -> dict[str, ErrorCurve]:
+    """The errors of whatever shows the held-out views, over the slider.
+
+    Args:
+        evaluator: the views
+        pictures: by name: what is shown at a slider value. -> [h,w,3] each
+        strengths: slider values, ascending
+        truth: what the pictures should be at one of them. -> [h,w,3] each
+        perceptual: LPIPS, or its stand-in
+    """
+    rows: dict[str, list[tuple[float, float, float]]] = {name: [] for name in pictures}
+    for s in strengths:
+        expected = truth(s)
+        for name, shown in pictures.items():
+            found = shown(s)
+            rows[name].append(
+                (
+                    evaluator.psnr(found, expected),
+                    evaluator.ssim(found, expected),
+                    evaluator.perceptual(found, expected, perceptual, "measured"),
+                )
+            )
+        perceptual.forget()
+    return {
+        name: ErrorCurve(tuple(strengths), *(tuple(row[i] for row in found) for i in range(3)))
+        for name, found in rows.items()
+    }
+
+
+def against_editor(
+    evaluator: Evaluator,
+    fields: Mapping[str, BakedField],
+    asked: Sequence[tuple[float, float]],
+    perceptual: Perceptual,
+) -> dict[str, ErrorCurve]:
+    """Each field's errors against the editor's own pictures.
+
+    Args:
+        evaluator: held-out views with these pictures
+        fields: by name
+        asked: slider value and the strength that the editor was asked at, ascending
+        perceptual: LPIPS, or its stand-in
+    """
+    strength = dict(asked)
+    return error_curves(
+        evaluator, fields, tuple(strength), lambda s: evaluator.edited[strength[s]], perceptual
+    )
+
 
 COMPARED = "keyframes2"
 """The baseline whose courses stand beside the field's: what anyone would do first."""
@@ -88,8 +177,7 @@ class Measured:
 
 
 def measure(
-    evaluator: Evaluator,
-    reporting: Evaluator,
+    judges: tuple[Evaluator, Evaluator],
     trajectory: Trajectory,
     fitted: Fitted,
     shown: BakedField,
@@ -100,8 +188,7 @@ def measure(
     """Measure the chosen field beside the compared baseline.
 
     Args:
-        evaluator: all held-out views
-        reporting: those of them on which the field was not chosen
+        judges: all held-out views, and those of them on which the field was not chosen
         trajectory: what was recorded
         fitted: the field and its baselines
         shown: the field as it is shipped
@@ -109,7 +196,7 @@ def measure(
         perceptual: LPIPS, or its stand-in
         clip: measured already, or the reason why not
     """
-    field = fitted.chosen.field
+    (evaluator, reporting), field = judges, fitted.chosen.field
     fields = {"slider": field, COMPARED: fitted.baselines[COMPARED].field}
     slider = slider_statistics(lambda s: evaluator.pictures(shown.offsets(s)), masks=evaluator.pixels)
     samples = sample_strengths()[::_EVERY]
@@ -135,23 +222,25 @@ def expected_measures(trajectory: Trajectory) -> int:
     return 30 + 3 * len(sample_strengths()[::_EVERY]) + 2 * len(trajectory.asked) + 2 * _NODES
 
 
-def clip_curve(evaluator: Evaluator, views: Sequence[View], field: BakedField, texts: Texts) -> Direction:
+def clip_curve(
+    evaluator: Evaluator, views: Sequence[View], field: BakedField, texts: TextOptions
+) -> Direction:
     """CLIP directional similarity of the whole held-out views, or the reason why it is not measured.
 
     Args:
         evaluator: held-out views
         views: the same, whole
         field: what the slider shows
-        texts: see `Texts`
+        texts: see `TextOptions`
     """
-    for text, option in ((texts.before, "--text-before"), (texts.after, "--text-after")):
+    for text, option in ((texts.text_before, "--text-before"), (texts.text_after, "--text-after")):
         if not text.strip():
             return Direction(reason=f"{option} was not given: it takes a text for each end of the slider")
     try:
         clip = load_clip(CLIP_MODEL)
     except ProgdfError as error:
         return Direction(reason=str(error))
-    before, after = clip.texts([texts.before, texts.after])
+    before, after = clip.texts([texts.text_before, texts.text_after])
     if bool(same_features(before, after)):
         return Direction(reason="--text-before and --text-after say the same to CLIP")
     original = clip.pictures([view.image for view in views])

@@ -14,6 +14,7 @@ from PIL import Image
 
 PAPER, INK, PALE, GRID = (250, 249, 246), (38, 36, 34), (118, 113, 107), (228, 225, 219)
 LINES = ((34, 84, 180), (214, 96, 36), (60, 150, 90), (150, 70, 160), (196, 158, 28), (70, 160, 180))
+_DASHES = ("-", "--", ":")  # of lines beyond as many as there are colors
 
 _DPI = 100
 _LEFT, _RIGHT, _TOP, _BOTTOM, _LEGEND = 56, 16, 30, 44, 20  # pixels around the axes; a legend's line is below
@@ -63,12 +64,13 @@ def draw_plot(plot: Plot, width: int, height: int) -> Image.Image:
         axes.set(xticks=[], yticks=[])
         axes.text(0.5, 0.5, "nothing to show", color=pale, ha="center", transform=axes.transAxes)
         return _image(figure)
-    for color, (name, (xs, ys)) in zip(LINES, lines.items(), strict=False):
+    for i, (name, (xs, ys)) in enumerate(lines.items()):
+        color, dash = _shade(LINES[i % len(LINES)]), _DASHES[i // len(LINES) % len(_DASHES)]
         if plot.form == "bars":
-            axes.bar(range(len(ys)), ys, width=0.72, color=_shade(color), label=name)
+            axes.bar(range(len(ys)), ys, width=0.72, color=color, label=name)
         else:
             marker = "o" if len(xs) <= _MARKED else ""
-            axes.plot(xs, ys, color=_shade(color), linewidth=1.5, marker=marker, markersize=3.5, label=name)
+            axes.plot(xs, ys, dash, color=color, linewidth=1.5, marker=marker, markersize=3.5, label=name)
     axes.set_axisbelow(True)
     axes.grid(color=grid, axis="y" if plot.form == "bars" else "both")
     if plot.form == "bars":

@@ -13,10 +13,10 @@ from progdf.field import BakedField
 from progdf.field.choose import sample_strengths
 from progdf.io.images import contact_sheet, to_picture
 from trainer.fit.evaluate import Evaluator
-from trainer.optimize.objective import Losses
-from trainer.report.curves import ErrorCurve
+from trainer.optimize.losses import Losses
 from trainer.report.measures import COMPARED, Direction, Measured
 
+from .measures import ErrorCurve
 from .plots import PAPER, Plot, Points, draw_plot
 
 SHOWN = (0.0, 0.25, 0.5, 0.75, 1.0)

@@ -19,11 +19,80 @@ from progdf.camera import Camera
 from progdf.gaussians import ATTRIBUTES, Gaussians, attribute_slices, unpack
 from progdf.rasterize import ActivatedGaussians, Crop, Rendering, activate, render
 from progdf.rasterize.cpu.engine import ColorMap, color_map
+from progdf.rasterize.cpu.forward import TILE_H, TILE_W
 from progdf.sh import C0, basis
 from progdf.threads import threads
 
-from .tiles import live_pixels, live_tiles, may_reach
 from .view import seen_colors
+
+_SUPPORT = 2 * 5.55
+"""Most squared Mahalanobis distance at which alpha ≥ 1/255: 2 ln 255, rounded up."""
+
+_DILATION = 0.3
+"""Pixels² that the rasterizer adds to a projected covariance."""
+
+
+def live_tiles(contributes: Tensor, box: Crop) -> Tensor:
+    """The tiles in which some pixel of a box is set, on the tile grid of the full image.
+
+    Args:
+        contributes: pixels of the box. [h,w] bool
+        box: x0, y0, x1, y1 in the full image
+
+    Returns:
+        [rows, columns] bool; tiles from the image's left top to the box's right bottom
+    """
+    x0, y0, x1, y1 = box
+    rows, columns = -(-y1 // TILE_H), -(-x1 // TILE_W)
+    whole = torch.zeros(rows * TILE_H, columns * TILE_W, dtype=torch.bool)
+    whole[y0:y1, x0:x1] = contributes
+    return whole.view(rows, TILE_H, columns, TILE_W).any(dim=3).any(dim=1)
+
+
+def live_pixels(live: Tensor, box: Crop) -> Tensor:
+    """The pixels of a box that lie in live tiles. [rows, columns] bool -> [h,w] bool"""
+    x0, y0, x1, y1 = box
+    return live.repeat_interleave(TILE_H, dim=0).repeat_interleave(TILE_W, dim=1)[y0:y1, x0:x1]
+
+
+def may_reach(means: Tensor, scales: Tensor, camera: Camera, live: Tensor) -> Tensor:
+    """Which Gaussians may reach into a live tile; too many rather than too few.
+
+    The bound: the largest axis, through the Jacobian of the projection at the place where the rasterizer
+    takes it (Kerbl 2023 clamps it to 1.3 times the field of view), is the largest a projected axis can be.
+
+    Args:
+        means, scales: activated. [n,3], [n,3]
+        camera: the whole view
+        live: as from `live_tiles`
+
+    Returns:
+        [n] bool
+    """
+    seen = means.double() @ camera.viewmat[:3, :3].T.double() + camera.viewmat[:3, 3].double()
+    z = seen[:, 2].clamp_min(camera.near)
+    K = camera.K.double()
+    focal = torch.stack([K[0, 0], K[1, 1]])
+    size = torch.tensor([camera.width, camera.height], dtype=torch.float64)
+    slope = seen[:, :2] / z[:, None]
+    center = slope * focal + K[:2, 2]
+    # at least as far out as the rasterizer's clamp, which leaves 0.15 of the picture beyond each edge
+    most = torch.maximum(K[:2, 2], size - K[:2, 2]) / focal + 0.2 * size / focal
+    widened = 1 + slope.abs().minimum(most).square().sum(dim=1)
+    spread = (scales.double().amax(dim=1) * focal.max() / z).square() * widened + _DILATION
+    radius = (_SUPPORT * spread).sqrt() + 1.0
+    rows, columns = live.shape
+    step = torch.tensor([TILE_W, TILE_H], dtype=torch.float64)
+    last = torch.tensor([columns, rows])
+    low = ((center - radius[:, None]) / step).floor().clamp(min=0).minimum(last).nan_to_num(0.0).long()
+    high = ((center + radius[:, None]) / step).floor().clamp(min=-1).minimum(last - 1).nan_to_num(
+        0.0
+    ).long() + 1
+    sums = torch.zeros(rows + 1, columns + 1, dtype=torch.int64)
+    sums[1:, 1:] = live.long().cumsum(0).cumsum(1)
+    (left, top), (right, bottom) = low.unbind(1), high.unbind(1)
+    found = sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]
+    return found > 0
 
 
 @dataclass(frozen=True)
@@ -41,7 +110,6 @@ class CropScene:
         cached: pixels that are drawn [h,w,1] bool, and the original picture [h,w,3], which the others are;
             None where all are drawn
         still: nothing but the members' colors ever differs
-        leads_back: clamps of colors and pixels pass gradients that lead back into range, see `clamp`
     """
 
     camera: Camera
@@ -52,7 +120,6 @@ class CropScene:
     background: Tensor
     cached: tuple[Tensor, Tensor] | None = None
     still: bool = False
-    leads_back: bool = True
 
     @property
     def size(self) -> tuple[int, int]:
@@ -71,10 +138,10 @@ class CropScene:
             moving: attributes whose values differ from the original's; the others are not looked at
 
         Returns:
-            image [h,w,3], 0..1 (see `leads_back`); transmittance [h,w]
+            image [h,w,3], 0..1 (see `clamp_towards`); transmittance [h,w]
         """
         members = unpack(packed, self.member_shN)
-        colors = member_colors(members, self.camera.position, self.leads_back)
+        colors = member_colors(members, self.camera.position)
         if self.still and not colors.requires_grad:
             weighed, others, transmittance = self._linear
             image = others + weighed.picture(colors)
@@ -92,7 +159,7 @@ class CropScene:
         if self.cached is not None:
             live, original = self.cached
             image = torch.where(live, image, original)
-        return (clamp_towards if self.leads_back else torch.clamp)(image, 0.0, 1.0), transmittance
+        return clamp_towards(image, 0.0, 1.0), transmittance
 
     @cached_property
     def _linear(self) -> tuple[ColorMap, Tensor, Tensor]:
@@ -119,18 +186,18 @@ COLORS = ("sh0", "shN")
 """The others."""
 
 
-def member_colors(members: Gaussians, eye: Tensor, leads_back: bool = True) -> Tensor:
-    """SH colors seen from `eye`; a channel clamped at 0 keeps the gradient that would raise it, or not. [M,3]
+def member_colors(members: Gaussians, eye: Tensor) -> Tensor:
+    """SH colors seen from `eye`; a channel clamped at 0 keeps the gradient that would raise it. [M,3]
 
     Directions are constants here: their share of the means' gradient is small and mostly noise.
     """
-    degree, clamp = min(members.sh_degree, 3), clamp_towards if leads_back else torch.clamp
+    degree = min(members.sh_degree, 3)
     if degree == 0:
-        return clamp(members.sh0 * C0 + 0.5, 0.0, float("inf"))
+        return clamp_towards(members.sh0 * C0 + 0.5, 0.0, float("inf"))
     directions = torch.nn.functional.normalize(members.means.detach() - eye, dim=1)
     weights = basis(degree, directions)
     raw = (weights[..., None] * members.sh[:, : weights.shape[1]]).sum(dim=1) + 0.5
-    return clamp(raw, 0.0, float("inf"))
+    return clamp_towards(raw, 0.0, float("inf"))
 
 
 def crop_scene(
@@ -140,7 +207,6 @@ def crop_scene(
     box: Crop,
     background: Tensor,
     still: bool = False,
-    leads_back: bool = True,
 ) -> CropScene:
     """Prepare one view.
 
@@ -152,7 +218,6 @@ def crop_scene(
         background: rgb. [3]
         still: nothing but colors will move, so only the tiles that show a member are drawn, see `tiles`, and
             without gradients a linear map of the members' colors; transmittance is right in these only
-        leads_back: see `CropScene`
     """
     activated = activate(scene, seen_colors(scene, camera))
     kept = render(activated, camera, background, crop=box).info.visible.clone()
@@ -165,7 +230,6 @@ def crop_scene(
         torch.searchsorted(index, members),
         scene.shN[members],
         background,
-        leads_back=leads_back,
     )
     return _keep_live_tiles(replace(whole, still=True)) if still else whole
 

@@ -20,7 +20,7 @@ from progdf.io.atomic import atomic_write
 from progdf.rasterize.cpu import jit
 from tests.helpers.paths import ROOT
 from tests.helpers.scenes import random_gaussians
-from trainer.regions.options import RegionOptions, ViewsOptions
+from trainer.options import ShowRegionOptions, WriteViewsOptions
 
 
 def stderr_of(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
@@ -91,21 +91,22 @@ def test_an_option_that_does_not_exist_is_one_line(command: str, capsys: pytest.
     assert f"see progdf {command} --help" in said
 
 
-NO_SUITE = (
-    "invalid choice 'tables' for argument '--suite'. Expected one of ('sliders'); see progdf evaluate --help"
+NO_PRESET = (
+    "invalid choice 'tables' for argument '--preset'. Expected one of ('default', 'paper'); "
+    "see progdf train --help"
 )
 
 
 def test_a_choice_that_is_none_names_those_there_are(capsys: pytest.CaptureFixture[str]) -> None:
-    said = stderr_of(capsys, "evaluate", "run", "--suite", "tables")
-    assert said == f"progdf: {NO_SUITE}\n"
+    said = stderr_of(capsys, "train", "scene.ply", "--preset", "tables")
+    assert said == f"progdf: {NO_PRESET}\n"
 
 
 def test_options_are_refused_in_one_line_where_no_frame_can_be_drawn() -> None:
-    command = [sys.executable, "-m", "progdf", "evaluate", "run", "--suite", "tables"]
+    command = [sys.executable, "-m", "progdf", "train", "scene.ply", "--preset", "tables"]
     env = {**os.environ, "PYTHONIOENCODING": "ascii"}
     refused = subprocess.run(command, env=env, capture_output=True, text=True, check=False)
-    assert (refused.returncode, refused.stderr) == (2, f"progdf: {NO_SUITE}\n")
+    assert (refused.returncode, refused.stderr) == (2, f"progdf: {NO_PRESET}\n")
 
 
 @pytest.mark.parametrize("threads", ["-1", "99999"])
@@ -247,16 +248,16 @@ def test_settings_that_numba_does_not_work_with_are_one_line(monkeypatch: pytest
 @pytest.mark.parametrize(
     ("words", "writer"),
     [
-        (["views", "scene.ply", "--out"], "trainer.regions.originals.write"),
+        (["views", "scene.ply", "--out"], "trainer.regions.command.write"),
         (["region", "scene.ply", "all", "-o"], "trainer.regions.command.show"),
     ],
 )
 def test_control_characters_of_own_arguments_are_escaped(
     words: list[str], writer: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def wrote(options: ViewsOptions | RegionOptions) -> str | list[str]:
+    def wrote(options: WriteViewsOptions | ShowRegionOptions) -> str | list[str]:
         said = f"wrote {options.out}"
-        return said if isinstance(options, ViewsOptions) else [said]
+        return said if isinstance(options, WriteViewsOptions) else [said]
 
     monkeypatch.setattr(writer, wrote)
     assert main([*words, "a\x1b[2J\n.png"]) == 0

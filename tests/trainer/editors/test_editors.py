@@ -17,6 +17,7 @@ from progdf.sh import rgb_to_sh0, sh0_to_rgb
 from tests.helpers.trained import WHITE, small
 from trainer.editors import EDITORS, check_editor, make_editor
 from trainer.editors.procedural import StripesEditor
+from trainer.options import EditorOptions
 from trainer.views.view import make_view
 
 PROCEDURAL = (
@@ -32,7 +33,7 @@ PROCEDURAL = (
 @pytest.mark.parametrize("spec", PROCEDURAL)
 def test_strength_zero_is_the_original_view_bit_for_bit(spec: str) -> None:
     case = small()
-    editor = make_editor(spec, case.scene, case.region, case.views)
+    editor = make_editor(EditorOptions(spec), case.scene, case.region, case.views)
     for view in case.views:
         assert torch.equal(editor.edit(view, 0.0), view.image)
 
@@ -41,7 +42,7 @@ def test_strength_zero_is_the_original_view_bit_for_bit(spec: str) -> None:
 def test_pixels_that_do_not_show_the_region_keep_their_color(spec: str) -> None:
     case = small()
     view = case.views[0]
-    edited = make_editor(spec, case.scene, case.region, case.views).edit(view, 1.0)
+    edited = make_editor(EditorOptions(spec), case.scene, case.region, case.views).edit(view, 1.0)
     assert torch.equal(edited[view.mask == 0], view.image[view.mask == 0])
     assert float((edited - view.image).abs().max()) > 0.1, "and the region changes"
 
@@ -50,7 +51,7 @@ def test_pixels_that_do_not_show_the_region_keep_their_color(spec: str) -> None:
 def test_the_edit_grows_continuously_with_the_strength(spec: str) -> None:
     case = small()
     view = case.views[0]
-    editor = make_editor(spec, case.scene, case.region, case.views)
+    editor = make_editor(EditorOptions(spec), case.scene, case.region, case.views)
     pictures = [editor.edit(view, s / 50) for s in range(51)]
     steps = [float((b - a).abs().max()) for a, b in pairwise(pictures)]
     assert max(steps) < 0.25
@@ -82,7 +83,7 @@ def test_stripes_are_painted_on_the_thing_and_so_the_same_from_everywhere() -> N
     case = small("body")
     matt = replace(case.scene, shN=case.scene.shN[:, :0])
     views = [make_view(matt, case.region, view.camera, WHITE) for view in case.views]
-    editor = make_editor("stripes:#20a040", matt, case.region, views)
+    editor = make_editor(EditorOptions("stripes:#20a040"), matt, case.region, views)
     assert isinstance(editor, StripesEditor)
     rows = case.region.members
     painted = editor.paint(sh0_to_rgb(matt.sh0[rows]).clamp_min(0), 1.0)
@@ -113,7 +114,7 @@ def test_stripes_are_painted_on_the_thing_and_so_the_same_from_everywhere() -> N
 def test_an_editor_that_makes_no_sense_is_one_line_that_says_what_would(spec: str) -> None:
     case = small()
     with pytest.raises(ProgdfError, match="; ") as told:
-        make_editor(spec, case.scene, case.region, case.views)
+        make_editor(EditorOptions(spec), case.scene, case.region, case.views)
     assert "\n" not in str(told.value)
 
 
@@ -127,7 +128,7 @@ def test_a_folder_of_edited_views_comes_back_as_it_was_saved(tmp_path: Path) -> 
     for view, picture in zip(case.views, half, strict=True):
         write_image(tmp_path / f"{view.camera.name}.png", picture)
         write_image(tmp_path / "0.5" / f"{view.camera.name}.png", view.image)
-    editor = make_editor(f"folder:{tmp_path}", case.scene, case.region, case.views)
+    editor = make_editor(EditorOptions(f"folder:{tmp_path}"), case.scene, case.region, case.views)
     assert editor.stages == (0.5, 1.0)
     for view, picture in zip(case.views, half, strict=True):
         assert torch.allclose(editor.edit(view, 1.0), picture, atol=1e-6)
@@ -140,7 +141,7 @@ def test_a_larger_edited_view_is_scaled_and_transparency_is_white(tmp_path: Path
     for view in case.views:
         side = 2 * view.camera.width
         Image.new("RGBA", (side, side), (255, 0, 0, 0)).save(tmp_path / f"{view.camera.name}.png")
-    editor = make_editor(f"folder:{tmp_path}", case.scene, case.region, case.views)
+    editor = make_editor(EditorOptions(f"folder:{tmp_path}"), case.scene, case.region, case.views)
     assert torch.equal(editor.edit(case.views[0], 1.0), torch.ones_like(case.views[0].image))
 
 
@@ -165,7 +166,7 @@ def test_a_folder_that_does_not_fit_is_refused_in_one_line(tmp_path: Path, damag
         (tmp_path / "1.5").mkdir()
 
     def edit_all() -> None:
-        editor = make_editor(f"folder:{where}", case.scene, case.region, case.views)
+        editor = make_editor(EditorOptions(f"folder:{where}"), case.scene, case.region, case.views)
         for view in case.views:
             editor.edit(view, 1.0)
 

@@ -16,9 +16,9 @@ from PIL import Image
 from progdf.errors import ProgdfError
 from tests.helpers.tiny_pipelines import tiny_flux2_klein, tiny_flux_kontext, tiny_instruct_pix2pix
 from tests.helpers.trained import quick_options, small, train, write_bear
-from trainer.editors import EditorSettings, make_editor
-from trainer.editors.adapters import ADAPTERS
-from trainer.editors.instruct import InstructEditor
+from trainer.editors import make_editor
+from trainer.editors.instruct import ADAPTERS, InstructEditor
+from trainer.options import EditorOptions
 
 BATMAN = 'instruct:"turn him into Batman"'
 
@@ -38,13 +38,13 @@ def pix2pix(diffusers: None, tmp_path_factory: pytest.TempPathFactory) -> str:
     return str(tiny_instruct_pix2pix(tmp_path_factory.mktemp("pix2pix")))
 
 
-def settings_of(model: str, **more: object) -> EditorSettings:
-    return replace(EditorSettings(model=model, size=64, steps=2), **more)  # type: ignore[arg-type]
+def settings_of(model: str, **more: object) -> EditorOptions:
+    return replace(EditorOptions(BATMAN, model, edit_size=64, edit_steps=2), **more)  # type: ignore[arg-type]
 
 
-def editor_of(settings: EditorSettings, spec: str = BATMAN) -> InstructEditor:
+def editor_of(settings: EditorOptions, spec: str = BATMAN) -> InstructEditor:
     case = small()
-    editor = make_editor(spec, case.scene, case.region, case.views, settings)
+    editor = make_editor(replace(settings, editor=spec), case.scene, case.region, case.views)
     assert isinstance(editor, InstructEditor)
     return editor
 
@@ -69,8 +69,10 @@ def test_the_same_seed_gives_the_same_picture_and_another_another(pix2pix: str) 
     assert float((first - other).abs().mean()) > 0.01
 
 
-@pytest.mark.parametrize("change", [{"guidance": 2.0}, {"image_guidance": 4.0}, {"steps": 3}, {"size": 96}])
-def test_every_option_reaches_the_pipeline(pix2pix: str, change: dict[str, float]) -> None:
+@pytest.mark.parametrize(
+    "change", [{"guidance": "2"}, {"guidance": "7.5,4"}, {"edit_steps": 3}, {"edit_size": 96}]
+)
+def test_every_option_reaches_the_pipeline(pix2pix: str, change: dict[str, object]) -> None:
     view = small().views[0]
     plain, changed = (editor_of(settings_of(pix2pix, **more)).edit(view, 1.0) for more in ({}, change))
     assert not torch.equal(plain, changed)
@@ -92,13 +94,13 @@ def test_one_target_by_default_and_strengths_by_guidance_on_request(pix2pix: str
         editor_of(settings_of(pix2pix)).edit(view, 0.5)
     graded = editor_of(settings_of(pix2pix, graded=True))
     assert graded.stages == ()
-    half = editor_of(settings_of(pix2pix, guidance=4.25)).edit(view, 1.0)  # half way from 1 to 7.5
+    half = editor_of(settings_of(pix2pix, guidance="4.25")).edit(view, 1.0)  # half way from 1 to 7.5
     assert torch.equal(graded.edit(view, 0.5), half)
 
 
 def test_a_view_is_edited_once_for_all_runs(pix2pix: str, tmp_path: Path) -> None:
     view = small().views[0]
-    settings = settings_of(pix2pix, kept=tmp_path)
+    settings = settings_of(pix2pix, cache=tmp_path)
     first = editor_of(settings).edit(view, 1.0)
     note = json.loads((tmp_path / f"{view.camera.name}.json").read_text())
     assert note["editor"]["instruct"] == "turn him into Batman"
@@ -130,7 +132,7 @@ def test_missing_weights_are_one_line_that_names_what_to_download(
 ) -> None:
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
     with pytest.raises(ProgdfError, match=f"hf download {model}") as told:
-        editor_of(EditorSettings(model=model))
+        editor_of(EditorOptions(BATMAN, model))
     assert "\n" not in str(told.value)
 
 
@@ -159,18 +161,18 @@ def test_a_folder_that_is_no_whole_pipeline_is_one_line(pix2pix: str, damage: st
 
 def test_image_guidance_for_a_model_without_it_is_one_line(diffusers: None, tmp_path: Path) -> None:
     with pytest.raises(ProgdfError, match="does not support guidance of the picture; "):
-        editor_of(settings_of(str(tiny_flux_kontext(tmp_path)), image_guidance=1.5))
+        editor_of(settings_of(str(tiny_flux_kontext(tmp_path)), guidance="2.5,1.5"))
 
 
 def test_an_empty_sentence_is_one_line() -> None:
     with pytest.raises(ProgdfError, match="needs an instruction; "):
-        editor_of(EditorSettings(), 'instruct:""')
+        editor_of(EditorOptions(""), 'instruct:""')
 
 
 def test_without_the_packages_one_line_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "diffusers", None)
     with pytest.raises(ProgdfError, match=r"pip install progdf-studio\[diffusion\]"):
-        editor_of(EditorSettings())
+        editor_of(EditorOptions(""))
 
 
 def test_a_run_is_trained_on_what_a_pipeline_makes_of_its_views(pix2pix: str, tmp_path: Path) -> None:

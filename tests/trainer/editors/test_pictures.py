@@ -18,9 +18,10 @@ from progdf.rasterize import render
 from progdf.region import whole_scene
 from progdf.scene.orbit_rig import orbit_rig
 from tests.helpers.scenes import ball
-from trainer.editors import EditorSettings, check_new_editor, make_editor
+from trainer.editors import check_new_editor, make_editor
 from trainer.editors.pictures import background_of, picture_cameras, picture_paths
-from trainer.setup.training_setup import quantize_image
+from trainer.options import EditorOptions
+from trainer.setup import quantize_image
 from trainer.views.view import View, make_view, render_view
 
 WHITE = torch.ones(3)
@@ -46,7 +47,7 @@ def test_a_picture_is_its_view_s_edit(tmp_path: Path) -> None:
     shown = render_view(scene, camera, WHITE).clamp(0, 1)  # as a view is: a picture knows nothing above white
     path = save(tmp_path / "A.png", 1 - 0.5 * shown, camera)
     (view,) = views_of(scene, path)
-    editor = make_editor(f"pictures:{path}", scene, whole_scene(scene), [view])
+    editor = make_editor(EditorOptions(f"pictures:{path}"), scene, whole_scene(scene), [view])
     assert editor.stages == (1.0,)
     assert editor.kind == "color"
     assert torch.equal(editor.edit(view, 0.0), view.image)
@@ -81,16 +82,16 @@ def test_subfolders_hold_the_strengths_between(tmp_path: Path) -> None:
     (tmp_path / "2024").mkdir()  # a folder of something else
     spec = f"pictures:{paths[0]},{paths[1]}"
     views = views_of(scene, *paths)
-    editor = make_editor(spec, scene, whole_scene(scene), views)
+    editor = make_editor(EditorOptions(spec), scene, whole_scene(scene), views)
     assert editor.stages == (0.5, 1.0)
     half = editor.edit(views[1], 0.5)
     assert float((half - 0.75 * views[1].image)[views[1].mask > 0.99].abs().max()) < 0.02
     (tmp_path / "0.5" / "B.png").unlink()
     with pytest.raises(ProgdfError, match=r"0\.5/B\.png is missing; every picture needs one"):
-        make_editor(spec, scene, whole_scene(scene), views)
+        make_editor(EditorOptions(spec), scene, whole_scene(scene), views)
     (tmp_path / "0.5" / "A.png").rename(tmp_path / "2024" / "A.png")
     with pytest.raises(ProgdfError, match="not between 0 and 1; name it"):
-        make_editor(spec, scene, whole_scene(scene), views)
+        make_editor(EditorOptions(spec), scene, whole_scene(scene), views)
 
 
 def test_a_picture_of_another_size_brings_its_camera_along(tmp_path: Path) -> None:
@@ -121,7 +122,7 @@ def test_what_is_no_list_of_pictures_is_one_line(tmp_path: Path) -> None:
         (f"{tmp_path}/A.png,{tmp_path}/B/A.jpg", "two pictures are named A; name"),
     ):
         with pytest.raises(ProgdfError, match=message):
-            check_new_editor(f"pictures:{what}", EditorSettings())
+            check_new_editor(EditorOptions(f"pictures:{what}"))
     many = [tmp_path / f"{i}.png" for i in range(33)]
     for path in many:
         path.touch()
@@ -142,5 +143,5 @@ def test_a_shift_by_two_pixels_is_undone_before_training(tmp_path: Path) -> None
     painted[20:26, 28:34] = torch.tensor([0.1, 0.2, 0.9])
     path = save(tmp_path / "A.png", painted.roll((-2, 1), (0, 1)), camera)
     (view,) = views_of(scene, path)
-    edited = make_editor(f"pictures:{path}", scene, whole_scene(scene), [view]).edit(view, 1.0)
+    edited = make_editor(EditorOptions(f"pictures:{path}"), scene, whole_scene(scene), [view]).edit(view, 1.0)
     assert float((edited - painted)[4:-4, 4:-4].abs().max()) < 0.01

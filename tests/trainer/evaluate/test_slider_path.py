@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from tests.helpers.scenes import orbit_camera
-from trainer.evaluate.camera_path import FRAMES, camera_path, neighbor_similarity
+from trainer.evaluate.consistency import FRAMES, camera_path, neighbor_similarity
 from trainer.evaluate.measures import SliderPath, slider_path
 from trainer.fit.evaluate import Evaluator
 

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-import trainer.pipeline.run
+import trainer.run.run
 from progdf.errors import ProgdfError
 from progdf.field import neural_fit
 from progdf.field.neural_fit import NeuralFit, NeuralSettings
@@ -19,12 +19,11 @@ from progdf.formats.ply import load_ply
 from progdf.gdf.file import load_gdf
 from tests.helpers.edits import curved_trajectory
 from tests.helpers.trained import quick_options
-from trainer.fit.memory_bank import JointTraining, MemoryBank
-from trainer.option_checks import check_network_options, check_options
-from trainer.options import FitOptions
-from trainer.pipeline.refit import refit
-from trainer.pipeline.run import RunResult
-from trainer.plan import make_plan
+from trainer.fit.network import JointTraining, MemoryBank
+from trainer.options import FitOptions, with_values
+from trainer.resolve import check_field_options, check_options
+from trainer.run.finish import refit
+from trainer.run.run import RunResult
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -43,14 +42,8 @@ def short_fits() -> Iterator[None]:
 def train_jointly(folder: Path, out: str, resume: bool = False) -> RunResult:
     """A short run whose network sees positions and is trained beside the members."""
     settings = {"steps": 60, "stages": 2, "views": 5, "image_size": 56, "field": "neural", "name": "joint"}
-    plan = make_plan(quick_options(folder, out, **settings))
-    network = replace(plan.field.network, inputs="position")
-    plan = replace(
-        plan,
-        optimization=replace(plan.optimization, joint=True),
-        field=replace(plan.field, network=network),
-    )
-    return trainer.pipeline.run.train(plan, folder / out, 1, resume, quiet=True)
+    options = quick_options(folder, out, **settings, as_printed=True, resume=resume)
+    return trainer.run.run.train(options, quiet=True)
 
 
 @pytest.fixture(scope="module")
@@ -177,12 +170,13 @@ def test_a_refit_trains_a_network_on_what_was_recorded(folder: Path, alongside: 
     before = alongside.folder.trajectory.read_bytes()
     kept = alongside.gdf.read_bytes()
     found = refit(
-        FitOptions(alongside.folder.root, field="neural", field_loss="pictures", threads=1), quiet=True
+        with_values(FitOptions(alongside.folder.root), field="neural", field_loss="pictures", threads=1),
+        quiet=True,
     )
     assert alongside.folder.trajectory.read_bytes() == before
     origin = load_gdf(found.gdf, load_ply(folder / "scene.ply")).field.origin
     assert origin is not None
-    assert (origin.network.shape.inputs, origin.network.shape.code) == ("position", 8)
+    assert (origin.network.shape.inputs, origin.network.shape.code) == ("position", 0)
     trajectory, _, _ = load_trajectory(found.folder.trajectory)
     assert _end(found, folder).equal(trajectory.end)
     alongside.gdf.write_bytes(kept)
@@ -211,4 +205,4 @@ def test_network_options_that_mean_nothing_are_told(
 
 def test_a_refit_knows_its_options_too(folder: Path) -> None:
     with pytest.raises(ProgdfError, match="--size does not apply"):
-        check_network_options(FitOptions(folder, size="small"))
+        check_field_options(with_values(FitOptions(folder), size="small").field)

@@ -16,12 +16,11 @@ from progdf.gaussians import pack
 from progdf.metrics.slider import slider_statistics
 from tests.helpers.trained import WHITE, quick_options, small
 from trainer.editors import make_editor
-from trainer.editors.base import EditKind
 from trainer.fit.slider_uniformity import equalize_slider, equalized_strengths, equalizing_remap
-from trainer.optimize.settings import resolve_slider
-from trainer.options import Slider
-from trainer.plan import make_plan
-from trainer.setup.training_setup import TrainingSetup
+from trainer.optimize.retime import resolve_slider
+from trainer.options import EditKind, EditorOptions, Slider
+from trainer.resolve import resolve
+from trainer.setup import TrainingSetup
 from trainer.views.crops import crop_scene, render_all
 from trainer.views.view import View
 
@@ -125,8 +124,8 @@ def test_a_fitted_field_is_as_even_in_views_that_were_not_looked_at() -> None:
 
 def test_auto_is_even_but_pinned_where_pictures_of_several_strengths_were_given() -> None:
     def resolved(slider: Slider, editor: str, strengths: tuple[float, ...] = QUARTERS) -> str:
-        plan = make_plan(quick_options(Path("nowhere"), editor=editor, slider=slider))
-        return resolve_slider(plan.slider, strengths)
+        options = resolve(quick_options(Path("nowhere"), editor=editor, slider=slider))
+        return resolve_slider(options.optimize.slider, strengths)
 
     assert resolved("auto", "recolor:#3060d0") == "even"
     assert resolved("auto", "folder:here", (1.0,)) == "even"
@@ -138,7 +137,7 @@ def test_auto_is_even_but_pinned_where_pictures_of_several_strengths_were_given(
 
 def test_the_stripes_of_a_scarf_are_asked_for_where_they_show() -> None:
     case = small(count=6)
-    editor = make_editor("stripes:#20a040", case.scene, case.region, case.views)
+    editor = make_editor(EditorOptions("stripes:#20a040"), case.scene, case.region, case.views)
     asked = equalized_strengths(editor, "stripes:#20a040", case.views, QUARTERS)
     assert asked != QUARTERS
     assert all(a < b for a, b in pairwise((0.0, *asked)))

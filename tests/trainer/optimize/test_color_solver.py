@@ -16,11 +16,10 @@ from progdf.region import Region
 from progdf.sh import rgb_to_sh0
 from tests.helpers.scenes import random_gaussians
 from trainer.optimize.color_solver import iterations, make_solver, solve
-from trainer.optimize.optimizer_state import PgsState
-from trainer.optimize.pgs import ParameterSnapshot, TargetStage
+from trainer.optimize.pgs import ParameterSnapshot, PgsState, TargetStage
 from trainer.optimize.unseen import UnseenMembers
 from trainer.options import QUICK_STEPS
-from trainer.setup.resolution import unresolved_share
+from trainer.setup import unresolved_share
 from trainer.views.crops import CropScene, crop_scene, render_all
 
 WHITE = torch.ones(3)

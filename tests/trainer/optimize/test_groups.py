@@ -26,10 +26,10 @@ from trainer.motion.similarity import (
     move_rows,
 )
 from trainer.optimize.groups import Groups, group_path, group_stage, restore_groups
-from trainer.optimize.losses import GradientL1
-from trainer.optimize.objective import LossWeights, Objective
+from trainer.optimize.losses import GradientL1, Objective
 from trainer.optimize.pgs import PgsSettings, TargetStage, learning_rates, optimize
-from trainer.pipeline.run import RunResult
+from trainer.options import OptimizeOptions
+from trainer.run.run import RunResult
 from trainer.views.crops import CropScene, crop_scene
 from trainer.views.view import crop
 
@@ -237,7 +237,7 @@ def test_no_member_grows_beyond_the_clamp() -> None:
     largest = []
     for growth in (1.2, math.inf):
         settings = PgsSettings(20 * learning_rates("geometry", rows.shape[1], 1.0), growth=growth, ramp=0.0)
-        objective = Objective(GradientL1(), LossWeights(0.0))
+        objective = Objective(GradientL1(), OptimizeOptions(perceptual_weight=0.0))
         *_, last = optimize(rows, crops, crops[:1], [TargetStage(1.0, targets, 12)], objective, settings)
         largest.append(float(last.offsets[:, attribute_slices(14)["log_scales"]].exp().max()))
     assert largest[0] < 1.2001

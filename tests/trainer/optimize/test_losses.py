@@ -7,9 +7,9 @@ from itertools import pairwise
 import pytest
 import torch
 
-import trainer.optimize.losses as losses
 from progdf.errors import ProgdfError
 from progdf.metrics.lpips import Lpips
+from trainer.optimize import losses
 from trainer.optimize.losses import GradientL1, LpipsLoss, perceptual_loss, warmup
 from trainer.views.crops import clamp_towards
 

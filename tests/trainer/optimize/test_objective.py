@@ -15,10 +15,22 @@ from progdf.metrics.lpips import Lpips
 from tests.helpers.count import Count
 from tests.helpers.trained import WHITE, small
 from trainer.editors import make_editor
-from trainer.optimize.losses import GradientL1, LpipsLoss, erode, l1, progressive_change, sharpness
-from trainer.optimize.objective import LossWeights, Moment, Objective, TermMeans, loss_table, total_loss
+from trainer.optimize.losses import (
+    GradientL1,
+    LpipsLoss,
+    Moment,
+    Objective,
+    TermMeans,
+    describe_loss,
+    erode,
+    l1,
+    loss_table,
+    progressive_change,
+    sharpness,
+    total_loss,
+)
 from trainer.optimize.pgs import ParameterSnapshot, PgsSettings, TargetStage, learning_rates, optimize
-from trainer.options import Norm, Progressive
+from trainer.options import EditorOptions, Norm, OptimizeOptions, Progressive
 from trainer.views.crops import crop_scene
 from trainer.views.view import crop
 
@@ -36,7 +48,12 @@ def moment(**more: object) -> Moment:
     return replace(settled, **more)  # type: ignore[arg-type]
 
 
-ALL_TERMS = LossWeights(0.3, 1, "decay", 5.0, "hinge", 0.5)
+def paying(perceptual_weight: float = 0.1, **more: object) -> OptimizeOptions:
+    """What an objective is to pay for."""
+    return replace(OptimizeOptions(), perceptual_weight=perceptual_weight, **more)  # type: ignore[arg-type]
+
+
+ALL_TERMS = paying(0.3, perceptual_every=1, progressive="decay", sharpness="hinge")
 
 
 # ---- gradients
@@ -96,10 +113,12 @@ def test_each_term_has_its_name_and_their_sum_is_the_loss() -> None:
     assert float(total_loss(terms).detach()) == pytest.approx(sum(float(x.detach()) for x in terms.values()))
 
 
-def test_weights_scale_their_terms_and_leave_l1_alone() -> None:
-    doubled = replace(ALL_TERMS, perceptual=0.6, progressive_weight=10.0, sharpness_weight=1.0)
+def test_weights_scale_their_terms_and_leave_l1_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     now = moment(image=0.5 * noise(8, 9, 3))
-    single, double = (Objective(GradientL1(), weights).terms(now) for weights in (ALL_TERMS, doubled))
+    single = Objective(GradientL1(), ALL_TERMS).terms(now)
+    monkeypatch.setattr("trainer.optimize.losses.PROGRESSIVE_WEIGHT", 10.0)
+    monkeypatch.setattr("trainer.optimize.losses.SHARPNESS_WEIGHT", {"hinge": 0.2})
+    double = Objective(GradientL1(), replace(ALL_TERMS, perceptual_weight=0.6)).terms(now)
     for name, value in single.items():
         assert float(value.detach()) > 0
         factor = 1.0 if name == "l1" else 2.0
@@ -107,7 +126,7 @@ def test_weights_scale_their_terms_and_leave_l1_alone() -> None:
 
 
 def test_the_perceptual_term_is_paid_every_so_many_steps_and_only_at_the_stages_own_picture() -> None:
-    objective = Objective(GradientL1(), LossWeights(perceptual_every=3))
+    objective = Objective(GradientL1(), paying(perceptual_every=3))
     paid = ["perceptual" in objective.terms(moment(local=local)) for local in range(6)]
     assert paid == [True, False, False, True, False, False]
     assert "perceptual" not in objective.terms(moment(local=0, arrived=False))
@@ -115,7 +134,7 @@ def test_the_perceptual_term_is_paid_every_so_many_steps_and_only_at_the_stages_
 
 @pytest.mark.parametrize("progressive", ["warmup", "off"])
 def test_a_warm_up_is_no_loss(progressive: str) -> None:
-    terms = Objective(GradientL1(), LossWeights(progressive=progressive)).terms(moment())  # type: ignore[arg-type]
+    terms = Objective(GradientL1(), paying(progressive=progressive)).terms(moment())  # type: ignore[arg-type]
     assert "progressive" not in terms
 
 
@@ -126,14 +145,14 @@ def test_a_new_stage_forgets_the_targets_of_the_last() -> None:
         def forget(self) -> None:
             forgotten.append(True)
 
-    Objective(Watched(), LossWeights()).begin_stage()
+    Objective(Watched(), paying()).begin_stage()
     assert forgotten == [True]
 
 
 def test_the_line_for_the_log_names_what_is_really_used() -> None:
-    assert LossWeights().description("gradient-l1") == "L1 + 0.1 gradient-l1 every 2 steps"
-    assert ALL_TERMS.description("lpips-vgg") == (
-        "L1 + 0.3 lpips-vgg + 5 progressive (decay, squares) + 0.5 sharpness (hinge)"
+    assert describe_loss(paying(), "gradient-l1") == "L1 + 0.1 gradient-l1 every 2 steps"
+    assert describe_loss(ALL_TERMS, "lpips-vgg") == (
+        "L1 + 0.3 lpips-vgg + 5 progressive (decay, squares) + 0.1 sharpness (hinge)"
     )
 
 
@@ -153,10 +172,10 @@ def test_the_progressive_change_is_the_printed_sum() -> None:
             assert float(decayed) == pytest.approx(0.05 * 1.1 ** (-step / 50) * float(length))
 
 
-def recolored(weights: LossWeights, steps: int = 30, **more: object) -> list[ParameterSnapshot]:
+def recolored(weights: OptimizeOptions, steps: int = 30, **more: object) -> list[ParameterSnapshot]:
     """The recordings of a short recoloring of a small bear."""
     case = small("body")
-    editor = make_editor("recolor:#3060d0", case.scene, case.region, case.views)
+    editor = make_editor(EditorOptions("recolor:#3060d0"), case.scene, case.region, case.views)
     original = pack(case.scene[case.region.members], with_shN=True)
     crops = [crop_scene(case.scene, case.region.members, v.camera, v.box, WHITE) for v in case.views]
     stage = TargetStage(1.0, [crop(editor.edit(v, 1.0), v.box) for v in case.views], steps)
@@ -165,7 +184,7 @@ def recolored(weights: LossWeights, steps: int = 30, **more: object) -> list[Par
     return list(optimize(original, crops, crops[:1], [stage], Objective(GradientL1(), weights), settings))
 
 
-def distance_traveled(weights: LossWeights) -> float:
+def distance_traveled(weights: OptimizeOptions) -> float:
     """Mean offset at the end of it."""
     return float(recolored(weights)[-1].offsets.abs().mean())
 
@@ -174,7 +193,7 @@ def distance_traveled(weights: LossWeights) -> float:
 def test_absolutes_of_steps_freeze_the_edit_and_squares_slow_it_down(progressive: Progressive) -> None:
     def ways(norm: Norm) -> tuple[float, float]:
         """Mean offset after 30 steps and after 90."""
-        held = LossWeights(progressive=progressive, progressive_norm=norm)
+        held = paying(progressive=progressive, progressive_norm=norm)
         found = recolored(held, 90, every=30, smoothing=0.0)
         return float(found[0].offsets.abs().mean()), float(found[-1].offsets.abs().mean())
 
@@ -184,15 +203,16 @@ def test_absolutes_of_steps_freeze_the_edit_and_squares_slow_it_down(progressive
     assert late > 2.0 * early, "it goes on"
 
 
-def test_a_small_weight_of_the_constraint_does_not_hold_the_edit() -> None:
-    slight = LossWeights(progressive="decay", progressive_weight=1e-6, progressive_norm="absolutes")
-    assert distance_traveled(slight) > 0.8 * distance_traveled(LossWeights())
+def test_a_small_weight_of_the_constraint_does_not_hold_the_edit(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("trainer.optimize.losses.PROGRESSIVE_WEIGHT", 1e-6)
+    slight = paying(progressive="decay", progressive_norm="absolutes")
+    assert distance_traveled(slight) > 0.8 * distance_traveled(paying())
 
 
 def test_a_frozen_edit_is_recorded_too_where_recordings_go_by_steps() -> None:
-    frozen = LossWeights(progressive="growth", progressive_norm="absolutes")
+    frozen = paying(progressive="growth", progressive_norm="absolutes")
     assert [found.step for found in recolored(frozen, every=8, smoothing=0.0)] == [8, 16, 24, 30]
-    assert len(recolored(frozen)) < 4 < len(recolored(LossWeights())), "else by what is seen"
+    assert len(recolored(frozen)) < 4 < len(recolored(paying())), "else by what is seen"
 
 
 # ---- sharpness

@@ -13,6 +13,7 @@ from progdf.rasterize import render
 from tests.helpers.trained import WHITE, Small, course, masked_psnr, small
 from trainer.editors import make_editor
 from trainer.optimize.pgs import ParameterSnapshot, learning_rates, most_change, optimize
+from trainer.options import EditorOptions
 from trainer.views.crops import crop_scene
 from trainer.views.view import crop
 
@@ -27,7 +28,7 @@ def test_the_members_arrive_at_the_edited_views() -> None:
     case = small("body")
     original, found = run(case, steps=60)
     edited = case.scene.replace_rows(case.region.members, original + found[-1].offsets)
-    editor = make_editor("recolor:#3060d0", case.scene, case.region, case.views)
+    editor = make_editor(EditorOptions("recolor:#3060d0"), case.scene, case.region, case.views)
     for view in case.views:
         target, inside = editor.edit(view, 1.0), view.mask > 0.5
         before = masked_psnr(view.image, target, inside)

@@ -10,10 +10,8 @@ from torch import Tensor
 from progdf.camera import Camera, intrinsics, look_at
 from progdf.gaussians import ATTRIBUTES, Gaussians, pack
 from progdf.sh import C0, rgb_to_sh0
-from trainer.optimize.optimizer_state import PgsState
-from trainer.optimize.paint import fit_paint
-from trainer.optimize.pgs import TargetStage
-from trainer.optimize.picture_solver import PictureSolver, make_picture_solver, solve_pictures
+from trainer.optimize.pgs import PgsState, TargetStage
+from trainer.optimize.solve_pictures import PictureSolver, fit_paint, make_picture_solver, solve_pictures
 from trainer.views.crops import crop_scene
 from trainer.views.view import render_view
 

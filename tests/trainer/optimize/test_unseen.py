@@ -9,11 +9,11 @@ from progdf.camera import Camera, intrinsics, look_at
 from progdf.gaussians import Gaussians, pack
 from progdf.region import Region
 from progdf.sh import rgb_to_sh0
-from trainer.editors.base import EditKind
 from trainer.optimize.pgs import TargetStage
 from trainer.optimize.unseen import UnseenMembers, find_unseen_members, least_shown, unseen_members_of
-from trainer.pipeline.training import is_no_worse
-from trainer.setup.training_setup import TrainingSetup
+from trainer.options import EditKind
+from trainer.run.training import is_no_worse
+from trainer.setup import TrainingSetup
 from trainer.views.crops import crop_scene, render_all
 from trainer.views.view import View, make_view
 

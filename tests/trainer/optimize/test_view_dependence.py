@@ -10,7 +10,7 @@ import torch
 from progdf.gaussians import Gaussians
 from progdf.sh import shade
 from tests.helpers.scenes import logit_of, orbit_camera, random_gaussians
-from trainer.optimize.view_dependence import view_dependence
+from trainer.optimize.unseen import view_dependence
 from trainer.views.choose import visible_area
 
 CAMERAS = [orbit_camera(azimuth=0.7 * i, elevation=0.1 * i) for i in range(8)]

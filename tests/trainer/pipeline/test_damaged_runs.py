@@ -14,7 +14,7 @@ from torch import Tensor
 from progdf.field.trajectory import load_trajectory, save_trajectory
 from tests.helpers.refused import refusal
 from tests.helpers.trained import quick_options, train, write_bear
-from trainer.pipeline.reopen import reopen_run
+from trainer.run.record import reopen_run
 
 Change = Callable[[dict[str, Any], dict[str, Tensor]], object]
 

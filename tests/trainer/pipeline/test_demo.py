@@ -13,8 +13,8 @@ import pytest
 import torch
 from PIL import Image
 
-import trainer.pipeline.resume
-import trainer.pipeline.run
+import trainer.run.resume
+import trainer.run.run
 from progdf import demo_scenes as scenes
 from progdf.__main__ import main
 from progdf.errors import ProgdfError
@@ -27,8 +27,9 @@ from progdf.io.picture_camera import find_picture_camera
 from progdf.region import from_labels
 from progdf.scene.regions import parse_region
 from tests.helpers import demo_scenes
-from trainer.pipeline import demo
-from trainer.plan import Plan
+from trainer.options import TrainOptions
+from trainer.resolve import resolve
+from trainer.run import demo
 
 SIZE = 1500
 
@@ -64,7 +65,8 @@ def _edit(folder: Path, scene: scenes.DemoScene, edit: demo.DemoEdit) -> Gdf:
 def commands(monkeypatch: pytest.MonkeyPatch, bear: scenes.DemoScene) -> list[Sequence[str]]:
     """Replaces the training by a formula and the window by a list of the commands that would open it."""
 
-    def train(plan: Plan, out: Path, threads: int, resume: bool) -> None:
+    def train(options: TrainOptions) -> None:
+        plan, out = resolve(options), options.out
         edit = next(edit for edit in demo.SHOWS["bear"].edits if edit.name == plan.name == out.name)
         if edit.paint is None:
             region = parse_region(plan.region.region, load_ply(plan.scene), edit.name)
@@ -82,7 +84,7 @@ def commands(monkeypatch: pytest.MonkeyPatch, bear: scenes.DemoScene) -> list[Se
         opened.append(command)
         return SimpleNamespace(returncode=3)
 
-    monkeypatch.setattr(trainer.pipeline.run, "train", train)
+    monkeypatch.setattr(trainer.run.run, "train", train)
     monkeypatch.setattr(subprocess, "run", run)
     return opened
 
@@ -189,21 +191,21 @@ def test_a_demo_that_was_stopped_goes_on_and_one_that_was_not_starts_over(
 ) -> None:
     asked: list[tuple[str, bool]] = []
 
-    def train(plan: Plan, out: Path, threads: int, resume: bool) -> None:
-        asked.append((out.name, resume))
+    def train(options: TrainOptions) -> None:
+        asked.append((options.out.name, options.resume))
         if len(asked) == 2:
             raise KeyboardInterrupt("--resume")
 
     here = {"scarf": "finished", "gold": "stopped", "frost": "nothing", "panda": "nothing"}
-    monkeypatch.setattr(trainer.pipeline.run, "train", train)
-    monkeypatch.setattr(trainer.pipeline.resume, "find_run", lambda out, plan: here[out.name])
+    monkeypatch.setattr(trainer.run.run, "train", train)
+    monkeypatch.setattr(trainer.run.resume, "find_run", lambda options: here[options.out.name])
     arguments = ["--size", str(SIZE), "--out", str(tmp_path / "demo"), "--no-window"]
     with pytest.raises(KeyboardInterrupt, match="give the same command again to go on"):
         demo.main(arguments)
     assert asked == [("scarf", True), ("gold", True)]
     here["gold"] = "nothing"
     monkeypatch.setattr(
-        trainer.pipeline.run, "train", lambda plan, out, threads, resume: asked.append((out.name, resume))
+        trainer.run.run, "train", lambda options: asked.append((options.out.name, options.resume))
     )
     with pytest.raises(ProgdfError):  # this training writes nothing
         demo.main(arguments)

@@ -18,11 +18,11 @@ from progdf.scene.regions import parse_region
 from tests.helpers.ply_files import moved_columns, write
 from tests.helpers.trained import quick_options, train
 from trainer.editors.pictures import picture_cameras
-from trainer.pipeline.reopen import render_run_views, reopen_run
-from trainer.pipeline.run import RunResult
-from trainer.regions import originals
-from trainer.regions.from_pictures import RegionSettings, region_kinds
-from trainer.regions.options import ViewsOptions
+from trainer.options import RegionOptions, ViewOptions, WriteViewsOptions, with_values
+from trainer.regions import command
+from trainer.regions.from_pictures import RegionRequest, region_kinds
+from trainer.run.record import render_run_views, reopen_run
+from trainer.run.run import RunResult
 
 FAR = (1e6, 2e6, -5e5)
 BOX = (-0.9, -0.9, -0.4, 0.9, 0.9, 0.9)
@@ -47,7 +47,7 @@ def runs(folder: Path) -> dict[str, RunResult]:
             "region": f"box:{box}",
             "name": "coat",
         }
-        options = replace(quick_options(folder), scene=folder / f"{name}.ply", out=folder / name, **more)
+        options = with_values(quick_options(folder), scene=folder / f"{name}.ply", out=folder / name, **more)
         made[name] = train(options)
     return made
 
@@ -78,12 +78,14 @@ def test_a_far_run_is_opened_again_with_its_views(runs: dict[str, RunResult]) ->
 
 def test_masks_over_views_of_a_far_scene_find_their_region(folder: Path, runs: dict[str, RunResult]) -> None:
     scene = load_ply(folder / "far.ply")
-    originals.write(ViewsOptions(folder / "far.ply", folder / "drawn", views=4, image_size=64))
+    command.write(WriteViewsOptions(folder / "far.ply", folder / "drawn", views=4, image_size=64))
     for path in sorted((folder / "drawn" / "original").iterdir()):
         picture = read_picture(path)
         mask = (picture.mean(dim=2) < 0.5).float()[..., None].expand(-1, -1, 3)
         to_picture(mask).save(folder / "drawn" / path.name)
-    settings = RegionSettings(None, 30, lambda: folder, quiet=True, scene=folder / "far.ply")
+    settings = RegionRequest(
+        RegionOptions("masks"), ViewOptions(scene=folder / "far.ply"), lambda: folder, True
+    )
     found = parse_region(f"masks:{folder / 'drawn'}", scene, kinds=region_kinds(settings))
     assert 0 < len(found) < len(scene)
 
@@ -99,6 +101,6 @@ def test_a_changed_picture_of_a_far_scene_tells_what_was_changed(
     to_picture(changed).save(path, pnginfo=camera_chunk(view.camera, origin=scene.origin))
     (camera,) = picture_cameras([path], (), scene.origin)
     assert torch.allclose(camera.viewmat, view.camera.viewmat, atol=1e-6)
-    settings = RegionSettings(None, 30, lambda: folder, quiet=True, pictures=[path])
+    settings = RegionRequest(RegionOptions("changed"), ViewOptions(pictures=(path,)), lambda: folder, True)
     found = parse_region("changed", scene, kinds=region_kinds(settings))
     assert 0 < len(found) < len(scene) // 2

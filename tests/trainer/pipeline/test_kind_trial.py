@@ -16,17 +16,17 @@ from progdf.rasterize import render
 from tests.helpers.demo_scenes import bear
 from tests.helpers.trained import WHITE, Small, quick_options, small
 from trainer.editors import make_editor
-from trainer.pipeline.kind_trial import Approach, Trial, approaches, try_approaches
-from trainer.plan import OptimizationPlan, make_plan
-from trainer.setup.training_setup import TrainingSetup
+from trainer.options import EditorOptions, TrainOptions, with_values
+from trainer.resolve import resolve
+from trainer.run.kinds import Approach, Trial, approaches, try_approaches
+from trainer.setup import TrainingSetup
 
 COLOR, STYLE, FREE = Approach("color"), Approach("style"), Approach("geometry")
 IN_PARTS = Approach("geometry", 120)
 
 
-def asked(**more: object) -> OptimizationPlan:
-    options = replace(quick_options(Path("nowhere")), **{"steps": 144, **more})  # type: ignore[arg-type]
-    return make_plan(options).optimization
+def asked(**more: object) -> TrainOptions:
+    return resolve(with_values(quick_options(Path("nowhere")), **{"steps": 144, **more}))
 
 
 def setup(case: Small) -> TrainingSetup:
@@ -53,7 +53,7 @@ def scarf() -> Small:
 
 def test_a_recolor_given_as_pictures_is_a_color_edit() -> None:
     case = scarf()
-    editor = make_editor("recolor:#3060d0", case.scene, case.region, case.views)
+    editor = make_editor(EditorOptions("recolor:#3060d0"), case.scene, case.region, case.views)
     pictures = [editor.edit(view, 1.0) for view in case.views]
     trial = try_approaches(asked(), setup(case), pictures, [COLOR, STYLE, FREE, IN_PARTS])
     assert trial.chosen == COLOR

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -16,19 +15,18 @@ from progdf.gaussians import ATTRIBUTES, pack
 from progdf.gdf.file import load_gdf
 from tests.helpers.trained import WHITE, quick_options, small, train
 from trainer.cli import train_options
-from trainer.fit.network import RenderedLoss
-from trainer.optimize.losses import GradientL1, l1
-from trainer.optimize.objective import LossWeights
-from trainer.optimize.settings import pgs_settings
-from trainer.pipeline.run import RunResult
-from trainer.plan import Plan, make_plan, plan_optimization
-from trainer.presets import apply_preset
+from trainer.fit.network import RenderedLoss, network_settings
+from trainer.optimize.losses import GradientL1, describe_loss, l1
+from trainer.optimize.pgs import pgs_settings
+from trainer.options import TrainOptions, apply_preset, with_values
+from trainer.resolve import resolve, resolve_kind
+from trainer.run.run import RunResult
 from trainer.views.crops import crop_scene, moving_attributes
 
 
-def plan(*more: str, region: str = "all") -> Plan:
+def plan(*more: str, region: str = "all") -> TrainOptions:
     words = ("scene.ply", "--out", "run", "--region", region, "--editor", "night", "--preset", "paper")
-    return make_plan(train_options([*words, *more]))
+    return resolve(train_options([*words, *more]))
 
 
 @pytest.fixture(scope="module")
@@ -44,37 +42,38 @@ def run(folder: Path, finishing: list[int]) -> Iterator[RunResult]:
     short = {"steps": 40, "views": 5, "image_size": 56, "size": "tiny"}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("trainer.fit.network.train_network", lambda *given: finishing.append(given[3]))
-        yield train(type(options)(**{**vars(options), **short}))
+        yield train(with_values(options, **short))
 
 
 def test_pgs_pays_what_is_printed_whatever_the_edit() -> None:
     """λ = 1, 5, 1: L1 + LPIPS, α·β^(t/s)·Σ‖ΔΘ‖², −∇²R; one target, 1500 to 2000 steps."""
     for kind in ("color", "style", "geometry"):
-        found = plan_optimization(plan().optimization, kind, 0)
-        assert found.weights == LossWeights(1.0, 1, "growth", 5.0, "paper", 1.0, "squares")
-        assert not found.solves_colors
+        found = resolve_kind(plan(), kind, 0)
+        assert describe_loss(found, "LPIPS") == (
+            "L1 + 1 LPIPS + 5 progressive (growth, squares) + 1 sharpness (paper)"
+        )
+        assert found.solver == "descent"
         assert found.stages == 1
         assert 1500 <= found.steps <= 2000
 
 
 def test_pgs_is_the_plain_optimizer_of_3dgs_and_records_its_iterates_every_100_steps() -> None:
-    found = plan_optimization(plan().optimization, "color", 0)
+    found = resolve_kind(plan(), "color", 0)
     settings = pgs_settings(found, found.sh != "off", 23, 1.0, 1)
     assert bool((settings.rates[:14] > 0).all()), "all attributes are free"
     assert not bool(settings.rates[14:].any()), "three color channels only"
-    assert (settings.damped, settings.ramp, settings.fall, settings.reach) == (False, 0.0, 0.0, 0.0)
+    assert (settings.raised, settings.ramp, settings.fall, settings.reach) == (False, 0.0, 0.0, 0.0)
     assert (settings.smoothing, settings.every) == (0.0, 100)
 
 
 def test_at_most_96_views_and_the_slider_is_time() -> None:
-    assert (plan().views.views, plan().slider) == (96, "time")
+    assert (plan().views.views, plan().optimize.slider) == (96, "time")
 
 
 def test_the_field_is_a_network_of_positions_and_hard_bins_trained_beside_pgs_on_pictures() -> None:
-    network = plan().field.network
+    network = network_settings(plan().field)
     assert (network.size, network.inputs, network.bins, network.code) == ("paper", "position", "hard", 0)
-    assert network.loss == "pictures"
-    assert plan().optimization.joint
+    assert plan().field.field_loss == "pictures"
 
 
 def test_masks_are_refused_before_any_work_as_the_printed_lifting_selects_nothing() -> None:
@@ -103,13 +102,11 @@ def test_the_loss_of_the_field_is_the_printed_sum() -> None:
     laplacian = gray[:-2, 1:-1] + gray[2:, 1:-1] + gray[1:-1, :-2] + gray[1:-1, 2:] - 4 * gray[1:-1, 1:-1]
     printed = l1(image, expected) + GradientL1()(image, expected) - laplacian.mean()
     assert float(loss(found, recorded, 1)) == pytest.approx(float(printed), rel=1e-6)
-    without = replace(loss, sharpness=False)
-    assert float(without(found, recorded, 1)) == pytest.approx(float(printed + laplacian.mean()), rel=1e-6)
 
 
 def test_losses_are_of_whole_pictures(folder: Path, run: RunResult, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert plan().optimization.whole
-    assert not make_plan(quick_options(folder)).optimization.whole
+    assert plan().optimize.as_printed
+    assert not quick_options(folder).optimize.as_printed
     assert run.report["objective"] == (
         f"L1 + 1 {run.report['edit']['perceptual']} + 5 progressive (growth, squares) + 1 sharpness (paper)"
     )

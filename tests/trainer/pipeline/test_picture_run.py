@@ -21,12 +21,11 @@ from progdf.region import Region
 from progdf.scene.regions import parse_region
 from tests.helpers.trained import quick_options, train
 from trainer.editors import make_editor
-from trainer.evaluate.command import evaluate_folder
-from trainer.evaluate.options import EvaluateOptions
-from trainer.pipeline.run import RunResult
+from trainer.evaluate.command import evaluate
+from trainer.options import EditorOptions, EvaluateOptions, ViewOptions, with_values
 from trainer.report.measures import PaintTaken, measure_paint
-from trainer.setup.resolution import ViewSettings
-from trainer.setup.training_setup import make_training_setup
+from trainer.run.run import RunResult
+from trainer.setup import make_training_setup
 from trainer.views.view import View, render_view
 
 SPEC = "recolor:#3060d0"
@@ -36,27 +35,27 @@ SPEC = "recolor:#3060d0"
 def views(folder: Path) -> tuple[View, ...]:
     """Views of the bear's region, the first of which is the picture's."""
     scene, region = bear(folder)
-    setup = make_training_setup(ViewSettings(views=12, image_size=96), scene, region)
+    setup = make_training_setup(ViewOptions(views=12, image_size=96), scene, region)
     return tuple(setup.views)
 
 
 def bear(folder: Path) -> tuple:  # type: ignore[type-arg]
     scene = load_ply(folder / "scene.ply")
-    return scene, parse_region(quick_options(folder).region, scene)
+    return scene, parse_region(quick_options(folder).region.region, scene)
 
 
 @pytest.fixture(scope="module")
 def picture(folder: Path, views: tuple[View, ...]) -> Path:
     """The first view, recolored, as a .png that carries its camera."""
     scene, region = bear(folder)
-    edited = make_editor(SPEC, scene, region, views).edit(views[0], 1.0)
+    edited = make_editor(EditorOptions(SPEC), scene, region, views).edit(views[0], 1.0)
     to_picture(edited).save(folder / "A.png", pnginfo=camera_chunk(views[0].camera))
     return folder / "A.png"
 
 
 @pytest.fixture(scope="module")
 def done(folder: Path, picture: Path) -> RunResult:
-    options = replace(quick_options(folder), out=folder / "one", editor=f"pictures:{picture}", name="")
+    options = with_values(quick_options(folder), out=folder / "one", editor=f"pictures:{picture}", name="")
     return train(options, quiet=True)
 
 
@@ -65,7 +64,7 @@ def test_other_sides_follow_a_fill_from_one_picture(
 ) -> None:
     scene, region = bear(folder)
     edited = compose_layers(scene, [Layer(load_gdf(done.gdf, scene), 1.0)])
-    truth = make_editor(SPEC, scene, region, views)
+    truth = make_editor(EditorOptions(SPEC), scene, region, views)
     for view in views[1:]:
         shown, counts = render_view(edited, view.camera, torch.ones(3)).clamp(0, 1), view.mask > 0.05
         error = decibels(float((shown - truth.edit(view, 1.0))[counts].square().mean()))
@@ -97,7 +96,7 @@ def test_painting_a_thing_away_is_said_to_remove_nothing(
     folder: Path, background: tuple[float, float, float], all_of_it: bool
 ) -> None:
     scene, region = bear(folder)
-    setup = make_training_setup(ViewSettings(views=6, image_size=96), scene, region)
+    setup = make_training_setup(ViewOptions(views=6, image_size=96), scene, region)
     others = torch.ones(len(scene), dtype=torch.bool).index_fill(0, region.members, False)
     # all of it: with what the members hide, which are then less than was painted away
     left = scene[:0] if all_of_it else scene[others.nonzero()[:, 0]]
@@ -123,7 +122,7 @@ def test_a_thing_painted_in_a_color_of_its_own_is_not_told_as_removed(
     folder: Path, color: tuple[float, float, float]
 ) -> None:
     scene, region = bear(folder)
-    setup = make_training_setup(ViewSettings(views=6, image_size=96), scene, region)
+    setup = make_training_setup(ViewOptions(views=6, image_size=96), scene, region)
     painted = [
         torch.where(view.mask[..., None] > 0.5, torch.tensor(color), view.image) for view in setup.train
     ]
@@ -133,7 +132,7 @@ def test_a_thing_painted_in_a_color_of_its_own_is_not_told_as_removed(
 
 def test_what_saving_does_beside_the_members_is_not_counted_as_painted(folder: Path) -> None:
     scene, region = bear(folder)
-    setup = make_training_setup(ViewSettings(views=6, image_size=96), scene, region)
+    setup = make_training_setup(ViewOptions(views=6, image_size=96), scene, region)
     noise = torch.rand(96, 96, 3, generator=torch.Generator().manual_seed(0)) * 0.04
     saved = [torch.where(view.mask[..., None] > 0.5, view.image, view.image - noise) for view in setup.train]
     rows = pack(scene[region.members], with_shN=True)
@@ -158,7 +157,7 @@ def test_the_way_is_neither_gray_nor_raw(done: RunResult) -> None:
 
 
 def test_such_a_run_can_be_evaluated(done: RunResult, capsys: pytest.CaptureFixture[str]) -> None:
-    evaluate_folder(EvaluateOptions(done.folder.root))
+    evaluate(EvaluateOptions(done.folder.root))
     said = capsys.readouterr().out
     assert "no two held-out views see enough of the same" in said
     assert "to the run's own pictures, trained on, at 1, PSNR" in said
@@ -167,7 +166,7 @@ def test_such_a_run_can_be_evaluated(done: RunResult, capsys: pytest.CaptureFixt
 def test_a_finished_run_of_another_picture_is_not_taken_for_this_one_s(
     folder: Path, done: RunResult, picture: Path
 ) -> None:
-    options = replace(quick_options(folder), out=folder / "one", editor=f"pictures:{picture}", name="")
+    options = with_values(quick_options(folder), out=folder / "one", editor=f"pictures:{picture}", name="")
     assert train(replace(options, resume=True), quiet=True).gdf == done.gdf
     was = picture.read_bytes()
     try:
@@ -182,7 +181,9 @@ def test_a_finished_run_of_another_picture_is_not_taken_for_this_one_s(
 
 def test_a_picture_without_camera_is_refused_before_the_scene_is_read(folder: Path) -> None:
     to_picture(torch.ones(8, 8, 3)).save(folder / "bare.png")
-    options = replace(quick_options(folder), out=folder / "bare", editor=f"pictures:{folder / 'bare.png'}")
+    options = with_values(
+        quick_options(folder), out=folder / "bare", editor=f"pictures:{folder / 'bare.png'}"
+    )
     with pytest.raises(ProgdfError, match="does not say from where it was rendered"):
         train(options, quiet=True)
     assert not (folder / "bare").exists()
@@ -193,4 +194,4 @@ def test_a_picture_that_does_not_show_the_region_is_one_line(folder: Path, pictu
     away = Region("nothing there", region.members, region.score)
     far = replace(scene, means=scene.means + 1e4)
     with pytest.raises(ProgdfError, match="does not show the region 'nothing there'; leave it out"):
-        make_training_setup(ViewSettings(pictures=(picture,)), far, away)
+        make_training_setup(ViewOptions(pictures=(picture,)), far, away)

@@ -57,7 +57,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     def load(path: object) -> None:
         raise AssertionError("the scene was loaded")
 
-    monkeypatch.setattr("trainer.pipeline.run.load_scene", load)
+    monkeypatch.setattr("trainer.run.run.load_scene", load)
     return tmp_path
 
 
@@ -108,15 +108,15 @@ def test_a_segmenter_that_cannot_be_loaded_is_told_before_the_scene_is(
     damage: str, here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pytest.importorskip("transformers")
-    from trainer.segmenters import SegmenterSettings
-    from trainer.segmenters.grounded_sam import check_grounded_sam
+    from trainer.options import RegionOptions
+    from trainer.regions.segment import check_grounded_sam
 
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(here / "hub"))
     tiny_detector(Path("detector"))
     tiny_sam(Path("sam_model"))
     weights = Path("sam_model/model.safetensors")
     if damage == "none":
-        check_grounded_sam(SegmenterSettings("detector", "sam_model"))
+        check_grounded_sam(RegionOptions("", detector="detector", sam_model="sam_model"))
         return
     if damage == "no weights":
         weights.unlink()
@@ -136,13 +136,13 @@ def test_a_pipeline_that_cannot_be_loaded_is_told_before_the_scene_is(
 ) -> None:
     pytest.importorskip("diffusers")
     from tests.helpers.tiny_pipelines import tiny_instruct_pix2pix
-    from trainer.editors import EditorSettings
     from trainer.editors.instruct import check_instruct
+    from trainer.options import EditorOptions
 
     model = tiny_instruct_pix2pix(Path())
     weights = model / "unet" / "diffusion_pytorch_model.safetensors"
     if damage == "none":
-        check_instruct("as Batman", EditorSettings(model=str(model)))
+        check_instruct("as Batman", EditorOptions("", str(model)))
         return
     if damage == "no weights":
         weights.unlink()

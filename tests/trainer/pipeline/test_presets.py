@@ -3,24 +3,29 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import get_args
 
 import pytest
 import torch
 
-import trainer.pipeline.run
+import trainer.run.run
 from progdf.errors import ProgdfError
 from progdf.io.json_values import convert_json, plain
-from tests.helpers.trained import quick_options
 from trainer.cli import train_options
-from trainer.editors.base import EditKind
-from trainer.optimize.settings import Optimization, pgs_settings
-from trainer.options import Preset, TrainOptions
-from trainer.pipeline.resume import plan_difference
-from trainer.plan import Plan, make_plan, plan_optimization
-from trainer.presets import PRESETS, apply_preset
+from trainer.optimize.pgs import pgs_settings
+from trainer.options import (
+    PRESETS,
+    EditKind,
+    OptimizeOptions,
+    Preset,
+    TrainOptions,
+    apply_preset,
+    with_values,
+)
+from trainer.resolve import recorded_options, resolve, resolve_kind
+from trainer.run.resume import plan_difference
 
 ASKED = ("scene.ply", "--out", "run", "--region", "all", "--editor", "night")
 
@@ -29,8 +34,8 @@ def asked(*more: str) -> TrainOptions:
     return train_options([*ASKED, *more])
 
 
-def planned(kind: EditKind, *more: str, group_steps: int = 0) -> Optimization:
-    return plan_optimization(make_plan(asked(*more)).optimization, kind, group_steps)
+def planned(kind: EditKind, *more: str, group_steps: int = 0) -> OptimizeOptions:
+    return resolve_kind(resolve(asked(*more)), kind, group_steps)
 
 
 def test_every_preset_is_there_and_the_default_one_changes_nothing() -> None:
@@ -40,57 +45,61 @@ def test_every_preset_is_there_and_the_default_one_changes_nothing() -> None:
 
 @pytest.mark.parametrize("preset", [name for name in PRESETS if name != "default"])
 def test_a_preset_is_its_values_and_no_more(preset: Preset) -> None:
-    plain, found = asdict(asked()), asdict(asked("--preset", preset))
-    assert {name: found[name] for name in found if found[name] != plain[name]} == {
-        **{name: value for name, value in PRESETS[preset].items() if plain[name] != value},
-        "preset": preset,
-    }
-    assert found == asdict(apply_preset(asked(), preset)), "Python has the same"
+    plain, found = asked(), asked("--preset", preset)
+    for part, values in PRESETS[preset].items():
+        before, after = vars(getattr(plain, part)), vars(getattr(found, part))
+        assert after == {**before, **values}
+    parts = {part: getattr(plain, part) for part in PRESETS[preset]}
+    assert replace(found, preset="default", **parts) == plain
+    assert found == apply_preset(asked(), preset), "Python has the same"
 
 
 @pytest.mark.parametrize("preset", [name for name in PRESETS if name != "default"])
 def test_each_value_of_a_preset_could_be_given_on_the_command_line(preset: Preset) -> None:
-    pairs = [(f"--{name.replace('_', '-')}", str(value)) for name, value in PRESETS[preset].items()]
-    words = [word for pair in pairs for word in pair]
-    assert asdict(asked(*words)) == {**asdict(asked("--preset", preset)), "preset": "default"}
+    fixed = {"rates", "perceptual_every", "sharpness", "as_printed", "color_solver", "ema", "target_ramp"}
+    fixed |= {"propagation"}
+    values = {name: value for part in PRESETS[preset].values() for name, value in part.items()}
+    words = [w for n, v in values.items() if n not in fixed for w in (f"--{n.replace('_', '-')}", str(v))]
+    assert with_values(asked(*words), **{n: values[n] for n in fixed}, preset=preset) == asked(
+        "--preset", preset
+    )
 
 
 def test_what_the_command_line_says_goes_before_the_preset_wherever_it_stands() -> None:
     before = asked("--steps", "300", "--preset", "paper")
     after = asked("--preset", "paper", "--steps", "300")
     assert before == after
-    assert before.steps == 300
-    assert before.progressive == "growth"
+    assert before.optimize.steps == 300
+    assert before.optimize.progressive == "growth"
 
 
 def test_a_default_that_the_command_line_spells_out_goes_before_the_preset_too() -> None:
-    assert asked("--preset", "paper", "--stages", "0").stages == asked().stages == 0
+    assert asked("--preset", "paper", "--stages", "0").optimize.stages == asked().optimize.stages == 0
 
 
 def test_the_papers_trainer_can_leave_out_its_network() -> None:
-    plan = make_plan(asked("--preset", "paper", "--field", "auto"))
-    assert not plan.optimization.joint
+    plan = resolve(asked("--preset", "paper", "--field", "auto"))
     assert plan.field.field == "auto"
 
 
 def test_the_paper_can_let_go_instead_of_tightening() -> None:
-    assert planned("style", "--preset", "paper", "--progressive", "decay").weights.progressive == "decay"
+    assert planned("style", "--preset", "paper", "--progressive", "decay").progressive == "decay"
 
 
 def test_by_default_a_color_edit_is_paid_in_l1_mostly_and_a_style_for_its_texture_too() -> None:
-    color, style, geometry = (planned(kind).weights for kind in ("color", "style", "geometry"))
-    assert (color.perceptual, style.perceptual, geometry.perceptual) == (0.1, 0.3, 0.3)
+    color, style, geometry = (planned(kind) for kind in ("color", "style", "geometry"))
+    assert (color.perceptual_weight, style.perceptual_weight, geometry.perceptual_weight) == (0.1, 0.3, 0.3)
     assert (color.sharpness, style.sharpness, geometry.sharpness) == ("off", "hinge", "off")
 
 
 def test_colors_are_solved_for_unless_something_is_asked_for_that_a_descent_has() -> None:
-    assert planned("color").solves_colors
-    assert planned("color", "--perceptual-weight", "0").solves_colors
-    assert not planned("style").solves_colors
+    assert planned("color").solver == "colors"
+    assert planned("color", "--perceptual-weight", "0").solver == "colors"
+    assert planned("style").solver == "descent"
     for words in (("--perceptual-weight", "0.1"), ("--progressive", "warmup"), ("--preset", "paper")):
-        assert not planned("color", *words).solves_colors
-    asks = make_plan(replace(asked("--reedit-every", "9"), editor="style:14"))
-    assert not plan_optimization(asks.optimization, "color", 0).solves_colors
+        assert planned("color", *words).solver == "descent"
+    again = resolve(with_values(asked("--reedit-every", "9"), editor="style:14"))
+    assert resolve_kind(again, "color", 0).solver == "descent"
 
 
 def test_a_style_goes_straight_to_its_end_unless_stages_are_asked_for() -> None:
@@ -106,7 +115,7 @@ def test_a_style_goes_straight_to_its_end_unless_stages_are_asked_for() -> None:
 
 def test_weights_that_are_given_hold_whatever_the_edit_and_zero_is_a_weight() -> None:
     for kind in ("color", "style"):
-        assert planned(kind, "--perceptual-weight", "0").weights.perceptual == 0.0
+        assert planned(kind, "--perceptual-weight", "0").perceptual_weight == 0.0
 
 
 def test_parts_move_as_wholes_only_where_something_moves() -> None:
@@ -128,44 +137,20 @@ def test_a_color_edit_holds_the_geometry_still_unless_the_plain_rates_are_asked_
     assert float(ours[11]) > 10 * float(plain[11])
 
 
-def refined(kind: EditKind, **less: bool) -> Optimization:
-    """Without some of the refinements."""
-    optimization = make_plan(asked()).optimization
-    refinements = replace(optimization.refinements, **less)
-    return plan_optimization(replace(optimization, refinements=refinements), kind, 0)
-
-
-@pytest.mark.parametrize(
-    ("refinement", "changes"),
-    [
-        ("damps", "damped"),
-        ("ramps", "ramp"),
-        ("slows", "fall"),
-        ("sizes", "reach"),
-        ("averages", "smoothing"),
-    ],
-)
-def test_each_refinement_of_a_descent_can_be_left_out_alone(refinement: str, changes: str) -> None:
+@pytest.mark.parametrize(("part", "changes"), [("target_ramp", "ramp"), ("ema", "smoothing")])
+def test_each_refinement_of_a_descent_can_be_left_out_alone(part: str, changes: str) -> None:
+    without = resolve_kind(with_values(resolve(asked()), **{part: False}), "style", 0)
     whole = vars(pgs_settings(planned("style"), True, 14, 1.0, 4))
-    less = vars(pgs_settings(refined("style", **{refinement: False}), True, 14, 1.0, 4))
+    less = vars(pgs_settings(without, True, 14, 1.0, 4))
     assert torch.equal(whole.pop("rates"), less.pop("rates"))
     assert {name for name in whole if whole[name] != less[name]} == {changes}
     assert not less[changes]
 
 
 def test_colors_are_solved_for_unless_that_is_left_out() -> None:
-    assert planned("color").solves_colors
-    assert not refined("color", solves=False).solves_colors
-
-
-def test_an_editor_is_asked_at_equal_strengths_where_that_refinement_is_left_out(folder: Path) -> None:
-    plan = make_plan(
-        quick_options(folder, "equal", steps=16, views=4, image_size=48, editor="stripes:#20a040")
-    )
-    refinements = replace(plan.optimization.refinements, asks_evenly=False)
-    plan = replace(plan, optimization=replace(plan.optimization, refinements=refinements))
-    found = trainer.pipeline.run.train(plan, folder / "equal", threads=1, quiet=True)
-    assert found.report["trajectory"]["stages"] == [0.25, 0.5, 0.75, 1.0]
+    assert planned("color").solver == "colors"
+    descends = with_values(resolve(asked()), color_solver=False)
+    assert resolve_kind(descends, "color", 0).solver == "descent"
 
 
 def test_only_a_color_edit_may_leave_the_bands_alone() -> None:
@@ -177,18 +162,21 @@ def test_only_a_color_edit_may_leave_the_bands_alone() -> None:
 
 def test_a_plan_is_read_back_from_json_as_it_was() -> None:
     for words in ((), ("--preset", "paper"), ("--quick", "--cameras", "c.json", "--text-before", "a bear")):
-        plan = make_plan(asked(*words))
-        assert convert_json(json.loads(json.dumps(plain(plan))), Plan) == plan
+        plan = resolve(asked(*words))
+        assert convert_json(json.loads(json.dumps(plain(plan))), TrainOptions) == plan
 
 
 def test_two_plans_differ_by_the_first_option_that_does() -> None:
-    plan = make_plan(asked())
+    def resolve(options: TrainOptions) -> TrainOptions:
+        return recorded_options(trainer.resolve.resolve(options))
+
+    plan = resolve(asked())
     assert plan_difference(plan, plan) == ""
-    assert plan_difference(plan, make_plan(asked("--steps", "40", "--stages", "2"))) == "--steps 800, not 40"
-    assert plan_difference(plan, make_plan(asked("--views", "9"))) == "--views by default, not 9"
-    paper = make_plan(asked("--preset", "paper", "--views", "9"))
-    assert plan_difference(make_plan(asked("--views", "9")), paper) == "--lift-rule share, not paper"
-    here = make_plan(replace(asked(), scene=Path.cwd() / "scene.ply"))
+    assert plan_difference(plan, resolve(asked("--steps", "40", "--stages", "2"))) == "--steps 800, not 40"
+    assert plan_difference(plan, resolve(asked("--views", "9"))) == "--views by default, not 9"
+    paper = resolve(asked("--preset", "paper", "--views", "9"))
+    assert plan_difference(resolve(asked("--views", "9")), paper) == "--lift-rule share, not paper"
+    here = resolve(replace(asked(), scene=Path.cwd() / "scene.ply"))
     assert plan_difference(plan, here) == "", "the same file"
 
 
@@ -202,4 +190,4 @@ def test_two_plans_differ_by_the_first_option_that_does() -> None:
 )
 def test_weights_and_presets_that_make_no_sense_are_named(words: tuple[str, ...], named: str) -> None:
     with pytest.raises(ProgdfError, match=named):
-        make_plan(asked(*words))
+        resolve(asked(*words))

@@ -14,8 +14,8 @@ from tests.helpers.trained import WHITE, quick_options, small, train, write_bear
 from trainer.editors.cache import KeptPictures
 from trainer.editors.style import StyleEditor
 from trainer.options import TrainOptions
-from trainer.pipeline.reedit import Reedit
-from trainer.setup.training_setup import TrainingSetup
+from trainer.run.reedit import Reedit
+from trainer.setup import TrainingSetup
 from trainer.store.progress import RunLog
 
 
@@ -117,7 +117,7 @@ def test_a_run_with_edits_on_the_way_is_the_same_again_and_after_a_stop(
                 raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
-        patched.setattr("trainer.pipeline.run.RunLog", Stopping)
+        patched.setattr("trainer.run.run.RunLog", Stopping)
         patched.setattr("trainer.store.state.SAVE_EVERY", 0.0)
         with pytest.raises(KeyboardInterrupt):
             train(options, quiet=True)

@@ -13,15 +13,14 @@ from pathlib import Path
 import pytest
 import torch
 
-import trainer.pipeline.run
-import trainer.pipeline.training
+import trainer.run.run
 from progdf.__main__ import main
 from progdf.errors import ProgdfError
 from tests.helpers.stopped import OUT, bits, small_run
 from tests.helpers.stopped_runs import NEVER, at_step, gone_on, killed, saved_step, words
 from tests.helpers.trained import train
-from trainer.pipeline.resume import find_run, processor_kind
-from trainer.plan import make_plan
+from trainer.run import training
+from trainer.run.resume import find_run, processor_kind
 from trainer.store.state import StateFolder
 
 pytest_plugins = ["tests.helpers.stopped_runs"]
@@ -84,7 +83,7 @@ def test_ctrl_c_before_the_optimization_is_kept_too(
     bear_folder: Path, uninterrupted: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with monkeypatch.context() as patch:
-        patch.setattr(trainer.pipeline.run, "edit_views", lambda *_: os.kill(os.getpid(), signal.SIGINT))
+        patch.setattr(trainer.run.run, "edit_views", lambda *_: os.kill(os.getpid(), signal.SIGINT))
         with pytest.raises(KeyboardInterrupt, match="--resume"):
             train(small_run(bear_folder), quiet=True)
     gone_on(bear_folder, uninterrupted)
@@ -143,7 +142,7 @@ def test_views_that_are_edited_are_not_edited_again(
     def make_editor(*_: object) -> None:
         raise AssertionError("edited again")
 
-    monkeypatch.setattr(trainer.pipeline.run, "make_editor", make_editor)
+    monkeypatch.setattr(trainer.run.run, "make_editor", make_editor)
     gone_on(bear_folder, uninterrupted)
 
 
@@ -154,7 +153,7 @@ def test_the_region_is_not_looked_for_again(
     def parse_region(*_: object) -> None:
         raise AssertionError("looked for again")
 
-    monkeypatch.setattr(trainer.pipeline.run, "parse_region", parse_region)
+    monkeypatch.setattr(trainer.run.run, "parse_region", parse_region)
     gone_on(bear_folder, uninterrupted)
 
 
@@ -221,7 +220,7 @@ def test_a_run_that_moves_parts_goes_on_to_the_same_bits(
     bear_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     options = small_run(bear_folder, kind="geometry", group_steps=8, steps=16)
-    monkeypatch.setattr(trainer.pipeline.run, "finish_run", lambda *_: None)
+    monkeypatch.setattr(trainer.run.run, "finish_run", lambda *_: None)
     train(options, quiet=True)
     expected = (OUT / "trajectory.safetensors").read_bytes()
     shutil.rmtree(OUT)
@@ -233,7 +232,7 @@ def test_a_run_that_moves_parts_goes_on_to_the_same_bits(
     def group_stage(*_: object) -> None:
         raise AssertionError("parts looked for again")
 
-    monkeypatch.setattr(trainer.pipeline.training, "group_stage", group_stage)
+    monkeypatch.setattr(training, "group_stage", group_stage)
     train(replace(options, resume=True), quiet=True)
     assert (OUT / "trajectory.safetensors").read_bytes() == expected
 
@@ -241,10 +240,10 @@ def test_a_run_that_moves_parts_goes_on_to_the_same_bits(
 def test_what_is_found_in_a_folder_depends_on_the_options(
     bear_folder: Path, uninterrupted: Path, interrupted: Path
 ) -> None:
-    assert find_run(OUT, make_plan(small_run(bear_folder))) == "nothing"
+    assert find_run(small_run(bear_folder)) == "nothing"
     shutil.copytree(interrupted, OUT)
-    assert find_run(OUT, make_plan(small_run(bear_folder))) == "stopped"
-    assert find_run(OUT, make_plan(small_run(bear_folder, seed=1))) == "nothing"
+    assert find_run(small_run(bear_folder)) == "stopped"
+    assert find_run(small_run(bear_folder, seed=1)) == "nothing"
     shutil.rmtree(OUT)
     shutil.copytree(uninterrupted, OUT)
-    assert find_run(OUT, make_plan(small_run(bear_folder))) == "finished"
+    assert find_run(small_run(bear_folder)) == "finished"

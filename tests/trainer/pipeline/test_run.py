@@ -14,7 +14,6 @@ import pytest
 import torch
 from PIL import Image
 
-import trainer.pipeline.training
 from progdf.cli.options import parse_options
 from progdf.compose.reference import Layer, compose_layers
 from progdf.errors import ProgdfError
@@ -25,16 +24,14 @@ from progdf.gaussians import ATTRIBUTES, pack
 from progdf.gdf.file import load_gdf
 from tests.helpers.trained import quick_options, train
 from trainer import cli
-from trainer.evaluate.command import evaluate_folder
-from trainer.evaluate.options import EvaluateOptions
-from trainer.option_checks import check_options
-from trainer.options import FitOptions
-from trainer.pipeline.fit_and_report import load_evaluator
-from trainer.pipeline.refit import refit
-from trainer.pipeline.reopen import render_run_views, reopen_run
-from trainer.pipeline.run import RunResult
-from trainer.plan import make_plan
+from trainer.evaluate.command import evaluate
+from trainer.options import EvaluateOptions, FitOptions, TrainOptions, with_values
 from trainer.report.plots import LINES, draw_plot
+from trainer.resolve import check_options, resolve
+from trainer.run import training
+from trainer.run.finish import load_evaluator, refit
+from trainer.run.record import render_run_views, reopen_run
+from trainer.run.run import RunResult
 
 
 @pytest.fixture(scope="module")
@@ -72,7 +69,7 @@ def test_a_figure_from_one_held_out_view_says_that_it_is_one(
     log = train(few, quiet=True).folder.log.read_text()
     assert re.search(r"worst .* dB against \d+ recordings in 1 view\n", log)
     assert "one held-out view alone: " in log
-    evaluate_folder(EvaluateOptions(few.out))
+    evaluate(EvaluateOptions(few.out))
     assert "to the one edited view held out, at 1, PSNR" in capsys.readouterr().out
     assert re.search(r"\d+ held-out views: .* dB, ", done.folder.log.read_text())
 
@@ -145,7 +142,7 @@ def test_the_report_has_what_others_read_from_it(done: RunResult) -> None:
         "curves": {"against_trajectory", "against_editor", "change", "clip_direction"},
         "time": {"views", "edit", "optimize", "fit", "total"},
         "memory_by_stage_mb": {"views", "edit", "optimize", "fit", "report"},
-        "plan": {"scene", "editor", "optimization", "field"},
+        "plan": {"scene", "editor", "optimize", "field"},
     }
     for part, keys in expected.items():
         assert keys <= set(report[part]), part
@@ -232,7 +229,7 @@ def test_a_refit_keeps_the_best_field_within_a_budget(folder: Path) -> None:
     assert not result.report["field"]["target_met"]
     assert "fits into 1 bytes" in result.report["choice"]["why"]
     least = result.report["field"]["bytes_per_gaussian"]
-    again = refit(FitOptions(result.folder.root, bytes_budget=least + 3, threads=1), quiet=True)
+    again = refit(with_values(FitOptions(result.folder.root), bytes_budget=least + 3, threads=1), quiet=True)
     assert again.report["plan"]["field"]["bytes_budget"] == least + 3
     assert again.report["field"]["target_met"]
     assert least < again.report["field"]["bytes_per_gaussian"] <= least + 3
@@ -242,7 +239,7 @@ def test_a_refit_keeps_the_best_field_within_a_budget(folder: Path) -> None:
 def test_refitting_changes_the_field_and_nothing_that_was_optimized(folder: Path) -> None:
     result = train(quick_options(folder, "refit", steps=16, stages=2), quiet=True)
     before = result.folder.trajectory.read_bytes()
-    again = refit(FitOptions(result.folder.root, field="keyframes", threads=1), quiet=True)
+    again = refit(with_values(FitOptions(result.folder.root), field="keyframes", threads=1), quiet=True)
     assert again.report["field"]["kind"] == "keyframes"
     assert load_gdf(again.gdf).field.kind == "keyframes"
     tried = again.report["choice"]["tried"]
@@ -264,7 +261,7 @@ def test_an_interrupted_run_leaves_the_earlier_edit_whole(
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(trainer.pipeline.training, "solve", interrupt)
+    monkeypatch.setattr(training, "solve", interrupt)
     with pytest.raises(KeyboardInterrupt, match="with --resume to go on"):
         train(options, quiet=True)
     assert first.gdf.read_bytes() == kept
@@ -327,9 +324,9 @@ def test_the_command_line_sets_every_option_it_is_given(folder: Path) -> None:
     words = (
         f"{folder / 'scene.ply'} --out r --region all --editor night --quick --seed 7 --slider even".split()
     )
-    plan = make_plan(parse_options(trainer.options.TrainOptions, words, "progdf train"))
-    assert (plan.optimization.seed, plan.slider, plan.name) == (7, "even", "r")
-    assert (plan.optimization.steps, plan.views.views) == (240, 12)
+    plan = resolve(parse_options(TrainOptions, words, "progdf train"))
+    assert (plan.optimize.seed, plan.optimize.slider, plan.name) == (7, "even", "r")
+    assert (plan.optimize.steps, plan.views.views) == (240, 12)
 
 
 def test_one_member_in_one_view_is_enough(folder: Path) -> None:
@@ -338,5 +335,5 @@ def test_one_member_in_one_view_is_enough(folder: Path) -> None:
     labels[int(scene.means[:, 1].argmax())] = 1
     np.save(folder / "one.npy", labels)
     options = quick_options(folder, "one", steps=8, stages=1, views=5)
-    result = train(replace(options, region=f"labels:{folder / 'one.npy'}:1"), quiet=True)
+    result = train(with_values(options, region=f"labels:{folder / 'one.npy'}:1"), quiet=True)
     assert load_gdf(result.gdf).field.members == 1

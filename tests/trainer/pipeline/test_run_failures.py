@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 import torch
 
-import trainer.optimize.pgs
 from progdf.__main__ import main
 from progdf.errors import ProgdfError
 from progdf.io.tensors import read_tensors, write_tensors
@@ -19,6 +18,7 @@ from tests.helpers.full_disk import files_up_to, refuse_temporary_files
 from tests.helpers.stopped import OUT, small_run
 from tests.helpers.stopped_runs import NEVER, at_step, gone_on, saved_step, words
 from tests.helpers.trained import train
+from trainer.optimize import pgs
 from trainer.store.run_folder import RunFolder, lock_folder
 
 pytest_plugins = ["tests.helpers.stopped_runs"]
@@ -69,7 +69,7 @@ def test_a_disk_that_is_full_from_the_start_is_one_line(
 def test_a_loss_that_is_not_finite_keeps_the_state_before_it(
     bear_folder: Path, uninterrupted: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    calls, true_sum = 0, trainer.optimize.pgs.total_loss
+    calls, true_sum = 0, pgs.total_loss
 
     def poisoned(terms: dict[str, torch.Tensor]) -> torch.Tensor:
         nonlocal calls
@@ -77,7 +77,7 @@ def test_a_loss_that_is_not_finite_keeps_the_state_before_it(
         return true_sum(terms) * (float("nan") if calls == 13 else 1.0)
 
     with monkeypatch.context() as patch:
-        patch.setattr(trainer.optimize.pgs, "total_loss", poisoned)
+        patch.setattr(pgs, "total_loss", poisoned)
         patch.setattr("trainer.store.state.SAVE_EVERY", NEVER)
         with pytest.raises(ProgdfError, match="the loss is nan at step 12; the state before it is kept"):
             train(small_run(bear_folder), quiet=True)

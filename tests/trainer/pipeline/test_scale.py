@@ -20,7 +20,15 @@ from progdf.region import Region
 from progdf.scene.bounds import near_plane
 from tests.helpers.demo_scenes import bear
 from tests.helpers.trained import train
-from trainer.options import TrainOptions
+from trainer.options import (
+    EditorOptions,
+    FieldOptions,
+    Kind,
+    OptimizeOptions,
+    RegionOptions,
+    TrainOptions,
+    ViewOptions,
+)
 from trainer.views.view import region_rig, render_view, with_near_plane
 
 FACTORS = (1e-3, 1e4)
@@ -44,23 +52,20 @@ def test_a_scene_of_any_size_is_trained_on_the_same_pictures(factor: float) -> N
         assert float((first - second).abs().max()) < 0.01
 
 
-def trained(folder: Path, scene: Gaussians, members: Tensor, editor: str, kind: str) -> Gaussians:
+def trained(folder: Path, scene: Gaussians, members: Tensor, editor: str, kind: Kind) -> Gaussians:
     """The scene under a whole edit, trained in a hurry."""
     folder.mkdir()
     save_ply(folder / "scene.ply", scene)
     labels = torch.zeros(len(scene), dtype=torch.uint8).index_fill(0, members, 1)
     np.save(folder / "labels.npy", labels.numpy())
     options = TrainOptions(
-        scene=folder / "scene.ply",
-        out=folder / "edit",
-        region=f"labels:{folder / 'labels.npy'}:1",
-        editor=editor,
-        views=6,
-        image_size=64,
-        steps=40,
-        stages=2,
-        field="separable",
-        kind=kind,
+        folder / "scene.ply",
+        folder / "edit",
+        RegionOptions(f"labels:{folder / 'labels.npy'}:1"),
+        EditorOptions(editor),
+        views=ViewOptions(views=6, image_size=64),
+        optimize=OptimizeOptions(steps=40, stages=2, kind=kind),
+        field=FieldOptions("separable"),
         threads=1,
     )
     train(options, quiet=True)
@@ -72,7 +77,7 @@ def trained(folder: Path, scene: Gaussians, members: Tensor, editor: str, kind: 
     [("recolor:#3060d0", "color"), ("darken:0.6", "style")],
 )
 @pytest.mark.slow
-def test_a_scaled_scene_trains_to_the_same_picture(tmp_path: Path, editor: str, kind: str) -> None:
+def test_a_scaled_scene_trains_to_the_same_picture(tmp_path: Path, editor: str, kind: Kind) -> None:
     demo = bear(1500)
     members = demo.members("scarf")
     region = Region("scarf", members, torch.zeros(1500).index_fill(0, members, 1.0))

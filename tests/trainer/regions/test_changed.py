@@ -25,15 +25,16 @@ from tests.helpers.scenes import random_gaussians
 from tests.helpers.trained import small
 from trainer.editors import make_editor
 from trainer.editors.pictures import read_change
-from trainer.optimize.picture_solver import make_picture_solver
+from trainer.optimize.solve_pictures import make_picture_solver
+from trainer.options import EditorOptions, RegionOptions, ViewOptions
 from trainer.regions.changed import find_change
-from trainer.regions.from_pictures import RegionSettings, region_checks, region_kinds
+from trainer.regions.from_pictures import RegionRequest, region_checks, region_kinds
 from trainer.views.crops import crop_scene
 from trainer.views.view import crop, make_view, render_view
 
 
-def settings(pictures: list[Path], folder: Path) -> RegionSettings:
-    return RegionSettings(None, 6, lambda: folder, pictures=pictures)
+def settings(pictures: list[Path], folder: Path) -> RegionRequest:
+    return RegionRequest(RegionOptions("changed"), ViewOptions(pictures=tuple(pictures)), lambda: folder)
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +42,7 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Four sides of the bear, its body filled with blue, as .png with their cameras."""
     folder = tmp_path_factory.mktemp("pictures")
     case = small("body", count=6, image_size=160)
-    editor = make_editor("recolor:#3060d0", case.scene, case.region, case.views)
+    editor = make_editor(EditorOptions("recolor:#3060d0"), case.scene, case.region, case.views)
     paths = []
     for i, view in enumerate(case.views[:4]):
         paths.append(folder / f"p{i}.png")

@@ -24,12 +24,11 @@ from progdf.scene.regions import parse_region
 from tests.helpers.demo_scenes import bear
 from tests.helpers.tiny_segmenters import tiny_detector, tiny_sam
 from tests.helpers.trained import label_mask, quick_options, train, write_bear
-from trainer import segmenters
-from trainer.editors.folder import FolderEditor
-from trainer.regions.from_pictures import RegionSettings, region_kinds
-from trainer.segmenters import SEGMENTERS, SegmenterSettings
-from trainer.segmenters.folder import read_masks
-from trainer.segmenters.grounded_sam import normalize_prompt
+from trainer.editors.pictures import FolderEditor
+from trainer.options import RegionOptions, ViewOptions, with_values
+from trainer.regions.from_pictures import RegionRequest, region_kinds
+from trainer.regions.masks import read_masks
+from trainer.regions.segment import SEGMENTERS, normalize_prompt
 from trainer.views.view import View
 
 SIZE, VIEWS = 96, 6
@@ -53,15 +52,21 @@ def masks(tmp_path: Path) -> Path:
     return folder
 
 
-def settings(tmp_path: Path, cameras: Path | None = None, **more: object) -> RegionSettings:
-    return RegionSettings(cameras, VIEWS, lambda: tmp_path / "segmented", quiet=True, **more)  # type: ignore[arg-type]
+def settings(
+    tmp_path: Path,
+    cameras: Path | None = None,
+    options: RegionOptions | None = None,
+    say: Callable[[str], None] | None = None,
+) -> RegionRequest:
+    views = ViewOptions(cameras, views=VIEWS)
+    return RegionRequest(options or RegionOptions(""), views, lambda: tmp_path / "segmented", True, say)
 
 
-def region_of(spec: str, told: RegionSettings, scene: Gaussians = SCENE) -> Region:
+def region_of(spec: str, told: RegionRequest, scene: Gaussians = SCENE) -> Region:
     return parse_region(spec, scene, kinds=region_kinds(told))
 
 
-def refusal(spec: str, told: RegionSettings) -> str:
+def refusal(spec: str, told: RegionRequest) -> str:
     with pytest.raises(ProgdfError, match="; ") as caught:
         region_of(spec, told)
     assert "\n" not in str(caught.value)
@@ -176,7 +181,9 @@ def test_a_camera_without_a_mask_tells_nothing_and_none_at_all_is_one_line(
 
 
 def test_masks_that_select_nothing_tell_the_highest_score(masks: Path, tmp_path: Path) -> None:
-    assert "give --lift-rule share" in refusal(f"masks:{masks}", settings(tmp_path, rule="paper"))
+    assert "give --lift-rule share" in refusal(
+        f"masks:{masks}", settings(tmp_path, options=RegionOptions("", "paper"))
+    )
     for path in masks.glob("*.png"):
         Image.new("L", (SIZE, SIZE)).save(path)
     assert "highest score is 0" in refusal(f"masks:{masks}", settings(tmp_path))
@@ -200,8 +207,8 @@ def reddish(monkeypatch: pytest.MonkeyPatch) -> Asked:
         red, green, blue = image.unbind(2)
         return (red > green + 0.15) & (red > blue + 0.15)
 
-    kinds: dict[str, Callable[[SegmenterSettings], object]] = {"text": lambda _: segment}
-    monkeypatch.setattr(segmenters, "SEGMENTERS", kinds)
+    kinds: dict[str, Callable[[RegionOptions], object]] = {"text": lambda _: segment}
+    monkeypatch.setattr("trainer.regions.segment.SEGMENTERS", kinds)
     monkeypatch.setattr("trainer.regions.from_pictures.SEGMENTERS", kinds)
     monkeypatch.setattr("trainer.regions.from_pictures.SEGMENTER_CHECKS", {"text": lambda settings: None})
     return asked
@@ -215,7 +222,7 @@ def test_a_sentence_is_segmented_once_and_kept(reddish: Asked, tmp_path: Path) -
     assert len(reddish) == 2 * VIEWS
     assert torch.equal(first.members, again.members)
     assert torch.equal(first.score, again.score)
-    region_of('text:"the Red scarf"', replace(told, segmenter=SegmenterSettings(box_threshold=0.5)))
+    region_of('text:"the Red scarf"', replace(told, options=RegionOptions("", box_threshold=0.5)))
     assert len(reddish) == 4 * VIEWS
 
 
@@ -233,7 +240,7 @@ def test_sentences_join_with_other_kinds_of_region(reddish: Asked, tmp_path: Pat
 
 def test_given_cameras_are_thinned_out_evenly(reddish: Asked, tmp_path: Path) -> None:
     save_cameras(tmp_path / "many.json", orbit_rig(SCENE, 20, SIZE, SIZE))
-    region_of("text:scarf", replace(settings(tmp_path, tmp_path / "many.json"), views=4))
+    region_of("text:scarf", replace(settings(tmp_path), views=ViewOptions(tmp_path / "many.json", views=4)))
     kept = sorted(path.stem for path in (tmp_path / "segmented" / "scarf").glob("*.png"))
     assert kept == ["orbit_002", "orbit_007", "orbit_012", "orbit_017"]
 
@@ -248,7 +255,7 @@ def test_a_sentence_leaves_a_folder_that_is_no_run_alone(reddish: Asked, tmp_pat
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "thesis.txt").write_text("important")
     with pytest.raises(ProgdfError, match="neither empty nor a run of progdf train"):
-        train(replace(quick_options(tmp_path), region="text:scarf"), quiet=True)
+        train(with_values(quick_options(tmp_path), region="text:scarf"), quiet=True)
     assert [path.name for path in (tmp_path / "run").iterdir()] == ["thesis.txt"]
     assert reddish == []
 
@@ -257,8 +264,8 @@ def test_after_a_sentence_that_finds_nothing_another_can_be_tried(reddish: Asked
     write_bear(tmp_path)
     options = quick_options(tmp_path, steps=8, stages=1, views=5)
     with pytest.raises(ProgdfError, match="found in none"):
-        train(replace(options, region="text:unicorn"), quiet=True)
-    done = train(replace(options, region="text:scarf"), quiet=True)
+        train(with_values(options, region="text:unicorn"), quiet=True)
+    done = train(with_values(options, region="text:scarf"), quiet=True)
     assert done.gdf.is_file()
     assert len(list((done.folder.segmented / "scarf").glob("*.png"))) == 10
 
@@ -272,16 +279,16 @@ def test_prompts_are_asked_as_the_detector_was_trained() -> None:
 
 
 @pytest.fixture(scope="module")
-def tiny(tmp_path_factory: pytest.TempPathFactory) -> SegmenterSettings:
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> RegionOptions:
     """A detector and an sam_model of the real classes, saved and found as real ones are."""
     pytest.importorskip("transformers")
     folder = tmp_path_factory.mktemp("models")
-    return SegmenterSettings(
-        str(tiny_detector(folder / "dino")), str(tiny_sam(folder / "sam")), box_threshold=0.01
+    return RegionOptions(
+        "", str(tiny_detector(folder / "dino")), str(tiny_sam(folder / "sam")), box_threshold=0.01
     )
 
 
-def test_the_networks_make_a_mask_of_the_pictures_size(tiny: SegmenterSettings) -> None:
+def test_the_networks_make_a_mask_of_the_pictures_size(tiny: RegionOptions) -> None:
     segment = SEGMENTERS["text"](tiny)
     image = torch.rand(60, 90, 3, generator=torch.Generator().manual_seed(0))
     mask = segment(image, "The scarf")
@@ -292,8 +299,8 @@ def test_the_networks_make_a_mask_of_the_pictures_size(tiny: SegmenterSettings) 
     assert not bool(nothing.any())
 
 
-def test_boxes_are_in_pixels_of_the_picture(tiny: SegmenterSettings) -> None:
-    from trainer.segmenters.grounded_sam import grounded_sam
+def test_boxes_are_in_pixels_of_the_picture(tiny: RegionOptions) -> None:
+    from trainer.regions.segment import grounded_sam
 
     picture = Image.new("RGB", (300, 100), "white")
     boxes = grounded_sam(tiny).boxes(picture, "scarf")
@@ -304,9 +311,9 @@ def test_boxes_are_in_pixels_of_the_picture(tiny: SegmenterSettings) -> None:
 
 
 @pytest.mark.slow
-def test_a_run_trains_a_region_that_a_sentence_names(tiny: SegmenterSettings, tmp_path: Path) -> None:
+def test_a_run_trains_a_region_that_a_sentence_names(tiny: RegionOptions, tmp_path: Path) -> None:
     write_bear(tmp_path, 800)
-    options = replace(
+    options = with_values(
         quick_options(tmp_path, steps=8, stages=1, views=3),
         region='text:"the scarf" - sphere:9,9,9,0.1',
         detector=tiny.detector,
@@ -320,25 +327,25 @@ def test_a_run_trains_a_region_that_a_sentence_names(tiny: SegmenterSettings, tm
 
 
 def test_missing_weights_are_one_line_that_tells_how_to_get_them(
-    tiny: SegmenterSettings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tiny: RegionOptions, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "empty"))
-    absent = settings(tmp_path, segmenter=replace(tiny, detector="someone/no-such-detector"))
+    absent = settings(tmp_path, options=replace(tiny, detector="someone/no-such-detector"))
     assert "hf download someone/no-such-detector" in refusal("text:scarf", absent)
-    absent = settings(tmp_path, segmenter=replace(tiny, sam_model=str(tmp_path / "nowhere")))
+    absent = settings(tmp_path, options=replace(tiny, sam_model=str(tmp_path / "nowhere")))
     assert "give --sam-model" in refusal("text:scarf", absent)
     (tmp_path / "broken").mkdir()
     for file in Path(tiny.sam_model).iterdir():
         (tmp_path / "broken" / file.name).write_bytes(file.read_bytes())
     (tmp_path / "broken" / "model.safetensors").write_bytes(b"half")
-    broken = settings(tmp_path, segmenter=replace(tiny, sam_model=str(tmp_path / "broken")))
+    broken = settings(tmp_path, options=replace(tiny, sam_model=str(tmp_path / "broken")))
     assert "not hold a complete model with safetensors weights" in refusal("text:scarf", broken)
 
 
-def test_a_model_of_another_kind_is_one_line(tiny: SegmenterSettings, tmp_path: Path) -> None:
-    swapped = SegmenterSettings(tiny.sam_model, tiny.detector)
+def test_a_model_of_another_kind_is_one_line(tiny: RegionOptions, tmp_path: Path) -> None:
+    swapped = RegionOptions("", detector=tiny.sam_model, sam_model=tiny.detector)
     assert "is a sam model, not grounding-dino; give --detector" in refusal(
-        "text:scarf", settings(tmp_path, segmenter=swapped)
+        "text:scarf", settings(tmp_path, options=swapped)
     )
 
 

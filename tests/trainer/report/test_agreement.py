@@ -13,8 +13,9 @@ from torch import Tensor
 from progdf.rasterize import render
 from tests.helpers.trained import WHITE, Small, small
 from trainer.editors import make_editor
+from trainer.options import EditorOptions
 from trainer.report.agreement import Agreement, fit_colors, measure_agreement, view_change
-from trainer.setup.training_setup import TrainingSetup
+from trainer.setup import TrainingSetup
 from trainer.views.view import crop, render_colors
 
 
@@ -35,7 +36,7 @@ def judged(pictures: list[Tensor]) -> Agreement:
 
 def edited(spec: str) -> list[Tensor]:
     case = body()
-    editor = make_editor(spec, case.scene, case.region, case.views)
+    editor = make_editor(EditorOptions(spec), case.scene, case.region, case.views)
     return [editor.edit(view, 1.0) for view in case.views]
 
 

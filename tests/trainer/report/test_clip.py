@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import sys
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -21,11 +20,11 @@ from progdf.io.images import to_picture
 from tests.helpers.tiny_clip import tiny_clip
 from tests.helpers.trained import WHITE, quick_options, small, train, write_bear
 from trainer.fit.evaluate import make_evaluator
-from trainer.options import FitOptions, TrainOptions
-from trainer.pipeline.refit import refit
-from trainer.plan import make_plan
-from trainer.report.clip import Clip, Texts, direction, load_clip, square_picture
+from trainer.options import FitOptions, TextOptions, with_values
+from trainer.report.clip import Clip, direction, load_clip, square_picture
 from trainer.report.measures import clip_curve
+from trainer.resolve import resolve
+from trainer.run.finish import refit
 
 pytest.importorskip("transformers")
 
@@ -127,10 +126,10 @@ def test_what_is_missing_or_no_clip_is_one_line_that_names_the_remedy(
 
 
 def test_an_instruction_is_what_one_sees_after_unless_something_else_is_said() -> None:
-    told = TrainOptions(Path("s.ply"), Path("run"), "all", 'instruct:"a golden bear"', text_before="a bear")
-    assert make_plan(told).texts.after == "a golden bear"
-    assert make_plan(replace(told, text_after="gold")).texts.after == "gold"
-    assert make_plan(replace(told, editor="recolor:#fff")).texts.after == ""
+    told = quick_options(Path(), editor='instruct:"a golden bear"', text_before="a bear")
+    assert resolve(told).texts.text_after == "a golden bear"
+    assert resolve(with_values(told, text_after="gold")).texts.text_after == "gold"
+    assert resolve(with_values(told, editor="recolor:#fff")).texts.text_after == ""
 
 
 @pytest.mark.slow
@@ -149,7 +148,7 @@ def test_a_run_reports_the_course_over_the_slider_and_a_refit_can_ask_in_other_w
     assert -1.0 <= edit["clip_direction"] <= 1.0
     assert edit["clip_model"] == saved.name
 
-    again = refit(FitOptions(result.folder.root, text_after="zebra", threads=1), quiet=True)
+    again = refit(with_values(FitOptions(result.folder.root), text_after="zebra", threads=1), quiet=True)
     assert again.report["edit"]["clip_direction"] != edit["clip_direction"]
 
 
@@ -164,7 +163,7 @@ def test_why_nothing_is_measured_is_told(saved: Path, monkeypatch: pytest.Monkey
             evaluator,
             bear.views,
             BakedField("separable", torch.tensor([0.0, 1.0]), {}, 14),
-            Texts(before, after),
+            TextOptions(before, after),
         )
         assert not found.s
         return found.reason

@@ -20,7 +20,7 @@ from tests.helpers.trained import WHITE, Small, small
 from trainer.fit.evaluate import Evaluator, make_evaluator
 from trainer.fit.fit import drop_idle_attributes
 from trainer.optimize.losses import GradientL1
-from trainer.report.curves import error_curves
+from trainer.report.measures import error_curves
 from trainer.report.plots import LINES, Plot, draw_plot
 from trainer.report.report import best_view, columns_of, editor_strip, strip, thumbnail
 from trainer.store.progress import PeakMemory
@@ -112,6 +112,13 @@ def test_every_line_of_a_plot_is_drawn_in_its_color(scale: str) -> None:
     assert picture.size == (400, 270)
     assert all(_color_count(picture, color) > 150 for color in LINES[:4])
     assert _color_count(picture, LINES[4]) == 0
+
+
+def test_more_lines_than_colors_are_all_drawn() -> None:
+    lines = {str(i): ([0.0, 1.0], [float(i), float(i)]) for i in range(len(LINES) + 2)}
+    all_of_them, first = (draw_plot(Plot("t", dict(list(lines.items())[:n])), 900, 400) for n in (8, 6))
+    for color in LINES[:2]:
+        assert _color_count(all_of_them, color) > 1.2 * _color_count(first, color)
 
 
 def test_gaps_zeros_and_empty_lines_do_not_break_a_plot() -> None:

@@ -12,9 +12,10 @@ import torch
 from progdf.camera import Camera
 from progdf.region import Region
 from tests.helpers.demo_scenes import bear
-from trainer.options import MOST_VIEWS, VIEWS, TrainOptions
-from trainer.plan import make_plan
-from trainer.setup.resolution import SIZES, ViewSettings, choose_resolution
+from tests.helpers.trained import quick_options
+from trainer.options import MOST_VIEWS, VIEWS, ViewOptions
+from trainer.resolve import resolve
+from trainer.setup import SIZES, choose_resolution
 from trainer.views.view import region_rig
 
 
@@ -22,7 +23,7 @@ def choice(count: int, cameras: int | None = None, **said: object) -> tuple[int,
     """Pixels and views for so many of the bear's Gaussians, with that many cameras given."""
     scene = bear(max(400, count)).gaussians[:count]
     region = Region("all", torch.arange(count), torch.ones(count))
-    settings = ViewSettings(None if cameras is None else Path("c.json"))
+    settings = ViewOptions(None if cameras is None else Path("c.json"))
     settings = replace(settings, **said)  # type: ignore[arg-type]
 
     def cameras_of(image_size: int, views: int) -> Sequence[Camera]:
@@ -35,7 +36,7 @@ def choice(count: int, cameras: int | None = None, **said: object) -> tuple[int,
 @pytest.fixture(autouse=True)
 def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """A tenth of the pixels, so that a small bear is dense."""
-    monkeypatch.setattr("trainer.setup.resolution.SIZES", tuple(size // 10 for size in SIZES))
+    monkeypatch.setattr("trainer.setup.SIZES", tuple(size // 10 for size in SIZES))
 
 
 def test_a_sparse_region_gets_few_small_views() -> None:
@@ -58,8 +59,8 @@ def test_what_was_typed_is_kept() -> None:
 
 def test_what_is_painted_view_by_view_and_a_draft_stay_small() -> None:
     assert choice(6000, dense=False) == (25, VIEWS)
-    words = {"scene": Path("s.ply"), "out": Path("o"), "region": "all", "editor": "recolor:#3060d0"}
     plans = [
-        make_plan(TrainOptions(**words | more)) for more in ({}, {"quick": True}, {"editor": "style:14"})
+        resolve(quick_options(Path(), views=0, image_size=0, **more))
+        for more in ({}, {"quick": True}, {"editor": "style:14"})
     ]
     assert [plan.views.dense for plan in plans] == [True, False, False]

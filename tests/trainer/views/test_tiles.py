@@ -14,8 +14,7 @@ from progdf.rasterize import ActivatedGaussians, render
 from progdf.rasterize.cpu.forward import TILE_H, TILE_W
 from tests.helpers.scenes import front_camera, hard_cases, orbit_camera, random_gaussians
 from tests.helpers.trained import WHITE, small
-from trainer.views.crops import CropScene, crop_scene, render_all
-from trainer.views.tiles import live_pixels, live_tiles, may_reach
+from trainer.views.crops import CropScene, crop_scene, live_pixels, live_tiles, may_reach, render_all
 
 COLORS = ("sh0", "shN")
 

@@ -19,8 +19,8 @@ from progdf.region import from_mask
 from tests.helpers.demo_scenes import room
 from tests.helpers.scenes import concatenate, front_camera, one_gaussian, orbit_camera, random_gaussians
 from tests.helpers.trained import WHITE, Small, small
-from trainer.setup.resolution import ViewSettings
-from trainer.setup.training_setup import make_training_setup
+from trainer.options import ViewOptions
+from trainer.setup import make_training_setup
 from trainer.views.choose import (
     ViewChoice,
     choose_views,
@@ -160,7 +160,7 @@ def test_views_from_within_show_every_wall() -> None:
 def test_a_scene_to_stand_inside_asks_for_its_cameras(tmp_path: Path) -> None:
     demo = room(1500)
     save_ply(tmp_path / "room.ply", demo.gaussians)
-    settings = ViewSettings(views=6, image_size=48)
+    settings = ViewOptions(views=6, image_size=48)
     region = from_mask("rug", torch.isin(torch.arange(1500), demo.members("rug")))
     with pytest.raises(ProgdfError, match="--cameras") as told:
         make_training_setup(settings, demo.gaussians, region)

@@ -17,8 +17,9 @@ from progdf.region import from_mask
 from progdf.scene.bounds import scene_sphere
 from tests.helpers.scenes import ball, concatenate, front_camera, one_gaussian
 from tests.helpers.trained import small
-from trainer.editors import EditorSettings, check_new_editor, make_editor
-from trainer.editors.folder import FolderEditor
+from trainer.editors import check_new_editor, make_editor
+from trainer.editors.pictures import FolderEditor
+from trainer.options import EditorOptions
 from trainer.views.view import fit_size, make_view, name_cameras, region_box, region_rig, seen_colors
 
 
@@ -74,15 +75,19 @@ def test_edited_photographs_are_straightened_before_they_are_targets(tmp_path: P
         ((torch.arange(72)[:, None] // 6 + torch.arange(72) // 6) % 2).float()[..., None].expand(-1, -1, 3)
     )
     write_image(tmp_path / "p" / f"{view.camera.name}.png", checks)
-    raw = make_editor(f"folder:{tmp_path / 'p'}", case.scene, case.region, [view]).edit(view, 1.0)
-    straight = make_editor(f"photographs:{tmp_path / 'p'}", case.scene, case.region, [view]).edit(view, 1.0)
+    raw = make_editor(EditorOptions(f"folder:{tmp_path / 'p'}"), case.scene, case.region, [view]).edit(
+        view, 1.0
+    )
+    straight = make_editor(
+        EditorOptions(f"photographs:{tmp_path / 'p'}"), case.scene, case.region, [view]
+    ).edit(view, 1.0)
     assert torch.equal(raw, checks)
     expected, shown = undistort(checks, view.camera.K, lens)
     assert torch.equal(straight[shown], expected[shown])
     assert torch.equal(straight[~shown], view.image[~shown]), "what no photograph shows stays as it is"
     assert float((straight - raw).abs().mean()) > 0.01
     plain = replace(view, camera=replace(view.camera, lens=None))
-    editor = make_editor(f"photographs:{tmp_path / 'p'}", case.scene, case.region, [plain])
+    editor = make_editor(EditorOptions(f"photographs:{tmp_path / 'p'}"), case.scene, case.region, [plain])
     assert torch.equal(editor.edit(plain, 1.0), raw)
 
 
@@ -97,14 +102,14 @@ def test_of_photographs_with_their_originals_only_the_change_is_trained(tmp_path
     for folder, picture in (("before", sharp), ("after", painted)):
         write_image(tmp_path / folder / f"{view.camera.name}.png", picture)
     spec = f"photographs:{tmp_path / 'after'},{tmp_path / 'before'}"
-    editor = make_editor(spec, case.scene, case.region, [view])
+    editor = make_editor(EditorOptions(spec), case.scene, case.region, [view])
     made = editor.edit(view, 1.0)
     untouched = torch.ones(made.shape[:2], dtype=torch.bool)
     untouched[20:40, 30:50] = False
     torch.testing.assert_close(made[untouched], view.image[untouched], atol=1e-6, rtol=0)
     expected = (view.image + painted - sharp).clamp(0, 1)
     torch.testing.assert_close(made, expected, atol=1.5 / 255, rtol=0)  # both files are rounded to 8 bits
-    alone = make_editor(f"photographs:{tmp_path / 'after'}", case.scene, case.region, [view])
+    alone = make_editor(EditorOptions(f"photographs:{tmp_path / 'after'}"), case.scene, case.region, [view])
     torch.testing.assert_close(alone.edit(view, 1.0), painted, atol=0.6 / 255, rtol=0)
     assert isinstance(editor, FolderEditor)
     assert isinstance(alone, FolderEditor)
@@ -118,7 +123,7 @@ def test_of_photographs_with_their_originals_only_the_change_is_trained(tmp_path
 )
 def test_photographs_that_are_not_there_are_refused_in_one_line(tmp_path: Path, spec: str) -> None:
     with pytest.raises(ProgdfError, match="; ") as told:
-        check_new_editor(spec.format(tmp_path), EditorSettings())
+        check_new_editor(EditorOptions(spec.format(tmp_path)))
     assert "\n" not in str(told.value)
 
 
@@ -128,7 +133,12 @@ def test_an_original_photograph_that_is_missing_is_refused_before_training(tmp_p
     for view in case.views:
         write_image(tmp_path / f"{view.camera.name}.png", view.image)
     with pytest.raises(ProgdfError, match=r"before has no picture .*; put the photographs there"):
-        make_editor(f"photographs:{tmp_path},{tmp_path / 'before'}", case.scene, case.region, case.views)
+        make_editor(
+            EditorOptions(f"photographs:{tmp_path},{tmp_path / 'before'}"),
+            case.scene,
+            case.region,
+            case.views,
+        )
 
 
 def test_what_is_put_in_place_of_the_inside_is_mixed_as_the_original_was() -> None:

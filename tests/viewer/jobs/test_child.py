@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from trainer.pipeline import demo
+from trainer.run import demo
 from viewer.jobs.child import NICE, STARVED_S, Child
 
 MODULES = ("numpy", "threading", "torch", "signal", "json", "progdf", "trainer")

@@ -9,8 +9,7 @@ import torch
 
 from progdf.errors import ProgdfError
 from tests.helpers.trained import course, small
-from trainer.optimize.optimizer_state import PgsState
-from trainer.optimize.pgs import optimize
+from trainer.optimize.pgs import PgsState, optimize
 from trainer.store.state import PeriodicSave, Saved, StateFolder
 
 

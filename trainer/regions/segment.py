@@ -6,19 +6,26 @@ Together they are what the paper calls LangSAM. Weights are read from this machi
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
 from progdf.errors import ProgdfError
 from progdf.io.images import to_picture
-from trainer.options import DETECTOR, SAM_MODEL
+from trainer.options import DETECTOR, SAM_MODEL, RegionOptions
 from trainer.store.pretrained import BROKEN, check_weights_here, folder_of_model
 
-from .base import SegmenterSettings
+
+class Segmenter(Protocol):
+    """Finds what a prompt names."""
+
+    def __call__(self, image: Tensor, prompt: str) -> Tensor:
+        """The mask of it, empty where there is none. [H,W,3] 0..1 -> [H,W] bool"""
+        ...
 
 
 @dataclass(frozen=True)
@@ -75,7 +82,7 @@ def normalize_prompt(prompt: str) -> str:
     return f"{words}."
 
 
-def grounded_sam(settings: SegmenterSettings) -> GroundedSam:
+def grounded_sam(options: RegionOptions) -> GroundedSam:
     """Load both networks from this machine.
 
     Raises:
@@ -109,18 +116,18 @@ def grounded_sam(settings: SegmenterSettings) -> GroundedSam:
             raise ProgdfError(_missing(model, option)) from error
 
     finder = load(
-        settings.detector,
+        options.detector,
         "grounding-dino",
         "--detector",
         DETECTOR,
         GroundingDinoForObjectDetection,
         GroundingDinoProcessor,
     )
-    sam_model = load(settings.sam_model, "sam", "--sam-model", SAM_MODEL, SamModel, SamProcessor)
-    return GroundedSam(*finder, *sam_model, settings.box_threshold)
+    sam_model = load(options.sam_model, "sam", "--sam-model", SAM_MODEL, SamModel, SamProcessor)
+    return GroundedSam(*finder, *sam_model, options.box_threshold)
 
 
-def check_grounded_sam(settings: SegmenterSettings) -> None:
+def check_grounded_sam(options: RegionOptions) -> None:
     """What `grounded_sam` would raise, as far as it is to be known without loading a network.
 
     Raises:
@@ -131,8 +138,8 @@ def check_grounded_sam(settings: SegmenterSettings) -> None:
     except ImportError as error:
         raise _import_failure(error) from error
     for model, kind, option, usual in (
-        (settings.detector, "grounding-dino", "--detector", DETECTOR),
-        (settings.sam_model, "sam", "--sam-model", SAM_MODEL),
+        (options.detector, "grounding-dino", "--detector", DETECTOR),
+        (options.sam_model, "sam", "--sam-model", SAM_MODEL),
     ):
         try:
             _check_kind(AutoConfig.from_pretrained(model, local_files_only=True), model, kind, option, usual)
@@ -157,3 +164,10 @@ def _missing(model: str, option: str) -> str:
         f"the weights of {model} are not on this machine or are incomplete; download them with "
         f"'hf download {model}', or give {option} the folder of a saved model"
     )
+
+
+SEGMENTERS: Mapping[str, Callable[[RegionOptions], Segmenter]] = {"text": grounded_sam}
+"""Kind of region → the segmenter behind it, loaded when it is made."""
+
+SEGMENTER_CHECKS: Mapping[str, Callable[[RegionOptions], None]] = {"text": check_grounded_sam}
+"""Kind of region → what raises a ProgdfError where that segmenter cannot be made; it loads no weights."""

@@ -21,7 +21,9 @@ from progdf.io.json_values import convert_json, decode_json, plain
 from progdf.region import Region
 from trainer.editors.pictures import strengths_of
 from trainer.options import MOST_THREADS, TrainOptions
-from trainer.plan import Plan
+from trainer.resolve import recorded_options, resolve
+from trainer.run.record import upgrade_plan
+from trainer.run.threads import count_threads
 from trainer.store.run_folder import RunFolder, begin_log, remove_leftovers
 
 _SWITCHES = (
@@ -62,23 +64,20 @@ def load_region(out: Path) -> Region | None:
         return Region(name, saved.tensors["members"], score)
 
 
-def decide_resume(
-    folder: RunFolder, plan: Plan, region: Region, count: int, threads: int, resume: bool
-) -> ResumeDecision:
+def decide_resume(folder: RunFolder, options: TrainOptions, region: Region, count: int) -> ResumeDecision:
     """Find out what is to be done, and make the folder ready for it.
 
     Args:
         folder: opened and locked
-        plan: of the run that is asked for
+        options: of the run that is asked for, resolved
         region: what may change
         count: Gaussians in the scene
-        threads: that are asked for
-        resume: go on with what was stopped
 
     Raises:
         ProgdfError: a stopped run that would be lost without --resume; with it, another plan than the run's.
     """
-    saved = _saved_identity(folder)
+    saved, plan = _saved_identity(folder), recorded_options(options)
+    threads, resume = count_threads(options.threads), options.resume
     if resume and saved is None and folder.report.is_file():
         was, pictures = _finished(folder)
         again = "leave out --resume to train again"
@@ -112,7 +111,7 @@ def decide_resume(
         return ResumeDecision("go on", saved.threads, tuple(notes))
     if saved is not None and (step := _saved_step(folder)):
         raise ProgdfError(
-            f"{folder.root} holds a run that was stopped at step {step} of {saved.plan.optimization.steps}; "
+            f"{folder.root} holds a run that was stopped at step {step} of {saved.plan.optimize.steps}; "
             f"add --resume to continue it, or delete {folder.state.path} to start over"
         )
     begin_log(folder, plan.edit)
@@ -122,9 +121,9 @@ def decide_resume(
     return ResumeDecision("start", threads, tuple(notes))
 
 
-def find_run(out: Path, plan: Plan) -> Literal["nothing", "stopped", "finished"]:
-    """What a run that resumes would find in the folder, of a run with this very plan."""
-    folder = RunFolder(out)
+def find_run(options: TrainOptions) -> Literal["nothing", "stopped", "finished"]:
+    """What a run that resumes would find in the folder, of a run with these very options."""
+    folder, plan = RunFolder(options.out), recorded_options(resolve(options))
     saved = _saved_identity(folder)
     if saved is None and not folder.report.is_file():
         return "nothing"
@@ -168,7 +167,7 @@ def check_exists(folder: RunFolder) -> Iterator[None]:
 class _Identity(msgspec.Struct):
     """All that decides the bits of a run's result, as run.json has it; of files their hashes."""
 
-    plan: Plan
+    plan: TrainOptions
     scene: str
     cameras: str | None
     threads: Annotated[int, msgspec.Meta(ge=1, le=MOST_THREADS)]
@@ -177,7 +176,7 @@ class _Identity(msgspec.Struct):
     processor: str = ""  # of runs before it was kept
 
 
-def _identity(plan: Plan, threads: int) -> _Identity:
+def _identity(plan: TrainOptions, threads: int) -> _Identity:
     cameras = plan.views.cameras
     return _Identity(
         plan,
@@ -201,7 +200,7 @@ def processor_kind() -> str:
     return ", ".join([name, torch.backends.cpu.get_cpu_capability(), *switches])
 
 
-def picture_digests(plan: Plan) -> dict[str, str]:
+def picture_digests(plan: TrainOptions) -> dict[str, str]:
     """The changed pictures that a plan names, those of further strengths among them, and their hashes."""
     paths = [path for given in plan.views.pictures for path in strengths_of(given).values()]
     return {str(path.resolve()): _digest(path) for path in paths}
@@ -211,39 +210,48 @@ def _saved_identity(folder: RunFolder) -> _Identity | None:
     found = folder.state.identity()
     if found is None:
         return None
+    if "optimization" in found.get("plan", {}):
+        raise ProgdfError(
+            f"{folder.root} was begun by an earlier version, which ends it; or delete {folder.state.path} "
+            "and train again"
+        )
     try:
         return convert_json(found, _Identity)
     except ValueError as error:
         raise folder.state.damage_error(folder.state.path / "run.json", error) from None
 
 
-def plan_difference(was: Plan, now: Plan) -> str:
+def plan_difference(was: TrainOptions, now: TrainOptions) -> str:
     """A value that differs, in words, "--steps 24, not 40"; "" where none does. What was typed goes first."""
-    typed = {field.name for field in fields(TrainOptions)}
     pairs = zip(_values(was), _values(now), strict=True)
-    found = [(name, before, after) for (name, before), (_, after) in pairs if before != after]
-    if not found:
+    differing = [
+        (name, typed, before, after) for (name, typed, before), (*_, after) in pairs if before != after
+    ]
+    if not differing:
         return ""
-    name, before, after = min(found, key=lambda value: value[0] not in typed)
-    said = "--" + name.replace("_", "-") if name in typed else name.replace("_", " ")
+    name, typed, before, after = min(differing, key=lambda value: not value[1])
+    said = "--" + name.replace("_", "-") if typed else name.replace("_", " ")
     return f"{said} {_said(before)}, not {_said(after)}"
 
 
-def _values(part: Any) -> Iterator[tuple[str, Any]]:
-    """All values of a plan with their names, in order; paths as places."""
+def _values(part: Any) -> Iterator[tuple[str, bool, Any]]:
+    """All values of options in order: name, whether it is typed, value; paths absolute."""
     for field in fields(part):
         value = getattr(part, field.name)
         if is_dataclass(value):
             yield from _values(value)
         else:
-            yield field.name, value.resolve() if isinstance(value, Path) else value
+            typed = not str(field.type).startswith("Fixed")
+            if field.name in ("views", "image_size", "stages"):
+                value = value or None  # 0: by default
+            yield field.name, typed, value.resolve() if isinstance(value, Path) else value
 
 
 def _said(value: object) -> object:
-    return "by default" if value is None or value == "" else value
+    return "by default" if value in (None, "") else value
 
 
-def _check_plan(folder: RunFolder, was: Plan, now: Plan, remedy: str) -> None:
+def _check_plan(folder: RunFolder, was: TrainOptions, now: TrainOptions, remedy: str) -> None:
     if difference := plan_difference(was, now):
         raise ProgdfError(f"{folder.root} was started with {difference}; {remedy}")
 
@@ -254,11 +262,13 @@ def _check_pictures(folder: RunFolder, was: Mapping[str, str], now: Mapping[str,
             raise ProgdfError(f"{path} has changed since {folder.root} was started; {remedy}")
 
 
-def _finished(folder: RunFolder) -> tuple[Plan, dict[str, str]]:
+def _finished(folder: RunFolder) -> tuple[TrainOptions, dict[str, str]]:
     """A finished run's plan, and the hashes of its changed pictures."""
     try:
         report = decode_json(folder.report.read_bytes())
-        return convert_json(report["plan"], Plan), convert_json(report.get("pictures", {}), dict[str, str])
+        return convert_json(upgrade_plan(report["plan"]), TrainOptions), convert_json(
+            report.get("pictures", {}), dict[str, str]
+        )
     except (ValueError, KeyError, TypeError) as error:
         raise ProgdfError(f"{folder.report} is damaged; leave out --resume to train again") from error
 

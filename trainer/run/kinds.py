@@ -19,15 +19,13 @@ from torch.nn.functional import interpolate
 from progdf.gaussians import pack
 from progdf.metrics.image import decibels
 from progdf.scene.bounds import scene_sphere
-from trainer.editors import ImageEditor
-from trainer.editors.base import EditKind
-from trainer.optimize.groups import group_stage
-from trainer.optimize.losses import GradientL1
-from trainer.optimize.objective import LossWeights, Objective
-from trainer.optimize.pgs import TargetStage, optimize
-from trainer.optimize.settings import GROUP_STEPS, pgs_settings
-from trainer.plan import OptimizationPlan, plan_optimization
-from trainer.setup.training_setup import TrainingSetup
+from trainer.editors import KIND_UNKNOWN, ImageEditor
+from trainer.optimize.groups import GROUP_STEPS, group_stage
+from trainer.optimize.losses import GradientL1, Objective
+from trainer.optimize.pgs import TargetStage, optimize, pgs_settings
+from trainer.options import EditKind, OptimizeOptions, TrainOptions, with_values
+from trainer.resolve import resolve_kind
+from trainer.setup import TrainingSetup
 from trainer.store.progress import Advance, RunLog
 from trainer.views.crops import CropScene, crop_scene, render_all
 from trainer.views.view import View, crop, fit_size
@@ -116,50 +114,52 @@ class Trial:
 
 
 def choose_approach(
-    asked: OptimizationPlan, setup: TrainingSetup, editor: ImageEditor, knows_kind: bool, log: RunLog
+    options: TrainOptions, setup: TrainingSetup, editor: ImageEditor, log: RunLog
 ) -> tuple[Approach, dict[str, Any] | None]:
     """What plan and editor say, or a trial finds where they leave it open; and the trial's figures.
 
     Args:
-        asked: see `OptimizationPlan`
+        options: resolved
         setup: the training views
         editor: pictures the finished edit
-        knows_kind: the editor knows what its pictures move
         log: of the run
 
     Raises:
         ProgdfError: an edited view is missing or broken.
     """
-    kind = editor.kind if asked.kind is None and knows_kind else asked.kind
-    if kind in ("color", "style"):
+    asked = options.optimize
+    knows_kind = options.editor.family not in KIND_UNKNOWN
+    kind = editor.kind if asked.kind == "auto" and knows_kind else asked.kind
+    if kind == "color" or kind == "style":
         return Approach(kind), None
     if kind == "geometry" and asked.group_steps is not None:
         return Approach(kind, asked.group_steps), None
     edited = [editor.edit(view, 1.0) for view in setup.train]
-    ways = approaches(asked, setup, edited)
+    ways = approaches(options, setup, edited)
     if all(torch.equal(picture, view.image) for picture, view in zip(edited, setup.train, strict=True)):
         return ways[0], None
     with log.steps("try kinds", len(ways)) as advance:
-        trial = try_approaches(asked, setup, edited, ways, advance)
+        trial = try_approaches(options, setup, edited, ways, advance)
     log.say(trial.line())
     return trial.chosen, trial.figures()
 
 
-def approaches(asked: OptimizationPlan, setup: TrainingSetup, edited: Sequence[Tensor]) -> list[Approach]:
+def approaches(options: TrainOptions, setup: TrainingSetup, edited: Sequence[Tensor]) -> list[Approach]:
     """The ways that the plan leaves open, those that move least first.
 
     Where a tool repaints the whole picture nothing tells what moved from what was painted anew beside it, and
     moving the region over that is no edit of it: geometry is then not tried unless it is asked for.
 
     Args:
-        asked: see `OptimizationPlan`
+        options: resolved
         setup: the training views
         edited: the finished edit of each, not confined. [H,W,3]
     """
+    asked = options.optimize
     groups = GROUP_STEPS if asked.group_steps is None else asked.group_steps
     geometry = [Approach("geometry")] if not groups or asked.group_steps is None else []
     geometry += [Approach("geometry", groups)] if groups else []
-    if asked.kind is not None:
+    if asked.kind != "auto":
         return geometry if asked.kind == "geometry" else [Approach(asked.kind)]
     changed = beside = 0.0
     for view, picture in zip(setup.train, edited, strict=True):
@@ -171,7 +171,7 @@ def approaches(asked: OptimizationPlan, setup: TrainingSetup, edited: Sequence[T
 
 
 def try_approaches(
-    asked: OptimizationPlan,
+    options: TrainOptions,
     setup: TrainingSetup,
     edited: Sequence[Tensor],
     ways: Sequence[Approach],
@@ -180,7 +180,7 @@ def try_approaches(
     """Try some ways; the same inputs give the same figures.
 
     Args:
-        asked: of the run
+        options: of the run
         setup: scene, region and training views
         edited: the finished edit of each training view, not confined. [H,W,3]
         ways: see `approaches`
@@ -197,17 +197,17 @@ def try_approaches(
     crops, targets = [one.scene for one in taught], [one.target for one in taught]
     original = pack(setup.scene[members], with_shN=setup.scene.sh_degree > 0)
     extent = 2.0 * scene_sphere(setup.scene[members])[1]
-    steps = max(_LEAST_STEPS, min(_MOST_STEPS, round(_SHARE * asked.steps)))
-    objective = Objective(GradientL1(), LossWeights(perceptual=0.0))
+    steps = max(_LEAST_STEPS, min(_MOST_STEPS, round(_SHARE * options.optimize.steps)))
+    objective = Objective(GradientL1(), OptimizeOptions(perceptual_weight=0.0))
     psnrs: dict[Approach, float] = {}
     for way in ways:
         stages = [TargetStage(1.0, targets, steps)]
         if way.group_steps:
             # how far parts get as wholes; what the members add to that takes longer than a trial
-            groups = group_stage(original, crops, [targets], steps, asked.seed)
+            groups = group_stage(original, crops, [targets], steps, options.optimize.seed)
             end = groups.to_stages(original, crops, stages)[0].place(torch.zeros_like(original))
         else:
-            own = plan_optimization(replace(asked, steps=steps), way.kind, 0)
+            own = resolve_kind(with_values(options, steps=steps), way.kind, 0)
             settings = pgs_settings(own, True, original.shape[1], extent, 1)
             *_, last = optimize(
                 original, crops, [], stages, objective, replace(settings, smoothing=0.9, every=0, snapshots=1)

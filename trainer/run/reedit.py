@@ -10,15 +10,16 @@ run goes on with, and the same run again paints none of them twice.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
 from progdf.errors import ProgdfError
 from progdf.gaussians import pack
 from trainer.editors import RepaintingEditor, make_editor
-from trainer.editors.base import EditKind
-from trainer.plan import EditorPlan
-from trainer.setup.training_setup import TrainingSetup, confines_edit, quantize_image
+from trainer.options import EditorOptions, OptimizeOptions
+from trainer.setup import TrainingSetup, confines_edit, quantize_image
 from trainer.store.progress import RunLog
 from trainer.store.run_folder import RunFolder
 from trainer.views.view import crop, render_view
@@ -38,13 +39,8 @@ class Reedit:
     def __init__(
         self, editor: RepaintingEditor, setup: TrainingSetup, every: int, confined: bool, log: RunLog
     ) -> None:
-        self._editor, self._stand, self._every, self._confined, self._log = (
-            editor,
-            setup,
-            every,
-            confined,
-            log,
-        )
+        self._editor, self._setup, self._log = editor, setup, log
+        self._every, self._confined = every, confined
         self._shown = 0  # the step whose pictures are the targets now; 0: none
 
     def __call__(self, step: int, local: int, strength: float, offsets: Tensor) -> list[Tensor] | None:
@@ -53,7 +49,7 @@ class Reedit:
         if due <= step - local or due == self._shown:
             return None
         self._shown = due
-        setup, members = self._stand, self._stand.region.members
+        setup, members = self._setup, self._setup.region.members
         renders: list[Tensor | None] = [None] * len(setup.train)
         if due == step:
             rows = pack(setup.scene[members], with_shN=setup.scene.sh_degree > 0) + offsets
@@ -71,16 +67,20 @@ class Reedit:
 
 
 def reedit(
-    editor: EditorPlan, every: int, setup: TrainingSetup, kind: EditKind, folder: RunFolder, log: RunLog
+    options: EditorOptions,
+    setup: TrainingSetup,
+    optimization: OptimizeOptions,
+    folder: RunFolder,
+    log: RunLog,
 ) -> Reedit | None:
     """What --reedit-every asks for; None where it asks for nothing.
 
     Raises:
         ProgdfError: the editor cannot look at a picture again.
     """
-    if not every:
+    if not options.reedit_every:
         return None
-    made = make_editor(editor.editor, setup.scene, setup.region, setup.views, editor.settings(folder.painted))
-    if not isinstance(made, RepaintingEditor):
-        raise ProgdfError(f"--reedit-every does not apply to {editor.editor}; leave it out")
-    return Reedit(made, setup, every, confines_edit(made, kind), log)
+    editor = make_editor(replace(options, cache=folder.painted), setup.scene, setup.region, setup.views)
+    if not isinstance(editor, RepaintingEditor):
+        raise ProgdfError(f"--reedit-every does not apply to {options.editor}; leave it out")
+    return Reedit(editor, setup, options.reedit_every, confines_edit(editor, optimization.kind), log)

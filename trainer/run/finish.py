@@ -21,20 +21,24 @@ from progdf.io.json_values import convert_json, decode_json, plain
 from progdf.terminal import file_size, format_count
 from trainer.editors.pictures import picture_background
 from trainer.fit.evaluate import Evaluator, make_evaluator
-from trainer.fit.fit import evaluate_field, expected_looks, fit_field, visibility
-from trainer.fit.network import fit_network
+from trainer.fit.fit import Fitted, evaluate_field, expected_looks, fit_field, visibility
+from trainer.fit.network import NetworkFit, fit_network
 from trainer.fit.slider_uniformity import equalize_slider
-from trainer.optimize.losses import Perceptual
-from trainer.optimize.settings import resolve_slider
-from trainer.pipeline.record import RunRecord
-from trainer.report.measures import clip_curve, expected_measures, figures, measure, measure_paint
+from trainer.optimize.losses import Perceptual, perceptual_loss
+from trainer.optimize.retime import resolve_slider
+from trainer.options import FieldOptions, FitOptions, TextOptions
+from trainer.report.measures import PaintTaken, clip_curve, expected_measures, figures, measure, measure_paint
 from trainer.report.report import report_picture
-from trainer.setup.training_setup import TrainingSetup
+from trainer.resolve import check_field_options
+from trainer.setup import TrainingSetup, whole_views, widen_views
 from trainer.store.progress import RunLog
 from trainer.store.run_folder import RunFolder, read_views, write_json
 from trainer.store.state import Saved
 from trainer.views.crops import only_recolors
 from trainer.views.view import View
+
+from .record import RunRecord, render_run_views, reopen_run
+from .threads import use_threads
 
 _RANK_VIEWS = 4
 _REPORT_ALONE = ("plan", "time", "memory_mb", "memory_by_stage_mb", "curves", "views", "pictures")
@@ -46,19 +50,12 @@ _LPIPS_OVER = (
 
 @dataclass(frozen=True)
 class RunResult:
-    """What a run leaves.
-
-    Args:
-        folder: the run's folder
-        gdf: path of the .gdf file
-        report: what report.json holds
-        trajectory: what was recorded, at the slider values where the field shows it
-    """
+    """What a run leaves."""
 
     folder: RunFolder
     gdf: Path
-    report: Mapping[str, Any]
-    trajectory: Trajectory
+    report: Mapping[str, Any]  # what report.json holds
+    trajectory: Trajectory  # what was recorded, at the slider values where the field shows it
 
 
 def finish_run(
@@ -81,44 +78,19 @@ def finish_run(
         log: of the run
         begun: see `network.fit_network`
     """
-    plan = record.plan
-    target, budget = plan.field.target_psnr, plan.field.bytes_budget
-    scene, region = setup.scene, setup.region
+    options, scene, region = record.plan, setup.scene, setup.region
     with log.stage("fit"):
         evaluator = load_evaluator(folder, setup, setup.judging, trajectory)
         choosing, reporting = evaluator.halves()
-        if len(setup.held_out) == 1:
-            log.say("one view alone is held out: the field is chosen and reported on it")
-        if not setup.held_out:
-            log.say("no view is held out: all figures are of the views that were trained on")
-        few = setup.train[:: max(1, len(setup.train) // _RANK_VIEWS)][:_RANK_VIEWS]
-        seen = load_evaluator(folder, setup, few, trajectory)
-        with log.looks("weigh the members", len(setup.train)) as looked:
-            weights = visibility(scene, region.members, setup.train, looked)
-        if plan.field.field == "neural":
-            network = fit_network(
-                trajectory, setup, seen, reporting, weights, plan.field.network, perceptual, log, begun
-            )
-            fitted = evaluate_field(trajectory, reporting, network.field, target)
-        else:
-            network = None
-            with log.looks("fit the field", expected_looks(trajectory, plan.field.field)) as looked:
-                fitted = fit_field(
-                    trajectory,
-                    replace(seen, looked=looked),
-                    replace(choosing, looked=looked),
-                    replace(reporting, looked=looked),
-                    weights,
-                    plan.field.field,
-                    target,
-                    budget,
-                )
+        fitted, network = _fit(
+            options.field, setup, evaluator, trajectory, perceptual, log, folder, begun=begun
+        )
     with log.stage("even"):
-        slider = resolve_slider(plan.slider, trajectory.strengths)
+        slider = resolve_slider(options.optimize.slider, trajectory.strengths)
         field, remap = fitted.chosen.field, identity_remap()
         if slider == "even":
             field, remap = equalize_slider(field, setup, log)
-        shown = replace(trajectory, s=remap(trajectory.s).float())
+        shipped = replace(trajectory, s=remap(trajectory.s).float())
     log.say(
         f"{fitted.chosen.label}, {fitted.why}: "
         f"{field.bytes_per_member:.0f} bytes per Gaussian without the header, "
@@ -127,31 +99,24 @@ def finish_run(
         f"in {format_count(len(reporting.names), 'view')}"
     )
     if not fitted.met:
+        budget = options.field.bytes_budget
         if budget is not None and network is None:
             log.say(f"no field takes --bytes-budget {budget:g} or less; the smallest was kept")
         else:
-            log.say(f"no field reached --target-psnr {target:g}; the best was kept")
+            log.say(f"no field reached --target-psnr {options.field.target_psnr:g}; the best was kept")
     with log.stage("report"):
-        clip = clip_curve(evaluator, setup.judging, field, plan.texts)
-        if clip.reason and plan.texts.asked:
+        clip = clip_curve(evaluator, setup.judging, field, options.texts)
+        if clip.reason and options.texts.asked:
             log.say(f"CLIP directional similarity is not measured: {clip.reason}")
         with log.looks("measure the edit", expected_measures(trajectory)) as looked:
-            watched, apart = (replace(views, looked=looked) for views in (evaluator, reporting))
-            measured = measure(watched, apart, trajectory, fitted, field, remap, perceptual, clip)
-        editor, told = plan.editor.editor, plain(plan)
-        gdf = Gdf(plan.name, region, field, fingerprint(scene), editor, told)
+            judges = replace(evaluator, looked=looked), replace(reporting, looked=looked)
+            measured = measure(judges, trajectory, fitted, field, remap, perceptual, clip)
+        plan = plain(options)
+        gdf = Gdf(options.name, region, field, fingerprint(scene), options.editor.editor, plan)
         endpoint, outside = exactness(scene, gdf, end_rows(setup, trajectory))
-        title = f"{plan.name}: {editor}"
+        title = f"{options.name}: {options.editor.editor}"
         picture = report_picture(evaluator, measured, record.losses, title, len(setup.held_out))
-    paint = None
-    if plan.views.pictures:
-        pictures = read_views(folder, "edited", [view.camera.name for view in setup.train], 1.0)
-        files = zip(plan.views.pictures, setup.train, strict=True)
-        backgrounds = [  # a run may be fitted again when its pictures are gone
-            picture_background(scene, path, view.camera) if path.is_file() else setup.background
-            for path, view in files
-        ]
-        paint = measure_paint(setup, pictures, backgrounds, end_rows(setup, trajectory))
+    paint = _measure_paint(folder, setup, options.views.pictures, end_rows(setup, trajectory))
     measures = figures(measured, endpoint, outside)
     if network is not None:
         measures["field"] |= network.figures()
@@ -167,33 +132,97 @@ def finish_run(
         "trajectory": {
             "recordings": len(trajectory),
             "slider": slider,
-            "s": [round(float(s), 4) for s in shown.s],
+            "s": [round(float(s), 4) for s in shipped.s],
             "stages": list(trajectory.strengths),
-            "stages_at": [round(s, 4) for s, _ in shown.asked],
+            "stages_at": [round(s, 4) for s, _ in shipped.asked],
             "attribute_worth_db": record.attribute_worth_db,
         },
-        "objective": record.objective,
-        "losses": record.losses,
-        "kind": record.kind,
-        "kind_trial": record.kind_trial,
-        "agreement": record.agreement,
-        "followed": record.followed,
+        **_record_figures(record),
         "paint": paint.figures() if paint is not None else None,
-        "up": record.up,
+        **_cost_figures(folder, log),
+        "plan": plan,
+    }
+    return _write(folder, gdf, report, picture, shipped, setup, paint, log)
+
+
+def _fit(
+    options: FieldOptions,
+    setup: TrainingSetup,
+    evaluator: Evaluator,
+    trajectory: Trajectory,
+    perceptual: Perceptual,
+    log: RunLog,
+    folder: RunFolder,
+    begun: Saved | None,
+) -> tuple[Fitted, NetworkFit | None]:
+    """The field that the options ask for, and where it is a network's, that."""
+    choosing, reporting = evaluator.halves()
+    if len(setup.held_out) == 1:
+        log.say("one view alone is held out: the field is chosen and reported on it")
+    if not setup.held_out:
+        log.say("no view is held out: all figures are of the views that were trained on")
+    few = setup.train[:: max(1, len(setup.train) // _RANK_VIEWS)][:_RANK_VIEWS]
+    seen = load_evaluator(folder, setup, few, trajectory)
+    with log.looks("weigh the members", len(setup.train)) as looked:
+        weights = visibility(setup.scene, setup.region.members, setup.train, looked)
+    if options.field == "neural":
+        network = fit_network(
+            trajectory, setup, seen, reporting, weights, options, perceptual, log, begun=begun
+        )
+        return evaluate_field(trajectory, reporting, network.field, options.target_psnr), network
+    with log.looks("fit the field", expected_looks(trajectory, options.field)) as looked:
+        seen, choosing, reporting = (replace(some, looked=looked) for some in (seen, choosing, reporting))
+        return fit_field(trajectory, seen, choosing, reporting, weights, options), None
+
+
+def _measure_paint(
+    folder: RunFolder, setup: TrainingSetup, files: Sequence[Path], end: Tensor
+) -> PaintTaken | None:
+    """How much of changed pictures is in the edit; None where it was not made of such."""
+    if not files:
+        return None
+    pictures = read_views(folder, "edited", [view.camera.name for view in setup.train], 1.0)
+    backgrounds = [  # a run may be fitted again when its pictures are gone
+        picture_background(setup.scene, file, view.camera) if file.is_file() else setup.background
+        for file, view in zip(files, setup.train, strict=True)
+    ]
+    return measure_paint(setup, pictures, backgrounds, end)
+
+
+def _record_figures(record: RunRecord) -> dict[str, Any]:
+    """What the report repeats of the recording."""
+    names = ("objective", "losses", "kind", "kind_trial", "agreement", "followed", "up")
+    return {**{name: getattr(record, name) for name in names}, "pictures": dict(record.pictures)}
+
+
+def _cost_figures(folder: RunFolder, log: RunLog) -> dict[str, Any]:
+    """Seconds and memory; of a refit those of the stages that it did not run again too."""
+    return {
         "time": {**(_earlier_figures(folder, "time") if log.refits else {}), **log.rounded_seconds()},
         "memory_mb": log.memory.peak(),
         "memory_by_stage_mb": {
             **(_earlier_figures(folder, "memory_by_stage_mb") if log.refits else {}),
             **log.memory.by_stage,
         },
-        "plan": told,
-        "pictures": dict(record.pictures),
     }
+
+
+def _write(
+    folder: RunFolder,
+    gdf: Gdf,
+    report: dict[str, Any],
+    picture: Tensor,
+    trajectory: Trajectory,
+    setup: TrainingSetup,
+    paint: PaintTaken | None,
+    log: RunLog,
+) -> RunResult:
+    """Write all files, and say what is in them."""
+    path = folder.gdf(gdf.name)
     # the .gdf has the options beside it, is small, and the same training writes the same file
-    own = {part: value for part, value in report.items() if part not in _REPORT_ALONE}
-    save_gdf(folder.gdf(plan.name), replace(gdf, report=own))
-    size = folder.gdf(plan.name).stat().st_size
-    report["file"] = {"bytes": size, "bytes_per_gaussian": round(size / max(1, len(region)), 1)}
+    save_gdf(path, replace(gdf, report={k: v for k, v in report.items() if k not in _REPORT_ALONE}))
+    size, members = path.stat().st_size, max(1, len(gdf.region))
+    report["file"] = {"bytes": size, "bytes_per_gaussian": round(size / members, 1)}
     write_json(folder.report, report)
     write_image(folder.picture, picture)
     edit = report["edit"]
@@ -205,12 +234,11 @@ def finish_run(
         )
     )
     log.say(
-        f"wrote {folder.gdf(plan.name)}: {file_size(size)}, "
-        f"{size / max(1, len(region)):.0f} bytes per Gaussian with all that is in it"
+        f"wrote {path}: {file_size(size)}, {size / members:.0f} bytes per Gaussian with all that is in it"
     )
     if paint is not None:
         log.say(f"warning: {paint.warning}" if paint.warning else paint.share)
-    return RunResult(folder, folder.gdf(plan.name), report, shown)
+    return RunResult(folder, path, report, trajectory)
 
 
 def load_evaluator(
@@ -266,3 +294,45 @@ def load_result(folder: RunFolder, name: str, scene: Gaussians, log: RunLog) -> 
     except ValueError as error:
         raise ProgdfError(f"{folder.report} is damaged ({error}); train again without --resume") from error
     return RunResult(folder, path, report, replace(trajectory, s=torch.tensor(gdf.field.recorded)))
+
+
+def refit(options: FitOptions, quiet: bool = False) -> RunResult:
+    """Fit the field of a finished run anew and rewrite its .gdf and report; nothing is optimized.
+
+    Raises:
+        ProgdfError: the folder is no finished run, or its scene is gone or another.
+    """
+    check_field_options(options.field)
+    use_threads(options.threads)
+    run = reopen_run(options.run, options.scene)
+    log = RunLog(run.folder.log, quiet, refits=True)
+    try:
+        with log.stage("views"):
+            setup = render_run_views(run)
+            names = [view.camera.name for view in setup.train]
+            edited = {s: read_views(run.folder, "edited", names, s) for s in run.trajectory.strengths}
+            # what grows beyond the region's boxes is seen as well, or the slider is timed on half of it
+            whole = run.record.plan.optimize.as_printed
+            setup = whole_views(setup) if whole else widen_views(setup, edited)
+        perceptual, warning = perceptual_loss()
+        if warning:
+            log.say(warning)
+        own = run.record.plan
+        field = replace(
+            options.field, as_printed=own.field.as_printed, draft=own.field.draft, seed=own.field.seed
+        )
+        texts = asked_texts(options.texts, own.texts)
+        plan = replace(own, field=field, texts=texts)
+        record = replace(run.record, plan=plan)
+        return finish_run(run.folder, setup, run.trajectory, record, perceptual, log)
+    finally:
+        log.close()
+
+
+def asked_texts(typed: TextOptions, own: TextOptions) -> TextOptions:
+    """What CLIP is asked: the command's own texts, or the run's."""
+    return TextOptions(
+        typed.text_before or own.text_before,
+        typed.text_after or own.text_after,
+        own.asked or bool(typed.text_before or typed.text_after),
+    )

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -30,9 +30,16 @@ from progdf.io.images import contact_sheet, read_picture, to_picture, write_imag
 from progdf.io.picture_camera import camera_chunk
 from progdf.rasterize import render
 from progdf.terminal import print_line
-from trainer.option_checks import check_ranges
-from trainer.options import LARGEST_SEED, MOST_THREADS, TrainOptions
-from trainer.plan import Plan, make_plan
+from trainer.options import (
+    LARGEST_SEED,
+    MOST_THREADS,
+    EditorOptions,
+    OptimizeOptions,
+    RegionOptions,
+    TrainOptions,
+    ViewOptions,
+    check_ranges,
+)
 from trainer.store.state import StateFolder
 
 Paint = Callable[[Tensor, Camera, Callable[[tuple[str, ...]], Tensor]], Tensor]
@@ -258,8 +265,8 @@ def _train(options: DemoOptions, show: Show, scene: DemoScene) -> dict[str, Path
     for edit in show.edits:
         if edit.paint is not None:
             _paint_picture(options.out / f"{edit.name}.png", scene, scene.cameras[show.view], edit.paint)
-    runs = {edit.name: _plan(options, show, scene, edit) for edit in show.edits}
-    here = {name: find_run(options.out / name, run) for name, run in runs.items()}
+    runs = {edit.name: _train_options(options, show, scene, edit) for edit in show.edits}
+    here = {name: find_run(run) for name, run in runs.items()}
     for edit in show.edits:
         how = f"{edit.editor} on {', '.join(edit.parts)}" if edit.paint is None else f"{edit.name}.png"
         print(f"\n{edit.name}: {how}", flush=True)
@@ -268,7 +275,7 @@ def _train(options: DemoOptions, show: Show, scene: DemoScene) -> dict[str, Path
         if not goes_on:
             StateFolder(out / "state").clear()  # of a demo with other options
         try:
-            train(runs[edit.name], out, options.threads, goes_on)
+            train(replace(runs[edit.name], resume=goes_on))
         except KeyboardInterrupt:
             raise KeyboardInterrupt(
                 f"what is done is kept in {options.out}; give the same command again to go on"
@@ -276,24 +283,26 @@ def _train(options: DemoOptions, show: Show, scene: DemoScene) -> dict[str, Path
     return {edit.name: _gdf(options.out, edit) for edit in show.edits}
 
 
-def _plan(options: DemoOptions, show: Show, scene: DemoScene, edit: DemoEdit) -> Plan:
+def _train_options(options: DemoOptions, show: Show, scene: DemoScene, edit: DemoEdit) -> TrainOptions:
     """How one edit is trained."""
     ids = ",".join(str(scene.label_names.index(part)) for part in edit.parts)
     folder = options.out
     effort = show.draft if options.quick else show.full
     painted = edit.paint is not None
-    asked = TrainOptions(
+    return TrainOptions(
         scene=folder / "scene.ply",
         out=folder / edit.name,
-        region="changed" if painted else f"labels:{folder / 'labels.npy'}:{ids}",
-        editor=f"pictures:{folder / f'{edit.name}.png'}" if painted else edit.editor,
-        cameras=folder / "cameras.json" if show.inside else None,
-        views=effort.views,
-        image_size=0 if painted and not options.quick else effort.image_size,
-        steps=effort.steps,
+        region=RegionOptions("changed" if painted else f"labels:{folder / 'labels.npy'}:{ids}"),
+        editor=EditorOptions(f"pictures:{folder / f'{edit.name}.png'}" if painted else edit.editor),
+        views=ViewOptions(
+            cameras=folder / "cameras.json" if show.inside else None,
+            views=effort.views,
+            image_size=0 if painted and not options.quick else effort.image_size,
+        ),
+        optimize=OptimizeOptions(steps=effort.steps),
         seed=options.seed,
+        threads=options.threads,
     )
-    return make_plan(asked)
 
 
 def _paint_picture(path: Path, scene: DemoScene, camera: Camera, paint: Paint) -> None:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from pathlib import Path
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -14,25 +14,26 @@ from progdf.field.trajectory import Trajectory, load_trajectory, save_trajectory
 from progdf.formats.scene_file import load_scene
 from progdf.gaussians import BASE_CHANNELS, Gaussians
 from progdf.io.cameras import save_cameras
-from progdf.io.json_values import convert_json, plain
+from progdf.io.json_values import plain
 from progdf.region import Region
 from progdf.scene.regions import parse_region
-from trainer.editors import GIVEN, VIEW_BY_VIEW, make_editor
-from trainer.editors.base import EditKind
-from trainer.editors.folder import FolderEditor
+from trainer.editors import EXTERNAL, PER_VIEW, make_editor
+from trainer.editors.pictures import FolderEditor
 from trainer.fit.fit import drop_idle_attributes
 from trainer.fit.network import PART as NETWORK
 from trainer.fit.own_path import choose_path
 from trainer.fit.slider_uniformity import equalized_strengths
-from trainer.optimize.losses import Perceptual, perceptual_loss
-from trainer.optimize.settings import Optimization, resolve_slider
+from trainer.optimize.losses import Perceptual, describe_loss, perceptual_loss
+from trainer.optimize.retime import resolve_slider
 from trainer.optimize.unseen import unseen_members_of
-from trainer.pipeline.fit_and_report import load_result
-from trainer.pipeline.threads import use_threads, wanted_threads
-from trainer.plan import Plan, plan_optimization
+from trainer.options import EditKind, OptimizeOptions, TrainOptions
 from trainer.regions.from_pictures import region_kinds
 from trainer.report.agreement import Agreement, measure_agreement
-from trainer.setup.training_setup import (
+from trainer.resolve import recorded_options, resolve, resolve_kind
+from trainer.run.kinds import Approach, choose_approach
+from trainer.run.record import RunRecord, read_record
+from trainer.run.threads import use_threads
+from trainer.setup import (
     Pictures,
     TrainingSetup,
     confines_edit,
@@ -56,50 +57,46 @@ from trainer.store.run_folder import (
 from trainer.views.crops import only_recolors
 from trainer.views.view import BACKGROUND, render_view
 
-from .fit_and_report import RunResult, end_rows, finish_run, load_evaluator
-from .kind_trial import Approach, choose_approach
-from .preflight import check_command, region_settings
-from .record import RunRecord
+from .finish import RunResult, end_rows, finish_run, load_evaluator, load_result
+from .preflight import check_command, region_request
 from .reedit import reedit
 from .resume import check_exists, decide_resume, explain_stop, load_region, picture_digests
-from .training import JointNetwork, optimize_members, retime_trajectory
+from .training import optimize_members, retime_trajectory
 
 __all__ = ["RunResult", "train"]
 
 
-def train(plan: Plan, out: Path, threads: int = 0, resume: bool = False, quiet: bool = False) -> RunResult:
+def train(options: TrainOptions, quiet: bool = False) -> RunResult:
     """Edit a region of a scene and write its .gdf file.
 
     Args:
-        plan: see `make_plan`
-        out: folder of the run
-        threads: CPU threads; 0 takes all cores
-        resume: go on with a run that was stopped in this folder
+        options: as typed
         quiet: nothing on the screen; log.txt is written all the same
 
     Raises:
         ProgdfError: scene, region, cameras or edited views that do not work; no .gdf is touched.
         KeyboardInterrupt: interrupted; the message says how to go on. No .gdf is touched.
     """
-    check_command(plan, out, resume)
-    use_threads(threads)
-    scene = load_scene(plan.scene)
-    region, notes = load_region(out) if resume else None, list[str]()
+    options = resolve(options)
+    check_command(options)
+    use_threads(options.threads)
+    scene = load_scene(options.scene)
+    region, notes = load_region(options.out) if options.resume else None, list[str]()
     if region is None:
-        kinds = region_kinds(region_settings(plan, out, quiet, notes.append))
-        region = parse_region(plan.region.region, scene, plan.name, kinds, notes.append)
-    folder = open_run_folder(out, plan.edit)
+        kinds = region_kinds(region_request(options, quiet, notes.append))
+        region = parse_region(options.region.region, scene, options.name, kinds, notes.append)
+    folder = open_run_folder(options.out, options.edit)
     with interrupt_on_signals(), lock_folder(folder), explain_stop(folder):
-        session = decide_resume(folder, plan, region, len(scene), wanted_threads(threads), resume)
+        session = decide_resume(folder, options, region, len(scene))
         log = RunLog(folder.log, quiet, progress=folder.progress)
         try:
             for note in (*session.notes, *notes):
                 log.say(note)
             if session.does == "nothing":
-                return load_result(folder, plan.name, scene, log)
+                return load_result(folder, options.name, scene, log)
             use_threads(session.threads)
             with check_exists(folder):
-                result = _run_training(plan, scene, region, folder, log)
+                result = _run_training(options, scene, region, folder, log)
             folder.state.end()
             return result
         except KeyboardInterrupt:
@@ -109,33 +106,51 @@ def train(plan: Plan, out: Path, threads: int = 0, resume: bool = False, quiet: 
             log.close()
 
 
-def _run_training(plan: Plan, scene: Gaussians, region: Region, folder: RunFolder, log: RunLog) -> RunResult:
+def _run_training(
+    options: TrainOptions, scene: Gaussians, region: Region, folder: RunFolder, log: RunLog
+) -> RunResult:
     """Everything; what the saved state says is done is not done again, or is repeated to the same bits."""
     perceptual, warning = perceptual_loss()
     if warning:
         log.say(warning)
     with log.stage("views"):
-        setup = _render_originals(plan, scene, region, folder)
+        setup = _render_originals(options, scene, region, folder)
     log.say(f"{len(scene)} Gaussians, {len(region)} in the region; {_describe_views(setup)}")
     for note in setup.notes:
         log.say(note)
     with log.stage("edit"):
-        edited, approach, trial = _edit_views(plan, setup, folder, log)
+        edited, approach, trial = _edit_views(options, setup, folder, log)
         train_edits = {s: pictures[: len(setup.train)] for s, pictures in edited.items()}
-        setup = whole_views(setup) if plan.optimization.whole else widen_views(setup, train_edits)
+        setup = whole_views(setup) if options.optimize.as_printed else widen_views(setup, train_edits)
     recorded = folder.state.load("recorded")
     if recorded is None:
         with log.stage("agree"):
-            agreement = _agreement(plan, setup, edited, approach.kind, log)
-        optimization = plan_optimization(plan.optimization, approach.kind, approach.group_steps)
-        _record(plan, optimization, setup, train_edits, trial, perceptual, folder, log, agreement)
+            agreement = _agreement(options, setup, edited, approach.kind, log)
+        optimization = resolve_kind(options, approach.kind, approach.group_steps)
+        trajectory, outcome = _record(options, optimization, setup, train_edits, perceptual, folder, log)
+        record = RunRecord(
+            recorded_options(options),
+            options.scene.resolve(),
+            [view.camera.name for view in setup.held_out],
+            BACKGROUND,
+            approach.kind,
+            optimization.group_steps or 0,
+            kind_trial=trial,
+            agreement=agreement.figures() if agreement is not None else None,
+            up=setup.up.to_json() if setup.up is not None else None,
+            pictures=picture_digests(options),
+            **outcome,
+        )
+        extra = {"members": region.members, "score": region.score}
+        save_trajectory(folder.trajectory, trajectory, extra, plain(record))
+        _write_finals(setup, trajectory, folder, log)
         folder.state.save("recorded", {}, log.capture_state().values)
     else:
         log.restore(recorded)
         log.say("the trajectory is recorded")
     trajectory, _, about = load_trajectory(folder.trajectory)
     begun = folder.state.load(NETWORK)
-    return finish_run(folder, setup, trajectory, convert_json(about, RunRecord), perceptual, log, begun)
+    return finish_run(folder, setup, trajectory, read_record(about), perceptual, log, begun)
 
 
 def _describe_views(setup: TrainingSetup) -> str:
@@ -148,9 +163,11 @@ def _describe_views(setup: TrainingSetup) -> str:
     return f"{use}, {', '.join(sizes)} pixels"
 
 
-def _render_originals(plan: Plan, scene: Gaussians, region: Region, folder: RunFolder) -> TrainingSetup:
+def _render_originals(
+    options: TrainOptions, scene: Gaussians, region: Region, folder: RunFolder
+) -> TrainingSetup:
     """The views, rendered and on disk."""
-    setup = make_training_setup(plan.views, scene, region)
+    setup = make_training_setup(options.views, scene, region)
     views = setup.views
     remove_stale_views(folder, [view.camera.name for view in views])
     write_views(folder, "original", {view.camera.name: view.image for view in views})
@@ -161,7 +178,7 @@ def _render_originals(plan: Plan, scene: Gaussians, region: Region, folder: RunF
 
 
 def _edit_views(
-    plan: Plan, setup: TrainingSetup, folder: RunFolder, log: RunLog
+    options: TrainOptions, setup: TrainingSetup, folder: RunFolder, log: RunLog
 ) -> tuple[dict[float, list[Tensor]], Approach, dict[str, Any] | None]:
     """What the editor makes of all views, by strength, read where it is on disk; how to train towards it, and
     what a trial of that found.
@@ -176,15 +193,15 @@ def _edit_views(
             return edited, Approach(done.values["kind"], done.values["group_steps"]), done.values["trial"]
         except ProgdfError as error:
             log.say(f"the views are edited again: {str(error).partition(';')[0]}")
-    spec = plan.editor.editor
-    editor = make_editor(spec, setup.scene, setup.region, views, plan.editor.settings(folder.painted))
+    spec = options.editor.editor
+    editor = make_editor(replace(options.editor, cache=folder.painted), setup.scene, setup.region, views)
     if isinstance(editor, FolderEditor) and editor.warning is not None:
         log.say(editor.warning)
-    approach, trial = choose_approach(plan.optimization, setup, editor, plan.editor.knows_kind, log)
+    approach, trial = choose_approach(options, setup, editor, log)
     kind = approach.kind
-    stages = plan_optimization(plan.optimization, kind, approach.group_steps).stages
-    strengths = editor_strengths(editor, stages)
-    if plan.optimization.refinements.asks_evenly and resolve_slider(plan.slider, strengths) == "even":
+    optimization = resolve_kind(options, kind, approach.group_steps)
+    strengths = editor_strengths(editor, optimization.stages)
+    if not optimization.as_printed and resolve_slider(optimization.slider, strengths) == "even":
         strengths = equalized_strengths(editor, spec, views, strengths)
     confined = confines_edit(editor, kind)
     with log.steps("edit", len(views) * len(strengths)) as advance:
@@ -202,98 +219,97 @@ def _edit_views(
 
 
 def _agreement(
-    plan: Plan, setup: TrainingSetup, edited: Pictures, kind: EditKind, log: RunLog
+    options: TrainOptions, setup: TrainingSetup, edited: Pictures, kind: EditKind, log: RunLog
 ) -> Agreement | None:
     """Whether the edited views agree; None where an editor cannot but edit all alike."""
-    if kind == "geometry" or plan.editor.family not in VIEW_BY_VIEW:
+    if kind == "geometry" or options.editor.family not in PER_VIEW:
         return None
     count = len(setup.train)
-    found = measure_agreement(setup, edited[1.0][:count], edited[1.0][count:] or edited[1.0])
-    log.say(found.line(plan.editor.family, setup.judged_on))
-    return found
+    agreement = measure_agreement(setup, edited[1.0][:count], edited[1.0][count:] or edited[1.0])
+    log.say(agreement.line(options.editor.family, setup.judged_on))
+    return agreement
 
 
 def _record(
-    plan: Plan,
-    optimization: Optimization,
+    options: TrainOptions,
+    optimization: OptimizeOptions,
     setup: TrainingSetup,
     edited: Pictures,
-    trial: Mapping[str, Any] | None,
     perceptual: Perceptual,
     folder: RunFolder,
     log: RunLog,
-    agreement: Agreement | None,
-) -> None:
-    """Optimize, and write the trajectory and the finished edit's views."""
-    kind, scene, region = optimization.kind, setup.scene, setup.region
-    pictures = picture_digests(plan)
-    objective = optimization.objective(perceptual.name)
+) -> tuple[Trajectory, dict[str, Any]]:
+    """Optimize; the trajectory on its slider, and what the run's record says of it."""
+    objective = describe_loss(optimization, perceptual.name)
     log.say(f"loss: {objective}")
-    if plan.optimization.group_steps and kind != "geometry":
-        log.say(f"--group-steps: without effect on this {kind} edit, whose loss is {objective}")
+    if options.optimize.group_steps and optimization.kind != "geometry":
+        log.say(f"--group-steps: without effect on this {optimization.kind} edit, whose loss is {objective}")
     with log.stage("optimize"):
-        renewal = reedit(plan.editor, plan.optimization.reedit_every, setup, kind, folder, log)
-        unseen_members = unseen_members_of(setup, kind) if optimization.refinements.propagates else None
+        renewal = reedit(options.editor, setup, optimization, folder, log)
+        followers = unseen_members_of(setup, optimization) if optimization.propagation else None
         trajectory, losses = optimize_members(
+            options,
             optimization,
             setup,
             edited,
             perceptual,
             folder.state,
             log,
-            renewal,
-            unseen_members,
-            JointNetwork(plan.field.network, plan.slider) if plan.optimization.joint else None,
+            renewal=renewal,
+            unseen_members=followers,
         )
-
-    def retimed(trajectory: Trajectory) -> Trajectory:
-        return retime_trajectory(trajectory, setup, plan.slider, optimization.raw, log)
-
     with log.stage("retime"):
         costs: dict[str, float] = {}
         if not only_recolors(trajectory.offsets) or trajectory.end.shape[1] > BASE_CHANNELS:
             choosing, _ = load_evaluator(folder, setup, setup.judging, trajectory).halves()
-            trajectory, costs = drop_idle_attributes(trajectory, choosing, optimization.refinements.prunes)
-        recorded = len(trajectory)
-        way = ""
-        of_one_end = len(edited) == 1 and not optimization.few  # whose solver lays the way
-        if not optimization.raw and plan.field.field != "neural" and of_one_end:
-            editor = None  # of pictures made elsewhere: their folder may be gone by now, and there is no half
-            if plan.editor.family not in GIVEN:
-                views, settings = setup.views, plan.editor.settings(folder.painted)
-                editor = make_editor(plan.editor.editor, scene, region, views, settings)
-            trajectory, way = choose_path(trajectory, setup, editor, bool(optimization.group_steps), retimed)
+            prunes = not (optimization.as_printed or optimization.solver == "pictures")
+            trajectory, costs = drop_idle_attributes(trajectory, choosing, prunes)
+        recorded, reason = len(trajectory), ""
+        # where pictures are solved for the solver lays the way
+        one_end = len(edited) == 1 and optimization.solver != "pictures"
+        if one_end and not optimization.as_printed and options.field.field != "neural":
+            trajectory, reason = _choose_path(trajectory, options, optimization, setup, folder, log)
         else:
-            trajectory = retimed(trajectory)
+            trajectory = retime_trajectory(trajectory, setup, optimization, log)
     log.say(
         f"{recorded} recordings, {len(trajectory)} kept; without an attribute, dB: {costs or 'none moves'}"
     )
-    if way:
-        log.say(f"between original and edit: {way}")
-    record = RunRecord(
-        plan,
-        plan.scene.resolve(),
-        [view.camera.name for view in setup.held_out],
-        BACKGROUND,
-        kind,
-        optimization.group_steps,
-        trial,
-        objective,
-        losses,
-        costs,
-        agreement.figures() if agreement is not None else None,
-        len(unseen_members.places) if unseen_members is not None else 0,
-        setup.up.to_json() if setup.up is not None else None,
-        pictures,
-    )
-    extra = {"members": region.members, "score": region.score}
-    save_trajectory(folder.trajectory, trajectory, extra, plain(record))
+    if reason:
+        log.say(f"between original and edit: {reason}")
+    followed = len(followers.places) if followers is not None else 0
+    return trajectory, {
+        "objective": objective,
+        "losses": losses,
+        "attribute_worth_db": costs,
+        "followed": followed,
+    }
+
+
+def _choose_path(
+    trajectory: Trajectory,
+    options: TrainOptions,
+    optimization: OptimizeOptions,
+    setup: TrainingSetup,
+    folder: RunFolder,
+    log: RunLog,
+) -> tuple[Trajectory, str]:
+    """The way to the only target there was, and why."""
+    editor = None  # of pictures made elsewhere: their folder may be gone by now, and there is no half
+    if options.editor.family not in EXTERNAL:
+        editor = make_editor(
+            replace(options.editor, cache=folder.painted), setup.scene, setup.region, setup.views
+        )
+    retimed = partial(retime_trajectory, setup=setup, optimization=optimization, log=log)
+    return choose_path(trajectory, setup, editor, bool(optimization.group_steps), retimed)
+
+
+def _write_finals(setup: TrainingSetup, trajectory: Trajectory, folder: RunFolder, log: RunLog) -> None:
+    """The finished edit's views."""
     with log.stage("final"):
-        edited_scene = scene.replace_rows(region.members, end_rows(setup, trajectory))
-        views = setup.views
+        edited_scene = setup.scene.replace_rows(setup.region.members, end_rows(setup, trajectory))
         finals = {}
-        with log.looks("picture the edit", len(views)) as looked:
-            for view in views:
+        with log.looks("picture the edit", len(setup.views)) as looked:
+            for view in setup.views:
                 finals[view.camera.name] = render_view(edited_scene, view.camera, setup.background)
                 looked()
         write_views(folder, "final", finals)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,19 +16,22 @@ from progdf.gaussians import Gaussians
 from progdf.io.cameras import load_cameras
 from progdf.io.images import write_image
 from progdf.io.picture_camera import up_in_picture
+from progdf.rasterize import alpha_weights
 from progdf.region import Region
 from progdf.scene.bounds import is_surrounding
 from progdf.scene.up_axis import UpAxis, find_up, up_from_json
 from progdf.threads import threads
-from trainer.editors.base import EditKind, ImageEditor
-from trainer.editors.pictures import picture_cameras
-from trainer.editors.procedural import ColorEditor
-from trainer.store.picture_list import add_pictures
-from trainer.store.progress import Advance
-from trainer.store.run_folder import RunFolder
-from trainer.views.choose import choose_views, split_views
-from trainer.views.crops import CropScene, crop_scene
-from trainer.views.view import (
+
+from .editors.base import ImageEditor
+from .editors.pictures import picture_cameras
+from .editors.procedural import ColorEditor
+from .options import MOST_VIEWS, VIEWS, Kind, ViewOptions
+from .store.picture_list import add_pictures
+from .store.progress import Advance
+from .store.run_folder import RunFolder
+from .views.choose import choose_views, split_views
+from .views.crops import CropScene, crop_scene
+from .views.view import (
     BACKGROUND,
     INSIDE,
     View,
@@ -39,7 +42,75 @@ from trainer.views.view import (
     with_near_plane,
 )
 
-from .resolution import PICTURE_SIZE, ViewSettings, choose_resolution
+SIZES = (256, 320, 384)
+"""Longer sides that are tried, in pixels."""
+
+PICTURE_SIZE = 512
+"""The longest side at which a changed picture is trained on."""
+
+_WELCOME, _BEARABLE = 0.3, 0.5
+"""Share of unresolved members up to which a size will do, and above which it is said."""
+
+_LOOK, _LOOKS = 96, 4  # pixels of the views in which members are measured, and how many
+
+
+def unresolved_share(
+    scene: Gaussians, region: Region, cameras: Sequence[Camera], image_size: int, views: int
+) -> float:
+    """Share of the visible members that get less than a pixel, in so many views of that size together. 0..1
+
+    Args:
+        scene, region: what is looked at
+        cameras: views of it, of which a few are looked through
+        image_size: longer side in pixels
+        views: how many there will be
+    """
+    shown = torch.zeros(len(region))
+    looks = cameras[:: max(1, len(cameras) // _LOOKS)][:_LOOKS]
+    for camera in looks:
+        small = fit_size(camera, _LOOK)
+        area = (image_size / max(small.width, small.height)) ** 2
+        weights = alpha_weights(scene, small, torch.ones(small.height, small.width))
+        shown += area * weights[region.members, 2]
+    shown *= views / max(1, len(looks))
+    visible = shown > 0
+    return float((shown[visible] < 1.0).float().mean()) if bool(visible.any()) else 0.0
+
+
+def choose_resolution(
+    options: ViewOptions,
+    scene: Gaussians,
+    region: Region,
+    cameras_of: Callable[[int, int], Sequence[Camera]],
+) -> tuple[Sequence[Camera], int, str]:
+    """Cameras, how many of them to choose, and a line where the members are not resolved by these.
+
+    What was typed is kept to. Else there are more and larger views where members are dense, and only larger
+    ones where the cameras are given and few. Why 40 of 320 and not 30 of 384: docs/experiments.md, Views.
+
+    Args:
+        options: see `ViewOptions`
+        scene, region: what they look at
+        cameras_of: longer side in pixels, number of views -> cameras
+    """
+    tried = list(zip(SIZES, (VIEWS, MOST_VIEWS, MOST_VIEWS), strict=True)) if options.dense else []
+    if options.dense and options.cameras is None and not options.views:
+        tried.pop()
+    tried = [
+        (options.image_size or size, options.views or views) for size, views in tried or [(SIZES[0], VIEWS)]
+    ]
+    for size, views in tried:
+        cameras = cameras_of(size, views)
+        count = min(views, len(cameras)) * 4 // 5  # every fifth is held out
+        share = unresolved_share(scene, region, cameras, size, count)
+        if share <= _WELCOME:
+            break
+    line = (
+        f"{share:.0%} of the region's visible Gaussians have less than a pixel in all {count} views "
+        f"of {size} pixels: what differs among neighbors is not resolved; give --image-size or --views more"
+    )
+    return cameras, views, line if share > _BEARABLE else ""
+
 
 _PROBES = 3
 
@@ -86,7 +157,7 @@ class TrainingSetup:
         return f"{len(self.held_out)} held-out views" if len(self.held_out) > 1 else "one held-out view alone"
 
 
-def make_training_setup(settings: ViewSettings, scene: Gaussians, region: Region) -> TrainingSetup:
+def make_training_setup(options: ViewOptions, scene: Gaussians, region: Region) -> TrainingSetup:
     """The views: those of changed pictures; else the best of the given cameras, or of a rig that looks at the
     region.
 
@@ -94,23 +165,23 @@ def make_training_setup(settings: ViewSettings, scene: Gaussians, region: Region
         ProgdfError: no camera sees the region, or none are given and the scene is one to stand inside.
     """
     background = torch.tensor(BACKGROUND)
-    given = [] if settings.cameras is None else load_cameras(settings.cameras, scene.origin)
-    up = find_up(scene, given, settings.up, settings.scene)
-    if settings.pictures:
-        if settings.up == "auto" and (shown := _up_of_pictures(settings.pictures)) is not None:
+    given = [] if options.cameras is None else load_cameras(options.cameras, scene.origin)
+    up = find_up(scene, given, options.up, options.scene)
+    if options.pictures:
+        if options.up == "auto" and (shown := _up_of_pictures(options.pictures)) is not None:
             up = shown
-        return _picture_setup(settings, scene, region, given, up)
-    if settings.cameras is None and is_surrounding(scene, up.direction):
+        return _picture_setup(options, scene, region, given, up)
+    if options.cameras is None and is_surrounding(scene, up.direction):
         raise ProgdfError(f"the scene {INSIDE}")
 
     def cameras_of(image_size: int, views: int) -> list[Camera]:
-        if settings.cameras is not None:
+        if options.cameras is not None:
             found = [fit_size(camera, image_size) for camera in given]
         else:  # half as many again, as some will find the region hidden
             found = region_rig(scene, region, views + views // 2, image_size, up.direction)
         return with_near_plane(name_cameras(found), scene)
 
-    cameras, views, unresolved = choose_resolution(settings, scene, region, cameras_of)
+    cameras, views, unresolved = choose_resolution(options, scene, region, cameras_of)
     choice = choose_views(scene, region, cameras, views, background)
     train, held_out = split_views(choice, max(1, len(choice.views) // 5))
     notes = [f"up is {up.name}, {up.reason}"]
@@ -132,16 +203,16 @@ def _up_of_pictures(paths: Sequence[Path]) -> UpAxis | None:
 
 
 def _picture_setup(
-    settings: ViewSettings, scene: Gaussians, region: Region, given: Sequence[Camera], up: UpAxis
+    options: ViewOptions, scene: Gaussians, region: Region, given: Sequence[Camera], up: UpAxis
 ) -> TrainingSetup:
     """The views of changed pictures. All are trained on: what one shows no other may."""
-    background, size = torch.tensor(BACKGROUND), settings.image_size or PICTURE_SIZE
-    cameras = [fit_size(camera, size) for camera in picture_cameras(settings.pictures, given, scene.origin)]
+    background, size = torch.tensor(BACKGROUND), options.image_size or PICTURE_SIZE
+    cameras = [fit_size(camera, size) for camera in picture_cameras(options.pictures, given, scene.origin)]
     views = [
         make_view(scene, region, camera, background)
         for camera in with_near_plane(name_cameras(cameras), scene)
     ]
-    for view, path in zip(views, settings.pictures, strict=True):
+    for view, path in zip(views, options.pictures, strict=True):
         if not bool((view.mask > 0).any()):
             raise ProgdfError(f"{path} does not show the region '{region.name}'; leave it out")
     return TrainingSetup(scene, region, views, [], background, [f"up is {up.name}, {up.reason}"], up)
@@ -152,7 +223,7 @@ def editor_strengths(editor: ImageEditor, stages: int) -> tuple[float, ...]:
     return editor.stages or tuple((i + 1) / stages for i in range(stages))
 
 
-def confines_edit(editor: ImageEditor, kind: EditKind) -> bool:
+def confines_edit(editor: ImageEditor, kind: Kind) -> bool:
     """Whether what the editor changed outside the region is put back: unless the edit moves parts."""
     return kind != "geometry" and not editor.confined
 

@@ -20,7 +20,7 @@ from torch import Tensor
 from progdf.camera import Camera, undistort
 from progdf.errors import ProgdfError
 from progdf.io.images import flatten_onto, open_picture
-from trainer.editors.folder import SUFFIXES
+from trainer.editors.pictures import SUFFIXES
 
 
 def read_masks(folder: Path, cameras: Sequence[Camera], bent: bool = False) -> list[Tensor | None]:

@@ -6,12 +6,11 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.sliders import CASES, STRENGTHS, CaseResult, run_suite, suite_json, suite_picture, suite_table
 from progdf.demo_scenes import bear_edits
 from tests.helpers.demo_scenes import bear
-from trainer.evaluate.suite import CASES, STRENGTHS, CaseResult, run_suite
-from trainer.evaluate.suite_report import suite_json, suite_picture, suite_table
 from trainer.optimize.losses import GradientL1
-from trainer.pipeline.demo import Effort
+from trainer.run.demo import Effort
 
 _FEW = tuple(case for case in CASES if case.name in ("blue scarf", "tilted ears"))
 _SIZES = {"bear": 1500}
@@ -29,7 +28,7 @@ pytestmark = pytest.mark.slow  # trains its edits
 def suite(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[CaseResult]]:
     folder = tmp_path_factory.mktemp("suite")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("trainer.evaluate.suite.bear", bear)  # made once for many tests
+        patch.setattr("benchmarks.sliders.bear", bear)  # made once for many tests
         return folder, _run(folder)
 
 

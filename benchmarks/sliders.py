@@ -1,0 +1,342 @@
+"""`python -m benchmarks sliders FOLDER`: edits of the demo scenes whose picture is known at every strength.
+
+An editor of colors says what a view shows at any strength, an analytic edit what every Gaussian is. The
+trainer sees pictures of its training views at 8 strengths; compared are held-out views at 11.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import tyro
+from torch import Tensor
+
+from progdf.demo_scenes import AnalyticEdit, DemoScene, bear, bear_edits, room
+from progdf.formats.ply import load_ply
+from progdf.gaussians import Gaussians
+from progdf.io.atomic import make_folder
+from progdf.io.images import contact_sheet, to_picture, write_image
+from progdf.metrics.slider import Pictures
+from progdf.scene.regions import parse_region
+from progdf.terminal import print_line
+from trainer.editors import make_editor
+from trainer.evaluate.measures import markdown_table
+from trainer.evaluate.opened import FADE, KEYFRAMES, SLIDER, OpenedRun, open_run
+from trainer.optimize.losses import Perceptual, perceptual_loss
+from trainer.options import EditorOptions, OptimizeOptions, RegionOptions, TrainOptions, ViewOptions
+from trainer.report.measures import ErrorCurve, picture_courses
+from trainer.report.plots import Plot
+from trainer.report.report import stack_plots, thumbnail
+from trainer.resolve import resolve
+from trainer.run.demo import Effort, write_scene
+from trainer.run.resume import find_run
+from trainer.run.run import train
+from trainer.run.threads import use_threads
+from trainer.setup import make_training_setup
+from trainer.store.run_folder import write_json
+from trainer.views.view import crop, render_view
+
+STRENGTHS = tuple(i / 10 for i in range(11))
+"""At which sliders are compared with the truth; 0 is exact for all."""
+
+ASKED = 8
+"""Strengths at which the trainer is given pictures, evenly."""
+
+SIZES = {"bear": 12_000, "room": 20_000}
+"""Gaussians of the scenes."""
+
+_SHOWN = (SLIDER, KEYFRAMES, FADE)
+_THUMBNAIL = 170
+_PLOTS_A_ROW = 5
+
+EFFORT = Effort(views=20, image_size=192, steps=480)
+
+
+@dataclass(frozen=True)
+class SliderOptions:
+    """Train edits of the demo scenes whose pictures are known at every strength, and compare the sliders.
+
+    They are compared with these at 11 strengths. Runs that are finished are not trained again.
+    """
+
+    folder: tyro.conf.Positional[Path]
+    """For scenes, pictures, runs and the table; made if need be."""
+    threads: int = 0
+    """CPU threads; 0 takes all cores."""
+
+
+def run_sliders(options: SliderOptions) -> list[CaseResult]:
+    """Train and compare; FOLDER/sliders.json and .png, and a table on the screen.
+
+    Raises:
+        ProgdfError: the folder cannot be written to, or holds other runs.
+    """
+    use_threads(options.threads)
+    make_folder(options.folder)
+    perceptual, warning = perceptual_loss()
+    if warning:
+        print_line(warning.replace("training with", "measuring with"))
+    results = run_suite(options.folder, perceptual, options.threads, print_line)
+    write_json(options.folder / "sliders.json", suite_json(results, perceptual.name))
+    write_image(options.folder / "sliders.png", suite_picture(results))
+    for line in suite_table(results).splitlines():
+        print_line(line)
+    print_line(f"wrote {options.folder / 'sliders.json'} and sliders.png")
+    return results
+
+
+@dataclass(frozen=True)
+class SliderCase:
+    """One edit.
+
+    Args:
+        name: of the edit; of an analytic one as `bear_edits` names it
+        scene: the demo scene
+        parts: what may change
+        editor: `KIND:WHAT` of an editor of colors; "" for an analytic edit
+    """
+
+    name: str
+    scene: Literal["bear", "room"]
+    parts: tuple[str, ...]
+    editor: str = ""
+
+    @property
+    def folder(self) -> str:
+        """Its run's name."""
+        return self.name.replace(" ", "-")
+
+
+_COAT = ("body", "head", "ears", "arms", "legs")
+CASES = (
+    SliderCase("blue scarf", "bear", ("scarf",), "recolor:#2356c7"),
+    SliderCase("gold coat", "bear", _COAT, "recolor:#d89a12"),
+    SliderCase("tinted coat", "bear", _COAT, "tint:#4f6fd8"),
+    SliderCase("striped body", "bear", ("body", "arms"), "stripes:#2b62c9"),
+    SliderCase("night", "bear", (*_COAT, "scarf", "plinth", "grass"), "night"),
+    SliderCase("blue rug", "room", ("rug",), "recolor:#3a55b4"),
+    SliderCase("big ears", "bear", ("ears",)),
+    SliderCase("tilted ears", "bear", ("ears",)),
+    SliderCase("long ears", "bear", ("ears",)),
+    SliderCase("bent ears", "bear", ("ears",)),
+)
+
+
+@dataclass(frozen=True)
+class CaseResult:
+    """One edit's figures.
+
+    Args:
+        case: the edit
+        members: how many Gaussians it may change
+        bytes_per_member: of the shipped field
+        seconds: of the run, as its report tells
+        curves: against the truth at `STRENGTHS`, by what is shown
+        strips: the best held-out view half way and at the end: the truth, and what is shown. [h,w,3] each
+    """
+
+    case: SliderCase
+    members: int
+    bytes_per_member: float
+    seconds: float | None
+    curves: Mapping[str, ErrorCurve]
+    strips: Mapping[str, tuple[Tensor, Tensor]]
+
+
+def run_suite(
+    folder: Path,
+    perceptual: Perceptual,
+    threads: int = 0,
+    told: Callable[[str], None] = lambda line: None,
+    cases: Sequence[SliderCase] = CASES,
+    sizes: Mapping[str, int] = SIZES,
+    effort: Effort = EFFORT,
+) -> list[CaseResult]:
+    """Train and judge every edit; runs that are finished are not trained again.
+
+    Args:
+        folder: for scenes, pictures and runs; made if need be
+        perceptual: LPIPS, or its stand-in
+        threads: CPU threads; 0 takes all cores
+        told: called with a line before each edit
+        cases, sizes, effort: edits, Gaussians of the scenes, training
+
+    Raises:
+        ProgdfError: the folder cannot be written to, or holds other runs.
+    """
+    makers = {"bear": bear, "room": room}
+    scenes: dict[str, DemoScene] = {}
+    results = []
+    for i, case in enumerate(cases, 1):
+        if case.scene not in scenes:
+            scene = makers[case.scene](sizes[case.scene])
+            write_scene(folder / case.scene, scene)
+            # as it is read again, half a step of its file's rounding away
+            scenes[case.scene] = replace(scene, gaussians=load_ply(folder / case.scene / "scene.ply"))
+        told(f"{i} of {len(cases)}: {case.name}")
+        results.append(_run_case(folder, case, scenes[case.scene], perceptual, threads, effort))
+    return results
+
+
+def _run_case(
+    folder: Path, case: SliderCase, scene: DemoScene, perceptual: Perceptual, threads: int, effort: Effort
+) -> CaseResult:
+    truth_folder, out = folder / "truth" / case.folder, folder / case.folder
+    if not case.editor:
+        make_folder(truth_folder)
+    options = replace(_train_options(folder, case, scene, effort), threads=threads)
+    state = find_run(options)
+    if state == "nothing" and not case.editor:
+        _write_truth(truth_folder, resolve(options), scene.gaussians, _analytic(case, scene))
+    train(replace(options, resume=state != "nothing"), quiet=True)
+    opened = open_run(out)
+    truth, contenders = _truth(case, opened, scene), opened.contenders()
+    curves = picture_courses(opened.evaluator, contenders, STRENGTHS, truth, perceptual)
+    best = max(range(len(opened.evaluator.pixels)), key=lambda k: int(opened.evaluator.pixels[k].sum()))
+    shown = {"truth": truth, **contenders}
+    strips = {name: (pictures(0.5)[best], pictures(1.0)[best]) for name, pictures in shown.items()}
+    seconds = opened.report.get("time", {}).get("total")
+    field = opened.gdf.field
+    return CaseResult(case, len(opened.gdf.region), field.bytes_per_member, seconds, curves, strips)
+
+
+def _train_options(folder: Path, case: SliderCase, scene: DemoScene, effort: Effort) -> TrainOptions:
+    at = folder / case.scene
+    ids = ",".join(str(scene.label_names.index(part)) for part in case.parts)
+    cameras = at / "cameras.json" if case.scene == "room" else None  # one stands inside it
+    return TrainOptions(
+        scene=at / "scene.ply",
+        out=folder / case.folder,
+        region=RegionOptions(f"labels:{at / 'labels.npy'}:{ids}"),
+        editor=EditorOptions(case.editor or f"folder:{folder / 'truth' / case.folder}"),
+        views=ViewOptions(cameras, views=effort.views, image_size=effort.image_size),
+        # of a folder as many stages as it holds; the slider's value is the editor's strength
+        optimize=OptimizeOptions(effort.steps, stages=ASKED if case.editor else 0, slider="stages"),
+    )
+
+
+def _analytic(case: SliderCase, scene: DemoScene) -> AnalyticEdit:
+    return bear_edits(scene)[case.name][0]
+
+
+def _write_truth(folder: Path, options: TrainOptions, scene: Gaussians, edit: AnalyticEdit) -> None:
+    """Picture the edit in the views that the run will have, DIR/STRENGTH/NAME.png."""
+    region = parse_region(options.region.region, scene, options.name)
+    setup = make_training_setup(options.views, scene, region)
+    for strength in ((i + 1) / ASKED for i in range(ASKED)):
+        edited = edit.apply(scene, region.members, strength)
+        for view in setup.views:
+            picture = render_view(edited, view.camera, setup.background)
+            write_image(folder / f"{strength:g}" / f"{view.camera.name}.png", picture)
+
+
+def _truth(case: SliderCase, opened: OpenedRun, scene: DemoScene) -> Pictures:
+    """The held-out views' boxes as they should be at any strength."""
+    setup = opened.setup
+    boxes = [shown.box for shown in opened.evaluator.crops]
+    if case.editor:
+        views = setup.views
+        editor = make_editor(EditorOptions(case.editor), setup.scene, setup.region, views)
+
+        def pictures(s: float) -> list[Tensor]:
+            return [editor.edit(view, s) for view in setup.judging]
+
+    else:
+        edit, members = _analytic(case, scene), setup.region.members
+
+        def pictures(s: float) -> list[Tensor]:
+            edited = edit.apply(setup.scene, members, s)
+            return [render_view(edited, view.camera, setup.background).clamp(0, 1) for view in setup.judging]
+
+    return lambda s: [crop(picture, box) for picture, box in zip(pictures(s), boxes, strict=True)]
+
+
+def suite_rows(results: Sequence[CaseResult]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Headings, and a row an edit: mean and worst PSNR over strengths .1 to 1, mean LPIPS over the same."""
+    head = (
+        "edit",
+        "members",
+        *(f"{name}, PSNR mean / worst, dB" for name in _SHOWN),
+        *(f"{name}, LPIPS" for name in _SHOWN),
+        "PSNR at 1, dB",
+        "bytes a member",
+    )
+    rows = [
+        (
+            result.case.name,
+            str(result.members),
+            *(_decibels(result.curves[name]) for name in _SHOWN),
+            *(f"{_mean(result.curves[name].lpips[1:]):.4f}" for name in _SHOWN),
+            f"{result.curves[SLIDER].psnr[-1]:.1f}",
+            f"{result.bytes_per_member:.0f}",
+        )
+        for result in results
+    ]
+    return head, rows
+
+
+def suite_table(results: Sequence[CaseResult]) -> str:
+    """The same in Markdown."""
+    return markdown_table(*suite_rows(results))
+
+
+def suite_json(results: Sequence[CaseResult], perceptual: str) -> dict[str, Any]:
+    """As sliders.json has it."""
+    edits = {
+        result.case.name: {
+            "scene": result.case.scene,
+            "editor": result.case.editor or "analytic",
+            "members": result.members,
+            "bytes_per_member": round(result.bytes_per_member, 1),
+            "seconds": result.seconds,
+            "curves": {
+                name: {"psnr": curve.psnr, "ssim": curve.ssim, "lpips": curve.lpips}
+                for name, curve in result.curves.items()
+            },
+        }
+        for result in results
+    }
+    return {"perceptual": perceptual, "strengths": STRENGTHS, "edits": edits}
+
+
+def suite_picture(results: Sequence[CaseResult]) -> Tensor:
+    """A row an edit, half way and at the end; then PSNR over the slider. -> [H,W,3]"""
+    names = ("truth", *_SHOWN)
+    rows = [
+        [thumbnail(_square(result.strips[name][end]), _THUMBNAIL) for end in (0, 1) for name in names]
+        for result in results
+    ]
+    heads = [f"{name}, {s}" for s in (".5", "1") for name in names]
+    sheet = contact_sheet(rows, [result.case.name for result in results], heads, "Sliders against the truth")
+    plots = [
+        Plot(
+            f"{result.case.name}: PSNR, dB",
+            {name: (STRENGTHS[1:], result.curves[name].psnr[1:]) for name in _SHOWN},
+            "slider",
+            span=(0.0, 1.0),
+        )
+        for result in results
+    ]
+    lines = [plots[i : i + _PLOTS_A_ROW] for i in range(0, len(plots), _PLOTS_A_ROW)]
+    return stack_plots(to_picture(sheet), lines)
+
+
+def _decibels(curve: ErrorCurve) -> str:
+    return f"{_mean(curve.psnr[1:]):.1f} / {min(curve.psnr[1:]):.1f}"
+
+
+def _mean(values: Sequence[float]) -> float:
+    return sum(values) / len(values)
+
+
+def _square(image: Tensor) -> Tensor:
+    """On white, as wide as high, so that all thumbnails are of one size. [h,w,3] -> [n,n,3]"""
+    height, width = image.shape[:2]
+    side = max(height, width)
+    page = image.new_ones(side, side, 3)
+    top, left = (side - height) // 2, (side - width) // 2
+    page[top : top + height, left : left + width] = image
+    return page

@@ -1,0 +1,229 @@
+"""Options checked, and what they leave open filled in: once, before the run; for the kind, once it is known.
+
+What the scene decides (the axis that is up, the number and size of the views, the SH bands) is decided where
+the scene is looked at. What is resolved is all that the bits of a result depend on, but for files' contents.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+from progdf.errors import ProgdfError
+from progdf.io.atomic import is_portable
+from progdf.metrics.image import NO_DIFFERENCE
+from trainer.editors import EXTERNAL, PER_VIEW
+from trainer.editors.instruct import parse_guidance
+from trainer.editors.pictures import picture_paths
+from trainer.options import EditKind
+
+from .options import (
+    LARGEST_SEED,
+    LONGEST_NAME,
+    MOST_STAGES,
+    MOST_STEPS,
+    MOST_THREADS,
+    PRESETS,
+    QUICK_STAGES,
+    QUICK_STEPS,
+    QUICK_VIEWS,
+    SMALLEST_VIEW,
+    STAGE_STEPS,
+    VIEWS,
+    EditorOptions,
+    FieldOptions,
+    OptimizeOptions,
+    Preset,
+    Sharpness,
+    TrainOptions,
+    check_ranges,
+)
+
+PERCEPTUAL_WEIGHT: Mapping[EditKind, float] = {"color": 0.1, "style": 0.3, "geometry": 0.3}
+SHARPNESS: Mapping[EditKind, Sharpness] = {"color": "off", "style": "hinge", "geometry": "off"}
+STAGES: Mapping[EditKind, int] = {"color": MOST_STAGES, "style": 1, "geometry": MOST_STAGES}
+
+
+def resolve(options: TrainOptions) -> TrainOptions:
+    """The options, checked, with what they leave to each other filled in.
+
+    Raises:
+        ProgdfError: one makes no sense.
+    """
+    check_options(options)
+    quick, optimize, views = options.quick, options.optimize, options.views.views
+    family, _, what = options.editor.editor.partition(":")
+    stages = min(optimize.stages, QUICK_STAGES) if quick else optimize.stages
+    texts = options.texts
+    return replace(
+        options,
+        name=check_name(options.name or options.out.resolve().name),
+        editor=replace(options.editor, graded=stages > 1, seed=options.seed),
+        views=replace(
+            options.views,
+            views=min(views or QUICK_VIEWS, QUICK_VIEWS) if quick else views,
+            dense=not quick and family not in PER_VIEW,
+            pictures=picture_paths(what) if family == "pictures" else (),
+            scene=options.scene,
+        ),
+        optimize=replace(
+            optimize,
+            steps=min(optimize.steps, QUICK_STEPS) if quick else optimize.steps,
+            stages=stages,
+            slider="even" if optimize.slider == "auto" and family not in EXTERNAL else optimize.slider,
+            seed=options.seed,
+        ),
+        field=replace(options.field, draft=quick, seed=options.seed),
+        texts=replace(
+            texts,
+            text_after=texts.text_after or (what.strip().strip("\"'") if family == "instruct" else ""),
+            asked=bool(texts.text_before or texts.text_after),
+        ),
+    )
+
+
+def recorded_options(options: TrainOptions) -> TrainOptions:
+    """Resolved options without where and how the command ran, of which no bit of the result depends."""
+    return replace(options, out=Path(), preset="default", quick=False, threads=0, resume=False)
+
+
+def resolve_kind(options: TrainOptions, kind: EditKind, group_steps: int) -> OptimizeOptions:
+    """How the members are optimized in an edit of this kind: nothing is left open.
+
+    What each of the defaults gives, alone, is in docs/experiments.md, Terms and options of a descent.
+
+    Args:
+        options: resolved, see `resolve`
+        kind: what the edit moves
+        group_steps: as asked, or as a trial found; without effect where nothing moves
+    """
+    asked = options.optimize
+    sharpness = SHARPNESS[kind] if asked.sharpness == "kind" else asked.sharpness
+    solves_colors = (
+        kind == "color"  # colors alone change, and nothing is asked for that only a descent view by view has
+        and asked.color_solver
+        and asked.rates == "kind"
+        and asked.progressive == "off"
+        and sharpness == "off"
+        and not asked.perceptual_weight
+        and not asked.as_printed
+        and not options.editor.reedit_every
+    )
+    few = solves_colors and bool(options.views.pictures)
+    weight, most = asked.perceptual_weight, STAGES[kind]
+    return replace(
+        asked,
+        kind=kind,
+        stages=asked.stages or min(most, QUICK_STAGES if asked.steps < STAGE_STEPS * most else most),
+        group_steps=group_steps if kind == "geometry" else 0,
+        # only an edit of colors may leave the bands alone
+        sh="on" if asked.sh == "auto" and kind != "color" else asked.sh,
+        perceptual_weight=PERCEPTUAL_WEIGHT[kind] if weight is None else weight,
+        sharpness=sharpness,
+        propagation=asked.propagation and not few,
+        solver="pictures" if few else "colors" if solves_colors else "descent",
+    )
+
+
+def check_options(options: TrainOptions) -> None:
+    """Refuse what makes no sense, and what would be passed over in silence.
+
+    Raises:
+        ProgdfError: a number out of its range, or an option that the editor or the field does not know.
+    """
+    region, editor, optimize = options.region, options.editor, options.optimize
+    check_ranges(
+        ("--views", options.views.views or VIEWS, 3, 96),
+        ("--image-size", options.views.image_size or SMALLEST_VIEW, SMALLEST_VIEW, 2048),
+        ("--stages", optimize.stages, 0, 16),
+        ("--group-steps", optimize.group_steps, 0, 10_000),
+        ("--seed", options.seed, 0, LARGEST_SEED),
+        ("--threads", options.threads, 0, MOST_THREADS),
+        ("--edit-steps", editor.edit_steps, 1, 1000),
+        ("--edit-size", editor.edit_size, 32, 4096),
+        ("--lift-threshold", region.lift_threshold, 0, 1),
+        ("--box-threshold", region.box_threshold, 0, 1),
+        ("--reedit-every", editor.reedit_every, 0, 100_000),
+    )
+    stages = optimize.stages or MOST_STAGES
+    if not 4 * stages <= optimize.steps <= MOST_STEPS:
+        raise ProgdfError(
+            f"--steps must be between {4 * stages} and {MOST_STEPS} for {stages} stages, got {optimize.steps}"
+        )
+    weight = optimize.perceptual_weight
+    if weight is not None and not 0 <= weight < math.inf:
+        raise ProgdfError(f"--perceptual-weight must be 0 or more, got {weight}")
+    lifts = region.lift_rule == "paper" and re.search(r"(masks|text):", region.region)
+    if lifts and (region.lift_threshold is None or region.lift_threshold >= 0.8):
+        raise ProgdfError(
+            "--lift-rule paper selects nothing at the printed .8: the mean weight of a splat in its pixels "
+            "is a fifth at most; give --lift-rule share, or --lift-threshold .01"
+        )
+    _check_editor_options(editor, optimize)
+    check_field_options(options.field, options.preset)
+    parse_guidance(editor.guidance)
+
+
+def check_name(name: str) -> str:
+    """The name of a layer and its file, if it can be one.
+
+    Raises:
+        ProgdfError: it cannot.
+    """
+    if not name or name.startswith(".") or not name.isprintable() or {"/", "\\"} & set(name):
+        raise ProgdfError(
+            f"'{name}' is not a valid layer name; choose one with --name, for example --name shirt"
+        )
+    if not is_portable(name):
+        raise ProgdfError(
+            f"'{name}' is not a valid layer name, as Windows cannot have a file of that name; "
+            "choose one with --name, for example --name shirt"
+        )
+    if len(f"{name}.gdf".encode()) > LONGEST_NAME:
+        raise ProgdfError(f"the name '{name[:20]}…' is too long for a file; choose another one with --name")
+    return name
+
+
+def _check_editor_options(editor: EditorOptions, optimize: OptimizeOptions) -> None:
+    """No option is passed over in silence: one that the editor does not know is refused."""
+    if editor.family == "pictures" and optimize.kind not in ("auto", "color"):
+        raise ProgdfError(
+            f"--kind {optimize.kind} does not apply to pictures: few views do not tell how deep a part lies; "
+            "give more as folder:DIR, of views that --cameras has"
+        )
+    of_instruct = ("model", "guidance", "edit_steps")
+    of_painters = ("edit_size", "reedit_every")
+    for names, kinds in ((of_instruct, ("instruct",)), (of_painters, ("style", "instruct"))):
+        for name in names:
+            if getattr(editor, name) != getattr(EditorOptions, name) and editor.family not in kinds:
+                option = "--" + name.replace("_", "-")
+                raise ProgdfError(
+                    f"{option} does not apply to {editor.family}; it is for {' and '.join(kinds)}"
+                )
+
+
+def check_field_options(options: FieldOptions, preset: Preset = "default") -> None:
+    """Options of the field that make sense, and those of a network only where there is one, or by a preset.
+
+    Raises:
+        ProgdfError: one does not.
+    """
+    if not 0 < options.target_psnr <= NO_DIFFERENCE:
+        raise ProgdfError(
+            f"--target-psnr must be above 0 and at most {NO_DIFFERENCE:g} dB, which stands for no "
+            f"difference, got {options.target_psnr:g}"
+        )
+    by_preset = PRESETS[preset].get("field", {})
+    for name in ("size", "field_loss"):
+        defaults = (getattr(FieldOptions, name), by_preset.get(name))
+        if options.field != "neural" and getattr(options, name) not in defaults:
+            option = "--" + name.replace("_", "-")
+            raise ProgdfError(f"{option} does not apply to --field {options.field}; add --field neural")
+    if options.bytes_budget is not None:
+        if options.field in ("neural", "lossless"):
+            raise ProgdfError(f"--bytes-budget does not apply to --field {options.field}; leave one out")
+        if not 1 <= options.bytes_budget < math.inf:
+            raise ProgdfError(f"--bytes-budget must be at least 1 byte, got {options.bytes_budget:g}")

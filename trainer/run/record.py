@@ -1,0 +1,171 @@
+"""A finished run, opened again: its scene, region and views as they were, and what was recorded."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from progdf.errors import ProgdfError
+from progdf.field.trajectory import Trajectory, load_trajectory
+from progdf.formats.scene_file import load_scene, scene_file
+from progdf.gaussians import Gaussians
+from progdf.io.cameras import load_cameras
+from progdf.io.json_values import convert_json
+from progdf.region import Region
+from trainer.options import EditKind, TrainOptions
+from trainer.resolve import check_name
+from trainer.setup import TrainingSetup
+from trainer.store.run_folder import RunFolder
+from trainer.views.view import make_view, with_near_plane
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """What the recording's file tells of the run.
+
+    Raises:
+        ValueError: the losses do not fit each other, or the name is none.
+    """
+
+    plan: TrainOptions  # what was to be done, see `recorded_options`
+    scene: Path  # where the scene was
+    held_out: Sequence[str]  # names of the views that the edit was not trained on
+    background: tuple[float, float, float]  # color behind the scene
+    kind: EditKind  # what the edit moves
+    group_steps: int  # of the stage in which parts move as wholes; 0: there was none
+    kind_trial: Mapping[str, Any] | None  # figures of the trial that found these two, if there was one
+    objective: str  # what was minimized, in words
+    losses: Mapping[str, Sequence[float | None]]  # see `Losses`
+    attribute_worth_db: Mapping[str, float]  # what the edit would lose without each attribute, dB
+    agreement: Mapping[str, Any] | None  # whether the edited views agree, where that was measured
+    followed: int  # members that took their colors from others
+    up: Mapping[str, Any] | None  # the axis that is up, and why
+    pictures: Mapping[str, str] = field(default_factory=dict)  # changed pictures, and their hashes
+
+    def __post_init__(self) -> None:
+        columns = [self.losses.get(name, []) for name in ("step", "left")]
+        if not all(columns) or len({len(column) for column in self.losses.values()}) > 1:
+            raise ValueError("its losses do not fit each other")
+        check_name(self.plan.name)
+
+
+def read_record(about: Mapping[str, Any]) -> RunRecord:
+    """What a recording's file tells of its run.
+
+    Raises:
+        ValueError, KeyError, TypeError: it is no record, or damaged.
+    """
+    return convert_json({**about, "plan": upgrade_plan(about["plan"])}, RunRecord)
+
+
+def upgrade_plan(plan: Mapping[str, Any]) -> Mapping[str, Any]:
+    """JSON values of a recorded plan as `TrainOptions` has them, also where its parts have their older names.
+
+    Raises:
+        ValueError, KeyError, TypeError: it is none.
+    """
+    if "optimization" not in plan:
+        return plan
+    region, editor, views = dict(plan["region"]), dict(plan["editor"]), dict(plan["views"])
+    optimize, field, texts = dict(plan["optimization"]), dict(plan["field"]), plan["texts"]
+    network, segmenter, refinements = field.pop("network"), region.pop("segmenter"), optimize["refinements"]
+    guidance = [editor.pop(name) for name in ("guidance", "image_guidance")]
+    return {
+        "scene": plan["scene"],
+        "out": "",
+        "name": plan["name"],
+        "region": region | segmenter,
+        "editor": editor
+        | {
+            "guidance": ",".join(str(number) for number in guidance if number is not None),
+            "reedit_every": optimize["reedit_every"],
+        },
+        "views": views | {name: views[name] or 0 for name in ("views", "image_size")},
+        "optimize": optimize
+        | {
+            "kind": optimize["kind"] or "auto",
+            "stages": optimize["stages"] or 0,
+            "slider": plan["slider"],
+            "as_printed": optimize["raw"],
+            "color_solver": refinements["solves"],
+            "ema": refinements["averages"],
+            "target_ramp": refinements["ramps"],
+            "propagation": refinements["propagates"],
+        },
+        "field": field
+        | {
+            "size": network["size"],
+            "field_loss": network["loss"],
+            "as_printed": network["inputs"] == "position",
+            "draft": network["draft"],
+            "seed": network["seed"],
+        },
+        "texts": {"text_before": texts["before"], "text_after": texts["after"], "asked": texts["asked"]},
+    }
+
+
+@dataclass(frozen=True)
+class FinishedRun:
+    """What a finished run left."""
+
+    folder: RunFolder
+    scene: Gaussians  # the original
+    region: Region  # what was edited
+    trajectory: Trajectory  # what was recorded
+    record: RunRecord
+
+
+def reopen_run(root: Path, scene: Path | None = None) -> FinishedRun:
+    """Open a run folder.
+
+    Args:
+        root: the folder
+        scene: where the scene is now, if it has moved
+
+    Raises:
+        ProgdfError: the folder is no finished run, or its scene is gone or another.
+    """
+    folder = RunFolder(root)
+    if not folder.trajectory.is_file():
+        raise ProgdfError(f"{root} holds no trajectory.safetensors; give a folder that progdf train finished")
+    trajectory, extra, about = load_trajectory(folder.trajectory)
+    try:
+        record = read_record(about)
+        members, score = extra["members"], extra["score"]
+        path = scene or record.scene
+        if not os.path.isfile(scene_file(path)):
+            raise ProgdfError(f"the scene {path} does not exist; give its path with --scene")
+        gaussians = load_scene(path)
+        if len(score) != len(gaussians):
+            raise ProgdfError(
+                f"{path} has {len(gaussians)} Gaussians, the run's scene had {len(score)}; "
+                "give that one with --scene"
+            )
+        region = Region(record.plan.name, members, score)
+        if len(region) != trajectory.end.shape[0]:
+            raise ValueError(f"it has {trajectory.end.shape[0]} members, the region {len(region)}")
+    except ProgdfError:
+        raise
+    except (KeyError, TypeError, ValueError) as error:
+        raise ProgdfError(f"{folder.trajectory} is damaged ({error}); train again") from error
+    return FinishedRun(folder, gaussians, region, trajectory, record)
+
+
+def render_run_views(run: FinishedRun) -> TrainingSetup:
+    """The run's views, rendered; their boxes hold the region, not what an edit may show beside it."""
+    background = torch.tensor(run.record.background)
+    held_out = set(run.record.held_out)
+    cameras = with_near_plane(load_cameras(run.folder.cameras, run.scene.origin), run.scene)
+    views = [make_view(run.scene, run.region, camera, background) for camera in cameras]
+    return TrainingSetup(
+        run.scene,
+        run.region,
+        [view for view in views if view.camera.name not in held_out],
+        [view for view in views if view.camera.name in held_out],
+        background,
+    )

@@ -1,0 +1,363 @@
+"""PGS over a run's training views, saved as it goes: recordings in, a trajectory out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
+
+import msgspec
+import torch
+from torch import Tensor
+
+from progdf.errors import ProgdfError
+from progdf.field.trajectory import Trajectory
+from progdf.gaussians import BASE_CHANNELS, pack
+from progdf.io.json_values import convert_json
+from progdf.scene.bounds import scene_sphere
+from trainer.fit.network import JointTraining, begin_joint_training, save_network
+from trainer.optimize.color_solver import iterations, make_solver, solve
+from trainer.optimize.groups import Groups, group_path, group_stage, restore_groups
+from trainer.optimize.losses import Losses, Objective, Perceptual, erode, loss_table
+from trainer.optimize.pgs import (
+    OnStep,
+    ParameterSnapshot,
+    PgsState,
+    Renewal,
+    TargetStage,
+    optimize,
+    pgs_settings,
+)
+from trainer.optimize.retime import record, resolve_slider, retime, select_recordings, straight_recordings
+from trainer.optimize.solve_pictures import RECORDINGS, make_picture_solver, solve_pictures
+from trainer.optimize.unseen import NEEDED, UnseenMembers, view_dependence
+from trainer.options import OptimizeOptions, TrainOptions
+from trainer.setup import Pictures, TrainingSetup, probe_views
+from trainer.store.interrupts import defer_signals
+from trainer.store.progress import RunLog
+from trainer.store.state import PeriodicSave, Resumable, Saved, StateFolder
+from trainer.views.crops import COLORS, CropScene, crop_scene, moving_attributes, only_recolors, render_all
+from trainer.views.view import crop
+
+
+class _RecordingValues(msgspec.Struct):
+    """What is saved of a recording beside its offsets."""
+
+    step: int
+    stage: int
+    ends_stage: bool
+    means: dict[str, float]
+
+
+@dataclass(frozen=True)
+class SavedSnapshot:
+    """A snapshot as it is kept.
+
+    Args:
+        step, stage, ends_stage, means: see `ParameterSnapshot`
+        offsets: of the members, in half precision. [M,C] float16
+    """
+
+    step: int
+    stage: int
+    ends_stage: bool
+    offsets: Tensor
+    means: Mapping[str, float]
+
+
+class Recordings:
+    """All recordings so far, a `state.Resumable`: each is written once, to a file of its own.
+
+    Args:
+        folder: where
+        shape: of the offsets
+    """
+
+    def __init__(self, folder: StateFolder, shape: torch.Size) -> None:
+        self.made: list[SavedSnapshot] = []
+        self._folder, self._shape, self._written = folder, shape, 0
+
+    def add(self, found: ParameterSnapshot) -> None:
+        """Keep one."""
+        offsets = found.offsets.half()
+        self.made.append(SavedSnapshot(found.step, found.stage, found.ends_stage, offsets, found.means))
+
+    def capture_state(self) -> Saved:
+        """How many there are; those that came since the last time are written first."""
+        for index in range(self._written, len(self.made)):
+            kept = self.made[index]
+            values = {"step": kept.step, "stage": kept.stage, "ends_stage": kept.ends_stage}
+            self._folder.save("recordings", {"offsets": kept.offsets}, values | {"means": kept.means}, index)
+        self._written = len(self.made)
+        return Saved({}, {"count": self._written})
+
+    def restore(self, saved: Saved) -> None:
+        """Read as many as there were; what a killed run wrote beyond them will be written again."""
+        self._written = saved.values["count"]
+        found = [self._folder.load("recordings", index) for index in range(self._written)]
+        if None in found:
+            raise ProgdfError(f"recordings are missing in {self._folder.path}; delete it and train again")
+        self.made = [self._read(kept) for kept in found if kept]
+
+    def _read(self, kept: Saved) -> SavedSnapshot:
+        values, offsets = convert_json(kept.values, _RecordingValues), kept.tensors["offsets"]
+        if offsets.shape != self._shape or offsets.dtype != torch.float16:
+            raise ValueError("a recording is of other members")
+        return SavedSnapshot(values.step, values.stage, values.ends_stage, offsets, values.means)
+
+
+PART = "training"
+"""Of the saved state: all that changes while the members are optimized."""
+
+_TIMED_VIEWS = 4  # in which the slider is timed; 8 or all at full size time it no better
+
+
+Way = Callable[[OnStep], Iterator[ParameterSnapshot]]
+"""Optimizes from the state on, and yields recordings."""
+
+
+def optimize_members(
+    options: TrainOptions,
+    optimization: OptimizeOptions,
+    setup: TrainingSetup,
+    edited: Pictures,
+    perceptual: Perceptual,
+    folder: StateFolder,
+    log: RunLog,
+    renewal: Renewal | None = None,
+    unseen_members: UnseenMembers | None = None,
+) -> tuple[Trajectory, Losses]:
+    """Optimize the members, from the beginning or from the saved state.
+
+    Args:
+        options: resolved
+        optimization: its part with nothing left open, see `resolve_kind`
+        setup: scene, region, views with boxes that hold the edit
+        edited: strength → the edited training views, whole
+        perceptual: distance of pictures
+        folder: where the state is saved
+        log: of the run
+        renewal: see `pgs.Renewal`
+        unseen_members: members that take their colors from others
+
+    Returns:
+        The trajectory, even in time; mean of every loss term, and what is left to the edit, per recording
+
+    Raises:
+        ProgdfError: the loss is not finite.
+        KeyboardInterrupt: interrupted; the state is saved.
+    """
+    scene, members, solver = setup.scene, setup.region.members, optimization.solver
+    bands = _trains_bands(optimization, setup, log)
+    original = pack(scene[members], with_shN=scene.sh_degree > 0)
+    still = optimization.kind == "color" and optimization.rates == "kind"
+    crops = [crop_scene(scene, members, v.camera, v.box, setup.background, still) for v in setup.train]
+    stages, groups = _stages(optimization, setup, edited), None
+    if optimization.group_steps:
+        groups = _groups(optimization, original, crops, stages, folder, log)
+        stages = groups.to_stages(original, crops, stages)
+    extent = 2.0 * scene_sphere(scene[members])[1] if groups is None else groups.extent
+    settings = pgs_settings(optimization, bands, original.shape[1], extent, len(stages))
+    state, recordings = PgsState(original, settings.seed), Recordings(folder, original.shape)
+    way: Way
+    if solver == "pictures":
+        with log.stage("weights"):
+            pictures = make_picture_solver(scene, members, crops, original, bands)
+        log.say(f"{pictures.unseen} members that no picture shows follow their own surface")
+        way = partial(solve_pictures, original, pictures, stages, state)
+    elif solver == "colors":
+        with log.stage("weights"):
+            colors = make_solver(crops, original, bands and original.shape[1] > BASE_CHANNELS)
+        way = partial(solve, original, colors, stages, state, unseen_members=unseen_members)
+    else:
+        inside = [erode(crop(view.mask, view.box)) for view in setup.train]
+        objective, probes = Objective(perceptual, optimization, inside), probe_views(setup)
+        way = partial(
+            optimize, original, crops, probes, stages, objective, settings, state=state, renewal=renewal
+        )
+    joint = None
+    if optimization.as_printed and options.field.field == "neural":
+        joint = begin_joint_training(
+            options.field, optimization, setup, settings.rates, stages, crops, perceptual
+        )
+    saver = _record_way(way, sum(stage.steps for stage in stages), state, recordings, joint, folder, log)
+    distances = [made.means["left"] for made in recordings.made]
+    log.say(f"L1 to the finished edit: {distances[0]:.4f} at first, {distances[-1]:.4f} at the end")
+    log.say(f"the state was saved {saver.saves} times, in {saver.seconds:.2f} s")
+    end = stages[-1].place(state.average).clone()
+    snapshots = [(made.step, made.stage, made.ends_stage, made.offsets) for made in recordings.made]
+    if unseen_members is not None and len(unseen_members.places):
+        follow = solver == "colors" or is_no_worse(unseen_members, end, original, crops, stages)
+        if follow and solver != "colors":
+            snapshots = [(a, b, c, unseen_members.propagate(made)) for a, b, c, made in snapshots]
+            end = unseen_members.propagate(end)
+        log.say(_unseen_line(len(unseen_members.places), follow))
+    if groups is not None:
+        ends = [made for made in recordings.made if made.ends_stage]
+        offsets = [*(made.offsets.float() for made in ends[:-1]), end]
+        snapshots = group_path(original, groups, offsets, [made.step for made in ends], settings.snapshots)
+    losses = loss_table([(made.step, made.means) for made in recordings.made])
+    return record(snapshots, end, list(edited)), losses
+
+
+def _stages(optimization: OptimizeOptions, setup: TrainingSetup, edited: Pictures) -> list[TargetStage]:
+    """The strengths to optimize towards, and the steps that each gets."""
+    steps = iterations(optimization.steps) if optimization.solver == "colors" else optimization.steps
+    steps = max(steps, len(edited) + 1)  # each stage is to have one
+    if optimization.solver == "pictures":
+        steps = max(RECORDINGS, 2 * len(edited))
+    return [
+        TargetStage(s, [crop(p, v.box) for p, v in zip(pictures, setup.train, strict=True)], steps)
+        for (s, pictures), steps in zip(edited.items(), _steps_by_stage(steps, len(edited)), strict=True)
+    ]
+
+
+def _record_way(
+    way: Way,
+    steps: int,
+    state: PgsState,
+    recordings: Recordings,
+    joint: JointTraining | None,
+    folder: StateFolder,
+    log: RunLog,
+) -> PeriodicSave:
+    """Go the way to its end, from the saved state on, and a jointly trained network with it."""
+    parts: dict[str, Resumable] = {"pgs": state, "recordings": recordings, "log": log}
+    saver = PeriodicSave(folder, PART, parts | ({"field": joint} if joint else {}))
+    if saver.restore():
+        if joint is not None:
+            joint.refill([(made.step, made.offsets) for made in recordings.made])
+        log.say(f"continuing at step {state.step} of {steps}, with {len(recordings.made)} recordings")
+    with log.steps("optimize", steps) as advance, defer_signals() as stopped:
+
+        def step_done(step: int, left: float) -> None:
+            if joint is not None:
+                joint.step()
+            advance(step, f"loss to the edit {left:.4f}")
+            if stopped():
+                saver.save()
+                raise KeyboardInterrupt
+            saver.step_done()
+
+        advance(state.step, "")  # of a handful of pictures nearly all is done before the first step
+        try:
+            for snapshot in way(step_done):
+                recordings.add(snapshot)
+                if joint is not None:
+                    joint.add(snapshot.step, snapshot.offsets)
+        except FloatingPointError as error:
+            saver.save()
+            raise ProgdfError(
+                f"training failed: {error}; the state before it is kept: fix the edited views and continue "
+                "with --resume, or try --kind style in another folder"
+            ) from error
+    saver.save()
+    if joint is not None:
+        save_network(joint, folder)
+    return saver
+
+
+def _unseen_line(count: int, follow: bool) -> str:
+    """What becomes of the members that no view shows, for the log."""
+    if follow:
+        return f"{count} members that no view shows follow their neighbors"
+    return (
+        f"{count} members that hardly show keep what they learned: "
+        "following their neighbors would take the training views away from the edit"
+    )
+
+
+def is_no_worse(
+    unseen_members: UnseenMembers,
+    end: Tensor,
+    original: Tensor,
+    crops: Sequence[CropScene],
+    stages: Sequence[TargetStage],
+) -> bool:
+    """Whether the training views stay as near to the finished edit as they are, to a hundredth."""
+
+    def error(offsets: Tensor) -> float:
+        pairs = zip(render_all(crops, original + offsets, COLORS), stages[-1].targets, strict=True)
+        return sum(float((picture - target).square().sum()) for picture, target in pairs)
+
+    return error(unseen_members.propagate(end)) <= 1.01 * error(end)
+
+
+def _trains_bands(optimization: OptimizeOptions, setup: TrainingSetup, log: RunLog) -> bool:
+    """Whether the SH bands beyond DC are trained: a color edit trains them where the region's own show."""
+    if optimization.sh != "auto" or setup.scene.sh_degree == 0 or optimization.solver == "pictures":
+        return optimization.sh != "off"
+    change = view_dependence(setup.scene[setup.region.members], [view.camera for view in setup.train])
+    needed = change >= NEEDED
+    log.say(
+        f"the region's colors change with the view by {change:.3f} of 1: "
+        f"the SH bands beyond DC are {'trained' if needed else 'left as they are'} ({NEEDED:g} is needed)"
+    )
+    return needed
+
+
+def _groups(
+    optimization: OptimizeOptions,
+    original: Tensor,
+    crops: Sequence[CropScene],
+    stages: Sequence[TargetStage],
+    folder: StateFolder,
+    log: RunLog,
+) -> Groups:
+    """The group stage, or what was saved of it."""
+    done = folder.load("groups")
+    if done is not None:
+        return restore_groups(original, done.tensors)
+    steps = optimization.group_steps or 0
+    try:
+        with log.steps("move parts", steps * len(stages)) as advance:
+            groups = group_stage(
+                original,
+                crops,
+                [stage.targets for stage in stages],
+                steps,
+                optimization.seed,
+                lambda step, loss: advance(step, f"loss {loss:.4f}"),
+                [stage.strength for stage in stages],
+            )
+    except FloatingPointError as error:
+        raise ProgdfError(
+            f"training failed: {error}; fix the edited views and continue with --resume"
+        ) from error
+    folder.save("groups", groups.capture_state(), {})
+    for line in groups.lines():
+        log.say(line)
+    return groups
+
+
+def retime_trajectory(
+    trajectory: Trajectory, setup: TrainingSetup, optimization: OptimizeOptions, log: RunLog
+) -> Trajectory:
+    """Without jitter, and at the slider values where its change is due; every recording is rendered once.
+
+    Args:
+        trajectory: as recorded
+        setup: scene, region, views
+        optimization: what slider values mean, and whether jitter is kept
+        log: of the run
+    """
+    moving = moving_attributes(trajectory.end)
+    small = probe_views(setup, _TIMED_VIEWS, still=only_recolors(trajectory.offsets))
+    original = pack(setup.scene[setup.region.members], with_shN=trajectory.end.shape[1] > BASE_CHANNELS)
+    pictures: list[Tensor] = []
+    with log.steps("time the slider", len(trajectory)) as advance:
+        for i in range(len(trajectory)):
+            images = render_all(small, original + trajectory.node(i), moving)
+            pictures.append(torch.cat([image.flatten() for image in images]))
+            advance(i + 1, "recordings")
+    if not optimization.as_printed:
+        rows = straight_recordings(trajectory, pictures)
+        trajectory, pictures = select_recordings(trajectory, rows), [pictures[i] for i in rows]
+    return retime(trajectory, pictures, resolve_slider(optimization.slider, trajectory.strengths))
+
+
+def _steps_by_stage(steps: int, stages: int) -> list[int]:
+    """Steps per stage, adding up to `steps`; the last, which is looked at most, has twice as many."""
+    marks = [steps * i // (stages + 1) for i in range(stages)]
+    return [b - a for a, b in pairwise([*marks, steps])]

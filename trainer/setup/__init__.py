@@ -1,1 +1,0 @@
-"""What training works on: cameras, their number and size, the originals."""
