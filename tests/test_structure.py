@@ -35,7 +35,7 @@ ORDER = {
         demo_scenes io rasterize field formats gdf scene compose cli __init__ __main__""",
     "trainer": """__init__ options store views editors resolve setup regions
         motion optimize fit report preview run evaluate cli""",
-    "viewer": "__init__ camera gl jobs state render files pictures ui panel select app commands",
+    "viewer": "__init__ camera gl jobs state render files pictures ui panel app commands",
     "benchmarks": """__init__ courses joint_svd table ablation field_forms rasterizer
         recorded_runs viewer field_plot field edits networks sliders warps pictures __main__""",
 }

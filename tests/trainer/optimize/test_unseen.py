@@ -11,7 +11,7 @@ from progdf.region import Region
 from progdf.sh import rgb_to_sh0
 from trainer.optimize.pgs import TargetStage
 from trainer.optimize.unseen import UnseenMembers, find_unseen_members, least_shown, unseen_members_of
-from trainer.options import EditKind
+from trainer.options import EditKind, OptimizeOptions
 from trainer.run.training import is_no_worse
 from trainer.setup import TrainingSetup
 from trainer.views.crops import crop_scene, render_all
@@ -97,7 +97,7 @@ def test_only_edits_of_colors_are_propagated(kind: EditKind, followed: bool) -> 
     scene = two_boards()
     region, views = half_seen(scene)
     setup = TrainingSetup(scene, region, views, [], WHITE)
-    assert bool(len(unseen_members_of(setup, kind).places)) == followed
+    assert bool(len(unseen_members_of(setup, OptimizeOptions(kind=kind)).places)) == followed
 
 
 def test_what_counts_as_unseen_follows_the_density() -> None:

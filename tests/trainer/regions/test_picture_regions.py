@@ -284,7 +284,10 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> RegionOptions:
     pytest.importorskip("transformers")
     folder = tmp_path_factory.mktemp("models")
     return RegionOptions(
-        "", str(tiny_detector(folder / "dino")), str(tiny_sam(folder / "sam")), box_threshold=0.01
+        "",
+        detector=str(tiny_detector(folder / "dino")),
+        sam_model=str(tiny_sam(folder / "sam")),
+        box_threshold=0.01,
     )
 
 

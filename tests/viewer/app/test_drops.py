@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -112,7 +113,9 @@ def test_a_dropped_file_that_is_broken_is_one_line_and_changes_nothing(
     opened: application.App, tmp_path: Path
 ) -> None:
     before = opened.main_view.work.view
-    other = replace(bear().gdfs[1], scene=replace(bear().gdfs[1].scene, means_sha256="0" * 64))
+    other = replace(
+        bear().gdfs[1], scene=msgspec.structs.replace(bear().gdfs[1].scene, means_sha256="0" * 64)
+    )
     save_gdf(tmp_path / "other.gdf", other)
     (tmp_path / "torn.ply").write_bytes(b"ply\nformat")
     (tmp_path / "notes.txt").write_text("hello")

@@ -253,7 +253,7 @@ def test_an_order_is_a_command_line_that_the_trainer_reads_back() -> None:
     order = EditOrder(Path("a b.ply"), Path("out/-x"), "-x", "all-sphere:0,0,0,1", "night:0.70", True, 1)
     options = train_options(order.arguments(resumes=True)[1:])
     assert (options.scene, options.out, options.name) == (order.scene, order.out, order.name)
-    assert (options.region, options.editor) == (order.region, order.editor)
+    assert (options.region.region, options.editor.editor) == (order.region, order.editor)
     assert options.quick
     assert options.resume
     assert options.threads == 1
