@@ -44,27 +44,24 @@ RECORDED = "benchmarks.recorded_runs:recorded_edit"
 
 @dataclass(frozen=True)
 class BenchOptions:
-    """Measure speed against error; each benchmark interleaves what it compares in one process.
-
-    Args:
-        what: rasterize, field, edits, networks, viewer, select, frames, moving, window, warps, pictures;
-            none named is all
-        json: also write the tables to this JSON file
-        markdown: also put the tables between their markers in these Markdown files
-        runs: finished run folders: `edits` and `networks` measure them, `field` beside the bear's edits
-        plot: `field` also draws its errors into this PNG file
-        scenes: .ply files that viewer, select, frames, moving and window take in place of the bears, warps
-            beside them, and pictures alone
-        seconds: how long `window` drags its slider; 60 where not said
-    """
+    """Measure speed against error; each benchmark interleaves what it compares in one process."""
 
     what: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
+    """rasterize, field, edits, networks, viewer, select, frames, moving, window, warps, pictures; none named
+    is all."""
     json: Path | None = None
+    """also write the tables to this JSON file."""
     markdown: tuple[Path, ...] = ()
+    """also put the tables between their markers in these Markdown files."""
     runs: tuple[Path, ...] = ()
+    """finished run folders: `edits` and `networks` measure them, `field` beside the bear's edits."""
     plot: Path | None = None
+    """`field` also draws its errors into this PNG file."""
     scenes: tuple[Path, ...] = ()
+    """.ply files that viewer, select, frames, moving and window take in place of the bears, warps beside
+    them, and pictures alone."""
     seconds: float | None = None
+    """how long `window` drags its slider; 60 where not said."""
 
 
 def main(argv: Sequence[str]) -> int:

@@ -14,7 +14,6 @@ from torch import Tensor
 from progdf.camera import Camera
 from progdf.compose.composer import Composer
 from progdf.compose.layers import Layer
-from progdf.demo_scenes import AnalyticEdit
 from progdf.field import BakedField, FieldEvaluator
 from progdf.field.choose import Field, Render
 from progdf.gaussians import Gaussians, pack
@@ -24,39 +23,29 @@ from progdf.rasterize import alpha_weights, render, set_threads
 from progdf.region import from_mask
 from progdf.threads import threads
 
+from .analytic_edits import AnalyticEdit
+
 AT_SNAPSHOTS = 6
 """Snapshots at which fields are judged beside the strengths between them."""
 
 
 @dataclass(frozen=True)
 class KnownEdit:
-    """An edit's true course.
+    """An edit's true course."""
 
-    Args:
-        name: of the edit
-        scene: the original
-        members: that the edit changes, ascending. [M] int64
-        strengths: of the snapshots that fields are fitted to. [T]
-        offsets: [T,M,C]
-        truth: the offsets at any strength. [M,C]
-        judge: errors against the truth, in views that no choice has seen, over the pixels that change
-        chooser: the same in other views that `look` does not show, which have the last word on a choice
-        look: pixels on which ranks are grown
-        weights: visibility of the members. [M]
-        unseen: the judge's pixels
-    """
-
-    name: str
-    scene: Gaussians
-    members: Tensor
-    strengths: Tensor
-    offsets: Tensor
-    truth: Callable[[float], Tensor]
+    name: str  # of the edit
+    scene: Gaussians  # the original
+    members: Tensor  # that the edit changes, ascending. [M] int64
+    strengths: Tensor  # of the snapshots that fields are fitted to. [T]
+    offsets: Tensor  # [T,M,C]
+    truth: Callable[[float], Tensor]  # the offsets at any strength. [M,C]
+    # errors against the truth, in views that no choice has seen, over the pixels that change
     judge: FieldEvaluator
+    # the same in other views that `look` does not show, which have the last word on a choice
     chooser: FieldEvaluator
-    look: Render
-    weights: Tensor
-    unseen: Render
+    look: Render  # pixels on which ranks are grown
+    weights: Tensor  # visibility of the members. [M]
+    unseen: Render  # the judge's pixels
 
     @cached_property
     def _shown(self) -> list[tuple[float, Tensor]]:

@@ -19,7 +19,7 @@ from torch import Tensor
 from progdf.compose.composer import Composer
 from progdf.compose.layers import Layer
 from progdf.compose.reference import compose_layers
-from progdf.demo_scenes import bear, bear_edits
+from progdf.demo_scenes import bear
 from progdf.field import fit_separable
 from progdf.gaussians import ATTRIBUTES, Gaussians, pack
 from progdf.gdf.file import Gdf
@@ -27,6 +27,7 @@ from progdf.io.atomic import atomic_write
 from progdf.rasterize import set_threads
 from progdf.threads import threads
 
+from .analytic_edits import bear_edits
 from .courses import KnownEdit, edit_of, known_edit, milliseconds, processor_milliseconds
 from .field_forms import Form, baked_forms
 from .field_plot import draw_forms

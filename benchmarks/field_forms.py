@@ -21,30 +21,19 @@ COUNTS = (3, 4, 9)
 
 @dataclass(frozen=True)
 class Form:
-    """One field of one edit, measured.
+    """One field of one edit, measured."""
 
-    Args:
-        edit, members: what was edited
-        kind: as the plot tells them apart
-        label: what it is
-        numbers: stored
-        bytes_per_member: on disk
-        curve: PSNR over the slider between the snapshots, dB
-        at_snapshots: least PSNR at snapshots, dB
-        seconds: to fit it, with the pictures that this looks at
-        step: ms for one change of the slider, with one thread and with two
-    """
-
+    # edit, members: what was edited
     edit: str
     members: int
-    kind: str
-    label: str
-    numbers: int
-    bytes_per_member: float
-    curve: tuple[float, ...]
-    at_snapshots: float
-    seconds: float
-    step: tuple[float, float]
+    kind: str  # as the plot tells them apart
+    label: str  # what it is
+    numbers: int  # stored
+    bytes_per_member: float  # on disk
+    curve: tuple[float, ...]  # PSNR over the slider between the snapshots, dB
+    at_snapshots: float  # least PSNR at snapshots, dB
+    seconds: float  # to fit it, with the pictures that this looks at
+    step: tuple[float, float]  # ms for one change of the slider, with one thread and with two
 
     @property
     def worst(self) -> float:

@@ -67,19 +67,12 @@ NOTE = (
 
 @dataclass(frozen=True)
 class Trained:
-    """One network of one edit.
+    """One network of one edit."""
 
-    Args:
-        network: as it is stored
-        baked: as the viewer shows it
-        steps: of training, 0 where it would take too long
-        seconds: of processor time that they took
-    """
-
-    network: NeuralField
-    baked: BakedField
-    steps: int
-    seconds: float
+    network: NeuralField  # as it is stored
+    baked: BakedField  # as the viewer shows it
+    steps: int  # of training, 0 where it would take too long
+    seconds: float  # of processor time that they took
 
 
 def tables(runs: Sequence[Path] = ()) -> list[Table]:

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import tyro
 from torch import Tensor
 
-from progdf.demo_scenes import AnalyticEdit, DemoScene, bear, bear_edits, room
+from progdf.demo_scenes import DemoScene, bear, room
 from progdf.formats.ply import load_ply
 from progdf.gaussians import Gaussians
 from progdf.io.atomic import make_folder
@@ -38,6 +38,8 @@ from trainer.run.threads import use_threads
 from trainer.setup import make_training_setup
 from trainer.store.run_folder import write_json
 from trainer.views.view import crop, render_view
+
+from .analytic_edits import AnalyticEdit, bear_edits
 
 STRENGTHS = tuple(i / 10 for i in range(11))
 """At which sliders are compared with the truth; 0 is exact for all."""
@@ -90,19 +92,12 @@ def run_sliders(options: SliderOptions) -> list[CaseResult]:
 
 @dataclass(frozen=True)
 class SliderCase:
-    """One edit.
+    """One edit."""
 
-    Args:
-        name: of the edit; of an analytic one as `bear_edits` names it
-        scene: the demo scene
-        parts: what may change
-        editor: `KIND:WHAT` of an editor of colors; "" for an analytic edit
-    """
-
-    name: str
-    scene: Literal["bear", "room"]
-    parts: tuple[str, ...]
-    editor: str = ""
+    name: str  # of the edit; of an analytic one as `bear_edits` names it
+    scene: Literal["bear", "room"]  # the demo scene
+    parts: tuple[str, ...]  # what may change
+    editor: str = ""  # `KIND:WHAT` of an editor of colors; "" for an analytic edit
 
     @property
     def folder(self) -> str:
@@ -127,22 +122,14 @@ CASES = (
 
 @dataclass(frozen=True)
 class CaseResult:
-    """One edit's figures.
+    """One edit's figures."""
 
-    Args:
-        case: the edit
-        members: how many Gaussians it may change
-        bytes_per_member: of the shipped field
-        seconds: of the run, as its report tells
-        curves: against the truth at `STRENGTHS`, by what is shown
-        strips: the best held-out view half way and at the end: the truth, and what is shown. [h,w,3] each
-    """
-
-    case: SliderCase
-    members: int
-    bytes_per_member: float
-    seconds: float | None
-    curves: Mapping[str, ErrorCurve]
+    case: SliderCase  # the edit
+    members: int  # how many Gaussians it may change
+    bytes_per_member: float  # of the shipped field
+    seconds: float | None  # of the run, as its report tells
+    curves: Mapping[str, ErrorCurve]  # against the truth at `STRENGTHS`, by what is shown
+    # the best held-out view half way and at the end: the truth, and what is shown. [h,w,3] each
     strips: Mapping[str, tuple[Tensor, Tensor]]
 
 

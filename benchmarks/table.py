@@ -13,21 +13,13 @@ BEGIN, END = "<!-- bench {name} -->", "<!-- end {name} -->"
 
 @dataclass(frozen=True)
 class Table:
-    """One benchmark's result.
+    """One benchmark's result."""
 
-    Args:
-        name: short, for the markers and the JSON file
-        title: one line
-        columns: headings, with units
-        rows: one text a column
-        note: what was measured and how, one or two lines
-    """
-
-    name: str
-    title: str
-    columns: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    note: str = ""
+    name: str  # short, for the markers and the JSON file
+    title: str  # one line
+    columns: tuple[str, ...]  # headings, with units
+    rows: tuple[tuple[str, ...], ...]  # one text a column
+    note: str = ""  # what was measured and how, one or two lines
 
     def markdown(self) -> str:
         """The table as GitHub Markdown, with its title and note."""

@@ -14,8 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from progdf.demo_scenes import AnalyticEdit, bear
-from progdf.demo_scenes.warps import column_warps, smile_warp
+from progdf.demo_scenes import bear
 from progdf.errors import ProgdfError
 from progdf.formats.ply import load_ply
 from progdf.gaussians import Gaussians
@@ -34,6 +33,7 @@ from trainer.setup import TrainingSetup, make_training_setup, probe_views, quant
 from trainer.views.crops import CropScene, crop_scene
 from trainer.views.view import View, crop
 
+from .analytic_edits import AnalyticEdit, column_warps, smile_warp
 from .table import Table
 
 STEPS, VIEWS, SIZE = 240, 15, 160
@@ -46,17 +46,11 @@ Picture = Callable[[View], Tensor]
 
 @dataclass(frozen=True)
 class WarpCase:
-    """One edit of one region.
+    """One edit of one region."""
 
-    Args:
-        name: of both
-        setup: scene, region, views
-        picture: the finished edit in a view
-    """
-
-    name: str
-    setup: TrainingSetup
-    picture: Picture
+    name: str  # of both
+    setup: TrainingSetup  # scene, region, views
+    picture: Picture  # the finished edit in a view
 
 
 def tables(scenes: Sequence[Path] = ()) -> list[Table]:

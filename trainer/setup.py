@@ -26,9 +26,8 @@ from .editors.base import ImageEditor
 from .editors.pictures import picture_cameras
 from .editors.procedural import ColorEditor
 from .options import MOST_VIEWS, VIEWS, Kind, ViewOptions
-from .store.picture_list import add_pictures
 from .store.progress import Advance
-from .store.run_folder import RunFolder
+from .store.run_folder import RunFolder, add_pictures
 from .views.choose import choose_views, split_views
 from .views.crops import CropScene, crop_scene
 from .views.view import (
@@ -120,24 +119,16 @@ Pictures = Mapping[float, Sequence[Tensor]]
 
 @dataclass(frozen=True)
 class TrainingSetup:
-    """The scene, the region, the views on it, and what is to be said of these.
+    """The scene, the region, the views on it, and what is to be said of these."""
 
-    Args:
-        scene, region: what is edited
-        train: views to train on
-        held_out: views to measure with; none where there are few, see `judging`
-        background: rgb. [3]
-        notes: lines for the log
-        up: the axis that is up
-    """
-
+    # scene, region: what is edited
     scene: Gaussians
     region: Region
-    train: Sequence[View]
-    held_out: Sequence[View]
-    background: Tensor
-    notes: Sequence[str] = ()
-    up: UpAxis | None = None
+    train: Sequence[View]  # views to train on
+    held_out: Sequence[View]  # views to measure with; none where there are few, see `judging`
+    background: Tensor  # rgb. [3]
+    notes: Sequence[str] = ()  # lines for the log
+    up: UpAxis | None = None  # the axis that is up
 
     @property
     def views(self) -> list[View]:

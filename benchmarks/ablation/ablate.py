@@ -34,10 +34,9 @@ from trainer.run.record import reopen_run
 from trainer.run.threads import use_threads
 from trainer.run.training import optimize_members, retime_trajectory
 from trainer.setup import Pictures, whole_views
-from trainer.store.interrupts import interrupt_on_signals
 from trainer.store.progress import RunLog
 from trainer.store.run_folder import RunFolder, lock_folder, write_json
-from trainer.store.state import StateFolder
+from trainer.store.state import StateFolder, interrupt_on_signals
 
 from .judge import fit_variant, with_figures
 from .options import AblateOptions

@@ -8,9 +8,8 @@ from dataclasses import replace
 import torch
 
 from progdf.field import BakedField, fit_keyframes
-from progdf.field.baked import identity_remap
+from progdf.field.baked import identity_remap, interpolate_at
 from progdf.field.trajectory import Trajectory
-from progdf.interpolation import interpolate_at
 from progdf.metrics.slider import slider_statistics
 from trainer.fit.fit import fit_field
 from trainer.fit.network import PART as NETWORK

@@ -27,17 +27,11 @@ _ROW, _HEAD, _WIDTH = 0.21, 1.0, 12.0  # inches
 
 @dataclass(frozen=True)
 class _Line:
-    """A row of the picture.
+    """A row of the picture."""
 
-    Args:
-        name: of the variant
-        of: of the one that it differs from
-        rows: of each run; None where it makes no difference there
-    """
-
-    name: str
-    of: str
-    rows: Sequence[Row | None]
+    name: str  # of the variant
+    of: str  # of the one that it differs from
+    rows: Sequence[Row | None]  # of each run; None where it makes no difference there
 
 
 def plot_ablations(ablations: Sequence[Ablation]) -> Tensor:

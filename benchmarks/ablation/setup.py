@@ -37,33 +37,20 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True)
 class AblationSetup:
-    """What all variants share.
+    """What all variants share."""
 
-    Args:
-        run: the finished run
-        plan: its own, as a draft if asked for
-        kind: what the edit moves
-        setup: scene, region, views whose boxes hold the edit
-        edited: strength → the edited training views, whole
-        evaluator: held-out views with the editor's pictures of the shown columns, for whatever moves
-        still: the same, and `seen`, for what moves nothing but colors, which they draw faster
-        columns: where on the run's slider the variants are shown, and what the editor was asked there
-        seen: a few training views, on which the field's ranks are chosen
-        weights: how visible each member is. [M]
-        digest: of all of this but the plan
-    """
-
-    run: FinishedRun
-    plan: TrainOptions
-    kind: EditKind
-    setup: TrainingSetup
-    edited: Pictures
-    evaluator: Evaluator
+    run: FinishedRun  # the finished run
+    plan: TrainOptions  # its own, as a draft if asked for
+    kind: EditKind  # what the edit moves
+    setup: TrainingSetup  # scene, region, views whose boxes hold the edit
+    edited: Pictures  # strength → the edited training views, whole
+    evaluator: Evaluator  # held-out views with the editor's pictures of the shown columns, for whatever moves
+    # the same, and `seen`, for what moves nothing but colors, which they draw faster
     still: tuple[Evaluator, Evaluator]
-    columns: Columns
-    seen: Evaluator
-    weights: Tensor
-    digest: str
+    columns: Columns  # where on the run's slider the variants are shown, and what the editor was asked there
+    seen: Evaluator  # a few training views, on which the field's ranks are chosen
+    weights: Tensor  # how visible each member is. [M]
+    digest: str  # of all of this but the plan
 
     def evaluators(self, offsets: Tensor) -> tuple[Evaluator, Evaluator]:
         """Held-out views and `seen`, for what moves as these do. [T,M,C]"""

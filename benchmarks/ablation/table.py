@@ -17,35 +17,28 @@ from trainer.report.report import Columns, column_heading
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one variant with one seed, on held-out views.
+    """What became of one variant with one seed, on held-out views."""
 
-    Args:
-        name, what, of: of the variant
-        psnr, ssim, lpips: of the finished edit to the edited views
-        between: a quarter, half or three quarters of the slider → PSNR to the editor's own picture from
-            there or near by, dB, where it was asked
-        uniformity: least over largest visible change of twenty equal steps, 0..1
-        t50, t90: slider value at which half and nine tenths of the change are reached
-        bytes_per_member: of the field
-        seconds: processor time of the optimization, with that of a network that is trained beside it
-        objective: the loss, in words
-        failed: why there are no figures, "" where there are
-    """
-
+    # name, what, of: of the variant
     name: str
     what: str
     of: str = ""
+    # psnr, ssim, lpips: of the finished edit to the edited views
     psnr: float = 0.0
     ssim: float = 0.0
     lpips: float = 0.0
+    # a quarter, half or three quarters of the slider → PSNR to the editor's own picture from there or near
+    # by, dB, where it was asked
     between: Mapping[str, float] | None = None
-    uniformity: float = 0.0
+    uniformity: float = 0.0  # least over largest visible change of twenty equal steps, 0..1
+    # t50, t90: slider value at which half and nine tenths of the change are reached
     t50: float = 0.0
     t90: float = 0.0
-    bytes_per_member: float = 0.0
+    bytes_per_member: float = 0.0  # of the field
+    # processor time of the optimization, with that of a network that is trained beside it
     seconds: float = 0.0
-    objective: str = ""
-    failed: str = ""
+    objective: str = ""  # the loss, in words
+    failed: str = ""  # why there are no figures, "" where there are
 
     @property
     def way(self) -> float | None:
@@ -55,13 +48,9 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Row:
-    """A variant of one run.
+    """A variant of one run."""
 
-    Args:
-        outcomes: with each seed, at least one
-    """
-
-    outcomes: Sequence[Outcome]
+    outcomes: Sequence[Outcome]  # with each seed, at least one
 
     @property
     def first(self) -> Outcome:
@@ -81,38 +70,23 @@ class Row:
 
 @dataclass(frozen=True)
 class Ablation:
-    """All variants of one run that are done.
+    """All variants of one run that are done."""
 
-    Args:
-        name: of the run
-        title: one line
-        note: what was measured, one line
-        rows: in order
-        perceptual: name of the distance, LPIPS or what stands in for it
-    """
-
-    name: str
-    title: str
-    note: str
-    rows: Sequence[Row]
-    perceptual: str
+    name: str  # of the run
+    title: str  # one line
+    note: str  # what was measured, one line
+    rows: Sequence[Row]  # in order
+    perceptual: str  # name of the distance, LPIPS or what stands in for it
 
 
 @dataclass(frozen=True)
 class Figure:
-    """A column of the table.
+    """A column of the table."""
 
-    Args:
-        heading: with its unit
-        short: as the terminal has it
-        digits: behind the point
-        of: reads it
-    """
-
-    heading: str
-    short: str
-    digits: int
-    of: Callable[[Outcome], float | None]
+    heading: str  # with its unit
+    short: str  # as the terminal has it
+    digits: int  # behind the point
+    of: Callable[[Outcome], float | None]  # reads it
 
     def text(self, row: Row, spread: bool = True) -> str:
         """The mean over the seeds, and ± its standard deviation where there are several."""

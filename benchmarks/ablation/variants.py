@@ -37,25 +37,17 @@ _AFTERWARDS = ("optimize.slider", "trainer.fit.fit._PAYS")  # the optimization k
 
 @dataclass(frozen=True)
 class Variant:
-    """One row of the ablation.
+    """One row of the ablation."""
 
-    Args:
-        name: short, as --only takes it
-        what: what is different, in words
-        changes: values of the plan in place of the other variant's, by their paths
-        of: name of that variant
-        linear: the slider goes straight from the original to the end, whatever was recorded
-        patches: what stands in the trainer's modules meanwhile, by its dotted names
-        longer: how many times the other variant's steps it takes
-    """
-
-    name: str
-    what: str
+    name: str  # short, as --only takes it
+    what: str  # what is different, in words
+    # values of the plan in place of the other variant's, by their paths
     changes: Mapping[str, Any] = field(default_factory=dict)
-    of: str = BASE
-    linear: bool = False
+    of: str = BASE  # name of that variant
+    linear: bool = False  # the slider goes straight from the original to the end, whatever was recorded
+    # what stands in the trainer's modules meanwhile, by its dotted names
     patches: Mapping[str, object] = field(default_factory=dict)
-    longer: float = 1.0
+    longer: float = 1.0  # how many times the other variant's steps it takes
 
     @property
     def trains_as(self) -> str:

@@ -55,17 +55,11 @@ def display(width: int = 1400, height: int = 900) -> Iterator[str]:
 
 @dataclass
 class Opened:
-    """A window that is open: its process and what it says of itself.
+    """A window that is open: its process and what it says of itself."""
 
-    Args:
-        process: runs `benchmarks.viewer.watched`
-        environment: with the display
-        figures: what was said so far (see `bench_watched`)
-    """
-
-    process: subprocess.Popen[str]
-    environment: dict[str, str]
-    figures: dict[str, Any] = field(default_factory=dict)
+    process: subprocess.Popen[str]  # runs `benchmarks.viewer.watched`
+    environment: dict[str, str]  # with the display
+    figures: dict[str, Any] = field(default_factory=dict)  # what was said so far (see `bench_watched`)
     name: str = ""
 
     def listen(self) -> None:

@@ -51,45 +51,28 @@ WAYS = {"gl": "OpenGL", "cpu": "CPU"}
 
 @dataclass(frozen=True)
 class Turning:
-    """One scene turned, drawn one way; an entry of `frames_ms`, `draws_ms` and `coarse_ms` per frame.
+    """One scene turned, drawn one way; an entry of `frames_ms`, `draws_ms` and `coarse_ms` per frame."""
 
-    Args:
-        count: Gaussians in the scene
-        way: a key of `WAYS`
-        frames_ms: from the mouse's event to finished pixels of the whole window
-        draws_ms: the picture in it: sorted and drawn
-        checked, wrong: pictures that were drawn afresh once more, and how many of them differ
-        opened_s: from a file opened in the running window to its first picture
-        coarse_ms: whole frames again, coarse while they move
-        coarse_db: PSNR of the coarse pictures against the full ones, the worst
-        at_rest: how far the picture is from the full one once the hand rests, of 255
-    """
-
-    count: int
-    way: str
-    frames_ms: tuple[float, ...]
-    draws_ms: tuple[float, ...]
+    count: int  # Gaussians in the scene
+    way: str  # a key of `WAYS`
+    frames_ms: tuple[float, ...]  # from the mouse's event to finished pixels of the whole window
+    draws_ms: tuple[float, ...]  # the picture in it: sorted and drawn
+    # checked, wrong: pictures that were drawn afresh once more, and how many of them differ
     checked: int
     wrong: int
-    opened_s: float
-    coarse_ms: tuple[float, ...]
-    coarse_db: float
-    at_rest: int
+    opened_s: float  # from a file opened in the running window to its first picture
+    coarse_ms: tuple[float, ...]  # whole frames again, coarse while they move
+    coarse_db: float  # PSNR of the coarse pictures against the full ones, the worst
+    at_rest: int  # how far the picture is from the full one once the hand rests, of 255
 
 
 @dataclass(frozen=True)
 class Start:
-    """`progdf view` in a process of its own; medians.
+    """`progdf view` in a process of its own; medians."""
 
-    Args:
-        first_s: from the start of the process to the first picture on the screen
-        imports_s: of that, until Python has read the program and the libraries
-        memory_mb: the most that the process has held by then
-    """
-
-    first_s: float
-    imports_s: float
-    memory_mb: float
+    first_s: float  # from the start of the process to the first picture on the screen
+    imports_s: float  # of that, until Python has read the program and the libraries
+    memory_mb: float  # the most that the process has held by then
 
 
 def tables(scenes: Sequence[Path] = ()) -> list[Table]:

@@ -41,30 +41,19 @@ _UNDER_WAY_S = 0.2  # a training that goes on has its threads at work
 
 @dataclass(frozen=True)
 class Moving:
-    """One scene in the hand; times in ms.
+    """One scene in the hand; times in ms."""
 
-    Args:
-        count: Gaussians
-        turning: frames while the picture turns
-        beside: the same while a training runs
-        sharp: from the last of these to the picture in full, the hand at rest on the button
-        meanwhile: the longest frame until then
-        click, lasso: the longest frame of a click on the picture; of letting go of a lasso
-        full: the picture in full
-        db: PSNR of the pictures in motion to those in full, the worst
-        luminance: difference of their means, the largest, of the full one's
-    """
-
-    count: int
-    turning: tuple[float, ...]
-    beside: tuple[float, ...]
-    sharp: float
-    meanwhile: float
+    count: int  # Gaussians
+    turning: tuple[float, ...]  # frames while the picture turns
+    beside: tuple[float, ...]  # the same while a training runs
+    sharp: float  # from the last of these to the picture in full, the hand at rest on the button
+    meanwhile: float  # the longest frame until then
+    # click, lasso: the longest frame of a click on the picture; of letting go of a lasso
     click: float
     lasso: float
-    full: float
-    db: float
-    luminance: float
+    full: float  # the picture in full
+    db: float  # PSNR of the pictures in motion to those in full, the worst
+    luminance: float  # difference of their means, the largest, of the full one's
 
 
 def tables(scenes: Sequence[Path] = ()) -> list[Table]:

@@ -36,15 +36,10 @@ PARTS = ("compose_ms", "upload_ms", "sort_ms", "draw_ms")
 
 @dataclass(frozen=True)
 class Way:
-    """One way to bring a slider's change to the screen; what is to be compared gets a row here.
+    """One way to bring a slider's change to the screen; what is to be compared gets a row here."""
 
-    Args:
-        title: in the table
-        draw: of `engine.DRAWS`
-    """
-
-    title: str
-    draw: str
+    title: str  # in the table
+    draw: str  # of `engine.DRAWS`
 
 
 WAYS = {
@@ -55,15 +50,10 @@ WAYS = {
 
 @dataclass(frozen=True)
 class SliderCase:
-    """An edit of a scene.
+    """An edit of a scene."""
 
-    Args:
-        members: Gaussians that it changes
-        moves: whether it moves them too, so that they have to be sorted anew
-    """
-
-    members: int
-    moves: bool
+    members: int  # Gaussians that it changes
+    moves: bool  # whether it moves them too, so that they have to be sorted anew
 
     @property
     def title(self) -> str:
@@ -80,22 +70,14 @@ CASES = (
 
 @dataclass(frozen=True)
 class SliderTimes:
-    """What one way took, an entry per step of the slider, and how far its picture is from the CPU engine's.
-
-    Args:
-        count: Gaussians in the scene
-        way: a key of `WAYS`
-        events_ms: from the mouse's event to finished pixels
-        parts: what of that the engine took
-        psnr_db: against `progdf.render`, the worst of three strengths
-    """
+    """What one way took, an entry per slider step, and how far its picture is from the CPU engine's."""
 
     case: SliderCase
-    count: int
-    way: str
-    events_ms: tuple[float, ...]
-    parts: tuple[FrameTimings, ...]
-    psnr_db: float
+    count: int  # Gaussians in the scene
+    way: str  # a key of `WAYS`
+    events_ms: tuple[float, ...]  # from the mouse's event to finished pixels
+    parts: tuple[FrameTimings, ...]  # what of that the engine took
+    psnr_db: float  # against `progdf.render`, the worst of three strengths
 
     @property
     def rest_ms(self) -> float:

@@ -35,34 +35,21 @@ _SWEEP = 40
 
 @dataclass(frozen=True)
 class Idle:
-    """A window that nobody touches.
+    """A window that nobody touches."""
 
-    Args:
-        state: where the mouse is
-        processor_s: time that the process has used, all threads, seconds
-        wall_s: in so many seconds
-    """
-
-    state: str
-    processor_s: float
-    wall_s: float
+    state: str  # where the mouse is
+    processor_s: float  # time that the process has used, all threads, seconds
+    wall_s: float  # in so many seconds
 
 
 @dataclass(frozen=True)
 class Dragging:
-    """A slider dragged to and fro.
+    """A slider dragged to and fro."""
 
-    Args:
-        seconds: when each sample was taken, since the dragging began
-        memory_mb: resident memory, one entry a sample
-        pictures: that were drawn
-        slider_ms: of the last 120 slider events to finished pixels
-    """
-
-    seconds: tuple[float, ...]
-    memory_mb: tuple[float, ...]
-    pictures: int
-    slider_ms: tuple[float, ...]
+    seconds: tuple[float, ...]  # when each sample was taken, since the dragging began
+    memory_mb: tuple[float, ...]  # resident memory, one entry a sample
+    pictures: int  # that were drawn
+    slider_ms: tuple[float, ...]  # of the last 120 slider events to finished pixels
 
     @property
     def slope(self) -> float:

@@ -24,17 +24,14 @@ from .options import absent_option, parse_options
 
 @dataclass(frozen=True)
 class EditOptions:
-    """Write a scene again without what should not be in it. The scene itself is never changed.
-
-    Args:
-        scene: a .ply, .spz, .splat, .ksplat or .sog
-        out: the .ply file to write
-        clean: leave out floaters, needles, giants and what is too transparent to be drawn
-    """
+    """Write a scene again without what should not be in it. The scene itself is never changed."""
 
     scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
+    """a .ply, .spz, .splat, .ksplat or .sog."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT.ply")]
+    """the .ply file to write."""
     clean: Annotated[bool, tyro.conf.FlagCreatePairsOff, absent_option(None)] = False
+    """leave out floaters, needles, giants and what is too transparent to be drawn."""
 
 
 def main(argv: Sequence[str]) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import shlex
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -10,23 +11,102 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import msgspec
+import torch
 import tyro
 
 from progdf.errors import ProgdfError
 from progdf.field.baked import BakedField
 from progdf.formats.scene_file import load_scene_with_report, scene_file, scene_format
-from progdf.gaussians import ZERO
+from progdf.gaussians import ZERO, Gaussians
 from progdf.gdf.file import read_gdf
 from progdf.io import session as session_file
 from progdf.io.atomic import read_file
 from progdf.io.cameras import load_cameras
 from progdf.io.json_values import convert_json, decode_json
-from progdf.scene.stats import survey
+from progdf.scene.bounds import is_surrounding, scene_sphere
 from progdf.scene.strays import find_strays
-from progdf.scene.up_axis import UpChoice, find_up
-from progdf.terminal import file_size, format_count, group_digits, print_line
+from progdf.scene.up_axis import UpAxis, UpChoice, find_up
+from progdf.terminal import file_size, format_count, format_place, group_digits, print_line
 
 from .options import absent_option, parse_options
+
+
+@dataclass(frozen=True)
+class Survey:
+    """A scene in numbers."""
+
+    count: int  # Gaussians N
+    center: tuple[float, float, float]  # median of the means, in the world
+    radius: float  # distance from the center within which 97 % of the means lie, world units
+    farthest: float  # distance of the farthest mean from the center, world units
+    # box, bulk_box: the corners of all Gaussians, and of the middle 95 % along each axis, in the world
+    box: tuple[float, ...]
+    bulk_box: tuple[float, ...]
+    up: UpAxis  # which way is up, and how that was decided
+    surrounding: bool  # it looks like a scene to stand inside, which cameras around it cannot frame
+    median_size: float  # median of the longest axes, one standard deviation, world units
+    largest_size: float  # the longest axis of all
+
+    def lines(self) -> list[str]:
+        """The survey for a person, a line per fact."""
+        center = " ".join(format_place(at, self.radius, 4) for at in self.center)
+        lines = [
+            f"place: center {center}, radius {self.radius:.4g} (97 % of the Gaussians), "
+            f"farthest {self.farthest:.4g}",
+            f"up: {self.up.name}, {self.up.reason}",
+            f"bulk, 95 % along each axis: --region {_box(self.bulk_box)}",
+            f"all: --region {_box(self.box)}",
+            f"size: median {self.median_size:.3g}, largest {self.largest_size:.3g} "
+            "(longest axis, one standard deviation)",
+        ]
+        if self.surrounding:
+            lines.append(
+                "cameras: a scene to stand inside, which cameras around it cannot frame; give its own, "
+                "or keep views with F4 in progdf view"
+            )
+        return lines
+
+
+def survey(scene: Gaussians, up: UpAxis | None = None) -> Survey:
+    """Measure a scene of at least one Gaussian, every number in it finite, as `load_ply` makes them.
+
+    Args:
+        scene: N Gaussians
+        up: which way is up; None finds it
+    """
+    center, radius = scene_sphere(scene)
+    up = find_up(scene) if up is None else up
+    longest = scene.log_scales.amax(dim=1).exp()
+    x, y, z = (at + middle for at, middle in zip(scene.origin, center.tolist(), strict=True))
+    return Survey(
+        count=len(scene),
+        center=(x, y, z),
+        radius=radius,
+        farthest=float((scene.means - center).norm(dim=1).max()),
+        box=_corners(scene, 0.0),
+        bulk_box=_corners(scene, 0.025),
+        up=up,
+        surrounding=is_surrounding(scene, up.direction),
+        median_size=float(longest.median()),
+        largest_size=float(longest.max()),
+    )
+
+
+def _corners(scene: Gaussians, left_out: float) -> tuple[float, ...]:
+    """Least x, y, z and largest x, y, z of what is left without a share of the means on each side."""
+    ordered = scene.means.sort(dim=0).values
+    cut = int(left_out * len(ordered))
+    ends = torch.cat([ordered[cut], ordered[len(ordered) - 1 - cut]]).tolist()
+    return tuple(at + end for at, end in zip(2 * scene.origin, ends, strict=True))
+
+
+def _box(corners: tuple[float, ...]) -> str:
+    """The corners as a region, rounded outwards to a hundred-thousandth of the box."""
+    step = 10.0 ** math.floor(math.log10(max(math.dist(corners[:3], corners[3:]), 1e-12)) - 4)
+    places = max(0, -round(math.log10(step)))
+    rounded = [(math.floor, math.ceil)[i // 3](corner / step) * step for i, corner in enumerate(corners)]
+    return "box:" + ",".join(f"{corner:.{places}f}" for corner in rounded)
+
 
 TIMELINE_MARK = "progdf_timeline"
 """The first key of every timeline file of the window, which identifies its kind."""
@@ -37,16 +117,14 @@ class InfoOptions:
     """Show the contents of a scene, a .gdf edit, a session or a camera file. Nothing is written.
 
     Of a scene, also what had to be repaired to load it, and its strays; of an edit, its error report.
-
-    Args:
-        file: its content decides what it is, not its name
-        cameras: of the scene, which tell the up axis
-        up: the axis of the scene that is up
     """
 
     file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
+    """its content decides what it is, not its name."""
     cameras: Annotated[Path | None, absent_option("CAMERAS", "those beside the file")] = None
+    """of the scene, which tell the up axis."""
     up: UpChoice = "auto"
+    """the axis of the scene that is up."""
 
 
 def main(argv: Sequence[str]) -> int:

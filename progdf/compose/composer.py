@@ -15,10 +15,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from progdf.field.baked import AttributeBases
+from progdf.field.baked import AttributeBases, Segment, find_segment
 from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.gdf.file import Gdf, verify
-from progdf.interpolation import Segment, find_segment
 from progdf.rasterize.cpu.jit import kernel
 from progdf.threads import run_chunks
 

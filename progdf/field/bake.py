@@ -14,10 +14,9 @@ import torch
 from torch import Tensor
 
 from progdf.gaussians import BASE_CHANNELS
-from progdf.interpolation import interpolate_at
 from progdf.metrics.image import decibels
 
-from .baked import MOST_RANK, BakedField, BakePlan, NeuralForm
+from .baked import MOST_RANK, BakedField, BakePlan, NeuralForm, interpolate_at
 from .choose import Field, Render, sample_strengths
 from .neural import NeuralField
 from .separable import fit_amplitude, fit_separable, moving_attributes, principal_modes

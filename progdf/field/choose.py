@@ -18,10 +18,9 @@ from typing import Literal, Protocol
 import torch
 from torch import Tensor
 
-from progdf.interpolation import interpolate_at
 from progdf.metrics.image import decibels
 
-from .baked import BakedField
+from .baked import BakedField, interpolate_at
 from .keyframes import fit_keyframes, fit_lossless
 from .separable import (
     AttributeTrajectory,

@@ -17,12 +17,11 @@ import torch
 from torch import Tensor
 
 from progdf.errors import ProgdfError
-from progdf.interpolation import find_segment
 from progdf.io.atomic import atomic_write, open_error
 from progdf.io.json_values import convert_json, decode_json
 from progdf.io.tensors import read_tensors, write_tensors
 
-from .baked import BakedField
+from .baked import BakedField, find_segment
 from .keyframes import fit_lossless
 
 FILE_NAME = "trajectory.safetensors"

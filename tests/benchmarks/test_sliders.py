@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.analytic_edits import bear_edits
 from benchmarks.sliders import CASES, STRENGTHS, CaseResult, run_suite, suite_json, suite_picture, suite_table
-from progdf.demo_scenes import bear_edits
 from tests.helpers.demo_scenes import bear
 from trainer.optimize.losses import GradientL1
 from trainer.run.demo import Effort

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 import tyro
 
-from progdf.demo_scenes.edits import AnalyticEdit, bear_edits, scale_edit
+from benchmarks.analytic_edits import AnalyticEdit, bear_edits, scale_edit
 from progdf.formats.ply import load_ply, save_ply
 from progdf.gaussians import Gaussians
 from progdf.io.images import write_image

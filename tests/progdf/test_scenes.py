@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks import analytic_edits
 from progdf import demo_scenes as scenes
 from progdf.color.edits import typical_color
 from progdf.demo_scenes import surface
@@ -172,7 +173,7 @@ EDITS = ("gold", "blue scarf", "stripes", "big ears", "tilted ears", "long ears"
 def test_an_analytic_edit_leaves_other_rows_and_strength_zero_alone(
     bear: scenes.DemoScene, name: str
 ) -> None:
-    edit, members = scenes.bear_edits(bear)[name]
+    edit, members = analytic_edits.bear_edits(bear)[name]
     assert _same(edit.apply(bear.gaussians, members, 0.0), bear.gaussians)
     edited = edit.apply(bear.gaussians, members, 0.7)
     others = torch.ones(len(bear.gaussians), dtype=torch.bool)
@@ -183,7 +184,7 @@ def test_an_analytic_edit_leaves_other_rows_and_strength_zero_alone(
 
 def test_growing_doubles_sizes_and_distances_from_the_pivot(bear: scenes.DemoScene) -> None:
     ears, pivot = bear.members("ears"), torch.tensor([[0.0, 1.0, 0.0]])
-    edited = scenes.scale_edit(3.0, pivot).apply(bear.gaussians, ears, 0.5)
+    edited = analytic_edits.scale_edit(3.0, pivot).apply(bear.gaussians, ears, 0.5)
     before = bear.gaussians[ears]
     assert torch.allclose(edited.means[ears] - pivot, 2 * (before.means - pivot), atol=1e-5)
     assert torch.allclose(edited.scales[ears], 2 * before.scales, rtol=1e-5)
@@ -191,7 +192,7 @@ def test_growing_doubles_sizes_and_distances_from_the_pivot(bear: scenes.DemoSce
 
 def test_swinging_is_a_rigid_turn(bear: scenes.DemoScene) -> None:
     ears, pivot = bear.members("ears"), torch.tensor([[0.0, 1.0, 0.0]])
-    edit = scenes.swing_edit(180.0, torch.tensor([0.0, 0.0, 2.0]), pivot)
+    edit = analytic_edits.swing_edit(180.0, torch.tensor([0.0, 0.0, 2.0]), pivot)
     half = edit.apply(bear.gaussians, ears, 0.5)[ears]
     arm = bear.gaussians.means[ears] - pivot
     expected = torch.stack([-arm[:, 1], arm[:, 0], arm[:, 2]], dim=1)
@@ -200,7 +201,7 @@ def test_swinging_is_a_rigid_turn(bear: scenes.DemoScene) -> None:
     camera = bear.cameras[0].resize(96, 96)
     whole = torch.arange(len(bear.gaussians))
     plain = replace(bear.gaussians, shN=torch.zeros(len(bear.gaussians), 0, 3))
-    turned = scenes.swing_edit(180.0, torch.tensor([0.0, 0.0, 1.0]), torch.zeros(1, 3)).apply(
+    turned = analytic_edits.swing_edit(180.0, torch.tensor([0.0, 0.0, 1.0]), torch.zeros(1, 3)).apply(
         plain, whole, 0.5
     )
     quarter = torch.eye(4)
@@ -222,12 +223,12 @@ def test_a_deformation_that_is_a_turn_or_a_growth_looks_like_one(bear: scenes.De
         return pivot + (1 + 0.5 * s) * (place - pivot.double())
 
     for move, plain in (
-        (turned, scenes.swing_edit(30.0, axis, pivot[None])),
-        (larger, scenes.scale_edit(1.5, pivot[None])),
+        (turned, analytic_edits.swing_edit(30.0, axis, pivot[None])),
+        (larger, analytic_edits.scale_edit(1.5, pivot[None])),
     ):
         pictures = [
             render(edit.apply(bear.gaussians, ears, 0.6), camera).image
-            for edit in (scenes.deform_edit("same", move), plain)
+            for edit in (analytic_edits.deform_edit("same", move), plain)
         ]
         assert float((pictures[0] - pictures[1]).abs().max()) < 1e-3
 
@@ -238,10 +239,14 @@ def test_stretching_keeps_what_lies_across_and_bending_keeps_distances_from_the_
     ears, pivot = bear.members("ears"), torch.tensor([0.0, 1.0, 0.0])
     up, side = torch.tensor([0.0, 2.0, 0.0]), torch.tensor([1.0, 0.0, 0.0])
     before = bear.gaussians.means[ears]
-    long = scenes.stretch_edit(3.0, up, pivot).apply(bear.gaussians, ears, 0.5).means[ears]
+    long = analytic_edits.stretch_edit(3.0, up, pivot).apply(bear.gaussians, ears, 0.5).means[ears]
     assert torch.allclose(long[:, [0, 2]], before[:, [0, 2]], atol=1e-6)
     assert torch.allclose(long[:, 1] - 1, 2 * (before[:, 1] - 1), atol=1e-5)
-    bent = scenes.bend_edit(45.0, side, up, pivot, length=0.5).apply(bear.gaussians, ears, 1.0).means[ears]
+    bent = (
+        analytic_edits.bend_edit(45.0, side, up, pivot, length=0.5)
+        .apply(bear.gaussians, ears, 1.0)
+        .means[ears]
+    )
     assert torch.allclose((bent - pivot).norm(dim=1), (before - pivot).norm(dim=1), atol=1e-5)
     angle = torch.atan2(*(bent - pivot)[:, [2, 1]].T) - torch.atan2(*(before - pivot)[:, [2, 1]].T)
     assert torch.allclose(angle, math.radians(45) * (before[:, 1] - 1) / 0.5, atol=1e-4)
@@ -250,7 +255,7 @@ def test_stretching_keeps_what_lies_across_and_bending_keeps_distances_from_the_
 def test_recoloring_is_exact_at_its_end(bear: scenes.DemoScene) -> None:
     scarf = bear.members("scarf")
     target = torch.tensor([0.1, 0.5, 0.3])
-    edited = scenes.recolor_edit(target).apply(bear.gaussians, scarf, 1.0)
+    edited = analytic_edits.recolor_edit(target).apply(bear.gaussians, scarf, 1.0)
     assert torch.allclose(typical_color(sh0_to_rgb(edited.sh0[scarf])), target, atol=0.12)
 
 
@@ -278,7 +283,7 @@ def test_the_pandas_picture_changes_the_coat_and_keeps_face_scarf_and_ground(bea
 @pytest.mark.parametrize("strength", [-0.1, 1.1, math.nan])
 def test_a_strength_outside_its_range_is_refused(bear: scenes.DemoScene, strength: float) -> None:
     with pytest.raises(ProgdfError, match="between 0 and 1"):
-        scenes.darken_edit().apply(bear.gaussians, torch.arange(3), strength)
+        analytic_edits.darken_edit().apply(bear.gaussians, torch.arange(3), strength)
 
 
 def test_which_of_parts_of_one_size_gets_the_gaussian_that_is_left_does_not_hang_on_rounding() -> None:

@@ -23,7 +23,7 @@ from progdf.errors import ProgdfError
 from progdf.io.atomic import atomic_write
 from progdf.io.images import read_picture, to_picture, write_image
 from progdf.io.json_values import decode_json
-from trainer.store.picture_list import add_pictures
+from trainer.store.run_folder import add_pictures
 
 Recipe = Mapping[str, str | int | float | None]
 """All that a painted picture depends on besides the picture that it is painted from."""

@@ -46,30 +46,21 @@ _FLOW = {
 
 @dataclass(frozen=True)
 class Adapter:
-    """How one pipeline is asked.
+    """How one pipeline is asked."""
 
-    Args:
-        model: the id of its weights on the Hugging Face hub
-        words: our word → its keyword, of steps, guidance (how closely the instruction is followed),
-            image_guidance (how closely the picture is), width, height, area
-        steps, guidance, image_guidance: the values it was made for
-        size: longer side in pixels at which it was made to paint
-        dtype: of its weights on a CPU
-        always: further arguments of a call
-        loading: further arguments of its from_pretrained
-        needs: packages that it needs besides the extra's
-    """
-
-    model: str
+    model: str  # the id of its weights on the Hugging Face hub
+    # our word → its keyword, of steps, guidance (how closely the instruction is followed), image_guidance
+    # (how closely the picture is), width, height, area
     words: Mapping[str, str]
+    # steps, guidance, image_guidance: the values it was made for
     steps: int
     guidance: float
-    size: int
-    dtype: torch.dtype
+    size: int  # longer side in pixels at which it was made to paint
+    dtype: torch.dtype  # of its weights on a CPU
     image_guidance: float | None = None
-    always: Mapping[str, object] = field(default_factory=dict)
-    loading: Mapping[str, object] = field(default_factory=dict)
-    needs: tuple[str, ...] = ()
+    always: Mapping[str, object] = field(default_factory=dict)  # further arguments of a call
+    loading: Mapping[str, object] = field(default_factory=dict)  # further arguments of its from_pretrained
+    needs: tuple[str, ...] = ()  # packages that it needs besides the extra's
 
     def arguments(
         self, prompt: str, picture: Image.Image, steps: int, guidance: float, image_guidance: float | None
@@ -155,21 +146,14 @@ class _Request:
 
 @dataclass(frozen=True)
 class InstructEditor:
-    """Edits pictures as a sentence says.
+    """Edits pictures as a sentence says."""
 
-    Args:
-        paint: the whole picture edited, under a guidance. [H,W,3], guidance -> [H,W,3]
-        guidance: of the finished edit
-        recipe: what a picture depends on besides guidance
-        kept: where pictures are kept
-        stages: (1,), or empty where graded
-    """
-
+    # the whole picture edited, under a guidance. [H,W,3], guidance -> [H,W,3]
     paint: Callable[[Tensor, float], Tensor]
-    guidance: float
-    recipe: Recipe
-    kept: KeptPictures
-    stages: tuple[float, ...] = (1.0,)
+    guidance: float  # of the finished edit
+    recipe: Recipe  # what a picture depends on besides guidance
+    kept: KeptPictures  # where pictures are kept
+    stages: tuple[float, ...] = (1.0,)  # (1,), or empty where graded
     kind: EditKind = "style"
     confined: bool = False
 

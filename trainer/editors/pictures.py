@@ -48,17 +48,11 @@ _SKEWED = 0.02  # by which a picture may differ in its proportions from its came
 
 @dataclass(frozen=True)
 class PicturesEditor:
-    """Reads the changed pictures; see the module's head.
+    """Reads the changed pictures; see the module's head."""
 
-    Args:
-        scene: the original
-        files: name of the view → strength → picture
-        stages: the strengths, ascending
-    """
-
-    scene: Gaussians
-    files: Mapping[str, Mapping[float, Path]]
-    stages: tuple[float, ...]
+    scene: Gaussians  # the original
+    files: Mapping[str, Mapping[float, Path]]  # name of the view → strength → picture
+    stages: tuple[float, ...]  # the strengths, ascending
     kind: EditKind = "color"
     confined: bool = False
 
@@ -285,21 +279,15 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 
 @dataclass(frozen=True)
 class FolderEditor:
-    """Reads edited views from one folder per strength.
+    """Reads edited views from one folder per strength."""
 
-    Args:
-        folders: strength → folder
-        stages: the strengths, ascending
-        bent: the pictures were taken through the views' lenses and are to be straightened
-        originals: where the unedited photographs lie, if the views are to be changed as these were; else the
-            pictures are taken as they are
-    """
-
-    folders: dict[float, Path]
-    stages: tuple[float, ...]
+    folders: dict[float, Path]  # strength → folder
+    stages: tuple[float, ...]  # the strengths, ascending
     kind: EditKind = "style"
     confined: bool = False
-    bent: bool = False
+    bent: bool = False  # the pictures were taken through the views' lenses and are to be straightened
+    # where the unedited photographs lie, if the views are to be changed as these were; else the pictures are
+    # taken as they are
     originals: Path | None = None
 
     @property

@@ -44,23 +44,14 @@ class ColorEditor:
 
 @dataclass(frozen=True)
 class StripesEditor:
-    """A pattern painted on the Gaussians themselves and rendered: the same stripes from everywhere.
+    """A pattern painted on the Gaussians themselves and rendered: the same stripes from everywhere."""
 
-    Args:
-        scene: the original
-        members: rows of the region. [M] int64
-        pattern: how much of each member is stripe, 0..1. [M]
-        target: color of the stripes, sRGB 0..1. [3]
-        typical: color of the region, sRGB 0..1. [3]
-        path: see `bend_of`
-    """
-
-    scene: Gaussians
-    members: Tensor
-    pattern: Tensor
-    target: Tensor
-    typical: Tensor
-    path: ColorPath = "bowed"
+    scene: Gaussians  # the original
+    members: Tensor  # rows of the region. [M] int64
+    pattern: Tensor  # how much of each member is stripe, 0..1. [M]
+    target: Tensor  # color of the stripes, sRGB 0..1. [3]
+    typical: Tensor  # color of the region, sRGB 0..1. [3]
+    path: ColorPath = "bowed"  # see `bend_of`
     kind: EditKind = "color"
     stages: tuple[float, ...] = ()
     confined: bool = True

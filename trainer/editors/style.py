@@ -38,19 +38,13 @@ _LEAST = 32  # the network's least side
 
 @dataclass(frozen=True)
 class StyleEditor:
-    """Paints views in one style.
+    """Paints views in one style."""
 
-    Args:
-        paint: the network: a picture in, the finished painting of it out. [h,w,3] -> [h,w,3]
-        recipe: what the painting depends on
-        kept: where paintings are kept
-        whole: whether the network looks at the whole view, else at the region's box
-    """
-
+    # the network: a picture in, the finished painting of it out. [h,w,3] -> [h,w,3]
     paint: Callable[[Tensor], Tensor]
-    recipe: Recipe
-    kept: KeptPictures
-    whole: bool = False
+    recipe: Recipe  # what the painting depends on
+    kept: KeptPictures  # where paintings are kept
+    whole: bool = False  # whether the network looks at the whole view, else at the region's box
     kind: EditKind = "style"
     confined: bool = True
     stages: tuple[float, ...] = ()

@@ -32,35 +32,26 @@ _SHOWS = 0.05  # a pixel shows the region where the members' weight is above thi
 
 @dataclass(frozen=True)
 class WarpedPair:
-    """One held-out view warped onto another.
+    """One held-out view warped onto another."""
 
-    Args:
-        source, target: the views' names
-        shared: share of the target's counted pixels that the source sees too, 0..1
-        pictures: whose -> target's box, and the source warped onto it where both see. [h,w,3] each
-        both: the pixels that are compared. [h,w] bool
-        depth: of the edited scene in the target's box, world units; 0 where it is not opaque. [h,w]
-    """
-
+    # source, target: the views' names
     source: str
     target: str
-    shared: float
+    shared: float  # share of the target's counted pixels that the source sees too, 0..1
+    # whose -> target's box, and the source warped onto it where both see. [h,w,3] each
     pictures: dict[str, tuple[Tensor, Tensor]]
-    both: Tensor
-    depth: Tensor
+    both: Tensor  # the pixels that are compared. [h,w] bool
+    depth: Tensor  # of the edited scene in the target's box, world units; 0 where it is not opaque. [h,w]
 
 
 @dataclass(frozen=True)
 class Consistency:
-    """How alike views of the same thing are.
+    """How alike views of the same thing are."""
 
-    Args:
-        lpips, psnr: whose -> mean over the pairs, LPIPS in the targets' boxes, PSNR over what both see, dB
-        pairs: what was compared; none where no two held-out views see enough of the same
-    """
-
+    # lpips, psnr: whose -> mean over the pairs, LPIPS in the targets' boxes, PSNR over what both see, dB
     lpips: dict[str, float]
     psnr: dict[str, float]
+    # what was compared; none where no two held-out views see enough of the same
     pairs: tuple[WarpedPair, ...]
 
 

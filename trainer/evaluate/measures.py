@@ -21,40 +21,25 @@ from .opened import FADE, KEYFRAMES, SLIDER, OpenedRun
 
 @dataclass(frozen=True)
 class Row:
-    """One line of the table.
+    """One line of the table."""
 
-    Args:
-        name: in evaluation.json
-        text: in the table, with the unit
-        cells: by column: figures, None where one is not defined
-        digits: behind the point
-        missing: why nothing was measured, "" where it was
-    """
-
-    name: str
-    text: str
-    cells: Mapping[str, float | None]
-    digits: int = 3
-    missing: str = ""
+    name: str  # in evaluation.json
+    text: str  # in the table, with the unit
+    cells: Mapping[str, float | None]  # by column: figures, None where one is not defined
+    digits: int = 3  # behind the point
+    missing: str = ""  # why nothing was measured, "" where it was
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What was measured.
+    """What was measured."""
 
-    Args:
-        rows: the table
-        curves: against the editor's own pictures at the slider values that it was asked for, by what is shown
-        paths: the slider in equal steps, by what is shown
-        consistency: between held-out views
-        perceptual: name of the perceptual distance
-    """
-
-    rows: tuple[Row, ...]
+    rows: tuple[Row, ...]  # the table
+    # against the editor's own pictures at the slider values that it was asked for, by what is shown
     curves: Mapping[str, ErrorCurve]
-    paths: Mapping[str, SliderPath]
-    consistency: Consistency
-    perceptual: str
+    paths: Mapping[str, SliderPath]  # the slider in equal steps, by what is shown
+    consistency: Consistency  # between held-out views
+    perceptual: str  # name of the perceptual distance
 
 
 def evaluate_run(opened: OpenedRun, perceptual: Perceptual, texts: TextOptions) -> Evaluation:
@@ -170,19 +155,12 @@ def _scaled(values: Mapping[str, float], factor: float) -> dict[str, float | Non
 
 @dataclass(frozen=True)
 class SliderPath:
-    """A slider in 20 equal steps.
+    """A slider in 20 equal steps."""
 
-    Args:
-        evenness: smallest over largest visible change of a step, as report.json's `uniformity`, 0..1
-        monotone: share of the steps that lead away from the original, by visible change, 0..1
-        steps: LPIPS between neighboring slider values. [20]
-        from_original: LPIPS from slider value 0, at the 21 values
-    """
-
-    evenness: float
-    monotone: float
-    steps: tuple[float, ...]
-    from_original: tuple[float, ...]
+    evenness: float  # smallest over largest visible change of a step, as report.json's `uniformity`, 0..1
+    monotone: float  # share of the steps that lead away from the original, by visible change, 0..1
+    steps: tuple[float, ...]  # LPIPS between neighboring slider values. [20]
+    from_original: tuple[float, ...]  # LPIPS from slider value 0, at the 21 values
 
     @property
     def ends(self) -> float:

@@ -30,25 +30,15 @@ even as ours; the pictures of both ends, blended in sRGB."""
 
 @dataclass(frozen=True)
 class OpenedRun:
-    """What is measured.
+    """What is measured."""
 
-    Args:
-        run: see `FinishedRun`
-        report: its report.json
-        setup: its views; the boxes of the training views hold what the edit changes
-        evaluator: its judging views, beside what the editor made of them
-        gdf: the edit as it is shipped
-        trajectory: what was recorded, on the shipped slider
-        keyframes: the end alone, see `KEYFRAMES`
-    """
-
-    run: FinishedRun
-    report: Mapping[str, Any]
-    setup: TrainingSetup
-    evaluator: Evaluator
-    gdf: Gdf
-    trajectory: Trajectory
-    keyframes: BakedField
+    run: FinishedRun  # see `FinishedRun`
+    report: Mapping[str, Any]  # its report.json
+    setup: TrainingSetup  # its views; the boxes of the training views hold what the edit changes
+    evaluator: Evaluator  # its judging views, beside what the editor made of them
+    gdf: Gdf  # the edit as it is shipped
+    trajectory: Trajectory  # what was recorded, on the shipped slider
+    keyframes: BakedField  # the end alone, see `KEYFRAMES`
 
     @property
     def fields(self) -> dict[str, BakedField]:

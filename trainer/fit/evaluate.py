@@ -23,23 +23,14 @@ from trainer.views.view import View, crop
 
 @dataclass(frozen=True)
 class Evaluator:
-    """Held-out views, ready to be compared.
+    """Held-out views, ready to be compared."""
 
-    Args:
-        original: raw member rows, packed. [M,C]
-        crops: the views' boxes with the scene around the region
-        pixels: which pixels count. [h,w] bool each
-        edited: strength → the editor's pictures of the boxes
-        names: the views' names
-        looked: called at every look at all views, for a progress bar
-    """
-
-    original: Tensor
-    crops: Sequence[CropScene]
-    pixels: Sequence[Tensor]
-    edited: Mapping[float, Sequence[Tensor]]
-    names: Sequence[str]
-    looked: Callable[[], None] | None = None
+    original: Tensor  # raw member rows, packed. [M,C]
+    crops: Sequence[CropScene]  # the views' boxes with the scene around the region
+    pixels: Sequence[Tensor]  # which pixels count. [h,w] bool each
+    edited: Mapping[float, Sequence[Tensor]]  # strength → the editor's pictures of the boxes
+    names: Sequence[str]  # the views' names
+    looked: Callable[[], None] | None = None  # called at every look at all views, for a progress bar
 
     def pictures(self, offsets: Tensor) -> list[Tensor]:
         """Every view with these offsets. [M,C] -> [h,w,3] each"""

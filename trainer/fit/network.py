@@ -15,13 +15,13 @@ from torch import Tensor
 
 from progdf.errors import ProgdfError
 from progdf.field import BakedField, NeuralSettings, bake_network
+from progdf.field.baked import interpolate_at
 from progdf.field.choose import FieldEvaluator, Render, rendered_importance
 from progdf.field.neural import NeuralShape
 from progdf.field.neural_fit import EFFORT, NeuralFit, PictureLoss, train_network
 from progdf.field.separable import moving_attributes
 from progdf.field.trajectory import Trajectory
 from progdf.gaussians import BASE_CHANNELS, attribute_slices, pack
-from progdf.interpolation import interpolate_at
 from trainer.optimize.losses import Perceptual, l1, sharpness
 from trainer.optimize.pgs import TargetStage
 from trainer.optimize.retime import resolve_slider
@@ -157,15 +157,10 @@ PICTURE_STEPS = 1500
 
 @dataclass(frozen=True)
 class NetworkFit:
-    """A neural field as a run ships it.
+    """A neural field as a run ships it."""
 
-    Args:
-        field: baked, with the network as its origin
-        unbaked: PSNR of the network's own answers over the slider, its ends not pinned, dB
-    """
-
-    field: BakedField
-    unbaked: tuple[float, ...]
+    field: BakedField  # baked, with the network as its origin
+    unbaked: tuple[float, ...]  # PSNR of the network's own answers over the slider, its ends not pinned, dB
 
     def figures(self) -> dict[str, Any]:
         """For report.json."""
@@ -306,18 +301,12 @@ def _rendered_loss(setup: TrainingSetup, trajectory: Trajectory, perceptual: Per
 class RenderedLoss:
     """L_GDF = L_pred + L_render: L1 + LPIPS between the renders of Θ0 + GDF(s) and of the snapshot at s, and
     −∇²R of the former. A `PictureLoss`.
-
-    Args:
-        crops: the training views
-        rows: raw values of the members before the edit, packed. [M,C]
-        moving: attributes that differ from these
-        perceptual: LPIPS, or what stands in for it
     """
 
-    crops: Sequence[CropScene]
-    rows: Tensor
-    moving: Collection[str]
-    perceptual: Perceptual
+    crops: Sequence[CropScene]  # the training views
+    rows: Tensor  # raw values of the members before the edit, packed. [M,C]
+    moving: Collection[str]  # attributes that differ from these
+    perceptual: Perceptual  # LPIPS, or what stands in for it
 
     @property
     def views(self) -> int:

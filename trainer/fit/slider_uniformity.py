@@ -18,9 +18,8 @@ import torch
 from torch import Tensor
 
 from progdf.field import BakedField
-from progdf.field.baked import SliderRemap, identity_remap, remap_slider
+from progdf.field.baked import SliderRemap, identity_remap, interpolate, interpolate_at, remap_slider
 from progdf.gaussians import BASE_CHANNELS, pack
-from progdf.interpolation import interpolate, interpolate_at
 from trainer.editors import COSTLY_STRENGTHS, check_editor
 from trainer.editors.base import ImageEditor
 from trainer.setup import TrainingSetup, probe_views

@@ -45,19 +45,12 @@ _B = TypeVar("_B")
 
 @dataclass(frozen=True)
 class ColorView:
-    """One training view's box as a function of the members' colors.
+    """One training view's box as a function of the members' colors."""
 
-    Args:
-        map: what each member weighs in each pixel
-        others: what all but the members show, unclamped. [h,w,3]
-        basis: weight of each trained band in each member's color from here. [M,B]
-        original: the members' unclamped colors as they were. [M,3]
-    """
-
-    map: ColorMap
-    others: Tensor
-    basis: Tensor
-    original: Tensor
+    map: ColorMap  # what each member weighs in each pixel
+    others: Tensor  # what all but the members show, unclamped. [h,w,3]
+    basis: Tensor  # weight of each trained band in each member's color from here. [M,B]
+    original: Tensor  # the members' unclamped colors as they were. [M,3]
 
     def colors(self, offsets: Tensor) -> Tensor:
         """Unclamped. [M,B,3] -> [M,3]"""
@@ -95,17 +88,11 @@ def color_view(crop: CropScene, original: Tensor, bands: int) -> ColorView:
 
 @dataclass(frozen=True)
 class _Pull:
-    """What a view says at some offsets.
+    """What a view says at some offsets."""
 
-    Args:
-        gradient: of half the squared error, in the members' colors. [M,3]
-        squared: sum of squared differences from the target
-        left: mean absolute difference from the finished edit
-    """
-
-    gradient: Tensor
-    squared: float
-    left: float
+    gradient: Tensor  # of half the squared error, in the members' colors. [M,3]
+    squared: float  # sum of squared differences from the target
+    left: float  # mean absolute difference from the finished edit
 
 
 def _pull_into_range(view: ColorView, offsets: Tensor, target: Tensor, finished: Tensor) -> _Pull:
@@ -126,20 +113,14 @@ def leads_back(value: Tensor, low: float, high: float, slope: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Solver:
-    """All training views of a run.
+    """All training views of a run."""
 
-    Args:
-        views: see `ColorView`
-        weights: bound of each member's and band's curvature: Σ w·m over the views' pixels, m the members'
-            weight there, times the basis squared. [M,B,1]
-        bands: the members' own higher bands as far as they are trained. [M,B-1,3]
-        dc: the members' own DC. [M,3]
-    """
-
-    views: Sequence[ColorView]
+    views: Sequence[ColorView]  # see `ColorView`
+    # bound of each member's and band's curvature: Σ w·m over the views' pixels, m the members' weight there,
+    # times the basis squared. [M,B,1]
     weights: Tensor
-    bands: Tensor
-    dc: Tensor
+    bands: Tensor  # the members' own higher bands as far as they are trained. [M,B-1,3]
+    dc: Tensor  # the members' own DC. [M,3]
 
     def error(self, offsets: Tensor, targets: Sequence[Tensor]) -> float:
         """Mean squared difference over all pixels and channels of all boxes. [M,B,3]"""

@@ -47,16 +47,11 @@ _BETTER = 0.9  # share of what parts leave that control points may leave: they c
 
 @dataclass(frozen=True)
 class Groups:
-    """The parts of a region and where each is at the end of every stage.
+    """The parts of a region and where each is at the end of every stage."""
 
-    Args:
-        parts: the region taken apart
-        motions: of the parts, one per stage
-        warps: of control points, one per stage; none where parts moved as wholes
-    """
-
-    parts: Parts
-    motions: tuple[Motion, ...]
+    parts: Parts  # the region taken apart
+    motions: tuple[Motion, ...]  # of the parts, one per stage
+    # of control points, one per stage; none where parts moved as wholes
     warps: tuple[WarpPlacement, ...] = ()
 
     @property

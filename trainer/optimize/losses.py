@@ -213,27 +213,16 @@ def describe_loss(options: OptimizeOptions, perceptual: str) -> str:
 
 @dataclass(frozen=True)
 class Moment:
-    """What one optimizer step looks at.
+    """What one optimizer step looks at."""
 
-    Args:
-        image: the render, differentiable. [h,w,3]
-        target: what it should be. [h,w,3]
-        view: index of the training view
-        step: steps done before this one, over all stages
-        local: steps done before this one in its stage
-        arrived: the target is the stage's own picture, no longer on the way to it
-        moved: offsets of the members, differentiable. [M,C]
-        previous: the offsets one step earlier, or the same tensor at the first step. [M,C]
-    """
-
-    image: Tensor
-    target: Tensor
-    view: int
-    step: int
-    local: int
-    arrived: bool
-    moved: Tensor
-    previous: Tensor
+    image: Tensor  # the render, differentiable. [h,w,3]
+    target: Tensor  # what it should be. [h,w,3]
+    view: int  # index of the training view
+    step: int  # steps done before this one, over all stages
+    local: int  # steps done before this one in its stage
+    arrived: bool  # the target is the stage's own picture, no longer on the way to it
+    moved: Tensor  # offsets of the members, differentiable. [M,C]
+    previous: Tensor  # the offsets one step earlier, or the same tensor at the first step. [M,C]
 
 
 class Objective:

@@ -251,42 +251,28 @@ def pgs_settings(
 
 @dataclass(frozen=True)
 class TargetStage:
-    """One strength to optimize towards.
+    """One strength to optimize towards."""
 
-    Args:
-        strength: the slider value it belongs to, 0..1
-        targets: the edited box of each training view. [h,w,3] each
-        steps: how many steps
-        place: turns the members' own offsets, which are optimized, into those that are seen and recorded: a
-            part that moves as a whole takes them along; differentiable. [M,C] -> [M,C]
-        length: factor to the learning rates; None: by the way that the pictures have to go, see
-            `PgsSettings.reach`
-    """
-
-    strength: float
-    targets: Sequence[Tensor]
-    steps: int
+    strength: float  # the slider value it belongs to, 0..1
+    targets: Sequence[Tensor]  # the edited box of each training view. [h,w,3] each
+    steps: int  # how many steps
+    # turns the members' own offsets, which are optimized, into those that are seen and recorded: a part that
+    # moves as a whole takes them along; differentiable. [M,C] -> [M,C]
     place: Callable[[Tensor], Tensor] = lambda offsets: offsets
+    # factor to the learning rates; None: by the way that the pictures have to go, see `PgsSettings.reach`
     length: float | None = None
 
 
 @dataclass(frozen=True)
 class ParameterSnapshot:
-    """One recording: the running mean of the parameters, as offsets from the original.
+    """One recording: the running mean of the parameters, as offsets from the original."""
 
-    Args:
-        step: steps done, over all stages
-        stage: index of the stage
-        ends_stage: whether it is the last of its stage
-        offsets: raw-space offsets of the members as placed. [M,C] float32
-        means: since the last recording: each loss term, weighted, over the steps that paid for it, and
-            "left", the L1 distance from the finished edit
-    """
-
-    step: int
-    stage: int
-    ends_stage: bool
-    offsets: Tensor
+    step: int  # steps done, over all stages
+    stage: int  # index of the stage
+    ends_stage: bool  # whether it is the last of its stage
+    offsets: Tensor  # raw-space offsets of the members as placed. [M,C] float32
+    # since the last recording: each loss term, weighted, over the steps that paid for it, and "left", the L1
+    # distance from the finished edit
     means: Mapping[str, float]
 
 

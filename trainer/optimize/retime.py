@@ -13,8 +13,8 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
+from progdf.field.baked import interpolate, interpolate_at
 from progdf.field.trajectory import Trajectory
-from progdf.interpolation import interpolate, interpolate_at
 from trainer.options import Slider
 
 _LEAST_GAP = 1e-4  # slider values of neighboring recordings stay apart by this

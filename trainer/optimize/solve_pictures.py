@@ -48,23 +48,16 @@ _COVERED, _TOUCHED = 0.8, 0.3
 
 @dataclass(frozen=True)
 class Paint:
-    """An edit of colors as one function.
+    """An edit of colors as one function."""
 
-    Args:
-        full: change of each member where the amount is 1. [M,3]
-        amounts: 0 untouched .. 1 all of it. [M]
-        slope: derivative of the new color by the old one, less the old one's own, rows in, columns out. [3,3]
-        trust: share of the change's energy that this explains, 0..1
-        whole: the amount is 1 everywhere
-        general: what a function of color without amounts makes of each member, where nearly all that shows
-            has changed; else None. [M,3]
-    """
-
-    full: Tensor
-    amounts: Tensor
+    full: Tensor  # change of each member where the amount is 1. [M,3]
+    amounts: Tensor  # 0 untouched .. 1 all of it. [M]
+    # derivative of the new color by the old one, less the old one's own, rows in, columns out. [3,3]
     slope: Tensor
-    trust: float
-    whole: bool
+    trust: float  # share of the change's energy that this explains, 0..1
+    whole: bool  # the amount is 1 everywhere
+    # what a function of color without amounts makes of each member, where nearly all that shows has changed;
+    # else None. [M,3]
     general: Tensor | None
 
 
@@ -137,23 +130,14 @@ _FILLED = 300  # most steps of these from member to member, where no picture loo
 
 @dataclass(frozen=True)
 class PictureSolver:
-    """The pictures and the ties, ready to be solved.
+    """The pictures and the ties, ready to be solved."""
 
-    Args:
-        views: of the pictures; see `ColorView`
-        shown: what the pictures say of each member, Σ w² of all pixels; 0 behind others. [M] float64
-        ties: graph Laplacian, as strong as it is to be
-        ridge: see `_RIDGE`
-        colors: the members' own, of DC. [M,3] float64
-        bands: their own higher bands as far as they follow. [M,B-1,3] float64
-    """
-
-    views: Sequence[ColorView]
-    shown: Tensor
-    ties: csr_matrix
-    ridge: float
-    colors: Tensor
-    bands: Tensor
+    views: Sequence[ColorView]  # of the pictures; see `ColorView`
+    shown: Tensor  # what the pictures say of each member, Σ w² of all pixels; 0 behind others. [M] float64
+    ties: csr_matrix  # graph Laplacian, as strong as it is to be
+    ridge: float  # see `_RIDGE`
+    colors: Tensor  # the members' own, of DC. [M,3] float64
+    bands: Tensor  # their own higher bands as far as they follow. [M,B-1,3] float64
 
     @property
     def unseen(self) -> int:

@@ -35,17 +35,11 @@ _SOURCES = 6
 
 @dataclass(frozen=True)
 class UnseenMembers:
-    """Who follows whom, as places among the members.
+    """Who follows whom, as places among the members."""
 
-    Args:
-        places: the unseen members. [U] int64
-        sources: seen members that each of them follows. [U,k] int64
-        weights: how much it follows each, adding up to 1. [U,k]
-    """
-
-    places: Tensor
-    sources: Tensor
-    weights: Tensor
+    places: Tensor  # the unseen members. [U] int64
+    sources: Tensor  # seen members that each of them follows. [U,k] int64
+    weights: Tensor  # how much it follows each, adding up to 1. [U,k]
 
     def propagate(self, offsets: Tensor) -> Tensor:
         """The offsets with the unseen members' colors moved as their sources' are. [M,C] -> [M,C]"""

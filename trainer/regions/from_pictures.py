@@ -8,14 +8,17 @@ from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
+import numpy as np
 import torch
+from PIL import Image
 from rich.progress import track
 from torch import Tensor
 
-from progdf.camera import Camera
+from progdf.camera import Camera, undistort
 from progdf.errors import ProgdfError
 from progdf.gaussians import ZERO, Gaussians, Origin
 from progdf.io.cameras import load_cameras, save_cameras
+from progdf.io.images import flatten_onto, open_picture
 from progdf.io.picture_camera import edits_in_picture
 from progdf.region import Region
 from progdf.scene.bounds import is_surrounding
@@ -23,9 +26,8 @@ from progdf.scene.orbit_rig import orbit_rig
 from progdf.scene.regions import Check, Kind
 from progdf.scene.up_axis import find_up
 from trainer.editors.cache import KeptPictures, Recipe
-from trainer.editors.pictures import picture_paths, rendered_cameras
+from trainer.editors.pictures import SUFFIXES, picture_paths, rendered_cameras
 from trainer.options import VIEWS, RegionOptions, ViewOptions
-from trainer.regions.segment import SEGMENTER_CHECKS, SEGMENTERS, Segmenter
 from trainer.views.view import (
     BACKGROUND,
     INSIDE,
@@ -38,7 +40,46 @@ from trainer.views.view import (
 
 from .changed import LIFTED_AT, changed_region
 from .lift import lift_masks
-from .masks import read_masks
+from .segment import SEGMENTER_CHECKS, SEGMENTERS, Segmenter
+
+
+def read_masks(folder: Path, cameras: Sequence[Camera], bent: bool = False) -> list[Tensor | None]:
+    """The mask of every camera, scaled to its size, [H,W] float32 0..1 each; None where there is none.
+
+    Args:
+        folder: see the module's head
+        cameras: with the names of their views
+        bent: the masks were drawn over photographs, which the cameras' lenses have bent: straighten them
+
+    Raises:
+        ProgdfError: no such folder, not one mask in it, or one that is broken or of other proportions.
+    """
+    if not folder.is_dir():
+        raise ProgdfError(f"{folder} is not a folder; give the one that holds a mask for each view")
+    files = [_file(folder, camera) for camera in cameras]
+    if not any(files):
+        raise ProgdfError(
+            f"{folder} has no mask for any of the {len(cameras)} cameras; "
+            f"name each as its view, as {cameras[0].name}.png"
+        )
+    found = zip(files, cameras, strict=True)
+    return [None if file is None else _mask(file, camera, bent) for file, camera in found]
+
+
+def _file(folder: Path, camera: Camera) -> Path | None:
+    paths = (folder / f"{camera.name}{suffix}" for suffix in SUFFIXES)
+    return next((path for path in paths if path.is_file()), None)
+
+
+def _mask(path: Path, camera: Camera, bent: bool) -> Tensor:
+    size = (camera.width, camera.height)
+    gray = flatten_onto(open_picture(path, size, calibrated=bent), "black").convert("L")
+    if gray.size != size:
+        gray = gray.resize(size, Image.Resampling.BOX)
+    mask = torch.from_numpy(np.asarray(gray, dtype=np.float32) / 255.0)
+    if bent and camera.lens:
+        return undistort(mask[..., None].expand(-1, -1, 3), camera.K, camera.lens)[0][..., 0]
+    return mask
 
 
 @dataclass(frozen=True)

@@ -30,27 +30,17 @@ _HALF_HIDDEN, _DOUBTFUL = 0.3, (0.3, 0.7)
 
 @dataclass(frozen=True)
 class Evidence:
-    """What the views say of each Gaussian; w = αT, sums run over the pixels it contributes to, and views.
+    """What the views say of each Gaussian; w = αT, sums run over the pixels it contributes to, and views."""
 
-    Args:
-        inside: Σ w·m, its contribution inside the masks. [N]
-        pixels_inside: Σ m. [N]
-        weight: Σ w, its contribution in all. [N]
-        pixels: n. [N]
-        clearness: mean transmittance in front of it in the view that shows it best, 0 hidden .. 1 bare. [N]
-        views: how many views show it: clearer than `HIDDEN`. [N]
-        views_inside: in how many of these more than half of its contribution falls inside the mask. [N]
-        opacities: σ. [N]
-    """
-
-    inside: Tensor
-    pixels_inside: Tensor
-    weight: Tensor
-    pixels: Tensor
+    inside: Tensor  # Σ w·m, its contribution inside the masks. [N]
+    pixels_inside: Tensor  # Σ m. [N]
+    weight: Tensor  # Σ w, its contribution in all. [N]
+    pixels: Tensor  # n. [N]
+    # mean transmittance in front of it in the view that shows it best, 0 hidden .. 1 bare. [N]
     clearness: Tensor
-    views: Tensor
-    views_inside: Tensor
-    opacities: Tensor
+    views: Tensor  # how many views show it: clearer than `HIDDEN`. [N]
+    views_inside: Tensor  # in how many of these more than half of its contribution falls inside the mask. [N]
+    opacities: Tensor  # σ. [N]
 
 
 def bare_weight(opacities: Tensor) -> Tensor:

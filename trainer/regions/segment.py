@@ -30,19 +30,15 @@ class Segmenter(Protocol):
 
 @dataclass(frozen=True)
 class GroundedSam:
-    """Both networks with their processors; make it with `grounded_sam`.
+    """Both networks with their processors; make it with `grounded_sam`."""
 
-    Args:
-        detector, detector_processor: `GroundingDinoForObjectDetection`, `GroundingDinoProcessor`
-        sam_model, sam_processor: `SamModel`, `SamProcessor`
-        box_threshold: confidence of a find, 0..1
-    """
-
+    # detector, detector_processor: `GroundingDinoForObjectDetection`, `GroundingDinoProcessor`
     detector: Any
     detector_processor: Any
+    # sam_model, sam_processor: `SamModel`, `SamProcessor`
     sam_model: Any
     sam_processor: Any
-    box_threshold: float
+    box_threshold: float  # confidence of a find, 0..1
 
     def __call__(self, image: Tensor, prompt: str) -> Tensor:
         """See `Segmenter`: the union of the outlines of all that is found."""

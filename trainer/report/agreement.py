@@ -38,15 +38,10 @@ DAMPING = 1e-3  # of the first round's curvature: members that hardly show keep 
 
 @dataclass(frozen=True)
 class Agreement:
-    """How well one scene can show all the edited views.
+    """How well one scene can show all the edited views."""
 
-    Args:
-        psnr: of the best colors on held-out views, over the pixels that show the region or change, dB
-        unexplained: what those colors leave of the change there, as a share of its energy, 0 is best
-    """
-
-    psnr: float
-    unexplained: float
+    psnr: float  # of the best colors on held-out views, over the pixels that show the region or change, dB
+    unexplained: float  # what those colors leave of the change there, as a share of its energy, 0 is best
 
     @property
     def agree(self) -> bool:

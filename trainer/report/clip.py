@@ -35,19 +35,12 @@ _MEAN, _SPREAD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0
 
 @dataclass(frozen=True)
 class Clip:
-    """CLIP's two networks; make it with `load_clip`.
+    """CLIP's two networks; make it with `load_clip`."""
 
-    Args:
-        network: a `transformers.CLIPModel`
-        tokenizer: its tokenizer
-        size: side of the pictures it takes, pixels
-        name: as report.json names it
-    """
-
-    network: Any
-    tokenizer: Any
-    size: int
-    name: str
+    network: Any  # a `transformers.CLIPModel`
+    tokenizer: Any  # its tokenizer
+    size: int  # side of the pictures it takes, pixels
+    name: str  # as report.json names it
 
     def pictures(self, images: Sequence[Tensor]) -> Tensor:
         """Features of pictures [H,W,3] of range 0..1, of unit length. [n,D]"""

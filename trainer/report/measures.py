@@ -32,18 +32,12 @@ from .clip import CLIP_MODEL, Clip, direction, load_clip, same_features
 
 @dataclass(frozen=True)
 class ErrorCurve:
-    """Errors of pictures along the slider, over all held-out views.
+    """Errors of pictures along the slider, over all held-out views."""
 
-    Args:
-        s: slider values, ascending
-        psnr: over the pixels that count, dB, at most 99
-        ssim: over the same, at most 1
-        lpips: of the views' boxes, ≥ 0 (or what stands in for LPIPS, see `Evaluator.perceptual`)
-    """
-
-    s: tuple[float, ...]
-    psnr: tuple[float, ...]
-    ssim: tuple[float, ...]
+    s: tuple[float, ...]  # slider values, ascending
+    psnr: tuple[float, ...]  # over the pixels that count, dB, at most 99
+    ssim: tuple[float, ...]  # over the same, at most 1
+    # of the views' boxes, ≥ 0 (or what stands in for LPIPS, see `Evaluator.perceptual`)
     lpips: tuple[float, ...]
 
 
@@ -130,19 +124,13 @@ CLIP_STRENGTHS = tuple(i / 10 for i in range(11))
 
 @dataclass(frozen=True)
 class Direction:
-    """CLIP directional similarity along the slider.
+    """CLIP directional similarity along the slider."""
 
-    Args:
-        s: slider values; none where nothing was measured
-        similarity: mean over held-out views, −1..1; None where it is undefined, as at 0
-        model: the CLIP model, "" where nothing was measured
-        reason: why nothing was measured, "" where it was
-    """
-
-    s: tuple[float, ...] = ()
+    s: tuple[float, ...] = ()  # slider values; none where nothing was measured
+    # mean over held-out views, −1..1; None where it is undefined, as at 0
     similarity: tuple[float | None, ...] = ()
-    model: str = ""
-    reason: str = ""
+    model: str = ""  # the CLIP model, "" where nothing was measured
+    reason: str = ""  # why nothing was measured, "" where it was
 
 
 @dataclass(frozen=True)
@@ -150,30 +138,20 @@ class Measured:
     """Everything about the fitted field that the report tells, measured on held-out views.
 
     What concerns the edit is measured on all of them, the field's errors on those that it was not chosen on.
-
-    Args:
-        fitted: the field and its baselines, on the trajectory's slider
-        shown: the field as it is shipped, on a slider of its own
-        remap: from the trajectory's slider to that
-        asked: slider value of what the editor was asked for, and the strength that it was asked at
-        slider: how the slider feels
-        at_recordings: worst PSNR of the field at the recordings themselves, dB
-        trajectory: "slider" and the compared baseline against the recorded trajectory
-        editor: the same against the editor's own pictures, at the strengths it was asked for
-        perceptual: name of the perceptual distance
-        clip: see `Direction`
     """
 
-    fitted: Fitted
-    shown: BakedField
-    remap: SliderRemap
+    fitted: Fitted  # the field and its baselines, on the trajectory's slider
+    shown: BakedField  # the field as it is shipped, on a slider of its own
+    remap: SliderRemap  # from the trajectory's slider to that
+    # slider value of what the editor was asked for, and the strength that it was asked at
     asked: Sequence[tuple[float, float]]
-    slider: SliderStatistics
-    at_recordings: float
-    trajectory: Mapping[str, ErrorCurve]
+    slider: SliderStatistics  # how the slider feels
+    at_recordings: float  # worst PSNR of the field at the recordings themselves, dB
+    trajectory: Mapping[str, ErrorCurve]  # "slider" and the compared baseline against the recorded trajectory
+    # the same against the editor's own pictures, at the strengths it was asked for
     editor: Mapping[str, ErrorCurve]
-    perceptual: str
-    clip: Direction
+    perceptual: str  # name of the perceptual distance
+    clip: Direction  # see `Direction`
 
 
 def measure(

@@ -27,26 +27,18 @@ Points = tuple[Sequence[float], Sequence[float]]
 
 @dataclass(frozen=True)
 class Plot:
-    """Curves over one axis.
+    """Curves over one axis."""
 
-    Args:
-        title: what is shown, with its unit
-        lines: name → points, in the order of the colors
-        across: name of the axis below, "" for none
-        scale: of the axis at the left; "log" needs values above 0, others are left out
-        form: "lines", or "bars" side by side from 0
-        low, high: what the axis at the left shows at least; None is as the values are
-        span: what the axis below shows at least
-    """
-
-    title: str
-    lines: Mapping[str, Points]
-    across: str = ""
+    title: str  # what is shown, with its unit
+    lines: Mapping[str, Points]  # name → points, in the order of the colors
+    across: str = ""  # name of the axis below, "" for none
+    # of the axis at the left; "log" needs values above 0, others are left out
     scale: Literal["linear", "log"] = "linear"
-    form: Literal["lines", "bars"] = "lines"
+    form: Literal["lines", "bars"] = "lines"  # "lines", or "bars" side by side from 0
+    # low, high: what the axis at the left shows at least; None is as the values are
     low: float | None = None
     high: float | None = None
-    span: tuple[float, float] | None = None
+    span: tuple[float, float] | None = None  # what the axis below shows at least
 
 
 def draw_plot(plot: Plot, width: int, height: int) -> Image.Image:

@@ -53,16 +53,13 @@ _GRID = (0.0, 1 / 3, 2 / 3, 1.0)
 
 @dataclass(frozen=True)
 class DemoEdit:
-    """One edit of the demo: what it is called, which parts it may change, how.
-
-    Args:
-        paint: makes a changed picture of the scene, of which the edit is then made: picture, its camera, how
-            much of each pixel named parts are -> picture; its parts are found
-    """
+    """One edit of the demo: what it is called, which parts it may change, how."""
 
     name: str
     parts: tuple[str, ...] = ()
     editor: str = ""
+    # makes a changed picture of the scene, of which the edit is then made: picture, its camera, how much of
+    # each pixel named parts are -> picture; its parts are found
     paint: Paint | None = None
 
 
@@ -77,24 +74,16 @@ class Effort:
 
 @dataclass(frozen=True)
 class Show:
-    """What the demo does with one scene.
+    """What the demo does with one scene."""
 
-    Args:
-        make: size and seed -> the scene
-        size: Gaussians if nobody says how many
-        view: which of the scene's cameras takes the pictures
-        inside: whether the edits are trained from the scene's own cameras, as one cannot see in from outside
-        draft: the effort of --quick
-        full: the effort otherwise
-        edits: two edits that share no Gaussian, one that meets one of them at least, and more
-    """
-
-    make: Callable[[int, int], DemoScene]
-    size: int
-    view: int
+    make: Callable[[int, int], DemoScene]  # size and seed -> the scene
+    size: int  # Gaussians if nobody says how many
+    view: int  # which of the scene's cameras takes the pictures
+    # whether the edits are trained from the scene's own cameras, as one cannot see in from outside
     inside: bool
-    draft: Effort
-    full: Effort
+    draft: Effort  # the effort of --quick
+    full: Effort  # the effort otherwise
+    # two edits that share no Gaussian, one that meets one of them at least, and more
     edits: tuple[DemoEdit, ...]
 
 

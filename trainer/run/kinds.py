@@ -43,15 +43,10 @@ _REPAINTED = 0.3  # share of the pixels beside the region that change where a to
 
 @dataclass(frozen=True)
 class Approach:
-    """A way to train.
+    """A way to train."""
 
-    Args:
-        kind: what moves
-        group_steps: of the stage in which connected parts move as wholes; 0 leaves it out
-    """
-
-    kind: EditKind
-    group_steps: int = 0
+    kind: EditKind  # what moves
+    group_steps: int = 0  # of the stage in which connected parts move as wholes; 0 leaves it out
 
     def __str__(self) -> str:
         return f"{self.kind} in parts" if self.group_steps else self.kind
@@ -65,17 +60,11 @@ class Approach:
 
 @dataclass(frozen=True)
 class Trial:
-    """What came of it.
+    """What came of it."""
 
-    Args:
-        steps: of each approach
-        psnrs: of each approach on the judging views, dB
-        unedited: the original's, dB
-    """
-
-    steps: int
-    psnrs: Mapping[Approach, float]
-    unedited: float
+    steps: int  # of each approach
+    psnrs: Mapping[Approach, float]  # of each approach on the judging views, dB
+    unedited: float  # the original's, dB
 
     @property
     def chosen(self) -> Approach:

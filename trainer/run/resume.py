@@ -36,17 +36,12 @@ REGION = "region"
 
 @dataclass(frozen=True)
 class ResumeDecision:
-    """What is to be done in a run folder.
+    """What is to be done in a run folder."""
 
-    Args:
-        does: "start" from nothing, "go on" from the saved state; "nothing", as the run is finished
-        threads: with how many; a run keeps to those it began with, as sums depend on them
-        notes: lines for the log
-    """
-
+    # "start" from nothing, "go on" from the saved state; "nothing", as the run is finished
     does: Literal["start", "go on", "nothing"]
-    threads: int
-    notes: tuple[str, ...] = ()
+    threads: int  # with how many; a run keeps to those it began with, as sums depend on them
+    notes: tuple[str, ...] = ()  # lines for the log
 
 
 def load_region(out: Path) -> Region | None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -12,27 +14,24 @@ from torch import Tensor
 from progdf.errors import ProgdfError
 from progdf.field.trajectory import Trajectory, load_trajectory, save_trajectory
 from progdf.formats.scene_file import load_scene
-from progdf.gaussians import BASE_CHANNELS, Gaussians
-from progdf.io.cameras import save_cameras
+from progdf.gaussians import BASE_CHANNELS, ZERO, Gaussians, pack
+from progdf.io.atomic import read_file
+from progdf.io.cameras import load_cameras, save_cameras
 from progdf.io.json_values import plain
 from progdf.region import Region
-from progdf.scene.regions import parse_region
-from trainer.editors import EXTERNAL, PER_VIEW, make_editor
-from trainer.editors.pictures import FolderEditor
-from trainer.fit.fit import drop_idle_attributes
+from progdf.scene.regions import check_region, parse_region
+from trainer.editors import EXTERNAL, PER_VIEW, RepaintingEditor, check_editor, check_new_editor, make_editor
+from trainer.editors.pictures import FolderEditor, picture_cameras
+from trainer.fit.fit import choose_path, drop_idle_attributes
 from trainer.fit.network import PART as NETWORK
-from trainer.fit.own_path import choose_path
 from trainer.fit.slider_uniformity import equalized_strengths
 from trainer.optimize.losses import Perceptual, describe_loss, perceptual_loss
 from trainer.optimize.retime import resolve_slider
 from trainer.optimize.unseen import unseen_members_of
-from trainer.options import EditKind, OptimizeOptions, TrainOptions
-from trainer.regions.from_pictures import region_kinds
+from trainer.options import EditKind, EditorOptions, OptimizeOptions, TrainOptions
+from trainer.regions.from_pictures import RegionRequest, region_checks, region_kinds
 from trainer.report.agreement import Agreement, measure_agreement
 from trainer.resolve import recorded_options, resolve, resolve_kind
-from trainer.run.kinds import Approach, choose_approach
-from trainer.run.record import RunRecord, read_record
-from trainer.run.threads import use_threads
 from trainer.setup import (
     Pictures,
     TrainingSetup,
@@ -44,24 +43,131 @@ from trainer.setup import (
     whole_views,
     widen_views,
 )
-from trainer.store.interrupts import interrupt_on_signals
 from trainer.store.progress import RunLog
 from trainer.store.run_folder import (
     RunFolder,
+    check_folder,
     lock_folder,
     open_run_folder,
     read_views,
     remove_stale_views,
     write_views,
 )
+from trainer.store.state import interrupt_on_signals
 from trainer.views.crops import only_recolors
-from trainer.views.view import BACKGROUND, render_view
+from trainer.views.view import BACKGROUND, crop, render_view
 
 from .finish import RunResult, end_rows, finish_run, load_evaluator, load_result
-from .preflight import check_command, region_request
-from .reedit import reedit
+from .kinds import Approach, choose_approach
+from .record import RunRecord, read_record
 from .resume import check_exists, decide_resume, explain_stop, load_region, picture_digests
+from .threads import use_threads
 from .training import optimize_members, retime_trajectory
+
+
+def check_command(options: TrainOptions) -> None:
+    """Look at everything that the command names, as far as it can be seen without the scene.
+
+    A run that goes on needs no longer what it began with: its region and its edited views are kept.
+
+    Args:
+        options: resolved
+
+    Raises:
+        ProgdfError: the folder is taken, the editor or the segmenter cannot run, or a file is not there.
+    """
+    check_editor(options.editor.editor)
+    folder, views = check_folder(options.out, options.edit), options.views
+    if not options.scene.is_dir():  # some formats are folders
+        read_file(options.scene, 0)
+    if views.cameras is not None and not options.resume:
+        load_cameras(views.cameras, ZERO)
+    if views.pictures:
+        cameras = [] if views.cameras is None else load_cameras(views.cameras, ZERO)
+        picture_cameras(views.pictures, cameras, ZERO)
+    if not options.resume or load_region(options.out) is None:
+        check_region(options.region.region, region_checks(region_request(options, quiet=True)))
+    if not folder.root.is_dir() or not any(folder.root.iterdir()):
+        check_new_editor(replace(options.editor, cache=folder.painted))
+
+
+def region_request(
+    options: TrainOptions, quiet: bool, say: Callable[[str], None] | None = None
+) -> RegionRequest:
+    """How the region is made of pictures; those that are segmented are kept in the run's folder.
+
+    Args:
+        options: resolved
+        quiet, say: see `RegionRequest`
+    """
+
+    def cache() -> Path:
+        # nothing is written into a folder that is no run of ours
+        return open_run_folder(options.out, options.edit).segmented
+
+    return RegionRequest(options.region, options.views, cache, quiet, say)
+
+
+class Reedit:
+    """New targets for the training views, every so many steps of a stage; see `pgs.Renewal`.
+
+    Args:
+        editor: paints
+        setup: scene, region and the training views with their final boxes
+        every: steps between two edits, counted over all stages
+        confined: put back what changes outside the region
+        log: of the run
+    """
+
+    def __init__(
+        self, editor: RepaintingEditor, setup: TrainingSetup, every: int, confined: bool, log: RunLog
+    ) -> None:
+        self._editor, self._setup, self._log = editor, setup, log
+        self._every, self._confined = every, confined
+        self._shown = 0  # the step whose pictures are the targets now; 0: none
+
+    def __call__(self, step: int, local: int, strength: float, offsets: Tensor) -> list[Tensor] | None:
+        """See `pgs.Renewal`. A run that goes on between two edits finds the last one's pictures on disk."""
+        due = step - step % self._every
+        if due <= step - local or due == self._shown:
+            return None
+        self._shown = due
+        setup, members = self._setup, self._setup.region.members
+        renders: list[Tensor | None] = [None] * len(setup.train)
+        if due == step:
+            rows = pack(setup.scene[members], with_shN=setup.scene.sh_degree > 0) + offsets
+            scene = setup.scene.replace_rows(members, rows)
+            with torch.no_grad():
+                renders = [
+                    render_view(scene, view.camera, setup.background).clamp(0, 1) for view in setup.train
+                ]
+            self._log.say(f"step {step}: the editor looks at {len(renders)} renders again")
+        targets = []
+        for view, now in zip(setup.train, renders, strict=True):
+            made = self._editor.edit_again(view, strength, now, due)
+            targets.append(crop(quantize_image(view.confine(made) if self._confined else made), view.box))
+        return targets
+
+
+def reedit(
+    options: EditorOptions,
+    setup: TrainingSetup,
+    optimization: OptimizeOptions,
+    folder: RunFolder,
+    log: RunLog,
+) -> Reedit | None:
+    """What --reedit-every asks for; None where it asks for nothing.
+
+    Raises:
+        ProgdfError: the editor cannot look at a picture again.
+    """
+    if not options.reedit_every:
+        return None
+    editor = make_editor(replace(options, cache=folder.painted), setup.scene, setup.region, setup.views)
+    if not isinstance(editor, RepaintingEditor):
+        raise ProgdfError(f"--reedit-every does not apply to {options.editor}; leave it out")
+    return Reedit(editor, setup, options.reedit_every, confines_edit(editor, optimization.kind), log)
+
 
 __all__ = ["RunResult", "train"]
 

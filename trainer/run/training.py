@@ -34,9 +34,8 @@ from trainer.optimize.solve_pictures import RECORDINGS, make_picture_solver, sol
 from trainer.optimize.unseen import NEEDED, UnseenMembers, view_dependence
 from trainer.options import OptimizeOptions, TrainOptions
 from trainer.setup import Pictures, TrainingSetup, probe_views
-from trainer.store.interrupts import defer_signals
 from trainer.store.progress import RunLog
-from trainer.store.state import PeriodicSave, Resumable, Saved, StateFolder
+from trainer.store.state import PeriodicSave, Resumable, Saved, StateFolder, defer_signals
 from trainer.views.crops import COLORS, CropScene, crop_scene, moving_attributes, only_recolors, render_all
 from trainer.views.view import crop
 
@@ -52,17 +51,13 @@ class _RecordingValues(msgspec.Struct):
 
 @dataclass(frozen=True)
 class SavedSnapshot:
-    """A snapshot as it is kept.
+    """A snapshot as it is kept."""
 
-    Args:
-        step, stage, ends_stage, means: see `ParameterSnapshot`
-        offsets: of the members, in half precision. [M,C] float16
-    """
-
+    # step, stage, ends_stage, means: see `ParameterSnapshot`
     step: int
     stage: int
     ends_stage: bool
-    offsets: Tensor
+    offsets: Tensor  # of the members, in half precision. [M,C] float16
     means: Mapping[str, float]
 
 

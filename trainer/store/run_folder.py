@@ -14,9 +14,9 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from torch import Tensor
@@ -27,8 +27,53 @@ from progdf.io.atomic import LOCK, LockedError, atomic_write, hold_lock, is_temp
 from progdf.io.images import read_picture, write_image
 from progdf.io.json_values import decode_json
 
-from .picture_list import add_pictures, remove_pictures_but_of
 from .state import StateFolder
+
+NAME = "pictures.txt"
+
+
+def read_list(folder: Path) -> list[str]:
+    """The lines of the folder's list."""
+    try:
+        return (folder / NAME).read_text(encoding="utf-8").splitlines()
+    except (OSError, ValueError):
+        return []
+
+
+def add_pictures(folder: Path, paths: Iterable[Path]) -> None:
+    """Put files in the folder on its list."""
+    lines = read_list(folder)
+    new = dict.fromkeys(path.relative_to(folder).as_posix() for path in paths)
+    if added := [line for line in new if line not in set(lines)]:
+        _write(folder, [*lines, *added])
+
+
+def remove_pictures_but_of(folder: Path, views: Collection[str]) -> None:
+    """Delete the listed files that are not of one of these views; nothing behind a link is touched."""
+    kept = []
+    for line in read_list(folder):
+        path = folder / line
+        if path.stem in views or not _is_inside(folder, line):
+            kept.append(line)
+        elif os.path.isfile(path):  # pathlib's raises where a name is too long
+            path.unlink()
+    if read_list(folder) != kept:
+        _write(folder, kept)
+
+
+def _is_inside(folder: Path, line: str) -> bool:
+    """Whether a line leads to a place in the folder, through no link."""
+    parts = PurePosixPath(line)
+    if parts.is_absolute() or ".." in parts.parts or not parts.parts:
+        return False
+    places = [folder / part for part in (parts, *parts.parents)]  # the last is the folder itself
+    return not any(place.is_symlink() for place in places)
+
+
+def _write(folder: Path, lines: Iterable[str]) -> None:
+    with atomic_write(folder / NAME) as temporary_file:
+        temporary_file.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
+
 
 _SIGNATURE = "progdf train"
 _LOOK_S = 1.0  # a window that asks whether a run is locked holds the lock for a moment

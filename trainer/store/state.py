@@ -13,13 +13,16 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import signal
 import sys
+import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from types import FrameType
+from typing import Any, NoReturn, Protocol
 
 import torch
 from torch import Tensor
@@ -28,6 +31,59 @@ from progdf.errors import ProgdfError
 from progdf.io.atomic import atomic_write
 from progdf.io.json_values import convert_json, decode_json
 from progdf.io.tensors import read_tensors, write_tensors
+
+_ENDINGS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
+"""Sent by who wants a process to end, and by a terminal that is closed; Windows has no SIGHUP."""
+
+
+@contextmanager
+def interrupt_on_signals() -> Iterator[None]:
+    """SIGTERM and SIGHUP are a KeyboardInterrupt too, so that all end in the same way."""
+
+    def stop(number: int, frame: FrameType | None) -> NoReturn:
+        raise KeyboardInterrupt
+
+    with _handle_signals(_ENDINGS, stop):
+        yield
+
+
+@contextmanager
+def defer_signals() -> Iterator[Callable[[], bool]]:
+    """Hold Ctrl-C, SIGTERM and SIGHUP back; the yielded function says whether one came.
+
+    Ask it where the state is whole, save, and raise KeyboardInterrupt. A second signal does not wait, and
+    neither does one that nobody asked about.
+    """
+    came = False
+
+    def note(number: int, frame: FrameType | None) -> None:
+        nonlocal came
+        if came:
+            raise KeyboardInterrupt
+        came = True
+
+    with _handle_signals((signal.SIGINT, *_ENDINGS), note):
+        yield lambda: came
+    if came:
+        raise KeyboardInterrupt
+
+
+@contextmanager
+def _handle_signals(
+    signals: tuple[signal.Signals, ...], handler: Callable[[int, FrameType | None], None]
+) -> Iterator[None]:
+    """Python lets only the main thread handle signals; elsewhere the owner of that thread does."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    heeded = [number for number in signals if signal.getsignal(number) != signal.SIG_IGN]  # nohup's stays
+    earlier = {number: signal.signal(number, handler) for number in heeded}
+    try:
+        yield
+    finally:
+        for number, was in earlier.items():
+            signal.signal(number, was)
+
 
 SHARE = 0.01
 """Of the time, at most, that saving the state may take."""
@@ -38,15 +94,10 @@ for the run shows the newest recording."""
 
 @dataclass(frozen=True)
 class Saved:
-    """What was saved of a part.
+    """What was saved of a part."""
 
-    Args:
-        tensors: by name
-        values: JSON values by name; floats come back bit for bit
-    """
-
-    tensors: Mapping[str, Tensor]
-    values: Mapping[str, Any]
+    tensors: Mapping[str, Tensor]  # by name
+    values: Mapping[str, Any]  # JSON values by name; floats come back bit for bit
 
 
 class Resumable(Protocol):

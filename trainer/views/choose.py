@@ -41,21 +41,13 @@ _LEAST_COVER = 0.25
 
 @dataclass(frozen=True)
 class ViewChoice:
-    """The views an edit works on.
+    """The views an edit works on."""
 
-    Args:
-        views: in the order of the cameras' list
-        likeness: how far view j shows what view i shows, from near the same side. [V,V] 0..1
-        offered: how many cameras there were
-        unseeing: how many of them do not see the region
-        scant: how many show less than a quarter of what the median view shows
-    """
-
-    views: tuple[View, ...]
-    likeness: Tensor
-    offered: int
-    unseeing: int
-    scant: int
+    views: tuple[View, ...]  # in the order of the cameras' list
+    likeness: Tensor  # how far view j shows what view i shows, from near the same side. [V,V] 0..1
+    offered: int  # how many cameras there were
+    unseeing: int  # how many of them do not see the region
+    scant: int  # how many show less than a quarter of what the median view shows
 
     def line(self) -> str:
         """What became of the cameras, for the log."""

@@ -97,29 +97,20 @@ def may_reach(means: Tensor, scales: Tensor, camera: Camera, live: Tensor) -> Te
 
 @dataclass(frozen=True)
 class CropScene:
-    """What one view's box can show, ready to be rendered with other member rows.
+    """What one view's box can show, ready to be rendered with other member rows."""
 
-    Args:
-        camera: the whole view
-        box: the pixels that are rendered
-        gaussians: the n Gaussians of the box with their colors as seen from this camera; members hold the
-            original's values
-        rows: where the members are among them, in the region's order. [M] int64
-        member_shN: higher SH bands of the members in the original. [M,K,3]
-        background: what shows through. [3]
-        cached: pixels that are drawn [h,w,1] bool, and the original picture [h,w,3], which the others are;
-            None where all are drawn
-        still: nothing but the members' colors ever differs
-    """
-
-    camera: Camera
-    box: Crop
+    camera: Camera  # the whole view
+    box: Crop  # the pixels that are rendered
+    # the n Gaussians of the box with their colors as seen from this camera; members hold the original's
+    # values
     gaussians: ActivatedGaussians
-    rows: Tensor
-    member_shN: Tensor
-    background: Tensor
+    rows: Tensor  # where the members are among them, in the region's order. [M] int64
+    member_shN: Tensor  # higher SH bands of the members in the original. [M,K,3]
+    background: Tensor  # what shows through. [3]
+    # pixels that are drawn [h,w,1] bool, and the original picture [h,w,3], which the others are; None where
+    # all are drawn
     cached: tuple[Tensor, Tensor] | None = None
-    still: bool = False
+    still: bool = False  # nothing but the members' colors ever differs
 
     @property
     def size(self) -> tuple[int, int]:

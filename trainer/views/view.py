@@ -38,22 +38,15 @@ _CHANGED = 0.05  # a pixel is changed where a channel differs by more than this
 
 @dataclass(frozen=True)
 class View:
-    """One camera's picture of the original scene, and the region in it.
+    """One camera's picture of the original scene, and the region in it."""
 
-    Args:
-        camera: the whole view; its name is the file name of its pictures
-        image: the original. [H,W,3] 0..1
-        mask: the members' blended weight Σ αT; soft at edges, less behind others. [H,W] 0..1
-        inside: the color of the members alone, unmixed from what shares a pixel with them; meaningless
-            where `mask` is 0. [H,W,3]
-        box: the pixels that an edit can change, at least 64 each way where the image is that large
-    """
-
-    camera: Camera
-    image: Tensor
-    mask: Tensor
+    camera: Camera  # the whole view; its name is the file name of its pictures
+    image: Tensor  # the original. [H,W,3] 0..1
+    mask: Tensor  # the members' blended weight Σ αT; soft at edges, less behind others. [H,W] 0..1
+    # the color of the members alone, unmixed from what shares a pixel with them; meaningless where `mask` is
+    # 0. [H,W,3]
     inside: Tensor
-    box: Crop
+    box: Crop  # the pixels that an edit can change, at least 64 each way where the image is that large
 
     def blend(self, edited_inside: Tensor) -> Tensor:
         """The view with another color in place of `inside`, mixed as the original was. [H,W,3] -> [H,W,3]

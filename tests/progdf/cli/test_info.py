@@ -10,11 +10,11 @@ import torch
 from PIL import Image
 
 from progdf.__main__ import main
+from progdf.cli.info import survey
 from progdf.formats.ply import load_ply, save_ply
 from progdf.gaussians import Gaussians
 from progdf.io.cameras import save_cameras
 from progdf.scene.orbit_rig import orbit_rig
-from progdf.scene.stats import survey
 from progdf.terminal import format_count
 from tests.helpers.scenes import random_gaussians
 from tests.helpers.stacks import bear_stack

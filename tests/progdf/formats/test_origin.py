@@ -10,13 +10,13 @@ import pytest
 import torch
 from plyfile import PlyData
 
+from progdf.cli.info import survey
 from progdf.cli.rebind import match_scenes
 from progdf.formats.ply import load_ply, load_ply_with_report, save_ply
 from progdf.formats.repair import find_origin
 from progdf.formats.scene_file import load_scene, rotate_about_x
 from progdf.gaussians import ZERO, Gaussians
 from progdf.gdf.file import fingerprint
-from progdf.scene.stats import survey
 from tests.helpers.ply_files import COUNT, as_type, assert_same, moved_columns, scene_of, table_of, write
 from tests.helpers.scene_files import write_scene
 from tests.helpers.scenes import random_gaussians

@@ -11,7 +11,7 @@ from torch import Tensor
 from progdf.field.trajectory import Trajectory
 from progdf.gaussians import attribute_slices, pack
 from tests.helpers.trained import WHITE, small
-from trainer.fit.own_path import choose_path
+from trainer.fit.fit import choose_path
 from trainer.options import EditKind
 from trainer.setup import TrainingSetup
 from trainer.views.view import View, render_view

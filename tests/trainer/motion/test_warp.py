@@ -9,8 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from progdf.demo_scenes.edits import AnalyticEdit
-from progdf.demo_scenes.warps import bend_warp, stretch_warp, warp_edit
+from benchmarks.analytic_edits import AnalyticEdit, bend_warp, stretch_warp, warp_edit
 from progdf.gaussians import attribute_slices, pack
 from progdf.rasterize import render
 from tests.helpers.trained import WHITE, Small, small

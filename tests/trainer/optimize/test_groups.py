@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from progdf.demo_scenes.edits import AnalyticEdit, scale_edit, swing_edit
+from benchmarks.analytic_edits import AnalyticEdit, scale_edit, swing_edit
 from progdf.gaussians import attribute_slices, pack
 from progdf.rasterize import render
 from tests.helpers.analytic_views import Truth, bear_truth, write_analytic_views, write_truth

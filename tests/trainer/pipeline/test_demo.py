@@ -15,6 +15,7 @@ from PIL import Image
 
 import trainer.run.resume
 import trainer.run.run
+from benchmarks import analytic_edits
 from progdf import demo_scenes as scenes
 from progdf.__main__ import main
 from progdf.errors import ProgdfError
@@ -51,7 +52,7 @@ def _edit(folder: Path, scene: scenes.DemoScene, edit: demo.DemoEdit) -> Gdf:
     gaussians = load_ply(folder / "scene.ply")
     ids = [scene.label_names.index(part) for part in edit.parts or ("head",)]
     region = from_labels(edit.name, scene.labels, ids)
-    formula = scenes.recolor_edit(torch.tensor([0.1, 0.3, 0.9]))
+    formula = analytic_edits.recolor_edit(torch.tensor([0.1, 0.3, 0.9]))
     strengths = torch.tensor([0.0, 0.5, 1.0])
     rows = torch.stack(
         [pack(formula.apply(gaussians, region.members, float(s))[region.members]) for s in strengths]

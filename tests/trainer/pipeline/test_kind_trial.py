@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from progdf.demo_scenes.edits import AnalyticEdit, bear_edits
+from benchmarks.analytic_edits import AnalyticEdit, bear_edits
 from progdf.gaussians import Gaussians
 from progdf.rasterize import render
 from tests.helpers.demo_scenes import bear

@@ -14,7 +14,7 @@ from tests.helpers.trained import WHITE, quick_options, small, train, write_bear
 from trainer.editors.cache import KeptPictures
 from trainer.editors.style import StyleEditor
 from trainer.options import TrainOptions
-from trainer.run.reedit import Reedit
+from trainer.run.run import Reedit
 from trainer.setup import TrainingSetup
 from trainer.store.progress import RunLog
 

@@ -26,8 +26,7 @@ from tests.helpers.tiny_segmenters import tiny_detector, tiny_sam
 from tests.helpers.trained import label_mask, quick_options, train, write_bear
 from trainer.editors.pictures import FolderEditor
 from trainer.options import RegionOptions, ViewOptions, with_values
-from trainer.regions.from_pictures import RegionRequest, region_kinds
-from trainer.regions.masks import read_masks
+from trainer.regions.from_pictures import RegionRequest, read_masks, region_kinds
 from trainer.regions.segment import SEGMENTERS, normalize_prompt
 from trainer.views.view import View
 

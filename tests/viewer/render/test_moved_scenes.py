@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from progdf.camera import Camera
+from progdf.cli.info import survey
 from progdf.errors import ProgdfError
 from progdf.formats.scene_file import load_scene
 from progdf.gaussians import Gaussians
@@ -19,7 +20,6 @@ from progdf.rasterize import render
 from progdf.rasterize.engines import render_depth
 from progdf.scene.orbit_rig import orbit_rig
 from progdf.scene.regions import parse_region
-from progdf.scene.stats import survey
 from progdf.scene.subject import subject_rows
 from progdf.scene.up_axis import find_up
 from tests.helpers.ply_files import moved_columns, write
