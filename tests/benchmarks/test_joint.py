@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from benchmarks.joint_svd import fit_joint
+from benchmarks.field_forms import fit_joint
 from progdf.gaussians import attribute_slices
 from tests.helpers.edits import at_snapshots, curved_trajectory
 
