@@ -64,7 +64,7 @@ def edit_table(opened: Sequence[OpenedRun]) -> Table:
     perceptual, _ = perceptual_loss()
     rows = []
     for run in opened:
-        strength = dict(run.trajectory.asked)
+        strength = dict(run.trajectory.stage_strengths)
         curves = picture_courses(
             run.evaluator,
             run.contenders(),
@@ -160,7 +160,7 @@ def far_evaluator(run: OpenedRun) -> Evaluator:
     edited: dict[float, list[Tensor]] = {}
     plan = run.run.record.plan
     if plan.editor.family not in PER_VIEW:
-        options = replace(plan.editor, cache=run.run.folder.painted)
+        options = replace(plan.editor, cache=run.run.folder.paintings)
         editor = make_editor(options, scene, region, setup.views)
         edited = {s: [editor.edit(view, s) for view in views] for s in run.trajectory.strengths}
     channels = run.trajectory.end.shape[1]
@@ -201,7 +201,7 @@ def _from_elsewhere(run: OpenedRun, far: Evaluator) -> tuple[str, str, str]:
         return "-", "-", "-"
 
     def errors(field: BakedField) -> list[float]:
-        asked = run.trajectory.asked
+        asked = run.trajectory.stage_strengths
         return [far.psnr(far.pictures(field.offsets(s)), far.edited[strength]) for s, strength in asked]
 
     ours, plain = errors(run.gdf.field), errors(run.keyframes)

@@ -18,6 +18,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.helpers.sizes import Module, calls, dotted, functions, importers, modules, with_tree
+
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("progdf", "trainer", "viewer", "benchmarks")
 
@@ -42,6 +44,17 @@ ORDER = {
 
 MOST_FILES = 14
 MOST_LINES = 600
+
+# What a package may hold: modules, and lines of code (no blank, comment, docstring or import). A feature
+# says in its commit what it adds and what it replaces; these only fall.
+BUDGETS = {"progdf": (111, 9900), "trainer": (94, 7900), "viewer": (112, 11200)}
+MOST_IMPORTS = 0.080  # of all lines
+MOST_FUNCTION_LINES = 80
+MOST_POSITIONAL = 8
+LEAST_LINES = 80  # of a module that one other imports alone; it is a section of that one
+
+# What looks like a section of its only importer and is none: entry points, children that are run as programs.
+SMALL = {"progdf.__main__", "progdf.formats.gaussforge_child", "progdf.io.colmap_child"}
 
 Graph = dict[str, set[str]]
 
@@ -293,6 +306,66 @@ def test_no_file_is_longer_than_one_reads_in_a_sitting(sources: dict[Path, str])
     lengths = {path.as_posix(): source.count("\n") for path, source in sources.items()}
     long = sorted(name for name, lines in lengths.items() if lines > MOST_LINES)
     assert not long, f"more than {MOST_LINES} lines: {long}"
+
+
+@pytest.fixture(scope="module")
+def measured() -> dict[str, list[Module]]:
+    return {package: modules(package) for package in BUDGETS}
+
+
+def test_packages_keep_their_budgets(measured: dict[str, list[Module]]) -> None:
+    sizes = {name: (len(group), sum(module.code for module in group)) for name, group in measured.items()}
+    over = {
+        name: size
+        for name, size in sizes.items()
+        if any(a > b for a, b in zip(size, BUDGETS[name], strict=True))
+    }
+    assert not over, f"modules, lines of code: {over}; the budgets are {BUDGETS}"
+    lines = sum(module.lines for group in measured.values() for module in group)
+    imports = sum(module.imports for group in measured.values() for module in group)
+    assert imports <= MOST_IMPORTS * lines, f"{imports / lines:.1%} of all lines are imports"
+
+
+def test_a_small_module_that_one_other_imports_is_a_section_of_it(measured: dict[str, list[Module]]) -> None:
+    everything = {dotted(module.path): module for group in measured.values() for module in group}
+    alone = {
+        name: users
+        for name, users in importers(everything).items()
+        if len(users) == 1 and everything[name].lines < LEAST_LINES and name not in SMALL
+    }
+    assert not alone, "\n".join(f"{name} belongs into {next(iter(users))}" for name, users in alone.items())
+
+
+def test_functions_fit_on_a_screen(measured: dict[str, list[Module]]) -> None:
+    sizes = [size for group in measured.values() for module in group for size in functions(module)]
+    assert not [where for size, where in sizes if size > MOST_FUNCTION_LINES]
+
+
+def test_calls_say_by_name_what_many_arguments_are(measured: dict[str, list[Module]]) -> None:
+    wide = [call for group in measured.values() for module in group for call in calls(module)]
+    # compiled kernels take their arrays by position, and a table of ranges is one row an argument
+    plain = [
+        (size, where) for size, where in wide if "rasterize/cpu" not in where and "check_ranges" not in where
+    ]
+    assert not [where for size, where in plain if size > MOST_POSITIONAL]
+
+
+def test_functions_are_verbs_or_nouns_never_bare_participles(measured: dict[str, list[Module]]) -> None:
+    bare = [
+        where
+        for group in measured.values()
+        for module in group
+        for _, where in functions(module)
+        if re.fullmatch(
+            r"_?(?!around|ground|field)[a-z]+(ed|ept|eld|own|ound)", where.rsplit(" ", 1)[1].lstrip("_")
+        )
+    ]
+    assert not bare
+
+
+def test_the_documented_tree_is_that_of_the_modules() -> None:
+    page = (ROOT / "docs" / "contributing.md").read_text(encoding="utf-8")
+    assert page == with_tree(page), "run python -m tests.helpers.sizes --tree"
 
 
 def test_builders_draw_what_every_processor_draws_alike() -> None:

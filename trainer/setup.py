@@ -216,7 +216,7 @@ def editor_strengths(editor: ImageEditor, stages: int) -> tuple[float, ...]:
 
 def confines_edit(editor: ImageEditor, kind: Kind) -> bool:
     """Whether what the editor changed outside the region is put back: unless the edit moves parts."""
-    return kind != "geometry" and not editor.confined
+    return kind != "geometry" and not editor.is_confined
 
 
 def edit_views(
@@ -224,7 +224,7 @@ def edit_views(
     views: Sequence[View],
     strengths: Sequence[float],
     folder: RunFolder,
-    confined: bool,
+    is_confined: bool,
     advance: Advance,
 ) -> dict[float, list[Tensor]]:
     """Every view edited once per strength. What is kept on disk, in 8 bits, is what is trained on.
@@ -234,7 +234,7 @@ def edit_views(
         views: all views
         strengths: what the editor is asked for
         folder: where the pictures go
-        confined: put back what changed outside the region; members would be pulled over it otherwise
+        is_confined: put back what changed outside the region; members would be pulled over it otherwise
         advance: progress
     """
     paths = {
@@ -244,7 +244,7 @@ def edit_views(
     def edit(asked: tuple[float, int]) -> Tensor:
         strength, i = asked
         made = editor.edit(views[i], strength)
-        picture = quantize_image(views[i].confine(made) if confined else made)
+        picture = quantize_image(views[i].confine(made) if is_confined else made)
         write_image(paths[strength][i], picture)
         return picture
 

@@ -54,7 +54,7 @@ def fit_variant(
         field = fitted.chosen.field
         if resolve_slider(plan.optimize.slider, trajectory.strengths) == "even":
             field, remap = equalize_slider(field, shared.setup)
-    return field, {strength: remap.at(s) for s, strength in trajectory.asked}
+    return field, {strength: remap.at(s) for s, strength in trajectory.stage_strengths}
 
 
 def _slider_value(asked: Mapping[float, float], strength: float, at: float) -> float:

@@ -86,7 +86,7 @@ def make_ablation_setup(run: FinishedRun, plan: TrainOptions, kind: EditKind, qu
         plan = with_values(plan, steps=min(plan.optimize.steps, QUICK_STEPS), stages=len(strengths))
     edited = {s: _read_edited(run, setup.train, s) for s in strengths}
     setup = widen_views(setup, edited)
-    columns = columns_of(run.trajectory.asked)
+    columns = columns_of(run.trajectory.stage_strengths)
     shown = [strength for _, strength in columns[1:] if strength is not None]
     few = _thin(setup.train, 4)
     channels = BASE_CHANNELS + 3 * run.scene.shN.shape[1]
@@ -120,13 +120,13 @@ def make_ablation_setup(run: FinishedRun, plan: TrainOptions, kind: EditKind, qu
 def edit_at_equal_strengths(shared: AblationSetup) -> Pictures:
     """The training views as the editor has them at as many strengths, these equally far apart."""
     run, setup, plan = shared.run, shared.setup, shared.plan
-    options = replace(plan.editor, cache=run.folder.painted)
+    options = replace(plan.editor, cache=run.folder.paintings)
     editor = make_editor(options, run.scene, run.region, [*setup.train, *setup.held_out])
-    confined = confines_edit(editor, shared.kind)
+    is_confined = confines_edit(editor, shared.kind)
 
     def picture(view: View, strength: float) -> Tensor:
         made = editor.edit(view, strength)
-        return quantize_image(view.confine(made) if confined else made)
+        return quantize_image(view.confine(made) if is_confined else made)
 
     strengths = editor_strengths(editor, len(shared.edited))
     return {strength: [picture(view, strength) for view in setup.train] for strength in strengths}

@@ -56,7 +56,7 @@ class Trajectory:
         return int(self.s.shape[0])
 
     @property
-    def asked(self) -> tuple[tuple[float, float], ...]:
+    def stage_strengths(self) -> tuple[tuple[float, float], ...]:
         """Slider value of each stage's end, and the strength that the editor was asked for there."""
         return tuple((float(self.s[e]), s) for e, s in zip(self.stage_ends, self.strengths, strict=True))
 

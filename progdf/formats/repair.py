@@ -251,7 +251,7 @@ class LoadReport:
         )
 
     @property
-    def ignored(self) -> tuple[str, ...]:
+    def ignored_parts(self) -> tuple[str, ...]:
         """One phrase for each part of the file that was not used."""
         phrases = []
         if self.ignored_properties:
@@ -275,7 +275,7 @@ class LoadReport:
             sh += " (band 4 is kept, and not shown)"
         lines = [
             f"{self.file}: {format_count(self.count)}, {sh}, {self.format}, {file_size(self.file_bytes)}",
-            *(f"ignored: {phrase}" for phrase in self.ignored),
+            *(f"ignored: {phrase}" for phrase in self.ignored_parts),
         ]
         if self.antialiased:
             lines.append("trained anti-aliased (mip), and drawn so")

@@ -67,7 +67,7 @@ def open_picture(
         # Pillow turns a .tiff itself; a .png may say how it is stored behind its pixels
         turn = _orientation(picture, loaded=True)
         if calibrated and (stored > 1 or turn > 1):
-            raise _turned(path, max(stored, turn))
+            raise _orientation_error(path, max(stored, turn))
         upright = _to_bytes(path, picture)
         upright = upright.transpose(_TURNS[turn]) if turn in _TURNS else upright.copy()
         _check_proportions(path, upright.size, proportions)
@@ -79,7 +79,7 @@ def picture_size(path: str | os.PathLike[str], calibrated: bool = False) -> tupl
     with _open(path) as picture:
         stored = _orientation(picture)
         if calibrated and stored >= 5:
-            raise _turned(path, stored)
+            raise _orientation_error(path, stored)
         return _upright_size(picture, stored)
 
 
@@ -109,7 +109,7 @@ def _check_proportions(
         )
 
 
-def _turned(path: str | os.PathLike[str], orientation: int) -> ProgdfError:
+def _orientation_error(path: str | os.PathLike[str], orientation: int) -> ProgdfError:
     return ProgdfError(
         f"{path} is stored turned (EXIF orientation {orientation}), and nothing says whether its camera was "
         "calibrated before or after turning it; save it upright, without that tag"

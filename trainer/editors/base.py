@@ -27,7 +27,7 @@ class ImageEditor(Protocol):
         ...
 
     @property
-    def confined(self) -> bool:
+    def is_confined(self) -> bool:
         """Whether it leaves alone what is not the region; else its pictures may change anywhere."""
         ...
 

@@ -155,7 +155,7 @@ class InstructEditor:
     kept: KeptPictures  # where pictures are kept
     stages: tuple[float, ...] = (1.0,)  # (1,), or empty where graded
     kind: EditKind = "style"
-    confined: bool = False
+    is_confined: bool = False
 
     def edit(self, view: View, strength: float) -> Tensor:
         """See `ImageEditor.edit`."""

@@ -54,7 +54,7 @@ class PicturesEditor:
     files: Mapping[str, Mapping[float, Path]]  # name of the view → strength → picture
     stages: tuple[float, ...]  # the strengths, ascending
     kind: EditKind = "color"
-    confined: bool = False
+    is_confined: bool = False
 
     def edit(self, view: View, strength: float) -> Tensor:
         """See `ImageEditor.edit`; ProgdfError where the picture is missing or broken.
@@ -221,11 +221,11 @@ def background_of(
     errors = [float((save(before.expand(16, 16, 3)) - color).abs().amax()) for before in near]
     likely = [before for before, error in zip(near, errors, strict=True) if error <= min(errors)]
 
-    def replayed(before: Tensor) -> float:
+    def replay_error(before: Tensor) -> float:
         over = (original + clear * (before - run)).clamp(0.0, 1.0)
         return float((save(over) - picture).abs().mean())
 
-    return min(likely, key=replayed) if len(likely) > 1 else likely[0]
+    return min(likely, key=replay_error) if len(likely) > 1 else likely[0]
 
 
 def resize_image(image: Tensor, size: tuple[int, int]) -> Tensor:
@@ -284,7 +284,7 @@ class FolderEditor:
     folders: dict[float, Path]  # strength → folder
     stages: tuple[float, ...]  # the strengths, ascending
     kind: EditKind = "style"
-    confined: bool = False
+    is_confined: bool = False
     bent: bool = False  # the pictures were taken through the views' lenses and are to be straightened
     # where the unedited photographs lie, if the views are to be changed as these were; else the pictures are
     # taken as they are

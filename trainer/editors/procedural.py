@@ -32,7 +32,7 @@ class ColorEditor:
     change: Callable[[Tensor, float], Tensor]
     kind: EditKind = "color"
     stages: tuple[float, ...] = ()
-    confined: bool = True
+    is_confined: bool = True
 
     def edit(self, view: View, strength: float) -> Tensor:
         """See `ImageEditor.edit`."""
@@ -54,7 +54,7 @@ class StripesEditor:
     path: ColorPath = "bowed"  # see `bend_of`
     kind: EditKind = "color"
     stages: tuple[float, ...] = ()
-    confined: bool = True
+    is_confined: bool = True
 
     def paint(self, rgb: Tensor, strength: float) -> Tensor:
         """The members' colors [M,3] under the paint, which takes most of the old texture's contrast away."""

@@ -46,7 +46,7 @@ class StyleEditor:
     kept: KeptPictures  # where paintings are kept
     whole: bool = False  # whether the network looks at the whole view, else at the region's box
     kind: EditKind = "style"
-    confined: bool = True
+    is_confined: bool = True
     stages: tuple[float, ...] = ()
 
     def edit(self, view: View, strength: float) -> Tensor:

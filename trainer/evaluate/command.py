@@ -38,7 +38,7 @@ _SPAN = (0.0, 1.0)
 def evaluation_picture(opened: OpenedRun, evaluation: Evaluation) -> Tensor:
     """Thumbnails over curves. -> [H,W,3]"""
     evaluator = opened.evaluator
-    columns, best = columns_of(opened.trajectory.asked), best_view(evaluator)
+    columns, best = columns_of(opened.trajectory.stage_strengths), best_view(evaluator)
     strips = {
         name: [thumbnail(pictures(s)[best], _THUMBNAIL) for s, _ in columns]
         for name, pictures in opened.contenders().items()
@@ -55,7 +55,7 @@ def evaluation_picture(opened: OpenedRun, evaluation: Evaluation) -> Tensor:
     ]
     if pairs := evaluation.consistency.pairs:
         sheets.append(_warp_sheet(max(pairs, key=lambda pair: pair.shared)))
-    return stack_plots(_joined([to_picture(sheet) for sheet in sheets]), _plots(evaluation))
+    return stack_plots(_join_sheets([to_picture(sheet) for sheet in sheets]), _plots(evaluation))
 
 
 def _warp_sheet(pair: WarpedPair) -> Tensor:
@@ -97,7 +97,7 @@ def _plots(evaluation: Evaluation) -> list[list[Plot]]:
     ]
 
 
-def _joined(sheets: Sequence[Image.Image]) -> Image.Image:
+def _join_sheets(sheets: Sequence[Image.Image]) -> Image.Image:
     """Sheets below each other on one page."""
     page = Image.new("RGB", (max(s.width for s in sheets), sum(s.height for s in sheets)), PAPER)
     top = 0

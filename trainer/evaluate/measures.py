@@ -51,7 +51,7 @@ def evaluate_run(opened: OpenedRun, perceptual: Perceptual, texts: TextOptions) 
         texts: what CLIP is asked
     """
     evaluator, contenders = opened.evaluator, opened.contenders()
-    strength = dict(opened.trajectory.asked)
+    strength = dict(opened.trajectory.stage_strengths)
     curves = picture_courses(
         evaluator, contenders, tuple(strength), lambda s: evaluator.edited[strength[s]], perceptual
     )
@@ -67,7 +67,7 @@ def evaluate_run(opened: OpenedRun, perceptual: Perceptual, texts: TextOptions) 
         *_edited_rows(curves, lpips, views[min(len(opened.setup.held_out), 2)]),
         *_path_rows(paths, lpips),
         *_consistency_rows(consistency, lpips),
-        Row("outside", "outside the region, mean change, of 255", _scaled(outside_change(opened), 255)),
+        Row("outside", "outside the region, mean change, of 255", _scale_values(outside_change(opened), 255)),
         *_clip_rows(opened, texts),
         *_cost_rows(opened),
     )
@@ -149,7 +149,7 @@ def _cost_rows(opened: OpenedRun) -> list[Row]:
     ]
 
 
-def _scaled(values: Mapping[str, float], factor: float) -> dict[str, float | None]:
+def _scale_values(values: Mapping[str, float], factor: float) -> dict[str, float | None]:
     return {name: factor * value for name, value in values.items()}
 
 
@@ -214,7 +214,7 @@ def evaluation_table(evaluation: Evaluation) -> str:
 
 def evaluation_json(evaluation: Evaluation) -> dict[str, Any]:
     """As evaluation.json has it: rows by name, their figures by column, or why there are none."""
-    rows = {row.name: {"missing": row.missing} if row.missing else _rounded(row) for row in evaluation.rows}
+    rows = {row.name: {"missing": row.missing} if row.missing else _round_row(row) for row in evaluation.rows}
     curves = {
         name: {"s": curve.s, "psnr": curve.psnr, "ssim": curve.ssim, "lpips": curve.lpips}
         for name, curve in evaluation.curves.items()
@@ -237,6 +237,6 @@ def _cell(row: Row, column: str) -> str:
     return "" if value is None else f"{value:.{row.digits}f}"
 
 
-def _rounded(row: Row) -> dict[str, float | None]:
+def _round_row(row: Row) -> dict[str, float | None]:
     digits = row.digits + 2
     return {name: None if value is None else round(value, digits) for name, value in row.cells.items()}

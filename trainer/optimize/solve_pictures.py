@@ -72,12 +72,12 @@ def fit_paint(colors: Tensor, change: Tensor, weights: Tensor) -> Paint:
     ones = torch.ones_like(weights)
     energy = (weights[:, None] * change.square()).sum().clamp_min(1e-30)
 
-    def unexplained(full: Tensor, amounts: Tensor) -> float:
+    def unexplained_share(full: Tensor, amounts: Tensor) -> float:
         left = change - amounts[:, None] * full
         return float((weights[:, None] * left.square()).sum() / energy)
 
     full, slope = _fit_affine(colors, change, weights)
-    left = unexplained(full, ones)
+    left = unexplained_share(full, ones)
     if left <= _WHOLE:
         return Paint(full, ones, slope, max(0.0, 1.0 - left), True, full)
     typical = (energy / weights.sum().clamp_min(1e-30)).sqrt()
@@ -90,7 +90,7 @@ def fit_paint(colors: Tensor, change: Tensor, weights: Tensor) -> Paint:
         full, slope = _fit_affine(colors, change / divisor[:, None], telling * divisor.square())
         along = (change * full).sum(dim=1) / full.square().sum(dim=1).clamp_min(1e-9)
         amounts = along.clamp(0.0, 1.0)
-    return Paint(full, amounts, slope, max(0.0, 1.0 - unexplained(full, amounts)), False, general)
+    return Paint(full, amounts, slope, max(0.0, 1.0 - unexplained_share(full, amounts)), False, general)
 
 
 def _fit_affine(colors: Tensor, change: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:

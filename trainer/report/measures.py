@@ -50,10 +50,10 @@ def error_curves(
 ) -> dict[str, ErrorCurve]:
     """Each field's errors on held-out views, over the slider; see `picture_courses`."""
 
-    def shown(field: BakedField) -> Pictures:
+    def pictures_of(field: BakedField) -> Pictures:
         return lambda s: evaluator.pictures(field.offsets(s))
 
-    pictures = {name: shown(field) for name, field in fields.items()}
+    pictures = {name: pictures_of(field) for name, field in fields.items()}
     return picture_courses(evaluator, pictures, strengths, truth, perceptual)
 
 
@@ -182,7 +182,7 @@ def measure(
         reporting, fields, samples, lambda s: reporting.pictures(trajectory.at(s)), perceptual
     )
     recorded = {n: replace(c, s=tuple(remap.at(s) for s in c.s)) for n, c in recorded.items()}
-    asked = tuple((remap.at(s), strength) for s, strength in trajectory.asked)
+    asked = tuple((remap.at(s), strength) for s, strength in trajectory.stage_strengths)
     drawn = against_editor(evaluator, {**fields, "slider": shown}, asked, perceptual)
     nodes = trajectory.s[1:-1][:: max(1, -(-(len(trajectory) - 2) // _NODES))].tolist()
     worst = min(
@@ -192,12 +192,23 @@ def measure(
         ),
         default=fitted.chosen.worst,
     )
-    return Measured(fitted, shown, remap, asked, slider, worst, recorded, drawn, perceptual.name, clip)
+    return Measured(
+        fitted,
+        shown,
+        remap,
+        asked=asked,
+        slider=slider,
+        at_recordings=worst,
+        trajectory=recorded,
+        editor=drawn,
+        perceptual=perceptual.name,
+        clip=clip,
+    )
 
 
 def expected_measures(trajectory: Trajectory) -> int:
     """About how often `measure` looks at its views, for a progress bar."""
-    return 30 + 3 * len(sample_strengths()[::_EVERY]) + 2 * len(trajectory.asked) + 2 * _NODES
+    return 30 + 3 * len(sample_strengths()[::_EVERY]) + 2 * len(trajectory.stage_strengths) + 2 * _NODES
 
 
 def clip_curve(

@@ -134,7 +134,7 @@ def finish_run(
             "slider": slider,
             "s": [round(float(s), 4) for s in shipped.s],
             "stages": list(trajectory.strengths),
-            "stages_at": [round(s, 4) for s, _ in shipped.asked],
+            "stages_at": [round(s, 4) for s, _ in shipped.stage_strengths],
             "attribute_worth_db": record.attribute_worth_db,
         },
         **_record_figures(record),

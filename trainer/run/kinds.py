@@ -142,7 +142,7 @@ def approaches(options: TrainOptions, setup: TrainingSetup, edited: Sequence[Ten
     Args:
         options: resolved
         setup: the training views
-        edited: the finished edit of each, not confined. [H,W,3]
+        edited: the finished edit of each, not is_confined. [H,W,3]
     """
     asked = options.optimize
     groups = GROUP_STEPS if asked.group_steps is None else asked.group_steps
@@ -171,7 +171,7 @@ def try_approaches(
     Args:
         options: of the run
         setup: scene, region and training views
-        edited: the finished edit of each training view, not confined. [H,W,3]
+        edited: the finished edit of each training view, not is_confined. [H,W,3]
         ways: see `approaches`
         advance: progress: ways tried
 

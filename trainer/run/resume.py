@@ -74,7 +74,7 @@ def decide_resume(folder: RunFolder, options: TrainOptions, region: Region, coun
     saved, plan = _saved_identity(folder), recorded_options(options)
     threads, resume = count_threads(options.threads), options.resume
     if resume and saved is None and folder.report.is_file():
-        was, pictures = _finished(folder)
+        was, pictures = _finished_run(folder)
         again = "leave out --resume to train again"
         _check_plan(folder, was, plan, again)
         _check_pictures(folder, pictures, picture_digests(plan), again)
@@ -123,7 +123,7 @@ def find_run(options: TrainOptions) -> Literal["nothing", "stopped", "finished"]
     if saved is None and not folder.report.is_file():
         return "nothing"
     try:
-        _check_plan(folder, saved.plan if saved else _finished(folder)[0], plan, "")
+        _check_plan(folder, saved.plan if saved else _finished_run(folder)[0], plan, "")
     except ProgdfError:
         return "nothing"
     return "stopped" if saved else "finished"
@@ -257,7 +257,7 @@ def _check_pictures(folder: RunFolder, was: Mapping[str, str], now: Mapping[str,
             raise ProgdfError(f"{path} has changed since {folder.root} was started; {remedy}")
 
 
-def _finished(folder: RunFolder) -> tuple[TrainOptions, dict[str, str]]:
+def _finished_run(folder: RunFolder) -> tuple[TrainOptions, dict[str, str]]:
     """A finished run's plan, and the hashes of its changed pictures."""
     try:
         report = decode_json(folder.report.read_bytes())

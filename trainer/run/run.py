@@ -88,7 +88,7 @@ def check_command(options: TrainOptions) -> None:
     if not options.resume or load_region(options.out) is None:
         check_region(options.region.region, region_checks(region_request(options, quiet=True)))
     if not folder.root.is_dir() or not any(folder.root.iterdir()):
-        check_new_editor(replace(options.editor, cache=folder.painted))
+        check_new_editor(replace(options.editor, cache=folder.paintings))
 
 
 def region_request(
@@ -103,7 +103,7 @@ def region_request(
 
     def cache() -> Path:
         # nothing is written into a folder that is no run of ours
-        return open_run_folder(options.out, options.edit).segmented
+        return open_run_folder(options.out, options.edit).segment_masks
 
     return RegionRequest(options.region, options.views, cache, quiet, say)
 
@@ -115,15 +115,15 @@ class Reedit:
         editor: paints
         setup: scene, region and the training views with their final boxes
         every: steps between two edits, counted over all stages
-        confined: put back what changes outside the region
+        is_confined: put back what changes outside the region
         log: of the run
     """
 
     def __init__(
-        self, editor: RepaintingEditor, setup: TrainingSetup, every: int, confined: bool, log: RunLog
+        self, editor: RepaintingEditor, setup: TrainingSetup, every: int, is_confined: bool, log: RunLog
     ) -> None:
         self._editor, self._setup, self._log = editor, setup, log
-        self._every, self._confined = every, confined
+        self._every, self._confined = every, is_confined
         self._shown = 0  # the step whose pictures are the targets now; 0: none
 
     def __call__(self, step: int, local: int, strength: float, offsets: Tensor) -> list[Tensor] | None:
@@ -163,7 +163,7 @@ def reedit(
     """
     if not options.reedit_every:
         return None
-    editor = make_editor(replace(options, cache=folder.painted), setup.scene, setup.region, setup.views)
+    editor = make_editor(replace(options, cache=folder.paintings), setup.scene, setup.region, setup.views)
     if not isinstance(editor, RepaintingEditor):
         raise ProgdfError(f"--reedit-every does not apply to {options.editor}; leave it out")
     return Reedit(editor, setup, options.reedit_every, confines_edit(editor, optimization.kind), log)
@@ -300,7 +300,7 @@ def _edit_views(
         except ProgdfError as error:
             log.say(f"the views are edited again: {str(error).partition(';')[0]}")
     spec = options.editor.editor
-    editor = make_editor(replace(options.editor, cache=folder.painted), setup.scene, setup.region, views)
+    editor = make_editor(replace(options.editor, cache=folder.paintings), setup.scene, setup.region, views)
     if isinstance(editor, FolderEditor) and editor.warning is not None:
         log.say(editor.warning)
     approach, trial = choose_approach(options, setup, editor, log)
@@ -309,9 +309,9 @@ def _edit_views(
     strengths = editor_strengths(editor, optimization.stages)
     if not optimization.as_printed and resolve_slider(optimization.slider, strengths) == "even":
         strengths = equalized_strengths(editor, spec, views, strengths)
-    confined = confines_edit(editor, kind)
+    is_confined = confines_edit(editor, kind)
     with log.steps("edit", len(views) * len(strengths)) as advance:
-        edited = edit_views(editor, views, strengths, folder, confined, advance)
+        edited = edit_views(editor, views, strengths, folder, is_confined, advance)
     if all(
         torch.equal(p, quantize_image(v.image)) for s in edited for p, v in zip(edited[s], views, strict=True)
     ):
@@ -403,7 +403,7 @@ def _choose_path(
     editor = None  # of pictures made elsewhere: their folder may be gone by now, and there is no half
     if options.editor.family not in EXTERNAL:
         editor = make_editor(
-            replace(options.editor, cache=folder.painted), setup.scene, setup.region, setup.views
+            replace(options.editor, cache=folder.paintings), setup.scene, setup.region, setup.views
         )
     retimed = partial(retime_trajectory, setup=setup, optimization=optimization, log=log)
     return choose_path(trajectory, setup, editor, bool(optimization.group_steps), retimed)

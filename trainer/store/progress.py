@@ -162,12 +162,12 @@ class RunLog:
         done = 0
         with self.steps(what, total) as advance:
 
-            def looked() -> None:
+            def count_look() -> None:
                 nonlocal done
                 done += 1
                 advance(min(done, total), "")
 
-            yield looked
+            yield count_look
 
     def close(self) -> None:
         """End the file."""

@@ -106,7 +106,7 @@ class RunFolder:
         return self.root / "report.png"
 
     @property
-    def segmented(self) -> Path:
+    def segment_masks(self) -> Path:
         """Masks of text:"…", a folder a prompt; they are made before the run begins."""
         return self.root / "segmented"
 
@@ -135,7 +135,7 @@ class RunFolder:
         return self.root / "views"
 
     @property
-    def painted(self) -> Path:
+    def paintings(self) -> Path:
         """What a learned editor painted, with a list of its own."""
         return self.views / "painted"
 
@@ -159,7 +159,7 @@ def check_folder(root: Path, edit: Mapping[str, str]) -> RunFolder:
         raise ProgdfError(f"{root} is a file; give --out a folder")
     folder = RunFolder(root)
     if root.is_dir() and not all(
-        is_temporary(entry.name) or entry.name == LOCK or entry == folder.segmented
+        is_temporary(entry.name) or entry.name == LOCK or entry == folder.segment_masks
         for entry in root.iterdir()
     ):
         first = (
@@ -247,7 +247,7 @@ def read_views(folder: RunFolder, kind: str, names: Iterable[str], strength: flo
 
 def remove_stale_views(folder: RunFolder, names: Sequence[str]) -> None:
     """Delete pictures of views that an earlier run of the same edit had and this one has not."""
-    for place in (folder.views, folder.painted):
+    for place in (folder.views, folder.paintings):
         remove_pictures_but_of(place, set(names))
 
 

@@ -152,7 +152,7 @@ class App:
         self.main_view.show_message(line, True, details)
 
     @contextmanager
-    def _guarded(self) -> Iterator[None]:
+    def _guard(self) -> Iterator[None]:
         try:
             yield
         except Exception as error:
@@ -165,21 +165,21 @@ class App:
         self.window.present()
         while not self.is_closed:
             waits = [wait for wait in self._wait_times() if wait is not None]
-            with self._guarded():
+            with self._guard():
                 if not self.main_view.opening:  # else events wait in the window system, and no letter is lost
                     self.window.wait(min(waits, default=None))
             if self.failure is not None:
                 raise self.failure
             for path in self.take_dropped():
-                with self._guarded():
+                with self._guard():
                     self.open(path)
             if self.window.closing and not self.is_closed:
                 self.window.stay_open()
                 self.main_view.request("quit")
-            with self._guarded():
+            with self._guard():
                 if self.main_view.is_due():
                     self.draw()
-        with self._guarded():
+        with self._guard():
             self.file_actions.on_close()
 
     def draw(self) -> None:
@@ -197,7 +197,7 @@ class App:
         self.window.present()
         self._rename()
         for request in self.main_view.take_requests():
-            with self._guarded():
+            with self._guard():
                 self._handle(request)
 
     def _handle(self, request: str) -> None:
@@ -226,13 +226,13 @@ class App:
         )
 
     def _look(self, poll: Callable[[], float | None]) -> float | None:
-        with self._guarded():
+        with self._guard():
             return poll()
         return RETRY_S
 
     def _redraw(self) -> None:
         try:
-            with self._guarded():
+            with self._guard():
                 self.draw()
         except BaseException as failure:  # glfw would only print it
             self.failure = failure

@@ -19,7 +19,7 @@ from progdf.terminal import escape_text
 from viewer.state.workspace import Dialog
 from viewer.ui.context import PALETTE, SMALL_PX, UiContext
 from viewer.ui.overlay import Area
-from viewer.ui.widgets import elide, section, small, tip, wrapped
+from viewer.ui.widgets import elide, section, small, tip, wrapped_text
 
 from .studio import pages
 
@@ -136,7 +136,7 @@ def _content(
     imgui.push_font(ui.fonts.bold, 0.0)
     imgui.text(TITLES[dialog.kind])
     imgui.pop_font()
-    wrapped(_HINTS[dialog.kind].format(escape_text(Path(dialog.text).name)), PALETTE.dim)
+    wrapped_text(_HINTS[dialog.kind].format(escape_text(Path(dialog.text).name)), PALETTE.dim)
     imgui.dummy(imgui.ImVec2(0.0, 2.0 * ui.scale))
     if "Escape" in pressed:
         return Answer(None)
@@ -149,7 +149,7 @@ def _content(
         if dialog.kind == "log":
             _log(Path(dialog.text), bottom, ui)
         if dialog.kind == "about":
-            wrapped(dialog.text, PALETTE.text)
+            wrapped_text(dialog.text, PALETTE.text)
             imgui.dummy(imgui.ImVec2(0.0, 2.0 * ui.scale))
         return _answer(dialog, _pressed_button(_CHOICES[dialog.kind], pressed, ui))
     if _is_new(dialog.kind) or (dialog.error and not imgui.is_any_item_active()):
@@ -171,7 +171,7 @@ def _content(
     if dialog.notice:
         small(dialog.notice, PALETTE.warning)
     if dialog.error:
-        wrapped(escape_text(dialog.error), PALETTE.error)
+        wrapped_text(escape_text(dialog.error), PALETTE.error)
     if dialog.options is not None and dialog.kind in ("render_picture", "render_film"):
         kind = dialog.kind.removeprefix("render_")
         text, options = pages.draw_fields(kind, dialog.text, dialog.options, ui)
@@ -283,7 +283,7 @@ def _log(path: Path, bottom: float, ui: UiContext) -> None:
     imgui.push_style_color(imgui.Col_.child_bg, imgui.ImVec4(*PALETTE.scrim))
     padded = imgui.ChildFlags_.always_use_window_padding.value
     imgui.begin_child("log", imgui.ImVec2(0.0, tall), padded)
-    wrapped(_escape_lines(text), PALETTE.text)
+    wrapped_text(_escape_lines(text), PALETTE.text)
     if imgui.is_window_appearing():
         imgui.set_scroll_here_y(1.0)
     imgui.end_child()

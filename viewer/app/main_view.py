@@ -242,16 +242,16 @@ class MainView:
         self._clock += max(seconds, 0.0)
         self._pace.step(seconds)
         self._resting = False
-        with self._guarded():
+        with self._guard():
             self.work = workspace.advance(self.work, seconds)
         before = self.work
         imgui.backends.opengl3_new_frame()
         imgui.new_frame()
-        with self._guarded():
+        with self._guard():
             self._update(keys, seconds)
-        with self._guarded():
+        with self._guard():
             self._draw_picture(screen)
-        with self._guarded():
+        with self._guard():
             self._draw_overlays()
         imgui.render()
         screen.use()
@@ -262,8 +262,8 @@ class MainView:
             self.latencies_ms.append(1e3 * (time.perf_counter() - arrived))
         self._save_files(screen, size)
 
-    def _guarded(self) -> AbstractContextManager[None]:
-        return self.ui.guarded(self.report)
+    def _guard(self) -> AbstractContextManager[None]:
+        return self.ui.guard(self.report)
 
     def _report(self, error: Exception) -> None:
         """Without an application: what the person can mend is a message, mistakes of ours go on."""
@@ -344,7 +344,7 @@ class MainView:
         if self.work.view.panel:
             several = len(layer_selection.selected_layers(self.work)) > 1
             reveal = self._revealed != (self.work.focus, several)
-            with self._guarded():
+            with self._guard():
                 textures, missing = self.canvas.thumbnails(self.work.snapshots, self.work.view)
                 if missing:
                     self.wake()
@@ -354,7 +354,7 @@ class MainView:
             self._revealed = self.work.focus, several
         if not off:  # else the right button has said all it was pressed for
             tool, pointer, self._tool = self._tool, self._pointer(), MouseTool()  # put down if it raises
-            with self._guarded():
+            with self._guard():
                 self._tool, self.work = mouse.handle_mouse(tool, self.work, pointer)
 
     def _takes_keys(self) -> bool:
@@ -370,7 +370,7 @@ class MainView:
         self._keys = replace(self._keys, pressed=())
 
     def _perform(self, action: str) -> None:
-        with self._guarded():
+        with self._guard():
             self.work = interface.perform_actions(self.work, [action], self._pointer())
 
     def _pointer(self) -> PointerContext:
@@ -406,10 +406,10 @@ class MainView:
         pointer, before = self._pointer(), self.work
         over = max(self._popups) > 1  # a list over the question takes its keys
         pressed = [] if over else [press.chord for press in self._keys.pressed]
-        with self._guarded():
+        with self._guard():
             self.work = interface.draw_dialog(self.work, pointer, self.recent, pressed)
         original = self._shows_original
-        with self._guarded():
+        with self._guard():
             if self.cover is not None and not original:
                 pages.draw_cover(self.cover, self.work.view, pointer.size, pointer.area, self.ui)
         labels = self.canvas.comparer.labels(self.work.view)
@@ -454,7 +454,7 @@ class MainView:
         left = tuple(request for request in self.work.requests if request not in served)
         self.work = replace(self.work, requests=left)
         for request in served:
-            with self._guarded():
+            with self._guard():
                 self.show_message(self._save(request, screen, size))
 
     def _save(self, request: str, screen: moderngl.Framebuffer, size: tuple[int, int]) -> str:

@@ -115,7 +115,7 @@ def extend(gesture: Gesture, at: Point, radius: float) -> Gesture:
     return gesture if at == gesture.path[-1] else replace(gesture, path=(*gesture.path, at))
 
 
-def enclosed(gesture: Gesture, surface: Surface, through: bool) -> Mask:
+def rows_inside(gesture: Gesture, surface: Surface, through: bool) -> Mask:
     """What the gesture selects as it is. Arguments as of `begin`. [N]"""
     if gesture.brushed is not None:
         return gesture.brushed.touched
@@ -132,7 +132,7 @@ def enclosed(gesture: Gesture, surface: Surface, through: bool) -> Mask:
     return mask
 
 
-def clicked(
+def rows_at_click(
     tool: str,
     at: Point,
     surface: Surface,
@@ -221,7 +221,7 @@ def adjust(click: Click | None, work: Workspace, pointer: PointerContext) -> tup
 def _click(click: Click, work: Workspace, pointer: PointerContext) -> tuple[Click, Workspace]:
     """What a click selects by the tool as it is now."""
     options = work.view.select.tolerance, work.view.select.through
-    mask = clicked(click.tool, click.at, click.surface, *options, pointer.facts.neighborhood)
+    mask = rows_at_click(click.tool, click.at, click.surface, *options, pointer.facts.neighborhood)
     if mask is not None:
         work = _apply(click, work, mask, pointer)
     return replace(click, options=options, after=work.view.selection.members), work
@@ -234,7 +234,7 @@ def follow(gesture: Gesture, work: Workspace, pointer: PointerContext) -> Held:
     density = imgui.get_io().display_framebuffer_scale.x * pointer.ui.scale
     gesture = extend(gesture, pointer.cursor, work.view.select.radius * density)
     if gesture.tool in ("brush", "sphere"):
-        work = _apply(gesture, work, _enclosed(gesture, work, pointer), pointer)
+        work = _apply(gesture, work, _selected_rows(gesture, work, pointer), pointer)
     return gesture, work
 
 
@@ -250,7 +250,7 @@ def finish(gesture: Gesture, work: Workspace, pointer: PointerContext) -> Held:
     low, high = map(min, zip(*gesture.path, strict=True)), map(max, zip(*gesture.path, strict=True))
     small = max(b - a for a, b in zip(low, high, strict=True)) <= _TRAVEL_PX * pointer.ui.scale
     if not small:
-        return None, _apply(gesture, work, _enclosed(gesture, work, pointer), pointer)
+        return None, _apply(gesture, work, _selected_rows(gesture, work, pointer), pointer)
     return None, _with(work, selection.select_none(work.view.selection)) if gesture.mode == "new" else work
 
 
@@ -278,8 +278,8 @@ def _is_near(gesture: Gesture, pointer: PointerContext) -> bool:
     return len(gesture.path) > 2 and (x - cx) ** 2 + (y - cy) ** 2 <= reach * reach
 
 
-def _enclosed(gesture: Gesture, work: Workspace, pointer: PointerContext) -> Mask:
-    return enclosed(gesture, pointer.surface, work.view.select.through)
+def _selected_rows(gesture: Gesture, work: Workspace, pointer: PointerContext) -> Mask:
+    return rows_inside(gesture, pointer.surface, work.view.select.through)
 
 
 def _apply(gesture: Gesture | Click, work: Workspace, mask: Mask, pointer: PointerContext) -> Workspace:

@@ -108,7 +108,7 @@ class Child:
         return 1e-9 * ran, 1e-9 * waited
 
     @property
-    def starved(self) -> bool:
+    def is_starved(self) -> bool:
         """Whether other programs keep the processor from it: ready for half of the last seconds, it had less
         than a tenth of a core. False where that is unknown."""
         times, now, (since, had, waited) = self.processor_s, time.monotonic(), self._seen

@@ -265,7 +265,7 @@ class JobQueue:
         if progress.share == job.began_at:  # it is still starting, which takes as long as it takes
             self._began[job.number] = now
         seconds = now - self._began[job.number]
-        self._change(replace(job, progress=progress, seconds=seconds, starved=child.starved))
+        self._change(replace(job, progress=progress, seconds=seconds, starved=child.is_starved))
 
     def _look_elsewhere(self, job: Job) -> Job | None:
         """How far a run is that another window trains; the job once that has finished or discarded it."""

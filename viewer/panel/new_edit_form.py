@@ -36,7 +36,7 @@ from viewer.ui.widgets import (
     small,
     tip,
     value_slider,
-    wrapped,
+    wrapped_text,
 )
 
 COLUMN_PX = 66.0
@@ -106,7 +106,7 @@ def _content(work: Workspace, count: int, preview: tuple[str, bool], ui: UiConte
     form = _preview(form, preview, column, ui)
     error = form.error or missing_package(form.choice)
     if error:
-        wrapped(error, PALETTE.error)
+        wrapped_text(error, PALETTE.error)
     imgui.begin_disabled(bool(form.obstacle))
     if accent_button(f"{Icon.TRAIN}  Train", imgui.ImVec2(-1.0, 0.0)):
         action = "train"
@@ -227,7 +227,7 @@ def _preview(form: NewEdit, preview: tuple[str, bool], column: float, ui: UiCont
     tip("Strength of the preview. Training learns all strengths")
     state, failed = preview
     if form.preview and failed:
-        wrapped(state, PALETTE.error)
+        wrapped_text(state, PALETTE.error)
     else:
         small(state or " ", PALETTE.dim)  # always a line, so that nothing below moves
     return form

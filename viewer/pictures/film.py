@@ -291,7 +291,7 @@ def write(
         return f"wrote {out} ({count} pictures of {size}, drawn by {engine.draws_with})"
     check_output(out)
     total = sum(1 for _ in timeline.film_frames(keys))
-    drawn = _counted(frames(keys, view, still, engine, timeline.film_frames(keys)), total, advance)
+    drawn = _count_frames(frames(keys, view, still, engine, timeline.film_frames(keys)), total, advance)
     if out.suffix:
         with atomic_write(out) as temporary_file:
             write_film(temporary_file, drawn, keys.fps)
@@ -300,7 +300,7 @@ def write(
     return f"wrote {out} ({total} frames of {size}, {keys.fps} a second, drawn by {engine.draws_with})"
 
 
-def _counted(drawn: Iterable[Pixels], total: int, advance: Advance | None) -> Iterator[Pixels]:
+def _count_frames(drawn: Iterable[Pixels], total: int, advance: Advance | None) -> Iterator[Pixels]:
     for done, picture in enumerate(drawn, 1):
         yield picture
         if advance is not None:

@@ -59,10 +59,10 @@ class History:
 
 
 def edit_of(state: ViewState) -> Edit:
-    return Edit(**_edited(state))
+    return Edit(**_edit_values(state))
 
 
-def _edited(part: ViewState | Edit) -> dict[str, Any]:
+def _edit_values(part: ViewState | Edit) -> dict[str, Any]:
     return {field.name: getattr(part, field.name) for field in fields(Edit)}
 
 
@@ -143,7 +143,7 @@ def _take_changes(look: Look, before: Look, after: Look) -> Look:
 
 def apply_edit(state: ViewState, edit: Edit) -> ViewState:
     """`state` edited as in `edit`, seen from where it is."""
-    return replace(state, **_edited(edit))
+    return replace(state, **_edit_values(edit))
 
 
 def apply_present(state: ViewState, history: History) -> ViewState:

@@ -121,7 +121,7 @@ def blend(
     share = min(1.0, max(0.0, share))
     a, b = pair_of(snapshots, view.pair)
     pair = replace(view.pair, a=snapshots[a].name, b=snapshots[b].name, share=share)
-    ends = [restore(view, snapshots[i] if i else _faded(snapshots[j])) for i, j in ((a, b), (b, a))]
+    ends = [restore(view, snapshots[i] if i else _faded_snapshot(snapshots[j])) for i, j in ((a, b), (b, a))]
     if share in (0.0, 1.0):
         return replace(ends[round(share)], pair=pair)
     near, far = ends if share < 0.5 else ends[::-1]
@@ -172,7 +172,7 @@ def is_blend(view: ViewState, snapshots: Sequence[SliderSnapshot], counts: Calla
     return (made.layers, made.groups, made.blend) == (view.layers, view.groups, view.blend)
 
 
-def _faded(snapshot: SliderSnapshot) -> SliderSnapshot:
+def _faded_snapshot(snapshot: SliderSnapshot) -> SliderSnapshot:
     """The original as the other end of a slider: that snapshot with every strength at 0."""
     layers = tuple(replace(layer, strength=0.0) for layer in snapshot.edit.layers)
     return replace(snapshot, edit=replace(snapshot.edit, layers=layers))

@@ -53,7 +53,7 @@ layer, the focused one where none is named; `replace:INDEX` asks for its new edi
 `save_region:NAME`, `rename_region:INDEX:NAME`."""
 
 
-def _unknown() -> Neighborhood:
+def _no_neighborhood() -> Neighborhood:
     raise ValueError("nothing is known of this scene's neighborhood")
 
 
@@ -72,7 +72,7 @@ class SceneFacts:
     fit_members: Callable[[ViewCamera, float, Mask], ViewCamera] = lambda camera, *_: camera
     home: Fit = keep_camera  # gives the first camera for another up axis, which is the given camera's
     # of the scene's Gaussians, made when it is first asked for
-    neighborhood: Callable[[], Neighborhood] = _unknown
+    neighborhood: Callable[[], Neighborhood] = _no_neighborhood
 
 
 @dataclass(frozen=True)

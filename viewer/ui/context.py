@@ -122,7 +122,7 @@ class UiContext:
             _apply_style(scale)
 
     @contextmanager
-    def guarded(self, report: Callable[[Exception], None]) -> Iterator[None]:
+    def guard(self, report: Callable[[Exception], None]) -> Iterator[None]:
         """A part of a frame: what it raises ends it alone, with imgui's stacks as before it."""
         begun = imgui.internal.ErrorRecoveryState()
         drawing = imgui.get_current_context().within_frame_scope

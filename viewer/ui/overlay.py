@@ -200,7 +200,7 @@ def draw_axes(view: ViewState, area: Area, lit: bool, ui: UiContext) -> None:
     on = axis_under(view, area, ui) if lit else ""
     for end in _ends(view.camera, area, ui):
         sign, letter = end.name[0], end.name[1]
-        ink, at = _dimmed(_INKS[letter], end.nearness), imgui.ImVec2(end.x, end.y)
+        ink, at = _dim(_INKS[letter], end.nearness), imgui.ImVec2(end.x, end.y)
         if sign == "+":
             canvas.add_line(imgui.ImVec2(x, y), at, u32(_SHADE), 3.5 * s)
             canvas.add_line(imgui.ImVec2(x, y), at, u32(ink), 2.0 * s)
@@ -239,7 +239,7 @@ def _ends(camera: ViewCamera, area: Area, ui: UiContext) -> list[_End]:
     return sorted(ends, key=lambda end: end.nearness)
 
 
-def _dimmed(ink: Rgba, nearness: float) -> Rgba:
+def _dim(ink: Rgba, nearness: float) -> Rgba:
     """An ink as it is on an end that points so far towards the eye."""
     share = 1.0 - _AWAY * max(-nearness, 0.0)
     return ink[0] * share, ink[1] * share, ink[2] * share, ink[3]

@@ -48,7 +48,7 @@ def small(text: str, color: Rgba, room: float | None = None) -> None:
     imgui.pop_font()
 
 
-def wrapped(text: str, color: Rgba) -> None:
+def wrapped_text(text: str, color: Rgba) -> None:
     """Small text in as many lines as it takes."""
     imgui.push_font(None, SMALL_PX)
     imgui.push_text_wrap_pos(0.0)

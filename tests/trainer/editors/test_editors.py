@@ -177,7 +177,7 @@ def test_a_folder_that_does_not_fit_is_refused_in_one_line(tmp_path: Path, damag
 
 def test_an_edit_of_the_whole_picture_is_confined_to_the_region() -> None:
     view = small().views[0]
-    confined = view.confine(1.0 - view.image)
-    assert torch.equal(confined[view.mask == 0], view.image[view.mask == 0])
+    is_confined = view.confine(1.0 - view.image)
+    assert torch.equal(is_confined[view.mask == 0], view.image[view.mask == 0])
     inside = view.mask > 0.5
-    assert torch.allclose(confined[inside], 1.0 - view.image[inside], atol=1e-6)
+    assert torch.allclose(is_confined[inside], 1.0 - view.image[inside], atol=1e-6)

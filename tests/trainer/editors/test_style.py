@@ -33,7 +33,7 @@ def styles() -> None:
 def test_a_style_changes_the_region_and_nothing_else() -> None:
     case = small()
     editor = make_editor(EditorOptions("style:14"), case.scene, case.region, case.views)
-    assert (editor.kind, editor.stages, editor.confined) == ("style", (), True)
+    assert (editor.kind, editor.stages, editor.is_confined) == ("style", (), True)
     for view in case.views[:2]:
         assert torch.equal(editor.edit(view, 0.0), view.image)
         edited = editor.edit(view, 1.0)

@@ -45,7 +45,7 @@ class Halfway:
     offsets: Tensor
     stages: tuple[float, ...] = ()
     kind: EditKind = "style"
-    confined: bool = True
+    is_confined: bool = True
 
     def edit(self, view: View, strength: float) -> Tensor:
         assert strength == 0.5, "no other picture is needed"
@@ -68,7 +68,7 @@ def test_a_detour_that_the_editor_does_not_take_is_left() -> None:
     assert torch.equal(kept.end, bent.end)
     assert torch.equal(kept.at(0.25), 0.25 * bent.end)
     assert kept.stage_ends == (1,)
-    assert kept.asked == ((1.0, 1.0),)
+    assert kept.stage_strengths == ((1.0, 1.0),)
     assert why.startswith("straight: the editor's half")
 
 

@@ -33,7 +33,7 @@ class Late:
 
     stages: tuple[float, ...] = ()
     kind: EditKind = "color"
-    confined: bool = True
+    is_confined: bool = True
     power: float = 3.0
     asked: int = 0
 

@@ -28,7 +28,7 @@ def reedit_of(folder: Path, every: int = 10) -> Reedit:
     folder.mkdir(exist_ok=True)
     setup = TrainingSetup(case.scene, case.region, case.views[:4], case.views[4:], WHITE)
     editor = StyleEditor(negative, {"style": 1}, KeptPictures(folder / "painted"))
-    return Reedit(editor, setup, every, confined=False, log=RunLog(folder / "log.txt", quiet=True))
+    return Reedit(editor, setup, every, is_confined=False, log=RunLog(folder / "log.txt", quiet=True))
 
 
 def nothing_moved() -> Tensor:

@@ -266,7 +266,7 @@ def test_after_a_sentence_that_finds_nothing_another_can_be_tried(reddish: Asked
         train(with_values(options, region="text:unicorn"), quiet=True)
     done = train(with_values(options, region="text:scarf"), quiet=True)
     assert done.gdf.is_file()
-    assert len(list((done.folder.segmented / "scarf").glob("*.png"))) == 10
+    assert len(list((done.folder.segment_masks / "scarf").glob("*.png"))) == 10
 
 
 def test_prompts_are_asked_as_the_detector_was_trained() -> None:
@@ -325,7 +325,7 @@ def test_a_run_trains_a_region_that_a_sentence_names(tiny: RegionOptions, tmp_pa
     )
     done = train(options, quiet=True)
     assert done.gdf.is_file()
-    assert len(list((done.folder.segmented / "the-scarf").glob("*.png"))) == 6
+    assert len(list((done.folder.segment_masks / "the-scarf").glob("*.png"))) == 6
 
 
 def test_missing_weights_are_one_line_that_tells_how_to_get_them(

@@ -18,7 +18,7 @@ def written(root: Path) -> RunFolder:
     for kind, strength in (("original", 1.0), ("edited", 1.0), ("edited", 0.25)):
         write_views(folder, kind, {"a": PICTURE, "b": PICTURE}, strength)
     for name in "ab":
-        KeptPictures(folder.painted).picture(name, PICTURE, {}, lambda image: image)
+        KeptPictures(folder.paintings).picture(name, PICTURE, {}, lambda image: image)
     return folder
 
 

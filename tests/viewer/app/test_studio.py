@@ -32,7 +32,7 @@ class Trainer:
     ended: int | None = None
     line = ""
     edit: Path | None = None
-    starved = False
+    is_starved = False
 
     def __init__(self, arguments: Sequence[str], log: Path, talks: bool = False) -> None:
         type(self).said = arguments

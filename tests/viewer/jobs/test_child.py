@@ -109,7 +109,7 @@ def test_a_child_is_starved_that_is_ready_and_gets_next_to_nothing(
     monkeypatch.setattr(time, "monotonic", lambda: clock[0])
     monkeypatch.setattr(Child, "processor_s", property(lambda _: times[0]))
     started = child("--version")
-    assert not started.starved
+    assert not started.is_starved
     for now, starved in (
         ((5.0, 1.0), False),  # it works
         ((5.1, 5.9), True),  # ready all the time, it had a fiftieth
@@ -119,7 +119,7 @@ def test_a_child_is_starved_that_is_ready_and_gets_next_to_nothing(
     ):
         clock[0] += STARVED_S
         times[0] = now
-        assert started.starved == starved
+        assert started.is_starved == starved
 
 
 def test_a_child_stops_though_the_window_was_started_with_interrupts_ignored() -> None:

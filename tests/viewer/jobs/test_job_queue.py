@@ -35,7 +35,7 @@ def children_as_urgent_as_the_tests(monkeypatch: pytest.MonkeyPatch) -> None:
 class Waiting:
     """Stands for a child that trains until it is told to stop, and has saved something by then."""
 
-    starved = False
+    is_starved = False
 
     def __init__(self, arguments: Sequence[str], log: Path) -> None:
         self.status: int | None = None
@@ -240,7 +240,7 @@ def test_a_run_without_a_processor_says_so(stopped: EditOrder, monkeypatch: pyte
     queue.resume(1)
     queue.poll()
     for starved in (True, False, True):
-        monkeypatch.setattr(Waiting, "starved", starved)
+        monkeypatch.setattr(Waiting, "is_starved", starved)
         queue.poll()
         assert queue.jobs[0].starved == starved
     queue.stop(1)
