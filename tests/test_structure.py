@@ -47,8 +47,8 @@ MOST_LINES = 600
 
 # What a package may hold: modules, and lines of code (no blank, comment, docstring or import). A feature
 # says in its commit what it adds and what it replaces; these only fall.
-BUDGETS = {"progdf": (111, 9900), "trainer": (94, 7900), "viewer": (112, 11200)}
-MOST_IMPORTS = 0.080  # of all lines
+BUDGETS = {"progdf": (72, 9300), "trainer": (57, 7650), "viewer": (66, 10800)}
+MOST_IMPORTS = 0.073  # of all lines
 MOST_FUNCTION_LINES = 80
 MOST_POSITIONAL = 8
 LEAST_LINES = 80  # of a module that one other imports alone; it is a section of that one

@@ -90,17 +90,23 @@ class Previewer:
         self._view = lru_cache(maxsize=2)(self._make_view)
         self._editor = lru_cache(maxsize=2)(self._make_editor)
 
-    def picture(self, asked: Request) -> Tensor:
+    def picture(self, request: Request) -> Tensor:
         """The view as the editor makes it. [H,W,3] 0..1
 
         Raises:
             ProgdfError: region or editor do not work, or the view shows nothing of the region.
         """
-        seen = (asked.region, asked.viewmat, asked.K, (asked.width, asked.height), asked.background)
+        seen = (
+            request.region,
+            request.viewmat,
+            request.K,
+            (request.width, request.height),
+            request.background,
+        )
         view = self._view(*seen)
         if not bool((view.mask > 0.0).any()):
             return view.image
-        return self._editor(asked.editor, *seen).edit(view, asked.strength)
+        return self._editor(request.editor, *seen).edit(view, request.strength)
 
     def _find_region(self, spec: str) -> Region:
         request = RegionRequest(RegionOptions(spec), ViewOptions(scene=self._path), _no_masks, quiet=True)
@@ -141,8 +147,8 @@ class Previewer:
 def serve(argv: Sequence[str]) -> int:
     """Run `progdf preview`; 0 when its input has ended. Raises ProgdfError for a scene that does not work."""
     options = parse_options(PreviewOptions, argv, "progdf preview")
-    with tempfile.TemporaryDirectory(prefix="progdf-preview-") as kept:
-        previewer = Previewer(options.scene, Path(kept))
+    with tempfile.TemporaryDirectory(prefix="progdf-preview-") as cache:
+        previewer = Previewer(options.scene, Path(cache))
         lines: queue.SimpleQueue[str] = queue.SimpleQueue()
         threading.Thread(target=_read_lines, args=(lines,), daemon=True).start()
         while line := newest_line(lines):
@@ -154,14 +160,14 @@ def serve(argv: Sequence[str]) -> int:
 def answer(previewer: Previewer, line: str) -> Answer:
     """Write the picture that a line asks for; what went wrong is in the answer."""
     try:
-        asked = msgspec.json.decode(line, type=Request)
+        request = msgspec.json.decode(line, type=Request)
     except msgspec.MsgspecError as error:
         return Answer(-1, f"the request cannot be read: {error}")
     try:
-        write_image(Path(asked.out), previewer.picture(asked))
+        write_image(Path(request.out), previewer.picture(request))
     except (ProgdfError, OSError) as error:
-        return Answer(asked.number, " ".join(str(error).split()))
-    return Answer(asked.number)
+        return Answer(request.number, " ".join(str(error).split()))
+    return Answer(request.number)
 
 
 def _read_lines(lines: queue.SimpleQueue[str]) -> None:

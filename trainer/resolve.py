@@ -100,30 +100,30 @@ def resolve_kind(options: TrainOptions, kind: EditKind, group_steps: int) -> Opt
         kind: what the edit moves
         group_steps: as asked, or as a trial found; without effect where nothing moves
     """
-    asked = options.optimize
-    sharpness = SHARPNESS[kind] if asked.sharpness == "kind" else asked.sharpness
+    optimize = options.optimize
+    sharpness = SHARPNESS[kind] if optimize.sharpness == "kind" else optimize.sharpness
     solves_colors = (
         kind == "color"  # colors alone change, and nothing is asked for that only a descent view by view has
-        and asked.color_solver
-        and asked.rates == "kind"
-        and asked.progressive == "off"
+        and optimize.color_solver
+        and optimize.rates == "kind"
+        and optimize.progressive == "off"
         and sharpness == "off"
-        and not asked.perceptual_weight
-        and not asked.as_printed
+        and not optimize.perceptual_weight
+        and not optimize.as_printed
         and not options.editor.reedit_every
     )
     few = solves_colors and bool(options.views.pictures)
-    weight, most = asked.perceptual_weight, STAGES[kind]
+    weight, most = optimize.perceptual_weight, STAGES[kind]
     return replace(
-        asked,
+        optimize,
         kind=kind,
-        stages=asked.stages or min(most, QUICK_STAGES if asked.steps < STAGE_STEPS * most else most),
+        stages=optimize.stages or min(most, QUICK_STAGES if optimize.steps < STAGE_STEPS * most else most),
         group_steps=group_steps if kind == "geometry" else 0,
         # only an edit of colors may leave the bands alone
-        sh="on" if asked.sh == "auto" and kind != "color" else asked.sh,
+        sh="on" if optimize.sh == "auto" and kind != "color" else optimize.sh,
         perceptual_weight=PERCEPTUAL_WEIGHT[kind] if weight is None else weight,
         sharpness=sharpness,
-        propagation=asked.propagation and not few,
+        propagation=optimize.propagation and not few,
         solver="pictures" if few else "colors" if solves_colors else "descent",
     )
 

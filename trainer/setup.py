@@ -64,16 +64,16 @@ def unresolved_share(
         image_size: longer side in pixels
         views: how many there will be
     """
-    shown = torch.zeros(len(region))
+    weight = torch.zeros(len(region))
     looks = cameras[:: max(1, len(cameras) // _LOOKS)][:_LOOKS]
     for camera in looks:
         small = fit_size(camera, _LOOK)
         area = (image_size / max(small.width, small.height)) ** 2
         weights = alpha_weights(scene, small, torch.ones(small.height, small.width))
-        shown += area * weights[region.members, 2]
-    shown *= views / max(1, len(looks))
-    visible = shown > 0
-    return float((shown[visible] < 1.0).float().mean()) if bool(visible.any()) else 0.0
+        weight += area * weights[region.members, 2]
+    weight *= views / max(1, len(looks))
+    visible = weight > 0
+    return float((weight[visible] < 1.0).float().mean()) if bool(visible.any()) else 0.0
 
 
 def choose_resolution(
@@ -159,18 +159,18 @@ def make_training_setup(options: ViewOptions, scene: Gaussians, region: Region) 
     given = [] if options.cameras is None else load_cameras(options.cameras, scene.origin)
     up = find_up(scene, given, options.up, options.scene)
     if options.pictures:
-        if options.up == "auto" and (shown := _up_of_pictures(options.pictures)) is not None:
-            up = shown
+        if options.up == "auto" and (pictured_up := _up_of_pictures(options.pictures)) is not None:
+            up = pictured_up
         return _picture_setup(options, scene, region, given, up)
     if options.cameras is None and is_surrounding(scene, up.direction):
         raise ProgdfError(f"the scene {INSIDE}")
 
     def cameras_of(image_size: int, views: int) -> list[Camera]:
         if options.cameras is not None:
-            found = [fit_size(camera, image_size) for camera in given]
+            fitted = [fit_size(camera, image_size) for camera in given]
         else:  # half as many again, as some will find the region hidden
-            found = region_rig(scene, region, views + views // 2, image_size, up.direction)
-        return with_near_plane(name_cameras(found), scene)
+            fitted = region_rig(scene, region, views + views // 2, image_size, up.direction)
+        return with_near_plane(name_cameras(fitted), scene)
 
     cameras, views, unresolved = choose_resolution(options, scene, region, cameras_of)
     choice = choose_views(scene, region, cameras, views, background)
@@ -241,21 +241,21 @@ def edit_views(
         strength: [folder.view("edited", v.camera.name, strength) for v in views] for strength in strengths
     }
 
-    def edit(asked: tuple[float, int]) -> Tensor:
-        strength, i = asked
+    def edit(requeststs: tuple[float, int]) -> Tensor:
+        strength, i = requeststs
         made = editor.edit(views[i], strength)
         picture = quantize_image(views[i].confine(made) if is_confined else made)
         write_image(paths[strength][i], picture)
         return picture
 
     add_pictures(folder.views, [path for some in paths.values() for path in some])
-    asked = [(strength, i) for strength in strengths for i in range(len(views))]
+    requests = [(strength, i) for strength in strengths for i in range(len(views))]
     edited: dict[float, list[Tensor]] = {strength: [] for strength in strengths}
     with ThreadPoolExecutor(threads()) as pool:
         # the others have a network, or draw: these use all cores by themselves
-        made = pool.map(edit, asked) if isinstance(editor, ColorEditor) else map(edit, asked)
+        made = pool.map(edit, requests) if isinstance(editor, ColorEditor) else map(edit, requests)
         try:
-            for done, ((strength, _), picture) in enumerate(zip(asked, made, strict=True), 1):
+            for done, ((strength, _), picture) in enumerate(zip(requests, made, strict=True), 1):
                 edited[strength].append(picture)
                 advance(done, f"strength {strength:g}")
         except BaseException:

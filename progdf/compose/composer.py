@@ -208,9 +208,9 @@ class Composer:
             rows = chosen[0] if len(chosen) == 1 else np.unique(np.concatenate(chosen))
             parts = {}
             for edit, members in enumerate(self._members):
-                _, own, at = np.intersect1d(members, rows, assume_unique=True, return_indices=True)
-                if len(own):
-                    parts[edit] = own, at
+                _, members_at, at = np.intersect1d(members, rows, assume_unique=True, return_indices=True)
+                if len(members_at):
+                    parts[edit] = members_at, at
             self._plans[changed] = _Plan(rows, parts)
         return self._plans[changed]
 
@@ -345,8 +345,12 @@ def _finish(
                 largest = max(largest, step)
         row = rows[first]
         if rows[first + count - 1] - row == count - 1:
-            new, old, own = after[row : row + count], before[row : row + count], total[first : first + count]
-            new_run, old_run, own_run = new.reshape(-1), old.reshape(-1), own.reshape(-1)
+            new, old, offsets = (
+                after[row : row + count],
+                before[row : row + count],
+                total[first : first + count],
+            )
+            new_run, old_run, own_run = new.reshape(-1), old.reshape(-1), offsets.reshape(-1)
             for j in range(count * width):
                 new_run[j] = old_run[j] + own_run[j]
             continue

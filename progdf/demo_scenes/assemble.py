@@ -175,8 +175,8 @@ def assemble(
     pieces: list[Gaussians] = []
     labels: list[Tensor] = []
     with one_thread():  # hundreds of small tensor operations
-        counts, shown = _budget(parts, size)
-        for part, count, share in zip(parts, counts, shown, strict=True):
+        counts, shares = _budget(parts, size)
+        for part, count, share in zip(parts, counts, shares, strict=True):
             at = _sample_visible(parts, part, count, share, random)
             pieces.append(_make_gaussians(parts, part, at, paint(part, at, table), daylight, random))
             labels.append(torch.full((count,), label_names.index(part.label), dtype=torch.uint8))

@@ -170,9 +170,9 @@ def alpha_weights(gaussians: ActivatedGaussians, view: RasterView, mask: Tensor)
         for x in range(0, width, TILE):
             alphas, weights, _, members = tile_weights(splats, x, y)
             tile = inside[:, y : y + TILE, x : x + TILE].reshape(2, -1)
-            touched = (alphas > 0).to(means.dtype)
+            covered = (alphas > 0).to(means.dtype)
             sums = torch.stack(
-                [tile[0] @ weights, tile[0] @ touched, tile[1] @ weights, tile[1] @ touched], dim=1
+                [tile[0] @ weights, tile[0] @ covered, tile[1] @ weights, tile[1] @ covered], dim=1
             )
             totals.index_add_(0, splats.rows[members], sums)
     return totals

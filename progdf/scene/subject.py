@@ -84,15 +84,15 @@ def fit_eye(points: Tensor, radius: float, axes: Tensor, tangents: tuple[float, 
         tangents: of half the angle that is to be filled, along the width and along the height
     """
     right, up, back = (points.double() @ axes.double().T).unbind(1)
-    place, away = [], -math.inf
+    best, away = [], -math.inf
     for along, tangent in ((right, tangents[0]), (up, tangents[1])):
         # |along − place| ≤ tangent · (away − back) for every point: two planes, which meet at the eye
         margin = radius * math.sqrt(1 + tangent**2)
         high = float(_quantile(along + tangent * back, 0.995)) + margin
         low = float(_quantile(tangent * back - along, 0.995)) + margin
-        place.append(0.5 * (high - low))
+        best.append(0.5 * (high - low))
         away = max(away, 0.5 * (high + low) / tangent)
-    return torch.tensor([*place, away], dtype=torch.float64) @ axes.double()
+    return torch.tensor([*best, away], dtype=torch.float64) @ axes.double()
 
 
 def is_room(scene: Gaussians, up: Tensor) -> bool:

@@ -63,8 +63,8 @@ class KeptPictures:
         if path is None:
             return _eight_bits(paint(source))
         note = path.with_suffix(".json")
-        wanted = {"source": digest(source), "editor": dict(recipe)}
-        if _read_note(note) == wanted:
+        expected = {"source": digest(source), "editor": dict(recipe)}
+        if _read_note(note) == expected:
             try:
                 return read_picture(path, size=(source.shape[1], source.shape[0]))
             except ProgdfError:
@@ -74,7 +74,7 @@ class KeptPictures:
         write_image(path, painted)
         with atomic_write(note) as temporary_file:
             temporary_file.write_text(
-                json.dumps(wanted, indent=2, ensure_ascii=False) + "\n", encoding="utf-8"
+                json.dumps(expected, indent=2, ensure_ascii=False) + "\n", encoding="utf-8"
             )
         assert self.folder is not None
         add_pictures(self.folder, [path, note])

@@ -182,8 +182,8 @@ def instruct(
     what: str, scene: Gaussians, region: Region, views: Sequence[View], options: EditorOptions
 ) -> InstructEditor:
     """`instruct:"…"`: the model and its options are checked now, its weights are loaded when first needed."""
-    model, kind, asked = _resolve_request(what, options)
-    prompt = asked.prompt
+    model, kind, request = _resolve_request(what, options)
+    prompt = request.prompt
 
     @cache
     def pipeline() -> Any:
@@ -193,15 +193,15 @@ def instruct(
         "instruct": prompt,
         "model": model,
         "pipeline": kind,
-        "image_guidance": asked.image_guidance,
-        "steps": asked.steps,
-        "size": asked.size,
-        "seed": asked.seed,
+        "image_guidance": request.image_guidance,
+        "steps": request.steps,
+        "size": request.size,
+        "seed": request.seed,
     }
-    graded = options.graded and asked.guidance > 1.0
+    graded = options.graded and request.guidance > 1.0
     return InstructEditor(
-        lambda picture, guidance: _run_pipeline(pipeline(), asked, picture, guidance),
-        asked.guidance,
+        lambda picture, guidance: _run_pipeline(pipeline(), request, picture, guidance),
+        request.guidance,
         recipe,
         KeptPictures(options.cache),
         stages=() if graded else (1.0,),
@@ -219,10 +219,10 @@ def check_instruct(what: str, options: EditorOptions) -> None:
         folder = folder_of_model(model, "model_index.json")
         parts = json.loads((folder / "model_index.json").read_bytes())
         for name, made in parts.items():
-            wanted = isinstance(made, list) and made[0] and name not in ADAPTERS[kind].loading
-            if wanted and not (folder / name).is_dir():
+            missing = isinstance(made, list) and made[0] and name not in ADAPTERS[kind].loading
+            if missing and not (folder / name).is_dir():
                 raise OSError(f"{folder} has no {name}")
-            if wanted and (folder / name / "config.json").is_file():
+            if missing and (folder / name / "config.json").is_file():
                 check_weights_here(folder / name)
     except BROKEN as error:
         raise _missing(model) from error
@@ -310,15 +310,17 @@ def load_pipeline(model: str, kind: str) -> Any:
     return pipeline.to("cuda" if gpu else "cpu")
 
 
-def _run_pipeline(pipeline: Any, asked: _Request, view: Tensor, guidance: float) -> Tensor:
+def _run_pipeline(pipeline: Any, request: _Request, view: Tensor, guidance: float) -> Tensor:
     """One picture through a pipeline, back at its own size. [H,W,3] -> [H,W,3]"""
     source = to_picture(view)
-    scale = asked.size / max(source.size)
+    scale = request.size / max(source.size)
     width, height = (max(_MULTIPLE, round(side * scale / _MULTIPLE) * _MULTIPLE) for side in source.size)
     picture = source.resize((width, height), Image.Resampling.LANCZOS)
-    arguments = asked.adapter.arguments(asked.prompt, picture, asked.steps, guidance, asked.image_guidance)
+    arguments = request.adapter.arguments(
+        request.prompt, picture, request.steps, guidance, request.image_guidance
+    )
     # the same noise in every view: what the picture leaves open is then decided alike
-    noise = torch.Generator().manual_seed(asked.seed)
+    noise = torch.Generator().manual_seed(request.seed)
     edited = pipeline(**arguments, generator=noise).images[0]
     edited = edited.convert("RGB").resize(source.size, Image.Resampling.LANCZOS)
     return torch.from_numpy(np.asarray(edited, dtype=np.float32) / 255.0)

@@ -110,7 +110,7 @@ def picture_paths(what: str) -> tuple[Path, ...]:
 
 def strengths_of(path: Path) -> dict[float, Path]:
     """Strength → picture: those of its name in subfolders that are named for one, and itself at 1."""
-    found = {1.0: path}
+    paths = {1.0: path}
     for child in sorted(path.parent.iterdir()):
         try:
             strength = float(child.name)
@@ -121,8 +121,8 @@ def strengths_of(path: Path) -> dict[float, Path]:
                 raise ProgdfError(
                     f"{child} is named for a strength that is not between 0 and 1; name it 0.25, 0.5, …"
                 )
-            found[strength] = child / path.name
-    return found
+            paths[strength] = child / path.name
+    return paths
 
 
 def picture_cameras(paths: Sequence[Path], given: Sequence[Camera], origin: Origin = ZERO) -> list[Camera]:
@@ -251,8 +251,8 @@ def lay_over(original: Tensor, picture: Tensor) -> Tensor:
     expected, (height, width) = a[rows, columns], edges.shape
 
     def misfit(shift: tuple[int, int]) -> float:
-        found = b[(rows - shift[0]).clip(0, height - 1), (columns - shift[1]).clip(0, width - 1)]
-        return float(np.quantile(np.abs(found - expected).max(axis=1), STILL))
+        shifted = b[(rows - shift[0]).clip(0, height - 1), (columns - shift[1]).clip(0, width - 1)]
+        return float(np.quantile(np.abs(shifted - expected).max(axis=1), STILL))
 
     if misfit((0, 0)) <= STEP:  # it lies where it lay
         return picture
@@ -306,10 +306,10 @@ class FolderEditor:
             return view.image
         if strength not in self.folders:
             raise ValueError(f"no folder holds strength {strength:g}; there are {list(self.stages)}")
-        picture, shown = self._read_undistorted(self.folders[strength], view)
+        picture, visible = self._read_undistorted(self.folders[strength], view)
         if self.originals is not None:
             picture = (view.image + picture - self._read_undistorted(self.originals, view)[0]).clamp(0.0, 1.0)
-        return torch.where(shown[..., None], picture, view.image)
+        return torch.where(visible[..., None], picture, view.image)
 
     def _read_undistorted(self, where: Path, view: View) -> tuple[Tensor, Tensor]:
         """A picture at its view's size, straight, and which of its pixels were taken. [H,W,3], [H,W] bool"""

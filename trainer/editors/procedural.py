@@ -36,9 +36,9 @@ class ColorEditor:
 
     def edit(self, view: View, strength: float) -> Tensor:
         """See `ImageEditor.edit`."""
-        shown = view.mask > 0
+        visible = view.mask > 0
         inside = view.inside.clone()
-        inside[shown] = self.change(view.inside[shown], strength)
+        inside[visible] = self.change(view.inside[visible], strength)
         return view.blend(inside)
 
 
@@ -78,16 +78,16 @@ def recolor(
     what: str, scene: Gaussians, region: Region, views: Sequence[View], options: EditorOptions
 ) -> ColorEditor:
     """`recolor:#rrggbb[,path=hue]`: another color, the shading kept."""
-    (target, path), own = paint_of(what), region_color(views)
-    return ColorEditor(lambda rgb, strength: color.recolor(rgb, target, strength, own, path))
+    (target, path), typical = paint_of(what), region_color(views)
+    return ColorEditor(lambda rgb, strength: color.recolor(rgb, target, strength, typical, path))
 
 
 def tint(
     what: str, scene: Gaussians, region: Region, views: Sequence[View], options: EditorOptions
 ) -> ColorEditor:
     """`tint:#rrggbb[,path=hue]`: a wash of color, lightness kept."""
-    (target, path), own = paint_of(what), region_color(views)
-    return ColorEditor(lambda rgb, strength: color.tint(rgb, target, strength, own, path))
+    (target, path), typical = paint_of(what), region_color(views)
+    return ColorEditor(lambda rgb, strength: color.tint(rgb, target, strength, typical, path))
 
 
 def darken(

@@ -64,8 +64,8 @@ class StyleEditor:
         box = all_of_it if self.whole else region_box(view.mask)
         looked_at = None if source is None else crop(source, box)
         painted = self.kept.picture(view.camera.name, looked_at, self.recipe, self.paint, place)
-        shown = (view.mask > 1e-4)[..., None]
-        inside = torch.where(shown, view.inside, view.image)
+        visible = (view.mask > 1e-4)[..., None]
+        inside = torch.where(visible, view.inside, view.image)
         x0, y0, x1, y1 = box
         inside[y0:y1, x0:x1] = cross_fade(crop(inside, box), painted, strength)
         return view.blend(inside)
@@ -81,8 +81,8 @@ def cross_fade(plain: Tensor, painted: Tensor, strength: float) -> Tensor:
     if strength in (0.0, 1.0):
         return painted if strength else plain
     fade = torch.lerp(plain, painted, strength)
-    smooth, wanted = _smooth(fade), torch.lerp(_contrast(plain), _contrast(painted), strength)
-    gain = (wanted / _contrast(fade).clamp_min(1e-4)).clamp(1.0, 2.0)
+    smooth, target = _smooth(fade), torch.lerp(_contrast(plain), _contrast(painted), strength)
+    gain = (target / _contrast(fade).clamp_min(1e-4)).clamp(1.0, 2.0)
     return (smooth + gain * (fade - smooth)).clamp(0.0, 1.0)
 
 

@@ -61,9 +61,9 @@ def evaluation_picture(opened: OpenedRun, evaluation: Evaluation) -> Tensor:
 def _warp_sheet(pair: WarpedPair) -> Tensor:
     """A view, another warped onto it, and what differs: of the edited scene and of the original."""
     depth = pair.depth
-    shown = depth > 0
-    near, far = (float(depth[shown].quantile(q)) if bool(shown.any()) else q for q in (0.02, 0.98))
-    gray = torch.where(shown, 1 - 0.85 * ((depth - near) / max(far - near, 1e-9)).clamp(0, 1), 1.0)
+    visible = depth > 0
+    near, far = (float(depth[visible].quantile(q)) if bool(visible.any()) else q for q in (0.02, 0.98))
+    gray = torch.where(visible, 1 - 0.85 * ((depth - near) / max(far - near, 1e-9)).clamp(0, 1), 1.0)
     rows = []
     for whose in (EDITED, UNEDITED):
         view, warped = pair.pictures[whose]

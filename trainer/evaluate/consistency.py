@@ -63,7 +63,7 @@ def view_consistency(opened: OpenedRun, perceptual: Perceptual) -> Consistency:
     """
     scene, views, background = opened.run.scene, opened.setup.judging, opened.setup.background
     edited = finished_scene(opened)
-    whole = {
+    pictures_by_side = {
         EDITED: [render_view(edited, view.camera, background).clamp(0, 1) for view in views],
         EDITOR: judging_pictures(opened, "edited"),
         UNEDITED: [view.image for view in views],
@@ -79,12 +79,12 @@ def view_consistency(opened: OpenedRun, perceptual: Perceptual) -> Consistency:
         for source in range(len(views)):
             if source == target:
                 continue
-            pair = _warp(opened.evaluator, whole, seen, source, target)
+            pair = _warp(opened.evaluator, pictures_by_side, seen, source, target)
             best = pair if best is None or pair.shared > best.shared else best
         if best is not None and best.shared >= _LEAST_SHARED:
             pairs.append(best)
     lpips, decibels = {}, {}
-    for whose in whole:
+    for whose in pictures_by_side:
         compared = [pair.pictures[whose] for pair in pairs]
         with torch.no_grad():
             distances = [float(perceptual(warped, shown)) for shown, warped in compared]
@@ -137,8 +137,8 @@ def _warp(
         both &= crop(visible, box)
     pictures = {}
     for whose, (picture, _) in warped.items():
-        shown = crop(whole[whose][target], box)
-        pictures[whose] = (shown, torch.where(both[..., None], crop(picture, box), shown))
+        target_picture = crop(whole[whose][target], box)
+        pictures[whose] = (target_picture, torch.where(both[..., None], crop(picture, box), target_picture))
     depth, alpha = (crop(plane, box) for plane in seen[EDITED][target].depth)
     names = evaluator.names
     shared = float(both.sum()) / max(1, int(counted.sum()))
@@ -203,8 +203,10 @@ def warp_view(image: Tensor, source: SeenDepth, target: SeenDepth) -> tuple[Tens
     # pixel centers lie at +0.5, as those of `grid_sample` without align_corners do
     grid = torch.stack([2 * u / there.width - 1, 2 * v / there.height - 1], dim=2).clamp(-2, 2)
     planes = torch.cat([image, source.depth.depth[..., None], source.depth.alpha[..., None]], dim=2)
-    found = grid_sample(planes.permute(2, 0, 1)[None], grid[None], align_corners=False, padding_mode="border")
-    warped, depth, alpha = found[0, :3].permute(1, 2, 0), found[0, 3], found[0, 4]
+    sampled = grid_sample(
+        planes.permute(2, 0, 1)[None], grid[None], align_corners=False, padding_mode="border"
+    )
+    warped, depth, alpha = sampled[0, :3].permute(1, 2, 0), sampled[0, 3], sampled[0, 4]
     both = inside & (target.depth.alpha > _OPAQUE) & (alpha > _OPAQUE)
     return warped, both & ((depth - z).abs() <= _SAME_PLACE * z)
 
@@ -245,8 +247,8 @@ def clip_consistency(opened: OpenedRun) -> tuple[float | None, str]:
         clip.pictures([render_view(scene, camera, opened.setup.background) for camera in path])
         for scene in (opened.run.scene, finished_scene(opened))
     )
-    found = neighbor_similarity(before, after)
-    return found, "" if found is not None else "the edit changes nothing that CLIP sees"
+    similarity = neighbor_similarity(before, after)
+    return similarity, "" if similarity is not None else "the edit changes nothing that CLIP sees"
 
 
 def neighbor_similarity(before: Tensor, after: Tensor) -> float | None:

@@ -102,8 +102,8 @@ def _edited_rows(curves: Mapping[str, ErrorCurve], lpips: str, views: str) -> li
 
 def _path_rows(paths: Mapping[str, SliderPath], lpips: str) -> list[Row]:
     def of(value: str) -> dict[str, float | None]:
-        found = {name: float(getattr(path, value)) for name, path in paths.items()}
-        return {name: None if math.isnan(number) else number for name, number in found.items()}
+        numbers = {name: float(getattr(path, value)) for name, path in paths.items()}
+        return {name: None if math.isnan(number) else number for name, number in numbers.items()}
 
     return [
         Row("evenness", "20 equal steps: evenness, least over largest change", of("evenness"), 2),
@@ -115,11 +115,11 @@ def _path_rows(paths: Mapping[str, SliderPath], lpips: str) -> list[Row]:
     ]
 
 
-def _consistency_rows(found: Consistency, lpips: str) -> list[Row]:
-    missing = "" if found.pairs else "no two held-out views see enough of the same"
+def _consistency_rows(consistency: Consistency, lpips: str) -> list[Row]:
+    missing = "" if consistency.pairs else "no two held-out views see enough of the same"
     return [
-        Row("warped_lpips", f"one view warped onto another, {lpips}", dict(found.lpips), 3, missing),
-        Row("warped_psnr", "one view warped onto another, PSNR, dB", dict(found.psnr), 1, missing),
+        Row("warped_lpips", f"one view warped onto another, {lpips}", dict(consistency.lpips), 3, missing),
+        Row("warped_psnr", "one view warped onto another, PSNR, dB", dict(consistency.psnr), 1, missing),
     ]
 
 

@@ -45,30 +45,34 @@ class Evaluator:
         """One view with these offsets. [M,C] -> [h,w,3]"""
         return replace(self, crops=[self.crops[view]]).pictures(offsets)[0]
 
-    def psnr(self, found: Sequence[Tensor], expected: Sequence[Tensor]) -> float:
+    def psnr(self, pictures: Sequence[Tensor], expected: Sequence[Tensor]) -> float:
         """PSNR over the pixels that count, all views together, dB; 99 where nothing differs."""
         error = count = 0.0
-        for a, b, pixels in zip(found, expected, self.pixels, strict=True):
+        for a, b, pixels in zip(pictures, expected, self.pixels, strict=True):
             error += float((a[pixels] - b[pixels]).double().square().sum())
             count += 3 * int(pixels.sum())
         return decibels(error / max(count, 1))
 
-    def ssim(self, found: Sequence[Tensor], expected: Sequence[Tensor]) -> float:
+    def ssim(self, pictures: Sequence[Tensor], expected: Sequence[Tensor]) -> float:
         """SSIM over the pixels that count, all views together, at most 1."""
         total = count = 0.0
-        for a, b, pixels in zip(found, expected, self.pixels, strict=True):
+        for a, b, pixels in zip(pictures, expected, self.pixels, strict=True):
             if here := int(pixels.sum()):
                 total += here * float(ssim(a, b, pixels))
                 count += here
         return total / count if count else 1.0
 
     def perceptual(
-        self, found: Sequence[Tensor], expected: Sequence[Tensor], measure: Perceptual, key: Hashable = None
+        self,
+        pictures: Sequence[Tensor],
+        expected: Sequence[Tensor],
+        measure: Perceptual,
+        key: Hashable = None,
     ) -> float:
         """Mean perceptual distance of the boxes. `key`: of the expected pictures, see `Perceptual`"""
         keys = [None if key is None else (key, i) for i in range(len(expected))]
         with torch.no_grad():
-            values = [float(measure(a, b, k)) for a, b, k in zip(found, expected, keys, strict=True)]
+            values = [float(measure(a, b, k)) for a, b, k in zip(pictures, expected, keys, strict=True)]
         return sum(values) / max(1, len(values))
 
     def halves(self) -> tuple[Evaluator, Evaluator]:

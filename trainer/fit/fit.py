@@ -78,11 +78,11 @@ def choose_path(
     def nearest(way: Trajectory) -> float:
         return max(evaluator.psnr(evaluator.pictures(way.at(s)), evaluator.edited[0.5]) for s in _HALFWAY)
 
-    own, direct = nearest(trajectory), nearest(line)
-    found = (
-        f"the editor's half is met to {own:.1f} dB by the recorded way, to {direct:.1f} dB by a straight one"
+    ours, direct = nearest(trajectory), nearest(line)
+    why = (
+        f"the editor's half is met to {ours:.1f} dB by the recorded way, to {direct:.1f} dB by a straight one"
     )
-    return (trajectory, f"as recorded: {found}") if own >= direct + _BETTER else (line, f"straight: {found}")
+    return (trajectory, f"as recorded: {why}") if ours >= direct + _BETTER else (line, f"straight: {why}")
 
 
 BASELINES = (2, 4)
@@ -235,7 +235,7 @@ def drop_idle_attributes(
     costs: dict[str, float] = {}
     slices = attribute_slices(end.shape[1])
     target = evaluator.edited[1.0]
-    now = whole = evaluator.psnr(evaluator.pictures(end), target)
+    now = complete = evaluator.psnr(evaluator.pictures(end), target)
     for name in ("shN", "quats", "log_scales", "means", "logit_opacities"):
         if name not in slices or not bool(end[:, slices[name]].any()):
             continue
@@ -243,7 +243,7 @@ def drop_idle_attributes(
         tried[:, slices[name]] = 0.0
         then = evaluator.psnr(evaluator.pictures(tried), target)
         costs[name] = round(now - then, 3)
-        if prunes and whole - then < _PAYS:
+        if prunes and complete - then < _PAYS:
             now = then
             offsets = offsets.clone()
             offsets[:, :, slices[name]] = 0.0

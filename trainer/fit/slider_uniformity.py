@@ -64,10 +64,10 @@ def equalized_strengths(
     if max(steps) > _JUMP * sum(steps):
         return plain
     _, due = _spread(even, pictures, 1)
-    asked = interpolate(torch.tensor(plain, dtype=torch.float64), even, due)
-    found = (*(round(float(s), 3) for s in asked[:-1]), 1.0)
-    rises = all(b - a > 5e-4 for a, b in zip((0.0, *found), found, strict=False))
-    return found if rises else plain
+    even_strengths = interpolate(torch.tensor(plain, dtype=torch.float64), even, due)
+    rounded = (*(round(float(s), 3) for s in even_strengths[:-1]), 1.0)
+    rises = all(b - a > 5e-4 for a, b in zip((0.0, *rounded), rounded, strict=False))
+    return rounded if rises else plain
 
 
 def equalize_slider(
@@ -121,8 +121,8 @@ def equalizing_remap(seen: Callable[[float], Tensor], passes: int = _PASSES) -> 
         best, following = -1.0, places
         for _ in range(passes + 1):
             current = following
-            shown = [interpolate_at(looked, pictures, float(s)) for s in current]
-            uniformity, following = _spread(current, shown, _FINE)
+            blended = [interpolate_at(looked, pictures, float(s)) for s in current]
+            uniformity, following = _spread(current, blended, _FINE)
             if uniformity > best:
                 best, places = uniformity, current
     return SliderRemap(places[::_FINE].contiguous(), even[::_FINE].contiguous())

@@ -62,8 +62,8 @@ class ColorView:
 
     def error(self, offsets: Tensor, target: Tensor) -> float:
         """Sum of squared differences, of colors 0..1. [M,B,3], [h,w,3]"""
-        found = self.picture(self.colors(offsets)).clamp(0.0, 1.0)
-        return float((found - target).square().sum())
+        image = self.picture(self.colors(offsets)).clamp(0.0, 1.0)
+        return float((image - target).square().sum())
 
 
 def color_view(crop: CropScene, original: Tensor, bands: int) -> ColorView:
@@ -76,8 +76,8 @@ def color_view(crop: CropScene, original: Tensor, bands: int) -> ColorView:
     weighed = color_map(crop.gaussians, camera, crop.box, crop.rows)
     picture = crop.original()
     if crop.cached is not None:
-        live, rest = crop.cached
-        picture = torch.where(live, picture, rest)
+        live, constant = crop.cached
+        picture = torch.where(live, picture, constant)
     return ColorView(
         weighed,
         picture - weighed.picture(colors.clamp_min(0.0)),
@@ -99,11 +99,11 @@ def _pull_into_range(view: ColorView, offsets: Tensor, target: Tensor, finished:
     """A clamp passes what would bring its value back into the range, as `clamp_towards` does."""
     raw = view.colors(offsets)
     rendered = view.picture(raw)
-    shown = rendered.clamp(0.0, 1.0)
-    apart = shown - target
+    image = rendered.clamp(0.0, 1.0)
+    apart = image - target
     back = view.map.gradient(apart * leads_back(rendered, 0.0, 1.0, apart))
     back = back * leads_back(raw, 0.0, math.inf, back)
-    return _Pull(back, float(apart.square().sum()), float(l1(shown, finished)))
+    return _Pull(back, float(apart.square().sum()), float(l1(image, finished)))
 
 
 def leads_back(value: Tensor, low: float, high: float, slope: Tensor) -> Tensor:
@@ -181,12 +181,12 @@ def make_solver(crops: Sequence[CropScene], original: Tensor, trained_bands: boo
 
     def weigh(view: ColorView) -> Tensor:
         ones = torch.ones(view.map.count, 3)
-        shown = view.map.gradient(view.map.picture(ones))[:, :1]
+        weight = view.map.gradient(view.map.picture(ones))[:, :1]
         # (Σ a)² ≤ 2 a0² + 2 (Σ others)²: DC is not slowed down by the number of bands
         size = view.basis.abs()
         others = size[:, 1:].sum(dim=1, keepdim=True)
         bound = torch.cat([size[:, :1].square(), size[:, 1:] * others], dim=1) * (2.0 if bands > 1 else 1.0)
-        return bound * shown
+        return bound * weight
 
     weights = torch.stack(_map_threads(weigh, views)).sum(dim=0)[..., None]
     return Solver(views, weights, members.shN[:, : bands - 1], members.sh0)
@@ -223,12 +223,12 @@ def solve(
             moved = state.moved.detach()[:, columns].reshape(len(original), -1, 3)
             before = state.previous[:, columns].reshape(len(original), -1, 3)
             ahead = moved + (moved - before) * (state.local / (state.local + 3.0))
-            found, squared, state.running = solver.step(ahead, stage.targets, finished)
-            if not math.isfinite(squared) or not math.isfinite(float(found.sum())):
+            offsets, squared, state.running = solver.step(ahead, stage.targets, finished)
+            if not math.isfinite(squared) or not math.isfinite(float(offsets.sum())):
                 raise FloatingPointError(f"the loss is {squared} at step {state.step}")
             state.previous.copy_(state.moved.detach())
             with torch.no_grad():
-                state.moved[:, columns] = found.flatten(1)
+                state.moved[:, columns] = offsets.flatten(1)
                 if unseen_members is not None:
                     state.moved.copy_(unseen_members.propagate(state.moved.detach()))
             state.means.add({"l2": squared, "left": state.running})
@@ -245,8 +245,8 @@ def color_columns(channels: int, bands: int) -> Tensor:
     """Where DC and the trained bands are in a packed row. [3·B] int64"""
     slices = attribute_slices(channels)
     dc = torch.arange(channels)[slices["sh0"]]
-    rest = torch.arange(channels)[slices["shN"]][: 3 * (bands - 1)] if bands > 1 else dc[:0]
-    return torch.cat([dc, rest])
+    higher = torch.arange(channels)[slices["shN"]][: 3 * (bands - 1)] if bands > 1 else dc[:0]
+    return torch.cat([dc, higher])
 
 
 def _map_threads(work: Callable[[_A], _B], items: Sequence[_A]) -> list[_B]:

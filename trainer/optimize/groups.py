@@ -78,12 +78,12 @@ class Groups:
         before: Sequence[Tensor] = render_all(crops, original)
         staged = []
         for stage, placement in zip(stages, self.placements, strict=True):
-            place = partial(placement.carry, original)
-            found = render_all(crops, original + place(torch.zeros_like(original)))
-            whole, _ = visible_way(stage.targets, before)
-            rest, left = visible_way(stage.targets, found)
-            length = min(1.0, left / _LEFT, rest / (_REST * max(whole, 1e-9)))
-            staged.append(replace(stage, place=place, length=max(0.02, length)))
+            carried = partial(placement.carry, original)
+            moved = render_all(crops, original + carried(torch.zeros_like(original)))
+            total, _ = visible_way(stage.targets, before)
+            remaining, left = visible_way(stage.targets, moved)
+            length = min(1.0, left / _LEFT, remaining / (_REST * max(total, 1e-9)))
+            staged.append(replace(stage, place=carried, length=max(0.02, length)))
             before = stage.targets
         return staged
 
@@ -207,14 +207,14 @@ def group_path(
     """
     placement, own, begun = groups.rest, torch.zeros_like(original), 0
     each = max(2, count // len(ends))
-    found = []
+    placements = []
     for stage, (end, step, after) in enumerate(zip(ends, steps, groups.placements, strict=True)):
         next_own = after.carry_back(original, end)
         for i in range(1, each):
             share = i / each
             halfway = between(placement, after, share)
             offsets = halfway.carry(original, torch.lerp(own, next_own, share))
-            found.append((begun + round(share * (step - begun)), stage, False, offsets.half()))
-        found.append((step, stage, True, end.half()))
+            placements.append((begun + round(share * (step - begun)), stage, False, offsets.half()))
+        placements.append((step, stage, True, end.half()))
         placement, own, begun = after, next_own, step
-    return found
+    return placements

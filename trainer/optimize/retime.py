@@ -108,38 +108,38 @@ def straight_recordings(
         pictures: what is seen of each recording, any fixed shape
         detour: share of the direct way that a recording may cost, ≥ 0
     """
-    kept = list(range(len(trajectory)))
+    nodes = list(range(len(trajectory)))
     fixed = {0, *trajectory.stage_ends}
 
     def length(a: int, b: int) -> float:
         return float((pictures[a] - pictures[b]).abs().mean())
 
     def excess(k: int) -> float:
-        a, b, c = kept[k - 1 : k + 2]
+        a, b, c = nodes[k - 1 : k + 2]
         return (length(a, b) + length(b, c)) / max(length(a, c), 1e-12) - 1.0
 
-    cost = {k: excess(i) for i, k in enumerate(kept) if k not in fixed}
+    cost = {k: excess(i) for i, k in enumerate(nodes) if k not in fixed}
     while cost:
         worst = max(cost, key=lambda k: cost[k])
         if cost[worst] <= detour:
             break
-        place = kept.index(worst)
-        del kept[place], cost[worst]
-        for near in (place - 1, place):
-            if kept[near] in cost:
-                cost[kept[near]] = excess(near)
-    return kept
+        index = nodes.index(worst)
+        del nodes[index], cost[worst]
+        for near in (index - 1, index):
+            if nodes[near] in cost:
+                cost[nodes[near]] = excess(near)
+    return nodes
 
 
-def select_recordings(trajectory: Trajectory, kept: Sequence[int]) -> Trajectory:
+def select_recordings(trajectory: Trajectory, nodes: Sequence[int]) -> Trajectory:
     """These recordings alone; ascending, both ends and the stages' ends among them."""
-    rows = torch.tensor(kept)
+    rows = torch.tensor(nodes)
     return replace(
         trajectory,
         s=trajectory.s[rows],
         offsets=trajectory.offsets[rows],
         steps=trajectory.steps[rows],
-        stage_ends=tuple(kept.index(end) for end in trajectory.stage_ends),
+        stage_ends=tuple(nodes.index(end) for end in trajectory.stage_ends),
     )
 
 

@@ -81,8 +81,8 @@ def fit_paint(colors: Tensor, change: Tensor, weights: Tensor) -> Paint:
     if left <= _WHOLE:
         return Paint(full, ones, slope, max(0.0, 1.0 - left), True, full)
     typical = (energy / weights.sum().clamp_min(1e-30)).sqrt()
-    touched = (weights * (change.norm(dim=1) > _TOUCHED * typical)).sum()
-    general = full if bool(touched >= _COVERED * weights.sum()) else None
+    changed_weight = (weights * (change.norm(dim=1) > _TOUCHED * typical)).sum()
+    general = full if bool(changed_weight >= _COVERED * weights.sum()) else None
     least = _TYPICAL * typical
     telling, amounts = weights * (change.norm(dim=1) > least), ones
     for _ in range(_PAINT_ROUNDS):
@@ -98,8 +98,8 @@ def _fit_affine(colors: Tensor, change: Tensor, weights: Tensor) -> tuple[Tensor
     x = torch.cat([colors - 0.5, torch.ones(len(colors), 1, dtype=colors.dtype)], dim=1)
     square = x.T @ (weights[:, None] * x)
     square += (1e-4 * square.diagonal().mean() + 1e-12) * torch.eye(4, dtype=colors.dtype)
-    found = torch.linalg.solve(square, x.T @ (weights[:, None] * change))
-    return x @ found, found[:3]
+    coefficients = torch.linalg.solve(square, x.T @ (weights[:, None] * change))
+    return x @ coefficients, coefficients[:3]
 
 
 RECORDINGS = 8
@@ -206,16 +206,16 @@ class PictureSolver:
         """The change with that of the members which no picture shows as the ties have it: in a descent over
         the pictures it would take far too many steps to travel around a body. [M,3]"""
         unseen = (self.shown == 0).numpy()
-        rest = (change - prior).numpy()
+        residual = (change - prior).numpy()
         ties = self.ties[unseen]
-        inner, asked = ties[:, unseen], -(ties[:, ~unseen] @ rest[~unseen])
+        inner, right_side = ties[:, unseen], -(ties[:, ~unseen] @ residual[~unseen])
         diagonal = torch.from_numpy(inner.diagonal() + ridge)[:, None]
 
         def apply(x: Tensor) -> Tensor:
             return torch.from_numpy(inner @ x.numpy()) + ridge * x
 
-        start = torch.from_numpy(rest[unseen])
-        left = torch.from_numpy(asked) - apply(start)
+        start = torch.from_numpy(residual[unseen])
+        left = torch.from_numpy(right_side) - apply(start)
         found = prior[unseen] + start + conjugate_gradients(apply, diagonal, left, _FILLED)
         low, high = self._limits(0.0)
         filled = change.clone()
@@ -263,13 +263,13 @@ class PictureSolver:
             rows: [M,3] bool
             free: channels that count, of each view. [h,w,3] bool
         """
-        asked = (self.shown > 0)[:, None]
+        visible = (self.shown > 0)[:, None]
         diagonal = (self.shown + torch.from_numpy(self.ties.diagonal()) + self.ridge)[:, None]
 
         def apply(p: Tensor) -> Tensor:
-            shown = p * asked
+            masked = p * visible
             pictures = [
-                view.map.picture(shown) * passed for view, passed in zip(self.views, free, strict=True)
+                view.map.picture(masked) * passed for view, passed in zip(self.views, free, strict=True)
             ]
             return rows * (self._transpose(pictures) + self._tie(p))
 
@@ -316,14 +316,14 @@ def make_picture_solver(
     region = unpack(original, crops[0].member_shN)
     bands = min(region.shN.shape[1], 15) if follow else 0
     views = [color_view(crop, original, 1 + bands) for crop in crops]
-    told = torch.zeros(len(members), dtype=torch.float64)
+    evidence = torch.zeros(len(members), dtype=torch.float64)
     clear = torch.zeros(len(members), dtype=torch.float64)
     for view in views:
         squares, mean = _weights_of(view.map)
-        told += squares
+        evidence += squares
         clear = torch.maximum(clear, mean)
     hidden = clear < HIDDEN * bare_weight(scene[members].opacities).double()
-    shown = told.masked_fill(hidden, 0.0)
+    shown = evidence.masked_fill(hidden, 0.0)
     typical = float(shown.square().sum() / shown.sum().clamp_min(1e-30))
     return PictureSolver(
         views,
@@ -419,8 +419,8 @@ def _laplacian(region: Gaussians, covered: Tensor) -> csr_matrix:
     if count < 3:
         return csr_matrix((count, count))
     near, likeness = surface_likeness(region, torch.arange(count), covered)
-    kept = (likeness >= _WEAKEST_TIE).numpy()
-    rows = np.repeat(np.arange(count), kept.sum(axis=1))
-    ties = csr_matrix((likeness.double().numpy()[kept], (rows, near.numpy()[kept])), (count, count))
+    alike = (likeness >= _WEAKEST_TIE).numpy()
+    rows = np.repeat(np.arange(count), alike.sum(axis=1))
+    ties = csr_matrix((likeness.double().numpy()[alike], (rows, near.numpy()[alike])), (count, count))
     ties = 0.5 * (ties + ties.T)
     return csr_matrix(diags(np.asarray(ties.sum(axis=1)).ravel()) - ties)

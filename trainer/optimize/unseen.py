@@ -73,22 +73,22 @@ def find_unseen_members(scene: Gaussians, members: Tensor, views: Sequence[View]
         members: rows of the region. [M] int64
         views: the training views
     """
-    shown = torch.zeros(len(members))
+    weight = torch.zeros(len(members))
     for view in views:
         camera = view.camera
-        shown += alpha_weights(scene, camera, torch.ones_like(view.mask))[members, 2].float()
-    return _find_sources(scene[members], shown >= least_shown(shown))
+        weight += alpha_weights(scene, camera, torch.ones_like(view.mask))[members, 2].float()
+    return _find_sources(scene[members], weight >= least_shown(weight))
 
 
-def least_shown(shown: Tensor) -> float:
+def least_shown(weight: Tensor) -> float:
     """Visible weight below which a member counts as unseen: a share of what the member behind an average
     visible pixel gets (Σ w² / Σ w, which members that hardly show do not change), at most `_SEEN`.
 
     Args:
-        shown: Σ αT of each member over all pixels and views, in pixels. [M]
+        weight: Σ αT of each member over all pixels and views, in pixels. [M]
     """
-    own = float(shown.square().sum() / shown.sum().clamp_min(1e-12))
-    return min(_SEEN, _SHARE * own)
+    typical = float(weight.square().sum() / weight.sum().clamp_min(1e-12))
+    return min(_SEEN, _SHARE * typical)
 
 
 def _find_sources(region: Gaussians, seen: Tensor) -> UnseenMembers:
@@ -108,12 +108,12 @@ def _find_sources(region: Gaussians, seen: Tensor) -> UnseenMembers:
         reached = known.sum(dim=1) > 1e-6
         if not bool(reached.any()):
             break
-        found = known[reached].topk(k, dim=1)
-        through = near[reached].gather(1, found.indices)
+        likeliest = known[reached].topk(k, dim=1)
+        through = near[reached].gather(1, likeliest.indices)
         best = weights[through].argmax(dim=2, keepdim=True)
         rows = unseen[reached]
         sources[rows] = sources[through].gather(2, best)[..., 0]
-        weights[rows] = found.values / found.values.sum(dim=1, keepdim=True)
+        weights[rows] = likeliest.values / likeliest.values.sum(dim=1, keepdim=True)
         decided[rows] = True
     unseen_members = unseen[decided[unseen]]
     return UnseenMembers(unseen_members, sources[unseen_members], weights[unseen_members])

@@ -153,9 +153,9 @@ def find_change(
     numbers = np.arange(count + 1)
     # another engine, or another program's JPEG, is off by a little in a place or two of a block's size
     large = np.bincount(pieces.ravel(), minlength=count + 1) > _BLOCK**2
-    kept = large | (np.asarray(ndimage.maximum(apart.max(axis=2), pieces, numbers)) > _CHANGED)
-    kept[0] = False
-    return torch.from_numpy(kept[pieces])
+    significant = large | (np.asarray(ndimage.maximum(apart.max(axis=2), pieces, numbers)) > _CHANGED)
+    significant[0] = False
+    return torch.from_numpy(significant[pieces])
 
 
 def _moved_or_noisy(apart: np.ndarray, original: np.ndarray) -> bool:
@@ -207,9 +207,9 @@ def _drop_strays(scene: Gaussians, region: Region, evidence: Evidence, inner: Te
         return region
     members = scene[region.members]
     piece = connected_pieces(members)
-    inside, shown = (np.bincount(piece, part[region.members].numpy()) for part in (inner, evidence.weight))
-    whole = (inside > _INNER * shown) & (inside > _LITTLE * inside.max()) | (inside == inside.max())
-    kept = torch.from_numpy(whole[piece])
+    inside, weight = (np.bincount(piece, part[region.members].numpy()) for part in (inner, evidence.weight))
+    mostly = (inside > _INNER * weight) & (inside > _LITTLE * inside.max()) | (inside == inside.max())
+    kept = torch.from_numpy(mostly[piece])
     hidden = _hidden(evidence)[region.members]
     if bool(hidden.any()) and bool((kept & ~hidden).any()):
         colors = sh0_to_rgb(members.sh0).numpy()

@@ -66,12 +66,12 @@ def show(options: ShowRegionOptions) -> list[str]:
     check_ranges(("--lift-threshold", options.lift_threshold, 0, 1))
     size = _size(options.size)
     scene = load_scene(options.scene)
-    said: list[str] = []
+    lines: list[str] = []
     with tempfile.TemporaryDirectory() as folder:
         masks = RegionOptions(options.spec, options.lift_rule, options.lift_threshold)
         views = ViewOptions(options.cameras, options.up, scene=options.scene)
-        request = RegionRequest(masks, views, lambda: Path(folder), say=said.append)
-        region = parse_region(options.spec, scene, kinds=region_kinds(request), say=said.append)
+        request = RegionRequest(masks, views, lambda: Path(folder), say=lines.append)
+        region = parse_region(options.spec, scene, kinds=region_kinds(request), say=lines.append)
     if suffix == ".npy":
         save_npy(options.out, region.members.numpy())
     else:
@@ -80,21 +80,21 @@ def show(options: ShowRegionOptions) -> list[str]:
         cameras = with_near_plane(_cameras(options, scene, up, size), scene)
         write_image(options.out, _sheet([picture(scene, region, camera) for camera in cameras]))
     share = 100 * len(region) / max(1, len(scene))
-    said.append(
+    lines.append(
         f"wrote {options.out}: {format_count(len(region))} of {group_digits(len(scene))} ({share:.3g} %)"
     )
-    return said
+    return lines
 
 
 def picture(scene: Gaussians, region: Region, camera: Camera) -> Tensor:
     """The scene in pale gray with the region tinted; what hides the region hides it here too. [H,W,3] 0..1"""
     colors = seen_colors(scene, camera)
     gray = (colors @ torch.tensor([0.299, 0.587, 0.114]))[:, None].clamp(0.0, 1.0)
-    shown = (gray + _PALE * (1 - gray)).expand(-1, 3).clone()
+    image = (gray + _PALE * (1 - gray)).expand(-1, 3).clone()
     rows = region.members
     # a light tint of its own brightness, so that shape and shading stay readable
-    shown[rows] = torch.lerp(colors[rows].clamp(0.0, 1.0), _TINT * (0.35 + 0.65 * gray[rows]), _TINTED)
-    return render_colors(scene, shown, camera, torch.ones(3)).clamp(0.0, 1.0)
+    image[rows] = torch.lerp(colors[rows].clamp(0.0, 1.0), _TINT * (0.35 + 0.65 * gray[rows]), _TINTED)
+    return render_colors(scene, image, camera, torch.ones(3)).clamp(0.0, 1.0)
 
 
 def _cameras(options: ShowRegionOptions, scene: Gaussians, up: Tensor, size: tuple[int, int]) -> list[Camera]:
@@ -127,12 +127,12 @@ def _fit_camera(
     around, above = math.radians(azimuth), math.radians(elevation)
     back = math.cos(above) * (math.cos(around) * ahead + math.sin(around) * side) + math.sin(above) * up
     axes = look_at(back, torch.zeros(3), up)[:3, :3] * torch.tensor([[1.0], [-1.0], [-1.0]])
-    shown = scene[subject_rows(scene, up)]
+    subject = scene[subject_rows(scene, up)]
     tangent = _FILLED * math.tan(0.5 * _FOV)
-    radius = 2 * float(shown.log_scales.amax(dim=1).median().exp())
-    eye = fit_eye(shown.means, radius, axes, (tangent * size[0] / size[1], tangent)).float()
+    radius = 2 * float(subject.log_scales.amax(dim=1).median().exp())
+    eye = fit_eye(subject.means, radius, axes, (tangent * size[0] / size[1], tangent)).float()
     if away is not None:
-        depth = float(eye @ back - (shown.means @ back).median())
+        depth = float(eye @ back - (subject.means @ back).median())
         eye = eye + (away - depth) * back
     return Camera(look_at(eye, eye - back, up), intrinsics(_FOV, *size), *size)
 

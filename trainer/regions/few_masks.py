@@ -65,10 +65,10 @@ def drop_strays(
     # what two masks hold counts, not what one view alone shows: a tree may be larger than the bear
     sure = np.bincount(piece, weights=(views_inside[rows] >= 2).double().numpy())
     weight = sure if sure.any() else sizes
-    kept = torch.from_numpy((weight >= _PIECE * weight.max())[piece])
+    large = torch.from_numpy((weight >= _PIECE * weight.max())[piece])
     result = torch.zeros_like(member)
-    result[rows[kept]] = True
-    dropped = int((~kept).sum())
+    result[rows[large]] = True
+    dropped = int((~large).sum())
     pieces = int((weight >= _PIECE * weight.max()).sum())
     _report(say, dropped, f"apart from the {format_count(pieces, 'largest connected surface')}, left out")
     return result

@@ -62,8 +62,8 @@ def read_masks(folder: Path, cameras: Sequence[Camera], bent: bool = False) -> l
             f"{folder} has no mask for any of the {len(cameras)} cameras; "
             f"name each as its view, as {cameras[0].name}.png"
         )
-    found = zip(files, cameras, strict=True)
-    return [None if file is None else _mask(file, camera, bent) for file, camera in found]
+    pairs = zip(files, cameras, strict=True)
+    return [None if file is None else _mask(file, camera, bent) for file, camera in pairs]
 
 
 def _file(folder: Path, camera: Camera) -> Path | None:
@@ -109,40 +109,40 @@ def region_kinds(request: RegionRequest) -> dict[str, Kind]:
     which are straightened where the cameras have lenses; `changed` is where pictures differ from the scene.
     """
 
-    def from_folder(rest: str, scene: Gaussians, bent: bool) -> Region:
+    def from_folder(text: str, scene: Gaussians, bent: bool) -> Region:
         kind = "photomasks" if bent else "masks"
-        folder, file = _mask_folder(kind, rest, request)
+        folder, file = _mask_folder(kind, text, request)
         cameras = _cameras(file, scene)
         masks = read_masks(folder, cameras, bent)
         count = sum(mask is not None for mask in masks)
         if request.say is not None and count < len(masks):
             request.say(f"{count} of {len(masks)} cameras have a mask; the others tell nothing")
-        return _lift(scene, cameras, masks, f"{kind}:{rest}", request)
+        return _lift(scene, cameras, masks, f"{kind}:{text}", request)
 
-    def from_text(rest: str, scene: Gaussians) -> Region:
-        prompt = _prompt(rest)
+    def from_text(text: str, scene: Gaussians) -> Region:
+        prompt = _prompt(text)
         folder = request.cache() / _slug(prompt)
         cameras = _segmented_cameras(scene, request)
         masks = _segment(scene, cameras, prompt, folder, request)
-        found = _masks_with_pixels(masks, prompt, request)
+        nonempty = _masks_with_pixels(masks, prompt, request)
         if request.views.cameras is None:
             # Around the scene a thing may be a few pixels wide: look again from where it fills the picture;
             # with masks of the bear's body a pixel too wide or too narrow, IoU .93 for .61-.68.
-            nearer = _near_cameras(scene, _lift(scene, cameras, found, prompt, request), request)
+            nearer = _near_cameras(scene, _lift(scene, cameras, nonempty, prompt, request), request)
             masks = [*masks, *_segment(scene, nearer, prompt, folder, request)]
-            cameras, found = [*cameras, *nearer], _masks_with_pixels(masks, prompt, request)
+            cameras, nonempty = [*cameras, *nearer], _masks_with_pixels(masks, prompt, request)
         # with these the folder is one for masks:DIR, of the same region
-        telling = [camera for camera, mask in zip(cameras, found, strict=True) if mask is not None]
+        telling = [camera for camera, mask in zip(cameras, nonempty, strict=True) if mask is not None]
         save_cameras(folder / "cameras.json", telling, scene.origin)
-        return _lift(scene, cameras, found, f"text:{prompt}", request)
+        return _lift(scene, cameras, nonempty, f"text:{prompt}", request)
 
     return {
-        "masks": lambda rest, scene: from_folder(rest, scene, bent=False),
-        "photomasks": lambda rest, scene: from_folder(rest, scene, bent=True),
+        "masks": lambda text, scene: from_folder(text, scene, bent=False),
+        "photomasks": lambda text, scene: from_folder(text, scene, bent=True),
         "text": from_text,
-        "changed": lambda rest, scene: changed_region(
+        "changed": lambda text, scene: changed_region(
             scene,
-            *_changed_pictures(rest, request, scene.origin),
+            *_changed_pictures(text, request, scene.origin),
             request.options.lift_threshold,
             request.say,
         ),
@@ -152,23 +152,23 @@ def region_kinds(request: RegionRequest) -> dict[str, Kind]:
 def region_checks(request: RegionRequest) -> dict[str, Check]:
     """What is to be known of these kinds before the scene is loaded, for `check_region`."""
 
-    def of_text(rest: str) -> None:
-        _prompt(rest)
+    def of_text(text: str) -> None:
+        _prompt(text)
         SEGMENTER_CHECKS["text"](request.options)
 
     return {
-        "masks": lambda rest: load_cameras(_mask_folder("masks", rest, request)[1], ZERO),
-        "photomasks": lambda rest: load_cameras(_mask_folder("photomasks", rest, request)[1], ZERO),
+        "masks": lambda text: load_cameras(_mask_folder("masks", text, request)[1], ZERO),
+        "photomasks": lambda text: load_cameras(_mask_folder("photomasks", text, request)[1], ZERO),
         "text": of_text,
-        "changed": lambda rest: _changed_pictures(rest, request, ZERO),
+        "changed": lambda text: _changed_pictures(text, request, ZERO),
     }
 
 
 def _changed_pictures(
-    rest: str, request: RegionRequest, origin: Origin
+    text: str, request: RegionRequest, origin: Origin
 ) -> tuple[Sequence[Path], Sequence[Camera]]:
     """The pictures of `changed:A.png,B.png`, by default those of the editor, and their cameras."""
-    paths = picture_paths(rest) if rest else request.views.pictures
+    paths = picture_paths(text) if text else request.views.pictures
     if not paths:
         raise ProgdfError(
             "changed needs pictures: use it with --editor pictures:A.png, or name them, changed:A.png,B.png"
@@ -183,16 +183,16 @@ def _changed_pictures(
     return paths, rendered_cameras(paths, given, origin)
 
 
-def _mask_folder(kind: str, rest: str, request: RegionRequest) -> tuple[Path, Path]:
+def _mask_folder(kind: str, text: str, request: RegionRequest) -> tuple[Path, Path]:
     """The folder of masks, and the file of their cameras."""
-    if not rest:
+    if not text:
         raise ProgdfError(f"{kind}: needs a folder; write {kind}:DIR with a mask for each camera in DIR")
-    folder = Path(rest).expanduser()
+    folder = Path(text).expanduser()
     if not folder.is_dir():
         raise ProgdfError(f"{folder} is not a folder; give the one that holds a mask for each view")
-    own = folder / "cameras.json"
-    if own.is_file():
-        return folder, own
+    beside = folder / "cameras.json"
+    if beside.is_file():
+        return folder, beside
     if request.views.cameras is None:
         raise ProgdfError(
             f"the masks in {folder} have no cameras; give --cameras, or put a cameras.json beside them"
@@ -200,8 +200,8 @@ def _mask_folder(kind: str, rest: str, request: RegionRequest) -> tuple[Path, Pa
     return folder, request.views.cameras
 
 
-def _prompt(rest: str) -> str:
-    prompt = rest.strip().strip("\"'“”").strip()
+def _prompt(text: str) -> str:
+    prompt = text.strip().strip("\"'“”").strip()
     if not prompt:
         raise ProgdfError('text: needs a prompt; write text:"the man\'s shirt"')
     return prompt
@@ -244,13 +244,13 @@ def _scale_mask(mask: Tensor, camera: Camera) -> Tensor:
 
 def _masks_with_pixels(masks: Sequence[Tensor], prompt: str, request: RegionRequest) -> list[Tensor | None]:
     """The masks in which the prompt was found: where it was not, it may still be."""
-    found = [mask if bool(mask.any()) else None for mask in masks]
-    if all(mask is None for mask in found):
+    nonempty = [mask if bool(mask.any()) else None for mask in masks]
+    if all(mask is None for mask in nonempty):
         raise ProgdfError(
             f"'{prompt}' is found in none of {len(masks)} views; rephrase it, or lower "
             f"--box-threshold (now {request.options.box_threshold:g})"
         )
-    return found
+    return nonempty
 
 
 def _segment(

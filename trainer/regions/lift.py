@@ -62,13 +62,13 @@ def gather(scene: Gaussians, cameras: Sequence[Camera], masks: Sequence[Tensor])
     views, views_inside = torch.zeros(len(scene)), torch.zeros(len(scene))
     bare = bare_weight(scene.opacities)
     for camera, mask in zip(cameras, masks, strict=True):
-        found = alpha_weights(scene, camera, mask)
-        sums += found
-        mean = (found[:, 2] / found[:, 3].clamp_min(1.0)).float()
+        weights = alpha_weights(scene, camera, mask)
+        sums += weights
+        mean = (weights[:, 2] / weights[:, 3].clamp_min(1.0)).float()
         mean_weight = torch.maximum(mean_weight, mean)
-        shown = mean > HIDDEN * bare
-        views += shown
-        views_inside += shown & (found[:, 0] > 0.5 * found[:, 2])
+        visible = mean > HIDDEN * bare
+        views += visible
+        views_inside += visible & (weights[:, 0] > 0.5 * weights[:, 2])
     clearness = (mean_weight / bare).clamp(0.0, 1.0)
     inside, pixels_inside, weight, pixels = sums.float().unbind(1)
     return Evidence(inside, pixels_inside, weight, pixels, clearness, views, views_inside, scene.opacities)

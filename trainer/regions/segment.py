@@ -48,11 +48,11 @@ class GroundedSam:
             return torch.zeros(image.shape[:2], dtype=torch.bool)
         inputs = self.sam_processor(images=picture, input_boxes=[boxes.tolist()], return_tensors="pt")
         with torch.no_grad():
-            found = self.sam_model(
+            outlines = self.sam_model(
                 pixel_values=inputs["pixel_values"], input_boxes=inputs["input_boxes"], multimask_output=False
             )
         masks: Tensor = self.sam_processor.post_process_masks(
-            found.pred_masks, inputs["original_sizes"], inputs["reshaped_input_sizes"]
+            outlines.pred_masks, inputs["original_sizes"], inputs["reshaped_input_sizes"]
         )[0]
         return masks.bool().flatten(0, 1).any(dim=0)
 
@@ -61,14 +61,14 @@ class GroundedSam:
         inputs = self.detector_processor(images=picture, text=normalize_prompt(prompt), return_tensors="pt")
         with torch.no_grad():
             answer = self.detector(**inputs)
-        found = self.detector_processor.post_process_grounded_object_detection(
+        detections = self.detector_processor.post_process_grounded_object_detection(
             answer,
             inputs["input_ids"],
             threshold=self.box_threshold,
             text_threshold=self.box_threshold,
             target_sizes=[(picture.height, picture.width)],
         )[0]
-        boxes: Tensor = found["boxes"].float()
+        boxes: Tensor = detections["boxes"].float()
         return boxes
 
 

@@ -67,9 +67,9 @@ class SurfaceVote:
         """
         for rows in torch.split(undecided[~self._known[undecided]], _AT_ONCE):
             near, likeness = surface_likeness(self._scene, rows, self._covered)
-            kept = (likeness >= _WEAKEST).numpy()
-            of = np.repeat(rows.numpy(), kept.sum(axis=1))
-            self._ties += csr_matrix((likeness.numpy()[kept], (of, near.numpy()[kept])), self._ties.shape)
+            alike = (likeness >= _WEAKEST).numpy()
+            of = np.repeat(rows.numpy(), alike.sum(axis=1))
+            self._ties += csr_matrix((likeness.numpy()[alike], (of, near.numpy()[alike])), self._ties.shape)
             self._known[rows] = True
         open_, vote = undecided.numpy(), (2.0 * member.float() - 1.0).numpy()
         ties, vote[open_] = self._ties[open_], 0.0
@@ -117,13 +117,13 @@ def covered_rows(scene: Gaussians, cameras: Sequence[Camera]) -> Tensor:
                 for colors in (means, squares[:, :3], squares[:, 3:])
             ]
         alpha = 1.0 - drawn[0].transmittance[at]
-        shown, *products = (found.image[at] / alpha.clamp_min(1e-6)[:, None] for found in drawn)
+        first, *products = (found.image[at] / alpha.clamp_min(1e-6)[:, None] for found in drawn)
         moments = means.new_zeros(len(rows), 3, 3)
         moments[:, pairs[0], pairs[1]] = torch.cat(products, dim=1)
         moments[:, pairs[1], pairs[0]] = torch.cat(products, dim=1)
-        spread = moments - shown[:, :, None] * shown[:, None, :] + axes[rows] @ axes[rows].transpose(1, 2)
+        spread = moments - first[:, :, None] * first[:, None, :] + axes[rows] @ axes[rows].transpose(1, 2)
         spread += _FLOAT32 * torch.eye(3)
-        off = means[rows] - shown
+        off = means[rows] - first
         deviations = (off * torch.linalg.solve(spread, off)).sum(dim=1)  # squared
         behind = (deviations > _THICK**2) & (off @ camera.viewmat[2, :3] > 0) & (alpha > 0.5)
         covered[rows[behind]] = True

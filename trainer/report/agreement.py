@@ -85,8 +85,8 @@ class ViewChange:
         """The picture that changes of the members' colors make, where it counts. [M,3] -> [h,w,3]"""
         scene = self.scene
         changes = torch.zeros_like(scene.gaussians.colors).index_copy(0, scene.rows, colors)
-        shown = scene.gaussians._replace(colors=changes)
-        drawn = render(shown, scene.camera, (0.0, 0.0, 0.0), crop=scene.box, grad_rows=scene.rows)
+        changed = scene.gaussians._replace(colors=changes)
+        drawn = render(changed, scene.camera, (0.0, 0.0, 0.0), crop=scene.box, grad_rows=scene.rows)
         return drawn.image * self.counts
 
     def gather(self, picture: Tensor, members: int) -> Tensor:
@@ -131,14 +131,14 @@ def fit_colors(seen: Sequence[ViewChange], members: int) -> Tensor:
     damping = None
     for _ in range(_ROUNDS):
         with torch.no_grad():
-            shown = [one.render(direction) for one in seen]
-        length, curve = float(direction.square().sum()), sum(float(p.square().sum()) for p in shown)
+            rendered = [one.render(direction) for one in seen]
+        length, curve = float(direction.square().sum()), sum(float(p.square().sum()) for p in rendered)
         if curve <= 0:
             break
         damping = DAMPING * curve / length if damping is None else damping
         step = float(slope.square().sum()) / (curve + damping * length)
         colors = colors + step * direction
-        left = [picture - step * p for picture, p in zip(left, shown, strict=True)]
+        left = [picture - step * p for picture, p in zip(left, rendered, strict=True)]
         before, slope = float(slope.square().sum()), gather(left) - damping * colors
         direction = slope + float(slope.square().sum()) / before * direction
     return colors

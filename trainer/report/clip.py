@@ -96,9 +96,9 @@ def direction(before: Tensor, after: Tensor, text_before: Tensor, text_after: Te
         before, after: features of the pictures, of unit length. [n,D]
         text_before, text_after: features of the texts, of unit length. [D]
     """
-    said = (text_after - text_before).double()
+    direction = (text_after - text_before).double()
     seen = (after - before).double()
-    cosines = (seen @ said) / (seen.norm(dim=1) * said.norm()).clamp_min(1e-30)
+    cosines = (seen @ direction) / (seen.norm(dim=1) * direction.norm()).clamp_min(1e-30)
     changes = ~same_features(before, after) & ~same_features(text_before, text_after)
     return [float(c) if changed else None for c, changed in zip(cosines, changes.tolist(), strict=True)]
 
@@ -109,9 +109,9 @@ def same_features(a: Tensor, b: Tensor) -> Tensor:
     return apart < ROUNDING
 
 
-def _features(found: Any) -> Tensor:
+def _features(output: Any) -> Tensor:
     """transformers 5 returns an output object, 4 the features themselves."""
-    features = found if isinstance(found, Tensor) else found.pooler_output
+    features = output if isinstance(output, Tensor) else output.pooler_output
     assert isinstance(features, Tensor)
     return features.float()
 

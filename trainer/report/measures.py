@@ -76,26 +76,26 @@ def picture_courses(
     rows: dict[str, list[tuple[float, float, float]]] = {name: [] for name in pictures}
     for s in strengths:
         expected = truth(s)
-        for name, shown in pictures.items():
-            found = shown(s)
+        for name, picture_at in pictures.items():
+            pictures_at = picture_at(s)
             rows[name].append(
                 (
-                    evaluator.psnr(found, expected),
-                    evaluator.ssim(found, expected),
-                    evaluator.perceptual(found, expected, perceptual, "measured"),
+                    evaluator.psnr(pictures_at, expected),
+                    evaluator.ssim(pictures_at, expected),
+                    evaluator.perceptual(pictures_at, expected, perceptual, "measured"),
                 )
             )
         perceptual.forget()
     return {
-        name: ErrorCurve(tuple(strengths), *(tuple(row[i] for row in found) for i in range(3)))
-        for name, found in rows.items()
+        name: ErrorCurve(tuple(strengths), *(tuple(row[i] for row in pictures_at) for i in range(3)))
+        for name, pictures_at in rows.items()
     }
 
 
 def against_editor(
     evaluator: Evaluator,
     fields: Mapping[str, BakedField],
-    asked: Sequence[tuple[float, float]],
+    stages: Sequence[tuple[float, float]],
     perceptual: Perceptual,
 ) -> dict[str, ErrorCurve]:
     """Each field's errors against the editor's own pictures.
@@ -103,10 +103,10 @@ def against_editor(
     Args:
         evaluator: held-out views with these pictures
         fields: by name
-        asked: slider value and the strength that the editor was asked at, ascending
+        stages: slider value and the strength that the editor was asked at, ascending
         perceptual: LPIPS, or its stand-in
     """
-    strength = dict(asked)
+    strength = dict(stages)
     return error_curves(
         evaluator, fields, tuple(strength), lambda s: evaluator.edited[strength[s]], perceptual
     )
@@ -158,7 +158,7 @@ def measure(
     judges: tuple[Evaluator, Evaluator],
     trajectory: Trajectory,
     fitted: Fitted,
-    shown: BakedField,
+    shipped: BakedField,
     remap: SliderRemap,
     perceptual: Perceptual,
     clip: Direction,
@@ -169,21 +169,21 @@ def measure(
         judges: all held-out views, and those of them on which the field was not chosen
         trajectory: what was recorded
         fitted: the field and its baselines
-        shown: the field as it is shipped
+        shipped: the field as it is shipped
         remap: from the trajectory's slider to the shipped field's
         perceptual: LPIPS, or its stand-in
         clip: measured already, or the reason why not
     """
     (evaluator, reporting), field = judges, fitted.chosen.field
     fields = {"slider": field, COMPARED: fitted.baselines[COMPARED].field}
-    slider = slider_statistics(lambda s: evaluator.pictures(shown.offsets(s)), masks=evaluator.pixels)
+    slider = slider_statistics(lambda s: evaluator.pictures(shipped.offsets(s)), masks=evaluator.pixels)
     samples = sample_strengths()[::_EVERY]
     recorded = error_curves(
         reporting, fields, samples, lambda s: reporting.pictures(trajectory.at(s)), perceptual
     )
     recorded = {n: replace(c, s=tuple(remap.at(s) for s in c.s)) for n, c in recorded.items()}
-    asked = tuple((remap.at(s), strength) for s, strength in trajectory.stage_strengths)
-    drawn = against_editor(evaluator, {**fields, "slider": shown}, asked, perceptual)
+    stages = tuple((remap.at(s), strength) for s, strength in trajectory.stage_strengths)
+    drawn = against_editor(evaluator, {**fields, "slider": shipped}, stages, perceptual)
     nodes = trajectory.s[1:-1][:: max(1, -(-(len(trajectory) - 2) // _NODES))].tolist()
     worst = min(
         (
@@ -194,9 +194,9 @@ def measure(
     )
     return Measured(
         fitted,
-        shown,
+        shipped,
         remap,
-        asked=asked,
+        asked=stages,
         slider=slider,
         at_recordings=worst,
         trajectory=recorded,
@@ -300,13 +300,13 @@ def figures(measured: Measured, endpoint_error: float, outside_change: float) ->
 
 def _clip_features(clip: Clip, evaluator: Evaluator, views: Sequence[View], offsets: Tensor) -> Tensor:
     """CLIP's features of the whole views with these offsets. [n,D]"""
-    whole = []
+    pictures = []
     for view, scene, picture in zip(views, evaluator.crops, evaluator.pictures(offsets), strict=True):
         x0, y0, x1, y1 = scene.box
         image = view.image.clone()
         image[y0:y1, x0:x1] = picture
-        whole.append(image)
-    return clip.pictures(whole)
+        pictures.append(image)
+    return clip.pictures(pictures)
 
 
 def _mean(values: Sequence[float | None]) -> float | None:
@@ -389,18 +389,18 @@ def measure_paint(
         energy = (target - view.image).square().sum(dim=2)
         # a JPEG is off by a little all over: elsewhere only what is painted for certain
         least = torch.where(view.mask > 0.5, _ROUNDED, _ALIKE)
-        touched = (target - view.image).abs().amax(dim=2) > least
+        changed = (target - view.image).abs().amax(dim=2) > least
         made = render_view(edited, view.camera, setup.background).clamp(0.0, 1.0)
-        change += float(energy[touched].sum())
-        missing += float((target - made)[touched].square().sum())
-        behind += float(energy[touched & _shows_behind(scene, without, view, target, background)].sum())
-        pixels += int(touched.sum())
-        weights += alpha_weights(scene, view.camera, touched)[:, (0, 2)]
+        change += float(energy[changed].sum())
+        missing += float((target - made)[changed].square().sum())
+        behind += float(energy[changed & _shows_behind(scene, without, view, target, background)].sum())
+        pixels += int(changed.sum())
+        weights += alpha_weights(scene, view.camera, changed)[:, (0, 2)]
     inside, weight = weights[members].unbind(1)
-    shown = int((inside > 0.5 * weight).sum())
+    visible = int((inside > 0.5 * weight).sum())
     strength = (missing / max(1, 3 * pixels)) ** 0.5
     reached = max(0.0, 1.0 - missing / max(change, 1e-12))
-    return PaintTaken(reached, strength, pixels, shown, behind > 0.5 * change)
+    return PaintTaken(reached, strength, pixels, visible, behind > 0.5 * change)
 
 
 def _shows_behind(

@@ -72,8 +72,8 @@ def draw_plot(plot: Plot, width: int, height: int) -> Image.Image:
         axes.set_yscale("log")
         axes.set_ylim(bottom=max(axes.get_ylim()[0], highest * 10.0**-_DECADES))
     # the axes show at least this: points that nobody sees stretch them
-    for name, place in (("x", plot.span or ()), ("y", [y for y in (plot.low, plot.high) if y is not None])):
-        axes.update_datalim([(x, x) for x in place], updatex=name == "x", updatey=name == "y")
+    for name, limits in (("x", plot.span or ()), ("y", [y for y in (plot.low, plot.high) if y is not None])):
+        axes.update_datalim([(x, x) for x in limits], updatex=name == "x", updatey=name == "y")
     if plot.scale == "linear":
         axes.autoscale_view()
     legend = 0

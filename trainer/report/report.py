@@ -81,15 +81,15 @@ def best_view(evaluator: Evaluator) -> int:
     return max(range(len(evaluator.pixels)), key=lambda i: int(evaluator.pixels[i].sum()))
 
 
-def columns_of(asked: Sequence[tuple[float, float]]) -> Columns:
+def columns_of(stages: Sequence[tuple[float, float]]) -> Columns:
     """Five slider values to show: `SHOWN`, or close by where the editor was asked.
 
     Args:
-        asked: slider value and the strength that the editor was asked at, ascending, the last (1, 1)
+        stages: slider value and the strength that the editor was asked at, ascending, the last (1, 1)
     """
     columns: list[tuple[float, float | None]] = [(0.0, 0.0)]
     for s in SHOWN[1:]:
-        at, strength = min(asked, key=lambda pair: abs(pair[0] - s))
+        at, strength = min(stages, key=lambda pair: abs(pair[0] - s))
         columns.append((at, strength) if abs(at - s) <= _CLOSE else (s, None))
     return columns
 
@@ -105,8 +105,8 @@ def editor_strip(evaluator: Evaluator, columns: Columns, width: int = _THUMBNAIL
     best = best_view(evaluator)
     blank = torch.full((*evaluator.crops[best].size, 3), 0.94)
     original = evaluator.crops[best].original().clamp(0, 1)
-    own = [original, *(blank if at is None else evaluator.edited[at][best] for _, at in columns[1:])]
-    return [thumbnail(image, width) for image in own]
+    edited = [original, *(blank if at is None else evaluator.edited[at][best] for _, at in columns[1:])]
+    return [thumbnail(image, width) for image in edited]
 
 
 def thumbnail(image: Tensor, width: int) -> Tensor:
@@ -197,8 +197,8 @@ def _training(losses: Losses, perceptual: str) -> Plot:
     return Plot("loss terms as weighted", lines, "optimizer steps", "log")
 
 
-def _clip(found: Direction) -> Plot:
-    defined = [(s, v) for s, v in zip(found.s, found.similarity, strict=True) if v is not None]
+def _clip(direction: Direction) -> Plot:
+    defined = [(s, v) for s, v in zip(direction.s, direction.similarity, strict=True) if v is not None]
     line = ([s for s, _ in defined], [v for _, v in defined])
     return Plot("CLIP directional similarity", {"slider": line}, "slider", low=0.0, span=_SPAN)
 
@@ -213,10 +213,10 @@ def _distance(measured: Measured) -> str:
     return "LPIPS" if measured.perceptual.startswith("lpips") else measured.perceptual
 
 
-def column_heading(s: float, asked: float | None) -> str:
+def column_heading(s: float, strength: float | None) -> str:
     """What stands above a column; the editor's strength where it is another number."""
-    own = "" if asked is None or abs(asked - s) < 5e-3 else f", editor {asked:.2g}"
-    return f"s = {round(s, 2):g}{own}"
+    suffix = "" if strength is None or abs(strength - s) < 5e-3 else f", editor {strength:.2g}"
+    return f"s = {round(s, 2):g}{suffix}"
 
 
 def _label(name: str) -> str:

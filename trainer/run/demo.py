@@ -299,8 +299,8 @@ def _paint_picture(path: Path, scene: DemoScene, camera: Camera, paint: Paint) -
     gaussians = scene.gaussians
 
     def cover(parts: tuple[str, ...]) -> Tensor:
-        shown = torch.zeros(len(gaussians), 3).index_fill(0, scene.members(*parts), 1.0)
-        return render(gaussians, camera, (0.0, 0.0, 0.0), colors=shown).image[..., 0].clamp(0, 1)
+        colors = torch.zeros(len(gaussians), 3).index_fill(0, scene.members(*parts), 1.0)
+        return render(gaussians, camera, (0.0, 0.0, 0.0), colors=colors).image[..., 0].clamp(0, 1)
 
     with torch.no_grad():
         picture = render(gaussians, camera, scene.background).image.clamp(0, 1)

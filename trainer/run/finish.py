@@ -312,8 +312,8 @@ def refit(options: FitOptions, quiet: bool = False) -> RunResult:
             names = [view.camera.name for view in setup.train]
             edited = {s: read_views(run.folder, "edited", names, s) for s in run.trajectory.strengths}
             # what grows beyond the region's boxes is seen as well, or the slider is timed on half of it
-            whole = run.record.plan.optimize.as_printed
-            setup = whole_views(setup) if whole else widen_views(setup, edited)
+            as_printed = run.record.plan.optimize.as_printed
+            setup = whole_views(setup) if as_printed else widen_views(setup, edited)
         perceptual, warning = perceptual_loss()
         if warning:
             log.say(warning)
@@ -329,10 +329,10 @@ def refit(options: FitOptions, quiet: bool = False) -> RunResult:
         log.close()
 
 
-def asked_texts(typed: TextOptions, own: TextOptions) -> TextOptions:
+def asked_texts(typed: TextOptions, recorded: TextOptions) -> TextOptions:
     """What CLIP is asked: the command's own texts, or the run's."""
     return TextOptions(
-        typed.text_before or own.text_before,
-        typed.text_after or own.text_after,
-        own.asked or bool(typed.text_before or typed.text_after),
+        typed.text_before or recorded.text_before,
+        typed.text_after or recorded.text_after,
+        recorded.asked or bool(typed.text_before or typed.text_after),
     )

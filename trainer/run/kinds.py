@@ -116,13 +116,13 @@ def choose_approach(
     Raises:
         ProgdfError: an edited view is missing or broken.
     """
-    asked = options.optimize
+    optimize = options.optimize
     knows_kind = options.editor.family not in KIND_UNKNOWN
-    kind = editor.kind if asked.kind == "auto" and knows_kind else asked.kind
+    kind = editor.kind if optimize.kind == "auto" and knows_kind else optimize.kind
     if kind == "color" or kind == "style":
         return Approach(kind), None
-    if kind == "geometry" and asked.group_steps is not None:
-        return Approach(kind, asked.group_steps), None
+    if kind == "geometry" and optimize.group_steps is not None:
+        return Approach(kind, optimize.group_steps), None
     edited = [editor.edit(view, 1.0) for view in setup.train]
     ways = approaches(options, setup, edited)
     if all(torch.equal(picture, view.image) for picture, view in zip(edited, setup.train, strict=True)):
@@ -144,12 +144,12 @@ def approaches(options: TrainOptions, setup: TrainingSetup, edited: Sequence[Ten
         setup: the training views
         edited: the finished edit of each, not is_confined. [H,W,3]
     """
-    asked = options.optimize
-    groups = GROUP_STEPS if asked.group_steps is None else asked.group_steps
-    geometry = [Approach("geometry")] if not groups or asked.group_steps is None else []
+    optimize = options.optimize
+    groups = GROUP_STEPS if optimize.group_steps is None else optimize.group_steps
+    geometry = [Approach("geometry")] if not groups or optimize.group_steps is None else []
     geometry += [Approach("geometry", groups)] if groups else []
-    if asked.kind != "auto":
-        return geometry if asked.kind == "geometry" else [Approach(asked.kind)]
+    if optimize.kind != "auto":
+        return geometry if optimize.kind == "geometry" else [Approach(optimize.kind)]
     changed = beside = 0.0
     for view, picture in zip(setup.train, edited, strict=True):
         outside = view.mask < 0.05
@@ -196,8 +196,8 @@ def try_approaches(
             groups = group_stage(original, crops, [targets], steps, options.optimize.seed)
             end = groups.to_stages(original, crops, stages)[0].place(torch.zeros_like(original))
         else:
-            own = resolve_kind(with_values(options, steps=steps), way.kind, 0)
-            settings = pgs_settings(own, True, original.shape[1], extent, 1)
+            resolved = resolve_kind(with_values(options, steps=steps), way.kind, 0)
+            settings = pgs_settings(resolved, True, original.shape[1], extent, 1)
             *_, last = optimize(
                 original, crops, [], stages, objective, replace(settings, smoothing=0.9, every=0, snapshots=1)
             )

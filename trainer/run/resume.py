@@ -202,16 +202,16 @@ def picture_digests(plan: TrainOptions) -> dict[str, str]:
 
 
 def _saved_identity(folder: RunFolder) -> _Identity | None:
-    found = folder.state.identity()
-    if found is None:
+    identity = folder.state.identity()
+    if identity is None:
         return None
-    if "optimization" in found.get("plan", {}):
+    if "optimization" in identity.get("plan", {}):
         raise ProgdfError(
             f"{folder.root} was begun by an earlier version, which ends it; or delete {folder.state.path} "
             "and train again"
         )
     try:
-        return convert_json(found, _Identity)
+        return convert_json(identity, _Identity)
     except ValueError as error:
         raise folder.state.damage_error(folder.state.path / "run.json", error) from None
 
@@ -225,8 +225,8 @@ def plan_difference(was: TrainOptions, now: TrainOptions) -> str:
     if not differing:
         return ""
     name, typed, before, after = min(differing, key=lambda value: not value[1])
-    said = "--" + name.replace("_", "-") if typed else name.replace("_", " ")
-    return f"{said} {_said(before)}, not {_said(after)}"
+    option = "--" + name.replace("_", "-") if typed else name.replace("_", " ")
+    return f"{option} {_said(before)}, not {_said(after)}"
 
 
 def _values(part: Any) -> Iterator[tuple[str, bool, Any]]:

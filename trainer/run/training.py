@@ -73,30 +73,34 @@ class Recordings:
         self.made: list[SavedSnapshot] = []
         self._folder, self._shape, self._written = folder, shape, 0
 
-    def add(self, found: ParameterSnapshot) -> None:
+    def add(self, snapshot: ParameterSnapshot) -> None:
         """Keep one."""
-        offsets = found.offsets.half()
-        self.made.append(SavedSnapshot(found.step, found.stage, found.ends_stage, offsets, found.means))
+        offsets = snapshot.offsets.half()
+        self.made.append(
+            SavedSnapshot(snapshot.step, snapshot.stage, snapshot.ends_stage, offsets, snapshot.means)
+        )
 
     def capture_state(self) -> Saved:
         """How many there are; those that came since the last time are written first."""
         for index in range(self._written, len(self.made)):
-            kept = self.made[index]
-            values = {"step": kept.step, "stage": kept.stage, "ends_stage": kept.ends_stage}
-            self._folder.save("recordings", {"offsets": kept.offsets}, values | {"means": kept.means}, index)
+            snapshot = self.made[index]
+            values = {"step": snapshot.step, "stage": snapshot.stage, "ends_stage": snapshot.ends_stage}
+            self._folder.save(
+                "recordings", {"offsets": snapshot.offsets}, values | {"means": snapshot.means}, index
+            )
         self._written = len(self.made)
         return Saved({}, {"count": self._written})
 
     def restore(self, saved: Saved) -> None:
         """Read as many as there were; what a killed run wrote beyond them will be written again."""
         self._written = saved.values["count"]
-        found = [self._folder.load("recordings", index) for index in range(self._written)]
-        if None in found:
+        recordings = [self._folder.load("recordings", index) for index in range(self._written)]
+        if None in recordings:
             raise ProgdfError(f"recordings are missing in {self._folder.path}; delete it and train again")
-        self.made = [self._read(kept) for kept in found if kept]
+        self.made = [self._read(kept) for kept in recordings if kept]
 
-    def _read(self, kept: Saved) -> SavedSnapshot:
-        values, offsets = convert_json(kept.values, _RecordingValues), kept.tensors["offsets"]
+    def _read(self, saved: Saved) -> SavedSnapshot:
+        values, offsets = convert_json(saved.values, _RecordingValues), saved.tensors["offsets"]
         if offsets.shape != self._shape or offsets.dtype != torch.float16:
             raise ValueError("a recording is of other members")
         return SavedSnapshot(values.step, values.stage, values.ends_stage, offsets, values.means)

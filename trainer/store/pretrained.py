@@ -25,10 +25,10 @@ def folder_of_model(model: str, file: str) -> Path:
         return Path(model)
     from huggingface_hub import try_to_load_from_cache
 
-    found = try_to_load_from_cache(model, file)
-    if not isinstance(found, str):
+    cached = try_to_load_from_cache(model, file)
+    if not isinstance(cached, str):
         raise OSError(f"{model} is not on this machine")
-    return Path(found).parent
+    return Path(cached).parent
 
 
 def check_weights_here(folder: Path) -> None:

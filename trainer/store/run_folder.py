@@ -50,15 +50,15 @@ def add_pictures(folder: Path, paths: Iterable[Path]) -> None:
 
 def remove_pictures_but_of(folder: Path, views: Collection[str]) -> None:
     """Delete the listed files that are not of one of these views; nothing behind a link is touched."""
-    kept = []
+    entries = []
     for line in read_list(folder):
         path = folder / line
         if path.stem in views or not _is_inside(folder, line):
-            kept.append(line)
+            entries.append(line)
         elif os.path.isfile(path):  # pathlib's raises where a name is too long
             path.unlink()
-    if read_list(folder) != kept:
-        _write(folder, kept)
+    if read_list(folder) != entries:
+        _write(folder, entries)
 
 
 def _is_inside(folder: Path, line: str) -> bool:
@@ -67,7 +67,7 @@ def _is_inside(folder: Path, line: str) -> bool:
     if parts.is_absolute() or ".." in parts.parts or not parts.parts:
         return False
     places = [folder / part for part in (parts, *parts.parents)]  # the last is the folder itself
-    return not any(place.is_symlink() for place in places)
+    return not any(path.is_symlink() for path in places)
 
 
 def _write(folder: Path, lines: Iterable[str]) -> None:
@@ -216,8 +216,8 @@ def lock_folder(folder: RunFolder) -> Iterator[None]:
 
 def remove_leftovers(folder: RunFolder) -> None:
     """Delete what a run that was killed was just about to write."""
-    for place, _, _ in os.walk(folder.root):
-        remove_abandoned(Path(place))
+    for directory, _, _ in os.walk(folder.root):
+        remove_abandoned(Path(directory))
 
 
 def write_views(folder: RunFolder, kind: str, pictures: Mapping[str, Tensor], strength: float = 1.0) -> None:
@@ -247,8 +247,8 @@ def read_views(folder: RunFolder, kind: str, names: Iterable[str], strength: flo
 
 def remove_stale_views(folder: RunFolder, names: Sequence[str]) -> None:
     """Delete pictures of views that an earlier run of the same edit had and this one has not."""
-    for place in (folder.views, folder.paintings):
-        remove_pictures_but_of(place, set(names))
+    for directory in (folder.views, folder.paintings):
+        remove_pictures_but_of(directory, set(names))
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:

@@ -95,11 +95,11 @@ def choose_views(
     enough = cover >= _LEAST_COVER * cover[seeing].median()
     good = enough.nonzero()[:, 0].tolist()
     toward = _toward(places, [cameras[looked[k]] for k in good])
-    shown = _Shown(_relative_visibility(weights[good]), toward, _reach(count))
-    taken = _greedy(shown, count) if len(good) > count else list(range(len(good)))
+    visibility = _Shown(_relative_visibility(weights[good]), toward, _reach(count))
+    taken = _greedy(visibility, count) if len(good) > count else list(range(len(good)))
     return ViewChoice(
         tuple(make_view(scene, region, cameras[looked[good[k]]], background) for k in taken),
-        _likeness(shown, taken),
+        _likeness(visibility, taken),
         len(cameras),
         int((~framed.any(dim=1)).sum()) + int((~seeing).sum()),
         int((seeing & ~enough).sum()),
@@ -150,20 +150,20 @@ class _Shown:
         return self.visible[camera] * near
 
 
-def _greedy(shown: _Shown, count: int) -> list[int]:
+def _greedy(visibility: _Shown, count: int) -> list[int]:
     """The cameras that add most, one after the other, in the order of the list; ties by that order."""
-    served = torch.zeros_like(shown.visible)
+    served = torch.zeros_like(visibility.visible)
     left = torch.ones(len(served), dtype=torch.bool)
     for _ in range(count):
-        gain = (shown.visible * (1 - served)).sum(dim=1)
+        gain = (visibility.visible * (1 - served)).sum(dim=1)
         best = int(torch.where(left, gain, -1.0).argmax())
         left[best] = False
-        served = torch.maximum(served, shown.coverage_by(best))
+        served = torch.maximum(served, visibility.coverage_by(best))
     return (~left).nonzero()[:, 0].tolist()
 
 
-def _likeness(shown: _Shown, taken: Sequence[int]) -> Tensor:
-    some = _Shown(shown.visible[taken], shown.toward[taken], shown.reach)
+def _likeness(visibility: _Shown, taken: Sequence[int]) -> Tensor:
+    some = _Shown(visibility.visible[taken], visibility.toward[taken], visibility.reach)
     columns = [
         (some.visible * some.coverage_by(k)).sum(dim=1) / some.visible.sum(dim=1).clamp_min(1e-12)
         for k in range(len(taken))

@@ -44,9 +44,9 @@ def live_tiles(contributes: Tensor, box: Crop) -> Tensor:
     """
     x0, y0, x1, y1 = box
     rows, columns = -(-y1 // TILE_H), -(-x1 // TILE_W)
-    whole = torch.zeros(rows * TILE_H, columns * TILE_W, dtype=torch.bool)
-    whole[y0:y1, x0:x1] = contributes
-    return whole.view(rows, TILE_H, columns, TILE_W).any(dim=3).any(dim=1)
+    tiles = torch.zeros(rows * TILE_H, columns * TILE_W, dtype=torch.bool)
+    tiles[y0:y1, x0:x1] = contributes
+    return tiles.view(rows, TILE_H, columns, TILE_W).any(dim=3).any(dim=1)
 
 
 def live_pixels(live: Tensor, box: Crop) -> Tensor:
@@ -91,8 +91,8 @@ def may_reach(means: Tensor, scales: Tensor, camera: Camera, live: Tensor) -> Te
     sums = torch.zeros(rows + 1, columns + 1, dtype=torch.int64)
     sums[1:, 1:] = live.long().cumsum(0).cumsum(1)
     (left, top), (right, bottom) = low.unbind(1), high.unbind(1)
-    found = sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]
-    return found > 0
+    counts = sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]
+    return counts > 0
 
 
 @dataclass(frozen=True)
@@ -211,10 +211,10 @@ def crop_scene(
             without gradients a linear map of the members' colors; transmittance is right in these only
     """
     activated = activate(scene, seen_colors(scene, camera))
-    kept = render(activated, camera, background, crop=box).info.visible.clone()
-    kept[members] = True  # a member that is out of sight now may come into it
-    index = kept.nonzero()[:, 0]
-    whole = CropScene(
+    visible = render(activated, camera, background, crop=box).info.visible.clone()
+    visible[members] = True  # a member that is out of sight now may come into it
+    index = visible.nonzero()[:, 0]
+    crop_of_all = CropScene(
         camera,
         box,
         activated.select(index),
@@ -222,25 +222,25 @@ def crop_scene(
         scene.shN[members],
         background,
     )
-    return _keep_live_tiles(replace(whole, still=True)) if still else whole
+    return _keep_live_tiles(replace(crop_of_all, still=True)) if still else crop_of_all
 
 
 def _keep_live_tiles(view: CropScene) -> CropScene:
     """The view with all that no member contributes to taken from the original picture."""
-    whole = view.gaussians
-    member = torch.zeros_like(whole.opacities)
+    gaussians = view.gaussians
+    member = torch.zeros_like(gaussians.opacities)
     member[view.rows] = 1.0
-    white = whole._replace(colors=member[:, None].expand(-1, 3).contiguous())
+    white = gaussians._replace(colors=member[:, None].expand(-1, 3).contiguous())
     share = replace(view, background=torch.zeros(3))._draw(white).image
     live = live_tiles((share > 0).any(dim=2), view.box)
     if bool(live_pixels(live, view.box).all()):
         return view
-    kept = may_reach(whole.means, whole.scales, view.camera, live)
-    kept[view.rows] = True
-    index = kept.nonzero()[:, 0]
+    reachable = may_reach(gaussians.means, gaussians.scales, view.camera, live)
+    reachable[view.rows] = True
+    index = reachable.nonzero()[:, 0]
     return replace(
         view,
-        gaussians=whole.select(index),
+        gaussians=gaussians.select(index),
         rows=torch.searchsorted(index, view.rows),
         cached=(live_pixels(live, view.box)[..., None], view.original()),
     )

@@ -108,12 +108,12 @@ def render_view(scene: Gaussians, camera: Camera, background: Tensor) -> Tensor:
 def region_box(mask: Tensor, margin: int = 6) -> Crop:
     """The smallest box around the pixels that show the region, with a margin, grown to 64 pixels. [H,W]"""
     height, width = mask.shape
-    shown = mask > 0.5 * _SEEN
-    if not bool(shown.any()):
+    visible = mask > 0.5 * _SEEN
+    if not bool(visible.any()):
         return (0, 0, width, height)
     spans = []
     for axis, side in ((0, width), (1, height)):
-        hit = shown.any(dim=axis).nonzero()[:, 0]
+        hit = visible.any(dim=axis).nonzero()[:, 0]
         low, high = int(hit[0]) - margin, int(hit[-1]) + 1 + margin
         missing = _LEAST_BOX - (high - low)
         if missing > 0:

@@ -242,7 +242,7 @@ def _is_region_file(path: Path) -> bool:
         return False
 
 
-def _free_region_path(state: SelectionState, name: str, folder: Path, own: Path | None = None) -> Path:
+def _free_region_path(state: SelectionState, name: str, folder: Path, current: Path | None = None) -> Path:
     """A file in `folder` that no region and no other file has."""
 
     def path(free: str) -> Path:
@@ -251,6 +251,6 @@ def _free_region_path(state: SelectionState, name: str, folder: Path, own: Path 
     others = {region.path for region in state.regions}
 
     def is_taken(free: str) -> bool:
-        return path(free) in others or (path(free) != own and os.path.lexists(path(free)))
+        return path(free) in others or (path(free) != current and os.path.lexists(path(free)))
 
     return path(selection.free_name(state, name, is_taken))

@@ -66,7 +66,7 @@ class WindowFile(SessionFile, frozen=True, forbid_unknown_fields=True):
         """Every value is one that the window could have made."""
         timeline_file.check(self.view.timeline, "view.timeline.keys")
         stacks = {"view": self.view.layers}
-        stacks |= {f"snapshots[{i}].edit": kept.edit.layers for i, kept in enumerate(self.snapshots)}
+        stacks |= {f"snapshots[{i}].edit": snapshot.edit.layers for i, snapshot in enumerate(self.snapshots)}
         for where, layers in stacks.items():
             for i, layer in enumerate(layers):
                 if not 0 <= layer.gdf < len(self.edits):

@@ -111,7 +111,7 @@ class SplatTextures:
             Bytes sent.
         """
         runs = [(0, self.rows)] if rows is None else list(row_runs(rows))
-        touched = []
+        dirty = []
         for attribute in attributes:
             texel = PLACES[attribute]
             if texel.texture not in self._memory:
@@ -127,9 +127,9 @@ class SplatTextures:
             for first, last in runs:
                 begin, end = first * SPLATS_PER_ROW, min(last * SPLATS_PER_ROW, self.count)
                 memory[begin:end] = numbers[begin:end]
-            if texel.texture not in touched:
-                touched.append(texel.texture)
-        return sum(self._send(name, runs) for name in touched)
+            if texel.texture not in dirty:
+                dirty.append(texel.texture)
+        return sum(self._send(name, runs) for name in dirty)
 
     def _send(self, name: str, runs: list[tuple[int, int]]) -> int:
         texture, memory = self.textures[name], self._memory[name]
@@ -156,10 +156,10 @@ def row_runs(rows: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
     """Texture rows [first, last) that hold the Gaussians `rows` (sorted), near ones joined."""
     if not len(rows):
         return
-    touched = rows // SPLATS_PER_ROW
-    breaks = np.flatnonzero(np.diff(touched) > _GAP)
-    firsts = touched[np.concatenate([[0], breaks + 1])]
-    lasts = touched[np.concatenate([breaks, [len(touched) - 1]])]
+    texture_rows = rows // SPLATS_PER_ROW
+    breaks = np.flatnonzero(np.diff(texture_rows) > _GAP)
+    firsts = texture_rows[np.concatenate([[0], breaks + 1])]
+    lasts = texture_rows[np.concatenate([breaks, [len(texture_rows) - 1]])]
     for first, last in zip(firsts, lasts, strict=True):
         yield int(first), int(last) + 1
 

@@ -47,14 +47,14 @@ def _job_row(job: Job) -> _Row:
     about = str(task.out)
     if isinstance(task, EditOrder):
         about = f"{task.name}\n{task.editor} on {task.region}\n{task.out}"
-    said = (
+    line = (
         (job.error or job.warning)
         if failed
         else f"For {job.elsewhere}  ·  " * bool(job.elsewhere) + _said(job)
     )
     runs = job.status == "running" and not job.starved
     items = ("Show log…", "run_log", True), ("Discard…", "ask_discard", job.status in ("stopped", "failed"))
-    row = _Row(task.name, about, _status(job), job.progress.share, said, failed, runs, _buttons(job))
+    row = _Row(task.name, about, _status(job), job.progress.share, line, failed, runs, _buttons(job))
     return replace(row, menu=items) if isinstance(task, EditOrder) and job.status != "queued" else row
 
 

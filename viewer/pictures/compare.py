@@ -187,13 +187,13 @@ class Comparer:
         if view.compare.mode == "off":
             return self.engine.image(view, size, camera)
         if view.compare.mode == "beside":
-            whole = camera or to_camera(view.camera, *size)
-            camera = half_camera(whole)
+            full = camera or to_camera(view.camera, *size)
+            camera = half_camera(full)
         edited = self.engine.image(view, size, camera)
         other = self._second(view).image(self._other_view(view), size, camera)
         self.psnr = _psnr(other, edited)
         if view.compare.mode == "beside":
-            gap = np.ones((edited.shape[0], whole.width - 2 * edited.shape[1], 3), np.float32)
+            gap = np.ones((edited.shape[0], full.width - 2 * edited.shape[1], 3), np.float32)
             return np.concatenate([other, edited, gap], axis=1)
         if view.compare.mode == "split":
             at = column(view.compare, edited.shape[1])

@@ -82,9 +82,9 @@ class _Begun:
     def _draw(self, gaussians: ActivatedGaussians) -> tuple[Image, Image]:
         began = time.perf_counter()
         with stopped_by(self._stop):
-            found = _draw(gaussians, self._camera, self._background)
+            picture = _draw(gaussians, self._camera, self._background)
         self._ms = 1e3 * (time.perf_counter() - began)
-        return found
+        return picture
 
 
 class CpuRenderer:
@@ -155,23 +155,23 @@ class CpuRenderer:
         it has fewer Gaussians."""
         begun, self.begun_ms = self._begun, 0.0
         if pixels > 1:
-            found = self._draw_fewer(camera, background, pixels)
+            picture = self._draw_fewer(camera, background, pixels)
         elif begun is not None and begun.shows(camera, background):
-            found, self.begun_ms = begun.result()
+            picture, self.begun_ms = begun.result()
         else:
-            found = _draw(self._drawn, camera, background)
+            picture = _draw(self._drawn, camera, background)
         self._drop()
-        self._kept, self._stale, self._changed = _Kept(*found, camera, background), True, pixels > 1
+        self._kept, self._stale, self._changed = _Kept(*picture, camera, background), True, pixels > 1
 
     def _draw_fewer(self, camera: Camera, background: Vec3, pixels: int) -> tuple[Image, Image]:
         began = time.perf_counter()
         fewer = simplify(self._drawn, camera, self._budget, pixels)
-        found = _draw(fewer, camera, background)
+        picture = _draw(fewer, camera, background)
         taken, (low, high) = 1e3 * (time.perf_counter() - began), MOVING_MS
         if taken > high or (taken < low and len(fewer.means) > 0.9 * self._budget):
-            wanted = int(self._budget * (0.85 if taken > high else 1.15))
-            self._budget = min(max(wanted, BUDGETS[0]), BUDGETS[2])
-        return found
+            budget = int(self._budget * (0.85 if taken > high else 1.15))
+            self._budget = min(max(budget, BUDGETS[0]), BUDGETS[2])
+        return picture
 
     def prepare(self, camera: Camera, background: Vec3) -> bool:
         """See `Renderer.prepare`."""
@@ -206,8 +206,8 @@ class CpuRenderer:
     ) -> None:
         """See `Renderer.show`."""
         assert self._ctx is not None, "nothing to show on without a context"
-        kept = self._picture()
-        image = kept.image
+        picture = self._picture()
+        image = picture.image
         size = size or (image.shape[1], image.shape[0])
         if self._copy is None or (self._copy.size, self._copy.left) != (size, left):
             if self._copy is not None:
@@ -219,7 +219,7 @@ class CpuRenderer:
             self._copy.write(image)
         elif self._stale and grid is not None:  # cheaper than another picture, or another pass of software GL
             lines = grid.view(np.float32).reshape(len(grid), -1)
-            with lines_behind(image, kept.through, lines, CLEAR):
+            with lines_behind(image, picture.through, lines, CLEAR):
                 self._copy.write(image)
         self._stale = False
         self._copy.show(framebuffer)
@@ -264,8 +264,8 @@ class CpuRenderer:
 def _draw(gaussians: ActivatedGaussians, camera: Camera, background: Vec3) -> tuple[Image, Image]:
     """The picture and what shines through it."""
     with torch.no_grad():
-        found = render(gaussians, camera, background)
-    return found.image.numpy(), found.transmittance.numpy()
+        rendered = render(gaussians, camera, background)
+    return rendered.image.numpy(), rendered.transmittance.numpy()
 
 
 def _same(camera: Camera, background: Vec3, other: Camera, other_background: Vec3) -> bool:

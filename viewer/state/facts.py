@@ -135,8 +135,8 @@ def visible_changes(scene: Gaussians, gdf: Gdf) -> tuple[float, ...]:
 
     original = pictures(0.0)
     changes = [visible_change(original, pictures(i / STEPS)) for i in range(count)]
-    whole = changes[STEPS]
-    return tuple(change / whole for change in changes) if whole > 0.0 else (0.0,) * count
+    total = changes[STEPS]
+    return tuple(change / total for change in changes) if total > 0.0 else (0.0,) * count
 
 
 NO_FILE = "the edit was not opened from a file"

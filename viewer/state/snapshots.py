@@ -204,8 +204,8 @@ def _lerp(a: float, b: float, share: float) -> float:
 
 def _sliders(view: ViewState) -> Edit:
     """What a snapshot keeps: all that undo knows but the film, the selection and the blend of snapshots."""
-    whole = history.edit_of(view)
-    return replace(whole, timeline=Timeline(), selection=SelectionState(), pair=SnapshotPair())
+    edit = history.edit_of(view)
+    return replace(edit, timeline=Timeline(), selection=SelectionState(), pair=SnapshotPair())
 
 
 def _name(snapshots: Sequence[SliderSnapshot]) -> str:

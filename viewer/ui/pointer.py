@@ -69,8 +69,8 @@ class PointerContext:
 
     def camera(self, camera: ViewCamera) -> Camera:
         """`camera` as it takes the picture."""
-        whole = to_camera(camera, *self.size)
-        return half_camera(whole) if self.is_beside else whole
+        full = to_camera(camera, *self.size)
+        return half_camera(full) if self.is_beside else full
 
     @property
     def scene(self) -> Gaussians:
