@@ -188,8 +188,8 @@ class FieldOptions:
     """Which field is fitted to the recording."""
 
     field: FieldKind = "auto"
-    """Kind of field; auto keeps the smallest separable one that meets --target-psnr; lossless
-    keeps every recording."""
+    """Kind of field; auto keeps the smallest separable one or straight line that meets --target-psnr;
+    lossless keeps every recording."""
     size: Size = "tiny"
     """neural: numbers in the network, 17 thousand, .5 million or 6 million (paper, a quarter of an hour)."""
     field_loss: FieldLoss = "parameters"

@@ -169,7 +169,8 @@ def choose_field(
         offsets: raw offsets of the members; the first row is 0, the last the recorded end. [T,M,C] float32
         render: of a few views and their interesting pixels; the ranks are chosen on it
         weights: how much an error of each number shows: visibility [M] or [M,C]; None is evenly
-        kind: "auto" is "separable"; "keyframes" the baseline; "lossless" every snapshot, whatever it takes
+        kind: "auto" tries separable fields and the straight line; "keyframes" is the baseline, "lossless"
+            every snapshot, whatever it takes
         target: least PSNR over the slider, dB; infinite asks for the best in the budget
         budget: most bytes a member; None is as many as it takes
         evaluator: decides in the end, best on views that `render` does not show; None decides by `render`
@@ -195,6 +196,8 @@ def choose_field(
         spread = channel_weights(weights, offsets.shape[1], offsets.shape[2])
         seen = render_trajectories(offsets, spread, render)
         tried = _grow_fields(seen, strengths, target, budget, evaluator, recorded)
+    if kind == "auto":  # the straight line takes fewest bytes, and may be all that the edit needs
+        tried += _even_keyframes(strengths, offsets, -math.inf, budget, evaluator, recorded)
     return pick_candidate(tuple(tried), target, budget)
 
 

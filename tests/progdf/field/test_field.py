@@ -220,6 +220,7 @@ def test_a_straight_trajectory_needs_two_keyframes_only() -> None:
     strengths, offsets = curved_trajectory(20)
     straight = strengths[:, None, None] * offsets[-1]
     chosen = choose_field(strengths, straight, linear_pictures(20, 14))
+    assert "2 keyframes" in [candidate.label for candidate in chosen.tried]
     assert chosen.best.field.bytes_per_member == 56
     assert chosen.best.worst > 90
 
