@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal, TypeVar
 import tyro
 from tyro.conf import Fixed
 
+from progdf.cli.options import absent_option
 from progdf.errors import ProgdfError
 from progdf.field.neural import Size
 from progdf.scene.up_axis import UpChoice
@@ -56,11 +57,6 @@ SMALLEST_VIEW = 32
 QUICK_STEPS, QUICK_STAGES, QUICK_VIEWS = 240, 4, 12
 
 
-def _absent(metavar: str, instead: str) -> Any:
-    """An option that may be left out, in the help: what it takes, and what happens without it."""
-    return tyro.conf.arg(metavar=metavar, help_behavior_hint=f"(default: {instead})")
-
-
 @dataclass(frozen=True)
 class RegionOptions:
     """What may change."""
@@ -72,7 +68,7 @@ class RegionOptions:
     lift_rule: LiftRule = "share"
     """masks, text: a Gaussian's score is the share of its visible weight that lies in the masks, the share of
     its pixels, or the paper's printed sum, which selects nothing at the paper's threshold."""
-    lift_threshold: Annotated[float | None, _absent("FLOAT", "the rule's own")] = None
+    lift_threshold: Annotated[float | None, absent_option("FLOAT", "the rule's own")] = None
     """masks, text: minimum score of a member; by default .7 for share, .8 for count and paper."""
     detector: str = DETECTOR
     """text: id or folder of the GroundingDINO that finds objects; download it first."""
@@ -90,14 +86,14 @@ class EditorOptions:
     """recolor:#rrggbb, tint:#rrggbb, stripes:#rrggbb, darken:AMOUNT, night, folder:DIR (edited views),
     photographs:EDITED,ORIGINALS (of what the cameras took), pictures:A.png[,B.png] (rendered, then changed in
     any program), style:N (a painting, N from 0 to 25), instruct:"turn him into Batman"."""
-    model: Annotated[str, _absent("STR", "timbrooks/instruct-pix2pix")] = ""
+    model: Annotated[str, absent_option("STR", "timbrooks/instruct-pix2pix")] = ""
     """instruct: id or folder of a diffusers pipeline; empty: timbrooks/instruct-pix2pix (the paper's)."""
-    guidance: Annotated[str, _absent("NUMBER[,NUMBER]", "the model's own")] = ""
+    guidance: Annotated[str, absent_option("NUMBER[,NUMBER]", "the model's own")] = ""
     """instruct: how closely the instruction is followed and, after a comma, the picture, where the model
     supports that; by default the model's own values (paper: 7.5,1.5)."""
-    edit_steps: Annotated[int | None, _absent("INT", "the model's own")] = None
+    edit_steps: Annotated[int | None, absent_option("INT", "the model's own")] = None
     """instruct: denoising steps per picture; by default the model's own number (paper: 20)."""
-    edit_size: Annotated[int | None, _absent("INT", "the model's own")] = None
+    edit_size: Annotated[int | None, absent_option("INT", "the model's own")] = None
     """style, instruct: longer side in pixels at which pictures are painted; larger makes finer strokes."""
     reedit_every: int = 0
     """style, instruct: every N steps, edit the current renders again and train towards those; 0: never."""
@@ -115,7 +111,7 @@ class EditorOptions:
 class ViewOptions:
     """Which views are edited."""
 
-    cameras: Annotated[Path | None, _absent("PATH", "a rig that looks at the region")] = None
+    cameras: Annotated[Path | None, absent_option("PATH", "a rig that looks at the region")] = None
     """cameras.json, transforms.json or the folder of a COLMAP model; without it, a rig that looks at
     the region."""
     up: UpChoice = "auto"
@@ -140,7 +136,7 @@ class OptimizeOptions:
     kind: Kind = "auto"
     """What the edit moves; sets learning rates and loss weights. auto: as the editor knows; for folder:,
     photographs: and instruct: all are tried on a few small views, and the log says which was best."""
-    group_steps: Annotated[int | None, _absent("INT", "chosen by a trial")] = None
+    group_steps: Annotated[int | None, absent_option("INT", "chosen by a trial")] = None
     """geometry: first the connected parts of the region are moved as rigid wholes, in this many steps per
     strength or twice as many; 0: every Gaussian finds its own way, which bends well but smears what moves
     far. By default 120 or 0, whichever a short trial finds better."""
@@ -153,7 +149,7 @@ class OptimizeOptions:
     """Colors that change with the direction one looks from: trained, and kept where leaving them out would
     cost 0.1 dB (on), left as they are (off), or trained unless the edit is of colors and the region's own
     hardly change with the view (auto)."""
-    perceptual_weight: Annotated[float | None, _absent("FLOAT", "by the kind of edit")] = None
+    perceptual_weight: Annotated[float | None, absent_option("FLOAT", "by the kind of edit")] = None
     """Weight of LPIPS beside L1; by default .3 for style and geometry (paper: 1). An edit of colors is solved
     for, all views at once; a weight makes it descend view by view instead."""
     progressive: Progressive = "off"
@@ -197,7 +193,7 @@ class FieldOptions:
     sharpness; about .3 s a step with the network of 6 million)."""
     target_psnr: float = 40.0
     """The field's worst PSNR against the recorded trajectory over the slider, on held-out views, dB."""
-    bytes_budget: Annotated[float | None, _absent("FLOAT", "as many as --target-psnr takes")] = None
+    bytes_budget: Annotated[float | None, absent_option("FLOAT", "as many as --target-psnr takes")] = None
     """Bytes per Gaussian of the region that the field may take; the best one within is kept, whatever its
     PSNR. Not for neural."""
     as_printed: Fixed[bool] = (
@@ -211,10 +207,10 @@ class FieldOptions:
 class TextOptions:
     """What CLIP is asked; of fit and evaluate the run's own texts, if nothing is given."""
 
-    text_before: Annotated[str, _absent("STR", "none; of fit and evaluate the run's own")] = ""
+    text_before: Annotated[str, absent_option("STR", "none; of fit and evaluate the run's own")] = ""
     """What the views show before the edit, such as "a bear"; with --text-after, CLIP directional similarity
     is measured (ViT-L/14; pip install progdf-studio[clip])."""
-    text_after: Annotated[str, _absent("STR", "none; of fit and evaluate the run's own")] = ""
+    text_after: Annotated[str, absent_option("STR", "none; of fit and evaluate the run's own")] = ""
     """What they show after it, such as "a golden bear"; instruct: its sentence, if nothing is given."""
     asked: Fixed[bool] = False  # whether a text was given for this; an instruction alone asks for nothing
 
@@ -236,7 +232,7 @@ class TrainOptions:
     preset: Preset = "default"
     """Values of the options below, where the command line gives none: paper is the paper's trainer as it is
     printed. In Python: trainer.options.apply_preset."""
-    name: Annotated[str, _absent("STR", "the folder's name")] = ""
+    name: Annotated[str, absent_option("STR", "the folder's name")] = ""
     """Name of the layer and of the .gdf file; the folder's name if empty."""
     views: ViewOptions = ViewOptions()
     optimize: OptimizeOptions = OptimizeOptions()
@@ -333,7 +329,7 @@ class FitOptions:
     run: tyro.conf.Positional[Path]
     """Folder that progdf train wrote."""
     field: FieldOptions = FieldOptions()
-    scene: Annotated[Path | None, _absent("PATH", "where the run found it")] = None
+    scene: Annotated[Path | None, absent_option("PATH", "where the run found it")] = None
     """Where the scene is now, if it has moved since the run."""
     texts: TextOptions = TextOptions()
     threads: int = 0
@@ -347,7 +343,7 @@ class EvaluateOptions:
 
     run: tyro.conf.Positional[Path]
     """Folder that progdf train wrote."""
-    scene: Annotated[Path | None, _absent("PATH", "where the run found it")] = None
+    scene: Annotated[Path | None, absent_option("PATH", "where the run found it")] = None
     """Where the scene is now, if it has moved since the run."""
     texts: TextOptions = TextOptions()
     threads: int = 0
@@ -364,11 +360,11 @@ class ShowRegionOptions:
     """The region, as progdf train --region has it: box:…, lasso:…, masks:DIR, file:MEMBERS.npy, …"""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """picture.png, in which the region is tinted and the rest is pale; or members.npy, its rows (int64)."""
-    cameras: Annotated[Path | None, _absent("PATH", "none")] = None
+    cameras: Annotated[Path | None, absent_option("PATH", "none")] = None
     """masks: their cameras, where DIR holds none; text: views in which to look for it."""
-    camera: Annotated[str | None, _absent("FILE[:INDEX]", "four sides")] = None
+    camera: Annotated[str | None, absent_option("FILE[:INDEX]", "four sides")] = None
     """Look through a camera of this file, the first where no INDEX is given."""
-    orbit: Annotated[str | None, _absent("AZ,EL[,DISTANCE]", "four sides")] = None
+    orbit: Annotated[str | None, absent_option("AZ,EL[,DISTANCE]", "four sides")] = None
     """Look from degrees around the scene, degrees above it, world units away (fitting); without camera and
     orbit the picture shows four sides."""
     size: Annotated[str, tyro.conf.arg(metavar="WxH")] = "640x480"
@@ -377,7 +373,7 @@ class ShowRegionOptions:
     """The axis of the scene that is up."""
     lift_rule: LiftRule = "share"
     """masks, text: as for progdf train."""
-    lift_threshold: Annotated[float | None, _absent("FLOAT", "the rule's own")] = None
+    lift_threshold: Annotated[float | None, absent_option("FLOAT", "the rule's own")] = None
     """masks, text: as for progdf train."""
 
 
@@ -393,9 +389,9 @@ class WriteViewsOptions:
     """The scene, a 3DGS .ply file."""
     out: Path
     """Folder for original/NAME.png and cameras.json."""
-    cameras: Annotated[Path | None, _absent("PATH", "a rig around the scene")] = None
+    cameras: Annotated[Path | None, absent_option("PATH", "a rig around the scene")] = None
     """cameras.json, transforms.json or the folder of a COLMAP model; without it, a rig around the scene."""
-    region: Annotated[str | None, _absent("STR", "the whole scene")] = None
+    region: Annotated[str | None, absent_option("STR", "the whole scene")] = None
     """The rig looks at this region instead of the whole scene."""
     views: int = 12
     """How many views, at most; of more cameras, those that differ most."""

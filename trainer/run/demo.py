@@ -18,7 +18,7 @@ import tyro
 from torch import Tensor
 
 from progdf.camera import Camera
-from progdf.cli.options import parse_options
+from progdf.cli.options import absent_option, parse_options
 from progdf.compose.reference import Layer, compose_layers
 from progdf.demo_scenes import DemoScene, bear, paint_panda, room
 from progdf.errors import ProgdfError
@@ -132,8 +132,8 @@ class DemoOptions:
 
     scene: Literal["bear", "room"] = "bear"
     """A bear in the grass to look at from all around, or a room to stand in."""
-    size: int | None = None
-    """Number of Gaussians; by default 24000 for the bear, 40000 for the room."""
+    size: Annotated[int | None, absent_option("COUNT", "24000 for the bear, 40000 for the room")] = None
+    """Number of Gaussians."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("demo")
     """Folder for the scene, the edits and the pictures; created if needed."""
     quick: bool = False
