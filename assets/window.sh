@@ -21,4 +21,4 @@ xdotool key shift+F2
 sleep 3
 xdotool key ctrl+q
 wait "$window"
-mv "$folder"/*.png "$out"
+mv "$(ls -t "$demo"/scene_*.png | head -1)" "$out" # pictures are saved beside the scene
