@@ -226,12 +226,14 @@ def appearance(rows: Tensor, end: Tensor) -> Tensor:
 
 def control_signal(shape: NeuralShape, nodes: Tensor, s: Tensor) -> Tensor:
     """The control signal H(s) of each strength. [bins,CONTROL], [B] -> [B,CONTROL]"""
+    # index_select: the gradient of indexing adds up in the order that threads come in
     if shape.hard:
-        return nodes[hard_bin(s, shape.bins)]
+        return nodes.index_select(0, hard_bin(s, shape.bins))
     position = s.clamp(0.0, 1.0) * shape.bins
     left = position.floor().clamp(max=shape.bins - 1).long()
     full = torch.cat([torch.zeros_like(nodes[:1]), nodes])
-    return torch.lerp(full[left], full[left + 1], (position - left)[:, None])
+    ends = full.index_select(0, left), full.index_select(0, left + 1)
+    return torch.lerp(*ends, (position - left)[:, None])
 
 
 def hard_bin(s: Tensor, bins: int = 10) -> Tensor:

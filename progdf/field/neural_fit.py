@@ -216,7 +216,7 @@ class NeuralFit:
         signal = control_signal(self.shape, self._learned["control"], s)
         parts = [self._told[rows], signal]
         if self.shape.code:
-            parts.insert(1, self._learned["codes"][rows])
+            parts.insert(1, self._learned["codes"].index_select(0, rows))
         hidden = linear(
             torch.cat(parts, dim=1), self._learned["layers.0.weight"], self._learned["layers.0.bias"]
         )
