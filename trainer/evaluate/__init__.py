@@ -1,1 +1,1 @@
-"""What papers report of an edit: `progdf evaluate` measures a finished run, or a suite of known courses."""
+"""What papers report of an edit: `progdf evaluate` measures a finished run."""
