@@ -54,140 +54,131 @@ TAP_S = 0.25
 """A key that is let go sooner was tapped, not held."""
 NUDGES = (("", 0.01), ("Shift+", 0.10), ("Ctrl+", 0.001))
 
+
+def _keys(
+    help_: str, *chords: str, listed: str = "", repeats: bool = False, tap: bool = False
+) -> tuple[KeyBinding, ...]:
+    """A row of the list of shortcuts, and its keys, each as "chord action"."""
+    pairs = [text.split() for text in chords]
+    keys = [KeyBinding(chord, action, "", repeats, tap) for chord, action in pairs]
+    return replace(keys[0], help=help_, listed=listed), *keys[1:]
+
+
+_FOCUS = [f"{i} focus:{i}" for i in range(1, 10)] + [f"Shift+{i} toggle:{i}" for i in range(1, 10)]
+_NUDGE = [
+    f"{modifiers}{arrow} nudge:{sign * step:g}"
+    for modifiers, step in NUDGES
+    for arrow, sign in (("Left", -1), ("Right", 1), ("Down", -1), ("Up", 1))
+]
+
 TOPICS: dict[str, tuple[KeyBinding, ...]] = {
     "Layers": (
-        *(
-            KeyBinding(
-                str(i),
-                f"focus:{i}",
-                "select a layer; with Shift show or hide" if i == 1 else "",
-                listed="1–9",
-            )
-            for i in range(1, 10)
+        *_keys("select a layer; with Shift show or hide", *_FOCUS, listed="1–9"),
+        *_keys("strength or gain; Shift coarse, Ctrl fine", *_NUDGE, listed="← →", repeats=True),
+        *_keys("next slider for the arrow keys", "Tab next_slider:1", "Shift+Tab next_slider:-1"),
+        *_keys("show or hide the selected layer", "H hide"),
+        *_keys("solo (Alt+click the eye)", "Shift+H solo"),
+        *_keys("show all", "Alt+H show_all"),
+        *_keys("lock", "Shift+L lock"),
+        *_keys("gains and curve; with Alt compact rows", "G fold", "Alt+G cards"),
+        *_keys("rename (double-click the name)", "Enter rename"),
+        *_keys("duplicate", "Ctrl+D duplicate"),
+        *_keys("delete", "Ctrl+Delete remove"),
+        *_keys("move up or down (drag the name)", "Alt+Up move:-1", "Alt+Down move:1", listed="Alt+↑ ↓"),
+        *_keys("select all (Ctrl+click, Shift+click)", "Ctrl+Alt+A select_layers"),
+        *_keys("group; with Shift ungroup", "Ctrl+G group", "Ctrl+Shift+G ungroup"),
+        *_keys(
+            "copy, paste, reset strength and gains",
+            *("Ctrl+C copy_values", "Ctrl+V paste_values", "Ctrl+R reset", "Ctrl+Shift+R reset_all"),
+            listed="Ctrl+C, V, R",
         ),
-        *(KeyBinding(f"Shift+{i}", f"toggle:{i}", "") for i in range(1, 10)),
-        *(
-            KeyBinding(f"{held}{arrow}", f"nudge:{sign * step:g}", help_, repeats=True, listed="← →")
-            for held, step in NUDGES
-            for arrow, sign, help_ in (
-                ("Left", -1, ""),
-                ("Right", 1, "strength or gain; Shift coarse, Ctrl fine" if not held else ""),
-                ("Down", -1, ""),
-                ("Up", 1, ""),
-            )
-        ),
-        KeyBinding("Tab", "next_slider:1", "next slider for the arrow keys"),
-        KeyBinding("Shift+Tab", "next_slider:-1", ""),
-        KeyBinding("H", "hide", "show or hide the selected layer"),
-        KeyBinding("Shift+H", "solo", "solo (Alt+click the eye)"),
-        KeyBinding("Alt+H", "show_all", "show all"),
-        KeyBinding("Shift+L", "lock", "lock"),
-        KeyBinding("G", "fold", "gains and curve; with Alt compact rows"),
-        KeyBinding("Enter", "rename", "rename (double-click the name)"),
-        KeyBinding("Ctrl+D", "duplicate", "duplicate"),
-        KeyBinding("Ctrl+Delete", "remove", "delete"),
-        KeyBinding("Alt+Up", "move:-1", ""),
-        KeyBinding("Alt+Down", "move:1", "move up or down (drag the name)", listed="Alt+↑ ↓"),
-        KeyBinding("Ctrl+Alt+A", "select_layers", "select all (Ctrl+click, Shift+click)"),
-        KeyBinding("Ctrl+G", "group", "group; with Shift ungroup"),
-        KeyBinding("Ctrl+Shift+G", "ungroup", ""),
-        KeyBinding("Ctrl+C", "copy_values", "copy, paste, reset strength and gains", listed="Ctrl+C, V, R"),
-        KeyBinding("Ctrl+V", "paste_values", ""),
-        KeyBinding("Ctrl+R", "reset", ""),
-        KeyBinding("Ctrl+Shift+R", "reset_all", ""),
-        KeyBinding("Ctrl+F", "search", "search layers"),
-        KeyBinding("Alt+G", "cards", ""),
+        *_keys("search layers", "Ctrl+F search"),
     ),
     "View": (
-        KeyBinding("V", "fly", "orbit or fly mode"),
-        KeyBinding("F", "frame", "frame the selection, layer or scene"),
-        KeyBinding("Num.", "frame", ""),
-        KeyBinding("Shift+F", "home", "reset the view (numpad 0)"),
-        KeyBinding("Num0", "home", ""),
-        KeyBinding("Num1", "look:front", "front, right, top; Ctrl opposite", listed="Numpad 1 3 7"),
-        KeyBinding("Num3", "look:right", ""),
-        KeyBinding("Num7", "look:top", ""),
-        KeyBinding("Ctrl+Num1", "look:back", ""),
-        KeyBinding("Ctrl+Num3", "look:left", ""),
-        KeyBinding("Ctrl+Num7", "look:bottom", ""),
-        KeyBinding("Shift+G", "grid", "grid on the ground"),
-        KeyBinding(HELD_ORIGINAL, "before", "original: tap, or hold", tap=True),
-        KeyBinding("Y", "beside", "side by side; with Shift split view"),
-        KeyBinding("Shift+Y", "split", ""),
-        KeyBinding("D", "difference", "difference (a tap; held it flies)", tap=True),
-        KeyBinding("Alt+Y", "against", "compare with the recording"),
+        *_keys("orbit or fly mode", "V fly"),
+        *_keys("frame the selection, layer or scene", "F frame", "Num. frame"),
+        *_keys("reset the view (numpad 0)", "Shift+F home", "Num0 home"),
+        *_keys(
+            "front, right, top; Ctrl opposite",
+            *("Num1 look:front", "Num3 look:right", "Num7 look:top"),
+            *("Ctrl+Num1 look:back", "Ctrl+Num3 look:left", "Ctrl+Num7 look:bottom"),
+            listed="Numpad 1 3 7",
+        ),
+        *_keys("grid on the ground", "Shift+G grid"),
+        *_keys("original: tap, or hold", f"{HELD_ORIGINAL} before", tap=True),
+        *_keys("side by side; with Shift split view", "Y beside", "Shift+Y split"),
+        *_keys("difference (a tap; held it flies)", "D difference", tap=True),
+        *_keys("compare with the recording", "Alt+Y against"),
     ),
     "Edits": (
-        KeyBinding("M", "blend", "next blend rule"),
-        KeyBinding("O", "overshoot", "overshoot to 1.2"),
-        KeyBinding("Escape", "unfocus", "close this list; leave the tool; deselect", listed="Esc"),
-        KeyBinding("Ctrl+Z", "undo", "undo", repeats=True),
-        KeyBinding("Ctrl+Shift+Z", "redo", "redo", repeats=True),
-        KeyBinding("Ctrl+Y", "redo", "", repeats=True),
+        *_keys("next blend rule", "M blend"),
+        *_keys("overshoot to 1.2", "O overshoot"),
+        *_keys("close this list; leave the tool; deselect", "Escape unfocus", listed="Esc"),
+        *_keys("undo", "Ctrl+Z undo", repeats=True),
+        *_keys("redo", "Ctrl+Shift+Z redo", "Ctrl+Y redo", repeats=True),
     ),
     "Brush": (
-        KeyBinding("B", "brush", "paint strength (left drag)"),
-        KeyBinding("X", "brush_mode", "brush: erase, smooth, add"),
-        KeyBinding("Shift+B", "brush_through", "brush: front surface or all depths"),
-        KeyBinding("C", "brush_weights", "brush: tint or all weights as colors"),
-        KeyBinding("[", f"brush_radius:{1 / 1.25:g}", "", repeats=True),
-        KeyBinding("]", "brush_radius:1.25", "brush radius; with Shift softness", repeats=True, listed="[ ]"),
-        KeyBinding("Shift+[", "brush_softness:-0.1", "", repeats=True),
-        KeyBinding("Shift+]", "brush_softness:0.1", "", repeats=True),
-        KeyBinding("Backspace", "paint_clear", "clear the paint; with Shift fill it"),
-        KeyBinding("Shift+Backspace", "paint_fill", ""),
-        KeyBinding("Shift+X", "paint_feather", "feather the paint"),
+        *_keys("paint strength (left drag)", "B brush"),
+        *_keys("brush: erase, smooth, add", "X brush_mode"),
+        *_keys("brush: front surface or all depths", "Shift+B brush_through"),
+        *_keys("brush: tint or all weights as colors", "C brush_weights"),
+        *_keys(
+            "brush radius; with Shift softness",
+            *(f"[ brush_radius:{1 / 1.25:g}", "] brush_radius:1.25"),
+            *("Shift+[ brush_softness:-0.1", "Shift+] brush_softness:0.1"),
+            listed="[ ]",
+            repeats=True,
+        ),
+        *_keys("clear the paint; with Shift fill it", "Backspace paint_clear", "Shift+Backspace paint_fill"),
+        *_keys("feather the paint", "Shift+X paint_feather"),
     ),
     "Select": (
-        KeyBinding("R", "select_tool:box", "box, lasso, polygon, brush", listed="R L P U"),
-        KeyBinding("L", "select_tool:lasso", ""),
-        KeyBinding("P", "select_tool:polygon", ""),
-        KeyBinding("U", "select_tool:brush", ""),
-        KeyBinding("Shift+R", "select_tool:sphere", ""),
-        KeyBinding("J", "select_tool:flood", "sphere, connected and alike, alike", listed="Shift+R J I"),
-        KeyBinding("I", "select_tool:color", ""),
-        KeyBinding("N", "select_through", "front surface or all depths"),
-        KeyBinding("Ctrl+A", "select_all", "all; with Shift none"),
-        KeyBinding("Ctrl+Shift+A", "select_none", ""),
-        KeyBinding("Ctrl+I", "invert", "invert, or the paint with the brush"),
-        KeyBinding("Ctrl+[", "select_shrink", "", repeats=True),
-        KeyBinding("Ctrl+]", "select_grow", "shrink, grow", repeats=True, listed="Ctrl+[ ]"),
-        KeyBinding("Ctrl+H", "hide_selected", "hide; with Shift isolate"),
-        KeyBinding("Ctrl+Shift+H", "isolate", ""),
+        *_keys(
+            "box, lasso, polygon, brush",
+            *("R select_tool:box", "L select_tool:lasso", "P select_tool:polygon", "U select_tool:brush"),
+            listed="R L P U",
+        ),
+        *_keys(
+            "sphere, connected and alike, alike",
+            *("Shift+R select_tool:sphere", "J select_tool:flood", "I select_tool:color"),
+            listed="Shift+R J I",
+        ),
+        *_keys("front surface or all depths", "N select_through"),
+        *_keys("all; with Shift none", "Ctrl+A select_all", "Ctrl+Shift+A select_none"),
+        *_keys("invert, or the paint with the brush", "Ctrl+I invert"),
+        *_keys("shrink, grow", "Ctrl+[ select_shrink", "Ctrl+] select_grow", listed="Ctrl+[ ]", repeats=True),
+        *_keys("hide; with Shift isolate", "Ctrl+H hide_selected", "Ctrl+Shift+H isolate"),
     ),
     "Timeline": (
-        KeyBinding("Space", "play", "play or pause"),
-        KeyBinding("K", "key", "insert a keyframe"),
-        KeyBinding("Delete", "drop_key", "delete the keyframe"),
-        KeyBinding(",", "step:-1", "", repeats=True),
-        KeyBinding(".", "step:1", "previous or next frame", repeats=True, listed=", ."),
-        KeyBinding("Shift+,", "jump:-1", ""),
-        KeyBinding("Shift+.", "jump:1", "previous or next keyframe", listed="Shift+, ."),
-        KeyBinding("Shift+K", "easing", "interpolation: smooth, linear, hold"),
-        KeyBinding("Alt+K", "ping_pong", "ping-pong"),
-        KeyBinding("Ctrl+K", "timeline_file", "save the timeline as a file"),
-        KeyBinding("T", "timeline", "show or hide the timeline"),
+        *_keys("play or pause", "Space play"),
+        *_keys("insert a keyframe", "K key"),
+        *_keys("delete the keyframe", "Delete drop_key"),
+        *_keys("previous or next frame", ", step:-1", ". step:1", listed=", .", repeats=True),
+        *_keys("previous or next keyframe", "Shift+, jump:-1", "Shift+. jump:1", listed="Shift+, ."),
+        *_keys("interpolation: smooth, linear, hold", "Shift+K easing"),
+        *_keys("ping-pong", "Alt+K ping_pong"),
+        *_keys("save the timeline as a file", "Ctrl+K timeline_file"),
+        *_keys("show or hide the timeline", "T timeline"),
     ),
     "Window and files": (
-        KeyBinding("F1", "help", "this list"),
-        KeyBinding("F2", "picture", "save the picture as PNG"),
-        KeyBinding("Ctrl+F2", "take_view", "take this view without edits, to change it"),
-        KeyBinding("Shift+F2", "window_picture", "save the whole window as PNG"),
-        KeyBinding("F3", "snapshot", "add a snapshot; with Shift compare two"),
-        KeyBinding("Shift+F3", "compare_snapshots", ""),
-        KeyBinding("F4", "camera", "save this view as a camera"),
-        KeyBinding("Ctrl+N", "new_edit", "new edit"),
-        KeyBinding("Ctrl+S", "save", "save the session"),
-        KeyBinding("Ctrl+Shift+S", "save_as", "save the session as"),
-        KeyBinding("Ctrl+O", "open", "open a session, scene or edit"),
-        KeyBinding("Ctrl+E", "export", "export the edited scene as .ply"),
-        KeyBinding("Ctrl+P", "render_picture", "render a picture"),
-        KeyBinding("Ctrl+Shift+P", "render_film", "render a film"),
-        KeyBinding("F10", "overlay", "show timings"),
-        KeyBinding("Shift+F10", "dynamic_resolution", "dynamic resolution: auto, on, off"),
-        KeyBinding("F11", "full_screen", "full screen"),
-        KeyBinding("F12", "panel", "show or hide the panel"),
-        KeyBinding("Ctrl+Q", "quit", "quit"),
+        *_keys("this list", "F1 help"),
+        *_keys("save the picture as PNG", "F2 picture"),
+        *_keys("take this view without edits, to change it", "Ctrl+F2 take_view"),
+        *_keys("save the whole window as PNG", "Shift+F2 window_picture"),
+        *_keys("add a snapshot; with Shift compare two", "F3 snapshot", "Shift+F3 compare_snapshots"),
+        *_keys("save this view as a camera", "F4 camera"),
+        *_keys("new edit", "Ctrl+N new_edit"),
+        *_keys("save the session", "Ctrl+S save"),
+        *_keys("save the session as", "Ctrl+Shift+S save_as"),
+        *_keys("open a session, scene or edit", "Ctrl+O open"),
+        *_keys("export the edited scene as .ply", "Ctrl+E export"),
+        *_keys("render a picture", "Ctrl+P render_picture"),
+        *_keys("render a film", "Ctrl+Shift+P render_film"),
+        *_keys("show timings", "F10 overlay"),
+        *_keys("dynamic resolution: auto, on, off", "Shift+F10 dynamic_resolution"),
+        *_keys("full screen", "F11 full_screen"),
+        *_keys("show or hide the panel", "F12 panel"),
+        *_keys("quit", "Ctrl+Q quit"),
     ),
 }
 KEYS = tuple(key for keys in TOPICS.values() for key in keys)
@@ -310,8 +301,8 @@ def tapped_actions(taps: Taps, keys: Keys, now: float, flies: bool) -> tuple[Tap
     down = {press.chord: now for press in keys.pressed if press.chord in actions and not press.again}
     since = {chord: at for chord, at in {**dict(taps.since), **down}.items() if chord not in ignored}
     tapped = [c for c, at in since.items() if c not in keys.held and now - at <= TAP_S]
-    held = tuple((c, at) for c, at in since.items() if c in keys.held and now - at <= TAP_S)
-    return Taps(held), [actions[chord] for chord in tapped]
+    undecided = tuple((c, at) for c, at in since.items() if c in keys.held and now - at <= TAP_S)
+    return Taps(undecided), [actions[chord] for chord in tapped]
 
 
 def is_repeating(keys: Keys) -> bool:
@@ -380,12 +371,12 @@ class PendingKeys:
     def __init__(self) -> None:
         self._waiting: tuple[Press, ...] = ()
         self._frames = 0
-        self._asked_at = -OPENING_FRAMES  # the frame in which a text field was last asked for
+        self._opened_at = -OPENING_FRAMES  # the frame in which a text field was last asked for
 
     @property
     def opening(self) -> bool:
         """Whether a text field was asked for and has no keyboard yet."""
-        return self._frames - self._asked_at < OPENING_FRAMES and not imgui.get_io().want_text_input
+        return self._frames - self._opened_at < OPENING_FRAMES and not imgui.get_io().want_text_input
 
     def take(self, keys: Keys) -> Keys:
         """The keys of one frame that imgui has come to; call once a frame."""
@@ -394,6 +385,6 @@ class PendingKeys:
         opener = next((i for i, press in enumerate(pressed[:count]) if opens_text(press)), None)
         self._frames += 1
         if opener is not None:
-            count, self._asked_at = opener + 1, self._frames
+            count, self._opened_at = opener + 1, self._frames
         self._waiting = pressed[count:]
         return replace(keys, pressed=pressed[:count])
