@@ -21,7 +21,7 @@ from viewer.render.dynamic_resolution import FrameTimings
 from viewer.render.engine import ViewEngine
 from viewer.render.gl_renderer import Image
 from viewer.state.facts import RecordingFile
-from viewer.state.layers import shown_edits
+from viewer.state.layers import visible_edits
 from viewer.state.selection import NOBODY
 from viewer.state.snapshots import SliderSnapshot, restore, with_original
 from viewer.state.view_state import Comparison, ViewState
@@ -116,7 +116,7 @@ class Canvas:
         view: ViewState,
         screen: moderngl.Framebuffer,
         size: tuple[int, int],
-        held: bool,
+        dragging: bool,
         now: float,
         focus: int | None = None,
         overlap: int | None = None,
@@ -128,7 +128,7 @@ class Canvas:
             focus: the layer whose painted weights are shown while the brush is out, or None
             overlap: the layer of which is shown what it shares with the others, or None
             pointed: what else the panel is asked about
-            held: the mouse holds something, so that more will follow
+            dragging: the mouse holds something, so that more will follow
             now: seconds on the main view's clock
 
         Raises:
@@ -138,17 +138,17 @@ class Canvas:
         screen.clear(*PALETTE.panel)
         aim, edits = (view.camera, size), (view.layers, view.blend, view.background)
         turned, slid = aim != self._last[0], edits != self._last[1]
-        self._last, self._sliding = (aim, edits), held and (self._sliding or slid)
+        self._last, self._sliding = (aim, edits), dragging and (self._sliding or slid)
         mode = "off" if view.compare.mode == "difference" else view.dynamic_resolution
         before = self._resolution
-        self._resolution = dynamic_resolution.before_draw(before, mode, held, turned, slid, now)
+        self._resolution = dynamic_resolution.before_draw(before, mode, dragging, turned, slid, now)
         self.comparer.engine.highlight = highlight.requested_highlight(
             view, focus, overlap, pointed, self._sliding
         )
         target = aim, edits, self.comparer.engine.highlight
         has_picture, self._begun = self.pictures_drawn or self._follows, None
         if mode != "off" and has_picture and dynamic_resolution.takes_long(before, self._resolution):
-            moves = turned or (held and self._awaited not in (None, target))
+            moves = turned or (dragging and self._awaited not in (None, target))
             if moves or not self.comparer.prepare(view, size):
                 stays = not moves and before.pixels == 1 and view.compare.mode == "off"
                 self._resolution = dynamic_resolution.wait(self._resolution, now, coarsely=not stays)
@@ -203,7 +203,7 @@ class Canvas:
             return exports.picture(folder, title, pixels)
         camera = to_camera(view.camera, image.shape[1], image.shape[0])
         origin = self.comparer.engine.scene.origin
-        chunk = camera_chunk(camera, shown_edits(view), origin, view.camera.up)
+        chunk = camera_chunk(camera, visible_edits(view), origin, view.camera.up)
         line = exports.picture(folder, title, pixels, chunk)
         return f"{line}; change it in any program, and drop it here" if to_change else line
 

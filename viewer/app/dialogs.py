@@ -341,12 +341,12 @@ class Browser:
     the library would wait for the person."""
 
     def __init__(self) -> None:
-        self._shown: dialogs.open_file | dialogs.save_file | None = None
+        self._dialog: dialogs.open_file | dialogs.save_file | None = None
 
     @property
     def on_screen(self) -> bool:
         """Whether a dialog is shown, and worth another look after `POLL_S`."""
-        return self._shown is not None
+        return self._dialog is not None
 
     def open(self, dialog: Dialog, near: Path) -> Dialog:
         """The question while the desktop's dialog is shown, or with the reason why there is none.
@@ -361,28 +361,28 @@ class Browser:
         path = Path(dialog.text or near).expanduser().absolute()
         if dialog.kind in ("open", "replace"):
             folder = path if path.is_dir() else path.parent
-            self._shown = dialogs.open_file("Open", escape_text(f"{folder}/"), _OPEN)
+            self._dialog = dialogs.open_file("Open", escape_text(f"{folder}/"), _OPEN)
         else:
             filters = _SAVE if dialog.kind == "save" else ["All files", "*"]
-            self._shown = dialogs.save_file("Save", escape_text(str(path)), filters)
+            self._dialog = dialogs.save_file("Save", escape_text(str(path)), filters)
         return replace(
             dialog, choosing=True, notice="Choose a file in the system dialog, or type a path here"
         )
 
     def poll(self, dialog: Dialog | None) -> Dialog | None:
         """The question after a look at the dialog: with the file, if one was chosen. Does not wait."""
-        if self._shown is None or dialog is None or not dialog.choosing:
+        if self._dialog is None or dialog is None or not dialog.choosing:
             self.close()  # the question was answered without it
             return dialog
-        if not self._shown.ready(0):
+        if not self._dialog.ready(0):
             return dialog
-        answer: Sequence[str] | str = self._shown.result()
+        answer: Sequence[str] | str = self._dialog.result()
         path = answer if isinstance(answer, str) else next(iter(answer), "")
-        self._shown = None
+        self._dialog = None
         return replace(dialog, choosing=False, notice="", chosen=path)
 
     def close(self) -> None:
         """Take the dialog away, answered or not."""
-        if self._shown is not None and not self._shown.ready(0):
-            self._shown.kill()
-        self._shown = None
+        if self._dialog is not None and not self._dialog.ready(0):
+            self._dialog.kill()
+        self._dialog = None

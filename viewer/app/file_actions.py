@@ -417,10 +417,10 @@ class FileActions:
         if self._app.document.path is None:
             return
         paths = session.find_autosaves(self._session_name(), numbered=self.path is None)
-        left = [path for path in paths if path != self.session_autosave.path and path not in self._put_off]
-        if left:
-            self._put_off.add(left[0])  # if it is not decided now
-            self._app.main_view.ask(Dialog("restore", str(left[0])))
+        new = [path for path in paths if path != self.session_autosave.path and path not in self._put_off]
+        if new:
+            self._put_off.add(new[0])  # if it is not decided now
+            self._app.main_view.ask(Dialog("restore", str(new[0])))
 
     def _discard(self) -> None:
         """Unsaved work is given up; its autosave stays under another name."""

@@ -123,7 +123,7 @@ class MainView:
         self.recent_files: tuple[pages.RecentFile, ...] = ()  # those of the start page
         self.up_strip: UpStrip | None = None  # asks which way is up
         self.cover: Cover | None = None  # what lies over the picture
-        self.preview_said = ("", False)  # of the picture of a new edit, and whether it failed
+        self.preview_message = ("", False)  # of the picture of a new edit, and whether it failed
         self.live: tuple[LayerState, ...] = ()  # what is being trained, on top of the stack
         self.report: Callable[[Exception], None] = self._report  # told of what a part of a frame raises
         self.surfaces = Surfaces()
@@ -179,7 +179,7 @@ class MainView:
         """A new state and snapshots, with nothing to undo, nothing in the hand or over the picture."""
         self.work = workspace.new_workspace(view, snapshots)
         self._tool, self._taps = MouseTool(), Taps()
-        self.cover, self.up_strip, self.preview_said = None, None, ("", False)
+        self.cover, self.up_strip, self.preview_message = None, None, ("", False)
         self.wake()
 
     def next_frame_delay(self) -> float | None:
@@ -286,7 +286,7 @@ class MainView:
             self.wake()
 
     def _draw_picture(self, screen: moderngl.Framebuffer) -> None:
-        view, area = self._shown_view(), self._pointer().size
+        view, area = self._displayed_view(), self._pointer().size
         self.canvas.comparer.sides = compare_sides(self.work.snapshots, view)
         pointed = (self.work.overlap, self.work.pointed) if view.panel else (None, None)
         self.canvas.draw(view, screen, area, self._is_held(), self._clock, self.work.focus, *pointed)
@@ -349,7 +349,7 @@ class MainView:
                 if missing:
                     self.wake()
                 self.work = interface.panels(
-                    self.work, self._pointer(), textures, self.preview_said, self.recent, reveal
+                    self.work, self._pointer(), textures, self.preview_message, self.recent, reveal
                 )
             self._revealed = self.work.focus, several
         if not off:  # else the right button has said all it was pressed for
@@ -379,10 +379,17 @@ class MainView:
         if self._tool.drag is None:
             self._half = int(2 * imgui.get_io().mouse_pos.x >= area.width)
         return PointerContext(
-            self.engine, self.facts, self._shown_view(), area, self.ui, self._clock, self.surfaces, self._half
+            self.engine,
+            self.facts,
+            self._displayed_view(),
+            area,
+            self.ui,
+            self._clock,
+            self.surfaces,
+            self._half,
         )
 
-    def _shown_view(self) -> ViewState:
+    def _displayed_view(self) -> ViewState:
         if self._shows_original:
             return workspace.original(self.work.view)
         view, sides = self.work.view, compare_sides(self.work.snapshots, self.work.view)
@@ -451,14 +458,14 @@ class MainView:
         """Serve the requests for files that the main view can make by itself."""
         known = (*exports.REQUESTS, "copy_values", "paste_values")
         served = [request for request in self.work.requests if request in known]
-        left = tuple(request for request in self.work.requests if request not in served)
-        self.work = replace(self.work, requests=left)
+        unserved = tuple(request for request in self.work.requests if request not in served)
+        self.work = replace(self.work, requests=unserved)
         for request in served:
             with self._guard():
                 self.show_message(self._save(request, screen, size))
 
     def _save(self, request: str, screen: moderngl.Framebuffer, size: tuple[int, int]) -> str:
-        title, view = self.facts.title, self._shown_view()
+        title, view = self.facts.title, self._displayed_view()
         if request == "copy_values":
             text, what = layer_selection.copy_values(self.work)
             imgui.set_clipboard_text(text)

@@ -229,10 +229,10 @@ def _begin_stroke(tool: MouseTool, work: Workspace, pointer: PointerContext) -> 
     reason = tools.paint_obstacle(work.view, work.focus)
     if reason or work.focus is None:
         return tool, workspace.with_message(work, f"Cannot paint: {reason}", pointer.now, error=True)
-    layer, held = work.view.layers[work.focus], work.view.brush
-    mode = paint.mode_while(held.mode, modifier())
+    layer, brush = work.view.layers[work.focus], work.view.brush
+    mode = paint.mode_while(brush.mode, modifier())
     gdf = pointer.engine.gdfs[layer.gdf]
-    stroke = paint.begin_stroke(layer.paint, gdf, pointer.surface, held.through, mode)
+    stroke = paint.begin_stroke(layer.paint, gdf, pointer.surface, brush.through, mode)
     return _paint(MouseTool(tools.PAINT_DRAG, stroke), work, pointer)
 
 

@@ -267,8 +267,8 @@ def take_keys(
         gesture, work = finish(gesture, work, pointer)
     elif "Escape" in pressed:
         gesture = None
-    left = tuple(press for press in keys.pressed if press.chord not in ("Enter", "Escape"))
-    return gesture, work, replace(keys, pressed=left)
+    unused = tuple(press for press in keys.pressed if press.chord not in ("Enter", "Escape"))
+    return gesture, work, replace(keys, pressed=unused)
 
 
 def _is_near(gesture: Gesture, pointer: PointerContext) -> bool:

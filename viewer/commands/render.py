@@ -44,7 +44,7 @@ from viewer.pictures.compare import Comparer, draw_labels
 from viewer.render.engine import ViewEngine
 from viewer.render.gl_renderer import headless_context
 from viewer.state import facts, timeline
-from viewer.state.layers import shown_edits, visible_layers
+from viewer.state.layers import visible_edits, visible_layers
 from viewer.state.paint import layer_of
 from viewer.state.snapshots import compare_sides
 from viewer.state.view_state import MOST_AMPLIFIED, Comparison, Timeline, ViewState
@@ -183,7 +183,7 @@ def _render_still(
     if options.alpha:
         picture = Image.fromarray(transparent_image(engine, view, camera))
         with atomic_write(options.out) as temporary_file:
-            picture.save(temporary_file, pnginfo=camera_chunk(camera, shown_edits(view), origin, opened.up))
+            picture.save(temporary_file, pnginfo=camera_chunk(camera, visible_edits(view), origin, opened.up))
         return ""
     where = opened.document.recordings()
     missing = facts.obstacle(where)
@@ -198,7 +198,7 @@ def _render_still(
         image = comparer.image(view, camera=camera)
         # a comparison is no view that could be edited and trained on
         single = view.compare.mode == "off"
-        carried = camera_chunk(camera, shown_edits(view), origin, opened.up) if single else None
+        carried = camera_chunk(camera, visible_edits(view), origin, opened.up) if single else None
         labelled = Image.fromarray(draw_labels(image, view.compare, comparer.labels(view)))
         with atomic_write(options.out) as temporary_file:
             labelled.save(temporary_file, pnginfo=carried)

@@ -46,8 +46,8 @@ class Presenter:
             self._stretch_vao.render(moderngl.TRIANGLES, vertices=3)
 
     def release(self) -> None:
-        for held in (self._vao, self._program, self._stretch_vao, self._stretch):
-            held.release()
+        for resource in (self._vao, self._program, self._stretch_vao, self._stretch):
+            resource.release()
 
 
 class ScreenCopy:

@@ -29,8 +29,8 @@ class _Buffers:
     splat: moderngl.VertexArray
 
     def release(self) -> None:
-        for held in (self.project, self.splat, self.order, self.projected):
-            held.release()
+        for resource in (self.project, self.splat, self.order, self.projected):
+            resource.release()
 
 
 @dataclass(frozen=True)
@@ -74,8 +74,8 @@ class SplatRenderer:
         """Take a whole scene; gives the bytes sent. The order has to be set anew."""
         count, coefficients = len(scene), min(int(scene.shN.shape[1]), SHOWN_SH)
         size = (count, coefficients)
-        held = self._scene
-        if held is None or (held.count, held.sh_coefficients) != size:
+        scene_textures = self._scene
+        if scene_textures is None or (scene_textures.count, scene_textures.sh_coefficients) != size:
             self._release_scene()
             self._scene = SplatTextures(self.ctx, count, coefficients)
             self._buffers = self._make_buffers(max(count, 1))
@@ -239,5 +239,5 @@ class GridPass:
         self._vao.render(moderngl.TRIANGLE_STRIP, vertices=4, instances=len(lines))
 
     def release(self) -> None:
-        for held in (self._vao, self._lines, self._program):
-            held.release()
+        for resource in (self._vao, self._lines, self._program):
+            resource.release()

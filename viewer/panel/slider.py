@@ -67,7 +67,7 @@ def draw(
         return _text_field(label, value, width, most)
     left, top = imgui.get_cursor_screen_pos()
     imgui.invisible_button(label, imgui.ImVec2(width, height * scale))
-    hovered, held = imgui.is_item_hovered(), imgui.is_item_active()
+    hovered, pressed = imgui.is_item_hovered(), imgui.is_item_active()
     radius = RADIUS_PX * scale
     start, span = left + radius, max(width - 2 * radius, 1.0) / most
     mouse = imgui.get_io().mouse_pos.x
@@ -80,17 +80,17 @@ def draw(
         value = value if on_handle else min(most, max(0.0, (mouse - start) / span))
         value = default if imgui.is_mouse_double_clicked(imgui.MouseButton_.left.value) else value
         _anchor(label, mouse, value)
-    elif held or is_released():  # a slow frame may hold the last move and the release
+    elif pressed or is_released():  # a slow frame may hold the last move and the release
         was_fine = storage.get_bool(_slot(label, "fine"))
         moved = (mouse - storage.get_float(_slot(label, "x"))) / span * (FINE if was_fine else 1.0)
         value = min(most, max(0.0, storage.get_float(_slot(label, "value")) + moved))
         if was_fine != imgui.get_io().key_shift:
             _anchor(label, mouse, value)  # after the move: a slow frame holds both
-    if not held:
+    if not pressed:
         tip(help_)
     color = fill if active else PALETTE.faint
     ticks = ticks if height >= HEIGHT_PX else ()
-    _paint((start, top, span), value, ticks, scale, color, hovered or held, most)
+    _paint((start, top, span), value, ticks, scale, color, hovered or pressed, most)
     return value
 
 

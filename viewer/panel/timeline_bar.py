@@ -147,12 +147,12 @@ def _ruler(timeline: Timeline, frame: int, wide: float, actions: list[str], ui: 
         storage.set_int(slot, -1 if under is None else under)
         actions.append(f"seek:{to if under is None else under}")
     elif imgui.is_item_active() or is_released():  # a slow frame may hold move and release
-        held = storage.get_int(slot, -1)
+        origin = storage.get_int(slot, -1)
         moved = imgui.get_mouse_drag_delta(0, 3.0 * scale).x != 0.0 or imgui.is_item_deactivated()
-        if held < 0 and to != frame:
+        if origin < 0 and to != frame:
             actions.append(f"seek:{to}")
-        elif held >= 0 and moved and to != held and key_at(timeline, to) is None:
-            actions.append(f"move_key:{held}>{to}")
+        elif origin >= 0 and moved and to != origin and key_at(timeline, to) is None:
+            actions.append(f"move_key:{origin}>{to}")
             storage.set_int(slot, to)
     if under is not None:
         imgui.set_mouse_cursor(imgui.MouseCursor_.resize_ew.value)

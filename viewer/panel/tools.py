@@ -109,26 +109,26 @@ def draw(state: ViewState, ui: UiContext, actions: list[str]) -> tuple[ViewState
     return state, pointed
 
 
-def _options(held: SelectTool, ui: UiContext) -> SelectTool:
+def _options(tool: SelectTool, ui: UiContext) -> SelectTool:
     """How the tool selects."""
     column = COLUMN_PX * ui.scale
     modes = dict(zip(SELECT_MODES, ("New", "Add", "Sub", "And"), strict=True))
     help_ = f"What becomes of the present selection.\n{_MODES}"
-    held = replace(held, mode=choice_row("Mode", modes, held.mode, column, ui, help_))
-    if held.tool not in ("sphere", "flood"):
+    tool = replace(tool, mode=choice_row("Mode", modes, tool.mode, column, ui, help_))
+    if tool.tool not in ("sphere", "flood"):
         help_ = "Select only the front surface, or everything behind it too"
-        through = choice_row("Depth", _DEPTHS, held.through, column, ui, help_, "select_through")
-        held = replace(held, through=through)
-    if held.tool == "brush":
+        through = choice_row("Depth", _DEPTHS, tool.through, column, ui, help_, "select_through")
+        tool = replace(tool, through=through)
+    if tool.tool == "brush":
         ends, help_ = (SMALLEST_PX, LARGEST_PX), f"Brush radius ({_SIZE_KEYS})"
-        radius = slider_row("Radius", held.radius, ends, SelectTool.radius, column, ui, help_, "%.0f px")
-        held = replace(held, radius=radius)
-    if held.tool in ("flood", "color"):
+        radius = slider_row("Radius", tool.radius, ends, SelectTool.radius, column, ui, help_, "%.0f px")
+        tool = replace(tool, radius=radius)
+    if tool.tool in ("flood", "color"):
         ends = (0.01, 1.0)
         help_ = f"How unlike the clicked color a color may be ({_SIZE_KEYS}). The last click follows it"
-        tolerance = slider_row("Tolerance", held.tolerance, ends, SelectTool.tolerance, column, ui, help_)
-        held = replace(held, tolerance=tolerance)
-    return held
+        tolerance = slider_row("Tolerance", tool.tolerance, ends, SelectTool.tolerance, column, ui, help_)
+        tool = replace(tool, tolerance=tolerance)
+    return tool
 
 
 def _hidden(state: ViewState, ui: UiContext, actions: list[str]) -> None:

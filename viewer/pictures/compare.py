@@ -139,7 +139,7 @@ class Comparer:
         self._against = ""  # what `_other` draws, of `AGAINST`
         self._presenter: Presenter | None = None
         self._texture: moderngl.Texture | None = None
-        self._shown: float | None = None  # how much the difference in the texture is amplified
+        self._amplified: float | None = None  # how much the difference in the texture is amplified
 
     def needs_draw(self, view: ViewState, size: tuple[int, int], pixels: int = 1) -> bool:
         """Whether splats have to be drawn for `view`, or a difference taken; arguments as for `draw`."""
@@ -149,7 +149,7 @@ class Comparer:
             return True
         if view.compare.mode == "off":
             return False
-        another = view.compare.mode == "difference" and self._shown != view.compare.amplify
+        another = view.compare.mode == "difference" and self._amplified != view.compare.amplify
         return another or self._second(view).needs_draw(self._other_view(view), drawn, camera)
 
     def draw(
@@ -169,7 +169,7 @@ class Comparer:
         """
         if view.compare.mode == "difference":
             return self._draw_difference(view, framebuffer, size)
-        self._shown = None  # the engines go on, and the next difference is another
+        self._amplified = None  # the engines go on, and the next difference is another
         if view.compare.mode in ("beside", "split"):
             return self._draw_sides(view, framebuffer, size, pixels)
         return self.engine.draw(view, framebuffer, size, pixels)
@@ -217,9 +217,9 @@ class Comparer:
 
     def release(self) -> None:
         """Give back all but the engine."""
-        for held in (self._other, self._presenter, self._texture):
-            if held is not None:
-                held.release()
+        for resource in (self._other, self._presenter, self._texture):
+            if resource is not None:
+                resource.release()
 
     def _second(self, view: ViewState) -> ViewEngine:
         """What draws the other side of `view`."""
@@ -286,7 +286,7 @@ class Comparer:
                     self._texture.release()
                 self._texture = self._ctx.texture(size, 3, dtype="f4")
             self._texture.write(image)
-            self._shown = view.compare.amplify
+            self._amplified = view.compare.amplify
             timings = _add_timings(self.engine.timings, self._second(view).timings)
         else:
             timings = FrameTimings(drawn=self.engine.timings.drawn)

@@ -192,10 +192,12 @@ def _repaint(workspace: Workspace, how: str, facts: SceneFacts) -> Workspace:
 def _take_tool(workspace: Workspace, tool: str) -> Workspace:
     """A tool that selects; the brush is put down, and a tool that is held too."""
     view = workspace.view
-    held = "" if view.select.tool == tool else tool
+    new_tool = "" if view.select.tool == tool else tool
     return replace(
         workspace,
-        view=replace(view, select=replace(view.select, tool=held), brush=replace(view.brush, active=False)),
+        view=replace(
+            view, select=replace(view.select, tool=new_tool), brush=replace(view.brush, active=False)
+        ),
     )
 
 

@@ -41,7 +41,7 @@ def is_visible(view: ViewState, layer: LayerState) -> bool:
     return any(visible.name == layer.name for visible in visible_layers(view))
 
 
-def shown_edits(view: ViewState) -> list[str]:
+def visible_edits(view: ViewState) -> list[str]:
     """The names of the layers that change the picture."""
     return [layer.name for layer in visible_layers(view) if layer.strength > 0.0]
 

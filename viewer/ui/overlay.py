@@ -177,7 +177,7 @@ class _End:
 
 def axis_under(view: ViewState, area: Area, ui: UiContext) -> str:
     """What the mouse is on: an end of `AXES`, "disc" for the rest of it, "" where it is elsewhere."""
-    if not _is_shown(view, area, ui):
+    if not _has_axes(view, area, ui):
         return ""
     mouse, (x, y) = imgui.get_io().mouse_pos, _center(area, ui)
     for end in reversed(_ends(view.camera, area, ui)):
@@ -192,7 +192,7 @@ def draw_axes(view: ViewState, area: Area, lit: bool, ui: UiContext) -> None:
     Args:
         lit: the mouse is on it, or holds it
     """
-    if not _is_shown(view, area, ui):
+    if not _has_axes(view, area, ui):
         return
     canvas, (x, y), s = imgui.get_background_draw_list(), _center(area, ui), ui.scale
     if lit:
@@ -214,7 +214,7 @@ def draw_axes(view: ViewState, area: Area, lit: bool, ui: UiContext) -> None:
                 _letter(canvas, end, f"−{letter}", _LIGHT, ui)
 
 
-def _is_shown(view: ViewState, area: Area, ui: UiContext) -> bool:
+def _has_axes(view: ViewState, area: Area, ui: UiContext) -> bool:
     """It goes with the panel: F12 leaves nothing but the picture."""
     return view.axes and view.panel and area.width >= LEAST_PX * ui.scale
 

@@ -311,8 +311,8 @@ def key_name(key: int, scancode: int) -> str:
 def chord(name: str, mods: int) -> str:
     """A key with its modifiers, as in `keys.KEYS`; on a Mac, Command does what Ctrl does elsewhere."""
     ctrl = glfw.MOD_CONTROL | (glfw.MOD_SUPER if sys.platform == "darwin" else 0)
-    held = (("Ctrl+", ctrl), ("Shift+", glfw.MOD_SHIFT), ("Alt+", glfw.MOD_ALT))
-    return "".join(prefix for prefix, bit in held if mods & bit) + name
+    modifiers = (("Ctrl+", ctrl), ("Shift+", glfw.MOD_SHIFT), ("Alt+", glfw.MOD_ALT))
+    return "".join(prefix for prefix, bit in modifiers if mods & bit) + name
 
 
 class _GlfwLoader:

@@ -254,8 +254,8 @@ class PreviewActions:
     def _show(self, text: str, cover: Cover | None, failed: bool = False) -> None:
         """The cover, and what the form says of it."""
         main_view = self._app.main_view
-        if (main_view.cover, main_view.preview_said) != (cover, (text, failed)):
-            main_view.cover, main_view.preview_said = cover, (text, failed)
+        if (main_view.cover, main_view.preview_message) != (cover, (text, failed)):
+            main_view.cover, main_view.preview_message = cover, (text, failed)
             main_view.wake()
 
     def _end(self) -> None:
