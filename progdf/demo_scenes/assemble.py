@@ -188,7 +188,7 @@ def _budget(parts: Sequence[Part], size: int) -> tuple[list[int], list[float]]:
     wishes, shares = [], []
     for part in parts:
         probes = sample(part, _PROBES)
-        share = float(_is_shown(parts, part, probes).float().mean())
+        share = float(_is_outside(parts, part, probes).float().mean())
         # five digits: what equal parts get must not hang on the last bits, which depend on the processor
         wishes.append(float(f"{float((probes.spacing**2).sum()) * share * part.weight:.5g}"))
         shares.append(max(share, 1 / _PROBES))
@@ -201,7 +201,7 @@ def _budget(parts: Sequence[Part], size: int) -> tuple[list[int], list[float]]:
     return counts, shares
 
 
-def _is_shown(parts: Sequence[Part], outer: Part, at: Samples) -> Tensor:
+def _is_outside(parts: Sequence[Part], outer: Part, at: Samples) -> Tensor:
     """Which samples lie on the outside of all other parts, or just below their skin. [N] bool"""
     visible = torch.ones(len(at), dtype=torch.bool)
     for part in parts:
@@ -219,7 +219,7 @@ def _sample_visible(
     drawn = math.ceil(count / share)
     while True:
         at = sample(part, drawn)
-        rows = _is_shown(parts, part, at).nonzero()[:, 0]
+        rows = _is_outside(parts, part, at).nonzero()[:, 0]
         if len(rows) >= count:
             break
         if drawn > _MOST_DRAWN * count:

@@ -18,11 +18,11 @@ from trainer.report.report import (
     column_heading,
     columns_of,
     editor_strip,
-    shown_view,
     stack_plots,
     thumbnail,
+    view_caption,
 )
-from trainer.run.finish import asked_texts
+from trainer.run.finish import effective_texts
 from trainer.run.threads import use_threads
 from trainer.store.run_folder import write_json
 
@@ -50,7 +50,7 @@ def evaluation_picture(opened: OpenedRun, evaluation: Evaluation) -> Tensor:
             list(strips),
             [column_heading(*column) for column in columns],
             f"{opened.gdf.name}: {opened.run.record.plan.editor.editor}",
-            shown_view(evaluator, len(opened.setup.held_out)),
+            view_caption(evaluator, len(opened.setup.held_out)),
         )
     ]
     if pairs := evaluation.consistency.pairs:
@@ -126,7 +126,7 @@ def evaluate(options: EvaluateOptions) -> Evaluation:
     perceptual, warning = perceptual_loss()
     if warning:
         print_line(warning.replace("training with", "measuring with"))
-    texts = asked_texts(options.texts, opened.run.record.plan.texts)
+    texts = effective_texts(options.texts, opened.run.record.plan.texts)
     evaluation = evaluate_run(opened, perceptual, texts)
     folder = opened.run.folder
     write_json(folder.root / "evaluation.json", evaluation_json(evaluation))

@@ -77,10 +77,10 @@ def find_unseen_members(scene: Gaussians, members: Tensor, views: Sequence[View]
     for view in views:
         camera = view.camera
         weight += alpha_weights(scene, camera, torch.ones_like(view.mask))[members, 2].float()
-    return _find_sources(scene[members], weight >= least_shown(weight))
+    return _find_sources(scene[members], weight >= least_visible(weight))
 
 
-def least_shown(weight: Tensor) -> float:
+def least_visible(weight: Tensor) -> float:
     """Visible weight below which a member counts as unseen: a share of what the member behind an average
     visible pixel gets (Σ w² / Σ w, which members that hardly show do not change), at most `_SEEN`.
 

@@ -54,7 +54,7 @@ def report_picture(
             ["slider", "the editor", "2 keyframes"],
             [column_heading(*column) for column in columns],
             title,
-            shown_view(evaluator, held_out)
+            view_caption(evaluator, held_out)
             + ("; gray: the editor was not asked" if any(at is None for _, at in columns[1:]) else ""),
         )
     )
@@ -65,7 +65,7 @@ def report_picture(
     return stack_plots(sheet, rows)
 
 
-def shown_view(evaluator: Evaluator, held_out: int) -> str:
+def view_caption(evaluator: Evaluator, held_out: int) -> str:
     """Which view is shown, in words: the best one, and whether all figures are of it alone.
 
     Args:

@@ -321,7 +321,7 @@ def refit(options: FitOptions, quiet: bool = False) -> RunResult:
         field = replace(
             options.field, as_printed=own.field.as_printed, draft=own.field.draft, seed=own.field.seed
         )
-        texts = asked_texts(options.texts, own.texts)
+        texts = effective_texts(options.texts, own.texts)
         plan = replace(own, field=field, texts=texts)
         record = replace(run.record, plan=plan)
         return finish_run(run.folder, setup, run.trajectory, record, perceptual, log)
@@ -329,7 +329,7 @@ def refit(options: FitOptions, quiet: bool = False) -> RunResult:
         log.close()
 
 
-def asked_texts(typed: TextOptions, recorded: TextOptions) -> TextOptions:
+def effective_texts(typed: TextOptions, recorded: TextOptions) -> TextOptions:
     """What CLIP is asked: the command's own texts, or the run's."""
     return TextOptions(
         typed.text_before or recorded.text_before,

@@ -226,7 +226,7 @@ def plan_difference(was: TrainOptions, now: TrainOptions) -> str:
         return ""
     name, typed, before, after = min(differing, key=lambda value: not value[1])
     option = "--" + name.replace("_", "-") if typed else name.replace("_", " ")
-    return f"{option} {_said(before)}, not {_said(after)}"
+    return f"{option} {_spell_value(before)}, not {_spell_value(after)}"
 
 
 def _values(part: Any) -> Iterator[tuple[str, bool, Any]]:
@@ -242,7 +242,7 @@ def _values(part: Any) -> Iterator[tuple[str, bool, Any]]:
             yield field.name, typed, value.resolve() if isinstance(value, Path) else value
 
 
-def _said(value: object) -> object:
+def _spell_value(value: object) -> object:
     return "by default" if value in (None, "") else value
 
 

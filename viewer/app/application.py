@@ -1,4 +1,4 @@
-"""What actions on files need of the application, and how failures are put: as a message, and in the log."""
+"""What the parts of the application need of it, and how failures are put: as a message, and in the log."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from typing import Protocol
 
 from progdf import __version__
 from progdf.errors import ProgdfError
+from progdf.gdf.file import Gdf
 from progdf.io.atomic import state_folder
 from viewer.files.document import Document
 from viewer.state.snapshots import SliderSnapshot
-from viewer.state.view_state import ViewState
+from viewer.state.view_state import LayerState, ViewState
 
 from .main_view import MainView
 
@@ -24,13 +25,18 @@ LOG = "window.log"
 
 
 class Application(Protocol):
-    """What file actions need of the application."""
+    """The application as its parts see it, which it imports: they cannot import it in turn."""
 
     document: Document
     main_view: MainView
 
-    def show(self, document: Document) -> None:
-        """Draw the same scene with other edits from now on."""
+    def open(self, path: Path) -> None:
+        """A file, by what it is."""
+
+    def show(
+        self, document: Document, live: tuple[Gdf, ...] = (), layers: tuple[LayerState, ...] = ()
+    ) -> None:
+        """Draw the same scene with other edits from now on, with what is being trained on top."""
 
     def open_document(
         self, document: Document, view: ViewState, snapshots: tuple[SliderSnapshot, ...] = ()

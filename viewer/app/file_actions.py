@@ -434,7 +434,7 @@ class FileActions:
 
     def _open_scene(self, path: Path) -> None:
         opened = documents.load(path)
-        camera = first_camera(opened.scene, up=opened.found_up.direction)
+        camera = first_camera(opened.scene, up=opened.detected_up.direction)
         self._app.open_document(opened, on_another_scene(self._app.main_view.work.view, camera))
         self.session_autosave.drop()
         self.path = None

@@ -173,7 +173,7 @@ class OpenStack:
         """The direction that is up in the scene."""
         opened = self.document
         if self.up_option == "auto":
-            return opened.found_up.direction
+            return opened.detected_up.direction
         return up_of(opened.scene, opened.gdfs, self.up_option)
 
     @property

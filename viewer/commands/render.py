@@ -146,9 +146,9 @@ def render(argv: Sequence[str]) -> int:
         options.viewpoint.camera is None
         and saved is None
         and options.drawing.up == "auto"
-        and not opened.document.found_up.certain
+        and not opened.document.detected_up.certain
     ):
-        print_line(f"up is {opened.document.found_up.reason}")
+        print_line(f"up is {opened.document.detected_up.reason}")
     if view.layers and not swept and not any(layer.strength for layer in view.layers):
         print_line(
             f"every slider is at 0, so this is the original; --set {view.layers[0].name}=1 shows an edit"

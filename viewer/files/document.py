@@ -32,7 +32,7 @@ class Document:
     gdf_paths: tuple[Path, ...] = ()  # the edits' files, one for each where there are any
 
     @cached_property
-    def found_up(self) -> SceneUp:
+    def detected_up(self) -> SceneUp:
         """Which way is up, as the scene and its edits tell."""
         return find_scene_up(self.scene, self.gdfs, path=self.path)
 

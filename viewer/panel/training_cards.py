@@ -50,7 +50,7 @@ def _job_row(job: Job) -> _Row:
     line = (
         (job.error or job.warning)
         if failed
-        else f"For {job.elsewhere}  ·  " * bool(job.elsewhere) + _said(job)
+        else f"For {job.elsewhere}  ·  " * bool(job.elsewhere) + _status_text(job)
     )
     runs = job.status == "running" and not job.starved
     items = ("Show log…", "run_log", True), ("Discard…", "ask_discard", job.status in ("stopped", "failed"))
@@ -147,7 +147,7 @@ def _menu(row: _Row, ui: UiContext) -> list[str]:
     return actions
 
 
-def _said(job: Job) -> str:
+def _status_text(job: Job) -> str:
     progress = job.progress
     match job.status:
         case "running" if job.starved:

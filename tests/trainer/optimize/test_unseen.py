@@ -10,7 +10,7 @@ from progdf.gaussians import Gaussians, pack
 from progdf.region import Region
 from progdf.sh import rgb_to_sh0
 from trainer.optimize.pgs import TargetStage
-from trainer.optimize.unseen import UnseenMembers, find_unseen_members, least_shown, unseen_members_of
+from trainer.optimize.unseen import UnseenMembers, find_unseen_members, least_visible, unseen_members_of
 from trainer.options import EditKind, OptimizeOptions
 from trainer.run.training import is_no_worse
 from trainer.setup import TrainingSetup
@@ -103,10 +103,10 @@ def test_only_edits_of_colors_are_propagated(kind: EditKind, followed: bool) -> 
 def test_what_counts_as_unseen_follows_the_density() -> None:
     """A region of large members has 3 pixels, one in which each has a tenth of a pixel far less."""
     large = torch.tensor([400.0] * 90 + [2.0] * 10)
-    assert least_shown(large) == 3.0
+    assert least_visible(large) == 3.0
     dense = torch.rand(10_000, generator=torch.Generator().manual_seed(1)) * 0.2
-    assert float((dense < least_shown(dense)).float().mean()) < 0.02
-    assert least_shown(torch.cat([dense, torch.zeros(10_000)])) == pytest.approx(least_shown(dense))
+    assert float((dense < least_visible(dense)).float().mean()) < 0.02
+    assert least_visible(torch.cat([dense, torch.zeros(10_000)])) == pytest.approx(least_visible(dense))
 
 
 def test_following_that_makes_the_loss_worse_is_undone() -> None:

@@ -140,7 +140,7 @@ def test_a_scene_that_does_not_tell_which_way_is_up_is_asked_about_once(
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     save_ply(tmp_path / "cloud.ply", random_gaussians(300, scale=0.2))
     cloud = load(tmp_path / "cloud.ply")
-    first = ViewState(camera=first_camera(cloud.scene, up=cloud.found_up.direction))
+    first = ViewState(camera=first_camera(cloud.scene, up=cloud.detected_up.direction))
     with null_app(cloud, first, tmp_path) as app:
         for _ in range(6):
             app._wait_times()

@@ -13,6 +13,7 @@ from progdf.errors import ProgdfError
 from progdf.io.atomic import state_folder
 from progdf.scene import up_axis
 from progdf.scene.up_axis import direction_name
+from viewer.app.application import Application
 from viewer.camera.view_camera import Vec3, first_camera
 from viewer.files.user_files import THUMBNAIL_SIZE, keep_thumbnail, load_thumbnail
 from viewer.gl.present import picture_texture
@@ -23,7 +24,6 @@ from viewer.state import history, workspace
 from viewer.state.view_state import Comparison, ViewState
 
 from .pages import UP_SIZE, RecentFile, UpChoice, UpStrip
-from .training import StudioApplication
 
 POLL_S = 0.5
 
@@ -40,7 +40,7 @@ class StartActions:
 
     def __init__(
         self,
-        app: StudioApplication,
+        app: Application,
         context: moderngl.Context,
         queue: JobQueue,
         memory: Path | None = None,
@@ -141,7 +141,7 @@ class UpActions:
         context: the GL context
     """
 
-    def __init__(self, app: StudioApplication, context: moderngl.Context) -> None:
+    def __init__(self, app: Application, context: moderngl.Context) -> None:
         self._app, self._context = app, context
         self._textures: list[moderngl.Texture] = []
         self._looked = False  # at the scene
@@ -183,7 +183,7 @@ class UpActions:
             self._looked, self._path = True, document.path
             if document.path is None or session is not None:
                 return None
-            if document.found_up.certain or up != document.found_up.direction:
+            if document.detected_up.certain or up != document.detected_up.direction:
                 return None  # it tells, or somebody said
             main_view.up_strip = self._question()
         elif up != before:
@@ -222,7 +222,7 @@ class UpActions:
 
     def _question(self) -> UpStrip:
         scene, camera = self._app.document.scene, self._app.main_view.work.view.camera
-        ups = self._app.document.found_up.candidates
+        ups = self._app.document.detected_up.candidates
         names = [direction_name(torch.tensor(up)).upper().replace("-", "−") for up in ups]
         choices = tuple(
             UpChoice(name, first_camera(scene, aspect=UP_SIZE[0] / UP_SIZE[1], fov_y=camera.fov_y, up=up))

@@ -6,15 +6,12 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Protocol
 
 from progdf.errors import ProgdfError
-from progdf.gdf.file import Gdf
 from progdf.io.atomic import make_folder
 from progdf.scene.regions import check_region
 from viewer.app.application import Application, failure_line
 from viewer.files import exports
-from viewer.files.document import Document
 from viewer.jobs import training
 from viewer.jobs.job_queue import Delivery, Job, JobQueue
 from viewer.jobs.training import ALL, CHANGED, SELECTION, TYPED, EditOrder, NewEdit
@@ -31,18 +28,6 @@ _KINDS = ("masks", "photomasks", "text", "changed")
 """Of regions, besides those that every command knows."""
 
 
-class StudioApplication(Application, Protocol):
-    """What new edits need of the application."""
-
-    def open(self, path: Path) -> None:
-        """A file, by what it is."""
-
-    def show(
-        self, document: Document, live: tuple[Gdf, ...] = (), layers: tuple[LayerState, ...] = ()
-    ) -> None:
-        """Draw another document from now on, with what is being trained on top."""
-
-
 class JobActions:
     """Trains what the form asks for, and follows all jobs. `close` it with the window.
 
@@ -51,7 +36,7 @@ class JobActions:
         memory: folder of the program's state; the user's own if None
     """
 
-    def __init__(self, app: StudioApplication, memory: Path | None = None) -> None:
+    def __init__(self, app: Application, memory: Path | None = None) -> None:
         self._app, self._memory = app, memory
         self.queue = JobQueue()
         self._scene: Path | None = None
