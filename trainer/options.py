@@ -406,7 +406,7 @@ class BatchOptions:
     """Train every edit of a catalogue, side by side; finished runs are kept."""
 
     catalogue: tyro.conf.Positional[Path]
-    """TOML: [defaults], [[scenes]] with a path, [[scenes.edits]] with a name, [sweep]; see docs/batch.md."""
+    """TOML: [defaults], [[scenes]] with a path, [[scenes.edits]] with a name, [sweep]; see docs/cli.md."""
     out: Path
     """Folder of the batch: OUT/SCENE/NAME/ are ordinary runs, OUT/batch.html and batch.csv tell of all."""
     workers: int = 0

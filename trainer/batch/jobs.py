@@ -64,7 +64,7 @@ def read_catalogue(path: Path, out: Path) -> tuple[list[Job], list[str]]:
     """The jobs of a catalogue, and what is wrong with it, a line each.
 
     Args:
-        path: TOML, see docs/batch.md
+        path: TOML; docs/cli.md, batch
         out: folder of the batch; jobs are written to OUT/SCENE/NAME
 
     Raises:
@@ -197,7 +197,7 @@ def _typed_values(options: Any, default: Any) -> Iterator[tuple[str, Any, Any]]:
 
 @dataclass(frozen=True)
 class Cost:
-    """What a run takes, by a line through measured ones (docs/batch.md); what has ended corrects it."""
+    """What a run takes, by a line through measured ones (docs/scale.md); what has ended corrects it."""
 
     seconds: float  # on one thread
     memory: int  # peak, bytes

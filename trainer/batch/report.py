@@ -9,25 +9,29 @@ import json
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields
 from html import escape
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+import msgspec
 from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
 from progdf.errors import ProgdfError
 from progdf.io.atomic import atomic_write
-from progdf.io.json_values import decode_json
-from progdf.terminal import escape_text, file_size, group_digits
+from progdf.io.json_values import convert_json, decode_json
+from progdf.terminal import escape_text, file_size
 from trainer.store.run_folder import RunFolder
 
 from .jobs import Job
-from .worker import PREVIEW, PREVIEW_SIDE, Outcome
+
+Status = Literal["done", "failed", "stopped", "memory", "waiting"]
 
 CSV, PAGE = "batch.csv", "batch.html"
+PREVIEW = "preview.jpg"
+"""Of a run's folder: the edit at one half and at 1, side by side."""
 _LINES = 12  # of running jobs on a terminal
 _EVENT_S = 2.0  # between two progress events
 _SPARK_WIDTH, _SPARK_HEIGHT = 96, 28
@@ -35,22 +39,21 @@ _SPARK_WIDTH, _SPARK_HEIGHT = 96, 28
 
 @dataclass(frozen=True)
 class Row:
-    """One job in batch.csv and batch.html."""
+    """How a job ended: one line of batch.csv and batch.html."""
 
-    job: str
-    status: str  # done, failed, stopped, or waiting
-    reason: str = ""  # why it is not done
+    job: str  # its key
+    status: Status  # stopped: by Ctrl-C; memory: it took more than there was, and is begun again
+    reason: str = ""  # why it is not done, in one line
     psnr_end: float | None = None  # of the edit, to the editor's pictures on held-out views, dB
     psnr_between: float | None = None  # the worst strength in between, dB
-    members: int | None = None  # Gaussians of the region
     bytes: int | None = None  # of the .gdf
     bytes_per_gaussian: float | None = None  # of the region
     seconds: float | None = None  # of the run, over all its sessions
     cpu_seconds: float | None = None  # of the session that ended it, all threads
     memory_mb: int | None = None  # peak
-    attempts: int = 0  # how often it was begun
-    host: str = ""
     folder_bytes: int | None = None  # of all that the run left
+    attempts: int = 1  # how often it was begun
+    host: str = ""  # the machine
 
     @property
     def line(self) -> str:
@@ -62,41 +65,30 @@ class Row:
         return f"{self.job}: {end}{file_size(self.bytes or 0)}, {self.seconds or 0:.0f} s"
 
 
-def make_row(job: Job, outcome: Outcome) -> Row:
-    """The row of a job that ended, with what its run's report tells."""
-    row = Row(
+def finished_row(job: Job) -> Row:
+    """The row of a run that is finished, from what its folder tells."""
+    report, root = read_report(job), job.options.out
+    return Row(
         job.key,
-        "done" if outcome.status == "done" else "stopped" if outcome.status == "stopped" else "failed",
-        outcome.reason,
-        seconds=round(outcome.seconds, 2),
-        cpu_seconds=round(outcome.cpu_seconds, 2),
-        attempts=outcome.attempts,
-        host=outcome.host,
-    )
-    if row.status != "done":
-        return row
-    report, course = read_report(job), slider_course(read_report(job))
-    size = sum(path.stat().st_size for path in job.options.out.rglob("*") if path.is_file())
-    file = report.get("file", {})
-    return replace(
-        row,
+        "done",
         psnr_end=report.get("edit", {}).get("psnr_to_views"),
-        psnr_between=min((psnr for s, psnr in course if s < 1), default=None),
-        members=outcome.members,
-        bytes=file.get("bytes"),
-        bytes_per_gaussian=file.get("bytes_per_gaussian"),
+        psnr_between=min((psnr for s, psnr in slider_course(report) if s < 1), default=None),
+        bytes=report.get("file", {}).get("bytes"),
+        bytes_per_gaussian=report.get("file", {}).get("bytes_per_gaussian"),
         seconds=report.get("time", {}).get("total"),
         memory_mb=report.get("memory_mb"),
-        folder_bytes=size,
+        folder_bytes=sum(path.stat().st_size for path in root.rglob("*") if path.is_file()),
     )
 
 
 def read_report(job: Job) -> dict[str, Any]:
     """A run's report.json; empty where it is absent or broken."""
+    return _read_table(RunFolder(job.options.out).report)
+
+
+def _read_table(path: Path) -> dict[str, Any]:
     with suppress(OSError, ValueError):
-        report = decode_json(RunFolder(job.options.out).report.read_bytes())
-        if isinstance(report, dict):
-            return report
+        return convert_json(decode_json(path.read_bytes()), dict[str, Any])
     return {}
 
 
@@ -116,21 +108,12 @@ def read_rows(out: Path) -> dict[str, Row]:
     if not path.is_file():
         return {}
     try:
-        with path.open(encoding="utf-8", newline="") as file:
-            rows = [_parse_row(record) for record in csv.DictReader(file)]
-    except (ValueError, KeyError, TypeError, OSError, csv.Error) as error:
+        records = csv.DictReader(path.read_text(encoding="utf-8").splitlines())
+        given = [{key: value for key, value in record.items() if value} for record in records]
+        rows = [msgspec.convert(values, Row, strict=False) for values in given]
+    except (ValueError, TypeError, csv.Error) as error:
         raise ProgdfError(f"{path} is damaged ({error}); delete it, the runs are not lost") from None
     return {row.job: row for row in rows}
-
-
-def _parse_row(record: Mapping[str, str]) -> Row:
-    parse = {"str": str, "int": int, "int | None": int, "float | None": float}
-    values = {
-        field.name: parse[str(field.type)](record[field.name])
-        for field in fields(Row)
-        if record[field.name] or field.type == "str"
-    }
-    return Row(**values)
 
 
 def write_rows(out: Path, rows: Sequence[Row]) -> None:
@@ -149,7 +132,13 @@ def write_page(out: Path, jobs: Mapping[str, Job], rows: Sequence[Row]) -> None:
     failed = sum(row.status == "failed" for row in rows)
     summary = f"{done} of {len(rows)} done" + (f", {failed} failed" if failed else "")
     body = "\n".join(_html_row(row, jobs.get(row.job)) for row in rows)
-    page = _PAGE.replace("{summary}", escape(summary)).replace("{rows}", body)
+    page = (
+        Path(__file__)
+        .with_name("page.html")
+        .read_text(encoding="utf-8")
+        .replace("{summary}", escape(summary))
+        .replace("{rows}", body)
+    )
     with atomic_write(out / PAGE) as temporary_file:
         temporary_file.write_text(page, encoding="utf-8")
 
@@ -162,7 +151,6 @@ def _html_row(row: Row, job: Job | None) -> str:
         _number(row.psnr_end, 1),
         _number(row.psnr_between, 1),
         f"<td>{_sparkline(slider_course(read_report(job))) if job and row.status == 'done' else ''}</td>",
-        _number(row.members, 0, group_digits(row.members) if row.members else ""),
         _number(row.bytes, 0, file_size(row.bytes) if row.bytes else ""),
         _number(row.cpu_seconds, 0),
         f'<td class="{escape(row.status)}">{escape(row.status)}'
@@ -210,7 +198,7 @@ class Screen:
     """What a batch says while it runs: a live list on a terminal, lines elsewhere, or JSON events.
 
     Args:
-        jobs: by key
+        jobs: those that will run, by key
         seconds: how long each is expected to take; what has ended corrects it
         workers: how many run at once
         events: one JSON object a line on stdout instead
@@ -220,25 +208,14 @@ class Screen:
         self, jobs: Mapping[str, Job], seconds: Mapping[str, float], workers: int, events: bool
     ) -> None:
         self._jobs, self._seconds, self._workers, self._events = jobs, seconds, workers, events
-        self._console = Console(stderr=not events, highlight=False)
+        self._console = Console(stderr=True, highlight=False, quiet=events)
         self._live = Live(console=self._console, auto_refresh=False, transient=True)
-        self._is_live = self._console.is_terminal and not events
         self._rows: list[Row] = []
         self._told = 0.0
 
-    def __enter__(self) -> Screen:
-        if self._is_live:
-            self._live.start()
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        if self._is_live:
-            self._live.stop()
-
     def say(self, line: str) -> None:
         """One line."""
-        if not self._events:
-            self._console.print(escape_text(line), soft_wrap=True, markup=False)
+        self._console.print(escape_text(line), soft_wrap=True, markup=False)
 
     def event(self, name: str, **values: object) -> None:
         """One JSON line, where these are asked for."""
@@ -253,40 +230,42 @@ class Screen:
 
     def tick(self, running: Sequence[str]) -> None:
         """A few times a second, with the jobs that run."""
-        if not self._is_live and time.monotonic() - self._told < _EVENT_S:
+        live = self._console.is_terminal and not self._events
+        if not live and (not self._events or time.monotonic() - self._told < _EVENT_S):
             return
         self._told = time.monotonic()
-        if not self._is_live and not self._events:
-            return
-        states = {key: _progress(self._jobs[key]) for key in running[:_LINES]}
-        left = self.remaining(running)
-        if self._events:
-            self.event(
-                "progress", running=states, ended=len(self._rows), jobs=len(self._jobs), seconds_left=left
-            )
-            return
-        text = Text()
-        for key, state in states.items():
-            share, seconds = state.get("share", 0.0), state.get("seconds", 0.0)
-            more = f"{seconds / share * (1 - share):4.0f} s left" if share > 0.1 else ""
-            text.append(f"  {escape_text(key):<40} {share:4.0%} {state.get('label', ''):<20} {more}\n", "dim")
-        failed = sum(row.status == "failed" for row in self._rows)
-        text.append(
-            f"{len(self._rows)} of {len(self._jobs)} ended" + (f", {failed} failed" if failed else "")
-        )
-        text.append(f", about {duration(left)} left" if left else "")
-        self._live.update(text, refresh=True)
+        states = {
+            key: _read_table(RunFolder(self._jobs[key].options.out).progress) for key in running[:_LINES]
+        }
+        remaining = self._remaining(running)
+        ended, failed = len(self._rows), sum(row.status == "failed" for row in self._rows)
+        self.event("progress", running=states, ended=ended, failed=failed, seconds_left=remaining)
+        if live:
+            lines = [f"  {key:<40} {_state(state)}" for key, state in states.items()]
+            time_left = f", about {duration(remaining)} left" if remaining else ""
+            lines.append(f"{ended} of {len(self._jobs)} ended, {failed} failed{time_left}")
+            self._live.start()
+            self._live.update(Text("\n".join(map(escape_text, lines))), refresh=True)
 
-    def remaining(self, running: Sequence[str]) -> float | None:
-        """Seconds until all have ended, from the jobs that have; None before the first."""
-        ended = [row for row in self._rows if row.seconds and row.job in self._seconds]
-        expected = sum(self._seconds[row.job] for row in ended)
+    def close(self) -> None:
+        """Leave the terminal as it was."""
+        self._live.stop()
+
+    def _remaining(self, running: Sequence[str]) -> float | None:
+        """Seconds until all have ended, by those that have; None before the first."""
+        ended = {row.job: row.seconds for row in self._rows if row.seconds and row.job in self._seconds}
+        expected = sum(self._seconds[key] for key in ended)
         if not expected:
             return None
-        factor = sum(row.seconds or 0.0 for row in ended) / expected
         over = {row.job for row in self._rows}
-        left = sum(s * (0.5 if key in running else 1) for key, s in self._seconds.items() if key not in over)
-        return factor * left / max(1, self._workers)
+        ahead = sum(s * (0.5 if key in running else 1) for key, s in self._seconds.items() if key not in over)
+        return sum(ended.values()) / expected * ahead / self._workers
+
+
+def _state(state: Mapping[str, Any]) -> str:
+    share, seconds = state.get("share", 0.0), state.get("seconds", 0.0)
+    time_left = f"{duration(seconds / share * (1 - share))} left" if share > 0.1 else ""
+    return f"{share:4.0%} {state.get('label', ''):<20} {time_left}"
 
 
 def duration(seconds: float) -> str:
@@ -294,68 +273,3 @@ def duration(seconds: float) -> str:
     if seconds < 90:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
-
-
-def _progress(job: Job) -> dict[str, Any]:
-    with suppress(OSError, ValueError):
-        state = decode_json(RunFolder(job.options.out).progress.read_bytes())
-        if isinstance(state, dict):
-            return {key: state.get(key) for key in ("share", "label", "seconds")}
-    return {}
-
-
-_PAGE = f"""<!doctype html>
-<html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">
-<meta http-equiv="Content-Security-Policy"
- content="default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'">
-<title>ProGDF batch: {{summary}}</title>
-<style>
-:root {{ color-scheme: light dark; --line: #8883; --dim: #888; --blue: #3f7fd9; }}
-body {{ font: 14px/1.45 system-ui, sans-serif; margin: 2rem auto; max-width: 1180px; padding: 0 1rem; }}
-h1 {{ font-size: 1.25rem; font-weight: 600; }} h1 small {{ color: var(--dim); font-weight: 400; }}
-table {{ border-collapse: collapse; width: 100%; }}
-th {{ cursor: pointer; text-align: left; white-space: nowrap; position: sticky; top: 0; background: Canvas; }}
-th.n, td.n {{ text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }}
-th[aria-sort=ascending]::after {{ content: " ↑"; }} th[aria-sort=descending]::after {{ content: " ↓"; }}
-th:focus-visible {{ outline: 2px solid var(--blue); }}
-td, th {{ padding: .4rem .6rem; border-bottom: 1px solid var(--line); vertical-align: middle; }}
-td.p {{ padding-left: 0; }} img {{ display: block; height: {PREVIEW_SIDE // 2}px; border-radius: 4px; }}
-svg polyline {{ fill: none; stroke: var(--blue); stroke-width: 1.6; }}
-td.failed {{ color: #c33; max-width: 22rem; }} td.done, td.waiting, td.stopped {{ color: var(--dim); }}
-a {{ color: inherit; }}
-</style>
-<h1>ProGDF batch <small>{{summary}}</small></h1>
-<table><thead><tr>
-<th data-none></th><th tabindex="0">Scene</th><th tabindex="0">Edit</th>
-<th class="n" tabindex="0" title="to the editor's pictures, held-out views">dB at 1</th>
-<th class="n" tabindex="0" title="the worst strength in between">Worst between</th>
-<th data-none title="dB over the slider">Slider</th>
-<th class="n" tabindex="0">Gaussians</th><th class="n" tabindex="0">.gdf</th>
-<th class="n" tabindex="0" title="all threads">Processor s</th><th tabindex="0">Status</th>
-</tr></thead><tbody>
-{{rows}}
-</tbody></table>
-<script>
-const body = document.querySelector("tbody");
-function sort(head) {{
-  const column = head.cellIndex, up = head.getAttribute("aria-sort") !== "ascending";
-  const value = row => {{
-    const cell = row.cells[column], number = cell.dataset.v;
-    return number === undefined ? cell.textContent : number === "" ? NaN : Number(number);
-  }};
-  const compare = (a, b) => {{
-    const x = value(a), y = value(b);
-    if (typeof x === "string") return up ? x.localeCompare(y) : y.localeCompare(x);
-    return isNaN(x) - isNaN(y) || (up ? x - y : y - x);
-  }};
-  for (const other of document.querySelectorAll("th")) other.removeAttribute("aria-sort");
-  head.setAttribute("aria-sort", up ? "ascending" : "descending");
-  body.append(...[...body.rows].sort(compare));
-}}
-for (const head of document.querySelectorAll("th:not([data-none])")) {{
-  head.addEventListener("click", () => sort(head));
-  head.addEventListener("keydown", event => {{ if (event.key === "Enter") sort(head); }});
-}}
-</script>
-</html>
-"""

@@ -3,24 +3,22 @@
 from __future__ import annotations
 
 import logging
-import multiprocessing
-import os
+import pickle
 import shutil
 import signal
+import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import chdir, contextmanager, suppress
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from importlib.util import find_spec
-from multiprocessing.connection import Connection
-from multiprocessing.context import SpawnProcess
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, BinaryIO, Protocol, cast
 
 from progdf.errors import ProgdfError
 from progdf.io.atomic import LOCK, LockedError, hold_lock, make_folder
@@ -30,8 +28,8 @@ from trainer.run.resume import find_run
 from trainer.run.threads import count_threads
 
 from .jobs import Cost, Job, estimate_cost, read_catalogue
-from .report import CSV, PAGE, Row, Screen, duration, make_row, read_rows, write_page, write_rows
-from .worker import Finding, Outcome, inspect_scene, run_job
+from .report import CSV, PAGE, Row, Screen, duration, finished_row, read_rows, write_page, write_rows
+from .worker import Finding, Lost, inspect_scene, run_job
 
 _log = logging.getLogger(__name__)
 
@@ -40,65 +38,38 @@ MOST_ATTEMPTS = 4
 
 _FAILED = 3  # exit status where some jobs failed
 _PAGE_EVERY_S = 10.0
+_LOOK_S = 2.0  # between two looks at a cluster's cores
 _STOP_S = 20.0  # in which what runs saves its state when all is stopped
 _STORE_BYTES = 80 * 2**20  # of Ray's object store, through which only words go
 
 
 @dataclass(frozen=True)
-class Lost:
-    """What comes back instead of a result when a worker, its node or its machine ends."""
+class Task:
+    """What a worker is given, and what it takes of a machine."""
 
-    reason: str
-    from_memory: bool = False  # it was ended as memory ran out
-
-
-@dataclass(frozen=True)
-class Need:
-    """What a task takes of a machine."""
-
+    function: Callable[[Any], Any]
+    argument: Any  # pickled on the way
+    key: str = ""  # of the job, or of the scene that is looked at
     threads: int = 1
     memory: int = 0  # bytes; 0: unknown
     gpu: bool = False
+    attempt: int = 1
+    alone: bool = False  # nothing runs beside it, as it ran out of memory
 
 
 class Pool(Protocol):
-    """Workers. Tokens stand for what was started."""
+    """Workers."""
 
     name: str
 
     def capacity(self, threads: int) -> int:
         """How many tasks of so many threads can run at once."""
 
-    def start(self, function: Callable[[Any], Any], argument: Any, need: Need) -> object:
-        """Begin `function(argument)` in a worker; a token."""
-
-    def wait(self, seconds: float) -> list[tuple[object, Any]]:
-        """What has ended: token and result, `Lost` or the exception. At once, or after so many seconds."""
+    def submit(self, task: Task) -> Future[Any]:
+        """Begin a task in a worker. Its result may be `Lost`; an exception is a worker that ended, too."""
 
     def stop(self) -> None:
         """End all that runs, as Ctrl-C does, and wait until it has saved its state."""
-
-
-def _serve(connection: Connection) -> None:
-    """A worker of `LocalPool`: tasks in, results out, until the other side is gone."""
-    parent = multiprocessing.parent_process()
-    if hasattr(os, "setsid"):
-        os.setsid()  # Ctrl-C reaches it once, by `stop`
-
-    def watch() -> None:
-        if parent is not None:
-            parent.join()
-            os.kill(os.getpid(), signal.SIGTERM)
-
-    threading.Thread(target=watch, daemon=True).start()
-    with suppress(EOFError, OSError, KeyboardInterrupt):
-        while True:
-            function, argument = connection.recv()
-            try:
-                result = function(argument)
-            except Exception as error:
-                result = Lost(f"{type(error).__name__}: {error}")
-            connection.send(result)
 
 
 class LocalPool:
@@ -107,59 +78,44 @@ class LocalPool:
     name = "one worker process"
 
     def __init__(self) -> None:
-        self._context = multiprocessing.get_context("spawn")
-        self._process: SpawnProcess | None = None
-        self._connection: Connection | None = None
-        self._token: object | None = None
+        self._thread = ThreadPoolExecutor(1)
+        self._worker: subprocess.Popen[bytes] | None = None
+        self._future: Future[Any] = Future()
 
     def capacity(self, threads: int) -> int:
         """See `Pool`."""
         return 1
 
-    def start(self, function: Callable[[Any], Any], argument: Any, need: Need) -> object:
+    def submit(self, task: Task) -> Future[Any]:
         """See `Pool`."""
-        if self._process is None or self._connection is None:
-            self._connection, theirs = self._context.Pipe()
-            self._process = self._context.Process(target=_serve, args=(theirs,), daemon=False)
-            self._process.start()
-            theirs.close()
-        self._connection.send((function, argument))
-        self._token = object()
-        return self._token
+        self._future = self._thread.submit(self._run, task)
+        return self._future
 
-    def wait(self, seconds: float) -> list[tuple[object, Any]]:
-        """See `Pool`."""
-        if self._token is None or self._connection is None or not self._connection.poll(seconds):
-            return []
-        token, self._token = self._token, None
+    def _run(self, task: Task) -> Any:
+        if self._worker is None:
+            self._worker = subprocess.Popen(
+                [sys.executable, "-P", "-c", "from trainer.batch.worker import serve; serve()"],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                start_new_session=True,  # Ctrl-C reaches it once, by `stop`
+            )
         try:
-            return [(token, self._connection.recv())]
-        except (EOFError, OSError):
-            return [(token, Lost(f"its worker ended ({self._end()})"))]
+            pickle.dump((task.function, task.argument), cast(BinaryIO, self._worker.stdin))
+            cast(BinaryIO, self._worker.stdin).flush()
+            return pickle.load(cast(BinaryIO, self._worker.stdout))
+        except (EOFError, OSError, pickle.UnpicklingError):
+            code, self._worker = self._worker.wait(), None
+            return Lost(f"its worker ended ({signal.Signals(-code).name if code < 0 else f'status {code}'})")
 
     def stop(self) -> None:
         """See `Pool`."""
-        if self._process is not None:
-            if self._token is not None and self._process.is_alive() and self._process.pid is not None:
-                with suppress(ProcessLookupError):
-                    os.kill(self._process.pid, signal.SIGINT)
-                self.wait(_STOP_S)
-            self._end()
-
-    def _end(self) -> str:
-        """End the worker; how it ended."""
-        process, self._process = self._process, None
-        if self._connection is not None:
-            self._connection.close()  # an idle worker ends by this
-            self._connection = None
-        if process is None:
-            return ""
-        process.join(2.0)
-        if process.is_alive():
-            process.kill()
-            process.join()
-        code = process.exitcode or 0
-        return signal.Signals(-code).name if code < 0 else f"exit status {code}"
+        if (worker := self._worker) is not None:
+            if self._future.running():
+                worker.send_signal(signal.SIGINT)
+                wait([self._future], _STOP_S)
+            worker.kill()
+            worker.wait()
+        self._thread.shutdown()
 
 
 class RayPool:
@@ -173,81 +129,52 @@ class RayPool:
     def __init__(self, address: str, cpus: int) -> None:
         import ray
 
-        self._ray = ray
-        self._folder = None if address else tempfile.mkdtemp(prefix="progdf-ray-")
-        quiet = {"log_to_driver": False, "logging_level": "error"}
-        os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # a warning about what comes
+        self._ray, self._references = ray, list[Any]()
+        self._folder = "" if address else tempfile.mkdtemp(prefix="progdf-ray-")
+        own = {"num_cpus": cpus, "object_store_memory": _STORE_BYTES, "_temp_dir": self._folder}
+        where: dict[str, Any] = {"address": address} if address else {**own, "include_dashboard": False}
         try:
-            if address:
-                ray.init(address=address, **quiet)
-            else:
-                ray.init(
-                    num_cpus=cpus,
-                    include_dashboard=False,
-                    object_store_memory=_STORE_BYTES,
-                    _temp_dir=self._folder,
-                    **quiet,
-                )
+            ray.init(log_to_driver=False, logging_level="error", **where)
         except (ConnectionError, RuntimeError, OSError, ValueError) as error:
-            self._remove_folder()
-            where = f"the Ray cluster at {address}" if address else "Ray"
-            raise ProgdfError(f"{where} cannot be used ({str(error).splitlines()[0]})") from error
-        self._tasks: dict[Any, object] = {}
-        self._looked, self._resources = 0.0, dict[str, float]()
-        self.name = f"Ray on {len(self._nodes())} machines" if address else "Ray on this machine"
+            shutil.rmtree(self._folder, ignore_errors=True)
+            raise ProgdfError(f"Ray cannot be used ({str(error).splitlines()[0]})") from error
+        self._looked, self._cpus = 0.0, 0
+        machines = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+        self._memory = max(machine.get("memory", 0.0) for machine in machines)
+        self._has_gpu = any(machine.get("GPU") for machine in machines)
+        self.name = f"Ray, {format_count(len(machines), 'machine')}"
 
     def capacity(self, threads: int) -> int:
-        """See `Pool`."""
-        if time.monotonic() - self._looked > 2.0:
-            self._looked, self._resources = time.monotonic(), self._ray.cluster_resources()
-        return max(1, int(self._resources.get("CPU", 0)) // threads)
+        """See `Pool`. Machines come and go."""
+        if time.monotonic() - self._looked > _LOOK_S:
+            self._looked, self._cpus = time.monotonic(), int(self._ray.cluster_resources().get("CPU", 0))
+        return max(1, self._cpus // threads)
 
-    def start(self, function: Callable[[Any], Any], argument: Any, need: Need) -> object:
+    def submit(self, task: Task) -> Future[Any]:
         """See `Pool`."""
-        most = max((node["Resources"].get("memory", 0) for node in self._nodes()), default=0)
-        options = {"num_cpus": need.threads, "memory": int(min(need.memory, 0.9 * most))}
-        if need.gpu and self._resources.get("GPU"):
-            options["num_gpus"] = 1
-        task = self._ray.remote(function).options(max_retries=0, **options)
-        reference = task.remote(argument)
-        self._tasks[reference] = token = object()
-        return token
-
-    def wait(self, seconds: float) -> list[tuple[object, Any]]:
-        """See `Pool`."""
-        if not self._tasks:
-            return []
-        ready, _ = self._ray.wait(list(self._tasks), num_returns=1, timeout=seconds)
-        return [(self._tasks.pop(reference), self._result(reference)) for reference in ready]
+        remote = self._ray.remote(task.function).options(
+            num_cpus=task.threads,
+            num_gpus=int(task.gpu and self._has_gpu),
+            memory=int(min(task.memory, 0.9 * self._memory)),  # or it would wait for ever
+            max_retries=0,
+            name=task.key,
+        )
+        reference = remote.remote(task.argument)
+        self._references.append(reference)
+        future: Future[Any] = reference.future()
+        future.add_done_callback(lambda _: self._references.remove(reference))
+        return future
 
     def stop(self) -> None:
         """See `Pool`."""
-        with suppress(self._ray.exceptions.RayError):
-            for reference in self._tasks:
+        running = list(self._references)
+        for reference in running:
+            with suppress(self._ray.exceptions.RayError):
                 self._ray.cancel(reference, force=False)
-            if self._tasks:
-                self._ray.wait(list(self._tasks), num_returns=len(self._tasks), timeout=_STOP_S)
-        self._tasks.clear()
+        if running:
+            self._ray.wait(running, num_returns=len(running), timeout=_STOP_S)
         self._ray.shutdown()
-        self._remove_folder()
-
-    def _result(self, reference: Any) -> Any:
-        errors = self._ray.exceptions
-        try:
-            return self._ray.get(reference)
-        except errors.OutOfMemoryError:
-            return Lost("its worker was ended as memory ran out", from_memory=True)
-        except errors.RayTaskError as error:
-            return ProgdfError(f"internal error: {error.cause!s}")
-        except errors.RayError as error:
-            return Lost(f"its worker ended ({type(error).__name__})")
-
-    def _nodes(self) -> list[dict[str, Any]]:
-        return [node for node in self._ray.nodes() if node["Alive"]]
-
-    def _remove_folder(self) -> None:
-        if self._folder is not None:
-            shutil.rmtree(self._folder, ignore_errors=True)
+        shutil.rmtree(self._folder, ignore_errors=True)
 
 
 @contextmanager
@@ -264,9 +191,9 @@ def open_pool(workers: int, address: str, threads: int, jobs: int) -> Iterator[P
         ProgdfError: Ray is needed and not installed, or cannot be reached.
     """
     has_ray = find_spec("ray") is not None
-    if address and not has_ray:
-        raise ProgdfError("--address needs Ray; pip install progdf-studio[cluster]")
     workers = min(jobs, workers or max(1, count_threads(0) // threads))
+    if not has_ray and address:
+        raise ProgdfError("--address needs Ray; pip install progdf-studio[cluster]")
     if not has_ray and workers > 1:
         _log.warning("one worker process; pip install progdf-studio[cluster] for %d at once", workers)
     pool = RayPool(address, workers * threads) if has_ray and (workers > 1 or address) else LocalPool()
@@ -276,87 +203,95 @@ def open_pool(workers: int, address: str, threads: int, jobs: int) -> Iterator[P
         pool.stop()
 
 
-@dataclass(frozen=True)
-class Attempt:
-    """A job that waits or runs."""
-
-    job: Job
-    need: Need = Need()
-    number: int = 1
-    alone: bool = False  # nothing runs beside it, as it ran out of memory
-    begun: float = 0.0
-
-
-def inspect(jobs: Sequence[Job], pool: Pool) -> list[Finding]:
-    """Look at all jobs, scene by scene; what is wrong with each before anything starts."""
-    scenes: dict[tuple[Path, Path], list[Job]] = {}
-    for job in jobs:
-        scenes.setdefault((job.folder, job.options.scene), []).append(job)
-    waiting, running = deque(scenes.values()), dict[object, list[Job]]()
-    findings: dict[str, Finding] = {}
-    while waiting or running:
-        while waiting and len(running) < pool.capacity(1):
-            group = waiting.popleft()
-            running[pool.start(inspect_scene, group, Need())] = group
-        for token, result in pool.wait(0.5):
-            group = running.pop(token)
-            if isinstance(result, Lost | Exception):
-                reason = result.reason if isinstance(result, Lost) else str(result)
-                result = [Finding(job.key, f"its scene cannot be looked at: {reason}") for job in group]
-            findings |= {finding.key: finding for finding in result}
-    return [findings[job.key] for job in jobs]
-
-
-def run_attempts(
-    attempts: Sequence[Attempt],
+def run_tasks(
+    tasks: Sequence[Task],
     pool: Pool,
-    tell: Callable[[str, Attempt, str], None] = lambda event, attempt, reason: None,
-    tick: Callable[[Sequence[Attempt]], None] = lambda running: None,
-) -> Iterator[Outcome]:
-    """Run jobs; what a lost worker had is begun again and goes on from its saved state.
+    tell: Callable[[str, Task, str], None] = lambda event, task, reason: None,
+    tick: Callable[[Sequence[Task]], None] = lambda running: None,
+) -> Iterator[tuple[Task, Any]]:
+    """Run tasks; what a lost worker had is begun again.
 
     Args:
-        attempts: in order
+        tasks: in order
         pool: workers
         tell: hears of "start" and "retry", with the reason of the latter
         tick: called about twice a second with what runs
 
     Yields:
-        every job's end, as it comes.
+        task and result as they come, `Lost` where a task was given up.
     """
-    waiting, running = deque(attempts), dict[object, Attempt]()
+    waiting, running = deque(tasks), dict[Future[Any], Task]()
     while waiting or running:
         while waiting and _may_start(waiting[0], running, pool):
-            attempt = replace(waiting.popleft(), begun=time.time())
-            tell("start", attempt, "")
-            running[pool.start(run_job, attempt.job, attempt.need)] = attempt
-        for token, result in pool.wait(0.5):
-            attempt = running.pop(token)
-            if isinstance(result, Exception):
-                result = Outcome(attempt.job.key, "failed", str(result))
-            lost = result if isinstance(result, Lost) else None
-            if result.status == "memory" if lost is None else lost.from_memory:
-                lost = lost or Lost(result.reason, from_memory=True)
-            if lost is None:
-                yield replace(result, attempts=attempt.number)
-            elif attempt.number == MOST_ATTEMPTS or (attempt.alone and lost.from_memory):
-                yield Outcome(attempt.job.key, "failed", lost.reason, attempts=attempt.number)
-            else:
+            task = waiting.popleft()
+            tell("start", task, "")
+            running[pool.submit(task)] = task
+        for future in wait(running, 0.5, FIRST_COMPLETED).done:
+            task, result = running.pop(future), _result(future)
+            lost = isinstance(result, Lost) and not (task.alone and result.from_memory)
+            if lost and task.attempt < MOST_ATTEMPTS:
+                tell("retry", task, result.reason)
                 # who dies a second time may have been ended by the system for its memory
-                alone = lost.from_memory or attempt.number > 1
-                tell("retry", attempt, lost.reason)
-                again = replace(attempt, number=attempt.number + 1, alone=alone)
+                alone = result.from_memory or task.attempt > 1
+                again = replace(task, attempt=task.attempt + 1, alone=alone)
                 waiting.append(again) if alone else waiting.appendleft(again)
+            else:
+                yield task, result
         tick(list(running.values()))
 
 
-def _may_start(attempt: Attempt, running: dict[object, Attempt], pool: Pool) -> bool:
-    if attempt.alone or any(other.alone for other in running.values()):
+def _may_start(task: Task, running: Mapping[Future[Any], Task], pool: Pool) -> bool:
+    if task.alone or any(other.alone for other in running.values()):
         return not running
-    return len(running) < pool.capacity(attempt.need.threads)
+    return len(running) < pool.capacity(task.threads)
 
 
-def run(jobs: Sequence[Job], workers: int = 0, address: str = "") -> Iterator[Outcome]:
+def _result(future: Future[Any]) -> Any:
+    """A task's result; `Lost` for one of Ray's errors, and where memory ran out."""
+    if (error := future.exception()) is not None:
+        kind = type(error).__name__
+        return Lost(f"its worker ended ({kind})", from_memory=kind == "OutOfMemoryError")
+    result = future.result()
+    if isinstance(result, Row) and result.status == "memory":
+        return Lost(result.reason, from_memory=True)
+    return result
+
+
+def inspect(jobs: Sequence[Job], pool: Pool) -> dict[str, Finding]:
+    """Look at all jobs, scene by scene: what is wrong with each before anything starts, by key."""
+    scenes: dict[tuple[Path, Path], list[Job]] = {}
+    for job in jobs:
+        scenes.setdefault((job.folder, job.options.scene), []).append(job)
+    findings = list[Finding]()
+    for task, result in run_tasks([Task(inspect_scene, group) for group in scenes.values()], pool):
+        if isinstance(result, Lost):
+            result = [
+                Finding(job.key, f"looking at its scene failed: {result.reason}") for job in task.argument
+            ]
+        findings += result
+    return {finding.key: finding for finding in findings}
+
+
+def run_jobs(
+    tasks: Sequence[Task],
+    pool: Pool,
+    tell: Callable[[str, Task, str], None] = lambda event, task, reason: None,
+    tick: Callable[[Sequence[Task]], None] = lambda running: None,
+) -> Iterator[Row]:
+    """`run_tasks` for tasks of `train_task`; every job's row as it ends."""
+    for task, result in run_tasks(tasks, pool, tell, tick):
+        if isinstance(result, Lost):
+            result = Row(task.key, "failed", result.reason)
+        yield replace(result, attempts=task.attempt)
+
+
+def train_task(job: Job, memory: int = 0) -> Task:
+    """A job as a task; memory in bytes, 0: unknown."""
+    gpu = job.options.editor.family == "instruct" or "text:" in job.options.region.region
+    return Task(run_job, job, job.key, count_threads(job.options.threads), memory, gpu)
+
+
+def run(jobs: Sequence[Job], workers: int = 0, address: str = "") -> Iterator[Row]:
     """Train jobs side by side; for Python programs. Nothing is looked at before the start, see `inspect`.
 
     Args:
@@ -365,12 +300,12 @@ def run(jobs: Sequence[Job], workers: int = 0, address: str = "") -> Iterator[Ou
         address: of a running Ray cluster; "": this machine
 
     Yields:
-        every job's end, as it comes.
+        every job's row as it ends.
     """
-    threads = max((count_threads(job.options.threads) for job in jobs), default=1)
+    tasks = [train_task(job) for job in jobs]
+    threads = max((task.threads for task in tasks), default=1)
     with open_pool(workers, address, threads, len(jobs)) as pool:
-        attempts = [Attempt(job, Need(count_threads(job.options.threads))) for job in jobs]
-        yield from run_attempts(attempts, pool)
+        yield from run_jobs(tasks, pool)
 
 
 def batch(options: BatchOptions) -> int:
@@ -395,7 +330,7 @@ def batch(options: BatchOptions) -> int:
     pending = [job for job in selected if job.key not in kept]
     threads = max((count_threads(job.options.threads) for job in pending), default=1)
     with open_pool(options.workers, options.address, threads, len(pending)) as pool:
-        findings = {finding.key: finding for finding in inspect(pending, pool)}
+        findings = inspect(pending, pool)
         faults += [f"{f.key}: {f.fault}" for f in findings.values() if f.fault]
         healthy = [job for job in pending if not findings[job.key].fault]
         costs = {
@@ -437,9 +372,9 @@ def _run_batch(
     rows |= {job.key: Row(job.key, "waiting") for job in pending}
     for job in jobs:
         if job.key not in rows and _is_finished(job):  # a run of train's, or one whose row was lost
-            rows[job.key] = make_row(job, Outcome(job.key, "done"))
-    attempts = [Attempt(job, _need(job, costs[job.key])) for job in pending]
-    threads = max((attempt.need.threads for attempt in attempts), default=1)
+            rows[job.key] = finished_row(job)
+    tasks = [train_task(job, costs[job.key].memory) for job in pending]
+    threads = max((task.threads for task in tasks), default=1)
     screen = Screen(
         {job.key: job for job in pending},
         {key: cost.seconds for key, cost in costs.items()},
@@ -447,10 +382,10 @@ def _run_batch(
         options.json,
     )
 
-    def tell(event: str, attempt: Attempt, reason: str) -> None:
-        screen.event(event, job=attempt.job.key, attempt=attempt.number, reason=reason)
+    def tell(event: str, task: Task, reason: str) -> None:
+        screen.event(event, job=task.key, attempt=task.attempt, reason=reason)
         if event == "retry":
-            screen.say(f"{attempt.job.key}: {reason}; it is begun again and goes on where it was")
+            screen.say(f"{task.key}: {reason}; it is begun again and goes on where it was")
 
     def write(with_page: bool) -> None:
         ordered = [rows[job.key] for job in jobs if job.key in rows]
@@ -460,22 +395,22 @@ def _run_batch(
 
     begun = page_at = time.monotonic()
     screen.say(f"{format_count(len(pending), 'job')} on {pool.name}, {format_count(threads, 'thread')} each")
-    ends = run_attempts(attempts, pool, tell, lambda running: screen.tick([a.job.key for a in running]))
+    ends = run_jobs(tasks, pool, tell, lambda running: screen.tick([task.key for task in running]))
     try:
-        with screen:
-            write(with_page=True)
-            for outcome in ends:
-                rows[outcome.key] = make_row(by_key[outcome.key], outcome)
-                screen.end(rows[outcome.key])
-                late = time.monotonic() - page_at > _PAGE_EVERY_S
-                write(with_page=late)
-                page_at = time.monotonic() if late else page_at
+        write(with_page=True)
+        for row in ends:
+            rows[row.job] = row
+            screen.end(row)
+            late = time.monotonic() - page_at > _PAGE_EVERY_S
+            write(with_page=late)
+            page_at = time.monotonic() if late else page_at
     except KeyboardInterrupt:
         again = "--resume" if options.resume else "--resume added"
         raise KeyboardInterrupt(
             f"what is done is kept in {options.out}; give the same command with {again} to go on"
         ) from None
     finally:
+        screen.close()
         write(with_page=True)
     statuses = [rows[job.key].status for job in selected]
     done, failed = statuses.count("done"), statuses.count("failed")
@@ -500,11 +435,6 @@ def _is_finished(job: Job) -> bool:
             return find_run(job.options) == "finished"
         except ProgdfError:  # a broken run: training it says what is wrong
             return False
-
-
-def _need(job: Job, cost: Cost) -> Need:
-    gpu = job.options.editor.family == "instruct" or "text:" in job.options.region.region
-    return Need(count_threads(job.options.threads), cost.memory, gpu)
 
 
 def _disk_faults(out: Path, costs: Mapping[str, Cost]) -> list[str]:

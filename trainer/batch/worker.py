@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import _thread
+import os
+import pickle
 import re
 import socket
+import threading
 import time
 from collections.abc import Sequence
 from contextlib import chdir, suppress
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Literal
+from queue import SimpleQueue
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,7 +25,7 @@ from progdf.compose.reference import Layer, compose_layers
 from progdf.errors import ProgdfError, is_out_of_memory
 from progdf.formats.scene_file import load_scene
 from progdf.gaussians import Gaussians
-from progdf.gdf.file import Gdf, load_gdf
+from progdf.gdf.file import load_gdf
 from progdf.io.atomic import LOCK, atomic_write, cache_folder, hold_lock, is_locked
 from progdf.io.cameras import load_cameras
 from progdf.io.images import to_picture
@@ -33,29 +38,11 @@ from trainer.store.run_folder import RunFolder
 from trainer.views.view import BACKGROUND
 
 from .jobs import Job
+from .report import PREVIEW, Row, Status, finished_row
 
-PREVIEW = "preview.jpg"
-"""Of a run's folder: the edit at one half and at 1, side by side."""
-PREVIEW_SIDE = 144
-
+_PREVIEW_SIDE = 144
 _LOCK_WAIT_S = 600.0  # a lost node's worker may still be writing
 _URL = re.compile(r"\b(s3|gs|gcs|az|abfs|https?|hf|file):/+([^\s:,+]+)")  # a Path has one slash of the two
-
-Status = Literal["done", "failed", "stopped", "memory"]
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """How a job ended."""
-
-    key: str  # of the job
-    status: Status  # stopped: by Ctrl-C; memory: it took more than there was
-    reason: str = ""  # why it is not done, in one line
-    seconds: float = 0.0  # from begin to end, of the last attempt
-    cpu_seconds: float = 0.0  # of all threads, of the last attempt
-    host: str = ""  # the machine
-    attempts: int = 1  # how often it was begun
-    members: int | None = None  # Gaussians of the region
 
 
 @dataclass(frozen=True)
@@ -69,7 +56,7 @@ class Finding:
 
 
 @cache
-def _shared() -> Shared:
+def _shared_parts() -> Shared:
     """What this process's jobs have in common; models and weights stay loaded from here on."""
     keep_models()
     return Shared()
@@ -89,65 +76,69 @@ def inspect_scene(jobs: Sequence[Job]) -> list[Finding]:
 
 def _inspect(job: Job) -> Finding:
     options = resolve(_with_local_files(job.options))
-    out = options.out
-    check_command(replace(options, resume=(out / "state").is_dir() or (out / "report.json").is_file()))
+    check_command(replace(options, resume=_is_begun(RunFolder(options.out))))
     scene = _scene(options)
     if "text:" in options.region.region:
         return Finding(job.key, "", len(scene), 0)
-    region, _ = select_region(options, scene, True, _shared())
+    region, _ = select_region(options, scene, True, _shared_parts())
     return Finding(job.key, "", len(scene), len(region))
 
 
 def _scene(options: TrainOptions) -> Gaussians:
-    return _shared().get("scene", options.scene.resolve(), lambda: load_scene(options.scene))
+    return _shared_parts().get("scene", options.scene.resolve(), lambda: load_scene(options.scene))
 
 
-def run_job(job: Job) -> Outcome:
+def run_job(job: Job) -> Row:
     """Train a job in this process, or go on with it where it was stopped; a finished one is left as it is."""
-    begun, processor = time.perf_counter(), time.process_time()
-
-    def outcome(status: Status, reason: str = "", members: int | None = None) -> Outcome:
-        seconds, cpu_seconds = time.perf_counter() - begun, time.process_time() - processor
-        line = " ".join(reason.split())
-        host = socket.gethostname()
-        return Outcome(job.key, status, line, seconds, cpu_seconds, host, members=members)
-
+    begun, cpu_begun = time.perf_counter(), time.process_time()
     try:
         with chdir(job.folder):
-            _forget_peak_memory()
-            options = _with_local_files(job.options)
-            folder = RunFolder(options.out)
-            if is_locked(folder.root / LOCK):
-                with hold_lock(folder.root / LOCK, _LOCK_WAIT_S):
-                    pass
-            resume = folder.state.path.is_dir() or folder.report.is_file()
-            result = train(replace(options, resume=resume), quiet=True, shared=_shared())
-            scene = _scene(options)
-            gdf = load_gdf(result.gdf, scene)
-            if not (folder.root / PREVIEW).is_file():
-                _write_preview(result, gdf, scene)
-        return outcome("done", members=len(gdf.region))
+            _train(job)
+            row = finished_row(job)
     except KeyboardInterrupt as interrupt:
-        return outcome("stopped", str(interrupt))
+        row = Row(job.key, "stopped", str(interrupt))
     except (ProgdfError, OSError) as error:
-        return outcome("failed", str(error))
+        row = Row(job.key, "failed", str(error))
     except Exception as error:
-        if is_out_of_memory(error):
-            return outcome("memory", "out of memory")
-        return outcome("failed", f"internal error: {type(error).__name__}: {error}")
+        status: Status = "memory" if is_out_of_memory(error) else "failed"
+        row = Row(job.key, status, f"{type(error).__name__}: {error}")
+    return replace(
+        row,
+        reason=" ".join(row.reason.split()),
+        seconds=row.seconds or round(time.perf_counter() - begun, 2),
+        cpu_seconds=round(time.process_time() - cpu_begun, 2),
+        host=socket.gethostname(),
+    )
 
 
-def _write_preview(result: RunResult, gdf: Gdf, scene: Gaussians) -> None:
+def _train(job: Job) -> None:
+    with suppress(OSError):  # Linux: the peak that report.json tells is this job's, not that of those before
+        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+    options = _with_local_files(job.options)
+    folder = RunFolder(options.out)
+    if is_locked(folder.root / LOCK):
+        with hold_lock(folder.root / LOCK, _LOCK_WAIT_S):
+            pass
+    result = train(replace(options, resume=_is_begun(folder)), quiet=True, shared=_shared_parts())
+    if not (folder.root / PREVIEW).is_file():
+        _write_preview(result, _scene(options))
+
+
+def _is_begun(folder: RunFolder) -> bool:
+    return folder.state.path.is_dir() or folder.report.is_file()
+
+
+def _write_preview(result: RunResult, scene: Gaussians) -> None:
     """The edit at one half and at 1, from the held-out view that shows most of the region."""
-    folder = result.folder
+    folder, gdf = result.folder, load_gdf(result.gdf, scene)
     cameras = {camera.name: camera for camera in load_cameras(folder.cameras, scene.origin)}
 
-    def shown(name: str) -> float:
+    def coverage(name: str) -> float:
         with Image.open(folder.view("mask", name)) as mask:
             return float(np.asarray(mask, dtype=np.float32).mean())
 
-    camera = cameras[max(result.report["views"]["edit"], key=shown)]
-    scale = PREVIEW_SIDE / max(camera.width, camera.height)
+    camera = cameras[max(result.report["views"]["edit"], key=coverage)]
+    scale = _PREVIEW_SIDE / max(camera.width, camera.height)
     small = camera.resize(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
     with torch.no_grad():
         pictures = [
@@ -156,12 +147,6 @@ def _write_preview(result: RunResult, gdf: Gdf, scene: Gaussians) -> None:
         ]
     with atomic_write(folder.root / PREVIEW) as temporary_file:
         to_picture(torch.cat(pictures, dim=1)).save(temporary_file, format="JPEG", quality=88)
-
-
-def _forget_peak_memory() -> None:
-    """Linux: the peak that report.json tells is this job's, not that of the jobs before."""
-    with suppress(OSError):
-        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
 
 
 def _with_local_files(options: TrainOptions) -> TrainOptions:
@@ -190,3 +175,36 @@ def _local_copy(url: str) -> str:
         raise ProgdfError(f"{url}: {error}") from error
     except (OSError, ValueError) as error:
         raise ProgdfError(f"{url} cannot be read ({error})") from error
+
+
+@dataclass(frozen=True)
+class Lost:
+    """What comes back instead of a result when a worker, its node or its machine ends."""
+
+    reason: str
+    from_memory: bool = False  # it was ended as memory ran out
+
+
+def serve() -> None:
+    """A worker without Ray: pickled tasks from stdin, results to what was stdout, until its input ends."""
+    tasks, results = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
+    queue = SimpleQueue[Any]()
+
+    def read() -> None:
+        with suppress(EOFError):
+            while True:
+                queue.put(pickle.load(tasks))
+        queue.put(None)
+        _thread.interrupt_main()  # nobody waits for what runs: save the state
+
+    threading.Thread(target=read, daemon=True).start()
+    with suppress(KeyboardInterrupt, BrokenPipeError):
+        while (task := queue.get()) is not None:
+            function, argument = task
+            try:
+                result = function(argument)
+            except Exception as error:
+                result = Lost(f"{type(error).__name__}: {error}")
+            pickle.dump(result, results)
+            results.flush()

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
-import multiprocessing
+import os
 import signal
 import subprocess
 import sys
@@ -18,8 +19,7 @@ from tests.helpers.trained import quick_options, train, write_bear
 from trainer import cli
 from trainer.batch.jobs import Job, read_catalogue
 from trainer.batch.report import Row, read_rows
-from trainer.batch.run import Attempt, LocalPool, RayPool, run, run_attempts
-from trainer.batch.worker import Outcome
+from trainer.batch.run import LocalPool, RayPool, Task, run, run_jobs, train_task
 
 BEARS = """
 [defaults]
@@ -75,12 +75,14 @@ def children(of: int) -> list[int]:
 
 
 def kill_workers() -> None:
-    for child in multiprocessing.active_children():
-        child.kill()
+    for pid in children(os.getpid()):
+        with contextlib.suppress(OSError):
+            if b"serve()" in Path(f"/proc/{pid}/cmdline").read_bytes():
+                os.kill(pid, signal.SIGKILL)
 
 
-def ends(attempts: list[Attempt], pool: LocalPool | RayPool, **more: object) -> dict[str, Outcome]:
-    return {outcome.key: outcome for outcome in run_attempts(attempts, pool, **more)}  # type: ignore[arg-type]
+def ends(tasks: list[Task], pool: LocalPool | RayPool, **more: object) -> dict[str, Row]:
+    return {row.job: row for row in run_jobs(tasks, pool, **more)}  # type: ignore[arg-type]
 
 
 def test_a_batch_writes_ordinary_runs_a_table_and_a_page_and_names_what_is_broken(
@@ -96,7 +98,7 @@ def test_a_batch_writes_ordinary_runs_a_table_and_a_page_and_names_what_is_broke
     assert gdf_bytes(out) == singly
     rows = list(read_rows(out).values())
     assert [row.status for row in rows] == ["done", "done", "failed"]
-    assert all(row.psnr_end and row.bytes and row.members and row.cpu_seconds for row in rows[:2])
+    assert all(row.psnr_end and row.bytes and row.memory_mb and row.cpu_seconds for row in rows[:2])
     events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
     assert events[-1] | {"seconds": 0} == {"event": "total", "done": 2, "failed": 1, "jobs": 3, "seconds": 0}
     page = (out / "batch.html").read_text(encoding="utf-8")
@@ -139,13 +141,13 @@ def test_a_killed_worker_s_job_goes_on_in_another_one(
     retried: list[str] = []
     pool = LocalPool()
 
-    def kill(running: list[Attempt]) -> None:
-        if not retried and any((a.job.options.out / "state" / "run.json").is_file() for a in running):
+    def kill(running: list[Task]) -> None:
+        if not retried and any((a.argument.options.out / "state" / "run.json").is_file() for a in running):
             kill_workers()
 
     try:
         outcomes = ends(
-            [Attempt(job) for job in jobs],
+            [train_task(job) for job in jobs],
             pool,
             tell=lambda event, attempt, reason: retried.append(reason) if event == "retry" else None,
             tick=kill,
@@ -158,15 +160,11 @@ def test_a_killed_worker_s_job_goes_on_in_another_one(
 
 
 def test_a_job_that_always_dies_fails_and_the_others_are_done(tmp_path: Path) -> None:
-    class Dying(LocalPool):
-        def wait(self, seconds: float) -> list[tuple[object, object]]:
-            kill_workers()
-            return super().wait(seconds)
-
     write_bear(tmp_path)
-    pool = Dying()
+    pool = LocalPool()
     try:
-        (outcome,) = run_attempts([Attempt(Job("one", quick_options(tmp_path)))], pool)
+        task = train_task(Job("one", quick_options(tmp_path)))
+        (outcome,) = run_jobs([task], pool, tick=lambda running: kill_workers())
     finally:
         pool.stop()
     assert (outcome.status, outcome.attempts) == ("failed", 4)
@@ -233,21 +231,21 @@ def test_on_a_cluster_a_lost_machine_s_job_goes_on_elsewhere(
     retried: list[str] = []
     began: dict[str, int] = {}
 
-    def tell(event: str, attempt: Attempt, reason: str) -> None:
+    def tell(event: str, attempt: Task, reason: str) -> None:
         if event == "retry":
             retried.append(reason)
-        began[attempt.job.key] = attempt.number
+        began[attempt.key] = attempt.attempt
 
-    def remove(running: list[Attempt]) -> None:
+    def remove(running: list[Task]) -> None:
         nonlocal second
-        begun = [a for a in running if (a.job.options.out / "state" / "run.json").is_file()]
+        begun = [a for a in running if (a.argument.options.out / "state" / "run.json").is_file()]
         if second is not None and len(begun) == 2:
             cluster.remove_node(second, allow_graceful=False)  # type: ignore[attr-defined]
             second = None
 
     pool = RayPool(cluster.address, 2)  # type: ignore[attr-defined]
     try:
-        outcomes = ends([Attempt(job) for job in jobs], pool, tell=tell, tick=remove)
+        outcomes = ends([train_task(job) for job in jobs], pool, tell=tell, tick=remove)
     finally:
         pool.stop()
     assert retried
@@ -260,7 +258,7 @@ def test_programs_train_jobs_side_by_side(tmp_path: Path) -> None:
     write_bear(tmp_path)
     sizes: dict[str, object] = {"views": 4, "image_size": 48, "steps": 24, "stages": 2}
     jobs = [Job(part, quick_options(tmp_path, part, part, **sizes)) for part in ("scarf", "ears")]
-    assert {(outcome.key, outcome.status) for outcome in run(jobs, workers=2)} == {
+    assert {(row.job, row.status) for row in run(jobs, workers=2)} == {
         ("scarf", "done"),
         ("ears", "done"),
     }
