@@ -19,13 +19,14 @@ from typing import NoReturn
 
 from progdf.io.atomic import atomic_write, disk_full
 
-from .errors import ProgdfError
+from .errors import ProgdfError, is_out_of_memory
 from .io.atomic import state_folder
 from .terminal import PrintableFormatter, escape_text
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "demo": ("trainer.run.demo:main", "make a scene, train its edits, write previews, open the window"),
     "train": ("trainer.cli:train", "edit a region of a scene and write its .gdf file"),
+    "batch": ("trainer.cli:batch", "train every edit of a catalogue, on this machine or a Ray cluster"),
     "region": ("trainer.cli:region", "show or keep which Gaussians a region selects"),
     "views": ("trainer.cli:views", "write views of a scene to draw masks or edits on"),
     "fit": ("trainer.cli:fit", "refit a field to a recorded trajectory"),
@@ -80,7 +81,7 @@ def run_guarded(run: Callable[[Sequence[str]], int], arguments: Sequence[str]) -
     except KeyboardInterrupt as interrupt:
         return _report_failure(f"interrupted{'; ' + str(interrupt) if str(interrupt) else ''}", 130)
     except Exception as error:
-        if _is_out_of_memory(error):
+        if is_out_of_memory(error):
             return _report_failure("out of memory; close other programs or use a smaller scene")
         message = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
         return _report_failure(f"internal error in progdf ({message[:200]}); {_save_traceback()}", 70)
@@ -105,12 +106,6 @@ def _run(arguments: Sequence[str]) -> int:
 def _report_failure(line: str, status: int = 2) -> int:
     print(f"progdf: {escape_text(' '.join(line.split()))}", file=sys.stderr)
     return status
-
-
-def _is_out_of_memory(error: Exception) -> bool:
-    """torch raises a RuntimeError of its allocator's."""
-    message = str(error) if isinstance(error, RuntimeError) else ""
-    return isinstance(error, MemoryError) or "allocate memory" in message or "not enough memory" in message
 
 
 def _save_traceback() -> str:

@@ -14,3 +14,10 @@ class ProgdfError(ValueError):
 
     def __str__(self) -> str:
         return escape_text(" ".join(super().__str__().split()))
+
+
+def is_out_of_memory(error: Exception) -> bool:
+    """Whether memory ran out; torch raises a RuntimeError of its allocator's."""
+    message = str(error) if isinstance(error, RuntimeError) else ""
+    words = ("allocate memory", "not enough memory", "out of memory")
+    return isinstance(error, MemoryError) or any(word in message for word in words)

@@ -36,7 +36,7 @@ ORDER = {
     "progdf": """quaternions sh gaussians terminal errors threads region camera color metrics
         demo_scenes io rasterize field formats gdf scene compose cli __init__ __main__""",
     "trainer": """__init__ options store views editors resolve setup regions
-        motion optimize fit report preview run evaluate cli""",
+        motion optimize fit report preview run evaluate batch cli""",
     "viewer": "__init__ camera gl jobs state render files pictures ui panel app commands",
     "benchmarks": """__init__ analytic_edits courses table ablation field_forms rasterizer
         recorded_runs viewer field_plot field edits networks sliders warps pictures __main__""",

@@ -1,4 +1,4 @@
-"""The command lines of `progdf train`, `fit`, `evaluate`, `region` and `views`, made from dataclasses."""
+"""The command lines of the trainer's commands, made from dataclasses."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from progdf.cli.options import parse_options
 from progdf.terminal import print_line
 
 from .options import (
+    BatchOptions,
     EvaluateOptions,
     FitOptions,
     ShowRegionOptions,
@@ -24,6 +25,14 @@ def train(argv: Sequence[str]) -> int:
 
     run(options)
     return 0
+
+
+def batch(argv: Sequence[str]) -> int:
+    """Run `progdf batch`; 0 all done, 2 something is wrong and nothing was started, 3 some failed."""
+    options = parse_options(BatchOptions, argv, "progdf batch")
+    from trainer.batch.run import batch as run
+
+    return run(options)
 
 
 def fit(argv: Sequence[str]) -> int:

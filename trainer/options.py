@@ -399,3 +399,29 @@ class WriteViewsOptions:
     """Longer side of the views in pixels."""
     up: UpChoice = "auto"
     """The axis of the scene that is up."""
+
+
+@dataclass(frozen=True)
+class BatchOptions:
+    """Train every edit of a catalogue, side by side; finished runs are kept."""
+
+    catalogue: tyro.conf.Positional[Path]
+    """TOML: [defaults], [[scenes]] with a path, [[scenes.edits]] with a name, [sweep]; see docs/cli.md."""
+    out: Path
+    """Folder of the batch: OUT/SCENE/NAME/ are ordinary runs, OUT/batch.html and batch.csv tell of all."""
+    workers: int = 0
+    """Jobs at once; 0: as many as the cores allow. Without Ray (pip install progdf-studio[cluster]) one."""
+    address: Annotated[str, absent_option("HOST:PORT|auto", "a cluster of this machine's cores")] = ""
+    """A Ray cluster that runs, whose machines share OUT and the scenes."""
+    resume: bool = False
+    """Go on with the batch in OUT: finished runs are kept, stopped ones continued, the others begun."""
+    only: Annotated[str, absent_option("PATTERN", "all")] = ""
+    """Jobs whose SCENE/NAME or NAME matches, such as "shoes/*" or "blue*"."""
+    failed: bool = False
+    """Of the batch in OUT, those jobs that failed."""
+    keep_going: bool = False
+    """Start although some jobs cannot be trained; these count as failed."""
+    dry_run: bool = False
+    """Check, print the jobs and what they will take, and train nothing."""
+    json: bool = False
+    """Events for programs, one JSON object a line, instead of text."""

@@ -31,7 +31,7 @@ from progdf.gaussians import Gaussians
 from progdf.io.images import to_picture
 from progdf.region import Region
 from trainer.options import EditKind, EditorOptions
-from trainer.store.pretrained import BROKEN, check_weights_here, folder_of_model
+from trainer.store.pretrained import BROKEN, check_weights_here, folder_of_model, last_model
 from trainer.views.view import View
 
 from .cache import KeptPictures, Recipe
@@ -187,7 +187,7 @@ def instruct(
 
     @cache
     def pipeline() -> Any:
-        return load_pipeline(model, kind)
+        return last_model("pipeline", (model, kind), lambda: load_pipeline(model, kind))
 
     recipe: Recipe = {
         "instruct": prompt,

@@ -28,6 +28,7 @@ from progdf.scene.up_axis import find_up
 from trainer.editors.cache import KeptPictures, Recipe
 from trainer.editors.pictures import SUFFIXES, picture_paths, rendered_cameras
 from trainer.options import VIEWS, RegionOptions, ViewOptions
+from trainer.store.pretrained import last_model
 from trainer.views.view import (
     BACKGROUND,
     INSIDE,
@@ -264,7 +265,10 @@ def _segment(
         "sam_model": chosen.sam_model,
         "box_threshold": chosen.box_threshold,
     }
-    loaded: Callable[[], Segmenter] = cache(lambda: SEGMENTERS["text"](chosen))
+    networks = replace(chosen, region="")
+    loaded: Callable[[], Segmenter] = cache(
+        lambda: last_model("segmenter", networks, lambda: SEGMENTERS["text"](networks))
+    )
 
     def paint(image: Tensor) -> Tensor:
         return loaded()(image, prompt).float()[..., None].expand(-1, -1, 3)

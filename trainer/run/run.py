@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -169,28 +169,46 @@ def reedit(
     return Reedit(editor, setup, options.reedit_every, confines_edit(editor, optimization.kind), log)
 
 
-__all__ = ["RunResult", "train"]
+__all__ = ["RunResult", "Shared", "train"]
+
+_T = TypeVar("_T")
 
 
-def train(options: TrainOptions, quiet: bool = False) -> RunResult:
+class Shared:
+    """The scene, region and views of the last run of a process, for the next run if it has the same ones."""
+
+    def __init__(self) -> None:
+        self._last: dict[str, tuple[object, Any]] = {}
+
+    def get(self, what: str, key: object, make: Callable[[], _T]) -> _T:
+        """What `make` gives, or gave when it was last asked for `what` with an equal key."""
+        if what not in self._last or self._last[what][0] != key:
+            self._last.pop(what, None)  # first, so that two scenes are never in memory
+            self._last[what] = key, make()
+        value: _T = self._last[what][1]
+        return value
+
+
+def train(options: TrainOptions, quiet: bool = False, shared: Shared | None = None) -> RunResult:
     """Edit a region of a scene and write its .gdf file.
 
     Args:
         options: as typed
         quiet: nothing on the screen; log.txt is written all the same
+        shared: of runs that follow each other in this process, whose files do not change meanwhile
 
     Raises:
         ProgdfError: scene, region, cameras or edited views that do not work; no .gdf is touched.
         KeyboardInterrupt: interrupted; the message says how to go on. No .gdf is touched.
     """
-    options = resolve(options)
+    options, shared = resolve(options), shared or Shared()
     check_command(options)
     use_threads(options.threads)
-    scene = load_scene(options.scene)
+    scene = shared.get("scene", options.scene.resolve(), lambda: load_scene(options.scene))
     region, notes = load_region(options.out) if options.resume else None, list[str]()
     if region is None:
-        kinds = region_kinds(region_request(options, quiet, notes.append))
-        region = parse_region(options.region.region, scene, options.name, kinds, notes.append)
+        selected, notes = select_region(options, scene, quiet, shared)
+        region = replace(selected, name=options.name)
     folder = open_run_folder(options.out, options.edit)
     with interrupt_on_signals(), lock_folder(folder), explain_stop(folder):
         session = decide_resume(folder, options, region, len(scene))
@@ -202,7 +220,7 @@ def train(options: TrainOptions, quiet: bool = False) -> RunResult:
                 return load_result(folder, options.name, scene, log)
             use_threads(session.threads)
             with check_exists(folder):
-                result = _run_training(options, scene, region, folder, log)
+                result = _run_training(options, scene, region, folder, shared, log)
             folder.state.end()
             return result
         except KeyboardInterrupt:
@@ -212,15 +230,37 @@ def train(options: TrainOptions, quiet: bool = False) -> RunResult:
             log.close()
 
 
+def select_region(
+    options: TrainOptions, scene: Gaussians, quiet: bool, shared: Shared
+) -> tuple[Region, list[str]]:
+    """The region that resolved options name, and what is to be said of it, a line each.
+
+    Raises:
+        ProgdfError: see `parse_region`.
+    """
+
+    def select() -> tuple[Region, list[str]]:
+        notes = list[str]()
+        kinds = region_kinds(region_request(options, quiet, notes.append))
+        return parse_region(options.region.region, scene, options.name, kinds, notes.append), notes
+
+    return shared.get("region", (options.scene.resolve(), options.region, options.views), select)
+
+
 def _run_training(
-    options: TrainOptions, scene: Gaussians, region: Region, folder: RunFolder, log: RunLog
+    options: TrainOptions,
+    scene: Gaussians,
+    region: Region,
+    folder: RunFolder,
+    shared: Shared,
+    log: RunLog,
 ) -> RunResult:
     """Everything; what the saved state says is done is not done again, or is repeated to the same bits."""
     perceptual, warning = perceptual_loss()
     if warning:
         log.say(warning)
     with log.stage("views"):
-        setup = _render_originals(options, scene, region, folder)
+        setup = _render_originals(options, scene, region, folder, shared)
     log.say(f"{len(scene)} Gaussians, {len(region)} in the region; {_describe_views(setup)}")
     for note in setup.notes:
         log.say(note)
@@ -270,10 +310,12 @@ def _describe_views(setup: TrainingSetup) -> str:
 
 
 def _render_originals(
-    options: TrainOptions, scene: Gaussians, region: Region, folder: RunFolder
+    options: TrainOptions, scene: Gaussians, region: Region, folder: RunFolder, shared: Shared
 ) -> TrainingSetup:
     """The views, rendered and on disk."""
-    setup = make_training_setup(options.views, scene, region)
+    key = options.views, region.members.numpy().tobytes(), region.score.numpy().tobytes()
+    setup = shared.get("views", key, lambda: make_training_setup(options.views, scene, region))
+    setup = replace(setup, region=region)
     views = setup.views
     remove_stale_views(folder, [view.camera.name for view in views])
     write_views(folder, "original", {view.camera.name: view.image for view in views})

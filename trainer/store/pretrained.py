@@ -3,12 +3,32 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from safetensors import SafetensorError, safe_open
 
 BROKEN = (OSError, ValueError, RuntimeError, KeyError, TypeError, SafetensorError)
 """What transformers and diffusers raise for a model that is not there, not whole, or another's."""
+
+_models: dict[str, tuple[object, Any]] | None = None  # the last one of each kind, where they are kept
+
+
+def keep_models() -> None:
+    """From now on the last model of each kind stays in memory, for a process that trains many edits."""
+    global _models
+    _models = {} if _models is None else _models
+
+
+def last_model(kind: str, key: object, load: Callable[[], Any]) -> Any:
+    """What `load` gives; after `keep_models`, what it gave last for this kind if the key is the same."""
+    if _models is None:
+        return load()
+    if kind not in _models or _models[kind][0] != key:
+        _models.pop(kind, None)  # first, so that two are never in memory
+        _models[kind] = key, load()
+    return _models[kind][1]
 
 
 def folder_of_model(model: str, file: str) -> Path:

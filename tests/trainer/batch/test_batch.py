@@ -1,0 +1,264 @@
+"""`progdf batch`: what it writes, what it refuses, and what becomes of workers and machines that are lost."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from progdf.errors import ProgdfError
+from tests.helpers.trained import quick_options, train, write_bear
+from trainer import cli
+from trainer.batch.jobs import Job, read_catalogue
+from trainer.batch.report import Row, read_rows
+from trainer.batch.run import LocalPool, RayPool, Task, run, run_jobs, train_task
+
+BEARS = """
+[defaults]
+views = 4
+image-size = 48
+steps = {steps}
+stages = 2
+[[scenes]]
+path = "scene.ply"
+name = "bear"
+[[scenes.edits]]
+name = "scarf"
+region = "labels:labels.npy:{scarf}"
+editor = "recolor:#3060d0"
+[[scenes.edits]]
+name = "body"
+region = "labels:labels.npy:{body}"
+editor = "darken:.5"
+"""
+
+
+@pytest.fixture(scope="module")
+def catalogue(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A catalogue of two edits of a small bear."""
+    from progdf.demo_scenes.bear import LABELS
+
+    folder = tmp_path_factory.mktemp("bears")
+    write_bear(folder)
+    text = BEARS.format(steps=24, scarf=LABELS.index("scarf"), body=LABELS.index("body"))
+    (folder / "catalogue.toml").write_text(text, encoding="utf-8")
+    return folder / "catalogue.toml"
+
+
+@pytest.fixture(scope="module")
+def singly(catalogue: Path) -> dict[str, bytes]:
+    """The .gdf bytes of each job's command, run alone."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(catalogue.parent)
+        jobs, _ = read_catalogue(catalogue, catalogue.parent / "alone")
+        return {job.key: train(job.options).gdf.read_bytes() for job in jobs}
+
+
+def gdf_bytes(folder: Path) -> dict[str, bytes]:
+    return {f"{path.parts[-3]}/{path.parts[-2]}": path.read_bytes() for path in folder.glob("*/*/*.gdf")}
+
+
+def children(of: int) -> list[int]:
+    """Processes below another, at any depth."""
+    listed = subprocess.run(["ps", "-eo", "pid=,ppid="], capture_output=True, text=True, check=True).stdout
+    parents = {int(pid): int(parent) for pid, parent in (line.split() for line in listed.splitlines())}
+    below = [pid for pid, parent in parents.items() if parent == of]
+    return below + [deeper for pid in below for deeper in children(pid)]
+
+
+def kill_workers() -> None:
+    for pid in children(os.getpid()):
+        with contextlib.suppress(OSError):
+            if b"serve()" in Path(f"/proc/{pid}/cmdline").read_bytes():
+                os.kill(pid, signal.SIGKILL)
+
+
+def ends(tasks: list[Task], pool: LocalPool | RayPool, **more: object) -> dict[str, Row]:
+    return {row.job: row for row in run_jobs(tasks, pool, **more)}  # type: ignore[arg-type]
+
+
+def test_a_batch_writes_ordinary_runs_a_table_and_a_page_and_names_what_is_broken(
+    catalogue: Path, singly: dict[str, bytes], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = catalogue.read_text(encoding="utf-8")
+    text += '\n[[scenes]]\npath="broken.ply"\n[[scenes.edits]]\nname="a"\nregion="all"\neditor="night"'
+    (catalogue.parent / "broken.ply").write_bytes(b"ply\nnothing")
+    (catalogue.parent / "one_broken.toml").write_text(text, encoding="utf-8")
+    out = tmp_path / "runs"
+    command = [str(catalogue.parent / "one_broken.toml"), "--out", str(out), "--workers", "1"]
+    assert cli.batch([*command, "--keep-going", "--json"]) == 3
+    assert gdf_bytes(out) == singly
+    rows = list(read_rows(out).values())
+    assert [row.status for row in rows] == ["done", "done", "failed"]
+    assert all(row.psnr_end and row.bytes and row.memory_mb and row.cpu_seconds for row in rows[:2])
+    events = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert events[-1] | {"seconds": 0} == {"event": "total", "done": 2, "failed": 1, "jobs": 3, "seconds": 0}
+    page = (out / "batch.html").read_text(encoding="utf-8")
+    assert page.count("data:image/jpeg") == 2
+    assert page.count("<polyline") == 2
+    assert "http" not in page.replace("http-equiv", "")
+
+    with pytest.raises(ProgdfError, match="holds a batch; add --resume"):
+        cli.batch([str(catalogue), *command[1:]])
+    before = {path: path.stat().st_mtime_ns for path in out.glob("*/*/*.gdf")}
+    assert cli.batch([str(catalogue), *command[1:], "--resume"]) == 0
+    assert {path: path.stat().st_mtime_ns for path in out.glob("*/*/*.gdf")} == before
+    assert cli.batch([*command, "--dry-run", "--only", "body"]) == 0
+    assert "bear/body: finished" in capsys.readouterr().out
+
+
+def test_everything_is_checked_before_anything_starts(
+    catalogue: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = catalogue.read_text(encoding="utf-8").replace("recolor:#3060d0", "recolour:#3060d0")
+    text = text.replace("darken:.5", "pictures:absent.png")
+    text += '\n[[scenes.edits]]\nname="empty"\nregion="sphere:900,0,0,1"\neditor="night"'
+    text += '\n[[scenes]]\npath="broken.ply"\n[[scenes.edits]]\nname="a"\nregion="all"\neditor="night"'
+    (catalogue.parent / "broken.ply").write_bytes(b"ply\nnothing")
+    (catalogue.parent / "faulty.toml").write_text(text, encoding="utf-8")
+    out = tmp_path / "runs"
+    assert cli.batch([str(catalogue.parent / "faulty.toml"), "--out", str(out), "--workers", "1"]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    faults = [line for line in lines if line.startswith("progdf: ")]
+    assert len(faults) == 4
+    for words in ("unknown editor 'recolour'", "absent.png", "holds no Gaussian", "broken.ply"):
+        assert any(words in line for line in faults), faults
+    assert not out.exists()
+
+
+def test_a_killed_worker_s_job_goes_on_in_another_one(
+    catalogue: Path, singly: dict[str, bytes], tmp_path: Path
+) -> None:
+    jobs, _ = read_catalogue(catalogue, tmp_path / "runs")
+    retried: list[str] = []
+    pool = LocalPool()
+
+    def kill(running: list[Task]) -> None:
+        if not retried and any((a.argument.options.out / "state" / "run.json").is_file() for a in running):
+            kill_workers()
+
+    try:
+        outcomes = ends(
+            [train_task(job) for job in jobs],
+            pool,
+            tell=lambda event, attempt, reason: retried.append(reason) if event == "retry" else None,
+            tick=kill,
+        )
+    finally:
+        pool.stop()
+    assert "SIGKILL" in retried[0]
+    assert {outcome.status for outcome in outcomes.values()} == {"done"}
+    assert gdf_bytes(tmp_path / "runs") == singly
+
+
+def test_a_job_that_always_dies_fails_and_the_others_are_done(tmp_path: Path) -> None:
+    write_bear(tmp_path)
+    pool = LocalPool()
+    try:
+        task = train_task(Job("one", quick_options(tmp_path)))
+        (outcome,) = run_jobs([task], pool, tick=lambda running: kill_workers())
+    finally:
+        pool.stop()
+    assert (outcome.status, outcome.attempts) == ("failed", 4)
+    assert "SIGKILL" in outcome.reason
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals")
+def test_ctrl_c_stops_all_and_resume_ends_with_the_same_bytes(
+    catalogue: Path, singly: dict[str, bytes], tmp_path: Path
+) -> None:
+    out = tmp_path / "runs"
+    command = [sys.executable, "-P", "-m", "progdf", "batch", str(catalogue), "--out", str(out)]
+    process = subprocess.Popen(
+        [*command, "--workers", "1"],
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+    )
+    try:
+        deadline = time.monotonic() + 60
+        while not (out / "bear" / "scarf" / "state" / "run.json").is_file() and time.monotonic() < deadline:
+            time.sleep(0.02)
+        process.send_signal(signal.SIGINT)
+        error = process.communicate(timeout=30)[1]
+    finally:
+        process.kill()
+    assert process.returncode == 130
+    assert "with --resume added to go on" in error
+    assert [row.status for row in read_rows(out).values()] != ["done", "done"]
+    assert not children(process.pid)
+    assert cli.batch([str(catalogue), "--out", str(out), "--workers", "1", "--resume"]) == 0
+    assert gdf_bytes(out) == singly
+
+
+def test_a_row_is_read_back_as_it_was_written(tmp_path: Path) -> None:
+    from trainer.batch.report import write_page, write_rows
+
+    rows = [
+        Row('a,"b"/c', "failed", "it; <script>alert(1)</script>", attempts=4),
+        Row("d/e", "done", psnr_end=30.25),
+    ]
+    write_rows(tmp_path, rows)
+    assert list(read_rows(tmp_path).values()) == rows
+    write_page(tmp_path, {}, rows)
+    assert "<script>alert" not in (tmp_path / "batch.html").read_text(encoding="utf-8")
+
+
+@pytest.fixture
+def cluster() -> Iterator[object]:
+    """Two simulated machines of one core each."""
+    pytest.importorskip("ray")
+    from ray.cluster_utils import Cluster
+
+    made = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "object_store_memory": 80 * 2**20})
+    yield made
+    made.shutdown()
+
+
+def test_on_a_cluster_a_lost_machine_s_job_goes_on_elsewhere(
+    catalogue: Path, singly: dict[str, bytes], tmp_path: Path, cluster: object
+) -> None:
+    second = cluster.add_node(num_cpus=1, object_store_memory=80 * 2**20)  # type: ignore[attr-defined]
+    jobs, _ = read_catalogue(catalogue, tmp_path / "runs")
+    retried: list[str] = []
+    began: dict[str, int] = {}
+
+    def tell(event: str, attempt: Task, reason: str) -> None:
+        if event == "retry":
+            retried.append(reason)
+        began[attempt.key] = attempt.attempt
+
+    def remove(running: list[Task]) -> None:
+        nonlocal second
+        begun = [a for a in running if (a.argument.options.out / "state" / "run.json").is_file()]
+        if second is not None and len(begun) == 2:
+            cluster.remove_node(second, allow_graceful=False)  # type: ignore[attr-defined]
+            second = None
+
+    pool = RayPool(cluster.address, 2)  # type: ignore[attr-defined]
+    try:
+        outcomes = ends([train_task(job) for job in jobs], pool, tell=tell, tick=remove)
+    finally:
+        pool.stop()
+    assert retried
+    assert {outcome.status for outcome in outcomes.values()} == {"done"}
+    assert gdf_bytes(tmp_path / "runs") == singly
+
+
+@pytest.mark.slow
+def test_programs_train_jobs_side_by_side(tmp_path: Path) -> None:
+    write_bear(tmp_path)
+    sizes: dict[str, object] = {"views": 4, "image_size": 48, "steps": 24, "stages": 2}
+    jobs = [Job(part, quick_options(tmp_path, part, part, **sizes)) for part in ("scarf", "ears")]
+    assert {(row.job, row.status) for row in run(jobs, workers=2)} == {
+        ("scarf", "done"),
+        ("ears", "done"),
+    }

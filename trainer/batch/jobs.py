@@ -1,0 +1,223 @@
+"""What a batch is to do: jobs from a catalogue, what is wrong with them, and what they will take.
+
+A job is an ordinary run: `cd FOLDER; progdf train …` writes the same bytes (`Job.command`).
+"""
+
+from __future__ import annotations
+
+import difflib
+import itertools
+import re
+import shlex
+import tomllib
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from progdf.errors import ProgdfError
+from progdf.io.atomic import read_file
+from progdf.io.json_values import convert_json, plain
+from trainer.options import (
+    MOST_STAGES,
+    PRESETS,
+    VIEWS,
+    EditorOptions,
+    RegionOptions,
+    TrainOptions,
+    apply_preset,
+    with_values,
+)
+from trainer.resolve import check_name, resolve
+
+THREADS = 1
+"""Threads of a run where the catalogue gives none: several jobs use the cores better than several threads."""
+
+_MOST_BYTES = 1 << 24  # of a catalogue
+_MOST_JOBS = 100_000
+_LIST_OF = {"scenes": "[[scenes]]", "edits": "[[scenes.edits]]"}
+_NO_OPTION = ("out", "resume", "scene", "name")  # a catalogue has other ways to say these
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run of a batch."""
+
+    key: str  # SCENE/NAME, by which reports and --only call it
+    options: TrainOptions  # as typed; `out` is absolute, other paths are relative to `folder`
+    folder: Path = Path()  # where the run works
+
+    @property
+    def command(self) -> str:
+        """The command that does the same alone, to be run in `folder`."""
+        options, words = self.options, ["progdf", "train", str(self.options.scene)]
+        default = apply_preset(_blank(Path()), options.preset)
+        for name, value, usual in _typed_values(options, replace(default, preset="default")):
+            if value != usual and name != "scene":
+                words.append("--" + name.replace("_", "-"))
+                words += [] if isinstance(value, bool) else [str(value)]
+        return shlex.join(words)
+
+
+def read_catalogue(path: Path, out: Path) -> tuple[list[Job], list[str]]:
+    """The jobs of a catalogue, and what is wrong with it, a line each.
+
+    Args:
+        path: TOML; docs/cli.md, batch
+        out: folder of the batch; jobs are written to OUT/SCENE/NAME
+
+    Raises:
+        ProgdfError: the file cannot be read, or is no TOML.
+    """
+    try:
+        content = read_file(path, _MOST_BYTES + 1)
+        if len(content) > _MOST_BYTES:
+            raise ProgdfError(f"{path} is larger than any catalogue")
+        table = tomllib.loads(content.decode())
+    except (ValueError, RecursionError) as error:
+        raise ProgdfError(f"{path} is not a TOML file ({error})") from None
+    folder, jobs, faults = path.resolve().parent, list[Job](), list[str]()
+    try:
+        for key, values in _entries(table):
+            try:
+                jobs.append(Job(key, make_options(values, out.absolute() / key), folder))
+            except ProgdfError as error:
+                faults.append(f"{key}: {error}")
+            if len(jobs) > _MOST_JOBS:
+                raise ProgdfError(f"more than {_MOST_JOBS} jobs; split the catalogue")
+    except ProgdfError as error:
+        return [], [f"{path}: {error}"]
+    counts = Counter(job.key.casefold() for job in jobs)  # some file systems take A and a for one
+    twice = dict.fromkeys(job.key for job in jobs if counts[job.key.casefold()] > 1)
+    faults += [
+        f"{key}: {counts[key.casefold()]} jobs have this name; give scenes or edits a `name`" for key in twice
+    ]
+    if not jobs and not faults:
+        faults.append(f"{path} holds no edit; add [[scenes]] with a path and [[scenes.edits]]")
+    return jobs, faults
+
+
+def _entries(table: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Key and options of every job, with what the catalogue says for all, for a scene, and by the sweep."""
+    _check_keys(table, ("defaults", "scenes", "sweep"), "the catalogue")
+    defaults, sweep = _table(table, "defaults"), _table(table, "sweep")
+    for name, values in sweep.items():
+        if not isinstance(values, list) or not values:
+            raise ProgdfError(f"[sweep] {name} must be a list of values")
+    for scene in _tables(table, "scenes"):
+        if not isinstance(scene.get("path"), str):
+            raise ProgdfError("each of [[scenes]] needs a path")
+        path = scene["path"]
+        scene_name = check_name(str(scene.get("name", Path(path).stem or path)))
+        for edit in _tables(scene, "edits"):
+            if not isinstance(edit.get("name"), str):
+                raise ProgdfError(f"an edit of {scene_name} has no name")
+            own = {k: v for k, v in {**scene, **edit}.items() if k not in ("path", "name", "edits")}
+            for values in itertools.product(*sweep.values()):
+                point = dict(zip(sweep, values, strict=True))
+                suffix = "".join(f",{key}={_file_word(value)}" for key, value in point.items())
+                run_name = check_name(edit["name"] + suffix)
+                yield f"{scene_name}/{run_name}", {"scene": path, **defaults, **own, **point}
+
+
+def _table(table: Mapping[str, Any], key: str) -> dict[str, Any]:
+    value = table.get(key, {})
+    if not isinstance(value, dict):
+        raise ProgdfError(f"[{key}] must be a table")
+    return value
+
+
+def _tables(table: Mapping[str, Any], key: str) -> list[dict[str, Any]]:
+    value = table.get(key, [])
+    if not isinstance(value, list) or not all(isinstance(entry, dict) for entry in value):
+        raise ProgdfError(f"{key} must be tables, {_LIST_OF[key]}")
+    return value
+
+
+def _check_keys(table: Mapping[str, Any], known: Sequence[str], where: str) -> None:
+    for key in table:
+        if key not in known:
+            raise ProgdfError(f"{where} has an unknown key '{key}'{_closest(key, known)}")
+
+
+def _closest(name: str, known: Sequence[str]) -> str:
+    match = difflib.get_close_matches(name, known, 1)
+    return f"; did you mean '{match[0]}'?" if match else ""
+
+
+def _file_word(value: object) -> str:
+    """A swept value as a part of a file's name."""
+    return re.sub(r"[^\w.#=+@%-]+", "-", str(value)).strip("-")
+
+
+def make_options(values: Mapping[str, Any], out: Path) -> TrainOptions:
+    """Options of a run from their command-line names.
+
+    Args:
+        values: names with hyphens or underscores; `scene`, `region` and `editor` are needed
+        out: folder of the run
+
+    Raises:
+        ProgdfError: a name or a value that `progdf train` does not take.
+    """
+    values = {name.replace("-", "_"): value for name, value in values.items()}
+    for name in ("region", "editor"):
+        if not isinstance(values.get(name), str):
+            raise ProgdfError(f"{name} is missing")
+    options = _blank(out)
+    known = [name for name, *_ in _typed_values(options, options) if name not in _NO_OPTION]
+    _check_keys({k: v for k, v in values.items() if k != "scene"}, known, "it")
+    if (preset := values.get("preset", "default")) != "default":
+        if preset not in list(PRESETS):  # a list: what is no text has no hash
+            raise ProgdfError(f"there is no preset {preset!r}")
+        options = apply_preset(options, preset)
+    options = with_values(options, **{"threads": THREADS, **values})
+    try:
+        options = convert_json(plain(options), TrainOptions)
+    except ValueError as error:
+        raise ProgdfError(re.sub(r"^(\w+\.)?(\w+)", r"\2", str(error))) from None
+    resolve(options)
+    return options
+
+
+def _blank(out: Path) -> TrainOptions:
+    return TrainOptions(Path(), out, RegionOptions(""), EditorOptions(""))
+
+
+def _typed_values(options: Any, default: Any) -> Iterator[tuple[str, Any, Any]]:
+    """All values that can be typed: name, value, and that of `default`."""
+    for field in fields(options):
+        value, usual = getattr(options, field.name), getattr(default, field.name)
+        if is_dataclass(value):
+            yield from _typed_values(value, usual)
+        elif not str(field.type).startswith("Fixed"):
+            yield field.name, value, usual
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What a run takes, by a line through measured ones (docs/scale.md); what has ended corrects it."""
+
+    seconds: float  # on one thread
+    memory: int  # peak, bytes
+    disk: int  # of its folder, bytes
+
+
+def estimate_cost(options: TrainOptions, gaussians: int, members: int) -> Cost:
+    """What a run takes.
+
+    Args:
+        options: as typed
+        gaussians: of the scene
+        members: of the region
+    """
+    options = resolve(options)
+    views, side = options.views.views or VIEWS, options.views.image_size or 256
+    strengths = options.optimize.stages or MOST_STAGES
+    pixels = views * side * side
+    return Cost(
+        seconds=3 + 1.3e-6 * pixels * strengths + 1.7e-4 * members,
+        memory=int(500e6 + 300 * gaussians + 4200 * members + 160 * pixels),
+        disk=int(1e6 + 1.6 * pixels * (strengths + 3) + 500 * members),
+    )

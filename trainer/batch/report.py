@@ -1,0 +1,275 @@
+"""What a batch tells: lines while it runs, batch.csv, and batch.html with pictures and curves."""
+
+from __future__ import annotations
+
+import base64
+import csv
+import io
+import json
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, fields
+from html import escape
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+from rich.console import Console
+from rich.live import Live
+from rich.text import Text
+
+from progdf.errors import ProgdfError
+from progdf.io.atomic import atomic_write
+from progdf.io.json_values import convert_json, decode_json
+from progdf.terminal import escape_text, file_size
+from trainer.store.run_folder import RunFolder
+
+from .jobs import Job
+
+Status = Literal["done", "failed", "stopped", "memory", "waiting"]
+
+CSV, PAGE = "batch.csv", "batch.html"
+PREVIEW = "preview.jpg"
+"""Of a run's folder: the edit at one half and at 1, side by side."""
+_LINES = 12  # of running jobs on a terminal
+_EVENT_S = 2.0  # between two progress events
+_SPARK_WIDTH, _SPARK_HEIGHT = 96, 28
+
+
+@dataclass(frozen=True)
+class Row:
+    """How a job ended: one line of batch.csv and batch.html."""
+
+    job: str  # its key
+    status: Status  # stopped: by Ctrl-C; memory: it took more than there was, and is begun again
+    reason: str = ""  # why it is not done, in one line
+    psnr_end: float | None = None  # of the edit, to the editor's pictures on held-out views, dB
+    psnr_between: float | None = None  # the worst strength in between, dB
+    bytes: int | None = None  # of the .gdf
+    bytes_per_gaussian: float | None = None  # of the region
+    seconds: float | None = None  # of the run, over all its sessions
+    cpu_seconds: float | None = None  # of the session that ended it, all threads
+    memory_mb: int | None = None  # peak
+    folder_bytes: int | None = None  # of all that the run left
+    attempts: int = 1  # how often it was begun
+    host: str = ""  # the machine
+
+    @property
+    def line(self) -> str:
+        """For a screen."""
+        if self.status != "done":
+            return f"{self.job}: {self.status}{': ' if self.reason else ''}{self.reason}"
+        between = "" if self.psnr_between is None else f", {self.psnr_between:.1f} at worst in between"
+        end = "" if self.psnr_end is None else f"{self.psnr_end:.1f} dB{between}, "
+        return f"{self.job}: {end}{file_size(self.bytes or 0)}, {self.seconds or 0:.0f} s"
+
+
+def finished_row(job: Job) -> Row:
+    """The row of a run that is finished, from what its folder tells."""
+    report, root = read_report(job), job.options.out
+    return Row(
+        job.key,
+        "done",
+        psnr_end=report.get("edit", {}).get("psnr_to_views"),
+        psnr_between=min((psnr for s, psnr in slider_course(report) if s < 1), default=None),
+        bytes=report.get("file", {}).get("bytes"),
+        bytes_per_gaussian=report.get("file", {}).get("bytes_per_gaussian"),
+        seconds=report.get("time", {}).get("total"),
+        memory_mb=report.get("memory_mb"),
+        folder_bytes=sum(path.stat().st_size for path in root.rglob("*") if path.is_file()),
+    )
+
+
+def read_report(job: Job) -> dict[str, Any]:
+    """A run's report.json; empty where it is absent or broken."""
+    return _read_table(RunFolder(job.options.out).report)
+
+
+def _read_table(path: Path) -> dict[str, Any]:
+    with suppress(OSError, ValueError):
+        return convert_json(decode_json(path.read_bytes()), dict[str, Any])
+    return {}
+
+
+def slider_course(report: Mapping[str, Any]) -> list[tuple[float, float]]:
+    """Slider value and PSNR to the editor's pictures there, dB."""
+    curve = report.get("curves", {}).get("against_editor", {}).get("slider", {})
+    return list(zip(curve.get("s", []), curve.get("psnr", []), strict=False))
+
+
+def read_rows(out: Path) -> dict[str, Row]:
+    """The rows of an earlier session by job; none where there was none.
+
+    Raises:
+        ProgdfError: batch.csv is damaged.
+    """
+    path = out / CSV
+    if not path.is_file():
+        return {}
+    try:
+        records = csv.DictReader(path.read_text(encoding="utf-8").splitlines())
+        given = [{key: value for key, value in record.items() if value} for record in records]
+        rows = [msgspec.convert(values, Row, strict=False) for values in given]
+    except (ValueError, TypeError, csv.Error) as error:
+        raise ProgdfError(f"{path} is damaged ({error}); delete it, the runs are not lost") from None
+    return {row.job: row for row in rows}
+
+
+def write_rows(out: Path, rows: Sequence[Row]) -> None:
+    """Write batch.csv, whole or not at all."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, [field.name for field in fields(Row)])
+    writer.writeheader()
+    writer.writerows(asdict(row) for row in rows)
+    with atomic_write(out / CSV) as temporary_file:
+        temporary_file.write_text(text.getvalue(), encoding="utf-8")
+
+
+def write_page(out: Path, jobs: Mapping[str, Job], rows: Sequence[Row]) -> None:
+    """Write batch.html: one file that fetches nothing."""
+    done = sum(row.status == "done" for row in rows)
+    failed = sum(row.status == "failed" for row in rows)
+    summary = f"{done} of {len(rows)} done" + (f", {failed} failed" if failed else "")
+    body = "\n".join(_html_row(row, jobs.get(row.job)) for row in rows)
+    page = (
+        Path(__file__)
+        .with_name("page.html")
+        .read_text(encoding="utf-8")
+        .replace("{summary}", escape(summary))
+        .replace("{rows}", body)
+    )
+    with atomic_write(out / PAGE) as temporary_file:
+        temporary_file.write_text(page, encoding="utf-8")
+
+
+def _html_row(row: Row, job: Job | None) -> str:
+    scene, _, name = row.job.rpartition("/")
+    cells = [
+        f'<td class="p">{_picture(job)}</td>',
+        f"<td>{escape(scene)}</td><td>{_link(row, name)}</td>",
+        _number(row.psnr_end, 1),
+        _number(row.psnr_between, 1),
+        f"<td>{_sparkline(slider_course(read_report(job))) if job and row.status == 'done' else ''}</td>",
+        _number(row.bytes, 0, file_size(row.bytes) if row.bytes else ""),
+        _number(row.cpu_seconds, 0),
+        f'<td class="{escape(row.status)}">{escape(row.status)}'
+        f"{'<br><small>' + escape(row.reason) + '</small>' if row.reason else ''}</td>",
+    ]
+    return f"<tr>{''.join(cells)}</tr>"
+
+
+def _number(value: float | None, digits: int, text: str = "") -> str:
+    if value is None:
+        return '<td class="n" data-v=""></td>'
+    return f'<td class="n" data-v="{value}">{escape(text or f"{value:.{digits}f}")}</td>'
+
+
+def _link(row: Row, name: str) -> str:
+    href = escape(f"{row.job}/report.png".replace("%", "%25").replace("#", "%23").replace("?", "%3F"), True)
+    return f'<a href="{href}">{escape(name)}</a>' if row.status == "done" else escape(name)
+
+
+def _picture(job: Job | None) -> str:
+    with suppress(OSError, AttributeError):
+        content = (job.options.out / PREVIEW).read_bytes()  # type: ignore[union-attr]
+        data = base64.b64encode(content).decode()
+        return f'<img alt="at one half and at 1" src="data:image/jpeg;base64,{data}">'
+    return ""
+
+
+def _sparkline(course: Sequence[tuple[float, float]]) -> str:
+    """PSNR over the slider as a small curve; its height is what this row spans, at least 3 dB."""
+    if len(course) < 2:
+        return ""
+    low, high = min(p for _, p in course), max(p for _, p in course)
+    span = max(high - low, 3.0)
+    points = " ".join(
+        f"{2 + s * (_SPARK_WIDTH - 4):.1f},{2 + (high - psnr) / span * (_SPARK_HEIGHT - 4):.1f}"
+        for s, psnr in course
+    )
+    return (
+        f'<svg width="{_SPARK_WIDTH}" height="{_SPARK_HEIGHT}"><title>{low:.1f} to {high:.1f} dB</title>'
+        f'<polyline points="{points}"/></svg>'
+    )
+
+
+class Screen:
+    """What a batch says while it runs: a live list on a terminal, lines elsewhere, or JSON events.
+
+    Args:
+        jobs: those that will run, by key
+        seconds: how long each is expected to take; what has ended corrects it
+        workers: how many run at once
+        events: one JSON object a line on stdout instead
+    """
+
+    def __init__(
+        self, jobs: Mapping[str, Job], seconds: Mapping[str, float], workers: int, events: bool
+    ) -> None:
+        self._jobs, self._seconds, self._workers, self._events = jobs, seconds, workers, events
+        self._console = Console(stderr=True, highlight=False, quiet=events)
+        self._live = Live(console=self._console, auto_refresh=False, transient=True)
+        self._rows: list[Row] = []
+        self._told = 0.0
+
+    def say(self, line: str) -> None:
+        """One line."""
+        self._console.print(escape_text(line), soft_wrap=True, markup=False)
+
+    def event(self, name: str, **values: object) -> None:
+        """One JSON line, where these are asked for."""
+        if self._events:
+            print(json.dumps({"event": name, **values}, ensure_ascii=False), flush=True)
+
+    def end(self, row: Row) -> None:
+        """A job ended."""
+        self._rows.append(row)
+        self.event("end", **asdict(row))
+        self.say(row.line)
+
+    def tick(self, running: Sequence[str]) -> None:
+        """A few times a second, with the jobs that run."""
+        live = self._console.is_terminal and not self._events
+        if not live and (not self._events or time.monotonic() - self._told < _EVENT_S):
+            return
+        self._told = time.monotonic()
+        states = {
+            key: _read_table(RunFolder(self._jobs[key].options.out).progress) for key in running[:_LINES]
+        }
+        remaining = self._remaining(running)
+        ended, failed = len(self._rows), sum(row.status == "failed" for row in self._rows)
+        self.event("progress", running=states, ended=ended, failed=failed, seconds_left=remaining)
+        if live:
+            lines = [f"  {key:<40} {_state(state)}" for key, state in states.items()]
+            time_left = f", about {duration(remaining)} left" if remaining else ""
+            lines.append(f"{ended} of {len(self._jobs)} ended, {failed} failed{time_left}")
+            self._live.start()
+            self._live.update(Text("\n".join(map(escape_text, lines))), refresh=True)
+
+    def close(self) -> None:
+        """Leave the terminal as it was."""
+        self._live.stop()
+
+    def _remaining(self, running: Sequence[str]) -> float | None:
+        """Seconds until all have ended, by those that have; None before the first."""
+        ended = {row.job: row.seconds for row in self._rows if row.seconds and row.job in self._seconds}
+        expected = sum(self._seconds[key] for key in ended)
+        if not expected:
+            return None
+        over = {row.job for row in self._rows}
+        ahead = sum(s * (0.5 if key in running else 1) for key, s in self._seconds.items() if key not in over)
+        return sum(ended.values()) / expected * ahead / self._workers
+
+
+def _state(state: Mapping[str, Any]) -> str:
+    share, seconds = state.get("share", 0.0), state.get("seconds", 0.0)
+    time_left = f"{duration(seconds / share * (1 - share))} left" if share > 0.1 else ""
+    return f"{share:4.0%} {state.get('label', ''):<20} {time_left}"
+
+
+def duration(seconds: float) -> str:
+    """Seconds for a person: "40 s", "12 min", "3.5 h"."""
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

@@ -1,0 +1,210 @@
+"""What a worker process does: look at a scene's jobs before the start, and train one job after another."""
+
+from __future__ import annotations
+
+import _thread
+import os
+import pickle
+import re
+import socket
+import threading
+import time
+from collections.abc import Sequence
+from contextlib import chdir, suppress
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+
+from progdf.compose.reference import Layer, compose_layers
+from progdf.errors import ProgdfError, is_out_of_memory
+from progdf.formats.scene_file import load_scene
+from progdf.gaussians import Gaussians
+from progdf.gdf.file import load_gdf
+from progdf.io.atomic import LOCK, atomic_write, cache_folder, hold_lock, is_locked
+from progdf.io.cameras import load_cameras
+from progdf.io.images import to_picture
+from progdf.rasterize import render
+from trainer.options import TrainOptions
+from trainer.resolve import resolve
+from trainer.run.run import RunResult, Shared, check_command, select_region, train
+from trainer.store.pretrained import keep_models
+from trainer.store.run_folder import RunFolder
+from trainer.views.view import BACKGROUND
+
+from .jobs import Job
+from .report import PREVIEW, Row, Status, finished_row
+
+_PREVIEW_SIDE = 144
+_LOCK_WAIT_S = 600.0  # a lost node's worker may still be writing
+_URL = re.compile(r"\b(s3|gs|gcs|az|abfs|https?|hf|file):/+([^\s:,+]+)")  # a Path has one slash of the two
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What a look at a job's scene tells before the start."""
+
+    key: str  # of the job
+    fault: str = ""  # why it cannot be trained, in one line
+    gaussians: int = 0  # of the scene
+    members: int = 0  # of the region; 0 where only a network can tell
+
+
+@cache
+def _shared_parts() -> Shared:
+    """What this process's jobs have in common; models and weights stay loaded from here on."""
+    keep_models()
+    return Shared()
+
+
+def inspect_scene(jobs: Sequence[Job]) -> list[Finding]:
+    """Look at everything that jobs of one scene name, as far as it can be seen without training."""
+    findings = []
+    for job in jobs:
+        with chdir(job.folder):
+            try:
+                findings.append(_inspect(job))
+            except (ProgdfError, OSError, ImportError) as error:
+                findings.append(Finding(job.key, " ".join(str(error).split())))
+    return findings
+
+
+def _inspect(job: Job) -> Finding:
+    options = resolve(_with_local_files(job.options))
+    check_command(replace(options, resume=_is_begun(RunFolder(options.out))))
+    scene = _scene(options)
+    if "text:" in options.region.region:
+        return Finding(job.key, "", len(scene), 0)
+    region, _ = select_region(options, scene, True, _shared_parts())
+    return Finding(job.key, "", len(scene), len(region))
+
+
+def _scene(options: TrainOptions) -> Gaussians:
+    return _shared_parts().get("scene", options.scene.resolve(), lambda: load_scene(options.scene))
+
+
+def run_job(job: Job) -> Row:
+    """Train a job in this process, or go on with it where it was stopped; a finished one is left as it is."""
+    begun, cpu_begun = time.perf_counter(), time.process_time()
+    try:
+        with chdir(job.folder):
+            _train(job)
+            row = finished_row(job)
+    except KeyboardInterrupt as interrupt:
+        row = Row(job.key, "stopped", str(interrupt))
+    except (ProgdfError, OSError) as error:
+        row = Row(job.key, "failed", str(error))
+    except Exception as error:
+        status: Status = "memory" if is_out_of_memory(error) else "failed"
+        row = Row(job.key, status, f"{type(error).__name__}: {error}")
+    return replace(
+        row,
+        reason=" ".join(row.reason.split()),
+        seconds=row.seconds or round(time.perf_counter() - begun, 2),
+        cpu_seconds=round(time.process_time() - cpu_begun, 2),
+        host=socket.gethostname(),
+    )
+
+
+def _train(job: Job) -> None:
+    with suppress(OSError):  # Linux: the peak that report.json tells is this job's, not that of those before
+        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+    options = _with_local_files(job.options)
+    folder = RunFolder(options.out)
+    if is_locked(folder.root / LOCK):
+        with hold_lock(folder.root / LOCK, _LOCK_WAIT_S):
+            pass
+    result = train(replace(options, resume=_is_begun(folder)), quiet=True, shared=_shared_parts())
+    if not (folder.root / PREVIEW).is_file():
+        _write_preview(result, _scene(options))
+
+
+def _is_begun(folder: RunFolder) -> bool:
+    return folder.state.path.is_dir() or folder.report.is_file()
+
+
+def _write_preview(result: RunResult, scene: Gaussians) -> None:
+    """The edit at one half and at 1, from the held-out view that shows most of the region."""
+    folder, gdf = result.folder, load_gdf(result.gdf, scene)
+    cameras = {camera.name: camera for camera in load_cameras(folder.cameras, scene.origin)}
+
+    def coverage(name: str) -> float:
+        with Image.open(folder.view("mask", name)) as mask:
+            return float(np.asarray(mask, dtype=np.float32).mean())
+
+    camera = cameras[max(result.report["views"]["edit"], key=coverage)]
+    scale = _PREVIEW_SIDE / max(camera.width, camera.height)
+    small = camera.resize(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
+    with torch.no_grad():
+        pictures = [
+            render(compose_layers(scene, [Layer(gdf, s)]), small, background=BACKGROUND).image
+            for s in (0.5, 1.0)
+        ]
+    with atomic_write(folder.root / PREVIEW) as temporary_file:
+        to_picture(torch.cat(pictures, dim=1)).save(temporary_file, format="JPEG", quality=88)
+
+
+def _with_local_files(options: TrainOptions) -> TrainOptions:
+    """The options with files of s3://, gs:// and the like copied to this machine, once."""
+    cameras = options.views.cameras
+    return replace(
+        options,
+        scene=Path(_fetch(str(options.scene))),
+        region=replace(options.region, region=_fetch(options.region.region)),
+        editor=replace(options.editor, editor=_fetch(options.editor.editor)),
+        views=replace(options.views, cameras=None if cameras is None else Path(_fetch(str(cameras)))),
+    )
+
+
+def _fetch(text: str) -> str:
+    return _URL.sub(lambda url: _local_copy(f"{url[1]}://{'/' * (url[1] == 'file')}{url[2]}"), text)
+
+
+def _local_copy(url: str) -> str:
+    import fsspec
+
+    folder = cache_folder() / "batch"
+    try:
+        return str(fsspec.open_local(f"filecache::{url}", filecache={"cache_storage": str(folder)}))
+    except ImportError as error:
+        raise ProgdfError(f"{url}: {error}") from error
+    except (OSError, ValueError) as error:
+        raise ProgdfError(f"{url} cannot be read ({error})") from error
+
+
+@dataclass(frozen=True)
+class Lost:
+    """What comes back instead of a result when a worker, its node or its machine ends."""
+
+    reason: str
+    from_memory: bool = False  # it was ended as memory ran out
+
+
+def serve() -> None:
+    """A worker without Ray: pickled tasks from stdin, results to what was stdout, until its input ends."""
+    tasks, results = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
+    queue = SimpleQueue[Any]()
+
+    def read() -> None:
+        with suppress(EOFError):
+            while True:
+                queue.put(pickle.load(tasks))
+        queue.put(None)
+        _thread.interrupt_main()  # nobody waits for what runs: save the state
+
+    threading.Thread(target=read, daemon=True).start()
+    with suppress(KeyboardInterrupt, BrokenPipeError):
+        while (task := queue.get()) is not None:
+            function, argument = task
+            try:
+                result = function(argument)
+            except Exception as error:
+                result = Lost(f"{type(error).__name__}: {error}")
+            pickle.dump(result, results)
+            results.flush()
