@@ -15,6 +15,7 @@ import tyro
 from torch import Tensor
 
 from progdf.demo_scenes import DemoScene, bear, room
+from progdf.errors import ProgdfError
 from progdf.formats.ply import load_ply
 from progdf.gaussians import Gaussians
 from progdf.io.atomic import make_folder
@@ -22,6 +23,8 @@ from progdf.io.images import contact_sheet, to_picture, write_image
 from progdf.metrics.slider import Pictures
 from progdf.scene.regions import parse_region
 from progdf.terminal import print_line
+from trainer.batch.jobs import Job
+from trainer.batch.run import run
 from trainer.editors import make_editor
 from trainer.evaluate.measures import markdown_table
 from trainer.evaluate.opened import FADE, KEYFRAMES, SLIDER, OpenedRun, open_run
@@ -33,7 +36,6 @@ from trainer.report.report import stack_plots, thumbnail
 from trainer.resolve import resolve
 from trainer.run.demo import Effort, write_scene
 from trainer.run.resume import find_run
-from trainer.run.run import train
 from trainer.run.threads import use_threads
 from trainer.setup import make_training_setup
 from trainer.store.run_folder import write_json
@@ -66,8 +68,8 @@ class SliderOptions:
 
     folder: tyro.conf.Positional[Path]
     """For scenes, pictures, runs and the table; made if need be."""
-    threads: int = 0
-    """CPU threads; 0 takes all cores."""
+    threads: int = 1
+    """CPU threads of a run; as many runs at once as the cores allow."""
 
 
 def run_sliders(options: SliderOptions) -> list[CaseResult]:
@@ -136,7 +138,7 @@ class CaseResult:
 def run_suite(
     folder: Path,
     perceptual: Perceptual,
-    threads: int = 0,
+    threads: int = 1,
     told: Callable[[str], None] = lambda line: None,
     cases: Sequence[SliderCase] = CASES,
     sizes: Mapping[str, int] = SIZES,
@@ -147,8 +149,8 @@ def run_suite(
     Args:
         folder: for scenes, pictures and runs; made if need be
         perceptual: LPIPS, or its stand-in
-        threads: CPU threads; 0 takes all cores
-        told: called with a line before each edit
+        threads: CPU threads of a run
+        told: called with a line for each edit that is trained
         cases, sizes, effort: edits, Gaussians of the scenes, training
 
     Raises:
@@ -156,30 +158,34 @@ def run_suite(
     """
     makers = {"bear": bear, "room": room}
     scenes: dict[str, DemoScene] = {}
-    results = []
-    for i, case in enumerate(cases, 1):
+    jobs = []
+    for case in cases:
         if case.scene not in scenes:
             scene = makers[case.scene](sizes[case.scene])
             write_scene(folder / case.scene, scene)
             # as it is read again, half a step of its file's rounding away
             scenes[case.scene] = replace(scene, gaussians=load_ply(folder / case.scene / "scene.ply"))
-        told(f"{i} of {len(cases)}: {case.name}")
-        results.append(_run_case(folder, case, scenes[case.scene], perceptual, threads, effort))
-    return results
+        options = replace(_train_options(folder, case, scenes[case.scene], effort), threads=threads)
+        _prepare_truth(folder, case, scenes[case.scene], options)
+        jobs.append(Job(case.name, options))
+    for row in run(jobs):
+        told(row.line)
+        if row.status != "done":
+            raise ProgdfError(f"{row.job}: {row.reason}")
+    return [_judge_case(folder, case, scenes[case.scene], perceptual) for case in cases]
 
 
-def _run_case(
-    folder: Path, case: SliderCase, scene: DemoScene, perceptual: Perceptual, threads: int, effort: Effort
-) -> CaseResult:
-    truth_folder, out = folder / "truth" / case.folder, folder / case.folder
+def _prepare_truth(folder: Path, case: SliderCase, scene: DemoScene, options: TrainOptions) -> None:
+    """Pictures of an analytic edit, unless a run has had them."""
+    truth_folder = folder / "truth" / case.folder
     if not case.editor:
         make_folder(truth_folder)
-    options = replace(_train_options(folder, case, scene, effort), threads=threads)
-    state = find_run(options)
-    if state == "nothing" and not case.editor:
-        _write_truth(truth_folder, resolve(options), scene.gaussians, _analytic(case, scene))
-    train(replace(options, resume=state != "nothing"), quiet=True)
-    opened = open_run(out)
+        if find_run(options) == "nothing":
+            _write_truth(truth_folder, resolve(options), scene.gaussians, _analytic(case, scene))
+
+
+def _judge_case(folder: Path, case: SliderCase, scene: DemoScene, perceptual: Perceptual) -> CaseResult:
+    opened = open_run(folder / case.folder)
     truth, contenders = _truth(case, opened, scene), opened.contenders()
     curves = picture_courses(opened.evaluator, contenders, STRENGTHS, truth, perceptual)
     best = max(range(len(opened.evaluator.pixels)), key=lambda k: int(opened.evaluator.pixels[k].sum()))

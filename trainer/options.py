@@ -342,7 +342,7 @@ class EvaluateOptions:
     """Measure a finished run as papers do: one table, one picture, on views that training has not seen."""
 
     run: tyro.conf.Positional[Path]
-    """Folder that progdf train wrote."""
+    """Folder that progdf train or progdf batch wrote."""
     scene: Annotated[Path | None, absent_option("PATH", "where the run found it")] = None
     """Where the scene is now, if it has moved since the run."""
     texts: TextOptions = TextOptions()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from PIL import Image
@@ -10,7 +11,7 @@ from torch import Tensor
 
 from progdf.io.images import contact_sheet, to_picture, write_image
 from progdf.terminal import print_line
-from trainer.optimize.losses import perceptual_loss
+from trainer.optimize.losses import Perceptual, perceptual_loss
 from trainer.options import EvaluateOptions
 from trainer.report.plots import PAPER, Plot
 from trainer.report.report import (
@@ -27,7 +28,7 @@ from trainer.run.threads import use_threads
 from trainer.store.run_folder import write_json
 
 from .consistency import EDITED, UNEDITED, WarpedPair
-from .measures import Evaluation, evaluate_run, evaluation_json, evaluation_table
+from .measures import Evaluation, evaluate_run, evaluation_json, evaluation_table, summary_table
 from .opened import OpenedRun, open_run
 
 _THUMBNAIL = 240
@@ -115,23 +116,38 @@ def _ends(count: int) -> list[float]:
     return [i / (count - 1) for i in range(count)]
 
 
-def evaluate(options: EvaluateOptions) -> Evaluation:
-    """Measure a finished run; print a table, write it and its picture: RUN/evaluation.json and .png.
+def evaluate(options: EvaluateOptions) -> list[Evaluation]:
+    """Measure a finished run, or all of a batch, and print the table.
 
     Raises:
         ProgdfError: the folder is no finished run, a file of it is damaged, or its scene is gone or another.
     """
     use_threads(options.threads)
-    opened = open_run(options.run, options.scene)
     perceptual, warning = perceptual_loss()
     if warning:
         print_line(warning.replace("training with", "measuring with"))
+    root = options.run
+    reports = [] if (root / "report.json").is_file() else sorted(root.glob("*/*/report.json"))
+    if not reports:
+        evaluation = _evaluate_run(options, perceptual)
+        for line in evaluation_table(evaluation).splitlines():
+            print_line(line)
+        print_line(f"wrote {root / 'evaluation.json'} and evaluation.png")
+        return [evaluation]
+    evaluations = [_evaluate_run(replace(options, run=report.parent), perceptual) for report in reports]
+    names = [report.parent.relative_to(root).as_posix() for report in reports]
+    for line in summary_table(names, evaluations).splitlines():
+        print_line(line)
+    print_line(f"wrote evaluation.json and evaluation.png into the folder of each of {len(reports)} runs")
+    return evaluations
+
+
+def _evaluate_run(options: EvaluateOptions, perceptual: Perceptual) -> Evaluation:
+    """Measure one run; RUN/evaluation.json and .png."""
+    opened = open_run(options.run, options.scene)
     texts = effective_texts(options.texts, opened.run.record.plan.texts)
     evaluation = evaluate_run(opened, perceptual, texts)
     folder = opened.run.folder
     write_json(folder.root / "evaluation.json", evaluation_json(evaluation))
     write_image(folder.root / "evaluation.png", evaluation_picture(opened, evaluation))
-    for line in evaluation_table(evaluation).splitlines():
-        print_line(line)
-    print_line(f"wrote {folder.root / 'evaluation.json'} and evaluation.png")
     return evaluation

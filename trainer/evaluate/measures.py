@@ -212,6 +212,19 @@ def evaluation_table(evaluation: Evaluation) -> str:
     return "\n".join([markdown_table(("", *COLUMNS), rows), *(["", *notes] if notes else [])])
 
 
+SUMMARY = ("psnr_end", "psnr_between", "lpips_end", "evenness", "bytes_per_member", "seconds")
+"""Rows of which the table of a batch has a column."""
+
+
+def summary_table(names: Sequence[str], evaluations: Sequence[Evaluation]) -> str:
+    """A line a run: what its slider reaches in `SUMMARY`."""
+    lines = []
+    for name, evaluation in zip(names, evaluations, strict=True):
+        rows = {row.name: row for row in evaluation.rows}
+        lines.append((name, *(_cell(rows[key], SLIDER) if key in rows else "" for key in SUMMARY)))
+    return markdown_table(("", *(key.replace("_", " ") for key in SUMMARY)), lines)
+
+
 def evaluation_json(evaluation: Evaluation) -> dict[str, Any]:
     """As evaluation.json has it: rows by name, their figures by column, or why there are none."""
     rows = {row.name: {"missing": row.missing} if row.missing else _round_row(row) for row in evaluation.rows}
