@@ -12,7 +12,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, fields
 from html import escape
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TextIO
 
 import msgspec
 from rich.console import Console
@@ -22,12 +22,15 @@ from rich.text import Text
 from progdf.errors import ProgdfError
 from progdf.io.atomic import atomic_write
 from progdf.io.json_values import convert_json, decode_json
-from progdf.terminal import escape_text, file_size
+from progdf.terminal import escape_text, file_size, format_count
 from trainer.store.run_folder import RunFolder
 
 from .jobs import Job
 
 Status = Literal["done", "failed", "stopped", "memory", "waiting"]
+
+SOME_FAILED = 3
+"""Exit status."""
 
 CSV, PAGE = "batch.csv", "batch.html"
 PREVIEW = "preview.jpg"
@@ -201,17 +204,21 @@ class Screen:
         jobs: those that will run, by key
         seconds: how long each is expected to take; what has ended corrects it
         workers: how many run at once
-        events: one JSON object a line on stdout instead
+        events: where one JSON object a line goes instead
     """
 
     def __init__(
-        self, jobs: Mapping[str, Job], seconds: Mapping[str, float], workers: int, events: bool
+        self,
+        jobs: Mapping[str, Job],
+        seconds: Mapping[str, float],
+        workers: int,
+        events: TextIO | None = None,
     ) -> None:
         self._jobs, self._seconds, self._workers, self._events = jobs, seconds, workers, events
-        self._console = Console(stderr=True, highlight=False, quiet=events)
+        self._console = Console(stderr=True, highlight=False, quiet=events is not None)
         self._live = Live(console=self._console, auto_refresh=False, transient=True)
         self._rows: list[Row] = []
-        self._told = 0.0
+        self._begun, self._told = time.monotonic(), 0.0
 
     def say(self, line: str) -> None:
         """One line."""
@@ -219,8 +226,8 @@ class Screen:
 
     def event(self, name: str, **values: object) -> None:
         """One JSON line, where these are asked for."""
-        if self._events:
-            print(json.dumps({"event": name, **values}, ensure_ascii=False), flush=True)
+        if self._events is not None:
+            print(json.dumps({"event": name, **values}, ensure_ascii=False), file=self._events, flush=True)
 
     def end(self, row: Row) -> None:
         """A job ended."""
@@ -230,8 +237,8 @@ class Screen:
 
     def tick(self, running: Sequence[str]) -> None:
         """A few times a second, with the jobs that run."""
-        live = self._console.is_terminal and not self._events
-        if not live and (not self._events or time.monotonic() - self._told < _EVENT_S):
+        live = self._console.is_terminal and self._events is None
+        if not live and (self._events is None or time.monotonic() - self._told < _EVENT_S):
             return
         self._told = time.monotonic()
         states = {
@@ -246,6 +253,17 @@ class Screen:
             lines.append(f"{ended} of {len(self._jobs)} ended, {failed} failed{time_left}")
             self._live.start()
             self._live.update(Text("\n".join(map(escape_text, lines))), refresh=True)
+
+    def total(self, rows: Sequence[Row], out: Path) -> int:
+        """What became of all that was asked for; the exit status."""
+        statuses, seconds = [row.status for row in rows], time.monotonic() - self._begun
+        done, failed = statuses.count("done"), statuses.count("failed")
+        self.event("total", done=done, failed=failed, jobs=len(rows), seconds=seconds)
+        self.say(
+            f"{done} of {format_count(len(rows), 'job')} done{f', {failed} failed' if failed else ''} "
+            f"in {duration(seconds)}; see {out / PAGE} and {CSV}"
+        )
+        return SOME_FAILED if failed else 0
 
     def close(self) -> None:
         """Leave the terminal as it was."""

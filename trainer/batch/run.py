@@ -13,7 +13,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from contextlib import chdir, contextmanager, suppress
+from contextlib import chdir, contextmanager, redirect_stdout, suppress
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from importlib.util import find_spec
@@ -28,7 +28,7 @@ from trainer.run.resume import find_run
 from trainer.run.threads import count_threads
 
 from .jobs import Cost, Job, estimate_cost, read_catalogue
-from .report import CSV, PAGE, Row, Screen, duration, finished_row, read_rows, write_page, write_rows
+from .report import SOME_FAILED, Row, Screen, duration, finished_row, read_rows, write_page, write_rows
 from .worker import Finding, Lost, inspect_scene, run_job
 
 _log = logging.getLogger(__name__)
@@ -36,7 +36,6 @@ _log = logging.getLogger(__name__)
 MOST_ATTEMPTS = 4
 """How often a job is begun whose worker, node or machine was lost."""
 
-_FAILED = 3  # exit status where some jobs failed
 _PAGE_EVERY_S = 10.0
 _LOOK_S = 2.0  # between two looks at a cluster's cores
 _STOP_S = 20.0  # in which what runs saves its state when all is stopped
@@ -329,7 +328,11 @@ def batch(options: BatchOptions) -> int:
     kept = {job.key for job in selected if _is_finished(job)}
     pending = [job for job in selected if job.key not in kept]
     threads = max((count_threads(job.options.threads) for job in pending), default=1)
-    with open_pool(options.workers, options.address, threads, len(pending)) as pool:
+    stdout = sys.stdout
+    with (
+        redirect_stdout(sys.stderr),  # Ray prints what it notices of machines
+        open_pool(options.workers, options.address, threads, len(pending)) as pool,
+    ):
         findings = inspect(pending, pool)
         faults += [f"{f.key}: {f.fault}" for f in findings.values() if f.fault]
         healthy = [job for job in pending if not findings[job.key].fault]
@@ -341,46 +344,44 @@ def batch(options: BatchOptions) -> int:
         for fault in faults:
             print(f"progdf: {escape_text(fault)}", file=sys.stderr)
         if options.dry_run:
-            _print_plan(selected, kept, costs, pool.capacity(threads))
+            with redirect_stdout(stdout):
+                _print_plan(selected, kept, costs, pool.capacity(threads))
         if faults and not (options.keep_going and healthy and not options.dry_run):
             return 2
         if options.dry_run:
             return 0
+        tasks = [train_task(job, costs[job.key].memory) for job in healthy]
+        rows |= {f.key: Row(f.key, "failed", f.fault) for f in findings.values() if f.fault}
+        rows |= {job.key: Row(job.key, "waiting") for job in healthy}
+        for job in jobs:
+            if job.key not in rows and _is_finished(job):  # a run of train's, or one whose row was lost
+                rows[job.key] = finished_row(job)
+        seconds = {key: cost.seconds for key, cost in costs.items()}
+        by_key = {job.key: job for job in healthy}
+        screen = Screen(by_key, seconds, pool.capacity(threads), stdout if options.json else None)
+        screen.say(
+            f"{format_count(len(tasks), 'job')} on {pool.name}, {format_count(threads, 'thread')} each"
+        )
         make_folder(options.out)
         try:
             with hold_lock(options.out / LOCK):
-                return _run_batch(options, jobs, selected, healthy, rows, findings, costs, pool) or (
-                    _FAILED if faults else 0
-                )
+                _run_batch(options, jobs, tasks, rows, pool, screen)
         except LockedError:
             raise ProgdfError(f"another batch works in {options.out}; wait for it, or stop it") from None
+        return screen.total([rows[job.key] for job in selected], options.out) or (
+            SOME_FAILED if faults else 0
+        )
 
 
 def _run_batch(
     options: BatchOptions,
     jobs: Sequence[Job],
-    selected: Sequence[Job],
-    pending: Sequence[Job],
+    tasks: Sequence[Task],
     rows: dict[str, Row],
-    findings: Mapping[str, Finding],
-    costs: Mapping[str, Cost],
     pool: Pool,
-) -> int:
-    """Train the pending jobs; batch.csv after each, batch.html from time to time. The exit status."""
-    by_key = {job.key: job for job in jobs}
-    rows |= {key: Row(key, "failed", finding.fault) for key, finding in findings.items() if finding.fault}
-    rows |= {job.key: Row(job.key, "waiting") for job in pending}
-    for job in jobs:
-        if job.key not in rows and _is_finished(job):  # a run of train's, or one whose row was lost
-            rows[job.key] = finished_row(job)
-    tasks = [train_task(job, costs[job.key].memory) for job in pending]
-    threads = max((task.threads for task in tasks), default=1)
-    screen = Screen(
-        {job.key: job for job in pending},
-        {key: cost.seconds for key, cost in costs.items()},
-        pool.capacity(threads),
-        options.json,
-    )
+    screen: Screen,
+) -> None:
+    """Run the tasks; batch.csv after each, batch.html from time to time."""
 
     def tell(event: str, task: Task, reason: str) -> None:
         screen.event(event, job=task.key, attempt=task.attempt, reason=reason)
@@ -391,14 +392,12 @@ def _run_batch(
         ordered = [rows[job.key] for job in jobs if job.key in rows]
         write_rows(options.out, ordered)
         if with_page:
-            write_page(options.out, by_key, ordered)
+            write_page(options.out, {job.key: job for job in jobs}, ordered)
 
-    begun = page_at = time.monotonic()
-    screen.say(f"{format_count(len(pending), 'job')} on {pool.name}, {format_count(threads, 'thread')} each")
-    ends = run_jobs(tasks, pool, tell, lambda running: screen.tick([task.key for task in running]))
+    page_at = time.monotonic()
     try:
         write(with_page=True)
-        for row in ends:
+        for row in run_jobs(tasks, pool, tell, lambda running: screen.tick([task.key for task in running])):
             rows[row.job] = row
             screen.end(row)
             late = time.monotonic() - page_at > _PAGE_EVERY_S
@@ -412,14 +411,6 @@ def _run_batch(
     finally:
         screen.close()
         write(with_page=True)
-    statuses = [rows[job.key].status for job in selected]
-    done, failed = statuses.count("done"), statuses.count("failed")
-    screen.event("total", done=done, failed=failed, jobs=len(selected), seconds=time.monotonic() - begun)
-    screen.say(
-        f"{done} of {format_count(len(selected), 'job')} done{f', {failed} failed' if failed else ''} "
-        f"in {duration(time.monotonic() - begun)}; see {options.out / PAGE} and {CSV}"
-    )
-    return _FAILED if failed else 0
 
 
 def _is_selected(job: Job, options: BatchOptions, rows: Mapping[str, Row]) -> bool:

@@ -262,3 +262,53 @@ def test_programs_train_jobs_side_by_side(tmp_path: Path) -> None:
         ("scarf", "done"),
         ("ears", "done"),
     }
+
+
+@pytest.mark.slow
+def test_twelve_jobs_survive_a_killed_worker_a_lost_machine_and_ctrl_c(
+    catalogue: Path, tmp_path: Path, cluster: object
+) -> None:
+    second = cluster.add_node(num_cpus=1, object_store_memory=80 * 2**20)  # type: ignore[attr-defined]
+    text = catalogue.read_text(encoding="utf-8") + "\n[sweep]\nsteps = [200, 400]\nseed = [0, 1, 2]\n"
+    (catalogue.parent / "twelve.toml").write_text(text, encoding="utf-8")
+    out = tmp_path / "runs"
+    command = [sys.executable, "-P", "-m", "progdf", "batch", str(catalogue.parent / "twelve.toml")]
+    command += ["--out", str(out), "--address", cluster.address, "--json"]  # type: ignore[attr-defined]
+    events: list[dict[str, object]] = []
+
+    def follow(more: list[str], stop: bool) -> int:
+        nonlocal second
+        with subprocess.Popen(
+            [*command, *more],
+            stdout=subprocess.PIPE,
+            text=True,
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+        ) as process:
+            assert process.stdout is not None
+            for line in process.stdout:
+                events.append(json.loads(line))
+                ended = sum(event["event"] == "end" for event in events)
+                if events[-1]["event"] == "end" and ended == 2:
+                    workers = [pid for pid in children(os.getpid()) if b"ray::bear" in command_of(pid)]
+                    os.kill(workers[0], signal.SIGKILL)
+                if events[-1]["event"] == "end" and ended == 4:
+                    cluster.remove_node(second, allow_graceful=False)  # type: ignore[attr-defined]
+                if stop and events[-1]["event"] == "end" and ended == 6:
+                    process.send_signal(signal.SIGINT)
+        return process.returncode
+
+    assert follow([], stop=True) == 130
+    assert follow(["--resume"], stop=False) == 0
+    ends = [event["job"] for event in events if event["event"] == "end" and event["status"] == "done"]
+    assert len(ends) == len(set(ends)) == 12  # no job ran twice
+    assert any(event["event"] == "retry" for event in events)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(catalogue.parent)
+        for job in read_catalogue(catalogue.parent / "twelve.toml", tmp_path / "alone")[0]:
+            assert train(job.options).gdf.read_bytes() == gdf_bytes(out)[job.key], job.key
+
+
+def command_of(pid: int) -> bytes:
+    with contextlib.suppress(OSError):
+        return Path(f"/proc/{pid}/cmdline").read_bytes()
+    return b""
