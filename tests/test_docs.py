@@ -140,9 +140,10 @@ def test_docstrings_cite_only_documents_and_sections_that_are_here() -> None:
                 continue
             source = " ".join(path.read_text().replace("#", " ").split())
             for cited, rest in re.findall(r"(\w[\w/.-]*\.md\b)(.{0,60})", source):
-                if cited in ("ablation.md", "docs/benchmarks.md", "docs/paper.md"):  # as a whole
+                whole = ("ablation.md", "docs/benchmarks.md", "docs/paper.md")
+                assert cited == "ablation.md" or (ROOT / cited).is_file(), f"{path.name} cites {cited}"
+                if cited in whole or rest[:1] in (")", ".", ";", '"'):  # as a whole
                     continue
-                assert (ROOT / cited).is_file(), f"{path.name} cites {cited}"
                 headings = re.findall(r"^##+ (.*)$", (ROOT / cited).read_text(), re.MULTILINE)
                 wanted = rest.removeprefix(",").strip()
                 assert any(wanted.startswith((h, h.partition(".")[0])) for h in headings), (

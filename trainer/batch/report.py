@@ -38,6 +38,7 @@ PREVIEW = "preview.jpg"
 _LINES = 12  # of running jobs on a terminal
 _EVENT_S = 2.0  # between two progress events
 _SPARK_WIDTH, _SPARK_HEIGHT = 96, 28
+_MOST_EMBEDDED = 1000  # pictures in the page itself, some 15 kB each; beyond, it shows those of its folder
 
 
 @dataclass(frozen=True)
@@ -129,12 +130,14 @@ def write_rows(out: Path, rows: Sequence[Row]) -> None:
         temporary_file.write_text(text.getvalue(), encoding="utf-8")
 
 
-def write_page(out: Path, jobs: Mapping[str, Job], rows: Sequence[Row]) -> None:
-    """Write batch.html: one file that fetches nothing."""
+def write_page(out: Path, rows: Sequence[Row], jobs: Sequence[Job]) -> None:
+    """Write batch.html: one file that fetches nothing but, where jobs are many, its folder's pictures."""
     done = sum(row.status == "done" for row in rows)
     failed = sum(row.status == "failed" for row in rows)
     summary = f"{done} of {len(rows)} done" + (f", {failed} failed" if failed else "")
-    body = "\n".join(_html_row(row, jobs.get(row.job)) for row in rows)
+    embed = len(rows) <= _MOST_EMBEDDED
+    by_key = {job.key: job for job in jobs}
+    body = "\n".join(_html_row(row, by_key.get(row.job), embed) for row in rows)
     page = (
         Path(__file__)
         .with_name("page.html")
@@ -146,10 +149,10 @@ def write_page(out: Path, jobs: Mapping[str, Job], rows: Sequence[Row]) -> None:
         temporary_file.write_text(page, encoding="utf-8")
 
 
-def _html_row(row: Row, job: Job | None) -> str:
+def _html_row(row: Row, job: Job | None, embed: bool) -> str:
     scene, _, name = row.job.rpartition("/")
     cells = [
-        f'<td class="p">{_picture(job)}</td>',
+        f'<td class="p">{_picture(row, job, embed)}</td>',
         f"<td>{escape(scene)}</td><td>{_link(row, name)}</td>",
         _number(row.psnr_end, 1),
         _number(row.psnr_between, 1),
@@ -169,16 +172,23 @@ def _number(value: float | None, digits: int, text: str = "") -> str:
 
 
 def _link(row: Row, name: str) -> str:
-    href = escape(f"{row.job}/report.png".replace("%", "%25").replace("#", "%23").replace("?", "%3F"), True)
-    return f'<a href="{href}">{escape(name)}</a>' if row.status == "done" else escape(name)
+    if row.status != "done":
+        return escape(name)
+    return f'<a href="{_address(row, "report.png")}">{escape(name)}</a>'
 
 
-def _picture(job: Job | None) -> str:
-    with suppress(OSError, AttributeError):
-        content = (job.options.out / PREVIEW).read_bytes()  # type: ignore[union-attr]
-        data = base64.b64encode(content).decode()
-        return f'<img alt="at one half and at 1" src="data:image/jpeg;base64,{data}">'
-    return ""
+def _address(row: Row, file: str) -> str:
+    return escape(f"{row.job}/{file}".replace("%", "%25").replace("#", "%23").replace("?", "%3F"), True)
+
+
+def _picture(row: Row, job: Job | None, embed: bool) -> str:
+    if job is None or not (job.options.out / PREVIEW).is_file():
+        return ""
+    source = _address(row, PREVIEW)
+    if embed:
+        content = (job.options.out / PREVIEW).read_bytes()
+        source = f"data:image/jpeg;base64,{base64.b64encode(content).decode()}"
+    return f'<img loading="lazy" alt="at one half and at 1" src="{source}">'
 
 
 def _sparkline(course: Sequence[tuple[float, float]]) -> str:

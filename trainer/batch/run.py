@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import pickle
 import shutil
 import signal
@@ -16,6 +17,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import chdir, contextmanager, redirect_stdout, suppress
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol, cast
@@ -36,7 +38,7 @@ _log = logging.getLogger(__name__)
 MOST_ATTEMPTS = 4
 """How often a job is begun whose worker, node or machine was lost."""
 
-_PAGE_EVERY_S = 10.0
+_PACE = 40.0  # times what writing a table took pass before it is written again
 _LOOK_S = 2.0  # between two looks at a cluster's cores
 _STOP_S = 20.0  # in which what runs saves its state when all is stopped
 _STORE_BYTES = 80 * 2**20  # of Ray's object store, through which only words go
@@ -136,7 +138,8 @@ class RayPool:
             ray.init(log_to_driver=False, logging_level="error", **where)
         except (ConnectionError, RuntimeError, OSError, ValueError) as error:
             shutil.rmtree(self._folder, ignore_errors=True)
-            raise ProgdfError(f"Ray cannot be used ({str(error).splitlines()[0]})") from error
+            hint = "; where the cluster asks for a token, RAY_AUTH_MODE=token sends it" if address else ""
+            raise ProgdfError(f"Ray cannot be used ({str(error).splitlines()[0]}){hint}") from error
         self._looked, self._cpus = 0.0, 0
         machines = [node["Resources"] for node in ray.nodes() if node["Alive"]]
         self._memory = max(machine.get("memory", 0.0) for machine in machines)
@@ -381,28 +384,30 @@ def _run_batch(
     pool: Pool,
     screen: Screen,
 ) -> None:
-    """Run the tasks; batch.csv after each, batch.html from time to time."""
+    """Run the tasks; batch.csv and batch.html as they end, in a twentieth of the time at most."""
 
     def tell(event: str, task: Task, reason: str) -> None:
         screen.event(event, job=task.key, attempt=task.attempt, reason=reason)
         if event == "retry":
             screen.say(f"{task.key}: {reason}; it is begun again and goes on where it was")
 
-    def write(with_page: bool) -> None:
-        ordered = [rows[job.key] for job in jobs if job.key in rows]
-        write_rows(options.out, ordered)
-        if with_page:
-            write_page(options.out, {job.key: job for job in jobs}, ordered)
+    writers: list[Callable[[Path, Sequence[Row]], None]] = [write_rows, partial(write_page, jobs=jobs)]
+    due = [0.0, 0.0]  # a row that is not written is found again in its run
 
-    page_at = time.monotonic()
+    def write(now: float = math.inf) -> None:
+        ordered = [rows[job.key] for job in jobs if job.key in rows]
+        for index, writer in enumerate(writers):
+            if now >= due[index]:
+                begun = time.monotonic()
+                writer(options.out, ordered)
+                due[index] = begun + _PACE * (time.monotonic() - begun)
+
     try:
-        write(with_page=True)
+        write()
         for row in run_jobs(tasks, pool, tell, lambda running: screen.tick([task.key for task in running])):
             rows[row.job] = row
             screen.end(row)
-            late = time.monotonic() - page_at > _PAGE_EVERY_S
-            write(with_page=late)
-            page_at = time.monotonic() if late else page_at
+            write(time.monotonic())
     except KeyboardInterrupt:
         again = "--resume" if options.resume else "--resume added"
         raise KeyboardInterrupt(
@@ -410,7 +415,7 @@ def _run_batch(
         ) from None
     finally:
         screen.close()
-        write(with_page=True)
+        write()
 
 
 def _is_selected(job: Job, options: BatchOptions, rows: Mapping[str, Row]) -> bool:
