@@ -28,6 +28,7 @@ from progdf.field import (
     fit_keyframes,
     fit_neural,
 )
+from progdf.field.baked import NeuralForm
 from progdf.field.choose import Field
 from progdf.field.neural_fit import NeuralFit
 from progdf.field.separable import moving_attributes
@@ -185,7 +186,7 @@ def _trained(run: Path, name: str, settings: NeuralSettings, course: KnownEdit) 
         made = edit_of(course.scene, course.members, bake_network(network, before, course.truth))
         save_gdf(path, replace(made, name=name, report=took))
     kept = load_gdf(path, course.scene)
-    assert kept.field.origin is not None
+    assert isinstance(kept.field.origin, NeuralForm)
     return Trained(kept.field.origin.network, kept.field, kept.report["steps"], kept.report["seconds"])
 
 

@@ -172,9 +172,6 @@ class OptimizeOptions:
     color_solver: Fixed[bool] = True  # an edit of colors is solved for, all views at once, where it can be
     ema: Fixed[bool] = True  # a running mean of the parameters is recorded, not the bare iterates
     target_ramp: Fixed[bool] = True  # a stage's target moves from the last stage's pictures to its own
-    propagation: Fixed[bool] = (
-        True  # in an edit of colors, members that no view shows do what their neighbors do
-    )
     seed: Fixed[int] = 0  # order of the views
     solver: Fixed[Solver] = "descent"  # filled in once the kind is known, see `resolve_kind`
 
@@ -280,7 +277,6 @@ PRESETS: Mapping[Preset, Mapping[str, Mapping[str, Any]]] = {
             "color_solver": False,
             "ema": False,
             "target_ramp": False,
-            "propagation": False,
         },
         "field": {"field": "neural", "size": "paper", "field_loss": "pictures", "as_printed": True},
     },

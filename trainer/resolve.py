@@ -123,7 +123,6 @@ def resolve_kind(options: TrainOptions, kind: EditKind, group_steps: int) -> Opt
         sh="on" if optimize.sh == "auto" and kind != "color" else optimize.sh,
         perceptual_weight=PERCEPTUAL_WEIGHT[kind] if weight is None else weight,
         sharpness=sharpness,
-        propagation=optimize.propagation and not few,
         solver="pictures" if few else "colors" if solves_colors else "descent",
     )
 

@@ -241,8 +241,8 @@ def edit_views(
         strength: [folder.view("edited", v.camera.name, strength) for v in views] for strength in strengths
     }
 
-    def edit(requeststs: tuple[float, int]) -> Tensor:
-        strength, i = requeststs
+    def edit(request: tuple[float, int]) -> Tensor:
+        strength, i = request
         made = editor.edit(views[i], strength)
         picture = quantize_image(views[i].confine(made) if is_confined else made)
         write_image(paths[strength][i], picture)

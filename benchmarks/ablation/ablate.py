@@ -26,7 +26,6 @@ from progdf.io.images import read_picture, write_image
 from progdf.io.json_values import decode_json, plain
 from trainer.fit.fit import drop_idle_attributes
 from trainer.optimize.losses import Perceptual, describe_loss, perceptual_loss
-from trainer.optimize.unseen import unseen_members_of
 from trainer.options import TrainOptions
 from trainer.report.report import SHOWN, best_view, editor_strip, strip
 from trainer.resolve import resolve_kind
@@ -198,7 +197,6 @@ def _record(
             perceptual,
             state,
             log,
-            unseen_members=unseen_members_of(setup, optimization) if optimization.propagation else None,
         )
     choosing, _ = shared.evaluators(trajectory.offsets)[0].halves()
     trajectory, _ = drop_idle_attributes(trajectory, choosing, not optimization.as_printed)

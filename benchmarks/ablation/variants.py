@@ -15,7 +15,6 @@ from typing import Any, TypeVar
 from unittest import mock
 
 import torch
-from torch import Tensor
 
 from progdf.errors import ProgdfError
 from trainer.editors import COSTLY_STRENGTHS, EXTERNAL
@@ -118,15 +117,7 @@ def _other(name: str, what: str, part: str, value: object, of: str = BASE) -> Va
 _PGS, _EPSILON = "trainer.optimize.pgs", "trainer.optimize.pgs.EPSILON"
 
 
-def _is_inside(value: Tensor, low: float, high: float, slope: Tensor) -> Tensor:
-    """`leads_back` of a plain clamp."""
-    return (value >= low) & (value <= high)
-
-
-_PLAIN_CLAMPS = {
-    "trainer.views.crops.clamp_towards": torch.clamp,
-    "trainer.optimize.color_solver.leads_back": _is_inside,
-}
+_PLAIN_CLAMPS = {"trainer.views.crops.clamp_towards": torch.clamp}
 
 VARIANTS = (
     Variant(BASE, "the run's own options", of=BASE),
@@ -139,7 +130,6 @@ VARIANTS = (
     _other("no-sh", "view-dependent color left as it is", "sh", "off"),
     _other("with-sh", "view-dependent color trained in any case", "sh", "on"),
     Variant("plain-clamps", "clamps pass no gradient that leads back", patches=_PLAIN_CLAMPS),
-    _other("no-propagation", "members that no view shows left alone", "propagation", False),
     _patched("no-pruning", "attributes kept that do not pay", "trainer.fit.fit._PAYS", -math.inf),
     _other("no-groups", "parts are not moved as wholes first", "group_steps", 0),
     _other(DESCENT, "view by view, where colors are solved for", "color_solver", False),

@@ -15,7 +15,7 @@ import torch
 import tyro
 
 from progdf.errors import ProgdfError
-from progdf.field.baked import BakedField
+from progdf.field.baked import BakedField, GradeForm, NeuralForm
 from progdf.formats.scene_file import load_scene_with_report, scene_file, scene_format
 from progdf.gaussians import ZERO, Gaussians
 from progdf.gdf.file import read_gdf
@@ -239,8 +239,11 @@ def _describe_field(field: BakedField) -> str:
     ranks = {name: len(bases.residual_basis) for name, bases in field.attributes.items()}
     # the first is the offset at strength 1 as it was recorded, see `AttributeBases.end_offset`
     bases = ", ".join(
-        f"{name} 1 exact + {rank} fitted" for name, rank in (form.plan.ranks if form else ranks).items()
+        f"{name} 1 exact + {rank} fitted"
+        for name, rank in (form.plan.ranks if isinstance(form, NeuralForm) else ranks).items()
     )
+    if isinstance(form, GradeForm):
+        return f"{form.label}; {len(form.knots)} knots"
     if form is None:
         return f"{len(field.knots)} knots; bases: {bases or 'none, nothing moves'}"
     network = form.network

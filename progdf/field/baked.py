@@ -146,17 +146,127 @@ class NeuralForm:
     # network, pinned, and what was baked of it
     error: Mapping[str, float] | None = None
 
+    @property
+    def members(self) -> int:
+        """Number of members M."""
+        return self.network.members
+
+    @property
+    def bytes_per_member(self) -> float:
+        """Stored bytes for one member, the network's share."""
+        return self.network.bytes_per_member
+
+
+@dataclass(frozen=True)
+class SliderRemap:
+    """Where on a new slider the strengths of the old one lie, linear between knots."""
+
+    old: Tensor  # ascending from 0 to 1. [K] float64
+    new: Tensor  # the same strengths on the new slider, ascending from 0 to 1. [K] float64
+
+    def __post_init__(self) -> None:
+        if self.old.shape != self.new.shape:
+            raise ValueError(f"{list(self.old.shape)} old knots for {list(self.new.shape)} new ones")
+        for knots in (self.old, self.new):
+            if float(knots[0]) != 0.0 or float(knots[-1]) != 1.0 or bool((knots.diff() <= 0).any()):
+                raise ValueError("the knots of a remap must ascend from 0 to 1")
+
+    def __call__(self, s: Tensor) -> Tensor:
+        """New strengths of old ones, 0..1; both ends exact. [n] -> [n] float64"""
+        return interpolate(s.double(), self.old, self.new)
+
+    @property
+    def is_identity(self) -> bool:
+        """Whether it changes nothing."""
+        return torch.equal(self.old, self.new)
+
+    def at(self, s: float) -> float:
+        """The same of one strength."""
+        return float(self(torch.tensor([s], dtype=torch.float64)))
+
+
+def identity_remap() -> SliderRemap:
+    """The slider remap that changes nothing."""
+    ends = torch.tensor([0.0, 1.0], dtype=torch.float64)
+    return SliderRemap(ends, ends)
+
+
+MONOMIALS = {1: 4, 2: 10, 3: 20}
+"""Monomials of three channels up to a degree."""
+
+
+def identity_map(degree: int) -> Tensor:
+    """The map that changes no color. [K,3]"""
+    table = torch.zeros(MONOMIALS[degree], 3)
+    table[1:4] = torch.eye(3)
+    return table
+
+
+@dataclass(frozen=True)
+class GradeForm:
+    """What a file keeps of a grade field. Raises ValueError where its parts do not fit each other."""
+
+    degree: int  # of the map, 1 to 3
+    knots: Tensor  # strengths at which the map is given, ascending from 0 to 1. [S] float32
+    table: Tensor  # the map at each knot; the identity at the first. [S,K,3] float32
+    residual: Tensor  # bases of the lowest B bands, as stored. [R,M,3B] int8
+    scale: Tensor  # what one unit of them is worth. [R,3B] float32
+    coefficients: Tensor  # of the bases at each knot; 0 at the first. [S,R] float32
+    remap: SliderRemap  # from these knots to the slider
+
+    def __post_init__(self) -> None:
+        if self.degree not in MONOMIALS:
+            raise ValueError(f"a grade of degree {self.degree}, expected 1 to 3")
+        knots, numbers = len(self.knots), MONOMIALS[self.degree]
+        shapes = {
+            "table": (self.table, (knots, numbers, 3)),
+            "coefficients": (self.coefficients, (knots, len(self.residual))),
+            "scale": (self.scale, (len(self.residual), self.residual.shape[-1])),
+        }
+        for name, (tensor, shape) in shapes.items():
+            if tuple(tensor.shape) != shape or tensor.dtype != torch.float32:
+                raise ValueError(
+                    f"{name} is {list(tensor.shape)} {tensor.dtype}, expected {list(shape)} float32"
+                )
+        if self.knots.ndim != 1 or knots < 2 or float(self.knots[0]) != 0.0 or float(self.knots[-1]) != 1.0:
+            raise ValueError("knots must run from 0 to 1")
+        if bool((self.knots.diff() <= 0).any()):
+            raise ValueError("knots must ascend")
+        if self.residual.dtype != torch.int8 or self.residual.ndim != 3 or len(self.residual) > MOST_RANK:
+            raise ValueError(f"residual is {list(self.residual.shape)} {self.residual.dtype}, expected int8")
+        if self.residual.shape[2] not in (0, 3, 12, 27, 48):
+            raise ValueError(f"residual has {self.residual.shape[2]} channels, expected whole bands")
+        if bool(self.coefficients[0].any()) or not torch.equal(self.table[0], identity_map(self.degree)):
+            raise ValueError("the map must be the identity and the residual 0 at strength 0")
+
+    @property
+    def members(self) -> int:
+        """Number of members M."""
+        return int(self.residual.shape[1])
+
+    @property
+    def label(self) -> str:
+        """What it is, as in "grade of degree 2, 2 bases of DC"."""
+        bases, parts = len(self.residual), "DC" if self.residual.shape[2] == 3 else "two bands"
+        beside = f"{bases} bas{'is' if bases == 1 else 'es'} of {parts}" if bases else "no residual"
+        return f"grade of degree {self.degree}, {beside}"
+
+    @property
+    def bytes_per_member(self) -> float:
+        """Stored bytes for one member; the map is the region's."""
+        return float(self.residual.shape[0] * self.residual.shape[2])
+
 
 @dataclass(frozen=True)
 class BakedField:
     """A field ready to run, for the members it was made for."""
 
-    kind: str  # "separable", "keyframes" or "neural"
+    kind: str  # "grade", "separable", "keyframes" or "neural"
     knots: Tensor  # strengths at which the coefficients are given, ascending, first 0, last 1. [S] float32
     attributes: Mapping[str, AttributeBases]  # by name, see `ATTRIBUTES`; one that does not move is absent
     channels: int  # of a packed row: 14, or 14 + 3K when shN moves
     recorded: tuple[float, ...] = ()  # strengths of the recorded snapshots, for the slider's ticks
-    origin: NeuralForm | None = None  # the network that it was baked from and that a file stores instead
+    origin: NeuralForm | GradeForm | None = None  # what it was baked from and a file stores instead
 
     def __post_init__(self) -> None:
         if self.knots.ndim != 1 or self.knots.dtype != torch.float32:
@@ -186,9 +296,9 @@ class BakedField:
 
     @property
     def bytes_per_member(self) -> float:
-        """Bytes on disk for one member of the region, of a network its share."""
+        """Bytes on disk for one member of the region."""
         if self.origin is not None:
-            return self.origin.network.bytes_per_member
+            return self.origin.bytes_per_member
         return self.baked_bytes_per_member
 
     @property
@@ -236,49 +346,21 @@ class BakedField:
         return packed
 
 
-@dataclass(frozen=True)
-class SliderRemap:
-    """Where on a new slider the strengths of the old one lie, linear between knots."""
-
-    old: Tensor  # ascending from 0 to 1. [K] float64
-    new: Tensor  # the same strengths on the new slider, ascending from 0 to 1. [K] float64
-
-    def __post_init__(self) -> None:
-        if self.old.shape != self.new.shape:
-            raise ValueError(f"{list(self.old.shape)} old knots for {list(self.new.shape)} new ones")
-        for knots in (self.old, self.new):
-            if float(knots[0]) != 0.0 or float(knots[-1]) != 1.0 or bool((knots.diff() <= 0).any()):
-                raise ValueError("the knots of a remap must ascend from 0 to 1")
-
-    def __call__(self, s: Tensor) -> Tensor:
-        """New strengths of old ones, 0..1; both ends exact. [n] -> [n] float64"""
-        return interpolate(s.double(), self.old, self.new)
-
-    def at(self, s: float) -> float:
-        """The same of one strength."""
-        return float(self(torch.tensor([s], dtype=torch.float64)))
-
-
-def identity_remap() -> SliderRemap:
-    """The slider remap that changes nothing."""
-    ends = torch.tensor([0.0, 1.0], dtype=torch.float64)
-    return SliderRemap(ends, ends)
-
-
 def remap_slider(field: BakedField, remap: SliderRemap) -> BakedField:
     """The field under another slider: its knots move, and where the remap bends far from any, one is added.
 
     No base is touched: the bytes per member are the same, and so are both ends, bit for bit.
 
     Args:
-        field: no network, whose slider is learned
+        field: no network, whose slider is learned; of a grade, one that has not got another slider yet
         remap: from the field's strengths to the wanted ones
 
     Raises:
         ValueError: the field is a network's.
     """
-    if field.origin is not None:
-        raise ValueError("a network's slider is its own; only separable and keyframe fields take another")
+    if isinstance(field.origin, NeuralForm):
+        raise ValueError("a network's slider is its own; the other fields take another")
+    origin = None if field.origin is None else replace(field.origin, remap=remap)
     old = field.knots.double()
     far = (remap.old[:, None] - old).abs().amin(dim=1) > _NEAR
     knots = torch.cat([old, remap.old[far]]).sort().values
@@ -294,4 +376,4 @@ def remap_slider(field: BakedField, remap: SliderRemap) -> BakedField:
         for name, bases in field.attributes.items()
     }
     ticks = remap(torch.tensor(field.recorded, dtype=torch.float64)).tolist()
-    return replace(field, knots=moved[distinct], attributes=attributes, recorded=tuple(ticks))
+    return replace(field, knots=moved[distinct], attributes=attributes, recorded=tuple(ticks), origin=origin)

@@ -21,7 +21,7 @@ from progdf.io.atomic import atomic_write, open_error
 from progdf.io.json_values import convert_json, decode_json
 from progdf.io.tensors import read_tensors, write_tensors
 
-from .baked import BakedField, find_segment
+from .baked import MONOMIALS, BakedField, find_segment
 from .keyframes import fit_lossless
 
 FILE_NAME = "trajectory.safetensors"
@@ -51,6 +51,10 @@ class Trajectory:
     stage_ends: tuple[int, ...]  # recording at which each stage ends, ascending, the last S − 1
     # what the editor was asked for, of each stage; `s[stage_ends]` is where that is
     strengths: tuple[float, ...]
+    # of an edit of colors that is a map of the region and a residual of its members' lowest bands: the map of
+    # each stage [stages,K,3], and how many bands that are
+    maps: Tensor | None = None
+    bands: int = 0
 
     def __len__(self) -> int:
         return int(self.s.shape[0])
@@ -90,6 +94,8 @@ def save_trajectory(
         "strengths": torch.tensor(trajectory.strengths, dtype=torch.float64),
         **extra,
     }
+    if trajectory.maps is not None:
+        tensors |= {"maps": trajectory.maps, "bands": torch.tensor(trajectory.bands)}
     header = {"format": _FORMAT, "about": json.dumps(dict(about))}
     with atomic_write(path) as temporary_file:
         write_tensors(temporary_file, tensors, header, checksum=True)
@@ -113,19 +119,23 @@ def load_trajectory(path: Path) -> tuple[Trajectory, dict[str, Tensor], dict[str
         tensors.pop("steps"),
         tuple(tensors.pop("stage_ends").tolist()),
         tuple(tensors.pop("strengths").tolist()),
+        tensors.pop("maps", None),
+        int(tensors.pop("bands", torch.tensor(0))),
     )
     _check(path, trajectory)
     return trajectory, tensors, about
 
 
-def peek_trajectory(path: Path) -> tuple[Tensor, Tensor]:
-    """The end [M,C] and the members [M] of a file, without its recordings: enough to tell whose they are.
+def peek_trajectory(path: Path, maps: bool = False) -> tuple[Tensor, Tensor]:
+    """The end [M,C], or the maps [stages,K,3], and the members [M] of a file, without its recordings: enough
+    to tell whose they are.
 
     Raises:
         ProgdfError: see `load_trajectory`.
     """
-    tensors, _ = _read(path, ("end", "members"))
-    return tensors["end"], tensors["members"]
+    what = "maps" if maps else "end"
+    tensors, _ = _read(path, (what, "members"))
+    return tensors[what], tensors["members"]
 
 
 def recorded_field(trajectory: Trajectory) -> BakedField:
@@ -162,6 +172,15 @@ def _check(path: Path, trajectory: Trajectory) -> None:
     ascend = all(before < after for before, after in pairwise((0, *ends)))
     if not ends or len(ends) != len(trajectory.strengths) or not ascend or ends[-1] != len(s) - 1:
         raise _damage_error(path, "its stages do not fit its recordings")
+    maps = trajectory.maps
+    if maps is not None and (
+        maps.dtype != torch.float32
+        or maps.shape[1:] not in [(count, 3) for count in MONOMIALS.values()]
+        or len(maps) != len(ends)
+        or not bool(maps.isfinite().all())
+        or trajectory.bands not in (0, 1, 4)
+    ):
+        raise _damage_error(path, "its maps of color do not fit its stages")
     if len(trajectory.steps) != len(s) or not bool(
         trajectory.offsets.isfinite().all() & trajectory.end.isfinite().all()
     ):

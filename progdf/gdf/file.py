@@ -16,7 +16,8 @@ from torch.utils.weak import WeakIdKeyDictionary
 
 from progdf.errors import ProgdfError
 from progdf.field.bake import bake_form, rows_hash
-from progdf.field.baked import BakedField
+from progdf.field.baked import BakedField, GradeForm, NeuralForm
+from progdf.field.grade import bake_grade
 from progdf.gaussians import BASE_CHANNELS, ZERO, Gaussians, Origin, pack
 from progdf.io.atomic import atomic_write, read_file
 from progdf.region import Region
@@ -142,7 +143,7 @@ def save_gdf(path: str | os.PathLike[str], gdf: Gdf) -> None:
 def load_gdf(
     path: str | os.PathLike[str], scene: Gaussians | None = None, scene_name: str = "the scene"
 ) -> Gdf:
-    """Read an edit. A network is baked here, for which the scene is needed.
+    """Read an edit. A network or a grade is baked here, for which the scene is needed.
 
     Args:
         path: a .gdf file
@@ -150,25 +151,27 @@ def load_gdf(
         scene_name: what to call the scene in the message
 
     Raises:
-        ProgdfError: see `read_gdf`; or it was made for another scene; or it keeps a network and no scene is
+        ProgdfError: see `read_gdf`; or it was made for another scene; or it is to be baked and no scene is
             given.
     """
     gdf, name = read_gdf(path), Path(path).name
     if scene is not None:
         verify(gdf, scene, name, scene_name)
-    if gdf.field.origin is None:
+    form = gdf.field.origin
+    if form is None:
         return gdf
     if scene is None:
-        raise ProgdfError(f"{name} keeps a neural field, which is baked on its scene; load it with the scene")
-    rows = pack(scene[gdf.region.members])
-    if gdf.field.origin.rows_sha256 not in ("", rows_hash(rows)):
+        kind = gdf.field.kind
+        raise ProgdfError(f"{name} keeps a {kind} field, which is baked on its scene; load it with the scene")
+    rows = pack(scene[gdf.region.members], with_shN=scene.sh_degree > 0)
+    if isinstance(form, NeuralForm) and form.rows_sha256 not in ("", rows_hash(rows)):
         raise ProgdfError(
             f"{name} was made for another scene: {scene_name} has its Gaussians, but they look different"
         )
     try:
-        baked = bake_form(gdf.field.origin, rows)
+        baked = bake_grade(form, rows) if isinstance(form, GradeForm) else bake_form(form, rows)
         _check_reach(baked)
-        return replace(gdf, field=baked)
+        return replace(gdf, field=replace(baked, recorded=gdf.field.recorded))
     except (ValueError, RuntimeError) as error:
         raise contradiction_error(name, error) from error
 
@@ -196,7 +199,7 @@ def _unpack(header: GdfHeader, tensors: Mapping[str, Tensor]) -> Gdf:
     _check_reach(field)
     members = field.members if field.attributes else header.members
     if field.origin is not None:
-        members = field.origin.network.members
+        members = field.origin.members
     if header.members != members:
         raise ValueError(f"the header has {header.members} members, the field {members}")
     region = unpack_region(header.region, tensors, header.scene.count, header.members)

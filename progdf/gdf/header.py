@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from progdf.errors import ProgdfError
-from progdf.field.baked import AttributeBases, BakedField, BakePlan, NeuralForm
+from progdf.field.baked import AttributeBases, BakedField, BakePlan, GradeForm, NeuralForm, SliderRemap
 from progdf.field.neural import NeuralField, NeuralShape
 from progdf.gaussians import ATTRIBUTES
 from progdf.io.json_values import convert_json, decode_json
@@ -35,6 +35,7 @@ MOST_GAUSSIANS = 1 << 26
 _MOST_HEADER = 1 << 24  # bytes; a report takes a few kB, and JSON of 100 MB could become a gigabyte
 _METADATA = "progdf"  # the one key: the library writes several in an order that differs from run to run
 _PARTS = ("end_offset", "residual_basis", "scale", "coefficients")  # of `AttributeBases`
+_GRADE = ("knots", "table", "residual", "scale", "coefficients")  # of `GradeForm`
 _NETWORK = "network."
 _END_CORRECTION = "end_correction."
 _RENAMED = {  # parts of tensors' names in format 1
@@ -70,6 +71,7 @@ class FieldHeader(msgspec.Struct, frozen=True):
     attributes: list[str]
     recorded: list[float]
     network: NetworkHeader | None = None
+    grade: int | None = None  # degree of the map of a grade
 
 
 class GdfHeader(msgspec.Struct, frozen=True):
@@ -172,7 +174,7 @@ def _to_json(value: Any) -> str | float:
 
 
 def pack_field(field: BakedField) -> tuple[FieldHeader, dict[str, Tensor]]:
-    """A field's part of the header, and its tensors; of a baked network, the network."""
+    """A field's part of the header, and its tensors; of one that is baked when it is loaded, its origin."""
     header = FieldHeader(field.kind, field.channels, list(field.attributes), list(field.recorded))
     if field.origin is None:
         tensors = {"knots": field.knots}
@@ -180,6 +182,11 @@ def pack_field(field: BakedField) -> tuple[FieldHeader, dict[str, Tensor]]:
             tensors |= {f"{name}.{part}": getattr(bases, part) for part in _PARTS}
         return header, tensors
     form = field.origin
+    if isinstance(form, GradeForm):
+        tensors = {name: getattr(form, name) for name in _GRADE} | {
+            "remap": torch.stack([form.remap.old, form.remap.new])
+        }
+        return msgspec.structs.replace(header, attributes=[], grade=form.degree), tensors
     network, plan = form.network, form.plan
     tensors = {_NETWORK + name: tensor for name, tensor in network.tensors.items()}
     tensors |= {"knots": plan.knots, "end": network.end}
@@ -200,6 +207,12 @@ def unpack_field(header: FieldHeader, tensors: Mapping[str, Tensor]) -> BakedFie
     for name in header.attributes:
         if name not in ATTRIBUTES:
             raise ValueError(f"unknown attribute {name}")
+    if header.grade is not None:
+        old, new = tensors["remap"].double()
+        grade = GradeForm(
+            header.grade, **{name: tensors[name] for name in _GRADE}, remap=SliderRemap(old, new)
+        )
+        return BakedField("grade", torch.tensor([0.0, 1.0]), {}, header.channels, recorded, grade)
     if header.network is None:
         attributes = {
             name: AttributeBases(**{part: tensors[f"{name}.{part}"] for part in _PARTS})

@@ -113,7 +113,7 @@ def test_a_variant_differs_from_another_in_one_value_of_the_plan(
         assert len(variant.changes) == 1 or (variant.patches and not differ)
 
 
-@pytest.mark.parametrize("part", ["color_solver", "ema", "target_ramp", "propagation"])
+@pytest.mark.parametrize("part", ["color_solver", "ema", "target_ramp"])
 def test_every_refinement_has_a_variant_without_it(part: str) -> None:
     assert any(variant.changes == {f"optimize.{part}": False} for variant in VARIANTS)
 
@@ -186,11 +186,11 @@ def test_every_variant_is_a_row_of_the_table_a_row_of_the_picture_and_an_edit_to
 def test_variants_of_the_slider_share_one_optimization_and_end_alike(run: Path) -> None:
     rows = json.loads((run / "ablation" / "ablation.json").read_text(encoding="utf-8"))["variants"]
     base, linear, plain, by_time = rows
-    assert base["psnr"] == linear["psnr"] == by_time["psnr"] != plain["psnr"]
+    assert base["psnr"] == by_time["psnr"] == plain["psnr"], "the end is solved for whatever the way"
     assert linear["between"] != base["between"]
     assert by_time["between"] == base["between"], "judged where each shows it"
     assert by_time["uniformity"] < base["uniformity"]
-    assert "continuing at step 25 of 25" in (run / "ablation/slider-time/log.txt").read_text(encoding="utf-8")
+    assert "continuing at step 4 of 4" in (run / "ablation/slider-time/log.txt").read_text(encoding="utf-8")
     assert "going on" not in (run / "ablation/one-target/log.txt").read_text(encoding="utf-8")
 
 

@@ -89,11 +89,11 @@ def open_run(root: Path, scene: Path | None = None) -> OpenedRun:
         raise ProgdfError(f"{gdf.name}.gdf is not of the recording beside it; run progdf fit {root}")
     trajectory = replace(run.trajectory, s=shown_at)
     evaluator = load_evaluator(run.folder, setup, setup.judging, run.trajectory)
-    return OpenedRun(run, report, setup, evaluator, gdf, trajectory, _two_keyframes(run, setup, report))
+    return OpenedRun(run, report, setup, evaluator, gdf, trajectory, _two_keyframes(gdf, setup, report))
 
 
-def _two_keyframes(run: FinishedRun, setup: TrainingSetup, report: Mapping[str, Any]) -> BakedField:
-    end = run.trajectory.end
+def _two_keyframes(gdf: Gdf, setup: TrainingSetup, report: Mapping[str, Any]) -> BakedField:
+    end = gdf.field.offsets(1.0)
     field = fit_keyframes(torch.tensor([0.0, 1.0]), torch.stack([torch.zeros_like(end), end]), 2)
     even = report.get("trajectory", {}).get("slider") == "even"
     return equalize_slider(field, setup)[0] if even else field

@@ -47,11 +47,15 @@ class Evaluator:
 
     def psnr(self, pictures: Sequence[Tensor], expected: Sequence[Tensor]) -> float:
         """PSNR over the pixels that count, all views together, dB; 99 where nothing differs."""
+        return decibels(self.mse(pictures, expected))
+
+    def mse(self, pictures: Sequence[Tensor], expected: Sequence[Tensor]) -> float:
+        """Mean squared error over the pixels that count, all views together."""
         error = count = 0.0
         for a, b, pixels in zip(pictures, expected, self.pixels, strict=True):
             error += float((a[pixels] - b[pixels]).double().square().sum())
             count += 3 * int(pixels.sum())
-        return decibels(error / max(count, 1))
+        return error / max(count, 1)
 
     def ssim(self, pictures: Sequence[Tensor], expected: Sequence[Tensor]) -> float:
         """SSIM over the pixels that count, all views together, at most 1."""

@@ -11,12 +11,16 @@ import torch
 from torch import Tensor
 
 from progdf.field import BakedField, Candidate, FieldEvaluator, choose_field, fit_keyframes
+from progdf.field.baked import MONOMIALS, GradeForm, NeuralForm, identity_map
 from progdf.field.choose import MOST_SNAPSHOTS, SAMPLES
+from progdf.field.grade import bake_grade, fit_grade, lowest_bands, mapped_trajectory, rank_limit
 from progdf.field.separable import moving_attributes
 from progdf.field.trajectory import Trajectory
 from progdf.gaussians import BASE_CHANNELS, Gaussians, attribute_slices
+from progdf.metrics.image import decibels
 from progdf.rasterize import alpha_weights
 from trainer.editors.base import ImageEditor
+from trainer.optimize.color_solver import ROUNDING
 from trainer.options import FieldKind, FieldOptions
 from trainer.setup import TrainingSetup
 from trainer.views.choose import split_held_out
@@ -142,6 +146,69 @@ def fit_field(
     return Fitted(chosen, choice.met, choice.tried, baselines, choice.why)
 
 
+ADDED = 0.1
+"""Share of the error that an edit has against its editor which its field may add."""
+
+
+def fit_grades(
+    trajectory: Trajectory,
+    rows: Tensor,
+    choosing: Evaluator,
+    reporting: Evaluator,
+    weights: Tensor,
+    options: FieldOptions,
+) -> Fitted:
+    """The grade of a recorded map with the fewest bases beside it that add at most `ADDED` of the error that
+    the recording has against the editor's own pictures (mean square, all strengths together).
+
+    Args:
+        trajectory: what was recorded, with its maps
+        rows: raw values of the members before the edit, packed. [M,14+3K]
+        choosing, reporting, weights, options: see `fit_field`
+    """
+    assert trajectory.maps is not None
+    nodes = [0, *trajectory.stage_ends]
+    degree = next(d for d, count in MONOMIALS.items() if count == trajectory.maps.shape[1])
+    table = torch.cat([identity_map(degree)[None], trajectory.maps])
+    mapped = mapped_trajectory(degree, table, rows)
+    recorded = torch.stack([trajectory.node(i) for i in nodes])
+    course = lowest_bands(recorded - mapped, trajectory.bands)
+    expected = [choosing.edited[strength] for strength in trajectory.strengths]
+
+    def errors(offsets: Callable[[int], Tensor]) -> list[float]:
+        pictures = (choosing.pictures(offsets(i)) for i in range(1, len(expected) + 1))
+        return [ROUNDING + choosing.mse(p, e) for p, e in zip(pictures, expected, strict=True)]
+
+    own, budget = sum(errors(lambda i: recorded[i])), options.bytes_budget
+    tried, met = list[tuple[float, Candidate]](), False
+    for rank in range(rank_limit(course) + 1):
+        form = fit_grade(trajectory.s[nodes], degree, table, course, rank, weights)
+        if budget is not None and form.bytes_per_member > budget:
+            break
+        field = replace(bake_grade(form, rows, mapped), recorded=tuple(trajectory.s.tolist()))
+        found = errors(lambda i: field.offsets(float(trajectory.s[nodes[i]])))  # noqa: B023
+        tried.append((sum(found), Candidate(field, tuple(decibels(e) for e in found), form.label)))
+        met = sum(found) <= (1.0 + ADDED) * own
+        if met and budget is None:
+            break
+    chosen, adds = min(tried, key=lambda one: one[0])[1], "adds at most a tenth to the edit's own error"
+    why = f"the smallest of {len(tried)} that {adds}" if met else f"the best of {len(tried)}; none {adds}"
+    if budget is not None:
+        met, why = True, f"the best of {len(tried)} that fits into {budget:g} bytes"
+    measured = FieldEvaluator(trajectory.s, _recorded_offsets(trajectory), reporting.counted_pixels)
+    return Fitted(
+        measured.candidate(chosen.field, chosen.label),
+        met,
+        tuple(candidate for _, candidate in tried),
+        _baselines(trajectory, _recorded_offsets(trajectory), measured),
+        why,
+    )
+
+
+def _recorded_offsets(trajectory: Trajectory) -> Tensor:
+    return torch.stack([trajectory.node(i) for i in range(len(trajectory))])
+
+
 def expected_looks(trajectory: Trajectory, kind: FieldKind) -> int:
     """About how often `fit_field` looks at its views, for a progress bar."""
     snapshots = min(len(trajectory), MOST_SNAPSHOTS)
@@ -243,7 +310,7 @@ def drop_idle_attributes(
         tried[:, slices[name]] = 0.0
         then = evaluator.psnr(evaluator.pictures(tried), target)
         costs[name] = round(now - then, 3)
-        if prunes and complete - then < _PAYS:
+        if prunes and trajectory.maps is None and complete - then < _PAYS:
             now = then
             offsets = offsets.clone()
             offsets[:, :, slices[name]] = 0.0
@@ -252,17 +319,17 @@ def drop_idle_attributes(
         offsets, end = offsets[:, :, :BASE_CHANNELS].clone(), end[:, :BASE_CHANNELS].clone()
     if end is trajectory.end:
         return trajectory, costs
-    return Trajectory(
-        trajectory.s, offsets, end, trajectory.steps, trajectory.stage_ends, trajectory.strengths
-    ), costs
+    return replace(trajectory, offsets=offsets, end=end), costs
 
 
 def stored_numbers(field: BakedField) -> int:
     """How many numbers the field holds for all members together, coefficients included; of a network, those
     that are learned and the recorded end."""
-    if field.origin is not None:
-        network = field.origin.network
-        return network.parameters + network.end.numel()
+    form = field.origin
+    if isinstance(form, NeuralForm):
+        return form.network.parameters + form.network.end.numel()
+    if isinstance(form, GradeForm):
+        return sum(part.numel() for part in (form.table, form.residual, form.scale, form.coefficients))
     return sum(
         bases.end_offset.numel()
         + bases.residual_basis.numel()

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from progdf.errors import ProgdfError
 from progdf.field import BakedField, NeuralSettings, bake_network
-from progdf.field.baked import interpolate_at
+from progdf.field.baked import NeuralForm, interpolate_at
 from progdf.field.choose import FieldEvaluator, Render, rendered_importance
 from progdf.field.neural import NeuralShape
 from progdf.field.neural_fit import EFFORT, NeuralFit, PictureLoss, train_network
@@ -165,7 +165,7 @@ class NetworkFit:
     def figures(self) -> dict[str, Any]:
         """For report.json."""
         curve, form = self.unbaked, self.field.origin
-        assert form is not None
+        assert isinstance(form, NeuralForm)
         return {
             "unbaked": {"psnr_mean": round(sum(curve) / len(curve), 2), "psnr_worst": round(min(curve), 2)},
             "bake_error": dict(form.error or {}),

@@ -18,7 +18,14 @@ import torch
 from torch import Tensor
 
 from progdf.field import BakedField
-from progdf.field.baked import SliderRemap, identity_remap, interpolate, interpolate_at, remap_slider
+from progdf.field.baked import (
+    NeuralForm,
+    SliderRemap,
+    identity_remap,
+    interpolate,
+    interpolate_at,
+    remap_slider,
+)
 from progdf.gaussians import BASE_CHANNELS, pack
 from trainer.editors import COSTLY_STRENGTHS, check_editor
 from trainer.editors.base import ImageEditor
@@ -77,7 +84,7 @@ def equalize_slider(
 
     A network keeps its slider.
     """
-    if field.origin is not None or not field.attributes:
+    if isinstance(field.origin, NeuralForm) or not field.attributes:
         return field, identity_remap()
     moving = list(field.attributes)
     small = probe_views(setup, _FIELD_VIEWS, still=not set(moving) & set(GEOMETRY))

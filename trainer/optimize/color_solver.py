@@ -1,10 +1,15 @@
-"""Edits of colors alone: all views at once, each member by the step that its own weight asks for.
+"""Edits of colors alone: one map of color for the region, and what single members need beside it.
 
 While nothing moves, every training view is linear in the members' colors (`progdf.rasterize.cpu.engine`), but
-for the clamps at black and white. So a stage is a least-squares problem. It is solved by accelerated gradient
-descent (Nesterov 1983), each member's step divided by a bound of its curvature, Σ w·m over its pixels (SIRT
-in tomography): a member that is a hundredth of a pixel gets its answer as a large one does, and nothing
-walks at random, as where an optimizer looks at a view at a time and steps by the gradient's sign.
+for the clamps at black and white. The map, a polynomial of what is drawn (`progdf.field.grade`), is linear in
+its coefficients too: its least squares over all views take a tenth of a second. What the map cannot say is a
+residual of the members' lowest bands, by conjugate gradients that know the clamps, each
+member preconditioned by its own weight, as in tomography: one that is a hundredth of a pixel gets its answer
+as a large one does. A member that no view shows follows the map.
+
+How much of this a region gets (degree of the map; no residual, one of DC, or one of two bands) is decided on
+views that are not solved for, at the full strength: the least of which more would take away less than a
+twentieth of the error.
 """
 
 from __future__ import annotations
@@ -18,7 +23,10 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
+from progdf.field.baked import MONOMIALS, identity_map
+from progdf.field.grade import MOST_COLOR, band_offsets, map_colors, member_bands, monomials
 from progdf.gaussians import attribute_slices, unpack
+from progdf.metrics.image import decibels
 from progdf.rasterize.cpu.engine import ColorMap, color_map
 from progdf.sh import basis
 from progdf.threads import one_thread, threads
@@ -26,18 +34,25 @@ from trainer.views.crops import CropScene
 
 from .losses import l1
 from .pgs import OnStep, ParameterSnapshot, PgsState, TargetStage
-from .unseen import UnseenMembers
 
 STEPS_OF_OTHERS = 8
 """Steps of an optimizer that looks at one view at a time which one iteration over all views stands for."""
 
-HURRIED_STEPS, HURRIED = 4, 60
-"""The same for a run of few steps, up to so many iterations: with half of them a draft of the toy robot was
-mottled half way (held out, s = .5: 30.1 dB; 33.3 with 60, 35.7 with 100)."""
+MORE_PAYS = 0.95
+"""Share of the error that a larger model must leave at most, to be worth its bytes."""
 
-BANDS_HELD = 0.1
-"""How strongly the higher bands are held to what the change of DC predicts, beside what the views say of
-them: views are few directions, and bands that are free fit these and shine in others."""
+ROUNDING = 1 / 255**2 / 12
+"""Mean squared error of a picture of 8 bits: what is nearer to it than this is not told apart."""
+
+_RIDGE = 0.002  # of a typical member's weight: holds the residual of what hardly shows at 0
+_MAP_RIDGE = 1e-6  # the same of the map's coefficients, for regions of few colors
+_MAP_HELD = 1e-2  # say of the members' own colors beside the pixels: there a map is held to the affine one
+_COVERED = 0.05  # the region's weight in a pixel that the map is fitted to
+_MOST_PIXELS = 250_000  # for the some twenty coefficients of the map; of more, evenly spread ones
+_CLAMP_ROUNDS = 3  # of the map's least squares, for pixels that are white or black anyway
+_SETTLED = (
+    0.01  # share of the finished edit's error that a step takes away at least, for another one to follow
+)
 
 _A = TypeVar("_A")
 _B = TypeVar("_B")
@@ -49,25 +64,25 @@ class ColorView:
 
     map: ColorMap  # what each member weighs in each pixel
     others: Tensor  # what all but the members show, unclamped. [h,w,3]
-    basis: Tensor  # weight of each trained band in each member's color from here. [M,B]
+    basis: Tensor  # weight of each band in each member's color from here. [M,B]
     original: Tensor  # the members' unclamped colors as they were. [M,3]
 
     def colors(self, offsets: Tensor) -> Tensor:
-        """Unclamped. [M,B,3] -> [M,3]"""
-        return self.original + torch.einsum("mb,mbc->mc", self.basis, offsets)
+        """Unclamped. Offsets of the lowest bands [M,b,3] -> [M,3]"""
+        return self.original + torch.einsum("mb,mbc->mc", self.basis[:, : offsets.shape[1]], offsets)
 
     def picture(self, colors: Tensor) -> Tensor:
         """Unclamped. [M,3] -> [h,w,3]"""
         return self.others + self.map.picture(colors.clamp_min(0.0))
 
     def error(self, offsets: Tensor, target: Tensor) -> float:
-        """Sum of squared differences, of colors 0..1. [M,B,3], [h,w,3]"""
+        """Sum of squared differences, of colors 0..1. [M,b,3], [h,w,3]"""
         image = self.picture(self.colors(offsets)).clamp(0.0, 1.0)
         return float((image - target).square().sum())
 
 
 def color_view(crop: CropScene, original: Tensor, bands: int) -> ColorView:
-    """Prepare a view. `original`: raw member rows [M,14+]; `bands`: how many are trained, DC among them."""
+    """Prepare a view. `original`: raw member rows [M,14+]; `bands`: how many may change, DC among them."""
     camera = crop.camera
     members = unpack(original, crop.member_shN)
     directions = torch.nn.functional.normalize(members.means - camera.position, dim=1)
@@ -86,29 +101,126 @@ def color_view(crop: CropScene, original: Tensor, bands: int) -> ColorView:
     )
 
 
+def color_views(crops: Sequence[CropScene], original: Tensor) -> list[ColorView]:
+    """All views, with all bands that are drawn."""
+    bands = member_bands(original).shape[1]
+    return _map_threads(lambda crop: color_view(crop, original, bands), crops)
+
+
+@dataclass(frozen=True)
+class MapFit:
+    """The views' pixels as monomials of the region's drawn colors: a map's picture is linear in them."""
+
+    design: Tensor  # what each pixel shows of every monomial. [P,20] float32
+    others: Tensor  # what it shows of all but the members. [P,3]
+    pixels: Sequence[Tensor]  # which pixels of each view these are, one view after another. [p] int64
+    normal: Tensor  # products of all pixels' monomials. [20,20] float64
+    held: Tensor  # the same of the members', hidden or not, as far as they count. [20,20] float64
+
+    @one_thread()
+    def solve(self, degree: int, targets: Sequence[Tensor]) -> Tensor:
+        """The map of least squares. [h,w,3] each -> [K,3]
+
+        A polynomial goes astray beyond the colors that it was fitted to, and members that no picture shows
+        may have such: at all members' colors it is held to the affine map.
+        """
+        count, identity = MONOMIALS[degree], identity_map(degree)
+        design = self.design[:, :count].contiguous()
+        normal, pull = self.normal[:count, :count], torch.zeros(count, 3, dtype=torch.float64)
+        if degree > 1:
+            affine = (self.solve(1, targets) - identity_map(1)).double()
+            normal, pull = normal + self.held[:count, :count], self.held[:count, :4] @ affine
+        normal = normal + _MAP_RIDGE * (normal.diagonal() + 1e-12).diag()
+        target = torch.cat([t.reshape(-1, 3)[p] for t, p in zip(targets, self.pixels, strict=True)])
+        original, table = design @ identity, identity
+        for _ in range(_CLAMP_ROUNDS):
+            image = design @ table + self.others
+            clamped = ((image >= 1.0) & (target >= 1.0)) | ((image <= 0.0) & (target <= 0.0))
+            change = torch.where(clamped, image, target) - self.others - original
+            right = (design.T @ change).double() + pull
+            table = identity + torch.linalg.solve(normal, right).float()
+        return table
+
+
+@one_thread()
+def fit_maps(views: Sequence[ColorView]) -> MapFit:
+    """Prepare the views for maps of any degree."""
+    total = sum(math.prod(view.map.size) for view in views)
+    stride = max(1, -(-total // _MOST_PIXELS))
+
+    def lay_out(view: ColorView) -> tuple[Tensor, Tensor]:
+        terms = monomials(view.original.clamp(0.0, MOST_COLOR), 3)
+        planes = torch.split(torch.cat([terms, torch.zeros(len(terms), 1)], dim=1), 3, dim=1)
+        shown = torch.cat([view.map.picture(plane).reshape(-1, 3) for plane in planes], dim=1)[:, :20]
+        pixels = (shown[:, 0] > _COVERED).nonzero()[::stride, 0]
+        return shown[pixels], pixels
+
+    laid = _map_threads(lay_out, views)
+    design, pixels = torch.cat([some for some, _ in laid]), [some for _, some in laid]
+    others = torch.cat([view.others.reshape(-1, 3)[some] for view, some in zip(views, pixels, strict=True)])
+    wide, members = design.double(), torch.zeros(20, 20, dtype=torch.float64)
+    for view in views:
+        terms = monomials(view.original.clamp(0.0, MOST_COLOR), 3).double()
+        members += terms.T @ terms
+    share = _MAP_HELD * len(design) / max(1, len(views) * len(views[0].original))
+    return MapFit(design, others, pixels, wide.T @ wide, share * members)
+
+
+@dataclass(frozen=True)
+class Judge:
+    """Views that are not solved for, and the finished edit in them."""
+
+    views: Sequence[ColorView]
+    targets: Sequence[Tensor]  # [h,w,3] each
+
+    def error(self, offsets: Tensor) -> float:
+        """Mean squared difference, with that of the pictures' own rounding. [M,B,3]"""
+        count = max(1, sum(target.numel() for target in self.targets))
+        return ROUNDING + self.squared_error(offsets) / count
+
+    def squared_error(self, offsets: Tensor) -> float:
+        """Sum of squared differences. [M,B,3]"""
+        return sum(
+            _map_threads(
+                lambda pair: pair[0].error(offsets, pair[1]), list(zip(self.views, self.targets, strict=True))
+            )
+        )
+
+
+@dataclass(frozen=True)
+class Model:
+    """How much of an edit of colors is modelled."""
+
+    degree: int  # of the map
+    residual: Tensor  # of the finished edit: b of 0, 1 or 4 bands. [M,b,3]
+    floor: float  # squared error of the finished edit in the training views: what is finer is not chased
+    tried: Sequence[tuple[str, float]]  # what was tried, and its error on views not solved for, dB
+
+    @property
+    def bands(self) -> int:
+        """How many bands the residual has."""
+        return self.residual.shape[1]
+
+    @property
+    def line(self) -> str:
+        """What was chosen and over what, for the log."""
+        residual = (
+            f"and a residual of {self.bands} SH function{'s' * (self.bands > 1)}" if self.bands else "alone"
+        )
+        over = ", ".join(f"{name} {error:.1f}" for name, error in self.tried)
+        return (
+            f"a map of color of degree {self.degree} {residual}, the least that is within a twentieth; dB: {over}"
+        )
+
+
 @dataclass(frozen=True)
 class _Pull:
-    """What a view says at some offsets."""
+    """What the views say at some residual."""
 
-    gradient: Tensor  # of half the squared error, in the members' colors. [M,3]
-    squared: float  # sum of squared differences from the target
-    left: float  # mean absolute difference from the finished edit
-
-
-def _pull_into_range(view: ColorView, offsets: Tensor, target: Tensor, finished: Tensor) -> _Pull:
-    """A clamp passes what would bring its value back into the range, as `clamp_towards` does."""
-    raw = view.colors(offsets)
-    rendered = view.picture(raw)
-    image = rendered.clamp(0.0, 1.0)
-    apart = image - target
-    back = view.map.gradient(apart * leads_back(rendered, 0.0, 1.0, apart))
-    back = back * leads_back(raw, 0.0, math.inf, back)
-    return _Pull(back, float(apart.square().sum()), float(l1(image, finished)))
-
-
-def leads_back(value: Tensor, low: float, high: float, slope: Tensor) -> Tensor:
-    """Where a clamp passes a gradient: inside, and where descent would bring the value back. [...] bool"""
-    return ((value >= low) | (slope < 0.0)) & ((value <= high) | (slope > 0.0))
+    descent: Tensor  # against the gradient of half the error. [M,b,3]
+    error: float  # squared, with what holds the residual
+    # of each view, members' channels and pixels' that a clamp lets through. [M,3], [h,w,3] bool
+    clamps: Sequence[tuple[Tensor, Tensor]]
 
 
 @dataclass(frozen=True)
@@ -116,133 +228,236 @@ class Solver:
     """All training views of a run."""
 
     views: Sequence[ColorView]  # see `ColorView`
-    # bound of each member's and band's curvature: Σ w·m over the views' pixels, m the members' weight there,
-    # times the basis squared. [M,B,1]
+    sh: Tensor  # the members' own. [M,B,3]
+    # bound of the curvature of each member's lowest bands: Σ w·m over the pixels, m its own weight, times the
+    # basis squared. [M,b,1]
     weights: Tensor
-    bands: Tensor  # the members' own higher bands as far as they are trained. [M,B-1,3]
-    dc: Tensor  # the members' own DC. [M,3]
+    maps: MapFit
 
-    def error(self, offsets: Tensor, targets: Sequence[Tensor]) -> float:
-        """Mean squared difference over all pixels and channels of all boxes. [M,B,3]"""
-        pairs = list(zip(self.views, targets, strict=True))
-        total = sum(_map_threads(lambda pair: pair[0].error(offsets, pair[1]), pairs))
-        return total / max(1, sum(target.numel() for target in targets))
+    def map_offsets(self, degree: int, table: Tensor) -> Tensor:
+        """What a map adds. [K,3] -> [M,B,3]"""
+        return map_colors(self.sh, table, degree) - self.sh
 
-    def step(
-        self, offsets: Tensor, targets: Sequence[Tensor], finished: Sequence[Tensor]
-    ) -> tuple[Tensor, float, float]:
-        """One step of plain descent from these offsets. [M,B,3]
+    def table(self, degree: int, targets: Sequence[Tensor]) -> Tensor:
+        """The map that comes nearest to these pictures. [K,3]"""
+        return self.maps.solve(degree, targets)
 
-        Returns:
-            where it leads [M,B,3]; at the offsets: mean squared difference from the targets, mean absolute
-            difference from the finished edit
+    @one_thread()  # sums of members are added in an order that depends on the number of threads
+    def residual(
+        self,
+        mapped: Tensor,
+        start: Tensor,
+        targets: Sequence[Tensor],
+        steps: int,
+        tell: Callable[[], None],
+        floor: float = 0.0,
+    ) -> Tensor:
+        """What the members' lowest bands need beside the map: preconditioned conjugate gradients (Polak and
+        Ribière) that look at every step anew what the clamps pass.
+
+        Args:
+            mapped: what the map adds. [M,B,3]
+            start: a guess. [M,b,3]
+            targets: pictures of the views
+            steps: most steps
+            tell: called after each
+            floor: squared error that counts as none, see `Model.floor`
         """
-        work = list(zip(self.views, targets, finished, strict=True))
-        pulls = _map_threads(lambda item: _pull_into_range(item[0], offsets, item[1], item[2]), work)
-        held = self._hold_weights()
-        gradient = held * (offsets - self._predicted_bands(offsets))
-        for view, pull in zip(self.views, pulls, strict=True):
-            gradient += view.basis[..., None] * pull.gradient[:, None]
-        squared = sum(pull.squared for pull in pulls) / max(1, sum(target.numel() for target in targets))
-        left = sum(pull.left for pull in pulls) / len(pulls)
-        return offsets - gradient / (self.weights + held).clamp_min(1e-9), squared, left
+        base = _map_threads(lambda view: view.colors(mapped), self.views)
+        curvature = self.weights[:, : start.shape[1]]
+        ridge = _RIDGE * float(curvature[:, :1].mean())
+        inverse = 1.0 / (curvature + ridge)
+        now, pull = start, self._pull(base, start, targets, ridge)
+        conditioned = along = inverse * pull.descent
+        for _ in range(steps):
+            length = _inner(pull.descent, along) / max(self._curvature(pull, along, ridge), 1e-30)
+            ahead = now + length * along
+            next_pull = self._pull(base, ahead, targets, ridge)
+            if not next_pull.error < pull.error:
+                if along is conditioned:
+                    break
+                along = conditioned  # the direction was of other clamps: begin again
+                continue
+            before, last, power = pull, conditioned, _inner(pull.descent, conditioned)
+            now, pull = ahead, next_pull
+            if before.error - pull.error <= _SETTLED * max(pull.error, floor):
+                break
+            conditioned = inverse * pull.descent
+            turn = (_inner(pull.descent, conditioned) - _inner(pull.descent, last)) / power
+            along = conditioned + max(0.0, turn) * along
+            tell()
+        return now
 
-    def _hold_weights(self) -> Tensor:
-        """How strongly each band of each member is held. [M,B,1]"""
-        held = torch.zeros_like(self.weights)
-        held[:, 1:] = BANDS_HELD * self.weights[:, :1]
-        return held
+    def _pull(
+        self, base: Sequence[Tensor], residual: Tensor, targets: Sequence[Tensor], ridge: float
+    ) -> _Pull:
+        """See `_Pull`. A clamp passes what would bring its value back into the range."""
 
-    @one_thread()  # products of members are added in an order that depends on the number of threads
-    def _predicted_bands(self, offsets: Tensor) -> Tensor:
-        """DC as it is; the higher bands turned and stretched as DC is: the linear part of the affine map from
-        old DC to new, fitted to all members by what they weigh. [M,B,3]"""
-        predicted = offsets.clone()
-        if offsets.shape[1] > 1:
-            weights = self.weights[:, 0]
-            x = torch.cat([self.dc, torch.ones(len(self.dc), 1)], dim=1)
-            square = x.T @ (weights * x)
-            square += 1e-4 * square.diagonal().mean() * torch.eye(4)
-            change = torch.linalg.solve(square, x.T @ (weights * offsets[:, 0]))[:3]
-            predicted[:, 1:] = self.bands @ change
-        return predicted
+        def look(index: int) -> tuple[Tensor, Tensor, Tensor, float]:
+            view, target = self.views[index], targets[index]
+            colors = base[index] + torch.einsum("mb,mbc->mc", view.basis[:, : residual.shape[1]], residual)
+            image = view.picture(colors)
+            squared = float((target - image.clamp(0.0, 1.0)).double().square().sum())
+            counts = ~(((image <= 0.0) & (target <= 0.0)) | ((image >= 1.0) & (target >= 1.0)))
+            pull = view.map.gradient((target - image) * counts)
+            drawn = (colors > 0.0) | (pull > 0.0)
+            return drawn, counts, pull * drawn, squared
+
+        seen = _map_threads(look, range(len(self.views)))
+        descent = -ridge * residual
+        for view, (_, _, pull, _) in zip(self.views, seen, strict=True):
+            descent += view.basis[:, : residual.shape[1], None] * pull[:, None]
+        error = sum(squared for *_, squared in seen) + ridge * _inner(residual, residual)
+        return _Pull(descent, error, [(drawn, counts) for drawn, counts, _, _ in seen])
+
+    def _curvature(self, pull: _Pull, along: Tensor, ridge: float) -> float:
+        """Of half the squared error in a direction, where the clamps stay as they are. [M,b,3]"""
+
+        def look(index: int) -> float:
+            view, (drawn, counts) = self.views[index], pull.clamps[index]
+            colors = torch.einsum("mb,mbc->mc", view.basis[:, : along.shape[1]], along) * drawn
+            return float((view.map.picture(colors) * counts).double().square().sum())
+
+        return sum(_map_threads(look, range(len(self.views)))) + ridge * _inner(along, along)
+
+    def left(self, offsets: Tensor, finished: Sequence[Tensor]) -> float:
+        """Mean absolute difference from the finished edit. [M,B,3]"""
+
+        def look(pair: tuple[ColorView, Tensor]) -> float:
+            view, target = pair
+            return float(l1(view.picture(view.colors(offsets)).clamp(0.0, 1.0), target))
+
+        found = _map_threads(look, list(zip(self.views, finished, strict=True)))
+        return sum(found) / len(found)
+
+
+def make_solver(crops: Sequence[CropScene], original: Tensor) -> Solver:
+    """The views, prepared."""
+    views = color_views(crops, original)
+    ones = torch.ones(len(original), 3)
+
+    def weigh(view: ColorView) -> Tensor:
+        return view.basis[:, :4].square() * view.map.gradient(view.map.picture(ones))[:, :1]
+
+    weights = torch.stack(_map_threads(weigh, views)).sum(dim=0)[..., None]
+    return Solver(views, member_bands(original), weights, fit_maps(views))
+
+
+def choose_model(
+    solver: Solver,
+    judge: Judge,
+    targets: Sequence[Tensor],
+    steps: int,
+    most_bands: int,
+    tell: Callable[[], None],
+) -> Model:
+    """The smallest model of which a larger one would take away less than a twentieth of the error.
+
+    Args:
+        solver: the views
+        judge: views that are not solved for
+        targets: the finished edit in the solver's views
+        steps: most steps of conjugate gradients for a residual
+        most_bands: that a residual may have: 1 or 4
+        tell: called between rounds
+    """
+    tried: list[tuple[str, float]] = []
+    mapped, errors = {}, {}
+    for degree in MONOMIALS:
+        mapped[degree] = solver.map_offsets(degree, solver.table(degree, targets))
+        errors[degree] = judge.error(mapped[degree])
+        tried.append((f"map of degree {degree}", errors[degree]))
+    degree = min(d for d in errors if MORE_PAYS * errors[d] <= min(errors.values()))
+    least = errors[degree]
+    residual = least_residual = torch.zeros(len(solver.sh), 0, 3)
+    for more in (1, 4)[: 1 + (most_bands > 1 and solver.sh.shape[1] > 1)]:
+        wider = torch.cat([residual, torch.zeros(len(residual), more - residual.shape[1], 3)], dim=1)
+        residual = solver.residual(mapped[degree], wider, targets, steps, tell)
+        error = judge.error(add_bands(mapped[degree], residual))
+        tried.append((f"with a residual of {more}", error))
+        if error < MORE_PAYS * least:
+            least_residual, least = residual, error
+    floor = Judge(solver.views, targets).squared_error(add_bands(mapped[degree], least_residual))
+    return Model(degree, least_residual, floor, [(name, decibels(error)) for name, error in tried])
+
+
+def _inner(a: Tensor, b: Tensor) -> float:
+    return float((a * b).double().sum())
+
+
+def add_bands(offsets: Tensor, residual: Tensor) -> Tensor:
+    """Offsets with a residual of their lowest bands added. [M,B,3], [M,b,3] -> [M,B,3]"""
+    total = offsets.clone()
+    total[:, : residual.shape[1]] += residual
+    return total
 
 
 def iterations(steps: int) -> int:
-    """Over all views, for `--steps` of one view each; few steps are not to stop far from the answer."""
-    return max(1, round(steps / STEPS_OF_OTHERS), min(HURRIED, round(steps / HURRIED_STEPS)))
-
-
-def make_solver(crops: Sequence[CropScene], original: Tensor, trained_bands: bool) -> Solver:
-    """The views, prepared. `trained_bands`: whether colors may change with the direction otherwise."""
-    members = unpack(original, crops[0].member_shN)
-    bands = 1 + (min(members.shN.shape[1], 15) if trained_bands else 0)
-    views = [color_view(crop, original, bands) for crop in crops]
-
-    def weigh(view: ColorView) -> Tensor:
-        ones = torch.ones(view.map.count, 3)
-        weight = view.map.gradient(view.map.picture(ones))[:, :1]
-        # (Σ a)² ≤ 2 a0² + 2 (Σ others)²: DC is not slowed down by the number of bands
-        size = view.basis.abs()
-        others = size[:, 1:].sum(dim=1, keepdim=True)
-        bound = torch.cat([size[:, :1].square(), size[:, 1:] * others], dim=1) * (2.0 if bands > 1 else 1.0)
-        return bound * weight
-
-    weights = torch.stack(_map_threads(weigh, views)).sum(dim=0)[..., None]
-    return Solver(views, weights, members.shN[:, : bands - 1], members.sh0)
+    """Most steps of conjugate gradients for `--steps` of one view each."""
+    return max(1, round(steps / STEPS_OF_OTHERS))
 
 
 def solve(
     original: Tensor,
     solver: Solver,
+    model: Model,
     stages: Sequence[TargetStage],
     state: PgsState,
     on_step: OnStep,
-    unseen_members: UnseenMembers | None = None,
+    steps: int,
 ) -> Iterator[ParameterSnapshot]:
-    """Solve for the stages in turn, each from where the last one ended, and yield each one's end.
+    """Solve for the stages in turn and yield each one's end, with its map.
 
     Args:
         original: raw member rows, packed. [M,C]
         solver: the views
-        stages: strengths ascending; a stage's steps are its iterations
-        state: where to go on from, changed in place; a step is an iteration over all views
+        model: how much is modelled
+        stages: strengths ascending
+        state: where to go on from, changed in place; a step is a stage
         on_step: progress; here, and only here, the state is whole and may be saved
-        unseen_members: members that no view shows; tied to those that they follow at every step, they cost
-            the views nothing afterwards (the demo's room in another tint, PSNR where no view looks: 17.2 dB
-            without them, 42.7 with them)
+        steps: most steps of conjugate gradients of a stage
 
     Raises:
-        FloatingPointError: the loss or where it leads is not finite; the state is that of the step before.
+        FloatingPointError: the loss or where it leads is not finite; the state is that of the stage before.
     """
-    columns = color_columns(original.shape[1], solver.weights.shape[1])
-    finished = stages[-1].targets
+    finished, last = stages[-1].targets, None
     for index in range(state.stage, len(stages)):
-        stage = stages[index]
-        while state.local < stage.steps:
-            moved = state.moved.detach()[:, columns].reshape(len(original), -1, 3)
-            before = state.previous[:, columns].reshape(len(original), -1, 3)
-            ahead = moved + (moved - before) * (state.local / (state.local + 3.0))
-            offsets, squared, state.running = solver.step(ahead, stage.targets, finished)
-            if not math.isfinite(squared) or not math.isfinite(float(offsets.sum())):
-                raise FloatingPointError(f"the loss is {squared} at step {state.step}")
-            state.previous.copy_(state.moved.detach())
-            with torch.no_grad():
-                state.moved[:, columns] = offsets.flatten(1)
-                if unseen_members is not None:
-                    state.moved.copy_(unseen_members.propagate(state.moved.detach()))
-            state.means.add({"l2": squared, "left": state.running})
-            state.step, state.local = state.step + 1, state.local + 1
-            state.average.copy_(state.moved.detach())
-            if state.local == stage.steps:
-                state.recorded += 1
-                yield ParameterSnapshot(state.step, index, True, state.average.clone(), state.means.read())
-            on_step(state.step, state.running)
+        targets = stages[index].targets
+        table = solver.table(model.degree, targets)
+        mapped = solver.map_offsets(model.degree, table)
+        offsets = mapped
+        if model.bands:
+            start, before = torch.zeros_like(model.residual), 0.0
+            if index:
+                before = stages[index - 1].strength
+                if last is None:
+                    earlier = solver.table(model.degree, stages[index - 1].targets)
+                    last = solver.map_offsets(model.degree, earlier)
+                start = (member_bands(state.moved.detach()) - last)[:, : model.bands]
+            share = (stages[index].strength - before) / (stages[-1].strength - before)
+            start = torch.lerp(start, model.residual, share)
+            residual = solver.residual(
+                mapped, start, targets, steps, lambda: on_step(state.step, state.running), model.floor
+            )
+            offsets = add_bands(mapped, residual)
+        last = mapped
+        left = solver.left(offsets, finished)
+        if not math.isfinite(left) or not bool(offsets.isfinite().all()):
+            raise FloatingPointError(f"the loss is {left} at step {state.step}")
+        state.previous.copy_(state.moved.detach())
+        with torch.no_grad():
+            state.moved.copy_(band_offsets(offsets, original.shape[1]))
+        state.average.copy_(state.moved.detach())
+        state.running = left
+        state.means.add({"l2": Judge(solver.views, targets).error(offsets), "left": left})
+        state.step, state.recorded = state.step + 1, state.recorded + 1
         state.stage, state.local = index + 1, 0
+        yield ParameterSnapshot(state.step, index, True, state.average.clone(), state.means.read(), table)
+        on_step(state.step, state.running)
 
 
 def color_columns(channels: int, bands: int) -> Tensor:
-    """Where DC and the trained bands are in a packed row. [3·B] int64"""
+    """Where DC and the lowest bands are in a packed row. [3·B] int64"""
     slices = attribute_slices(channels)
     dc = torch.arange(channels)[slices["sh0"]]
     higher = torch.arange(channels)[slices["shN"]][: 3 * (bands - 1)] if bands > 1 else dc[:0]

@@ -274,6 +274,7 @@ class ParameterSnapshot:
     # since the last recording: each loss term, weighted, over the steps that paid for it, and "left", the L1
     # distance from the finished edit
     means: Mapping[str, float]
+    table: Tensor | None = None  # the map of color at a stage's end, where there is one. [K,3]
 
 
 Renewal = Callable[[int, int, float, Tensor], Sequence[Tensor] | None]

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from progdf.compose.reference import Layer, compose_layers
 from progdf.errors import ProgdfError
-from progdf.field.baked import identity_remap
+from progdf.field.baked import GradeForm, identity_remap
 from progdf.field.trajectory import Trajectory, load_trajectory
 from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians, pack
 from progdf.gdf.file import Gdf, fingerprint, load_gdf, save_gdf
@@ -21,7 +21,7 @@ from progdf.io.json_values import convert_json, decode_json, plain
 from progdf.terminal import file_size, format_count
 from trainer.editors.pictures import picture_background
 from trainer.fit.evaluate import Evaluator, make_evaluator
-from trainer.fit.fit import Fitted, evaluate_field, expected_looks, fit_field, visibility
+from trainer.fit.fit import Fitted, evaluate_field, expected_looks, fit_field, fit_grades, visibility
 from trainer.fit.network import NetworkFit, fit_network
 from trainer.fit.slider_uniformity import equalize_slider
 from trainer.optimize.losses import Perceptual, perceptual_loss
@@ -90,6 +90,8 @@ def finish_run(
         field, remap = fitted.chosen.field, identity_remap()
         if slider == "even":
             field, remap = equalize_slider(field, setup, log)
+        if isinstance(field.origin, GradeForm):  # its end is what its file says, not what was recorded
+            trajectory = replace(trajectory, end=field.offsets(1.0))
         shipped = replace(trajectory, s=remap(trajectory.s).float())
     log.say(
         f"{fitted.chosen.label}, {fitted.why}: "
@@ -172,6 +174,10 @@ def _fit(
         return evaluate_field(trajectory, reporting, network.field, options.target_psnr), network
     with log.looks("fit the field", expected_looks(trajectory, options.field)) as looked:
         seen, choosing, reporting = (replace(some, looked=looked) for some in (seen, choosing, reporting))
+        if trajectory.maps is not None and options.field == "auto":
+            scene = setup.scene[setup.region.members]
+            rows = pack(scene, with_shN=scene.sh_degree > 0)
+            return fit_grades(trajectory, rows, choosing, reporting, weights, options), None
         return fit_field(trajectory, seen, choosing, reporting, weights, options), None
 
 
@@ -191,7 +197,7 @@ def _measure_paint(
 
 def _record_figures(record: RunRecord) -> dict[str, Any]:
     """What the report repeats of the recording."""
-    names = ("objective", "losses", "kind", "kind_trial", "agreement", "followed", "up")
+    names = ("objective", "losses", "kind", "kind_trial", "agreement", "up")
     return {**{name: getattr(record, name) for name in names}, "pictures": dict(record.pictures)}
 
 

@@ -43,7 +43,6 @@ class RunRecord:
     losses: Mapping[str, Sequence[float | None]]  # see `Losses`
     attribute_worth_db: Mapping[str, float]  # what the edit would lose without each attribute, dB
     agreement: Mapping[str, Any] | None  # whether the edited views agree, where that was measured
-    followed: int  # members that took their colors from others
     up: Mapping[str, Any] | None  # the axis that is up, and why
     pictures: Mapping[str, str] = field(default_factory=dict)  # changed pictures, and their hashes
 
@@ -95,7 +94,6 @@ def upgrade_plan(plan: Mapping[str, Any]) -> Mapping[str, Any]:
             "color_solver": refinements["solves"],
             "ema": refinements["averages"],
             "target_ramp": refinements["ramps"],
-            "propagation": refinements["propagates"],
         },
         "field": field
         | {

@@ -27,7 +27,6 @@ from trainer.fit.network import PART as NETWORK
 from trainer.fit.slider_uniformity import equalized_strengths
 from trainer.optimize.losses import Perceptual, describe_loss, perceptual_loss
 from trainer.optimize.retime import resolve_slider
-from trainer.optimize.unseen import unseen_members_of
 from trainer.options import EditKind, EditorOptions, OptimizeOptions, TrainOptions
 from trainer.regions.from_pictures import RegionRequest, region_checks, region_kinds
 from trainer.report.agreement import Agreement, measure_agreement
@@ -273,7 +272,7 @@ def _run_training(
         with log.stage("agree"):
             agreement = _agreement(options, setup, edited, approach.kind, log)
         optimization = resolve_kind(options, approach.kind, approach.group_steps)
-        trajectory, outcome = _record(options, optimization, setup, train_edits, perceptual, folder, log)
+        trajectory, outcome = _record(options, optimization, setup, edited, perceptual, folder, log)
         record = RunRecord(
             recorded_options(options),
             options.scene.resolve(),
@@ -394,7 +393,6 @@ def _record(
         log.say(f"--group-steps: without effect on this {optimization.kind} edit, whose loss is {objective}")
     with log.stage("optimize"):
         renewal = reedit(options.editor, setup, optimization, folder, log)
-        followers = unseen_members_of(setup, optimization) if optimization.propagation else None
         trajectory, losses = optimize_members(
             options,
             optimization,
@@ -404,7 +402,6 @@ def _record(
             folder.state,
             log,
             renewal=renewal,
-            unseen_members=followers,
         )
     with log.stage("retime"):
         costs: dict[str, float] = {}
@@ -424,12 +421,10 @@ def _record(
     )
     if reason:
         log.say(f"between original and edit: {reason}")
-    followed = len(followers.places) if followers is not None else 0
     return trajectory, {
         "objective": objective,
         "losses": losses,
         "attribute_worth_db": costs,
-        "followed": followed,
     }
 
 

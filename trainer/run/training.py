@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 
@@ -17,7 +17,16 @@ from progdf.gaussians import BASE_CHANNELS, pack
 from progdf.io.json_values import convert_json
 from progdf.scene.bounds import scene_sphere
 from trainer.fit.network import JointTraining, begin_joint_training, save_network
-from trainer.optimize.color_solver import iterations, make_solver, solve
+from trainer.optimize.color_solver import (
+    Judge,
+    Model,
+    Solver,
+    choose_model,
+    color_views,
+    iterations,
+    make_solver,
+    solve,
+)
 from trainer.optimize.groups import Groups, group_path, group_stage, restore_groups
 from trainer.optimize.losses import Losses, Objective, Perceptual, erode, loss_table
 from trainer.optimize.pgs import (
@@ -31,13 +40,13 @@ from trainer.optimize.pgs import (
 )
 from trainer.optimize.retime import record, resolve_slider, retime, select_recordings, straight_recordings
 from trainer.optimize.solve_pictures import RECORDINGS, make_picture_solver, solve_pictures
-from trainer.optimize.unseen import NEEDED, UnseenMembers, view_dependence
 from trainer.options import OptimizeOptions, TrainOptions
 from trainer.setup import Pictures, TrainingSetup, probe_views
 from trainer.store.progress import RunLog
 from trainer.store.state import PeriodicSave, Resumable, Saved, StateFolder, defer_signals
-from trainer.views.crops import COLORS, CropScene, crop_scene, moving_attributes, only_recolors, render_all
-from trainer.views.view import crop
+from trainer.views.choose import split_held_out
+from trainer.views.crops import CropScene, crop_scene, moving_attributes, only_recolors, render_all
+from trainer.views.view import View, crop
 
 
 class _RecordingValues(msgspec.Struct):
@@ -59,6 +68,7 @@ class SavedSnapshot:
     ends_stage: bool
     offsets: Tensor  # of the members, in half precision. [M,C] float16
     means: Mapping[str, float]
+    table: Tensor | None = None
 
 
 class Recordings:
@@ -77,7 +87,9 @@ class Recordings:
         """Keep one."""
         offsets = snapshot.offsets.half()
         self.made.append(
-            SavedSnapshot(snapshot.step, snapshot.stage, snapshot.ends_stage, offsets, snapshot.means)
+            SavedSnapshot(
+                snapshot.step, snapshot.stage, snapshot.ends_stage, offsets, snapshot.means, snapshot.table
+            )
         )
 
     def capture_state(self) -> Saved:
@@ -85,9 +97,10 @@ class Recordings:
         for index in range(self._written, len(self.made)):
             snapshot = self.made[index]
             values = {"step": snapshot.step, "stage": snapshot.stage, "ends_stage": snapshot.ends_stage}
-            self._folder.save(
-                "recordings", {"offsets": snapshot.offsets}, values | {"means": snapshot.means}, index
-            )
+            tensors = {"offsets": snapshot.offsets}
+            if snapshot.table is not None:
+                tensors["table"] = snapshot.table
+            self._folder.save("recordings", tensors, values | {"means": snapshot.means}, index)
         self._written = len(self.made)
         return Saved({}, {"count": self._written})
 
@@ -103,7 +116,8 @@ class Recordings:
         values, offsets = convert_json(saved.values, _RecordingValues), saved.tensors["offsets"]
         if offsets.shape != self._shape or offsets.dtype != torch.float16:
             raise ValueError("a recording is of other members")
-        return SavedSnapshot(values.step, values.stage, values.ends_stage, offsets, values.means)
+        table = saved.tensors.get("table")
+        return SavedSnapshot(values.step, values.stage, values.ends_stage, offsets, values.means, table)
 
 
 PART = "training"
@@ -125,7 +139,6 @@ def optimize_members(
     folder: StateFolder,
     log: RunLog,
     renewal: Renewal | None = None,
-    unseen_members: UnseenMembers | None = None,
 ) -> tuple[Trajectory, Losses]:
     """Optimize the members, from the beginning or from the saved state.
 
@@ -138,7 +151,6 @@ def optimize_members(
         folder: where the state is saved
         log: of the run
         renewal: see `pgs.Renewal`
-        unseen_members: members that take their colors from others
 
     Returns:
         The trajectory, even in time; mean of every loss term, and what is left to the edit, per recording
@@ -148,7 +160,7 @@ def optimize_members(
         KeyboardInterrupt: interrupted; the state is saved.
     """
     scene, members, solver = setup.scene, setup.region.members, optimization.solver
-    bands = _trains_bands(optimization, setup, log)
+    bands = optimization.sh != "off"
     original = pack(scene[members], with_shN=scene.sh_degree > 0)
     still = optimization.kind == "color" and optimization.rates == "kind"
     crops = [crop_scene(scene, members, v.camera, v.box, setup.background, still) for v in setup.train]
@@ -160,6 +172,7 @@ def optimize_members(
     settings = pgs_settings(optimization, bands, original.shape[1], extent, len(stages))
     state, recordings = PgsState(original, settings.seed), Recordings(folder, original.shape)
     way: Way
+    model: Model | None = None
     if solver == "pictures":
         with log.stage("weights"):
             pictures = make_picture_solver(scene, members, crops, original, bands)
@@ -167,8 +180,11 @@ def optimize_members(
         way = partial(solve_pictures, original, pictures, stages, state)
     elif solver == "colors":
         with log.stage("weights"):
-            colors = make_solver(crops, original, bands and original.shape[1] > BASE_CHANNELS)
-        way = partial(solve, original, colors, stages, state, unseen_members=unseen_members)
+            colors = make_solver(crops, original)
+        with log.stage("model"):
+            model = _choose_model(colors, crops, stages, optimization, setup, edited, original, log)
+        most = iterations(optimization.steps)
+        way = partial(solve, original, colors, model, stages, state, steps=most)
     else:
         inside = [erode(crop(view.mask, view.box)) for view in setup.train]
         objective, probes = Objective(perceptual, optimization, inside), probe_views(setup)
@@ -186,30 +202,63 @@ def optimize_members(
     log.say(f"the state was saved {saver.saves} times, in {saver.seconds:.2f} s")
     end = stages[-1].place(state.average).clone()
     snapshots = [(made.step, made.stage, made.ends_stage, made.offsets) for made in recordings.made]
-    if unseen_members is not None and len(unseen_members.places):
-        follow = solver == "colors" or is_no_worse(unseen_members, end, original, crops, stages)
-        if follow and solver != "colors":
-            snapshots = [(a, b, c, unseen_members.propagate(made)) for a, b, c, made in snapshots]
-            end = unseen_members.propagate(end)
-        log.say(_unseen_line(len(unseen_members.places), follow))
     if groups is not None:
         ends = [made for made in recordings.made if made.ends_stage]
         offsets = [*(made.offsets.float() for made in ends[:-1]), end]
         snapshots = group_path(original, groups, offsets, [made.step for made in ends], settings.snapshots)
     losses = loss_table([(made.step, made.means) for made in recordings.made])
-    return record(snapshots, end, list(edited)), losses
+    trajectory = record(snapshots, end, list(edited))
+    if model is not None:
+        maps = torch.stack([made.table for made in recordings.made if made.table is not None])
+        trajectory = replace(trajectory, maps=maps, bands=model.bands)
+    return trajectory, losses
 
 
 def _stages(optimization: OptimizeOptions, setup: TrainingSetup, edited: Pictures) -> list[TargetStage]:
     """The strengths to optimize towards, and the steps that each gets."""
-    steps = iterations(optimization.steps) if optimization.solver == "colors" else optimization.steps
-    steps = max(steps, len(edited) + 1)  # each stage is to have one
+    steps = max(optimization.steps, len(edited) + 1)  # each stage is to have one
+    if optimization.solver == "colors":
+        return [TargetStage(s, _boxes(pictures, setup.train), 1) for s, pictures in edited.items()]
     if optimization.solver == "pictures":
         steps = max(RECORDINGS, 2 * len(edited))
     return [
-        TargetStage(s, [crop(p, v.box) for p, v in zip(pictures, setup.train, strict=True)], steps)
+        TargetStage(s, _boxes(pictures, setup.train), steps)
         for (s, pictures), steps in zip(edited.items(), _steps_by_stage(steps, len(edited)), strict=True)
     ]
+
+
+def _boxes(pictures: Sequence[Tensor], views: Sequence[View]) -> list[Tensor]:
+    return [crop(picture, view.box) for picture, view in zip(pictures, views, strict=False)]
+
+
+def _choose_model(
+    solver: Solver,
+    crops: Sequence[CropScene],
+    stages: Sequence[TargetStage],
+    optimization: OptimizeOptions,
+    setup: TrainingSetup,
+    edited: Pictures,
+    original: Tensor,
+    log: RunLog,
+) -> Model:
+    """How much of the edit is modelled, found on views that are held out, or on all where none are."""
+    judge = Judge(solver.views, stages[-1].targets)
+    views = split_held_out(setup.held_out)[0]
+    pictures = split_held_out(edited[max(edited)][len(setup.train) :])[0]
+    if views and pictures:
+        made = [
+            crop_scene(setup.scene, setup.region.members, v.camera, v.box, setup.background, True)
+            for v in views
+        ]
+        judge = Judge(color_views(made, original), _boxes(pictures, views))
+    most_bands = 1 if optimization.sh == "off" else 4
+    model = choose_model(solver, judge, stages[-1].targets, iterations(optimization.steps), most_bands, _wait)
+    log.say(f"{model.line}, on {'views that are held out' if views else 'all views, as none is held out'}")
+    return model
+
+
+def _wait() -> None:
+    """Nothing to tell: a model is chosen within seconds."""
 
 
 def _record_way(
@@ -255,45 +304,6 @@ def _record_way(
     if joint is not None:
         save_network(joint, folder)
     return saver
-
-
-def _unseen_line(count: int, follow: bool) -> str:
-    """What becomes of the members that no view shows, for the log."""
-    if follow:
-        return f"{count} members that no view shows follow their neighbors"
-    return (
-        f"{count} members that hardly show keep what they learned: "
-        "following their neighbors would take the training views away from the edit"
-    )
-
-
-def is_no_worse(
-    unseen_members: UnseenMembers,
-    end: Tensor,
-    original: Tensor,
-    crops: Sequence[CropScene],
-    stages: Sequence[TargetStage],
-) -> bool:
-    """Whether the training views stay as near to the finished edit as they are, to a hundredth."""
-
-    def error(offsets: Tensor) -> float:
-        pairs = zip(render_all(crops, original + offsets, COLORS), stages[-1].targets, strict=True)
-        return sum(float((picture - target).square().sum()) for picture, target in pairs)
-
-    return error(unseen_members.propagate(end)) <= 1.01 * error(end)
-
-
-def _trains_bands(optimization: OptimizeOptions, setup: TrainingSetup, log: RunLog) -> bool:
-    """Whether the SH bands beyond DC are trained: a color edit trains them where the region's own show."""
-    if optimization.sh != "auto" or setup.scene.sh_degree == 0 or optimization.solver == "pictures":
-        return optimization.sh != "off"
-    change = view_dependence(setup.scene[setup.region.members], [view.camera for view in setup.train])
-    needed = change >= NEEDED
-    log.say(
-        f"the region's colors change with the view by {change:.3f} of 1: "
-        f"the SH bands beyond DC are {'trained' if needed else 'left as they are'} ({NEEDED:g} is needed)"
-    )
-    return needed
 
 
 def _groups(

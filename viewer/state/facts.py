@@ -16,6 +16,7 @@ from torch import Tensor
 
 from progdf.compose.layers import KINDS
 from progdf.errors import ProgdfError
+from progdf.field.baked import GradeForm
 from progdf.field.trajectory import FILE_NAME, load_trajectory, peek_trajectory, recorded_field
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
@@ -155,13 +156,16 @@ def find_recording(gdf: Gdf, path: Path) -> RecordingFile:
     beside = path.with_name(FILE_NAME)
     if not beside.is_file():
         return RecordingFile(reason=f"there is no {FILE_NAME} beside {path.name}")
+    field, form = gdf.field, gdf.field.origin
     try:
-        end, members = peek_trajectory(beside)
+        recorded, members = peek_trajectory(beside, isinstance(form, GradeForm))
     except ProgdfError as error:
         return RecordingFile(reason=str(error))
-    field = gdf.field
-    same_end = torch.equal(end, field.offsets(1.0)) if field.attributes else not bool(end.any())
-    if not same_end or not torch.equal(members, gdf.region.members):
+    if isinstance(form, GradeForm):
+        same = torch.equal(recorded, form.table[1:])
+    else:
+        same = torch.equal(recorded, field.offsets(1.0)) if field.attributes else not bool(recorded.any())
+    if not same or not torch.equal(members, gdf.region.members):
         return RecordingFile(reason=f"the {FILE_NAME} beside {path.name} belongs to another edit")
     return RecordingFile(beside)
 

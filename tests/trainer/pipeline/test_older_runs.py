@@ -97,7 +97,7 @@ def test_a_plan_of_an_earlier_version_is_read_with_all_its_values(printed: bool)
         True,
     )
     assert plan.optimize.as_printed == plan.field.as_printed == printed
-    assert plan.optimize.ema == plan.optimize.propagation == (not printed)
+    assert plan.optimize.ema == (not printed)
 
 
 def test_a_plan_of_this_version_stays_as_it_is() -> None:

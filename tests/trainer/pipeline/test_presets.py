@@ -57,7 +57,6 @@ def test_a_preset_is_its_values_and_no_more(preset: Preset) -> None:
 @pytest.mark.parametrize("preset", [name for name in PRESETS if name != "default"])
 def test_each_value_of_a_preset_could_be_given_on_the_command_line(preset: Preset) -> None:
     fixed = {"rates", "perceptual_every", "sharpness", "as_printed", "color_solver", "ema", "target_ramp"}
-    fixed |= {"propagation"}
     values = {name: value for part in PRESETS[preset].values() for name, value in part.items()}
     words = [w for n, v in values.items() if n not in fixed for w in (f"--{n.replace('_', '-')}", str(v))]
     assert with_values(asked(*words), **{n: values[n] for n in fixed}, preset=preset) == asked(

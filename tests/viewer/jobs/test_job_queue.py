@@ -12,7 +12,7 @@ import pytest
 
 from progdf.errors import ProgdfError
 from progdf.formats.ply import save_ply
-from progdf.gdf.file import load_gdf
+from progdf.gdf.file import read_gdf
 from progdf.io.atomic import LOCK, LockedError, hold_lock
 from tests.helpers.count import Count
 from tests.helpers.demo_scenes import bear
@@ -115,7 +115,7 @@ def test_runs_train_in_turn_and_a_failure_is_one_line(scene: Path, monkeypatch: 
     assert failed.error.startswith("region 'sphere:99,99,99,1' holds no Gaussian")
     assert done.number == number
     assert done.status == "done"
-    assert load_gdf(done.task.result).name == "blue"
+    assert read_gdf(done.task.result).name == "blue"
     queue.discard(failed.number)
     assert not failed.task.out.with_name("nowhere.train.json").exists()
     queue.close()

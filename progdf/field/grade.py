@@ -1,0 +1,230 @@
+"""The grade field: one map of color for the whole region, and a small residual by Gaussian.
+
+For each knot of the slider the map is a polynomial of the drawn color q = clamp(SH color, 0, 1.5):
+color' = Σ_k c_k m_k(q), with m_k the monomials up to the degree. It is held as spherical harmonics of the
+members, which are computed from the scene's own when the field is loaded, so that a file keeps some hundred
+numbers and whatever draws Gaussians draws it. What a map cannot say of single Gaussians is a residual of
+their lowest bands, of a few int8 bases.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import cache
+
+import torch
+from torch import Tensor
+
+from progdf.gaussians import attribute_slices
+from progdf.sh import C0, basis
+
+from .baked import BakedField, GradeForm, identity_map, identity_remap, remap_slider
+from .separable import fit_amplitude, fit_separable, moving_attributes, principal_modes, quantize_bases
+
+MOST_COLOR = 1.5
+"""Colors above this, which no screen shows, are mapped as this."""
+
+_DIRECTIONS = 48  # in which a member's color is mapped; three times the functions of three bands
+_CLAMP_ROUNDS = 12  # of alternating projection, for members with colors below 0
+_CHUNK = 1 << 14  # members at once
+_TOLERANCE = 0.003  # root mean square that factoring the mapped colors in memory may cost, as a share
+_MOST_RANK = 8
+MOST_RESIDUALS = 4
+"""Bases of a residual that are tried."""
+_WITHIN = 0.999  # share of the members whose residual is reached: few must not take the levels of all
+
+
+def monomials(colors: Tensor, degree: int) -> Tensor:
+    """The monomials of colors up to a degree, 1 first. [...,3] -> [...,K]"""
+    red, green, blue = colors.unbind(-1)
+    terms = [torch.ones_like(red), red, green, blue]
+    if degree >= 2:
+        terms += [red * red, green * green, blue * blue, red * green, green * blue, blue * red]
+    if degree >= 3:
+        terms += [red**3, green**3, blue**3, red * red * green, red * red * blue, green * green * red]
+        terms += [green * green * blue, blue * blue * red, blue * blue * green, red * green * blue]
+    return torch.stack(terms, dim=-1)
+
+
+@cache
+def _sphere(degree: int) -> tuple[Tensor, Tensor]:
+    """Values of the bands in even directions of the sphere, and their least squares. [D,B], [B,D] float32"""
+    index = torch.arange(_DIRECTIONS, dtype=torch.float64) + 0.5
+    z, angle = 1 - 2 * index / _DIRECTIONS, math.pi * (1 + math.sqrt(5)) * index
+    radius = (1 - z * z).sqrt()
+    values = basis(degree, torch.stack([radius * angle.cos(), radius * angle.sin(), z], dim=1))
+    return values.float(), torch.linalg.pinv(values).float()
+
+
+def map_colors(sh: Tensor, table: Tensor, degree: int) -> Tensor:
+    """Spherical harmonics that show, from everywhere, what a map makes of the colors that they showed.
+
+    What is drawn is clamped at 0, so a color that is to be black may be anything below: members whose colors
+    go below 0 are found by alternating projections. With the identity they stay as they are, bit for bit.
+
+    Args:
+        sh: of M members, B bands. [M,B,3]
+        table: the map. [K,3]
+        degree: of the map
+
+    Returns:
+        [M,B,3]
+    """
+    bands = sh.shape[1]
+    if torch.equal(table, identity_map(degree)):
+        return sh.clone()
+    if bands == 1:
+        colors = sh[:, 0] * C0 + 0.5
+        mapped = _map_drawn(colors, table, degree)
+        hidden = (mapped <= 0.0) & (colors <= 0.0)
+        return torch.where(hidden, sh[:, 0], (mapped - 0.5) / C0)[:, None]
+    values, inverse = _sphere(math.isqrt(bands) - 1)
+    channels = sh.mT.reshape(-1, bands)
+    count = 3 * _CHUNK
+    chunks: tuple[Tensor, ...] = torch.split(channels, count)
+    made = [_map_chunk(chunk, table, degree, values, inverse) for chunk in chunks]
+    return torch.cat(made).reshape(-1, 3, bands).mT.contiguous()
+
+
+def _map_drawn(colors: Tensor, table: Tensor, degree: int) -> Tensor:
+    """What the map makes of colors; the part above `MOST_COLOR` stays. [...,3] -> [...,3]"""
+    shown = colors.clamp(0.0, MOST_COLOR)
+    return monomials(shown, degree) @ table + (colors - MOST_COLOR).clamp_min(0.0)
+
+
+def _map_chunk(sh: Tensor, table: Tensor, degree: int, values: Tensor, inverse: Tensor) -> Tensor:
+    """`map_colors` of members whose channels lie one after another. [3M,B] -> [3M,B]"""
+    colors = sh @ values.T + 0.5
+    mapped = _map_drawn(colors.reshape(-1, 3, colors.shape[1]).mT, table, degree).mT.reshape(colors.shape)
+    made = sh + (mapped - colors.clamp_min(0.0)) @ inverse.T
+    clamped = (colors.amin(dim=1) < 0.0) | (mapped.amin(dim=1) < 0.0)
+    some, target = made[clamped], mapped[clamped]
+    dark = target <= 0.0
+    for _ in range(_CLAMP_ROUNDS if len(some) else 0):
+        now = some @ values.T + 0.5
+        some = some + (target - now).masked_fill_(dark & (now <= 0.0), 0.0) @ inverse.T
+    made[clamped] = some
+    return made
+
+
+def member_bands(rows: Tensor) -> Tensor:
+    """The bands of packed rows that are drawn. [M,14+3K] -> [M,B,3]"""
+    slices = attribute_slices(rows.shape[1])
+    bands = [rows[:, slices["sh0"]].reshape(-1, 1, 3)]
+    if "shN" in slices:
+        higher = rows[:, slices["shN"]].reshape(len(rows), -1, 3)
+        bands.append(higher[:, :15])
+    return torch.cat(bands, dim=1)
+
+
+def band_offsets(change: Tensor, channels: int) -> Tensor:
+    """A change of the lowest bands as packed offsets. [M,B,3] -> [M,channels]"""
+    slices = attribute_slices(channels)
+    offsets = torch.zeros(len(change), channels)
+    offsets[:, slices["sh0"]] = change[:, 0]
+    if change.shape[1] > 1:
+        first = slices["shN"].start
+        offsets[:, first : first + 3 * (change.shape[1] - 1)] = change[:, 1:].flatten(1)
+    return offsets
+
+
+def mapped_trajectory(degree: int, table: Tensor, rows: Tensor) -> Tensor:
+    """What the map alone does to the members at each knot. [S,K,3], [M,14+3K] -> [S,M,14+3K]"""
+    sh = member_bands(rows)
+    return torch.stack(
+        [band_offsets(map_colors(sh, at_knot, degree) - sh, rows.shape[1]) for at_knot in table]
+    )
+
+
+def residual_offsets(form: GradeForm, channels: int) -> Tensor:
+    """What the residual adds at each knot. [S,M,channels]"""
+    change = torch.einsum("sr,rmc->smc", form.coefficients, form.residual * form.scale[:, None])
+    bands = change.shape[2] // 3
+    return torch.stack([band_offsets(at_knot.reshape(-1, bands, 3), channels) for at_knot in change])
+
+
+def lowest_bands(offsets: Tensor, bands: int) -> Tensor:
+    """The columns of the lowest bands of packed offsets. [S,M,C] -> [S,M,3·bands]"""
+    slices = attribute_slices(offsets.shape[2])
+    columns = list(range(*slices["sh0"].indices(offsets.shape[2])))[: 3 * bands]
+    if bands > 1:
+        first = slices["shN"].start
+        columns += range(first, first + 3 * (bands - 1))
+    return offsets[:, :, columns]
+
+
+def bake_grade(form: GradeForm, rows: Tensor, mapped: Tensor | None = None) -> BakedField:
+    """The field that runs.
+
+    Args:
+        form: what a file keeps
+        rows: raw values of the members before the edit, packed. [M,14+3K]
+        mapped: see `mapped_trajectory`, where that is known
+
+    Raises:
+        ValueError: not as many Gaussians, or fewer bands than the residual has.
+    """
+    if len(rows) != form.members or form.residual.shape[2] // 3 > member_bands(rows).shape[1]:
+        raise ValueError(f"a grade of {form.members} members for {len(rows)} of {rows.shape[1]} numbers")
+    trajectory = mapped_trajectory(form.degree, form.table, rows) if mapped is None else mapped
+    if len(form.residual):
+        trajectory = trajectory + residual_offsets(form, rows.shape[1])
+    ranks = {
+        name: _rank(trajectory[:, :, columns]) for name, columns in moving_attributes(trajectory).items()
+    }
+    recorded = form.knots.tolist()
+    baked = fit_separable(form.knots, trajectory, ranks, recorded=recorded)
+    baked = replace(baked, kind="grade", origin=form)
+    return baked if form.remap.is_identity else remap_slider(baked, form.remap)
+
+
+def fit_grade(
+    knots: Tensor, degree: int, table: Tensor, course: Tensor, rank: int, weights: Tensor
+) -> GradeForm:
+    """A grade whose residual has so many bases.
+
+    Args:
+        knots: strengths, ascending from 0 to 1. [S]
+        degree: of the map
+        table: the map at each knot, the identity at the first. [S,K,3]
+        course: what the members' lowest bands need beside the map at each knot; 0 at the first. [S,M,3b]
+        rank: number of bases, at most `rank_limit`
+        weights: how much an error of each member shows, ≥ 0. [M]
+    """
+    root = weights.sqrt()[:, None]
+    reach = course.abs().amax(dim=0).kthvalue(max(1, math.ceil(_WITHIN * course.shape[1])), dim=0).values
+    course = course.clamp(-reach, reach)
+    rows = (course * root).flatten(1)
+    _, vectors = torch.linalg.eigh((rows @ rows.T).double())
+    mix = vectors.flip(1)[:, :rank].T.float()
+    exact = (mix @ course.flatten(1)).reshape(rank, *course.shape[1:])
+    levels, scale = quantize_bases(exact, torch.int8)
+    columns = (levels * scale[:, None] * root).flatten(1)
+    normal = (columns @ columns.T).double()
+    coefficients = (rows @ columns.T).double() @ torch.linalg.pinv(normal, rtol=1e-9, hermitian=True)
+    coefficients[0] = 0.0
+    return GradeForm(
+        degree,
+        knots.float(),
+        table.float(),
+        levels,
+        scale,
+        coefficients.float(),
+        identity_remap(),
+    )
+
+
+def rank_limit(course: Tensor) -> int:
+    """The most bases that say anything of a residual's course. [S,M,3b]"""
+    return min(len(course) - 1, MOST_RESIDUALS) if bool(course.any()) else 0
+
+
+def _rank(offsets: Tensor) -> int:
+    """The fewest bases by which an attribute's course is met to `_TOLERANCE`. [S,M,c]"""
+    fitted = fit_amplitude(offsets, torch.ones_like(offsets[0]))
+    allowed = _TOLERANCE**2 * float(fitted.offsets.double().square().sum())
+    power = torch.linalg.eigvalsh(fitted.gram).flip(0).clamp(min=0)
+    remaining = float(power.sum()) - power.cumsum(0)
+    needed = 0 if float(power.sum()) <= allowed else 1 + int((remaining > allowed).sum())
+    return min(needed, _MOST_RANK, principal_modes(fitted.gram)[0].shape[1])

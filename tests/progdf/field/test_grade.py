@@ -1,0 +1,212 @@
+"""A grade: one map of color for a region, beside it a small residual, and nothing else in the file."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from progdf.compose.reference import Layer, compose_layers
+from progdf.errors import ProgdfError
+from progdf.field.baked import MONOMIALS, GradeForm, SliderRemap, identity_map, identity_remap, remap_slider
+from progdf.field.grade import (
+    MOST_COLOR,
+    bake_grade,
+    band_offsets,
+    fit_grade,
+    lowest_bands,
+    map_colors,
+    mapped_trajectory,
+    member_bands,
+    monomials,
+)
+from progdf.gaussians import Gaussians, pack
+from progdf.gdf.file import load_gdf, read_gdf, save_gdf
+from progdf.sh import C0, basis
+from tests.helpers.edits import edit_of, some_rows
+from tests.helpers.scenes import random_gaussians
+
+KNOTS = torch.tensor([0.0, 0.4, 1.0])
+
+
+def some_table(degree: int, strength: float = 1.0, seed: int = 1) -> Tensor:
+    """A map that mixes the channels, and bends them where it can."""
+    draws = torch.Generator().manual_seed(seed)
+    return identity_map(degree) + strength * 0.2 * torch.randn(MONOMIALS[degree], 3, generator=draws)
+
+
+def some_form(rows: Tensor, degree: int = 2, bands: int = 1, rank: int = 2) -> GradeForm:
+    """A grade of these members with a residual that is drawn."""
+    draws = torch.Generator().manual_seed(4)
+    table = torch.stack([some_table(degree, float(s)) for s in KNOTS])
+    course = 0.1 * torch.randn(2, len(rows), 3 * bands, generator=draws)
+    course = torch.stack([torch.zeros_like(course[0]), 0.5 * course[0], course[1]])
+    return fit_grade(KNOTS, degree, table, course, rank, torch.ones(len(rows)))
+
+
+def directions(count: int = 300) -> Tensor:
+    return torch.nn.functional.normalize(
+        torch.randn(count, 3, generator=torch.Generator().manual_seed(7)), dim=1
+    )
+
+
+def drawn(sh: Tensor, toward: Tensor) -> Tensor:
+    """Colors from each direction, as they are drawn. [M,B,3], [D,3] -> [M,D,3]"""
+    values = basis(int(sh.shape[1] ** 0.5) - 1, toward)
+    return (torch.einsum("db,mbc->mdc", values, sh) + 0.5).clamp_min(0.0)
+
+
+@pytest.mark.parametrize("degree", MONOMIALS)
+@pytest.mark.parametrize("sh_degree", [0, 1, 2, 3])
+def test_the_map_that_changes_nothing_changes_no_bit(degree: int, sh_degree: int) -> None:
+    sh = member_bands(pack(random_gaussians(50, sh_degree=sh_degree), with_shN=sh_degree > 0))
+    assert torch.equal(map_colors(sh, identity_map(degree), degree), sh)
+    assert monomials(torch.rand(4, 5, 3), degree).shape == (4, 5, MONOMIALS[degree])
+
+
+@pytest.mark.parametrize("degree", MONOMIALS)
+def test_a_region_without_bands_is_mapped_exactly_as_it_is_drawn(degree: int) -> None:
+    sh = member_bands(pack(random_gaussians(200), with_shN=False))
+    table = some_table(degree)
+    colors = sh[:, 0] * C0 + 0.5
+    expected = monomials(colors.clamp(0.0, MOST_COLOR), degree) @ table + (colors - MOST_COLOR).clamp_min(0.0)
+    found = map_colors(sh, table, degree)[:, 0] * C0 + 0.5
+    torch.testing.assert_close(found.clamp_min(0.0), expected.clamp_min(0.0), atol=2e-6, rtol=0)
+
+
+@pytest.mark.parametrize("sh_degree", [1, 2, 3])
+def test_a_linear_map_of_colors_that_are_not_clamped_is_exact_from_everywhere(sh_degree: int) -> None:
+    sh = 0.1 * member_bands(pack(random_gaussians(80, sh_degree=sh_degree), with_shN=True))
+    table = torch.tensor([[0.1, 0.0, 0.05], [0.5, 0.2, 0.0], [0.1, 0.6, 0.1], [0.0, 0.1, 0.7]])
+    expected = monomials(drawn(sh, directions()), 1) @ table
+    found = drawn(map_colors(sh, table, 1), directions())
+    torch.testing.assert_close(found, expected, atol=2e-5, rtol=0)
+
+
+def test_colors_that_are_clamped_are_nearer_than_their_least_squares() -> None:
+    sh = member_bands(pack(random_gaussians(300, sh_degree=2), with_shN=True))
+    table, toward = some_table(1, 0.3), directions()
+    before = drawn(sh, toward)
+    assert float((before <= 0.0).float().mean()) > 0.05
+    bright = before.clamp_max(MOST_COLOR)
+    expected = (monomials(bright, 1) @ table + before - bright).clamp_min(0.0)
+    values = basis(2, toward)
+    plain = torch.stack([torch.linalg.lstsq(values, wanted - 0.5).solution for wanted in expected])
+    mapped = map_colors(sh, table, 1)
+    errors = [float((drawn(some, toward) - expected).square().mean()) for some in (mapped, plain)]
+    assert errors[0] < errors[1], errors
+
+
+@pytest.mark.parametrize("sh_degree", [0, 2])
+def test_a_file_gives_the_same_field_and_a_byte_a_number_of_the_residual(
+    tmp_path: Path, sh_degree: int
+) -> None:
+    scene = random_gaussians(400, sh_degree=sh_degree)
+    members = some_rows(scene, 150)
+    rows = pack(scene[members], with_shN=sh_degree > 0)
+    form = some_form(rows, bands=4 if sh_degree else 1)
+    field = bake_grade(form, rows)
+    gdf = edit_of(scene, members, field)
+    save_gdf(tmp_path / "edit.gdf", gdf)
+    again = load_gdf(tmp_path / "edit.gdf", scene)
+    assert again.field.kind == "grade"
+    assert field.bytes_per_member == 2 * 3 * (4 if sh_degree else 1)
+    for s in (0.0, 0.3, 0.7, 1.0):
+        assert torch.equal(again.field.offsets(s), field.offsets(s))
+    assert not bool(field.offsets(0.0).any())
+    stored = read_gdf(tmp_path / "edit.gdf").field.origin
+    assert isinstance(stored, GradeForm)
+    assert torch.equal(stored.residual, form.residual)
+    with pytest.raises(ProgdfError, match="keeps a grade field, which is baked on its scene"):
+        load_gdf(tmp_path / "edit.gdf")
+
+
+def test_both_ends_are_what_the_file_says(tmp_path: Path) -> None:
+    scene = random_gaussians(300, sh_degree=1)
+    members = some_rows(scene, 120)
+    rows = pack(scene[members], with_shN=True)
+    form = some_form(rows)
+    field = bake_grade(form, rows)
+    change = torch.einsum("r,rmc->mc", form.coefficients[-1], form.residual * form.scale[:, None])
+    mapped = map_colors(member_bands(rows), form.table[-1], 2) - member_bands(rows)
+    mapped[:, :1] += change[:, None]
+    assert torch.equal(field.offsets(1.0), band_offsets(mapped, rows.shape[1]))
+    edited = compose_layers(scene, [Layer(edit_of(scene, members, field), 0.0)])
+    assert torch.equal(edited.sh, scene.sh)
+
+
+def test_the_way_between_the_knots_is_that_of_the_map_and_its_residual() -> None:
+    rows = pack(random_gaussians(500, sh_degree=2), with_shN=True)
+    form = some_form(rows, bands=4)
+    field = bake_grade(form, rows)
+    expected = mapped_trajectory(2, form.table, rows)
+    expected = expected + torch.stack([field.offsets(float(s)) * 0 for s in KNOTS])
+    residual = torch.einsum("sr,rmc->smc", form.coefficients, form.residual * form.scale[:, None])
+    found = torch.stack([field.offsets(float(s)) for s in KNOTS])
+    wanted = expected + torch.stack([band_offsets(r.reshape(-1, 4, 3), rows.shape[1]) for r in residual])
+    error = float((found - wanted).square().mean().sqrt() / wanted.square().mean().sqrt())
+    assert error < 0.01
+
+
+def test_what_few_members_need_more_than_the_rest_does_not_take_their_levels() -> None:
+    members = 5000
+    course = torch.zeros(2, members, 3)
+    course[1] = 0.1 * torch.rand(members, 3, generator=torch.Generator().manual_seed(2))
+    course[1, :3] = 30.0
+    table = torch.stack([identity_map(1), some_table(1)])
+    form = fit_grade(torch.tensor([0.0, 1.0]), 1, table, course, 1, torch.ones(members))
+    found = form.coefficients[1, 0] * form.residual[0] * form.scale[0]
+    assert float((found[3:] - course[1, 3:]).abs().max()) < 0.001
+
+
+def test_the_residual_of_two_bands_is_read_from_its_columns() -> None:
+    offsets = torch.arange(2 * 5 * 38.0).reshape(2, 5, 38)
+    bands = torch.stack([member_bands(some) for some in offsets])
+    assert torch.equal(lowest_bands(offsets, 4), bands[:, :, :4].flatten(2))
+    assert lowest_bands(offsets, 0).shape == (2, 5, 0)
+
+
+def test_a_slider_that_is_laid_anew_is_kept_by_the_file(tmp_path: Path) -> None:
+    scene = random_gaussians(300)
+    members = some_rows(scene, 120)
+    rows = pack(scene[members], with_shN=False)
+    even = torch.tensor([0.0, 0.5, 1.0], dtype=torch.float64)
+    remap = SliderRemap(torch.tensor([0.0, 0.2, 1.0], dtype=torch.float64), even)
+    plain = bake_grade(some_form(rows), rows)
+    field = remap_slider(plain, remap)
+    save_gdf(tmp_path / "edit.gdf", edit_of(scene, members, field))
+    again = load_gdf(tmp_path / "edit.gdf", scene).field
+    assert again.recorded == field.recorded
+    for s in (0.1, 0.5, 0.8, 1.0):
+        assert torch.equal(again.offsets(s), field.offsets(s))
+    torch.testing.assert_close(field.offsets(0.5), plain.offsets(0.2), atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"degree": 4}, "a grade of degree 4"),
+        ({"degree": 3}, "table is"),
+        ({"table": torch.zeros(3, 10, 3)}, "must be the identity"),
+        ({"knots": torch.tensor([0.0, 0.5, 0.5])}, "knots must"),
+        ({"knots": torch.tensor([0.0, 0.5, 0.4, 1.0])}, "table is"),
+        ({"coefficients": torch.ones(3, 2)}, "residual 0 at strength 0"),
+        ({"residual": torch.zeros(2, 120, 5, dtype=torch.int8)}, "scale is"),
+        ({"residual": torch.zeros(2, 120, 3)}, "expected int8"),
+    ],
+)
+def test_parts_that_do_not_fit_each_other_are_refused(change: dict[str, object], message: str) -> None:
+    form = some_form(pack(random_gaussians(120), with_shN=False))
+    with pytest.raises(ValueError, match=message):
+        replace(form, **change)  # type: ignore[arg-type]
+
+
+def test_a_grade_with_more_bands_than_the_scene_is_refused() -> None:
+    scene: Gaussians = random_gaussians(60)
+    rows = pack(scene, with_shN=False)
+    with pytest.raises(ValueError, match="a grade of 60 members for 60"):
+        bake_grade(some_form(rows, bands=4), rows)
+    assert identity_remap().is_identity
