@@ -209,7 +209,7 @@ class Model:
         )
         over = ", ".join(f"{name} {error:.1f}" for name, error in self.tried)
         return (
-            f"a map of color of degree {self.degree} {residual}, the least that is within a twentieth; dB: {over}"
+            f"a map of color of degree {self.degree} {residual}, the least within a twentieth; dB: {over}"
         )
 
 
