@@ -208,9 +208,7 @@ class Model:
             f"and a residual of {self.bands} SH function{'s' * (self.bands > 1)}" if self.bands else "alone"
         )
         over = ", ".join(f"{name} {error:.1f}" for name, error in self.tried)
-        return (
-            f"a map of color of degree {self.degree} {residual}, the least within a twentieth; dB: {over}"
-        )
+        return f"a map of color of degree {self.degree} {residual}, the least within a twentieth; dB: {over}"
 
 
 @dataclass(frozen=True)
