@@ -50,9 +50,9 @@ _MAP_HELD = 1e-2  # say of the members' own colors beside the pixels: there a ma
 _COVERED = 0.05  # the region's weight in a pixel that the map is fitted to
 _MOST_PIXELS = 250_000  # for the some twenty coefficients of the map; of more, evenly spread ones
 _CLAMP_ROUNDS = 3  # of the map's least squares, for pixels that are white or black anyway
-_SETTLED = (
-    0.01  # share of the finished edit's error that a step takes away at least, for another one to follow
-)
+_SETTLED = 0.005  # share of the finished edit's error that a step takes away at least, for another to follow
+_SHARES = (1.0, 0.5, 0.2)  # of a step, where the whole of it would run into clamps
+_LOOKS = 3  # steps over which that is taken: the first ones of a new direction gain little
 
 _A = TypeVar("_A")
 _B = TypeVar("_B")
@@ -267,18 +267,23 @@ class Solver:
         inverse = 1.0 / (curvature + ridge)
         now, pull = start, self._pull(base, start, targets, ridge)
         conditioned = along = inverse * pull.descent
+        errors = [math.inf] * (_LOOKS - 1) + [pull.error]
         for _ in range(steps):
             length = _inner(pull.descent, along) / max(self._curvature(pull, along, ridge), 1e-30)
-            ahead = now + length * along
-            next_pull = self._pull(base, ahead, targets, ridge)
-            if not next_pull.error < pull.error:
+            for share in _SHARES:
+                ahead = now + share * length * along
+                next_pull = self._pull(base, ahead, targets, ridge)
+                if next_pull.error < pull.error:
+                    break
+            else:
                 if along is conditioned:
                     break
                 along = conditioned  # the direction was of other clamps: begin again
                 continue
-            before, last, power = pull, conditioned, _inner(pull.descent, conditioned)
+            last, power = conditioned, _inner(pull.descent, conditioned)
             now, pull = ahead, next_pull
-            if before.error - pull.error <= _SETTLED * max(pull.error, floor):
+            errors.append(pull.error)
+            if errors[-1 - _LOOKS] - pull.error <= _LOOKS * _SETTLED * max(pull.error, floor):
                 break
             conditioned = inverse * pull.descent
             turn = (_inner(pull.descent, conditioned) - _inner(pull.descent, last)) / power
