@@ -149,8 +149,8 @@ def fit_maps(views: Sequence[ColorView]) -> MapFit:
     stride = max(1, -(-total // _MOST_PIXELS))
 
     def lay_out(view: ColorView) -> tuple[Tensor, Tensor]:
-        terms = monomials(view.original.clamp(0.0, MOST_COLOR), 3)
-        planes = torch.split(torch.cat([terms, torch.zeros(len(terms), 1)], dim=1), 3, dim=1)
+        terms = monomials(view.original.T.clamp(0.0, MOST_COLOR), 3).T
+        planes: tuple[Tensor, ...] = torch.split(torch.cat([terms, terms[:, :1]], dim=1), 3, dim=1)
         shown = torch.cat([view.map.picture(plane).reshape(-1, 3) for plane in planes], dim=1)[:, :20]
         pixels = (shown[:, 0] > _COVERED).nonzero()[::stride, 0]
         return shown[pixels], pixels
@@ -160,8 +160,8 @@ def fit_maps(views: Sequence[ColorView]) -> MapFit:
     others = torch.cat([view.others.reshape(-1, 3)[some] for view, some in zip(views, pixels, strict=True)])
     wide, members = design.double(), torch.zeros(20, 20, dtype=torch.float64)
     for view in views:
-        terms = monomials(view.original.clamp(0.0, MOST_COLOR), 3).double()
-        members += terms.T @ terms
+        terms = monomials(view.original.T.clamp(0.0, MOST_COLOR), 3).double()
+        members += terms @ terms.T
     share = _MAP_HELD * len(design) / max(1, len(views) * len(views[0].original))
     return MapFit(design, others, pixels, wide.T @ wide, share * members)
 
