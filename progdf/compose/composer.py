@@ -21,8 +21,8 @@ from progdf.gdf.file import Gdf, verify
 from progdf.rasterize.cpu.jit import kernel
 from progdf.threads import run_chunks
 
-from .layers import KINDS, Effects, Layer, changed_edits, check_numbers, check_weights, effects_of
-from .reference import coverage
+from .layers import KINDS, ORDERED, Effects, Layer, changed_edits, check_numbers, check_weights, effects_of
+from .reference import compose_layers, coverage
 
 Floats = NDArray[np.float32]
 Rows = NDArray[np.int64]
@@ -155,6 +155,9 @@ class Composer:
         plan = self._plan(changed)
         moving = {name for edit in plan.parts for name in self._bases[edit]}
         names = tuple(name for name in self._before if name in moving)
+        active = [layer for _, layer in stack]
+        if blend == "adjust" and any(layer.gdf.field.kind == "grade" for layer in active[1:]):
+            return Change(plan.rows, names, self._write_composed(active, plan.rows, names))
         parts = [self._part(plan, edit, layer) for edit, layer in stack if edit in plan.parts]
         count = 1 + len(plan.rows) // CHUNK
         cuts = [len(plan.rows) * part // count for part in range(count + 1)]
@@ -162,6 +165,17 @@ class Composer:
             lambda chunk: self._rewrite(plan.rows, parts, names, blend, cuts[chunk], cuts[chunk + 1]), count
         )
         return Change(plan.rows, names, math.sqrt(max(moves)))
+
+    def _write_composed(self, layers: Sequence[Layer], rows: Rows, names: Sequence[str]) -> float:
+        """Write what the plain form gives; the largest step of a center."""
+        composed, largest = compose_layers(self._scene, layers, "adjust"), 0.0
+        for name in names:
+            new = getattr(composed, name)[torch.from_numpy(rows)].float().reshape(len(rows), -1).numpy()
+            if name == "means":
+                steps = np.square(new - self._after[name][rows]).sum(axis=1)
+                largest = math.sqrt(float(steps.max(initial=0.0)))
+            self._after[name][rows] = new
+        return largest
 
     def _rewrite(
         self, rows: Rows, parts: Sequence[_Part], names: Sequence[str], blend: str, first: int, last: int
@@ -185,7 +199,7 @@ class Composer:
                 if bases is None or gain == 0:
                     continue
                 used, factors = bases.factors(part.segment)
-                covered = self._coverage_of(part.edit, KINDS[name]) if blend == "over" else _NOTHING
+                covered = self._coverage_of(part.edit, KINDS[name]) if blend in ORDERED else _NOTHING
                 hidden = np.float32(part.layer.clamped_strength) * np.float32(min(abs(gain), 1.0))
                 selection = part.at, part.members, part.weights
                 stored, scale = (bases.end, bases.residual), np.float32(gain)

@@ -14,8 +14,11 @@ from torch import Tensor
 from progdf.errors import ProgdfError
 from progdf.gdf.file import Gdf
 
-BLENDS = ("normalized", "sum", "over")
+BLENDS = ("normalized", "sum", "over", "adjust")
 """How layers that share a Gaussian go together; see `progdf.compose.reference.compose_layers`."""
+
+ORDERED = ("over", "adjust")
+"""Those where it counts which layer lies on top."""
 
 KINDS = {
     "means": "geometry",
@@ -118,7 +121,7 @@ def effects_of(stack: Sequence[tuple[int, Layer]], blend: str) -> Effects:
     effects: dict[int, Effect] = {}
     for index, (edit, layer) in enumerate(stack):
         version = -1 if layer.weights is None else layer.weights._version
-        order = index if blend == "over" else 0
+        order = index if blend in ORDERED else 0
         entry = (layer.strength, layer.gains, layer.weights, version, order)
         effects[edit] = (*effects.get(edit, ()), entry)
     return Effects(blend, effects)

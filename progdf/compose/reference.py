@@ -13,12 +13,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from progdf.field.baked import BakedField
+from progdf.field.baked import BakedField, GradeForm
+from progdf.field.grade import adjust_colors
 from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.gdf.file import Gdf, verify
 from progdf.sh import C0
 
-from .layers import BLENDS, KINDS, Gains, Layer, check_layers
+from .layers import BLENDS, KINDS, ORDERED, Gains, Layer, check_layers
 
 _COLOR = 0.1  # of sRGB's 0..1: a change that is plain to see
 _OPACITY = 0.2  # of 0..1
@@ -100,6 +101,8 @@ __all__ = ["BLENDS", "Gains", "Layer", "compose_layers"]
 NEGATIVE_ZERO = -0.0
 """The number that added to any other, −0.0 included, leaves every bit as it was."""
 _ALL = slice(None)
+_COLORS = ("sh0", "shN")
+_DRAWN = 16  # bands that are drawn
 
 
 def compose_layers(scene: Gaussians, layers: Sequence[Layer], blend: str = "normalized") -> Gaussians:
@@ -113,6 +116,10 @@ def compose_layers(scene: Gaussians, layers: Sequence[Layer], blend: str = "norm
     - "over": in the order given, Δ ← Δ · (1 − m s c min(1, |g|)) + m g Δ(s), where c is how much the layer
       itself changes of that kind, see `progdf.compose.reference`; the last layer lies on top, and what it
       leaves alone shows the layers below.
+
+    - "adjust": as "over", but a grade (see `progdf.field.grade`) hides nothing: it maps the colors that the
+      layers below have left, Δ ← Δ + m g (grade(Θ0 + Δ, s) − Θ0 − Δ). Over what nobody changed it is the edit
+      as trained; darkened stripes stay stripes.
 
     In Σ m s and 1 − m s c, s is held to 0..1: an overshoot exaggerates its own edit and does not dim the
     others.
@@ -142,21 +149,16 @@ def compose_layers(scene: Gaussians, layers: Sequence[Layer], blend: str = "norm
     for part in parts:
         weight_sum[part.rows] += part.weights * part.layer.clamped_strength
 
+    adjusted = _adjusted_colors(scene, rows, parts) if blend == "adjust" else {}
     changed: dict[str, Any] = {}
     for name in ATTRIBUTES:
         movers = [part for part in parts if part.moves(name)]
         if not movers:
             continue
         old: Tensor = getattr(scene, name)
-        total = torch.full((len(rows), old[0].numel()), NEGATIVE_ZERO)
-        for part in movers:
-            layer, weight = part.layer, part.weights[:, None]
-            below = total[part.rows]
-            if blend == "over":
-                hidden = torch.tensor(layer.clamped_strength) * torch.tensor(min(abs(layer.gain(name)), 1.0))
-                below = below * (1 - weight * hidden * part.coverage[KINDS[name]][part.members, None])
-            offsets = layer.gdf.field.attribute_offsets(name, layer.strength)[part.members]
-            total[part.rows] = below + weight * layer.gain(name) * offsets
+        total = adjusted.get(name, torch.full((len(rows), old[0].numel()), NEGATIVE_ZERO))
+        for part in movers if name not in adjusted else ():
+            part.add(total, name, hides=blend in ORDERED)
         if blend == "normalized":
             total = total / weight_sum.clamp(min=1.0)[:, None]
         new = old[rows] + total.reshape(-1, *old.shape[1:]).to(old.dtype)
@@ -175,9 +177,44 @@ class _Part:
     # how far it hides the layers below, by kind of attribute; empty but for "over". [M] float32
     coverage: Mapping[str, Tensor]
 
+    def add(self, total: Tensor, name: str, hides: bool) -> None:
+        """Add its offsets of one attribute to the sums. [U,c]"""
+        weight, gain, below = self.weights[:, None], self.layer.gain(name), total[self.rows]
+        if hides:
+            hidden = torch.tensor(self.layer.clamped_strength) * torch.tensor(min(abs(gain), 1.0))
+            below = below * (1 - weight * hidden * self.coverage[KINDS[name]][self.members, None])
+        offsets = self.layer.gdf.field.attribute_offsets(name, self.layer.strength)[self.members]
+        total[self.rows] = below + weight * gain * offsets
+
     def moves(self, attribute: str) -> bool:
         """Whether it changes an attribute at all."""
         return attribute in self.layer.gdf.field.attributes and self.layer.gain(attribute) != 0
+
+
+def _adjusted_colors(scene: Gaussians, rows: Tensor, parts: Sequence[_Part]) -> dict[str, Tensor]:
+    """The sums of the color attributes under "adjust". [U,c] each"""
+    moved = {name for part in parts for name in _COLORS if part.moves(name)}
+    old = {name: getattr(scene, name)[rows].float().flatten(1) for name in _COLORS if name in moved}
+    total = {name: torch.full_like(values, NEGATIVE_ZERO) for name, values in old.items()}
+    touched = torch.zeros(len(rows), dtype=torch.bool)
+    for part in parts:
+        form, names = part.layer.gdf.field.origin, [name for name in old if part.moves(name)]
+        before = {name: total[name][part.rows].clone() for name in names}
+        for name in names:
+            part.add(total[name], name, hides=not isinstance(form, GradeForm))
+        here = touched[part.rows]
+        if isinstance(form, GradeForm) and names and bool(here.any()):
+            sh = [(old[n][part.rows] + before[n])[here].reshape(int(here.sum()), -1, 3) for n in names]
+            members = torch.arange(len(part.layer.gdf.region))[part.members][here]
+            change = adjust_colors(form, torch.cat(sh, dim=1)[:, :_DRAWN], members, part.layer.strength)
+            factor = part.weights[here, None, None] * part.layer.gain("sh0")
+            for name, bands in zip(names, (change[:, :1], change[:, 1:]), strict=False):
+                sums, new = total[name][part.rows], before[name][here]
+                new[:, : 3 * bands.shape[1]] += (factor * bands).flatten(1)
+                sums[here] = new
+                total[name][part.rows] = sums
+        touched[part.rows] = True
+    return total
 
 
 def _parts(scene: Gaussians, layers: Sequence[Layer], blend: str) -> tuple[Tensor, list[_Part]]:
@@ -198,7 +235,7 @@ def _parts(scene: Gaussians, layers: Sequence[Layer], blend: str) -> tuple[Tenso
             members,
             _ALL if len(layer_rows) == len(rows) else position[layer_rows],
             weights,
-            coverage(scene, layer.gdf) if blend == "over" else {},
+            coverage(scene, layer.gdf) if blend in ORDERED else {},
         )
         for layer, layer_rows, (members, weights) in zip(layers, reached, chosen, strict=True)
     ]

@@ -19,7 +19,15 @@ from torch import Tensor
 from progdf.gaussians import attribute_slices
 from progdf.sh import C0, basis
 
-from .baked import BakedField, GradeForm, identity_map, identity_remap, remap_slider
+from .baked import (
+    BakedField,
+    GradeForm,
+    find_segment,
+    identity_map,
+    identity_remap,
+    interpolate,
+    remap_slider,
+)
 from .separable import fit_amplitude, fit_separable, moving_attributes, principal_modes, quantize_bases
 
 MOST_COLOR = 1.5
@@ -173,6 +181,30 @@ def bake_grade(form: GradeForm, rows: Tensor, mapped: Tensor | None = None) -> B
     baked = fit_separable(form.knots, trajectory, ranks, recorded=recorded)
     baked = replace(baked, kind="grade", origin=form)
     return baked if form.remap.is_identity else remap_slider(baked, form.remap)
+
+
+def adjust_colors(form: GradeForm, sh: Tensor, members: Tensor | slice, s: float) -> Tensor:
+    """What a grade adds at strength `s` to colors that others have changed already.
+
+    Args:
+        form: the grade
+        sh: of these members, as it lies below. [m,B,3]
+        members: which of the grade's members these are
+        s: of the slider; beyond 1 the last segment goes on
+
+    Returns:
+        [m,B,3]; exactly 0 at 0, and the map and residual of the file at 1
+    """
+    at = form.remap.new.new_tensor([s])
+    strength = float(interpolate(at, form.remap.new, form.remap.old)) if s < 1.0 else s
+    right, share = find_segment(form.knots, strength)
+    table = torch.lerp(form.table[right - 1], form.table[right], share)
+    change = map_colors(sh, table if share != 1.0 else form.table[right], form.degree) - sh
+    if len(form.residual):
+        row = torch.lerp(form.coefficients[right - 1], form.coefficients[right], share)
+        residual = (form.residual[:, members] * (row[:, None] * form.scale)[:, None]).sum(dim=0)
+        change[:, : residual.shape[1] // 3] += residual.reshape(len(sh), -1, 3)
+    return change
 
 
 def fit_grade(

@@ -29,7 +29,7 @@ from viewer.state.paint import encode
 from viewer.state.snapshots import SliderSnapshot
 from viewer.state.view_state import OVERSHOOT, LayerState, ViewState
 
-Blend = Literal["normalized", "sum", "over"]
+Blend = Literal["normalized", "sum", "over", "adjust"]
 Against = Literal["original", "recorded"]
 NO_SCENE = Path()
 """What stands for the scene where none is given."""

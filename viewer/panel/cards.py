@@ -228,10 +228,12 @@ def _group_name(
 HEADING_PX = 34.0  # at 1×: above the cards
 _DRAGS = ("dragged", "dropped")
 INSET_PX = 10.0  # of a group's layers, at 1×
+BLEND_TITLES = {"normalized": "Average", "sum": "Add", "over": "Over", "adjust": "Adjust"}
 BLEND_HELP = {
     "normalized": "Overlapping edits are averaged by weight; never more than a full edit.",
     "sum": "Overlapping edits add up.",
     "over": "An edit covers those below it, where and as far as it changes something.",
+    "adjust": "As Over, but edits of colors change the colors that lie below: darkened stripes stay stripes.",
 }
 
 
@@ -262,7 +264,7 @@ def heading(state: ViewState, form_open: bool, ui: UiContext, actions: list[str]
         return state
     imgui.same_line(right - combo)
     imgui.set_next_item_width(combo)
-    titles, now = [blend.capitalize() for blend in BLENDS], BLENDS.index(state.blend)
+    titles, now = [BLEND_TITLES[blend] for blend in BLENDS], BLENDS.index(state.blend)
     help_ = f"Where edits overlap ({shortcut('blend')}): " + BLEND_HELP[state.blend]
     pressed = drop_down(
         "##blend", titles[now], titles, now, ui, help_, [BLEND_HELP[blend] for blend in BLENDS]

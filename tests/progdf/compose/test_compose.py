@@ -12,6 +12,8 @@ from progdf.compose.composer import Composer
 from progdf.compose.reference import BLENDS, Gains, Layer, compose_layers, coverage
 from progdf.errors import ProgdfError
 from progdf.field import fit_keyframes
+from progdf.field.baked import identity_map
+from progdf.field.grade import bake_grade, fit_grade, map_colors
 from progdf.gaussians import ATTRIBUTES, Gaussians, attribute_slices, pack
 from progdf.gdf.file import Gdf
 from progdf.rasterize import set_threads
@@ -439,3 +441,61 @@ def test_every_attribute_has_a_gain(scene: Gaussians) -> None:
     mute = compose_layers(scene, [Layer(edit, 0.5, gains=Gains(0.0, 0.0, 0.0))])
     assert set(everything.attributes) == set(ATTRIBUTES)
     assert bits(mute) == bits(scene)
+
+
+def graded(scene: Gaussians, members: torch.Tensor, darker: float, residual: bool = True) -> Gdf:
+    """An edit that takes all colors of some rows towards black, and a little of single ones elsewhere."""
+    knots = torch.tensor([0.0, 0.5, 1.0])
+    table = torch.stack([identity_map(1) * torch.tensor(1.0 - darker * float(s)) for s in knots])
+    course = torch.zeros(3, len(members), 3)
+    if residual:
+        course[1:] = 0.1 * torch.rand(2, len(members), 3, generator=torch.Generator().manual_seed(3))
+    form = fit_grade(knots, 1, table, course, int(residual), torch.ones(len(members)))
+    rows = pack(scene[members], with_shN=scene.sh_degree > 0)
+    return edit_of(scene, members, bake_grade(form, rows), "dark")
+
+
+@pytest.mark.parametrize("strength", [0.0, 0.3, 1.0])
+def test_adjust_maps_the_colors_that_lie_below(scene: Gaussians, shirt: Gdf, strength: float) -> None:
+    dark = graded(scene, shirt.region.members, 0.6, residual=False)
+    below = compose_layers(scene, [Layer(shirt, 1.0)])
+    both = compose_layers(scene, [Layer(shirt, 1.0), Layer(dark, strength)], "adjust")
+    rows, table = shirt.region.members, identity_map(1) * (1.0 - 0.6 * strength)
+    expected = map_colors(below.sh[rows], table, 1)
+    torch.testing.assert_close(both.sh[rows], expected, atol=2e-6, rtol=0)
+    if strength == 0.0:
+        assert bits(both) == bits(below)
+
+
+def test_adjust_alone_is_the_edit_as_trained_and_its_paint_counts(scene: Gaussians, shirt: Gdf) -> None:
+    dark = graded(scene, shirt.region.members, 0.6)
+    alone = compose_layers(scene, [Layer(dark, 0.7)])
+    assert bits(compose_layers(scene, [Layer(dark, 0.7)], "adjust")) == bits(alone)
+    elsewhere = graded(scene, torch.arange(len(scene))[-1:], 0.5)
+    side = compose_layers(scene, [Layer(elsewhere, 1.0), Layer(dark, 0.7)], "adjust")
+    rows = shirt.region.members[shirt.region.members < len(scene) - 1]
+    assert torch.equal(side.sh[rows], alone.sh[rows])
+    nothing = torch.zeros(len(shirt.region))
+    unpainted = compose_layers(scene, [Layer(shirt, 1.0), Layer(dark, 1.0, weights=nothing)], "adjust")
+    assert bits(unpainted) == bits(compose_layers(scene, [Layer(shirt, 1.0)]))
+
+
+def test_adjust_counts_the_order(scene: Gaussians, shirt: Gdf) -> None:
+    dark = graded(scene, shirt.region.members, 0.9)
+    above = compose_layers(scene, [Layer(shirt, 1.0), Layer(dark, 1.0)], "adjust")
+    below = compose_layers(scene, [Layer(dark, 1.0), Layer(shirt, 1.0)], "adjust")
+    assert not torch.equal(above.sh0, below.sh0)
+
+
+def test_the_composer_adjusts_as_compose_does(scene: Gaussians, shirt: Gdf, hat: Gdf) -> None:
+    dark = graded(scene, shirt.region.members, 0.6)
+    composer = Composer(scene, [shirt, hat, dark])
+    for stack in (
+        [Layer(shirt, 0.4), Layer(hat, 1.0), Layer(dark, 0.3)],
+        [Layer(shirt, 1.0), Layer(dark, 1.0), Layer(hat, 0.2)],
+        [Layer(dark, 0.8)],
+        [Layer(shirt, 1.0), Layer(dark, 1.2, gains=Gains(color=0.5))],
+        [],
+    ):
+        composer.update(stack, "adjust")
+        assert bits(composer.gaussians) == bits(compose_layers(scene, stack, "adjust"))
