@@ -220,3 +220,37 @@ def test_a_picture_that_nothing_changes_gives_no_change() -> None:
     scene = dense_ball(500, bands=3)
     offsets = solved(scene, scene, orbit(4, 48))
     assert float(offsets.abs().max()) < 1e-4
+
+
+@pytest.mark.parametrize(
+    "case", ["one color", "black", "white", "beyond white", "hidden", "one member", "huge bands"]
+)
+def test_hard_regions_give_finite_offsets_and_their_pictures(case: str) -> None:
+    scene = dense_ball(400, bands=8)
+    colors = {"one color": 0.4, "black": -0.2, "white": 1.0, "beyond white": 3.0}
+    if case in colors:
+        plain = torch.full((400, 3), colors[case])
+        scene = replace(scene, sh0=rgb_to_sh0(plain), shN=torch.zeros_like(scene.shN))
+    if case == "hidden":
+        scene = replace(scene, logit_opacities=torch.full_like(scene.logit_opacities, -9.0))
+    if case == "huge bands":
+        scene = replace(scene, shN=20.0 * scene.shN)
+    members = torch.arange(1 if case == "one member" else len(scene))
+    cameras = orbit(3, 40)
+    crops = [crop_scene(scene, members, c, (0, 0, c.width, c.height), WHITE, still=True) for c in cameras]
+    original = pack(scene[members], with_shN=True)
+    before = render_all(crops, original)
+    targets = [torch.lerp(picture, torch.tensor([0.2, 0.3, 0.8]), 0.5) for picture in before]
+    solver = make_solver(crops, original)
+    model = model_of(solver, targets)
+    stages, state = [TargetStage(1.0, targets, 1)], PgsState(original)
+    list(solve(original, solver, model, stages, state, lambda step, left: None, 40))
+    moved = state.moved.detach()
+    assert bool(moved.isfinite().all())
+    assert float(moved.abs().max()) < 1e3
+    after = render_all(crops, original + moved)
+    errors = [
+        sum(float((a - b).square().sum()) for a, b in zip(pictures, targets, strict=True))
+        for pictures in (after, before)
+    ]
+    assert errors[0] <= errors[1] * 1.0001
