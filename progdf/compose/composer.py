@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from progdf.field.baked import AttributeBases, Segment, find_segment
 from progdf.gaussians import ATTRIBUTES, Gaussians
@@ -22,7 +23,7 @@ from progdf.rasterize.cpu.jit import kernel
 from progdf.threads import run_chunks
 
 from .layers import KINDS, ORDERED, Effects, Layer, changed_edits, check_numbers, check_weights, effects_of
-from .reference import compose_layers, coverage
+from .reference import changed_rows, coverage
 
 Floats = NDArray[np.float32]
 Rows = NDArray[np.int64]
@@ -125,7 +126,7 @@ class Composer:
         width = {name: math.prod(values.shape[1:]) for name, values in before.items()}
         self._before = {name: values.reshape(-1, width[name]).numpy() for name, values in before.items()}
         self._after = {name: values.view(-1, width[name]).numpy() for name, values in after.items()}
-        self._coverage: dict[int, Mapping[str, Floats]] = {}
+        self._coverage: dict[int, Mapping[str, Tensor]] = {}
         self._effects = Effects()
         self._plans: dict[frozenset[int], _Plan] = {}
         self._checked: list[tuple[torch.Tensor, int]] = []  # weights and their versions
@@ -157,7 +158,7 @@ class Composer:
         names = tuple(name for name in self._before if name in moving)
         active = [layer for _, layer in stack]
         if blend == "adjust" and any(layer.gdf.field.kind == "grade" for layer in active[1:]):
-            return Change(plan.rows, names, self._write_composed(active, plan.rows, names))
+            return Change(plan.rows, names, self._write_adjusted(active, plan.rows, names))
         parts = [self._part(plan, edit, layer) for edit, layer in stack if edit in plan.parts]
         count = 1 + len(plan.rows) // CHUNK
         cuts = [len(plan.rows) * part // count for part in range(count + 1)]
@@ -166,15 +167,19 @@ class Composer:
         )
         return Change(plan.rows, names, math.sqrt(max(moves)))
 
-    def _write_composed(self, layers: Sequence[Layer], rows: Rows, names: Sequence[str]) -> float:
-        """Write what the plain form gives; the largest step of a center."""
-        composed, largest = compose_layers(self._scene, layers, "adjust"), 0.0
+    def _write_adjusted(self, layers: Sequence[Layer], rows: Rows, names: Sequence[str]) -> float:
+        """Write these rows as the plain form has them; the largest step of a center."""
+        covers = {id(gdf): self._coverage_of(edit) for edit, gdf in enumerate(self._gdfs)}
+        at, new = changed_rows(self._scene, layers, "adjust", lambda _, gdf: covers[id(gdf)])
+        largest = 0.0
         for name in names:
-            new = getattr(composed, name)[torch.from_numpy(rows)].float().reshape(len(rows), -1).numpy()
+            before = self._after[name][rows]
+            self._after[name][rows] = self._before[name][rows]
+            if name in new:
+                self._after[name][at.numpy()] = new[name].float().reshape(len(at), -1).numpy()
             if name == "means":
-                steps = np.square(new - self._after[name][rows]).sum(axis=1)
+                steps = np.square(self._after[name][rows] - before).sum(axis=1)
                 largest = math.sqrt(float(steps.max(initial=0.0)))
-            self._after[name][rows] = new
         return largest
 
     def _rewrite(
@@ -199,7 +204,7 @@ class Composer:
                 if bases is None or gain == 0:
                     continue
                 used, factors = bases.factors(part.segment)
-                covered = self._coverage_of(part.edit, KINDS[name]) if blend in ORDERED else _NOTHING
+                covered = self._coverage_of(part.edit)[KINDS[name]].numpy() if blend in ORDERED else _NOTHING
                 hidden = np.float32(part.layer.clamped_strength) * np.float32(min(abs(gain), 1.0))
                 selection = part.at, part.members, part.weights
                 stored, scale = (bases.end, bases.residual), np.float32(gain)
@@ -228,11 +233,10 @@ class Composer:
             self._plans[changed] = _Plan(rows, parts)
         return self._plans[changed]
 
-    def _coverage_of(self, edit: int, kind: str) -> Floats:
+    def _coverage_of(self, edit: int) -> Mapping[str, Tensor]:
         if edit not in self._coverage:
-            covered = coverage(self._scene, self._gdfs[edit])
-            self._coverage[edit] = {name: values.numpy() for name, values in covered.items()}
-        return self._coverage[edit][kind]
+            self._coverage[edit] = coverage(self._scene, self._gdfs[edit])
+        return self._coverage[edit]
 
     def _check_weights(self, layers: Sequence[Layer]) -> None:
         """`check_weights` of those that are new or were written to."""

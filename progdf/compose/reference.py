@@ -6,7 +6,7 @@ numbers while a slider is dragged, in buffers that are made once.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -100,6 +100,9 @@ __all__ = ["BLENDS", "Gains", "Layer", "compose_layers"]
 
 NEGATIVE_ZERO = -0.0
 """The number that added to any other, −0.0 included, leaves every bit as it was."""
+Coverage = Callable[[Gaussians, Gdf], Mapping[str, Tensor]]
+"""See `coverage`."""
+
 _ALL = slice(None)
 _COLORS = ("sh0", "shN")
 _DRAWN = 16  # bands that are drawn
@@ -144,7 +147,27 @@ def compose_layers(scene: Gaussians, layers: Sequence[Layer], blend: str = "norm
     active = [layer for layer in layers if layer.active]
     if not active or not len(scene):
         return scene
-    rows, parts = _parts(scene, active, blend)
+    rows, changed = changed_rows(scene, active, blend)
+    return replace(
+        scene, **{name: getattr(scene, name).index_copy(0, rows, new) for name, new in changed.items()}
+    )
+
+
+def changed_rows(
+    scene: Gaussians, layers: Sequence[Layer], blend: str, covers: Coverage = coverage
+) -> tuple[Tensor, dict[str, Any]]:
+    """What `compose_layers` changes, without a copy of the scene.
+
+    Args:
+        scene: the original
+        layers: active ones, at least one, checked
+        blend: one of `BLENDS`
+        covers: `coverage`, or where that is kept
+
+    Returns:
+        Sorted rows [U] int64, and by attribute that a layer moves what they become [U,...]
+    """
+    rows, parts = _parts(scene, layers, blend, covers)
     weight_sum = torch.zeros(len(rows))  # Σ m s
     for part in parts:
         weight_sum[part.rows] += part.weights * part.layer.clamped_strength
@@ -161,9 +184,8 @@ def compose_layers(scene: Gaussians, layers: Sequence[Layer], blend: str = "norm
             part.add(total, name, hides=blend in ORDERED)
         if blend == "normalized":
             total = total / weight_sum.clamp(min=1.0)[:, None]
-        new = old[rows] + total.reshape(-1, *old.shape[1:]).to(old.dtype)
-        changed[name] = old.index_copy(0, rows, new)
-    return replace(scene, **changed)
+        changed[name] = old[rows] + total.reshape(-1, *old.shape[1:]).to(old.dtype)
+    return rows, changed
 
 
 @dataclass(frozen=True)
@@ -217,7 +239,9 @@ def _adjusted_colors(scene: Gaussians, rows: Tensor, parts: Sequence[_Part]) -> 
     return total
 
 
-def _parts(scene: Gaussians, layers: Sequence[Layer], blend: str) -> tuple[Tensor, list[_Part]]:
+def _parts(
+    scene: Gaussians, layers: Sequence[Layer], blend: str, covers: Coverage
+) -> tuple[Tensor, list[_Part]]:
     """The sorted rows of the scene that change, [U] int64, and each layer's part in them."""
     chosen: list[tuple[Tensor | slice, Tensor]] = []  # members and their weights
     for layer in layers:
@@ -235,7 +259,7 @@ def _parts(scene: Gaussians, layers: Sequence[Layer], blend: str) -> tuple[Tenso
             members,
             _ALL if len(layer_rows) == len(rows) else position[layer_rows],
             weights,
-            coverage(scene, layer.gdf) if blend in ORDERED else {},
+            covers(scene, layer.gdf) if blend in ORDERED else {},
         )
         for layer, layer_rows, (members, weights) in zip(layers, reached, chosen, strict=True)
     ]

@@ -112,11 +112,16 @@ class EditActions:
     def add(self, path: Path) -> None:
         """An edit on top, at full strength, so that one sees what came.
 
+        The second edit of a stack sets its rule, which there was no way to choose: two at 1 are not averaged.
+
         Raises:
             ProgdfError: the file is missing, broken, or was made for another scene.
         """
         gdf = self._load(path)
-        view = add_layer(self._app.main_view.work.view, self._open(gdf, path), gdf.name)
+        before = self._app.main_view.work.view
+        if len(before.layers) == 1 and before.blend == "normalized":
+            before = replace(before, blend="adjust")
+        view = add_layer(before, self._open(gdf, path), gdf.name)
         self._apply(view, len(view.layers) - 1)
 
     def duplicate(self, index: int) -> None:

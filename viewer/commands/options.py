@@ -74,7 +74,7 @@ class StackOptions:
     """Painted strength of an edit: a .npy of weights 0 to 1, one per member or per Gaussian."""
     overshoot: Switch = False
     """Overshoot to 1.2: extrapolates past the trained range."""
-    blend: Annotated[Blend | None, word("{normalized,sum,over}", "the session's rule, else normalized")] = (
+    blend: Annotated[Blend | None, word("{normalized,sum,over,adjust}", "the session's, else normalized")] = (
         None
     )
     """How edits that share Gaussians add up."""

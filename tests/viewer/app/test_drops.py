@@ -54,6 +54,7 @@ def test_a_dropped_edit_comes_on_top_and_can_be_undone(opened: application.App, 
     assert [(layer.name, layer.strength) for layer in layers] == [("scarf", 0.5), ("ears", 1.0)]
     assert [row.count for row in opened.main_view.facts.rows] == [len(g.region) for g in bear().gdfs]
     assert len(opened.main_view.work.past.past) == 1
+    assert opened.main_view.work.view.blend == "adjust", "two edits at 1 do not dull each other"
 
 
 @pytest.mark.gl
