@@ -191,7 +191,6 @@ def differing_variants(plan: TrainOptions, kind: EditKind, stages: int, sh_degre
         *(() if asked else (EQUAL,)),
         *(() if sh_degree > 0 else ("no-sh", "with-sh")),
         *(("no-interpolation", "no-sizing") if kind == "geometry" else ("no-groups",)),
-        *(() if kind == "color" else ("no-propagation",)),
     }
     seen: list[Resolved] = []
     found = []
