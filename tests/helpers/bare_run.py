@@ -64,13 +64,13 @@ def jobs() -> None:
 
     queue = JobQueue()
     number = queue.add(order("blue"))
-    assert wait("Training") == "Training"
+    assert wait("Editing views") == "Editing views"
     queue.stop(number)
     assert (said := wait()) == "stopped", said
     queue.resume(number)
     assert (said := wait()) == "done", said
     queue.add(order("red"))
-    assert wait("Training") == "Training"
+    assert wait("Editing views") == "Editing views"
     (child,) = queue._children.values()
     child.kill()
     assert wait().startswith("failed")

@@ -183,7 +183,7 @@ def _run(name: str, folder: Path) -> Reader:
     write_bear(folder, 400)
     options = quick_options(folder, views=4, image_size=48, steps=64, stages=2)
     resumes, file = name.startswith("resume"), FILES_OF_RUNS[name]
-    _train(options, stop_at=5 if resumes else None)
+    _train(options, stops=resumes)
     good = folder / "good"
     options.out.rename(good)
     content = (good / file).read_bytes()
@@ -205,14 +205,12 @@ def _run(name: str, folder: Path) -> Reader:
     return f"x{suffix}", read, [*changes[suffix], changed_bytes(content)]
 
 
-def _train(options: TrainOptions, stop_at: int | None) -> None:
-    """Train, or begin to: Ctrl-C comes after so many steps."""
-    calls, done = 0, PeriodicSave.step_done
+def _train(options: TrainOptions, stops: bool) -> None:
+    """Train, or begin to: Ctrl-C comes after the first recording."""
+    done = PeriodicSave.step_done
 
     def step_done(self: PeriodicSave) -> None:
-        nonlocal calls
-        calls += 1
-        if calls == stop_at:
+        if stops and (options.out / "state" / "recordings" / "000000.safetensors").is_file():
             os.kill(os.getpid(), signal.SIGINT)
         done(self)
 
