@@ -154,6 +154,8 @@ class RecordingFile:
 def find_recording(gdf: Gdf, path: Path) -> RecordingFile:
     """The recording in the run folder that the edit at `path` lies in, if it is this edit's."""
     beside = path.with_name(FILE_NAME)
+    if gdf.applied:
+        return RecordingFile(reason=f"{path.name} was not trained on this region")
     if not beside.is_file():
         return RecordingFile(reason=f"there is no {FILE_NAME} beside {path.name}")
     field, form = gdf.field, gdf.field.origin
