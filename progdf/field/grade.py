@@ -92,14 +92,14 @@ def map_colors(sh: Tensor, table: Tensor, degree: int) -> Tensor:
         return sh.clone()
     if bands == 1:
         colors = sh[:, 0].T * C0 + 0.5
-        mapped = _map_drawn(colors, table, degree)
+        mapped = map_drawn(colors, table, degree)
         hidden = ((mapped <= 0.0) & (colors <= 0.0)).T
         return torch.where(hidden, sh[:, 0], (mapped.T - 0.5) / C0)[:, None]
     chunks: tuple[Tensor, ...] = torch.split(sh.movedim(2, 0), _CHUNK, dim=1)
     return torch.cat([_map_chunk(chunk, table, degree) for chunk in chunks], dim=1).movedim(0, 2).contiguous()
 
 
-def _map_drawn(colors: Tensor, table: Tensor, degree: int) -> Tensor:
+def map_drawn(colors: Tensor, table: Tensor, degree: int) -> Tensor:
     """What the map makes of colors; of a polynomial, what is above `MOST_COLOR` stays. [3,...] -> [3,...]"""
     if degree == LATTICE:
         return look_up(colors.clamp(0.0, 1.0), table)
@@ -119,7 +119,7 @@ def _map_chunk(sh: Tensor, table: Tensor, degree: int) -> Tensor:
     """`map_colors` of the channels of some members. [3,m,B] -> [3,m,B]"""
     values, inverse = _sphere(math.isqrt(sh.shape[2]) - 1)
     colors = sh @ values.T + 0.5
-    mapped = _map_drawn(colors, table, degree)
+    mapped = map_drawn(colors, table, degree)
     made = sh + (mapped - colors.clamp_min(0.0)) @ inverse.T
     clamped = (colors.amin(dim=2) < 0.0) | (mapped.amin(dim=2) < 0.0)
     some, target = made[clamped], mapped[clamped]
@@ -236,7 +236,7 @@ def _segment(form: GradeForm, s: float) -> Segment:
 
 def mapped_lattice(form: GradeForm, s: float, side: int) -> Tensor:
     """What the map at strength `s` makes of the colors of a lattice, see `lattice_colors`. [side³,3]"""
-    return _map_drawn(lattice_colors(side).T, map_at(form, s), form.degree).T
+    return map_drawn(lattice_colors(side).T, map_at(form, s), form.degree).T
 
 
 def lattice_form(table: Tensor) -> GradeForm:
@@ -251,22 +251,6 @@ def without_residual(form: GradeForm, members: int) -> GradeForm:
     """The map of a grade alone, for so many members of any scene."""
     none = torch.zeros(0, members, 0, dtype=torch.int8)
     return replace(form, residual=none, scale=torch.zeros(0, 0), coefficients=form.coefficients[:, :0])
-
-
-def projection_error(form: GradeForm, rows: Tensor) -> float:
-    """How far the members, drawn by their bands, are off the map at strength 1: root mean square, 0..1.
-
-    Over the directions of `map_colors`, of at most `_CHUNK` members. [M,14+3K]
-    """
-    sh = member_bands(rows[:: 1 + len(rows) // _CHUNK])
-    values, _ = _sphere(math.isqrt(sh.shape[1]) - 1)
-    before, after = (
-        some.movedim(2, 0) @ values.T + 0.5 for some in (sh, map_colors(sh, form.table[-1], form.degree))
-    )
-    error = _map_drawn(before.clamp(0.0, 1.0), form.table[-1], form.degree).clamp(0.0, 1.0) - after.clamp(
-        0.0, 1.0
-    )
-    return float(error.square().mean().sqrt())
 
 
 def fit_grade(

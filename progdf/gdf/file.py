@@ -17,7 +17,7 @@ from torch.utils.weak import WeakIdKeyDictionary
 from progdf.errors import ProgdfError
 from progdf.field.bake import bake_form, rows_hash
 from progdf.field.baked import BakedField, GradeForm, NeuralForm
-from progdf.field.grade import bake_grade, lattice_form, projection_error, without_residual
+from progdf.field.grade import bake_grade, lattice_form, without_residual
 from progdf.formats.cube import SUFFIX as CUBE
 from progdf.formats.cube import read_cube
 from progdf.gaussians import BASE_CHANNELS, ZERO, Gaussians, Origin, pack
@@ -205,24 +205,9 @@ def apply_grade(gdf: Gdf, scene: Gaussians, region: Region) -> Gdf:
     if not len(region):
         raise ProgdfError(f"the region for {gdf.name} has no Gaussians; give another")
     rows = pack(scene[region.members], with_shN=scene.sh_degree > 0)
-    form = without_residual(stored, len(region))
-    field = replace(bake_grade(form, rows), recorded=())
-    report = {"residual_left_out": len(stored.residual) > 0, "map_rms": projection_error(form, rows)}
-    return Gdf(
-        gdf.name, region, field, fingerprint(scene), gdf.instruction, {}, {"applied": report}, applied=True
-    )
-
-
-def describe_applied(gdf: Gdf) -> str:
-    """What is not shown of a grade that was applied, in one line; "" where all is, to 1/255."""
-    if not gdf.applied:
-        return ""
-    report, lines = gdf.report["applied"], []
-    if report["residual_left_out"]:
-        lines.append("its residual, which is of the scene it was trained on, is left out")
-    if (levels := 255 * report["map_rms"]) > 1:
-        lines.append(f"colors that turn with the view are {levels:.1f}/255 (rms) off its map")
-    return f"{gdf.name} on {gdf.region.name}: {'; '.join(lines)}" if lines else ""
+    field = replace(bake_grade(without_residual(stored, len(region)), rows), recorded=())
+    report = {"residual_left_out": len(stored.residual) > 0}
+    return Gdf(gdf.name, region, field, fingerprint(scene), gdf.instruction, report=report, applied=True)
 
 
 def read_gdf(path: str | os.PathLike[str]) -> Gdf:

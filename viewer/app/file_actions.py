@@ -17,7 +17,7 @@ from progdf.camera import Camera
 from progdf.cli.info import kind_of
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
-from progdf.gdf.file import Gdf, describe_applied, fingerprint, load_gdf
+from progdf.gdf.file import Gdf, fingerprint, load_gdf
 from progdf.io.cameras import load_cameras
 from progdf.io.picture_camera import edits_in_picture, find_picture_camera
 from progdf.metrics.image import NO_DIFFERENCE
@@ -32,6 +32,7 @@ from viewer.files.session import SessionAutosave, WindowSession, session_file
 from viewer.files.user_files import parse_path, read_recent, remember_recent
 from viewer.jobs.training import with_picture
 from viewer.state import selection, workspace
+from viewer.state.facts import describe_applied
 from viewer.state.layers import add_layer, duplicate_layer, replace_edit
 from viewer.state.timeline import Player
 from viewer.state.view_state import ViewState, on_another_scene
@@ -163,7 +164,7 @@ class EditActions:
 
         with all_threads():
             gdf = load_gdf(path, scene, place=place)
-        if note := describe_applied(gdf):
+        if note := describe_applied(scene, gdf):
             self._app.main_view.show_message(note)
         return gdf
 

@@ -20,7 +20,7 @@ from progdf.cli.options import parse_options
 from progdf.color.edits import parse_color
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
-from progdf.gdf.file import Gdf, describe_applied
+from progdf.gdf.file import Gdf
 from progdf.io.tensors import open_npy
 from progdf.region import Region
 from progdf.scene.regions import check_region, parse_region
@@ -29,6 +29,7 @@ from viewer.camera.view_camera import Vec3, up_of, with_up
 from viewer.files import document, session
 from viewer.files.document import Document
 from viewer.state import layers as stacks
+from viewer.state.facts import describe_applied
 from viewer.state.paint import encode
 from viewer.state.snapshots import SliderSnapshot
 from viewer.state.view_state import OVERSHOOT, LayerState, ViewState
@@ -248,7 +249,7 @@ def open_stack(stack: StackOptions, drawing: DrawingOptions | None = None, unset
     opened = document.load(stack.scene, stack.gdfs, _placing(stack.region))
     for text in stack.region:
         check_edit(text.partition("=")[0], opened.gdfs, "--region")
-    notes = [note for gdf in opened.gdfs if (note := describe_applied(gdf))]
+    notes = [note for gdf in opened.gdfs if (note := describe_applied(opened.scene, gdf))]
     for note in notes:
         _log.warning(note)
     layers = stack_layers(opened.gdfs, stack, unset)

@@ -100,7 +100,7 @@ def export(argv: Sequence[str]) -> int:
     options: ExportOptions = parse(ExportOptions, argv, "progdf export")
     out = options.out
     if out.suffix.lower() not in (".ply", CUBE):
-        raise ProgdfError(f"{out} is no .ply file; give the edited scene a name that ends in .ply, or .cube")
+        raise ProgdfError(f"{out} is not a .ply file; give the edited scene a name that ends in .ply")
     opened = open_stack(options.stack, unset=1.0)
     check_not_an_input(out, opened.files)
     if out.suffix.lower() == CUBE:
