@@ -26,6 +26,7 @@ from progdf.errors import ProgdfError
 from progdf.field.baked import lattice_colors
 from progdf.formats.cube import SIDE, write_cube
 from progdf.formats.ply import save_ply
+from progdf.io.cameras import save_cameras
 from progdf.io.images import contact_sheet, read_picture, to_picture
 
 COAT = ("body", "head", "ears", "arms", "legs")
@@ -56,7 +57,8 @@ def train(folder: Path, scene: str, name: str, editor: str) -> None:
     """An edit of SCENE.ply in the rows of SCENE.npy, unless it is there."""
     if not (folder / f"{name}.gdf").exists():
         region, out = f"file:{folder / scene}.npy", folder / "runs" / name
-        run("train", folder / f"{scene}.ply", "--out", out, "--region", region, "--editor", editor, *QUICK)
+        words = "--region", region, "--editor", editor, "--cameras", folder / f"{scene}.json", *QUICK
+        run("train", folder / f"{scene}.ply", "--out", out, *words)
         (out / f"{name}.gdf").rename(folder / f"{name}.gdf")
 
 
@@ -64,6 +66,7 @@ def prepare(folder: Path) -> None:
     """Scenes, edits and the table."""
     for name, made, parts in (("bear", bear(24_000, 0), COAT), ("room", room(12_000, 0), None)):
         save_ply(folder / f"{name}.ply", made.gaussians)
+        save_cameras(folder / f"{name}.json", made.cameras, made.gaussians.origin)
         np.save(folder / f"{name}.npy", made.members(*(parts or made.label_names)).numpy())
     for name, editor in EDITS.items():
         train(folder, "bear", name, editor)

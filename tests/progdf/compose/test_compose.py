@@ -488,6 +488,19 @@ def test_adjust_counts_the_order(scene: Gaussians, shirt: Gdf) -> None:
     assert not torch.equal(above.sh0, below.sh0)
 
 
+def test_grades_that_share_no_gaussian_are_adjusted_as_fast_as_any_edit(
+    scene: Gaussians, hat: Gdf, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    halves = [graded(scene, half, 0.6) for half in torch.arange(len(scene)).split(len(scene) // 2)]
+    composer = Composer(scene, [*halves, hat])
+    monkeypatch.setattr(composer, "_write_adjusted", None)
+    for stack in ([Layer(halves[1], 0.3), Layer(halves[0], 0.8)], [Layer(halves[1], 0.3), Layer(hat, 0.5)]):
+        composer.update(stack, "adjust")
+        assert bits(composer.gaussians) == bits(compose_layers(scene, stack, "adjust"))
+    with pytest.raises(TypeError):
+        composer.update([Layer(hat, 0.5), Layer(halves[1], 0.3)], "adjust")
+
+
 def test_the_composer_adjusts_as_compose_does(scene: Gaussians, shirt: Gdf, hat: Gdf) -> None:
     dark = graded(scene, shirt.region.members, 0.6)
     composer = Composer(scene, [shirt, hat, dark])
