@@ -1,6 +1,6 @@
-"""Makes the page of layers, assets/layers.png: how edits of colors go together.
+"""Makes the page of layers, assets/layers.jpg: how edits of colors go together.
 
-usage: python assets/layers.py -o OUT.png [--work FOLDER]
+usage: python assets/layers.py -o OUT.jpg [--work FOLDER]
 
 Everything is made here: the bear, three edits of its coat, the room and its dusk, a table of colors. FOLDER
 keeps scenes and edits, so that a second run only draws.
@@ -16,7 +16,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from PIL import Image
 from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -32,7 +31,7 @@ from progdf.io.images import contact_sheet, read_picture, to_picture
 COAT = ("body", "head", "ears", "arms", "legs")
 EDITS = {"stripes": "stripes:#2a6f9e", "dark": "darken:0.6", "gold": "tint:#e0a030"}
 QUICK = ("--views", "12", "--image-size", "192", "--threads", "1")
-VIEW = ("--orbit", "20,12", "--size", "480x400", "--background", "#82a3c2", "--engine", "cpu")
+VIEW = ("--orbit", "20,12", "--size", "400x340", "--background", "#82a3c2", "--engine", "cpu")
 COLUMNS = 3
 STACKS = {
     "stripes": ("stripes.gdf",),
@@ -73,7 +72,7 @@ def prepare(folder: Path) -> None:
     train(folder, "room", "dusk", "tint:#4f6fd8")
     colors = lattice_colors(SIDE)
     light = (colors @ torch.tensor([0.2126, 0.7152, 0.0722]))[:, None]
-    teal = torch.lerp(torch.tensor([-0.1, 0.06, 0.1]), torch.tensor([0.14, 0.02, -0.12]), light)
+    teal = torch.lerp(torch.tensor([-0.08, 0.02, 0.1]), torch.tensor([0.08, 0.0, -0.1]), light)
     write_cube(folder / "teal.cube", colors * colors * (3 - 2 * colors) + teal, "teal and orange")
 
 
@@ -99,7 +98,7 @@ def main() -> int:
         sheet = contact_sheet(
             [pictures[i : i + COLUMNS] for i in rows], notes=[names[i : i + COLUMNS] for i in rows]
         )
-        to_picture(sheet).convert("P", palette=Image.Palette.ADAPTIVE, colors=128).save(asked.out)
+        to_picture(sheet).save(asked.out, quality=88)
     return 0
 
 

@@ -223,6 +223,23 @@ def adjust_colors(form: GradeForm, sh: Tensor, members: Tensor | slice, s: float
     return change
 
 
+def map_share(field: BakedField) -> Tensor:
+    """How much of each member's change at strength 1 is its map's: 1 − |residual|² / |map|², 0..1. [M]
+
+    Where the residual undoes the map, as between stripes, or does as much again, it is 0.
+    """
+    form, moved = field.origin, field.attributes
+    ends = [moved[name].end_offset for name in ("sh0", "shN") if name in moved]
+    if not isinstance(form, GradeForm) or not len(form.residual) or not ends:
+        return torch.ones(field.members)
+    change = torch.cat(ends, dim=1)
+    residual = torch.zeros_like(change)
+    scaled = form.residual * form.scale[:, None]
+    residual[:, : scaled.shape[2]] = torch.einsum("r,rmc->mc", form.coefficients[-1], scaled)
+    ratio = residual.square().sum(dim=1) / (change - residual).square().sum(dim=1)
+    return (1.0 - ratio).clamp(0.0, 1.0).nan_to_num(1.0)
+
+
 def map_at(form: GradeForm, s: float) -> Tensor:
     """The map of a grade at strength `s` of the slider. [K,3]"""
     right, share = _segment(form, s)

@@ -488,6 +488,27 @@ def test_adjust_counts_the_order(scene: Gaussians, shirt: Gdf) -> None:
     assert not torch.equal(above.sh0, below.sh0)
 
 
+def test_a_grade_that_is_a_pattern_lies_over_what_is_below_as_far_as_its_map_does_not_say_it(
+    scene: Gaussians, shirt: Gdf
+) -> None:
+    rows = torch.arange(len(scene))
+    dark = compose_layers(scene, [Layer(graded(scene, rows, 0.6, residual=False))])
+    knots, table = torch.tensor([0.0, 1.0]), identity_map(1)
+    halfway = table + 0.5 * (torch.tensor([[0.1, 0.3, 0.9]] + [[0.0] * 3] * 3) - table)
+    mapped = map_colors(scene.sh, halfway, 1) - scene.sh
+    course = torch.zeros(2, len(scene), 12)
+    course[1] = torch.where(rows[:, None] % 2 == 0, -1.0, 1.0) * mapped.flatten(1)
+    form = fit_grade(knots, 1, torch.stack([table, halfway]), course, 1, torch.ones(len(scene)))
+    stripes = edit_of(scene, rows, bake_grade(form, pack(scene, True)), "stripes")
+    assert float(coverage(scene, stripes)["map"].mean()) < 0.1, "half of it is undone, the other half doubled"
+    layers = [Layer(graded(scene, rows, 0.6, residual=False)), Layer(stripes)]
+    both, alone = compose_layers(scene, layers, "adjust"), compose_layers(scene, [Layer(stripes)])
+    between, far = rows[::2], coverage(scene, stripes)["color"] == 1.0
+    assert float((both.sh0 - dark.sh0)[between].abs().mean()) < 0.1
+    assert torch.allclose(both.sh0[far], alone.sh0[far], atol=0.1)
+    assert int(far.sum()) > 50
+
+
 def test_grades_that_share_no_gaussian_are_adjusted_as_fast_as_any_edit(
     scene: Gaussians, hat: Gdf, monkeypatch: pytest.MonkeyPatch
 ) -> None:
