@@ -16,6 +16,7 @@ import tyro
 
 from progdf.errors import ProgdfError
 from progdf.field.baked import BakedField, GradeForm, NeuralForm
+from progdf.formats.cube import SUFFIX as CUBE
 from progdf.formats.scene_file import load_scene_with_report, scene_file, scene_format
 from progdf.gaussians import ZERO, Gaussians
 from progdf.gdf.file import read_gdf
@@ -163,7 +164,7 @@ def kind_of(path: str | os.PathLike[str]) -> str:
         return "timeline"
     if start.lstrip()[:1] in (b"{", b"[") or start.startswith(b"\x89PNG"):
         return "cameras"
-    if path.suffix.lower() == ".gdf":
+    if path.suffix.lower() in (".gdf", CUBE):
         return "gdf"  # its reader knows best what is wrong
     raise ProgdfError(f"{path} is not a file progdf knows; give a scene, a .gdf edit or a camera file")
 
@@ -185,12 +186,16 @@ def _edit_lines(path: Path) -> Iterator[str]:
     yield f"{path.name}: the edit '{gdf.name}', {file_size(size)}"
     if gdf.instruction:
         yield f"asked for: {gdf.instruction}"
-    yield f"scene: {format_count(count)}, fingerprint {gdf.scene.means_sha256[:12]}"
-    yield f"region: {gdf.region.name}, {format_count(members)} ({members / max(1, count):.1%})"
-    sizes = (
-        f"{gdf.field.bytes_per_member:.4g} bytes per Gaussian, {size / max(1, members):.4g} with the header"
-    )
-    yield f"field: {gdf.field.kind}, {sizes}, {_describe_field(gdf.field)}"
+    sizes = ""
+    if count:
+        yield f"scene: {format_count(count)}, fingerprint {gdf.scene.means_sha256[:12]}"
+        yield f"region: {gdf.region.name}, {format_count(members)} ({members / max(1, count):.1%})"
+        each = gdf.field.bytes_per_member
+        sizes = f"{each:.4g} bytes per Gaussian, {size / max(1, members):.4g} with the header, "
+    yield f"field: {gdf.field.kind}, {sizes}{_describe_field(gdf.field)}"
+    if gdf.field.kind == "grade":
+        bound = "bound to its scene; its map alone goes" if count else "bound to no scene; it goes"
+        yield f"grade: {bound} on any with --region {gdf.name}=REGION"
     if gdf.field.recorded:
         yield f"recorded: {len(gdf.field.recorded)} snapshots"
     for head, content in (("option", gdf.options), ("report", gdf.report)):

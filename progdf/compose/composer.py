@@ -127,6 +127,7 @@ class Composer:
         self._before = {name: values.reshape(-1, width[name]).numpy() for name, values in before.items()}
         self._after = {name: values.view(-1, width[name]).numpy() for name, values in after.items()}
         self._coverage: dict[int, Mapping[str, Tensor]] = {}
+        self._meets: dict[tuple[int, int], bool] = {}
         self._effects = Effects()
         self._plans: dict[frozenset[int], _Plan] = {}
         self._checked: list[tuple[torch.Tensor, int]] = []  # weights and their versions
@@ -157,7 +158,7 @@ class Composer:
         moving = {name for edit in plan.parts for name in self._bases[edit]}
         names = tuple(name for name in self._before if name in moving)
         active = [layer for _, layer in stack]
-        if blend == "adjust" and any(layer.gdf.field.kind == "grade" for layer in active[1:]):
+        if blend == "adjust" and self._maps_others(stack):
             return Change(plan.rows, names, self._write_adjusted(active, plan.rows, names))
         parts = [self._part(plan, edit, layer) for edit, layer in stack if edit in plan.parts]
         count = 1 + len(plan.rows) // CHUNK
@@ -166,6 +167,23 @@ class Composer:
             lambda chunk: self._rewrite(plan.rows, parts, names, blend, cuts[chunk], cuts[chunk + 1]), count
         )
         return Change(plan.rows, names, math.sqrt(max(moves)))
+
+    def _maps_others(self, stack: Sequence[tuple[int, Layer]]) -> bool:
+        """Whether a grade lies over Gaussians of another layer, whose colors it maps."""
+        return any(
+            self._meet(edit, below)
+            for index, (edit, layer) in enumerate(stack)
+            for below, _ in stack[:index]
+            if layer.gdf.field.kind == "grade"
+        )
+
+    def _meet(self, edit: int, other: int) -> bool:
+        """Whether two edits share a Gaussian."""
+        pair = min(edit, other), max(edit, other)
+        if pair not in self._meets:
+            members = self._members[edit], self._members[other]
+            self._meets[pair] = len(np.intersect1d(*members, assume_unique=True)) > 0
+        return self._meets[pair]
 
     def _write_adjusted(self, layers: Sequence[Layer], rows: Rows, names: Sequence[str]) -> float:
         """Write these rows as the plain form has them; the largest step of a center."""

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from progdf.field.baked import BakedField, GradeForm
-from progdf.field.grade import adjust_colors
+from progdf.field.grade import adjust_colors, map_share
 from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.gdf.file import Gdf, verify
 from progdf.sh import C0
@@ -44,7 +44,7 @@ def coverage(scene: Gaussians, gdf: Gdf) -> Mapping[str, Tensor]:
     Nothing of it is stored: it follows from the offsets at strength 1, and so holds for every .gdf.
 
     Returns:
-        Kind, see `layers.KINDS` -> c, 0..1. [M] float32
+        Kind, see `layers.KINDS` -> c, 0..1; of a grade also "map" -> see `map_share`. [M] float32
     """
     members, field = gdf.region.members, gdf.field
     sizes = {
@@ -53,7 +53,8 @@ def coverage(scene: Gaussians, gdf: Gdf) -> Mapping[str, Tensor]:
         "geometry": (_shape_change(scene, members, field), 1.0),
     }
     moved = {KINDS[name] for name in field.attributes}
-    return {kind: _rise(size, floor) for kind, (size, floor) in sizes.items() if kind in moved}
+    covered = {kind: _rise(size, floor) for kind, (size, floor) in sizes.items() if kind in moved}
+    return covered | {"map": map_share(field)} if isinstance(field.origin, GradeForm) else covered
 
 
 def _rise(size: Tensor, floor: float) -> Tensor:
@@ -122,7 +123,8 @@ def compose_layers(scene: Gaussians, layers: Sequence[Layer], blend: str = "norm
 
     - "adjust": as "over", but a grade (see `progdf.field.grade`) hides nothing: it maps the colors that the
       layers below have left, Δ ← Δ + m g (grade(Θ0 + Δ, s) − Θ0 − Δ). Over what nobody changed it is the edit
-      as trained; darkened stripes stay stripes.
+      as trained; darkened stripes stay stripes. Where a member's change is more its residual's than the map's
+      it lies over the others that far, see `map_share`: between stripes on what is dark it stays dark.
 
     In Σ m s and 1 − m s c, s is held to 0..1: an overshoot exaggerates its own edit and does not dim the
     others.
@@ -223,17 +225,18 @@ def _adjusted_colors(scene: Gaussians, rows: Tensor, parts: Sequence[_Part]) -> 
         form, names = part.layer.gdf.field.origin, [name for name in old if part.moves(name)]
         before = {name: total[name][part.rows].clone() for name in names}
         for name in names:
-            part.add(total[name], name, hides=not isinstance(form, GradeForm))
+            part.add(total[name], name, hides=True)
         here = touched[part.rows]
         if isinstance(form, GradeForm) and names and bool(here.any()):
             sh = [(old[n][part.rows] + before[n])[here].reshape(int(here.sum()), -1, 3) for n in names]
             members = torch.arange(len(part.layer.gdf.region))[part.members][here]
             change = adjust_colors(form, torch.cat(sh, dim=1)[:, :_DRAWN], members, part.layer.strength)
             factor = part.weights[here, None, None] * part.layer.gain("sh0")
+            share = part.coverage["map"][members, None]
             for name, bands in zip(names, (change[:, :1], change[:, 1:]), strict=False):
                 sums, new = total[name][part.rows], before[name][here]
                 new[:, : 3 * bands.shape[1]] += (factor * bands).flatten(1)
-                sums[here] = new
+                sums[here] = torch.lerp(sums[here], new, share)
                 total[name][part.rows] = sums
         touched[part.rows] = True
     return total

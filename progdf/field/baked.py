@@ -194,9 +194,31 @@ def identity_remap() -> SliderRemap:
 MONOMIALS = {1: 4, 2: 10, 3: 20}
 """Monomials of three channels up to a degree."""
 
+LATTICE = 0
+"""In place of a degree: the map is given at the points of a cube of colors, as a .cube file has it."""
+MOST_SIDE = 129
+"""Points along an edge of a lattice; the largest that color programs write has 65."""
 
-def identity_map(degree: int) -> Tensor:
-    """The map that changes no color. [K,3]"""
+
+def lattice_colors(side: int) -> Tensor:
+    """The colors at the points of a lattice over 0..1, red fastest. [side³,3]"""
+    at = torch.linspace(0.0, 1.0, side)
+    blue, green, red = torch.meshgrid(at, at, at, indexing="ij")
+    return torch.stack([red, green, blue], dim=-1).reshape(-1, 3)
+
+
+def lattice_side(points: int) -> int:
+    """Points along an edge of a lattice of so many. Raises ValueError: no cube of 2 to `MOST_SIDE`."""
+    side: int = round(points ** (1 / 3))
+    if side**3 != points or not 2 <= side <= MOST_SIDE:
+        raise ValueError(f"a lattice of {points} colors, expected a cube of 2 to {MOST_SIDE}")
+    return side
+
+
+def identity_map(degree: int, points: int = 0) -> Tensor:
+    """The map that changes no color; of a lattice, with so many points. [K,3]"""
+    if degree == LATTICE:
+        return lattice_colors(lattice_side(points))
     table = torch.zeros(MONOMIALS[degree], 3)
     table[1:4] = torch.eye(3)
     return table
@@ -206,7 +228,7 @@ def identity_map(degree: int) -> Tensor:
 class GradeForm:
     """What a file keeps of a grade field. Raises ValueError where its parts do not fit each other."""
 
-    degree: int  # of the map, 1 to 3
+    degree: int  # of the map, 1 to 3, or `LATTICE`
     knots: Tensor  # strengths at which the map is given, ascending from 0 to 1. [S] float32
     table: Tensor  # the map at each knot; the identity at the first. [S,K,3] float32
     residual: Tensor  # bases of the lowest B bands, as stored. [R,M,3B] int8
@@ -215,9 +237,9 @@ class GradeForm:
     remap: SliderRemap  # from these knots to the slider
 
     def __post_init__(self) -> None:
-        if self.degree not in MONOMIALS:
-            raise ValueError(f"a grade of degree {self.degree}, expected 1 to 3")
-        knots, numbers = len(self.knots), MONOMIALS[self.degree]
+        if self.degree not in (LATTICE, *MONOMIALS) or self.table.ndim != 3:
+            raise ValueError(f"a grade of degree {self.degree}, expected 0 to 3")
+        knots, numbers = len(self.knots), MONOMIALS.get(self.degree, self.table.shape[1])
         shapes = {
             "table": (self.table, (knots, numbers, 3)),
             "coefficients": (self.coefficients, (knots, len(self.residual))),
@@ -230,13 +252,15 @@ class GradeForm:
                 )
         if self.knots.ndim != 1 or knots < 2 or float(self.knots[0]) != 0.0 or float(self.knots[-1]) != 1.0:
             raise ValueError("knots must run from 0 to 1")
-        if bool((self.knots.diff() <= 0).any()):
-            raise ValueError("knots must ascend")
+        if bool((self.knots.diff() <= 0).any()) or (self.degree == LATTICE and knots > 2):
+            raise ValueError("knots must ascend, and a lattice has two")
         if self.residual.dtype != torch.int8 or self.residual.ndim != 3 or len(self.residual) > MOST_RANK:
             raise ValueError(f"residual is {list(self.residual.shape)} {self.residual.dtype}, expected int8")
         if self.residual.shape[2] not in (0, 3, 12, 27, 48):
             raise ValueError(f"residual has {self.residual.shape[2]} channels, expected whole bands")
-        if bool(self.coefficients[0].any()) or not torch.equal(self.table[0], identity_map(self.degree)):
+        if bool(self.coefficients[0].any()) or not torch.equal(
+            self.table[0], identity_map(self.degree, numbers)
+        ):
             raise ValueError("the map must be the identity and the residual 0 at strength 0")
 
     @property
@@ -249,7 +273,8 @@ class GradeForm:
         """What it is, as in "grade of degree 2, 2 bases of DC"."""
         bases, parts = len(self.residual), "DC" if self.residual.shape[2] == 3 else "two bands"
         beside = f"{bases} bas{'is' if bases == 1 else 'es'} of {parts}" if bases else "no residual"
-        return f"grade of degree {self.degree}, {beside}"
+        side = 0 if self.degree else lattice_side(self.table.shape[1])
+        return f"grade of {f'degree {self.degree}' if self.degree else f'{side}³ colors'}, {beside}"
 
     @property
     def bytes_per_member(self) -> float:

@@ -1,7 +1,8 @@
 """The grade field: one map of color for the whole region, and a small residual by Gaussian.
 
 For each knot of the slider the map is a polynomial of the drawn color q = clamp(SH color, 0, 1.5):
-color' = Σ_k c_k m_k(q), with m_k the monomials up to the degree. It is held as spherical harmonics of the
+color' = Σ_k c_k m_k(q), with m_k the monomials up to the degree; that of a .cube file is linear between the
+points of its lattice, on q = clamp(SH color, 0, 1). It is held as spherical harmonics of the
 members, which are computed from the scene's own when the field is loaded, so that a file keeps some hundred
 numbers and whatever draws Gaussians draws it. What a map cannot say of single Gaussians is a residual of
 their lowest bands, of a few int8 bases.
@@ -15,17 +16,22 @@ from functools import cache
 
 import torch
 from torch import Tensor
+from torch.nn.functional import grid_sample
 
 from progdf.gaussians import attribute_slices
 from progdf.sh import C0, basis
 
 from .baked import (
+    LATTICE,
     BakedField,
     GradeForm,
+    Segment,
     find_segment,
     identity_map,
     identity_remap,
     interpolate,
+    lattice_colors,
+    lattice_side,
     remap_slider,
 )
 from .separable import fit_amplitude, fit_separable, moving_attributes, principal_modes, quantize_bases
@@ -82,28 +88,38 @@ def map_colors(sh: Tensor, table: Tensor, degree: int) -> Tensor:
         [M,B,3]
     """
     bands = sh.shape[1]
-    if torch.equal(table, identity_map(degree)):
+    if torch.equal(table, identity_map(degree, len(table))):
         return sh.clone()
     if bands == 1:
         colors = sh[:, 0].T * C0 + 0.5
-        mapped = _map_drawn(colors, table, degree)
+        mapped = map_drawn(colors, table, degree)
         hidden = ((mapped <= 0.0) & (colors <= 0.0)).T
         return torch.where(hidden, sh[:, 0], (mapped.T - 0.5) / C0)[:, None]
     chunks: tuple[Tensor, ...] = torch.split(sh.movedim(2, 0), _CHUNK, dim=1)
     return torch.cat([_map_chunk(chunk, table, degree) for chunk in chunks], dim=1).movedim(0, 2).contiguous()
 
 
-def _map_drawn(colors: Tensor, table: Tensor, degree: int) -> Tensor:
-    """What the map makes of colors; the part above `MOST_COLOR` stays. [3,...] -> [3,...]"""
+def map_drawn(colors: Tensor, table: Tensor, degree: int) -> Tensor:
+    """What the map makes of colors; of a polynomial, what is above `MOST_COLOR` stays. [3,...] -> [3,...]"""
+    if degree == LATTICE:
+        return look_up(colors.clamp(0.0, 1.0), table)
     terms = monomials(colors.clamp(0.0, MOST_COLOR), degree).flatten(1)
     return (table.T @ terms).reshape(colors.shape) + (colors - MOST_COLOR).clamp_min(0.0)
+
+
+def look_up(colors: Tensor, table: Tensor) -> Tensor:
+    """Linear between the eight points of a lattice around each color, 0..1. [3,...], [K,3] -> [3,...]"""
+    side = lattice_side(len(table))
+    lattice = table.T.reshape(1, 3, side, side, side)  # blue, green, red
+    places = (2.0 * colors.flatten(1).T - 1.0)[None, None, None]
+    return grid_sample(lattice, places, align_corners=True)[0, :, 0, 0].reshape(colors.shape)
 
 
 def _map_chunk(sh: Tensor, table: Tensor, degree: int) -> Tensor:
     """`map_colors` of the channels of some members. [3,m,B] -> [3,m,B]"""
     values, inverse = _sphere(math.isqrt(sh.shape[2]) - 1)
     colors = sh @ values.T + 0.5
-    mapped = _map_drawn(colors, table, degree)
+    mapped = map_drawn(colors, table, degree)
     made = sh + (mapped - colors.clamp_min(0.0)) @ inverse.T
     clamped = (colors.amin(dim=2) < 0.0) | (mapped.amin(dim=2) < 0.0)
     some, target = made[clamped], mapped[clamped]
@@ -195,16 +211,63 @@ def adjust_colors(form: GradeForm, sh: Tensor, members: Tensor | slice, s: float
     Returns:
         [m,B,3]; exactly 0 at 0, and the map and residual of the file at 1
     """
-    at = form.remap.new.new_tensor([s])
-    strength = float(interpolate(at, form.remap.new, form.remap.old)) if s < 1.0 else s
-    right, share = find_segment(form.knots, strength)
-    table = torch.lerp(form.table[right - 1], form.table[right], share)
-    change = map_colors(sh, table if share != 1.0 else form.table[right], form.degree) - sh
+    right, share = _segment(form, s)
+    if form.degree == LATTICE:  # colors above 1 go the straight way too
+        change = share * (map_colors(sh, form.table[right], LATTICE) - sh)
+    else:
+        change = map_colors(sh, map_at(form, s), form.degree) - sh
     if len(form.residual):
         row = torch.lerp(form.coefficients[right - 1], form.coefficients[right], share)
         residual = (form.residual[:, members] * (row[:, None] * form.scale)[:, None]).sum(dim=0)
         change[:, : residual.shape[1] // 3] += residual.reshape(len(sh), -1, 3)
     return change
+
+
+def map_share(field: BakedField) -> Tensor:
+    """How much of each member's change at strength 1 is its map's: 1 − |residual|² / |map|², 0..1. [M]
+
+    Where the residual undoes the map, as between stripes, or does as much again, it is 0.
+    """
+    form, moved = field.origin, field.attributes
+    ends = [moved[name].end_offset for name in ("sh0", "shN") if name in moved]
+    if not isinstance(form, GradeForm) or not len(form.residual) or not ends:
+        return torch.ones(field.members)
+    change = torch.cat(ends, dim=1)
+    residual = torch.zeros_like(change)
+    scaled = form.residual * form.scale[:, None]
+    residual[:, : scaled.shape[2]] = torch.einsum("r,rmc->mc", form.coefficients[-1], scaled)
+    ratio = residual.square().sum(dim=1) / (change - residual).square().sum(dim=1)
+    return (1.0 - ratio).clamp(0.0, 1.0).nan_to_num(1.0)
+
+
+def map_at(form: GradeForm, s: float) -> Tensor:
+    """The map of a grade at strength `s` of the slider. [K,3]"""
+    right, share = _segment(form, s)
+    return form.table[right] if share == 1.0 else torch.lerp(form.table[right - 1], form.table[right], share)
+
+
+def _segment(form: GradeForm, s: float) -> Segment:
+    at = form.remap.new.new_tensor([s])
+    return find_segment(form.knots, float(interpolate(at, form.remap.new, form.remap.old)) if s < 1.0 else s)
+
+
+def mapped_lattice(form: GradeForm, s: float, side: int) -> Tensor:
+    """What the map at strength `s` makes of the colors of a lattice, see `lattice_colors`. [side³,3]"""
+    return map_drawn(lattice_colors(side).T, map_at(form, s), form.degree).T
+
+
+def lattice_form(table: Tensor) -> GradeForm:
+    """The grade of a lattice, for no members: the straight way to the colors of the table. [K,3]"""
+    ends = torch.stack([lattice_colors(lattice_side(len(table))), table])
+    none = torch.zeros(0, 0, 0, dtype=torch.int8)
+    knots = torch.tensor([0.0, 1.0])
+    return GradeForm(LATTICE, knots, ends, none, torch.zeros(0, 0), torch.zeros(2, 0), identity_remap())
+
+
+def without_residual(form: GradeForm, members: int) -> GradeForm:
+    """The map of a grade alone, for so many members of any scene."""
+    none = torch.zeros(0, members, 0, dtype=torch.int8)
+    return replace(form, residual=none, scale=torch.zeros(0, 0), coefficients=form.coefficients[:, :0])
 
 
 def fit_grade(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Mapping, MutableMapping
+from collections.abc import Callable, Mapping, MutableMapping
 from dataclasses import dataclass, replace
 from dataclasses import field as default
 from pathlib import Path
@@ -17,10 +17,12 @@ from torch.utils.weak import WeakIdKeyDictionary
 from progdf.errors import ProgdfError
 from progdf.field.bake import bake_form, rows_hash
 from progdf.field.baked import BakedField, GradeForm, NeuralForm
-from progdf.field.grade import bake_grade
+from progdf.field.grade import bake_grade, lattice_form, without_residual
+from progdf.formats.cube import SUFFIX as CUBE
+from progdf.formats.cube import read_cube
 from progdf.gaussians import BASE_CHANNELS, ZERO, Gaussians, Origin, pack
 from progdf.io.atomic import atomic_write, read_file
-from progdf.region import Region
+from progdf.region import Region, whole_scene
 
 from .header import (
     MOST_GAUSSIANS,
@@ -37,6 +39,8 @@ from .header import (
 
 _FINGERPRINTS: MutableMapping[Tensor, tuple[tuple[int, Origin] | None, str]] = WeakIdKeyDictionary()
 """Version, origin and hash of the centers of scenes that are alive."""
+ANY_SCENE = SceneFingerprint(0, "")
+"""Of a grade that was trained on none."""
 _FAR = 1e18
 """An offset that is larger is absurd, as a position is (see `progdf.formats.repair`)."""
 _FARTHEST = {"log_scales": 80.0}
@@ -54,6 +58,7 @@ class Gdf:
     instruction: str = ""  # to the editor, e.g. "recolor:#3060d0"
     options: Mapping[str, Any] = default(default_factory=dict)  # of the training, JSON values
     report: Mapping[str, Any] = default(default_factory=dict)  # the run's errors, see report.json
+    applied: bool = False  # the map of a grade that is bound to no scene, on a region of this one
 
     def __post_init__(self) -> None:
         if self.field.attributes and self.field.members != len(self.region):
@@ -98,6 +103,8 @@ def verify(gdf: Gdf, scene: Gaussians, gdf_name: str = "", scene_name: str = "th
         f"--to {scene_name} -o NEW.gdf"
     )
     count, scene_count = (f"{n:,}".replace(",", " ") for n in (gdf.scene.count, len(scene)))
+    if isinstance(gdf.field.origin, GradeForm):
+        rebind = f"its grade goes on any scene with --region {gdf.name}=all, or another region; {rebind}"
     if gdf.scene.count != len(scene):
         counts = f"it has {count} Gaussians, {scene_name} has {scene_count}"
         raise ProgdfError(f"{other}: {counts}; {rebind}")
@@ -141,21 +148,29 @@ def save_gdf(path: str | os.PathLike[str], gdf: Gdf) -> None:
 
 
 def load_gdf(
-    path: str | os.PathLike[str], scene: Gaussians | None = None, scene_name: str = "the scene"
+    path: str | os.PathLike[str],
+    scene: Gaussians | None = None,
+    scene_name: str = "the scene",
+    place: Callable[[Gdf], Region | None] = lambda stored: None,
 ) -> Gdf:
     """Read an edit. A network or a grade is baked here, for which the scene is needed.
 
     Args:
-        path: a .gdf file
+        path: a .gdf file, or a .cube file, which is a grade of no scene
         scene: when given, the edit must belong to it
         scene_name: what to call the scene in the message
+        place: the region of the scene that a grade is applied to, by the edit as it is stored; None: where it
+            was trained, and of a .cube file everywhere
 
     Raises:
-        ProgdfError: see `read_gdf`; or it was made for another scene; or it is to be baked and no scene is
-            given.
+        ProgdfError: see `read_gdf`, `apply_grade`; or it was made for another scene; or it is to be baked and
+            no scene is given.
     """
     gdf, name = read_gdf(path), Path(path).name
     if scene is not None:
+        region = place(gdf)
+        if region is not None or gdf.scene == ANY_SCENE:
+            return apply_grade(gdf, scene, whole_scene(scene) if region is None else region)
         verify(gdf, scene, name, scene_name)
     form = gdf.field.origin
     if form is None:
@@ -176,13 +191,39 @@ def load_gdf(
         raise contradiction_error(name, error) from error
 
 
+def apply_grade(gdf: Gdf, scene: Gaussians, region: Region) -> Gdf:
+    """The map of a grade on a region of any scene: its residual and its figures are of another one.
+
+    Raises:
+        ProgdfError: it is no grade, or the region has no members.
+    """
+    stored = gdf.field.origin
+    if not isinstance(stored, GradeForm):
+        raise ProgdfError(
+            f"{gdf.name} is no grade: its field is {gdf.field.kind}; only a grade goes on any region"
+        )
+    if not len(region):
+        raise ProgdfError(f"the region for {gdf.name} has no Gaussians; give another")
+    rows = pack(scene[region.members], with_shN=scene.sh_degree > 0)
+    field = replace(bake_grade(without_residual(stored, len(region)), rows), recorded=())
+    report = {"residual_left_out": len(stored.residual) > 0}
+    return Gdf(gdf.name, region, field, fingerprint(scene), gdf.instruction, report=report, applied=True)
+
+
 def read_gdf(path: str | os.PathLike[str]) -> Gdf:
     """The edit as it is stored, every byte checked; a network is not baked yet and moves nothing.
 
+    Of a .cube file, a grade of no members, to be applied.
+
     Raises:
-        ProgdfError: it is no .gdf, from a newer version, truncated, damaged or inconsistent.
+        ProgdfError: it is no .gdf, from a newer version, truncated, damaged or inconsistent; see `read_cube`.
     """
     name = Path(path).name
+    if Path(path).suffix.lower() == CUBE:
+        nobody = Region("any", torch.zeros(0, dtype=torch.int64), torch.zeros(0))
+        ends, form = torch.tensor([0.0, 1.0]), lattice_form(read_cube(path))
+        field = BakedField("grade", ends, {}, BASE_CHANNELS, origin=form)
+        return Gdf(Path(path).stem, nobody, field, ANY_SCENE, name)
     header, tensors = unpack_file(read_file(path), name)
     try:
         return _unpack(header, tensors)

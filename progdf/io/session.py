@@ -52,11 +52,18 @@ class FileRef(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return Path(os.path.normpath(folder / self.file))
 
 
+class EditRef(FileRef, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """An edit that a session needs."""
+
+    region: str = ""  # name of the region that its grade is applied to; "" where it is the edit's own
+    members: bytes = b""  # which Gaussians that is, as a selection is stored
+
+
 class SessionFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What a session file holds, its state as plain JSON values."""
 
     scene: FileRef  # the .ply
-    edits: tuple[FileRef, ...] = ()  # the .gdf files, in the order in which layers count them
+    edits: tuple[EditRef, ...] = ()  # the .gdf files, in the order in which layers count them
     view: dict[str, Any] = {}  # the state on screen
     snapshots: tuple[dict[str, Any], ...] = ()  # states that were kept
 

@@ -44,8 +44,8 @@ TITLES = {
 }
 _HINTS = {
     "save": "A .session.json file. The scene and its edits stay where they are.",
-    "open": "A scene (.ply, .spz, .sog …), an edit (.gdf), a changed picture, a session or cameras.",
-    "replace": "An edit (.gdf) of this scene. The layer keeps its position, strength and gains.",
+    "open": "A scene (.ply, .spz, .sog …), an edit (.gdf, .cube), a changed picture, a session or cameras.",
+    "replace": "An edit (.gdf, .cube). The layer keeps its position, strength and gains.",
     "leave": "Save changes to {}?",
     "overwrite": "{} was not opened in this window. Replacing it cannot be undone.",
     "restore": "The last session was not closed properly. Its unsaved work was saved to {}.",
@@ -322,7 +322,7 @@ POLL_S = 0.05
 
 _OPEN = [
     "Scenes, edits, sessions, cameras",
-    "*.ply *.spz *.splat *.ksplat *.sog *.gdf *.json",
+    "*.ply *.spz *.splat *.ksplat *.sog *.gdf *.cube *.json",
     "All files",
     "*",
 ]

@@ -11,15 +11,17 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from progdf.camera import Camera
 from progdf.cli.info import kind_of
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
-from progdf.gdf.file import Gdf, load_gdf
+from progdf.gdf.file import Gdf, fingerprint, load_gdf
 from progdf.io.cameras import load_cameras
 from progdf.io.picture_camera import edits_in_picture, find_picture_camera
 from progdf.metrics.image import NO_DIFFERENCE
+from progdf.region import Region, from_mask
 from progdf.scene.strays import Strays, clean, find_strays, picture_difference
 from progdf.terminal import group_digits
 from progdf.threads import all_threads
@@ -30,6 +32,7 @@ from viewer.files.session import SessionAutosave, WindowSession, session_file
 from viewer.files.user_files import parse_path, read_recent, remember_recent
 from viewer.jobs.training import with_picture
 from viewer.state import selection, workspace
+from viewer.state.facts import describe_applied
 from viewer.state.layers import add_layer, duplicate_layer, replace_edit
 from viewer.state.timeline import Player
 from viewer.state.view_state import ViewState, on_another_scene
@@ -110,17 +113,16 @@ class EditActions:
         self._app = app
 
     def add(self, path: Path) -> None:
-        """An edit on top, at full strength, so that one sees what came.
-
-        The second edit of a stack sets its rule, which there was no way to choose: two at 1 are not averaged.
+        """An edit on top, at full strength, so that one sees what came; a grade of another scene or of none
+        goes on what is selected, and with nothing selected everywhere.
 
         Raises:
-            ProgdfError: the file is missing, broken, or was made for another scene.
+            ProgdfError: the file is missing or broken, or no grade, and was made for another scene.
         """
-        gdf = self._load(path)
-        before = self._app.main_view.work.view
-        if len(before.layers) == 1 and before.blend == "normalized":
-            before = replace(before, blend="adjust")
+        before, scene = self._app.main_view.work.view, self._app.document.scene
+        selected = selection.unpack(before.selection.members, len(scene)).copy()
+        name, mask = ("selection", selected) if selected.any() else ("all", np.ones(len(scene), bool))
+        gdf = self._load(path, from_mask(name, torch.from_numpy(mask)))
         view = add_layer(before, self._open(gdf, path), gdf.name)
         self._apply(view, len(view.layers) - 1)
 
@@ -132,13 +134,13 @@ class EditActions:
         self._apply(duplicate_layer(view, index, self._open(document.gdfs[gdf], path)), index + 1)
 
     def replace(self, index: int, path: Path) -> None:
-        """Another edit in a layer's place.
+        """Another edit in a layer's place; a grade of another scene or of none takes the layer's region.
 
         Raises:
             ProgdfError: as for `add`.
         """
-        gdf = self._load(path)
         view = self._app.main_view.work.view
+        gdf = self._load(path, self._app.document.gdfs[view.layers[index].gdf].region)
         self._apply(replace_edit(view, index, self._open(gdf, path), gdf.name), index)
 
     def layer(self, index: str) -> int:
@@ -153,9 +155,18 @@ class EditActions:
             raise ProgdfError("no layer is selected; click one first")
         return chosen
 
-    def _load(self, path: Path) -> Gdf:
+    def _load(self, path: Path, region: Region) -> Gdf:
+        """An edit of the scene, or the grade of another on a region."""
+        scene = self._app.document.scene
+
+        def place(stored: Gdf) -> Region | None:
+            return region if stored.field.kind == "grade" and stored.scene != fingerprint(scene) else None
+
         with all_threads():
-            return load_gdf(path, self._app.document.scene)
+            gdf = load_gdf(path, scene, place=place)
+        if note := describe_applied(scene, gdf):
+            self._app.main_view.show_message(note)
+        return gdf
 
     def _open(self, gdf: Gdf, path: Path | None) -> int:
         """Have one more edit open; its index."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import os
 from collections.abc import Callable, Sequence
@@ -18,16 +19,22 @@ from progdf.cli.info import kind_of
 from progdf.cli.options import parse_options
 from progdf.color.edits import parse_color
 from progdf.errors import ProgdfError
+from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
 from progdf.io.tensors import open_npy
+from progdf.region import Region
+from progdf.scene.regions import check_region, parse_region
 from progdf.scene.up_axis import UpChoice
 from viewer.camera.view_camera import Vec3, up_of, with_up
 from viewer.files import document, session
 from viewer.files.document import Document
 from viewer.state import layers as stacks
+from viewer.state.facts import describe_applied
 from viewer.state.paint import encode
 from viewer.state.snapshots import SliderSnapshot
 from viewer.state.view_state import OVERSHOOT, LayerState, ViewState
+
+_log = logging.getLogger(__name__)
 
 Blend = Literal["normalized", "sum", "over", "adjust"]
 Against = Literal["original", "recorded"]
@@ -35,7 +42,7 @@ NO_SCENE = Path()
 """What stands for the scene where none is given."""
 SESSION = "--session"
 _BARE = {"--split": "0.5", "--difference": "4"}  # what an option without a value means
-_SAID_BY_SESSION = ("gdfs", "gain", "solo", "paint", "overshoot", "background")
+_SAID_BY_SESSION = ("gdfs", "region", "gain", "solo", "paint", "overshoot", "background")
 
 
 def word(metavar: str | None = None, absent: str | Callable[[str], str] | None = None, **more: Any) -> Any:
@@ -62,7 +69,10 @@ class StackOptions:
     scene: Annotated[Path, Positional, word("SCENE", _scene)]
     """The scene: a .ply, .spz, .splat, .ksplat or .sog; or a session (Ctrl+S), also as --session FILE."""
     gdfs: Annotated[tuple[Path, ...], Positional, word("EDIT.gdf", "the scene alone")] = ()
-    """Edits of this scene, the lowest layer first."""
+    """Edits of this scene, the lowest layer first; also .cube files, which change colors everywhere."""
+    region: Annotated[tuple[str, ...], UseAppendAction, word("NAME=REGION")] = ()
+    """Apply the grade of an edit, of whatever scene, or a .cube file to a region of this scene: all, or as
+    `progdf train` has it."""
     set: Annotated[tuple[str, ...], UseAppendAction, word("NAME=S")] = ()
     """Strength of an edit, 0 to 1; repeat it for several edits. An edit that is not named is at 1 in `render`
     and `export`, at 0 in `view`, --sweep and --sheet, and as a session has it."""
@@ -74,9 +84,7 @@ class StackOptions:
     """Painted strength of an edit: a .npy of weights 0 to 1, one per member or per Gaussian."""
     overshoot: Switch = False
     """Overshoot to 1.2: extrapolates past the trained range."""
-    blend: Annotated[Blend | None, word("{normalized,sum,over,adjust}", "the session's, else normalized")] = (
-        None
-    )
+    blend: Annotated[Blend | None, word("{normalized,sum,over,adjust}", "the session's, else adjust")] = None
     """How edits that share Gaussians add up."""
 
 
@@ -142,11 +150,11 @@ class RenderOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class ExportOptions:
-    """Write a scene under its edits as a 3DGS .ply file."""
+    """Write a scene under its edits as a 3DGS .ply file, or the colors of a grade as a .cube file."""
 
     stack: OmitArgPrefixes[StackOptions]
     out: Annotated[Path, word("FILE", aliases=["-o"])]
-    """The .ply file to write."""
+    """The .ply file to write; or a .cube file, for color programs, of what one grade does at its strength."""
 
 
 class Named(Protocol):
@@ -234,12 +242,38 @@ def open_stack(stack: StackOptions, drawing: DrawingOptions | None = None, unset
         if first is not path:
             again = "" if first == path else f", first as {first}"
             raise ProgdfError(f"{path} was given twice{again}; give each edit once")
-    view = ViewState(blend=stack.blend or "normalized", overshoot=stack.overshoot)
+    view = ViewState(overshoot=stack.overshoot)
+    view = view if stack.blend is None else replace(view, blend=stack.blend)
     if drawing is not None:
         view = replace(view, background=parse_background(drawing.background))
-    opened = document.load(stack.scene, stack.gdfs)
+    opened = document.load(stack.scene, stack.gdfs, _placing(stack.region))
+    for text in stack.region:
+        check_edit(text.partition("=")[0], opened.gdfs, "--region")
+    notes = [note for gdf in opened.gdfs if (note := describe_applied(opened.scene, gdf))]
+    for note in notes:
+        _log.warning(note)
     layers = stack_layers(opened.gdfs, stack, unset)
-    return OpenStack(opened, replace(view, layers=layers), up_option=drawing.up if drawing else "auto")
+    up = drawing.up if drawing else "auto"
+    return OpenStack(opened, replace(view, layers=layers), up_option=up, warning="; ".join(notes))
+
+
+def _placing(texts: Sequence[str]) -> document.Place:
+    """Where `--region NAME=REGION` options apply edits; what can be told without a scene is refused here."""
+    specs: dict[str, str] = {}
+    for text in texts:
+        name, equals, spec = text.partition("=")
+        if not equals or not name or name in specs:
+            again = "names an edit twice" if name in specs else "has no NAME=REGION"
+            raise ProgdfError(
+                f"--region {text} {again}; write for each edit --region NAME=all or another region"
+            )
+        check_region(spec)
+        specs[name] = spec
+
+    def place(scene: Gaussians, index: int, name: str) -> Region | None:
+        return parse_region(specs[name], scene) if name in specs else None
+
+    return place
 
 
 def _open_session(stack: StackOptions, drawing: DrawingOptions | None) -> OpenStack:

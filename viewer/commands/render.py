@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,10 @@ from PIL import Image
 from progdf.camera import Camera
 from progdf.compose.reference import compose_layers
 from progdf.errors import ProgdfError
+from progdf.field.baked import GradeForm, lattice_colors, lattice_side
+from progdf.field.grade import mapped_lattice
+from progdf.formats.cube import SIDE, write_cube
+from progdf.formats.cube import SUFFIX as CUBE
 from progdf.formats.ply import save_ply_checked
 from progdf.formats.scene_file import scene_format
 from progdf.gaussians import ZERO, Gaussians
@@ -94,10 +99,12 @@ def export(argv: Sequence[str]) -> int:
     """`progdf export`: the edited scene as a .ply that any viewer opens."""
     options: ExportOptions = parse(ExportOptions, argv, "progdf export")
     out = options.out
-    if out.suffix.lower() != ".ply":
+    if out.suffix.lower() not in (".ply", CUBE):
         raise ProgdfError(f"{out} is not a .ply file; give the edited scene a name that ends in .ply")
     opened = open_stack(options.stack, unset=1.0)
     check_not_an_input(out, opened.files)
+    if out.suffix.lower() == CUBE:
+        return _export_cube(out, opened)
     document, states = opened.document, visible_layers(opened.view)
     layers = [layer_of(document.gdfs[s.gdf], s.strength, s.gains, s.paint) for s in states]
     edited = compose_layers(document.scene, layers, opened.view.blend)
@@ -107,6 +114,24 @@ def export(argv: Sequence[str]) -> int:
     print_line(f"wrote {out}: {format_count(len(edited))}, {strengths}{far}; read back and compared")
     if document.path is not None and (kind := scene_format(document.path)) != "ply":
         print_line(f"{document.title} is a .{kind}, this is a plain .ply")
+    return 0
+
+
+def _export_cube(out: Path, opened: OpenStack) -> int:
+    """What one grade does to colors as a .cube file, at its strength and its gain of color."""
+    states = visible_layers(opened.view)
+    forms = [opened.document.gdfs[state.gdf].field.origin for state in states]
+    form = forms[0] if forms else None
+    if len(forms) != 1 or not isinstance(form, GradeForm):
+        raise ProgdfError(f"{out} holds what one grade does to colors; give one edit that is a grade")
+    (state,) = states
+    side = SIDE if form.degree else lattice_side(form.table.shape[1])
+    same = lattice_colors(side)
+    table = same + state.gains.color * (mapped_lattice(form, state.strength, side) - same)
+    write_cube(out, table, state.name)
+    parts = {"residual": len(form.residual), "paint": state.paint}
+    left_out = "".join(f"; its {name} is left out" for name, part in parts.items() if part)
+    print_line(f"wrote {out}: {side}³ colors, {describe_strengths(opened.view)}{left_out}")
     return 0
 
 

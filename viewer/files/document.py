@@ -13,12 +13,21 @@ import torch
 from progdf.formats.scene_file import load_scene, scene_file, scene_name
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf, load_gdf
+from progdf.region import Region
 from progdf.scene.neighbors import Neighborhood
 from progdf.terminal import escape_text
 from progdf.threads import all_threads
 from viewer.camera.view_camera import SceneUp, bounds_of, find_scene_up, first_camera, fit, fit_all
 from viewer.state.facts import RecordingFile, find_recording, layer_rows
 from viewer.state.workspace import SceneFacts
+
+Place = Callable[[Gaussians, int, str], Region | None]
+"""Gives the region of a scene that an edit's grade is applied to, by its number and its name; None where the
+edit has its own."""
+
+
+def _where_trained(_: Gaussians, index: int, name: str) -> Region | None:
+    return None
 
 
 @dataclass(frozen=True)
@@ -90,7 +99,7 @@ def empty() -> Document:
     return Document("", unseen)
 
 
-def load(scene: Path, gdfs: Sequence[Path] = ()) -> Document:
+def load(scene: Path, gdfs: Sequence[Path] = (), place: Place = _where_trained) -> Document:
     """Read a scene and its edits.
 
     Raises:
@@ -98,21 +107,26 @@ def load(scene: Path, gdfs: Sequence[Path] = ()) -> Document:
     """
     scene = scene_file(scene)
     gaussians = load_scene(scene)
-    return Document(
-        escape_text(scene_name(scene)), gaussians, load_edits(gdfs, gaussians, scene), scene, tuple(gdfs)
-    )
+    edits = load_edits(gdfs, gaussians, scene, place)
+    return Document(escape_text(scene_name(scene)), gaussians, edits, scene, tuple(gdfs))
 
 
-def load_edits(paths: Sequence[Path], scene: Gaussians, scene_path: Path) -> tuple[Gdf, ...]:
+def load_edits(
+    paths: Sequence[Path], scene: Gaussians, scene_path: Path, place: Place = _where_trained
+) -> tuple[Gdf, ...]:
     """The edits of a scene; a second one of the same name becomes NAME-2, so that --set can tell them apart.
 
     Raises:
         ProgdfError: a file is missing, broken, or was made for another scene.
     """
     gdfs: list[Gdf] = []
-    for path in paths:
+    for index, path in enumerate(paths):
+
+        def region(stored: Gdf, index: int = index) -> Region | None:
+            return place(scene, index, _free_name(stored.name, gdfs))
+
         with all_threads():
-            gdf = load_gdf(path, scene, scene_path.name)
+            gdf = load_gdf(path, scene, scene_path.name, region)
         gdfs.append(replace(gdf, name=_free_name(gdf.name, gdfs)))
     return tuple(gdfs)
 

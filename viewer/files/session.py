@@ -14,10 +14,16 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+import torch
+
 from progdf.errors import ProgdfError
+from progdf.gaussians import Gaussians
+from progdf.gdf.file import Gdf
 from progdf.io.atomic import replace_file
 from progdf.io.session import (
     SUFFIX,
+    EditRef,
     SessionFile,
     read_session,
     reference,
@@ -25,11 +31,13 @@ from progdf.io.session import (
     verify_files,
     write_session,
 )
+from progdf.region import Region, from_mask
 from progdf.terminal import escape_text
 from viewer.camera.view_camera import Vec3, move_camera
 from viewer.state import paint
 from viewer.state.selection import SUFFIX as REGION_SUFFIX
 from viewer.state.selection import check as check_selection
+from viewer.state.selection import pack, unpack
 from viewer.state.snapshots import SliderSnapshot
 from viewer.state.view_state import LayerState, ViewState
 
@@ -87,8 +95,20 @@ def save(path: Path, session: WindowSession) -> None:
         raise ProgdfError(f"the folder {path.parent} does not exist; create it first")
     folder = path.parent
     view = _with_region_paths(view, lambda region: Path(relative_name(region, folder)))
-    edits = tuple(reference(gdf, folder) for gdf in session.document.gdf_paths)
+    opened = session.document
+    edits = tuple(
+        _edit_ref(gdf, path, folder) for gdf, path in zip(opened.gdfs, opened.gdf_paths, strict=True)
+    )
     write_session(path, WindowFile(reference(scene, folder), edits, view, snapshots))
+
+
+def _edit_ref(gdf: Gdf, path: Path, folder: Path) -> EditRef:
+    file = reference(path, folder)
+    if not gdf.applied:
+        return EditRef(file.file, file.sha256)
+    mask = np.zeros(gdf.scene.count, bool)
+    mask[gdf.region.members.numpy()] = True
+    return EditRef(file.file, file.sha256, gdf.region.name, pack(mask))
 
 
 def open_session(path: Path, memory: Path | None = None) -> WindowSession:
@@ -104,7 +124,13 @@ def open_session(path: Path, memory: Path | None = None) -> WindowSession:
     """
     file = read_session(path, WindowFile)
     scene, gdfs = verify_files(path, file)
-    opened = document.load(scene, gdfs)
+
+    def place(scene: Gaussians, index: int, name: str) -> Region | None:
+        edit = file.edits[index]
+        mask = unpack(edit.members, len(scene)).copy()
+        return from_mask(edit.region, torch.from_numpy(mask)) if edit.region else None
+
+    opened = document.load(scene, gdfs, place)
     x, y, z = opened.scene.origin
     view, snapshots = _move(file.view, file.snapshots, (-x, -y, -z))
     check_selection(view.selection, len(opened.scene))

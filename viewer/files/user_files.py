@@ -27,7 +27,7 @@ MOST_THUMBNAILS = 64
 
 def is_listed(path: Path) -> bool:
     """Whether it may be a scene or a session: no edit, and no work that was saved or put aside by itself."""
-    return path.suffix.lower() != ".gdf" and session_of(path) is None and "\n" not in str(path)
+    return path.suffix.lower() not in (".gdf", ".cube") and session_of(path) is None and "\n" not in str(path)
 
 
 def read_recent(folder: Path | None = None) -> tuple[Path, ...]:

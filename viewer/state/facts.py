@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -14,15 +15,17 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from progdf.camera import Camera
 from progdf.compose.layers import KINDS
 from progdf.errors import ProgdfError
 from progdf.field.baked import GradeForm
+from progdf.field.grade import map_drawn
 from progdf.field.trajectory import FILE_NAME, load_trajectory, peek_trajectory, recorded_field
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
 from progdf.metrics.slider import visible_change
 from progdf.rasterize import render
-from progdf.sh import sh0_to_rgb
+from progdf.sh import sh0_to_rgb, shade
 from viewer.camera.view_camera import Bounds, Fit, ViewCamera, bounds_of, fit, frame, keep_camera, to_camera
 
 from .layers import visible_layers
@@ -37,6 +40,7 @@ SIDE_PX = 72
 MOST_MEMBERS = 20_000
 """Of a larger region every so-manieth Gaussian is drawn, so that a row unfolds in a fraction of a second."""
 
+_COVERED = 0.95  # transmittance of a pixel that shows the region
 _FROM = (20.0, 200.0)  # degrees around the scene: from before and behind
 
 
@@ -122,8 +126,7 @@ def visible_changes(scene: Gaussians, gdf: Gdf) -> tuple[float, ...]:
         return (0.0,) * count
     every = -(-len(members) // MOST_MEMBERS)
     region = scene[members[::every]]
-    bounds = bounds_of(region)
-    cameras = [to_camera(frame(ViewCamera(azimuth=azimuth), bounds), SIDE_PX, SIDE_PX) for azimuth in _FROM]
+    cameras = _two_sides(region)
 
     def pictures(strength: float) -> list[Tensor]:
         moved: dict[str, Any] = {}
@@ -140,6 +143,40 @@ def visible_changes(scene: Gaussians, gdf: Gdf) -> tuple[float, ...]:
     return tuple(change / total for change in changes) if total > 0.0 else (0.0,) * count
 
 
+def _two_sides(region: Gaussians) -> list[Camera]:
+    bounds = bounds_of(region)
+    return [to_camera(frame(ViewCamera(azimuth=azimuth), bounds), SIDE_PX, SIDE_PX) for azimuth in _FROM]
+
+
+def describe_applied(scene: Gaussians, gdf: Gdf) -> str:
+    """What is not shown of a grade that was applied to a region, in one line; "" where all is, to 1/255.
+
+    Colors that turn with the view follow its map as far as their bands can; how far they are off is measured
+    on small renders of the region alone, whose Gaussians have the very colors that the map makes of theirs.
+    """
+    form, lines = gdf.field.origin, []
+    if not gdf.applied or not isinstance(form, GradeForm):
+        return ""
+    if gdf.report["residual_left_out"]:
+        lines.append("its residual, which is of the scene it was trained on, is left out")
+    every = -(-len(gdf.region) // MOST_MEMBERS)
+    region, moved = scene[gdf.region.members[::every]], gdf.field.attributes
+    sh = region.sh[:, :16].clone()
+    for name, bands in (("sh0", sh[:, :1]), ("shN", sh[:, 1:])):
+        if name in moved:
+            bands += moved[name].end_offset[::every].reshape(len(sh), -1, 3)[:, : bands.shape[1]]
+    errors: list[Tensor] = []
+    for camera in _two_sides(region) if sh.shape[1] > 1 else ():
+        toward = torch.nn.functional.normalize(region.means - camera.position, dim=1)
+        drawn = shade(math.isqrt(sh.shape[1]) - 1, toward, region.sh)
+        exact = map_drawn(drawn.T, form.table[-1], form.degree).T.clamp_min(0.0).contiguous()
+        a, b = (render(region, camera, colors=colors) for colors in (exact, sh))
+        errors.append((a.image.clamp(0.0, 1.0) - b.image.clamp(0.0, 1.0))[a.transmittance < _COVERED])
+    if errors and (levels := 255 * float(torch.cat(errors).square().mean().sqrt())) > 1:
+        lines.append(f"pictures are {levels:.1f}/255 (rms) off its map, as its colors turn with the view")
+    return f"{gdf.name} on {gdf.region.name}: {'; '.join(lines)}" if lines else ""
+
+
 NO_FILE = "the edit was not opened from a file"
 
 
@@ -154,6 +191,8 @@ class RecordingFile:
 def find_recording(gdf: Gdf, path: Path) -> RecordingFile:
     """The recording in the run folder that the edit at `path` lies in, if it is this edit's."""
     beside = path.with_name(FILE_NAME)
+    if gdf.applied:
+        return RecordingFile(reason=f"{path.name} was not trained on this region")
     if not beside.is_file():
         return RecordingFile(reason=f"there is no {FILE_NAME} beside {path.name}")
     field, form = gdf.field, gdf.field.origin

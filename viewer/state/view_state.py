@@ -137,7 +137,7 @@ class ViewState:
 
     camera: ViewCamera = ViewCamera()
     layers: tuple[LayerState, ...] = ()
-    blend: Blend = "normalized"
+    blend: Blend = "adjust"
     background: tuple[Share, Share, Share] = (1.0, 1.0, 1.0)
     overlay: bool = False
     panel: bool = True

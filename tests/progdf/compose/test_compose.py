@@ -12,11 +12,12 @@ from progdf.compose.composer import Composer
 from progdf.compose.reference import BLENDS, Gains, Layer, compose_layers, coverage
 from progdf.errors import ProgdfError
 from progdf.field import fit_keyframes
-from progdf.field.baked import identity_map
-from progdf.field.grade import bake_grade, fit_grade, map_colors
+from progdf.field.baked import BakedField, identity_map
+from progdf.field.grade import bake_grade, fit_grade, lattice_form, map_colors
 from progdf.gaussians import ATTRIBUTES, Gaussians, attribute_slices, pack
-from progdf.gdf.file import Gdf
+from progdf.gdf.file import Gdf, apply_grade
 from progdf.rasterize import set_threads
+from progdf.region import from_mask, whole_scene
 from tests.helpers.edits import bits, curved_field, edit_of, some_rows
 from tests.helpers.scenes import random_gaussians
 
@@ -487,6 +488,40 @@ def test_adjust_counts_the_order(scene: Gaussians, shirt: Gdf) -> None:
     assert not torch.equal(above.sh0, below.sh0)
 
 
+def test_a_grade_that_is_a_pattern_lies_over_what_is_below_as_far_as_its_map_does_not_say_it(
+    scene: Gaussians, shirt: Gdf
+) -> None:
+    rows = torch.arange(len(scene))
+    dark = compose_layers(scene, [Layer(graded(scene, rows, 0.6, residual=False))])
+    knots, table = torch.tensor([0.0, 1.0]), identity_map(1)
+    halfway = table + 0.5 * (torch.tensor([[0.1, 0.3, 0.9]] + [[0.0] * 3] * 3) - table)
+    mapped = map_colors(scene.sh, halfway, 1) - scene.sh
+    course = torch.zeros(2, len(scene), 12)
+    course[1] = torch.where(rows[:, None] % 2 == 0, -1.0, 1.0) * mapped.flatten(1)
+    form = fit_grade(knots, 1, torch.stack([table, halfway]), course, 1, torch.ones(len(scene)))
+    stripes = edit_of(scene, rows, bake_grade(form, pack(scene, True)), "stripes")
+    assert float(coverage(scene, stripes)["map"].mean()) < 0.1, "half of it is undone, the other half doubled"
+    layers = [Layer(graded(scene, rows, 0.6, residual=False)), Layer(stripes)]
+    both, alone = compose_layers(scene, layers, "adjust"), compose_layers(scene, [Layer(stripes)])
+    between, far = rows[::2], coverage(scene, stripes)["color"] == 1.0
+    assert float((both.sh0 - dark.sh0)[between].abs().mean()) < 0.1
+    assert torch.allclose(both.sh0[far], alone.sh0[far], atol=0.1)
+    assert int(far.sum()) > 50
+
+
+def test_grades_that_share_no_gaussian_are_adjusted_as_fast_as_any_edit(
+    scene: Gaussians, hat: Gdf, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    halves = [graded(scene, half, 0.6) for half in torch.arange(len(scene)).split(len(scene) // 2)]
+    composer = Composer(scene, [*halves, hat])
+    monkeypatch.setattr(composer, "_write_adjusted", None)
+    for stack in ([Layer(halves[1], 0.3), Layer(halves[0], 0.8)], [Layer(halves[1], 0.3), Layer(hat, 0.5)]):
+        composer.update(stack, "adjust")
+        assert bits(composer.gaussians) == bits(compose_layers(scene, stack, "adjust"))
+    with pytest.raises(TypeError):
+        composer.update([Layer(hat, 0.5), Layer(halves[1], 0.3)], "adjust")
+
+
 def test_the_composer_adjusts_as_compose_does(scene: Gaussians, shirt: Gdf, hat: Gdf) -> None:
     dark = graded(scene, shirt.region.members, 0.6)
     composer = Composer(scene, [shirt, hat, dark])
@@ -499,3 +534,34 @@ def test_the_composer_adjusts_as_compose_does(scene: Gaussians, shirt: Gdf, hat:
     ):
         composer.update(stack, "adjust")
         assert bits(composer.gaussians) == bits(compose_layers(scene, stack, "adjust"))
+
+
+def test_the_composer_adjusts_with_grades_of_other_scenes_and_tables_as_compose_does(
+    scene: Gaussians, shirt: Gdf, hat: Gdf
+) -> None:
+    table = torch.rand(125, 3, generator=torch.Generator().manual_seed(5))
+    field = BakedField("grade", torch.tensor([0.0, 1.0]), {}, 14, (), lattice_form(table))
+    look = edit_of(scene, torch.zeros(0, dtype=torch.int64), field)
+    above = apply_grade(look, scene, from_mask("some", torch.arange(len(scene)) % 2 == 0))
+    other = random_gaussians(60, seed=8)
+    below = apply_grade(graded(other, torch.arange(60), 0.5), scene, whole_scene(scene))
+    composer, weights = Composer(scene, [shirt, hat, above, below]), torch.linspace(0, 1, len(above.region))
+    for stack in (
+        [Layer(shirt, 1.0), Layer(above, 1.0), Layer(hat, 0.7)],
+        [Layer(below, 1.0), Layer(shirt, 0.3), Layer(above, 0.6, weights=weights)],
+        [Layer(above, 0.6), Layer(below, 1.0)],
+        [Layer(shirt, 1.0), Layer(below, 0.4, gains=Gains(color=0.5)), Layer(above, 1.2)],
+        [Layer(above, 0.5)],
+    ):
+        for blend in BLENDS:
+            composer.update(stack, blend)
+            assert bits(composer.gaussians) == bits(compose_layers(scene, stack, blend)), blend
+    orders = [
+        compose_layers(scene, [Layer(a), Layer(b)], "adjust") for a, b in ((above, below), (below, above))
+    ]
+    assert not torch.equal(orders[0].sh0, orders[1].sh0)
+    both = compose_layers(scene, [Layer(below, 1.0), Layer(above, 1.0)], "adjust")
+    once = compose_layers(scene, [Layer(below, 1.0)])
+    rows = above.region.members
+    expected = map_colors(once.sh[rows], table, 0)
+    torch.testing.assert_close(both.sh[rows], expected, atol=2e-6, rtol=0)

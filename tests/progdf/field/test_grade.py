@@ -17,16 +17,19 @@ from progdf.field.grade import (
     bake_grade,
     band_offsets,
     fit_grade,
+    lattice_form,
     lowest_bands,
     map_colors,
     mapped_trajectory,
     member_bands,
     monomials,
 )
+from progdf.formats.cube import read_cube, write_cube
 from progdf.gaussians import Gaussians, pack
 from progdf.gdf.file import load_gdf, read_gdf, save_gdf
+from progdf.region import from_mask, whole_scene
 from progdf.sh import C0, basis
-from tests.helpers.edits import edit_of, some_rows
+from tests.helpers.edits import curved_field, edit_of, some_rows
 from tests.helpers.scenes import random_gaussians
 
 KNOTS = torch.tensor([0.0, 0.4, 1.0])
@@ -215,3 +218,61 @@ def test_a_grade_with_more_bands_than_the_scene_is_refused() -> None:
     with pytest.raises(ValueError, match="a grade of 60 members for 60"):
         bake_grade(some_form(rows, bands=4), rows)
     assert identity_remap().is_identity
+
+
+def some_lattice(side: int = 5) -> GradeForm:
+    return lattice_form(torch.rand(side**3, 3, generator=torch.Generator().manual_seed(side)))
+
+
+@pytest.mark.parametrize("form", ["degree 2", "lattice"])
+@pytest.mark.parametrize("sh_degree", [0, 2])
+def test_a_grade_of_another_scene_shows_what_its_map_makes_of_this_one(
+    tmp_path: Path, form: str, sh_degree: int
+) -> None:
+    scene, other = random_gaussians(300, sh_degree=sh_degree), random_gaussians(90, seed=5)
+    rows = pack(other[torch.arange(40)], with_shN=False)
+    grade = some_lattice() if form == "lattice" else some_form(rows)
+    if form == "lattice":
+        write_cube(tmp_path / "look.cube", grade.table[1], "look")
+        path = tmp_path / "look.cube"
+        grade = replace(grade, table=torch.stack([grade.table[0], read_cube(path)]))
+    else:
+        path = tmp_path / "look.gdf"
+        save_gdf(path, edit_of(other, torch.arange(40), bake_grade(grade, rows)))
+    region = from_mask("some", torch.arange(300) % 3 == 0)
+    gdf = load_gdf(path, scene, place=lambda stored: region)
+    assert (gdf.applied, gdf.region.name, gdf.field.recorded) == (True, "some", ())
+    assert gdf.report == {"residual_left_out": form != "lattice"}
+    edited = compose_layers(scene, [Layer(gdf, 1.0)])
+    expected = map_colors(scene.sh[region.members], grade.table[-1], grade.degree)
+    torch.testing.assert_close(edited.sh[region.members], expected, atol=2e-6, rtol=0)
+    assert compose_layers(scene, [Layer(gdf, 0.0)]) is scene
+    save_gdf(tmp_path / "bound.gdf", gdf)
+    again = load_gdf(tmp_path / "bound.gdf", scene)
+    assert not again.applied
+    assert torch.equal(again.field.offsets(0.7), gdf.field.offsets(0.7))
+
+
+def test_only_a_grade_goes_on_a_region_of_another_scene_and_only_where_something_is(tmp_path: Path) -> None:
+    scene, other = random_gaussians(300), random_gaussians(90, seed=5)
+    save_gdf(tmp_path / "bent.gdf", edit_of(other, torch.arange(12), curved_field(12), "bent"))
+    with pytest.raises(ProgdfError, match="bent is no grade: its field is separable"):
+        load_gdf(tmp_path / "bent.gdf", scene, place=lambda stored: whole_scene(scene))
+    rows = pack(other[torch.arange(40)], with_shN=False)
+    save_gdf(
+        tmp_path / "look.gdf", edit_of(other, torch.arange(40), bake_grade(some_form(rows), rows), "look")
+    )
+    with pytest.raises(ProgdfError, match="look has no Gaussians"):
+        load_gdf(tmp_path / "look.gdf", scene, place=lambda stored: from_mask("", torch.zeros(300) > 0))
+    with pytest.raises(ProgdfError, match="its grade goes on any scene with --region look=all") as refused:
+        load_gdf(tmp_path / "look.gdf", scene)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("spoilt", ["rows", "knots", "identity"])
+def test_a_lattice_that_is_none_is_refused(spoilt: str) -> None:
+    good = some_lattice(3)
+    tables = {"rows": good.table[:, :26], "identity": good.table.flip(0), "knots": good.table[[0, 0, 1]]}
+    knots = KNOTS if spoilt == "knots" else good.knots
+    with pytest.raises(ValueError, match=r"lattice|identity"):
+        replace(good, knots=knots, table=tables[spoilt], coefficients=torch.zeros(len(knots), 0))

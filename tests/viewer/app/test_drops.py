@@ -11,6 +11,8 @@ import msgspec
 import numpy as np
 import pytest
 
+from progdf.field.baked import lattice_colors
+from progdf.formats.cube import write_cube
 from progdf.formats.ply import save_ply
 from progdf.gdf.file import save_gdf
 from progdf.io.picture_camera import camera_chunk
@@ -19,6 +21,7 @@ from viewer.app import app as application
 from viewer.camera.view_camera import to_camera
 from viewer.files import timeline_file
 from viewer.files.exports import save_picture
+from viewer.state import selection
 from viewer.state.view_state import Keyframe, Timeline
 
 
@@ -55,6 +58,26 @@ def test_a_dropped_edit_comes_on_top_and_can_be_undone(opened: application.App, 
     assert [row.count for row in opened.main_view.facts.rows] == [len(g.region) for g in bear().gdfs]
     assert len(opened.main_view.work.past.past) == 1
     assert opened.main_view.work.view.blend == "adjust", "two edits at 1 do not dull each other"
+
+
+@pytest.mark.gl
+def test_a_dropped_table_goes_on_what_is_selected_else_everywhere_and_in_a_layers_place_on_its_region(
+    opened: application.App, tmp_path: Path
+) -> None:
+    write_cube(tmp_path / "look.cube", lattice_colors(5).flip(1), "look")
+    opened.open(tmp_path / "look.cube")
+    view = opened.main_view.work.view
+    mask = np.arange(len(opened.document.scene)) % 4 == 0
+    opened.main_view.change(replace(view, selection=selection.select(view.selection, mask)))
+    opened.open(tmp_path / "look.cube")
+    opened.draw()
+    layers = opened.main_view.work.view.layers
+    assert [layer.name for layer in layers] == ["scarf", "look", "look-2"]
+    total, some = len(opened.document.scene), int(mask.sum())
+    assert [row.count for row in opened.main_view.facts.rows][1:] == [total, some]
+    assert [row.region for row in opened.main_view.facts.rows][1:] == ["all", "selection"]
+    opened.file_actions.handle(f"replace_by:0:{tmp_path / 'look.cube'}")
+    assert opened.document.gdfs[-1].region == opened.document.gdfs[0].region
 
 
 @pytest.mark.gl

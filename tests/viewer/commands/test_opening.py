@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,9 +13,17 @@ from PIL import Image
 
 from progdf.__main__ import main
 from progdf.compose.layers import Gains
+from progdf.field.baked import GradeForm, identity_map, lattice_colors
+from progdf.field.grade import bake_grade, fit_grade, lattice_form, map_colors
+from progdf.formats.cube import read_cube, write_cube
 from progdf.formats.ply import load_ply
-from progdf.gaussians import ATTRIBUTES
+from progdf.gaussians import ATTRIBUTES, Gaussians, pack
+from progdf.gdf.file import save_gdf
 from progdf.quaternions import normalize_quats
+from progdf.region import Region, from_mask
+from progdf.sh import C0
+from tests.helpers.edits import edit_of
+from tests.helpers.scenes import random_gaussians
 from tests.helpers.sessions import full_view
 from tests.helpers.ui_rig import bear
 from viewer.files import document, session
@@ -264,3 +273,129 @@ def test_help_says_what_happens_without_an_option(command: str, capsys: pytest.C
     text = capsys.readouterr().out
     assert [trace for trace in ("None", "False", "(default: )", "STR", "PATH") if trace in text] == []
     assert "--set NAME=S" in text
+
+
+def look_of(folder: Path) -> GradeForm:
+    """look.cube, a table of 5³ colors, and look.gdf, a grade of another scene, with a residual."""
+    table = torch.rand(125, 3, generator=torch.Generator().manual_seed(1))
+    write_cube(folder / "table.cube", table, "table")
+    other = random_gaussians(60)
+    maps = torch.stack([identity_map(1), identity_map(1) * 0.25])
+    course = torch.stack([torch.zeros(60, 3), torch.full((60, 3), 0.2)])
+    form = fit_grade(torch.tensor([0.0, 1.0]), 1, maps, course, 1, torch.ones(60))
+    save_gdf(folder / "look.gdf", edit_of(other, torch.arange(60), bake_grade(form, pack(other)), "look"))
+    return lattice_form(read_cube(folder / "table.cube"))
+
+
+def test_a_grade_of_another_scene_goes_on_a_region_of_this_one_and_a_table_everywhere(
+    here: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    bear().save(here)
+    form, rows = look_of(here), torch.arange(50)
+    np.save("rows.npy", rows.numpy())
+    words = ("bear.ply", "table.cube", "look.gdf", "--region", "look=file:rows.npy", "--set", "table=0.5")
+    assert run("export", *words, "-o", "edited.ply") == 0
+    turning, left_out = caplog.messages
+    assert turning.startswith("table on all: pictures are ")
+    assert left_out == (
+        "look on file:rows.npy: its residual, which is of the scene it was trained on, is left out"
+    )
+    scene = bear().scene
+    edited, sh = load_ply("edited.ply"), scene.sh
+    expected = torch.lerp(sh, map_colors(sh, form.table[1], 0), 0.5)
+    expected[rows] = map_colors(expected[rows], identity_map(1) * 0.25, 1)
+    assert torch.allclose(edited.sh, expected, atol=2e-5)
+    assert torch.equal(edited.means, scene.means)
+    assert run("render", *words, *SMALL, "-o", "x.png") == 0
+
+
+def test_the_colors_of_a_grade_are_written_at_its_strength_and_read_as_the_same_edit(
+    here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bear().save(here)
+    form = look_of(here)
+    assert run("export", "bear.ply", "table.cube", "-o", "same.cube") == 0
+    torch.testing.assert_close(read_cube("same.cube"), form.table[1], atol=1e-6, rtol=0)
+    assert run("export", "bear.ply", "table.cube", "--set", "table=0.25", "-o", "weak.cube") == 0
+    weak = torch.lerp(form.table[0], form.table[1], 0.25)
+    torch.testing.assert_close(read_cube("weak.cube"), weak, atol=1e-6, rtol=0)
+    words = ("bear.ply", "look.gdf", "--region", "look=all")
+    assert run("export", *words, "--gain", "look:color=0.5", "-o", "look.cube") == 0
+    found = read_cube("look.cube")
+    assert len(found) == 33**3
+    torch.testing.assert_close(found, 0.625 * lattice_colors(33), atol=1e-6, rtol=0)
+    assert "look 1" in capsys.readouterr().out
+    for name in ("direct", "again"):
+        edit = (*words[1:], "--gain", "look:color=0.5") if name == "direct" else ("look.cube",)
+        assert run("export", "bear.ply", *edit, "-o", f"{name}.ply") == 0
+    direct, again = load_ply("direct.ply"), load_ply("again.ply")
+    within = ((bear().scene.sh0 * C0).abs() < 0.4).all(dim=1)  # beyond 0..1 a table has no say
+    assert torch.allclose(direct.sh0[within], again.sh0[within], atol=0.05)
+    assert int(within.sum()) > 500
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("look.gdf",), "its grade goes on any scene with --region look=all"),
+        (("table.cube", "--region", "look=all"), "--region look: there is no edit of that name"),
+        (("table.cube", "--region", "table"), "--region table has no NAME=REGION"),
+        (("table.cube", "--region", "table=all", "--region", "table=all"), "names an edit twice"),
+        (("table.cube", "--region", "table=masks:x"), "unknown region 'masks:x'"),
+        (("table.cube", "--region", "table=sphere:99,99,99,1"), "holds no Gaussian"),
+        (("scarf.gdf", "--region", "scarf=all"), "scarf is no grade: its field is"),
+        (("no.cube",), "no.cube does not exist"),
+        (("bad.cube",), "bad.cube has a line 'hello'"),
+    ],
+)
+@pytest.mark.parametrize("command", ["view", "render", "export"])
+def test_a_grade_that_cannot_be_placed_is_one_line_and_nothing_is_written(
+    here: Path, command: str, words: tuple[str, ...], told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bear().save(here)
+    look_of(here)
+    (here / "bad.cube").write_text("hello\n")
+    before = set(here.iterdir())
+    out = {"render": ("-o", "x.png"), "export": ("-o", "x.ply")}.get(command, ())
+    assert run(command, "bear.ply", *words, *out) == 2
+    assert told in capsys.readouterr().err.splitlines()[-1]
+    assert set(here.iterdir()) == before
+
+
+@pytest.mark.parametrize("words", [("table.cube", "look.gdf", "--region", "look=all"), ("scarf.gdf",), ()])
+def test_a_file_of_colors_is_of_one_grade(
+    here: Path, words: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    bear().save(here)
+    look_of(here)
+    assert run("export", "bear.ply", *words, "-o", "x.cube") == 2
+    assert "x.cube holds what one grade does to colors; give one edit" in capsys.readouterr().err
+    assert not (here / "x.cube").exists()
+
+
+def test_a_session_remembers_where_a_grade_was_applied(here: Path) -> None:
+    scene, scarf, _ = bear().save(here)
+    look_of(here)
+    (here / "edits").mkdir()
+    region = from_mask("a third", torch.arange(len(bear().scene)) % 3 == 0)
+
+    def place(_: Gaussians, index: int, name: str) -> Region | None:
+        return region if index else None
+
+    opened = document.load(scene, [scarf, here / "look.gdf", here / "table.cube"], place)
+    view = ViewState(layers=tuple(LayerState(i, gdf.name, 0.5) for i, gdf in enumerate(opened.gdfs)))
+    session.save(here / "work.session.json", WindowSession(opened, view))
+    again = session.open_session(here / "work.session.json").document
+    assert [gdf.applied for gdf in again.gdfs] == [False, True, True]
+    for was, now in zip(opened.gdfs, again.gdfs, strict=True):
+        assert (now.name, now.region.name) == (was.name, was.region.name)
+        assert torch.equal(now.region.members, was.region.members)
+        assert torch.equal(now.field.offsets(0.5), was.field.offsets(0.5))
+    edits = json.loads((here / "work.session.json").read_text())["edits"]
+    assert [set(edit) - {"file", "sha256"} for edit in edits] == [
+        set(),
+        {"region", "members"},
+        {"region", "members"},
+    ]
+    assert run("export", "work.session.json", "-o", "edited.ply") == 0
+    assert run("export", "work.session.json", "--region", "look=all", "-o", "edited.ply") == 2

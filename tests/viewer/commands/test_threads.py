@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 
 from progdf import threads
-from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf, load_gdf
 from tests.helpers.ui_rig import bear
 from viewer.commands import render
@@ -20,9 +20,9 @@ def test_a_command_draws_on_one_thread_and_reads_edits_on_all(
 ) -> None:
     seen: list[tuple[str, int]] = []
 
-    def reading(path: Path, scene: Gaussians | None = None, name: str = "") -> Gdf:
+    def reading(path: Path, *where: Any) -> Gdf:
         seen.append(("read", torch.get_num_threads()))
-        return load_gdf(path, scene, name)
+        return load_gdf(path, *where)
 
     def drawing(self: object, *_: object, **__: object) -> None:
         seen.append(("draw", torch.get_num_threads()))

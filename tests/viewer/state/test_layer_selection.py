@@ -117,7 +117,7 @@ def test_values_go_from_one_layer_to_all_selected_ones_and_from_several_by_name(
     assert strengths(pasted) == [0.1, 0.2, 0.5, 0.2, 0.5, 0.2]
     two, _ = layer_selection.copy_values(press(press(act(work, "blend"), "one", "a"), "toggle", "b"))
     other, what = layer_selection.paste_values(six(), two)
-    assert (what, strengths(other)[:3], other.view.blend) == ("2 layers", [0.1, 0.2, 0.5], "sum")
+    assert (what, strengths(other)[:3], other.view.blend) == ("2 layers", [0.1, 0.2, 0.5], "normalized")
     for text in (
         "",
         "hello",

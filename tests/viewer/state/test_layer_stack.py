@@ -166,7 +166,7 @@ def test_the_keys_do_all_that_the_cards_do(hand: Rig) -> None:
     assert names(hand) == ["ears", "scarf"]
     assert hand.main_view.work.focus == 0, "the focus goes with its layer"
     hand.key("M")
-    assert hand.main_view.work.view.blend == BLENDS[1]
+    assert hand.main_view.work.view.blend == BLENDS[0], "on from adjust, the last"
     hand.key("O")
     for _ in range(9):
         hand.key("Shift+Right")

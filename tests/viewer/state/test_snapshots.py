@@ -89,7 +89,7 @@ def test_a_blend_is_each_snapshot_at_its_end_and_straight_between_them() -> None
     assert [seen[share]["ears"].gains.geometry for share in seen] == pytest.approx([0.875, 0.625])
     weights = [paint.decode(seen[share]["ears"].paint, members(1)) for share in seen]
     assert [float(w.mean()) for w in weights if w is not None] == pytest.approx([0.75, 0.25], abs=0.003)
-    assert [at(share).blend for share in seen] == ["sum", "normalized"], "a rule changes half way"
+    assert [at(share).blend for share in seen] == ["sum", "adjust"], "a rule changes half way"
     assert at(0.25).pair == SnapshotPair("1", "2", 0.25)
     assert snapshots.is_blend(at(0.25), kept, members)
     assert not snapshots.is_blend(replace(at(0.25), layers=view.layers), kept, members)
