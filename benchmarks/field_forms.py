@@ -67,6 +67,7 @@ def fit_joint(
         coefficients = torch.cat([course.amplitude[:, None], table.float()], dim=1)
         coefficients[[0, -1]] = 0.0
         coefficients[-1, 0] = 1.0
+        step = torch.cat([torch.ones(1, step.shape[1]), step])
         attributes[name] = AttributeBases(course.offsets[-1].contiguous(), rest, step, coefficients)
     ticks = strengths.tolist() if recorded is None else recorded
     return BakedField("separable", strengths.float(), attributes, offsets.shape[2], tuple(ticks))

@@ -99,7 +99,7 @@ def _mean_color(scene: Gaussians, gdf: Gdf) -> Rgb:
     sh0 = scene.sh0[members]
     bases = gdf.field.attributes.get("sh0")
     if bases is not None:
-        sh0 = sh0 + bases.end_offset
+        sh0 = sh0 + bases.end
     weights = scene.opacities[members].nan_to_num()[:, None] + 1e-6
     color = (sh0_to_rgb(sh0).nan_to_num().clamp(0.0, 1.0) * weights).sum(0) / weights.sum()
     red, green, blue = (float(c) for c in color)
