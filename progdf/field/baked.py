@@ -112,6 +112,12 @@ class AttributeBases:
         return self.end_offset.float() * self.scale[0]
 
     @property
+    def label(self) -> str:
+        """How it is stored, as in "int8 + 2": the type of the end, and the number of the other bases."""
+        ranks = len(self.residual_basis)
+        return str(self.end_offset.dtype).removeprefix("torch.") + (f" + {ranks}" if ranks else "")
+
+    @property
     def bytes_per_member(self) -> float:
         """Stored bytes for one member of the region."""
         full = self.end_offset.shape[1] * self.end_offset.element_size()

@@ -14,6 +14,7 @@ import math
 from bisect import bisect_left
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from typing import Literal, Protocol
 
@@ -58,7 +59,7 @@ MOST_SNAPSHOTS = 40
 UNSEEN = 0.1
 """Say of the bare numbers beside the pictures, for members that these views do not show."""
 
-Modes = Mapping[str, tuple[Tensor, Tensor]]
+Modes = Mapping[str, Tensor]
 """By attribute, as `separable.principal_modes` gives them."""
 
 Ends = Mapping[str, tuple[Tensor, Tensor]]
@@ -84,7 +85,7 @@ class Candidate:
 
     field: BakedField  # the field
     curve: tuple[float, ...]  # PSNR at `sample_strengths()`, dB
-    label: str  # what it is, e.g. "separable (means 2, sh0 3)"
+    label: str  # what it is, e.g. "separable (means int16 + 2, sh0 int8)"
     excess: float = 0.0  # its error as a multiple of what is allowed: up to 1 it serves
     to_editor: float | None = None  # PSNR to the editor's own pictures, all strengths together, dB
 
@@ -297,17 +298,6 @@ def store_ends(offsets: Tensor, evaluator: FieldEvaluator, budget: float | None 
     return {name: kinds[name][k] for name, k in chosen.items() if k < len(kinds[name])}
 
 
-def separable_within(
-    seen: RenderedTrajectories,
-    strengths: Tensor,
-    budget: float,
-    evaluator: FieldEvaluator,
-    recorded: Sequence[float] | None = None,
-) -> Candidate:
-    """The separable field with the ranks expected to be best within `budget` bytes a member."""
-    return _separable(seen, strengths, grow_ranks(seen, budget)[-1], evaluator, recorded)
-
-
 def _grow_fields(
     seen: RenderedTrajectories,
     strengths: Tensor,
@@ -348,27 +338,19 @@ def _separable(
     ticks = tuple(strengths.tolist() if recorded is None else recorded)
     candidates = []
     for modes in (
-        emphasize_modes(seen, ranks),
+        seen.modes,
         {n: principal_modes(c.gram) for n, c in seen.trajectories.items()},
     ):
         attributes = {
-            name: store_attribute(trajectory, modes[name][0][:, : ranks[name]])
+            name: store_attribute(trajectory, modes[name][:, : ranks[name]])
             for name, trajectory in seen.trajectories.items()
         }
         field = BakedField("separable", strengths.float(), attributes, seen.channels, ticks)
-        candidates.append(evaluator.candidate(field, _label(field)))
+        stored = ", ".join(f"{name} {bases.label}" for name, bases in attributes.items())
+        candidates.append(evaluator.candidate(field, f"separable ({stored or 'nothing moves'})"))
         if candidates[-1].excess <= 1.0 or not any(ranks.values()):
             break
     return min(candidates, key=lambda candidate: candidate.excess)
-
-
-def _label(field: BakedField) -> str:
-    """As in "separable (means int16 + 1, sh0 int8 + 3)"."""
-    parts = []
-    for name, bases in field.attributes.items():
-        kind, rank = str(bases.end_offset.dtype).removeprefix("torch."), len(bases.residual_basis)
-        parts.append(f"{name} {kind} + {rank}" if rank else f"{name} {kind}")
-    return f"separable ({', '.join(parts) or 'nothing moves'})"
 
 
 def _even_keyframes(
@@ -391,18 +373,16 @@ def _even_keyframes(
 def grow_ranks(seen: RenderedTrajectories, most_bytes: float) -> list[dict[str, int]]:
     """Ranks from none upwards; each step adds the basis that takes most rendered error per byte."""
     widths = {name: trajectory.offsets.shape[2] for name, trajectory in seen.trajectories.items()}
-    evenly = torch.ones(seen.gram.shape[1], dtype=torch.float64)
-    modes = seen.modes(evenly)
     ranks = dict.fromkeys(seen.trajectories, 0)
     stored = sum(trajectory.end_bytes for trajectory in seen.trajectories.values())
     path = [dict(ranks)]
-    now = _hardness(seen.mse(modes, ranks))
+    now = float(seen.mse(ranks).mean())
     while now > 0:
         best: tuple[float, str, float] | None = None
         for name, width in widths.items():
-            if ranks[name] >= modes[name][0].shape[1] or stored + width > most_bytes:
+            if ranks[name] >= seen.modes[name].shape[1] or stored + width > most_bytes:
                 continue
-            then = _hardness(seen.mse(modes, {**ranks, name: ranks[name] + 1}))
+            then = float(seen.mse({**ranks, name: ranks[name] + 1}).mean())
             gain = math.log(now / max(then, 1e-30)) / width
             if best is None or gain > best[0]:
                 best = (gain, name, then)
@@ -415,29 +395,6 @@ def grow_ranks(seen: RenderedTrajectories, most_bytes: float) -> list[dict[str, 
     return path
 
 
-def _hardness(mse: Tensor) -> float:
-    """Between mean and worst over the snapshots: the fourth-power mean, so that no step is in vain."""
-    return float(mse.pow(4).mean().pow(0.25))
-
-
-def emphasize_modes(seen: RenderedTrajectories, ranks: Mapping[str, int]) -> Modes:
-    """Bases for these ranks, with snapshots of large error made to count more until the worst is least."""
-    emphasis = torch.ones(seen.gram.shape[1], dtype=torch.float64)
-    best = modes = seen.modes(emphasis)
-    least = mse = seen.mse(modes, ranks)
-    for _ in range(8):
-        inner = mse[1:-1]
-        if not bool((inner > 0).any()):
-            break
-        emphasis[1:-1] *= (inner / inner.mean()).clamp(min=1e-3).pow(0.5)
-        emphasis = emphasis.clamp(1e-3, 1e3)
-        modes = seen.modes(emphasis)
-        mse = seen.mse(modes, ranks)
-        if float(mse.max()) < float(least.max()):
-            best, least = modes, mse
-    return best
-
-
 @dataclass(frozen=True)
 class RenderedTrajectories:
     """What straightening each attribute changes in the pictures."""
@@ -447,23 +404,24 @@ class RenderedTrajectories:
     values: int  # numbers that each inner product sums over
     channels: int  # width of a packed row
 
-    def modes(self, emphasis: Tensor) -> Modes:
-        """Each attribute's best bases, when the snapshots count as `emphasis` says. [T] float64, > 0"""
+    @cached_property
+    def modes(self) -> Modes:
+        """Each attribute's best bases."""
         modes = {}
         for i, (name, trajectory) in enumerate(self.trajectories.items()):
             seen = self.gram[i, :, i]
             parameters = float(trajectory.gram.diagonal().sum())
             share = UNSEEN * float(seen.diagonal().sum()) / parameters if parameters > 0 else 0.0
-            modes[name] = principal_modes(seen + share * trajectory.gram, emphasis)
+            modes[name] = principal_modes(seen + share * trajectory.gram)
         return modes
 
-    def mse(self, modes: Modes, ranks: Mapping[str, int]) -> Tensor:
+    def mse(self, ranks: Mapping[str, int]) -> Tensor:
         """Expected mean squared error of the pictures at each snapshot. [T] float64"""
         snapshots = self.gram.shape[1]
         remaining = torch.eye(snapshots, dtype=torch.float64).repeat(len(self.trajectories), 1, 1)
         for i, name in enumerate(self.trajectories):
-            mix, table = (part[:, : ranks.get(name, 0)] for part in modes[name])
-            remaining[i] -= table @ mix.T  # row t: what remains there, as a sum of the rows of pixels
+            mix = self.modes[name][:, : ranks.get(name, 0)]
+            remaining[i] -= mix @ mix.T  # row t: what remains there, as a sum of the rows of pixels
         half = torch.einsum("ats,asbu->atbu", remaining, self.gram)
         return torch.einsum("atbu,btu->t", half, remaining).clamp(min=0) / self.values
 

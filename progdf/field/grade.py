@@ -255,4 +255,4 @@ def _rank(offsets: Tensor) -> int:
     power = torch.linalg.eigvalsh(fitted.gram).flip(0).clamp(min=0)
     remaining = float(power.sum()) - power.cumsum(0)
     needed = 0 if float(power.sum()) <= allowed else 1 + int((remaining > allowed).sum())
-    return min(needed, _MOST_RANK, principal_modes(fitted.gram)[0].shape[1])
+    return min(needed, _MOST_RANK, principal_modes(fitted.gram).shape[1])

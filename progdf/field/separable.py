@@ -108,24 +108,22 @@ def fit_amplitude(
     return replace(trajectory, gram=(rows @ rows.T).double())
 
 
-def principal_modes(gram: Tensor, emphasis: Tensor | None = None) -> tuple[Tensor, Tensor]:
+def principal_modes(gram: Tensor) -> Tensor:
     """The best bases of any number, by the inner products of the rows they shall explain (a weighted SVD).
 
     Args:
         gram: of the T rows, row 0 and the last are 0. [T,T] float64
-        emphasis: how much each row counts, > 0; None is evenly. [T] float64
 
     Returns:
         How each basis is mixed from the rows, strongest first, and what the bases are multiplied with to give
-        the rows again. [T,R], [T,R] float64; R is as large as there is anything to explain, at most T − 2
+        the rows again. [T,R] float64; R is as large as there is anything to explain, at most T − 2
     """
-    root = torch.ones(len(gram), dtype=torch.float64) if emphasis is None else emphasis.double().sqrt()
     # T is small: the T×T Gram matrix holds all there is to know of the left singular vectors
-    values, vectors = torch.linalg.eigh(root[:, None] * gram * root)
+    values, vectors = torch.linalg.eigh(gram)
     values, vectors = values.flip(0), vectors.flip(1)
     rank = int((values > 1e-9 * values[0]).sum()) if float(values[0]) > 0 else 0
-    vectors = vectors[:, : min(rank, max(len(gram) - 2, 0))]
-    return root[:, None] * vectors, vectors / root[:, None]
+    modes: Tensor = vectors[:, : min(rank, max(len(gram) - 2, 0))]
+    return modes
 
 
 def store_attribute(
@@ -224,5 +222,4 @@ def fit_separable(
 
 
 def _fit_attribute(trajectory: AttributeTrajectory, rank: int, basis_type: torch.dtype) -> AttributeBases:
-    mix, _ = principal_modes(trajectory.gram)
-    return store_attribute(trajectory, mix[:, :rank], basis_type)
+    return store_attribute(trajectory, principal_modes(trajectory.gram)[:, :rank], basis_type)

@@ -29,7 +29,6 @@ from .evaluate import Evaluator, make_evaluator
 _VIEWS = 3
 _BETTER = 0.5  # dB by which the own way has to be nearer: it takes several times the bytes
 _HALFWAY = (0.3, 0.4, 0.5, 0.6, 0.7)  # a way is judged where it comes nearest to the half
-_SAME = 40.0  # dB above which two ways look alike
 
 
 def straight_path(trajectory: Trajectory) -> Trajectory:
@@ -60,22 +59,17 @@ def choose_path(
         in_parts: connected parts were moved as wholes
         retimed: lays the slider over a trajectory; done only where its own way may be kept
     """
+    if in_parts:
+        return retimed(trajectory), "as the parts move"
     line = straight_path(trajectory)
-    if not in_parts and (editor is None or editor.stages):
+    if editor is None or editor.stages:
         return line, "straight: the editor pictures the end alone"
     trajectory = retimed(trajectory)
     views = split_held_out(setup.judging)[0][:_VIEWS]
-    halves = {}
-    if editor is not None and not in_parts:
-        halves = {0.5: [editor.edit(view, 0.5) for view in views]}
+    halves = {0.5: [editor.edit(view, 0.5) for view in views]}
     evaluator = make_evaluator(
         setup.scene, setup.region, views, halves, setup.background, trajectory.end.shape[1]
     )
-    if in_parts:
-        apart = evaluator.psnr(evaluator.pictures(trajectory.at(0.5)), evaluator.pictures(line.at(0.5)))
-        if apart >= _SAME:
-            return line, f"straight, which looks the same half way ({apart:.1f} dB)"
-        return trajectory, f"as the parts move, which straight lines would distort ({apart:.1f} dB half way)"
 
     def nearest(way: Trajectory) -> float:
         return max(evaluator.psnr(evaluator.pictures(way.at(s)), evaluator.edited[0.5]) for s in _HALFWAY)
@@ -288,7 +282,7 @@ def drop_idle_attributes(
     slices = attribute_slices(end.shape[1])
     target = evaluator.edited[1.0]
     now = complete = evaluator.psnr(evaluator.pictures(end), target)
-    for name in ("shN", "quats", "log_scales", "means", "logit_opacities"):
+    for name in ("shN", "quats", "log_scales", "means", "logit_opacities", "sh0"):
         if name not in slices or not bool(end[:, slices[name]].any()):
             continue
         tried = end.clone()

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 
 from progdf.field import Candidate, FieldEvaluator, choose_field, fit_separable
-from progdf.field.choose import pick_candidate, render_trajectories, separable_within
+from progdf.field.choose import pick_candidate
 from tests.helpers.edits import curved_field, curved_trajectory, linear_pictures
 
 
@@ -44,7 +43,6 @@ def test_numbers_choose_the_bases_where_pictures_are_the_worse_guide() -> None:
         return (10 * shown(moved)).sin() / 2  # so far from linear that effects do not add up
 
     evaluator = FieldEvaluator(strengths, offsets, far)
-    seen = render_trajectories(offsets, torch.ones(40, 14), far)
-    found = separable_within(seen, strengths, 65.0, evaluator)
+    found = choose_field(strengths, offsets, far, budget=23.0, evaluator=evaluator).best
     ranks = {name: len(bases.residual_basis) for name, bases in found.field.attributes.items()}
     assert found.worst >= evaluator.candidate(fit_separable(strengths, offsets, ranks), "").worst
