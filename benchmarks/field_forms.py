@@ -11,7 +11,6 @@ from torch import Tensor
 
 from progdf.field import choose_field, fit_keyframes
 from progdf.field.baked import AttributeBases, BakedField
-from progdf.field.choose import render_trajectories, separable_within
 from progdf.field.separable import (
     channel_weights,
     check_trajectory,
@@ -59,14 +58,15 @@ def fit_joint(
     for course in courses.values():
         power = float(course.gram.diagonal().sum())
         gram += course.gram / power if power > 0 else 0.0
-    mix, table = (part[:, :rank] for part in principal_modes(gram))
+    mix = principal_modes(gram)[:, :rank]
     attributes = {}
     for name, course in courses.items():
         exact = (mix.T.float() @ course.residual.flatten(1)).reshape(-1, *course.offsets.shape[1:])
         rest, step = quantize_bases(exact, torch.int8)
-        coefficients = torch.cat([course.amplitude[:, None], table.float()], dim=1)
+        coefficients = torch.cat([course.amplitude[:, None], mix.float()], dim=1)
         coefficients[[0, -1]] = 0.0
         coefficients[-1, 0] = 1.0
+        step = torch.cat([torch.ones(1, step.shape[1]), step])
         attributes[name] = AttributeBases(course.offsets[-1].contiguous(), rest, step, coefficients)
     ticks = strengths.tolist() if recorded is None else recorded
     return BakedField("separable", strengths.float(), attributes, offsets.shape[2], tuple(ticks))
@@ -108,10 +108,10 @@ def baked_forms(course: KnownEdit) -> list[Form]:
     strengths, offsets, judge, weights = course.strengths, course.offsets, course.judge, course.weights
     found: list[Form] = []
 
-    def measure(kind: str, fit: Callable[[], tuple[BakedField, str]], shared: float = 0.0) -> Form:
+    def measure(kind: str, fit: Callable[[], tuple[BakedField, str]]) -> Form:
         begin = time.perf_counter()
         field, label = fit()
-        seconds = shared + time.perf_counter() - begin
+        seconds = time.perf_counter() - begin
         found.append(
             Form(
                 course.name, len(course.members), kind, label, stored_numbers(field), field.bytes_per_member,
@@ -126,9 +126,6 @@ def baked_forms(course: KnownEdit) -> list[Form]:
             "keyframes, float32",
             lambda c=count: (fit_keyframes(strengths, offsets, c), f"{c} keyframes, float32"),  # type: ignore[misc]
         )
-    begin = time.perf_counter()
-    courses = render_trajectories(offsets, channel_weights(weights, *offsets.shape[1:]), course.look)
-    straightened = time.perf_counter() - begin
     for count in COUNTS:
         measure(
             "keyframes, int8",
@@ -142,17 +139,15 @@ def baked_forms(course: KnownEdit) -> list[Form]:
             lambda c=count: (fit_joint(strengths, offsets, c - 2, weights), f"joint SVD, rank {c - 2}"),  # type: ignore[misc]
         )
 
-        def separable(size: float = size) -> tuple[BakedField, str]:
-            candidate = separable_within(courses, strengths, size, course.chooser)
-            return candidate.field, candidate.label
+        def separable(size: float | None = size) -> tuple[BakedField, str]:
+            best = choose_field(
+                strengths, offsets, course.look, weights, budget=size, evaluator=course.chooser
+            ).best
+            return best.field, best.label
 
-        measure("separable", separable, straightened)
+        measure("separable", separable)
 
-    def auto() -> tuple[BakedField, str]:
-        best = choose_field(strengths, offsets, course.look, weights, evaluator=course.chooser).best
-        return best.field, f"auto at 40 dB: {best.label}"
-
-    measure("auto", auto)
+    measure("auto", lambda: separable(None))
     return found
 
 

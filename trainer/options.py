@@ -181,16 +181,17 @@ class FieldOptions:
     """Which field is fitted to the recording."""
 
     field: FieldKind = "auto"
-    """Kind of field; auto keeps the smallest separable one or straight line that meets --target-psnr;
-    lossless keeps every recording."""
+    """Kind of field; auto is a grade for edits of colors, else separable, each the smallest that adds at most
+    a tenth to the error which the edit has against its editor; lossless keeps every recording."""
     size: Size = "tiny"
     """neural: numbers in the network, 17 thousand, .5 million or 6 million (paper, a quarter of an hour)."""
     field_loss: FieldLoss = "parameters"
     """neural: what it is trained on: the recorded offsets, or pictures of them (the paper's L1 + LPIPS and
     sharpness; about .3 s a step with the network of 6 million)."""
-    target_psnr: float = 40.0
-    """The field's worst PSNR against the recorded trajectory over the slider, on held-out views, dB."""
-    bytes_budget: Annotated[float | None, absent_option("FLOAT", "as many as --target-psnr takes")] = None
+    target_psnr: Annotated[float | None, absent_option("FLOAT", "a tenth of the edit's own error")] = None
+    """The field's worst PSNR against the recorded trajectory over the slider, on held-out views, dB, in place
+    of that rule."""
+    bytes_budget: Annotated[float | None, absent_option("FLOAT", "as many as it takes")] = None
     """Bytes per Gaussian of the region that the field may take; the best one within is kept, whatever its
     PSNR. Not for neural."""
     as_printed: Fixed[bool] = (

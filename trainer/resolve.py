@@ -210,7 +210,7 @@ def check_field_options(options: FieldOptions, preset: Preset = "default") -> No
     Raises:
         ProgdfError: one does not.
     """
-    if not 0 < options.target_psnr <= NO_DIFFERENCE:
+    if options.target_psnr is not None and not 0 < options.target_psnr <= NO_DIFFERENCE:
         raise ProgdfError(
             f"--target-psnr must be above 0 and at most {NO_DIFFERENCE:g} dB, which stands for no "
             f"difference, got {options.target_psnr:g}"

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from progdf.demo_scenes import bear
 from progdf.field.baked import AttributeBases, BakedField
+from progdf.field.separable import quantize_bases
 from progdf.formats.scene_file import load_scene
 from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.gdf.file import Gdf, fingerprint
@@ -52,7 +53,7 @@ def copies(scene: Gaussians, times: int = COPIES) -> Gaussians:
 
 def edit_for(scene: Gaussians, members: int, moves: bool) -> Gdf:
     """A made-up edit of the `members` Gaussians nearest to the scene's center, as large as a trained one:
-    beside the full offset three int8 bases.
+    in int8, three bases beside the full offset.
 
     Args:
         members: how many; all of a scene that has fewer
@@ -69,12 +70,13 @@ def edit_for(scene: Gaussians, members: int, moves: bool) -> Gdf:
     attributes = {}
     for name, size in spread.items():
         width = 4 if name == "quats" else 3
+        end, unit = quantize_bases(size * torch.randn(1, len(region), width, generator=rng), torch.int8)
         attributes[name] = AttributeBases(
-            end_offset=size * torch.randn(len(region), width, generator=rng),
+            end_offset=end[0],
             residual_basis=torch.randint(
                 -127, 128, (RANKS, len(region), width), generator=rng, dtype=torch.int8
             ),
-            scale=torch.full((RANKS, width), 2e-3 * size),
+            scale=torch.cat([unit, torch.full((RANKS, width), 2e-3 * size)]),
             coefficients=coefficients.clone(),
         )
     score = torch.zeros(len(scene)).index_fill(0, region, 1.0)

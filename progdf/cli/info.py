@@ -15,7 +15,7 @@ import torch
 import tyro
 
 from progdf.errors import ProgdfError
-from progdf.field.baked import BakedField, GradeForm, NeuralForm
+from progdf.field.baked import BakedField, GradeForm
 from progdf.formats.cube import SUFFIX as CUBE
 from progdf.formats.scene_file import load_scene_with_report, scene_file, scene_format
 from progdf.gaussians import ZERO, Gaussians
@@ -241,18 +241,14 @@ class _Timeline(msgspec.Struct):
 def _describe_field(field: BakedField) -> str:
     """What a field is made of."""
     form = field.origin
-    ranks = {name: len(bases.residual_basis) for name, bases in field.attributes.items()}
-    # the first is the offset at strength 1 as it was recorded, see `AttributeBases.end_offset`
-    bases = ", ".join(
-        f"{name} 1 exact + {rank} fitted"
-        for name, rank in (form.plan.ranks if isinstance(form, NeuralForm) else ranks).items()
-    )
     if isinstance(form, GradeForm):
         return f"{form.label}; {len(form.knots)} knots"
     if form is None:
-        return f"{len(field.knots)} knots; bases: {bases or 'none, nothing moves'}"
+        stored = ", ".join(f"{name} {bases.label}" for name, bases in field.attributes.items())
+        return f"{len(field.knots)} knots; ends and bases: {stored or 'none, nothing moves'}"
     network = form.network
     error = ", ".join(f"{name} {value:.4g}" for name, value in (form.error or {}).items())
+    bases = ", ".join(f"{name} {rank}" for name, rank in form.plan.ranks.items())
     return (
         f"{group_digits(network.parameters)} numbers in {network.shape.layers} layers of "
         f"{network.shape.width}; baked at {len(form.plan.knots)} knots with bases: {bases}; "

@@ -53,16 +53,16 @@ class Change:
 class _Bases(NamedTuple):
     """One attribute of an edit, see `AttributeBases`."""
 
-    end: Floats  # [M,c]
+    end: NDArray[Any]  # int8 or float32. [M,c]
     residual: NDArray[Any]  # int8 or float32. [R,M,c]
-    scale: Floats  # [R,c]
+    scale: Floats  # [1+R,c]
     coefficients: Floats  # [S,1+R]
 
     @staticmethod
     def of(bases: AttributeBases) -> _Bases:
-        residual = bases.residual_basis
-        residual = residual if residual.dtype == torch.int8 else residual.float()
-        tensors = bases.end_offset, residual, bases.scale, bases.coefficients
+        stored = (bases.end_offset, bases.residual_basis)
+        levels = (part if part.dtype == torch.int8 else part.float() for part in stored)
+        tensors = *levels, bases.scale, bases.coefficients
         return _Bases(*(tensor.contiguous().numpy() for tensor in tensors))
 
     def factors(self, at: Segment) -> tuple[Rows, Floats]:
@@ -76,8 +76,8 @@ class _Bases(NamedTuple):
         used = np.flatnonzero(row[1:])
         if not len(used) and row[0] == 0.0:
             return used, np.zeros((0, self.end.shape[1]), np.float32)
-        first = np.full((1, self.end.shape[1]), row[0])
-        return used, np.concatenate([first, row[1:][used, None] * self.scale[used]])
+        bases = np.concatenate([[0], 1 + used])
+        return used, row[bases, None] * self.scale[bases]
 
 
 class _Plan(NamedTuple):
@@ -286,7 +286,7 @@ def _between(part: _Part, first: int, last: int) -> _Part:
 def _add_offsets(
     total: Floats,
     part: tuple[Rows, Rows, Floats],
-    stored: tuple[Floats, NDArray[Any]],
+    stored: tuple[NDArray[Any], NDArray[Any]],
     used: Rows,
     factors: Floats,
     gain: np.float32,
@@ -321,7 +321,7 @@ def _add_offsets(
                 if k == 0:
                     run = ends[low * width : (low + count) * width]
                     for j in range(count * width):
-                        offsets[j] = tile[j] * run[j]
+                        offsets[j] = tile[j] * np.float32(run[j])
                 else:
                     levels = residual_levels[used[k - 1]].reshape(-1)[low * width : (low + count) * width]
                     for j in range(count * width):
@@ -332,7 +332,7 @@ def _add_offsets(
                     for c in range(width):
                         j = i * width + c
                         if k == 0:
-                            offsets[j] = factors[0, c] * end[members[first + i], c]
+                            offsets[j] = factors[0, c] * np.float32(end[members[first + i], c])
                         else:
                             level = residual_levels[used[k - 1], members[first + i], c]
                             offsets[j] += factors[k, c] * np.float32(level)

@@ -67,10 +67,10 @@ def _rise(size: Tensor, floor: float) -> Tensor:
 
 
 def _color_change(field: BakedField) -> Tensor:
-    changes = [field.attributes[name].end_offset for name in ("sh0", "shN") if name in field.attributes]
+    changes = [field.attributes[name].end for name in ("sh0", "shN") if name in field.attributes]
     if not changes:
         return torch.zeros(0)
-    together = torch.cat([change.float().reshape(len(change), -1, 3) for change in changes], dim=1)
+    together = torch.cat([change.reshape(len(change), -1, 3) for change in changes], dim=1)
     change: Tensor = C0 * together.norm(dim=1).amax(dim=1)
     return change
 
@@ -79,7 +79,7 @@ def _opacity_change(scene: Gaussians, members: Tensor, field: BakedField) -> Ten
     if "logit_opacities" not in field.attributes:
         return torch.zeros(0)
     before = scene.logit_opacities[members].float()
-    after = before + field.attributes["logit_opacities"].end_offset.float().reshape(-1)
+    after = before + field.attributes["logit_opacities"].end.reshape(-1)
     return (after.sigmoid() - before.sigmoid()).abs()
 
 
@@ -88,12 +88,12 @@ def _shape_change(scene: Gaussians, members: Tensor, field: BakedField) -> Tenso
     if "means" in field.attributes and len(members):
         means = scene.means[members].float()
         extent = (means - means.mean(dim=0)).norm(dim=1).median().clamp_min(1e-12) * 2
-        size = field.attributes["means"].end_offset.float().norm(dim=1) / (_MOVE * extent)
+        size = field.attributes["means"].end.norm(dim=1) / (_MOVE * extent)
     if "log_scales" in field.attributes:
-        size = size.maximum(field.attributes["log_scales"].end_offset.float().abs().amax(dim=1) / _GROWTH)
+        size = size.maximum(field.attributes["log_scales"].end.abs().amax(dim=1) / _GROWTH)
     if "quats" in field.attributes:
         length = scene.quats[members].float().norm(dim=1).clamp_min(1e-6)
-        size = size.maximum(field.attributes["quats"].end_offset.float().norm(dim=1) / (_TURN * length))
+        size = size.maximum(field.attributes["quats"].end.norm(dim=1) / (_TURN * length))
     return size
 
 

@@ -164,5 +164,5 @@ def _ranks(trajectory: Tensor, tolerance: float) -> dict[str, int]:
         power = torch.linalg.eigvalsh(fitted.gram).flip(0).clamp(min=0)
         remaining = float(power.sum()) - power.cumsum(0)
         needed = 0 if float(power.sum()) <= allowed else 1 + int((remaining > allowed).sum())
-        ranks[name] = min(needed, MOST_RANK, principal_modes(fitted.gram)[0].shape[1])
+        ranks[name] = min(needed, MOST_RANK, principal_modes(fitted.gram).shape[1])
     return ranks

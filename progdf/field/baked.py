@@ -1,8 +1,8 @@
 """The only field that the viewer and `export` run: Δ_i(s) = Σ_k B_ik a_k(s), per attribute.
 
 Every kind of field (separable, keyframes, neural) becomes one of these when it is loaded. Basis 0 is the full
-offset in float32 with a_0(0) = 0 and a_0(1) = 1, all others vanish at both ends, so s = 0 is the original and
-s = 1 the recorded end without any rounding.
+offset with a_0(0) = 0 and a_0(1) = 1, all others vanish at both ends, so s = 0 is the original and s = 1 what
+basis 0 decodes to, without any rounding: in float32 the recorded end, in integers by definition the end.
 """
 
 from __future__ import annotations
@@ -54,6 +54,8 @@ def interpolate(x: Tensor, knots: Tensor, values: Tensor) -> Tensor:
 
 BASIS_TYPES = (torch.int8, torch.float16, torch.float32)
 """How bases 1..R may be stored."""
+END_TYPES = (torch.int8, torch.int16, torch.float32)
+"""How basis 0 may be stored, from the smallest."""
 
 MOST_KNOTS, MOST_RANK = 257, 16
 """Of a network that is baked."""
@@ -66,9 +68,9 @@ _NEAR = 1 / 80
 class AttributeBases:
     """One attribute's bases for M members of c channels each."""
 
-    end_offset: Tensor  # basis 0, the offset at s = 1, raw space. [M,c] float32
+    end_offset: Tensor  # basis 0, the offset at s = 1, as stored. [M,c] int8, int16 or float32
     residual_basis: Tensor  # bases 1..R as stored. [R,M,c] int8, float16 or float32
-    scale: Tensor  # what one unit of `residual_basis` is worth, per basis and channel. [R,c] float32
+    scale: Tensor  # what one unit is worth in raw space, per basis, from 0, and channel. [1+R,c] float32
     coefficients: Tensor  # a_k at the knots; row 0 all 0, the last row 1, 0, …, 0. [S,1+R] float32
 
     def __post_init__(self) -> None:
@@ -83,11 +85,13 @@ class AttributeBases:
             raise ValueError(
                 f"residual_basis is {self.residual_basis.dtype}, expected int8, float16 or float32"
             )
-        for name in ("end_offset", "scale", "coefficients"):
+        if self.end_offset.dtype not in END_TYPES:
+            raise ValueError(f"end_offset is {self.end_offset.dtype}, expected int8, int16 or float32")
+        for name in ("scale", "coefficients"):
             if getattr(self, name).dtype != torch.float32:
                 raise ValueError(f"{name} is {getattr(self, name).dtype}, expected float32")
         if tuple(self.residual_basis.shape[1:]) != (members, width) or tuple(self.scale.shape) != (
-            ranks,
+            1 + ranks,
             width,
         ):
             raise ValueError(
@@ -101,6 +105,17 @@ class AttributeBases:
         ends = self.coefficients[[0, -1]]
         if bool(ends[0].any()) or bool(ends[1, 1:].any()) or float(ends[1, 0]) != 1.0:
             raise ValueError("coefficients must be 0 at s = 0 and 1, 0, …, 0 at s = 1")
+
+    @property
+    def end(self) -> Tensor:
+        """The offset at s = 1, raw space. [M,c] float32"""
+        return self.end_offset.float() * self.scale[0]
+
+    @property
+    def label(self) -> str:
+        """How it is stored, as in "int8 + 2": the type of the end, and the number of the other bases."""
+        ranks = len(self.residual_basis)
+        return str(self.end_offset.dtype).removeprefix("torch.") + (f" + {ranks}" if ranks else "")
 
     @property
     def bytes_per_member(self) -> float:
@@ -344,16 +359,15 @@ class BakedField:
 
     def factors(self, name: str, s: float) -> Tensor:
         """What each base of one attribute, as it is stored, is multiplied with at `s`. [1+R,c] float32"""
-        weights, scale = self.coefficients(name, s), self.attributes[name].scale
-        return torch.cat([weights[:1, None].expand(1, scale.shape[1]), weights[1:, None] * scale])
+        return self.coefficients(name, s)[:, None] * self.attributes[name].scale
 
     def attribute_offsets(self, name: str, s: float) -> Tensor:
-        """Raw offsets of one attribute at strength `s`; exactly 0 at 0, `end_offset` at 1. [M,c] float32"""
+        """Raw offsets of one attribute at strength `s`; exactly 0 at 0, `end` at 1. [M,c] float32"""
         bases = self.attributes[name]
         weights, factors = self.coefficients(name, s).tolist(), self.factors(name, s)
         if not any(weights):
-            return torch.zeros_like(bases.end_offset)
-        total = factors[0] * bases.end_offset
+            return torch.zeros(bases.end_offset.shape)
+        total = factors[0] * bases.end_offset.float()
         for weight, factor, basis in zip(weights[1:], factors[1:], bases.residual_basis, strict=True):
             if weight != 0.0:
                 total = total + factor * basis.float()

@@ -1,6 +1,7 @@
-"""Which field to ship: ranks by rendered error per byte, the fewest bytes that meet the target.
+"""Which field to ship: the smallest that adds at most a tenth of the error which the edit itself has.
 
-The trajectory is rendered once (docs/method.md 5). Numbers of different attributes cannot be compared, and an
+Ends are stored in the smallest integers that serve, then ranks grow by rendered error per byte. For that the
+trajectory is rendered once (docs/method.md 5). Numbers of different attributes cannot be compared, and an
 error that no picture shows is none: so every attribute is straightened (its offset replaced by a_0(s) times
 the full one), one at a time, at every snapshot, and the change in the pictures is one row of pixels per
 attribute and snapshot. The inner products of these rows predict the error of any ranks; errors of several
@@ -10,38 +11,36 @@ attributes may add up or cancel. Ranks are grown on that prediction, and the pic
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from typing import Literal, Protocol
 
 import torch
 from torch import Tensor
 
-from progdf.metrics.image import decibels
+from progdf.metrics.image import ROUNDING, decibels
 
-from .baked import BakedField, interpolate_at
+from .baked import END_TYPES, BakedField, interpolate_at
 from .keyframes import fit_keyframes, fit_lossless
 from .separable import (
     AttributeTrajectory,
     channel_weights,
     check_trajectory,
+    decode_bases,
     fit_amplitude,
     moving_attributes,
     principal_modes,
+    quantize_bases,
     store_attribute,
 )
 
-Kind = Literal["auto", "separable", "keyframes", "lossless"]
+Kind = Literal["separable", "keyframes", "lossless"]
 
-MOST_BYTES = 400.0
-"""Bytes a member beyond which a separable field is not grown; nine keyframes of 14 numbers take 448."""
-
-CLOSE = 0.02
-"""Share of its bytes that may be saved in vain before the search for ranks goes on."""
-
-SPARE = 1.0
-"""Decibels above the target at which the search goes on all the same."""
+ADDED = 0.1
+"""Share of the error that an edit has against its editor which its field may add."""
 
 KEYFRAMES = (2, 3, 4, 5, 6, 9, 12, 17)
 
@@ -60,8 +59,11 @@ MOST_SNAPSHOTS = 40
 UNSEEN = 0.1
 """Say of the bare numbers beside the pictures, for members that these views do not show."""
 
-Modes = Mapping[str, tuple[Tensor, Tensor]]
+Modes = Mapping[str, Tensor]
 """By attribute, as `separable.principal_modes` gives them."""
+
+Ends = Mapping[str, tuple[Tensor, Tensor]]
+"""By attribute, as `separable.quantize_bases` gives them; one that is not named is in float32."""
 
 
 class Field(Protocol):
@@ -83,7 +85,9 @@ class Candidate:
 
     field: BakedField  # the field
     curve: tuple[float, ...]  # PSNR at `sample_strengths()`, dB
-    label: str  # what it is, e.g. "separable (means 2, sh0 3)"
+    label: str  # what it is, e.g. "separable (means int16 + 2, sh0 int8)"
+    excess: float = 0.0  # its error as a multiple of what is allowed: up to 1 it serves
+    to_editor: float | None = None  # PSNR to the editor's own pictures, all strengths together, dB
 
     @property
     def worst(self) -> float:
@@ -102,13 +106,19 @@ def sample_strengths() -> tuple[float, ...]:
 
 
 class FieldEvaluator:
-    """Renders fields and compares them with the trajectory, whose pictures are made once.
+    """Renders fields and says whether they serve.
+
+    Beside the editor's own pictures a field serves that adds at most `ADDED` of the mean square error which
+    the trajectory has against them: where there are such pictures, all together, and on the way, against the
+    trajectory, on the mean. Without them its worst PSNR against the trajectory decides.
 
     Args:
         strengths: of the snapshots. [T]
         offsets: [T,M,C]
         render: the pixels that count; held-out views are the honest choice
         truth: the offsets at any strength, [M,C]; None is straight from snapshot to snapshot
+        edited: the same pixels of the editor's own pictures, by the strength on the slider, 1 the last
+        target: least PSNR over the slider where there are no such pictures, dB
     """
 
     def __init__(
@@ -117,28 +127,65 @@ class FieldEvaluator:
         offsets: Tensor,
         render: Render,
         truth: Callable[[float], Tensor] | None = None,
+        edited: Mapping[float, Tensor] | None = None,
+        target: float = 40.0,
     ) -> None:
         course = truth or (lambda s: interpolate_at(strengths, offsets, s))
-        self._render = render
+        self._render, self._rule = render, bool(edited)
         self._nothing = torch.zeros_like(offsets[0])
         with torch.no_grad():
             self._expected = [render(course(s)) for s in sample_strengths()]
+            self._edited = edited or {1.0: render(course(1.0))}
+        self._own = self._errors(course)
+        self._allowed = ADDED * _mean(self._own) if edited else 10 ** (-target / 10)
+        own = decibels(_mean(self._own))
+        tenth = f"adds at most a tenth to the edit's own error ({own:.1f} dB to the editor)"
+        self.wanted = tenth if edited else f"reaches {target:g} dB"
+        """What a field that serves does, in words."""
+
+    def end_excess(self, end: Tensor) -> float:
+        """The error of these offsets at strength 1 as a multiple of what is allowed there. [M,C]"""
+        allowed = ADDED * self._own[-1] if self._rule else self._allowed
+        with torch.no_grad():
+            added = _difference(self._render(end), self._edited[max(self._edited)]) + ROUNDING - self._own[-1]
+        return added / allowed
+
+    def candidate(self, field: Field, label: str) -> Candidate:
+        """The field with its error."""
+        assert isinstance(field, BakedField)
+        curve = self._deviations(field)
+        found = self._errors(lambda s: self._offsets(field, s))
+        on_the_way = _mean(curve) if self._rule else max(curve)
+        excess = max(_mean(found) - _mean(self._own), on_the_way) / self._allowed
+        to_editor = decibels(_mean(found)) if self._rule else None
+        return Candidate(field, tuple(decibels(e) for e in curve), label, excess, to_editor)
 
     def curve(self, field: Field) -> tuple[float, ...]:
         """PSNR at `sample_strengths()`, dB."""
+        return tuple(decibels(e) for e in self._deviations(field))
+
+    def _deviations(self, field: Field) -> list[float]:
         with torch.no_grad():
-            return tuple(
-                decibels(float((self._render(self._offsets(field, s)) - expected).double().square().mean()))
+            return [
+                _difference(self._render(self._offsets(field, s)), expected)
                 for s, expected in zip(sample_strengths(), self._expected, strict=True)
-            )
+            ]
+
+    def _errors(self, course: Callable[[float], Tensor]) -> list[float]:
+        with torch.no_grad():
+            return [ROUNDING + _difference(self._render(course(s)), e) for s, e in self._edited.items()]
 
     def _offsets(self, field: Field, s: float) -> Tensor:
         # a field that moves nothing does not know how many members it has
         return field.offsets(s) if field.attributes else self._nothing
 
-    def candidate(self, field: BakedField, label: str) -> Candidate:
-        """The field with its error."""
-        return Candidate(field, self.curve(field), label)
+
+def _difference(a: Tensor, b: Tensor) -> float:
+    return float((a - b).double().square().mean()) if len(a) else 0.0
+
+
+def _mean(errors: Sequence[float]) -> float:
+    return sum(errors) / len(errors)
 
 
 @dataclass(frozen=True)
@@ -156,28 +203,25 @@ def choose_field(
     offsets: Tensor,
     render: Render,
     weights: Tensor | None = None,
-    kind: Kind = "auto",
-    target: float = 40.0,
+    kind: Kind = "separable",
     budget: float | None = None,
     evaluator: FieldEvaluator | None = None,
     recorded: Sequence[float] | None = None,
 ) -> FieldChoice:
-    """The smallest field whose worst PSNR against the trajectory reaches the target, or the best in a budget.
+    """The smallest field that serves, or the best in a budget.
 
     Args:
         strengths: of the snapshots, ascending from 0 to 1. [T]
         offsets: raw offsets of the members; the first row is 0, the last the recorded end. [T,M,C] float32
         render: of a few views and their interesting pixels; the ranks are chosen on it
         weights: how much an error of each number shows: visibility [M] or [M,C]; None is evenly
-        kind: "auto" tries separable fields and the straight line; "keyframes" is the baseline, "lossless"
-            every snapshot, whatever it takes
-        target: least PSNR over the slider, dB; infinite asks for the best in the budget
-        budget: most bytes a member; None is as many as it takes
+        kind: "keyframes" is the baseline, "lossless" every snapshot, whatever it takes
+        budget: most bytes a member; the best field within it is chosen, whether it serves or not
         evaluator: decides in the end, best on views that `render` does not show; None decides by `render`
         recorded: strengths for the slider's ticks; `strengths` when None
 
     Returns:
-        The choice; where nothing reaches the target within the budget, the best there is, with `met` false.
+        The choice; where nothing serves, the best there is, with `met` false.
 
     Raises:
         ValueError: no trajectory, or weights that do not fit.
@@ -187,82 +231,95 @@ def choose_field(
     if kind == "lossless":
         everything = fit_lossless(strengths, offsets, recorded)
         candidate = evaluator.candidate(everything, f"all {len(strengths)} snapshots")
-        fits = budget is None or everything.bytes_per_member <= budget
-        met = fits and (not math.isfinite(target) or candidate.worst >= target)
-        return FieldChoice(candidate, met, (candidate,), "nothing is left out")
+        return FieldChoice(candidate, candidate.excess <= 1.0, (candidate,), "nothing is left out")
     if kind == "keyframes":
-        tried = _even_keyframes(strengths, offsets, target, budget, evaluator, recorded)
+        tried = _even_keyframes(strengths, offsets, budget, evaluator, recorded)
     else:
         spread = channel_weights(weights, offsets.shape[1], offsets.shape[2])
-        seen = render_trajectories(offsets, spread, render)
-        tried = _grow_fields(seen, strengths, target, budget, evaluator, recorded)
-    if kind == "auto":  # the straight line takes fewest bytes, and may be all that the edit needs
-        tried += _even_keyframes(strengths, offsets, -math.inf, budget, evaluator, recorded)
-    return pick_candidate(tuple(tried), target, budget)
+        ends = store_ends(offsets, evaluator, budget)
+        seen = render_trajectories(offsets, spread, render, ends)
+        tried = _grow_fields(seen, strengths, budget, evaluator, recorded)
+    return pick_candidate(tried, evaluator.wanted, budget)
 
 
-def pick_candidate(tried: tuple[Candidate, ...], target: float, budget: float | None) -> FieldChoice:
-    """The smallest that reaches the target, else the best; of those that the budget allows, if any."""
-    looked = f"{len(tried)} fields"
-    allowed = [c for c in tried if budget is None or c.field.bytes_per_member <= budget]
-    if not allowed:
-        least = min(tried, key=lambda c: (c.field.bytes_per_member, -c.worst))
-        return FieldChoice(least, False, tried, f"the smallest of {looked}; none fits into {budget:g} bytes")
-    good = [c for c in allowed if c.worst >= target]
-    within = "" if budget is None else f" within {budget:g} bytes"
-    if good:
-        best = min(good, key=lambda c: (c.field.bytes_per_member, -c.worst))
-        return FieldChoice(best, True, tried, f"the smallest of {looked}{within} that reaches {target:g} dB")
-    best = max(allowed, key=lambda c: (c.worst, -c.field.bytes_per_member))
-    if math.isfinite(target):
-        return FieldChoice(best, False, tried, f"the best of {looked}{within}; none reaches {target:g} dB")
-    return FieldChoice(best, True, tried, f"the best of {looked}{within}")
+def pick_candidate(tried: Sequence[Candidate], wanted: str, budget: float | None = None) -> FieldChoice:
+    """The smallest that serves, else the best; with a budget the best of those within it."""
+    looked = f"{len(tried)} field{'s'[: len(tried) != 1]}"
+    within = [c for c in tried if budget is None or c.field.bytes_per_member <= budget]
+    if not within:
+        least = min(tried, key=lambda c: (c.field.bytes_per_member, c.excess))
+        return FieldChoice(
+            least, False, tuple(tried), f"the smallest of {looked}; none fits into {budget:g} bytes"
+        )
+    best = min(within, key=lambda c: (c.excess, c.field.bytes_per_member))
+    if budget is not None:
+        return FieldChoice(best, True, tuple(tried), f"the best of {looked} within {budget:g} bytes")
+    if best.excess > 1.0:
+        return FieldChoice(best, False, tuple(tried), f"the best of {looked}; none {wanted}")
+    best = min((c for c in tried if c.excess <= 1.0), key=lambda c: (c.field.bytes_per_member, c.excess))
+    return FieldChoice(best, True, tuple(tried), f"the smallest of {looked} that {wanted}")
 
 
-def separable_within(
-    seen: RenderedTrajectories,
-    strengths: Tensor,
-    budget: float,
-    evaluator: FieldEvaluator,
-    recorded: Sequence[float] | None = None,
-) -> Candidate:
-    """The separable field with the ranks expected to be best within `budget` bytes a member."""
-    return _separable(seen, strengths, grow_ranks(seen, budget)[-1], evaluator, recorded)
+def store_ends(offsets: Tensor, evaluator: FieldEvaluator, budget: float | None = None) -> Ends:
+    """Each attribute's end in integers: all in the smallest, then the one that shows most per byte in larger
+    ones, until what they decode to serves or the budget is spent.
+
+    Args:
+        offsets: [T,M,C]
+        evaluator: says what serves
+        budget: most bytes a member
+    """
+    moving, end = moving_attributes(offsets), offsets[-1]
+    kinds = {
+        name: [quantize_bases(end[None, :, columns], kind) for kind in END_TYPES[:-1]]
+        for name, columns in moving.items()
+    }
+    chosen = dict.fromkeys(moving, 0)
+
+    def excess(chosen: Mapping[str, int]) -> float:
+        stored = end.clone()
+        for name, level in chosen.items():
+            if level < len(kinds[name]):
+                stored[:, moving[name]] = decode_bases(*kinds[name][level])[0]
+        return evaluator.end_excess(stored)
+
+    def size(chosen: Mapping[str, int]) -> int:
+        return sum(END_TYPES[k].itemsize * (moving[n].stop - moving[n].start) for n, k in chosen.items())
+
+    now = excess(chosen)
+    while now > 1.0:
+        larger = [{**chosen, name: k + 1} for name, k in chosen.items() if k + 1 < len(END_TYPES)]
+        larger = [c for c in larger if budget is None or size(c) <= budget]
+        if not larger:
+            break
+        gains = [(now - excess(c)) / (size(c) - size(chosen)) for c in larger]
+        chosen = larger[gains.index(max(gains))]
+        now = excess(chosen)
+    return {name: kinds[name][k] for name, k in chosen.items() if k < len(kinds[name])}
 
 
 def _grow_fields(
     seen: RenderedTrajectories,
     strengths: Tensor,
-    target: float,
     budget: float | None,
     evaluator: FieldEvaluator,
     recorded: Sequence[float] | None,
 ) -> list[Candidate]:
-    """Separable fields along the path of growing ranks, until one just meets the target."""
-    path = grow_ranks(seen, budget or MOST_BYTES)
-    expected = expected_worst(seen, path)
-    widths = {name: trajectory.offsets.shape[2] for name, trajectory in seen.trajectories.items()}
-    stored = [sum((4 + ranks[name]) * width for name, width in widths.items()) for ranks in path]
-    tried: dict[int, Candidate] = {}
+    """Separable fields along the path of growing ranks, in ever longer steps until one serves and back by
+    halves; with a budget the last alone."""
+    path, tried = grow_ranks(seen, budget or math.inf), dict[int, Candidate]()
 
-    def evaluate(i: int) -> Candidate:
+    def serves(i: int) -> bool:
         if i not in tried:
-            tried[i] = _separable(seen, strengths, path[i], evaluator, recorded, target)
-        return tried[i]
+            tried[i] = _separable(seen, strengths, path[i], evaluator, recorded)
+        return tried[i].excess <= 1.0
 
-    # the prediction leads to the place, each look corrects it, until the smallest that holds is cornered
-    low, high = -1, len(path)
-    correction = 0.0
-    while high - low > 1:
-        likely = [i for i in range(low + 1, high) if expected[i] + correction >= target]
-        i = likely[0] if likely else high - 1
-        if high < len(path) and stored[high] - stored[i] <= CLOSE * stored[high]:
-            if evaluate(high).worst < target + SPARE:
-                break
-            i = (low + high) // 2  # the prediction asks for too much
-        candidate = evaluate(i)
-        correction = candidate.worst - expected[i]
-        low, high = (low, i) if candidate.worst >= target else (i, high)
+    last = len(path) - 1
+    reach = 0 if budget is None else last
+    while not serves(reach) and reach < last:
+        reach = min(2 * reach + 1, last)
+    if budget is None:
+        bisect_left(range(reach), True, lo=reach // 2, key=serves)
     return list(tried.values())
 
 
@@ -272,44 +329,42 @@ def _separable(
     ranks: Mapping[str, int],
     evaluator: FieldEvaluator,
     recorded: Sequence[float] | None,
-    enough: float = math.inf,
 ) -> Candidate:
-    """The field of these ranks: pictures choose the bases or, short of `enough` dB, numbers if better.
+    """The field of these ranks: pictures choose the bases or, where these do not serve, numbers if better.
 
     Pictures are the better guide but for parts that move far, where straightening an attribute changes more
     than a sum of effects can say.
     """
     ticks = tuple(strengths.tolist() if recorded is None else recorded)
-    label = ", ".join(f"{name} {rank}" for name, rank in ranks.items() if rank) or "rank 0"
     candidates = []
     for modes in (
-        emphasize_modes(seen, ranks),
+        seen.modes,
         {n: principal_modes(c.gram) for n, c in seen.trajectories.items()},
     ):
         attributes = {
-            name: store_attribute(trajectory, modes[name][0][:, : ranks[name]])
+            name: store_attribute(trajectory, modes[name][:, : ranks[name]])
             for name, trajectory in seen.trajectories.items()
         }
         field = BakedField("separable", strengths.float(), attributes, seen.channels, ticks)
-        candidates.append(evaluator.candidate(field, f"separable ({label})"))
-        if candidates[-1].worst >= enough or not any(ranks.values()):
+        stored = ", ".join(f"{name} {bases.label}" for name, bases in attributes.items())
+        candidates.append(evaluator.candidate(field, f"separable ({stored or 'nothing moves'})"))
+        if candidates[-1].excess <= 1.0 or not any(ranks.values()):
             break
-    return max(candidates, key=lambda candidate: candidate.worst)
+    return min(candidates, key=lambda candidate: candidate.excess)
 
 
 def _even_keyframes(
     strengths: Tensor,
     offsets: Tensor,
-    target: float,
     budget: float | None,
     evaluator: FieldEvaluator,
     recorded: Sequence[float] | None,
 ) -> list[Candidate]:
-    """Ever more keyframes at even strengths, until the target is met or the budget spent."""
+    """Ever more keyframes at even strengths, until they serve or the budget is spent."""
     tried: list[Candidate] = []
     for count in (count for count in KEYFRAMES if count <= len(strengths)):
         field = fit_keyframes(strengths, offsets, count, recorded, torch.int8)
-        if tried and (tried[-1].worst >= target or field.bytes_per_member > (budget or math.inf)):
+        if tried and (tried[-1].excess <= 1.0 or field.bytes_per_member > (budget or math.inf)):
             break
         tried.append(evaluator.candidate(field, f"{count} keyframes"))
     return tried
@@ -318,18 +373,16 @@ def _even_keyframes(
 def grow_ranks(seen: RenderedTrajectories, most_bytes: float) -> list[dict[str, int]]:
     """Ranks from none upwards; each step adds the basis that takes most rendered error per byte."""
     widths = {name: trajectory.offsets.shape[2] for name, trajectory in seen.trajectories.items()}
-    evenly = torch.ones(seen.gram.shape[1], dtype=torch.float64)
-    modes = seen.modes(evenly)
     ranks = dict.fromkeys(seen.trajectories, 0)
-    stored = 4.0 * sum(widths.values())
+    stored = sum(trajectory.end_bytes for trajectory in seen.trajectories.values())
     path = [dict(ranks)]
-    now = _hardness(seen.mse(modes, ranks))
+    now = float(seen.mse(ranks).mean())
     while now > 0:
         best: tuple[float, str, float] | None = None
         for name, width in widths.items():
-            if ranks[name] >= modes[name][0].shape[1] or stored + width > most_bytes:
+            if ranks[name] >= seen.modes[name].shape[1] or stored + width > most_bytes:
                 continue
-            then = _hardness(seen.mse(modes, {**ranks, name: ranks[name] + 1}))
+            then = float(seen.mse({**ranks, name: ranks[name] + 1}).mean())
             gain = math.log(now / max(then, 1e-30)) / width
             if best is None or gain > best[0]:
                 best = (gain, name, then)
@@ -342,35 +395,6 @@ def grow_ranks(seen: RenderedTrajectories, most_bytes: float) -> list[dict[str, 
     return path
 
 
-def _hardness(mse: Tensor) -> float:
-    """Between mean and worst over the snapshots: the fourth-power mean, so that no step is in vain."""
-    return float(mse.pow(4).mean().pow(0.25))
-
-
-def emphasize_modes(seen: RenderedTrajectories, ranks: Mapping[str, int]) -> Modes:
-    """Bases for these ranks, with snapshots of large error made to count more until the worst is least."""
-    emphasis = torch.ones(seen.gram.shape[1], dtype=torch.float64)
-    best = modes = seen.modes(emphasis)
-    least = mse = seen.mse(modes, ranks)
-    for _ in range(8):
-        inner = mse[1:-1]
-        if not bool((inner > 0).any()):
-            break
-        emphasis[1:-1] *= (inner / inner.mean()).clamp(min=1e-3).pow(0.5)
-        emphasis = emphasis.clamp(1e-3, 1e3)
-        modes = seen.modes(emphasis)
-        mse = seen.mse(modes, ranks)
-        if float(mse.max()) < float(least.max()):
-            best, least = modes, mse
-    return best
-
-
-def expected_worst(seen: RenderedTrajectories, path: Sequence[Mapping[str, int]]) -> list[float]:
-    """Least PSNR over the slider that each of these ranks should give at least, dB."""
-    modes = seen.modes(torch.ones(seen.gram.shape[1], dtype=torch.float64))
-    return [decibels(float(seen.mse(modes, ranks).max())) for ranks in path]
-
-
 @dataclass(frozen=True)
 class RenderedTrajectories:
     """What straightening each attribute changes in the pictures."""
@@ -380,38 +404,46 @@ class RenderedTrajectories:
     values: int  # numbers that each inner product sums over
     channels: int  # width of a packed row
 
-    def modes(self, emphasis: Tensor) -> Modes:
-        """Each attribute's best bases, when the snapshots count as `emphasis` says. [T] float64, > 0"""
+    @cached_property
+    def modes(self) -> Modes:
+        """Each attribute's best bases."""
         modes = {}
         for i, (name, trajectory) in enumerate(self.trajectories.items()):
             seen = self.gram[i, :, i]
             parameters = float(trajectory.gram.diagonal().sum())
             share = UNSEEN * float(seen.diagonal().sum()) / parameters if parameters > 0 else 0.0
-            modes[name] = principal_modes(seen + share * trajectory.gram, emphasis)
+            modes[name] = principal_modes(seen + share * trajectory.gram)
         return modes
 
-    def mse(self, modes: Modes, ranks: Mapping[str, int]) -> Tensor:
+    def mse(self, ranks: Mapping[str, int]) -> Tensor:
         """Expected mean squared error of the pictures at each snapshot. [T] float64"""
         snapshots = self.gram.shape[1]
         remaining = torch.eye(snapshots, dtype=torch.float64).repeat(len(self.trajectories), 1, 1)
         for i, name in enumerate(self.trajectories):
-            mix, table = (part[:, : ranks.get(name, 0)] for part in modes[name])
-            remaining[i] -= table @ mix.T  # row t: what remains there, as a sum of the rows of pixels
+            mix = self.modes[name][:, : ranks.get(name, 0)]
+            remaining[i] -= mix @ mix.T  # row t: what remains there, as a sum of the rows of pixels
         half = torch.einsum("ats,asbu->atbu", remaining, self.gram)
         return torch.einsum("atbu,btu->t", half, remaining).clamp(min=0) / self.values
 
 
-def render_trajectories(offsets: Tensor, weights: Tensor, render: Render) -> RenderedTrajectories:
+def render_trajectories(
+    offsets: Tensor, weights: Tensor, render: Render, ends: Ends | None = None
+) -> RenderedTrajectories:
     """Straighten every attribute at every snapshot, and look.
 
     Args:
         offsets: [T,M,C] float32, the first row 0
         weights: how much an error of each number shows, ≥ 0. [M,C]
         render: called (1 + A)·(T − 2) times at most, where T counts no more than `MOST_SNAPSHOTS`
+        ends: as they are stored; the last row of the offsets becomes what they decode to
     """
-    attributes = moving_attributes(offsets)
+    attributes, ends = moving_attributes(offsets), ends or {}
+    if ends:
+        offsets = offsets.clone()
+        for name, stored in ends.items():
+            offsets[-1, :, attributes[name]] = decode_bases(*stored)[0]
     trajectories = {
-        name: fit_amplitude(offsets[:, :, columns], weights[:, columns])
+        name: fit_amplitude(offsets[:, :, columns], weights[:, columns], ends.get(name))
         for name, columns in attributes.items()
     }
     snapshots = len(offsets)

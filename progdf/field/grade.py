@@ -229,7 +229,7 @@ def map_share(field: BakedField) -> Tensor:
     Where the residual undoes the map, as between stripes, or does as much again, it is 0.
     """
     form, moved = field.origin, field.attributes
-    ends = [moved[name].end_offset for name in ("sh0", "shN") if name in moved]
+    ends = [moved[name].end for name in ("sh0", "shN") if name in moved]
     if not isinstance(form, GradeForm) or not len(form.residual) or not ends:
         return torch.ones(field.members)
     change = torch.cat(ends, dim=1)
@@ -318,4 +318,4 @@ def _rank(offsets: Tensor) -> int:
     power = torch.linalg.eigvalsh(fitted.gram).flip(0).clamp(min=0)
     remaining = float(power.sum()) - power.cumsum(0)
     needed = 0 if float(power.sum()) <= allowed else 1 + int((remaining > allowed).sum())
-    return min(needed, _MOST_RANK, principal_modes(fitted.gram)[0].shape[1])
+    return min(needed, _MOST_RANK, principal_modes(fitted.gram).shape[1])

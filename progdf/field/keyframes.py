@@ -54,7 +54,8 @@ def fit_keyframes(
             basis, scale = inner.to(basis_type), torch.ones(len(inner), full.shape[1])
         else:
             basis, scale = quantize_bases(inner - straight.float()[:, None, None] * full, basis_type)
-        attributes[name] = AttributeBases(full, basis, scale, table.clone())
+        units = torch.cat([torch.ones(1, full.shape[1]), scale])
+        attributes[name] = AttributeBases(full, basis, units, table.clone())
     ticks = strengths.tolist() if recorded is None else recorded
     return BakedField("keyframes", strengths[rows].float(), attributes, offsets.shape[2], tuple(ticks))
 

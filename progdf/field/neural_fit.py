@@ -30,7 +30,7 @@ from .neural import (
     encode,
     offsets_of_answer,
 )
-from .separable import LEVELS, channel_weights, check_trajectory, moving_attributes
+from .separable import channel_weights, check_trajectory, moving_attributes, quantize_bases
 
 
 class PictureLoss(Protocol):
@@ -267,10 +267,8 @@ class NeuralFit:
         """The network as it is stored: weights in float16, codes in int8."""
         learned = {name: tensor.detach().half() for name, tensor in self._learned.items() if name != "codes"}
         codes = self._learned.get("codes", torch.zeros(len(self._rows), 0)).detach()
-        largest = codes.abs().amax(dim=0) if len(codes) else codes.new_zeros(codes.shape[1])
-        step = torch.where(largest > 0, largest / LEVELS, torch.ones_like(largest))
-        stored = (codes / step).round().clamp(-LEVELS, LEVELS).to(torch.int8)
-        return NeuralField(self.shape, {**learned, **self._frame}, self._end, stored, step, recorded)
+        stored, step = quantize_bases(codes[None], torch.int8)
+        return NeuralField(self.shape, {**learned, **self._frame}, self._end, stored[0], step[0], recorded)
 
 
 def _place_frame(shape: NeuralShape, rows: Tensor) -> dict[str, Tensor]:

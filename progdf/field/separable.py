@@ -1,9 +1,9 @@
 """The separable field: Δ_i(s) = Σ_k B_ik a_k(s), one small sum per attribute, fitted by weighted SVD
 (docs/method.md 5).
 
-Basis 0 is the recorded end in float32, so that s = 1 has no error. What it leaves is a matrix of snapshots
-× numbers whose leading singular vectors are bases 1..R; those are kept as int8, and the coefficients are
-solved again for the bases as stored.
+Basis 0 is the end, in integers where that is enough: s = 1 is what they decode to. What it leaves is a matrix
+of snapshots × numbers whose leading singular vectors are bases 1..R; those are kept as int8, and the
+coefficients are solved again for the bases as stored.
 
 a_k(s) is linear between the snapshots; a cubic gains nothing with as many as a run records
 (docs/experiments.md, Separable fields).
@@ -21,8 +21,8 @@ from progdf.gaussians import attribute_slices
 
 from .baked import AttributeBases, BakedField
 
-LEVELS = 127
-"""Largest int8 level that is used; −128 is left out to keep the levels symmetric."""
+_LEVELS = {torch.int8: 127, torch.int16: 32767}
+"""Largest level that is used; the lowest is left out to keep the levels symmetric."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +34,14 @@ class AttributeTrajectory:
     amplitude: Tensor  # a_0 at the snapshots, the best share of the full offset; 0 first, 1 last. [T] float32
     # weighted inner products of what a_0 times the full offset leaves at the snapshots. [T,T] float64
     gram: Tensor
+    # the last row as stored, which that row is decoded from; None: in float32. [1,M,c], [1,c]
+    end: tuple[Tensor, Tensor] | None = None
+
+    @property
+    def end_bytes(self) -> int:
+        """Stored bytes of one member's end."""
+        stored = self.offsets if self.end is None else self.end[0]
+        return stored.shape[2] * stored.element_size()
 
     @property
     def residual(self) -> Tensor:
@@ -84,8 +92,10 @@ def moving_attributes(offsets: Tensor) -> dict[str, slice]:
     }
 
 
-def fit_amplitude(offsets: Tensor, weights: Tensor) -> AttributeTrajectory:
-    """One attribute's trajectory. [T,M,c] float32, [M,c] ≥ 0"""
+def fit_amplitude(
+    offsets: Tensor, weights: Tensor, stored: tuple[Tensor, Tensor] | None = None
+) -> AttributeTrajectory:
+    """One attribute's trajectory, and what its last row was decoded from. [T,M,c] float32, [M,c] ≥ 0"""
     root = weights.sqrt()
     end = (offsets[-1] * root).flatten()
     power = float(end.double() @ end.double())
@@ -93,29 +103,27 @@ def fit_amplitude(offsets: Tensor, weights: Tensor) -> AttributeTrajectory:
     if power > 0:
         amplitude = ((offsets * root).flatten(1) @ end).double() / power
     amplitude[0], amplitude[-1] = 0.0, 1.0
-    trajectory = AttributeTrajectory(offsets, weights, amplitude.float(), torch.zeros(0))
+    trajectory = AttributeTrajectory(offsets, weights, amplitude.float(), torch.zeros(0), stored)
     rows = (trajectory.residual * root).flatten(1)
     return replace(trajectory, gram=(rows @ rows.T).double())
 
 
-def principal_modes(gram: Tensor, emphasis: Tensor | None = None) -> tuple[Tensor, Tensor]:
+def principal_modes(gram: Tensor) -> Tensor:
     """The best bases of any number, by the inner products of the rows they shall explain (a weighted SVD).
 
     Args:
         gram: of the T rows, row 0 and the last are 0. [T,T] float64
-        emphasis: how much each row counts, > 0; None is evenly. [T] float64
 
     Returns:
         How each basis is mixed from the rows, strongest first, and what the bases are multiplied with to give
-        the rows again. [T,R], [T,R] float64; R is as large as there is anything to explain, at most T − 2
+        the rows again. [T,R] float64; R is as large as there is anything to explain, at most T − 2
     """
-    root = torch.ones(len(gram), dtype=torch.float64) if emphasis is None else emphasis.double().sqrt()
     # T is small: the T×T Gram matrix holds all there is to know of the left singular vectors
-    values, vectors = torch.linalg.eigh(root[:, None] * gram * root)
+    values, vectors = torch.linalg.eigh(gram)
     values, vectors = values.flip(0), vectors.flip(1)
     rank = int((values > 1e-9 * values[0]).sum()) if float(values[0]) > 0 else 0
-    vectors = vectors[:, : min(rank, max(len(gram) - 2, 0))]
-    return root[:, None] * vectors, vectors / root[:, None]
+    modes: Tensor = vectors[:, : min(rank, max(len(gram) - 2, 0))]
+    return modes
 
 
 def store_attribute(
@@ -129,23 +137,27 @@ def store_attribute(
         basis_type: int8, float16 or float32
     """
     full = trajectory.offsets[-1].contiguous()
+    end, unit = trajectory.end or (full[None], torch.ones(1, full.shape[1]))
     exact = (mix.T.float() @ trajectory.residual.flatten(1)).reshape(-1, *full.shape)
-    residual_basis, step = quantize_bases(exact, basis_type)
-    table = solve_coefficients(
-        trajectory.offsets, full, residual_basis.float() * step[:, None], trajectory.weights
-    )
-    return AttributeBases(full, residual_basis, step, table)
+    levels, step = quantize_bases(exact, basis_type)
+    table = solve_coefficients(trajectory.offsets, full, decode_bases(levels, step), trajectory.weights)
+    return AttributeBases(end[0], levels, torch.cat([unit, step]), table)
 
 
 def quantize_bases(exact: Tensor, basis_type: torch.dtype) -> tuple[Tensor, Tensor]:
     """Bases in their stored type, and what one unit is worth. [R,M,c] -> [R,M,c], [R,c] float32"""
     largest = exact.abs().amax(dim=1) if exact.shape[1] else exact.new_zeros(exact.shape[0], exact.shape[2])
-    if basis_type == torch.int8:
-        step = largest / LEVELS
+    if most := _LEVELS.get(basis_type):
+        step = largest / most
         step = torch.where(step > 0, step, torch.ones_like(step))
-        return (exact / step[:, None]).round().clamp(-LEVELS, LEVELS).to(torch.int8), step
+        return (exact / step[:, None]).round().clamp(-most, most).to(basis_type), step
     step = torch.where(largest > 0, largest, torch.ones_like(largest))  # keeps float16 away from its limits
     return (exact / step[:, None]).to(basis_type), step
+
+
+def decode_bases(levels: Tensor, step: Tensor) -> Tensor:
+    """The inverse of `quantize_bases`. [R,M,c], [R,c] -> [R,M,c] float32"""
+    return levels.float() * step[:, None]
 
 
 def solve_coefficients(offsets: Tensor, full: Tensor, residual_basis: Tensor, weights: Tensor) -> Tensor:
@@ -210,5 +222,4 @@ def fit_separable(
 
 
 def _fit_attribute(trajectory: AttributeTrajectory, rank: int, basis_type: torch.dtype) -> AttributeBases:
-    mix, _ = principal_modes(trajectory.gram)
-    return store_attribute(trajectory, mix[:, :rank], basis_type)
+    return store_attribute(trajectory, principal_modes(trajectory.gram)[:, :rank], basis_type)

@@ -266,9 +266,9 @@ def _check_reach(field: BakedField) -> None:
     """Raises ValueError where an offset, whatever the strength, is beyond any scene: sums would overflow."""
     for name, bases in field.attributes.items():
         most = bases.coefficients.abs().amax(0).double()
-        reach = float(most[0]) * float(bases.end_offset.abs().max() if bases.end_offset.numel() else 0.0)
+        reach = float(most[0]) * float(bases.end.abs().max() if bases.end_offset.numel() else 0.0)
         if bases.residual_basis.numel():
-            peaks = bases.residual_basis.abs().amax(1).double() * bases.scale.abs().double()
+            peaks = bases.residual_basis.abs().amax(1).double() * bases.scale[1:].abs().double()
             reach += float(most[1:] @ peaks.amax(1))
         if not reach < _FARTHEST.get(name, _FAR):
             raise ValueError(f"{name} moves by up to {reach:.3g}, farther than any scene reaches")

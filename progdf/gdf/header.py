@@ -26,7 +26,7 @@ from progdf.gaussians import ATTRIBUTES
 from progdf.io.json_values import convert_json, decode_json
 from progdf.region import Region
 
-FORMAT = 2
+FORMAT = 3
 """The version of the file format."""
 
 MOST_GAUSSIANS = 1 << 26
@@ -133,7 +133,7 @@ def unpack_file(content: bytes, name: str) -> tuple[GdfHeader, dict[str, Tensor]
             sha256 = convert_json(value["sha256"], str)
             signed = text.replace(sha256, "")
         version = convert_json(value["format"], int)
-        intact = checksum(signed, tensors) == sha256 and version == (1 if older else FORMAT)
+        intact = checksum(signed, tensors) == sha256 and version in ((1,) if older else (2, FORMAT))
     except (msgspec.MsgspecError, ValueError, KeyError, TypeError, RuntimeError):
         raise damage from None
     if version > FORMAT:
@@ -143,9 +143,13 @@ def unpack_file(content: bytes, name: str) -> tuple[GdfHeader, dict[str, Tensor]
     if older:
         tensors = {".".join(_RENAMED.get(p, p) for p in key.split(".")): t for key, t in tensors.items()}
     try:
+        if version < 3:  # where the end was always in float32
+            for key in [key for key in tensors if key.endswith(".end_offset")]:
+                scale = f"{key.removesuffix('end_offset')}scale"
+                tensors[scale] = torch.nn.functional.pad(tensors[scale], (0, 0, 1, 0), value=1.0)
         # a key that is unknown may be of a later version, which reads the file in another way
         return convert_json(value, GdfHeader, closed=True), tensors
-    except ValueError as error:
+    except (ValueError, KeyError, RuntimeError) as error:
         raise contradiction_error(name, error) from error
 
 

@@ -14,6 +14,9 @@ WINDOW, SIGMA = 11, 1.5
 NO_DIFFERENCE = 99.0
 """PSNR, dB, that stands for pictures which do not differ."""
 
+ROUNDING = 1 / 255**2 / 12
+"""Mean squared error of a picture of 8 bits."""
+
 
 def decibels(mse: float) -> float:
     """PSNR of a mean squared error of images of range 0..1, at most `NO_DIFFERENCE`, dB."""

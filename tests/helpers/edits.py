@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from progdf.field import BakedField, fit_separable
 from progdf.field.choose import Render
+from progdf.field.separable import quantize_bases
 from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians, attribute_slices
 from progdf.gdf.file import Gdf, fingerprint
 from progdf.region import Region
@@ -43,10 +45,19 @@ def curved_field(
     moving: Collection[str] = ATTRIBUTES,
     rank: int = 2,
     basis_type: torch.dtype = torch.int8,
+    end_type: torch.dtype = torch.float32,
 ) -> BakedField:
-    """A separable field of `curved_trajectory`."""
+    """A separable field of `curved_trajectory`, its ends stored in `end_type`."""
     strengths, offsets = curved_trajectory(members, seed, channels, moving)
-    return fit_separable(strengths, offsets, dict.fromkeys(ATTRIBUTES, rank), basis_type=basis_type)
+    field = fit_separable(strengths, offsets, dict.fromkeys(ATTRIBUTES, rank), basis_type=basis_type)
+    if end_type == torch.float32:
+        return field
+    attributes = {}
+    for name, bases in field.attributes.items():
+        levels, unit = quantize_bases(bases.end[None], end_type)
+        scale = torch.cat([unit, bases.scale[1:]])
+        attributes[name] = replace(bases, end_offset=levels[0], scale=scale)
+    return replace(field, attributes=attributes)
 
 
 def at_snapshots(field: BakedField, strengths: Tensor) -> Tensor:

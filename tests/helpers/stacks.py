@@ -129,7 +129,7 @@ def _gdf(scene: Gaussians, name: str, members: Tensor, instruction: str, offsets
         attribute: AttributeBases(
             end_offset=full,
             residual_basis=(0.1 * full)[None].half(),
-            scale=torch.ones(1, full.shape[1]),
+            scale=torch.ones(2, full.shape[1]),
             coefficients=coefficients.clone(),
         )
         for attribute, full in offsets.items()

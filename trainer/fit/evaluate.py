@@ -95,7 +95,10 @@ class Evaluator:
 
     def counted_pixels(self, offsets: Tensor) -> Tensor:
         """The pixels that count, of all views, with these offsets. [M,C] -> [P,3]"""
-        pictures = self.pictures(offsets)
+        return self.count(self.pictures(offsets))
+
+    def count(self, pictures: Sequence[Tensor]) -> Tensor:
+        """The pixels that count of pictures of all views. [h,w,3] each -> [P,3]"""
         return torch.cat([picture[pixels] for picture, pixels in zip(pictures, self.pixels, strict=True)])
 
 

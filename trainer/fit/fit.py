@@ -10,17 +10,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from progdf.field import BakedField, Candidate, FieldEvaluator, choose_field, fit_keyframes
+from progdf.field import BakedField, Candidate, FieldChoice, FieldEvaluator, choose_field, fit_keyframes
 from progdf.field.baked import MONOMIALS, GradeForm, NeuralForm, identity_map
-from progdf.field.choose import MOST_SNAPSHOTS, SAMPLES
+from progdf.field.choose import MOST_SNAPSHOTS, SAMPLES, pick_candidate
 from progdf.field.grade import bake_grade, fit_grade, lowest_bands, mapped_trajectory, rank_limit
 from progdf.field.separable import moving_attributes
 from progdf.field.trajectory import Trajectory
 from progdf.gaussians import BASE_CHANNELS, Gaussians, attribute_slices
-from progdf.metrics.image import decibels
 from progdf.rasterize import alpha_weights
 from trainer.editors.base import ImageEditor
-from trainer.optimize.color_solver import ROUNDING
 from trainer.options import FieldKind, FieldOptions
 from trainer.setup import TrainingSetup
 from trainer.views.choose import split_held_out
@@ -31,7 +29,6 @@ from .evaluate import Evaluator, make_evaluator
 _VIEWS = 3
 _BETTER = 0.5  # dB by which the own way has to be nearer: it takes several times the bytes
 _HALFWAY = (0.3, 0.4, 0.5, 0.6, 0.7)  # a way is judged where it comes nearest to the half
-_SAME = 40.0  # dB above which two ways look alike
 
 
 def straight_path(trajectory: Trajectory) -> Trajectory:
@@ -62,22 +59,17 @@ def choose_path(
         in_parts: connected parts were moved as wholes
         retimed: lays the slider over a trajectory; done only where its own way may be kept
     """
+    if in_parts:
+        return retimed(trajectory), "as the parts move"
     line = straight_path(trajectory)
-    if not in_parts and (editor is None or editor.stages):
+    if editor is None or editor.stages:
         return line, "straight: the editor pictures the end alone"
     trajectory = retimed(trajectory)
     views = split_held_out(setup.judging)[0][:_VIEWS]
-    halves = {}
-    if editor is not None and not in_parts:
-        halves = {0.5: [editor.edit(view, 0.5) for view in views]}
+    halves = {0.5: [editor.edit(view, 0.5) for view in views]}
     evaluator = make_evaluator(
         setup.scene, setup.region, views, halves, setup.background, trajectory.end.shape[1]
     )
-    if in_parts:
-        apart = evaluator.psnr(evaluator.pictures(trajectory.at(0.5)), evaluator.pictures(line.at(0.5)))
-        if apart >= _SAME:
-            return line, f"straight, which looks the same half way ({apart:.1f} dB)"
-        return trajectory, f"as the parts move, which straight lines would distort ({apart:.1f} dB half way)"
 
     def nearest(way: Trajectory) -> float:
         return max(evaluator.psnr(evaluator.pictures(way.at(s)), evaluator.edited[0.5]) for s in _HALFWAY)
@@ -99,7 +91,7 @@ class Fitted:
 
     # the field with its errors against the trajectory, on views that the choice has not seen
     chosen: Candidate
-    met: bool  # whether it reached the target on the views that it was chosen on, or the budget
+    met: bool  # whether it serves on the views that it was chosen on, or is within the budget
     # the fields that were looked at, with their errors on the views that the choice was made on
     tried: tuple[Candidate, ...]
     baselines: Mapping[str, Candidate]  # keyframe fields by name, on the same views as `chosen`
@@ -114,7 +106,7 @@ def fit_field(
     weights: Tensor,
     options: FieldOptions,
 ) -> Fitted:
-    """Fit fields and keep the smallest whose worst PSNR over the slider reaches the target, or the best one.
+    """The smallest field that serves, see `FieldEvaluator`, or where none does the best.
 
     Args:
         trajectory: what was recorded
@@ -122,32 +114,20 @@ def fit_field(
         choosing: held-out views, which have the last word on the choice
         reporting: other held-out views, on which the chosen field's errors are taken
         weights: how visible each member is. [M]
-        options: which field; where none reaches the target, the best is kept and `met` is false
+        options: which field
     """
-    offsets = torch.stack([trajectory.node(i) for i in range(len(trajectory))])
-    ticks = tuple(float(s) for s in trajectory.s)
     assert options.field != "neural"
-    budget = options.bytes_budget
-    target = options.target_psnr if budget is None else math.inf
     choice = choose_field(
         trajectory.s,
-        offsets,
+        _recorded_offsets(trajectory),
         seen.counted_pixels,
         weights,
-        options.field,
-        target,
-        budget,
-        evaluator=FieldEvaluator(trajectory.s, offsets, choosing.counted_pixels),
-        recorded=ticks,
+        "separable" if options.field == "auto" else options.field,
+        options.bytes_budget,
+        field_evaluator(trajectory, choosing, options.target_psnr),
+        trajectory.s.tolist(),
     )
-    errors = FieldEvaluator(trajectory.s, offsets, reporting.counted_pixels)
-    chosen = errors.candidate(choice.best.field, choice.best.label)
-    baselines = _baselines(trajectory, offsets, errors)
-    return Fitted(chosen, choice.met, choice.tried, baselines, choice.why)
-
-
-ADDED = 0.1
-"""Share of the error that an edit has against its editor which its field may add."""
+    return _measured(choice, trajectory, reporting)
 
 
 def fit_grades(
@@ -158,8 +138,7 @@ def fit_grades(
     weights: Tensor,
     options: FieldOptions,
 ) -> Fitted:
-    """The grade of a recorded map with the fewest bases beside it that add at most `ADDED` of the error that
-    the recording has against the editor's own pictures (mean square, all strengths together).
+    """The grade of a recorded map with the fewest bases beside it that serve, see `fit_field`.
 
     Args:
         trajectory: what was recorded, with its maps
@@ -171,38 +150,37 @@ def fit_grades(
     degree = next(d for d, count in MONOMIALS.items() if count == trajectory.maps.shape[1])
     table = torch.cat([identity_map(degree)[None], trajectory.maps])
     mapped = mapped_trajectory(degree, table, rows)
-    recorded = torch.stack([trajectory.node(i) for i in nodes])
-    course = lowest_bands(recorded - mapped, trajectory.bands)
-    expected = [choosing.edited[strength] for strength in trajectory.strengths]
-
-    def errors(offsets: Callable[[int], Tensor]) -> list[float]:
-        pictures = (choosing.pictures(offsets(i)) for i in range(1, len(expected) + 1))
-        return [ROUNDING + choosing.mse(p, e) for p, e in zip(pictures, expected, strict=True)]
-
-    own, budget = sum(errors(lambda i: recorded[i])), options.bytes_budget
-    tried, met = list[tuple[float, Candidate]](), False
+    course = lowest_bands(torch.stack([trajectory.node(i) for i in nodes]) - mapped, trajectory.bands)
+    evaluator, budget = field_evaluator(trajectory, choosing, options.target_psnr), options.bytes_budget
+    tried = list[Candidate]()
     for rank in range(rank_limit(course) + 1):
         form = fit_grade(trajectory.s[nodes], degree, table, course, rank, weights)
-        if budget is not None and form.bytes_per_member > budget:
+        if tried and form.bytes_per_member > (budget or math.inf):
             break
         field = replace(bake_grade(form, rows, mapped), recorded=tuple(trajectory.s.tolist()))
-        found = errors(lambda i: field.offsets(float(trajectory.s[nodes[i]])))  # noqa: B023
-        tried.append((sum(found), Candidate(field, tuple(decibels(e) for e in found), form.label)))
-        met = sum(found) <= (1.0 + ADDED) * own
-        if met and budget is None:
+        tried.append(evaluator.candidate(field, form.label))
+        if tried[-1].excess <= 1.0 and budget is None:
             break
-    chosen, adds = min(tried, key=lambda one: one[0])[1], "adds at most a tenth to the edit's own error"
-    why = f"the smallest of {len(tried)} that {adds}" if met else f"the best of {len(tried)}; none {adds}"
-    if budget is not None:
-        met, why = True, f"the best of {len(tried)} that fits into {budget:g} bytes"
-    measured = FieldEvaluator(trajectory.s, _recorded_offsets(trajectory), reporting.counted_pixels)
-    return Fitted(
-        measured.candidate(chosen.field, chosen.label),
-        met,
-        tuple(candidate for _, candidate in tried),
-        _baselines(trajectory, _recorded_offsets(trajectory), measured),
-        why,
-    )
+    return _measured(pick_candidate(tried, evaluator.wanted, budget), trajectory, reporting)
+
+
+def field_evaluator(trajectory: Trajectory, views: Evaluator, target: float | None) -> FieldEvaluator:
+    """What decides whether a field serves: the editor's own pictures of these views, or a target in dB."""
+    edited = {s: views.count(views.edited[strength]) for s, strength in trajectory.stage_strengths}
+    offsets, render = _recorded_offsets(trajectory), views.counted_pixels
+    if target is None:
+        return FieldEvaluator(trajectory.s, offsets, render, edited=edited)
+    return FieldEvaluator(trajectory.s, offsets, render, target=target)
+
+
+def _measured(choice: FieldChoice, trajectory: Trajectory, reporting: Evaluator) -> Fitted:
+    """The choice with its errors, and baselines with theirs, on views that it has not seen."""
+    offsets, best, why = _recorded_offsets(trajectory), choice.best, choice.why
+    errors = FieldEvaluator(trajectory.s, offsets, reporting.counted_pixels)
+    if best.to_editor is not None:
+        why += f", with it {best.to_editor:.1f} dB"
+    chosen = errors.candidate(best.field, best.label)
+    return Fitted(chosen, choice.met, choice.tried, _baselines(trajectory, offsets, errors), why)
 
 
 def _recorded_offsets(trajectory: Trajectory) -> Tensor:
@@ -219,14 +197,14 @@ def expected_looks(trajectory: Trajectory, kind: FieldKind) -> int:
 
 
 def evaluate_field(
-    trajectory: Trajectory, reporting: Evaluator, field: BakedField, target_psnr: float
+    trajectory: Trajectory, reporting: Evaluator, field: BakedField, target: float | None
 ) -> Fitted:
     """A field that is there already, a network's, beside the same baselines."""
-    offsets = torch.stack([trajectory.node(i) for i in range(len(trajectory))])
-    errors = FieldEvaluator(trajectory.s, offsets, reporting.counted_pixels)
-    measured = errors.candidate(field, field.kind)
-    baselines = _baselines(trajectory, offsets, errors)
-    return Fitted(measured, measured.worst >= target_psnr, (measured,), baselines, "a network was asked for")
+    evaluator = field_evaluator(trajectory, reporting, target)
+    network = evaluator.candidate(field, field.kind)
+    why = f"a network was asked for{'; none' if network.excess > 1.0 else ' and'} {evaluator.wanted}"
+    choice = FieldChoice(network, network.excess <= 1.0, (network,), why)
+    return _measured(choice, trajectory, reporting)
 
 
 def _baselines(trajectory: Trajectory, offsets: Tensor, errors: FieldEvaluator) -> dict[str, Candidate]:
@@ -259,6 +237,7 @@ def choice_figures(fitted: Fitted) -> dict[str, Any]:
             "bytes_per_gaussian": round(candidate.field.bytes_per_member, 1),
             "psnr_mean": round(candidate.mean, 2),
             "psnr_worst": round(candidate.worst, 2),
+            "psnr_to_editor": None if candidate.to_editor is None else round(candidate.to_editor, 2),
         }
         for candidate in fitted.tried
     ]
@@ -303,7 +282,7 @@ def drop_idle_attributes(
     slices = attribute_slices(end.shape[1])
     target = evaluator.edited[1.0]
     now = complete = evaluator.psnr(evaluator.pictures(end), target)
-    for name in ("shN", "quats", "log_scales", "means", "logit_opacities"):
+    for name in ("shN", "quats", "log_scales", "means", "logit_opacities", "sh0"):
         if name not in slices or not bool(end[:, slices[name]].any()):
             continue
         tried = end.clone()

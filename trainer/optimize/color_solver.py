@@ -26,7 +26,7 @@ from torch import Tensor
 from progdf.field.baked import MONOMIALS, identity_map
 from progdf.field.grade import MOST_COLOR, band_offsets, map_colors, member_bands, monomials
 from progdf.gaussians import attribute_slices, unpack
-from progdf.metrics.image import decibels
+from progdf.metrics.image import ROUNDING, decibels
 from progdf.rasterize.cpu.engine import ColorMap, color_map
 from progdf.sh import basis
 from progdf.threads import one_thread, threads
@@ -40,9 +40,6 @@ STEPS_OF_OTHERS = 8
 
 MORE_PAYS = 0.95
 """Share of the error that a larger model must leave at most, to be worth its bytes."""
-
-ROUNDING = 1 / 255**2 / 12
-"""Mean squared error of a picture of 8 bits: what is nearer to it than this is not told apart."""
 
 _RIDGE = 0.002  # of a typical member's weight: holds the residual of what hardly shows at 0
 _MAP_RIDGE = 1e-6  # the same of the map's coefficients, for regions of few colors

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from progdf.compose.reference import Layer, compose_layers
 from progdf.errors import ProgdfError
-from progdf.field.baked import GradeForm, identity_remap
+from progdf.field.baked import identity_remap
 from progdf.field.trajectory import Trajectory, load_trajectory
 from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians, pack
 from progdf.gdf.file import Gdf, fingerprint, load_gdf, save_gdf
@@ -90,7 +90,7 @@ def finish_run(
         field, remap = fitted.chosen.field, identity_remap()
         if slider == "even":
             field, remap = equalize_slider(field, setup, log)
-        if isinstance(field.origin, GradeForm):  # its end is what its file says, not what was recorded
+        if field.attributes:  # its end is what its file says, not what was recorded
             trajectory = replace(trajectory, end=field.offsets(1.0))
         shipped = replace(trajectory, s=remap(trajectory.s).float())
     log.say(
@@ -100,12 +100,6 @@ def finish_run(
         f"mean {fitted.chosen.mean:.1f} dB against {len(trajectory)} recordings "
         f"in {format_count(len(reporting.names), 'view')}"
     )
-    if not fitted.met:
-        budget = options.field.bytes_budget
-        if budget is not None and network is None:
-            log.say(f"no field takes --bytes-budget {budget:g} or less; the smallest was kept")
-        else:
-            log.say(f"no field reached --target-psnr {options.field.target_psnr:g}; the best was kept")
     with log.stage("report"):
         clip = clip_curve(evaluator, setup.judging, field, options.texts)
         if clip.reason and options.texts.asked:

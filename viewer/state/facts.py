@@ -103,7 +103,7 @@ def _mean_color(scene: Gaussians, gdf: Gdf) -> Rgb:
     sh0 = scene.sh0[members]
     bases = gdf.field.attributes.get("sh0")
     if bases is not None:
-        sh0 = sh0 + bases.end_offset
+        sh0 = sh0 + bases.end
     weights = scene.opacities[members].nan_to_num()[:, None] + 1e-6
     color = (sh0_to_rgb(sh0).nan_to_num().clamp(0.0, 1.0) * weights).sum(0) / weights.sum()
     red, green, blue = (float(c) for c in color)
@@ -164,7 +164,7 @@ def describe_applied(scene: Gaussians, gdf: Gdf) -> str:
     sh = region.sh[:, :16].clone()
     for name, bands in (("sh0", sh[:, :1]), ("shN", sh[:, 1:])):
         if name in moved:
-            bands += moved[name].end_offset[::every].reshape(len(sh), -1, 3)[:, : bands.shape[1]]
+            bands += moved[name].end[::every].reshape(len(sh), -1, 3)[:, : bands.shape[1]]
     errors: list[Tensor] = []
     for camera in _two_sides(region) if sh.shape[1] > 1 else ():
         toward = torch.nn.functional.normalize(region.means - camera.position, dim=1)

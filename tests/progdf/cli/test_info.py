@@ -134,7 +134,7 @@ def test_info_of_an_edit_tells_its_scene_region_field_and_errors(
     assert any(
         line.startswith(f"field: {gdf.field.kind}, ") and "bytes per Gaussian" in line for line in lines
     )
-    assert any(line.endswith(", 5 knots; bases: sh0 1 exact + 1 fitted") for line in lines)
+    assert any(line.endswith(", 5 knots; ends and bases: sh0 float32 + 1") for line in lines)
     assert {"option: steps 600", "option: slider even"} <= set(lines)
     assert {"report: field.psnr_worst 46.91", "report: edit.clip_direction not measured"} <= set(lines)
 

@@ -38,7 +38,7 @@ def scene() -> Gaussians:
 
 @pytest.fixture(scope="module")
 def shirt(scene: Gaussians) -> Gdf:
-    return edit_of(scene, some_rows(scene, 150, 1), curved_field(150, 1), "shirt")
+    return edit_of(scene, some_rows(scene, 150, 1), curved_field(150, 1, end_type=torch.int8), "shirt")
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +62,7 @@ def test_one_layer_at_full_strength_is_the_recorded_end_exactly(
     scene: Gaussians, shirt: Gdf, blend: str
 ) -> None:
     edited = compose_layers(scene, [Layer(shirt, 1.0)], blend)
-    full = torch.cat([bases.end_offset for bases in shirt.field.attributes.values()], dim=1)
+    full = torch.cat([bases.end for bases in shirt.field.attributes.values()], dim=1)
     expected = scene.replace_rows(shirt.region.members, pack(scene)[shirt.region.members] + full)
     assert bits(edited) == bits(expected)
 
@@ -250,12 +250,14 @@ def test_an_edit_of_another_scene_is_refused(scene: Gaussians, shirt: Gdf) -> No
 
 @pytest.fixture(scope="module")
 def wardrobe(scene: Gaussians, shirt: Gdf, hat: Gdf) -> list[Gdf]:
-    """Overlapping edits of every storage type: int8, one member of float32, everything in float16 with SH."""
+    """Overlapping edits of every storage type: int8, one member of float32, everything in float16 and
+    int16 with SH."""
     channels = 14 + 9
     single = edit_of(
         scene, some_rows(scene, 1, 5), curved_field(1, 5, channels, basis_type=torch.float32), "pin"
     )
-    night = curved_field(len(scene), 6, channels, ("means", "quats", "shN"), basis_type=torch.float16)
+    moving = ("means", "quats", "shN")
+    night = curved_field(len(scene), 6, channels, moving, basis_type=torch.float16, end_type=torch.int16)
     return [shirt, hat, single, edit_of(scene, torch.arange(len(scene)), night, "night")]
 
 

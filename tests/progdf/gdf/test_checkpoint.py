@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 
 from progdf.__main__ import main
 from progdf.errors import ProgdfError
+from progdf.field.baked import BASIS_TYPES, END_TYPES
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf, SceneFingerprint, fingerprint, load_gdf, save_gdf, verify
 from progdf.gdf.header import FORMAT
@@ -80,9 +81,13 @@ def test_an_edit_comes_back_as_it_was_saved(shirt: Gdf, saved: Path, scene: Gaus
     assert same(load_gdf(saved, scene), shirt)
 
 
-@pytest.mark.parametrize("basis_type", [torch.int8, torch.float16, torch.float32])
-def test_every_storage_type_survives(scene: Gaussians, tmp_path: Path, basis_type: torch.dtype) -> None:
-    edit = edit_of(scene, some_rows(scene, 9), curved_field(9, basis_type=basis_type))
+@pytest.mark.parametrize("end_type", END_TYPES)
+@pytest.mark.parametrize("basis_type", BASIS_TYPES)
+def test_every_storage_type_survives(
+    scene: Gaussians, tmp_path: Path, basis_type: torch.dtype, end_type: torch.dtype
+) -> None:
+    field = curved_field(9, basis_type=basis_type, end_type=end_type)
+    edit = edit_of(scene, some_rows(scene, 9), field)
     save_gdf(tmp_path / "a.gdf", edit)
     assert same(load_gdf(tmp_path / "a.gdf"), edit)
 
@@ -241,6 +246,7 @@ def test_a_file_of_a_newer_version_asks_for_an_update(saved: Path, tmp_path: Pat
     [
         {"means__end_offset": torch.ones(39, 3)},
         {"means__end_offset": torch.ones(40, 3, dtype=torch.float64)},
+        {"means__end_offset": torch.ones(40, 3, dtype=torch.int16), "means__scale": torch.ones(2, 3)},
         {"means__end_offset": torch.full((40, 3), float("nan"))},
         {"means__residual_basis": None},
         {"means__coefficients": torch.ones(9, 3)},
@@ -261,6 +267,7 @@ def test_a_file_of_a_newer_version_asks_for_an_update(saved: Path, tmp_path: Pat
         {"members": -1},
         {"members": 10**9},
         {"means__end_offset": torch.full((40, 3), 3e38)},
+        {"means__end_offset": torch.ones(40, 3, dtype=torch.int8), "means__scale": torch.full((3, 3), 1e30)},
         {"log_scales__end_offset": torch.full((40, 3), 200.0)},
     ],
 )
@@ -293,8 +300,9 @@ def test_flipped_or_missing_bytes_give_the_same_edit_or_one_line(
 # ---- older files
 
 
-def test_a_file_of_format_1_is_read(shirt: Gdf) -> None:
-    old = load_gdf(Path(__file__).parent / "format_1" / "shirt.gdf")
+@pytest.mark.parametrize("version", ["format_1", "format_2"])
+def test_a_file_of_an_older_format_is_read(shirt: Gdf, version: str) -> None:
+    old = load_gdf(Path(__file__).parent / version / "shirt.gdf")
     scene = random_gaussians(60, seed=1, sh_degree=1)
     field = curved_field(6, channels=14 + 9, moving=("means", "quats", "sh0", "shN"))
     edit = edit_of(scene, some_rows(scene, 6), field)
@@ -304,10 +312,18 @@ def test_a_file_of_format_1_is_read(shirt: Gdf) -> None:
     assert same(old, replace(expected, options=shirt.options, report=shirt.report))
 
 
-def test_a_damaged_file_of_format_1_is_refused(tmp_path: Path) -> None:
-    content = bytearray((Path(__file__).parent / "format_1" / "shirt.gdf").read_bytes())
+@pytest.mark.parametrize("version", ["format_1", "format_2"])
+def test_a_damaged_file_of_an_older_format_is_refused(tmp_path: Path, version: str) -> None:
+    content = bytearray((Path(__file__).parent / version / "shirt.gdf").read_bytes())
     content[-100] ^= 1
     assert "is damaged" in refusal(written(tmp_path, bytes(content)))
+
+
+@pytest.mark.parametrize("scale", [None, torch.ones(3), torch.ones(2, 2, 3)])
+def test_an_older_file_whose_scales_do_not_fit_is_refused(
+    saved: Path, tmp_path: Path, scale: torch.Tensor | None
+) -> None:
+    assert "is inconsistent" in refusal(rewritten(saved, tmp_path, format=2, means__scale=scale))
 
 
 # ---- headers that somebody changed

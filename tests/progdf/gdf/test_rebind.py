@@ -62,7 +62,7 @@ def test_a_negated_quaternion_turns_the_same_way(stack: Stack) -> None:
         residual_basis=torch.zeros(
             bases.residual_basis.shape[0], len(gdf.region), 4, dtype=bases.residual_basis.dtype
         ),
-        scale=torch.zeros(bases.scale.shape[0], 4),
+        scale=torch.ones(bases.scale.shape[0], 4),
     )
     gdf = replace(gdf, field=replace(gdf.field, attributes={"quats": turning}))
     other, order = shuffled(scene)

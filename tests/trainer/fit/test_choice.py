@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 
 from progdf.field import Candidate, FieldEvaluator, choose_field, fit_separable
-from progdf.field.choose import pick_candidate, render_trajectories, separable_within
+from progdf.field.choose import pick_candidate
 from tests.helpers.edits import curved_field, curved_trajectory, linear_pictures
 
 
 def test_the_best_field_is_the_one_whose_worst_picture_is_best() -> None:
-    steady = Candidate(curved_field(3), (30.0, 31.0), "steady")
-    uneven = Candidate(curved_field(3), (20.0, 60.0), "good on the mean")
-    assert pick_candidate((uneven, steady), 99.0, None).best is steady
+    steady = Candidate(curved_field(3), (30.0, 31.0), "steady", 2.0)
+    uneven = Candidate(curved_field(3), (20.0, 60.0), "good on the mean", 20.0)
+    assert pick_candidate((uneven, steady), "reaches 33 dB").best is steady
 
 
 def test_every_snapshot_is_not_enough_where_the_course_between_them_is_another() -> None:
     strengths, offsets = curved_trajectory(20, snapshots=3)
     shown = linear_pictures(20, 14)
-    evaluator = FieldEvaluator(strengths, offsets, shown, lambda s: s**4 * offsets[-1])
-    chosen = choose_field(strengths, offsets, shown, kind="lossless", target=80.0, evaluator=evaluator)
+    evaluator = FieldEvaluator(strengths, offsets, shown, lambda s: s**4 * offsets[-1], target=80.0)
+    chosen = choose_field(strengths, offsets, shown, kind="lossless", evaluator=evaluator)
     assert chosen.best.worst < 80.0
     assert not chosen.met
 
@@ -28,10 +27,11 @@ def test_every_snapshot_is_not_enough_where_the_course_between_them_is_another()
 def test_keyframes_are_added_until_the_target_is_met_or_the_budget_spent() -> None:
     strengths, offsets = curved_trajectory(20, snapshots=17)
     shown = linear_pictures(20, 14)
-    chosen = choose_field(strengths, offsets, shown, kind="keyframes", target=30.0)
+    evaluators = [FieldEvaluator(strengths, offsets, shown, target=target) for target in (30.0, 90.0)]
+    chosen = choose_field(strengths, offsets, shown, kind="keyframes", evaluator=evaluators[0])
     assert chosen.met
     assert len(chosen.best.field.knots) == max(len(c.field.knots) for c in chosen.tried)
-    small = choose_field(strengths, offsets, shown, kind="keyframes", target=90.0, budget=14 * 6)
+    small = choose_field(strengths, offsets, shown, kind="keyframes", budget=14 * 6, evaluator=evaluators[1])
     assert [c.label for c in small.tried] == ["2 keyframes", "3 keyframes", "4 keyframes"]
 
 
@@ -43,7 +43,6 @@ def test_numbers_choose_the_bases_where_pictures_are_the_worse_guide() -> None:
         return (10 * shown(moved)).sin() / 2  # so far from linear that effects do not add up
 
     evaluator = FieldEvaluator(strengths, offsets, far)
-    seen = render_trajectories(offsets, torch.ones(40, 14), far)
-    found = separable_within(seen, strengths, 65.0, evaluator)
+    found = choose_field(strengths, offsets, far, budget=23.0, evaluator=evaluator).best
     ranks = {name: len(bases.residual_basis) for name, bases in found.field.attributes.items()}
     assert found.worst >= evaluator.candidate(fit_separable(strengths, offsets, ranks), "").worst

@@ -38,7 +38,7 @@ def wandering(scene: Gaussians) -> Gdf:
 
     def base(full: torch.Tensor) -> AttributeBases:
         none = torch.zeros(0, *full.shape, dtype=torch.int8)
-        return AttributeBases(full, none, torch.zeros(0, full.shape[1]), nodes[:, None].clone())
+        return AttributeBases(full, none, torch.ones(1, full.shape[1]), nodes[:, None].clone())
 
     def noise(width: int, size: float) -> torch.Tensor:
         return size * torch.randn(len(members), width, generator=rng)
