@@ -15,7 +15,16 @@ from progdf.rasterize.cpu.engine import color_map
 from progdf.region import Region
 from progdf.sh import rgb_to_sh0
 from tests.helpers.scenes import random_gaussians
-from trainer.optimize.color_solver import Judge, Model, Solver, choose_model, color_views, make_solver, solve
+from trainer.optimize.color_solver import (
+    Judge,
+    Model,
+    Solver,
+    add_bands,
+    choose_model,
+    color_views,
+    make_solver,
+    solve,
+)
 from trainer.optimize.pgs import OnStep, ParameterSnapshot, PgsState, TargetStage
 from trainer.setup import unresolved_share
 from trainer.views.crops import CropScene, crop_scene, render_all
@@ -166,6 +175,26 @@ def test_a_pattern_gets_a_residual_and_only_as_many_bands_as_pay() -> None:
     turned = replace(edited, shN=scene.shN * (1.0 - 2.0 * side[..., None]))
     assert bands_of(turned) == 4
     assert bands_of(turned, most=1) == 1
+
+
+@pytest.mark.parametrize(("members", "size", "most"), [(200, 64, 60), (6000, 40, 40)])
+def test_steps_end_where_other_views_gain_little_and_go_on_where_members_are_dense(
+    members: int, size: int, most: int
+) -> None:
+    """18 of 60 steps for members of many pixels each; all 40 for members smaller than a pixel."""
+    scene = dense_ball(members)
+    side = scene.means[:, :1] > 0
+    edited = replace(scene, sh0=torch.where(side, scene.sh0.flip(1), scene.sh0 + 0.3))
+    (crops, original), (others, _) = (prepared(scene, c) for c in (orbit(8, size), orbit(16, size)[1::2]))
+    targets, aside = (render_all(some, pack(edited, with_shN=False)) for some in (crops, others))
+    solver = make_solver(color_views(crops, original), original)
+    mapped = solver.map_offsets(1, solver.table(1, targets))
+    start, judge = torch.zeros(members, 1, 3), Judge(color_views(others, original), aside)
+    found, taken = solver.residual(mapped, start, targets, most, lambda: None, judge)
+    assert taken == most if members == 6000 else taken < most / 2
+    further, all_steps = solver.residual(mapped, start, targets, most, lambda: None)
+    assert all_steps == most or members == 200
+    assert judge.error(add_bands(mapped, found)) <= 1.02 * judge.error(add_bands(mapped, further))
 
 
 def test_a_member_that_no_view_shows_follows_the_map() -> None:
