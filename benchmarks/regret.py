@@ -32,6 +32,7 @@ from trainer.optimize.color_solver import (
 )
 from trainer.optimize.color_solver import (
     Judge,
+    Model,
     add_bands,
     color_views,
     iterations,
@@ -149,8 +150,8 @@ class Edit:
         """The whole pictures of the views that choose."""
         return list(split_held_out(self.picture(s)[len(self.setup.train) :])[0])
 
-    def automatic(self, judge: Evaluator) -> tuple[int, str, Result]:
-        """Degree of the map, what was decided, and what came of it."""
+    def automatic(self, judge: Evaluator) -> tuple[Model, str, Result]:
+        """How much is modelled, all that was decided in words, and what came of it."""
         most, drawn = (
             iterations(OptimizeOptions().steps),
             color_views(self._crops(self.choosing), self.original),
@@ -180,7 +181,7 @@ class Edit:
         )
         offsets = [snapshot.offsets for snapshot in made]
         result = self.measure(name, judge, strengths, model.bands, tables, offsets, spent)
-        return model.degree, f"{line}; strengths {at} in {steps} steps", result
+        return model, f"{line}; strengths {at} in {steps} steps", result
 
     def sweep(
         self, judge: Evaluator, degree: int, bands: int, most: int, stages: Sequence[int]
@@ -283,23 +284,24 @@ def run_regret(options: RegretOptions) -> Table:
 
     edit = edit_from(0)
     judge = edit.judge()
-    degree, line, automatic = edit.automatic(judge)
+    model, line, automatic = edit.automatic(judge)
     print_line(line)
     results = [automatic]
     print_line(" | ".join(automatic.cells))
     for bands in (bands for bands in BANDS if bands <= edit.drawn[0].basis.shape[1]):
-        for result in edit.sweep(judge, degree, bands, STEPS[-1], STAGES):
+        most = STEPS[-1] if bands == model.bands else STEPS[-2]
+        for result in edit.sweep(judge, model.degree, bands, most, STAGES):
             print_line(" | ".join(result.cells))
             results.append(result)
-    used = max(results[1:], key=lambda result: result.mean).name.split(", ")[-1]
+    used = max(results[1:], key=lambda result: result.mean).name.split()[-2]
     for views in VIEWS:
-        for result in edit_from(views).sweep(judge, degree, int(used.split()[0]), STEPS[1], STAGES[:1]):
+        for result in edit_from(views).sweep(judge, model.degree, int(used), STEPS[-2], STAGES[:1]):
             print_line(" | ".join(result.cells))
             results.append(result)
     best = max(results, key=lambda result: result.mean)
     near = min((r for r in results if r.mean >= best.mean - NEAR), key=lambda result: result.seconds)
     told = (
-        f"Regret {best.mean - automatic.mean:.2f} dB, to {best.name}. The cheapest within {NEAR:g} dB of that "
+        f"Regret {best.mean - automatic.mean:.2f} dB to {best.name}. The cheapest within {NEAR:g} dB of that "
         f"is {near.name}; the automatic one takes {automatic.seconds / near.seconds:.2f} times as long."
     )
     columns = ("what", "dB", "mean", "s", "bytes a Gaussian")

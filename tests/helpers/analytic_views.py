@@ -135,7 +135,7 @@ def main() -> None:
         quick=options.quick,
     )
     write_analytic_views(edited, truth, run, [float(s) for s in options.strengths.split(",")])
-    words = ["train", str(scene), "--out", str(run.out), "--region", region, "--editor", run.editor]
+    words = ["train", str(scene), "--out", str(run.out), "--region", region, "--editor", run.editor.editor]
     print("progdf", shlex.join([*words, "--kind", "geometry", *(["--quick"] if options.quick else [])]))
 
 

@@ -9,7 +9,7 @@ as a large one does. A member that no view shows follows the map.
 
 How much of this a region gets (degree of the map; no residual, one of DC, or one of two bands) is decided on
 views that are not solved for, at the full strength: the least of which more would take away less than a
-twentieth of the error.
+twentieth of the error. They also say when a strength has had enough steps.
 """
 
 from __future__ import annotations
