@@ -70,11 +70,14 @@ def main(argv: Sequence[str]) -> int:
         return ablate(argv[1:])
     if list(argv[:1]) == ["sliders"]:
         return sliders(argv[1:])
+    if list(argv[:1]) == ["regret"]:
+        return regret(argv[1:])
     options = parse_options(BenchOptions, argv, COMMAND)
     for name in options.what:
         if name not in BENCHES:
             raise ProgdfError(
-                f"unknown benchmark '{name}'; use one of {', '.join((*BENCHES, 'ablate', 'sliders'))}"
+                f"unknown benchmark '{name}'; use one of "
+                f"{', '.join((*BENCHES, 'ablate', 'sliders', 'regret'))}"
             )
     if options.plot and options.what and "field" not in options.what:
         raise ProgdfError("--plot is for fields; use python -m benchmarks field")
@@ -148,6 +151,14 @@ def sliders(argv: Sequence[str]) -> int:
     from .sliders import SliderOptions, run_sliders
 
     run_sliders(parse_options(SliderOptions, argv, f"{COMMAND} sliders"))
+    return 0
+
+
+def regret(argv: Sequence[str]) -> int:
+    """Sweep an edit's effort; 0 when the table is printed. Raises ProgdfError for what the user can mend."""
+    from .regret import RegretOptions, run_regret
+
+    print(run_regret(parse_options(RegretOptions, argv, f"{COMMAND} regret")).markdown())
     return 0
 
 

@@ -51,7 +51,7 @@ STAGE_STEPS = 40
 """A stage needs so many: with fewer each view is seen once or twice, and the next target is there before this
 one is met. `QUICK_STAGES` are asked for then (docs/experiments.md, Stages)."""
 VIEWS, MOST_VIEWS = 30, 40
-"""How many views are edited by default, and how many of a dense region (see `trainer.views.setup`)."""
+"""How many views are edited by default, and how many of an edit of colors (see `trainer.views.setup`)."""
 SMALLEST_VIEW = 32
 """Pixels of a view's longer side, at least."""
 QUICK_STEPS, QUICK_STAGES, QUICK_VIEWS = 240, 4, 12
@@ -118,7 +118,7 @@ class ViewOptions:
     """The axis of the scene that is up. auto: from the cameras, else from the ground, else −y."""
     views: int = 0
     """How many views are edited, 3 to 96 (the paper's limit); every fifth is held out to measure with. 0: 30,
-    or 40 for an edit of colors whose members are dense."""
+    or 40 for an edit of colors, of which half are solved for where that is as good."""
     image_size: int = 0
     """Longer side of the views in pixels; 0: 256, or up to 384 for an edit of colors whose members are so
     dense that most have less than a pixel."""
@@ -132,7 +132,8 @@ class OptimizeOptions:
     """How the members are optimized."""
 
     steps: int = 800
-    """Optimizer steps over all stages (paper: 1500-2000 towards the finished edit alone)."""
+    """Optimizer steps over all stages (paper: 1500-2000 towards the finished edit alone). An edit of colors
+    takes an eighth of these iterations a strength at most, and ends where other views gain little."""
     kind: Kind = "auto"
     """What the edit moves; sets learning rates and loss weights. auto: as the editor knows; for folder:,
     photographs: and instruct: all are tried on a few small views, and the log says which was best."""
@@ -141,10 +142,10 @@ class OptimizeOptions:
     strength or twice as many; 0: every Gaussian finds its own way, which bends well but smears what moves
     far. By default 120 or 0, whichever a short trial finds better."""
     stages: int = 0
-    """Number of strengths that an editor with a strength control is asked for; 0: 8, or 4 for fewer than 320
-    steps, but 1 for a style, which is the paper's way, towards the end alone. instruct is asked for
-    strengths, by rising guidance, only if more than 1 are asked for here: each is another pass over the
-    views."""
+    """Number of strengths that an editor with a strength control is asked for; 0: as many as the course of an
+    edit of colors bends; else 8, or 4 for fewer than 320 steps, but 1 for a style, which is the paper's way,
+    towards the end alone. instruct is asked for strengths, by rising guidance, only if more than 1 are asked
+    for here: each is another pass over the views."""
     sh: Bands = "auto"
     """Colors that change with the direction one looks from: trained, and kept where leaving them out would
     cost 0.1 dB (on), left as they are (off), or trained unless the edit is of colors and the region's own
@@ -237,7 +238,7 @@ class TrainOptions:
     field: FieldOptions = FieldOptions()
     texts: TextOptions = TextOptions()
     quick: bool = False
-    """A draft in a third of the time: 240 steps in 4 stages, 12 views."""
+    """A draft in a third of the time: 240 steps, in 4 stages where colors are not solved for, 12 views."""
     seed: int = 0
     """Order of the views; the same seed gives the same files."""
     threads: int = 0

@@ -84,15 +84,16 @@ def choose_resolution(
 ) -> tuple[Sequence[Camera], int, str]:
     """Cameras, how many of them to choose, and a line where the members are not resolved by these.
 
-    What was typed is kept to. Else there are more and larger views where members are dense, and only larger
-    ones where the cameras are given and few. Why 40 of 320 and not 30 of 384: docs/experiments.md, Views.
+    What was typed is kept to. Else edits of colors have more views, of which half are solved for where those
+    do as well, and larger ones where members are dense. Why 40 of 320 and not 30 of 384: docs/experiments.md,
+    Views.
 
     Args:
         options: see `ViewOptions`
         scene, region: what they look at
         cameras_of: longer side in pixels, number of views -> cameras
     """
-    tried = list(zip(SIZES, (VIEWS, MOST_VIEWS, MOST_VIEWS), strict=True)) if options.dense else []
+    tried = [(size, MOST_VIEWS) for size in SIZES] if options.dense else []
     if options.dense and options.cameras is None and not options.views:
         tried.pop()
     tried = [
@@ -174,7 +175,8 @@ def make_training_setup(options: ViewOptions, scene: Gaussians, region: Region) 
 
     cameras, views, unresolved = choose_resolution(options, scene, region, cameras_of)
     choice = choose_views(scene, region, cameras, views, background)
-    train, held_out = split_views(choice, max(1, len(choice.views) // 5))
+    aside = len(choice.views) // 5
+    train, held_out = split_views(choice, max(1, aside if options.views else min(aside, VIEWS // 5)))
     notes = [f"up is {up.name}, {up.reason}"]
     notes += [unresolved] if unresolved else []
     notes += [choice.line()] if len(choice.views) < choice.offered else []

@@ -189,7 +189,7 @@ def _record(
     optimization = resolve_kind(plan, shared.kind, plan.optimize.group_steps or 0)
     setup = whole_views(shared.setup) if optimization.as_printed else shared.setup
     with _count_processor_seconds(state), log.stage("optimize"):
-        trajectory, _ = optimize_members(
+        trajectory, *_ = optimize_members(
             plan,
             optimization,
             setup,

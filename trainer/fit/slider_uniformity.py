@@ -34,6 +34,8 @@ from trainer.store.progress import RunLog
 from trainer.views.crops import GEOMETRY, render_all
 from trainer.views.view import View
 
+from .fit import ADDED
+
 STEPS = 20
 """Equal steps that a user makes over the whole slider."""
 
@@ -45,7 +47,11 @@ _JUMP = 0.7  # of the change in one step of an editor's strength: no strength be
 
 
 def equalized_strengths(
-    editor: ImageEditor, spec: str, views: Sequence[View], plain: tuple[float, ...]
+    editor: ImageEditor,
+    spec: str,
+    views: Sequence[View],
+    plain: tuple[float, ...],
+    missed: float | None = None,
 ) -> tuple[float, ...]:
     """Strengths at which the editor's own pictures are as far along as `plain` says, the last 1.
 
@@ -57,6 +63,9 @@ def equalized_strengths(
         spec: what it was made of, `KIND:WHAT`
         views: of which a few are looked at
         plain: shares of the visible change, ascending, the last 1
+        missed: share of the change (mean square) that the finished edit misses; with it shares are halves,
+            quarters …, as many as it takes until straight lines between the pictures miss at most `ADDED` as
+            much, less where less of the change is there
     """
     if editor.stages or len(plain) == 1 or check_editor(spec)[0] in COSTLY_STRENGTHS:
         return plain
@@ -71,10 +80,42 @@ def equalized_strengths(
     if max(steps) > _JUMP * sum(steps):
         return plain
     _, due = _spread(even, pictures, 1)
-    even_strengths = interpolate(torch.tensor(plain, dtype=torch.float64), even, due)
-    rounded = (*(round(float(s), 3) for s in even_strengths[:-1]), 1.0)
+    shares = plain if missed is None else _bends(even, pictures, due, ADDED * missed)
+    at = interpolate(torch.tensor(shares, dtype=torch.float64), even, due)
+    rounded = (*(round(float(s), 3) for s in at[:-1]), 1.0)
     rises = all(b - a > 5e-4 for a, b in zip((0.0, *rounded), rounded, strict=False))
     return rounded if rises else plain
+
+
+def _bends(
+    even: Tensor, pictures: Sequence[Tensor], due: Tensor, allowed: float, low: float = 0.0, high: float = 1.0
+) -> tuple[float, ...]:
+    """Shares of the visible change at which a course is to be met for straight lines between to miss little.
+
+    Args:
+        even: strengths. [n] float64
+        pictures: what is seen there
+        due: strengths at which the change is as far along as `even` says. [n]
+        allowed: share of the change that may be missed (mean square), less where less of it is there
+        low, high: shares between which one looks; halved where a straight line will not do
+    """
+    first, last = (float(s) for s in interpolate(torch.tensor([low, high], dtype=torch.float64), even, due))
+    ends, change = (
+        [interpolate_at(even, pictures, s) for s in (first, last)],
+        _power(pictures[-1] - pictures[0]),
+    )
+    for s, picture in zip(even.tolist(), pictures, strict=True):
+        if first < s < last and high - low > 2 / STEPS:
+            share = (s - first) / (last - first)
+            if _power(torch.lerp(*ends, share) - picture) > allowed * change * (low + share * (high - low)):
+                middle = (low + high) / 2
+                halves = (low, middle), (middle, high)
+                return tuple(s for half in halves for s in _bends(even, pictures, due, allowed, *half))
+    return (high,)
+
+
+def _power(change: Tensor) -> float:
+    return float(change.double().square().sum())
 
 
 def equalize_slider(

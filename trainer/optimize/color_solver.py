@@ -9,7 +9,7 @@ as a large one does. A member that no view shows follows the map.
 
 How much of this a region gets (degree of the map; no residual, one of DC, or one of two bands) is decided on
 views that are not solved for, at the full strength: the least of which more would take away less than a
-twentieth of the error.
+twentieth of the error. They also say when a strength has had enough steps.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -41,13 +41,18 @@ STEPS_OF_OTHERS = 8
 MORE_PAYS = 0.95
 """Share of the error that a larger model must leave at most, to be worth its bytes."""
 
+SETTLED = 0.001
+"""Share of the error in views not solved for that a step takes away at least, for another to follow."""
+
+STEPS = "steps"
+"""Of a recording's means: the steps that it took."""
+
 _RIDGE = 0.002  # of a typical member's weight: holds the residual of what hardly shows at 0
 _MAP_RIDGE = 1e-6  # the same of the map's coefficients, for regions of few colors
 _MAP_HELD = 1e-2  # say of the members' own colors beside the pixels: there a map is held to the affine one
 _COVERED = 0.05  # the region's weight in a pixel that the map is fitted to
 _MOST_PIXELS = 250_000  # for the some twenty coefficients of the map; of more, evenly spread ones
 _CLAMP_ROUNDS = 3  # of the map's least squares, for pixels that are white or black anyway
-_SETTLED = 0.005  # share of the finished edit's error that a step takes away at least, for another to follow
 _SHARES = (1.0, 0.5, 0.2)  # of a step, where the whole of it would run into clamps
 _LOOKS = 3  # steps over which that is taken: the first ones of a new direction gain little
 
@@ -165,7 +170,7 @@ def fit_maps(views: Sequence[ColorView]) -> MapFit:
 
 @dataclass(frozen=True)
 class Judge:
-    """Views that are not solved for, and the finished edit in them."""
+    """Views that are not solved for, and an edit in them."""
 
     views: Sequence[ColorView]
     targets: Sequence[Tensor]  # [h,w,3] each
@@ -173,15 +178,8 @@ class Judge:
     def error(self, offsets: Tensor) -> float:
         """Mean squared difference, with that of the pictures' own rounding. [M,B,3]"""
         count = max(1, sum(target.numel() for target in self.targets))
-        return ROUNDING + self.squared_error(offsets) / count
-
-    def squared_error(self, offsets: Tensor) -> float:
-        """Sum of squared differences. [M,B,3]"""
-        return sum(
-            _map_threads(
-                lambda pair: pair[0].error(offsets, pair[1]), list(zip(self.views, self.targets, strict=True))
-            )
-        )
+        pairs = list(zip(self.views, self.targets, strict=True))
+        return ROUNDING + sum(_map_threads(lambda pair: pair[0].error(offsets, pair[1]), pairs)) / count
 
 
 @dataclass(frozen=True)
@@ -190,13 +188,24 @@ class Model:
 
     degree: int  # of the map
     residual: Tensor  # of the finished edit: b of 0, 1 or 4 bands. [M,b,3]
-    floor: float  # squared error of the finished edit in the training views: what is finer is not chased
+    error: float  # mean square, of the finished edit in views not solved for: what is finer is not chased
+    unedited: float  # the same of the original
     tried: Sequence[tuple[str, float]]  # what was tried, and its error on views not solved for, dB
 
     @property
     def bands(self) -> int:
         """How many bands the residual has."""
         return self.residual.shape[1]
+
+    @property
+    def missed(self) -> float:
+        """Share of the change that the finished edit misses, mean square."""
+        return self.error / self.unedited
+
+    def figures(self) -> dict[str, Any]:
+        """As report.json has it."""
+        tried = {name: round(error, 2) for name, error in self.tried}
+        return {"degree": self.degree, "sh_functions": self.bands, "tried_psnr": tried}
 
     @property
     def line(self) -> str:
@@ -245,10 +254,11 @@ class Solver:
         targets: Sequence[Tensor],
         steps: int,
         tell: Callable[[], None],
+        judge: Judge | None = None,
         floor: float = 0.0,
-    ) -> Tensor:
+    ) -> tuple[Tensor, int]:
         """What the members' lowest bands need beside the map: preconditioned conjugate gradients (Polak and
-        Ribière) that look at every step anew what the clamps pass.
+        Ribière) that look at every step anew what the clamps pass; and the steps that were taken.
 
         Args:
             mapped: what the map adds. [M,B,3]
@@ -256,7 +266,9 @@ class Solver:
             targets: pictures of the views
             steps: most steps
             tell: called after each
-            floor: squared error that counts as none, see `Model.floor`
+            judge: the best in its views is kept, and steps end when they gain little there, see `SETTLED`;
+                None takes all
+            floor: error in these views that counts as none, see `Model.error`
         """
         base = _map_threads(lambda view: view.colors(mapped), self.views)
         curvature = self.weights[:, : start.shape[1]]
@@ -264,8 +276,9 @@ class Solver:
         inverse = 1.0 / (curvature + ridge)
         now, pull = start, self._pull(base, start, targets, ridge)
         conditioned = along = inverse * pull.descent
-        errors = [math.inf] * (_LOOKS - 1) + [pull.error]
-        for _ in range(steps):
+        best, taken = now, 0
+        looks = [math.inf] * (_LOOKS - 1) + [judge.error(add_bands(mapped, now)) if judge else math.inf]
+        while taken < steps:
             length = _inner(pull.descent, along) / max(self._curvature(pull, along, ridge), 1e-30)
             for share in _SHARES:
                 ahead = now + share * length * along
@@ -278,15 +291,18 @@ class Solver:
                 along = conditioned  # the direction was of other clamps: begin again
                 continue
             last, power = conditioned, _inner(pull.descent, conditioned)
-            now, pull = ahead, next_pull
-            errors.append(pull.error)
-            if errors[-1 - _LOOKS] - pull.error <= _LOOKS * _SETTLED * max(pull.error, floor):
-                break
+            now, pull, taken = ahead, next_pull, taken + 1
+            if judge is not None:
+                error = judge.error(add_bands(mapped, now))
+                best = now if error < min(looks) else best
+                looks.append(error)
+                if looks[-1 - _LOOKS] - error <= _LOOKS * SETTLED * max(error, floor):
+                    break
             conditioned = inverse * pull.descent
             turn = (_inner(pull.descent, conditioned) - _inner(pull.descent, last)) / power
             along = conditioned + max(0.0, turn) * along
             tell()
-        return now
+        return (now if judge is None else best), taken
 
     def _pull(
         self, base: Sequence[Tensor], residual: Tensor, targets: Sequence[Tensor], ridge: float
@@ -331,9 +347,8 @@ class Solver:
         return sum(found) / len(found)
 
 
-def make_solver(crops: Sequence[CropScene], original: Tensor) -> Solver:
-    """The views, prepared."""
-    views = color_views(crops, original)
+def make_solver(views: Sequence[ColorView], original: Tensor) -> Solver:
+    """The views, prepared to be solved for. `original`: raw member rows [M,14+]"""
     ones = torch.ones(len(original), 3)
 
     def weigh(view: ColorView) -> Tensor:
@@ -372,13 +387,14 @@ def choose_model(
     residual = least_residual = torch.zeros(len(solver.sh), 0, 3)
     for more in (1, 4)[: 1 + (most_bands > 1 and solver.sh.shape[1] > 1)]:
         wider = torch.cat([residual, torch.zeros(len(residual), more - residual.shape[1], 3)], dim=1)
-        residual = solver.residual(mapped[degree], wider, targets, steps, tell)
+        residual, _ = solver.residual(mapped[degree], wider, targets, steps, tell, judge)
         error = judge.error(add_bands(mapped[degree], residual))
         tried.append((f"with a residual of {more}", error))
         if error < MORE_PAYS * least:
             least_residual, least = residual, error
-    floor = Judge(solver.views, targets).squared_error(add_bands(mapped[degree], least_residual))
-    return Model(degree, least_residual, floor, [(name, decibels(error)) for name, error in tried])
+    unedited = judge.error(torch.zeros_like(solver.sh))
+    decided = [(name, decibels(error)) for name, error in tried]
+    return Model(degree, least_residual, least, unedited, decided)
 
 
 def _inner(a: Tensor, b: Tensor) -> float:
@@ -402,6 +418,7 @@ def solve(
     solver: Solver,
     model: Model,
     stages: Sequence[TargetStage],
+    judges: Sequence[Judge],
     state: PgsState,
     on_step: OnStep,
     steps: int,
@@ -413,6 +430,7 @@ def solve(
         solver: the views
         model: how much is modelled
         stages: strengths ascending
+        judges: of each stage, views that say when it is done
         state: where to go on from, changed in place; a step is a stage
         on_step: progress; here, and only here, the state is whole and may be saved
         steps: most steps of conjugate gradients of a stage
@@ -436,9 +454,16 @@ def solve(
                 start = (member_bands(state.moved.detach()) - last)[:, : model.bands]
             share = (stages[index].strength - before) / (stages[-1].strength - before)
             start = torch.lerp(start, model.residual, share)
-            residual = solver.residual(
-                mapped, start, targets, steps, lambda: on_step(state.step, state.running), model.floor
+            residual, taken = solver.residual(
+                mapped,
+                start,
+                targets,
+                steps,
+                lambda: on_step(state.step, state.running),
+                judges[index],
+                model.error,
             )
+            state.means.add({STEPS: taken})
             offsets = add_bands(mapped, residual)
         last = mapped
         left = solver.left(offsets, finished)

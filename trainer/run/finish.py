@@ -191,7 +191,7 @@ def _measure_paint(
 
 def _record_figures(record: RunRecord) -> dict[str, Any]:
     """What the report repeats of the recording."""
-    names = ("objective", "losses", "kind", "kind_trial", "agreement", "up")
+    names = ("objective", "losses", "kind", "kind_trial", "agreement", "up", "effort")
     return {**{name: getattr(record, name) for name in names}, "pictures": dict(record.pictures)}
 
 

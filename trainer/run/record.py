@@ -44,6 +44,7 @@ class RunRecord:
     attribute_worth_db: Mapping[str, float]  # what the edit would lose without each attribute, dB
     agreement: Mapping[str, Any] | None  # whether the edited views agree, where that was measured
     up: Mapping[str, Any] | None  # the axis that is up, and why
+    effort: Mapping[str, Any] = field(default_factory=dict)  # what was decided: strengths, steps, model
     pictures: Mapping[str, str] = field(default_factory=dict)  # changed pictures, and their hashes
 
     def __post_init__(self) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -20,14 +20,23 @@ from progdf.io.cameras import load_cameras, save_cameras
 from progdf.io.json_values import plain
 from progdf.region import Region
 from progdf.scene.regions import check_region, parse_region
-from trainer.editors import EXTERNAL, PER_VIEW, RepaintingEditor, check_editor, check_new_editor, make_editor
+from trainer.editors import (
+    COSTLY_STRENGTHS,
+    EXTERNAL,
+    PER_VIEW,
+    RepaintingEditor,
+    check_editor,
+    check_new_editor,
+    make_editor,
+)
+from trainer.editors.base import ImageEditor
 from trainer.editors.pictures import FolderEditor, picture_cameras
 from trainer.fit.fit import choose_path, drop_idle_attributes
 from trainer.fit.network import PART as NETWORK
 from trainer.fit.slider_uniformity import equalized_strengths
 from trainer.optimize.losses import Perceptual, describe_loss, perceptual_loss
 from trainer.optimize.retime import resolve_slider
-from trainer.options import EditKind, EditorOptions, OptimizeOptions, TrainOptions
+from trainer.options import MOST_STAGES, EditKind, EditorOptions, OptimizeOptions, TrainOptions
 from trainer.regions.from_pictures import RegionRequest, region_checks, region_kinds
 from trainer.report.agreement import Agreement, measure_agreement
 from trainer.resolve import recorded_options, resolve, resolve_kind
@@ -272,7 +281,10 @@ def _run_training(
         with log.stage("agree"):
             agreement = _agreement(options, setup, edited, approach.kind, log)
         optimization = resolve_kind(options, approach.kind, approach.group_steps)
-        trajectory, outcome = _record(options, optimization, setup, edited, perceptual, folder, log)
+        between = None
+        if waits_for_error(options, optimization):
+            between = partial(_edit_between, edited, options, setup, approach, folder, log)
+        trajectory, outcome = _record(options, optimization, setup, edited, between, perceptual, folder, log)
         record = RunRecord(
             recorded_options(options),
             options.scene.resolve(),
@@ -348,21 +360,70 @@ def _edit_views(
     kind = approach.kind
     optimization = resolve_kind(options, kind, approach.group_steps)
     strengths = editor_strengths(editor, optimization.stages)
-    if not optimization.as_printed and resolve_slider(optimization.slider, strengths) == "even":
+    if waits_for_error(options, optimization):
+        strengths = (1.0,)
+    elif not optimization.as_printed and resolve_slider(optimization.slider, strengths) == "even":
         strengths = equalized_strengths(editor, spec, views, strengths)
-    is_confined = confines_edit(editor, kind)
-    with log.steps("edit", len(views) * len(strengths)) as advance:
-        edited = edit_views(editor, views, strengths, folder, is_confined, advance)
+    edited = _edit_at(strengths, {}, editor, setup, approach, trial, folder, log)
     if all(
         torch.equal(p, quantize_image(v.image)) for s in edited for p, v in zip(edited[s], views, strict=True)
     ):
         raise ProgdfError(
             f"{spec} changes none of the views; check the region and what the editor is asked for"
         )
-    log.say(f"{spec}: a {kind} edit at strength {', '.join(f'{s:g}' for s in strengths)}")
-    saved = {"strengths": list(edited), "kind": kind, "group_steps": approach.group_steps, "trial": trial}
-    folder.state.save("edited", {}, saved)
     return edited, approach, trial
+
+
+def waits_for_error(options: TrainOptions, optimization: OptimizeOptions) -> bool:
+    """Whether strengths between are chosen when it is known what the finished edit misses."""
+    known = options.optimize.stages or options.editor.family in (*EXTERNAL, *COSTLY_STRENGTHS)
+    return optimization.solver == "colors" and not known
+
+
+def _edit_between(
+    edited: Mapping[float, list[Tensor]],
+    options: TrainOptions,
+    setup: TrainingSetup,
+    approach: Approach,
+    folder: RunFolder,
+    log: RunLog,
+    missed: float,
+) -> Pictures:
+    """All views edited at as many strengths as the edit's course calls for; `missed`: see
+    `equalized_strengths`."""
+    if len(edited) > 1:
+        return edited
+    plain = tuple((i + 1) / MOST_STAGES for i in range(MOST_STAGES))
+    painter = replace(options.editor, cache=folder.paintings)
+    editor = make_editor(painter, setup.scene, setup.region, setup.views)
+    strengths = equalized_strengths(editor, options.editor.editor, setup.views, plain, missed)
+    return _edit_at(strengths, edited, editor, setup, approach, None, folder, log)
+
+
+def _edit_at(
+    strengths: Sequence[float],
+    edited: Mapping[float, list[Tensor]],
+    editor: ImageEditor,
+    setup: TrainingSetup,
+    approach: Approach,
+    trial: dict[str, Any] | None,
+    folder: RunFolder,
+    log: RunLog,
+) -> dict[float, list[Tensor]]:
+    """All views edited at these strengths, but for those that are already; kept on disk."""
+    views, new = setup.views, [s for s in strengths if s not in edited]
+    with log.steps("edit", len(views) * len(new)) as advance:
+        made = edit_views(editor, views, new, folder, confines_edit(editor, approach.kind), advance)
+    at = ", ".join(f"{s:g}" for s in strengths)
+    log.say(f"a {approach.kind} edit at strength {at}")
+    saved = {
+        "strengths": strengths,
+        "kind": approach.kind,
+        "group_steps": approach.group_steps,
+        "trial": trial,
+    }
+    folder.state.save("edited", {}, saved)
+    return {s: made[s] if s in made else edited[s] for s in strengths}
 
 
 def _agreement(
@@ -382,6 +443,7 @@ def _record(
     optimization: OptimizeOptions,
     setup: TrainingSetup,
     edited: Pictures,
+    between: Callable[[float], Pictures] | None,
     perceptual: Perceptual,
     folder: RunFolder,
     log: RunLog,
@@ -393,7 +455,7 @@ def _record(
         log.say(f"--group-steps: without effect on this {optimization.kind} edit, whose loss is {objective}")
     with log.stage("optimize"):
         renewal = reedit(options.editor, setup, optimization, folder, log)
-        trajectory, losses = optimize_members(
+        trajectory, losses, effort = optimize_members(
             options,
             optimization,
             setup,
@@ -402,6 +464,7 @@ def _record(
             folder.state,
             log,
             renewal=renewal,
+            between=between,
         )
     with log.stage("retime"):
         costs: dict[str, float] = {}
@@ -411,7 +474,7 @@ def _record(
             trajectory, costs = drop_idle_attributes(trajectory, choosing, prunes)
         recorded, reason = len(trajectory), ""
         # where pictures are solved for the solver lays the way
-        one_end = len(edited) == 1 and optimization.solver != "pictures"
+        one_end = len(trajectory.strengths) == 1 and optimization.solver != "pictures"
         if one_end and not optimization.as_printed and options.field.field != "neural":
             trajectory, reason = _choose_path(trajectory, options, optimization, setup, folder, log)
         else:
@@ -424,6 +487,7 @@ def _record(
     return trajectory, {
         "objective": objective,
         "losses": losses,
+        "effort": effort,
         "attribute_worth_db": costs,
     }
 

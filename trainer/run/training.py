@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
+from typing import Any
 
 import msgspec
 import torch
@@ -15,9 +16,13 @@ from progdf.errors import ProgdfError
 from progdf.field.trajectory import Trajectory
 from progdf.gaussians import BASE_CHANNELS, pack
 from progdf.io.json_values import convert_json
+from progdf.metrics.image import decibels
 from progdf.scene.bounds import scene_sphere
 from trainer.fit.network import JointTraining, begin_joint_training, save_network
 from trainer.optimize.color_solver import (
+    MORE_PAYS,
+    STEPS,
+    ColorView,
     Judge,
     Model,
     Solver,
@@ -40,7 +45,7 @@ from trainer.optimize.pgs import (
 )
 from trainer.optimize.retime import record, resolve_slider, retime, select_recordings, straight_recordings
 from trainer.optimize.solve_pictures import RECORDINGS, make_picture_solver, solve_pictures
-from trainer.options import OptimizeOptions, TrainOptions
+from trainer.options import Bands, OptimizeOptions, TrainOptions
 from trainer.setup import Pictures, TrainingSetup, probe_views
 from trainer.store.progress import RunLog
 from trainer.store.state import PeriodicSave, Resumable, Saved, StateFolder, defer_signals
@@ -139,7 +144,8 @@ def optimize_members(
     folder: StateFolder,
     log: RunLog,
     renewal: Renewal | None = None,
-) -> tuple[Trajectory, Losses]:
+    between: Callable[[float], Pictures] | None = None,
+) -> tuple[Trajectory, Losses, Mapping[str, Any]]:
     """Optimize the members, from the beginning or from the saved state.
 
     Args:
@@ -151,9 +157,12 @@ def optimize_members(
         folder: where the state is saved
         log: of the run
         renewal: see `pgs.Renewal`
+        between: of colors that are solved for, the share of the finished edit that is missed (mean square) ->
+            `edited` at as many strengths as that calls for; None: as many as there are
 
     Returns:
-        The trajectory, even in time; mean of every loss term, and what is left to the edit, per recording
+        The trajectory, even in time; mean of every loss term, and what is left to the edit, per recording;
+        the effort that was decided on, as report.json has it
 
     Raises:
         ProgdfError: the loss is not finite.
@@ -179,12 +188,24 @@ def optimize_members(
         log.say(f"{pictures.unseen} members that no picture shows follow their own surface")
         way = partial(solve_pictures, original, pictures, stages, state)
     elif solver == "colors":
+        most, given = iterations(optimization.steps), bool(options.views.views)
         with log.stage("weights"):
-            colors = make_solver(crops, original)
+            drawn = color_views(crops, original)
+            judging = _judging(setup, drawn, original, edited)
         with log.stage("model"):
-            model = _choose_model(colors, crops, stages, optimization, setup, edited, original, log)
-        most = iterations(optimization.steps)
-        way = partial(solve, original, colors, model, stages, state, steps=most)
+            judge = judging(edited[max(edited)])
+            fewer = not given and judge.views is not drawn
+            colors, model, line = choose_effort(
+                drawn, judge, stages[-1].targets, original, most, optimization.sh, fewer
+            )
+        log.say(line)
+        if between is not None:
+            edited = between(model.missed)
+            stages = _stages(optimization, setup, edited)
+        every = len(drawn) // len(colors.views)
+        stages = [replace(stage, targets=stage.targets[::every]) for stage in stages]
+        judges = [judging(pictures) for pictures in edited.values()]
+        way = partial(solve, original, colors, model, stages, judges, state, steps=most)
     else:
         inside = [erode(crop(view.mask, view.box)) for view in setup.train]
         objective, probes = Objective(perceptual, optimization, inside), probe_views(setup)
@@ -206,12 +227,17 @@ def optimize_members(
         ends = [made for made in recordings.made if made.ends_stage]
         offsets = [*(made.offsets.float() for made in ends[:-1]), end]
         snapshots = group_path(original, groups, offsets, [made.step for made in ends], settings.snapshots)
-    losses = loss_table([(made.step, made.means) for made in recordings.made])
-    trajectory = record(snapshots, end, list(edited))
+    taken = [int(made.means[STEPS]) for made in recordings.made if STEPS in made.means]
+    rows = [
+        (m.step, {name: mean for name, mean in m.means.items() if name != STEPS}) for m in recordings.made
+    ]
+    trajectory, effort = record(snapshots, end, list(edited)), {"strengths": list(edited), STEPS: taken}
     if model is not None:
         maps = torch.stack([made.table for made in recordings.made if made.table is not None])
         trajectory = replace(trajectory, maps=maps, bands=model.bands)
-    return trajectory, losses
+        log.say(f"{len(edited)} strengths in {', '.join(map(str, taken))} steps, of {most} each at most")
+        effort |= model.figures() | {"most_steps": most, "views": len(colors.views)}
+    return trajectory, loss_table(rows), effort
 
 
 def _stages(optimization: OptimizeOptions, setup: TrainingSetup, edited: Pictures) -> list[TargetStage]:
@@ -231,30 +257,51 @@ def _boxes(pictures: Sequence[Tensor], views: Sequence[View]) -> list[Tensor]:
     return [crop(picture, view.box) for picture, view in zip(pictures, views, strict=False)]
 
 
-def _choose_model(
-    solver: Solver,
-    crops: Sequence[CropScene],
-    stages: Sequence[TargetStage],
-    optimization: OptimizeOptions,
-    setup: TrainingSetup,
-    edited: Pictures,
+def _judging(
+    setup: TrainingSetup, drawn: Sequence[ColorView], original: Tensor, edited: Pictures
+) -> Callable[[Sequence[Tensor]], Judge]:
+    """All views' whole pictures of an edit -> the held-out views that choose, or all where there are none."""
+    views, count = split_held_out(setup.held_out)[0], len(setup.train)
+    if not views or len(edited[max(edited)]) <= count:
+        return lambda pictures: Judge(drawn, _boxes(pictures, setup.train))
+    members = setup.region.members
+    crops = [crop_scene(setup.scene, members, v.camera, v.box, setup.background, True) for v in views]
+    choosing = color_views(crops, original)
+    return lambda pictures: Judge(choosing, _boxes(split_held_out(pictures[count:])[0], views))
+
+
+def choose_effort(
+    views: Sequence[ColorView],
+    judge: Judge,
+    targets: Sequence[Tensor],
     original: Tensor,
-    log: RunLog,
-) -> Model:
-    """How much of the edit is modelled, found on views that are held out, or on all where none are."""
-    judge = Judge(solver.views, stages[-1].targets)
-    views = split_held_out(setup.held_out)[0]
-    pictures = split_held_out(edited[max(edited)][len(setup.train) :])[0]
-    if views and pictures:
-        made = [
-            crop_scene(setup.scene, setup.region.members, v.camera, v.box, setup.background, True)
-            for v in views
-        ]
-        judge = Judge(color_views(made, original), _boxes(pictures, views))
-    most_bands = 1 if optimization.sh == "off" else 4
-    model = choose_model(solver, judge, stages[-1].targets, iterations(optimization.steps), most_bands, _wait)
-    log.say(f"{model.line}, on {'views that are held out' if views else 'all views, as none is held out'}")
-    return model
+    most: int,
+    sh: Bands,
+    fewer: bool,
+) -> tuple[Solver, Model, str]:
+    """How much of a finished edit is modelled, from how many views, and why.
+
+    Args:
+        views: all training views
+        judge: views that decide
+        targets: the finished edit in the training views
+        original: raw member rows
+        most: steps of conjugate gradients
+        sh: whether a residual may have more than one band
+        fewer: every other view does, where all of them would take away less than a twentieth of the error
+    """
+    tried: list[tuple[Solver, Model]] = []
+    for every in (2, 1) if fewer and len(views) > 3 else (1,):
+        solver = make_solver(views[::every], original)
+        model = choose_model(solver, judge, targets[::every], most, 1 if sh == "off" else 4, _wait)
+        tried.append((solver, model))
+    solver, model = tried[MORE_PAYS * tried[0][1].error > tried[-1][1].error]
+    on = "all views, as none is held out" if judge.views is views else "views that are held out"
+    line = f"{model.line}, on {on}"
+    if len(tried) > 1:
+        over = " and ".join(f"{decibels(m.error):.1f} dB from {len(s.views)} views" for s, m in tried)
+        line += f"; {len(solver.views)} of {len(views)} views are solved for: {over}"
+    return solver, model, line
 
 
 def _wait() -> None:

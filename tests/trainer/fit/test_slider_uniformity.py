@@ -15,7 +15,7 @@ from progdf.field import fit_separable
 from progdf.gaussians import pack
 from progdf.metrics.slider import slider_statistics
 from tests.helpers.trained import WHITE, quick_options, small
-from trainer.editors import make_editor
+from trainer.editors import ImageEditor, make_editor
 from trainer.fit.slider_uniformity import equalize_slider, equalized_strengths, equalizing_remap
 from trainer.optimize.retime import resolve_slider
 from trainer.options import EditKind, EditorOptions, Slider
@@ -75,6 +75,20 @@ def test_given_strengths_costly_models_and_single_targets_are_not_asked_around(
 ) -> None:
     assert equalized_strengths(editor, spec, small(count=4).views, plain) == plain
     assert editor.asked == 0
+
+
+def test_strengths_are_as_many_as_the_course_bends_and_the_edit_is_good() -> None:
+    views = small(count=4).views
+
+    def asked(editor: ImageEditor, missed: float) -> tuple[float, ...]:
+        return equalized_strengths(editor, "darken:0.5", views, QUARTERS, missed)
+
+    assert asked(Late(power=1.0), 1e-9) == (1.0,), "a straight course needs no more than its end"
+    bent = make_editor(EditorOptions("recolor:#3060d0"), small().scene, small().region, views)
+    rough, fine = asked(bent, 3e-2), asked(bent, 1e-4)
+    assert 1 <= len(rough) < len(fine) <= 16
+    assert fine[0] < 0.2, "what is fine near the original shows a bend soonest"
+    assert asked(bent, 1e9) == (1.0,)
 
 
 def test_an_edit_that_jumps_is_asked_at_the_plain_strengths() -> None:

@@ -97,6 +97,21 @@ def test_the_field_tells_where_it_shows_what_was_recorded(folder: Path, done: Ru
     assert float((done.trajectory.end - trajectory.end).square().mean().sqrt()) < 0.05
 
 
+def test_effort_that_nobody_gives_is_decided_on_the_scene_and_reported(folder: Path, done: RunResult) -> None:
+    free = train(quick_options(folder, "free", stages=0, views=0, image_size=40), quiet=True)
+    effort, given = free.report["effort"], done.report["effort"]
+    assert effort["strengths"] == free.report["trajectory"]["stages"]
+    assert effort["strengths"] != given["strengths"] and len(given["strengths"]) == 4
+    assert len(effort["steps"]) == (len(effort["strengths"]) if effort["sh_functions"] else 0)
+    assert max(given["steps"]) <= given["most_steps"] == 25
+    log = free.folder.log.read_text()
+    trained = len(free.report["views"]["edit"])
+    assert effort["views"] in (17, 34) and trained == 6
+    assert f"{effort['views']} of 34 views are solved for" in log
+    assert "are solved for: " not in done.folder.log.read_text(), "ten views are asked for"
+    assert free.report["edit"]["psnr_to_views"] > 32.0
+
+
 def test_with_stages_the_slider_is_the_editors_own_strength(folder: Path) -> None:
     result = train(quick_options(folder, "pinned", slider="stages", steps=24), quiet=True)
     assert set(result.report["between"]) == {"0.25", "0.5", "0.75"}

@@ -39,11 +39,11 @@ def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("trainer.setup.SIZES", tuple(size // 10 for size in SIZES))
 
 
-def test_a_sparse_region_gets_few_small_views() -> None:
-    assert choice(60) == (25, VIEWS)
+def test_a_sparse_region_gets_small_views() -> None:
+    assert choice(60) == (25, MOST_VIEWS)
 
 
-def test_a_dense_region_gets_more_views_and_larger_ones() -> None:
+def test_a_dense_region_gets_larger_views() -> None:
     assert choice(6000) == (32, MOST_VIEWS)
 
 

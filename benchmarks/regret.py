@@ -1,0 +1,309 @@
+"""`python -m benchmarks regret SCENE REGION EDITOR`: how much better or cheaper an edit of colors could be.
+
+The views, strengths, steps and SH functions that a run decides on by itself stand beside a sweep of all of
+them. Every field is measured in views in which nobody trains or chooses, at strengths that are nobody's own.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import torch
+import tyro
+from torch import Tensor
+
+from progdf.field.grade import band_offsets
+from progdf.field.trajectory import Trajectory
+from progdf.formats.scene_file import load_scene
+from progdf.gaussians import Gaussians, pack
+from progdf.region import Region
+from progdf.scene.regions import parse_region
+from progdf.terminal import print_line
+from trainer.editors import make_editor
+from trainer.editors.base import ImageEditor
+from trainer.fit.evaluate import Evaluator, make_evaluator
+from trainer.fit.fit import fit_grades, visibility
+from trainer.fit.slider_uniformity import equalized_strengths
+from trainer.optimize.color_solver import (
+    STEPS as TAKEN,
+)
+from trainer.optimize.color_solver import (
+    Judge,
+    Model,
+    add_bands,
+    color_views,
+    iterations,
+    make_solver,
+    solve,
+)
+from trainer.optimize.pgs import PgsState, TargetStage
+from trainer.options import EditorOptions, FieldOptions, OptimizeOptions, ViewOptions
+from trainer.run.threads import use_threads
+from trainer.run.training import choose_effort
+from trainer.setup import TrainingSetup, make_training_setup, quantize_image, widen_views
+from trainer.views.choose import choose_views, split_held_out
+from trainer.views.crops import CropScene, crop_scene
+from trainer.views.view import View, crop, name_cameras, region_rig, with_near_plane
+
+from .table import Table
+
+MEASURED = (0.12, 0.38, 0.64, 0.88, 1.0)
+"""Strengths at which the editor is asked for what it means."""
+STAGES, STEPS, BANDS, VIEWS = (8, 4, 2), (5, 12, 24), (0, 1, 4), (20, 30)
+"""What is swept: even strengths; steps of conjugate gradients for each, where nothing ends them before; SH
+functions of the residual; fewer views than a run's own, with what was best for those."""
+REPORTING = 13
+"""Cameras of a rig that stand where no training view does."""
+NEAR = 0.3
+"""dB within which a cheaper field counts as equal."""
+
+NOTE = (
+    f"dB to the editor's own pictures at strength {', '.join(f'{s:g}' for s in MEASURED)}, in "
+    f"{REPORTING - 1} views of a rig in which nobody trained or chose, over the pixels that show the region; "
+    "mean: of the end and the mean of the in-betweens. Seconds: of the processor, one thread, for the "
+    "pictures, their weights, the model, the solving and the choice of the field. The sweep's strengths are "
+    "solved for once, each from the finished edit's, and fewer are every other of them."
+)
+
+
+@dataclass(frozen=True)
+class RegretOptions:
+    """Sweep the effort of an edit of colors, beside what a run decides on by itself."""
+
+    scene: tyro.conf.Positional[Path]
+    """The scene."""
+    region: tyro.conf.Positional[str]
+    """As progdf train --region has it."""
+    editor: tyro.conf.Positional[str]
+    """An editor of colors that pictures any strength."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """One way to make the edit."""
+
+    name: str
+    psnrs: Sequence[float]  # at `MEASURED`, dB
+    seconds: float  # of the processor
+    bytes: float  # of the field by Gaussian
+
+    @property
+    def mean(self) -> float:
+        """Of the end and the mean of the in-betweens, dB."""
+        return (self.psnrs[-1] + sum(self.psnrs[:-1]) / (len(self.psnrs) - 1)) / 2
+
+    @property
+    def cells(self) -> tuple[str, ...]:
+        """As a row of the table."""
+        psnrs = " ".join(f"{psnr:.1f}" for psnr in self.psnrs)
+        return self.name, psnrs, f"{self.mean:.2f}", f"{self.seconds:.1f}", f"{self.bytes:.0f}"
+
+
+@dataclass
+class Edit:
+    """An edit from one set of views, its pictures and solutions made once."""
+
+    scene: Gaussians
+    region: Region
+    editor: str
+    setup: TrainingSetup
+    seconds: float = 0.0  # of the processor, for what every way needs
+    pictures: dict[float, list[Tensor]] = field(default_factory=dict)  # of all views, by strength
+    a_strength: float = 0.0  # of the processor, for all views' pictures at one strength
+
+    def __post_init__(self) -> None:
+        self.painter: ImageEditor = make_editor(
+            EditorOptions(self.editor), self.scene, self.region, self.setup.views
+        )
+        self.original = pack(self.scene[self.region.members], with_shN=self.scene.sh_degree > 0)
+        finished = self.picture(1.0)[: len(self.setup.train)]
+        self.setup = widen_views(self.setup, {1.0: finished})
+        began = time.process_time()
+        self.drawn = color_views(self._crops(self.setup.train), self.original)
+        self.seconds += time.process_time() - began
+        self.choosing = split_held_out(self.setup.held_out)[0]
+        self.weights = visibility(self.scene, self.region.members, self.setup.train)
+        self.solved: dict[tuple[int, int, float, int], tuple[Tensor, Tensor, float]] = {}
+
+    def strengths(self, count: int, missed: float | None = None) -> tuple[float, ...]:
+        """As a run asks for them."""
+        plain = tuple((i + 1) / count for i in range(count))
+        return equalized_strengths(self.painter, self.editor, self.setup.views, plain, missed)
+
+    def picture(self, s: float) -> list[Tensor]:
+        """All views, as they are kept."""
+        if s not in self.pictures:
+            began = time.process_time()
+            self.pictures[s] = [quantize_image(self.painter.edit(view, s)) for view in self.setup.views]
+            self.a_strength = time.process_time() - began
+        return self.pictures[s]
+
+    def targets(self, s: float, every: int = 1) -> list[Tensor]:
+        """The training views' boxes."""
+        pairs = list(zip(self.picture(s), self.setup.train, strict=False))
+        return [crop(picture, view.box) for picture, view in pairs[::every]]
+
+    def aside(self, s: float) -> list[Tensor]:
+        """The whole pictures of the views that choose."""
+        return list(split_held_out(self.picture(s)[len(self.setup.train) :])[0])
+
+    def automatic(self, judge: Evaluator) -> tuple[Model, str, Result]:
+        """How much is modelled, all that was decided in words, and what came of it."""
+        most, drawn = (
+            iterations(OptimizeOptions().steps),
+            color_views(self._crops(self.choosing), self.original),
+        )
+
+        def choosing(s: float) -> Judge:
+            boxes = [crop(p, view.box) for p, view in zip(self.aside(s), self.choosing, strict=True)]
+            return Judge(drawn, boxes)
+
+        self.picture(1.0)
+        began = time.process_time()
+        solver, model, line = choose_effort(
+            self.drawn, choosing(1.0), self.targets(1.0), self.original, most, "auto", True
+        )
+        spent = time.process_time() - began
+        strengths, every = self.strengths(8, model.missed), len(self.drawn) // len(solver.views)
+        stages = [TargetStage(s, self.targets(s, every), 1) for s in strengths]
+        judges, state = [choosing(s) for s in strengths], PgsState(self.original)
+        began = time.process_time()
+        made = list(solve(self.original, solver, model, stages, judges, state, lambda step, left: None, most))
+        spent += time.process_time() - began
+        steps = ", ".join(f"{snapshot.means.get(TAKEN, 0):.0f}" for snapshot in made)
+        at = ", ".join(f"{s:g}" for s in strengths)
+        tables = [snapshot.table for snapshot in made if snapshot.table is not None]
+        name = (
+            f"automatic: {len(solver.views)} views solved for, {len(strengths)} strengths, {model.bands} SH"
+        )
+        offsets = [snapshot.offsets for snapshot in made]
+        result = self.measure(name, judge, strengths, model.bands, tables, offsets, spent)
+        return model, f"{line}; strengths {at} in {steps} steps", result
+
+    def sweep(
+        self, judge: Evaluator, degree: int, bands: int, most: int, stages: Sequence[int]
+    ) -> Iterator[Result]:
+        """Some strengths and steps."""
+        began = time.process_time()
+        solver, last = make_solver(self.drawn, self.original), None
+        once = time.process_time() - began
+        every = self.strengths(stages[0])
+        for s in (1.0, *every[:-1]):
+            targets, began = self.targets(s), time.process_time()
+            table = solver.table(degree, targets)
+            mapped = solver.map_offsets(degree, table)
+            spent, done = time.process_time() - began, 0
+            now = torch.zeros(len(mapped), bands, 3) if last is None else s * last
+            for steps in (steps for steps in STEPS if steps <= most):
+                began = time.process_time()
+                if bands:
+                    now, _ = solver.residual(mapped, now, targets, steps - done, lambda: None)
+                spent, done = spent + time.process_time() - began, steps
+                self.solved[degree, bands, s, steps] = table, add_bands(mapped, now), spent
+            last = now if last is None else last
+        for count in stages:
+            strengths = every[len(every) // count - 1 :: len(every) // count]
+            for steps in STEPS[: 1 if not bands else len(STEPS)]:
+                if steps <= most:
+                    made = [self.solved[degree, bands, s, steps] for s in strengths]
+                    words = f", {steps} steps" if bands else ""
+                    name = f"{len(self.setup.views)} views, {count} strengths{words}, {bands} SH"
+                    offsets = [band_offsets(change, self.original.shape[1]) for _, change, _ in made]
+                    spent = once + sum(seconds for *_, seconds in made)
+                    tables = [table for table, *_ in made]
+                    yield self.measure(name, judge, strengths, bands, tables, offsets, spent)
+
+    def measure(
+        self,
+        name: str,
+        judge: Evaluator,
+        strengths: Sequence[float],
+        bands: int,
+        tables: Sequence[Tensor],
+        offsets: Sequence[Tensor],
+        spent: float,
+    ) -> Result:
+        """The field that a run would keep of these, its slider the editor's own strength."""
+        count = len(strengths)
+        trajectory = Trajectory(
+            torch.tensor([0.0, *strengths]),
+            torch.stack([torch.zeros_like(offsets[0]), *offsets]).half(),
+            offsets[-1],
+            torch.arange(count + 1),
+            tuple(range(1, count + 1)),
+            tuple(strengths),
+            torch.stack(list(tables)),
+            bands,
+        )
+        choosing = self.evaluator(self.choosing, {s: self.aside(s) for s in strengths})
+        one = replace(choosing, crops=choosing.crops[:1], pixels=choosing.pixels[:1], edited={})
+        began = time.process_time()
+        fitted = fit_grades(trajectory, self.original, choosing, one, self.weights, FieldOptions())
+        seconds = self.seconds + count * self.a_strength + spent + time.process_time() - began
+        chosen = fitted.chosen.field
+        psnrs = [judge.psnr(judge.pictures(chosen.offsets(s)), judge.edited[s]) for s in MEASURED]
+        return Result(name, psnrs, seconds, chosen.bytes_per_member)
+
+    def judge(self) -> Evaluator:
+        """Views of nobody's, as large as these."""
+        assert self.setup.up is not None
+        camera = self.setup.train[0].camera
+        size = max(camera.width, camera.height)
+        rig = region_rig(self.scene, self.region, REPORTING, size, self.setup.up.direction)[1:]
+        cameras = with_near_plane(name_cameras(rig), self.scene)
+        views = choose_views(self.scene, self.region, cameras, len(cameras), self.setup.background).views
+        edited = {s: [quantize_image(self.painter.edit(view, s)) for view in views] for s in MEASURED}
+        return self.evaluator(views, edited)
+
+    def evaluator(self, views: Sequence[View], edited: dict[float, list[Tensor]]) -> Evaluator:
+        """These views beside their pictures."""
+        channels = self.original.shape[1]
+        return make_evaluator(self.scene, self.region, views, edited, self.setup.background, channels, True)
+
+    def _crops(self, views: Sequence[View]) -> list[CropScene]:
+        members, background = self.region.members, self.setup.background
+        return [crop_scene(self.scene, members, v.camera, v.box, background, True) for v in views]
+
+
+def run_regret(options: RegretOptions) -> Table:
+    """Sweep; a line as soon as there is a result, the table at the end.
+
+    Raises:
+        ProgdfError: a scene, region or editor that does not work.
+    """
+    use_threads(1)
+    scene = load_scene(options.scene)
+    region = parse_region(options.region, scene)
+
+    def edit_from(views: int) -> Edit:
+        setup = make_training_setup(ViewOptions(views=views), scene, region)
+        return Edit(scene, region, options.editor, setup)
+
+    edit = edit_from(0)
+    judge = edit.judge()
+    model, line, automatic = edit.automatic(judge)
+    print_line(line)
+    results = [automatic]
+    print_line(" | ".join(automatic.cells))
+    for bands in (bands for bands in BANDS if bands <= edit.drawn[0].basis.shape[1]):
+        most = STEPS[-1] if bands == model.bands else STEPS[-2]
+        for result in edit.sweep(judge, model.degree, bands, most, STAGES):
+            print_line(" | ".join(result.cells))
+            results.append(result)
+    used = max(results[1:], key=lambda result: result.mean).name.split()[-2]
+    for views in VIEWS:
+        for result in edit_from(views).sweep(judge, model.degree, int(used), STEPS[-2], STAGES[:1]):
+            print_line(" | ".join(result.cells))
+            results.append(result)
+    best = max(results, key=lambda result: result.mean)
+    near = min((r for r in results if r.mean >= best.mean - NEAR), key=lambda result: result.seconds)
+    told = (
+        f"Regret {best.mean - automatic.mean:.2f} dB to {best.name}. The cheapest within {NEAR:g} dB of that "
+        f"is {near.name}; the automatic one takes {automatic.seconds / near.seconds:.2f} times as long."
+    )
+    columns = ("what", "dB", "mean", "s", "bytes a Gaussian")
+    title = f"{options.scene.stem} ({len(region)} members, SH {scene.sh_degree}), {options.editor}"
+    return Table("regret", title, columns, tuple(r.cells for r in results), f"{told} {NOTE}")
