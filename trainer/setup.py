@@ -33,11 +33,14 @@ from .views.crops import CropScene, crop_scene
 from .views.view import (
     BACKGROUND,
     INSIDE,
+    LazySequence,
     View,
     fit_size,
+    from_bytes,
     make_view,
     name_cameras,
     region_rig,
+    to_bytes,
     with_near_plane,
 )
 
@@ -226,7 +229,7 @@ def edit_views(
     folder: RunFolder,
     is_confined: bool,
     advance: Advance,
-) -> dict[float, list[Tensor]]:
+) -> dict[float, Sequence[Tensor]]:
     """Every view edited once per strength. What is kept on disk, in 8 bits, is what is trained on.
 
     Args:
@@ -245,8 +248,8 @@ def edit_views(
         made, course = [], edit_course(editor, views[request[0][1]])
         for strength, i in request:
             whole = course(strength)
-            made.append(quantize_image(views[i].confine(whole) if is_confined else whole))
-            write_image(paths[strength][i], made[-1])
+            made.append(to_bytes(views[i].confine(whole) if is_confined else whole))
+            write_image(paths[strength][i], from_bytes(made[-1]))
         return made
 
     add_pictures(folder.views, [path for some in paths.values() for path in some])
@@ -265,7 +268,7 @@ def edit_views(
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
-    return edited
+    return {strength: LazySequence(pictures, from_bytes) for strength, pictures in edited.items()}
 
 
 def widen_views(setup: TrainingSetup, edited: Pictures) -> TrainingSetup:
@@ -299,4 +302,4 @@ def probe_views(setup: TrainingSetup, count: int = _PROBES, still: bool = False)
 
 def quantize_image(image: Tensor) -> Tensor:
     """What is left of an image in an 8-bit file. [H,W,3] -> [H,W,3]"""
-    return (image.clamp(0.0, 1.0) * 255.0).round() / 255.0
+    return from_bytes(to_bytes(image))

@@ -42,7 +42,7 @@ from trainer.setup import (
     whole_views,
     widen_views,
 )
-from trainer.store.progress import RunLog
+from trainer.store.progress import LATER, RunLog
 from trainer.store.run_folder import (
     RunFolder,
     check_folder,
@@ -226,7 +226,10 @@ def train(options: TrainOptions, quiet: bool = False, shared: Shared | None = No
             log.note("interrupted")
             raise
         finally:
-            log.close()
+            try:
+                folder.state.wait()
+            finally:
+                log.close()
 
 
 def select_region(
@@ -326,7 +329,7 @@ def _render_originals(
 
 def _edit_views(
     options: TrainOptions, setup: TrainingSetup, folder: RunFolder, log: RunLog
-) -> tuple[dict[float, list[Tensor]], Approach, dict[str, Any] | None]:
+) -> tuple[Pictures, Approach, dict[str, Any] | None]:
     """What the editor makes of all views, by strength, read where it is on disk; how to train towards it, and
     what a trial of that found.
     """
@@ -337,7 +340,10 @@ def _edit_views(
         try:
             edited = {s: read_views(folder, "edited", names, s) for s in done.values["strengths"]}
             log.say("the edited views are on disk")
-            return edited, Approach(done.values["kind"], done.values["group_steps"]), done.values["trial"]
+            approach = Approach(done.values["kind"], done.values["group_steps"])
+            optimization = resolve_kind(options, approach.kind, approach.group_steps)
+            log.expect(expected_work(setup, optimization, len(edited)))
+            return edited, approach, done.values["trial"]
         except ProgdfError as error:
             log.say(f"the views are edited again: {str(error).partition(';')[0]}")
     spec = options.editor.editor
@@ -348,6 +354,7 @@ def _edit_views(
     kind = approach.kind
     optimization = resolve_kind(options, kind, approach.group_steps)
     strengths = editor_strengths(editor, optimization.stages)
+    log.expect(expected_work(setup, optimization, len(strengths)))
     if not optimization.as_printed and resolve_slider(optimization.slider, strengths) == "even":
         strengths = equalized_strengths(editor, spec, views, strengths)
     is_confined = confines_edit(editor, kind)
@@ -363,6 +370,27 @@ def _edit_views(
     saved = {"strengths": list(edited), "kind": kind, "group_steps": approach.group_steps, "trial": trial}
     folder.state.save("edited", {}, saved)
     return edited, approach, trial
+
+
+def expected_work(setup: TrainingSetup, optimization: OptimizeOptions, strengths: int) -> dict[str, float]:
+    """For `RunLog.expect`, in that of preparing a view.
+
+    Args:
+        setup: scene, region, views
+        optimization: its options with nothing left open
+        strengths: of how many there will be pictures
+    """
+    views, train = len(setup.views), len(setup.train)
+    work = {name: each * views for name, each in LATER.items()} | {
+        "views": views,
+        "edit": 0.1 * views * strengths,
+    }
+    if optimization.solver == "colors":
+        return work | {"model": 2.0 * train, "optimize": 0.45 * train * strengths}
+    if optimization.solver == "pictures":
+        return work | {"optimize": 20.0 * train}
+    moves = optimization.group_steps or 0
+    return work | {"move parts": 0.5 * moves * strengths, "optimize": 0.3 * optimization.steps}
 
 
 def _agreement(

@@ -46,7 +46,7 @@ from trainer.store.progress import RunLog
 from trainer.store.state import PeriodicSave, Resumable, Saved, StateFolder, defer_signals
 from trainer.views.choose import split_held_out
 from trainer.views.crops import CropScene, crop_scene, moving_attributes, only_recolors, render_all
-from trainer.views.view import View, crop
+from trainer.views.view import LazySequence, View, crop, stored_pictures
 
 
 class _RecordingValues(msgspec.Struct):
@@ -93,14 +93,14 @@ class Recordings:
         )
 
     def capture_state(self) -> Saved:
-        """How many there are; those that came since the last time are written first."""
+        """How many there are; those that came since the last time are saved first."""
         for index in range(self._written, len(self.made)):
             snapshot = self.made[index]
             values = {"step": snapshot.step, "stage": snapshot.stage, "ends_stage": snapshot.ends_stage}
             tensors = {"offsets": snapshot.offsets}
             if snapshot.table is not None:
                 tensors["table"] = snapshot.table
-            self._folder.save("recordings", tensors, values | {"means": snapshot.means}, index)
+            self._folder.save_later("recordings", tensors, values | {"means": snapshot.means}, index)
         self._written = len(self.made)
         return Saved({}, {"count": self._written})
 
@@ -163,7 +163,7 @@ def optimize_members(
     bands = optimization.sh != "off"
     original = pack(scene[members], with_shN=scene.sh_degree > 0)
     still = optimization.kind == "color" and optimization.rates == "kind"
-    crops = [crop_scene(scene, members, v.camera, v.box, setup.background, still) for v in setup.train]
+    crops = _crops(setup, setup.train, still)
     stages, groups = _stages(optimization, setup, edited), None
     if optimization.group_steps:
         groups = _groups(optimization, original, crops, stages, folder, log)
@@ -182,7 +182,7 @@ def optimize_members(
         with log.stage("weights"):
             colors = make_solver(crops, original)
         with log.stage("model"):
-            model = _choose_model(colors, crops, stages, optimization, setup, edited, original, log)
+            model = _choose_model(colors, stages, optimization, setup, edited, original, log)
         most = iterations(optimization.steps)
         way = partial(solve, original, colors, model, stages, state, steps=most)
     else:
@@ -227,13 +227,21 @@ def _stages(optimization: OptimizeOptions, setup: TrainingSetup, edited: Picture
     ]
 
 
-def _boxes(pictures: Sequence[Tensor], views: Sequence[View]) -> list[Tensor]:
-    return [crop(picture, view.box) for picture, view in zip(pictures, views, strict=False)]
+def _boxes(pictures: Sequence[Tensor], views: Sequence[View]) -> Sequence[Tensor]:
+    return stored_pictures(crop(picture, view.box) for picture, view in zip(pictures, views, strict=False))
+
+
+def _crops(setup: TrainingSetup, views: Sequence[View], still: bool) -> Sequence[CropScene]:
+    """Of an edit of colors each is made when it is looked at: once, by `color_views`."""
+    scene, members = setup.scene, setup.region.members
+    crops = LazySequence(
+        views, lambda v: crop_scene(scene, members, v.camera, v.box, setup.background, still)
+    )
+    return crops if still else list(crops)
 
 
 def _choose_model(
     solver: Solver,
-    crops: Sequence[CropScene],
     stages: Sequence[TargetStage],
     optimization: OptimizeOptions,
     setup: TrainingSetup,
@@ -246,11 +254,7 @@ def _choose_model(
     views = split_held_out(setup.held_out)[0]
     pictures = split_held_out(edited[max(edited)][len(setup.train) :])[0]
     if views and pictures:
-        made = [
-            crop_scene(setup.scene, setup.region.members, v.camera, v.box, setup.background, True)
-            for v in views
-        ]
-        judge = Judge(color_views(made, original), _boxes(pictures, views))
+        judge = Judge(color_views(_crops(setup, views, True), original), _boxes(pictures, views))
     most_bands = 1 if optimization.sh == "off" else 4
     model = choose_model(solver, judge, stages[-1].targets, iterations(optimization.steps), most_bands, _wait)
     log.say(f"{model.line}, on {'views that are held out' if views else 'all views, as none is held out'}")
@@ -278,15 +282,19 @@ def _record_way(
             joint.refill([(made.step, made.offsets) for made in recordings.made])
         log.say(f"continuing at step {state.step} of {steps}, with {len(recordings.made)} recordings")
     with log.steps("optimize", steps) as advance, defer_signals() as stopped:
+        saved_at = state.step
 
         def step_done(step: int, left: float) -> None:
+            nonlocal saved_at
             if joint is not None:
                 joint.step()
             advance(step, f"loss to the edit {left:.4f}")
             if stopped():
                 saver.save()
                 raise KeyboardInterrupt
-            saver.step_done()
+            if step > saved_at:  # within a step there is nothing new to save
+                saver.step_done()
+                saved_at = step
 
         advance(state.step, "")  # of a handful of pictures nearly all is done before the first step
         try:
@@ -300,7 +308,7 @@ def _record_way(
                 f"training failed: {error}; the state before it is kept: fix the edited views and continue "
                 "with --resume, or try --kind style in another folder"
             ) from error
-    saver.save()
+    saver.save(waits=False)
     if joint is not None:
         save_network(joint, folder)
     return saver
