@@ -24,7 +24,7 @@ from progdf.threads import threads
 
 from .editors.base import ImageEditor
 from .editors.pictures import picture_cameras
-from .editors.procedural import ColorEditor
+from .editors.procedural import ColorEditor, edit_course
 from .options import MOST_VIEWS, VIEWS, Kind, ViewOptions
 from .store.progress import Advance
 from .store.run_folder import RunFolder, add_pictures
@@ -33,11 +33,14 @@ from .views.crops import CropScene, crop_scene
 from .views.view import (
     BACKGROUND,
     INSIDE,
+    LazySequence,
     View,
     fit_size,
+    from_bytes,
     make_view,
     name_cameras,
     region_rig,
+    to_bytes,
     with_near_plane,
 )
 
@@ -228,7 +231,7 @@ def edit_views(
     folder: RunFolder,
     is_confined: bool,
     advance: Advance,
-) -> dict[float, list[Tensor]]:
+) -> dict[float, Sequence[Tensor]]:
     """Every view edited once per strength. What is kept on disk, in 8 bits, is what is trained on.
 
     Args:
@@ -243,27 +246,31 @@ def edit_views(
         strength: [folder.view("edited", v.camera.name, strength) for v in views] for strength in strengths
     }
 
-    def edit(request: tuple[float, int]) -> Tensor:
-        strength, i = request
-        made = editor.edit(views[i], strength)
-        picture = quantize_image(views[i].confine(made) if is_confined else made)
-        write_image(paths[strength][i], picture)
-        return picture
+    def edit(request: Sequence[tuple[float, int]]) -> list[Tensor]:
+        made, course = [], edit_course(editor, views[request[0][1]])
+        for strength, i in request:
+            whole = course(strength)
+            made.append(to_bytes(views[i].confine(whole) if is_confined else whole))
+            write_image(paths[strength][i], from_bytes(made[-1]))
+        return made
 
     add_pictures(folder.views, [path for some in paths.values() for path in some])
-    requests = [(strength, i) for strength in strengths for i in range(len(views))]
     edited: dict[float, list[Tensor]] = {strength: [] for strength in strengths}
+    together = isinstance(editor, ColorEditor)  # the others have a network, or draw: these use all cores
+    requests = [[(strength, i)] for strength in strengths for i in range(len(views))]
+    if together:
+        requests = [[(strength, i) for strength in strengths] for i in range(len(views))]
     with ThreadPoolExecutor(threads()) as pool:
-        # the others have a network, or draw: these use all cores by themselves
-        made = pool.map(edit, requests) if isinstance(editor, ColorEditor) else map(edit, requests)
+        made = pool.map(edit, requests) if together else map(edit, requests)
         try:
-            for done, ((strength, _), picture) in enumerate(zip(requests, made, strict=True), 1):
-                edited[strength].append(picture)
-                advance(done, f"strength {strength:g}")
+            for request, pictures in zip(requests, made, strict=True):
+                for (strength, _), picture in zip(request, pictures, strict=True):
+                    edited[strength].append(picture)
+                advance(sum(map(len, edited.values())), f"strength {request[-1][0]:g}")
         except BaseException:
             pool.shutdown(cancel_futures=True)
             raise
-    return edited
+    return {strength: LazySequence(pictures, from_bytes) for strength, pictures in edited.items()}
 
 
 def widen_views(setup: TrainingSetup, edited: Pictures) -> TrainingSetup:
@@ -297,4 +304,4 @@ def probe_views(setup: TrainingSetup, count: int = _PROBES, still: bool = False)
 
 def quantize_image(image: Tensor) -> Tensor:
     """What is left of an image in an 8-bit file. [H,W,3] -> [H,W,3]"""
-    return (image.clamp(0.0, 1.0) * 255.0).round() / 255.0
+    return from_bytes(to_bytes(image))

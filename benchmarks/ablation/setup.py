@@ -145,7 +145,7 @@ def digest_of(shared: AblationSetup, variant: Variant, seed: int, optimization: 
     return hashlib.sha256(told.encode()).hexdigest()
 
 
-def _read_edited(run: FinishedRun, views: Sequence[View], strength: float) -> list[Tensor]:
+def _read_edited(run: FinishedRun, views: Sequence[View], strength: float) -> Sequence[Tensor]:
     return read_views(run.folder, "edited", [view.camera.name for view in views], strength)
 
 

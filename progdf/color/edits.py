@@ -8,6 +8,8 @@ lightness are those of `progdf.color.oklab`; what lies between the original and 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -18,12 +20,15 @@ from .oklab import (
     ColorPath,
     Strength,
     bend_of,
+    color_course,
     fit_gamut,
     hue_of,
-    interpolate_colors,
     oklab_to_srgb,
     srgb_to_oklab,
 )
+
+Course = Callable[[Strength], Tensor]
+"""Some colors [...,3] at a strength."""
 
 _LEAST_CHROMA = 0.015  # of a target that has a hue
 _LARGEST_GAIN = 3.0  # a dark part that becomes bright is lifted instead of amplifying its noise further
@@ -68,10 +73,14 @@ def recolor(
         reference: the region's own color, `typical_color` of `rgb` by default. [3]
         path: see `bend_of`
     """
-    typical = _as_tensor(typical_color(rgb) if reference is None else reference, rgb)
-    return interpolate_colors(
-        rgb, recolor_fully(rgb, target, typical), strength, bend_of(typical, _as_tensor(target, rgb), path)
-    )
+    return recolor_course(rgb, target, typical_color(rgb) if reference is None else reference, path)(strength)
+
+
+def recolor_course(rgb: Tensor, target: Tensor, reference: Tensor, path: ColorPath = "bowed") -> Course:
+    """`recolor` for many strengths."""
+    typical = _as_tensor(reference, rgb)
+    bend = bend_of(typical, _as_tensor(target, rgb), path)
+    return color_course(rgb, recolor_fully(rgb, target, typical), bend)
 
 
 def recolor_fully(rgb: Tensor, target: Tensor, reference: Tensor) -> Tensor:
@@ -102,10 +111,16 @@ def tint(
 
     See `recolor` for the arguments; here `reference` decides nothing but the bend.
     """
-    typical = _as_tensor(typical_color(rgb) if reference is None else reference, rgb)
-    return interpolate_colors(
-        rgb, tint_fully(rgb, target, share), strength, bend_of(typical, _as_tensor(target, rgb), path)
-    )
+    reference = typical_color(rgb) if reference is None else reference
+    return tint_course(rgb, target, reference, path, share)(strength)
+
+
+def tint_course(
+    rgb: Tensor, target: Tensor, reference: Tensor, path: ColorPath = "bowed", share: float = 0.7
+) -> Course:
+    """`tint` for many strengths."""
+    bend = bend_of(_as_tensor(reference, rgb), _as_tensor(target, rgb), path)
+    return color_course(rgb, tint_fully(rgb, target, share), bend)
 
 
 def tint_fully(rgb: Tensor, target: Tensor, share: float) -> Tensor:
@@ -129,8 +144,13 @@ def darken(rgb: Tensor, strength: Strength = 1.0, stops: float = 3.0) -> Tensor:
 
 def night(rgb: Tensor, strength: Strength = 1.0, stops: float = 3.0) -> Tensor:
     """Moonlight: `darken`, with colors fading to a cool blue as they do in scarce light. [...,3]"""
-    blue = tint_fully(rgb, rgb.new_tensor([0.35, 0.50, 0.85]), share=0.75)
-    return darken(interpolate_colors(rgb, blue, strength, STRAIGHT), strength, stops)
+    return night_course(rgb, stops)(strength)
+
+
+def night_course(rgb: Tensor, stops: float = 3.0) -> Course:
+    """`night` for many strengths."""
+    bluer = color_course(rgb, tint_fully(rgb, rgb.new_tensor([0.35, 0.50, 0.85]), share=0.75), STRAIGHT)
+    return lambda strength: darken(bluer(strength), strength, stops)
 
 
 def stripe_pattern(

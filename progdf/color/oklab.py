@@ -6,6 +6,7 @@ Its polar form, OKLCh, has hue, chroma and lightness: scaling the lightness ther
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
@@ -132,32 +133,43 @@ def interpolate_colors(rgb: Tensor, end: Tensor, strength: Strength, bend: Bend)
         strength: 0..1
         bend: of the region
     """
+    return color_course(rgb, end, bend)(strength)
+
+
+def color_course(rgb: Tensor, end: Tensor, bend: Bend) -> Callable[[Strength], Tensor]:
+    """`interpolate_colors` for many strengths: what they share is computed once."""
     inside = rgb.clamp(0, 1)
-    s = torch.as_tensor(strength, dtype=rgb.dtype, device=rgb.device).expand(rgb.shape[:-1]).clamp(0, 1)
-    if bend.fade:
-        way = torch.lerp(inside, end, s[..., None])
-    else:
-        way = _mix_oklab(srgb_to_oklab(inside), srgb_to_oklab(end), s, bend)
-    edited = way + (1 - s)[..., None] * (rgb - inside)
-    return torch.where((s == 0)[..., None], rgb, torch.where((s == 1)[..., None], end, edited))
+    mix = None if bend.fade else _oklab_course(srgb_to_oklab(inside), srgb_to_oklab(end), bend)
+
+    def colors_at(strength: Strength) -> Tensor:
+        s = torch.as_tensor(strength, dtype=rgb.dtype, device=rgb.device).expand(rgb.shape[:-1]).clamp(0, 1)
+        way = torch.lerp(inside, end, s[..., None]) if mix is None else mix(s)
+        edited = way + (1 - s)[..., None] * (rgb - inside)
+        return torch.where((s == 0)[..., None], rgb, torch.where((s == 1)[..., None], end, edited))
+
+    return colors_at
 
 
-def _mix_oklab(a: Tensor, b: Tensor, s: Tensor, bend: Bend) -> Tensor:
-    """From OKLab to OKLab; sRGB. [...,3], [...,3], [...] -> [...,3]"""
-    chroma_a, chroma_b = a[..., 1:].norm(dim=-1), b[..., 1:].norm(dim=-1)
-    turn = bend.direction * _wrap(hue_of(b) - hue_of(a))  # -pi..pi, the region's sense being positive
+def _oklab_course(a: Tensor, b: Tensor, bend: Bend) -> Callable[[Tensor], Tensor]:
+    """From OKLab to OKLab; sRGB at strengths [...]. [...,3], [...,3]"""
+    chroma_a, chroma_b, hue = a[..., 1:].norm(dim=-1), b[..., 1:].norm(dim=-1), hue_of(a)
+    turn = bend.direction * _wrap(hue_of(b) - hue)  # -pi..pi, the region's sense being positive
     alone = _rise(turn + math.pi, bend.whole, bend.none)
-    chroma = torch.lerp(chroma_a, chroma_b, s)
-
-    def rotate(angle: Tensor) -> Tensor:
-        hue = hue_of(a) + bend.direction * s * angle
-        return torch.stack([chroma * torch.cos(hue), chroma * torch.sin(hue)], dim=-1)
-
-    around = torch.lerp(rotate(turn + 2 * math.pi), rotate(turn), alone[..., None])
     bow = bend.bow * 4 * chroma_a * chroma_b / (chroma_a + chroma_b).clamp_min(1e-6).square()
-    lab = torch.lerp(a, b, s[..., None])
-    lab[..., 1:] += bow[..., None] * (around - lab[..., 1:])
-    return fit_gamut(lab)
+
+    def colors_at(s: Tensor) -> Tensor:
+        chroma = torch.lerp(chroma_a, chroma_b, s)
+
+        def rotate(angle: Tensor) -> Tensor:
+            turned = hue + bend.direction * s * angle
+            return torch.stack([chroma * torch.cos(turned), chroma * torch.sin(turned)], dim=-1)
+
+        around = torch.lerp(rotate(turn + 2 * math.pi), rotate(turn), alone[..., None])
+        lab = torch.lerp(a, b, s[..., None])
+        lab[..., 1:] += bow[..., None] * (around - lab[..., 1:])
+        return fit_gamut(lab)
+
+    return colors_at
 
 
 def _wrap(angle: Tensor) -> Tensor:

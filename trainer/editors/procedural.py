@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -21,6 +22,8 @@ from progdf.region import Region
 from trainer.options import EditKind, EditorOptions
 from trainer.views.view import View, render_colors, seen_colors
 
+from .base import ImageEditor
+
 _COVER = 0.75  # of the old contrast is lost under a stripe
 _STRIPES = 7  # across the longest side of the region
 
@@ -29,17 +32,26 @@ _STRIPES = 7  # across the longest side of the region
 class ColorEditor:
     """A function of color and strength, applied to each pixel's share of the region."""
 
-    change: Callable[[Tensor, float], Tensor]
+    change: Callable[[Tensor], color.Course]
     kind: EditKind = "color"
     stages: tuple[float, ...] = ()
     is_confined: bool = True
 
     def edit(self, view: View, strength: float) -> Tensor:
         """See `ImageEditor.edit`."""
+        return self.course(view)(strength)
+
+    def course(self, view: View) -> Callable[[float], Tensor]:
+        """`edit` of one view at many strengths, which share most of the work."""
         visible = view.mask > 0
-        inside = view.inside.clone()
-        inside[visible] = self.change(view.inside[visible], strength)
-        return view.blend(inside)
+        change = self.change(view.inside[visible])
+
+        def edit(strength: float) -> Tensor:
+            inside = view.inside.clone()
+            inside[visible] = change(strength)
+            return view.blend(inside)
+
+        return edit
 
 
 @dataclass(frozen=True)
@@ -74,12 +86,17 @@ class StripesEditor:
         return view.blend((premultiplied / view.mask.clamp_min(1e-4)[..., None]).clamp(0.0, 1.0))
 
 
+def edit_course(editor: ImageEditor, view: View) -> Callable[[float], Tensor]:
+    """`editor.edit` of one view at many strengths."""
+    return editor.course(view) if isinstance(editor, ColorEditor) else partial(editor.edit, view)
+
+
 def recolor(
     what: str, scene: Gaussians, region: Region, views: Sequence[View], options: EditorOptions
 ) -> ColorEditor:
     """`recolor:#rrggbb[,path=hue]`: another color, the shading kept."""
     (target, path), typical = paint_of(what), region_color(views)
-    return ColorEditor(lambda rgb, strength: color.recolor(rgb, target, strength, typical, path))
+    return ColorEditor(lambda rgb: color.recolor_course(rgb, target, typical, path))
 
 
 def tint(
@@ -87,7 +104,7 @@ def tint(
 ) -> ColorEditor:
     """`tint:#rrggbb[,path=hue]`: a wash of color, lightness kept."""
     (target, path), typical = paint_of(what), region_color(views)
-    return ColorEditor(lambda rgb, strength: color.tint(rgb, target, strength, typical, path))
+    return ColorEditor(lambda rgb: color.tint_course(rgb, target, typical, path))
 
 
 def darken(
@@ -95,7 +112,7 @@ def darken(
 ) -> ColorEditor:
     """`darken:AMOUNT`: that share of the light is taken away, 0..1, by default 0.875 (three stops)."""
     stops = stops_of(what, "darken")
-    return ColorEditor(lambda rgb, strength: color.darken(rgb, strength, stops))
+    return ColorEditor(lambda rgb: partial(color.darken, rgb, stops=stops))
 
 
 def night(
@@ -103,7 +120,7 @@ def night(
 ) -> ColorEditor:
     """`night` or `night:AMOUNT`: as `darken`, with colors fading to the blue of moonlight."""
     stops = stops_of(what, "night")
-    return ColorEditor(lambda rgb, strength: color.night(rgb, strength, stops))
+    return ColorEditor(lambda rgb: color.night_course(rgb, stops))
 
 
 def stripes(

@@ -29,6 +29,7 @@ from progdf.field.baked import (
 from progdf.gaussians import BASE_CHANNELS, pack
 from trainer.editors import COSTLY_STRENGTHS, check_editor
 from trainer.editors.base import ImageEditor
+from trainer.editors.procedural import edit_course
 from trainer.setup import TrainingSetup, probe_views
 from trainer.store.progress import RunLog
 from trainer.views.crops import GEOMETRY, render_all
@@ -70,9 +71,10 @@ def equalized_strengths(
     if editor.stages or len(plain) == 1 or check_editor(spec)[0] in COSTLY_STRENGTHS:
         return plain
     few = views[:: max(1, len(views) // _ASKED_VIEWS)][:_ASKED_VIEWS]
+    courses = [edit_course(editor, view) for view in few]
 
     def picture_at(s: float) -> Tensor:
-        return torch.cat([editor.edit(view, s).flatten() for view in few])
+        return torch.cat([picture_at(s).flatten() for picture_at in courses])
 
     even = torch.linspace(0, 1, STEPS + 1, dtype=torch.float64)
     pictures = [picture_at(float(s)) for s in even]

@@ -104,9 +104,9 @@ def color_view(crop: CropScene, original: Tensor, bands: int) -> ColorView:
 
 
 def color_views(crops: Sequence[CropScene], original: Tensor) -> list[ColorView]:
-    """All views, with all bands that are drawn."""
+    """All views, with all bands that are drawn. Each crop is looked at once, and not needed any more."""
     bands = member_bands(original).shape[1]
-    return _map_threads(lambda crop: color_view(crop, original, bands), crops)
+    return _map_threads(lambda i: color_view(crops[i], original, bands), range(len(crops)))
 
 
 @dataclass(frozen=True)
@@ -469,7 +469,6 @@ def solve(
         left = solver.left(offsets, finished)
         if not math.isfinite(left) or not bool(offsets.isfinite().all()):
             raise FloatingPointError(f"the loss is {left} at step {state.step}")
-        state.previous.copy_(state.moved.detach())
         with torch.no_grad():
             state.moved.copy_(band_offsets(offsets, original.shape[1]))
         state.average.copy_(state.moved.detach())

@@ -128,7 +128,12 @@ class PgsState:
 
     def capture_state(self) -> Saved:
         """See `state.Resumable`."""
-        tensors = {name: getattr(self, name) for name in _ROWS}
+        # of an edit that is solved for the moments are 0, and the mean is where it is
+        tensors = {name: rows for name in _ROWS if bool(_bits(rows := getattr(self, name)).any())}
+        if torch.equal(_bits(self.average), _bits(self.moved)):
+            tensors.pop("average", None)
+        else:
+            tensors["average"] = self.average
         tensors |= {f"picture{i}": picture for i, picture in enumerate(self.pictures)}
         tensors["order"] = self._order.get_state()
         values = {
@@ -147,13 +152,19 @@ class PgsState:
         tensors, values = saved.tensors, convert_json(saved.values, _StateValues)
         with torch.no_grad():
             for name in _ROWS:
-                getattr(self, name).copy_(tensors[name])
+                same = tensors.get("moved" if name == "average" else name, torch.zeros_like(self.first))
+                getattr(self, name).copy_(tensors.get(name, same))
         self.pictures = [tensors[f"picture{i}"] for i in range(sum(k.startswith("picture") for k in tensors))]
         self.step, self.stage, self.local = values.step, values.stage, values.local
         self.recorded = values.recorded
         self.running = math.nan if values.running is None else values.running
         self.means.sums = dict(values.means)
         self._order, self._queue = generator(tensors["order"]), list(values.queue)
+
+
+def _bits(rows: Tensor) -> Tensor:
+    """In which −0 is not 0."""
+    return rows.detach().view(torch.int32)
 
 
 LEARNING_RATES: Mapping[str, Mapping[str, float]] = {

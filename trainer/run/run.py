@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -51,7 +51,7 @@ from trainer.setup import (
     whole_views,
     widen_views,
 )
-from trainer.store.progress import RunLog
+from trainer.store.progress import LATER, RunLog
 from trainer.store.run_folder import (
     RunFolder,
     check_folder,
@@ -235,7 +235,10 @@ def train(options: TrainOptions, quiet: bool = False, shared: Shared | None = No
             log.note("interrupted")
             raise
         finally:
-            log.close()
+            try:
+                folder.state.wait()
+            finally:
+                log.close()
 
 
 def select_region(
@@ -338,7 +341,7 @@ def _render_originals(
 
 def _edit_views(
     options: TrainOptions, setup: TrainingSetup, folder: RunFolder, log: RunLog
-) -> tuple[dict[float, list[Tensor]], Approach, dict[str, Any] | None]:
+) -> tuple[Pictures, Approach, dict[str, Any] | None]:
     """What the editor makes of all views, by strength, read where it is on disk; how to train towards it, and
     what a trial of that found.
     """
@@ -349,7 +352,10 @@ def _edit_views(
         try:
             edited = {s: read_views(folder, "edited", names, s) for s in done.values["strengths"]}
             log.say("the edited views are on disk")
-            return edited, Approach(done.values["kind"], done.values["group_steps"]), done.values["trial"]
+            approach = Approach(done.values["kind"], done.values["group_steps"])
+            optimization = resolve_kind(options, approach.kind, approach.group_steps)
+            log.expect(expected_work(setup, optimization, len(edited)))
+            return edited, approach, done.values["trial"]
         except ProgdfError as error:
             log.say(f"the views are edited again: {str(error).partition(';')[0]}")
     spec = options.editor.editor
@@ -360,6 +366,7 @@ def _edit_views(
     kind = approach.kind
     optimization = resolve_kind(options, kind, approach.group_steps)
     strengths = editor_strengths(editor, optimization.stages)
+    log.expect(expected_work(setup, optimization, len(strengths)))
     if waits_for_error(options, optimization):
         strengths = (1.0,)
     elif not optimization.as_printed and resolve_slider(optimization.slider, strengths) == "even":
@@ -381,7 +388,7 @@ def waits_for_error(options: TrainOptions, optimization: OptimizeOptions) -> boo
 
 
 def _edit_between(
-    edited: Mapping[float, list[Tensor]],
+    edited: Pictures,
     options: TrainOptions,
     setup: TrainingSetup,
     approach: Approach,
@@ -397,19 +404,21 @@ def _edit_between(
     painter = replace(options.editor, cache=folder.paintings)
     editor = make_editor(painter, setup.scene, setup.region, setup.views)
     strengths = equalized_strengths(editor, options.editor.editor, setup.views, plain, missed)
+    optimization = resolve_kind(options, approach.kind, approach.group_steps)
+    log.expect(expected_work(setup, optimization, len(strengths)))
     return _edit_at(strengths, edited, editor, setup, approach, None, folder, log)
 
 
 def _edit_at(
     strengths: Sequence[float],
-    edited: Mapping[float, list[Tensor]],
+    edited: Pictures,
     editor: ImageEditor,
     setup: TrainingSetup,
     approach: Approach,
     trial: dict[str, Any] | None,
     folder: RunFolder,
     log: RunLog,
-) -> dict[float, list[Tensor]]:
+) -> dict[float, Sequence[Tensor]]:
     """All views edited at these strengths, but for those that are already; kept on disk."""
     views, new = setup.views, [s for s in strengths if s not in edited]
     with log.steps("edit", len(views) * len(new)) as advance:
@@ -424,6 +433,27 @@ def _edit_at(
     }
     folder.state.save("edited", {}, saved)
     return {s: made[s] if s in made else edited[s] for s in strengths}
+
+
+def expected_work(setup: TrainingSetup, optimization: OptimizeOptions, strengths: int) -> dict[str, float]:
+    """For `RunLog.expect`, in that of preparing a view.
+
+    Args:
+        setup: scene, region, views
+        optimization: its options with nothing left open
+        strengths: of how many there will be pictures
+    """
+    views, train = len(setup.views), len(setup.train)
+    work = {name: each * views for name, each in LATER.items()} | {
+        "views": views,
+        "edit": 0.1 * views * strengths,
+    }
+    if optimization.solver == "colors":
+        return work | {"model": 2.0 * train, "optimize": 0.45 * train * strengths}
+    if optimization.solver == "pictures":
+        return work | {"optimize": 20.0 * train}
+    moves = optimization.group_steps or 0
+    return work | {"move parts": 0.5 * moves * strengths, "optimize": 0.3 * optimization.steps}
 
 
 def _agreement(

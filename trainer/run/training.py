@@ -51,7 +51,7 @@ from trainer.store.progress import RunLog
 from trainer.store.state import PeriodicSave, Resumable, Saved, StateFolder, defer_signals
 from trainer.views.choose import split_held_out
 from trainer.views.crops import CropScene, crop_scene, moving_attributes, only_recolors, render_all
-from trainer.views.view import View, crop
+from trainer.views.view import LazySequence, View, crop, stored_pictures
 
 
 class _RecordingValues(msgspec.Struct):
@@ -98,14 +98,14 @@ class Recordings:
         )
 
     def capture_state(self) -> Saved:
-        """How many there are; those that came since the last time are written first."""
+        """How many there are; those that came since the last time are saved first."""
         for index in range(self._written, len(self.made)):
             snapshot = self.made[index]
             values = {"step": snapshot.step, "stage": snapshot.stage, "ends_stage": snapshot.ends_stage}
             tensors = {"offsets": snapshot.offsets}
             if snapshot.table is not None:
                 tensors["table"] = snapshot.table
-            self._folder.save("recordings", tensors, values | {"means": snapshot.means}, index)
+            self._folder.save_later("recordings", tensors, values | {"means": snapshot.means}, index)
         self._written = len(self.made)
         return Saved({}, {"count": self._written})
 
@@ -172,7 +172,7 @@ def optimize_members(
     bands = optimization.sh != "off"
     original = pack(scene[members], with_shN=scene.sh_degree > 0)
     still = optimization.kind == "color" and optimization.rates == "kind"
-    crops = [crop_scene(scene, members, v.camera, v.box, setup.background, still) for v in setup.train]
+    crops = _crops(setup, setup.train, still)
     stages, groups = _stages(optimization, setup, edited), None
     if optimization.group_steps:
         groups = _groups(optimization, original, crops, stages, folder, log)
@@ -253,8 +253,17 @@ def _stages(optimization: OptimizeOptions, setup: TrainingSetup, edited: Picture
     ]
 
 
-def _boxes(pictures: Sequence[Tensor], views: Sequence[View]) -> list[Tensor]:
-    return [crop(picture, view.box) for picture, view in zip(pictures, views, strict=False)]
+def _boxes(pictures: Sequence[Tensor], views: Sequence[View]) -> Sequence[Tensor]:
+    return stored_pictures(crop(picture, view.box) for picture, view in zip(pictures, views, strict=False))
+
+
+def _crops(setup: TrainingSetup, views: Sequence[View], still: bool) -> Sequence[CropScene]:
+    """Of an edit of colors each is made when it is looked at: once, by `color_views`."""
+    scene, members = setup.scene, setup.region.members
+    crops = LazySequence(
+        views, lambda v: crop_scene(scene, members, v.camera, v.box, setup.background, still)
+    )
+    return crops if still else list(crops)
 
 
 def _judging(
@@ -264,9 +273,7 @@ def _judging(
     views, count = split_held_out(setup.held_out)[0], len(setup.train)
     if not views or len(edited[max(edited)]) <= count:
         return lambda pictures: Judge(drawn, _boxes(pictures, setup.train))
-    members = setup.region.members
-    crops = [crop_scene(setup.scene, members, v.camera, v.box, setup.background, True) for v in views]
-    choosing = color_views(crops, original)
+    choosing = color_views(_crops(setup, views, True), original)
     return lambda pictures: Judge(choosing, _boxes(split_held_out(pictures[count:])[0], views))
 
 
@@ -325,15 +332,19 @@ def _record_way(
             joint.refill([(made.step, made.offsets) for made in recordings.made])
         log.say(f"continuing at step {state.step} of {steps}, with {len(recordings.made)} recordings")
     with log.steps("optimize", steps) as advance, defer_signals() as stopped:
+        saved_at = state.step
 
         def step_done(step: int, left: float) -> None:
+            nonlocal saved_at
             if joint is not None:
                 joint.step()
             advance(step, f"loss to the edit {left:.4f}")
             if stopped():
                 saver.save()
                 raise KeyboardInterrupt
-            saver.step_done()
+            if step > saved_at:  # within a step there is nothing new to save
+                saver.step_done()
+                saved_at = step
 
         advance(state.step, "")  # of a handful of pictures nearly all is done before the first step
         try:
@@ -347,7 +358,7 @@ def _record_way(
                 f"training failed: {error}; the state before it is kept: fix the edited views and continue "
                 "with --resume, or try --kind style in another folder"
             ) from error
-    saver.save()
+    saver.save(waits=False)
     if joint is not None:
         save_network(joint, folder)
     return saver

@@ -16,7 +16,6 @@ from rich.progress import (
     Progress,
     SpinnerColumn,
     TextColumn,
-    TimeRemainingColumn,
 )
 
 from progdf.errors import ProgdfError
@@ -29,20 +28,32 @@ Advance = Callable[[int, str], None]
 """Steps done so far, and a short word about them (the loss)."""
 
 STAGES = {
-    "edit": ("Editing views", 0.08, 0.38),
-    "even the slider": ("Evening the slider", 0.08, 0.2),
-    "try kinds": ("Choosing what moves", 0.08, 0.2),
-    "move parts": ("Moving parts", 0.38, 0.5),
-    "optimize": ("Training", 0.38, 0.64),
-    "time the slider": ("Timing the slider", 0.64, 0.66),
-    "picture the edit": ("Finishing", 0.66, 0.7),
-    "weigh the members": ("Packing", 0.7, 0.73),
-    "fit the field": ("Packing", 0.73, 0.82),
-    "field": ("Packing", 0.7, 0.82),
-    "measure the edit": ("Measuring", 0.82, 0.96),
+    "views": "",
+    "try kinds": "Choosing what moves",
+    "edit": "Editing views",
+    "model": "",
+    "move parts": "Moving parts",
+    "optimize": "Training",
+    "time the slider": "Timing the slider",
+    "picture the edit": "Finishing",
+    "weigh the members": "Packing",
+    "fit the field": "Packing",
+    "field": "Packing",
+    "even the slider": "Evening the slider",
+    "measure the edit": "Measuring",
 }
-"""The long stages of a run: the label in the window, and the shares of a run's time at which each usually
-begins and ends."""
+"""The long stages of a run in their order, with their labels in the window; those without tell no steps."""
+
+LATER = {
+    "time the slider": 0.15,
+    "picture the edit": 0.2,
+    "weigh the members": 0.2,
+    "fit the field": 0.7,
+    "even the slider": 0.3,
+    "measure the edit": 1.7,
+}
+"""Work for each view of the stages that follow the optimization, see `RunLog.expect`."""
+
 
 _EVERY_S = 5.0
 _FILE_EVERY_S = 0.4
@@ -70,6 +81,13 @@ class RunLog:
         self.refits = refits
         self._earlier = 0.0
         self._progress, self._written, self._share = progress, 0.0, 0.0
+        self._work: Mapping[str, float] = {
+            "views": 1.0,
+            "try kinds": 1.0,
+            "edit": 1.0,
+            "optimize": 5.0,
+            **LATER,
+        }
         self._running: dict[str, float] = {}
         self.memory = PeakMemory()
         self._start = time.perf_counter()
@@ -99,6 +117,31 @@ class RunLog:
         self._earlier = saved.values["total"]
         self.memory.restore(**saved.values["memory"])
 
+    def expect(self, work: Mapping[str, float]) -> None:
+        """How much work the stages of this run are, in any unit; how fast it goes is measured.
+
+        Args:
+            work: of `STAGES`, those that the run has
+        """
+        self._work = work
+
+    def seconds_left(self, stage: str, share: float, elapsed: float) -> float:
+        """Until the run ends, as far as it can be told.
+
+        What is to come is taken to go at the pace of all that was; a stage's own pace counts as far as it is.
+
+        Args:
+            stage: that runs
+            share: of it that is done, 0..1
+            elapsed: seconds of it so far
+        """
+        order = list(STAGES)
+        ended = sum(work for name, work in self._work.items() if order.index(name) < order.index(stage))
+        ahead = sum(work for name, work in self._work.items() if order.index(name) > order.index(stage))
+        own = self._work.get(stage, 0.0)
+        pace = self._total() / max(ended + share * own, 1e-9)
+        return (1.0 - share) * ((1.0 - share) * pace * own + elapsed) + pace * ahead
+
     def note(self, text: str) -> None:
         """A line for the file alone."""
         self._file.write(f"{time.perf_counter() - self._start:8.1f} s  {escape_text(text)}\n")
@@ -124,7 +167,16 @@ class RunLog:
 
     @contextmanager
     def steps(self, what: str, total: int) -> Iterator[Advance]:
-        """One of `STAGES` in `total` steps: a bar on a terminal, a line every few seconds elsewhere."""
+        """One of `STAGES` in `total` steps: a bar on a terminal, a line every few seconds elsewhere, with the
+        seconds until the run ends."""
+        begun = last = time.perf_counter()
+
+        def tell(done: int, word: str) -> float:
+            share = min(done / max(total, 1), 1.0)
+            left = self.seconds_left(what, share, time.perf_counter() - begun)
+            self._write_progress(what, left, word, done >= total)
+            return left
+
         if self._bar:
             columns = (
                 SpinnerColumn(),
@@ -132,26 +184,21 @@ class RunLog:
                 BarColumn(),
                 MofNCompleteColumn(),
                 TextColumn("{task.fields[word]}"),
-                TimeRemainingColumn(),
             )
             with Progress(*columns, console=self._console, transient=True) as progress:
                 task = progress.add_task(what, total=total, word="")
 
                 def move_bar(done: int, word: str) -> None:
-                    progress.update(task, completed=done, word=word)
-                    self._write_progress(what, done, total, word)
+                    progress.update(task, completed=done, word=f"{word}  {tell(done, word):.0f} s left")
 
                 yield move_bar
             return
-        begun = last = time.perf_counter()
 
         def advance(done: int, word: str) -> None:
             nonlocal last
-            self._write_progress(what, done, total, word)
-            now = time.perf_counter()
+            left, now = tell(done, word), time.perf_counter()
             if now - last >= _EVERY_S and done < total:
                 last = now
-                left = (now - begun) / max(done, 1) * (total - done)
                 self.say(f"{what} {done}/{total}  {word}  {left:.0f} s left")
 
         yield advance
@@ -174,20 +221,20 @@ class RunLog:
         with suppress(OSError):  # a full disk, which has been reported already
             self._file.close()
 
-    def _write_progress(self, what: str, done: int, total: int, word: str) -> None:
+    def _write_progress(self, what: str, left: float, word: str, ends: bool) -> None:
         """Rewrite the progress file, not too often; who cannot write it goes on all the same."""
         now = time.perf_counter()
-        if self._progress is None or (now - self._written < _FILE_EVERY_S and done < total):
+        if self._progress is None or (now - self._written < _FILE_EVERY_S and not ends):
             return
         self._written = now
-        label, begin, end = STAGES[what]
-        self._share = max(self._share, begin + (end - begin) * min(done / max(total, 1), 1.0))
+        total = self._total()
+        self._share = max(self._share, total / max(total + left, 1e-9))
         state = {
             "share": self._share,
-            "label": label,
+            "label": STAGES[what],
             # that of a field is on another scale
             "loss": word.removeprefix("loss to the edit ") if what == "optimize" else "",
-            "seconds": self._total(),
+            "seconds": total,
         }
         with suppress(OSError, ProgdfError), atomic_write(self._progress) as temporary_file:
             temporary_file.write_text(json.dumps(state, ensure_ascii=False), encoding="utf-8")

@@ -26,6 +26,7 @@ from progdf.field.trajectory import FILE_NAME
 from progdf.io.atomic import LOCK, LockedError, atomic_write, hold_lock, is_temporary, remove_abandoned
 from progdf.io.images import read_picture, write_image
 from progdf.io.json_values import decode_json
+from trainer.views.view import stored_pictures
 
 from .state import StateFolder
 
@@ -228,21 +229,22 @@ def write_views(folder: RunFolder, kind: str, pictures: Mapping[str, Tensor], st
     add_pictures(folder.views, paths)
 
 
-def read_views(folder: RunFolder, kind: str, names: Iterable[str], strength: float = 1.0) -> list[Tensor]:
-    """The pictures of the named views. [H,W,3] each
+def read_views(folder: RunFolder, kind: str, names: Iterable[str], strength: float = 1.0) -> Sequence[Tensor]:
+    """The pictures of the named views, see `stored_pictures`. [H,W,3] each
 
     Raises:
         ProgdfError: one is missing or broken.
     """
-    pictures = []
-    for name in names:
+
+    def read(name: str) -> Tensor:
         path = folder.view(kind, name, strength)
         try:
-            pictures.append(read_picture(path))
+            return read_picture(path)
         except ProgdfError as error:
             what = "is damaged" if path.is_file() else "is missing"
             raise ProgdfError(f"{path} {what}; train again, with --resume if the run was stopped") from error
-    return pictures
+
+    return stored_pictures(map(read, names))
 
 
 def remove_stale_views(folder: RunFolder, names: Sequence[str]) -> None:

@@ -18,8 +18,10 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn, Protocol
@@ -120,6 +122,14 @@ class Resumable(Protocol):
         ...
 
 
+_writing: dict[Path, Future[float]] = {}  # the last save of each folder that `wait` has not seen end
+
+
+@cache
+def _writer() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(1, thread_name_prefix="state")
+
+
 @dataclass(frozen=True)
 class StateFolder:
     """RUN/state.
@@ -167,13 +177,42 @@ class StateFolder:
         Raises:
             OSError: the disk is full or the folder is gone; what was saved before is still whole.
         """
-        path = self._file(part, index)
-        if index is not None and self.path.is_dir():
-            path.parent.mkdir(exist_ok=True)
+        self.save_later(part, tensors, values, index)
+        self.wait()
+
+    def save_later(
+        self, part: str, tensors: Mapping[str, Tensor], values: Mapping[str, Any], index: int | None = None
+    ) -> Future[float]:
+        """Have a thread save it, after all that it was given before: a disk can take seconds to flush a file.
+
+        Args:
+            part, values, index: see `save`
+            tensors: that nobody changes meanwhile
+
+        Returns:
+            How long it took, seconds. What it raises, `wait` and all later saves raise too.
+        """
+        path, before = self._file(part, index), _writing.get(self.path)
         header = {"values": json.dumps(dict(values), ensure_ascii=False)}
-        with atomic_write(path) as temporary_file:
-            write_tensors(temporary_file, tensors, header, checksum=True)
-            _flush(temporary_file)
+
+        def write() -> float:
+            if before is not None:
+                before.result()
+            begun = time.perf_counter()
+            if index is not None and self.path.is_dir():
+                path.parent.mkdir(exist_ok=True)
+            with atomic_write(path) as temporary_file:
+                write_tensors(temporary_file, tensors, header, checksum=True)
+                _flush(temporary_file)
+            return time.perf_counter() - begun
+
+        _writing[self.path] = _writer().submit(write)
+        return _writing[self.path]
+
+    def wait(self) -> None:
+        """Until all is saved. Raises OSError where something could not be, see `save`."""
+        if (writing := _writing.pop(self.path, None)) is not None:
+            writing.result()
 
     def load(self, part: str, index: int | None = None) -> Saved | None:
         """What was saved of a part; None where nothing was.
@@ -181,6 +220,7 @@ class StateFolder:
         Raises:
             ProgdfError: the file is damaged.
         """
+        self.wait()
         path = self._file(part, index)
         if not path.is_file():
             return None
@@ -211,6 +251,7 @@ class StateFolder:
 
     def end(self) -> None:
         """The run is finished: remove the folder."""
+        self.wait()
         self.clear()
         shutil.rmtree(self.path, ignore_errors=True)  # not if it is a link
 
@@ -223,7 +264,7 @@ class StateFolder:
 
 
 class PeriodicSave:
-    """Saves what trains together, in one file, every so often.
+    """Saves what trains together, in one file, every so often; training goes on while it is written.
 
     Args:
         folder: where to
@@ -240,11 +281,13 @@ class PeriodicSave:
         members: Mapping[str, Resumable],
         every_s: float | None = None,
     ) -> None:
-        self.seconds = 0.0
+        self.seconds = 0.0  # for which training stood still
         self.saves = 0
         self._folder, self._part, self._members = folder, part, members
         self._every_s = SAVE_EVERY if every_s is None else every_s
         self._last = time.perf_counter()
+        self._writing: Future[float] | None = None
+        self._written = 0.0  # seconds that the thread has written
 
     def restore(self) -> bool:
         """Give every member what was saved of it; False where nothing was."""
@@ -263,19 +306,33 @@ class PeriodicSave:
 
     def step_done(self) -> None:
         """Save if it is time to."""
-        cost = self.seconds / max(1, self.saves)
+        if self._writing is not None and not self._writing.done():
+            return
+        self._look()
+        cost = (self.seconds + self._written) / max(1, self.saves)
         if not self._every_s or time.perf_counter() - self._last >= max(self._every_s, cost / SHARE):
-            self.save()
+            self.save(waits=not self._every_s)
 
-    def save(self) -> None:
-        """Save now. Raises OSError where it cannot; the last save stays whole."""
+    def save(self, waits: bool = True) -> None:
+        """Save now, and wait until it is on the disk. Raises OSError where it cannot; the last save stays."""
         begun = time.perf_counter()
         parts = {name: member.capture_state() for name, member in self._members.items()}
-        tensors = {f"{name}/{key}": t for name, part in parts.items() for key, t in part.tensors.items()}
-        self._folder.save(self._part, tensors, {name: part.values for name, part in parts.items()})
+        tensors = {
+            f"{n}/{key}": t.detach().clone() for n, part in parts.items() for key, t in part.tensors.items()
+        }
+        values = {name: part.values for name, part in parts.items()}
+        self._writing = self._folder.save_later(self._part, tensors, values)
+        if waits:
+            self._look()
         self._last = time.perf_counter()
         self.seconds += self._last - begun
         self.saves += 1
+
+    def _look(self) -> None:
+        """Wait for what is written now, and raise what became of it."""
+        if self._writing is not None:
+            self._written += self._writing.result()
+            self._writing = None
 
 
 def generator(state: Tensor) -> torch.Generator:

@@ -445,7 +445,10 @@ class Runs(NamedTuple):
 
     rows: Array  # the Gaussian of each run, 0..M−1. [R] int32
     starts: Array  # first entry of each run, and the number of entries. [R+1] int64
-    pixels: Array  # of each entry, in the window, row by row. [E] int32
+    firsts: Array  # pixel of each run's first entry, in the window, row by row. [R] int32
+    pixels: (
+        Array  # of each entry, counted from its run's first. [E] uint16, in windows too wide for it uint32
+    )
     weights: Array  # αT of each entry. [E] float32
 
 
@@ -531,7 +534,7 @@ def _list_tile(
         mx, my = shape[MX] - x - 0.5, shape[MY] - y - 0.5
         first = max(math.ceil(my - shape[EXTENT_Y]), top)
         end = min(math.floor(my + shape[EXTENT_Y]) + 1, bottom)
-        begun = entry
+        begun, base = entry, 0
         for i in range(first, end):
             v = shape[L22] * (i - my)
             remaining = shape[R2] - v * v
@@ -554,12 +557,14 @@ def _list_tile(
                 through[i * TILE_W + j] = after
                 if rows[s] >= 0:
                     if write:
-                        out.pixels[entry] = (y - camera.window[1] + i) * width + x - camera.window[0] + j
+                        pixel = (y - camera.window[1] + i) * width + x - camera.window[0] + j
+                        base = pixel if entry == begun else base
+                        out.pixels[entry] = pixel - base
                         out.weights[entry] = alpha * before
                     entry += 1
         if entry > begun:
             if write:
-                out.rows[run], out.starts[run] = rows[s], begun
+                out.rows[run], out.starts[run], out.firsts[run] = rows[s], begun, base
             run += 1
     return run, entry
 

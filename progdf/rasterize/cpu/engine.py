@@ -298,17 +298,20 @@ def color_map(gaussians: ActivatedGaussians, camera: Camera, crop: Crop, rows: T
     listed[rows.numpy()] = np.arange(len(rows), dtype=np.int32)
     splats, lists = bin_view(gaussians, pinhole)
     counts = np.zeros((len(lists.starts) - 1, 2), np.int64)
-    share_tiles(list_weights, pinhole, splats, lists, pinhole, listed, False, counts, _new_runs(0, 0))
-    runs = _new_runs(*counts.sum(axis=0).tolist())
+    index = np.dtype(np.uint16 if TILE_H * (crop[2] - crop[0]) < 1 << 16 else np.uint32)
+    share_tiles(list_weights, pinhole, splats, lists, pinhole, listed, False, counts, _new_runs(0, 0, index))
+    run_count, entries = counts.sum(axis=0).tolist()
+    runs = _new_runs(run_count, entries, index)
     cursors = np.cumsum(counts, axis=0) - counts
     share_tiles(list_weights, pinhole, splats, lists, pinhole, listed, True, cursors, runs)
     x0, y0, x1, y1 = crop
     return ColorMap(len(rows), (y1 - y0, x1 - x0), runs)
 
 
-def _new_runs(runs: int, entries: int) -> Runs:
-    starts = np.full(runs + 1, entries, np.int64)
-    return Runs(np.empty(runs, np.int32), starts, np.empty(entries, np.int32), np.empty(entries, np.float32))
+def _new_runs(runs: int, entries: int, index: np.dtype[Any]) -> Runs:
+    """Room for them; `index`: of a pixel in its run."""
+    rows, firsts, starts = np.empty(runs, np.int32), np.empty(runs, np.int32), np.full(runs + 1, entries)
+    return Runs(rows, starts, firsts, np.empty(entries, index), np.empty(entries, np.float32))
 
 
 @kernel(fast=True, cache=True)
@@ -317,8 +320,11 @@ def add_images(runs: Runs, colors: Array, image: Array) -> None:
     for run in range(runs.rows.size):
         row = runs.rows[run]
         red, green, blue = colors[row, 0], colors[row, 1], colors[row, 2]
-        for k in range(runs.starts[run], runs.starts[run + 1]):
-            p, w = runs.pixels[k], runs.weights[k]
+        first = np.uint64(
+            runs.firsts[run]
+        )  # unsigned: numba looks at signed ones whether they count from the end
+        for k in range(np.uint64(runs.starts[run]), np.uint64(runs.starts[run + 1])):
+            p, w = first + np.uint64(runs.pixels[k]), runs.weights[k]
             image[p, 0] += w * red
             image[p, 1] += w * green
             image[p, 2] += w * blue
@@ -329,8 +335,9 @@ def add_gradients(runs: Runs, gradient: Array, by_colors: Array) -> None:
     """by_colors += Σ w·g. gradient: of the image, [h·w,3] float32; by_colors: [M,3] float32"""
     for run in range(runs.rows.size):
         red = green = blue = np.float32(0.0)
-        for k in range(runs.starts[run], runs.starts[run + 1]):
-            p, w = runs.pixels[k], runs.weights[k]
+        first = np.uint64(runs.firsts[run])
+        for k in range(np.uint64(runs.starts[run]), np.uint64(runs.starts[run + 1])):
+            p, w = first + np.uint64(runs.pixels[k]), runs.weights[k]
             red += w * gradient[p, 0]
             green += w * gradient[p, 1]
             blue += w * gradient[p, 2]
