@@ -26,6 +26,7 @@ from progdf.field.baked import (
     interpolate_at,
     remap_slider,
 )
+from progdf.field.choose import ADDED
 from progdf.gaussians import BASE_CHANNELS, pack
 from trainer.editors import COSTLY_STRENGTHS, check_editor
 from trainer.editors.base import ImageEditor
@@ -34,8 +35,6 @@ from trainer.setup import TrainingSetup, probe_views
 from trainer.store.progress import RunLog
 from trainer.views.crops import GEOMETRY, render_all
 from trainer.views.view import View
-
-from .fit import ADDED
 
 STEPS = 20
 """Equal steps that a user makes over the whole slider."""
