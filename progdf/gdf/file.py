@@ -195,7 +195,7 @@ def apply_grade(gdf: Gdf, scene: Gaussians, region: Region) -> Gdf:
     """The map of a grade on a region of any scene: its residual and its figures are of another one.
 
     Raises:
-        ProgdfError: it is no grade, or the region has no members.
+        ProgdfError: it is no grade, its colors are beyond any, or the region has no members.
     """
     stored = gdf.field.origin
     if not isinstance(stored, GradeForm):
@@ -206,6 +206,10 @@ def apply_grade(gdf: Gdf, scene: Gaussians, region: Region) -> Gdf:
         raise ProgdfError(f"the region for {gdf.name} has no Gaussians; give another")
     rows = pack(scene[region.members], with_shN=scene.sh_degree > 0)
     field = replace(bake_grade(without_residual(stored, len(region)), rows), recorded=())
+    try:
+        _check_reach(field)
+    except ValueError as error:
+        raise contradiction_error(gdf.name, error) from error
     report = {"residual_left_out": len(stored.residual) > 0}
     return Gdf(gdf.name, region, field, fingerprint(scene), gdf.instruction, report=report, applied=True)
 

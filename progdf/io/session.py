@@ -55,8 +55,8 @@ class FileRef(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class EditRef(FileRef, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """An edit that a session needs."""
 
-    region: str = ""  # name of the region that its grade is applied to; "" where it is the edit's own
-    members: bytes = b""  # which Gaussians that is, as a selection is stored
+    region: str = ""  # name of the region that its grade is applied to
+    members: bytes = b""  # which Gaussians that is, as a selection is stored; empty: the edit's own
 
 
 class SessionFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

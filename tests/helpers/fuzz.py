@@ -24,7 +24,9 @@ from PIL import ExifTags, Image
 
 from progdf.cli.info import describe
 from progdf.errors import ProgdfError
+from progdf.field.baked import lattice_colors
 from progdf.field.trajectory import load_trajectory, save_trajectory
+from progdf.formats.cube import read_cube, write_cube
 from progdf.formats.ply import load_ply, save_ply
 from progdf.gdf.file import load_gdf, save_gdf
 from progdf.io.cameras import load_cameras, save_cameras
@@ -110,6 +112,7 @@ def inputs(folder: Path, reader: str) -> dict[str, tuple[str, Callable[[Path], A
         "progdf_timeline": 1, "fps": 24, "length": 72, "ping_pong": False,
         "keys": [{"frame": 0, "strengths": {}, "camera": {"pivot": [0, 1, 0], "distance": 4}}, {"frame": 9}],
     }  # fmt: skip
+    write_cube(folder / "a.cube", lattice_colors(3), "colors")
     np.save(folder / "a.npy", np.arange(40, dtype=np.float32))
     exif = Image.Exif()
     exif[ExifTags.Base.Orientation] = 6
@@ -150,6 +153,7 @@ def inputs(folder: Path, reader: str) -> dict[str, tuple[str, Callable[[Path], A
         "session": ("s/x.session.json", use_session, both(read(saved))),
         "timeline": ("x.json", lambda p: timeline_file.load(p, ()), both(json.dumps(timeline).encode())),
         "cameras": ("x.json", load_cameras, [c for content in camera_files for c in both(content)]),
+        "cube": ("x.cube", read_cube, [changed_bytes(read(folder / "a.cube"))]),
         "npy": ("x.npy", open_npy, [changed_bytes(read(folder / "a.npy"))]),
         "pictures": ("x.png", read_picture, [changed_bytes(read(path)) for path in pictures]),
         "trajectory": (
@@ -183,6 +187,7 @@ READERS = (
     "session",
     "timeline",
     "cameras",
+    "cube",
     "npy",
     "pictures",
     "trajectory",

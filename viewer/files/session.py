@@ -127,8 +127,9 @@ def open_session(path: Path, memory: Path | None = None) -> WindowSession:
 
     def place(scene: Gaussians, index: int, name: str) -> Region | None:
         edit = file.edits[index]
-        mask = unpack(edit.members, len(scene)).copy()
-        return from_mask(edit.region, torch.from_numpy(mask)) if edit.region else None
+        if not edit.members:
+            return None
+        return from_mask(edit.region, torch.from_numpy(unpack(edit.members, len(scene)).copy()))
 
     opened = document.load(scene, gdfs, place)
     x, y, z = opened.scene.origin

@@ -567,3 +567,5 @@ def test_the_composer_adjusts_with_grades_of_other_scenes_and_tables_as_compose_
     rows = above.region.members
     expected = map_colors(once.sh[rows], table, 0)
     torch.testing.assert_close(both.sh[rows], expected, atol=2e-6, rtol=0)
+    weak = compose_layers(scene, [Layer(below), Layer(above, 0.6)], "adjust").sh[rows]
+    torch.testing.assert_close(weak, torch.lerp(once.sh[rows], expected, 0.6), atol=2e-6, rtol=0)

@@ -26,7 +26,7 @@ from progdf.field.grade import (
 )
 from progdf.formats.cube import read_cube, write_cube
 from progdf.gaussians import Gaussians, pack
-from progdf.gdf.file import load_gdf, read_gdf, save_gdf
+from progdf.gdf.file import apply_grade, load_gdf, read_gdf, save_gdf
 from progdf.region import from_mask, whole_scene
 from progdf.sh import C0, basis
 from tests.helpers.edits import curved_field, edit_of, some_rows
@@ -259,9 +259,13 @@ def test_only_a_grade_goes_on_a_region_of_another_scene_and_only_where_something
     with pytest.raises(ProgdfError, match="bent is no grade: its field is separable"):
         load_gdf(tmp_path / "bent.gdf", scene, place=lambda stored: whole_scene(scene))
     rows = pack(other[torch.arange(40)], with_shN=False)
-    save_gdf(
-        tmp_path / "look.gdf", edit_of(other, torch.arange(40), bake_grade(some_form(rows), rows), "look")
-    )
+    form = some_form(rows)
+    look = edit_of(other, torch.arange(40), bake_grade(form, rows), "look")
+    save_gdf(tmp_path / "look.gdf", look)
+    wild = replace(form, table=form.table * torch.tensor([1.0, 1.0, 1e30])[:, None, None])
+    absurd = replace(look, field=replace(look.field, origin=wild))
+    with pytest.raises(ProgdfError, match="farther than any scene reaches"):
+        apply_grade(absurd, scene, whole_scene(scene))
     with pytest.raises(ProgdfError, match="look has no Gaussians"):
         load_gdf(tmp_path / "look.gdf", scene, place=lambda stored: from_mask("", torch.zeros(300) > 0))
     with pytest.raises(ProgdfError, match="its grade goes on any scene with --region look=all") as refused:

@@ -9,13 +9,19 @@ from dataclasses import replace
 import moderngl
 import numpy as np
 import pytest
+import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from progdf.compose.reference import Gains, Layer, compose_layers
 from progdf.errors import ProgdfError
+from progdf.field.baked import BakedField
+from progdf.field.grade import lattice_form
+from progdf.gdf.file import apply_grade
 from progdf.rasterize import render
+from progdf.region import whole_scene
 from tests.helpers.count import Count
+from tests.helpers.edits import bits, edit_of
 from tests.helpers.stacks import EARS, SCARF, Stack, view_of
 from viewer.camera.view_camera import to_camera
 from viewer.gl.present import read_rgb
@@ -23,6 +29,7 @@ from viewer.render import engine as engine_module
 from viewer.render.dynamic_resolution import FrameTimings
 from viewer.render.engine import ViewEngine
 from viewer.render.gl_renderer import is_software
+from viewer.state.paint import decode, encode
 from viewer.state.view_state import LayerState, ViewState
 
 SIZE = (96, 72)
@@ -45,6 +52,30 @@ def test_the_picture_is_the_composed_scene_drawn(engine: ViewEngine, stack: Stac
     assert image.shape == (72, 96, 3)
     assert image.dtype == np.float32
     assert float(np.abs(image - expected).max()) <= 0.0101, "more than the early stop at 1e-4 explains"
+
+
+@pytest.mark.gl
+@pytest.mark.parametrize("draw", ["gl", "cpu"])
+def test_a_table_of_colors_over_an_edit_is_drawn_as_composed(
+    ctx: moderngl.Context, stack: Stack, draw: str
+) -> None:
+    table = torch.rand(125, 3, generator=torch.Generator().manual_seed(3))
+    members = torch.zeros(0, dtype=torch.int64)
+    field = BakedField("grade", torch.tensor([0.0, 1.0]), {}, 14, (), lattice_form(table))
+    look = apply_grade(edit_of(stack.scene, members, field, "look"), stack.scene, whole_scene(stack.scene))
+    made = ViewEngine(ctx, stack.scene, (*stack.gdfs, look), draw)
+    painted = encode(np.linspace(0.0, 1.0, len(look.region)))
+    for strength, paint in ((0.4, ""), (1.0, painted), (1.2, ""), (0.0, "")):
+        first = view_of(stack, 0.7, 0.4)
+        top = LayerState(len(stack.gdfs), "look", strength, gains=Gains(color=0.75), paint=paint)
+        view = replace(first, layers=(*first.layers, top), overshoot=True)
+        layers = [Layer(stack.gdfs[SCARF], 0.7), Layer(stack.gdfs[EARS], 0.4)]
+        layers.append(Layer(look, strength, gains=Gains(color=0.75), weights=decode(paint, len(look.region))))
+        expected = compose_layers(stack.scene, layers, "adjust")
+        assert bits(made.gaussians(view)) == bits(expected)
+        picture = render(expected, to_camera(view.camera, *SIZE)).image.numpy()
+        assert float(np.abs(made.image(view, SIZE) - picture).max()) <= 0.0101, "see above"
+    made.release()
 
 
 @pytest.mark.gl
