@@ -26,6 +26,7 @@ from trainer.optimize.color_solver import (
     iterations,
     make_solver,
     solve,
+    split_solver,
 )
 from trainer.optimize.groups import Groups, group_path, group_stage, restore_groups
 from trainer.optimize.losses import Losses, Objective, Perceptual, erode, loss_table
@@ -39,7 +40,7 @@ from trainer.optimize.pgs import (
     pgs_settings,
 )
 from trainer.optimize.retime import record, resolve_slider, retime, select_recordings, straight_recordings
-from trainer.optimize.solve_pictures import RECORDINGS, make_picture_solver, solve_pictures
+from trainer.optimize.ties import surface_ties
 from trainer.options import OptimizeOptions, TrainOptions
 from trainer.setup import Pictures, TrainingSetup, probe_views
 from trainer.store.progress import RunLog
@@ -159,7 +160,7 @@ def optimize_members(
         ProgdfError: the loss is not finite.
         KeyboardInterrupt: interrupted; the state is saved.
     """
-    scene, members, solver = setup.scene, setup.region.members, optimization.solver
+    scene, members = setup.scene, setup.region.members
     bands = optimization.sh != "off"
     original = pack(scene[members], with_shN=scene.sh_degree > 0)
     still = optimization.kind == "color" and optimization.rates == "kind"
@@ -173,14 +174,14 @@ def optimize_members(
     state, recordings = PgsState(original, settings.seed), Recordings(folder, original.shape)
     way: Way
     model: Model | None = None
-    if solver == "pictures":
+    if optimization.solver == "colors":
         with log.stage("weights"):
-            pictures = make_picture_solver(scene, members, crops, original, bands)
-        log.say(f"{pictures.unseen} members that no picture shows follow their own surface")
-        way = partial(solve_pictures, original, pictures, stages, state)
-    elif solver == "colors":
-        with log.stage("weights"):
-            colors = make_solver(crops, original)
+            few = options.views.pictures
+            ties = surface_ties(scene, members, [crop.camera for crop in crops]) if few else None
+            colors = make_solver(color_views(crops, original), original, ties)
+        if few:
+            unseen = len(members) - int(colors.asked.sum())
+            log.say(f"{unseen} members that no picture shows follow the map and their own surface")
         with log.stage("model"):
             model = _choose_model(colors, crops, stages, optimization, setup, edited, original, log)
         most = iterations(optimization.steps)
@@ -219,8 +220,6 @@ def _stages(optimization: OptimizeOptions, setup: TrainingSetup, edited: Picture
     steps = max(optimization.steps, len(edited) + 1)  # each stage is to have one
     if optimization.solver == "colors":
         return [TargetStage(s, _boxes(pictures, setup.train), 1) for s, pictures in edited.items()]
-    if optimization.solver == "pictures":
-        steps = max(RECORDINGS, 2 * len(edited))
     return [
         TargetStage(s, _boxes(pictures, setup.train), steps)
         for (s, pictures), steps in zip(edited.items(), _steps_by_stage(steps, len(edited)), strict=True)
@@ -242,18 +241,24 @@ def _choose_model(
     log: RunLog,
 ) -> Model:
     """How much of the edit is modelled, found on views that are held out, or on all where none are."""
-    judge = Judge(solver.views, stages[-1].targets)
+    finished = stages[-1].targets
+    trials, of = [(solver, Judge(solver.views, finished))], "all views, as none is held out"
     views = split_held_out(setup.held_out)[0]
     pictures = split_held_out(edited[max(edited)][len(setup.train) :])[0]
-    if views and pictures:
+    if solver.ties is not None:
+        trials, of = split_solver(solver, original, finished), "squares of the pictures that are held out"
+    elif views and pictures:
         made = [
             crop_scene(setup.scene, setup.region.members, v.camera, v.box, setup.background, True)
             for v in views
         ]
-        judge = Judge(color_views(made, original), _boxes(pictures, views))
+        trials, of = (
+            [(solver, Judge(color_views(made, original), _boxes(pictures, views)))],
+            ("views that are held out"),
+        )
     most_bands = 1 if optimization.sh == "off" else 4
-    model = choose_model(solver, judge, stages[-1].targets, iterations(optimization.steps), most_bands, _wait)
-    log.say(f"{model.line}, on {'views that are held out' if views else 'all views, as none is held out'}")
+    model = choose_model(solver, trials, finished, iterations(optimization.steps), most_bands, _wait)
+    log.say(f"{model.line}, on {of}")
     return model
 
 

@@ -15,7 +15,7 @@ from progdf.rasterize.cpu.engine import color_map
 from progdf.region import Region
 from progdf.sh import rgb_to_sh0
 from tests.helpers.scenes import random_gaussians
-from trainer.optimize.color_solver import Judge, Model, Solver, choose_model, make_solver, solve
+from trainer.optimize.color_solver import Judge, Model, Solver, choose_model, color_views, make_solver, solve
 from trainer.optimize.pgs import ParameterSnapshot, PgsState, TargetStage
 from trainer.setup import unresolved_share
 from trainer.views.crops import CropScene, crop_scene, render_all
@@ -55,14 +55,14 @@ def prepared(scene: Gaussians, cameras: list[Camera]) -> tuple[list[CropScene], 
 
 
 def model_of(solver: Solver, targets: list[Tensor], steps: int = 40, bands: int = 4) -> Model:
-    return choose_model(solver, Judge(solver.views, targets), targets, steps, bands, lambda: None)
+    return choose_model(solver, [(solver, Judge(solver.views, targets))], targets, steps, bands, lambda: None)
 
 
 def solved(scene: Gaussians, edited: Gaussians, cameras: list[Camera], steps: int = 40) -> Tensor:
     """Offsets of the edit of `scene` whose pictures are those of `edited`."""
     crops, original = prepared(scene, cameras)
     targets = render_all(crops, pack(edited, with_shN=scene.sh_degree > 0))
-    solver = make_solver(crops, original)
+    solver = make_solver(color_views(crops, original), original)
     stages, model = [TargetStage(1.0, targets, 1)], model_of(solver, targets, steps)
     found = solve(original, solver, model, stages, PgsState(original), lambda step, left: None, steps)
     return list[ParameterSnapshot](found)[-1].offsets
@@ -110,7 +110,7 @@ def test_a_color_below_zero_is_reached_through_clamps_that_lead_back() -> None:
     dark = replace(scene, sh0=rgb_to_sh0(torch.full((500, 3), -0.2)))
     crops, original = prepared(dark, orbit(3, 32))
     targets = render_all(crops, pack(scene, with_shN=False))
-    solver = make_solver(crops, original)
+    solver = make_solver(color_views(crops, original), original)
     nothing = torch.zeros(500, 1, 3)
     offsets = solver.residual(nothing, nothing, targets, 20, lambda: None)
     assert float((offsets > 0.0).float().mean()) > 0.5
@@ -123,7 +123,7 @@ def test_a_change_of_all_colors_is_a_map_alone_and_holds_where_no_view_looks() -
     cameras = orbit(8, 64)
     crops, original = prepared(scene, [cameras[0], cameras[4]])
     targets = render_all(crops, pack(edited, with_shN=True))
-    solver = make_solver(crops, original)
+    solver = make_solver(color_views(crops, original), original)
     model = model_of(solver, targets)
     assert (model.degree, model.bands) == (1, 0)
     offsets = solved(scene, edited, [cameras[0], cameras[4]])
@@ -137,7 +137,7 @@ def test_a_pattern_gets_a_residual_and_only_as_many_bands_as_pay() -> None:
     edited = replace(scene, sh0=scene.sh0 + 0.8 * side, shN=scene.shN)
     crops, original = prepared(scene, orbit(8, 64))
     targets = render_all(crops, pack(edited, with_shN=True))
-    solver = make_solver(crops, original)
+    solver = make_solver(color_views(crops, original), original)
     assert model_of(solver, targets).bands == 1
     turned = replace(edited, shN=scene.shN * (1.0 - 2.0 * side[..., None]))
     targets = render_all(crops, pack(turned, with_shN=True))
@@ -164,7 +164,7 @@ def test_what_was_stopped_goes_on_to_the_same_bits() -> None:
         TargetStage(s, render_all(crops, pack(replace(scene, sh0=scene.sh0 + s * side), with_shN=False)), 1)
         for s in (0.3, 0.6, 1.0)
     ]
-    solver = make_solver(crops, original)
+    solver = make_solver(color_views(crops, original), original)
     model = model_of(solver, list(stages[-1].targets))
     assert model.bands == 1
     whole = PgsState(original)
@@ -195,7 +195,7 @@ def test_one_thread_and_two_solve_to_the_same_bits(one_thread: None) -> None:
     for threads in (1, 2):
         torch.set_num_threads(threads)
         set_threads(threads)
-        solver, state = make_solver(crops, original), PgsState(original)
+        solver, state = make_solver(color_views(crops, original), original), PgsState(original)
         stages, model = [TargetStage(1.0, targets, 1)], model_of(solver, targets, 6)
         list(solve(original, solver, model, stages, state, lambda step, left: None, 6))
         ends.append(state.moved.detach())
@@ -208,7 +208,7 @@ def test_a_target_that_is_not_finite_stops_before_the_step() -> None:
     scene = dense_ball(200)
     crops, original = prepared(scene, orbit(2, 40))
     pictures = render_all(crops, original)
-    solver, state = make_solver(crops, original), PgsState(original)
+    solver, state = make_solver(color_views(crops, original), original), PgsState(original)
     model = model_of(solver, pictures)
     broken = [TargetStage(1.0, [torch.full_like(picture, torch.nan) for picture in pictures], 1)]
     with pytest.raises(FloatingPointError, match="the loss is nan at step 0"):
@@ -241,7 +241,7 @@ def test_hard_regions_give_finite_offsets_and_their_pictures(case: str) -> None:
     original = pack(scene[members], with_shN=True)
     before = render_all(crops, original)
     targets = [torch.lerp(picture, torch.tensor([0.2, 0.3, 0.8]), 0.5) for picture in before]
-    solver = make_solver(crops, original)
+    solver = make_solver(color_views(crops, original), original)
     model = model_of(solver, targets)
     stages, state = [TargetStage(1.0, targets, 1)], PgsState(original)
     list(solve(original, solver, model, stages, state, lambda step, left: None, 40))
