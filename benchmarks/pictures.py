@@ -92,7 +92,7 @@ def _rows(path: Path, edit: str) -> list[tuple[str, ...]]:
         targets = [crop(picture, view.box) for view, picture in zip(large, edited, strict=True)]
         trials = split_solver(solver, original, targets)
         model = choose_model(solver, trials, targets, STEPS, 1, lambda: None)
-        offsets = band_offsets(solver.finished(model, targets), original.shape[1])
+        offsets = band_offsets(solver.edit_offsets(model, targets), original.shape[1])
         took = time.process_time() - began
         found = scene.replace_rows(region.members, original + offsets)
         near: list[float] = []

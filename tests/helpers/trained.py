@@ -77,7 +77,7 @@ def edit_few(scene: Gaussians, members: Tensor, crops: list[CropScene], targets:
     ties = surface_ties(scene, members, [some.camera for some in crops])
     solver = make_solver(color_views(crops, original), original, ties)
     model = choose_model(solver, split_solver(solver, original, targets), targets, 100, 1, lambda: None)
-    return solver.finished(model, targets)
+    return solver.edit_offsets(model, targets)
 
 
 def label_mask(scene: Gaussians, member: Tensor, camera: Camera) -> Tensor:

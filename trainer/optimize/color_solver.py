@@ -11,11 +11,9 @@ How much of this a region gets (degree of the map; no residual, one of DC, or on
 views that are not solved for, at the full strength: the least of which more would take away less than a
 twentieth of the error.
 
-A handful of pictures (`Ties`) leaves most members undecided: a pixel is a mixture of many, some far behind
-others, and what no picture shows has no pixel at all. There neighbors on one surface have residuals alike,
-a member behind others is not asked by the pixels through which it hardly shines, and how far a residual
-travels before it fades into the map, or whether any map of the whole region is a good guess, is decided
-on squares of the pictures that are not solved for.
+A handful of pictures (`trainer.optimize.ties`) leaves most members undecided. There neighbors on one surface
+have residuals alike, what hardly shines through others is not asked, and how far a residual travels before it
+fades into the map is decided on squares of the pictures that are not solved for.
 """
 
 from __future__ import annotations
@@ -30,6 +28,7 @@ import numpy as np
 import torch
 from scipy.sparse import csr_matrix
 from torch import Tensor
+from torch.nn.functional import pad
 
 from progdf.field.baked import MONOMIALS, identity_map
 from progdf.field.grade import MOST_COLOR, band_offsets, map_colors, member_bands, monomials
@@ -286,7 +285,7 @@ class Solver:
         """The map that comes nearest to these pictures; of degree 0 the identity. [K,3]"""
         return self.maps.solve(degree, targets) if degree else identity_map(1)
 
-    def finished(self, model: Model, targets: Sequence[Tensor]) -> Tensor:
+    def edit_offsets(self, model: Model, targets: Sequence[Tensor]) -> Tensor:
         """What a model adds where it was chosen for these pictures. [M,B,3]"""
         mapped = self.map_offsets(model.degree, self.table(model.degree, targets))
         return add_bands(mapped, model.residual)
@@ -458,8 +457,7 @@ def choose_model(
 
     Args:
         solver: the views
-        trials: solvers to try it with, and views or pixels that these do not know: the views' own, or those
-            of `split_solver`
+        trials: solvers to try it with, and views or pixels that these do not know; see `split_solver`
         targets: the finished edit in the solver's views
         steps: most steps of conjugate gradients for a residual
         most_bands: that a residual may have: 1 or 4
@@ -473,7 +471,7 @@ def choose_model(
 
     def attempt(name: str, offsets: list[Tensor], start: list[Tensor], bands: int, hold: float) -> Attempt:
         """Residuals beside the map's offsets, of each trial, and the error with them."""
-        residuals = [widen_bands(one, bands) for one in start]
+        residuals = [pad(one, (0, 0, 0, bands - one.shape[1])) for one in start]
         if bands:
             residuals = [
                 by.residual(made, one, targets, steps, tell, hold)
@@ -509,13 +507,8 @@ def choose_model(
         zero = torch.zeros_like(residual)
         residual = solver.residual(map_with(solver, degree), zero, targets, steps, tell, best.hold)
     model = Model(degree, best.hold, residual, 0.0, [(name, decibels(error)) for name, error in tried])
-    floor = Judge(solver.views, targets).total(solver.finished(model, targets))
+    floor = Judge(solver.views, targets).total(solver.edit_offsets(model, targets))
     return replace(model, floor=floor)
-
-
-def widen_bands(residual: Tensor, bands: int) -> Tensor:
-    """A residual with zeros for further bands. [M,b,3] -> [M,bands,3]"""
-    return torch.cat([residual, torch.zeros(len(residual), bands - residual.shape[1], 3)], dim=1)
 
 
 def _inner(a: Tensor, b: Tensor) -> float:
