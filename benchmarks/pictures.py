@@ -14,14 +14,20 @@ from pathlib import Path
 import torch
 
 from progdf.errors import ProgdfError
+from progdf.field.grade import band_offsets
 from progdf.formats.scene_file import load_scene
 from progdf.gaussians import pack
 from progdf.metrics.image import decibels
 from progdf.scene.regions import parse_region
 from progdf.scene.up_axis import find_up
 from trainer.editors import make_editor
-from trainer.optimize.color_solver import color_columns
-from trainer.optimize.solve_pictures import make_picture_solver
+from trainer.optimize.color_solver import (
+    choose_model,
+    color_views,
+    make_solver,
+    split_solver,
+)
+from trainer.optimize.ties import surface_ties
 from trainer.options import EditorOptions
 from trainer.setup import quantize_image
 from trainer.views.crops import crop_scene
@@ -38,7 +44,7 @@ from trainer.views.view import (
 from .table import Table
 
 EDITS = ("stripes:#20a040", "recolor:#3060d0")
-RIG, SIZE, LARGE, NEAR = 36, 256, 512, 45.0
+RIG, SIZE, LARGE, NEAR, STEPS = 36, 256, 512, 45.0, 100
 GIVEN = ((0,), (9,), (27,), (0, 18), (0, 9, 18, 27))
 """Numbers of the rig's pictures: the front is 0."""
 
@@ -81,13 +87,14 @@ def _rows(path: Path, edit: str) -> list[tuple[str, ...]]:
         large = [view.widen([picture]) for view, picture in zip(large, edited, strict=True)]
         began = time.process_time()
         crops = [crop_scene(scene, region.members, v.camera, v.box, background, True) for v in large]
-        solver = make_picture_solver(scene, region.members, crops, original, True)
+        ties = surface_ties(scene, region.members, [view.camera for view in large])
+        solver = make_solver(color_views(crops, original), original, ties)
         targets = [crop(picture, view.box) for view, picture in zip(large, edited, strict=True)]
-        offsets = solver.solve(targets, torch.zeros(len(region), 1 + solver.bands.shape[1], 3))
+        trials = split_solver(solver, original, targets)
+        model = choose_model(solver, trials, targets, STEPS, 1, lambda: None)
+        offsets = band_offsets(solver.edit_offsets(model, targets), original.shape[1])
         took = time.process_time() - began
-        moved = original.clone()
-        moved[:, color_columns(original.shape[1], offsets.shape[1])] += offsets.flatten(1)
-        found = scene.replace_rows(region.members, moved)
+        found = scene.replace_rows(region.members, original + offsets)
         near: list[float] = []
         far: list[float] = []
         for i, view in enumerate(views):

@@ -17,7 +17,7 @@ from progdf.io.atomic import is_portable
 from progdf.metrics.image import NO_DIFFERENCE
 from trainer.editors import EXTERNAL, PER_VIEW
 from trainer.editors.instruct import parse_guidance
-from trainer.editors.pictures import picture_paths
+from trainer.editors.pictures import picture_paths, strengths_of
 from trainer.options import EditKind
 
 from .options import (
@@ -58,6 +58,9 @@ def resolve(options: TrainOptions) -> TrainOptions:
     family, _, what = options.editor.editor.partition(":")
     stages = min(optimize.stages, QUICK_STAGES) if quick else optimize.stages
     texts = options.texts
+    pictures = picture_paths(what) if family == "pictures" else ()
+    # where the finished edit alone is given, the way there is ours
+    paced = family not in EXTERNAL or (pictures and all(len(strengths_of(path)) == 1 for path in pictures))
     return replace(
         options,
         name=check_name(options.name or options.out.resolve().name),
@@ -66,14 +69,14 @@ def resolve(options: TrainOptions) -> TrainOptions:
             options.views,
             views=min(views or QUICK_VIEWS, QUICK_VIEWS) if quick else views,
             dense=not quick and family not in PER_VIEW,
-            pictures=picture_paths(what) if family == "pictures" else (),
+            pictures=pictures,
             scene=options.scene,
         ),
         optimize=replace(
             optimize,
             steps=min(optimize.steps, QUICK_STEPS) if quick else optimize.steps,
             stages=stages,
-            slider="even" if optimize.slider == "auto" and family not in EXTERNAL else optimize.slider,
+            slider="even" if optimize.slider == "auto" and paced else optimize.slider,
             seed=options.seed,
         ),
         field=replace(options.field, draft=quick, seed=options.seed),
@@ -112,7 +115,6 @@ def resolve_kind(options: TrainOptions, kind: EditKind, group_steps: int) -> Opt
         and not optimize.as_printed
         and not options.editor.reedit_every
     )
-    few = solves_colors and bool(options.views.pictures)
     weight, most = optimize.perceptual_weight, STAGES[kind]
     return replace(
         optimize,
@@ -123,7 +125,7 @@ def resolve_kind(options: TrainOptions, kind: EditKind, group_steps: int) -> Opt
         sh="on" if optimize.sh == "auto" and kind != "color" else optimize.sh,
         perceptual_weight=PERCEPTUAL_WEIGHT[kind] if weight is None else weight,
         sharpness=sharpness,
-        solver="pictures" if few else "colors" if solves_colors else "descent",
+        solver="colors" if solves_colors else "descent",
     )
 
 

@@ -18,8 +18,10 @@ from progdf.gaussians import Gaussians, pack
 from progdf.region import Region, from_mask
 from tests.helpers.demo_scenes import bear
 from trainer.editors import make_editor
+from trainer.optimize.color_solver import choose_model, color_views, make_solver, split_solver
 from trainer.optimize.losses import GradientL1, Objective
 from trainer.optimize.pgs import PgsSettings, TargetStage, learning_rates
+from trainer.optimize.ties import surface_ties
 from trainer.options import EditorOptions, OptimizeOptions, RegionOptions, TrainOptions, with_values
 from trainer.run.finish import RunResult
 from trainer.views.choose import choose_views
@@ -67,6 +69,15 @@ def course(case: Small, steps: int = 40, **more: object) -> Optimization:
         Objective(GradientL1(), OptimizeOptions(perceptual_weight=0.1)),
         settings,
     )
+
+
+def edit_few(scene: Gaussians, members: Tensor, crops: list[CropScene], targets: list[Tensor]) -> Tensor:
+    """What a handful of pictures changes of the members' lowest bands. [M,B,3]"""
+    original = pack(scene[members], with_shN=scene.sh_degree > 0)
+    ties = surface_ties(scene, members, [some.camera for some in crops])
+    solver = make_solver(color_views(crops, original), original, ties)
+    model = choose_model(solver, split_solver(solver, original, targets), targets, 100, 1, lambda: None)
+    return solver.edit_offsets(model, targets)
 
 
 def label_mask(scene: Gaussians, member: Tensor, camera: Camera) -> Tensor:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import pairwise, product
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +24,8 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from progdf.camera import Camera, undistort
+from progdf.color.edits import typical_color
+from progdf.color.oklab import Bend, bend_of, interpolate_colors
 from progdf.errors import ProgdfError
 from progdf.gaussians import ZERO, Gaussians, Origin
 from progdf.io.images import picture_size, read_picture, save_as
@@ -36,6 +38,7 @@ from trainer.views.view import BACKGROUND, View, seen_colors
 MOST_PICTURES = 32
 """More are a folder of views: what a handful needs would take long."""
 
+_LEAST_STRENGTHS = 8  # where several are given, those between them counted
 STEP = 1 / 255
 """What 8 bits, rounded on another machine, may differ by."""
 
@@ -48,33 +51,32 @@ _SKEWED = 0.02  # by which a picture may differ in its proportions from its came
 
 @dataclass(frozen=True)
 class PicturesEditor:
-    """Reads the changed pictures; see the module's head."""
+    """The changed pictures, and what lies between them: straight in OKLab, with a bow (`bend_of`)."""
 
-    scene: Gaussians  # the original
-    files: Mapping[str, Mapping[float, Path]]  # name of the view → strength → picture
-    stages: tuple[float, ...]  # the strengths, ascending
+    given: Mapping[str, Mapping[float, Tensor]]  # view's name → strength, 0 among them → picture. [H,W,3]
+    bends: Mapping[float, Bend]  # of the way to each strength from the one before
+    stages: tuple[float, ...]  # ascending; empty where the finished edit alone is given
     kind: EditKind = "color"
     is_confined: bool = False
 
     def edit(self, view: View, strength: float) -> Tensor:
-        """See `ImageEditor.edit`; ProgdfError where the picture is missing or broken.
-
-        What was changed is taken at the picture's own size, then shrunk: a picture that is shrunk differs
-        from a small render wherever the scene is fine.
-        """
-        if strength == 0.0:
-            return view.image
-        path, camera = self.files[view.camera.name][strength], view.camera
-        original, picture = read_change(self.scene, path, camera.resize(*picture_size(path)))
-        change = (lay_over(original, picture) - original).permute(2, 0, 1)[None]
-        shrunk = interpolate(change, size=(camera.height, camera.width), mode="area")[0].permute(1, 2, 0)
-        return (view.image + shrunk).clamp(0.0, 1.0)
+        """See `ImageEditor.edit`."""
+        given = self.given[view.camera.name]
+        if strength in given:
+            return given[strength]
+        before, after = max(s for s in given if s < strength), min(s for s in given if s > strength)
+        share = (strength - before) / (after - before)
+        return interpolate_colors(given[before], given[after], share, self.bends[after])
 
 
 def pictures(
     what: str, scene: Gaussians, region: Region, views: Sequence[View], options: EditorOptions
 ) -> PicturesEditor:
-    """`pictures:A.png[,B.png…]`: see the module's head; the views are the pictures', in their order."""
+    """`pictures:A.png[,B.png…]`: see the module's head; the views are the pictures', in their order.
+
+    Raises:
+        ProgdfError: a picture is missing or broken.
+    """
     found = [strengths_of(path) for path in picture_paths(what)]
     stages = sorted({strength for strengths in found for strength in strengths})
     for strengths in found:
@@ -82,8 +84,31 @@ def pictures(
             if strength not in strengths:
                 path = strengths[1.0].parent / f"{strength:g}" / strengths[1.0].name
                 raise ProgdfError(f"{path} is missing; every picture needs one of each strength")
-    names = [view.camera.name for view in views]
-    return PicturesEditor(scene, dict(zip(names, found, strict=True)), tuple(stages))
+    given = {
+        view.camera.name: {0.0: view.image} | {s: _read_edit(scene, view, path) for s, path in some.items()}
+        for view, some in zip(views, found, strict=True)
+    }
+    bends, ways = {}, list(pairwise((0.0, *stages)))
+    for before, after in ways:
+        first, last = (torch.cat([some[s] for some in given.values()]) for s in (before, after))
+        weights = (last - first).norm(dim=2)
+        bends[after] = bend_of(typical_color(first, weights), typical_color(last, weights))
+    parts = -(-_LEAST_STRENGTHS // len(stages))
+    between = [a + (b - a) * (k + 1) / parts for a, b in ways for k in range(parts - 1)]
+    return PicturesEditor(given, bends, tuple(sorted({*between, *stages})) if len(stages) > 1 else ())
+
+
+def _read_edit(scene: Gaussians, view: View, path: Path) -> Tensor:
+    """The view as a picture has changed it; ProgdfError where that is broken. [H,W,3]
+
+    What was changed is taken at the picture's own size, then shrunk: a picture that is shrunk differs
+    from a small render wherever the scene is fine.
+    """
+    camera = view.camera
+    original, picture = read_change(scene, path, camera.resize(*picture_size(path)))
+    change = (lay_over(original, picture) - original).permute(2, 0, 1)[None]
+    shrunk = interpolate(change, size=(camera.height, camera.width), mode="area")[0].permute(1, 2, 0)
+    return (view.image + shrunk).clamp(0.0, 1.0)
 
 
 def picture_paths(what: str) -> tuple[Path, ...]:

@@ -10,6 +10,10 @@ as a large one does. A member that no view shows follows the map.
 How much of this a region gets (degree of the map; no residual, one of DC, or one of two bands) is decided on
 views that are not solved for, at the full strength: the least of which more would take away less than a
 twentieth of the error. They also say when a strength has had enough steps.
+
+A handful of pictures (`trainer.optimize.ties`) leaves most members undecided. There neighbors on one surface
+have residuals alike, what hardly shines through others is not asked, and how far a residual travels before it
+fades into the map is decided on squares of the pictures that are not solved for.
 """
 
 from __future__ import annotations
@@ -17,15 +21,18 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from typing import Any, TypeVar
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple, TypeVar
 
+import numpy as np
 import torch
+from scipy.sparse import csr_matrix
 from torch import Tensor
+from torch.nn.functional import pad
 
 from progdf.field.baked import MONOMIALS, identity_map
 from progdf.field.grade import MOST_COLOR, band_offsets, map_colors, member_bands, monomials
-from progdf.gaussians import attribute_slices, unpack
+from progdf.gaussians import unpack
 from progdf.metrics.image import ROUNDING, decibels
 from progdf.rasterize.cpu.engine import ColorMap, color_map
 from progdf.sh import basis
@@ -34,6 +41,7 @@ from trainer.views.crops import CropScene
 
 from .losses import l1
 from .pgs import OnStep, ParameterSnapshot, PgsState, TargetStage
+from .ties import Ties
 
 STEPS_OF_OTHERS = 8
 """Steps of an optimizer that looks at one view at a time which one iteration over all views stands for."""
@@ -48,8 +56,17 @@ STEPS = "steps"
 """Of a recording's means: the steps that it took."""
 
 _RIDGE = 0.002  # of a typical member's weight: holds the residual of what hardly shows at 0
+_TIES = 0.001  # of a typical member's weight: ties neighbors, where views are few
+_TRUSTED = 0.1  # of the same: a member of less is rather as its neighbors are
+_HOLDS = (
+    1e-5,
+    1e-3,
+    1e-8,
+)  # ridges that are tried there: a residual goes some way, to its neighbors, around all
+_SQUARES = 6  # of a view's longer side, every other one of which is solved for while these are tried
 _MAP_RIDGE = 1e-6  # the same of the map's coefficients, for regions of few colors
 _MAP_HELD = 1e-2  # say of the members' own colors beside the pixels: there a map is held to the affine one
+_SHIFT_HELD = 1e-2  # of that: the affine map is held to the same change of all
 _COVERED = 0.05  # the region's weight in a pixel that the map is fitted to
 _MOST_PIXELS = 250_000  # for the some twenty coefficients of the map; of more, evenly spread ones
 _CLAMP_ROUNDS = 3  # of the map's least squares, for pixels that are white or black anyway
@@ -68,6 +85,7 @@ class ColorView:
     others: Tensor  # what all but the members show, unclamped. [h,w,3]
     basis: Tensor  # weight of each band in each member's color from here. [M,B]
     original: Tensor  # the members' unclamped colors as they were. [M,3]
+    counts: Tensor  # the pixels that are looked at. [h,w,1] bool
 
     def colors(self, offsets: Tensor) -> Tensor:
         """Unclamped. Offsets of the lowest bands [M,b,3] -> [M,3]"""
@@ -77,10 +95,18 @@ class ColorView:
         """Unclamped. [M,3] -> [h,w,3]"""
         return self.others + self.map.picture(colors.clamp_min(0.0))
 
-    def error(self, offsets: Tensor, target: Tensor) -> float:
-        """Sum of squared differences, of colors 0..1. [M,b,3], [h,w,3]"""
+    def error(self, offsets: Tensor, target: Tensor, power: float = 2.0) -> float:
+        """Sum of differences to some power, of colors 0..1. [M,b,3], [h,w,3]"""
         image = self.picture(self.colors(offsets)).clamp(0.0, 1.0)
-        return float((image - target).square().sum())
+        return float(((image - target) * self.counts).abs().pow(power).sum())
+
+    def halves(self) -> tuple[ColorView, ColorView]:
+        """The view with every other square of its pixels, and with the others."""
+        height, width = self.map.size
+        side = max(1, max(height, width) // _SQUARES)
+        rows, columns = torch.arange(height)[:, None, None] // side, torch.arange(width)[:, None] // side
+        even = (rows + columns) % 2 == 0
+        return replace(self, counts=self.counts & even), replace(self, counts=self.counts & ~even)
 
 
 def color_view(crop: CropScene, original: Tensor, bands: int) -> ColorView:
@@ -100,6 +126,7 @@ def color_view(crop: CropScene, original: Tensor, bands: int) -> ColorView:
         picture - weighed.picture(colors.clamp_min(0.0)),
         weights[:, :bands].contiguous(),
         colors,
+        torch.ones(*weighed.size, 1, dtype=torch.bool),
     )
 
 
@@ -124,24 +151,32 @@ class MapFit:
         """The map of least squares. [h,w,3] each -> [K,3]
 
         A polynomial goes astray beyond the colors that it was fitted to, and members that no picture shows
-        may have such: at all members' colors it is held to the affine map.
+        may have such: at all members' colors it is held to the affine map, and
+        that one to the same change of all.
         """
-        count, identity = MONOMIALS[degree], identity_map(degree)
-        design = self.design[:, :count].contiguous()
+        return identity_map(degree) + self._change(MONOMIALS[degree], targets)
+
+    def _change(self, count: int, targets: Sequence[Tensor]) -> Tensor:
+        """What is added to the identity's first coefficients: 1, 4, 10 or 20. [count,3]"""
+        design, target = self.design[:, :count].contiguous(), self._pixels(targets)
         normal, pull = self.normal[:count, :count], torch.zeros(count, 3, dtype=torch.float64)
-        if degree > 1:
-            affine = (self.solve(1, targets) - identity_map(1)).double()
-            normal, pull = normal + self.held[:count, :count], self.held[:count, :4] @ affine
+        if count > 1:
+            coarse = self._change(4 if count > 4 else 1, targets).double()
+            held = self.held[:count, :count] * (1.0 if count > 4 else _SHIFT_HELD)
+            normal, pull = normal + held, held[:, : len(coarse)] @ coarse
         normal = normal + _MAP_RIDGE * (normal.diagonal() + 1e-12).diag()
-        target = torch.cat([t.reshape(-1, 3)[p] for t, p in zip(targets, self.pixels, strict=True)])
-        original, table = design @ identity, identity
+        original, change = self.design[:, 1:4], torch.zeros(count, 3)
         for _ in range(_CLAMP_ROUNDS):
-            image = design @ table + self.others
+            image = original + design @ change + self.others
             clamped = ((image >= 1.0) & (target >= 1.0)) | ((image <= 0.0) & (target <= 0.0))
-            change = torch.where(clamped, image, target) - self.others - original
-            right = (design.T @ change).double() + pull
-            table = identity + torch.linalg.solve(normal, right).float()
-        return table
+            goal = torch.where(clamped, image, target) - self.others - original
+            right = (design.T @ goal).double() + pull
+            change = torch.linalg.solve(normal, right).float()
+        return change
+
+    def _pixels(self, images: Sequence[Tensor]) -> Tensor:
+        """[h,w,3] each -> [P,3]"""
+        return torch.cat([image.reshape(-1, 3)[p] for image, p in zip(images, self.pixels, strict=True)])
 
 
 @one_thread()
@@ -154,7 +189,7 @@ def fit_maps(views: Sequence[ColorView]) -> MapFit:
         terms = monomials(view.original.T.clamp(0.0, MOST_COLOR), 3).T
         planes: tuple[Tensor, ...] = torch.split(torch.cat([terms, terms[:, :1]], dim=1), 3, dim=1)
         shown = torch.cat([view.map.picture(plane).reshape(-1, 3) for plane in planes], dim=1)[:, :20]
-        pixels = (shown[:, 0] > _COVERED).nonzero()[::stride, 0]
+        pixels = ((shown[:, 0] > _COVERED) & view.counts.flatten()).nonzero()[::stride, 0]
         return shown[pixels], pixels
 
     laid = _map_threads(lay_out, views)
@@ -177,16 +212,21 @@ class Judge:
 
     def error(self, offsets: Tensor) -> float:
         """Mean squared difference, with that of the pictures' own rounding. [M,B,3]"""
-        count = max(1, sum(target.numel() for target in self.targets))
+        count = max(1, 3 * sum(int(view.counts.sum()) for view in self.views))
+        return ROUNDING + self.total(offsets) / count
+
+    def total(self, offsets: Tensor, power: float = 2.0) -> float:
+        """Sum of differences to some power. [M,B,3]"""
         pairs = list(zip(self.views, self.targets, strict=True))
-        return ROUNDING + sum(_map_threads(lambda pair: pair[0].error(offsets, pair[1]), pairs)) / count
+        return sum(_map_threads(lambda pair: pair[0].error(offsets, pair[1], power), pairs))
 
 
 @dataclass(frozen=True)
 class Model:
     """How much of an edit of colors is modelled."""
 
-    degree: int  # of the map
+    degree: int  # of the map; 0: none
+    hold: float  # of the residual at 0, as a share of a typical member's weight
     residual: Tensor  # of the finished edit: b of 0, 1 or 4 bands. [M,b,3]
     error: float  # mean square, of the finished edit in views not solved for: what is finer is not chased
     unedited: float  # the same of the original
@@ -214,7 +254,16 @@ class Model:
             f"and a residual of {self.bands} SH function{'s' * (self.bands > 1)}" if self.bands else "alone"
         )
         over = ", ".join(f"{name} {error:.1f}" for name, error in self.tried)
-        return f"a map of color of degree {self.degree} {residual}, the least within a twentieth; dB: {over}"
+        of_color = f"a map of color of degree {self.degree}" if self.degree else "no map"
+        return f"{of_color} {residual}, the least within a twentieth; dB: {over}"
+
+
+class Attempt(NamedTuple):
+    """What a model leaves in what was not solved for."""
+
+    error: float
+    residuals: list[Tensor]  # of each trial. [M,b,3]
+    hold: float  # see `Model.hold`
 
 
 @dataclass(frozen=True)
@@ -237,14 +286,22 @@ class Solver:
     # basis squared. [M,b,1]
     weights: Tensor
     maps: MapFit
+    ties: Ties | None  # None where views are many
+    asked: Tensor  # members whose residual is solved for. [M] bool
+    held: csr_matrix  # ties among these, as strong as they are to be. [M,M]
 
     def map_offsets(self, degree: int, table: Tensor) -> Tensor:
         """What a map adds. [K,3] -> [M,B,3]"""
-        return map_colors(self.sh, table, degree) - self.sh
+        return map_colors(self.sh, table, max(1, degree)) - self.sh
 
     def table(self, degree: int, targets: Sequence[Tensor]) -> Tensor:
-        """The map that comes nearest to these pictures. [K,3]"""
-        return self.maps.solve(degree, targets)
+        """The map that comes nearest to these pictures; of degree 0 the identity. [K,3]"""
+        return self.maps.solve(degree, targets) if degree else identity_map(1)
+
+    def edit_offsets(self, model: Model, targets: Sequence[Tensor]) -> Tensor:
+        """What a model adds where it was chosen for these pictures. [M,B,3]"""
+        mapped = self.map_offsets(model.degree, self.table(model.degree, targets))
+        return add_bands(mapped, model.residual)
 
     @one_thread()  # sums of members are added in an order that depends on the number of threads
     def residual(
@@ -254,6 +311,7 @@ class Solver:
         targets: Sequence[Tensor],
         steps: int,
         tell: Callable[[], None],
+        hold: float = _RIDGE,
         judge: Judge | None = None,
         floor: float = 0.0,
     ) -> tuple[Tensor, int]:
@@ -266,18 +324,42 @@ class Solver:
             targets: pictures of the views
             steps: most steps
             tell: called after each
+            hold: see `Model.hold`
             judge: the best in its views is kept, and steps end when they gain little there, see `SETTLED`;
                 None takes all
             floor: error in these views that counts as none, see `Model.error`
         """
-        base = _map_threads(lambda view: view.colors(mapped), self.views)
+        ridge, base = hold * self.typical, _map_threads(lambda view: view.colors(mapped), self.views)
+        look = None if judge is None else lambda now: judge.error(add_bands(mapped, now))
+        start = start * self.asked[:, None, None]
+        residual, first = self._descend(base, start, targets, ridge, steps, tell, look, floor)
+        if self.ties is None:
+            return residual, first
+        weights = self.asked * self.weights[:, 0, 0] / (_TRUSTED * self.typical)
+        around = self.ties.spread(residual, weights, hold / _TIES)
+        start = around * self.asked[:, None, None]
+        residual, more = self._descend(base, start, targets, ridge, steps, tell, look, floor)
+        return torch.where(self.asked[:, None, None], residual, around), first + more
+
+    def _descend(
+        self,
+        base: Sequence[Tensor],
+        start: Tensor,
+        targets: Sequence[Tensor],
+        ridge: float,
+        steps: int,
+        tell: Callable[[], None],
+        look: Callable[[Tensor], float] | None,
+        floor: float,
+    ) -> tuple[Tensor, int]:
+        """See `residual`; `base`: the colors in each view without it [M,3]; `look`: the judge's error."""
         curvature = self.weights[:, : start.shape[1]]
-        ridge = _RIDGE * float(curvature[:, :1].mean())
-        inverse = 1.0 / (curvature + ridge)
+        tied = torch.from_numpy(self.held.diagonal())[:, None, None]
+        inverse = self.asked[:, None, None] / (curvature + tied + ridge)
         now, pull = start, self._pull(base, start, targets, ridge)
         conditioned = along = inverse * pull.descent
         best, taken = now, 0
-        looks = [math.inf] * (_LOOKS - 1) + [judge.error(add_bands(mapped, now)) if judge else math.inf]
+        looks = [math.inf] * (_LOOKS - 1) + [math.inf if look is None else look(now)]
         while taken < steps:
             length = _inner(pull.descent, along) / max(self._curvature(pull, along, ridge), 1e-30)
             for share in _SHARES:
@@ -292,8 +374,8 @@ class Solver:
                 continue
             last, power = conditioned, _inner(pull.descent, conditioned)
             now, pull, taken = ahead, next_pull, taken + 1
-            if judge is not None:
-                error = judge.error(add_bands(mapped, now))
+            if look is not None:
+                error = look(now)
                 best = now if error < min(looks) else best
                 looks.append(error)
                 if looks[-1 - _LOOKS] - error <= _LOOKS * SETTLED * max(error, floor):
@@ -302,7 +384,18 @@ class Solver:
             turn = (_inner(pull.descent, conditioned) - _inner(pull.descent, last)) / power
             along = conditioned + max(0.0, turn) * along
             tell()
-        return (now if judge is None else best), taken
+        return (now if look is None else best), taken
+
+    @property
+    def typical(self) -> float:
+        """The mean weight of the members that are asked."""
+        return float(self.weights[self.asked, 0].mean())
+
+    def _hold(self, x: Tensor, ridge: float) -> Tensor:
+        """The gradient of half of what a residual costs beside the pixels. [M,b,3] -> [M,b,3]"""
+        if self.ties is None:
+            return ridge * x
+        return ridge * x + torch.from_numpy(self.held @ x.flatten(1).numpy()).view_as(x)
 
     def _pull(
         self, base: Sequence[Tensor], residual: Tensor, targets: Sequence[Tensor], ridge: float
@@ -313,17 +406,17 @@ class Solver:
             view, target = self.views[index], targets[index]
             colors = base[index] + torch.einsum("mb,mbc->mc", view.basis[:, : residual.shape[1]], residual)
             image = view.picture(colors)
-            squared = float((target - image.clamp(0.0, 1.0)).double().square().sum())
-            counts = ~(((image <= 0.0) & (target <= 0.0)) | ((image >= 1.0) & (target >= 1.0)))
+            squared = float(((target - image.clamp(0.0, 1.0)) * view.counts).double().square().sum())
+            counts = view.counts & ~(((image <= 0.0) & (target <= 0.0)) | ((image >= 1.0) & (target >= 1.0)))
             pull = view.map.gradient((target - image) * counts)
             drawn = (colors > 0.0) | (pull > 0.0)
             return drawn, counts, pull * drawn, squared
 
         seen = _map_threads(look, range(len(self.views)))
-        descent = -ridge * residual
+        descent = -self._hold(residual, ridge)
         for view, (_, _, pull, _) in zip(self.views, seen, strict=True):
             descent += view.basis[:, : residual.shape[1], None] * pull[:, None]
-        error = sum(squared for *_, squared in seen) + ridge * _inner(residual, residual)
+        error = sum(squared for *_, squared in seen) + _inner(residual, self._hold(residual, ridge))
         return _Pull(descent, error, [(drawn, counts) for drawn, counts, _, _ in seen])
 
     def _curvature(self, pull: _Pull, along: Tensor, ridge: float) -> float:
@@ -334,7 +427,7 @@ class Solver:
             colors = torch.einsum("mb,mbc->mc", view.basis[:, : along.shape[1]], along) * drawn
             return float((view.map.picture(colors) * counts).double().square().sum())
 
-        return sum(_map_threads(look, range(len(self.views)))) + ridge * _inner(along, along)
+        return sum(_map_threads(look, range(len(self.views)))) + _inner(along, self._hold(along, ridge))
 
     def left(self, offsets: Tensor, finished: Sequence[Tensor]) -> float:
         """Mean absolute difference from the finished edit. [M,B,3]"""
@@ -347,20 +440,33 @@ class Solver:
         return sum(found) / len(found)
 
 
-def make_solver(views: Sequence[ColorView], original: Tensor) -> Solver:
-    """The views, prepared to be solved for. `original`: raw member rows [M,14+]"""
+def make_solver(views: Sequence[ColorView], original: Tensor, ties: Ties | None = None) -> Solver:
+    """The views, prepared. `original`: raw member rows [M,14+]; `ties`: where the views are few."""
     ones = torch.ones(len(original), 3)
 
     def weigh(view: ColorView) -> Tensor:
-        return view.basis[:, :4].square() * view.map.gradient(view.map.picture(ones))[:, :1]
+        return view.basis[:, :4].square() * view.map.gradient(view.map.picture(ones) * view.counts)[:, :1]
 
     weights = torch.stack(_map_threads(weigh, views)).sum(dim=0)[..., None]
-    return Solver(views, member_bands(original), weights, fit_maps(views))
+    asked, held = (
+        torch.ones(len(original), dtype=torch.bool),
+        csr_matrix((len(original), len(original)), dtype=np.float32),
+    )
+    if ties is not None:
+        asked = ties.clear & (weights[:, 0, 0] > 0.0)
+        held = ties.of(asked) * np.float32(_TIES * weights[asked, 0].mean())
+    return Solver(views, member_bands(original), weights, fit_maps(views), ties, asked, held)
+
+
+def split_solver(solver: Solver, original: Tensor, targets: Sequence[Tensor]) -> list[tuple[Solver, Judge]]:
+    """Two trials for `choose_model` where no view is held out: some squares of all views, and the others."""
+    folds = tuple(zip(*(view.halves() for view in solver.views), strict=True))
+    return [(make_solver(folds[i], original, solver.ties), Judge(folds[1 - i], targets)) for i in (0, 1)]
 
 
 def choose_model(
     solver: Solver,
-    judge: Judge,
+    trials: Sequence[tuple[Solver, Judge]],
     targets: Sequence[Tensor],
     steps: int,
     most_bands: int,
@@ -368,33 +474,64 @@ def choose_model(
 ) -> Model:
     """The smallest model of which a larger one would take away less than a twentieth of the error.
 
+    Of a few pictures there is always a residual, or what single members got would not be in the edit; how far
+    it travels is what takes away most.
+
     Args:
         solver: the views
-        judge: views that are not solved for
+        trials: solvers to try it with, and views or pixels that these do not know; see `split_solver`
         targets: the finished edit in the solver's views
         steps: most steps of conjugate gradients for a residual
         most_bands: that a residual may have: 1 or 4
         tell: called between rounds
     """
     tried: list[tuple[str, float]] = []
-    mapped, errors = {}, {}
-    for degree in MONOMIALS:
-        mapped[degree] = solver.map_offsets(degree, solver.table(degree, targets))
-        errors[degree] = judge.error(mapped[degree])
-        tried.append((f"map of degree {degree}", errors[degree]))
-    degree = min(d for d in errors if MORE_PAYS * errors[d] <= min(errors.values()))
-    least = errors[degree]
-    residual = least_residual = torch.zeros(len(solver.sh), 0, 3)
-    for more in (1, 4)[: 1 + (most_bands > 1 and solver.sh.shape[1] > 1)]:
-        wider = torch.cat([residual, torch.zeros(len(residual), more - residual.shape[1], 3)], dim=1)
-        residual, _ = solver.residual(mapped[degree], wider, targets, steps, tell, judge)
-        error = judge.error(add_bands(mapped[degree], residual))
-        tried.append((f"with a residual of {more}", error))
-        if error < MORE_PAYS * least:
-            least_residual, least = residual, error
-    unedited = judge.error(torch.zeros_like(solver.sh))
+    few, zero = solver.ties is not None, torch.zeros(len(solver.sh), 0, 3)
+
+    def map_with(by: Solver, degree: int) -> Tensor:
+        return by.map_offsets(degree, by.table(degree, targets))
+
+    def attempt(name: str, offsets: list[Tensor], start: list[Tensor], bands: int, hold: float) -> Attempt:
+        """Residuals beside the map's offsets, of each trial, and the error with them."""
+        residuals = [pad(one, (0, 0, 0, bands - one.shape[1])) for one in start]
+        if bands:
+            residuals = [
+                by.residual(made, one, targets, steps, tell, hold, judge)[0]
+                for (by, judge), made, one in zip(trials, offsets, residuals, strict=True)
+            ]
+        total = zip(trials, offsets, residuals, strict=True)
+        error = sum(judge.error(add_bands(made, one)) for (_, judge), made, one in total) / len(trials)
+        tried.append((name, error))
+        return Attempt(error, residuals, hold)
+
+    def left_by(degree: int) -> float:
+        return sum(judge.total(made, 1.0) for (_, judge), made in zip(trials, mapped[degree], strict=True))
+
+    mapped = {degree: [map_with(by, degree) for by, _ in trials] for degree in (0, *MONOMIALS)}
+    start, by_degree = [zero for _ in trials], {}
+    # of what no picture shows a map is a guess: where it is the worse one for most that is shown, for less
+    # than about half of that is painted, there is none
+    degrees = (0,) if few and left_by(0) <= min(left_by(d) for d in MONOMIALS) else MONOMIALS
+    for degree in degrees:
+        name = f"map of degree {degree}" if degree else "no map"
+        by_degree[degree] = attempt(name, mapped[degree], start, int(few), _HOLDS[0] if few else _RIDGE)
+    least = min(one.error for one in by_degree.values())
+    degree = min(d for d, one in by_degree.items() if MORE_PAYS * one.error <= least)
+    best = last = by_degree[degree]
+    sizes = [(1, _RIDGE), (4, _RIDGE)][: 1 + (most_bands > 1 and solver.sh.shape[1] > 1)]
+    for bands, hold in [(1, hold) for hold in _HOLDS[1:]] if few else sizes:
+        name = f"residual held by {hold:g}" if few else f"with a residual of {bands}"
+        last = attempt(name, mapped[degree], last.residuals, bands, hold)
+        if last.error < (1.0 if few else MORE_PAYS) * best.error:
+            best = last
+    residual = best.residuals[0]
+    if few:  # the trials solved for a part of it
+        made, judge = map_with(solver, degree), Judge(solver.views, targets)
+        zero = torch.zeros_like(residual)
+        residual, _ = solver.residual(made, zero, targets, steps, tell, best.hold, judge, best.error)
+    unedited = sum(judge.error(torch.zeros_like(solver.sh)) for _, judge in trials) / len(trials)
     decided = [(name, decibels(error)) for name, error in tried]
-    return Model(degree, least_residual, least, unedited, decided)
+    return Model(degree, best.hold, residual, best.error, unedited, decided)
 
 
 def _inner(a: Tensor, b: Tensor) -> float:
@@ -460,6 +597,7 @@ def solve(
                 targets,
                 steps,
                 lambda: on_step(state.step, state.running),
+                model.hold,
                 judges[index],
                 model.error,
             )
@@ -478,14 +616,6 @@ def solve(
         state.stage, state.local = index + 1, 0
         yield ParameterSnapshot(state.step, index, True, state.average.clone(), state.means.read(), table)
         on_step(state.step, state.running)
-
-
-def color_columns(channels: int, bands: int) -> Tensor:
-    """Where DC and the lowest bands are in a packed row. [3·B] int64"""
-    slices = attribute_slices(channels)
-    dc = torch.arange(channels)[slices["sh0"]]
-    higher = torch.arange(channels)[slices["shN"]][: 3 * (bands - 1)] if bands > 1 else dc[:0]
-    return torch.cat([dc, higher])
 
 
 def _map_threads(work: Callable[[_A], _B], items: Sequence[_A]) -> list[_B]:

@@ -194,8 +194,6 @@ def describe_loss(options: OptimizeOptions, perceptual: str) -> str:
         options: with nothing left open, see `trainer.resolve.resolve_kind`
         perceptual: the name of the distance that is really used
     """
-    if options.solver == "pictures":
-        return "squared error, all pictures at once, neighbors tied"
     if options.solver == "colors":
         return "squared error, all views at once"
     terms = ["L1"]

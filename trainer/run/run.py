@@ -500,11 +500,10 @@ def _record(
         costs: dict[str, float] = {}
         if not only_recolors(trajectory.offsets) or trajectory.end.shape[1] > BASE_CHANNELS:
             choosing, _ = load_evaluator(folder, setup, setup.judging, trajectory).halves()
-            prunes = not (optimization.as_printed or optimization.solver == "pictures")
+            prunes = not optimization.as_printed
             trajectory, costs = drop_idle_attributes(trajectory, choosing, prunes)
         recorded, reason = len(trajectory), ""
-        # where pictures are solved for the solver lays the way
-        one_end = len(trajectory.strengths) == 1 and optimization.solver != "pictures"
+        one_end = len(trajectory.strengths) == 1
         if one_end and not optimization.as_printed and options.field.field != "neural":
             trajectory, reason = _choose_path(trajectory, options, optimization, setup, folder, log)
         else:

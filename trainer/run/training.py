@@ -31,6 +31,7 @@ from trainer.optimize.color_solver import (
     iterations,
     make_solver,
     solve,
+    split_solver,
 )
 from trainer.optimize.groups import Groups, group_path, group_stage, restore_groups
 from trainer.optimize.losses import Losses, Objective, Perceptual, erode, loss_table
@@ -44,7 +45,7 @@ from trainer.optimize.pgs import (
     pgs_settings,
 )
 from trainer.optimize.retime import record, resolve_slider, retime, select_recordings, straight_recordings
-from trainer.optimize.solve_pictures import RECORDINGS, make_picture_solver, solve_pictures
+from trainer.optimize.ties import Ties, surface_ties
 from trainer.options import Bands, OptimizeOptions, TrainOptions
 from trainer.setup import Pictures, TrainingSetup, probe_views
 from trainer.store.progress import RunLog
@@ -168,7 +169,7 @@ def optimize_members(
         ProgdfError: the loss is not finite.
         KeyboardInterrupt: interrupted; the state is saved.
     """
-    scene, members, solver = setup.scene, setup.region.members, optimization.solver
+    scene, members = setup.scene, setup.region.members
     bands = optimization.sh != "off"
     original = pack(scene[members], with_shN=scene.sh_degree > 0)
     still = optimization.kind == "color" and optimization.rates == "kind"
@@ -182,23 +183,23 @@ def optimize_members(
     state, recordings = PgsState(original, settings.seed), Recordings(folder, original.shape)
     way: Way
     model: Model | None = None
-    if solver == "pictures":
+    if optimization.solver == "colors":
         with log.stage("weights"):
-            pictures = make_picture_solver(scene, members, crops, original, bands)
-        log.say(f"{pictures.unseen} members that no picture shows follow their own surface")
-        way = partial(solve_pictures, original, pictures, stages, state)
-    elif solver == "colors":
-        most, given = iterations(optimization.steps), bool(options.views.views)
-        with log.stage("weights"):
+            few = options.views.pictures
+            ties = surface_ties(scene, members, [view.camera for view in setup.train]) if few else None
             drawn = color_views(crops, original)
             judging = _judging(setup, drawn, original, edited)
+        most, given = iterations(optimization.steps), bool(options.views.views)
         with log.stage("model"):
             judge = judging(edited[max(edited)])
             fewer = not given and judge.views is not drawn
             colors, model, line = choose_effort(
-                drawn, judge, stages[-1].targets, original, most, optimization.sh, fewer
+                drawn, judge, stages[-1].targets, original, most, optimization.sh, fewer, ties
             )
         log.say(line)
+        if few:
+            unseen = len(members) - int(colors.asked.sum())
+            log.say(f"{unseen} members that no picture shows follow the map and their own surface")
         if between is not None:
             edited = between(model.missed)
             stages = _stages(optimization, setup, edited)
@@ -245,8 +246,6 @@ def _stages(optimization: OptimizeOptions, setup: TrainingSetup, edited: Picture
     steps = max(optimization.steps, len(edited) + 1)  # each stage is to have one
     if optimization.solver == "colors":
         return [TargetStage(s, _boxes(pictures, setup.train), 1) for s, pictures in edited.items()]
-    if optimization.solver == "pictures":
-        steps = max(RECORDINGS, 2 * len(edited))
     return [
         TargetStage(s, _boxes(pictures, setup.train), steps)
         for (s, pictures), steps in zip(edited.items(), _steps_by_stage(steps, len(edited)), strict=True)
@@ -285,6 +284,7 @@ def choose_effort(
     most: int,
     sh: Bands,
     fewer: bool,
+    ties: Ties | None = None,
 ) -> tuple[Solver, Model, str]:
     """How much of a finished edit is modelled, from how many views, and why.
 
@@ -296,14 +296,17 @@ def choose_effort(
         most: steps of conjugate gradients
         sh: whether a residual may have more than one band
         fewer: every other view does, where all of them would take away less than a twentieth of the error
+        ties: where the views are a handful of pictures; squares of them decide
     """
     tried: list[tuple[Solver, Model]] = []
     for every in (2, 1) if fewer and len(views) > 3 else (1,):
-        solver = make_solver(views[::every], original)
-        model = choose_model(solver, judge, targets[::every], most, 1 if sh == "off" else 4, _wait)
+        solver = make_solver(views[::every], original, ties)
+        trials = [(solver, judge)] if ties is None else split_solver(solver, original, targets)
+        model = choose_model(solver, trials, targets[::every], most, 1 if sh == "off" else 4, _wait)
         tried.append((solver, model))
     solver, model = tried[MORE_PAYS * tried[0][1].error > tried[-1][1].error]
     on = "all views, as none is held out" if judge.views is views else "views that are held out"
+    on = on if ties is None else "squares of the pictures that are held out"
     line = f"{model.line}, on {on}"
     if len(tried) > 1:
         over = " and ".join(f"{decibels(m.error):.1f} dB from {len(s.views)} views" for s, m in tried)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -48,12 +49,15 @@ def test_a_picture_is_its_view_s_edit(tmp_path: Path) -> None:
     path = save(tmp_path / "A.png", 1 - 0.5 * shown, camera)
     (view,) = views_of(scene, path)
     editor = make_editor(EditorOptions(f"pictures:{path}"), scene, whole_scene(scene), [view])
-    assert editor.stages == (1.0,)
+    assert editor.stages == ()  # the way there is ours
     assert editor.kind == "color"
     assert torch.equal(editor.edit(view, 0.0), view.image)
     inside = view.mask > 0.99
     expected = 1 - 0.5 * view.image
     assert float((editor.edit(view, 1.0) - expected)[inside].abs().max()) < 0.01
+    way = [editor.edit(view, k / 8) for k in range(9)]
+    steps = [float((b - a)[inside].abs().mean()) for a, b in pairwise(way)]
+    assert min(steps) > 0.6 * max(steps)  # .8 when written: straight in OKLab, not one jump
 
 
 @pytest.mark.parametrize("color", [[0.0, 0.0, 0.0], [0.1, 0.3, 0.8]])
@@ -83,7 +87,7 @@ def test_subfolders_hold_the_strengths_between(tmp_path: Path) -> None:
     spec = f"pictures:{paths[0]},{paths[1]}"
     views = views_of(scene, *paths)
     editor = make_editor(EditorOptions(spec), scene, whole_scene(scene), views)
-    assert editor.stages == (0.5, 1.0)
+    assert editor.stages == tuple(k / 8 for k in range(1, 9))  # eight at least, those given among them
     half = editor.edit(views[1], 0.5)
     assert float((half - 0.75 * views[1].image)[views[1].mask > 0.99].abs().max()) < 0.02
     (tmp_path / "0.5" / "B.png").unlink()

@@ -64,7 +64,7 @@ def prepared(scene: Gaussians, cameras: list[Camera]) -> tuple[list[CropScene], 
 
 
 def model_of(solver: Solver, targets: list[Tensor], steps: int = 40, bands: int = 4) -> Model:
-    return choose_model(solver, Judge(solver.views, targets), targets, steps, bands, lambda: None)
+    return choose_model(solver, [(solver, Judge(solver.views, targets))], targets, steps, bands, lambda: None)
 
 
 def solve_all(
@@ -168,7 +168,7 @@ def test_a_pattern_gets_a_residual_and_only_as_many_bands_as_pay() -> None:
             for some in (crops, others)
         )
         judge = Judge(color_views(others, original), aside)
-        return choose_model(solver, judge, targets, 40, most, lambda: None).bands
+        return choose_model(solver, [(solver, judge)], targets, 40, most, lambda: None).bands
 
     solver = make_solver(color_views(crops, original), original)
     assert bands_of(edited) == 1
@@ -190,7 +190,7 @@ def test_steps_end_where_other_views_gain_little_and_go_on_where_members_are_den
     solver = make_solver(color_views(crops, original), original)
     mapped = solver.map_offsets(1, solver.table(1, targets))
     start, judge = torch.zeros(members, 1, 3), Judge(color_views(others, original), aside)
-    found, taken = solver.residual(mapped, start, targets, most, lambda: None, judge)
+    found, taken = solver.residual(mapped, start, targets, most, lambda: None, judge=judge)
     assert taken == most if members == 6000 else taken < most / 2
     further, all_steps = solver.residual(mapped, start, targets, most, lambda: None)
     assert all_steps == most or members == 200

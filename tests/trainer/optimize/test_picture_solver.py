@@ -8,10 +8,9 @@ import torch
 from torch import Tensor
 
 from progdf.camera import Camera, intrinsics, look_at
-from progdf.gaussians import ATTRIBUTES, Gaussians, pack
+from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.sh import C0, rgb_to_sh0
-from trainer.optimize.pgs import PgsState, TargetStage
-from trainer.optimize.solve_pictures import PictureSolver, fit_paint, make_picture_solver, solve_pictures
+from tests.helpers.trained import edit_few
 from trainer.views.crops import crop_scene
 from trainer.views.view import render_view
 
@@ -44,17 +43,18 @@ def ahead(width: float = 0.6) -> Camera:
     return Camera(viewmat, intrinsics(width, 96, 96), 96, 96)
 
 
-def solver_of(scene: Gaussians, camera: Camera) -> PictureSolver:
+def change_of(scene: Gaussians, camera: Camera, painted: Tensor) -> Tensor:
+    """What one picture changes of the members' colors. [M,3]"""
     members = torch.arange(len(scene))
     crops = [crop_scene(scene, members, camera, (0, 0, 96, 96), WHITE, True)]
-    return make_picture_solver(scene, members, crops, pack(scene), False)
+    return C0 * edit_few(scene, members, crops, [painted])[:, 0]
 
 
 def test_a_hidden_wall_is_not_painted_with_the_one_before_it() -> None:
     scene, camera = two_walls(), ahead()
     painted = render_view(scene, camera, WHITE).clamp(0, 1)
     painted[24:72, 24:72] = torch.tensor([0.1, 0.2, 0.9])
-    change = C0 * solver_of(scene, camera).solve([painted], torch.zeros(len(scene), 1, 3))[:, 0]
+    change = change_of(scene, camera, painted)
     middle = (scene.means[:, :2].abs() < 0.4).all(dim=1)
     front, back = middle & (scene.means[:, 2] == 0.0), middle & (scene.means[:, 2] > 0.0)
     assert float(change[front, 2].mean()) > 0.6  # of .7: it is blue
@@ -65,68 +65,21 @@ def test_what_lies_beside_the_picture_follows_a_fill() -> None:
     scene = wall(0.0, torch.tensor([0.8, 0.5, 0.2]))
     camera = ahead(0.3)  # the middle of the wall alone
     painted = render_view(scene, camera, WHITE).clamp(0, 1) * 0.5
-    change = C0 * solver_of(scene, camera).solve([painted], torch.zeros(len(scene), 1, 3))[:, 0]
+    change = change_of(scene, camera, painted)
     corner = (scene.means[:, :2].abs() > 0.9).all(dim=1)
     assert float((change[corner] - torch.tensor([-0.4, -0.25, -0.1])).abs().max()) < 0.05
 
 
 def test_what_lies_beside_the_picture_takes_the_nearest_of_two_paints() -> None:
     scene, camera = wall(0.0, torch.zeros(3)), ahead(0.3)
-    right = camera.viewmat[0, :3] @ scene.means.T  # beyond .5 it is out of sight, and darker
-    generator = torch.Generator().manual_seed(0)
-    gray = torch.where(right.abs() > 0.6, 0.35, 0.4 + 0.2 * torch.rand(len(scene), generator=generator))
+    right = camera.viewmat[0, :3] @ scene.means.T  # beyond .5 it is out of sight
+    gray = 0.4 + 0.2 * torch.rand(len(scene), generator=torch.Generator().manual_seed(0))
     scene = replace(scene, sh0=rgb_to_sh0(gray[:, None].expand(-1, 3)).clone())
     painted = torch.tensor([0.9, 0.2, 0.2]).expand(96, 96, 3).clone()
     painted[:, 48:] = torch.tensor([0.2, 0.2, 0.9])
-    change = C0 * solver_of(scene, camera).solve([painted], torch.zeros(len(scene), 1, 3))[:, 0]
+    change = change_of(scene, camera, painted)
     colors = gray[:, None] + change
     for side, channel in ((right < -0.8, 0), (right > 0.8, 2)):
         found = colors[side].mean(dim=0)
         assert float(found[channel] - found[2 - channel]) > 0.15  # of .7, where the other paint is far
-        assert abs(float(found[1]) - 0.2) < 0.03  # both paints, and not as much darker as it was before
-
-
-def test_the_way_is_recorded_and_goes_on_from_where_it_was_stopped() -> None:
-    scene, camera = two_walls(), ahead()
-    original, solver = pack(scene), solver_of(scene, camera)
-    painted = render_view(scene, camera, WHITE).clamp(0, 1).flip(2)
-    half = 0.5 * (painted + render_view(scene, camera, WHITE).clamp(0, 1))
-    stages = [TargetStage(0.5, [half], 4), TargetStage(1.0, [painted], 4)]
-
-    def ignore(step: int, left: float) -> None:
-        pass
-
-    whole = list(solve_pictures(original, solver, stages, PgsState(original), ignore))
-    assert [found.step for found in whole] == list(range(1, 9))
-    assert [found.ends_stage for found in whole] == [False, False, False, True] * 2
-    assert whole[-1].means["left"] < 0.1 * whole[0].means["left"]
-    state = PgsState(original)
-    first = solve_pictures(original, solver, stages, state, ignore)
-    for _ in range(6):
-        next(first)
-    first.close()
-    rest = list(solve_pictures(original, solver, stages, state, ignore))
-    assert torch.equal(rest[-1].offsets, whole[-1].offsets)
-
-
-def test_one_paint_explains_a_fill_and_stripes() -> None:
-    colors = torch.rand(400, 3, generator=torch.Generator().manual_seed(0)).double()
-    weights = torch.ones(400).double()
-    fill = 0.5 * colors + torch.tensor([0.0, 0.2, 0.4]) - colors
-    paint = fit_paint(colors, fill, weights)
-    assert paint.whole
-    assert paint.trust > 0.999
-    assert torch.allclose(paint.slope, -0.5 * torch.eye(3).double(), atol=1e-3)
-    striped = (torch.arange(400) % 2).double()
-    paint = fit_paint(colors, striped[:, None] * fill, weights)
-    assert not paint.whole
-    assert paint.trust > 0.95
-    assert float((paint.amounts - striped).abs().max()) < 0.1
-
-
-def test_an_edit_without_any_paint_is_not_trusted() -> None:
-    noise = torch.randn(400, 3, generator=torch.Generator().manual_seed(1)).double()
-    colors = torch.rand(400, 3, generator=torch.Generator().manual_seed(0)).double()
-    assert fit_paint(colors, noise, torch.ones(400).double()).trust < 0.6
-    still = fit_paint(colors, torch.zeros(400, 3).double(), torch.ones(400).double())
-    assert float(still.full.abs().max()) < 1e-6
+        assert abs(float(found[1]) - 0.2) < 0.03  # of both paints

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from progdf.camera import Camera, intrinsics, look_at
 from progdf.errors import ProgdfError
-from progdf.gaussians import Gaussians, pack
+from progdf.gaussians import Gaussians
 from progdf.io.images import save_as, to_picture
 from progdf.io.picture_camera import camera_chunk
 from progdf.scene.orbit_rig import orbit_rig
@@ -22,10 +22,9 @@ from progdf.scene.regions import check_region, parse_region
 from progdf.sh import rgb_to_sh0
 from tests.helpers.demo_scenes import bear
 from tests.helpers.scenes import random_gaussians
-from tests.helpers.trained import small
+from tests.helpers.trained import edit_few, small
 from trainer.editors import make_editor
 from trainer.editors.pictures import read_change
-from trainer.optimize.solve_pictures import make_picture_solver
 from trainer.options import EditorOptions, RegionOptions, ViewOptions
 from trainer.regions.changed import find_change
 from trainer.regions.from_pictures import RegionRequest, region_checks, region_kinds
@@ -205,8 +204,7 @@ def test_what_is_painted_on_a_thin_thing_s_front_does_not_show_from_behind(
     found = parse_region(region, scene, kinds=region_kinds(settings([path], tmp_path)))
     members, view = found.members, make_view(scene, found, camera, torch.ones(3))
     crops = [crop_scene(scene, members, camera, view.box, torch.ones(3), still=True)]
-    solver = make_picture_solver(scene, members, crops, pack(scene[members], with_shN=False), True)
-    offsets = solver.solve([crop(painted, view.box)], torch.zeros(len(members), 1, 3))
+    offsets = edit_few(scene, members, crops, [crop(painted, view.box)])
     edited = replace(scene, sh0=scene.sh0.index_add(0, members, offsets[:, 0]))
 
     def change(z: float) -> float:
