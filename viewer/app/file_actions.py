@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from progdf.camera import Camera
 from progdf.cli.info import kind_of
@@ -109,20 +110,37 @@ class EditActions:
     def __init__(self, app: Application) -> None:
         self._app = app
 
-    def add(self, path: Path) -> None:
-        """An edit on top, at full strength, so that one sees what came.
-
-        The second edit of a stack sets its rule, which there was no way to choose: two at 1 are not averaged.
+    def add(self, path: Path, name: str = "", strength: float = 1.0) -> None:
+        """An edit on top, see `add_layer`. `name`: the layer's, "" for the edit's
 
         Raises:
             ProgdfError: the file is missing, broken, or was made for another scene.
         """
         gdf = self._load(path)
-        before = self._app.main_view.work.view
-        if len(before.layers) == 1 and before.blend == "normalized":
-            before = replace(before, blend="adjust")
-        view = add_layer(before, self._open(gdf, path), gdf.name)
+        gdf = replace(gdf, name=name or gdf.name)
+        index = self._open(gdf, path)
+        view = add_layer(self._app.main_view.work.view, index, gdf.name, strength)
         self._apply(view, len(view.layers) - 1)
+
+    def finish(self, draft: Path, path: Path) -> bool:
+        """The trained edit in place of its draft, in every layer and entry of the history; whether one shows.
+
+        Nothing of the state changes: strength, gains, paint, order, selection and undo are as they were.
+
+        Raises:
+            ProgdfError: as for `add`.
+        """
+        document, view = self._app.document, self._app.main_view.work.view
+        drafts = [i for i, known in enumerate(document.gdf_paths) if known == draft]
+        if not drafts:
+            return False
+        gdf, gdfs, paths = self._load(path), list(document.gdfs), list(document.gdf_paths)
+        for i in drafts:
+            if not torch.equal(gdf.region.members, gdfs[i].region.members):
+                return False
+            gdfs[i], paths[i] = replace(gdf, name=gdfs[i].name), path
+        self._app.show(replace(document, gdfs=tuple(gdfs), gdf_paths=tuple(paths)))
+        return any(layer.gdf in drafts for layer in view.layers)
 
     def duplicate(self, index: int) -> None:
         """A copy of a layer above it, with an edit of its own: the timeline and undo tell edits apart."""

@@ -144,10 +144,14 @@ def free_name(view: ViewState, name: str) -> str:
     return free
 
 
-def add_layer(view: ViewState, gdf: int, name: str) -> ViewState:
-    """An edit of its own on top of the others, at full strength, so that one sees what came."""
-    layer = LayerState(gdf, free_name(view, name), strength=1.0)
-    return replace(view, layers=(*view.layers, layer))
+def add_layer(view: ViewState, gdf: int, name: str, strength: float = 1.0) -> ViewState:
+    """An edit of its own on top of the others, at full strength, so that one sees what came.
+
+    The second edit of a stack sets its rule, which there was no way to choose: two at 1 are not averaged.
+    """
+    if len(view.layers) == 1 and view.blend == "normalized":
+        view = replace(view, blend="adjust")
+    return replace(view, layers=(*view.layers, LayerState(gdf, free_name(view, name), strength)))
 
 
 def remove_layer(view: ViewState, index: int) -> ViewState:
