@@ -39,7 +39,7 @@ CARRIED = 0.1
 """Of what an edit changes, mean square: a grade that leaves more does not carry it."""
 
 _SIZE = 192  # pixels of a view; smaller ones mix colors, and the region's typical color with them
-_ROUNDS, _VIEWS = 3, 5  # most rounds of new views, and views of a round, of which one is not fitted to
+_ROUNDS, _VIEWS = 5, 3  # most rounds of new views, and views of a round, of which one is not fitted to
 _SECONDS = 0.5  # of the processor, after which no round follows
 _SETTLED = 0.99  # of the error: what the views of a round must get it below, for another round to follow
 _FITTED, _JUDGED = 1500, 500  # pixels that represent those of all views; a map has 60 numbers at most
@@ -201,7 +201,7 @@ def _thin(row: View) -> View:
 
 
 def _knots(judged: _Pixels, table: Tensor, expected: Sequence[Tensor]) -> int:
-    """Every which of the maps is enough, as those between cost a hundredth of the error at most. [S,K,3]"""
+    """Every which of the maps is enough: those between take at most a twentieth away. [S,K,3]"""
     strengths = torch.arange(len(table))
 
     def error(every: int) -> float:
@@ -211,7 +211,7 @@ def _knots(judged: _Pixels, table: Tensor, expected: Sequence[Tensor]) -> int:
         return sum(_error(judged.picture(t), e) for t, e in zip(course[1:], expected, strict=True))
 
     least = error(1)
-    return next(every for every in (8, 4, 2, 1) if _SETTLED * error(every) <= least)
+    return next(every for every in (8, 4, 2, 1) if MORE_PAYS * error(every) <= least)
 
 
 def _drawn_error(views: DraftViews, table: Tensor, degree: int, expected: Tensor) -> float:
