@@ -31,12 +31,12 @@ from progdf.cli.options import parse_options
 from progdf.errors import ProgdfError
 from progdf.formats.scene_file import load_scene
 from progdf.gaussians import Gaussians
-from progdf.gdf.file import save_gdf
+from progdf.gdf.file import Gdf, save_gdf
 from progdf.io.images import write_image
 from progdf.region import Region
 from progdf.scene.regions import parse_region
 from trainer.editors import COLOR_FUNCTIONS, ImageEditor, check_new_editor, make_editor
-from trainer.fit.draft import Draft, DraftViews, draft_grade, draft_views
+from trainer.fit.draft import DraftViews, draft_grade, draft_views
 from trainer.options import EditorOptions, RegionOptions, ViewOptions
 from trainer.regions.from_pictures import RegionRequest, region_kinds
 from trainer.views.view import View, make_view, with_near_plane
@@ -96,7 +96,7 @@ class Previewer:
         self._editor = lru_cache(maxsize=2)(self._make_editor)
         self._draft: tuple[str, DraftViews | None] = "", None  # the last one's region, and its views
 
-    def grade(self, request: Request) -> Draft | None:
+    def grade(self, request: Request) -> Gdf | None:
         """A grade alone of the edit; None where none carries it.
 
         Raises:
@@ -188,7 +188,7 @@ def answer(previewer: Previewer, line: str) -> Answer:
         return Answer(-1, f"the request cannot be read: {error}")
     try:
         if (draft := previewer.grade(request)) is not None:
-            save_gdf(Path(request.out).with_suffix(".gdf"), draft.gdf)
+            save_gdf(Path(request.out).with_suffix(".gdf"), draft)
             return Answer(request.number, made="grade")
         write_image(Path(request.out), previewer.picture(request))
     except (ProgdfError, OSError) as error:

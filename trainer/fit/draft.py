@@ -70,15 +70,6 @@ class DraftViews:
     judged: _Pixels  # of views that nothing is fitted to
 
 
-@dataclass(frozen=True)
-class Draft:
-    """A grade alone of an edit."""
-
-    gdf: Gdf  # as a file keeps it: its field is not baked
-    degree: int
-    db: float  # in the views that are not fitted to, at strength 1, against the editor's own pictures
-
-
 def draft_views(options: ViewOptions, editor: str, scene: Gaussians, region: Region) -> DraftViews | None:
     """A few small views; more of them as long as these take a hundredth of the error away.
 
@@ -160,9 +151,12 @@ def _error(picture: Tensor, expected: Tensor) -> float:
     return ROUNDING + float((picture - expected[0]).square().mean())
 
 
-def draft_grade(views: DraftViews, options: EditorOptions, name: str) -> Draft | None:
-    """The grade that comes nearest to an edit at strengths that are evenly visible; None where it leaves more
-    than `CARRIED` of it, or the editor is no function of color.
+def draft_grade(views: DraftViews, options: EditorOptions, name: str) -> Gdf | None:
+    """The grade that comes nearest to an edit at strengths that are evenly visible, its field not baked; None
+    where it leaves more than `CARRIED` of it, or the editor is no function of color.
+
+    `draft` in its report has the map's degree, and its dB at strength 1 to the editor's own pictures of the
+    views that it was not fitted to.
 
     Raises:
         ProgdfError: there is no such editor.
@@ -190,8 +184,7 @@ def draft_grade(views: DraftViews, options: EditorOptions, name: str) -> Draft |
     channels = BASE_CHANNELS + 3 * views.scene.shN.shape[1]
     field = BakedField("grade", torch.tensor([0.0, 1.0]), {}, channels, tuple(knots.tolist()), form)
     about = {"draft": {"degree": degree, "psnr": round(decibels(error), 2)}}
-    gdf = Gdf(name, views.region, field, fingerprint(views.scene), options.editor, report=about)
-    return Draft(gdf, degree, decibels(error))
+    return Gdf(name, views.region, field, fingerprint(views.scene), options.editor, report=about)
 
 
 def _thin(row: View) -> View:

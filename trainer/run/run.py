@@ -324,10 +324,10 @@ def _write_draft(
     if draft is None:
         log.say("no draft: one map of color does not carry this edit")
         return
-    save_gdf(folder.draft, draft.gdf)
+    save_gdf(folder.draft, draft)
     log.say(
-        f"{folder.draft} after {time.perf_counter() - began:.1f} s: a grade of degree {draft.degree}, "
-        f"{draft.db:.1f} dB in views that it was not fitted to; training goes on"
+        "{} after {:.1f} s: a grade of degree {degree}, {psnr:.1f} dB in views that it was not fitted to; "
+        "training goes on".format(folder.draft, time.perf_counter() - began, **draft.report["draft"])
     )
 
 

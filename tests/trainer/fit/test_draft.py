@@ -36,7 +36,7 @@ def drafted(editor: str, folder: Path) -> Gdf:
     """The draft of an edit of the bear's body as a window loads it."""
     made = draft_grade(views(), EditorOptions(editor), "blue")
     assert made is not None
-    save_gdf(folder / "draft.gdf", made.gdf)
+    save_gdf(folder / "draft.gdf", made)
     return load_gdf(folder / "draft.gdf", small("body").scene)
 
 
