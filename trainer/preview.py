@@ -1,10 +1,12 @@
-"""`progdf preview`: an editor's own pictures of views, for the window, by JSON lines in and out.
+"""`progdf preview`: what an edit will be, for the window, by JSON lines in and out.
 
     {"number": 3, "out": "3.png", "region": "all", "editor": "recolor:#3060d0", "strength": 0.7,
      "background": [1, 1, 1], "viewmat": [[…]], "K": [[…]], "width": 640, "height": 480}
-    {"number": 3, "error": ""}
+    {"number": 3, "error": "", "made": "grade"}
 
-Requests that a later one has overtaken are passed over. It ends when its input does.
+Where one map of color carries the edit the answer is a grade of it, 3.gdf beside 3.png, for every strength
+and from every side; else the editor's own picture of the view. Requests that a later one has overtaken are
+passed over. It ends when its input does.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import msgspec
 import torch
@@ -29,10 +31,12 @@ from progdf.cli.options import parse_options
 from progdf.errors import ProgdfError
 from progdf.formats.scene_file import load_scene
 from progdf.gaussians import Gaussians
+from progdf.gdf.file import Gdf, save_gdf
 from progdf.io.images import write_image
 from progdf.region import Region
 from progdf.scene.regions import parse_region
-from trainer.editors import ImageEditor, check_new_editor, make_editor
+from trainer.editors import COLOR_FUNCTIONS, ImageEditor, check_new_editor, make_editor
+from trainer.fit.draft import DraftViews, draft_grade, draft_views
 from trainer.options import EditorOptions, RegionOptions, ViewOptions
 from trainer.regions.from_pictures import RegionRequest, region_kinds
 from trainer.views.view import View, make_view, with_near_plane
@@ -44,14 +48,14 @@ _Side = Annotated[int, msgspec.Meta(ge=1, le=4096)]
 
 @dataclass(frozen=True)
 class PreviewOptions:
-    """Serve an editor's own pictures of views; for the window."""
+    """Serve what edits will be, as grades or as pictures; for the window."""
 
     scene: tyro.conf.Positional[Path]
     """The scene."""
 
 
 class Request(msgspec.Struct, frozen=True):
-    """A picture that is wanted: where it goes, what is edited how, and from where one looks.
+    """An edit that is to be seen: where its picture goes, what is edited how, and from where one looks.
 
     `viewmat` is relative to the origin of the scene, which window and child load alike.
     """
@@ -69,14 +73,15 @@ class Request(msgspec.Struct, frozen=True):
 
 
 class Answer(msgspec.Struct):
-    """The request's number, and why there is no picture; "" where there is."""
+    """The request's number, what was made, and why nothing is; "" where it is."""
 
     number: int
     error: str = ""
+    made: Literal["picture", "grade"] = "picture"
 
 
 class Previewer:
-    """Pictures of one scene; what two requests have in common is made once.
+    """Grades and pictures of one scene; what two requests have in common is made once.
 
     Args:
         path: the scene's file
@@ -89,6 +94,24 @@ class Previewer:
         self._region = lru_cache(maxsize=4)(self._find_region)
         self._view = lru_cache(maxsize=2)(self._make_view)
         self._editor = lru_cache(maxsize=2)(self._make_editor)
+        self._draft: tuple[str, DraftViews | None] = "", None  # the last one's region, and its views
+
+    def grade(self, request: Request) -> Gdf | None:
+        """A grade alone of the edit; None where none carries it.
+
+        Raises:
+            ProgdfError: region or editor do not work.
+        """
+        options = EditorOptions(request.editor)
+        check_new_editor(options)
+        if options.family not in COLOR_FUNCTIONS:
+            return None
+        if self._draft[0] != request.region:
+            region = self._region(request.region)
+            views = draft_views(ViewOptions(scene=self._path), request.editor, self._scene, region)
+            self._draft = request.region, views
+        views = self._draft[1]
+        return None if views is None else draft_grade(views, options, options.family)
 
     def picture(self, request: Request) -> Tensor:
         """The view as the editor makes it. [H,W,3] 0..1
@@ -158,12 +181,15 @@ def serve(argv: Sequence[str]) -> int:
 
 
 def answer(previewer: Previewer, line: str) -> Answer:
-    """Write the picture that a line asks for; what went wrong is in the answer."""
+    """Write what a line asks for; what went wrong is in the answer."""
     try:
         request = msgspec.json.decode(line, type=Request)
     except msgspec.MsgspecError as error:
         return Answer(-1, f"the request cannot be read: {error}")
     try:
+        if (draft := previewer.grade(request)) is not None:
+            save_gdf(Path(request.out).with_suffix(".gdf"), draft)
+            return Answer(request.number, made="grade")
         write_image(Path(request.out), previewer.picture(request))
     except (ProgdfError, OSError) as error:
         return Answer(request.number, " ".join(str(error).split()))

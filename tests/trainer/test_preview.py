@@ -1,4 +1,4 @@
-"""`progdf preview`: an editor's own picture of a view, asked for and answered in lines."""
+"""`progdf preview`: a grade of an edit, or its editor's own picture, asked for and answered in lines."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import pytest
 
 from progdf.__main__ import main
 from progdf.formats.ply import save_ply
+from progdf.gdf.file import load_gdf
 from progdf.io.images import read_picture
 from tests.helpers.demo_scenes import bear
 from trainer.preview import Previewer, answer, newest_line
@@ -44,10 +45,21 @@ def request(number: int, out: Path, **changes: object) -> str:
 def test_strength_0_is_the_original_and_1_is_not(scene: Path, tmp_path: Path) -> None:
     previewer = Previewer(scene, tmp_path / "kept")
     for number, strength in enumerate((0.0, 0.5, 1.0)):
-        assert answer(previewer, request(number, tmp_path, strength=strength)).error == ""
+        line = request(number, tmp_path, strength=strength, editor="stripes:#3060d0")
+        assert (answer(previewer, line).error, answer(previewer, line).made) == ("", "picture")
     original, half, edited = (read_picture(tmp_path / f"{number}.png") for number in range(3))
     change = [(picture - original).abs().mean() for picture in (half, edited)]
     assert 0.0 < float(change[0]) < float(change[1])
+
+
+def test_an_edit_that_a_map_of_color_carries_is_answered_with_a_grade(scene: Path, tmp_path: Path) -> None:
+    previewer = Previewer(scene, tmp_path / "kept")
+    for number, editor in enumerate(("recolor:#3060d0", "darken:0.5")):
+        told = answer(previewer, request(number, tmp_path, editor=editor))
+        assert (told.error, told.made) == ("", "grade")
+        gdf = load_gdf(tmp_path / f"{number}.gdf", previewer.scene)
+        assert (gdf.field.kind, gdf.instruction) == ("grade", editor)
+        assert not (tmp_path / f"{number}.png").exists()
 
 
 def test_what_does_not_work_is_one_line_and_the_next_request_does(scene: Path, tmp_path: Path) -> None:

@@ -37,6 +37,9 @@ and all options of editors."""
 PER_VIEW = ("folder", "photographs", "style", "instruct")
 """Kinds whose views are edited one by one, so that nothing makes them agree."""
 
+COLOR_FUNCTIONS = ("recolor", "tint", "darken", "night")
+"""Kinds that give each color another one, wherever it is."""
+
 EXTERNAL = ("folder", "photographs", "pictures")
 """Kinds whose pictures were made elsewhere, at the strengths that they were made at."""
 
@@ -99,6 +102,7 @@ def make_editor(
 
 
 __all__ = [
+    "COLOR_FUNCTIONS",
     "COSTLY_STRENGTHS",
     "EDITORS",
     "EXTERNAL",

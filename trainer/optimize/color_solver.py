@@ -180,25 +180,24 @@ class MapFit:
 
 
 @one_thread()
-def fit_maps(views: Sequence[ColorView]) -> MapFit:
-    """Prepare the views for maps of any degree."""
-    total = sum(math.prod(view.map.size) for view in views)
-    stride = max(1, -(-total // _MOST_PIXELS))
+def fit_maps(views: Sequence[ColorView], most: int = _MOST_PIXELS) -> MapFit:
+    """Prepare the views for maps of any degree. `most`: pixels that they are fitted to"""
 
-    def lay_out(view: ColorView) -> tuple[Tensor, Tensor]:
-        terms = monomials(view.original.T.clamp(0.0, MOST_COLOR), 3).T
-        planes: tuple[Tensor, ...] = torch.split(torch.cat([terms, terms[:, :1]], dim=1), 3, dim=1)
-        shown = torch.cat([view.map.picture(plane).reshape(-1, 3) for plane in planes], dim=1)[:, :20]
-        pixels = ((shown[:, 0] > _COVERED) & view.counts.flatten()).nonzero()[::stride, 0]
-        return shown[pixels], pixels
+    def lay_out(view: ColorView) -> tuple[Tensor, Tensor, Tensor]:
+        terms = monomials(view.original.T.clamp(0.0, MOST_COLOR), 3)
+        planes: tuple[Tensor, ...] = torch.split(torch.cat([terms, terms[:1]]), 3)
+        shown = torch.cat([view.map.picture(plane.T).reshape(-1, 3) for plane in planes], dim=1)[:, :20]
+        pixels = ((shown[:, 0] > _COVERED) & view.counts.flatten()).nonzero()[:, 0]
+        return shown[pixels], pixels, (terms @ terms.T).double()
 
     laid = _map_threads(lay_out, views)
-    design, pixels = torch.cat([some for some, _ in laid]), [some for _, some in laid]
+    stride = max(1, -(-sum(len(some) for some, _, _ in laid) // most))
+    design, pixels = (
+        torch.cat([some[::stride] for some, _, _ in laid]),
+        [some[::stride] for _, some, _ in laid],
+    )
     others = torch.cat([view.others.reshape(-1, 3)[some] for view, some in zip(views, pixels, strict=True)])
-    wide, members = design.double(), torch.zeros(20, 20, dtype=torch.float64)
-    for view in views:
-        terms = monomials(view.original.T.clamp(0.0, MOST_COLOR), 3).double()
-        members += terms @ terms.T
+    wide, members = design.double(), torch.stack([some for _, _, some in laid]).sum(dim=0)
     share = _MAP_HELD * len(design) / max(1, len(views) * len(views[0].original))
     return MapFit(design, others, pixels, wide.T @ wide, share * members)
 

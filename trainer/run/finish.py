@@ -221,6 +221,8 @@ def _write(
     path = folder.gdf(gdf.name)
     # the .gdf has the options beside it, is small, and the same training writes the same file
     save_gdf(path, replace(gdf, report={k: v for k, v in report.items() if k not in _REPORT_ALONE}))
+    if path != folder.draft:
+        folder.draft.unlink(missing_ok=True)
     size, members = path.stat().st_size, max(1, len(gdf.region))
     report["file"] = {"bytes": size, "bytes_per_gaussian": round(size / members, 1)}
     write_json(folder.report, report)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -15,12 +16,14 @@ from progdf.errors import ProgdfError
 from progdf.field.trajectory import Trajectory, load_trajectory, save_trajectory
 from progdf.formats.scene_file import load_scene
 from progdf.gaussians import BASE_CHANNELS, ZERO, Gaussians, pack
+from progdf.gdf.file import save_gdf
 from progdf.io.atomic import read_file
 from progdf.io.cameras import load_cameras, save_cameras
 from progdf.io.json_values import plain
 from progdf.region import Region
 from progdf.scene.regions import check_region, parse_region
 from trainer.editors import (
+    COLOR_FUNCTIONS,
     COSTLY_STRENGTHS,
     EXTERNAL,
     PER_VIEW,
@@ -31,6 +34,7 @@ from trainer.editors import (
 )
 from trainer.editors.base import ImageEditor
 from trainer.editors.pictures import FolderEditor, picture_cameras
+from trainer.fit.draft import draft_grade, draft_views
 from trainer.fit.fit import choose_path, drop_idle_attributes
 from trainer.fit.network import PART as NETWORK
 from trainer.fit.slider_uniformity import equalized_strengths
@@ -228,6 +232,8 @@ def train(options: TrainOptions, quiet: bool = False, shared: Shared | None = No
                 return load_result(folder, options.name, scene, log)
             use_threads(session.threads)
             with check_exists(folder):
+                if session.does == "start":
+                    _write_draft(options, scene, region, folder, log)
                 result = _run_training(options, scene, region, folder, shared, log)
             folder.state.end()
             return result
@@ -311,6 +317,26 @@ def _run_training(
     trajectory, _, about = load_trajectory(folder.trajectory)
     begun = folder.state.load(NETWORK)
     return finish_run(folder, setup, trajectory, read_record(about), perceptual, log, begun)
+
+
+def _write_draft(
+    options: TrainOptions, scene: Gaussians, region: Region, folder: RunFolder, log: RunLog
+) -> None:
+    """A grade alone, where one carries the edit: a slider to begin with."""
+    if folder.draft == folder.gdf(options.name) or options.editor.family not in COLOR_FUNCTIONS:
+        return
+    folder.draft.unlink(missing_ok=True)
+    began = time.perf_counter()
+    views = draft_views(options.views, options.editor.editor, scene, region)
+    draft = draft_grade(views, options.editor, options.name) if views is not None else None
+    if draft is None:
+        log.say("no draft: one map of color does not carry this edit")
+        return
+    save_gdf(folder.draft, draft)
+    log.say(
+        "{} after {:.1f} s: a grade of degree {degree}, {psnr:.1f} dB in views that it was not fitted to; "
+        "training goes on".format(folder.draft, time.perf_counter() - began, **draft.report["draft"])
+    )
 
 
 def _describe_views(setup: TrainingSetup) -> str:

@@ -1,5 +1,6 @@
 """The run folder: what lies where, whose folder it is, and pictures of views out and in.
 
+RUN/draft.gdf  a grade alone, until NAME.gdf is there
 RUN/NAME.gdf  trajectory.safetensors  cameras.json  report.json  report.png  log.txt
 RUN/views/original|mask|final/VIEW.png           the view before, where the region is, after
 RUN/views/edited/VIEW.png, edited/0.25/VIEW.png  what the editor made of it: finished, at other strengths
@@ -129,6 +130,11 @@ class RunFolder:
     def gdf(self, name: str) -> Path:
         """The edit."""
         return self.root / f"{name}.gdf"
+
+    @property
+    def draft(self) -> Path:
+        """A grade alone of the edit, while it is trained."""
+        return self.root / "draft.gdf"
 
     @property
     def views(self) -> Path:

@@ -47,7 +47,7 @@ class Application(Protocol):
         """Close the window, without a question."""
 
 
-def failure_line(act: Callable[[], None]) -> str:
+def failure_line(act: Callable[[], object]) -> str:
     """Do it; what went wrong, in one line, "" for nothing. Mistakes of ours go on."""
     try:
         act()

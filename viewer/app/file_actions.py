@@ -112,19 +112,41 @@ class EditActions:
     def __init__(self, app: Application) -> None:
         self._app = app
 
-    def add(self, path: Path) -> None:
-        """An edit on top, at full strength, so that one sees what came; a grade of another scene or of none
-        goes on what is selected, and with nothing selected everywhere.
+    def add(self, path: Path, name: str = "", strength: float = 1.0) -> None:
+        """An edit on top, see `add_layer`; a grade of another scene or of none goes on what is selected, and
+        with nothing selected everywhere. `name`: the layer's, "" for the edit's
 
         Raises:
             ProgdfError: the file is missing or broken, or no grade, and was made for another scene.
         """
         before, scene = self._app.main_view.work.view, self._app.document.scene
         selected = selection.unpack(before.selection.members, len(scene)).copy()
-        name, mask = ("selection", selected) if selected.any() else ("all", np.ones(len(scene), bool))
-        gdf = self._load(path, from_mask(name, torch.from_numpy(mask)))
-        view = add_layer(before, self._open(gdf, path), gdf.name)
+        where, mask = ("selection", selected) if selected.any() else ("all", np.ones(len(scene), bool))
+        gdf = self._load(path, from_mask(where, torch.from_numpy(mask)))
+        gdf = replace(gdf, name=name or gdf.name)
+        view = add_layer(before, self._open(gdf, path), gdf.name, strength)
         self._apply(view, len(view.layers) - 1)
+
+    def finish(self, draft: Path, path: Path) -> bool:
+        """The trained edit in place of its draft, in every layer and entry of the history; whether one shows.
+
+        Nothing of the state changes: strength, gains, paint, order, selection and undo are as they were.
+
+        Raises:
+            ProgdfError: as for `add`.
+        """
+        document, view = self._app.document, self._app.main_view.work.view
+        drafts = [i for i, known in enumerate(document.gdf_paths) if known == draft]
+        if not drafts:
+            return False
+        gdf = self._load(path, document.gdfs[drafts[0]].region)
+        gdfs, paths = list(document.gdfs), list(document.gdf_paths)
+        for i in drafts:
+            if not torch.equal(gdf.region.members, gdfs[i].region.members):
+                return False
+            gdfs[i], paths[i] = replace(gdf, name=gdfs[i].name), path
+        self._app.show(replace(document, gdfs=tuple(gdfs), gdf_paths=tuple(paths)))
+        return any(layer.gdf in drafts for layer in view.layers)
 
     def duplicate(self, index: int) -> None:
         """A copy of a layer above it, with an edit of its own: the timeline and undo tell edits apart."""

@@ -23,6 +23,7 @@ from viewer.render.engine import ViewEngine, drawn_size
 from viewer.render.picking import Surfaces
 from viewer.state import actions, layer_selection, timeline, workspace
 from viewer.state.facts import RecordingFile
+from viewer.state.layers import add_layer
 from viewer.state.snapshots import SliderSnapshot, compare_sides
 from viewer.state.view_state import LayerState, ViewState
 from viewer.state.workspace import Dialog, SceneFacts
@@ -395,7 +396,9 @@ class MainView:
         view, sides = self.work.view, compare_sides(self.work.snapshots, self.work.view)
         if sides is not None:
             return sides.right
-        return replace(view, layers=(*view.layers, *self.live)) if self.live else view
+        for layer in self.live:
+            view = add_layer(view, layer.gdf, layer.name, layer.strength)
+        return view
 
     @property
     def _shows_original(self) -> bool:

@@ -376,7 +376,7 @@ def _foot(work: Workspace, index: int, row: LayerRow, ui: UiContext) -> Workspac
         for i, other in enumerate(work.view.layers)
         if i != index and other.gdf < len(row.shared) and row.shared[other.gdf]
     ]
-    note = f"{group_digits(row.count)} splats"
+    note = f"{'Draft  ·  ' * row.draft}{group_digits(row.count)} splats"
     if len(overlaps) == 1:
         name, count = overlaps[0]
         note += f"  ·  {'all' if count == row.count else group_digits(count)} in {name}"

@@ -65,6 +65,7 @@ class LayerRow:
     points: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 3), np.float32), compare=False)
     fit: Fit = keep_camera  # gives the camera that frames this layer
     region: str = ""  # its name
+    draft: bool = False  # a grade alone, until its training is done
 
 
 def layer_rows(scene: Gaussians, gdfs: Sequence[Gdf]) -> tuple[LayerRow, ...]:
@@ -86,6 +87,7 @@ def _row(scene: Gaussians, gdf: Gdf, gdfs: Sequence[Gdf]) -> LayerRow:
         points=scene.means[members].numpy(),
         fit=lambda camera, aspect: fit(camera, scene[members], aspect),
         region=gdf.region.name,
+        draft="draft" in gdf.report,
     )
 
 

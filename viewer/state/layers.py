@@ -144,10 +144,9 @@ def free_name(view: ViewState, name: str) -> str:
     return free
 
 
-def add_layer(view: ViewState, gdf: int, name: str) -> ViewState:
-    """An edit of its own on top of the others, at full strength, so that one sees what came."""
-    layer = LayerState(gdf, free_name(view, name), strength=1.0)
-    return replace(view, layers=(*view.layers, layer))
+def add_layer(view: ViewState, gdf: int, name: str, strength: float = 1.0) -> ViewState:
+    """An edit of its own on top of the others, at full strength unless said, so that one sees what came."""
+    return replace(view, layers=(*view.layers, LayerState(gdf, free_name(view, name), strength)))
 
 
 def remove_layer(view: ViewState, index: int) -> ViewState:

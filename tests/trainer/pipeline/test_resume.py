@@ -16,6 +16,8 @@ import torch
 import trainer.run.run
 from progdf.__main__ import main
 from progdf.errors import ProgdfError
+from progdf.formats.ply import load_ply
+from progdf.gdf.file import load_gdf
 from tests.helpers.stopped import OUT, bits, small_run
 from tests.helpers.stopped_runs import NEVER, at_step, gone_on, killed, saved_step, words
 from tests.helpers.trained import train
@@ -87,6 +89,26 @@ def test_ctrl_c_before_the_optimization_is_kept_too(
         with pytest.raises(KeyboardInterrupt, match="--resume"):
             train(small_run(bear_folder), quiet=True)
     gone_on(bear_folder, uninterrupted)
+
+
+def test_a_draft_is_there_until_the_edit_is(
+    bear_folder: Path, uninterrupted: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(trainer.run.run, "_render_originals", lambda *_: os.kill(os.getpid(), signal.SIGINT))
+        with pytest.raises(KeyboardInterrupt):
+            train(small_run(bear_folder), quiet=True)
+    draft = load_gdf(OUT / "draft.gdf", load_ply(bear_folder / "scene.ply"))
+    assert (draft.name, draft.field.kind) == (small_run(bear_folder).name or "run", "grade")
+    assert "dB in views that it was not fitted to; training goes on" in (OUT / "log.txt").read_text()
+    train(replace(small_run(bear_folder), resume=True), quiet=True)
+    assert bits(OUT) == bits(uninterrupted)
+    assert not (OUT / "draft.gdf").exists()
+
+
+def test_an_edit_that_is_called_draft_is_none(bear_folder: Path) -> None:
+    done = train(replace(small_run(bear_folder), name="draft"), quiet=True)
+    assert "draft" not in load_gdf(done.gdf, load_ply(bear_folder / "scene.ply")).report
 
 
 @pytest.mark.usefixtures("stopped")

@@ -1,4 +1,6 @@
-"""The editor's own picture over the view while the form of a new edit is open, made by `progdf preview`."""
+"""What a new edit will be while its form is open, made by `progdf preview`: a live layer on top of the stack
+where one map of color carries it, else the editor's own picture over the view.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +13,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import moderngl
 import msgspec
@@ -20,11 +23,13 @@ from PIL import Image
 
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
+from progdf.gdf.file import Gdf, load_gdf
 from progdf.io.json_values import convert_json, decode_json
 from viewer.app.application import Application
 from viewer.camera.view_camera import Vec3, ViewCamera, to_camera
 from viewer.jobs.child import Child
 from viewer.jobs.training import EDITORS, NewEdit
+from viewer.state.view_state import LayerState
 
 from .pages import Cover
 
@@ -47,19 +52,26 @@ class _Request:
     size: tuple[int, int]  # of the view, pixels
     background: Vec3
 
+    @property
+    def of_all_views(self) -> tuple[str, str]:
+        """What a grade depends on."""
+        return self.region, self.editor
+
 
 @dataclass(frozen=True)
-class PreviewPicture:
-    """What came of a request: a picture [H,W,3], or None and why there is none."""
+class Preview:
+    """What came of a request: a picture [H,W,3], or the file of a grade, or why there is neither."""
 
     number: int  # -1: the child has ended, or what it wrote cannot be read
-    pixels: NDArray[np.uint8] | None
+    pixels: NDArray[np.uint8] | None = None
+    grade: Path | None = None
     error: str = ""
 
 
 class _Answer(msgspec.Struct):
     number: int
     error: str = ""
+    made: Literal["picture", "grade"] = "picture"
 
 
 class PreviewChild:
@@ -85,7 +97,7 @@ class PreviewChild:
         return Path(self._folder.name)
 
     def ask(self, region: str, request: _Request, camera: Camera) -> int:
-        """Ask for a picture; its number."""
+        """Ask for a grade or a picture; its number."""
         number = next(self._numbers)
         values = {
             "number": number,
@@ -102,22 +114,24 @@ class PreviewChild:
         self._child.send(msgspec.json.encode(values).decode())
         return number
 
-    def take(self) -> PreviewPicture | None:
+    def take(self) -> Preview | None:
         """The last answer since the last call; a child that has ended says why. Does not wait."""
         line = None
         while self._answers:
             line = self._answers.popleft()
         if line is None:
             ended = self._child.status is not None
-            return PreviewPicture(-1, None, self._child.error() or "the preview ended") if ended else None
+            return Preview(-1, error=self._child.error() or "the preview ended") if ended else None
         try:
             answer = convert_json(decode_json(line), _Answer)
             if answer.error:
-                return PreviewPicture(answer.number, None, answer.error)
+                return Preview(answer.number, error=answer.error)
+            if answer.made == "grade":
+                return Preview(answer.number, grade=self._picture(answer.number).with_suffix(".gdf"))
             with Image.open(self._picture(answer.number)) as picture:
-                return PreviewPicture(answer.number, np.asarray(picture.convert("RGB")))
+                return Preview(answer.number, np.asarray(picture.convert("RGB")))
         except (OSError, ValueError) as error:
-            return PreviewPicture(-1, None, f"the preview cannot be read: {error}")
+            return Preview(-1, error=f"the preview cannot be read: {error}")
 
     def close(self) -> None:
         """End it."""
@@ -136,7 +150,7 @@ class PreviewChild:
 
 
 class PreviewActions:
-    """Asks the child for pictures and shows them. `close` it with the window.
+    """Asks the child for what the form says and shows it. `close` it with the window.
 
     Args:
         app: the window
@@ -155,12 +169,14 @@ class PreviewActions:
         self._seen: _Request | None = None  # at the last look
         self._seen_at = self._used_at = 0.0
         self._broken = False  # it cannot be started, or has ended by itself
+        self._grade: tuple[_Request, Gdf, Path] | None = None  # of the live layer, and what it was made for
 
     def poll(self) -> float | None:
-        """Ask for the picture and show what has come; seconds until the next look, None for ever."""
+        """Ask for the preview and show what has come; seconds until the next look, None for ever."""
         now, scene, request = time.monotonic(), self._app.document.path, self._request()
         if request is None or scene is None:
             self._show("", None)
+            self._end_live()
             self._broken = False
             if self._child is not None and now - self._used_at > KEPT_S:
                 self._end()
@@ -174,8 +190,11 @@ class PreviewActions:
                 self._show(f"No preview: {error.strerror or error}", None, failed=True)
         if self._child is not None:
             self._take(self._child)
+        self._show_live()
         if self._child is None or self._broken:
             return None
+        if self._grade is not None and request.of_all_views == self._grade[0].of_all_views:
+            self._sent = self._seen = request  # one grade is for every strength and view
         if request != self._seen:
             moved = (
                 self._seen is None or request.camera != self._seen.camera or request.size != self._seen.size
@@ -185,9 +204,17 @@ class PreviewActions:
             self._send(request, self._child)
         return POLL_S if self._outstanding or request != self._sent else None
 
+    def draft(self, form: NewEdit) -> Path | None:
+        """The file of the grade that shows what a form says; None where there is none."""
+        request = self._request()
+        if form != self._app.main_view.work.form or request is None or self._grade is None:
+            return None
+        return self._grade[2] if request.of_all_views == self._grade[0].of_all_views else None
+
     def leave_scene(self) -> None:
         """The child is for a scene that is not open any more."""
         self._end()
+        self._grade = None
         self._broken = False
 
     def close(self) -> None:
@@ -220,7 +247,7 @@ class PreviewActions:
         self._outstanding = True
         cover = self._app.main_view.cover
         in_place = cover is not None and (cover.camera, cover.size) == (request.camera, request.size)
-        self._show("" if in_place else "Drawing …", cover)
+        self._show("" if in_place or self._grade else "Drawing …", cover)
 
     def _take(self, child: PreviewChild) -> None:
         """What the child has answered."""
@@ -229,17 +256,44 @@ class PreviewActions:
             return
         if answer.number in (self._number, -1):
             self._outstanding = False
-        if answer.pixels is None:
+        if answer.error:
             if answer.number < 0:
                 self._broken = True
                 self._end()
+            self._end_live()
             self._show(answer.error, None, failed=True)
-        elif self._sent is not None and answer.number == self._number:
+        elif answer.grade is not None and self._sent is not None and answer.number == self._number:
+            gdf = load_gdf(answer.grade, self._app.document.scene)
+            self._grade = self._sent, gdf, answer.grade
+            self._app.main_view.live = ()  # of the last color
+            self._show("Live: turn it, slide it", None)
+        elif answer.pixels is not None and self._sent is not None and answer.number == self._number:
             kind = self._sent.editor.partition(":")[0]
             title = next(choice.title for choice in EDITORS if choice.kind == kind)
+            self._end_live()
             name, texture = f"Preview: {title} at {self._sent.strength:.2f}", self._upload(answer.pixels)
             self._show("", Cover(texture, self._sent.camera, self._sent.size, name))
             self._app.main_view.wake()
+
+    def _show_live(self) -> None:
+        """The grade as a layer on top, at the form's strength."""
+        if self._grade is None:
+            return
+        main_view, document = self._app.main_view, self._app.document
+        layers = main_view.work.view.layers
+        name, solo = main_view.work.form.layer_name, any(layer.solo for layer in layers)
+        strength = main_view.work.form.strength
+        live = (LayerState(len(document.gdfs), name, strength, solo=solo),)
+        if not main_view.live:
+            self._app.show(document, (self._grade[1],), live)
+        elif main_view.live != live:
+            main_view.live = live
+            main_view.wake()
+
+    def _end_live(self) -> None:
+        if self._grade is not None and self._app.main_view.live:
+            self._app.show(self._app.document)
+        self._grade = None
 
     def _upload(self, pixels: NDArray[np.uint8]) -> int:
         size = pixels.shape[1], pixels.shape[0]

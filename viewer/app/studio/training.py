@@ -5,12 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from progdf.errors import ProgdfError
-from progdf.io.atomic import make_folder
+from progdf.io.atomic import atomic_write, make_folder, read_file
 from progdf.scene.regions import check_region
 from viewer.app.application import Application, failure_line
+from viewer.app.file_actions import EditActions
 from viewer.files import exports
 from viewer.jobs import training
 from viewer.jobs.job_queue import Delivery, Job, JobQueue
@@ -34,14 +36,22 @@ class JobActions:
     Args:
         app: the window
         memory: folder of the program's state; the user's own if None
+        draft: gives the file of a grade that shows what the form says
     """
 
-    def __init__(self, app: Application, memory: Path | None = None) -> None:
-        self._app, self._memory = app, memory
+    def __init__(
+        self,
+        app: Application,
+        memory: Path | None = None,
+        draft: Callable[[NewEdit], Path | None] = lambda _: None,
+    ) -> None:
+        self._app, self._memory, self._draft = app, memory, draft
+        self._edits = EditActions(app)
         self.queue = JobQueue()
         self._scene: Path | None = None
         self._followed = False  # its runs that were stopped are in the queue
         self._live: Path | None = None  # the recording on screen
+        self._live_layers: tuple[LayerState, ...] = ()  # that show it
         self._live_due = 0.0
         self._quits: type | None = None  # once no such task is busy
 
@@ -110,13 +120,26 @@ class JobActions:
             raise ProgdfError("the scene has no file yet; open one first")
         out = training.free_run(training.edits_folder(scene, self._memory), form.layer_name)
         region, threads = self.region_spec(form, out.parent, out.name), training.spare_threads()
-        self.queue.add(EditOrder(scene.resolve(), out, out.name, region, form.spec, form.quick, threads))
+        order = EditOrder(scene.resolve(), out, out.name, region, form.spec, form.quick, threads)
+        self.queue.add(order)
+        if (draft := self._draft(form)) is not None:
+            self._try(partial(self._add_draft, order, draft, form.strength))
         if form.region == SELECTION:  # it becomes a region: its highlight would hide what is trained
             main_view = self._app.main_view
             view = main_view.work.view
             name, path = free_name(view.selection, out.name), out.with_name(f"{out.name}{SUFFIX}")
             selection = replace(add_region(view.selection, name, path), members=NOBODY, count=0)
             main_view.change(replace(view, selection=selection))
+
+    def _add_draft(self, order: EditOrder, draft: Path, strength: float = 1.0) -> None:
+        """A grade becomes the layer that the training will make better.
+
+        Raises:
+            ProgdfError: its file cannot be written or read.
+        """
+        with atomic_write(order.draft) as temporary_file:
+            temporary_file.write_bytes(read_file(draft))
+        self._edits.add(order.draft, order.name, strength)
 
     def region_spec(self, form: NewEdit, folder: Path, name: str) -> str:
         """The form's region as `progdf train --region` has it; one that has no file gets one in the folder.
@@ -140,7 +163,7 @@ class JobActions:
         exports.write_region(NamedRegion(name, path, members, selection.count), total)
         return f"file:{path}"
 
-    def _try(self, act: Callable[[], None]) -> None:
+    def _try(self, act: Callable[[], object]) -> None:
         """Do it, or say why it cannot be done."""
         if error := failure_line(act):
             self._app.main_view.show_message(error, error=True)
@@ -167,7 +190,8 @@ class JobActions:
             return
         if job.status == "done" and self._scene == task.scene:  # it takes the place of its recordings
             self._live = None
-            self._app.open(task.result)
+            if not self._edits.finish(task.draft, task.result):
+                self._app.open(task.result)
             main_view.show_message(f"{task.name} is trained; drag its slider")
             return
         if self._live is not None:
@@ -191,6 +215,9 @@ class JobActions:
         path = self._app.document.path
         self._followed, self._scene = True, path.resolve() if path is not None else None
         if (scene := self._scene) is not None:
+            for draft in dict.fromkeys(self._app.document.gdf_paths):
+                if (result := training.finished_edit(draft)) is not None:
+                    self._try(partial(self._edits.finish, draft, result))
             for order in training.stopped_orders(training.edits_folder(scene, self._memory), scene):
                 self.queue.add_stopped(order)
 
@@ -200,6 +227,12 @@ class JobActions:
         order = next((task for task in orders if isinstance(task, EditOrder)), None)
         if order is None or order.scene != self._scene or now < self._live_due:
             return
+        live = self._app.main_view.live
+        if order.draft in self._app.document.gdf_paths or (live and live != self._live_layers):
+            return  # there is a layer of it, or of what the form says
+        if (order.out / "draft.gdf").is_file() and not order.draft.exists():
+            self._try(partial(self._add_draft, order, order.out / "draft.gdf"))
+            return
         recording = order.newest_recording()
         if recording is None or recording == self._live:
             return
@@ -207,7 +240,7 @@ class JobActions:
         if (edit := order.recorded_edit(recording, document.scene)) is not None:
             layer = LayerState(len(document.gdfs), f"{edit.name} (training)", 1.0)
             self._app.show(document, (edit,), (layer,))
-            self._live = recording
+            self._live, self._live_layers = recording, (layer,)
         cost = time.monotonic() - begun
         self._live_due = now + max(LIVE_EVERY_S, cost / LIVE_SHARE)
 

@@ -1,0 +1,81 @@
+"""A grade alone before anything is trained: near the editor's own pictures, or none at all."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+import torch
+
+from progdf.compose.reference import Layer, compose_layers
+from progdf.demo_scenes import SMALLEST_ROOM, room
+from progdf.gdf.file import Gdf, load_gdf, save_gdf
+from progdf.region import from_mask
+from tests.helpers.trained import WHITE, masked_psnr, small
+from trainer.editors import make_editor
+from trainer.fit import draft
+from trainer.fit.draft import DraftViews, draft_grade, draft_views
+from trainer.options import EditorOptions, ViewOptions
+from trainer.views.view import render_view
+
+
+@cache
+def views() -> DraftViews:
+    case = small("body")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(draft, "_SECONDS", float("inf"))
+        found = draft_views(ViewOptions(), "recolor:#3060d0", case.scene, case.region)
+    assert found is not None
+    return found
+
+
+def drafted(editor: str, folder: Path) -> Gdf:
+    """The draft of an edit of the bear's body as a window loads it."""
+    made = draft_grade(views(), EditorOptions(editor), "blue")
+    assert made is not None
+    save_gdf(folder / "draft.gdf", made)
+    return load_gdf(folder / "draft.gdf", small("body").scene)
+
+
+@pytest.mark.parametrize("spec", ["recolor:#3060d0", "tint:#3060d0", "darken:0.6", "night"])
+def test_a_draft_shows_an_edit_at_every_strength_as_its_editor_does(spec: str, tmp_path: Path) -> None:
+    case, gdf = small("body"), drafted(spec, tmp_path)
+    editor = make_editor(EditorOptions(spec), case.scene, case.region, case.views)
+    edited = render_view(compose_layers(case.scene, [Layer(gdf, 1.0)]), case.views[0].camera, WHITE)
+    mask, target = case.views[0].mask > 0.05, editor.edit(case.views[0], 1.0)
+    before = masked_psnr(case.views[0].image, target, mask)
+    assert masked_psnr(edited, target, mask) > before + 10.0, "a tenth of the change, as its rule has it"
+    shown = [
+        render_view(compose_layers(case.scene, [Layer(gdf, s)]), case.views[0].camera, WHITE)[mask]
+        for s in (0.0, 0.25, 0.5, 0.75, 1.0)
+    ]
+    steps = [float((b - a).abs().mean()) for a, b in pairwise(shown)]
+    assert min(steps) > 0.6 * max(steps), "equal steps look equally large"
+
+
+def test_a_draft_says_that_it_is_one_and_how_near_it_is(tmp_path: Path) -> None:
+    gdf = drafted("recolor:#3060d0", tmp_path)
+    assert gdf.report["draft"]["psnr"] > 25.0
+    assert (tmp_path / "draft.gdf").stat().st_size < 6000
+
+
+def test_what_a_map_of_color_leaves_too_much_of_has_no_draft(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert draft_grade(views(), EditorOptions("stripes:#20a040"), "stripes") is None
+    monkeypatch.setattr(draft, "CARRIED", 1e-5)
+    monkeypatch.setattr(draft, "ROUNDING", 0.0)
+    assert draft_grade(views(), EditorOptions("recolor:#3060d0"), "blue") is None
+
+
+def test_a_region_that_no_view_shows_has_no_draft() -> None:
+    case = small("body")
+    hidden = replace(case.scene, logit_opacities=torch.full_like(case.scene.logit_opacities, -30.0))
+    assert draft_views(ViewOptions(), "night", hidden, case.region) is None
+
+
+def test_a_scene_to_stand_inside_has_no_draft_without_cameras() -> None:
+    scene = room(SMALLEST_ROOM).gaussians
+    region = from_mask("all", torch.ones(len(scene), dtype=torch.bool))
+    assert draft_views(ViewOptions(), "night", scene, region) is None

@@ -1,0 +1,182 @@
+"""A grade of a new edit in the window: live while the form is open, a draft layer while it is trained."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from progdf.gdf.file import load_gdf, save_gdf
+from tests.helpers.null_app import null_app, press
+from tests.helpers.sessions import bear_files, opened_document
+from tests.helpers.ui_rig import bear, first_view
+from tests.viewer.app.test_studio import Trainer, request, turn
+from viewer.app import app as application
+from viewer.app.studio import preview
+from viewer.files.session import open_session
+from viewer.jobs import job_queue
+from viewer.state import paint
+from viewer.state.layers import visible_layers
+from viewer.state.view_state import LayerState
+
+pytestmark = pytest.mark.gl
+
+
+class Previews:
+    """Stands for the child: it answers with the same grade, or a picture."""
+
+    grade: Path | None = None
+    asked = 0
+
+    def __init__(self, scene: Path) -> None:
+        self.folder, self._number = scene.parent, 0
+        self._answers: list[preview.Preview] = []
+
+    def ask(self, *_: object) -> int:
+        type(self).asked += 1
+        self._number += 1
+        pixels = np.zeros((4, 4, 3), np.uint8) if self.grade is None else None
+        self._answers.append(preview.Preview(self._number, pixels, self.grade))
+        return self._number
+
+    def take(self) -> preview.Preview | None:
+        return self._answers.pop() if self._answers else None
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.fixture
+def window(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[application.App]:
+    folder = bear_files(tmp_path)
+    monkeypatch.setattr(job_queue, "Child", Trainer)
+    monkeypatch.setattr(preview, "PreviewChild", Previews)
+    monkeypatch.setattr(preview, "REST_S", 0.0)
+    Trainer.ended, Trainer.line, Trainer.edit = None, "", folder / "edits" / "scarf.gdf"
+    scarf = load_gdf(folder / "edits" / "scarf.gdf", bear().scene)
+    save_gdf(tmp_path / "grade.gdf", replace(scarf, report={"draft": {}}))
+    Previews.grade, Previews.asked = tmp_path / "grade.gdf", 0
+    with null_app(replace(opened_document(folder), gdfs=(), gdf_paths=()), first_view(bear()), folder) as app:
+        yield app
+
+
+def with_form(app: application.App, **changes: object) -> None:
+    work = app.main_view.work
+    app.main_view.work = replace(work, form=replace(work.form, **changes))  # type: ignore[arg-type]
+    for _ in range(3):
+        turn(app)
+
+
+def opened(app: application.App, **changes: object) -> None:
+    work = app.main_view.work  # before it opens, as then the name is being typed
+    app.main_view.work = replace(work, form=replace(work.form, name="blue"))
+    press(app, "Ctrl+N")
+    with_form(app, **changes)
+
+
+def layer(app: application.App) -> LayerState:
+    (only,) = app.main_view.work.view.layers
+    return only
+
+
+def test_a_grade_is_a_live_layer_that_the_form_drives_from_every_side(window: application.App) -> None:
+    opened(window, strength=0.25)
+    assert [live.strength for live in window.main_view.live] == [0.25]
+    assert (window.main_view.cover, window.main_view.work.view.layers) == (None, ())
+    with_form(window, strength=0.75)
+    press(window, "Home", "5")
+    assert [live.strength for live in visible_layers(window.main_view._displayed_view())] == [0.75]
+    assert Previews.asked == 1, "neither the strength nor the camera asks for another"
+    with_form(window, color=(1.0, 0.0, 0.0))
+    assert (Previews.asked, len(window.main_view.live)) == (2, 1)
+    with_form(window, preview=False)
+    assert window.main_view.live == ()
+
+
+def test_what_no_grade_carries_is_the_editors_own_picture_as_before(window: application.App) -> None:
+    opened(window)
+    Previews.grade = None
+    with_form(window, editor=2)
+    assert window.main_view.cover is not None
+    assert window.main_view.live == ()
+
+
+def test_the_trained_edit_takes_the_place_of_its_draft_and_nothing_else_changes(
+    window: application.App,
+) -> None:
+    opened(window, strength=0.6)
+    request(window, "train")
+    assert (layer(window).name, layer(window).strength, window.main_view.live) == ("blue", 0.6, ())
+    assert window.document.facts().rows[0].draft
+    view = window.main_view.work.view
+    weights = paint.encode(np.linspace(0, 1, len(window.document.gdfs[0].region), dtype=np.float32))
+    touched = replace(layer(window), strength=0.3, paint=weights, locked=True)
+    window.main_view.change(replace(view, layers=(touched,)))
+    past, before = window.main_view.work.past, window.engine.image(window.main_view.work.view, (32, 24))
+    assert before.any()
+    Trainer.ended = 0
+    turn(window)
+    assert (layer(window), window.main_view.work.past) == (touched, past)
+    (path,) = window.document.gdf_paths
+    assert path.name == "blue.gdf"
+    assert not window.document.facts().rows[0].draft
+    press(window, "Ctrl+Z")
+    assert layer(window).strength == 0.6
+    press(window, "Ctrl+Z", "Ctrl+Shift+Z")
+    assert layer(window).name == "blue"
+
+
+def test_a_draft_whose_training_ends_badly_stays_until_it_is_deleted(window: application.App) -> None:
+    opened(window)
+    request(window, "train")
+    Trainer.ended, Trainer.line = 2, "the disk is full"
+    turn(window)
+    (job,) = window.main_view.work.jobs
+    request(window, f"discard_run:{job.number}")
+    assert layer(window).name == "blue"
+    press(window, "Ctrl+Delete")
+    assert window.main_view.work.view.layers == ()
+    press(window, "Ctrl+Z")
+    assert layer(window).name == "blue"
+
+
+def test_a_deleted_draft_is_not_in_the_way_of_the_trained_edit(window: application.App) -> None:
+    opened(window)
+    request(window, "train")
+    press(window, "Ctrl+Delete")
+    Trainer.ended = 0
+    turn(window)
+    assert layer(window).name == "scarf"
+
+
+def test_a_session_saved_with_a_draft_opens_with_what_was_trained_since(
+    window: application.App, tmp_path: Path
+) -> None:
+    opened(window, strength=0.6)
+    request(window, "train")
+    window.file_actions.save(tmp_path / "bear.session.json")
+    saved = open_session(tmp_path / "bear.session.json")
+    assert [path.name for path in saved.document.gdf_paths] == ["blue.draft.gdf"]
+    Trainer.ended = 0
+    turn(window)
+    window.open(tmp_path / "bear.session.json")
+    turn(window)
+    assert [path.name for path in window.document.gdf_paths] == ["blue.gdf"]
+    assert layer(window).strength == 0.6
+
+
+def test_without_a_preview_the_draft_of_the_run_becomes_the_layer(window: application.App) -> None:
+    opened(window, preview=False)
+    request(window, "train")
+    assert window.main_view.work.view.layers == ()
+    (job,) = window.main_view.work.jobs
+    job.task.out.mkdir(parents=True)
+    (job.task.out / "draft.gdf").write_bytes((Previews.grade or Path()).read_bytes())
+    turn(window)
+    assert (layer(window).name, layer(window).strength) == ("blue", 1.0)
+    Trainer.ended = 0
+    turn(window)
+    assert [path.name for path in window.document.gdf_paths] == ["blue.gdf"]
