@@ -19,6 +19,7 @@ from progdf.field.separable import (
     principal_modes,
     quantize_bases,
 )
+from trainer.fit.fit import stored_numbers
 
 from .courses import KnownEdit, edit_of, step_ms
 
@@ -147,16 +148,9 @@ def baked_forms(course: KnownEdit) -> list[Form]:
 
         measure("separable", separable)
 
-    measure("auto", lambda: separable(None))
+    def auto() -> tuple[BakedField, str]:
+        field, label = separable(None)
+        return field, f"auto at 40 dB: {label}"
+
+    measure("auto", auto)
     return found
-
-
-def stored_numbers(field: BakedField) -> int:
-    """How many numbers the field holds for all members together, coefficients included."""
-    return sum(
-        bases.end_offset.numel()
-        + bases.residual_basis.numel()
-        + bases.scale.numel()
-        + bases.coefficients.numel()
-        for bases in field.attributes.values()
-    )

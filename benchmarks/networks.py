@@ -26,19 +26,19 @@ from progdf.field import (
     bake_network,
     choose_field,
     fit_keyframes,
-    fit_neural,
 )
 from progdf.field.baked import NeuralForm
 from progdf.field.choose import Field
-from progdf.field.neural_fit import NeuralFit
+from progdf.field.neural_fit import NeuralFit, train_network
 from progdf.field.separable import moving_attributes
 from progdf.gaussians import Gaussians, pack
 from progdf.gdf.file import Gdf, load_gdf, save_gdf
 from progdf.io.atomic import make_folder
 from progdf.rasterize import set_threads
+from trainer.fit.fit import stored_numbers
+from trainer.fit.network import rendered_importance
 
 from .courses import KnownEdit, edit_of, processor_milliseconds
-from .field_forms import stored_numbers
 from .recorded_runs import recorded_edit
 from .table import Table
 
@@ -181,7 +181,9 @@ def _trained(run: Path, name: str, settings: NeuralSettings, course: KnownEdit) 
             fit = _begin(course, settings)
             return Trained(fit.field(), bake_network(fit.field(), before), 0, each * settings.steps)
         begin = time.process_time()
-        network = fit_neural(course.strengths, course.offsets, before, settings, course.weights, course.look)
+        fit = _begin(course, settings)
+        train_network(fit, course.strengths, course.offsets, settings.steps)
+        network = fit.field(tuple(course.strengths.tolist()))
         took = {"steps": settings.steps, "seconds": round(time.process_time() - begin, 1)}
         made = edit_of(course.scene, course.members, bake_network(network, before, course.truth))
         save_gdf(path, replace(made, name=name, report=took))
@@ -192,8 +194,9 @@ def _trained(run: Path, name: str, settings: NeuralSettings, course: KnownEdit) 
 
 def _begin(course: KnownEdit, settings: NeuralSettings) -> NeuralFit:
     before = pack(course.scene[course.members])
-    fit = NeuralFit(before, course.offsets.shape[2], tuple(moving_attributes(course.offsets)), settings)
-    fit.scale_to(course.offsets)
+    moving, channels = tuple(moving_attributes(course.offsets)), course.offsets.shape[2]
+    fit = NeuralFit(before, channels, moving, settings, course.weights)
+    fit.scale_to(course.offsets, rendered_importance(course.offsets, course.look))
     return fit
 
 

@@ -13,15 +13,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from benchmarks.__main__ import BENCHES
 from benchmarks.__main__ import main as benchmarks
 from progdf.__main__ import COMMANDS
 from progdf.__main__ import main as progdf
 from progdf.compose.reference import Layer, compose_layers
-from progdf.field import fit_separable
+from progdf.field.baked import END_TYPES
 from progdf.gdf.file import save_gdf
-from tests.helpers.edits import curved_trajectory, edit_of, some_rows
+from tests.helpers.edits import curved_field, edit_of, some_rows
 from tests.helpers.scenes import ball
 
 ROOT = Path(__file__).parents[1]
@@ -153,11 +154,11 @@ def test_docstrings_cite_only_documents_and_sections_that_are_here() -> None:
                 )
 
 
-def test_the_documented_reader_reads_what_is_written(tmp_path: Path) -> None:
+@pytest.mark.parametrize("end_type", END_TYPES)
+def test_the_documented_reader_reads_what_is_written(tmp_path: Path, end_type: torch.dtype) -> None:
     scene = ball(60)
     members = some_rows(scene, 20)
-    s, offsets = curved_trajectory(20)
-    gdf = edit_of(scene, members, fit_separable(s, offsets, {"means": 1, "sh0": 2}))
+    gdf = edit_of(scene, members, curved_field(20, end_type=end_type))
     save_gdf(tmp_path / "edit.gdf", gdf)
     reader: dict[str, Any] = {}
     (code,) = blocks((ROOT / "docs" / "file-format.md").read_text(), "python")

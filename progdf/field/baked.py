@@ -120,11 +120,8 @@ class AttributeBases:
     @property
     def bytes_per_member(self) -> float:
         """Stored bytes for one member of the region."""
-        full = self.end_offset.shape[1] * self.end_offset.element_size()
-        return (
-            full
-            + self.residual_basis.shape[0] * self.residual_basis.shape[2] * self.residual_basis.element_size()
-        )
+        stored = self.end_offset[None], self.residual_basis
+        return sum(len(part) * part.shape[2] * part.element_size() for part in stored)
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
+from statistics import fmean
 from typing import Literal, Protocol
 
 import torch
@@ -137,8 +138,8 @@ class FieldEvaluator:
             self._expected = [render(course(s)) for s in sample_strengths()]
             self._edited = edited or {1.0: render(course(1.0))}
         self._own = self._errors(course)
-        self._allowed = ADDED * _mean(self._own) if edited else 10 ** (-target / 10)
-        own = decibels(_mean(self._own))
+        self._allowed = ADDED * fmean(self._own) if edited else 10 ** (-target / 10)
+        own = decibels(fmean(self._own))
         tenth = f"adds at most a tenth to the edit's own error ({own:.1f} dB to the editor)"
         self.wanted = tenth if edited else f"reaches {target:g} dB"
         """What a field that serves does, in words."""
@@ -155,9 +156,9 @@ class FieldEvaluator:
         assert isinstance(field, BakedField)
         curve = self._deviations(field)
         found = self._errors(lambda s: self._offsets(field, s))
-        on_the_way = _mean(curve) if self._rule else max(curve)
-        excess = max(_mean(found) - _mean(self._own), on_the_way) / self._allowed
-        to_editor = decibels(_mean(found)) if self._rule else None
+        on_the_way = fmean(curve) if self._rule else max(curve)
+        excess = max(fmean(found) - fmean(self._own), on_the_way) / self._allowed
+        to_editor = decibels(fmean(found)) if self._rule else None
         return Candidate(field, tuple(decibels(e) for e in curve), label, excess, to_editor)
 
     def curve(self, field: Field) -> tuple[float, ...]:
@@ -182,10 +183,6 @@ class FieldEvaluator:
 
 def _difference(a: Tensor, b: Tensor) -> float:
     return float((a - b).double().square().mean()) if len(a) else 0.0
-
-
-def _mean(errors: Sequence[float]) -> float:
-    return sum(errors) / len(errors)
 
 
 @dataclass(frozen=True)
@@ -246,18 +243,15 @@ def pick_candidate(tried: Sequence[Candidate], wanted: str, budget: float | None
     """The smallest that serves, else the best; with a budget the best of those within it."""
     looked = f"{len(tried)} field{'s'[: len(tried) != 1]}"
     within = [c for c in tried if budget is None or c.field.bytes_per_member <= budget]
+    good = [c for c in within if c.excess <= 1.0]
+    small, met, why = good, True, f"the smallest of {looked} that {wanted}"
     if not within:
-        least = min(tried, key=lambda c: (c.field.bytes_per_member, c.excess))
-        return FieldChoice(
-            least, False, tuple(tried), f"the smallest of {looked}; none fits into {budget:g} bytes"
-        )
-    best = min(within, key=lambda c: (c.excess, c.field.bytes_per_member))
-    if budget is not None:
-        return FieldChoice(best, True, tuple(tried), f"the best of {looked} within {budget:g} bytes")
-    if best.excess > 1.0:
-        return FieldChoice(best, False, tuple(tried), f"the best of {looked}; none {wanted}")
-    best = min((c for c in tried if c.excess <= 1.0), key=lambda c: (c.field.bytes_per_member, c.excess))
-    return FieldChoice(best, True, tuple(tried), f"the smallest of {looked} that {wanted}")
+        small, met, why = list(tried), False, f"the smallest of {looked}; none fits into {budget:g} bytes"
+    elif budget is not None or not good:
+        small, met = [min(within, key=lambda c: c.excess)], budget is not None
+        why = f"the best of {looked}" + (f" within {budget:g} bytes" if met else f"; none {wanted}")
+    best = min(small, key=lambda c: (c.field.bytes_per_member, c.excess))
+    return FieldChoice(best, met, tuple(tried), why)
 
 
 def store_ends(offsets: Tensor, evaluator: FieldEvaluator, budget: float | None = None) -> Ends:
@@ -484,24 +478,3 @@ def _interpolation_weights(looked: Sequence[int], snapshots: int) -> Tensor:
         share = (inner - a).double() / (b - a)
         shares[inner, column], shares[inner, column + 1] = 1.0 - share, share
     return shares
-
-
-def rendered_importance(offsets: Tensor, render: Render, seed: int = 0) -> dict[str, float]:
-    """How much an error of one spread in each attribute shows in pictures, half way; these add up to 1.
-
-    Args:
-        offsets: [T,M,C]
-        render: pixels of some views
-    """
-    draws = torch.Generator().manual_seed(seed)
-    middle = offsets[len(offsets) // 2].float()
-    importance = {}
-    with torch.no_grad():
-        expected = render(middle)
-        for name, columns in moving_attributes(offsets).items():
-            spread = float(offsets[1:, :, columns].float().square().mean().sqrt())
-            moved = middle.clone()
-            moved[:, columns] += 0.1 * spread * torch.randn(moved[:, columns].shape, generator=draws)
-            importance[name] = float((render(moved) - expected).square().mean()) if len(expected) else 1.0
-    total = sum(importance.values())
-    return {name: value / total if total > 0 else 1.0 / len(importance) for name, value in importance.items()}

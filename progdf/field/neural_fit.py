@@ -16,7 +16,6 @@ import torch
 from torch import Tensor
 from torch.nn.functional import linear
 
-from .choose import Render, rendered_importance
 from .neural import (
     LAYOUT,
     Bins,
@@ -125,7 +124,7 @@ class NeuralFit:
 
         Args:
             offsets: of the snapshots so far. [T,M,C]
-            importance: see `rendered_importance`; None is the same for every number
+            importance: how much an error of each attribute shows, in all 1; None is the same for every number
         """
         columns = self.shape.columns
         self._end = offsets[-1][:, columns].float()
@@ -304,10 +303,6 @@ def fit_neural(
     rows: Tensor,
     settings: NeuralSettings | None = None,
     visibility: Tensor | None = None,
-    render: Render | None = None,
-    pictures: PictureLoss | None = None,
-    recorded: tuple[float, ...] | None = None,
-    on_step: Callable[[int, float], None] | None = None,
 ) -> NeuralField:
     """Train a neural field on a finished trajectory.
 
@@ -317,10 +312,6 @@ def fit_neural(
         rows: raw values of the members before the edit, packed. [M,≥14]
         settings: see NeuralSettings
         visibility: how much each member shows. [M]; None is evenly
-        render: of a few views; tells how much each attribute shows. None weighs all numbers alike
-        pictures: the loss is of these instead of offsets
-        recorded: strengths for the slider's ticks; `strengths` when None
-        on_step: progress: steps done, loss
 
     Raises:
         ValueError: no trajectory, or one that moves nothing.
@@ -330,9 +321,9 @@ def fit_neural(
     if not attributes:
         raise ValueError("nothing moves, so there is nothing for a network to learn")
     fit = NeuralFit(rows, offsets.shape[2], attributes, settings or NeuralSettings(), visibility)
-    fit.scale_to(offsets, rendered_importance(offsets, render) if render is not None else None)
-    train_network(fit, strengths, offsets, fit.settings.steps, pictures, on_step)
-    return fit.field(tuple(strengths.tolist()) if recorded is None else recorded)
+    fit.scale_to(offsets)
+    train_network(fit, strengths, offsets, fit.settings.steps)
+    return fit.field(tuple(strengths.tolist()))
 
 
 def train_network(

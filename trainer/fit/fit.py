@@ -127,7 +127,7 @@ def fit_field(
         field_evaluator(trajectory, choosing, options.target_psnr),
         trajectory.s.tolist(),
     )
-    return _measured(choice, trajectory, reporting)
+    return _measure_choice(choice, trajectory, reporting)
 
 
 def fit_grades(
@@ -161,7 +161,7 @@ def fit_grades(
         tried.append(evaluator.candidate(field, form.label))
         if tried[-1].excess <= 1.0 and budget is None:
             break
-    return _measured(pick_candidate(tried, evaluator.wanted, budget), trajectory, reporting)
+    return _measure_choice(pick_candidate(tried, evaluator.wanted, budget), trajectory, reporting)
 
 
 def field_evaluator(trajectory: Trajectory, views: Evaluator, target: float | None) -> FieldEvaluator:
@@ -173,7 +173,7 @@ def field_evaluator(trajectory: Trajectory, views: Evaluator, target: float | No
     return FieldEvaluator(trajectory.s, offsets, render, target=target)
 
 
-def _measured(choice: FieldChoice, trajectory: Trajectory, reporting: Evaluator) -> Fitted:
+def _measure_choice(choice: FieldChoice, trajectory: Trajectory, reporting: Evaluator) -> Fitted:
     """The choice with its errors, and baselines with theirs, on views that it has not seen."""
     offsets, best, why = _recorded_offsets(trajectory), choice.best, choice.why
     errors = FieldEvaluator(trajectory.s, offsets, reporting.counted_pixels)
@@ -204,7 +204,7 @@ def evaluate_field(
     network = evaluator.candidate(field, field.kind)
     why = f"a network was asked for{'; none' if network.excess > 1.0 else ' and'} {evaluator.wanted}"
     choice = FieldChoice(network, network.excess <= 1.0, (network,), why)
-    return _measured(choice, trajectory, reporting)
+    return _measure_choice(choice, trajectory, reporting)
 
 
 def _baselines(trajectory: Trajectory, offsets: Tensor, errors: FieldEvaluator) -> dict[str, Candidate]:
@@ -309,10 +309,4 @@ def stored_numbers(field: BakedField) -> int:
         return form.network.parameters + form.network.end.numel()
     if isinstance(form, GradeForm):
         return sum(part.numel() for part in (form.table, form.residual, form.scale, form.coefficients))
-    return sum(
-        bases.end_offset.numel()
-        + bases.residual_basis.numel()
-        + bases.scale.numel()
-        + bases.coefficients.numel()
-        for bases in field.attributes.values()
-    )
+    return sum(part.numel() for bases in field.attributes.values() for part in vars(bases).values())

@@ -16,7 +16,7 @@ from torch import Tensor
 from progdf.errors import ProgdfError
 from progdf.field import BakedField, NeuralSettings, bake_network
 from progdf.field.baked import NeuralForm, interpolate_at
-from progdf.field.choose import FieldEvaluator, Render, rendered_importance
+from progdf.field.choose import FieldEvaluator, Render
 from progdf.field.neural import NeuralShape
 from progdf.field.neural_fit import EFFORT, NeuralFit, PictureLoss, train_network
 from progdf.field.separable import moving_attributes
@@ -321,3 +321,24 @@ class RenderedLoss:
         image, _ = crop.render(self.rows + found, self.moving)
         predicted = l1(image, expected) + self.perceptual(image, expected)
         return predicted + sharpness(image, expected, "paper")
+
+
+def rendered_importance(offsets: Tensor, render: Render, seed: int = 0) -> dict[str, float]:
+    """How much an error of one spread in each attribute shows in pictures, half way; these add up to 1.
+
+    Args:
+        offsets: [T,M,C]
+        render: pixels of some views
+    """
+    draws = torch.Generator().manual_seed(seed)
+    middle = offsets[len(offsets) // 2].float()
+    importance = {}
+    with torch.no_grad():
+        expected = render(middle)
+        for name, columns in moving_attributes(offsets).items():
+            spread = float(offsets[1:, :, columns].float().square().mean().sqrt())
+            moved = middle.clone()
+            moved[:, columns] += 0.1 * spread * torch.randn(moved[:, columns].shape, generator=draws)
+            importance[name] = float((render(moved) - expected).square().mean()) if len(expected) else 1.0
+    total = sum(importance.values())
+    return {name: value / total if total > 0 else 1.0 / len(importance) for name, value in importance.items()}

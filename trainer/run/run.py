@@ -476,8 +476,6 @@ def expected_work(setup: TrainingSetup, optimization: OptimizeOptions, strengths
     }
     if optimization.solver == "colors":
         return work | {"model": 2.0 * train, "optimize": 0.45 * train * strengths}
-    if optimization.solver == "pictures":
-        return work | {"optimize": 20.0 * train}
     moves = optimization.group_steps or 0
     return work | {"move parts": 0.5 * moves * strengths, "optimize": 0.3 * optimization.steps}
 

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from progdf.field import NeuralSettings, bake_network, fit_neural
-from progdf.field.choose import rendered_importance
 from progdf.field.neural_fit import NeuralFit, train_network
 from tests.helpers.edits import curved_trajectory
 from tests.helpers.networks import MEMBERS, SHORT, members, rows, scene, smooth_trajectory
@@ -62,13 +61,6 @@ def test_visible_members_are_fitted_first() -> None:
     field = fit_neural(strengths, offsets, same_place, given, visibility).bind(same_place)
     wrong = (field.offsets(0.5) - offsets[4]).square().sum(dim=1)
     assert int(wrong.argmin()) == 7
-
-
-def test_importance_is_what_pictures_show() -> None:
-    _, offsets = curved_trajectory(MEMBERS, moving=("means", "sh0"))
-    found = rendered_importance(offsets, lambda moved: moved[:, 11:14])
-    assert found["sh0"] > 0.999
-    assert sum(found.values()) == pytest.approx(1.0)
 
 
 class Watched:

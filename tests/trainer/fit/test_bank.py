@@ -19,7 +19,7 @@ from progdf.formats.ply import load_ply
 from progdf.gdf.file import load_gdf
 from tests.helpers.edits import curved_trajectory
 from tests.helpers.trained import quick_options
-from trainer.fit.network import JointTraining, MemoryBank
+from trainer.fit.network import JointTraining, MemoryBank, rendered_importance
 from trainer.options import FitOptions, with_values
 from trainer.resolve import check_field_options, check_options
 from trainer.run.finish import refit
@@ -206,3 +206,10 @@ def test_network_options_that_mean_nothing_are_told(
 def test_a_refit_knows_its_options_too(folder: Path) -> None:
     with pytest.raises(ProgdfError, match="--size does not apply"):
         check_field_options(with_values(FitOptions(folder), size="small").field)
+
+
+def test_importance_is_what_pictures_show() -> None:
+    _, offsets = curved_trajectory(30, moving=("means", "sh0"))
+    found = rendered_importance(offsets, lambda moved: moved[:, 11:14])
+    assert found["sh0"] > 0.999
+    assert sum(found.values()) == pytest.approx(1.0)

@@ -242,7 +242,7 @@ def test_a_budget_that_makes_no_sense_is_told(folder: Path, field: str, budget: 
 
 def test_a_refit_keeps_the_best_field_within_a_budget(folder: Path) -> None:
     result = train(quick_options(folder, "budget", steps=16, stages=2, bytes_budget=1.0), quiet=True)
-    assert "fits into 1 bytes" in result.report["choice"]["why"]
+    assert "within 1 bytes" in result.report["choice"]["why"]
     assert result.report["field"]["bytes_per_gaussian"] == 0.0
     least = result.report["field"]["bytes_per_gaussian"]
     again = refit(with_values(FitOptions(result.folder.root), bytes_budget=least + 7, threads=1), quiet=True)
