@@ -99,15 +99,14 @@ def _bends(
         allowed: share of the change that may be missed (mean square), less where less of it is there
         low, high: shares between which one looks; halved where a straight line will not do
     """
-    first, last = (float(s) for s in interpolate(torch.tensor([low, high], dtype=torch.float64), even, due))
-    ends, change = (
-        [interpolate_at(even, pictures, s) for s in (first, last)],
-        _power(pictures[-1] - pictures[0]),
-    )
+    first, last = interpolate(torch.tensor([low, high], dtype=torch.float64), even, due).tolist()
+    start, end = interpolate_at(even, pictures, first), interpolate_at(even, pictures, last)
+    change = _power(pictures[-1] - pictures[0])
     for s, picture in zip(even.tolist(), pictures, strict=True):
         if first < s < last and high - low > 2 / STEPS:
             share = (s - first) / (last - first)
-            if _power(torch.lerp(*ends, share) - picture) > allowed * change * (low + share * (high - low)):
+            there = low + share * (high - low)
+            if _power(torch.lerp(start, end, share) - picture) > allowed * change * there:
                 middle = (low + high) / 2
                 halves = (low, middle), (middle, high)
                 return tuple(s for half in halves for s in _bends(even, pictures, due, allowed, *half))

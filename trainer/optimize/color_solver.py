@@ -18,6 +18,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, TypeVar
 
 import torch
@@ -256,9 +257,9 @@ class Solver:
         start: Tensor,
         targets: Sequence[Tensor],
         steps: int,
-        tell: Callable[[], None],
         judge: Judge | None = None,
         floor: float = 0.0,
+        tell: Callable[[], None] = lambda: None,
     ) -> tuple[Tensor, int]:
         """What the members' lowest bands need beside the map: preconditioned conjugate gradients (Polak and
         Ribière) that look at every step anew what the clamps pass; and the steps that were taken.
@@ -268,10 +269,10 @@ class Solver:
             start: a guess. [M,b,3]
             targets: pictures of the views
             steps: most steps
-            tell: called after each
             judge: the best in its views is kept, and steps end when they gain little there, see `SETTLED`;
                 None takes all
             floor: error in these views that counts as none, see `Model.error`
+            tell: called after each step
         """
         base = _map_threads(lambda view: view.colors(mapped), self.views)
         curvature = self.weights[:, : start.shape[1]]
@@ -367,7 +368,6 @@ def choose_model(
     targets: Sequence[Tensor],
     steps: int,
     most_bands: int,
-    tell: Callable[[], None],
 ) -> Model:
     """The smallest model of which a larger one would take away less than a twentieth of the error.
 
@@ -377,7 +377,6 @@ def choose_model(
         targets: the finished edit in the solver's views
         steps: most steps of conjugate gradients for a residual
         most_bands: that a residual may have: 1 or 4
-        tell: called between rounds
     """
     tried: list[tuple[str, float]] = []
     mapped, errors = {}, {}
@@ -390,7 +389,7 @@ def choose_model(
     residual = least_residual = torch.zeros(len(solver.sh), 0, 3)
     for more in (1, 4)[: 1 + (most_bands > 1 and solver.sh.shape[1] > 1)]:
         wider = torch.cat([residual, torch.zeros(len(residual), more - residual.shape[1], 3)], dim=1)
-        residual, _ = solver.residual(mapped[degree], wider, targets, steps, tell, judge)
+        residual, _ = solver.residual(mapped[degree], wider, targets, steps, judge)
         error = judge.error(add_bands(mapped[degree], residual))
         tried.append((f"with a residual of {more}", error))
         if error < MORE_PAYS * least:
@@ -457,15 +456,8 @@ def solve(
                 start = (member_bands(state.moved.detach()) - last)[:, : model.bands]
             share = (stages[index].strength - before) / (stages[-1].strength - before)
             start = torch.lerp(start, model.residual, share)
-            residual, taken = solver.residual(
-                mapped,
-                start,
-                targets,
-                steps,
-                lambda: on_step(state.step, state.running),
-                judges[index],
-                model.error,
-            )
+            told = partial(on_step, state.step, state.running)
+            residual, taken = solver.residual(mapped, start, targets, steps, judges[index], model.error, told)
             state.means.add({STEPS: taken})
             offsets = add_bands(mapped, residual)
         last = mapped
