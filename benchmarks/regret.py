@@ -200,7 +200,7 @@ class Edit:
             for steps in (steps for steps in STEPS if steps <= most):
                 began = time.process_time()
                 if bands:
-                    now, _ = solver.residual(mapped, now, targets, steps - done, lambda: None)
+                    now, _ = solver.residual(mapped, now, targets, steps - done)
                 spent, done = spent + time.process_time() - began, steps
                 self.solved[degree, bands, s, steps] = table, add_bands(mapped, now), spent
             last = now if last is None else last

@@ -28,6 +28,7 @@ from progdf.field.baked import (
 )
 from progdf.field.choose import ADDED
 from progdf.gaussians import BASE_CHANNELS, pack
+from progdf.metrics.image import ROUNDING
 from trainer.editors import COSTLY_STRENGTHS, check_editor
 from trainer.editors.base import ImageEditor
 from trainer.editors.procedural import edit_course
@@ -97,16 +98,19 @@ def _bends(
         even: strengths. [n] float64
         pictures: what is seen there
         due: strengths at which the change is as far along as `even` says. [n]
-        allowed: share of the change that may be missed (mean square), less where less of it is there
+        allowed: share of the change that may be missed (mean square), less where less of it is there; what
+            rounding to 8 bits misses always may
         low, high: shares between which one looks; halved where a straight line will not do
     """
-    first, last = (float(s) for s in interpolate(torch.tensor([low, high], dtype=torch.float64), even, due))
-    start, end = (interpolate_at(even, pictures, s) for s in (first, last))
-    change = _power(pictures[-1] - pictures[0])
+    first, last = interpolate(torch.tensor([low, high], dtype=torch.float64), even, due).tolist()
+    start, end = interpolate_at(even, pictures, first), interpolate_at(even, pictures, last)
+    change = pictures[-1] - pictures[0]
+    rounding = ROUNDING * int((change.abs() > 1 / 255).sum())
     for s, picture in zip(even.tolist(), pictures, strict=True):
         if first < s < last and high - low > 2 / STEPS:
             share = (s - first) / (last - first)
-            if _power(torch.lerp(start, end, share) - picture) > allowed * change * (low + share * (high - low)):
+            most = max(rounding, allowed * _power(change) * (low + share * (high - low)))
+            if _power(torch.lerp(start, end, share) - picture) > most:
                 middle = (low + high) / 2
                 halves = (low, middle), (middle, high)
                 return tuple(s for half in halves for s in _bends(even, pictures, due, allowed, *half))

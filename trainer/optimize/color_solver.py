@@ -22,6 +22,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -309,10 +310,10 @@ class Solver:
         start: Tensor,
         targets: Sequence[Tensor],
         steps: int,
-        tell: Callable[[], None],
-        hold: float = _RIDGE,
         judge: Judge | None = None,
         floor: float = 0.0,
+        hold: float = _RIDGE,
+        tell: Callable[[], None] = lambda: None,
     ) -> tuple[Tensor, int]:
         """What the members' lowest bands need beside the map: preconditioned conjugate gradients (Polak and
         Ribière) that look at every step anew what the clamps pass; and the steps that were taken.
@@ -322,11 +323,11 @@ class Solver:
             start: a guess. [M,b,3]
             targets: pictures of the views
             steps: most steps
-            tell: called after each
-            hold: see `Model.hold`
             judge: the best in its views is kept, and steps end when they gain little there, see `SETTLED`;
                 None takes all
             floor: error in these views that counts as none, see `Model.error`
+            hold: see `Model.hold`
+            tell: called after each step
         """
         ridge, base = hold * self.typical, _map_threads(lambda view: view.colors(mapped), self.views)
         look = None if judge is None else lambda now: judge.error(add_bands(mapped, now))
@@ -469,7 +470,6 @@ def choose_model(
     targets: Sequence[Tensor],
     steps: int,
     most_bands: int,
-    tell: Callable[[], None],
 ) -> Model:
     """The smallest model of which a larger one would take away less than a twentieth of the error.
 
@@ -482,7 +482,6 @@ def choose_model(
         targets: the finished edit in the solver's views
         steps: most steps of conjugate gradients for a residual
         most_bands: that a residual may have: 1 or 4
-        tell: called between rounds
     """
     tried: list[tuple[str, float]] = []
     few, zero = solver.ties is not None, torch.zeros(len(solver.sh), 0, 3)
@@ -495,7 +494,7 @@ def choose_model(
         residuals = [pad(one, (0, 0, 0, bands - one.shape[1])) for one in start]
         if bands:
             residuals = [
-                by.residual(made, one, targets, steps, tell, hold, judge)[0]
+                by.residual(made, one, targets, steps, judge, hold=hold)[0]
                 for (by, judge), made, one in zip(trials, offsets, residuals, strict=True)
             ]
         total = zip(trials, offsets, residuals, strict=True)
@@ -527,7 +526,7 @@ def choose_model(
     if few:  # the trials solved for a part of it
         made, judge = map_with(solver, degree), Judge(solver.views, targets)
         zero = torch.zeros_like(residual)
-        residual, _ = solver.residual(made, zero, targets, steps, tell, best.hold, judge, best.error)
+        residual, _ = solver.residual(made, zero, targets, steps, judge, best.error, best.hold)
     unedited = sum(judge.error(torch.zeros_like(solver.sh)) for _, judge in trials) / len(trials)
     decided = [(name, decibels(error)) for name, error in tried]
     return Model(degree, best.hold, residual, best.error, unedited, decided)
@@ -590,15 +589,9 @@ def solve(
                 start = (member_bands(state.moved.detach()) - last)[:, : model.bands]
             share = (stages[index].strength - before) / (stages[-1].strength - before)
             start = torch.lerp(start, model.residual, share)
+            told = partial(on_step, state.step, state.running)
             residual, taken = solver.residual(
-                mapped,
-                start,
-                targets,
-                steps,
-                lambda: on_step(state.step, state.running),
-                model.hold,
-                judges[index],
-                model.error,
+                mapped, start, targets, steps, judges[index], model.error, model.hold, told
             )
             state.means.add({STEPS: taken})
             offsets = add_bands(mapped, residual)

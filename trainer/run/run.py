@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -282,7 +282,7 @@ def _run_training(
     for note in setup.notes:
         log.say(note)
     with log.stage("edit"):
-        edited, approach, trial = _edit_views(options, setup, folder, log)
+        edited, approach, trial, between = _edit_views(options, setup, folder, log)
         train_edits = {s: pictures[: len(setup.train)] for s, pictures in edited.items()}
         setup = whole_views(setup) if options.optimize.as_printed else widen_views(setup, train_edits)
     recorded = folder.state.load("recorded")
@@ -290,9 +290,6 @@ def _run_training(
         with log.stage("agree"):
             agreement = _agreement(options, setup, edited, approach.kind, log)
         optimization = resolve_kind(options, approach.kind, approach.group_steps)
-        between = None
-        if waits_for_error(options, optimization):
-            between = partial(_edit_between, edited, options, setup, approach, folder, log)
         trajectory, outcome = _record(options, optimization, setup, edited, between, perceptual, folder, log)
         record = RunRecord(
             recorded_options(options),
@@ -367,98 +364,74 @@ def _render_originals(
 
 def _edit_views(
     options: TrainOptions, setup: TrainingSetup, folder: RunFolder, log: RunLog
-) -> tuple[Pictures, Approach, dict[str, Any] | None]:
-    """What the editor makes of all views, by strength, read where it is on disk; how to train towards it, and
-    what a trial of that found.
+) -> tuple[Pictures, Approach, dict[str, Any] | None, Callable[[float], Pictures]]:
+    """What the editor makes of all views, by strength, read where it is on disk; how to train towards it;
+    what a trial found of that; and, given what the finished edit misses, all strengths that its course
+    calls for.
     """
-    views = setup.views
+    views, spec = setup.views, options.editor.editor
     names = [view.camera.name for view in views]
+    made: dict[float, Sequence[Tensor]] = {}
+    approach, trial = Approach("color"), None
+
+    @cache
+    def editor() -> ImageEditor:
+        return make_editor(replace(options.editor, cache=folder.paintings), setup.scene, setup.region, views)
+
+    def edit(strengths: Sequence[float]) -> Pictures:
+        new, is_confined = [s for s in strengths if s not in made], confines_edit(editor(), approach.kind)
+        with log.steps("edit", len(views) * len(new)) as advance:
+            made.update(edit_views(editor(), views, new, folder, is_confined, advance))
+        log.say(f"{spec}: a {approach.kind} edit at strength {', '.join(f'{s:g}' for s in strengths)}")
+        saved = {"strengths": list(strengths), "kind": approach.kind, "group_steps": approach.group_steps}
+        folder.state.save("edited", {}, saved | {"trial": trial})
+        return {s: made[s] for s in strengths}
+
+    def between(missed: float) -> Pictures:
+        if len(made) > 1 or not _waits_for_error(options, resolve_kind(options, approach.kind, 0)):
+            return made
+        plain = tuple((i + 1) / MOST_STAGES for i in range(MOST_STAGES))
+        strengths = equalized_strengths(editor(), spec, views, plain, missed)
+        log.expect(expected_work(setup, resolve_kind(options, approach.kind, 0), len(strengths)))
+        return edit(strengths)
+
     done = folder.state.load("edited")
     if done is not None:
         try:
-            edited = {s: read_views(folder, "edited", names, s) for s in done.values["strengths"]}
-            log.say("the edited views are on disk")
+            made.update({s: read_views(folder, "edited", names, s) for s in done.values["strengths"]})
             approach = Approach(done.values["kind"], done.values["group_steps"])
-            optimization = resolve_kind(options, approach.kind, approach.group_steps)
-            log.expect(expected_work(setup, optimization, len(edited)))
-            return edited, approach, done.values["trial"]
+            trial = done.values["trial"]
+            log.say("the edited views are on disk")
+            log.expect(expected_work(setup, resolve_kind(options, approach.kind, 0), len(made)))
+            return made, approach, trial, between
         except ProgdfError as error:
+            made.clear()
             log.say(f"the views are edited again: {str(error).partition(';')[0]}")
-    spec = options.editor.editor
-    editor = make_editor(replace(options.editor, cache=folder.paintings), setup.scene, setup.region, views)
-    if isinstance(editor, FolderEditor) and editor.warning is not None:
-        log.say(editor.warning)
-    approach, trial = choose_approach(options, setup, editor, log)
-    kind = approach.kind
-    optimization = resolve_kind(options, kind, approach.group_steps)
-    strengths = editor_strengths(editor, optimization.stages)
+    painter = editor()
+    if isinstance(painter, FolderEditor) and painter.warning is not None:
+        log.say(painter.warning)
+    approach, trial = choose_approach(options, setup, editor(), log)
+    optimization = resolve_kind(options, approach.kind, approach.group_steps)
+    strengths = editor_strengths(editor(), optimization.stages)
     log.expect(expected_work(setup, optimization, len(strengths)))
-    if waits_for_error(options, optimization):
+    if _waits_for_error(options, optimization):
         strengths = (1.0,)
     elif not optimization.as_printed and resolve_slider(optimization.slider, strengths) == "even":
-        strengths = equalized_strengths(editor, spec, views, strengths)
-    edited = _edit_at(strengths, {}, editor, setup, approach, trial, folder, log)
+        strengths = equalized_strengths(editor(), spec, views, strengths)
+    edited = edit(strengths)
     if all(
         torch.equal(p, quantize_image(v.image)) for s in edited for p, v in zip(edited[s], views, strict=True)
     ):
         raise ProgdfError(
             f"{spec} changes none of the views; check the region and what the editor is asked for"
         )
-    return edited, approach, trial
+    return edited, approach, trial, between
 
 
-def waits_for_error(options: TrainOptions, optimization: OptimizeOptions) -> bool:
+def _waits_for_error(options: TrainOptions, optimization: OptimizeOptions) -> bool:
     """Whether strengths between are chosen when it is known what the finished edit misses."""
     known = options.optimize.stages or options.editor.family in (*EXTERNAL, *COSTLY_STRENGTHS)
     return optimization.solver == "colors" and not known
-
-
-def _edit_between(
-    edited: Pictures,
-    options: TrainOptions,
-    setup: TrainingSetup,
-    approach: Approach,
-    folder: RunFolder,
-    log: RunLog,
-    missed: float,
-) -> Pictures:
-    """All views edited at as many strengths as the edit's course calls for; `missed`: see
-    `equalized_strengths`."""
-    if len(edited) > 1:
-        return edited
-    plain = tuple((i + 1) / MOST_STAGES for i in range(MOST_STAGES))
-    painter = replace(options.editor, cache=folder.paintings)
-    editor = make_editor(painter, setup.scene, setup.region, setup.views)
-    strengths = equalized_strengths(editor, options.editor.editor, setup.views, plain, missed)
-    optimization = resolve_kind(options, approach.kind, approach.group_steps)
-    log.expect(expected_work(setup, optimization, len(strengths)))
-    return _edit_at(strengths, edited, editor, setup, approach, None, folder, log)
-
-
-def _edit_at(
-    strengths: Sequence[float],
-    edited: Pictures,
-    editor: ImageEditor,
-    setup: TrainingSetup,
-    approach: Approach,
-    trial: dict[str, Any] | None,
-    folder: RunFolder,
-    log: RunLog,
-) -> dict[float, Sequence[Tensor]]:
-    """All views edited at these strengths, but for those that are already; kept on disk."""
-    views, new = setup.views, [s for s in strengths if s not in edited]
-    with log.steps("edit", len(views) * len(new)) as advance:
-        made = edit_views(editor, views, new, folder, confines_edit(editor, approach.kind), advance)
-    at = ", ".join(f"{s:g}" for s in strengths)
-    log.say(f"a {approach.kind} edit at strength {at}")
-    saved = {
-        "strengths": strengths,
-        "kind": approach.kind,
-        "group_steps": approach.group_steps,
-        "trial": trial,
-    }
-    folder.state.save("edited", {}, saved)
-    return {s: made[s] if s in made else edited[s] for s in strengths}
 
 
 def expected_work(setup: TrainingSetup, optimization: OptimizeOptions, strengths: int) -> dict[str, float]:
@@ -497,7 +470,7 @@ def _record(
     optimization: OptimizeOptions,
     setup: TrainingSetup,
     edited: Pictures,
-    between: Callable[[float], Pictures] | None,
+    between: Callable[[float], Pictures],
     perceptual: Perceptual,
     folder: RunFolder,
     log: RunLog,

@@ -184,28 +184,10 @@ def optimize_members(
     way: Way
     model: Model | None = None
     if optimization.solver == "colors":
-        with log.stage("weights"):
-            few = options.views.pictures
-            ties = surface_ties(scene, members, [view.camera for view in setup.train]) if few else None
-            drawn = color_views(crops, original)
-            judging = _judging(setup, drawn, original, edited)
-        most, given = iterations(optimization.steps), bool(options.views.views)
-        with log.stage("model"):
-            judge = judging(edited[max(edited)])
-            fewer = not given and judge.views is not drawn
-            colors, model, line = choose_effort(
-                drawn, judge, stages[-1].targets, original, most, optimization.sh, fewer, ties
-            )
-        log.say(line)
-        if few:
-            unseen = len(members) - int(colors.asked.sum())
-            log.say(f"{unseen} members that no picture shows follow the map and their own surface")
-        if between is not None:
-            edited = between(model.missed)
-            stages = _stages(optimization, setup, edited)
-        every = len(drawn) // len(colors.views)
-        stages = [replace(stage, targets=stage.targets[::every]) for stage in stages]
-        judges = [judging(pictures) for pictures in edited.values()]
+        most = iterations(optimization.steps)
+        colors, model, edited, stages, judges = _prepare_colors(
+            options, optimization, setup, edited, crops, original, between, log
+        )
         way = partial(solve, original, colors, model, stages, judges, state, steps=most)
     else:
         inside = [erode(crop(view.mask, view.box)) for view in setup.train]
@@ -244,8 +226,6 @@ def optimize_members(
 def _stages(optimization: OptimizeOptions, setup: TrainingSetup, edited: Pictures) -> list[TargetStage]:
     """The strengths to optimize towards, and the steps that each gets."""
     steps = max(optimization.steps, len(edited) + 1)  # each stage is to have one
-    if optimization.solver == "colors":
-        return [TargetStage(s, _boxes(pictures, setup.train), 1) for s, pictures in edited.items()]
     return [
         TargetStage(s, _boxes(pictures, setup.train), steps)
         for (s, pictures), steps in zip(edited.items(), _steps_by_stage(steps, len(edited)), strict=True)
@@ -263,6 +243,39 @@ def _crops(setup: TrainingSetup, views: Sequence[View], still: bool) -> Sequence
         views, lambda v: crop_scene(scene, members, v.camera, v.box, setup.background, still)
     )
     return crops if still else list(crops)
+
+
+def _prepare_colors(
+    options: TrainOptions,
+    optimization: OptimizeOptions,
+    setup: TrainingSetup,
+    edited: Pictures,
+    crops: Sequence[CropScene],
+    original: Tensor,
+    between: Callable[[float], Pictures] | None,
+    log: RunLog,
+) -> tuple[Solver, Model, Pictures, list[TargetStage], list[Judge]]:
+    """The views to solve for, how much is modelled, the strengths; and what says when each is done."""
+    with log.stage("weights"):
+        drawn = color_views(crops, original)
+        judging, few = _judging(setup, drawn, original, edited), options.views.pictures
+        cameras = [view.camera for view in setup.train]
+        ties = surface_ties(setup.scene, setup.region.members, cameras) if few else None
+    with log.stage("model"):
+        judge, finished = judging(edited[max(edited)]), _boxes(edited[max(edited)], setup.train)
+        fewer = not options.views.views and judge.views is not drawn
+        most = iterations(optimization.steps)
+        solver, model, line = choose_effort(
+            drawn, judge, finished, original, most, optimization.sh, fewer, ties
+        )
+    log.say(line)
+    if few:
+        unseen = len(original) - int(solver.asked.sum())
+        log.say(f"{unseen} members that no picture shows follow the map and their own surface")
+    edited = edited if between is None else between(model.missed)
+    every = len(drawn) // len(solver.views)
+    stages = [TargetStage(s, _boxes(some, setup.train)[::every], 1) for s, some in edited.items()]
+    return solver, model, edited, stages, [judging(pictures) for pictures in edited.values()]
 
 
 def _judging(
@@ -302,7 +315,7 @@ def choose_effort(
     for every in (2, 1) if fewer and len(views) > 3 else (1,):
         solver = make_solver(views[::every], original, ties)
         trials = [(solver, judge)] if ties is None else split_solver(solver, original, targets)
-        model = choose_model(solver, trials, targets[::every], most, 1 if sh == "off" else 4, _wait)
+        model = choose_model(solver, trials, targets[::every], most, 1 if sh == "off" else 4)
         tried.append((solver, model))
     solver, model = tried[MORE_PAYS * tried[0][1].error > tried[-1][1].error]
     on = "all views, as none is held out" if judge.views is views else "views that are held out"
@@ -312,10 +325,6 @@ def choose_effort(
         over = " and ".join(f"{decibels(m.error):.1f} dB from {len(s.views)} views" for s, m in tried)
         line += f"; {len(solver.views)} of {len(views)} views are solved for: {over}"
     return solver, model, line
-
-
-def _wait() -> None:
-    """Nothing to tell: a model is chosen within seconds."""
 
 
 def _record_way(

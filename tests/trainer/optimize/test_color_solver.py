@@ -64,7 +64,7 @@ def prepared(scene: Gaussians, cameras: list[Camera]) -> tuple[list[CropScene], 
 
 
 def model_of(solver: Solver, targets: list[Tensor], steps: int = 40, bands: int = 4) -> Model:
-    return choose_model(solver, [(solver, Judge(solver.views, targets))], targets, steps, bands, lambda: None)
+    return choose_model(solver, [(solver, Judge(solver.views, targets))], targets, steps, bands)
 
 
 def solve_all(
@@ -134,7 +134,7 @@ def test_a_color_below_zero_is_reached_through_clamps_that_lead_back() -> None:
     targets = render_all(crops, pack(scene, with_shN=False))
     solver = make_solver(color_views(crops, original), original)
     nothing = torch.zeros(500, 1, 3)
-    offsets, _ = solver.residual(nothing, nothing, targets, 20, lambda: None)
+    offsets, _ = solver.residual(nothing, nothing, targets, 20)
     assert float((offsets > 0.0).float().mean()) > 0.5
 
 
@@ -168,7 +168,7 @@ def test_a_pattern_gets_a_residual_and_only_as_many_bands_as_pay() -> None:
             for some in (crops, others)
         )
         judge = Judge(color_views(others, original), aside)
-        return choose_model(solver, [(solver, judge)], targets, 40, most, lambda: None).bands
+        return choose_model(solver, [(solver, judge)], targets, 40, most).bands
 
     solver = make_solver(color_views(crops, original), original)
     assert bands_of(edited) == 1
@@ -190,9 +190,9 @@ def test_steps_end_where_other_views_gain_little_and_go_on_where_members_are_den
     solver = make_solver(color_views(crops, original), original)
     mapped = solver.map_offsets(1, solver.table(1, targets))
     start, judge = torch.zeros(members, 1, 3), Judge(color_views(others, original), aside)
-    found, taken = solver.residual(mapped, start, targets, most, lambda: None, judge=judge)
+    found, taken = solver.residual(mapped, start, targets, most, judge)
     assert taken == most if members == 6000 else taken < most / 2
-    further, all_steps = solver.residual(mapped, start, targets, most, lambda: None)
+    further, all_steps = solver.residual(mapped, start, targets, most)
     assert all_steps == most or members == 200
     assert judge.error(add_bands(mapped, found)) <= 1.02 * judge.error(add_bands(mapped, further))
 

@@ -259,6 +259,38 @@ def test_a_run_that_moves_parts_goes_on_to_the_same_bits(
     assert (OUT / "trajectory.safetensors").read_bytes() == expected
 
 
+def test_a_run_that_decides_on_its_effort_goes_on_to_the_same_bits(
+    bear_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Stopped while the views are edited at the strengths that were decided on, then between two of them."""
+    free = {"perceptual_weight": None, "steps": 200, "stages": 0, "views": 0, "image_size": 40}
+    options = small_run(bear_folder, field="auto", **free)
+    train(options, quiet=True)
+    expected, strengths = bits(OUT), 0
+    shutil.rmtree(OUT)
+    monkeypatch.setattr("trainer.store.state.SAVE_EVERY", 0.0)
+
+    def edit_views(*given: object, made: object = trainer.run.run.edit_views) -> object:
+        nonlocal strengths
+        strengths += len(given[2])  # type: ignore[arg-type]
+        if strengths == 1:
+            return made(*given)  # type: ignore[operator]
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(trainer.run.run, "edit_views", edit_views)
+        with pytest.raises(KeyboardInterrupt):
+            train(options, quiet=True)
+    assert strengths > 2
+    with monkeypatch.context() as patch:
+        at_step(patch, 2, lambda: os.kill(os.getpid(), signal.SIGINT))
+        with pytest.raises(KeyboardInterrupt):
+            train(replace(options, resume=True), quiet=True)
+    assert saved_step() > 0
+    train(replace(options, resume=True), quiet=True)
+    assert bits(OUT) == expected
+
+
 def test_what_is_found_in_a_folder_depends_on_the_options(
     bear_folder: Path, uninterrupted: Path, interrupted: Path
 ) -> None:
