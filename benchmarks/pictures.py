@@ -91,7 +91,7 @@ def _rows(path: Path, edit: str) -> list[tuple[str, ...]]:
         solver = make_solver(color_views(crops, original), original, ties)
         targets = [crop(picture, view.box) for view, picture in zip(large, edited, strict=True)]
         trials = split_solver(solver, original, targets)
-        model = choose_model(solver, trials, targets, STEPS, 1, lambda: None)
+        model = choose_model(solver, trials, targets, STEPS, 1)
         offsets = band_offsets(solver.edit_offsets(model, targets), original.shape[1])
         took = time.process_time() - began
         found = scene.replace_rows(region.members, original + offsets)

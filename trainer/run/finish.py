@@ -157,21 +157,22 @@ def _fit(
         log.say("one view alone is held out: the field is chosen and reported on it")
     if not setup.held_out:
         log.say("no view is held out: all figures are of the views that were trained on")
-    few = setup.train[:: max(1, len(setup.train) // _RANK_VIEWS)][:_RANK_VIEWS]
-    seen = load_evaluator(folder, setup, few, trajectory)
     with log.looks("weigh the members", len(setup.train)) as looked:
         weights = visibility(setup.scene, setup.region.members, setup.train, looked)
+    few = setup.train[:: max(1, len(setup.train) // _RANK_VIEWS)][:_RANK_VIEWS]
     if options.field == "neural":
+        seen = load_evaluator(folder, setup, few, trajectory)
         network = fit_network(
             trajectory, setup, seen, reporting, weights, options, perceptual, log, begun=begun
         )
         return evaluate_field(trajectory, reporting, network.field, options.target_psnr), network
     with log.looks("fit the field", expected_looks(trajectory, options.field)) as looked:
-        seen, choosing, reporting = (replace(some, looked=looked) for some in (seen, choosing, reporting))
+        choosing, reporting = replace(choosing, looked=looked), replace(reporting, looked=looked)
         if trajectory.maps is not None and options.field == "auto":
             scene = setup.scene[setup.region.members]
             rows = pack(scene, with_shN=scene.sh_degree > 0)
             return fit_grades(trajectory, rows, choosing, reporting, weights, options), None
+        seen = replace(load_evaluator(folder, setup, few, trajectory), looked=looked)
         return fit_field(trajectory, seen, choosing, reporting, weights, options), None
 
 

@@ -231,7 +231,7 @@ def train(options: TrainOptions, quiet: bool = False, shared: Shared | None = No
             if session.does == "nothing":
                 return load_result(folder, options.name, scene, log)
             use_threads(session.threads)
-            with check_exists(folder):
+            with check_exists(folder), folder.state.writing():
                 if session.does == "start":
                     _write_draft(options, scene, region, folder, log)
                 result = _run_training(options, scene, region, folder, shared, log)
@@ -241,10 +241,7 @@ def train(options: TrainOptions, quiet: bool = False, shared: Shared | None = No
             log.note("interrupted")
             raise
         finally:
-            try:
-                folder.state.wait()
-            finally:
-                log.close()
+            log.close()
 
 
 def select_region(
@@ -448,9 +445,9 @@ def expected_work(setup: TrainingSetup, optimization: OptimizeOptions, strengths
         "edit": 0.1 * views * strengths,
     }
     if optimization.solver == "colors":
-        return work | {"model": 2.0 * train, "optimize": 0.45 * train * strengths}
+        return work | {"weights": 0.5 * train, "model": 1.5 * train, "optimize": 0.45 * train * strengths}
     moves = optimization.group_steps or 0
-    return work | {"move parts": 0.5 * moves * strengths, "optimize": 0.3 * optimization.steps}
+    return work | {"move parts": 0.5 * moves * strengths, "optimize": 0.25 * optimization.steps}
 
 
 def _agreement(

@@ -31,6 +31,7 @@ STAGES = {
     "views": "",
     "try kinds": "Choosing what moves",
     "edit": "Editing views",
+    "weights": "",
     "model": "",
     "move parts": "Moving parts",
     "optimize": "Training",
@@ -41,6 +42,7 @@ STAGES = {
     "field": "Packing",
     "even the slider": "Evening the slider",
     "measure the edit": "Measuring",
+    "draw": "",
 }
 """The long stages of a run in their order, with their labels in the window; those without tell no steps."""
 
@@ -51,9 +53,12 @@ LATER = {
     "fit the field": 0.7,
     "even the slider": 0.3,
     "measure the edit": 1.7,
+    "draw": 0.4,
 }
 """Work for each view of the stages that follow the optimization, see `RunLog.expect`."""
 
+
+_EDITOR = ("try kinds", "edit")
 
 _EVERY_S = 5.0
 _FILE_EVERY_S = 0.4
@@ -81,13 +86,8 @@ class RunLog:
         self.refits = refits
         self._earlier = 0.0
         self._progress, self._written, self._share = progress, 0.0, 0.0
-        self._work: Mapping[str, float] = {
-            "views": 1.0,
-            "try kinds": 1.0,
-            "edit": 1.0,
-            "optimize": 5.0,
-            **LATER,
-        }
+        self._work: Mapping[str, float] = {"views": 1.0, "edit": 1.0, "optimize": 5.0, **LATER}
+        self._took: dict[str, float] = {}  # seconds of the stages that have ended
         self._running: dict[str, float] = {}
         self.memory = PeakMemory()
         self._start = time.perf_counter()
@@ -128,18 +128,24 @@ class RunLog:
     def seconds_left(self, stage: str, share: float, elapsed: float) -> float:
         """Until the run ends, as far as it can be told.
 
-        What is to come is taken to go at the pace of all that was; a stage's own pace counts as far as it is.
+        What is to come is taken to go at the pace of all that was, but for the editor's work, which is of
+        another kind; a stage's own pace counts as far as it is.
 
         Args:
             stage: that runs
             share: of it that is done, 0..1
             elapsed: seconds of it so far
         """
-        order = list(STAGES)
-        ended = sum(work for name, work in self._work.items() if order.index(name) < order.index(stage))
-        ahead = sum(work for name, work in self._work.items() if order.index(name) > order.index(stage))
-        own = self._work.get(stage, 0.0)
-        pace = self._total() / max(ended + share * own, 1e-9)
+        own, place = self._work.get(stage, 0.0), list(STAGES).index(stage)
+        ahead = sum(work for name, work in self._work.items() if list(STAGES).index(name) > place)
+        took, work = 0.0, 0.0
+        for name, seconds in self._took.items() | {(stage, elapsed)}:
+            if name not in _EDITOR:
+                took, work = (
+                    took + seconds,
+                    work + self._work.get(name, 0.0) * (share if name == stage else 1.0),
+                )
+        pace = took / work if work else elapsed / max(share * own, 1e-9)
         return (1.0 - share) * ((1.0 - share) * pace * own + elapsed) + pace * ahead
 
     def note(self, text: str) -> None:
@@ -164,6 +170,8 @@ class RunLog:
             self.memory.end(name)
             del self._running[name]
             self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begun
+            if not STAGES.get(name, name):
+                self._took[name] = time.perf_counter() - begun
 
     @contextmanager
     def steps(self, what: str, total: int) -> Iterator[Advance]:
@@ -192,6 +200,7 @@ class RunLog:
                     progress.update(task, completed=done, word=f"{word}  {tell(done, word):.0f} s left")
 
                 yield move_bar
+            self._took[what] = time.perf_counter() - begun
             return
 
         def advance(done: int, word: str) -> None:
@@ -202,6 +211,7 @@ class RunLog:
                 self.say(f"{what} {done}/{total}  {word}  {left:.0f} s left")
 
         yield advance
+        self._took[what] = time.perf_counter() - begun
 
     @contextmanager
     def looks(self, what: str, total: int) -> Iterator[Callable[[], None]]:

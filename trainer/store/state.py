@@ -214,6 +214,14 @@ class StateFolder:
         if (writing := _writing.pop(self.path, None)) is not None:
             writing.result()
 
+    @contextmanager
+    def writing(self) -> Iterator[None]:
+        """Whatever happens, all is saved in the end; see `wait`."""
+        try:
+            yield
+        finally:
+            self.wait()
+
     def load(self, part: str, index: int | None = None) -> Saved | None:
         """What was saved of a part; None where nothing was.
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -70,7 +72,34 @@ def test_saving_waits_until_it_is_a_hundredth_of_the_time(
     for _ in range(4000):
         now += 0.1
         kept.step_done()
+        folder.wait()  # the clock stands still for the thread that writes
     assert 0.5 * 0.01 < kept.seconds / now < 1.01 * 0.01
+
+
+def test_training_goes_on_while_a_disk_takes_its_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flushed, rows = threading.Event(), torch.ones(3)
+    monkeypatch.setattr("trainer.store.state._flush", lambda path: flushed.wait(60.0))
+    folder = StateFolder(tmp_path / "state")
+    folder.path.mkdir()
+
+    class Rows:
+        def capture_state(self) -> Saved:
+            return Saved({"rows": rows}, {})
+
+        def restore(self, saved: Saved) -> None: ...
+
+    kept = PeriodicSave(folder, "training", {"rows": Rows()}, every_s=0.001)
+    time.sleep(0.002)
+    kept.step_done()
+    rows += 1.0
+    kept.step_done()
+    assert kept.saves == 1, "one after the other"
+    flushed.set()
+    saved = folder.load("training")
+    assert saved is not None
+    assert saved.tensors["rows/rows"].tolist() == [1.0] * 3, "as it was when it was saved"
 
 
 def test_a_state_folder_that_is_a_link_is_refused_and_nothing_behind_it_is_touched(tmp_path: Path) -> None:
