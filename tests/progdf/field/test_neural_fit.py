@@ -79,7 +79,9 @@ class Watched:
 def test_pictures_are_compared_at_a_snapshot_drawn_at_random_never_between_two() -> None:
     strengths, offsets = curved_trajectory(MEMBERS, moving=("sh0",))
     pictures = Watched()
-    fit_neural(strengths, offsets, rows(), replace(SHORT, steps=60), pictures=pictures)
+    fit = NeuralFit(rows(), offsets.shape[2], ("sh0",), SHORT)
+    fit.scale_to(offsets)
+    train_network(fit, strengths, offsets, 60, pictures)
     assert len(pictures.asked) == 60, "in every step"
     drawn = {
         next(i for i, made in enumerate(offsets) if torch.equal(made, recorded))
