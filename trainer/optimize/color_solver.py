@@ -59,11 +59,7 @@ STEPS = "steps"
 _RIDGE = 0.002  # of a typical member's weight: holds the residual of what hardly shows at 0
 _TIES = 0.001  # of a typical member's weight: ties neighbors, where views are few
 _TRUSTED = 0.1  # of the same: a member of less is rather as its neighbors are
-_HOLDS = (
-    1e-5,
-    1e-3,
-    1e-8,
-)  # ridges that are tried there: a residual goes some way, to its neighbors, around all
+_HOLDS = (1e-8, 1e-5, 1e-3)  # ridges tried there: a residual goes around all, some way, to its neighbors
 _SQUARES = 6  # of a view's longer side, every other one of which is solved for while these are tried
 _MAP_RIDGE = 1e-6  # the same of the map's coefficients, for regions of few colors
 _MAP_HELD = 1e-2  # say of the members' own colors beside the pixels: there a map is held to the affine one
@@ -474,7 +470,7 @@ def choose_model(
     """The smallest model of which a larger one would take away less than a twentieth of the error.
 
     Of a few pictures there is always a residual, or what single members got would not be in the edit; how far
-    it travels is what takes away most.
+    it travels is all the way, unless less takes away a twentieth.
 
     Args:
         solver: the views
@@ -520,7 +516,7 @@ def choose_model(
     for bands, hold in [(1, hold) for hold in _HOLDS[1:]] if few else sizes:
         name = f"residual held by {hold:g}" if few else f"with a residual of {bands}"
         last = attempt(name, mapped[degree], last.residuals, bands, hold)
-        if last.error < (1.0 if few else MORE_PAYS) * best.error:
+        if last.error < MORE_PAYS * best.error:
             best = last
     residual = best.residuals[0]
     if few:  # the trials solved for a part of it
