@@ -43,10 +43,11 @@ from trainer.optimize.solve_pictures import RECORDINGS, make_picture_solver, sol
 from trainer.options import OptimizeOptions, TrainOptions
 from trainer.setup import Pictures, TrainingSetup, probe_views
 from trainer.store.progress import RunLog
+from trainer.store.run_folder import LazySequence, stored_pictures
 from trainer.store.state import PeriodicSave, Resumable, Saved, StateFolder, defer_signals
 from trainer.views.choose import split_held_out
 from trainer.views.crops import CropScene, crop_scene, moving_attributes, only_recolors, render_all
-from trainer.views.view import LazySequence, View, crop, stored_pictures
+from trainer.views.view import View, crop
 
 
 class _RecordingValues(msgspec.Struct):
