@@ -27,20 +27,17 @@ from .editors.pictures import picture_cameras
 from .editors.procedural import ColorEditor, edit_course
 from .options import MOST_VIEWS, VIEWS, Kind, ViewOptions
 from .store.progress import Advance
-from .store.run_folder import RunFolder, add_pictures
+from .store.run_folder import LazySequence, RunFolder, add_pictures, from_bytes, to_bytes
 from .views.choose import choose_views, split_views
 from .views.crops import CropScene, crop_scene
 from .views.view import (
     BACKGROUND,
     INSIDE,
-    LazySequence,
     View,
     fit_size,
-    from_bytes,
     make_view,
     name_cameras,
     region_rig,
-    to_bytes,
     with_near_plane,
 )
 

@@ -408,12 +408,14 @@ class Solver:
             drawn = (colors > 0.0) | (pull > 0.0)
             return drawn, counts, pull * drawn, squared
 
-        seen = _map_threads(look, range(len(self.views)))
-        descent = -self._hold(residual, ridge)
-        for view, (_, _, pull, _) in zip(self.views, seen, strict=True):
+        descent, clamps = -self._hold(residual, ridge), list[tuple[Tensor, Tensor]]()
+        error = _inner(residual, self._hold(residual, ridge))
+        looks = _in_turn(look, range(len(self.views)))
+        for view, (drawn, counts, pull, squared) in zip(self.views, looks, strict=True):
             descent += view.basis[:, : residual.shape[1], None] * pull[:, None]
-        error = sum(squared for *_, squared in seen) + _inner(residual, self._hold(residual, ridge))
-        return _Pull(descent, error, [(drawn, counts) for drawn, counts, _, _ in seen])
+            error += squared
+            clamps.append((drawn, counts))
+        return _Pull(descent, error, clamps)
 
     def _curvature(self, pull: _Pull, along: Tensor, ridge: float) -> float:
         """Of half the squared error in a direction, where the clamps stay as they are. [M,b,3]"""
@@ -608,7 +610,13 @@ def solve(
 
 def _map_threads(work: Callable[[_A], _B], items: Sequence[_A]) -> list[_B]:
     """`work` of every item, on as many threads as the rasterizer has; the same bits on any number."""
+    return list(_in_turn(work, items))
+
+
+def _in_turn(work: Callable[[_A], _B], items: Sequence[_A]) -> Iterator[_B]:
+    """The same one by one, for what need not be kept."""
     if threads() == 1 or len(items) == 1:
-        return [work(item) for item in items]
+        yield from map(work, items)
+        return
     with ThreadPoolExecutor(threads()) as pool:
-        return list(pool.map(work, items))
+        yield from pool.map(work, items)

@@ -447,7 +447,7 @@ def expected_work(setup: TrainingSetup, optimization: OptimizeOptions, strengths
     if optimization.solver == "colors":
         return work | {"weights": 0.5 * train, "model": 1.5 * train, "optimize": 0.45 * train * strengths}
     moves = optimization.group_steps or 0
-    return work | {"move parts": 0.5 * moves * strengths, "optimize": 0.25 * optimization.steps}
+    return work | {"move parts": 0.2 * moves * strengths, "optimize": 0.25 * optimization.steps}
 
 
 def _agreement(

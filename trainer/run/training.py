@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -49,10 +50,11 @@ from trainer.optimize.ties import Ties, surface_ties
 from trainer.options import Bands, OptimizeOptions, TrainOptions
 from trainer.setup import Pictures, TrainingSetup, probe_views
 from trainer.store.progress import RunLog
+from trainer.store.run_folder import LazySequence, stored_pictures
 from trainer.store.state import PeriodicSave, Resumable, Saved, StateFolder, defer_signals
 from trainer.views.choose import split_held_out
 from trainer.views.crops import CropScene, crop_scene, moving_attributes, only_recolors, render_all
-from trainer.views.view import LazySequence, View, crop, stored_pictures
+from trainer.views.view import View, crop
 
 
 class _RecordingValues(msgspec.Struct):
@@ -350,7 +352,7 @@ def _record_way(
             nonlocal saved_at
             if joint is not None:
                 joint.step()
-            advance(step, f"loss to the edit {left:.4f}")
+            advance(step, "" if math.isnan(left) else f"loss to the edit {left:.4f}")
             if stopped():
                 saver.save()
                 raise KeyboardInterrupt

@@ -53,7 +53,7 @@ LATER = {
     "fit the field": 0.7,
     "even the slider": 0.3,
     "measure the edit": 1.7,
-    "draw": 0.4,
+    "draw": 0.5,
 }
 """Work for each view of the stages that follow the optimization, see `RunLog.expect`."""
 

@@ -15,11 +15,12 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, TypeVar, overload
 
+import torch
 from torch import Tensor
 
 from progdf.errors import ProgdfError
@@ -27,7 +28,6 @@ from progdf.field.trajectory import FILE_NAME
 from progdf.io.atomic import LOCK, LockedError, atomic_write, hold_lock, is_temporary, remove_abandoned
 from progdf.io.images import read_picture, write_image
 from progdf.io.json_values import decode_json
-from trainer.views.view import stored_pictures
 
 from .state import StateFolder
 
@@ -79,6 +79,9 @@ def _write(folder: Path, lines: Iterable[str]) -> None:
 
 _SIGNATURE = "progdf train"
 _LOOK_S = 1.0  # a window that asks whether a run is locked holds the lock for a moment
+
+
+_T = TypeVar("_T")
 
 
 @dataclass(frozen=True)
@@ -251,6 +254,40 @@ def read_views(folder: RunFolder, kind: str, names: Iterable[str], strength: flo
             raise ProgdfError(f"{path} {what}; train again, with --resume if the run was stopped") from error
 
     return stored_pictures(map(read, names))
+
+
+class LazySequence(Sequence[_T]):
+    """What `make` makes of each of some items, anew at each look: for what is too large to keep."""
+
+    def __init__(self, items: Sequence[Any], make: Callable[[Any], _T]) -> None:
+        self._items, self._make = items, make
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    @overload
+    def __getitem__(self, index: int) -> _T: ...
+    @overload
+    def __getitem__(self, index: slice) -> LazySequence[_T]: ...
+    def __getitem__(self, index: int | slice) -> _T | LazySequence[_T]:
+        if isinstance(index, slice):
+            return LazySequence(self._items[index], self._make)
+        return self._make(self._items[index])
+
+
+def stored_pictures(pictures: Iterable[Tensor]) -> LazySequence[Tensor]:
+    """Pictures of 8-bit files, kept in a quarter of their memory. [H,W,3] float32 each, as they were"""
+    return LazySequence([to_bytes(picture) for picture in pictures], from_bytes)
+
+
+def to_bytes(image: Tensor) -> Tensor:
+    """What an 8-bit file keeps of an image. [H,W,3] 0..1 -> [H,W,3] uint8"""
+    return (image.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
+
+
+def from_bytes(stored: Tensor) -> Tensor:
+    """The inverse of `to_bytes`, of what was kept."""
+    return stored.float() / 255.0
 
 
 def remove_stale_views(folder: RunFolder, names: Sequence[str]) -> None:

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 import unicodedata
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, TypeVar, overload
 
 import torch
 from torch import Tensor
@@ -22,8 +21,6 @@ from progdf.scene.up_axis import guess_up
 from progdf.sh import shade
 
 BACKGROUND = (1.0, 1.0, 1.0)
-
-_T = TypeVar("_T")
 
 INSIDE = (
     "looks like a scene to stand inside, which cameras around it cannot show; give its own with --cameras "
@@ -71,40 +68,6 @@ class View:
         """The view with its box grown to all that these pictures of it change visibly."""
         changed = torch.stack([(picture - self.image).abs().amax(dim=2) for picture in edited]).amax(dim=0)
         return replace(self, box=region_box(torch.maximum(self.mask, (changed > _CHANGED).float())))
-
-
-class LazySequence(Sequence[_T]):
-    """What `make` makes of each of some items, anew at each look: for what is too large to keep."""
-
-    def __init__(self, items: Sequence[Any], make: Callable[[Any], _T]) -> None:
-        self._items, self._make = items, make
-
-    def __len__(self) -> int:
-        return len(self._items)
-
-    @overload
-    def __getitem__(self, index: int) -> _T: ...
-    @overload
-    def __getitem__(self, index: slice) -> LazySequence[_T]: ...
-    def __getitem__(self, index: int | slice) -> _T | LazySequence[_T]:
-        if isinstance(index, slice):
-            return LazySequence(self._items[index], self._make)
-        return self._make(self._items[index])
-
-
-def stored_pictures(pictures: Iterable[Tensor]) -> LazySequence[Tensor]:
-    """Pictures of 8-bit files, kept in a quarter of their memory. [H,W,3] float32 each, as they were"""
-    return LazySequence([to_bytes(picture) for picture in pictures], from_bytes)
-
-
-def to_bytes(image: Tensor) -> Tensor:
-    """What an 8-bit file keeps of an image. [H,W,3] 0..1 -> [H,W,3] uint8"""
-    return (image.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
-
-
-def from_bytes(stored: Tensor) -> Tensor:
-    """The inverse of `to_bytes`, of what was kept."""
-    return stored.float() / 255.0
 
 
 def crop(image: Tensor, box: Crop) -> Tensor:
