@@ -26,7 +26,7 @@ from trainer.fit.network import NetworkFit, fit_network
 from trainer.fit.slider_uniformity import equalize_slider
 from trainer.optimize.losses import Perceptual, perceptual_loss
 from trainer.optimize.retime import resolve_slider
-from trainer.options import FieldOptions, FitOptions, TextOptions
+from trainer.options import EditorOptions, FieldOptions, FitOptions, RegionOptions, TextOptions, TrainOptions
 from trainer.report.measures import PaintTaken, clip_curve, expected_measures, figures, measure, measure_paint
 from trainer.report.report import report_picture
 from trainer.resolve import check_field_options
@@ -41,7 +41,11 @@ from .record import RunRecord, render_run_views, reopen_run
 from .threads import use_threads
 
 _RANK_VIEWS = 4
-_REPORT_ALONE = ("plan", "time", "memory_mb", "memory_by_stage_mb", "curves", "views", "pictures")
+_REPORT_ALONE = (
+    *("plan", "time", "memory_mb", "memory_by_stage_mb", "curves", "views", "pictures"),
+    *("losses", "trajectory", "effort", "choice"),
+)
+_DEFAULTS = plain(TrainOptions(Path(), Path(), RegionOptions(""), EditorOptions("")))
 
 _LPIPS_OVER = (
     "each view's box around all that shows the region or that the editor changes, at least 64 pixels"
@@ -108,7 +112,8 @@ def finish_run(
             judges = replace(evaluator, looked=looked), replace(reporting, looked=looked)
             measured = measure(judges, trajectory, fitted, field, remap, perceptual, clip)
         plan = plain(options)
-        gdf = Gdf(options.name, region, field, fingerprint(scene), options.editor.editor, plan)
+        given = _differences(plan, _DEFAULTS)
+        gdf = Gdf(options.name, region, field, fingerprint(scene), options.editor.editor, given)
         endpoint, outside = exactness(scene, gdf, end_rows(setup, trajectory))
         title = f"{options.name}: {options.editor.editor}"
         picture = report_picture(evaluator, measured, record.losses, title, len(setup.held_out))
@@ -194,6 +199,15 @@ def _record_figures(record: RunRecord) -> dict[str, Any]:
     """What the report repeats of the recording."""
     names = ("objective", "losses", "kind", "kind_trial", "agreement", "up", "effort")
     return {**{name: getattr(record, name) for name in names}, "pictures": dict(record.pictures)}
+
+
+def _differences(values: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:
+    """The values that are none of the defaults."""
+    return {
+        name: _differences(value, defaults[name]) if isinstance(value, dict) else value
+        for name, value in values.items()
+        if value != defaults[name]
+    }
 
 
 def _cost_figures(folder: RunFolder, log: RunLog) -> dict[str, Any]:
