@@ -16,13 +16,14 @@ from functools import cache
 
 import torch
 from torch import Tensor
-from torch.nn.functional import grid_sample
+from torch.nn.functional import grid_sample, pad
 
-from progdf.gaussians import attribute_slices
+from progdf.gaussians import BASE_CHANNELS, attribute_slices
 from progdf.sh import C0, basis
 
 from .baked import (
     LATTICE,
+    AttributeBases,
     BakedField,
     GradeForm,
     Segment,
@@ -34,7 +35,7 @@ from .baked import (
     lattice_side,
     remap_slider,
 )
-from .separable import fit_amplitude, fit_separable, moving_attributes, principal_modes, quantize_bases
+from .separable import fit_amplitude, principal_modes, quantize_bases, store_attribute
 
 MOST_COLOR = 1.5
 """Colors above this, which no screen shows, are mapped as this."""
@@ -149,19 +150,10 @@ def band_offsets(change: Tensor, channels: int) -> Tensor:
     return offsets
 
 
-def mapped_trajectory(degree: int, table: Tensor, rows: Tensor) -> Tensor:
-    """What the map alone does to the members at each knot. [S,K,3], [M,14+3K] -> [S,M,14+3K]"""
+def mapped_bands(degree: int, table: Tensor, rows: Tensor) -> Tensor:
+    """What the map alone adds to the members' bands at each knot. [S,K,3], [M,14+3K] -> [S,M,3B]"""
     sh = member_bands(rows)
-    return torch.stack(
-        [band_offsets(map_colors(sh, at_knot, degree) - sh, rows.shape[1]) for at_knot in table]
-    )
-
-
-def residual_offsets(form: GradeForm, channels: int) -> Tensor:
-    """What the residual adds at each knot. [S,M,channels]"""
-    change = torch.einsum("sr,rmc->smc", form.coefficients, form.residual * form.scale[:, None])
-    bands = change.shape[2] // 3
-    return torch.stack([band_offsets(at_knot.reshape(-1, bands, 3), channels) for at_knot in change])
+    return torch.stack([(map_colors(sh, at_knot, degree) - sh).flatten(1) for at_knot in table])
 
 
 def lowest_bands(offsets: Tensor, bands: int) -> Tensor:
@@ -180,23 +172,35 @@ def bake_grade(form: GradeForm, rows: Tensor, mapped: Tensor | None = None) -> B
     Args:
         form: what a file keeps
         rows: raw values of the members before the edit, packed. [M,14+3K]
-        mapped: see `mapped_trajectory`, where that is known
+        mapped: see `mapped_bands`, where that is known
 
     Raises:
         ValueError: not as many Gaussians, or fewer bands than the residual has.
     """
-    if len(rows) != form.members or form.residual.shape[2] // 3 > member_bands(rows).shape[1]:
+    width = form.residual.shape[2]
+    if len(rows) != form.members or width // 3 > member_bands(rows).shape[1]:
         raise ValueError(f"a grade of {form.members} members for {len(rows)} of {rows.shape[1]} numbers")
-    trajectory = mapped_trajectory(form.degree, form.table, rows) if mapped is None else mapped
+    course = mapped_bands(form.degree, form.table, rows) if mapped is None else mapped.clone()
     if len(form.residual):
-        trajectory = trajectory + residual_offsets(form, rows.shape[1])
-    ranks = {
-        name: _rank(trajectory[:, :, columns]) for name, columns in moving_attributes(trajectory).items()
-    }
-    recorded = form.knots.tolist()
-    baked = fit_separable(form.knots, trajectory, ranks, recorded=recorded)
-    baked = replace(baked, kind="grade", origin=form)
+        course[:, :, :width] += torch.einsum(
+            "sr,rmc->smc", form.coefficients, form.residual * form.scale[:, None]
+        )
+    higher = rows.shape[1] - BASE_CHANNELS
+    parts = {"sh0": course[:, :, :3], "shN": pad(course[:, :, 3:], (0, higher - course.shape[2] + 3))}
+    attributes = {name: _bake_attribute(part) for name, part in parts.items() if bool(part.any())}
+    knots = form.knots.tolist()
+    baked = BakedField("grade", form.knots, attributes, rows.shape[1], tuple(knots), form)
     return baked if form.remap.is_identity else remap_slider(baked, form.remap)
+
+
+def _bake_attribute(offsets: Tensor) -> AttributeBases:
+    """The fewest bases by which an attribute's course is met to `_TOLERANCE`. [S,M,c]"""
+    fitted = fit_amplitude(offsets, torch.ones_like(offsets[0]))
+    allowed = _TOLERANCE**2 * float(fitted.offsets.double().square().sum())
+    power = torch.linalg.eigvalsh(fitted.gram).flip(0).clamp(min=0)
+    remaining = float(power.sum()) - power.cumsum(0)
+    needed = 0 if float(power.sum()) <= allowed else 1 + int((remaining > allowed).sum())
+    return store_attribute(fitted, principal_modes(fitted.gram)[:, : min(needed, _MOST_RANK)])
 
 
 def adjust_colors(form: GradeForm, sh: Tensor, members: Tensor | slice, s: float) -> Tensor:
@@ -309,13 +313,3 @@ def fit_grade(
 def rank_limit(course: Tensor) -> int:
     """The most bases that say anything of a residual's course. [S,M,3b]"""
     return min(len(course) - 1, MOST_RESIDUALS) if bool(course.any()) else 0
-
-
-def _rank(offsets: Tensor) -> int:
-    """The fewest bases by which an attribute's course is met to `_TOLERANCE`. [S,M,c]"""
-    fitted = fit_amplitude(offsets, torch.ones_like(offsets[0]))
-    allowed = _TOLERANCE**2 * float(fitted.offsets.double().square().sum())
-    power = torch.linalg.eigvalsh(fitted.gram).flip(0).clamp(min=0)
-    remaining = float(power.sum()) - power.cumsum(0)
-    needed = 0 if float(power.sum()) <= allowed else 1 + int((remaining > allowed).sum())
-    return min(needed, _MOST_RANK, principal_modes(fitted.gram).shape[1])

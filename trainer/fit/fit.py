@@ -13,7 +13,7 @@ from torch import Tensor
 from progdf.field import BakedField, Candidate, FieldChoice, FieldEvaluator, choose_field, fit_keyframes
 from progdf.field.baked import MONOMIALS, GradeForm, NeuralForm, identity_map
 from progdf.field.choose import MOST_SNAPSHOTS, SAMPLES, pick_candidate
-from progdf.field.grade import bake_grade, fit_grade, lowest_bands, mapped_trajectory, rank_limit
+from progdf.field.grade import bake_grade, fit_grade, lowest_bands, mapped_bands, rank_limit
 from progdf.field.separable import moving_attributes
 from progdf.field.trajectory import Trajectory
 from progdf.gaussians import BASE_CHANNELS, Gaussians, attribute_slices
@@ -149,8 +149,8 @@ def fit_grades(
     nodes = [0, *trajectory.stage_ends]
     degree = next(d for d, count in MONOMIALS.items() if count == trajectory.maps.shape[1])
     table = torch.cat([identity_map(degree)[None], trajectory.maps])
-    mapped = mapped_trajectory(degree, table, rows)
-    course = lowest_bands(torch.stack([trajectory.node(i) for i in nodes]) - mapped, trajectory.bands)
+    mapped, recorded = mapped_bands(degree, table, rows), torch.stack([trajectory.node(i) for i in nodes])
+    course = lowest_bands(recorded, trajectory.bands) - mapped[:, :, : 3 * trajectory.bands]
     evaluator, budget = field_evaluator(trajectory, choosing, options.target_psnr), options.bytes_budget
     tried = list[Candidate]()
     for rank in range(rank_limit(course) + 1):
