@@ -262,7 +262,7 @@ def _prepare_colors(
         most = iterations(optimization.steps)
         solver, model, line = choose_effort(drawn, judge, finished, original, most, optimization.sh, fewer)
     log.say(line)
-    edited = edited if between is None else between(model.missed)
+    edited = edited if between is None else between(model.error_share)
     every = len(drawn) // len(solver.views)
     stages = [TargetStage(s, _boxes(some, setup.train)[::every], 1) for s, some in edited.items()]
     return solver, model, edited, stages, [judging(pictures) for pictures in edited.values()]
