@@ -156,7 +156,7 @@ def sliders(argv: Sequence[str]) -> int:
 
 def regret(argv: Sequence[str]) -> int:
     """Sweep an edit's effort; 0 when the table is printed. Raises ProgdfError for what the user can mend."""
-    from .regret import RegretOptions, run_regret
+    from .ablation.regret import RegretOptions, run_regret
 
     print(run_regret(parse_options(RegretOptions, argv, f"{COMMAND} regret")).markdown())
     return 0

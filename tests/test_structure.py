@@ -39,7 +39,7 @@ ORDER = {
         motion optimize fit report preview run evaluate batch cli""",
     "viewer": "__init__ camera gl jobs state render files pictures ui panel app commands",
     "benchmarks": """__init__ analytic_edits courses table ablation field_forms rasterizer
-        recorded_runs viewer field_plot field edits networks sliders warps pictures regret __main__""",
+        recorded_runs viewer field_plot field edits networks sliders warps pictures __main__""",
 }
 
 MOST_FILES = 14

@@ -68,7 +68,7 @@ _COVERED = 0.05  # the region's weight in a pixel that the map is fitted to
 _MOST_PIXELS = 250_000  # for the some twenty coefficients of the map; of more, evenly spread ones
 _CLAMP_ROUNDS = 3  # of the map's least squares, for pixels that are white or black anyway
 _SHARES = (1.0, 0.5, 0.2)  # of a step, where the whole of it would run into clamps
-_LOOKS = 3  # steps over which that is taken: the first ones of a new direction gain little
+_LOOKS = 10  # steps over which that is taken: the first few may gain nothing in other views
 
 _A = TypeVar("_A")
 _B = TypeVar("_B")
@@ -234,7 +234,7 @@ class Model:
         return self.residual.shape[1]
 
     @property
-    def missed(self) -> float:
+    def error_share(self) -> float:
         """Share of the change that the finished edit misses, mean square."""
         return self.error / self.unedited
 

@@ -274,7 +274,7 @@ def _prepare_colors(
     if few:
         unseen = len(original) - int(solver.asked.sum())
         log.say(f"{unseen} members that no picture shows follow the map and their own surface")
-    edited = edited if between is None else between(model.missed)
+    edited = edited if between is None else between(model.error_share)
     every = len(drawn) // len(solver.views)
     stages = [TargetStage(s, _boxes(some, setup.train)[::every], 1) for s, some in edited.items()]
     return solver, model, edited, stages, [judging(pictures) for pictures in edited.values()]

@@ -48,7 +48,7 @@ from trainer.views.choose import choose_views, split_held_out
 from trainer.views.crops import CropScene, crop_scene
 from trainer.views.view import View, crop, name_cameras, region_rig, with_near_plane
 
-from .table import Table
+from ..table import Table
 
 MEASURED = (0.12, 0.38, 0.64, 0.88, 1.0)
 """Strengths at which the editor is asked for what it means."""
@@ -167,7 +167,7 @@ class Edit:
             self.drawn, choosing(1.0), self.targets(1.0), self.original, most, "auto", True
         )
         spent = time.process_time() - began
-        strengths, every = self.strengths(8, model.missed), len(self.drawn) // len(solver.views)
+        strengths, every = self.strengths(8, model.error_share), len(self.drawn) // len(solver.views)
         stages = [TargetStage(s, self.targets(s, every), 1) for s in strengths]
         judges, state = [choosing(s) for s in strengths], PgsState(self.original)
         began = time.process_time()
