@@ -106,9 +106,7 @@ class App:
         self.deliver = DeliverActions(self, self.jobs.queue)
         self.start = StartActions(self, self.context, self.jobs.queue, memory)
         self.up = UpActions(self, self.context)
-        self.preview = PreviewActions(
-            self, self.context, lambda form, folder: self.jobs.region_spec(form, folder, "preview")
-        )
+        self.preview = PreviewActions(self, self.context, self.jobs.region_spec)
         self.strays = StrayActions(self)
         self.is_closed = False
         self._title = ""

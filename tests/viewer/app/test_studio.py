@@ -7,9 +7,11 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from progdf.formats.ply import save_ply
+from progdf.scene.regions import parse_region
 from tests.helpers.null_app import null_app, press
 from tests.helpers.sessions import bear_files, opened_document
 from tests.helpers.ui_rig import bear, first_view
@@ -111,6 +113,21 @@ def test_what_is_selected_is_the_region_of_a_new_edit(window: application.App) -
     assert region.endswith("blue.region.npy")
     after = window.main_view.work.view.selection
     assert (after.count, [kept.name for kept in after.regions]) == (0, ["blue"]), "it is a region now"
+
+
+def test_another_selection_is_another_file_for_the_preview(window: application.App, tmp_path: Path) -> None:
+    """Who makes previews reads a file once; under one name for all, the second selection showed the first's."""
+    view, total = window.main_view.work.view, len(window.document.scene)
+    specs = []
+    for row in (3, 7, 3):
+        mask = np.zeros(total, bool)
+        mask[row] = True
+        chosen = selection.select(view.selection, mask)
+        window.main_view.work = replace(window.main_view.work, view=replace(view, selection=chosen))
+        form = replace(window.main_view.work.form, region=SELECTION)
+        specs.append(window.jobs.region_spec(form, tmp_path))
+        assert parse_region(specs[-1], window.document.scene).members.tolist() == [row]
+    assert specs[0] == specs[2] != specs[1]
 
 
 def test_what_cannot_be_trained_stands_in_the_form(window: application.App) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import zlib
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -141,8 +142,10 @@ class JobActions:
             temporary_file.write_bytes(read_file(draft))
         self._edits.add(order.draft, order.name, strength)
 
-    def region_spec(self, form: NewEdit, folder: Path, name: str) -> str:
+    def region_spec(self, form: NewEdit, folder: Path, name: str = "") -> str:
         """The form's region as `progdf train --region` has it; one that has no file gets one in the folder.
+
+        Without a name the file is called by what is in it: who has read it need not read it again.
 
         Raises:
             ProgdfError: it cannot be read or written.
@@ -159,7 +162,7 @@ class JobActions:
             raise ProgdfError(f"there is no region {form.region} any more; choose another one")
         members = selection.members if region is None else region.members
         make_folder(folder)
-        path = folder / f"{name}{SUFFIX}"
+        path = folder / f"{name or f'{zlib.crc32(members):08x}'}{SUFFIX}"
         exports.write_region(NamedRegion(name, path, members, selection.count), total)
         return f"file:{path}"
 
