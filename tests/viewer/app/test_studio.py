@@ -116,7 +116,7 @@ def test_what_is_selected_is_the_region_of_a_new_edit(window: application.App) -
 
 
 def test_another_selection_is_another_file_for_the_preview(window: application.App, tmp_path: Path) -> None:
-    """Who makes previews reads a file once; under one name for all, the second selection showed the first's."""
+    """Who makes previews reads a file once: under one name, the second selection showed the first one."""
     view, total = window.main_view.work.view, len(window.document.scene)
     specs = []
     for row in (3, 7, 3):
