@@ -16,11 +16,9 @@ from progdf.errors import ProgdfError
 from progdf.field.trajectory import Trajectory
 from progdf.gaussians import BASE_CHANNELS, pack
 from progdf.io.json_values import convert_json
-from progdf.metrics.image import decibels
 from progdf.scene.bounds import scene_sphere
 from trainer.fit.network import JointTraining, begin_joint_training, save_network
 from trainer.optimize.color_solver import (
-    MORE_PAYS,
     STEPS,
     ColorView,
     Judge,
@@ -45,7 +43,7 @@ from trainer.optimize.pgs import (
 )
 from trainer.optimize.retime import record, resolve_slider, retime, select_recordings, straight_recordings
 from trainer.optimize.solve_pictures import RECORDINGS, make_picture_solver, solve_pictures
-from trainer.options import Bands, OptimizeOptions, TrainOptions
+from trainer.options import OptimizeOptions, TrainOptions
 from trainer.setup import Pictures, TrainingSetup, probe_views
 from trainer.store.progress import RunLog
 from trainer.store.state import PeriodicSave, Resumable, Saved, StateFolder, defer_signals
@@ -190,7 +188,7 @@ def optimize_members(
     elif solver == "colors":
         most = iterations(optimization.steps)
         colors, model, edited, stages, judges = _prepare_colors(
-            options, optimization, setup, edited, crops, original, between, log
+            optimization, setup, edited, crops, original, between, log
         )
         way = partial(solve, original, colors, model, stages, judges, state, steps=most)
     else:
@@ -243,7 +241,6 @@ def _boxes(pictures: Sequence[Tensor], views: Sequence[View]) -> list[Tensor]:
 
 
 def _prepare_colors(
-    options: TrainOptions,
     optimization: OptimizeOptions,
     setup: TrainingSetup,
     edited: Pictures,
@@ -258,13 +255,12 @@ def _prepare_colors(
         judging = _judging(setup, drawn, original, edited)
     with log.stage("model"):
         judge, finished = judging(edited[max(edited)]), _boxes(edited[max(edited)], setup.train)
-        fewer = not options.views.views and judge.views is not drawn
-        most = iterations(optimization.steps)
-        solver, model, line = choose_effort(drawn, judge, finished, original, most, optimization.sh, fewer)
-    log.say(line)
+        solver, most = make_solver(drawn, original), iterations(optimization.steps)
+        model = choose_model(solver, judge, finished, most, 1 if optimization.sh == "off" else 4)
+    on = "all views, as none is held out" if judge.views is drawn else "views that are held out"
+    log.say(f"{model.line}, on {on}")
     edited = edited if between is None else between(model.error_share)
-    every = len(drawn) // len(solver.views)
-    stages = [TargetStage(s, _boxes(some, setup.train)[::every], 1) for s, some in edited.items()]
+    stages = [TargetStage(s, _boxes(some, setup.train), 1) for s, some in edited.items()]
     return solver, model, edited, stages, [judging(pictures) for pictures in edited.values()]
 
 
@@ -279,40 +275,6 @@ def _judging(
     crops = [crop_scene(setup.scene, members, v.camera, v.box, setup.background, True) for v in views]
     choosing = color_views(crops, original)
     return lambda pictures: Judge(choosing, _boxes(split_held_out(pictures[count:])[0], views))
-
-
-def choose_effort(
-    views: Sequence[ColorView],
-    judge: Judge,
-    targets: Sequence[Tensor],
-    original: Tensor,
-    most: int,
-    sh: Bands,
-    fewer: bool,
-) -> tuple[Solver, Model, str]:
-    """How much of a finished edit is modelled, from how many views, and why.
-
-    Args:
-        views: all training views
-        judge: views that decide
-        targets: the finished edit in the training views
-        original: raw member rows
-        most: steps of conjugate gradients
-        sh: whether a residual may have more than one band
-        fewer: every other view does, where all of them would take away less than a twentieth of the error
-    """
-    tried: list[tuple[Solver, Model]] = []
-    for every in (2, 1) if fewer and len(views) > 3 else (1,):
-        solver = make_solver(views[::every], original)
-        model = choose_model(solver, judge, targets[::every], most, 1 if sh == "off" else 4)
-        tried.append((solver, model))
-    solver, model = tried[MORE_PAYS * tried[0][1].error > tried[-1][1].error]
-    on = "all views, as none is held out" if judge.views is views else "views that are held out"
-    line = f"{model.line}, on {on}"
-    if len(tried) > 1:
-        over = " and ".join(f"{decibels(m.error):.1f} dB from {len(s.views)} views" for s, m in tried)
-        line += f"; {len(solver.views)} of {len(views)} views are solved for: {over}"
-    return solver, model, line
 
 
 def _record_way(
