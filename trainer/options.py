@@ -118,7 +118,7 @@ class ViewOptions:
     """The axis of the scene that is up. auto: from the cameras, else from the ground, else −y."""
     views: int = 0
     """How many views are edited, 3 to 96 (the paper's limit); every fifth is held out to measure with. 0: 30,
-    or 40 for an edit of colors, of which half are solved for where that is as good."""
+    or 40 for an edit of colors."""
     image_size: int = 0
     """Longer side of the views in pixels; 0: 256, or up to 384 for an edit of colors whose members are so
     dense that most have less than a pixel."""

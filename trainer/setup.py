@@ -84,9 +84,8 @@ def choose_resolution(
 ) -> tuple[Sequence[Camera], int, str]:
     """Cameras, how many of them to choose, and a line where the members are not resolved by these.
 
-    What was typed is kept to. Else edits of colors have more views, of which half are solved for where those
-    do as well, and larger ones where members are dense. Why 40 of 320 and not 30 of 384: docs/experiments.md,
-    Views.
+    What was typed is kept to. Else edits of colors have more views, and larger ones where members are dense.
+    Why 40 of 320 and not 30 of 384: docs/experiments.md, Views.
 
     Args:
         options: see `ViewOptions`

@@ -34,6 +34,7 @@ from trainer.optimize.color_solver import (
     Judge,
     Model,
     add_bands,
+    choose_model,
     color_views,
     iterations,
     make_solver,
@@ -42,7 +43,6 @@ from trainer.optimize.color_solver import (
 from trainer.optimize.pgs import PgsState, TargetStage
 from trainer.options import EditorOptions, FieldOptions, OptimizeOptions, ViewOptions
 from trainer.run.threads import use_threads
-from trainer.run.training import choose_effort
 from trainer.setup import TrainingSetup, make_training_setup, quantize_image, widen_views
 from trainer.views.choose import choose_views, split_held_out
 from trainer.views.crops import CropScene, crop_scene
@@ -141,10 +141,10 @@ class Edit:
             self.a_strength = time.process_time() - began
         return self.pictures[s]
 
-    def targets(self, s: float, every: int = 1) -> list[Tensor]:
+    def targets(self, s: float) -> list[Tensor]:
         """The training views' boxes."""
-        pairs = list(zip(self.picture(s), self.setup.train, strict=False))
-        return [crop(picture, view.box) for picture, view in pairs[::every]]
+        pairs = zip(self.picture(s), self.setup.train, strict=False)
+        return [crop(picture, view.box) for picture, view in pairs]
 
     def aside(self, s: float) -> list[Tensor]:
         """The whole pictures of the views that choose."""
@@ -163,12 +163,11 @@ class Edit:
 
         self.picture(1.0)
         began = time.process_time()
-        solver, model, line = choose_effort(
-            self.drawn, choosing(1.0), self.targets(1.0), self.original, most, "auto", True
-        )
+        solver = make_solver(self.drawn, self.original)
+        model = choose_model(solver, choosing(1.0), self.targets(1.0), most, 4)
         spent = time.process_time() - began
-        strengths, every = self.strengths(8, model.error_share), len(self.drawn) // len(solver.views)
-        stages = [TargetStage(s, self.targets(s, every), 1) for s in strengths]
+        strengths = self.strengths(8, model.error_share)
+        stages = [TargetStage(s, self.targets(s), 1) for s in strengths]
         judges, state = [choosing(s) for s in strengths], PgsState(self.original)
         began = time.process_time()
         made = list(solve(self.original, solver, model, stages, judges, state, lambda step, left: None, most))
@@ -176,12 +175,10 @@ class Edit:
         steps = ", ".join(f"{snapshot.means.get(TAKEN, 0):.0f}" for snapshot in made)
         at = ", ".join(f"{s:g}" for s in strengths)
         tables = [snapshot.table for snapshot in made if snapshot.table is not None]
-        name = (
-            f"automatic: {len(solver.views)} views solved for, {len(strengths)} strengths, {model.bands} SH"
-        )
+        name = f"automatic: {len(self.setup.views)} views, {len(strengths)} strengths, {model.bands} SH"
         offsets = [snapshot.offsets for snapshot in made]
         result = self.measure(name, judge, strengths, model.bands, tables, offsets, spent)
-        return model, f"{line}; strengths {at} in {steps} steps", result
+        return model, f"{model.line}; strengths {at} in {steps} steps", result
 
     def sweep(
         self, judge: Evaluator, degree: int, bands: int, most: int, stages: Sequence[int]

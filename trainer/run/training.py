@@ -17,11 +17,9 @@ from progdf.errors import ProgdfError
 from progdf.field.trajectory import Trajectory
 from progdf.gaussians import BASE_CHANNELS, pack
 from progdf.io.json_values import convert_json
-from progdf.metrics.image import decibels
 from progdf.scene.bounds import scene_sphere
 from trainer.fit.network import JointTraining, begin_joint_training, save_network
 from trainer.optimize.color_solver import (
-    MORE_PAYS,
     STEPS,
     ColorView,
     Judge,
@@ -46,8 +44,8 @@ from trainer.optimize.pgs import (
     pgs_settings,
 )
 from trainer.optimize.retime import record, resolve_slider, retime, select_recordings, straight_recordings
-from trainer.optimize.ties import Ties, surface_ties
-from trainer.options import Bands, OptimizeOptions, TrainOptions
+from trainer.optimize.ties import surface_ties
+from trainer.options import OptimizeOptions, TrainOptions
 from trainer.setup import Pictures, TrainingSetup, probe_views
 from trainer.store.progress import RunLog
 from trainer.store.run_folder import LazySequence, stored_pictures
@@ -260,23 +258,21 @@ def _prepare_colors(
     """The views to solve for, how much is modelled, the strengths; and what says when each is done."""
     with log.stage("weights"):
         drawn = color_views(crops, original)
-        judging, few = _judging(setup, drawn, original, edited), options.views.pictures
+        judging = _judging(setup, drawn, original, edited)
         cameras = [view.camera for view in setup.train]
-        ties = surface_ties(setup.scene, setup.region.members, cameras) if few else None
+        ties = surface_ties(setup.scene, setup.region.members, cameras) if options.views.pictures else None
     with log.stage("model"):
         judge, finished = judging(edited[max(edited)]), _boxes(edited[max(edited)], setup.train)
-        fewer = not options.views.views and judge.views is not drawn
-        most = iterations(optimization.steps)
-        solver, model, line = choose_effort(
-            drawn, judge, finished, original, most, optimization.sh, fewer, ties
-        )
-    log.say(line)
-    if few:
+        solver, most = make_solver(drawn, original, ties), iterations(optimization.steps)
+        trials = [(solver, judge)] if ties is None else split_solver(solver, original, finished)
+        model = choose_model(solver, trials, finished, most, 1 if optimization.sh == "off" else 4)
+    on = "all views, as none is held out" if judge.views is drawn else "views that are held out"
+    log.say(f"{model.line}, on {on if ties is None else 'squares of the pictures that are held out'}")
+    if ties is not None:
         unseen = len(original) - int(solver.asked.sum())
         log.say(f"{unseen} members that no picture shows follow the map and their own surface")
     edited = edited if between is None else between(model.error_share)
-    every = len(drawn) // len(solver.views)
-    stages = [TargetStage(s, _boxes(some, setup.train)[::every], 1) for s, some in edited.items()]
+    stages = [TargetStage(s, _boxes(some, setup.train), 1) for s, some in edited.items()]
     return solver, model, edited, stages, [judging(pictures) for pictures in edited.values()]
 
 
@@ -289,44 +285,6 @@ def _judging(
         return lambda pictures: Judge(drawn, _boxes(pictures, setup.train))
     choosing = color_views(_crops(setup, views, True), original)
     return lambda pictures: Judge(choosing, _boxes(split_held_out(pictures[count:])[0], views))
-
-
-def choose_effort(
-    views: Sequence[ColorView],
-    judge: Judge,
-    targets: Sequence[Tensor],
-    original: Tensor,
-    most: int,
-    sh: Bands,
-    fewer: bool,
-    ties: Ties | None = None,
-) -> tuple[Solver, Model, str]:
-    """How much of a finished edit is modelled, from how many views, and why.
-
-    Args:
-        views: all training views
-        judge: views that decide
-        targets: the finished edit in the training views
-        original: raw member rows
-        most: steps of conjugate gradients
-        sh: whether a residual may have more than one band
-        fewer: every other view does, where all of them would take away less than a twentieth of the error
-        ties: where the views are a handful of pictures; squares of them decide
-    """
-    tried: list[tuple[Solver, Model]] = []
-    for every in (2, 1) if fewer and len(views) > 3 else (1,):
-        solver = make_solver(views[::every], original, ties)
-        trials = [(solver, judge)] if ties is None else split_solver(solver, original, targets)
-        model = choose_model(solver, trials, targets[::every], most, 1 if sh == "off" else 4)
-        tried.append((solver, model))
-    solver, model = tried[MORE_PAYS * tried[0][1].error > tried[-1][1].error]
-    on = "all views, as none is held out" if judge.views is views else "views that are held out"
-    on = on if ties is None else "squares of the pictures that are held out"
-    line = f"{model.line}, on {on}"
-    if len(tried) > 1:
-        over = " and ".join(f"{decibels(m.error):.1f} dB from {len(s.views)} views" for s, m in tried)
-        line += f"; {len(solver.views)} of {len(views)} views are solved for: {over}"
-    return solver, model, line
 
 
 def _record_way(

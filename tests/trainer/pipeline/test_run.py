@@ -105,11 +105,9 @@ def test_effort_that_nobody_gives_is_decided_on_the_scene_and_reported(folder: P
     assert len(given["strengths"]) == 4
     assert len(effort["steps"]) == (len(effort["strengths"]) if effort["sh_functions"] else 0)
     assert max(given["steps"]) <= given["most_steps"] == 25
-    log = free.folder.log.read_text()
-    assert effort["views"] in (17, 34)
+    assert effort["views"] == 34
     assert len(free.report["views"]["edit"]) == 6
-    assert f"{effort['views']} of 34 views are solved for" in log
-    assert "are solved for: " not in done.folder.log.read_text(), "ten views are asked for"
+    assert f"{len(effort['strengths'])} strengths in " in free.folder.log.read_text()
     assert free.report["edit"]["psnr_to_views"] > 32.0
 
 
