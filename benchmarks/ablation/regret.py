@@ -164,7 +164,7 @@ class Edit:
         self.picture(1.0)
         began = time.process_time()
         solver = make_solver(self.drawn, self.original)
-        model = choose_model(solver, choosing(1.0), self.targets(1.0), most, 4)
+        model = choose_model(solver, [(solver, choosing(1.0))], self.targets(1.0), most, 4)
         spent = time.process_time() - began
         strengths = self.strengths(8, model.error_share)
         stages = [TargetStage(s, self.targets(s), 1) for s in strengths]
