@@ -21,12 +21,8 @@ from progdf.metrics.image import decibels
 from progdf.scene.regions import parse_region
 from progdf.scene.up_axis import find_up
 from trainer.editors import make_editor
-from trainer.optimize.color_solver import (
-    choose_model,
-    color_views,
-    make_solver,
-    split_solver,
-)
+from trainer.optimize.color_solver import choose_model, make_solver, split_solver
+from trainer.optimize.color_views import color_views
 from trainer.optimize.ties import surface_ties
 from trainer.options import EditorOptions
 from trainer.setup import quantize_image

@@ -30,16 +30,8 @@ from trainer.fit.slider_uniformity import equalized_strengths
 from trainer.optimize.color_solver import (
     STEPS as TAKEN,
 )
-from trainer.optimize.color_solver import (
-    Judge,
-    Model,
-    add_bands,
-    choose_model,
-    color_views,
-    iterations,
-    make_solver,
-    solve,
-)
+from trainer.optimize.color_solver import Model, add_bands, choose_model, iterations, make_solver, solve
+from trainer.optimize.color_views import Judge, color_views
 from trainer.optimize.pgs import PgsState, TargetStage
 from trainer.options import EditorOptions, FieldOptions, OptimizeOptions, ViewOptions
 from trainer.run.threads import use_threads

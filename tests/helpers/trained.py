@@ -18,7 +18,8 @@ from progdf.gaussians import Gaussians, pack
 from progdf.region import Region, from_mask
 from tests.helpers.demo_scenes import bear
 from trainer.editors import make_editor
-from trainer.optimize.color_solver import choose_model, color_views, make_solver, split_solver
+from trainer.optimize.color_solver import choose_model, make_solver, split_solver
+from trainer.optimize.color_views import color_views
 from trainer.optimize.losses import GradientL1, Objective
 from trainer.optimize.pgs import PgsSettings, TargetStage, learning_rates
 from trainer.optimize.ties import surface_ties
@@ -76,7 +77,7 @@ def edit_few(scene: Gaussians, members: Tensor, crops: list[CropScene], targets:
     original = pack(scene[members], with_shN=scene.sh_degree > 0)
     ties = surface_ties(scene, members, [some.camera for some in crops])
     solver = make_solver(color_views(crops, original), original, ties)
-    model = choose_model(solver, split_solver(solver, original, targets), targets, 100, 1, lambda: None)
+    model = choose_model(solver, split_solver(solver, original, targets), targets, 100, 1)
     return solver.edit_offsets(model, targets)
 
 

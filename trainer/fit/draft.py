@@ -30,7 +30,8 @@ from progdf.scene.up_axis import find_up
 from progdf.sh import basis
 from trainer.editors import COLOR_FUNCTIONS, make_editor
 from trainer.editors.procedural import edit_course
-from trainer.optimize.color_solver import MORE_PAYS, ColorView, MapFit, fit_maps
+from trainer.optimize.color_solver import MORE_PAYS
+from trainer.optimize.color_views import ColorView, MapFit, fit_maps
 from trainer.options import MOST_STAGES, EditorOptions, ViewOptions
 from trainer.views.view import BACKGROUND, View, fit_size, region_rig, with_near_plane
 

@@ -21,17 +21,15 @@ from progdf.scene.bounds import scene_sphere
 from trainer.fit.network import JointTraining, begin_joint_training, save_network
 from trainer.optimize.color_solver import (
     STEPS,
-    ColorView,
-    Judge,
     Model,
     Solver,
     choose_model,
-    color_views,
     iterations,
     make_solver,
     solve,
     split_solver,
 )
+from trainer.optimize.color_views import ColorView, Judge, color_views
 from trainer.optimize.groups import Groups, group_path, group_stage, restore_groups
 from trainer.optimize.losses import Losses, Objective, Perceptual, erode, loss_table
 from trainer.optimize.pgs import (

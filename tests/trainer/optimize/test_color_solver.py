@@ -15,16 +15,8 @@ from progdf.rasterize.cpu.engine import color_map
 from progdf.region import Region
 from progdf.sh import rgb_to_sh0
 from tests.helpers.scenes import random_gaussians
-from trainer.optimize.color_solver import (
-    Judge,
-    Model,
-    Solver,
-    add_bands,
-    choose_model,
-    color_views,
-    make_solver,
-    solve,
-)
+from trainer.optimize.color_solver import Model, Solver, add_bands, choose_model, make_solver, solve
+from trainer.optimize.color_views import Judge, color_views
 from trainer.optimize.pgs import OnStep, ParameterSnapshot, PgsState, TargetStage
 from trainer.setup import unresolved_share
 from trainer.views.crops import CropScene, crop_scene, render_all

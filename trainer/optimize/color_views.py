@@ -1,0 +1,193 @@
+"""Views as functions of the members' colors, and maps of color fitted to them.
+
+While nothing moves, every view is linear in the members' colors (`progdf.rasterize.cpu.engine`), but for the
+clamps at black and white. A map of color, a polynomial of what is drawn (`progdf.field.grade`), is linear in
+its coefficients too: its least squares over all views take a tenth of a second.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+import torch
+from torch import Tensor
+
+from progdf.field.baked import MONOMIALS, identity_map
+from progdf.field.grade import MOST_COLOR, member_bands, monomials
+from progdf.gaussians import unpack
+from progdf.metrics.image import ROUNDING
+from progdf.rasterize.cpu.engine import ColorMap, color_map
+from progdf.sh import basis
+from progdf.threads import one_thread, threads
+from trainer.views.crops import CropScene
+
+_SQUARES = 6  # of a view's longer side, every other one of which is in one of its halves
+_COVERED = 0.05  # the region's weight in a pixel that the map is fitted to
+_MOST_PIXELS = 250_000  # for the some twenty coefficients of the map; of more, evenly spread ones
+_CLAMP_ROUNDS = 3  # of the map's least squares, for pixels that are white or black anyway
+_MAP_RIDGE = 1e-6  # of the diagonal of a map's normal equations, for regions of few colors
+_MAP_HELD = 1e-2  # say of the members' own colors beside the pixels: there a map is held to the affine one
+_SHIFT_HELD = 1e-2  # of that: the affine map is held to the same change of all
+
+_A = TypeVar("_A")
+_B = TypeVar("_B")
+
+
+@dataclass(frozen=True)
+class ColorView:
+    """One training view's box as a function of the members' colors."""
+
+    map: ColorMap  # what each member weighs in each pixel
+    others: Tensor  # what all but the members show, unclamped. [h,w,3]
+    basis: Tensor  # weight of each band in each member's color from here. [M,B]
+    original: Tensor  # the members' unclamped colors as they were. [M,3]
+    counts: Tensor  # the pixels that are looked at. [h,w,1] bool
+
+    def colors(self, offsets: Tensor) -> Tensor:
+        """Unclamped. Offsets of the lowest bands [M,b,3] -> [M,3]"""
+        return self.original + torch.einsum("mb,mbc->mc", self.basis[:, : offsets.shape[1]], offsets)
+
+    def picture(self, colors: Tensor) -> Tensor:
+        """Unclamped. [M,3] -> [h,w,3]"""
+        return self.others + self.map.picture(colors.clamp_min(0.0))
+
+    def error(self, offsets: Tensor, target: Tensor, power: float = 2.0) -> float:
+        """Sum of differences to some power, of colors 0..1. [M,b,3], [h,w,3]"""
+        image = self.picture(self.colors(offsets)).clamp(0.0, 1.0)
+        return float(((image - target) * self.counts).abs().pow(power).sum())
+
+    def halves(self) -> tuple[ColorView, ColorView]:
+        """The view with every other square of its pixels, and with the others."""
+        height, width = self.map.size
+        side = max(1, max(height, width) // _SQUARES)
+        rows, columns = torch.arange(height)[:, None, None] // side, torch.arange(width)[:, None] // side
+        even = (rows + columns) % 2 == 0
+        return replace(self, counts=self.counts & even), replace(self, counts=self.counts & ~even)
+
+
+def color_view(crop: CropScene, original: Tensor, bands: int) -> ColorView:
+    """Prepare a view. `original`: raw member rows [M,14+]; `bands`: how many may change, DC among them."""
+    camera = crop.camera
+    members = unpack(original, crop.member_shN)
+    directions = torch.nn.functional.normalize(members.means - camera.position, dim=1)
+    weights = basis(min(members.sh_degree, 3), directions)
+    colors = (weights[..., None] * members.sh[:, : weights.shape[1]]).sum(dim=1) + 0.5
+    weighed = color_map(crop.gaussians, camera, crop.box, crop.rows)
+    picture = crop.original()
+    if crop.cached is not None:
+        live, constant = crop.cached
+        picture = torch.where(live, picture, constant)
+    return ColorView(
+        weighed,
+        picture - weighed.picture(colors.clamp_min(0.0)),
+        weights[:, :bands].contiguous(),
+        colors,
+        torch.ones(*weighed.size, 1, dtype=torch.bool),
+    )
+
+
+def color_views(crops: Sequence[CropScene], original: Tensor) -> list[ColorView]:
+    """All views, with all bands that are drawn. Each crop is looked at once, and not needed any more."""
+    bands = member_bands(original).shape[1]
+    return map_views(lambda i: color_view(crops[i], original, bands), range(len(crops)))
+
+
+@dataclass(frozen=True)
+class MapFit:
+    """The views' pixels as monomials of the region's drawn colors: a map's picture is linear in them."""
+
+    design: Tensor  # what each pixel shows of every monomial. [P,20] float32
+    others: Tensor  # what it shows of all but the members. [P,3]
+    pixels: Sequence[Tensor]  # which pixels of each view these are, one view after another. [p] int64
+    normal: Tensor  # products of all pixels' monomials. [20,20] float64
+    held: Tensor  # the same of the members', hidden or not, as far as they count. [20,20] float64
+
+    @one_thread()
+    def solve(self, degree: int, targets: Sequence[Tensor]) -> Tensor:
+        """The map of least squares. [h,w,3] each -> [K,3]
+
+        A polynomial goes astray beyond the colors that it was fitted to, and members that no picture shows
+        may have such: at all members' colors it is held to the affine map, and
+        that one to the same change of all.
+        """
+        return identity_map(degree) + self._change(MONOMIALS[degree], targets)
+
+    def _change(self, count: int, targets: Sequence[Tensor]) -> Tensor:
+        """What is added to the identity's first coefficients: 1, 4, 10 or 20. [count,3]"""
+        design, target = self.design[:, :count].contiguous(), self._pixels(targets)
+        normal, pull = self.normal[:count, :count], torch.zeros(count, 3, dtype=torch.float64)
+        if count > 1:
+            coarse = self._change(4 if count > 4 else 1, targets).double()
+            held = self.held[:count, :count] * (1.0 if count > 4 else _SHIFT_HELD)
+            normal, pull = normal + held, held[:, : len(coarse)] @ coarse
+        normal = normal + _MAP_RIDGE * (normal.diagonal() + 1e-12).diag()
+        original, change = self.design[:, 1:4], torch.zeros(count, 3)
+        for _ in range(_CLAMP_ROUNDS):
+            image = original + design @ change + self.others
+            clamped = ((image >= 1.0) & (target >= 1.0)) | ((image <= 0.0) & (target <= 0.0))
+            goal = torch.where(clamped, image, target) - self.others - original
+            right = (design.T @ goal).double() + pull
+            change = torch.linalg.solve(normal, right).float()
+        return change
+
+    def _pixels(self, images: Sequence[Tensor]) -> Tensor:
+        """[h,w,3] each -> [P,3]"""
+        return torch.cat([image.reshape(-1, 3)[p] for image, p in zip(images, self.pixels, strict=True)])
+
+
+@one_thread()
+def fit_maps(views: Sequence[ColorView], most: int = _MOST_PIXELS) -> MapFit:
+    """Prepare the views for maps of any degree. `most`: pixels that they are fitted to"""
+
+    def lay_out(view: ColorView) -> tuple[Tensor, Tensor, Tensor]:
+        terms = monomials(view.original.T.clamp(0.0, MOST_COLOR), 3)
+        planes: tuple[Tensor, ...] = torch.split(torch.cat([terms, terms[:1]]), 3)
+        shown = torch.cat([view.map.picture(plane.T).reshape(-1, 3) for plane in planes], dim=1)[:, :20]
+        pixels = ((shown[:, 0] > _COVERED) & view.counts.flatten()).nonzero()[:, 0]
+        return shown[pixels], pixels, (terms @ terms.T).double()
+
+    laid = map_views(lay_out, views)
+    stride = max(1, -(-sum(len(some) for some, _, _ in laid) // most))
+    design, pixels = (
+        torch.cat([some[::stride] for some, _, _ in laid]),
+        [some[::stride] for _, some, _ in laid],
+    )
+    others = torch.cat([view.others.reshape(-1, 3)[some] for view, some in zip(views, pixels, strict=True)])
+    wide, members = design.double(), torch.stack([some for _, _, some in laid]).sum(dim=0)
+    share = _MAP_HELD * len(design) / max(1, len(views) * len(views[0].original))
+    return MapFit(design, others, pixels, wide.T @ wide, share * members)
+
+
+@dataclass(frozen=True)
+class Judge:
+    """Views that are not solved for, and an edit in them."""
+
+    views: Sequence[ColorView]
+    targets: Sequence[Tensor]  # [h,w,3] each
+
+    def error(self, offsets: Tensor) -> float:
+        """Mean squared difference, with that of the pictures' own rounding. [M,B,3]"""
+        count = max(1, 3 * sum(int(view.counts.sum()) for view in self.views))
+        return ROUNDING + self.total(offsets) / count
+
+    def total(self, offsets: Tensor, power: float = 2.0) -> float:
+        """Sum of differences to some power. [M,B,3]"""
+        pairs = list(zip(self.views, self.targets, strict=True))
+        return sum(map_views(lambda pair: pair[0].error(offsets, pair[1], power), pairs))
+
+
+def map_views(work: Callable[[_A], _B], items: Sequence[_A]) -> list[_B]:
+    """`work` of every item, on as many threads as the rasterizer has; the same bits on any number."""
+    return list(iterate_views(work, items))
+
+
+def iterate_views(work: Callable[[_A], _B], items: Sequence[_A]) -> Iterator[_B]:
+    """The same one by one, for what need not be kept."""
+    if threads() == 1 or len(items) == 1:
+        yield from map(work, items)
+        return
+    with ThreadPoolExecutor(threads()) as pool:
+        yield from pool.map(work, items)
