@@ -1,9 +1,9 @@
 """Edits of colors alone: one map of color for the region, and what single members need beside it.
 
-The map is a least squares over all views (`trainer.optimize.color_views`). What it cannot say is a residual of
-the members' lowest bands, by conjugate gradients that know the clamps, each member preconditioned by its own
-weight, as in tomography: one that is a hundredth of a pixel gets its answer as a large one does. A member that
-no view shows follows the map.
+The map is a least squares over all views (`trainer.optimize.color_views`). What it cannot say is a residual
+of the members' lowest bands, by conjugate gradients that know the clamps, each member preconditioned by its
+own weight, as in tomography: one that is a hundredth of a pixel gets its answer as a large one does. A member
+that no view shows follows the map.
 
 How much of this a region gets (degree of the map; no residual, one of DC, or one of two bands) is decided on
 views that are not solved for, at the full strength: the least of which more would take away less than a
@@ -55,7 +55,7 @@ _TIES = 0.001  # of a typical member's weight: ties neighbors, where views are f
 _TRUSTED = 0.1  # of the same: a member of less is rather as its neighbors are
 _HOLDS = (1e-8, 1e-5, 1e-3)  # ridges tried there: a residual goes around all, some way, to its neighbors
 _SHARES = (1.0, 0.5, 0.2)  # of a step, where the whole of it would run into clamps
-_LOOKS = 10  # steps over which that is taken: the first few may gain nothing in other views
+_LOOKS = 3  # steps over which that is taken: a single one may gain nothing in other views
 
 
 @dataclass(frozen=True)

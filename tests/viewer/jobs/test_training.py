@@ -175,8 +175,8 @@ def test_the_trainer_s_progress_and_recordings_are_read_as_it_writes_them(tmp_pa
     assert (told.label, told.loss) == ("Training", "0.5")
     assert 0.0 < told.share < 1.0, "the field is still to come"
     assert told.seconds > 0.0, "for the question whether to discard it"
-    later = Progress(0.9, "Packing", "", 1e6)
-    assert asked.read_progress(later) == Progress(0.9, "Training", "0.5", 1e6), "never back"
+    later = Progress(0.9999, "Packing", "", 1e6)
+    assert asked.read_progress(later) == Progress(0.9999, "Training", "0.5", 1e6), "never back"
     members = torch.tensor([1, 5])
     region = Region("blue", members, torch.zeros(len(scene)).index_fill(0, members, 1.0))
     folder.state.save("region", {"members": region.members, "score": region.score}, {"name": "blue"})
