@@ -148,8 +148,8 @@ class OptimizeOptions:
     for here: each is another pass over the views."""
     sh: Bands = "auto"
     """Colors that change with the direction one looks from: trained, and kept where leaving them out would
-    cost 0.1 dB (on), left as they are (off), or trained unless the edit is of colors and the region's own
-    hardly change with the view (auto)."""
+    cost 0.1 dB (on, auto), or left as they are (off); those of an edit of colors follow its map, and get a
+    residual where that takes a twentieth of the error away (on, auto)."""
     perceptual_weight: Annotated[float | None, absent_option("FLOAT", "by the kind of edit")] = None
     """Weight of LPIPS beside L1; by default .3 for style and geometry (paper: 1). An edit of colors is solved
     for, all views at once; a weight makes it descend view by view instead."""
