@@ -274,8 +274,8 @@ def drop_idle_attributes(
         prunes: whether anything is taken out that moves at all
 
     Returns:
-        The trajectory (without the higher SH bands' columns if these go), and what leaving out each attribute
-        that moves would cost, dB.
+        The trajectory (without the higher SH bands' columns if these go; that of a grade as it is), and what
+        leaving out each attribute that moves would cost, dB.
     """
     offsets, end = trajectory.offsets, trajectory.end
     costs: dict[str, float] = {}
@@ -294,7 +294,8 @@ def drop_idle_attributes(
             offsets = offsets.clone()
             offsets[:, :, slices[name]] = 0.0
             end = tried
-    if "shN" in slices and not bool(end[:, slices["shN"]].any()):
+    # a grade is of all bands that the scene has, whether or not its map moves them
+    if trajectory.maps is None and "shN" in slices and not bool(end[:, slices["shN"]].any()):
         offsets, end = offsets[:, :, :BASE_CHANNELS].clone(), end[:, :BASE_CHANNELS].clone()
     if end is trajectory.end:
         return trajectory, costs

@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from progdf.field import BakedField, fit_keyframes
+from progdf.field.baked import identity_map
 from progdf.field.trajectory import Trajectory
 from progdf.gaussians import pack
 from tests.helpers.trained import WHITE, Small, small
@@ -217,3 +219,23 @@ def test_attributes_that_show_little_each_are_not_all_left_out_where_together_th
     moving = moving_attributes(kept.end)
     assert ("means" in moving) != ("quats" in moving)
     assert "sh0" not in moving
+
+
+def test_a_grade_keeps_the_bands_that_its_map_leaves_alone() -> None:
+    """A part was painted and there is no map: a grade is of all bands of the scene, and so is its recording."""
+
+    class Judging(Evaluator):
+        def pictures(self, offsets: Tensor) -> list[Tensor]:
+            return [torch.zeros(1, 1, 3)]
+
+    end = torch.zeros(2, 23)
+    end[:, 11] = 1.0
+    offsets = torch.stack([torch.zeros(2, 23), end]).half()
+    steps, maps = torch.tensor([0, 1]), identity_map(1)[None]
+    trajectory = Trajectory(torch.tensor([0.0, 1.0]), offsets, end, steps, (1,), (1.0,), maps, 1)
+    pixels = [torch.ones(1, 1, dtype=torch.bool)]
+    evaluator = Judging(torch.zeros(2, 23), [], pixels, {1.0: [torch.zeros(1, 1, 3)]}, ["a"])
+    kept, _ = drop_idle_attributes(trajectory, evaluator)
+    assert kept.end.shape == (2, 23)
+    without, _ = drop_idle_attributes(replace(trajectory, maps=None), evaluator, prunes=False)
+    assert without.end.shape == (2, 14)
