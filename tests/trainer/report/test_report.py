@@ -222,7 +222,7 @@ def test_attributes_that_show_little_each_are_not_all_left_out_where_together_th
 
 
 def test_a_grade_keeps_the_bands_that_its_map_leaves_alone() -> None:
-    """A part was painted and there is no map: a grade is of all bands of the scene, and so is its recording."""
+    """A part was painted and there is no map: a grade is of all bands of the scene, as is its recording."""
 
     class Judging(Evaluator):
         def pictures(self, offsets: Tensor) -> list[Tensor]:
