@@ -22,7 +22,7 @@ from typing import Literal, Protocol
 import torch
 from torch import Tensor
 
-from progdf.metrics.image import ROUNDING, decibels
+from progdf.metrics.image import LEVEL, ROUNDING, decibels
 
 from .baked import END_TYPES, BakedField, interpolate_at
 from .keyframes import fit_keyframes, fit_lossless
@@ -42,6 +42,13 @@ Kind = Literal["separable", "keyframes", "lossless"]
 
 ADDED = 0.1
 """Share of the error that an edit has against its editor which its field may add."""
+
+
+def allowed_error(own: float) -> float:
+    """What may be added to an edit's own error, mean square: `ADDED` of it, where it is less than 8 bits show
+    as much as brings both there."""
+    return (1.0 + ADDED) * max(own, LEVEL) - own
+
 
 KEYFRAMES = (2, 3, 4, 5, 6, 9, 12, 17)
 
@@ -109,9 +116,9 @@ def sample_strengths() -> tuple[float, ...]:
 class FieldEvaluator:
     """Renders fields and says whether they serve.
 
-    Beside the editor's own pictures a field serves that adds at most `ADDED` of the mean square error which
-    the trajectory has against them: where there are such pictures, all together, and on the way, against the
-    trajectory, on the mean. Without them its worst PSNR against the trajectory decides.
+    Beside the editor's own pictures a field serves that adds at most `allowed_error` of what the trajectory has
+    against them: where there are such pictures, all together, and on the way, against the trajectory, on the
+    mean. Without them its worst PSNR against the trajectory decides.
 
     Args:
         strengths: of the snapshots. [T]
@@ -138,7 +145,7 @@ class FieldEvaluator:
             self._expected = [render(course(s)) for s in sample_strengths()]
             self._edited = edited or {1.0: render(course(1.0))}
         self._own = self._errors(course)
-        self._allowed = ADDED * fmean(self._own) if edited else 10 ** (-target / 10)
+        self._allowed = allowed_error(fmean(self._own)) if edited else 10 ** (-target / 10)
         own = decibels(fmean(self._own))
         tenth = f"adds at most a tenth to the edit's own error ({own:.1f} dB to the editor)"
         self.wanted = tenth if edited else f"reaches {target:g} dB"
@@ -146,7 +153,7 @@ class FieldEvaluator:
 
     def end_excess(self, end: Tensor) -> float:
         """The error of these offsets at strength 1 as a multiple of what is allowed there. [M,C]"""
-        allowed = ADDED * self._own[-1] if self._rule else self._allowed
+        allowed = allowed_error(self._own[-1]) if self._rule else self._allowed
         with torch.no_grad():
             added = _difference(self._render(end), self._edited[max(self._edited)]) + ROUNDING - self._own[-1]
         return added / allowed
@@ -331,10 +338,7 @@ def _separable(
     """
     ticks = tuple(strengths.tolist() if recorded is None else recorded)
     candidates = []
-    for modes in (
-        seen.modes,
-        {n: principal_modes(c.gram) for n, c in seen.trajectories.items()},
-    ):
+    for modes in (seen.modes, {n: principal_modes(c.gram) for n, c in seen.trajectories.items()}):
         attributes = {
             name: store_attribute(trajectory, modes[name][:, : ranks[name]])
             for name, trajectory in seen.trajectories.items()

@@ -17,6 +17,10 @@ NO_DIFFERENCE = 99.0
 ROUNDING = 1 / 255**2 / 12
 """Mean squared error of a picture of 8 bits."""
 
+LEVEL = 1 / 255**2
+"""Mean squared error of pictures a level of 8 bits apart, as rounding may leave two that agree: no screen
+shows less for certain."""
+
 
 def decibels(mse: float) -> float:
     """PSNR of a mean squared error of images of range 0..1, at most `NO_DIFFERENCE`, dB."""

@@ -26,7 +26,6 @@ from progdf.field.baked import (
     interpolate_at,
     remap_slider,
 )
-from progdf.field.choose import ADDED
 from progdf.gaussians import BASE_CHANNELS, pack
 from progdf.metrics.image import ROUNDING
 from trainer.editors import COSTLY_STRENGTHS, check_editor
@@ -64,9 +63,8 @@ def equalized_strengths(
         spec: what it was made of, `KIND:WHAT`
         views: of which a few are looked at
         plain: shares of the visible change, ascending, the last 1
-        missed: share of the change (mean square) that the finished edit misses; with it shares are halves,
-            quarters …, as many as it takes until straight lines between the pictures miss at most `ADDED` as
-            much, less where less of the change is there
+        missed: share of the change (mean square) that straight lines between the pictures may miss, less
+            where less of it is there; with it shares are halves, quarters …, as many as that takes
     """
     if editor.stages or len(plain) == 1 or check_editor(spec)[0] in COSTLY_STRENGTHS:
         return plain
@@ -82,7 +80,7 @@ def equalized_strengths(
     if max(steps) > _JUMP * sum(steps):
         return plain
     _, due = _spread(even, pictures, 1)
-    shares = plain if missed is None else _bends(even, pictures, due, ADDED * missed)
+    shares = plain if missed is None else _bends(even, pictures, due, missed)
     at = interpolate(torch.tensor(shares, dtype=torch.float64), even, due)
     rounded = (*(round(float(s), 3) for s in at[:-1]), 1.0)
     rises = all(b - a > 5e-4 for a, b in zip((0.0, *rounded), rounded, strict=False))

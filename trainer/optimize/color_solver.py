@@ -29,8 +29,9 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from progdf.field.baked import MONOMIALS, identity_map
+from progdf.field.choose import allowed_error
 from progdf.field.grade import band_offsets, map_colors, member_bands
-from progdf.metrics.image import decibels
+from progdf.metrics.image import LEVEL, decibels
 from progdf.threads import one_thread
 
 from .color_views import ColorView, Judge, MapFit, fit_maps, iterate_views, map_views
@@ -75,9 +76,9 @@ class Model:
         return self.residual.shape[1]
 
     @property
-    def error_share(self) -> float:
-        """Share of the change that the finished edit misses, mean square."""
-        return self.error / self.unedited
+    def allowed_share(self) -> float:
+        """Share of the change that strengths between may miss beside the finished edit's own, mean square."""
+        return allowed_error(self.error) / self.unedited
 
     def figures(self) -> dict[str, Any]:
         """As report.json has it."""
@@ -162,7 +163,7 @@ class Solver:
             steps: most steps
             judge: the best in its views is kept, and steps end when they gain little there, see `SETTLED`;
                 None takes all
-            floor: error in these views that counts as none, see `Model.error`
+            floor: error in these views that counts as none, see `Model.error`; one of `LEVEL` always does
             hold: see `Model.hold`
             tell: called after each step
         """
@@ -215,7 +216,7 @@ class Solver:
                 error = look(now)
                 best = now if error < min(looks) else best
                 looks.append(error)
-                if looks[-1 - _LOOKS] - error <= _LOOKS * SETTLED * max(error, floor):
+                if looks[-1 - _LOOKS] - error <= _LOOKS * SETTLED * max(error, floor, LEVEL):
                     break
             conditioned = inverse * pull.descent
             turn = (_inner(pull.descent, conditioned) - _inner(pull.descent, last)) / power
@@ -310,7 +311,7 @@ def choose_model(
     steps: int,
     most_bands: int,
 ) -> Model:
-    """The smallest model of which a larger one would take away less than a twentieth of the error.
+    """The smallest model of which a larger one would take away less than a twentieth of the error that shows.
 
     Of a few pictures there is always a residual, or what single members got would not be in the edit; how far
     it travels is all the way, unless less takes away a twentieth.
@@ -359,7 +360,7 @@ def choose_model(
     for bands, hold in [(1, hold) for hold in _HOLDS[1:]] if few else sizes:
         name = f"residual held by {hold:g}" if few else f"with a residual of {bands}"
         last = attempt(name, mapped[degree], last.residuals, bands, hold)
-        if last.error < MORE_PAYS * best.error:
+        if max(last.error, LEVEL) < MORE_PAYS * best.error:
             best = last
     residual = best.residuals[0]
     if few:  # the trials solved for a part of it

@@ -156,7 +156,7 @@ def optimize_members(
         folder: where the state is saved
         log: of the run
         renewal: see `pgs.Renewal`
-        between: of colors that are solved for, the share of the finished edit that is missed (mean square) ->
+        between: of colors that are solved for, the share of the change that may be missed (mean square) ->
             `edited` at as many strengths as that calls for; None: as many as there are
 
     Returns:
@@ -269,7 +269,7 @@ def _prepare_colors(
     if ties is not None:
         unseen = len(original) - int(solver.asked.sum())
         log.say(f"{unseen} members that no picture shows follow the map and their own surface")
-    edited = edited if between is None else between(model.error_share)
+    edited = edited if between is None else between(model.allowed_share)
     stages = [TargetStage(s, _boxes(some, setup.train), 1) for s, some in edited.items()]
     return solver, model, edited, stages, [judging(pictures) for pictures in edited.values()]
 

@@ -29,7 +29,7 @@ from progdf.field.separable import (
     store_attribute,
 )
 from progdf.gaussians import ATTRIBUTES, attribute_slices
-from progdf.metrics.image import ROUNDING
+from progdf.metrics.image import LEVEL, ROUNDING
 from tests.helpers.edits import at_snapshots, curved_field, curved_trajectory, linear_pictures
 
 EVERYTHING = dict.fromkeys(ATTRIBUTES, 2)
@@ -293,7 +293,10 @@ def test_what_an_edit_misses_of_its_editor_decides_how_much_is_stored() -> None:
     for chosen, missed in ((rough, 0.1), (fine, 0.001)):
         own = ROUNDING + missed**2 * float(noise.square().mean())
         assert chosen.best.to_editor is not None
-        assert 10 ** (-chosen.best.to_editor / 10) <= 1.1001 * own
+        assert 10 ** (-chosen.best.to_editor / 10) <= 1.1001 * max(own, LEVEL), (
+            "what no screen shows is nothing"
+        )
+    assert 10 ** (-fine.best.to_editor / 10) > 1.1 * own
 
 
 def test_an_end_that_moves_far_is_stored_in_more_bits_and_the_others_are_not() -> None:

@@ -85,7 +85,7 @@ def test_strengths_are_as_many_as_the_course_bends_and_the_edit_is_good() -> Non
 
     assert asked(Late(power=1.0), 1e-9) == (1.0,), "a straight course needs no more than its end"
     bent = make_editor(EditorOptions("recolor:#3060d0"), small().scene, small().region, views)
-    rough, fine = asked(bent, 3e-2), asked(bent, 1e-4)
+    rough, fine = asked(bent, 3e-3), asked(bent, 1e-5)
     assert 1 <= len(rough) < len(fine) <= 16
     assert fine[0] < 0.2, "what is fine near the original shows a bend soonest"
     assert asked(bent, 1e9) == (1.0,)
