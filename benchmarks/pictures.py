@@ -21,7 +21,7 @@ from progdf.metrics.image import decibels
 from progdf.scene.regions import parse_region
 from progdf.scene.up_axis import find_up
 from trainer.editors import make_editor
-from trainer.optimize.color_solver import choose_model, make_solver, split_solver
+from trainer.optimize.color_solver import add_bands, choose_model, make_solver, split_solver
 from trainer.optimize.color_views import color_views
 from trainer.optimize.ties import surface_ties
 from trainer.options import EditorOptions
@@ -88,7 +88,8 @@ def _rows(path: Path, edit: str) -> list[tuple[str, ...]]:
         targets = [crop(picture, view.box) for view, picture in zip(large, edited, strict=True)]
         trials = split_solver(solver, original, targets)
         model = choose_model(solver, trials, targets, STEPS, 1)
-        offsets = band_offsets(solver.edit_offsets(model, targets), original.shape[1])
+        change = add_bands(solver.fit_map(model.degree, targets)[1], model.residual)
+        offsets = band_offsets(change, original.shape[1])
         took = time.process_time() - began
         found = scene.replace_rows(region.members, original + offsets)
         near: list[float] = []

@@ -158,7 +158,7 @@ class Edit:
         solver = make_solver(self.drawn, self.original)
         model = choose_model(solver, [(solver, choosing(1.0))], self.targets(1.0), most, 4)
         spent = time.process_time() - began
-        strengths = self.strengths(8, model.error_share)
+        strengths = self.strengths(8, model.allowed_share)
         stages = [TargetStage(s, self.targets(s), 1) for s in strengths]
         judges, state = [choosing(s) for s in strengths], PgsState(self.original)
         began = time.process_time()
@@ -182,8 +182,7 @@ class Edit:
         every = self.strengths(stages[0])
         for s in (1.0, *every[:-1]):
             targets, began = self.targets(s), time.process_time()
-            table = solver.table(degree, targets)
-            mapped = solver.map_offsets(degree, table)
+            table, mapped = solver.fit_map(degree, targets)
             spent, done = time.process_time() - began, 0
             now = torch.zeros(len(mapped), bands, 3) if last is None else s * last
             for steps in (steps for steps in STEPS if steps <= most):

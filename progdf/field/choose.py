@@ -116,9 +116,9 @@ def sample_strengths() -> tuple[float, ...]:
 class FieldEvaluator:
     """Renders fields and says whether they serve.
 
-    Beside the editor's own pictures a field serves that adds at most `allowed_error` of what the trajectory has
-    against them: where there are such pictures, all together, and on the way, against the trajectory, on the
-    mean. Without them its worst PSNR against the trajectory decides.
+    Beside the editor's own pictures a field serves that adds at most `allowed_error` of what the trajectory
+    has against them: where there are such pictures, all together, and on the way, against the trajectory, on
+    the mean. Without them its worst PSNR against the trajectory decides.
 
     Args:
         strengths: of the snapshots. [T]

@@ -18,7 +18,7 @@ from progdf.gaussians import Gaussians, pack
 from progdf.region import Region, from_mask
 from tests.helpers.demo_scenes import bear
 from trainer.editors import make_editor
-from trainer.optimize.color_solver import choose_model, make_solver, split_solver
+from trainer.optimize.color_solver import add_bands, choose_model, make_solver, split_solver
 from trainer.optimize.color_views import color_views
 from trainer.optimize.losses import GradientL1, Objective
 from trainer.optimize.pgs import PgsSettings, TargetStage, learning_rates
@@ -78,7 +78,7 @@ def edit_few(scene: Gaussians, members: Tensor, crops: list[CropScene], targets:
     ties = surface_ties(scene, members, [some.camera for some in crops])
     solver = make_solver(color_views(crops, original), original, ties)
     model = choose_model(solver, split_solver(solver, original, targets), targets, 100, 1)
-    return solver.edit_offsets(model, targets)
+    return add_bands(solver.fit_map(model.degree, targets)[1], model.residual)
 
 
 def label_mask(scene: Gaussians, member: Tensor, camera: Camera) -> Tensor:

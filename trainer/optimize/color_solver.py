@@ -35,7 +35,6 @@ from progdf.metrics.image import LEVEL, decibels
 from progdf.threads import one_thread
 
 from .color_views import ColorView, Judge, MapFit, fit_maps, iterate_views, map_views
-from .losses import l1
 from .pgs import OnStep, ParameterSnapshot, PgsState, TargetStage
 from .ties import Ties
 
@@ -128,18 +127,11 @@ class Solver:
     asked: Tensor  # members whose residual is solved for. [M] bool
     held: csr_matrix  # ties among these, as strong as they are to be. [M,M]
 
-    def map_offsets(self, degree: int, table: Tensor) -> Tensor:
-        """What a map adds. [K,3] -> [M,B,3]"""
-        return map_colors(self.sh, table, max(1, degree)) - self.sh
-
-    def table(self, degree: int, targets: Sequence[Tensor]) -> Tensor:
-        """The map that comes nearest to these pictures; of degree 0 the identity. [K,3]"""
-        return self.maps.solve(degree, targets) if degree else identity_map(1)
-
-    def edit_offsets(self, model: Model, targets: Sequence[Tensor]) -> Tensor:
-        """What a model adds where it was chosen for these pictures. [M,B,3]"""
-        mapped = self.map_offsets(model.degree, self.table(model.degree, targets))
-        return add_bands(mapped, model.residual)
+    def fit_map(self, degree: int, targets: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+        """The map that comes nearest to these pictures, of degree 0 the identity, and what it adds. [K,3],
+        [M,B,3]"""
+        table = self.maps.solve(degree, targets) if degree else identity_map(1)
+        return table, map_colors(self.sh, table, max(1, degree)) - self.sh
 
     @one_thread()  # sums of members are added in an order that depends on the number of threads
     def residual(
@@ -269,16 +261,6 @@ class Solver:
 
         return sum(map_views(look, range(len(self.views)))) + _inner(along, self._hold(along, ridge))
 
-    def left(self, offsets: Tensor, finished: Sequence[Tensor]) -> float:
-        """Mean absolute difference from the finished edit. [M,B,3]"""
-
-        def look(pair: tuple[ColorView, Tensor]) -> float:
-            view, target = pair
-            return float(l1(view.picture(view.colors(offsets)).clamp(0.0, 1.0), target))
-
-        found = map_views(look, list(zip(self.views, finished, strict=True)))
-        return sum(found) / len(found)
-
 
 def make_solver(views: Sequence[ColorView], original: Tensor, ties: Ties | None = None) -> Solver:
     """The views, prepared. `original`: raw member rows [M,14+]; `ties`: where the views are few."""
@@ -326,9 +308,6 @@ def choose_model(
     tried: list[tuple[str, float]] = []
     few, zero = solver.ties is not None, torch.zeros(len(solver.sh), 0, 3)
 
-    def map_with(by: Solver, degree: int) -> Tensor:
-        return by.map_offsets(degree, by.table(degree, targets))
-
     def attempt(name: str, offsets: list[Tensor], start: list[Tensor], bands: int, hold: float) -> Attempt:
         """Residuals beside the map's offsets, of each trial, and the error with them."""
         residuals = [pad(one, (0, 0, 0, bands - one.shape[1])) for one in start]
@@ -343,9 +322,9 @@ def choose_model(
         return Attempt(error, residuals, hold)
 
     def left_by(degree: int) -> float:
-        return sum(judge.total(made, 1.0) for (_, judge), made in zip(trials, mapped[degree], strict=True))
+        return sum(judge.mean(made, 1.0) for (_, judge), made in zip(trials, mapped[degree], strict=True))
 
-    mapped = {degree: [map_with(by, degree) for by, _ in trials] for degree in (0, *MONOMIALS)}
+    mapped = {degree: [by.fit_map(degree, targets)[1] for by, _ in trials] for degree in (0, *MONOMIALS)}
     start, by_degree = [zero for _ in trials], {}
     # of what no picture shows a map is a guess: where it is the worse one for most that is shown, for less
     # than about half of that is painted, there is none
@@ -364,7 +343,7 @@ def choose_model(
             best = last
     residual = best.residuals[0]
     if few:  # the trials solved for a part of it
-        made, judge = map_with(solver, degree), Judge(solver.views, targets)
+        made, judge = solver.fit_map(degree, targets)[1], Judge(solver.views, targets)
         zero = torch.zeros_like(residual)
         residual, _ = solver.residual(made, zero, targets, steps, judge, best.error, best.hold)
     unedited = sum(judge.error(torch.zeros_like(solver.sh)) for _, judge in trials) / len(trials)
@@ -413,19 +392,17 @@ def solve(
     Raises:
         FloatingPointError: the loss or where it leads is not finite; the state is that of the stage before.
     """
-    finished, last = stages[-1].targets, None
+    finished, last = Judge(solver.views, stages[-1].targets), None
     for index in range(state.stage, len(stages)):
         targets = stages[index].targets
-        table = solver.table(model.degree, targets)
-        mapped = solver.map_offsets(model.degree, table)
+        table, mapped = solver.fit_map(model.degree, targets)
         offsets = mapped
         if model.bands:
             start, before = torch.zeros_like(model.residual), 0.0
             if index:
                 before = stages[index - 1].strength
                 if last is None:
-                    earlier = solver.table(model.degree, stages[index - 1].targets)
-                    last = solver.map_offsets(model.degree, earlier)
+                    _, last = solver.fit_map(model.degree, stages[index - 1].targets)
                 start = (member_bands(state.moved.detach()) - last)[:, : model.bands]
             share = (stages[index].strength - before) / (stages[-1].strength - before)
             start = torch.lerp(start, model.residual, share)
@@ -436,7 +413,7 @@ def solve(
             state.means.add({STEPS: taken})
             offsets = add_bands(mapped, residual)
         last = mapped
-        left = solver.left(offsets, finished)
+        left = finished.mean(offsets, 1.0)
         if not math.isfinite(left) or not bool(offsets.isfinite().all()):
             raise FloatingPointError(f"the loss is {left} at step {state.step}")
         with torch.no_grad():

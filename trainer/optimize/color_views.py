@@ -54,7 +54,7 @@ class ColorView:
         """Unclamped. [M,3] -> [h,w,3]"""
         return self.others + self.map.picture(colors.clamp_min(0.0))
 
-    def error(self, offsets: Tensor, target: Tensor, power: float = 2.0) -> float:
+    def error(self, offsets: Tensor, target: Tensor, power: float) -> float:
         """Sum of differences to some power, of colors 0..1. [M,b,3], [h,w,3]"""
         image = self.picture(self.colors(offsets)).clamp(0.0, 1.0)
         return float(((image - target) * self.counts).abs().pow(power).sum())
@@ -142,21 +142,27 @@ class MapFit:
 def fit_maps(views: Sequence[ColorView], most: int = _MOST_PIXELS) -> MapFit:
     """Prepare the views for maps of any degree. `most`: pixels that they are fitted to"""
 
-    def lay_out(view: ColorView) -> tuple[Tensor, Tensor, Tensor]:
+    def find_covered(view: ColorView) -> Tensor:
+        share = view.map.picture(torch.ones_like(view.original))[..., :1]
+        return ((share > _COVERED) & view.counts).flatten().nonzero()[:, 0]
+
+    def lay_out(index: int) -> tuple[Tensor, Tensor]:
+        view, some = views[index], pixels[index]
         terms = monomials(view.original.T.clamp(0.0, MOST_COLOR), 3)
         planes: tuple[Tensor, ...] = torch.split(torch.cat([terms, terms[:1]]), 3)
-        shown = torch.cat([view.map.picture(plane.T).reshape(-1, 3) for plane in planes], dim=1)[:, :20]
-        pixels = ((shown[:, 0] > _COVERED) & view.counts.flatten()).nonzero()[:, 0]
-        return shown[pixels], pixels, (terms @ terms.T).double()
+        shown = torch.cat([view.map.picture(plane.T).reshape(-1, 3)[some] for plane in planes], dim=1)
+        return shown[:, :20], (terms @ terms.T).double()
 
-    laid = map_views(lay_out, views)
-    stride = max(1, -(-sum(len(some) for some, _, _ in laid) // most))
-    design, pixels = (
-        torch.cat([some[::stride] for some, _, _ in laid]),
-        [some[::stride] for _, some, _ in laid],
+    covered = map_views(find_covered, views)
+    stride = max(1, -(-sum(map(len, covered)) // most))
+    pixels = [some[::stride].clone() for some in covered]
+    laid = map_views(lay_out, range(len(views)))
+    design, members = (
+        torch.cat([some for some, _ in laid]),
+        torch.stack([some for _, some in laid]).sum(dim=0),
     )
     others = torch.cat([view.others.reshape(-1, 3)[some] for view, some in zip(views, pixels, strict=True)])
-    wide, members = design.double(), torch.stack([some for _, _, some in laid]).sum(dim=0)
+    wide = design.double()
     share = _MAP_HELD * len(design) / max(1, len(views) * len(views[0].original))
     return MapFit(design, others, pixels, wide.T @ wide, share * members)
 
@@ -170,13 +176,13 @@ class Judge:
 
     def error(self, offsets: Tensor) -> float:
         """Mean squared difference, with that of the pictures' own rounding. [M,B,3]"""
-        count = max(1, 3 * sum(int(view.counts.sum()) for view in self.views))
-        return ROUNDING + self.total(offsets) / count
+        return ROUNDING + self.mean(offsets, 2.0)
 
-    def total(self, offsets: Tensor, power: float = 2.0) -> float:
-        """Sum of differences to some power. [M,B,3]"""
+    def mean(self, offsets: Tensor, power: float) -> float:
+        """Mean difference to some power. [M,B,3]"""
         pairs = list(zip(self.views, self.targets, strict=True))
-        return sum(map_views(lambda pair: pair[0].error(offsets, pair[1], power), pairs))
+        total = sum(map_views(lambda pair: pair[0].error(offsets, pair[1], power), pairs))
+        return total / max(1, 3 * sum(int(view.counts.sum()) for view in self.views))
 
 
 def map_views(work: Callable[[_A], _B], items: Sequence[_A]) -> list[_B]:

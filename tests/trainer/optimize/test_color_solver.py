@@ -180,7 +180,7 @@ def test_steps_end_where_other_views_gain_little_and_go_on_where_members_are_den
     (crops, original), (others, _) = (prepared(scene, c) for c in (orbit(8, size), orbit(16, size)[1::2]))
     targets, aside = (render_all(some, pack(edited, with_shN=False)) for some in (crops, others))
     solver = make_solver(color_views(crops, original), original)
-    mapped = solver.map_offsets(1, solver.table(1, targets))
+    _, mapped = solver.fit_map(1, targets)
     start, judge = torch.zeros(members, 1, 3), Judge(color_views(others, original), aside)
     found, taken = solver.residual(mapped, start, targets, most, judge)
     assert taken == most if members == 6000 else taken < most / 2
