@@ -162,6 +162,7 @@ def test_everything_is_checked_before_anything_starts(
     assert not out.exists()
 
 
+@pytest.mark.slow  # one that always dies is tried again in every run of the tests
 def test_a_killed_worker_s_job_goes_on_in_another_one(
     catalogue: Path, singly: dict[str, bytes], tmp_path: Path
 ) -> None:
