@@ -14,7 +14,7 @@ from progdf.compose.composer import Composer
 from progdf.compose.layers import Layer
 from progdf.rasterize import ActivatedGaussians, activate, alpha_weights, render
 from progdf.rasterize.cpu.engine import color_map
-from progdf.rasterize.simplification import simplify
+from progdf.rasterize.cpu.pyramid import Pyramid
 from progdf.rasterize.screen import lines_behind
 from tests.helpers.edits import curved_field, edit_of, some_rows
 from tests.helpers.scenes import ball, front_camera
@@ -32,7 +32,9 @@ lines = numpy.zeros((0, 14), numpy.float32)
 with lines_behind(picture.image.numpy(), picture.transmittance.numpy(), lines, 0.5):
     pass
 rows = some_rows(scene, 20)
-simplify(activate(scene), camera, 10)
+pyramid = Pyramid(activate(scene))
+pyramid.simplify(camera, 10)
+pyramid.refresh(rows.numpy(), True)
 weighed = color_map(activate(scene), camera, (0, 0, camera.width, camera.height), rows)
 weighed.gradient(weighed.picture(torch.ones(20, 3)))
 gdf = edit_of(scene, rows, curved_field(20))

@@ -186,6 +186,11 @@ class HighlightTexture:
             part = self._memory[first * SPLATS_PER_ROW : last * SPLATS_PER_ROW]
             self._texture.write(part, viewport=(0, first, SPLATS_PER_ROW, last - first))
 
+    def read(self) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+        """Which Gaussians are not in their own colors, and in which. [R] and [R,4]"""
+        rows = np.flatnonzero(self._memory[:, 3])
+        return rows, self._memory[rows]
+
     @property
     def empty(self) -> bool:
         """Whether it leaves every Gaussian its own color."""

@@ -70,6 +70,13 @@ class SplatRenderer:
         assert self._scene is not None, "upload comes first"
         return self._scene
 
+    @property
+    def highlights(self) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+        """Which Gaussians are highlighted and how, as `highlight` takes them."""
+        if self._highlights is None:
+            return np.zeros(0, np.int64), np.zeros((0, 4), np.uint8)
+        return self._highlights.read()
+
     def upload(self, scene: Gaussians) -> int:
         """Take a whole scene; gives the bytes sent. The order has to be set anew."""
         count, coefficients = len(scene), min(int(scene.shN.shape[1]), SHOWN_SH)

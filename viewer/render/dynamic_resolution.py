@@ -1,9 +1,38 @@
-"""Fewer pixels while something moves and a whole picture takes long; all of them once it rests."""
+"""Fewer pixels and Gaussians while something moves and a whole picture takes long; all once it rests."""
 
 from __future__ import annotations
 
 import math
+import time
+from collections.abc import Callable, Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import cache
+from typing import TypeVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from progdf.camera import Camera
+from progdf.gaussians import Gaussians
+from progdf.rasterize import ActivatedGaussians
+from progdf.rasterize.cpu.pyramid import Pyramid
+from progdf.sh import C0
+from viewer.gl.scene_textures import SPLATS_PER_ROW, row_runs
+
+from .highlight import HIDDEN
+
+Array = NDArray[np.float32]
+T = TypeVar("T")
+
+SH = ("sh0", "shN")
+
+BUDGETS = 10_000, 50_000, 500_000
+"""How many Gaussians a picture in motion has at most: on a slow machine, at first, on a quick one."""
+
+MOVING_MS = 24.0, 32.0
+"""What such a picture shall take; with more or less time, the next one has fewer or more Gaussians."""
 
 SLOW_MS = 40.0
 """What a picture may take before "auto" halves its sides: 25 pictures a second."""
@@ -109,3 +138,132 @@ class FrameTimings:
     @property
     def total_ms(self) -> float:
         return self.compose_ms + self.upload_ms + self.sort_ms + self.draw_ms
+
+
+class LiveScene:
+    """The scene as it is drawn, activated, under its highlights; and a pyramid over it for what moves.
+
+    Args:
+        scene: what is copied; later changes come by `update`
+    """
+
+    def __init__(self, scene: Gaussians) -> None:
+        self.drawn = ActivatedGaussians(
+            means=torch.from_numpy(_copy(scene.means)),
+            quats=torch.from_numpy(_copy(scene.quats)),
+            scales=torch.from_numpy(_exp(scene.log_scales)),
+            opacities=torch.from_numpy(_sigmoid(scene.logit_opacities)),
+            colors=scene.sh,
+            antialiased=scene.antialiased,
+        )
+        self._scene = scene
+        self._highlights: Array | None = None  # rgb and its share, 0..1; None is no highlight. [N,4]
+        self._budget = BUDGETS[1]
+        self._pyramid: Future[Pyramid] | None = None
+        self._behind: list[tuple[NDArray[np.int64], bool]] = []  # rows that it lacks, and whether only colors
+
+    def update(self, scene: Gaussians, attributes: Iterable[str], rows: NDArray[np.int64]) -> None:
+        """See `Renderer.update`."""
+        self._scene, names = scene, tuple(attributes)
+        highlighted = self._highlights is not None and any(name in SH for name in names)
+        names = tuple(dict.fromkeys((*names, *SH))) if highlighted else names
+        for first, last in row_runs(rows):  # whole runs, as slices are many times faster than indices
+            part = slice(first * SPLATS_PER_ROW, last * SPLATS_PER_ROW)
+            for name in names:
+                self._write(scene, name, part)
+            if highlighted:
+                self._apply_highlight(part)
+        if self._pyramid is not None and len(rows):
+            self._behind.append((rows, all(name in SH for name in names)))
+
+    def highlight(self, rows: NDArray[np.int64], highlights: NDArray[np.uint8]) -> None:
+        """See `Renderer.highlight`."""
+        if self._highlights is None:
+            self._highlights = np.zeros((len(self.drawn.means), 4), np.float32)
+        hidden = self._highlights[rows, 3] == 1.0
+        self._highlights[rows] = highlights.astype(np.float32) / 255.0
+        names = SH if (hidden == (highlights[:, 3] == HIDDEN)).all() else ("logit_opacities", *SH)
+        self.update(self._scene, names, rows)
+        if not self._highlights[:, 3].any():
+            self._highlights = None
+
+    def begin_pyramid(self) -> Future[Pyramid]:
+        """Build it beside everything else; what is written meanwhile is merged anew afterwards."""
+        self._pyramid = _worker().submit(_build, self.drawn)
+        return self._pyramid
+
+    def draw_fewer(self, draw: Callable[[ActivatedGaussians], T], camera: Camera, pixels: int) -> T | None:
+        """Draw as many as there is time for; None until there is a pyramid.
+
+        Args:
+            camera: of the coarse picture
+            pixels: of the window that one of its pixels covers, each way
+        """
+        pyramid = self._pyramid or self.begin_pyramid()
+        if not pyramid.done():
+            return None
+        started = time.perf_counter()
+        for colors_only in (False, True):
+            rows = [rows for rows, colors in self._behind if colors == colors_only]
+            if rows:
+                pyramid.result().refresh(np.concatenate(rows), colors_only)
+        self._behind.clear()
+        fewer = pyramid.result().simplify(camera, self._budget, pixels)
+        picture = draw(fewer)
+        taken, (low, high) = 1e3 * (time.perf_counter() - started), MOVING_MS
+        if taken > high or (taken < low and len(fewer.means) > 0.8 * self._budget):
+            budget = int(self._budget * (0.85 if taken > high else 1.15))
+            self._budget = min(max(budget, BUDGETS[0]), BUDGETS[2])
+        return picture
+
+    def _write(self, scene: Gaussians, name: str, part: slice) -> None:
+        means, quats, scales, opacities, sh = (tensor.numpy() for tensor in self.drawn.tensors)
+        match name:
+            case "means":
+                means[part] = scene.means[part].numpy()
+            case "quats":
+                quats[part] = scene.quats[part].numpy()
+            case "log_scales":
+                scales[part] = _exp(scene.log_scales[part])
+            case "logit_opacities":
+                opacities[part] = _sigmoid(scene.logit_opacities[part])
+                if self._highlights is not None:
+                    opacities[part] *= self._highlights[part, 3] < 1.0
+            case "sh0":
+                sh[part, 0] = scene.sh0[part].numpy()
+            case "shN":
+                sh[part, 1:] = scene.shN[part].numpy()
+
+    def _apply_highlight(self, part: slice) -> None:
+        """Mix the highlights into colors that were just written: all bands, as color is linear in them."""
+        assert self._highlights is not None, "nothing to highlight with"
+        sh, share = self.drawn.colors.numpy()[part], self._highlights[part, 3:]
+        sh *= 1.0 - share[:, :, None]
+        sh[:, 0] += share * (self._highlights[part, :3] - 0.5) / C0
+
+
+def _build(gaussians: ActivatedGaussians) -> Pyramid:
+    """A pyramid that was used once: its kernels are compiled now, and not under the first touch."""
+    pyramid = Pyramid(gaussians)
+    pyramid.simplify(Camera(torch.eye(4), torch.eye(3), 1, 1), 1)
+    return pyramid
+
+
+@cache
+def _worker() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(1, thread_name_prefix="pyramid")
+
+
+def _copy(values: torch.Tensor) -> Array:
+    return np.array(values.detach().numpy(), np.float32, order="C")
+
+
+def _exp(values: torch.Tensor) -> Array:
+    """With numpy, on one thread: torch's threads would spin against the rasterizer's."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.exp(_copy(values))
+
+
+def _sigmoid(values: torch.Tensor) -> Array:
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.asarray(1.0 / (1.0 + np.exp(-_copy(values))), np.float32)

@@ -210,7 +210,7 @@ class ViewEngine:
         highlight_ms = self._apply_highlight(highlight)
         started = time.perf_counter()
         camera = replace(camera, near=self.near)
-        if self.renderer.wants_order and self._ordered_for != target.viewmat:
+        if self.renderer.wants_order and pixels == 1 and self._ordered_for != target.viewmat:
             self.order = back_to_front(self.composer.gaussians.means.numpy(), camera)
             self._ordered_for = target.viewmat
         sorted_at = time.perf_counter()

@@ -7,18 +7,26 @@ from typing import Protocol, TypeVar
 
 import moderngl
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
+from progdf.rasterize import ActivatedGaussians
+from progdf.sh import C0
 from viewer.camera.view_camera import Vec3
 from viewer.gl.present import Presenter
 from viewer.gl.splats import GridPass, SplatRenderer
 
+from .dynamic_resolution import LiveScene
 from .ground_grid import Lines
 
 Image = NDArray[np.float32]
+
+_ROOM = 1 << 14  # Gaussians that textures grow by
+_LEAST = 1e-30  # what is taken for zero has a logarithm
+
 T = TypeVar("T")
 
 
@@ -90,25 +98,54 @@ class GlRenderer:
     def __init__(self, ctx: moderngl.Context) -> None:
         self._ctx = ctx
         self._renderer = SplatRenderer(ctx)
+        self._moving: tuple[LiveScene, SplatRenderer] | None = None  # what is drawn while something moves
         self._presenter = Presenter(ctx)
         self._picture: moderngl.Texture | None = None
         self._grid: GridPass | None = None
 
     def upload(self, scene: Gaussians) -> None:
+        self._scene = scene
+        self._release_moving()
         self._renderer.upload(scene)
         self._ctx.finish()
 
     def update(self, scene: Gaussians, attributes: Iterable[str], rows: NDArray[np.int64]) -> None:
-        self._renderer.update(scene, attributes, rows)
+        self._scene, names = scene, tuple(attributes)
+        self._renderer.update(scene, names, rows)
+        if self._moving is not None:
+            self._moving[0].update(scene, names, rows)
         self._ctx.finish()
 
     def highlight(self, rows: NDArray[np.int64], highlights: NDArray[np.uint8]) -> None:
         self._renderer.highlight(rows, highlights)
+        if self._moving is not None:
+            self._moving[0].highlight(rows, highlights)
 
     def draw(self, camera: Camera, background: Vec3, order: NDArray[np.uint32], pixels: int = 1) -> None:
-        self._renderer.set_order(order)
-        self._picture = self._renderer.draw(camera, background)
+        self._picture = self._draw_fewer(camera, background, pixels) if pixels > 1 else None
+        if self._picture is None:
+            self._renderer.set_order(
+                order if pixels == 1 else back_to_front(self._scene.means.numpy(), camera)
+            )
+            self._picture = self._renderer.draw(camera, background)
         self._ctx.finish()
+
+    def _draw_fewer(self, camera: Camera, background: Vec3, pixels: int) -> moderngl.Texture | None:
+        if self._moving is None:
+            live = LiveScene(self._scene)
+            live.highlight(*self._renderer.highlights)
+            self._moving = live, SplatRenderer(self._ctx)
+        live, renderer = self._moving
+
+        def draw(fewer: ActivatedGaussians) -> moderngl.Texture:
+            gaussians = _to_raw(fewer)
+            renderer.upload(gaussians)
+            renderer.set_order(back_to_front(gaussians.means[: len(fewer.means)].numpy(), camera))
+            picture = renderer.draw(camera, background)
+            self._ctx.finish()
+            return picture
+
+        return live.draw_fewer(draw, camera, pixels)
 
     def prepare(self, camera: Camera, background: Vec3) -> bool:
         return True
@@ -137,8 +174,26 @@ class GlRenderer:
     def release(self) -> None:
         self._presenter.release()
         self._renderer.release()
+        self._release_moving()
         if self._grid is not None:
             self._grid.release()
+
+    def _release_moving(self) -> None:
+        if self._moving is not None:
+            self._moving[1].release()
+            self._moving = None
+
+
+def _to_raw(fewer: ActivatedGaussians) -> Gaussians:
+    """As textures hold them, with empty ones behind them up to one of few sizes."""
+    room = -(-max(len(fewer.means), 1) // _ROOM) * _ROOM - len(fewer.means)
+    means, quats, scales, opacities, rgb = (
+        torch.nn.functional.pad(tensor, (0, 0) * (tensor.ndim - 1) + (0, room)) for tensor in fewer.tensors
+    )
+    return Gaussians(
+        means, quats, scales.clamp_min(_LEAST).log(), opacities.clamp(_LEAST, 1.0 - 1e-6).logit(),
+        (rgb - 0.5) / C0, rgb.new_zeros(len(rgb), 0, 3),
+    )  # fmt: skip
 
 
 def _require_picture(thing: T | None) -> T:

@@ -196,7 +196,7 @@ def camera_center(camera: Pinhole) -> Vec:
 
 
 @kernel(contract=True, inline=True)
-def _unit_quat(w: float, x: float, y: float, z: float) -> tuple[float, float, float, float, float]:
+def unit_quat(w: float, x: float, y: float, z: float) -> tuple[float, float, float, float, float]:
     """Unit quaternion and 1/length; the identity and 0 where it is zero or not finite."""
     total = abs(w) + abs(x) + abs(y) + abs(z)
     if not (total > 0.0 and total < np.inf):
@@ -206,7 +206,7 @@ def _unit_quat(w: float, x: float, y: float, z: float) -> tuple[float, float, fl
 
 
 @kernel(contract=True, inline=True)
-def _rotation_rows(w: float, x: float, y: float, z: float) -> tuple[Vec, Vec, Vec]:
+def rotation_rows(w: float, x: float, y: float, z: float) -> tuple[Vec, Vec, Vec]:
     """Rows of the rotation by a unit quaternion."""
     return (
         (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
@@ -227,11 +227,11 @@ def footprint(camera: Pinhole, scene: Scene, i: int) -> Footprint:
     jx, jy = camera.fx * inv_z, camera.fy * inv_z
     a0 = blend2(jx, camera.rows[0], -jx * tan_x, camera.rows[2])
     a1 = blend2(jy, camera.rows[1], -jy * tan_y, camera.rows[2])
-    qw, qx, qy, qz, inv_length = _unit_quat(
+    qw, qx, qy, qz, inv_length = unit_quat(
         np.float64(scene.quats[i, 0]), np.float64(scene.quats[i, 1]),
         np.float64(scene.quats[i, 2]), np.float64(scene.quats[i, 3]),
     )  # fmt: skip
-    rotation = _rotation_rows(qw, qx, qy, qz)
+    rotation = rotation_rows(qw, qx, qy, qz)
     turned0, turned1 = row_times(a0, rotation), row_times(a1, rotation)
     p0, p1 = times(turned0, scale), times(turned1, scale)
     a, b, c = dot(p0, p0), dot(p0, p1), dot(p1, p1)

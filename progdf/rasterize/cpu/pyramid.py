@@ -1,0 +1,528 @@
+"""Fewer Gaussians for a picture in motion: neighbors merged once, and of each part of the view as much detail
+as it shows.
+
+- A binary tree over the scene, split at the median of the widest axis down to leaves of four to eight. Each
+  node is one Gaussian with the moments of those below it, weighed by opacity times area.
+- A view takes a node whose detail does not show, and else looks at its two halves, or at the Gaussians of a
+  leaf. What merging loses is estimated in pixels² as the spread of the centers, in pixels, times the root of
+  the visible area, as errors add up in squares; and it shows as far as light reaches it, which a coarser cut
+  of the same view tells, added up in a grid of cells and slices of depth.
+- The limit is sought so that about as many are drawn as asked for, from the last picture's on.
+- The dilation, wider in a coarse picture, is taken off the size, and the remainder off the opacity.
+
+The plain version is in tests/helpers/plain_pyramid.py.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from progdf.camera import Camera
+from progdf.rasterize.engines import (
+    ALPHA_MAX,
+    ALPHA_MIN,
+    ANTIALIAS_FLOOR,
+    DILATION,
+    ActivatedGaussians,
+    RasterView,
+)  # fmt: skip
+from progdf.threads import run_chunks
+
+from .engine import make_pinhole, share_gaussians
+from .forward import (
+    Pinhole,
+    Scene,
+    camera_center,
+    cross,
+    dot,
+    footprint,
+    largest_extents,
+    rotation_rows,
+    shade_splat,
+    times,
+    unit_quat,
+    vec,
+)
+from .jit import Number, kernel, prefetch
+
+Array = NDArray[Any]
+
+LEAF = 4
+"""Gaussians of a leaf at least; fewer cost memory, more lose .7 dB (docs/experiments.md, The viewer)."""
+
+CELL = 8
+"""Side of a cell of the grid in which optical depth is added up, pixels."""
+
+SLICES = 224
+"""Of a cell's depth from the near plane on, sixteen to a factor of two."""
+
+DARKEST = 3.0
+"""Optical depth beyond which it makes no more difference: cells know nothing of gaps."""
+
+COARSER = 4.0
+"""Times the limit, with which the cut is made that tells the light."""
+
+FINEST = 1e-3
+"""Least limit, pixels²: what one loses below it no picture of eight bits shows."""
+
+ENOUGH = 0.85
+"""Of what was asked for: with so many the limit is not sought any further."""
+
+_ONE = int(np.float32(1.0).view(np.int32))
+_SLICE_SHIFT = 19  # of a float's bits: sixteen slices for a factor of two
+_TOP = 5  # levels of which each node is a chunk of its own
+_AHEAD = 8  # rows that are fetched before it is their turn: they lie far apart
+_MOST = 1e30  # of a weight
+_LEAST = 1e-30
+_TRIALS = 12  # for a limit
+_REACH = 3.0  # standard deviations of a node that are in front of the near plane, or it is not drawn
+
+
+class Nodes(NamedTuple):
+    """The tree, level after level: node i has the halves 2i + 1 and 2i + 2, and leaf l of L = 2^levels the
+    rows order[l·N // L : (l + 1)·N // L]."""
+
+    gaussians: Scene  # what stands for each node. [2L-1, …]
+    weights: Array  # Σ opacity · area of what is below, world units². [2L-1] float32
+    spreads: Array  # root of the summed variances of the centers below, world units. [2L-1] float32
+    order: Array  # rows of the scene. [N] int32
+    levels: int
+
+
+class Pyramid:
+    """The tree over a scene, which is read where it lies: after a change of it, `refresh`.
+
+    Args:
+        gaussians: the scene, float32; colors are harmonics
+    """
+
+    def __init__(self, gaussians: ActivatedGaussians) -> None:
+        self._gaussians = gaussians
+        self.scene = Scene(*(tensor.detach().numpy() for tensor in gaussians.tensors))
+        count = len(self.scene.means)
+        levels = max((count // LEAF).bit_length() - 1, 0)
+        order = _sort(self.scene.means, levels)
+        total = (2 << levels) - 1
+        self.nodes = Nodes(
+            Scene(*(np.zeros((total, *array.shape[1:]), np.float32) for array in self.scene)),
+            np.zeros(total, np.float32),
+            np.zeros(total, np.float32),
+            order,
+            levels,
+        )
+        self.limit = 1.0  # of what a node may lose, pixels²: where the last search ended
+        self._places: Array | None = None  # of each row in the order, once one is asked for. [N] int32
+        for level in range(levels, -1, -1):
+            self._merge(level, np.arange(1 << level))
+
+    def refresh(self, rows: Array, colors_only: bool) -> None:
+        """Merge anew what is above some rows of the scene. rows: [M] int64"""
+        count, levels = len(self.nodes.order), self.nodes.levels
+        if self._places is None:
+            self._places = np.empty(count, np.int32)
+            self._places[self.nodes.order] = np.arange(count, dtype=np.int32)
+        marks = np.zeros(1 << levels, np.bool_)
+        # the leaf whose first place is the last one that is not after it
+        marks[((self._places[rows].astype(np.int64) + 1 << levels) - 1) // max(count, 1)] = True
+        for level in range(levels, -1, -1):
+            self._merge(level, np.flatnonzero(marks), colors_only)
+            if level:
+                marks = marks[0::2] | marks[1::2]
+
+    def simplify(self, camera: Camera, budget: int, pixels: int = 1) -> ActivatedGaussians:
+        """What `render` draws in place of the scene while something moves.
+
+        Args:
+            camera: of the coarse picture
+            budget: how many Gaussians are drawn at most; somewhat fewer where they would be many more
+            pixels: of the fine picture that one of the coarse one covers, each way
+
+        Returns:
+            Gaussians in the colors that this camera sees; rgb [M,3]
+        """
+        view, dilation = make_pinhole(RasterView.of(camera, self._gaussians)), DILATION / pixels**2
+        picks = self.cut(view, budget, dilation)
+        out = Scene(*(np.empty((len(picks), width), np.float32) for width in (3, 4, 3, 1, 3)))
+        share_gaussians(
+            lambda begin, end: _take(
+                begin, end, picks, self.scene, self.nodes.gaussians, view, dilation, out, np.empty(16)
+            ),
+            len(picks),
+        )
+        means, quats, scales, opacities, rgb = map(torch.from_numpy, out)
+        return ActivatedGaussians(means, quats, scales, opacities[:, 0], rgb)
+
+    def cut(self, view: Pinhole, budget: int, dilation: float) -> Array:
+        """What a view takes: nodes, and rows of the scene as their complement (~row). [M] int32"""
+        shape = -(-view.window[3] // CELL), -(-view.window[2] // CELL), SLICES
+        low, high = 0.0, math.inf
+        for _ in range(_TRIALS):
+            depths = np.zeros(shape, np.float32)
+            coarse = self._cut(view, self.limit * COARSER, np.zeros(1, np.float32))
+            _add_depths(coarse, self.scene, self.nodes.gaussians, view, dilation, depths.reshape(-1))
+            _sum_depths(depths)
+            picks = self._cut(view, self.limit, depths.reshape(-1))
+            if len(picks) > budget:
+                low = self.limit
+            elif len(picks) >= ENOUGH * budget or self.limit <= FINEST:
+                break
+            else:
+                high = self.limit
+            # a limit twice as high leaves about half as many
+            guess = self.limit * (len(picks) + 1) / (0.5 * (1.0 + ENOUGH) * budget)
+            if not low < guess < high:
+                guess = math.sqrt(max(low, FINEST) * high) if high < math.inf else 2.0 * low
+            self.limit = max(guess, FINEST)
+        return picks
+
+    def _cut(self, view: Pinhole, limit: float, depths: Array) -> Array:
+        top = min(_TOP, self.nodes.levels)
+        room = -(-len(self.nodes.order) >> top) + 1
+
+        def walk(chunk: int) -> Array:
+            picks = np.empty(room, np.int32)
+            root = (1 << top) - 1 + chunk
+            stack = np.empty(64, np.int32)
+            return picks[: _walk(root, self.scene, self.nodes, view, limit, depths, stack, picks)]
+
+        return np.concatenate(run_chunks(walk, 1 << top))
+
+    def _merge(self, level: int, nodes: Array, colors_only: bool = False) -> None:
+        """Merge some nodes of a level, counted from its first one, of what is right below them."""
+        bands = self.scene.colors.shape[1]
+        share_gaussians(
+            lambda begin, end: _merge(
+                begin, end, nodes, level, self.scene, self.nodes, colors_only, np.empty((3, 3)), np.empty(4),
+                np.empty((bands, 3)),
+            ),
+            len(nodes),
+        )  # fmt: skip
+
+
+def _sort(means: Array, levels: int) -> Array:
+    """Rows in such an order that each node's are together. means: [N,3] -> [N] int32"""
+    points = np.nan_to_num(means, nan=0.0, posinf=0.0, neginf=0.0)
+    order = np.arange(len(means), dtype=np.int32)
+    top = min(2, levels)
+    _split(points, order, 0, 0, top)
+    run_chunks(lambda chunk: _split(points, order, top, chunk, levels), 1 << top)
+    return order
+
+
+@kernel(cache=True)
+def _split(points: Array, order: Array, level: int, first: int, levels: int) -> None:
+    """Split node `first` of a level at the medians, down to `levels`; changes points and order alike."""
+    count = points.shape[0]
+    for deeper in range(level, levels):
+        for node in range(first << (deeper - level), (first + 1) << (deeper - level)):
+            begin, end = (node * count) >> deeper, ((node + 1) * count) >> deeper
+            axis, widest = 0, np.float32(-1.0)
+            for k in range(3):
+                least = most = points[begin, k]
+                for i in range(begin, end):
+                    least, most = min(least, points[i, k]), max(most, points[i, k])
+                if most - least > widest:
+                    axis, widest = k, most - least
+            _select(points, order, axis, begin, end, ((2 * node + 1) * count) >> (deeper + 1))
+
+
+@kernel()
+def _select(points: Array, order: Array, axis: int, begin: int, end: int, middle: int) -> None:
+    """Reorder begin … end − 1 so that none before `middle` is greater than any after it (Hoare's select)."""
+    low, high = begin, end - 1
+    while low < high:
+        a, b, c = points[low, axis], points[(low + high) >> 1, axis], points[high, axis]
+        pivot = max(min(a, b), min(max(a, b), c))
+        i, j = low, high
+        while i <= j:
+            while points[i, axis] < pivot:
+                i += 1
+            while points[j, axis] > pivot:
+                j -= 1
+            if i <= j:
+                for k in range(3):
+                    points[i, k], points[j, k] = points[j, k], points[i, k]
+                order[i], order[j] = order[j], order[i]
+                i += 1
+                j -= 1
+        if middle <= j:
+            high = j
+        elif middle >= i:
+            low = i
+        else:
+            return
+
+
+@kernel(contract=True, inline=True)
+def _two_largest(scene: Scene, i: int) -> tuple[float, float]:
+    a, b, c = vec(scene.scales, i)
+    a, b, c = abs(a), abs(b), abs(c)
+    return max(a, max(b, c)), max(min(a, b), min(max(a, b), c))
+
+
+@kernel(contract=True, inline=True)
+def _weight(scene: Scene, i: int) -> float:
+    """Opacity times area; 0 for one that cannot be drawn."""
+    mean, opacity = vec(scene.means, i), np.float64(scene.opacities[i])
+    longest, middle = _two_largest(scene, i)
+    weight = opacity * longest * middle
+    drawn = opacity >= ALPHA_MIN and abs(mean[0]) + abs(mean[1]) + abs(mean[2]) < np.inf and weight < _MOST
+    return max(weight, _LEAST) if drawn else 0.0
+
+
+@kernel(contract=True, cache=True)
+def _merge(
+    begin: int, end: int, indices: Array, level: int, scene: Scene, nodes: Nodes, colors_only: bool,
+    matrix: Array, quat: Array, colors: Array,
+) -> None:  # fmt: skip
+    """Merge nodes indices[begin … end − 1] of a level of what is right below them; at last, scratch."""
+    out, count, leaf = nodes.gaussians, nodes.order.shape[0], level == nodes.levels
+    below = scene if leaf else out
+    for at in range(begin, end):
+        me = (1 << level) - 1 + indices[at]
+        first, last = 2 * me + 1, 2 * me + 3
+        if leaf:
+            first, last = (indices[at] * count) >> level, ((indices[at] + 1) * count) >> level
+        total = x = y = z = 0.0
+        colors[:] = 0.0
+        for k in range(first, last):
+            i = nodes.order[k] if leaf else k
+            weight = _weight(scene, i) if leaf else np.float64(nodes.weights[i])
+            if weight > 0.0:
+                total += weight
+                x, y, z = (
+                    x + weight * below.means[i, 0],
+                    y + weight * below.means[i, 1],
+                    z + weight * below.means[i, 2],
+                )
+                for band in range(colors.shape[0]):
+                    for channel in range(3):
+                        colors[band, channel] += weight * below.colors[i, band, channel]
+        share = 1.0 / max(total, _LEAST)
+        for band in range(colors.shape[0]):
+            for channel in range(3):
+                out.colors[me, band, channel] = colors[band, channel] * share
+        if colors_only:
+            continue
+        x, y, z, own = x * share, y * share, z * share, 0.0
+        matrix[:] = 0.0
+        for k in range(first, last):
+            i = nodes.order[k] if leaf else k
+            weight = (_weight(scene, i) if leaf else np.float64(nodes.weights[i])) * share
+            if weight > 0.0:
+                own += weight * _add_moments(below, i, weight, (x, y, z), matrix)
+                own -= 0.0 if leaf else weight * nodes.spreads[i] * nodes.spreads[i]
+        spread = math.sqrt(max(matrix[0, 0] + matrix[1, 1] + matrix[2, 2] - own, 0.0))
+        _diagonalize(matrix, quat)
+        out.means[me, 0], out.means[me, 1], out.means[me, 2] = x, y, z
+        for k in range(4):
+            out.quats[me, k] = quat[k]
+        for k in range(3):
+            out.scales[me, k] = math.sqrt(max(matrix[k, k], 0.0))
+        longest, middle = _two_largest(out, me)
+        out.opacities[me] = min(total / max(longest * middle, _LEAST), ALPHA_MAX)
+        nodes.weights[me], nodes.spreads[me] = total, spread
+
+
+@kernel(contract=True, inline=True)
+def _add_moments(
+    scene: Scene, i: int, weight: float, center: tuple[float, float, float], matrix: Array
+) -> float:
+    """Add a Gaussian's second moments about a center to a matrix; gives the sum of its own variances."""
+    mean, scale = vec(scene.means, i), vec(scene.scales, i)
+    off = mean[0] - center[0], mean[1] - center[1], mean[2] - center[2]
+    qw, qx, qy, qz, _ = unit_quat(
+        np.float64(scene.quats[i, 0]), np.float64(scene.quats[i, 1]),
+        np.float64(scene.quats[i, 2]), np.float64(scene.quats[i, 3]),
+    )  # fmt: skip
+    rotation = rotation_rows(qw, qx, qy, qz)
+    turned = times(rotation[0], scale), times(rotation[1], scale), times(rotation[2], scale)
+    for row in range(3):
+        for column in range(3):
+            matrix[row, column] += weight * (dot(turned[row], turned[column]) + off[row] * off[column])
+    return dot(scale, scale)
+
+
+@kernel(contract=True)
+def _diagonalize(matrix: Array, quat: Array) -> None:
+    """Turn a symmetric matrix [3,3] into the diagonal one of its eigenvalues (Jacobi's rotations).
+
+    Args:
+        quat: out, wxyz of the rotation whose columns are the eigenvectors. [4]
+    """
+    quat[0], quat[1], quat[2], quat[3] = 1.0, 0.0, 0.0, 0.0
+    for _ in range(8):
+        off = matrix[0, 1] ** 2 + matrix[0, 2] ** 2 + matrix[1, 2] ** 2
+        if off <= 1e-14 * (matrix[0, 0] ** 2 + matrix[1, 1] ** 2 + matrix[2, 2] ** 2):
+            return
+        for axis in range(3):
+            p, q = (axis + 1) % 3, (axis + 2) % 3
+            if matrix[p, q] == 0.0:
+                continue
+            half = (matrix[q, q] - matrix[p, p]) / (2.0 * matrix[p, q])
+            tangent = math.copysign(1.0, half) / (abs(half) + math.sqrt(half * half + 1.0))
+            cosine = 1.0 / math.sqrt(tangent * tangent + 1.0)
+            sine = tangent * cosine
+            matrix[p, p] -= tangent * matrix[p, q]
+            matrix[q, q] += tangent * matrix[p, q]
+            to_p, to_q = matrix[axis, p], matrix[axis, q]
+            matrix[p, q] = matrix[q, p] = 0.0
+            matrix[axis, p] = matrix[p, axis] = cosine * to_p - sine * to_q
+            matrix[axis, q] = matrix[q, axis] = sine * to_p + cosine * to_q
+            turn = math.sqrt(0.5 * (1.0 + cosine))  # cosine of half the angle, about −axis
+            lean = -0.5 * sine / turn
+            w, along, at_p, at_q = quat[0], quat[1 + axis], quat[1 + p], quat[1 + q]
+            quat[0], quat[1 + axis] = w * turn - along * lean, along * turn + w * lean
+            quat[1 + p], quat[1 + q] = at_p * turn + at_q * lean, at_q * turn - at_p * lean
+
+
+@kernel(contract=True, inline=True)
+def _cell(x: float, y: float, z: float, camera: Pinhole) -> int:
+    """Index in the flat grid of a point at pixel (x, y) and depth z; at the edge for one outside."""
+    column = int(min(max(x, 0.0), camera.window[2] - 1.0) / CELL)
+    row = int(min(max(y, 0.0), camera.window[3] - 1.0) / CELL)
+    # of the logarithm of the depth, nearly
+    at: Number = (np.float32(z / camera.near).view(np.int32) - _ONE) >> _SLICE_SHIFT
+    slice_index: int = min(max(at, 0), SLICES - 1)
+    return (row * -(-camera.window[2] // CELL) + column) * SLICES + slice_index
+
+
+@kernel(contract=True, inline=True)
+def _is_outside(camera: Pinhole, x: float, y: float, wide2: float, high2: float) -> bool:
+    """Whether the window shows nothing of a box around pixel (x, y); squares of half its sides."""
+    out_x = max(max(-x, x - camera.window[2]), 0.0)
+    out_y = max(max(-y, y - camera.window[3]), 0.0)
+    return bool(out_x * out_x > wide2 or out_y * out_y > high2)
+
+
+@kernel(contract=True, cache=True)
+def _walk(
+    root: int,
+    scene: Scene,
+    nodes: Nodes,
+    camera: Pinhole,
+    limit: float,
+    depths: Array,
+    stack: Array,
+    picks: Array,
+) -> int:
+    """Cut the tree below a node.
+
+    Args:
+        limit: of what a node may lose, pixels²
+        depths: optical depth before each slice, or [1]: all in the light
+        stack: scratch, longer than twice the levels
+        picks: out, as in `Pyramid.cut`
+
+    Returns:
+        how many are picked
+    """
+    merged, focal, first_leaf = nodes.gaussians, math.sqrt(camera.fx * camera.fy), (1 << nodes.levels) - 1
+    count: int = 0
+    top = 1
+    stack[0] = root
+    while top > 0:
+        top -= 1
+        i = stack[top]
+        longest = max(merged.scales[i, 0], max(merged.scales[i, 1], merged.scales[i, 2]))
+        nearest = dot(camera.rows[2], vec(merged.means, i)) + camera.shift[2] - camera.near
+        if nodes.weights[i] <= 0.0 or nearest + _REACH * longest < 0.0:
+            continue
+        loss = np.inf
+        usable, x, y, z, wide2, high2 = largest_extents(camera, merged, i)
+        if usable and nearest > _REACH * longest:
+            if _is_outside(camera, x, y, wide2, high2):
+                continue
+            scaled = focal / z
+            loss = nodes.spreads[i] * math.sqrt(nodes.weights[i]) * scaled * scaled
+            if depths.size > 1:
+                loss *= math.exp(-0.5 * min(depths[_cell(x, y, z - longest, camera)], DARKEST))
+        if loss <= limit:
+            picks[count] = i
+            count += 1
+        elif i >= first_leaf:
+            leaf, rows = i - first_leaf, nodes.order.shape[0]
+            for k in range((leaf * rows) >> nodes.levels, ((leaf + 1) * rows) >> nodes.levels):
+                usable, x, y, z, wide2, high2 = largest_extents(camera, scene, nodes.order[k])
+                if usable and not _is_outside(camera, x, y, wide2, high2):
+                    picks[count] = ~nodes.order[k]
+                    count += 1
+        else:
+            stack[top], stack[top + 1] = 2 * i + 1, 2 * i + 2
+            top += 2
+    return count
+
+
+@kernel(contract=True, cache=True)
+def _add_depths(
+    picks: Array, scene: Scene, merged: Scene, camera: Pinhole, dilation: float, depths: Array
+) -> None:
+    """Add the optical depth of each pick to its cell of the flat grid, in which it fills no more than all."""
+    for k in range(picks.size):
+        source, i = (merged, picks[k]) if picks[k] >= 0 else (scene, ~picks[k])
+        _, x, y, z, _, _ = largest_extents(camera, source, i)
+        if 0.0 <= x <= camera.window[2] and 0.0 <= y <= camera.window[3]:
+            longest, middle = _two_largest(source, i)
+            nearer = camera.fx * camera.fy / (z * z)
+            area = math.sqrt((longest * longest * nearer + dilation) * (middle * middle * nearer + dilation))
+            depth = -math.log(1.0 - min(np.float64(source.opacities[i]), ALPHA_MAX))
+            depths[_cell(x, y, z, camera)] += depth * min(2.0 * math.pi * area / (CELL * CELL), 1.0)
+
+
+@kernel(cache=True)
+def _sum_depths(depths: Array) -> None:
+    """Of each slice what is before it instead of what is in it. [rows,columns,slices]"""
+    for row in range(depths.shape[0]):
+        for column in range(depths.shape[1]):
+            total = np.float32(0.0)
+            for k in range(depths.shape[2]):
+                total, depths[row, column, k] = total + depths[row, column, k], total
+
+
+@kernel(contract=True, cache=True)
+def _take(
+    begin: int, end: int, picks: Array, scene: Scene, merged: Scene, camera: Pinhole, dilation: float,
+    out: Scene, basis: Array,
+) -> None:  # fmt: skip
+    """Take picks begin … end − 1 as they are drawn."""
+    eye = camera_center(camera)
+    for at in range(begin, end):
+        source, i = (merged, picks[at]) if picks[at] >= 0 else (scene, ~picks[at])
+        following = picks[min(at + _AHEAD, end - 1)]
+        if following < 0:
+            prefetch(scene.means, ~following)
+            prefetch(scene.quats, ~following)
+            prefetch(scene.scales, ~following)
+            prefetch(scene.colors, ~following)
+        seen = footprint(camera, source, i)
+        opacity = np.float64(source.opacities[i])
+        # the coarse picture's dilation instead of the fine one's: off the size, as far as that goes
+        more = (dilation - DILATION) / (camera.fx * camera.fy * seen.inv_z * seen.inv_z)
+        a, b, c = vec(source.scales, i)
+        size = (
+            math.sqrt(max(a * a + more, 0.0)), math.sqrt(max(b * b + more, 0.0)),
+            math.sqrt(max(c * c + more, 0.0)),
+        )  # fmt: skip
+        p0, p1 = times(seen.turned0, size), times(seen.turned1, size)
+        normal = cross(p0, p1)
+        fine = seen.det0 + dilation * (seen.a + seen.c) + dilation * dilation
+        coarse = dot(normal, normal) + DILATION * (dot(p0, p0) + dot(p1, p1)) + DILATION * DILATION
+        if camera.antialiased:
+            opacity *= math.sqrt(max(ANTIALIAS_FLOOR, seen.det0 / fine))
+        out.opacities[at, 0] = opacity * math.sqrt(fine / coarse)
+        for k in range(3):
+            out.means[at, k] = source.means[i, k]
+        out.scales[at, 0], out.scales[at, 1], out.scales[at, 2] = size
+        for k in range(4):
+            out.quats[at, k] = source.quats[i, k]
+        red, green, blue = shade_splat(source, i, camera.degree, eye, basis)
+        out.colors[at, 0], out.colors[at, 1], out.colors[at, 2] = (
+            max(red, 0.0),
+            max(green, 0.0),
+            max(blue, 0.0),
+        )

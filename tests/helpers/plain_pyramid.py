@@ -1,0 +1,199 @@
+"""`progdf.rasterize.cpu.pyramid` in plain torch: the tree by recursion, each node of all that is below it."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from progdf.camera import Camera
+from progdf.gaussians import normalize_quats
+from progdf.quaternions import matrix_quats, rotation_matrices
+from progdf.rasterize.cpu.pyramid import CELL, COARSER, DARKEST, LEAF, SLICES
+from progdf.rasterize.engines import (
+    ALPHA_MAX,
+    ALPHA_MIN,
+    ANTIALIAS_FLOOR,
+    DILATION,
+    FRUSTUM_MARGIN,
+    ActivatedGaussians,
+    RasterView,
+)  # fmt: skip
+from progdf.rasterize.reference import covariances
+from progdf.sh import shade
+
+
+class Node(NamedTuple):
+    """What stands for some rows."""
+
+    rows: Tensor
+    weight: float
+    mean: Tensor  # [3]
+    covariance: Tensor  # [3,3]
+    spread: float
+    opacity: float
+    colors: Tensor  # [K,3]
+
+
+def plain_tree(gaussians: ActivatedGaussians) -> list[Node]:
+    """Every node, level after level."""
+    count = len(gaussians.means)
+    levels = max((count // LEAF).bit_length() - 1, 0)
+    lists = [torch.arange(count)]
+    nodes = [merge_rows(gaussians, lists[0])]
+    for level in range(levels):
+        halves = []
+        for node, rows in enumerate(lists):
+            means = gaussians.means[rows]
+            axis = int((means.amax(0) - means.amin(0)).argmax())
+            begin, middle = (node * count) >> level, ((2 * node + 1) * count) >> (level + 1)
+            order = rows[means[:, axis].argsort(stable=True)]
+            halves += [order[: middle - begin], order[middle - begin :]]
+        lists = halves
+        nodes += [merge_rows(gaussians, rows) for rows in lists]
+    return nodes
+
+
+def merge_rows(gaussians: ActivatedGaussians, rows: Tensor) -> Node:
+    """One Gaussian with the moments of some rows."""
+    means, quats, scales, opacities, colors = (tensor[rows].double() for tensor in gaussians.tensors)
+    weights = opacities * scales.sort(1).values[:, 1:].prod(1)
+    weights = torch.where(opacities >= ALPHA_MIN, weights, 0.0)
+    share = weights / weights.sum()
+    mean = share @ means
+    turned = rotation_matrices(normalize_quats(quats)) * scales[:, None]
+    off = means - mean
+    between = torch.einsum("n,ni,nj->ij", share, off, off)
+    covariance = between + torch.einsum("n,nij,nkj->ik", share, turned, turned)
+    area = float(torch.linalg.eigvalsh(covariance)[1:].clamp_min(0.0).prod().sqrt())
+    opacity = min(float(weights.sum()) / area, ALPHA_MAX)
+    spread = math.sqrt(float(between.trace()))
+    return Node(
+        rows, float(weights.sum()), mean, covariance, spread, opacity,
+        torch.einsum("n,nkc->kc", share, colors),
+    )  # fmt: skip
+
+
+class PlainCut:
+    """A scene as a view draws it under a limit.
+
+    Args:
+        gaussians: all of the scene, in harmonics
+        camera: of the coarse picture
+        limit: of what a node may lose, pixels²
+        pixels: of the fine picture that one of the coarse one covers, each way
+    """
+
+    def __init__(self, gaussians: ActivatedGaussians, camera: Camera, limit: float, pixels: int) -> None:
+        self._gaussians, self._camera, self._nodes = gaussians, camera, plain_tree(gaussians)
+        self._dilation = DILATION / pixels**2
+        self._depths: Tensor | None = None
+        coarse = self._cut(0, limit * COARSER)
+        shape = (-(-camera.height // CELL), -(-camera.width // CELL), SLICES)
+        depths = torch.zeros(shape, dtype=torch.double)
+        for pick in coarse:
+            mean, covariance, opacity, _ = self._parts(pick)
+            x, y, z = self._project(mean)
+            if 0 <= x <= camera.width and 0 <= y <= camera.height:
+                nearer = self._focal2 / z**2
+                sizes = torch.linalg.eigvalsh(covariance)[1:].clamp_min(0.0) * nearer + self._dilation
+                part = min(2 * math.pi * float(sizes.prod().sqrt()) / CELL**2, 1.0)
+                depths[self._cell(x, y, z)] -= math.log(1.0 - min(opacity, ALPHA_MAX)) * part
+        self._depths = depths.cumsum(2) - depths
+        self.picks = self._cut(0, limit)
+
+    def taken(self, picks: list[int]) -> ActivatedGaussians:
+        """Picks as they are drawn."""
+        means, sigmas, opacities, colors = zip(*map(self._parts, picks), strict=True)
+        mean, colors, opacity = torch.stack(means), torch.stack(colors), torch.tensor(opacities).double()
+        values, vectors = torch.linalg.eigh(torch.stack(sigmas))
+        vectors = vectors * torch.linalg.det(vectors)[:, None, None]  # rotations, not mirrors
+        quats, scales = matrix_quats(vectors), values.clamp_min(0.0).sqrt()
+        view = RasterView.of(self._camera, self._gaussians)
+        rotation, translation = self._camera.viewmat[:3, :3].double(), self._camera.viewmat[:3, 3].double()
+        points = mean @ rotation.T + translation
+        more = (self._dilation - DILATION) * points[:, 2:] ** 2 / self._focal2
+        sizes = (scales**2 + more).clamp_min(0.0).sqrt()
+        a, _, c, det0 = covariances(points, quats, scales, view)
+        fine = det0 + self._dilation * (a + c) + self._dilation**2
+        a, _, c, det = covariances(points, quats, sizes, view)
+        opacity = opacity * (fine / (det + DILATION * (a + c) + DILATION**2)).sqrt()
+        if self._gaussians.antialiased:
+            opacity = opacity * (det0 / fine).clamp_min(ANTIALIAS_FLOOR).sqrt()
+        direction = torch.nn.functional.normalize(mean + rotation.T @ translation, dim=1)
+        rgb = shade(view.sh_degree or 0, direction, colors)
+        return ActivatedGaussians(mean, quats, sizes, opacity, rgb).each(Tensor.float)
+
+    @property
+    def _focal2(self) -> float:
+        return float(self._camera.K[0, 0] * self._camera.K[1, 1])
+
+    def _parts(self, pick: int) -> tuple[Tensor, Tensor, float, Tensor]:
+        """Mean, covariance, opacity and colors of a node or, ~row, of a row."""
+        if pick >= 0:
+            node = self._nodes[pick]
+            return node.mean, node.covariance, node.opacity, node.colors
+        means, quats, scales, opacities, colors = (
+            tensor[~pick].double() for tensor in self._gaussians.tensors
+        )
+        turned = rotation_matrices(normalize_quats(quats[None]))[0] * scales
+        return means, turned @ turned.T, float(opacities), colors
+
+    def _project(self, mean: Tensor) -> tuple[float, float, float]:
+        x, y, z = (self._camera.viewmat[:3, :3].double() @ mean + self._camera.viewmat[:3, 3]).tolist()
+        K = self._camera.K
+        return float(K[0, 0]) * x / z + float(K[0, 2]), float(K[1, 1]) * y / z + float(K[1, 2]), z
+
+    def _cell(self, x: float, y: float, z: float) -> tuple[int, int, int]:
+        near = torch.tensor(z / self._camera.near).float().view(torch.int32)
+        slices = int(near - torch.tensor(1.0).view(torch.int32)) >> 19
+        column = int(min(max(x, 0.0), self._camera.width - 1.0) / CELL)
+        row = int(min(max(y, 0.0), self._camera.height - 1.0) / CELL)
+        return row, column, min(max(slices, 0), SLICES - 1)
+
+    def _cut(self, index: int, limit: float) -> list[int]:
+        """Picks below a node, in no order."""
+        node, near = self._nodes[index], self._camera.near
+        largest = float(torch.linalg.eigvalsh(node.covariance)[-1]) ** 0.5
+        x, y, z = self._project(node.mean)
+        if node.weight <= 0.0 or z + 3.0 * largest < near:
+            return []
+        loss = math.inf
+        if z - 3.0 * largest > near and node.opacity >= ALPHA_MIN:
+            if not self._in_window(node.mean, largest):
+                return []
+            loss = node.spread * math.sqrt(node.weight) * self._focal2 / z**2
+            if self._depths is not None:
+                depth = float(self._depths[self._cell(x, y, z - largest)])
+                loss *= math.exp(-0.5 * min(depth, DARKEST))
+        if loss <= limit:
+            return [index]
+        if 2 * index + 1 >= len(self._nodes):
+            means, scales = self._gaussians.means.double(), self._gaussians.scales.double()
+            return [
+                ~row
+                for row in node.rows.tolist()
+                if self._gaussians.opacities[row] >= ALPHA_MIN
+                and self._in_window(means[row], float(scales[row].max()))
+            ]
+        return self._cut(2 * index + 1, limit) + self._cut(2 * index + 2, limit)
+
+    def _in_window(self, mean: Tensor, extent: float) -> bool:
+        """Whether a Gaussian of a largest scale may reach the window."""
+        x, y, z = self._project(mean)
+        if z <= self._camera.near:
+            return False
+        for at, focal, center, side in (
+            (x, float(self._camera.K[0, 0]), float(self._camera.K[0, 2]), self._camera.width),
+            (y, float(self._camera.K[1, 1]), float(self._camera.K[1, 2]), self._camera.height),
+        ):
+            tangent = (at - center) / focal
+            margin = FRUSTUM_MARGIN * 0.5 * side / focal
+            tangent = min(max(tangent, -(center / focal + margin)), (side - center) / focal + margin)
+            variance = (focal * extent / z) ** 2 * (1.0 + tangent**2) + DILATION
+            reach = math.sqrt(-2.002 * math.log(ALPHA_MIN) * variance)
+            if not -reach <= at <= side + reach:
+                return False
+        return True
