@@ -15,7 +15,7 @@ from viewer.state import history, workspace
 from viewer.state.actions import GLIDES, perform
 from viewer.state.workspace import Workspace
 from viewer.ui import overlay
-from viewer.ui.context import PALETTE, SMALL_PX, UiContext
+from viewer.ui.context import FIXED, PALETTE, SMALL_PX, UNFOCUSED, UiContext
 from viewer.ui.keys import TOPICS
 from viewer.ui.pointer import PointerContext
 
@@ -89,7 +89,7 @@ def draw_bindings(room: imgui.ImVec2, ui: UiContext) -> None:
     imgui.push_style_var(imgui.StyleVar_.window_rounding, 6.0 * ui.scale)
     imgui.push_style_var(imgui.StyleVar_.window_padding, imgui.ImVec2(margin, margin))
     imgui.push_style_var(imgui.StyleVar_.item_spacing, imgui.ImVec2(8.0 * ui.scale, 0.0))
-    imgui.begin("bindings", None, _OVER_ALL)
+    imgui.begin("bindings", None, FIXED & ~imgui.WindowFlags_.no_scrollbar.value | UNFOCUSED)
     imgui.internal.bring_window_to_display_front(imgui.internal.get_current_window())
     left, top = imgui.get_cursor_pos_x(), imgui.get_cursor_pos_y()
     for i, column in enumerate(packed):
@@ -133,17 +133,6 @@ def _pack(topics: Sequence[Topic], height: float) -> list[list[Topic]]:
         else:
             packed.append([topic])
     return packed
-
-
-_OVER_ALL = (
-    imgui.WindowFlags_.no_title_bar.value
-    | imgui.WindowFlags_.no_resize.value
-    | imgui.WindowFlags_.no_collapse.value
-    | imgui.WindowFlags_.no_saved_settings.value
-    | imgui.WindowFlags_.no_focus_on_appearing.value
-    | imgui.WindowFlags_.no_nav.value
-    | imgui.WindowFlags_.no_move.value
-)
 
 
 def panels(

@@ -15,7 +15,7 @@ from viewer.state.facts import obstacle
 from viewer.state.layer_selection import selected_layers
 from viewer.state.view_state import AGAINST, COMPARE_MODES, MOST_AMPLIFIED, Comparison, ViewState
 from viewer.state.workspace import UNSAVED, SceneFacts, Workspace, has_unsaved, is_compact
-from viewer.ui.context import PALETTE, Icon, UiContext
+from viewer.ui.context import BEHIND, FIXED, PALETTE, Icon, UiContext
 from viewer.ui.keys import shortcut
 from viewer.ui.widgets import (
     choice,
@@ -171,7 +171,7 @@ def draw(
     display = imgui.get_io().display_size
     imgui.set_next_window_pos(imgui.ImVec2(display.x - width(ui), 0.0))
     imgui.set_next_window_size(imgui.ImVec2(width(ui), display.y))
-    imgui.begin("panel", None, _FLAGS)
+    imgui.begin("panel", None, FIXED | BEHIND | imgui.WindowFlags_.no_scroll_with_mouse.value)
     _title(work, facts, recent, ui, actions)
     footer = imgui.get_frame_height() + imgui.get_style().item_spacing.y * 2
     room = imgui.get_content_region_avail().y - footer - cards.HEADING_PX * ui.scale
@@ -320,14 +320,6 @@ def _comparison(
     return compare
 
 
-_FLAGS = (
-    imgui.WindowFlags_.no_decoration.value
-    | imgui.WindowFlags_.no_move.value
-    | imgui.WindowFlags_.no_saved_settings.value
-    | imgui.WindowFlags_.no_bring_to_front_on_focus.value
-    | imgui.WindowFlags_.no_nav.value
-    | imgui.WindowFlags_.no_scroll_with_mouse.value
-)
 _ALWAYS_CLAMP = imgui.SliderFlags_.always_clamp.value
 _LOGARITHMIC = _ALWAYS_CLAMP | imgui.SliderFlags_.logarithmic.value
 

@@ -12,7 +12,7 @@ from imgui_bundle import imgui
 
 from viewer.state.timeline import EASINGS, Player, key_at, key_before
 from viewer.state.view_state import FASTEST, LONGEST, Timeline
-from viewer.ui.context import PALETTE, SMALL_PX, UiContext, u32
+from viewer.ui.context import BEHIND, FIXED, PALETTE, SMALL_PX, UNFOCUSED, UiContext, u32
 from viewer.ui.keys import shortcut
 from viewer.ui.overlay import Area
 from viewer.ui.widgets import icon_button, is_released, tip
@@ -48,7 +48,7 @@ def draw(timeline: Timeline, player: Player, area: Area, ui: UiContext) -> tuple
     imgui.set_next_window_size(imgui.ImVec2(area.width, tall))
     imgui.push_style_color(imgui.Col_.window_bg, imgui.ImVec4(*PALETTE.scrim))
     imgui.push_style_var(imgui.StyleVar_.window_padding, imgui.ImVec2(10.0 * ui.scale, 10.0 * ui.scale))
-    imgui.begin("timeline", None, _FLAGS)
+    imgui.begin("timeline", None, FIXED | BEHIND | UNFOCUSED)
     actions: list[str] = []
     frame = min(player.frame, timeline.length)
     _buttons(timeline, player, frame, actions, ui)
@@ -239,13 +239,3 @@ def _paint_key(canvas: imgui.ImDrawList, x: float, y: float, size: float, color:
         points = [turn + 2 * math.pi * i / corners for i in range(corners)]
         a, b, c, d = (imgui.ImVec2(x + radius * math.cos(t), y + radius * math.sin(t)) for t in points)
         canvas.add_quad_filled(a, b, c, d, ink)
-
-
-_FLAGS = (
-    imgui.WindowFlags_.no_decoration.value
-    | imgui.WindowFlags_.no_move.value
-    | imgui.WindowFlags_.no_saved_settings.value
-    | imgui.WindowFlags_.no_bring_to_front_on_focus.value
-    | imgui.WindowFlags_.no_focus_on_appearing.value
-    | imgui.WindowFlags_.no_nav.value
-)

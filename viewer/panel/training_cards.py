@@ -73,22 +73,9 @@ def _card(row: _Row, number: int, ui: UiContext) -> list[str]:
 
 
 def _status(job: Job) -> str:
-    match job.status:
-        case "running":
-            return f"{100 * job.progress.share:.0f} %" if job.progress.share else ""
-        case "queued":
-            return "Queued"
-        case "stopping":
-            return "Stopping"
-        case "stopped":
-            return "Stopped"
-        case "elsewhere":
-            return f"{100 * job.progress.share:.0f} %" if job.progress.share else ""
-        case "failed":
-            return "Failed"
-        case "done":
-            return "Done"
-    return ""
+    if job.status in ("running", "elsewhere"):
+        return f"{100 * job.progress.share:.0f} %" if job.progress.share else ""
+    return job.status.capitalize()
 
 
 def _bar(row: _Row, ui: UiContext) -> None:

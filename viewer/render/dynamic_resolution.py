@@ -28,10 +28,10 @@ T = TypeVar("T")
 
 SH = ("sh0", "shN")
 
-BUDGETS = 10_000, 50_000, 500_000
+BUDGETS = 20_000, 50_000, 500_000
 """How many Gaussians a picture in motion has at most: on a slow machine, at first, on a quick one."""
 
-MOVING_MS = 24.0, 32.0
+MOVING_MS = 27.0, 36.0
 """What such a picture shall take; with more or less time, the next one has fewer or more Gaussians."""
 
 SLOW_MS = 40.0
@@ -218,21 +218,17 @@ class LiveScene:
 
     def _write(self, scene: Gaussians, name: str, part: slice) -> None:
         means, quats, scales, opacities, sh = (tensor.numpy() for tensor in self.drawn.tensors)
-        match name:
-            case "means":
-                means[part] = scene.means[part].numpy()
-            case "quats":
-                quats[part] = scene.quats[part].numpy()
-            case "log_scales":
-                scales[part] = _exp(scene.log_scales[part])
-            case "logit_opacities":
-                opacities[part] = _sigmoid(scene.logit_opacities[part])
-                if self._highlights is not None:
-                    opacities[part] *= self._highlights[part, 3] < 1.0
-            case "sh0":
-                sh[part, 0] = scene.sh0[part].numpy()
-            case "shN":
-                sh[part, 1:] = scene.shN[part].numpy()
+        target, activated = {
+            "means": (means, _copy),
+            "quats": (quats, _copy),
+            "log_scales": (scales, _exp),
+            "logit_opacities": (opacities, _sigmoid),
+            "sh0": (sh[:, 0], _copy),
+            "shN": (sh[:, 1:], _copy),
+        }[name]
+        target[part] = activated(getattr(scene, name)[part])
+        if name == "logit_opacities" and self._highlights is not None:
+            opacities[part] *= self._highlights[part, 3] < 1.0
 
     def _apply_highlight(self, part: slice) -> None:
         """Mix the highlights into colors that were just written: all bands, as color is linear in them."""

@@ -46,6 +46,17 @@ class Palette:
 
 PALETTE = Palette()
 
+FIXED = (
+    imgui.WindowFlags_.no_decoration.value
+    | imgui.WindowFlags_.no_move.value
+    | imgui.WindowFlags_.no_saved_settings.value
+    | imgui.WindowFlags_.no_nav.value
+)
+"""Flags of a part of the window that stays where it is."""
+
+BEHIND = imgui.WindowFlags_.no_bring_to_front_on_focus.value
+UNFOCUSED = imgui.WindowFlags_.no_focus_on_appearing.value
+
 
 class Icon:
     """Glyphs of the icon font that is merged into the text font."""

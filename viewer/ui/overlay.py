@@ -14,7 +14,7 @@ from viewer.render.dynamic_resolution import FrameTimings
 from viewer.state.view_state import ViewState
 from viewer.state.workspace import Message
 
-from .context import FONT_PX, PALETTE, SMALL_PX, Rgba, UiContext, u32
+from .context import FIXED, FONT_PX, PALETTE, SMALL_PX, UNFOCUSED, Rgba, UiContext, u32
 from .widgets import group_digits
 
 
@@ -101,7 +101,7 @@ def message(line: Message, area: Area, ui: UiContext) -> tuple[str, float]:
     imgui.set_next_window_size_constraints(imgui.ImVec2(0.0, 0.0), imgui.ImVec2(widest, area.height))
     imgui.push_style_color(imgui.Col_.window_bg, imgui.ImVec4(*PALETTE.scrim))
     imgui.push_style_var(imgui.StyleVar_.window_rounding, 5.0 * ui.scale)
-    imgui.begin("message", None, _FLOATING)
+    imgui.begin("message", None, FIXED | UNFOCUSED | imgui.WindowFlags_.always_auto_resize.value)
     buttons = {"Copy details": "copy", "×": "close"} if line.details else {"×": "close"}
     around = 2 * imgui.get_style().frame_padding.x + imgui.get_style().item_spacing.x
     room = widest - 2 * pad - sum(imgui.calc_text_size(text).x + around for text in buttons)
@@ -120,16 +120,6 @@ def message(line: Message, area: Area, ui: UiContext) -> tuple[str, float]:
     imgui.pop_style_var()
     imgui.pop_style_color()
     return clicked, top
-
-
-_FLOATING = (
-    imgui.WindowFlags_.no_decoration.value
-    | imgui.WindowFlags_.always_auto_resize.value
-    | imgui.WindowFlags_.no_saved_settings.value
-    | imgui.WindowFlags_.no_focus_on_appearing.value
-    | imgui.WindowFlags_.no_nav.value
-    | imgui.WindowFlags_.no_move.value
-)
 
 
 def _text_width(text: str, size: float, ui: UiContext) -> float:

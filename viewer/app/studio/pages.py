@@ -15,7 +15,7 @@ from viewer.camera.view_camera import ViewCamera
 from viewer.jobs.job_queue import FORMAT_NAMES, FORMATS, FPS, SIZES, DeliverOptions
 from viewer.state.view_state import ViewState
 from viewer.ui import overlay
-from viewer.ui.context import PALETTE, SMALL_PX, Icon, UiContext, u32
+from viewer.ui.context import BEHIND, FIXED, PALETTE, SMALL_PX, UNFOCUSED, Icon, UiContext, u32
 from viewer.ui.overlay import Area
 from viewer.ui.widgets import (
     accent_button,
@@ -27,13 +27,6 @@ from viewer.ui.widgets import (
     right_edge,
     section,
     tip,
-)
-
-_FLAGS = (
-    imgui.WindowFlags_.no_decoration.value
-    | imgui.WindowFlags_.no_move.value
-    | imgui.WindowFlags_.no_saved_settings.value
-    | imgui.WindowFlags_.no_nav.value
 )
 
 KEYS = ("open", "quit", "full_screen", "window_picture", "help", "unfocus", "about")
@@ -57,7 +50,7 @@ def draw_start_page(recent: Sequence[RecentFile], ui: UiContext) -> list[str]:
     imgui.set_next_window_pos(imgui.ImVec2(0.0, 0.0))
     imgui.set_next_window_size(display)
     imgui.push_style_var(imgui.StyleVar_.window_padding, imgui.ImVec2(0.0, 0.0))
-    imgui.begin("start page", None, _FLAGS | imgui.WindowFlags_.no_bring_to_front_on_focus.value)
+    imgui.begin("start page", None, FIXED | BEHIND)
     imgui.pop_style_var()
     wide = min(WIDEST_PX * scale, display.x - 2 * MARGIN_PX * scale)
     cards = max(int((wide + GAP_PX * scale) // ((CARD_PX + GAP_PX) * scale)), 1)
@@ -211,7 +204,7 @@ def draw_up_strip(strip: UpStrip, area: Area, ui: UiContext) -> tuple[str, ...]:
     imgui.push_style_color(imgui.Col_.window_bg, imgui.ImVec4(*PALETTE.scrim))
     imgui.push_style_var(imgui.StyleVar_.window_rounding, 6.0 * scale)
     imgui.push_style_var(imgui.StyleVar_.window_padding, imgui.ImVec2(_PAD_PX * scale, _PAD_PX * scale))
-    imgui.begin("up axis", None, _FLAGS | imgui.WindowFlags_.no_focus_on_appearing.value)
+    imgui.begin("up axis", None, FIXED | UNFOCUSED)
     top, right = imgui.get_cursor_pos_y(), right_edge()
     imgui.text("Which way is up?")
     keep = f"Keep {strip.now} (Esc)"
