@@ -160,7 +160,8 @@ class LiveScene:
         self._highlights: Array | None = None  # rgb and its share, 0..1; None is no highlight. [N,4]
         self._budget = BUDGETS[1]
         self._pyramid: Future[Pyramid] | None = None
-        self._behind: list[tuple[NDArray[np.int64], bool]] = []  # rows that it lacks, and whether only colors
+        # what the pyramid lacks of each row: nothing, its colors, or more. [N] uint8
+        self._behind = np.zeros(len(scene), np.uint8)
 
     def update(self, scene: Gaussians, attributes: Iterable[str], rows: NDArray[np.int64]) -> None:
         """See `Renderer.update`."""
@@ -173,8 +174,8 @@ class LiveScene:
                 self._write(scene, name, part)
             if highlighted:
                 self._apply_highlight(part)
-        if self._pyramid is not None and len(rows):
-            self._behind.append((rows, all(name in SH for name in names)))
+        lacks = 1 if all(name in SH for name in names) else 2
+        self._behind[rows] = np.maximum(self._behind[rows], lacks)
 
     def highlight(self, rows: NDArray[np.int64], highlights: NDArray[np.uint8]) -> None:
         """See `Renderer.highlight`."""
@@ -189,6 +190,7 @@ class LiveScene:
 
     def begin_pyramid(self) -> Future[Pyramid]:
         """Build it beside everything else; what is written meanwhile is merged anew afterwards."""
+        self._behind[:] = 0
         self._pyramid = _worker().submit(_build, self.drawn)
         return self._pyramid
 
@@ -203,11 +205,10 @@ class LiveScene:
         if not pyramid.done():
             return None
         started = time.perf_counter()
-        for colors_only in (False, True):
-            rows = [rows for rows, colors in self._behind if colors == colors_only]
-            if rows:
-                pyramid.result().refresh(np.concatenate(rows), colors_only)
-        self._behind.clear()
+        for lacks in (2, 1):
+            if len(rows := np.flatnonzero(self._behind == lacks)):
+                pyramid.result().refresh(rows, colors_only=lacks == 1)
+        self._behind[:] = 0
         fewer = pyramid.result().simplify(camera, self._budget, pixels)
         picture = draw(fewer)
         taken, (low, high) = 1e3 * (time.perf_counter() - started), MOVING_MS
@@ -239,10 +240,9 @@ class LiveScene:
 
 
 def _build(gaussians: ActivatedGaussians) -> Pyramid:
-    """A pyramid that was used once: its kernels are compiled now, and not under the first touch."""
-    pyramid = Pyramid(gaussians)
-    pyramid.simplify(Camera(torch.eye(4), torch.eye(3), 1, 1), 1)
-    return pyramid
+    few = Pyramid(gaussians.select(torch.arange(min(len(gaussians.means), 2))))
+    few.simplify(Camera(torch.eye(4), torch.eye(3), 1, 1), 1)  # compiles now what else the first touch would
+    return Pyramid(gaussians)
 
 
 @cache

@@ -8,17 +8,23 @@ import moderngl
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 
 from progdf.camera import Camera
 from progdf.field.baked import AttributeBases, BakedField
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf, fingerprint
+from progdf.metrics.image import psnr
 from progdf.region import Region
 from tests.helpers.stacks import Stack
 from viewer.camera.view_camera import first_camera, to_camera
 from viewer.gl.present import read_rgb
 from viewer.render import cpu_renderer as cpu_renderer
+from viewer.render import dynamic_resolution
+from viewer.render.cpu_renderer import CpuRenderer
 from viewer.render.engine import ViewEngine
+from viewer.render.highlight import Highlight
+from viewer.state.selection import pack
 from viewer.state.view_state import LayerState, ViewState
 
 SIZE = (160, 120)
@@ -121,3 +127,36 @@ def test_the_screen_shows_the_last_picture(ctx: moderngl.Context, stack: Stack) 
         assert np.abs(shown.astype(int) - image).max() <= 1
     for held in (engine, fresh, screen):
         held.release()
+
+
+@pytest.mark.parametrize("draw", ["cpu", "gl"])
+def test_a_moving_picture_follows_sliders_and_highlights(
+    ctx: moderngl.Context, stack: Stack, monkeypatch: pytest.MonkeyPatch, draw: str
+) -> None:
+    monkeypatch.setattr(dynamic_resolution, "BUDGETS", (len(stack.scene),) * 3)
+    slid, afresh = (ViewEngine(ctx, stack.scene, stack.gdfs, draw) for _ in range(2))
+    framebuffer = ctx.simple_framebuffer(SIZE)
+
+    def moving(engine: ViewEngine, view: ViewState) -> NDArray[np.float32]:
+        engine.draw(replace(view, background=(0.0, 0.0, 0.0)), framebuffer, SIZE, pixels=2)
+        dynamic_resolution._worker().submit(int).result()  # now there is a pyramid
+        engine.draw(view, framebuffer, SIZE, pixels=2)
+        return engine.renderer.pixels()
+
+    before = moving(slid, view_of(stack, 0.0, 0.1))
+    hidden = torch.zeros(len(stack.scene), dtype=torch.bool)
+    hidden[::7] = True
+    target = view_of(stack, 0.9, 0.6)
+    target = replace(target, selection=replace(target.selection, hidden=pack(hidden.numpy())))
+    slid.highlight = afresh.highlight = Highlight(region=1)
+    slid.image(view_of(stack, 0.3, 0.6), SIZE)  # what is not drawn in motion is carried over later
+    after, expected = moving(slid, target), moving(afresh, target)
+    assert float(np.abs(after - before).mean()) > 1e-2
+    assert psnr(torch.from_numpy(after), torch.from_numpy(expected)) > 45.0
+    live = slid.renderer._scene if isinstance(slid.renderer, CpuRenderer) else slid.renderer._moving[0]
+    pyramid = live._pyramid.result()
+    merged = [array.copy() for array in pyramid.nodes.gaussians]
+    pyramid.refresh(np.arange(len(stack.scene)), colors_only=False)
+    assert all(map(np.array_equal, merged, pyramid.nodes.gaussians)), "nothing was behind"
+    for engine in (slid, afresh):
+        engine.release()
