@@ -23,13 +23,13 @@ EditKind = Literal["color", "style", "geometry"]
 Kind = Literal["auto", "color", "style", "geometry"]
 Slider = Literal["auto", "even", "stages", "time"]
 """What slider values mean; auto becomes one of the others (`resolve_slider`)."""
-Rates = Literal["kind", "3dgs"]
+Rates = Literal["kind", "3dgs", "gaussian-editor"]
 Progressive = Literal["warmup", "decay", "growth", "off"]
 Sharpness = Literal["kind", "hinge", "paper", "off"]
 Solver = Literal["descent", "colors"]
 FieldLoss = Literal["parameters", "pictures"]
-Norm = Literal["squares", "absolutes"]
-LiftRule = Literal["share", "count", "paper"]
+Over = Literal["mean", "sum"]
+LiftRule = Literal["share", "paper"]
 Bands = Literal["auto", "on", "off"]
 Preset = Literal["default", "paper"]
 
@@ -66,10 +66,10 @@ class RegionOptions:
     camera), photomasks:DIR (of photographs), changed (where pictures: differ), text:"the man's shirt"; join
     by + -."""
     lift_rule: LiftRule = "share"
-    """masks, text: a Gaussian's score is the share of its visible weight that lies in the masks, the share of
-    its pixels, or the paper's printed sum, which selects nothing at the paper's threshold."""
+    """masks, text: a Gaussian's score is the share of its visible weight that lies in the masks, or, as the
+    paper's, the share of its pixels, which leaves out many at borders and all that no view shows."""
     lift_threshold: Annotated[float | None, absent_option("FLOAT", "the rule's own")] = None
-    """masks, text: minimum score of a member; by default .7 for share, .8 for count and paper."""
+    """masks, text: minimum score of a member; by default .7 for share, .8 for paper."""
     detector: str = DETECTOR
     """text: id or folder of the GroundingDINO that finds objects; download it first."""
     sam_model: str = SAM_MODEL
@@ -156,14 +156,16 @@ class OptimizeOptions:
     progressive: Progressive = "off"
     """The paper's progressive constraint (eq. 5): as a warm-up of the learning rate, or as a loss that lets
     go of the steps (decay) or tightens (growth, the printed exponent)."""
-    progressive_norm: Norm = "squares"
-    """How that loss measures a step, of which the paper says nothing: squares spread the change over the run
-    and cost 1.6 to 4.6 dB, absolutes freeze the edit."""
+    progressive_over: Over = "mean"
+    """What that loss takes of the members' squared steps, of which the paper says nothing: their mean, or
+    their sum, which holds an edit back the more, the more members it has."""
+    rates: Rates = "kind"
+    """Learning rates: as the kind of edit needs; those of 3DGS, which hardly move in 600 steps; or as
+    GaussianEditor multiplies these, 5 times for means and colors, twice for all else."""
     slider: Slider = "auto"
     """Slider values. even: equal steps look equally large, and an editor with a strength control is asked for
     pictures that do; stages: s is the editor's own strength, even in between; time: the optimizer's. auto:
     even, but stages where folder: has pictures of several strengths."""
-    rates: Fixed[Rates] = "kind"  # as the kind of edit needs, or 3DGS's, which hardly move in 600 steps
     perceptual_every: Fixed[int] = 2  # LPIPS is paid for every so many steps
     # Of the renders: not less than the target's, or the printed term, which pulls at no pixel but the rim's.
     sharpness: Fixed[Sharpness] = "kind"
@@ -269,10 +271,10 @@ PRESETS: Mapping[Preset, Mapping[str, Mapping[str, Any]]] = {
             "group_steps": 0,
             "perceptual_weight": 1.0,
             "progressive": "growth",
-            "progressive_norm": "squares",
+            "progressive_over": "mean",
             "sh": "off",
             "slider": "time",
-            "rates": "3dgs",
+            "rates": "gaussian-editor",
             "perceptual_every": 1,
             "sharpness": "paper",
             "as_printed": True,

@@ -177,6 +177,15 @@ LEARNING_RATES: Mapping[str, Mapping[str, float]] = {
         "sh0": 2.5e-3,
         "shN": 1.25e-4,
     },
+    # the same as GaussianEditor's scripts of 1500 steps multiply them (Chen 2024)
+    "gaussian-editor": {
+        "means": 8e-4,
+        "log_scales": 1e-2,
+        "quats": 2e-3,
+        "logit_opacities": 1e-1,
+        "sh0": 1.25e-2,
+        "shN": 6.25e-4,
+    },
     # By kind of edit: what it needs to arrive within a few hundred steps (docs/method.md 3). A color edit
     # leaves the geometry alone, which is 1.4 dB better and 11 floats a Gaussian smaller.
     "color": {"sh0": 7.5e-2, "shN": 3.75e-3},
@@ -241,7 +250,7 @@ def pgs_settings(
         stages: how many strengths there are to optimize towards
     """
     recolors, printed = options.kind != "geometry", options.as_printed
-    rates = learning_rates("3dgs" if options.rates == "3dgs" else options.kind, channels, extent)
+    rates = learning_rates(options.kind if options.rates == "kind" else options.rates, channels, extent)
     if not bands:
         rates[BASE_CHANNELS:] = 0.0
     return PgsSettings(
@@ -301,7 +310,7 @@ def learning_rates(kind: str, channels: int, extent: float) -> Tensor:
     """Learning rate of every column of a packed row, [C].
 
     Args:
-        kind: what the edit moves, or 3dgs: all attributes free; see `LEARNING_RATES`
+        kind: what the edit moves, or whose they are, with all attributes free; see `LEARNING_RATES`
         channels: columns of a packed row
         extent: size of what moves, world units
     """

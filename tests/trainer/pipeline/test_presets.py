@@ -56,7 +56,7 @@ def test_a_preset_is_its_values_and_no_more(preset: Preset) -> None:
 
 @pytest.mark.parametrize("preset", [name for name in PRESETS if name != "default"])
 def test_each_value_of_a_preset_could_be_given_on_the_command_line(preset: Preset) -> None:
-    fixed = {"rates", "perceptual_every", "sharpness", "as_printed", "color_solver", "ema", "target_ramp"}
+    fixed = {"perceptual_every", "sharpness", "as_printed", "color_solver", "ema", "target_ramp"}
     values = {name: value for part in PRESETS[preset].values() for name, value in part.items()}
     words = [w for n, v in values.items() if n not in fixed for w in (f"--{n.replace('_', '-')}", str(v))]
     assert with_values(asked(*words), **{n: values[n] for n in fixed}, preset=preset) == asked(
@@ -133,7 +133,7 @@ def test_a_color_edit_holds_the_geometry_still_unless_the_plain_rates_are_asked_
     plain = pgs_settings(planned("color", "--preset", "paper"), True, 23, 1.0, 4).rates
     assert torch.equal(ours[:11], torch.zeros(11))
     assert float(plain[:11].min()) > 0
-    assert float(ours[11]) > 10 * float(plain[11])
+    assert float(ours[11]) > 5 * float(plain[11])
 
 
 @pytest.mark.parametrize(("part", "changes"), [("target_ramp", "ramp"), ("ema", "smoothing")])
