@@ -24,7 +24,7 @@ Kind = Literal["auto", "color", "style", "geometry"]
 Slider = Literal["auto", "even", "stages", "time"]
 """What slider values mean; auto becomes one of the others (`resolve_slider`)."""
 Rates = Literal["kind", "3dgs", "gaussian-editor"]
-Progressive = Literal["warmup", "decay", "growth", "off"]
+Progressive = Literal["decay", "growth", "off"]
 Sharpness = Literal["kind", "hinge", "paper", "off"]
 Solver = Literal["descent", "colors"]
 FieldLoss = Literal["parameters", "pictures"]
@@ -154,8 +154,8 @@ class OptimizeOptions:
     """Weight of LPIPS beside L1; by default .3 for style and geometry (paper: 1). An edit of colors is solved
     for, all views at once; a weight makes it descend view by view instead."""
     progressive: Progressive = "off"
-    """The paper's progressive constraint (eq. 5): as a warm-up of the learning rate, or as a loss that lets
-    go of the steps (decay) or tightens (growth, the printed exponent)."""
+    """The paper's progressive constraint (eq. 5), a loss that lets go of the steps (decay, as its text says)
+    or tightens (growth, the printed exponent)."""
     progressive_over: Over = "mean"
     """What that loss takes of the members' squared steps, of which the paper says nothing: their mean, or
     their sum, which holds an edit back the more, the more members it has."""

@@ -170,7 +170,6 @@ VARIANTS = (
     _other("sharpness-hinge", "L_render: as sharp as the target", "sharpness", "hinge", DESCENT),
     _other("sharpness-paper", "L_render of the paper", "sharpness", "paper", DESCENT),
     _other("progressive-off", "no progressive constraint", "progressive", "off", DESCENT),
-    _other("progressive-warmup", "the constraint as a warm-up", "progressive", "warmup", DESCENT),
     _other("progressive-growth", "the constraint tightening", "progressive", "growth", DESCENT),
     _other("progressive-decay", "the constraint letting go", "progressive", "decay", DESCENT),
     _other("growth-sum", "over all members' sum", "progressive_over", "sum", "progressive-growth"),

@@ -103,14 +103,6 @@ def perceptual_loss(net: Net = "alex") -> tuple[Perceptual, str]:
         return GradientL1(), f"training with gradient L1 in place of LPIPS: {error}"
 
 
-def warmup(step: int, c: float = 10.0, beta: float = 1.1, period: float = 50.0) -> float:
-    """ProGDF's progressive constraint as the learning-rate factor it acts as: 2 / (1 + c·β^(−t/period)).
-
-    Early steps are short, which is what the paper's constraint is for (eq. 5, `progressive_change`).
-    """
-    return 2.0 / (1.0 + c * math.exp(-step / period * math.log(beta)))
-
-
 def progressive_change(
     moved: Tensor,
     previous: Tensor,

@@ -132,12 +132,6 @@ def test_the_perceptual_term_is_paid_every_so_many_steps_and_only_at_the_stages_
     assert "perceptual" not in objective.terms(moment(local=0, arrived=False))
 
 
-@pytest.mark.parametrize("progressive", ["warmup", "off"])
-def test_a_warm_up_is_no_loss(progressive: str) -> None:
-    terms = Objective(GradientL1(), paying(progressive=progressive)).terms(moment())  # type: ignore[arg-type]
-    assert "progressive" not in terms
-
-
 def test_a_new_stage_forgets_the_targets_of_the_last() -> None:
     forgotten = []
 

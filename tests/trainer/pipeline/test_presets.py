@@ -95,7 +95,7 @@ def test_colors_are_solved_for_unless_something_is_asked_for_that_a_descent_has(
     assert planned("color").solver == "colors"
     assert planned("color", "--perceptual-weight", "0").solver == "colors"
     assert planned("style").solver == "descent"
-    for words in (("--perceptual-weight", "0.1"), ("--progressive", "warmup"), ("--preset", "paper")):
+    for words in (("--perceptual-weight", "0.1"), ("--progressive", "decay"), ("--preset", "paper")):
         assert planned("color", *words).solver == "descent"
     again = resolve(with_values(asked("--reedit-every", "9"), editor="style:14"))
     assert resolve_kind(again, "color", 0).solver == "descent"
@@ -120,12 +120,6 @@ def test_weights_that_are_given_hold_whatever_the_edit_and_zero_is_a_weight() ->
 def test_parts_move_as_wholes_only_where_something_moves() -> None:
     assert planned("geometry", group_steps=9).group_steps == 9
     assert planned("color", group_steps=9).group_steps == 0
-
-
-def test_only_the_warm_up_shortens_the_first_steps() -> None:
-    for progressive, warm in (("warmup", True), ("decay", False), ("growth", False), ("off", False)):
-        settings = pgs_settings(planned("color", "--progressive", progressive), True, 14, 1.0, 4)
-        assert settings.warmup == warm
 
 
 def test_a_color_edit_holds_the_geometry_still_unless_the_plain_rates_are_asked_for() -> None:
