@@ -270,7 +270,7 @@ PRESETS: Mapping[Preset, Mapping[str, Mapping[str, Any]]] = {
             "stages": 1,
             "group_steps": 0,
             "perceptual_weight": 1.0,
-            "progressive": "growth",
+            "progressive": "decay",
             "progressive_over": "mean",
             "sh": "off",
             "slider": "time",

@@ -127,8 +127,8 @@ def _signed(image: Tensor, *_: object) -> Tensor:
     return -losses.laplacian(image.mean(dim=2)).mean()
 
 
-def _squared(image: Tensor, *_: object) -> Tensor:
-    return -losses.laplacian(image.mean(dim=2)).square().mean()
+def _magnitude(image: Tensor, *_: object) -> Tensor:
+    return -losses.laplacian(image.mean(dim=2)).abs().mean()
 
 
 def _absolute_change(moved: Tensor, previous: Tensor, step: int, grows: bool, *_: object) -> Tensor:
@@ -184,9 +184,9 @@ VARIANTS = (
     Variant(PAPER_PGS, "our field in place of the network", {"field.field": "auto"}, PAPER),
     _other("paper-no-sharpness", "no L_render", "sharpness", "off", PAPER_PGS),
     _patched("paper-signed", "L_render signed, as printed", f"{_LOSSES}.sharpness", _signed, PAPER_PGS),
-    _patched("paper-square", "L_render of squares", f"{_LOSSES}.sharpness", _squared, PAPER_PGS),
+    _patched("paper-magnitude", "L_render of magnitudes", f"{_LOSSES}.sharpness", _magnitude, PAPER_PGS),
     _other("paper-progressive-off", "no progressive constraint", "progressive", "off", PAPER_PGS),
-    _other("paper-decay", "the constraint letting go", "progressive", "decay", PAPER_PGS),
+    _other("paper-growth", "the constraint tightening, as printed", "progressive", "growth", PAPER_PGS),
     _other("paper-sum", "the constraint over all members' sum", "progressive_over", "sum", PAPER_PGS),
     _patched(
         "paper-absolutes",

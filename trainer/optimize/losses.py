@@ -136,7 +136,7 @@ def sharpness(
 ) -> Tensor:
     """The paper's L_render. []
 
-    "paper" is −|∇²R|, the mean over the whole picture; of the printed −∇²R, signed, nothing is left but the
+    "paper" is −(∇²R)², the mean over the whole picture; of the printed −∇²R, signed, nothing is left but the
     rim. "hinge" asks for no more than the target has: max(0, S(target) − S(image)), S the mean of |∇²Y|
     inside the region, Y the luma.
 
@@ -147,7 +147,7 @@ def sharpness(
         inside: the pixels that count under "hinge"; None: all. [h,w] bool
     """
     if form == "paper":
-        return -laplacian(image.mean(dim=2)).abs().mean()
+        return -laplacian(image.mean(dim=2)).square().mean()
     weights = torch.ones_like(image[1:-1, 1:-1, 0]) if inside is None else inside[1:-1, 1:-1].to(image.dtype)
     count = weights.sum().clamp_min(1.0)
 

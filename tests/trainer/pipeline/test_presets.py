@@ -69,7 +69,7 @@ def test_what_the_command_line_says_goes_before_the_preset_wherever_it_stands() 
     after = asked("--preset", "paper", "--steps", "300")
     assert before == after
     assert before.optimize.steps == 300
-    assert before.optimize.progressive == "growth"
+    assert before.optimize.progressive == "decay"
 
 
 def test_a_default_that_the_command_line_spells_out_goes_before_the_preset_too() -> None:
@@ -81,8 +81,8 @@ def test_the_papers_trainer_can_leave_out_its_network() -> None:
     assert plan.field.field == "auto"
 
 
-def test_the_paper_can_let_go_instead_of_tightening() -> None:
-    assert planned("style", "--preset", "paper", "--progressive", "decay").progressive == "decay"
+def test_the_paper_can_tighten_instead_of_letting_go() -> None:
+    assert planned("style", "--preset", "paper", "--progressive", "growth").progressive == "growth"
 
 
 def test_by_default_a_color_edit_is_paid_in_l1_mostly_and_a_style_for_its_texture_too() -> None:
