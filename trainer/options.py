@@ -231,8 +231,8 @@ class TrainOptions:
     region: RegionOptions
     editor: EditorOptions
     preset: Preset = "default"
-    """Values of the options below, where the command line gives none: paper is the paper's trainer as it is
-    printed. In Python: trainer.options.apply_preset."""
+    """Values of the options below, where the command line gives none: paper is the paper's trainer, in the
+    readings that work. In Python: trainer.options.apply_preset."""
     name: Annotated[str, absent_option("STR", "the folder's name")] = ""
     """Name of the layer and of the .gdf file; the folder's name if empty."""
     views: ViewOptions = ViewOptions()
@@ -260,8 +260,7 @@ class TrainOptions:
 
 PRESETS: Mapping[Preset, Mapping[str, Mapping[str, Any]]] = {
     "default": {},
-    # the trainer of ProGDF (AAAI 2025) as it is printed: docs/method.md, The paper to the letter; but for the
-    # clamps: with 3DGS's own, a sixth of the colors could never change, and the paper is silent
+    # the trainer of ProGDF (AAAI 2025), what it leaves open in the readings that work (docs/paper.md)
     "paper": {
         "region": {"lift_rule": "paper"},
         "views": {"views": 96, "image_size": 256},

@@ -205,7 +205,7 @@ VARIANTS = (
         },
     ),
     _other("paper-rates-3dgs", "the learning rates of 3DGS", "rates", "3dgs", PAPER_PGS),
-    _other("paper-sum-3dgs", "the same", "rates", "3dgs", "paper-sum"),
+    _other("paper-sum-3dgs", "the learning rates of 3DGS, too", "rates", "3dgs", "paper-sum"),
 )
 
 _BY_NAME = {variant.name: variant for variant in VARIANTS}
