@@ -130,6 +130,15 @@ def test_a_color_edit_holds_the_geometry_still_unless_the_plain_rates_are_asked_
     assert float(ours[11]) > 5 * float(plain[11])
 
 
+def test_the_papers_rates_are_those_of_3dgs_as_gaussian_editor_multiplies_them() -> None:
+    plain, multiplied = (
+        pgs_settings(planned("color", "--preset", "paper", *words), True, 14, 1.0, 1).rates
+        for words in (("--rates", "3dgs"), ())
+    )
+    factors = [5.0] * 3 + [2.0] * 8 + [5.0] * 3  # means; log-scales, quaternion, opacity; color
+    assert torch.allclose(multiplied / plain, torch.tensor(factors))
+
+
 @pytest.mark.parametrize(("part", "changes"), [("target_ramp", "ramp"), ("ema", "smoothing")])
 def test_each_refinement_of_a_descent_can_be_left_out_alone(part: str, changes: str) -> None:
     without = resolve_kind(with_values(resolve(asked()), **{part: False}), "style", 0)
