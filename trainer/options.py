@@ -160,8 +160,8 @@ class OptimizeOptions:
     """What that loss takes of the members' squared steps, of which the paper says nothing: their mean, or
     their sum, which holds an edit back the more, the more members it has."""
     rates: Rates = "kind"
-    """Learning rates: as the kind of edit needs; those of 3DGS, which hardly move in 600 steps; or as
-    GaussianEditor multiplies these, 5 times for means and colors, twice for all else."""
+    """Learning rates: as the kind of edit needs; or, of all attributes, those of 3DGS, which hardly move in
+    600 steps, or as GaussianEditor multiplies these, 5 times for means and colors, twice for all else."""
     slider: Slider = "auto"
     """Slider values. even: equal steps look equally large, and an editor with a strength control is asked for
     pictures that do; stages: s is the editor's own strength, even in between; time: the optimizer's. auto:
