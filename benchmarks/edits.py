@@ -17,27 +17,34 @@ from torch import Tensor
 from progdf.camera import Camera, look_at
 from progdf.errors import ProgdfError
 from progdf.field import BakedField
+from progdf.field.baked import interpolate_at
 from progdf.field.choose import sample_strengths
-from trainer.editors import PER_VIEW, make_editor
+from trainer.editors import PER_VIEW
 from trainer.evaluate.opened import FADE, KEYFRAMES, SLIDER, OpenedRun, open_run
 from trainer.fit.evaluate import Evaluator, make_evaluator
 from trainer.optimize.losses import perceptual_loss
 from trainer.report.measures import COMPARED, picture_courses
+from trainer.setup import Pictures
 from trainer.views.choose import split_held_out
-from trainer.views.view import make_view
+from trainer.views.view import View, crop, make_view
 
+from .ablation.setup import editor_pictures
 from .table import Table
 
 RAISED, ZOOM = (30.0, -15.0), 3.0
 """Degrees of elevation that far views stand above and below a held-out one; how near the third comes."""
 
 VALUES = 101
+ASKED = 20
+"""Strengths, evenly apart, at which the worst of the slider is looked for."""
 
 EDIT_NOTE = (
     "PSNR on all held-out views, over the pixels that show the region or that the editor changes; LPIPS over "
     "each view's box. 2 keyframes: original and end, a straight line in raw parameters, made even as ours "
     "is. Cross-fade: the rendered ends, blended in sRGB. Even: smallest over largest change of 20 equal "
-    "steps. A file holds the field, the region, the plan and the report."
+    "steps. A file holds the field, the region, the plan and the report. Worst: the lowest of "
+    f"{ASKED} even strengths, of most of which training saw no picture, and where; the slider value of each "
+    "lies straight between those of the strengths that training asked for."
 )
 SLIDER_NOTE = (
     "Against the recording, on the half of the held-out views on which the field was not chosen. Far views: "
@@ -84,6 +91,7 @@ def edit_table(opened: Sequence[OpenedRun]) -> Table:
                     " / ".join(f"{curves[name].psnr[i]:.1f}" for i in quarters) if between else "-"
                     for name in (SLIDER, KEYFRAMES, FADE)
                 ),
+                *worst_places(run),
                 f"{curves[SLIDER].psnr[-1]:.1f}",
                 f"{curves[SLIDER].lpips[-1]:.4f}",
                 f"{run.report['slider']['uniformity']:.2f}",
@@ -99,6 +107,9 @@ def edit_table(opened: Sequence[OpenedRun]) -> Table:
             "slider, about s = ¼ / ½ / ¾, dB",
             "2 keyframes, re-timed",
             "cross-fade",
+            "worst of the slider, at s",
+            "of 2 keyframes",
+            "of the cross-fade",
             "all at 1",
             f"{perceptual.name} at 1",
             "even",
@@ -148,6 +159,34 @@ def slider_table(opened: Sequence[OpenedRun]) -> Table:
     )
 
 
+def worst_places(run: OpenedRun) -> tuple[str, ...]:
+    """The lowest PSNR of the slider and of what is simpler, and the slider value that has it."""
+    strengths = [(i + 1) / ASKED for i in range(ASKED)]
+    pictures = _editor_pictures(run, run.setup.judging, strengths)
+    if not pictures:
+        return ("-",) * 3
+    at, asked = zip((0.0, 0.0), *run.trajectory.stage_strengths, strict=True)
+    knots, values = (torch.tensor(some, dtype=torch.float64) for some in (asked, at))
+    found = []
+    for shown in run.contenders().values():
+        errors = []
+        for strength, edited in pictures.items():
+            s = float(interpolate_at(knots, values, strength))
+            boxes = [
+                crop(picture, scene.box) for picture, scene in zip(edited, run.evaluator.crops, strict=True)
+            ]
+            errors.append((run.evaluator.psnr(shown(s), boxes), s))
+        found.append("{:.1f} at {:.2f}".format(*min(errors)))
+    return tuple(found)
+
+
+def _editor_pictures(run: OpenedRun, views: Sequence[View], strengths: Sequence[float]) -> Pictures:
+    """See `editor_pictures`; none where it paints the views one by one."""
+    if run.run.record.plan.editor.family in PER_VIEW:
+        return {}
+    return editor_pictures(run.run, run.setup.views, views, strengths)
+
+
 def far_evaluator(run: OpenedRun) -> Evaluator:
     """Views from elsewhere, beside the editor's pictures of them where it can make any."""
     scene, region, setup = run.setup.scene, run.setup.region, run.setup
@@ -157,12 +196,7 @@ def far_evaluator(run: OpenedRun) -> Evaluator:
     cameras = [far for view in reporting for far in far_cameras(view.camera, center, up)]
     views = [make_view(scene, region, camera, setup.background) for camera in cameras]
     views = [view for view in views if bool((view.mask > 0.05).any())]
-    edited: dict[float, list[Tensor]] = {}
-    plan = run.run.record.plan
-    if plan.editor.family not in PER_VIEW:
-        options = replace(plan.editor, cache=run.run.folder.paintings)
-        editor = make_editor(options, scene, region, setup.views)
-        edited = {s: [editor.edit(view, s) for view in views] for s in run.trajectory.strengths}
+    edited = _editor_pictures(run, views, run.trajectory.strengths)
     channels = run.trajectory.end.shape[1]
     return make_evaluator(scene, region, views, edited, setup.background, channels)
 

@@ -23,13 +23,13 @@ EditKind = Literal["color", "style", "geometry"]
 Kind = Literal["auto", "color", "style", "geometry"]
 Slider = Literal["auto", "even", "stages", "time"]
 """What slider values mean; auto becomes one of the others (`resolve_slider`)."""
-Rates = Literal["kind", "3dgs"]
-Progressive = Literal["warmup", "decay", "growth", "off"]
+Rates = Literal["kind", "3dgs", "gaussian-editor"]
+Progressive = Literal["decay", "growth", "off"]
 Sharpness = Literal["kind", "hinge", "paper", "off"]
 Solver = Literal["descent", "colors"]
 FieldLoss = Literal["parameters", "pictures"]
-Norm = Literal["squares", "absolutes"]
-LiftRule = Literal["share", "count", "paper"]
+Over = Literal["mean", "sum"]
+LiftRule = Literal["share", "paper"]
 Bands = Literal["auto", "on", "off"]
 Preset = Literal["default", "paper"]
 
@@ -66,10 +66,10 @@ class RegionOptions:
     camera), photomasks:DIR (of photographs), changed (where pictures: differ), text:"the man's shirt"; join
     by + -."""
     lift_rule: LiftRule = "share"
-    """masks, text: a Gaussian's score is the share of its visible weight that lies in the masks, the share of
-    its pixels, or the paper's printed sum, which selects nothing at the paper's threshold."""
+    """masks, text: a Gaussian's score is the share of its visible weight that lies in the masks, or, as the
+    paper's, the share of its pixels, which leaves out many at borders and all that no view shows."""
     lift_threshold: Annotated[float | None, absent_option("FLOAT", "the rule's own")] = None
-    """masks, text: minimum score of a member; by default .7 for share, .8 for count and paper."""
+    """masks, text: minimum score of a member; by default .7 for share, .8 for paper."""
     detector: str = DETECTOR
     """text: id or folder of the GroundingDINO that finds objects; download it first."""
     sam_model: str = SAM_MODEL
@@ -154,16 +154,18 @@ class OptimizeOptions:
     """Weight of LPIPS beside L1; by default .3 for style and geometry (paper: 1). An edit of colors is solved
     for, all views at once; a weight makes it descend view by view instead."""
     progressive: Progressive = "off"
-    """The paper's progressive constraint (eq. 5): as a warm-up of the learning rate, or as a loss that lets
-    go of the steps (decay) or tightens (growth, the printed exponent)."""
-    progressive_norm: Norm = "squares"
-    """How that loss measures a step, of which the paper says nothing: squares spread the change over the run
-    and cost 1.6 to 4.6 dB, absolutes freeze the edit."""
+    """The paper's progressive constraint (eq. 5), a loss that lets go of the steps (decay, as its text says)
+    or tightens (growth, the printed exponent)."""
+    progressive_over: Over = "mean"
+    """What that loss takes of the members' squared steps, of which the paper says nothing: their mean, or
+    their sum, which holds an edit back the more, the more members it has."""
+    rates: Rates = "kind"
+    """Learning rates: as the kind of edit needs; or, of all attributes, those of 3DGS, which hardly move in
+    600 steps, or as GaussianEditor multiplies these, 5 times for means and colors, twice for all else."""
     slider: Slider = "auto"
     """Slider values. even: equal steps look equally large, and an editor with a strength control is asked for
     pictures that do; stages: s is the editor's own strength, even in between; time: the optimizer's. auto:
     even, but stages where folder: has pictures of several strengths."""
-    rates: Fixed[Rates] = "kind"  # as the kind of edit needs, or 3DGS's, which hardly move in 600 steps
     perceptual_every: Fixed[int] = 2  # LPIPS is paid for every so many steps
     # Of the renders: not less than the target's, or the printed term, which pulls at no pixel but the rim's.
     sharpness: Fixed[Sharpness] = "kind"
@@ -229,8 +231,8 @@ class TrainOptions:
     region: RegionOptions
     editor: EditorOptions
     preset: Preset = "default"
-    """Values of the options below, where the command line gives none: paper is the paper's trainer as it is
-    printed. In Python: trainer.options.apply_preset."""
+    """Values of the options below, where the command line gives none: paper is the paper's trainer, in the
+    readings that work. In Python: trainer.options.apply_preset."""
     name: Annotated[str, absent_option("STR", "the folder's name")] = ""
     """Name of the layer and of the .gdf file; the folder's name if empty."""
     views: ViewOptions = ViewOptions()
@@ -258,8 +260,7 @@ class TrainOptions:
 
 PRESETS: Mapping[Preset, Mapping[str, Mapping[str, Any]]] = {
     "default": {},
-    # the trainer of ProGDF (AAAI 2025) as it is printed: docs/method.md, The paper to the letter; but for the
-    # clamps: with 3DGS's own, a sixth of the colors could never change, and the paper is silent
+    # the trainer of ProGDF (AAAI 2025), what it leaves open in the readings that work (docs/paper.md)
     "paper": {
         "region": {"lift_rule": "paper"},
         "views": {"views": 96, "image_size": 256},
@@ -268,11 +269,11 @@ PRESETS: Mapping[Preset, Mapping[str, Mapping[str, Any]]] = {
             "stages": 1,
             "group_steps": 0,
             "perceptual_weight": 1.0,
-            "progressive": "growth",
-            "progressive_norm": "squares",
+            "progressive": "decay",
+            "progressive_over": "mean",
             "sh": "off",
             "slider": "time",
-            "rates": "3dgs",
+            "rates": "gaussian-editor",
             "perceptual_every": 1,
             "sharpness": "paper",
             "as_printed": True,

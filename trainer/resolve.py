@@ -7,7 +7,6 @@ the scene is looked at. What is resolved is all that the bits of a result depend
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -157,12 +156,6 @@ def check_options(options: TrainOptions) -> None:
     weight = optimize.perceptual_weight
     if weight is not None and not 0 <= weight < math.inf:
         raise ProgdfError(f"--perceptual-weight must be 0 or more, got {weight}")
-    lifts = region.lift_rule == "paper" and re.search(r"(masks|text):", region.region)
-    if lifts and (region.lift_threshold is None or region.lift_threshold >= 0.8):
-        raise ProgdfError(
-            "--lift-rule paper selects nothing at the printed .8: the mean weight of a splat in its pixels "
-            "is a fifth at most; give --lift-rule share, or --lift-threshold .01"
-        )
     _check_editor_options(editor, optimize)
     check_field_options(options.field, options.preset)
     parse_guidance(editor.guidance)

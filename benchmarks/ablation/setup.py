@@ -119,17 +119,31 @@ def make_ablation_setup(run: FinishedRun, plan: TrainOptions, kind: EditKind, qu
 
 def edit_at_equal_strengths(shared: AblationSetup) -> Pictures:
     """The training views as the editor has them at as many strengths, these equally far apart."""
-    run, setup, plan = shared.run, shared.setup, shared.plan
-    options = replace(plan.editor, cache=run.folder.paintings)
-    editor = make_editor(options, run.scene, run.region, [*setup.train, *setup.held_out])
-    is_confined = confines_edit(editor, shared.kind)
+    return editor_pictures(shared.run, shared.setup.views, shared.setup.train, len(shared.edited))
+
+
+def editor_pictures(
+    run: FinishedRun, all_views: Sequence[View], views: Sequence[View], strengths: Sequence[float] | int
+) -> Pictures:
+    """What a run's editor makes of views.
+
+    Args:
+        run: the finished run
+        all_views: its views
+        views: these or others
+        strengths: at which, or at how many, these equally far apart
+    """
+    options = replace(run.record.plan.editor, cache=run.folder.paintings)
+    editor = make_editor(options, run.scene, run.region, all_views)
+    is_confined = confines_edit(editor, run.record.kind)
 
     def picture(view: View, strength: float) -> Tensor:
         made = editor.edit(view, strength)
         return quantize_image(view.confine(made) if is_confined else made)
 
-    strengths = editor_strengths(editor, len(shared.edited))
-    return {strength: [picture(view, strength) for view in setup.train] for strength in strengths}
+    if isinstance(strengths, int):
+        strengths = editor_strengths(editor, strengths)
+    return {strength: [picture(view, strength) for view in views] for strength in strengths}
 
 
 def digest_of(shared: AblationSetup, variant: Variant, seed: int, optimization: bool = False) -> str:

@@ -15,9 +15,11 @@ from typing import Any, TypeVar
 from unittest import mock
 
 import torch
+from torch import Tensor
 
 from progdf.errors import ProgdfError
 from trainer.editors import COSTLY_STRENGTHS, EXTERNAL
+from trainer.optimize import losses
 from trainer.optimize.groups import GROUP_STEPS
 from trainer.optimize.retime import resolve_slider
 from trainer.options import PRESETS, EditKind, FieldOptions, OptimizeOptions, TrainOptions
@@ -26,7 +28,7 @@ from trainer.resolve import resolve_kind
 BASE, LINEAR, EQUAL = "base", "2-keyframes", "equal-strengths"
 DESCENT, PAPER, PAPER_PGS = "descent", "paper", "paper-pgs"
 
-Resolved = tuple[OptimizeOptions, FieldOptions | None, tuple[str, ...]]
+Resolved = tuple[OptimizeOptions, FieldOptions | None, tuple[tuple[str, object], ...]]
 """All that decides a variant's bits, but for what all variants of a run share."""
 
 _T = TypeVar("_T")
@@ -117,6 +119,23 @@ def _other(name: str, what: str, part: str, value: object, of: str = BASE) -> Va
 _PGS, _EPSILON = "trainer.optimize.pgs", "trainer.optimize.pgs.EPSILON"
 
 
+_LOSSES = "trainer.optimize.losses"
+
+
+def _signed(image: Tensor, *_: object) -> Tensor:
+    """Its gradient is 0 but at the rim of the picture."""
+    return -losses.laplacian(image.mean(dim=2)).mean()
+
+
+def _magnitude(image: Tensor, *_: object) -> Tensor:
+    return -losses.laplacian(image.mean(dim=2)).abs().mean()
+
+
+def _absolute_change(moved: Tensor, previous: Tensor, step: int, grows: bool, *_: object) -> Tensor:
+    factor: float = 0.05 * 1.1 ** ((step if grows else -step) / 50)
+    return factor * (moved - previous.detach()).abs().sum()
+
+
 _PLAIN_CLAMPS = {"trainer.views.crops.clamp_towards": torch.clamp}
 
 VARIANTS = (
@@ -149,15 +168,11 @@ VARIANTS = (
     _other("no-lpips", "L1 alone", "perceptual_weight", 0.0, DESCENT),
     _other("sharpness-off", "no L_render", "sharpness", "off", DESCENT),
     _other("sharpness-hinge", "L_render: as sharp as the target", "sharpness", "hinge", DESCENT),
-    _other("sharpness-paper", "L_render as printed", "sharpness", "paper", DESCENT),
+    _other("sharpness-paper", "L_render of the paper", "sharpness", "paper", DESCENT),
     _other("progressive-off", "no progressive constraint", "progressive", "off", DESCENT),
-    _other("progressive-warmup", "the constraint as a warm-up", "progressive", "warmup", DESCENT),
-    _other("progressive-growth", "the constraint tightening, as printed", "progressive", "growth", DESCENT),
+    _other("progressive-growth", "the constraint tightening", "progressive", "growth", DESCENT),
     _other("progressive-decay", "the constraint letting go", "progressive", "decay", DESCENT),
-    *(
-        _other(f"{way}-absolutes", "its steps as sums of absolutes", "progressive_norm", "absolutes", of)
-        for way, of in (("growth", "progressive-growth"), ("decay", "progressive-decay"))
-    ),
+    _other("growth-sum", "over all members' sum", "progressive_over", "sum", "progressive-growth"),
     Variant(PAPER, "the paper's preset with its network", _as_printed(), longer=_PAPER_STEPS),
     _patched(
         "paper-gdf-no-sharpness",
@@ -168,7 +183,29 @@ VARIANTS = (
     ),
     Variant(PAPER_PGS, "our field in place of the network", {"field.field": "auto"}, PAPER),
     _other("paper-no-sharpness", "no L_render", "sharpness", "off", PAPER_PGS),
+    _patched("paper-signed", "L_render signed, as printed", f"{_LOSSES}.sharpness", _signed, PAPER_PGS),
+    _patched("paper-magnitude", "L_render of magnitudes", f"{_LOSSES}.sharpness", _magnitude, PAPER_PGS),
     _other("paper-progressive-off", "no progressive constraint", "progressive", "off", PAPER_PGS),
+    _other("paper-growth", "the constraint tightening, as printed", "progressive", "growth", PAPER_PGS),
+    _other("paper-sum", "the constraint over all members' sum", "progressive_over", "sum", PAPER_PGS),
+    _patched(
+        "paper-absolutes",
+        "the constraint a sum of absolutes",
+        f"{_LOSSES}.progressive_change",
+        _absolute_change,
+        PAPER_PGS,
+    ),
+    Variant(
+        "paper-weights",
+        "L1 and LPIPS ten times as heavy, as in GaussianEditor",
+        of=PAPER_PGS,
+        patches={
+            f"{_LOSSES}.PROGRESSIVE_WEIGHT": losses.PROGRESSIVE_WEIGHT / 10,
+            f"{_LOSSES}.SHARPNESS_WEIGHT": {"paper": losses.SHARPNESS_WEIGHT["paper"] / 10},
+        },
+    ),
+    _other("paper-rates-3dgs", "the learning rates of 3DGS", "rates", "3dgs", PAPER_PGS),
+    _other("paper-sum-3dgs", "the learning rates of 3DGS, too", "rates", "3dgs", "paper-sum"),
 )
 
 _BY_NAME = {variant.name: variant for variant in VARIANTS}
@@ -230,10 +267,10 @@ def _resolve(variant: Variant, own: TrainOptions, kind: EditKind, stages: int) -
     groups = GROUP_STEPS if plan.optimize.group_steps is None else plan.optimize.group_steps
     slider = resolve_slider(plan.optimize.slider, (1.0,) * stages)
     optimization = replace(resolve_kind(plan, kind, groups), slider=slider, color_solver=True)
-    changes = (*_all_patches(variant), *([EQUAL] if variant.name == EQUAL else []))
+    changes = (*_all_patches(variant).items(), *([(EQUAL, True)] if variant.name == EQUAL else []))
     if optimization.solver != "descent":
         optimization = replace(optimization, perceptual_weight=0.0, target_ramp=True, ema=True)
-        changes = tuple(path for path in changes if not path.startswith((_PGS, _EPSILON)))
+        changes = tuple(change for change in changes if not change[0].startswith((_PGS, _EPSILON)))
     return optimization, plan.field if plan.field.field == "neural" else None, changes
 
 

@@ -83,7 +83,7 @@ def test_only_what_makes_a_difference_to_the_run_is_tried(options: TrainOptions)
     assert not {"no-sizing", "no-interpolation"} & geometry
     assert not {"one-target", "slider-stages"} & _names(options, "color", 1, 1)
     assert "no-sh" not in _names(options, "color", 4, 0)
-    without = with_values(options, perceptual_weight=0.0, progressive="warmup")
+    without = with_values(options, perceptual_weight=0.0, progressive="growth")
     assert "no-lpips" not in _names(without, "style", 4, 1)
     assert "progressive-off" in _names(without, "color", 4, 1)
     pinned = with_values(options, slider="stages")

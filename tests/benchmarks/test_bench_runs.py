@@ -44,8 +44,11 @@ def test_edits_stand_beside_simpler_ones_at_101_values_and_in_far_views(
     monkeypatch.setattr(bench_edits, "VALUES", 11)
     edits, values = bench_edits.tables([run])
     assert edits.rows[0][0] == values.rows[0][0]
-    field, file = (float(size) for size in edits.rows[0][7].split(" / "))
+    field, file = (float(size) for size in edits.rows[0][10].split(" / "))
     assert file > field > 0
+    lowest = [float(cell.split(" at ")[0]) for cell in edits.rows[0][4:7]]
+    assert lowest[0] <= min(float(quarter) for quarter in edits.rows[0][1].split(" / ")) + 0.05
+    assert lowest[0] <= float(edits.rows[0][7]) + 0.05, "the end is one of the strengths"
     worst = float(values.rows[0][1].split(" / ")[1])
     assert float(values.rows[0][3]) <= worst + 2.0
     assert "-" not in values.rows[0], "this editor can be asked for views from elsewhere"

@@ -94,9 +94,14 @@ def _edited_rows(curves: Mapping[str, ErrorCurve], lpips: str, views: str) -> li
     if not inner:
         return rows
     places = "value" if inner == 1 else "values"
-    return rows + [
-        Row(f"{name}_between", f"at {inner} {places} between, {text}", between(values), digits)
-        for name, text, values, digits in measures
+    lowest: dict[str, float | None] = {name: min(curve.psnr) for name, curve in curves.items()}
+    return [
+        *rows,
+        *(
+            Row(f"{name}_between", f"at {inner} {places} between, {text}", between(values), digits)
+            for name, text, values, digits in measures
+        ),
+        Row("psnr_worst", "the worst of all these, PSNR, dB", lowest, 1),
     ]
 
 

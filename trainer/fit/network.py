@@ -300,7 +300,7 @@ def _rendered_loss(setup: TrainingSetup, trajectory: Trajectory, perceptual: Per
 @dataclass(frozen=True)
 class RenderedLoss:
     """L_GDF = L_pred + L_render: L1 + LPIPS between the renders of Θ0 + GDF(s) and of the snapshot at s, and
-    −∇²R of the former. A `PictureLoss`.
+    −(∇²R)² of the former. A `PictureLoss`.
     """
 
     crops: Sequence[CropScene]  # the training views

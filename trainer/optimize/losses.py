@@ -16,7 +16,7 @@ from torch.nn.functional import avg_pool2d, max_pool2d
 
 from progdf.errors import ProgdfError
 from progdf.metrics.lpips import Features, Lpips, Net
-from trainer.options import Norm, OptimizeOptions, Sharpness
+from trainer.options import OptimizeOptions, Over, Sharpness
 
 _LUMA = (0.299, 0.587, 0.114)  # ITU-R BT.601
 
@@ -103,41 +103,32 @@ def perceptual_loss(net: Net = "alex") -> tuple[Perceptual, str]:
         return GradientL1(), f"training with gradient L1 in place of LPIPS: {error}"
 
 
-def warmup(step: int, c: float = 10.0, beta: float = 1.1, period: float = 50.0) -> float:
-    """ProGDF's progressive constraint as the learning-rate factor it acts as: 2 / (1 + c·β^(−t/period)).
-
-    Early steps are short, which is what the paper's constraint is for (eq. 5, `progressive_change`).
-    """
-    return 2.0 / (1.0 + c * math.exp(-step / period * math.log(beta)))
-
-
 def progressive_change(
     moved: Tensor,
     previous: Tensor,
     step: int,
     grows: bool,
-    norm: Norm = "squares",
+    over: Over = "mean",
     alpha: float = 0.05,
     beta: float = 1.1,
 ) -> Tensor:
-    """The paper's progressive constraint (eq. 5): L_prog = α·β^(±t/50)·Σ‖ΔΘ‖, without its λ2. []
+    """The paper's progressive constraint (eq. 5): L_prog = α·β^(±t/50)·Σ‖ΔΘ‖², without its λ2. []
 
-    ΔΘ is what the last step changed, summed over all raw parameters of all members. The paper names no norm:
-    "squares" sums Δ², "absolutes" |Δ|, which freezes the edit (docs/experiments.md, The progressive
-    constraint).
+    ΔΘ is what the last step changed of a member's raw parameters. The paper does not say of which norm and of
+    how many members: docs/experiments.md, The progressive constraint.
 
     Args:
         moved: offsets of the members. [M,C]
         previous: one step earlier. [M,C]
         step: t
         grows: the printed exponent +t/50, which allows ever shorter steps; else −t/50, which lets go of them
-        norm: see above
+        over: the members: their mean, or their sum
         alpha, beta: of the paper
     """
     period = 50.0
     factor: float = alpha * beta ** ((step if grows else -step) / period)
-    change = moved - previous.detach()
-    return factor * (change.square() if norm == "squares" else change.abs()).sum()
+    change = (moved - previous.detach()).square().sum()
+    return factor * (change / len(moved) if over == "mean" else change)
 
 
 def sharpness(
@@ -145,8 +136,9 @@ def sharpness(
 ) -> Tensor:
     """The paper's L_render. []
 
-    "paper" is the printed −∇²R, signed, over the whole picture. "hinge" asks for no more than the target
-    has: max(0, S(target) − S(image)), S the mean of |∇²Y| inside the region, Y the luma.
+    "paper" is −(∇²R)², the mean over the whole picture; of the printed −∇²R, signed, nothing is left but the
+    rim. "hinge" asks for no more than the target has: max(0, S(target) − S(image)), S the mean of |∇²Y|
+    inside the region, Y the luma.
 
     Args:
         image: the render. [h,w,3]
@@ -155,7 +147,7 @@ def sharpness(
         inside: the pixels that count under "hinge"; None: all. [h,w] bool
     """
     if form == "paper":
-        return -laplacian(image.mean(dim=2)).mean()
+        return -laplacian(image.mean(dim=2)).square().mean()
     weights = torch.ones_like(image[1:-1, 1:-1, 0]) if inside is None else inside[1:-1, 1:-1].to(image.dtype)
     count = weights.sum().clamp_min(1.0)
 
@@ -202,7 +194,7 @@ def describe_loss(options: OptimizeOptions, perceptual: str) -> str:
         terms.append(f"{options.perceptual_weight:g} {perceptual}{often}")
     if options.progressive in ("decay", "growth"):
         terms.append(
-            f"{PROGRESSIVE_WEIGHT:g} progressive ({options.progressive}, {options.progressive_norm})"
+            f"{PROGRESSIVE_WEIGHT:g} progressive ({options.progressive}, {options.progressive_over})"
         )
     if options.sharpness in SHARPNESS_WEIGHT:
         terms.append(f"{SHARPNESS_WEIGHT[options.sharpness]:g} sharpness ({options.sharpness})")
@@ -254,7 +246,7 @@ class Objective:
         if options.progressive in ("decay", "growth"):
             grows = options.progressive == "growth"
             change = progressive_change(
-                moment.moved, moment.previous, moment.step, grows, options.progressive_norm
+                moment.moved, moment.previous, moment.step, grows, options.progressive_over
             )
             terms["progressive"] = PROGRESSIVE_WEIGHT * change
         if options.sharpness == "hinge" or options.sharpness == "paper":

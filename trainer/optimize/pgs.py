@@ -27,7 +27,7 @@ from trainer.options import OptimizeOptions
 from trainer.store.state import Saved, generator
 from trainer.views.crops import CropScene, render_all
 
-from .losses import Moment, Objective, TermMeans, l1, total_loss, warmup
+from .losses import Moment, Objective, TermMeans, l1, total_loss
 
 EPSILON = 0.1
 """Of the root mean square of an attribute's gradient: Adam's ε where it is raised."""
@@ -177,6 +177,15 @@ LEARNING_RATES: Mapping[str, Mapping[str, float]] = {
         "sh0": 2.5e-3,
         "shN": 1.25e-4,
     },
+    # the same as GaussianEditor's scripts of 1500 steps multiply them (Chen 2024)
+    "gaussian-editor": {
+        "means": 8e-4,
+        "log_scales": 1e-2,
+        "quats": 2e-3,
+        "logit_opacities": 1e-1,
+        "sh0": 1.25e-2,
+        "shN": 6.25e-4,
+    },
     # By kind of edit: what it needs to arrive within a few hundred steps (docs/method.md 3). A color edit
     # leaves the geometry alone, which is 1.4 dB better and 11 floats a Gaussian smaller.
     "color": {"sh0": 7.5e-2, "shN": 3.75e-3},
@@ -213,7 +222,6 @@ class PgsSettings:
     """How the members descend."""
 
     rates: Tensor  # learning rate of each column of a packed row, raw units. [C]
-    warmup: bool = False  # start with short steps
     raised: bool = True  # Adam's ε holds members still that hardly show, see `PgsState.descend`
     ramp: float = 0.6  # share of a stage's steps in which its target moves from the last stage's to its own
     fall: float = FALL  # share of a stage's steps, its last, in which the rate falls to a tenth; 0: flat
@@ -241,12 +249,11 @@ def pgs_settings(
         stages: how many strengths there are to optimize towards
     """
     recolors, printed = options.kind != "geometry", options.as_printed
-    rates = learning_rates("3dgs" if options.rates == "3dgs" else options.kind, channels, extent)
+    rates = learning_rates(options.kind if options.rates == "kind" else options.rates, channels, extent)
     if not bands:
         rates[BASE_CHANNELS:] = 0.0
     return PgsSettings(
         rates,
-        warmup=options.progressive == "warmup",
         raised=not printed,
         # one target alone is approached slowly: quick steps towards it shine in all colors half way
         ramp=(0.9 if stages == 1 else 0.6) if recolors and options.target_ramp else 0.0,
@@ -301,7 +308,7 @@ def learning_rates(kind: str, channels: int, extent: float) -> Tensor:
     """Learning rate of every column of a packed row, [C].
 
     Args:
-        kind: what the edit moves, or 3dgs: all attributes free; see `LEARNING_RATES`
+        kind: what the edit moves, or whose they are, with all attributes free; see `LEARNING_RATES`
         channels: columns of a packed row
         extent: size of what moves, world units
     """
@@ -368,7 +375,7 @@ def optimize(
                 image, target, view, state.step, state.local, share >= 1.0, state.moved, state.previous
             )
             gradient = _gradient(objective, moment, state, stages[-1].targets[view])
-            length = size * _rate_factor(settings, state.step, state.local, stage.steps)
+            length = size * _decay(settings.fall, state.local, stage.steps)
             state.descend(
                 gradient, settings.rates, length, settings.raised, settings.smoothing, settings.growth
             )
@@ -433,13 +440,8 @@ def most_change(targets: Sequence[Tensor], before: Sequence[Tensor]) -> float:
     return float(changing.kthvalue(math.ceil(0.95 * len(changing))).values) if len(changing) else 0.0
 
 
-def _rate_factor(settings: PgsSettings, step: int, local: int, steps: int) -> float:
-    """Falls at a stage's end, so that it ends near its target; early steps may be short."""
-    return _decay(settings.fall, local, steps) * (warmup(step) if settings.warmup else 1.0)
-
-
 def _decay(fall: float, local: int, steps: int) -> float:
-    """See `PgsSettings.fall`."""
+    """Factor to the rates: falls where a stage ends, so that it ends near its target."""
     return min(1.0, 0.1 + 0.9 * (steps - local) / (steps * fall)) if fall > 0 else 1.0
 
 

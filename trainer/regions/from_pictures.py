@@ -225,12 +225,9 @@ def _lift(
         scene, small, scaled, name, request.options.lift_rule, request.options.lift_threshold, request.say
     )
     if not len(region):
-        way = "lower --lift-threshold"
-        if request.options.lift_rule == "paper":
-            way = "far below the printed .8: give --lift-rule share, or lower --lift-threshold"
         raise ProgdfError(
             f"{name} selects no Gaussian by the rule {request.options.lift_rule}; its highest score is "
-            f"{float(region.score.max()):.2g}, {way}"
+            f"{float(region.score.max()):.2g}; lower --lift-threshold"
         )
     return region
 

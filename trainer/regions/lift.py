@@ -18,8 +18,8 @@ from trainer.options import LiftRule
 from .few_masks import FEW, drop_strays, find_holes
 from .surface import SurfaceVote
 
-THRESHOLDS: dict[LiftRule, float] = {"share": 0.7, "count": 0.8, "paper": 0.8}
-"""Least score of a member under each rule; those of `count` and `paper` are the paper's."""
+THRESHOLDS: dict[LiftRule, float] = {"share": 0.7, "paper": 0.8}
+"""Least score of a member under each rule."""
 
 HIDDEN = 0.06
 """Below this clearness a Gaussian counts as never seen: what shines through tells of what covers it."""
@@ -77,14 +77,13 @@ def gather(scene: Gaussians, cameras: Sequence[Camera], masks: Sequence[Tensor])
 def score(evidence: Evidence, rule: LiftRule = "share") -> Tensor:
     """How surely the masks mean each Gaussian. [N] 0..1; 0 where no view shows it.
 
-    share: Σ w·m / Σ w, the part of its visible contribution that falls inside the masks. count: Σ m / n.
-    paper: Σ σ·α·T·m / n as printed. α has σ in it already, and the sum is at most σ times the mean of αT, far
-    below the printed threshold of .8.
+    share: Σ w·m / Σ w, the part of its visible contribution that falls inside the masks. paper: Σ m / n, as
+    the kernel of GaussianEditor counts that the paper refers to. The sum that is printed, Σ σ·α·T·m / n, has
+    σ twice and comes to a fifth at most, far below the printed threshold of .8.
     """
     if rule == "share":
         return evidence.inside / evidence.weight.clamp_min(1e-12)
-    above = evidence.pixels_inside if rule == "count" else evidence.opacities * evidence.inside
-    return above / evidence.pixels.clamp_min(1.0)
+    return evidence.pixels_inside / evidence.pixels.clamp_min(1.0)
 
 
 def lift_masks(
@@ -111,8 +110,8 @@ def lift_masks(
         The members, and the score of every Gaussian, by which these are the members: `score` ≥ threshold. It
         is the rule's for Gaussians that the views decide; for the others it tells how much of the surface
         around them belongs to the members (see `surface.SurfaceVote`), half of it being the threshold.
-        Where the views decide on no member there is none. Under the rule `paper` the score alone decides, as
-        printed: there is no surface, and no cleaning.
+        Where the views decide on no member there is none. Under the rule `paper` the score alone decides:
+        there is no surface, and no cleaning.
 
     How the rules and thresholds do against exact labels is in docs/experiments.md, Regions from masks.
     """

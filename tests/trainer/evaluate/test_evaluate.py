@@ -40,6 +40,7 @@ def test_figures_that_the_report_has_too_are_the_reports(run: Path, rows: dict[s
     assert rows["evenness"]["slider"] == pytest.approx(slider["uniformity"], abs=1e-3)
     between = [figures["psnr"] for figures in report["between"].values()]
     assert rows["psnr_between"]["slider"] == pytest.approx(sum(between) / len(between), abs=0.01)
+    assert rows["psnr_worst"]["slider"] == pytest.approx(min(*between, edit["psnr_to_views"]), abs=0.01)
     assert rows["seconds"]["slider"] == pytest.approx(report["time"]["total"], abs=0.01)
 
 

@@ -1,8 +1,6 @@
-"""The clamp that keeps useful gradients, the perceptual terms, the warm-up."""
+"""The clamp that keeps useful gradients and the perceptual terms."""
 
 from __future__ import annotations
-
-from itertools import pairwise
 
 import pytest
 import torch
@@ -10,7 +8,7 @@ import torch
 from progdf.errors import ProgdfError
 from progdf.metrics.lpips import Lpips
 from trainer.optimize import losses
-from trainer.optimize.losses import GradientL1, LpipsLoss, perceptual_loss, warmup
+from trainer.optimize.losses import GradientL1, LpipsLoss, perceptual_loss
 from trainer.views.crops import clamp_towards
 
 
@@ -70,10 +68,3 @@ def test_cached_lpips_targets_change_nothing_and_are_forgotten_when_told() -> No
     assert float(measure(image, other, "a")) == plain, "the cached target counts"
     measure.forget()
     assert float(measure(image, other, "a")) != plain
-
-
-def test_the_warm_up_starts_low_rises_and_stays_below_two() -> None:
-    rates = [warmup(step) for step in range(0, 2000, 50)]
-    assert rates[0] == pytest.approx(2 / 11)
-    assert all(a < b for a, b in pairwise(rates))
-    assert rates[-1] < 2.0

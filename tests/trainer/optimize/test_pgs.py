@@ -69,12 +69,6 @@ def test_the_same_seed_gives_the_same_bits_and_another_seed_does_not() -> None:
     assert not torch.equal(first, other)
 
 
-def test_the_warm_up_takes_shorter_steps_at_first() -> None:
-    case = small("body")
-    free, warm = (run(case, steps=6, warmup=on)[1][-1].offsets for on in (False, True))
-    assert float(warm.abs().mean()) < 0.5 * float(free.abs().mean())
-
-
 def test_a_loss_that_is_not_finite_stops_the_run_instead_of_spoiling_it() -> None:
     case = small("body")
     broken = replace(case, views=tuple(replace(v, image=v.image * float("nan")) for v in case.views))

@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 import torch
 
-from progdf.errors import ProgdfError
 from progdf.field.trajectory import load_trajectory
 from progdf.formats.ply import load_ply
 from progdf.gaussians import ATTRIBUTES, pack
@@ -46,11 +45,11 @@ def run(folder: Path, finishing: list[int]) -> Iterator[RunResult]:
 
 
 def test_pgs_pays_what_is_printed_whatever_the_edit() -> None:
-    """λ = 1, 5, 1: L1 + LPIPS, α·β^(t/s)·Σ‖ΔΘ‖², −∇²R; one target, 1500 to 2000 steps."""
+    """λ = 1, 5, 1: L1 + LPIPS, α·β^(−t/s)·mean‖ΔΘ‖², −(∇²R)²; one target, 1500 to 2000 steps."""
     for kind in ("color", "style", "geometry"):
         found = resolve_kind(plan(), kind, 0)
         assert describe_loss(found, "LPIPS") == (
-            "L1 + 1 LPIPS + 5 progressive (growth, squares) + 1 sharpness (paper)"
+            "L1 + 1 LPIPS + 5 progressive (decay, mean) + 1 sharpness (paper)"
         )
         assert found.solver == "descent"
         assert found.stages == 1
@@ -76,17 +75,8 @@ def test_the_field_is_a_network_of_positions_and_hard_bins_trained_beside_pgs_on
     assert plan().field.field_loss == "pictures"
 
 
-def test_masks_are_refused_before_any_work_as_the_printed_lifting_selects_nothing() -> None:
-    for region in ("masks:here", "photomasks:here", 'text:"the shirt"'):
-        with pytest.raises(ProgdfError, match=r"selects nothing at the printed \.8.*--lift-rule share"):
-            plan(region=region)
-    assert plan("--lift-rule", "share", region="masks:here").region.lift_rule == "share"
-    assert plan("--lift-threshold", ".01", region="masks:here").region.lift_rule == "paper"
-    assert plan(region="labels:l.npy:2").region.lift_rule == "paper", "which is not lifted"
-
-
 def test_the_loss_of_the_field_is_the_printed_sum() -> None:
-    """L_GDF = L1 + LPIPS between the renders of Θ0 + GDF(s) and of the snapshot, −∇²R of the former."""
+    """L_GDF = L1 + LPIPS between the renders of Θ0 + GDF(s) and of the snapshot, −(∇²R)² of the former."""
     case = small("body")
     rows = pack(case.scene[case.region.members])
     height, width = case.views[0].camera.height, case.views[0].camera.width
@@ -100,7 +90,7 @@ def test_the_loss_of_the_field_is_the_printed_sum() -> None:
     image, expected = (crops[1].render(rows + offsets)[0] for offsets in (found, recorded))
     gray = image.mean(dim=2)
     laplacian = gray[:-2, 1:-1] + gray[2:, 1:-1] + gray[1:-1, :-2] + gray[1:-1, 2:] - 4 * gray[1:-1, 1:-1]
-    printed = l1(image, expected) + GradientL1()(image, expected) - laplacian.mean()
+    printed = l1(image, expected) + GradientL1()(image, expected) - laplacian.square().mean()
     assert float(loss(found, recorded, 1)) == pytest.approx(float(printed), rel=1e-6)
 
 
@@ -108,7 +98,7 @@ def test_losses_are_of_whole_pictures(folder: Path, run: RunResult, monkeypatch:
     assert plan().optimize.as_printed
     assert not quick_options(folder).optimize.as_printed
     assert run.report["objective"] == (
-        f"L1 + 1 {run.report['edit']['perceptual']} + 5 progressive (growth, squares) + 1 sharpness (paper)"
+        f"L1 + 1 {run.report['edit']['perceptual']} + 5 progressive (decay, mean) + 1 sharpness (paper)"
     )
 
 

@@ -56,7 +56,7 @@ def test_a_preset_is_its_values_and_no_more(preset: Preset) -> None:
 
 @pytest.mark.parametrize("preset", [name for name in PRESETS if name != "default"])
 def test_each_value_of_a_preset_could_be_given_on_the_command_line(preset: Preset) -> None:
-    fixed = {"rates", "perceptual_every", "sharpness", "as_printed", "color_solver", "ema", "target_ramp"}
+    fixed = {"perceptual_every", "sharpness", "as_printed", "color_solver", "ema", "target_ramp"}
     values = {name: value for part in PRESETS[preset].values() for name, value in part.items()}
     words = [w for n, v in values.items() if n not in fixed for w in (f"--{n.replace('_', '-')}", str(v))]
     assert with_values(asked(*words), **{n: values[n] for n in fixed}, preset=preset) == asked(
@@ -69,7 +69,7 @@ def test_what_the_command_line_says_goes_before_the_preset_wherever_it_stands() 
     after = asked("--preset", "paper", "--steps", "300")
     assert before == after
     assert before.optimize.steps == 300
-    assert before.optimize.progressive == "growth"
+    assert before.optimize.progressive == "decay"
 
 
 def test_a_default_that_the_command_line_spells_out_goes_before_the_preset_too() -> None:
@@ -81,8 +81,8 @@ def test_the_papers_trainer_can_leave_out_its_network() -> None:
     assert plan.field.field == "auto"
 
 
-def test_the_paper_can_let_go_instead_of_tightening() -> None:
-    assert planned("style", "--preset", "paper", "--progressive", "decay").progressive == "decay"
+def test_the_paper_can_tighten_instead_of_letting_go() -> None:
+    assert planned("style", "--preset", "paper", "--progressive", "growth").progressive == "growth"
 
 
 def test_by_default_a_color_edit_is_paid_in_l1_mostly_and_a_style_for_its_texture_too() -> None:
@@ -95,7 +95,7 @@ def test_colors_are_solved_for_unless_something_is_asked_for_that_a_descent_has(
     assert planned("color").solver == "colors"
     assert planned("color", "--perceptual-weight", "0").solver == "colors"
     assert planned("style").solver == "descent"
-    for words in (("--perceptual-weight", "0.1"), ("--progressive", "warmup"), ("--preset", "paper")):
+    for words in (("--perceptual-weight", "0.1"), ("--progressive", "decay"), ("--preset", "paper")):
         assert planned("color", *words).solver == "descent"
     again = resolve(with_values(asked("--reedit-every", "9"), editor="style:14"))
     assert resolve_kind(again, "color", 0).solver == "descent"
@@ -122,18 +122,21 @@ def test_parts_move_as_wholes_only_where_something_moves() -> None:
     assert planned("color", group_steps=9).group_steps == 0
 
 
-def test_only_the_warm_up_shortens_the_first_steps() -> None:
-    for progressive, warm in (("warmup", True), ("decay", False), ("growth", False), ("off", False)):
-        settings = pgs_settings(planned("color", "--progressive", progressive), True, 14, 1.0, 4)
-        assert settings.warmup == warm
-
-
 def test_a_color_edit_holds_the_geometry_still_unless_the_plain_rates_are_asked_for() -> None:
     ours = pgs_settings(planned("color"), True, 23, 1.0, 4).rates
     plain = pgs_settings(planned("color", "--preset", "paper"), True, 23, 1.0, 4).rates
     assert torch.equal(ours[:11], torch.zeros(11))
     assert float(plain[:11].min()) > 0
-    assert float(ours[11]) > 10 * float(plain[11])
+    assert float(ours[11]) > 5 * float(plain[11])
+
+
+def test_the_papers_rates_are_those_of_3dgs_as_gaussian_editor_multiplies_them() -> None:
+    plain, multiplied = (
+        pgs_settings(planned("color", "--preset", "paper", *words), True, 14, 1.0, 1).rates
+        for words in (("--rates", "3dgs"), ())
+    )
+    factors = [5.0] * 3 + [2.0] * 8 + [5.0] * 3  # means; log-scales, quaternion, opacity; color
+    assert torch.allclose(multiplied / plain, torch.tensor(factors))
 
 
 @pytest.mark.parametrize(("part", "changes"), [("target_ramp", "ramp"), ("ema", "smoothing")])
