@@ -68,7 +68,8 @@ class Thumbnails:
         edited = replace(view, layers=()) if index == 0 else restore(view, snapshot)
         target = replace(edited, camera=snapshot.camera, compare=Comparison())
         try:
-            pixels = to_pixels(self._engine.image(target, SIZE))
+            many = len(self._engine.scene) >= dynamic_resolution.MANY
+            pixels = to_pixels(self._engine.image(target, SIZE, pixels=2 if many else 1))
         except ProgdfError:  # an edit that is not open
             pixels = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
         return picture_texture(self._ctx, pixels)

@@ -151,13 +151,20 @@ class ViewEngine:
         self._apply_highlight(_with_hidden(self.highlight, view))
         return self.renderer.prepare(replace(camera, near=self.near), view.background)
 
-    def image(self, view: ViewState, size: tuple[int, int] = (0, 0), camera: Camera | None = None) -> Image:
+    def image(
+        self,
+        view: ViewState,
+        size: tuple[int, int] = (0, 0),
+        camera: Camera | None = None,
+        pixels: int = 1,
+    ) -> Image:
         """The picture as an array: upper row first, linear as drawn, 0..1 as far as the colors are.
 
         Args:
             view: what to draw
             size: width, height in pixels
             camera: takes the place of the view's own camera and of `size`
+            pixels: of the picture at rest that one of this one stands for, see `Renderer.draw`
 
         Returns:
             [H,W,3] float32
@@ -165,7 +172,8 @@ class ViewEngine:
         Raises:
             ProgdfError: a layer of `view` means nothing.
         """
-        self.timings = self._update_picture(view, camera or to_camera(view.camera, *size))
+        self.timings = self._update_picture(view, camera or to_camera(view.camera, *size), pixels=pixels)
+        self._picture = self._picture if pixels == 1 else None  # a picture in full is another one
         return self.renderer.pixels()
 
     def gaussians(self, view: ViewState) -> Gaussians:
