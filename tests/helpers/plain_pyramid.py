@@ -11,7 +11,7 @@ from torch import Tensor
 from progdf.camera import Camera
 from progdf.gaussians import normalize_quats
 from progdf.quaternions import matrix_quats, rotation_matrices
-from progdf.rasterize.cpu.pyramid import CELL, COARSER, DARKEST, LEAF, SLICES
+from progdf.rasterize.cpu.pyramid import CELL, COARSER, DARKEST, LEAF, SLICES, SWELL
 from progdf.rasterize.engines import (
     ALPHA_MAX,
     ALPHA_MIN,
@@ -33,7 +33,7 @@ class Node(NamedTuple):
     mean: Tensor  # [3]
     covariance: Tensor  # [3,3]
     spread: float
-    opacity: float
+    opacity: float  # as a density, beyond 1 too
     colors: Tensor  # [K,3]
 
 
@@ -68,7 +68,7 @@ def merge_rows(gaussians: ActivatedGaussians, rows: Tensor) -> Node:
     between = torch.einsum("n,ni,nj->ij", share, off, off)
     covariance = between + torch.einsum("n,nij,nkj->ik", share, turned, turned)
     area = float(torch.linalg.eigvalsh(covariance)[1:].clamp_min(0.0).prod().sqrt())
-    opacity = min(float(weights.sum()) / area, ALPHA_MAX)
+    opacity = float(weights.sum()) / area
     spread = math.sqrt(float(between.trace()))
     return Node(
         rows, float(weights.sum()), mean, covariance, spread, opacity,
@@ -115,8 +115,11 @@ class PlainCut:
         rotation, translation = self._camera.viewmat[:3, :3].double(), self._camera.viewmat[:3, 3].double()
         points = mean @ rotation.T + translation
         more = (self._dilation - DILATION) * points[:, 2:] ** 2 / self._focal2
-        sizes = (scales**2 + more).clamp_min(0.0).sqrt()
-        a, _, c, det0 = covariances(points, quats, scales, view)
+        merged = torch.tensor(picks) >= 0
+        grow = torch.where(merged, 1.0 + SWELL * opacity.clamp_min(1.0).log(), 1.0)[:, None]
+        opacity = torch.where(merged, opacity.clamp_max(ALPHA_MAX), opacity)
+        sizes = (grow * scales**2 + more).clamp_min(0.0).sqrt()
+        a, _, c, det0 = covariances(points, quats, grow.sqrt() * scales, view)
         fine = det0 + self._dilation * (a + c) + self._dilation**2
         a, _, c, det = covariances(points, quats, sizes, view)
         opacity = opacity * (fine / (det + DILATION * (a + c) + DILATION**2)).sqrt()

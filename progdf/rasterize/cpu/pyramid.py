@@ -64,6 +64,10 @@ SLICES = 224
 DARKEST = 3.0
 """Optical depth beyond which it makes no more difference: cells know nothing of gaps."""
 
+SWELL = 0.25
+"""How much the area of a node grows with the logarithm of its density beyond 1: opaque patches have no soft
+rims, and a surface of nodes would have holes."""
+
 COARSER = 4.0
 """Times the limit, with which the cut is made that tells the light."""
 
@@ -87,7 +91,7 @@ class Nodes(NamedTuple):
     """The tree, level after level: node i has the halves 2i + 1 and 2i + 2, and leaf l of L = 2^levels the
     rows order[l·N // L : (l + 1)·N // L]."""
 
-    gaussians: Scene  # what stands for each node. [2L-1, …]
+    gaussians: Scene  # what stands for each node; opacities as densities, beyond 1 too. [2L-1, …]
     weights: Array  # Σ opacity · area of what is below, world units². [2L-1] float32
     spreads: Array  # root of the summed variances of the centers below, world units. [2L-1] float32
     order: Array  # rows of the scene. [N] int32
@@ -325,7 +329,7 @@ def _merge(
         for k in range(3):
             out.scales[me, k] = math.sqrt(max(matrix[k, k], 0.0))
         longest, middle = _two_largest(out, me)
-        out.opacities[me] = min(total / max(longest * middle, _LEAST), ALPHA_MAX)
+        out.opacities[me] = total / max(longest * middle, _LEAST)
         nodes.weights[me], nodes.spreads[me] = total, spread
 
 
@@ -500,20 +504,23 @@ def _take(
             prefetch(scene.scales, ~following)
             prefetch(scene.colors, ~following)
         seen = footprint(camera, source, i)
-        opacity = np.float64(source.opacities[i])
+        density = np.float64(source.opacities[i])  # of a node; more than 1 where several cover each other
+        grow = 1.0 + SWELL * math.log(density) if picks[at] >= 0 and density > 1.0 else 1.0
+        opacity = min(density, ALPHA_MAX) if picks[at] >= 0 else density
         # the coarse picture's dilation instead of the fine one's: off the size, as far as that goes
         more = (dilation - DILATION) / (camera.fx * camera.fy * seen.inv_z * seen.inv_z)
         a, b, c = vec(source.scales, i)
         size = (
-            math.sqrt(max(a * a + more, 0.0)), math.sqrt(max(b * b + more, 0.0)),
-            math.sqrt(max(c * c + more, 0.0)),
+            math.sqrt(max(grow * a * a + more, 0.0)), math.sqrt(max(grow * b * b + more, 0.0)),
+            math.sqrt(max(grow * c * c + more, 0.0)),
         )  # fmt: skip
         p0, p1 = times(seen.turned0, size), times(seen.turned1, size)
         normal = cross(p0, p1)
-        fine = seen.det0 + dilation * (seen.a + seen.c) + dilation * dilation
+        det0 = grow * grow * seen.det0
+        fine = det0 + dilation * (grow * (seen.a + seen.c) + dilation)
         coarse = dot(normal, normal) + DILATION * (dot(p0, p0) + dot(p1, p1)) + DILATION * DILATION
         if camera.antialiased:
-            opacity *= math.sqrt(max(ANTIALIAS_FLOOR, seen.det0 / fine))
+            opacity *= math.sqrt(max(ANTIALIAS_FLOOR, det0 / fine))
         out.opacities[at, 0] = opacity * math.sqrt(fine / coarse)
         for k in range(3):
             out.means[at, k] = source.means[i, k]
