@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+import datetime
+import hashlib
 import os
 import platform
+import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from importlib.metadata import version
 from pathlib import Path
 
 BEGIN, END = "<!-- bench {name} -->", "<!-- end {name} -->"
+
+BUSY = 0.05
+"""Share of the cores above which others make wall times worthless."""
+
+_SPIN_S = 0.3
 
 
 @dataclass(frozen=True)
@@ -20,6 +30,7 @@ class Table:
     columns: tuple[str, ...]  # headings, with units
     rows: tuple[tuple[str, ...], ...]  # one text a column
     note: str = ""  # what was measured and how, one or two lines
+    wall: tuple[str, ...] = ()  # the columns that are wall times
 
     def markdown(self) -> str:
         """The table as GitHub Markdown, with its title and note."""
@@ -30,9 +41,34 @@ class Table:
             lines += ["", self.note]
         return "\n".join(lines)
 
+    def without_wall(self) -> Table:
+        """With a dash for every wall time."""
+        rows = tuple(
+            tuple(
+                "–" if column in self.wall else cell for column, cell in zip(self.columns, row, strict=True)
+            )
+            for row in self.rows
+        )
+        return replace(self, rows=rows)
+
+
+def busy_share() -> float:
+    """Share of the cores that others use, 0..1: what a loop on every core for a moment does not get."""
+    block = bytes(1 << 20)  # hashed without Python's lock
+
+    def spin(_: int) -> float:
+        began, used = time.perf_counter(), time.thread_time()
+        while time.perf_counter() - began < _SPIN_S:
+            hashlib.sha256(block)
+        return (time.thread_time() - used) / (time.perf_counter() - began)
+
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    with ThreadPoolExecutor(cores) as pool:
+        return max(0.0, 1.0 - sum(pool.map(spin, range(cores))) / cores)
+
 
 def machine() -> str:
-    """One line that names the machine, for the tables."""
+    """One line that names the machine and the day, for the tables."""
     model = platform.processor() or platform.machine()
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists():
@@ -42,15 +78,19 @@ def machine() -> str:
             if "model name" in line
         ]
         model = names[0] if names else model
-    return f"{model}, {os.cpu_count()} cores, Python {platform.python_version()}, {platform.system()}"
+    versions = ", ".join(f"{name} {version(name)}" for name in ("torch", "numba"))
+    python = f"Python {platform.python_version()}, {versions}, {platform.system()}"
+    today = datetime.date.today()
+    return f"{model}, {os.cpu_count()} cores, {python}, {today.day} {today:%B %Y}"
 
 
 def put_tables(text: str, tables: Sequence[Table]) -> str:
-    """`text` with every table placed between its markers; a table without markers is left out."""
-    for table in tables:
-        begin, end = BEGIN.format(name=table.name), END.format(name=table.name)
+    """`text` with every table placed between its markers, and the machine's line; a table without markers is
+    left out."""
+    for name, filled in [("machine", machine()), *((table.name, table.markdown()) for table in tables)]:
+        begin, end = BEGIN.format(name=name), END.format(name=name)
         if begin in text and end in text:
             head, rest = text.split(begin, 1)
             tail = rest.split(end, 1)[1]
-            text = f"{head}{begin}\n{table.markdown()}\n{end}{tail}"
+            text = f"{head}{begin}\n{filled}\n{end}{tail}"
     return text
