@@ -80,8 +80,8 @@ def main(argv: Sequence[str]) -> int:
         return regret(argv[1:])
     options = parse_options(BenchOptions, argv, COMMAND)
     if options.what == ("page",):
-        page, plots = str(ROOT / "docs" / "speed-and-error.md"), str(ROOT / "assets")
-        return main([*PAGE, *argv[1:], "--markdown", page, "--plots", plots])
+        written = ["--markdown", str(ROOT / "docs" / "speed-and-error.md"), "--plots", str(ROOT / "assets")]
+        return main([*PAGE, *argv[1:], *written])
     for name in options.what:
         if name not in BENCHES:
             raise ProgdfError(
@@ -121,7 +121,7 @@ def main(argv: Sequence[str]) -> int:
     busy = busy_share()
     for name in options.what or tuple(BENCHES):
         try:
-            measured = _function(BENCHES[name])(**given.get(name, {}))
+            bare = _function(BENCHES[name])(**given.get(name, {}))
         except ProgdfError as error:
             if options.what:
                 raise
@@ -130,7 +130,7 @@ def main(argv: Sequence[str]) -> int:
         before, busy = busy, busy_share()
         taken = [options.scenes] if options.scenes and name in shown else []
         words = " ".join([name, *(f"--scenes {' '.join(path.name for path in paths)}" for paths in taken)])
-        made = [_stated(table, f"`{COMMAND} {words}`", max(before, busy)) for table in measured]
+        made = [_stated(table, f"`{COMMAND} {words}`", max(before, busy)) for table in bare]
         for table in made:
             print(table.markdown() + "\n", flush=True)
         tables += made
@@ -139,10 +139,10 @@ def main(argv: Sequence[str]) -> int:
             with atomic_write(page) as temporary_file:
                 temporary_file.write_text(filled, encoding="utf-8")
     if options.json:
-        written = {"machine": machine(), "tables": [asdict(table) for table in tables]}
+        measured = {"machine": machine(), "tables": [asdict(table) for table in tables]}
         with atomic_write(options.json) as temporary_file:
             temporary_file.write_text(
-                json.dumps(written, indent=1, ensure_ascii=False) + "\n", encoding="utf-8"
+                json.dumps(measured, indent=1, ensure_ascii=False) + "\n", encoding="utf-8"
             )
     return 0
 

@@ -97,9 +97,10 @@ class InOklab:
         columns = attribute_slices(self.end.shape[1])["sh0"]
         before = self.start[:, columns] * C0 + 0.5
         after = before + self.end[:, columns] * C0
-        lab = torch.lerp(*(srgb_to_oklab(rgb.clamp(0.0, 1.0)) for rgb in (before, after)), s)
+        shown, finished = before.clamp(0.0, 1.0), after.clamp(0.0, 1.0)
+        lab = torch.lerp(srgb_to_oklab(shown), srgb_to_oklab(finished), s)
         # what no screen shows lies beside, on its own straight line
-        beyond = torch.lerp(*(rgb - rgb.clamp(0.0, 1.0) for rgb in (before, after)), s)
+        beyond = torch.lerp(before - shown, after - finished, s)
         moved = s * self.end
         moved[:, columns] = (oklab_to_srgb(lab) + beyond - before) / C0
         return moved

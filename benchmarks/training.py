@@ -34,7 +34,7 @@ from trainer.setup import make_training_setup
 from .ablation.regret import MEASURED, REPORTING, Edit
 from .table import Table
 
-WAYS = ("", "--quick", "--steps 240", "--views 12", "--stages 4", "--preset paper --field auto --quick")
+WAYS = ("", "--quick", "--steps 40", "--views 12", "--stages 4", "--preset paper --field auto --quick")
 """What `progdf train` is given beside what is edited."""
 
 BEAR = 12_000
@@ -90,12 +90,12 @@ def train(task: Task, scene: Gaussians, judge: Evaluator, way: str, out: Path) -
         ProgdfError: the training fails.
     """
     words = [str(task.scene), "--region", task.region, "--editor", task.editor, "--slider", "stages"]
-    command = [sys.executable, "-m", "progdf", "train", *words, *way.split(), "--out", str(out)]
+    command = [sys.executable, "-P", "-m", "progdf", "train", *words, *way.split(), "--out", str(out)]
     began, before = time.perf_counter(), os.times()
     run = subprocess.run(command, capture_output=True, text=True, check=False)
     seconds, after = time.perf_counter() - began, os.times()
     if run.returncode:
-        raise ProgdfError(f"{' '.join(command[2:])}: {run.stderr.strip()}")
+        raise ProgdfError(f"{' '.join(command[3:])}: {run.stderr.strip()}")
     spent = after.children_user + after.children_system - before.children_user - before.children_system
     field = load_gdf(next(out.glob("*.gdf")), scene).field
     psnrs = [judge.psnr(judge.pictures(field.offsets(s)), judge.edited[s]) for s in MEASURED]
@@ -119,13 +119,12 @@ def tables(scenes: Sequence[Path] = (), plot: Path | None = None) -> list[Table]
     if plot is not None:
         panels = []
         for task, runs in found.items():
-            lines = {}
-            for line, pick in (
-                ("at 1", lambda psnrs: psnrs[-1]),
-                ("worst between", lambda psnrs: min(psnrs[:-1])),
-            ):
-                ordered = sorted(runs, key=lambda run: run.processor)
-                lines[line] = [run.processor for run in ordered], [pick(run.psnrs) for run in ordered]
+            runs = sorted(runs, key=lambda run: run.processor)
+            seconds = [run.processor for run in runs]
+            lines = {
+                "at 1": (seconds, [run.psnrs[-1] for run in runs]),
+                "worst between": (seconds, [min(run.psnrs[:-1]) for run in runs]),
+            }
             title = f"{task.scene.stem}, {task.editor}: dB"
             panels.append(Plot(title, lines, "seconds of the processor"))
         save_plots(panels, plot)

@@ -79,7 +79,7 @@ class Start:
 
 
 def tables(scenes: Sequence[Path] = ()) -> list[Table]:
-    """Measure, for docs/benchmarks.md.
+    """Measure, for docs/speed-and-error.md.
 
     Args:
         scenes: .ply files that take the place of the bears; the largest is also laid over itself four times
@@ -146,7 +146,8 @@ def measure_turning(
                     wrong,
                     opened_s[way],
                     tuple(coarse[way].frames_ms[WARM_UP:]),
-                    *(float(np.median(turned[way].processor_ms[WARM_UP:])) for turned in (full, coarse)),
+                    float(np.median(full[way].processor_ms[WARM_UP:])),
+                    float(np.median(coarse[way].processor_ms[WARM_UP:])),
                     min(errors),
                     _at_rest(mouse),
                 )

@@ -62,7 +62,7 @@ class Moving:
 
 
 def tables(scenes: Sequence[Path] = ()) -> list[Table]:
-    """Measure, for docs/benchmarks.md.
+    """Measure, for docs/speed-and-error.md.
 
     Args:
         scenes: .ply files that take the place of the bears; the largest is laid over itself up to a million

@@ -88,7 +88,7 @@ class SliderTimes:
 
 
 def tables(scenes: Sequence[Path] = ()) -> list[Table]:
-    """Measure, for docs/benchmarks.md.
+    """Measure, for docs/speed-and-error.md.
 
     Args:
         scenes: .ply files that take the place of the bears
