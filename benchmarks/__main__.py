@@ -80,7 +80,7 @@ def main(argv: Sequence[str]) -> int:
         return regret(argv[1:])
     options = parse_options(BenchOptions, argv, COMMAND)
     if options.what == ("page",):
-        written = ["--markdown", str(ROOT / "docs" / "speed-and-error.md"), "--plots", str(ROOT / "assets")]
+        written = ["--markdown", str(ROOT / "docs/speed-and-error.md"), "--plots", str(ROOT / "assets")]
         return main([*PAGE, *argv[1:], *written])
     for name in options.what:
         if name not in BENCHES:

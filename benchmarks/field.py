@@ -43,14 +43,13 @@ from progdf.rasterize import set_threads
 from progdf.sh import C0
 from progdf.threads import threads
 from trainer.optimize.color_solver import add_bands, make_solver
-from trainer.report.plots import Plot
 from trainer.run.threads import use_threads
 
 from .ablation.regret import MEASURED, REPORTING, Edit
 from .analytic_edits import bear_edits
 from .courses import edit_of, known_edit, milliseconds, processor_milliseconds
 from .table import Table
-from .training import edit_of_task, save_plots, tasks
+from .training import Point, edit_of_task, save_plot, tasks
 
 STAGES, STEPS, RANKS = 8, 12, (0, 1, 2)
 """Even strengths at most; steps of conjugate gradients of a residual at each; its ranks."""
@@ -128,7 +127,11 @@ def tables(scenes: Sequence[Path] = (), plot: Path | None = None) -> list[Table]
         use_threads(0)
         torch.set_num_threads(before)
     if plot is not None:
-        save_plots([_plot(forms, edit) for edit in dict.fromkeys(form.edit for form in forms)], plot)
+        panels: dict[str, list[Point]] = {}
+        for form in forms:
+            point = Point(form.kind, form.bytes, form.psnrs, form.chosen)
+            panels.setdefault(form.edit, []).append(point)
+        save_plot(panels, "bytes a member", plot)
     return [field_table(forms), _compose_table()]
 
 
@@ -162,7 +165,7 @@ def color_forms(name: str, edit: Edit) -> list[Form]:
             field = bake_grade(form, edit.original, mapped)
             label = f"grade of degree {degree} ({len(table[0])} × 3 numbers a knot)"
             label += f", residual of rank {rank}" if rank else " alone"
-            measure(f"grade {degree}", label, form.bytes_per_member, field, began)
+            measure(f"grade of degree {degree}", label, form.bytes_per_member, field, began)
         if degree == max(1, model.degree):
             moved = [add_bands(m, r) for (_, m), r in zip(maps, own, strict=True)]
             width = edit.original.shape[1]
@@ -171,9 +174,9 @@ def color_forms(name: str, edit: Edit) -> list[Form]:
             )
     began = time.process_time()
     field = fit_keyframes(knots, recording, 2)
-    measure("2 keyframes", "2 keyframes, raw", field.bytes_per_member, field, began)
+    measure("2 keyframes, raw", "2 keyframes, raw", field.bytes_per_member, field, began)
     straight = InOklab(edit.original, recording[-1], tuple(field.attributes))
-    measure("2 keyframes", "2 keyframes, OKLab", field.bytes_per_member, straight, began)
+    measure("2 keyframes, OKLab", "2 keyframes, OKLab", field.bytes_per_member, straight, began)
     views = edit.evaluator(edit.choosing, {})
     for target in TARGETS:
         began = time.process_time()
@@ -192,7 +195,15 @@ def color_forms(name: str, edit: Edit) -> list[Form]:
     chosen = f"{automatic.name.partition(': ')[2]}: what a run ships"
     return [
         *forms,
-        Form(name, "shipped", chosen, automatic.bytes, tuple(automatic.psnrs), automatic.seconds, True),
+        Form(
+            name,
+            f"grade of degree {model.degree}",
+            chosen,
+            automatic.bytes,
+            tuple(automatic.psnrs),
+            automatic.seconds,
+            True,
+        ),
     ]
 
 
@@ -218,7 +229,7 @@ def moved_forms() -> list[Form]:
 
     for count in (2, 4, 9):
         measure(
-            "keyframes",
+            "2 keyframes, raw" if count == 2 else "4, 9 keyframes",
             lambda c=count: (fit_keyframes(course.strengths, course.offsets, c), f"{c} keyframes, raw"),  # type: ignore[misc]
         )
 
@@ -282,16 +293,6 @@ def field_table(forms: Sequence[Form]) -> Table:
         "its numbers once for all members. The motion: PSNR to its true course, over the pixels that it "
         "changes. Seconds: to fit; of the bold grade with its solving.",
     )  # fmt: skip
-
-
-def _plot(forms: Sequence[Form], edit: str) -> Plot:
-    lines: dict[str, tuple[list[float], list[float]]] = {}
-    for form in forms:
-        if form.edit == edit:
-            xs, ys = lines.setdefault("shipped" if form.chosen else form.kind, ([], []))
-            xs.append(form.bytes)
-            ys.append(min(form.psnrs))
-    return Plot(f"{edit}: worst dB", lines, "bytes a member")
 
 
 def _compose_table() -> Table:

@@ -16,6 +16,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure as Drawing
+from matplotlib.lines import Line2D
 from PIL import Image
 
 from progdf.demo_scenes import bear
@@ -28,7 +31,7 @@ from progdf.io.atomic import atomic_write
 from progdf.scene.regions import parse_region
 from trainer.fit.evaluate import Evaluator
 from trainer.options import ViewOptions
-from trainer.report.plots import Plot, draw_plot
+from trainer.report.plots import GRID, INK, LINES, PAPER
 from trainer.setup import make_training_setup
 
 from .ablation.regret import MEASURED, REPORTING, Edit
@@ -39,6 +42,8 @@ WAYS = ("", "--quick", "--steps 40", "--views 12", "--stages 4", "--preset paper
 
 BEAR = 12_000
 """Gaussians of the bear, whose scarf is striped."""
+
+_MARKS = "os^DvPX*<>"  # of a plot's kinds
 
 STRIPES, BLUE, TINT = "stripes:#20a040", "recolor:#3060d0", "tint:#c08040"
 """What is done to the scarf, to what is labeled 1 in a given scene, and to all of one without labels."""
@@ -117,17 +122,13 @@ def tables(scenes: Sequence[Path] = (), plot: Path | None = None) -> list[Table]
             outs = (Path(name) / f"{len(found)}-{i}" for i in range(len(WAYS)))
             found[task] = [train(task, edit.scene, judge, *pair) for pair in zip(WAYS, outs, strict=True)]
     if plot is not None:
-        panels = []
-        for task, runs in found.items():
-            runs = sorted(runs, key=lambda run: run.processor)
-            seconds = [run.processor for run in runs]
-            lines = {
-                "at 1": (seconds, [run.psnrs[-1] for run in runs]),
-                "worst between": (seconds, [min(run.psnrs[:-1]) for run in runs]),
-            }
-            title = f"{task.scene.stem}, {task.editor}: dB"
-            panels.append(Plot(title, lines, "seconds of the processor"))
-        save_plots(panels, plot)
+        panels = {
+            f"{task.scene.stem}, {task.editor}": [
+                Point(run.way or "default", run.processor, run.psnrs) for run in runs
+            ]
+            for task, runs in found.items()
+        }
+        save_plot(panels, "seconds of the processor", plot)
     return [table(found)]
 
 
@@ -167,12 +168,61 @@ def table(found: Mapping[Task, Sequence[Trained]]) -> Table:
     return Table("training", "Training: error over time", columns, tuple(rows), note, ("wall, s",))
 
 
-def save_plots(plots: Sequence[Plot], path: Path) -> None:
-    """Plots side by side in one small PNG file."""
-    pictures = [np.asarray(draw_plot(plot, 380, 270).convert("RGB")) for plot in plots]
-    page = Image.fromarray(np.concatenate(pictures, axis=1)).quantize(64, dither=Image.Dither.NONE)
+@dataclass(frozen=True)
+class Point:
+    """Something that is measured, in a plot."""
+
+    kind: str  # in the legend
+    x: float  # ≥ 0
+    psnrs: Sequence[float]  # at `MEASURED`, dB
+    chosen: bool = False
+
+
+def save_plot(panels: Mapping[str, Sequence[Point]], across: str, path: Path) -> None:
+    """Panels side by side in one small PNG file; a point at its error at 1, a stroke to its worst between."""
+    kinds = list(dict.fromkeys(point.kind for points in panels.values() for point in points))
+    drawing = Drawing((3.8 * len(panels), 3.6), 100, facecolor=_shade(PAPER), layout="constrained")
+    for axes, (title, points) in zip(
+        drawing.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True
+    ):
+        axes.set_facecolor(_shade(PAPER))
+        axes.set_title(title, loc="left", fontsize=9)
+        axes.set_xlabel(across, fontsize=8)
+        axes.set_ylabel("dB at 1; the stroke: worst between", fontsize=8)
+        axes.tick_params(labelsize=8, length=0)
+        axes.grid(color=_shade(GRID))
+        axes.spines[:].set_visible(False)
+        most = max(point.x for point in points)
+        axes.set_xlim(-0.03 * most, 1.08 * most)
+        if min(point.x for point in points) == 0.0:  # bytes, of 0 to some hundred
+            axes.set_xscale("symlog", linthresh=1.0)
+            axes.xaxis.set_major_formatter(lambda x, _: f"{x:g}")
+            axes.set_xlim(-0.2, 1.5 * most)
+        for point in points:
+            index = kinds.index(point.kind)
+            color, mark = _shade(LINES[index % len(LINES)]), _MARKS[index % len(_MARKS)]
+            axes.plot([point.x] * 2, [point.psnrs[-1], min(point.psnrs[:-1])], color=color, linewidth=1)
+            axes.plot(point.x, point.psnrs[-1], mark, color=color, markersize=5, zorder=3)
+            if point.chosen:
+                axes.plot(point.x, point.psnrs[-1], "o", mfc="none", mec=_shade(INK), markersize=11)
+    handles = []
+    for index, kind in enumerate(kinds):
+        color, mark = _shade(LINES[index % len(LINES)]), _MARKS[index % len(_MARKS)]
+        handles.append(Line2D([], [], color=color, marker=mark, linewidth=0, label=kind))
+    if any(point.chosen for points in panels.values() for point in points):
+        handles.append(Line2D([], [], mfc="none", mec=_shade(INK), marker="o", linewidth=0, label="chosen"))
+    drawing.legend(
+        handles=handles, loc="outside lower left", fontsize=7.5, ncols=2 * len(panels), frameon=False
+    )
+    canvas = FigureCanvasAgg(drawing)
+    canvas.draw()
+    page = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
     with atomic_write(path) as temporary_file:
-        page.save(temporary_file, format="PNG", optimize=True)
+        page.quantize(64, dither=Image.Dither.NONE).save(temporary_file, format="PNG", optimize=True)
+
+
+def _shade(color: tuple[int, int, int]) -> tuple[float, ...]:
+    return tuple(channel / 255 for channel in color)
 
 
 def _short(region: str) -> str:

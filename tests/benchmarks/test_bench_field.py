@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from PIL import Image
 
 from benchmarks import field, training
-from benchmarks.field import Form, InOklab
-from benchmarks.training import Task, Trained, save_plots, table, tasks
+from benchmarks.field import InOklab
+from benchmarks.training import Point, Task, Trained, save_plot, table, tasks
 from progdf.color.oklab import srgb_to_oklab
 from progdf.sh import C0
+from trainer.report.plots import LINES
 
 
 @pytest.fixture
@@ -91,12 +93,14 @@ def test_the_training_table_names_the_worst_strength_between() -> None:
     assert row == ("a, tint:#c08040", "(default)", "35.0", "30.0", "31.0 30.0 33.0 34.0", "12", "10", "6")
 
 
-def test_a_form_is_drawn_where_its_bytes_and_its_worst_error_are(tmp_path: Path) -> None:
-    forms = [
-        Form("bear", "grade 1", "a", 3.0, (40.0, 50.0), 0.1),
-        Form("bear", "x", "b", 6.0, (45.0, 41.0), 0.1, True),
-    ]
-    plot = field._plot(forms, "bear")
-    assert plot.lines == {"grade 1": ([3.0], [40.0]), "shipped": ([6.0], [41.0])}
-    save_plots([plot, plot], tmp_path / "two.png")
+def test_a_point_is_drawn_where_its_error_is(tmp_path: Path) -> None:
+    def height(psnr: float) -> float:
+        """Where the second point of two is, the first at 30 dB."""
+        points = [Point("a", 3.0, (30.0, 30.0)), Point("b", 6.0, (psnr, psnr), True)]
+        save_plot({"bear": points, "robot": points}, "bytes", tmp_path / "two.png")
+        with Image.open(tmp_path / "two.png") as picture:
+            pixels = np.asarray(picture.convert("RGB").crop((0, 0, 380, 250))).astype(int)
+        return float((abs(pixels - LINES[1]).sum(axis=2) < 40).nonzero()[0].mean())
+
+    assert height(50.0) < height(20.0)
     assert (tmp_path / "two.png").stat().st_size < 40_000
