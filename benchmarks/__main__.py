@@ -149,9 +149,10 @@ def main(argv: Sequence[str]) -> int:
 
 def _stated(table: Table, command: str, busy: float) -> Table:
     """With what made it; and without wall times where others used the cores."""
-    if busy > BUSY and table.wall:
-        table = table.without_wall()
-        command += f"; others used {100 * busy:.0f} % of the cores, so wall times are left out"
+    bare = table.without_wall()
+    if busy > BUSY and bare != table:
+        table, share = bare, f"{100 * busy:.0f} %"
+        command += f"; others used {share} of the cores, so wall times and what depends on them are left out"
     return replace(table, note=f"{table.note} Made by {command}.".strip())
 
 

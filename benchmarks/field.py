@@ -48,7 +48,7 @@ from trainer.run.threads import use_threads
 from .ablation.regret import MEASURED, REPORTING, Edit
 from .analytic_edits import bear_edits
 from .courses import edit_of, known_edit, milliseconds, processor_milliseconds
-from .table import Table
+from .table import Table, Wall
 from .training import Point, edit_of_task, save_plot, tasks
 
 STAGES, STEPS, RANKS = 8, 12, (0, 1, 2)
@@ -315,21 +315,17 @@ def _compose_table() -> Table:
         columns=(
             "members / Gaussians",
             "MB moved",
-            "copying, ms",
+            Wall("copying, ms"),
             "compose, processor ms",
-            "Composer 1 thread, ms",
+            Wall("Composer 1 thread, ms"),
             "of the processor, ms",
-            "2 threads, ms",
-            "of these for one member",
-            "ratio to copying, 1 / 2 threads",
+            Wall("2 threads, ms"),
+            Wall("of these for one member"),
+            Wall("ratio to copying, 1 / 2 threads"),
             "largest difference",
             "the paper's network asked, processor ms",
         ),
         rows=tuple(rows),
-        wall=(
-            "copying, ms", "Composer 1 thread, ms", "2 threads, ms", "of these for one member",
-            "ratio to copying, 1 / 2 threads",
-        ),
         note="Medians, taken in turns. Moved: what a step must read (bases, the original, the last centers, "
         "row numbers) and write; copying: a NumPy copy that reads and writes as much, one thread. What one "
         "member takes does not grow. The plain compose also checks that the edit belongs to the scene. A "

@@ -22,7 +22,7 @@ from progdf.camera import Camera, intrinsics
 from progdf.rasterize import reference, render, set_threads
 from progdf.rasterize.engines import ActivatedGaussians, RasterView
 
-from .table import Table
+from .table import Table, Wall
 
 INPUTS = ("means", "quats", "scales", "opacities", "colors")
 
@@ -211,16 +211,15 @@ def tables() -> list[Table]:
         "Gaussians",
         "pixels",
         "threads",
-        "forward (ms)",
-        "forward + backward (ms)",
+        Wall("forward (ms)"),
+        Wall("forward + backward (ms)"),
         "of the processor (ms)",
-        "tiled torch (ms)",
+        Wall("tiled torch (ms)"),
         "ratio",
         "plain version, of the processor (ms)",
         "image error",
         "worst gradient error",
     )
-    wall = ("forward (ms)", "forward + backward (ms)", "tiled torch (ms)")
     note = (
         "Median and range; the engines take turns in one process. The plain version is "
         "`progdf.rasterize.reference` in float64, forward alone where no gradient error is given. Errors are "
@@ -228,7 +227,7 @@ def tables() -> list[Table]:
         "tiles of torch are the easy opponent: OpenSplat's CPU engine, in one run with an earlier engine of "
         "ours, took 4.5 to 8.9 times as long as that, its gradients of quats and scales being wrong."
     )
-    return [Table("rasterize", "CPU rasterizer", columns, tuple(rows), note, wall)]
+    return [Table("rasterize", "CPU rasterizer", columns, tuple(rows), note)]
 
 
 def hard_tables() -> list[Table]:

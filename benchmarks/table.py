@@ -21,6 +21,10 @@ BUSY = 0.05
 _SPIN_S = 0.3
 
 
+class Wall(str):
+    """The heading of a column of wall times, or of what depends on them."""
+
+
 @dataclass(frozen=True)
 class Table:
     """One benchmark's result."""
@@ -30,7 +34,6 @@ class Table:
     columns: tuple[str, ...]  # headings, with units
     rows: tuple[tuple[str, ...], ...]  # one text a column
     note: str = ""  # what was measured and how, one or two lines
-    wall: tuple[str, ...] = ()  # the columns that are wall times
 
     def markdown(self) -> str:
         """The table as GitHub Markdown, with its title and note."""
@@ -42,12 +45,10 @@ class Table:
         return "\n".join(lines)
 
     def without_wall(self) -> Table:
-        """With a dash for every wall time."""
+        """With a dash for everything below a `Wall`."""
+        walls = [isinstance(column, Wall) for column in self.columns]
         rows = tuple(
-            tuple(
-                "–" if column in self.wall else cell for column, cell in zip(self.columns, row, strict=True)
-            )
-            for row in self.rows
+            tuple("–" if w else cell for w, cell in zip(walls, row, strict=True)) for row in self.rows
         )
         return replace(self, rows=rows)
 

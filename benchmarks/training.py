@@ -35,7 +35,7 @@ from trainer.report.plots import GRID, INK, LINES, PAPER
 from trainer.setup import make_training_setup
 
 from .ablation.regret import MEASURED, REPORTING, Edit
-from .table import Table
+from .table import Table, Wall
 
 WAYS = ("", "--quick", "--steps 40", "--views 12", "--stages 4", "--preset paper --field auto --quick")
 """What `progdf train` is given beside what is edited."""
@@ -153,7 +153,7 @@ def table(found: Mapping[Task, Sequence[Trained]]) -> Table:
     strengths = ", ".join(f"{s:g}" for s in MEASURED[:-1])
     columns = (
         "edit", "`progdf train` with", "dB at 1", "worst between, dB", f"at {strengths}",
-        "processor, s", "wall, s", "bytes a member",
+        "processor, s", Wall("wall, s"), "bytes a member",
     )  # fmt: skip
     commands = ", ".join(
         f"`progdf train {task.scene.name} --region {_short(task.region)} --editor {task.editor} "
@@ -165,7 +165,7 @@ def table(found: Mapping[Task, Sequence[Trained]]) -> Table:
         "chose, over the pixels that show the region; whole processes, imports and the report's pictures "
         f"included. Each row is that option added to: {commands}."
     )
-    return Table("training", "Training: error over time", columns, tuple(rows), note, ("wall, s",))
+    return Table("training", "Training: error over time", columns, tuple(rows), note)
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from benchmarks.table import Table
+from benchmarks.table import Table, Wall
 from progdf.formats.ply import save_ply
 from progdf.metrics.image import psnr
 from progdf.threads import one_thread
@@ -198,12 +198,12 @@ def frames_table(turnings: Sequence[Turning], starts: Sequence[Start], renderer:
         (
             "Gaussians",
             "drawn by",
-            "sort and draw, ms",
-            "whole frame p50 / p95, ms",
+            Wall("sort and draw, ms"),
+            Wall("whole frame p50 / p95, ms"),
             "of the processor, ms",
             "the same drawn afresh",
-            "first picture of an opened file, s",
-            "of `progdf view`, s (imports)",
+            Wall("first picture of an opened file, s"),
+            Wall("of `progdf view`, s (imports)"),
             "memory by then, MB",
         ),
         tuple(rows),
@@ -236,17 +236,16 @@ def coarse_table(turnings: Sequence[Turning], renderer: str) -> Table:
         (
             "Gaussians",
             "drawn by",
-            "frame in full, ms",
-            "coarse, ms",
-            "ratio",
+            Wall("frame in full, ms"),
+            Wall("coarse, ms"),
+            Wall("ratio"),
             "of the processor, ms: full / coarse",
-            "PSNR while moving, dB",
+            Wall("PSNR while moving, dB"),
             "difference at rest, of 255",
         ),
         tuple(rows),
         f"OpenGL by {renderer}. Medians of whole frames while orbiting; one pixel drawn fills "
         f"{COARSE}×{COARSE} of the window. The error is the worst of {KEPT} frames.",
-        ("frame in full, ms", "coarse, ms", "ratio"),
     )
 
 

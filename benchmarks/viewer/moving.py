@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch.nn.functional import interpolate
 
-from benchmarks.table import Table
+from benchmarks.table import Table, Wall
 from progdf.demo_scenes import bear
 from progdf.gaussians import Gaussians
 from progdf.metrics.image import psnr
@@ -156,15 +156,15 @@ def table(results: Sequence[Moving]) -> Table:
         f"A scene in the hand without a graphics card, {SIZE[0]}×{SIZE[1]}, ms",
         (
             "Gaussians",
-            "picture in full",
-            "frame while turning p50 / p95",
+            Wall("picture in full"),
+            Wall("frame while turning p50 / p95"),
             "of the processor",
-            "beside a training",
-            "sharp after (longest frame)",
-            "click",
-            "lasso let go",
-            "PSNR while turning, dB",
-            "luminance while turning",
+            Wall("beside a training"),
+            Wall("sharp after (longest frame)"),
+            Wall("click"),
+            Wall("lasso let go"),
+            Wall("PSNR while turning, dB"),
+            Wall("luminance while turning"),
             "pyramid, s of the processor",
             "its memory, of the scene's",
         ),
@@ -172,14 +172,6 @@ def table(results: Sequence[Moving]) -> Table:
         "Whole frames, from the mouse's event to finished pixels of picture and panel; each step of "
         f"{STEPS} turns three degrees. The errors are the worst of {JUDGED} pictures, on white, as they are "
         "shown: stretched smoothly. The pyramid is built before.",
-        (
-            "picture in full",
-            "frame while turning p50 / p95",
-            "beside a training",
-            "sharp after (longest frame)",
-            "click",
-            "lasso let go",
-        ),
     )
 
 

@@ -16,7 +16,7 @@ import moderngl
 import numpy as np
 import torch
 
-from benchmarks.table import Table
+from benchmarks.table import Table, Wall
 from progdf.gaussians import Gaussians
 from progdf.metrics.image import psnr
 from progdf.rasterize import render
@@ -160,19 +160,18 @@ def table(results: Sequence[SliderTimes], renderer: str) -> Table:
             "members",
             "edit of",
             "drawn by",
-            "compose",
-            "upload",
-            "sort",
-            "draw",
-            "panel, screen",
-            "in all p50 / p95",
+            Wall("compose"),
+            Wall("upload"),
+            Wall("sort"),
+            Wall("draw"),
+            Wall("panel, screen"),
+            Wall("in all p50 / p95"),
             "processor",
             "PSNR to the CPU engine, dB",
         ),
         tuple(_cells(result) for result in results),
         f"OpenGL by {renderer}. A hand drags the slider of a window without a screen; wall clock, the GPU "
         "waited for, the parts are medians; processor: of all cores. The CPU rasterizer sorts as it draws.",
-        ("compose", "upload", "sort", "draw", "panel, screen", "in all p50 / p95"),
     )
 
 

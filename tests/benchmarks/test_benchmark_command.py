@@ -12,7 +12,7 @@ import pytest
 
 from benchmarks import __main__ as command
 from benchmarks.__main__ import main
-from benchmarks.table import Table, busy_share, machine
+from benchmarks.table import Table, Wall, busy_share, machine
 from progdf.errors import ProgdfError
 
 
@@ -31,9 +31,7 @@ def test_an_unknown_benchmark_is_named_with_those_there_are() -> None:
 
 
 def _table(**_: object) -> list[Table]:
-    return [
-        Table("hard", "A table", ("case", "ms", "processor ms"), (("one", "7", "5"),), "A note.", ("ms",))
-    ]
+    return [Table("hard", "A table", ("case", Wall("ms"), "processor ms"), (("one", "7", "5"),), "A note.")]
 
 
 @pytest.mark.parametrize(("busy", "ms"), [(0.0, "7"), (0.5, "–")])
