@@ -22,7 +22,7 @@ from progdf.cli.options import parse_options
 from progdf.errors import ProgdfError
 from progdf.io.atomic import atomic_write
 
-from .table import BUSY, Table, busy_share, machine, put_tables
+from .table import BUSY, Table, busy_share, machine, put_tables, today
 
 COMMAND = "python -m benchmarks"
 
@@ -153,7 +153,7 @@ def _stated(table: Table, command: str, busy: float) -> Table:
     if busy > BUSY and bare != table:
         table, share = bare, f"{100 * busy:.0f} %"
         command += f"; others used {share} of the cores, so wall times and what depends on them are left out"
-    return replace(table, note=f"{table.note} Made by {command}.".strip())
+    return replace(table, note=f"{table.note} Made by {command}; {today()}.".strip())
 
 
 def _function(path: str) -> Callable[..., Any]:

@@ -43,7 +43,6 @@ from progdf.rasterize import set_threads
 from progdf.sh import C0
 from progdf.threads import threads
 from trainer.optimize.color_solver import add_bands, make_solver
-from trainer.run.threads import use_threads
 
 from .ablation.regret import MEASURED, REPORTING, Edit
 from .analytic_edits import bear_edits
@@ -113,19 +112,13 @@ def tables(scenes: Sequence[Path] = (), plot: Path | None = None) -> list[Table]
             `MOST` members
         plot: also draw the errors into this PNG file
     """
-    before = torch.get_num_threads()
-    use_threads(1)
-    try:
-        forms = list[Form]()
-        with tempfile.TemporaryDirectory() as name:
-            for task in tasks(Path(name), scenes):
-                edit = edit_of_task(task)
-                if len(edit.region) <= MOST:
-                    forms += color_forms(f"{task.scene.stem}, {task.editor}", edit)
-        forms += moved_forms()
-    finally:
-        use_threads(0)
-        torch.set_num_threads(before)
+    forms = list[Form]()
+    with tempfile.TemporaryDirectory() as name:
+        for task in tasks(Path(name), scenes):
+            edit = edit_of_task(task)
+            if len(edit.region) <= MOST:
+                forms += color_forms(f"{task.scene.stem}, {task.editor}", edit)
+    forms += moved_forms()
     if plot is not None:
         panels: dict[str, list[Point]] = {}
         for form in forms:
@@ -329,7 +322,7 @@ def _compose_table() -> Table:
         note="Medians, taken in turns. Moved: what a step must read (bases, the original, the last centers, "
         "row numbers) and write; copying: a NumPy copy that reads and writes as much, one thread. What one "
         "member takes does not grow. The plain compose also checks that the edit belongs to the scene. A "
-        "network is asked once, untrained, on one thread.",
+        "network is asked once, untrained.",
     )  # fmt: skip
 
 

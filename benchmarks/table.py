@@ -81,8 +81,13 @@ def machine() -> str:
         model = names[0] if names else model
     versions = ", ".join(f"{name} {version(name)}" for name in ("torch", "numba"))
     python = f"Python {platform.python_version()}, {versions}, {platform.system()}"
-    today = datetime.date.today()
-    return f"{model}, {os.cpu_count()} cores, {python}, {today.day} {today:%B %Y}"
+    return f"{model}, {os.cpu_count()} cores, {python}, {today()}"
+
+
+def today() -> str:
+    """The day, in words."""
+    day = datetime.date.today()
+    return f"{day.day} {day:%B %Y}"
 
 
 def put_tables(text: str, tables: Sequence[Table]) -> str:

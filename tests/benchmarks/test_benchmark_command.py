@@ -12,7 +12,7 @@ import pytest
 
 from benchmarks import __main__ as command
 from benchmarks.__main__ import main
-from benchmarks.table import Table, Wall, busy_share, machine
+from benchmarks.table import Table, Wall, busy_share, machine, today
 from progdf.errors import ProgdfError
 
 
@@ -50,6 +50,7 @@ def test_wall_times_are_left_out_where_others_use_the_cores(
     text = page.read_text()
     assert f"| one | {ms} | 5 |" in text
     assert "A note. Made by `python -m benchmarks hard`" in text
+    assert text.count(today()) == 2
     assert ("others used 50 % of the cores" in text) == (busy > 0)
     assert f"<!-- bench machine -->\n{machine()}\n<!-- end machine -->" in text
 
