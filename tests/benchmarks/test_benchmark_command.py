@@ -56,11 +56,11 @@ def test_wall_times_are_left_out_where_others_use_the_cores(
 
 
 def test_a_loop_in_another_process_is_seen() -> None:
-    """A loop on every core, beside which half of each is left, or all if it has come to its end."""
+    """A loop on every core, beside which half of each is left."""
     loop = [sys.executable, "-c", "while True: pass"]
     children = [subprocess.Popen(loop) for _ in range(os.cpu_count() or 1)]
     try:
-        assert max(busy_share() for _ in range(5)) > 0.3
+        assert busy_share() > 0.3
     finally:
         for child in children:
             child.kill()
