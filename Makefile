@@ -71,4 +71,4 @@ pictures: setup window
 	$(BIN)/progdf demo --out demo --no-window
 	cp demo/hero.png demo/one-picture.png assets/
 	assets/window.sh $(BIN)/progdf demo assets/window.png
-	$(BIN)/python -m benchmarks --markdown docs/benchmarks.md benchmarks/results/*.md
+	$(BIN)/python -m benchmarks --markdown docs/*.md benchmarks/results/*.md --plots assets

@@ -1,7 +1,8 @@
 """`python -m benchmarks`: run the benchmarks and print their tables, each speed beside its error.
 
 `python -m benchmarks ablate RUN …` trains finished runs again without each part of the method, `python -m
-benchmarks sliders FOLDER` trains edits whose pictures are known at every strength.
+benchmarks sliders FOLDER` trains edits whose pictures are known at every strength, and `python -m benchmarks
+page` fills docs/speed-and-error.md. Wall times are left out where others use the cores.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import importlib
 import json
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,12 +22,14 @@ from progdf.cli.options import parse_options
 from progdf.errors import ProgdfError
 from progdf.io.atomic import atomic_write
 
-from .table import Table, machine, put_tables
+from .table import BUSY, Table, busy_share, machine, put_tables, today
 
 COMMAND = "python -m benchmarks"
 
 BENCHES: dict[str, str] = {
+    "training": "benchmarks.training:tables",
     "rasterize": "benchmarks.rasterizer:tables",
+    "hard": "benchmarks.rasterizer:hard_tables",
     "field": "benchmarks.field:tables",
     "edits": "benchmarks.edits:tables",
     "networks": "benchmarks.networks:tables",
@@ -39,7 +42,10 @@ BENCHES: dict[str, str] = {
     "pictures": "benchmarks.pictures:tables",
 }
 
-RECORDED = "benchmarks.recorded_runs:recorded_edit"
+PAGE = ("training", "field", "viewer", "rasterize", "moving", "frames", "hard")
+"""What docs/speed-and-error.md is made of."""
+
+ROOT = Path(__file__).parents[1]
 
 
 @dataclass(frozen=True)
@@ -47,19 +53,19 @@ class BenchOptions:
     """Measure speed against error; each benchmark interleaves what it compares in one process."""
 
     what: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
-    """rasterize, field, edits, networks, viewer, select, frames, moving, window, warps, pictures; none named
-    is all."""
+    """page (all of docs/speed-and-error.md), training, rasterize, hard, field, edits, networks, viewer,
+    select, frames, moving, window, warps, pictures; none named is all."""
     json: Path | None = None
     """also write the tables to this JSON file."""
     markdown: tuple[Path, ...] = ()
     """also put the tables between their markers in these Markdown files."""
     runs: tuple[Path, ...] = ()
     """finished run folders: `edits` and `networks` measure them, `field` beside the bear's edits."""
-    plot: Path | None = None
-    """`field` also draws its errors into this PNG file."""
+    plots: Path | None = None
+    """`training` and `field` also draw their errors into PNG files of their names in this folder."""
     scenes: tuple[Path, ...] = ()
-    """.ply files that viewer, select, frames, moving and window take in place of the bears, warps beside
-    them, and pictures alone."""
+    """.ply files that viewer, select, frames, moving and window take in place of the bears, training,
+    field and warps beside them, and pictures alone; those of `page` are for training and fields."""
     seconds: float | None = None
     """how long `window` drags its slider; 60 where not said."""
 
@@ -73,59 +79,81 @@ def main(argv: Sequence[str]) -> int:
     if list(argv[:1]) == ["regret"]:
         return regret(argv[1:])
     options = parse_options(BenchOptions, argv, COMMAND)
+    if options.what == ("page",):
+        written = ["--markdown", str(ROOT / "docs/speed-and-error.md"), "--plots", str(ROOT / "assets")]
+        return main([*PAGE, *argv[1:], *written])
     for name in options.what:
         if name not in BENCHES:
             raise ProgdfError(
                 f"unknown benchmark '{name}'; use one of "
-                f"{', '.join((*BENCHES, 'ablate', 'sliders', 'regret'))}"
+                f"{', '.join((*BENCHES, 'page', 'ablate', 'sliders', 'regret'))}"
             )
-    if options.plot and options.what and "field" not in options.what:
-        raise ProgdfError("--plot is for fields; use python -m benchmarks field")
-    trained = ("field", "edits", "networks")
+    plotted = ("training", "field")
+    if options.plots and options.what and not set(plotted) & set(options.what):
+        raise ProgdfError(f"--plots are for {', '.join(plotted)}; use python -m benchmarks {plotted[0]}")
+    trained = ("edits", "networks")
     if options.runs and options.what and not set(trained) & set(options.what):
         raise ProgdfError(f"--runs are for {', '.join(trained)}; use python -m benchmarks {trained[0]}")
-    drawing = ("viewer", "select", "frames", "moving", "window", "warps", "pictures")
+    drawing = (*plotted, "viewer", "select", "frames", "moving", "window", "warps", "pictures")
     if options.scenes and options.what and not set(drawing) & set(options.what):
-        raise ProgdfError(f"--scenes are for {', '.join(drawing)}; use python -m benchmarks {drawing[0]}")
+        raise ProgdfError(f"--scenes are for {', '.join(drawing)}; use python -m benchmarks viewer")
     if options.seconds is not None and options.what and "window" not in options.what:
         raise ProgdfError("--seconds is how long the window is dragged; use python -m benchmarks window")
-    for output in (options.json, options.plot):  # told now, not when an hour has been measured
-        if output is not None and not output.parent.is_dir():
-            raise ProgdfError(f"the folder {output.parent} does not exist; create it first")
+    for folder in (
+        options.json and options.json.parent,
+        options.plots,
+    ):  # told before an hour has been measured
+        if folder is not None and not folder.is_dir():
+            raise ProgdfError(f"the folder {folder} does not exist; create it first")
     for page in options.markdown:
         if not page.is_file():
             raise ProgdfError(f"{page} does not exist; check the name and the folder")
-    given: dict[str, dict[str, object]] = {"field": {"plot": options.plot}}
-    given |= {name: {"runs": options.runs} for name in ("edits", "networks")}
-    if options.runs and (not options.what or "field" in options.what):
-        given["field"]["recorded"] = [_function(RECORDED)(run) for run in options.runs]
-    given |= {name: {"scenes": options.scenes} for name in drawing}
+    given: dict[str, dict[str, object]] = {name: {"runs": options.runs} for name in trained}
+    shown = plotted if options.what[: len(PAGE)] == PAGE else drawing
+    given |= {name: {"scenes": options.scenes} for name in shown}
+    if options.plots:
+        for name in plotted:
+            given[name]["plot"] = options.plots / f"{name}.png"
     if options.seconds is not None:
         given["window"]["seconds"] = options.seconds
     tables: list[Table] = []
     print(f"{machine()}\n")
+    busy = busy_share()
     for name in options.what or tuple(BENCHES):
         try:
-            measured = _function(BENCHES[name])(**given.get(name, {}))
+            bare = _function(BENCHES[name])(**given.get(name, {}))
         except ProgdfError as error:
             if options.what:
                 raise
             print(f"{name} is not measured: {error}\n", file=sys.stderr)
             continue
-        for table in measured:
-            tables.append(table)
+        before, busy = busy, busy_share()
+        taken = [options.scenes] if options.scenes and name in shown else []
+        words = " ".join([name, *(f"--scenes {' '.join(path.name for path in paths)}" for paths in taken)])
+        made = [_stated(table, f"`{COMMAND} {words}`", max(before, busy)) for table in bare]
+        for table in made:
             print(table.markdown() + "\n", flush=True)
+        tables += made
+        for page in options.markdown if made else ():  # at once: the next may take long
+            filled = put_tables(page.read_text(encoding="utf-8"), made)
+            with atomic_write(page) as temporary_file:
+                temporary_file.write_text(filled, encoding="utf-8")
     if options.json:
-        written = {"machine": machine(), "tables": [asdict(table) for table in tables]}
+        measured = {"machine": machine(), "tables": [asdict(table) for table in tables]}
         with atomic_write(options.json) as temporary_file:
             temporary_file.write_text(
-                json.dumps(written, indent=1, ensure_ascii=False) + "\n", encoding="utf-8"
+                json.dumps(measured, indent=1, ensure_ascii=False) + "\n", encoding="utf-8"
             )
-    for page in options.markdown:
-        filled = put_tables(page.read_text(encoding="utf-8"), tables)
-        with atomic_write(page) as temporary_file:
-            temporary_file.write_text(filled, encoding="utf-8")
     return 0
+
+
+def _stated(table: Table, command: str, busy: float) -> Table:
+    """With what made it; and without wall times where others used the cores."""
+    bare = table.without_wall()
+    if busy > BUSY and bare != table:
+        table, share = bare, f"{100 * busy:.0f} %"
+        command += f"; others used {share} of the cores, so wall times and what depends on them are left out"
+    return replace(table, note=f"{table.note} Made by {command}; {today()}.".strip())
 
 
 def _function(path: str) -> Callable[..., Any]:

@@ -2,31 +2,22 @@
 
 from __future__ import annotations
 
-import statistics
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
 
 import torch
 from torch import Tensor
 
 from progdf.camera import Camera
-from progdf.compose.composer import Composer
-from progdf.compose.layers import Layer
 from progdf.field import BakedField, FieldEvaluator
-from progdf.field.choose import Field, Render
+from progdf.field.choose import Render
 from progdf.gaussians import Gaussians, pack
 from progdf.gdf.file import Gdf, fingerprint
-from progdf.metrics.image import decibels
-from progdf.rasterize import alpha_weights, render, set_threads
+from progdf.rasterize import alpha_weights, render
 from progdf.region import from_mask
-from progdf.threads import threads
 
 from .analytic_edits import AnalyticEdit
-
-AT_SNAPSHOTS = 6
-"""Snapshots at which fields are judged beside the strengths between them."""
 
 
 @dataclass(frozen=True)
@@ -46,22 +37,6 @@ class KnownEdit:
     look: Render  # pixels on which ranks are grown
     weights: Tensor  # visibility of the members. [M]
     unseen: Render  # the judge's pixels
-
-    @cached_property
-    def _shown(self) -> list[tuple[float, Tensor]]:
-        inner = range(1, len(self.strengths) - 1)
-        some = inner[:: max(1, len(inner) // AT_SNAPSHOTS)][:AT_SNAPSHOTS]
-        with torch.no_grad():
-            return [(float(self.strengths[t]), self.unseen(self.offsets[t])) for t in some]
-
-    def worst_at_snapshots(self, field: Field) -> float:
-        """Least PSNR at some snapshots that a field was fitted to, dB, where `judge` looks between them."""
-        with torch.no_grad():
-            errors = [
-                float((self.unseen(field.offsets(s)) - shown).double().square().mean())
-                for s, shown in self._shown
-            ]
-        return min((decibels(error) for error in errors), default=decibels(0.0))
 
 
 def known_edit(
@@ -106,27 +81,6 @@ def _changed_pixels(scene: Gaussians, members: Tensor, offsets: Tensor, cameras:
     ends = [pictures(offsets[t]) for t in (0, len(offsets) // 2, -1)]
     counts = [((b - a).abs() + (c - a).abs()).amax(dim=2) > 2 / 255 for a, b, c in zip(*ends, strict=True)]
     return lambda moved: torch.cat([p[c] for p, c in zip(pictures(moved), counts, strict=True)])
-
-
-def step_ms(scene: Gaussians, edit: Gdf) -> tuple[float, float]:
-    """A slider step of the composer with one thread and with two, in turns, medians, ms."""
-    composer = Composer(scene, [edit])
-    layers = [Layer(edit, s / 20) for s in range(1, 20)]
-    before = threads()
-
-    def step(count: int, layer: Layer) -> float:
-        set_threads(count)
-        return milliseconds(partial(composer.update, [layer]))
-
-    times: tuple[list[float], list[float]] = ([], [])
-    try:
-        for layer in layers:
-            for count in (1, 2):
-                composer.update([])
-                times[count - 1].append(step(count, layer))
-    finally:
-        set_threads(before)
-    return statistics.median(times[0]), statistics.median(times[1])
 
 
 def milliseconds(work: Callable[[], object]) -> float:

@@ -1,117 +1,291 @@
-"""`python -m benchmarks field`: error against bytes and milliseconds for every kind of field.
+"""`python -m benchmarks field`: how near every form of field comes to an edit, and how many bytes it takes.
 
-Errors are those against the edit's true course, at and between the snapshots that the fields were fitted to,
-in views that the choice of ranks has not seen, over the pixels that the edit changes.
+Fields of edits of colors are judged by the editor's own pictures, of views in which nobody trains or chooses,
+at strengths that are nobody's own; those of a motion by its true course.
 """
 
 from __future__ import annotations
 
 import statistics
-from collections.abc import Sequence
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
-from PIL import Image
 from torch import Tensor
 
+from progdf.color.oklab import oklab_to_srgb, srgb_to_oklab
 from progdf.compose.composer import Composer
 from progdf.compose.layers import Layer
 from progdf.compose.reference import compose_layers
 from progdf.demo_scenes import bear
-from progdf.field import fit_separable
-from progdf.gaussians import ATTRIBUTES, Gaussians, pack
+from progdf.field import (
+    FieldEvaluator,
+    NeuralField,
+    NeuralSettings,
+    choose_field,
+    fit_keyframes,
+    fit_separable,
+)
+from progdf.field.baked import MONOMIALS, BakedField, identity_map
+from progdf.field.choose import Field
+from progdf.field.grade import bake_grade, band_offsets, fit_grade, mapped_bands
+from progdf.field.neural_fit import NeuralFit, train_network
+from progdf.field.separable import moving_attributes
+from progdf.gaussians import ATTRIBUTES, Gaussians, attribute_slices, pack
 from progdf.gdf.file import Gdf
-from progdf.io.atomic import atomic_write
+from progdf.metrics.image import decibels
 from progdf.rasterize import set_threads
+from progdf.sh import C0
 from progdf.threads import threads
+from trainer.optimize.color_solver import add_bands, make_solver
 
+from .ablation.regret import MEASURED, REPORTING, Edit
 from .analytic_edits import bear_edits
-from .courses import KnownEdit, edit_of, known_edit, milliseconds, processor_milliseconds
-from .field_forms import Form, baked_forms
-from .field_plot import draw_forms
-from .table import Table
+from .courses import edit_of, known_edit, milliseconds, processor_milliseconds
+from .table import Table, Wall
+from .training import Point, edit_of_task, save_plot, tasks
 
-EDITS = ("gold", "stripes", "big ears")
-BEAR, SIDE, SNAPSHOTS = 12_000, 160, 33
+STAGES, STEPS, RANKS = 8, 12, (0, 1, 2)
+"""Even strengths at most; steps of conjugate gradients of a residual at each; its ranks."""
+
+TARGETS = (40.0, 50.0, 60.0)
+"""What separable fields are to reach, worst PSNR to the recording, dB."""
+
+MOST = 10_000
+"""Members; the forms of more would take ten minutes."""
+
+NETWORK, PAPERS = NeuralSettings("tiny", steps=1000), NeuralSettings("paper", "position")
+"""One that is trained, and the paper's, which is timed untrained."""
+
+MOVED, MOVING, SIDE, SNAPSHOTS = "big ears", 12_000, 160, 33
+"""The motion, of a bear of so many Gaussians; in views of so many pixels; recordings."""
+
 CLOUDS = ((3_000, 30_000), (30_000, 100_000), (100_000, 100_000))
 """Members and Gaussians of the scenes on which a slider step is timed."""
 
 
-def tables(recorded: Sequence[KnownEdit] = (), plot: Path | None = None) -> list[Table]:
-    """Error against bytes and time; a slider step against copying as many bytes.
+@dataclass(frozen=True)
+class Form:
+    """One field of one edit, measured."""
+
+    edit: str
+    kind: str  # a line of the plot
+    label: str
+    bytes: float  # by member, without the header
+    psnrs: tuple[float, ...]  # at `MEASURED`, dB
+    seconds: float  # of the processor, to fit it
+    chosen: bool = False  # whether a run ships it
+
+
+@dataclass(frozen=True)
+class InOklab:
+    """Two keyframes between which the colors of band 0 go straight in OKLab; all else as numbers."""
+
+    start: Tensor  # packed rows. [M,C]
+    end: Tensor  # offsets. [M,C]
+    attributes: tuple[str, ...]
+
+    def offsets(self, s: float) -> Tensor:
+        """As `Field` has it."""
+        columns = attribute_slices(self.end.shape[1])["sh0"]
+        before = self.start[:, columns] * C0 + 0.5
+        after = before + self.end[:, columns] * C0
+        shown, finished = before.clamp(0.0, 1.0), after.clamp(0.0, 1.0)
+        lab = torch.lerp(srgb_to_oklab(shown), srgb_to_oklab(finished), s)
+        # what no screen shows lies beside, on its own straight line
+        beyond = torch.lerp(before - shown, after - finished, s)
+        moved = s * self.end
+        moved[:, columns] = (oklab_to_srgb(lab) + beyond - before) / C0
+        return moved
+
+
+def tables(scenes: Sequence[Path] = (), plot: Path | None = None) -> list[Table]:
+    """Error against bytes; a slider step against copying as many bytes, and against a network that is asked.
 
     Args:
-        recorded: edits that were recorded, measured after the bear's
+        scenes: edited as `python -m benchmarks training` does, after its bear, but for those of more than
+            `MOST` members
         plot: also draw the errors into this PNG file
     """
-    scene = bear(BEAR)
-    edits = bear_edits(scene)
-    cameras = [camera.resize(SIDE, SIDE) for camera in scene.cameras]
-    known = [known_edit(name, scene.gaussians, *edits[name], cameras, SNAPSHOTS) for name in EDITS]
-    courses = [*known, *recorded]
-    forms = [form for course in courses for form in baked_forms(course)]
+    forms = list[Form]()
+    with tempfile.TemporaryDirectory() as name:
+        for task in tasks(Path(name), scenes):
+            edit = edit_of_task(task)
+            if len(edit.region) <= MOST:
+                forms += color_forms(f"{task.scene.stem}, {task.editor}", edit)
+    forms += moved_forms()
     if plot is not None:
-        with atomic_write(plot) as temporary_file:
-            drawn = draw_forms(forms).quantize(128, kmeans=3, dither=Image.Dither.NONE)
-            drawn.save(temporary_file, format="PNG", optimize=True)
+        panels: dict[str, list[Point]] = {}
+        for form in forms:
+            point = Point(form.kind, form.bytes, form.psnrs, form.chosen)
+            panels.setdefault(form.edit, []).append(point)
+        save_plot(panels, "bytes a member", plot)
     return [field_table(forms), _compose_table()]
+
+
+def color_forms(name: str, edit: Edit) -> list[Form]:
+    """Every form of field of an edit of colors."""
+    judge, forms = edit.judge(), list[Form]()
+
+    def measure(kind: str, label: str, size: float, field: Field, began: float) -> None:
+        seconds = time.process_time() - began
+        psnrs = (judge.psnr(judge.pictures(field.offsets(s)), judge.edited[s]) for s in MEASURED)
+        forms.append(Form(name, kind, label, size, tuple(psnrs), seconds))
+
+    model, _, automatic = edit.automatic(judge)
+    strengths = edit.strengths(STAGES, model.allowed_share)
+    knots = torch.tensor([0.0, *strengths])
+    solver, recording = make_solver(edit.drawn, edit.original), torch.zeros(0)
+    for degree in MONOMIALS:
+        began = time.process_time()
+        maps = [solver.fit_map(degree, edit.targets(s)) for s in strengths]
+        table = torch.stack([identity_map(degree), *(table for table, _ in maps)])
+        mapped = mapped_bands(degree, table, edit.original)
+        bands = max(1, model.bands)
+        zero = torch.zeros(len(edit.original), bands, 3)
+        own = [
+            solver.residual(m, zero, edit.targets(s), STEPS)[0]
+            for (_, m), s in zip(maps, strengths, strict=True)
+        ]
+        course = torch.stack([zero, *own]).flatten(2)
+        for rank in RANKS:
+            form = fit_grade(knots, degree, table, course, rank, edit.weights)
+            field = bake_grade(form, edit.original, mapped)
+            label = f"grade of degree {degree} ({len(table[0])} × 3 numbers a knot)"
+            label += f", residual of rank {rank}" if rank else " alone"
+            measure(f"grade of degree {degree}", label, form.bytes_per_member, field, began)
+        if degree == max(1, model.degree):
+            moved = [add_bands(m, r) for (_, m), r in zip(maps, own, strict=True)]
+            width = edit.original.shape[1]
+            recording = torch.stack(
+                [torch.zeros_like(edit.original), *(band_offsets(m, width) for m in moved)]
+            )
+    began = time.process_time()
+    field = fit_keyframes(knots, recording, 2)
+    measure("2 keyframes, raw", "2 keyframes, raw", field.bytes_per_member, field, began)
+    straight = InOklab(edit.original, recording[-1], tuple(field.attributes))
+    measure("2 keyframes, OKLab", "2 keyframes, OKLab", field.bytes_per_member, straight, began)
+    views = edit.evaluator(edit.choosing, {})
+    for target in TARGETS:
+        began = time.process_time()
+        wanted = FieldEvaluator(knots, recording, views.counted_pixels, target=target)
+        best = choose_field(knots, recording, views.counted_pixels, edit.weights, evaluator=wanted).best
+        label = f"{best.label}, to reach {target:g} dB"
+        measure("separable", label, best.field.bytes_per_member, best.field, began)
+    began = time.process_time()
+    ranks = dict.fromkeys(moving_attributes(recording), 2)
+    field = fit_separable(knots, recording, ranks, edit.weights)
+    measure("float32 ends", "separable of rank 2, float32 ends", field.bytes_per_member, field, began)
+    began = time.process_time()
+    network = trained_network(edit.original, knots, recording, edit.weights, NETWORK, NETWORK.steps)
+    label, bound = f"network ({NETWORK.size}), {NETWORK.steps} steps", network.bind(edit.original)
+    measure("network", label, network.bytes_per_member, bound, began)
+    chosen = f"{automatic.name.partition(': ')[2]}: what a run ships"
+    return [
+        *forms,
+        Form(
+            name,
+            f"grade of degree {model.degree}",
+            chosen,
+            automatic.bytes,
+            tuple(automatic.psnrs),
+            automatic.seconds,
+            True,
+        ),
+    ]
+
+
+def moved_forms() -> list[Form]:
+    """Keyframes and separable fields of a motion, against its true course."""
+    scene = bear(MOVING)
+    cameras = [camera.resize(SIDE, SIDE) for camera in scene.cameras]
+    course = known_edit(MOVED, scene.gaussians, *bear_edits(scene)[MOVED], cameras, SNAPSHOTS)
+    forms = list[Form]()
+
+    def measure(kind: str, fit: Callable[[], tuple[BakedField, str]]) -> None:
+        began = time.process_time()
+        field, label = fit()
+        seconds = time.process_time() - began
+        with torch.no_grad():
+            errors = [
+                (course.unseen(field.offsets(s)) - course.unseen(course.truth(s))).double().square().mean()
+                for s in MEASURED
+            ]
+        psnrs = tuple(decibels(float(error)) for error in errors)
+        chosen = label.endswith("to reach 40 dB")
+        forms.append(Form(f"bear, {MOVED}", kind, label, field.bytes_per_member, psnrs, seconds, chosen))
+
+    for count in (2, 4, 9):
+        measure(
+            "2 keyframes, raw" if count == 2 else "4, 9 keyframes",
+            lambda c=count: (fit_keyframes(course.strengths, course.offsets, c), f"{c} keyframes, raw"),  # type: ignore[misc]
+        )
+
+    def separable(target: float) -> tuple[BakedField, str]:
+        wanted = FieldEvaluator(course.strengths, course.offsets, course.look, course.truth, target=target)
+        best = choose_field(
+            course.strengths, course.offsets, course.look, course.weights, evaluator=wanted
+        ).best
+        return best.field, f"{best.label}, to reach {target:g} dB"
+
+    for target in TARGETS:
+        measure("separable", partial(separable, target))
+    ranks = dict.fromkeys(moving_attributes(course.offsets), 2)
+    measure(
+        "float32 ends",
+        lambda: (
+            fit_separable(course.strengths, course.offsets, ranks, course.weights),
+            "separable of rank 2, float32 ends",
+        ),
+    )
+    return forms
+
+
+def trained_network(
+    rows: Tensor, knots: Tensor, recording: Tensor, weights: Tensor, settings: NeuralSettings, steps: int
+) -> NeuralField:
+    """A network of the recorded numbers after so many steps."""
+    settings = settings.resolve()
+    settings = replace(settings, batch=min(settings.batch, len(rows)))
+    fit = NeuralFit(rows, recording.shape[2], tuple(moving_attributes(recording)), settings, weights)
+    fit.scale_to(recording)
+    train_network(fit, knots, recording, steps)
+    return fit.field()
 
 
 def field_table(forms: Sequence[Form]) -> Table:
     """The table of all fields of all edits, in their order."""
     rows = [
         (
-            f"{form.edit}, {form.members} members",
-            form.label,
-            f"{form.numbers:,}".replace(",", " "),
-            f"{form.bytes_per_member:.0f}",
-            f"{form.mean:.1f} / {form.worst:.1f}",
-            f"{form.at_snapshots:.1f}",
+            form.edit,
+            f"**{form.label}**" if form.chosen else form.label,
+            f"{form.bytes:.1f}",
+            f"{min(form.psnrs):.1f}",
+            " ".join(f"{psnr:.1f}" for psnr in form.psnrs),
             f"{form.seconds:.1f}",
-            f"{form.step[0]:.2f}",
-            f"{form.step[1]:.2f}",
         )
         for form in forms
     ]
+    strengths = ", ".join(f"{s:g}" for s in MEASURED)
     return Table(
         name="field",
-        title="Fields: error against bytes and time",
+        title="Fields: error over bytes",
         columns=(
-            "edit",
-            "field",
-            "numbers",
-            "bytes a member, no header",
-            "PSNR between snapshots, mean / worst, dB",
-            "worst at snapshots",
-            "s to fit",
-            "ms a slider step, 1 thread",
-            "2 threads",
+            "edit", "field", "bytes a member, no header", "worst, dB", f"at {strengths}",
+            "processor, s",
         ),
         rows=tuple(rows),
-        note=f"Bear of {BEAR} Gaussians, {SNAPSHOTS} snapshots, against the true course; recorded edits "
-        "against the recording. 13 slider values, views that no choice has seen, pixels that the edit "
-        "changes. Keyframes lie at even strengths. For networks see python -m benchmarks networks. "
-        f"{_at_same_bytes(forms)}",
-    )
-
-
-def _at_same_bytes(forms: Sequence[Form]) -> str:
-    """By how much the separable field's worst error is better than the best keyframes' of the same bytes."""
-    told = []
-    for edit in dict.fromkeys(form.edit for form in forms):
-        own = [form for form in forms if form.edit == edit]
-        limit = next(form.bytes_per_member for form in own if form.label == "4 keyframes, int8") + 0.5
-        best = {
-            kind: max(f.worst for f in own if kind in f.kind and f.bytes_per_member <= limit)
-            for kind in ("separable", "keyframes")
-        }
-        told.append(f"{edit} {best['separable'] - best['keyframes']:+.1f} dB")
-    return (
-        "Worst PSNR of the separable field less that of the best keyframes, at 6 bytes a moving number "
-        f"(84 where all 14 move): {', '.join(told)}."
-    )
+        note="Bold: what a run ships. Edits of colors: PSNR to the editor's own pictures in "
+        f"{REPORTING - 1} views in which nobody trained or chose; all forms but the bold one are of the "
+        f"same recording, {STEPS} steps of the residual at each of up to {STAGES} strengths, and a map costs "
+        "its numbers once for all members. The motion: PSNR to its true course, over the pixels that it "
+        "changes. Seconds: to fit; of the bold grade with its solving.",
+    )  # fmt: skip
 
 
 def _compose_table() -> Table:
@@ -134,29 +308,35 @@ def _compose_table() -> Table:
         columns=(
             "members / Gaussians",
             "MB moved",
-            "copying, ms",
+            Wall("copying, ms"),
             "compose, processor ms",
-            "Composer 1 thread, ms",
-            "2 threads, ms",
-            "of these for one member",
-            "ratio to copying, 1 / 2 threads",
+            Wall("Composer 1 thread, ms"),
+            "of the processor, ms",
+            Wall("2 threads, ms"),
+            Wall("of these for one member"),
+            Wall("ratio to copying, 1 / 2 threads"),
             "largest difference",
+            "the paper's network asked, processor ms",
         ),
         rows=tuple(rows),
         note="Medians, taken in turns. Moved: what a step must read (bases, the original, the last centers, "
         "row numbers) and write; copying: a NumPy copy that reads and writes as much, one thread. What one "
-        "member takes does not grow. The plain compose also checks that the edit belongs to the scene.",
-    )
+        "member takes does not grow. The plain compose also checks that the edit belongs to the scene. A "
+        "network is asked once, untrained.",
+    )  # fmt: skip
 
 
 def _compose_row(scene: Gaussians, edit: Gdf, single: Gdf) -> tuple[str, ...]:
     composer, alone = Composer(scene, [edit]), Composer(scene, [single])
+    rows, knots = pack(scene[edit.region.members]), torch.tensor([0.0, 1.0])
+    ends = torch.stack([edit.field.offsets(s) for s in (0.0, 1.0)])
+    asked = trained_network(rows, knots, ends, torch.ones(len(rows)), PAPERS, 0).bind(rows)
     # bases, the original and the last centers are read, row numbers too, 14 numbers written
     traffic = len(edit.region) * (edit.field.bytes_per_member + 56 + 12 + 12 + 56)
     source = np.ones(int(traffic) // 8, np.float32)
     target = source.copy()
     before = threads()
-    times: dict[str, list[float]] = {"plain": [], "1": [], "2": [], "copy": [], "one": []}
+    times: dict[str, list[float]] = {"plain": [], "1": [], "2": [], "copy": [], "one": [], "processor": []}
     difference = 0.0
     try:
         for i in range(50):
@@ -167,7 +347,10 @@ def _compose_row(scene: Gaussians, edit: Gdf, single: Gdf) -> tuple[str, ...]:
             for count in (1, 2):
                 set_threads(count)
                 composer.update([])
+                used = time.process_time()
                 times[str(count)].append(milliseconds(partial(composer.update, [layer])))
+                if count == 1:
+                    times["processor"].append(1e3 * (time.process_time() - used))
             times["one"].append(milliseconds(partial(alone.update, [Layer(single, s)])))
             times["copy"].append(milliseconds(partial(np.copyto, target, source)))
             if i % 10 == 0:
@@ -182,10 +365,12 @@ def _compose_row(scene: Gaussians, edit: Gdf, single: Gdf) -> tuple[str, ...]:
         f"{took['copy']:.3f}",
         f"{took['plain']:.1f}",
         f"{took['1']:.3f}",
+        f"{took['processor']:.3f}",
         f"{took['2']:.3f}",
         f"{took['one']:.3f}",
         f"{took['1'] / took['copy']:.1f} / {took['2'] / took['copy']:.1f}",
         f"{difference:g}",
+        f"{processor_milliseconds(partial(asked.offsets, 0.5)):.0f}",
     )
 
 

@@ -2,13 +2,27 @@
 
 from __future__ import annotations
 
+import datetime
+import hashlib
 import os
 import platform
+import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from importlib.metadata import version
 from pathlib import Path
 
 BEGIN, END = "<!-- bench {name} -->", "<!-- end {name} -->"
+
+BUSY = 0.05
+"""Share of the cores above which others make wall times worthless."""
+
+_SPIN_S, _LOOKS = 0.3, 3
+
+
+class Wall(str):
+    """The heading of a column of wall times, or of what depends on them."""
 
 
 @dataclass(frozen=True)
@@ -30,9 +44,35 @@ class Table:
             lines += ["", self.note]
         return "\n".join(lines)
 
+    def without_wall(self) -> Table:
+        """With a dash for everything below a `Wall`."""
+        walls = [isinstance(column, Wall) for column in self.columns]
+        rows = tuple(
+            tuple("–" if w else cell for w, cell in zip(walls, row, strict=True)) for row in self.rows
+        )
+        return replace(self, rows=rows)
+
+
+def busy_share() -> float:
+    """Share of the cores that others use, 0..1: what a loop on every core for a moment does not get.
+
+    The least of some moments: every machine has its own work now and then.
+    """
+    block = bytes(1 << 20)  # hashed without Python's lock
+
+    def spin(_: int) -> float:
+        began, used = time.perf_counter(), time.thread_time()
+        while time.perf_counter() - began < _SPIN_S:
+            hashlib.sha256(block)
+        return (time.thread_time() - used) / (time.perf_counter() - began)
+
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    with ThreadPoolExecutor(cores) as pool:
+        return max(0.0, 1.0 - max(sum(pool.map(spin, range(cores))) / cores for _ in range(_LOOKS)))
+
 
 def machine() -> str:
-    """One line that names the machine, for the tables."""
+    """One line that names the machine and the day, for the tables."""
     model = platform.processor() or platform.machine()
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists():
@@ -42,15 +82,24 @@ def machine() -> str:
             if "model name" in line
         ]
         model = names[0] if names else model
-    return f"{model}, {os.cpu_count()} cores, Python {platform.python_version()}, {platform.system()}"
+    versions = ", ".join(f"{name} {version(name)}" for name in ("torch", "numba"))
+    python = f"Python {platform.python_version()}, {versions}, {platform.system()}"
+    return f"{model}, {os.cpu_count()} cores, {python}, {today()}"
+
+
+def today() -> str:
+    """The day, in words."""
+    day = datetime.date.today()
+    return f"{day.day} {day:%B %Y}"
 
 
 def put_tables(text: str, tables: Sequence[Table]) -> str:
-    """`text` with every table placed between its markers; a table without markers is left out."""
-    for table in tables:
-        begin, end = BEGIN.format(name=table.name), END.format(name=table.name)
+    """`text` with every table placed between its markers, and the machine's line; a table without markers is
+    left out."""
+    for name, filled in [("machine", machine()), *((table.name, table.markdown()) for table in tables)]:
+        begin, end = BEGIN.format(name=name), END.format(name=name)
         if begin in text and end in text:
             head, rest = text.split(begin, 1)
             tail = rest.split(end, 1)[1]
-            text = f"{head}{begin}\n{table.markdown()}\n{end}{tail}"
+            text = f"{head}{begin}\n{filled}\n{end}{tail}"
     return text

@@ -38,8 +38,8 @@ ORDER = {
     "trainer": """__init__ options store views editors resolve setup regions
         motion optimize fit report preview run evaluate batch cli""",
     "viewer": "__init__ camera gl jobs state render files pictures ui panel app commands",
-    "benchmarks": """__init__ analytic_edits courses table ablation field_forms rasterizer
-        recorded_runs viewer field_plot field edits networks sliders warps pictures __main__""",
+    "benchmarks": """__init__ analytic_edits courses table ablation rasterizer training
+        recorded_runs viewer field edits networks sliders warps pictures __main__""",
 }
 
 MOST_FILES = 14

@@ -20,14 +20,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from benchmarks.table import Table
+from benchmarks.table import Table, Wall
 from progdf.formats.ply import save_ply
 from progdf.metrics.image import psnr
 from progdf.threads import one_thread
 from viewer.camera.view_camera import first_camera
 from viewer.files import document as documents
 from viewer.panel.panel import WIDTH_PX
-from viewer.render.dynamic_resolution import COARSE, REST_S
+from viewer.render.dynamic_resolution import COARSE
 from viewer.render.engine import ViewEngine
 from viewer.render.gl_renderer import headless_context
 from viewer.state.view_state import ViewState
@@ -62,6 +62,9 @@ class Turning:
     wrong: int
     opened_s: float  # from a file opened in the running window to its first picture
     coarse_ms: tuple[float, ...]  # whole frames again, coarse while they move
+    # processor_ms, coarse_processor_ms: medians of the same frames, of all cores together
+    processor_ms: float
+    coarse_processor_ms: float
     coarse_db: float  # PSNR of the coarse pictures against the full ones, the worst
     at_rest: int  # how far the picture is from the full one once the hand rests, of 255
 
@@ -76,7 +79,7 @@ class Start:
 
 
 def tables(scenes: Sequence[Path] = ()) -> list[Table]:
-    """Measure, for docs/benchmarks.md.
+    """Measure, for docs/speed-and-error.md.
 
     Args:
         scenes: .ply files that take the place of the bears; the largest is also laid over itself four times
@@ -128,6 +131,7 @@ def measure_turning(
         full = _turn(mice, steps)
         for mouse in mice.values():
             mouse.main_view.change(replace(mouse.main_view.work.view, dynamic_resolution="on"))
+            mouse.wait_pyramid()
         coarse = _turn(mice, steps)
         for way, mouse in mice.items():
             wrong = sum(not np.array_equal(image, _draw_anew(mouse, view)) for view, image in full[way].kept)
@@ -142,6 +146,8 @@ def measure_turning(
                     wrong,
                     opened_s[way],
                     tuple(coarse[way].frames_ms[WARM_UP:]),
+                    float(np.median(full[way].processor_ms[WARM_UP:])),
+                    float(np.median(coarse[way].processor_ms[WARM_UP:])),
                     min(errors),
                     _at_rest(mouse),
                 )
@@ -179,6 +185,7 @@ def frames_table(turnings: Sequence[Turning], starts: Sequence[Start], renderer:
                 WAYS[result.way],
                 f"{np.median(result.draws_ms):.1f}",
                 f"**{middle:.1f}** / {late:.1f}",
+                f"{result.processor_ms:.1f}",
                 f"{result.checked - result.wrong} of {result.checked}",
                 f"{result.opened_s:.2f}",
                 "-" if start is None else f"{start.first_s:.2f} ({start.imports_s:.2f})",
@@ -191,11 +198,12 @@ def frames_table(turnings: Sequence[Turning], starts: Sequence[Start], renderer:
         (
             "Gaussians",
             "drawn by",
-            "sort and draw, ms",
-            "whole frame p50 / p95, ms",
+            Wall("sort and draw, ms"),
+            Wall("whole frame p50 / p95, ms"),
+            "of the processor, ms",
             "the same drawn afresh",
-            "first picture of an opened file, s",
-            "of `progdf view`, s (imports)",
+            Wall("first picture of an opened file, s"),
+            Wall("of `progdf view`, s (imports)"),
             "memory by then, MB",
         ),
         tuple(rows),
@@ -217,6 +225,7 @@ def coarse_table(turnings: Sequence[Turning], renderer: str) -> Table:
                 f"{full:.1f}",
                 f"{coarse:.1f}",
                 f"{full / coarse:.1f}×",
+                f"{result.processor_ms:.1f} / {result.coarse_processor_ms:.1f}",
                 f"{result.coarse_db:.1f}",
                 str(result.at_rest),
             )
@@ -227,10 +236,11 @@ def coarse_table(turnings: Sequence[Turning], renderer: str) -> Table:
         (
             "Gaussians",
             "drawn by",
-            "frame in full, ms",
-            "coarse, ms",
-            "ratio",
-            "PSNR while moving, dB",
+            Wall("frame in full, ms"),
+            Wall("coarse, ms"),
+            Wall("ratio"),
+            "of the processor, ms: full / coarse",
+            Wall("PSNR while moving, dB"),
             "difference at rest, of 255",
         ),
         tuple(rows),
@@ -245,6 +255,7 @@ class _Turned:
 
     frames_ms: list[float] = field(default_factory=list)
     draws_ms: list[float] = field(default_factory=list)
+    processor_ms: list[float] = field(default_factory=list)
     kept: list[tuple[ViewState, NDArray[np.uint8]]] = field(default_factory=list)
 
 
@@ -273,6 +284,7 @@ def _turn(mice: Mapping[str, Mouse], steps: int) -> dict[str, _Turned]:
             break
         for way, mouse in mice.items():
             turns[way].frames_ms.append(mouse.turn(TURN_PX))
+            turns[way].processor_ms.append(mouse.processor_ms)
             turns[way].draws_ms.append(mouse.main_view.canvas.timings.total_ms)
             if step >= 0 and (steps - 1 - step) % -(-steps // KEPT) == 0:
                 turns[way].kept.append((mouse.main_view.work.view, mouse.picture()))
@@ -307,7 +319,7 @@ def _at_rest(mouse: Mouse) -> int:
     mouse.turn(TURN_PX)
     if mouse.main_view.canvas.pixels == 1:
         raise AssertionError("the picture in motion was not coarse")
-    mouse.frame(seconds=2 * REST_S)
+    mouse.wait_sharp()
     rested, view = mouse.picture(), mouse.main_view.work.view
     mouse.release()
     mouse.settle()

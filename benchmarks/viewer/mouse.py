@@ -13,17 +13,20 @@ from numpy.typing import NDArray
 
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
+from progdf.rasterize.cpu.pyramid import Pyramid
 from viewer.app.main_view import MainView
 from viewer.files.document import Document
 from viewer.gl.present import read_rgb
 from viewer.panel import panel
+from viewer.render.cpu_renderer import CpuRenderer
+from viewer.render.dynamic_resolution import REST_S
 from viewer.render.engine import ViewEngine
 from viewer.state.view_state import ViewState
 
 SIZE = (640, 480)
 """Of the picture; the panel stands beside it."""
 
-_STEP_S = 1.0 / 60.0
+_STEP_S, _POLL_S = 1.0 / 60.0, 0.02
 _INSET, _FIRST, _NEXT = 12 + 10 + 7, 136.0, 97.0  # the panel's layout at 1×
 
 
@@ -53,6 +56,7 @@ class Mouse:
         size: tuple[int, int] = SIZE,
     ) -> None:
         self.engine, self.size = engine, size
+        self.processor_ms = 0.0  # that the last frame took of all cores together
         self.pixels = (size[0] + round(panel.WIDTH_PX), size[1])
         self._ctx = ctx
         self.main_view = MainView(ctx, engine, Document("scene.ply", scene, tuple(gdfs)).facts(), view)
@@ -77,12 +81,28 @@ class Mouse:
             seconds: that have passed on the main view's clock since the last one
             event: whether something has happened; else time alone brings this frame
         """
-        began = time.perf_counter()
+        began, used = time.perf_counter(), time.process_time()
         if event:
             self.main_view.wake()
         self.main_view.frame(self._screen, self.pixels, seconds, arrived=began)
         self._ctx.finish()
+        self.processor_ms = 1e3 * (time.process_time() - used)
         return 1e3 * (time.perf_counter() - began)
+
+    def wait_sharp(self, at_most_s: float = 20.0) -> None:
+        """Frames, the hand at rest on the button, until the picture is in full."""
+        began = time.perf_counter()
+        self.frame(seconds=2 * REST_S)
+        while self.main_view.canvas.pixels != 1 and time.perf_counter() - began < at_most_s:
+            time.sleep(_POLL_S)
+            self.frame(seconds=_POLL_S, event=False)
+
+    def wait_pyramid(self) -> Pyramid | None:
+        """What moving pictures are drawn of, once it is built; None where OpenGL draws all."""
+        if not isinstance(self.engine.renderer, CpuRenderer):
+            return None
+        live = self.engine.renderer._scene
+        return (live._pyramid or live.begin_pyramid()).result()
 
     def settle(self) -> None:
         """Frames until nothing is left to draw at once."""

@@ -16,14 +16,16 @@ import moderngl
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch.nn.functional import interpolate
 
-from benchmarks.table import Table
+from benchmarks.table import Table, Wall
 from progdf.demo_scenes import bear
 from progdf.gaussians import Gaussians
 from progdf.metrics.image import psnr
+from progdf.rasterize.cpu.pyramid import Pyramid
 from progdf.threads import one_thread
 from viewer.camera.view_camera import first_camera
-from viewer.render.dynamic_resolution import COARSE
+from viewer.render.cpu_renderer import CpuRenderer
 from viewer.render.engine import ViewEngine
 from viewer.render.gl_renderer import headless_context
 from viewer.state.view_state import ViewState
@@ -48,6 +50,9 @@ class Moving:
     beside: tuple[float, ...]  # the same while a training runs
     sharp: float  # from the last of these to the picture in full, the hand at rest on the button
     meanwhile: float  # the longest frame until then
+    processor: float  # that a turning frame takes of all cores, the median
+    build: float  # the pyramid of which moving pictures are drawn, s of the processor
+    memory: float  # its bytes over those of the scene that is drawn
     # click, lasso: the longest frame of a click on the picture; of letting go of a lasso
     click: float
     lasso: float
@@ -57,7 +62,7 @@ class Moving:
 
 
 def tables(scenes: Sequence[Path] = ()) -> list[Table]:
-    """Measure, for docs/benchmarks.md.
+    """Measure, for docs/speed-and-error.md.
 
     Args:
         scenes: .ply files that take the place of the bears; the largest is laid over itself up to a million
@@ -88,10 +93,12 @@ def measure(
     engine = ViewEngine(ctx, scene, (), "cpu")
     view = ViewState(first_camera(scene), dynamic_resolution="on")
     with Mouse(ctx, engine, scene, (), view, size) as mouse:
+        build, memory = _pyramid(mouse)
         mouse.grip_picture()
-        turning, beside, db, luminance = [], [], math.inf, 0.0
+        turning, processor, beside, db, luminance = [], [], [], math.inf, 0.0
         for step in range(-WARM_UP, steps):
             turning.append(mouse.turn(TURN_PX))
+            processor.append(mouse.processor_ms)
             if step >= 0 and step % max(steps // JUDGED, 1) == 0:
                 error, apart = _compare(mouse, scene)
                 db, luminance = min(db, error), max(luminance, apart, key=abs)
@@ -116,8 +123,11 @@ def measure(
             mouse.move(middle[0] + reach * np.sin(turn), middle[1] - reach * np.cos(turn))
         lasso = max(mouse.release(), _rest(mouse, time.perf_counter()))
     engine.release()
-    turned = tuple(turning[WARM_UP:])
-    return Moving(len(scene), turned, tuple(beside), sharp, meanwhile, click, lasso, full, db, luminance)
+    turned, used = tuple(turning[WARM_UP:]), float(np.median(processor[WARM_UP:]))
+    return Moving(
+        len(scene), turned, tuple(beside), sharp, meanwhile, used, build, memory, click, lasso, full, db,
+        luminance,
+    )  # fmt: skip
 
 
 def table(results: Sequence[Moving]) -> Table:
@@ -130,12 +140,15 @@ def table(results: Sequence[Moving]) -> Table:
                 f"{result.count:,}".replace(",", " "),
                 f"{result.full:.0f}",
                 f"**{alone[0]:.0f}** / {alone[1]:.0f}",
+                f"{result.processor:.0f}",
                 f"{beside[0]:.0f} / {beside[1]:.0f}",
                 f"{result.sharp:.0f} ({result.meanwhile:.0f})",
                 f"{result.click:.0f}",
                 f"{result.lasso:.0f}",
                 f"{result.db:.1f}",
                 f"{100 * result.luminance:+.2f} %",
+                f"{result.build:.2f}",
+                f"{result.memory:.2f}",
             )
         )
     return Table(
@@ -143,29 +156,46 @@ def table(results: Sequence[Moving]) -> Table:
         f"A scene in the hand without a graphics card, {SIZE[0]}×{SIZE[1]}, ms",
         (
             "Gaussians",
-            "picture in full",
-            "frame while turning p50 / p95",
-            "beside a training",
-            "sharp after (longest frame)",
-            "click",
-            "lasso let go",
-            "PSNR while turning, dB",
-            "luminance while turning",
+            Wall("picture in full"),
+            Wall("frame while turning p50 / p95"),
+            "of the processor",
+            Wall("beside a training"),
+            Wall("sharp after (longest frame)"),
+            Wall("click"),
+            Wall("lasso let go"),
+            Wall("PSNR while turning, dB"),
+            Wall("luminance while turning"),
+            "pyramid, s of the processor",
+            "its memory, of the scene's",
         ),
         tuple(rows),
         "Whole frames, from the mouse's event to finished pixels of picture and panel; each step of "
-        f"{STEPS} turns three degrees. The errors are the worst of {JUDGED} pictures, on white.",
+        f"{STEPS} turns three degrees. The errors are the worst of {JUDGED} pictures, on white, as they are "
+        "shown: stretched smoothly. The pyramid is built before.",
     )
 
 
 def _compare(mouse: Mouse, scene: Gaussians) -> tuple[float, float]:
     """PSNR of the last picture to the one in full, and the relative difference of their luminance."""
     view, (width, height) = mouse.main_view.work.view, mouse.size
-    drawn = mouse.engine.renderer.pixels().clip(0.0, 1.0)
-    moving = drawn.repeat(COARSE, 0).repeat(COARSE, 1)[:height, :width]
+    drawn = torch.from_numpy(mouse.engine.renderer.pixels().clip(0.0, 1.0)).movedim(2, 0)[None]
+    moving = interpolate(drawn, (height, width), mode="bilinear")[0].movedim(0, 2).numpy()
     full: NDArray[np.float32] = ViewEngine(None, scene).image(view, mouse.size).clip(0.0, 1.0)
     error = psnr(torch.from_numpy(moving), torch.from_numpy(full))
     return error, float((moving @ _LUMINANCE).mean() / (full @ _LUMINANCE).mean()) - 1.0
+
+
+def _pyramid(mouse: Mouse) -> tuple[float, float]:
+    """Build the pyramid once more, when the window's own stands: seconds of the processor, and its bytes over
+    those of the scene that is drawn."""
+    mouse.wait_pyramid()
+    assert isinstance(mouse.engine.renderer, CpuRenderer)
+    drawn, began = mouse.engine.renderer._scene.drawn, time.process_time()
+    nodes = Pyramid(drawn).nodes
+    seconds = time.process_time() - began
+    arrays = (*nodes.gaussians, nodes.weights, nodes.spreads, nodes.order)
+    held = sum(tensor.numel() * tensor.element_size() for tensor in drawn.tensors)
+    return seconds, sum(array.nbytes for array in arrays) / held
 
 
 def _rest(mouse: Mouse, last: float, until_sharp: bool = False) -> float:

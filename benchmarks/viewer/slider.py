@@ -16,7 +16,7 @@ import moderngl
 import numpy as np
 import torch
 
-from benchmarks.table import Table
+from benchmarks.table import Table, Wall
 from progdf.gaussians import Gaussians
 from progdf.metrics.image import psnr
 from progdf.rasterize import render
@@ -76,6 +76,7 @@ class SliderTimes:
     count: int  # Gaussians in the scene
     way: str  # a key of `WAYS`
     events_ms: tuple[float, ...]  # from the mouse's event to finished pixels
+    processor_ms: tuple[float, ...]  # the same on all cores together
     parts: tuple[FrameTimings, ...]  # what of that the engine took
     psnr_db: float  # against `progdf.render`, the worst of three strengths
 
@@ -87,7 +88,7 @@ class SliderTimes:
 
 
 def tables(scenes: Sequence[Path] = ()) -> list[Table]:
-    """Measure, for docs/benchmarks.md.
+    """Measure, for docs/speed-and-error.md.
 
     Args:
         scenes: .ply files that take the place of the bears
@@ -120,6 +121,7 @@ def rows(
     layers = (LayerState(0, "edit", 0.05),)
     view = ViewState(first_camera(scene), layers, dynamic_resolution="off")
     events: dict[str, list[float]] = {way: [] for way in WAYS}
+    processor: dict[str, list[float]] = {way: [] for way in WAYS}
     parts: dict[str, list[FrameTimings]] = {way: [] for way in WAYS}
     with ExitStack() as held:
         mice: dict[str, Mouse] = {}
@@ -132,6 +134,7 @@ def rows(
             place = slider_at(mice["cpu"].pixels[0], 0, 0.05 + 0.9 * step / (WARM_UP + steps))
             for name, mouse in mice.items():
                 events[name].append(mouse.move(*place))
+                processor[name].append(mouse.processor_ms)
                 parts[name].append(mouse.main_view.canvas.timings)
         return [
             SliderTimes(
@@ -139,6 +142,7 @@ def rows(
                 len(scene),
                 name,
                 tuple(events[name][WARM_UP:]),
+                tuple(processor[name][WARM_UP:]),
                 tuple(parts[name][WARM_UP:]),
                 _psnr(mouse.engine, view, size),
             )
@@ -156,17 +160,18 @@ def table(results: Sequence[SliderTimes], renderer: str) -> Table:
             "members",
             "edit of",
             "drawn by",
-            "compose",
-            "upload",
-            "sort",
-            "draw",
-            "panel, screen",
-            "in all p50 / p95",
+            Wall("compose"),
+            Wall("upload"),
+            Wall("sort"),
+            Wall("draw"),
+            Wall("panel, screen"),
+            Wall("in all p50 / p95"),
+            "processor",
             "PSNR to the CPU engine, dB",
         ),
         tuple(_cells(result) for result in results),
         f"OpenGL by {renderer}. A hand drags the slider of a window without a screen; wall clock, the GPU "
-        "waited for, the parts are medians. The CPU rasterizer sorts as it draws.",
+        "waited for, the parts are medians; processor: of all cores. The CPU rasterizer sorts as it draws.",
     )
 
 
@@ -180,6 +185,7 @@ def _cells(result: SliderTimes) -> tuple[str, ...]:
         *(f"{np.median([getattr(part, name) for part in result.parts]):.1f}" for name in PARTS),
         f"{result.rest_ms:.1f}",
         f"**{middle:.1f}** / {late:.1f}",
+        f"{np.median(result.processor_ms):.1f}",
         "exact" if math.isinf(result.psnr_db) else f"{result.psnr_db:.0f}",
     )
 

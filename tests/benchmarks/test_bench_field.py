@@ -1,4 +1,4 @@
-"""The field benchmark runs, puts an error beside every speed, and draws both."""
+"""The benchmarks of training and of fields run, put an error beside every speed, and draw both."""
 
 from __future__ import annotations
 
@@ -6,74 +6,101 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
-from benchmarks import __main__ as bench
-from benchmarks import field as bench_field
-from benchmarks.field_forms import Form
-from benchmarks.field_plot import PAPER, draw_forms
-from progdf.errors import ProgdfError
+from benchmarks import field, training
+from benchmarks.field import InOklab
+from benchmarks.training import Point, Task, Trained, save_plot, table, tasks
+from progdf.color.oklab import srgb_to_oklab
+from progdf.sh import C0
+from trainer.report.plots import LINES
 
 
-def _form(edit: str, kind: str, bytes_per_member: float, worst: float, ms: float) -> Form:
-    curve = (worst + 5, worst)
-    return Form(edit, 100, kind, f"4 {kind}", 900, bytes_per_member, curve, worst, 0.1, (ms, 2 * ms))
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(training, "BEAR", 700)
+    monkeypatch.setattr(training, "WAYS", ("--quick --views 5 --image-size 48 --stages 2 --threads 1",))
 
 
-def _forms(edit: str) -> list[Form]:
-    return [
-        _form(edit, "keyframes, int8", 84, 31.0, 0.1),
-        _form(edit, "separable", 84, 44.0, 0.2),
-        _form(edit, "joint SVD", 200, 25.0, 4.0),
+@pytest.mark.slow
+def test_a_training_is_timed_beside_its_error_in_views_of_nobodys(small: None, tmp_path: Path) -> None:
+    (made,) = training.tables(plot=tmp_path / "training.png")
+    ((edit, way, at_1, worst, between, processor, wall, size),) = made.rows
+    assert (edit, way) == ("bear, stripes:#20a040", f"`{training.WAYS[0]}`")
+    assert 20.0 < float(worst) <= min(map(float, between.split())) + 0.05
+    assert 20.0 < float(at_1) < 70.0
+    assert float(processor) >= 1
+    assert float(wall) >= 1
+    assert float(size) >= 0
+    assert "progdf train bear.ply --region labels:bear_labels.npy:5 --editor stripes:#20a040" in made.note
+    assert made.without_wall().rows[0][-2] == "–"
+    with Image.open(tmp_path / "training.png") as picture:
+        assert picture.width == 380
+
+
+@pytest.mark.slow
+def test_every_form_of_field_is_judged_alike_and_the_shipped_one_is_marked(
+    small: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    for name, value in (("STAGES", 2), ("STEPS", 2), ("TARGETS", (30.0,)), ("MOVING", 700), ("SIDE", 48)):
+        monkeypatch.setattr(field, name, value)
+    monkeypatch.setattr(field, "SNAPSHOTS", 5)
+    monkeypatch.setattr(field, "NETWORK", field.NeuralSettings("tiny", steps=3))
+    monkeypatch.setattr(field, "CLOUDS", ((30, 300),))
+    fields, steps = field.tables(plot=tmp_path / "field.png")
+    labels = [row[1] for row in fields.rows]
+    assert sum(label.startswith("grade of degree") for label in labels) == 9
+    assert {"2 keyframes, raw", "2 keyframes, OKLab", "separable of rank 2, float32 ends"} < set(labels)
+    assert sum(label.startswith("**") for label in labels) >= 1
+    sizes = {label: float(row[2]) for label, row in zip(labels, fields.rows, strict=True)}
+    assert sizes[labels[0]] == 0.0 < sizes[labels[1]] < sizes[labels[2]]
+    assert all(float(row[3]) <= min(map(float, row[4].split())) + 0.05 for row in fields.rows)
+    assert steps.rows[0][-2] == "0"
+    assert "–" in steps.without_wall().rows[0]
+    with Image.open(tmp_path / "field.png") as picture:
+        assert picture.width == 2 * 380
+
+
+def test_keyframes_in_oklab_have_the_ends_of_raw_ones_and_go_straight_between() -> None:
+    rng = torch.Generator().manual_seed(0)
+    start, end = torch.randn(50, 14, generator=rng), torch.randn(50, 14, generator=rng)
+    # float32 through cubes and cube roots, which are steep at black
+    moved = InOklab(start, end, ("sh0",))
+    torch.testing.assert_close(moved.offsets(0.0), torch.zeros_like(end), atol=1e-4, rtol=0)
+    torch.testing.assert_close(moved.offsets(1.0), end, atol=1e-4, rtol=0)
+    gray, blue = torch.full((1, 14), 0.0), torch.zeros(1, 14)
+    blue[0, 11:14] = torch.tensor([-0.3, -0.1, 0.4]) / C0
+    half = 0.5 + C0 * InOklab(gray, blue, ("sh0",)).offsets(0.5)[0, 11:14]
+    ends = srgb_to_oklab(torch.tensor([[0.5, 0.5, 0.5], [0.2, 0.4, 0.9]]))
+    torch.testing.assert_close(srgb_to_oklab(half), ends.mean(dim=0), atol=1e-5, rtol=0)
+
+
+def test_a_scene_is_recolored_where_labels_lie_beside_it_and_else_tinted(small: None, tmp_path: Path) -> None:
+    (tmp_path / "robot_labels.npy").touch()
+    robot, guitar = tmp_path / "robot.ply", tmp_path / "guitar.splat"
+    bear, *given = tasks(tmp_path, [robot, guitar])
+    assert bear.scene.is_file()
+    assert given == [
+        Task(robot, f"labels:{tmp_path}/robot_labels.npy:1", training.BLUE),
+        Task(guitar, "all", training.TINT),
     ]
 
 
-def test_the_field_table_names_error_bytes_and_time_and_the_plot_is_written(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setattr(bench_field, "BEAR", 2_000)
-    monkeypatch.setattr(bench_field, "SIDE", 48)
-    monkeypatch.setattr(bench_field, "SNAPSHOTS", 5)
-    monkeypatch.setattr(bench_field, "EDITS", ("tilted ears",))
-    monkeypatch.setattr(bench_field, "CLOUDS", ((30, 300),))
-    fields, steps = bench_field.tables(plot=tmp_path / "pareto.png")
-    labels = [row[1] for row in fields.rows]
-    assert {"2 keyframes, float32", "4 keyframes, int8", "joint SVD, rank 2"} < set(labels)
-    assert any(label.startswith("auto at 40 dB") for label in labels)
-    assert all(float(row[3]) > 0 and float(row[7]) > 0 and float(row[8]) > 0 for row in fields.rows)
-    assert "tilted ears +" in fields.note or "tilted ears -" in fields.note
-    assert steps.rows[0][-1] == "0"
-    with Image.open(tmp_path / "pareto.png") as picture:
-        assert picture.width > 900
+def test_the_training_table_names_the_worst_strength_between() -> None:
+    runs = [Trained("", 9.6, 12.3, (31.0, 30.0, 33.0, 34.0, 35.0), 6.0)]
+    (row,) = table({Task(Path("a.ply"), "all", "tint:#c08040"): runs}).rows
+    assert row == ("a, tint:#c08040", "(default)", "35.0", "30.0", "31.0 30.0 33.0 34.0", "12", "10", "6")
 
 
-def test_the_note_compares_forms_of_the_same_bytes_edit_by_edit() -> None:
-    table = bench_field.field_table([*_forms("bear"), *_forms("robot")])
-    assert "bear +13.0 dB, robot +13.0 dB" in table.note
+def test_a_point_is_drawn_where_its_error_is(tmp_path: Path) -> None:
+    def height(psnr: float) -> float:
+        """Where the second point of two is, the first at 30 dB."""
+        points = [Point("a", 3.0, (30.0, 30.0)), Point("b", 6.0, (psnr, psnr), True)]
+        save_plot({"bear": points, "robot": points}, "bytes", tmp_path / "two.png")
+        with Image.open(tmp_path / "two.png") as picture:
+            pixels = np.asarray(picture.convert("RGB").crop((0, 0, 380, 285))).astype(int)
+        return float((abs(pixels - LINES[1]).sum(axis=2) < 40).nonzero()[0].mean())
 
-
-def test_the_plot_has_a_panel_for_every_edit_and_grows_by_rows_of_three() -> None:
-    three = draw_forms([form for edit in "abc" for form in _forms(edit)])
-    four = draw_forms([form for edit in "abcd" for form in _forms(edit)])
-    assert four.width == three.width
-    assert four.height > 1.8 * three.height
-    corner = three.crop((three.width * 2 // 3, three.height // 2, three.width, three.height))
-    assert any(color != PAPER for _, color in corner.getcolors(maxcolors=100_000) or [])
-
-
-def test_a_separable_point_lies_higher_where_its_error_is_smaller() -> None:
-    def height(worst: float) -> float:
-        picture = draw_forms([_form("bear", "separable", 84, worst, 0.1)]).crop((0, 60, 340, 250))
-        return float((np.asarray(picture) == (34, 84, 180)).all(2).nonzero()[0].mean())
-
-    assert height(50.0) < height(30.0)
-
-
-def test_runs_and_a_plot_are_refused_where_no_fields_are_measured(tmp_path: Path) -> None:
-    with pytest.raises(ProgdfError, match="use python -m benchmarks field"):
-        bench.main(["rasterize", "--plot", str(tmp_path / "x.png")])
-
-
-def test_a_folder_that_is_no_run_is_refused_before_anything_is_measured(tmp_path: Path) -> None:
-    with pytest.raises(ProgdfError, match=r"holds no trajectory\.safetensors"):
-        bench.main(["field", "--runs", str(tmp_path)])
+    assert height(50.0) < height(20.0)
+    assert (tmp_path / "two.png").stat().st_size < 40_000

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -24,9 +26,11 @@ from benchmarks.viewer.window import Dragging, Idle
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.formats.ply import save_ply
+from progdf.rasterize.screen import fill_screen
 from tests.helpers.demo_scenes import bear
 from viewer.camera.view_camera import bounds_of, first_camera
-from viewer.render import engine
+from viewer.render import dynamic_resolution, engine
+from viewer.render.cpu_renderer import CpuRenderer
 from viewer.render.engine import ViewEngine
 from viewer.render.gl_renderer import headless_context
 from viewer.state.view_state import LayerState, ViewState
@@ -42,6 +46,7 @@ def test_the_slider_table_has_a_row_for_each_way_to_draw_with_its_error() -> Non
     assert [result.way for result in results] == list(bench.WAYS)
     for result in results:
         assert len(result.events_ms) == len(result.parts) == 2
+        assert min(result.processor_ms) > 0.0
         assert all(part.changed == 100 for part in result.parts)
         assert all(ms > part.total_ms for ms, part in zip(result.events_ms, result.parts, strict=True))
         assert result.psnr_db >= 65.0, "the early stop at 1e-4, in a picture of few pixels"
@@ -62,6 +67,8 @@ def test_frames_are_counted_one_a_turn_and_are_the_same_drawn_afresh(tmp_path: P
     for turning in turnings:
         assert len(turning.frames_ms) == len(turning.draws_ms) == len(turning.coarse_ms) == 2
         assert min(turning.draws_ms) > 0.0, "every frame is a new picture"
+        assert turning.processor_ms > 0.0
+        assert turning.coarse_processor_ms > 0.0
         assert (turning.count, turning.wrong) == (600, 0)
         assert turning.checked >= 2
         assert 10.0 < turning.coarse_db < 60.0
@@ -85,7 +92,48 @@ def test_a_scene_in_the_hand_is_timed_beside_the_error_of_its_motion(monkeypatch
     assert len(result.turning) == len(result.beside) == 2
     assert 20.0 < result.db < 60.0
     assert abs(result.luminance) < 0.02
+    assert result.processor > 0.0
+    assert 0.0 < result.build < 1.0
+    assert 0.1 < result.memory < 0.5, "a node for about four Gaussians"
     assert moving.table([result]).rows[0][0] == "2 000"
+
+
+@pytest.mark.gl
+def test_a_picture_at_rest_is_looked_at_once_it_is_sharp(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """A large scene's sharp picture is made beside the window's work and comes some frames later."""
+    path, asked = tmp_path / "bear.ply", list[int]()
+    save_ply(path, bear(600).gaussians)
+    prepare = CpuRenderer.prepare
+
+    def slow(renderer: CpuRenderer, *picture: Any) -> bool:
+        asked.append(1)
+        return prepare(renderer, *picture) and len(asked) % 5 == 0
+
+    monkeypatch.setattr(CpuRenderer, "prepare", slow)
+    monkeypatch.setattr(dynamic_resolution, "SLOW_MS", -1.0)
+    ctx = headless_context()
+    turnings = bench_frames.measure_turning(ctx, path, steps=2, size=SIZE)
+    ctx.release()
+    assert len(asked) >= 5
+    assert [turning.at_rest for turning in turnings] == [0, 0]
+
+
+def test_a_moving_picture_is_compared_as_the_screen_stretches_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    size, drawn = (43, 30), np.random.default_rng(0).random((15, 22, 3), np.float32)
+    screen = np.zeros((size[1], size[0], 4), np.uint8)
+    fill_screen(drawn, screen)
+    full = screen[::-1, :, :3].astype(np.float32) / 255
+    pixels = SimpleNamespace(pixels=lambda: drawn)
+    work = SimpleNamespace(view=None)
+    mouse = SimpleNamespace(
+        size=size, engine=SimpleNamespace(renderer=pixels), main_view=SimpleNamespace(work=work)
+    )
+    monkeypatch.setattr(moving, "ViewEngine", lambda *_: SimpleNamespace(image=lambda *_: full))
+    error, apart = moving._compare(mouse, None)  # type: ignore[arg-type]
+    assert error > 20.0 * np.log10(255) + 10.0, "rounding to bytes alone"
+    assert abs(apart) < 1e-3
 
 
 def test_slow_frames_are_repeated_as_often_as_there_is_time_for() -> None:

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import os
+import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
+from benchmarks import __main__ as command
 from benchmarks.__main__ import main
+from benchmarks.table import Table, Wall, busy_share, machine, today
 from progdf.errors import ProgdfError
 
 
-@pytest.mark.parametrize("option", ["--json", "--plot", "--markdown"])
+@pytest.mark.parametrize("option", ["--json", "--plots", "--markdown"])
 def test_a_benchmark_that_could_not_be_written_down_is_not_begun(
     option: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -20,5 +26,55 @@ def test_a_benchmark_that_could_not_be_written_down_is_not_begun(
 
 
 def test_an_unknown_benchmark_is_named_with_those_there_are() -> None:
-    with pytest.raises(ProgdfError, match=r"unknown benchmark 'speed'; use one of rasterize, .*ablate"):
+    with pytest.raises(ProgdfError, match=r"unknown benchmark 'speed'; use one of training, .*ablate"):
         main(["speed"])
+
+
+def _table(**_: object) -> list[Table]:
+    return [Table("hard", "A table", ("case", Wall("ms"), "processor ms"), (("one", "7", "5"),), "A note.")]
+
+
+@pytest.mark.parametrize(("busy", "ms"), [(0.0, "7"), (0.5, "–")])
+def test_wall_times_are_left_out_where_others_use_the_cores(
+    busy: float, ms: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(command, "BENCHES", {"hard": "here"})
+    monkeypatch.setattr(command, "_function", lambda path: _table)
+    shares = iter((0.0, busy))  # before and after
+    monkeypatch.setattr(command, "busy_share", lambda: next(shares))
+    page = tmp_path / "page.md"
+    page.write_text(
+        "a\n<!-- bench machine -->\n<!-- end machine -->\n<!-- bench hard -->\nx\n<!-- end hard -->\nb\n"
+    )
+    main(["hard", "--markdown", str(page)])
+    text = page.read_text()
+    assert f"| one | {ms} | 5 |" in text
+    assert "A note. Made by `python -m benchmarks hard`" in text
+    assert text.count(today()) == 2
+    assert ("others used 50 % of the cores" in text) == (busy > 0)
+    assert f"<!-- bench machine -->\n{machine()}\n<!-- end machine -->" in text
+
+
+def test_a_loop_in_another_process_is_seen() -> None:
+    """A loop on every core, beside which half of each is left."""
+    loop = [sys.executable, "-c", "while True: pass"]
+    children = [subprocess.Popen(loop) for _ in range(os.cpu_count() or 1)]
+    try:
+        assert busy_share() > 0.3
+    finally:
+        for child in children:
+            child.kill()
+            child.wait()
+
+
+def test_page_is_all_that_its_document_has_markers_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+    monkeypatch.setattr(command, "_function", lambda path: lambda **_: asked.append(path) or [])
+    monkeypatch.setattr(command, "atomic_write", lambda path: pytest.fail("nothing was measured"))
+    with pytest.raises(ProgdfError, match="unknown benchmark 'page'"):
+        main(["page", "hard"])
+    main(["page"])
+    assert asked == [command.BENCHES[name] for name in command.PAGE]
+    text = (command.ROOT / "docs" / "speed-and-error.md").read_text()
+    named = set(re.findall(r"<!-- bench (\w+) -->", text))
+    assert named == {"machine", "compose", "coarse", *command.PAGE}

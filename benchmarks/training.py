@@ -1,0 +1,231 @@
+"""`python -m benchmarks training`: how good an edit of colors is by how long its training takes.
+
+Each run is a process of its own. All runs of a scene are judged alike: by the editor's own pictures of views
+in which nobody trains or chooses, at strengths that are nobody's own.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure as Drawing
+from matplotlib.lines import Line2D
+from PIL import Image
+
+from progdf.demo_scenes import bear
+from progdf.errors import ProgdfError
+from progdf.formats.ply import save_ply
+from progdf.formats.scene_file import load_scene
+from progdf.gaussians import Gaussians
+from progdf.gdf.file import load_gdf
+from progdf.io.atomic import atomic_write
+from progdf.scene.regions import parse_region
+from trainer.fit.evaluate import Evaluator
+from trainer.options import ViewOptions
+from trainer.report.plots import GRID, INK, LINES, PAPER
+from trainer.setup import make_training_setup
+
+from .ablation.regret import MEASURED, REPORTING, Edit
+from .table import Table, Wall
+
+WAYS = ("", "--quick", "--steps 40", "--views 12", "--stages 4", "--preset paper --field auto --quick")
+"""What `progdf train` is given beside what is edited."""
+
+BEAR = 12_000
+"""Gaussians of the bear, whose scarf is striped."""
+
+_MARKS = "os^DvPX*<>"  # of a plot's kinds
+
+STRIPES, BLUE, TINT = "stripes:#20a040", "recolor:#3060d0", "tint:#c08040"
+"""What is done to the scarf, to what is labeled 1 in a given scene, and to all of one without labels."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is edited, as `progdf train` has it."""
+
+    scene: Path
+    region: str
+    editor: str
+
+
+@dataclass(frozen=True)
+class Trained:
+    """One run."""
+
+    way: str  # one of `WAYS`
+    seconds: float  # of the wall
+    processor: float  # seconds of all cores together
+    psnrs: tuple[float, ...]  # to the editor's pictures at `MEASURED`, dB
+    bytes: float  # of the field by member
+
+
+def tasks(folder: Path, scenes: Sequence[Path] = ()) -> list[Task]:
+    """The bear, made in a folder, and each given scene, whose labels are in NAME_labels.npy beside it."""
+    scene, labels = bear(BEAR), folder / "bear_labels.npy"
+    save_ply(folder / "bear.ply", scene.gaussians)
+    np.save(labels, scene.labels.numpy())
+    made = [Task(folder / "bear.ply", f"labels:{labels}:{scene.label_names.index('scarf')}", STRIPES)]
+    for path in scenes:
+        labels = path.with_name(f"{path.stem}_labels.npy")
+        made.append(Task(path, f"labels:{labels}:1", BLUE) if labels.is_file() else Task(path, "all", TINT))
+    return made
+
+
+def edit_of_task(task: Task) -> Edit:
+    """With the views, the pictures and the judge that it takes."""
+    scene = load_scene(task.scene)
+    region = parse_region(task.region, scene)
+    return Edit(scene, region, task.editor, make_training_setup(ViewOptions(), scene, region))
+
+
+def train(task: Task, scene: Gaussians, judge: Evaluator, way: str, out: Path) -> Trained:
+    """Train one way, and judge what was written.
+
+    Raises:
+        ProgdfError: the training fails.
+    """
+    words = [str(task.scene), "--region", task.region, "--editor", task.editor, "--slider", "stages"]
+    command = [sys.executable, "-P", "-m", "progdf", "train", *words, *way.split(), "--out", str(out)]
+    began, before = time.perf_counter(), os.times()
+    run = subprocess.run(command, capture_output=True, text=True, check=False)
+    seconds, after = time.perf_counter() - began, os.times()
+    if run.returncode:
+        raise ProgdfError(f"{' '.join(command[3:])}: {run.stderr.strip()}")
+    spent = after.children_user + after.children_system - before.children_user - before.children_system
+    field = load_gdf(next(out.glob("*.gdf")), scene).field
+    psnrs = [judge.psnr(judge.pictures(field.offsets(s)), judge.edited[s]) for s in MEASURED]
+    return Trained(way, seconds, spent, tuple(psnrs), field.bytes_per_member)
+
+
+def tables(scenes: Sequence[Path] = (), plot: Path | None = None) -> list[Table]:
+    """Train each scene every way.
+
+    Args:
+        scenes: trained beside the bear and the room
+        plot: also draw the errors over the processor's time into this PNG file
+    """
+    with tempfile.TemporaryDirectory() as name:
+        found: dict[Task, list[Trained]] = {}
+        for task in tasks(Path(name), scenes):
+            edit = edit_of_task(task)
+            judge = edit.judge()
+            outs = (Path(name) / f"{len(found)}-{i}" for i in range(len(WAYS)))
+            found[task] = [train(task, edit.scene, judge, *pair) for pair in zip(WAYS, outs, strict=True)]
+    if plot is not None:
+        panels = {
+            f"{task.scene.stem}, {task.editor}": [
+                Point(run.way or "default", run.processor, run.psnrs) for run in runs
+            ]
+            for task, runs in found.items()
+        }
+        save_plot(panels, "seconds of the processor", plot)
+    return [table(found)]
+
+
+def table(found: Mapping[Task, Sequence[Trained]]) -> Table:
+    """A row a run."""
+    rows = []
+    for task, runs in found.items():
+        for run in runs:
+            between = " ".join(f"{psnr:.1f}" for psnr in run.psnrs[:-1])
+            rows.append(
+                (
+                    f"{task.scene.stem}, {task.editor}",
+                    f"`{run.way}`" if run.way else "(default)",
+                    f"{run.psnrs[-1]:.1f}",
+                    f"{min(run.psnrs[:-1]):.1f}",
+                    between,
+                    f"{run.processor:.0f}",
+                    f"{run.seconds:.0f}",
+                    f"{run.bytes:.0f}",
+                )
+            )
+    strengths = ", ".join(f"{s:g}" for s in MEASURED[:-1])
+    columns = (
+        "edit", "`progdf train` with", "dB at 1", "worst between, dB", f"at {strengths}",
+        "processor, s", Wall("wall, s"), "bytes a member",
+    )  # fmt: skip
+    commands = ", ".join(
+        f"`progdf train {task.scene.name} --region {_short(task.region)} --editor {task.editor} "
+        "--slider stages --out RUN`"
+        for task in found
+    )
+    note = (
+        f"PSNR to the editor's own pictures in {REPORTING - 1} views of a rig in which nobody trained or "
+        "chose, over the pixels that show the region; whole processes, imports and the report's pictures "
+        f"included. Each row is that option added to: {commands}."
+    )
+    return Table("training", "Training: error over time", columns, tuple(rows), note)
+
+
+@dataclass(frozen=True)
+class Point:
+    """Something that is measured, in a plot."""
+
+    kind: str  # in the legend
+    x: float  # ≥ 0
+    psnrs: Sequence[float]  # at `MEASURED`, dB
+    chosen: bool = False
+
+
+def save_plot(panels: Mapping[str, Sequence[Point]], across: str, path: Path) -> None:
+    """Panels side by side in one small PNG file; a point at its error at 1, a stroke to its worst between."""
+    kinds = list(dict.fromkeys(point.kind for points in panels.values() for point in points))
+    drawing = Drawing((3.8 * len(panels), 3.6), 100, facecolor=_shade(PAPER), layout="constrained")
+    for axes, (title, points) in zip(
+        drawing.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True
+    ):
+        axes.set_facecolor(_shade(PAPER))
+        axes.set_title(title, loc="left", fontsize=9)
+        axes.set_xlabel(across, fontsize=8)
+        axes.set_ylabel("dB at 1; the stroke: worst between", fontsize=8)
+        axes.tick_params(labelsize=8, length=0)
+        axes.grid(color=_shade(GRID))
+        axes.spines[:].set_visible(False)
+        most = max(point.x for point in points)
+        axes.set_xlim(-0.03 * most, 1.08 * most)
+        if min(point.x for point in points) == 0.0:  # bytes, of 0 to some hundred
+            axes.set_xscale("symlog", linthresh=1.0)
+            axes.xaxis.set_major_formatter(lambda x, _: f"{x:g}")
+            axes.set_xlim(-0.2, 1.5 * most)
+        for point in points:
+            index = kinds.index(point.kind)
+            color, mark = _shade(LINES[index % len(LINES)]), _MARKS[index % len(_MARKS)]
+            axes.plot([point.x] * 2, [point.psnrs[-1], min(point.psnrs[:-1])], color=color, linewidth=1)
+            axes.plot(point.x, point.psnrs[-1], mark, color=color, markersize=5, zorder=3)
+            if point.chosen:
+                axes.plot(point.x, point.psnrs[-1], "o", mfc="none", mec=_shade(INK), markersize=11)
+    handles = []
+    for index, kind in enumerate(kinds):
+        color, mark = _shade(LINES[index % len(LINES)]), _MARKS[index % len(_MARKS)]
+        handles.append(Line2D([], [], color=color, marker=mark, linewidth=0, label=kind))
+    if any(point.chosen for points in panels.values() for point in points):
+        handles.append(Line2D([], [], mfc="none", mec=_shade(INK), marker="o", linewidth=0, label="chosen"))
+    drawing.legend(
+        handles=handles, loc="outside lower left", fontsize=7.5, ncols=2 * len(panels), frameon=False
+    )
+    canvas = FigureCanvasAgg(drawing)
+    canvas.draw()
+    page = Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
+    with atomic_write(path) as temporary_file:
+        page.quantize(64, dither=Image.Dither.NONE).save(temporary_file, format="PNG", optimize=True)
+
+
+def _shade(color: tuple[int, int, int]) -> tuple[float, ...]:
+    return tuple(channel / 255 for channel in color)
+
+
+def _short(region: str) -> str:
+    """A region's labels without their folder."""
+    kind, colon, rest = region.partition(":")
+    return kind + colon + rest.rpartition("/")[2]
