@@ -54,7 +54,9 @@ def begin_training(scene: Gaussians) -> Iterator[Training]:
         folder = Path(name)
         save_ply(folder / "scene.ply", scene)
         words = ["train", str(folder / "scene.ply"), "--out", str(folder / "run"), "--region", "all"]
-        child = Child([*words, "--editor", "stripes:#20a040", "--steps", "100000"], folder / "log")
+        # a descent, which does not end before its steps do
+        words += ["--editor", "stripes:#20a040", "--preset", "paper", "--field", "auto", "--steps", "100000"]
+        child = Child(words, folder / "log")
         try:
             began = time.monotonic()
             while _STARTED not in child.log.read_text("utf-8"):
