@@ -165,8 +165,10 @@ def fit_grades(
 
 
 def field_evaluator(trajectory: Trajectory, views: Evaluator, target: float | None) -> FieldEvaluator:
-    """What decides whether a field serves: the editor's own pictures of these views, or a target in dB."""
-    edited = {s: views.count(views.edited[strength]) for s, strength in trajectory.stage_strengths}
+    """What decides whether a field serves: the editor's own pictures of these views, at the strengths of
+    which there are some; or a target in dB."""
+    known = [(s, strength) for s, strength in trajectory.stage_strengths if strength in views.edited]
+    edited = {s: views.count(views.edited[strength]) for s, strength in known}
     offsets, render = _recorded_offsets(trajectory), views.counted_pixels
     if target is None:
         return FieldEvaluator(trajectory.s, offsets, render, edited=edited)
