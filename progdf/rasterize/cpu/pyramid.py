@@ -7,7 +7,7 @@ as it shows.
   leaf. What merging loses is estimated in pixels² as the spread of the centers, in pixels, times the root of
   the visible area, as errors add up in squares; and it shows as far as light reaches it, which a coarser cut
   of the same view tells, added up in a grid of cells and slices of depth.
-- The limit is sought so that about as many are drawn as asked for, from the last picture's on.
+- The limit is sought so that about as many are drawn as asked for, beginning at the last picture's.
 - The dilation, wider in a coarse picture, is taken off the size, and the remainder off the opacity.
 
 The plain version is in tests/helpers/plain_pyramid.py.
@@ -143,7 +143,7 @@ class Pyramid:
 
         Args:
             camera: of the coarse picture
-            budget: how many Gaussians are drawn at most; somewhat fewer where they would be many more
+            budget: about how many Gaussians are drawn; more only where no limit is found in time
             pixels: of the fine picture that one of the coarse one covers, each way
 
         Returns:
@@ -420,7 +420,7 @@ def _walk(
     Args:
         limit: of what a node may lose, pixels²
         depths: optical depth before each slice, or [1]: all in the light
-        stack: scratch, longer than twice the levels
+        stack: scratch, more than the levels
         picks: out, as in `Pyramid.cut`
 
     Returns:

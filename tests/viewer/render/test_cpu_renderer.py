@@ -160,3 +160,13 @@ def test_a_moving_picture_follows_sliders_and_highlights(
     assert all(map(np.array_equal, merged, pyramid.nodes.gaussians)), "nothing was behind"
     for engine in (slid, afresh):
         engine.release()
+
+
+def test_a_small_picture_of_a_large_scene_leaves_the_one_in_full_as_it_is(stack: Stack) -> None:
+    engine, afresh = (ViewEngine(None, stack.scene, stack.gdfs) for _ in range(2))
+    engine.image(view_of(stack, 0.1, 0.6), SIZE, pixels=2)
+    dynamic_resolution._worker().submit(int).result()  # now there is a pyramid
+    small = engine.image(view_of(stack, 0.4, 0.6), SIZE, pixels=2).copy()
+    full = engine.image(view_of(stack, 0.4, 0.6), SIZE)
+    assert not np.array_equal(full, small)
+    assert np.array_equal(full, afresh.image(view_of(stack, 0.4, 0.6), SIZE))
