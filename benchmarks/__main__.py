@@ -20,6 +20,7 @@ import tyro
 from progdf.__main__ import run_guarded
 from progdf.cli.options import parse_options
 from progdf.errors import ProgdfError
+from progdf.formats.scene_file import load_scene
 from progdf.io.atomic import atomic_write
 
 from .table import BUSY, Table, busy_share, machine, put_tables, today
@@ -105,6 +106,8 @@ def main(argv: Sequence[str]) -> int:
     ):  # told before an hour has been measured
         if folder is not None and not folder.is_dir():
             raise ProgdfError(f"the folder {folder} does not exist; create it first")
+    for path in options.scenes:
+        load_scene(path)
     for page in options.markdown:
         if not page.is_file():
             raise ProgdfError(f"{page} does not exist; check the name and the folder")

@@ -25,6 +25,14 @@ def test_a_benchmark_that_could_not_be_written_down_is_not_begun(
         main(["field", option, str(tmp_path / "no" / "f.x")])
 
 
+def test_nothing_is_measured_where_a_scene_is_broken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    broken = tmp_path / "scene.ply"
+    broken.write_text("ply\n")
+    monkeypatch.setattr(command, "_function", lambda name: pytest.fail(f"{name} was begun"))
+    with pytest.raises(ProgdfError, match=r"scene\.ply"):
+        main(["page", "--scenes", str(broken)])
+
+
 def test_an_unknown_benchmark_is_named_with_those_there_are() -> None:
     with pytest.raises(ProgdfError, match=r"unknown benchmark 'speed'; use one of training, .*ablate"):
         main(["speed"])
