@@ -140,12 +140,13 @@ def color_forms(name: str, edit: Edit) -> list[Form]:
     model, _, automatic = edit.automatic(judge)
     strengths = edit.strengths(STAGES, model.allowed_share)
     knots = torch.tensor([0.0, *strengths])
-    solver, recording = make_solver(edit.drawn, edit.original), torch.zeros(0)
-    for degree in MONOMIALS:
+    plain, recording = make_solver(edit.drawn, edit.original), torch.zeros(0)
+    for degree, mask in [(d, mask) for mask in dict.fromkeys((None, model.mask)) for d in MONOMIALS]:
         began = time.process_time()
+        solver = plain if mask is None else plain.with_mask(mask.float() / 255.0)
         maps = [solver.fit_map(degree, edit.targets(s)) for s in strengths]
         table = torch.stack([identity_map(degree), *(table for table, _ in maps)])
-        mapped = mapped_bands(degree, table, edit.original)
+        mapped = mapped_bands(degree, table, edit.original, solver.share)
         bands = max(1, model.bands)
         zero = torch.zeros(len(edit.original), bands, 3)
         own = [
@@ -154,12 +155,14 @@ def color_forms(name: str, edit: Edit) -> list[Form]:
         ]
         course = torch.stack([zero, *own]).flatten(2)
         for rank in RANKS:
-            form = fit_grade(knots, degree, table, course, rank, edit.weights)
+            form = fit_grade(knots, degree, table, course, rank, edit.weights, mask)
             field = bake_grade(form, edit.original, mapped)
             label = f"grade of degree {degree} ({len(table[0])} × 3 numbers a knot)"
+            label += "" if mask is None else ", a mask"
             label += f", residual of rank {rank}" if rank else " alone"
-            measure(f"grade of degree {degree}", label, form.bytes_per_member, field, began)
-        if degree == max(1, model.degree):
+            kind = f"grade of degree {degree}" if mask is None else f"masked grade of degree {degree}"
+            measure(kind, label, form.bytes_per_member, field, began)
+        if degree == max(1, model.degree) and mask is model.mask:
             moved = [add_bands(m, r) for (_, m), r in zip(maps, own, strict=True)]
             width = edit.original.shape[1]
             recording = torch.stack(
@@ -190,7 +193,7 @@ def color_forms(name: str, edit: Edit) -> list[Form]:
         *forms,
         Form(
             name,
-            f"grade of degree {model.degree}",
+            f"{'masked ' * (model.mask is not None)}grade of degree {model.degree}",
             chosen,
             automatic.bytes,
             tuple(automatic.psnrs),

@@ -156,7 +156,7 @@ class Edit:
         self.picture(1.0)
         began = time.process_time()
         solver = make_solver(self.drawn, self.original)
-        model = choose_model(solver, [(solver, choosing(1.0))], self.targets(1.0), most, 4)
+        solver, model = choose_model(solver, [(solver, choosing(1.0))], self.targets(1.0), most, 4)
         spent = time.process_time() - began
         strengths = self.strengths(8, model.allowed_share)
         stages = [TargetStage(s, self.targets(s), 1) for s in strengths]
@@ -169,15 +169,22 @@ class Edit:
         tables = [snapshot.table for snapshot in made if snapshot.table is not None]
         name = f"automatic: {len(self.setup.views)} views, {len(strengths)} strengths, {model.bands} SH"
         offsets = [snapshot.offsets for snapshot in made]
-        result = self.measure(name, judge, strengths, model.bands, tables, offsets, spent)
+        result = self.measure(name, judge, strengths, model.bands, tables, offsets, spent, model.mask)
         return model, f"{model.line}; strengths {at} in {steps} steps", result
 
     def sweep(
-        self, judge: Evaluator, degree: int, bands: int, most: int, stages: Sequence[int]
+        self,
+        judge: Evaluator,
+        degree: int,
+        bands: int,
+        most: int,
+        stages: Sequence[int],
+        mask: Tensor | None,
     ) -> Iterator[Result]:
         """Some strengths and steps."""
         began = time.process_time()
         solver, last = make_solver(self.drawn, self.original), None
+        solver = solver if mask is None else solver.with_mask(mask.float() / 255.0)
         once = time.process_time() - began
         every = self.strengths(stages[0])
         for s in (1.0, *every[:-1]):
@@ -198,11 +205,12 @@ class Edit:
                 if steps <= most:
                     made = [self.solved[degree, bands, s, steps] for s in strengths]
                     words = f", {steps} steps" if bands else ""
+                    words += ", a mask" * (mask is not None)
                     name = f"{len(self.setup.views)} views, {count} strengths{words}, {bands} SH"
                     offsets = [band_offsets(change, self.original.shape[1]) for _, change, _ in made]
                     spent = once + sum(seconds for *_, seconds in made)
                     tables = [table for table, *_ in made]
-                    yield self.measure(name, judge, strengths, bands, tables, offsets, spent)
+                    yield self.measure(name, judge, strengths, bands, tables, offsets, spent, mask)
 
     def measure(
         self,
@@ -213,6 +221,7 @@ class Edit:
         tables: Sequence[Tensor],
         offsets: Sequence[Tensor],
         spent: float,
+        mask: Tensor | None = None,
     ) -> Result:
         """The field that a run would keep of these, its slider the editor's own strength."""
         count = len(strengths)
@@ -225,6 +234,7 @@ class Edit:
             tuple(strengths),
             torch.stack(list(tables)),
             bands,
+            mask,
         )
         choosing = self.evaluator(self.choosing, {s: self.aside(s) for s in strengths})
         one = replace(choosing, crops=choosing.crops[:1], pixels=choosing.pixels[:1], edited={})
@@ -278,12 +288,14 @@ def run_regret(options: RegretOptions) -> Table:
     print_line(" | ".join(automatic.cells))
     for bands in (bands for bands in BANDS if bands <= edit.drawn[0].basis.shape[1]):
         most = STEPS[-1] if bands == model.bands else STEPS[-2]
-        for result in edit.sweep(judge, model.degree, bands, most, STAGES):
+        for result in edit.sweep(judge, model.degree, bands, most, STAGES, model.mask):
             print_line(" | ".join(result.cells))
             results.append(result)
     used = max(results[1:], key=lambda result: result.mean).name.split()[-2]
     for views in VIEWS:
-        for result in edit_from(views).sweep(judge, model.degree, int(used), STEPS[-2], STAGES[:1]):
+        for result in edit_from(views).sweep(
+            judge, model.degree, int(used), STEPS[-2], STAGES[:1], model.mask
+        ):
             print_line(" | ".join(result.cells))
             results.append(result)
     best = max(results, key=lambda result: result.mean)

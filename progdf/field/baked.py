@@ -247,6 +247,7 @@ class GradeForm:
     scale: Tensor  # what one unit of them is worth. [R,3B] float32
     coefficients: Tensor  # of the bases at each knot; 0 at the first. [S,R] float32
     remap: SliderRemap  # from these knots to the slider
+    mask: Tensor | None = None  # how much of the map each member takes, in 255ths; None: all. [M] uint8
 
     def __post_init__(self) -> None:
         if self.degree not in (LATTICE, *MONOMIALS) or self.table.ndim != 3:
@@ -270,6 +271,9 @@ class GradeForm:
             raise ValueError(f"residual is {list(self.residual.shape)} {self.residual.dtype}, expected int8")
         if self.residual.shape[2] not in (0, 3, 12, 27, 48):
             raise ValueError(f"residual has {self.residual.shape[2]} channels, expected whole bands")
+        mask = self.mask
+        if mask is not None and (mask.shape != (self.members,) or mask.dtype != torch.uint8):
+            raise ValueError(f"mask is {list(mask.shape)} {mask.dtype}, expected [{self.members}] uint8")
         if bool(self.coefficients[0].any()) or not torch.equal(
             self.table[0], identity_map(self.degree, numbers)
         ):
@@ -281,17 +285,23 @@ class GradeForm:
         return int(self.residual.shape[1])
 
     @property
+    def share(self) -> Tensor:
+        """How much of the map each member takes, 0..1. [M] float32"""
+        return torch.ones(self.members) if self.mask is None else self.mask.float() / 255.0
+
+    @property
     def label(self) -> str:
-        """What it is, as in "grade of degree 2, 2 bases of DC"."""
+        """What it is, as in "grade of degree 2, a mask, 2 bases of DC"."""
         bases, parts = len(self.residual), "DC" if self.residual.shape[2] == 3 else "two bands"
         beside = f"{bases} bas{'is' if bases == 1 else 'es'} of {parts}" if bases else "no residual"
+        beside = beside if self.mask is None else f"a mask, {beside}"
         side = 0 if self.degree else lattice_side(self.table.shape[1])
         return f"grade of {f'degree {self.degree}' if self.degree else f'{side}³ colors'}, {beside}"
 
     @property
     def bytes_per_member(self) -> float:
         """Stored bytes for one member; the map is the region's."""
-        return float(self.residual.shape[0] * self.residual.shape[2])
+        return float(self.residual.shape[0] * self.residual.shape[2] + (self.mask is not None))
 
 
 @dataclass(frozen=True)

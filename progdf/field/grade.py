@@ -4,8 +4,9 @@ For each knot of the slider the map is a polynomial of the drawn color q = clamp
 color' = Σ_k c_k m_k(q), with m_k the monomials up to the degree; that of a .cube file is linear between the
 points of its lattice, on q = clamp(SH color, 0, 1). It is held as spherical harmonics of the
 members, which are computed from the scene's own when the field is loaded, so that a file keeps some hundred
-numbers and whatever draws Gaussians draws it. What a map cannot say of single Gaussians is a residual of
-their lowest bands, of a few int8 bases.
+numbers and whatever draws Gaussians draws it. A pattern takes a mask beside it: a byte by Gaussian, how much
+of the map it takes. What both cannot say of single Gaussians is a residual of their lowest bands, of a few
+int8 bases.
 """
 
 from __future__ import annotations
@@ -150,10 +151,11 @@ def band_offsets(change: Tensor, channels: int) -> Tensor:
     return offsets
 
 
-def mapped_bands(degree: int, table: Tensor, rows: Tensor) -> Tensor:
-    """What the map alone adds to the members' bands at each knot. [S,K,3], [M,14+3K] -> [S,M,3B]"""
+def mapped_bands(degree: int, table: Tensor, rows: Tensor, share: Tensor) -> Tensor:
+    """What the map adds to the members' bands at each knot. [S,K,3], [M,14+3K], [M] -> [S,M,3B]"""
     sh = member_bands(rows)
-    return torch.stack([(map_colors(sh, at_knot, degree) - sh).flatten(1) for at_knot in table])
+    changes = [share[:, None] * (map_colors(sh, at_knot, degree) - sh).flatten(1) for at_knot in table]
+    return torch.stack(changes)
 
 
 def lowest_bands(offsets: Tensor, bands: int) -> Tensor:
@@ -180,7 +182,7 @@ def bake_grade(form: GradeForm, rows: Tensor, mapped: Tensor | None = None) -> B
     width = form.residual.shape[2]
     if len(rows) != form.members or width // 3 > member_bands(rows).shape[1]:
         raise ValueError(f"a grade of {form.members} members for {len(rows)} of {rows.shape[1]} numbers")
-    course = mapped_bands(form.degree, form.table, rows) if mapped is None else mapped.clone()
+    course = mapped_bands(form.degree, form.table, rows, form.share) if mapped is None else mapped.clone()
     if len(form.residual):
         course[:, :, :width] += torch.einsum(
             "sr,rmc->smc", form.coefficients, form.residual * form.scale[:, None]
@@ -220,6 +222,7 @@ def adjust_colors(form: GradeForm, sh: Tensor, members: Tensor | slice, s: float
         change = share * (map_colors(sh, form.table[right], LATTICE) - sh)
     else:
         change = map_colors(sh, map_at(form, s), form.degree) - sh
+    change = form.share[members, None, None] * change
     if len(form.residual):
         row = torch.lerp(form.coefficients[right - 1], form.coefficients[right], share)
         residual = (form.residual[:, members] * (row[:, None] * form.scale)[:, None]).sum(dim=0)
@@ -268,14 +271,22 @@ def lattice_form(table: Tensor) -> GradeForm:
     return GradeForm(LATTICE, knots, ends, none, torch.zeros(0, 0), torch.zeros(2, 0), identity_remap())
 
 
-def without_residual(form: GradeForm, members: int) -> GradeForm:
+def map_alone(form: GradeForm, members: int) -> GradeForm:
     """The map of a grade alone, for so many members of any scene."""
     none = torch.zeros(0, members, 0, dtype=torch.int8)
-    return replace(form, residual=none, scale=torch.zeros(0, 0), coefficients=form.coefficients[:, :0])
+    return replace(
+        form, residual=none, scale=torch.zeros(0, 0), coefficients=form.coefficients[:, :0], mask=None
+    )
 
 
 def fit_grade(
-    knots: Tensor, degree: int, table: Tensor, course: Tensor, rank: int, weights: Tensor
+    knots: Tensor,
+    degree: int,
+    table: Tensor,
+    course: Tensor,
+    rank: int,
+    weights: Tensor,
+    mask: Tensor | None = None,
 ) -> GradeForm:
     """A grade whose residual has so many bases.
 
@@ -286,6 +297,7 @@ def fit_grade(
         course: what the members' lowest bands need beside the map at each knot; 0 at the first. [S,M,3b]
         rank: number of bases, at most `rank_limit`
         weights: how much an error of each member shows, ≥ 0. [M]
+        mask: see `GradeForm`
     """
     root = weights.sqrt()[:, None]
     reach = course.abs().amax(dim=0).kthvalue(max(1, math.ceil(_WITHIN * course.shape[1])), dim=0).values
@@ -307,6 +319,7 @@ def fit_grade(
         scale,
         coefficients.float(),
         identity_remap(),
+        mask,
     )
 
 

@@ -55,6 +55,7 @@ class Trajectory:
     # each stage [stages,K,3], and how many bands that are
     maps: Tensor | None = None
     bands: int = 0
+    mask: Tensor | None = None  # how much of the maps each member takes, see `GradeForm.mask`. [M] uint8
 
     def __len__(self) -> int:
         return int(self.s.shape[0])
@@ -96,6 +97,8 @@ def save_trajectory(
     }
     if trajectory.maps is not None:
         tensors |= {"maps": trajectory.maps, "bands": torch.tensor(trajectory.bands)}
+    if trajectory.mask is not None:
+        tensors["mask"] = trajectory.mask
     header = {"format": _FORMAT, "about": json.dumps(dict(about))}
     with atomic_write(path) as temporary_file:
         write_tensors(temporary_file, tensors, header, checksum=True)
@@ -119,8 +122,9 @@ def load_trajectory(path: Path) -> tuple[Trajectory, dict[str, Tensor], dict[str
         tensors.pop("steps"),
         tuple(tensors.pop("stage_ends").tolist()),
         tuple(tensors.pop("strengths").tolist()),
-        tensors.pop("maps", None),
-        int(tensors.pop("bands", torch.tensor(0))),
+        maps=tensors.pop("maps", None),
+        bands=int(tensors.pop("bands", torch.tensor(0))),
+        mask=tensors.pop("mask", None),
     )
     _check(path, trajectory)
     return trajectory, tensors, about
@@ -181,6 +185,9 @@ def _check(path: Path, trajectory: Trajectory) -> None:
         or trajectory.bands not in (0, 1, 4)
     ):
         raise _damage_error(path, "its maps of color do not fit its stages")
+    mask = trajectory.mask
+    if mask is not None and (mask.dtype != torch.uint8 or mask.shape != shape[1:2]):
+        raise _damage_error(path, "its mask does not fit its members")
     if len(trajectory.steps) != len(s) or not bool(
         trajectory.offsets.isfinite().all() & trajectory.end.isfinite().all()
     ):

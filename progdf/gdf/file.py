@@ -17,7 +17,7 @@ from torch.utils.weak import WeakIdKeyDictionary
 from progdf.errors import ProgdfError
 from progdf.field.bake import bake_form, rows_hash
 from progdf.field.baked import BakedField, GradeForm, NeuralForm
-from progdf.field.grade import bake_grade, lattice_form, without_residual
+from progdf.field.grade import bake_grade, lattice_form, map_alone
 from progdf.formats.cube import SUFFIX as CUBE
 from progdf.formats.cube import read_cube
 from progdf.gaussians import BASE_CHANNELS, ZERO, Gaussians, Origin, pack
@@ -192,7 +192,7 @@ def load_gdf(
 
 
 def apply_grade(gdf: Gdf, scene: Gaussians, region: Region) -> Gdf:
-    """The map of a grade on a region of any scene: its residual and its figures are of another one.
+    """The map of a grade on a region of any scene: its mask, residual and figures are of another one.
 
     Raises:
         ProgdfError: it is no grade, its colors are beyond any, or the region has no members.
@@ -205,12 +205,13 @@ def apply_grade(gdf: Gdf, scene: Gaussians, region: Region) -> Gdf:
     if not len(region):
         raise ProgdfError(f"the region for {gdf.name} has no Gaussians; give another")
     rows = pack(scene[region.members], with_shN=scene.sh_degree > 0)
-    field = replace(bake_grade(without_residual(stored, len(region)), rows), recorded=())
+    field = replace(bake_grade(map_alone(stored, len(region)), rows), recorded=())
     try:
         _check_reach(field)
     except ValueError as error:
         raise contradiction_error(gdf.name, error) from error
-    report = {"residual_left_out": len(stored.residual) > 0}
+    parts = {"mask": stored.mask is not None, "residual": len(stored.residual) > 0}
+    report = {"left_out": " and ".join(name for name, there in parts.items() if there)}
     return Gdf(gdf.name, region, field, fingerprint(scene), gdf.instruction, report=report, applied=True)
 
 

@@ -26,7 +26,7 @@ from progdf.gaussians import ATTRIBUTES
 from progdf.io.json_values import convert_json, decode_json
 from progdf.region import Region
 
-FORMAT = 3
+FORMAT = 4
 """The version of the file format."""
 
 MOST_GAUSSIANS = 1 << 26
@@ -133,7 +133,7 @@ def unpack_file(content: bytes, name: str) -> tuple[GdfHeader, dict[str, Tensor]
             sha256 = convert_json(value["sha256"], str)
             signed = text.replace(sha256, "")
         version = convert_json(value["format"], int)
-        intact = checksum(signed, tensors) == sha256 and version in ((1,) if older else (2, FORMAT))
+        intact = checksum(signed, tensors) == sha256 and version in ((1,) if older else range(2, FORMAT + 1))
     except (msgspec.MsgspecError, ValueError, KeyError, TypeError, RuntimeError):
         raise damage from None
     if version > FORMAT:
@@ -190,6 +190,8 @@ def pack_field(field: BakedField) -> tuple[FieldHeader, dict[str, Tensor]]:
         tensors = {name: getattr(form, name) for name in _GRADE} | {
             "remap": torch.stack([form.remap.old, form.remap.new])
         }
+        if form.mask is not None:
+            tensors["mask"] = form.mask
         return msgspec.structs.replace(header, attributes=[], grade=form.degree), tensors
     network, plan = form.network, form.plan
     tensors = {_NETWORK + name: tensor for name, tensor in network.tensors.items()}
@@ -214,7 +216,10 @@ def unpack_field(header: FieldHeader, tensors: Mapping[str, Tensor]) -> BakedFie
     if header.grade is not None:
         old, new = tensors["remap"].double()
         grade = GradeForm(
-            header.grade, **{name: tensors[name] for name in _GRADE}, remap=SliderRemap(old, new)
+            header.grade,
+            **{name: tensors[name] for name in _GRADE},
+            remap=SliderRemap(old, new),
+            mask=tensors.get("mask"),
         )
         return BakedField("grade", torch.tensor([0.0, 1.0]), {}, header.channels, recorded, grade)
     if header.network is None:

@@ -30,8 +30,7 @@ from progdf.scene.up_axis import find_up
 from progdf.sh import basis
 from trainer.editors import COLOR_FUNCTIONS, make_editor
 from trainer.editors.procedural import edit_course
-from trainer.optimize.color_solver import MORE_PAYS
-from trainer.optimize.color_views import ColorView, MapFit, fit_maps
+from trainer.optimize.color_views import MORE_PAYS, ColorView, MapFit, fit_maps
 from trainer.options import MOST_STAGES, EditorOptions, ViewOptions
 from trainer.views.view import BACKGROUND, View, fit_size, region_rig, with_near_plane
 
@@ -59,7 +58,7 @@ class _Pixels:
 
     def picture(self, table: Tensor) -> Tensor:
         """The row under a map. [K,3] -> [P,3] 0..1"""
-        return (self.maps.design[:, : len(table)] @ table + self.maps.others).clamp(0.0, 1.0)
+        return self.maps.picture(table).clamp(0.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -129,7 +128,7 @@ def _look(scene: Gaussians, region: Region, camera: Camera) -> tuple[View, Color
 def _sample(looked: Sequence[tuple[View, ColorView]], most: int) -> _Pixels:
     """Evenly spread pixels of views."""
     views = [view for _, view in looked]
-    maps = fit_maps(views, most)
+    maps = fit_maps(views, torch.ones(len(views[0].original)), most)
 
     def gather(images: Sequence[Tensor]) -> Tensor:
         return torch.cat([i.flatten(0, 1)[p] for i, p in zip(images, maps.pixels, strict=True)])[None]

@@ -149,12 +149,15 @@ def fit_grades(
     nodes = [0, *trajectory.stage_ends]
     degree = next(d for d, count in MONOMIALS.items() if count == trajectory.maps.shape[1])
     table = torch.cat([identity_map(degree)[None], trajectory.maps])
-    mapped, recorded = mapped_bands(degree, table, rows), torch.stack([trajectory.node(i) for i in nodes])
+    mask, share = trajectory.mask, torch.ones(len(rows))
+    share = share if mask is None else mask.float() / 255.0
+    mapped = mapped_bands(degree, table, rows, share)
+    recorded = torch.stack([trajectory.node(i) for i in nodes])
     course = lowest_bands(recorded, trajectory.bands) - mapped[:, :, : 3 * trajectory.bands]
     evaluator, budget = field_evaluator(trajectory, choosing, options.target_psnr), options.bytes_budget
     tried = list[Candidate]()
     for rank in range(rank_limit(course) + 1):
-        form = fit_grade(trajectory.s[nodes], degree, table, course, rank, weights)
+        form = fit_grade(trajectory.s[nodes], degree, table, course, rank, weights, mask)
         if tried and form.bytes_per_member > (budget or math.inf):
             break
         field = replace(bake_grade(form, rows, mapped), recorded=tuple(trajectory.s.tolist()))
@@ -311,5 +314,6 @@ def stored_numbers(field: BakedField) -> int:
     if isinstance(form, NeuralForm):
         return form.network.parameters + form.network.end.numel()
     if isinstance(form, GradeForm):
-        return sum(part.numel() for part in (form.table, form.residual, form.scale, form.coefficients))
+        parts = (form.table, form.residual, form.scale, form.coefficients, form.mask)
+        return sum(part.numel() for part in parts if part is not None)
     return sum(part.numel() for bases in field.attributes.values() for part in vars(bases).values())

@@ -18,9 +18,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -32,17 +32,25 @@ from progdf.field.baked import MONOMIALS, identity_map
 from progdf.field.choose import allowed_error
 from progdf.field.grade import band_offsets, map_colors, member_bands
 from progdf.metrics.image import LEVEL, decibels
+from progdf.sh import C0
 from progdf.threads import one_thread
 
-from .color_views import ColorView, Judge, MapFit, fit_maps, iterate_views, map_views
+from .color_views import (
+    MORE_PAYS,
+    ColorView,
+    Judge,
+    MapFit,
+    fit_maps,
+    improve_mask,
+    iterate_views,
+    map_views,
+    mask_of_members,
+)
 from .pgs import OnStep, ParameterSnapshot, PgsState, TargetStage
 from .ties import Ties
 
 STEPS_OF_OTHERS = 8
 """Steps of an optimizer that looks at one view at a time which one iteration over all views stands for."""
-
-MORE_PAYS = 0.95
-"""Share of the error that a larger model must leave at most, to be worth its bytes."""
 
 SETTLED = 0.001
 """Share of the error in views not solved for that a step takes away at least, for another to follow."""
@@ -65,6 +73,7 @@ class Model:
     degree: int  # of the map; 0: none
     hold: float  # of the residual at 0, as a share of a typical member's weight
     residual: Tensor  # of the finished edit: b of 0, 1 or 4 bands. [M,b,3]
+    mask: Tensor | None  # see `GradeForm.mask`
     error: float  # mean square, of the finished edit in views not solved for: what is finer is not chased
     unedited: float  # the same of the original
     tried: Sequence[tuple[str, float]]  # what was tried, and its error on views not solved for, dB
@@ -82,7 +91,8 @@ class Model:
     def figures(self) -> dict[str, Any]:
         """As report.json has it."""
         tried = {name: round(error, 2) for name, error in self.tried}
-        return {"degree": self.degree, "sh_functions": self.bands, "tried_psnr": tried}
+        masked = self.mask is not None
+        return {"degree": self.degree, "mask": masked, "sh_functions": self.bands, "tried_psnr": tried}
 
     @property
     def line(self) -> str:
@@ -92,15 +102,37 @@ class Model:
         )
         over = ", ".join(f"{name} {error:.1f}" for name, error in self.tried)
         of_color = f"a map of color of degree {self.degree}" if self.degree else "no map"
+        of_color += "" if self.mask is None else ", a mask of it"
         return f"{of_color} {residual}, the least within a twentieth; dB: {over}"
 
 
-class Attempt(NamedTuple):
+@dataclass(frozen=True)
+class _Attempt:
     """What a model leaves in what was not solved for."""
 
+    name: str
     error: float
-    residuals: list[Tensor]  # of each trial. [M,b,3]
+    solvers: Sequence[Solver]  # of each trial, with the mask
+    degree: int
+    offsets: Sequence[Tensor]  # of each trial, what its map adds. [M,B,3]
+    residuals: Sequence[Tensor]  # [M,b,3]
     hold: float  # see `Model.hold`
+    masked: bool = False
+
+    @property
+    def bands(self) -> int:
+        """See `Model.bands`."""
+        return self.residuals[0].shape[1]
+
+    @property
+    def size(self) -> int:
+        """Bytes by member, of one basis of a residual."""
+        return 3 * self.bands + self.masked
+
+    @property
+    def changes(self) -> list[Tensor]:
+        """What map and residual add. [M,B,3]"""
+        return [add_bands(made, one) for made, one in zip(self.offsets, self.residuals, strict=True)]
 
 
 @dataclass(frozen=True)
@@ -123,15 +155,42 @@ class Solver:
     # basis squared. [M,b,1]
     weights: Tensor
     maps: MapFit
+    share: Tensor  # how much of a map each member takes, 0..1. [M]
     ties: Ties | None  # None where views are many
     asked: Tensor  # members whose residual is solved for. [M] bool
     held: csr_matrix  # ties among these, as strong as they are to be. [M,M]
 
     def fit_map(self, degree: int, targets: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-        """The map that comes nearest to these pictures, of degree 0 the identity, and what it adds. [K,3],
-        [M,B,3]"""
+        """The map that comes nearest to these pictures, of degree 0 the identity, and what the members take
+        of it. [K,3], [M,B,3]"""
         table = self.maps.solve(degree, targets) if degree else identity_map(1)
-        return table, map_colors(self.sh, table, max(1, degree)) - self.sh
+        return table, self.share[:, None, None] * (map_colors(self.sh, table, max(1, degree)) - self.sh)
+
+    def with_mask(self, share: Tensor) -> Solver:
+        """The same with a mask. [M] 0..1"""
+        return replace(self, maps=fit_maps(self.views, share), share=share)
+
+    def find_mask(self, change: Tensor, targets: Sequence[Tensor], spreads: bool) -> Solver | None:
+        """The same with the mask that these pictures ask for, in 255ths; None where it explains the members'
+        changes no better than a map alone.
+
+        Args:
+            change: of the members, a guess. [M,B,3]
+            targets: pictures of the views
+            spreads: whether what no picture shows takes as much of the map as most; else as its surface, or none
+        """
+        weights = self.weights[:, 0, 0]
+        share, off = mask_of_members(self.sh[:, 0] * C0 + 0.5, change[:, 0] * C0, weights)
+        if off >= MORE_PAYS:
+            return None
+        if self.ties is not None:
+            mean, say = weights @ share / weights.sum(), self.asked * weights / (_TRUSTED * self.typical)
+            mean = mean * spreads
+            share = mean + self.ties.spread((share - mean)[:, None, None], say, _HOLDS[0] / _TIES)[:, 0, 0]
+            share = share.clamp(0.0, 1.0)
+        full = map_colors(self.sh, self.with_mask(share).maps.solve(1, targets), 1) - self.sh
+        share = torch.where(self.asked, improve_mask(self.views, full, share, targets), share)
+        return self.with_mask((share * 255.0).round() / 255.0)
 
     @one_thread()  # sums of members are added in an order that depends on the number of threads
     def residual(
@@ -277,7 +336,8 @@ def make_solver(views: Sequence[ColorView], original: Tensor, ties: Ties | None 
     if ties is not None:
         asked = ties.clear & (weights[:, 0, 0] > 0.0)
         held = ties.of(asked) * np.float32(_TIES * weights[asked, 0].mean())
-    return Solver(views, member_bands(original), weights, fit_maps(views), ties, asked, held)
+    share = torch.ones(len(original))
+    return Solver(views, member_bands(original), weights, fit_maps(views, share), share, ties, asked, held)
 
 
 def split_solver(solver: Solver, original: Tensor, targets: Sequence[Tensor]) -> list[tuple[Solver, Judge]]:
@@ -292,8 +352,9 @@ def choose_model(
     targets: Sequence[Tensor],
     steps: int,
     most_bands: int,
-) -> Model:
-    """The smallest model of which a larger one would take away less than a twentieth of the error that shows.
+) -> tuple[Solver, Model]:
+    """The smallest model of which a larger one would take away less than a twentieth of the error that shows;
+    and the solver with its mask.
 
     Of a few pictures there is always a residual, or what single members got would not be in the edit; how far
     it travels is all the way, unless less takes away a twentieth.
@@ -305,50 +366,96 @@ def choose_model(
         steps: most steps of conjugate gradients for a residual
         most_bands: that a residual may have: 1 or 4
     """
-    tried: list[tuple[str, float]] = []
-    few, zero = solver.ties is not None, torch.zeros(len(solver.sh), 0, 3)
+    tried: list[_Attempt] = []
+    few, judges = solver.ties is not None, [judge for _, judge in trials]
+    most_bands = min(most_bands, 1 if few or solver.sh.shape[1] == 1 else 4)
 
-    def attempt(name: str, offsets: list[Tensor], start: list[Tensor], bands: int, hold: float) -> Attempt:
-        """Residuals beside the map's offsets, of each trial, and the error with them."""
-        residuals = [pad(one, (0, 0, 0, bands - one.shape[1])) for one in start]
+    def attempt(base: _Attempt, name: str, bands: int, hold: float) -> _Attempt:
+        """With a residual that begins where that of `base` ended."""
+        residuals = [pad(one[:, :bands], (0, 0, 0, max(0, bands - base.bands))) for one in base.residuals]
         if bands:
             residuals = [
                 by.residual(made, one, targets, steps, judge, hold=hold)[0]
-                for (by, judge), made, one in zip(trials, offsets, residuals, strict=True)
+                for by, judge, made, one in zip(base.solvers, judges, base.offsets, residuals, strict=True)
             ]
-        total = zip(trials, offsets, residuals, strict=True)
-        error = sum(judge.error(add_bands(made, one)) for (_, judge), made, one in total) / len(trials)
-        tried.append((name, error))
-        return Attempt(error, residuals, hold)
+        made = replace(base, name=name, residuals=residuals, hold=hold)
+        error = sum(judge.error(one) for judge, one in zip(judges, made.changes, strict=True)) / len(trials)
+        tried.append(replace(made, error=error))
+        return tried[-1]
 
-    def left_by(degree: int) -> float:
-        return sum(judge.mean(made, 1.0) for (_, judge), made in zip(trials, mapped[degree], strict=True))
+    def start(degree: int) -> _Attempt:
+        solvers = [by for by, _ in trials]
+        offsets = [by.fit_map(degree, targets)[1] for by in solvers]
+        return _Attempt("", math.inf, solvers, degree, offsets, [made[:, :0] for made in offsets], _RIDGE)
 
-    mapped = {degree: [by.fit_map(degree, targets)[1] for by, _ in trials] for degree in (0, *MONOMIALS)}
-    start, by_degree = [zero for _ in trials], {}
+    def left_by(base: _Attempt) -> float:
+        return sum(judge.mean(made, 1.0) for judge, made in zip(judges, base.offsets, strict=True))
+
+    bases = {degree: start(degree) for degree in (0, *MONOMIALS)}
     # of what no picture shows a map is a guess: where it is the worse one for most that is shown, for less
     # than about half of that is painted, there is none
-    degrees = (0,) if few and left_by(0) <= min(left_by(d) for d in MONOMIALS) else MONOMIALS
-    for degree in degrees:
-        name = f"map of degree {degree}" if degree else "no map"
-        by_degree[degree] = attempt(name, mapped[degree], start, int(few), _HOLDS[0] if few else _RIDGE)
-    least = min(one.error for one in by_degree.values())
-    degree = min(d for d, one in by_degree.items() if MORE_PAYS * one.error <= least)
-    best = last = by_degree[degree]
-    sizes = [(1, _RIDGE), (4, _RIDGE)][: 1 + (most_bands > 1 and solver.sh.shape[1] > 1)]
+    degrees = (0,) if few and left_by(bases[0]) <= min(left_by(bases[d]) for d in MONOMIALS) else MONOMIALS
+    by_degree = [
+        attempt(
+            bases[degree],
+            f"map of degree {degree}" if degree else "no map",
+            int(few),
+            _HOLDS[0] if few else _RIDGE,
+        )
+        for degree in degrees
+    ]
+    best = last = _least(by_degree, lambda one: one.degree)
+    sizes = [(1, _RIDGE), (4, _RIDGE)][: 1 + (most_bands > 1)]
     for bands, hold in [(1, hold) for hold in _HOLDS[1:]] if few else sizes:
         name = f"residual held by {hold:g}" if few else f"with a residual of {bands}"
-        last = attempt(name, mapped[degree], last.residuals, bands, hold)
+        last = attempt(last, name, bands, hold)
         if max(last.error, LEVEL) < MORE_PAYS * best.error:
             best = last
-    residual = best.residuals[0]
+    spreads = best.degree > 0
+    if best.bands and (others := _with_masks(best, targets)):
+        masked = [attempt(base, f"a mask of degree {base.degree}", 0, best.hold) for base in others]
+        base = others[_least(masked, lambda one: one.degree).degree - 1]
+        masked = [] if few else masked
+        masked.append(attempt(base, "with a mask and a residual of 1", 1, best.hold))
+        if most_bands > 1 and masked[-1].error < MORE_PAYS * best.error:
+            masked.append(attempt(masked[-1], "with a mask and a residual of 4", 4, best.hold))
+        best = _least([best, *masked], lambda one: one.size)
+    chosen, degree, residual = best.solvers[0], best.degree, best.residuals[0]
     if few:  # the trials solved for a part of it
-        made, judge = solver.fit_map(degree, targets)[1], Judge(solver.views, targets)
-        zero = torch.zeros_like(residual)
-        residual, _ = solver.residual(made, zero, targets, steps, judge, best.error, best.hold)
-    unedited = sum(judge.error(torch.zeros_like(solver.sh)) for _, judge in trials) / len(trials)
-    decided = [(name, decibels(error)) for name, error in tried]
-    return Model(degree, best.hold, residual, best.error, unedited, decided)
+        chosen, total = solver, torch.stack(best.changes).mean(dim=0)
+        if best.masked:
+            chosen = solver.find_mask(total, targets, spreads) or solver.with_mask(best.solvers[0].share)
+        made, judge = chosen.fit_map(degree, targets)[1], Judge(solver.views, targets)
+        begin = (total - made)[:, :1] if best.masked else torch.zeros_like(residual)
+        residual, _ = chosen.residual(made, begin, targets, steps, judge, best.error, best.hold)
+    mask = (chosen.share * 255.0).round().to(torch.uint8) if best.masked else None
+    unedited = sum(judge.error(torch.zeros_like(solver.sh)) for judge in judges) / len(trials)
+    decided = [(one.name, decibels(one.error)) for one in tried]
+    return chosen, Model(degree, best.hold, residual, mask, best.error, unedited, decided)
+
+
+def _least(attempts: Sequence[_Attempt], size: Callable[[_Attempt], int]) -> _Attempt:
+    """The smallest within a twentieth of the least error, or of what shows."""
+    least = max(LEVEL, min(one.error for one in attempts))
+    return min((one for one in attempts if MORE_PAYS * one.error <= least), key=size)
+
+
+def _with_masks(best: _Attempt, targets: Sequence[Tensor]) -> list[_Attempt]:
+    """The same change by masks of the trials' own and maps of each degree, what is missing in the residuals;
+    none where a mask is no better a guess than a map alone."""
+    solvers = [
+        by.find_mask(change, targets, best.degree > 0)
+        for by, change in zip(best.solvers, best.changes, strict=True)
+    ]
+    masked = [by for by in solvers if by is not None]
+    bases = list[_Attempt]()
+    for degree in MONOMIALS if len(masked) == len(solvers) else ():
+        offsets = [by.fit_map(degree, targets)[1] for by in masked]
+        residuals = [(change - made)[:, :1] for change, made in zip(best.changes, offsets, strict=True)]
+        bases.append(
+            replace(best, solvers=masked, degree=degree, offsets=offsets, residuals=residuals, masked=True)
+        )
+    return bases
 
 
 def _inner(a: Tensor, b: Tensor) -> float:

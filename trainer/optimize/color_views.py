@@ -14,6 +14,7 @@ from typing import TypeVar
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from progdf.field.baked import MONOMIALS, identity_map
 from progdf.field.grade import MOST_COLOR, member_bands, monomials
@@ -31,6 +32,14 @@ _CLAMP_ROUNDS = 3  # of the map's least squares, for pixels that are white or bl
 _MAP_RIDGE = 1e-6  # of the diagonal of a map's normal equations, for regions of few colors
 _MAP_HELD = 1e-2  # say of the members' own colors beside the pixels: there a map is held to the affine one
 _SHIFT_HELD = 1e-2  # of that: the affine map is held to the same change of all
+_MASK_TURNS = 8  # of maps and shares by members
+_MASK_WITHIN = 0.98  # of what says what a share is: the largest there is 1, few beyond do not scale it
+_MASK_STEPS, _MASK_SETTLED = 16, 0.01  # at most, of gradients by pixels; of the error, that a step gains
+_MASK_LENGTHS = (4.0, 2.0, 1.0, 0.5, 0.25)  # of a step, in units of a bound of the curvature
+_MASK_RIDGE = 0.01  # of a typical curvature, for members that hardly show
+
+MORE_PAYS = 0.95
+"""Share of the error that a larger model must leave at most, to be worth its bytes."""
 
 _A = TypeVar("_A")
 _B = TypeVar("_B")
@@ -100,10 +109,15 @@ class MapFit:
     """The views' pixels as monomials of the region's drawn colors: a map's picture is linear in them."""
 
     design: Tensor  # what each pixel shows of every monomial. [P,20] float32
-    others: Tensor  # what it shows of all but the members. [P,3]
+    original: Tensor  # what it showed before the edit, unclamped. [P,3]
     pixels: Sequence[Tensor]  # which pixels of each view these are, one view after another. [p] int64
     normal: Tensor  # products of all pixels' monomials. [20,20] float64
     held: Tensor  # the same of the members', hidden or not, as far as they count. [20,20] float64
+
+    def picture(self, table: Tensor) -> Tensor:
+        """What the pixels show under a map, unclamped. [K,3] -> [P,3]"""
+        change = table - pad(identity_map(1), (0, 0, 0, len(table) - MONOMIALS[1]))
+        return self.original + self.design[:, : len(table)] @ change
 
     @one_thread()
     def solve(self, degree: int, targets: Sequence[Tensor]) -> Tensor:
@@ -124,11 +138,11 @@ class MapFit:
             held = self.held[:count, :count] * (1.0 if count > 4 else _SHIFT_HELD)
             normal, pull = normal + held, held[:, : len(coarse)] @ coarse
         normal = normal + _MAP_RIDGE * (normal.diagonal() + 1e-12).diag()
-        original, change = self.design[:, 1:4], torch.zeros(count, 3)
+        change = torch.zeros(count, 3)
         for _ in range(_CLAMP_ROUNDS):
-            image = original + design @ change + self.others
+            image = self.original + design @ change
             clamped = ((image >= 1.0) & (target >= 1.0)) | ((image <= 0.0) & (target <= 0.0))
-            goal = torch.where(clamped, image, target) - self.others - original
+            goal = torch.where(clamped, image, target) - self.original
             right = (design.T @ goal).double() + pull
             change = torch.linalg.solve(normal, right).float()
         return change
@@ -139,32 +153,123 @@ class MapFit:
 
 
 @one_thread()
-def fit_maps(views: Sequence[ColorView], most: int = _MOST_PIXELS) -> MapFit:
-    """Prepare the views for maps of any degree. `most`: pixels that they are fitted to"""
+def fit_maps(views: Sequence[ColorView], share: Tensor, most: int = _MOST_PIXELS) -> MapFit:
+    """Prepare the views for maps of any degree.
+
+    Args:
+        views: see `ColorView`
+        share: how much of a map each member takes, 0..1. [M]
+        most: pixels that the maps are fitted to
+    """
 
     def find_covered(view: ColorView) -> Tensor:
         share = view.map.picture(torch.ones_like(view.original))[..., :1]
         return ((share > _COVERED) & view.counts).flatten().nonzero()[:, 0]
 
-    def lay_out(index: int) -> tuple[Tensor, Tensor]:
+    def lay_out(index: int) -> tuple[Tensor, Tensor, Tensor]:
         view, some = views[index], pixels[index]
         terms = monomials(view.original.T.clamp(0.0, MOST_COLOR), 3)
-        planes: tuple[Tensor, ...] = torch.split(torch.cat([terms, terms[:1]]), 3)
+        planes: tuple[Tensor, ...] = torch.split(torch.cat([share * terms, terms[:1]]), 3)
         shown = torch.cat([view.map.picture(plane.T).reshape(-1, 3)[some] for plane in planes], dim=1)
-        return shown[:, :20], (terms @ terms.T).double()
+        original = view.picture(view.original).reshape(-1, 3)[some]
+        return shown[:, :20], original, (terms @ terms.T).double()
 
     covered = map_views(find_covered, views)
     stride = max(1, -(-sum(map(len, covered)) // most))
     pixels = [some[::stride].clone() for some in covered]
     laid = map_views(lay_out, range(len(views)))
-    design, members = (
-        torch.cat([some for some, _ in laid]),
-        torch.stack([some for _, some in laid]).sum(dim=0),
-    )
-    others = torch.cat([view.others.reshape(-1, 3)[some] for view, some in zip(views, pixels, strict=True)])
+    design, original = (torch.cat([one[i] for one in laid]) for i in (0, 1))
+    members = torch.stack([one[2] for one in laid]).sum(dim=0)
     wide = design.double()
-    share = _MAP_HELD * len(design) / max(1, len(views) * len(views[0].original))
-    return MapFit(design, others, pixels, wide.T @ wide, share * members)
+    say = _MAP_HELD * len(design) / max(1, len(views) * len(views[0].original))
+    return MapFit(design, original, pixels, wide.T @ wide, say * members)
+
+
+def mask_of_members(colors: Tensor, change: Tensor, weights: Tensor) -> tuple[Tensor, float]:
+    """How much of one affine map each member takes, if its change is to be that, as between stripes.
+
+    Maps by least squares over the members and their shares of it, in turn. The largest share is 1.
+
+    Args:
+        colors: as they were. [M,3]
+        change: of each member's color. [M,3]
+        weights: how much each shows, ≥ 0. [M]
+
+    Returns:
+        The shares, 0..1 [M]; what the changes are off these, as a share of what they are off a map alone
+    """
+    weights, change = weights.double(), change.double()
+    terms = monomials(colors.T.clamp(0.0, MOST_COLOR), 1).double()
+
+    def fit_change(share: Tensor) -> Tensor:
+        design = share * terms
+        normal = (design * weights) @ design.T
+        normal += _MAP_RIDGE * (normal.diagonal() + 1e-12).diag()
+        table: Tensor = torch.linalg.solve(normal, (design * weights) @ change)
+        return terms.T @ table
+
+    def error_of(share: Tensor, full: Tensor) -> float:
+        return float((weights @ (change - share[:, None] * full).square()).sum())
+
+    whole, size = torch.ones_like(weights), change.norm(dim=1)
+    typical = ((weights @ size.square()) / weights.sum().clamp_min(1e-30)).sqrt()
+    share = (size / typical.clamp_min(1e-12)).clamp(0.0, 1.0)
+    for _ in range(_MASK_TURNS):
+        full = fit_change(share)
+        power = full.square().sum(dim=1).clamp_min(1e-12)
+        along, evidence = (change * full).sum(dim=1) / power, weights * power
+        order = along.argsort()
+        reached = evidence[order].cumsum(0) >= _MASK_WITHIN * evidence.sum()
+        share = (along / along[order][reached][0].clamp_min(1e-6)).clamp(0.0, 1.0)
+    plain = error_of(whole, fit_change(whole))
+    return share.float(), error_of(share, fit_change(share)) / max(plain, 1e-30)
+
+
+@one_thread()
+def improve_mask(
+    views: Sequence[ColorView], full: Tensor, share: Tensor, targets: Sequence[Tensor]
+) -> Tensor:
+    """The shares of a map by the pictures: projected gradients, each member's by its own weight. [M] -> [M]
+
+    Args:
+        views: see `ColorView`
+        full: what the whole of the map adds. [M,B,3]
+        share: a guess
+        targets: pictures of the views
+    """
+    changes = [torch.einsum("mb,mbc->mc", view.basis, full) for view in views]
+    pairs = list(zip(views, changes, targets, strict=True))
+
+    def weigh(pair: tuple[ColorView, Tensor, Tensor]) -> Tensor:
+        view, size = pair[0], pair[1].abs()
+        return (view.map.gradient(view.map.picture(size) * view.counts) * size).sum(dim=1)
+
+    def look(share: Tensor) -> tuple[Tensor, float]:
+        def pull(pair: tuple[ColorView, Tensor, Tensor]) -> tuple[Tensor, float]:
+            view, change, target = pair
+            image = view.picture(view.original + share[:, None] * change).clamp(0.0, 1.0)
+            missing = (target - image) * view.counts
+            return (view.map.gradient(missing) * change).sum(dim=1), float(missing.double().square().sum())
+
+        looks = map_views(pull, pairs)
+        return torch.stack([one for one, _ in looks]).sum(dim=0), sum(error for _, error in looks)
+
+    curvature = torch.stack(map_views(weigh, pairs)).sum(dim=0)
+    curvature = curvature + _MASK_RIDGE * curvature.mean() + 1e-12
+    descent, error = look(share)
+    for _ in range(_MASK_STEPS):
+        for length in _MASK_LENGTHS:
+            ahead = (share + length * descent / curvature).clamp(0.0, 1.0)
+            next_descent, next_error = look(ahead)
+            if next_error < error:
+                break
+        else:
+            break
+        gained = (error - next_error) / error
+        share, descent, error = ahead, next_descent, next_error
+        if gained < _MASK_SETTLED:
+            break
+    return share
 
 
 @dataclass(frozen=True)

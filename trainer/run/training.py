@@ -215,7 +215,7 @@ def optimize_members(
     trajectory, effort = record(snapshots, end, list(edited)), {"strengths": list(edited), STEPS: taken}
     if model is not None:
         maps = torch.stack([made.table for made in recordings.made if made.table is not None])
-        trajectory = replace(trajectory, maps=maps, bands=model.bands)
+        trajectory = replace(trajectory, maps=maps, bands=model.bands, mask=model.mask)
         log.say(f"{len(edited)} strengths in {', '.join(map(str, taken))} steps, of {most} each at most")
         effort |= model.figures() | {"most_steps": most, "views": len(colors.views)}
     return trajectory, loss_table(rows), effort
@@ -263,7 +263,7 @@ def _prepare_colors(
         judge, finished = judging(edited[max(edited)]), _boxes(edited[max(edited)], setup.train)
         solver, most = make_solver(drawn, original, ties), iterations(optimization.steps)
         trials = [(solver, judge)] if ties is None else split_solver(solver, original, finished)
-        model = choose_model(solver, trials, finished, most, 1 if optimization.sh == "off" else 4)
+        solver, model = choose_model(solver, trials, finished, most, 1 if optimization.sh == "off" else 4)
     on = "all views, as none is held out" if judge.views is drawn else "views that are held out"
     log.say(f"{model.line}, on {on if ties is None else 'squares of the pictures that are held out'}")
     if ties is not None:

@@ -129,7 +129,7 @@ def _export_cube(out: Path, opened: OpenStack) -> int:
     same = lattice_colors(side)
     table = same + state.gains.color * (mapped_lattice(form, state.strength, side) - same)
     write_cube(out, table, state.name)
-    parts = {"residual": len(form.residual), "paint": state.paint}
+    parts = {"mask": form.mask is not None, "residual": len(form.residual), "paint": state.paint}
     left_out = "".join(f"; its {name} is left out" for name, part in parts.items() if part)
     print_line(f"wrote {out}: {side}³ colors, {describe_strengths(opened.view)}{left_out}")
     return 0

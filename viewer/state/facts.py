@@ -159,8 +159,8 @@ def describe_applied(scene: Gaussians, gdf: Gdf) -> str:
     form, lines = gdf.field.origin, []
     if not gdf.applied or not isinstance(form, GradeForm):
         return ""
-    if gdf.report["residual_left_out"]:
-        lines.append("its residual, which is of the scene it was trained on, is left out")
+    if parts := gdf.report["left_out"]:
+        lines.append(f"without its {parts}, which fits the scene it was trained on alone")
     every = -(-len(gdf.region) // MOST_MEMBERS)
     region, moved = scene[gdf.region.members[::every]], gdf.field.attributes
     sh = region.sh[:, :16].clone()

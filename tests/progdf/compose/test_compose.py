@@ -446,14 +446,18 @@ def test_every_attribute_has_a_gain(scene: Gaussians) -> None:
     assert bits(mute) == bits(scene)
 
 
-def graded(scene: Gaussians, members: torch.Tensor, darker: float, residual: bool = True) -> Gdf:
-    """An edit that takes all colors of some rows towards black, and a little of single ones elsewhere."""
+def graded(
+    scene: Gaussians, members: torch.Tensor, darker: float, residual: bool = True, masked: bool = False
+) -> Gdf:
+    """An edit that takes all colors of some rows towards black, and a little of single ones elsewhere; with a
+    mask each by another share."""
     knots = torch.tensor([0.0, 0.5, 1.0])
     table = torch.stack([identity_map(1) * torch.tensor(1.0 - darker * float(s)) for s in knots])
     course = torch.zeros(3, len(members), 3)
     if residual:
         course[1:] = 0.1 * torch.rand(2, len(members), 3, generator=torch.Generator().manual_seed(3))
-    form = fit_grade(knots, 1, table, course, int(residual), torch.ones(len(members)))
+    mask = torch.arange(len(members)).to(torch.uint8) if masked else None
+    form = fit_grade(knots, 1, table, course, int(residual), torch.ones(len(members)), mask)
     rows = pack(scene[members], with_shN=scene.sh_degree > 0)
     return edit_of(scene, members, bake_grade(form, rows), "dark")
 
@@ -481,6 +485,16 @@ def test_adjust_alone_is_the_edit_as_trained_and_its_paint_counts(scene: Gaussia
     nothing = torch.zeros(len(shirt.region))
     unpainted = compose_layers(scene, [Layer(shirt, 1.0), Layer(dark, 1.0, weights=nothing)], "adjust")
     assert bits(unpainted) == bits(compose_layers(scene, [Layer(shirt, 1.0)]))
+
+
+def test_adjust_maps_what_lies_below_as_far_as_the_mask_lets_it(scene: Gaussians, shirt: Gdf) -> None:
+    rows = shirt.region.members
+    dark = graded(scene, rows, 0.6, residual=False, masked=True)
+    below = compose_layers(scene, [Layer(shirt, 1.0)])
+    both = compose_layers(scene, [Layer(shirt, 1.0), Layer(dark, 1.0)], "adjust")
+    share = (torch.arange(len(rows)) % 256)[:, None, None] / 255
+    expected = torch.lerp(below.sh[rows], map_colors(below.sh[rows], identity_map(1) * 0.4, 1), share)
+    torch.testing.assert_close(both.sh[rows], expected, atol=2e-6, rtol=0)
 
 
 def test_adjust_counts_the_order(scene: Gaussians, shirt: Gdf) -> None:
@@ -524,8 +538,9 @@ def test_grades_that_share_no_gaussian_are_adjusted_as_fast_as_any_edit(
         composer.update([Layer(hat, 0.5), Layer(halves[1], 0.3)], "adjust")
 
 
-def test_the_composer_adjusts_as_compose_does(scene: Gaussians, shirt: Gdf, hat: Gdf) -> None:
-    dark = graded(scene, shirt.region.members, 0.6)
+@pytest.mark.parametrize("masked", [False, True])
+def test_the_composer_adjusts_as_compose_does(scene: Gaussians, shirt: Gdf, hat: Gdf, masked: bool) -> None:
+    dark = graded(scene, shirt.region.members, 0.6, masked=masked)
     composer = Composer(scene, [shirt, hat, dark])
     for stack in (
         [Layer(shirt, 0.4), Layer(hat, 1.0), Layer(dark, 0.3)],

@@ -108,26 +108,34 @@ def test_colors_that_are_clamped_are_nearer_than_their_least_squares() -> None:
     assert errors[0] < errors[1], errors
 
 
+def some_mask(members: int) -> Tensor:
+    """Shares of a map, none and all among them."""
+    return torch.linspace(0, 255, members).round().to(torch.uint8)
+
+
+@pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize("sh_degree", [0, 2])
-def test_a_file_gives_the_same_field_and_a_byte_a_number_of_the_residual(
-    tmp_path: Path, sh_degree: int
+def test_a_file_gives_the_same_field_and_a_byte_a_number_of_mask_and_residual(
+    tmp_path: Path, sh_degree: int, masked: bool
 ) -> None:
     scene = random_gaussians(400, sh_degree=sh_degree)
     members = some_rows(scene, 150)
     rows = pack(scene[members], with_shN=sh_degree > 0)
     form = some_form(rows, bands=4 if sh_degree else 1)
+    form = replace(form, mask=some_mask(len(rows))) if masked else form
     field = bake_grade(form, rows)
     gdf = edit_of(scene, members, field)
     save_gdf(tmp_path / "edit.gdf", gdf)
     again = load_gdf(tmp_path / "edit.gdf", scene)
     assert again.field.kind == "grade"
-    assert field.bytes_per_member == 2 * 3 * (4 if sh_degree else 1)
+    assert field.bytes_per_member == 2 * 3 * (4 if sh_degree else 1) + masked
     for s in (0.0, 0.3, 0.7, 1.0):
         assert torch.equal(again.field.offsets(s), field.offsets(s))
     assert not bool(field.offsets(0.0).any())
     stored = read_gdf(tmp_path / "edit.gdf").field.origin
     assert isinstance(stored, GradeForm)
     assert torch.equal(stored.residual, form.residual)
+    assert (stored.mask is not None) == masked
     with pytest.raises(ProgdfError, match="keeps a grade field, which is baked on its scene"):
         load_gdf(tmp_path / "edit.gdf")
 
@@ -150,11 +158,28 @@ def test_the_way_between_the_knots_is_that_of_the_map_and_its_residual() -> None
     rows = pack(random_gaussians(500, sh_degree=2), with_shN=True)
     form = some_form(rows, bands=4)
     field = bake_grade(form, rows)
-    wanted = mapped_bands(2, form.table, rows)
+    wanted = mapped_bands(2, form.table, rows, form.share)
     wanted[:, :, :12] += torch.einsum("sr,rmc->smc", form.coefficients, form.residual * form.scale[:, None])
     found = lowest_bands(torch.stack([field.offsets(float(s)) for s in KNOTS]), 9)
     error = float((found - wanted).square().mean().sqrt() / wanted.square().mean().sqrt())
     assert error < 0.01
+
+
+def test_a_mask_says_how_much_of_the_map_each_member_takes() -> None:
+    rows = pack(random_gaussians(200, sh_degree=1), with_shN=True)
+    whole = some_form(rows, rank=0)
+    form = replace(whole, mask=some_mask(200))
+    assert form.label == "grade of degree 2, a mask, no residual"
+    share = (torch.arange(200) / 199 * 255).round()[:, None] / 255
+    expected = share * bake_grade(whole, rows).offsets(1.0)
+    found = bake_grade(form, rows).offsets(1.0)
+    torch.testing.assert_close(found, expected, atol=1e-6, rtol=0)
+    assert not bool(found[0].any()), "none of it"
+    full = replace(whole, mask=torch.full((200,), 255, dtype=torch.uint8))
+    assert torch.equal(bake_grade(full, rows).offsets(0.7), bake_grade(whole, rows).offsets(0.7))
+    for mask in (torch.zeros(199, dtype=torch.uint8), torch.zeros(200)):
+        with pytest.raises(ValueError, match=r"mask is .*, expected \[200\] uint8"):
+            replace(whole, mask=mask)
 
 
 def test_what_few_members_need_more_than_the_rest_does_not_take_their_levels() -> None:
@@ -240,7 +265,7 @@ def test_a_grade_of_another_scene_shows_what_its_map_makes_of_this_one(
     region = from_mask("some", torch.arange(300) % 3 == 0)
     gdf = load_gdf(path, scene, place=lambda stored: region)
     assert (gdf.applied, gdf.region.name, gdf.field.recorded) == (True, "some", ())
-    assert gdf.report == {"residual_left_out": form != "lattice"}
+    assert gdf.report == {"left_out": "" if form == "lattice" else "residual"}
     edited = compose_layers(scene, [Layer(gdf, 1.0)])
     expected = map_colors(scene.sh[region.members], grade.table[-1], grade.degree)
     torch.testing.assert_close(edited.sh[region.members], expected, atol=2e-6, rtol=0)

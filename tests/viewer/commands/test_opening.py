@@ -298,7 +298,7 @@ def test_a_grade_of_another_scene_goes_on_a_region_of_this_one_and_a_table_every
     turning, left_out = caplog.messages
     assert turning.startswith("table on all: pictures are ")
     assert left_out == (
-        "look on file:rows.npy: its residual, which is of the scene it was trained on, is left out"
+        "look on file:rows.npy: without its residual, which fits the scene it was trained on alone"
     )
     scene = bear().scene
     edited, sh = load_ply("edited.ply"), scene.sh
