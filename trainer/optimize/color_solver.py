@@ -177,7 +177,7 @@ class Solver:
         Args:
             change: of the members, a guess. [M,B,3]
             targets: pictures of the views
-            spreads: whether what no picture shows takes as much of the map as most; else as its surface, or none
+            spreads: whether what no picture shows takes as much of the map as most, else none
         """
         weights = self.weights[:, 0, 0]
         share, off = mask_of_members(self.sh[:, 0] * C0 + 0.5, change[:, 0] * C0, weights)
