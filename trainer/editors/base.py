@@ -53,7 +53,10 @@ class RepaintingEditor(Protocol):
 class Painter(Protocol):
     """Paints one picture as it was told, at any degree."""
 
-    references: int  # pictures beside the view's own that one call can take
+    @property
+    def references(self) -> int:
+        """How many pictures beside the view's own one call can take."""
+        ...
 
     def paint(
         self,

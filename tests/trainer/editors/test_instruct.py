@@ -17,7 +17,9 @@ from progdf.errors import ProgdfError
 from tests.helpers.tiny_pipelines import tiny_flux2_klein, tiny_flux_kontext, tiny_instruct_pix2pix
 from tests.helpers.trained import quick_options, small, train, write_bear
 from trainer.editors import make_editor
-from trainer.editors.instruct import ADAPTERS, InstructEditor
+from trainer.editors.adapters import ADAPTERS
+from trainer.editors.instruct import InstructEditor
+from trainer.editors.mixed_steps import MixedSteps
 from trainer.options import EditorOptions
 
 BATMAN = 'instruct:"turn him into Batman"'
@@ -87,15 +89,14 @@ def test_the_sentence_reaches_the_pipeline_without_its_quotes(pix2pix: str) -> N
     assert not torch.equal(quoted, other)
 
 
-def test_one_target_by_default_and_strengths_by_guidance_on_request(pix2pix: str) -> None:
+def test_any_strength_can_be_asked_for_and_the_change_grows_with_it(pix2pix: str) -> None:
     view = small().views[0]
-    assert editor_of(settings_of(pix2pix)).stages == (1.0,)
-    with pytest.raises(ValueError, match=r"not 0\.5"):
-        editor_of(settings_of(pix2pix)).edit(view, 0.5)
-    graded = editor_of(settings_of(pix2pix, graded=True))
-    assert graded.stages == ()
-    half = editor_of(settings_of(pix2pix, guidance="4.25")).edit(view, 1.0)  # half way from 1 to 7.5
-    assert torch.equal(graded.edit(view, 0.5), half)
+    editor = editor_of(settings_of(pix2pix, edit_steps=4))
+    assert editor.stages == ()
+    shares = [float((editor.edit(view, s) - view.image).norm()) for s in (0.25, 0.5, 0.75, 1.0)]
+    assert shares == sorted(shares)
+    assert shares[0] > 0
+    assert editor.calls((0.25, 0.5, 0.75, 1.0)) == 1 + 3 + 4 + 4
 
 
 def test_a_view_is_edited_once_for_all_runs(pix2pix: str, tmp_path: Path) -> None:
@@ -104,14 +105,44 @@ def test_a_view_is_edited_once_for_all_runs(pix2pix: str, tmp_path: Path) -> Non
     first = editor_of(settings).edit(view, 1.0)
     note = json.loads((tmp_path / f"{view.camera.name}.json").read_text())
     assert note["editor"]["instruct"] == "turn him into Batman"
-    again = editor_of(settings)
 
-    def fails(picture: torch.Tensor, guidance: float) -> torch.Tensor:
+    def fails() -> MixedSteps:
         raise AssertionError("it was kept")
 
-    assert torch.equal(replace(again, paint=fails).edit(view, 1.0), first)
-    with pytest.raises(AssertionError, match="kept"):
-        replace(editor_of(replace(settings, seed=1)), paint=fails).edit(view, 1.0)
+    assert torch.equal(replace(editor_of(settings), load=fails).edit(view, 1.0), first)
+    for other in (editor_of(replace(settings, seed=1)), editor_of(settings)):
+        with pytest.raises(AssertionError, match="kept"):
+            replace(other, load=fails).edit(view, 0.5)
+
+
+def test_a_model_gets_the_region_with_a_margin_at_its_own_size_and_its_answer_is_kept(
+    pix2pix: str, tmp_path: Path
+) -> None:
+    view = small(image_size=200).views[0]
+    editor = editor_of(settings_of(pix2pix, edit_size=128, cache=tmp_path))
+    (x0, y0, x1, y1), camera = editor.frame(view)
+    shown = (view.mask > 0.5).nonzero()
+    inside = (shown[:, 0] >= y0) & (shown[:, 0] < y1) & (shown[:, 1] >= x0) & (shown[:, 1] < x1)
+    assert bool(inside.all())
+    assert (x1 - x0) * (y1 - y0) < 0.8 * 200 * 200
+    assert camera.width % 32 == camera.height % 32 == 0
+    assert 0.7 * 128**2 < camera.width * camera.height <= 128**2
+    middle = torch.tensor([[x0 + x1, y0 + y1]]) / 2  # of the box, in the view: of the frame, in the frame
+    rays = (middle - view.camera.K[:2, 2]) / view.camera.K.diagonal()[:2]
+    framed = rays * camera.K.diagonal()[:2] + camera.K[:2, 2]
+    assert torch.allclose(framed, torch.tensor([[camera.width, camera.height]]) / 2, atol=1e-3)
+    edited = editor.edit(view, 1.0)
+    native = tmp_path / f"{view.camera.name}.png"
+    assert Image.open(native).size == (camera.width, camera.height)
+    outside = torch.ones(200, 200, dtype=torch.bool)
+    outside[y0:y1, x0:x1] = False
+    assert torch.equal(edited[outside], view.image[outside])
+
+
+def test_what_a_model_leaves_alone_stays_to_the_bit(pix2pix: str) -> None:
+    view = small(image_size=200).views[0]
+    editor = editor_of(settings_of(pix2pix, edit_size=128))
+    assert torch.equal(editor.paste(view, editor.original(view)), view.image)
 
 
 @pytest.mark.parametrize("name", ADAPTERS)
@@ -120,7 +151,7 @@ def test_the_table_s_words_are_keywords_of_the_pipelines(diffusers: None, name: 
 
     adapter = ADAPTERS[name]
     picture = Image.new("RGB", (64, 32))
-    asked = adapter.arguments("x", picture, adapter.steps, adapter.guidance, adapter.image_guidance)
+    asked = adapter.arguments("x", [picture], adapter.steps, adapter.guidance, adapter.image_guidance)
     known = inspect.signature(getattr(library, name).__call__).parameters
     assert set(asked) | {"generator"} <= set(known)
     assert None not in asked.values()
@@ -131,7 +162,7 @@ def test_missing_weights_are_one_line_that_names_what_to_download(
     diffusers: None, model: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
-    with pytest.raises(ProgdfError, match=f"hf download {model}") as told:
+    with pytest.raises(ProgdfError, match=f"hf download {model} --include") as told:
         editor_of(EditorOptions(BATMAN, model))
     assert "\n" not in str(told.value)
 
@@ -194,6 +225,3 @@ def test_a_run_is_trained_on_what_a_pipeline_makes_of_its_views(pix2pix: str, tm
     assert result.report["trajectory"]["stages"] == [1.0]
     assert "the edited views" in result.folder.log.read_text(encoding="utf-8")
     assert set(result.report["agreement"]) == {"psnr_best", "unexplained", "agree"}
-    for path in painted.glob("*.png"):
-        original = Image.open(result.folder.view("original", path.stem))
-        assert Image.open(path).size == original.size
