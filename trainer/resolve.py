@@ -63,13 +63,14 @@ def resolve(options: TrainOptions) -> TrainOptions:
     family, _, what = options.editor.editor.partition(":")
     stages = min(optimize.stages, QUICK_STAGES) if quick else optimize.stages
     texts = options.texts
+    model = options.editor.model or (default_model() if family == "instruct" else "")
     pictures = picture_paths(what) if family == "pictures" else ()
     # where the finished edit alone is given, the way there is ours
     paced = family not in EXTERNAL or (pictures and all(len(strengths_of(path)) == 1 for path in pictures))
     return replace(
         options,
         name=check_name(options.name or options.out.resolve().name),
-        editor=replace(options.editor, seed=options.seed, model=_model(options.editor)),
+        editor=replace(options.editor, seed=options.seed, model=model),
         views=replace(
             options.views,
             views=min(views or QUICK_VIEWS, QUICK_VIEWS) if quick else views,
@@ -86,15 +87,8 @@ def resolve(options: TrainOptions) -> TrainOptions:
             seed=options.seed,
         ),
         field=replace(options.field, draft=quick, seed=options.seed),
-        texts=replace(
-            texts,
-            asked=bool(texts.text_before or texts.text_after),
-        ),
+        texts=replace(texts, asked=bool(texts.text_before or texts.text_after)),
     )
-
-
-def _model(editor: EditorOptions) -> str:
-    return editor.model or (default_model() if editor.family == "instruct" else "")
 
 
 def recorded_options(options: TrainOptions) -> TrainOptions:

@@ -7,34 +7,23 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
+from inspect import signature
 from pathlib import Path
-from typing import Any
 
 import torch
 from PIL import Image
+from torch import Tensor
 
 from progdf.errors import ProgdfError
-from trainer.options import EditorOptions
+from progdf.io.images import to_picture
+from trainer.options import Device
 from trainer.store.pretrained import BROKEN, folder_of_model, gpu_memory, model_device, weights_here
 
 from .mixed_steps import MixedSteps, euler_scheduler
-
-_FLOW = {
-    "steps": "num_inference_steps",
-    "guidance": "guidance_scale",
-    "width": "width",
-    "height": "height",
-}
-_PIX2PIX = {
-    "steps": "num_inference_steps",
-    "guidance": "guidance_scale",
-    "image_guidance": "image_guidance_scale",
-}
-_TRUE_CFG = {**_FLOW, "guidance": "true_cfg_scale"}
 
 _MULTIPLE, _LEAST = 32, 64  # pixels: what every pipeline's autoencoder and patches divide; its least side
 _LARGE = 2e9  # parameters from which painting on a CPU takes days
@@ -48,15 +37,15 @@ class Adapter:
     """How one pipeline is asked."""
 
     model: str  # the id of its weights on the Hugging Face hub
-    # our word → its keyword, of steps, guidance (how closely the instruction is followed), image_guidance
-    # (how closely the picture is), width, height, area
-    words: Mapping[str, str]
-    # steps, guidance, image_guidance: the values it was made for
+    # steps, guidance (how closely the instruction is followed), image_guidance (how closely the picture is):
+    # the values it was made for; None: it has no such thing
     steps: int
-    guidance: float
-    size: int = 1024  # it was made to paint pictures of the area of such a square, pixels
+    guidance: float | None
     image_guidance: float | None = None
-    is_half: bool = False  # its weights live in float16 (on a CPU in float32), else in bfloat16
+    guidance_word: str = "guidance_scale"  # its keyword
+    size: int = 1024  # it was made to paint pictures of the area of such a square, pixels
+    # of Stable Diffusion's family: weights in float16 (on a CPU in float32), not bfloat16; CLIP alone reads
+    is_stable: bool = False
     is_fixed: bool = False  # it paints at that area whatever is asked
     encodes_alone: bool = True  # the sentence is encoded without the picture
     passes: int = 1  # calls of its network in a step
@@ -82,78 +71,53 @@ class Adapter:
 
     def arguments(
         self,
+        known: Collection[str],
         prompt: str,
         pictures: Sequence[Image.Image],
         steps: int,
-        guidance: float,
+        guidance: float | None,
         image_guidance: float | None,
     ) -> dict[str, object]:
-        """Keyword arguments of a call, all but its `generator`. The view's own picture comes first."""
-        width, height = pictures[0].size
+        """Keyword arguments of a call, all but its `generator`, of those that the pipeline knows."""
+        width, height = pictures[0].size  # the view's own
         ours = {
-            "steps": steps,
-            "guidance": guidance,
-            "image_guidance": image_guidance,
+            "num_inference_steps": steps,
+            self.guidance_word: guidance,
+            "image_guidance_scale": image_guidance,
             "width": width,
             "height": height,
-            "area": width * height,
+            "max_area": width * height,
         }
-        theirs = {word: ours[name] for name, word in self.words.items()}
+        theirs = {word: value for word, value in ours.items() if word in known and value is not None}
         image = list(pictures) if self.references else pictures[0]
         return {"prompt": prompt, "image": image, **theirs, **self.always}
 
 
-_KLEIN = Adapter("black-forest-labs/FLUX.2-klein-4B", _FLOW, steps=4, guidance=1.0, references=3)
+_PIX2PIX = Adapter(  # ProGDF's own; the result has the picture's size
+    "timbrooks/instruct-pix2pix", 20, 7.5, 1.5, size=512, is_stable=True,
+    loading={"safety_checker": None, "requires_safety_checker": False},
+)  # fmt: skip
+_KLEIN = Adapter("black-forest-labs/FLUX.2-klein-4B", 4, 1.0, references=3)
 _QWEN = Adapter(
-    "Qwen/Qwen-Image-Edit-2509",
-    _TRUE_CFG,
-    steps=40,
-    guidance=4.0,
-    is_fixed=True,
-    encodes_alone=False,
-    passes=2,
-    references=2,
+    "Qwen/Qwen-Image-Edit-2509", 40, 4.0, guidance_word="true_cfg_scale", is_fixed=True, encodes_alone=False,
+    passes=2, references=2, needs=("torchvision",),
     always={"negative_prompt": " "},  # without one it has no guidance at all
-    needs=("torchvision",),
-)
+)  # fmt: skip
 
 ADAPTERS: dict[str, Adapter] = {
-    # ProGDF's own; the result has the picture's size
-    "StableDiffusionInstructPix2PixPipeline": Adapter(
-        "timbrooks/instruct-pix2pix",
-        _PIX2PIX,
-        steps=20,
-        guidance=7.5,
-        size=512,
-        image_guidance=1.5,
-        is_half=True,
-        loading={"safety_checker": None, "requires_safety_checker": False},
-    ),
-    "StableDiffusionXLInstructPix2PixPipeline": Adapter(
-        "diffusers/sdxl-instructpix2pix-768",
-        {**_PIX2PIX, "width": "width", "height": "height"},
-        steps=30,
-        guidance=3.0,
-        size=768,
-        image_guidance=1.5,
-        is_half=True,
+    "StableDiffusionInstructPix2PixPipeline": _PIX2PIX,
+    "StableDiffusionXLInstructPix2PixPipeline": replace(
+        _PIX2PIX, model="diffusers/sdxl-instructpix2pix-768", steps=30, guidance=3.0, size=768,
         loading={"add_watermarker": False},
     ),
     "FluxKontextPipeline": Adapter(
-        "black-forest-labs/FLUX.1-Kontext-dev",
-        {**_FLOW, "area": "max_area"},
-        steps=28,
-        guidance=2.5,
-        is_gated=True,
+        "black-forest-labs/FLUX.1-Kontext-dev", 28, 2.5, is_gated=True,
         # it would scale every picture to about a megapixel; ours comes at the size that was asked for
         always={"_auto_resize": False},
     ),
     "Flux2KleinPipeline": _KLEIN,
     "Flux2KleinKVPipeline": replace(
-        _KLEIN,
-        model="black-forest-labs/FLUX.2-klein-9b-kv",
-        words={word: name for word, name in _FLOW.items() if word != "guidance"},
-        is_gated=True,
+        _KLEIN, model="black-forest-labs/FLUX.2-klein-9b-kv", guidance=None, is_gated=True
     ),
     "Flux2Pipeline": replace(
         _KLEIN, model="black-forest-labs/FLUX.2-dev", steps=28, guidance=4.0, is_gated=True
@@ -161,16 +125,39 @@ ADAPTERS: dict[str, Adapter] = {
     "QwenImageEditPipeline": replace(_QWEN, model="Qwen/Qwen-Image-Edit", steps=50, references=0),
     "QwenImageEditPlusPipeline": _QWEN,
     "LongCatImageEditPipeline": replace(
-        _QWEN,
-        model="meituan-longcat/LongCat-Image-Edit",
-        words={word: name for word, name in _FLOW.items() if word in ("steps", "guidance")},
-        steps=50,
-        guidance=4.5,
-        references=0,
-        always={},
+        _QWEN, model="meituan-longcat/LongCat-Image-Edit", steps=50, guidance=4.5,
+        guidance_word="guidance_scale", references=0, always={},
     ),
-}
+}  # fmt: skip
 """Class name in diffusers, as a saved pipeline's model_index.json has it → how it is asked."""
+
+
+@dataclass(frozen=True)
+class Request:
+    """One sentence for one model, nothing left open."""
+
+    prompt: str
+    model: str
+    pipeline: str  # class in diffusers
+    adapter: Adapter
+    steps: int
+    guidance: float | None
+    image_guidance: float | None
+    size: int  # side of a square of the area that is painted, pixels
+    seed: int
+    quantize: str
+
+    def ask(self, pictures: Sequence[Tensor], seed: int) -> dict[str, object]:
+        """The arguments of a call. The same noise each time: what pictures leave open is decided alike."""
+        import diffusers
+
+        known = signature(getattr(diffusers, self.pipeline).__call__).parameters
+        images = [to_picture(picture) for picture in pictures]
+        arguments = self.adapter.arguments(
+            known, self.prompt, images, self.steps, self.guidance, self.image_guidance
+        )
+        return arguments | {"generator": torch.Generator().manual_seed(seed)}
+
 
 SMALL_MODEL = ADAPTERS["StableDiffusionInstructPix2PixPipeline"].model
 
@@ -232,9 +219,8 @@ def memory_need(adapter: Adapter, sizes: Mapping[str, int], quantize: str, size:
     packed = quantize == "nf4"
     parts = {name: n * (_NF4 if packed and _is_large(name) else 2.0) for name, n in sizes.items()}
     first = [name for name in parts if adapter.encodes_alone and name.startswith("text_encoder")]
-    encoder = _WORKING + max(
-        (parts.pop(name) for name in first), default=0.0
-    )  # it goes before the rest comes
+    # the encoder goes before the rest comes
+    encoder = _WORKING + max((parts.pop(name) for name in first), default=0.0)
     working = _WORKING + _WORKING_PER_MEGAPIXEL * size * size / 1e6
     return max(encoder, working + sum(parts.values())), max(encoder, working + max(parts.values()))
 
@@ -283,57 +269,54 @@ class Placement:
         return f"on {self.device} in {dtype}, {how}: about {_gb(self.need)} needed, {_gb(self.free)} free"
 
 
-def place(model: str, adapter: Adapter, options: EditorOptions, size: int) -> Placement:
-    """Where and how the pipeline will run.
+def place(request: Request, device: Device) -> Placement:
+    """Where and how its pipeline will run.
 
     Raises:
-        ProgdfError: weights are not here, or it is far too large for a CPU and nobody asked for that.
+        ProgdfError: weights or a package are not here, or it is too large for a CPU that nobody asked for.
     """
-    sizes = component_sizes(model, adapter)
-    if model_device(options.device) == "cpu":
+    model, adapter, sizes = request.model, request.adapter, component_sizes(request.model, request.adapter)
+    if request.quantize == "nf4" and find_spec("bitsandbytes") is None:
+        raise ProgdfError(
+            "--quantize nf4 needs the package bitsandbytes; pip install progdf-studio[quantize]"
+        )
+    if model_device(device) == "cpu":
         count = sum(sizes.values())
-        if count > _LARGE and options.device != "cpu":
+        if count > _LARGE and device != "cpu":
             raise ProgdfError(
                 f"{model} has {count / 1e9:.0f} billion parameters and torch has no graphics card here "
                 f"(torch {torch.__version__}): a picture takes hours; install torch for your card, use "
                 f"--model {SMALL_MODEL}, or add --device cpu"
             )
-        return Placement("cpu", torch.float32 if adapter.is_half else torch.bfloat16)
+        if request.quantize != "off":
+            raise ProgdfError("--quantize nf4 needs a graphics card; leave it out")
+        return Placement("cpu", torch.float32 if adapter.is_stable else torch.bfloat16)
     memory = gpu_memory()
     assert memory is not None
-    whole, in_turn = memory_need(adapter, sizes, options.quantize, size)
-    is_half = adapter.is_half or not torch.cuda.is_bf16_supported(including_emulation=False)
+    whole, in_turn = memory_need(adapter, sizes, request.quantize, request.size)
+    is_half = adapter.is_stable or not torch.cuda.is_bf16_supported(including_emulation=False)
     dtype, is_tight = torch.float16 if is_half else torch.bfloat16, memory[0] < whole
     return Placement("cuda", dtype, is_tight, in_turn if is_tight else whole, memory[0])
 
 
 @contextmanager
-def explain_memory(model: str, placement: Placement, quantize: str) -> Iterator[None]:
+def explain_memory(request: Request, placement: Placement) -> Iterator[None]:
     """Say in one line that a card's memory ran out, and what to try."""
     try:
         yield
     except torch.OutOfMemoryError as error:
-        quantized = "" if quantize == "nf4" else "add --quantize nf4, "
+        quantized = "" if request.quantize == "nf4" else "add --quantize nf4, "
         raise ProgdfError(
-            f"out of memory: {model} {placement.line()}; {quantized}close what else uses the card, give a "
-            f"smaller --edit-size, or use --model {_KLEIN.model} or {SMALL_MODEL}"
+            f"out of memory: {request.model} {placement.line()}; {quantized}close what else uses the card, "
+            f"give a smaller --edit-size, or use --model {_KLEIN.model} or {SMALL_MODEL}"
         ) from error
 
 
-def load_pipeline(
-    model: str, kind: str, adapter: Adapter, placement: Placement, quantize: str, call: Mapping[str, object]
-) -> MixedSteps:
-    """The pipeline with its weights, from this machine only, where it runs.
-
-    Args:
-        model: id or folder
-        kind, adapter: see `adapter_of`
-        placement: see `place`
-        quantize: see `EditorOptions.quantize`
-        call: arguments of any call: its sentence is encoded once, and the encoder let go
+def load_pipeline(request: Request, placement: Placement) -> MixedSteps:
+    """Its pipeline with its weights, from this machine only, where it runs.
 
     Raises:
-        ProgdfError: weights are missing or broken, a package is missing, or the card's memory runs out.
+        ProgdfError: weights are missing or broken, or the card's memory runs out.
     """
     import diffusers
     from diffusers.utils import logging as diffusers_logging
@@ -342,13 +325,17 @@ def load_pipeline(
     for speaks in (diffusers_logging, transformers_logging):
         speaks.set_verbosity(logging.ERROR)
         speaks.disable_progress_bar()
-    loading = dict(adapter.loading)
-    if quantize == "nf4":
-        loading["quantization_config"] = _nf4(model, adapter, placement.dtype)
-    with explain_memory(model, placement, quantize):
+    adapter, loading = request.adapter, dict(request.adapter.loading)
+    if request.quantize == "nf4":
+        bits = {"load_in_4bit": True, "bnb_4bit_quant_type": "nf4", "bnb_4bit_compute_dtype": placement.dtype}
+        large = [name for name in component_sizes(request.model, adapter) if _is_large(name)]
+        loading["quantization_config"] = diffusers.PipelineQuantizationConfig(
+            quant_backend="bitsandbytes_4bit", quant_kwargs=bits, components_to_quantize=large
+        )
+    with explain_memory(request, placement):
         try:
-            pipeline = getattr(diffusers, kind).from_pretrained(
-                model,
+            pipeline = getattr(diffusers, request.pipeline).from_pretrained(
+                request.model,
                 dtype=placement.dtype,
                 local_files_only=True,
                 use_safetensors=True,  # the other kind of weights can run code
@@ -357,15 +344,14 @@ def load_pipeline(
         except torch.OutOfMemoryError:
             raise
         except BROKEN as error:
-            raise missing_weights(model) from error
+            raise missing_weights(request.model) from error
         pipeline.set_progress_bar_config(disable=True)
         pipeline.scheduler = euler_scheduler(pipeline)
         mixed = MixedSteps(pipeline, adapter.encodes_alone)
-        on_card = placement.device != "cpu"
-        if on_card and adapter.encodes_alone:  # the encoder is on the card for the sentence alone
-            pipeline.enable_model_cpu_offload(device=placement.device)
         if adapter.encodes_alone:
-            mixed.encode(call)
+            if placement.device != "cpu":  # the encoder is on the card for the sentence alone
+                pipeline.enable_model_cpu_offload(device=placement.device)
+            mixed.encode(request.ask([torch.ones(_LEAST, _LEAST, 3)], request.seed))
             pipeline.remove_all_hooks()
             for name in [name for name in pipeline.components if name.startswith("text_encoder")]:
                 setattr(pipeline, name, None)
@@ -375,20 +361,6 @@ def load_pipeline(
         else:
             pipeline.to(placement.device)
     return mixed
-
-
-def _nf4(model: str, adapter: Adapter, dtype: torch.dtype) -> Any:
-    from diffusers.quantizers import PipelineQuantizationConfig
-
-    if find_spec("bitsandbytes") is None:
-        raise ProgdfError(
-            "--quantize nf4 needs the package bitsandbytes; pip install progdf-studio[quantize]"
-        )
-    return PipelineQuantizationConfig(
-        quant_backend="bitsandbytes_4bit",
-        quant_kwargs={"load_in_4bit": True, "bnb_4bit_quant_type": "nf4", "bnb_4bit_compute_dtype": dtype},
-        components_to_quantize=[name for name in component_sizes(model, adapter) if _is_large(name)],
-    )
 
 
 def missing_weights(model: str) -> ProgdfError:

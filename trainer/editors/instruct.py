@@ -8,10 +8,9 @@ model's, but that of `mixed_steps`.
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cache
 
 import torch
@@ -21,7 +20,6 @@ from torch.nn.functional import interpolate
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
-from progdf.io.images import to_picture
 from progdf.rasterize import Crop
 from progdf.region import Region
 from trainer.options import EditKind, EditorOptions
@@ -30,8 +28,8 @@ from trainer.views.view import BACKGROUND, View, region_box, render_view
 
 from .adapters import (
     SMALL_MODEL,
-    Adapter,
     Placement,
+    Request,
     adapter_of,
     default_model,
     explain_memory,
@@ -42,32 +40,6 @@ from .cache import KeptPictures, Recipe
 from .mixed_steps import MixedSteps, network_steps
 
 _MARGIN = 0.4  # of the region's box: what is added to each of its sides in all
-_CLIP_WORDS = 77  # tokens that InstructPix2Pix reads of a sentence
-
-_log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class Request:
-    """One sentence for one model, nothing left open."""
-
-    prompt: str
-    model: str
-    pipeline: str  # class in diffusers
-    adapter: Adapter
-    steps: int
-    guidance: float
-    image_guidance: float | None
-    size: int  # side of a square of the area that is painted, pixels
-    seed: int
-    quantize: str
-
-    def ask(self, pictures: Sequence[Tensor], seed: int) -> dict[str, object]:
-        """The arguments of a call. The same noise each time: what pictures leave open is decided alike."""
-        arguments = self.adapter.arguments(
-            self.prompt, [to_picture(p) for p in pictures], self.steps, self.guidance, self.image_guidance
-        )
-        return arguments | {"generator": torch.Generator().manual_seed(seed)}
 
 
 @dataclass(frozen=True)
@@ -92,24 +64,15 @@ class InstructEditor:
     @property
     def recipe(self) -> Recipe:
         """What a picture depends on besides its source and strength."""
-        request = self.request
-        return {
-            "instruct": request.prompt,
-            "model": request.model,
-            "pipeline": request.pipeline,
-            "guidance": request.guidance,
-            "image_guidance": request.image_guidance,
-            "steps": request.steps,
-            "size": request.size,
-            "seed": request.seed,
-            "quantize": request.quantize,
-        }
+        values = {f.name: getattr(self.request, f.name) for f in fields(self.request)}
+        return {"instruct": values.pop("prompt")} | {k: v for k, v in values.items() if k != "adapter"}
 
     @property
     def note(self) -> str:
         """What will paint, where, and what that takes; for the log."""
-        calls = self.calls((1.0,))
-        return f"{self.request.model} {self.placement.line()}; {calls} calls of its network a picture"
+        request, unread = self.request, unread_words(self.request)
+        line = f"{request.model} {self.placement.line()}; {self.calls((1.0,))} calls of its network a picture"
+        return f"{line}; it does not read the end of the sentence: “{unread}”" if unread else line
 
     def calls(self, strengths: Sequence[float]) -> int:
         """How often its network is asked for one view at these strengths."""
@@ -182,7 +145,7 @@ class InstructEditor:
             )
         request = self.request
         noise = request.seed if seed is None else seed
-        with explain_memory(request.model, self.placement, request.quantize):
+        with explain_memory(request, self.placement):
             painted = self.load().paint(
                 lambda pictures: request.ask(pictures, noise),
                 (picture, *references),
@@ -198,25 +161,17 @@ def instruct(
 ) -> InstructEditor:
     """`instruct:"…"`: the model and its options are checked now, its weights are loaded when first needed."""
     request = resolve_request(what, options)
-    placement = place(request.model, request.adapter, options, request.size)
 
     @cache
     def pipeline() -> MixedSteps:
-        blank = torch.ones(64, 64, 3)
+        key = request.model, request.prompt, request.quantize, options.device
+        # placed anew: what was there before has gone by then
         loaded: MixedSteps = last_model(
-            "pipeline",
-            (request.model, request.pipeline, request.prompt, request.quantize, placement),
-            lambda: load_pipeline(
-                request.model,
-                request.pipeline,
-                request.adapter,
-                placement,
-                request.quantize,
-                request.ask([blank], request.seed),
-            ),
+            "pipeline", key, lambda: load_pipeline(request, place(request, options.device))
         )
         return loaded
 
+    placement = place(request, options.device)
     return InstructEditor(scene, request, placement, pipeline, KeptPictures(options.cache))
 
 
@@ -226,8 +181,7 @@ def check_instruct(what: str, options: EditorOptions) -> None:
     Raises:
         ProgdfError: nothing is said, a package or weights are missing or truncated, an option is not known.
     """
-    request = resolve_request(what, options)
-    place(request.model, request.adapter, options, request.size)
+    place(resolve_request(what, options), options.device)
 
 
 def sentence(what: str) -> str:
@@ -250,16 +204,16 @@ def resolve_request(what: str, options: EditorOptions) -> Request:
     model = options.model or default_model()
     kind, adapter = adapter_of(model)
     guidance, image_guidance = parse_guidance(options.guidance)
-    if image_guidance is not None and "image_guidance" not in adapter.words:
+    if image_guidance is not None and adapter.image_guidance is None:
         raise ProgdfError(
             f"{model} does not support guidance of the picture; give --guidance one number, "
             f"or use --model {SMALL_MODEL}"
         )
-    for value, word, option in (
-        (guidance, "guidance" in adapter.words, "--guidance"),
-        (options.edit_size, not adapter.is_fixed, "--edit-size"),
+    for is_given, option in (
+        (guidance is not None and adapter.guidance is None, "--guidance"),
+        (options.edit_size is not None and adapter.is_fixed, "--edit-size"),
     ):
-        if value is not None and not word:
+        if is_given:
             raise ProgdfError(f"{option} does not apply to {model}, which has its own; leave it out")
     return Request(
         prompt,
@@ -273,6 +227,17 @@ def resolve_request(what: str, options: EditorOptions) -> Request:
         seed=options.seed,
         quantize=options.quantize,
     )
+
+
+def unread_words(request: Request) -> str:
+    """The end of a sentence that is longer than CLIP's 77 tokens, where CLIP is all that reads it."""
+    if not request.adapter.is_stable:
+        return ""
+    from transformers import CLIPTokenizer
+
+    tokenizer = CLIPTokenizer.from_pretrained(request.model, subfolder="tokenizer", local_files_only=True)
+    tokens = tokenizer(request.prompt)["input_ids"]
+    return str(tokenizer.decode(tokens[tokenizer.model_max_length - 1 : -1])).strip()
 
 
 def parse_guidance(text: str) -> tuple[float | None, float | None]:

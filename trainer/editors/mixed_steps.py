@@ -18,11 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-_EULER = (
-    "FlowMatchEulerDiscreteScheduler",
-    "EulerAncestralDiscreteScheduler",
-    "EulerDiscreteScheduler",
-)
+_EULER = ("FlowMatchEulerDiscreteScheduler", "EulerAncestralDiscreteScheduler", "EulerDiscreteScheduler")
 
 
 def step_weight(strength: float, softness: float, progress: float) -> float:
@@ -148,7 +144,7 @@ class MixedSteps:
         def step(predicted: Tensor, timestep: Any, sample: Tensor, *args: Any, **kwargs: Any) -> Any:
             weight = self._weight()
             if weight < 1.0:
-                straight = self._straight(sample.float()).to(sample.dtype)
+                straight = self._straight(sample.float()).to(predicted.dtype)
                 predicted = torch.lerp(straight, predicted, weight) if weight > 0.0 else straight
             self._step += 1
             return inner(predicted, timestep, sample, *args, **kwargs)
@@ -160,8 +156,9 @@ class MixedSteps:
         latents = self.latents if self._source is None else self._source
         assert latents is not None
         if sample.ndim == 4:  # planes, of a UNet: the picture's come first, and as the autoencoder has them
-            scaled = 1.0 if getattr(self.pipeline, "is_cosxl_edit", False) else self._vae_scale
-            source = latents[: len(sample)].float() * scaled
+            is_scaled = getattr(self.pipeline, "is_cosxl_edit", False)
+            scale = 1.0 if is_scaled else self.pipeline.vae.config.scaling_factor
+            source = latents[: len(sample)].float() * scale
         else:  # tokens; those of further pictures follow
             source = latents[:, : sample.shape[1]].float()
         scheduler = self.pipeline.scheduler
@@ -170,10 +167,6 @@ class MixedSteps:
             root = (sigma**2 + 1).sqrt()
             sample, source = sample / root, source * root
         return (sample - source) / sigma
-
-    @property
-    def _vae_scale(self) -> float:
-        return float(self.pipeline.vae.config.scaling_factor)
 
 
 def _once(inner: Callable[..., Any]) -> Callable[..., Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import math
 from collections.abc import Callable
@@ -75,7 +76,8 @@ def gpu_memory() -> tuple[int, int] | None:
     """Free and total bytes of the graphics card that torch uses; None where there is none."""
     if not torch.cuda.is_available():
         return None
-    torch.cuda.empty_cache()  # what a network before left is free too
+    gc.collect()  # what a network before left is free too
+    torch.cuda.empty_cache()
     return torch.cuda.mem_get_info()
 
 

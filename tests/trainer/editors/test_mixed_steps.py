@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -36,11 +37,16 @@ def one_thread() -> Iterator[None]:
 
 
 def asking(kind: str, steps: int = STEPS) -> Ask:
+    import diffusers
+
     adapter = ADAPTERS[kind]
 
     def ask(pictures: Sequence[Tensor]) -> dict[str, object]:
         shown = [to_picture(picture) for picture in pictures]
-        arguments = adapter.arguments("as Batman", shown, steps, adapter.guidance, adapter.image_guidance)
+        known = signature(getattr(diffusers, kind).__call__).parameters
+        arguments = adapter.arguments(
+            known, "as Batman", shown, steps, adapter.guidance, adapter.image_guidance
+        )
         return arguments | {"generator": torch.Generator().manual_seed(3)}
 
     return ask
@@ -109,6 +115,23 @@ def test_at_strength_zero_every_step_leads_to_the_source(
     remembers = 2 if kind == "Flux2KleinKVPipeline" else 0  # it keeps what it saw in its first step
     assert mixed.calls - before == remembers
     assert torch.equal(paint(mixed, kind, 0.0), view())
+
+
+def test_networks_that_predict_velocity_in_euler_s_steps_are_led_to_the_source_too(folder: Path) -> None:
+    kind = "StableDiffusionXLInstructPix2PixPipeline"
+    pipeline = PIPELINES[kind](folder)
+    pipeline.set_progress_bar_config(disable=True)
+    settings = {**pipeline.scheduler.config, "prediction_type": "v_prediction"}
+    pipeline.scheduler = type(pipeline.scheduler).from_config(settings)
+    mixed = MixedSteps(pipeline, encodes_alone=True)
+    ended = pipeline(**asking(kind)([view()]), output_type="latent").images
+    mixed._strength = 0.0
+    mixed._step = 0
+    led = pipeline(**asking(kind)([view()]), output_type="latent").images
+    assert mixed.latents is not None
+    latents = mixed.latents[:1] * pipeline.vae.config.scaling_factor
+    assert float((led - latents).abs().max()) < 1e-6
+    assert float((ended - latents).abs().max()) > 0.1
 
 
 def test_the_change_grows_with_the_strength(kind: str, folder: Path) -> None:
