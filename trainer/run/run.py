@@ -100,7 +100,8 @@ def check_command(options: TrainOptions) -> None:
         picture_cameras(views.pictures, cameras, ZERO)
     if not options.resume or load_region(options.out) is None:
         check_region(options.region.region, region_checks(region_request(options, quiet=True)))
-    if not folder.root.is_dir() or not any(folder.root.iterdir()):
+    is_new = not folder.root.is_dir() or not any(folder.root.iterdir())
+    if is_new or (options.editor.family in COSTLY_STRENGTHS and not options.resume):
         check_new_editor(replace(options.editor, cache=folder.paintings))
 
 

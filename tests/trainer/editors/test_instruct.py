@@ -29,6 +29,8 @@ from trainer.editors.instruct import InstructEditor, sentence
 from trainer.editors.mixed_steps import MixedSteps, network_steps
 from trainer.options import EditorOptions, TrainOptions, with_values
 from trainer.resolve import resolve, resolve_kind
+from trainer.run.run import check_command
+from trainer.store.run_folder import RunFolder, begin_log
 
 BATMAN = 'instruct:"turn him into Batman"'
 
@@ -268,6 +270,16 @@ def test_a_text_edit_is_trained_in_stages_and_stopped_anywhere_comes_to_the_same
 
 def calls_at(strengths: Sequence[float]) -> int:
     return sum(network_steps(s, 1.0, 2) for s in strengths)
+
+
+def test_weights_are_looked_for_before_a_used_folder_is_trained_in_again(
+    pix2pix: str, tmp_path: Path
+) -> None:
+    write_bear(tmp_path, 900)
+    (tmp_path / "run" / "views").mkdir(parents=True)
+    begin_log(RunFolder(tmp_path / "run"), text_run(tmp_path, "gone", "run").edit)
+    with pytest.raises(ProgdfError, match="the weights of gone are not on this machine"):
+        check_command(resolve(text_run(tmp_path, "gone", "run")))
 
 
 def test_where_things_move_the_end_alone_is_asked(pix2pix: str, tmp_path: Path) -> None:

@@ -121,8 +121,8 @@ def test_networks_that_predict_velocity_in_euler_s_steps_are_led_to_the_source_t
     kind = "StableDiffusionXLInstructPix2PixPipeline"
     pipeline = PIPELINES[kind](folder)
     pipeline.set_progress_bar_config(disable=True)
-    settings = {**pipeline.scheduler.config, "prediction_type": "v_prediction"}
-    pipeline.scheduler = type(pipeline.scheduler).from_config(settings)
+    scheduler = pipeline.scheduler
+    pipeline.scheduler = scheduler.from_config(scheduler.config, prediction_type="v_prediction")
     mixed = MixedSteps(pipeline, encodes_alone=True)
     ended = pipeline(**asking(kind)([view()]), output_type="latent").images
     mixed._strength = 0.0
