@@ -295,8 +295,10 @@ def test_views_of_text_edits_have_512_pixels_unless_others_are_asked_for(tmp_pat
     assert resolve(quick_options(tmp_path, image_size=0)).views.image_size == 0
 
 
-def test_clip_is_asked_for_descriptions_alone(tmp_path: Path) -> None:
-    assert resolve(text_run(tmp_path, "m", "run", text_before="a bear")).texts.text_after == ""
+@pytest.mark.parametrize("option", [{"quantize": "nf4"}, {"device": "cpu"}])
+def test_options_of_models_are_for_text_edits_alone(option: dict[str, object], tmp_path: Path) -> None:
+    with pytest.raises(ProgdfError, match="does not apply to recolor; it is for instruct"):
+        resolve(quick_options(tmp_path, **option))
 
 
 def test_parts_that_go_to_the_card_in_turn_paint_the_same_picture(
@@ -332,6 +334,7 @@ def test_four_bits_need_their_package_and_a_card(pix2pix: str, monkeypatch: pyte
         ("'like the boys'", "like the boys"),
         ("\"he says 'no'\"", "he says 'no'"),
         ('"', '"'),
+        ("'twas night", "'twas night"),
     ],
 )
 def test_only_a_pair_of_quotes_around_a_sentence_is_taken_off(typed: str, read: str) -> None:
