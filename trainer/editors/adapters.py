@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from inspect import signature
@@ -164,15 +164,11 @@ SMALL_MODEL = ADAPTERS["StableDiffusionInstructPix2PixPipeline"].model
 
 def default_model() -> str:
     """FLUX.2-klein-4B where it is on this machine and fits its card, else InstructPix2Pix."""
-    try:
-        memory = gpu_memory()
-        if memory is not None:
-            sizes = component_sizes(_KLEIN.model, _KLEIN)
-            # of the whole card: what is free now may be less on the next day
-            if memory[1] >= memory_need(_KLEIN, sizes, "off", _KLEIN.size)[1]:
-                return _KLEIN.model
-    except ProgdfError:
-        pass
+    with suppress(ProgdfError):
+        total = (gpu_memory() or (0, 0))[1]  # of the card: what is free now may be less on the next day
+        sizes = component_sizes(_KLEIN.model, _KLEIN) if total else {}
+        if sizes and total >= memory_need(_KLEIN, sizes, "off", _KLEIN.size)[1]:
+            return _KLEIN.model
     return SMALL_MODEL
 
 
@@ -217,16 +213,12 @@ def memory_need(adapter: Adapter, sizes: Mapping[str, int], quantize: str, size:
         size: side of a square of the area that is painted, pixels
     """
     packed = quantize == "nf4"
-    parts = {name: n * (_NF4 if packed and _is_large(name) else 2.0) for name, n in sizes.items()}
+    parts = {name: n * (_NF4 if packed and name != "vae" else 2.0) for name, n in sizes.items()}
     first = [name for name in parts if adapter.encodes_alone and name.startswith("text_encoder")]
     # the encoder goes before the rest comes
     encoder = _WORKING + max((parts.pop(name) for name in first), default=0.0)
     working = _WORKING + _WORKING_PER_MEGAPIXEL * size * size / 1e6
     return max(encoder, working + sum(parts.values())), max(encoder, working + max(parts.values()))
-
-
-def _is_large(component: str) -> bool:
-    return component.startswith(("transformer", "unet", "text_encoder"))
 
 
 def component_sizes(model: str, adapter: Adapter) -> dict[str, int]:
@@ -328,7 +320,7 @@ def load_pipeline(request: Request, placement: Placement) -> MixedSteps:
     adapter, loading = request.adapter, dict(request.adapter.loading)
     if request.quantize == "nf4":
         bits = {"load_in_4bit": True, "bnb_4bit_quant_type": "nf4", "bnb_4bit_compute_dtype": placement.dtype}
-        large = [name for name in component_sizes(request.model, adapter) if _is_large(name)]
+        large = [name for name in component_sizes(request.model, adapter) if name != "vae"]
         loading["quantization_config"] = diffusers.PipelineQuantizationConfig(
             quant_backend="bitsandbytes_4bit", quant_kwargs=bits, components_to_quantize=large
         )

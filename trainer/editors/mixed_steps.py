@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 import torch
@@ -66,12 +67,9 @@ class MixedSteps:
     def encode(self, arguments: Mapping[str, object]) -> None:
         """Encode the sentence of these arguments, and nothing else."""
         self._encoding = True
-        try:
+        with suppress(_EncodedError):
             self.pipeline(**arguments)
-        except _EncodedError:
-            pass
-        finally:
-            self._encoding = False
+        self._encoding = False
 
     def paint(
         self,

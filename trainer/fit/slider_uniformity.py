@@ -75,7 +75,10 @@ def equalized_strengths(
     courses = [edit_course(editor, view) for view in few]
 
     def picture_at(s: float) -> Tensor:
-        return torch.cat([picture_at(s).flatten() for picture_at in courses])
+        pictures = [picture_at(s) for picture_at in courses]
+        if not editor.is_confined:  # what changes beside the region is put back
+            pictures = [view.confine(picture) for view, picture in zip(few, pictures, strict=True)]
+        return torch.cat([picture.flatten() for picture in pictures])
 
     even = torch.linspace(0, 1, (_COSTLY_STEPS if costly else STEPS) + 1, dtype=torch.float64)
     pictures = [picture_at(float(s)) for s in even]
