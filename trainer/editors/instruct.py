@@ -115,7 +115,7 @@ class InstructEditor:
     def paste(self, view: View, painted: Tensor) -> Tensor:
         """The view with what was changed in its frame, shrunk by area. [h,w,3] -> [H,W,3]
 
-        The change, not the picture: a render shrunk is 4 to 10 dB off the smaller render that is trained.
+        The change, not the picture: a render shrunk is some 32 dB off the smaller render that is trained.
         """
         x0, y0, x1, y1 = self.frame(view)[0]
         change = (painted - self.original(view)).permute(2, 0, 1)[None]
@@ -164,11 +164,11 @@ def instruct(
 
     @cache
     def pipeline() -> MixedSteps:
-        key = request.model, request.prompt, request.quantize, options.device
         # placed anew: what was there before has gone by then
-        loaded: MixedSteps = last_model(
-            "pipeline", key, lambda: load_pipeline(request, place(request, options.device))
-        )
+        def load() -> MixedSteps:
+            return load_pipeline(request, place(request, options.device))
+
+        loaded: MixedSteps = last_model("pipeline", (request, options.device), load)
         return loaded
 
     placement = place(request, options.device)

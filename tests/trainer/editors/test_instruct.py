@@ -155,6 +155,18 @@ def test_what_a_model_leaves_alone_stays_to_the_bit(pix2pix: str) -> None:
     assert torch.equal(editor.paste(view, editor.original(view)), view.image)
 
 
+def test_a_kept_model_is_loaded_again_where_its_sentence_would_be_encoded_otherwise(
+    pix2pix: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("trainer.store.pretrained._models", {})
+    view = small().views[0]
+    with_guidance, without, again = (
+        editor_of(settings_of(pix2pix, guidance=guidance)).edit(view, 1.0) for guidance in ("7.5", "1", "7.5")
+    )
+    assert not torch.equal(with_guidance, without)
+    assert torch.equal(with_guidance, again)
+
+
 @pytest.mark.parametrize("name", ADAPTERS)
 def test_what_pipelines_are_asked_is_among_their_keywords(diffusers: None, name: str) -> None:
     import diffusers as library
