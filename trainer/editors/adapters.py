@@ -179,13 +179,13 @@ def adapter_of(model: str) -> tuple[str, Adapter]:
         ProgdfError: diffusers is not installed, the model not on this machine or no editor.
     """
     try:
-        from diffusers import DiffusionPipeline
+        import diffusers  # noqa: F401
     except ImportError as error:
         raise ProgdfError(
             f"instruct: needs the package diffusers ({error}); pip install progdf-studio[diffusion]"
         ) from error
     try:
-        index = DiffusionPipeline.load_config(model, local_files_only=True)
+        index = json.loads((pipeline_folder(model) / "model_index.json").read_bytes())
         kind = str(index["_class_name"])
     except BROKEN as error:
         raise missing_weights(model) from error
@@ -201,6 +201,11 @@ def adapter_of(model: str) -> tuple[str, Adapter]:
     if kind == "Flux2KleinPipeline" and not index.get("is_distilled", True):
         adapter = replace(adapter, steps=50, guidance=4.0, passes=2)  # a base model
     return kind, adapter
+
+
+def pipeline_folder(model: str) -> Path:
+    """Where a pipeline lies; one of `BROKEN` where it is not on this machine."""
+    return folder_of_model(model, "model_index.json")
 
 
 def memory_need(adapter: Adapter, sizes: Mapping[str, int], quantize: str, size: int) -> tuple[float, float]:
@@ -229,7 +234,7 @@ def component_sizes(model: str, adapter: Adapter) -> dict[str, int]:
     """
     sizes = {}
     try:
-        folder = folder_of_model(model, "model_index.json")
+        folder = pipeline_folder(model)
         for name, made in json.loads((folder / "model_index.json").read_bytes()).items():
             if not (isinstance(made, list) and made[0]) or name in adapter.loading:
                 continue
@@ -327,7 +332,7 @@ def load_pipeline(request: Request, placement: Placement) -> MixedSteps:
     with explain_memory(request, placement):
         try:
             pipeline = getattr(diffusers, request.pipeline).from_pretrained(
-                request.model,
+                pipeline_folder(request.model),
                 dtype=placement.dtype,
                 local_files_only=True,
                 use_safetensors=True,  # the other kind of weights can run code

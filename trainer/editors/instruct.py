@@ -34,6 +34,7 @@ from .adapters import (
     default_model,
     explain_memory,
     load_pipeline,
+    pipeline_folder,
     place,
 )
 from .cache import KeptPictures, Recipe
@@ -235,7 +236,7 @@ def unread_words(request: Request) -> str:
         return ""
     from transformers import CLIPTokenizer
 
-    tokenizer = CLIPTokenizer.from_pretrained(request.model, subfolder="tokenizer", local_files_only=True)
+    tokenizer = CLIPTokenizer.from_pretrained(pipeline_folder(request.model) / "tokenizer")
     tokens = tokenizer(request.prompt)["input_ids"]
     return str(tokenizer.decode(tokens[tokenizer.model_max_length - 1 : -1])).strip()
 
