@@ -32,6 +32,8 @@ Over = Literal["mean", "sum"]
 LiftRule = Literal["share", "paper"]
 Bands = Literal["auto", "on", "off"]
 Preset = Literal["default", "paper"]
+Quantize = Literal["off", "nf4"]
+Device = Literal["auto", "cpu"]
 
 DETECTOR, SAM_MODEL = "IDEA-Research/grounding-dino-tiny", "facebook/sam-vit-base"
 FieldKind = Literal["auto", "separable", "keyframes", "lossless", "neural"]
@@ -86,18 +88,25 @@ class EditorOptions:
     """recolor:#rrggbb, tint:#rrggbb, stripes:#rrggbb, darken:AMOUNT, night, folder:DIR (edited views),
     photographs:EDITED,ORIGINALS (of what the cameras took), pictures:A.png[,B.png] (rendered, then changed in
     any program), style:N (a painting, N from 0 to 25), instruct:"turn him into Batman"."""
-    model: Annotated[str, absent_option("STR", "timbrooks/instruct-pix2pix")] = ""
-    """instruct: id or folder of a diffusers pipeline; empty: timbrooks/instruct-pix2pix (the paper's)."""
+    model: Annotated[str, absent_option("STR", "what is here and fits")] = ""
+    """instruct: id or folder of a diffusers pipeline; by default black-forest-labs/FLUX.2-klein-4B where it
+    was downloaded and fits the graphics card, else timbrooks/instruct-pix2pix (the paper's)."""
     guidance: Annotated[str, absent_option("NUMBER[,NUMBER]", "the model's own")] = ""
     """instruct: how closely the instruction is followed and, after a comma, the picture, where the model
     supports that; by default the model's own values (paper: 7.5,1.5)."""
     edit_steps: Annotated[int | None, absent_option("INT", "the model's own")] = None
     """instruct: denoising steps per picture; by default the model's own number (paper: 20)."""
     edit_size: Annotated[int | None, absent_option("INT", "the model's own")] = None
-    """style, instruct: longer side in pixels at which pictures are painted; larger makes finer strokes."""
+    """style: longer side in pixels at which pictures are painted; larger makes finer strokes. instruct: side
+    of a square of the area that is painted, whatever the proportions."""
+    quantize: Quantize = "off"
+    """instruct: nf4 keeps the model's large parts in 4 bits, a quarter of the memory at some loss (pip
+    install progdf-studio[quantize])."""
+    device: Device = "auto"
+    """instruct: auto is the graphics card that torch has, else the CPU for what is small; cpu is the CPU for
+    anything, which takes hours a picture with a large model."""
     reedit_every: int = 0
     """style, instruct: every N steps, edit the current renders again and train towards those; 0: never."""
-    graded: Fixed[bool] = False  # at several strengths by rising guidance, not the finished edit alone
     seed: Fixed[int] = 0  # of the noise, the same in every view
     cache: Fixed[Path | None] = None  # folder in which painted pictures are kept; None keeps nothing
 
@@ -121,7 +130,7 @@ class ViewOptions:
     or 40 for an edit of colors."""
     image_size: int = 0
     """Longer side of the views in pixels; 0: 256, or up to 384 for an edit of colors whose members are so
-    dense that most have less than a pixel."""
+    dense that most have less than a pixel; 512 for instruct."""
     dense: Fixed[bool] = True  # dense members get more and larger views; not what is painted one by one
     pictures: Fixed[tuple[Path, ...]] = ()  # changed pictures, whose cameras are the views, all to train on
     scene: Fixed[Path | None] = None  # its file, beside which there may be cameras that tell which way is up
@@ -144,8 +153,7 @@ class OptimizeOptions:
     stages: int = 0
     """Number of strengths that an editor with a strength control is asked for; 0: as many as the course of an
     edit of colors bends; else 8, or 4 for fewer than 320 steps, but 1 for a style, which is the paper's way,
-    towards the end alone. instruct is asked for strengths, by rising guidance, only if more than 1 are asked
-    for here: each is another pass over the views."""
+    towards the end alone; instruct: 4, each another pass over the views, but 1 where parts move."""
     sh: Bands = "auto"
     """Colors that change with the direction one looks from: trained, and kept where leaving them out would
     cost 0.1 dB (on, auto), or left as they are (off); those of an edit of colors follow its map, and get a
@@ -212,7 +220,7 @@ class TextOptions:
     """What the views show before the edit, such as "a bear"; with --text-after, CLIP directional similarity
     is measured (ViT-L/14; pip install progdf-studio[clip])."""
     text_after: Annotated[str, absent_option("STR", "none; of fit and evaluate the run's own")] = ""
-    """What they show after it, such as "a golden bear"; instruct: its sentence, if nothing is given."""
+    """What they show after it, such as "a golden bear": a description, never an instruction."""
     asked: Fixed[bool] = False  # whether a text was given for this; an instruction alone asks for nothing
 
 

@@ -14,7 +14,8 @@ from pathlib import Path
 from progdf.errors import ProgdfError
 from progdf.io.atomic import is_portable
 from progdf.metrics.image import NO_DIFFERENCE
-from trainer.editors import EXTERNAL, PER_VIEW
+from trainer.editors import COSTLY_STRENGTHS, EXTERNAL, PER_VIEW
+from trainer.editors.adapters import default_model
 from trainer.editors.instruct import parse_guidance
 from trainer.editors.pictures import picture_paths, strengths_of
 from trainer.options import EditKind
@@ -44,6 +45,11 @@ from .options import (
 PERCEPTUAL_WEIGHT: Mapping[EditKind, float] = {"color": 0.1, "style": 0.3, "geometry": 0.3}
 SHARPNESS: Mapping[EditKind, Sharpness] = {"color": "off", "style": "hinge", "geometry": "off"}
 STAGES: Mapping[EditKind, int] = {"color": MOST_STAGES, "style": 1, "geometry": MOST_STAGES}
+COSTLY_STAGES: Mapping[EditKind, int] = {"color": 4, "style": 4, "geometry": 1}
+"""Of what paints each strength anew; where things move its pictures between show two of them."""
+
+INSTRUCT_SIZE = 512
+"""Longer side of views that a diffusion model paints, shrunk from what it paints at its own size."""
 
 
 def resolve(options: TrainOptions) -> TrainOptions:
@@ -57,17 +63,19 @@ def resolve(options: TrainOptions) -> TrainOptions:
     family, _, what = options.editor.editor.partition(":")
     stages = min(optimize.stages, QUICK_STAGES) if quick else optimize.stages
     texts = options.texts
+    model = options.editor.model or (default_model() if family == "instruct" else "")
     pictures = picture_paths(what) if family == "pictures" else ()
     # where the finished edit alone is given, the way there is ours
     paced = family not in EXTERNAL or (pictures and all(len(strengths_of(path)) == 1 for path in pictures))
     return replace(
         options,
         name=check_name(options.name or options.out.resolve().name),
-        editor=replace(options.editor, graded=stages > 1, seed=options.seed),
+        editor=replace(options.editor, seed=options.seed, model=model),
         views=replace(
             options.views,
             views=min(views or QUICK_VIEWS, QUICK_VIEWS) if quick else views,
             dense=not quick and family not in PER_VIEW,
+            image_size=options.views.image_size or (INSTRUCT_SIZE if family == "instruct" else 0),
             pictures=pictures,
             scene=options.scene,
         ),
@@ -79,11 +87,7 @@ def resolve(options: TrainOptions) -> TrainOptions:
             seed=options.seed,
         ),
         field=replace(options.field, draft=quick, seed=options.seed),
-        texts=replace(
-            texts,
-            text_after=texts.text_after or (what.strip().strip("\"'") if family == "instruct" else ""),
-            asked=bool(texts.text_before or texts.text_after),
-        ),
+        texts=replace(texts, asked=bool(texts.text_before or texts.text_after)),
     )
 
 
@@ -114,7 +118,8 @@ def resolve_kind(options: TrainOptions, kind: EditKind, group_steps: int) -> Opt
         and not optimize.as_printed
         and not options.editor.reedit_every
     )
-    weight, most = optimize.perceptual_weight, STAGES[kind]
+    costly = options.editor.family in COSTLY_STRENGTHS
+    weight, most = optimize.perceptual_weight, (COSTLY_STAGES if costly else STAGES)[kind]
     return replace(
         optimize,
         kind=kind,
@@ -188,7 +193,7 @@ def _check_editor_options(editor: EditorOptions, optimize: OptimizeOptions) -> N
             f"--kind {optimize.kind} does not apply to pictures: few views do not tell how deep a part lies; "
             "give more as folder:DIR, of views that --cameras has"
         )
-    of_instruct = ("model", "guidance", "edit_steps")
+    of_instruct = ("model", "guidance", "edit_steps", "quantize", "device")
     of_painters = ("edit_size", "reedit_every")
     for names, kinds in ((of_instruct, ("instruct",)), (of_painters, ("style", "instruct"))):
         for name in names:

@@ -2,19 +2,38 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import patch
 
 import torch
+from PIL import ImageStat
 
 from tests.helpers.tiny_clip import CLIP_VOCABULARY, clip_tokenizer, write_vocabulary
 
+_VISION = [f"<|{name}|>" for name in ("vision_start", "vision_end", "image_pad")]
 _QWEN = [f"<|{name}|>" for name in ("endoftext", "im_start", "im_end")]
 _VAE: dict[str, Any] = {
     "block_out_channels": (8, 8, 8, 8),
     "down_block_types": ("DownEncoderBlock2D",) * 4,
     "up_block_types": ("UpDecoderBlock2D",) * 4,
     "latent_channels": 4,
+    "norm_num_groups": 4,
+}
+_UNET: dict[str, Any] = {
+    "block_out_channels": (8, 16),
+    "layers_per_block": 1,
+    "sample_size": 16,
+    "in_channels": 8,  # the noise and the picture
+    "out_channels": 4,
+    "down_block_types": ("DownBlock2D", "CrossAttnDownBlock2D"),
+    "up_block_types": ("CrossAttnUpBlock2D", "UpBlock2D"),
+    "cross_attention_dim": 16,
+    "attention_head_dim": 4,
     "norm_num_groups": 4,
 }
 _FLUX: dict[str, Any] = {
@@ -27,8 +46,8 @@ _FLUX: dict[str, Any] = {
 }
 
 
-def tiny_instruct_pix2pix(folder: Path) -> Path:
-    """A StableDiffusionInstructPix2PixPipeline of about 100 000 parameters in `folder`."""
+def pix2pix_pipeline(folder: Path) -> Any:
+    """A StableDiffusionInstructPix2PixPipeline of about 100 000 parameters; its words go to `folder`."""
     from diffusers import (
         AutoencoderKL,
         EulerAncestralDiscreteScheduler,
@@ -37,20 +56,9 @@ def tiny_instruct_pix2pix(folder: Path) -> Path:
     )
 
     torch.manual_seed(0)
-    unet = UNet2DConditionModel(
-        block_out_channels=(8, 16),
-        layers_per_block=1,
-        sample_size=16,
-        in_channels=8,  # the noise and the picture
-        out_channels=4,
-        down_block_types=("DownBlock2D", "CrossAttnDownBlock2D"),
-        up_block_types=("CrossAttnUpBlock2D", "UpBlock2D"),
-        cross_attention_dim=16,
-        attention_head_dim=4,
-        norm_num_groups=4,
-    )
+    unet = UNet2DConditionModel(**_UNET)
     vae = AutoencoderKL(**_VAE)
-    pipeline = StableDiffusionInstructPix2PixPipeline(
+    return StableDiffusionInstructPix2PixPipeline(
         vae=vae.eval(),
         text_encoder=_clip(16),
         tokenizer=clip_tokenizer(folder / "words"),
@@ -60,17 +68,39 @@ def tiny_instruct_pix2pix(folder: Path) -> Path:
         feature_extractor=None,
         requires_safety_checker=False,
     )
-    return _saved(pipeline, folder)
 
 
-def tiny_flux_kontext(folder: Path) -> Path:
-    """A FluxKontextPipeline of about 100 000 parameters in `folder`."""
+def pix2pix_xl_pipeline(folder: Path) -> Any:
+    """A StableDiffusionXLInstructPix2PixPipeline of about 100 000 parameters."""
     from diffusers import (
         AutoencoderKL,
-        FlowMatchEulerDiscreteScheduler,
-        FluxKontextPipeline,
-        FluxTransformer2DModel,
+        EulerDiscreteScheduler,
+        StableDiffusionXLInstructPix2PixPipeline,
+        UNet2DConditionModel,
     )
+
+    torch.manual_seed(0)
+    unet = UNet2DConditionModel(
+        **{**_UNET, "cross_attention_dim": 32},
+        addition_embed_type="text_time",
+        addition_time_embed_dim=8,
+        projection_class_embeddings_input_dim=16 + 6 * 8,
+    )
+    return StableDiffusionXLInstructPix2PixPipeline(
+        vae=AutoencoderKL(**_VAE).eval(),
+        text_encoder=_clip(16),
+        text_encoder_2=_clip(16, projects=True),
+        tokenizer=clip_tokenizer(folder / "words"),
+        tokenizer_2=clip_tokenizer(folder / "words"),
+        unet=unet.eval(),
+        scheduler=EulerDiscreteScheduler(),
+        add_watermarker=False,
+    )
+
+
+def kontext_pipeline(folder: Path) -> Any:
+    """A FluxKontextPipeline of about 100 000 parameters."""
+    from diffusers import FlowMatchEulerDiscreteScheduler, FluxKontextPipeline, FluxTransformer2DModel
     from transformers import T5Config, T5EncoderModel
 
     torch.manual_seed(0)
@@ -81,64 +111,215 @@ def tiny_flux_kontext(folder: Path) -> Path:
         axes_dims_rope=(4, 4, 8),
         guidance_embeds=True,
     )
-    vae = AutoencoderKL(
-        **_VAE, use_quant_conv=False, use_post_quant_conv=False, shift_factor=0.1, scaling_factor=0.4
-    )
+    vae = _flux_vae()
     t5 = T5EncoderModel(
         T5Config(vocab_size=64, d_model=32, d_kv=8, d_ff=16, num_layers=1, num_heads=2)
     ).eval()
-    pipeline = FluxKontextPipeline(
+    return FluxKontextPipeline(
         scheduler=FlowMatchEulerDiscreteScheduler(),
-        vae=vae.eval(),
+        vae=vae,
         text_encoder=_clip(16),
         tokenizer=clip_tokenizer(folder / "words"),
         text_encoder_2=t5,
         tokenizer_2=_t5_tokenizer(),
         transformer=transformer.eval(),
     )
-    return _saved(pipeline, folder)
 
 
-def tiny_flux2_klein(folder: Path) -> Path:
-    """A Flux2KleinPipeline of about 100 000 parameters in `folder`."""
-    from diffusers import (
-        AutoencoderKLFlux2,
-        FlowMatchEulerDiscreteScheduler,
-        Flux2KleinPipeline,
-        Flux2Transformer2DModel,
-    )
+def klein_pipeline(folder: Path, kind: str = "Flux2KleinPipeline", is_distilled: bool = True) -> Any:
+    """A Flux2KleinPipeline, Flux2KleinKVPipeline or Flux2Pipeline of about 100 000 parameters."""
+    import diffusers
     from transformers import Qwen3Config, Qwen3ForCausalLM
 
     torch.manual_seed(0)
-    layers = 28  # the pipeline reads hidden states 9, 18 and 27
+    is_dev = kind == "Flux2Pipeline"  # it reads hidden states 10, 20 and 30, the others 9, 18 and 27
     text = Qwen3ForCausalLM(
         Qwen3Config(
             vocab_size=160,
             hidden_size=16,
             intermediate_size=16,
-            num_hidden_layers=layers,
+            num_hidden_layers=31 if is_dev else 28,
             num_attention_heads=2,
             num_key_value_heads=2,
             head_dim=8,
         )
     ).eval()
-    transformer = Flux2Transformer2DModel(
+    transformer = diffusers.Flux2Transformer2DModel(
         **_FLUX,
         joint_attention_dim=48,
         timestep_guidance_channels=16,
         axes_dims_rope=(4, 4, 4, 4),
-        guidance_embeds=False,
+        guidance_embeds=is_dev,
     )
-    vae = AutoencoderKLFlux2(**_VAE, layers_per_block=1, sample_size=32)
-    pipeline = Flux2KleinPipeline(
-        scheduler=FlowMatchEulerDiscreteScheduler(),
+    vae = diffusers.AutoencoderKLFlux2(**_VAE, layers_per_block=1, sample_size=32)
+    words = _qwen_tokenizer(folder / "words")
+    parts = {
+        "scheduler": diffusers.FlowMatchEulerDiscreteScheduler(),
+        "vae": vae.eval(),
+        "text_encoder": text,
+        "tokenizer": _Conversation(words) if is_dev else words,
+        "transformer": transformer.eval(),
+    }
+    if kind == "Flux2KleinPipeline":
+        parts["is_distilled"] = is_distilled
+    return getattr(diffusers, kind)(**parts)
+
+
+def qwen_pipeline(folder: Path, kind: str = "QwenImageEditPlusPipeline") -> Any:
+    """A QwenImageEditPlusPipeline or QwenImageEditPipeline, whose reader of pictures is a stand-in."""
+    import diffusers
+
+    torch.manual_seed(0)
+    transformer = diffusers.QwenImageTransformer2DModel(
+        patch_size=2,
+        in_channels=16,
+        out_channels=4,
+        num_layers=1,
+        attention_head_dim=16,
+        num_attention_heads=2,
+        joint_attention_dim=16,
+        axes_dims_rope=(4, 4, 8),
+    )
+    vae = diffusers.AutoencoderKLQwenImage(
+        base_dim=8,
+        z_dim=4,
+        dim_mult=[1, 1, 1, 1],
+        num_res_blocks=1,
+        temperal_downsample=[False, True, True],
+        latents_mean=[0.0] * 4,
+        latents_std=[1.0] * 4,
+    )
+    return getattr(diffusers, kind)(
+        scheduler=diffusers.FlowMatchEulerDiscreteScheduler(),
         vae=vae.eval(),
-        text_encoder=text,
+        text_encoder=_Reader(),
         tokenizer=_qwen_tokenizer(folder / "words"),
+        processor=_ReaderInput(),
         transformer=transformer.eval(),
-        is_distilled=True,
     )
-    return _saved(pipeline, folder)
+
+
+def longcat_pipeline(folder: Path) -> Any:
+    """A LongCatImageEditPipeline, whose reader of pictures is a stand-in."""
+    import diffusers
+
+    torch.manual_seed(0)
+    transformer = diffusers.LongCatImageTransformer2DModel(
+        patch_size=1,
+        in_channels=64,  # its pipeline takes 16 channels of latents for granted
+        num_layers=1,
+        num_single_layers=1,
+        attention_head_dim=16,
+        num_attention_heads=2,
+        joint_attention_dim=16,
+        pooled_projection_dim=16,
+        axes_dims_rope=(4, 4, 8),
+    )
+    words = _qwen_tokenizer(folder / "words")
+    words.add_tokens(_VISION, special_tokens=True)
+    return diffusers.LongCatImageEditPipeline(
+        scheduler=diffusers.FlowMatchEulerDiscreteScheduler(),
+        vae=_flux_vae(latent_channels=16),
+        text_encoder=_Reader(),
+        tokenizer=words,
+        text_processor=_ReaderInput(),
+        transformer=transformer.eval(),
+    )
+
+
+PIPELINES: dict[str, Callable[[Path], Any]] = {
+    "StableDiffusionInstructPix2PixPipeline": pix2pix_pipeline,
+    "StableDiffusionXLInstructPix2PixPipeline": pix2pix_xl_pipeline,
+    "FluxKontextPipeline": kontext_pipeline,
+    **{
+        kind: partial(klein_pipeline, kind=kind)
+        for kind in ("Flux2KleinPipeline", "Flux2KleinKVPipeline", "Flux2Pipeline")
+    },
+    **{
+        kind: partial(qwen_pipeline, kind=kind)
+        for kind in ("QwenImageEditPipeline", "QwenImageEditPlusPipeline")
+    },
+    "LongCatImageEditPipeline": longcat_pipeline,
+}
+"""Class in diffusers -> a tiny one, in memory."""
+
+
+def tiny_instruct_pix2pix(folder: Path) -> Path:
+    """A saved StableDiffusionInstructPix2PixPipeline."""
+    return _saved(pix2pix_pipeline(folder), folder)
+
+
+def tiny_flux_kontext(folder: Path) -> Path:
+    """A saved FluxKontextPipeline."""
+    return _saved(kontext_pipeline(folder), folder)
+
+
+def tiny_flux2_klein(folder: Path) -> Path:
+    """A saved Flux2KleinPipeline."""
+    return _saved(klein_pipeline(folder), folder)
+
+
+class _Conversation:
+    """What FLUX.2 dev takes its sentence's tokens from."""
+
+    def __init__(self, words: Any) -> None:
+        self._words = words
+
+    def apply_chat_template(self, conversations: Any, **_: Any) -> Any:
+        said = [
+            turn["content"][0]["text"] for talk in conversations for turn in talk if turn["role"] == "user"
+        ]
+        return self._words(said, padding="max_length", truncation=True, max_length=77, return_tensors="pt")
+
+
+class _ReaderInput:
+    """Words and pictures for `_Reader`: characters, and a picture's mean color."""
+
+    merge_size = 1
+
+    def __call__(self, text: Any = None, images: Any = None, **_: Any) -> Any:
+        from transformers import BatchFeature
+
+        pictures = images if isinstance(images, list) else [images]
+        means = torch.stack([torch.tensor(ImageStat.Stat(p.convert("RGB")).mean) / 255 for p in pictures])
+        found = {"pixel_values": means, "image_grid_thw": torch.tensor([[1, 1, 1]])}
+        if text is not None:
+            tokens = torch.tensor([[ord(c) % 128 for c in (text[0][:30] + text[0][-90:]).ljust(120)]])
+            found |= {"input_ids": tokens, "attention_mask": torch.ones_like(tokens)}
+        return BatchFeature(found)
+
+    @property
+    def image_processor(self) -> _ReaderInput:
+        return self
+
+
+class _Reader(torch.nn.Module):
+    """A text encoder that sees the picture too."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.words, self.colors = torch.nn.Embedding(256, 16), torch.nn.Linear(3, 16)
+
+    @property
+    def dtype(self) -> torch.dtype:
+        return self.colors.weight.dtype
+
+    @property
+    def device(self) -> torch.device:
+        return self.colors.weight.device
+
+    def forward(self, input_ids: Any, pixel_values: Any = None, **_: Any) -> Any:
+        read = self.words(input_ids) + self.colors(pixel_values.to(self.dtype)).mean(dim=0)
+        return SimpleNamespace(hidden_states=[read])
+
+
+def _flux_vae(**more: Any) -> Any:
+    from diffusers import AutoencoderKL
+
+    settings = {**_VAE, **more}
+    return AutoencoderKL(
+        **settings, use_quant_conv=False, use_post_quant_conv=False, shift_factor=0.1, scaling_factor=0.4
+    ).eval()
 
 
 def _saved(pipeline: Any, folder: Path) -> Path:
@@ -146,10 +327,10 @@ def _saved(pipeline: Any, folder: Path) -> Path:
     return folder / "pipeline"
 
 
-def _clip(width: int) -> Any:
-    from transformers import CLIPTextConfig, CLIPTextModel
+def _clip(width: int, projects: bool = False) -> Any:
+    from transformers import CLIPTextConfig, CLIPTextModel, CLIPTextModelWithProjection
 
-    return CLIPTextModel(
+    return (CLIPTextModelWithProjection if projects else CLIPTextModel)(
         CLIPTextConfig(
             vocab_size=CLIP_VOCABULARY,
             hidden_size=width,
@@ -179,3 +360,22 @@ def _qwen_tokenizer(folder: Path) -> Any:
     tokenizer = Qwen2Tokenizer.from_pretrained(folder, model_max_length=77)
     tokenizer.chat_template = "{% for m in messages %}<|im_start|>{{ m['content'] }}<|im_end|>{% endfor %}"
     return tokenizer
+
+
+@contextmanager
+def small_megapixels(side: int) -> Iterator[None]:
+    """Pipelines that scale every picture to a megapixel take it for a square of this side meanwhile."""
+    from diffusers.pipelines.longcat_image import pipeline_longcat_image_edit as longcat
+    from diffusers.pipelines.qwenimage import pipeline_qwenimage_edit as qwen
+    from diffusers.pipelines.qwenimage import pipeline_qwenimage_edit_plus as plus
+
+    area = side * side
+    with ExitStack() as changes:
+        for name in ("VAE_IMAGE_SIZE", "CONDITION_IMAGE_SIZE"):
+            changes.enter_context(patch.object(plus, name, area))
+        for module in (longcat, qwen):
+            inner = module.calculate_dimensions
+            changes.enter_context(
+                patch.object(module, "calculate_dimensions", lambda _, ratio, inner=inner: inner(area, ratio))
+            )
+        yield

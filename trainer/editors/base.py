@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Protocol, runtime_checkable
 
 from torch import Tensor
@@ -45,5 +46,36 @@ class RepaintingEditor(Protocol):
 
         None for the render stands for the one that was painted from at that step; ProgdfError if that picture
         is no longer there.
+        """
+        ...
+
+
+class Painter(Protocol):
+    """Paints one picture as it was told, at any degree."""
+
+    @property
+    def references(self) -> int:
+        """How many pictures beside the view's own one call can take."""
+        ...
+
+    def paint(
+        self,
+        picture: Tensor,
+        references: Sequence[Tensor] = (),
+        *,
+        strength: float = 1.0,
+        softness: float = 1.0,
+        source: Tensor | None = None,
+        seed: int | None = None,
+    ) -> Tensor:
+        """The picture painted anew, at the size that the model works at. -> [H,W,3] 0..1
+
+        Args:
+            picture: what is painted over, the condition. [H,W,3] 0..1
+            references: further pictures that the model looks at, at most `references`. [H,W,3] each
+            strength: 0 gives `source`, 1 what the model makes of its condition
+            softness: over which share of the steps the model's say grows from none to all of it
+            source: where strength 0 ends; None: `picture`. As large as it. [H,W,3]
+            seed: of the noise; None: the editor's
         """
         ...

@@ -1,7 +1,7 @@
 """Painted pictures kept on disk, so that a run that comes again, or goes on, paints nothing twice.
 
-RUN/views/painted/VIEW.png              what a learned editor made of the whole view
-RUN/views/painted/VIEW.json             from what: the view's picture, the editor, all its options
+RUN/views/painted/VIEW.png              what a learned editor made of what it was shown, at its own size
+RUN/views/painted/VIEW.json             from what: a digest of that, the editor, all its options
 RUN/views/painted/0.25/VIEW.png         at another strength, where the editor has several
 RUN/views/painted/step_00200/VIEW.png   of the render at a training step (--reedit-every)
 

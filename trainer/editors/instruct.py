@@ -1,211 +1,179 @@
-"""`instruct:"turn him into Batman"`: pipelines of diffusers that edit a picture as a sentence says.
+"""`instruct:"turn him into Batman"`: pictures edited as a sentence says, at any degree.
 
-InstructPix2Pix is ProGDF's editor, the others are newer and larger (see `adapters`). Weights are gigabytes:
-they are read from this machine and never fetched unasked.
-
-Why one target by default: text guidance is no strength. With little of it the picture is not the original
-(it has been through the model's autoencoder), and as it rises the edit arrives at once, at another guidance
-in every view. `--stages 4` asks for strengths that way all the same, at the price of a whole pass over the
-views for each.
+A view is rendered anew for the model: the box around the region with a margin, at the size that the model was
+made for. Its answer is kept at that size, and the training picture is shrunk from it. InstructPix2Pix is
+ProGDF's editor, the others are newer and larger (`adapters`); the degree is theirs no more than any other
+model's, but that of `mixed_steps`.
 """
 
 from __future__ import annotations
 
-import json
-import logging
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, fields, replace
 from functools import cache
-from importlib.util import find_spec
-from pathlib import Path
-from typing import Any
 
-import numpy as np
 import torch
-from PIL import Image
 from torch import Tensor
+from torch.nn.functional import interpolate
 
+from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
-from progdf.io.images import to_picture
+from progdf.rasterize import Crop
 from progdf.region import Region
 from trainer.options import EditKind, EditorOptions
-from trainer.store.pretrained import BROKEN, check_weights_here, folder_of_model, last_model
-from trainer.views.view import View
+from trainer.store.pretrained import last_model
+from trainer.views.view import BACKGROUND, View, region_box, render_view
 
+from .adapters import (
+    SMALL_MODEL,
+    Placement,
+    Request,
+    adapter_of,
+    default_model,
+    explain_memory,
+    load_pipeline,
+    pipeline_folder,
+    place,
+)
 from .cache import KeptPictures, Recipe
+from .mixed_steps import MixedSteps, network_steps
 
-_FLOW = {
-    "steps": "num_inference_steps",
-    "guidance": "guidance_scale",
-    "width": "width",
-    "height": "height",
-}
-
-
-@dataclass(frozen=True)
-class Adapter:
-    """How one pipeline is asked."""
-
-    model: str  # the id of its weights on the Hugging Face hub
-    # our word → its keyword, of steps, guidance (how closely the instruction is followed), image_guidance
-    # (how closely the picture is), width, height, area
-    words: Mapping[str, str]
-    # steps, guidance, image_guidance: the values it was made for
-    steps: int
-    guidance: float
-    size: int  # longer side in pixels at which it was made to paint
-    dtype: torch.dtype  # of its weights on a CPU
-    image_guidance: float | None = None
-    always: Mapping[str, object] = field(default_factory=dict)  # further arguments of a call
-    loading: Mapping[str, object] = field(default_factory=dict)  # further arguments of its from_pretrained
-    needs: tuple[str, ...] = ()  # packages that it needs besides the extra's
-
-    def arguments(
-        self, prompt: str, picture: Image.Image, steps: int, guidance: float, image_guidance: float | None
-    ) -> dict[str, object]:
-        """Keyword arguments of a call, all but its `generator`."""
-        ours = {
-            "steps": steps,
-            "guidance": guidance,
-            "image_guidance": image_guidance,
-            "width": picture.width,
-            "height": picture.height,
-            "area": picture.width * picture.height,
-        }
-        theirs = {word: ours[name] for name, word in self.words.items()}
-        return {"prompt": prompt, "image": picture, **theirs, **self.always}
-
-
-ADAPTERS: dict[str, Adapter] = {
-    # ProGDF's own; the result has the picture's size
-    "StableDiffusionInstructPix2PixPipeline": Adapter(
-        model="timbrooks/instruct-pix2pix",
-        words={
-            "steps": "num_inference_steps",
-            "guidance": "guidance_scale",
-            "image_guidance": "image_guidance_scale",
-        },
-        steps=20,
-        guidance=7.5,
-        image_guidance=1.5,
-        size=512,
-        dtype=torch.float32,
-        loading={"safety_checker": None, "requires_safety_checker": False},
-    ),
-    "FluxKontextPipeline": Adapter(
-        model="black-forest-labs/FLUX.1-Kontext-dev",
-        words={**_FLOW, "area": "max_area"},
-        steps=28,
-        guidance=2.5,
-        size=1024,
-        dtype=torch.bfloat16,
-        # it would scale every picture to about a megapixel; ours comes at the size that was asked for
-        always={"_auto_resize": False},
-    ),
-    "Flux2KleinPipeline": Adapter(
-        model="black-forest-labs/FLUX.2-klein-4B",
-        words=_FLOW,
-        steps=4,
-        guidance=1.0,
-        size=1024,
-        dtype=torch.bfloat16,
-    ),
-    "QwenImageEditPlusPipeline": Adapter(
-        model="Qwen/Qwen-Image-Edit-2509",
-        words={**_FLOW, "guidance": "true_cfg_scale"},
-        steps=40,
-        guidance=4.0,
-        size=1024,
-        dtype=torch.bfloat16,
-        always={"negative_prompt": " "},  # without one it has no guidance at all
-        needs=("torchvision",),
-    ),
-}
-"""Class name in diffusers, as a saved pipeline's model_index.json has it → how it is asked."""
-
-DEFAULT_MODEL = ADAPTERS["StableDiffusionInstructPix2PixPipeline"].model
-
-
-_MULTIPLE = 32  # pixels: what every pipeline's autoencoder and patches divide
-
-
-@dataclass(frozen=True)
-class _Request:
-    """One sentence for one model, nothing left open."""
-
-    prompt: str
-    adapter: Adapter
-    steps: int
-    guidance: float
-    image_guidance: float | None
-    size: int
-    seed: int
+_MARGIN = 0.4  # of the region's box: what is added to each of its sides in all
 
 
 @dataclass(frozen=True)
 class InstructEditor:
-    """Edits pictures as a sentence says."""
+    """Edits pictures as a sentence says; a `Painter` too."""
 
-    # the whole picture edited, under a guidance. [H,W,3], guidance -> [H,W,3]
-    paint: Callable[[Tensor, float], Tensor]
-    guidance: float  # of the finished edit
-    recipe: Recipe  # what a picture depends on besides guidance
-    kept: KeptPictures  # where pictures are kept
-    stages: tuple[float, ...] = (1.0,)  # (1,), or empty where graded
+    scene: Gaussians
+    request: Request
+    placement: Placement
+    load: Callable[[], MixedSteps]  # the pipeline, when it is first needed
+    kept: KeptPictures  # where its answers are kept, at their own size
+    stages: tuple[float, ...] = ()
     kind: EditKind = "style"
     is_confined: bool = False
+    _renders: dict[str, Tensor] = field(default_factory=dict, repr=False)
+
+    @property
+    def references(self) -> int:
+        """See `Painter`."""
+        return self.request.adapter.references
+
+    @property
+    def recipe(self) -> Recipe:
+        """What a picture depends on besides its source and strength."""
+        values = {f.name: getattr(self.request, f.name) for f in fields(self.request)}
+        return {"instruct": values.pop("prompt")} | {k: v for k, v in values.items() if k != "adapter"}
+
+    @property
+    def note(self) -> str:
+        """What will paint, where, and what that takes; for the log."""
+        request, unread = self.request, unread_words(self.request)
+        line = f"{request.model} {self.placement.line()}; {self.calls((1.0,))} calls of its network a picture"
+        return f"{line}; it does not read the end of the sentence: “{unread}”" if unread else line
+
+    def calls(self, strengths: Sequence[float]) -> int:
+        """How often its network is asked for one view at these strengths."""
+        request = self.request
+        return request.adapter.passes * sum(network_steps(s, 1.0, request.steps) for s in strengths)
+
+    def frame(self, view: View) -> tuple[Crop, Camera]:
+        """The box of a view that is painted, in its pixels, and the camera that pictures it for the model."""
+        x0, y0, x1, y1 = region_box(view.mask, margin=0)
+        across, down = round(_MARGIN / 2 * (x1 - x0)), round(_MARGIN / 2 * (y1 - y0))
+        camera = view.camera
+        x0, x1 = max(0, x0 - across), min(camera.width, x1 + across)
+        y0, y1 = max(0, y0 - down), min(camera.height, y1 + down)
+        width, height = self.request.adapter.paint_size(x1 - x0, y1 - y0, self.request.size)
+        shift = torch.tensor([[0.0, 0.0, x0], [0.0, 0.0, y0], [0.0, 0.0, 0.0]])
+        box = replace(camera, K=camera.K - shift, width=x1 - x0, height=y1 - y0)
+        return (x0, y0, x1, y1), box.resize(width, height)
+
+    def original(self, view: View) -> Tensor:
+        """The picture of that frame, in 8 bits. [h,w,3]"""
+        name = view.camera.name
+        if name not in self._renders:
+            image = render_view(self.scene, self.frame(view)[1], torch.tensor(BACKGROUND))
+            self._renders[name] = (image.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
+        return self._renders[name].float() / 255.0
 
     def edit(self, view: View, strength: float) -> Tensor:
         """See `ImageEditor.edit`."""
         if strength == 0.0:
             return view.image
-        return self._paint(view, view.image, strength, "" if strength == 1.0 else f"{strength:g}")
-
-    def edit_again(self, view: View, strength: float, current: Tensor | None, step: int) -> Tensor:
-        """See `RepaintingEditor.edit_again`."""
-        return self._paint(view, current, strength, f"step_{step:05d}")
-
-    def _paint(self, view: View, source: Tensor | None, strength: float, place: str) -> Tensor:
-        if self.stages and strength not in self.stages:
-            raise ValueError(f"this editor edits at strengths {list(self.stages)}, not {strength:g}")
-        # guidance 1 is none, and pipelines skip it altogether below
-        guidance = self.guidance if strength == 1.0 else 1.0 + strength * (self.guidance - 1.0)
-        recipe = {**self.recipe, "guidance": guidance}
-        return self.kept.picture(
-            view.camera.name, source, recipe, lambda picture: self.paint(picture, guidance), place
+        painted = self.kept.picture(
+            view.camera.name,
+            self.original(view),
+            {**self.recipe, "strength": strength},
+            lambda picture: self.paint(picture, strength=strength),
+            "" if strength == 1.0 else f"{strength:g}",
         )
+        return self.paste(view, painted)
+
+    def paste(self, view: View, painted: Tensor) -> Tensor:
+        """The view with what was changed in its frame, shrunk by area. [h,w,3] -> [H,W,3]
+
+        The change, not the picture: a render shrunk is some 32 dB off the smaller render that is trained.
+        """
+        x0, y0, x1, y1 = self.frame(view)[0]
+        change = (painted - self.original(view)).permute(2, 0, 1)[None]
+        shrunk = interpolate(change, (y1 - y0, x1 - x0), mode="area")[0].permute(1, 2, 0)
+        edited = view.image.clone()
+        edited[y0:y1, x0:x1] += shrunk
+        return edited.clamp(0.0, 1.0)
+
+    def paint(
+        self,
+        picture: Tensor,
+        references: Sequence[Tensor] = (),
+        *,
+        strength: float = 1.0,
+        softness: float = 1.0,
+        source: Tensor | None = None,
+        seed: int | None = None,
+    ) -> Tensor:
+        """See `Painter.paint`; in 8 bits.
+
+        Raises:
+            ProgdfError: weights are missing or broken, or the card's memory runs out.
+        """
+        if len(references) > self.references:
+            raise ValueError(
+                f"{self.request.model} takes {self.references} references, not {len(references)}"
+            )
+        request = self.request
+        noise = request.seed if seed is None else seed
+        with explain_memory(request, self.placement):
+            painted = self.load().paint(
+                lambda pictures: request.ask(pictures, noise),
+                (picture, *references),
+                picture if source is None else source,
+                strength,
+                softness,
+            )
+        return (painted * 255.0).round() / 255.0
 
 
 def instruct(
     what: str, scene: Gaussians, region: Region, views: Sequence[View], options: EditorOptions
 ) -> InstructEditor:
     """`instruct:"…"`: the model and its options are checked now, its weights are loaded when first needed."""
-    model, kind, request = _resolve_request(what, options)
-    prompt = request.prompt
+    request = resolve_request(what, options)
 
     @cache
-    def pipeline() -> Any:
-        return last_model("pipeline", (model, kind), lambda: load_pipeline(model, kind))
+    def pipeline() -> MixedSteps:
+        # placed anew: what was there before has gone by then
+        def load() -> MixedSteps:
+            return load_pipeline(request, place(request, options.device))
 
-    recipe: Recipe = {
-        "instruct": prompt,
-        "model": model,
-        "pipeline": kind,
-        "image_guidance": request.image_guidance,
-        "steps": request.steps,
-        "size": request.size,
-        "seed": request.seed,
-    }
-    graded = options.graded and request.guidance > 1.0
-    return InstructEditor(
-        lambda picture, guidance: _run_pipeline(pipeline(), request, picture, guidance),
-        request.guidance,
-        recipe,
-        KeptPictures(options.cache),
-        stages=() if graded else (1.0,),
-    )
+        loaded: MixedSteps = last_model("pipeline", (request, options.device), load)
+        return loaded
+
+    placement = place(request, options.device)
+    return InstructEditor(scene, request, placement, pipeline, KeptPictures(options.cache))
 
 
 def check_instruct(what: str, options: EditorOptions) -> None:
@@ -214,28 +182,63 @@ def check_instruct(what: str, options: EditorOptions) -> None:
     Raises:
         ProgdfError: nothing is said, a package or weights are missing or truncated, an option is not known.
     """
-    model, kind, _ = _resolve_request(what, options)
-    try:
-        folder = folder_of_model(model, "model_index.json")
-        parts = json.loads((folder / "model_index.json").read_bytes())
-        for name, made in parts.items():
-            missing = isinstance(made, list) and made[0] and name not in ADAPTERS[kind].loading
-            if missing and not (folder / name).is_dir():
-                raise OSError(f"{folder} has no {name}")
-            if missing and (folder / name / "config.json").is_file():
-                check_weights_here(folder / name)
-    except BROKEN as error:
-        raise _missing(model) from error
+    place(resolve_request(what, options), options.device)
 
 
-def _resolve_request(what: str, options: EditorOptions) -> tuple[str, str, _Request]:
-    """The model, its pipeline's class, and what it will be asked."""
-    prompt = what.strip().strip("\"'").strip()
+def sentence(what: str) -> str:
+    """The instruction without the pair of quotes around it."""
+    words = what.strip()
+    if len(words) > 1 and words[0] == words[-1] and words[0] in "\"'":
+        words = words[1:-1].strip()
+    return words
+
+
+def resolve_request(what: str, options: EditorOptions) -> Request:
+    """The options, with the model's own values where nothing was said.
+
+    Raises:
+        ProgdfError: see `check_instruct`.
+    """
+    prompt = sentence(what)
     if not prompt:
         raise ProgdfError('instruct: needs an instruction; write instruct:"turn him into Batman"')
-    model = options.model or DEFAULT_MODEL
-    kind = pipeline_class(model)
-    return model, kind, _make_request(prompt, model, kind, options)
+    model = options.model or default_model()
+    kind, adapter = adapter_of(model)
+    guidance, image_guidance = parse_guidance(options.guidance)
+    if image_guidance is not None and adapter.image_guidance is None:
+        raise ProgdfError(
+            f"{model} does not support guidance of the picture; give --guidance one number, "
+            f"or use --model {SMALL_MODEL}"
+        )
+    for is_given, option in (
+        (guidance is not None and adapter.guidance is None, "--guidance"),
+        (options.edit_size is not None and adapter.is_fixed, "--edit-size"),
+    ):
+        if is_given:
+            raise ProgdfError(f"{option} does not apply to {model}, which has its own; leave it out")
+    return Request(
+        prompt,
+        model,
+        kind,
+        adapter,
+        steps=adapter.steps if options.edit_steps is None else options.edit_steps,
+        guidance=adapter.guidance if guidance is None else guidance,
+        image_guidance=adapter.image_guidance if image_guidance is None else image_guidance,
+        size=adapter.size if options.edit_size is None else options.edit_size,
+        seed=options.seed,
+        quantize=options.quantize,
+    )
+
+
+def unread_words(request: Request) -> str:
+    """The end of a sentence that is longer than CLIP's 77 tokens, where CLIP is all that reads it."""
+    if not request.adapter.is_stable:
+        return ""
+    from transformers import CLIPTokenizer
+
+    tokenizer = CLIPTokenizer.from_pretrained(pipeline_folder(request.model) / "tokenizer")
+    tokens = tokenizer(request.prompt)["input_ids"]
+    return str(tokenizer.decode(tokens[tokenizer.model_max_length - 1 : -1])).strip()
 
 
 def parse_guidance(text: str) -> tuple[float | None, float | None]:
@@ -255,108 +258,3 @@ def parse_guidance(text: str) -> tuple[float | None, float | None]:
         )
     sentence, picture = (*numbers, None, None)[:2]
     return sentence, picture
-
-
-def pipeline_class(model: str) -> str:
-    """Class of a saved pipeline, by its model_index.json, in a folder or as downloaded from the hub.
-
-    Raises:
-        ProgdfError: diffusers is not installed, the model not on this machine or no editor.
-    """
-    try:
-        from diffusers import DiffusionPipeline
-    except ImportError as error:
-        raise ProgdfError(
-            f"instruct: needs the package diffusers ({error}); pip install progdf-studio[diffusion]"
-        ) from error
-    try:
-        kind = DiffusionPipeline.load_config(model, local_files_only=True)["_class_name"]
-    except BROKEN as error:
-        raise _missing(model) from error
-    if kind not in ADAPTERS:
-        raise ProgdfError(f"{model} is a {kind}, which cannot edit pictures here; use one of {_models()}")
-    for package in ADAPTERS[kind].needs:
-        if find_spec(package) is None:
-            raise ProgdfError(f"{model} needs the package {package}; pip install {package}")
-    return str(kind)
-
-
-def load_pipeline(model: str, kind: str) -> Any:
-    """The pipeline with its weights, from this machine only, on the GPU where torch has one.
-
-    Raises:
-        ProgdfError: weights are missing or broken.
-    """
-    import diffusers
-    from diffusers.utils import logging as diffusers_logging
-    from transformers.utils import logging as transformers_logging
-
-    for speaks in (diffusers_logging, transformers_logging):
-        speaks.set_verbosity(logging.ERROR)
-        speaks.disable_progress_bar()
-    adapter = ADAPTERS[kind]
-    gpu = torch.cuda.is_available()
-    try:
-        pipeline = getattr(diffusers, kind).from_pretrained(
-            model,
-            dtype=torch.bfloat16 if gpu else adapter.dtype,
-            local_files_only=True,
-            use_safetensors=True,  # the other kind of weights can run code
-            **adapter.loading,
-        )
-    except BROKEN as error:
-        raise _missing(model) from error
-    pipeline.set_progress_bar_config(disable=True)
-    return pipeline.to("cuda" if gpu else "cpu")
-
-
-def _run_pipeline(pipeline: Any, request: _Request, view: Tensor, guidance: float) -> Tensor:
-    """One picture through a pipeline, back at its own size. [H,W,3] -> [H,W,3]"""
-    source = to_picture(view)
-    scale = request.size / max(source.size)
-    width, height = (max(_MULTIPLE, round(side * scale / _MULTIPLE) * _MULTIPLE) for side in source.size)
-    picture = source.resize((width, height), Image.Resampling.LANCZOS)
-    arguments = request.adapter.arguments(
-        request.prompt, picture, request.steps, guidance, request.image_guidance
-    )
-    # the same noise in every view: what the picture leaves open is then decided alike
-    noise = torch.Generator().manual_seed(request.seed)
-    edited = pipeline(**arguments, generator=noise).images[0]
-    edited = edited.convert("RGB").resize(source.size, Image.Resampling.LANCZOS)
-    return torch.from_numpy(np.asarray(edited, dtype=np.float32) / 255.0)
-
-
-def _make_request(prompt: str, model: str, kind: str, options: EditorOptions) -> _Request:
-    """The options, with the model's own values where nothing was said."""
-    adapter = ADAPTERS[kind]
-    guidance, image_guidance = parse_guidance(options.guidance)
-    if image_guidance is not None and "image_guidance" not in adapter.words:
-        raise ProgdfError(
-            f"{model} does not support guidance of the picture; give --guidance one number, "
-            f"or use --model {DEFAULT_MODEL}"
-        )
-    return _Request(
-        prompt,
-        adapter,
-        steps=adapter.steps if options.edit_steps is None else options.edit_steps,
-        guidance=adapter.guidance if guidance is None else guidance,
-        image_guidance=adapter.image_guidance if image_guidance is None else image_guidance,
-        size=adapter.size if options.edit_size is None else options.edit_size,
-        seed=options.seed,
-    )
-
-
-def _missing(model: str) -> ProgdfError:
-    if model.startswith((".", "/", "~")) or Path(model).is_dir():
-        return ProgdfError(
-            f"{model} does not hold a complete diffusers pipeline with safetensors weights; "
-            f"give --model such a folder, or one of {_models()}"
-        )
-    return ProgdfError(
-        f"the weights of {model} are not on this machine or are incomplete; download them with "
-        f"'hf download {model}', or give --model the folder of a saved pipeline"
-    )
-
-
-def _models() -> str:
-    return ", ".join(adapter.model for adapter in ADAPTERS.values())

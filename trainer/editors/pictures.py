@@ -316,7 +316,7 @@ class FolderEditor:
     originals: Path | None = None
 
     @property
-    def warning(self) -> str | None:
+    def note(self) -> str | None:
         """What the person should know before training, if anything."""
         if not self.bent or self.originals is not None:
             return None

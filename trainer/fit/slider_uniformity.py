@@ -40,6 +40,7 @@ STEPS = 20
 """Equal steps that a user makes over the whole slider."""
 
 _ASKED_VIEWS, _FIELD_VIEWS = 3, 6
+_COSTLY_STEPS = 8  # of the anchor view, where each picture costs a model's work
 _FINE = 2  # a step may begin at so many places per step
 _PASSES = 3
 _LOOKS = 2  # how often all places are looked at
@@ -55,8 +56,9 @@ def equalized_strengths(
 ) -> tuple[float, ...]:
     """Strengths at which the editor's own pictures are as far along as `plain` says, the last 1.
 
-    Three decimals each, as they name folders. `plain` itself where the editor has strengths of its own, where
-    each picture costs a model's work, or where the whole change is one jump.
+    Three decimals each, as they name folders. `plain` itself where the editor has strengths of its own,
+    or where the whole change is one jump. Where each picture costs a model's work, one view is looked at in
+    eight steps.
 
     Args:
         editor: see `ImageEditor`
@@ -66,15 +68,19 @@ def equalized_strengths(
         missed: share of the change (mean square) that straight lines between the pictures may miss, less
             where less of it is there; with it shares are halves, quarters …, as many as that takes
     """
-    if editor.stages or len(plain) == 1 or check_editor(spec)[0] in COSTLY_STRENGTHS:
+    if editor.stages or len(plain) == 1:
         return plain
-    few = views[:: max(1, len(views) // _ASKED_VIEWS)][:_ASKED_VIEWS]
+    costly = check_editor(spec)[0] in COSTLY_STRENGTHS
+    few = views[:1] if costly else views[:: max(1, len(views) // _ASKED_VIEWS)][:_ASKED_VIEWS]
     courses = [edit_course(editor, view) for view in few]
 
     def picture_at(s: float) -> Tensor:
-        return torch.cat([picture_at(s).flatten() for picture_at in courses])
+        pictures = [picture_at(s) for picture_at in courses]
+        if not editor.is_confined:  # what changes beside the region is put back
+            pictures = [view.confine(picture) for view, picture in zip(few, pictures, strict=True)]
+        return torch.cat([picture.flatten() for picture in pictures])
 
-    even = torch.linspace(0, 1, STEPS + 1, dtype=torch.float64)
+    even = torch.linspace(0, 1, (_COSTLY_STEPS if costly else STEPS) + 1, dtype=torch.float64)
     pictures = [picture_at(float(s)) for s in even]
     steps = [float((b - a).abs().mean()) for a, b in pairwise(pictures)]
     if max(steps) > _JUMP * sum(steps):

@@ -17,7 +17,7 @@ from torch import Tensor
 from progdf.errors import ProgdfError
 from progdf.io.images import to_picture
 from trainer.options import DETECTOR, SAM_MODEL, RegionOptions
-from trainer.store.pretrained import BROKEN, check_weights_here, folder_of_model
+from trainer.store.pretrained import BROKEN, folder_of_model, model_device, weights_here
 
 
 class Segmenter(Protocol):
@@ -49,16 +49,19 @@ class GroundedSam:
         inputs = self.sam_processor(images=picture, input_boxes=[boxes.tolist()], return_tensors="pt")
         with torch.no_grad():
             outlines = self.sam_model(
-                pixel_values=inputs["pixel_values"], input_boxes=inputs["input_boxes"], multimask_output=False
+                pixel_values=inputs["pixel_values"].to(self.sam_model.device),
+                input_boxes=inputs["input_boxes"].to(self.sam_model.device, torch.float32),
+                multimask_output=False,
             )
         masks: Tensor = self.sam_processor.post_process_masks(
-            outlines.pred_masks, inputs["original_sizes"], inputs["reshaped_input_sizes"]
+            outlines.pred_masks.cpu(), inputs["original_sizes"], inputs["reshaped_input_sizes"]
         )[0]
         return masks.bool().flatten(0, 1).any(dim=0)
 
     def boxes(self, picture: Any, prompt: str) -> Tensor:
         """x0, y0, x1, y1 in pixels of all that is found in a PIL image. [B,4]"""
         inputs = self.detector_processor(images=picture, text=normalize_prompt(prompt), return_tensors="pt")
+        inputs = inputs.to(self.detector.device)
         with torch.no_grad():
             answer = self.detector(**inputs)
         detections = self.detector_processor.post_process_grounded_object_detection(
@@ -68,7 +71,7 @@ class GroundedSam:
             text_threshold=self.box_threshold,
             target_sizes=[(picture.height, picture.width)],
         )[0]
-        boxes: Tensor = detections["boxes"].float()
+        boxes: Tensor = detections["boxes"].float().cpu()
         return boxes
 
 
@@ -102,8 +105,9 @@ def grounded_sam(options: RegionOptions) -> GroundedSam:
     def load(model: str, kind: str, option: str, usual: str, network: Any, processor: Any) -> tuple[Any, Any]:
         try:
             _check_kind(AutoConfig.from_pretrained(model, local_files_only=True), model, kind, option, usual)
+            loaded = network.from_pretrained(model, local_files_only=True, use_safetensors=True)
             return (
-                network.from_pretrained(model, local_files_only=True, use_safetensors=True).float().eval(),
+                loaded.float().eval().to(model_device()),
                 processor.from_pretrained(model, local_files_only=True),
             )
         except ProgdfError:
@@ -139,7 +143,7 @@ def check_grounded_sam(options: RegionOptions) -> None:
     ):
         try:
             _check_kind(AutoConfig.from_pretrained(model, local_files_only=True), model, kind, option, usual)
-            check_weights_here(folder_of_model(model, "config.json"))
+            weights_here(folder_of_model(model, "config.json"))
         except BROKEN as error:
             raise ProgdfError(_missing(model, option)) from error
 

@@ -33,6 +33,7 @@ from trainer.editors import (
     make_editor,
 )
 from trainer.editors.base import ImageEditor
+from trainer.editors.instruct import InstructEditor
 from trainer.editors.pictures import FolderEditor, picture_cameras
 from trainer.fit.draft import draft_grade, draft_views
 from trainer.fit.fit import choose_path, drop_idle_attributes
@@ -99,7 +100,8 @@ def check_command(options: TrainOptions) -> None:
         picture_cameras(views.pictures, cameras, ZERO)
     if not options.resume or load_region(options.out) is None:
         check_region(options.region.region, region_checks(region_request(options, quiet=True)))
-    if not folder.root.is_dir() or not any(folder.root.iterdir()):
+    is_new = not folder.root.is_dir() or not any(folder.root.iterdir())
+    if is_new or (options.editor.family in COSTLY_STRENGTHS and not options.resume):
         check_new_editor(replace(options.editor, cache=folder.paintings))
 
 
@@ -379,7 +381,10 @@ def _edit_views(
         new, is_confined = [s for s in strengths if s not in made], confines_edit(editor(), approach.kind)
         with log.steps("edit", len(views) * len(new)) as advance:
             made.update(edit_views(editor(), views, new, folder, is_confined, advance))
-        log.say(f"{spec}: a {approach.kind} edit at strength {', '.join(f'{s:g}' for s in strengths)}")
+        line = f"{spec}: a {approach.kind} edit at strength {', '.join(f'{s:g}' for s in strengths)}"
+        if isinstance(painter := editor(), InstructEditor):
+            line += f"; {len(views) * painter.calls(strengths)} calls of its network"
+        log.say(line)
         saved = {"strengths": list(strengths), "kind": approach.kind, "group_steps": approach.group_steps}
         folder.state.save("edited", {}, saved | {"trial": trial})
         return {s: made[s] for s in strengths}
@@ -405,8 +410,8 @@ def _edit_views(
             made.clear()
             log.say(f"the views are edited again: {str(error).partition(';')[0]}")
     painter = editor()
-    if isinstance(painter, FolderEditor) and painter.warning is not None:
-        log.say(painter.warning)
+    if isinstance(painter, FolderEditor | InstructEditor) and painter.note is not None:
+        log.say(painter.note)
     approach, trial = choose_approach(options, setup, editor(), log)
     optimization = resolve_kind(options, approach.kind, approach.group_steps)
     strengths = editor_strengths(editor(), optimization.stages)
@@ -524,8 +529,10 @@ def _choose_path(
     log: RunLog,
 ) -> tuple[Trajectory, str]:
     """The way to the only target there was, and why."""
-    editor = None  # of pictures made elsewhere: their folder may be gone by now, and there is no half
-    if options.editor.family not in EXTERNAL:
+    # of pictures made elsewhere the folder may be gone by now, and there is no half; a model was asked for
+    # the end alone
+    editor = None
+    if options.editor.family not in (*EXTERNAL, *COSTLY_STRENGTHS):
         editor = make_editor(
             replace(options.editor, cache=folder.paintings), setup.scene, setup.region, setup.views
         )

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import gc
 import json
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import torch
 from safetensors import SafetensorError, safe_open
 
 BROKEN = (OSError, ValueError, RuntimeError, KeyError, TypeError, SafetensorError)
@@ -51,8 +54,8 @@ def folder_of_model(model: str, file: str) -> Path:
     return Path(cached).parent
 
 
-def check_weights_here(folder: Path) -> None:
-    """Read the heads of a network's weights.
+def weights_here(folder: Path) -> int:
+    """How many numbers a network's weights hold, by the heads of its files.
 
     Raises:
         one of `BROKEN`: there are none, one of several files is missing, or one is truncated.
@@ -62,6 +65,22 @@ def check_weights_here(folder: Path) -> None:
         files |= {folder / name for name in json.loads(index.read_bytes())["weight_map"].values()}
     if not files:
         raise OSError(f"{folder} holds no weights")
+    count = 0
     for file in files:
-        with safe_open(file, framework="pt"):
-            pass
+        with safe_open(file, framework="pt") as weights:
+            count += sum(math.prod(weights.get_slice(name).get_shape()) for name in weights.keys())  # noqa: SIM118
+    return count
+
+
+def gpu_memory() -> tuple[int, int] | None:
+    """Free and total bytes of the graphics card that torch uses; None where there is none."""
+    if not torch.cuda.is_available():
+        return None
+    gc.collect()  # what a network before left is free too
+    torch.cuda.empty_cache()
+    return torch.cuda.mem_get_info()
+
+
+def model_device(choice: str = "auto") -> str:
+    """Where pretrained networks run: "cuda" where torch has a graphics card, unless "cpu" is asked for."""
+    return "cuda" if choice == "auto" and torch.cuda.is_available() else "cpu"

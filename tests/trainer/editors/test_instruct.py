@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import inspect
 import json
+import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,11 +15,22 @@ import torch
 from PIL import Image
 
 from progdf.errors import ProgdfError
-from tests.helpers.tiny_pipelines import tiny_flux2_klein, tiny_flux_kontext, tiny_instruct_pix2pix
+from progdf.gdf.file import load_gdf
+from tests.helpers.tiny_pipelines import (
+    klein_pipeline,
+    tiny_flux2_klein,
+    tiny_flux_kontext,
+    tiny_instruct_pix2pix,
+)
 from tests.helpers.trained import quick_options, small, train, write_bear
 from trainer.editors import make_editor
-from trainer.editors.instruct import ADAPTERS, InstructEditor
-from trainer.options import EditorOptions
+from trainer.editors.adapters import ADAPTERS, Adapter, default_model, load_pipeline, missing_weights
+from trainer.editors.instruct import InstructEditor, sentence
+from trainer.editors.mixed_steps import MixedSteps, network_steps
+from trainer.options import EditorOptions, TrainOptions, with_values
+from trainer.resolve import resolve, resolve_kind
+from trainer.run.run import check_command
+from trainer.store.run_folder import RunFolder, begin_log
 
 BATMAN = 'instruct:"turn him into Batman"'
 
@@ -87,15 +99,14 @@ def test_the_sentence_reaches_the_pipeline_without_its_quotes(pix2pix: str) -> N
     assert not torch.equal(quoted, other)
 
 
-def test_one_target_by_default_and_strengths_by_guidance_on_request(pix2pix: str) -> None:
+def test_any_strength_can_be_asked_for_and_the_change_grows_with_it(pix2pix: str) -> None:
     view = small().views[0]
-    assert editor_of(settings_of(pix2pix)).stages == (1.0,)
-    with pytest.raises(ValueError, match=r"not 0\.5"):
-        editor_of(settings_of(pix2pix)).edit(view, 0.5)
-    graded = editor_of(settings_of(pix2pix, graded=True))
-    assert graded.stages == ()
-    half = editor_of(settings_of(pix2pix, guidance="4.25")).edit(view, 1.0)  # half way from 1 to 7.5
-    assert torch.equal(graded.edit(view, 0.5), half)
+    editor = editor_of(settings_of(pix2pix, edit_steps=4))
+    assert editor.stages == ()
+    shares = [float((editor.edit(view, s) - view.image).norm()) for s in (0.25, 0.5, 0.75, 1.0)]
+    assert shares == sorted(shares)
+    assert shares[0] > 0
+    assert editor.calls((0.25, 0.5, 0.75, 1.0)) == 1 + 3 + 4 + 4
 
 
 def test_a_view_is_edited_once_for_all_runs(pix2pix: str, tmp_path: Path) -> None:
@@ -104,26 +115,69 @@ def test_a_view_is_edited_once_for_all_runs(pix2pix: str, tmp_path: Path) -> Non
     first = editor_of(settings).edit(view, 1.0)
     note = json.loads((tmp_path / f"{view.camera.name}.json").read_text())
     assert note["editor"]["instruct"] == "turn him into Batman"
-    again = editor_of(settings)
 
-    def fails(picture: torch.Tensor, guidance: float) -> torch.Tensor:
+    def fails() -> MixedSteps:
         raise AssertionError("it was kept")
 
-    assert torch.equal(replace(again, paint=fails).edit(view, 1.0), first)
-    with pytest.raises(AssertionError, match="kept"):
-        replace(editor_of(replace(settings, seed=1)), paint=fails).edit(view, 1.0)
+    assert torch.equal(replace(editor_of(settings), load=fails).edit(view, 1.0), first)
+    for other in (editor_of(replace(settings, seed=1)), editor_of(settings)):
+        with pytest.raises(AssertionError, match="kept"):
+            replace(other, load=fails).edit(view, 0.5)
+
+
+def test_a_model_gets_the_region_with_a_margin_at_its_own_size_and_its_answer_is_kept(
+    pix2pix: str, tmp_path: Path
+) -> None:
+    view = small(image_size=200).views[0]
+    editor = editor_of(settings_of(pix2pix, edit_size=128, cache=tmp_path))
+    (x0, y0, x1, y1), camera = editor.frame(view)
+    shown = (view.mask > 0.5).nonzero()
+    inside = (shown[:, 0] >= y0) & (shown[:, 0] < y1) & (shown[:, 1] >= x0) & (shown[:, 1] < x1)
+    assert bool(inside.all())
+    assert (x1 - x0) * (y1 - y0) < 0.8 * 200 * 200
+    assert camera.width % 32 == camera.height % 32 == 0
+    assert 0.7 * 128**2 < camera.width * camera.height <= 128**2
+    middle = torch.tensor([[x0 + x1, y0 + y1]]) / 2  # of the box, in the view: of the frame, in the frame
+    rays = (middle - view.camera.K[:2, 2]) / view.camera.K.diagonal()[:2]
+    framed = rays * camera.K.diagonal()[:2] + camera.K[:2, 2]
+    assert torch.allclose(framed, torch.tensor([[camera.width, camera.height]]) / 2, atol=1e-3)
+    edited = editor.edit(view, 1.0)
+    native = tmp_path / f"{view.camera.name}.png"
+    assert Image.open(native).size == (camera.width, camera.height)
+    outside = torch.ones(200, 200, dtype=torch.bool)
+    outside[y0:y1, x0:x1] = False
+    assert torch.equal(edited[outside], view.image[outside])
+
+
+def test_what_a_model_leaves_alone_stays_to_the_bit(pix2pix: str) -> None:
+    view = small(image_size=200).views[0]
+    editor = editor_of(settings_of(pix2pix, edit_size=128))
+    assert torch.equal(editor.paste(view, editor.original(view)), view.image)
+
+
+def test_a_kept_model_is_loaded_again_where_its_sentence_would_be_encoded_otherwise(
+    pix2pix: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("trainer.store.pretrained._models", {})
+    view = small().views[0]
+    with_guidance, without, again = (
+        editor_of(settings_of(pix2pix, guidance=guidance)).edit(view, 1.0) for guidance in ("7.5", "1", "7.5")
+    )
+    assert not torch.equal(with_guidance, without)
+    assert torch.equal(with_guidance, again)
 
 
 @pytest.mark.parametrize("name", ADAPTERS)
-def test_the_table_s_words_are_keywords_of_the_pipelines(diffusers: None, name: str) -> None:
+def test_what_pipelines_are_asked_is_among_their_keywords(diffusers: None, name: str) -> None:
     import diffusers as library
 
     adapter = ADAPTERS[name]
-    picture = Image.new("RGB", (64, 32))
-    asked = adapter.arguments("x", picture, adapter.steps, adapter.guidance, adapter.image_guidance)
     known = inspect.signature(getattr(library, name).__call__).parameters
-    assert set(asked) | {"generator"} <= set(known)
-    assert None not in asked.values()
+    picture = Image.new("RGB", (64, 32))
+    asked = adapter.arguments(known, "x", [picture], 3, adapter.guidance, adapter.image_guidance)
+    assert set(asked) | {"generator", "output_type"} <= set(known)
+    assert {"prompt", "image", "num_inference_steps"} <= set(asked)
+    assert (adapter.guidance is None) == (adapter.guidance_word not in asked)
 
 
 @pytest.mark.parametrize("model", ["timbrooks/instruct-pix2pix", "someone/no-such-model"])
@@ -131,7 +185,7 @@ def test_missing_weights_are_one_line_that_names_what_to_download(
     diffusers: None, model: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
-    with pytest.raises(ProgdfError, match=f"hf download {model}") as told:
+    with pytest.raises(ProgdfError, match=f"hf download {model} --include") as told:
         editor_of(EditorOptions(BATMAN, model))
     assert "\n" not in str(told.value)
 
@@ -175,25 +229,297 @@ def test_without_the_packages_one_line_names_the_extra(monkeypatch: pytest.Monke
         editor_of(EditorOptions(""))
 
 
-def test_a_run_is_trained_on_what_a_pipeline_makes_of_its_views(pix2pix: str, tmp_path: Path) -> None:
-    write_bear(tmp_path, 900)
-    options = quick_options(
-        tmp_path,
+def text_run(folder: Path, model: str, out: str, **more: object) -> TrainOptions:
+    return quick_options(
+        folder,
+        out,
         editor=BATMAN,
-        model=pix2pix,
-        edit_steps=1,
+        model=model,
+        edit_steps=2,
         edit_size=64,
-        steps=24,
-        stages=1,
+        steps=40,
+        stages=0,
         views=5,
         image_size=64,
+        kind="style",
+        **more,
     )
-    result = train(options, quiet=True)
+
+
+def test_a_text_edit_is_trained_in_stages_and_stopped_anywhere_comes_to_the_same_bits(
+    pix2pix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_bear(tmp_path, 900)
+    result = train(text_run(tmp_path, pix2pix, "run"), quiet=True)
     painted = result.folder.root / "views" / "painted"
     assert len(list(painted.glob("*.png"))) == len(list(painted.glob("*.json"))) == 5
-    assert result.report["trajectory"]["stages"] == [1.0]
-    assert "the edited views" in result.folder.log.read_text(encoding="utf-8")
+    assert len(result.report["trajectory"]["stages"]) == 4
+    log = result.folder.log.read_text(encoding="utf-8")
+    assert "calls of its network a picture" in log
+    strengths = sorted({float(path.parent.name) for path in painted.glob("*/*.png")})
+    taken = [s for s in strengths if len(list((painted / f"{s:g}").glob("*.png"))) == 5]
+    assert re.search(
+        rf"a style edit at strength .*, 1; {5 * (2 + calls_at(taken))} calls of its network", log
+    )
     assert set(result.report["agreement"]) == {"psnr_best", "unexplained", "agree"}
-    for path in painted.glob("*.png"):
-        original = Image.open(result.folder.view("original", path.stem))
-        assert Image.open(path).size == original.size
+
+    paint, count = MixedSteps.paint, iter(range(1000))
+
+    def stops(self: MixedSteps, *args: object) -> torch.Tensor:
+        if next(count) == 9:
+            raise KeyboardInterrupt
+        return paint(self, *args)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(MixedSteps, "paint", stops)
+    with pytest.raises(KeyboardInterrupt, match="--resume"):
+        train(text_run(tmp_path, pix2pix, "stopped", name="run"), quiet=True)
+    resumed = train(text_run(tmp_path, pix2pix, "stopped", name="run", resume=True), quiet=True)
+    pictures = len(list(painted.rglob("*.png")))
+    assert next(count) == pictures + 1, "what was painted before is not painted again"
+    whole, again = (load_gdf(r.folder.gdf("run")).field for r in (result, resumed))
+    assert all(torch.equal(whole.offsets(s), again.offsets(s)) for s in (0.25, 0.5, 1.0))
+
+
+def calls_at(strengths: Sequence[float]) -> int:
+    return sum(network_steps(s, 1.0, 2) for s in strengths)
+
+
+def test_weights_are_looked_for_before_a_used_folder_is_trained_in_again(
+    pix2pix: str, tmp_path: Path
+) -> None:
+    write_bear(tmp_path, 900)
+    (tmp_path / "run" / "views").mkdir(parents=True)
+    begin_log(RunFolder(tmp_path / "run"), text_run(tmp_path, "gone", "run").edit)
+    with pytest.raises(ProgdfError, match="the weights of gone are not on this machine"):
+        check_command(resolve(text_run(tmp_path, "gone", "run")))
+
+
+def test_where_things_move_the_end_alone_is_asked(pix2pix: str, tmp_path: Path) -> None:
+    options = resolve(text_run(tmp_path, pix2pix, "run"))
+    assert [resolve_kind(options, kind, 0).stages for kind in ("color", "style", "geometry")] == [4, 4, 1]
+    several = replace(options, optimize=replace(options.optimize, stages=3))
+    assert resolve_kind(several, "geometry", 0).stages == 3
+
+
+def test_views_of_text_edits_have_512_pixels_unless_others_are_asked_for(tmp_path: Path) -> None:
+    assert resolve(with_values(text_run(tmp_path, "m", "run"), image_size=0)).views.image_size == 512
+    assert resolve(text_run(tmp_path, "m", "run")).views.image_size == 64
+    assert resolve(quick_options(tmp_path, image_size=0)).views.image_size == 0
+
+
+@pytest.mark.parametrize("option", [{"quantize": "nf4"}, {"device": "cpu"}])
+def test_options_of_models_are_for_text_edits_alone(option: dict[str, object], tmp_path: Path) -> None:
+    with pytest.raises(ProgdfError, match="does not apply to recolor; it is for instruct"):
+        resolve(quick_options(tmp_path, **option))
+
+
+def test_parts_that_go_to_the_card_in_turn_paint_the_same_picture(
+    pix2pix: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from diffusers import AutoencoderKL
+
+    tiled = []
+    # a tiny autoencoder's tiles would be of 32 pixels
+    monkeypatch.setattr(AutoencoderKL, "enable_tiling", lambda self: tiled.append(self))
+    editor, view = editor_of(settings_of(pix2pix)), small().views[0]
+    mixed = load_pipeline(editor.request, replace(editor.placement, in_turn=True))
+    in_turn = replace(editor, load=lambda: mixed)
+    for strength in (0.5, 1.0, 0.5):
+        assert torch.equal(in_turn.edit(view, strength), editor.edit(view, strength))
+    assert len(tiled) == 1
+    assert mixed.calls == 2 * calls_at((0.5,)) + 2
+
+
+def test_four_bits_need_their_package_and_a_card(pix2pix: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("trainer.editors.adapters.find_spec", lambda package: package)
+    with pytest.raises(ProgdfError, match="needs a graphics card"):
+        editor_of(settings_of(pix2pix, quantize="nf4"))
+    monkeypatch.setattr("trainer.editors.adapters.find_spec", lambda package: None)
+    with pytest.raises(ProgdfError, match=r"pip install progdf-studio\[quantize\]"):
+        editor_of(settings_of(pix2pix, quantize="nf4"))
+
+
+@pytest.mark.parametrize(
+    ("typed", "read"),
+    [
+        ("like the boys'", "like the boys'"),
+        ("'like the boys'", "like the boys"),
+        ("\"he says 'no'\"", "he says 'no'"),
+        ('"', '"'),
+        ("'twas night", "'twas night"),
+    ],
+)
+def test_only_a_pair_of_quotes_around_a_sentence_is_taken_off(typed: str, read: str) -> None:
+    assert sentence(typed) == read
+
+
+def test_what_clip_does_not_read_of_a_long_sentence_is_said(pix2pix: str) -> None:
+    assert "does not read" not in editor_of(settings_of(pix2pix)).note
+    words = " ".join(["very"] * 90 + ["batman"])
+    note = editor_of(settings_of(pix2pix), f"instruct:{words}").note
+    assert "it does not read the end of the sentence: “" in note
+    assert note.endswith("batman”")
+
+
+def test_a_base_model_of_klein_s_is_asked_as_such(diffusers: None, tmp_path: Path) -> None:
+    model = str(tmp_path / "base")
+    klein_pipeline(tmp_path, is_distilled=False).save_pretrained(model)
+    base = editor_of(EditorOptions(BATMAN, model, edit_size=64)).request
+    assert (base.steps, base.guidance, base.adapter.passes) == (50, 4.0, 2)
+    editor = editor_of(EditorOptions(BATMAN, model, edit_size=64, edit_steps=2))
+    assert editor.calls((1.0,)) == 4
+    assert editor.edit(small().views[0], 1.0).shape == small().views[0].image.shape
+
+
+GIB = 2**30
+
+
+@pytest.fixture
+def card(monkeypatch: pytest.MonkeyPatch) -> Callable[[float, float], None]:
+    """A graphics card that has so many bytes free, for all that only asks."""
+
+    def has(free: float, total: float) -> None:
+        monkeypatch.setattr("trainer.editors.adapters.gpu_memory", lambda: (int(free), int(total)))
+        monkeypatch.setattr(
+            "trainer.editors.adapters.model_device", lambda choice: "cpu" if choice == "cpu" else "cuda"
+        )
+        monkeypatch.setattr(
+            torch.cuda, "is_bf16_supported", lambda including_emulation=True: including_emulation
+        )
+
+    return has
+
+
+def test_the_log_says_what_will_paint_on_what_and_whether_it_fits(
+    pix2pix: str, card: Callable[[float, float], None]
+) -> None:
+    assert "on the CPU in float32" in editor_of(settings_of(pix2pix)).note
+    card(8 * GIB, 8 * GIB)
+    assert (
+        "on cuda in float16, all of it there: about 1.0 GB needed, 8.6 GB free; 2 calls"
+        in editor_of(settings_of(pix2pix)).note
+    )
+    card(GIB / 2, 8 * GIB)
+    tight = editor_of(settings_of(pix2pix))
+    assert tight.placement.in_turn
+    assert "its parts there in turn: about 1.0 GB needed, 0.5 GB free" in tight.note
+    assert editor_of(settings_of(pix2pix, device="cpu")).placement.device == "cpu"
+
+
+def test_a_card_without_bfloat16_gets_float16(
+    diffusers: None, tmp_path: Path, card: Callable[[float, float], None]
+) -> None:
+    card(8 * GIB, 8 * GIB)
+    assert editor_of(settings_of(str(tiny_flux2_klein(tmp_path)))).placement.dtype == torch.float16
+
+
+def test_klein_is_the_default_where_it_is_here_and_fits(
+    monkeypatch: pytest.MonkeyPatch, card: Callable[[float, float], None]
+) -> None:
+    small_one = "timbrooks/instruct-pix2pix"
+    sizes = {"transformer": 3_880_000_000, "text_encoder": 4_020_000_000, "vae": 80_000_000}
+    assert default_model() == small_one  # no card
+    card(1 * GIB, 12 * GIB)
+    monkeypatch.setattr("trainer.editors.adapters.component_sizes", lambda model, adapter: sizes)
+    assert default_model() == "black-forest-labs/FLUX.2-klein-4B"
+    card(8 * GIB, 8 * GIB)
+    assert default_model() == small_one
+
+    def absent(model: str, adapter: Adapter) -> dict[str, int]:
+        raise missing_weights(model)
+
+    card(80 * GIB, 80 * GIB)
+    monkeypatch.setattr("trainer.editors.adapters.component_sizes", absent)
+    assert default_model() == small_one
+
+
+def test_a_large_model_on_a_cpu_is_refused_unless_it_is_asked_for(
+    pix2pix: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("trainer.editors.adapters._LARGE", 1000)
+    with pytest.raises(ProgdfError, match=r"no graphics card here .* or add --device cpu"):
+        editor_of(settings_of(pix2pix))
+    assert editor_of(settings_of(pix2pix, device="cpu")).note
+
+
+@pytest.mark.parametrize("when", ["loading", "painting"])
+def test_a_card_whose_memory_runs_out_is_one_line_with_what_to_try(
+    pix2pix: str, when: str, monkeypatch: pytest.MonkeyPatch, card: Callable[[float, float], None]
+) -> None:
+    from diffusers import StableDiffusionInstructPix2PixPipeline as Pipeline
+
+    card(GIB / 2, 8 * GIB)
+    editor = editor_of(settings_of(pix2pix))
+
+    def runs_out(*_: object, **__: object) -> None:
+        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 9.00 GiB")
+
+    if when == "loading":
+        monkeypatch.setattr(Pipeline, "from_pretrained", runs_out)
+    else:
+        monkeypatch.setattr(MixedSteps, "paint", runs_out)
+        editor = replace(editor, load=lambda: MixedSteps.__new__(MixedSteps))
+    with pytest.raises(
+        ProgdfError, match=r"about 1\.0 GB needed, 0\.5 GB free; add --quantize nf4, .*klein-4B"
+    ) as told:
+        editor.edit(small().views[0], 1.0)
+    assert "\n" not in str(told.value)
+
+
+def test_a_gated_model_is_told_with_its_login(
+    diffusers: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
+    with pytest.raises(
+        ProgdfError, match=r"--include model_index\.json' after accepting its license .* 'hf auth login'"
+    ):
+        editor_of(EditorOptions(BATMAN, "black-forest-labs/FLUX.1-Kontext-dev"))
+
+
+@pytest.mark.parametrize(
+    ("kind", "option", "line"),
+    [
+        ("Flux2KleinKVPipeline", {"guidance": "4"}, "--guidance does not apply"),
+        ("QwenImageEditPlusPipeline", {"edit_size": 512}, "--edit-size does not apply"),
+        ("QwenImageEditPlusPipeline", {}, "constraints.txt 'progdf-studio.qwen.'"),
+    ],
+)
+def test_what_a_model_does_not_take_is_one_line(
+    diffusers: None,
+    kind: str,
+    option: dict[str, object],
+    line: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    (tmp_path / "model_index.json").write_text(
+        json.dumps({"_class_name": kind, "_diffusers_version": "0.42.1"})
+    )
+    monkeypatch.setattr("trainer.editors.adapters.find_spec", lambda package: package if option else None)
+    with pytest.raises(ProgdfError, match=line):
+        editor_of(EditorOptions(BATMAN, str(tmp_path), **option))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("name", ADAPTERS)
+@pytest.mark.parametrize("shape", [(1, 1), (16, 9), (9, 1), (3, 4), (1, 30)])
+def test_pictures_are_painted_at_the_model_s_area_in_sizes_that_it_takes(
+    name: str, shape: tuple[int, int]
+) -> None:
+    adapter = ADAPTERS[name]
+    for size in (adapter.size, 64, 32):
+        width, height = adapter.paint_size(*shape, size)
+        assert width % 32 == height % 32 == 0
+        assert min(width, height) >= 64
+        if size == adapter.size and max(shape) < 20:
+            assert 0.85 * size * size < width * height <= (1.1 if adapter.is_fixed else 1.0) * size * size
+            assert abs(width / height / (shape[0] / shape[1]) - 1) < 0.15
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (16, 9), (9, 1), (3, 4), (700, 333)])
+def test_models_that_scale_to_an_area_of_their_own_leave_our_sizes_as_they_are(
+    diffusers: None, shape: tuple[int, int]
+) -> None:
+    from diffusers.pipelines.qwenimage.pipeline_qwenimage_edit_plus import calculate_dimensions
+
+    width, height = ADAPTERS["QwenImageEditPlusPipeline"].paint_size(*shape, 1024)
+    assert calculate_dimensions(1024 * 1024, width / height) == (width, height)

@@ -56,6 +56,13 @@ def test_an_editor_is_asked_for_pictures_that_are_evenly_far_from_each_other() -
     assert float(steps.min() / steps.max()) > 0.95
 
 
+def test_a_model_that_takes_its_time_is_asked_nine_strengths_of_one_view() -> None:
+    views, editor = small(count=4).views, Late()
+    asked = equalized_strengths(editor, "instruct:make him smile", views, QUARTERS)
+    assert asked == pytest.approx([0.25 ** (1 / 3), 0.5 ** (1 / 3), 0.75 ** (1 / 3), 1.0], abs=0.02)
+    assert editor.asked == 9
+
+
 def test_strengths_name_folders_and_so_have_three_decimals() -> None:
     asked = equalized_strengths(Late(), "darken:0.5", small(count=4).views, QUARTERS)
     assert all(float(f"{s:g}") == s and s == round(s, 3) for s in asked)
@@ -66,11 +73,10 @@ def test_strengths_name_folders_and_so_have_three_decimals() -> None:
     ("editor", "spec", "plain"),
     [
         (Late(stages=QUARTERS), "folder:somewhere", QUARTERS),
-        (Late(), "instruct:make him smile", QUARTERS),
         (Late(), "darken:0.5", (1.0,)),
     ],
 )
-def test_given_strengths_costly_models_and_single_targets_are_not_asked_around(
+def test_given_strengths_and_single_targets_are_not_asked_around(
     editor: Late, spec: str, plain: tuple[float, ...]
 ) -> None:
     assert equalized_strengths(editor, spec, small(count=4).views, plain) == plain

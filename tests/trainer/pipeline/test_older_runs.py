@@ -87,7 +87,7 @@ def earlier_plan(printed: bool = False) -> dict[str, Any]:
 def test_a_plan_of_an_earlier_version_is_read_with_all_its_values(printed: bool) -> None:
     plan = convert_json(upgrade_plan(earlier_plan(printed)), TrainOptions)
     assert (plan.name, plan.region.region, plan.region.box_threshold) == ("blue", "all", 0.4)
-    assert (plan.editor.guidance, plan.editor.reedit_every, plan.editor.graded) == ("7.5,1.25", 9, True)
+    assert (plan.editor.guidance, plan.editor.reedit_every) == ("7.5,1.25", 9)
     assert (plan.views.views, plan.views.image_size, plan.views.pictures) == (0, 64, (Path("A.png"),))
     assert (plan.optimize.kind, plan.optimize.steps, plan.optimize.slider) == ("auto", 48, "even")
     assert (plan.field.target_psnr, plan.field.draft, plan.field.seed) == (41.0, True, 3)

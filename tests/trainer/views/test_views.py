@@ -113,9 +113,9 @@ def test_of_photographs_with_their_originals_only_the_change_is_trained(tmp_path
     torch.testing.assert_close(alone.edit(view, 1.0), painted, atol=0.6 / 255, rtol=0)
     assert isinstance(editor, FolderEditor)
     assert isinstance(alone, FolderEditor)
-    assert editor.warning is None
-    assert alone.warning is not None
-    assert "photographs:EDITED,ORIGINALS" in alone.warning
+    assert editor.note is None
+    assert alone.note is not None
+    assert "photographs:EDITED,ORIGINALS" in alone.note
 
 
 @pytest.mark.parametrize(
