@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from inspect import signature
@@ -174,6 +174,16 @@ def default_model() -> str:
     except ProgdfError:
         pass
     return SMALL_MODEL
+
+
+def models_here() -> list[str]:
+    """Models that are on this machine whole, by the ids of their weights."""
+    models = []
+    for adapter in ADAPTERS.values():
+        with suppress(ProgdfError):
+            component_sizes(adapter.model, adapter)
+            models.append(adapter.model)
+    return models
 
 
 def adapter_of(model: str) -> tuple[str, Adapter]:
