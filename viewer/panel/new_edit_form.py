@@ -19,7 +19,7 @@ from viewer.jobs.training import (
     with_editor,
 )
 from viewer.state.selection import SelectionState
-from viewer.state.workspace import Workspace
+from viewer.state.workspace import PreviewState, Workspace
 from viewer.ui.context import PALETTE, Icon, UiContext
 from viewer.ui.keys import shortcut
 from viewer.ui.widgets import (
@@ -42,15 +42,12 @@ from viewer.ui.widgets import (
 COLUMN_PX = 66.0
 
 
-def draw(
-    work: Workspace, count: int, preview: tuple[str, bool], ui: UiContext, actions: list[str]
-) -> Workspace:
+def draw(work: Workspace, count: int, preview: PreviewState, ui: UiContext, actions: list[str]) -> Workspace:
     """The form, if it is open. Tab goes through it, Enter trains, Escape closes it.
 
     Args:
         count: Gaussians in the scene
-        preview: what the editor's picture is at: "", a word such as "drawing", or why there is none; and
-            whether that is so
+        preview: what the editor's picture is at
     """
     if not work.form_open:
         return work
@@ -82,8 +79,9 @@ def has_keyboard() -> bool:
     return window is not None and window.was_active and f"/{_NAME}_" in window.name
 
 
-def _content(work: Workspace, count: int, preview: tuple[str, bool], ui: UiContext) -> tuple[NewEdit, str]:
-    """The form as the hand leaves it, and what was asked for: "train", "new_edit" to close it, or ""."""
+def _content(work: Workspace, count: int, preview: PreviewState, ui: UiContext) -> tuple[NewEdit, str]:
+    """The form as the hand leaves it, and what was asked for: "train", "paint_over", "new_edit" to close it,
+    or ""."""
     form, selection, action, right = work.form, work.view.selection, "", right_edge()
     imgui.push_font(ui.fonts.bold, 0.0)
     imgui.align_text_to_frame_padding()
@@ -96,7 +94,12 @@ def _content(work: Workspace, count: int, preview: tuple[str, bool], ui: UiConte
     column = COLUMN_PX * ui.scale
     form = _region(form, selection, count, column, ui)
     form = _editor(form, column, ui)
-    form = _settings(form, column, ui)
+    form = _settings(form, preview, column, ui)
+    if form.choice.setting == "sentence":
+        if replace(form, asks=0, anchor="") != replace(work.form, asks=0, anchor=""):
+            form = replace(form, asks=0, anchor="")  # a picture of something else
+        form, asked = _anchor(form, preview, column)
+        action = action or asked
     if work.form_opening:
         imgui.set_keyboard_focus_here()
     form = replace(form, name=_text_row("Name", form.suggested_name, form.name, column))
@@ -158,7 +161,7 @@ def _editor(form: NewEdit, column: float, ui: UiContext) -> NewEdit:
     return form if pressed is None else with_editor(form, pressed)
 
 
-def _settings(form: NewEdit, column: float, ui: UiContext) -> NewEdit:
+def _settings(form: NewEdit, preview: PreviewState, column: float, ui: UiContext) -> NewEdit:
     """What this editor is asked."""
     match form.choice.setting:
         case "color":
@@ -180,7 +183,7 @@ def _settings(form: NewEdit, column: float, ui: UiContext) -> NewEdit:
             form = _style(form, ui)
         case "sentence":
             form = replace(form, sentence=_text_row("Text", "turn him into a statue", form.sentence, column))
-            tip("Needs a model on this machine; see progdf train --help")
+            form = _model(form, preview, column, ui)
         case "pictures":
             form = replace(form, pictures=_text_row("Pictures", "A.png, B.png", form.pictures, column))
             taken = f"One or a few pictures that were taken here ({shortcut('take_view')})"
@@ -189,6 +192,37 @@ def _settings(form: NewEdit, column: float, ui: UiContext) -> NewEdit:
             form = replace(form, folder=_text_row("Folder", "FOLDER", form.folder, column))
             tip("Pictures of the training views, edited by any program; see progdf views")
     return form
+
+
+def _model(form: NewEdit, preview: PreviewState, column: float, ui: UiContext) -> NewEdit:
+    """Which model paints a sentence."""
+    label("Model", column)
+    imgui.set_next_item_width(-1.0)
+    models = ["", *preview.models]
+    titles = [model.partition("/")[2] or model or "What fits this machine" for model in models]
+    at = models.index(form.model) if form.model in models else 0
+    pressed = drop_down("##model", titles[at], titles, at, ui, "Models on this machine")
+    return form if pressed is None else replace(form, model=models[pressed], asks=0)
+
+
+def _anchor(form: NewEdit, preview: PreviewState, column: float) -> tuple[NewEdit, str]:
+    """The picture that all views follow: painted, painted again, or painted over by hand ("paint_over")."""
+    label("Anchor", column)
+    half, action = 0.5 * (imgui.get_content_region_avail().x - imgui.get_style().item_spacing.x), ""
+    imgui.begin_disabled(bool(form.obstacle) or preview.busy)
+    if imgui.button("Again" if form.asks else "Paint this view", imgui.ImVec2(half, 0.0)):
+        form = replace(form, asks=form.asks + 1, anchor="")
+    imgui.end_disabled()
+    tip("Paint the view that you see. All views will follow this picture; without one, the front decides")
+    imgui.same_line()
+    imgui.begin_disabled(not preview.painted)
+    if imgui.button("Paint over", imgui.ImVec2(half, 0.0)):
+        action = "paint_over"
+    imgui.end_disabled()
+    tip(form.anchor or "Write the picture into a file: change it in any program, save it, and train")
+    if preview.text:
+        wrapped_text(preview.text, PALETTE.error if preview.failed else PALETTE.dim)
+    return form, action
 
 
 def _style(form: NewEdit, ui: UiContext) -> NewEdit:
@@ -209,10 +243,10 @@ def _style(form: NewEdit, ui: UiContext) -> NewEdit:
     return replace(form, style=order[at % len(order)])
 
 
-def _preview(form: NewEdit, preview: tuple[str, bool], column: float, ui: UiContext) -> NewEdit:
+def _preview(form: NewEdit, preview: PreviewState, column: float, ui: UiContext) -> NewEdit:
     """The strength of the editor's own picture, and whether it is shown."""
     if not form.choice.pictured:
-        if form.choice.kind != "pictures":
+        if form.choice.setting == "folder":
             small("No picture in advance: this editor takes its time", PALETTE.dim)
         return form
     label("Preview", column)
@@ -225,11 +259,10 @@ def _preview(form: NewEdit, preview: tuple[str, bool], column: float, ui: UiCont
     form = replace(form, strength=value_slider("##strength", form.strength, (0.0, 1.0), "%.2f", 1.0, ui))
     imgui.end_disabled()
     tip("Strength of the preview. Training learns all strengths")
-    state, failed = preview
-    if form.preview and failed:
-        wrapped_text(state, PALETTE.error)
+    if form.preview and preview.failed:
+        wrapped_text(preview.text, PALETTE.error)
     else:
-        small(state or " ", PALETTE.dim)  # always a line, so that nothing below moves
+        small(preview.text or " ", PALETTE.dim)  # always a line, so that nothing below moves
     return form
 
 

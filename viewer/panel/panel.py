@@ -14,7 +14,7 @@ from viewer.state import history
 from viewer.state.facts import obstacle
 from viewer.state.layer_selection import selected_layers
 from viewer.state.view_state import AGAINST, COMPARE_MODES, MOST_AMPLIFIED, Comparison, ViewState
-from viewer.state.workspace import UNSAVED, SceneFacts, Workspace, has_unsaved, is_compact
+from viewer.state.workspace import UNSAVED, PreviewState, SceneFacts, Workspace, has_unsaved, is_compact
 from viewer.ui.context import BEHIND, FIXED, PALETTE, Icon, UiContext
 from viewer.ui.keys import shortcut
 from viewer.ui.widgets import (
@@ -150,7 +150,7 @@ def draw(
     work: Workspace,
     facts: SceneFacts,
     textures: Sequence[int],
-    preview: tuple[str, bool],
+    preview: PreviewState,
     recent: Sequence[Path],
     reveal: bool,
     ui: UiContext,
@@ -162,7 +162,7 @@ def draw(
         work: what it shows and changes
         facts: of the open scene
         textures: GL names of the snapshots' pictures, that of the original first; 0 before one is drawn
-        preview: what is said of the picture of a new edit, and whether it failed
+        preview: what is said of the picture of a new edit
         recent: files opened before, the last one first
         reveal: scroll to the focused layer
         ui: fonts and scale

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 from progdf.gaussians import ZERO, Origin
 from progdf.scene.neighbors import Neighborhood
@@ -34,6 +35,7 @@ REQUESTS = (
     *("save", "save_as", "save_to", "open", "open_file", "browse", "discard"),
     *(
         "train",
+        "paint_over",
         "stop_run",
         "resume_run",
         "ask_discard",
@@ -51,6 +53,16 @@ REQUESTS = (
 afterwards; `browse` shows the desktop's own dialog beside the question that is open; `duplicate:INDEX` of a
 layer, the focused one where none is named; `replace:INDEX` asks for its new edit, `replace_by:INDEX:PATH`;
 `save_region:NAME`, `rename_region:INDEX:NAME`."""
+
+
+class PreviewState(NamedTuple):
+    """What the form of a new edit says of its picture."""
+
+    text: str = ""  # a word such as "drawing", or why there is none
+    failed: bool = False  # whether it is that
+    busy: bool = False  # a model paints
+    painted: bool = False  # a sentence's picture is there
+    models: tuple[str, ...] = ()  # that are on this machine
 
 
 def _no_neighborhood() -> Neighborhood:

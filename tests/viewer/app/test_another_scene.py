@@ -20,7 +20,7 @@ from viewer.files.session import WindowSession
 from viewer.state import selection
 from viewer.state.selection import NamedRegion, SelectionState, pack
 from viewer.state.view_state import Brush, SelectTool, SnapshotPair, ViewState, on_another_scene
-from viewer.state.workspace import mark_saved, new_workspace
+from viewer.state.workspace import PreviewState, mark_saved, new_workspace
 
 OF_THE_WINDOW = {"background", "overlay", "panel", "dynamic_resolution", "grid", "axes", "cards"}
 
@@ -89,7 +89,7 @@ def test_another_scene_opens_while_everything_of_the_old_one_is_in_use(
     assert work.view.selection.regions == ()
     assert not work.view.brush.active
     assert (work.form_open, work.form, work.player) == (fresh.form_open, fresh.form, fresh.player)
-    assert (main_view.cover, main_view.preview_message, main_view.up_strip) == (None, ("", False), None)
+    assert (main_view.cover, main_view.preview, main_view.up_strip) == (None, PreviewState(), None)
 
 
 @pytest.mark.gl

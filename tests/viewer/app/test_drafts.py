@@ -8,14 +8,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
+from progdf.camera import Camera
 from progdf.gdf.file import load_gdf, save_gdf
+from progdf.io.picture_camera import find_picture_camera
 from tests.helpers.null_app import null_app, press
 from tests.helpers.sessions import bear_files, opened_document
 from tests.helpers.ui_rig import bear, first_view
 from tests.viewer.app.test_studio import Trainer, request, turn
 from viewer.app import app as application
 from viewer.app.studio import preview
+from viewer.camera.view_camera import to_camera
 from viewer.files.session import open_session
 from viewer.jobs import job_queue
 from viewer.state import paint
@@ -35,9 +39,12 @@ class Previews:
         self.folder, self._number = scene.parent, 0
         self._answers: list[preview.Preview] = []
 
-    def ask(self, *_: object) -> int:
+    def ask(self, _: str, request: preview._Request, camera: Camera) -> int:
         type(self).asked += 1
         self._number += 1
+        if request.seed < 0:
+            self._answers.append(preview.Preview(self._number, note="tiny on the CPU", models=("a/tiny",)))
+            return self._number
         pixels = np.zeros((4, 4, 3), np.uint8) if self.grade is None else None
         self._answers.append(preview.Preview(self._number, pixels, self.grade))
         return self._number
@@ -102,6 +109,32 @@ def test_what_no_grade_carries_is_the_editors_own_picture_as_before(window: appl
     with_form(window, editor=2)
     assert window.main_view.cover is not None
     assert window.main_view.live == ()
+
+
+def test_a_sentence_is_painted_when_it_is_asked_for_and_the_edit_follows_that_picture(
+    window: application.App,
+) -> None:
+    pytest.importorskip("diffusers", reason="pip install progdf-studio[diffusion]")
+    Previews.grade = None
+    opened(window)
+    Previews.asked = 0
+    with_form(window, editor=6, sentence="make it a statue")
+    state = window.main_view.preview
+    assert (state.text, state.models, state.painted) == ("tiny on the CPU", ("a/tiny",), False)
+    assert (window.main_view.cover, Previews.asked) == (None, 1), "said what would paint, nothing painted"
+    with_form(window, asks=1)
+    assert window.main_view.cover is not None
+    assert window.main_view.cover.name == "Anchor: make it a statue"
+    assert (window.main_view.preview.painted, Previews.asked) == (True, 2)
+    painted = to_camera(window.main_view.work.view.camera, 4, 4)
+    press(window, "Home", "5")
+    turn(window)
+    assert Previews.asked == 2, "a picture takes its time: a camera that moves asks for none"
+    request(window, "paint_over")
+    anchor = Path(window.main_view.work.form.anchor)
+    assert torch.allclose(find_picture_camera(anchor).viewmat, painted.viewmat, atol=1e-6)
+    request(window, "train")
+    assert f"--anchor={anchor}" in Trainer.said
 
 
 def test_the_trained_edit_takes_the_place_of_its_draft_and_nothing_else_changes(

@@ -30,6 +30,7 @@ from viewer.camera.view_camera import Vec3, ViewCamera, to_camera
 from viewer.jobs.child import Child
 from viewer.jobs.training import EDITORS, NewEdit
 from viewer.state.view_state import LayerState
+from viewer.state.workspace import PreviewState
 
 from .pages import Cover
 
@@ -51,6 +52,8 @@ class _Request:
     camera: ViewCamera
     size: tuple[int, int]  # of the view, pixels
     background: Vec3
+    model: str = ""  # of a sentence
+    seed: int = 0  # the same; -1 asks what would paint, for no picture
 
     @property
     def of_all_views(self) -> tuple[str, str]:
@@ -66,12 +69,16 @@ class Preview:
     pixels: NDArray[np.uint8] | None = None
     grade: Path | None = None
     error: str = ""
+    note: str = ""  # what would paint a sentence
+    models: tuple[str, ...] = ()  # that are on this machine
 
 
 class _Answer(msgspec.Struct):
     number: int
     error: str = ""
-    made: Literal["picture", "grade"] = "picture"
+    made: Literal["picture", "grade", "note"] = "picture"
+    note: str = ""
+    models: list[str] = msgspec.field(default_factory=list)
 
 
 class PreviewChild:
@@ -110,6 +117,8 @@ class PreviewChild:
             "K": camera.K.tolist(),
             "width": camera.width,
             "height": camera.height,
+            "model": request.model,
+            "seed": request.seed,
         }
         self._child.send(msgspec.json.encode(values).decode())
         return number
@@ -126,6 +135,8 @@ class PreviewChild:
             answer = convert_json(decode_json(line), _Answer)
             if answer.error:
                 return Preview(answer.number, error=answer.error)
+            if answer.made == "note":
+                return Preview(answer.number, note=answer.note, models=tuple(answer.models))
             if answer.made == "grade":
                 return Preview(answer.number, grade=self._picture(answer.number).with_suffix(".gdf"))
             with Image.open(self._picture(answer.number)) as picture:
@@ -170,6 +181,9 @@ class PreviewActions:
         self._seen_at = self._used_at = 0.0
         self._broken = False  # it cannot be started, or has ended by itself
         self._grade: tuple[_Request, Gdf, Path] | None = None  # of the live layer, and what it was made for
+        self._pose: tuple[int, ViewCamera, tuple[int, int]] | None = None  # of which a sentence's picture is
+        self._painted: tuple[_Request, NDArray[np.uint8]] | None = None  # that picture
+        self._sent_at = 0.0
 
     def poll(self) -> float | None:
         """Ask for the preview and show what has come; seconds until the next look, None for ever."""
@@ -190,6 +204,8 @@ class PreviewActions:
                 self._show(f"No preview: {error.strerror or error}", None, failed=True)
         if self._child is not None:
             self._take(self._child)
+        if self._outstanding and request.editor.startswith("instruct:") and request.seed >= 0:
+            self._show(f"Painting … {now - self._sent_at:.0f} s", self._app.main_view.cover)
         self._show_live()
         if self._child is None or self._broken:
             return None
@@ -203,6 +219,14 @@ class PreviewActions:
         if request != self._sent and now - self._seen_at >= REST_S:
             self._send(request, self._child)
         return POLL_S if self._outstanding or request != self._sent else None
+
+    def anchor(self, form: NewEdit) -> tuple[NDArray[np.uint8], Camera] | None:
+        """A sentence's picture of one view, and its camera, which the edit is to follow; None for none."""
+        request = self._request()
+        if self._painted is None or request is None or request != self._painted[0] or not form.asks:
+            return None
+        pixels = self._painted[1]
+        return pixels, to_camera(request.camera, pixels.shape[1], pixels.shape[0])
 
     def draft(self, form: NewEdit) -> Path | None:
         """The file of the grade that shows what a form says; None where there is none."""
@@ -228,13 +252,21 @@ class PreviewActions:
         """What the form and the view ask for; None for no picture."""
         work, size = self._app.main_view.work, self._app.main_view.picture_size
         form, view = work.form, work.view
-        if not (work.form_open and view.panel and form.preview and form.choice.pictured) or form.obstacle:
+        of_sentence = form.choice.setting == "sentence"
+        pictured = (form.preview and form.choice.pictured) or of_sentence
+        if not (work.form_open and view.panel and pictured) or form.obstacle:
             return None
         region = f"{form.region}|{form.typed_region}|{hash(view.selection.members)}"
+        if of_sentence:  # a picture takes its time: it is of the view in which it was asked for
+            if self._pose is None or self._pose[0] != form.asks:
+                self._pose = form.asks, view.camera, size
+            _, camera, size = self._pose
+            seed = form.asks - 1
+            return _Request(region, form.spec, 1.0, camera, size, view.background, form.model, seed)
         return _Request(region, form.spec, round(form.strength, 2), view.camera, size, view.background)
 
     def _send(self, request: _Request, child: PreviewChild) -> None:
-        self._sent = request
+        self._sent, self._sent_at = request, time.monotonic()
         scale = min(1.0, LONGEST_SIDE / max(request.size))
         width, height = (max(round(side * scale), 1) for side in request.size)
         try:
@@ -247,7 +279,8 @@ class PreviewActions:
         self._outstanding = True
         cover = self._app.main_view.cover
         in_place = cover is not None and (cover.camera, cover.size) == (request.camera, request.size)
-        self._show("" if in_place or self._grade else "Drawing …", cover)
+        text = "Looking for models …" if request.seed < 0 else "Drawing …"
+        self._show("" if in_place or self._grade else text, cover)
 
     def _take(self, child: PreviewChild) -> None:
         """What the child has answered."""
@@ -262,17 +295,24 @@ class PreviewActions:
                 self._end()
             self._end_live()
             self._show(answer.error, None, failed=True)
+        elif answer.note and answer.number == self._number:
+            self._show(answer.note, None, models=answer.models)
         elif answer.grade is not None and self._sent is not None and answer.number == self._number:
             gdf = load_gdf(answer.grade, self._app.document.scene)
             self._grade = self._sent, gdf, answer.grade
             self._app.main_view.live = ()  # of the last color
             self._show("Live: turn it, slide it", None)
         elif answer.pixels is not None and self._sent is not None and answer.number == self._number:
-            kind = self._sent.editor.partition(":")[0]
+            kind, _, what = self._sent.editor.partition(":")
             title = next(choice.title for choice in EDITORS if choice.kind == kind)
             self._end_live()
-            name, texture = f"Preview: {title} at {self._sent.strength:.2f}", self._upload(answer.pixels)
-            self._show("", Cover(texture, self._sent.camera, self._sent.size, name))
+            name, text = f"Preview: {title} at {self._sent.strength:.2f}", ""
+            self._painted = None
+            if kind == "instruct":
+                name, text = f"Anchor: {what}", "The edit will follow this picture"
+                self._painted = self._sent, answer.pixels
+            texture = self._upload(answer.pixels)
+            self._show(text, Cover(texture, self._sent.camera, self._sent.size, name))
             self._app.main_view.wake()
 
     def _show_live(self) -> None:
@@ -305,11 +345,16 @@ class PreviewActions:
         self._texture.write(np.ascontiguousarray(pixels).tobytes(), alignment=1)
         return int(self._texture.glo)
 
-    def _show(self, text: str, cover: Cover | None, failed: bool = False) -> None:
+    def _show(
+        self, text: str, cover: Cover | None, failed: bool = False, models: tuple[str, ...] | None = None
+    ) -> None:
         """The cover, and what the form says of it."""
         main_view = self._app.main_view
-        if (main_view.cover, main_view.preview_message) != (cover, (text, failed)):
-            main_view.cover, main_view.preview_message = cover, (text, failed)
+        known = main_view.preview.models if models is None else models
+        painted = self._painted is not None and self._painted[0] == self._request()
+        state = PreviewState(text, failed, self._outstanding, painted, known)
+        if (main_view.cover, main_view.preview) != (cover, state):
+            main_view.cover, main_view.preview = cover, state
             main_view.wake()
 
     def _end(self) -> None:

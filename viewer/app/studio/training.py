@@ -9,8 +9,14 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.io.atomic import atomic_write, make_folder, read_file
+from progdf.io.picture_camera import camera_chunk
 from progdf.scene.regions import check_region
 from viewer.app.application import Application, failure_line
 from viewer.app.file_actions import EditActions
@@ -38,6 +44,7 @@ class JobActions:
         app: the window
         memory: folder of the program's state; the user's own if None
         draft: gives the file of a grade that shows what the form says
+        anchor: gives the picture of one view that the form's sentence is to follow
     """
 
     def __init__(
@@ -45,8 +52,9 @@ class JobActions:
         app: Application,
         memory: Path | None = None,
         draft: Callable[[NewEdit], Path | None] = lambda _: None,
+        anchor: Callable[[NewEdit], tuple[NDArray[np.uint8], Camera] | None] = lambda _: None,
     ) -> None:
-        self._app, self._memory, self._draft = app, memory, draft
+        self._app, self._memory, self._draft, self._anchor = app, memory, draft, anchor
         self._edits = EditActions(app)
         self.queue = JobQueue()
         self._scene: Path | None = None
@@ -62,6 +70,8 @@ class JobActions:
         match name:
             case "train":
                 self._train()
+            case "paint_over":
+                self._try(self._paint_over)
             case "stop_run":
                 self.queue.stop(int(argument))
             case "resume_run":
@@ -121,7 +131,12 @@ class JobActions:
             raise ProgdfError("the scene has no file yet; open one first")
         out = training.free_run(training.edits_folder(scene, self._memory), form.layer_name)
         region, threads = self.region_spec(form, out.parent, out.name), training.spare_threads()
-        order = EditOrder(scene.resolve(), out, out.name, region, form.spec, form.quick, threads)
+        model = anchor = ""
+        if form.choice.setting == "sentence":
+            model, anchor = form.model, self._write_anchor(form, out)
+        order = EditOrder(
+            scene.resolve(), out, out.name, region, form.spec, form.quick, threads, model, anchor
+        )
         self.queue.add(order)
         if (draft := self._draft(form)) is not None:
             self._try(partial(self._add_draft, order, draft, form.strength))
@@ -141,6 +156,33 @@ class JobActions:
         with atomic_write(order.draft) as temporary_file:
             temporary_file.write_bytes(read_file(draft))
         self._edits.add(order.draft, order.name, strength)
+
+    def _write_anchor(self, form: NewEdit, run: Path) -> str:
+        """The file of the picture that a sentence is to follow, beside its run; "" for none.
+
+        Raises:
+            ProgdfError: it cannot be written.
+        """
+        taken = None if form.anchor else self._anchor(form)
+        if taken is None:
+            return form.anchor
+        make_folder(run.parent)
+        path = run.with_name(f"{run.name}.anchor.png")
+        chunk = camera_chunk(taken[1], origin=self._app.document.scene.origin)
+        with atomic_write(path) as temporary_file:
+            Image.fromarray(taken[0]).save(temporary_file, "PNG", pnginfo=chunk)
+        return str(path)
+
+    def _paint_over(self) -> None:
+        """Write the picture where any program can change it, and follow that file from now on."""
+        main_view, scene = self._app.main_view, self._app.document.path
+        if scene is None:
+            raise ProgdfError("the scene has no file yet; open one first")
+        form = main_view.work.form
+        run = training.free_run(training.edits_folder(scene, self._memory), form.layer_name)
+        if path := self._write_anchor(form, run):
+            main_view.work = replace(main_view.work, form=replace(form, anchor=path))
+            main_view.show_message(f"Change {path}, save it, and press Train")
 
     def region_spec(self, form: NewEdit, folder: Path, name: str = "") -> str:
         """The form's region as `progdf train --region` has it; one that has no file gets one in the folder.
