@@ -23,7 +23,7 @@ from progdf.gdf.file import Gdf, fingerprint
 from progdf.io.cameras import load_cameras
 from progdf.metrics.image import ROUNDING, decibels
 from progdf.rasterize import activate, render
-from progdf.rasterize.cpu.engine import color_map
+from progdf.rasterize.engines import color_map
 from progdf.region import Region
 from progdf.scene.bounds import is_surrounding
 from progdf.scene.up_axis import find_up

@@ -19,7 +19,7 @@ from progdf.field.baked import MONOMIALS, identity_map
 from progdf.field.grade import MOST_COLOR, member_bands, monomials
 from progdf.gaussians import unpack
 from progdf.metrics.image import ROUNDING
-from progdf.rasterize.cpu.engine import ColorMap, color_map
+from progdf.rasterize.engines import ColorMap, color_map
 from progdf.sh import basis
 from progdf.threads import one_thread, threads
 from trainer.views.crops import CropScene

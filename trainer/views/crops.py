@@ -18,7 +18,7 @@ from torch import Tensor
 from progdf.camera import Camera
 from progdf.gaussians import ATTRIBUTES, Gaussians, attribute_slices, unpack
 from progdf.rasterize import ActivatedGaussians, Crop, Rendering, activate, render
-from progdf.rasterize.cpu.engine import ColorMap, color_map
+from progdf.rasterize.engines import ColorMap, color_map
 from progdf.rasterize.cpu.forward import TILE_H, TILE_W
 from progdf.sh import C0, basis
 from progdf.threads import threads
