@@ -124,8 +124,8 @@ def rotate_about_x(shN: Tensor) -> Tensor:
 
 def _wigner_change(degree: int, quats: Tensor) -> Tensor:
     """The Wigner matrices of bands 1 to `degree`, less the identity. [N,4] -> [N,K,K] float64"""
-    directions, inverse = _samples(degree)
-    back = quats.double() * torch.tensor([1.0, -1.0, -1.0, -1.0], dtype=torch.float64)
+    directions, inverse = (samples.to(quats.device) for samples in _samples(degree))
+    back = quats.double() * quats.new_tensor([1.0, -1.0, -1.0, -1.0], dtype=torch.float64)
     turned = rotate_vectors(directions[None], back[:, None])
     seen = basis(degree, turned) - basis(degree, directions)
     return inverse @ seen[..., 1:]

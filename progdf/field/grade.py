@@ -89,7 +89,7 @@ def map_colors(sh: Tensor, table: Tensor, degree: int) -> Tensor:
         [M,B,3]
     """
     bands = sh.shape[1]
-    if torch.equal(table, identity_map(degree, len(table))):
+    if torch.equal(table, identity_map(degree, len(table)).to(table)):
         return sh.clone()
     if bands == 1:
         colors = sh[:, 0].T * C0 + 0.5
@@ -118,7 +118,7 @@ def look_up(colors: Tensor, table: Tensor) -> Tensor:
 
 def _map_chunk(sh: Tensor, table: Tensor, degree: int) -> Tensor:
     """`map_colors` of the channels of some members. [3,m,B] -> [3,m,B]"""
-    values, inverse = _sphere(math.isqrt(sh.shape[2]) - 1)
+    values, inverse = (some.to(sh) for some in _sphere(math.isqrt(sh.shape[2]) - 1))
     colors = sh @ values.T + 0.5
     mapped = map_drawn(colors, table, degree)
     made = sh + (mapped - colors.clamp_min(0.0)) @ inverse.T
@@ -142,7 +142,7 @@ def member_bands(rows: Tensor) -> Tensor:
 def band_offsets(change: Tensor, channels: int) -> Tensor:
     """A change of the lowest bands as packed offsets. [M,B,3] -> [M,channels]"""
     slices = attribute_slices(channels)
-    offsets = torch.zeros(len(change), channels)
+    offsets = change.new_zeros(len(change), channels)
     offsets[:, slices["sh0"]] = change[:, 0]
     if change.shape[1] > 1:
         first = slices["shN"].start

@@ -10,10 +10,10 @@ weights, whichever engine draws.
 from __future__ import annotations
 
 import importlib
-import importlib.util
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from importlib.util import find_spec
 from math import isqrt
 from typing import NamedTuple, Protocol, cast
 
@@ -160,7 +160,7 @@ def choose_engine(name: str) -> str:
     """The engine that "auto" is on this machine: warp where there is a card and it can draw, else cpu."""
     if name != "auto":
         return name
-    return "warp" if torch.cuda.is_available() and importlib.util.find_spec("warp") else "cpu"
+    return "warp" if torch.cuda.is_available() and find_spec("warp") else "cpu"
 
 
 def engine_device(name: str) -> torch.device:

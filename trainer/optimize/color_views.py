@@ -64,7 +64,7 @@ class ColorView:
         height, width = self.map.size
         side = max(1, max(height, width) // _SQUARES)
         rows, columns = torch.arange(height)[:, None, None] // side, torch.arange(width)[:, None] // side
-        even = (rows + columns) % 2 == 0
+        even = ((rows + columns) % 2 == 0).to(self.counts.device)
         return replace(self, counts=self.counts & even), replace(self, counts=self.counts & ~even)
 
 
@@ -75,7 +75,7 @@ def color_view(crop: CropScene, original: Tensor, bands: int) -> ColorView:
     directions = torch.nn.functional.normalize(members.means - camera.position, dim=1)
     weights = basis(min(members.sh_degree, 3), directions)
     colors = (weights[..., None] * members.sh[:, : weights.shape[1]]).sum(dim=1) + 0.5
-    weighed = color_map(crop.gaussians, camera, crop.box, crop.rows)
+    weighed = color_map(crop.gaussians, camera, crop.box, crop.rows, crop.engine)
     picture = crop.original()
     if crop.cached is not None:
         live, constant = crop.cached
@@ -85,7 +85,7 @@ def color_view(crop: CropScene, original: Tensor, bands: int) -> ColorView:
         picture - weighed.picture(colors.clamp_min(0.0)),
         weights[:, :bands].contiguous(),
         colors,
-        torch.ones(*weighed.size, 1, dtype=torch.bool),
+        torch.ones_like(picture[..., :1], dtype=torch.bool),
     )
 
 
@@ -113,18 +113,19 @@ class MapFit:
         may have such: at all members' colors it is held to the affine map, and
         that one to the same change of all.
         """
-        return identity_map(degree) + self._change(MONOMIALS[degree], targets)
+        change = self._change(MONOMIALS[degree], targets)
+        return identity_map(degree).to(change) + change
 
     def _change(self, count: int, targets: Sequence[Tensor]) -> Tensor:
         """What is added to the identity's first coefficients: 1, 4, 10 or 20. [count,3]"""
         design, target = self.design[:, :count].contiguous(), self._pixels(targets)
-        normal, pull = self.normal[:count, :count], torch.zeros(count, 3, dtype=torch.float64)
+        normal, pull = self.normal[:count, :count], self.normal.new_zeros(count, 3)
         if count > 1:
             coarse = self._change(4 if count > 4 else 1, targets).double()
             held = self.held[:count, :count] * (1.0 if count > 4 else _SHIFT_HELD)
             normal, pull = normal + held, held[:, : len(coarse)] @ coarse
         normal = normal + _MAP_RIDGE * (normal.diagonal() + 1e-12).diag()
-        original, change = self.design[:, 1:4], torch.zeros(count, 3)
+        original, change = self.design[:, 1:4], design.new_zeros(count, 3)
         for _ in range(_CLAMP_ROUNDS):
             image = original + design @ change + self.others
             clamped = ((image >= 1.0) & (target >= 1.0)) | ((image <= 0.0) & (target <= 0.0))
