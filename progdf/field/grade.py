@@ -64,13 +64,13 @@ def monomials(colors: Tensor, degree: int) -> Tensor:
 
 
 @cache
-def _sphere(degree: int) -> tuple[Tensor, Tensor]:
+def _sphere(degree: int, device: torch.device) -> tuple[Tensor, Tensor]:
     """Values of the bands in even directions of the sphere, and their least squares. [D,B], [B,D] float32"""
     index = torch.arange(_DIRECTIONS, dtype=torch.float64) + 0.5
     z, angle = 1 - 2 * index / _DIRECTIONS, math.pi * (1 + math.sqrt(5)) * index
     radius = (1 - z * z).sqrt()
     values = basis(degree, torch.stack([radius * angle.cos(), radius * angle.sin(), z], dim=1))
-    return values.float(), torch.linalg.pinv(values).float()
+    return values.float().to(device), torch.linalg.pinv(values).float().to(device)
 
 
 def map_colors(sh: Tensor, table: Tensor, degree: int) -> Tensor:
@@ -118,7 +118,7 @@ def look_up(colors: Tensor, table: Tensor) -> Tensor:
 
 def _map_chunk(sh: Tensor, table: Tensor, degree: int) -> Tensor:
     """`map_colors` of the channels of some members. [3,m,B] -> [3,m,B]"""
-    values, inverse = (some.to(sh) for some in _sphere(math.isqrt(sh.shape[2]) - 1))
+    values, inverse = _sphere(math.isqrt(sh.shape[2]) - 1, sh.device)
     colors = sh @ values.T + 0.5
     mapped = map_drawn(colors, table, degree)
     made = sh + (mapped - colors.clamp_min(0.0)) @ inverse.T

@@ -124,11 +124,6 @@ class RasterView:
 class ColorMap(Protocol):
     """What each of M Gaussians weighs in each pixel of a window: αT, for as long as nothing moves."""
 
-    @property
-    def size(self) -> tuple[int, int]:
-        """Height and width of the window."""
-        ...
-
     def picture(self, colors: Tensor) -> Tensor:
         """Σ αT·c of every pixel, on black. [M,3] -> [h,w,3]"""
         ...

@@ -65,9 +65,7 @@ def color_map(gaussians: ActivatedGaussians, view: RasterView, rows: Tensor) -> 
     with torch.no_grad():
         splats, _ = project(gaussians, view)
     black = splats.colors.new_zeros(3)
-    return DrawnColors(
-        splats, view.crop, rows, len(gaussians.means), lambda some: blend(some, view.crop, black)[0]
-    )
+    return DrawnColors(splats, rows, len(gaussians.means), lambda some: blend(some, view.crop, black)[0])
 
 
 @dataclass(frozen=True)
@@ -75,15 +73,9 @@ class DrawnColors:
     """A color map that draws its splats anew each time."""
 
     splats: ReferenceSplats
-    crop: Crop
     rows: Tensor  # which of the N Gaussians have colors, the others are black. [M] int64
     count: int  # N
     draw: Callable[[ReferenceSplats], Tensor]  # on black, differentiable in the splats' colors. -> [h,w,3]
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Height and width of the window."""
-        return self.crop[3] - self.crop[1], self.crop[2] - self.crop[0]
 
     def picture(self, colors: Tensor) -> Tensor:
         """See `ColorMap`."""
@@ -188,7 +180,7 @@ def tile_weights(splats: ReferenceSplats, x: int, y: int) -> tuple[Tensor, Tenso
     near_x = (high[:, 0] >= x) & (low[:, 0] <= x + TILE)
     near_y = (high[:, 1] >= y) & (low[:, 1] <= y + TILE)
     members = (near_x & near_y).nonzero()[:, 0]
-    center = torch.arange(TILE).to(splats.means2d) + 0.5
+    center = splats.means2d.new_ones(TILE).cumsum(0) - 0.5
     pixels = torch.cartesian_prod(y + center, x + center).flip(1)
     dx, dy = (pixels[:, None] - splats.means2d[members]).unbind(2)
     l11, l21, l22 = splats.whitening[members].unbind(1)
@@ -206,7 +198,8 @@ def alpha_weights(gaussians: ActivatedGaussians, view: RasterView, mask: Tensor)
     means, width, height = gaussians.means, view.width, view.height
     splats, _ = project(gaussians, view)
     # two channels, zero beyond the image's edge: the mask, and what is image at all
-    inside = torch.stack([mask.to(means.dtype), torch.ones_like(mask, dtype=means.dtype)])
+    mask = mask.to(means)
+    inside = torch.stack([mask, torch.ones_like(mask)])
     inside = torch.nn.functional.pad(inside, (0, -width % TILE, 0, -height % TILE))
     totals = means.new_zeros(len(means), 4)
     for y in range(0, height, TILE):

@@ -13,10 +13,12 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from progdf.errors import ProgdfError
 
@@ -57,34 +59,34 @@ _launching = threading.Lock()
 _function: Callable[[Any], Any] = wp.func
 _kernel: Callable[[Any], Any] = wp.kernel
 
-wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)  # no banner, no line for each module
-wp.config.kernel_cache_dir = wp.config.kernel_cache_dir or str(find_cache_folder() / "warp")
 wp.set_module_options({"enable_backward": False})
-wp.init()
+
+
+@cache
+def _start() -> None:
+    """Start Warp, without a word; compiled kernels lie beside the cpu engine's."""
+    wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
+    wp.config.kernel_cache_dir = wp.config.kernel_cache_dir or str(find_cache_folder() / "warp")
+    wp.init()
 
 
 @_function
-def pixel_of(thread: int, window: wp.vec4i) -> wp.vec2i:
-    """Column and row in the full image of a thread's pixel: blocks are the window's tiles, row by row."""
+def pixel_of(thread: int, window: wp.vec4i) -> wp.vec3i:
+    """Column and row of a thread's pixel in the full image; its place in the window, row by row, −1: outside.
+
+    Blocks of threads are the window's tiles, row by row.
+    """
     left, top = window[0] // TILE, window[1] // TILE
     columns = (window[2] + TILE - 1) // TILE - left
     tile, place = thread // PIXELS, thread % PIXELS
-    return wp.vec2i(
-        (left + tile % columns) * TILE + place % TILE, (top + tile // columns) * TILE + place // TILE
-    )
+    x, y = (left + tile % columns) * TILE + place % TILE, (top + tile // columns) * TILE + place // TILE
+    if x < window[0] or y < window[1] or x >= window[2] or y >= window[3]:
+        return wp.vec3i(x, y, -1)
+    return wp.vec3i(x, y, (y - window[1]) * (window[2] - window[0]) + x - window[0])
 
 
 @_function
-def index_of(pixel: wp.vec2i, window: wp.vec4i) -> int:
-    """Where a pixel is in the window, row by row; −1 outside."""
-    x, y = pixel[0] - window[0], pixel[1] - window[1]
-    if x < 0 or y < 0 or pixel[0] >= window[2] or pixel[1] >= window[3]:
-        return -1
-    return int(y * (window[2] - window[0]) + x)
-
-
-@_function
-def alpha_at(pixel: wp.vec2i, box: wp.vec4, shape: Any, opacity: float) -> wp.vec3:
+def alpha_at(pixel: wp.vec3i, box: wp.vec4, shape: Any, opacity: float) -> wp.vec3:
     """Alpha before the clamp, 0 below 1/255; u and v, the whitened offset."""
     x, y = float(pixel[0]) + 0.5, float(pixel[1]) + 0.5
     if x < box[0] or y < box[1] or x > box[2] or y > box[3]:  # in float32: most pairs end here
@@ -99,17 +101,10 @@ def alpha_at(pixel: wp.vec2i, box: wp.vec4, shape: Any, opacity: float) -> wp.ve
 
 @_kernel
 def blend_kernel(
-    window: wp.vec4i,
-    starts: wp.array[int],
-    members: wp.array[int],
-    boxes: wp.array[wp.vec4],
-    shapes: wp.array[_Shape],
-    colors: wp.array[wp.vec4],
-    image: wp.array[wp.vec3],
-    transmittance: wp.array[float],
-    last: wp.array[int],
-    deepest: wp.array[int],
-) -> None:
+    window: wp.vec4i, starts: wp.array[int], members: wp.array[int], boxes: wp.array[wp.vec4],
+    shapes: wp.array[_Shape], colors: wp.array[wp.vec4], image: wp.array[wp.vec3],
+    transmittance: wp.array[float], last: wp.array[int], deepest: wp.array[int],
+) -> None:  # fmt: skip
     """Blend front to back, on black.
 
     Args:
@@ -118,7 +113,7 @@ def blend_kernel(
     """
     thread = wp.tid()
     pixel = pixel_of(thread, window)
-    p = index_of(pixel, window)
+    p = pixel[2]
     if p < 0:
         return
     tile = thread // PIXELS
@@ -142,24 +137,15 @@ def blend_kernel(
 
 @_kernel
 def blend_backward_kernel(
-    window: wp.vec4i,
-    starts: wp.array[int],
-    members: wp.array[int],
-    boxes: wp.array[wp.vec4],
-    shapes: wp.array[_Shape],
-    colors: wp.array[wp.vec4],
-    transmittance: wp.array[float],
-    last: wp.array[int],
-    deepest: wp.array[int],
-    slots: wp.array[int],
-    by_image: wp.array[wp.vec3],
-    by_transmittance: wp.array[float],
-    sums: wp.array[_Sums],
-) -> None:
+    window: wp.vec4i, starts: wp.array[int], members: wp.array[int], boxes: wp.array[wp.vec4],
+    shapes: wp.array[_Shape], colors: wp.array[wp.vec4], transmittance: wp.array[float],
+    last: wp.array[int], deepest: wp.array[int], slots: wp.array[int], by_image: wp.array[wp.vec3],
+    by_transmittance: wp.array[float], sums: wp.array[_Sums],
+) -> None:  # fmt: skip
     """Gradients, back to front. slots: the row of `sums` for each of `members`, −1: no gradient is wanted."""
     thread = wp.tid()
     pixel = pixel_of(thread, window)
-    p = index_of(pixel, window)
+    p = pixel[2]
     tile = thread // PIXELS
     g, through, behind, final = wp.vec3(0.0), float(1.0), float(0.0), int(-1)
     if p >= 0:
@@ -186,33 +172,26 @@ def blend_backward_kernel(
                 if seen[0] > MOST:
                     by_alpha = float(0.0)
                 behind += weight * front
-                by_u, by_v = by_alpha * seen[1], by_alpha * seen[2]
-                row = _Sums(
-                    weight * g[0], weight * g[1], weight * g[2],
-                    by_alpha, by_u, by_v, by_u * seen[1], by_u * seen[2], by_v * seen[2],
-                )  # fmt: skip
+                first = wp.vec3(1.0, seen[1], seen[2])
+                second = wp.vec3(seen[1] * seen[1], seen[1] * seen[2], seen[2] * seen[2])
+                for k in range(3):
+                    row[k] = weight * g[k]
+                    row[3 + k] = by_alpha * first[k]
+                    row[6 + k] = by_alpha * second[k]
         if slot >= 0:  # the same for the whole block, which adds up together
             wp.tile_atomic_add(sums, wp.tile_sum(wp.tile(row, preserve_type=True)), offset=slot)
 
 
 @_kernel
 def add_weights_kernel(
-    window: wp.vec4i,
-    starts: wp.array[int],
-    members: wp.array[int],
-    boxes: wp.array[wp.vec4],
-    shapes: wp.array[_Shape],
-    colors: wp.array[wp.vec4],
-    last: wp.array[int],
-    deepest: wp.array[int],
-    slots: wp.array[int],
-    mask: wp.array[float],
-    sums: wp.array[wp.vec4],
-) -> None:
+    window: wp.vec4i, starts: wp.array[int], members: wp.array[int], boxes: wp.array[wp.vec4],
+    shapes: wp.array[_Shape], colors: wp.array[wp.vec4], last: wp.array[int], deepest: wp.array[int],
+    slots: wp.array[int], mask: wp.array[float], sums: wp.array[wp.vec4],
+) -> None:  # fmt: skip
     """Σ w·m, Σ m, Σ w and n of every intersection; w = αT."""
     thread = wp.tid()
     pixel = pixel_of(thread, window)
-    p = index_of(pixel, window)
+    p = pixel[2]
     tile = thread // PIXELS
     inside, through, final = float(0.0), float(1.0), int(-1)
     if p >= 0:
@@ -260,9 +239,7 @@ def list_tiles(splats: ReferenceSplats, crop: Crop) -> TileLists:
     wide = sides[owners, 0]
     column, row = low[owners, 0] + at % wide - left, low[owners, 1] + at // wide - top
     tiles, slots = (row * columns + column).int().sort(stable=True)
-    starts = torch.searchsorted(
-        tiles, torch.arange(columns * rows + 1, device=tiles.device, dtype=torch.int32)
-    )
+    starts = pad(torch.bincount(tiles, minlength=columns * rows).cumsum(0), (1, 0))
     return TileLists(starts.int(), owners[slots].int(), slots, counts)
 
 
@@ -283,7 +260,7 @@ def color_map(gaussians: ActivatedGaussians, view: RasterView, rows: Tensor) -> 
         splats, info = project(gaussians.each(Tensor.double), view)
     lists, wanted = list_tiles(splats, view.crop), is_listed(splats, info, rows)
     return DrawnColors(
-        splats, view.crop, rows, len(gaussians.means), lambda some: blend(some, lists, view.crop, wanted)[0]
+        splats, rows, len(gaussians.means), lambda some: blend(some, lists, view.crop, wanted)[0]
     )
 
 
@@ -293,9 +270,8 @@ def alpha_weights(gaussians: ActivatedGaussians, view: RasterView, mask: Tensor)
     lists = list_tiles(splats, view.crop)
     arrays = splat_arrays(splats)
     _, _, last, deepest = _blend(arrays, lists, view.crop)
-    sums = mask.new_zeros(len(lists.members), 4, dtype=torch.float32)
-    inside = mask.to(torch.float32).flatten()
-    _launch(add_weights_kernel, lists, view.crop, *arrays, last, deepest, lists.slots.int(), inside, sums)
+    sums, inside = arrays[0].new_zeros(len(lists.members), 4), mask.to(arrays[0]).flatten()
+    _launch(add_weights_kernel, lists, view.crop, (*arrays, last, deepest, lists.slots.int(), inside, sums))
     totals = sums.new_zeros(len(gaussians.means), 4)
     return totals.index_copy(0, splats.rows, _add_slots(sums, lists))
 
@@ -323,13 +299,9 @@ def blend(
 class _Blend(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any,
-        splats: ReferenceSplats,
-        lists: TileLists,
-        crop: Crop,
-        wanted: Tensor | None,
+        ctx: Any, splats: ReferenceSplats, lists: TileLists, crop: Crop, wanted: Tensor | None,
         *leaves: Tensor,
-    ) -> tuple[Tensor, Tensor]:
+    ) -> tuple[Tensor, Tensor]:  # fmt: skip
         arrays = splat_arrays(splats)
         image, *made = _blend(arrays, lists, crop)
         ctx.forward_pass = splats, lists, crop, wanted, arrays, made
@@ -345,7 +317,7 @@ class _Blend(torch.autograd.Function):
             slots = slots.where(wanted[lists.members], -1)
         sums = by_image.new_zeros(len(lists.members), SUMS)
         gradients = by_image.flatten(0, 1).contiguous(), by_transmittance.flatten().contiguous()
-        _launch(blend_backward_kernel, lists, crop, *arrays, *made, slots, *gradients, sums)
+        _launch(blend_backward_kernel, lists, crop, (*arrays, *made, slots, *gradients, sums))
         moments = _add_slots(sums, lists).double()
         g, gu, gv, guu, guv, gvv = moments[:, 3:].unbind(1)
         l11, l21, l22 = splats.whitening.unbind(1)
@@ -373,7 +345,7 @@ def _blend(arrays: Sequence[Tensor], lists: TileLists, crop: Crop) -> tuple[Tens
     image, transmittance = arrays[0].new_empty(pixels, 3), arrays[0].new_empty(pixels)
     last = torch.empty_like(transmittance, dtype=torch.int32)
     deepest = torch.full_like(lists.starts[1:], -1)
-    _launch(blend_kernel, lists, crop, *arrays, image, transmittance, last, deepest)
+    _launch(blend_kernel, lists, crop, (*arrays, image, transmittance, last, deepest))
     return image, transmittance, last, deepest
 
 
@@ -382,10 +354,11 @@ def _add_slots(sums: Tensor, lists: TileLists) -> Tensor:
     return torch.segment_reduce(sums, "sum", lengths=lists.counts, unsafe=True)
 
 
-def _launch(kernel: Any, lists: TileLists, crop: Crop, *tensors: Tensor) -> None:
+def _launch(kernel: Any, lists: TileLists, crop: Crop, tensors: Sequence[Tensor]) -> None:
     """Run a kernel with a block for each tile of the window, on torch's stream."""
     device = lists.starts.device
     with _launching:
+        _start()
         wp.launch(
             kernel, dim=(len(lists.starts) - 1) * TILE * TILE,
             inputs=[wp.vec4i(*crop), lists.starts, lists.members, *tensors],

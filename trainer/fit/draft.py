@@ -122,7 +122,7 @@ def _look(scene: Gaussians, region: Region, camera: Camera) -> tuple[View, Color
             others = render(activated, camera, background).image - drawn
     inside = (drawn / share.clamp_min(1e-4)).clamp(0.0, 1.0)
     view = View(camera, (others + drawn).clamp(0.0, 1.0), share[..., 0].clamp(0.0, 1.0), inside, box)
-    counts = torch.ones(*weighed.size, 1, dtype=torch.bool)
+    counts = torch.ones_like(share, dtype=torch.bool)
     return view, ColorView(weighed, others, weights[members], shown, counts)
 
 

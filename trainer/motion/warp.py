@@ -121,7 +121,7 @@ def farthest_points(means: Tensor, count: int) -> Tensor:
     for _ in range(count - 1):
         chosen.append(int(distance.argmax()))
         distance = torch.minimum(distance, (means - means[chosen[-1]]).square().sum(dim=1))
-    return torch.tensor(chosen, device=means.device)
+    return means.new_tensor(chosen, dtype=torch.int64)
 
 
 @dataclass(frozen=True)

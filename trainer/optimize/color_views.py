@@ -61,7 +61,7 @@ class ColorView:
 
     def halves(self) -> tuple[ColorView, ColorView]:
         """The view with every other square of its pixels, and with the others."""
-        height, width = self.map.size
+        height, width = self.counts.shape[:2]
         side = max(1, max(height, width) // _SQUARES)
         rows, columns = torch.arange(height)[:, None, None] // side, torch.arange(width)[:, None] // side
         even = ((rows + columns) % 2 == 0).to(self.counts.device)

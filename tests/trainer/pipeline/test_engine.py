@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import torch
+from torch import Tensor
 
+import trainer.setup
 from progdf.errors import ProgdfError
+from progdf.gaussians import pack
 from progdf.rasterize import engines
-from progdf.rasterize.engines import choose_engine
+from progdf.rasterize.engines import ENGINES, choose_engine, get_engine
+from tests.helpers.card import CARD, Card
 from tests.helpers.drawn import NEEDS_WARP
-from tests.helpers.trained import quick_options, train
+from tests.helpers.trained import WHITE, quick_options, small, train, write_bear
+from trainer.optimize.losses import Objective, perceptual_loss
+from trainer.optimize.pgs import PgsSettings, TargetStage, learning_rates, optimize
+from trainer.options import OptimizeOptions
+from trainer.run import training
+from trainer.views.crops import crop_scene
 
 
 @NEEDS_WARP
@@ -19,7 +29,7 @@ from tests.helpers.trained import quick_options, train
     "asked",
     [
         {"kind": "style", "steps": 24, "stages": 1},
-        {"steps": 40, "stages": 2},
+        pytest.param({"steps": 40, "stages": 2}, marks=pytest.mark.slow),
         pytest.param(
             {"kind": "geometry", "group_steps": 10, "steps": 16, "stages": 1}, marks=pytest.mark.slow
         ),
@@ -59,3 +69,61 @@ def test_a_run_goes_on_with_the_engine_that_it_began_with(folder: Path) -> None:
     train(quick_options(folder, "kept", **asked))
     with pytest.raises(ProgdfError, match="was started with --engine cpu, not warp"):
         train(quick_options(folder, "kept", engine="warp", resume=True, **asked))
+
+
+@pytest.fixture
+def card(monkeypatch: pytest.MonkeyPatch) -> Iterator[Card]:
+    """A card on which the reference draws in place of warp."""
+    monkeypatch.setitem(ENGINES, "warp", ENGINES["reference"])
+    get_engine.cache_clear()
+    for module in (training, trainer.setup):
+        monkeypatch.setattr(
+            module, "engine_device", lambda name: CARD if name == "warp" else torch.device("cpu")
+        )
+    with Card() as made:
+        yield made
+    get_engine.cache_clear()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "asked",
+    [
+        {"kind": "style", "steps": 8, "stages": 1},
+        {"steps": 16, "stages": 2},
+        {"kind": "geometry", "group_steps": 4, "steps": 8, "stages": 1},
+    ],
+    ids=["style", "color", "geometry"],
+)
+def test_a_whole_run_works_where_its_steps_are_on_a_card(
+    tmp_path: Path, card: Card, asked: dict[str, object]
+) -> None:
+    """Nothing on the card meets what is not, and the result is that of the processor."""
+    write_bear(tmp_path, 400)
+    asked = {"part": "scarf", "views": 4, "image_size": 40} | asked
+    there = train(quick_options(tmp_path, "there", engine="warp", **asked))
+    assert card.moved > 0
+    here = train(quick_options(tmp_path, "here", engine="cpu", **asked))
+    assert there.report["edit"]["psnr_to_views"] == pytest.approx(
+        here.report["edit"]["psnr_to_views"], abs=0.02
+    )
+    assert type(there.trajectory.end) is Tensor
+
+
+@pytest.mark.parametrize("kind", ["color", "style", "geometry"])
+def test_no_step_moves_anything_to_the_card_or_back(card: Card, kind: str) -> None:
+    case, moved = small("scarf", 400, 2, 40), []
+    scene = case.scene.to(CARD)
+    original = pack(scene[case.region.members.to(CARD)], with_shN=True)
+    crops = [
+        crop_scene(scene, case.region.members, v.camera, v.box, WHITE, engine="warp") for v in case.views
+    ]
+    targets = [crop_.original().clamp(0.0, 1.0).flip(2) for crop_ in crops]
+    objective = Objective(perceptual_loss()[0], OptimizeOptions(perceptual_weight=0.3, sharpness="hinge"))
+    rates = learning_rates(kind, original.shape[1], 1.0)
+    for steps in (2, 2, 6):
+        before = card.moved
+        stages = [TargetStage(1.0, targets, steps)]
+        assert list(optimize(original, crops, [], stages, objective, PgsSettings(rates, ramp=0.0)))
+        moved.append(card.moved - before)
+    assert moved[2] == moved[1], "the first brings the network there, each its rates"
