@@ -153,9 +153,8 @@ class RasterEngine(Protocol):
 
 def choose_engine(name: str) -> str:
     """The engine that "auto" is on this machine: warp where there is a card and it can draw, else cpu."""
-    if name != "auto":
-        return name
-    return "warp" if torch.cuda.is_available() and find_spec("warp") else "cpu"
+    card = torch.cuda.is_available() and find_spec("warp") is not None
+    return name if name != "auto" else "warp" if card else "cpu"
 
 
 def engine_device(name: str) -> torch.device:

@@ -169,8 +169,10 @@ def optimize_members(
     """
     scene, members = setup.scene, setup.region.members
     bands = optimization.sh != "off"
-    engine = optimization.engine
-    device = engine_device(engine)
+    engine, device = optimization.engine, engine_device(optimization.engine)
+    if engine == "warp":
+        card = torch.cuda.get_device_name(device) if device.type == "cuda" else "the CPU, in place of a card"
+        log.say(f"the steps are drawn by warp on {card}")
     original = pack(scene[members], with_shN=scene.sh_degree > 0).to(device)
     still = optimization.kind == "color" and optimization.rates == "kind"
     crops = _crops(setup, setup.train, still, engine)
@@ -228,16 +230,13 @@ def _stages(optimization: OptimizeOptions, setup: TrainingSetup, edited: Picture
     """The strengths to optimize towards, and the steps that each gets."""
     steps = max(optimization.steps, len(edited) + 1)  # each stage is to have one
     return [
-        TargetStage(s, _boxes(pictures, setup.train, optimization), steps)
+        TargetStage(s, _boxes(pictures, setup.train, optimization.engine), steps)
         for (s, pictures), steps in zip(edited.items(), _steps_by_stage(steps, len(edited)), strict=True)
     ]
 
 
-def _boxes(
-    pictures: Sequence[Tensor], views: Sequence[View], optimization: OptimizeOptions
-) -> Sequence[Tensor]:
-    """What the boxes show, where the engine has it."""
-    device, pairs = engine_device(optimization.engine), zip(pictures, views, strict=False)
+def _boxes(pictures: Sequence[Tensor], views: Sequence[View], engine: str) -> Sequence[Tensor]:
+    device, pairs = engine_device(engine), zip(pictures, views, strict=False)
     return stored_pictures(crop(picture, view.box).to(device) for picture, view in pairs)
 
 
@@ -261,13 +260,14 @@ def _prepare_colors(
     log: RunLog,
 ) -> tuple[Solver, Model, Pictures, list[TargetStage], list[Judge]]:
     """The views to solve for, how much is modelled, the strengths; and what says when each is done."""
+    engine = optimization.engine
     with log.stage("weights"):
         drawn = color_views(crops, original)
-        judging = _judging(setup, drawn, original, edited, optimization)
+        judging = _judging(setup, drawn, original, edited, engine)
         cameras = [view.camera for view in setup.train]
         ties = surface_ties(setup.scene, setup.region.members, cameras) if options.views.pictures else None
     with log.stage("model"):
-        judge, finished = judging(edited[max(edited)]), _boxes(edited[max(edited)], setup.train, optimization)
+        judge, finished = judging(edited[max(edited)]), _boxes(edited[max(edited)], setup.train, engine)
         solver, most = make_solver(drawn, original, ties), iterations(optimization.steps)
         trials = [(solver, judge)] if ties is None else split_solver(solver, original, finished)
         model = choose_model(solver, trials, finished, most, 1 if optimization.sh == "off" else 4)
@@ -277,23 +277,19 @@ def _prepare_colors(
         unseen = len(original) - int(solver.asked.sum())
         log.say(f"{unseen} members that no picture shows follow the map and their own surface")
     edited = edited if between is None else between(model.allowed_share)
-    stages = [TargetStage(s, _boxes(some, setup.train, optimization), 1) for s, some in edited.items()]
+    stages = [TargetStage(s, _boxes(some, setup.train, engine), 1) for s, some in edited.items()]
     return solver, model, edited, stages, [judging(pictures) for pictures in edited.values()]
 
 
 def _judging(
-    setup: TrainingSetup,
-    drawn: Sequence[ColorView],
-    original: Tensor,
-    edited: Pictures,
-    optimization: OptimizeOptions,
+    setup: TrainingSetup, drawn: Sequence[ColorView], original: Tensor, edited: Pictures, engine: str
 ) -> Callable[[Sequence[Tensor]], Judge]:
     """All views' whole pictures of an edit -> the held-out views that choose, or all where there are none."""
     views, count = split_held_out(setup.held_out)[0], len(setup.train)
     if not views or len(edited[max(edited)]) <= count:
-        return lambda pictures: Judge(drawn, _boxes(pictures, setup.train, optimization))
-    choosing = color_views(_crops(setup, views, True, optimization.engine), original)
-    return lambda pictures: Judge(choosing, _boxes(split_held_out(pictures[count:])[0], views, optimization))
+        return lambda pictures: Judge(drawn, _boxes(pictures, setup.train, engine))
+    choosing = color_views(_crops(setup, views, True, engine), original)
+    return lambda pictures: Judge(choosing, _boxes(split_held_out(pictures[count:])[0], views, engine))
 
 
 def _record_way(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -43,6 +44,8 @@ def test_a_run_on_warp_ends_at_the_cpu_engine_s_digits(folder: Path, asked: dict
         options = quick_options(folder, out, part="scarf", views=4, image_size=48, engine=engine, **asked)
         ends.append(train(options))
     cpu, warp = ends
+    assert "the steps are drawn by warp on " in warp.folder.log.read_text()
+    assert "by warp" not in cpu.folder.log.read_text()
     # a step's gradients differ by 1e-5 of the largest, and Adam takes what hardly shows for as much
     assert warp.report["edit"]["psnr_to_views"] == pytest.approx(
         cpu.report["edit"]["psnr_to_views"], abs=0.02
@@ -62,6 +65,17 @@ def test_auto_is_warp_where_there_is_a_card_and_warp_and_else_the_cpu(
         monkeypatch.setattr(engines, "find_spec", lambda name, there=installed: object() if there else None)
         assert choose_engine("auto") == chosen
         assert choose_engine("cpu") == "cpu"
+
+
+def test_without_warp_the_run_is_refused_before_it_begins(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "warp", None)
+    monkeypatch.delitem(sys.modules, ENGINES["warp"], raising=False)
+    get_engine.cache_clear()
+    with pytest.raises(ProgdfError, match="the engine warp needs warp-lang; pip install"):
+        train(quick_options(folder, "none", engine="warp"))
+    assert not (folder / "none").exists()
 
 
 def test_a_run_goes_on_with_the_engine_that_it_began_with(folder: Path) -> None:
