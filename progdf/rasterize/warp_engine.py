@@ -10,6 +10,7 @@ the same in every run on the same device.
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -66,7 +67,8 @@ wp.set_module_options({"enable_backward": False})
 def _start() -> None:
     """Start Warp, without a word; compiled kernels lie beside the cpu engine's."""
     wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
-    wp.config.kernel_cache_dir = wp.config.kernel_cache_dir or str(find_cache_folder() / "warp")
+    named = wp.config.kernel_cache_dir or os.environ.get("WARP_CACHE_PATH")
+    wp.config.kernel_cache_dir = named or str(find_cache_folder() / "warp")
     wp.init()
 
 
@@ -272,8 +274,7 @@ def alpha_weights(gaussians: ActivatedGaussians, view: RasterView, mask: Tensor)
     _, _, last, deepest = _blend(arrays, lists, view.crop)
     sums, inside = arrays[0].new_zeros(len(lists.members), 4), mask.to(arrays[0]).flatten()
     _launch(add_weights_kernel, lists, view.crop, (*arrays, last, deepest, lists.slots.int(), inside, sums))
-    totals = sums.new_zeros(len(gaussians.means), 4)
-    return totals.index_copy(0, splats.rows, _add_slots(sums, lists))
+    return sums.new_zeros(len(gaussians.means), 4).index_copy(0, splats.rows, _add_slots(sums, lists))
 
 
 def is_listed(splats: ReferenceSplats, info: RasterInfo, rows: Tensor | None) -> Tensor | None:

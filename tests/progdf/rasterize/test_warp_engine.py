@@ -59,7 +59,8 @@ def test_the_kernels_compile_for_cards_without_a_card(tmp_path: Path) -> None:
 def test_nothing_is_loaded_before_the_engine_is_asked_for_and_its_start_is_quiet() -> None:
     code = (
         "import sys; import progdf, progdf.rasterize; assert 'warp' not in sys.modules;"
-        "from progdf.rasterize.engines import get_engine; get_engine('warp'); assert 'warp' in sys.modules"
+        "from tests.helpers.scenes import front_camera, one_gaussian;"
+        "progdf.render(one_gaussian(), front_camera(), engine='warp'); assert 'warp' in sys.modules"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert not done.stdout
