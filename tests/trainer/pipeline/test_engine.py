@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -19,7 +20,7 @@ from tests.helpers.card import CARD, Card
 from tests.helpers.drawn import NEEDS_WARP
 from tests.helpers.trained import WHITE, quick_options, small, train, write_bear
 from trainer.optimize.losses import Objective, perceptual_loss
-from trainer.optimize.pgs import PgsSettings, TargetStage, learning_rates, optimize
+from trainer.optimize.pgs import PgsSettings, PgsState, TargetStage, learning_rates, optimize
 from trainer.options import OptimizeOptions
 from trainer.run import training
 from trainer.views.crops import crop_scene
@@ -141,3 +142,18 @@ def test_no_step_moves_anything_to_the_card_or_back(card: Card, kind: str) -> No
         assert list(optimize(original, crops, [], stages, objective, PgsSettings(rates, ramp=0.0)))
         moved.append(card.moved - before)
     assert moved[2] == moved[1], "the first brings the network there, each its rates"
+
+
+def test_a_saved_state_goes_back_to_the_card(card: Card) -> None:
+    rows = torch.rand(5, 14).to(CARD)
+    state = PgsState(rows)
+    state.view(3)
+    state.descend(torch.rand(5, 14).to(CARD), torch.ones(14).to(CARD), 0.1, True, 0.9)
+    state.pictures = [torch.rand(4, 4, 3).to(CARD)]
+    saved = state.capture_state()
+    kept = replace(saved, tensors={name: tensor.detach().cpu() for name, tensor in saved.tensors.items()})
+    again = PgsState(rows)
+    again.restore(kept)
+    assert again.moved.device == again.pictures[0].device == CARD
+    assert torch.equal(again.moved.detach().cpu(), state.moved.detach().cpu())
+    assert torch.equal(again.second.cpu(), state.second.cpu())
