@@ -30,6 +30,7 @@ COMMAND = "python -m benchmarks"
 BENCHES: dict[str, str] = {
     "training": "benchmarks.training:tables",
     "rasterize": "benchmarks.rasterizer:tables",
+    "warp": "benchmarks.rasterizer:warp_tables",
     "hard": "benchmarks.rasterizer:hard_tables",
     "field": "benchmarks.field:tables",
     "edits": "benchmarks.edits:tables",
@@ -43,7 +44,7 @@ BENCHES: dict[str, str] = {
     "pictures": "benchmarks.pictures:tables",
 }
 
-PAGE = ("training", "field", "viewer", "rasterize", "moving", "frames", "hard")
+PAGE = ("training", "field", "viewer", "rasterize", "warp", "moving", "frames", "hard")
 """What docs/speed-and-error.md is made of."""
 
 ROOT = Path(__file__).parents[1]
@@ -54,8 +55,8 @@ class BenchOptions:
     """Measure speed against error; each benchmark interleaves what it compares in one process."""
 
     what: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
-    """page (all of docs/speed-and-error.md), training, rasterize, hard, field, edits, networks, viewer,
-    select, frames, moving, window, warps, pictures; none named is all."""
+    """page (all of docs/speed-and-error.md), training, rasterize, warp, hard, field, edits, networks,
+    viewer, select, frames, moving, window, warps, pictures; none named is all."""
     json: Path | None = None
     """also write the tables to this JSON file."""
     markdown: tuple[Path, ...] = ()

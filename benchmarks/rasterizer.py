@@ -1,26 +1,37 @@
-"""`python -m benchmarks rasterize`: the cpu engine's speed beside its error, against tiles in plain torch.
+"""`python -m benchmarks rasterize` and `warp`: an engine's speed beside its error.
+
+First the cpu engine, against tiles in plain torch.
 
 What it is compared with is a plain tiled renderer in float32, differentiated by autograd: tiles of 16x16
 pixels, within which every listed Gaussian meets every pixel; listed is what the square of three standard
 deviations of the longer axis touches, as published (Kerbl 2023). Both take turns in one process, on one
 thread each and on two.
+
+Then the engine warp: on a card, if there is one, on the CPU device for its errors.
 """
 
 from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from math import pi
 
 import torch
 from torch import Tensor
 
 from progdf.camera import Camera, intrinsics
+from progdf.gaussians import Gaussians, pack
 from progdf.rasterize import reference, render, set_threads
-from progdf.rasterize.engines import ActivatedGaussians, RasterView
+from progdf.rasterize.engines import ActivatedGaussians, RasterView, engine_device
+from progdf.sh import C0
+from trainer.optimize.losses import Objective, perceptual_loss
+from trainer.optimize.pgs import PgsSettings, TargetStage, learning_rates, optimize
+from trainer.options import OptimizeOptions
+from trainer.views.crops import crop_scene
 
 from .table import Table, Wall
 
@@ -32,11 +43,15 @@ class RasterCase:
     """A random cloud in front of a camera."""
 
     count: int  # Gaussians
-    size: int  # width and height of the image, pixels
+    size: int  # width of the image, pixels
     baseline: bool = True  # whether torch can do it in the memory of a small machine
+    height: int = 0  # of the image, pixels; 0: as its width
 
 
 CASES = (RasterCase(2_000, 128), RasterCase(20_000, 256), RasterCase(100_000, 512, baseline=False))
+WARP_CASES = CASES[:2]
+CARD_CASES = (RasterCase(200_000, 512, False), RasterCase(1_000_000, 1920, False, 1080))
+STEP_CASE = RasterCase(200_000, 512, False)
 
 
 THREADS = (1, 2)
@@ -78,14 +93,15 @@ def cloud(case: RasterCase) -> tuple[ActivatedGaussians, Camera]:
     """
     rng = torch.Generator().manual_seed(case.count)
     means = torch.randn(case.count, 3, generator=rng) * 0.7 + torch.tensor([0.0, 0.0, 4.0])
-    K = intrinsics(0.9, case.size, case.size)
+    height = case.height or case.size
+    K = intrinsics(0.9, case.size, height)
     scale = 1.4 * 4.0 / float(K[0, 0])
     scales = scale * torch.exp(0.5 * torch.randn(case.count, 3, generator=rng))
     quats = torch.randn(case.count, 4, generator=rng)
     opacities = torch.sigmoid(1.5 * torch.randn(case.count, generator=rng))
     colors = torch.rand(case.count, 3, generator=rng)
     activated = ActivatedGaussians(means, quats, scales, opacities, colors)
-    return activated, Camera(torch.eye(4), K, case.size, case.size)
+    return activated, Camera(torch.eye(4), K, case.size, height)
 
 
 def draw(
@@ -93,14 +109,25 @@ def draw(
 ) -> tuple[float, Tensor, list[Tensor]]:
     """Milliseconds of one pass, the image, and the gradients that a fixed gradient of the image leads to."""
     leaves = inputs.each(lambda tensor: tensor.clone().to(dtype).requires_grad_(backward))
-    ramp = torch.linspace(0.0, pi, camera.width, dtype=dtype).sin()
-    grad_image = torch.stack([ramp[:, None] * ramp, ramp[:, None] - ramp, -ramp * ramp[:, None]], -1)
+    across, down = (
+        torch.linspace(0.0, pi, side, dtype=dtype, device=leaves.means.device).sin()
+        for side in (camera.width, camera.height)
+    )
+    grad_image = torch.stack([down[:, None] * across, down[:, None] - across, -across * down[:, None]], -1)
+    _settle(leaves.means)
     begin = time.perf_counter()
     image = _image(engine, leaves, camera)
     if backward:
         image.backward(grad_image)  # type: ignore[no-untyped-call]
+    _settle(leaves.means)
     elapsed = 1e3 * (time.perf_counter() - begin)
     return elapsed, image.detach(), [leaf.grad for leaf in leaves.tensors if leaf.grad is not None]
+
+
+def _settle(tensor: Tensor) -> None:
+    """Wait for what a card has been given."""
+    if tensor.is_cuda:
+        torch.cuda.synchronize()
 
 
 def _image(engine: str, gaussians: ActivatedGaussians, camera: Camera) -> Tensor:
@@ -163,12 +190,18 @@ def measure(case: RasterCase, rounds: int = 9, torch_rounds: int = 3) -> RasterT
     with torch.set_grad_enabled(case.baseline):
         _, exact, exact_gradients = draw(inputs, camera, "reference", torch.float64, backward=case.baseline)
     plain = 1e3 * (time.process_time() - used)
+    return RasterTimes(case, duels, plain, *_errors(image, gradients, exact, exact_gradients))
+
+
+def _errors(
+    image: Tensor, gradients: list[Tensor], exact: Tensor, exact_gradients: list[Tensor]
+) -> tuple[float, dict[str, float]]:
+    """Largest difference of a color; of each input's gradient, over the largest."""
     errors = {
-        name: float((gradient - expected).abs().max() / expected.abs().max())
+        name: float((gradient.cpu() - expected).abs().max() / expected.abs().max())
         for name, gradient, expected in zip(INPUTS, gradients, exact_gradients, strict=False)
     }
-    image_error = float((image - exact).abs().max())
-    return RasterTimes(case, duels, plain, image_error, errors)
+    return float((image.cpu() - exact).abs().max()), errors
 
 
 @contextmanager
@@ -230,24 +263,124 @@ def tables() -> list[Table]:
     return [Table("rasterize", "CPU rasterizer", columns, tuple(rows), note)]
 
 
+def warp_tables(cases: Sequence[RasterCase] | None = None, rounds: int = 5) -> list[Table]:
+    """The engine warp on this machine's card; without one on a CPU, where only its errors count.
+
+    Args:
+        cases: what to draw; None: `CARD_CASES` or `WARP_CASES`
+        rounds: of which medians are taken, after one that is not counted
+    """
+    device = engine_device("warp")
+    card = torch.cuda.get_device_name(device) if device.type == "cuda" else "CPU device, for tests"
+    rows = []
+    for case in cases or (CARD_CASES if device.type == "cuda" else WARP_CASES):
+        inputs, camera = cloud(case)
+        there = inputs.each(lambda tensor: tensor.to(device))
+        oracle, dtype = ("reference", torch.float64) if case.baseline else ("cpu", torch.float32)
+        _, exact, exact_gradients = draw(inputs, camera, oracle, dtype, backward=True)
+        times = [
+            [draw(there, camera, "warp", torch.float32, backward)[0] for _ in range(rounds + 1)][1:]
+            for backward in (False, True)
+        ]
+        figures = []
+        for engine, given in (("warp", there), ("cpu", inputs)):
+            used = []
+            with _threads(1, 1):
+                for _ in range(rounds + 1):
+                    used.append(-time.process_time())
+                    _, image, gradients = draw(given, camera, engine, torch.float32, backward=True)
+                    used[-1] += time.process_time()
+            figures.append(f"{1e3 * statistics.median(used[1:]):.0f}")
+            error, errors = _errors(image, gradients, exact, exact_gradients)
+            worst = max(errors, key=lambda name: errors[name])
+            figures += (
+                [f"{error:.1e}", f"{errors[worst]:.1e} ({worst})"]
+                if case.baseline or engine == "warp"
+                else ["", ""]
+            )
+        count = f"{case.count:,}".replace(",", " ")
+        size = f"{camera.width}×{camera.height}"
+        rows.append((card, count, size, *(_spread(some) for some in times), *figures))
+    if device.type == "cuda":
+        rows.append(
+            (card, "200 000 members", "512×512", "–", f"{_step_time(STEP_CASE, 40):.1f} a step", *[""] * 6)
+        )
+    columns = (
+        "device",
+        "Gaussians",
+        "pixels",
+        Wall("forward (ms)"),
+        Wall("forward + backward (ms)"),
+        "of the processor (ms)",
+        "image error",
+        "worst gradient error",
+        "cpu engine, of the processor (ms)",
+        "its image error",
+        "its worst gradient error",
+    )
+    note = (
+        "Median and range, the card waited for; of the processor: forward and backward, on one thread. "
+        "Errors are against the reference in float64; of the cases that a card gets (200 000 and 1 000 000 "
+        "Gaussians) against the cpu engine. A step is a whole one of training: members to picture, L1, LPIPS "
+        "every second step, gradients, Adam. Warp's CPU device runs the same kernels one thread after "
+        "another, for tests alone."
+    )
+    return [Table("warp", "The engine warp", columns, tuple(rows), note)]
+
+
+def _step_time(case: RasterCase, steps: int) -> float:
+    """Milliseconds of a step of `optimize`, half of the steps not counted, every Gaussian a member."""
+    inputs, camera = cloud(case)
+    rgb = (inputs.colors - 0.5) / C0
+    raw = Gaussians(
+        inputs.means,
+        inputs.quats,
+        inputs.scales.log(),
+        inputs.opacities.logit(),
+        rgb,
+        rgb[:, None].expand(-1, 0, 3),
+    ).to(engine_device("warp"))
+    crop = crop_scene(
+        raw, torch.arange(case.count), camera, (0, 0, case.size, case.size), torch.ones(3), engine="warp"
+    )
+    rows = pack(raw, with_shN=False)
+    target = crop.original().clamp(0.0, 1.0).flip(2)
+    options = OptimizeOptions(perceptual_weight=0.3, sharpness="off")
+    settings = PgsSettings(learning_rates("style", rows.shape[1], 1.0), ramp=0.0, reach=0.0)
+    ends: list[float] = []
+    stages, objective = [TargetStage(1.0, [target], steps)], Objective(perceptual_loss()[0], options)
+    for _ in optimize(
+        rows, [crop], [], stages, objective, settings,
+        on_step=lambda step, left: ends.append(time.perf_counter()),
+    ):  # fmt: skip
+        pass
+    return 1e3 * (ends[-1] - ends[steps // 2]) / (steps - 1 - steps // 2)
+
+
 def hard_tables() -> list[Table]:
-    """What every engine must survive: the largest differences of the cpu engine from the reference."""
+    """What every engine must survive: the largest differences of the fast engines from the reference."""
     from tests.helpers.drawn import CASES as HARD
     from tests.helpers.drawn import drawn_case, relative_errors
 
     rows = []
+    engines = ("cpu", "warp") if find_spec("warp") else ("cpu",)
     for name, case in HARD.items():
-        fast, plain = drawn_case(name, "cpu"), drawn_case(name, "reference")
-        errors = relative_errors(fast, plain)
-        worst = max(errors, key=lambda name: errors[name])
-        apart = float((fast.image - plain.image).abs().max())
-        where = f" ({worst})" if errors[worst] else ""
-        count = f"{len(case.gaussians):,}".replace(",", " ")
-        rows.append((name, count, f"{apart:.1e}", f"{errors[worst]:.1e}{where}"))
-    columns = ("case", "Gaussians", "image error", "worst gradient error")
+        plain = drawn_case(name, "reference")
+        row = [name, f"{len(case.gaussians):,}".replace(",", " ")]
+        for engine in engines:
+            fast = drawn_case(name, engine)
+            errors = relative_errors(fast, plain)
+            worst = max(errors, key=lambda name: errors[name])
+            where = f" ({worst})" if errors[worst] else ""
+            row += [f"{float((fast.image - plain.image).abs().max()):.1e}", f"{errors[worst]:.1e}{where}"]
+        rows.append(tuple(row))
+    figures = [
+        f"{engine}: {figure}" for engine in engines for figure in ("image error", "worst gradient error")
+    ]
+    columns = ("case", "Gaussians", *figures)
     note = (
-        "The cpu engine in float32 against the reference in float64: largest difference of a color; of a "
-        "gradient over the largest, of the input named. The cases are those of "
+        "The engines in float32 against the reference in float64, warp on its CPU device: largest "
+        "difference of a color; of a gradient over the largest, of the input named. The cases are those of "
         "`tests/progdf/rasterize/test_rasterize.py`, which fails beyond its tolerances."
     )
     return [Table("hard", f"{len(rows)} hard cases", columns, tuple(rows), note)]

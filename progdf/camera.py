@@ -136,6 +136,10 @@ class Camera:
         """The camera's center in world units. [3]"""
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
+    def to(self, device: torch.device) -> Camera:
+        """The same camera with its matrices on another device."""
+        return replace(self, viewmat=self.viewmat.to(device), K=self.K.to(device))
+
     def resize(self, width: int, height: int) -> Camera:
         """The same view in another image size; the intrinsics scale with each axis."""
         scale = torch.tensor([[width / self.width], [height / self.height], [1.0]], dtype=self.K.dtype)

@@ -82,5 +82,5 @@ def matrix_turns(matrices: Tensor) -> Tensor:
     """Rotation vectors of rotation matrices; no gradient. [P,3,3] -> [P,3]"""
     from scipy.spatial.transform import Rotation  # half a second that nothing else here needs
 
-    turns = Rotation.from_matrix(matrices.detach().double().numpy()).as_rotvec()
+    turns = Rotation.from_matrix(matrices.detach().double().cpu().numpy()).as_rotvec()
     return torch.from_numpy(turns).to(matrices)

@@ -124,18 +124,18 @@ def rotate_about_x(shN: Tensor) -> Tensor:
 
 def _wigner_change(degree: int, quats: Tensor) -> Tensor:
     """The Wigner matrices of bands 1 to `degree`, less the identity. [N,4] -> [N,K,K] float64"""
-    directions, inverse = _samples(degree)
-    back = quats.double() * torch.tensor([1.0, -1.0, -1.0, -1.0], dtype=torch.float64)
+    directions, inverse = _samples(degree, quats.device)
+    back = quats.double() * quats.new_tensor([1.0, -1.0, -1.0, -1.0], dtype=torch.float64)
     turned = rotate_vectors(directions[None], back[:, None])
     seen = basis(degree, turned) - basis(degree, directions)
     return inverse @ seen[..., 1:]
 
 
 @cache
-def _samples(degree: int) -> tuple[Tensor, Tensor]:
+def _samples(degree: int, device: torch.device) -> tuple[Tensor, Tensor]:
     """Directions, and the bands from the colors seen along them. [J,3], [K,J] float64"""
     z = 1.0 - (2.0 * torch.arange(_SAMPLES, dtype=torch.float64) + 1.0) / _SAMPLES
     angle = torch.arange(_SAMPLES, dtype=torch.float64) * math.pi * (3.0 - math.sqrt(5.0))
     radius = (1.0 - z * z).sqrt()
     directions = torch.stack([radius * angle.cos(), radius * angle.sin(), z], dim=1)
-    return directions, torch.linalg.pinv(basis(degree, directions))[1:]
+    return directions.to(device), torch.linalg.pinv(basis(degree, directions))[1:].to(device)

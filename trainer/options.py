@@ -34,6 +34,7 @@ Bands = Literal["auto", "on", "off"]
 Preset = Literal["default", "paper"]
 Quantize = Literal["off", "nf4"]
 Device = Literal["auto", "cpu"]
+Engine = Literal["auto", "cpu", "warp"]
 
 DETECTOR, SAM_MODEL = "IDEA-Research/grounding-dino-tiny", "facebook/sam-vit-base"
 FieldKind = Literal["auto", "separable", "keyframes", "lossless", "neural"]
@@ -174,6 +175,9 @@ class OptimizeOptions:
     """Slider values. even: equal steps look equally large, and an editor with a strength control is asked for
     pictures that do; stages: s is the editor's own strength, even in between; time: the optimizer's. auto:
     even, but stages where folder: has pictures of several strengths."""
+    engine: Engine = "auto"
+    """What draws the steps: cpu; or warp (extra gpu), where the steps stay on a CUDA card, or, slowly and for
+    tests, on a CPU that stands in for one. auto: warp, if there is a card and it is installed; else cpu."""
     perceptual_every: Fixed[int] = 2  # LPIPS is paid for every so many steps
     # Of the renders: not less than the target's, or the printed term, which pulls at no pixel but the rim's.
     sharpness: Fixed[Sharpness] = "kind"

@@ -10,10 +10,12 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 from progdf.errors import ProgdfError
 from progdf.io.atomic import is_portable
 from progdf.metrics.image import NO_DIFFERENCE
+from progdf.rasterize.engines import choose_engine
 from trainer.editors import COSTLY_STRENGTHS, EXTERNAL, PER_VIEW
 from trainer.editors.adapters import default_model
 from trainer.editors.instruct import parse_guidance
@@ -34,6 +36,7 @@ from .options import (
     STAGE_STEPS,
     VIEWS,
     EditorOptions,
+    Engine,
     FieldOptions,
     OptimizeOptions,
     Preset,
@@ -83,6 +86,7 @@ def resolve(options: TrainOptions) -> TrainOptions:
             optimize,
             steps=min(optimize.steps, QUICK_STEPS) if quick else optimize.steps,
             stages=stages,
+            engine=cast(Engine, choose_engine(optimize.engine)),
             slider="even" if optimize.slider == "auto" and paced else optimize.slider,
             seed=options.seed,
         ),

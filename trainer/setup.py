@@ -17,6 +17,7 @@ from progdf.io.cameras import load_cameras
 from progdf.io.images import write_image
 from progdf.io.picture_camera import up_in_picture
 from progdf.rasterize import alpha_weights
+from progdf.rasterize.engines import engine_device
 from progdf.region import Region
 from progdf.scene.bounds import is_surrounding
 from progdf.scene.up_axis import UpAxis, find_up, up_from_json
@@ -282,17 +283,21 @@ def whole_views(setup: TrainingSetup) -> TrainingSetup:
     )
 
 
-def probe_views(setup: TrainingSetup, count: int = _PROBES, still: bool = False) -> list[CropScene]:
-    """A few training views at half size, in which movement is measured. `still`: see `crop_scene`"""
+def probe_views(
+    setup: TrainingSetup, count: int = _PROBES, still: bool = False, engine: str = "cpu"
+) -> list[CropScene]:
+    """A few training views at half size, in which movement is measured. Others: see `crop_scene`"""
+    scene = setup.scene.to(engine_device(engine))
     chosen = setup.train[:: max(1, len(setup.train) // count)][:count]
     return [
         crop_scene(
-            setup.scene,
+            scene,
             setup.region.members,
             view.camera.resize(max(1, view.camera.width // 2), max(1, view.camera.height // 2)),
             (view.box[0] // 2, view.box[1] // 2, max(1, view.box[2] // 2), max(1, view.box[3] // 2)),
             setup.background,
             still,
+            engine,
         )
         for view in chosen
     ]

@@ -65,13 +65,13 @@ def monomials(colors: Tensor, degree: int) -> Tensor:
 
 
 @cache
-def _sphere(degree: int) -> tuple[Tensor, Tensor]:
+def _sphere(degree: int, device: torch.device) -> tuple[Tensor, Tensor]:
     """Values of the bands in even directions of the sphere, and their least squares. [D,B], [B,D] float32"""
     index = torch.arange(_DIRECTIONS, dtype=torch.float64) + 0.5
     z, angle = 1 - 2 * index / _DIRECTIONS, math.pi * (1 + math.sqrt(5)) * index
     radius = (1 - z * z).sqrt()
     values = basis(degree, torch.stack([radius * angle.cos(), radius * angle.sin(), z], dim=1))
-    return values.float(), torch.linalg.pinv(values).float()
+    return values.float().to(device), torch.linalg.pinv(values).float().to(device)
 
 
 def map_colors(sh: Tensor, table: Tensor, degree: int) -> Tensor:
@@ -90,7 +90,7 @@ def map_colors(sh: Tensor, table: Tensor, degree: int) -> Tensor:
         [M,B,3]
     """
     bands = sh.shape[1]
-    if torch.equal(table, identity_map(degree, len(table))):
+    if torch.equal(table, identity_map(degree, len(table)).to(table)):
         return sh.clone()
     if bands == 1:
         colors = sh[:, 0].T * C0 + 0.5
@@ -119,7 +119,7 @@ def look_up(colors: Tensor, table: Tensor) -> Tensor:
 
 def _map_chunk(sh: Tensor, table: Tensor, degree: int) -> Tensor:
     """`map_colors` of the channels of some members. [3,m,B] -> [3,m,B]"""
-    values, inverse = _sphere(math.isqrt(sh.shape[2]) - 1)
+    values, inverse = _sphere(math.isqrt(sh.shape[2]) - 1, sh.device)
     colors = sh @ values.T + 0.5
     mapped = map_drawn(colors, table, degree)
     made = sh + (mapped - colors.clamp_min(0.0)) @ inverse.T
@@ -143,7 +143,7 @@ def member_bands(rows: Tensor) -> Tensor:
 def band_offsets(change: Tensor, channels: int) -> Tensor:
     """A change of the lowest bands as packed offsets. [M,B,3] -> [M,channels]"""
     slices = attribute_slices(channels)
-    offsets = torch.zeros(len(change), channels)
+    offsets = change.new_zeros(len(change), channels)
     offsets[:, slices["sh0"]] = change[:, 0]
     if change.shape[1] > 1:
         first = slices["shN"].start

@@ -120,6 +120,13 @@ class Lpips:
         parts = ([tensor.to(device) for tensor in part] for part in (kernels, biases, importance))
         return cls(backbone, *parts)
 
+    def to(self, device: torch.device) -> Lpips:
+        """The same network on another device; itself where it is there."""
+        if self.kernels[0].device == device:
+            return self
+        parts = (self.kernels, self.biases, self.importance)
+        return Lpips(self.backbone, *([tensor.to(device) for tensor in part] for part in parts))
+
     def features(self, image: Tensor) -> Features:
         """What the network sees in an image of range 0..1; keep it for a target that comes again. [H,W,3]
 

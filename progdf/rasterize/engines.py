@@ -13,6 +13,7 @@ import importlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from importlib.util import find_spec
 from math import isqrt
 from typing import NamedTuple, Protocol, cast
 
@@ -20,6 +21,7 @@ import torch
 from torch import Tensor
 
 from progdf.camera import Camera
+from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.sh import rgb_to_sh0
 
@@ -44,8 +46,15 @@ ANTIALIAS_FLOOR = 0.005
 Crop = tuple[int, int, int, int]
 """A window x0, y0, x1, y1 in pixels of the full image; x1 and y1 are one past the last."""
 
-ENGINES = {"reference": "progdf.rasterize.reference", "cpu": "progdf.rasterize.cpu.engine"}
+ENGINES = {
+    "reference": "progdf.rasterize.reference",
+    "cpu": "progdf.rasterize.cpu.engine",
+    "warp": "progdf.rasterize.warp_engine",
+}
 """Engine name -> module that is a `RasterEngine`, imported when first used."""
+
+MOST_INTERSECTIONS = 100_000_000
+"""(Gaussian, tile) pairs beyond which a view is refused: 1.2 GB forward, 3.6 GB more backward."""
 
 _DRAWN_SH = 16  # coefficients that a picture shows; one that is not finite hides its Gaussian
 
@@ -105,10 +114,23 @@ class RasterView:
     def of(cls, camera: Camera, gaussians: ActivatedGaussians, crop: Crop | None = None) -> RasterView:
         """What `camera` sees of `gaussians`; of its whole image where there is no crop."""
         width, height = camera.width, camera.height
+        viewmat, K = (matrix.to(gaussians.means.device) for matrix in (camera.viewmat, camera.K))
         return cls(
-            camera.viewmat, camera.K, width, height, crop or (0, 0, width, height), camera.near,
-            gaussians.sh_degree, gaussians.antialiased,
+            viewmat, K, width, height, crop or (0, 0, width, height), camera.near, gaussians.sh_degree,
+            gaussians.antialiased,
         )  # fmt: skip
+
+
+class ColorMap(Protocol):
+    """What each of M Gaussians weighs in each pixel of a window: αT, for as long as nothing moves."""
+
+    def picture(self, colors: Tensor) -> Tensor:
+        """Σ αT·c of every pixel, on black. [M,3] -> [h,w,3]"""
+        ...
+
+    def gradient(self, image: Tensor) -> Tensor:
+        """The transpose: Σ αT·g of every Gaussian. [h,w,3] -> [M,3]"""
+        ...
 
 
 class RasterEngine(Protocol):
@@ -123,6 +145,21 @@ class RasterEngine(Protocol):
     def alpha_weights(self, gaussians: ActivatedGaussians, view: RasterView, mask: Tensor) -> Tensor:
         """See `progdf.rasterize.alpha_weights`; colors are not read."""
         ...
+
+    def color_map(self, gaussians: ActivatedGaussians, view: RasterView, rows: Tensor) -> ColorMap:
+        """See `color_map`; colors are not read."""
+        ...
+
+
+def choose_engine(name: str) -> str:
+    """The engine that "auto" is on this machine: warp where there is a card and it can draw, else cpu."""
+    card = torch.cuda.is_available() and find_spec("warp") is not None
+    return name if name != "auto" else "warp" if card else "cpu"
+
+
+def engine_device(name: str) -> torch.device:
+    """Where an engine should have its Gaussians: on the card, if there is one and it draws there."""
+    return torch.device("cuda" if name == "warp" and torch.cuda.is_available() else "cpu")
 
 
 @cache
@@ -172,11 +209,11 @@ def render(
             bit for bit. Gaussians that do not touch it cost next to nothing
         grad_rows: only these rows get gradients, all others zero; takes much less time where they are few.
             [M] int64
-        engine: a key of `ENGINES`; "cpu" computes in float32 (projection in float64) whatever the inputs'
-            type
+        engine: a key of `ENGINES`; all but "reference" compute in float32 (projection in float64) whatever
+            the inputs' type, "warp" on the device that they are on
 
     Returns:
-        Image, transmittance and what the projection yields: float32 of "cpu", of "reference" the means' type.
+        Image, transmittance and what the projection yields: of "reference" the means' type, else float32.
 
     Raises:
         ValueError: a shape does not fit, the crop is empty or leaves the image, the engine is unknown,
@@ -216,6 +253,35 @@ def alpha_weights(gaussians: Gaussians, camera: Camera, mask: Tensor, engine: st
     activated = activate(gaussians, torch.zeros_like(gaussians.means))
     with torch.no_grad():
         return get_engine(engine).alpha_weights(activated, RasterView.of(camera, activated), mask)
+
+
+def color_map(
+    gaussians: ActivatedGaussians, camera: Camera, crop: Crop, rows: Tensor, engine: str = "cpu"
+) -> ColorMap:
+    """What some Gaussians weigh in a window of a view, as `render` draws it.
+
+    Args:
+        gaussians: all N that are drawn; their colors are not read
+        camera: the view
+        crop: x0, y0, x1, y1 of the window
+        rows: which of the N Gaussians, distinct. [M] int64
+        engine: a key of `ENGINES`
+    """
+    black = gaussians._replace(colors=torch.zeros_like(gaussians.means))
+    return get_engine(engine).color_map(black, RasterView.of(camera, black, crop), rows)
+
+
+def check_intersections(splats: int, pairs: int) -> None:
+    """Refuse a view of more than `MOST_INTERSECTIONS` (Gaussian, tile) pairs.
+
+    Raises:
+        ProgdfError: it has more.
+    """
+    if pairs > MOST_INTERSECTIONS:
+        raise ProgdfError(
+            f"{splats} Gaussians meet {pairs} tiles of the image, more than {MOST_INTERSECTIONS}; draw a "
+            "smaller image or a crop, or take giant Gaussians out of the scene"
+        )
 
 
 def _check_shapes(gaussians: ActivatedGaussians) -> None:
@@ -265,7 +331,7 @@ def render_depth(
 
 def paint_depth(gaussians: Gaussians, camera: Camera) -> Gaussians:
     """The scene in the colors (camera z, 1, 0), to be drawn on black from this camera by any engine."""
-    viewmat = camera.viewmat.double()
+    viewmat = camera.viewmat.to(gaussians.means.device).double()
     z = (gaussians.means.double() @ viewmat[2, :3] + viewmat[2, 3]).to(gaussians.means)
     colors = torch.stack([z, torch.ones_like(z), torch.zeros_like(z)], dim=1)
     finite = gaussians.sh[:, :_DRAWN_SH].isfinite().flatten(1).all(1)

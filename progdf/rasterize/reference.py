@@ -6,7 +6,8 @@ Conventions: Kerbl et al. 2023 (3D Gaussian Splatting) with the choices listed i
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -22,6 +23,7 @@ from .engines import (
     FRUSTUM_MARGIN,
     TRANSMITTANCE_MIN,
     ActivatedGaussians,
+    ColorMap,
     Crop,
     RasterInfo,
     RasterView,
@@ -46,12 +48,45 @@ def rasterize(
     gaussians: ActivatedGaussians, view: RasterView, background: Tensor, grad_rows: Tensor | None
 ) -> tuple[Tensor, Tensor, RasterInfo]:
     """See `progdf.rasterize.render`; computed in the type of `means`, projection in float64."""
-    if grad_rows is not None:
-        rows = grad_rows
-        gaussians = gaussians.each(lambda tensor: tensor.detach().index_copy(0, rows, tensor[rows]))
-    splats, info = project(gaussians, view)
+    splats, info = project(of_rows(gaussians, grad_rows), view)
     image, transmittance = blend(splats, view.crop, background)
     return image, transmittance, info
+
+
+def of_rows(gaussians: ActivatedGaussians, rows: Tensor | None) -> ActivatedGaussians:
+    """The same, of which only these rows get gradients; None: all."""
+    if rows is None:
+        return gaussians
+    return gaussians.each(lambda tensor: tensor.detach().index_copy(0, rows, tensor[rows]))
+
+
+def color_map(gaussians: ActivatedGaussians, view: RasterView, rows: Tensor) -> ColorMap:
+    """See `progdf.rasterize.color_map`."""
+    with torch.no_grad():
+        splats, _ = project(gaussians, view)
+    black = splats.colors.new_zeros(3)
+    return DrawnColors(splats, rows, len(gaussians.means), lambda some: blend(some, view.crop, black)[0])
+
+
+@dataclass(frozen=True)
+class DrawnColors:
+    """A color map that draws its splats anew each time."""
+
+    splats: ReferenceSplats
+    rows: Tensor  # which of the N Gaussians have colors, the others are black. [M] int64
+    count: int  # N
+    draw: Callable[[ReferenceSplats], Tensor]  # on black, differentiable in the splats' colors. -> [h,w,3]
+
+    def picture(self, colors: Tensor) -> Tensor:
+        """See `ColorMap`."""
+        every = colors.new_zeros(self.count, 3).index_copy(0, self.rows, colors)
+        return self.draw(replace(self.splats, colors=every[self.splats.rows].to(self.splats.colors)))
+
+    def gradient(self, image: Tensor) -> Tensor:
+        """See `ColorMap`."""
+        colors = image.new_zeros(len(self.rows), 3, requires_grad=True)
+        with torch.enable_grad():
+            return torch.autograd.grad(self.picture(colors), colors, image)[0]
 
 
 def blend(splats: ReferenceSplats, crop: Crop, background: Tensor) -> tuple[Tensor, Tensor]:
@@ -72,7 +107,7 @@ def blend(splats: ReferenceSplats, crop: Crop, background: Tensor) -> tuple[Tens
         bands.append(torch.cat(tiles, dim=1))
     window = torch.cat(bands, dim=0)[y0 - top : y1 - top, x0 - left : x1 - left]
     transmittance = window[..., 3]
-    return window[..., :3] + transmittance[..., None] * background.to(window.dtype), transmittance
+    return window[..., :3] + transmittance[..., None] * background.to(window), transmittance
 
 
 def project(gaussians: ActivatedGaussians, view: RasterView) -> tuple[ReferenceSplats, RasterInfo]:
@@ -129,7 +164,7 @@ def project(gaussians: ActivatedGaussians, view: RasterView) -> tuple[ReferenceS
         rgb.to(dtype),
         extents[order].to(dtype),
     )
-    visible = torch.zeros(len(means), dtype=torch.bool).index_fill(0, splats.rows, True)
+    visible = torch.zeros_like(usable).index_fill(0, splats.rows, True)
     centers = torch.zeros_like(means[:, :2]).index_copy(0, rows, means2d).detach().float()
     return splats, RasterInfo(centers, depths, visible)
 
@@ -145,7 +180,7 @@ def tile_weights(splats: ReferenceSplats, x: int, y: int) -> tuple[Tensor, Tenso
     near_x = (high[:, 0] >= x) & (low[:, 0] <= x + TILE)
     near_y = (high[:, 1] >= y) & (low[:, 1] <= y + TILE)
     members = (near_x & near_y).nonzero()[:, 0]
-    center = torch.arange(TILE, dtype=splats.means2d.dtype) + 0.5
+    center = splats.means2d.new_ones(TILE).cumsum(0) - 0.5
     pixels = torch.cartesian_prod(y + center, x + center).flip(1)
     dx, dy = (pixels[:, None] - splats.means2d[members]).unbind(2)
     l11, l21, l22 = splats.whitening[members].unbind(1)
@@ -163,7 +198,8 @@ def alpha_weights(gaussians: ActivatedGaussians, view: RasterView, mask: Tensor)
     means, width, height = gaussians.means, view.width, view.height
     splats, _ = project(gaussians, view)
     # two channels, zero beyond the image's edge: the mask, and what is image at all
-    inside = torch.stack([mask.to(means.dtype), torch.ones_like(mask, dtype=means.dtype)])
+    mask = mask.to(means)
+    inside = torch.stack([mask, torch.ones_like(mask)])
     inside = torch.nn.functional.pad(inside, (0, -width % TILE, 0, -height % TILE))
     totals = means.new_zeros(len(means), 4)
     for y in range(0, height, TILE):

@@ -5,8 +5,9 @@ from __future__ import annotations
 import pytest
 
 from benchmarks import rasterizer as bench_rasterize
-from benchmarks.rasterizer import RasterCase, hard_tables, measure, tables
+from benchmarks.rasterizer import RasterCase, hard_tables, measure, tables, warp_tables
 from tests.helpers import drawn
+from tests.helpers.drawn import NEEDS_WARP
 
 
 def test_the_rasterizer_benchmark_names_an_error_beside_every_speed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -33,6 +34,19 @@ def test_every_hard_case_has_a_row_with_its_largest_errors(monkeypatch: pytest.M
     assert table.title == "3 hard cases"
     assert all(float(row[2]) <= 2e-6 and float(row[3].split()[0]) <= 2e-5 for row in table.rows)
     assert float(table.rows[1][2]) > 0.0
+
+
+@NEEDS_WARP
+def test_the_engine_warp_has_a_row_that_names_its_device_and_its_errors() -> None:
+    (table,) = warp_tables([RasterCase(60, 32), RasterCase(90, 40, False, 24)], rounds=1)
+    cells = [dict(zip(table.columns, row, strict=True)) for row in table.rows]
+    assert [row["pixels"] for row in cells] == ["32×32", "40×24"]
+    assert [bool(row["its image error"]) for row in cells] == [True, False]
+    for row in cells:
+        assert row["device"]
+        assert float(row["image error"]) <= 2e-6
+        assert float(row["worst gradient error"].split()[0]) <= 2e-5
+    assert bench_rasterize._step_time(RasterCase(60, 40), 6) > 0.0
 
 
 @pytest.mark.slow

@@ -3,19 +3,27 @@
 from __future__ import annotations
 
 import functools
+import importlib.util
 from dataclasses import dataclass, replace
 
+import pytest
 import torch
 from torch import Tensor
 
 from progdf.camera import Camera
 from progdf.gaussians import Gaussians
-from progdf.rasterize import ActivatedGaussians, Crop, RasterInfo, Rendering, activate, render
+from progdf.rasterize import ENGINES, ActivatedGaussians, Crop, RasterInfo, Rendering, activate, render
 from tests.helpers.draws import Draws
 from tests.helpers.scenes import hard_cases
 
 INPUTS = ("means", "quats", "scales", "opacities", "colors", "viewmat", "K", "background")
 CASES = hard_cases()
+
+NEEDS_WARP = pytest.mark.skipif(importlib.util.find_spec("warp") is None, reason="warp-lang is not installed")
+EVERY = [pytest.param(name, marks=NEEDS_WARP if name == "warp" else ()) for name in ENGINES]
+"""All engines."""
+FAST = EVERY[1:]
+"""All but the reference."""
 
 
 @dataclass(frozen=True)

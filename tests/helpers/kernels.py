@@ -13,7 +13,7 @@ import torch
 from progdf.compose.composer import Composer
 from progdf.compose.layers import Layer
 from progdf.rasterize import ActivatedGaussians, activate, alpha_weights, render
-from progdf.rasterize.cpu.engine import color_map
+from progdf.rasterize.engines import color_map
 from progdf.rasterize.cpu.pyramid import Pyramid
 from progdf.rasterize.screen import lines_behind
 from tests.helpers.edits import curved_field, edit_of, some_rows

@@ -15,6 +15,7 @@ from progdf.formats.ply import load_ply, load_ply_with_report, read_header, save
 from progdf.gaussians import Gaussians, pack
 from progdf.rasterize import alpha_weights, render
 from progdf.region import Region
+from tests.helpers.drawn import EVERY
 from tests.helpers.ply_files import scene_of, table_of, write
 from tests.helpers.scenes import front_camera
 from tests.helpers.stacks import Stack, bear_stack
@@ -101,14 +102,14 @@ def test_an_exported_edit_still_says_it(stack: Stack, tmp_path: Path) -> None:
     assert load_ply(tmp_path / "edited.ply").antialiased
 
 
-def test_weights_count_what_is_drawn(stack: Stack) -> None:
+@pytest.mark.parametrize("engine", EVERY)
+def test_weights_count_what_is_drawn(stack: Stack, engine: str) -> None:
     """Σ w over all Gaussians is the share of a pixel that they cover, with the filter as without."""
     scene, camera = stack.scene, to_camera(first_camera(stack.scene, stack.demo.cameras), 40, 30)
     white = replace(scene, sh0=torch.full_like(scene.sh0, 1.7724539), shN=scene.shN[:, :0])
     covered = render(white, camera, (0.0, 0.0, 0.0)).image[..., 0].sum()
-    for engine in ("cpu", "reference"):
-        weights = alpha_weights(scene, camera, torch.ones(30, 40), engine=engine)[:, 2].sum()
-        torch.testing.assert_close(weights, covered, rtol=1e-4, atol=0.0)  # sums of float32
+    weights = alpha_weights(scene, camera, torch.ones(30, 40), engine=engine)[:, 2].sum()
+    torch.testing.assert_close(weights, covered, rtol=1e-4, atol=0.0)  # sums of float32
 
 
 def test_training_views_show_what_is_drawn(stack: Stack) -> None:

@@ -23,7 +23,7 @@ from progdf.gdf.file import Gdf, fingerprint
 from progdf.io.cameras import load_cameras
 from progdf.metrics.image import ROUNDING, decibels
 from progdf.rasterize import activate, render
-from progdf.rasterize.cpu.engine import color_map
+from progdf.rasterize.engines import color_map
 from progdf.region import Region
 from progdf.scene.bounds import is_surrounding
 from progdf.scene.up_axis import find_up
@@ -121,7 +121,7 @@ def _look(scene: Gaussians, region: Region, camera: Camera) -> tuple[View, Color
             others = render(activated, camera, background).image - drawn
     inside = (drawn / share.clamp_min(1e-4)).clamp(0.0, 1.0)
     view = View(camera, (others + drawn).clamp(0.0, 1.0), share[..., 0].clamp(0.0, 1.0), inside, box)
-    counts = torch.ones(*weighed.size, 1, dtype=torch.bool)
+    counts = torch.ones_like(share, dtype=torch.bool)
     return view, ColorView(weighed, others, weights[members], shown, counts)
 
 

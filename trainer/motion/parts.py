@@ -150,8 +150,8 @@ class GroupSearch:
             [start.shift / self.parts.sizes[:, None], start.log_scale[:, None], start.turn], dim=1
         )
         shift, size, turn = _RATES
-        rates = torch.tensor([shift] * 3 + [size] + [turn] * 3)
-        wide_rates = torch.tensor([3 * shift] * 3 + [size] + [0.0] * 3)
+        rates = values.new_tensor([shift] * 3 + [size] + [turn] * 3)
+        wide_rates = values.new_tensor([3 * shift] * 3 + [size] + [0.0] * 3)
         widening = round(_WIDE * self.steps) if wide else 0
 
         def loss_in(values: Tensor, view: int, step: int) -> Tensor:

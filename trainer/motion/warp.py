@@ -84,8 +84,8 @@ def make_control_points(means: Tensor, part: Tensor, count: int) -> ControlPoint
         count: control points in all, at most one a member; parts share them by size, at least one each
     """
     rows, part_of, links, begun = [], [], [], 0
-    nearest = torch.zeros(len(means), _NEAREST, dtype=torch.int64)
-    weights = torch.zeros(len(means), _NEAREST)
+    nearest = part.new_zeros(len(means), _NEAREST)
+    weights = means.new_zeros(len(means), _NEAREST)
     for index, size in enumerate(torch.bincount(part).tolist()):
         mine = (part == index).nonzero()[:, 0]
         points = min(size, max(1, round(count * size / len(means))))
@@ -101,10 +101,10 @@ def make_control_points(means: Tensor, part: Tensor, count: int) -> ControlPoint
         around = min(_LINKS, points - 1)
         spacings = torch.cdist(means[chosen], means[chosen])
         others = spacings.topk(around + 1, dim=1, largest=False).indices[:, 1:]
-        ones = torch.arange(points)[:, None].expand_as(others)
+        ones = torch.arange(points).to(others)[:, None].expand_as(others)
         links.append(begun + torch.stack([ones, others], dim=2).reshape(-1, 2))
         rows.append(chosen)
-        part_of.append(torch.full((points,), index))
+        part_of.append(part.new_full((points,), index))
         begun += points
     at, pairs = torch.cat(rows), torch.cat(links)
     gaps = (means[at[pairs[:, 0]]] - means[at[pairs[:, 1]]]).norm(dim=1)
@@ -121,7 +121,7 @@ def farthest_points(means: Tensor, count: int) -> Tensor:
     for _ in range(count - 1):
         chosen.append(int(distance.argmax()))
         distance = torch.minimum(distance, (means - means[chosen[-1]]).square().sum(dim=1))
-    return torch.tensor(chosen)
+    return means.new_tensor(chosen, dtype=torch.int64)
 
 
 @dataclass(frozen=True)
@@ -325,7 +325,7 @@ class WarpSearch:
     ) -> WarpMotion:
         size = control.spacing
         shift, turn, stretch = _RATES
-        rates = torch.tensor([shift] * 3 + [turn] * 3 + [stretch] * 6)
+        rates = start.shift.new_tensor([shift] * 3 + [turn] * 3 + [stretch] * 6)
         widening = round(wide * self.steps)
 
         def motion_of(values: Tensor) -> WarpMotion:

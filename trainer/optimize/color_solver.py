@@ -163,7 +163,7 @@ class Solver:
     def fit_map(self, degree: int, targets: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
         """The map that comes nearest to these pictures, of degree 0 the identity, and what the members take
         of it. [K,3], [M,B,3]"""
-        table = self.maps.solve(degree, targets) if degree else identity_map(1)
+        table = self.maps.solve(degree, targets) if degree else identity_map(1).to(self.sh)
         return table, self.share[:, None, None] * (map_colors(self.sh, table, max(1, degree)) - self.sh)
 
     def with_mask(self, share: Tensor) -> Solver:
@@ -243,7 +243,7 @@ class Solver:
     ) -> tuple[Tensor, int]:
         """See `residual`; `base`: the colors in each view without it [M,3]; `look`: the judge's error."""
         curvature = self.weights[:, : start.shape[1]]
-        tied = torch.from_numpy(self.held.diagonal())[:, None, None]
+        tied = torch.from_numpy(self.held.diagonal()).to(curvature)[:, None, None]
         inverse = self.asked[:, None, None] / (curvature + tied + ridge)
         now, pull = start, self._pull(base, start, targets, ridge)
         conditioned = along = inverse * pull.descent
@@ -284,7 +284,7 @@ class Solver:
         """The gradient of half of what a residual costs beside the pixels. [M,b,3] -> [M,b,3]"""
         if self.ties is None:
             return ridge * x
-        return ridge * x + torch.from_numpy(self.held @ x.flatten(1).numpy()).view_as(x)
+        return ridge * x + torch.from_numpy(self.held @ x.flatten(1).cpu().numpy()).to(x).view_as(x)
 
     def _pull(
         self, base: Sequence[Tensor], residual: Tensor, targets: Sequence[Tensor], ridge: float
@@ -323,20 +323,20 @@ class Solver:
 
 def make_solver(views: Sequence[ColorView], original: Tensor, ties: Ties | None = None) -> Solver:
     """The views, prepared. `original`: raw member rows [M,14+]; `ties`: where the views are few."""
-    ones = torch.ones(len(original), 3)
+    ones = original.new_ones(len(original), 3)
 
     def weigh(view: ColorView) -> Tensor:
         return view.basis[:, :4].square() * view.map.gradient(view.map.picture(ones) * view.counts)[:, :1]
 
     weights = torch.stack(map_views(weigh, views)).sum(dim=0)[..., None]
     asked, held = (
-        torch.ones(len(original), dtype=torch.bool),
+        torch.ones_like(original[:, 0], dtype=torch.bool),
         csr_matrix((len(original), len(original)), dtype=np.float32),
     )
     if ties is not None:
-        asked = ties.clear & (weights[:, 0, 0] > 0.0)
-        held = ties.of(asked) * np.float32(_TIES * weights[asked, 0].mean())
-    share = torch.ones(len(original))
+        asked = ties.clear.to(weights.device) & (weights[:, 0, 0] > 0.0)
+        held = ties.of(asked.cpu()) * np.float32(_TIES * float(weights[asked, 0].mean()))
+    share = original.new_ones(len(original))
     return Solver(views, member_bands(original), weights, fit_maps(views, share), share, ties, asked, held)
 
 
@@ -428,7 +428,7 @@ def choose_model(
         made, judge = chosen.fit_map(degree, targets)[1], Judge(solver.views, targets)
         begin = (total - made)[:, :1] if best.masked else torch.zeros_like(residual)
         residual, _ = chosen.residual(made, begin, targets, steps, judge, best.error, best.hold)
-    mask = (chosen.share * 255.0).round().to(torch.uint8) if best.masked else None
+    mask = (chosen.share * 255.0).round().to(torch.uint8).cpu() if best.masked else None
     unedited = sum(judge.error(torch.zeros_like(solver.sh)) for judge in judges) / len(trials)
     decided = [(one.name, decibels(one.error)) for one in tried]
     return chosen, Model(degree, best.hold, residual, mask, best.error, unedited, decided)

@@ -20,7 +20,7 @@ from progdf.field.baked import MONOMIALS, identity_map
 from progdf.field.grade import MOST_COLOR, member_bands, monomials
 from progdf.gaussians import unpack
 from progdf.metrics.image import ROUNDING
-from progdf.rasterize.cpu.engine import ColorMap, color_map
+from progdf.rasterize.engines import ColorMap, color_map
 from progdf.sh import basis
 from progdf.threads import one_thread, threads
 from trainer.views.crops import CropScene
@@ -70,10 +70,10 @@ class ColorView:
 
     def halves(self) -> tuple[ColorView, ColorView]:
         """The view with every other square of its pixels, and with the others."""
-        height, width = self.map.size
+        height, width = self.counts.shape[:2]
         side = max(1, max(height, width) // _SQUARES)
         rows, columns = torch.arange(height)[:, None, None] // side, torch.arange(width)[:, None] // side
-        even = (rows + columns) % 2 == 0
+        even = ((rows + columns) % 2 == 0).to(self.counts.device)
         return replace(self, counts=self.counts & even), replace(self, counts=self.counts & ~even)
 
 
@@ -84,7 +84,7 @@ def color_view(crop: CropScene, original: Tensor, bands: int) -> ColorView:
     directions = torch.nn.functional.normalize(members.means - camera.position, dim=1)
     weights = basis(min(members.sh_degree, 3), directions)
     colors = (weights[..., None] * members.sh[:, : weights.shape[1]]).sum(dim=1) + 0.5
-    weighed = color_map(crop.gaussians, camera, crop.box, crop.rows)
+    weighed = color_map(crop.gaussians, camera, crop.box, crop.rows, crop.engine)
     picture = crop.original()
     if crop.cached is not None:
         live, constant = crop.cached
@@ -94,7 +94,7 @@ def color_view(crop: CropScene, original: Tensor, bands: int) -> ColorView:
         picture - weighed.picture(colors.clamp_min(0.0)),
         weights[:, :bands].contiguous(),
         colors,
-        torch.ones(*weighed.size, 1, dtype=torch.bool),
+        torch.ones_like(picture[..., :1], dtype=torch.bool),
     )
 
 
@@ -116,7 +116,7 @@ class MapFit:
 
     def picture(self, table: Tensor) -> Tensor:
         """What the pixels show under a map, unclamped. [K,3] -> [P,3]"""
-        change = table - pad(identity_map(1), (0, 0, 0, len(table) - MONOMIALS[1]))
+        change = table - pad(identity_map(1), (0, 0, 0, len(table) - MONOMIALS[1])).to(table)
         return self.original + self.design[:, : len(table)] @ change
 
     @one_thread()
@@ -127,18 +127,19 @@ class MapFit:
         may have such: at all members' colors it is held to the affine map, and
         that one to the same change of all.
         """
-        return identity_map(degree) + self._change(MONOMIALS[degree], targets)
+        change = self._change(MONOMIALS[degree], targets)
+        return identity_map(degree).to(change) + change
 
     def _change(self, count: int, targets: Sequence[Tensor]) -> Tensor:
         """What is added to the identity's first coefficients: 1, 4, 10 or 20. [count,3]"""
         design, target = self.design[:, :count].contiguous(), self._pixels(targets)
-        normal, pull = self.normal[:count, :count], torch.zeros(count, 3, dtype=torch.float64)
+        normal, pull = self.normal[:count, :count], self.normal.new_zeros(count, 3)
         if count > 1:
             coarse = self._change(4 if count > 4 else 1, targets).double()
             held = self.held[:count, :count] * (1.0 if count > 4 else _SHIFT_HELD)
             normal, pull = normal + held, held[:, : len(coarse)] @ coarse
         normal = normal + _MAP_RIDGE * (normal.diagonal() + 1e-12).diag()
-        change = torch.zeros(count, 3)
+        change = design.new_zeros(count, 3)
         for _ in range(_CLAMP_ROUNDS):
             image = self.original + design @ change
             clamped = ((image >= 1.0) & (target >= 1.0)) | ((image <= 0.0) & (target <= 0.0))

@@ -125,7 +125,7 @@ def group_stage(
         FloatingPointError: the loss is not finite.
     """
     means = original[:, attribute_slices(original.shape[1])["means"]]
-    parts = make_parts(original, connected_parts(means))
+    parts = make_parts(original, connected_parts(means.cpu()).to(means.device))
     search = GroupSearch(original, parts, crops, steps, seed)
     motions: list[Motion] = []
 
@@ -145,6 +145,7 @@ def group_stage(
 
 def restore_groups(original: Tensor, saved: Mapping[str, Tensor]) -> Groups:
     """What `Groups.capture_state` gave, of the same members."""
+    saved = {name: tensor.to(original.device) for name, tensor in saved.items()}
     motions = tuple(Motion(m[:, :3], m[:, 3], m[:, 4:]) for m in saved["motions"])
     warps: tuple[WarpPlacement, ...] = ()
     if "warps" in saved:
@@ -206,6 +207,7 @@ def group_path(
         (step, stage, ends_stage, offsets [M,C] float16) in order, as `retime.record` takes them
     """
     placement, own, begun = groups.rest, torch.zeros_like(original), 0
+    ends = [end.to(original.device) for end in ends]
     each = max(2, count // len(ends))
     placements = []
     for stage, (end, step, after) in enumerate(zip(ends, steps, groups.placements, strict=True)):
@@ -214,7 +216,7 @@ def group_path(
             share = i / each
             halfway = between(placement, after, share)
             offsets = halfway.carry(original, torch.lerp(own, next_own, share))
-            placements.append((begun + round(share * (step - begun)), stage, False, offsets.half()))
-        placements.append((step, stage, True, end.half()))
+            placements.append((begun + round(share * (step - begun)), stage, False, offsets.half().cpu()))
+        placements.append((step, stage, True, end.half().cpu()))
         placement, own, begun = after, next_own, step
     return placements

@@ -60,6 +60,7 @@ class LpipsLoss:
 
     def __call__(self, image: Tensor, target: Tensor, key: Hashable = None) -> Tensor:
         """See `Perceptual`."""
+        self._network = self._network.to(image.device)
         seen = self._kept.get(key) if key is not None else None
         if seen is None:
             with torch.no_grad():

@@ -154,7 +154,10 @@ class PgsState:
             for name in _ROWS:
                 same = tensors.get("moved" if name == "average" else name, torch.zeros_like(self.first))
                 getattr(self, name).copy_(tensors.get(name, same))
-        self.pictures = [tensors[f"picture{i}"] for i in range(sum(k.startswith("picture") for k in tensors))]
+        self.pictures = [
+            tensors[f"picture{i}"].to(self.first)
+            for i in range(sum(k.startswith("picture") for k in tensors))
+        ]
         self.step, self.stage, self.local = values.step, values.stage, values.local
         self.recorded = values.recorded
         self.running = math.nan if values.running is None else values.running
@@ -348,7 +351,7 @@ def optimize(
     Raises:
         FloatingPointError: the loss or its gradient is not finite; the state is that of the step before.
     """
-    slices = attribute_slices(original.shape[1])
+    slices, rates = attribute_slices(original.shape[1]), settings.rates.to(original.device)
     moving = {name for name, columns in slices.items() if bool((settings.rates[columns] > 0).any())}
     state = PgsState(original, settings.seed) if state is None else state
     if not state.step:
@@ -365,7 +368,7 @@ def optimize(
                 placed = stage.place(state.average).detach()
                 renewed = renewal(state.step, state.local, stage.strength, placed)
                 if renewed is not None:
-                    targets = renewed
+                    targets = [picture.to(original.device) for picture in renewed]
                     objective.begin_stage()
             view = state.view(len(crops))
             share = (state.local + 1) / max(1.0, settings.ramp * stage.steps)
@@ -376,9 +379,7 @@ def optimize(
             )
             gradient = _gradient(objective, moment, state, stages[-1].targets[view])
             length = size * _decay(settings.fall, state.local, stage.steps)
-            state.descend(
-                gradient, settings.rates, length, settings.raised, settings.smoothing, settings.growth
-            )
+            state.descend(gradient, rates, length, settings.raised, settings.smoothing, settings.growth)
 
             last = state.local == stage.steps
             if last or (state.step % settings.every == 0 if settings.every else state.local % 2):

@@ -43,15 +43,15 @@ class Ties:
             weights: of the members, in units of a member's ties together; 0: the residual means nothing. [M]
             ridge: the pull to 0 in the same unit
         """
-        weight = weights.double().numpy()[:, None]
+        weight = weights.double().cpu().numpy()[:, None]
         system = csr_matrix(self.graph + diags(weight[:, 0] + ridge))
-        known = residual.flatten(1).double().numpy()
+        known = residual.flatten(1).double().cpu().numpy()
         scale = diags(1.0 / system.diagonal())
         columns = [
             cg(system, weight[:, 0] * column, column, rtol=_EXACT, maxiter=_STEPS, M=scale)[0]
             for column in known.T
         ]
-        return torch.from_numpy(np.stack(columns, axis=1)).float().view_as(residual)
+        return torch.from_numpy(np.stack(columns, axis=1)).to(residual).view_as(residual)
 
 
 def surface_ties(scene: Gaussians, members: Tensor, cameras: Sequence[Camera]) -> Ties:

@@ -239,6 +239,8 @@ def _values(part: Any) -> Iterator[tuple[str, bool, Any]]:
             typed = not str(field.type).startswith("Fixed")
             if field.name in ("views", "image_size", "stages"):
                 value = value or None  # 0: by default
+            if field.name == "engine" and value == "auto":  # of runs before there were two
+                value = "cpu"
             yield field.name, typed, value.resolve() if isinstance(value, Path) else value
 
 

@@ -20,6 +20,7 @@ from progdf.gdf.file import save_gdf
 from progdf.io.atomic import read_file
 from progdf.io.cameras import load_cameras, save_cameras
 from progdf.io.json_values import plain
+from progdf.rasterize.engines import get_engine
 from progdf.region import Region
 from progdf.scene.regions import check_region, parse_region
 from trainer.editors import (
@@ -89,6 +90,7 @@ def check_command(options: TrainOptions) -> None:
     Raises:
         ProgdfError: the folder is taken, the editor or the segmenter cannot run, or a file is not there.
     """
+    get_engine(options.optimize.engine)
     check_editor(options.editor.editor)
     folder, views = check_folder(options.out, options.edit), options.views
     if not options.scene.is_dir():  # some formats are folders
@@ -149,7 +151,7 @@ class Reedit:
         setup, members = self._setup, self._setup.region.members
         renders: list[Tensor | None] = [None] * len(setup.train)
         if due == step:
-            rows = pack(setup.scene[members], with_shN=setup.scene.sh_degree > 0) + offsets
+            rows = pack(setup.scene[members], with_shN=setup.scene.sh_degree > 0) + offsets.cpu()
             scene = setup.scene.replace_rows(members, rows)
             with torch.no_grad():
                 renders = [

@@ -17,6 +17,7 @@ from progdf.errors import ProgdfError
 from progdf.field.trajectory import Trajectory
 from progdf.gaussians import BASE_CHANNELS, pack
 from progdf.io.json_values import convert_json
+from progdf.rasterize.engines import engine_device
 from progdf.scene.bounds import scene_sphere
 from trainer.fit.network import JointTraining, begin_joint_training, save_network
 from trainer.optimize.color_solver import (
@@ -89,11 +90,10 @@ class Recordings:
 
     def add(self, snapshot: ParameterSnapshot) -> None:
         """Keep one."""
-        offsets = snapshot.offsets.half()
+        offsets, table = snapshot.offsets.half().cpu(), snapshot.table
+        table = table.cpu() if table is not None else None
         self.made.append(
-            SavedSnapshot(
-                snapshot.step, snapshot.stage, snapshot.ends_stage, offsets, snapshot.means, snapshot.table
-            )
+            SavedSnapshot(snapshot.step, snapshot.stage, snapshot.ends_stage, offsets, snapshot.means, table)
         )
 
     def capture_state(self) -> Saved:
@@ -169,9 +169,13 @@ def optimize_members(
     """
     scene, members = setup.scene, setup.region.members
     bands = optimization.sh != "off"
-    original = pack(scene[members], with_shN=scene.sh_degree > 0)
+    engine, device = optimization.engine, engine_device(optimization.engine)
+    if engine == "warp":
+        card = torch.cuda.get_device_name(device) if device.type == "cuda" else "the CPU, in place of a card"
+        log.say(f"the steps are drawn by warp on {card}")
+    original = pack(scene[members], with_shN=scene.sh_degree > 0).to(device)
     still = optimization.kind == "color" and optimization.rates == "kind"
-    crops = _crops(setup, setup.train, still)
+    crops = _crops(setup, setup.train, still, engine)
     stages, groups = _stages(optimization, setup, edited), None
     if optimization.group_steps:
         groups = _groups(optimization, original, crops, stages, folder, log)
@@ -188,8 +192,9 @@ def optimize_members(
         )
         way = partial(solve, original, colors, model, stages, judges, state, steps=most)
     else:
-        inside = [erode(crop(view.mask, view.box)) for view in setup.train]
-        objective, probes = Objective(perceptual, optimization, inside), probe_views(setup)
+        inside = [erode(crop(view.mask, view.box)).to(device) for view in setup.train]
+        objective = Objective(perceptual, optimization, inside)
+        probes = probe_views(setup, engine=engine)
         way = partial(
             optimize, original, crops, probes, stages, objective, settings, state=state, renewal=renewal
         )
@@ -202,7 +207,7 @@ def optimize_members(
     distances = [made.means["left"] for made in recordings.made]
     log.say(f"L1 to the finished edit: {distances[0]:.4f} at first, {distances[-1]:.4f} at the end")
     log.say(f"the state was saved {saver.saves} times, in {saver.seconds:.2f} s")
-    end = stages[-1].place(state.average).clone()
+    end = stages[-1].place(state.average).cpu().clone()
     snapshots = [(made.step, made.stage, made.ends_stage, made.offsets) for made in recordings.made]
     if groups is not None:
         ends = [made for made in recordings.made if made.ends_stage]
@@ -225,20 +230,21 @@ def _stages(optimization: OptimizeOptions, setup: TrainingSetup, edited: Picture
     """The strengths to optimize towards, and the steps that each gets."""
     steps = max(optimization.steps, len(edited) + 1)  # each stage is to have one
     return [
-        TargetStage(s, _boxes(pictures, setup.train), steps)
+        TargetStage(s, _boxes(pictures, setup.train, optimization.engine), steps)
         for (s, pictures), steps in zip(edited.items(), _steps_by_stage(steps, len(edited)), strict=True)
     ]
 
 
-def _boxes(pictures: Sequence[Tensor], views: Sequence[View]) -> Sequence[Tensor]:
-    return stored_pictures(crop(picture, view.box) for picture, view in zip(pictures, views, strict=False))
+def _boxes(pictures: Sequence[Tensor], views: Sequence[View], engine: str) -> Sequence[Tensor]:
+    device, pairs = engine_device(engine), zip(pictures, views, strict=False)
+    return stored_pictures(crop(picture, view.box).to(device) for picture, view in pairs)
 
 
-def _crops(setup: TrainingSetup, views: Sequence[View], still: bool) -> Sequence[CropScene]:
+def _crops(setup: TrainingSetup, views: Sequence[View], still: bool, engine: str) -> Sequence[CropScene]:
     """Of an edit of colors each is made when it is looked at: once, by `color_views`."""
-    scene, members = setup.scene, setup.region.members
+    scene, members = setup.scene.to(engine_device(engine)), setup.region.members
     crops = LazySequence(
-        views, lambda v: crop_scene(scene, members, v.camera, v.box, setup.background, still)
+        views, lambda v: crop_scene(scene, members, v.camera, v.box, setup.background, still, engine)
     )
     return crops if still else list(crops)
 
@@ -254,13 +260,14 @@ def _prepare_colors(
     log: RunLog,
 ) -> tuple[Solver, Model, Pictures, list[TargetStage], list[Judge]]:
     """The views to solve for, how much is modelled, the strengths; and what says when each is done."""
+    engine = optimization.engine
     with log.stage("weights"):
         drawn = color_views(crops, original)
-        judging = _judging(setup, drawn, original, edited)
+        judging = _judging(setup, drawn, original, edited, engine)
         cameras = [view.camera for view in setup.train]
         ties = surface_ties(setup.scene, setup.region.members, cameras) if options.views.pictures else None
     with log.stage("model"):
-        judge, finished = judging(edited[max(edited)]), _boxes(edited[max(edited)], setup.train)
+        judge, finished = judging(edited[max(edited)]), _boxes(edited[max(edited)], setup.train, engine)
         solver, most = make_solver(drawn, original, ties), iterations(optimization.steps)
         trials = [(solver, judge)] if ties is None else split_solver(solver, original, finished)
         solver, model = choose_model(solver, trials, finished, most, 1 if optimization.sh == "off" else 4)
@@ -270,19 +277,19 @@ def _prepare_colors(
         unseen = len(original) - int(solver.asked.sum())
         log.say(f"{unseen} members that no picture shows follow the map and their own surface")
     edited = edited if between is None else between(model.allowed_share)
-    stages = [TargetStage(s, _boxes(some, setup.train), 1) for s, some in edited.items()]
+    stages = [TargetStage(s, _boxes(some, setup.train, engine), 1) for s, some in edited.items()]
     return solver, model, edited, stages, [judging(pictures) for pictures in edited.values()]
 
 
 def _judging(
-    setup: TrainingSetup, drawn: Sequence[ColorView], original: Tensor, edited: Pictures
+    setup: TrainingSetup, drawn: Sequence[ColorView], original: Tensor, edited: Pictures, engine: str
 ) -> Callable[[Sequence[Tensor]], Judge]:
     """All views' whole pictures of an edit -> the held-out views that choose, or all where there are none."""
     views, count = split_held_out(setup.held_out)[0], len(setup.train)
     if not views or len(edited[max(edited)]) <= count:
-        return lambda pictures: Judge(drawn, _boxes(pictures, setup.train))
-    choosing = color_views(_crops(setup, views, True), original)
-    return lambda pictures: Judge(choosing, _boxes(split_held_out(pictures[count:])[0], views))
+        return lambda pictures: Judge(drawn, _boxes(pictures, setup.train, engine))
+    choosing = color_views(_crops(setup, views, True, engine), original)
+    return lambda pictures: Judge(choosing, _boxes(split_held_out(pictures[count:])[0], views, engine))
 
 
 def _record_way(
@@ -321,7 +328,7 @@ def _record_way(
             for snapshot in way(step_done):
                 recordings.add(snapshot)
                 if joint is not None:
-                    joint.add(snapshot.step, snapshot.offsets)
+                    joint.add(snapshot.step, snapshot.offsets.cpu())
         except FloatingPointError as error:
             saver.save()
             raise ProgdfError(

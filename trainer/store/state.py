@@ -194,6 +194,7 @@ class StateFolder:
         """
         path, before = self._file(part, index), _writing.get(self.path)
         header = {"values": json.dumps(dict(values), ensure_ascii=False)}
+        tensors = {name: tensor.cpu() for name, tensor in tensors.items()}
 
         def write() -> float:
             if before is not None:

@@ -18,8 +18,8 @@ from torch import Tensor
 from progdf.camera import Camera
 from progdf.gaussians import ATTRIBUTES, Gaussians, attribute_slices, unpack
 from progdf.rasterize import ActivatedGaussians, Crop, Rendering, activate, render
-from progdf.rasterize.cpu.engine import ColorMap, color_map
 from progdf.rasterize.cpu.forward import TILE_H, TILE_W
+from progdf.rasterize.engines import ColorMap, color_map
 from progdf.sh import C0, basis
 from progdf.threads import threads
 
@@ -44,7 +44,7 @@ def live_tiles(contributes: Tensor, box: Crop) -> Tensor:
     """
     x0, y0, x1, y1 = box
     rows, columns = -(-y1 // TILE_H), -(-x1 // TILE_W)
-    tiles = torch.zeros(rows * TILE_H, columns * TILE_W, dtype=torch.bool)
+    tiles = contributes.new_zeros(rows * TILE_H, columns * TILE_W)
     tiles[y0:y1, x0:x1] = contributes
     return tiles.view(rows, TILE_H, columns, TILE_W).any(dim=3).any(dim=1)
 
@@ -73,7 +73,7 @@ def may_reach(means: Tensor, scales: Tensor, camera: Camera, live: Tensor) -> Te
     z = seen[:, 2].clamp_min(camera.near)
     K = camera.K.double()
     focal = torch.stack([K[0, 0], K[1, 1]])
-    size = torch.tensor([camera.width, camera.height], dtype=torch.float64)
+    size = K.new_tensor([camera.width, camera.height])
     slope = seen[:, :2] / z[:, None]
     center = slope * focal + K[:2, 2]
     # at least as far out as the rasterizer's clamp, which leaves 0.15 of the picture beyond each edge
@@ -82,13 +82,12 @@ def may_reach(means: Tensor, scales: Tensor, camera: Camera, live: Tensor) -> Te
     spread = (scales.double().amax(dim=1) * focal.max() / z).square() * widened + _DILATION
     radius = (_SUPPORT * spread).sqrt() + 1.0
     rows, columns = live.shape
-    step = torch.tensor([TILE_W, TILE_H], dtype=torch.float64)
-    last = torch.tensor([columns, rows])
+    step, last = K.new_tensor([TILE_W, TILE_H]), K.new_tensor([columns, rows])
     low = ((center - radius[:, None]) / step).floor().clamp(min=0).minimum(last).nan_to_num(0.0).long()
     high = ((center + radius[:, None]) / step).floor().clamp(min=-1).minimum(last - 1).nan_to_num(
         0.0
     ).long() + 1
-    sums = torch.zeros(rows + 1, columns + 1, dtype=torch.int64)
+    sums = live.new_zeros(rows + 1, columns + 1, dtype=torch.int64)
     sums[1:, 1:] = live.long().cumsum(0).cumsum(1)
     (left, top), (right, bottom) = low.unbind(1), high.unbind(1)
     counts = sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]
@@ -111,6 +110,7 @@ class CropScene:
     # all are drawn
     cached: tuple[Tensor, Tensor] | None = None
     still: bool = False  # nothing but the members' colors ever differs
+    engine: str = "cpu"  # that draws, on the device of the Gaussians
 
     @property
     def size(self) -> tuple[int, int]:
@@ -125,13 +125,13 @@ class CropScene:
         """The box with these raw values in the region's rows, differentiable in them.
 
         Args:
-            packed: member rows as `gaussians.pack` gives them. [M,14] or [M,14+3K]
+            packed: member rows as `gaussians.pack` gives them, on any device. [M,14] or [M,14+3K]
             moving: attributes whose values differ from the original's; the others are not looked at
 
         Returns:
             image [h,w,3], 0..1 (see `clamp_towards`); transmittance [h,w]
         """
-        members = unpack(packed, self.member_shN)
+        members = unpack(packed.to(self.background.device), self.member_shN)
         colors = member_colors(members, self.camera.position)
         if self.still and not colors.requires_grad:
             weighed, others, transmittance = self._linear
@@ -155,7 +155,7 @@ class CropScene:
     @cached_property
     def _linear(self) -> tuple[ColorMap, Tensor, Tensor]:
         """While nothing moves: what each member weighs in each pixel, what all others show, transmittance."""
-        weighed = color_map(self.gaussians, self.camera, self.box, self.rows)
+        weighed = color_map(self.gaussians, self.camera, self.box, self.rows, self.engine)
         image, transmittance, _ = self._draw(self.gaussians)
         return weighed, image - weighed.picture(self.gaussians.colors[self.rows]), transmittance
 
@@ -167,7 +167,9 @@ class CropScene:
         )
 
     def _draw(self, gaussians: ActivatedGaussians) -> Rendering:
-        return render(gaussians, self.camera, self.background, crop=self.box, grad_rows=self.rows)
+        return render(
+            gaussians, self.camera, self.background, crop=self.box, grad_rows=self.rows, engine=self.engine
+        )
 
 
 GEOMETRY = ("means", "quats", "log_scales", "logit_opacities")
@@ -198,8 +200,9 @@ def crop_scene(
     box: Crop,
     background: Tensor,
     still: bool = False,
+    engine: str = "cpu",
 ) -> CropScene:
-    """Prepare one view.
+    """Prepare one view, on the device of the scene.
 
     Args:
         scene: the original
@@ -209,9 +212,12 @@ def crop_scene(
         background: rgb. [3]
         still: nothing but colors will move, so only the tiles that show a member are drawn, see `tiles`, and
             without gradients a linear map of the members' colors; transmittance is right in these only
+        engine: that draws
     """
+    device = scene.means.device
+    members, camera, background = members.to(device), camera.to(device), background.to(device)
     activated = activate(scene, seen_colors(scene, camera))
-    visible = render(activated, camera, background, crop=box).info.visible.clone()
+    visible = render(activated, camera, background, crop=box, engine=engine).info.visible.clone()
     visible[members] = True  # a member that is out of sight now may come into it
     index = visible.nonzero()[:, 0]
     crop_of_all = CropScene(
@@ -221,6 +227,7 @@ def crop_scene(
         torch.searchsorted(index, members),
         scene.shN[members],
         background,
+        engine=engine,
     )
     return _keep_live_tiles(replace(crop_of_all, still=True)) if still else crop_of_all
 
@@ -231,7 +238,7 @@ def _keep_live_tiles(view: CropScene) -> CropScene:
     member = torch.zeros_like(gaussians.opacities)
     member[view.rows] = 1.0
     white = gaussians._replace(colors=member[:, None].expand(-1, 3).contiguous())
-    share = replace(view, background=torch.zeros(3))._draw(white).image
+    share = replace(view, background=torch.zeros_like(view.background))._draw(white).image
     live = live_tiles((share > 0).any(dim=2), view.box)
     if bool(live_pixels(live, view.box).all()):
         return view

@@ -16,9 +16,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from progdf.camera import Camera
-from progdf.errors import ProgdfError
-from progdf.rasterize.engines import FRUSTUM_MARGIN, ActivatedGaussians, Crop, RasterInfo, RasterView
+from progdf.rasterize.engines import (
+    FRUSTUM_MARGIN,
+    ActivatedGaussians,
+    RasterInfo,
+    RasterView,
+    check_intersections,
+)
 from progdf.threads import run_chunks, threads
 
 from .backward import BLOCK, CAMERA, project_backward
@@ -50,9 +54,6 @@ from .jit import kernel
 
 Array = NDArray[Any]
 _T = TypeVar("_T")
-
-MOST_INTERSECTIONS = 100_000_000
-"""(Gaussian, tile) pairs beyond which a view is refused: 1.2 GB forward, 3.6 GB more backward."""
 
 _LEAST_TILES = 4  # fewer are not worth a call
 _CHUNKS = 4  # for each thread: tiles take unequally long
@@ -157,11 +158,7 @@ def _project_and_bin(scene: Scene, camera: Pinhole, with_slots: bool) -> tuple[S
 
     tiles = np.concatenate(share_gaussians(project_and_find, n))
     total = int(counts.sum(dtype=np.int64))
-    if total > MOST_INTERSECTIONS:
-        raise ProgdfError(
-            f"{int(splats.visible.sum())} Gaussians meet {total} tiles of the image, more than "
-            f"{MOST_INTERSECTIONS}; draw a smaller image or a crop, or take giant Gaussians out of the scene"
-        )
+    check_intersections(int(splats.visible.sum()), total)
     if len(tiles) < total:  # no room for those of some chunk
         again = share_gaussians(lambda begin, end: find(begin, end, int(counts[begin:end].sum())), n)
         tiles = np.concatenate(again)
@@ -264,36 +261,29 @@ def alpha_weights(gaussians: ActivatedGaussians, view: RasterView, mask: Tensor)
 
 
 @dataclass(frozen=True)
-class ColorMap:
-    """What each of M Gaussians weighs in each pixel of a window: αT, for as long as nothing moves."""
+class ListedWeights:
+    """A color map as lists of weights."""
 
     count: int  # M
     size: tuple[int, int]  # height and width of the window
     runs: Runs
 
     def picture(self, colors: Tensor) -> Tensor:
-        """Σ αT·c of every pixel, on black. [M,3] -> [h,w,3]"""
+        """See `ColorMap`."""
         image = np.zeros((self.size[0] * self.size[1], 3), np.float32)
         add_images(self.runs, to_float32(colors).numpy(), image)
         return torch.from_numpy(image).view(*self.size, 3)
 
     def gradient(self, image: Tensor) -> Tensor:
-        """The transpose: Σ αT·g of every Gaussian. [h,w,3] -> [M,3]"""
+        """See `ColorMap`."""
         colors = np.zeros((self.count, 3), np.float32)
         add_gradients(self.runs, to_float32(image).numpy().reshape(-1, 3), colors)
         return torch.from_numpy(colors)
 
 
-def color_map(gaussians: ActivatedGaussians, camera: Camera, crop: Crop, rows: Tensor) -> ColorMap:
-    """List what some Gaussians weigh in a window of a view, as `render` draws it.
-
-    Args:
-        gaussians: all N that are drawn; their colors are not read
-        camera: the view
-        crop: x0, y0, x1, y1 of the window
-        rows: which of the N Gaussians, distinct. [M] int64
-    """
-    pinhole = make_pinhole(RasterView.of(camera, gaussians, crop))
+def color_map(gaussians: ActivatedGaussians, view: RasterView, rows: Tensor) -> ListedWeights:
+    """See `progdf.rasterize.engines.color_map`."""
+    pinhole, crop = make_pinhole(view), view.crop
     listed = np.full(len(gaussians.means), -1, np.int32)
     listed[rows.numpy()] = np.arange(len(rows), dtype=np.int32)
     splats, lists = bin_view(gaussians, pinhole)
@@ -305,7 +295,7 @@ def color_map(gaussians: ActivatedGaussians, camera: Camera, crop: Crop, rows: T
     cursors = np.cumsum(counts, axis=0) - counts
     share_tiles(list_weights, pinhole, splats, lists, pinhole, listed, True, cursors, runs)
     x0, y0, x1, y1 = crop
-    return ColorMap(len(rows), (y1 - y0, x1 - x0), runs)
+    return ListedWeights(len(rows), (y1 - y0, x1 - x0), runs)
 
 
 def _new_runs(runs: int, entries: int, index: np.dtype[Any]) -> Runs:

@@ -1,4 +1,4 @@
-"""The rasterizer: both engines against each other and against finite differences, on every hard case."""
+"""The rasterizer: the engines against each other and against finite differences, on every hard case."""
 
 from __future__ import annotations
 
@@ -10,16 +10,17 @@ import torch
 from torch import Tensor
 
 from progdf.gaussians import ATTRIBUTES
-from progdf.rasterize import ENGINES, ActivatedGaussians, activate, render
-from tests.helpers.drawn import CASES, INPUTS, draw, drawn_case, relative_errors, render_leaves
+from progdf.rasterize import ActivatedGaussians, activate, render
+from tests.helpers.drawn import CASES, EVERY, FAST, INPUTS, draw, drawn_case, relative_errors, render_leaves
 from tests.helpers.scenes import front_camera, one_gaussian, orbit_camera, random_gaussians
 
 pytestmark = pytest.mark.usefixtures("two_threads")
 
 
+@pytest.mark.parametrize("engine", FAST)
 @pytest.mark.parametrize("name", CASES)
-def test_the_cpu_engine_draws_each_hard_case_like_the_reference(name: str) -> None:
-    found, expected = drawn_case(name, "cpu"), drawn_case(name, "reference")
+def test_a_fast_engine_draws_each_hard_case_like_the_reference(name: str, engine: str) -> None:
+    found, expected = drawn_case(name, engine), drawn_case(name, "reference")
     assert found.image.shape == expected.image.shape
     assert float((found.image - expected.image).abs().max()) <= 1e-5
     assert float((found.transmittance - expected.transmittance).abs().max()) <= 1e-5
@@ -28,14 +29,15 @@ def test_the_cpu_engine_draws_each_hard_case_like_the_reference(name: str) -> No
     assert torch.equal(found.info.depths, expected.info.depths)
 
 
+@pytest.mark.parametrize("engine", FAST)
 @pytest.mark.parametrize("name", CASES)
-def test_the_cpu_engine_has_the_references_gradients_in_each_hard_case(name: str) -> None:
-    errors = relative_errors(drawn_case(name, "cpu"), drawn_case(name, "reference"))
+def test_a_fast_engine_has_the_references_gradients_in_each_hard_case(name: str, engine: str) -> None:
+    errors = relative_errors(drawn_case(name, engine), drawn_case(name, "reference"))
     assert set(errors) == set(INPUTS)
     assert max(errors.values()) <= 1e-4, errors
 
 
-@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("engine", EVERY)
 @pytest.mark.parametrize("name", [name for name, case in CASES.items() if case.poisoned])
 def test_a_gaussian_that_is_not_finite_leaves_all_others_untouched(name: str, engine: str) -> None:
     case, rows = CASES[name], list(CASES[name].poisoned)
@@ -57,12 +59,13 @@ def test_a_gaussian_that_is_not_finite_leaves_all_others_untouched(name: str, en
     assert bool(found.gradients["means"][others].isfinite().all())
 
 
+@pytest.mark.parametrize("engine", FAST)
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_random_scenes_meet_the_stated_errors(seed: int, antialiased: bool) -> None:
+def test_random_scenes_meet_the_stated_errors(seed: int, antialiased: bool, engine: str) -> None:
     scene = replace(random_gaussians(300, seed=seed, sh_degree=3), antialiased=antialiased)
     camera = orbit_camera(90, 61)
-    found, expected = (draw(scene, camera, engine) for engine in ("cpu", "reference"))
+    found, expected = (draw(scene, camera, name) for name in (engine, "reference"))
     assert float((found.image - expected.image).abs().max()) <= 2e-6
     errors = relative_errors(found, expected)
     assert max(errors.values()) <= 2e-5, errors
@@ -103,15 +106,16 @@ def test_the_reference_has_the_gradients_of_finite_differences() -> None:
         assert claimed == pytest.approx(measured, rel=1e-6, abs=1e-8), name
 
 
-def test_gradients_of_a_crop_match_the_references() -> None:
+@pytest.mark.parametrize("engine", FAST)
+def test_gradients_of_a_crop_match_the_references(engine: str) -> None:
     scene, camera, crop = random_gaussians(200, seed=5, sh_degree=1), orbit_camera(90, 61), (21, 13, 70, 44)
-    found, expected = (draw(scene, camera, engine, crop=crop) for engine in ("cpu", "reference"))
+    found, expected = (draw(scene, camera, name, crop=crop) for name in (engine, "reference"))
     errors = relative_errors(found, expected)
     assert max(errors.values()) <= 2e-5, errors
     assert torch.equal(found.info.visible, expected.info.visible)
 
 
-@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("engine", EVERY)
 def test_only_the_wanted_rows_get_gradients_and_theirs_are_the_full_ones(engine: str) -> None:
     scene, camera = random_gaussians(200, seed=12, sh_degree=1), orbit_camera(90, 61)
     rows = torch.arange(3, 200, 7)
@@ -128,10 +132,11 @@ def test_only_the_wanted_rows_get_gradients_and_theirs_are_the_full_ones(engine:
         assert not bool(some[others].any())
 
 
-def test_double_precision_inputs_get_double_precision_gradients() -> None:
+@pytest.mark.parametrize("engine", FAST)
+def test_double_precision_inputs_get_double_precision_gradients(engine: str) -> None:
     scene, camera = one_gaussian().to(dtype=torch.float64), front_camera()
     means = scene.means.requires_grad_()
-    image = render(scene, camera, (0.0, 0.0, 0.0)).image
+    image = render(scene, camera, (0.0, 0.0, 0.0), engine=engine).image
     (image[:, :15] ** 2).sum().backward()
     assert image.dtype == torch.float32
     assert means.grad is not None
@@ -139,7 +144,8 @@ def test_double_precision_inputs_get_double_precision_gradients() -> None:
     assert float(means.grad.abs().max()) > 0
 
 
-def test_a_real_scene_matches_the_reference(shared_data: Path) -> None:
+@pytest.mark.parametrize("engine", FAST)
+def test_a_real_scene_matches_the_reference(shared_data: Path, engine: str) -> None:
     from progdf.formats.ply import load_ply
 
     scene = load_ply(shared_data / "playbot_8k.ply")
@@ -147,7 +153,7 @@ def test_a_real_scene_matches_the_reference(shared_data: Path) -> None:
     scene = replace(scene, means=(scene.means - (low + high) / 2) / float((high - low).max()) * 2)
     scene = replace(scene, log_scales=scene.log_scales - torch.log((high - low).max() / 2))
     camera = orbit_camera(64, 48, distance=3.0)
-    found, expected = (draw(scene, camera, engine) for engine in ("cpu", "reference"))
+    found, expected = (draw(scene, camera, name) for name in (engine, "reference"))
     assert float((found.image - expected.image).abs().max()) <= 1e-5
     errors = relative_errors(found, expected)
     assert max(errors.values()) <= 1e-4, errors

@@ -1,4 +1,4 @@
-"""What a rasterized picture is, in both engines: crops, order, support, background, weights of masks."""
+"""What a rasterized picture is, in every engine: crops, order, support, background, weights of masks."""
 
 from __future__ import annotations
 
@@ -7,15 +7,16 @@ from dataclasses import replace
 import pytest
 import torch
 
-from progdf.rasterize import ENGINES, ActivatedGaussians, activate, alpha_weights, render
-from tests.helpers.drawn import CASES, draw, drawn_case
+from progdf.rasterize import ActivatedGaussians, activate, alpha_weights, render
+from progdf.rasterize.engines import color_map
+from tests.helpers.drawn import CASES, EVERY, FAST, draw, drawn_case
 from tests.helpers.scenes import concatenate, front_camera, one_gaussian, orbit_camera, random_gaussians
 
 pytestmark = pytest.mark.usefixtures("two_threads")
 
 
 @pytest.mark.parametrize("crop", [(0, 0, 90, 61), (13, 7, 14, 8), (31, 8, 65, 40), (64, 33, 90, 61)])
-@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("engine", EVERY)
 def test_a_crop_is_the_slice_of_the_whole_picture(engine: str, crop: tuple[int, int, int, int]) -> None:
     camera = orbit_camera(90, 61)
     camera = replace(camera, K=camera.K + torch.tensor([[0.0, 0.0, 7.0], [0.0, 0.0, -5.0], [0.0, 0.0, 0.0]]))
@@ -30,25 +31,28 @@ def test_a_crop_is_the_slice_of_the_whole_picture(engine: str, crop: tuple[int, 
         torch.testing.assert_close(found, expected[y0:y1, x0:x1], atol=rounding, rtol=0.0)
 
 
-def test_the_order_of_the_list_does_not_matter_where_depths_differ() -> None:
+@pytest.mark.parametrize("engine", FAST)
+def test_the_order_of_the_list_does_not_matter_where_depths_differ(engine: str) -> None:
     scene, camera = random_gaussians(300, seed=8), orbit_camera(50, 40)
     activated = activate(scene, scene.sh0.sigmoid())
     shuffle = torch.randperm(300, generator=torch.Generator().manual_seed(1))
-    assert torch.equal(render(activated, camera).image, render(activated.select(shuffle), camera).image)
+    first, second = (render(some, camera, engine=engine) for some in (activated, activated.select(shuffle)))
+    assert torch.equal(first.image, second.image)
 
 
-def test_equal_depths_are_drawn_in_the_order_of_the_list() -> None:
+@pytest.mark.parametrize("engine", EVERY)
+def test_equal_depths_are_drawn_in_the_order_of_the_list(engine: str) -> None:
     red, green = (
         one_gaussian(rgb=(1.0, 0.0, 0.0), opacity=0.99),
         one_gaussian(rgb=(0.0, 1.0, 0.0), opacity=0.99),
     )
     camera = front_camera()
     center = (camera.height // 2, camera.width // 2)
-    assert float(render(concatenate(red, green), camera).image[center][0]) > 0.9
-    assert float(render(concatenate(green, red), camera).image[center][1]) > 0.9
+    assert float(render(concatenate(red, green), camera, engine=engine).image[center][0]) > 0.9
+    assert float(render(concatenate(green, red), camera, engine=engine).image[center][1]) > 0.9
 
 
-@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("engine", EVERY)
 def test_the_support_ends_exactly_where_alpha_falls_below_1_255(engine: str) -> None:
     camera = front_camera(60, 40)
     one = ActivatedGaussians(
@@ -64,13 +68,13 @@ def test_the_support_ends_exactly_where_alpha_falls_below_1_255(engine: str) -> 
     assert torch.equal(transmittance == 1.0, alpha == 0.0)
 
 
-@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("engine", EVERY)
 def test_no_pixel_falls_below_the_least_transmittance(engine: str) -> None:
     drawn = drawn_case("400 opaque ones stacked", engine)
     assert 1e-4 < float(drawn.transmittance.min()) < 2e-3
 
 
-@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("engine", EVERY)
 def test_no_gaussians_leave_the_background(engine: str) -> None:
     nothing = random_gaussians(5)[:0]
     image, transmittance, _ = render(nothing, front_camera(), (0.25, 0.5, 0.75), engine=engine)
@@ -78,22 +82,39 @@ def test_no_gaussians_leave_the_background(engine: str) -> None:
     assert bool((transmittance == 1.0).all())
 
 
-def test_mask_weights_match_the_reference_and_the_picture() -> None:
+@pytest.mark.parametrize("engine", FAST)
+def test_mask_weights_match_the_reference_and_the_picture(engine: str) -> None:
     scene, camera = random_gaussians(200, seed=9), orbit_camera(90, 61)
     mask = torch.rand(61, 90, generator=torch.Generator().manual_seed(2)).round()
-    found = alpha_weights(scene, camera, mask)
+    found = alpha_weights(scene, camera, mask, engine)
     expected = alpha_weights(scene.to(dtype=torch.float64), camera, mask, engine="reference")
     torch.testing.assert_close(found.double(), expected, rtol=2e-5, atol=2e-5)
-    transmittance = render(scene, camera).transmittance
+    transmittance = render(scene, camera, engine=engine).transmittance
     assert float(found[:, 2].sum()) == pytest.approx(float((1 - transmittance).sum()), rel=1e-5)
     inside = float(((1 - transmittance) * mask).sum())
     assert float(found[:, 0].sum()) == pytest.approx(inside, rel=1e-5)
 
 
-@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("engine", EVERY)
 def test_mask_weights_of_every_hard_case_are_finite(engine: str) -> None:
     for name, case in CASES.items():
         mask = torch.ones(case.camera.height, case.camera.width, dtype=torch.bool)
         weights = alpha_weights(case.gaussians.to(dtype=torch.float64), case.camera, mask, engine=engine)
         assert bool(weights.isfinite().all()), name
         assert torch.equal(weights[:, 1], weights[:, 3]), name
+
+
+@pytest.mark.parametrize("engine", EVERY)
+def test_a_color_map_draws_its_rows_and_its_gradient_is_the_transpose(engine: str) -> None:
+    scene, camera, window = random_gaussians(300, seed=11), orbit_camera(90, 61), (21, 13, 70, 44)
+    rng = torch.Generator().manual_seed(5)
+    rows = torch.randperm(300, generator=rng)[:120]
+    colors, seen = torch.rand(120, 3, generator=rng), torch.rand(31, 49, 3, generator=rng)
+    activated = activate(scene)
+    weighed = color_map(activated, camera, window, rows, engine)
+    every = torch.zeros(300, 3).index_copy(0, rows, colors)
+    drawn = render(activated, camera, (0.0, 0.0, 0.0), colors=every, crop=window, engine="reference").image
+    picture = weighed.picture(colors)
+    torch.testing.assert_close(picture, drawn, rtol=0, atol=2e-6)
+    forth, back = (picture.double() * seen).sum(), (colors.double() * weighed.gradient(seen)).sum()
+    assert float(forth) == pytest.approx(float(back), rel=1e-6)

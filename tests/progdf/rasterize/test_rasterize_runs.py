@@ -13,7 +13,7 @@ import torch
 from progdf.errors import ProgdfError
 from progdf.rasterize import ActivatedGaussians, activate, alpha_weights, render, set_threads
 from progdf.rasterize.cpu.forward import depth_order
-from tests.helpers.drawn import INPUTS, Drawn, draw
+from tests.helpers.drawn import FAST, INPUTS, Drawn, draw
 from tests.helpers.scenes import front_camera, one_gaussian, orbit_camera, random_gaussians
 
 pytestmark = pytest.mark.usefixtures("two_threads")
@@ -36,13 +36,14 @@ def test_bits_do_not_depend_on_the_run_the_number_of_threads_or_the_room_for_til
             assert torch.equal(again.gradients[name], first.gradients[name]), name
 
 
-def test_two_python_threads_may_draw_at_once() -> None:
+@pytest.mark.parametrize("engine", FAST)
+def test_two_python_threads_may_draw_at_once(engine: str) -> None:
     scene, camera = random_gaussians(500, seed=7), orbit_camera(64, 48)
-    expected = draw(scene, camera, "cpu")
+    expected = draw(scene, camera, engine)
     found: list[Drawn] = []
 
     def work() -> None:
-        found.extend(draw(scene, camera, "cpu") for _ in range(5))
+        found.extend(draw(scene, camera, engine) for _ in range(5))
 
     workers = [threading.Thread(target=work) for _ in range(2)]
     for worker in workers:
@@ -61,12 +62,13 @@ def test_camera_gradients_of_some_rows_only_are_refused() -> None:
         render(scene, free, grad_rows=torch.tensor([0]))
 
 
-def test_too_many_intersections_are_refused_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    from progdf.rasterize.cpu import engine
+@pytest.mark.parametrize("engine", FAST)
+def test_too_many_intersections_are_refused_in_one_line(monkeypatch: pytest.MonkeyPatch, engine: str) -> None:
+    from progdf.rasterize import engines
 
-    monkeypatch.setattr(engine, "MOST_INTERSECTIONS", 100)
+    monkeypatch.setattr(engines, "MOST_INTERSECTIONS", 100)
     with pytest.raises(ProgdfError, match="more than 100; draw a smaller image or a crop") as error:
-        render(random_gaussians(200, seed=1), orbit_camera(100, 60))
+        render(random_gaussians(200, seed=1), orbit_camera(100, 60), engine=engine)
     assert "\n" not in str(error.value)
 
 
@@ -75,7 +77,7 @@ def test_wrong_shapes_and_windows_are_refused_by_name() -> None:
     scene = one_gaussian()
     with pytest.raises(ValueError, match=r"crop \(0, 0, 41, 24\) is empty or leaves the image of 40x24"):
         render(scene, camera, crop=(0, 0, 41, 24))
-    with pytest.raises(ValueError, match="unknown rasterizer 'gpu'; use one of reference, cpu"):
+    with pytest.raises(ValueError, match="unknown rasterizer 'gpu'; use one of reference, cpu, warp"):
         render(scene, camera, engine="gpu")
     with pytest.raises(ValueError, match=r"mask has shape \[3, 3\], expected \[24, 40\]"):
         alpha_weights(scene, camera, torch.ones(3, 3))

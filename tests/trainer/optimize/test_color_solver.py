@@ -11,7 +11,7 @@ from torch import Tensor
 from progdf.camera import Camera, intrinsics, look_at
 from progdf.gaussians import Gaussians, pack
 from progdf.rasterize import activate, render, set_threads
-from progdf.rasterize.cpu.engine import color_map
+from progdf.rasterize.engines import color_map
 from progdf.region import Region
 from progdf.sh import rgb_to_sh0
 from tests.helpers.scenes import random_gaussians

@@ -135,7 +135,15 @@ class JobActions:
         if form.choice.setting == "sentence":
             model, anchor = form.model, self._write_anchor(form, out)
         order = EditOrder(
-            scene.resolve(), out, out.name, region, form.spec, form.quick, threads, model, anchor
+            scene.resolve(),
+            out,
+            out.name,
+            region=region,
+            editor=form.spec,
+            quick=form.quick,
+            threads=threads,
+            model=model,
+            anchor=anchor,
         )
         self.queue.add(order)
         if (draft := self._draft(form)) is not None:

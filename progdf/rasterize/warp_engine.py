@@ -1,0 +1,368 @@
+"""The engine for graphics cards: kernels on Warp, which needs no compiler; on a CPU it is slow, for tests.
+
+Projection is the reference's, tile lists are torch's, and three kernels blend, differentiate and add up.
+
+What decides (offsets from a center, alpha ≥ 1/255) is float64, pixels are float32. A tile is a block of
+threads: the backward pass adds up a splat's gradients within the block and writes one row for each (splat,
+tile) intersection, of the same moments as the cpu engine's. No two blocks add to one number, so the bits are
+the same in every run on the same device.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from progdf.errors import ProgdfError
+
+from .cpu.jit import find_cache_folder
+from .engines import (
+    ALPHA_MAX,
+    ALPHA_MIN,
+    TRANSMITTANCE_MIN,
+    ActivatedGaussians,
+    ColorMap,
+    Crop,
+    RasterInfo,
+    RasterView,
+    check_intersections,
+)
+from .reference import DrawnColors, ReferenceSplats, of_rows, project
+
+try:
+    import warp as wp
+except ImportError as error:
+    raise ProgdfError("the engine warp needs warp-lang; pip install 'progdf-studio[gpu]'") from error
+
+TILE = 16
+"""Pixels of a tile's side."""
+
+PIXELS = wp.constant(TILE * TILE)
+MOST = wp.constant(ALPHA_MAX)
+LEAST = wp.constant(TRANSMITTANCE_MIN)
+
+SUMS = 9
+"""Numbers of one intersection: gradient of the color (3); with g = alpha · dL/dalpha: Σg, Σg·u, Σg·v, Σg·u²,
+Σg·uv, Σg·v²."""
+
+_SLACK = 0.01  # pixels by which a box is larger than the support: beyond float32's error on any screen
+_Sums = wp.types.vector(length=SUMS, dtype=wp.float32)
+_Shape = wp.types.vector(length=6, dtype=wp.float64)
+_launching = threading.Lock()
+_function: Callable[[Any], Any] = wp.func
+_kernel: Callable[[Any], Any] = wp.kernel
+
+wp.set_module_options({"enable_backward": False})
+
+
+@cache
+def _start() -> None:
+    """Start Warp, without a word; compiled kernels lie beside the cpu engine's."""
+    wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)
+    named = wp.config.kernel_cache_dir or os.environ.get("WARP_CACHE_PATH")
+    wp.config.kernel_cache_dir = named or str(find_cache_folder() / "warp")
+    wp.init()
+
+
+@_function
+def pixel_of(thread: int, window: wp.vec4i) -> wp.vec3i:
+    """Column and row of a thread's pixel in the full image; its place in the window, row by row, −1: outside.
+
+    Blocks of threads are the window's tiles, row by row.
+    """
+    left, top = window[0] // TILE, window[1] // TILE
+    columns = (window[2] + TILE - 1) // TILE - left
+    tile, place = thread // PIXELS, thread % PIXELS
+    x, y = (left + tile % columns) * TILE + place % TILE, (top + tile // columns) * TILE + place // TILE
+    if x < window[0] or y < window[1] or x >= window[2] or y >= window[3]:
+        return wp.vec3i(x, y, -1)
+    return wp.vec3i(x, y, (y - window[1]) * (window[2] - window[0]) + x - window[0])
+
+
+@_function
+def alpha_at(pixel: wp.vec3i, box: wp.vec4, shape: Any, opacity: float) -> wp.vec3:
+    """Alpha before the clamp, 0 below 1/255; u and v, the whitened offset."""
+    x, y = float(pixel[0]) + 0.5, float(pixel[1]) + 0.5
+    if x < box[0] or y < box[1] or x > box[2] or y > box[3]:  # in float32: most pairs end here
+        return wp.vec3(0.0)
+    dx, dy = wp.float64(x) - shape[0], wp.float64(y) - shape[1]
+    u, v = shape[2] * dx + shape[3] * dy, shape[4] * dy
+    squared = u * u + v * v
+    if squared > shape[5]:
+        return wp.vec3(0.0)
+    return wp.vec3(opacity * wp.exp(-0.5 * float(squared)), float(u), float(v))
+
+
+@_kernel
+def blend_kernel(
+    window: wp.vec4i, starts: wp.array[int], members: wp.array[int], boxes: wp.array[wp.vec4],
+    shapes: wp.array[_Shape], colors: wp.array[wp.vec4], image: wp.array[wp.vec3],
+    transmittance: wp.array[float], last: wp.array[int], deepest: wp.array[int],
+) -> None:  # fmt: skip
+    """Blend front to back, on black.
+
+    Args:
+        last: out, index in `members` of a pixel's last contributor, −1 if none. [h·w]
+        deepest: out, of a tile's; −1 on entry. [T]
+    """
+    thread = wp.tid()
+    pixel = pixel_of(thread, window)
+    p = pixel[2]
+    if p < 0:
+        return
+    tile = thread // PIXELS
+    rgb, through, final = wp.vec3(0.0), float(1.0), int(-1)
+    for index in range(starts[tile], starts[tile + 1]):
+        s = members[index]
+        color = colors[s]
+        alpha = wp.min(alpha_at(pixel, boxes[s], shapes[s], color[3])[0], MOST)
+        if alpha > 0.0:
+            after = through * (1.0 - alpha)
+            if after <= LEAST:
+                break
+            rgb += (alpha * through) * wp.vec3(color[0], color[1], color[2])
+            through = after
+            final = index
+    image[p] = rgb
+    transmittance[p] = through
+    last[p] = final
+    wp.atomic_max(deepest, tile, final)
+
+
+@_kernel
+def blend_backward_kernel(
+    window: wp.vec4i, starts: wp.array[int], members: wp.array[int], boxes: wp.array[wp.vec4],
+    shapes: wp.array[_Shape], colors: wp.array[wp.vec4], transmittance: wp.array[float],
+    last: wp.array[int], deepest: wp.array[int], slots: wp.array[int], by_image: wp.array[wp.vec3],
+    by_transmittance: wp.array[float], sums: wp.array[_Sums],
+) -> None:  # fmt: skip
+    """Gradients, back to front. slots: the row of `sums` for each of `members`, −1: no gradient is wanted."""
+    thread = wp.tid()
+    pixel = pixel_of(thread, window)
+    p = pixel[2]
+    tile = thread // PIXELS
+    g, through, behind, final = wp.vec3(0.0), float(1.0), float(0.0), int(-1)
+    if p >= 0:
+        g = by_image[p]
+        through = transmittance[p]
+        final = last[p]
+        behind = through * by_transmittance[p]
+    bottom = deepest[tile]
+    for step in range(bottom + 1 - starts[tile]):
+        index = bottom - step
+        s = members[index]
+        slot = slots[index]
+        row = _Sums()
+        if index <= final:
+            color = colors[s]
+            seen = alpha_at(pixel, boxes[s], shapes[s], color[3])
+            if seen[0] > 0.0:
+                alpha = wp.min(seen[0], MOST)
+                inverse = 1.0 / (1.0 - alpha)
+                front = color[0] * g[0] + color[1] * g[1] + color[2] * g[2]
+                through *= inverse
+                weight = alpha * through
+                by_alpha = alpha * (through * front - behind * inverse)
+                if seen[0] > MOST:
+                    by_alpha = float(0.0)
+                behind += weight * front
+                first = wp.vec3(1.0, seen[1], seen[2])
+                second = wp.vec3(seen[1] * seen[1], seen[1] * seen[2], seen[2] * seen[2])
+                for k in range(3):
+                    row[k] = weight * g[k]
+                    row[3 + k] = by_alpha * first[k]
+                    row[6 + k] = by_alpha * second[k]
+        if slot >= 0:  # the same for the whole block, which adds up together
+            wp.tile_atomic_add(sums, wp.tile_sum(wp.tile(row, preserve_type=True)), offset=slot)
+
+
+@_kernel
+def add_weights_kernel(
+    window: wp.vec4i, starts: wp.array[int], members: wp.array[int], boxes: wp.array[wp.vec4],
+    shapes: wp.array[_Shape], colors: wp.array[wp.vec4], last: wp.array[int], deepest: wp.array[int],
+    slots: wp.array[int], mask: wp.array[float], sums: wp.array[wp.vec4],
+) -> None:  # fmt: skip
+    """Σ w·m, Σ m, Σ w and n of every intersection; w = αT."""
+    thread = wp.tid()
+    pixel = pixel_of(thread, window)
+    p = pixel[2]
+    tile = thread // PIXELS
+    inside, through, final = float(0.0), float(1.0), int(-1)
+    if p >= 0:
+        inside = mask[p]
+        final = last[p]
+    for index in range(starts[tile], deepest[tile] + 1):
+        s = members[index]
+        row = wp.vec4(0.0)
+        if index <= final:
+            alpha = wp.min(alpha_at(pixel, boxes[s], shapes[s], colors[s][3])[0], MOST)
+            if alpha > 0.0:
+                weight = alpha * through
+                through *= 1.0 - alpha
+                row = wp.vec4(weight * inside, inside, weight, 1.0)
+        wp.tile_atomic_add(sums, wp.tile_sum(wp.tile(row, preserve_type=True)), offset=slots[index])
+
+
+@dataclass(frozen=True)
+class TileLists:
+    """The splats of a window's tiles, nearest first; tiles are aligned to the full image, row by row."""
+
+    starts: Tensor  # first of each tile in `members`, and how many there are. [T+1] int32
+    members: Tensor  # rows of the splats. [I] int32
+    slots: Tensor  # number of each, counted splat by splat. [I] int64
+    counts: Tensor  # tiles of each splat. [V] int64
+
+
+def list_tiles(splats: ReferenceSplats, crop: Crop) -> TileLists:
+    """Sort the splats into the tiles that their boxes meet."""
+    x0, y0, x1, y1 = crop
+    left, top = x0 // TILE, y0 // TILE
+    columns, rows = -(-x1 // TILE) - left, -(-y1 // TILE) - top
+    means2d, extents = splats.means2d.detach(), splats.extents
+    window = means2d.new_tensor([[x0, y0], [x1 - 1, y1 - 1]])
+    # pixels whose centers lie in the boxes
+    first = (means2d - extents - 0.5 - 1e-6).ceil().maximum(window[0])
+    final = (means2d + extents - 0.5 + 1e-6).floor().minimum(window[1])
+    low, high = (edge.div(TILE, rounding_mode="floor").long() for edge in (first, final))
+    sides = torch.where((first <= final).all(dim=1, keepdim=True), high - low + 1, 0)
+    counts = sides.prod(dim=1)
+    total = int(counts.sum())
+    check_intersections(len(counts), total)
+    owners = torch.arange(len(counts), device=counts.device).repeat_interleave(counts, output_size=total)
+    at = torch.arange(total, device=counts.device) - (counts.cumsum(0) - counts)[owners]
+    wide = sides[owners, 0]
+    column, row = low[owners, 0] + at % wide - left, low[owners, 1] + at // wide - top
+    tiles, slots = (row * columns + column).int().sort(stable=True)
+    starts = pad(torch.bincount(tiles, minlength=columns * rows).cumsum(0), (1, 0))
+    return TileLists(starts.int(), owners[slots].int(), slots, counts)
+
+
+def rasterize(
+    gaussians: ActivatedGaussians, view: RasterView, background: Tensor, grad_rows: Tensor | None
+) -> tuple[Tensor, Tensor, RasterInfo]:
+    """See `progdf.rasterize.render`."""
+    splats, info = project(of_rows(gaussians.each(Tensor.double), grad_rows), view)
+    image, transmittance = blend(
+        splats, list_tiles(splats, view.crop), view.crop, is_listed(splats, info, grad_rows)
+    )
+    return image + transmittance[..., None] * background.to(image), transmittance, info
+
+
+def color_map(gaussians: ActivatedGaussians, view: RasterView, rows: Tensor) -> ColorMap:
+    """See `progdf.rasterize.color_map`."""
+    with torch.no_grad():
+        splats, info = project(gaussians.each(Tensor.double), view)
+    lists, wanted = list_tiles(splats, view.crop), is_listed(splats, info, rows)
+    return DrawnColors(
+        splats, rows, len(gaussians.means), lambda some: blend(some, lists, view.crop, wanted)[0]
+    )
+
+
+def alpha_weights(gaussians: ActivatedGaussians, view: RasterView, mask: Tensor) -> Tensor:
+    """See `progdf.rasterize.alpha_weights`."""
+    splats, _ = project(gaussians.each(Tensor.double), view)
+    lists = list_tiles(splats, view.crop)
+    arrays = splat_arrays(splats)
+    _, _, last, deepest = _blend(arrays, lists, view.crop)
+    sums, inside = arrays[0].new_zeros(len(lists.members), 4), mask.to(arrays[0]).flatten()
+    _launch(add_weights_kernel, lists, view.crop, (*arrays, last, deepest, lists.slots.int(), inside, sums))
+    return sums.new_zeros(len(gaussians.means), 4).index_copy(0, splats.rows, _add_slots(sums, lists))
+
+
+def is_listed(splats: ReferenceSplats, info: RasterInfo, rows: Tensor | None) -> Tensor | None:
+    """Which splats are of these Gaussians, None: all. [V] bool"""
+    return None if rows is None else torch.zeros_like(info.visible).index_fill(0, rows, True)[splats.rows]
+
+
+def blend(
+    splats: ReferenceSplats, lists: TileLists, crop: Crop, wanted: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    """Blend projected Gaussians on black; differentiable in those that are wanted.
+
+    Returns:
+        image [h,w,3] and transmittance [h,w] of the window, float32
+    """
+    leaves = splats.means2d, splats.whitening, splats.opacities, splats.colors
+    drawn: tuple[Tensor, Tensor] = _Blend.apply(  # type: ignore[no-untyped-call]
+        splats, lists, crop, wanted, *leaves
+    )
+    return drawn
+
+
+class _Blend(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, splats: ReferenceSplats, lists: TileLists, crop: Crop, wanted: Tensor | None,
+        *leaves: Tensor,
+    ) -> tuple[Tensor, Tensor]:  # fmt: skip
+        arrays = splat_arrays(splats)
+        image, *made = _blend(arrays, lists, crop)
+        ctx.forward_pass = splats, lists, crop, wanted, arrays, made
+        size = crop[3] - crop[1], crop[2] - crop[0]
+        return image.view(*size, 3), made[0].view(size)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, by_image: Tensor, by_transmittance: Tensor) -> tuple[Tensor | None, ...]:
+        splats, lists, crop, wanted, arrays, made = ctx.forward_pass
+        slots = lists.slots.int()
+        if wanted is not None:
+            slots = slots.where(wanted[lists.members], -1)
+        sums = by_image.new_zeros(len(lists.members), SUMS)
+        gradients = by_image.flatten(0, 1).contiguous(), by_transmittance.flatten().contiguous()
+        _launch(blend_backward_kernel, lists, crop, (*arrays, *made, slots, *gradients, sums))
+        moments = _add_slots(sums, lists).double()
+        g, gu, gv, guu, guv, gvv = moments[:, 3:].unbind(1)
+        l11, l21, l22 = splats.whitening.unbind(1)
+        # −Σ g·u·dx, −Σ g·u·dy, −Σ g·v·dy, and their likes: offsets by what they are whitened
+        by_center = torch.stack([l11 * gu, l21 * gu + l22 * gv], dim=1)
+        by_whitening = torch.stack([(l21 / l22 * guv - guu) / l11, -guv / l22, -gvv / l22], dim=1)
+        return None, None, None, None, by_center, by_whitening, g / splats.opacities, moments[:, :3]
+
+
+def splat_arrays(splats: ReferenceSplats) -> tuple[Tensor, Tensor, Tensor]:
+    """Boxes [V,4], shapes [V,6] and colors with opacity [V,4], as the kernels have them."""
+    means2d, whitening, opacities, colors, extents = (
+        tensor.detach()
+        for tensor in (splats.means2d, splats.whitening, splats.opacities, splats.colors, splats.extents)
+    )
+    boxes = torch.cat([means2d - extents - _SLACK, means2d + extents + _SLACK], dim=1).float()
+    squared = 2.0 * (opacities / ALPHA_MIN).log()
+    shapes = torch.cat([means2d, whitening, squared[:, None]], dim=1)
+    return boxes, shapes, torch.cat([colors, opacities[:, None]], dim=1).float()
+
+
+def _blend(arrays: Sequence[Tensor], lists: TileLists, crop: Crop) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Image on black [h·w,3], transmittance [h·w]; last [h·w] and deepest [T], see `blend_kernel`."""
+    pixels = (crop[3] - crop[1]) * (crop[2] - crop[0])
+    image, transmittance = arrays[0].new_empty(pixels, 3), arrays[0].new_empty(pixels)
+    last = torch.empty_like(transmittance, dtype=torch.int32)
+    deepest = torch.full_like(lists.starts[1:], -1)
+    _launch(blend_kernel, lists, crop, (*arrays, image, transmittance, last, deepest))
+    return image, transmittance, last, deepest
+
+
+def _add_slots(sums: Tensor, lists: TileLists) -> Tensor:
+    """What each splat's intersections add up to, in their fixed order. [I,C] -> [V,C]"""
+    return torch.segment_reduce(sums, "sum", lengths=lists.counts, unsafe=True)
+
+
+def _launch(kernel: Any, lists: TileLists, crop: Crop, tensors: Sequence[Tensor]) -> None:
+    """Run a kernel with a block for each tile of the window, on torch's stream."""
+    device = lists.starts.device
+    with _launching:
+        _start()
+        wp.launch(
+            kernel, dim=(len(lists.starts) - 1) * TILE * TILE,
+            inputs=[wp.vec4i(*crop), lists.starts, lists.members, *tensors],
+            block_dim=TILE * TILE, device=wp.device_from_torch(device),
+            stream=wp.stream_from_torch(torch.cuda.current_stream(device)) if device.type == "cuda" else None,
+        )  # fmt: skip

@@ -1,0 +1,80 @@
+"""The engine for graphics cards, on Warp's CPU device: blocks of threads, code for cards, a quiet start."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from progdf.errors import ProgdfError
+from progdf.rasterize.engines import ENGINES, get_engine
+from tests.helpers.drawn import INPUTS, NEEDS_WARP, draw
+from tests.helpers.scenes import orbit_camera, random_gaussians
+
+ARCHITECTURES = (75, 86, 89, 90)
+"""Of the cards from RTX 20 to H100."""
+
+
+@NEEDS_WARP
+def test_the_bits_are_the_same_in_every_run() -> None:
+    scene, camera = random_gaussians(1000, seed=6, sh_degree=1), orbit_camera(64, 48)
+    first, second = draw(scene, camera, "warp"), draw(scene, camera, "warp")
+    assert torch.equal(first.image, second.image)
+    for name in INPUTS:
+        assert torch.equal(first.gradients[name], second.gradients[name]), name
+
+
+@pytest.mark.slow
+@NEEDS_WARP
+def test_a_block_of_threads_adds_up_what_single_threads_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on a card: 256 threads of a tile that meet at each sum. Otherwise a CPU runs them one by one."""
+    import warp as wp
+
+    scene, camera = random_gaussians(300, seed=6, sh_degree=1), orbit_camera(50, 40)
+    single = draw(scene, camera, "warp")
+    monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
+    block = draw(scene, camera, "warp")
+    assert torch.equal(block.image, single.image)
+    for name in INPUTS:
+        torch.testing.assert_close(block.gradients[name], single.gradients[name], rtol=1e-5, atol=1e-5)
+
+
+@NEEDS_WARP
+def test_the_kernels_compile_for_cards_without_a_card(tmp_path: Path) -> None:
+    import warp as wp
+
+    from progdf.rasterize import warp_engine
+
+    wp.compile_aot_module(warp_engine.__name__, arch=ARCHITECTURES, module_dir=tmp_path)
+    compiled = [path.name for path in tmp_path.iterdir()]
+    for architecture in ARCHITECTURES:
+        (name,) = (name for name in compiled if f".sm{architecture}." in name)
+        assert (tmp_path / name).stat().st_size > 10_000
+
+
+@NEEDS_WARP
+def test_nothing_is_loaded_before_the_engine_is_asked_for_and_its_start_is_quiet() -> None:
+    code = (
+        "import sys; import progdf, progdf.rasterize; assert 'warp' not in sys.modules;"
+        "from tests.helpers.scenes import front_camera, one_gaussian;"
+        "progdf.render(one_gaussian(), front_camera(), engine='warp'); assert 'warp' in sys.modules"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert not done.stdout
+    assert set(done.stderr.splitlines()) <= {NO_DRIVER}
+
+
+def test_without_warp_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "warp", None)
+    monkeypatch.delitem(sys.modules, ENGINES["warp"], raising=False)
+    with pytest.raises(ProgdfError, match=r"needs warp-lang; pip install 'progdf-studio\[gpu\]'"):
+        get_engine.__wrapped__("warp")
+
+
+NO_DRIVER = (
+    "Warp CUDA warning: Could not find or load the NVIDIA CUDA driver. GPU execution will not be available."
+)
+"""Printed by Warp's native part, which no setting reaches, on machines without a card."""
