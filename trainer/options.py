@@ -95,8 +95,6 @@ class EditorOptions:
     """instruct: denoising steps per picture; by default the model's own number (paper: 20)."""
     edit_size: Annotated[int | None, absent_option("INT", "the model's own")] = None
     """style, instruct: longer side in pixels at which pictures are painted; larger makes finer strokes."""
-    reedit_every: int = 0
-    """style, instruct: every N steps, edit the current renders again and train towards those; 0: never."""
     graded: Fixed[bool] = False  # at several strengths by rising guidance, not the finished edit alone
     seed: Fixed[int] = 0  # of the noise, the same in every view
     cache: Fixed[Path | None] = None  # folder in which painted pictures are kept; None keeps nothing

@@ -112,7 +112,6 @@ def resolve_kind(options: TrainOptions, kind: EditKind, group_steps: int) -> Opt
         and sharpness == "off"
         and not optimize.perceptual_weight
         and not optimize.as_printed
-        and not options.editor.reedit_every
     )
     weight, most = optimize.perceptual_weight, STAGES[kind]
     return replace(
@@ -146,7 +145,6 @@ def check_options(options: TrainOptions) -> None:
         ("--edit-size", editor.edit_size, 32, 4096),
         ("--lift-threshold", region.lift_threshold, 0, 1),
         ("--box-threshold", region.box_threshold, 0, 1),
-        ("--reedit-every", editor.reedit_every, 0, 100_000),
     )
     stages = optimize.stages or MOST_STAGES
     if not 4 * stages <= optimize.steps <= MOST_STEPS:
@@ -189,8 +187,7 @@ def _check_editor_options(editor: EditorOptions, optimize: OptimizeOptions) -> N
             "give more as folder:DIR, of views that --cameras has"
         )
     of_instruct = ("model", "guidance", "edit_steps")
-    of_painters = ("edit_size", "reedit_every")
-    for names, kinds in ((of_instruct, ("instruct",)), (of_painters, ("style", "instruct"))):
+    for names, kinds in ((of_instruct, ("instruct",)), (("edit_size",), ("style", "instruct"))):
         for name in names:
             if getattr(editor, name) != getattr(EditorOptions, name) and editor.family not in kinds:
                 option = "--" + name.replace("_", "-")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Protocol, runtime_checkable
+from collections.abc import Sequence
+from typing import Protocol
 
 from torch import Tensor
 
@@ -36,14 +37,33 @@ class ImageEditor(Protocol):
         ...
 
 
-@runtime_checkable
-class RepaintingEditor(Protocol):
-    """An editor that looks at a picture and paints another, and so can look at a render again."""
+class Painter(Protocol):
+    """Paints one picture as it was told, at any degree."""
 
-    def edit_again(self, view: View, strength: float, current: Tensor | None, step: int) -> Tensor:
-        """The edited view, painted from the render of training step `step`. [H,W,3] -> [H,W,3] 0..1
+    references: int  # pictures beside the view's own that one call can take
 
-        None for the render stands for the one that was painted from at that step; ProgdfError if that picture
-        is no longer there.
+    def paint(
+        self,
+        picture: Tensor,
+        references: Sequence[Tensor] = (),
+        *,
+        strength: float = 1.0,
+        softness: float = 1.0,
+        source: Tensor | None = None,
+        seed: int | None = None,
+    ) -> Tensor:
+        """The picture as it was told.
+
+        Args:
+            picture: what is painted, and the condition of the painting. [H,W,3] 0..1
+            references: further pictures to look at, at most as many as it can take. [h,w,3] each
+            strength: 0 is `source`, 1 the finished edit
+            softness: share of the painting over which the source is let go of; 1 all of it, small: first the
+                source alone, then a free finish
+            source: where strength 0 ends; None: `picture` itself. [H,W,3]
+            seed: of the noise; None: the editor's own
+
+        Returns:
+            [H,W,3] 0..1
         """
         ...

@@ -161,20 +161,14 @@ class InstructEditor:
         """See `ImageEditor.edit`."""
         if strength == 0.0:
             return view.image
-        return self._paint(view, view.image, strength, "" if strength == 1.0 else f"{strength:g}")
-
-    def edit_again(self, view: View, strength: float, current: Tensor | None, step: int) -> Tensor:
-        """See `RepaintingEditor.edit_again`."""
-        return self._paint(view, current, strength, f"step_{step:05d}")
-
-    def _paint(self, view: View, source: Tensor | None, strength: float, place: str) -> Tensor:
         if self.stages and strength not in self.stages:
             raise ValueError(f"this editor edits at strengths {list(self.stages)}, not {strength:g}")
         # guidance 1 is none, and pipelines skip it altogether below
         guidance = self.guidance if strength == 1.0 else 1.0 + strength * (self.guidance - 1.0)
         recipe = {**self.recipe, "guidance": guidance}
+        place = "" if strength == 1.0 else f"{strength:g}"
         return self.kept.picture(
-            view.camera.name, source, recipe, lambda picture: self.paint(picture, guidance), place
+            view.camera.name, view.image, recipe, lambda picture: self.paint(picture, guidance), place
         )
 
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from progdf.errors import ProgdfError
 from progdf.field.trajectory import Trajectory, load_trajectory, save_trajectory
 from progdf.formats.scene_file import load_scene
-from progdf.gaussians import BASE_CHANNELS, ZERO, Gaussians, pack
+from progdf.gaussians import BASE_CHANNELS, ZERO, Gaussians
 from progdf.gdf.file import save_gdf
 from progdf.io.atomic import read_file
 from progdf.io.cameras import load_cameras, save_cameras
@@ -27,7 +27,6 @@ from trainer.editors import (
     COSTLY_STRENGTHS,
     EXTERNAL,
     PER_VIEW,
-    RepaintingEditor,
     check_editor,
     check_new_editor,
     make_editor,
@@ -40,7 +39,7 @@ from trainer.fit.network import PART as NETWORK
 from trainer.fit.slider_uniformity import equalized_strengths
 from trainer.optimize.losses import Perceptual, describe_loss, perceptual_loss
 from trainer.optimize.retime import resolve_slider
-from trainer.options import MOST_STAGES, EditKind, EditorOptions, OptimizeOptions, TrainOptions
+from trainer.options import MOST_STAGES, EditKind, OptimizeOptions, TrainOptions
 from trainer.regions.from_pictures import RegionRequest, region_checks, region_kinds
 from trainer.report.agreement import Agreement, measure_agreement
 from trainer.resolve import recorded_options, resolve, resolve_kind
@@ -67,7 +66,7 @@ from trainer.store.run_folder import (
 )
 from trainer.store.state import interrupt_on_signals
 from trainer.views.crops import only_recolors
-from trainer.views.view import BACKGROUND, crop, render_view
+from trainer.views.view import BACKGROUND, render_view
 
 from .finish import RunResult, end_rows, finish_run, load_evaluator, load_result
 from .kinds import Approach, choose_approach
@@ -118,67 +117,6 @@ def region_request(
         return open_run_folder(options.out, options.edit).segment_masks
 
     return RegionRequest(options.region, options.views, cache, quiet, say)
-
-
-class Reedit:
-    """New targets for the training views, every so many steps of a stage; see `pgs.Renewal`.
-
-    Args:
-        editor: paints
-        setup: scene, region and the training views with their final boxes
-        every: steps between two edits, counted over all stages
-        is_confined: put back what changes outside the region
-        log: of the run
-    """
-
-    def __init__(
-        self, editor: RepaintingEditor, setup: TrainingSetup, every: int, is_confined: bool, log: RunLog
-    ) -> None:
-        self._editor, self._setup, self._log = editor, setup, log
-        self._every, self._confined = every, is_confined
-        self._shown = 0  # the step whose pictures are the targets now; 0: none
-
-    def __call__(self, step: int, local: int, strength: float, offsets: Tensor) -> list[Tensor] | None:
-        """See `pgs.Renewal`. A run that goes on between two edits finds the last one's pictures on disk."""
-        due = step - step % self._every
-        if due <= step - local or due == self._shown:
-            return None
-        self._shown = due
-        setup, members = self._setup, self._setup.region.members
-        renders: list[Tensor | None] = [None] * len(setup.train)
-        if due == step:
-            rows = pack(setup.scene[members], with_shN=setup.scene.sh_degree > 0) + offsets
-            scene = setup.scene.replace_rows(members, rows)
-            with torch.no_grad():
-                renders = [
-                    render_view(scene, view.camera, setup.background).clamp(0, 1) for view in setup.train
-                ]
-            self._log.say(f"step {step}: the editor looks at {len(renders)} renders again")
-        targets = []
-        for view, now in zip(setup.train, renders, strict=True):
-            made = self._editor.edit_again(view, strength, now, due)
-            targets.append(crop(quantize_image(view.confine(made) if self._confined else made), view.box))
-        return targets
-
-
-def reedit(
-    options: EditorOptions,
-    setup: TrainingSetup,
-    optimization: OptimizeOptions,
-    folder: RunFolder,
-    log: RunLog,
-) -> Reedit | None:
-    """What --reedit-every asks for; None where it asks for nothing.
-
-    Raises:
-        ProgdfError: the editor cannot look at a picture again.
-    """
-    if not options.reedit_every:
-        return None
-    editor = make_editor(replace(options, cache=folder.paintings), setup.scene, setup.region, setup.views)
-    if not isinstance(editor, RepaintingEditor):
-        raise ProgdfError(f"--reedit-every does not apply to {options.editor}; leave it out")
-    return Reedit(editor, setup, options.reedit_every, confines_edit(editor, optimization.kind), log)
 
 
 __all__ = ["RunResult", "Shared", "train"]
@@ -478,17 +416,8 @@ def _record(
     if options.optimize.group_steps and optimization.kind != "geometry":
         log.say(f"--group-steps: without effect on this {optimization.kind} edit, whose loss is {objective}")
     with log.stage("optimize"):
-        renewal = reedit(options.editor, setup, optimization, folder, log)
         trajectory, losses, effort = optimize_members(
-            options,
-            optimization,
-            setup,
-            edited,
-            perceptual,
-            folder.state,
-            log,
-            renewal=renewal,
-            between=between,
+            options, optimization, setup, edited, perceptual, folder.state, log, between=between
         )
     with log.stage("retime"):
         costs: dict[str, float] = {}
