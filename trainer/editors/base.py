@@ -40,7 +40,10 @@ class ImageEditor(Protocol):
 class Painter(Protocol):
     """Paints one picture as it was told, at any degree."""
 
-    references: int  # pictures beside the view's own that one call can take
+    @property
+    def references(self) -> int:
+        """Pictures beside the view's own that one call can take."""
+        ...
 
     def paint(
         self,

@@ -148,14 +148,28 @@ class _Request:
 class InstructEditor:
     """Edits pictures as a sentence says."""
 
-    # the whole picture edited, under a guidance. [H,W,3], guidance -> [H,W,3]
-    paint: Callable[[Tensor, float], Tensor]
+    # the whole picture edited, under a guidance, with the noise of a seed. [H,W,3] -> [H,W,3]
+    ask: Callable[[Tensor, float, int | None], Tensor]
     guidance: float  # of the finished edit
     recipe: Recipe  # what a picture depends on besides guidance
     kept: KeptPictures  # where pictures are kept
     stages: tuple[float, ...] = (1.0,)  # (1,), or empty where graded
     kind: EditKind = "style"
     is_confined: bool = False
+    references: int = 0
+
+    def paint(
+        self,
+        picture: Tensor,
+        references: Sequence[Tensor] = (),
+        *,
+        strength: float = 1.0,
+        softness: float = 1.0,
+        source: Tensor | None = None,
+        seed: int | None = None,
+    ) -> Tensor:
+        """See `Painter.paint`; the strength is without effect."""
+        return self.ask(picture, self.guidance, seed)
 
     def edit(self, view: View, strength: float) -> Tensor:
         """See `ImageEditor.edit`."""
@@ -168,7 +182,7 @@ class InstructEditor:
         recipe = {**self.recipe, "guidance": guidance}
         place = "" if strength == 1.0 else f"{strength:g}"
         return self.kept.picture(
-            view.camera.name, view.image, recipe, lambda picture: self.paint(picture, guidance), place
+            view.camera.name, view.image, recipe, lambda picture: self.ask(picture, guidance, None), place
         )
 
 
@@ -194,7 +208,7 @@ def instruct(
     }
     graded = options.graded and request.guidance > 1.0
     return InstructEditor(
-        lambda picture, guidance: _run_pipeline(pipeline(), request, picture, guidance),
+        lambda picture, guidance, seed: _run_pipeline(pipeline(), request, picture, guidance, seed),
         request.guidance,
         recipe,
         KeptPictures(options.cache),
@@ -304,7 +318,9 @@ def load_pipeline(model: str, kind: str) -> Any:
     return pipeline.to("cuda" if gpu else "cpu")
 
 
-def _run_pipeline(pipeline: Any, request: _Request, view: Tensor, guidance: float) -> Tensor:
+def _run_pipeline(
+    pipeline: Any, request: _Request, view: Tensor, guidance: float, seed: int | None
+) -> Tensor:
     """One picture through a pipeline, back at its own size. [H,W,3] -> [H,W,3]"""
     source = to_picture(view)
     scale = request.size / max(source.size)
@@ -314,7 +330,7 @@ def _run_pipeline(pipeline: Any, request: _Request, view: Tensor, guidance: floa
         request.prompt, picture, request.steps, guidance, request.image_guidance
     )
     # the same noise in every view: what the picture leaves open is then decided alike
-    noise = torch.Generator().manual_seed(request.seed)
+    noise = torch.Generator().manual_seed(request.seed if seed is None else seed)
     edited = pipeline(**arguments, generator=noise).images[0]
     edited = edited.convert("RGB").resize(source.size, Image.Resampling.LANCZOS)
     return torch.from_numpy(np.asarray(edited, dtype=np.float32) / 255.0)

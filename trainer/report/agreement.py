@@ -13,11 +13,11 @@ Where parts move, colors cannot follow, and nothing is measured.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
-from torch.nn.functional import interpolate
+from torch.nn.functional import avg_pool2d, interpolate
 
 from progdf.metrics.image import NO_DIFFERENCE, decibels
 from progdf.rasterize import render
@@ -26,10 +26,11 @@ from trainer.views.crops import CropScene, crop_scene
 from trainer.views.view import View, crop
 
 _MOST_UNEXPLAINED = 0.4  # half way between the edits that agree and those that do not, see above
+_LEAST_CONTRAST = 0.5
 _HARMLESS_DB = 28.0  # what differs by less is not seen, whatever its share of a faint change
 _REMEDIES = {
     "style": "use a calmer style (14, 23, 20, 7)",
-    "instruct": "use less --guidance or --reedit-every 200, or --kind geometry if parts move",
+    "instruct": "use less --guidance, or --kind geometry if parts move",
     "folder": "edit the views more alike, or say --kind geometry if parts move",
 }
 _ROUNDS = 6
@@ -42,11 +43,15 @@ class Agreement:
 
     psnr: float  # of the best colors on held-out views, over the pixels that show the region or change, dB
     unexplained: float  # what those colors leave of the change there, as a share of its energy, 0 is best
+    contrast: float = (
+        1.0  # energy of the fine part of the change, of those colors over the pictures', 1 is best
+    )
 
     @property
     def agree(self) -> bool:
         """Whether that is what edits that are the same from everywhere leave."""
-        return self.unexplained <= _MOST_UNEXPLAINED or self.psnr >= _HARMLESS_DB
+        alike = self.unexplained <= _MOST_UNEXPLAINED and self.contrast >= _LEAST_CONTRAST
+        return alike or self.psnr >= _HARMLESS_DB
 
     def line(self, editor: str, judged_on: str) -> str:
         """One line for the log, with advice where the views disagree.
@@ -56,6 +61,7 @@ class Agreement:
             judged_on: the views that the figures are of, in words
         """
         share = f"{100 * self.unexplained:.0f} % of the change"
+        share = f"{share} and {100 * max(0.0, 1 - self.contrast):.0f} % of its fine contrast"
         if self.agree:
             best = f"the best colors reach {self.psnr:.1f} dB and miss {share}"
             return f"the edited views agree: on {judged_on} {best}"
@@ -69,6 +75,7 @@ class Agreement:
         return {
             "psnr_best": round(self.psnr, 2),
             "unexplained": round(self.unexplained, 3),
+            "contrast": round(self.contrast, 3),
             "agree": self.agree,
         }
 
@@ -89,6 +96,16 @@ class ViewChange:
         drawn = render(changed, scene.camera, (0.0, 0.0, 0.0), crop=scene.box, grad_rows=scene.rows)
         return drawn.image * self.counts
 
+    def residual(self, colors: Tensor) -> float:
+        """Share of the change's energy that the picture of these colors leaves. [M,3] -> 0 is best"""
+        with torch.no_grad():
+            missing = (self.change - self.render(colors)).square().sum()
+        return float(missing / self.change.square().sum().clamp_min(1e-12))
+
+    def weighted(self, weight: float) -> ViewChange:
+        """The view with another say in a fit."""
+        return replace(self, change=self.change * weight**0.5, counts=self.counts * weight**0.5)
+
     def gather(self, picture: Tensor, members: int) -> Tensor:
         """The transpose of `render`: what each member gets of a picture. [h,w,3] -> [M,3]"""
         colors = torch.zeros(members, 3, requires_grad=True)
@@ -106,16 +123,31 @@ def measure_agreement(setup: TrainingSetup, train: Sequence[Tensor], held_out: S
     members = len(setup.region.members)
     seen = [view_change(setup, view, edited) for view, edited in zip(setup.train, train, strict=True)]
     colors = fit_colors(seen, members)
-    lost = change = count = 0.0
+    judged = [view_change(setup, view, edited) for view, edited in zip(setup.judging, held_out, strict=True)]
     with torch.no_grad():
-        for view, edited in zip(setup.judging, held_out, strict=True):
-            one = view_change(setup, view, edited)
-            lost += float((one.change - one.render(colors)).square().sum())
-            change += float(one.change.square().sum())
-            count += 3 * float(one.counts.sum())
+        lost = sum(float((one.change - one.render(colors)).square().sum()) for one in judged)
+    change = sum(float(one.change.square().sum()) for one in judged)
+    count = 3 * sum(float(one.counts.sum()) for one in judged)
     if lost <= 0 or count == 0:
         return Agreement(NO_DIFFERENCE, 0.0)
-    return Agreement(decibels(lost / count), lost / max(change, 1e-12))
+    return Agreement(decibels(lost / count), lost / max(change, 1e-12), contrast(judged, colors))
+
+
+def contrast(seen: Sequence[ViewChange], colors: Tensor) -> float:
+    """Energy of the fine part of the change (Laplacian), of these colors [M,3] over that of the pictures.
+
+    Texture that disagrees hardly weighs in the energy of the change, and what is washed out agrees; both
+    lose this.
+    """
+    with torch.no_grad():
+        shown = sum(_fine_energy(one.render(colors)) for one in seen)
+    return shown / max(sum(_fine_energy(one.change) for one in seen), 1e-12)
+
+
+def _fine_energy(change: Tensor) -> float:
+    """Of a picture's Laplacian. [h,w,3]"""
+    planes = change.permute(2, 0, 1)[:, None]
+    return float((4 * planes - 4 * avg_pool2d(planes, 3, 1, 1)).square().sum())
 
 
 def fit_colors(seen: Sequence[ViewChange], members: int) -> Tensor:
@@ -144,10 +176,24 @@ def fit_colors(seen: Sequence[ViewChange], members: int) -> Tensor:
     return colors
 
 
-def view_change(setup: TrainingSetup, view: View, edited: Tensor) -> ViewChange:
-    camera = view.camera.resize(max(1, view.camera.width // 2), max(1, view.camera.height // 2))
+def robust_colors(seen: Sequence[ViewChange], members: int) -> Tensor:
+    """`fit_colors` in which a view has the less say the less the fit of all explains it. -> [M,3]
+
+    Cauchy's weights, at twice the median residual: of views alike all count alike. None goes without a say,
+    as a member that no other view shows gets its color from there.
+    """
+    colors = fit_colors(seen, members)
+    shares = torch.tensor([one.residual(colors) for one in seen])
+    weights = 1 / (1 + (shares / (2 * shares.median()).clamp_min(1e-6)).square())
+    return fit_colors([one.weighted(float(w)) for one, w in zip(seen, weights, strict=True)], members)
+
+
+def view_change(setup: TrainingSetup, view: View, edited: Tensor, shrink: int = 2) -> ViewChange:
+    """The change of a view at a fraction of its size. [H,W,3]"""
+    camera = view.camera.resize(max(1, view.camera.width // shrink), max(1, view.camera.height // shrink))
     x0, y0, x1, y1 = view.box
-    box = (x0 // 2, y0 // 2, min(camera.width, -(-x1 // 2)), min(camera.height, -(-y1 // 2)))
+    right, bottom = min(camera.width, -(-x1 // shrink)), min(camera.height, -(-y1 // shrink))
+    box = (x0 // shrink, y0 // shrink, right, bottom)
 
     def small(picture: Tensor) -> Tensor:
         stack = picture.permute(2, 0, 1)[None]

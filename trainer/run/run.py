@@ -32,6 +32,7 @@ from trainer.editors import (
     make_editor,
 )
 from trainer.editors.base import ImageEditor
+from trainer.editors.instruct import InstructEditor
 from trainer.editors.pictures import FolderEditor, picture_cameras
 from trainer.fit.draft import draft_grade, draft_views
 from trainer.fit.fit import choose_path, drop_idle_attributes
@@ -68,6 +69,7 @@ from trainer.store.state import interrupt_on_signals
 from trainer.views.crops import only_recolors
 from trainer.views.view import BACKGROUND, render_view
 
+from .agree import Easel, agree_views
 from .finish import RunResult, end_rows, finish_run, load_evaluator, load_result
 from .kinds import Approach, choose_approach
 from .record import RunRecord, read_record
@@ -216,8 +218,9 @@ def _run_training(
     log.say(f"{len(scene)} Gaussians, {len(region)} in the region; {_describe_views(setup)}")
     for note in setup.notes:
         log.say(note)
+    editor = cache(partial(_make_editor, options, setup, folder, log))
     with log.stage("edit"):
-        edited, approach, trial, between = _edit_views(options, setup, folder, log)
+        edited, approach, trial, between = _edit_views(options, setup, editor, folder, log)
         train_edits = {s: pictures[: len(setup.train)] for s, pictures in edited.items()}
         setup = whole_views(setup) if options.optimize.as_printed else widen_views(setup, train_edits)
     recorded = folder.state.load("recorded")
@@ -225,7 +228,9 @@ def _run_training(
         with log.stage("agree"):
             agreement = _agreement(options, setup, edited, approach.kind, log)
         optimization = resolve_kind(options, approach.kind, approach.group_steps)
-        trajectory, outcome = _record(options, optimization, setup, edited, between, perceptual, folder, log)
+        trajectory, outcome = _record(
+            options, optimization, setup, edited, between, editor, perceptual, folder, log
+        )
         record = RunRecord(
             recorded_options(options),
             options.scene.resolve(),
@@ -297,8 +302,21 @@ def _render_originals(
     return setup
 
 
+def _make_editor(options: TrainOptions, setup: TrainingSetup, folder: RunFolder, log: RunLog) -> ImageEditor:
+    """The run's one editor; where a model paints, with views that agree."""
+    settings = replace(options.editor, cache=folder.paintings)
+    editor = make_editor(settings, setup.scene, setup.region, setup.views)
+    if not isinstance(editor, InstructEditor):
+        return editor
+    return agree_views(Easel(editor, editor.recipe, editor.kept, settings.seed), setup, editor, log)
+
+
 def _edit_views(
-    options: TrainOptions, setup: TrainingSetup, folder: RunFolder, log: RunLog
+    options: TrainOptions,
+    setup: TrainingSetup,
+    editor: Callable[[], ImageEditor],
+    folder: RunFolder,
+    log: RunLog,
 ) -> tuple[Pictures, Approach, dict[str, Any] | None, Callable[[float], Pictures]]:
     """What the editor makes of all views, by strength, read where it is on disk; how to train towards it;
     what a trial found of that; and, given what the finished edit misses, all strengths that its course
@@ -308,10 +326,6 @@ def _edit_views(
     names = [view.camera.name for view in views]
     made: dict[float, Sequence[Tensor]] = {}
     approach, trial = Approach("color"), None
-
-    @cache
-    def editor() -> ImageEditor:
-        return make_editor(replace(options.editor, cache=folder.paintings), setup.scene, setup.region, views)
 
     def edit(strengths: Sequence[float]) -> Pictures:
         new, is_confined = [s for s in strengths if s not in made], confines_edit(editor(), approach.kind)
@@ -406,6 +420,7 @@ def _record(
     setup: TrainingSetup,
     edited: Pictures,
     between: Callable[[float], Pictures],
+    editor: Callable[[], ImageEditor],
     perceptual: Perceptual,
     folder: RunFolder,
     log: RunLog,
@@ -428,7 +443,7 @@ def _record(
         recorded, reason = len(trajectory), ""
         one_end = len(trajectory.strengths) == 1
         if one_end and not optimization.as_printed and options.field.field != "neural":
-            trajectory, reason = _choose_path(trajectory, options, optimization, setup, folder, log)
+            trajectory, reason = _choose_path(trajectory, options, optimization, setup, editor, log)
         else:
             trajectory = retime_trajectory(trajectory, setup, optimization, log)
     log.say(
@@ -449,17 +464,14 @@ def _choose_path(
     options: TrainOptions,
     optimization: OptimizeOptions,
     setup: TrainingSetup,
-    folder: RunFolder,
+    editor: Callable[[], ImageEditor],
     log: RunLog,
 ) -> tuple[Trajectory, str]:
     """The way to the only target there was, and why."""
-    editor = None  # of pictures made elsewhere: their folder may be gone by now, and there is no half
-    if options.editor.family not in EXTERNAL:
-        editor = make_editor(
-            replace(options.editor, cache=folder.paintings), setup.scene, setup.region, setup.views
-        )
+    # of pictures made elsewhere the folder may be gone by now, and there is no half
+    painter = None if options.editor.family in EXTERNAL else editor()
     retimed = partial(retime_trajectory, setup=setup, optimization=optimization, log=log)
-    return choose_path(trajectory, setup, editor, bool(optimization.group_steps), retimed)
+    return choose_path(trajectory, setup, painter, bool(optimization.group_steps), retimed)
 
 
 def _write_finals(setup: TrainingSetup, trajectory: Trajectory, folder: RunFolder, log: RunLog) -> None:
