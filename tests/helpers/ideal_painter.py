@@ -6,6 +6,7 @@ decides which, early, as in a trained model; Euler's steps of a flow, x = (1 −
 
 from __future__ import annotations
 
+import cmath
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -37,7 +38,7 @@ class IdealPainter:
     choices: Sequence[Tensor]  # of each view. [K,H,W,3]
     references: int = 2
     reach: float = math.radians(33)  # standard deviation about the choice that references show
-    scale: float = 1.0  # of the pictures against the noise
+    scale: float = 0.25  # of the pictures against the noise
     alone: bool = True  # whether each view has noise of its own: what it decides, it decides alone
     calls: int = 0
     chosen: list[int] = field(default_factory=list)
@@ -88,23 +89,20 @@ class IdealPainter:
         return -0.5 * (apart / self.reach).square()
 
     def direction(self, index: int, reference: Tensor) -> complex:
-        """The choice that a reference shows, in its own view or laid over this one, as a unit vector."""
-        best, error = 0, math.inf
-        for i in range(len(self.views)):
-            view, edits = self.views[i], self.choices[i]
-            if reference.shape != view.image.shape:
-                continue
-            same = (reference - view.image)[view.mask < 1e-3]
-            if not (i == index or (len(same) and float(same.abs().max()) < 1e-3)):
-                continue
-            changed = (reference - view.image).abs().amax(dim=2) > 0.02
-            if i == index and int(changed.sum()) < 8:
-                return 0j
-            misfit = (edits[:, changed] - reference[changed]).square().flatten(1).mean(dim=1)
-            if float(misfit.min()) < error:
-                best, error = int(misfit.argmin()), float(misfit.min())
-        angle = 2 * math.pi * best / len(self.choices[0])
-        return complex(math.cos(angle), math.sin(angle))
+        """The choice that a reference shows, as a unit vector times the share of the region that it edits.
+
+        It is a picture of a view that it equals beside the region: its own, or else this one.
+        """
+        beside = [v.mask < 1e-3 for v in self.views]
+        of = index
+        for i, view in enumerate(self.views):
+            if torch.allclose(reference[beside[i]], view.image[beside[i]], rtol=0, atol=2 / 255):
+                of = i
+        view = self.views[of]
+        changed = (reference - view.image).abs().amax(dim=2) > 0.02
+        misfit = (self.choices[of][:, changed] - reference[changed]).square().flatten(1).sum(dim=1)
+        share = float(changed.sum() / (view.mask > 0.05).sum())
+        return share * cmath.exp(2j * math.pi * int(misfit.argmin()) / len(self.choices[0]))
 
 
 def hues(case: Small, count: int) -> list[Tensor]:
@@ -126,6 +124,6 @@ def phases(case: Small, count: int) -> list[Tensor]:
     period = float(torch.quantile(heights, 0.98) - torch.quantile(heights, 0.02)) / STRIPES
     patterns = [0.5 + 0.5 * torch.cos(2 * math.pi * (heights / period + k / count)) for k in range(count)]
     return [
-        torch.stack([replace(editor, pattern=pattern).edit(view, 1.0) for pattern in patterns])
+        torch.stack([replace(editor, pattern=pattern).edit(view, 0.6) for pattern in patterns])
         for view in case.views
     ]

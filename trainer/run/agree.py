@@ -1,19 +1,21 @@
 """Views that agree: what a sentence leaves open is decided once, in one picture, and all views follow it.
 
-A model that paints every view for itself decides anew in each (which mask, which stripes), and what they show
-differently no scene can show. So one view is painted first, the anchor; where a picture shows one side only,
-a few, each after the one before. The other views are painted with references beside them: the nearest anchor
-as it is seen from there, laid over the surface by the rendered depth, and the first anchor itself. A model
-that takes one picture alone sweeps: each next view starts from what the views so far have made of the scene.
-Then one round of consensus: the colors that all views agree on best are fitted (`robust_colors`), and every
-view is painted again away from their render, with its own original as the condition: what it starts from
-decides what is painted, the rest of the way is free.
+A model that paints every view by itself decides anew in each (which mask, which stripes), and what the views
+show differently no scene can show. So one view is painted first, the anchor, then one from every other side,
+then all others, each with two references: what the anchors make of the scene as it is seen from there (the
+members' colors fitted to them), and the first anchor itself. A model that takes one picture alone sweeps:
+each next view starts from what the views so far make of the scene. Then comes consensus: colors are fitted to
+all views (`robust_colors`), and each is painted again away from their render, its own original being the
+condition: what it starts from decides what is painted, and the rest of the way is free.
 
-What the models answer is a little shifted and scaled; `register` takes that back.
+A model's answers are shifted and scaled by a little: `register` takes that back. What is moved farther is
+painted again with another seed, then left out.
 
-RUN/views/painted/anchor/VIEW.png     the anchor; painted over by hand it decides the edit of a run that is
-                                      begun again: what was painted after another is painted anew
-RUN/views/painted/reference|sweep|round_1/VIEW.png   the others, and the rounds of consensus
+RUN/views/painted/anchor/VIEW.png   the first of them decides: painted over by hand, all follow it in a run
+                                    that is begun again
+RUN/views/painted/reference|sweep|round_1/VIEW.png   the others; the rounds of consensus
+
+What it brings is in docs/experiments.md, Views that agree.
 """
 
 from __future__ import annotations
@@ -31,11 +33,15 @@ from progdf.errors import ProgdfError
 from progdf.scene.bounds import scene_sphere
 from trainer.editors.base import ImageEditor, Painter
 from trainer.editors.cache import KeptPictures, Recipe, digest
+from trainer.editors.style import cross_fade
 from trainer.options import EditKind
-from trainer.report.agreement import ViewChange, contrast, fit_colors, robust_colors, view_change
+from trainer.report.agreement import ViewChange, fine_energy, fit_colors, robust_colors, view_change
 from trainer.setup import TrainingSetup
 from trainer.store.progress import Advance, RunLog
 from trainer.views.view import View
+
+ANCHOR = "anchor"
+"""Folder of the pictures that decide."""
 
 SIDE = math.radians(60)
 """Angle around the region from which on a view shows another side, which gets an anchor of its own."""
@@ -107,6 +113,7 @@ def register(original: Tensor, picture: Tensor, beside: Tensor) -> Registration:
 
 
 _BETTER = 0.8  # of the misfit as it lies: noise alone makes one place a little better than another
+_TEXTURE = 0.01  # standard deviation of color; what has less fits anywhere
 _TUKEY = 4.685  # in standard deviations: 95 % as good as least squares where the noise is normal
 
 
@@ -114,7 +121,7 @@ def _step(a: Tensor, b: Tensor, weight: Tensor, parameters: Tensor) -> tuple[Ten
     """One step of Gauss-Newton with Tukey's weights [3], and the robust misfit before it."""
     moved, (x, y) = _sample(b, parameters), _places(b)
     counts = (weight > 0)[0, 0]
-    if int(counts.sum()) < 16:
+    if int(counts.sum()) < 16 or float(a[0][:, counts].std(dim=1).max()) < _TEXTURE:
         return torch.zeros(3, dtype=torch.float64), 0.0
     gradients = [
         torch.nn.functional.pad((moved[..., 2:] - moved[..., :-2]) / 2, (1, 1)),
@@ -204,10 +211,10 @@ class Easel:
 
             where = place if seed == self.seed else f"{place}/again"
             picture = self.kept.picture(view.camera.name, view.image, recipe, paint, where)
-            place_found = register(view.image, picture, beside_region(view.mask))
-            moved = place_found.size
+            registration = register(view.image, picture, beside_region(view.mask))
+            moved = registration.size
             if moved <= MOST_MOVED:
-                return place_found.lay(picture), moved
+                return registration.lay(picture), moved
         return None, moved
 
 
@@ -254,8 +261,10 @@ class AgreedEditor:
         finished = self.pictures[view.camera.name]
         if strength == 1.0:
             return finished
-        picture, _ = self.easel.paint(view, f"{strength:g}", [self.fit.render(view)], strength=strength)
-        return torch.lerp(view.image, finished, strength) if picture is None else picture
+        picture = None
+        if self.easel.painter.references:  # else nothing tells the model which edit is meant
+            picture, _ = self.easel.paint(view, f"{strength:g}", [self.fit.render(view)], strength=strength)
+        return cross_fade(view.image, finished, strength) if picture is None else picture
 
 
 def painting_order(setup: TrainingSetup) -> tuple[list[View], int]:
@@ -319,7 +328,7 @@ class _Loop:
         references: Sequence[Tensor] = ()
         fit = None
         for i, view in enumerate(views):
-            place = "anchor" if i < anchors else "reference"
+            place = ANCHOR if i < anchors else "reference"
             if fit is not None:
                 references = [fit.render(view), references[-1]]
             self.paint(view, place, references=references)
@@ -342,7 +351,7 @@ class _Loop:
                 render = Fit(self._setup, fit_colors(seen, members)).render(view)
                 self.paint(view, "sweep", source=render, strength=SWEEP, softness=SOFTNESS)
             else:
-                self.paint(view, "anchor")
+                self.paint(view, ANCHOR)
             if name in self.pictures and name in train:
                 seen.append(self._change(view))
             rows.append(self._index[name])
@@ -358,12 +367,17 @@ class _Loop:
         """The colors that the pictures of the training views agree on best."""
         return Fit(self._setup, robust_colors(self.changes(), len(self._setup.region.members)))
 
+    def fine_energy(self) -> float:
+        """Of the changes of the training views so far, a view."""
+        energies = [fine_energy(one.change) for one in self.changes()]
+        return sum(energies) / len(energies)
+
     def changes(self) -> list[ViewChange]:
         """What the pictures of the training views change so far."""
         return [self._change(view) for view in self._setup.train if view.camera.name in self.pictures]
 
     def _change(self, view: View) -> ViewChange:
-        return view_change(self._setup, view, view.confine(self.pictures[view.camera.name]))
+        return view_change(self._setup, view, view.confine(self.pictures[view.camera.name]), shrink=1)
 
 
 def agree_views(easel: Easel, setup: TrainingSetup, editor: ImageEditor, log: RunLog) -> AgreedEditor:
@@ -381,10 +395,13 @@ def agree_views(easel: Easel, setup: TrainingSetup, editor: ImageEditor, log: Ru
     views, anchors = painting_order(setup)
     follows = easel.painter.references > 0
     rounds = 1 if follows else 2
-    how = f"{anchors} first, {len(views) - anchors} after them" if follows else "each after those before"
+    how = f"{anchors} first, {len(views) - anchors} after these" if follows else "each after those before"
     again = "once" if rounds == 1 else "twice"
     calls = len(views) * (1 + rounds)
     log.say(f"{calls} pictures to paint: {how}, then all {again} more, away from what they share")
+    if easel.kept.folder is not None:
+        path = easel.kept.folder / ANCHOR / f"{views[0].camera.name}.png"
+        log.say(f"{path} decides: paint over it and begin again, and all views follow it")
     with log.steps("edit", calls) as advance:
         loop = _Loop(easel, setup, advance)
         if follows:
@@ -395,7 +412,7 @@ def agree_views(easel: Easel, setup: TrainingSetup, editor: ImageEditor, log: Ru
             raise ProgdfError(
                 f"the model moves all that it paints by more than {MOST_MOVED:.0%}; use another --model"
             )
-        first = loop.changes()
+        before = loop.fine_energy()
         for number in range(rounds):
             loop.consent(views, f"round_{number + 1}")
     fit = loop.fit()
@@ -409,5 +426,5 @@ def agree_views(easel: Easel, setup: TrainingSetup, editor: ImageEditor, log: Ru
     pictures = loop.pictures | {
         view.camera.name: fit.render(view) for view in views if view.camera.name in left_out
     }
-    figures = {"left_out": left_out, "contrast": round(contrast(first, fit.colors), 3)}
+    figures = {"left_out": left_out, "contrast": round(loop.fine_energy() / max(before, 1e-9), 3)}
     return AgreedEditor(easel, pictures, fit, editor.stages, editor.kind, figures)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
@@ -42,7 +42,7 @@ from trainer.optimize.losses import Perceptual, describe_loss, perceptual_loss
 from trainer.optimize.retime import resolve_slider
 from trainer.options import MOST_STAGES, EditKind, OptimizeOptions, TrainOptions
 from trainer.regions.from_pictures import RegionRequest, region_checks, region_kinds
-from trainer.report.agreement import Agreement, measure_agreement
+from trainer.report.agreement import measure_agreement
 from trainer.resolve import recorded_options, resolve, resolve_kind
 from trainer.setup import (
     Pictures,
@@ -69,7 +69,7 @@ from trainer.store.state import interrupt_on_signals
 from trainer.views.crops import only_recolors
 from trainer.views.view import BACKGROUND, render_view
 
-from .agree import Easel, agree_views
+from .agree import AgreedEditor, Easel, agree_views
 from .finish import RunResult, end_rows, finish_run, load_evaluator, load_result
 from .kinds import Approach, choose_approach
 from .record import RunRecord, read_record
@@ -226,7 +226,7 @@ def _run_training(
     recorded = folder.state.load("recorded")
     if recorded is None:
         with log.stage("agree"):
-            agreement = _agreement(options, setup, edited, approach.kind, log)
+            agreement = _agreement(options, setup, edited, approach.kind, folder, log)
         optimization = resolve_kind(options, approach.kind, approach.group_steps)
         trajectory, outcome = _record(
             options, optimization, setup, edited, between, editor, perceptual, folder, log
@@ -239,7 +239,7 @@ def _run_training(
             approach.kind,
             optimization.group_steps or 0,
             kind_trial=trial,
-            agreement=agreement.figures() if agreement is not None else None,
+            agreement=agreement,
             up=setup.up.to_json() if setup.up is not None else None,
             pictures=picture_digests(options),
             **outcome,
@@ -333,7 +333,8 @@ def _edit_views(
             made.update(edit_views(editor(), views, new, folder, is_confined, advance))
         log.say(f"{spec}: a {approach.kind} edit at strength {', '.join(f'{s:g}' for s in strengths)}")
         saved = {"strengths": list(strengths), "kind": approach.kind, "group_steps": approach.group_steps}
-        folder.state.save("edited", {}, saved | {"trial": trial})
+        shared = painter.figures if isinstance(painter := editor(), AgreedEditor) else {}
+        folder.state.save("edited", {}, saved | {"trial": trial, "shared": shared})
         return {s: made[s] for s in strengths}
 
     def between(missed: float) -> Pictures:
@@ -403,15 +404,23 @@ def expected_work(setup: TrainingSetup, optimization: OptimizeOptions, strengths
 
 
 def _agreement(
-    options: TrainOptions, setup: TrainingSetup, edited: Pictures, kind: EditKind, log: RunLog
-) -> Agreement | None:
-    """Whether the edited views agree; None where an editor cannot but edit all alike."""
+    options: TrainOptions,
+    setup: TrainingSetup,
+    edited: Pictures,
+    kind: EditKind,
+    folder: RunFolder,
+    log: RunLog,
+) -> Mapping[str, Any] | None:
+    """Whether the edited views agree, and which were left out; None where an editor edits all alike."""
+    saved = folder.state.load("edited")
+    shared = saved.values.get("shared", {}) if saved is not None else {}
     if kind == "geometry" or options.editor.family not in PER_VIEW:
-        return None
+        return shared or None
     count = len(setup.train)
     agreement = measure_agreement(setup, edited[1.0][:count], edited[1.0][count:] or edited[1.0])
+    agreement = replace(agreement, contrast=shared.get("contrast", 1.0))
     log.say(agreement.line(options.editor.family, setup.judged_on))
-    return agreement
+    return {**shared, **agreement.figures()}
 
 
 def _record(
