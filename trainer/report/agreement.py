@@ -113,7 +113,7 @@ class ViewChange:
             missing = (self.change - self.render(colors)).square().sum()
         return float(missing / self.change.square().sum().clamp_min(1e-12))
 
-    def weighted(self, weight: float) -> ViewChange:
+    def weigh(self, weight: float) -> ViewChange:
         """The view with another say in a fit."""
         return replace(self, change=self.change * weight**0.5, counts=self.counts * weight**0.5)
 
@@ -191,7 +191,7 @@ def robust_colors(seen: Sequence[ViewChange], members: int) -> Tensor:
     colors = fit_colors(seen, members)
     shares = torch.tensor([one.residual(colors) for one in seen])
     weights = (2 * shares.median() / shares.clamp_min(1e-12)).clamp_max(1.0).square()
-    return fit_colors([one.weighted(float(w)) for one, w in zip(seen, weights, strict=True)], members)
+    return fit_colors([one.weigh(float(w)) for one, w in zip(seen, weights, strict=True)], members)
 
 
 def view_change(setup: TrainingSetup, view: View, edited: Tensor, shrink: int = 2) -> ViewChange:

@@ -267,16 +267,20 @@ class AgreedEditor:
         return cross_fade(view.image, finished, strength) if picture is None else picture
 
 
-def painting_order(setup: TrainingSetup) -> tuple[list[View], int]:
+def painting_order(setup: TrainingSetup, side: float = SIDE) -> tuple[list[View], int]:
     """All views in the order in which they are painted, and how many of them, the first, are anchors.
 
     The first shows most of the region and of detail, as fronts do; then come those farthest from all before,
-    until every view is within `SIDE` of one; then the others, nearest to an anchor first.
+    until every view that is trained on is within `side` of one; then the others, nearest to an anchor first.
     """
-    views, angles = setup.views, _angles(setup)
-    anchors = [max(range(len(setup.train)), key=lambda i: _front(views[i]))]
-    while float((nearest := angles[:, anchors].amin(dim=1)).max()) > SIDE:
-        anchors.append(int(nearest.argmax()))
+    views, train = setup.views, len(setup.train)
+    center = scene_sphere(setup.scene[setup.region.members])[0]
+    eyes = torch.stack([view.camera.position for view in views])
+    toward = torch.nn.functional.normalize((eyes - center).double(), dim=1)
+    angles = (toward @ toward.T).clamp(-1.0, 1.0).acos()
+    anchors = [max(range(train), key=lambda i: _front(views[i]))]
+    while float((nearest := angles[:, anchors].amin(dim=1))[:train].max()) > side:
+        anchors.append(int(nearest[:train].argmax()))
     others = sorted(set(range(len(views))) - set(anchors), key=lambda i: float(nearest[i]))
     return [views[i] for i in (*anchors, *others)], len(anchors)
 
@@ -286,14 +290,6 @@ def _front(view: View) -> float:
     image = view.image
     slope = (image[1:] - image[:-1]).abs().sum() + (image[:, 1:] - image[:, :-1]).abs().sum()
     return float(slope * view.mask.sum().sqrt())
-
-
-def _angles(setup: TrainingSetup) -> Tensor:
-    """Between the directions from which all views look at the region, radians. [V,V]"""
-    center = scene_sphere(setup.scene[setup.region.members])[0]
-    eyes = torch.stack([view.camera.position for view in setup.views])
-    toward = torch.nn.functional.normalize((eyes - center).double(), dim=1)
-    return (toward @ toward.T).clamp(-1.0, 1.0).acos()
 
 
 class _Loop:
@@ -307,8 +303,6 @@ class _Loop:
 
     def __init__(self, easel: Easel, setup: TrainingSetup, advance: Advance) -> None:
         self._easel, self._setup, self._advance = easel, setup, advance
-        self._index = {view.camera.name: i for i, view in enumerate(setup.views)}
-        self._angles = _angles(setup)
         self.pictures: dict[str, Tensor] = {}
         self.moved: dict[str, float] = {}
         self._calls = 0
@@ -339,22 +333,16 @@ class _Loop:
                 references = references or [self.pictures[name]]
 
     def sweep(self, views: Sequence[View]) -> None:
-        """Paint each view away from what the views so far, of those trained on, have made of the scene."""
-        remaining, members = {view.camera.name: view for view in views}, len(self._setup.region.members)
-        train = {view.camera.name for view in self._setup.train}
-        seen, rows = list[ViewChange](), list[int]()
-        while remaining:
-            distance = self._angles[:, rows].amin(dim=1) if rows else self._angles[0] * 0
-            name = min(remaining, key=lambda name: float(distance[self._index[name]]))
-            view = remaining.pop(name)
+        """Paint each view away from what the views so far, of those trained on, make of the scene."""
+        train, seen = {view.camera.name for view in self._setup.train}, list[ViewChange]()
+        for view in views:
             if seen:
-                render = Fit(self._setup, fit_colors(seen, members)).render(view)
-                self.paint(view, "sweep", source=render, strength=SWEEP, softness=SOFTNESS)
+                fit = Fit(self._setup, fit_colors(seen, len(self._setup.region.members)))
+                self.paint(view, "sweep", source=fit.render(view), strength=SWEEP, softness=SOFTNESS)
             else:
                 self.paint(view, ANCHOR)
-            if name in self.pictures and name in train:
+            if view.camera.name in train & self.pictures.keys():
                 seen.append(self._change(view))
-            rows.append(self._index[name])
 
     def consent(self, views: Sequence[View], place: str) -> None:
         """Paint all views again, away from the render of what they agree on."""
@@ -392,8 +380,8 @@ def agree_views(easel: Easel, setup: TrainingSetup, editor: ImageEditor, log: Ru
     Raises:
         ProgdfError: no answer can be laid over its view.
     """
-    views, anchors = painting_order(setup)
     follows = easel.painter.references > 0
+    views, anchors = painting_order(setup, SIDE if follows else math.pi)
     rounds = 1 if follows else 2
     how = f"{anchors} first, {len(views) - anchors} after these" if follows else "each after those before"
     again = "once" if rounds == 1 else "twice"

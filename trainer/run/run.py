@@ -229,7 +229,7 @@ def _run_training(
             agreement = _agreement(options, setup, edited, approach.kind, folder, log)
         optimization = resolve_kind(options, approach.kind, approach.group_steps)
         trajectory, outcome = _record(
-            options, optimization, setup, edited, between, editor, perceptual, folder, log
+            options, optimization, setup, edited, between, editor, perceptual, folder=folder, log=log
         )
         record = RunRecord(
             recorded_options(options),
