@@ -100,14 +100,15 @@ class EditorOptions:
     edit_size: Annotated[int | None, absent_option("INT", "the model's own")] = None
     """style: longer side in pixels at which pictures are painted; larger makes finer strokes. instruct: side
     of a square of the area that is painted, whatever the proportions."""
+    anchor: Annotated[Path | None, absent_option("PNG", "the model paints one")] = None
+    """instruct: a painted picture of the scene that decides, taken in the window (Ctrl+F2); all views follow
+    it."""
     quantize: Quantize = "off"
     """instruct: nf4 keeps the model's large parts in 4 bits, a quarter of the memory at some loss (pip
     install progdf-studio[quantize])."""
     device: Device = "auto"
     """instruct: auto is the graphics card that torch has, else the CPU for what is small; cpu is the CPU for
     anything, which takes hours a picture with a large model."""
-    reedit_every: int = 0
-    """style, instruct: every N steps, edit the current renders again and train towards those; 0: never."""
     seed: Fixed[int] = 0  # of the noise, the same in every view
     cache: Fixed[Path | None] = None  # folder in which painted pictures are kept; None keeps nothing
 

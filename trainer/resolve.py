@@ -120,7 +120,6 @@ def resolve_kind(options: TrainOptions, kind: EditKind, group_steps: int) -> Opt
         and sharpness == "off"
         and not optimize.perceptual_weight
         and not optimize.as_printed
-        and not options.editor.reedit_every
     )
     costly = options.editor.family in COSTLY_STRENGTHS
     weight, most = optimize.perceptual_weight, (COSTLY_STAGES if costly else STAGES)[kind]
@@ -155,7 +154,6 @@ def check_options(options: TrainOptions) -> None:
         ("--edit-size", editor.edit_size, 32, 4096),
         ("--lift-threshold", region.lift_threshold, 0, 1),
         ("--box-threshold", region.box_threshold, 0, 1),
-        ("--reedit-every", editor.reedit_every, 0, 100_000),
     )
     stages = optimize.stages or MOST_STAGES
     if not 4 * stages <= optimize.steps <= MOST_STEPS:
@@ -197,9 +195,8 @@ def _check_editor_options(editor: EditorOptions, optimize: OptimizeOptions) -> N
             f"--kind {optimize.kind} does not apply to pictures: few views do not tell how deep a part lies; "
             "give more as folder:DIR, of views that --cameras has"
         )
-    of_instruct = ("model", "guidance", "edit_steps", "quantize", "device")
-    of_painters = ("edit_size", "reedit_every")
-    for names, kinds in ((of_instruct, ("instruct",)), (of_painters, ("style", "instruct"))):
+    of_instruct = ("model", "guidance", "edit_steps", "anchor", "quantize", "device")
+    for names, kinds in ((of_instruct, ("instruct",)), (("edit_size",), ("style", "instruct"))):
         for name in names:
             if getattr(editor, name) != getattr(EditorOptions, name) and editor.family not in kinds:
                 option = "--" + name.replace("_", "-")

@@ -78,7 +78,6 @@ def make_ablation_setup(run: FinishedRun, plan: TrainOptions, kind: EditKind, qu
         ProgdfError: an edited view is gone.
     """
     setup, strengths = render_run_views(run), run.trajectory.strengths
-    plan = with_values(plan, reedit_every=0)
     if quick:
         strengths = tuple(_thin(strengths, QUICK_STAGES))
         train = _thin(setup.train, max(2, QUICK_VIEWS - len(setup.held_out)))

@@ -11,7 +11,7 @@ from progdf.region import Region
 from trainer.options import EditorOptions
 from trainer.views.view import View
 
-from .base import ImageEditor, RepaintingEditor
+from .base import ImageEditor, Painter
 from .instruct import check_instruct, instruct
 from .pictures import folder, folder_of, photograph_folders, photographs, picture_paths, pictures
 from .procedural import darken, night, paint_of, recolor, stops_of, stripes, tint
@@ -109,7 +109,7 @@ __all__ = [
     "KIND_UNKNOWN",
     "PER_VIEW",
     "ImageEditor",
-    "RepaintingEditor",
+    "Painter",
     "check_editor",
     "check_new_editor",
     "make_editor",

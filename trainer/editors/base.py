@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol, runtime_checkable
+from typing import Protocol
 
 from torch import Tensor
 
+from progdf.camera import Camera
+from progdf.rasterize import Crop
 from trainer.options import EditKind
 from trainer.views.view import View
 
@@ -37,25 +39,25 @@ class ImageEditor(Protocol):
         ...
 
 
-@runtime_checkable
-class RepaintingEditor(Protocol):
-    """An editor that looks at a picture and paints another, and so can look at a render again."""
-
-    def edit_again(self, view: View, strength: float, current: Tensor | None, step: int) -> Tensor:
-        """The edited view, painted from the render of training step `step`. [H,W,3] -> [H,W,3] 0..1
-
-        None for the render stands for the one that was painted from at that step; ProgdfError if that picture
-        is no longer there.
-        """
-        ...
-
-
 class Painter(Protocol):
-    """Paints one picture as it was told, at any degree."""
+    """Paints one picture as it was told, at any degree; of a view, the part around the region."""
 
     @property
     def references(self) -> int:
         """How many pictures beside the view's own one call can take."""
+        ...
+
+    def frame(self, view: View) -> tuple[Crop, Camera]:
+        """The box of a view that is painted, in its pixels, and the camera that pictures it at the size that
+        the model works at."""
+        ...
+
+    def original(self, view: View) -> Tensor:
+        """The picture of that frame. [h,w,3]"""
+        ...
+
+    def paste(self, view: View, painted: Tensor) -> Tensor:
+        """The view with what was changed in its frame. [h,w,3] -> [H,W,3]"""
         ...
 
     def paint(

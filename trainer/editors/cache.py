@@ -3,7 +3,6 @@
 RUN/views/painted/VIEW.png              what a learned editor made of what it was shown, at its own size
 RUN/views/painted/VIEW.json             from what: a digest of that, the editor, all its options
 RUN/views/painted/0.25/VIEW.png         at another strength, where the editor has several
-RUN/views/painted/step_00200/VIEW.png   of the render at a training step (--reedit-every)
 
 A picture is taken again while its note fits. So one that was touched up by hand stays as it is.
 """
@@ -38,7 +37,7 @@ class KeptPictures:
     def picture(
         self,
         name: str,
-        source: Tensor | None,
+        source: Tensor,
         recipe: Recipe,
         paint: Callable[[Tensor], Tensor],
         place: str = "",
@@ -47,21 +46,14 @@ class KeptPictures:
 
         Args:
             name: of the view, a file name
-            source: the picture that is painted from; None takes the kept one as it is. [H,W,3]
+            source: the picture that is painted from. [H,W,3]
             recipe: see `Recipe`
             paint: [H,W,3] -> [H,W,3]
             place: subfolder
-
-        Raises:
-            ProgdfError: nothing is kept where `source` is None.
         """
-        path = self.folder / place / f"{name}.png" if self.folder is not None else None
-        if source is None:
-            if path is None or not path.is_file():
-                raise ProgdfError(f"the painted picture {path} is missing; train again without --resume")
-            return read_picture(path)
-        if path is None:
+        if self.folder is None:
             return _eight_bits(paint(source))
+        path = self.folder / place / f"{name}.png"
         note = path.with_suffix(".json")
         expected = {"source": digest(source), "editor": dict(recipe)}
         if _read_note(note) == expected:
@@ -76,7 +68,6 @@ class KeptPictures:
             temporary_file.write_text(
                 json.dumps(expected, indent=2, ensure_ascii=False) + "\n", encoding="utf-8"
             )
-        assert self.folder is not None
         add_pictures(self.folder, [path, note])
         return _eight_bits(painted)
 

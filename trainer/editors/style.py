@@ -53,17 +53,9 @@ class StyleEditor:
         """See `ImageEditor.edit`."""
         if strength == 0.0:
             return view.image
-        return self._mix(view, strength, view.image, "")
-
-    def edit_again(self, view: View, strength: float, current: Tensor | None, step: int) -> Tensor:
-        """See `RepaintingEditor.edit_again`."""
-        return self._mix(view, strength, current, f"step_{step:05d}")
-
-    def _mix(self, view: View, strength: float, source: Tensor | None, place: str) -> Tensor:
         all_of_it = (0, 0, view.camera.width, view.camera.height)
         box = all_of_it if self.whole else region_box(view.mask)
-        looked_at = None if source is None else crop(source, box)
-        painted = self.kept.picture(view.camera.name, looked_at, self.recipe, self.paint, place)
+        painted = self.kept.picture(view.camera.name, crop(view.image, box), self.recipe, self.paint)
         visible = (view.mask > 1e-4)[..., None]
         inside = torch.where(visible, view.inside, view.image)
         x0, y0, x1, y1 = box

@@ -298,11 +298,6 @@ class ParameterSnapshot:
     table: Tensor | None = None  # the map of color at a stage's end, where there is one. [K,3]
 
 
-Renewal = Callable[[int, int, float, Tensor], Sequence[Tensor] | None]
-"""Asked before every step for other targets: steps done over all stages, and in this one, the stage's
-strength, the offsets as placed [M,C] -> the edited box of each training view [h,w,3], or None: no change. It
-answers a run that goes on as it did the run that was stopped."""
-
 OnStep = Callable[[int, float], None]
 """Called after every step: steps done, running mean of the L1 distance from the finished edit."""
 
@@ -330,7 +325,6 @@ def optimize(
     settings: PgsSettings,
     on_step: OnStep | None = None,
     state: PgsState | None = None,
-    renewal: Renewal | None = None,
 ) -> Iterator[ParameterSnapshot]:
     """Optimize the member rows towards each stage in turn, and yield recordings.
 
@@ -346,7 +340,6 @@ def optimize(
         settings: see PgsSettings
         on_step: progress; here, and only here, the state is whole and may be saved
         state: where to go on from, changed in place; None: from the original
-        renewal: takes the place of a stage's targets while it runs
 
     Raises:
         FloatingPointError: the loss or its gradient is not finite; the state is that of the step before.
@@ -362,17 +355,11 @@ def optimize(
         objective.begin_stage()
         size = _step_size(stage, before, settings.reach)
         spacing = visible_way(stage.targets, before)[0] * len(stages) / settings.snapshots
-        targets = stage.targets
         while state.local < stage.steps:
-            if renewal is not None:
-                placed = stage.place(state.average).detach()
-                renewed = renewal(state.step, state.local, stage.strength, placed)
-                if renewed is not None:
-                    targets = [picture.to(original.device) for picture in renewed]
-                    objective.begin_stage()
             view = state.view(len(crops))
             share = (state.local + 1) / max(1.0, settings.ramp * stage.steps)
-            target = targets[view] if share >= 1.0 else torch.lerp(before[view], targets[view], share)
+            target = stage.targets[view]
+            target = target if share >= 1.0 else torch.lerp(before[view], target, share)
             image, _ = crops[view].render(original + stage.place(state.moved), moving)
             moment = Moment(
                 image, target, view, state.step, state.local, share >= 1.0, state.moved, state.previous

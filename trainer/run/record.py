@@ -80,11 +80,7 @@ def upgrade_plan(plan: Mapping[str, Any]) -> Mapping[str, Any]:
         "out": "",
         "name": plan["name"],
         "region": region | segmenter,
-        "editor": editor
-        | {
-            "guidance": ",".join(str(number) for number in guidance if number is not None),
-            "reedit_every": optimize["reedit_every"],
-        },
+        "editor": editor | {"guidance": ",".join(str(number) for number in guidance if number is not None)},
         "views": views | {name: views[name] or 0 for name in ("views", "image_size")},
         "optimize": optimize
         | {

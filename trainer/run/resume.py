@@ -205,7 +205,8 @@ def _saved_identity(folder: RunFolder) -> _Identity | None:
     identity = folder.state.identity()
     if identity is None:
         return None
-    if "optimization" in identity.get("plan", {}):
+    plan = identity.get("plan", {})
+    if "optimization" in plan or plan.get("editor", {}).get("reedit_every"):  # which is no more
         raise ProgdfError(
             f"{folder.root} was begun by an earlier version, which ends it; or delete {folder.state.path} "
             "and train again"

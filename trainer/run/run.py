@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
@@ -15,11 +15,13 @@ from torch import Tensor
 from progdf.errors import ProgdfError
 from progdf.field.trajectory import Trajectory, load_trajectory, save_trajectory
 from progdf.formats.scene_file import load_scene
-from progdf.gaussians import BASE_CHANNELS, ZERO, Gaussians, pack
+from progdf.gaussians import BASE_CHANNELS, ZERO, Gaussians
 from progdf.gdf.file import save_gdf
 from progdf.io.atomic import read_file
 from progdf.io.cameras import load_cameras, save_cameras
+from progdf.io.images import read_picture
 from progdf.io.json_values import plain
+from progdf.io.picture_camera import find_picture_camera
 from progdf.rasterize.engines import get_engine
 from progdf.region import Region
 from progdf.scene.regions import check_region, parse_region
@@ -28,7 +30,6 @@ from trainer.editors import (
     COSTLY_STRENGTHS,
     EXTERNAL,
     PER_VIEW,
-    RepaintingEditor,
     check_editor,
     check_new_editor,
     make_editor,
@@ -42,9 +43,9 @@ from trainer.fit.network import PART as NETWORK
 from trainer.fit.slider_uniformity import equalized_strengths
 from trainer.optimize.losses import Perceptual, describe_loss, perceptual_loss
 from trainer.optimize.retime import resolve_slider
-from trainer.options import MOST_STAGES, EditKind, EditorOptions, OptimizeOptions, TrainOptions
+from trainer.options import MOST_STAGES, EditKind, OptimizeOptions, TrainOptions
 from trainer.regions.from_pictures import RegionRequest, region_checks, region_kinds
-from trainer.report.agreement import Agreement, measure_agreement
+from trainer.report.agreement import measure_agreement
 from trainer.resolve import recorded_options, resolve, resolve_kind
 from trainer.setup import (
     Pictures,
@@ -69,8 +70,9 @@ from trainer.store.run_folder import (
 )
 from trainer.store.state import interrupt_on_signals
 from trainer.views.crops import only_recolors
-from trainer.views.view import BACKGROUND, crop, render_view
+from trainer.views.view import BACKGROUND, fit_size, make_view, render_view, with_near_plane
 
+from .agree import AgreedEditor, Easel, agree_views
 from .finish import RunResult, end_rows, finish_run, load_evaluator, load_result
 from .kinds import Approach, choose_approach
 from .record import RunRecord, read_record
@@ -122,67 +124,6 @@ def region_request(
         return open_run_folder(options.out, options.edit).segment_masks
 
     return RegionRequest(options.region, options.views, cache, quiet, say)
-
-
-class Reedit:
-    """New targets for the training views, every so many steps of a stage; see `pgs.Renewal`.
-
-    Args:
-        editor: paints
-        setup: scene, region and the training views with their final boxes
-        every: steps between two edits, counted over all stages
-        is_confined: put back what changes outside the region
-        log: of the run
-    """
-
-    def __init__(
-        self, editor: RepaintingEditor, setup: TrainingSetup, every: int, is_confined: bool, log: RunLog
-    ) -> None:
-        self._editor, self._setup, self._log = editor, setup, log
-        self._every, self._confined = every, is_confined
-        self._shown = 0  # the step whose pictures are the targets now; 0: none
-
-    def __call__(self, step: int, local: int, strength: float, offsets: Tensor) -> list[Tensor] | None:
-        """See `pgs.Renewal`. A run that goes on between two edits finds the last one's pictures on disk."""
-        due = step - step % self._every
-        if due <= step - local or due == self._shown:
-            return None
-        self._shown = due
-        setup, members = self._setup, self._setup.region.members
-        renders: list[Tensor | None] = [None] * len(setup.train)
-        if due == step:
-            rows = pack(setup.scene[members], with_shN=setup.scene.sh_degree > 0) + offsets.cpu()
-            scene = setup.scene.replace_rows(members, rows)
-            with torch.no_grad():
-                renders = [
-                    render_view(scene, view.camera, setup.background).clamp(0, 1) for view in setup.train
-                ]
-            self._log.say(f"step {step}: the editor looks at {len(renders)} renders again")
-        targets = []
-        for view, now in zip(setup.train, renders, strict=True):
-            made = self._editor.edit_again(view, strength, now, due)
-            targets.append(crop(quantize_image(view.confine(made) if self._confined else made), view.box))
-        return targets
-
-
-def reedit(
-    options: EditorOptions,
-    setup: TrainingSetup,
-    optimization: OptimizeOptions,
-    folder: RunFolder,
-    log: RunLog,
-) -> Reedit | None:
-    """What --reedit-every asks for; None where it asks for nothing.
-
-    Raises:
-        ProgdfError: the editor cannot look at a picture again.
-    """
-    if not options.reedit_every:
-        return None
-    editor = make_editor(replace(options, cache=folder.paintings), setup.scene, setup.region, setup.views)
-    if not isinstance(editor, RepaintingEditor):
-        raise ProgdfError(f"--reedit-every does not apply to {options.editor}; leave it out")
-    return Reedit(editor, setup, options.reedit_every, confines_edit(editor, optimization.kind), log)
 
 
 __all__ = ["RunResult", "Shared", "train"]
@@ -282,16 +223,19 @@ def _run_training(
     log.say(f"{len(scene)} Gaussians, {len(region)} in the region; {_describe_views(setup)}")
     for note in setup.notes:
         log.say(note)
+    editor = cache(partial(_make_editor, options, setup, folder, log))
     with log.stage("edit"):
-        edited, approach, trial, between = _edit_views(options, setup, folder, log)
+        edited, approach, trial, between = _edit_views(options, setup, editor, folder, log)
         train_edits = {s: pictures[: len(setup.train)] for s, pictures in edited.items()}
         setup = whole_views(setup) if options.optimize.as_printed else widen_views(setup, train_edits)
     recorded = folder.state.load("recorded")
     if recorded is None:
         with log.stage("agree"):
-            agreement = _agreement(options, setup, edited, approach.kind, log)
+            agreement = _agreement(options, setup, edited, approach.kind, folder, log)
         optimization = resolve_kind(options, approach.kind, approach.group_steps)
-        trajectory, outcome = _record(options, optimization, setup, edited, between, perceptual, folder, log)
+        trajectory, outcome = _record(
+            options, optimization, setup, edited, between, editor, perceptual, folder=folder, log=log
+        )
         record = RunRecord(
             recorded_options(options),
             options.scene.resolve(),
@@ -300,7 +244,7 @@ def _run_training(
             approach.kind,
             optimization.group_steps or 0,
             kind_trial=trial,
-            agreement=agreement.figures() if agreement is not None else None,
+            agreement=agreement,
             up=setup.up.to_json() if setup.up is not None else None,
             pictures=picture_digests(options),
             **outcome,
@@ -363,8 +307,31 @@ def _render_originals(
     return setup
 
 
+def _make_editor(options: TrainOptions, setup: TrainingSetup, folder: RunFolder, log: RunLog) -> ImageEditor:
+    """The run's one editor; where a model paints, with views that agree."""
+    settings = replace(options.editor, cache=folder.paintings)
+    editor = make_editor(settings, setup.scene, setup.region, setup.views)
+    if not isinstance(editor, InstructEditor):
+        return editor
+    easel, approved = Easel(editor, editor.recipe, editor.kept, settings.seed), None
+    if settings.anchor is not None:
+        camera = fit_size(
+            find_picture_camera(settings.anchor, origin=setup.scene.origin), editor.request.size
+        )
+        (camera,) = with_near_plane([camera], setup.scene)
+        view = make_view(setup.scene, setup.region, camera, setup.background)
+        if not bool((view.mask > 0.0).any()):
+            raise ProgdfError(f"{settings.anchor} shows nothing of the region; take it from elsewhere")
+        approved = view, read_picture(settings.anchor, size=(camera.width, camera.height))
+    return agree_views(easel, setup, editor, log, approved)
+
+
 def _edit_views(
-    options: TrainOptions, setup: TrainingSetup, folder: RunFolder, log: RunLog
+    options: TrainOptions,
+    setup: TrainingSetup,
+    editor: Callable[[], ImageEditor],
+    folder: RunFolder,
+    log: RunLog,
 ) -> tuple[Pictures, Approach, dict[str, Any] | None, Callable[[float], Pictures]]:
     """What the editor makes of all views, by strength, read where it is on disk; how to train towards it;
     what a trial found of that; and, given what the finished edit misses, all strengths that its course
@@ -375,10 +342,6 @@ def _edit_views(
     made: dict[float, Sequence[Tensor]] = {}
     approach, trial = Approach("color"), None
 
-    @cache
-    def editor() -> ImageEditor:
-        return make_editor(replace(options.editor, cache=folder.paintings), setup.scene, setup.region, views)
-
     def edit(strengths: Sequence[float]) -> Pictures:
         new, is_confined = [s for s in strengths if s not in made], confines_edit(editor(), approach.kind)
         with log.steps("edit", len(views) * len(new)) as advance:
@@ -388,7 +351,8 @@ def _edit_views(
             line += f"; {len(views) * painter.calls(strengths)} calls of its network"
         log.say(line)
         saved = {"strengths": list(strengths), "kind": approach.kind, "group_steps": approach.group_steps}
-        folder.state.save("edited", {}, saved | {"trial": trial})
+        shared = painter.figures if isinstance(painter := editor(), AgreedEditor) else {}
+        folder.state.save("edited", {}, saved | {"trial": trial, "shared": shared})
         return {s: made[s] for s in strengths}
 
     def between(missed: float) -> Pictures:
@@ -458,15 +422,23 @@ def expected_work(setup: TrainingSetup, optimization: OptimizeOptions, strengths
 
 
 def _agreement(
-    options: TrainOptions, setup: TrainingSetup, edited: Pictures, kind: EditKind, log: RunLog
-) -> Agreement | None:
-    """Whether the edited views agree; None where an editor cannot but edit all alike."""
+    options: TrainOptions,
+    setup: TrainingSetup,
+    edited: Pictures,
+    kind: EditKind,
+    folder: RunFolder,
+    log: RunLog,
+) -> Mapping[str, Any] | None:
+    """Whether the edited views agree, and which were left out; None where an editor edits all alike."""
+    saved = folder.state.load("edited")
+    shared = saved.values.get("shared", {}) if saved is not None else {}
     if kind == "geometry" or options.editor.family not in PER_VIEW:
-        return None
+        return shared or None
     count = len(setup.train)
     agreement = measure_agreement(setup, edited[1.0][:count], edited[1.0][count:] or edited[1.0])
+    agreement = replace(agreement, contrast=shared.get("contrast", 1.0))
     log.say(agreement.line(options.editor.family, setup.judged_on))
-    return agreement
+    return {**shared, **agreement.figures()}
 
 
 def _record(
@@ -475,6 +447,7 @@ def _record(
     setup: TrainingSetup,
     edited: Pictures,
     between: Callable[[float], Pictures],
+    editor: Callable[[], ImageEditor],
     perceptual: Perceptual,
     folder: RunFolder,
     log: RunLog,
@@ -485,17 +458,8 @@ def _record(
     if options.optimize.group_steps and optimization.kind != "geometry":
         log.say(f"--group-steps: without effect on this {optimization.kind} edit, whose loss is {objective}")
     with log.stage("optimize"):
-        renewal = reedit(options.editor, setup, optimization, folder, log)
         trajectory, losses, effort = optimize_members(
-            options,
-            optimization,
-            setup,
-            edited,
-            perceptual,
-            folder.state,
-            log,
-            renewal=renewal,
-            between=between,
+            options, optimization, setup, edited, perceptual, folder.state, log, between=between
         )
     with log.stage("retime"):
         costs: dict[str, float] = {}
@@ -506,7 +470,7 @@ def _record(
         recorded, reason = len(trajectory), ""
         one_end = len(trajectory.strengths) == 1
         if one_end and not optimization.as_printed and options.field.field != "neural":
-            trajectory, reason = _choose_path(trajectory, options, optimization, setup, folder, log)
+            trajectory, reason = _choose_path(trajectory, options, optimization, setup, editor, log)
         else:
             trajectory = retime_trajectory(trajectory, setup, optimization, log)
     log.say(
@@ -527,19 +491,15 @@ def _choose_path(
     options: TrainOptions,
     optimization: OptimizeOptions,
     setup: TrainingSetup,
-    folder: RunFolder,
+    editor: Callable[[], ImageEditor],
     log: RunLog,
 ) -> tuple[Trajectory, str]:
     """The way to the only target there was, and why."""
     # of pictures made elsewhere the folder may be gone by now, and there is no half; a model was asked for
     # the end alone
-    editor = None
-    if options.editor.family not in (*EXTERNAL, *COSTLY_STRENGTHS):
-        editor = make_editor(
-            replace(options.editor, cache=folder.paintings), setup.scene, setup.region, setup.views
-        )
+    painter = None if options.editor.family in (*EXTERNAL, *COSTLY_STRENGTHS) else editor()
     retimed = partial(retime_trajectory, setup=setup, optimization=optimization, log=log)
-    return choose_path(trajectory, setup, editor, bool(optimization.group_steps), retimed)
+    return choose_path(trajectory, setup, painter, bool(optimization.group_steps), retimed)
 
 
 def _write_finals(setup: TrainingSetup, trajectory: Trajectory, folder: RunFolder, log: RunLog) -> None:

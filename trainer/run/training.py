@@ -37,7 +37,6 @@ from trainer.optimize.pgs import (
     OnStep,
     ParameterSnapshot,
     PgsState,
-    Renewal,
     TargetStage,
     optimize,
     pgs_settings,
@@ -142,7 +141,6 @@ def optimize_members(
     perceptual: Perceptual,
     folder: StateFolder,
     log: RunLog,
-    renewal: Renewal | None = None,
     between: Callable[[float], Pictures] | None = None,
 ) -> tuple[Trajectory, Losses, Mapping[str, Any]]:
     """Optimize the members, from the beginning or from the saved state.
@@ -155,7 +153,6 @@ def optimize_members(
         perceptual: distance of pictures
         folder: where the state is saved
         log: of the run
-        renewal: see `pgs.Renewal`
         between: of colors that are solved for, the share of the change that may be missed (mean square) ->
             `edited` at as many strengths as that calls for; None: as many as there are
 
@@ -195,9 +192,7 @@ def optimize_members(
         inside = [erode(crop(view.mask, view.box)).to(device) for view in setup.train]
         objective = Objective(perceptual, optimization, inside)
         probes = probe_views(setup, engine=engine)
-        way = partial(
-            optimize, original, crops, probes, stages, objective, settings, state=state, renewal=renewal
-        )
+        way = partial(optimize, original, crops, probes, stages, objective, settings, state=state)
     joint = None
     if optimization.as_printed and options.field.field == "neural":
         joint = begin_joint_training(

@@ -180,18 +180,6 @@ def test_killed_between_picture_and_note_it_is_painted_anew(
     assert paint.calls == 1, "the picture on disk is that of style 2"
 
 
-def test_a_render_is_painted_under_its_step_and_found_again_without_the_render(tmp_path: Path) -> None:
-    view = small().views[0]
-    editor, paint = _negatives(tmp_path, {"style": 1})
-    current = 0.5 * view.image
-    made = editor.edit_again(view, 1.0, current, 200)
-    assert (tmp_path / "step_00200" / f"{view.camera.name}.png").is_file()
-    assert torch.equal(editor.edit_again(view, 1.0, None, 200), made)
-    assert paint.calls == 1
-    with pytest.raises(ProgdfError, match="missing; "):
-        editor.edit_again(view, 1.0, None, 400)
-
-
 @pytest.mark.parametrize(
     ("editor", "kind", "expected"),
     [

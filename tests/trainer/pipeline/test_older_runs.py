@@ -87,7 +87,7 @@ def earlier_plan(printed: bool = False) -> dict[str, Any]:
 def test_a_plan_of_an_earlier_version_is_read_with_all_its_values(printed: bool) -> None:
     plan = convert_json(upgrade_plan(earlier_plan(printed)), TrainOptions)
     assert (plan.name, plan.region.region, plan.region.box_threshold) == ("blue", "all", 0.4)
-    assert (plan.editor.guidance, plan.editor.reedit_every) == ("7.5,1.25", 9)
+    assert plan.editor.guidance == "7.5,1.25"
     assert (plan.views.views, plan.views.image_size, plan.views.pictures) == (0, 64, (Path("A.png"),))
     assert (plan.optimize.kind, plan.optimize.steps, plan.optimize.slider) == ("auto", 48, "even")
     assert (plan.field.target_psnr, plan.field.draft, plan.field.seed) == (41.0, True, 3)
@@ -105,10 +105,13 @@ def test_a_plan_of_this_version_stays_as_it_is() -> None:
     assert upgrade_plan(plan) is plan
 
 
-def test_a_run_that_an_earlier_version_began_is_refused_in_one_line(tmp_path: Path) -> None:
+@pytest.mark.parametrize("plan", [earlier_plan(False), {"editor": {"reedit_every": 200}}])
+def test_a_run_that_an_earlier_version_began_is_refused_in_one_line(
+    tmp_path: Path, plan: dict[str, object]
+) -> None:
     options = quick_options(tmp_path)
     (options.out / "state").mkdir(parents=True)
-    (options.out / "state" / "run.json").write_text(json.dumps({"plan": earlier_plan()}))
+    (options.out / "state" / "run.json").write_text(json.dumps({"plan": plan}))
     with pytest.raises(ProgdfError, match="was begun by an earlier version, which") as told:
         find_run(options)
     assert "\n" not in str(told.value)

@@ -97,8 +97,6 @@ def test_colors_are_solved_for_unless_something_is_asked_for_that_a_descent_has(
     assert planned("style").solver == "descent"
     for words in (("--perceptual-weight", "0.1"), ("--progressive", "decay"), ("--preset", "paper")):
         assert planned("color", *words).solver == "descent"
-    again = resolve(with_values(asked("--reedit-every", "9"), editor="style:14"))
-    assert resolve_kind(again, "color", 0).solver == "descent"
 
 
 def test_a_style_goes_straight_to_its_end_unless_stages_are_asked_for() -> None:

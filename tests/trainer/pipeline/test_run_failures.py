@@ -17,7 +17,7 @@ from progdf.io.tensors import read_tensors, write_tensors
 from tests.helpers.full_disk import files_up_to, refuse_temporary_files
 from tests.helpers.stopped import OUT, small_run
 from tests.helpers.stopped_runs import NEVER, at_step, gone_on, saved_step, words
-from tests.helpers.trained import train
+from tests.helpers.trained import quick_options, train
 from trainer.optimize import pgs
 from trainer.store.run_folder import RunFolder, lock_folder
 
@@ -131,3 +131,27 @@ def test_a_damaged_state_is_one_line(bear_folder: Path, part: str) -> None:
     path.write_bytes(path.read_bytes()[:100])
     with pytest.raises(ProgdfError, match=r"is damaged .*; delete .*state and train again"):
         train(replace(small_run(bear_folder), resume=True), quiet=True)
+
+
+@pytest.mark.parametrize(
+    ("editor", "more"),
+    [
+        ("night", {"guidance": "7.5"}),
+        ("style:14", {"model": "timbrooks/instruct-pix2pix"}),
+        ("night", {"edit_size": 512}),
+        ("instruct:x", {"guidance": "0.5"}),
+        ("instruct:x", {"guidance": "7.5,0.5"}),
+        ("instruct:x", {"guidance": "7.5,1.5,1"}),
+        ("instruct:x", {"guidance": "much"}),
+        ("instruct:x", {"edit_steps": 0}),
+        ("style:14", {"edit_size": 8}),
+        ("pictures:A.png", {"kind": "geometry"}),
+    ],
+)
+def test_an_option_that_means_nothing_to_the_editor_is_one_line(
+    tmp_path: Path, editor: str, more: dict[str, object]
+) -> None:
+    with pytest.raises(ProgdfError, match=r"; it is for|does not apply to|must be ") as told:
+        train(quick_options(tmp_path, editor=editor, **more), quiet=True)
+    assert "\n" not in str(told.value)
+    assert not (tmp_path / "run").exists()

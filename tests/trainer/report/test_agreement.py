@@ -104,10 +104,10 @@ def test_colors_that_the_members_can_have_are_found() -> None:
 
 def test_the_line_tells_decibels_share_and_remedy() -> None:
     alone = "one held-out view alone"
-    line = Agreement(psnr=12.34, unexplained=0.61).line("style", alone)
+    line = Agreement(psnr=12.34, unexplained=0.61, unexplained_fine=0.8).line("style", alone)
     assert line.startswith("the edited views disagree: no 3D scene shows all of them, best possible 12.3 dB")
     assert f"dB on {alone}" in line
-    assert "61 % of the change; use a calmer style" in line
+    assert "61% of the change, 80% of its fine part; use a calmer style" in line
     assert "\n" not in line
     agreed = Agreement(psnr=25.0, unexplained=0.1).line("style", alone)
     assert agreed.startswith(f"the edited views agree: on {alone} the best colors reach 25.0 dB")
@@ -169,7 +169,13 @@ def test_the_decibels_are_of_what_the_fit_leaves_where_the_held_out_views_change
 def test_views_that_nothing_changed_agree_with_nothing_to_explain() -> None:
     found = judged([view.image for view in body().views])
     assert found == Agreement(99.0, 0.0)
-    assert found.figures() == {"psnr_best": 99.0, "unexplained": 0.0, "agree": True}
+    assert found.figures() == {
+        "psnr_best": 99.0,
+        "unexplained": 0.0,
+        "unexplained_fine": 0.0,
+        "contrast": 1.0,
+        "agree": True,
+    }
 
 
 def test_a_box_at_half_size_holds_all_of_its_odd_pixels_in_their_place() -> None:

@@ -1,0 +1,143 @@
+"""An ideal painter: the exact denoiser of a family of edits, for tests of what makes views agree.
+
+A picture is one of K edits of its view, each as likely as the others, or as a reference says. Its noise
+decides which, early, as in a trained model; Euler's steps of a flow, x = (1 − σ) picture + σ noise.
+"""
+
+from __future__ import annotations
+
+import cmath
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from progdf.camera import Camera
+from progdf.color.oklab import oklab_to_srgb
+from progdf.rasterize import Crop
+from tests.helpers.trained import Small
+from trainer.editors import make_editor
+from trainer.editors.procedural import StripesEditor
+from trainer.options import EditorOptions
+from trainer.views.view import View
+
+STEPS = 28
+STRIPES = 3  # over the height of the region
+UP = torch.tensor([0.0, 1.0, 0.0])
+
+
+@dataclass
+class IdealPainter:
+    """Paints any of the views that it knows.
+
+    Choice k of K lies at the angle 2π k / K.
+    """
+
+    views: Sequence[View]
+    choices: Sequence[Tensor]  # of each view. [K,H,W,3]
+    references: int = 2
+    reach: float = math.radians(33)  # standard deviation about the choice that references show
+    scale: float = 0.25  # of the pictures against the noise
+    alone: bool = True  # whether each view has noise of its own: what it decides, it decides alone
+    calls: int = 0
+    chosen: list[int] = field(default_factory=list)
+
+    def view_of(self, picture: Tensor) -> int:
+        """Index of the view that a picture is of."""
+        return next(i for i, v in enumerate(self.views) if torch.equal(v.image, picture))
+
+    def frame(self, view: View) -> tuple[Crop, Camera]:
+        """All of it."""
+        return (0, 0, view.camera.width, view.camera.height), view.camera
+
+    def original(self, view: View) -> Tensor:
+        """See `Painter.original`."""
+        return view.image
+
+    def paste(self, view: View, painted: Tensor) -> Tensor:
+        """See `Painter.paste`."""
+        return painted
+
+    def paint(
+        self,
+        picture: Tensor,
+        references: Sequence[Tensor] = (),
+        *,
+        strength: float = 1.0,
+        softness: float = 1.0,
+        source: Tensor | None = None,
+        seed: int | None = None,
+    ) -> Tensor:
+        """See `Painter.paint`."""
+        self.calls += 1
+        index = self.view_of(picture)
+        shows = self.views[index].mask > 0.05
+        edits = self.choices[index][:, shows].flatten(1) * self.scale  # [K,D]
+        start = (picture if source is None else source)[shows].flatten() * self.scale
+        prior = self.prior(index, references)
+        noise = np.random.default_rng([int(seed or 0), index * self.alone]).standard_normal(picture.shape)
+        x = torch.from_numpy(noise).float()[shows].flatten()
+        painted = start
+        for step in range(STEPS):
+            sigma, after = 1 - step / STEPS, 1 - (step + 1) / STEPS
+            misfit = (x - (1 - sigma) * edits).square().sum(dim=1) / (2 * sigma**2)
+            finished = torch.softmax(prior - misfit, dim=0) @ edits
+            weight = min(1.0, max(0.0, (strength * (1 + softness) - sigma) / softness))
+            painted = weight * finished + (1 - weight) * start
+            x = x + (after - sigma) * (x - painted) / sigma
+        image = picture.clone()
+        image[shows] = painted.unflatten(0, (-1, 3)) / self.scale
+        return image
+
+    def prior(self, index: int, references: Sequence[Tensor]) -> Tensor:
+        """Logarithm of how likely each choice is. [K]"""
+        count = len(self.choices[0])
+        direction = sum((self.direction(index, reference) for reference in references), 0j)
+        if abs(direction) < 1e-3:
+            return torch.zeros(count)
+        angles = torch.arange(count) * (2 * math.pi / count)
+        apart = (angles - math.atan2(direction.imag, direction.real) + math.pi) % (2 * math.pi) - math.pi
+        return -0.5 * (apart / self.reach).square()
+
+    def direction(self, index: int, reference: Tensor) -> complex:
+        """The choice that a reference shows, as a unit vector times the share of the region that it edits.
+
+        It is a picture of a view that it equals beside the region: its own, or else this one.
+        """
+        beside = [v.mask < 1e-3 for v in self.views]
+        of = index
+        for i, view in enumerate(self.views):
+            if torch.allclose(reference[beside[i]], view.image[beside[i]], rtol=0, atol=2 / 255):
+                of = i
+        view = self.views[of]
+        changed = (reference - view.image).abs().amax(dim=2) > 0.02
+        misfit = (self.choices[of][:, changed] - reference[changed]).square().flatten(1).sum(dim=1)
+        share = float(changed.sum() / (view.mask > 0.05).sum())
+        return share * cmath.exp(2j * math.pi * int(misfit.argmin()) / len(self.choices[0]))
+
+
+def hues(case: Small, count: int) -> list[Tensor]:
+    """Each view recolored in so many hues of one lightness, all around. [K,H,W,3] each"""
+    editors = []
+    for k in range(count):
+        angle = 2 * math.pi * k / count
+        rgb = oklab_to_srgb(torch.tensor([0.62, 0.12 * math.cos(angle), 0.12 * math.sin(angle)]))
+        spec = "recolor:#" + "".join(f"{round(255 * float(channel)):02x}" for channel in rgb.clamp(0, 1))
+        editors.append(make_editor(EditorOptions(spec), case.scene, case.region, case.views))
+    return [torch.stack([editor.edit(view, 1.0) for editor in editors]) for view in case.views]
+
+
+def phases(case: Small, count: int) -> list[Tensor]:
+    """Each view with level stripes at so many phases. [K,H,W,3] each"""
+    editor = make_editor(EditorOptions("stripes:#f0f0ff"), case.scene, case.region, case.views)
+    assert isinstance(editor, StripesEditor)
+    heights = case.scene.means[case.region.members] @ UP
+    period = float(torch.quantile(heights, 0.98) - torch.quantile(heights, 0.02)) / STRIPES
+    patterns = [0.5 + 0.5 * torch.cos(2 * math.pi * (heights / period + k / count)) for k in range(count)]
+    return [
+        torch.stack([replace(editor, pattern=pattern).edit(view, 0.6) for pattern in patterns])
+        for view in case.views
+    ]
