@@ -29,8 +29,24 @@ STRIPES = 3  # over the height of the region
 UP = torch.tensor([0.0, 1.0, 0.0])
 
 
+class WholeViews:
+    """Paints all of a view, at its own size; see `Painter`."""
+
+    def frame(self, view: View) -> tuple[Crop, Camera]:
+        """All of it."""
+        return (0, 0, view.camera.width, view.camera.height), view.camera
+
+    def original(self, view: View) -> Tensor:
+        """See `Painter.original`."""
+        return view.image
+
+    def paste(self, view: View, painted: Tensor) -> Tensor:
+        """See `Painter.paste`."""
+        return painted
+
+
 @dataclass
-class IdealPainter:
+class IdealPainter(WholeViews):
     """Paints any of the views that it knows.
 
     Choice k of K lies at the angle 2π k / K.
@@ -48,18 +64,6 @@ class IdealPainter:
     def view_of(self, picture: Tensor) -> int:
         """Index of the view that a picture is of."""
         return next(i for i, v in enumerate(self.views) if torch.equal(v.image, picture))
-
-    def frame(self, view: View) -> tuple[Crop, Camera]:
-        """All of it."""
-        return (0, 0, view.camera.width, view.camera.height), view.camera
-
-    def original(self, view: View) -> Tensor:
-        """See `Painter.original`."""
-        return view.image
-
-    def paste(self, view: View, painted: Tensor) -> Tensor:
-        """See `Painter.paste`."""
-        return painted
 
     def paint(
         self,

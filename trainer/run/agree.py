@@ -270,13 +270,14 @@ class AgreedEditor:
         finished = self.pictures[view.camera.name]
         if strength == 1.0:
             return finished
-        picture = None
-        if self.easel.painter.references:  # else nothing tells the model which edit is meant
-            painter = self.easel.painter
-            fit = self.fit.render(painter.frame(view)[1])
-            painted, _ = self.easel.paint(view, f"{strength:g}", [fit], strength=strength)
-            picture = None if painted is None else painter.paste(view, painted)
-        return cross_fade(view.image, finished, strength) if picture is None else picture
+        painter = self.easel.painter
+        fit = self.fit.render(painter.frame(view)[1])
+        # from the view at this degree of what all agree on, as free as that: 1 is the last round's picture
+        source, freedom = torch.lerp(painter.original(view), fit, strength), CONSENSUS * strength
+        painted, _ = self.easel.paint(view, f"{strength:g}", [fit], source, freedom, SOFTNESS)
+        if painted is None:
+            return cross_fade(view.image, finished, strength)
+        return painter.paste(view, painted)
 
 
 def painting_order(setup: TrainingSetup, side: float = SIDE) -> tuple[list[View], int]:

@@ -313,6 +313,7 @@ def _make_editor(options: TrainOptions, setup: TrainingSetup, folder: RunFolder,
     editor = make_editor(settings, setup.scene, setup.region, setup.views)
     if not isinstance(editor, InstructEditor):
         return editor
+    log.say(editor.note)
     easel, approved = Easel(editor, editor.recipe, editor.kept, settings.seed), None
     if settings.anchor is not None:
         camera = fit_size(
@@ -346,10 +347,7 @@ def _edit_views(
         new, is_confined = [s for s in strengths if s not in made], confines_edit(editor(), approach.kind)
         with log.steps("edit", len(views) * len(new)) as advance:
             made.update(edit_views(editor(), views, new, folder, is_confined, advance))
-        line = f"{spec}: a {approach.kind} edit at strength {', '.join(f'{s:g}' for s in strengths)}"
-        if isinstance(painter := editor(), InstructEditor):
-            line += f"; {len(views) * painter.calls(strengths)} calls of its network"
-        log.say(line)
+        log.say(f"{spec}: a {approach.kind} edit at strength {', '.join(f'{s:g}' for s in strengths)}")
         saved = {"strengths": list(strengths), "kind": approach.kind, "group_steps": approach.group_steps}
         shared = painter.figures if isinstance(painter := editor(), AgreedEditor) else {}
         folder.state.save("edited", {}, saved | {"trial": trial, "shared": shared})
@@ -376,7 +374,7 @@ def _edit_views(
             made.clear()
             log.say(f"the views are edited again: {str(error).partition(';')[0]}")
     painter = editor()
-    if isinstance(painter, FolderEditor | InstructEditor) and painter.note is not None:
+    if isinstance(painter, FolderEditor) and painter.note is not None:
         log.say(painter.note)
     approach, trial = choose_approach(options, setup, editor(), log)
     optimization = resolve_kind(options, approach.kind, approach.group_steps)

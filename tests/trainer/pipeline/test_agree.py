@@ -12,10 +12,11 @@ import pytest
 import torch
 from torch import Tensor
 
+from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.io.images import write_image
 from progdf.metrics.image import decibels
-from tests.helpers.ideal_painter import IdealPainter, hues, phases
+from tests.helpers.ideal_painter import IdealPainter, WholeViews, hues, phases
 from tests.helpers.trained import WHITE, Small, small
 from trainer.editors.cache import KeptPictures
 from trainer.editors.style import StyleEditor
@@ -57,12 +58,12 @@ class Family:
     def painter(self, **more: object) -> IdealPainter:
         return IdealPainter(self.setup.views, self.choices, **more)  # type: ignore[arg-type]
 
-    def nearest(self, render: Callable[[View], Tensor]) -> float:
+    def nearest(self, render: Callable[[Camera], Tensor]) -> float:
         """PSNR of what is rendered in held-out views to the nearest single edit, dB."""
         first, errors, count = len(self.setup.train), torch.zeros(len(self.choices[0])), 0
         for view, edits in zip(self.setup.held_out, self.choices[first:], strict=True):
             shows = view.mask > 0.05
-            errors += (edits[:, shows] - render(view)[shows]).square().flatten(1).sum(dim=1)
+            errors += (edits[:, shows] - render(view.camera)[shows]).square().flatten(1).sum(dim=1)
             count += 3 * int(shows.sum())
         return decibels(float(errors.min()) / count)
 
@@ -155,7 +156,7 @@ def test_nothing_is_moved_where_all_beside_the_region_is_plain_or_painted_anew()
 
 
 @dataclass
-class Clumsy:
+class Clumsy(WholeViews):
     """Darkens pictures, and enlarges those of one view, unless another seed is given that it spares."""
 
     view: View
@@ -193,7 +194,7 @@ def test_a_view_that_is_moved_too_far_by_every_answer_is_left_out_and_said(tmp_p
     name = view.camera.name
     assert made.figures["left_out"] == {name: pytest.approx(0.09, abs=0.005)}
     assert f"{name} is left out" in log
-    assert torch.equal(made.edit(view, 1.0), made.fit.render(view))
+    assert torch.equal(made.edit(view, 1.0), made.fit.render(view.camera))
 
 
 def test_a_model_that_moves_everything_is_one_line(tmp_path: Path) -> None:
@@ -214,7 +215,7 @@ class StoppedError(Exception):
 
 
 @dataclass
-class Counting:
+class Counting(WholeViews):
     """Paints what depends on all that it is given; stops at one call."""
 
     stop: int = -1
@@ -306,7 +307,7 @@ def test_pictures_that_agree_because_they_are_washed_out_do_not_agree(tmp_path: 
     some = family("hue", 12, 16, 2000, 56)
 
     @dataclass
-    class Washing:
+    class Washing(WholeViews):
         painter: IdealPainter
         references: int = 2
 
