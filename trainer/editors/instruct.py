@@ -20,6 +20,7 @@ from torch.nn.functional import interpolate
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
+from progdf.io.picture_camera import find_picture_camera
 from progdf.rasterize import Crop
 from progdf.region import Region
 from trainer.options import EditKind, EditorOptions
@@ -180,9 +181,12 @@ def check_instruct(what: str, options: EditorOptions) -> None:
     """What `instruct` and its pipeline would raise, as far as it is to be known without loading a network.
 
     Raises:
-        ProgdfError: nothing is said, a package or weights are missing or truncated, an option is not known.
+        ProgdfError: nothing is said, a package or weights are missing or truncated, an option is not known,
+            or the anchor is no picture or has no camera.
     """
     place(resolve_request(what, options), options.device)
+    if options.anchor is not None:
+        find_picture_camera(options.anchor)
 
 
 def sentence(what: str) -> str:

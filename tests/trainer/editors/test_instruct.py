@@ -26,7 +26,7 @@ from tests.helpers.trained import quick_options, small, train, write_bear
 from trainer.editors import make_editor
 from trainer.editors.adapters import ADAPTERS, Adapter, default_model, load_pipeline, missing_weights
 from trainer.editors.instruct import InstructEditor, sentence
-from trainer.editors.mixed_steps import MixedSteps
+from trainer.editors.mixed_steps import MixedSteps, network_steps
 from trainer.options import EditorOptions, TrainOptions, with_values
 from trainer.resolve import resolve, resolve_kind
 from trainer.run.run import check_command
