@@ -19,7 +19,7 @@ from torch.nn.functional import interpolate
 
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
-from progdf.gaussians import Gaussians
+from progdf.gaussians import ZERO, Gaussians
 from progdf.io.picture_camera import find_picture_camera
 from progdf.rasterize import Crop
 from progdf.region import Region
@@ -186,7 +186,7 @@ def check_instruct(what: str, options: EditorOptions) -> None:
     """
     place(resolve_request(what, options), options.device)
     if options.anchor is not None:
-        find_picture_camera(options.anchor)
+        find_picture_camera(options.anchor, origin=ZERO)
 
 
 def sentence(what: str) -> str:
