@@ -419,7 +419,7 @@ def choose_model(
         masked.append(attempt(base, "with a mask and a residual of 1", 1, best.hold))
         if most_bands > 1 and masked[-1].error < MORE_PAYS * best.error:
             masked.append(attempt(masked[-1], "with a mask and a residual of 4", 4, best.hold))
-        best = _least([best, *masked], lambda one: one.size)
+        best = _least([best, *masked], lambda one: one.size, LEVEL)  # degrees take no bytes, these do
     chosen, degree, residual = best.solvers[0], best.degree, best.residuals[0]
     if few:  # the trials solved for a part of it
         chosen, total = solver, torch.stack(best.changes).mean(dim=0)
@@ -434,9 +434,9 @@ def choose_model(
     return chosen, Model(degree, best.hold, residual, mask, best.error, unedited, decided)
 
 
-def _least(attempts: Sequence[_Attempt], size: Callable[[_Attempt], int]) -> _Attempt:
-    """The smallest within a twentieth of the least error, or of what shows."""
-    least = max(LEVEL, min(one.error for one in attempts))
+def _least(attempts: Sequence[_Attempt], size: Callable[[_Attempt], int], floor: float = 0.0) -> _Attempt:
+    """The smallest within a twentieth of the least error, or of an error that does not show."""
+    least = max(floor, min(one.error for one in attempts))
     return min((one for one in attempts if MORE_PAYS * one.error <= least), key=size)
 
 
