@@ -39,7 +39,7 @@ from progdf.region import Region, whole_scene
 from progdf.scene.regions import parse_region
 from trainer.editors import COLOR_FUNCTIONS, ImageEditor, check_new_editor, make_editor
 from trainer.editors.adapters import models_here
-from trainer.editors.instruct import instruct
+from trainer.editors.instruct import InstructEditor, instruct
 from trainer.fit.draft import DraftViews, draft_grade, draft_views
 from trainer.options import EditorOptions, RegionOptions, ViewOptions
 from trainer.regions.from_pictures import RegionRequest, region_kinds
@@ -86,6 +86,7 @@ class Answer(msgspec.Struct):
     made: Literal["picture", "grade", "note"] = "picture"
     note: str = ""
     models: list[str] = msgspec.field(default_factory=list)
+    follows: bool = False  # whether the edit of a sentence can follow this picture
 
 
 class Previewer:
@@ -110,7 +111,7 @@ class Previewer:
         Raises:
             ProgdfError: region or editor do not work.
         """
-        options = EditorOptions(request.editor)
+        options = EditorOptions(request.editor, model=request.model)
         check_new_editor(options)
         if options.family not in COLOR_FUNCTIONS:
             return None
@@ -148,9 +149,17 @@ class Previewer:
         Raises:
             ProgdfError: see `check_instruct`.
         """
+        return self._painter(request).note
+
+    def follows(self, request: Request) -> bool:
+        """Whether what is painted is a sentence, by a model that can follow a picture."""
+        painted = EditorOptions(request.editor).family == "instruct"
+        return painted and self._painter(request).references > 0
+
+    def _painter(self, request: Request) -> InstructEditor:
         options = EditorOptions(request.editor, model=request.model)
         what, region = options.editor.partition(":")[2], whole_scene(self._scene)
-        return instruct(what, self._scene, region, (), options).note
+        return instruct(what, self._scene, region, (), options)
 
     def _find_region(self, spec: str) -> Region:
         request = RegionRequest(RegionOptions(spec), ViewOptions(scene=self._path), _no_masks, quiet=True)
@@ -213,9 +222,10 @@ def answer(previewer: Previewer, line: str) -> Answer:
         if request.seed < 0:
             return Answer(request.number, "", "note", previewer.note(request), models_here())
         write_image(Path(request.out), previewer.picture(request))
+        return Answer(request.number, follows=previewer.follows(request))
     except (ProgdfError, OSError) as error:
-        return Answer(request.number, " ".join(str(error).split()))
-    return Answer(request.number)
+        models = models_here() if request.editor.startswith("instruct:") else []  # others to choose from
+        return Answer(request.number, " ".join(str(error).split()), models=models)
 
 
 def _read_lines(lines: queue.SimpleQueue[str]) -> None:

@@ -9,12 +9,14 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 
 from progdf.__main__ import main
 from progdf.formats.ply import save_ply
 from progdf.gdf.file import load_gdf
 from progdf.io.images import read_picture
 from tests.helpers.demo_scenes import bear
+from tests.helpers.tiny_pipelines import tiny_instruct_pix2pix
 from trainer.preview import Previewer, answer, newest_line
 
 
@@ -80,3 +82,23 @@ def test_only_the_last_of_several_requests_is_answered() -> None:
 def test_the_command_ends_with_its_input(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "stdin", io.StringIO(""))
     assert main(["preview", str(scene)]) == 0
+
+
+def test_what_would_paint_a_sentence_is_said_and_painted_only_when_it_is_asked_for(
+    scene: Path, tmp_path: Path
+) -> None:
+    for package in ("diffusers", "transformers", "accelerate"):
+        pytest.importorskip(package, reason="pip install progdf-studio[diffusion]")
+    model = str(tiny_instruct_pix2pix(tmp_path / "pix2pix"))
+    previewer, asked = Previewer(scene, tmp_path / "kept"), {"editor": "instruct:paint it", "model": model}
+    told = answer(previewer, request(0, tmp_path, seed=-1, **asked))
+    assert (told.error, told.made) == ("", "note")
+    assert told.note == f"{model} on the CPU in float32; 20 calls of its network a picture"
+    assert not (tmp_path / "0.png").exists()
+    for number, seed in ((1, 0), (2, 1)):
+        told = answer(previewer, request(number, tmp_path, seed=seed, **asked))
+        assert (told.error, told.made, told.follows) == ("", "picture", False), "it takes one picture alone"
+    first, again = (read_picture(tmp_path / f"{number}.png") for number in (1, 2))
+    assert not torch.equal(first, again), "another seed, another picture"
+    told = answer(previewer, request(3, tmp_path, seed=-1, editor="instruct:paint it", model="gone"))
+    assert told.error.startswith("the weights of gone are not on this machine")

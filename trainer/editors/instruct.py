@@ -28,6 +28,7 @@ from trainer.store.pretrained import last_model
 from trainer.views.view import BACKGROUND, View, region_box, render_view
 
 from .adapters import (
+    ADAPTERS,
     SMALL_MODEL,
     Placement,
     Request,
@@ -182,11 +183,18 @@ def check_instruct(what: str, options: EditorOptions) -> None:
 
     Raises:
         ProgdfError: nothing is said, a package or weights are missing or truncated, an option is not known,
-            or the anchor is no picture or has no camera.
+            or the anchor is no picture, has no camera, or is for a model that takes one picture alone.
     """
-    place(resolve_request(what, options), options.device)
+    request = resolve_request(what, options)
+    place(request, options.device)
     if options.anchor is not None:
         find_picture_camera(options.anchor, origin=ZERO)
+        if not request.adapter.references:
+            raise ProgdfError(
+                f"{request.model} takes one picture alone and cannot follow --anchor; leave it out, use "
+                f"--model {ADAPTERS['Flux2KleinPipeline'].model}, or train that picture by itself with "
+                f"--editor pictures:{options.anchor}"
+            )
 
 
 def sentence(what: str) -> str:

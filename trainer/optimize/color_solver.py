@@ -411,7 +411,7 @@ def choose_model(
         last = attempt(last, name, bands, hold)
         if max(last.error, LEVEL) < MORE_PAYS * best.error:
             best = last
-    spreads = best.degree > 0
+    spreads = best.degree > 0  # what no picture shows follows the map, masked or not
     if best.bands and (others := _with_masks(best, targets)):
         masked = [attempt(base, f"a mask of degree {base.degree}", 0, best.hold) for base in others]
         base = others[_least(masked, lambda one: one.degree).degree - 1]
@@ -420,18 +420,29 @@ def choose_model(
         if most_bands > 1 and masked[-1].error < MORE_PAYS * best.error:
             masked.append(attempt(masked[-1], "with a mask and a residual of 4", 4, best.hold))
         best = _least([best, *masked], lambda one: one.size, LEVEL)  # degrees take no bytes, these do
-    chosen, degree, residual = best.solvers[0], best.degree, best.residuals[0]
-    if few:  # the trials solved for a part of it
-        chosen, total = solver, torch.stack(best.changes).mean(dim=0)
-        if best.masked:
-            chosen = solver.find_mask(total, targets, spreads) or solver.with_mask(best.solvers[0].share)
-        made, judge = chosen.fit_map(degree, targets)[1], Judge(solver.views, targets)
-        begin = (total - made)[:, :1] if best.masked else torch.zeros_like(residual)
-        residual, _ = chosen.residual(made, begin, targets, steps, judge, best.error, best.hold)
+    chosen, residual = best.solvers[0], best.residuals[0]
+    if few:
+        chosen, residual = _solve_whole(solver, best, targets, steps, spreads)
     mask = (chosen.share * 255.0).round().to(torch.uint8).cpu() if best.masked else None
     unedited = sum(judge.error(torch.zeros_like(solver.sh)) for judge in judges) / len(trials)
     decided = [(one.name, decibels(one.error)) for one in tried]
-    return chosen, Model(degree, best.hold, residual, mask, best.error, unedited, decided)
+    return chosen, Model(best.degree, best.hold, residual, mask, best.error, unedited, decided)
+
+
+def _solve_whole(
+    solver: Solver, best: _Attempt, targets: Sequence[Tensor], steps: int, spreads: bool
+) -> tuple[Solver, Tensor]:
+    """What the trials solved for a part of the pixels, with all of them: the solver with its mask, and the
+    residual. [M,1,3]"""
+    total, begin = torch.stack(best.changes).mean(dim=0), torch.zeros_like(best.residuals[0])
+    if best.masked:
+        solver = solver.find_mask(total, targets, spreads) or solver.with_mask(best.solvers[0].share)
+    made = solver.fit_map(best.degree, targets)[1]
+    if best.masked:
+        begin = (total - made)[:, :1]
+    judge = Judge(solver.views, targets)
+    residual, _ = solver.residual(made, begin, targets, steps, judge, best.error, best.hold)
+    return solver, residual
 
 
 def _least(attempts: Sequence[_Attempt], size: Callable[[_Attempt], int], floor: float = 0.0) -> _Attempt:

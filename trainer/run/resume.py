@@ -198,6 +198,7 @@ def processor_kind() -> str:
 def picture_digests(plan: TrainOptions) -> dict[str, str]:
     """The changed pictures that a plan names, those of further strengths among them, and their hashes."""
     paths = [path for given in plan.views.pictures for path in strengths_of(given).values()]
+    paths += [plan.editor.anchor] if plan.editor.anchor is not None else []
     return {str(path.resolve()): _digest(path) for path in paths}
 
 

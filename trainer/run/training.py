@@ -216,7 +216,10 @@ def optimize_members(
     if model is not None:
         maps = torch.stack([made.table for made in recordings.made if made.table is not None])
         trajectory = replace(trajectory, maps=maps, bands=model.bands, mask=model.mask)
-        log.say(f"{len(edited)} strengths in {', '.join(map(str, taken))} steps, of {most} each at most")
+        counts = (
+            f"in {', '.join(map(str, taken))} steps, of {most} each at most" if taken else "by maps alone"
+        )
+        log.say(f"{len(edited)} strengths {counts}")
         effort |= model.figures() | {"most_steps": most, "views": len(colors.views)}
     return trajectory, loss_table(rows), effort
 

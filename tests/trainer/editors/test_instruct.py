@@ -16,6 +16,9 @@ from PIL import Image
 
 from progdf.errors import ProgdfError
 from progdf.gdf.file import load_gdf
+from progdf.io.images import to_picture
+from progdf.io.picture_camera import camera_chunk
+from tests.helpers.demo_scenes import bear
 from tests.helpers.tiny_pipelines import (
     klein_pipeline,
     tiny_flux2_klein,
@@ -31,6 +34,7 @@ from trainer.options import EditorOptions, TrainOptions, with_values
 from trainer.resolve import resolve, resolve_kind
 from trainer.run.run import check_command
 from trainer.store.run_folder import RunFolder, begin_log
+from trainer.views.view import render_view
 
 BATMAN = 'instruct:"turn him into Batman"'
 
@@ -278,6 +282,34 @@ def test_a_text_edit_is_trained_in_stages_and_stopped_anywhere_comes_to_the_same
     assert next(count) == pictures + 1, "what was painted before is not painted again"
     whole, again = (load_gdf(r.folder.gdf("run")).field for r in (result, resumed))
     assert all(torch.equal(whole.offsets(s), again.offsets(s)) for s in (0.25, 0.5, 1.0))
+
+
+def test_a_run_follows_an_anchor_of_any_camera_and_not_another_one_when_it_goes_on(
+    pix2pix: str, tmp_path: Path
+) -> None:
+    klein = str(tiny_flux2_klein(tmp_path / "klein"))
+    demo, _ = bear(900), write_bear(tmp_path, 900)
+    camera, anchor = demo.cameras[1].resize(80, 60), tmp_path / "anchor.png"
+    painted = render_view(demo.gaussians, camera, torch.ones(3)).clamp(0.0, 1.0).flip(2)
+
+    def save(picture: torch.Tensor) -> None:
+        to_picture(picture).save(anchor, pnginfo=camera_chunk(camera))
+
+    save(painted)
+    options = with_values(text_run(tmp_path, klein, "run"), anchor=anchor)
+    result = train(options, quiet=True)
+    log = result.folder.log.read_text(encoding="utf-8")
+    assert "decides: paint over it" not in log, "one is given"
+    save(painted.flip(0))
+    with pytest.raises(ProgdfError, match=r"anchor\.png has changed since"):
+        train(replace(options, resume=True), quiet=True)
+    away = replace(camera, viewmat=torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])) @ camera.viewmat)
+    to_picture(painted).save(anchor, pnginfo=camera_chunk(away))
+    other = with_values(text_run(tmp_path, klein, "away"), anchor=anchor)
+    with pytest.raises(ProgdfError, match=r"anchor\.png shows nothing of the region; take it from elsewhere"):
+        train(other, quiet=True)
+    with pytest.raises(ProgdfError, match="takes one picture alone and cannot follow --anchor"):
+        train(with_values(text_run(tmp_path, pix2pix, "alone"), anchor=anchor), quiet=True)
 
 
 def test_weights_are_looked_for_before_a_used_folder_is_trained_in_again(

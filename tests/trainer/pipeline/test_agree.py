@@ -108,6 +108,22 @@ def test_an_ideal_editor_is_held_to_one_edit_of_many(kind: str, tmp_path: Path) 
     assert sum(alone) / 3 <= 25, alone
 
 
+def test_views_follow_a_picture_that_was_approved_at_every_degree(tmp_path: Path) -> None:
+    some = family("stripes", 12, 16, 2000, 56)
+    log, view = RunLog(tmp_path / "log.txt", quiet=True), some.setup.train[0]
+    for approved in (2, 7):
+        easel = Easel(some.painter(), {}, NOTHING, 0)
+        made = agree_views(easel, some.setup, STYLE, log, (view, some.choices[0][approved]))
+        for s in (1.0, 0.5):
+            off = 0
+            for index, one in enumerate(some.setup.train):
+                shows, edits = one.mask > 0.05, torch.lerp(one.image, some.choices[index], s)
+                misfits = (edits[:, shows] - made.edit(one, s)[shows]).square().flatten(1).sum(dim=1)
+                off += abs((int(misfits.argmin()) - approved + 6) % 12 - 6)
+            assert off < 2 * len(some.setup.train), "three choices off is chance"
+        assert torch.equal(made.edit(view, 0.0), view.image)
+
+
 def test_a_painter_of_one_picture_sweeps(tmp_path: Path) -> None:
     some = family("hue", 12, 16, 2000, 56)
     painter = some.painter(references=0)

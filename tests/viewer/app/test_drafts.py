@@ -46,7 +46,8 @@ class Previews:
             self._answers.append(preview.Preview(self._number, note="tiny on the CPU", models=("a/tiny",)))
             return self._number
         pixels = np.zeros((4, 4, 3), np.uint8) if self.grade is None else None
-        self._answers.append(preview.Preview(self._number, pixels, self.grade))
+        follows = request.model != "a/tiny"
+        self._answers.append(preview.Preview(self._number, pixels, self.grade, follows=follows))
         return self._number
 
     def take(self) -> preview.Preview | None:
@@ -133,6 +134,10 @@ def test_a_sentence_is_painted_when_it_is_asked_for_and_the_edit_follows_that_pi
     request(window, "paint_over")
     anchor = Path(window.main_view.work.form.anchor)
     assert torch.allclose(find_picture_camera(anchor).viewmat, painted.viewmat, atol=1e-6)
+    with_form(window, asks=1, model="a/tiny", anchor="")
+    assert "cannot follow a picture" in window.main_view.preview.text
+    assert not window.main_view.preview.painted
+    with_form(window, asks=1, model="", anchor=str(anchor))
     request(window, "train")
     assert f"--anchor={anchor}" in Trainer.said
 

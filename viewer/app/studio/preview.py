@@ -71,6 +71,7 @@ class Preview:
     error: str = ""
     note: str = ""  # what would paint a sentence
     models: tuple[str, ...] = ()  # that are on this machine
+    follows: bool = False  # whether the edit of a sentence can follow this picture
 
 
 class _Answer(msgspec.Struct):
@@ -79,6 +80,7 @@ class _Answer(msgspec.Struct):
     made: Literal["picture", "grade", "note"] = "picture"
     note: str = ""
     models: list[str] = msgspec.field(default_factory=list)
+    follows: bool = False
 
 
 class PreviewChild:
@@ -134,13 +136,14 @@ class PreviewChild:
         try:
             answer = convert_json(decode_json(line), _Answer)
             if answer.error:
-                return Preview(answer.number, error=answer.error)
+                return Preview(answer.number, error=answer.error, models=tuple(answer.models))
             if answer.made == "note":
                 return Preview(answer.number, note=answer.note, models=tuple(answer.models))
             if answer.made == "grade":
                 return Preview(answer.number, grade=self._picture(answer.number).with_suffix(".gdf"))
             with Image.open(self._picture(answer.number)) as picture:
-                return Preview(answer.number, np.asarray(picture.convert("RGB")))
+                pixels = np.asarray(picture.convert("RGB"))
+            return Preview(answer.number, pixels, follows=answer.follows)
         except (OSError, ValueError) as error:
             return Preview(-1, error=f"the preview cannot be read: {error}")
 
@@ -294,7 +297,7 @@ class PreviewActions:
                 self._broken = True
                 self._end()
             self._end_live()
-            self._show(answer.error, None, failed=True)
+            self._show(answer.error, None, failed=True, models=answer.models)
         elif answer.note and answer.number == self._number:
             self._show(answer.note, None, models=answer.models)
         elif answer.grade is not None and self._sent is not None and answer.number == self._number:
@@ -310,7 +313,10 @@ class PreviewActions:
             self._painted = None
             if kind == "instruct":
                 name, text = f"Anchor: {what}", "The edit will follow this picture"
-                self._painted = self._sent, answer.pixels
+                if answer.follows:
+                    self._painted = self._sent, answer.pixels
+                else:
+                    name, text = f"Example: {what}", "An example: this model cannot follow a picture"
             texture = self._upload(answer.pixels)
             self._show(text, Cover(texture, self._sent.camera, self._sent.size, name))
             self._app.main_view.wake()
