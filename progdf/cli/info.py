@@ -182,14 +182,17 @@ def _scene_lines(path: Path, cameras: Path | None, up: UpChoice) -> Iterator[str
 
 def _edit_lines(path: Path) -> Iterator[str]:
     gdf = read_gdf(path)
-    size, members, count = path.stat().st_size, len(gdf.region), gdf.scene.count
+    size, members, count = path.stat().st_size, gdf.members, gdf.scene.count
     yield f"{path.name}: the edit '{gdf.name}', {file_size(size)}"
     if gdf.instruction:
         yield f"asked for: {gdf.instruction}"
     sizes = ""
     if count:
         yield f"scene: {format_count(count)}, fingerprint {gdf.scene.means_sha256[:12]}"
-        yield f"region: {gdf.region.name}, {format_count(members)} ({members / max(1, count):.1%})"
+        region, added = len(gdf.region), members - len(gdf.region)
+        yield f"region: {gdf.region.name}, {format_count(region)} ({region / max(1, count):.1%})"
+        if added:
+            yield f"adds: {format_count(added)}, none of which shows at strength 0"
         each = gdf.field.bytes_per_member
         sizes = f"{each:.4g} bytes per Gaussian, {size / max(1, members):.4g} with the header, "
     yield f"field: {gdf.field.kind}, {sizes}{_describe_field(gdf.field)}"

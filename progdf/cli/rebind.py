@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree
 
 from progdf.errors import ProgdfError
 from progdf.field.baked import AttributeBases, BakedField
+from progdf.field.separable import fit_bands
 from progdf.formats.scene_file import load_scene, rotate_about_x, scene_name
 from progdf.gaussians import BASE_CHANNELS, Gaussians
 from progdf.gdf.file import Gdf, fingerprint, load_gdf, save_gdf
@@ -128,10 +129,11 @@ def rebind_edit(gdf: Gdf, a: Gaussians, b: Gaussians, match: Match) -> Gdf:
     mine = np.flatnonzero(members[index] == match.rows)
     if not len(mine):
         raise ProgdfError(f"no member of {gdf.name} is in the other scene; give the same scene")
-    rows, source = torch.from_numpy(mine), torch.from_numpy(index[mine])
-    of_a = torch.from_numpy(match.rows)
+    rows, of_a = torch.from_numpy(mine), torch.from_numpy(match.rows)
+    source = torch.cat([torch.from_numpy(index[mine]), torch.arange(len(members), gdf.members)])
     # q and −q are one rotation, but not with the same offset
-    flipped = (a.quats[of_a[rows]] * b.quats[rows]).sum(dim=1) < 0
+    flipped = torch.zeros(len(source), dtype=torch.bool)
+    flipped[: len(rows)] = (a.quats[of_a[rows]] * b.quats[rows]).sum(dim=1) < 0
     attributes = {}
     for name, bases in gdf.field.attributes.items():
         full, basis, step = bases.end_offset[source], bases.residual_basis[:, source], bases.scale
@@ -139,7 +141,7 @@ def rebind_edit(gdf: Gdf, a: Gaussians, b: Gaussians, match: Match) -> Gdf:
             full = torch.where(flipped[:, None], -full, full)
             basis = torch.where(flipped[None, :, None], -basis, basis)
         elif name == "shN":
-            full, basis, step = (_fit_bands(tensor, 3 * b.shN.shape[1]) for tensor in (full, basis, step))
+            full, basis, step = (fit_bands(tensor, 3 * b.shN.shape[1]) for tensor in (full, basis, step))
         if full.shape[1]:
             attributes[name] = AttributeBases(full, basis, step, bases.coefficients)
     field = BakedField(
@@ -184,8 +186,3 @@ def _colors(scene: Gaussians) -> NDArray[np.float32]:
     """Colors of band 0 as far as every format keeps them, 0..1. [N,3]"""
     rgb: NDArray[np.float32] = sh0_to_rgb(scene.sh0).clamp(0.0, 1.0).numpy()
     return rgb
-
-
-def _fit_bands(tensor: torch.Tensor, width: int) -> torch.Tensor:
-    """Offsets of higher SH bands, cut or filled up with 0 to the other scene's. [...,c] -> [...,width]"""
-    return torch.nn.functional.pad(tensor[..., :width], (0, max(0, width - tensor.shape[-1])))

@@ -18,10 +18,11 @@ from torch import Tensor
 
 from progdf.field.baked import AttributeBases, Segment, find_segment
 from progdf.gaussians import ATTRIBUTES, Gaussians
-from progdf.gdf.file import Gdf, verify
+from progdf.gdf.file import Gdf
 from progdf.rasterize.cpu.jit import kernel
 from progdf.threads import run_chunks
 
+from .added import extend
 from .layers import KINDS, ORDERED, Effects, Layer, changed_edits, check_numbers, check_weights, effects_of
 from .reference import changed_rows, coverage
 
@@ -103,20 +104,20 @@ class Composer:
 
     Args:
         scene: the original, float32; it is never written to
-        gdfs: every edit that may appear in the stack
+        gdfs: every edit that may appear in the stack; rows that they add come after the scene's own
 
     Raises:
         ProgdfError: an edit was made for another scene.
     """
 
     def __init__(self, scene: Gaussians, gdfs: Sequence[Gdf]) -> None:
-        for gdf in gdfs:
-            verify(gdf, scene)
-        self._scene, self._gdfs = scene, tuple(gdfs)
-        self._index = {id(gdf): i for i, gdf in enumerate(gdfs)}
-        self._members = [gdf.region.members.numpy() for gdf in gdfs]
+        scene, extended = extend(scene, gdfs)
+        self._scene, self._gdfs = scene, extended
+        self._given = tuple(gdfs)  # alive, so that no other edit gets the id of one
+        self._index = {id(gdf): i for edits in (gdfs, extended) for i, gdf in enumerate(edits)}
+        self._members = [gdf.region.members.numpy() for gdf in extended]
         self._bases = [
-            {name: _Bases.of(bases) for name, bases in gdf.field.attributes.items()} for gdf in gdfs
+            {name: _Bases.of(bases) for name, bases in gdf.field.attributes.items()} for gdf in extended
         ]
         moving = {name for bases in self._bases for name in bases}
         before = {name: getattr(scene, name).detach().float() for name in ATTRIBUTES if name in moving}
@@ -148,7 +149,8 @@ class Composer:
             ValueError: weights do not fit, or an edit is not one of the composer's.
         """
         check_numbers(layers, blend)
-        stack = [(self._edit_of(layer.gdf), layer) for layer in layers if layer.active]
+        edits = [(self._edit_of(layer.gdf), layer) for layer in layers if layer.active]
+        stack = [(edit, replace(layer, gdf=self._gdfs[edit])) for edit, layer in edits]
         self._check_weights([layer for _, layer in stack])
         before, self._effects = self._effects, effects_of(stack, blend)
         changed = changed_edits(before, self._effects)

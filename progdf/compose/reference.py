@@ -16,9 +16,10 @@ from torch import Tensor
 from progdf.field.baked import BakedField, GradeForm
 from progdf.field.grade import adjust_colors, map_share
 from progdf.gaussians import ATTRIBUTES, Gaussians
-from progdf.gdf.file import Gdf, verify
+from progdf.gdf.file import Gdf
 from progdf.sh import C0
 
+from .added import extend
 from .layers import BLENDS, KINDS, ORDERED, Gains, Layer, check_layers
 
 _COLOR = 0.1  # of sRGB's 0..1: a change that is plain to see
@@ -135,7 +136,8 @@ def compose_layers(scene: Gaussians, layers: Sequence[Layer], blend: str = "norm
         blend: one of `BLENDS`
 
     Returns:
-        New Gaussians; attributes that no layer moves are the scene's own tensors. Rows outside all members,
+        New Gaussians, with the rows that the edits add after the scene's own (see `progdf.compose.added`);
+        attributes that no layer moves are the scene's own tensors. Rows outside all members,
         rows of weight 0, and everything at strength 0 keep their bytes. One layer at strength 1 gives Θ0 +
         full exactly.
 
@@ -143,9 +145,11 @@ def compose_layers(scene: Gaussians, layers: Sequence[Layer], blend: str = "norm
         ProgdfError: an edit belongs to another scene, a strength is not a number, the blend rule is unknown.
         ValueError: weights do not fit.
     """
+    edits = {id(layer.gdf): layer.gdf for layer in layers}
+    scene, extended = extend(scene, list(edits.values()))
+    edits = dict(zip(edits, extended, strict=True))
+    layers = [replace(layer, gdf=edits[id(layer.gdf)]) for layer in layers]
     check_layers(layers, blend)
-    for layer in layers:
-        verify(layer.gdf, scene)
     active = [layer for layer in layers if layer.active]
     if not active or not len(scene):
         return scene

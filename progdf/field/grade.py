@@ -24,7 +24,6 @@ from progdf.sh import C0, basis
 
 from .baked import (
     LATTICE,
-    AttributeBases,
     BakedField,
     GradeForm,
     Segment,
@@ -36,15 +35,14 @@ from .baked import (
     lattice_side,
     remap_slider,
 )
-from .separable import fit_amplitude, principal_modes, quantize_bases, store_attribute
+from .course import fit_course
+from .separable import quantize_bases
 
 MOST_COLOR = 1.5
 """Colors above this, which no screen shows, are mapped as this."""
 
 _DIRECTIONS = 32  # in which a member's color is mapped; twice the functions of three bands
 _CHUNK = 1 << 11  # members at once
-_TOLERANCE = 0.003  # root mean square that factoring the mapped colors in memory may cost, as a share
-_MOST_RANK = 8
 MOST_RESIDUALS = 4
 """Bases of a residual that are tried."""
 _WITHIN = 0.999  # share of the members whose residual is reached: few must not take the levels of all
@@ -189,20 +187,10 @@ def bake_grade(form: GradeForm, rows: Tensor, mapped: Tensor | None = None) -> B
         )
     higher = rows.shape[1] - BASE_CHANNELS
     parts = {"sh0": course[:, :, :3], "shN": pad(course[:, :, 3:], (0, higher - course.shape[2] + 3))}
-    attributes = {name: _bake_attribute(part) for name, part in parts.items() if bool(part.any())}
+    attributes = {name: fit_course(part) for name, part in parts.items() if bool(part.any())}
     knots = form.knots.tolist()
     baked = BakedField("grade", form.knots, attributes, rows.shape[1], tuple(knots), form)
     return baked if form.remap.is_identity else remap_slider(baked, form.remap)
-
-
-def _bake_attribute(offsets: Tensor) -> AttributeBases:
-    """The fewest bases by which an attribute's course is met to `_TOLERANCE`. [S,M,c]"""
-    fitted = fit_amplitude(offsets, torch.ones_like(offsets[0]))
-    allowed = _TOLERANCE**2 * float(fitted.offsets.double().square().sum())
-    power = torch.linalg.eigvalsh(fitted.gram).flip(0).clamp(min=0)
-    remaining = float(power.sum()) - power.cumsum(0)
-    needed = 0 if float(power.sum()) <= allowed else 1 + int((remaining > allowed).sum())
-    return store_attribute(fitted, principal_modes(fitted.gram)[:, : min(needed, _MOST_RANK)])
 
 
 def adjust_colors(form: GradeForm, sh: Tensor, members: Tensor | slice, s: float) -> Tensor:

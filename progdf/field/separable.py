@@ -160,6 +160,11 @@ def decode_bases(levels: Tensor, step: Tensor) -> Tensor:
     return levels.float() * step[:, None]
 
 
+def fit_bands(tensor: Tensor, width: int) -> Tensor:
+    """Numbers of higher SH bands, cut or filled up with 0 to another scene's. [...,c] -> [...,width]"""
+    return torch.nn.functional.pad(tensor[..., :width], (0, max(0, width - tensor.shape[-1])))
+
+
 def solve_coefficients(offsets: Tensor, full: Tensor, residual_basis: Tensor, weights: Tensor) -> Tensor:
     """Least squares for a_0 … a_R at every snapshot; both ends are given, not solved. [T,1+R] float32
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 from collections.abc import Callable, Mapping, MutableMapping
 from dataclasses import dataclass, replace
@@ -20,7 +21,7 @@ from progdf.field.baked import BakedField, GradeForm, NeuralForm
 from progdf.field.grade import bake_grade, lattice_form, map_alone
 from progdf.formats.cube import SUFFIX as CUBE
 from progdf.formats.cube import read_cube
-from progdf.gaussians import BASE_CHANNELS, ZERO, Gaussians, Origin, pack
+from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, ZERO, Gaussians, Origin, pack
 from progdf.io.atomic import atomic_write, read_file
 from progdf.region import Region, whole_scene
 
@@ -29,9 +30,11 @@ from .header import (
     GdfHeader,
     SceneFingerprint,
     contradiction_error,
+    pack_added,
     pack_field,
     pack_file,
     pack_region,
+    unpack_added,
     unpack_field,
     unpack_file,
     unpack_region,
@@ -46,6 +49,11 @@ _FAR = 1e18
 _FARTHEST = {"log_scales": 80.0}
 """Where it is another number: e^80 fits into float32, with a scale of any scene too."""
 
+UNSEEN_LOGIT = -math.log(254.0)
+"""Below it an opacity is less than 1/255, which no engine draws."""
+ADDED_LOGIT = -6.0
+"""The opacity of added rows at strength 0."""
+
 
 @dataclass(frozen=True)
 class Gdf:
@@ -53,20 +61,43 @@ class Gdf:
 
     name: str  # the layer's, e.g. "shirt"
     region: Region
-    field: BakedField  # of the region's members
+    field: BakedField  # of the region's members, and after them of the added rows
     scene: SceneFingerprint  # the scene it was made for
     instruction: str = ""  # to the editor, e.g. "recolor:#3060d0"
     options: Mapping[str, Any] = default(default_factory=dict)  # of the training, JSON values
     report: Mapping[str, Any] = default(default_factory=dict)  # the run's errors, see report.json
     applied: bool = False  # the map of a grade that is bound to no scene, on a region of this one
+    # B Gaussians that the scene does not have, as they are at strength 0, where nothing of them is drawn: the
+    # field's last B members, see `progdf.compose.added`
+    added: Gaussians | None = None
 
     def __post_init__(self) -> None:
-        if self.field.attributes and self.field.members != len(self.region):
-            raise ValueError(f"the field has {self.field.members} members, the region {len(self.region)}")
+        if (self.field.attributes or self.added is not None) and self.field.members != self.members:
+            raise ValueError(
+                f"the field has {self.field.members} members, the region {len(self.region)}"
+                + (f" and {self.members - len(self.region)} rows are added" if self.added is not None else "")
+            )
+        if self.added is not None:
+            _check_added(self.added)
         if len(self.region.score) != self.scene.count:
             raise ValueError(
                 f"the region's score has {len(self.region.score)} rows, the scene {self.scene.count}"
             )
+
+    @property
+    def members(self) -> int:
+        """Members of the field: the region's and the added rows."""
+        return len(self.region) + (0 if self.added is None else len(self.added))
+
+
+def _check_added(added: Gaussians) -> None:
+    """Raises ValueError where a row would show at strength 0, or is nowhere near any scene."""
+    if not bool((added.logit_opacities < UNSEEN_LOGIT).all()):
+        raise ValueError("an added row shows at strength 0")
+    for name in ATTRIBUTES:
+        values = getattr(added, name)
+        if values.numel() and not float(values.abs().max()) < _FARTHEST.get(name, _FAR):
+            raise ValueError(f"{name} of an added row is beyond any scene")
 
 
 def fingerprint(scene: Gaussians) -> SceneFingerprint:
@@ -124,7 +155,7 @@ def save_gdf(path: str | os.PathLike[str], gdf: Gdf) -> None:
     """
     field, tensors = pack_field(gdf.field)
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    tensors |= pack_region(gdf.region)
+    tensors |= pack_region(gdf.region) | pack_added(gdf.added)
     if broken := _infinite(tensors):
         raise ValueError(f"{broken} of {gdf.name} has a number that is not finite")
     header = GdfHeader(
@@ -136,6 +167,8 @@ def save_gdf(path: str | os.PathLike[str], gdf: Gdf) -> None:
         field=field,
         options=dict(gdf.options),
         report=dict(gdf.report),
+        added=gdf.members - len(gdf.region),
+        added_origin=ZERO if gdf.added is None else gdf.added.origin,
     )
     content = pack_file(header, tensors)
     try:
@@ -243,11 +276,13 @@ def _unpack(header: GdfHeader, tensors: Mapping[str, Tensor]) -> Gdf:
         raise ValueError(f"{header.members} members of a scene of {header.scene.count} Gaussians")
     field = unpack_field(header.field, tensors)
     _check_reach(field)
-    members = field.members if field.attributes else header.members
+    members = field.members if field.attributes else header.members + header.added
     if field.origin is not None:
         members = field.origin.members
-    if header.members != members:
-        raise ValueError(f"the header has {header.members} members, the field {members}")
+        if header.added:
+            raise ValueError(f"rows are added to a {field.kind} field, which has none")
+    if header.members + header.added != members:
+        raise ValueError(f"the header has {header.members + header.added} members, the field {members}")
     region = unpack_region(header.region, tensors, header.scene.count, header.members)
     if header.members != len(region):
         raise ValueError(f"the header has {header.members} members, the region {len(region)}")
@@ -259,6 +294,7 @@ def _unpack(header: GdfHeader, tensors: Mapping[str, Tensor]) -> Gdf:
         instruction=header.instruction,
         options=header.options,
         report=header.report,
+        added=unpack_added(header, tensors),
     )
 
 

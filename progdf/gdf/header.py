@@ -22,11 +22,11 @@ from torch import Tensor
 from progdf.errors import ProgdfError
 from progdf.field.baked import AttributeBases, BakedField, BakePlan, GradeForm, NeuralForm, SliderRemap
 from progdf.field.neural import NeuralField, NeuralShape
-from progdf.gaussians import ATTRIBUTES
+from progdf.gaussians import ATTRIBUTES, ZERO, Gaussians, Origin
 from progdf.io.json_values import convert_json, decode_json
 from progdf.region import Region
 
-FORMAT = 4
+FORMAT = 5
 """The version of the file format."""
 
 MOST_GAUSSIANS = 1 << 26
@@ -36,6 +36,7 @@ _MOST_HEADER = 1 << 24  # bytes; a report takes a few kB, and JSON of 100 MB cou
 _METADATA = "progdf"  # the one key: the library writes several in an order that differs from run to run
 _PARTS = ("end_offset", "residual_basis", "scale", "coefficients")  # of `AttributeBases`
 _GRADE = ("knots", "table", "residual", "scale", "coefficients")  # of `GradeForm`
+_ADDED = "added."
 _NETWORK = "network."
 _END_CORRECTION = "end_correction."
 _RENAMED = {  # parts of tensors' names in format 1
@@ -85,6 +86,8 @@ class GdfHeader(msgspec.Struct, frozen=True):
     field: FieldHeader
     options: dict[str, Any]
     report: dict[str, Any]
+    added: Annotated[int, msgspec.Meta(ge=0)] = 0  # rows that the scene does not have, see `Gdf.added`
+    added_origin: Origin = ZERO
     format: int = FORMAT
     sha256: str = ""
 
@@ -247,6 +250,28 @@ def unpack_field(header: FieldHeader, tensors: Mapping[str, Tensor]) -> BakedFie
     plan = BakePlan(tensors["knots"], header.network.ranks, correction)
     form = NeuralForm(network, plan, header.network.rows_sha256, header.network.bake_error)
     return BakedField("neural", torch.tensor([0.0, 1.0]), {}, header.channels, recorded, form)
+
+
+def pack_added(added: Gaussians | None) -> dict[str, Tensor]:
+    """The tensors of added rows."""
+    return {} if added is None else {_ADDED + name: getattr(added, name).float() for name in ATTRIBUTES}
+
+
+def unpack_added(header: GdfHeader, tensors: Mapping[str, Tensor]) -> Gaussians | None:
+    """The inverse of `pack_added`.
+
+    Raises:
+        ValueError, KeyError: they are not as many as the header says, or not in float32.
+    """
+    if not header.added:
+        return None
+    rows: dict[str, Any] = {name: tensors[_ADDED + name] for name in ATTRIBUTES}
+    if any(values.dtype != torch.float32 for values in rows.values()):
+        raise ValueError("an added row is not in float32")
+    added = Gaussians(**rows, origin=header.added_origin)
+    if len(added) != header.added:
+        raise ValueError(f"the header has {header.added} added rows, the tensors {len(added)}")
+    return added
 
 
 def pack_region(region: Region) -> dict[str, Tensor]:

@@ -1,0 +1,80 @@
+"""Gaussians that an edit adds: rows after the scene's own, of which nothing is drawn at strength 0.
+
+A scene is extended once by the rows of all its edits; what composes, draws or selects then needs to know
+nothing of where a row came from.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from progdf.field.separable import fit_bands
+from progdf.gaussians import ATTRIBUTES, Gaussians
+from progdf.gdf.file import UNSEEN_LOGIT, Gdf, fingerprint, verify
+from progdf.region import Region
+
+
+def extend(scene: Gaussians, gdfs: Sequence[Gdf]) -> tuple[Gaussians, tuple[Gdf, ...]]:
+    """The scene with the added rows of all edits after its own, and the edits of that scene.
+
+    Args:
+        scene: N Gaussians
+        gdfs: edits of it
+
+    Returns:
+        N + ΣB Gaussians, the added rows in the order of the edits; and for each edit one of M + B members
+        that adds nothing any more. Both as they were given where no edit adds a row.
+
+    Raises:
+        ProgdfError: an edit was made for another scene.
+    """
+    for gdf in gdfs:
+        verify(gdf, scene)
+    added = [gdf.added for gdf in gdfs if gdf.added is not None]
+    if not added:
+        return scene, tuple(gdfs)
+    extended = replace(scene, **_append_rows(scene, added))
+    total, scene_print, first = len(extended), fingerprint(extended), len(scene)
+    moved = []
+    for gdf in gdfs:
+        rows = torch.arange(first, first + gdf.members - len(gdf.region))
+        first += len(rows)
+        score = torch.zeros(total)
+        score[: len(scene)] = gdf.region.score
+        score[rows] = 1.0
+        region = Region(gdf.region.name, torch.cat([gdf.region.members, rows]), score)
+        moved.append(replace(gdf, region=region, scene=scene_print, added=None))
+    return extended, tuple(moved)
+
+
+def _append_rows(scene: Gaussians, added: Sequence[Gaussians]) -> dict[str, Any]:
+    """The attributes of the scene and of rows that have origins and bands of their own."""
+    columns: dict[str, list[Tensor]] = {name: [getattr(scene, name)] for name in ATTRIBUTES}
+    origin, shape = torch.tensor(scene.origin, dtype=torch.float64), scene.shN.shape[1:]
+    for rows in added:
+        means = rows.means if rows.origin == scene.origin else (rows.world_means - origin)
+        bands = fit_bands(rows.shN.flatten(1), shape.numel()).reshape(-1, *shape)
+        own = replace(rows, means=means.float(), shN=bands)
+        for name, parts in columns.items():
+            parts.append(getattr(own, name).to(parts[0]))
+    return {name: torch.cat(parts) for name, parts in columns.items()}
+
+
+def remaining_rows(scene: Gaussians, composed: Gaussians) -> Tensor:
+    """Which rows of a composed scene a file keeps: not what an edit took away or has not added yet.
+
+    Args:
+        scene: the original. N Gaussians
+        composed: it under its edits, with N + B rows
+
+    Returns:
+        Sorted row indices; at strength 0 the N rows of the original, the faint ones too. [R] int64
+    """
+    unseen = composed.logit_opacities < UNSEEN_LOGIT
+    unseen[: len(scene)] &= scene.logit_opacities >= UNSEEN_LOGIT
+    return (~unseen).nonzero()[:, 0]

@@ -1,0 +1,233 @@
+"""Edits that add Gaussians and take some away: nothing shows at strength 0, all at 1, linearly between."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import safetensors.torch
+import torch
+
+from progdf.cli import rebind
+from progdf.compose.added import extend, remaining_rows
+from progdf.compose.composer import Composer
+from progdf.compose.reference import BLENDS, Gains, Layer, compose_layers
+from progdf.errors import ProgdfError
+from progdf.field import BakedField
+from progdf.field.course import course_field, opacity_course
+from progdf.formats.ply import load_ply, save_ply
+from progdf.gaussians import ATTRIBUTES, Gaussians, attribute_slices
+from progdf.gdf.file import ADDED_LOGIT, Gdf, load_gdf, read_gdf, save_gdf
+from progdf.rasterize import render
+from tests.helpers.draws import Draws
+from tests.helpers.edits import bits, curved_field, edit_of, some_rows
+from tests.helpers.fuzz_changes import header_of, signed_gdf
+from tests.helpers.scenes import front_camera, random_gaussians
+
+LOGIT = attribute_slices(14)["logit_opacities"]
+COUNT = 300
+
+
+def added_rows(count: int, seed: int, bands: int = 1) -> Gaussians:
+    rows = random_gaussians(count, seed, sh_degree=bands)
+    return replace(rows, logit_opacities=torch.full((count,), ADDED_LOGIT))
+
+
+def growing(scene: Gaussians, members: torch.Tensor, count: int, seed: int, name: str = "hat") -> Gdf:
+    """Takes every second member away, and lets so many rows appear that move as they do."""
+    draws, added = Draws(seed), added_rows(count, seed)
+    start = torch.cat([scene.logit_opacities[members], added.logit_opacities])
+    end = torch.cat([start[: len(members)], draws.normal(count) + 2.0])
+    end[: len(members) : 2] = -8.0
+    knots, opacity = opacity_course(start, end)
+    offsets = torch.zeros(len(knots), len(start), 14)
+    offsets[:, :, LOGIT] = opacity[..., None]
+    offsets[:, :, :3] = knots[:, None, None] * draws.normal(len(start), 3)
+    return replace(edit_of(scene, members, curved_field(len(members)), name), **grown(offsets, knots, added))
+
+
+def grown(offsets: torch.Tensor, knots: torch.Tensor, added: Gaussians) -> dict[str, object]:
+    return {"field": course_field(knots, offsets), "added": added}
+
+
+@pytest.fixture(scope="module")
+def scene() -> Gaussians:
+    return random_gaussians(COUNT, seed=5, sh_degree=1)
+
+
+@pytest.fixture(scope="module")
+def hat(scene: Gaussians) -> Gdf:
+    return growing(scene, some_rows(scene, 40, 1), 25, 7)
+
+
+def test_nothing_of_what_is_added_or_taken_away_shows_at_zero(scene: Gaussians, hat: Gdf) -> None:
+    composed = compose_layers(scene, [Layer(hat, 0.0)])
+    assert len(composed) == COUNT + 25
+    assert bits(composed[:COUNT]) == bits(scene)
+    assert bits(composed[remaining_rows(scene, composed)]) == bits(scene)
+    before, after = (render(each, front_camera()).image for each in (scene, composed))
+    assert float(before.std()) > 0.01
+    # how many numbers are vectorized together depends on their number, so last bits may differ
+    assert float((before - after).abs().max()) <= 1e-6
+
+
+def test_opacity_goes_linearly_from_nothing_and_to_nothing(scene: Gaussians, hat: Gdf) -> None:
+    end = compose_layers(scene, [Layer(hat, 1.0)]).opacities
+    members = hat.region.members[::2]
+    for s in np.linspace(0.0, 1.0, 41):
+        opacity = compose_layers(scene, [Layer(hat, float(s))]).opacities
+        assert float(opacity[COUNT:].sum() / end[COUNT:].sum()) == pytest.approx(s, abs=0.02)
+        assert float(opacity[members].sum() / scene.opacities[members].sum()) == pytest.approx(
+            1 - s, abs=0.02
+        )
+
+
+def test_at_one_the_file_has_what_is_there_and_not_what_is_gone(scene: Gaussians, hat: Gdf) -> None:
+    composed = compose_layers(scene, [Layer(hat, 1.0)])
+    rows = remaining_rows(scene, composed)
+    faint = scene.logit_opacities < -np.log(254)
+    gone = set(hat.region.members[::2].tolist()) - set(faint.nonzero()[:, 0].tolist())
+    assert set(range(COUNT + 25)) - set(rows.tolist()) == gone
+
+
+@pytest.mark.parametrize("blend", BLENDS)
+def test_the_composer_is_the_plain_form_on_random_stacks(scene: Gaussians, blend: str) -> None:
+    draws = Draws(11)
+    gdfs = [
+        growing(scene, some_rows(scene, 40, 1), 25, 7),
+        edit_of(scene, some_rows(scene, 90, 2), curved_field(90, 2), "shirt"),
+        growing(scene, some_rows(scene, 60, 3), 1, 8, "pin"),
+    ]
+    composer = Composer(scene, gdfs)
+    for _ in range(250):
+        order = draws.order(3).tolist()
+        layers = [
+            Layer(
+                gdfs[i],
+                float(draws.uniform(1)) * 1.2,
+                enabled=float(draws.uniform(1)) < 0.8,
+                gains=Gains(*draws.uniform(3).tolist()) if float(draws.uniform(1)) < 0.3 else Gains(),
+                weights=draws.uniform(gdfs[i].members) if float(draws.uniform(1)) < 0.4 else None,
+            )
+            for i in order
+        ]
+        composer.update(layers, blend)
+        # the plain form appends rows in the order of its layers
+        plain = compose_layers(scene, [*(Layer(gdf, 0.0) for gdf in gdfs), *layers], blend)
+        assert bits(composer.gaussians) == bits(plain)
+
+
+def test_an_extended_scene_composes_as_the_scene_and_its_edits(scene: Gaussians, hat: Gdf) -> None:
+    extended, (edit,) = extend(scene, [hat])
+    assert bits(compose_layers(extended, [Layer(edit, 0.6)])) == bits(
+        compose_layers(scene, [Layer(hat, 0.6)])
+    )
+    assert extend(extended, [edit])[0] is extended
+
+
+def test_added_rows_come_back_as_they_were_saved_and_know_the_world(
+    scene: Gaussians, hat: Gdf, tmp_path: Path
+) -> None:
+    save_gdf(tmp_path / "hat.gdf", hat)
+    loaded = load_gdf(tmp_path / "hat.gdf", scene)
+    assert loaded.added is not None
+    assert hat.added is not None
+    assert bits(loaded.added) == bits(hat.added)
+    assert bits(compose_layers(scene, [Layer(loaded, 0.4)])) == bits(compose_layers(scene, [Layer(hat, 0.4)]))
+    far = replace(hat.added, origin=(1e6, 0.0, -3e5))
+    save_gdf(tmp_path / "far.gdf", replace(hat, added=far))
+    moved = compose_layers(scene, [Layer(load_gdf(tmp_path / "far.gdf", scene), 0.0)])
+    assert torch.equal(moved.means[COUNT:], far.world_means.float())
+
+
+def test_an_edit_is_carried_over_with_its_added_rows(
+    scene: Gaussians, hat: Gdf, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    order = Draws(2).order(COUNT)
+    save_ply(tmp_path / "a.ply", scene)
+    save_ply(tmp_path / "b.ply", scene[order])
+    save_gdf(tmp_path / "hat.gdf", hat)
+    paths = [f"--from={tmp_path / 'a.ply'}", f"--to={tmp_path / 'b.ply'}"]
+    rebind.main([str(tmp_path / "hat.gdf"), *paths, "-o", str(tmp_path / "new.gdf")])
+    a, b = load_ply(tmp_path / "a.ply"), load_ply(tmp_path / "b.ply")
+    there = compose_layers(b, [Layer(load_gdf(tmp_path / "new.gdf", b), 0.7)])
+    here = compose_layers(a, [Layer(hat, 0.7)])
+    rows = torch.cat([order, torch.arange(COUNT, COUNT + 25)])
+    assert bits(there) == bits(here[rows])
+
+
+def hostile_changes(draws: Draws, tensors: dict[str, torch.Tensor]) -> dict[str, object]:
+    """One thing that a wrong or hostile writer may have done."""
+    names = sorted(tensors)
+    name = names[int(draws.uniform(1) * len(names))]
+    tensor = tensors[name]
+    size = int(draws.uniform(1) * 60)
+    ways: list[dict[str, object]] = [
+        {name: None},
+        {name: tensor.double()},
+        {name: tensor[:size]},
+        {name: torch.cat([tensor, tensor])},
+        {name: tensor.reshape(-1)},
+        {
+            name: (tensor.float() + float("nan")).to(tensor.dtype)
+            if tensor.is_floating_point()
+            else tensor[:0]
+        },
+        {name: (tensor.float() * 1e30).to(tensor.dtype) if tensor.is_floating_point() else tensor[:0]},
+        {"added": size},
+        {"added": -1},
+        {"added": 10**12},
+        {"added": "25"},
+        {"added_origin": [0.0]},
+        {"added_origin": [1e400, 0.0, 0.0]},
+        {"members": size},
+        {"added.logit_opacities": torch.full((25,), 2.0)},
+        {"added.shN": torch.zeros(25, 2, 3)},
+    ]
+    return ways[int(draws.uniform(1) * len(ways))]
+
+
+@pytest.mark.parametrize("count", [200, pytest.param(2000, marks=pytest.mark.slow)])
+def test_hostile_files_are_one_line(scene: Gaussians, hat: Gdf, tmp_path: Path, count: int) -> None:
+    path = tmp_path / "hat.gdf"
+    save_gdf(path, hat)
+    content = path.read_bytes()
+    tensors, draws, refused = safetensors.torch.load(content), Draws(count), 0
+    for _ in range(count):
+        header, parts = header_of(content), dict(tensors)
+        for key, value in hostile_changes(draws, tensors).items():
+            target: dict[str, object] = header if key in header else parts  # type: ignore[assignment]
+            if value is None:
+                del target[key]
+            else:
+                target[key] = value
+        path.write_bytes(signed_gdf(header, parts))
+        line = ""
+        try:
+            composed = compose_layers(scene, [Layer(load_gdf(path, scene), 0.5)])
+            assert all(bool(torch.isfinite(getattr(composed, name)).all()) for name in ATTRIBUTES)
+        except ProgdfError as error:
+            line, refused = str(error), refused + 1
+        assert "\n" not in line
+    assert refused > count / 2
+
+
+def test_rows_that_would_show_at_zero_are_refused(scene: Gaussians, hat: Gdf) -> None:
+    assert hat.added is not None
+    shown = replace(hat.added, logit_opacities=torch.full((25,), -5.0))
+    with pytest.raises(ValueError, match="shows at strength 0"):
+        replace(hat, added=shown)
+
+
+def test_a_field_without_members_for_the_added_rows_is_refused(scene: Gaussians, hat: Gdf) -> None:
+    with pytest.raises(ValueError, match="25 rows are added"):
+        replace(hat, field=curved_field(40))
+    with pytest.raises(ValueError, match="25 rows are added"):
+        replace(hat, field=BakedField("separable", torch.tensor([0.0, 1.0]), {}, 14))
+
+
+def test_info_says_how_many_rows_an_edit_adds(hat: Gdf, tmp_path: Path) -> None:
+    save_gdf(tmp_path / "hat.gdf", hat)
+    assert read_gdf(tmp_path / "hat.gdf").members == 65
