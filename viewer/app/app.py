@@ -27,6 +27,7 @@ from .studio.deliver import DeliverActions
 from .studio.preview import PreviewActions
 from .studio.start import StartActions, UpActions
 from .studio.training import JobActions
+from .tidy import TidyActions
 
 SIZE = (1280, 800)
 SAY_AGAIN_S = 10.0
@@ -111,6 +112,7 @@ class App:
         self.up = UpActions(self, self.context)
         self.preview = PreviewActions(self, self.context, self.jobs.region_spec)
         self.strays = StrayActions(self)
+        self.tidy = TidyActions(self, memory)
         self.is_closed = False
         self._title = ""
         self._memory = memory
@@ -210,8 +212,8 @@ class App:
     @property
     def _parts(
         self,
-    ) -> tuple[JobActions | DeliverActions | StartActions | UpActions | StrayActions, ...]:
-        return self.jobs, self.deliver, self.start, self.up, self.strays
+    ) -> tuple[JobActions | DeliverActions | StartActions | UpActions | StrayActions | TidyActions, ...]:
+        return self.jobs, self.deliver, self.start, self.up, self.strays, self.tidy
 
     def _wait_times(self) -> tuple[float | None, ...]:
         """How long the next look at each part may take, seconds; None is for ever."""
@@ -279,7 +281,7 @@ class App:
         self.main_view.set_engine(engine, facts)
         self.main_view.restart(view, snapshots)
         self.main_view.pictures = exports.folder_of(document.path)
-        for part in (self.jobs, self.preview, self.up):
+        for part in (self.jobs, self.preview, self.up, self.tidy):
             part.leave_scene()
 
     def _keep_picture(self) -> None:

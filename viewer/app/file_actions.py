@@ -112,7 +112,7 @@ class EditActions:
     def __init__(self, app: Application) -> None:
         self._app = app
 
-    def add(self, path: Path, name: str = "", strength: float = 1.0) -> None:
+    def add(self, path: Path, name: str = "", strength: float = 1.0, deselect: bool = False) -> None:
         """An edit on top, see `add_layer`; a grade of another scene or of none goes on what is selected, and
         with nothing selected everywhere. `name`: the layer's, "" for the edit's
 
@@ -124,6 +124,8 @@ class EditActions:
         where, mask = ("selection", selected) if selected.any() else ("all", np.ones(len(scene), bool))
         gdf = self._load(path, from_mask(where, torch.from_numpy(mask)))
         gdf = replace(gdf, name=name or gdf.name)
+        if deselect:
+            before = replace(before, selection=selection.select_none(before.selection))
         view = add_layer(before, self._open(gdf, path), gdf.name, strength)
         self._apply(view, len(view.layers) - 1)
 

@@ -47,6 +47,7 @@ from viewer.ui.pointer import PointerContext
 
 from . import interface, mouse, select_tool
 from .canvas import Canvas
+from .gizmo import Gizmo
 from .mouse import MouseTool
 from .studio import pages
 from .studio.pages import Cover, UpStrip
@@ -127,6 +128,7 @@ class MainView:
         self.preview = PreviewState()  # of the picture of a new edit
         self.live: tuple[LayerState, ...] = ()  # what is being trained, on top of the stack
         self.report: Callable[[Exception], None] = self._report  # told of what a part of a frame raises
+        self.gizmo: Gizmo | None = None  # about what is being moved
         self.surfaces = Surfaces()
         self.ui = UiContext(scale)
         imgui.backends.opengl3_init("#version 330")
@@ -180,7 +182,7 @@ class MainView:
         """A new state and snapshots, with nothing to undo, nothing in the hand or over the picture."""
         self.work = workspace.new_workspace(view, snapshots)
         self._tool, self._taps = MouseTool(), Taps()
-        self.cover, self.up_strip, self.preview = None, None, PreviewState()
+        self.cover, self.up_strip, self.preview, self.gizmo = None, None, PreviewState(), None
         self.wake()
 
     def next_frame_delay(self) -> float | None:
@@ -353,10 +355,25 @@ class MainView:
                     self.work, self._pointer(), textures, self.preview, self.recent, reveal
                 )
             self._revealed = self.work.focus, several
-        if not off:  # else the right button has said all it was pressed for
+        held = self._tool.drag is None and self._move_gizmo()
+        if not off and not held:  # else the right button has said all it was pressed for
             tool, pointer, self._tool = self._tool, self._pointer(), MouseTool()  # put down if it raises
             with self._guard():
                 self._tool, self.work = mouse.handle_mouse(tool, self.work, pointer)
+
+    def _move_gizmo(self) -> bool:
+        """The handles follow the mouse; whether it is on them."""
+        if self.gizmo is None:
+            return False
+        pressed = [press.chord for press in self._keys.pressed]
+        self.gizmo, asked = self.gizmo.draw(self._pointer())
+        if "Escape" in pressed or "Enter" in pressed:
+            asked = "put_back" if "Escape" in pressed else "keep_placed"
+        if asked:
+            self.request(asked)
+        if self.gizmo.using:
+            self.wake()
+        return self.gizmo.takes_mouse
 
     def _takes_keys(self) -> bool:
         """Whether a question, a list, a menu or the form takes all keys, or Escape has just closed one."""

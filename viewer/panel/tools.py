@@ -61,6 +61,11 @@ _OPERATIONS = (
         ("Hide", "hide_selected", "Hide the selection"),
         ("Isolate", "isolate", "Hide everything else"),
     ),
+    (
+        ("Remove", "remove_selected", "A layer that lets the selection vanish along its slider"),
+        ("Move", "move_selected", "A layer that moves, turns and scales the selection along its slider"),
+        ("Copy", "duplicate_selected", "A layer with a copy of the selection, placed by hand"),
+    ),
 )
 COLUMN_PX = 82.0  # at 1×: where what a row chooses begins
 _DEPTHS = {False: "Front", True: "Through"}
@@ -93,13 +98,13 @@ def draw(state: ViewState, ui: UiContext, actions: list[str]) -> tuple[ViewState
     if count and imgui.is_item_hovered(imgui.HoveredFlags_.for_tooltip.value):
         pointed = ("selection", 0)
     imgui.begin_disabled(not count)
-    gap, columns = 4.0 * ui.scale, len(_OPERATIONS[0])
-    each = (imgui.get_content_region_avail().x - (columns - 1) * gap) / columns
+    gap, wide = 4.0 * ui.scale, imgui.get_content_region_avail().x
     imgui.push_style_var(imgui.StyleVar_.frame_padding, imgui.ImVec2(0.0, 4.0 * ui.scale))
     for row in _OPERATIONS:
         for i, (name, action, help_) in enumerate(row):
             if i:
                 imgui.same_line(0.0, gap)
+            each = (wide - (len(row) - 1) * gap) / len(row)
             if imgui.button(f"{name}##{action}", imgui.ImVec2(each, 0.0)):
                 actions.append(action)
             tip(help_, action)

@@ -144,10 +144,18 @@ TOPICS: dict[str, tuple[KeyBinding, ...]] = {
             listed="Shift+R J I",
         ),
         *_keys("front surface or all depths", "N select_through"),
-        *_keys("all; with Shift none", "Ctrl+A select_all", "Ctrl+Shift+A select_none"),
-        *_keys("invert, or the paint with the brush", "Ctrl+I invert"),
+        *_keys(
+            "all, with Shift none; invert (paint too)",
+            *("Ctrl+A select_all", "Ctrl+Shift+A select_none", "Ctrl+I invert"),
+            listed="Ctrl+A, I",
+        ),
         *_keys("shrink, grow", "Ctrl+[ select_shrink", "Ctrl+] select_grow", listed="Ctrl+[ ]", repeats=True),
         *_keys("hide; with Shift isolate", "Ctrl+H hide_selected", "Ctrl+Shift+H isolate"),
+        *_keys(
+            "remove, move, copy: as a layer",
+            *("Alt+Delete remove_selected", "Alt+M move_selected", "Alt+D duplicate_selected"),
+            listed="Alt+Del M D",
+        ),
     ),
     "Timeline": (
         *_keys("play or pause", "Space play"),

@@ -1,0 +1,126 @@
+"""What is done to the selection by hand: removed, moved, copied, each a layer with a slider."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from progdf.formats.ply import load_ply
+from tests.helpers.edits import bits
+from tests.helpers.null_app import null_app, press
+from tests.helpers.sessions import bear_files, opened_document
+from tests.helpers.ui_rig import bear, first_view
+from viewer.app.app import App
+from viewer.commands.render import export
+from viewer.files import session
+from viewer.files.session import WindowSession
+from viewer.state import selection
+
+pytestmark = pytest.mark.gl
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return bear_files(tmp_path)
+
+
+@pytest.fixture
+def app(folder: Path) -> Iterator[App]:
+    with null_app(opened_document(folder), first_view(bear(), 0.5, 0.5), folder) as app:
+        mask = np.zeros(app.main_view.facts.count, bool)
+        mask[bear().demo.members("scarf")] = True
+        view = app.main_view.work.view
+        app.main_view.change(replace(view, selection=selection.select(view.selection, mask)))
+        yield app
+
+
+def top(app: App) -> int:
+    return app.main_view.work.view.layers[-1].gdf
+
+
+def shown(app: App) -> torch.Tensor:
+    return app.engine.gaussians(app.main_view.work.view).opacities
+
+
+def test_what_is_removed_is_a_layer_that_undo_takes_back(app: App, folder: Path) -> None:
+    members, count = bear().demo.members("scarf"), len(bear().scene)
+    press(app, "Alt+Delete")
+    layer = app.main_view.work.view.layers[-1]
+    assert (layer.name, layer.strength) == ("removed", 1.0)
+    assert not app.main_view.work.view.selection.count
+    assert float(shown(app)[members].max()) < 1 / 255
+    press(app, "Ctrl+Z")
+    assert "removed" not in [layer.name for layer in app.main_view.work.view.layers]
+    assert len(shown(app)) == count
+    assert app.main_view.work.view.selection.count == len(members)
+
+
+def test_what_is_moved_follows_the_handles_and_is_kept_or_put_back(app: App) -> None:
+    press(app, "Alt+M")
+    gizmo = app.main_view.gizmo
+    assert gizmo is not None
+    matrix = np.eye(4)
+    matrix[:3, 3] = 0.5, 0.25, -0.125
+    app.main_view.gizmo = replace(gizmo, matrix=matrix)
+    app.main_view.request("place")
+    app.draw()
+    app.draw()
+    assert [layer.name for layer in app.main_view.live] == ["moved"]
+    press(app, "Escape")
+    assert app.main_view.gizmo is None
+    assert not app.main_view.live
+    press(app, "Alt+M")
+    app.main_view.gizmo = replace(gizmo, matrix=matrix)
+    press(app, "Enter")
+    members = bear().demo.members("scarf")
+    means = app.engine.gaussians(app.main_view.work.view).means[members] - bear().scene.means[members]
+    assert torch.allclose(means, torch.tensor(matrix[:3, 3]).float(), atol=1e-4)
+    press(app, "Ctrl+A", "Alt+M", "Enter")
+    assert app.main_view.work.view.layers[-1].name == "moved", (
+        "nothing was moved, so there is no second layer"
+    )
+
+
+def test_a_copy_has_rows_of_its_own_that_are_counted_selected_saved_and_exported(
+    app: App, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    members, scene = bear().demo.members("scarf"), bear().scene
+    press(app, "Alt+D", "Enter")
+    facts = app.main_view.facts
+    assert (facts.count, facts.added) == (len(scene) + len(members), len(members))
+    assert facts.rows[top(app)].added == len(members)
+    view = app.main_view.work.view
+    view = replace(view, selection=selection.hide(view.selection, np.ones(facts.count, bool)))
+    app.main_view.change(view)
+    app.draw()
+    path = folder / "work.session.json"
+    session.save(path, WindowSession(app.document, view))
+    again = session.open_session(path)
+    assert again.view.selection == view.selection
+    assert again.view.layers == view.layers
+    without = replace(view, layers=view.layers[:-1])
+    session.save(path, WindowSession(app.document, without))
+    kept = session.open_session(path)
+    assert len(kept.document.scene) == len(scene)
+    assert selection.unpack(kept.view.selection.hidden, len(scene)).all()
+    copy = app.document.gdf_paths[-1]
+    for strength, count in (("0", len(scene)), ("1", len(scene) + len(members))):
+        out = folder / f"out{strength}.ply"
+        words = [f"--set={app.document.edits[-1].name}={strength}", f"-o={out}"]
+        export([str(folder / "bear.ply"), str(copy), *words])
+        assert len(load_ply(out)) == count
+    assert bits(load_ply(folder / "out0.ply")) == bits(load_ply(folder / "bear.ply"))
+
+
+def test_without_a_selection_nothing_is_done_and_it_is_said(app: App) -> None:
+    press(app, "Ctrl+Shift+A", "Alt+Delete")
+    message = app.main_view.work.message
+    assert message is not None
+    assert message.error
+    assert "nothing of the scene is selected" in message.text
+    assert len(app.main_view.work.view.layers) == 2

@@ -1,0 +1,102 @@
+"""Handles in the picture by which a selection is moved, turned and scaled (ImGuizmo)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from imgui_bundle import imgui
+from imgui_bundle.imguizmo import im_guizmo
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from viewer.camera.view_camera import to_camera
+from viewer.ui.context import FIXED, PALETTE, UNFOCUSED
+from viewer.ui.pointer import PointerContext
+from viewer.ui.widgets import accent_button
+
+_OPERATION = im_guizmo.OPERATION
+_HANDLES = _OPERATION(_OPERATION.translate | _OPERATION.rotate | _OPERATION.scaleu)
+
+
+@dataclass(frozen=True)
+class Gizmo:
+    """Handles about what is being moved."""
+
+    does: Literal["transform", "duplicate"]
+    center: tuple[float, float, float]  # of what is moved, where the handles begin
+    # from where it was to where it is, about its center; the world's axes. [4,4]
+    matrix: NDArray[np.float64]
+    using: bool = False  # the mouse holds a handle
+
+    def draw(self, pointer: PointerContext) -> tuple[Gizmo, str]:
+        """The handles after this frame's mouse, and the request that this led to, "" for none."""
+        size = pointer.size
+        camera = to_camera(pointer.shown.camera, *size)
+        flip = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL looks against z
+        view = flip @ camera.viewmat.double().numpy()
+        place = np.eye(4)
+        place[:3, 3] = self.center
+        im_guizmo.begin_frame()
+        im_guizmo.set_drawlist(imgui.get_background_draw_list())
+        im_guizmo.set_rect(0.0, 0.0, pointer.area.width, pointer.area.height)
+        model = _columns(place @ self.matrix)
+        projection = _columns(_projection(pointer.shown.camera.fov_y, size[0] / size[1], pointer.engine.near))
+        im_guizmo.manipulate(_columns(view), projection, _HANDLES, im_guizmo.MODE.world, model)
+        moved = np.linalg.inv(place) @ np.array(model.values, np.float64).reshape(4, 4).T
+        using = bool(im_guizmo.is_using())
+        matrix = moved if using or self.using else self.matrix
+        asked = "place" if self.using and not using else _buttons(self, pointer)
+        return replace(self, matrix=matrix, using=using), asked
+
+    @property
+    def step(self) -> tuple[list[float], list[float], float]:
+        """The shift, the turn (axis times radians) and the growth of what is moved."""
+        linear = self.matrix[:3, :3]
+        grown = max(abs(float(np.linalg.det(linear))) ** (1 / 3), 1e-6)
+        turn = Rotation.from_matrix(linear / grown).as_rotvec()
+        return self.matrix[:3, 3].tolist(), turn.tolist(), grown
+
+    @property
+    def is_moved(self) -> bool:
+        """Whether anything is elsewhere than it was."""
+        return not np.allclose(self.matrix, np.eye(4), atol=1e-9)
+
+    @property
+    def takes_mouse(self) -> bool:
+        """Whether the mouse is on a handle, or holds one."""
+        return self.using or bool(im_guizmo.is_over())
+
+
+def _columns(matrix: NDArray[np.float64]) -> im_guizmo.Matrix16:
+    return im_guizmo.Matrix16(matrix.T.ravel().tolist())
+
+
+def _projection(fov_y: float, aspect: float, near: float) -> NDArray[np.float64]:
+    """OpenGL's, of a camera of so many degrees."""
+    tall, far = 1.0 / math.tan(math.radians(fov_y) / 2), 1e5 * near
+    projection = np.zeros((4, 4))
+    projection[0, 0], projection[1, 1] = tall / aspect, tall
+    projection[2, 2:] = (far + near) / (near - far), 2.0 * far * near / (near - far)
+    projection[3, 2] = -1.0
+    return projection
+
+
+def _buttons(gizmo: Gizmo, pointer: PointerContext) -> str:
+    """At the top of the picture: what can be done with what was moved."""
+    scale = pointer.ui.scale
+    at = imgui.ImVec2(pointer.area.width / 2, 14.0 * scale)
+    imgui.set_next_window_pos(at, 0, imgui.ImVec2(0.5, 0.0))
+    imgui.push_style_color(imgui.Col_.window_bg, imgui.ImVec4(*PALETTE.scrim))
+    imgui.begin("placing", None, FIXED | UNFOCUSED | imgui.WindowFlags_.always_auto_resize.value)
+    imgui.align_text_to_frame_padding()
+    imgui.text("Copy" if gizmo.does == "duplicate" else "Move")
+    imgui.same_line()
+    asked = "keep_placed" if accent_button("Keep", imgui.ImVec2(72.0 * scale, 0.0)) else ""
+    imgui.same_line()
+    asked = "put_back" if imgui.button("Cancel", imgui.ImVec2(72.0 * scale, 0.0)) else asked
+    imgui.end()
+    imgui.pop_style_color()
+    return asked

@@ -1,0 +1,125 @@
+"""What is done to a selection by hand: removed, moved, copied, each a layer with a slider."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+
+from progdf.errors import ProgdfError
+from progdf.gdf.file import save_gdf
+from progdf.io.atomic import make_folder
+from progdf.region import Region, from_mask
+from progdf.tidy import Step, similarity, tidy
+from viewer.jobs.training import edits_folder
+from viewer.state import selection
+from viewer.state.view_state import LayerState
+
+from .application import Application, failure_line
+from .file_actions import EditActions
+from .gizmo import Gizmo
+
+_NAMES = {"remove": "removed", "transform": "moved", "duplicate": "copy"}
+_INSTRUCTIONS = {"remove": "remove", "transform": "move", "duplicate": "copy"}
+_REQUESTS = {
+    "remove_selected": "remove",
+    "move_selected": "transform",
+    "duplicate_selected": "duplicate",
+}
+
+
+class TidyActions:
+    """Layers of what is done to the selection by hand.
+
+    Args:
+        app: the window
+        memory: folder of the program's state; the user's own if None
+    """
+
+    def __init__(self, app: Application, memory: Path | None = None) -> None:
+        self._app, self._memory = app, memory
+        self._edits = EditActions(app)
+        self._region: Region | None = None  # that is being moved
+
+    def handle(self, request: str) -> bool:
+        """Do what is asked for; False where it is nothing of ours."""
+        act = {
+            "place": self._place,
+            "keep_placed": self._keep,
+            "put_back": self._put_back,
+        }.get(request)
+        if request in _REQUESTS:
+            error = failure_line(lambda: self._begin(_REQUESTS[request]))
+        elif act is not None:
+            error = failure_line(act)
+        else:
+            return False
+        if error:
+            self._app.main_view.show_message(error, error=True)
+        return True
+
+    def leave_scene(self) -> None:
+        """Another scene is open."""
+        self._region, self._app.main_view.gizmo = None, None
+
+    def _begin(self, does: str) -> None:
+        main_view, scene = self._app.main_view, self._app.document.original
+        if self._app.document.path is None:
+            raise ProgdfError("the scene has no file yet; open one first")
+        mask = selection.unpack(main_view.work.view.selection.members, len(scene))
+        if not mask.any():
+            raise ProgdfError("nothing of the scene is selected; select it first")
+        region = from_mask("selection", torch.from_numpy(mask.copy()))
+        if does == "remove":
+            self._add(does, [Step("remove", region)])
+            return
+        center = scene.means[region.members].double().mean(dim=0)
+        kind: Literal["transform", "duplicate"] = "duplicate" if does == "duplicate" else "transform"
+        self._region = region
+        main_view.gizmo = Gizmo(kind, (float(center[0]), float(center[1]), float(center[2])), np.eye(4))
+        main_view.wake()
+
+    def _steps(self) -> list[Step]:
+        gizmo = self._app.main_view.gizmo
+        if gizmo is None or self._region is None:
+            return []
+        return [Step(gizmo.does, self._region, similarity(*gizmo.step))]
+
+    def _place(self) -> None:
+        """Show what is moved where the handles are."""
+        if steps := self._steps():
+            document = self._app.document
+            gdf = tidy(document.original, steps, _NAMES[steps[0].does])
+            live = (LayerState(len(document.edits), gdf.name, 1.0),)
+            self._app.show(document, (gdf,), live)
+
+    def _keep(self) -> None:
+        gizmo, steps = self._app.main_view.gizmo, self._steps()
+        if gizmo is not None and steps and (gizmo.does == "duplicate" or gizmo.is_moved):
+            self._add(steps[0].does, steps)
+        self._end()
+
+    def _put_back(self) -> None:
+        self._end()
+        self._app.show(self._app.document)
+
+    def _end(self) -> None:
+        self._region, self._app.main_view.gizmo = None, None
+        self._app.main_view.wake()
+
+    def _add(self, does: str, steps: Sequence[Step]) -> None:
+        """Write the edit, and have it as a layer on top."""
+        document = self._app.document
+        assert document.path is not None
+        folder = edits_folder(document.path, self._memory)
+        make_folder(folder)
+        name, number = document.free_name(_NAMES[does]), 2
+        path = folder / f"{name}.gdf"
+        while path.exists():
+            path, number = folder / f"{name}-{number}.gdf", number + 1
+        gdf = tidy(document.original, steps, name, _INSTRUCTIONS[does])
+        save_gdf(path, gdf)
+        self._edits.add(path, name, deselect=True)
