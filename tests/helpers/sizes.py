@@ -11,6 +11,7 @@ import sys
 import tokenize
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from statistics import median
 
@@ -57,6 +58,7 @@ def measure(path: Path, source: str) -> Module:
     return Module(path, source.count("\n"), len(used - texts - imports), len(imports), tree)
 
 
+@cache
 def modules(package: str) -> list[Module]:
     """All modules of a package that hold more than a line."""
     paths = sorted((ROOT / package).rglob("*.py"), key=lambda path: (path.parent.parts, path.name))
