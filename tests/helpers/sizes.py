@@ -28,6 +28,9 @@ _NO_CODE = (
     tokenize.ENDMARKER,
 )
 
+parse = cache(ast.parse)
+"""Each file is looked at by several tests."""
+
 
 @dataclass(frozen=True)
 class Module:
@@ -42,7 +45,7 @@ class Module:
 
 def measure(path: Path, source: str) -> Module:
     """The sizes of a file."""
-    tree = ast.parse(source)
+    tree = parse(source)
     texts: set[int] = set()
     imports: set[int] = set()
     for node in ast.walk(tree):
