@@ -57,6 +57,7 @@ SMALL = {"progdf.__main__", "progdf.formats.gaussforge_child", "progdf.io.colmap
 
 Graph = dict[str, set[str]]
 
+
 def source_files() -> list[Path]:
     """All Python files of the packages, relative to the repository."""
     return sorted(path.relative_to(ROOT) for name in PACKAGES for path in (ROOT / name).rglob("*.py"))
