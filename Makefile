@@ -61,7 +61,7 @@ test-all: setup extras window
 lint: setup extras
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	for system in linux win32 darwin; do $(BIN)/mypy --platform $$system --cache-dir .mypy_cache/$$system || exit 1; done
+	printf '%s\n' linux win32 darwin | xargs -P 3 -I % $(BIN)/mypy --platform % --cache-dir .mypy_cache/%
 
 bench: setup
 	$(BIN)/python -m benchmarks

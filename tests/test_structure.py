@@ -11,14 +11,13 @@ import sys
 import tomllib
 from collections import Counter
 from collections.abc import Mapping
-from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
 
-from tests.helpers.sizes import Module, calls, dotted, functions, importers, modules, with_tree
+from tests.helpers.sizes import Module, calls, dotted, functions, importers, modules, parse, with_tree
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("progdf", "trainer", "viewer", "benchmarks")
@@ -57,9 +56,6 @@ LEAST_LINES = 80  # of a module that one other imports alone; it is a section of
 SMALL = {"progdf.__main__", "progdf.formats.gaussforge_child", "progdf.io.colmap_child"}
 
 Graph = dict[str, set[str]]
-
-parse = cache(ast.parse)
-"""Each file is looked at by several tests."""
 
 
 def source_files() -> list[Path]:

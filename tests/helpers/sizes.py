@@ -11,6 +11,7 @@ import sys
 import tokenize
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from statistics import median
 
@@ -27,6 +28,9 @@ _NO_CODE = (
     tokenize.ENDMARKER,
 )
 
+parse = cache(ast.parse)
+"""Each file is looked at by several tests."""
+
 
 @dataclass(frozen=True)
 class Module:
@@ -41,7 +45,7 @@ class Module:
 
 def measure(path: Path, source: str) -> Module:
     """The sizes of a file."""
-    tree = ast.parse(source)
+    tree = parse(source)
     texts: set[int] = set()
     imports: set[int] = set()
     for node in ast.walk(tree):
@@ -57,6 +61,7 @@ def measure(path: Path, source: str) -> Module:
     return Module(path, source.count("\n"), len(used - texts - imports), len(imports), tree)
 
 
+@cache
 def modules(package: str) -> list[Module]:
     """All modules of a package that hold more than a line."""
     paths = sorted((ROOT / package).rglob("*.py"), key=lambda path: (path.parent.parts, path.name))

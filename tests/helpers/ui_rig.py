@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 from imgui_bundle import imgui
@@ -41,13 +42,21 @@ def first_view(stack: Stack, *strengths: float) -> ViewState:
     )
 
 
+_render = imgui.backends.opengl3_render_draw_data
+
+
 class Rig:
-    """A hand on the main view: each move, press and key is followed by one frame, as in the window."""
+    """A hand on the main view: each move, press and key is followed by one frame, as in the window.
+
+    What imgui draws over the picture is painted when somebody looks: a software GPU takes longer for it than
+    all else of a frame.
+    """
 
     def __init__(self, main_view: MainView, points: tuple[int, int], density: float) -> None:
         self.main_view, self.points = main_view, points
         self.pixels = (round(points[0] * density), round(points[1] * density))
         self.screen = main_view.context.simple_framebuffer(self.pixels)
+        self._unpainted: imgui.ImDrawData | None = None
         self.io = imgui.get_io()
         self.io.display_size = imgui.ImVec2(*points)
         self.io.display_framebuffer_scale = imgui.ImVec2(density, density)
@@ -128,8 +137,21 @@ class Rig:
         self.io.add_key_event(key, down)
         self.event()
 
+    def render(self, data: imgui.ImDrawData) -> None:
+        """In place of imgui's backend; what is written to a file is painted at once."""
+        self._unpainted = data
+        if self.main_view.work.requests:
+            self._paint()
+
+    def _paint(self) -> None:
+        if self._unpainted is not None:
+            self.screen.use()
+            _render(self._unpainted)
+            self._unpainted = None
+
     def image(self) -> NDArray[np.uint8]:
         """What is on screen. [H,W,3]"""
+        self._paint()
         return read_rgb(self.screen, self.pixels)
 
     def picture(self) -> NDArray[np.uint8]:
@@ -174,8 +196,10 @@ def rig(
     engine = ViewEngine(context, stack.scene, stack.gdfs, draw)
     facts = Document("bear.ply", stack.scene, stack.gdfs, gdf_paths=tuple(gdf_paths)).facts()
     main_view = MainView(context, engine, facts, view or first_view(stack, 0.5, 0.5), scale, pictures)
+    made = Rig(main_view, points, density)
     try:
-        yield Rig(main_view, points, density)
+        with patch.object(imgui.backends, "opengl3_render_draw_data", made.render):
+            yield made
     finally:
         main_view.close()
         engine.release()

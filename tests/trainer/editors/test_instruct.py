@@ -241,7 +241,7 @@ def text_run(folder: Path, model: str, out: str, **more: object) -> TrainOptions
         model=model,
         edit_steps=2,
         edit_size=64,
-        steps=40,
+        steps=32,
         stages=0,
         views=5,
         image_size=64,

@@ -22,8 +22,6 @@ from viewer.jobs.job_queue import LOOK_S, Delivery, Job, JobQueue
 from viewer.jobs.training import EditOrder, duration
 
 PATIENCE_S = 600.0
-EARS = "sphere:0,1.9,0,0.6"
-"""A small region, which trains in half of the time."""
 
 
 @pytest.fixture(autouse=True)
@@ -102,9 +100,12 @@ def wait(queue: JobQueue, until: str = "") -> list[Job]:
 
 
 def test_runs_train_in_turn_and_a_failure_is_one_line(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    arguments = EditOrder.arguments
+    smaller = ["--views=3", "--image-size=48", "--steps=8", "--stages=1"]  # than the window would have it
+    monkeypatch.setattr(EditOrder, "arguments", lambda *asked: arguments(*asked) + smaller)
     queue = JobQueue()
     queue.add(order(scene, "nowhere", "sphere:99,99,99,1"))
-    number = queue.add(order(scene, "blue", EARS))
+    number = queue.add(order(scene, "blue", "sphere:0,1.9,0,0.6"))
     queue.poll()
     assert [job.status for job in queue.jobs] == ["running", "queued"]
     shown, begun = Count(monkeypatch, JobQueue, "_change"), time.monotonic()
