@@ -40,6 +40,7 @@ from viewer.state.workspace import Dialog, focus_layer, with_camera
 
 from . import dialogs
 from .application import Application, error_details, failure_line, log_error
+from .decal import Decal, is_decal
 from .main_view import MainView
 
 PICTURES = (".png", ".jpg", ".jpeg", ".webp")
@@ -414,7 +415,12 @@ class FileActions:
         if self._app.main_view.at_start and kind in ("picture", "cameras", "timeline", "gdf"):
             raise ProgdfError(f"{path.name} belongs to a scene; open that first")
         if kind == "picture":
-            edit_picture(self._app.main_view, path)
+            main_view = self._app.main_view
+            if is_decal(path) and self._app.document.path is not None:
+                main_view.gizmo = Decal.take(main_view.context, path)
+                main_view.wake()
+            else:
+                edit_picture(main_view, path)
             return
         if kind == "cameras":
             look_through(self._app.main_view, path)

@@ -15,6 +15,7 @@ from pathlib import Path
 import moderngl
 from imgui_bundle import imgui
 
+from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from viewer.files import exports
 from viewer.gl.present import read_rgb
@@ -47,6 +48,7 @@ from viewer.ui.pointer import PointerContext
 
 from . import interface, mouse, select_tool
 from .canvas import Canvas
+from .decal import Decal
 from .gizmo import Gizmo
 from .mouse import MouseTool
 from .studio import pages
@@ -128,7 +130,7 @@ class MainView:
         self.preview = PreviewState()  # of the picture of a new edit
         self.live: tuple[LayerState, ...] = ()  # what is being trained, on top of the stack
         self.report: Callable[[Exception], None] = self._report  # told of what a part of a frame raises
-        self.gizmo: Gizmo | None = None  # about what is being moved
+        self.gizmo: Gizmo | Decal | None = None  # what is being moved, or laid on the scene
         self.surfaces = Surfaces()
         self.ui = UiContext(scale)
         imgui.backends.opengl3_init("#version 330")
@@ -362,18 +364,27 @@ class MainView:
                 self._tool, self.work = mouse.handle_mouse(tool, self.work, pointer)
 
     def _move_gizmo(self) -> bool:
-        """The handles follow the mouse; whether it is on them."""
+        """Handles, or a decal, follow the mouse; whether it is theirs."""
         if self.gizmo is None:
             return False
-        pressed = [press.chord for press in self._keys.pressed]
+        pressed, keep = [press.chord for press in self._keys.pressed], "lay_decal"
+        if isinstance(self.gizmo, Gizmo):
+            keep = "keep_placed"
         self.gizmo, asked = self.gizmo.draw(self._pointer())
         if "Escape" in pressed or "Enter" in pressed:
-            asked = "put_back" if "Escape" in pressed else "keep_placed"
+            asked = "put_back" if "Escape" in pressed else keep
         if asked:
             self.request(asked)
-        if self.gizmo.using:
+        if isinstance(self.gizmo, Gizmo) and self.gizmo.using:
             self.wake()
         return self.gizmo.takes_mouse
+
+    @property
+    def decal_place(self) -> tuple[Path, Camera, str] | None:
+        """The decal in the hand, from where it is laid on, and where in that picture."""
+        if not isinstance(self.gizmo, Decal):
+            return None
+        return self.gizmo.path, *self.gizmo.place(self._pointer())
 
     def _takes_keys(self) -> bool:
         """Whether a question, a list, a menu or the form takes all keys, or Escape has just closed one."""

@@ -84,7 +84,7 @@ class TidyActions:
 
     def _steps(self) -> list[Step]:
         gizmo = self._app.main_view.gizmo
-        if gizmo is None or self._region is None:
+        if not isinstance(gizmo, Gizmo) or self._region is None:
             return []
         return [Step(gizmo.does, self._region, similarity(*gizmo.step))]
 
@@ -98,13 +98,15 @@ class TidyActions:
 
     def _keep(self) -> None:
         gizmo, steps = self._app.main_view.gizmo, self._steps()
-        if gizmo is not None and steps and (gizmo.does == "duplicate" or gizmo.is_moved):
+        if isinstance(gizmo, Gizmo) and steps and (gizmo.does == "duplicate" or gizmo.is_moved):
             self._add(steps[0].does, steps)
         self._end()
 
     def _put_back(self) -> None:
+        moved = self._region is not None
         self._end()
-        self._app.show(self._app.document)
+        if moved:
+            self._app.show(self._app.document)
 
     def _end(self) -> None:
         self._region, self._app.main_view.gizmo = None, None

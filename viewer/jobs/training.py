@@ -225,12 +225,14 @@ class EditOrder:
     threads: int = 0  # CPU threads; 0 takes all
     model: str = ""  # of a sentence; "" takes what fits
     anchor: str = ""  # file of a painted picture that decides, "" for none
+    at: str = ""  # of a decal: where in the picture of the camera
+    camera: str = ""  # file of that one
 
     def arguments(self, resumes: bool = False) -> list[str]:
         """Words after `progdf`."""
         words = ["train", str(self.scene), f"--out={self.out}", f"--region={self.region}"]
         words += [f"--editor={self.editor}", f"--name={self.name}", f"--threads={self.threads}"]
-        given = {"model": self.model, "anchor": self.anchor}
+        given = {"model": self.model, "anchor": self.anchor, "at": self.at, "camera": self.camera}
         words += [f"--{name}={value}" for name, value in given.items() if value]
         return words + ["--quick"] * self.quick + ["--resume"] * resumes
 

@@ -47,7 +47,15 @@ REQUESTS = (
     *("export", "render_picture", "render_film", "deliver", "drop_and_quit"),
     *("about", "demo"),
     *("overwrite", "restore_autosave", "discard_autosave", "duplicate", "replace", "replace_by"),
-    *("remove_selected", "move_selected", "duplicate_selected", "place", "keep_placed", "put_back"),
+    *(
+        "remove_selected",
+        "move_selected",
+        "duplicate_selected",
+        "place",
+        "keep_placed",
+        "put_back",
+        "lay_decal",
+    ),
     *("save_region", "rename_region", "copy_values", "paste_values", "set_up", "keep_up", "hide_strays"),
 )
 """What only the window can do: `save_to:PATH`, `overwrite:PATH`, `open_file:PATH`; `save:THEN` asks for THEN

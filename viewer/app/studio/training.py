@@ -16,6 +16,7 @@ from PIL import Image
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.io.atomic import atomic_write, make_folder, read_file
+from progdf.io.cameras import save_cameras
 from progdf.io.picture_camera import camera_chunk
 from progdf.scene.regions import check_region
 from viewer.app.application import Application, failure_line
@@ -72,6 +73,8 @@ class JobActions:
                 self._train()
             case "paint_over":
                 self._try(self._paint_over)
+            case "lay_decal":
+                self._try(self._lay_decal)
             case "stop_run":
                 self.queue.stop(int(argument))
             case "resume_run":
@@ -154,6 +157,31 @@ class JobActions:
             name, path = free_name(view.selection, out.name), out.with_name(f"{out.name}{SUFFIX}")
             selection = replace(add_region(view.selection, name, path), members=NOBODY, count=0)
             main_view.change(replace(view, selection=selection))
+
+    def _lay_decal(self) -> None:
+        """The decal in the hand goes into the queue, as it lies in the picture."""
+        main_view, scene = self._app.main_view, self._app.document.path
+        placed, main_view.gizmo = main_view.decal_place, None
+        if placed is None or scene is None:
+            return
+        path, camera, at = placed
+        name = replace(NewEdit(), name=path.stem).layer_name
+        out = training.free_run(training.edits_folder(scene, self._memory), name)
+        make_folder(out.parent)
+        camera_file = out.with_name(f"{out.name}.camera.json")
+        save_cameras(camera_file, [camera], self._app.document.scene.origin)
+        order = EditOrder(
+            scene.resolve(),
+            out,
+            out.name,
+            region=ALL,
+            editor=f"decal:{path.resolve()}",
+            quick=False,
+            threads=training.spare_threads(),
+            at=at,
+            camera=str(camera_file),
+        )
+        self.queue.add(order)
 
     def _add_draft(self, order: EditOrder, draft: Path, strength: float = 1.0) -> None:
         """A grade becomes the layer that the training will make better.

@@ -1,0 +1,98 @@
+"""A picture with transparency in the hand: it follows the pointer over the scene until it is laid on."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import moderngl
+import numpy as np
+from imgui_bundle import imgui
+from PIL import Image
+
+from progdf.camera import Camera
+from progdf.io.images import open_picture
+from viewer.camera.view_camera import to_camera
+from viewer.ui import overlay
+from viewer.ui.pointer import PointerContext
+
+_LARGEST = 1024  # pixels of the longer side of what is shown of it
+_FIRST = 0.25  # of the picture's height, that its longer side takes at first
+_STEP, _TURN = 1.08, 5.0  # of a notch of the wheel: times the size, degrees
+_SIZES = (8.0, 8192.0)  # window pixels
+_HINT = "Wheel sizes, Shift+wheel turns; click or Enter lays it on, Esc puts it away"
+
+
+@dataclass(frozen=True)
+class Decal:
+    """The picture and how it lies in the window."""
+
+    path: Path
+    texture: moderngl.Texture
+    size: float = 0.0  # of its longer side, window pixels; 0 before the first frame
+    angle: float = 0.0  # degrees, counterclockwise
+    at: tuple[float, float] | None = None  # its center, window pixels; None before the first frame
+
+    @staticmethod
+    def take(context: moderngl.Context, path: Path) -> Decal:
+        """Take a picture into the hand.
+
+        Raises:
+            ProgdfError: it cannot be read.
+        """
+        picture = open_picture(path).convert("RGBA")
+        picture.thumbnail((_LARGEST, _LARGEST))
+        texture = context.texture(picture.size, 4, np.asarray(picture).tobytes(), alignment=1)
+        texture.filter = (moderngl.LINEAR, moderngl.LINEAR)
+        return Decal(path, texture)
+
+    def draw(self, pointer: PointerContext) -> tuple[Decal, str]:
+        """The picture after this frame's mouse, and the request that this led to, "" for none."""
+        io, area = imgui.get_io(), pointer.area
+        inside = 0.0 <= io.mouse_pos.x < area.width and 0.0 <= io.mouse_pos.y < area.height
+        over = inside and not io.want_capture_mouse
+        size, angle = self.size or _FIRST * area.height, self.angle
+        notches = (io.mouse_wheel or io.mouse_wheel_h) if over else 0.0  # with Shift some systems turn it
+        if notches and io.key_shift:
+            angle += math.copysign(_TURN, notches)
+        elif notches:
+            size = min(max(size * _STEP**notches, _SIZES[0]), _SIZES[1])
+        at = (io.mouse_pos.x, io.mouse_pos.y) if over else self.at or (area.width / 2, area.height / 2)
+        moved = replace(self, size=size, angle=angle, at=at)
+        a, b, c, d = (imgui.ImVec2(*corner) for corner in moved.corners)
+        imgui.get_background_draw_list().add_image_quad(imgui.ImTextureRef(self.texture.glo), a, b, c, d)
+        overlay.banner(_HINT, area, pointer.ui)
+        return moved, "lay_decal" if over and imgui.is_mouse_clicked(0) else ""
+
+    @property
+    def corners(self) -> list[tuple[float, float]]:
+        """Its corners in the window, clockwise from the upper left of the picture."""
+        scale, (x0, y0) = self.size / max(self.texture.size), self.at or (0.0, 0.0)
+        across, down = (scale * side / 2 for side in self.texture.size)
+        cosine, sine = math.cos(math.radians(self.angle)), math.sin(math.radians(self.angle))
+        return [
+            (x0 + x * cosine + y * sine, y0 - x * sine + y * cosine)
+            for x, y in ((-across, -down), (across, -down), (across, down), (-across, down))
+        ]
+
+    def place(self, pointer: PointerContext) -> tuple[Camera, str]:
+        """The camera from which it is laid on, and `progdf train --at`."""
+        camera = to_camera(pointer.shown.camera, *pointer.size)
+        density, (x, y) = camera.height / pointer.area.height, self.at or (0.0, 0.0)
+        numbers = (density * x, density * y, density * self.size, self.angle)
+        return camera, ",".join(f"{number:.2f}" for number in numbers)
+
+    @property
+    def takes_mouse(self) -> bool:
+        """Whether the mouse is its own: all but the buttons that move the camera."""
+        return not any(imgui.is_mouse_down(button) or imgui.is_mouse_released(button) for button in (1, 2))
+
+
+def is_decal(path: Path) -> bool:
+    """Whether a picture has anything transparent, and something that is not."""
+    with Image.open(path) as picture:
+        if "A" not in picture.getbands() and "transparency" not in picture.info:
+            return False
+        low, high = picture.convert("RGBA").getchannel("A").getextrema()
+    return bool(isinstance(low, int) and isinstance(high, int) and low < 255 and high > 0)
