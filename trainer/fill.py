@@ -122,7 +122,7 @@ def find_hole(rest: Gaussians, view: View, seen: Sequence[Front]) -> Hole:
     mask = unknown & (surface[..., 1] > 0.5)
     mask[mask.clone()] = _unseen(_unproject(camera, mask.nonzero(), inverse[mask]), seen, camera)
     # the soft edge of a surface is part of a hole, and by itself none
-    pieces, count = ndimage.label(mask.numpy(), np.ones((3, 3)))
+    pieces, _ = ndimage.label(mask.numpy(), np.ones((3, 3)))
     core = np.unique(pieces[(known[..., 1] < 0.5).numpy() & mask.numpy()])
     return Hole(camera, torch.from_numpy(np.isin(pieces, core[core > 0])), inverse, colors)
 
