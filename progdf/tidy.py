@@ -79,7 +79,13 @@ def duplicate(scene: Gaussians, region: Region, motion: Motion, name: str) -> Gd
     return tidy(scene, [Step("duplicate", region, motion)], name)
 
 
-def tidy(scene: Gaussians, steps: Sequence[Step], name: str, instruction: str = "") -> Gdf:
+def tidy(
+    scene: Gaussians,
+    steps: Sequence[Step],
+    name: str,
+    instruction: str = "",
+    added: Gaussians | None = None,
+) -> Gdf:
     """The steps as one edit with a slider: 0 the scene, 1 all of them done.
 
     Args:
@@ -87,6 +93,7 @@ def tidy(scene: Gaussians, steps: Sequence[Step], name: str, instruction: str = 
         steps: later ones move what earlier ones have moved; copies are of what the scene has
         name: of the layer
         instruction: as the .gdf repeats it
+        added: rows that appear beside the copies, as they are at 1
 
     Returns:
         An edit of all Gaussians that are removed or moved; copies are its added rows.
@@ -100,7 +107,7 @@ def tidy(scene: Gaussians, steps: Sequence[Step], name: str, instruction: str = 
             mask[step.region.members] = True
     region = from_mask(name, mask)
     members, bands = region.members, scene.sh_degree > 0 and any(_turns(step) for step in steps)
-    rows, added = pack(scene[members], with_shN=bands), _copies(scene, steps)
+    rows, added = pack(scene[members], with_shN=bands), _copies(scene, steps, added)
     start, end = rows[:, _OPACITY], _end_logits(scene, steps)[members]
     if added is not None:
         end = torch.cat([end, added.logit_opacities])
@@ -154,9 +161,9 @@ def _placed(scene: Gaussians, members: Tensor, steps: Sequence[Step], bands: boo
     return moved.to(rows.dtype)
 
 
-def _copies(scene: Gaussians, steps: Sequence[Step]) -> Gaussians | None:
-    """All copies, in order; None where there is none."""
-    parts = []
+def _copies(scene: Gaussians, steps: Sequence[Step], added: Gaussians | None = None) -> Gaussians | None:
+    """All copies, in order, after what is added; None where there is neither."""
+    parts = [] if added is None else [added]
     for step in steps:
         if step.does == "duplicate":
             part = scene[step.region.members]

@@ -34,7 +34,7 @@ _BLOCKS = (8, 4, 2, 1)  # pixels of a disc's side, where color allows
 _SAME = 2 / 255  # by which colors within a disc may differ
 _WIDTH, _THICKNESS, _LOGIT = 0.6, 0.1, 5.0  # of a side; of that; of the opacity
 _STEEPEST = 0.3  # least cosine by which a disc is lengthened
-_LEAST = 0.02  # of the largest hole's pixels: a view that has less is not filled
+_LEAST = 0.01  # of the region's pixels: a smaller hole in a view is the rim's own raggedness
 _MOST_VIEWS = 12
 _REACH = 4.0  # pixels
 
@@ -82,19 +82,22 @@ def fill_holes(
     given = pictures or {}
     seen = [(view.camera, _front(scene, view.camera)) for view in views]
     holes = [find_hole(rest, view, seen) for view in views]
-    before, filled, largest = sum(hole.pixels for hole in holes), rest, max(hole.pixels for hole in holes)
-    discs, tried = list[Gaussians](), set[int]()
-    while len(tried) < _MOST_VIEWS:
-        left = [i for i in range(len(views)) if i not in tried and holes[i].pixels > _LEAST * largest]
-        if not left:
-            break
+    before, filled, discs = sum(hole.pixels for hole in holes), rest, list[Gaussians]()
+    worth = [_LEAST * float((view.mask > _THERE).sum()) for view in views]
+    left = {i for i, hole in enumerate(holes) if hole.pixels > worth[i]}
+    while left and len(discs) < _MOST_VIEWS:
         # a given picture's own view goes first: there its colors are known
         best = max(left, key=lambda i: (views[i].camera.name in given, holes[i].pixels, -i))
-        tried.add(best)
-        discs.append(place_discs(holes[best], rest, given.get(views[best].camera.name, holes[best].colors)))
-        filled = concatenate([filled, discs[-1]])
-        pairs = zip(views, holes, strict=True)
-        holes = [find_hole(filled, view, seen) if old.pixels else old for view, old in pairs]
+        rows = place_discs(holes[best], rest, given.get(views[best].camera.name, holes[best].colors))
+        trial, pairs = concatenate([filled, rows]), zip(views, holes, strict=True)
+        closed = [find_hole(trial, view, seen) if old.pixels else old for view, old in pairs]
+        gain = sum(hole.pixels for hole in holes) - sum(hole.pixels for hole in closed)
+        left.discard(best)
+        # discs that stand elsewhere than the surface open as much in other views as they close
+        if 2 * gain > holes[best].pixels:
+            discs.append(rows)
+            filled, holes = trial, closed
+            left = {i for i in left if holes[i].pixels > worth[i]}
     after = sum(hole.pixels for hole in holes)
     return Fill(concatenate(discs) if discs else None, len(discs), before, after)
 
@@ -231,8 +234,7 @@ def _split(mask: Tensor, colors: Tensor) -> Tensor:
 def _front(scene: Gaussians, camera: Camera) -> Tensor:
     with torch.no_grad():
         drawn = render_depth(scene, camera)
-    far: Tensor = torch.where(drawn.alpha > 0.5, drawn.depth, torch.inf)
-    return far
+    return torch.where(drawn.alpha > 0.5, drawn.depth, torch.full_like(drawn.depth, torch.inf))
 
 
 def _unproject(camera: Camera, pixels: Tensor, inverse_depth: Tensor) -> Tensor:
