@@ -180,9 +180,10 @@ def _without(setup: TrainingSetup) -> Gaussians:
 
 def _painted_views(options: TrainOptions, setup: TrainingSetup) -> tuple[list[View], Mapping[str, Tensor]]:
     """Views of the pictures that show what was behind, and these by name, as the views would be. [H,W,3]"""
-    paths = options.views.pictures or picture_paths(options.editor.editor.partition(":")[2] or "")
-    if not paths:
+    what = options.editor.editor.partition(":")[2]
+    if not what:
         return [], {}
+    paths = options.views.pictures or picture_paths(what)
     if not options.views.pictures:
         setup = make_training_setup(replace(options.views, pictures=paths), setup.scene, setup.region)
     pairs = list(zip(setup.train, paths, strict=True))
