@@ -4,7 +4,7 @@ A pixel is one of a hole where the thing was, nothing opaque lies behind it, and
 alpha, inverse depth and color, weighted by alpha, are continued from the rim as a membrane (∇² = 0, which a
 plane's inverse depth fulfills), and alpha comes out above a half. So a hole that reaches a silhouette is
 closed along its continuation, and what stood before an empty background leaves nothing. No point of a hole
-may lie where some view saw, or saw through, before the removal.
+may lie where some view saw something else, or nothing, before the removal.
 
 The largest hole of any view becomes discs, then the largest of those that remain, until they are small.
 """
@@ -39,8 +39,9 @@ _MOST_VIEWS = 12
 _REACH = 4.0  # pixels
 
 
-Front = tuple[Camera, Tensor]
-"""A camera, and how far it sees: camera z, infinite where nothing stands. [H,W]"""
+Front = tuple[Camera, Tensor, Tensor]
+"""A camera; how far it sees: camera z, infinite where nothing stands. [H,W]; and where it sees the region. [H,W]
+bool"""
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,7 @@ def fill_holes(
         pictures: by name of the view, pictures whose colors are taken in place of the rim's. [H,W,3]
     """
     given = pictures or {}
-    seen = [(view.camera, _front(scene, view.camera)) for view in views]
+    seen = [(view.camera, _front(scene, view.camera), view.mask > 0.5) for view in views]
     holes = [find_hole(rest, view, seen) for view in views]
     before, filled, discs = sum(hole.pixels for hole in holes), rest, list[Gaussians]()
     worth = [_LEAST * float((view.mask > _THERE).sum()) for view in views]
@@ -247,18 +248,18 @@ def _unproject(camera: Camera, pixels: Tensor, inverse_depth: Tensor) -> Tensor:
 
 
 def _unseen(points: Tensor, seen: Sequence[Front], own: Camera) -> Tensor:
-    """Which points no view saw, nor through: something stood before each, or it was the surface. [P] bool
+    """Which points no view saw, nor through: the region, or something nearer, stood before each. [P] bool
 
     `own`: the camera whose pixels they are; the size of these is how far a point may be off a surface.
     """
     unseen = torch.ones(len(points), dtype=torch.bool)
     reach = _REACH * (points - own.position.double()).norm(dim=1) / float(own.K[0, 0])
-    for camera, front in seen:
+    for camera, front, region in seen:
         placed = points @ camera.viewmat[:3, :3].double().T + camera.viewmat[:3, 3].double()
         x, y, w = (placed @ camera.K.double().T).unbind(1)
         column, row = (x / w).floor(), (y / w).floor()
         framed = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
         index = (framed & (w > camera.near)).nonzero()[:, 0]
-        far = front[row[index].long(), column[index].long()]
-        unseen[index[far > w[index] + reach[index]]] = False
+        at = row[index].long(), column[index].long()
+        unseen[index[front[at] > w[index] + torch.where(region[at], reach[index], -reach[index])]] = False
     return unseen
