@@ -1,9 +1,8 @@
 """What a removed thing hid and nobody saw is a hole: it is closed from its rim, by discs on the surface.
 
-A pixel is one of a hole where the thing was, nothing opaque lies behind it, and the rim around is opaque:
-alpha, inverse depth and color, weighted by alpha, are continued from the rim as a membrane (∇² = 0, which a
-plane's inverse depth fulfills), and alpha comes out above a half. So a hole that reaches a silhouette is
-closed along its continuation, and what stood before an empty background leaves nothing. No point of a hole
+A hole in a view is one piece of pixels where the thing was and nothing opaque lies behind, with a rim that
+is opaque: what stood before an empty background leaves none. Alpha, inverse depth and color, weighted by alpha,
+are continued from the rim as a membrane (∇² = 0, which a plane's inverse depth fulfills). No point of a hole
 may lie where some view saw something else, or nothing, before the removal.
 
 The largest hole of any view becomes discs, then the largest of those that remain, until they are small.
@@ -28,7 +27,7 @@ from progdf.rasterize.engines import render_depth
 from progdf.sh import rgb_to_sh0
 from trainer.views.view import View, render_colors, seen_colors
 
-_OPAQUE = 0.9  # alpha from which a rim is taken as it is
+_OPAQUE = 0.9  # alpha from which a rim is taken as it is, and share of a rim that must be so
 _THERE = 0.05  # of the region's weight: its soft edge is part of what it hid
 _BLOCKS = (8, 4, 2, 1)  # pixels of a disc's side, where color allows
 _SAME = 2 / 255  # by which colors within a disc may differ
@@ -40,8 +39,7 @@ _REACH = 4.0  # pixels
 
 
 Front = tuple[Camera, Tensor, Tensor]
-"""A camera; how far it sees: camera z, infinite where nothing stands. [H,W]; and where it sees the region. [H,W]
-bool"""
+"""A camera; how far it sees: camera z, infinite where nothing stands [H,W]; and where that is the region [H,W]."""
 
 
 @dataclass(frozen=True)
@@ -120,15 +118,27 @@ def find_hole(rest: Gaussians, view: View, seen: Sequence[Front]) -> Hole:
     unknown = (view.mask > _THERE) & (known[..., 1] < _OPAQUE)
     if not bool(unknown.any()):
         return Hole(camera, unknown, known[..., 0], known[..., 2:])
-    surface = membrane(known, unknown)
+    mask = _enclosed(unknown, known[..., 1])
+    surface = membrane(known, mask)
     alpha = surface[..., 1].clamp_min(1e-6)[..., None]
     inverse, colors = (surface / alpha)[..., 0], (surface / alpha)[..., 2:].clamp(0.0, 1.0)
-    mask = unknown & (surface[..., 1] > 0.5)
     mask[mask.clone()] = _unseen(_unproject(camera, mask.nonzero(), inverse[mask]), seen, camera)
-    # the soft edge of a surface is part of a hole, and by itself none
-    pieces, _ = ndimage.label(mask.numpy(), np.ones((3, 3)))
-    core = np.unique(pieces[(known[..., 1] < 0.5).numpy() & mask.numpy()])
-    return Hole(camera, torch.from_numpy(np.isin(pieces, core[core > 0])), inverse, colors)
+    return Hole(camera, mask, inverse, colors)
+
+
+def _enclosed(unknown: Tensor, alpha: Tensor) -> Tensor:
+    """The pieces of unknown pixels that are open somewhere, and opaque all around. [H,W] bool"""
+    pieces, count = ndimage.label(unknown.numpy(), np.ones((3, 3)))
+    opaque = (alpha >= _OPAQUE).numpy()
+    closed = np.zeros(count + 1, bool)
+    for number, box in enumerate(ndimage.find_objects(pieces), 1):
+        around = tuple(slice(max(0, side.start - 1), side.stop + 1) for side in box)
+        piece = pieces[around] == number
+        rim = ndimage.binary_dilation(piece, np.ones((3, 3))) & ~piece
+        # the soft edge of a surface is part of a hole, and by itself none
+        is_open = bool((alpha[around].numpy()[piece] < 0.5).any())
+        closed[number] = is_open and bool(rim.any()) and opaque[around][rim].mean() > _OPAQUE
+    return torch.from_numpy(closed[pieces])
 
 
 def membrane(values: Tensor, unknown: Tensor) -> Tensor:
