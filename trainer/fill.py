@@ -1,9 +1,9 @@
 """What a removed thing hid and nobody saw is a hole: it is closed from its rim, by discs on the surface.
 
 A hole in a view is one piece of pixels where the thing was and nothing opaque lies behind, with a rim that
-is opaque: what stood before an empty background leaves none. Alpha, inverse depth and color, weighted by alpha,
-are continued from the rim as a membrane (∇² = 0, which a plane's inverse depth fulfills). No point of a hole
-may lie where some view saw something else, or nothing, before the removal.
+is opaque: what stood before an empty background leaves none. Alpha, inverse depth and color, weighted by
+alpha, are continued from the rim as a membrane (∇² = 0, which a plane's inverse depth fulfills). No point of
+a hole may lie where some view saw something else, or nothing, before the removal.
 
 The largest hole of any view becomes discs, then the largest of those that remain, until they are small.
 """
@@ -31,7 +31,7 @@ _OPAQUE = 0.9  # alpha from which a rim is taken as it is, and share of a rim th
 _THERE = 0.05  # of the region's weight: its soft edge is part of what it hid
 _BLOCKS = (8, 4, 2, 1)  # pixels of a disc's side, where color allows
 _SAME = 2 / 255  # by which colors within a disc may differ
-_WIDTH, _THICKNESS, _LOGIT = 0.6, 0.1, 5.0  # of a side; of that; of the opacity
+_WIDTH, _THICKNESS, _LOGIT = 0.7, 0.1, 5.0  # of a side; of that; of the opacity
 _STEEPEST = 0.3  # least cosine by which a disc is lengthened
 _LEAST = 0.01  # of the region's pixels: a smaller hole in a view is the rim's own raggedness
 _MOST_VIEWS = 12
@@ -39,7 +39,7 @@ _REACH = 4.0  # pixels
 
 
 Front = tuple[Camera, Tensor, Tensor]
-"""A camera; how far it sees: camera z, infinite where nothing stands [H,W]; and where that is the region [H,W]."""
+"""A camera; how far it sees, camera z, infinite where nothing stands; where that is the region. [H,W] each"""
 
 
 @dataclass(frozen=True)
@@ -245,7 +245,7 @@ def _split(mask: Tensor, colors: Tensor) -> Tensor:
 def _front(scene: Gaussians, camera: Camera) -> Tensor:
     with torch.no_grad():
         drawn = render_depth(scene, camera)
-    return torch.where(drawn.alpha > 0.5, drawn.depth, torch.full_like(drawn.depth, torch.inf))
+    return drawn.depth.masked_fill(drawn.alpha <= 0.5, torch.inf)
 
 
 def _unproject(camera: Camera, pixels: Tensor, inverse_depth: Tensor) -> Tensor:
@@ -254,7 +254,8 @@ def _unproject(camera: Camera, pixels: Tensor, inverse_depth: Tensor) -> Tensor:
     place = torch.stack([columns + 0.5, rows + 0.5, torch.ones_like(rows)], dim=1)
     sight = place @ torch.linalg.inv(camera.K.double()).T
     points = sight / inverse_depth.double().clamp_min(1e-12)[:, None]
-    return (points - camera.viewmat[:3, 3].double()) @ camera.viewmat[:3, :3].double()
+    world: Tensor = (points - camera.viewmat[:3, 3].double()) @ camera.viewmat[:3, :3].double()
+    return world
 
 
 def _unseen(points: Tensor, seen: Sequence[Front], own: Camera) -> Tensor:
