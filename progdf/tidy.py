@@ -121,7 +121,7 @@ def tidy(
         knots = torch.cat([knots, opacity_knots]).unique()  # type: ignore[no-untyped-call]
     offsets = rows.new_zeros(len(knots), len(end), rows.shape[1])
     for i, s in enumerate(knots.tolist()):
-        offsets[i, : len(members)] = _placed(scene, members, steps, bands, s) - rows if s else 0.0
+        offsets[i, : len(members)] = _rows_at(scene, members, steps, bands, s) - rows if s else 0.0
         offsets[i, :, _OPACITY] = interpolate_at(opacity_knots, logits, s)
     field = course_field(knots, offsets)
     return Gdf(name, region, field, fingerprint(scene), instruction, added=added)
@@ -131,7 +131,7 @@ def bake(scene: Gaussians, steps: Sequence[Step]) -> Gaussians:
     """The scene with the steps done for good: what is removed has no rows, copies come last."""
     everything = torch.arange(len(scene))
     bands = scene.sh_degree > 0 and any(_turns(step) for step in steps)
-    rows = _placed(scene, everything, steps, bands, 1.0)
+    rows = _rows_at(scene, everything, steps, bands, 1.0)
     mask = torch.ones(len(scene), dtype=torch.bool)
     for step in steps:
         if step.does == "remove":
@@ -150,7 +150,7 @@ def _reach(motion: Motion) -> float:
     return max(float(motion.turn.norm()), float(motion.log_scale.abs()))
 
 
-def _placed(scene: Gaussians, members: Tensor, steps: Sequence[Step], bands: bool, share: float) -> Tensor:
+def _rows_at(scene: Gaussians, members: Tensor, steps: Sequence[Step], bands: bool, share: float) -> Tensor:
     """Raw rows of members, sorted, where the steps have moved them; what none moves keeps its bits. [M,C]"""
     rows = pack(scene[members], with_shN=bands)
     moved = rows.double()

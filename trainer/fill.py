@@ -118,7 +118,7 @@ def find_hole(rest: Gaussians, view: View, seen: Sequence[Front]) -> Hole:
     unknown = (view.mask > _THERE) & (known[..., 1] < _OPAQUE)
     if not bool(unknown.any()):
         return Hole(camera, unknown, known[..., 0], known[..., 2:])
-    mask = _enclosed(unknown, known[..., 1])
+    mask = _find_pieces(unknown, known[..., 1])
     surface = membrane(known, mask)
     alpha = surface[..., 1].clamp_min(1e-6)[..., None]
     inverse, colors = (surface / alpha)[..., 0], (surface / alpha)[..., 2:].clamp(0.0, 1.0)
@@ -126,7 +126,7 @@ def find_hole(rest: Gaussians, view: View, seen: Sequence[Front]) -> Hole:
     return Hole(camera, mask, inverse, colors)
 
 
-def _enclosed(unknown: Tensor, alpha: Tensor) -> Tensor:
+def _find_pieces(unknown: Tensor, alpha: Tensor) -> Tensor:
     """The pieces of unknown pixels that are open somewhere, and opaque all around. [H,W] bool"""
     pieces, count = ndimage.label(unknown.numpy(), np.ones((3, 3)))
     opaque = (alpha >= _OPAQUE).numpy()
