@@ -118,6 +118,16 @@ def test_a_hole_that_nobody_saw_is_closed_as_the_surface_around_it() -> None:
         assert decibels(float((pictures[1] - pictures[0])[~hole].square().mean())) > 40.0
 
 
+@pytest.mark.parametrize(("depth", "behind_region", "is_hole"), [("inf", False, False), ("1", True, True)])
+def test_where_a_view_saw_through_there_is_no_hole(depth: str, behind_region: bool, is_hole: bool) -> None:
+    _, rest, setup = case()
+    view, other = setup.train[0], setup.train[1].camera
+    front = torch.full((other.height, other.width), float(depth))
+    assert find_hole(rest, view, []).pixels > 0
+    seen = [(other, front, torch.full(front.shape, behind_region))]
+    assert (find_hole(rest, view, seen).pixels > 0) == is_hole
+
+
 @pytest.mark.parametrize("fine", [False, True])
 def test_flat_parts_of_a_hole_take_few_rows(fine: bool) -> None:
     camera = case()[2].train[0].camera.resize(128, 128)
