@@ -79,7 +79,13 @@ def duplicate(scene: Gaussians, region: Region, motion: Motion, name: str) -> Gd
     return tidy(scene, [Step("duplicate", region, motion)], name)
 
 
-def tidy(scene: Gaussians, steps: Sequence[Step], name: str, instruction: str = "") -> Gdf:
+def tidy(
+    scene: Gaussians,
+    steps: Sequence[Step],
+    name: str,
+    instruction: str = "",
+    added: Gaussians | None = None,
+) -> Gdf:
     """The steps as one edit with a slider: 0 the scene, 1 all of them done.
 
     Args:
@@ -87,6 +93,7 @@ def tidy(scene: Gaussians, steps: Sequence[Step], name: str, instruction: str = 
         steps: later ones move what earlier ones have moved; copies are of what the scene has
         name: of the layer
         instruction: as the .gdf repeats it
+        added: rows that appear beside the copies, as they are at 1
 
     Returns:
         An edit of all Gaussians that are removed or moved; copies are its added rows.
@@ -100,7 +107,7 @@ def tidy(scene: Gaussians, steps: Sequence[Step], name: str, instruction: str = 
             mask[step.region.members] = True
     region = from_mask(name, mask)
     members, bands = region.members, scene.sh_degree > 0 and any(_turns(step) for step in steps)
-    rows, added = pack(scene[members], with_shN=bands), _copies(scene, steps)
+    rows, added = pack(scene[members], with_shN=bands), _copies(scene, steps, added)
     start, end = rows[:, _OPACITY], _end_logits(scene, steps)[members]
     if added is not None:
         end = torch.cat([end, added.logit_opacities])
@@ -114,7 +121,7 @@ def tidy(scene: Gaussians, steps: Sequence[Step], name: str, instruction: str = 
         knots = torch.cat([knots, opacity_knots]).unique()  # type: ignore[no-untyped-call]
     offsets = rows.new_zeros(len(knots), len(end), rows.shape[1])
     for i, s in enumerate(knots.tolist()):
-        offsets[i, : len(members)] = _placed(scene, members, steps, bands, s) - rows if s else 0.0
+        offsets[i, : len(members)] = _rows_at(scene, members, steps, bands, s) - rows if s else 0.0
         offsets[i, :, _OPACITY] = interpolate_at(opacity_knots, logits, s)
     field = course_field(knots, offsets)
     return Gdf(name, region, field, fingerprint(scene), instruction, added=added)
@@ -124,7 +131,7 @@ def bake(scene: Gaussians, steps: Sequence[Step]) -> Gaussians:
     """The scene with the steps done for good: what is removed has no rows, copies come last."""
     everything = torch.arange(len(scene))
     bands = scene.sh_degree > 0 and any(_turns(step) for step in steps)
-    rows = _placed(scene, everything, steps, bands, 1.0)
+    rows = _rows_at(scene, everything, steps, bands, 1.0)
     mask = torch.ones(len(scene), dtype=torch.bool)
     for step in steps:
         if step.does == "remove":
@@ -143,7 +150,7 @@ def _reach(motion: Motion) -> float:
     return max(float(motion.turn.norm()), float(motion.log_scale.abs()))
 
 
-def _placed(scene: Gaussians, members: Tensor, steps: Sequence[Step], bands: bool, share: float) -> Tensor:
+def _rows_at(scene: Gaussians, members: Tensor, steps: Sequence[Step], bands: bool, share: float) -> Tensor:
     """Raw rows of members, sorted, where the steps have moved them; what none moves keeps its bits. [M,C]"""
     rows = pack(scene[members], with_shN=bands)
     moved = rows.double()
@@ -154,9 +161,9 @@ def _placed(scene: Gaussians, members: Tensor, steps: Sequence[Step], bands: boo
     return moved.to(rows.dtype)
 
 
-def _copies(scene: Gaussians, steps: Sequence[Step]) -> Gaussians | None:
-    """All copies, in order; None where there is none."""
-    parts = []
+def _copies(scene: Gaussians, steps: Sequence[Step], added: Gaussians | None = None) -> Gaussians | None:
+    """All copies, in order, after what is added; None where there is neither."""
+    parts = [] if added is None else [added]
     for step in steps:
         if step.does == "duplicate":
             part = scene[step.region.members]

@@ -33,6 +33,8 @@ LiftRule = Literal["share", "paper"]
 Bands = Literal["auto", "on", "off"]
 Preset = Literal["default", "paper"]
 Quantize = Literal["off", "nf4"]
+Fill = Literal["none", "picture", "surface"]
+Removal = Literal["auto", "never", "always"]
 Device = Literal["auto", "cpu"]
 Engine = Literal["auto", "cpu", "warp"]
 
@@ -88,7 +90,8 @@ class EditorOptions:
     editor: str
     """recolor:#rrggbb, tint:#rrggbb, stripes:#rrggbb, darken:AMOUNT, night, folder:DIR (edited views),
     photographs:EDITED,ORIGINALS (of what the cameras took), pictures:A.png[,B.png] (rendered, then changed in
-    any program), style:N (a painting, N from 0 to 25), instruct:"turn him into Batman"."""
+    any program), style:N (a painting, N from 0 to 25), instruct:"turn him into Batman", remove (the region is
+    taken away; remove:A.png: as one of pictures: shows what was behind)."""
     model: Annotated[str, absent_option("STR", "what is here and fits")] = ""
     """instruct: id or folder of a diffusers pipeline; by default black-forest-labs/FLUX.2-klein-4B where it
     was downloaded and fits the graphics card, else timbrooks/instruct-pix2pix (the paper's)."""
@@ -109,6 +112,13 @@ class EditorOptions:
     device: Device = "auto"
     """instruct: auto is the graphics card that torch has, else the CPU for what is small; cpu is the CPU for
     anything, which takes hours a picture with a large model."""
+    fill: Annotated[Fill | None, absent_option("{none,picture,surface}", "by the editor")] = None
+    """remove, and pictures: that take something away: how holes are closed that it hid and no view shows:
+    not at all, as the picture shows them, or with the colors around (surface). By default picture where there
+    is one, else surface."""
+    removal: Removal = "auto"
+    """pictures: whether the region is taken away instead of recolored. auto: where most of what was painted
+    is what the scene shows without it."""
     seed: Fixed[int] = 0  # of the noise, the same in every view
     cache: Fixed[Path | None] = None  # folder in which painted pictures are kept; None keeps nothing
 

@@ -195,8 +195,17 @@ def _check_editor_options(editor: EditorOptions, optimize: OptimizeOptions) -> N
             f"--kind {optimize.kind} does not apply to pictures: few views do not tell how deep a part lies; "
             "give more as folder:DIR, of views that --cameras has"
         )
+    if editor.editor == "remove" and editor.fill == "picture":
+        raise ProgdfError("--fill picture needs a picture of what was behind; write --editor remove:A.png")
+    if editor.family == "pictures" and editor.removal == "never" and editor.fill is not None:
+        raise ProgdfError("--fill closes holes of a removal; leave out --removal never, or --fill")
     of_instruct = ("model", "guidance", "edit_steps", "anchor", "quantize", "device")
-    for names, kinds in ((of_instruct, ("instruct",)), (("edit_size",), ("style", "instruct"))):
+    for names, kinds in (
+        (of_instruct, ("instruct",)),
+        (("edit_size",), ("style", "instruct")),
+        (("fill",), ("remove", "pictures")),
+        (("removal",), ("pictures",)),
+    ):
         for name in names:
             if getattr(editor, name) != getattr(EditorOptions, name) and editor.family not in kinds:
                 option = "--" + name.replace("_", "-")

@@ -63,7 +63,7 @@ def _append_rows(scene: Gaussians, added: tuple[Gaussians, ...]) -> Gaussians:
     origin, shape = torch.tensor(scene.origin, dtype=torch.float64), scene.shN.shape[1:]
     for rows in added:
         means = rows.means if rows.origin == scene.origin else (rows.world_means - origin)
-        bands = fit_bands(rows.shN.flatten(1), shape.numel()).reshape(-1, *shape)
+        bands = fit_bands(rows.shN.flatten(1), shape.numel()).reshape(len(rows), *shape)
         own = replace(rows, means=means.float(), shN=bands)
         for name, parts in columns.items():
             parts.append(getattr(own, name).to(parts[0]))

@@ -152,8 +152,9 @@ def test_a_turn_goes_along_an_arc_even_all_the_way_round() -> None:
     assert torch.allclose(half[:, 0], -(means - center)[:, 0], atol=0.01)
 
 
-def test_a_copy_in_place_is_the_region_twice() -> None:
-    scene = scene_of()
+@pytest.mark.parametrize("degree", [0, 2])
+def test_a_copy_in_place_is_the_region_twice(degree: int) -> None:
+    scene = scene_of(degree)
     region = left_half(scene)
     gdf = duplicate(scene, region, similarity(), "twice")
     end = at(scene, gdf, 1.0)

@@ -14,7 +14,7 @@ from trainer.views.view import View
 from .base import ImageEditor, Painter
 from .instruct import check_instruct, instruct
 from .pictures import folder, folder_of, photograph_folders, photographs, picture_paths, pictures
-from .procedural import darken, night, paint_of, recolor, stops_of, stripes, tint
+from .procedural import darken, night, paint_of, recolor, remove, stops_of, stripes, tint
 from .style import check_style, style
 
 Factory = Callable[[str, Gaussians, Region, Sequence[View], EditorOptions], ImageEditor]
@@ -30,6 +30,7 @@ EDITORS: dict[str, Factory] = {
     "pictures": pictures,
     "style": style,
     "instruct": instruct,
+    "remove": remove,
 }
 """Kind of editor → its factory, given the text after the colon, the scene, the region, the views
 and all options of editors."""
@@ -59,6 +60,7 @@ EXAMPLES = (
     "photographs:EDITED,ORIGINALS",
     "pictures:A.png,B.png",
     "style:14",
+    "remove",
 )
 
 
@@ -72,6 +74,7 @@ CHECKS: dict[str, Callable[[str], object]] = {
     "photographs": photograph_folders,
     "pictures": picture_paths,
     "style": check_style,
+    "remove": lambda what: picture_paths(what) if what else (),
 }
 """Kind of editor → the check of the text after the colon, by itself."""
 

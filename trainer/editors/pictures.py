@@ -85,7 +85,7 @@ def pictures(
                 path = strengths[1.0].parent / f"{strength:g}" / strengths[1.0].name
                 raise ProgdfError(f"{path} is missing; every picture needs one of each strength")
     given = {
-        view.camera.name: {0.0: view.image} | {s: _read_edit(scene, view, path) for s, path in some.items()}
+        view.camera.name: {0.0: view.image} | {s: read_edit(scene, view, path) for s, path in some.items()}
         for view, some in zip(views, found, strict=True)
     }
     bends, ways = {}, list(pairwise((0.0, *stages)))
@@ -98,7 +98,7 @@ def pictures(
     return PicturesEditor(given, bends, tuple(sorted({*between, *stages})) if len(stages) > 1 else ())
 
 
-def _read_edit(scene: Gaussians, view: View, path: Path) -> Tensor:
+def read_edit(scene: Gaussians, view: View, path: Path) -> Tensor:
     """The view as a picture has changed it; ProgdfError where that is broken. [H,W,3]
 
     What was changed is taken at the picture's own size, then shrunk: a picture that is shrunk differs

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
@@ -20,7 +20,7 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.region import Region
 from trainer.options import EditKind, EditorOptions
-from trainer.views.view import View, render_colors, seen_colors
+from trainer.views.view import BACKGROUND, View, render_colors, render_view, seen_colors
 
 from .base import ImageEditor
 
@@ -86,6 +86,27 @@ class StripesEditor:
         return view.blend((premultiplied / view.mask.clamp_min(1e-4)[..., None]).clamp(0.0, 1.0))
 
 
+@dataclass(frozen=True)
+class RemoveEditor:
+    """Opacity of the region falls to nothing, and what is behind appears; holes are not closed."""
+
+    scene: Gaussians  # the original
+    members: Tensor  # rows of the region. [M] int64
+    background: Tensor  # rgb. [3]
+    kind: EditKind = "geometry"
+    stages: tuple[float, ...] = ()
+    is_confined: bool = True
+
+    def edit(self, view: View, strength: float) -> Tensor:
+        """See `ImageEditor.edit`."""
+        if strength == 0.0:
+            return view.image
+        opacities = self.scene.opacities
+        opacities[self.members] *= 1.0 - strength
+        faded = replace(self.scene, logit_opacities=opacities.logit())
+        return render_view(faded, view.camera, self.background).clamp(0.0, 1.0)
+
+
 def edit_course(editor: ImageEditor, view: View) -> Callable[[float], Tensor]:
     """`editor.edit` of one view at many strengths."""
     return editor.course(view) if isinstance(editor, ColorEditor) else partial(editor.edit, view)
@@ -132,6 +153,13 @@ def stripes(
     axis, period, phase = stripe_frame(points)
     pattern = color.stripe_pattern(points, axis, period, phase)
     return StripesEditor(scene, region.members, pattern, target, region_color(views), path)
+
+
+def remove(
+    what: str, scene: Gaussians, region: Region, views: Sequence[View], options: EditorOptions
+) -> RemoveEditor:
+    """`remove` or `remove:A.png`: the region is taken away."""
+    return RemoveEditor(scene, region.members, torch.tensor(BACKGROUND))
 
 
 def stripe_frame(points: Tensor) -> tuple[Tensor, float, float]:

@@ -355,7 +355,8 @@ class PaintTaken:
         reasons = []
         if self.removes:
             reasons.append(
-                "the painting covers things with what lies behind them: nothing is removed by painting"
+                "the painting covers things with what lies behind them: nothing is removed by painting "
+                "(--removal always takes it away)"
             )
         if shows and self.members < self.pixels:
             stand = f"{format_count(self.members)} stand for {group_digits(self.pixels)} painted pixels"

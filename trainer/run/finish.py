@@ -45,7 +45,7 @@ _REPORT_ALONE = (
     *("plan", "time", "memory_mb", "memory_by_stage_mb", "curves", "views", "pictures"),
     *("losses", "trajectory", "effort", "choice"),
 )
-_DEFAULTS = plain(TrainOptions(Path(), Path(), RegionOptions(""), EditorOptions("")))
+DEFAULTS = plain(TrainOptions(Path(), Path(), RegionOptions(""), EditorOptions("")))
 
 _LPIPS_OVER = (
     "each view's box around all that shows the region or that the editor changes, at least 64 pixels"
@@ -59,7 +59,8 @@ class RunResult:
     folder: RunFolder
     gdf: Path
     report: Mapping[str, Any]  # what report.json holds
-    trajectory: Trajectory  # what was recorded, at the slider values where the field shows it
+    # what was recorded, at the slider values where the field shows it; None of what is not trained
+    trajectory: Trajectory | None
 
 
 def finish_run(
@@ -112,7 +113,7 @@ def finish_run(
             judges = replace(evaluator, looked=looked), replace(reporting, looked=looked)
             measured = measure(judges, trajectory, fitted, field, remap, perceptual, clip)
         plan = plain(options)
-        given = _differences(plan, _DEFAULTS)
+        given = differences(plan, DEFAULTS)
         gdf = Gdf(options.name, region, field, fingerprint(scene), options.editor.editor, given)
         endpoint, outside = exactness(scene, gdf, end_rows(setup, trajectory))
         title = f"{options.name}: {options.editor.editor}"
@@ -201,10 +202,10 @@ def _record_figures(record: RunRecord) -> dict[str, Any]:
     return {**{name: getattr(record, name) for name in names}, "pictures": dict(record.pictures)}
 
 
-def _differences(values: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:
+def differences(values: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:
     """The values that are none of the defaults."""
     return {
-        name: _differences(value, defaults[name]) if isinstance(value, dict) else value
+        name: differences(value, defaults[name]) if isinstance(value, dict) else value
         for name, value in values.items()
         if value != defaults[name]
     }
@@ -304,13 +305,16 @@ def load_result(folder: RunFolder, name: str, scene: Gaussians, log: RunLog) -> 
     """The result of a run that is finished."""
     path = folder.gdf(name)
     gdf = load_gdf(path, scene)
-    trajectory, _, _ = load_trajectory(folder.trajectory)
+    trajectory = None
+    if folder.trajectory.is_file():
+        recorded, _, _ = load_trajectory(folder.trajectory)
+        trajectory = replace(recorded, s=torch.tensor(gdf.field.recorded))
     log.say(f"{folder.root} is finished: there is nothing left to do, and {path} is complete")
     try:
         report = convert_json(decode_json(folder.report.read_bytes()), dict[str, Any])
     except ValueError as error:
         raise ProgdfError(f"{folder.report} is damaged ({error}); train again without --resume") from error
-    return RunResult(folder, path, report, replace(trajectory, s=torch.tensor(gdf.field.recorded)))
+    return RunResult(folder, path, report, trajectory)
 
 
 def refit(options: FitOptions, quiet: bool = False) -> RunResult:

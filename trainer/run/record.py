@@ -127,7 +127,10 @@ def reopen_run(root: Path, scene: Path | None = None) -> FinishedRun:
     """
     folder = RunFolder(root)
     if not folder.trajectory.is_file():
-        raise ProgdfError(f"{root} holds no trajectory.safetensors; give a folder that progdf train finished")
+        raise ProgdfError(
+            f"{root} holds no trajectory.safetensors; give a folder that progdf train finished, "
+            "and of an edit that was trained: a removal has none"
+        )
     trajectory, extra, about = load_trajectory(folder.trajectory)
     try:
         record = read_record(about)

@@ -76,6 +76,7 @@ from .agree import AgreedEditor, Easel, agree_views
 from .finish import RunResult, end_rows, finish_run, load_evaluator, load_result
 from .kinds import Approach, choose_approach
 from .record import RunRecord, read_record
+from .removal import is_removal, remove_region
 from .resume import check_exists, decide_resume, explain_stop, load_region, picture_digests
 from .threads import use_threads
 from .training import optimize_members, retime_trajectory
@@ -223,6 +224,8 @@ def _run_training(
     log.say(f"{len(scene)} Gaussians, {len(region)} in the region; {_describe_views(setup)}")
     for note in setup.notes:
         log.say(note)
+    if is_removal(options, setup, log):
+        return remove_region(options, setup, folder, log)
     editor = cache(partial(_make_editor, options, setup, folder, log))
     with log.stage("edit"):
         edited, approach, trial, between = _edit_views(options, setup, editor, folder, log)

@@ -1,0 +1,253 @@
+"""A run that removes: `progdf train --editor remove`, and changed pictures that show what is behind."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from progdf.compose.reference import Layer, compose_layers
+from progdf.errors import ProgdfError
+from progdf.formats.ply import load_ply, save_ply
+from progdf.gaussians import Gaussians, concatenate
+from progdf.gdf.file import load_gdf
+from progdf.io.images import to_picture
+from progdf.io.picture_camera import camera_chunk
+from progdf.metrics.image import decibels
+from progdf.quaternions import matrix_quats
+from progdf.rasterize import render
+from progdf.region import Region, from_mask
+from progdf.sh import rgb_to_sh0
+from trainer.evaluate.command import evaluate
+from trainer.fill import Hole, fill_holes, find_hole, membrane, place_discs
+from trainer.options import (
+    EditorOptions,
+    EvaluateOptions,
+    RegionOptions,
+    TrainOptions,
+    ViewOptions,
+    with_values,
+)
+from trainer.run.removal import on_backgrounds
+from trainer.run.run import train
+from trainer.setup import TrainingSetup, make_training_setup
+from trainer.views.view import render_view
+
+WHITE = torch.ones(3)
+TABLE = "box:-9,-0.005,-9,9,9,9"
+POST = f"all-{TABLE}"
+
+
+def splats(means: Tensor, normals: Tensor, size: float, rgb: Tensor) -> Gaussians:
+    """Opaque discs on a surface."""
+    axis = torch.nn.functional.normalize(
+        torch.linalg.cross(normals, torch.eye(3)[normals.abs().argmin(1)]), dim=1
+    )
+    frames = torch.stack([axis, torch.linalg.cross(normals, axis), normals], dim=2)
+    scales = torch.log(torch.tensor([size, size, size / 10])).repeat(len(means), 1)
+    return Gaussians(
+        means, matrix_quats(frames), scales, torch.full((len(means),), 4.0), rgb_to_sh0(rgb),
+        torch.zeros(len(means), 0, 3),
+    )  # fmt: skip
+
+
+@cache
+def table(hole: float) -> Gaussians:
+    """A plane with a gradient of color, and a round hole of this radius in its middle."""
+    line = torch.linspace(-1.2, 1.2, 60)
+    x, z = torch.meshgrid(line, line, indexing="ij")
+    means = torch.stack([x.flatten(), torch.zeros(x.numel()), z.flatten()], dim=1)
+    rgb = torch.stack(
+        [0.5 + 0.2 * means[:, 0], 0.4 + 0.1 * means[:, 2], torch.full((len(means),), 0.3)], dim=1
+    )
+    up = torch.tensor([0.0, -1.0, 0.0]).repeat(len(means), 1)
+    return splats(means, up, 0.03, rgb)[means.norm(dim=1) > hole]
+
+
+@cache
+def post() -> Gaussians:
+    """A cylinder that stands on the table, a little wider than the hole."""
+    at = torch.arange(2500)
+    angle, height = at * math.pi * (3 - math.sqrt(5)), -0.01 - 0.8 * at / len(at)
+    out = torch.stack([angle.cos(), torch.zeros(len(at)), angle.sin()], dim=1)
+    red, yellow = (torch.tensor([[0.9, g, 0.1]]).repeat(len(at), 1) for g in (0.2, 0.5))
+    side = splats(torch.stack([0.34 * out[:, 0], height, 0.34 * out[:, 2]], dim=1), out, 0.03, red)
+    near = out * (0.34 * ((at + 0.5) / len(at)).sqrt())[:, None] - torch.tensor([0.0, 0.81, 0.0])
+    up = torch.tensor([0.0, -1.0, 0.0]).repeat(len(at), 1)
+    return concatenate([side, splats(near, up, 0.03, yellow)])
+
+
+@cache
+def case(hole: float = 0.27) -> tuple[Gaussians, Gaussians, TrainingSetup]:
+    """The post on the table, the table alone, and views of them."""
+    scene = concatenate([table(hole), post()])
+    region = from_mask("post", torch.arange(len(scene)) >= len(table(hole)))
+    return scene, table(hole), make_training_setup(ViewOptions(views=12, image_size=96), scene, region)
+
+
+def test_a_membrane_continues_a_plane_and_ends_evenly_at_the_edge() -> None:
+    y, x = torch.meshgrid(torch.arange(20.0), torch.arange(30.0), indexing="ij")
+    plane = torch.stack([0.3 * x - 0.1 * y, torch.ones_like(x)], dim=2)
+    hole = (x - 14).square() + (y - 9).square() < 36
+    assert torch.allclose(membrane(torch.where(hole[..., None], 0.0, plane), hole), plane, atol=1e-4)
+    edge = x > 25
+    assert torch.allclose(
+        membrane(torch.where(edge[..., None], 0.0, plane), edge)[..., 1], plane[..., 1], atol=1e-4
+    )
+
+
+def test_a_hole_that_nobody_saw_is_closed_as_the_surface_around_it() -> None:
+    scene, rest, setup = case()
+    fill = fill_holes(scene, rest, setup.train)
+    assert fill.rows is not None
+    assert fill.after < 0.05 * fill.before
+    done, whole = concatenate([rest, fill.rows]), table(-1.0)
+    for view in setup.held_out:
+        hole = find_hole(rest, view, []).mask
+        pictures = [render_view(some, view.camera, WHITE).clamp(0, 1) for some in (rest, done, whole)]
+        before, after = (decibels(float((one - pictures[2])[hole].square().mean())) for one in pictures[:2])
+        assert before < 15.0
+        assert after > 33.0  # 35 at the least when written
+        # nothing of what was seen is covered
+        assert decibels(float((pictures[1] - pictures[0])[~hole].square().mean())) > 40.0
+
+
+@pytest.mark.parametrize(("depth", "behind_region", "is_hole"), [("inf", False, False), ("1", True, True)])
+def test_where_a_view_saw_through_there_is_no_hole(depth: str, behind_region: bool, is_hole: bool) -> None:
+    _, rest, setup = case()
+    view, other = setup.train[0], setup.train[1].camera
+    front = torch.full((other.height, other.width), float(depth))
+    assert find_hole(rest, view, []).pixels > 0
+    seen = [(other, front, torch.full(front.shape, behind_region))]
+    assert (find_hole(rest, view, seen).pixels > 0) == is_hole
+
+
+@pytest.mark.parametrize("fine", [False, True])
+def test_flat_parts_of_a_hole_take_few_rows(fine: bool) -> None:
+    camera = case()[2].train[0].camera.resize(128, 128)
+    mask = torch.zeros(128, 128, dtype=torch.bool)
+    mask[10:110, 10:110] = True
+    colors = fine * torch.rand(128, 128, 3, generator=torch.Generator().manual_seed(1))
+    rows = place_discs(Hole(camera, mask, torch.full((128, 128), 0.5), colors), case()[1], colors)
+    drawn = render(rows, camera, (1.0, 1.0, 1.0))
+    assert float(drawn.transmittance[mask].mean()) < 0.02
+    assert len(rows) == 10_000 if fine else len(rows) < 1000
+
+
+def test_a_thing_before_an_empty_background_leaves_nothing_to_fill() -> None:
+    scene, rest, _ = case()
+    region = from_mask("table", torch.arange(len(scene)) < len(rest))
+    setup = make_training_setup(ViewOptions(views=12, image_size=96), scene, region)
+    assert fill_holes(scene, post(), setup.train).rows is None
+    solid, whole, around = case(-1.0)
+    assert fill_holes(solid, whole, around.train).rows is None  # no hole
+
+
+@pytest.fixture(scope="module")
+def scene_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("removal") / "scene.ply"
+    save_ply(path, case()[0])
+    return path
+
+
+def options_of(scene: Path, out: Path, editor: str = "remove", **more: object) -> TrainOptions:
+    options = TrainOptions(scene, out, RegionOptions(POST), EditorOptions(editor))
+    return with_values(options, threads=1, views=12, image_size=96, **more)
+
+
+def members_of(scene: Gaussians) -> Region:
+    return from_mask("post", torch.arange(len(scene)) >= len(case()[1]))
+
+
+def test_a_removal_is_a_run_like_any_other(scene_file: Path, tmp_path: Path) -> None:
+    out = tmp_path / "gone"
+    result = train(options_of(scene_file, out), quiet=True)
+    scene = load_ply(scene_file)
+    gdf = load_gdf(result.gdf, scene)
+    report = json.loads((out / "report.json").read_text())
+    assert gdf.added is not None
+    assert report["removal"]["rows_added"] == len(gdf.added)
+    assert report["removal"]["opacity_off_linear"] < 0.02
+    assert min(report["edit"]["psnr_by_background"].values()) > 50.0
+    assert (out / "report.png").is_file()
+    assert "shadows and reflections stay" in (out / "log.txt").read_text()
+    again = train(replace(options_of(scene_file, out), resume=True), quiet=True)
+    assert again.gdf == result.gdf
+    with pytest.raises(ProgdfError, match="a removal has none"):
+        evaluate(EvaluateOptions(out))
+
+
+def test_without_a_fill_the_rows_are_gone_and_nothing_is_added(scene_file: Path, tmp_path: Path) -> None:
+    result = train(options_of(scene_file, tmp_path / "gone", fill="none"), quiet=True)
+    scene = load_ply(scene_file)
+    gdf = load_gdf(result.gdf, scene)
+    assert gdf.added is None
+    removed = compose_layers(scene, [Layer(gdf, 1.0)])
+    for view in case()[2].held_out:
+        pairs = zip(on_backgrounds(removed, view.camera), on_backgrounds(case()[1], view.camera), strict=True)
+        assert all(float((a - b).abs().max()) < 1e-5 for a, b in pairs)  # an ulp, see test_tidy.py
+
+
+def paint(path: Path, image: Tensor, setup: TrainingSetup) -> Path:
+    to_picture(image).save(path, pnginfo=camera_chunk(setup.train[0].camera))
+    return path
+
+
+@pytest.mark.parametrize("removal", ["auto", "never"])
+def test_a_picture_of_what_is_behind_is_a_removal(scene_file: Path, tmp_path: Path, removal: str) -> None:
+    _, rest, setup = case()
+    picture = paint(tmp_path / "A.png", render_view(rest, setup.train[0].camera, WHITE).clamp(0, 1), setup)
+    out = tmp_path / "run"
+    options = options_of(scene_file, out, f"pictures:{picture}", removal=removal, steps=40, stages=1)
+    result = train(options, quiet=True)
+    gdf = load_gdf(result.gdf, load_ply(scene_file))
+    assert ("logit_opacities" in gdf.field.attributes) == (removal == "auto")
+    assert ("it is taken away" in (out / "log.txt").read_text()) == (removal == "auto")
+
+
+def test_a_picture_in_another_color_is_no_removal(scene_file: Path, tmp_path: Path) -> None:
+    view = case()[2].train[0]
+    blue = view.blend(torch.tensor([0.2, 0.3, 0.9]).expand_as(view.image))
+    picture = paint(tmp_path / "A.png", blue, case()[2])
+    result = train(
+        options_of(scene_file, tmp_path / "run", f"pictures:{picture}", steps=40, stages=1), quiet=True
+    )
+    assert "logit_opacities" not in load_gdf(result.gdf, load_ply(scene_file)).field.attributes
+
+
+def test_a_painted_picture_gives_the_hole_its_colors(scene_file: Path, tmp_path: Path) -> None:
+    _, rest, setup = case()
+    view = setup.train[0]
+    hole = find_hole(rest, view, []).mask
+    green = torch.tensor([0.1, 0.8, 0.2])
+    drawn = render_view(rest, view.camera, WHITE).clamp(0, 1)
+    picture = paint(tmp_path / "A.png", torch.where(hole[..., None], green, drawn), setup)
+    result = train(options_of(scene_file, tmp_path / "run", f"remove:{picture}"), quiet=True)
+    scene = load_ply(scene_file)
+    made = compose_layers(scene, [Layer(load_gdf(result.gdf, scene), 1.0)])
+    shown = render_view(made, view.camera, WHITE).clamp(0, 1)[hole]
+    assert float((shown.median(dim=0).values - green).abs().max()) < 0.03
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({"fill": "picture"}, "--fill picture needs a picture"),
+        ({"removal": "always"}, "--removal does not apply to remove"),
+        ({"editor": "recolor:#3060d0", "fill": "surface"}, "--fill does not apply to recolor"),
+        ({"editor": "remove:nowhere.png"}, "does not exist"),
+    ],
+)
+def test_options_that_make_no_sense_are_one_line(
+    scene_file: Path, tmp_path: Path, values: dict[str, str], said: str
+) -> None:
+    with pytest.raises(ProgdfError, match=said) as caught:
+        train(with_values(options_of(scene_file, tmp_path / "run"), **values), quiet=True)
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "run").exists()
