@@ -42,18 +42,18 @@ class Document:
     gdf_paths: tuple[Path, ...] = ()  # the edits' files, one for each where there are any
 
     @cached_property
-    def _extended(self) -> tuple[Gaussians, tuple[Gdf, ...]]:
+    def _extension(self) -> tuple[Gaussians, tuple[Gdf, ...]]:
         return extend(self.original, self.edits)
 
     @property
     def scene(self) -> Gaussians:
         """The original with the rows that edits add, as it is drawn with every slider at 0."""
-        return self._extended[0]
+        return self._extension[0]
 
     @property
     def gdfs(self) -> tuple[Gdf, ...]:
         """The edits of that scene."""
-        return self._extended[1]
+        return self._extension[1]
 
     @cached_property
     def detected_up(self) -> SceneUp:
