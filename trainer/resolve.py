@@ -196,7 +196,12 @@ def _check_editor_options(editor: EditorOptions, optimize: OptimizeOptions) -> N
             "give more as folder:DIR, of views that --cameras has"
         )
     of_instruct = ("model", "guidance", "edit_steps", "anchor", "quantize", "device")
-    for names, kinds in ((of_instruct, ("instruct",)), (("edit_size",), ("style", "instruct"))):
+    of_decal = ("at", "camera")
+    for names, kinds in (
+        (of_instruct, ("instruct",)),
+        (("edit_size",), ("style", "instruct")),
+        (of_decal, ("decal",)),
+    ):
         for name in names:
             if getattr(editor, name) != getattr(EditorOptions, name) and editor.family not in kinds:
                 option = "--" + name.replace("_", "-")

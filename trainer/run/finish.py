@@ -59,7 +59,8 @@ class RunResult:
     folder: RunFolder
     gdf: Path
     report: Mapping[str, Any]  # what report.json holds
-    trajectory: Trajectory  # what was recorded, at the slider values where the field shows it
+    # what was recorded, at the slider values where the field shows it; None: nothing was, it was written down
+    trajectory: Trajectory | None
 
 
 def finish_run(
