@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -122,6 +123,12 @@ class Gaussians:
             new = packed[:, channels].reshape(-1, *old.shape[1:])
             changed[name] = old.index_copy(0, rows, new.to(old.dtype))
         return replace(self, **changed)
+
+
+def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
+    """The rows of all parts in order; origin and antialiasing are the first one's, bands must be alike."""
+    joined: dict[str, Any] = {name: torch.cat([getattr(part, name) for part in parts]) for name in ATTRIBUTES}
+    return replace(parts[0], **joined)
 
 
 def attribute_slices(channels: int) -> dict[str, slice]:

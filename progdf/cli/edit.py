@@ -1,49 +1,90 @@
-"""`progdf edit SCENE … -o OUT.ply`: a scene with its Gaussians changed for good, as a new file."""
+"""`progdf edit SCENE … -o OUT.ply`: a scene tidied for good, as a new file; or as an edit with a slider."""
 
 from __future__ import annotations
 
+import math
 import shlex
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+import torch
 import tyro
+from tyro.conf import UseAppendAction
 
 from progdf.errors import ProgdfError
 from progdf.formats.ply import save_ply_checked
 from progdf.formats.scene_file import load_scene, scene_name
 from progdf.gaussians import Gaussians
+from progdf.gdf.file import save_gdf
 from progdf.io.atomic import check_not_an_input
 from progdf.metrics.image import NO_DIFFERENCE
+from progdf.scene.regions import check_region, parse_region, read_numbers, shorten
 from progdf.scene.strays import clean, find_strays, picture_difference
+from progdf.similarity import Motion
 from progdf.terminal import format_count, group_digits, print_line
+from progdf.tidy import Deed, Step, bake, similarity, tidy
 
 from .options import absent_option, parse_options
+
+Specs = Annotated[tuple[str, ...], UseAppendAction]
+
+MOST_DEGREES, MOST_SCALE = 360.0, 1000.0
 
 
 @dataclass(frozen=True)
 class EditOptions:
-    """Write a scene again without what should not be in it. The scene itself is never changed."""
+    """Write a scene again without what should not be in it, or with parts of it moved, turned, scaled or
+    copied; or write that as an edit with a slider. The scene itself is never changed.
+
+    REGION is written as for progdf train, without what takes pictures; numbers follow its last colon. All
+    regions are of the scene as it is in the file. Whatever the order typed, it is cleaned last, and of what
+    lies in several regions scaled first, then turned, then moved.
+    """
 
     scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
     """a .ply, .spz, .splat, .ksplat or .sog."""
-    out: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT.ply")]
-    """the .ply file to write."""
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT.ply|NAME.gdf")]
+    """the .ply file to write; or a .gdf of the scene, whose slider goes from nothing to all of it."""
     clean: Annotated[bool, tyro.conf.FlagCreatePairsOff, absent_option(None)] = False
-    """leave out floaters, needles, giants and what is too transparent to be drawn."""
+    """leave out floaters, needles, giants and what is too transparent to be drawn; of a .ply alone."""
+    delete: Annotated[Specs, absent_option("REGION")] = ()
+    """take away what is in the region; holes, shadows and reflections stay."""
+    scale: Annotated[Specs, absent_option("REGION:FACTOR")] = ()
+    """scale the region about the mean of its centers, .001 to 1000 times."""
+    rotate: Annotated[Specs, absent_option("REGION:AXIS,DEGREES")] = ()
+    """turn the region about the mean of its centers; AXIS is x, y, z or three numbers, and the thumb of a
+    right hand points along it; −360 to 360 degrees."""
+    move: Annotated[Specs, absent_option("REGION:DX,DY,DZ")] = ()
+    """shift the region, world units."""
+    duplicate: Annotated[Specs, absent_option("REGION:DX,DY,DZ")] = ()
+    """add a copy of the region, shifted, world units."""
 
 
 def main(argv: Sequence[str]) -> int:
     """Do what is asked for and write it. Raises ProgdfError where that is nothing, or would leave nothing."""
     options = parse_options(EditOptions, argv, "progdf edit")
-    if not options.clean:
-        raise ProgdfError("nothing was asked for; say what to do with the scene, for example --clean")
-    if options.out.suffix.lower() != ".ply":
-        raise ProgdfError(f"{options.out} is not a .ply file; give the new scene a name that ends in .ply")
+    makes_edit, makers = options.out.suffix.lower() == ".gdf", _read_steps(options)
+    if not options.clean and not makers:
+        raise ProgdfError(
+            "nothing was asked for; say what to do with the scene, for example --clean or --delete REGION"
+        )
+    if options.out.suffix.lower() != ".ply" and not makes_edit:
+        raise ProgdfError(
+            f"{options.out} is no .ply or .gdf file; give a new scene's name the end .ply, an edit's .gdf"
+        )
+    if makes_edit and options.clean:
+        raise ProgdfError("--clean has no slider; write a .ply, or leave --clean out")
     check_not_an_input(options.out, [options.scene])
     scene = load_scene(options.scene)
-    edited = _clean(scene)
+    steps = [make(scene) for make in makers]
+    if makes_edit:
+        return _write_edit(options, scene, steps)
+    edited = bake(scene, steps)
+    if steps:
+        print_line("; ".join(_describe(step) for step in steps))
+    edited = _clean(edited) if options.clean and len(edited) else edited
     if not len(edited):
         raise ProgdfError(f"nothing of {options.scene} would be left; it has no Gaussian that is drawn")
     save_ply_checked(options.out, edited)
@@ -55,6 +96,76 @@ def main(argv: Sequence[str]) -> int:
             f"an edit is carried over by progdf rebind EDIT.gdf --from {old} --to {new} -o NEW.gdf"
         )
     return 0
+
+
+def _write_edit(options: EditOptions, scene: Gaussians, steps: Sequence[Step]) -> int:
+    words = [
+        f"--{name} {spec}"
+        for name in ("delete", "scale", "rotate", "move", "duplicate")
+        for spec in getattr(options, name)
+    ]
+    gdf = tidy(scene, steps, options.out.stem, "edit " + " ".join(words))
+    save_gdf(options.out, gdf)
+    print_line("; ".join(_describe(step) for step in steps))
+    print_line(
+        f"wrote {options.out}: an edit with a slider; see it with progdf view {options.scene} {options.out}"
+    )
+    return 0
+
+
+def _describe(step: Step) -> str:
+    """What is done to how many, for a person."""
+    does = {"remove": "taken away", "transform": "moved as a whole", "duplicate": "copied"}[step.does]
+    return f"{shorten(step.region.name)}: {format_count(len(step.region))} {does}"
+
+
+def _read_steps(options: EditOptions) -> list[Callable[[Gaussians], Step]]:
+    """What makes each step of a scene, in their order. Raises ProgdfError: no scene can have one."""
+    forms: tuple[tuple[str, str, Callable[[str], Motion | None]], ...] = (
+        ("scale", "FACTOR", _factor),
+        ("rotate", "AXIS,DEGREES", _turn),
+        ("move", "DX,DY,DZ", _shift),
+        ("duplicate", "DX,DY,DZ", _shift),
+    )
+    makers = []
+    for name, form, read in forms:
+        for text in getattr(options, name):
+            spec, _, numbers = text.rpartition(":")
+            motion = read(numbers)
+            if motion is None or not spec:
+                raise ProgdfError(
+                    f"'{shorten(text)}' does not end as it should; write --{name} REGION:{form}"
+                )
+            makers.append(_maker("duplicate" if name == "duplicate" else "transform", spec, motion))
+    makers += [_maker("remove", spec, None) for spec in options.delete]
+    return makers
+
+
+def _maker(does: Deed, spec: str, motion: Motion | None) -> Callable[[Gaussians], Step]:
+    check_region(spec)
+    return lambda scene: Step(does, parse_region(spec, scene, say=print_line), motion)
+
+
+def _shift(text: str) -> Motion | None:
+    numbers = read_numbers(text)
+    return similarity(shift=numbers) if len(numbers) == 3 else None
+
+
+def _factor(text: str) -> Motion | None:
+    numbers = read_numbers(text)
+    if len(numbers) != 1 or not 1 / MOST_SCALE <= numbers[0] <= MOST_SCALE:
+        return None
+    return similarity(scale=numbers[0])
+
+
+def _turn(text: str) -> Motion | None:
+    axis, _, degrees = text.rpartition(",")
+    named = {"x": "1,0,0", "y": "0,1,0", "z": "0,0,1"}
+    direction, angle = read_numbers(named.get(axis.strip().lower(), axis)), read_numbers(degrees)
+    if len(direction) != 3 or not any(direction) or len(angle) != 1 or abs(angle[0]) > MOST_DEGREES:
+        return None
+    unit = torch.nn.functional.normalize(torch.tensor(direction, dtype=torch.float64), dim=0)
+    return similarity(turn=(math.radians(angle[0]) * unit).tolist())
 
 
 def _clean(scene: Gaussians) -> Gaussians:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -15,8 +16,8 @@ from torch import Tensor
 
 from progdf.field.separable import fit_bands
 from progdf.gaussians import ATTRIBUTES, Gaussians
-from progdf.gdf.file import UNSEEN_LOGIT, Gdf, fingerprint, verify
-from progdf.region import Region
+from progdf.gdf.file import UNSEEN_LOGIT, Gdf, apply_grade, fingerprint, verify
+from progdf.region import Region, whole_scene
 
 
 def extend(scene: Gaussians, gdfs: Sequence[Gdf]) -> tuple[Gaussians, tuple[Gdf, ...]]:
@@ -35,13 +36,16 @@ def extend(scene: Gaussians, gdfs: Sequence[Gdf]) -> tuple[Gaussians, tuple[Gdf,
     """
     for gdf in gdfs:
         verify(gdf, scene)
-    added = [gdf.added for gdf in gdfs if gdf.added is not None]
+    added = tuple(gdf.added for gdf in gdfs if gdf.added is not None)
     if not added:
         return scene, tuple(gdfs)
-    extended = replace(scene, **_append_rows(scene, added))
+    extended = _append_rows(scene, added)
     total, scene_print, first = len(extended), fingerprint(extended), len(scene)
     moved = []
     for gdf in gdfs:
+        if gdf.applied and len(gdf.region) == len(scene):  # on all that is there, whoever brings it
+            moved.append(apply_grade(gdf, extended, replace(whole_scene(extended), name=gdf.region.name)))
+            continue
         rows = torch.arange(first, first + gdf.members - len(gdf.region))
         first += len(rows)
         score = torch.zeros(total)
@@ -52,8 +56,9 @@ def extend(scene: Gaussians, gdfs: Sequence[Gdf]) -> tuple[Gaussians, tuple[Gdf,
     return extended, tuple(moved)
 
 
-def _append_rows(scene: Gaussians, added: Sequence[Gaussians]) -> dict[str, Any]:
-    """The attributes of the scene and of rows that have origins and bands of their own."""
+@lru_cache(maxsize=1)  # the same object for the same edits, so that what is known of it stays known
+def _append_rows(scene: Gaussians, added: tuple[Gaussians, ...]) -> Gaussians:
+    """The scene and rows that have origins and bands of their own."""
     columns: dict[str, list[Tensor]] = {name: [getattr(scene, name)] for name in ATTRIBUTES}
     origin, shape = torch.tensor(scene.origin, dtype=torch.float64), scene.shN.shape[1:]
     for rows in added:
@@ -62,7 +67,8 @@ def _append_rows(scene: Gaussians, added: Sequence[Gaussians]) -> dict[str, Any]
         own = replace(rows, means=means.float(), shN=bands)
         for name, parts in columns.items():
             parts.append(getattr(own, name).to(parts[0]))
-    return {name: torch.cat(parts) for name, parts in columns.items()}
+    together: dict[str, Any] = {name: torch.cat(parts) for name, parts in columns.items()}
+    return replace(scene, **together)
 
 
 def remaining_rows(scene: Gaussians, composed: Gaussians) -> Tensor:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -13,7 +12,7 @@ from torch import Tensor
 from progdf.camera import Camera
 from progdf.color.edits import parse_color
 from progdf.errors import ProgdfError
-from progdf.gaussians import ATTRIBUTES, Gaussians
+from progdf.gaussians import Gaussians, concatenate
 from progdf.quaternions import matrix_quats
 from progdf.sh import rgb_to_sh0
 from progdf.threads import one_thread
@@ -180,7 +179,7 @@ def assemble(
             at = _sample_visible(parts, part, count, share, random)
             pieces.append(_make_gaussians(parts, part, at, paint(part, at, table), daylight, random))
             labels.append(torch.full((count,), label_names.index(part.label), dtype=torch.uint8))
-    return _concatenate(pieces), torch.cat(labels)
+    return concatenate(pieces), torch.cat(labels)
 
 
 def _budget(parts: Sequence[Part], size: int) -> tuple[list[int], list[float]]:
@@ -269,8 +268,3 @@ def _place_gaussians(
     scales = torch.where(up > 0, hair, flat) * torch.exp(0.12 * torch.randn(n, 3, generator=random))
     height = pelt.lift * hair[:, :1] * up + 0.06 * h * torch.randn(n, 1, generator=random)
     return at.points + height * at.normals, matrix_quats(frame), scales.log()
-
-
-def _concatenate(pieces: Sequence[Gaussians]) -> Gaussians:
-    joined: dict[str, Any] = {name: torch.cat([getattr(p, name) for p in pieces]) for name in ATTRIBUTES}
-    return Gaussians(**joined)

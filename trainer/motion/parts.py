@@ -20,9 +20,8 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from progdf.scene.neighbors import nearest_rows
+from progdf.similarity import Motion, Parts, move_rows
 from trainer.views.crops import CropScene
-
-from .similarity import Motion, Parts, move_rows
 
 _NEIGHBOR = 8  # a Gaussian's spacing is the distance to its eighth neighbor: the first can be a twin
 _SAMPLES = 512  # Gaussians whose spacing is measured

@@ -30,10 +30,7 @@ from progdf.quaternions import (
     rotate_vectors,
     turn_quats,
 )
-from trainer.views.crops import CropScene
-
-from .parts import OnStep, descend, falling, mean_distance, view_distance
-from .similarity import (
+from progdf.similarity import (
     GEOMETRY,
     Motion,
     Parts,
@@ -43,6 +40,9 @@ from .similarity import (
     local_offsets,
     split_geometry,
 )
+from trainer.views.crops import CropScene
+
+from .parts import OnStep, descend, falling, mean_distance, view_distance
 
 LEVELS = (6, 18, 54)
 """Control points of each level, coarse to fine."""

@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 
 from progdf.gaussians import attribute_slices
+from progdf.similarity import Motion, Parts, make_parts
 from trainer.motion.parts import GroupSearch, OnStep, connected_parts
-from trainer.motion.similarity import Motion, Parts, make_parts
 from trainer.motion.warp import (
     PartsPlacement,
     Placement,

@@ -6,6 +6,7 @@ import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 from imgui_bundle import imgui
@@ -294,8 +295,8 @@ class App:
             self._title = title
 
     def _engine(self, document: Document, live: tuple[Gdf, ...] = ()) -> ViewEngine:
-        gdfs = (*document.gdfs, *live)
-        return ViewEngine(self.context, document.scene, gdfs, self._draw)
+        shown = replace(document, edits=(*document.edits, *live)) if live else document
+        return ViewEngine(self.context, shown.scene, shown.gdfs, self._draw)
 
     def leave(self) -> None:
         """Close the window, without a question."""

@@ -119,7 +119,7 @@ class EditActions:
         Raises:
             ProgdfError: the file is missing or broken, or no grade, and was made for another scene.
         """
-        before, scene = self._app.main_view.work.view, self._app.document.scene
+        before, scene = self._app.main_view.work.view, self._app.document.original
         selected = selection.unpack(before.selection.members, len(scene)).copy()
         where, mask = ("selection", selected) if selected.any() else ("all", np.ones(len(scene), bool))
         gdf = self._load(path, from_mask(where, torch.from_numpy(mask)))
@@ -139,13 +139,13 @@ class EditActions:
         drafts = [i for i, known in enumerate(document.gdf_paths) if known == draft]
         if not drafts:
             return False
-        gdf = self._load(path, document.gdfs[drafts[0]].region)
-        gdfs, paths = list(document.gdfs), list(document.gdf_paths)
+        gdf = self._load(path, document.edits[drafts[0]].region)
+        gdfs, paths = list(document.edits), list(document.gdf_paths)
         for i in drafts:
             if not torch.equal(gdf.region.members, gdfs[i].region.members):
                 return False
             gdfs[i], paths[i] = replace(gdf, name=gdfs[i].name), path
-        self._app.show(replace(document, gdfs=tuple(gdfs), gdf_paths=tuple(paths)))
+        self._app.show(replace(document, edits=tuple(gdfs), gdf_paths=tuple(paths)))
         return any(layer.gdf in drafts for layer in view.layers)
 
     def duplicate(self, index: int) -> None:
@@ -153,7 +153,7 @@ class EditActions:
         document, view = self._app.document, self._app.main_view.work.view
         gdf = view.layers[index].gdf
         path = document.gdf_paths[gdf] if gdf < len(document.gdf_paths) else None
-        self._apply(duplicate_layer(view, index, self._open(document.gdfs[gdf], path)), index + 1)
+        self._apply(duplicate_layer(view, index, self._open(document.edits[gdf], path)), index + 1)
 
     def replace(self, index: int, path: Path) -> None:
         """Another edit in a layer's place; a grade of another scene or of none takes the layer's region.
@@ -162,7 +162,7 @@ class EditActions:
             ProgdfError: as for `add`.
         """
         view = self._app.main_view.work.view
-        gdf = self._load(path, self._app.document.gdfs[view.layers[index].gdf].region)
+        gdf = self._load(path, self._app.document.edits[view.layers[index].gdf].region)
         self._apply(replace_edit(view, index, self._open(gdf, path), gdf.name), index)
 
     def layer(self, index: str) -> int:
@@ -179,7 +179,7 @@ class EditActions:
 
     def _load(self, path: Path, region: Region) -> Gdf:
         """An edit of the scene, or the grade of another on a region."""
-        scene = self._app.document.scene
+        scene = self._app.document.original
 
         def place(stored: Gdf) -> Region | None:
             return region if stored.field.kind == "grade" and stored.scene != fingerprint(scene) else None
@@ -194,10 +194,10 @@ class EditActions:
         """Have one more edit open; its index."""
         document = self._app.document
         renamed = replace(gdf, name=document.free_name(gdf.name))
-        known = path is not None and len(document.gdf_paths) == len(document.gdfs)
+        known = path is not None and len(document.gdf_paths) == len(document.edits)
         paths = (*document.gdf_paths, path) if known and path is not None else ()
-        self._app.show(replace(document, gdfs=(*document.gdfs, renamed), gdf_paths=paths))
-        return len(document.gdfs)
+        self._app.show(replace(document, edits=(*document.edits, renamed), gdf_paths=paths))
+        return len(document.edits)
 
     def _apply(self, view: ViewState, focus: int) -> None:
         """The changed stack, and the layer that it is about."""
@@ -224,7 +224,7 @@ class StrayActions:
         if request != "hide_strays":
             return False
         if self._search is None:
-            self._scene = self._app.document.scene
+            self._scene = self._app.document.original
             self._search = self._worker.submit(_search, self._scene)
             self._app.main_view.show_message("Looking for strays …")
         return True
@@ -236,7 +236,7 @@ class StrayActions:
         if not self._search.done():
             return _POLL_S
         search, self._search = self._search, None
-        if self._scene is self._app.document.scene:  # else another one was opened meanwhile
+        if self._scene is self._app.document.original:  # else another one was opened meanwhile
             self._hide(*search.result())
         return None
 
@@ -360,7 +360,7 @@ class FileActions:
         self._claim_regions(path)
         self._write(path)
         for region in self._app.main_view.work.view.selection.regions:
-            exports.region_file(region, len(self._app.document.scene))
+            exports.region_file(region, len(self._app.document.original))
         self.session_autosave.drop()
         self.path = path
         main_view = self._app.main_view
@@ -483,14 +483,14 @@ class FileActions:
         if self.path is None and opened.path is None:
             raise ProgdfError(f"{opened.title} was not opened from a file; save the scene first")
         folder = (self.path or opened.path or Path()).resolve().parent
-        view, total = main_view.work.view, len(opened.scene)
+        view, total = main_view.work.view, len(opened.original)
         selection = exports.keep_region(view.selection, name, folder, total)
         main_view.change(replace(view, selection=selection))
         path = selection.regions[-1].path
         main_view.show_message(f"Saved {path}; train it with --region file:{path.name}")
 
     def _rename_region(self, index: str, name: str) -> None:
-        view, total = self._app.main_view.work.view, len(self._app.document.scene)
+        view, total = self._app.main_view.work.view, len(self._app.document.original)
         renamed = exports.rename_region(view.selection, int(index), name, total)
         self._app.main_view.change(replace(view, selection=renamed))
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from progdf.camera import Camera
+from progdf.compose.added import remaining_rows
 from progdf.compose.reference import compose_layers
 from progdf.errors import ProgdfError
 from progdf.field.baked import GradeForm, lattice_colors, lattice_side
@@ -108,6 +109,7 @@ def export(argv: Sequence[str]) -> int:
     document, states = opened.document, visible_layers(opened.view)
     layers = [layer_of(document.gdfs[s.gdf], s.strength, s.gains, s.paint) for s in states]
     edited = compose_layers(document.scene, layers, opened.view.blend)
+    edited = edited[remaining_rows(document.original, edited)]
     save_ply_checked(out, edited)
     far = ", x y z as doubles as it is far from 0" if document.scene.origin != ZERO else ""
     strengths = describe_strengths(opened.view)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import torch
 
+from progdf.compose.added import extend
 from progdf.formats.scene_file import load_scene, scene_file, scene_name
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf, load_gdf
@@ -35,43 +36,58 @@ class Document:
     """The scene and its edits, in the order of `LayerState.gdf`."""
 
     title: str  # the scene's name; "" where nothing is open
-    scene: Gaussians  # the original
-    gdfs: tuple[Gdf, ...] = ()  # its edits
+    original: Gaussians  # as its file has it
+    edits: tuple[Gdf, ...] = ()  # of the original, as their files have them
     path: Path | None = None  # the scene's file; None where there is none, and so no session can be saved
     gdf_paths: tuple[Path, ...] = ()  # the edits' files, one for each where there are any
 
     @cached_property
+    def _extended(self) -> tuple[Gaussians, tuple[Gdf, ...]]:
+        return extend(self.original, self.edits)
+
+    @property
+    def scene(self) -> Gaussians:
+        """The original with the rows that edits add, as it is drawn with every slider at 0."""
+        return self._extended[0]
+
+    @property
+    def gdfs(self) -> tuple[Gdf, ...]:
+        """The edits of that scene."""
+        return self._extended[1]
+
+    @cached_property
     def detected_up(self) -> SceneUp:
         """Which way is up, as the scene and its edits tell."""
-        return find_scene_up(self.scene, self.gdfs, path=self.path)
+        return find_scene_up(self.original, self.edits, path=self.path)
 
     def facts(self) -> SceneFacts:
         """What the panel and the camera need to know of it."""
-        scene, rows = self.scene, layer_rows(self.scene, self.gdfs)
+        scene, added = self.scene, [gdf.members - len(gdf.region) for gdf in self.edits]
         return SceneFacts(
             title=self.title,
             count=len(scene),
-            bounds=bounds_of(scene),
+            added=len(scene) - len(self.original),
+            bounds=bounds_of(self.original),
             origin=scene.origin,
-            rows=rows,
+            rows=layer_rows(scene, self.gdfs, added),
             recordings=self.recordings(),
-            fit=lambda camera, aspect: fit_all(camera, scene, aspect),
+            fit=lambda camera, aspect: fit_all(camera, self.original, aspect),
             fit_members=lambda camera, aspect, mask: fit(camera, scene[torch.tensor(mask)], aspect),
             neighborhood=_once(lambda: Neighborhood(scene)),
             home=lambda camera, aspect: replace(
-                first_camera(scene, (), aspect, camera.fov_y, camera.up), mode=camera.mode
+                first_camera(self.original, (), aspect, camera.fov_y, camera.up), mode=camera.mode
             ),
         )
 
     def recordings(self) -> tuple[RecordingFile, ...]:
         """Where each edit was recorded."""
-        if len(self.gdf_paths) != len(self.gdfs):
-            return (RecordingFile(),) * len(self.gdfs)
-        return tuple(find_recording(gdf, path) for gdf, path in zip(self.gdfs, self.gdf_paths, strict=True))
+        if len(self.gdf_paths) != len(self.edits):
+            return (RecordingFile(),) * len(self.edits)
+        return tuple(find_recording(gdf, path) for gdf, path in zip(self.edits, self.gdf_paths, strict=True))
 
     def free_name(self, name: str) -> str:
         """An edit's name, with a number where another edit has it."""
-        return _free_name(name, self.gdfs)
+        return _free_name(name, self.edits)
 
 
 def _once(make: Callable[[], Neighborhood]) -> Callable[[], Neighborhood]:

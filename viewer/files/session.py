@@ -37,7 +37,7 @@ from viewer.camera.view_camera import Vec3, move_camera
 from viewer.state import paint
 from viewer.state.selection import SUFFIX as REGION_SUFFIX
 from viewer.state.selection import check as check_selection
-from viewer.state.selection import pack, unpack
+from viewer.state.selection import pack, take_rows, unpack
 from viewer.state.snapshots import SliderSnapshot
 from viewer.state.view_state import LayerState, ViewState
 
@@ -87,7 +87,7 @@ def save(path: Path, session: WindowSession) -> None:
     Raises:
         ProgdfError: the scene or an edit has no file, a file cannot be read, or the folder does not exist.
     """
-    if session.document.path is None or len(session.document.gdf_paths) != len(session.document.gdfs):
+    if session.document.path is None or len(session.document.gdf_paths) != len(session.document.edits):
         raise ProgdfError(f"{session.document.title} was not opened from files; save the scene first")
     scene, session = session.document.path, prune(session)
     view, snapshots = _move(session.view, session.snapshots, session.document.scene.origin)
@@ -97,7 +97,7 @@ def save(path: Path, session: WindowSession) -> None:
     view = _with_region_paths(view, lambda region: Path(relative_name(region, folder)))
     opened = session.document
     edits = tuple(
-        _edit_ref(gdf, path, folder) for gdf, path in zip(opened.gdfs, opened.gdf_paths, strict=True)
+        _edit_ref(gdf, path, folder) for gdf, path in zip(opened.edits, opened.gdf_paths, strict=True)
     )
     write_session(path, WindowFile(reference(scene, folder), edits, view, snapshots))
 
@@ -194,7 +194,13 @@ def prune(session: WindowSession) -> WindowSession:
         return tuple(replace(layer, gdf=places[layer.gdf]) for layer in layers)
 
     opened = session.document
-    if len(used) == len(opened.gdfs):
+    if opened.scene is not opened.original:  # masks of the rows that the file's own edits bring
+        added = [opened.gdfs[gdf] for gdf in used if opened.edits[gdf].added is not None]
+        count, members = len(opened.original), [gdf.region.members.numpy() for gdf in added]
+        rows = np.concatenate([np.arange(count), *(own[own >= count] for own in members)])
+        view = replace(view, selection=take_rows(view.selection, len(opened.scene), rows))
+        session = replace(session, view=view)
+    if len(used) == len(opened.edits):
         return session
     keys = tuple(
         replace(key, strengths=tuple((places[gdf], s) for gdf, s in key.strengths if gdf in places))
@@ -203,7 +209,7 @@ def prune(session: WindowSession) -> WindowSession:
     return WindowSession(
         replace(
             opened,
-            gdfs=tuple(opened.gdfs[gdf] for gdf in used),
+            edits=tuple(opened.edits[gdf] for gdf in used),
             gdf_paths=tuple(opened.gdf_paths[gdf] for gdf in used),
         ),
         replace(

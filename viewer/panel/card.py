@@ -36,6 +36,7 @@ from viewer.ui.widgets import (
     tip,
     typed_name,
     value_slider,
+    with_added,
 )
 
 from . import slider
@@ -376,7 +377,8 @@ def _foot(work: Workspace, index: int, row: LayerRow, ui: UiContext) -> Workspac
         for i, other in enumerate(work.view.layers)
         if i != index and other.gdf < len(row.shared) and row.shared[other.gdf]
     ]
-    note = f"{'Draft  ·  ' * row.draft}{group_digits(row.count)} splats"
+    size = f"{with_added(row.count, row.added)} splats"
+    note = f"{'Draft  ·  ' * row.draft}{size}"
     if len(overlaps) == 1:
         name, count = overlaps[0]
         note += f"  ·  {'all' if count == row.count else group_digits(count)} in {name}"
@@ -389,7 +391,7 @@ def _foot(work: Workspace, index: int, row: LayerRow, ui: UiContext) -> Workspac
         work = replace(work, overlap=index)
     shared = [f"{group_digits(count)} of its splats are also in {name}" for name, count in overlaps]
     shared += ["Highlighted in pink"] if overlaps else []
-    tip("\n".join((f"{group_digits(row.count)} splats", *filter(None, [row.instruction]), *shared)))
+    tip("\n".join((size, *filter(None, [row.instruction]), *shared)))
     view = work.view
     imgui.same_line(right - 4 * wide)
     if small_toggle("solo", "S", layer.solo, wide, ui):

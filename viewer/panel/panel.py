@@ -21,7 +21,6 @@ from viewer.ui.widgets import (
     choice,
     choice_row,
     elide,
-    group_digits,
     icon_button,
     is_double_clicked,
     label,
@@ -30,6 +29,7 @@ from viewer.ui.widgets import (
     section,
     small,
     tip,
+    with_added,
 )
 
 from . import card, cards, new_edit_form, snapshot_cards, tools, training_cards
@@ -232,7 +232,7 @@ def _title(
     room = imgui.get_content_region_avail().x
     imgui.text(elide(UNSAVED * has_unsaved(work) + facts.title, room - side))
     imgui.pop_font()
-    small(f"{group_digits(facts.count)} splats", PALETTE.dim, room - side)
+    small(f"{with_added(facts.count, facts.added)} splats", PALETTE.dim, room - side)
     below = imgui.get_cursor_pos()
     imgui.set_cursor_pos(imgui.ImVec2(at.x + room - side, at.y - 2.0 * ui.scale))
     _menu_button(work, recent, ui, actions)

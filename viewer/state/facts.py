@@ -66,14 +66,17 @@ class LayerRow:
     fit: Fit = keep_camera  # gives the camera that frames this layer
     region: str = ""  # its name
     draft: bool = False  # a grade alone, until its training is done
+    added: int = 0  # how many of its members the scene does not have
 
 
-def layer_rows(scene: Gaussians, gdfs: Sequence[Gdf]) -> tuple[LayerRow, ...]:
-    """One row per .gdf, in their order."""
-    return tuple(_row(scene, gdf, gdfs) for gdf in gdfs)
+def layer_rows(scene: Gaussians, gdfs: Sequence[Gdf], added: Sequence[int] = ()) -> tuple[LayerRow, ...]:
+    """One row per .gdf, in their order; `added`: how many Gaussians of its own each has, see `extend`."""
+    return tuple(
+        _row(scene, gdf, gdfs, count) for gdf, count in zip(gdfs, added or [0] * len(gdfs), strict=True)
+    )
 
 
-def _row(scene: Gaussians, gdf: Gdf, gdfs: Sequence[Gdf]) -> LayerRow:
+def _row(scene: Gaussians, gdf: Gdf, gdfs: Sequence[Gdf], added: int) -> LayerRow:
     members = gdf.region.members
     return LayerRow(
         count=len(members),
@@ -88,6 +91,7 @@ def _row(scene: Gaussians, gdf: Gdf, gdfs: Sequence[Gdf]) -> LayerRow:
         fit=lambda camera, aspect: fit(camera, scene[members], aspect),
         region=gdf.region.name,
         draft="draft" in gdf.report,
+        added=added,
     )
 
 

@@ -15,6 +15,7 @@ from typing import Annotated
 
 import numpy as np
 from msgspec import Meta
+from numpy.typing import NDArray
 
 from progdf.errors import ProgdfError
 from progdf.io.atomic import is_portable
@@ -74,21 +75,22 @@ def pack(mask: Mask) -> bytes:
 
 @lru_cache(maxsize=64)
 def unpack(members: bytes, total: int) -> Mask:
-    """The mask of a scene of `total` Gaussians, read-only. [N]
+    """The mask of a scene of `total` Gaussians, read-only; of fewer rows, those that edits add later are not
+    in it, of more, they are left out. [N]
 
     Raises:
-        ProgdfError: it is damaged or of a scene of another size.
+        ProgdfError: it is damaged.
     """
     mask = np.zeros(total, bool)
     if members != NOBODY:
-        unpacker = zlib.decompressobj()
+        unpacker, size = zlib.decompressobj(), -(-total // 8)
         try:
-            packed = unpacker.decompress(members, -(-total // 8) + 1)
+            packed = unpacker.decompress(members, size) if size else b""
         except zlib.error:
-            raise ProgdfError("a selection is damaged; select it again") from None
-        if len(packed) != -(-total // 8):
-            raise ProgdfError(f"a selection does not fit the scene's {total} Gaussians; select it again")
-        mask = np.unpackbits(np.frombuffer(packed, np.uint8), count=total).astype(bool)
+            packed = b""
+        if len(packed) < size and not unpacker.eof:
+            raise ProgdfError("a selection is damaged; select it again")
+        mask = np.unpackbits(np.frombuffer(packed.ljust(size, b"\0"), np.uint8), count=total).astype(bool)
     mask.flags.writeable = False
     return mask
 
@@ -212,3 +214,22 @@ def check(state: SelectionState, total: int) -> None:
     """ProgdfError where a mask does not fit a scene of `total` Gaussians."""
     for members in (state.members, state.hidden, *(region.members for region in state.regions)):
         unpack(members, total)
+        size = -(-total // 8)
+        if members != NOBODY and len(zlib.decompressobj().decompress(members, size + 1)) != size:
+            raise ProgdfError(f"a selection does not fit the scene's {total} Gaussians; select it again")
+
+
+def take_rows(state: SelectionState, total: int, rows: NDArray[np.int64]) -> SelectionState:
+    """The same in a scene that has these of `total` rows alone. [R]"""
+
+    def take(members: bytes) -> tuple[bytes, int]:
+        mask = unpack(members, total)[rows]
+        return pack(mask), int(np.count_nonzero(mask))
+
+    masks = [take(region.members) for region in state.regions]
+    regions = zip(state.regions, masks, strict=True)
+    return SelectionState(
+        *take(state.members),
+        take(state.hidden)[0],
+        tuple(replace(region, members=members, count=count) for region, (members, count) in regions),
+    )

@@ -74,9 +74,10 @@ class SceneFacts:
     """What does not change while a scene is open."""
 
     title: str  # the scene's name
-    count: int  # Gaussians in the scene
+    count: int  # Gaussians in the scene and of its edits: the rows that are drawn
     bounds: Bounds  # of the bulk of the scene
     rows: Sequence[LayerRow]  # one per .gdf, indexed by `LayerState.gdf`
+    added: int = 0  # of these, how many edits have added
     recordings: Sequence[RecordingFile] = ()  # where each .gdf was recorded, in the same order
     origin: Origin = ZERO  # where in the world the scene and its cameras begin, see `Gaussians.origin`
     fit: Fit = keep_camera  # gives the camera that `frame` takes with nothing selected and no layer focused

@@ -359,6 +359,11 @@ def group_digits(count: int) -> str:
     return f"{count:,}".replace(",", "\u2009")
 
 
+def with_added(total: int, added: int) -> str:
+    """So many Gaussians, as in "12 345 + 2 074" where edits have added some of them."""
+    return group_digits(total - added) + (f" + {group_digits(added)}" if added else "")
+
+
 def elide(text: str, room: float) -> str:
     """The text, shortened with "…" to fit `room` window pixels in the present font."""
     if imgui.calc_text_size(text).x <= room:

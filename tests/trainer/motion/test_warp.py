@@ -12,9 +12,9 @@ from torch import Tensor
 from benchmarks.analytic_edits import AnalyticEdit, bend_warp, stretch_warp, warp_edit
 from progdf.gaussians import attribute_slices, pack
 from progdf.rasterize import render
+from progdf.similarity import Motion, make_parts, move_rows
 from tests.helpers.trained import WHITE, Small, small
 from trainer.motion.parts import connected_parts
-from trainer.motion.similarity import Motion, make_parts, move_rows
 from trainer.motion.warp import (
     ControlPoints,
     WarpMotion,

@@ -13,10 +13,7 @@ from torch import Tensor
 from benchmarks.analytic_edits import AnalyticEdit, scale_edit, swing_edit
 from progdf.gaussians import attribute_slices, pack
 from progdf.rasterize import render
-from tests.helpers.analytic_views import Truth, bear_truth, write_analytic_views, write_truth
-from tests.helpers.trained import WHITE, Small, quick_options, small, train
-from trainer.motion.parts import GroupSearch, connected_parts
-from trainer.motion.similarity import (
+from progdf.similarity import (
     Motion,
     Parts,
     carry_offsets,
@@ -25,6 +22,9 @@ from trainer.motion.similarity import (
     make_parts,
     move_rows,
 )
+from tests.helpers.analytic_views import Truth, bear_truth, write_analytic_views, write_truth
+from tests.helpers.trained import WHITE, Small, quick_options, small, train
+from trainer.motion.parts import GroupSearch, connected_parts
 from trainer.optimize.groups import Groups, group_path, group_stage, restore_groups
 from trainer.optimize.losses import GradientL1, Objective
 from trainer.optimize.pgs import PgsSettings, TargetStage, learning_rates, optimize

@@ -67,7 +67,9 @@ def window(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[applicat
     scarf = load_gdf(folder / "edits" / "scarf.gdf", bear().scene)
     save_gdf(tmp_path / "grade.gdf", replace(scarf, report={"draft": {}}))
     Previews.grade, Previews.asked = tmp_path / "grade.gdf", 0
-    with null_app(replace(opened_document(folder), gdfs=(), gdf_paths=()), first_view(bear()), folder) as app:
+    with null_app(
+        replace(opened_document(folder), edits=(), gdf_paths=()), first_view(bear()), folder
+    ) as app:
         yield app
 
 

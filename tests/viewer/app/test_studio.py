@@ -63,7 +63,9 @@ def window(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[applicat
     folder = bear_files(tmp_path)
     monkeypatch.setattr(job_queue, "Child", Trainer)
     Trainer.ended, Trainer.line, Trainer.edit = None, "", folder / "edits" / "scarf.gdf"
-    with null_app(replace(opened_document(folder), gdfs=(), gdf_paths=()), first_view(bear()), folder) as app:
+    with null_app(
+        replace(opened_document(folder), edits=(), gdf_paths=()), first_view(bear()), folder
+    ) as app:
         app.main_view.work = replace(
             app.main_view.work, form=replace(app.main_view.work.form, preview=False, name="blue")
         )

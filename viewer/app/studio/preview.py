@@ -301,7 +301,7 @@ class PreviewActions:
         elif answer.note and answer.number == self._number:
             self._show(answer.note, None, models=answer.models)
         elif answer.grade is not None and self._sent is not None and answer.number == self._number:
-            gdf = load_gdf(answer.grade, self._app.document.scene)
+            gdf = load_gdf(answer.grade, self._app.document.original)
             self._grade = self._sent, gdf, answer.grade
             self._app.main_view.live = ()  # of the last color
             self._show("Live: turn it, slide it", None)

@@ -206,7 +206,7 @@ class JobActions:
             spec = form.typed_region.strip()
             check_region(spec, {kind: lambda _: None for kind in _KINDS})
             return spec
-        selection, total = self._app.main_view.work.view.selection, len(self._app.document.scene)
+        selection, total = self._app.main_view.work.view.selection, len(self._app.document.original)
         region = {region.name: region for region in selection.regions}.get(form.region)
         if form.region != SELECTION and region is None:
             raise ProgdfError(f"there is no region {form.region} any more; choose another one")
@@ -290,7 +290,7 @@ class JobActions:
         if recording is None or recording == self._live:
             return
         begun, document = time.monotonic(), self._app.document
-        if (edit := order.recorded_edit(recording, document.scene)) is not None:
+        if (edit := order.recorded_edit(recording, document.original)) is not None:
             layer = LayerState(len(document.gdfs), f"{edit.name} (training)", 1.0)
             self._app.show(document, (edit,), (layer,))
             self._live, self._live_layers = recording, (layer,)

@@ -1,0 +1,283 @@
+"""Removing, moving and copying regions: exact ends, what lies between, what stays, and the command."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from progdf.__main__ import main
+from progdf.camera import Camera
+from progdf.compose.reference import Layer, compose_layers
+from progdf.formats.ply import load_ply, save_ply
+from progdf.gaussians import ATTRIBUTES, Gaussians, pack
+from progdf.gdf.file import Gdf, load_gdf, save_gdf
+from progdf.quaternions import rotation_matrices, turn_quats
+from progdf.rasterize import render
+from progdf.rasterize.engines import ALPHA_MIN
+from progdf.region import Region, from_mask, whole_scene
+from progdf.similarity import Motion
+from progdf.tidy import Step, bake, duplicate, remove, similarity, tidy, transform
+from tests.helpers.scenes import front_camera, orbit_camera, random_gaussians
+
+BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
+TURN = (0.3, -1.1, 0.4)
+ROUNDING = 1 / 255
+"""A step of 8 bits: ends are kept in 16 bits of the farthest way, what lies between to a three-hundredth."""
+
+
+def scene_of(degree: int = 2) -> Gaussians:
+    scene = random_gaussians(400, seed=4, sh_degree=degree, spread=0.5, scale=0.08)
+    return replace(scene, means=scene.means + torch.tensor([0.0, 0.0, 3.0]))
+
+
+def left_half(scene: Gaussians) -> Region:
+    return from_mask("left", scene.means[:, 0] < 0)
+
+
+def outside(scene: Gaussians, region: Region) -> Tensor:
+    mask = torch.ones(len(scene), dtype=torch.bool)
+    mask[region.members] = False
+    return mask
+
+
+def at(scene: Gaussians, gdf: Gdf, s: float) -> Gaussians:
+    return compose_layers(scene, [Layer(gdf, s)])
+
+
+def picture(scene: Gaussians, background: tuple[float, float, float], camera: Camera) -> Tensor:
+    with torch.no_grad():
+        return render(scene, camera, background).image
+
+
+def checker(scene: Gaussians) -> Gaussians:
+    """The scene with a wall of black and white tiles behind it."""
+    x, y = torch.meshgrid(torch.arange(-6, 7), torch.arange(-6, 7), indexing="ij")
+    count = x.numel()
+    tone = ((x + y) % 2).float().flatten()[:, None].expand(-1, 3)
+    wall = Gaussians(
+        torch.stack([x.flatten() * 0.4, y.flatten() * 0.4, torch.full((count,), 6.0)], dim=1),
+        torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(count, 4),
+        torch.log(torch.tensor([0.2, 0.2, 0.01])).expand(count, 3),
+        torch.full((count,), 5.0),
+        (tone - 0.5) / 0.28209479,
+        torch.zeros(count, scene.shN.shape[1], 3),
+    )
+    joined = {name: torch.cat([getattr(scene, name), getattr(wall, name)]) for name in ATTRIBUTES}
+    return Gaussians(**joined)
+
+
+def test_what_is_removed_is_gone_on_white_black_and_checker() -> None:
+    scene = checker(scene_of())
+    region = left_half(scene)
+    region = Region("left", region.members[region.members < 400], region.score)
+    removed, without = at(scene, remove(scene, region, "gone"), 1.0), scene[outside(scene, region)]
+    for background in (WHITE, BLACK):
+        for camera in (front_camera(96, 64, 60.0), orbit_camera(96, 64, azimuth=2.0)):
+            there = picture(scene, background, camera)
+            gone, reference = picture(removed, background, camera), picture(without, background, camera)
+            assert float((there - reference).abs().max()) > 0.1
+            # the last rows of a tensor are activated by another loop than the others: an ulp
+            assert float((gone - reference).abs().max()) < 1e-5
+
+
+def test_opacity_falls_linearly_and_ends_where_nothing_is_drawn() -> None:
+    scene = scene_of()
+    region = left_half(scene)
+    gdf = remove(scene, region, "gone")
+    before = scene.opacities[region.members]
+    for s in torch.linspace(0.0, 1.0, 41).tolist():
+        sum_share = float(at(scene, gdf, s).opacities[region.members].sum() / before.sum())
+        assert sum_share == pytest.approx(1.0 - s, abs=0.02)
+    assert bool((at(scene, gdf, 1.0).opacities[region.members] < ALPHA_MIN).all())
+
+
+@pytest.mark.parametrize("does", ["remove", "transform", "duplicate"])
+def test_strength_zero_is_the_scene_and_rows_outside_are_never_touched(does: str) -> None:
+    scene = scene_of()
+    region, motion = left_half(scene), similarity((0.2, 0.1, 0.0), TURN, 1.3)
+    gdf = {
+        "remove": lambda: remove(scene, region, "a"),
+        "transform": lambda: transform(scene, region, motion, "a"),
+        "duplicate": lambda: duplicate(scene, region, motion, "a"),
+    }[does]()
+    start, mask = at(scene, gdf, 0.0), outside(scene, region)
+    for name in ATTRIBUTES:
+        assert torch.equal(getattr(start, name)[: len(scene)], getattr(scene, name))
+        for s in (0.3, 1.0):
+            assert torch.equal(
+                getattr(at(scene, gdf, s), name)[: len(scene)][mask], getattr(scene, name)[mask]
+            )
+    assert torch.equal(picture(start, WHITE, front_camera()), picture(scene, WHITE, front_camera()))
+
+
+def moved_camera(camera: Camera, center: Tensor, motion: Motion) -> Camera:
+    """The camera that sees what has moved as the given one saw what was there; it must not be scaled."""
+    turn = rotation_matrices(turn_quats(motion.turn))[0]
+    # x' = c + t + R (x − c), so that x = Rᵀ (x' − c − t) + c
+    back, offset = turn.T, center - turn.T @ (center + motion.shift[0])
+    view = camera.viewmat.double().clone()
+    view[:3, 3] = view[:3, :3] @ offset + view[:3, 3]
+    view[:3, :3] = view[:3, :3] @ back
+    return replace(camera, viewmat=view.float())
+
+
+@pytest.mark.parametrize("share", [0.37, 1.0])
+def test_a_thing_and_a_camera_that_move_alike_show_the_same_picture(share: float) -> None:
+    scene = scene_of(degree=3)
+    motion = similarity((0.4, -0.2, 0.3), TURN)
+    gdf = transform(scene, whole_scene(scene), motion, "moved")
+    part = Motion(*(share * value for value in vars(motion).values()))
+    camera = front_camera(64, 48, 50.0)
+    seen = picture(at(scene, gdf, share), BLACK, moved_camera(camera, scene.means.double().mean(0), part))
+    # colors that did not turn with it would be off by more than a tenth
+    assert float((seen - picture(scene, BLACK, camera)).square().mean().sqrt()) < ROUNDING
+
+
+def test_a_turn_goes_along_an_arc_even_all_the_way_round() -> None:
+    scene = scene_of()
+    region = left_half(scene)
+    gdf = transform(scene, region, similarity(turn=(0.0, 2 * math.pi, 0.0)), "round")
+    means = scene.means[region.members]
+    center = means.mean(dim=0)
+    radius = (means - center)[:, [0, 2]].norm(dim=1)
+    for s in (0.11, 0.25, 0.5, 0.77):
+        now = at(scene, gdf, s).means[region.members] - center
+        assert float((now[:, [0, 2]].norm(dim=1) - radius).abs().max()) < 0.01 * float(radius.max())
+    half = at(scene, gdf, 0.5).means[region.members] - center
+    assert torch.allclose(half[:, 0], -(means - center)[:, 0], atol=0.01)
+
+
+def test_a_copy_in_place_is_the_region_twice() -> None:
+    scene = scene_of()
+    region = left_half(scene)
+    gdf = duplicate(scene, region, similarity(), "twice")
+    end = at(scene, gdf, 1.0)
+    assert len(end) == len(scene) + len(region)
+    for name in ATTRIBUTES:
+        added, original = getattr(end, name)[len(scene) :], getattr(scene, name)[region.members]
+        assert (
+            torch.allclose(added, original, atol=1e-3)
+            if name == "logit_opacities"
+            else torch.equal(added, original)
+        )
+
+
+def test_copies_go_where_the_motion_takes_the_region_itself() -> None:
+    scene = scene_of(degree=3)
+    region, motion = left_half(scene), similarity((0.2, 0.1, 0.0), TURN, 1.3)
+    copy = duplicate(scene, region, motion, "copy").added
+    assert copy is not None
+    moved = bake(scene, [Step("transform", region, motion)])[region.members]
+    assert torch.equal(copy.means, moved.means)
+    assert torch.equal(copy.shN, moved.shN)
+
+
+def test_what_is_baked_is_the_slider_at_its_end() -> None:
+    scene = scene_of(degree=3)
+    left = left_half(scene)
+    low = from_mask("low", scene.means[:, 1] > 0.4)
+    steps = [
+        Step("transform", left, similarity(turn=TURN, scale=0.7)),
+        Step("duplicate", left, similarity((0.0, 0.0, 1.0))),
+        Step("remove", low),
+    ]
+    end, baked = at(scene, tidy(scene, steps, "all"), 1.0), bake(scene, steps)
+    drawn = end[end.opacities >= ALPHA_MIN]
+    kept = baked[baked.opacities >= ALPHA_MIN]
+    assert len(drawn) == len(kept)
+    assert torch.allclose(pack(drawn, True), pack(kept, True), atol=ROUNDING)
+
+
+def test_an_edit_that_only_adds_is_a_file_like_any_other(tmp_path: Path) -> None:
+    scene = scene_of()
+    gdf = duplicate(scene, left_half(scene), similarity((1.0, 0.0, 0.0)), "copy")
+    save_gdf(tmp_path / "copy.gdf", gdf)
+    again = load_gdf(tmp_path / "copy.gdf", scene)
+    for s in (0.0, 0.4, 1.0):
+        assert torch.equal(pack(at(scene, again, s), True), pack(at(scene, gdf, s), True))
+
+
+@pytest.fixture
+def ply(tmp_path: Path) -> Path:
+    save_ply(tmp_path / "scene.ply", scene_of())
+    return tmp_path / "scene.ply"
+
+
+LEFT = "box:-9,-9,-9,0,9,9"
+
+
+def test_the_command_deletes_and_copies_for_good(ply: Path, tmp_path: Path) -> None:
+    scene = load_ply(ply)
+    out = tmp_path / "out.ply"
+    assert main(["edit", str(ply), "--delete", LEFT, "--duplicate", f"all-{LEFT}:2,0,0", "-o", str(out)]) == 0
+    rest = scene[scene.means[:, 0] > 0]
+    edited = load_ply(out)
+    assert torch.equal(edited.means[: len(rest)], rest.means)
+    assert torch.allclose(edited.means[len(rest) :], rest.means + torch.tensor([2.0, 0.0, 0.0]))
+
+
+def test_the_command_writes_a_slider(ply: Path, tmp_path: Path) -> None:
+    out = tmp_path / "turned.gdf"
+    arguments = ["--rotate", f"{LEFT}:y,90", "--scale", f"{LEFT}:2", "--move", f"{LEFT}:0,-1,0"]
+    assert main(["edit", str(ply), *arguments, "-o", str(out)]) == 0
+    scene = load_ply(ply)
+    gdf = load_gdf(out, scene)
+    means, rows = at(scene, gdf, 1.0).means[gdf.region.members], scene.means[gdf.region.members]
+    arm = rows - rows.mean(dim=0)
+    expected = (
+        rows.mean(dim=0) + 2 * torch.stack([arm[:, 2], arm[:, 1], -arm[:, 0]], 1) + torch.tensor([0, -1.0, 0])
+    )
+    assert torch.allclose(means, expected, atol=ROUNDING)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        [],
+        ["--delete", ""],
+        ["--delete", "nothing"],
+        ["--delete", "box:5,5,5,6,6,6"],
+        ["--delete", "all"],
+        ["--move", "1,0,0"],
+        ["--move", ":1,0,0"],
+        ["--move", "all"],
+        ["--move", "all:1,0"],
+        ["--move", "all:nan,0,0"],
+        ["--move", "all:1e30,0,0"],
+        ["--move", "sphere:0,0,0,1"],
+        ["--rotate", "all:w,90"],
+        ["--rotate", "all:0,0,0,90"],
+        ["--rotate", "all:y,1e9"],
+        ["--rotate", "all:y"],
+        ["--scale", "all:0"],
+        ["--scale", "all:-1"],
+        ["--scale", "all:1e9"],
+        ["--scale", "labels:x.npy:3"],
+        ["--duplicate", "masks:nowhere:1,0,0"],
+    ],
+)
+def test_what_cannot_be_is_one_line_and_writes_nothing(
+    ply: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str]
+) -> None:
+    out = tmp_path / "out.ply"
+    assert main(["edit", str(ply), *arguments, "-o", str(out)]) == 2
+    assert len(capsys.readouterr().err.strip().splitlines()) == 1
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("options", [["--clean", "-o", "a.gdf"], ["--delete", LEFT, "-o", "a.spz"]])
+def test_an_output_that_does_not_fit_is_refused(
+    ply: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    options: list[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["edit", str(ply), *options]) == 2
+    assert len(capsys.readouterr().err.strip().splitlines()) == 1
