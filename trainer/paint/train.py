@@ -11,11 +11,9 @@ from scipy import ndimage
 from torch import Tensor
 
 from progdf.camera import Camera
-from progdf.compose.layers import Layer
-from progdf.compose.reference import compose_layers
 from progdf.errors import ProgdfError
 from progdf.field.course import course_field, opacity_course
-from progdf.gaussians import Gaussians, pack
+from progdf.gaussians import Gaussians, pack, unpack
 from progdf.gdf.file import Gdf, fingerprint
 from progdf.metrics.image import psnr
 from progdf.quaternions import rotate_vectors
@@ -24,7 +22,7 @@ from trainer.editors.decal import DecalEditor
 from trainer.views.view import BACKGROUND, make_view, render_view
 
 from .discs import DISC_LOGIT, Discs, Paint, faint, place_discs
-from .solve import solve_colors
+from .solve import join, solve_colors
 
 RING = 15
 """Pixels around the paint that must stay as they are."""
@@ -100,7 +98,7 @@ def train_decal(editor: DecalEditor, scene: Gaussians, name: str) -> Painted:
     """
     paint = editor.paint
     gdf, discs = paint_gdf(scene, paint, name)
-    edited, background = compose_layers(scene, [Layer(gdf, 1.0)]), torch.tensor(BACKGROUND)
+    edited, background = finished_scene(scene, gdf), torch.tensor(BACKGROUND)
     expected, shown, turned = list[Tensor](), list[Tensor](), dict[str, float | None]()
     pivot = _middle(discs)
     for degrees in TURNS:
@@ -125,6 +123,15 @@ def train_decal(editor: DecalEditor, scene: Gaussians, name: str) -> Painted:
     return Painted(gdf, figures, expected, shown)
 
 
+def finished_scene(scene: Gaussians, gdf: Gdf) -> Gaussians:
+    """The scene as the edit's field has it at strength 1, the added rows after its own."""
+    if gdf.added is None:
+        raise ValueError(f"{gdf.name} adds nothing")
+    end, members = gdf.field.offsets(1.0), gdf.region.members
+    moved = scene.replace_rows(members, pack(scene[members]) + end[: len(members)])
+    return join(moved, unpack(pack(gdf.added) + end[len(members) :], gdf.added.shN))
+
+
 def _middle(discs: Discs) -> Tensor:
     """The added row that lies nearest to the median of all. [3]"""
     means = discs.added.means
@@ -137,6 +144,6 @@ def orbit(camera: Camera, pivot: Tensor, degrees: float) -> Camera:
     axis, half = c2w[:3, 1], 0.5 * math.radians(degrees)
     turn = torch.cat([torch.tensor([math.cos(half)]).double(), math.sin(half) * axis])
     turned = torch.eye(4, dtype=torch.float64)
-    turned[:3, :3] = rotate_vectors(c2w[:3, :3].T, turn).T
+    turned[:3, :3] = rotate_vectors(c2w[:3, :3].T, turn[None]).T
     turned[:3, 3] = pivot.double() + rotate_vectors(c2w[:3, 3] - pivot.double(), turn)
     return replace(camera, viewmat=torch.linalg.inv(turned).float(), name=f"decal{degrees:+.0f}")

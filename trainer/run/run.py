@@ -25,7 +25,7 @@ from progdf.io.picture_camera import find_picture_camera
 from progdf.rasterize.engines import get_engine
 from progdf.region import Region
 from progdf.scene.regions import check_region, parse_region
-from progdf.terminal import file_size, format_count, group_digits
+from progdf.terminal import file_size, group_digits
 from trainer.editors import (
     COLOR_FUNCTIONS,
     COSTLY_STRENGTHS,
@@ -310,10 +310,11 @@ def _paint(
     }
     write_image(folder.picture, contact_sheet(rows, ["projected", "the edit"], labels, title, notes=notes))
     write_json(folder.report, report | rest)
+    added, pixels, moved = (group_digits(figures[name]) for name in ("added", "pixels", "moved"))
     log.say(
-        f"{format_count(figures['added'], 'Gaussian')} added for {group_digits(figures['pixels'])} painted pixels, "
-        f"{group_digits(figures['moved'])} moved behind them; {own} dB in the decal's own view, {figures['ring']} dB "
-        f"in the {RING} pixels around it, {turned['-30']} and {turned['+30']} dB from 30° to its sides"
+        f"{added} Gaussians added for {pixels} painted pixels, {moved} of the scene moved behind them; "
+        f"{own} dB in the decal's own view, {figures['ring']} dB in the {RING} pixels around it, "
+        f"{turned['-30']} and {turned['+30']} dB from 30° to its sides"
     )
     log.say(f"wrote {path}: {file_size(size)}")
     return RunResult(folder, path, report | rest, None)
