@@ -205,6 +205,7 @@ def _check_editor_options(editor: EditorOptions, optimize: OptimizeOptions) -> N
         (("edit_size",), ("style", "instruct")),
         (("fill",), ("remove", "pictures")),
         (("removal",), ("pictures",)),
+        (("at", "camera"), ("decal",)),
     ):
         for name in names:
             if getattr(editor, name) != getattr(EditorOptions, name) and editor.family not in kinds:

@@ -12,6 +12,7 @@ from trainer.options import EditorOptions
 from trainer.views.view import View
 
 from .base import ImageEditor, Painter
+from .decal import check_decal, decal
 from .instruct import check_instruct, instruct
 from .pictures import folder, folder_of, photograph_folders, photographs, picture_paths, pictures
 from .procedural import darken, night, paint_of, recolor, remove, stops_of, stripes, tint
@@ -28,6 +29,7 @@ EDITORS: dict[str, Factory] = {
     "folder": folder,
     "photographs": photographs,
     "pictures": pictures,
+    "decal": decal,
     "style": style,
     "instruct": instruct,
     "remove": remove,
@@ -59,6 +61,7 @@ EXAMPLES = (
     "folder:DIR",
     "photographs:EDITED,ORIGINALS",
     "pictures:A.png,B.png",
+    "decal:LOGO.png",
     "style:14",
     "remove",
 )
@@ -92,6 +95,8 @@ def check_new_editor(options: EditorOptions) -> None:
     kind, what = check_editor(options.editor)
     if kind == "instruct":
         check_instruct(what, options)
+    if kind == "decal":
+        check_decal(what, options)
     if kind in CHECKS:
         CHECKS[kind](what)
 

@@ -199,6 +199,7 @@ def picture_digests(plan: TrainOptions) -> dict[str, str]:
     """The changed pictures that a plan names, those of further strengths among them, and their hashes."""
     paths = [path for given in plan.views.pictures for path in strengths_of(given).values()]
     paths += [plan.editor.anchor] if plan.editor.anchor is not None else []
+    paths += [Path(plan.editor.editor.partition(":")[2])] if plan.editor.family == "decal" else []
     return {str(path.resolve()): _digest(path) for path in paths}
 
 

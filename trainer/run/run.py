@@ -19,12 +19,13 @@ from progdf.gaussians import BASE_CHANNELS, ZERO, Gaussians
 from progdf.gdf.file import save_gdf
 from progdf.io.atomic import read_file
 from progdf.io.cameras import load_cameras, save_cameras
-from progdf.io.images import read_picture
+from progdf.io.images import contact_sheet, read_picture, write_image
 from progdf.io.json_values import plain
 from progdf.io.picture_camera import find_picture_camera
 from progdf.rasterize.engines import get_engine
 from progdf.region import Region
 from progdf.scene.regions import check_region, parse_region
+from progdf.terminal import file_size, group_digits
 from trainer.editors import (
     COLOR_FUNCTIONS,
     COSTLY_STRENGTHS,
@@ -35,6 +36,7 @@ from trainer.editors import (
     make_editor,
 )
 from trainer.editors.base import ImageEditor
+from trainer.editors.decal import DecalEditor
 from trainer.editors.instruct import InstructEditor
 from trainer.editors.pictures import FolderEditor, picture_cameras
 from trainer.fit.draft import draft_grade, draft_views
@@ -44,6 +46,7 @@ from trainer.fit.slider_uniformity import equalized_strengths
 from trainer.optimize.losses import Perceptual, describe_loss, perceptual_loss
 from trainer.optimize.retime import resolve_slider
 from trainer.options import MOST_STAGES, EditKind, OptimizeOptions, TrainOptions
+from trainer.paint.train import RING, TURNS, train_decal
 from trainer.regions.from_pictures import RegionRequest, region_checks, region_kinds
 from trainer.report.agreement import measure_agreement
 from trainer.resolve import recorded_options, resolve, resolve_kind
@@ -66,6 +69,7 @@ from trainer.store.run_folder import (
     open_run_folder,
     read_views,
     remove_stale_views,
+    write_json,
     write_views,
 )
 from trainer.store.state import interrupt_on_signals
@@ -174,6 +178,10 @@ def train(options: TrainOptions, quiet: bool = False, shared: Shared | None = No
         try:
             for note in (*session.notes, *notes):
                 log.say(note)
+            if options.editor.family == "decal":  # takes seconds: what was stopped or is there is done again
+                result = _paint(options, scene, region, folder, log)
+                folder.state.end()
+                return result
             if session.does == "nothing":
                 return load_result(folder, options.name, scene, log)
             use_threads(session.threads)
@@ -262,6 +270,57 @@ def _run_training(
     trajectory, _, about = load_trajectory(folder.trajectory)
     begun = folder.state.load(NETWORK)
     return finish_run(folder, setup, trajectory, read_record(about), perceptual, log, begun)
+
+
+def _paint(
+    options: TrainOptions, scene: Gaussians, region: Region, folder: RunFolder, log: RunLog
+) -> RunResult:
+    """A decal: laid on, measured, and written as any run is, but for a trajectory."""
+    with log.stage("edit"):
+        editor = make_editor(options.editor, scene, region, ())
+    if not isinstance(editor, DecalEditor):
+        raise TypeError(f"{options.editor.editor} paints nothing")
+    view = editor.view
+    with log.stage("fit"):
+        painted = train_decal(editor, scene, options.name)
+    given = plain(recorded_options(options))
+    gdf, figures = replace(painted.gdf, instruction=options.editor.editor), painted.figures
+    own, turned = figures["own"], figures["turned"]
+    report = {"edit": {"psnr_to_views": own}, "paint": figures}
+    path = folder.gdf(options.name)
+    save_gdf(path, replace(gdf, report=report))
+    name = view.camera.name
+    save_cameras(folder.cameras, [view.camera], scene.origin)
+    middle = TURNS.index(0)
+    mask = view.mask[..., None].expand(-1, -1, 3)
+    pictures = {"original": view.image, "mask": mask, "edited": painted.expected[middle]}
+    for kind, picture in (pictures | {"final": painted.shown[middle]}).items():
+        write_views(folder, kind, {name: picture})
+    rows, labels = (
+        [painted.expected, painted.shown],
+        [f"{degrees:+d}°" if degrees else "0°" for degrees in TURNS],
+    )
+    title = f"{options.name}: {options.editor.editor}"
+    notes = [[], [f"{error} dB" if error is not None else "" for error in turned.values()]]
+    size = path.stat().st_size
+    rest = {
+        "views": {"held_out": False, "edit": [name]},
+        "file": {"bytes": size, "bytes_per_gaussian": round(size / max(1, gdf.members), 1)},
+        "time": log.rounded_seconds(),
+        "memory_mb": log.memory.peak(),
+        "plan": given,
+        "pictures": picture_digests(options),
+    }
+    write_image(folder.picture, contact_sheet(rows, ["projected", "the edit"], labels, title, notes=notes))
+    write_json(folder.report, report | rest)
+    added, pixels, moved = (group_digits(figures[name]) for name in ("added", "pixels", "moved"))
+    log.say(
+        f"{added} Gaussians added for {pixels} painted pixels, {moved} of the scene moved behind them; "
+        f"{own} dB in the decal's own view, {figures['ring']} dB in the {RING} pixels around it, "
+        f"{turned['-30']} and {turned['+30']} dB from 30° to its sides"
+    )
+    log.say(f"wrote {path}: {file_size(size)}")
+    return RunResult(folder, path, report | rest, None)
 
 
 def _write_draft(

@@ -1,0 +1,251 @@
+"""Paint that is finer than the Gaussians, on a wall made here: a plane of large, soft, thick Gaussians."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from progdf.camera import Camera, intrinsics, look_at
+from progdf.compose.layers import Layer
+from progdf.compose.reference import compose_layers
+from progdf.errors import ProgdfError
+from progdf.gaussians import Gaussians
+from progdf.gdf.file import load_gdf, save_gdf
+from progdf.io.cameras import save_cameras
+from progdf.metrics.image import psnr
+from progdf.rasterize import render
+from progdf.region import whole_scene
+from tests.helpers.edits import bits
+from trainer.editors.decal import DecalEditor, decal, parse_place
+from trainer.options import EditorOptions
+from trainer.paint.discs import Paint, merge_pixels, place_discs
+from trainer.paint.train import finished_scene, orbit, paint_gdf, train_decal
+from trainer.views.view import BACKGROUND
+
+SIDE = 128
+CAMERA = Camera(
+    look_at(torch.tensor([0.0, 0.0, -3.0]), torch.zeros(3), torch.tensor([0.0, -1.0, 0.0])),
+    intrinsics(math.radians(45), SIDE, SIDE),
+    SIDE,
+    SIDE,
+    near=0.01,
+)
+
+
+def wall(seed: int = 0, count: int = 2500) -> Gaussians:
+    """A wall across the picture, whose Gaussians are 5 pixels large and lie up to 6 before and behind it."""
+    random = torch.Generator().manual_seed(seed)
+    means = torch.rand(count, 3, generator=random) * torch.tensor([3.2, 3.2, 0.0]) - torch.tensor(
+        [1.6, 1.6, 0.0]
+    )
+    means[:, 2] = 0.05 * torch.randn(count, generator=random).clamp(-2, 2)
+    scales = torch.tensor([0.09, 0.09, 0.02]) * (0.7 + 0.6 * torch.rand(count, 3, generator=random))
+    colors = 0.6 + 0.05 * torch.randn(count, 3, generator=random)
+    return Gaussians(
+        means,
+        torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
+        scales.log(),
+        torch.full((count,), 0.5),
+        colors,
+        torch.zeros(count, 3, 3),
+    )
+
+
+def picture(scene: Gaussians) -> torch.Tensor:
+    return render(scene, CAMERA, BACKGROUND).image.clamp(0.0, 1.0)
+
+
+def letters(scene: Gaussians) -> Paint:
+    """Bars of five pixels in dark blue, as wide as what is between them, in the middle of the wall."""
+    painted = torch.zeros(SIDE, SIDE, dtype=torch.bool)
+    for left in range(45, 85, 10):
+        painted[50:78, left : left + 5] = True
+    image = torch.where(painted[..., None], torch.tensor([0.1, 0.15, 0.5]), picture(scene))
+    return Paint(CAMERA, image, painted)
+
+
+def put(folder: Path, image: np.ndarray) -> EditorOptions:
+    """A decal of this RGBA picture in the middle of the wall."""
+    Image.fromarray(image).save(folder / "logo.png")
+    save_cameras(folder / "camera.json", [CAMERA])
+    return EditorOptions(f"decal:{folder / 'logo.png'}", at="64,64,40", camera=folder / "camera.json")
+
+
+def make(options: EditorOptions, scene: Gaussians) -> DecalEditor:
+    return decal(options.editor.partition(":")[2], scene, whole_scene(scene), (), options)
+
+
+def test_letters_finer_than_the_gaussians_are_as_sharp_as_they_were_painted() -> None:
+    scene = wall()
+    paint = letters(scene)
+    gdf, _ = paint_gdf(scene, paint, "letters")
+    made = picture(compose_layers(scene, [Layer(gdf, 1.0)]))
+    # a recolor of Gaussians of 5 pixels leaves more than half of the change: below 18 dB
+    assert psnr(made, paint.picture, paint.painted) > 34.0
+    near = torch.zeros_like(paint.painted)
+    near[36:92, 34:92] = True
+    assert psnr(made, paint.picture, near & ~paint.painted) > 40.0
+
+
+def test_strength_zero_is_the_original_bit_for_bit_and_nothing_outside_the_region_changes() -> None:
+    scene = wall()
+    gdf, discs = paint_gdf(scene, letters(scene), "letters")
+    start = compose_layers(scene, [Layer(gdf, 0.0)])
+    assert bits(start[: len(scene)]) == bits(scene)
+    assert torch.equal(picture(start), picture(scene))
+    finished = compose_layers(scene, [Layer(gdf, 1.0)])
+    outside = torch.ones(len(scene), dtype=torch.bool).index_fill(0, discs.moved, False)
+    assert bits(finished[: len(scene)][outside]) == bits(scene[outside])
+    assert bits(finished) == bits(finished_scene(scene, gdf))
+
+
+def test_half_of_the_paint_is_there_at_half_the_slider() -> None:
+    scene = wall()
+    paint = letters(scene)
+    gdf, _ = paint_gdf(scene, paint, "letters")
+    half = picture(compose_layers(scene, [Layer(gdf, 0.5)]))
+    before, change = picture(scene), paint.picture - picture(scene)
+    share = ((half - before) * change)[paint.painted].sum() / change[paint.painted].square().sum()
+    assert 0.35 < float(share) < 0.65  # discs overlap, so that less than half covers less than half
+
+
+def test_what_moves_back_keeps_its_outline_in_the_painted_view() -> None:
+    scene = wall()
+    discs = place_discs(scene, letters(scene), 0.02)
+    assert len(discs.moved) > 0
+    row = discs.moved[:1]
+    before, after = (render(some[row], CAMERA, (0.0, 0.0, 0.0)).image for some in (scene, discs.scene))
+    assert float((before - after).abs().max()) < 1e-4  # float32 of both
+
+
+def test_an_untouched_picture_and_paint_beyond_the_silhouette_add_nothing() -> None:
+    scene = wall()
+    nothing = torch.zeros(SIDE, SIDE, dtype=torch.bool)
+    assert not len(place_discs(scene, Paint(CAMERA, picture(scene), nothing), 0.02).added)
+    small = scene[(scene.means[:, 0] < -1.0).nonzero()[:, 0]]
+    beyond = torch.zeros(SIDE, SIDE, dtype=torch.bool)
+    beyond[60:70, 90:110] = True
+    discs = place_discs(small, Paint(CAMERA, picture(small), beyond), 0.02)
+    assert not len(discs.added)
+    assert discs.scene is small
+    with pytest.raises(ProgdfError, match="opaque"):
+        paint_gdf(small, Paint(CAMERA, picture(small), beyond), "beyond")
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_every_pixel_is_in_one_rectangle_and_flat_paint_needs_few(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    mask = np.zeros((200, 220), bool)
+    top, left = random.integers(5, 20, 2)
+    mask[top : top + 160, left : left + 176] = True
+    flat = np.full((200, 220, 3), 0.4, np.float32)
+    cells = merge_pixels(flat, mask, 0.02)
+    covered = np.zeros(mask.shape, int)
+    for x, y, width, height in cells:
+        covered[
+            round(y - height / 2) : round(y + height / 2), round(x - width / 2) : round(x + width / 2)
+        ] += 1
+    assert (covered == mask).all()
+    assert len(cells) <= 0.015 * mask.sum()
+    noise = random.random((200, 220, 3)).astype(np.float32)
+    assert len(merge_pixels(noise, mask, 0.02)) == mask.sum()
+
+
+def test_paint_is_not_seen_through_a_thin_thing_from_behind() -> None:
+    scene = replace(wall(), means=wall().means * torch.tensor([1.0, 1.0, 0.3]))
+    paint = letters(scene)
+    gdf, _ = paint_gdf(scene, paint, "letters")
+    back = orbit(CAMERA, torch.zeros(3), 180.0)
+    before, after = (
+        render(some, back, BACKGROUND).image.clamp(0, 1) for some in (scene, finished_scene(scene, gdf))
+    )
+    shown = torch.zeros(SIDE, SIDE, dtype=torch.bool)
+    shown[50:78, 45:80] = True
+    assert psnr(after, before, shown) > 24.0  # the bars themselves are 12 dB away from the wall
+
+
+def test_a_decal_lies_on_the_surface_from_the_sides_too(tmp_path: Path) -> None:
+    scene = wall()
+    logo = np.zeros((32, 32, 4), np.uint8)
+    logo[:, :, :] = (200, 30, 40, 255)
+    logo[8:24, 8:24] = (250, 240, 90, 255)
+    painted = train_decal(make(put(tmp_path, logo), scene), scene, "logo")
+    assert painted.figures["own"] > 31.0
+    assert min(painted.figures["turned"][degrees] for degrees in ("-30", "+30")) > 24.0
+    save_gdf(tmp_path / "logo.gdf", painted.gdf)
+    assert bits(load_gdf(tmp_path / "logo.gdf", scene).added) == bits(painted.gdf.added)
+
+
+def test_transparency_leaves_the_scene_as_it_is(tmp_path: Path) -> None:
+    scene = wall()
+    logo = np.full((30, 30, 4), 255, np.uint8)
+    logo[:, 15:, 3] = 0
+    editor = make(put(tmp_path, logo), scene)
+    assert not bool(editor.paint.painted[:, 70:].any())
+    assert bool(editor.paint.painted[:, 50:60].any())
+    logo[..., 3] = 0
+    with pytest.raises(ProgdfError, match="all transparent"):
+        make(put(tmp_path, logo), scene)
+
+
+def test_an_angle_turns_a_decal_counterclockwise(tmp_path: Path) -> None:
+    scene = wall()
+    logo = np.full((20, 40, 4), (0, 0, 0, 255), np.uint8)
+    logo[:, 20:] = (255, 0, 0, 255)
+    options = replace(put(tmp_path, logo), at="64,64,40,90")
+    red = make(options, scene).drawn[..., 0]
+    assert float(red[:60].sum()) > 100.0
+    assert float(red[68:].sum()) < 1.0
+
+
+def test_a_place_is_in_pixels_or_in_shares() -> None:
+    wide = replace(CAMERA, width=2 * SIDE)
+    assert parse_place("64,32,40", wide) == parse_place("0.25,0.25,0.15625", wide)
+
+
+@pytest.mark.parametrize(
+    "at",
+    [
+        "",
+        "1",
+        "1,2",
+        "a,b,c",
+        "1,2,3,4,5",
+        "nan,1,1",
+        "64,64,0",
+        "64,64,-3",
+        "900,64,10",
+        "64,64,1e9",
+        "inf,0,1",
+    ],
+)
+def test_a_place_that_is_none_is_one_line(at: str) -> None:
+    with pytest.raises(ProgdfError, match="--at") as raised:
+        parse_place(at, CAMERA)
+    assert "\n" not in str(raised.value)
+
+
+def test_a_decal_that_is_no_picture_or_has_no_camera_is_one_line(tmp_path: Path) -> None:
+    from trainer.editors import check_new_editor
+
+    good = put(tmp_path, np.full((8, 8, 4), 255, np.uint8))
+    (tmp_path / "broken.png").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(64))
+    save_cameras(tmp_path / "two.json", [CAMERA, replace(CAMERA, name="b")])
+    bad = (
+        replace(good, editor="decal:"),
+        replace(good, editor=f"decal:{tmp_path / 'none.png'}"),
+        replace(good, editor=f"decal:{tmp_path / 'broken.png'}"),
+        replace(good, camera=None),
+        replace(good, camera=tmp_path / "two.json"),
+    )
+    check_new_editor(good)
+    for options in bad:
+        with pytest.raises(ProgdfError) as raised:
+            check_new_editor(options)
+        assert "\n" not in str(raised.value)
