@@ -284,7 +284,8 @@ def _paint(
     with log.stage("fit"):
         painted = train_decal(editor, scene, options.name)
     given = plain(recorded_options(options))
-    gdf, figures = replace(painted.gdf, instruction=options.editor.editor), painted.figures
+    decal = f"decal:{Path(options.editor.editor.partition(':')[2]).name}"
+    gdf, figures = replace(painted.gdf, instruction=decal), painted.figures
     own, turned = figures["own"], figures["turned"]
     report = {"edit": {"psnr_to_views": own}, "paint": figures}
     path = folder.gdf(options.name)
