@@ -35,13 +35,14 @@ DISC_LOGIT = 4.0
 
 _GROWN = 2  # pixels around the paint that discs keep as they are: what is drawn behind them was moved
 _SIDES = (16, 8, 4, 2, 1)  # of the rectangles of pixels that share a disc
-_SPREAD, _MERGED_SPREAD = 0.36, 0.6  # standard deviation of a disc in its sides: of a pixel, of more
+_SPREAD, _MERGED_SPREAD = 0.28, 0.6  # standard deviation of a disc in its sides: of a pixel, of more
 _BACK, _MERGED_BACK = 0.9, 0.4  # pixels by which discs lie deeper, as nearer neighbors cover them; of more
 _THIN = 0.1  # pixels: the standard deviation across
 _STEEP = 0.3  # cosine below which a disc is turned no further
 _MEDIAN, _SMOOTH, _SAME = 9, 3.0, 4.0  # pixels, of depths; how far both may be apart on one surface
 _LEAST_LIGHT = 0.005  # of a pixel, below which what a Gaussian takes before a disc does not matter
 _REACH = 4.0  # standard deviations of the light's depths, within which a Gaussian is of the surface
+_CLEARED = 12  # times, at most, that what lies before the discs is moved behind them
 _GAP = 1.0  # pixels between a disc and what is moved behind it
 
 
@@ -88,8 +89,14 @@ def place_discs(scene: Gaussians, paint: Paint, flat: float) -> Discs:
         origin=scene.origin,
     )
     pixel = float(np.median(depths)) / float(camera.K[0, 0])
-    moved, factors = _rows_before(scene, camera, surface + (_BACK + _MERGED_BACK + _GAP) * pixel, mask)
-    return Discs(added, cells, moved, _move_back(scene, camera, moved, factors))
+    behind, thick = surface + (_BACK + _MERGED_BACK + _GAP) * pixel, _thickness(scene, camera, mask)
+    cleared, moved = scene, torch.zeros(len(scene), dtype=torch.bool)
+    for _ in range(_CLEARED):  # what stood before others hid them
+        rows, factors = _rows_before(cleared, camera, behind, mask, _REACH * thick)
+        if not len(rows):
+            break
+        cleared, moved = _move_back(cleared, camera, rows, factors), moved.index_fill(0, rows, True)
+    return Discs(added, cells, moved.nonzero()[:, 0], cleared)
 
 
 def smooth_depth(depth: NDArray[np.float32], opaque: NDArray[np.bool_]) -> Array:
@@ -215,11 +222,11 @@ def _step(rays: Array, depth: Array, slope: Array, axis: int, focal: Array) -> A
 
 
 def _rows_before(
-    scene: Gaussians, camera: Camera, behind: Array, mask: NDArray[np.bool_]
+    scene: Gaussians, camera: Camera, behind: Array, mask: NDArray[np.bool_], reach: float
 ) -> tuple[Tensor, Tensor]:
     """Rows of the surface whose centers lie before the depths `behind` [H,W] of some pixels.
 
-    What lies farther before them than the surface is thick hides the paint, as it hides the surface.
+    What lies more than `reach` before them, world units, hides the paint as it hides the surface.
 
     Returns:
         Their indices, and by what their depth grows. [M] int64, [M]
@@ -237,20 +244,22 @@ def _rows_before(
     window = slice(box[1], box[3]), slice(box[0], box[2])
     short = behind[window].reshape(-1)[pixel] - depths[owner]
     before = mask[window].reshape(-1)[pixel] & (short > 0) & (runs.weights > _LEAST_LIGHT)
-    before &= short <= _REACH * _thickness(scene, camera, depths, mask)
+    before &= short <= reach
     needed = np.zeros(len(scene))
     np.maximum.at(needed, owner[before], short[before])
     moved = np.nonzero(needed)[0]
     return torch.from_numpy(moved), torch.from_numpy(1.0 + needed[moved] / depths[moved])
 
 
-def _thickness(scene: Gaussians, camera: Camera, depths: Array, mask: NDArray[np.bool_]) -> float:
+def _thickness(scene: Gaussians, camera: Camera, mask: NDArray[np.bool_]) -> float:
     """Typical standard deviation of the depths at which light is taken, world units, a pixel at least."""
-    z = torch.from_numpy(depths - np.median(depths)).float()
+    axis = camera.viewmat[2].double()
+    depths = scene.means.double() @ axis[:3] + axis[3]
+    z = (depths - depths.median()).float()
     colors = torch.stack([z, z.square(), torch.ones_like(z)], dim=1)
     mean, square, total = render(scene, camera, (0.0, 0.0, 0.0), colors=colors).image[mask].double().unbind(1)
     variance = square / total - (mean / total).square()
-    pixel = float(np.median(depths)) / float(camera.K[0, 0])
+    pixel = float(depths.median()) / float(camera.K[0, 0])
     return max(pixel, float(variance.clamp_min(0.0).sqrt().median()))
 
 

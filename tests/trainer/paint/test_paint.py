@@ -38,14 +38,14 @@ CAMERA = Camera(
 )
 
 
-def wall(seed: int = 0, count: int = 2500) -> Gaussians:
+def wall(seed: int = 0, count: int = 2500, size: float = 0.09, rough: float = 0.05) -> Gaussians:
     """A wall across the picture, whose Gaussians are 5 pixels large and lie up to 6 before and behind it."""
     random = torch.Generator().manual_seed(seed)
     means = torch.rand(count, 3, generator=random) * torch.tensor([3.2, 3.2, 0.0]) - torch.tensor(
         [1.6, 1.6, 0.0]
     )
-    means[:, 2] = 0.05 * torch.randn(count, generator=random).clamp(-2, 2)
-    scales = torch.tensor([0.09, 0.09, 0.02]) * (0.7 + 0.6 * torch.rand(count, 3, generator=random))
+    means[:, 2] = rough * torch.randn(count, generator=random).clamp(-2, 2)
+    scales = torch.tensor([size, size, 0.2 * size]) * (0.7 + 0.6 * torch.rand(count, 3, generator=random))
     colors = 0.6 + 0.05 * torch.randn(count, 3, generator=random)
     return Gaussians(
         means,
@@ -171,7 +171,7 @@ def test_paint_is_not_seen_through_a_thin_thing_from_behind() -> None:
 
 
 def test_a_decal_lies_on_the_surface_from_the_sides_too(tmp_path: Path) -> None:
-    scene = wall()
+    scene = wall(count=20_000, size=0.035, rough=0.01)
     logo = np.zeros((32, 32, 4), np.uint8)
     logo[:, :, :] = (200, 30, 40, 255)
     logo[8:24, 8:24] = (250, 240, 90, 255)
