@@ -43,7 +43,7 @@ _MEDIAN, _SMOOTH, _SAME = 9, 3.0, 4.0  # pixels, of depths; how far both may be 
 _LEAST_LIGHT = 0.005  # of a pixel, below which what a Gaussian takes before a disc does not matter
 _REACH = 4.0  # standard deviations of the light's depths, within which a Gaussian is of the surface
 _CLEARED = 12  # times, at most, that what lies before the discs is moved behind them
-_GAP = 1.0  # pixels between a disc and what is moved behind it
+_GAP = 4.0  # pixels between a disc and what is moved behind it, which is wide and seen from the sides too
 
 
 @dataclass(frozen=True)
@@ -89,10 +89,11 @@ def place_discs(scene: Gaussians, paint: Paint, flat: float) -> Discs:
         origin=scene.origin,
     )
     pixel = float(np.median(depths)) / float(camera.K[0, 0])
-    behind, thick = surface + (_BACK + _MERGED_BACK + _GAP) * pixel, _thickness(scene, camera, mask)
+    gap = (_BACK + _MERGED_BACK + _GAP) * pixel
+    reach = gap + _REACH * _thickness(scene, camera, mask)
     cleared, moved = scene, torch.zeros(len(scene), dtype=torch.bool)
     for _ in range(_CLEARED):  # what stood before others hid them
-        rows, factors = _rows_before(cleared, camera, behind, mask, _REACH * thick)
+        rows, factors = _rows_before(cleared, camera, surface + gap, mask, reach)
         if not len(rows):
             break
         cleared, moved = _move_back(cleared, camera, rows, factors), moved.index_fill(0, rows, True)
