@@ -25,7 +25,7 @@ from tests.helpers.edits import bits
 from trainer.editors.decal import DecalEditor, decal, parse_place
 from trainer.options import EditorOptions
 from trainer.paint.discs import Paint, merge_pixels, place_discs
-from trainer.paint.train import finished_scene, orbit, paint_gdf, train_decal
+from trainer.run.decal import finished_scene, orbit, paint_gdf, train_decal
 from trainer.views.view import BACKGROUND
 
 SIDE = 128
@@ -105,14 +105,14 @@ def test_strength_zero_is_the_original_bit_for_bit_and_nothing_outside_the_regio
     assert bits(finished) == bits(finished_scene(scene, gdf))
 
 
-def test_half_of_the_paint_is_there_at_half_the_slider() -> None:
+def test_paint_appears_in_the_middle_of_the_slider() -> None:
     scene = wall()
     paint = letters(scene)
     gdf, _ = paint_gdf(scene, paint, "letters")
     half = picture(compose_layers(scene, [Layer(gdf, 0.5)]))
     before, change = picture(scene), paint.picture - picture(scene)
     share = ((half - before) * change)[paint.painted].sum() / change[paint.painted].square().sum()
-    assert 0.35 < float(share) < 0.65  # discs overlap, so that less than half covers less than half
+    assert 0.3 < float(share) < 0.8  # what makes way stands before the discs up to about there, then behind
 
 
 def test_what_moves_back_keeps_its_outline_in_the_painted_view() -> None:
