@@ -7,11 +7,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from PIL import Image
-from scipy.interpolate import LinearNDInterpolator
+from scipy import ndimage
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
@@ -26,12 +28,15 @@ from trainer.options import EditKind, EditorOptions
 from trainer.paint.discs import OPAQUE, Paint, smooth_depth
 from trainer.views.view import BACKGROUND, View, make_view, with_near_plane
 
+Array = NDArray[np.float64]
+
 LEAST_ALPHA = 1 / 255
 """Below it nothing is painted."""
 
 _MOST_SIDE = 512  # pixels of a decal's longer side: of a larger one the view is shrunk
 _KNOTS = 20_000  # points of the surface, between which it is taken for flat where views are painted
 _IN_FRONT = 0.02  # of the depth, by which something may lie before the surface and be of it
+_NEWTON = 8  # steps of finding what a pixel shows
 _MARGIN = 4  # pixels around a decal in which its surface is looked at
 
 
@@ -183,16 +188,45 @@ class DecalEditor:
         ]
         if box[0] >= box[2] or box[1] >= box[3]:
             return result
-        back = LinearNDInterpolator(
-            np.stack([u[front], v[front]], axis=1), np.stack([x, y, depth], axis=-1)[front], fill_value=-1e6
-        )
         rows, columns = np.mgrid[box[1] : box[3], box[0] : box[2]] + 0.5
-        found = torch.from_numpy(back(columns, rows))
+        maps = np.stack([u, v, ux, uy, vx, vy, x, y, depth, front.astype(float)])
+        found = torch.from_numpy(_invert(maps, columns, rows))
         seen = render_depth(self.scene, camera).depth[box[1] : box[3], box[0] : box[2]]
         visible = found[..., 2] <= seen * (1.0 + _IN_FRONT)
         laid = _sample(self.drawn, found[..., 0], found[..., 1])
         result[box[1] : box[3], box[0] : box[2]] = laid * visible[..., None]
         return result
+
+
+def _invert(maps: Array, columns: Array, rows: Array) -> Array:
+    """What a grid of points shows at some pixels, by Newton's steps over the grid; far away where nothing is.
+
+    Args:
+        maps: where each point is seen, u and v; by how much these grow to the right and down: ux, uy, vx, vy;
+            three values and whether it counts. [10,I,J]
+        columns, rows: the pixels. [h,w] each
+
+    Returns:
+        [h,w,3]
+    """
+    u, v, front = maps[0], maps[1], maps[-1] > 0
+    size = np.array(u.shape)[:, None, None]
+    known = np.stack([u[front], v[front], np.ones(front.sum())], axis=1)
+    start = np.linalg.lstsq(known, np.stack(np.nonzero(front), axis=1).astype(float), rcond=None)[0]
+    at = np.moveaxis(np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ start, -1, 0)
+    for _ in range(_NEWTON):
+        at = at.clip(-0.5, size - 0.5)
+        u, v, ux, uy, vx, vy = (ndimage.map_coordinates(one, at, order=1, mode="nearest") for one in maps[:6])
+        right, down, area = columns - u, rows - v, ux * vy - uy * vx
+        area = np.where(np.abs(area) > 1e-9, area, 1e-9)
+        step = np.stack([ux * down - vx * right, vy * right - uy * down]) / area
+        at = at + step.clip(-0.1 * size, 0.1 * size)
+    at = at.clip(-0.5, size - 0.5)
+    values = np.stack([ndimage.map_coordinates(one, at, order=1, mode="nearest") for one in maps])
+    missed = np.hypot(values[0] - columns, values[1] - rows) > 0.5
+    return cast(
+        Array, np.where((missed | (values[-1] < 0.5))[..., None], -1e6, np.moveaxis(values[6:9], 0, -1))
+    )
 
 
 def decal(

@@ -2,7 +2,7 @@
 
 Splats are drawn in the order of their centers: a large Gaussian whose center is nearer than a disc covers it,
 although its own surface lies behind. Such a Gaussian is moved back along its ray and grows with the distance,
-which leaves its outline in the painted view as it is; see docs/method.md 9.
+which leaves its outline in the painted view as it is; see docs/method.md 3.
 """
 
 from __future__ import annotations
@@ -42,8 +42,9 @@ _STEEP = 0.3  # cosine below which a disc is turned no further
 _MEDIAN, _SMOOTH, _SAME = 9, 3.0, 4.0  # pixels, of depths; how far both may be apart on one surface
 _LEAST_LIGHT = 0.005  # of a pixel, below which what a Gaussian takes before a disc does not matter
 _REACH = 4.0  # standard deviations of the light's depths, within which a Gaussian is of the surface
+_SETTLED = 1e-3  # of the reach: nearer, a row that was moved is behind but for rounding
 _CLEARED = 12  # times, at most, that what lies before the discs is moved behind them
-_GAP = 1.0  # pixels between a disc and what is moved behind it
+_GAP = 4.0  # pixels between a disc and what is moved behind it, which is wide and seen from the sides too
 
 
 @dataclass(frozen=True)
@@ -89,10 +90,11 @@ def place_discs(scene: Gaussians, paint: Paint, flat: float) -> Discs:
         origin=scene.origin,
     )
     pixel = float(np.median(depths)) / float(camera.K[0, 0])
-    behind, thick = surface + (_BACK + _MERGED_BACK + _GAP) * pixel, _thickness(scene, camera, mask)
+    gap = (_BACK + _MERGED_BACK + _GAP) * pixel
+    reach = gap + _REACH * _thickness(scene, camera, mask)
     cleared, moved = scene, torch.zeros(len(scene), dtype=torch.bool)
     for _ in range(_CLEARED):  # what stood before others hid them
-        rows, factors = _rows_before(cleared, camera, behind, mask, _REACH * thick)
+        rows, factors = _rows_before(cleared, camera, surface + gap, mask, reach)
         if not len(rows):
             break
         cleared, moved = _move_back(cleared, camera, rows, factors), moved.index_fill(0, rows, True)
@@ -243,7 +245,7 @@ def _rows_before(
     pixel = np.repeat(runs.firsts.astype(np.int64), counts) + runs.pixels
     window = slice(box[1], box[3]), slice(box[0], box[2])
     short = behind[window].reshape(-1)[pixel] - depths[owner]
-    before = mask[window].reshape(-1)[pixel] & (short > 0) & (runs.weights > _LEAST_LIGHT)
+    before = mask[window].reshape(-1)[pixel] & (short > _SETTLED * reach) & (runs.weights > _LEAST_LIGHT)
     before &= short <= reach
     needed = np.zeros(len(scene))
     np.maximum.at(needed, owner[before], short[before])

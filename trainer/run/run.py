@@ -46,7 +46,6 @@ from trainer.fit.slider_uniformity import equalized_strengths
 from trainer.optimize.losses import Perceptual, describe_loss, perceptual_loss
 from trainer.optimize.retime import resolve_slider
 from trainer.options import MOST_STAGES, EditKind, OptimizeOptions, TrainOptions
-from trainer.paint.train import RING, TURNS, train_decal
 from trainer.regions.from_pictures import RegionRequest, region_checks, region_kinds
 from trainer.report.agreement import measure_agreement
 from trainer.resolve import recorded_options, resolve, resolve_kind
@@ -77,6 +76,7 @@ from trainer.views.crops import only_recolors
 from trainer.views.view import BACKGROUND, fit_size, make_view, render_view, with_near_plane
 
 from .agree import AgreedEditor, Easel, agree_views
+from .decal import RING, TURNS, train_decal
 from .finish import RunResult, end_rows, finish_run, load_evaluator, load_result
 from .kinds import Approach, choose_approach
 from .record import RunRecord, read_record

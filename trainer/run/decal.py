@@ -19,10 +19,9 @@ from progdf.metrics.image import psnr
 from progdf.quaternions import rotate_vectors
 from progdf.region import Region
 from trainer.editors.decal import DecalEditor
+from trainer.paint.discs import DISC_LOGIT, Discs, Paint, faint, place_discs
+from trainer.paint.solve import join, solve_colors
 from trainer.views.view import BACKGROUND, make_view, render_view
-
-from .discs import DISC_LOGIT, Discs, Paint, faint, place_discs
-from .solve import join, solve_colors
 
 RING = 15
 """Pixels around the paint that must stay as they are."""
