@@ -93,11 +93,6 @@ class EditorOptions:
     any program), decal:LOGO.png (laid on the surface), style:N (a painting, N from 0 to 25),
     instruct:"turn him into Batman", remove (the region is taken away; remove:A.png: as one of pictures: shows
     what was behind)."""
-    at: Annotated[str, absent_option("X,Y,SIZE[,ANGLE]", "none")] = ""
-    """decal: its center and its longer side in pixels of --camera's picture, or all three in shares of it;
-    then the degrees by which it is turned, counterclockwise."""
-    camera: Annotated[Path | None, absent_option("PNG|JSON", "none")] = None
-    """decal: from where it is laid on: a picture that progdf render wrote, or a file of one camera."""
     model: Annotated[str, absent_option("STR", "what is here and fits")] = ""
     """instruct: id or folder of a diffusers pipeline; by default black-forest-labs/FLUX.2-klein-4B where it
     was downloaded and fits the graphics card, else timbrooks/instruct-pix2pix (the paper's)."""
@@ -127,6 +122,11 @@ class EditorOptions:
     is what the scene shows without it."""
     seed: Fixed[int] = 0  # of the noise, the same in every view
     cache: Fixed[Path | None] = None  # folder in which painted pictures are kept; None keeps nothing
+    at: Annotated[str, absent_option("X,Y,SIZE[,ANGLE]", "none")] = ""
+    """decal: its center and its longer side in pixels of --camera's picture, or all three in shares of it;
+    then the degrees by which it is turned, counterclockwise."""
+    camera: Annotated[Path | None, absent_option("PNG|JSON", "none")] = None
+    """decal: from where it is laid on: a picture that progdf render wrote, or a file of one camera."""
 
     @property
     def family(self) -> str:
