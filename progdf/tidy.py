@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from progdf.field.baked import interpolate_at
-from progdf.field.course import course_field, opacity_course
+from progdf.field.separable import course_field, opacity_course
 from progdf.gaussians import Gaussians, attribute_slices, concatenate, pack
 from progdf.gdf.file import ADDED_LOGIT, Gdf, fingerprint
 from progdf.region import Region, from_mask

@@ -46,8 +46,8 @@ MOST_LINES = 600
 
 # What a package may hold: modules, and lines of code (no blank, comment, docstring or import). A feature
 # says in its commit what it adds and what it replaces; these only fall.
-BUDGETS = {"progdf": (79, 10604), "trainer": (70, 10443), "viewer": (69, 11447)}
-MOST_IMPORTS = 0.0733  # of all lines
+BUDGETS = {"progdf": (78, 10604), "trainer": (70, 10443), "viewer": (69, 11447)}
+MOST_IMPORTS = 0.073  # of all lines
 MOST_FUNCTION_LINES = 80
 MOST_POSITIONAL = 8
 LEAST_LINES = 80  # of a module that one other imports alone; it is a section of that one

@@ -134,7 +134,7 @@ def _read_steps(options: EditOptions) -> list[Callable[[Gaussians], Step]]:
             motion = read(numbers)
             if motion is None or not spec:
                 raise ProgdfError(
-                    f"'{shorten(text)}' does not end as it should; write --{name} REGION:{form}"
+                    f"'{shorten(text)}' has no usable numbers at its end; write --{name} REGION:{form}"
                 )
             makers.append(_maker("duplicate" if name == "duplicate" else "transform", spec, motion))
     makers += [_maker("remove", spec, None) for spec in options.delete]

@@ -35,8 +35,7 @@ from .baked import (
     lattice_side,
     remap_slider,
 )
-from .course import fit_course
-from .separable import quantize_bases
+from .separable import fit_course, quantize_bases
 
 MOST_COLOR = 1.5
 """Colors above this, which no screen shows, are mapped as this."""

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
-from progdf.field.course import course_field, opacity_course
+from progdf.field.separable import course_field, opacity_course
 from progdf.gaussians import Gaussians, pack, unpack
 from progdf.gdf.file import Gdf, fingerprint
 from progdf.metrics.image import psnr

@@ -16,7 +16,7 @@ from progdf.compose.composer import Composer
 from progdf.compose.reference import BLENDS, Gains, Layer, compose_layers
 from progdf.errors import ProgdfError
 from progdf.field import BakedField
-from progdf.field.course import course_field, opacity_course
+from progdf.field.separable import course_field, opacity_course
 from progdf.formats.ply import load_ply, save_ply
 from progdf.gaussians import ATTRIBUTES, Gaussians, attribute_slices
 from progdf.gdf.file import ADDED_LOGIT, Gdf, load_gdf, read_gdf, save_gdf
