@@ -18,6 +18,8 @@ from progdf.io.images import contact_sheet, write_image
 from progdf.io.json_values import plain
 from progdf.metrics.image import decibels
 from progdf.rasterize import render
+from progdf.region import Region, from_mask
+from progdf.scene.strays import find_strays
 from progdf.terminal import file_size, format_count
 from progdf.tidy import Step, tidy
 from trainer.editors.pictures import picture_background, picture_paths, read_edit, strengths_of
@@ -102,7 +104,11 @@ def remove_region(options: TrainOptions, setup: TrainingSetup, folder: RunFolder
         folder: of the run
         log: of the run
     """
-    scene, region, rest = setup.scene, setup.region, _without(setup)
+    scene, chosen = setup.scene, len(setup.region)
+    setup = replace(setup, region=with_crumbs(scene, setup.region))
+    region, rest = setup.region, _without(setup)
+    if len(region) > chosen:
+        log.say(f"{format_count(len(region) - chosen, 'Gaussian')} that would float alone without it go too")
     with log.stage("fill"):
         painted, pictures = _painted_views(options, setup)
         around = setup if not options.views.pictures else _views_around(options, setup)
@@ -142,6 +148,15 @@ def remove_region(options: TrainOptions, setup: TrainingSetup, folder: RunFolder
         }
         picture = _sheet(scene, gdf, judging, f"{options.name}: {options.editor.editor}")
     return _write(options, setup, folder, log, gdf, removed, report, picture)
+
+
+def with_crumbs(scene: Gaussians, region: Region) -> Region:
+    """The region, and the floaters that taking it away leaves of its surroundings; see `find_strays`."""
+    mask = torch.ones(len(scene), dtype=torch.bool)
+    mask[region.members] = False
+    alone = mask.nonzero()[:, 0][find_strays(scene[mask]).floaters]
+    mask[alone[~torch.isin(alone, torch.from_numpy(find_strays(scene).floaters))]] = False
+    return from_mask(region.name, ~mask)
 
 
 def _write(

@@ -19,7 +19,7 @@ from progdf.errors import ProgdfError
 from progdf.io.atomic import disk_full
 from progdf.io.json_values import convert_json, decode_json, plain
 from progdf.region import Region
-from trainer.editors.pictures import strengths_of
+from trainer.editors.pictures import picture_paths, strengths_of
 from trainer.options import MOST_THREADS, TrainOptions
 from trainer.resolve import recorded_options, resolve
 from trainer.run.record import upgrade_plan
@@ -199,7 +199,9 @@ def picture_digests(plan: TrainOptions) -> dict[str, str]:
     """The changed pictures that a plan names, those of further strengths among them, and their hashes."""
     paths = [path for given in plan.views.pictures for path in strengths_of(given).values()]
     paths += [plan.editor.anchor] if plan.editor.anchor is not None else []
-    paths += [Path(plan.editor.editor.partition(":")[2])] if plan.editor.family == "decal" else []
+    what = plan.editor.editor.partition(":")[2]
+    paths += [Path(what)] if plan.editor.family == "decal" else []
+    paths += picture_paths(what) if plan.editor.family == "remove" and what else []
     return {str(path.resolve()): _digest(path) for path in paths}
 
 

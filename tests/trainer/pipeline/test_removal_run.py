@@ -34,7 +34,8 @@ from trainer.options import (
     ViewOptions,
     with_values,
 )
-from trainer.run.removal import on_backgrounds
+from trainer.run.removal import on_backgrounds, with_crumbs
+from trainer.run.resume import picture_digests
 from trainer.run.run import train
 from trainer.setup import TrainingSetup, make_training_setup
 from trainer.views.view import render_view
@@ -233,6 +234,38 @@ def test_a_painted_picture_gives_the_hole_its_colors(scene_file: Path, tmp_path:
     made = compose_layers(scene, [Layer(load_gdf(result.gdf, scene), 1.0)])
     shown = render_view(made, view.camera, WHITE).clamp(0, 1)[hole]
     assert float((shown.median(dim=0).values - green).abs().max()) < 0.03
+
+
+def test_what_would_float_alone_without_the_region_goes_with_it(scene_file: Path, tmp_path: Path) -> None:
+    scene, rest, _ = case()
+    at = torch.tensor([[0.4, -0.4, 0.0], [0.0, -0.5, 0.4]])  # beside the post, high above the table
+    crumbs = splats(
+        at, at * torch.tensor([1.0, 0.0, 1.0]), 0.01, torch.tensor([[0.9, 0.2, 0.1]]).repeat(2, 1)
+    )
+    far = splats(torch.tensor([[0.0, -9.0, 0.0]]), torch.tensor([[0.0, 1.0, 0.0]]), 0.01, torch.ones(1, 3))
+    whole = concatenate([scene, crumbs, far])
+    region = from_mask(
+        "post", (torch.arange(len(whole)) >= len(rest)) & (torch.arange(len(whole)) < len(scene))
+    )
+    taken = with_crumbs(whole, region)
+    assert taken.members.tolist() == [*region.members.tolist(), len(scene), len(scene) + 1]
+    assert torch.equal(with_crumbs(scene, members_of(scene)).members, members_of(scene).members)
+    # what floats already is nobody's crumb
+    assert (
+        len(with_crumbs(concatenate([rest, far]), from_mask("none", torch.zeros(len(rest) + 1).bool()))) == 0
+    )
+
+
+def test_a_removal_with_another_picture_is_not_the_same_run(scene_file: Path, tmp_path: Path) -> None:
+    setup = case()[2]
+    picture = paint(
+        tmp_path / "A.png", render_view(case()[1], setup.train[0].camera, WHITE).clamp(0, 1), setup
+    )
+    options = options_of(scene_file, tmp_path / "run", f"remove:{picture}")
+    before = picture_digests(options)
+    paint(picture, render_view(case()[0], setup.train[0].camera, WHITE).clamp(0, 1), setup)
+    assert list(before) == [str(picture.resolve())]
+    assert picture_digests(options) != before
 
 
 @pytest.mark.parametrize(
