@@ -14,8 +14,7 @@ import tyro
 from tyro.conf import UseAppendAction
 
 from progdf.errors import ProgdfError
-from progdf.formats.ply import save_ply_checked
-from progdf.formats.scene_file import load_scene, scene_name
+from progdf.formats.scene_file import load_scene, save_scene, scene_name, written_format
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import save_gdf
 from progdf.io.atomic import check_not_an_input
@@ -70,10 +69,8 @@ def main(argv: Sequence[str]) -> int:
         raise ProgdfError(
             "nothing was asked for; say what to do with the scene, for example --clean or --delete REGION"
         )
-    if options.out.suffix.lower() != ".ply" and not makes_edit:
-        raise ProgdfError(
-            f"{options.out} is no .ply or .gdf file; give a new scene's name the end .ply, an edit's .gdf"
-        )
+    if not makes_edit:
+        written_format(options.out)
     if makes_edit and options.clean:
         raise ProgdfError("--clean has no slider; write a .ply, or leave --clean out")
     check_not_an_input(options.out, [options.scene])
@@ -87,7 +84,7 @@ def main(argv: Sequence[str]) -> int:
     edited = _clean(edited) if options.clean and len(edited) else edited
     if not len(edited):
         raise ProgdfError(f"nothing of {options.scene} would be left; it has no Gaussian that is drawn")
-    save_ply_checked(options.out, edited)
+    save_scene(options.out, edited)
     print_line(f"wrote {options.out}: {format_count(len(edited))}")
     if len(edited) < len(scene):
         old, new = shlex.quote(str(options.scene)), shlex.quote(str(options.out))

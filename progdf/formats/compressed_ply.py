@@ -1,4 +1,4 @@
-"""Compressed .ply (SuperSplat, splat-transform) → Gaussians: 16 bytes a Gaussian in chunks of 256.
+"""Compressed .ply (SuperSplat, splat-transform): 16 bytes a Gaussian in chunks of 256, SH bytes beside.
 
 Positions, log-scales and, in newer files, colors are shares of their chunk's range; rotations are the three
 smaller components of a quaternion; opacities are bytes; f_rest bytes cover −4 to 4.
@@ -12,14 +12,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import torch
+from plyfile import PlyData, PlyElement
+from torch import Tensor
 
 from progdf.errors import ProgdfError
-from progdf.gaussians import Gaussians
+from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.sh import C0
 
-from .ply import PlyFile
+from .ply import ANTIALIASED_COMMENT, PlyFile
 
 _CHUNK = 256
+_MORTON_BITS = 21  # of each axis: three fit a word
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _XYZ, _SCALES, _RGB = ("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b")
 _SH_REST = (0, 9, 24, 45)
@@ -75,6 +78,83 @@ def read_compressed_ply(ply: PlyFile) -> Gaussians:
         key: torch.from_numpy(np.ascontiguousarray(v, np.float32)) for key, v in arrays.items()
     }
     return Gaussians(**tensors, antialiased=ply.antialiased)
+
+
+def write_compressed_ply(path: Path, scene: Gaussians) -> None:
+    """Write the rows in their order; nearest values of each word, so a scene in `morton_order` loses least.
+
+    Args:
+        path: the file, which is written over
+        scene: N Gaussians of degree 3 at most, finite
+    """
+    arrays: dict[str, Floats] = {name: getattr(scene, name).cpu().numpy() for name in ATTRIBUTES}
+    count, at = len(scene), np.arange(len(scene)) // _CHUNK
+    starts = np.arange(0, count, _CHUNK)
+    values = {
+        _XYZ: scene.world_means.cpu().numpy().astype(np.float32),
+        _SCALES: arrays["log_scales"].clip(-20.0, 20.0),
+        _RGB: arrays["sh0"] * C0 + 0.5,
+    }
+    edges = {"min": np.minimum.reduceat, "max": np.maximum.reduceat}
+    ranges = np.zeros(
+        len(starts), [(f"{edge}_{name}", "<f4") for names in values for edge in edges for name in names]
+    )
+    shares = dict[tuple[str, ...], Floats]()
+    for names, table in values.items():
+        low, high = (edge(table, starts, axis=0) for edge in edges.values())
+        for i, name in enumerate(names):
+            ranges[f"min_{name}"], ranges[f"max_{name}"] = low[:, i], high[:, i]
+        span = np.where(high > low, high - low, 1.0)
+        shares[names] = ((table - low[at]) / span[at]).astype(np.float32)
+    quats = scene.unit_quats.cpu().numpy()
+    which = np.abs(quats).argmax(axis=1)
+    quats = quats * np.where(np.take_along_axis(quats, which[:, None], axis=1) < 0, -1.0, 1.0)
+    others = quats[np.arange(4) != which[:, None]].reshape(count, 3)
+    rotation = _words(others / np.float32(np.sqrt(2.0)) + 0.5, (20, 10, 0), (10, 10, 10))
+    rgba = np.concatenate([shares[_RGB], scene.opacities.cpu().numpy()[:, None]], axis=1)
+    words = (
+        _words(shares[_XYZ], (21, 11, 0), (11, 10, 11)),
+        rotation | (which.astype(np.uint32) << 30),
+        _words(shares[_SCALES], (21, 11, 0), (11, 10, 11)),
+        _words(rgba, (24, 16, 8, 0), (8, 8, 8, 8)),
+    )
+    packed = np.zeros(count, [(name, "<u4") for name in _PACKED])
+    for name, column in zip(_PACKED, words, strict=True):
+        packed[name] = column
+    elements = [PlyElement.describe(ranges, "chunk"), PlyElement.describe(packed, "vertex")]
+    if bands := arrays["shN"].shape[1]:
+        rest = arrays["shN"].transpose(0, 2, 1).reshape(count, 3 * bands)
+        table = ((rest / 8.0 + 0.5) * 256.0).clip(0, 255).astype("u1")
+        rows = np.ascontiguousarray(table).view([(f"f_rest_{i}", "u1") for i in range(3 * bands)])[:, 0]
+        elements.append(PlyElement.describe(rows, "sh"))
+    comments = [ANTIALIASED_COMMENT] if scene.antialiased else []
+    PlyData(elements, byte_order="<", comments=comments).write(str(path))
+
+
+def morton_order(means: Tensor) -> Tensor:
+    """Rows along a Z-order curve through their bounding box, of which neighbors are near each other.
+
+    Args:
+        means: [N,3]
+
+    Returns:
+        [N] int64
+    """
+    low, span = means.amin(dim=0), (means.amax(dim=0) - means.amin(dim=0)).clamp_min(1e-30)
+    cells = ((means - low) / span * (2**_MORTON_BITS - 1)).long()
+    code = torch.zeros(len(means), dtype=torch.int64)
+    for bit in range(_MORTON_BITS):
+        for axis in range(3):
+            code |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
+    return code.argsort(stable=True)
+
+
+def _words(shares: Floats, shifts: tuple[int, ...], bits: tuple[int, ...]) -> npt.NDArray[np.uint32]:
+    """Shares 0..1 as the parts of words, to the nearest. [N,parts] -> [N]"""
+    most = np.array([2**b - 1 for b in bits])
+    parts = (shares.clip(0.0, 1.0) * most).round().astype(np.uint32)
+    words: npt.NDArray[np.uint32] = np.bitwise_or.reduce(parts << np.array(shifts, np.uint32), axis=1)
+    return words
 
 
 def _unorm(words: npt.NDArray[np.uint32], shifts: tuple[int, ...], bits: tuple[int, ...]) -> Floats:

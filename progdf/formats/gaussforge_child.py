@@ -1,6 +1,6 @@
-"""Run as a script of its own: one scene file through gaussforge into a plain .ply, within bounds.
+"""Run as a script of its own: one scene file through gaussforge into another format, within bounds.
 
-    python -P gaussforge_child.py FORMAT IN OUT MEMORY OUTPUT SECONDS
+    python -P gaussforge_child.py FORMAT IN FORMAT OUT MEMORY OUTPUT SECONDS
 
 Its native code reads files of strangers, so it works in a process that may crash, and that has no more
 memory, output and time than it is given (bytes, bytes, seconds of processor time). Nothing of progdf is
@@ -38,7 +38,7 @@ def _bundle(meta: Path) -> bytes:
     return archive.getvalue()
 
 
-def main(kind: str, source: str, target: str, memory: int, output: int, seconds: int) -> None:
+def main(kind: str, source: str, to: str, target: str, memory: int, output: int, seconds: int) -> None:
     import gaussforge
 
     if sys.platform != "win32":  # which has no such limits: the time limit of the caller has to do there
@@ -55,7 +55,7 @@ def main(kind: str, source: str, target: str, memory: int, output: int, seconds:
                 resource.setrlimit(limit, (most, most))
     path = Path(source)
     content = _bundle(path) if path.name.lower() == "meta.json" else path.read_bytes()
-    converted = gaussforge.GaussForge().convert(content, kind, "ply")
+    converted = gaussforge.GaussForge().convert(content, kind, to)
     if "data" not in converted:
         raise ValueError(str(converted.get("error", "it gives no scene")))
     Path(target).write_bytes(converted["data"])
@@ -63,7 +63,7 @@ def main(kind: str, source: str, target: str, memory: int, output: int, seconds:
 
 if __name__ == "__main__":
     try:
-        main(sys.argv[1], sys.argv[2], sys.argv[3], *map(int, sys.argv[4:7]))
+        main(sys.argv[1], sys.argv[2], sys.argv[3], sys.argv[4], *map(int, sys.argv[5:8]))
     except Exception as error:  # reported by the caller
         print(f"{type(error).__name__}: {error}", file=sys.stderr)
         sys.exit(3)

@@ -1,19 +1,21 @@
-"""Scenes in every format that people have: .ply, compressed .ply, .spz, .splat, .ksplat, .sog.
+"""Scenes in every format that people have: .ply, compressed .ply, .spz, .splat, .ksplat, .sog, .glb.
 
-Recognized by content, else by name. Two readers are our own; .spz, .sog and .splat go through
-gaussforge, in a process of its own (see `gaussforge_child`), as its native code may crash on a broken file.
+Recognized by content, else by name. The code for .spz, .sog and .splat is that of gaussforge, in a process of
+its own (see `gaussforge_child`), as native code may crash on a broken file.
 """
 
 from __future__ import annotations
 
 import importlib.util
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import tempfile
 import zipfile
 import zlib
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,18 +25,24 @@ import torch
 from progdf import sh
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
-from progdf.io.atomic import read_file
+from progdf.io.atomic import atomic_write, read_file
 from progdf.io.json_values import decode_json
 from progdf.terminal import escape_text
 
-from . import gaussforge_child
-from .compressed_ply import is_compressed, read_compressed_ply
+from . import gaussforge_child, gltf, usd
+from .compressed_ply import is_compressed, morton_order, read_compressed_ply, write_compressed_ply
 from .ksplat import read_ksplat
-from .ply import load_ply_with_report, read_header
+from .ply import load_ply_with_report, read_header, save_ply, save_ply_checked
 from .repair import LoadReport, repair
 
-FORMATS = ("ply", "spz", "splat", "ksplat", "sog")
+FORMATS = ("ply", "spz", "splat", "ksplat", "sog", "glb")
 """What a scene may be, by the ending of its name; a compressed .ply is a .ply."""
+
+WRITTEN = (".ply", ".compressed.ply", ".spz", ".sog", ".splat", ".glb", usd.SUFFIX)
+"""What `save_scene` writes, by the ending of the name."""
+
+MOST_FRAMES = 1000
+"""Of `save_frames`, which numbers files with three digits."""
 
 SOG_META = "meta.json"
 """The file that represents an unpacked .sog: its folder's table of images."""
@@ -43,6 +51,8 @@ _MOST_META = 1 << 20
 """Bytes of its table, which has some 20 kB; parsed, JSON takes thirty times as much."""
 _MEMORY, _OUTPUT, SECONDS = (1 << 30, 64), (64 << 20, 64), (60, 2e-6)
 """What a reader of another's making gets: so much, and so much for each byte of its file."""
+_PATIENCE = 30
+"""Times as long for writing our own scenes: clustering the bands of a million for an .sog takes minutes."""
 
 
 def scene_format(path: str | os.PathLike[str]) -> str | None:
@@ -56,6 +66,8 @@ def scene_format(path: str | os.PathLike[str]) -> str | None:
     suffix = path.suffix.lower().lstrip(".")
     if start[:3] == b"ply":
         return "ply"
+    if start[:4] == gltf.MAGIC:
+        return "glb"
     if start[:4] == b"NGSP" or (start[:2] == b"\x1f\x8b" and _inflate(start)[:4] == b"NGSP"):
         return "spz"
     if start[:4] == b"PK\x03\x04":
@@ -103,6 +115,8 @@ def load_scene_with_report(path: str | os.PathLike[str]) -> tuple[Gaussians, Loa
     if kind == "ksplat":
         scene, level = read_ksplat(path)
         return _repair(path, scene, f".ksplat, level {level}")
+    if kind == "glb":
+        return _repair(path, rotate_about_x(gltf.read_glb(path)), ".glb, turned from y up to y down")
     scene, report = _through_gaussforge(path, kind)
     description, antialiased = f".{kind}", False
     if kind == "spz":
@@ -156,30 +170,118 @@ def _through_gaussforge(path: Path, kind: str) -> tuple[Gaussians, LoadReport]:
     Raises:
         ProgdfError: gaussforge is not installed, cannot read the file, crashes on it or takes too long.
     """
-    if importlib.util.find_spec("gaussforge") is None:
-        raise ProgdfError(f"{path}: .{kind} needs the package gaussforge; pip install progdf-studio[formats]")
-    size = _size(path)
-    memory, output, seconds = (int(base + each * size) for base, each in (_MEMORY, _OUTPUT, SECONDS))
+    _require_gaussforge(path, kind)
     with tempfile.TemporaryDirectory(prefix="progdf-") as folder:
         target = Path(folder) / "scene.ply"
-        words = [kind, str(path.resolve()), str(target), *map(str, (memory, output, seconds))]
-        try:
-            ended = subprocess.run(
-                [sys.executable, "-P", gaussforge_child.__file__, *words],
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.PIPE,
-                timeout=2 * seconds,
-                check=False,
-            )
-        except subprocess.TimeoutExpired:
-            raise _read_error(path, kind, f"did not answer within {2 * seconds} s") from None
-        if ended.returncode or not target.is_file():
-            raise _read_error(path, kind, _reason(ended.returncode, ended.stderr))
+        if reason := _convert(path, kind, target, "ply"):
+            raise _read_error(path, kind, reason)
         try:
             return load_ply_with_report(target)
         except ProgdfError:
             raise _read_error(path, kind, "returned no scene") from None
+
+
+def _convert(source: Path, kind: str, target: Path, to: str) -> str:
+    """A scene file through gaussforge into another format; what went wrong, or nothing."""
+    size, patience = _size(source), 1 if to == "ply" else _PATIENCE
+    memory, output, seconds = (int(base + each * size) for base, each in (_MEMORY, _OUTPUT, SECONDS))
+    limits = map(str, (memory, output, patience * seconds))
+    try:
+        ended = subprocess.run(
+            [
+                sys.executable,
+                "-P",
+                gaussforge_child.__file__,
+                kind,
+                str(source.resolve()),
+                to,
+                str(target),
+                *limits,
+            ],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            timeout=2 * patience * seconds,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        return f"did not answer within {2 * patience * seconds} s"
+    return _reason(ended.returncode, ended.stderr) if ended.returncode or not target.is_file() else ""
+
+
+def save_scene(path: Path, scene: Gaussians) -> None:
+    """Write a scene in the format that the name asks for; the file appears whole or not at all.
+
+    A .ply is exact and is read back and compared. The others are smaller, or are what another program reads:
+
+        .compressed.ply   16 bytes a Gaussian and 1 a coefficient; in Morton order, as chunks share a range
+        .spz, .sog        8 bits and less; .spz, .glb and .usdc are turned to y up, as readers expect
+        .splat            32 bytes, without SH bands
+        .glb, .usdc       float32, KHR_gaussian_splatting and ParticleField3DGaussianSplat
+
+    Args:
+        path: ends in one of `WRITTEN`
+        scene: N Gaussians, finite; bands above degree 3 are left out of all but the .ply
+
+    Raises:
+        ProgdfError: another ending, an absent package, or what cannot be written.
+    """
+    ending = written_format(path)
+    if ending == ".ply":
+        save_ply_checked(path, scene)
+        return
+    kind, scene = ending[1:], replace(scene, shN=scene.shN[:, : (gltf.MOST_DEGREE + 1) ** 2 - 1])
+    with atomic_write(path) as written:
+        if kind == "compressed.ply":
+            write_compressed_ply(written, scene[morton_order(scene.means)])
+        elif kind == "glb":
+            gltf.write_glb(written, rotate_about_x(scene))
+        elif ending == usd.SUFFIX:
+            usd.write_usd(written, [rotate_about_x(scene)])
+        else:
+            _require_gaussforge(path, kind)
+            with tempfile.TemporaryDirectory(prefix="progdf-") as folder:
+                source, target = Path(folder) / "scene.ply", Path(folder) / f"scene.{kind}"
+                save_ply(source, rotate_about_x(scene) if kind == "spz" else scene)
+                if reason := _convert(source, "ply", target, kind):
+                    raise ProgdfError(f"{path} was not written: the writer of .{kind} {reason}")
+                shutil.copyfile(target, written)
+
+
+def save_frames(path: Path, scenes: Iterable[Gaussians]) -> list[Path]:
+    """Write the same rows again and again: a .usdc of time samples, else NAME_000.ply and so on; which files.
+
+    Raises:
+        ProgdfError: as `save_scene`.
+    """
+    if written_format(path) == usd.SUFFIX:
+        with atomic_write(path) as written:
+            usd.write_usd(written, map(rotate_about_x, scenes))
+        return [path]
+    stem, paths = path.name.removesuffix(written_format(path)), list[Path]()
+    for number, scene in enumerate(scenes):
+        paths.append(path.with_name(f"{stem}_{number:03d}{written_format(path)}"))
+        save_scene(paths[-1], scene)
+    return paths
+
+
+def written_format(path: Path) -> str:
+    """Which of `WRITTEN` a name asks for.
+
+    Raises:
+        ProgdfError: none of them.
+    """
+    for ending in sorted(WRITTEN, key=len, reverse=True):
+        if path.name.lower().endswith(ending):
+            return ending
+    raise ProgdfError(
+        f"{path} names no format to write; end it in {', '.join(WRITTEN[:-1])} or {WRITTEN[-1]}"
+    )
+
+
+def _require_gaussforge(path: Path, kind: str) -> None:
+    if importlib.util.find_spec("gaussforge") is None:
+        raise ProgdfError(f"{path}: .{kind} needs the package gaussforge; pip install progdf-studio[formats]")
 
 
 def _reason(status: int, stderr: bytes) -> str:

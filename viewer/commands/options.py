@@ -150,11 +150,14 @@ class RenderOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class ExportOptions:
-    """Write a scene under its edits as a 3DGS .ply file, or the colors of a grade as a .cube file."""
+    """Write a scene under its edits for other programs, or the colors of a grade as a .cube file."""
 
     stack: OmitArgPrefixes[StackOptions]
     out: Annotated[Path, word("FILE", aliases=["-o"])]
-    """The .ply file to write; or a .cube file, for color programs, of what one grade does at its strength."""
+    """The file to write: a 3DGS .ply, .compressed.ply, .spz, .sog, .splat, .glb or .usdc; or a .cube file,
+    for color programs, of what one grade does at its strength."""
+    frames: Annotated[int | None, word("N", "one file")] = None
+    """As many steps from the original to the strengths: numbered files, of a .usdc its time samples."""
 
 
 class Named(Protocol):

@@ -21,16 +21,25 @@ from progdf.compose.reference import compose_layers
 from progdf.errors import ProgdfError
 from progdf.field.baked import GradeForm, lattice_colors, lattice_side
 from progdf.field.grade import mapped_lattice
+from progdf.formats import usd
 from progdf.formats.cube import SIDE, write_cube
 from progdf.formats.cube import SUFFIX as CUBE
-from progdf.formats.ply import save_ply_checked
-from progdf.formats.scene_file import scene_format
+from progdf.formats.scene_file import (
+    MOST_FRAMES,
+    load_scene_with_report,
+    save_frames,
+    save_scene,
+    scene_format,
+    written_format,
+)
 from progdf.gaussians import ZERO, Gaussians
 from progdf.gdf.file import Gdf
 from progdf.io.atomic import atomic_write, check_not_an_input
 from progdf.io.cameras import read_camera
 from progdf.io.picture_camera import camera_chunk
-from progdf.terminal import format_count, print_line
+from progdf.metrics.image import NO_DIFFERENCE
+from progdf.scene.strays import picture_difference
+from progdf.terminal import file_size, format_count, print_line
 from progdf.threads import one_thread
 from viewer.camera.view_camera import (
     FARTHEST,
@@ -100,23 +109,50 @@ def export(argv: Sequence[str]) -> int:
     """`progdf export`: the edited scene as a .ply that any viewer opens."""
     options: ExportOptions = parse(ExportOptions, argv, "progdf export")
     out = options.out
-    if out.suffix.lower() not in (".ply", CUBE):
-        raise ProgdfError(f"{out} is not a .ply file; give the edited scene a name that ends in .ply")
+    ending = CUBE if out.suffix.lower() == CUBE else written_format(out)
+    if options.frames is not None and (ending == CUBE or not 2 <= options.frames <= MOST_FRAMES):
+        raise ProgdfError(
+            f"--frames takes 2 to {MOST_FRAMES} steps of a scene, not {options.frames} of {out.name}"
+        )
     opened = open_stack(options.stack, unset=1.0)
     check_not_an_input(out, opened.files)
-    if out.suffix.lower() == CUBE:
+    if ending == CUBE:
         return _export_cube(out, opened)
-    document, states = opened.document, visible_layers(opened.view)
-    layers = [layer_of(document.gdfs[s.gdf], s.strength, s.gains, s.paint) for s in states]
-    edited = compose_layers(document.scene, layers, opened.view.blend)
-    edited = edited[remaining_rows(document.original, edited)]
-    save_ply_checked(out, edited)
-    far = ", x y z as doubles as it is far from 0" if document.scene.origin != ZERO else ""
-    strengths = describe_strengths(opened.view)
-    print_line(f"wrote {out}: {format_count(len(edited))}, {strengths}{far}; read back and compared")
-    if document.path is not None and (kind := scene_format(document.path)) != "ply":
+    document, strengths = opened.document, describe_strengths(opened.view)
+    if options.frames is not None:
+        shares = np.linspace(0.0, 1.0, options.frames).tolist()
+        paths = save_frames(out, (_compose(opened, share, whole=ending == usd.SUFFIX) for share in shares))
+        ends = f"{paths[0]} to {paths[-1].name}" if len(paths) > 1 else paths[0]
+        print_line(f"wrote {ends}: {options.frames} steps from the original to {strengths}")
+        return 0
+    edited = _compose(opened)
+    save_scene(out, edited)
+    far = (
+        ", x y z as doubles as it is far from 0" if document.scene.origin != ZERO and ending == ".ply" else ""
+    )
+    how = "read back and compared" if ending == ".ply" else _describe_loss(out, edited)
+    print_line(f"wrote {out}: {format_count(len(edited))}, {strengths}{far}; {how}")
+    if ending == ".ply" and document.path is not None and (kind := scene_format(document.path)) != "ply":
         print_line(f"{document.title} is a .{kind}, this is a plain .ply")
     return 0
+
+
+def _compose(opened: OpenStack, share: float = 1.0, whole: bool = False) -> Gaussians:
+    """The scene at a share of the strengths; without the rows that draw nothing, unless `whole`."""
+    states = visible_layers(opened.view)
+    layers = [layer_of(opened.document.gdfs[s.gdf], share * s.strength, s.gains, s.paint) for s in states]
+    edited = compose_layers(opened.document.scene, layers, opened.view.blend)
+    return edited if whole else edited[remaining_rows(opened.document.original, edited)]
+
+
+def _describe_loss(out: Path, edited: Gaussians) -> str:
+    """What a format of fewer bits or bands has changed, in pictures of what is read back."""
+    size = f"{file_size(out.stat().st_size)}, {out.stat().st_size / len(edited):.1f} bytes each"
+    if out.suffix.lower() == usd.SUFFIX:
+        return f"{size}, exact float32"
+    mean, worst = picture_difference(edited, load_scene_with_report(out)[0])
+    shown = "no pixel differs" if mean == NO_DIFFERENCE else f"{mean:.1f} dB to it, {worst:.1f} at worst"
+    return f"{size}; read back: {shown}"
 
 
 def _export_cube(out: Path, opened: OpenStack) -> int:

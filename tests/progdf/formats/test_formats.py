@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import struct
 import subprocess
 import sys
 import tracemalloc
@@ -22,8 +23,16 @@ from progdf.errors import ProgdfError
 from progdf.formats import gaussforge_child
 from progdf.formats import scene_file as formats
 from progdf.formats.ply import load_ply
-from progdf.formats.scene_file import load_scene, load_scene_with_report, rotate_about_x, scene_format
-from progdf.gaussians import Gaussians
+from progdf.formats.scene_file import (
+    load_scene,
+    load_scene_with_report,
+    morton_order,
+    rotate_about_x,
+    save_frames,
+    save_scene,
+    scene_format,
+)
+from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.quaternions import rotation_matrices
 from progdf.rasterize import render
 from progdf.sh import rgb_to_sh0, shade
@@ -47,6 +56,12 @@ def scene_of(degree: int = 0, count: int = 300) -> Gaussians:
     )
 
 
+def saved(path: Path, scene: Gaussians) -> Path:
+    """What we write ourselves."""
+    save_scene(path, scene)
+    return path
+
+
 WRITERS: dict[str, tuple[Write, str, int]] = {
     "compressed": (write_compressed_ply, "scene.ply", 3),
     "compressed, older": (
@@ -62,6 +77,11 @@ WRITERS: dict[str, tuple[Write, str, int]] = {
     "spz 3": (lambda path, scene: write_scene(path, scene, 3), "scene.spz", 2),
     "spz 4": (lambda path, scene: write_scene(path, scene, 4), "scene.spz", 3),
     "sog": (write_scene, "scene.sog", 3),
+    "saved compressed": (saved, "scene.compressed.ply", 3),
+    "saved splat": (saved, "scene.splat", 0),
+    "saved spz": (saved, "scene.spz", 3),
+    "saved sog": (saved, "scene.sog", 2),
+    "saved glb": (saved, "scene.glb", 3),
 }
 """How each is written, its name, and the degree of its spherical harmonics."""
 
@@ -70,6 +90,9 @@ MEANS |= {"spz 2": 2e-4, "spz 3": 2e-4, "spz 4": 2e-4, "sog": 1e-3}
 """Largest error of a center: half a step of each format over a cloud about 7 wide; the others keep floats."""
 SH = {"compressed": 0.017, "ksplat 1": 5e-4, "ksplat 2": 6e-3, "spz 2": 0.07, "spz 3": 0.07, "spz 4": 0.07}
 SH |= {"sog": 0.03}
+for saved_one in ("compressed", "spz", "sog"):
+    MEANS[f"saved {saved_one}"] = MEANS.get(saved_one, 2e-4)
+    SH[f"saved {saved_one}"] = SH.get(saved_one, 0.07)
 """Of a coefficient: bytes of −4..4, halves, bytes of −1.5..1.5, 4 and 5 bits of −1..1, and a palette."""
 
 
@@ -82,7 +105,7 @@ def test_every_format_gives_the_scene_that_was_written(name: str, tmp_path: Path
     found, report = load_scene_with_report(path)
     assert (report.file, report.count, report.sh_degree) == (file, len(scene), degree)
     assert report.file_bytes == path.stat().st_size
-    if name == "sog":  # in an order of its own
+    if name in ("sog", "saved sog", "saved compressed"):  # in an order of its own
         nearest = torch.cdist(found.means, scene.means).argmin(dim=1)
         assert len(nearest.unique()) == len(scene)
         scene = scene[nearest]
@@ -97,7 +120,10 @@ def test_every_format_gives_the_scene_that_was_written(name: str, tmp_path: Path
         assert float((found.shN - scene.shN).abs().max()) <= SH.get(name, 1e-6)
 
 
-@pytest.mark.parametrize("name", ["ksplat 1", "spz 4", "sog", "compressed"])
+@pytest.mark.parametrize(
+    "name",
+    ["ksplat 1", "spz 4", "sog", "compressed", "saved compressed", "saved spz", "saved sog", "saved glb"],
+)
 def test_every_format_looks_the_same_from_a_side(name: str, tmp_path: Path) -> None:
     """A turned axis, a swapped band or a wrong sign costs tens of dB."""
     writer, file, degree = WRITERS[name]
@@ -241,7 +267,7 @@ def test_a_reader_that_crashes_hangs_or_is_missing_is_one_line(
         ("raise SystemExit(3)", "said nothing"),
         ("import sys; sys.stderr.write('bad \\x1b[2J\\nworse \\x1b]0;x\\x07'); sys.exit(3)", "said: worse"),
         ("pass", "said nothing"),
-        ("import sys; open(sys.argv[3], 'w').write('ply')", "returned no scene"),
+        ("import sys; open(sys.argv[4], 'w').write('ply')", "returned no scene"),
     ):
         script.write_text(body)
         message = refusal(load_scene, path)
@@ -256,10 +282,127 @@ def test_a_reader_gets_no_more_memory_than_a_file_can_need(tmp_path: Path) -> No
     script, here = tmp_path / "greedy.py", "    path = Path(source)\n"
     own = Path(gaussforge_child.__file__).read_text()
     script.write_text(own.replace(here, f"    bytes(1 << 30)\n{here}"))
-    words = [sys.executable, "-P", str(script), "splat", "missing", "out", str(1 << 30), "1000000", "10"]
+    words = [
+        sys.executable,
+        "-P",
+        str(script),
+        "splat",
+        "missing",
+        "ply",
+        "out",
+        str(1 << 30),
+        "1000000",
+        "10",
+    ]
     ended = subprocess.run(words, capture_output=True, text=True, check=False)
     assert ended.returncode == 3
     assert ended.stderr.startswith("MemoryError")
+
+
+def test_a_compressed_ply_is_the_written_scene_in_the_order_of_a_curve(tmp_path: Path) -> None:
+    """The plain form of the tests writes the same numbers, a column at a time."""
+    scene = replace(scene_of(3, 600), antialiased=True)
+    ordered = scene[morton_order(scene.means)]
+    save_scene(tmp_path / "a.compressed.ply", scene)
+    ours = load_scene(tmp_path / "a.compressed.ply")
+    plain = load_scene(write_compressed_ply(tmp_path / "b.ply", ordered))
+    assert ours.antialiased
+    for name in ATTRIBUTES:
+        steps = {
+            "means": 4e-3,
+            "log_scales": 8e-3,
+            "logit_opacities": 0.3,
+            "sh0": 0.014,
+            "shN": 0.04,
+            "quats": 2.0,
+        }
+        assert float((getattr(ours, name) - getattr(plain, name)).abs().max()) <= steps[name], name
+    step = (ordered.means[1:] - ordered.means[:-1]).norm(dim=1).mean()
+    assert float(step) < 0.5 * float((scene.means[1:] - scene.means[:-1]).norm(dim=1).mean())
+
+
+def test_a_glb_loads_to_the_same_numbers_and_keeps_its_place_far_away(tmp_path: Path) -> None:
+    scene = replace(scene_of(2), origin=(4e6, -3e6, 2e6))
+    save_scene(tmp_path / "a.glb", scene)
+    found = load_scene(tmp_path / "a.glb")
+    assert float((found.world_means - scene.world_means).abs().max()) <= 1e-6
+    for name in ("sh0", "shN"):
+        assert torch.equal(getattr(found, name), getattr(scene, name)), name
+    assert torch.allclose(found.log_scales, scene.log_scales, atol=1e-6)
+    assert torch.allclose(found.opacities, scene.opacities, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        (
+            b'"nodes": [{"mesh": 0}]',
+            b'"nodes":[{"mesh":0,"scale":[2,2,2]}]',
+            "its nodes turn, scale or repeat",
+        ),
+        (b'"nodes": [{"mesh": 0}]', b'"nodes": [{"mesh": 0},{"mesh": 0}]', "its nodes turn, scale or repeat"),
+        (b'"KHR_gaussian_splatting:OPACITY"', b'"KHR_gaussian_splatting:OPACITI"', "it lacks KHR"),
+        (
+            b'"KHR_gaussian_splatting": {"kernel"',
+            b'"EXT_gaussian_splatting": {"kernel"',
+            "holds no Gaussians",
+        ),
+        (b'"componentType": 5126', b'"componentType": 5124', "an accessor is VEC3 of 5124"),
+        (b'"byteOffset": 0,', b'"byteOffset": 9999999999,', "an accessor lies outside its data"),
+        (b'"count": 300', b'"count": 900000000', "an accessor lies outside its data"),
+        (b'"count": 300', b'"count": -3', "cannot be read as .glb"),
+        (b'"bufferView": 0', b'"bufferView": 77', "cannot be read as .glb"),
+        (b"glTF", b"glTF", None),
+    ],
+)
+def test_a_glb_that_cannot_be_is_one_line(old: bytes, new: bytes, said: str | None, tmp_path: Path) -> None:
+    save_scene(tmp_path / "a.glb", scene_of(1))
+    content = (tmp_path / "a.glb").read_bytes()
+    size = int.from_bytes(content[12:16], "little")
+    table, data = content[20 : 20 + size], content[20 + size :]
+    assert old in table or said is None
+    table = table.replace(old, new, 1)
+    table += b" " * (-len(table) % 4)
+    (tmp_path / "a.glb").write_bytes(
+        content[:12] + struct.pack("<I", len(table)) + content[16:20] + table + data
+    )
+    if said is None:
+        assert len(load_scene(tmp_path / "a.glb")) == 300
+    else:
+        assert said in refusal(load_scene, tmp_path / "a.glb")
+
+
+def test_usd_has_the_numbers_of_every_step_and_stores_once_what_stays(tmp_path: Path) -> None:
+    Usd = pytest.importorskip("pxr.Usd", reason="pip install progdf-studio[usd]")
+    scene = scene_of(2)
+    steps = [scene, scene, replace(scene, sh0=scene.sh0 + 0.1), replace(scene, sh0=scene.sh0 + 0.2)]
+    (path,) = save_frames(tmp_path / "a.usdc", iter(steps))
+    stage = Usd.Stage.Open(str(path))
+    prim = stage.GetPrimAtPath("/Gaussians")
+    sh = prim.GetAttribute("radiance:sphericalHarmonicsCoefficients")
+    assert prim.GetTypeName() == "ParticleField3DGaussianSplat"
+    assert [prim.GetAttribute(n).GetNumTimeSamples() for n in ("positions", "scales", "opacities")] == [
+        0,
+        0,
+        0,
+    ]
+    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (0.0, 3.0)
+    for time, step in enumerate(map(rotate_about_x, steps)):
+        stored = torch.tensor(np.array(sh.Get(time))).reshape(len(step), -1, 3)
+        assert torch.equal(stored, torch.cat([step.sh0[:, None], step.shN], dim=1))
+    assert torch.equal(torch.tensor(np.array(prim.GetAttribute("positions").Get())), step.means)
+    real, imaginary = (
+        prim.GetAttribute("orientations").Get()[7].real,
+        prim.GetAttribute("orientations").Get()[7].imaginary,
+    )
+    assert torch.allclose(torch.tensor([real, *imaginary]), step.unit_quats[7])
+
+
+def test_frames_are_numbered_and_each_is_a_scene(tmp_path: Path) -> None:
+    scene = scene_of()
+    paths = save_frames(tmp_path / "turn.compressed.ply", (scene[: 300 - n] for n in range(3)))
+    assert [path.name for path in paths] == [f"turn_{n:03d}.compressed.ply" for n in range(3)]
+    assert [len(load_scene(path)) for path in paths] == [300, 299, 298]
 
 
 @pytest.mark.slow
@@ -269,7 +412,7 @@ def test_damaged_files_are_one_line_or_a_drawable_scene(name: str, tmp_path: Pat
     writer, file, degree = WRITERS[name]
     whole = writer(tmp_path / file, scene_of(degree, 70)).read_bytes()
     rng = np.random.default_rng(6)
-    own = name.startswith(("compressed", "ksplat"))  # our readers are tried in a millisecond
+    own = name.startswith(("compressed", "ksplat", "saved glb"))  # our readers are tried in a millisecond
     refused = 0
     for trial in range(200 if own else 16):
         broken = bytearray(whole)

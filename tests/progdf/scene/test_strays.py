@@ -177,7 +177,7 @@ def test_an_edit_is_carried_over_to_the_cleaned_scene(
     ("arguments", "line"),
     [
         (("-o", "x.ply"), "nothing was asked for; say what to do with the scene, for example --clean"),
-        (("--clean", "-o", "x.splat"), "x.splat is no .ply or .gdf file"),
+        (("--clean", "-o", "x.obj"), "x.obj names no format to write"),
         (("--clean", "-o", "bear.ply"), "bear.ply is one of the files to read; choose another name"),
     ],
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -242,7 +243,14 @@ def test_a_mistake_is_one_line_and_leaves_no_file(
         (("view", "nope.ply"), "nope.ply does not exist"),
         (("view", "bear.ply", "scarf.gdf", "--set", "hat=1"), "--set hat: there is no edit of that name"),
         (("export", "bear.ply", "ears.gdf", "-o", "bear.ply"), "bear.ply is one of the files to read"),
-        (("export", "bear.ply", "ears.gdf", "-o", "x.obj"), "x.obj is not a .ply file"),
+        (
+            ("export", "bear.ply", "ears.gdf", "-o", "x.obj"),
+            "x.obj names no format to write; end it in .ply,",
+        ),
+        (
+            ("export", "bear.ply", "ears.gdf", "--frames", "1", "-o", "x.ply"),
+            "--frames takes 2 to 1000 steps of a scene, not 1 of x.ply",
+        ),
         (
             ("export", "bear.ply", "ears.gdf", "--set", "ears=-1", "-o", "x.ply"),
             "--set ears=-1: the strength",
@@ -278,6 +286,27 @@ def test_an_exported_scene_is_the_composed_one(
     for name in ATTRIBUTES:
         tolerance = 1e-6 if name == "quats" else 0.0
         assert torch.allclose(getattr(found, name), getattr(expected, name), rtol=0.0, atol=tolerance), name
+
+
+@pytest.mark.parametrize("ending", [".compressed.ply", ".glb", ".splat"])
+def test_another_format_says_what_it_costs_and_what_it_changes(
+    run: Run, capsys: pytest.CaptureFixture[str], ending: str
+) -> None:
+    assert run("export", "bear.ply", "scarf.gdf", "-o", f"edited{ending}") == 0
+    said = capsys.readouterr().out
+    assert re.search(
+        r"[\d.]+ kB, [\d.]+ bytes each; read back: (no pixel differs|[\d.]+ dB to it, )", said
+    ), said
+
+
+def test_frames_go_from_the_original_to_the_strengths(run: Run, stack: Stack) -> None:
+    assert (
+        run("export", "bear.ply", "scarf.gdf", "--set", "scarf=0.8", "--frames", "3", "-o", "step.ply") == 0
+    )
+    scene = load_ply("bear.ply")
+    for number, strength in enumerate((0.0, 0.4, 0.8)):
+        expected = compose_layers(scene, [Layer(stack.gdfs[0], strength)])
+        assert torch.equal(load_ply(f"step_{number:03d}.ply").sh0, expected.sh0), number
 
 
 def test_an_export_that_does_not_read_back_leaves_no_file(

@@ -1,0 +1,90 @@
+"""Gaussians in a USD file, as UsdVol.ParticleField3DGaussianSplat has them: still, or an edit over time.
+
+Values are as drawn: linear scales, opacities 0 to 1; y is up and z towards the viewer. Attributes that do not
+change are stored once; every sample has the same rows, also those that draw nothing.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from progdf.errors import ProgdfError
+from progdf.gaussians import Gaussians
+
+SUFFIX = ".usdc"
+_PATH = "/Gaussians"
+
+
+def write_usd(path: Path, scenes: Iterable[Gaussians], rate: float = 24.0) -> None:
+    """Write one scene, or several with the same rows as the samples 0, 1, … of one prim.
+
+    Args:
+        path: the file, which is written over; ends in .usdc
+        scenes: N Gaussians each, whose y is up
+        rate: samples a second
+
+    Raises:
+        ProgdfError: the package usd-core is not installed.
+    """
+    if importlib.util.find_spec("pxr") is None:
+        raise ProgdfError(f"{path}: .usdc needs the package usd-core; pip install progdf-studio[usd]")
+    from pxr import Gf, Usd, UsdGeom, UsdVol, Vt
+
+    stage = Usd.Stage.CreateNew(str(path))
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+    stage.SetTimeCodesPerSecond(rate)
+    prim = UsdVol.ParticleField3DGaussianSplat.Define(stage, _PATH)
+    stage.SetDefaultPrim(prim.GetPrim())
+    create = {
+        "positions": (prim.CreatePositionsAttr(), Vt.Vec3fArray),
+        "orientations": (prim.CreateOrientationsAttr(), Vt.QuatfArray),
+        "scales": (prim.CreateScalesAttr(), Vt.Vec3fArray),
+        "opacities": (prim.CreateOpacitiesAttr(), Vt.FloatArray),
+        "coefficients": (prim.CreateRadianceSphericalHarmonicsCoefficientsAttr(), Vt.Vec3fArray),
+    }
+    before: dict[str, NDArray[np.float32]] = {}
+    for time, scene in enumerate(scenes):
+        for name, values in drawn_values(scene).items():
+            attribute, kind = create[name]
+            if time and np.array_equal(values, before[name]):
+                continue
+            if time and attribute.GetNumTimeSamples() == 0:  # it was still until here
+                attribute.Clear()
+                attribute.Set(kind.FromNumpy(before[name]), 0)
+            if time and attribute.GetNumTimeSamples() and attribute.GetTimeSamples()[-1] != time - 1:
+                attribute.Set(kind.FromNumpy(before[name]), time - 1)
+            attribute.Set(kind.FromNumpy(values), *([time] if time else []))
+            before[name] = values
+        if time == 0:
+            prim.CreateRadianceSphericalHarmonicsDegreeAttr(scene.sh_degree)
+            UsdGeom.Primvar(prim.GetRadianceSphericalHarmonicsCoefficientsAttr()).SetElementSize(
+                1 + scene.shN.shape[1]
+            )
+            corners = scene.means.amin(dim=0).tolist(), scene.means.amax(dim=0).tolist()
+            prim.CreateExtentAttr(Vt.Vec3fArray([Gf.Vec3f(*corner) for corner in corners]))
+            if any(scene.origin):
+                prim.AddTranslateOp().Set(Gf.Vec3d(*scene.origin))
+        stage.SetEndTimeCode(time)
+    stage.SetStartTimeCode(0)
+    stage.GetRootLayer().Save()
+
+
+def drawn_values(scene: Gaussians) -> dict[str, NDArray[np.float32]]:
+    """What the file stores of a scene: positions, orientations (imaginary first), scales, opacities, SH."""
+    quats = scene.unit_quats[:, [1, 2, 3, 0]]
+    sh = torch.cat([scene.sh0[:, None], scene.shN], dim=1).reshape(-1, 3)
+    columns: dict[str, Any] = {
+        "positions": scene.means,
+        "orientations": quats,
+        "scales": scene.scales,
+        "opacities": scene.opacities,
+        "coefficients": sh,
+    }
+    return {name: np.ascontiguousarray(t.detach().cpu().float().numpy()) for name, t in columns.items()}
