@@ -128,13 +128,15 @@ class RenderOptions:
 
     stack: OmitArgPrefixes[StackOptions]
     out: Annotated[Path, word("FILE", aliases=["-o"])]
-    """The picture to write: .png, with --sweep .gif or .mp4; with --timeline also a folder."""
+    """The picture to write: .png; of what moves .gif, .webp or .mp4, of a film also a folder."""
     viewpoint: OmitArgPrefixes[ViewpointOptions] = ViewpointOptions()
     drawing: OmitArgPrefixes[DrawingOptions] = DrawingOptions()
     alpha: Switch = False
     """A transparent background, in a .png."""
-    sweep: Annotated[str | None, word("NAME", "a still picture")] = None
-    """Move this edit's slider from 0 to 1 and back: an animation."""
+    sweep: Annotated[str | None, word("NAME|all", "a still picture")] = None
+    """Move this edit's slider from 0 to 1 and back, or of all in turn: an animation."""
+    turntable: Annotated[str | None, word("SECONDS", "a still picture")] = None
+    """A film that circles the scene once, at the strengths that are set."""
     sheet: Annotated[str | None, word("NAME[,NAME2]|N", "one picture")] = None
     """A contact sheet over this edit's slider, a grid over two sliders, or N pictures of the --timeline."""
     split: Annotated[str | None, word("[X]", "the session's comparison, else none")] = None

@@ -50,6 +50,7 @@ from viewer.camera.view_camera import (
     fit,
     fit_subject,
     frame,
+    from_camera,
     to_camera,
 )
 from viewer.files import timeline_file
@@ -80,7 +81,8 @@ from .options import (
 DEFAULT_SIZE = (640, 480)
 LARGEST_SIDE = 16_384
 _SAY_EVERY_S = 0.5
-ONE_OF = ("sweep", "sheet", "split", "difference", "timeline")
+_LONGEST_S = 120.0  # of a turntable
+ONE_OF = ("sweep", "sheet", "split", "difference", "timeline", "turntable")
 """Options that each say what the picture is; only a timeline goes with a sheet."""
 
 
@@ -183,12 +185,14 @@ def render(argv: Sequence[str]) -> int:
     check_not_an_input(options.out, opened.files)
     scene, gdfs, view = opened.document.scene, opened.document.gdfs, opened.view
     view = replace(view, compare=_comparison(options, view.compare))
-    if options.alpha and (view.compare.mode != "off" or one_moves or options.timeline is not None):
+    is_film = options.timeline is not None or options.turntable is not None
+    if options.alpha and (view.compare.mode != "off" or one_moves or is_film):
         raise ProgdfError("--alpha goes with a single picture; leave out comparisons, sheets and films")
     saved = None if opened.session is None else view.camera
     camera = choose_camera(options.viewpoint, scene, gdfs, saved, opened.up)
-    if options.timeline is not None:
-        keys, count = _keys(options, opened), _count(options.sheet)
+    if is_film:
+        keys = _keys(options, opened) if options.turntable is None else _turntable(options, opened, camera)
+        count = 0 if options.turntable is not None else _count(options.sheet)
         with _engine(scene, gdfs, options) as engine:
             print_line(film.write(options.out, keys, view, camera, engine, count, _say_frames()))
         return 0
@@ -229,8 +233,8 @@ def _render_film(
 
     with atomic_write(options.out) as temporary_file:
         if options.sweep is not None:
-            frames = (picture(moved) for moved in film.sweep(view, swept[0]))
-            write = film.write_gif if options.out.suffix.lower() == ".gif" else film.write_mp4
+            frames = (picture(moved) for moved in film.sweep(view, swept))
+            write = film.write_mp4 if options.out.suffix.lower() == ".mp4" else film.write_animation
             write(temporary_file, frames)
         elif len(swept) == 2:
             Image.fromarray(film.grid(swept[0], swept[1], picture, view)).save(temporary_file)
@@ -310,6 +314,17 @@ def _keys(options: RenderOptions, opened: OpenStack) -> Timeline:
     return keys
 
 
+def _turntable(options: RenderOptions, opened: OpenStack, camera: Camera) -> Timeline:
+    """Once around what stands in the scene, from the camera that was chosen."""
+    assert options.turntable is not None
+    problem = f"--turntable must be 1 to {_LONGEST_S:g} seconds, got {options.turntable}"
+    seconds = parse_number(options.turntable, 1.0, _LONGEST_S, problem)
+    scene = opened.document.original
+    return timeline.turntable(
+        from_camera(ViewCamera(up=opened.up), camera, bounds_of(scene)), Timeline().fps, seconds
+    )
+
+
 def _count(sheet: str | None) -> int:
     """How many pictures of a film a contact sheet shall show; 0 where none was asked for."""
     if sheet is None:
@@ -322,6 +337,8 @@ def _count(sheet: str | None) -> int:
 
 def _swept_layers(options: RenderOptions, opened: OpenStack) -> list[str]:
     """Names of the layers whose sliders move in the picture: none, one or two."""
+    if options.sweep == "all" and opened.view.layers and "all" not in [l.name for l in opened.view.layers]:
+        return [_check_visible(layer.name, opened.view, "--sweep") for layer in opened.view.layers]
     if options.sweep is not None:
         return [_check_visible(opened.layer(options.sweep), opened.view, "--sweep")]
     if options.sheet is None:
@@ -382,14 +399,16 @@ def _check_output(options: RenderOptions) -> None:
     given = [name for name in ONE_OF if getattr(options, name) is not None]
     if len(given) > 1 and given != ["sheet", "timeline"]:
         raise ProgdfError(f"--{given[0]} and --{given[1]} cannot be combined; give only one of them")
-    films = options.timeline is not None and options.sheet is None
+    films = options.turntable is not None or (options.timeline is not None and options.sheet is None)
     if films:
         film.check_output(options.out)
-    if options.sweep is not None and suffix not in (".gif", ".mp4"):
-        raise ProgdfError(f"{options.out} cannot hold an animation; --sweep writes a .gif or an .mp4")
+    if options.sweep is not None and suffix not in film.ANIMATIONS:
+        raise ProgdfError(
+            f"{options.out} cannot hold an animation; --sweep writes a .gif, a .webp or an .mp4"
+        )
     moves = options.sweep is not None or films
-    if not moves and suffix in (".gif", ".mp4"):
-        raise ProgdfError(f"{options.out} holds an animation; say which slider moves with --sweep NAME")
+    if not moves and suffix in film.ANIMATIONS:
+        raise ProgdfError(f"{options.out} holds an animation; say what moves: --sweep NAME or --turntable 4")
     if not moves and suffix != ".png":
         raise ProgdfError(f"{options.out} is not a .png file; pictures are written as .png")
     film.check_encoder(options.out)

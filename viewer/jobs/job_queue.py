@@ -29,11 +29,15 @@ LOOK_S = 1.0
 Status = Literal["queued", "running", "stopping", "stopped", "elsewhere", "failed", "done"]
 
 
-FORMATS = (".mp4", ".gif", "")
-"""Of films: two kinds of files, and a folder of frames."""
-FORMAT_NAMES = ("MP4", "GIF", "PNG frames")
+FORMATS = (".mp4", ".gif", ".webp", "")
+"""Of films: three kinds of files, and a folder of frames."""
+FORMAT_NAMES = ("MP4", "GIF", "WebP", "PNG frames")
 SIZES = ((1280, 720), (1920, 1080), (2560, 1440), (3840, 2160))
 FPS = (12, 24, 25, 30, 60)
+
+
+ALL_SLIDERS, TURNTABLE = "\0sliders", "\0turntable"
+"""Films of no layer's own, in `DeliverOptions.moves`."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +50,7 @@ class DeliverOptions:
     fps: int = 24  # frames a second
     seconds: float = 4.0  # of a film that moves a slider there and back
     format: str = ".mp4"  # of `FORMATS`
-    moves: str = ""  # "timeline", or the name of the layer whose slider moves
+    moves: str = ""  # "timeline", the name of the layer whose slider moves, or one of these two
     can_move: tuple[str, ...] = ()  # what there is to choose from
 
 

@@ -9,6 +9,7 @@ import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -29,7 +30,9 @@ Draw = Callable[[ViewState], Pixels]
 
 SWEEP_STEPS = 24
 FRAME_MS, HOLD_MS = 50, 600  # an animation rests at both ends
+_WEBP_QUALITY = 85  # of 100: no block is seen in a still
 _PALETTE_REACH = 8  # levels: Pillow looks up the nearest color of a palette in steps of 4
+ANIMATIONS = (".gif", ".webp", ".mp4")
 SHEET_STRENGTHS = (0.0, 0.25, 0.5, 0.75, 1.0)
 
 
@@ -49,10 +52,13 @@ def with_strengths(view: ViewState, strengths: dict[str, float]) -> ViewState:
     return replace(view, layers=moved, groups=groups)
 
 
-def sweep(view: ViewState, name: str, steps: int = SWEEP_STEPS) -> Iterator[ViewState]:
-    """`view` with layer `name` at 0, 1/steps, …, 1: steps + 1 states."""
-    for step in range(steps + 1):
-        yield with_strengths(view, {name: step / steps})
+def sweep(view: ViewState, names: Sequence[str], steps: int = SWEEP_STEPS) -> Iterator[ViewState]:
+    """`view` with these layers at 0, then each in turn at 1/steps, …, 1: a state more than steps."""
+    yield with_strengths(view, dict.fromkeys(names, 0.0))
+    for at, name in enumerate(names):
+        for step in range(1, steps + 1):
+            before = {done: float(i < at) for i, done in enumerate(names)}
+            yield with_strengths(view, before | {name: step / steps})
 
 
 def contact_sheet(name: str, draw: Draw, view: ViewState) -> Pixels:
@@ -76,21 +82,21 @@ def _sheet(rows: list[list[Pixels]], row_labels: list[str], column_labels: list[
     return to_pixels(images.contact_sheet(tensors, row_labels, column_labels).numpy())
 
 
-def write_gif(path: Path, frames: Iterable[Pixels]) -> None:
-    """An endless animation there and back again, with one palette for all frames so that nothing flickers.
+def write_animation(path: Path, frames: Iterable[Pixels]) -> None:
+    """An endless animation there and back again; in a .gif with one palette, so that nothing flickers.
 
     Args:
-        path: a .gif file
+        path: a .gif or .webp file
         frames: from one end of the slider to the other. [H,W,3] each
     """
-    indexed = _quantize(frames)
-    there_and_back = indexed + indexed[-2:0:-1]
-    rests = {0, len(indexed) - 1}
-    _save_gif(path, there_and_back, [HOLD_MS if i in rests else FRAME_MS for i in range(len(there_and_back))])
+    there = _prepare(path, frames)
+    there_and_back = there + there[-2:0:-1]
+    rests = {0, len(there) - 1}
+    _save(path, there_and_back, [HOLD_MS if i in rests else FRAME_MS for i in range(len(there_and_back))])
 
 
 def write_film(path: Path, frames: Iterable[Pixels], frames_per_second: int) -> None:
-    """Frames as they come, each for the same time: .gif, endless, or .mp4.
+    """Frames as they come, each for the same time: .gif or .webp, endless, or .mp4.
 
     A .gif counts in hundredths of a second, so its frames take turns in being a little longer and shorter; no
     frame is shorter than 2, as programs slow such down.
@@ -98,10 +104,10 @@ def write_film(path: Path, frames: Iterable[Pixels], frames_per_second: int) -> 
     if path.suffix.lower() == ".mp4":
         _encode_mp4(path, frames, frames_per_second)
         return
-    indexed = _quantize(frames)
-    ends = [round(100 * (i + 1) / frames_per_second) for i in range(len(indexed))]
+    prepared = _prepare(path, frames)
+    ends = [round(100 * (i + 1) / frames_per_second) for i in range(len(prepared))]
     hundredths = [end - start for start, end in zip([0, *ends], ends, strict=False)]
-    _save_gif(path, indexed, [10 * max(2, each) for each in hundredths])
+    _save(path, prepared, [10 * max(2, each) for each in hundredths])
 
 
 def write_sequence(folder: Path, frames: Iterable[Pixels]) -> None:
@@ -145,19 +151,21 @@ def check_sequence(folder: Path) -> None:
         raise ProgdfError(f"the folder {folder.absolute().parent} does not exist; create it first")
 
 
-def _quantize(frames: Iterable[Pixels]) -> list[Image.Image]:
-    """Frames in one palette."""
+def _prepare(path: Path, frames: Iterable[Pixels]) -> list[Image.Image]:
+    """Frames as pictures; for a .gif in one palette."""
     there = [Image.fromarray(frame) for frame in frames]
+    if path.suffix.lower() != ".gif":
+        return there
     few = there[:: max(1, len(there) // 4)]
     mosaic = Image.fromarray(np.concatenate([np.asarray(frame) for frame in few]))
     palette = _with_exact_background(mosaic, mosaic.quantize(256, method=Image.Quantize.MEDIANCUT))
     return [frame.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG) for frame in there]
 
 
-def _save_gif(path: Path, indexed: Sequence[Image.Image], durations: Sequence[int]) -> None:
-    indexed[0].save(
-        path, save_all=True, append_images=indexed[1:], duration=list(durations), loop=0, disposal=1
-    )
+def _save(path: Path, prepared: Sequence[Image.Image], durations: Sequence[int]) -> None:
+    kind: dict[str, Any] = {"disposal": 1} if path.suffix.lower() == ".gif" else {"quality": _WEBP_QUALITY}
+    more = list(prepared[1:])
+    prepared[0].save(path, save_all=True, append_images=more, duration=list(durations), loop=0, **kind)
 
 
 def _with_exact_background(picture: Image.Image, indexed: Image.Image) -> Image.Image:
@@ -215,10 +223,8 @@ MOST_SHOWN = 100
 def check_output(out: Path) -> None:
     """Raises ProgdfError where `out` is neither a film nor a place for a folder of frames."""
     suffix = out.suffix.lower()
-    if suffix not in (".gif", ".mp4", ""):
-        raise ProgdfError(
-            f"{out} cannot hold a film; --timeline writes a .gif, an .mp4 or a folder of frames"
-        )
+    if suffix not in (*ANIMATIONS, ""):
+        raise ProgdfError(f"{out} cannot hold a film; write a .gif, a .webp, an .mp4 or a folder of frames")
     if not suffix:
         check_sequence(out)
 
@@ -272,7 +278,7 @@ def write(
     count: int = 0,
     advance: Advance | None = None,
 ) -> str:
-    """Write the film: .gif, .mp4, or a folder of .png files; or a contact sheet of `count` frames.
+    """Write the film: .gif, .webp, .mp4, or a folder of .png files; or a contact sheet of `count` frames.
 
     `advance` hears how many frames of how many are drawn.
 

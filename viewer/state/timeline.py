@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from viewer.camera import views
@@ -70,6 +70,25 @@ def neighbor(timeline: Timeline, frame: int, step: int) -> int:
     if step > 0:
         return min((f for f in frames if f > frame), default=timeline.length)
     return max((f for f in frames if f < frame), default=0)
+
+
+def turntable(camera: ViewCamera, fps: int, seconds: float) -> Timeline:
+    """Once around the pivot at an even pace: after the last frame comes the first."""
+    count = min(max(2, round(fps * seconds)), LONGEST)
+    turns = [(camera.azimuth + 180.0 + 360.0 * frame / count) % 360.0 - 180.0 for frame in range(count)]
+    keys = tuple(Keyframe(frame, (), replace(camera, azimuth=turn)) for frame, turn in enumerate(turns))
+    return Timeline(keys, count - 1, fps)
+
+
+def slider_film(view: ViewState, gdfs: Sequence[int], fps: int, seconds: float) -> Timeline:
+    """The sliders of these edits from 0 to 1, one after the other, and back again; the others stay."""
+    step = min(max(1, round(fps * seconds / 2)), LONGEST // len(gdfs))
+    still = tuple((layer.gdf, layer.strength) for layer in view.layers if layer.gdf not in gdfs)
+    keys = tuple(
+        Keyframe(i * step, (*((gdf, float(at < i)) for at, gdf in enumerate(gdfs)), *still))
+        for i in range(len(gdfs) + 1)
+    )
+    return Timeline(keys, len(gdfs) * step, fps, ping_pong=True)
 
 
 def film_frames(timeline: Timeline) -> Iterator[int]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -20,6 +21,7 @@ from viewer.camera.view_camera import first_camera
 from viewer.files.document import empty
 from viewer.files.user_files import load_thumbnail
 from viewer.jobs import job_queue
+from viewer.jobs.job_queue import TURNTABLE
 from viewer.jobs.training import SELECTION, TYPED
 from viewer.state import selection
 from viewer.state.view_state import ViewState
@@ -245,9 +247,19 @@ def test_the_scene_is_exported_by_the_command(window: application.App, tmp_path:
     assert window.main_view.work.dialog is None
     turn(window)
     assert Trainer.said[0] == "render"
+    Trainer.ended = 0
+    turn(window)
+    Trainer.ended = None
     press(window, "Ctrl+Shift+P")
-    assert window.main_view.work.message is not None
-    assert "nothing to move" in window.main_view.work.message.text
+    asked = window.main_view.work.dialog
+    assert asked is not None
+    assert asked.options is not None
+    assert asked.options.can_move == (TURNTABLE,), "a film needs no edit"
+    press(window, "Enter")
+    for _ in range(2):
+        turn(window)
+    film = json.loads(Path(Trainer.said[-1]).read_text(encoding="utf-8"))["view"]["timeline"]
+    assert len({key["camera"]["azimuth"] for key in film["keys"]}) == len(film["keys"]) == 96
 
 
 def test_quitting_asks_while_something_is_written(window: application.App, tmp_path: Path) -> None:

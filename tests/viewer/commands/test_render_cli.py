@@ -166,6 +166,34 @@ def test_a_sweep_is_an_animation_there_and_back(run: Run) -> None:
     assert np.array_equal(frames[2], frames[3]), "the way back is the way there"
 
 
+def test_all_sliders_in_turn_end_with_all_at_one(run: Run) -> None:
+    edits = ("scarf.gdf", "ears.gdf")
+    assert run("render", "bear.ply", *edits, "--sweep", "all", *SMALL, "-o", "all.webp") == 0
+    with Image.open("all.webp") as animation:
+        assert animation.n_frames == 4 * film.SWEEP_STEPS
+        found = []
+        for i in (0, film.SWEEP_STEPS, 2 * film.SWEEP_STEPS):
+            animation.seek(i)
+            found.append(np.asarray(animation.convert("RGB")).astype(float))
+    for frame, settings in zip(found, ((0, 0), (1, 0), (1, 1)), strict=True):
+        strengths = [f"--set={name}={s}" for name, s in zip(("scarf", "ears"), settings, strict=True)]
+        assert run("render", "bear.ply", *edits, *strengths, *SMALL, "-o", "still.png") == 0
+        still = np.asarray(Image.open("still.png").convert("RGB")).astype(float)
+        assert np.abs(frame - still).mean() < 3.0, settings  # levels; the .webp is lossy
+
+
+def test_a_turntable_needs_no_edit_and_begins_at_the_chosen_camera(run: Run) -> None:
+    options = ("--turntable", "1", "--orbit", "40,20", *SMALL)
+    assert run("render", "bear.ply", *options, "-o", "turn") == 0
+    assert run("render", "bear.ply", "--orbit", "40,20", *SMALL, "-o", "still.png") == 0
+    assert len(list(Path("turn").glob("*.png"))) == 24
+    first, half, still = (
+        pixels(name).astype(int) for name in ("turn/frame_0000.png", "turn/frame_0012.png", "still.png")
+    )
+    assert np.abs(first - still).mean() < 0.5
+    assert np.abs(half - still).mean() > 2.0
+
+
 def test_a_sheet_of_one_slider_is_a_row_of_five(run: Run) -> None:
     assert run("render", "bear.ply", "ears.gdf", "--sheet", "ears", *SMALL, "-o", "row.png") == 0
     height, width, _ = pixels("row.png").shape
@@ -238,8 +266,12 @@ def test_a_mistake_is_one_line_and_leaves_no_file(
         (("render", "bear.ply", "nope.gdf", "-o", "x.png"), "nope.gdf does not exist"),
         (("render", "bear.ply", "-o", "nowhere/x.png"), "the folder nowhere does not exist"),
         (("render", "bear.ply", "-o", "x.jpg"), "x.jpg is not a .png file"),
-        (("render", "bear.ply", "-o", "x.gif"), "x.gif holds an animation; say which slider moves"),
+        (("render", "bear.ply", "-o", "x.gif"), "x.gif holds an animation; say what moves: --sweep NAME or"),
         (("render", "bear.ply", "--sweep", "ears", "-o", "x.gif"), "--sweep ears: no .gdf file was given"),
+        (
+            ("render", "bear.ply", "--turntable", "0", "-o", "x.gif"),
+            "--turntable must be 1 to 120 seconds, got 0",
+        ),
         (("view", "nope.ply"), "nope.ply does not exist"),
         (("view", "bear.ply", "scarf.gdf", "--set", "hat=1"), "--set hat: there is no edit of that name"),
         (("export", "bear.ply", "ears.gdf", "-o", "bear.ply"), "bear.ply is one of the files to read"),

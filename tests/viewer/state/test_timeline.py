@@ -181,6 +181,33 @@ def test_playing_shows_the_films_frames_in_their_order_at_its_pace(ping_pong: bo
     assert seen == (list(timeline.film_frames(made)) * 3)[:12]
 
 
+def test_a_turntable_is_even_and_its_last_frame_is_followed_by_its_first() -> None:
+    start = ViewCamera(azimuth=100.0, elevation=20.0)
+    turn = timeline.turntable(start, 24, 1.5)
+    frames = list(timeline.film_frames(turn))
+    assert len(frames) == 36
+    cameras = [timeline.camera_at(turn, frame) for frame in frames]
+    assert cameras[0] == start
+    for camera, after in zip(cameras, [*cameras[1:], cameras[0]], strict=True):
+        assert camera is not None
+        assert after is not None
+        assert (after.azimuth - camera.azimuth) % 360.0 == pytest.approx(10.0)
+        assert replace(after, azimuth=0.0) == replace(start, azimuth=0.0)
+
+
+def test_sliders_go_in_turn_and_back_and_the_others_stay() -> None:
+    one, both = (timeline.slider_film(view(), gdfs, 10, 2.0) for gdfs in ([1], [1, 0]))
+    assert [timeline.strengths_at(one, frame) for frame in (0, 5, 10)] == [
+        {0: 0.2, 1: s} for s in (0.0, pytest.approx(0.5), 1.0)
+    ]
+    assert [timeline.strengths_at(both, frame) for frame in (0, 10, 20)] == [
+        {1: 0.0, 0: 0.0},
+        {1: 1.0, 0: 0.0},
+        {1: 1.0, 0: 1.0},
+    ]
+    assert len(list(timeline.film_frames(both))) == 40
+
+
 def test_a_slow_frame_skips_frames_of_the_film_and_keeps_its_pace() -> None:
     made = replace(two_keys(length=20), fps=10)
     fast, slow = Player(playing=True), Player(playing=True)

@@ -12,8 +12,9 @@ from viewer.app.application import Application, failure_line
 from viewer.files import exports, session
 from viewer.files.session import WindowSession
 from viewer.files.user_files import parse_path
-from viewer.jobs.job_queue import DeliverOptions, Delivery, JobQueue
-from viewer.state.view_state import Comparison, Keyframe, Timeline, ViewState
+from viewer.jobs.job_queue import ALL_SLIDERS, TURNTABLE, DeliverOptions, Delivery, JobQueue
+from viewer.state import timeline
+from viewer.state.view_state import Comparison, ViewState
 from viewer.state.workspace import Dialog
 
 SUFFIXES = {"export": ".ply", "render_picture": ".png", "render_film": ".mp4"}
@@ -58,12 +59,12 @@ class DeliverActions:
         options = self._options.get(name, DeliverOptions())
         if name == "render_film":
             keys = ("timeline",) if len(view.timeline.keys) > 1 else ()
-            moving = (*keys, *(layer.name for layer in reversed(view.layers)))
-            if not moving:
-                raise ProgdfError(
-                    "there is nothing to move yet; make an edit, or set keys on the timeline (K)"
-                )
-            moves = moving[0] if keys or focus is None else view.layers[focus].name
+            sliders = (
+                *(layer.name for layer in reversed(view.layers)),
+                *[ALL_SLIDERS] * (len(view.layers) > 1),
+            )
+            moving = (*keys, *sliders, TURNTABLE)
+            moves = moving[0] if keys or focus is None or not view.layers else view.layers[focus].name
             options = self._options.get(name, DeliverOptions(width=1280, height=720))
             fps = view.timeline.fps if keys else options.fps
             options = replace(options, moves=moves, can_move=moving, fps=fps)
@@ -88,7 +89,7 @@ class DeliverActions:
             raise ProgdfError(exists)
         document, view = self._app.document, replace(self._app.main_view.work.view, compare=Comparison())
         if kind == "render_film" and options.moves != "timeline":
-            view = _slider_film(view, options)
+            view = _film(view, options)
         elif kind == "render_film":
             view = replace(view, timeline=replace(view.timeline, fps=options.fps))
         number = len(list(self._queue.folder.iterdir()))
@@ -112,10 +113,9 @@ class DeliverActions:
         return {job.task.out for job in self._queue.jobs if job.busy}
 
 
-def _slider_film(view: ViewState, options: DeliverOptions) -> ViewState:
-    """The view with a timeline on which one layer's slider goes there and back."""
-    gdf = next(layer.gdf for layer in view.layers if layer.name == options.moves)
-    length = max(round(options.fps * options.seconds / 2), 1)
-    still = tuple((layer.gdf, layer.strength) for layer in view.layers if layer.gdf != gdf)
-    keys = tuple(Keyframe(frame, ((gdf, s), *still)) for frame, s in ((0, 0.0), (length, 1.0)))
-    return replace(view, timeline=Timeline(keys, length, options.fps, ping_pong=True))
+def _film(view: ViewState, options: DeliverOptions) -> ViewState:
+    """The view with a timeline on which sliders go there and back, or the camera once around its pivot."""
+    if options.moves == TURNTABLE:
+        return replace(view, timeline=timeline.turntable(view.camera, options.fps, options.seconds))
+    gdfs = [layer.gdf for layer in view.layers if options.moves in (layer.name, ALL_SLIDERS)]
+    return replace(view, timeline=timeline.slider_film(view, gdfs, options.fps, options.seconds))
