@@ -20,6 +20,7 @@ from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf, fingerprint, load_gdf
 from progdf.io.cameras import load_cameras
 from progdf.io.picture_camera import edits_in_picture, find_picture_camera
+from progdf.io.session import BUNDLE, unpack_bundle
 from progdf.metrics.image import NO_DIFFERENCE
 from progdf.region import Region, from_mask
 from progdf.scene.strays import Strays, clean, find_strays, picture_difference
@@ -345,8 +346,9 @@ class FileActions:
         changed picture goes into the form of a new edit."""
 
         def open_kind() -> None:
-            picture = path.suffix.lower() in PICTURES
-            self._open(path, "picture" if picture else kind_of(path))
+            file = unpack_bundle(path) if path.name.endswith(BUNDLE) else path
+            picture = file.suffix.lower() in PICTURES
+            self._open(file, "picture" if picture else kind_of(file))
 
         self._report_errors(open_kind)
 

@@ -21,6 +21,7 @@ from progdf.color.edits import parse_color
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
+from progdf.io.session import BUNDLE, unpack_bundle
 from progdf.io.tensors import open_npy
 from progdf.region import Region
 from progdf.scene.regions import check_region, parse_region
@@ -156,8 +157,8 @@ class ExportOptions:
 
     stack: OmitArgPrefixes[StackOptions]
     out: Annotated[Path, word("FILE", aliases=["-o"])]
-    """The file to write: a 3DGS .ply, .compressed.ply, .spz, .sog, .splat, .glb or .usdc; or a .cube file,
-    for color programs, of what one grade does at its strength."""
+    """The file to write: a 3DGS .ply, .compressed.ply, .spz, .sog, .splat, .glb or .usdc; a .progdf.zip with
+    the scene and its edits, to hand on; or a .cube file, for color programs, of what one grade does."""
     frames: Annotated[int | None, word("N", "one file")] = None
     """As many steps from the original to the strengths: numbered files, of a .usdc its time samples."""
 
@@ -239,6 +240,8 @@ def open_stack(stack: StackOptions, drawing: DrawingOptions | None = None, unset
         ProgdfError: a file is missing or broken, an edit was made for another scene or given twice, options
             name no edit; or they say what a session says already.
     """
+    if stack.scene.name.endswith(BUNDLE):
+        stack = replace(stack, scene=unpack_bundle(stack.scene))
     if stack.scene.is_file() and kind_of(stack.scene) == "session":
         return _open_session(stack, drawing)
     paths: dict[str, Path] = {}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 import sys
+import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -37,6 +38,7 @@ from progdf.gdf.file import Gdf
 from progdf.io.atomic import atomic_write, check_not_an_input
 from progdf.io.cameras import read_camera
 from progdf.io.picture_camera import camera_chunk
+from progdf.io.session import BUNDLE, write_bundle
 from progdf.metrics.image import NO_DIFFERENCE
 from progdf.scene.strays import picture_difference
 from progdf.terminal import file_size, format_count, print_line
@@ -53,7 +55,7 @@ from viewer.camera.view_camera import (
     from_camera,
     to_camera,
 )
-from viewer.files import timeline_file
+from viewer.files import session, timeline_file
 from viewer.files.document import empty
 from viewer.pictures import film
 from viewer.pictures.compare import Comparer, draw_labels
@@ -111,8 +113,9 @@ def export(argv: Sequence[str]) -> int:
     """`progdf export`: the edited scene as a .ply that any viewer opens."""
     options: ExportOptions = parse(ExportOptions, argv, "progdf export")
     out = options.out
-    ending = CUBE if out.suffix.lower() == CUBE else written_format(out)
-    if options.frames is not None and (ending == CUBE or not 2 <= options.frames <= MOST_FRAMES):
+    endings = (end for end in (CUBE, BUNDLE) if out.name.lower().endswith(end))
+    ending = next(endings, None) or written_format(out)
+    if options.frames is not None and (ending in (CUBE, BUNDLE) or not 2 <= options.frames <= MOST_FRAMES):
         raise ProgdfError(
             f"--frames takes 2 to {MOST_FRAMES} steps of a scene, not {options.frames} of {out.name}"
         )
@@ -120,6 +123,13 @@ def export(argv: Sequence[str]) -> int:
     check_not_an_input(out, opened.files)
     if ending == CUBE:
         return _export_cube(out, opened)
+    if ending == BUNDLE:
+        with tempfile.TemporaryDirectory(prefix="progdf-") as folder:
+            source = Path(folder) / "stack.session.json"
+            session.save(source, session.WindowSession(opened.document, opened.view, opened.snapshots))
+            count = write_bundle(out, source)
+        print_line(f"wrote {out}: {file_size(out.stat().st_size)}, {count} files; open it with progdf view")
+        return 0
     document, strengths = opened.document, describe_strengths(opened.view)
     if options.frames is not None:
         shares = np.linspace(0.0, 1.0, options.frames).tolist()

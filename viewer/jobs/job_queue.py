@@ -40,6 +40,12 @@ ALL_SLIDERS, TURNTABLE = "\0sliders", "\0turntable"
 """Films of no layer's own, in `DeliverOptions.moves`."""
 
 
+def film_title(moves: str) -> str:
+    """What a film shows, for a person."""
+    whole = {"timeline": "The timeline", ALL_SLIDERS: "All sliders in turn", TURNTABLE: "Once around"}
+    return whole.get(moves, f"The slider of {moves}, there and back")
+
+
 @dataclass(frozen=True)
 class DeliverOptions:
     """What a picture or a film is asked for."""

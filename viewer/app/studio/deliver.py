@@ -8,6 +8,8 @@ from pathlib import Path
 
 from progdf import __version__
 from progdf.errors import ProgdfError
+from progdf.formats.scene_file import WRITTEN
+from progdf.io.session import BUNDLE
 from viewer.app.application import Application, failure_line
 from viewer.files import exports, session
 from viewer.files.session import WindowSession
@@ -78,7 +80,8 @@ class DeliverActions:
     def _start(self, kind: str, dialog: Dialog) -> None:
         out, options = parse_path(dialog.text).resolve(), dialog.options or DeliverOptions()
         suffix = options.format if kind == "render_film" else SUFFIXES[kind]
-        if suffix and out.suffix.lower() != suffix:
+        named = kind == "export" and out.name.lower().endswith((*WRITTEN, BUNDLE))
+        if suffix and not named and out.suffix.lower() != suffix:
             out = out.with_name(out.name + suffix)
         if not out.parent.is_dir():
             raise ProgdfError(f"the folder {out.parent} does not exist; create it first")

@@ -12,15 +12,7 @@ from progdf import __version__
 from progdf.io.session import SUFFIX
 from progdf.terminal import escape_text
 from viewer.camera.view_camera import ViewCamera
-from viewer.jobs.job_queue import (
-    ALL_SLIDERS,
-    FORMAT_NAMES,
-    FORMATS,
-    FPS,
-    SIZES,
-    TURNTABLE,
-    DeliverOptions,
-)
+from viewer.jobs.job_queue import FORMAT_NAMES, FORMATS, FPS, SIZES, DeliverOptions, film_title
 from viewer.state.view_state import ViewState
 from viewer.ui import overlay
 from viewer.ui.context import BEHIND, FIXED, PALETTE, SMALL_PX, UNFOCUSED, Icon, UiContext, u32
@@ -298,8 +290,7 @@ def draw_fields(kind: str, path: str, options: DeliverOptions, ui: UiContext) ->
         return path, options if pressed is None else replace(options, alpha=pressed == 1)
     label("Moves", column)
     imgui.set_next_item_width(-1.0)
-    whole = {"timeline": "The timeline", ALL_SLIDERS: "All sliders in turn", TURNTABLE: "Once around"}
-    titles = [whole.get(name, f"The slider of {name}, there and back") for name in options.can_move]
+    titles = [film_title(name) for name in options.can_move]
     now = options.can_move.index(options.moves)
     pressed = drop_down("##moves", titles[now], titles, now, ui, "What moves in the film")
     options = options if pressed is None else replace(options, moves=options.can_move[pressed])

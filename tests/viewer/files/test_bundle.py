@@ -1,0 +1,156 @@
+"""NAME.progdf.zip: a session and all it needs in one file, from `export` to `view` and the window."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from progdf.__main__ import main
+from progdf.errors import ProgdfError
+from progdf.io.session import unpack_bundle, write_bundle
+from tests.helpers.null_app import null_app
+from tests.helpers.sessions import bear_files, full_view, opened_document, saved_session
+from tests.helpers.ui_rig import bear
+from viewer.files import session
+from viewer.files.document import empty
+from viewer.state import selection
+from viewer.state.selection import SelectionState
+from viewer.state.view_state import ViewState
+
+
+@pytest.fixture
+def bundle(tmp_path: Path) -> Path:
+    """The bear's session in a file, alone in a folder."""
+    (tmp_path / "here").mkdir()
+    (tmp_path / "there").mkdir()
+    saved = saved_session(bear_files(tmp_path / "here"))
+    path = tmp_path / "there" / "bear.progdf.zip"
+    assert main(["export", str(saved), "-o", str(path)]) == 0
+    return path
+
+
+def test_a_bundle_is_the_session_in_a_folder_of_its_own(bundle: Path, tmp_path: Path) -> None:
+    (saved,) = (tmp_path / "here").glob("*.session.json")
+    before, after = session.open_session(saved), session.open_session(unpack_bundle(bundle))
+    assert (after.view, after.snapshots) == (before.view, before.snapshots)
+    names = {path.name for path in bundle.parent.iterdir()}
+    assert names == {"bear.progdf", "bear.progdf.zip"}
+    again = unpack_bundle(bundle)
+    assert again.parent == bundle.parent / "bear.progdf", "what was unpacked is opened, not unpacked again"
+
+
+def test_a_scene_with_edits_is_a_bundle_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = bear_files(tmp_path)
+    words = [
+        str(folder / "bear.ply"),
+        *map(str, sorted((folder / "edits").glob("*.gdf"))),
+        "--set",
+        "ears=0.3",
+    ]
+    assert main(["export", *words, "-o", str(tmp_path / "a.progdf.zip")]) == 0
+    assert "4 files; open it with progdf view" in capsys.readouterr().out
+    assert (
+        main(["render", str(tmp_path / "a.progdf.zip"), "--size", "32x32", "-o", str(tmp_path / "a.png")])
+        == 0
+    )
+    opened = session.open_session(unpack_bundle(tmp_path / "a.progdf.zip"))
+    assert {layer.name: layer.strength for layer in opened.view.layers}["ears"] == 0.3
+
+
+def test_regions_come_along_and_are_the_folder_s_own(tmp_path: Path) -> None:
+    folder = bear_files(tmp_path)
+    third = selection.select(SelectionState(), np.arange(len(bear().scene)) % 3 == 0)
+    kept = selection.add_region(third, "third", folder / "edits" / "third.region.npy")
+    document = opened_document(folder)
+    saved = session.WindowSession(document, replace(full_view(), selection=kept))
+    session.save(folder / "work.session.json", saved)
+    write_bundle(tmp_path / "a.progdf.zip", folder / "work.session.json")
+    opened = session.open_session(unpack_bundle(tmp_path / "a.progdf.zip"))
+    assert opened.warning == ""
+    (region,) = opened.view.selection.regions
+    assert region.path == tmp_path / "a.progdf" / "third.region.npy"
+    assert region.members == kept.regions[0].members
+
+
+def test_files_of_one_name_get_numbers(tmp_path: Path) -> None:
+    folder = bear_files(tmp_path)
+    saved = saved_session(folder)
+    for path, other in zip(sorted((folder / "edits").glob("*.gdf")), ("a", "b"), strict=True):
+        (folder / other).mkdir()
+        path.rename(folder / other / "Edit.gdf")
+        saved.write_text(saved.read_text().replace(f"edits/{path.name}", f"{other}/Edit.gdf"))
+    assert write_bundle(tmp_path / "a.progdf.zip", saved) == 4
+    with zipfile.ZipFile(tmp_path / "a.progdf.zip") as archive:
+        assert {"Edit.gdf", "Edit-2.gdf", "bear.ply"} < set(archive.namelist())
+
+
+def test_the_window_opens_a_bundle(bundle: Path) -> None:
+    with null_app(empty(), ViewState(), bundle.parent) as app:
+        app.open(bundle)
+        assert [layer.name for layer in app.main_view.work.view.layers] == ["ears → gold", "scarf"]
+
+
+def rewritten(path: Path, change: Callable[[dict[str, bytes]], None]) -> Path:
+    """The bundle with other files in it."""
+    with zipfile.ZipFile(path) as archive:
+        files = {name: archive.read(name) for name in archive.namelist()}
+    change(files)
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in files.items():
+            archive.writestr(name, content)
+    return path
+
+
+@pytest.mark.parametrize(
+    "name", ["../evil.ply", "/tmp/evil.ply", "a/evil.ply", "..", "a\\evil.ply", "C:evil", ".x"]
+)
+def test_nothing_is_written_outside_its_folder(bundle: Path, name: str) -> None:
+    rewritten(bundle, lambda files: files.update({name: b"evil"}))
+    with pytest.raises(ProgdfError, match="which is no plain file"):
+        unpack_bundle(bundle)
+    assert [path.name for path in bundle.parent.iterdir()] == ["bear.progdf.zip"]
+    assert not list(bundle.parents[1].rglob("*evil*"))
+
+
+def test_what_is_no_bundle_is_one_line_and_leaves_nothing(
+    bundle: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = bundle.read_bytes()
+    for content, said in (
+        (b"", "is no bundle"),
+        (whole[: len(whole) // 2], "is no bundle"),
+        (whole[:2000] + bytes(500) + whole[2500:], "is no bundle"),
+    ):
+        bundle.write_bytes(content)
+        with pytest.raises(ProgdfError, match=said) as caught:
+            unpack_bundle(bundle)
+        assert "\n" not in str(caught.value)
+        assert [path.name for path in bundle.parent.iterdir()] == ["bear.progdf.zip"]
+    bundle.write_bytes(whole)
+    rewritten(bundle, lambda files: files.update({"b.session.json": b"{}"}))
+    with pytest.raises(ProgdfError, match="it holds 2 sessions"):
+        unpack_bundle(bundle)
+    monkeypatch.setattr("progdf.io.session._MOST_INFLATED", 1)
+    rewritten(bundle, lambda files: files.update({"b.session.json": bytes(3 << 20)}))
+    rewritten(bundle, lambda files: files.update({"zeros.ply": files.pop("b.session.json")}))
+    with pytest.raises(ProgdfError, match="far more than it can hold"):
+        unpack_bundle(bundle)
+
+
+def test_a_file_that_was_changed_on_the_way_is_refused_by_name(bundle: Path) -> None:
+    rewritten(bundle, lambda files: files.update({"bear.ply": files["bear.ply"] + b" "}))
+    with pytest.raises(ProgdfError, match=r"was saved with another bear\.ply"):
+        session.open_session(unpack_bundle(bundle))
+
+
+def test_a_folder_of_somebody_else_is_left_alone(bundle: Path) -> None:
+    (bundle.parent / "bear.progdf").mkdir()
+    (bundle.parent / "bear.progdf" / "mine.txt").write_text("mine")
+    with pytest.raises(ProgdfError, match=r"is not what bear\.progdf\.zip unpacks to"):
+        unpack_bundle(bundle)
+    assert (bundle.parent / "bear.progdf" / "mine.txt").read_text() == "mine"
