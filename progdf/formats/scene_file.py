@@ -1,4 +1,4 @@
-"""Scenes in every format that people have: .ply, compressed .ply, .spz, .splat, .ksplat, .sog, .glb.
+"""Scenes in every format that people have: .ply, compressed .ply, .spz, .splat, .ksplat, .sog, .glb, .ckpt.
 
 Recognized by content, else by name. The code for .spz, .sog and .splat is that of gaussforge, in a process of
 its own (see `gaussforge_child`), as native code may crash on a broken file.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import pickle
 import shutil
 import signal
 import subprocess
@@ -35,7 +36,7 @@ from .ksplat import read_ksplat
 from .ply import load_ply_with_report, read_header, save_ply, save_ply_checked
 from .repair import LoadReport, repair
 
-FORMATS = ("ply", "spz", "splat", "ksplat", "sog", "glb")
+FORMATS = ("ply", "spz", "splat", "ksplat", "sog", "glb", "ckpt")
 """What a scene may be, by the ending of its name; a compressed .ply is a .ply."""
 
 WRITTEN = (".ply", ".compressed.ply", ".spz", ".sog", ".splat", ".glb", usd.SUFFIX)
@@ -70,6 +71,8 @@ def scene_format(path: str | os.PathLike[str]) -> str | None:
         return "glb"
     if start[:4] == b"NGSP" or (start[:2] == b"\x1f\x8b" and _inflate(start)[:4] == b"NGSP"):
         return "spz"
+    if suffix in ("ckpt", "pt") and start[:2] == b"PK":
+        return "ckpt"
     if start[:4] == b"PK\x03\x04":
         return "sog" if _sog_meta(path) is not None else None
     if path.name.lower() == SOG_META and start.lstrip()[:1] == b"{":
@@ -117,6 +120,8 @@ def load_scene_with_report(path: str | os.PathLike[str]) -> tuple[Gaussians, Loa
         return _repair(path, scene, f".ksplat, level {level}")
     if kind == "glb":
         return _repair(path, rotate_about_x(gltf.read_glb(path)), ".glb, turned from y up to y down")
+    if kind == "ckpt":
+        return _repair(path, read_checkpoint(path), "checkpoint of a training")
     scene, report = _through_gaussforge(path, kind)
     description, antialiased = f".{kind}", False
     if kind == "spz":
@@ -134,6 +139,49 @@ def load_scene_with_report(path: str | os.PathLike[str]) -> tuple[Gaussians, Loa
         origin=scene.origin,
     )
     return replace(scene, antialiased=antialiased), report
+
+
+def read_checkpoint(path: Path) -> Gaussians:
+    """The Gaussians of a gsplat (.pt) or nerfstudio (.ckpt) training, as stored; weights alone are read.
+
+    Raises:
+        ProgdfError: it holds anything but weights, or no Gaussians.
+    """
+    try:
+        table = torch.load(path, map_location="cpu", weights_only=True)
+        table = table.get("splats", table.get("pipeline", table))
+        columns = {
+            name.rpartition(".")[2]: tensor.float() for name, tensor in table.items() if _is_part(name)
+        }
+        rest = columns.get("shN", columns.get("features_rest"))
+        base = columns.get("sh0", columns.get("features_dc"))
+        if rest is None or base is None:
+            raise KeyError("colors")
+        base, rest = base.reshape(-1, 3), rest.reshape(len(rest), -1, 3)
+        if "features_dc" in columns and not rest.shape[1]:  # splatfacto without bands keeps logits of rgb
+            base = sh.rgb_to_sh0(base.sigmoid())
+        return Gaussians(
+            columns["means"],
+            columns["quats"],
+            columns["scales"],
+            columns["opacities"].reshape(-1),
+            base,
+            rest,
+        )
+    except (pickle.UnpicklingError, EOFError):
+        reason = "it holds more than weights, which is not loaded"
+    except (RuntimeError, OSError, ValueError):  # of its archive and of the shapes
+        reason = "it is damaged"
+    except (KeyError, AttributeError, TypeError):
+        reason = "it holds no means, quats, scales, opacities and colors"
+    raise ProgdfError(
+        f"{path} is no checkpoint of Gaussians from gsplat or nerfstudio: {reason}; export a .ply"
+    )
+
+
+def _is_part(name: str) -> bool:
+    """Whether it is a tensor of the Gaussians, and not one of their optimizer or of another model."""
+    return "." not in name or name.startswith("_model.gauss_params.")
 
 
 def rotate_about_x(scene: Gaussians) -> Gaussians:

@@ -35,7 +35,7 @@ from progdf.formats.scene_file import (
 from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.quaternions import rotation_matrices
 from progdf.rasterize import render
-from progdf.sh import rgb_to_sh0, shade
+from progdf.sh import rgb_to_sh0, sh0_to_rgb, shade
 from tests.helpers.refused import refusal
 from tests.helpers.scene_files import write_compressed_ply, write_ksplat, write_scene
 from tests.helpers.scenes import orbit_camera, random_gaussians
@@ -396,6 +396,64 @@ def test_usd_has_the_numbers_of_every_step_and_stores_once_what_stays(tmp_path: 
         prim.GetAttribute("orientations").Get()[7].imaginary,
     )
     assert torch.allclose(torch.tensor([real, *imaginary]), step.unit_quats[7])
+
+
+def checkpoints(scene: Gaussians) -> dict[str, object]:
+    """As gsplat's trainer and nerfstudio's splatfacto save them, with and without bands."""
+    splats = {"means": scene.means, "quats": scene.quats, "scales": scene.log_scales}
+    colors = {"features_dc": scene.sh0, "features_rest": scene.shN}
+    model = splats | {"opacities": scene.logit_opacities[:, None]} | colors
+    flat = model | {
+        "features_dc": sh0_to_rgb(scene.sh0).logit(),
+        "features_rest": torch.zeros(len(scene), 0, 3),
+    }
+    more = {"_model.camera_optimizer.pose_adjustment": torch.zeros(2, 6)}
+
+    def nerfstudio(model: dict[str, torch.Tensor]) -> dict[str, object]:
+        return {"step": 3, "pipeline": {f"_model.gauss_params.{n}": t for n, t in model.items()} | more}
+
+    bands = {"sh0": scene.sh0[:, None], "shN": scene.shN}
+    gsplat = {"step": 3, "splats": splats | {"opacities": scene.logit_opacities} | bands}
+    return {"gsplat.pt": gsplat, "nerfstudio.ckpt": nerfstudio(model), "flat.ckpt": nerfstudio(flat)}
+
+
+def test_checkpoints_of_trainings_open_as_scenes(tmp_path: Path) -> None:
+    scene = scene_of(2)
+    for name, content in checkpoints(scene).items():
+        torch.save(content, tmp_path / name)
+        assert kind_of(tmp_path / name) == "scene"
+        found = load_scene(tmp_path / name)
+        assert torch.allclose(found.sh0, scene.sh0, atol=0.0 if name != "flat.ckpt" else 1e-5), name
+        assert found.sh_degree == (0 if name == "flat.ckpt" else 2)
+        for part in ("means", "quats", "log_scales", "logit_opacities"):
+            assert torch.equal(getattr(found, part), getattr(scene, part)), (name, part)
+
+
+class Evil:
+    """What a pickle can do."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return Path.touch, (self.path,)
+
+
+def test_a_checkpoint_runs_nothing_and_what_is_none_is_one_line(tmp_path: Path) -> None:
+    whole = checkpoints(scene_of(1))["gsplat.pt"]
+    cases = {
+        "code.pt": ({"splats": Evil(tmp_path / "touched")}, "it holds more than weights"),
+        "other.ckpt": ({"pipeline": {"_model.field.weight": torch.zeros(3)}}, "it holds no means"),
+        "list.pt": ([1, 2], "it holds no means"),
+        "shape.pt": ({"splats": whole["splats"] | {"means": torch.zeros(5, 2)}}, "it is damaged"),  # type: ignore[index]
+    }
+    for name, (content, said) in cases.items():
+        torch.save(content, tmp_path / name)
+        assert said in refusal(load_scene, tmp_path / name), name
+    torch.save(whole, tmp_path / "cut.pt")
+    (tmp_path / "cut.pt").write_bytes((tmp_path / "cut.pt").read_bytes()[:5000])
+    assert "it is damaged" in refusal(load_scene, tmp_path / "cut.pt")
+    assert not (tmp_path / "touched").exists()
 
 
 def test_frames_are_numbered_and_each_is_a_scene(tmp_path: Path) -> None:
