@@ -128,6 +128,7 @@ def resolve_kind(options: TrainOptions, kind: EditKind, group_steps: int) -> Opt
         kind=kind,
         stages=optimize.stages or min(most, QUICK_STAGES if optimize.steps < STAGE_STEPS * most else most),
         group_steps=group_steps if kind == "geometry" else 0,
+        grow=optimize.grow if kind != "color" else 0.0,
         # only an edit of colors may leave the bands alone
         sh="on" if optimize.sh == "auto" and kind != "color" else optimize.sh,
         perceptual_weight=PERCEPTUAL_WEIGHT[kind] if weight is None else weight,
@@ -148,6 +149,7 @@ def check_options(options: TrainOptions) -> None:
         ("--image-size", options.views.image_size or SMALLEST_VIEW, SMALLEST_VIEW, 2048),
         ("--stages", optimize.stages, 0, 16),
         ("--group-steps", optimize.group_steps, 0, 10_000),
+        ("--grow", optimize.grow, 0, 1),
         ("--seed", options.seed, 0, LARGEST_SEED),
         ("--threads", options.threads, 0, MOST_THREADS),
         ("--edit-steps", editor.edit_steps, 1, 1000),
@@ -164,6 +166,8 @@ def check_options(options: TrainOptions) -> None:
     if weight is not None and not 0 <= weight < math.inf:
         raise ProgdfError(f"--perceptual-weight must be 0 or more, got {weight}")
     _check_editor_options(editor, optimize)
+    if optimize.grow and (optimize.kind == "color" or options.field.field == "neural"):
+        raise ProgdfError("--grow adds nothing to an edit of colors alone, nor to a network; leave it out")
     check_field_options(options.field, options.preset)
     parse_guidance(editor.guidance)
 
@@ -200,6 +204,8 @@ def _check_editor_options(editor: EditorOptions, optimize: OptimizeOptions) -> N
     if editor.family == "pictures" and editor.removal == "never" and editor.fill is not None:
         raise ProgdfError("--fill closes holes of a removal; leave out --removal never, or --fill")
     of_instruct = ("model", "guidance", "edit_steps", "anchor", "quantize", "device")
+    if optimize.grow and editor.family not in PER_VIEW:
+        raise ProgdfError(f"--grow does not apply to {editor.family}; it is for {' and '.join(PER_VIEW)}")
     for names, kinds in (
         (of_instruct, ("instruct",)),
         (("edit_size",), ("style", "instruct")),

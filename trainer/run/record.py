@@ -145,8 +145,9 @@ def reopen_run(root: Path, scene: Path | None = None) -> FinishedRun:
                 "give that one with --scene"
             )
         region = Region(record.plan.name, members, score)
-        if len(region) != trajectory.end.shape[0]:
-            raise ValueError(f"it has {trajectory.end.shape[0]} members, the region {len(region)}")
+        rows = len(region) + (0 if trajectory.added is None else len(trajectory.added))
+        if rows != trajectory.end.shape[0]:
+            raise ValueError(f"it has {trajectory.end.shape[0]} members, the region {rows}")
     except ProgdfError:
         raise
     except (KeyError, TypeError, ValueError) as error:

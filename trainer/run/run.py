@@ -43,6 +43,7 @@ from trainer.fit.draft import draft_grade, draft_views
 from trainer.fit.fit import choose_path, drop_idle_attributes
 from trainer.fit.network import PART as NETWORK
 from trainer.fit.slider_uniformity import equalized_strengths
+from trainer.optimize.growth import fade_in
 from trainer.optimize.losses import Perceptual, describe_loss, perceptual_loss
 from trainer.optimize.retime import resolve_slider
 from trainer.options import MOST_STAGES, EditKind, OptimizeOptions, TrainOptions
@@ -262,7 +263,7 @@ def _run_training(
         )
         extra = {"members": region.members, "score": region.score}
         save_trajectory(folder.trajectory, trajectory, extra, plain(record))
-        _write_finals(setup, trajectory, folder, log)
+        _write_finals(setup.extended(trajectory.added), trajectory, folder, log)
         folder.state.save("recorded", {}, log.capture_state().values)
     else:
         log.restore(recorded)
@@ -479,7 +480,9 @@ def expected_work(setup: TrainingSetup, optimization: OptimizeOptions, strengths
     if optimization.solver == "colors":
         return work | {"weights": 0.5 * train, "model": 1.5 * train, "optimize": 0.45 * train * strengths}
     moves = optimization.group_steps or 0
-    return work | {"move parts": 0.2 * moves * strengths, "optimize": 0.25 * optimization.steps}
+    tried = 0.1 * optimization.steps if optimization.grow else 0.0
+    work |= {"move parts": 0.2 * moves * strengths, "try to grow": tried}
+    return work | {"optimize": 0.25 * optimization.steps}
 
 
 def _agreement(
@@ -522,6 +525,7 @@ def _record(
         trajectory, losses, effort = optimize_members(
             options, optimization, setup, edited, perceptual, folder.state, log, between=between
         )
+    setup = setup.extended(trajectory.added)
     with log.stage("retime"):
         costs: dict[str, float] = {}
         if not only_recolors(trajectory.offsets) or trajectory.end.shape[1] > BASE_CHANNELS:
@@ -534,6 +538,7 @@ def _record(
             trajectory, reason = _choose_path(trajectory, options, optimization, setup, editor, log)
         else:
             trajectory = retime_trajectory(trajectory, setup, optimization, log)
+        trajectory = fade_in(trajectory, finer=True)
     log.say(
         f"{recorded} recordings, {len(trajectory)} kept; without an attribute, dB: {costs or 'none moves'}"
     )
