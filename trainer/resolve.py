@@ -100,7 +100,9 @@ def recorded_options(options: TrainOptions) -> TrainOptions:
     return replace(options, out=Path(), preset="default", quick=False, threads=0, resume=False)
 
 
-def resolve_kind(options: TrainOptions, kind: EditKind, group_steps: int) -> OptimizeOptions:
+def resolve_kind(
+    options: TrainOptions, kind: EditKind, group_steps: int, grow: float = 0.0
+) -> OptimizeOptions:
     """How the members are optimized in an edit of this kind: nothing is left open.
 
     What each of the defaults gives, alone, is in docs/experiments.md, Terms and options of a descent.
@@ -109,6 +111,7 @@ def resolve_kind(options: TrainOptions, kind: EditKind, group_steps: int) -> Opt
         options: resolved, see `resolve`
         kind: what the edit moves
         group_steps: as asked, or as a trial found; without effect where nothing moves
+        grow: how many rows may be added, as a share of the members; as a trial found
     """
     optimize = options.optimize
     sharpness = SHARPNESS[kind] if optimize.sharpness == "kind" else optimize.sharpness
@@ -128,7 +131,7 @@ def resolve_kind(options: TrainOptions, kind: EditKind, group_steps: int) -> Opt
         kind=kind,
         stages=optimize.stages or min(most, QUICK_STAGES if optimize.steps < STAGE_STEPS * most else most),
         group_steps=group_steps if kind == "geometry" else 0,
-        grow=optimize.grow if kind != "color" else 0.0,
+        grow=grow,
         # only an edit of colors may leave the bands alone
         sh="on" if optimize.sh == "auto" and kind != "color" else optimize.sh,
         perceptual_weight=PERCEPTUAL_WEIGHT[kind] if weight is None else weight,

@@ -43,19 +43,19 @@ _LEAST_WEIGHT = 1.0  # pixels in all views together, below which a row contribut
 
 
 def seed_rows(
-    setup: TrainingSetup, targets: Sequence[Tensor], shown: Sequence[Tensor], count: int, seed: int
+    setup: TrainingSetup, views: Sequence[View], targets: Sequence[Tensor], count: int, seed: int
 ) -> Gaussians:
-    """Rows for what is farthest from being shown, as they are at strength 0.
+    """Rows for what the scene is farthest from showing, as they are at strength 0.
 
     Args:
-        setup: scene, region and training views
+        setup: scene and region
+        views: some views of it
         targets: the edited pictures of these. [H,W,3] each
-        shown: what training begins with. [H,W,3] each
         count: rows, at most
         seed: of the draw
     """
-    scene, cameras = setup.scene, [view.camera for view in setup.train]
-    errors = [(a - b).square().mean(dim=2) for a, b in zip(targets, shown, strict=True)]
+    scene, cameras, targets = setup.scene, [view.camera for view in views], list(targets)
+    errors = [(a - view.image).square().mean(dim=2) for a, view in zip(targets, views, strict=True)]
     errors = [torch.where(error > _FAINT**2, error, 0.0) for error in errors]
     center, radius = scene_sphere(scene[setup.region.members])
     reach = max(radius, _error_reach(cameras, errors, center))

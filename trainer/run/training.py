@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
@@ -18,10 +17,8 @@ from progdf.errors import ProgdfError
 from progdf.field.trajectory import Trajectory
 from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians, pack
 from progdf.io.json_values import convert_json
-from progdf.metrics.image import ROUNDING, decibels
 from progdf.rasterize.engines import engine_device
 from progdf.scene.bounds import scene_sphere
-from trainer.fit.evaluate import make_evaluator
 from trainer.fit.network import JointTraining, begin_joint_training, save_network
 from trainer.optimize.color_solver import (
     STEPS,
@@ -36,11 +33,10 @@ from trainer.optimize.color_solver import (
 from trainer.optimize.color_views import ColorView, Judge, color_views
 from trainer.optimize.groups import Groups, group_path, group_stage, restore_groups
 from trainer.optimize.growth import add_rows, place_seeds, seed_rows
-from trainer.optimize.losses import GradientL1, Losses, Objective, Perceptual, erode, loss_table
+from trainer.optimize.losses import Losses, Objective, Perceptual, erode, loss_table
 from trainer.optimize.pgs import (
     OnStep,
     ParameterSnapshot,
-    PgsSettings,
     PgsState,
     TargetStage,
     optimize,
@@ -131,8 +127,6 @@ class Recordings:
 PART = "training"
 """Of the saved state: all that changes while the members are optimized."""
 
-_TRIAL = 4  # share of the steps, by which it is tried whether growth pays
-_PAYS = 0.1  # of the error in the views that choose, which growth must take away
 _TIMED_VIEWS = 4  # in which the slider is timed; 8 or all at full size time it no better
 
 
@@ -186,18 +180,15 @@ def optimize_members(
         stages = groups.to_stages(original, crops, stages)
     extent = 2.0 * scene_sphere(scene[members])[1] if groups is None else groups.extent
     settings = pgs_settings(optimization, bands, original.shape[1], extent, len(stages))
-    rows, own, growth = original, len(members), dict[str, Any]()
-    if optimization.grow:
-        ways = _Descent(setup, original, crops, stages, settings)
-        ways, growth = _grow(ways, optimization, edited, folder, log)
-        setup, rows, crops, stages, settings = (
-            ways.setup,
-            ways.rows,
-            ways.crops,
-            list(ways.stages),
-            ways.settings,
+    own, seeds = len(members), _seeds(setup, optimization, edited, folder) if optimization.grow else None
+    if seeds is not None:
+        setup, settings = setup.extended(seeds), replace(settings, ramp=0.0)
+        original = torch.cat([original, pack(seeds, with_shN=scene.sh_degree > 0).to(device)])
+        crops, stages = (
+            _crops(setup, setup.train, still, engine),
+            [place_seeds(s, len(seeds)) for s in stages],
         )
-    state, recordings = PgsState(rows, settings.seed), Recordings(folder, rows.shape)
+    state, recordings = PgsState(original, settings.seed), Recordings(folder, original.shape)
     way: Way
     model: Model | None = None
     if optimization.solver == "colors":
@@ -210,7 +201,7 @@ def optimize_members(
         inside = [erode(crop(view.mask, view.box)).to(device) for view in setup.train]
         objective = Objective(perceptual, optimization, inside)
         probes = probe_views(setup, engine=engine)
-        way = partial(optimize, rows, crops, probes, stages, objective, settings, state=state)
+        way = partial(optimize, original, crops, probes, stages, objective, settings, state=state)
     joint = None
     if optimization.as_printed and options.field.field == "neural":
         joint = begin_joint_training(
@@ -224,19 +215,18 @@ def optimize_members(
     snapshots = [(made.step, made.stage, made.ends_stage, made.offsets[:own]) for made in recordings.made]
     if groups is not None:
         ends = [made for made in recordings.made if made.ends_stage]
-        offsets = [*(made.offsets[:own].float() for made in ends[:-1]), end[:own]]
+        offsets = [*(made.offsets.float() for made in ends[:-1]), end]
         snapshots = group_path(original, groups, offsets, [made.step for made in ends], settings.snapshots)
     taken = [int(made.means[STEPS]) for made in recordings.made if STEPS in made.means]
-    losses = [
+    rows = [
         (m.step, {name: mean for name, mean in m.means.items() if name != STEPS}) for m in recordings.made
     ]
     trajectory, effort = record(snapshots, end[:own], list(edited)), {"strengths": list(edited), STEPS: taken}
-    if len(rows) > own:
-        edited_scene = setup.scene.replace_rows(setup.region.members, rows.cpu() + end)
-        trajectory = add_rows(trajectory, edited_scene, len(rows) - own, setup.train)
-    if growth:
-        growth["added"] = 0 if trajectory.added is None else len(trajectory.added)
-        effort["growth"] = growth
+    if seeds is not None:
+        edited_scene = setup.scene.replace_rows(setup.region.members, original.cpu() + end)
+        trajectory = add_rows(trajectory, edited_scene, len(seeds), setup.train)
+        effort["added"] = 0 if trajectory.added is None else len(trajectory.added)
+        log.say(f"growth: {effort['added']} Gaussians added, of {len(seeds)}; the others contribute nothing")
     if model is not None:
         maps = torch.stack([made.table for made in recordings.made if made.table is not None])
         trajectory = replace(trajectory, maps=maps, bands=model.bands, mask=model.mask)
@@ -245,7 +235,7 @@ def optimize_members(
         )
         log.say(f"{len(edited)} strengths {counts}")
         effort |= model.figures() | {"most_steps": most, "views": len(colors.views)}
-    return trajectory, loss_table(losses), effort
+    return trajectory, loss_table(rows), effort
 
 
 def _stages(optimization: OptimizeOptions, setup: TrainingSetup, edited: Pictures) -> list[TargetStage]:
@@ -376,114 +366,39 @@ def _groups(
     if done is not None:
         return restore_groups(original, done.tensors)
     steps = optimization.group_steps or 0
-    with _finite_losses(), log.steps("move parts", steps * len(stages)) as advance:
-        groups = group_stage(
-            original,
-            crops,
-            [stage.targets for stage in stages],
-            steps,
-            optimization.seed,
-            lambda step, loss: advance(step, f"loss {loss:.4f}"),
-            [stage.strength for stage in stages],
-        )
+    try:
+        with log.steps("move parts", steps * len(stages)) as advance:
+            groups = group_stage(
+                original,
+                crops,
+                [stage.targets for stage in stages],
+                steps,
+                optimization.seed,
+                lambda step, loss: advance(step, f"loss {loss:.4f}"),
+                [stage.strength for stage in stages],
+            )
+    except FloatingPointError as error:
+        raise ProgdfError(
+            f"training failed: {error}; fix the edited views and continue with --resume"
+        ) from error
     folder.save("groups", groups.capture_state(), {})
     for line in groups.lines():
         log.say(line)
     return groups
 
 
-@contextmanager
-def _finite_losses() -> Iterator[None]:
-    try:
-        yield
-    except FloatingPointError as error:
-        raise ProgdfError(
-            f"training failed: {error}; fix the edited views and continue with --resume"
-        ) from error
-
-
-@dataclass(frozen=True)
-class _Descent:
-    """What a descent begins with."""
-
-    setup: TrainingSetup
-    rows: Tensor  # raw member rows of the original. [M,C]
-    crops: Sequence[CropScene]
-    stages: Sequence[TargetStage]
-    settings: PgsSettings
-
-    def with_seeds(self, seeds: Gaussians, engine: str) -> _Descent:
-        """With rows that are members too."""
-        setup = self.setup.extended(seeds)
-        rows = torch.cat([self.rows, pack(seeds, with_shN=seeds.sh_degree > 0).to(self.rows)])
-        stages = [place_seeds(stage, len(seeds)) for stage in self.stages]
-        # what is there from the first step on would fade before a target that begins at the original
-        settings = replace(self.settings, ramp=0.0)
-        return _Descent(setup, rows, _crops(setup, setup.train, False, engine), stages, settings)
-
-    def error(self, steps: int, pictures: Sequence[Tensor]) -> float:
-        """Mean square, in the views that choose, of a short descent by L1 alone.
-
-        Args:
-            steps: how many
-            pictures: the finished edit of all judging views. [H,W,3]
-        """
-        setup, objective = self.setup, Objective(GradientL1(), OptimizeOptions(perceptual_weight=0.0))
-        views, edited = split_held_out(setup.judging)[0], split_held_out(pictures)[0]
-        *_, last = optimize(
-            self.rows,
-            self.crops,
-            [],
-            [replace(self.stages[-1], steps=steps)],
-            objective,
-            replace(self.settings, snapshots=1, every=0),
-        )
-        evaluator = make_evaluator(
-            setup.scene, setup.region, views, {1.0: edited}, setup.background, self.rows.shape[1]
-        )
-        return ROUNDING + evaluator.mse(evaluator.pictures(last.offsets.cpu()), evaluator.edited[1.0])
-
-
-def _grow(
-    plain: _Descent, optimization: OptimizeOptions, edited: Pictures, folder: StateFolder, log: RunLog
-) -> tuple[_Descent, dict[str, Any]]:
-    """With seeds, if other views gain by them, or as it was; and the trial's figures, or what was saved."""
-    setup, engine, saved = plain.setup, optimization.engine, folder.load("growth")
+def _seeds(
+    setup: TrainingSetup, optimization: OptimizeOptions, edited: Pictures, folder: StateFolder
+) -> Gaussians | None:
+    """The rows that are added, or what was saved of them; None where there are none."""
+    saved, finished = folder.load("seeds"), edited[max(edited)]
     if saved is None:
-        finished, count = edited[max(edited)], len(setup.train)
-        targets, steps = list(finished[:count]), max(1, optimization.steps // _TRIAL)
-        with torch.no_grad():
-            start = plain.rows + plain.stages[-1].place(torch.zeros_like(plain.rows))
-        shown = [view.image.clone() for view in setup.train]
-        for view, image, drawn in zip(setup.train, shown, render_all(plain.crops, start), strict=True):
-            crop(image, view.box).copy_(drawn.cpu())
-        seeds = seed_rows(setup, targets, shown, int(optimization.grow * len(start)), optimization.seed)
-        figures: dict[str, Any] = {"seeded": len(seeds)}
-        pays = False
-        if len(seeds):
-            judged = finished[count:] or finished
-            with _finite_losses(), log.steps("try to grow", 2) as advance:
-                errors = [plain.error(steps, judged)]
-                advance(1, "without")
-                errors.append(plain.with_seeds(seeds, engine).error(steps, judged))
-                advance(2, "with")
-            pays = errors[1] < (1 - _PAYS) * errors[0]
-            without, grown = (round(decibels(error), 2) for error in errors)
-            figures |= {"steps": steps, "psnr_without": without, "psnr_with": grown}
-            log.say(
-                f"growth, tried for {steps} steps with L1, PSNR in other views: {without:.1f} dB, with "
-                f"{len(seeds)} more Gaussians {grown:.1f} dB: "
-                + ("they are added" if pays else "less than a tenth of the error; none is added")
-            )
-        else:
-            log.say("growth: nothing is wrong anywhere; none is added")
-        rows = {name: getattr(seeds, name) for name in ATTRIBUTES} if pays else {}
-        folder.save("growth", rows, figures)
-        saved = Saved(rows, figures)
-    if not saved.tensors:
-        return plain, dict(saved.values)
-    kept: dict[str, Any] = dict(saved.tensors)
-    return plain.with_seeds(Gaussians(**kept), engine), dict(saved.values)
+        count = int(optimization.grow * len(setup.region))
+        seeds = seed_rows(setup, setup.train, finished[: len(setup.train)], count, optimization.seed)
+        saved = Saved({name: getattr(seeds, name) for name in ATTRIBUTES}, {})
+        folder.save("seeds", saved.tensors, saved.values)
+    rows: dict[str, Any] = dict(saved.tensors)
+    return Gaussians(**rows) if len(rows["means"]) else None
 
 
 def retime_trajectory(

@@ -34,7 +34,6 @@ STAGES = {
     "weights": "",
     "model": "",
     "move parts": "Moving parts",
-    "try to grow": "Choosing what to add",
     "optimize": "Training",
     "time the slider": "Timing the slider",
     "picture the edit": "Finishing",
