@@ -173,9 +173,12 @@ def _read(path: Path, names: Sequence[str] = ()) -> tuple[dict[str, Tensor], dic
 
 def _unpack_added(path: Path, rows: Mapping[str, Any]) -> Gaussians:
     try:
-        return Gaussians(**rows)
+        added = Gaussians(**rows)
     except (TypeError, ValueError) as error:
         raise _damage_error(path, error) from error
+    if not all(part.dtype == torch.float32 and bool(part.isfinite().all()) for part in rows.values()):
+        raise _damage_error(path, "an added row has numbers that are none")
+    return added
 
 
 def _check(path: Path, trajectory: Trajectory) -> None:

@@ -66,8 +66,9 @@ def seed_rows(
         wrong = min(int(count * float(error.sum()) / max(total, 1e-12)), int((error > 0).sum()))
         if wrong:
             pixels = torch.multinomial(error.flatten(), wrong, generator=draw)
-            places.append(_place_pixels(i, pixels, cameras, targets, depths, center, reach))
-            colors.append(targets[i].flatten(0, 1)[pixels])
+            points, known = _place_pixels(i, pixels, cameras, targets, depths, center, reach)
+            places.append(points[known])
+            colors.append(targets[i].flatten(0, 1)[pixels[known]])
     means = torch.cat(places)
     rows = len(means) if len(means) > 3 else 0  # fewer have no neighbors to be sized by
     spread = torch.ones(0)
@@ -111,7 +112,7 @@ def _place_pixels(
     depths: Sequence[Depth],
     center: Tensor,
     reach: float,
-) -> Tensor:
+) -> tuple[Tensor, Tensor]:
     """The place of each pixel of a view: the nearest at which the views that can see it show its color.
 
     Args:
@@ -122,7 +123,7 @@ def _place_pixels(
         center, reach: of the ball that is looked through
 
     Returns:
-        [n,3]
+        [n,3], and which of them enough views can see. [n] bool
     """
     camera = cameras[index]
     v, u = pixels // camera.width, pixels % camera.width
@@ -150,7 +151,7 @@ def _place_pixels(
     allowed = (seen >= _LEAST_VIEWS) & (along < _surface(depths[index]).flatten()[pixels, None] + behind)
     off = torch.where(allowed, off, 1.0)
     first = (off <= off.amin(dim=1, keepdim=True) + _ALIKE).float().argmax(dim=1)
-    return points[torch.arange(len(pixels)), first]
+    return points[torch.arange(len(pixels)), first], allowed.any(dim=1)
 
 
 def _surface(depth: Depth) -> Tensor:

@@ -110,12 +110,13 @@ class Trial:
         )
 
     def figures(self) -> dict[str, Any]:
-        """As report.json has it."""
+        """As report.json has it: growth only where it was taken, as a run without it writes the same."""
+        reported = [way for way in self.psnrs if not way.grow or way == self.chosen]
         return {
             "steps": self.steps,
             "loss": "L1",
             "unedited_psnr": round(self.unedited, 2),
-            "psnr": {str(approach): round(psnr, 2) for approach, psnr in self.psnrs.items()},
+            "psnr": {str(way): round(psnr, 2) for way, psnr in self.psnrs.items() if way in reported},
             "chosen": str(self.chosen),
         }
 
@@ -150,7 +151,8 @@ def choose_approach(
     with log.steps("try kinds", len(ways)) as advance:
         trial = try_approaches(options, setup, edited, ways, advance)
     log.say(trial.line())
-    return trial.chosen, trial.figures()
+    is_open = len(ways) > 2 or trial.chosen.grow or not optimize.grow
+    return trial.chosen, trial.figures() if is_open else None
 
 
 def approaches(options: TrainOptions, setup: TrainingSetup, edited: Sequence[Tensor]) -> list[Approach]:
