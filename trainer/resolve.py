@@ -7,14 +7,18 @@ the scene is looked at. What is resolved is all that the bits of a result depend
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
+import torch
+
 from progdf.errors import ProgdfError
 from progdf.io.atomic import is_portable
 from progdf.metrics.image import NO_DIFFERENCE
+from progdf.rasterize import set_threads
 from progdf.rasterize.engines import choose_engine
 from trainer.editors import COSTLY_STRENGTHS, EXTERNAL, PER_VIEW
 from trainer.editors.adapters import default_model
@@ -246,3 +250,22 @@ def check_field_options(options: FieldOptions, preset: Preset = "default") -> No
             raise ProgdfError(f"--bytes-budget does not apply to --field {options.field}; leave one out")
         if not 1 <= options.bytes_budget < math.inf:
             raise ProgdfError(f"--bytes-budget must be at least 1 byte, got {options.bytes_budget:g}")
+
+
+def use_threads(threads: int) -> None:
+    """Give torch and the rasterizer `threads` threads; 0 is all cores."""
+    count = count_threads(threads)
+    torch.set_num_threads(count)
+    set_threads(count)
+
+
+def count_threads(threads: int) -> int:
+    """How many threads `threads` means.
+
+    Raises:
+        ProgdfError: fewer than none, or more than any machine has.
+    """
+    if not 0 <= threads <= MOST_THREADS:
+        raise ProgdfError(f"--threads must be between 0 and {MOST_THREADS}, got {threads}")
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return threads or cores

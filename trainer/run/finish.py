@@ -37,7 +37,7 @@ from trainer.options import (
 )
 from trainer.report.measures import PaintTaken, clip_curve, expected_measures, figures, measure, measure_paint
 from trainer.report.report import report_picture
-from trainer.resolve import check_field_options
+from trainer.resolve import check_field_options, use_threads
 from trainer.setup import TrainingSetup, whole_views, widen_views
 from trainer.store.progress import RunLog
 from trainer.store.run_folder import RunFolder, read_views, write_json
@@ -46,7 +46,6 @@ from trainer.views.crops import only_recolors
 from trainer.views.view import View
 
 from .record import RunRecord, render_run_views, reopen_run
-from .threads import use_threads
 
 _RANK_VIEWS = 4
 _REPORT_ALONE = (

@@ -49,7 +49,7 @@ from trainer.optimize.retime import resolve_slider
 from trainer.options import MOST_STAGES, EditKind, OptimizeOptions, TrainOptions
 from trainer.regions.from_pictures import RegionRequest, region_checks, region_kinds
 from trainer.report.agreement import measure_agreement
-from trainer.resolve import recorded_options, resolve
+from trainer.resolve import recorded_options, resolve, use_threads
 from trainer.setup import (
     Pictures,
     TrainingSetup,
@@ -83,7 +83,6 @@ from .kinds import Approach, choose_approach, resolve_approach
 from .record import RunRecord, read_record
 from .removal import is_removal, remove_region
 from .resume import check_exists, decide_resume, explain_stop, load_region, picture_digests
-from .threads import use_threads
 from .training import optimize_members, retime_trajectory
 
 
