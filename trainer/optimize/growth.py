@@ -21,11 +21,11 @@ from progdf.field.separable import opacity_course
 from progdf.field.trajectory import Trajectory
 from progdf.gaussians import Gaussians, attribute_slices
 from progdf.gdf.file import ADDED_LOGIT
-from progdf.rasterize import alpha_weights
 from progdf.rasterize.engines import Depth, render_depth
 from progdf.scene.bounds import scene_sphere
 from progdf.sh import rgb_to_sh0
 from trainer.setup import TrainingSetup
+from trainer.views.crops import CropScene
 from trainer.views.view import View
 
 from .pgs import TargetStage
@@ -39,7 +39,6 @@ _REACH = 0.98  # of the error: around the region, as far as so much of it lies, 
 _CLIP, _ALIKE = 0.3, 0.03  # of color: views disagree by no more; a nearer depth is as good as the best
 _LEAST_VIEWS = 3  # that can see a place, beside its own
 _FAINT = 2 / 255  # of color; below, a pixel is as it should be
-_LEAST_WEIGHT = 1.0  # pixels in all views together, below which a row contributes nothing
 
 
 def seed_rows(
@@ -171,18 +170,8 @@ def place_seeds(stage: TargetStage, count: int) -> TargetStage:
     return replace(stage, place=place)
 
 
-def add_rows(trajectory: Trajectory, edited: Gaussians, count: int, views: Sequence[View]) -> Trajectory:
-    """A recording of the region's members with the rows that were trained beside them.
-
-    Args:
-        trajectory: of the region alone
-        edited: the edited scene, these its last `count` rows
-        views: in which those must show that are to stay
-    """
-    weight = torch.stack([alpha_weights(edited, v.camera, torch.ones_like(v.mask))[:, 2] for v in views]).sum(
-        0
-    )
-    rows = edited[-count:][weight[-count:] >= _LEAST_WEIGHT]
+def add_rows(trajectory: Trajectory, rows: Gaussians) -> Trajectory:
+    """A recording of the region's members with others, given as they are at strength 1."""
     if not len(rows):
         return trajectory
     below, logit = (0, 0, 0, len(rows)), attribute_slices(trajectory.end.shape[1])["logit_opacities"]
@@ -190,6 +179,32 @@ def add_rows(trajectory: Trajectory, edited: Gaussians, count: int, views: Seque
     end[-len(rows) :, logit] = (rows.logit_opacities - ADDED_LOGIT)[:, None]
     added = replace(rows, logit_opacities=torch.full_like(rows.logit_opacities, ADDED_LOGIT))
     return fade_in(replace(trajectory, offsets=offsets, end=end, added=added))
+
+
+def removal_costs(crops: Sequence[CropScene], rows: Tensor, targets: Sequence[Tensor], seed: int) -> Tensor:
+    """By how much half the squared error over all views would rise without each member. [M]
+
+    To second order in its opacity o: -g o + h o² / 2. The curvature h, Σ (dI/do)², is the mean square of the
+    gradient of a picture of random signs (Hutchinson), of which one a view is enough.
+
+    Args:
+        crops: the training views
+        rows: raw member rows. [M,C]
+        targets: what these views are to show. [h,w,3] each
+        seed: of the signs
+    """
+    draw, logit = torch.Generator().manual_seed(seed), attribute_slices(rows.shape[1])["logit_opacities"]
+    slope, curvature = rows.new_zeros(len(rows)), rows.new_zeros(len(rows))
+    for crop, target in zip(crops, targets, strict=True):
+        leaf = rows.clone().requires_grad_()
+        image = crop.render(leaf)[0]
+        signs = torch.randint(2, image.shape, generator=draw).to(image) * 2 - 1
+        (along,) = torch.autograd.grad(image, leaf, (image - target).detach(), retain_graph=True)
+        (drawn,) = torch.autograd.grad(image, leaf, signs)
+        slope += along[:, logit][:, 0]
+        curvature += drawn[:, logit][:, 0].square()
+    clear = 1.0 - rows[:, logit][:, 0].sigmoid()  # of logits x, do/dx = o (1 - o)
+    return curvature / (2 * clear.square()) - slope / clear
 
 
 def fade_in(trajectory: Trajectory, finer: bool = False) -> Trajectory:

@@ -32,7 +32,7 @@ from trainer.optimize.color_solver import (
 )
 from trainer.optimize.color_views import ColorView, Judge, color_views
 from trainer.optimize.groups import Groups, group_path, group_stage, restore_groups
-from trainer.optimize.growth import add_rows, place_seeds, seed_rows
+from trainer.optimize.growth import add_rows, place_seeds, removal_costs, seed_rows
 from trainer.optimize.losses import Losses, Objective, Perceptual, erode, loss_table
 from trainer.optimize.pgs import (
     OnStep,
@@ -223,8 +223,10 @@ def optimize_members(
     ]
     trajectory, effort = record(snapshots, end[:own], list(edited)), {"strengths": list(edited), STEPS: taken}
     if seeds is not None:
-        edited_scene = setup.scene.replace_rows(setup.region.members, original.cpu() + end)
-        trajectory = add_rows(trajectory, edited_scene, len(seeds), setup.train)
+        finished = original + end.to(device)
+        costs = removal_costs(crops, finished, stages[-1].targets, optimization.seed)[own:].cpu()
+        trained = setup.scene.replace_rows(setup.region.members, finished.cpu())[len(scene) :]
+        trajectory = add_rows(trajectory, trained[costs > 0.0])
         effort["added"] = 0 if trajectory.added is None else len(trajectory.added)
         log.say(f"growth: {effort['added']} Gaussians added, of {len(seeds)}; the others contribute nothing")
     if model is not None:

@@ -8,24 +8,28 @@ from pathlib import Path
 import pytest
 import torch
 from scipy.spatial import cKDTree
+from torch import Tensor
 
 from progdf.compose.reference import Layer, compose_layers
 from progdf.errors import ProgdfError
 from progdf.field.trajectory import Trajectory, load_trajectory, save_trajectory
 from progdf.formats.ply import load_ply
-from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, attribute_slices, concatenate
+from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, attribute_slices, concatenate, pack
 from progdf.gdf.file import ADDED_LOGIT, load_gdf
 from progdf.io.cameras import load_cameras
 from progdf.rasterize import render
 from tests.helpers.growth import things, write_growth
 from tests.helpers.trained import WHITE, quick_options, small, train
+from trainer.editors import make_editor
 from trainer.evaluate.opened import SLIDER, open_run
 from trainer.fit.fit import straight_path
-from trainer.optimize.growth import fade_in, seed_rows
-from trainer.options import FitOptions, with_values
+from trainer.optimize.growth import fade_in, removal_costs, seed_rows
+from trainer.options import EditorOptions, FitOptions, with_values
 from trainer.resolve import resolve
 from trainer.run.finish import refit
 from trainer.setup import TrainingSetup
+from trainer.views.crops import crop_scene, render_all
+from trainer.views.view import crop
 
 LOGIT = attribute_slices(BASE_CHANNELS)["logit_opacities"]
 
@@ -53,6 +57,28 @@ def test_pictures_that_show_nothing_new_seed_nothing() -> None:
     case = small("head")
     setup = TrainingSetup(case.scene, case.region, case.views, [], WHITE)
     assert not len(seed_rows(setup, case.views, [view.image for view in case.views], 80, 0))
+
+
+def test_what_a_row_is_worth_is_close_to_the_error_without_it() -> None:
+    case = small("scarf", count=8)
+    editor = make_editor(EditorOptions("stripes:#20a040"), case.scene, case.region, case.views)
+    targets = [crop(editor.edit(view, 1.0), view.box) for view in case.views]
+    crops = [crop_scene(case.scene, case.region.members, v.camera, v.box, WHITE) for v in case.views]
+    rows = pack(case.scene[case.region.members], with_shN=True)
+
+    def error(rows: Tensor) -> float:
+        pictures = render_all(crops, rows)
+        return sum(0.5 * float((a - b).square().sum()) for a, b in zip(pictures, targets, strict=True))
+
+    exact, chosen = [], range(0, len(rows), 9)
+    for row in chosen:
+        without = rows.clone()
+        without[row, LOGIT] = ADDED_LOGIT
+        exact.append(error(without) - error(rows))
+    costs = torch.stack([removal_costs(crops, rows, targets, seed) for seed in range(4)]).mean(dim=0)
+    pair = torch.stack([torch.tensor(exact), costs[list(chosen)]])
+    # to second order in opacity, where many are nearly opaque; sorting by either is much the same
+    assert float(torch.corrcoef(pair.argsort(dim=1).argsort(dim=1).double())[0, 1]) > 0.8
 
 
 @pytest.fixture(scope="module")
