@@ -35,7 +35,6 @@ SEED_LOGIT = 2.0
 
 _SIZE = 0.5  # standard deviation of a seed, of the distance to its three neighbors
 _DEPTHS = 256  # along a ray, at most; one for two pixels
-_REACH = 0.98  # of the error: around the region, as far as so much of it lies, rays are looked along
 _CLIP, _ALIKE = 0.3, 0.03  # of color: views disagree by no more; a nearer depth is as good as the best
 _LEAST_VIEWS = 3  # that can see a place, beside its own
 _FAINT = 2 / 255  # of color; below, a pixel is as it should be
@@ -57,7 +56,6 @@ def seed_rows(
     errors = [(a - view.image).square().mean(dim=2) for a, view in zip(targets, views, strict=True)]
     errors = [torch.where(error > _FAINT**2, error, 0.0) for error in errors]
     center, radius = scene_sphere(scene[setup.region.members])
-    reach = max(radius, _error_reach(cameras, errors, center))
     depths = [render_depth(scene, camera) for camera in cameras]
     total, draw = float(sum(error.sum() for error in errors)), torch.Generator().manual_seed(seed)
     places, colors = [torch.zeros(0, 3)], [torch.zeros(0, 3)]
@@ -65,7 +63,7 @@ def seed_rows(
         wrong = min(int(count * float(error.sum()) / max(total, 1e-12)), int((error > 0).sum()))
         if wrong:
             pixels = torch.multinomial(error.flatten(), wrong, generator=draw)
-            points, known = _place_pixels(i, pixels, cameras, targets, depths, center, reach)
+            points, known = _place_pixels(i, pixels, cameras, targets, depths, center)
             places.append(points[known])
             colors.append(targets[i].flatten(0, 1)[pixels[known]])
     means = torch.cat(places)
@@ -74,7 +72,7 @@ def seed_rows(
     if rows:
         near = torch.from_numpy(cKDTree(means.numpy()).query(means.numpy(), 4)[0]).float()
         spread = near[:, 1:].square().mean(dim=1).sqrt()
-        spread = spread.clamp(spread.quantile(0.1), spread.quantile(0.9)).clamp_min(1e-3 * reach)
+        spread = spread.clamp(spread.quantile(0.1), spread.quantile(0.9)).clamp_min(1e-3 * radius)
     return replace(
         scene[torch.zeros(rows, dtype=torch.int64)],
         means=means[:rows],
@@ -86,23 +84,6 @@ def seed_rows(
     )
 
 
-def _error_reach(cameras: Sequence[Camera], errors: Sequence[Tensor], center: Tensor) -> float:
-    """How far from the region's center most of the error lies, in the plane through it, world units."""
-    distances, weights = [], []
-    for camera, error in zip(cameras, errors, strict=True):
-        v, u = error.nonzero().T
-        x, y, z = camera.viewmat[:3, :3] @ center + camera.viewmat[:3, 3]
-        across, down = (
-            (u + 0.5 - camera.K[0, 2]) / camera.K[0, 0],
-            (v + 0.5 - camera.K[1, 2]) / camera.K[1, 1],
-        )
-        distances.append(z.clamp_min(0.0) * torch.hypot(across - x / z, down - y / z))
-        weights.append(error[v, u])
-    distance, order = torch.cat(distances).sort()
-    within = torch.cat(weights)[order].double().cumsum(0)
-    return float(distance[int((within < _REACH * within[-1]).sum())]) if len(within) else 0.0
-
-
 def _place_pixels(
     index: int,
     pixels: Tensor,
@@ -110,7 +91,6 @@ def _place_pixels(
     targets: Sequence[Tensor],
     depths: Sequence[Depth],
     center: Tensor,
-    reach: float,
 ) -> tuple[Tensor, Tensor]:
     """The place of each pixel of a view: the nearest at which the views that can see it show its color.
 
@@ -119,7 +99,7 @@ def _place_pixels(
         pixels: row by row. [n]
         cameras, targets: of all views
         depths: of the original in all views, behind which nothing is seen
-        center, reach: of the ball that is looked through
+        center: of the region, around which as far is looked as the view is wide there
 
     Returns:
         [n,3], and which of them enough views can see. [n] bool
@@ -129,8 +109,9 @@ def _place_pixels(
     x = (u + 0.5 - camera.K[0, 2]) / camera.K[0, 0]
     rays = torch.stack([x, (v + 0.5 - camera.K[1, 2]) / camera.K[1, 1], torch.ones_like(x)], dim=1)
     middle = float(camera.viewmat[2, :3] @ center + camera.viewmat[2, 3])
-    count = int(min(_DEPTHS, max(16.0, reach * float(camera.K[0, 0]) / max(middle, reach))))
-    along = torch.linspace(max(camera.near, middle - reach), middle + reach, count)
+    reach = middle * max(camera.width, camera.height) / (2 * float(camera.K[0, 0]))
+    count = min(_DEPTHS, max(camera.width, camera.height) // 2)
+    along = torch.linspace(max(camera.near, middle - reach), max(2 * camera.near, middle + reach), count)
     behind = 2 * float(along[1] - along[0])  # of a surface: what is nearer is on it
     points = (rays[:, None] * along[:, None] - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
     colors = targets[index].flatten(0, 1)[pixels, None]
@@ -207,16 +188,14 @@ def removal_costs(crops: Sequence[CropScene], rows: Tensor, targets: Sequence[Te
     return curvature / (2 * clear.square()) - slope / clear
 
 
-def fade_in(trajectory: Trajectory, finer: bool = False) -> Trajectory:
-    """The opacities of the added rows linear along the slider; `finer`: with recordings where logits bend."""
+def fade_in(trajectory: Trajectory) -> Trajectory:
+    """The opacities of the added rows linear along the slider, with recordings where logits bend."""
     added = trajectory.added
     if added is None:
         return trajectory
     logit = attribute_slices(trajectory.end.shape[1])["logit_opacities"]
     last = added.logit_opacities + trajectory.end[-len(added) :, logit][:, 0]
-    s = trajectory.s
-    if finer:
-        s = torch.unique(torch.cat([s, opacity_course(added.logit_opacities, last)[0]]))
+    s = torch.unique(torch.cat([trajectory.s, opacity_course(added.logit_opacities, last)[0]]))
     offsets = torch.stack([trajectory.at(float(at)).half() for at in s])
     opacity = torch.lerp(added.opacities.double(), last.double().sigmoid(), s[:, None].double())
     offsets[:, -len(added) :, logit] = (opacity.logit() - ADDED_LOGIT).half()[..., None]

@@ -535,7 +535,7 @@ def _record(
             trajectory, reason = _choose_path(trajectory, options, optimization, setup, editor, log)
         else:
             trajectory = retime_trajectory(trajectory, setup, optimization, log)
-        trajectory = fade_in(trajectory, finer=True)
+        trajectory = fade_in(trajectory)
     log.say(
         f"{recorded} recordings, {len(trajectory)} kept; without an attribute, dB: {costs or 'none moves'}"
     )
