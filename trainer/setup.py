@@ -136,7 +136,7 @@ class TrainingSetup:
         """All of them."""
         return [*self.train, *self.held_out]
 
-    def extended(self, added: Gaussians | None) -> TrainingSetup:
+    def extend(self, added: Gaussians | None) -> TrainingSetup:
         """With rows after the scene's own that are members too; of nothing added, as it is."""
         if added is None:
             return self

@@ -36,11 +36,11 @@ def balls(scene: Gaussians, means: Tensor, colors: Tensor, size: float) -> Gauss
 
 def things(scene: Gaussians, head: Tensor) -> dict[str, Gaussians]:
     """A striped hat that stands on a head, and a rod a few pixels thick that stands off it."""
-    means, draw = scene.means[head], torch.Generator().manual_seed(1)
+    means = scene.means[head]
     x, _, z = means.median(dim=0).values.tolist()
     top = float(means[:, 1].quantile(0.98))
     radius = 0.75 * float((means[:, 0] - x).abs().quantile(0.9))
-    out, angle = torch.rand(900, generator=draw).sqrt(), 2 * math.pi * torch.rand(900, generator=draw)
+    out, angle = ((torch.arange(900) + 0.5) / 900).sqrt(), math.pi * (3 - math.sqrt(5)) * torch.arange(900)
     cone = [x + radius * out * angle.cos(), top + radius * (1.1 - 1.2 * out), z + radius * out * angle.sin()]
     striped = torch.where(((1 - out) * 4).long()[:, None] % 2 == 0, torch.tensor(RED), torch.tensor(YELLOW))
     along = torch.linspace(0, 1, 200)

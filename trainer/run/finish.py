@@ -92,7 +92,7 @@ def finish_run(
     """
     options, scene, region = record.plan, setup.scene, setup.region
     with log.stage("fit"):
-        grown = setup.extended(trajectory.added)
+        grown = setup.extend(trajectory.added)
         evaluator = load_evaluator(folder, grown, setup.judging, trajectory)
         choosing, reporting = evaluator.halves()
         fitted, network = _fit(

@@ -216,7 +216,7 @@ def try_approaches(
         if way.grow:
             views, pictures = zip(*trained, strict=True)
             rows = seed_rows(setup, views, pictures, int(way.grow * len(setup.region)), options.optimize.seed)
-            grown, seeds = setup.extended(rows), len(rows)
+            grown, seeds = setup.extend(rows), len(rows)
             small = _small_views(grown, most)
         psnrs[way] = _try_approach(options, way, grown, seeds, small, steps)
         if advance is not None:

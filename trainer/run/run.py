@@ -262,7 +262,7 @@ def _run_training(
         )
         extra = {"members": region.members, "score": region.score}
         save_trajectory(folder.trajectory, trajectory, extra, plain(record))
-        _write_finals(setup.extended(trajectory.added), trajectory, folder, log)
+        _write_finals(setup.extend(trajectory.added), trajectory, folder, log)
         folder.state.save("recorded", {}, log.capture_state().values)
     else:
         log.restore(recorded)
@@ -522,7 +522,7 @@ def _record(
         trajectory, losses, effort = optimize_members(
             options, optimization, setup, edited, perceptual, folder.state, log, between=between
         )
-    setup = setup.extended(trajectory.added)
+    setup = setup.extend(trajectory.added)
     with log.stage("retime"):
         costs: dict[str, float] = {}
         if not only_recolors(trajectory.offsets) or trajectory.end.shape[1] > BASE_CHANNELS:

@@ -182,7 +182,7 @@ def optimize_members(
     settings = pgs_settings(optimization, bands, original.shape[1], extent, len(stages))
     own, seeds = len(members), _seeds(setup, optimization, edited, folder) if optimization.grow else None
     if seeds is not None:
-        setup, settings = setup.extended(seeds), replace(settings, ramp=0.0)
+        setup, settings = setup.extend(seeds), replace(settings, ramp=0.0)
         original = torch.cat([original, pack(seeds, with_shN=scene.sh_degree > 0).to(device)])
         crops, stages = (
             _crops(setup, setup.train, still, engine),
