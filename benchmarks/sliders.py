@@ -33,10 +33,9 @@ from trainer.options import EditorOptions, OptimizeOptions, RegionOptions, Train
 from trainer.report.measures import ErrorCurve, picture_courses
 from trainer.report.plots import Plot
 from trainer.report.report import stack_plots, thumbnail
-from trainer.resolve import resolve
+from trainer.resolve import resolve, use_threads
 from trainer.run.demo import Effort, write_scene
 from trainer.run.resume import find_run
-from trainer.run.threads import use_threads
 from trainer.setup import make_training_setup
 from trainer.store.run_folder import write_json
 from trainer.views.view import crop, render_view

@@ -192,6 +192,10 @@ class OptimizeOptions:
     """Slider values. even: equal steps look equally large, and an editor with a strength control is asked for
     pictures that do; stages: s is the editor's own strength, even in between; time: the optimizer's. auto:
     even, but stages where folder: has pictures of several strengths."""
+    grow: float = 0.0
+    """style, folder, photographs, instruct: how many Gaussians may be added where the region has none to show
+    the edit, such as a hat on a head, as a share of the region's, 0 to 1. They are where a trial finds that
+    other views gain more than a tenth of the error. What moves would be grown anew; so none by default."""
     engine: Engine = "auto"
     """What draws the steps: cpu; or warp (extra gpu), where the steps stay on a CUDA card, or, slowly and for
     tests, on a CPU that stands in for one. auto: warp, if there is a card and it is installed; else cpu."""

@@ -7,14 +7,18 @@ the scene is looked at. What is resolved is all that the bits of a result depend
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
+import torch
+
 from progdf.errors import ProgdfError
 from progdf.io.atomic import is_portable
 from progdf.metrics.image import NO_DIFFERENCE
+from progdf.rasterize import set_threads
 from progdf.rasterize.engines import choose_engine
 from trainer.editors import COSTLY_STRENGTHS, EXTERNAL, PER_VIEW
 from trainer.editors.adapters import default_model
@@ -100,7 +104,9 @@ def recorded_options(options: TrainOptions) -> TrainOptions:
     return replace(options, out=Path(), preset="default", quick=False, threads=0, resume=False)
 
 
-def resolve_kind(options: TrainOptions, kind: EditKind, group_steps: int) -> OptimizeOptions:
+def resolve_kind(
+    options: TrainOptions, kind: EditKind, group_steps: int, grow: float = 0.0
+) -> OptimizeOptions:
     """How the members are optimized in an edit of this kind: nothing is left open.
 
     What each of the defaults gives, alone, is in docs/experiments.md, Terms and options of a descent.
@@ -109,6 +115,7 @@ def resolve_kind(options: TrainOptions, kind: EditKind, group_steps: int) -> Opt
         options: resolved, see `resolve`
         kind: what the edit moves
         group_steps: as asked, or as a trial found; without effect where nothing moves
+        grow: how many rows may be added, as a share of the members; as a trial found
     """
     optimize = options.optimize
     sharpness = SHARPNESS[kind] if optimize.sharpness == "kind" else optimize.sharpness
@@ -128,6 +135,7 @@ def resolve_kind(options: TrainOptions, kind: EditKind, group_steps: int) -> Opt
         kind=kind,
         stages=optimize.stages or min(most, QUICK_STAGES if optimize.steps < STAGE_STEPS * most else most),
         group_steps=group_steps if kind == "geometry" else 0,
+        grow=grow,
         # only an edit of colors may leave the bands alone
         sh="on" if optimize.sh == "auto" and kind != "color" else optimize.sh,
         perceptual_weight=PERCEPTUAL_WEIGHT[kind] if weight is None else weight,
@@ -148,6 +156,7 @@ def check_options(options: TrainOptions) -> None:
         ("--image-size", options.views.image_size or SMALLEST_VIEW, SMALLEST_VIEW, 2048),
         ("--stages", optimize.stages, 0, 16),
         ("--group-steps", optimize.group_steps, 0, 10_000),
+        ("--grow", optimize.grow, 0, 1),
         ("--seed", options.seed, 0, LARGEST_SEED),
         ("--threads", options.threads, 0, MOST_THREADS),
         ("--edit-steps", editor.edit_steps, 1, 1000),
@@ -164,6 +173,8 @@ def check_options(options: TrainOptions) -> None:
     if weight is not None and not 0 <= weight < math.inf:
         raise ProgdfError(f"--perceptual-weight must be 0 or more, got {weight}")
     _check_editor_options(editor, optimize)
+    if optimize.grow and (optimize.kind == "color" or options.field.field == "neural"):
+        raise ProgdfError("--grow adds nothing to an edit of colors alone, nor to a network; leave it out")
     check_field_options(options.field, options.preset)
     parse_guidance(editor.guidance)
 
@@ -200,6 +211,8 @@ def _check_editor_options(editor: EditorOptions, optimize: OptimizeOptions) -> N
     if editor.family == "pictures" and editor.removal == "never" and editor.fill is not None:
         raise ProgdfError("--fill closes holes of a removal; leave out --removal never, or --fill")
     of_instruct = ("model", "guidance", "edit_steps", "anchor", "quantize", "device")
+    if optimize.grow and editor.family not in PER_VIEW:
+        raise ProgdfError(f"--grow does not apply to {editor.family}; it is for {' and '.join(PER_VIEW)}")
     for names, kinds in (
         (of_instruct, ("instruct",)),
         (("edit_size",), ("style", "instruct")),
@@ -237,3 +250,22 @@ def check_field_options(options: FieldOptions, preset: Preset = "default") -> No
             raise ProgdfError(f"--bytes-budget does not apply to --field {options.field}; leave one out")
         if not 1 <= options.bytes_budget < math.inf:
             raise ProgdfError(f"--bytes-budget must be at least 1 byte, got {options.bytes_budget:g}")
+
+
+def use_threads(threads: int) -> None:
+    """Give torch and the rasterizer `threads` threads; 0 is all cores."""
+    count = count_threads(threads)
+    torch.set_num_threads(count)
+    set_threads(count)
+
+
+def count_threads(threads: int) -> int:
+    """How many threads `threads` means.
+
+    Raises:
+        ProgdfError: fewer than none, or more than any machine has.
+    """
+    if not 0 <= threads <= MOST_THREADS:
+        raise ProgdfError(f"--threads must be between 0 and {MOST_THREADS}, got {threads}")
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return threads or cores

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
-from progdf.gaussians import Gaussians
+from progdf.gaussians import Gaussians, concatenate
 from progdf.io.cameras import load_cameras
 from progdf.io.images import write_image
 from progdf.io.picture_camera import up_in_picture
@@ -135,6 +135,18 @@ class TrainingSetup:
     def views(self) -> list[View]:
         """All of them."""
         return [*self.train, *self.held_out]
+
+    def extend(self, added: Gaussians | None) -> TrainingSetup:
+        """With rows after the scene's own that are members too; of nothing added, as it is."""
+        if added is None:
+            return self
+        rows = torch.arange(len(self.scene), len(self.scene) + len(added))
+        region = Region(
+            self.region.name,
+            torch.cat([self.region.members, rows]),
+            torch.cat([self.region.score, torch.ones(len(rows))]),
+        )
+        return replace(self, scene=concatenate([self.scene, added]), region=region)
 
     @property
     def judging(self) -> Sequence[View]:

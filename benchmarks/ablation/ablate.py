@@ -28,9 +28,8 @@ from trainer.fit.fit import drop_idle_attributes
 from trainer.optimize.losses import Perceptual, describe_loss, perceptual_loss
 from trainer.options import TrainOptions
 from trainer.report.report import SHOWN, best_view, editor_strip, strip
-from trainer.resolve import resolve_kind
+from trainer.resolve import resolve_kind, use_threads
 from trainer.run.record import reopen_run
-from trainer.run.threads import use_threads
 from trainer.run.training import optimize_members, retime_trajectory
 from trainer.setup import Pictures, whole_views
 from trainer.store.progress import RunLog

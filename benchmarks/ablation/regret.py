@@ -34,7 +34,7 @@ from trainer.optimize.color_solver import Model, add_bands, choose_model, iterat
 from trainer.optimize.color_views import Judge, color_views
 from trainer.optimize.pgs import PgsState, TargetStage
 from trainer.options import EditorOptions, FieldOptions, OptimizeOptions, ViewOptions
-from trainer.run.threads import use_threads
+from trainer.resolve import use_threads
 from trainer.setup import TrainingSetup, make_training_setup, quantize_image, widen_views
 from trainer.views.choose import choose_views, split_held_out
 from trainer.views.crops import CropScene, crop_scene

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from progdf.errors import ProgdfError
+from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.io.atomic import atomic_write, open_error
 from progdf.io.json_values import convert_json, decode_json
 from progdf.io.tensors import read_tensors, write_tensors
@@ -56,6 +57,7 @@ class Trajectory:
     maps: Tensor | None = None
     bands: int = 0
     mask: Tensor | None = None  # how much of the maps each member takes, see `GradeForm.mask`. [M] uint8
+    added: Gaussians | None = None  # rows that the scene does not have, the last members, see `Gdf.added`
 
     def __len__(self) -> int:
         return int(self.s.shape[0])
@@ -99,6 +101,8 @@ def save_trajectory(
         tensors |= {"maps": trajectory.maps, "bands": torch.tensor(trajectory.bands)}
     if trajectory.mask is not None:
         tensors["mask"] = trajectory.mask
+    if trajectory.added is not None:
+        tensors |= {f"added.{name}": getattr(trajectory.added, name) for name in ATTRIBUTES}
     header = {"format": _FORMAT, "about": json.dumps(dict(about))}
     with atomic_write(path) as temporary_file:
         write_tensors(temporary_file, tensors, header, checksum=True)
@@ -115,6 +119,7 @@ def load_trajectory(path: Path) -> tuple[Trajectory, dict[str, Tensor], dict[str
         tensor = tensors[name]
         if tensor.dtype != dtype or tensor.ndim != sides:
             raise _damage_error(path, f"{name} is {list(tensor.shape)} {tensor.dtype}")
+    added = {name: tensors.pop(f"added.{name}") for name in ATTRIBUTES if f"added.{name}" in tensors}
     trajectory = Trajectory(
         tensors.pop("s"),
         tensors.pop("offsets"),
@@ -125,6 +130,7 @@ def load_trajectory(path: Path) -> tuple[Trajectory, dict[str, Tensor], dict[str
         maps=tensors.pop("maps", None),
         bands=int(tensors.pop("bands", torch.tensor(0))),
         mask=tensors.pop("mask", None),
+        added=_unpack_added(path, added) if added else None,
     )
     _check(path, trajectory)
     return trajectory, tensors, about
@@ -163,6 +169,16 @@ def _read(path: Path, names: Sequence[str] = ()) -> tuple[dict[str, Tensor], dic
         raise
     except (KeyError, ValueError) as error:
         raise _damage_error(path, error) from error
+
+
+def _unpack_added(path: Path, rows: Mapping[str, Any]) -> Gaussians:
+    try:
+        added = Gaussians(**rows)
+    except (TypeError, ValueError) as error:
+        raise _damage_error(path, error) from error
+    if not all(part.dtype == torch.float32 and bool(part.isfinite().all()) for part in rows.values()):
+        raise _damage_error(path, "an added row has numbers that are none")
+    return added
 
 
 def _check(path: Path, trajectory: Trajectory) -> None:

@@ -26,8 +26,8 @@ from progdf.errors import ProgdfError
 from progdf.io.atomic import LOCK, LockedError, hold_lock, make_folder
 from progdf.terminal import escape_text, file_size, format_count, print_line
 from trainer.options import BatchOptions, check_ranges
+from trainer.resolve import count_threads
 from trainer.run.resume import find_run
-from trainer.run.threads import count_threads
 
 from .jobs import Cost, Job, estimate_cost, read_catalogue
 from .report import SOME_FAILED, Row, Screen, duration, finished_row, read_rows, write_page, write_rows

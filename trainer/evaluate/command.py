@@ -23,8 +23,8 @@ from trainer.report.report import (
     thumbnail,
     view_caption,
 )
+from trainer.resolve import use_threads
 from trainer.run.finish import effective_texts
-from trainer.run.threads import use_threads
 from trainer.store.run_folder import write_json
 
 from .consistency import EDITED, UNEDITED, WarpedPair

@@ -100,7 +100,7 @@ def outside_change(opened: OpenedRun) -> dict[str, float]:
     nor after it, 0..1: of the finished edit, and of what the editor made."""
     views, evaluator = opened.setup.judging, opened.evaluator
     edited = finished_scene(opened)
-    after = [make_view(edited, opened.run.region, view.camera, opened.setup.background) for view in views]
+    after = [make_view(edited, opened.setup.region, view.camera, opened.setup.background) for view in views]
     boxes = [scene.box for scene in evaluator.crops]
     outside = [
         crop((a.mask <= _SHOWS) & (b.mask <= _SHOWS), box)
@@ -117,10 +117,10 @@ def outside_change(opened: OpenedRun) -> dict[str, float]:
 def finished_scene(opened: OpenedRun) -> Gaussians:
     """The edited scene at strength 1."""
     end = opened.gdf.field.offsets(1.0)
-    members = opened.run.region.members
+    members = opened.setup.region.members
     if not len(end):
-        return opened.run.scene
-    return opened.run.scene.replace_rows(members, opened.evaluator.original[:, : end.shape[1]] + end)
+        return opened.setup.scene
+    return opened.setup.scene.replace_rows(members, opened.evaluator.original[:, : end.shape[1]] + end)
 
 
 def _warp(

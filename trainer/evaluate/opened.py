@@ -83,7 +83,7 @@ def open_run(root: Path, scene: Path | None = None) -> OpenedRun:
         raise ProgdfError(f"{root} has no views to measure with; train it again")
     names = [view.camera.name for view in setup.train]
     edited = {s: read_views(run.folder, "edited", names, s) for s in run.trajectory.strengths}
-    setup = widen_views(setup, edited)
+    setup = widen_views(setup, edited).extend(run.trajectory.added)
     shown_at = torch.tensor(gdf.field.recorded, dtype=torch.float32)
     if shown_at.shape != run.trajectory.s.shape:
         raise ProgdfError(f"{gdf.name}.gdf is not of the recording beside it; run progdf fit {root}")

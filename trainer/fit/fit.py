@@ -254,6 +254,8 @@ def visibility(
 ) -> Tensor:
     """Blended weight of each member over the views, mean 1, never 0 so that no row is left to chance. [M]
 
+    `scene`: the original, where rows are added with these as they are at strength 1.
+
     Members are weighted by it, numbers by nothing (docs/experiments.md, Separable fields).
 
     Members that no picture shows stay in the region: leaving them out saves 0 to 6 % of the bytes.

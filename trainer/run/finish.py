@@ -26,10 +26,18 @@ from trainer.fit.network import NetworkFit, fit_network
 from trainer.fit.slider_uniformity import equalize_slider
 from trainer.optimize.losses import Perceptual, perceptual_loss
 from trainer.optimize.retime import resolve_slider
-from trainer.options import EditorOptions, FieldOptions, FitOptions, RegionOptions, TextOptions, TrainOptions
+from trainer.options import (
+    EditorOptions,
+    FieldOptions,
+    FitOptions,
+    RegionOptions,
+    TextOptions,
+    TrainOptions,
+    with_values,
+)
 from trainer.report.measures import PaintTaken, clip_curve, expected_measures, figures, measure, measure_paint
 from trainer.report.report import report_picture
-from trainer.resolve import check_field_options
+from trainer.resolve import check_field_options, use_threads
 from trainer.setup import TrainingSetup, whole_views, widen_views
 from trainer.store.progress import RunLog
 from trainer.store.run_folder import RunFolder, read_views, write_json
@@ -38,7 +46,6 @@ from trainer.views.crops import only_recolors
 from trainer.views.view import View
 
 from .record import RunRecord, render_run_views, reopen_run
-from .threads import use_threads
 
 _RANK_VIEWS = 4
 _REPORT_ALONE = (
@@ -85,16 +92,17 @@ def finish_run(
     """
     options, scene, region = record.plan, setup.scene, setup.region
     with log.stage("fit"):
-        evaluator = load_evaluator(folder, setup, setup.judging, trajectory)
+        grown = setup.extend(trajectory.added)
+        evaluator = load_evaluator(folder, grown, setup.judging, trajectory)
         choosing, reporting = evaluator.halves()
         fitted, network = _fit(
-            options.field, setup, evaluator, trajectory, perceptual, log, folder, begun=begun
+            options.field, grown, evaluator, trajectory, perceptual, log, folder, begun=begun
         )
     with log.stage("even"):
         slider = resolve_slider(options.optimize.slider, trajectory.strengths)
         field, remap = fitted.chosen.field, identity_remap()
         if slider == "even":
-            field, remap = equalize_slider(field, setup, log)
+            field, remap = equalize_slider(field, grown, log)
         if field.attributes:  # its end is what its file says, not what was recorded
             trajectory = replace(trajectory, end=field.offsets(1.0))
         shipped = replace(trajectory, s=remap(trajectory.s).float())
@@ -113,12 +121,13 @@ def finish_run(
             judges = replace(evaluator, looked=looked), replace(reporting, looked=looked)
             measured = measure(judges, trajectory, fitted, field, remap, perceptual, clip)
         plan = plain(options)
-        given = differences(plan, DEFAULTS)
-        gdf = Gdf(options.name, region, field, fingerprint(scene), options.editor.editor, given)
-        endpoint, outside = exactness(scene, gdf, end_rows(setup, trajectory))
+        added = None if trajectory.added is None else grown.scene[len(scene) :]
+        given = differences(plan if added is not None else plain(with_values(options, grow=0.0)), DEFAULTS)
+        gdf = Gdf(options.name, region, field, fingerprint(scene), options.editor.editor, given, added=added)
+        endpoint, outside = exactness(scene, gdf, end_rows(grown, trajectory))
         title = f"{options.name}: {options.editor.editor}"
         picture = report_picture(evaluator, measured, record.losses, title, len(setup.held_out))
-    paint = _measure_paint(folder, setup, options.views.pictures, end_rows(setup, trajectory))
+    paint = _measure_paint(folder, grown, options.views.pictures, end_rows(grown, trajectory))
     measures = figures(measured, endpoint, outside)
     if network is not None:
         measures["field"] |= network.figures()
@@ -164,7 +173,11 @@ def _fit(
     if not setup.held_out:
         log.say("no view is held out: all figures are of the views that were trained on")
     with log.looks("weigh the members", len(setup.train)) as looked:
-        weights = visibility(setup.scene, setup.region.members, setup.train, looked)
+        members, scene = setup.region.members, setup.scene
+        if trajectory.added is not None:
+            count = len(trajectory.added)
+            scene = scene.replace_rows(members[-count:], end_rows(setup, trajectory)[-count:])
+        weights = visibility(scene, members, setup.train, looked)
     few = setup.train[:: max(1, len(setup.train) // _RANK_VIEWS)][:_RANK_VIEWS]
     if options.field == "neural":
         seen = load_evaluator(folder, setup, few, trajectory)
@@ -239,7 +252,7 @@ def _write(
     save_gdf(path, replace(gdf, report={k: v for k, v in report.items() if k not in _REPORT_ALONE}))
     if path != folder.draft:
         folder.draft.unlink(missing_ok=True)
-    size, members = path.stat().st_size, max(1, len(gdf.region))
+    size, members = path.stat().st_size, max(1, gdf.members)
     report["file"] = {"bytes": size, "bytes_per_gaussian": round(size / members, 1)}
     write_json(folder.report, report)
     write_image(folder.picture, picture)
@@ -280,13 +293,14 @@ def exactness(scene: Gaussians, gdf: Gdf, end: Tensor) -> tuple[float, float]:
     outside = torch.ones(len(scene), dtype=torch.bool)
     outside[gdf.region.members] = False
     finished = compose_layers(scene, [Layer(gdf, 1.0)])
-    packed = pack(finished[gdf.region.members], with_shN=end.shape[1] > BASE_CHANNELS)
+    members = torch.cat([gdf.region.members, torch.arange(len(scene), len(finished))])
+    packed = pack(finished[members], with_shN=end.shape[1] > BASE_CHANNELS)
     endpoint = float((packed - end).abs().max())
     change = 0.0
     for s in (0.3, 1.0):
         edited = compose_layers(scene, [Layer(gdf, s)])
         for name in ATTRIBUTES:
-            before, after = getattr(scene, name)[outside], getattr(edited, name)[outside]
+            before, after = getattr(scene, name)[outside], getattr(edited, name)[: len(scene)][outside]
             if before.numel() and not torch.equal(before, after):
                 change = max(change, float((after - before).abs().max()))
     return endpoint, change

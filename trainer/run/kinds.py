@@ -17,15 +17,16 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from progdf.gaussians import pack
-from progdf.metrics.image import decibels
+from progdf.metrics.image import ROUNDING, decibels
 from progdf.scene.bounds import scene_sphere
 from trainer.editors import KIND_UNKNOWN, ImageEditor
 from trainer.optimize.groups import GROUP_STEPS, group_stage
+from trainer.optimize.growth import place_seeds, seed_rows
 from trainer.optimize.losses import GradientL1, Objective
 from trainer.optimize.pgs import TargetStage, optimize, pgs_settings
 from trainer.options import EditKind, OptimizeOptions, TrainOptions, with_values
 from trainer.resolve import resolve_kind
-from trainer.setup import TrainingSetup
+from trainer.setup import TrainingSetup, confines_edit
 from trainer.store.progress import Advance, RunLog
 from trainer.views.crops import CropScene, crop_scene, render_all
 from trainer.views.view import View, crop, fit_size
@@ -38,6 +39,7 @@ _MOVED = 0.8
 """Share of the gain of painting, in dB, from which moving is taken: what moved and is painted looks torn at a
 PSNR that is no worse. Moving gains .2-.4 of it where paint was meant, .85-1.2 where a mouth was pulled.
 """
+_GROWS = 0.1  # of the error, which growth must take away
 _REPAINTED = 0.3  # share of the pixels beside the region that change where a tool repaints the whole picture
 
 
@@ -47,9 +49,11 @@ class Approach:
 
     kind: EditKind  # what moves
     group_steps: int = 0  # of the stage in which connected parts move as wholes; 0 leaves it out
+    grow: float = 0.0  # see `OptimizeOptions.grow`
 
     def __str__(self) -> str:
-        return f"{self.kind} in parts" if self.group_steps else self.kind
+        grows = " with growth" if self.grow else ""
+        return f"{self.kind} in parts" if self.group_steps else self.kind + grows
 
     @property
     def said(self) -> str:
@@ -69,8 +73,19 @@ class Trial:
     @property
     def chosen(self) -> Approach:
         """The best, with the allowances of `_MOVED` and `_AS_GOOD`."""
-        moving = [way for way in self.psnrs if way.kind == "geometry"]
-        painting = [way for way in self.psnrs if way.kind != "geometry"]
+        grown = max((way for way in self.psnrs if way.grow), key=self._gain, default=None)
+        plain = self._plain
+        moves = plain.kind == "geometry" and self._gain(plain) > max(0.0, _MOVED * self._gain(grown or plain))
+        if grown is None or moves:
+            return plain
+        before, after = (ROUNDING + 10 ** (-self.psnrs[way] / 10) for way in (plain, grown))
+        return grown if after < (1 - _GROWS) * before else plain
+
+    @property
+    def _plain(self) -> Approach:
+        """The best that adds nothing."""
+        moving = [way for way in self.psnrs if way.kind == "geometry" and not way.grow]
+        painting = [way for way in self.psnrs if way.kind != "geometry" and not way.grow]
         moved = max(moving, key=self._gain, default=None)
         painted = max(painting, key=self._gain, default=None)
         if moved is not None and (
@@ -86,18 +101,22 @@ class Trial:
     def line(self) -> str:
         """For the log."""
         tried = ", ".join(f"{approach} {psnr:.1f}" for approach, psnr in self.psnrs.items())
+        skips = "" if self.chosen.grow else f" ({self.chosen.said} skips the trial)"
+        if not self.chosen.grow and any(way.grow for way in self.psnrs):
+            skips = ": growth would not take a tenth of the error away, or takes the place of what moves"
         return (
             f"tried for {self.steps} steps with L1 on small views, PSNR in other views: unedited "
-            f"{self.unedited:.1f}, {tried} dB; taken: {self.chosen} ({self.chosen.said} skips the trial)"
+            f"{self.unedited:.1f}, {tried} dB; taken: {self.chosen}{skips}"
         )
 
     def figures(self) -> dict[str, Any]:
-        """As report.json has it."""
+        """As report.json has it: growth only where it was taken, as a run without it writes the same."""
+        reported = [way for way in self.psnrs if not way.grow or way == self.chosen]
         return {
             "steps": self.steps,
             "loss": "L1",
             "unedited_psnr": round(self.unedited, 2),
-            "psnr": {str(approach): round(psnr, 2) for approach, psnr in self.psnrs.items()},
+            "psnr": {str(way): round(psnr, 2) for way, psnr in self.psnrs.items() if way in reported},
             "chosen": str(self.chosen),
         }
 
@@ -119,18 +138,21 @@ def choose_approach(
     optimize = options.optimize
     knows_kind = options.editor.family not in KIND_UNKNOWN
     kind = editor.kind if optimize.kind == "auto" and knows_kind else optimize.kind
-    if kind == "color" or kind == "style":
+    if kind == "color" or (kind == "style" and not optimize.grow):
         return Approach(kind), None
-    if kind == "geometry" and optimize.group_steps is not None:
+    if kind == "geometry" and optimize.group_steps is not None and not optimize.grow:
         return Approach(kind, optimize.group_steps), None
     edited = [editor.edit(view, 1.0) for view in setup.train]
-    ways = approaches(options, setup, edited)
+    ways = approaches(with_values(options, kind=kind), setup, edited)
+    if ways[-1] == Approach("style", grow=optimize.grow) and confines_edit(editor, "style"):
+        edited = [view.confine(picture) for view, picture in zip(setup.train, edited, strict=True)]
     if all(torch.equal(picture, view.image) for picture, view in zip(edited, setup.train, strict=True)):
         return ways[0], None
     with log.steps("try kinds", len(ways)) as advance:
         trial = try_approaches(options, setup, edited, ways, advance)
     log.say(trial.line())
-    return trial.chosen, trial.figures()
+    is_open = len(ways) > 2 or trial.chosen.grow or not optimize.grow
+    return trial.chosen, trial.figures() if is_open else None
 
 
 def approaches(options: TrainOptions, setup: TrainingSetup, edited: Sequence[Tensor]) -> list[Approach]:
@@ -148,15 +170,20 @@ def approaches(options: TrainOptions, setup: TrainingSetup, edited: Sequence[Ten
     groups = GROUP_STEPS if optimize.group_steps is None else optimize.group_steps
     geometry = [Approach("geometry")] if not groups or optimize.group_steps is None else []
     geometry += [Approach("geometry", groups)] if groups else []
+    grow = [Approach("geometry", grow=optimize.grow)] if optimize.grow else []
+    if optimize.kind == "geometry":
+        return geometry + grow
+    grow = [replace(way, kind="style") for way in grow]
     if optimize.kind != "auto":
-        return geometry if optimize.kind == "geometry" else [Approach(optimize.kind)]
+        return [Approach(optimize.kind), *grow]
     changed = beside = 0.0
     for view, picture in zip(setup.train, edited, strict=True):
         outside = view.mask < 0.05
         changed += float(((picture - view.image).abs().amax(dim=2) > 0.05)[outside].sum())
         beside += float(outside.sum())
-    geometry = [] if changed > _REPAINTED * beside else geometry
-    return [Approach("color"), Approach("style"), *geometry]
+    if changed > _REPAINTED * beside:
+        return [Approach("color"), Approach("style"), *grow]
+    return [Approach("color"), Approach("style"), *geometry, *(replace(way, kind="geometry") for way in grow)]
 
 
 def try_approaches(
@@ -178,34 +205,58 @@ def try_approaches(
     Raises:
         FloatingPointError: a loss is not finite.
     """
-    members = setup.region.members
     most = sorted(zip(setup.train, edited, strict=True), key=lambda pair: -_change(*pair))[:_VIEWS]
-    small = [_small(setup, view.widen([picture]), picture) for view, picture in most]
-    judges = small[1::3] or small
-    taught = [one for i, one in enumerate(small) if i % 3 != 1]
-    crops, targets = [one.scene for one in taught], [one.target for one in taught]
-    original = pack(setup.scene[members], with_shN=setup.scene.sh_degree > 0)
-    extent = 2.0 * scene_sphere(setup.scene[members])[1]
+    trained = [pair for i, pair in enumerate(most) if i % 3 != 1]
+    plain = _small_views(setup, most)
+    unedited = _psnr(plain[1::3] or plain, pack(setup.scene[setup.region.members], with_shN=True))
     steps = max(_LEAST_STEPS, min(_MOST_STEPS, round(_SHARE * options.optimize.steps)))
-    objective = Objective(GradientL1(), OptimizeOptions(perceptual_weight=0.0))
     psnrs: dict[Approach, float] = {}
     for way in ways:
-        stages = [TargetStage(1.0, targets, steps)]
-        if way.group_steps:
-            # how far parts get as wholes; what the members add to that takes longer than a trial
-            groups = group_stage(original, crops, [targets], steps, options.optimize.seed)
-            end = groups.to_stages(original, crops, stages)[0].place(torch.zeros_like(original))
-        else:
-            resolved = resolve_kind(with_values(options, steps=steps), way.kind, 0)
-            settings = pgs_settings(resolved, True, original.shape[1], extent, 1)
-            *_, last = optimize(
-                original, crops, [], stages, objective, replace(settings, smoothing=0.9, every=0, snapshots=1)
-            )
-            end = last.offsets
-        psnrs[way] = _psnr(judges, original + end)
+        grown, small, seeds = setup, plain, 0
+        if way.grow:
+            views, pictures = zip(*trained, strict=True)
+            rows = seed_rows(setup, views, pictures, int(way.grow * len(setup.region)), options.optimize.seed)
+            grown, seeds = setup.extend(rows), len(rows)
+            small = _small_views(grown, most)
+        psnrs[way] = _try_approach(options, way, grown, seeds, small, steps)
         if advance is not None:
             advance(len(psnrs), f"{way} {psnrs[way]:.1f} dB")
-    return Trial(steps, psnrs, _psnr(judges, original))
+    return Trial(steps, psnrs, unedited)
+
+
+def _try_approach(
+    options: TrainOptions,
+    way: Approach,
+    setup: TrainingSetup,
+    seeds: int,
+    small: Sequence[_Small],
+    steps: int,
+) -> float:
+    """PSNR in the judging views, dB. `seeds`: how many members, the last, are none of the scene's"""
+    members, taught = setup.region.members, [one for i, one in enumerate(small) if i % 3 != 1]
+    crops, targets = [one.scene for one in taught], [one.target for one in taught]
+    original = pack(setup.scene[members], with_shN=setup.scene.sh_degree > 0)
+    stage = TargetStage(1.0, targets, steps)
+    if way.group_steps:
+        # how far parts get as wholes; what the members add to that takes longer than a trial
+        groups = group_stage(original, crops, [targets], steps, options.optimize.seed)
+        end = groups.to_stages(original, crops, [stage])[0].place(torch.zeros_like(original))
+    else:
+        resolved = resolve_kind(with_values(options, steps=steps), way.kind, 0)
+        extent = 2.0 * scene_sphere(setup.scene[members])[1]
+        settings = pgs_settings(resolved, True, original.shape[1], extent, 1)
+        settings = replace(settings, smoothing=0.9, every=0, snapshots=1)
+        if seeds:
+            stage, settings = place_seeds(stage, seeds), replace(settings, ramp=0.0)
+        objective = Objective(GradientL1(), OptimizeOptions(perceptual_weight=0.0))
+        *_, last = optimize(original, crops, [], [stage], objective, settings)
+        end = last.offsets
+    return _psnr(small[1::3] or small, original + end)
+
+
+def resolve_approach(options: TrainOptions, way: Approach) -> OptimizeOptions:
+    """See `resolve_kind`."""
+    return resolve_kind(options, way.kind, way.group_steps, way.grow)
 
 
 @dataclass(frozen=True)
@@ -215,6 +266,10 @@ class _Small:
     scene: CropScene
     target: Tensor
     counts: Tensor
+
+
+def _small_views(setup: TrainingSetup, pairs: Sequence[tuple[View, Tensor]]) -> list[_Small]:
+    return [_small(setup, view.widen([picture]), picture) for view, picture in pairs]
 
 
 def _small(setup: TrainingSetup, view: View, picture: Tensor) -> _Small:

@@ -58,50 +58,9 @@ def read_record(about: Mapping[str, Any]) -> RunRecord:
     """What a recording's file tells of its run.
 
     Raises:
-        ValueError, KeyError, TypeError: it is no record, or damaged.
+        ValueError: it is no record, or damaged.
     """
-    return convert_json({**about, "plan": upgrade_plan(about["plan"])}, RunRecord)
-
-
-def upgrade_plan(plan: Mapping[str, Any]) -> Mapping[str, Any]:
-    """JSON values of a recorded plan as `TrainOptions` has them, also where its parts have their older names.
-
-    Raises:
-        ValueError, KeyError, TypeError: it is none.
-    """
-    if "optimization" not in plan:
-        return plan
-    region, editor, views = dict(plan["region"]), dict(plan["editor"]), dict(plan["views"])
-    optimize, field, texts = dict(plan["optimization"]), dict(plan["field"]), plan["texts"]
-    network, segmenter, refinements = field.pop("network"), region.pop("segmenter"), optimize["refinements"]
-    guidance = [editor.pop(name) for name in ("guidance", "image_guidance")]
-    return {
-        "scene": plan["scene"],
-        "out": "",
-        "name": plan["name"],
-        "region": region | segmenter,
-        "editor": editor | {"guidance": ",".join(str(number) for number in guidance if number is not None)},
-        "views": views | {name: views[name] or 0 for name in ("views", "image_size")},
-        "optimize": optimize
-        | {
-            "kind": optimize["kind"] or "auto",
-            "stages": optimize["stages"] or 0,
-            "slider": plan["slider"],
-            "as_printed": optimize["raw"],
-            "color_solver": refinements["solves"],
-            "ema": refinements["averages"],
-            "target_ramp": refinements["ramps"],
-        },
-        "field": field
-        | {
-            "size": network["size"],
-            "field_loss": network["loss"],
-            "as_printed": network["inputs"] == "position",
-            "draft": network["draft"],
-            "seed": network["seed"],
-        },
-        "texts": {"text_before": texts["before"], "text_after": texts["after"], "asked": texts["asked"]},
-    }
+    return convert_json(about, RunRecord)
 
 
 @dataclass(frozen=True)
@@ -145,8 +104,9 @@ def reopen_run(root: Path, scene: Path | None = None) -> FinishedRun:
                 "give that one with --scene"
             )
         region = Region(record.plan.name, members, score)
-        if len(region) != trajectory.end.shape[0]:
-            raise ValueError(f"it has {trajectory.end.shape[0]} members, the region {len(region)}")
+        rows = len(region) + (0 if trajectory.added is None else len(trajectory.added))
+        if rows != trajectory.end.shape[0]:
+            raise ValueError(f"it has {trajectory.end.shape[0]} members, the region {rows}")
     except ProgdfError:
         raise
     except (KeyError, TypeError, ValueError) as error:

@@ -21,9 +21,7 @@ from progdf.io.json_values import convert_json, decode_json, plain
 from progdf.region import Region
 from trainer.editors.pictures import picture_paths, strengths_of
 from trainer.options import MOST_THREADS, TrainOptions
-from trainer.resolve import recorded_options, resolve
-from trainer.run.record import upgrade_plan
-from trainer.run.threads import count_threads
+from trainer.resolve import count_threads, recorded_options, resolve
 from trainer.store.run_folder import RunFolder, begin_log, remove_leftovers
 
 _SWITCHES = (
@@ -98,7 +96,7 @@ def decide_resume(folder: RunFolder, options: TrainOptions, region: Region, coun
         notes = []
         if saved.torch != now.torch:
             notes.append(f"torch was {saved.torch} and is {now.torch}: the last bits may differ")
-        if saved.processor not in ("", now.processor):
+        if saved.processor != now.processor:
             change = f"the processor was {saved.processor} and is {now.processor}"
             notes.append(f"{change}: the last bits may differ, the quality does not")
         if saved.threads != threads:
@@ -167,8 +165,8 @@ class _Identity(msgspec.Struct):
     cameras: str | None
     threads: Annotated[int, msgspec.Meta(ge=1, le=MOST_THREADS)]
     torch: str
-    pictures: dict[str, str] = {}
-    processor: str = ""  # of runs before it was kept
+    pictures: dict[str, str]
+    processor: str
 
 
 def _identity(plan: TrainOptions, threads: int) -> _Identity:
@@ -209,12 +207,6 @@ def _saved_identity(folder: RunFolder) -> _Identity | None:
     identity = folder.state.identity()
     if identity is None:
         return None
-    plan = identity.get("plan", {})
-    if "optimization" in plan or plan.get("editor", {}).get("reedit_every"):  # which is no more
-        raise ProgdfError(
-            f"{folder.root} was begun by an earlier version, which ends it; or delete {folder.state.path} "
-            "and train again"
-        )
     try:
         return convert_json(identity, _Identity)
     except ValueError as error:
@@ -244,8 +236,6 @@ def _values(part: Any) -> Iterator[tuple[str, bool, Any]]:
             typed = not str(field.type).startswith("Fixed")
             if field.name in ("views", "image_size", "stages"):
                 value = value or None  # 0: by default
-            if field.name == "engine" and value == "auto":  # of runs before there were two
-                value = "cpu"
             yield field.name, typed, value.resolve() if isinstance(value, Path) else value
 
 
@@ -268,9 +258,8 @@ def _finished_run(folder: RunFolder) -> tuple[TrainOptions, dict[str, str]]:
     """A finished run's plan, and the hashes of its changed pictures."""
     try:
         report = decode_json(folder.report.read_bytes())
-        return convert_json(upgrade_plan(report["plan"]), TrainOptions), convert_json(
-            report.get("pictures", {}), dict[str, str]
-        )
+        pictures = convert_json(report.get("pictures", {}), dict[str, str])
+        return convert_json(report["plan"], TrainOptions), pictures
     except (ValueError, KeyError, TypeError) as error:
         raise ProgdfError(f"{folder.report} is damaged; leave out --resume to train again") from error
 

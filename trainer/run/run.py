@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -43,12 +43,13 @@ from trainer.fit.draft import draft_grade, draft_views
 from trainer.fit.fit import choose_path, drop_idle_attributes
 from trainer.fit.network import PART as NETWORK
 from trainer.fit.slider_uniformity import equalized_strengths
+from trainer.optimize.growth import fade_in
 from trainer.optimize.losses import Perceptual, describe_loss, perceptual_loss
 from trainer.optimize.retime import resolve_slider
 from trainer.options import MOST_STAGES, EditKind, OptimizeOptions, TrainOptions
 from trainer.regions.from_pictures import RegionRequest, region_checks, region_kinds
 from trainer.report.agreement import measure_agreement
-from trainer.resolve import recorded_options, resolve, resolve_kind
+from trainer.resolve import recorded_options, resolve, use_threads
 from trainer.setup import (
     Pictures,
     TrainingSetup,
@@ -78,11 +79,10 @@ from trainer.views.view import BACKGROUND, fit_size, make_view, render_view, wit
 from .agree import AgreedEditor, Easel, agree_views
 from .decal import RING, TURNS, train_decal
 from .finish import RunResult, end_rows, finish_run, load_evaluator, load_result
-from .kinds import Approach, choose_approach
+from .kinds import Approach, choose_approach, resolve_approach
 from .record import RunRecord, read_record
 from .removal import is_removal, remove_region
 from .resume import check_exists, decide_resume, explain_stop, load_region, picture_digests
-from .threads import use_threads
 from .training import optimize_members, retime_trajectory
 
 
@@ -243,7 +243,7 @@ def _run_training(
     if recorded is None:
         with log.stage("agree"):
             agreement = _agreement(options, setup, edited, approach.kind, folder, log)
-        optimization = resolve_kind(options, approach.kind, approach.group_steps)
+        optimization = resolve_approach(options, approach)
         trajectory, outcome = _record(
             options, optimization, setup, edited, between, editor, perceptual, folder=folder, log=log
         )
@@ -262,7 +262,7 @@ def _run_training(
         )
         extra = {"members": region.members, "score": region.score}
         save_trajectory(folder.trajectory, trajectory, extra, plain(record))
-        _write_finals(setup, trajectory, folder, log)
+        _write_finals(setup.extend(trajectory.added), trajectory, folder, log)
         folder.state.save("recorded", {}, log.capture_state().values)
     else:
         log.restore(recorded)
@@ -411,27 +411,27 @@ def _edit_views(
         with log.steps("edit", len(views) * len(new)) as advance:
             made.update(edit_views(editor(), views, new, folder, is_confined, advance))
         log.say(f"{spec}: a {approach.kind} edit at strength {', '.join(f'{s:g}' for s in strengths)}")
-        saved = {"strengths": list(strengths), "kind": approach.kind, "group_steps": approach.group_steps}
+        saved = {"strengths": list(strengths), **asdict(approach)}
         shared = painter.figures if isinstance(painter := editor(), AgreedEditor) else {}
         folder.state.save("edited", {}, saved | {"trial": trial, "shared": shared})
         return {s: made[s] for s in strengths}
 
     def between(missed: float) -> Pictures:
-        if len(made) > 1 or not _waits_for_error(options, resolve_kind(options, approach.kind, 0)):
+        if len(made) > 1 or not _waits_for_error(options, resolve_approach(options, approach)):
             return made
         plain = tuple((i + 1) / MOST_STAGES for i in range(MOST_STAGES))
         strengths = equalized_strengths(editor(), spec, views, plain, missed)
-        log.expect(expected_work(setup, resolve_kind(options, approach.kind, 0), len(strengths)))
+        log.expect(expected_work(setup, resolve_approach(options, approach), len(strengths)))
         return edit(strengths)
 
     done = folder.state.load("edited")
     if done is not None:
         try:
             made.update({s: read_views(folder, "edited", names, s) for s in done.values["strengths"]})
-            approach = Approach(done.values["kind"], done.values["group_steps"])
+            approach = Approach(*(done.values[name] for name in ("kind", "group_steps", "grow")))
             trial = done.values["trial"]
             log.say("the edited views are on disk")
-            log.expect(expected_work(setup, resolve_kind(options, approach.kind, 0), len(made)))
+            log.expect(expected_work(setup, resolve_approach(options, approach), len(made)))
             return made, approach, trial, between
         except ProgdfError as error:
             made.clear()
@@ -440,7 +440,7 @@ def _edit_views(
     if isinstance(painter, FolderEditor) and painter.note is not None:
         log.say(painter.note)
     approach, trial = choose_approach(options, setup, editor(), log)
-    optimization = resolve_kind(options, approach.kind, approach.group_steps)
+    optimization = resolve_approach(options, approach)
     strengths = editor_strengths(editor(), optimization.stages)
     log.expect(expected_work(setup, optimization, len(strengths)))
     if _waits_for_error(options, optimization):
@@ -522,6 +522,7 @@ def _record(
         trajectory, losses, effort = optimize_members(
             options, optimization, setup, edited, perceptual, folder.state, log, between=between
         )
+    setup = setup.extend(trajectory.added)
     with log.stage("retime"):
         costs: dict[str, float] = {}
         if not only_recolors(trajectory.offsets) or trajectory.end.shape[1] > BASE_CHANNELS:
@@ -534,6 +535,7 @@ def _record(
             trajectory, reason = _choose_path(trajectory, options, optimization, setup, editor, log)
         else:
             trajectory = retime_trajectory(trajectory, setup, optimization, log)
+        trajectory = fade_in(trajectory)
     log.say(
         f"{recorded} recordings, {len(trajectory)} kept; without an attribute, dB: {costs or 'none moves'}"
     )

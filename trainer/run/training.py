@@ -15,7 +15,7 @@ from torch import Tensor
 
 from progdf.errors import ProgdfError
 from progdf.field.trajectory import Trajectory
-from progdf.gaussians import BASE_CHANNELS, pack
+from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians, pack
 from progdf.io.json_values import convert_json
 from progdf.rasterize.engines import engine_device
 from progdf.scene.bounds import scene_sphere
@@ -32,6 +32,7 @@ from trainer.optimize.color_solver import (
 )
 from trainer.optimize.color_views import ColorView, Judge, color_views
 from trainer.optimize.groups import Groups, group_path, group_stage, restore_groups
+from trainer.optimize.growth import add_rows, place_seeds, removal_costs, seed_rows
 from trainer.optimize.losses import Losses, Objective, Perceptual, erode, loss_table
 from trainer.optimize.pgs import (
     OnStep,
@@ -179,6 +180,14 @@ def optimize_members(
         stages = groups.to_stages(original, crops, stages)
     extent = 2.0 * scene_sphere(scene[members])[1] if groups is None else groups.extent
     settings = pgs_settings(optimization, bands, original.shape[1], extent, len(stages))
+    own, seeds = len(members), _seeds(setup, optimization, edited, folder) if optimization.grow else None
+    if seeds is not None:
+        setup, settings = setup.extend(seeds), replace(settings, ramp=0.0)
+        original = torch.cat([original, pack(seeds, with_shN=scene.sh_degree > 0).to(device)])
+        crops, stages = (
+            _crops(setup, setup.train, still, engine),
+            [place_seeds(s, len(seeds)) for s in stages],
+        )
     state, recordings = PgsState(original, settings.seed), Recordings(folder, original.shape)
     way: Way
     model: Model | None = None
@@ -203,7 +212,7 @@ def optimize_members(
     log.say(f"L1 to the finished edit: {distances[0]:.4f} at first, {distances[-1]:.4f} at the end")
     log.say(f"the state was saved {saver.saves} times, in {saver.seconds:.2f} s")
     end = stages[-1].place(state.average).cpu().clone()
-    snapshots = [(made.step, made.stage, made.ends_stage, made.offsets) for made in recordings.made]
+    snapshots = [(made.step, made.stage, made.ends_stage, made.offsets[:own]) for made in recordings.made]
     if groups is not None:
         ends = [made for made in recordings.made if made.ends_stage]
         offsets = [*(made.offsets.float() for made in ends[:-1]), end]
@@ -212,7 +221,14 @@ def optimize_members(
     rows = [
         (m.step, {name: mean for name, mean in m.means.items() if name != STEPS}) for m in recordings.made
     ]
-    trajectory, effort = record(snapshots, end, list(edited)), {"strengths": list(edited), STEPS: taken}
+    trajectory, effort = record(snapshots, end[:own], list(edited)), {"strengths": list(edited), STEPS: taken}
+    if seeds is not None:
+        finished = original + end.to(device)
+        costs = removal_costs(crops, finished, stages[-1].targets, optimization.seed)[own:].cpu()
+        trained = setup.scene.replace_rows(setup.region.members, finished.cpu())[len(scene) :]
+        trajectory = add_rows(trajectory, trained[costs > 0.0])
+        effort["added"] = 0 if trajectory.added is None else len(trajectory.added)
+        log.say(f"growth: {effort['added']} Gaussians added, of {len(seeds)}; the others contribute nothing")
     if model is not None:
         maps = torch.stack([made.table for made in recordings.made if made.table is not None])
         trajectory = replace(trajectory, maps=maps, bands=model.bands, mask=model.mask)
@@ -371,6 +387,20 @@ def _groups(
     for line in groups.lines():
         log.say(line)
     return groups
+
+
+def _seeds(
+    setup: TrainingSetup, optimization: OptimizeOptions, edited: Pictures, folder: StateFolder
+) -> Gaussians | None:
+    """The rows that are added, or what was saved of them; None where there are none."""
+    saved, finished = folder.load("seeds"), edited[max(edited)]
+    if saved is None:
+        count = int(optimization.grow * len(setup.region))
+        seeds = seed_rows(setup, setup.train, finished[: len(setup.train)], count, optimization.seed)
+        saved = Saved({name: getattr(seeds, name) for name in ATTRIBUTES}, {})
+        folder.save("seeds", saved.tensors, saved.values)
+    rows: dict[str, Any] = dict(saved.tensors)
+    return Gaussians(**rows) if len(rows["means"]) else None
 
 
 def retime_trajectory(

@@ -225,7 +225,7 @@ def load_recorded(gdf: Gdf, recording: RecordingFile) -> Gdf:
         return gdf
     trajectory, s = load_trajectory(recording.path)[0], torch.tensor(gdf.field.recorded, dtype=torch.float32)
     ascends = len(s) > 1 and float(s[0]) == 0.0 and float(s[-1]) == 1.0 and bool((s.diff() > 0).all())
-    if trajectory.end.shape[0] != len(gdf.region) or len(trajectory) != len(s) or not ascends:
+    if trajectory.end.shape[0] != gdf.members or len(trajectory) != len(s) or not ascends:
         raise ProgdfError(f"{recording.path} belongs to another edit; train again")
     return replace(gdf, field=recorded_field(replace(trajectory, s=s)))
 

@@ -23,10 +23,12 @@ from trainer.setup import TrainingSetup
 
 COLOR, STYLE, FREE = Approach("color"), Approach("style"), Approach("geometry")
 IN_PARTS = Approach("geometry", 120)
+GROWN, GROWN_STYLE = Approach("geometry", grow=0.2), Approach("style", grow=0.2)
 
 
 def asked(**more: object) -> TrainOptions:
-    return resolve(with_values(quick_options(Path("nowhere")), **{"steps": 144, **more}))
+    options = with_values(quick_options(Path("nowhere")), editor="folder:nowhere")
+    return resolve(with_values(options, **{"steps": 144, **more}))
 
 
 def setup(case: Small) -> TrainingSetup:
@@ -96,6 +98,19 @@ def test_moving_is_taken_where_it_gains_nearly_as_much_as_paint() -> None:
     assert Trial(40, {COLOR: 9.0, STYLE: 9.5, FREE: 9.9}, 10.0).chosen == STYLE, "nothing gains"
 
 
+def test_growth_is_taken_where_it_gains_a_tenth_of_the_error_and_nothing_moves() -> None:
+    assert Trial(60, {COLOR: 14.8, STYLE: 15.2, IN_PARTS: 20.2, GROWN: 27.1}, 14.6).chosen == GROWN
+    assert Trial(60, {COLOR: 20.4, STYLE: 20.4, GROWN: 20.4}, 20.4).chosen == COLOR
+    # a tenth of the error is .46 dB
+    assert Trial(60, {STYLE: 20.0, GROWN_STYLE: 20.4}, 10.0).chosen == STYLE
+    assert Trial(60, {STYLE: 20.0, GROWN_STYLE: 20.5}, 10.0).chosen == GROWN_STYLE
+    # what moves would fade in anew
+    moved = Trial(60, {FREE: 17.0, IN_PARTS: 28.0, GROWN: 29.5}, 14.0)
+    assert moved.chosen == IN_PARTS
+    assert "growth would not take a tenth of the error away, or takes the place of what moves" in moved.line()
+    assert moved.figures() == Trial(60, {FREE: 17.0, IN_PARTS: 28.0}, 14.0).figures()
+
+
 def test_the_line_tells_what_was_tried_and_what_was_taken() -> None:
     line = Trial(40, {COLOR: 18.0, FREE: 21.23}, 10.0).line()
     assert "40 steps with L1" in line
@@ -113,6 +128,9 @@ def test_the_line_tells_what_was_tried_and_what_was_taken() -> None:
         ({"kind": "geometry"}, [FREE, IN_PARTS]),
         ({"kind": "geometry", "group_steps": 12}, [Approach("geometry", 12)]),
         ({"kind": "style"}, [STYLE]),
+        ({"grow": 0.2}, [COLOR, STYLE, FREE, IN_PARTS, GROWN]),
+        ({"grow": 0.2, "kind": "geometry", "group_steps": 0}, [FREE, GROWN]),
+        ({"grow": 0.2, "kind": "style"}, [STYLE, GROWN_STYLE]),
     ],
 )
 def test_what_the_options_say_is_not_tried(more: dict[str, object], expected: list[Approach]) -> None:
@@ -124,4 +142,5 @@ def test_pictures_that_are_repainted_all_over_do_not_move_the_region() -> None:
     case = scarf()
     repainted = [0.8 * view.image for view in case.views]
     assert approaches(asked(), setup(case), repainted) == [COLOR, STYLE]
+    assert approaches(asked(grow=0.2), setup(case), repainted) == [COLOR, STYLE, GROWN_STYLE]
     assert approaches(asked(kind="geometry"), setup(case), repainted) == [FREE, IN_PARTS]

@@ -18,6 +18,7 @@ from progdf.__main__ import main
 from progdf.errors import ProgdfError
 from progdf.formats.ply import load_ply
 from progdf.gdf.file import load_gdf
+from tests.helpers.growth import write_growth
 from tests.helpers.stopped import OUT, bits, small_run
 from tests.helpers.stopped_runs import NEVER, at_step, gone_on, killed, saved_step, words
 from tests.helpers.trained import train
@@ -302,3 +303,18 @@ def test_what_is_found_in_a_folder_depends_on_the_options(
     shutil.rmtree(OUT)
     shutil.copytree(uninterrupted, OUT)
     assert find_run(small_run(bear_folder)) == "finished"
+
+
+def test_a_run_killed_while_it_grows_goes_on_to_the_same_bits(tmp_path: Path) -> None:
+    options = write_growth(tmp_path, "hat", image_size=64)
+    more = {"editor": options.editor.editor, "region": options.region.region, "views": options.views.views}
+    more |= {"grow": 0.5, "kind": "geometry", "group_steps": 0, "save_every": 0}
+    for name in ("whole", "cut"):
+        (tmp_path / name).mkdir()
+    killed(tmp_path, tmp_path / "whole", [], **more)
+    log = (tmp_path / "whole" / OUT / "log.txt").read_text(encoding="utf-8")
+    assert "Gaussians added, of" in log
+    # in the trial, around the file of the rows, and among the steps of all together
+    lines = killed(tmp_path, tmp_path / "cut", [31.0, 44.0, 15.0, 19.0, 24.0], **more)
+    assert sum(line.endswith("-9") for line in lines) == 5, lines
+    assert bits(tmp_path / "cut" / OUT) == bits(tmp_path / "whole" / OUT)

@@ -1,0 +1,200 @@
+"""Gaussians that an edit adds: a hat on a bear is grown, fades in, and is there in views never trained on."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from progdf.compose.reference import Layer, compose_layers
+from progdf.errors import ProgdfError
+from progdf.field.trajectory import Trajectory, load_trajectory, save_trajectory
+from progdf.formats.ply import load_ply
+from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, attribute_slices, concatenate, pack
+from progdf.gdf.file import ADDED_LOGIT, load_gdf
+from progdf.io.cameras import load_cameras
+from progdf.rasterize import render
+from tests.helpers.growth import things, write_growth
+from tests.helpers.trained import WHITE, quick_options, small, train
+from trainer.editors import make_editor
+from trainer.evaluate.opened import SLIDER, open_run
+from trainer.fit.fit import straight_path
+from trainer.optimize.growth import fade_in, removal_costs, seed_rows
+from trainer.options import EditorOptions, FitOptions, with_values
+from trainer.resolve import resolve
+from trainer.run.finish import refit
+from trainer.setup import TrainingSetup
+from trainer.views.crops import crop_scene, render_all
+from trainer.views.view import crop
+
+LOGIT = attribute_slices(BASE_CHANNELS)["logit_opacities"]
+
+
+@pytest.mark.parametrize("what", ["hat", "rod"])
+def test_seeds_lie_on_what_is_new(what: str) -> None:
+    case = small("head", count=12)
+    new = things(case.scene, case.region.members)[what]
+    with torch.no_grad():
+        truth = concatenate([case.scene, new])
+        targets = [render(truth, view.camera, WHITE).image.clamp(0, 1) for view in case.views]
+    setup = TrainingSetup(case.scene, case.region, case.views, [], WHITE)
+    seeds = seed_rows(setup, case.views, targets, 80, 0)
+    assert 60 <= len(seeds) <= 80
+    assert bool((seeds.logit_opacities == ADDED_LOGIT).all())
+    away = torch.from_numpy(cKDTree(new.means.numpy()).query(seeds.means.numpy())[0])
+    camera = case.views[0].camera
+    pixel = float((camera.position - seeds.means.mean(dim=0)).norm() / camera.K[0, 0])
+    # what is seen of a Gaussian reaches two standard deviations from its center; depths are two pixels apart
+    near = away < 2 * float(new.scales.max()) + 2 * pixel
+    assert float(near.float().mean()) > 0.85
+
+
+def test_pictures_that_show_nothing_new_seed_nothing() -> None:
+    case = small("head")
+    setup = TrainingSetup(case.scene, case.region, case.views, [], WHITE)
+    assert not len(seed_rows(setup, case.views, [view.image for view in case.views], 80, 0))
+
+
+@pytest.mark.parametrize("spec", ["", "stripes:#20a040"], ids=["where it is right", "where it is wrong"])
+def test_what_a_row_is_worth_is_close_to_the_error_without_it(spec: str) -> None:
+    case = small("scarf", count=8)
+    crops = [crop_scene(case.scene, case.region.members, v.camera, v.box, WHITE) for v in case.views]
+    rows = pack(case.scene[case.region.members], with_shN=True)
+    targets = render_all(crops, rows)
+    if spec:
+        editor = make_editor(EditorOptions(spec), case.scene, case.region, case.views)
+        targets = [crop(editor.edit(view, 1.0), view.box) for view in case.views]
+
+    def error(rows: Tensor) -> float:
+        pictures = render_all(crops, rows)
+        return sum(0.5 * float((a - b).square().sum()) for a, b in zip(pictures, targets, strict=True))
+
+    exact, chosen = [], range(0, len(rows), 9)
+    for row in chosen:
+        without = rows.clone()
+        without[row, LOGIT] = ADDED_LOGIT
+        exact.append(error(without) - error(rows))
+    costs = torch.stack([removal_costs(crops, rows, targets, seed) for seed in range(4)]).mean(dim=0)
+    pair = torch.stack([torch.tensor(exact), costs[list(chosen)]])
+    # to second order in opacity, where many are nearly opaque; sorting by either is much the same
+    assert float(torch.corrcoef(pair.argsort(dim=1).argsort(dim=1).double())[0, 1]) > 0.8
+    assert spec or (bool((pair >= 0.0).all()) and float(pair[1].max()) > 0.0)
+
+
+@pytest.fixture(scope="module")
+def hat(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the run `grown`, which may grow a hat, and `plain`, which may not."""
+    folder = tmp_path_factory.mktemp("hat")
+    options = write_growth(folder, "hat")
+    train(replace(options, out=folder / "plain"))
+    train(with_values(replace(options, out=folder / "grown"), grow=0.5))
+    return folder
+
+
+def test_a_hat_is_grown_and_nothing_else_changes_outside(hat: Path) -> None:
+    plain, grown = (open_run(hat / name) for name in ("plain", "grown"))
+    assert "taken: geometry with growth" in (hat / "grown" / "log.txt").read_text(encoding="utf-8")
+    # a hat that members are stretched over has 20 dB, of a fifth of these pixels and steps 31
+    assert grown.report["edit"]["psnr_to_views"] > plain.report["edit"]["psnr_to_views"] + 4
+    assert grown.gdf.added is not None
+    assert plain.gdf.added is None
+    assert len(grown.gdf.added) == grown.report["effort"]["added"] <= len(grown.gdf.region) // 2
+    assert grown.report["field"]["endpoint_error"] == grown.report["field"]["outside_change"] == 0.0
+    assert grown.report["slider"]["monotone"]
+
+
+def test_at_strength_0_a_grown_edit_is_the_original_bit_for_bit(hat: Path) -> None:
+    scene = load_ply(hat / "scene.ply")
+    gdf = load_gdf(hat / "grown" / "grown.gdf", scene)
+    composed = compose_layers(scene, [Layer(gdf, 0.0)])
+    camera = load_cameras(hat / "grown" / "cameras.json", scene.origin)[0]
+    assert all(
+        torch.equal(getattr(composed, name)[: len(scene)], getattr(scene, name)) for name in ATTRIBUTES
+    )
+    assert torch.equal(render(composed, camera, WHITE).image, render(scene, camera, WHITE).image)
+
+
+def test_a_grown_run_is_measured_and_fitted_again_with_its_rows(hat: Path) -> None:
+    before = (hat / "grown" / "grown.gdf").read_bytes()
+    opened = open_run(hat / "grown")
+    pictures = opened.contenders()[SLIDER](1.0)
+    error = opened.evaluator.psnr(pictures, opened.evaluator.edited[1.0])
+    assert error == pytest.approx(opened.report["edit"]["psnr_to_views"], abs=0.01)
+    refit(FitOptions(hat / "grown", threads=1), quiet=True)
+    assert (hat / "grown" / "grown.gdf").read_bytes() == before
+
+
+def test_half_of_what_is_added_is_there_halfway(hat: Path) -> None:
+    """Of the recording; the slider is then made even, as any is."""
+    trajectory, _, _ = load_trajectory(hat / "grown" / "trajectory.safetensors")
+    assert trajectory.added is not None
+    count = len(trajectory.added)
+    for s in torch.linspace(0, 1, 41).tolist():
+        opacity = (ADDED_LOGIT + trajectory.at(s)[-count:, LOGIT]).sigmoid().sum()
+        end = (ADDED_LOGIT + trajectory.end[-count:, LOGIT]).sigmoid().sum()
+        assert float(opacity / end) == pytest.approx(s, abs=0.02)
+
+
+def test_a_course_of_any_recordings_keeps_both_ends_to_the_bit() -> None:
+    draw = torch.Generator().manual_seed(3)
+    rows = small("head").scene[torch.arange(4)]
+    added = replace(rows, logit_opacities=torch.full((4,), ADDED_LOGIT))
+    offsets = torch.randn(9, 10, BASE_CHANNELS, generator=draw).cumsum(0) / 9
+    offsets[0], offsets[:, -4:, LOGIT] = 0.0, 8.0 + offsets[:, -4:, LOGIT]
+    s = torch.tensor([0.0, *torch.rand(7, generator=draw).sort().values.tolist(), 1.0])
+    given = Trajectory(s, offsets.half(), offsets[-1], torch.arange(9), (8,), (1.0,), added=added)
+    stages = replace(given, stage_ends=(4, 8), strengths=(0.5, 1.0))
+    for trajectory in (given, stages, straight_path(given)):
+        laid = fade_in(trajectory)
+        assert torch.equal(laid.at(1.0), trajectory.end)
+        assert not bool(laid.at(0.0).any())
+        assert laid.stage_strengths == trajectory.stage_strengths
+        assert torch.allclose(laid.at(0.4)[:6], trajectory.at(0.4)[:6], atol=2e-3)  # half precision
+        opacity = (ADDED_LOGIT + torch.stack([laid.at(float(x)) for x in laid.s])[:, -4:, LOGIT]).sigmoid()
+        expected = laid.s[:, None] * (ADDED_LOGIT + trajectory.end[-4:, LOGIT]).sigmoid().flatten()
+        assert torch.allclose(opacity[..., 0], expected, atol=4e-3)  # what is drawn by none at 0
+
+
+def test_growth_that_does_not_pay_adds_nothing_and_writes_the_same_file(tmp_path: Path) -> None:
+    """Ears that are gone leave a hole, which other pixels' rows do not fill."""
+    options = write_growth(tmp_path, "no ears", steps=60, views=6, name="edit")
+    for name, share in (("plain", 0.0), ("grown", 0.5)):
+        train(with_values(replace(options, out=tmp_path / name), grow=share))
+    log = (tmp_path / "grown" / "log.txt").read_text(encoding="utf-8")
+    assert "growth would not take a tenth of the error away, or takes the place of what moves" in log
+    files = [(tmp_path / name / "edit.gdf").read_bytes() for name in ("plain", "grown")]
+    assert files[0] == files[1]
+
+
+def test_a_recording_whose_added_rows_are_damaged_is_refused_in_one_line(hat: Path, tmp_path: Path) -> None:
+    trajectory, extra, about = load_trajectory(hat / "grown" / "trajectory.safetensors")
+    assert trajectory.added is not None
+    rows = trajectory.added
+    for broken in (replace(rows, means=rows.means / 0.0), replace(rows, quats=rows.quats.double())):
+        save_trajectory(tmp_path / "t", replace(trajectory, added=broken), extra, about)
+        with pytest.raises(ProgdfError, match="is damaged"):
+            load_trajectory(tmp_path / "t")
+
+
+@pytest.mark.parametrize(
+    ("editor", "more", "line"),
+    [
+        (
+            "recolor:#3060d0",
+            {},
+            "--grow does not apply to recolor; it is for folder",
+        ),
+        ("style:14", {"kind": "color"}, "--grow adds nothing to an edit of colors alone"),
+        ("style:14", {"field": "neural"}, "--grow adds nothing to an edit of colors alone, nor to a network"),
+        ("style:14", {"grow": 1.5}, "--grow must be between 0 and 1, got 1.5"),
+        ("style:14", {"grow": float("nan")}, "--grow must be between 0 and 1, got nan"),
+    ],
+)
+def test_what_cannot_grow_is_said_in_one_line(editor: str, more: dict[str, object], line: str) -> None:
+    options = with_values(quick_options(Path("nowhere")), editor=editor)
+    with pytest.raises(ProgdfError, match=line):
+        resolve(with_values(options, **{"grow": 0.2, **more}))
