@@ -28,6 +28,7 @@ from progdf.scene.up_axis import UpChoice
 from viewer.camera.view_camera import Vec3, up_of, with_up
 from viewer.files import document, session
 from viewer.files.document import Document
+from viewer.files.web_page import PageOptions
 from viewer.state import layers as stacks
 from viewer.state.facts import describe_applied
 from viewer.state.paint import encode
@@ -150,11 +151,18 @@ class RenderOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class ExportOptions:
-    """Write a scene under its edits as a 3DGS .ply file, or the colors of a grade as a .cube file."""
+    """Write a scene under its edits as a 3DGS .ply file or a web page with their sliders, or the colors of a
+    grade as a .cube file."""
 
     stack: OmitArgPrefixes[StackOptions]
     out: Annotated[Path, word("FILE", aliases=["-o"])]
-    """The .ply file to write; or a .cube file, for color programs, of what one grade does at its strength."""
+    """The .ply file to write; or a .html page, one file that any browser opens, with a slider for each edit;
+    or a .cube file, for color programs, of what one grade does at its strength."""
+    page: OmitArgPrefixes[PageOptions] = PageOptions()
+    up: UpChoice = "auto"
+    """The axis of the scene that is up in a page; auto: as the edits were trained, else from the ground."""
+    background: Annotated[str, word("COLOR")] = "white"
+    """Of a page: #rrggbb, white or black."""
 
 
 class Named(Protocol):

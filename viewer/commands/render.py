@@ -45,6 +45,8 @@ from viewer.camera.view_camera import (
 )
 from viewer.files import timeline_file
 from viewer.files.document import empty
+from viewer.files.web_page import SUFFIX as PAGE
+from viewer.files.web_page import PageOptions, write_page
 from viewer.pictures import film
 from viewer.pictures.compare import Comparer, draw_labels
 from viewer.render.engine import ViewEngine
@@ -57,6 +59,7 @@ from viewer.state.view_state import MOST_AMPLIFIED, Comparison, Timeline, ViewSt
 
 from .options import (
     NO_SCENE,
+    DrawingOptions,
     ExportOptions,
     OpenStack,
     RenderOptions,
@@ -100,11 +103,26 @@ def export(argv: Sequence[str]) -> int:
     """`progdf export`: the edited scene as a .ply that any viewer opens."""
     options: ExportOptions = parse(ExportOptions, argv, "progdf export")
     out = options.out
-    if out.suffix.lower() not in (".ply", CUBE):
-        raise ProgdfError(f"{out} is not a .ply file; give the edited scene a name that ends in .ply")
-    opened = open_stack(options.stack, unset=1.0)
+    kind = out.suffix.lower()
+    if kind not in (".ply", CUBE, PAGE):
+        raise ProgdfError(
+            f"{out} is not a .ply file; give the edited scene a name that ends in .ply or .html"
+        )
+    if kind != PAGE and (options.page, options.up, options.background) != (PageOptions(), "auto", "white"):
+        raise ProgdfError(f"{out} is no web page; leave out what only a .html page has")
+    drawing = DrawingOptions(up=options.up, background=options.background) if kind == PAGE else None
+    opened = open_stack(options.stack, drawing, unset=1.0)
     check_not_an_input(out, opened.files)
-    if out.suffix.lower() == CUBE:
+    if kind == PAGE:
+        camera = (
+            first_camera(opened.document.original, up=opened.up)
+            if opened.session is None
+            else opened.view.camera
+        )
+        view = replace(opened.view, camera=camera)
+        print_line(write_page(out, opened.document, view, opened.snapshots, options.page))
+        return 0
+    if kind == CUBE:
         return _export_cube(out, opened)
     document, states = opened.document, visible_layers(opened.view)
     layers = [layer_of(document.gdfs[s.gdf], s.strength, s.gains, s.paint) for s in states]
@@ -114,8 +132,8 @@ def export(argv: Sequence[str]) -> int:
     far = ", x y z as doubles as it is far from 0" if document.scene.origin != ZERO else ""
     strengths = describe_strengths(opened.view)
     print_line(f"wrote {out}: {format_count(len(edited))}, {strengths}{far}; read back and compared")
-    if document.path is not None and (kind := scene_format(document.path)) != "ply":
-        print_line(f"{document.title} is a .{kind}, this is a plain .ply")
+    if document.path is not None and (source := scene_format(document.path)) != "ply":
+        print_line(f"{document.title} is a .{source}, this is a plain .ply")
     return 0
 
 
