@@ -147,12 +147,12 @@ def _rows(scene: Gaussians, members: NDArray[np.bool_]) -> NDArray[np.int64]:
 
 
 def _scene_part(arrays: Arrays, name: str, values: NDArray[Any], exact: bool, moves: bool) -> dict[str, Any]:
-    """Rows of an attribute: float32, 16 bits where an edit moves them, else 8."""
+    """Rows of an attribute: float32; or 16 bits where an edit moves what is no color, else 8."""
     if exact:
         return arrays.add(values.astype(np.float32))
     if name == "means":
         return arrays.add_levels(values, "i2", "log")
-    if moves:
+    if moves and name not in ("sh0", "shN"):
         return arrays.add_levels(values, "i2")
     if name == "quats":
         values = values / np.maximum(np.abs(values).max(axis=1, keepdims=True), 1e-30)
@@ -184,7 +184,7 @@ def _edit(
         "knots": _numbers(gdf.field.knots),
         "members": arrays.add(np.diff(np.sort(rows), prepend=0).astype("<i4")),
         "attributes": {
-            name: _bases(arrays, bases, order, widths.get(name, bases.end_offset.shape[1]), exact)
+            name: _bases(arrays, name, bases, order, widths.get(name, bases.end_offset.shape[1]), exact)
             for name, bases in gdf.field.attributes.items()
             if widths.get(name, 1)
         },
@@ -199,12 +199,14 @@ def _edit(
     return record
 
 
-def _bases(arrays: Arrays, bases: AttributeBases, order: Tensor, width: int, exact: bool) -> dict[str, Any]:
+def _bases(
+    arrays: Arrays, name: str, bases: AttributeBases, order: Tensor, width: int, exact: bool
+) -> dict[str, Any]:
     """One attribute of an edit, its first `width` channels."""
     end, scale = bases.end_offset[order, :width], bases.scale[:, :width].clone()
     residual = bases.residual_basis[:, order, :width].float()
     if end.dtype == torch.float32 and not exact:
-        levels, unit = quantize_bases((end * scale[0])[None], torch.int16)
+        levels, unit = quantize_bases((end * scale[0])[None], torch.int8 if name == "shN" else torch.int16)
         end, scale[0] = levels[0], unit[0]
     if bases.residual_basis.dtype == torch.int8:
         residual = bases.residual_basis[:, order, :width]

@@ -141,6 +141,12 @@ class Page {
     });
   }
 
+  // The picture as a PNG, as a data address.
+  picture() {
+    this.#draw(performance.now());
+    return this.canvas.toDataURL();
+  }
+
   #film(playing) {
     this.playing = playing;
     this.lastFrame = null;
