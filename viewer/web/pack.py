@@ -29,6 +29,7 @@ DRAWN_SH = (0, 3, 8, 15)
 """SH coefficients above the first, by degree."""
 LEVELS = {"i1": 127, "i2": 32767}
 _SMALLEST = 1e-4  # of the scene's spread: a smaller axis is less than a pixel of any picture of it
+_UNSEEN = -1e3  # a logit
 _OPAQUE = 1 - 1 / 512  # and its opposite: opacities that 8 bits end at
 
 
@@ -50,26 +51,50 @@ class Arrays:
         self.size += len(planes)
         return record
 
-    def add_levels(self, values: NDArray[Any], kind: str, curve: str = "") -> dict[str, Any]:
+    def add_levels(
+        self, values: NDArray[Any], kind: str, curve: str = ""
+    ) -> tuple[dict[str, Any], NDArray[Any]]:
         """Append numbers as levels between the least and the largest of each channel. [n,c] float
 
         Args:
             kind: of `LEVELS`
             curve: "log" for signed logarithms (1 + |x|), "logit" for opacities
+
+        Returns:
+            What the header says of it, and what the page makes of it.
         """
         table = values.reshape(len(values), -1).astype(np.float64)
         if curve == "log":
             table = np.sign(table) * np.log1p(np.abs(table))
-        if not len(table):
-            return self.add(table.astype("<i1"), scale=[1.0] * table.shape[1], zero=[0.0] * table.shape[1])
-        low, high = table.min(axis=0), table.max(axis=0)
+        none = np.zeros((1, table.shape[1])) if not len(table) else table
+        low, high = none.min(axis=0), none.max(axis=0)
         zero, most = (low + high) / 2, LEVELS[kind]
         step = np.where(high > low, (high - low) / (2 * most), 1.0)
         levels = np.round((table - zero) / step).astype(f"<{kind}")
-        return self.add(levels, scale=step.tolist(), zero=zero.tolist(), curve=curve)
+        made = zero + step * levels
+        if curve == "log":
+            made = np.sign(made) * np.expm1(np.abs(made))
+        elif curve == "logit":
+            made = np.log(made / (1 - made))
+        return self.add(levels, scale=step.tolist(), zero=zero.tolist(), curve=curve), made
 
 
-def pack(scene: Gaussians, gdfs: Sequence[Gdf], quality: str, degree: int, more: Mapping[str, Any]) -> bytes:
+@dataclass(frozen=True)
+class Packed:
+    """What a page holds."""
+
+    data: bytes  # the container
+    scene: Gaussians  # the original as the page has it, in its own order; what was left out is unseen
+
+
+def pack(
+    scene: Gaussians,
+    gdfs: Sequence[Gdf],
+    quality: str,
+    degree: int,
+    more: Mapping[str, Any],
+    stays: NDArray[np.bool_] | None = None,
+) -> Packed:
     """The container of a scene and edits of it that add nothing any more.
 
     Args:
@@ -78,31 +103,26 @@ def pack(scene: Gaussians, gdfs: Sequence[Gdf], quality: str, degree: int, more:
         quality: "exact", float32 and the numbers of the edits' files, or "compact", 8 and 16 bits
         degree: of the spherical harmonics that stay, 0 to 3
         more: what else the header holds; in "paints" pairs of an edit and the weights of its members [M]
+        stays: which Gaussians; None: all that can be seen. [N]
     """
     scene = _finite(scene)
     kept = min(DRAWN_SH[degree], scene.shN.shape[1])
     members = np.zeros(len(scene), bool)
     for gdf in gdfs:
         members[gdf.region.members.numpy()] = True
-    order, count = _rows(scene, members), int(members.sum())
+    seen = members | (scene.logit_opacities.numpy() >= UNSEEN_LOGIT)
+    seen = seen if stays is None else seen & stays
+    order = _order(scene, members)
+    order, count = order[seen[order]], int((members & seen).sum())
     place = np.full(len(scene), -1, np.int64)
     place[order] = np.arange(len(order))
+    inside = [_ascending(place[gdf.region.members.numpy()]) for gdf in gdfs]
     arrays, exact = Arrays(), quality == "exact"
-    moved = {name for gdf in gdfs for name in gdf.field.attributes}
-    attributes = {}
-    for name in ATTRIBUTES:
-        values = getattr(scene, name).detach().float()[torch.from_numpy(order)]
-        values = (values[:, :kept] if name == "shN" else values).reshape(len(order), -1)
-        if values.shape[1]:
-            parts = (values[:count].numpy(), True), (values[count:].numpy(), False)
-            attributes[name] = [
-                _scene_part(arrays, name, part, exact, first and name in moved) for part, first in parts
-            ]
-    overlaps = len(gdfs) > 1 and sum(len(gdf.region) for gdf in gdfs) > count
+    attributes, made = _scene(arrays, scene, gdfs, order, count, kept, exact)
+    overlaps = len(gdfs) > 1 and sum(map(len, inside)) > count
     paints = []
     for edit, weights in more["paints"]:
-        rows = np.argsort(place[gdfs[edit].region.members.numpy()])
-        levels = np.round(weights.numpy()[rows] * 255).astype("<i2")
+        levels = np.round(weights[inside[edit]].numpy() * 255).astype("<i2")
         paints.append(arrays.add(levels, scale=[1 / 255], zero=[0.0]))
     header = {
         **more,
@@ -112,13 +132,51 @@ def pack(scene: Gaussians, gdfs: Sequence[Gdf], quality: str, degree: int, more:
         "sh": kept,
         "antialiased": scene.antialiased,
         "attributes": attributes,
-        "edits": [_edit(arrays, scene, gdf, place, kept, exact, overlaps) for gdf in gdfs],
+        "edits": [
+            _edit(arrays, scene, gdf, place, rows, kept, exact, overlaps)
+            for gdf, rows in zip(gdfs, inside, strict=True)
+        ],
         "sphere": [
             _numbers(part.flatten()) for part in sphere(math.isqrt(kept + 1) - 1, torch.device("cpu"))
         ],
     }
     text = json.dumps(header, ensure_ascii=True, allow_nan=False, separators=(",", ":")).encode()
-    return len(text).to_bytes(4, "little") + text + b"".join(arrays.parts)
+    return Packed(len(text).to_bytes(4, "little") + text + b"".join(arrays.parts), made)
+
+
+def _scene(
+    arrays: Arrays,
+    scene: Gaussians,
+    gdfs: Sequence[Gdf],
+    order: NDArray[np.int64],
+    count: int,
+    kept: int,
+    exact: bool,
+) -> tuple[dict[str, Any], Gaussians]:
+    """The attributes in the header, the first `count` rows apart, and the scene as they have it."""
+    moved = {name for gdf in gdfs for name in gdf.field.attributes}
+    attributes: dict[str, Any] = {}
+    changed: dict[str, Any] = {"shN": torch.zeros_like(scene.shN)}
+    changed["logit_opacities"] = torch.full_like(scene.logit_opacities, _UNSEEN)
+    rows = torch.from_numpy(order)
+    for name in ATTRIBUTES:
+        old = getattr(scene, name).detach().float()
+        values = (old[:, :kept] if name == "shN" else old)[rows].reshape(len(order), -1).numpy()
+        if not values.shape[1]:
+            continue
+        parts = values[:count], values[count:]
+        done = [
+            _scene_part(arrays, name, part, exact, first and name in moved)
+            for part, first in zip(parts, (True, False), strict=True)
+        ]
+        attributes[name] = [record for record, _ in done]
+        new = torch.from_numpy(np.concatenate([numbers for _, numbers in done])).float()
+        table = changed.setdefault(name, old.clone())
+        if name == "shN":
+            table[rows, :kept] = new.reshape(len(order), kept, 3)
+        else:
+            table[rows] = new.reshape(len(order), *old.shape[1:])
+    return attributes, replace(scene, **changed)
 
 
 def _finite(scene: Gaussians) -> Gaussians:
@@ -127,12 +185,12 @@ def _finite(scene: Gaussians) -> Gaussians:
     flat["log_scales"] = flat["log_scales"].clamp(min=-1e4)
     unseen = ~torch.cat(list(flat.values()), dim=1).isfinite().all(dim=1)
     changed: dict[str, Any] = {name: table.nan_to_num(0.0, 0.0, 0.0) for name, table in flat.items()}
-    changed["logit_opacities"] = changed["logit_opacities"].masked_fill(unseen[:, None], -1e3)
+    changed["logit_opacities"] = changed["logit_opacities"].masked_fill(unseen[:, None], _UNSEEN)
     return replace(scene, **{name: changed[name].reshape(getattr(scene, name).shape) for name in ATTRIBUTES})
 
 
-def _rows(scene: Gaussians, members: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Rows in the page's order: members first, near ones together; what nobody can ever see is left out."""
+def _order(scene: Gaussians, members: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Rows in the page's order: members first, near ones together (by Morton's code)."""
     means = scene.means.numpy().astype(np.float64)
     small = np.sign(means) * np.log1p(np.abs(means))
     low = small.min(axis=0, initial=0.0)
@@ -141,22 +199,29 @@ def _rows(scene: Gaussians, members: NDArray[np.bool_]) -> NDArray[np.int64]:
     for bit in range(10):
         for axis in range(3):
             code |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
-    seen = members | (scene.logit_opacities.numpy() >= UNSEEN_LOGIT)
-    order = np.lexsort((code, ~members))
-    return order[seen[order]]
+    return np.lexsort((code, ~members))
 
 
-def _scene_part(arrays: Arrays, name: str, values: NDArray[Any], exact: bool, moves: bool) -> dict[str, Any]:
+def _ascending(places: NDArray[np.int64]) -> Tensor:
+    """Which members are on the page, in its order; those that are not have the place −1."""
+    there = np.flatnonzero(places >= 0)
+    return torch.from_numpy(there[np.argsort(places[there])])
+
+
+def _scene_part(
+    arrays: Arrays, name: str, values: NDArray[Any], exact: bool, moves: bool
+) -> tuple[dict[str, Any], NDArray[Any]]:
     """Rows of an attribute: float32; or 16 bits where an edit moves what is no color, else 8."""
     if exact:
-        return arrays.add(values.astype(np.float32))
+        return arrays.add(values.astype(np.float32)), values
     if name == "means":
         return arrays.add_levels(values, "i2", "log")
     if moves and name not in ("sh0", "shN"):
         return arrays.add_levels(values, "i2")
     if name == "quats":
         values = values / np.maximum(np.abs(values).max(axis=1, keepdims=True), 1e-30)
-        return arrays.add(np.round(values * 127).astype(np.int8), scale=[1.0] * 4, zero=[0.0] * 4)
+        levels = np.round(values * 127).astype(np.int8)
+        return arrays.add(levels, scale=[1.0] * 4, zero=[0.0] * 4), levels
     if name == "logit_opacities":
         opacity = 1 / (1 + np.exp(-np.clip(values.astype(np.float64), -40, 40)))
         return arrays.add_levels(np.clip(opacity, 1 - _OPAQUE, _OPAQUE), "i1", "logit")
@@ -170,19 +235,19 @@ def _edit(
     scene: Gaussians,
     gdf: Gdf,
     place: NDArray[np.int64],
+    order: Tensor,
     kept: int,
     exact: bool,
     overlaps: bool,
 ) -> dict[str, Any]:
-    """An edit in the header; its members ascend in the page's order."""
-    rows = place[gdf.region.members.numpy()]
-    order = torch.from_numpy(np.argsort(rows))
+    """An edit in the header, and its members in this order."""
+    rows = place[gdf.region.members.numpy()[order.numpy()]]
     form, widths = gdf.field.origin, {"shN": 3 * kept}
     record: dict[str, Any] = {
         "name": gdf.name,
         "recorded": list(gdf.field.recorded),
         "knots": _numbers(gdf.field.knots),
-        "members": arrays.add(np.diff(np.sort(rows), prepend=0).astype("<i4")),
+        "members": arrays.add(np.diff(rows, prepend=0).astype("<i4")),
         "attributes": {
             name: _bases(arrays, name, bases, order, widths.get(name, bases.end_offset.shape[1]), exact)
             for name, bases in gdf.field.attributes.items()
@@ -192,7 +257,7 @@ def _edit(
     if overlaps:
         shares = {kind: share[order].numpy() for kind, share in coverage(scene, gdf).items()}
         record["coverage"] = {
-            kind: arrays.add(share) if exact else arrays.add_levels(share[:, None], "i1")
+            kind: arrays.add(share) if exact else arrays.add_levels(share, "i1")[0]
             for kind, share in shares.items()
         }
         record["grade"] = _grade(arrays, form, order, kept) if isinstance(form, GradeForm) else None
