@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import io
 import json
 import re
@@ -42,7 +43,8 @@ from viewer.web.page import script
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 SOFTWARE = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-SIZE = 480, 360
+SIZE = 660, 400
+PIXELS = 330, 200  # half as many each way, which the software renderer draws in a quarter of the time
 
 
 @pytest.fixture(scope="session")
@@ -66,6 +68,14 @@ class Opened:
     def strengths(self) -> dict[str, float]:
         return self.tab.evaluate("Object.fromEntries(progdf.view.layers.map((l) => [l.name, l.strength]))")
 
+    def wait(self, expression: str) -> None:
+        """Until it holds. (playwright's own way compiles text in the page, which its policy forbids.)"""
+        for _ in range(400):
+            if self.tab.evaluate(expression):
+                return
+            self.tab.wait_for_timeout(25)
+        raise AssertionError(f"{expression} never came; {self.complaints}")
+
     def camera(self) -> dict[str, Any]:
         return self.tab.evaluate("progdf.camera")
 
@@ -85,16 +95,15 @@ class Opened:
 def open_page(browser: Any) -> Iterator[Any]:
     contexts = []
 
-    def opening(path: Path, script: str = "", **options: Any) -> Opened:
-        context = browser.new_context(viewport=dict(zip(("width", "height"), SIZE, strict=True)) | {}, **options)
+    def opening(path: Path, script: str = "", size: tuple[int, int] = SIZE, **options: Any) -> Opened:
+        context = browser.new_context(viewport=dict(zip(("width", "height"), size, strict=True)), **options)
         contexts.append(context)
         tab = context.new_page()
         opened = Opened(tab, [], [])
         tab.on("request", lambda request: opened.requests.append(request.url))
         tab.on("pageerror", lambda error: opened.complaints.append(str(error)))
         tab.on("console", lambda message: opened.complaints.append(message.text))
-        if script:
-            tab.add_init_script(script)
+        tab.add_init_script(f"Object.defineProperty(window, 'devicePixelRatio', {{value: 0.5}}); {script}")
         tab.goto(path.as_uri())
         return opened
 
@@ -122,7 +131,10 @@ def grade_form(members: int, degree: int, bands: int, seed: int) -> GradeForm:
         knots, table = knots[::2], table[::2]
     coefficients = torch.linspace(0, 1, len(knots))[:, None]
     residual = (draws.normal(1, members, 3 * bands) * 40).clamp(-127, 127).to(torch.int8)
-    ends = torch.tensor([0.0, 0.4, 1.0], dtype=torch.float64), torch.tensor([0.0, 0.6, 1.0], dtype=torch.float64)
+    ends = (
+        torch.tensor([0.0, 0.4, 1.0], dtype=torch.float64),
+        torch.tensor([0.0, 0.6, 1.0], dtype=torch.float64),
+    )
     mask = (255 * draws.uniform(members)).to(torch.uint8)
     scale = torch.full((1, 3 * bands), 0.004)
     return GradeForm(degree, knots, table, residual, scale, coefficients, SliderRemap(*ends), mask)
@@ -169,8 +181,10 @@ def test_every_attribute_is_that_of_the_plain_form_under_every_rule(
     place[order] = np.arange(len(order))
     count = opened.tab.evaluate("progdf.composer.count")
     draws = Draws(degree)
-    stacks: list[tuple[list[Layer], str]] = [([Layer(g, s)], "adjust") for g in document.gdfs for s in (1.0, 0.0)]
-    for blend in BLENDS * 6:
+    stacks: list[tuple[list[Layer], str]] = [
+        ([Layer(g, s)], "adjust") for g in document.gdfs for s in (1.0, 0.0)
+    ]
+    for blend in BLENDS * 4:
         stacks.append((
             [
                 Layer(
@@ -190,7 +204,15 @@ def test_every_attribute_is_that_of_the_plain_form_under_every_rule(
             at = np.argsort(place[layer.gdf.region.members.numpy()])
             weights = None if layer.weights is None else layer.weights.numpy()[at].tolist()
             gains = {kind: getattr(layer.gains, kind) for kind in ("geometry", "opacity", "color")}
-            sent.append({"edit": edit, "strength": layer.strength, "gains": gains, "weights": weights, "paint": number})
+            sent.append(
+                {
+                    "edit": edit,
+                    "strength": layer.strength,
+                    "gains": gains,
+                    "weights": weights,
+                    "paint": number,
+                }
+            )
         after = opened.tab.evaluate(RUN, [sent, blend])
         plain = compose_layers(document.scene, layers, blend)
         for name in ATTRIBUTES:
@@ -202,3 +224,175 @@ def test_every_attribute_is_that_of_the_plain_form_under_every_rule(
                 assert page.tobytes() == numbers.tobytes(), (name, number)
             else:
                 assert np.abs(page - numbers).max() <= 1e-6 * max(1.0, np.abs(numbers).max()), (name, blend)
+
+
+@pytest.fixture(scope="module")
+def bear_page(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Stack]:
+    """The bear with its scarf and ears, by the command, both half way."""
+    folder = tmp_path_factory.mktemp("bear")
+    scene, *edits = bear().save(folder)
+    half = [word for gdf in bear().gdfs for word in ("--set", f"{gdf.name}=0.5")]
+    out = folder / "page.html"
+    assert main(["export", str(scene), *map(str, edits), "-o", str(out), "--quality", "exact", *half]) == 0
+    return out, bear()
+
+
+def cpu_picture(stack: Stack, camera: dict[str, Any], strengths: Sequence[float]) -> np.ndarray:
+    """What the CPU engine draws from where the page looks. [H,W,3] uint8"""
+    seen = replace(
+        first_camera(stack.scene), **{k: tuple(v) if isinstance(v, list) else v for k, v in camera.items()}
+    )
+    layers = [Layer(gdf, s) for gdf, s in zip(stack.gdfs, strengths, strict=True)]
+    with torch.no_grad():
+        edited = compose_layers(stack.scene, layers, "adjust")
+        image = render(edited, to_camera(seen, *PIXELS), background=(1.0, 1.0, 1.0)).image
+    return (image.clamp(0, 1) * 255 + 0.5).to(torch.uint8).numpy()
+
+
+@pytest.mark.parametrize(("quality", "least"), [("exact", 60.0), ("compact", 50.0)])
+def test_pictures_are_those_of_the_cpu_engine(
+    open_page: Any, tmp_path: Path, quality: str, least: float
+) -> None:
+    stack = bear()
+    document, view = document_of(stack.scene, stack.gdfs)
+    write_page(tmp_path / "page.html", document, view, (), PageOptions(quality=quality))  # type: ignore[arg-type]
+    opened = ready(open_page(tmp_path / "page.html"))
+    opened.tab.click("#fold")
+    for strengths in ((0.0, 0.0), (1.0, 1.0), (0.3, 0.8)):
+        opened.slide(strengths)
+        picture = opened.picture()
+        assert picture.shape == (*PIXELS[::-1], 3)
+        assert psnr(picture, cpu_picture(stack, opened.camera(), strengths)) >= least
+
+
+def test_the_mouse_turns_slides_and_zooms_and_sets_the_pivot(
+    open_page: Any, bear_page: tuple[Path, Stack]
+) -> None:
+    opened = ready(open_page(bear_page[0]))
+    mouse, start = opened.tab.mouse, opened.camera()
+    mouse.move(100, 150)
+    mouse.down()
+    mouse.move(160, 170, steps=3)
+    mouse.up()
+    turned = opened.camera()
+    assert turned["azimuth"] == pytest.approx((start["azimuth"] - 18 + 180) % 360 - 180)
+    assert turned["elevation"] == pytest.approx(start["elevation"] + 6)
+    mouse.down(button="right")
+    mouse.move(150, 170, steps=3)
+    mouse.up(button="right")
+    assert opened.camera()["pivot"] != turned["pivot"]
+    mouse.wheel(0, -100)
+    opened.wait(f"progdf.camera.distance < {0.95 * turned['distance']}")
+    opened.tab.click("#fold")
+    opened.tab.click("#home")
+    opened.wait("!progdf.glide")
+    assert opened.camera() == start
+    before = opened.tab.evaluate("progdf.camera.pivot")
+    mouse.dblclick(SIZE[0] / 2, SIZE[1] / 2)
+    opened.wait(f"!progdf.glide && progdf.camera.pivot[0] !== {before[0]}")
+    pivot, scene = np.array(opened.camera()["pivot"]), bear_page[1].scene
+    assert np.abs(pivot - before).max() > 1e-3
+    # on the bear's surface: the nearest Gaussians are as near as neighbors are
+    assert float((scene.means - torch.tensor(pivot)).norm(dim=1).min()) < 0.1
+
+
+def test_a_slider_is_dragged_and_moved_by_keys_and_shows_its_recordings(
+    open_page: Any, bear_page: tuple[Path, Stack]
+) -> None:
+    page, stack = bear_page
+    opened = ready(open_page(page))
+    names = opened.tab.locator(".layer .name").all_text_contents()
+    assert names == [gdf.name for gdf in reversed(stack.gdfs)], "the top layer first"
+    inner = [s for s in stack.gdfs[0].field.recorded if 0 < s < 1]
+    assert opened.tab.locator(".layer").last.locator(".ticks i").count() == len(inner) > 0
+    slider = opened.tab.get_by_role("slider", name="scarf")
+    box = slider.bounding_box()
+    opened.tab.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    opened.tab.mouse.down()
+    opened.tab.mouse.move(box["x"] + box["width"] + 30, box["y"] + 10, steps=4)
+    opened.tab.mouse.up()
+    assert opened.strengths()["scarf"] == 1.0
+    for _ in range(3):
+        opened.tab.keyboard.press("ArrowLeft")
+    assert opened.strengths() == {"scarf": pytest.approx(0.97), "ears": 0.5}
+    assert opened.tab.locator(".layer").last.locator("output").text_content() == "97"
+
+
+def test_space_compares_with_the_original_while_it_is_held(
+    open_page: Any, bear_page: tuple[Path, Stack]
+) -> None:
+    opened = ready(open_page(bear_page[0]))
+    edited = opened.picture()
+    opened.tab.keyboard.down(" ")
+    held = opened.picture()
+    opened.tab.keyboard.up(" ")
+    opened.slide((0.0, 0.0))
+    assert psnr(held, opened.picture()) > 90 > psnr(held, edited)
+    opened.slide((0.5, 0.5))
+    assert psnr(opened.picture(), edited) > 90
+    opened.tab.get_by_label("Hide ears").click()
+    assert opened.tab.evaluate("progdf.view.layers.map((l) => l.enabled)") == [True, False]
+
+
+def test_nothing_is_fetched_and_nothing_complains(open_page: Any, bear_page: tuple[Path, Stack]) -> None:
+    opened = ready(open_page(bear_page[0]))
+    opened.tab.evaluate("fetch('https://example.org/').catch((e) => 0)")
+    assert [url for url in opened.requests if not url.startswith(("file:", "blob:", "data:"))] == []
+    blocked = [line for line in opened.complaints if "Content Security Policy" not in line]
+    assert blocked == []
+    assert "http" not in re.sub(r"https?://www\.w3\.org\S+", "", script())
+
+
+def test_two_fingers_slide_and_zoom_on_a_phone(open_page: Any, bear_page: tuple[Path, Stack]) -> None:
+    opened = ready(open_page(bear_page[0], size=(300, 400), has_touch=True, is_mobile=True))
+    session = opened.tab.context.new_cdp_session(opened.tab)
+
+    def touch(kind: str, *points: tuple[int, int]) -> None:
+        at = [{"x": x, "y": y, "id": i} for i, (x, y) in enumerate(points)]
+        session.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": at})
+
+    start = opened.camera()
+    touch("touchStart", (100, 60))
+    touch("touchMove", (130, 60))
+    touch("touchEnd")
+    assert opened.camera()["azimuth"] != start["azimuth"]
+    assert opened.camera()["distance"] == start["distance"]
+    touch("touchStart", (100, 60), (140, 60))
+    touch("touchMove", (90, 70), (170, 70))
+    touch("touchEnd")
+    assert opened.camera()["distance"] == pytest.approx(start["distance"] / 2, rel=0.05)
+    assert opened.camera()["pivot"] != start["pivot"]
+    panel = opened.tab.locator("#panel").bounding_box()
+    assert panel["x"] == 0 and panel["width"] == 300, "along the lower edge"
+
+
+NO_WEBGL = "HTMLCanvasElement.prototype.getContext = () => null"
+
+
+def test_without_webgl_there_is_a_still_and_a_sentence(open_page: Any, bear_page: tuple[Path, Stack]) -> None:
+    opened = open_page(bear_page[0], NO_WEBGL)
+    opened.wait("document.getElementById('notice').textContent.includes('WebGL2')")
+    assert opened.tab.evaluate("document.getElementById('still').naturalWidth") == 1200
+    assert opened.tab.locator("#still").is_visible()
+    assert not opened.tab.locator("#controls").is_visible()
+    assert opened.complaints == []
+
+
+def test_a_large_scene_is_sorted_by_a_worker_and_without_one_where_a_policy_forbids_it(
+    open_page: Any, bear_page: tuple[Path, Stack], tmp_path: Path
+) -> None:
+    page = bear_page[0].read_text()
+    large = page.replace("LARGE = 150_000", "LARGE = 10")
+    assert large != page
+    digest = base64.b64encode(
+        hashlib.sha256(re.findall(r"<script>(.*?)</script>", large, re.S)[0].encode()).digest()
+    )
+    large = re.sub(r"script-src 'sha256-[^']+'", f"script-src 'sha256-{digest.decode()}'", large)
+    (tmp_path / "worker.html").write_text(large)
+    (tmp_path / "strict.html").write_text(large.replace("worker-src blob:", "worker-src 'none'"))
+    plain = ready(open_page(bear_page[0])).picture()
+    for name, works in (("worker", True), ("strict", False)):
+        opened = ready(open_page(tmp_path / f"{name}.html"))
+        opened.wait("progdf.renderer.drawn > 0")
+        assert opened.tab.evaluate("progdf.sorter.worker !== null") == works
+        assert psnr(opened.picture(), plain) > 90

@@ -46,7 +46,7 @@ class Page {
     this.#bind();
     const touch = matchMedia("(pointer: coarse)").matches;
     get("notice").textContent = touch
-      ? "Drag to turn · pinch to zoom · double tap sets the pivot" : "Drag to turn · scroll to zoom · Space compares";
+      ? "Drag to turn · pinch to zoom · tap twice to center" : "Drag to turn · scroll to zoom · Space compares";
     document.body.classList.add("ready");
     this.resize();
     this.change(this.view);

@@ -15,9 +15,9 @@ function make(kind, options = {}, ...children) {
 const percent = (x) => `${Math.round(100 * x)}`;
 
 // A labelled range input 0..most; `ticks`: where recordings lie.
-function slider(label, most, ticks, moved) {
+function slider(label, most, ticks, moved, step = 0.01) {
   const value = make("output");
-  const input = make("input", { type: "range", min: 0, max: most, step: 0.001, "aria-label": label });
+  const input = make("input", { type: "range", min: 0, max: most, step, "aria-label": label });
   const marks = ticks.filter((s) => s > 0 && s < most).map((s) => {
     const mark = make("i");
     mark.style.left = `${(100 * s) / most}%`;
@@ -111,7 +111,7 @@ function timeline(root, page) {
   if (!film) return null;
   const play = make("button", { type: "button", class: "play", title: "Play (P)", on: { click: () => page.play() } });
   const ticks = film.keys.map((key) => key.frame / film.length);
-  const { track, show } = slider("Timeline", 1, ticks, (share) => page.seek(share * film.length));
+  const { track, show } = slider("Timeline", 1, ticks, (share) => page.seek(share * film.length), 0.001);
   root.append(make("section", { class: "timeline" }, play, track));
   return () => {
     show(page.frame / film.length);

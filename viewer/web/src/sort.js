@@ -78,9 +78,9 @@ export class Sorter {
     this.worker.onerror = (event) => {  // refused after all
       event.preventDefault();
       this.worker = null;
-      this.order ??= new Uint32Array(means.length / 3);
+      this.order = new Uint32Array(means.length / 3);
       this.scratch = makeScratch(means.length / 3);
-      if (this.wanted) this.sort(this.wanted);
+      if (this.latest) this.sort(this.latest);
     };
     this.worker.onmessage = ({ data }) => {
       this.order = data.order;
@@ -98,6 +98,7 @@ export class Sorter {
   }
 
   sort(row) {
+    this.latest = row;
     if (!this.worker) this.done(this.order, backToFront(this.means, row, this.near, this.order, this.scratch));
     else if (!this.order) this.wanted = row;
     else {
