@@ -113,15 +113,18 @@ def write_page(
 def _shrink(make: Callable[[str, int, float], _Page], page: _Page, limit: int) -> _Page:
     """A page of at most `limit` bytes: compact; then without a degree of SH, or without as many bytes of the
     Gaussians that show least, whichever costs the start fewer dB, until it fits."""
+    least = make("compact", 0, _LEAST_SHARE)
+    if least.size > limit:
+        raise ProgdfError(
+            f"--max-size: a page of this scene has {least.size / 1e6:.2f} MB at least; give more"
+        )
     if page.quality == "exact":
         page = make("compact", page.degree, page.share)
     while page.size > limit:
         fewer = [make("compact", page.degree - 1, page.share)] if page.degree else []
         target = max(limit, fewer[0].size) if fewer else limit
-        share = page.share * min(0.99, target / page.size)
-        if share < _LEAST_SHARE:
-            smallest = f"{page.size / 1e6:.2f} MB"
-            raise ProgdfError(f"--max-size: a page of {smallest} has 1 % of the scene; give more than that")
+        part = (target - least.size) / (page.size - least.size)
+        share = max(_LEAST_SHARE, page.share * min(0.99, part))
         page = max([*fewer, make("compact", page.degree, share)], key=lambda each: each.psnr)
     return page
 
@@ -249,9 +252,8 @@ def _sliders(view: ViewState, names: str | None) -> set[str]:
         return there
     chosen = {name.strip() for name in names.split(",") if name.strip()}
     for name in sorted(chosen - there):
-        raise ProgdfError(
-            f"--layers {name}: there is no layer of that name; there {', '.join(sorted(there)) or 'is none'}"
-        )
+        names = f"are {', '.join(sorted(there))}" if there else "is none"
+        raise ProgdfError(f"--layers {name}: there is no layer of that name; there {names}")
     return chosen
 
 

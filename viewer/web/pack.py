@@ -42,7 +42,7 @@ class Arrays:
 
     def add(self, values: NDArray[Any], **more: Any) -> dict[str, Any]:
         """Append an array [n] or [n,c]; what the header says of it."""
-        table = np.ascontiguousarray(values.reshape(len(values), -1).T)
+        table = np.ascontiguousarray(_table(values).T)
         table = table.astype(table.dtype.newbyteorder("<"))
         planes = table.reshape(-1, 1).view(np.uint8).T.tobytes()
         kind = f"{table.dtype.kind}{table.dtype.itemsize}"
@@ -63,11 +63,11 @@ class Arrays:
         Returns:
             What the header says of it, and what the page makes of it.
         """
-        table = values.reshape(len(values), -1).astype(np.float64)
+        table = _table(values).astype(np.float64)
         if curve == "log":
             table = np.sign(table) * np.log1p(np.abs(table))
-        none = np.zeros((1, table.shape[1])) if not len(table) else table
-        low, high = none.min(axis=0), none.max(axis=0)
+        some = table if len(table) else np.zeros((1, table.shape[1]))
+        low, high = some.min(axis=0), some.max(axis=0)
         zero, most = (low + high) / 2, LEVELS[kind]
         step = np.where(high > low, (high - low) / (2 * most), 1.0)
         levels = np.round((table - zero) / step).astype(f"<{kind}")
@@ -77,6 +77,11 @@ class Arrays:
         elif curve == "logit":
             made = np.log(made / (1 - made))
         return self.add(levels, scale=step.tolist(), zero=zero.tolist(), curve=curve), made
+
+
+def _table(values: NDArray[Any]) -> NDArray[Any]:
+    """[n] or [n,…] -> [n,c]"""
+    return values.reshape(len(values), math.prod(values.shape[1:]))
 
 
 @dataclass(frozen=True)
@@ -161,7 +166,7 @@ def _scene(
     rows = torch.from_numpy(order)
     for name in ATTRIBUTES:
         old = getattr(scene, name).detach().float()
-        values = (old[:, :kept] if name == "shN" else old)[rows].reshape(len(order), -1).numpy()
+        values = _table((old[:, :kept] if name == "shN" else old)[rows].numpy())
         if not values.shape[1]:
             continue
         parts = values[:count], values[count:]
@@ -181,7 +186,7 @@ def _scene(
 
 def _finite(scene: Gaussians) -> Gaussians:
     """The scene with finite numbers; rows that no engine draws for theirs are unseen."""
-    flat = {name: getattr(scene, name).reshape(len(scene), -1) for name in ATTRIBUTES}
+    flat = {name: torch.from_numpy(_table(getattr(scene, name).detach().numpy())) for name in ATTRIBUTES}
     flat["log_scales"] = flat["log_scales"].clamp(min=-1e4)
     unseen = ~torch.cat(list(flat.values()), dim=1).isfinite().all(dim=1)
     changed: dict[str, Any] = {name: table.nan_to_num(0.0, 0.0, 0.0) for name, table in flat.items()}
@@ -194,7 +199,7 @@ def _order(scene: Gaussians, members: NDArray[np.bool_]) -> NDArray[np.int64]:
     means = scene.means.numpy().astype(np.float64)
     small = np.sign(means) * np.log1p(np.abs(means))
     low = small.min(axis=0, initial=0.0)
-    cells = ((small - low) / max(np.ptp(small) if len(small) else 0.0, 1e-12) * 1023).astype(np.int64)
+    cells = ((small - low) / max(np.ptp(small) if small.size else 0.0, 1e-12) * 1023).astype(np.int64)
     code = np.zeros(len(scene), np.int64)
     for bit in range(10):
         for axis in range(3):

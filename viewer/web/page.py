@@ -13,7 +13,7 @@ import html
 import io
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from typing import Any
 
@@ -34,12 +34,12 @@ _IMPORT = re.compile(r"^import .*?;\n", re.MULTILINE | re.DOTALL)
 _LINK = re.compile(r"https?://[^\s<>\"']+[^\s<>\"'.,;:)]")
 
 
-def script() -> str:
-    """All modules as one, in a function of its own."""
+def join(modules: Sequence[str] = MODULES, then: str = "") -> str:
+    """Modules of `src` one after another, and what follows them, in a function of their own."""
     folder = resources.files("viewer.web") / "src"
-    parts = [(folder / f"{name}.js").read_text(encoding="utf-8") for name in MODULES]
+    parts = [(folder / f"{name}.js").read_text(encoding="utf-8") for name in modules]
     joined = "\n".join(re.sub(r"^export ", "", _IMPORT.sub("", part), flags=re.MULTILINE) for part in parts)
-    return f'(() => {{\n"use strict";\n{joined}}})();\n'
+    return f'(() => {{\n"use strict";\n{joined}{then}}})();\n'
 
 
 def build_page(
@@ -62,7 +62,7 @@ def build_page(
     folder = resources.files("viewer.web") / "src"
     style = f":root {{ --behind: {behind}; }}\n" + (folder / "page.css").read_text(encoding="utf-8")
     sources = {name: _body(load_source(name).text) for name in STAGES}
-    code, picture = script(), io.BytesIO()
+    code, picture = join(), io.BytesIO()
     Image.fromarray(still).save(picture, "WEBP", quality=82)
     texts = {
         "title": html.escape(title),

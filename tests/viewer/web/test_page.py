@@ -9,7 +9,7 @@ import json
 import re
 import shutil
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,22 +23,22 @@ from progdf.compose.layers import BLENDS, Gains, Layer
 from progdf.compose.reference import compose_layers
 from progdf.field.baked import GradeForm, SliderRemap, identity_map, lattice_colors
 from progdf.field.grade import bake_grade
-from progdf.formats.ply import load_ply
 from progdf.gaussians import ATTRIBUTES, Gaussians, pack
 from progdf.gdf.file import Gdf, load_gdf, save_gdf
 from progdf.rasterize import render
 from tests.helpers.draws import Draws
 from tests.helpers.edits import curved_field, edit_of, growing, some_rows
 from tests.helpers.scenes import random_gaussians
-from tests.helpers.sessions import bear_files, saved_session
-from tests.helpers.stacks import Stack
+from tests.helpers.sessions import bear_files, full_view, saved_session
+from tests.helpers.stacks import Stack, many_edits
 from tests.helpers.ui_rig import bear
 from viewer.camera.view_camera import first_camera, to_camera
 from viewer.files.document import Document
 from viewer.files.web_page import PageOptions, write_page
-from viewer.state.layers import LayerState
-from viewer.state.view_state import ViewState
-from viewer.web.page import script
+from viewer.state import snapshots, timeline
+from viewer.state.layers import visible_layers
+from viewer.state.view_state import Keyframe, LayerGroup, LayerState, SnapshotPair, Timeline, ViewState
+from viewer.web.page import join
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -151,6 +151,12 @@ def document_of(scene: Gaussians, gdfs: Sequence[Gdf]) -> tuple[Document, ViewSt
     return Document("scene.ply", scene, tuple(gdfs)), ViewState(camera=first_camera(scene), layers=layers)
 
 
+def random_layer(gdf: Gdf, draws: Draws) -> Layer:
+    gains = Gains(*draws.uniform(3).tolist()) if float(draws.uniform(1)) < 0.4 else Gains()
+    weights = draws.uniform(gdf.members) if float(draws.uniform(1)) < 0.4 else None
+    return Layer(gdf, float(draws.uniform(1)) * 1.2, gains=gains, weights=weights)
+
+
 RUN = """([layers, blend]) => {
   const { composer } = progdf;
   composer.update(layers, blend);
@@ -184,19 +190,10 @@ def test_every_attribute_is_that_of_the_plain_form_under_every_rule(
     stacks: list[tuple[list[Layer], str]] = [
         ([Layer(g, s)], "adjust") for g in document.gdfs for s in (1.0, 0.0)
     ]
-    for blend in BLENDS * 4:
-        stacks.append((
-            [
-                Layer(
-                    document.gdfs[i],
-                    float(draws.uniform(1)) * 1.2,
-                    gains=Gains(*draws.uniform(3).tolist()) if float(draws.uniform(1)) < 0.4 else Gains(),
-                    weights=draws.uniform(document.gdfs[i].members) if float(draws.uniform(1)) < 0.4 else None,
-                )
-                for i in draws.order(4).tolist()
-            ],
-            blend,
-        ))  # fmt: skip
+    stacks += [
+        ([random_layer(document.gdfs[i], draws) for i in draws.order(4).tolist()], blend)
+        for blend in BLENDS * 4
+    ]
     for number, (layers, blend) in enumerate(stacks):
         sent = []
         for layer in layers:
@@ -340,7 +337,7 @@ def test_nothing_is_fetched_and_nothing_complains(open_page: Any, bear_page: tup
     assert [url for url in opened.requests if not url.startswith(("file:", "blob:", "data:"))] == []
     blocked = [line for line in opened.complaints if "Content Security Policy" not in line]
     assert blocked == []
-    assert "http" not in re.sub(r"https?://www\.w3\.org\S+", "", script())
+    assert "http" not in re.sub(r"https?://www\.w3\.org\S+", "", join())
 
 
 def test_two_fingers_slide_and_zoom_on_a_phone(open_page: Any, bear_page: tuple[Path, Stack]) -> None:
@@ -363,7 +360,7 @@ def test_two_fingers_slide_and_zoom_on_a_phone(open_page: Any, bear_page: tuple[
     assert opened.camera()["distance"] == pytest.approx(start["distance"] / 2, rel=0.05)
     assert opened.camera()["pivot"] != start["pivot"]
     panel = opened.tab.locator("#panel").bounding_box()
-    assert panel["x"] == 0 and panel["width"] == 300, "along the lower edge"
+    assert (panel["x"], panel["width"]) == (0, 300), "along the lower edge"
 
 
 NO_WEBGL = "HTMLCanvasElement.prototype.getContext = () => null"
@@ -396,3 +393,176 @@ def test_a_large_scene_is_sorted_by_a_worker_and_without_one_where_a_policy_forb
         opened.wait("progdf.renderer.drawn > 0")
         assert opened.tab.evaluate("progdf.sorter.worker !== null") == works
         assert psnr(opened.picture(), plain) > 90
+
+
+HOSTILE = "</script><script>document.title='run'</script><img src=x onerror=\"document.title='run'\">&lt;"
+
+
+def test_names_and_texts_of_a_stranger_are_text_whatever_they_hold(open_page: Any, tmp_path: Path) -> None:
+    stack = bear()
+    scene, *paths = stack.save(tmp_path)
+    names = (HOSTILE, "x" * 10_000)
+    for path, name in zip(paths, names, strict=True):
+        save_gdf(path, replace(load_gdf(path, stack.scene), name=name))
+    out = tmp_path / "page.html"
+    texts = ["--title", HOSTILE, "--credit", HOSTILE + " https://example.org/?a=1&b=%22<b>"]
+    assert main(["export", str(scene), *map(str, paths), "-o", str(out), *texts]) == 0
+    opened = ready(open_page(out))
+    assert opened.complaints == []
+    assert opened.tab.title() == HOSTILE
+    assert opened.tab.locator("h1").text_content() == HOSTILE
+    shown = opened.tab.locator(".layer .name").all_text_contents()
+    assert shown == ["x" * 10_000, HOSTILE]
+    assert opened.tab.locator("footer a").get_attribute("href") == "https://example.org/?a=1&b=%22"
+    assert opened.tab.locator("#panel").bounding_box()["width"] == 312, "a long name widens nothing"
+    assert opened.tab.evaluate("document.querySelectorAll('script, img').length") == 3
+
+
+@pytest.fixture(scope="module")
+def session_page(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    session = saved_session(bear_files(tmp_path_factory.mktemp("session")))
+    out = session.with_name("page.html")
+    assert main(["export", str(session), "-o", str(out), "--title", "work"]) == 0
+    return session, out
+
+
+def test_a_session_comes_with_its_camera_groups_snapshots_and_film(
+    open_page: Any, session_page: tuple[Path, Path]
+) -> None:
+    saved = json.loads(session_page[0].read_text())["view"]
+    opened = ready(open_page(session_page[1]))
+    camera = opened.camera()
+    assert all(
+        camera[name] == pytest.approx(saved["camera"][name])
+        for name in ("azimuth", "distance", "up", "fov_y")
+    )
+    assert opened.tab.evaluate("progdf.header.background") == pytest.approx(saved["background"])
+    assert opened.tab.evaluate("progdf.view.blend") == saved["blend"] == "over"
+    assert opened.strengths() == {"ears → gold": 0.75, "scarf": 0.25}
+    assert opened.tab.get_by_role("slider", name="warm").input_value() == "0.5"
+    opened.tab.get_by_role("slider", name="warm").press("ArrowRight")
+    assert opened.tab.evaluate("progdf.view.groups[0].strength") == pytest.approx(0.51)
+    painted = opened.tab.evaluate("progdf.composer.edits.length && [...progdf.paints[0]]")
+    assert (min(painted), max(painted), len(painted)) == (0.0, 1.0, len(bear().gdfs[1].region))
+    opened.tab.get_by_role("button", name="original", exact=True).click()
+    assert set(opened.strengths().values()) == {0.0}
+    opened.tab.get_by_role("button", name="1", exact=True).click()
+    assert opened.strengths() == {"ears → gold": 0.75, "scarf": 0.25}
+    assert opened.tab.evaluate("progdf.view.blend") == "sum"
+    opened.tab.get_by_role("slider", name="Blend of two snapshots").fill("0.5")
+    # half of what showed: a layer that is alone leaves its group's master
+    assert opened.strengths()["ears → gold"] == pytest.approx(0.5 * 0.75 * 0.5)
+    opened.tab.get_by_role("button", name="Play").click()
+    opened.wait("progdf.frame > 3")
+    assert opened.strengths()["scarf"] == 0.5, "the key's"
+
+
+def in_page(opened: Opened, expression: str, *values: Any) -> Any:
+    """What an expression of the page's own functions gives; a, b, c … are the values."""
+    names = "abcdef"[: len(values)]
+    body = join(("camera", "state"), f"return {expression};").removesuffix(";\n")
+    return opened.tab.evaluate(f"([{','.join(names)}]) => {body}", list(values))
+
+
+def test_a_film_is_that_of_the_window(open_page: Any, session_page: tuple[Path, Path]) -> None:
+    opened, draws, view = open_page(session_page[1]), Draws(3), full_view()
+    keys = tuple(
+        Keyframe(
+            frame,
+            ((0, float(draws.uniform(1))), (1, float(draws.uniform(1)))),
+            replace(
+                view.camera, azimuth=azimuth, elevation=20 * frame / 7, distance=1 + float(draws.uniform(1))
+            ),
+            easing,
+        )
+        for frame, azimuth, easing in (
+            (0, 170.0, "smooth"),
+            (7, -150.0, "smooth"),
+            (12, 20.0, "linear"),
+            (20, 9.0, "hold"),
+        )
+    )
+    sent = [vars(key) | {"camera": asdict(key.camera)} for key in keys]
+    layers = [{"edit": layer.gdf, "strength": layer.strength} for layer in view.layers]
+    for frame in (0, 2.5, 7, 11, 19.9, 24):
+        page = in_page(opened, "stateAt({ keys: a }, b, { layers: c }, null)", sent, frame, layers)
+        plain = timeline.state_at(Timeline(keys, 24), frame, view)
+        for name in ("azimuth", "elevation", "distance", "fov_y", "pivot", "up"):
+            assert page["camera"][name] == pytest.approx(getattr(plain.camera, name), abs=1e-9), (frame, name)
+        strengths = {layer["edit"]: layer["strength"] for layer in page["view"]["layers"]}
+        assert strengths == pytest.approx({layer.gdf: layer.strength for layer in plain.layers})
+
+
+def test_what_lies_between_two_snapshots_is_what_the_window_has(open_page: Any, tmp_path: Path) -> None:
+    stack, view = many_edits(bear(), 4)
+    draws, kept = Draws(8), ()
+    for _ in range(6):
+        alone, off, master = draws.uniform(3).tolist()
+        layers = tuple(
+            replace(
+                view.layers[i],
+                strength=round(float(draws.uniform(1)), 3),
+                enabled=float(draws.uniform(1)) < 0.7,
+                solo=alone < 0.2 and i == 2,
+                gains=Gains(*draws.uniform(3).tolist()),
+                group="pair" if i in (1, 3) else "",
+            )
+            for i in draws.order(4).tolist()
+        )
+        kept = snapshots.take(
+            kept, replace(view, layers=layers, groups=(LayerGroup("pair", off < 0.7, master),))
+        )
+    view = snapshots.restore(view, kept[-1])
+    document = Document("scene.ply", stack.scene, stack.gdfs)
+    write_page(tmp_path / "page.html", document, view, kept)
+    opened = ready(open_page(tmp_path / "page.html"))
+    listed, members = snapshots.with_original(kept, view), lambda gdf: document.gdfs[gdf].members
+    known = opened.tab.evaluate("[progdf.view, progdf.snapshots]")
+    for a, b in ((0, 1), (1, 2), (3, 2), (4, 5), (6, 0)):
+        for share in (0.0, 0.25, 0.6, 1.0):
+            page = in_page(opened, "visibleLayers(between(a, b[c], b[d], e))", *known, a, b, share)
+            pair = SnapshotPair(listed[a].name, listed[b].name, share)
+            plain = visible_layers(snapshots.blend(replace(view, pair=pair), listed, share, members))
+            assert [layer["edit"] for layer in page] == [layer.gdf for layer in plain], (a, b, share)
+            for mine, theirs in zip(page, plain, strict=True):
+                assert mine["strength"] == pytest.approx(theirs.strength), (a, b, share)
+                assert mine["gains"] == pytest.approx(asdict(theirs.gains))
+
+
+def test_a_page_gets_as_small_as_it_must_and_says_what_that_costs(tmp_path: Path) -> None:
+    document, view = document_of(bear(600).scene, bear(600).gdfs)
+    out = tmp_path / "page.html"
+
+    def written(**options: Any) -> tuple[int, str]:
+        line = write_page(out, document, view, (), PageOptions(**options))
+        return out.stat().st_size, line
+
+    size, _ = written()
+    assert size < written(quality="exact")[0]
+    assert size > written(layers="scarf")[0], "an edit that is at 0 and has no slider is left out"
+    limit = size - 9_000
+    smaller, line = written(max_size=f"{limit / 1000}kB")
+    assert smaller <= limit
+    assert re.search(r"(SH of degree 0 of 1|\d+ % of the Gaussians).*, \d\d\.\d dB to the scene", line), line
+
+
+def test_what_cannot_be_is_one_line_and_what_was_there_stays(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene, *edits = map(str, bear().save(tmp_path))
+    out = tmp_path / "page.html"
+    out.write_text("earlier")
+    (tmp_path / "broken.session.json").write_text('{"view": [1, ')
+    bad: list[tuple[list[str], str]] = [
+        ([scene, *edits, "--max-size", "9kB"], "MB at least"),
+        ([scene, *edits, "--max-size", "small"], "no size"),
+        ([scene, *edits, "--layers", "hat"], "no layer of that name; there are ears, scarf"),
+        ([scene, "-o", str(tmp_path / "page.ply"), "--title", "x"], "no web page"),
+        ([str(tmp_path / "broken.session.json")], "broken.session.json"),
+    ]
+    for words, message in bad:
+        assert main(["export", *words, *([] if "-o" in words else ["-o", str(out)])]) == 2
+        error = capsys.readouterr().err
+        assert message in error
+        assert error.count("\n") == 1
+    assert out.read_text() == "earlier"
