@@ -24,10 +24,11 @@ from progdf.rasterize import alpha_weights, render
 from progdf.scene.orbit_rig import orbit_rig
 from viewer.camera.view_camera import ViewCamera, bounds_of, to_camera
 from viewer.state import snapshots as kept
+from viewer.state import timeline
 from viewer.state.layers import largest_strength, visible_layers
 from viewer.state.paint import decode, layer_of
 from viewer.state.snapshots import SliderSnapshot
-from viewer.state.view_state import LayerState, ViewState
+from viewer.state.view_state import LayerState, Timeline, ViewState
 from viewer.web.pack import DRAWN_SH, pack
 from viewer.web.page import HOST, MAIL, build_page
 
@@ -203,7 +204,6 @@ def _stage(
         }
 
     listed = kept.with_original(snapshots, view)
-    film = view.timeline
     stage = {
         "background": view.background,
         "camera": _camera(view.camera),
@@ -224,25 +224,27 @@ def _stage(
             for each in snapshots
         ],
         "pair": kept.pair_of(listed, view.pair),
-        "timeline": {
-            "keys": [
-                {
-                    "frame": key.frame,
-                    "easing": key.easing,
-                    "strengths": [(edits.index(gdf), s) for gdf, s in key.strengths if gdf in edits],
-                    "camera": None if key.camera is None else _camera(key.camera),
-                }
-                for key in film.keys
-            ],
-            "length": film.length,
-            "fps": film.fps,
-            "ping_pong": film.ping_pong,
-        }
-        if film.keys
-        else None,
+        "timeline": _film(view.timeline, edits),
         "paints": paints,
     }
     return stage, edits
+
+
+def _film(film: Timeline, edits: Sequence[int]) -> dict[str, Any] | None:
+    """A timeline frame by frame; the strengths that it moves, and the camera where it moves that."""
+    if not film.keys:
+        return None
+    frames = []
+    for frame in range(film.length + 1):
+        camera, strengths = timeline.camera_at(film, frame), timeline.strengths_at(film, frame)
+        moved = [(edits.index(gdf), s) for gdf, s in strengths.items() if gdf in edits]
+        frames.append({"strengths": moved, "camera": None if camera is None else _camera(camera)})
+    return {
+        "frames": frames,
+        "keys": [key.frame for key in film.keys],
+        "fps": film.fps,
+        "ping_pong": film.ping_pong,
+    }
 
 
 def _sliders(view: ViewState, names: str | None) -> set[str]:

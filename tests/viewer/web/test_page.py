@@ -464,8 +464,8 @@ def in_page(opened: Opened, expression: str, *values: Any) -> Any:
     return opened.tab.evaluate(f"([{','.join(names)}]) => {body}", list(values))
 
 
-def test_a_film_is_that_of_the_window(open_page: Any, session_page: tuple[Path, Path]) -> None:
-    opened, draws, view = open_page(session_page[1]), Draws(3), full_view()
+def test_a_film_is_that_of_the_window(open_page: Any, tmp_path: Path) -> None:
+    draws, view = Draws(3), full_view()
     keys = tuple(
         Keyframe(
             frame,
@@ -482,15 +482,16 @@ def test_a_film_is_that_of_the_window(open_page: Any, session_page: tuple[Path, 
             (20, 9.0, "hold"),
         )
     )
-    sent = [vars(key) | {"camera": asdict(key.camera)} for key in keys]
-    layers = [{"edit": layer.gdf, "strength": layer.strength} for layer in view.layers]
-    for frame in (0, 2.5, 7, 11, 19.9, 24):
-        page = in_page(opened, "stateAt({ keys: a }, b, { layers: c }, null)", sent, frame, layers)
+    document = Document("scene.ply", bear().scene, bear().gdfs)
+    write_page(tmp_path / "page.html", document, replace(view, timeline=Timeline(keys, 24)))
+    opened = ready(open_page(tmp_path / "page.html"))
+    for frame in (0, 2, 7, 11, 20, 24):
+        opened.tab.evaluate(f"progdf.seek({frame})")
         plain = timeline.state_at(Timeline(keys, 24), frame, view)
+        camera = opened.camera()
         for name in ("azimuth", "elevation", "distance", "fov_y", "pivot", "up"):
-            assert page["camera"][name] == pytest.approx(getattr(plain.camera, name), abs=1e-9), (frame, name)
-        strengths = {layer["edit"]: layer["strength"] for layer in page["view"]["layers"]}
-        assert strengths == pytest.approx({layer.gdf: layer.strength for layer in plain.layers})
+            assert camera[name] == pytest.approx(getattr(plain.camera, name), abs=1e-9), (frame, name)
+        assert opened.strengths() == pytest.approx({layer.name: layer.strength for layer in plain.layers})
 
 
 def test_what_lies_between_two_snapshots_is_what_the_window_has(open_page: Any, tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ const DEGREES_PER_PIXEL = 0.3;
 const CLOSEST = 1e-4, WIDEST = 1e4;  // of the scene's radius
 const FARTHEST = 1e9;
 const radians = (degrees) => (degrees * Math.PI) / 180;
+export const wrap = (degrees) => ((((degrees + 180) % 360) + 360) % 360) - 180;
 export const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 export const addScaled = (origin, ...steps) =>
@@ -56,7 +57,7 @@ const held = (distance, radius) => Math.min(Math.max(distance, CLOSEST * radius)
 
 export function orbit(camera, dx, dy) {
   const elevation = Math.min(Math.max(camera.elevation + DEGREES_PER_PIXEL * dy, -90), 90);
-  const azimuth = ((((camera.azimuth - DEGREES_PER_PIXEL * dx + 180) % 360) + 360) % 360) - 180;
+  const azimuth = wrap(camera.azimuth - DEGREES_PER_PIXEL * dx);
   return keepFinite({ ...camera, azimuth, elevation }, camera);
 }
 

@@ -7,7 +7,7 @@ import { listen } from "./input.js";
 import { buildPanel } from "./panel.js";
 import { Renderer, depthRow } from "./renderer.js";
 import { Sorter } from "./sort.js";
-import { between, restore, stateAt, visibleLayers } from "./state.js";
+import { between, mixCameras, restore, stateAt, visibleLayers } from "./state.js";
 
 const MOST_PIXELS = 4e6;
 const SLOW_MS = 45;  // between frames while something moves: half the pixels each way then
@@ -192,25 +192,24 @@ class Page {
 
   #advance(now) {
     if (this.glide) {
-      const share = Math.min((now - this.glide.start) / GLIDE_MS, 1), { from, to } = this.glide;
-      const keys = [{ frame: 0, easing: "smooth", strengths: [], camera: from }, { frame: 1, easing: "smooth", strengths: [], camera: to }];
-      this.look(stateAt({ keys }, share, this.view, from).camera);
+      const { from, to, start } = this.glide, share = Math.min((now - start) / GLIDE_MS, 1);
+      this.look(mixCameras(from, to, share * share * (3 - 2 * share)));
       if (share >= 1) this.glide = null;
       this.request();
     }
-    const { timeline: film } = this.header;
-    if (this.playing && film) {
-      const round = film.ping_pong ? 2 * film.length : film.length + 1;
-      this.clock = ((this.lastFrame === null ? this.frame : this.clock) + ((now - (this.lastFrame ?? now)) * film.fps) / 1000) % round;
-      this.lastFrame = now;
-      this.seek(this.clock > film.length ? (film.ping_pong ? round - this.clock : film.length) : this.clock);
-      this.request();
-    }
+    if (!this.playing) return;
+    const { frames, fps, ping_pong: back } = this.header.timeline, last = frames.length - 1;
+    const round = back ? 2 * last : last + 1, passed = now - (this.lastFrame ?? now);
+    this.clock = ((this.lastFrame === null ? this.frame : this.clock) + (passed * fps) / 1000) % round;
+    this.lastFrame = now;
+    this.seek(this.clock <= last ? this.clock : back ? round - this.clock : last);
+    this.request();
   }
 
   #compose() {
     this.dirty = false;
-    const layers = this.comparing ? [] : visibleLayers(this.view).map((layer) => ({ ...layer, weights: this.#weights(layer.paint) }));
+    const layers = this.comparing ? [] : visibleLayers(this.view);
+    for (const layer of layers) layer.weights = this.#weights(layer.paint);
     const changed = this.composer.update(layers, this.view.blend);
     if (!changed) return;
     this.renderer.update(this.composer, changed);
@@ -238,10 +237,15 @@ class Page {
       this.request();
     });
     press("home", () => this.glideTo(this.home));
-    press("full", () => (document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen?.()));
+    press("full", () => {
+      if (document.fullscreenElement) document.exitFullscreen();
+      else document.documentElement.requestFullscreen?.();
+    });
     const hold = get("compare");
     hold.addEventListener("pointerdown", () => this.compare(true));
-    for (const name of ["pointerup", "pointerleave", "pointercancel", "blur"]) hold.addEventListener(name, () => this.compare(false));
+    for (const name of ["pointerup", "pointerleave", "pointercancel", "blur"]) {
+      hold.addEventListener(name, () => this.compare(false));
+    }
     addEventListener("keydown", (event) => {
       if (event.ctrlKey || event.metaKey || event.altKey) return;
       if (event.key === " ") {

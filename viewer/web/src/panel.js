@@ -58,7 +58,10 @@ export function buildPanel(root, page) {
   const add = (list, each, kind, options) => {
     const made = row(each.name, kind, {
       ...options,
-      toggled: () => change(list, each.name, { enabled: !page.view[list].find((l) => l.name === each.name).enabled, ...(list === "layers" ? { solo: false } : {}) }),
+      toggled: () => {
+        const { enabled } = page.view[list].find((one) => one.name === each.name);
+        change(list, each.name, { enabled: !enabled, solo: false });
+      },
       moved: (strength) => change(list, each.name, { strength }),
     });
     rows.set(`${list}/${each.name}`, made);
@@ -110,11 +113,11 @@ function timeline(root, page) {
   const { timeline: film } = page.header;
   if (!film) return null;
   const play = make("button", { type: "button", class: "play", title: "Play (P)", on: { click: () => page.play() } });
-  const ticks = film.keys.map((key) => key.frame / film.length);
-  const { track, show } = slider("Timeline", 1, ticks, (share) => page.seek(share * film.length), 0.001);
+  const last = film.frames.length - 1, ticks = film.keys.map((frame) => frame / last);
+  const { track, show } = slider("Timeline", 1, ticks, (share) => page.seek(share * last), 0.001);
   root.append(make("section", { class: "timeline" }, play, track));
   return () => {
-    show(page.frame / film.length);
+    show(page.frame / last);
     play.classList.toggle("on", page.playing);
     play.setAttribute("aria-label", page.playing ? "Pause" : "Play");
   };

@@ -1,7 +1,7 @@
 // What the page shows, as data: { layers, groups, blend } and how snapshots and a timeline change it; see
-// viewer/state/layers.py, snapshots.py, timeline.py and viewer/camera/views.py.
+// viewer/state/layers.py, snapshots.py.
 
-import { axes, lookAlong, unit } from "./camera.js";
+import { axes, lookAlong, unit, wrap } from "./camera.js";
 
 // The layers that take part, each at its strength times its group's.
 export function visibleLayers({ layers, groups }) {
@@ -63,73 +63,28 @@ export function between(view, a, b, share) {
   return { ...near, layers, groups };
 }
 
-// Which point comes before a frame, and how much of the way to the next lies behind.
-function segment(frames, frame) {
-  if (frame <= frames[0]) return [0, 0];
-  for (let i = 0; i + 1 < frames.length; i++) {
-    if (frames[i] <= frame && frame < frames[i + 1]) return [i, (frame - frames[i]) / (frames[i + 1] - frames[i])];
-  }
-  return [frames.length - 1, 0];
-}
-
-function slope(points, i) {
-  if (i === 0 || i === points.length - 1 || points[i - 1][1] !== "smooth" || points[i][1] !== "smooth") return 0;
-  const [[a, , x], [b, , y], [c, , z]] = points.slice(i - 1, i + 2), into = (y - x) / (b - a), out = (z - y) / (c - b);
-  if (into * out <= 0) return 0;
-  const left = 2 * (c - b) + (b - a), right = c - b + 2 * (b - a);
-  return (left + right) / (left / into + right / out);
-}
-
-// A track's value at a frame; points: [frame, easing, value].
-export function valueBetween(points, frame) {
-  const [i, share] = segment(points.map((point) => point[0]), frame), [at, easing, start] = points[i];
-  if (share === 0 || easing === "hold") return start;
-  const [next, , end] = points[i + 1];
-  if (easing === "linear") return lerp(start, end, share);
-  const leave = slope(points, i) * (next - at), come = slope(points, i + 1) * (next - at);
-  const reached = start + share * share * (3 - 2 * share) * (end - start)
-    + share * (1 - share) * ((1 - share) * leave - share * come);
-  return Math.min(Math.max(reached, Math.min(start, end)), Math.max(start, end));
-}
-
-// The camera between keys [frame, easing, camera].
-export function cameraBetween(keys, frame) {
-  const [i, share] = segment(keys.map((key) => key[0]), frame), here = keys[i][2];
-  if (share === 0 || keys[i][1] === "hold") return here;
-  const there = keys[i + 1][2];
-  const track = (of) => valueBetween(keys.map(([at, easing, camera]) => [at, easing, of(camera)]), frame);
+// A camera between two others, the shortest way around.
+export function mixCameras(a, b, share) {
+  if (share <= 0 || share >= 1) return share <= 0 ? a : b;
   const camera = {
-    ...here,
-    pivot: [0, 1, 2].map((axis) => track((c) => c.pivot[axis])),
-    distance: Math.exp(track((c) => Math.log(Math.max(c.distance, 1e-300)))),
-    fov_y: track((c) => c.fov_y),
+    ...a,
+    pivot: a.pivot.map((x, axis) => lerp(x, b.pivot[axis], share)),
+    distance: Math.exp(lerp(Math.log(a.distance), Math.log(b.distance), share)),
+    fov_y: lerp(a.fov_y, b.fov_y, share),
+    azimuth: wrap(a.azimuth + share * wrap(b.azimuth - a.azimuth)),
+    elevation: lerp(a.elevation, b.elevation, share),
   };
-  if (here.up.some((x, axis) => x !== there.up[axis])) {
-    const eased = valueBetween([[0, keys[i][1], 0], [1, keys[i][1], 1]], share);
-    const [a, b] = [axes(here), axes(there)];
-    const mixed = (name) => unit(a[name].map((x, axis) => lerp(x, b[name][axis], eased)), a[name]);
-    return lookAlong({ ...camera, up: mixed("up") }, mixed("back"));
-  }
-  let last = null;
-  const turns = new Map(keys.map(([, , c]) => {  // each within half a turn of the one before it
-    last = last === null ? c.azimuth : last + ((((c.azimuth - last + 180) % 360) + 360) % 360) - 180;
-    return [c, last];
-  }));
-  const azimuth = ((((track((c) => turns.get(c)) + 180) % 360) + 360) % 360) - 180;
-  return { ...camera, azimuth, elevation: track((c) => c.elevation) };
+  if (a.up.every((x, axis) => x === b.up[axis])) return camera;
+  const [from, to] = [axes(a), axes(b)];
+  const mixed = (name) => unit(from[name].map((x, axis) => lerp(x, to[name][axis], share)), from[name]);
+  return lookAlong({ ...camera, up: mixed("up") }, mixed("back"));
 }
 
-// The view and the camera at a frame of a timeline.
-export function stateAt(timeline, frame, view, camera) {
-  const tracks = new Map(), cameras = [];
-  for (const key of timeline.keys) {
-    for (const [edit, strength] of key.strengths) {
-      if (!tracks.has(edit)) tracks.set(edit, []);
-      tracks.get(edit).push([key.frame, key.easing, strength]);
-    }
-    if (key.camera) cameras.push([key.frame, key.easing, key.camera]);
-  }
-  const layers = view.layers.map((layer) =>
-    tracks.has(layer.edit) ? { ...layer, strength: valueBetween(tracks.get(layer.edit), frame) } : layer);
-  return { view: { ...view, layers }, camera: cameras.length ? cameraBetween(cameras, frame) : camera };
+// The view and the camera at a moment of a film, whose frames are given one by one.
+export function stateAt({ frames }, frame, view, camera) {
+  const before = Math.min(Math.floor(frame), frames.length - 1), share = frame - before;
+  const here = frames[before], next = frames[Math.min(before + 1, frames.length - 1)];
+  const strengths = new Map(here.strengths.map(([edit, s], i) => [edit, lerp(s, next.strengths[i][1], share)]));
+  const layers = view.layers.map((layer) => ({ ...layer, strength: strengths.get(layer.edit) ?? layer.strength }));
+  return { view: { ...view, layers }, camera: here.camera ? mixCameras(here.camera, next.camera, share) : camera };
 }
