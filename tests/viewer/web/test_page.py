@@ -503,7 +503,7 @@ def test_what_lies_between_two_snapshots_is_what_the_window_has(open_page: Any, 
                 view.layers[i],
                 strength=round(float(draws.uniform(1)), 3),
                 enabled=float(draws.uniform(1)) < 0.7,
-                solo=alone < 0.2 and i == 2,
+                solo=alone < 0.4 and i == 3,
                 gains=Gains(*draws.uniform(3).tolist()),
                 group="pair" if i in (1, 3) else "",
             )

@@ -13,76 +13,97 @@ function interpolate(x, knots, values) {
   return values[right - 1] + share * (values[right] - values[right - 1]);
 }
 
-// Gives a function that maps one color: rgb [3] -> rgb [3] in `out`.
-function polynomial(table, degree) {
-  const terms = new Float64Array(20);
-  return (color, out) => {
-    const [r, g, b] = color.map((x) => clamp(x, 0, MOST_COLOR));
-    terms.set([1, r, g, b, r * r, g * g, b * b, r * g, g * b, b * r, r * r * r, g * g * g, b * b * b,
-      r * r * g, r * r * b, g * g * r, g * g * b, b * b * r, b * b * g, r * g * b]);
-    const count = [0, 4, 10, 20][degree];
+// Gives a function that maps one color: (r, g, b, out [3]).
+function polynomial(t, degree) {
+  return (red, green, blue, out) => {
+    const r = clamp(red, 0, MOST_COLOR), g = clamp(green, 0, MOST_COLOR), b = clamp(blue, 0, MOST_COLOR);
+    const rr = r * r, gg = g * g, bb = b * b, rg = r * g, gb = g * b, br = b * r;
     for (let c = 0; c < 3; c++) {
-      let sum = 0;
-      for (let k = 0; k < count; k++) sum += table[3 * k + c] * terms[k];
-      out[c] = sum + Math.max(color[c] - MOST_COLOR, 0);
+      let sum = t[c] + t[3 + c] * r + t[6 + c] * g + t[9 + c] * b;
+      if (degree > 1) {
+        sum += t[12 + c] * rr + t[15 + c] * gg + t[18 + c] * bb + t[21 + c] * rg + t[24 + c] * gb + t[27 + c] * br;
+      }
+      if (degree > 2) {
+        sum += t[30 + c] * rr * r + t[33 + c] * gg * g + t[36 + c] * bb * b + t[39 + c] * rr * g + t[42 + c] * rr * b;
+        sum += t[45 + c] * gg * r + t[48 + c] * gg * b + t[51 + c] * bb * r + t[54 + c] * bb * g + t[57 + c] * rg * b;
+      }
+      out[c] = sum;
     }
+    if (red > MOST_COLOR) out[0] += red - MOST_COLOR;
+    if (green > MOST_COLOR) out[1] += green - MOST_COLOR;
+    if (blue > MOST_COLOR) out[2] += blue - MOST_COLOR;
   };
 }
 
 function lattice(table) {
-  const side = Math.round(Math.cbrt(table.length / 3));
-  return (color, out) => {
-    const at = color.map((x) => clamp(x, 0, 1) * (side - 1));
-    const low = at.map((x) => Math.min(Math.floor(x), side - 2));
+  const side = Math.round(Math.cbrt(table.length / 3)), at = new Float64Array(3), low = new Int32Array(3);
+  return (red, green, blue, out) => {
+    at[0] = clamp(red, 0, 1) * (side - 1);
+    at[1] = clamp(green, 0, 1) * (side - 1);
+    at[2] = clamp(blue, 0, 1) * (side - 1);
+    for (let axis = 0; axis < 3; axis++) {
+      low[axis] = Math.min(Math.floor(at[axis]), side - 2);
+      at[axis] -= low[axis];
+    }
     out.fill(0);
     for (let corner = 0; corner < 8; corner++) {
-      let weight = 1, index = 0;
-      for (let axis = 0; axis < 3; axis++) {
-        const up = (corner >> axis) & 1, share = at[axis] - low[axis];
-        weight *= up ? share : 1 - share;
-        index += (low[axis] + up) * side ** axis;
-      }
-      for (let c = 0; c < 3; c++) out[c] += weight * table[3 * index + c];
+      const [r, g, b] = [corner & 1, (corner >> 1) & 1, corner >> 2];
+      const weight = (r ? at[0] : 1 - at[0]) * (g ? at[1] : 1 - at[1]) * (b ? at[2] : 1 - at[2]);
+      const index = 3 * (low[0] + r + side * (low[1] + g + side * (low[2] + b)));
+      for (let c = 0; c < 3; c++) out[c] += weight * table[index + c];
     }
   };
 }
 
-// Spherical harmonics that show what the map makes of what they showed. sh, made: [B,3]
-function mapBands(sh, bands, map, [values, inverse], made) {
-  const color = [0, 0, 0], mapped = [0, 0, 0];
+// Gives a function (sh, made [B,3]): harmonics that show what the map makes of what they showed.
+function bandMapper(bands, map, [values, inverse]) {
+  const mapped = new Float64Array(3);
   if (bands === 1) {
-    for (let c = 0; c < 3; c++) color[c] = sh[c] * C0 + 0.5;
-    map(color, mapped);
-    for (let c = 0; c < 3; c++) made[c] = mapped[c] <= 0 && color[c] <= 0 ? sh[c] : (mapped[c] - 0.5) / C0;
-    return;
+    return (sh, made) => {
+      map(sh[0] * C0 + 0.5, sh[1] * C0 + 0.5, sh[2] * C0 + 0.5, mapped);
+      for (let c = 0; c < 3; c++) {
+        made[c] = mapped[c] <= 0 && sh[c] * C0 + 0.5 <= 0 ? sh[c] : (mapped[c] - 0.5) / C0;
+      }
+    };
   }
   const directions = values.length / bands, target = new Float64Array(3 * directions);
-  const clamped = [false, false, false];
-  const seen = (numbers, d, c) => {
-    let sum = 0.5;
-    for (let b = 0; b < bands; b++) sum += numbers[3 * b + c] * values[d * bands + b];
-    return sum;
-  };
-  const add = (d, c, missing) => {
-    for (let b = 0; b < bands; b++) made[3 * b + c] += missing * inverse[b * directions + d];
-  };
-  made.set(sh);
-  for (let d = 0; d < directions; d++) {
-    for (let c = 0; c < 3; c++) color[c] = seen(sh, d, c);
-    map(color, mapped);
-    for (let c = 0; c < 3; c++) {
-      target[3 * d + c] = mapped[c];
-      clamped[c] ||= color[c] < 0 || mapped[c] < 0;
-      add(d, c, mapped[c] - Math.max(color[c], 0));
+  const color = new Float64Array(3 * directions), clamped = new Uint8Array(3);
+  const show = (sh, c) => {
+    for (let d = 0; d < directions; d++) {
+      let sum = 0.5;
+      for (let b = 0; b < bands; b++) sum += sh[3 * b + c] * values[d * bands + b];
+      color[3 * d + c] = sum;
     }
-  }
-  for (let c = 0; c < 3; c++) {
-    if (!clamped[c]) continue;
-    const now = Array.from({ length: directions }, (_, d) => seen(made, d, c));
-    now.forEach((shown, d) => {
-      if (target[3 * d + c] > 0 || shown > 0) add(d, c, target[3 * d + c] - shown);
-    });
-  }
+  };
+  const add = (made, c, missing) => {  // least squares: missing [D,3]
+    for (let b = 0; b < bands; b++) {
+      let sum = 0;
+      for (let d = 0; d < directions; d++) sum += missing[3 * d + c] * inverse[b * directions + d];
+      made[3 * b + c] += sum;
+    }
+  };
+  return (sh, made) => {
+    made.set(sh);
+    clamped.fill(0);
+    for (let c = 0; c < 3; c++) show(sh, c);
+    for (let d = 0; d < 3 * directions; d += 3) {
+      map(color[d], color[d + 1], color[d + 2], mapped);
+      for (let c = 0; c < 3; c++) {
+        target[d + c] = mapped[c];
+        if (color[d + c] < 0 || mapped[c] < 0) clamped[c] = 1;
+        color[d + c] = mapped[c] - Math.max(color[d + c], 0);
+      }
+    }
+    for (let c = 0; c < 3; c++) add(made, c, color);
+    for (let c = 0; c < 3; c++) {
+      if (!clamped[c]) continue;
+      show(made, c);
+      for (let j = c; j < color.length; j += 3) {
+        color[j] = target[j] <= 0 && color[j] <= 0 ? 0 : target[j] - color[j];
+      }
+      add(made, c, color);
+    }
+  };
 }
 
 // Gives a function (sh [B,3], member, change) of a grade at a strength, which writes what it adds to the bands.
@@ -97,13 +118,15 @@ export function gradeChange(grade, strength, bands, sphere) {
     const from = grade.coefficients[right - 1][k];
     return from + share * (x - from);
   });
-  const made = new Float64Array(3 * bands), width = grade.scale[0]?.length ?? 0;
+  const remap = bandMapper(bands, map, sphere), made = new Float64Array(3 * bands);
+  const width = grade.scale[0]?.length ?? 0, factors = grade.scale.map((units, k) => units.map((unit) => unit * row[k]));
   return (sh, member, change) => {
-    mapBands(sh, bands, map, sphere, made);
+    remap(sh, made);
     const part = (straight ? share : 1) * (grade.share ? grade.share[member] : 1);
     for (let j = 0; j < change.length; j++) change[j] = part * (made[j] - sh[j]);
-    grade.residual.forEach((basis, k) => {
-      for (let j = 0; j < width; j++) change[j] += basis[member * width + j] * row[k] * grade.scale[k][j];
-    });
+    for (let k = 0; k < factors.length; k++) {
+      const basis = grade.residual[k], units = factors[k];
+      for (let j = 0; j < width; j++) change[j] += basis[member * width + j] * units[j];
+    }
   };
 }
