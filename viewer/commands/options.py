@@ -164,6 +164,11 @@ class ExportOptions:
     background: Annotated[str, word("COLOR")] = "white"
     """Of a page: #rrggbb, white or black."""
 
+    @property
+    def drawing(self) -> DrawingOptions:
+        """How a page is drawn."""
+        return DrawingOptions(up=self.up, background=self.background)
+
 
 class Named(Protocol):
     """An edit, or the layer that shows one."""

@@ -45,8 +45,7 @@ from viewer.camera.view_camera import (
 )
 from viewer.files import timeline_file
 from viewer.files.document import empty
-from viewer.files.web_page import SUFFIX as PAGE
-from viewer.files.web_page import PageOptions, write_page
+from viewer.files.web_page import PAGE, PageOptions, write_page
 from viewer.pictures import film
 from viewer.pictures.compare import Comparer, draw_labels
 from viewer.render.engine import ViewEngine
@@ -59,7 +58,6 @@ from viewer.state.view_state import MOST_AMPLIFIED, Comparison, Timeline, ViewSt
 
 from .options import (
     NO_SCENE,
-    DrawingOptions,
     ExportOptions,
     OpenStack,
     RenderOptions,
@@ -110,7 +108,7 @@ def export(argv: Sequence[str]) -> int:
         )
     if kind != PAGE and (options.page, options.up, options.background) != (PageOptions(), "auto", "white"):
         raise ProgdfError(f"{out} is no web page; leave out what only a .html page has")
-    drawing = DrawingOptions(up=options.up, background=options.background) if kind == PAGE else None
+    drawing = options.drawing if kind == PAGE else None
     opened = open_stack(options.stack, drawing, unset=1.0)
     check_not_an_input(out, opened.files)
     if kind == PAGE:

@@ -9,11 +9,8 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import torch
-from torch import Tensor
 
-from progdf.camera import Camera
 from progdf.cli.options import absent_option
-from progdf.compose.layers import Layer
 from progdf.compose.reference import compose_layers
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
@@ -23,18 +20,15 @@ from progdf.metrics.image import psnr
 from progdf.rasterize import alpha_weights, render
 from progdf.scene.orbit_rig import orbit_rig
 from viewer.camera.view_camera import ViewCamera, bounds_of, to_camera
-from viewer.state import snapshots as kept
-from viewer.state import timeline
+from viewer.state import snapshots, timeline
 from viewer.state.layers import largest_strength, visible_layers
 from viewer.state.paint import decode, layer_of
-from viewer.state.snapshots import SliderSnapshot
 from viewer.state.view_state import LayerState, Timeline, ViewState
-from viewer.web.pack import DRAWN_SH, pack
-from viewer.web.page import HOST, MAIL, build_page
+from viewer.web.page import DRAWN_SH, HOST, MAIL, build_page, pack
 
 from .document import Document
 
-SUFFIX = ".html"
+PAGE = ".html"
 _STILL = 1200, 800
 _RANK_VIEWS, _RANK_SIZE = 24, (480, 320)
 _LEAST_SHARE = 0.01
@@ -78,7 +72,7 @@ def write_page(
     out: Path,
     document: Document,
     view: ViewState,
-    snapshots: Sequence[SliderSnapshot] = (),
+    kept: Sequence[snapshots.SliderSnapshot] = (),
     options: PageOptions = PageOptions(),
 ) -> str:
     """Write the page; the line that says what it holds.
@@ -88,10 +82,9 @@ def write_page(
             the page cannot be written.
     """
     limit = _parse_size(options.max_size)
-    stage, edits = _stage(document, view, snapshots, options)
+    stage, edits = _stage(document, view, kept, options)
     gdfs, title = [document.gdfs[i] for i in edits], options.title or Path(document.title).stem
-    camera = to_camera(view.camera, *_STILL)
-    start = _picture(document.scene, document.gdfs, view, camera)
+    start = _picture(document.scene, document.gdfs, view)
     pixels = (start * 255.0 + 0.5).to(torch.uint8).numpy()
     rank = _rank(document, view) if limit is not None else None
 
@@ -99,7 +92,7 @@ def write_page(
         stays = None if rank is None or share == 1.0 else (rank < share * len(rank)).numpy()
         packed = pack(document.scene, gdfs, quality, degree, stage, stays)
         html = build_page(packed.data, title, options.credit, view.background, pixels)
-        error = psnr(_picture(packed.scene, document.gdfs, view, camera, DRAWN_SH[degree]), start)
+        error = psnr(_picture(packed.scene, document.gdfs, view, DRAWN_SH[degree]), start)
         return _Page(html, quality, degree, share, error)
 
     degree = min(options.sh, document.scene.sh_degree)
@@ -130,12 +123,13 @@ def _shrink(make: Callable[[str, int, float], _Page], page: _Page, limit: int) -
     return page
 
 
-def _rank(document: Document, view: ViewState) -> Tensor:
+def _rank(document: Document, view: ViewState) -> torch.Tensor:
     """Each Gaussian's place by what it contributes to views around the scene, with its edits or without."""
     cameras = [*orbit_rig(document.original, _RANK_VIEWS, *_RANK_SIZE), to_camera(view.camera, *_RANK_SIZE)]
     weights, everywhere = torch.zeros(len(document.scene)), torch.ones(_RANK_SIZE[::-1])
     for strength in (0.0, 1.0):
-        edited = compose_layers(document.scene, [Layer(gdf, strength) for gdf in document.gdfs], view.blend)
+        layers = tuple(replace(layer, strength=strength, enabled=True, solo=False) for layer in view.layers)
+        edited = _compose(document.scene, document.gdfs, replace(view, layers=layers, groups=()))
         for camera in cameras:
             weights = weights.maximum(alpha_weights(edited, camera, everywhere)[:, 2].float())
     return weights.argsort(descending=True, stable=True).argsort()
@@ -163,26 +157,32 @@ def _parse_size(text: str | None) -> int | None:
 
 
 def _picture(
-    scene: Gaussians, gdfs: Sequence[Gdf], view: ViewState, camera: Camera, bands: int = DRAWN_SH[-1]
-) -> Tensor:
+    scene: Gaussians, gdfs: Sequence[Gdf], view: ViewState, bands: int = DRAWN_SH[-1]
+) -> torch.Tensor:
     """What the CPU engine makes of the start with so many higher SH coefficients, 0..1. [H,W,3]"""
-    same = fingerprint(scene)
-    states = visible_layers(view)
-    layers = [layer_of(replace(gdfs[s.gdf], scene=same), s.strength, s.gains, s.paint) for s in states]
     with torch.no_grad():
-        edited = compose_layers(scene, layers, view.blend)
+        edited = _compose(scene, gdfs, view)
         edited = replace(edited, shN=edited.shN * (torch.arange(edited.shN.shape[1]) < bands)[:, None])
+        camera = to_camera(view.camera, *_STILL)
         return render(edited, camera, background=view.background, engine="cpu").image.clamp(0.0, 1.0)
 
 
+def _compose(scene: Gaussians, gdfs: Sequence[Gdf], view: ViewState) -> Gaussians:
+    """The scene, or what a page has of it, under the layers of a view."""
+    same = fingerprint(scene)
+    states = visible_layers(view)
+    layers = [layer_of(replace(gdfs[s.gdf], scene=same), s.strength, s.gains, s.paint) for s in states]
+    return compose_layers(scene, layers, view.blend)
+
+
 def _stage(
-    document: Document, view: ViewState, snapshots: Sequence[SliderSnapshot], options: PageOptions
+    document: Document, view: ViewState, kept: Sequence[snapshots.SliderSnapshot], options: PageOptions
 ) -> tuple[dict[str, Any], list[int]]:
     """What the page begins with, as viewer/web/src/main.js reads it, and the edits that it needs."""
     paints: list[tuple[int, Any]] = []
     known: dict[tuple[int, str], int] = {}
     sliders = _sliders(view, options.layers)
-    stacks = [view.layers, *(each.edit.layers for each in snapshots)]
+    stacks = [view.layers, *(each.edit.layers for each in kept)]
     needed = {l.gdf for stack in stacks for l in stack if l.strength > 0.0 or l.name in sliders}
     edits = sorted(needed | {gdf for key in view.timeline.keys for gdf, s in key.strengths if s > 0.0})
 
@@ -203,7 +203,7 @@ def _stage(
             "group": state.group,
         }
 
-    listed = kept.with_original(snapshots, view)
+    listed = snapshots.with_original(kept, view)
     stage = {
         "background": view.background,
         "camera": _camera(view.camera),
@@ -221,9 +221,9 @@ def _stage(
                 "groups": [asdict(group) for group in each.edit.groups],
                 "blend": each.edit.blend,
             }
-            for each in snapshots
+            for each in kept
         ],
-        "pair": kept.pair_of(listed, view.pair),
+        "pair": snapshots.pair_of(listed, view.pair),
         "timeline": _film(view.timeline, edits),
         "paints": paints,
     }

@@ -1,4 +1,4 @@
-// The container that viewer/web/pack.py writes: a header, and arrays of numbers.
+// The container that viewer/web/page.py writes: a header, and arrays of numbers.
 
 const BYTES = { f4: 4, i4: 4, i2: 2, i1: 1 };
 const TYPED = { f4: Float32Array, i4: Int32Array, i2: Int16Array, i1: Int8Array };
