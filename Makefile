@@ -10,7 +10,7 @@ PYTEST := env -u PYTHONDONTWRITEBYTECODE OMP_WAIT_POLICY=PASSIVE $(BIN)/python -
 
 EXTRAS := styles,diffusion,segment,clip,colmap,video,formats,usd,cluster,gpu
 
-.PHONY: setup extras gl window demo test test-cpus test-all lint bench pictures
+.PHONY: setup extras gl window browser demo test test-cpus test-all lint bench pictures
 .DELETE_ON_ERROR:
 
 setup: $(VENV)/.ready gl
@@ -39,10 +39,15 @@ window: gl
 	@if [ "$(APT)" = apt ] && [ "$$(id -u)" = 0 ] && ! { command -v Xvfb && command -v xdotool; } >/dev/null; then \
 	  apt-get update -qq && apt-get install -y -qq xvfb xdotool >/dev/null; fi
 
+# For the tests of the web page; without it they are skipped.
+browser:
+	@if [ "$(APT)" = apt ] && [ "$$(id -u)" = 0 ] && ! command -v chromium >/dev/null; then \
+	  apt-get update -qq && apt-get install -y -qq chromium >/dev/null; fi
+
 demo: setup
 	$(BIN)/progdf demo --out demo
 
-test: setup extras window
+test: setup extras window browser
 	$(PYTEST)
 
 # The same for other kinds of processors, as far as switches make this one into them: only last bits may differ.
@@ -53,7 +58,7 @@ test-cpus: setup extras window
 	  echo "with $$cpu"; env $$cpu $(PYTEST) $(TESTS) || failed="$$failed $$cpu"; done; \
 	test -z "$$failed" || { echo "failed with$$failed"; exit 1; }
 
-test-all: setup extras window
+test-all: setup extras window browser
 	$(PYTEST) -m '' --hypothesis-profile=search
 
 # With the extras, so that types are checked against the same packages everywhere; for each system, as each has

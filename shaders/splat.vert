@@ -2,8 +2,7 @@
 // One triangle around one projected Gaussian: an instance is a Gaussian, a vertex one of three corners.
 //
 // Reads   viewer/gl/scene_textures.py: PROJECTED (see project.vert), in pixels of the picture, y down.
-// Writes  gl_Position in clip space; picture y down is clip y up, so row 0 of the framebuffer is the picture's
-//         first row and gl_FragCoord.xy is the pixel position itself.
+// Writes  gl_Position and what splat.frag reads, see include/corner.glsl.
 
 in vec2 center;
 in vec3 shape;
@@ -12,32 +11,8 @@ in vec4 rgb_opacity;
 
 uniform vec2 size;           // width, height of the picture in pixels
 
-flat out vec2 splat_center;
-flat out vec3 splat_shape;
-flat out float splat_r2;
-flat out vec4 splat_rgb_opacity;
-
-// Around the unit circle, the smallest triangle: 1.65 times its area, and a quarter fewer shaded pixels than a
-// square's two triangles, whose common edge is shaded twice in 2x2 blocks.
-const vec2 CORNERS[3] = vec2[3](vec2(-1.7320508, -1.0), vec2(1.7320508, -1.0), vec2(0.0, 2.0));
-const float LARGEST = 16384.0;   // px: beyond it float32 corners are no longer exact to a pixel; cover the picture
+#include "include/corner.glsl"
 
 void main() {
-    splat_center = center;
-    splat_shape = shape;
-    splat_r2 = r2;
-    splat_rgb_opacity = rgb_opacity;
-    if (r2 < 0.0) {
-        gl_Position = vec4(2.0, 2.0, 2.0, 1.0);
-        return;
-    }
-    // a little larger, so that no pixel center at the rim is lost to the rounding of the corners
-    vec2 uv = CORNERS[gl_VertexID % 3] * (sqrt(r2) * 1.0001 + 0.03);
-    float dy = uv.y / shape.z;
-    vec2 corner = center + vec2(uv.x / shape.y - shape.x * dy, dy);
-    float reach = length(center) + (sqrt(r2) + 0.03) * (1.0 / shape.y + (1.0 + abs(shape.x)) / shape.z);
-    if (!(reach < LARGEST)) {
-        corner = size * vec2[3](vec2(0.0, 0.0), vec2(2.0, 0.0), vec2(0.0, 2.0))[gl_VertexID % 3];
-    }
-    gl_Position = vec4(2.0 * corner / size - 1.0, 0.0, 1.0);
+    place_corner(gl_VertexID % 3);
 }

@@ -36,7 +36,7 @@ ORDER = {
         demo_scenes io rasterize field formats gdf scene compose tidy cli __init__ __main__""",
     "trainer": """__init__ options store views paint fill editors resolve setup regions
         motion optimize fit report preview run evaluate batch cli""",
-    "viewer": "__init__ camera gl jobs state render files pictures ui panel app commands",
+    "viewer": "__init__ camera gl jobs state render web files pictures ui panel app commands",
     "benchmarks": """__init__ analytic_edits courses table ablation rasterizer training
         recorded_runs viewer field edits networks sliders warps pictures __main__""",
 }
@@ -46,8 +46,9 @@ MOST_LINES = 600
 
 # What a package may hold: modules, and lines of code (no blank, comment, docstring or import). A feature
 # says in its commit what it adds and what it replaces; these only fall.
-BUDGETS = {"progdf": (80, 11045), "trainer": (70, 10630), "viewer": (69, 11516)}
+BUDGETS = {"progdf": (80, 11045), "trainer": (70, 10630), "viewer": (71, 11966)}
 MOST_IMPORTS = 0.073  # of all lines
+MOST_SCRIPT_LINES = 1200  # of the JavaScript of the web page, counted alike
 MOST_FUNCTION_LINES = 80
 MOST_POSITIONAL = 8
 LEAST_LINES = 80  # of a module that one other imports alone; it is a section of that one
@@ -302,6 +303,23 @@ def test_no_file_is_longer_than_one_reads_in_a_sitting(sources: dict[Path, str])
     lengths = {path.as_posix(): source.count("\n") for path, source in sources.items()}
     long = sorted(name for name, lines in lengths.items() if lines > MOST_LINES)
     assert not long, f"more than {MOST_LINES} lines: {long}"
+
+
+def test_the_page_knows_nothing_of_the_window(sources: dict[Path, str]) -> None:
+    """It is made of the library and the shaders, so that a notebook can show it too."""
+    graph = import_graph(sources)
+    page = [module for module in graph if module.startswith("viewer.web")]
+    assert page
+    others = {target for module in page for target in graph[module] if not target.startswith("viewer.web")}
+    assert {target.split(".")[0] for target in others} == {"progdf"}
+
+
+def test_the_script_of_the_page_keeps_its_budget() -> None:
+    files = sorted((ROOT / "viewer" / "web" / "src").glob("*.js"))
+    lines = [line.strip() for file in files for line in file.read_text(encoding="utf-8").splitlines()]
+    code = [line for line in lines if line and not line.startswith(("//", "import "))]
+    assert 0 < len(code) <= MOST_SCRIPT_LINES
+    assert max(map(len, lines)) <= 130
 
 
 @pytest.fixture(scope="module")

@@ -62,7 +62,7 @@ def monomials(colors: Tensor, degree: int) -> Tensor:
 
 
 @cache
-def _sphere(degree: int, device: torch.device) -> tuple[Tensor, Tensor]:
+def sphere(degree: int, device: torch.device) -> tuple[Tensor, Tensor]:
     """Values of the bands in even directions of the sphere, and their least squares. [D,B], [B,D] float32"""
     index = torch.arange(_DIRECTIONS, dtype=torch.float64) + 0.5
     z, angle = 1 - 2 * index / _DIRECTIONS, math.pi * (1 + math.sqrt(5)) * index
@@ -116,7 +116,7 @@ def look_up(colors: Tensor, table: Tensor) -> Tensor:
 
 def _map_chunk(sh: Tensor, table: Tensor, degree: int) -> Tensor:
     """`map_colors` of the channels of some members. [3,m,B] -> [3,m,B]"""
-    values, inverse = _sphere(math.isqrt(sh.shape[2]) - 1, sh.device)
+    values, inverse = sphere(math.isqrt(sh.shape[2]) - 1, sh.device)
     colors = sh @ values.T + 0.5
     mapped = map_drawn(colors, table, degree)
     made = sh + (mapped - colors.clamp_min(0.0)) @ inverse.T

@@ -10,11 +10,12 @@ from torch import Tensor
 
 from progdf.field import BakedField, fit_separable
 from progdf.field.choose import Render
-from progdf.field.separable import quantize_bases
+from progdf.field.separable import course_field, opacity_course, quantize_bases
 from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians, attribute_slices
-from progdf.gdf.file import Gdf, fingerprint
+from progdf.gdf.file import ADDED_LOGIT, Gdf, fingerprint
 from progdf.region import Region
 from tests.helpers.draws import Draws
+from tests.helpers.scenes import random_gaussians
 
 
 def curved_trajectory(
@@ -80,6 +81,28 @@ def edit_of(scene: Gaussians, members: Tensor, field: BakedField, name: str = "s
     score = torch.zeros(len(scene))
     score[members] = 1.0
     return Gdf(name, Region(name, members, score), field, fingerprint(scene), "recolor:#3060d0")
+
+
+def added_rows(count: int, seed: int, bands: int = 1) -> Gaussians:
+    rows = random_gaussians(count, seed, sh_degree=bands)
+    return replace(rows, logit_opacities=torch.full((count,), ADDED_LOGIT))
+
+
+def growing(scene: Gaussians, members: torch.Tensor, count: int, seed: int, name: str = "hat") -> Gdf:
+    """Takes every second member away, and lets so many rows appear that move as they do."""
+    draws, added = Draws(seed), added_rows(count, seed)
+    start = torch.cat([scene.logit_opacities[members], added.logit_opacities])
+    end = torch.cat([start[: len(members)], draws.normal(count) + 2.0])
+    end[: len(members) : 2] = -8.0
+    knots, opacity = opacity_course(start, end)
+    offsets = torch.zeros(len(knots), len(start), 14)
+    offsets[:, :, attribute_slices(14)["logit_opacities"]] = opacity[..., None]
+    offsets[:, :, :3] = knots[:, None, None] * draws.normal(len(start), 3)
+    return replace(edit_of(scene, members, curved_field(len(members)), name), **grown(offsets, knots, added))
+
+
+def grown(offsets: torch.Tensor, knots: torch.Tensor, added: Gaussians) -> dict[str, object]:
+    return {"field": course_field(knots, offsets), "added": added}
 
 
 def some_rows(scene: Gaussians, count: int, seed: int = 0) -> Tensor:

@@ -38,6 +38,7 @@ TITLES = {
     "delivery": "Still being written",
     "log": "Training log",
     "export": "Export the edited scene",
+    "export_page": "Export a web page",
     "render_picture": "Render picture",
     "render_film": "Render film",
     "about": "About",
@@ -54,6 +55,7 @@ _HINTS = {
     "delivery": "{} is not finished. What is stopped now is not kept.",
     "log": "{}",
     "export": "A plain 3DGS .ply of what the sliders show, which any viewer opens.",
+    "export_page": "One .html file with these sliders, snapshots and film, which any browser opens.",
     "render_picture": "This view at any size; what stands at its upper and lower edge stays there.",
     "render_film": "It is rendered beside your work; the panel shows how far it is.",
     "about": "Edit a trained 3D Gaussian Splatting scene once, then drag a slider through it.",
@@ -63,11 +65,12 @@ _SUBMIT = {
     "open": "Open",
     "replace": "Replace",
     "export": "Export",
+    "export_page": "Export",
     "render_picture": "Render",
     "render_film": "Render",
 }
 """The button of each question that has a path field."""
-_DELIVERS = ("export", "render_picture", "render_film")
+_DELIVERS = ("export", "export_page", "render_picture", "render_film")
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,7 @@ from progdf.scene.up_axis import UpChoice
 from viewer.camera.view_camera import Vec3, up_of, with_up
 from viewer.files import document, session
 from viewer.files.document import Document
+from viewer.files.web_page import PageOptions
 from viewer.state import layers as stacks
 from viewer.state.facts import describe_applied
 from viewer.state.paint import encode
@@ -153,14 +154,26 @@ class RenderOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class ExportOptions:
-    """Write a scene under its edits for other programs, or the colors of a grade as a .cube file."""
+    """Write a scene under its edits for other programs, or as a web page with their sliders; or a grade as a
+    .cube file."""
 
     stack: OmitArgPrefixes[StackOptions]
     out: Annotated[Path, word("FILE", aliases=["-o"])]
-    """The file to write: a 3DGS .ply, .compressed.ply, .spz, .sog, .splat, .glb or .usdc; a .progdf.zip with
-    the scene and its edits, to hand on; or a .cube file, for color programs, of what one grade does."""
+    """The file to write: a 3DGS .ply, .compressed.ply, .spz, .sog, .splat, .glb or .usdc; a .html page, one
+    file that any browser opens, with a slider for each edit; a .progdf.zip with the scene and its edits, to
+    hand on; or a .cube file, for color programs, of what one grade does."""
     frames: Annotated[int | None, word("N", "one file")] = None
     """As many steps from the original to the strengths: numbered files, of a .usdc its time samples."""
+    page: OmitArgPrefixes[PageOptions] = PageOptions()
+    up: UpChoice = "auto"
+    """The axis of the scene that is up in a page; auto: as the edits were trained, else from the ground."""
+    background: Annotated[str, word("COLOR")] = "white"
+    """Of a page: #rrggbb, white or black."""
+
+    @property
+    def drawing(self) -> DrawingOptions:
+        """How a page is drawn."""
+        return DrawingOptions(up=self.up, background=self.background)
 
 
 class Named(Protocol):

@@ -57,6 +57,7 @@ from viewer.camera.view_camera import (
 )
 from viewer.files import session, timeline_file
 from viewer.files.document import empty
+from viewer.files.web_page import PAGE, PageOptions, write_page
 from viewer.pictures import film
 from viewer.pictures.compare import Comparer, draw_labels
 from viewer.render.engine import ViewEngine
@@ -110,26 +111,35 @@ def view(argv: Sequence[str]) -> int:
 
 
 def export(argv: Sequence[str]) -> int:
-    """`progdf export`: the edited scene as a .ply that any viewer opens."""
+    """`progdf export`: the edited scene for other programs, with its sliders for a browser or a colleague."""
     options: ExportOptions = parse(ExportOptions, argv, "progdf export")
     out = options.out
-    endings = (end for end in (CUBE, BUNDLE) if out.name.lower().endswith(end))
+    endings = (end for end in (CUBE, BUNDLE, PAGE) if out.name.lower().endswith(end))
     ending = next(endings, None) or written_format(out)
-    if options.frames is not None and (ending in (CUBE, BUNDLE) or not 2 <= options.frames <= MOST_FRAMES):
+    if options.frames is not None and (
+        ending in (CUBE, BUNDLE, PAGE) or not 2 <= options.frames <= MOST_FRAMES
+    ):
         raise ProgdfError(
             f"--frames takes 2 to {MOST_FRAMES} steps of a scene, not {options.frames} of {out.name}"
         )
-    opened = open_stack(options.stack, unset=1.0)
+    if ending != PAGE and (options.page, options.up, options.background) != (PageOptions(), "auto", "white"):
+        raise ProgdfError(f"{out} is no web page; leave out what only a .html page has")
+    drawing = options.drawing if ending == PAGE else None
+    opened = open_stack(options.stack, drawing, unset=1.0)
     check_not_an_input(out, opened.files)
+    if ending == PAGE:
+        camera = (
+            first_camera(opened.document.original, up=opened.up)
+            if opened.session is None
+            else opened.view.camera
+        )
+        view = replace(opened.view, camera=camera)
+        print_line(write_page(out, opened.document, view, opened.snapshots, options.page))
+        return 0
     if ending == CUBE:
         return _export_cube(out, opened)
     if ending == BUNDLE:
-        with tempfile.TemporaryDirectory(prefix="progdf-") as folder:
-            source = Path(folder) / "stack.session.json"
-            session.save(source, session.WindowSession(opened.document, opened.view, opened.snapshots))
-            count = write_bundle(out, source)
-        print_line(f"wrote {out}: {file_size(out.stat().st_size)}, {count} files; open it with progdf view")
-        return 0
+        return _export_bundle(out, opened)
     document, strengths = opened.document, describe_strengths(opened.view)
     if options.frames is not None:
         shares = np.linspace(0.0, 1.0, options.frames).tolist()
@@ -165,6 +175,16 @@ def _describe_loss(out: Path, edited: Gaussians) -> str:
     mean, worst = picture_difference(edited, load_scene_with_report(out)[0])
     shown = "no pixel differs" if mean == NO_DIFFERENCE else f"{mean:.1f} dB to it, {worst:.1f} at worst"
     return f"{size}; read back: {shown}"
+
+
+def _export_bundle(out: Path, opened: OpenStack) -> int:
+    """The scene, its edits and the session in one file."""
+    with tempfile.TemporaryDirectory(prefix="progdf-") as folder:
+        source = Path(folder) / "stack.session.json"
+        session.save(source, session.WindowSession(opened.document, opened.view, opened.snapshots))
+        count = write_bundle(out, source)
+    print_line(f"wrote {out}: {file_size(out.stat().st_size)}, {count} files; open it with progdf view")
+    return 0
 
 
 def _export_cube(out: Path, opened: OpenStack) -> int:

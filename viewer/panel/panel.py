@@ -43,6 +43,7 @@ _MAKES = (
     ("Take this view", "take_view"),
     ("Hide strays", "hide_strays"),
     ("Export .ply…", "export"),
+    ("Export web page…", "export_page"),
     ("Render picture…", "render_picture"),
     ("Render film…", "render_film"),
 )

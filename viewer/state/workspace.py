@@ -44,7 +44,7 @@ REQUESTS = (
         "run_log",
         "stop_and_quit",
     ),
-    *("export", "render_picture", "render_film", "deliver", "drop_and_quit"),
+    *("export", "export_page", "render_picture", "render_film", "deliver", "drop_and_quit"),
     *("about", "demo"),
     *("overwrite", "restore_autosave", "discard_autosave", "duplicate", "replace", "replace_by"),
     *(

@@ -180,6 +180,7 @@ TOPICS: dict[str, tuple[KeyBinding, ...]] = {
         *_keys("save the session as", "Ctrl+Shift+S save_as"),
         *_keys("open a session, scene or edit", "Ctrl+O open"),
         *_keys("export the edited scene as .ply", "Ctrl+E export"),
+        *_keys("export a web page with its sliders", "Ctrl+Shift+E export_page"),
         *_keys("render a picture", "Ctrl+P render_picture"),
         *_keys("render a film", "Ctrl+Shift+P render_film"),
         *_keys("show timings", "F10 overlay"),
@@ -199,6 +200,7 @@ OPENS_TEXT = (
     "save_as",
     "open",
     "export",
+    "export_page",
     "render_picture",
     "render_film",
 )

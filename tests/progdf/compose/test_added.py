@@ -16,40 +16,17 @@ from progdf.compose.composer import Composer
 from progdf.compose.reference import BLENDS, Gains, Layer, compose_layers
 from progdf.errors import ProgdfError
 from progdf.field import BakedField
-from progdf.field.separable import course_field, opacity_course
 from progdf.formats.ply import load_ply, save_ply
 from progdf.gaussians import ATTRIBUTES, Gaussians, attribute_slices
-from progdf.gdf.file import ADDED_LOGIT, Gdf, load_gdf, read_gdf, save_gdf
+from progdf.gdf.file import Gdf, load_gdf, read_gdf, save_gdf
 from progdf.rasterize import render
 from tests.helpers.draws import Draws
-from tests.helpers.edits import bits, curved_field, edit_of, some_rows
+from tests.helpers.edits import bits, curved_field, edit_of, growing, some_rows
 from tests.helpers.fuzz_changes import header_of, signed_gdf
 from tests.helpers.scenes import front_camera, random_gaussians
 
 LOGIT = attribute_slices(14)["logit_opacities"]
 COUNT = 300
-
-
-def added_rows(count: int, seed: int, bands: int = 1) -> Gaussians:
-    rows = random_gaussians(count, seed, sh_degree=bands)
-    return replace(rows, logit_opacities=torch.full((count,), ADDED_LOGIT))
-
-
-def growing(scene: Gaussians, members: torch.Tensor, count: int, seed: int, name: str = "hat") -> Gdf:
-    """Takes every second member away, and lets so many rows appear that move as they do."""
-    draws, added = Draws(seed), added_rows(count, seed)
-    start = torch.cat([scene.logit_opacities[members], added.logit_opacities])
-    end = torch.cat([start[: len(members)], draws.normal(count) + 2.0])
-    end[: len(members) : 2] = -8.0
-    knots, opacity = opacity_course(start, end)
-    offsets = torch.zeros(len(knots), len(start), 14)
-    offsets[:, :, LOGIT] = opacity[..., None]
-    offsets[:, :, :3] = knots[:, None, None] * draws.normal(len(start), 3)
-    return replace(edit_of(scene, members, curved_field(len(members)), name), **grown(offsets, knots, added))
-
-
-def grown(offsets: torch.Tensor, knots: torch.Tensor, added: Gaussians) -> dict[str, object]:
-    return {"field": course_field(knots, offsets), "added": added}
 
 
 @pytest.fixture(scope="module")

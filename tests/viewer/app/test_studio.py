@@ -19,6 +19,7 @@ from tests.helpers.ui_rig import bear, first_view
 from viewer.app import app as application
 from viewer.camera.view_camera import first_camera
 from viewer.files.document import empty
+from viewer.files.session import open_session
 from viewer.files.user_files import load_thumbnail
 from viewer.jobs import job_queue
 from viewer.jobs.job_queue import TURNTABLE
@@ -260,6 +261,17 @@ def test_the_scene_is_exported_by_the_command(window: application.App, tmp_path:
         turn(window)
     film = json.loads(Path(Trainer.said[-1]).read_text(encoding="utf-8"))["view"]["timeline"]
     assert len({key["camera"]["azimuth"] for key in film["keys"]}) == len(film["keys"]) == 96
+
+
+def test_a_web_page_is_exported_by_the_command_with_the_snapshots(window: application.App) -> None:
+    press(window, "F3", "Ctrl+Shift+E")
+    asked = window.main_view.work.dialog
+    assert asked is not None
+    assert asked.text.endswith("bear_edited.html")
+    press(window, "Enter")
+    turn(window)
+    assert Trainer.said[:3] == ("export", f"--out={asked.text}", "--title=bear")
+    assert len(open_session(Path(Trainer.said[-1])).snapshots) == 1
 
 
 def test_quitting_asks_while_something_is_written(window: application.App, tmp_path: Path) -> None:

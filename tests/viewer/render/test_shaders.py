@@ -9,10 +9,11 @@ import moderngl
 import numpy as np
 import pytest
 
+import shaders
 from progdf.gaussians import ATTRIBUTES
 from progdf.rasterize import engines
-from viewer.gl import programs
-from viewer.gl.programs import ShaderError, load_program, load_source
+from shaders import ShaderError, load_source
+from viewer.gl.programs import load_program
 from viewer.gl.scene_textures import GRID_LINE, ORDER, PLACES, PROJECTED, SPLAT_TEXTURES
 from viewer.gl.splats import vertex_format
 from viewer.render.ground_grid import CLEAR
@@ -21,6 +22,7 @@ STAGES = (
     "project.vert",
     "splat.vert",
     "splat.frag",
+    "web.vert",
     "present.vert",
     "present.frag",
     "stretch.frag",
@@ -96,7 +98,7 @@ def test_every_head_says_what_the_stage_reads_and_writes() -> None:
 def test_an_include_is_taken_once_and_keeps_the_files_lines() -> None:
     source = load_source("project.vert")
     assert source.files[0] == "project.vert"
-    assert len(set(source.files)) == len(source.files) == 4
+    assert len(set(source.files)) == len(source.files) == 5
     assert source.text.count("const float DILATION") == 1
     lines = source.text.splitlines()
     after = next(i for i, line in enumerate(lines) if line.startswith("in uint splat"))
@@ -113,7 +115,7 @@ def test_a_missing_include_names_the_file_and_line_that_wants_it(
 ) -> None:
     folder = tmp_path_factory.mktemp("shaders")
     (folder / "a.vert").write_text('#version 330 core\n\n#include "include/nope.glsl"\n')
-    monkeypatch.setattr(programs.resources, "files", lambda _: folder)
+    monkeypatch.setattr(shaders.resources, "files", lambda _: folder)
     with pytest.raises(ShaderError, match=r"shaders/include/nope\.glsl does not exist; shaders/a\.vert:3"):
         load_source("a.vert")
 
@@ -127,7 +129,7 @@ def test_a_mistake_in_an_include_is_told_with_its_own_file_and_line(
     (folder / "a.vert").write_text(
         '#version 330 core\n#include "broken.glsl"\nvoid main() { gl_Position = vec4(f()); }\n'
     )
-    monkeypatch.setattr(programs.resources, "files", lambda _: folder)
+    monkeypatch.setattr(shaders.resources, "files", lambda _: folder)
     with pytest.raises(ShaderError, match=r"shaders/broken\.glsl:3: error"):
         load_program(ctx, "a.vert", varyings=("gl_Position",))
 
@@ -142,7 +144,7 @@ def test_a_mistake_after_an_include_is_told_with_the_stages_line(
     (folder / "a.frag").write_text(
         '#version 330 core\nout vec4 color;\n#include "fine.glsl"\nvoid main() { color = nothing; }\n'
     )
-    monkeypatch.setattr(programs.resources, "files", lambda _: folder)
+    monkeypatch.setattr(shaders.resources, "files", lambda _: folder)
     with pytest.raises(ShaderError, match=r"shaders/a\.frag:4: .*nothing"):
         load_program(ctx, "a.vert", "a.frag")
 
@@ -151,5 +153,6 @@ def test_a_mistake_after_an_include_is_told_with_the_stages_line(
 def test_every_program_compiles_as_gl_3_3_core(ctx: moderngl.Context) -> None:
     load_program(ctx, "project.vert", varyings=PROJECTED.names or ()).release()
     load_program(ctx, "splat.vert", "splat.frag").release()
+    load_program(ctx, "web.vert", "splat.frag").release()
     load_program(ctx, "present.vert", "present.frag").release()
     load_program(ctx, "present.vert", "stretch.frag").release()

@@ -19,7 +19,7 @@ from viewer.state import timeline
 from viewer.state.view_state import Comparison, ViewState
 from viewer.state.workspace import Dialog
 
-SUFFIXES = {"export": ".ply", "render_picture": ".png", "render_film": ".mp4"}
+SUFFIXES = {"export": ".ply", "export_page": ".html", "render_picture": ".png", "render_film": ".mp4"}
 """Questions, and how the names of their files end."""
 
 
@@ -97,14 +97,15 @@ class DeliverActions:
             view = replace(view, timeline=replace(view.timeline, fps=options.fps))
         number = len(list(self._queue.folder.iterdir()))
         stack = self._queue.folder / f"stack{number}.session.json"
-        session.save(stack, WindowSession(document, view))
+        session.save(stack, WindowSession(document, view, self._app.main_view.work.snapshots))
         size = f"--size={options.width}x{options.height}"
         words = {
             "export": ["export", f"--out={out}"],
+            "export_page": ["export", f"--out={out}", f"--title={Path(document.title).stem}"],
             "render_picture": ["render", f"--out={out}", size, *["--alpha"] * options.alpha],
             "render_film": ["render", f"--out={out}", size, f"--timeline={stack}"],
         }[kind]
-        title = f"{'Exporting' if kind == 'export' else 'Rendering'} {out.name}"
+        title = f"{'Exporting' if kind.startswith('export') else 'Rendering'} {out.name}"
         assert document.path is not None
         self._queue.add(
             Delivery(title, out, (*words, str(stack)), stack.with_suffix(".log"), document.path.resolve())

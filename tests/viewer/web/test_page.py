@@ -1,0 +1,568 @@
+"""The web page in a real Chromium: its numbers, its pictures, and what a person does with it."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import io
+import json
+import re
+import shutil
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from progdf.__main__ import main
+from progdf.compose.layers import BLENDS, Gains, Layer
+from progdf.compose.reference import compose_layers
+from progdf.field.baked import GradeForm, SliderRemap, identity_map, lattice_colors
+from progdf.field.grade import bake_grade
+from progdf.gaussians import ATTRIBUTES, Gaussians, pack
+from progdf.gdf.file import Gdf, load_gdf, save_gdf
+from progdf.rasterize import render
+from tests.helpers.draws import Draws
+from tests.helpers.edits import curved_field, edit_of, growing, some_rows
+from tests.helpers.scenes import random_gaussians
+from tests.helpers.sessions import bear_files, full_view, saved_session
+from tests.helpers.stacks import Stack, many_edits
+from tests.helpers.ui_rig import bear
+from viewer.camera.view_camera import first_camera, to_camera
+from viewer.files.document import Document
+from viewer.files.web_page import PageOptions, write_page
+from viewer.state import snapshots, timeline
+from viewer.state.layers import visible_layers
+from viewer.state.view_state import Keyframe, LayerGroup, LayerState, SnapshotPair, Timeline, ViewState
+from viewer.web.page import join
+
+playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+SOFTWARE = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+SIZE = 660, 400
+PIXELS = 330, 200  # half as many each way, which the software renderer draws in a quarter of the time
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Any]:
+    if CHROMIUM is None:
+        pytest.skip("no Chromium is installed")
+    with playwright.sync_playwright() as started:
+        chromium = started.chromium.launch(executable_path=CHROMIUM, args=SOFTWARE)
+        yield chromium
+        chromium.close()
+
+
+@dataclass
+class Opened:
+    """A page in a tab of its own, and what it asked for and complained of."""
+
+    tab: Any
+    requests: list[str]
+    complaints: list[str]
+
+    def strengths(self) -> dict[str, float]:
+        return self.tab.evaluate("Object.fromEntries(progdf.view.layers.map((l) => [l.name, l.strength]))")
+
+    def wait(self, expression: str) -> None:
+        """Until it holds. (playwright's own way compiles text in the page, which its policy forbids.)"""
+        for _ in range(400):
+            if self.tab.evaluate(expression):
+                return
+            self.tab.wait_for_timeout(25)
+        raise AssertionError(f"{expression} never came; {self.complaints}")
+
+    def camera(self) -> dict[str, Any]:
+        return self.tab.evaluate("progdf.camera")
+
+    def picture(self) -> np.ndarray:
+        address = self.tab.evaluate("progdf.picture()")
+        return np.asarray(Image.open(io.BytesIO(base64.b64decode(address.split(",")[1]))).convert("RGB"))
+
+    def slide(self, strengths: Sequence[float]) -> None:
+        self.tab.evaluate(
+            "(s) => progdf.change({...progdf.view,"
+            " layers: progdf.view.layers.map((l, i) => ({...l, strength: s[i]}))})",
+            list(strengths),
+        )
+
+
+@pytest.fixture
+def open_page(browser: Any) -> Iterator[Any]:
+    contexts = []
+
+    def opening(path: Path, script: str = "", size: tuple[int, int] = SIZE, **options: Any) -> Opened:
+        context = browser.new_context(viewport=dict(zip(("width", "height"), size, strict=True)), **options)
+        contexts.append(context)
+        tab = context.new_page()
+        opened = Opened(tab, [], [])
+        tab.on("request", lambda request: opened.requests.append(request.url))
+        tab.on("pageerror", lambda error: opened.complaints.append(str(error)))
+        tab.on("console", lambda message: opened.complaints.append(message.text))
+        tab.add_init_script(f"Object.defineProperty(window, 'devicePixelRatio', {{value: 0.5}}); {script}")
+        tab.goto(path.as_uri())
+        return opened
+
+    yield opening
+    for context in contexts:
+        context.close()
+
+
+def ready(opened: Opened) -> Opened:
+    opened.tab.wait_for_selector("body.drawn", timeout=20_000)
+    return opened
+
+
+def psnr(a: np.ndarray, b: np.ndarray) -> float:
+    return float(10 * np.log10(255**2 / max(np.mean((a.astype(float) - b) ** 2), 1e-12)))
+
+
+def grade_form(members: int, degree: int, bands: int, seed: int) -> GradeForm:
+    """A map that bends colors, with a residual, a mask and a slider of its own."""
+    draws = Draws(seed)
+    knots, same = torch.tensor([0.0, 0.5, 1.0]), identity_map(2) if degree else lattice_colors(5)
+    bent = same + 0.3 * draws.normal(*same.shape)
+    table = torch.stack([same, same + 0.4 * (bent - same), bent])
+    if not degree:
+        knots, table = knots[::2], table[::2]
+    coefficients = torch.linspace(0, 1, len(knots))[:, None]
+    residual = (draws.normal(1, members, 3 * bands) * 40).clamp(-127, 127).to(torch.int8)
+    ends = (
+        torch.tensor([0.0, 0.4, 1.0], dtype=torch.float64),
+        torch.tensor([0.0, 0.6, 1.0], dtype=torch.float64),
+    )
+    mask = (255 * draws.uniform(members)).to(torch.uint8)
+    scale = torch.full((1, 3 * bands), 0.004)
+    return GradeForm(degree, knots, table, residual, scale, coefficients, SliderRemap(*ends), mask)
+
+
+def graded(scene: Gaussians, name: str, degree: int, seed: int) -> Gdf:
+    rows = some_rows(scene, 120, seed)
+    form = grade_form(len(rows), degree, 1 + min(scene.shN.shape[1], 3), seed)
+    return edit_of(scene, rows, bake_grade(form, pack(scene[rows], True)), name)
+
+
+def document_of(scene: Gaussians, gdfs: Sequence[Gdf]) -> tuple[Document, ViewState]:
+    layers = tuple(LayerState(i, gdf.name) for i, gdf in enumerate(gdfs))
+    return Document("scene.ply", scene, tuple(gdfs)), ViewState(camera=first_camera(scene), layers=layers)
+
+
+def random_layer(gdf: Gdf, draws: Draws) -> Layer:
+    gains = Gains(*draws.uniform(3).tolist()) if float(draws.uniform(1)) < 0.4 else Gains()
+    weights = draws.uniform(gdf.members) if float(draws.uniform(1)) < 0.4 else None
+    return Layer(gdf, float(draws.uniform(1)) * 1.2, gains=gains, weights=weights)
+
+
+RUN = """([layers, blend]) => {
+  const { composer } = progdf;
+  composer.update(layers, blend);
+  return Object.fromEntries([...composer.moving].map((name) => [name, [...composer.after[name]]]));
+}"""
+
+
+@pytest.mark.parametrize("degree", [0, 1])
+def test_every_attribute_is_that_of_the_plain_form_under_every_rule(
+    open_page: Any, tmp_path: Path, degree: int
+) -> None:
+    scene = random_gaussians(300, seed=5, sh_degree=degree)
+    scene = replace(scene, logit_opacities=scene.logit_opacities.clamp(min=-4.0))  # all are on the page
+    gdfs = [
+        growing(scene, some_rows(scene, 40, 1), 25, 7),
+        edit_of(scene, some_rows(scene, 150, 2), curved_field(150, 2, 14 + 3 * len(scene.shN[0])), "shirt"),
+        graded(scene, "warm", 2, 3),
+        graded(scene, "table", 0, 4),
+    ]
+    document, view = document_of(scene, gdfs)
+    write_page(tmp_path / "page.html", document, view, (), PageOptions(quality="exact"))
+    opened = ready(open_page(tmp_path / "page.html"))
+    assert opened.complaints == []
+    means = np.asarray(opened.tab.evaluate("[...progdf.means]"), np.float32).reshape(-1, 3)
+    rows = {row.tobytes(): i for i, row in enumerate(document.scene.means.numpy())}
+    order = np.array([rows[row.tobytes()] for row in means])  # of the page's rows in the scene
+    place = np.empty(len(order), int)
+    place[order] = np.arange(len(order))
+    count = opened.tab.evaluate("progdf.composer.count")
+    draws = Draws(degree)
+    stacks: list[tuple[list[Layer], str]] = [
+        ([Layer(g, s)], "adjust") for g in document.gdfs for s in (1.0, 0.0)
+    ]
+    stacks += [
+        ([random_layer(document.gdfs[i], draws) for i in draws.order(4).tolist()], blend)
+        for blend in BLENDS * 4
+    ]
+    for number, (layers, blend) in enumerate(stacks):
+        sent = []
+        for layer in layers:
+            edit = next(i for i, gdf in enumerate(document.gdfs) if gdf is layer.gdf)
+            at = np.argsort(place[layer.gdf.region.members.numpy()])
+            weights = None if layer.weights is None else layer.weights.numpy()[at].tolist()
+            gains = {kind: getattr(layer.gains, kind) for kind in ("geometry", "opacity", "color")}
+            sent.append(
+                {
+                    "edit": edit,
+                    "strength": layer.strength,
+                    "gains": gains,
+                    "weights": weights,
+                    "paint": number,
+                }
+            )
+        after = opened.tab.evaluate(RUN, [sent, blend])
+        plain = compose_layers(document.scene, layers, blend)
+        for name in ATTRIBUTES:
+            if name not in after:
+                continue
+            numbers = getattr(plain, name)[torch.from_numpy(order[:count])].numpy()
+            page = np.asarray(after[name], np.float32).reshape(numbers.shape)
+            if number < 8:  # one layer at an end
+                assert page.tobytes() == numbers.tobytes(), (name, number)
+            else:
+                assert np.abs(page - numbers).max() <= 1e-6 * max(1.0, np.abs(numbers).max()), (name, blend)
+
+
+@pytest.fixture(scope="module")
+def bear_page(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Stack]:
+    """The bear with its scarf and ears, by the command, both half way."""
+    folder = tmp_path_factory.mktemp("bear")
+    scene, *edits = bear().save(folder)
+    half = [word for gdf in bear().gdfs for word in ("--set", f"{gdf.name}=0.5")]
+    out = folder / "page.html"
+    assert main(["export", str(scene), *map(str, edits), "-o", str(out), "--quality", "exact", *half]) == 0
+    return out, bear()
+
+
+def cpu_picture(stack: Stack, camera: dict[str, Any], strengths: Sequence[float]) -> np.ndarray:
+    """What the CPU engine draws from where the page looks. [H,W,3] uint8"""
+    seen = replace(
+        first_camera(stack.scene), **{k: tuple(v) if isinstance(v, list) else v for k, v in camera.items()}
+    )
+    layers = [Layer(gdf, s) for gdf, s in zip(stack.gdfs, strengths, strict=True)]
+    with torch.no_grad():
+        edited = compose_layers(stack.scene, layers, "adjust")
+        image = render(edited, to_camera(seen, *PIXELS), background=(1.0, 1.0, 1.0)).image
+    return (image.clamp(0, 1) * 255 + 0.5).to(torch.uint8).numpy()
+
+
+@pytest.mark.parametrize(("quality", "least"), [("exact", 60.0), ("compact", 50.0)])
+def test_pictures_are_those_of_the_cpu_engine(
+    open_page: Any, tmp_path: Path, quality: str, least: float
+) -> None:
+    stack = bear()
+    document, view = document_of(stack.scene, stack.gdfs)
+    write_page(tmp_path / "page.html", document, view, (), PageOptions(quality=quality))  # type: ignore[arg-type]
+    opened = ready(open_page(tmp_path / "page.html"))
+    opened.tab.click("#fold")
+    for strengths in ((0.0, 0.0), (1.0, 1.0), (0.3, 0.8)):
+        opened.slide(strengths)
+        picture = opened.picture()
+        assert picture.shape == (*PIXELS[::-1], 3)
+        assert psnr(picture, cpu_picture(stack, opened.camera(), strengths)) >= least
+
+
+def test_the_mouse_turns_slides_and_zooms_and_sets_the_pivot(
+    open_page: Any, bear_page: tuple[Path, Stack]
+) -> None:
+    opened = ready(open_page(bear_page[0]))
+    mouse, start = opened.tab.mouse, opened.camera()
+    mouse.move(100, 150)
+    mouse.down()
+    mouse.move(160, 170, steps=3)
+    mouse.up()
+    turned = opened.camera()
+    assert turned["azimuth"] == pytest.approx((start["azimuth"] - 18 + 180) % 360 - 180)
+    assert turned["elevation"] == pytest.approx(start["elevation"] + 6)
+    mouse.down(button="right")
+    mouse.move(150, 170, steps=3)
+    mouse.up(button="right")
+    assert opened.camera()["pivot"] != turned["pivot"]
+    mouse.wheel(0, -100)
+    opened.wait(f"progdf.camera.distance < {0.95 * turned['distance']}")
+    opened.tab.click("#fold")
+    opened.tab.click("#home")
+    opened.wait("!progdf.glide")
+    assert opened.camera() == start
+    before = opened.tab.evaluate("progdf.camera.pivot")
+    mouse.dblclick(SIZE[0] / 2, SIZE[1] / 2)
+    opened.wait(f"!progdf.glide && progdf.camera.pivot[0] !== {before[0]}")
+    pivot, scene = np.array(opened.camera()["pivot"]), bear_page[1].scene
+    assert np.abs(pivot - before).max() > 1e-3
+    # on the bear's surface: the nearest Gaussians are as near as neighbors are
+    assert float((scene.means - torch.tensor(pivot)).norm(dim=1).min()) < 0.1
+
+
+def test_a_slider_is_dragged_and_moved_by_keys_and_shows_its_recordings(
+    open_page: Any, bear_page: tuple[Path, Stack]
+) -> None:
+    page, stack = bear_page
+    opened = ready(open_page(page))
+    names = opened.tab.locator(".layer .name").all_text_contents()
+    assert names == [gdf.name for gdf in reversed(stack.gdfs)], "the top layer first"
+    inner = [s for s in stack.gdfs[0].field.recorded if 0 < s < 1]
+    assert opened.tab.locator(".layer").last.locator(".ticks i").count() == len(inner) > 0
+    slider = opened.tab.get_by_role("slider", name="scarf")
+    box = slider.bounding_box()
+    opened.tab.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    opened.tab.mouse.down()
+    opened.tab.mouse.move(box["x"] + box["width"] + 30, box["y"] + 10, steps=4)
+    opened.tab.mouse.up()
+    assert opened.strengths()["scarf"] == 1.0
+    for _ in range(3):
+        opened.tab.keyboard.press("ArrowLeft")
+    assert opened.strengths() == {"scarf": pytest.approx(0.97), "ears": 0.5}
+    assert opened.tab.locator(".layer").last.locator("output").text_content() == "97"
+
+
+def test_space_compares_with_the_original_while_it_is_held(
+    open_page: Any, bear_page: tuple[Path, Stack]
+) -> None:
+    opened = ready(open_page(bear_page[0]))
+    edited = opened.picture()
+    opened.tab.keyboard.down(" ")
+    held = opened.picture()
+    opened.tab.keyboard.up(" ")
+    opened.slide((0.0, 0.0))
+    assert psnr(held, opened.picture()) > 90 > psnr(held, edited)
+    opened.slide((0.5, 0.5))
+    assert psnr(opened.picture(), edited) > 90
+    opened.tab.get_by_label("Hide ears").click()
+    assert opened.tab.evaluate("progdf.view.layers.map((l) => l.enabled)") == [True, False]
+
+
+def test_nothing_is_fetched_and_nothing_complains(open_page: Any, bear_page: tuple[Path, Stack]) -> None:
+    opened = ready(open_page(bear_page[0]))
+    assert opened.complaints == []
+    opened.tab.evaluate("fetch('https://example.org/').catch((e) => 0)")
+    assert [url for url in opened.requests if not url.startswith(("file:", "blob:", "data:"))] == []
+    assert "Content Security Policy" in opened.complaints[0], "nor can anything that a name might bring in"
+
+
+def test_two_fingers_slide_and_zoom_on_a_phone(open_page: Any, bear_page: tuple[Path, Stack]) -> None:
+    opened = ready(open_page(bear_page[0], size=(300, 400), has_touch=True, is_mobile=True))
+    session = opened.tab.context.new_cdp_session(opened.tab)
+
+    def touch(kind: str, *points: tuple[int, int]) -> None:
+        at = [{"x": x, "y": y, "id": i} for i, (x, y) in enumerate(points)]
+        session.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": at})
+
+    start = opened.camera()
+    touch("touchStart", (100, 60))
+    touch("touchMove", (130, 60))
+    touch("touchEnd")
+    assert opened.camera()["azimuth"] != start["azimuth"]
+    assert opened.camera()["distance"] == start["distance"]
+    touch("touchStart", (100, 60), (140, 60))
+    touch("touchMove", (90, 70), (170, 70))
+    touch("touchEnd")
+    assert opened.camera()["distance"] == pytest.approx(start["distance"] / 2, rel=0.05)
+    assert opened.camera()["pivot"] != start["pivot"]
+    panel = opened.tab.locator("#panel").bounding_box()
+    assert (panel["x"], panel["width"]) == (0, 300), "along the lower edge"
+
+
+NO_WEBGL = "HTMLCanvasElement.prototype.getContext = () => null"
+
+
+def test_without_webgl_there_is_a_still_and_a_sentence(open_page: Any, bear_page: tuple[Path, Stack]) -> None:
+    opened = open_page(bear_page[0], NO_WEBGL)
+    opened.wait("document.getElementById('notice').textContent.includes('WebGL2')")
+    assert opened.tab.evaluate("document.getElementById('still').naturalWidth") == 1200
+    assert opened.tab.locator("#still").is_visible()
+    assert not opened.tab.locator("#controls").is_visible()
+    assert opened.complaints == []
+
+
+def test_a_large_scene_is_sorted_by_a_worker_and_without_one_where_a_policy_forbids_it(
+    open_page: Any, bear_page: tuple[Path, Stack], tmp_path: Path
+) -> None:
+    page = bear_page[0].read_text()
+    large = page.replace("LARGE = 150_000", "LARGE = 10")
+    assert large != page
+    digest = base64.b64encode(
+        hashlib.sha256(re.findall(r"<script>(.*?)</script>", large, re.S)[0].encode()).digest()
+    )
+    large = re.sub(r"script-src 'sha256-[^']+'", f"script-src 'sha256-{digest.decode()}'", large)
+    (tmp_path / "worker.html").write_text(large)
+    (tmp_path / "strict.html").write_text(large.replace("worker-src blob:", "worker-src 'none'"))
+    plain = ready(open_page(bear_page[0])).picture()
+    for name, works in (("worker", True), ("strict", False)):
+        opened = ready(open_page(tmp_path / f"{name}.html"))
+        opened.wait("progdf.renderer.drawn > 0")
+        assert opened.tab.evaluate("progdf.sorter.worker !== null") == works
+        assert psnr(opened.picture(), plain) > 90
+
+
+HOSTILE = "</script><script>document.title='run'</script><img src=x onerror=\"document.title='run'\">&lt;"
+
+
+def test_names_and_texts_of_a_stranger_are_text_whatever_they_hold(open_page: Any, tmp_path: Path) -> None:
+    stack = bear()
+    scene, *paths = stack.save(tmp_path)
+    names = (HOSTILE, "x" * 10_000)
+    for path, name in zip(paths, names, strict=True):
+        save_gdf(path, replace(load_gdf(path, stack.scene), name=name))
+    out = tmp_path / "page.html"
+    texts = ["--title", HOSTILE, "--credit", HOSTILE + " https://example.org/?a=1&b=%22<b>"]
+    assert main(["export", str(scene), *map(str, paths), "-o", str(out), *texts]) == 0
+    opened = ready(open_page(out))
+    assert opened.complaints == []
+    assert opened.tab.title() == HOSTILE
+    assert opened.tab.locator("h1").text_content() == HOSTILE
+    shown = opened.tab.locator(".layer .name").all_text_contents()
+    assert shown == ["x" * 10_000, HOSTILE]
+    assert opened.tab.locator("footer a").get_attribute("href") == "https://example.org/?a=1&b=%22"
+    assert opened.tab.locator("#panel").bounding_box()["width"] == 312, "a long name widens nothing"
+    assert opened.tab.evaluate("document.querySelectorAll('script, img').length") == 3
+
+
+@pytest.fixture(scope="module")
+def session_page(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    session = saved_session(bear_files(tmp_path_factory.mktemp("session")))
+    out = session.with_name("page.html")
+    assert main(["export", str(session), "-o", str(out), "--title", "work"]) == 0
+    return session, out
+
+
+def test_a_session_comes_with_its_camera_groups_snapshots_and_film(
+    open_page: Any, session_page: tuple[Path, Path]
+) -> None:
+    saved = json.loads(session_page[0].read_text())["view"]
+    opened = ready(open_page(session_page[1]))
+    camera = opened.camera()
+    assert all(
+        camera[name] == pytest.approx(saved["camera"][name])
+        for name in ("azimuth", "distance", "up", "fov_y")
+    )
+    assert opened.tab.evaluate("progdf.header.background") == pytest.approx(saved["background"])
+    assert opened.tab.evaluate("progdf.view.blend") == saved["blend"] == "over"
+    assert opened.strengths() == {"ears → gold": 0.75, "scarf": 0.25}
+    assert opened.tab.get_by_role("slider", name="warm").input_value() == "0.5"
+    opened.tab.get_by_role("slider", name="warm").press("ArrowRight")
+    assert opened.tab.evaluate("progdf.view.groups[0].strength") == pytest.approx(0.51)
+    painted = opened.tab.evaluate("progdf.composer.edits.length && [...progdf.paints[0]]")
+    assert (min(painted), max(painted), len(painted)) == (0.0, 1.0, len(bear().gdfs[1].region))
+    opened.tab.get_by_role("button", name="original", exact=True).click()
+    assert set(opened.strengths().values()) == {0.0}
+    opened.tab.get_by_role("button", name="1", exact=True).click()
+    assert opened.strengths() == {"ears → gold": 0.75, "scarf": 0.25}
+    assert opened.tab.evaluate("progdf.view.blend") == "sum"
+    opened.tab.get_by_role("slider", name="Blend of two snapshots").fill("0.5")
+    # half of what showed: a layer that is alone leaves its group's master
+    assert opened.strengths()["ears → gold"] == pytest.approx(0.5 * 0.75 * 0.5)
+    opened.tab.get_by_role("button", name="Play").click()
+    opened.wait("progdf.frame > 3")
+    assert opened.strengths()["scarf"] == 0.5, "the key's"
+
+
+def in_page(opened: Opened, expression: str, *values: Any) -> Any:
+    """What an expression of the page's own functions gives; a, b, c … are the values."""
+    names = "abcdef"[: len(values)]
+    body = join(("camera", "state"), f"return {expression};").removesuffix(";\n")
+    return opened.tab.evaluate(f"([{','.join(names)}]) => {body}", list(values))
+
+
+def test_a_film_is_that_of_the_window(open_page: Any, tmp_path: Path) -> None:
+    draws, view = Draws(3), full_view()
+    keys = tuple(
+        Keyframe(
+            frame,
+            ((0, float(draws.uniform(1))), (1, float(draws.uniform(1)))),
+            replace(
+                view.camera, azimuth=azimuth, elevation=20 * frame / 7, distance=1 + float(draws.uniform(1))
+            ),
+            easing,
+        )
+        for frame, azimuth, easing in (
+            (0, 170.0, "smooth"),
+            (7, -150.0, "smooth"),
+            (12, 20.0, "linear"),
+            (20, 9.0, "hold"),
+        )
+    )
+    document = Document("scene.ply", bear().scene, bear().gdfs)
+    write_page(tmp_path / "page.html", document, replace(view, timeline=Timeline(keys, 24)))
+    opened = ready(open_page(tmp_path / "page.html"))
+    for frame in (0, 2, 7, 11, 20, 24):
+        opened.tab.evaluate(f"progdf.seek({frame})")
+        plain = timeline.state_at(Timeline(keys, 24), frame, view)
+        camera = opened.camera()
+        for name in ("azimuth", "elevation", "distance", "fov_y", "pivot", "up"):
+            assert camera[name] == pytest.approx(getattr(plain.camera, name), abs=1e-9), (frame, name)
+        assert opened.strengths() == pytest.approx({layer.name: layer.strength for layer in plain.layers})
+
+
+def test_what_lies_between_two_snapshots_is_what_the_window_has(open_page: Any, tmp_path: Path) -> None:
+    stack, view = many_edits(bear(), 4)
+    draws, kept = Draws(8), ()
+    for _ in range(6):
+        alone, off, master = draws.uniform(3).tolist()
+        layers = tuple(
+            replace(
+                view.layers[i],
+                strength=round(float(draws.uniform(1)), 3),
+                enabled=float(draws.uniform(1)) < 0.7,
+                solo=alone < 0.4 and i == 3,
+                gains=Gains(*draws.uniform(3).tolist()),
+                group="pair" if i in (1, 3) else "",
+            )
+            for i in draws.order(4).tolist()
+        )
+        kept = snapshots.take(
+            kept, replace(view, layers=layers, groups=(LayerGroup("pair", off < 0.7, master),))
+        )
+    view = snapshots.restore(view, kept[-1])
+    document = Document("scene.ply", stack.scene, stack.gdfs)
+    write_page(tmp_path / "page.html", document, view, kept)
+    opened = ready(open_page(tmp_path / "page.html"))
+    listed, members = snapshots.with_original(kept, view), lambda gdf: document.gdfs[gdf].members
+    known = opened.tab.evaluate("[progdf.view, progdf.snapshots]")
+    for a, b in ((0, 1), (1, 2), (3, 2), (4, 5), (6, 0)):
+        for share in (0.0, 0.25, 0.6, 1.0):
+            page = in_page(opened, "visibleLayers(between(a, b[c], b[d], e))", *known, a, b, share)
+            pair = SnapshotPair(listed[a].name, listed[b].name, share)
+            plain = visible_layers(snapshots.blend(replace(view, pair=pair), listed, share, members))
+            assert [layer["edit"] for layer in page] == [layer.gdf for layer in plain], (a, b, share)
+            for mine, theirs in zip(page, plain, strict=True):
+                assert mine["strength"] == pytest.approx(theirs.strength), (a, b, share)
+                assert mine["gains"] == pytest.approx(asdict(theirs.gains))
+
+
+def test_a_page_gets_as_small_as_it_must_and_says_what_that_costs(tmp_path: Path) -> None:
+    document, view = document_of(bear(600).scene, bear(600).gdfs)
+    out = tmp_path / "page.html"
+
+    def written(**options: Any) -> tuple[int, str]:
+        line = write_page(out, document, view, (), PageOptions(**options))
+        return out.stat().st_size, line
+
+    size, _ = written()
+    assert size < written(quality="exact")[0]
+    assert size > written(layers="scarf")[0], "an edit that is at 0 and has no slider is left out"
+    limit = size - 9_000
+    smaller, line = written(max_size=f"{limit / 1000}kB")
+    assert smaller <= limit
+    assert re.search(r"(SH of degree 0 of 1|\d+ % of the Gaussians).*, \d\d\.\d dB to the scene", line), line
+
+
+def test_what_cannot_be_is_one_line_and_what_was_there_stays(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene, *edits = map(str, bear().save(tmp_path))
+    out = tmp_path / "page.html"
+    out.write_text("earlier")
+    (tmp_path / "broken.session.json").write_text('{"view": [1, ')
+    bad: list[tuple[list[str], str]] = [
+        ([scene, *edits, "--max-size", "9kB"], "MB at least"),
+        ([scene, *edits, "--max-size", "small"], "no size"),
+        ([scene, *edits, "--layers", "hat"], "no layer of that name; there are ears, scarf"),
+        ([scene, "-o", str(tmp_path / "page.ply"), "--title", "x"], "no web page"),
+        ([str(tmp_path / "broken.session.json")], "broken.session.json"),
+    ]
+    for words, message in bad:
+        assert main(["export", *words, *([] if "-o" in words else ["-o", str(out)])]) == 2
+        error = capsys.readouterr().err
+        assert message in error
+        assert error.count("\n") == 1
+    assert out.read_text() == "earlier"

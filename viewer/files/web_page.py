@@ -1,0 +1,263 @@
+"""The open scene and its layers as a web page: what the page starts with, and how large it may be."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import torch
+
+from progdf.cli.options import absent_option
+from progdf.compose.reference import compose_layers
+from progdf.errors import ProgdfError
+from progdf.gaussians import Gaussians
+from progdf.gdf.file import Gdf, fingerprint
+from progdf.io.atomic import atomic_write
+from progdf.metrics.image import psnr
+from progdf.rasterize import alpha_weights, render
+from progdf.scene.orbit_rig import orbit_rig
+from viewer.camera.view_camera import ViewCamera, bounds_of, to_camera
+from viewer.state import snapshots, timeline
+from viewer.state.layers import largest_strength, visible_layers
+from viewer.state.paint import decode, layer_of
+from viewer.state.view_state import LayerState, Timeline, ViewState
+from viewer.web.page import DRAWN_SH, HOST, MAIL, build_page, pack
+
+from .document import Document
+
+PAGE = ".html"
+_STILL = 1200, 800
+_RANK_VIEWS, _RANK_SIZE = 24, (480, 320)
+_LEAST_SHARE = 0.01
+_EXACT_DB = 99.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class PageOptions:
+    """What a web page holds (.html)."""
+
+    quality: Literal["exact", "compact"] = "compact"
+    """Of a .html page: float32, or 8 and 16 bits, a third as large."""
+    sh: Literal[0, 1, 2, 3] = 3
+    """Degree of the spherical harmonics that stay in a page."""
+    max_size: Annotated[str | None, absent_option("SIZE", "as large as it is")] = None
+    """Largest page, as in 25MB: drops what shows least, and says what."""
+    layers: Annotated[str | None, absent_option("NAME[,NAME2]", "all")] = None
+    """Layers that get a slider; the others stay as they are."""
+    title: Annotated[str | None, absent_option("TEXT", "the scene's name")] = None
+    """Above the sliders."""
+    credit: Annotated[str, absent_option("TEXT", "none")] = ""
+    """Below them: whose scene it is, and its license; addresses become links."""
+
+
+@dataclass(frozen=True)
+class _Page:
+    """A page, and what it holds of the scene."""
+
+    html: str
+    quality: str
+    degree: int
+    share: float  # of the Gaussians
+    psnr: float  # of its start to that of the scene, dB
+
+    @property
+    def size(self) -> int:
+        return len(self.html.encode())
+
+
+def write_page(
+    out: Path,
+    document: Document,
+    view: ViewState,
+    kept: Sequence[snapshots.SliderSnapshot] = (),
+    options: PageOptions = PageOptions(),
+) -> str:
+    """Write the page; the line that says what it holds.
+
+    Raises:
+        ProgdfError: an option names a layer that is not there, or a size that is none or cannot be met, or
+            the page cannot be written.
+    """
+    limit = _parse_size(options.max_size)
+    stage, edits = _stage(document, view, kept, options)
+    gdfs, title = [document.gdfs[i] for i in edits], options.title or Path(document.title).stem
+    start = _picture(document.scene, document.gdfs, view)
+    pixels = (start * 255.0 + 0.5).to(torch.uint8).numpy()
+    rank = _rank(document, view) if limit is not None else None
+
+    def make(quality: str, degree: int, share: float) -> _Page:
+        stays = None if rank is None or share == 1.0 else (rank < share * len(rank)).numpy()
+        packed = pack(document.scene, gdfs, quality, degree, stage, stays)
+        html = build_page(packed.data, title, options.credit, view.background, pixels)
+        error = psnr(_picture(packed.scene, document.gdfs, view, DRAWN_SH[degree]), start)
+        return _Page(html, quality, degree, share, error)
+
+    degree = min(options.sh, document.scene.sh_degree)
+    page = make(options.quality, degree, 1.0)
+    if limit is not None and page.size > limit:
+        page = _shrink(make, page, limit)
+    with atomic_write(out) as temporary_file:
+        temporary_file.write_text(page.html, encoding="utf-8")
+    return f"wrote {out}: {_describe(page, document.scene.sh_degree)}"
+
+
+def _shrink(make: Callable[[str, int, float], _Page], page: _Page, limit: int) -> _Page:
+    """A page of at most `limit` bytes: compact; then without a degree of SH, or without as many bytes of the
+    Gaussians that show least, whichever costs the start fewer dB, until it fits."""
+    least = make("compact", 0, _LEAST_SHARE)
+    if least.size > limit:
+        raise ProgdfError(
+            f"--max-size: a page of this scene has {least.size / 1e6:.2f} MB at least; give more"
+        )
+    if page.quality == "exact":
+        page = make("compact", page.degree, page.share)
+    while page.size > limit:
+        fewer = [make("compact", page.degree - 1, page.share)] if page.degree else []
+        target = max(limit, fewer[0].size) if fewer else limit
+        part = (target - least.size) / (page.size - least.size)
+        share = max(_LEAST_SHARE, page.share * min(0.99, part))
+        page = max([*fewer, make("compact", page.degree, share)], key=lambda each: each.psnr)
+    return page
+
+
+def _rank(document: Document, view: ViewState) -> torch.Tensor:
+    """Each Gaussian's place by what it contributes to views around the scene, with its edits or without."""
+    cameras = [*orbit_rig(document.original, _RANK_VIEWS, *_RANK_SIZE), to_camera(view.camera, *_RANK_SIZE)]
+    weights, everywhere = torch.zeros(len(document.scene)), torch.ones(_RANK_SIZE[::-1])
+    for strength in (0.0, 1.0):
+        layers = tuple(replace(layer, strength=strength, enabled=True, solo=False) for layer in view.layers)
+        edited = _compose(document.scene, document.gdfs, replace(view, layers=layers, groups=()))
+        for camera in cameras:
+            weights = weights.maximum(alpha_weights(edited, camera, everywhere)[:, 2].float())
+    return weights.argsort(descending=True, stable=True).argsort()
+
+
+def _describe(page: _Page, degree: int) -> str:
+    """What a page holds, and where it is too large to go."""
+    parts = [f"{page.size / 1e6:.2f} MB", page.quality]
+    parts += [f"SH of degree {page.degree} of {degree}"] if page.degree < degree else []
+    parts += [f"{100 * page.share:.0f} % of the Gaussians"] if page.share < 1.0 else []
+    parts += [f"{page.psnr:.1f} dB to the scene"] if page.psnr < _EXACT_DB else []
+    takes = "common hosts take" if page.size > HOST else "most mail takes"
+    warning = f"; more than {takes}, --max-size makes it smaller" if page.size > MAIL else ""
+    return ", ".join(parts) + warning
+
+
+def _parse_size(text: str | None) -> int | None:
+    """Bytes of "25MB", "900 kB" or a plain number."""
+    if text is None:
+        return None
+    match = re.fullmatch(r"(\d{1,9}(?:\.\d{1,6})?)\s*(k|M|G)?B?", text.strip(), re.IGNORECASE)
+    if match is None or float(match[1]) <= 0:
+        raise ProgdfError(f"--max-size {text} is no size; write, for example, --max-size 25MB")
+    return int(float(match[1]) * {"": 1, "k": 1e3, "m": 1e6, "g": 1e9}[(match[2] or "").lower()])
+
+
+def _picture(
+    scene: Gaussians, gdfs: Sequence[Gdf], view: ViewState, bands: int = DRAWN_SH[-1]
+) -> torch.Tensor:
+    """What the CPU engine makes of the start with so many higher SH coefficients, 0..1. [H,W,3]"""
+    with torch.no_grad():
+        edited = _compose(scene, gdfs, view)
+        edited = replace(edited, shN=edited.shN * (torch.arange(edited.shN.shape[1]) < bands)[:, None])
+        camera = to_camera(view.camera, *_STILL)
+        return render(edited, camera, background=view.background, engine="cpu").image.clamp(0.0, 1.0)
+
+
+def _compose(scene: Gaussians, gdfs: Sequence[Gdf], view: ViewState) -> Gaussians:
+    """The scene, or what a page has of it, under the layers of a view."""
+    same = fingerprint(scene)
+    states = visible_layers(view)
+    layers = [layer_of(replace(gdfs[s.gdf], scene=same), s.strength, s.gains, s.paint) for s in states]
+    return compose_layers(scene, layers, view.blend)
+
+
+def _stage(
+    document: Document, view: ViewState, kept: Sequence[snapshots.SliderSnapshot], options: PageOptions
+) -> tuple[dict[str, Any], list[int]]:
+    """What the page begins with, as viewer/web/src/main.js reads it, and the edits that it needs."""
+    paints: list[tuple[int, Any]] = []
+    known: dict[tuple[int, str], int] = {}
+    sliders = _sliders(view, options.layers)
+    stacks = [view.layers, *(each.edit.layers for each in kept)]
+    needed = {l.gdf for stack in stacks for l in stack if l.strength > 0.0 or l.name in sliders}
+    edits = sorted(needed | {gdf for key in view.timeline.keys for gdf, s in key.strengths if s > 0.0})
+
+    def layer(state: LayerState) -> dict[str, Any]:
+        weights = decode(state.paint, document.gdfs[state.gdf].members)
+        if weights is not None and (state.gdf, state.paint) not in known:
+            known[state.gdf, state.paint] = len(paints)
+            paints.append((edits.index(state.gdf), weights))
+        return {
+            "edit": edits.index(state.gdf),
+            "fixed": state.name not in sliders,
+            "name": state.name,
+            "strength": state.strength,
+            "enabled": state.enabled,
+            "solo": state.solo,
+            "gains": asdict(state.gains),
+            "paint": known.get((state.gdf, state.paint), -1),
+            "group": state.group,
+        }
+
+    listed = snapshots.with_original(kept, view)
+    stage = {
+        "background": view.background,
+        "camera": _camera(view.camera),
+        "radius": bounds_of(document.original).radius,
+        "near": to_camera(view.camera, 1, 1).near,
+        "blend": view.blend,
+        "most": largest_strength(view),
+        "layers": [layer(state) for state in view.layers if state.gdf in edits],
+        "groups": [asdict(group) for group in view.groups],
+        "snapshots": [
+            {
+                "name": each.name,
+                "camera": _camera(each.camera),
+                "layers": [layer(state) for state in each.edit.layers if state.gdf in edits],
+                "groups": [asdict(group) for group in each.edit.groups],
+                "blend": each.edit.blend,
+            }
+            for each in kept
+        ],
+        "pair": snapshots.pair_of(listed, view.pair),
+        "timeline": _film(view.timeline, edits),
+        "paints": paints,
+    }
+    return stage, edits
+
+
+def _film(film: Timeline, edits: Sequence[int]) -> dict[str, Any] | None:
+    """A timeline frame by frame; the strengths that it moves, and the camera where it moves that."""
+    if not film.keys:
+        return None
+    frames = []
+    for frame in range(film.length + 1):
+        camera, strengths = timeline.camera_at(film, frame), timeline.strengths_at(film, frame)
+        moved = [(edits.index(gdf), s) for gdf, s in strengths.items() if gdf in edits]
+        frames.append({"strengths": moved, "camera": None if camera is None else _camera(camera)})
+    return {
+        "frames": frames,
+        "keys": [key.frame for key in film.keys],
+        "fps": film.fps,
+        "ping_pong": film.ping_pong,
+    }
+
+
+def _sliders(view: ViewState, names: str | None) -> set[str]:
+    """The layers that get a slider."""
+    there = {layer.name for layer in view.layers}
+    if names is None:
+        return there
+    chosen = {name.strip() for name in names.split(",") if name.strip()}
+    for name in sorted(chosen - there):
+        names = f"are {', '.join(sorted(there))}" if there else "is none"
+        raise ProgdfError(f"--layers {name}: there is no layer of that name; there {names}")
+    return chosen
+
+
+def _camera(camera: ViewCamera) -> dict[str, Any]:
+    return {name: value for name, value in asdict(camera).items() if name != "mode"}

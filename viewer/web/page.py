@@ -1,0 +1,406 @@
+"""A scene and its edits as one HTML file that shows them and moves their sliders, and that fetches nothing.
+
+The page reads a container (src/data.js): the length of its header, the header (JSON), and its arrays, channel
+after channel, the bytes of one weight together, so that gzip finds what is alike. Members of edits come
+first, so that a slider sends one run of rows, and near ones lie together. The script is src/*.js put one
+after another, the shaders are the viewer's own, and the policy in the page's head lets nothing else run: a
+.gdf's names are a stranger's text.
+"""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import hashlib
+import html
+import io
+import json
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from importlib import resources
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+from torch import Tensor
+
+from progdf import __version__
+from progdf.compose.reference import coverage
+from progdf.field.baked import AttributeBases, GradeForm
+from progdf.field.grade import sphere
+from progdf.field.separable import quantize_bases
+from progdf.gaussians import ATTRIBUTES, Gaussians
+from progdf.gdf.file import UNSEEN_LOGIT, Gdf
+from shaders import load_source
+
+DRAWN_SH = (0, 3, 8, 15)
+"""SH coefficients above the first, by degree."""
+LEVELS = {"i1": 127, "i2": 32767}
+_SMALLEST = 1e-4  # of the scene's spread: a smaller axis is less than a pixel of any picture of it
+_UNSEEN = -1e3  # a logit
+_OPAQUE = 1 - 1 / 512  # and its opposite: opacities that 8 bits end at
+
+
+@dataclass
+class Arrays:
+    """Arrays of a container, in the order in which they were added."""
+
+    parts: list[bytes] = field(default_factory=list)
+    size: int = 0
+
+    def add(self, values: NDArray[Any], **more: Any) -> dict[str, Any]:
+        """Append an array [n] or [n,c]; what the header says of it."""
+        table = np.ascontiguousarray(_table(values).T)
+        table = table.astype(table.dtype.newbyteorder("<"))
+        planes = table.reshape(-1, 1).view(np.uint8).T.tobytes()
+        kind = f"{table.dtype.kind}{table.dtype.itemsize}"
+        record = {"at": self.size, "type": kind, "rows": len(values), "width": len(table), **more}
+        self.parts.append(planes)
+        self.size += len(planes)
+        return record
+
+    def add_levels(
+        self, values: NDArray[Any], kind: str, curve: str = ""
+    ) -> tuple[dict[str, Any], NDArray[Any]]:
+        """Append numbers as levels between the least and the largest of each channel. [n,c] float
+
+        Args:
+            kind: of `LEVELS`
+            curve: "log" for signed logarithms (1 + |x|), "logit" for opacities
+
+        Returns:
+            What the header says of it, and what the page makes of it.
+        """
+        table = _table(values).astype(np.float64)
+        if curve == "log":
+            table = np.sign(table) * np.log1p(np.abs(table))
+        some = table if len(table) else np.zeros((1, table.shape[1]))
+        low, high = some.min(axis=0), some.max(axis=0)
+        zero, most = (low + high) / 2, LEVELS[kind]
+        step = np.where(high > low, (high - low) / (2 * most), 1.0)
+        levels = np.round((table - zero) / step).astype(f"<{kind}")
+        made = zero + step * levels
+        if curve == "log":
+            made = np.sign(made) * np.expm1(np.abs(made))
+        elif curve == "logit":
+            made = np.log(made / (1 - made))
+        return self.add(levels, scale=step.tolist(), zero=zero.tolist(), curve=curve), made
+
+
+def _table(values: NDArray[Any]) -> NDArray[Any]:
+    """[n] or [n,…] -> [n,c]"""
+    return values.reshape(len(values), math.prod(values.shape[1:]))
+
+
+@dataclass(frozen=True)
+class Packed:
+    """What a page holds."""
+
+    data: bytes  # the container
+    scene: Gaussians  # the original as the page has it, in its own order; what was left out is unseen
+
+
+def pack(
+    scene: Gaussians,
+    gdfs: Sequence[Gdf],
+    quality: str,
+    degree: int,
+    more: Mapping[str, Any],
+    stays: NDArray[np.bool_] | None = None,
+) -> Packed:
+    """The container of a scene and edits of it that add nothing any more.
+
+    Args:
+        scene: the original with the rows that edits add
+        gdfs: its edits
+        quality: "exact", float32 and the numbers of the edits' files, or "compact", 8 and 16 bits
+        degree: of the spherical harmonics that stay, 0 to 3
+        more: what else the header holds; in "paints" pairs of an edit and the weights of its members [M]
+        stays: which Gaussians; None: all that can be seen. [N]
+    """
+    scene = _finite(scene)
+    kept = min(DRAWN_SH[degree], scene.shN.shape[1])
+    members = np.zeros(len(scene), bool)
+    for gdf in gdfs:
+        members[gdf.region.members.numpy()] = True
+    seen = members | (scene.logit_opacities.numpy() >= UNSEEN_LOGIT)
+    seen = seen if stays is None else seen & stays
+    order = _order(scene, members)
+    order, count = order[seen[order]], int((members & seen).sum())
+    place = np.full(len(scene), -1, np.int64)
+    place[order] = np.arange(len(order))
+    inside = [_ascending(place[gdf.region.members.numpy()]) for gdf in gdfs]
+    arrays, exact = Arrays(), quality == "exact"
+    attributes, made = _scene(arrays, scene, gdfs, order, count, kept, exact)
+    overlaps = len(gdfs) > 1 and sum(map(len, inside)) > count
+    paints = []
+    for edit, weights in more["paints"]:
+        levels = np.round(weights[inside[edit]].numpy() * 255).astype("<i2")
+        paints.append(arrays.add(levels, scale=[1 / 255], zero=[0.0]))
+    header = {
+        **more,
+        "paints": paints,
+        "count": len(order),
+        "members": count,
+        "sh": kept,
+        "antialiased": scene.antialiased,
+        "attributes": attributes,
+        "edits": [
+            _edit(arrays, scene, gdf, place, rows, kept, exact, overlaps)
+            for gdf, rows in zip(gdfs, inside, strict=True)
+        ],
+        "sphere": [
+            _numbers(part.flatten()) for part in sphere(math.isqrt(kept + 1) - 1, torch.device("cpu"))
+        ],
+    }
+    text = json.dumps(header, ensure_ascii=True, allow_nan=False, separators=(",", ":")).encode()
+    return Packed(len(text).to_bytes(4, "little") + text + b"".join(arrays.parts), made)
+
+
+def _scene(
+    arrays: Arrays,
+    scene: Gaussians,
+    gdfs: Sequence[Gdf],
+    order: NDArray[np.int64],
+    count: int,
+    kept: int,
+    exact: bool,
+) -> tuple[dict[str, Any], Gaussians]:
+    """The attributes in the header, the first `count` rows apart, and the scene as they have it."""
+    moved = {name for gdf in gdfs for name in gdf.field.attributes}
+    attributes: dict[str, Any] = {}
+    changed: dict[str, Any] = {"shN": torch.zeros_like(scene.shN)}
+    changed["logit_opacities"] = torch.full_like(scene.logit_opacities, _UNSEEN)
+    rows = torch.from_numpy(order)
+    for name in ATTRIBUTES:
+        old = getattr(scene, name).detach().float()
+        values = _table((old[:, :kept] if name == "shN" else old)[rows].numpy())
+        if not values.shape[1]:
+            continue
+        parts = values[:count], values[count:]
+        done = [
+            _scene_part(arrays, name, part, exact, first and name in moved)
+            for part, first in zip(parts, (True, False), strict=True)
+        ]
+        attributes[name] = [record for record, _ in done]
+        new = torch.from_numpy(np.concatenate([numbers for _, numbers in done])).float()
+        table = changed.setdefault(name, old.clone())
+        if name == "shN":
+            table[rows, :kept] = new.reshape(len(order), kept, 3)
+        else:
+            table[rows] = new.reshape(len(order), *old.shape[1:])
+    return attributes, replace(scene, **changed)
+
+
+def _finite(scene: Gaussians) -> Gaussians:
+    """The scene with finite numbers; rows that no engine draws for theirs are unseen."""
+    flat = {name: torch.from_numpy(_table(getattr(scene, name).detach().numpy())) for name in ATTRIBUTES}
+    flat["log_scales"] = flat["log_scales"].clamp(min=-1e4)
+    unseen = ~torch.cat(list(flat.values()), dim=1).isfinite().all(dim=1)
+    changed: dict[str, Any] = {name: table.nan_to_num(0.0, 0.0, 0.0) for name, table in flat.items()}
+    changed["logit_opacities"] = changed["logit_opacities"].masked_fill(unseen[:, None], _UNSEEN)
+    return replace(scene, **{name: changed[name].reshape(getattr(scene, name).shape) for name in ATTRIBUTES})
+
+
+def _order(scene: Gaussians, members: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Rows in the page's order: members first, near ones together (by Morton's code)."""
+    means = scene.means.numpy().astype(np.float64)
+    small = np.sign(means) * np.log1p(np.abs(means))
+    low = small.min(axis=0, initial=0.0)
+    cells = ((small - low) / max(np.ptp(small) if small.size else 0.0, 1e-12) * 1023).astype(np.int64)
+    code = np.zeros(len(scene), np.int64)
+    for bit in range(10):
+        for axis in range(3):
+            code |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
+    return np.lexsort((code, ~members))
+
+
+def _ascending(places: NDArray[np.int64]) -> Tensor:
+    """Which members are on the page, in its order; those that are not have the place −1."""
+    there = np.flatnonzero(places >= 0)
+    return torch.from_numpy(there[np.argsort(places[there])])
+
+
+def _scene_part(
+    arrays: Arrays, name: str, values: NDArray[Any], exact: bool, moves: bool
+) -> tuple[dict[str, Any], NDArray[Any]]:
+    """Rows of an attribute: float32; or 16 bits where an edit moves what is no color, else 8."""
+    if exact:
+        return arrays.add(values.astype(np.float32)), values
+    if name == "means":
+        return arrays.add_levels(values, "i2", "log")
+    if moves and name not in ("sh0", "shN"):
+        return arrays.add_levels(values, "i2")
+    if name == "quats":
+        values = values / np.maximum(np.abs(values).max(axis=1, keepdims=True), 1e-30)
+        levels = np.round(values * 127).astype(np.int8)
+        return arrays.add(levels, scale=[1.0] * 4, zero=[0.0] * 4), levels
+    if name == "logit_opacities":
+        opacity = 1 / (1 + np.exp(-np.clip(values.astype(np.float64), -40, 40)))
+        return arrays.add_levels(np.clip(opacity, 1 - _OPAQUE, _OPAQUE), "i1", "logit")
+    if name == "log_scales" and len(values):
+        values = np.maximum(values, values.max(axis=1).mean() + math.log(_SMALLEST))
+    return arrays.add_levels(values, "i1")
+
+
+def _edit(
+    arrays: Arrays,
+    scene: Gaussians,
+    gdf: Gdf,
+    place: NDArray[np.int64],
+    order: Tensor,
+    kept: int,
+    exact: bool,
+    overlaps: bool,
+) -> dict[str, Any]:
+    """An edit in the header, and its members in this order."""
+    rows = place[gdf.region.members.numpy()[order.numpy()]]
+    form, widths = gdf.field.origin, {"shN": 3 * kept}
+    record: dict[str, Any] = {
+        "name": gdf.name,
+        "recorded": list(gdf.field.recorded),
+        "knots": _numbers(gdf.field.knots),
+        "members": arrays.add(np.diff(rows, prepend=0).astype("<i4")),
+        "attributes": {
+            name: _bases(arrays, name, bases, order, widths.get(name, bases.end_offset.shape[1]), exact)
+            for name, bases in gdf.field.attributes.items()
+            if widths.get(name, 1)
+        },
+    }
+    if overlaps:
+        shares = {kind: share[order].numpy() for kind, share in coverage(scene, gdf).items()}
+        record["coverage"] = {
+            kind: arrays.add(share) if exact else arrays.add_levels(share, "i1")[0]
+            for kind, share in shares.items()
+        }
+        record["grade"] = _grade(arrays, form, order, kept) if isinstance(form, GradeForm) else None
+    return record
+
+
+def _bases(
+    arrays: Arrays, name: str, bases: AttributeBases, order: Tensor, width: int, exact: bool
+) -> dict[str, Any]:
+    """One attribute of an edit, its first `width` channels."""
+    end, scale = bases.end_offset[order, :width], bases.scale[:, :width].clone()
+    residual = bases.residual_basis[:, order, :width].float()
+    if end.dtype == torch.float32 and not exact:
+        levels, unit = quantize_bases((end * scale[0])[None], torch.int8 if name == "shN" else torch.int16)
+        end, scale[0] = levels[0], unit[0]
+    if bases.residual_basis.dtype == torch.int8:
+        residual = bases.residual_basis[:, order, :width]
+    elif not exact:
+        residual, unit = quantize_bases(residual, torch.int8)
+        scale[1:] *= unit
+    return {
+        "end": arrays.add(end.numpy()),
+        "residual": [arrays.add(basis.numpy()) for basis in residual],
+        "scale": _numbers(scale),
+        "coefficients": _numbers(bases.coefficients),
+    }
+
+
+def _grade(arrays: Arrays, form: GradeForm, order: Tensor, kept: int) -> dict[str, Any]:
+    """The map of a grade, for colors that others have changed."""
+    width = min(form.residual.shape[2], 3 + 3 * kept)
+    return {
+        "degree": form.degree,
+        "knots": _numbers(form.knots),
+        "table": [arrays.add(table.numpy()) for table in form.table],
+        "residual": [arrays.add(basis[order, :width].numpy()) for basis in form.residual],
+        "scale": _numbers(form.scale[:, :width]),
+        "coefficients": _numbers(form.coefficients),
+        "old": form.remap.old.tolist(),
+        "new": form.remap.new.tolist(),
+        "share": arrays.add(form.share[order].numpy()) if form.mask is not None else None,
+    }
+
+
+def _numbers(tensor: Tensor) -> Any:
+    """float32 numbers as few digits as tell them apart, nested as the tensor is."""
+    values = tensor.numpy()
+    return [_numbers(row) for row in tensor] if values.ndim > 1 else [float(str(x)) for x in values]
+
+
+MODULES = ("camera", "data", "grade", "compose", "sort", "renderer", "state", "panel", "input", "main")
+"""Of `src`, each after those that it imports when it is read."""
+STAGES = ("web.vert", "splat.frag", "present.vert", "present.frag", "stretch.frag")
+MAIL, HOST = 25e6, 100e6
+"""Bytes: what mail takes, and common hosts."""
+
+_IMPORT = re.compile(r"^import .*?;\n", re.MULTILINE | re.DOTALL)
+_LINK = re.compile(r"https?://[^\s<>\"']+[^\s<>\"'.,;:)]")
+
+
+def join(modules: Sequence[str] = MODULES, then: str = "") -> str:
+    """Modules of `src` one after another, and what follows them, in a function of their own."""
+    folder = resources.files("viewer.web") / "src"
+    parts = [(folder / f"{name}.js").read_text(encoding="utf-8") for name in modules]
+    joined = "\n".join(re.sub(r"^export ", "", _IMPORT.sub("", part), flags=re.MULTILINE) for part in parts)
+    return f'(() => {{\n"use strict";\n{joined}{then}}})();\n'
+
+
+def build_page(
+    container: bytes,
+    title: str,
+    credit: str,
+    background: tuple[float, float, float],
+    still: NDArray[np.uint8],
+) -> str:
+    """The page of a container, see `pack`.
+
+    Args:
+        container: the scene and its edits
+        title: above the sliders and of the browser's tab
+        credit: below them, with addresses as links
+        background: behind the scene, 0..1
+        still: what shows until the scene is there, and where WebGL2 is not. [H,W,3]
+    """
+    behind = "#" + "".join(f"{round(255 * channel):02x}" for channel in background)
+    folder = resources.files("viewer.web") / "src"
+    style = f":root {{ --behind: {behind}; }}\n" + (folder / "page.css").read_text(encoding="utf-8")
+    sources = {name: _body(load_source(name).text) for name in STAGES}
+    code, picture = join(), io.BytesIO()
+    Image.fromarray(still).save(picture, "WEBP", quality=82)
+    texts = {
+        "title": html.escape(title),
+        "credit": _with_links(credit),
+        "version": __version__,
+        "style": style,
+        "style_hash": _hash(style),
+        "script": code,
+        "script_hash": _hash(code),
+        "still": "data:image/webp;base64," + base64.b64encode(picture.getvalue()).decode(),
+        "shaders": in_script(sources),
+        "data": base64.b64encode(gzip.compress(container, 9, mtime=0)).decode(),
+    }
+    template = (folder / "page.html").read_text(encoding="utf-8")
+    return re.sub(r"\{\{(\w+)\}\}", lambda found: texts[found[1]], template)
+
+
+def in_script(value: Mapping[str, Any]) -> str:
+    """JSON that ends no script element, whatever its texts are."""
+    return json.dumps(value, separators=(",", ":")).replace("<", "\\u003c")
+
+
+def _body(source: str) -> str:
+    """A stage without its version, which the page puts in front, and without comments."""
+    text = re.sub(r"//[^\n]*", "", source.removeprefix("#version 330 core"))
+    return "\n" + "\n".join(line.rstrip() for line in text.splitlines() if line.strip())
+
+
+def _hash(text: str) -> str:
+    return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+
+
+def _with_links(text: str) -> str:
+    parts, at = [], 0
+    for found in _LINK.finditer(text):
+        address = html.escape(found[0])
+        parts += [html.escape(text[at : found.start()])]
+        parts += [f'<a href="{address}" rel="noopener noreferrer" target="_blank">{address}</a>']
+        at = found.end()
+    return "".join([*parts, html.escape(text[at:])])

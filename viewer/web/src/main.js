@@ -1,0 +1,284 @@
+// The page: reads the container, and draws again whenever the view or the camera is another one.
+
+import { addScaled, pinhole, pivotOn } from "./camera.js";
+import { Composer } from "./compose.js";
+import { Container, inflate } from "./data.js";
+import { listen } from "./input.js";
+import { buildPanel } from "./panel.js";
+import { Renderer, depthRow } from "./renderer.js";
+import { Sorter } from "./sort.js";
+import { between, mixCameras, restore, stateAt, visibleLayers } from "./state.js";
+
+const MOST_PIXELS = 4e6;
+const SLOW_MS = 45;  // between frames while something moves: half the pixels each way then
+const REST_MS = 180;
+const GLIDE_MS = 250;
+
+const get = (id) => document.getElementById(id);
+
+class Page {
+  constructor(container, shaders) {
+    const { header } = container;
+    this.header = header;
+    this.canvas = get("picture");
+    this.renderer = new Renderer(this.canvas, shaders, container);
+    this.composer = new Composer(container);
+    this.means = new Float32Array(3 * header.count);
+    container.attribute("means", 0, header.count, this.means, 3);
+    this.paints = header.paints.map((record) => container.real(record));
+    this.sorter = new Sorter(this.means, header.near, (order, seen) => {
+      this.renderer.setOrder(order, seen);
+      this.request();
+    });
+    this.view = { layers: header.layers, groups: header.groups, blend: header.blend };
+    this.home = this.camera = header.camera;
+    this.radius = header.radius;
+    const original = { name: "original", original: true, ...this.view };
+    original.layers = original.layers.map((layer) => ({ ...layer, strength: 0 }));
+    this.snapshots = [original, ...header.snapshots];
+    this.pair = header.pair;
+    this.share = null;  // of the slider between two snapshots, once that moved
+    this.frame = 0;
+    this.playing = false;
+    this.comparing = false;
+    this.coarse = false;
+    this.update = buildPanel(get("controls"), this);
+    this.#bind();
+    const touch = matchMedia("(pointer: coarse)").matches;
+    get("notice").textContent = touch
+      ? "Drag to turn · pinch to zoom · tap twice to center" : "Drag to turn · scroll to zoom · Space compares";
+    document.body.classList.add("ready");
+    this.resize();
+    this.change(this.view);
+  }
+
+  // Shows another view.
+  change(view, share = null) {
+    this.view = view;
+    this.share = share;
+    this.dirty = true;
+    this.update();
+    this.request();
+  }
+
+  look(camera) {
+    if (camera === this.camera) return;
+    this.camera = camera;
+    this.movedAt = performance.now();
+    this.turned = true;
+    this.request();
+  }
+
+  touched() {
+    this.playing = false;
+    this.glide = null;
+    document.body.classList.add("touched");
+  }
+
+  choose(index) {
+    if (this.pair[1] !== index) this.pair = [this.pair[1], index];
+    this.#film(false);
+    this.change(restore(this.view, this.snapshots[index]), 1);
+    if (this.snapshots[index].camera) this.glideTo(this.snapshots[index].camera);
+  }
+
+  blend(share) {
+    const [a, b] = this.pair.map((index) => this.snapshots[index]);
+    this.#film(false);
+    this.change(between(this.view, a, b, share), share);
+  }
+
+  play() {
+    this.#film(!this.playing);
+    this.request();
+  }
+
+  seek(frame) {
+    const { view, camera } = stateAt(this.header.timeline, frame, this.view, this.camera);
+    this.frame = frame;
+    this.look(camera);
+    this.change(view);
+  }
+
+  compare(on) {
+    if (on === this.comparing) return;
+    this.comparing = on;
+    get("compare").setAttribute("aria-pressed", on);
+    this.dirty = true;
+    this.request();
+  }
+
+  glideTo(camera) {
+    this.glide = { from: this.camera, to: camera, start: performance.now() };
+    this.request();
+  }
+
+  pivotAt(x, y) {
+    const at = this.#pinhole(), scale = this.canvas.width / this.canvas.clientWidth, [fx, fy, cx, cy] = at.intrinsics;
+    const depth = this.renderer.depthAt(at, x * scale, y * scale);
+    if (depth === null) return;
+    const way = [(x * scale - cx) / fx, (y * scale - cy) / fy, 1];
+    const point = addScaled(at.eye, ...at.rows.map((axis, i) => [depth * way[i], axis]));
+    this.glideTo(pivotOn(this.camera, point, this.radius));
+  }
+
+  get focal() {
+    return this.#pinhole().intrinsics[0] * (this.canvas.clientWidth / this.canvas.width);
+  }
+
+  resize() {
+    const { clientWidth: width, clientHeight: height } = this.canvas;
+    const ratio = Math.min(devicePixelRatio || 1, Math.sqrt(MOST_PIXELS / Math.max(width * height, 1)));
+    this.canvas.width = Math.max(1, Math.round(width * ratio));
+    this.canvas.height = Math.max(1, Math.round(height * ratio));
+    this.request();
+  }
+
+  request() {
+    this.pending ??= requestAnimationFrame((now) => {
+      this.pending = null;
+      this.#draw(now);
+    });
+  }
+
+  // The picture as a PNG, as a data address.
+  picture() {
+    this.#draw(performance.now());
+    return this.canvas.toDataURL();
+  }
+
+  #film(playing) {
+    this.playing = playing;
+    this.lastFrame = null;
+    this.glide = null;
+    this.update();
+  }
+
+  // What one looks at lies beside the panel.
+  #pinhole() {
+    const { canvas } = this, scale = canvas.width / Math.max(canvas.clientWidth, 1);
+    const free = { x: 0, y: 0, width: canvas.width, height: canvas.height };
+    const panel = get("panel").getBoundingClientRect();
+    if (!document.body.classList.contains("folded")) {
+      if (panel.width < 0.7 * canvas.clientWidth) free.width = Math.round(panel.left * scale);
+      else free.height = Math.round(panel.top * scale);
+    }
+    if (free.width < 40 || free.height < 40) Object.assign(free, { width: canvas.width, height: canvas.height });
+    return pinhole(this.camera, canvas.width, canvas.height, free);
+  }
+
+  #draw(now) {
+    this.#advance(now);
+    if (this.dirty) this.#compose();
+    const at = this.#pinhole(), row = depthRow(at);
+    if (this.turned || this.sorted?.some((x, i) => x !== row[i]) !== false) {
+      this.sorted = row;
+      this.turned = false;
+      this.sorter.sort(row);
+    }
+    const moving = now - (this.movedAt ?? -Infinity) < REST_MS;
+    if (moving) {
+      const took = now - (this.drawnAt ?? now);
+      if (took > 0 && took < 1000) this.pace = 0.7 * (this.pace ?? 16) + 0.3 * took;
+      this.coarse ||= this.pace > SLOW_MS;
+      clearTimeout(this.resting);
+      this.resting = setTimeout(() => this.request(), REST_MS + 20);
+    } else this.pace = undefined;
+    this.coarse &&= moving;
+    this.renderer.draw(at, this.header.background, this.coarse ? 0.5 : 1);
+    this.drawnAt = now;
+    document.body.classList.add("drawn");
+  }
+
+  #advance(now) {
+    if (this.glide) {
+      const { from, to, start } = this.glide, share = Math.min((now - start) / GLIDE_MS, 1);
+      this.look(mixCameras(from, to, share * share * (3 - 2 * share)));
+      if (share >= 1) this.glide = null;
+      this.request();
+    }
+    if (!this.playing) return;
+    const { frames, fps, ping_pong: back } = this.header.timeline, last = frames.length - 1;
+    const round = back ? 2 * last : last + 1, passed = now - (this.lastFrame ?? now);
+    this.clock = ((this.lastFrame === null ? this.frame : this.clock) + (passed * fps) / 1000) % round;
+    this.lastFrame = now;
+    this.seek(this.clock <= last ? this.clock : back ? round - this.clock : last);
+    this.request();
+  }
+
+  #compose() {
+    this.dirty = false;
+    const layers = this.comparing ? [] : visibleLayers(this.view);
+    for (const layer of layers) layer.weights = this.#weights(layer.paint);
+    const changed = this.composer.update(layers, this.view.blend);
+    if (!changed) return;
+    this.renderer.update(this.composer, changed);
+    if (changed.names.includes("means")) {
+      this.means.set(this.composer.after.means.subarray(3 * changed.first, 3 * changed.last), 3 * changed.first);
+      this.sorter.moved(changed.first, changed.last);
+      this.turned = true;
+    }
+  }
+
+  #weights(paint) {
+    if (!Array.isArray(paint)) return paint < 0 ? null : this.paints[paint];
+    const [a, b, share] = paint, [from, to] = [a, b].map((index) => (index < 0 ? null : this.paints[index]));
+    return (from ?? to).map((_, i) => (1 - share) * (from ? from[i] : 1) + share * (to ? to[i] : 1));
+  }
+
+  #bind() {
+    listen(this.canvas, this);
+    new ResizeObserver(() => this.resize()).observe(this.canvas);
+    const press = (id, act) => get(id).addEventListener("click", act);
+    press("fold", () => {
+      const folded = document.body.classList.toggle("folded");
+      get("fold").setAttribute("aria-expanded", !folded);
+      this.turned = true;
+      this.request();
+    });
+    press("home", () => this.glideTo(this.home));
+    press("full", () => {
+      if (document.fullscreenElement) document.exitFullscreen();
+      else document.documentElement.requestFullscreen?.();
+    });
+    const hold = get("compare");
+    hold.addEventListener("pointerdown", () => this.compare(true));
+    for (const name of ["pointerup", "pointerleave", "pointercancel", "blur"]) {
+      hold.addEventListener(name, () => this.compare(false));
+    }
+    addEventListener("keydown", (event) => {
+      if (event.ctrlKey || event.metaKey || event.altKey) return;
+      if (event.key === " ") {
+        event.preventDefault();
+        this.compare(true);
+      } else if (event.key === "p" && this.header.timeline) this.play();
+      else if (event.key === "Home" && event.target === document.body) this.glideTo(this.home);
+    });
+    addEventListener("keyup", (event) => {
+      if (event.key !== " ") return;
+      event.preventDefault();
+      this.compare(false);
+    });
+    addEventListener("blur", () => this.compare(false));
+    this.canvas.addEventListener("webglcontextlost", (event) => {
+      event.preventDefault();
+      document.body.classList.remove("drawn");
+      get("notice").textContent = "The graphics card was reset; reload the page.";
+    });
+  }
+}
+
+async function start() {
+  const data = get("data"), shaders = JSON.parse(get("shaders").textContent);
+  try {
+    const text = data.textContent;
+    data.remove();
+    globalThis.progdf = new Page(new Container(await inflate(text)), shaders);
+  } catch (error) {
+    get("notice").textContent = error.message === "no WebGL2"
+      ? "This browser draws no 3D (WebGL2 is off), so this is a still picture."
+      : `The scene cannot be shown here: ${error.message}`;
+  }
+}
+
+start();
