@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from progdf.camera import Camera
+from progdf.compose.reference import Layer, compose_layers
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.metrics.image import psnr
@@ -100,7 +101,7 @@ def outside_change(opened: OpenedRun) -> dict[str, float]:
     nor after it, 0..1: of the finished edit, and of what the editor made."""
     views, evaluator = opened.setup.judging, opened.evaluator
     edited = finished_scene(opened)
-    after = [make_view(edited, opened.run.region, view.camera, opened.setup.background) for view in views]
+    after = [make_view(edited, opened.setup.region, view.camera, opened.setup.background) for view in views]
     boxes = [scene.box for scene in evaluator.crops]
     outside = [
         crop((a.mask <= _SHOWS) & (b.mask <= _SHOWS), box)
@@ -116,11 +117,7 @@ def outside_change(opened: OpenedRun) -> dict[str, float]:
 
 def finished_scene(opened: OpenedRun) -> Gaussians:
     """The edited scene at strength 1."""
-    end = opened.gdf.field.offsets(1.0)
-    members = opened.run.region.members
-    if not len(end):
-        return opened.run.scene
-    return opened.run.scene.replace_rows(members, opened.evaluator.original[:, : end.shape[1]] + end)
+    return compose_layers(opened.setup.scene, [Layer(opened.gdf, 1.0)])
 
 
 def _warp(

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from progdf.compose.added import extend
 from progdf.errors import ProgdfError
 from progdf.field import BakedField, fit_keyframes
 from progdf.field.trajectory import Trajectory
@@ -88,7 +89,9 @@ def open_run(root: Path, scene: Path | None = None) -> OpenedRun:
     if shown_at.shape != run.trajectory.s.shape:
         raise ProgdfError(f"{gdf.name}.gdf is not of the recording beside it; run progdf fit {root}")
     trajectory = replace(run.trajectory, s=shown_at)
-    evaluator = load_evaluator(run.folder, setup, setup.judging, run.trajectory)
+    evaluator = load_evaluator(run.folder, setup, setup.judging, run.trajectory, gdf)
+    extended, (gdf,) = extend(run.scene, [gdf])
+    setup = replace(setup, scene=extended, region=gdf.region)
     return OpenedRun(run, report, setup, evaluator, gdf, trajectory, _two_keyframes(gdf, setup, report))
 
 

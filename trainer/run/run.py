@@ -73,12 +73,12 @@ from trainer.store.run_folder import (
 )
 from trainer.store.state import interrupt_on_signals
 from trainer.views.crops import only_recolors
-from trainer.views.view import BACKGROUND, fit_size, make_view, render_view, with_near_plane
+from trainer.views.view import BACKGROUND, fit_size, make_view, with_near_plane
 
 from .agree import AgreedEditor, Easel, agree_views
-from .decal import RING, TURNS, train_decal
-from .finish import RunResult, end_rows, finish_run, load_evaluator, load_result
+from .finish import RunResult, end_rows, finish_run, load_evaluator, load_result, write_finals
 from .kinds import Approach, choose_approach
+from .paint import RING, TURNS, train_decal
 from .record import RunRecord, read_record
 from .removal import is_removal, remove_region
 from .resume import check_exists, decide_resume, explain_stop, load_region, picture_digests
@@ -262,7 +262,8 @@ def _run_training(
         )
         extra = {"members": region.members, "score": region.score}
         save_trajectory(folder.trajectory, trajectory, extra, plain(record))
-        _write_finals(setup, trajectory, folder, log)
+        with log.stage("final"):
+            write_finals(setup, scene.replace_rows(region.members, end_rows(setup, trajectory)), folder, log)
         folder.state.save("recorded", {}, log.capture_state().values)
     else:
         log.restore(recorded)
@@ -282,7 +283,7 @@ def _paint(
         raise TypeError(f"{options.editor.editor} paints nothing")
     view = editor.view
     with log.stage("fit"):
-        painted = train_decal(editor, scene, options.name)
+        painted = train_decal(editor, scene, options.name, log)
     given = plain(recorded_options(options))
     decal = f"decal:{Path(options.editor.editor.partition(':')[2]).name}"
     gdf, figures = replace(painted.gdf, instruction=decal), painted.figures
@@ -561,15 +562,3 @@ def _choose_path(
     painter = None if options.editor.family in (*EXTERNAL, *COSTLY_STRENGTHS) else editor()
     retimed = partial(retime_trajectory, setup=setup, optimization=optimization, log=log)
     return choose_path(trajectory, setup, painter, bool(optimization.group_steps), retimed)
-
-
-def _write_finals(setup: TrainingSetup, trajectory: Trajectory, folder: RunFolder, log: RunLog) -> None:
-    """The finished edit's views."""
-    with log.stage("final"):
-        edited_scene = setup.scene.replace_rows(setup.region.members, end_rows(setup, trajectory))
-        finals = {}
-        with log.looks("picture the edit", len(setup.views)) as looked:
-            for view in setup.views:
-                finals[view.camera.name] = render_view(edited_scene, view.camera, setup.background)
-                looked()
-        write_views(folder, "final", finals)

@@ -16,7 +16,7 @@ from progdf.compose.layers import Layer
 from progdf.compose.reference import compose_layers
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
-from progdf.gdf.file import load_gdf, save_gdf
+from progdf.gdf.file import Gdf, load_gdf, save_gdf
 from progdf.io.cameras import save_cameras
 from progdf.metrics.image import psnr
 from progdf.rasterize import render
@@ -24,8 +24,8 @@ from progdf.region import whole_scene
 from tests.helpers.edits import bits
 from trainer.editors.decal import DecalEditor, decal, parse_place
 from trainer.options import EditorOptions
-from trainer.paint.discs import Paint, merge_pixels, place_discs
-from trainer.run.decal import finished_scene, orbit, paint_gdf, train_decal
+from trainer.paint.discs import Paint, lay_on, merge_pixels, place_discs
+from trainer.run.paint import Laid, choose_discs, finished_scene, lay_discs, orbit, paint_gdf, train_decal
 from trainer.views.view import BACKGROUND
 
 SIDE = 128
@@ -66,8 +66,18 @@ def letters(scene: Gaussians) -> Paint:
     painted = torch.zeros(SIDE, SIDE, dtype=torch.bool)
     for left in range(45, 85, 10):
         painted[50:78, left : left + 5] = True
-    image = torch.where(painted[..., None], torch.tensor([0.1, 0.15, 0.5]), picture(scene))
-    return Paint(CAMERA, image, painted)
+    return paint_on(scene, painted)
+
+
+def paint_on(scene: Gaussians, painted: torch.Tensor) -> Paint:
+    """These pixels in dark blue. [H,W] bool"""
+    drawn = painted[..., None] * torch.tensor([0.1, 0.15, 0.5, 1.0])
+    return Paint(CAMERA, lay_on(picture(scene), drawn), drawn)
+
+
+def edit_of(scene: Gaussians, paint: Paint) -> tuple[Gdf, Laid]:
+    laid = lay_discs(scene, [paint], 4.0)
+    return paint_gdf(laid, scene, [paint], "letters", None), laid
 
 
 def put(folder: Path, image: np.ndarray) -> EditorOptions:
@@ -84,7 +94,7 @@ def make(options: EditorOptions, scene: Gaussians) -> DecalEditor:
 def test_letters_finer_than_the_gaussians_are_as_sharp_as_they_were_painted() -> None:
     scene = wall()
     paint = letters(scene)
-    gdf, _ = paint_gdf(scene, paint, "letters")
+    gdf, _ = edit_of(scene, paint)
     made = picture(compose_layers(scene, [Layer(gdf, 1.0)]))
     # hard edges in all pixels of a bar: what the engine blurs over a pixel would need colors below black
     assert psnr(made, paint.picture, paint.painted) > 26.0
@@ -95,12 +105,12 @@ def test_letters_finer_than_the_gaussians_are_as_sharp_as_they_were_painted() ->
 
 def test_strength_zero_is_the_original_bit_for_bit_and_nothing_outside_the_region_changes() -> None:
     scene = wall()
-    gdf, discs = paint_gdf(scene, letters(scene), "letters")
+    gdf, laid = edit_of(scene, letters(scene))
     start = compose_layers(scene, [Layer(gdf, 0.0)])
     assert bits(start[: len(scene)]) == bits(scene)
     assert torch.equal(picture(start), picture(scene))
     finished = compose_layers(scene, [Layer(gdf, 1.0)])
-    outside = torch.ones(len(scene), dtype=torch.bool).index_fill(0, discs.moved, False)
+    outside = torch.ones(len(scene), dtype=torch.bool).index_fill(0, laid.rows, False)
     assert bits(finished[: len(scene)][outside]) == bits(scene[outside])
     assert bits(finished) == bits(finished_scene(scene, gdf))
 
@@ -108,7 +118,7 @@ def test_strength_zero_is_the_original_bit_for_bit_and_nothing_outside_the_regio
 def test_paint_appears_in_the_middle_of_the_slider() -> None:
     scene = wall()
     paint = letters(scene)
-    gdf, _ = paint_gdf(scene, paint, "letters")
+    gdf, _ = edit_of(scene, paint)
     half = picture(compose_layers(scene, [Layer(gdf, 0.5)]))
     before, change = picture(scene), paint.picture - picture(scene)
     share = ((half - before) * change)[paint.painted].sum() / change[paint.painted].square().sum()
@@ -117,7 +127,7 @@ def test_paint_appears_in_the_middle_of_the_slider() -> None:
 
 def test_what_moves_back_keeps_its_outline_in_the_painted_view() -> None:
     scene = wall()
-    discs = place_discs(scene, letters(scene), 0.02)
+    discs = place_discs(scene, letters(scene), 0.02, 4.0)
     assert len(discs.moved) > 0
     row = discs.moved[:1]
     before, after = (render(some[row], CAMERA, (0.0, 0.0, 0.0)).image for some in (scene, discs.scene))
@@ -127,22 +137,22 @@ def test_what_moves_back_keeps_its_outline_in_the_painted_view() -> None:
 def test_what_stood_hidden_behind_others_does_not_cover_the_paint(tmp_path: Path) -> None:
     scene = wall(count=20_000, size=0.035, rough=0.01)
     logo = np.full((32, 32, 4), (200, 30, 40, 255), np.uint8)
-    discs = place_discs(scene, make(put(tmp_path, logo), scene).paint, 0.03)
+    discs = place_discs(scene, make(put(tmp_path, logo), scene).paint, 0.03, 4.0)
     assert float(discs.scene.means[discs.moved, 2].min()) > float(discs.added.means[:, 2].max())
 
 
 def test_an_untouched_picture_and_paint_beyond_the_silhouette_add_nothing() -> None:
     scene = wall()
     nothing = torch.zeros(SIDE, SIDE, dtype=torch.bool)
-    assert not len(place_discs(scene, Paint(CAMERA, picture(scene), nothing), 0.02).added)
+    assert not len(place_discs(scene, paint_on(scene, nothing), 0.02, 4.0).added)
     small = scene[(scene.means[:, 0] < -1.0).nonzero()[:, 0]]
     beyond = torch.zeros(SIDE, SIDE, dtype=torch.bool)
     beyond[60:70, 90:110] = True
-    discs = place_discs(small, Paint(CAMERA, picture(small), beyond), 0.02)
+    discs = place_discs(small, paint_on(small, beyond), 0.02, 4.0)
     assert not len(discs.added)
     assert discs.scene is small
     with pytest.raises(ProgdfError, match="opaque"):
-        paint_gdf(small, Paint(CAMERA, picture(small), beyond), "beyond")
+        choose_discs(small, [paint_on(small, beyond)], None)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -152,7 +162,7 @@ def test_every_pixel_is_in_one_rectangle_and_flat_paint_needs_few(seed: int) -> 
     top, left = random.integers(5, 20, 2)
     mask[top : top + 160, left : left + 176] = True
     flat = np.full((200, 220, 3), 0.4, np.float32)
-    cells = merge_pixels(flat, mask, 0.02)
+    cells = merge_pixels(flat, mask, 0.02, mask)
     covered = np.zeros(mask.shape, int)
     for x, y, width, height in cells:
         covered[
@@ -161,13 +171,13 @@ def test_every_pixel_is_in_one_rectangle_and_flat_paint_needs_few(seed: int) -> 
     assert (covered == mask).all()
     assert len(cells) <= 0.015 * mask.sum()
     noise = random.random((200, 220, 3)).astype(np.float32)
-    assert len(merge_pixels(noise, mask, 0.02)) == mask.sum()
+    assert len(merge_pixels(noise, mask, 0.02, mask)) == mask.sum()
 
 
 def test_paint_is_not_seen_through_a_thin_thing_from_behind() -> None:
     scene = replace(wall(), means=wall().means * torch.tensor([1.0, 1.0, 0.3]))
     paint = letters(scene)
-    gdf, _ = paint_gdf(scene, paint, "letters")
+    gdf, _ = edit_of(scene, paint)
     back = orbit(CAMERA, torch.zeros(3), 180.0)
     before, after = (
         render(some, back, BACKGROUND).image.clamp(0, 1) for some in (scene, finished_scene(scene, gdf))
