@@ -125,10 +125,8 @@ def finish_run(
         plan = plain(options)
         given = differences(plan, DEFAULTS)
         gdf = Gdf(options.name, region, field, fingerprint(scene), options.editor.editor, given)
-        sharp = None
-        if files := options.views.pictures:
-            cameras = [view.camera for view in setup.train]
-            sharp = sharpen(scene, gdf, dict(zip(files, cameras, strict=True)), log)
+        cameras = [view.camera for view in setup.train]
+        sharp = sharpen(scene, gdf, dict(zip(options.views.pictures, cameras, strict=False)), log)
         endpoint, outside = exactness(scene, gdf, end_rows(setup, trajectory))
         title = f"{options.name}: {options.editor.editor}"
         shown = evaluator

@@ -40,8 +40,8 @@ TURNS = (-45, -30, -15, 0, 15, 30, 45)
 """Degrees about what is painted, from which it is measured."""
 
 _TRIAL_TURNS = (-30, -15, 0, 15, 30)
-_GAPS = (4.0, 1.0, 12.0)  # pixels between discs and what is moved behind them, which are tried
-_FLAT = 0.02  # root mean square of color that one disc may be off, over its pixels
+_GAPS = (4.0, 1.0)  # pixels between discs and what is moved behind them, which are tried
+_FLAT = 0.015  # root mean square of color that one disc may be off, over its pixels
 _SPOILED = 1 / 255  # of color, by which what was moved shows beside the paint
 _LEAST_SHOWN = 0.5  # pixels of that, from which a row's color may change
 _ALIKE = 0.05  # of color, by which a pixel is told from what was painted
@@ -80,11 +80,12 @@ def lay_discs(scene: Gaussians, paints: Sequence[Paint], gap: float) -> Laid:
     for paint in paints:
         fresh = paint
         if len(added):
-            colors = torch.zeros(len(scene) + len(added), 3).index_fill(
-                0, torch.arange(len(scene), len(scene) + len(added)), 1.0
-            )
-            covered = render(join(cleared, added), paint.camera, (0.0, 0.0, 0.0), colors=colors).image
-            fresh = replace(paint, drawn=paint.drawn * (covered[..., :1] < 0.5))
+            colors = torch.cat([torch.zeros(len(scene), 3), torch.ones(len(added), 3)])
+            shown = render(join(cleared, added), paint.camera, (0.0, 0.0, 0.0), colors=colors).image[..., 0]
+            near = ndimage.binary_dilation(
+                (shown > 0.5).numpy(), iterations=GROWN
+            )  # as discs are beside paint
+            fresh = replace(paint, drawn=paint.drawn * ~torch.from_numpy(near)[..., None])
         discs = place_discs(scene, fresh, _FLAT, gap, cleared)
         cleared, added = discs.scene, join(added, discs.added)
         changed[discs.moved] = True
@@ -106,6 +107,7 @@ class Look:
     """A view around the paint, and what of it counts."""
 
     camera: Camera
+    degrees: float  # by which it is turned; 0: that of the picture
     expected: Tensor  # the paint laid on the surface. [H,W,3]
     covered: Tensor  # where it lies. [H,W] bool
     around: Tensor  # and the ring beside it. [H,W] bool
@@ -133,7 +135,7 @@ def look_around(scene: Gaussians, paints: Sequence[Paint], degrees: Sequence[flo
             else:
                 expected, covered = paint.picture, paint.painted
             grown = ndimage.binary_dilation(covered.numpy(), iterations=RING)
-            looks.append(Look(camera, expected, covered, torch.from_numpy(grown) & ~covered))
+            looks.append(Look(camera, angle, expected, covered, torch.from_numpy(grown) & ~covered))
     return looks
 
 
@@ -151,13 +153,20 @@ def _error(finished: Gaussians, looks: Sequence[Look]) -> float:
     return error / max(1.0, pixels)
 
 
-def choose_discs(scene: Gaussians, paints: Sequence[Paint], log: RunLog | None) -> Laid:
+def choose_discs(
+    scene: Gaussians, paints: Sequence[Paint], looks: Sequence[Look], log: RunLog | None
+) -> Laid:
     """Discs with the gap that comes closest to the paint, in its own views and from the sides.
+
+    Args:
+        scene: what they are laid on
+        paints: of one thing
+        looks: see `look_around`
+        log: of the run
 
     Raises:
         ProgdfError: nothing is painted on anything opaque.
     """
-    looks = look_around(scene, paints, _TRIAL_TURNS)
     tried = list[tuple[float, Laid]]()
     for gap in _GAPS:
         laid = lay_discs(scene, paints, gap)
@@ -267,13 +276,14 @@ def sharpen(scene: Gaussians, recolored: Gdf, pictures: Mapping[Path, Camera], l
     left = 1.0 - light[members, 0] / light[members, 1].clamp_min(1e-6)
     rows = pack(scene[members], with_shN=recolored.field.channels > BASE_CHANNELS)
     base = scene.replace_rows(members, rows + left[:, None] * recolored.field.offsets(1.0))
+    looks = look_around(base, paints, _TRIAL_TURNS)
     try:
-        laid = choose_discs(base, paints, log)
+        laid = choose_discs(base, paints, looks, log)
     except ProgdfError:
         return None
-    sides = look_around(base, paints, [degrees for degrees in _TRIAL_TURNS if degrees])
-    own = look_around(base, paints, [0])
-    errors = [[_error(one, looks) for one in (end, laid.finished)] for looks in (own, sides)]
+    own = [look for look in looks if not look.degrees]
+    sides = [look for look in looks if look.degrees]
+    errors = [[_error(one, some) for one in (end, laid.finished)] for some in (own, sides)]
     keeps = errors[0][1] < errors[0][0] and errors[1][1] <= errors[1][0]
     own_db, side_db = ([round(decibels(error), 1) for error in pair] for pair in errors)
     pixels, discs = (
@@ -321,7 +331,7 @@ def train_decal(editor: DecalEditor, scene: Gaussians, name: str, log: RunLog | 
         log: of the run
     """
     paints = [editor.paint]
-    laid = choose_discs(scene, paints, log)
+    laid = choose_discs(scene, paints, look_around(scene, paints, _TRIAL_TURNS), log)
     gdf = paint_gdf(laid, scene, paints, name, None)
     return measure_discs(gdf, scene, scene, paints)
 
