@@ -43,6 +43,7 @@ GROWN = 2
 
 _SIDES = (16, 8, 4, 2, 1)  # of the rectangles of pixels that share a disc
 _SPREAD, _MERGED_SPREAD = 0.28, 0.6  # standard deviation of a disc in its sides: of a pixel, of more
+_BLUR = 0.1  # pixels²: what of the engine's blur of .3 counts as a disc's error; colors undo the rest
 _BACK = 0.5  # pixels by which discs lie deeper, as nearer neighbors cover them
 _RELIEF = 1.25  # pixels for 1 of color by which discs lie deeper than darker neighbors, see `_rise_beside`
 _THIN = 0.1  # pixels: the standard deviation across
@@ -198,7 +199,10 @@ def _box_means(values: Array, height: int, width: int) -> Array:
 def _disc_error(image: Array, height: int, width: int) -> Array:
     """Mean square of what discs of the mean colors of the rectangles that begin at each pixel are off there.
     [H,W,3] -> [H,W]"""
-    spread = [(_MERGED_SPREAD * side if side > 1 else _SPREAD) / 2**0.5 for side in (height, width)]
+    spread = [
+        ((_MERGED_SPREAD * side if side > 1 else _SPREAD) ** 2 + _BLUR) ** 0.5 / 2**0.5
+        for side in (height, width)
+    ]
     rows, columns = image.shape[:2]
     padded = np.pad(image, ((0, height), (0, width), (0, 0)), mode="edge")
     color = _box_means(padded, height, width)[:rows, :columns]

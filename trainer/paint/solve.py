@@ -25,7 +25,7 @@ from .discs import Paint
 
 _STEPS, _ROUNDS = 40, 3  # of conjugate gradients; between them, colors below black are set to it
 _HELD = 0.05  # of a pixel: how much a row of the scene holds on to its own color
-_RIDGE = 1e-3  # the same of a disc
+_RIDGE = 0.02  # the same of a disc, on what was painted there
 _LEAST_BOX = 32  # pixels around the paint in which its colors are solved for
 
 

@@ -46,7 +46,7 @@ _SPOILED = 1 / 255  # of color, by which what was moved shows beside the paint
 _LEAST_SHOWN = 0.5  # pixels of that, from which a row's color may change
 _ALIKE = 0.05  # of color, by which a pixel is told from what was painted
 _ROUNDED = 1.5 / 255  # two images in 8 bits differ by as much
-_BLUR = 2.0  # pixels over which what is missing is taken together
+_WINDOW = 2.0  # pixels over which what is missing is taken together
 _LOOKS = 12  # strengths at which what shows is measured
 _LOGIT = 10  # channel of the opacity in a packed row, see `attribute_slices`
 
@@ -305,7 +305,7 @@ def _missed_paint(scene: Gaussians, end: Gaussians, path: Path, camera: Camera) 
     target = read_edit(scene, camera, image, path)
     changed = (target - image).abs().amax(dim=2) > _ROUNDED
     missing = (target - render_view(end, camera, background).clamp(0.0, 1.0)).square().mean(dim=2).numpy()
-    rough = ndimage.gaussian_filter(missing, _BLUR) > _ALIKE**2
+    rough = ndimage.gaussian_filter(missing, _WINDOW) > _ALIKE**2
     sharp = changed & torch.from_numpy(ndimage.binary_dilation(rough, iterations=GROWN))
     drawn = torch.cat([target, torch.ones_like(target[..., :1])], dim=2) * sharp[..., None]
     return Paint(camera, target, drawn), changed
