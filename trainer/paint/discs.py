@@ -27,7 +27,7 @@ from progdf.gdf.file import ADDED_LOGIT
 from progdf.quaternions import matrix_quats
 from progdf.rasterize import render
 from progdf.rasterize.cpu.engine import ListedWeights
-from progdf.rasterize.engines import activate, color_map, render_depth
+from progdf.rasterize.engines import Depth, activate, color_map, render_depth
 from progdf.sh import rgb_to_sh0
 
 Array = NDArray[np.float64]
@@ -97,11 +97,10 @@ def place_discs(
     camera, cleared = paint.camera, scene if cleared is None else cleared
     depth = render_depth(scene, camera)
     opaque = (depth.alpha > OPAQUE).numpy()
-    surface = smooth_depth(depth.depth.numpy(), opaque)
+    surface, even, pieces = _paint_surface(depth, camera)
     mask = ndimage.binary_dilation(paint.painted.numpy() & opaque, iterations=GROWN) & opaque
     if not mask.any():
         return Discs(scene[:0], torch.zeros(0, dtype=torch.int64), cleared)
-    even = _even_pixels(surface, camera)
     cells = merge_pixels(paint.picture.numpy(), mask, flat, even)
     added, depths = _discs(camera, cells, surface, paint.picture)
     added = replace(
@@ -112,22 +111,28 @@ def place_discs(
     )
     behind = surface + (_BACK + gap) * float(np.median(depths)) / float(camera.K[0, 0])
     reach = float((behind - surface).max()) + _REACH * _thickness(scene, camera, mask)
-    pieces, _ = ndimage.label(even)
-    nearest = ndimage.distance_transform_edt(~even, return_distances=False, return_indices=True)
     moved = torch.zeros(len(scene), dtype=torch.bool)
     for _ in range(_CLEARED):  # what stood before others hid them
-        rows, factors = _rows_before(cleared, camera, behind, mask, reach, pieces[tuple(nearest)])
+        rows, factors = _rows_before(cleared, camera, behind, mask, reach, pieces)
         if not len(rows):
             break
         cleared, moved = _move_back(cleared, camera, rows, factors), moved.index_fill(0, rows, True)
     return Discs(added, moved.nonzero()[:, 0], cleared)
 
 
-def _even_pixels(surface: Array, camera: Camera) -> NDArray[np.bool_]:
-    """Where the surface goes on: its depth changes less from pixel to pixel than a disc is turned. [H,W]"""
+def _paint_surface(seen: Depth, camera: Camera) -> tuple[Array, NDArray[np.bool_], NDArray[np.int32]]:
+    """Depths on which paint lies, where the surface goes on to its neighbors, and its pieces. [H,W] each
+
+    It goes on where its depth changes less from pixel to pixel than a disc is turned. What is blended over a
+    rim lies on one side of it, not between.
+    """
+    surface = smooth_depth(seen.depth.numpy(), (seen.alpha > OPAQUE).numpy())
     steepest = surface / float(camera.K[0, 0]) * (1 - _STEEP**2) ** 0.5 / _STEEP
     down, right = (np.abs(np.diff(surface, axis=axis, append=surface.take([-1], axis))) for axis in (0, 1))
-    return cast(NDArray[np.bool_], np.maximum(down, right) < steepest)
+    even = np.maximum(down, right) < steepest
+    away, nearest = ndimage.distance_transform_edt(~even, return_indices=True)
+    surface = np.where(away <= _MEDIAN, surface[tuple(nearest)], surface)
+    return surface, even, ndimage.label(even)[0][tuple(nearest)]
 
 
 def smooth_depth(depth: NDArray[np.float32], opaque: NDArray[np.bool_]) -> Array:
@@ -392,7 +397,7 @@ def project_paint(scene: Gaussians, own: Camera, drawn: Tensor, camera: Camera) 
     left, top = max(0, columns.min() - _MARGIN), max(0, rows.min() - _MARGIN)
     window = left, top, min(own.width, columns.max() + _MARGIN + 1), min(own.height, rows.max() + _MARGIN + 1)
     seen = render_depth(scene, own, crop=window)
-    surface = smooth_depth(seen.depth.numpy(), (seen.alpha > OPAQUE).numpy())
+    surface, _, _ = _paint_surface(seen, own)
     step = max(1, round(math.sqrt(surface.size / _KNOTS)))
     y, x = np.mgrid[: surface.shape[0] : step, : surface.shape[1] : step]
     K, there = own.K.double().numpy(), camera.K.double().numpy()

@@ -28,6 +28,7 @@ from trainer.fit.slider_uniformity import equalize_slider
 from trainer.optimize.losses import Perceptual, perceptual_loss
 from trainer.optimize.retime import resolve_slider
 from trainer.options import EditorOptions, FieldOptions, FitOptions, RegionOptions, TextOptions, TrainOptions
+from trainer.regions.from_pictures import CHANGED
 from trainer.report.measures import (
     PaintTaken,
     against_editor,
@@ -126,7 +127,8 @@ def finish_run(
         given = differences(plan, DEFAULTS)
         gdf = Gdf(options.name, region, field, fingerprint(scene), options.editor.editor, given)
         cameras = [view.camera for view in setup.train]
-        sharp = sharpen(scene, gdf, dict(zip(options.views.pictures, cameras, strict=False)), log)
+        pictures = dict(zip(options.views.pictures, cameras, strict=False))
+        sharp = sharpen(scene, gdf, pictures, options.region.region != CHANGED, log)
         endpoint, outside = exactness(scene, gdf, end_rows(setup, trajectory))
         title = f"{options.name}: {options.editor.editor}"
         shown = evaluator

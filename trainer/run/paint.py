@@ -32,7 +32,7 @@ from trainer.editors.pictures import read_edit
 from trainer.paint.discs import DISC_LOGIT, GROWN, Paint, faint, lay_on, place_discs, project_paint
 from trainer.paint.solve import box_of, join, solve_colors
 from trainer.store.progress import RunLog
-from trainer.views.view import BACKGROUND, crop, render_view
+from trainer.views.view import BACKGROUND, View, crop, make_view, render_view
 
 RING = 15
 """Pixels around the paint that must stay as they are."""
@@ -252,19 +252,27 @@ def _even_clock(laid: Laid, paints: Sequence[Paint], steps: Tensor, rise: Tensor
     return torch.from_numpy(np.interp(steps.double().numpy(), at, course)).float()
 
 
-def sharpen(scene: Gaussians, recolored: Gdf, pictures: Mapping[Path, Camera], log: RunLog) -> Gdf | None:
+def sharpen(
+    scene: Gaussians, recolored: Gdf, pictures: Mapping[Path, Camera], is_named: bool, log: RunLog
+) -> Gdf | None:
     """The edit with discs where paint is finer than the Gaussians; None where there is none, or they lose.
 
     Args:
         scene: the original
         recolored: what the best recolor is
         pictures: changed pictures, and the cameras that they are trained with
+        is_named: paint stays within the edit's region, which was not found by the pictures
         log: of the run
     """
     end = compose_layers(scene, [Layer(recolored, 1.0)])
     paints, light = list[Paint](), torch.zeros(len(scene), 2)
     for path, camera in pictures.items():
-        paint, changed = _missed_paint(scene, end, path, camera)
+        view = make_view(
+            scene, recolored.region, camera.resize(*picture_size(path)), torch.tensor(BACKGROUND)
+        )
+        target = read_edit(scene, view.camera, view.image, path)
+        target = (view if is_named else view.with_painted([target])).confine(target)
+        paint, changed = _missed_paint(end, view, target)
         light += torch.stack(
             [alpha_weights(scene, paint.camera, mask)[:, 0] for mask in (paint.painted, changed)], dim=1
         )
@@ -297,18 +305,14 @@ def sharpen(scene: Gaussians, recolored: Gdf, pictures: Mapping[Path, Camera], l
     return paint_gdf(laid, scene, paints, recolored.name, recolored) if keeps else None
 
 
-def _missed_paint(scene: Gaussians, end: Gaussians, path: Path, camera: Camera) -> tuple[Paint, Tensor]:
-    """What a recolor misses of a picture at the picture's own size, and all that was painted. [H,W] bool"""
-    background = torch.tensor(BACKGROUND)
-    camera = camera.resize(*picture_size(path))
-    image = render_view(scene, camera, background).clamp(0.0, 1.0)
-    target = read_edit(scene, camera, image, path)
-    changed = (target - image).abs().amax(dim=2) > _ROUNDED
-    missing = (target - render_view(end, camera, background).clamp(0.0, 1.0)).square().mean(dim=2).numpy()
-    rough = ndimage.gaussian_filter(missing, _WINDOW) > _ALIKE**2
+def _missed_paint(end: Gaussians, view: View, target: Tensor) -> tuple[Paint, Tensor]:
+    """What a recolor misses of a picture, and all that was painted. [H,W] bool"""
+    changed = (target - view.image).abs().amax(dim=2) > _ROUNDED
+    shown = render_view(end, view.camera, torch.tensor(BACKGROUND)).clamp(0.0, 1.0)
+    rough = ndimage.gaussian_filter((target - shown).square().mean(dim=2).numpy(), _WINDOW) > _ALIKE**2
     sharp = changed & torch.from_numpy(ndimage.binary_dilation(rough, iterations=GROWN))
     drawn = torch.cat([target, torch.ones_like(target[..., :1])], dim=2) * sharp[..., None]
-    return Paint(camera, target, drawn), changed
+    return Paint(view.camera, target, drawn), changed
 
 
 @dataclass(frozen=True)

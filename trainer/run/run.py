@@ -46,7 +46,7 @@ from trainer.fit.slider_uniformity import equalized_strengths
 from trainer.optimize.losses import Perceptual, describe_loss, perceptual_loss
 from trainer.optimize.retime import resolve_slider
 from trainer.options import MOST_STAGES, EditKind, OptimizeOptions, TrainOptions
-from trainer.regions.from_pictures import RegionRequest, region_checks, region_kinds
+from trainer.regions.from_pictures import CHANGED, RegionRequest, region_checks, region_kinds
 from trainer.report.agreement import measure_agreement
 from trainer.resolve import recorded_options, resolve, resolve_kind
 from trainer.setup import (
@@ -410,7 +410,10 @@ def _edit_views(
     def edit(strengths: Sequence[float]) -> Pictures:
         new, is_confined = [s for s in strengths if s not in made], confines_edit(editor(), approach.kind)
         with log.steps("edit", len(views) * len(new)) as advance:
-            made.update(edit_views(editor(), views, new, folder, is_confined, advance))
+            within = views
+            if options.region.region == CHANGED:  # of paint finer than the Gaussians few are found
+                within = [view.with_painted([editor().edit(view, 1.0)]) for view in views]
+            made.update(edit_views(editor(), within, new, folder, is_confined, advance))
         log.say(f"{spec}: a {approach.kind} edit at strength {', '.join(f'{s:g}' for s in strengths)}")
         saved = {"strengths": list(strengths), "kind": approach.kind, "group_steps": approach.group_steps}
         shared = painter.figures if isinstance(painter := editor(), AgreedEditor) else {}

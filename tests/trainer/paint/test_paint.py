@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,73 +10,23 @@ import pytest
 import torch
 from PIL import Image
 
-from progdf.camera import Camera, intrinsics, look_at
 from progdf.compose.layers import Layer
 from progdf.compose.reference import compose_layers
 from progdf.errors import ProgdfError
-from progdf.gaussians import Gaussians
-from progdf.gdf.file import Gdf, load_gdf, save_gdf
+from progdf.gaussians import Gaussians, concatenate
+from progdf.gdf.file import load_gdf, save_gdf
 from progdf.io.cameras import save_cameras
 from progdf.metrics.image import psnr
+from progdf.quaternions import rotate_vectors
 from progdf.rasterize import render
 from progdf.region import whole_scene
 from tests.helpers.edits import bits
+from tests.helpers.painted_wall import CAMERA, SIDE, edit_of, letters, paint_on, picture, wall
 from trainer.editors.decal import DecalEditor, decal, parse_place
 from trainer.options import EditorOptions
-from trainer.paint.discs import Paint, lay_on, merge_pixels, place_discs
-from trainer.run.paint import Laid, choose_discs, finished_scene, lay_discs, orbit, paint_gdf, train_decal
+from trainer.paint.discs import merge_pixels, place_discs
+from trainer.run.paint import choose_discs, finished_scene, orbit, train_decal
 from trainer.views.view import BACKGROUND
-
-SIDE = 128
-CAMERA = Camera(
-    look_at(torch.tensor([0.0, 0.0, -3.0]), torch.zeros(3), torch.tensor([0.0, -1.0, 0.0])),
-    intrinsics(math.radians(45), SIDE, SIDE),
-    SIDE,
-    SIDE,
-    near=0.01,
-)
-
-
-def wall(seed: int = 0, count: int = 2500, size: float = 0.09, rough: float = 0.05) -> Gaussians:
-    """A wall across the picture, whose Gaussians are 5 pixels large and lie up to 6 before and behind it."""
-    random = torch.Generator().manual_seed(seed)
-    means = torch.rand(count, 3, generator=random) * torch.tensor([3.2, 3.2, 0.0]) - torch.tensor(
-        [1.6, 1.6, 0.0]
-    )
-    means[:, 2] = rough * torch.randn(count, generator=random).clamp(-2, 2)
-    scales = torch.tensor([size, size, 0.2 * size]) * (0.7 + 0.6 * torch.rand(count, 3, generator=random))
-    colors = 0.6 + 0.05 * torch.randn(count, 3, generator=random)
-    return Gaussians(
-        means,
-        torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
-        scales.log(),
-        torch.full((count,), 0.5),
-        colors,
-        torch.zeros(count, 3, 3),
-    )
-
-
-def picture(scene: Gaussians) -> torch.Tensor:
-    return render(scene, CAMERA, BACKGROUND).image.clamp(0.0, 1.0)
-
-
-def letters(scene: Gaussians) -> Paint:
-    """Bars of five pixels in dark blue, as wide as what is between them, in the middle of the wall."""
-    painted = torch.zeros(SIDE, SIDE, dtype=torch.bool)
-    for left in range(45, 85, 10):
-        painted[50:78, left : left + 5] = True
-    return paint_on(scene, painted)
-
-
-def paint_on(scene: Gaussians, painted: torch.Tensor) -> Paint:
-    """These pixels in dark blue. [H,W] bool"""
-    drawn = painted[..., None] * torch.tensor([0.1, 0.15, 0.5, 1.0])
-    return Paint(CAMERA, lay_on(picture(scene), drawn), drawn)
-
-
-def edit_of(scene: Gaussians, paint: Paint) -> tuple[Gdf, Laid]:
-    laid = lay_discs(scene, [paint], 4.0)
-    return paint_gdf(laid, scene, [paint], "letters", None), laid
 
 
 def put(folder: Path, image: np.ndarray) -> EditorOptions:
@@ -266,3 +215,20 @@ def test_a_decal_that_is_no_picture_or_has_no_camera_is_one_line(tmp_path: Path)
         with pytest.raises(ProgdfError) as raised:
             check_new_editor(options)
         assert "\n" not in str(raised.value)
+
+
+def test_no_disc_lies_between_two_depths_and_what_stands_in_front_stays() -> None:
+    back, near = (wall(seed, count=20_000, size=0.035, rough=0.01) for seed in (0, 1))
+    near = replace(near, means=near.means - torch.tensor([0, 0, 0.6]))
+    near = near[(near.means[:, 0] > 0.0).nonzero()[:, 0]]
+    scene = concatenate([back, near])
+    painted = torch.zeros(SIDE, SIDE, dtype=torch.bool)
+    painted[40:90, 40:90] = True
+    discs = place_discs(scene, paint_on(scene, painted), 0.03, 4.0)
+    depth = discs.added.means[:, 2]
+    assert float(((depth > -0.5) & (depth < -0.1)).float().mean()) < 0.02
+    across = rotate_vectors(torch.tensor([[0.0, 0.0, 1.0]]).expand(len(depth), 3), discs.added.quats)
+    large = discs.added.log_scales.exp().amax(dim=1) > 0.02
+    assert float(across[large, 2].abs().min()) > 0.5
+    front = discs.moved[discs.moved >= len(back)]
+    assert float(discs.scene.means[front, 2].max()) < -0.3
