@@ -68,7 +68,7 @@ class Paint:
     drawn: Tensor  # what lies on the surface: colors times alpha, and alpha. [H,W,4]
 
     @property
-    def painted(self) -> Tensor:
+    def mask(self) -> Tensor:
         """The pixels that were changed. [H,W] bool"""
         return self.drawn[..., 3] > LEAST_ALPHA
 
@@ -98,7 +98,7 @@ def place_discs(
     depth = render_depth(scene, camera)
     opaque = (depth.alpha > OPAQUE).numpy()
     surface, even, pieces = _paint_surface(depth, camera)
-    mask = ndimage.binary_dilation(paint.painted.numpy() & opaque, iterations=GROWN) & opaque
+    mask = ndimage.binary_dilation(paint.mask.numpy() & opaque, iterations=GROWN) & opaque
     if not mask.any():
         return Discs(scene[:0], torch.zeros(0, dtype=torch.int64), cleared)
     cells = merge_pixels(paint.picture.numpy(), mask, flat, even)

@@ -65,7 +65,7 @@ def solve_colors(
     free, activated = torch.cat([rows, torch.arange(len(scene), len(joined))]), activate(joined)
     maps, missing, lowest = list[ColorMap](), list[Tensor](), torch.full((len(free), 3), -torch.inf)
     for paint in paints:
-        box, colors = box_of(paint.painted, paint.camera), seen_colors(joined, paint.camera)
+        box, colors = box_of(paint.mask, paint.camera), seen_colors(joined, paint.camera)
         shown = render(joined, paint.camera, BACKGROUND, colors=colors, crop=box).image
         maps.append(color_map(activated, paint.camera, box, free))
         missing.append(crop(paint.picture, box) - shown)

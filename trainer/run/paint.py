@@ -62,7 +62,7 @@ class Laid:
     gap: float  # pixels between these and what was moved
 
     @property
-    def finished(self) -> Gaussians:
+    def end(self) -> Gaussians:
         """The scene with the paint, the discs after its own rows."""
         return join(self.ended, self.added)
 
@@ -90,10 +90,10 @@ def lay_discs(scene: Gaussians, paints: Sequence[Paint], gap: float) -> Laid:
         cleared, added = discs.scene, join(added, discs.added)
         changed[discs.moved] = True
     for paint in paints:
-        box = box_of(paint.painted, paint.camera)
+        box = box_of(paint.mask, paint.camera)
         before, after = (render(some, paint.camera, BACKGROUND, crop=box).image for some in (scene, cleared))
-        beside = ~ndimage.binary_dilation(paint.painted.numpy(), iterations=GROWN)
-        spoiled = torch.zeros_like(paint.painted)
+        beside = ~ndimage.binary_dilation(paint.mask.numpy(), iterations=GROWN)
+        spoiled = torch.zeros_like(paint.mask)
         crop(spoiled, box)[:] = (after - before).abs().amax(dim=2) > _SPOILED
         light = alpha_weights(cleared, paint.camera, spoiled & torch.from_numpy(beside))[:, 0]
         changed |= light > _LEAST_SHOWN
@@ -133,7 +133,7 @@ def look_around(scene: Gaussians, paints: Sequence[Paint], degrees: Sequence[flo
                     laid = project_paint(scene, other.camera, other.drawn, camera)
                     expected, covered = lay_on(expected, laid), covered | (laid[..., 3] > 0)
             else:
-                expected, covered = paint.picture, paint.painted
+                expected, covered = paint.picture, paint.mask
             grown = ndimage.binary_dilation(covered.numpy(), iterations=RING)
             looks.append(Look(camera, angle, expected, covered, torch.from_numpy(grown) & ~covered))
     return looks
@@ -172,7 +172,7 @@ def choose_discs(
         laid = lay_discs(scene, paints, gap)
         if not len(laid.added):
             raise ProgdfError("nothing is painted where the picture is opaque; paint on the scene")
-        tried.append((_error(laid.finished, looks), laid))
+        tried.append((_error(laid.end, looks), laid))
     best = min(tried, key=lambda one: one[0])
     if log is not None:
         errors = ", ".join(f"{decibels(error):.1f} dB with {laid.gap:g}" for error, laid in tried)
@@ -233,20 +233,20 @@ def _shares(recolored: Gdf, members: Tensor, end: Tensor, knots: Tensor) -> Tens
 def _even_clock(laid: Laid, paints: Sequence[Paint], steps: Tensor, rise: Tensor) -> Tensor:
     """Strengths at which the knots of a straight course come, so that what shows is linear in them. [S]"""
     paint = paints[0]
-    box = box_of(paint.painted, paint.camera)
-    painted, start = crop(paint.painted, box), pack(laid.scene[laid.rows])
+    box = box_of(paint.mask, paint.camera)
+    painted, start = crop(paint.mask, box), pack(laid.scene[laid.rows])
     way, hidden = pack(laid.ended[laid.rows]) - start, faint(laid.added)
 
-    def shown(g: float) -> Tensor:
+    def look_at(g: float) -> Tensor:
         logits = hidden.logit_opacities + interpolate_at(steps, rise, g)
         moved = laid.scene.replace_rows(laid.rows, start + g * way)
         now = join(moved, replace(hidden, logit_opacities=logits))
         return render(now, paint.camera, BACKGROUND, crop=box).image[painted]
 
-    first, last = shown(0.0), shown(1.0)
+    first, last = look_at(0.0), look_at(1.0)
     change = last - first
     at = np.linspace(0.0, 1.0, _LOOKS + 1)
-    shares = [float(((shown(g) - first) * change).sum() / change.square().sum()) for g in at[1:-1]]
+    shares = [float(((look_at(g) - first) * change).sum() / change.square().sum()) for g in at[1:-1]]
     course = np.maximum.accumulate(np.clip([0.0, *shares, 1.0], 0.0, 1.0))
     course = 0.98 * course + 0.02 * at  # ascends
     return torch.from_numpy(np.interp(steps.double().numpy(), at, course)).float()
@@ -274,9 +274,9 @@ def sharpen(
         target = (view if is_named else view.with_painted([target])).confine(target)
         paint, changed = _missed_paint(end, view, target)
         light += torch.stack(
-            [alpha_weights(scene, paint.camera, mask)[:, 0] for mask in (paint.painted, changed)], dim=1
+            [alpha_weights(scene, paint.camera, mask)[:, 0] for mask in (paint.mask, changed)], dim=1
         )
-        paints += [paint] if bool(paint.painted.any()) else []
+        paints += [paint] if bool(paint.mask.any()) else []
     if not paints:
         return None
     members = recolored.region.members
@@ -291,11 +291,11 @@ def sharpen(
         return None
     own = [look for look in looks if not look.degrees]
     sides = [look for look in looks if look.degrees]
-    errors = [[_error(one, some) for one in (end, laid.finished)] for some in (own, sides)]
+    errors = [[_error(one, some) for one in (end, laid.end)] for some in (own, sides)]
     keeps = errors[0][1] < errors[0][0] and errors[1][1] <= errors[1][0]
     own_db, side_db = ([round(decibels(error), 1) for error in pair] for pair in errors)
     pixels, discs = (
-        group_digits(n) for n in (sum(int(paint.painted.sum()) for paint in paints), len(laid.added))
+        group_digits(n) for n in (sum(int(paint.mask.sum()) for paint in paints), len(laid.added))
     )
     log.say(
         f"{pixels} painted pixels are finer than the Gaussians: {discs} discs for them have {own_db[1]} dB "
@@ -351,7 +351,7 @@ def measure_discs(gdf: Gdf, scene: Gaussians, base: Gaussians, paints: Sequence[
     ]
     middle = TURNS.index(0)
     figures = {
-        "pixels": sum(int(paint.painted.sum()) for paint in paints),
+        "pixels": sum(int(paint.mask.sum()) for paint in paints),
         "added": 0 if gdf.added is None else len(gdf.added),
         "moved": len(gdf.region),
         "own": errors[middle],
@@ -368,7 +368,7 @@ def finished_scene(scene: Gaussians, gdf: Gdf) -> Gaussians:
 
 def _pivot(scene: Gaussians, paint: Paint) -> Tensor:
     """The point of the surface under the painted pixel that is nearest to the middle of all. [3]"""
-    camera, pixels = paint.camera, paint.painted.nonzero()
+    camera, pixels = paint.camera, paint.mask.nonzero()
     row, column = pixels[int((pixels - pixels.float().mean(dim=0)).norm(dim=1).argmin())].tolist()
     depth = render_depth(scene, camera, crop=(column, row, column + 1, row + 1)).depth[0, 0].double()
     K, c2w = camera.K.double(), camera.c2w.double()

@@ -21,7 +21,7 @@ from progdf.quaternions import rotate_vectors
 from progdf.rasterize import render
 from progdf.region import whole_scene
 from tests.helpers.edits import bits
-from tests.helpers.painted_wall import CAMERA, SIDE, edit_of, letters, paint_on, picture, wall
+from tests.trainer.painted_wall import CAMERA, SIDE, edit_of, letters, paint_on, picture, wall
 from trainer.editors.decal import DecalEditor, decal, parse_place
 from trainer.options import EditorOptions
 from trainer.paint.discs import merge_pixels, place_discs
@@ -45,10 +45,10 @@ def test_letters_finer_than_the_gaussians_are_as_sharp_as_they_were_painted() ->
     paint = letters(scene)
     gdf, _ = edit_of(scene, paint)
     made = picture(compose_layers(scene, [Layer(gdf, 1.0)]))
-    assert psnr(made, paint.picture, paint.painted) > 34.0
-    near = torch.zeros_like(paint.painted)
+    assert psnr(made, paint.picture, paint.mask) > 34.0
+    near = torch.zeros_like(paint.mask)
     near[36:92, 34:92] = True
-    assert psnr(made, paint.picture, near & ~paint.painted) > 34.0
+    assert psnr(made, paint.picture, near & ~paint.mask) > 34.0
 
 
 def test_strength_zero_is_the_original_bit_for_bit_and_nothing_outside_the_region_changes() -> None:
@@ -70,7 +70,7 @@ def test_what_shows_of_paint_is_linear_along_the_slider() -> None:
     before, change = picture(scene), paint.picture - picture(scene)
     for s in (0.1, 0.25, 0.5, 0.75, 0.9):
         shown = picture(compose_layers(scene, [Layer(gdf, s)])) - before
-        share = (shown * change)[paint.painted].sum() / change[paint.painted].square().sum()
+        share = (shown * change)[paint.mask].sum() / change[paint.mask].square().sum()
         assert float(share) == pytest.approx(s, abs=0.05)
 
 
@@ -153,8 +153,8 @@ def test_transparency_leaves_the_scene_as_it_is(tmp_path: Path) -> None:
     logo = np.full((30, 30, 4), 255, np.uint8)
     logo[:, 15:, 3] = 0
     editor = make(put(tmp_path, logo), scene)
-    assert not bool(editor.paint.painted[:, 70:].any())
-    assert bool(editor.paint.painted[:, 50:60].any())
+    assert not bool(editor.paint.mask[:, 70:].any())
+    assert bool(editor.paint.mask[:, 50:60].any())
     logo[..., 3] = 0
     with pytest.raises(ProgdfError, match="all transparent"):
         make(put(tmp_path, logo), scene)

@@ -17,8 +17,8 @@ from progdf.io.images import to_picture
 from progdf.io.picture_camera import camera_chunk
 from progdf.metrics.image import psnr
 from tests.helpers.edits import bits
-from tests.helpers.painted_wall import CAMERA, letters, paint_on, picture, wall
 from tests.helpers.trained import train
+from tests.trainer.painted_wall import CAMERA, letters, paint_on, picture, wall
 from trainer.evaluate.command import evaluate
 from trainer.options import EditorOptions, EvaluateOptions, RegionOptions, TrainOptions, with_values
 from trainer.paint.discs import lay_on, place_discs, project_paint
@@ -57,7 +57,7 @@ def test_letters_on_a_picture_are_as_sharp_as_they_were_painted(place: Path, let
     gdf = load_gdf(lettered.gdf, scene)
     assert gdf.added is not None
     paint = letters(scene)
-    assert psnr(picture(compose_layers(scene, [Layer(gdf, 1.0)])), paint.picture, paint.painted) > 32.0
+    assert psnr(picture(compose_layers(scene, [Layer(gdf, 1.0)])), paint.picture, paint.mask) > 32.0
     assert bits(compose_layers(scene, [Layer(gdf, 0.0)])[: len(scene)]) == bits(scene)
     log = lettered.folder.log.read_text()
     assert "painted pixels are finer than the Gaussians" in log
@@ -126,5 +126,5 @@ def test_two_pictures_of_one_stripe_share_one_set_of_rows() -> None:
     apart = lay_discs(scene, [first, paint_on(scene, other)], 4.0)
     assert len(apart.added) > 1.8 * len(alone.added)
     for paint in (first, second):
-        shown = render_view(both.finished, paint.camera, torch.tensor(BACKGROUND)).clamp(0, 1)
-        assert psnr(shown, paint.picture, paint.painted) > 26.0
+        shown = render_view(both.end, paint.camera, torch.tensor(BACKGROUND)).clamp(0, 1)
+        assert psnr(shown, paint.picture, paint.mask) > 26.0
