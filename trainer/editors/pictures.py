@@ -85,7 +85,8 @@ def pictures(
                 path = strengths[1.0].parent / f"{strength:g}" / strengths[1.0].name
                 raise ProgdfError(f"{path} is missing; every picture needs one of each strength")
     given = {
-        view.camera.name: {0.0: view.image} | {s: read_edit(scene, view, path) for s, path in some.items()}
+        view.camera.name: {0.0: view.image}
+        | {s: read_edit(scene, view.camera, view.image, path) for s, path in some.items()}
         for view, some in zip(views, found, strict=True)
     }
     bends, ways = {}, list(pairwise((0.0, *stages)))
@@ -98,17 +99,16 @@ def pictures(
     return PicturesEditor(given, bends, tuple(sorted({*between, *stages})) if len(stages) > 1 else ())
 
 
-def read_edit(scene: Gaussians, view: View, path: Path) -> Tensor:
-    """The view as a picture has changed it; ProgdfError where that is broken. [H,W,3]
+def read_edit(scene: Gaussians, camera: Camera, image: Tensor, path: Path) -> Tensor:
+    """The view `image` of a camera as a picture has changed it; ProgdfError where that is broken. [H,W,3]
 
     What was changed is taken at the picture's own size, then shrunk: a picture that is shrunk differs
     from a small render wherever the scene is fine.
     """
-    camera = view.camera
     original, picture = read_change(scene, path, camera.resize(*picture_size(path)))
     change = (lay_over(original, picture) - original).permute(2, 0, 1)[None]
     shrunk = interpolate(change, size=(camera.height, camera.width), mode="area")[0].permute(1, 2, 0)
-    return (view.image + shrunk).clamp(0.0, 1.0)
+    return (image + shrunk).clamp(0.0, 1.0)
 
 
 def picture_paths(what: str) -> tuple[Path, ...]:

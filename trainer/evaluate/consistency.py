@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from progdf.camera import Camera
+from progdf.compose.reference import Layer, compose_layers
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.metrics.image import psnr
@@ -116,11 +117,7 @@ def outside_change(opened: OpenedRun) -> dict[str, float]:
 
 def finished_scene(opened: OpenedRun) -> Gaussians:
     """The edited scene at strength 1."""
-    end = opened.gdf.field.offsets(1.0)
-    members = opened.setup.region.members
-    if not len(end):
-        return opened.setup.scene
-    return opened.setup.scene.replace_rows(members, opened.evaluator.original[:, : end.shape[1]] + end)
+    return compose_layers(opened.setup.scene, [Layer(opened.gdf, 1.0)])
 
 
 def _warp(

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from progdf.compose.added import extend
 from progdf.errors import ProgdfError
 from progdf.field import BakedField, fit_keyframes
 from progdf.field.trajectory import Trajectory
@@ -83,12 +84,14 @@ def open_run(root: Path, scene: Path | None = None) -> OpenedRun:
         raise ProgdfError(f"{root} has no views to measure with; train it again")
     names = [view.camera.name for view in setup.train]
     edited = {s: read_views(run.folder, "edited", names, s) for s in run.trajectory.strengths}
-    setup = widen_views(setup, edited).extend(run.trajectory.added)
+    setup = widen_views(setup, edited)
     shown_at = torch.tensor(gdf.field.recorded, dtype=torch.float32)
     if shown_at.shape != run.trajectory.s.shape:
         raise ProgdfError(f"{gdf.name}.gdf is not of the recording beside it; run progdf fit {root}")
     trajectory = replace(run.trajectory, s=shown_at)
-    evaluator = load_evaluator(run.folder, setup, setup.judging, run.trajectory)
+    evaluator = load_evaluator(run.folder, setup, setup.judging, run.trajectory, gdf)
+    extended, (gdf,) = extend(run.scene, [gdf])
+    setup = replace(setup, scene=extended, region=gdf.region)
     return OpenedRun(run, report, setup, evaluator, gdf, trajectory, _two_keyframes(gdf, setup, report))
 
 

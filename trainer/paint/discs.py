@@ -1,4 +1,5 @@
-"""Painted pixels as thin discs on the surface, and what lies before that surface moved behind them.
+"""Painted pixels as thin discs on the surface, and what lies before that surface moved behind them; and where
+other cameras see what is painted there.
 
 Splats are drawn in the order of their centers: a large Gaussian whose center is nearer than a disc covers it,
 although its own surface lies behind. Such a Gaussian is moved back along its ray and grows with the distance,
@@ -7,6 +8,7 @@ which leaves its outline in the painted view as it is; see docs/method.md 3.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import cast
@@ -15,7 +17,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.sparse import csr_array
 from torch import Tensor
+from torch.nn.functional import grid_sample
 
 from progdf.camera import Camera
 from progdf.gaussians import Gaussians
@@ -23,7 +27,7 @@ from progdf.gdf.file import ADDED_LOGIT
 from progdf.quaternions import matrix_quats
 from progdf.rasterize import render
 from progdf.rasterize.cpu.engine import ListedWeights
-from progdf.rasterize.engines import Crop, activate, color_map, render_depth
+from progdf.rasterize.engines import Depth, activate, color_map, render_depth
 from progdf.sh import rgb_to_sh0
 
 Array = NDArray[np.float64]
@@ -32,19 +36,27 @@ OPAQUE = 0.97
 """What a pixel must cover of the background to have a surface."""
 DISC_LOGIT = 4.0
 """The opacity of a disc at strength 1."""
+LEAST_ALPHA = 1 / 255
+"""Below it nothing is painted."""
+GROWN = 2
+"""Pixels around the paint that discs show as they are: what is drawn behind them was moved."""
 
-_GROWN = 2  # pixels around the paint that discs keep as they are: what is drawn behind them was moved
 _SIDES = (16, 8, 4, 2, 1)  # of the rectangles of pixels that share a disc
 _SPREAD, _MERGED_SPREAD = 0.28, 0.6  # standard deviation of a disc in its sides: of a pixel, of more
-_BACK, _MERGED_BACK = 0.9, 0.4  # pixels by which discs lie deeper, as nearer neighbors cover them; of more
+_BLUR = 0.1  # pixels²: what of the engine's blur of .3 counts as a disc's error; colors undo the rest
+_BACK = 0.5  # pixels by which discs lie deeper, as nearer neighbors cover them
+_RELIEF = 1.25  # pixels for 1 of color by which discs lie deeper than darker neighbors, see `_rise_beside`
 _THIN = 0.1  # pixels: the standard deviation across
-_STEEP = 0.3  # cosine below which a disc is turned no further
+_STEEP = 0.3  # cosine below which a disc is turned no further, and one surface ends before another
 _MEDIAN, _SMOOTH, _SAME = 9, 3.0, 4.0  # pixels, of depths; how far both may be apart on one surface
 _LEAST_LIGHT = 0.005  # of a pixel, below which what a Gaussian takes before a disc does not matter
 _REACH = 4.0  # standard deviations of the light's depths, within which a Gaussian is of the surface
 _SETTLED = 1e-3  # of the reach: nearer, a row that was moved is behind but for rounding
 _CLEARED = 12  # times, at most, that what lies before the discs is moved behind them
-_GAP = 4.0  # pixels between a disc and what is moved behind it, which is wide and seen from the sides too
+_MARGIN = 16  # pixels around the paint in which its surface is looked at
+_KNOTS = 20_000  # points of the surface, between which it is taken for flat where views are painted
+_IN_FRONT = 0.02  # of the depth, by which something may lie before the surface and be of it
+_NEWTON = 8  # steps of finding what a pixel shows
 
 
 @dataclass(frozen=True)
@@ -53,7 +65,12 @@ class Paint:
 
     camera: Camera
     picture: Tensor  # the view as it was painted, over the run's background. [H,W,3] 0..1
-    painted: Tensor  # the pixels that were changed. [H,W] bool
+    drawn: Tensor  # what lies on the surface: colors times alpha, and alpha. [H,W,4]
+
+    @property
+    def mask(self) -> Tensor:
+        """The pixels that were changed. [H,W] bool"""
+        return self.drawn[..., 3] > LEAST_ALPHA
 
 
 @dataclass(frozen=True)
@@ -61,27 +78,30 @@ class Discs:
     """Gaussians to add, and rows that make way."""
 
     added: Gaussians  # as they are at strength 1
-    cells: Array  # column and row of each one's center, pixels, and its sides. [B,4]
     moved: Tensor  # rows of the scene that lie before them, ascending. [M] int64
     scene: Gaussians  # with these rows moved
 
 
-def place_discs(scene: Gaussians, paint: Paint, flat: float) -> Discs:
+def place_discs(
+    scene: Gaussians, paint: Paint, flat: float, gap: float, cleared: Gaussians | None = None
+) -> Discs:
     """Discs for what is painted where the picture is opaque, and a little around it.
 
     Args:
         scene: the original
         paint: see `Paint`
         flat: root mean square of color, 0..1, that one disc may be off in its pixels
+        gap: pixels between a disc and what is moved behind it, which is wide and seen from the sides too
+        cleared: the scene as other paint has moved it
     """
-    camera, depth = paint.camera, render_depth(scene, paint.camera)
+    camera, cleared = paint.camera, scene if cleared is None else cleared
+    depth = render_depth(scene, camera)
     opaque = (depth.alpha > OPAQUE).numpy()
-    surface = smooth_depth(depth.depth.numpy(), opaque)
-    mask = ndimage.binary_dilation(paint.painted.numpy() & opaque, iterations=_GROWN) & opaque
+    surface, even, pieces = _paint_surface(depth, camera)
+    mask = ndimage.binary_dilation(paint.mask.numpy() & opaque, iterations=GROWN) & opaque
     if not mask.any():
-        empty = scene[:0]
-        return Discs(empty, np.zeros((0, 4)), torch.zeros(0, dtype=torch.int64), scene)
-    cells = merge_pixels(paint.picture.numpy(), mask, flat)
+        return Discs(scene[:0], torch.zeros(0, dtype=torch.int64), cleared)
+    cells = merge_pixels(paint.picture.numpy(), mask, flat, even)
     added, depths = _discs(camera, cells, surface, paint.picture)
     added = replace(
         added,
@@ -89,16 +109,30 @@ def place_discs(scene: Gaussians, paint: Paint, flat: float) -> Discs:
         antialiased=scene.antialiased,
         origin=scene.origin,
     )
-    pixel = float(np.median(depths)) / float(camera.K[0, 0])
-    gap = (_BACK + _MERGED_BACK + _GAP) * pixel
-    reach = gap + _REACH * _thickness(scene, camera, mask)
-    cleared, moved = scene, torch.zeros(len(scene), dtype=torch.bool)
+    behind = surface + (_BACK + gap) * float(np.median(depths)) / float(camera.K[0, 0])
+    reach = float((behind - surface).max()) + _REACH * _thickness(scene, camera, mask)
+    moved = torch.zeros(len(scene), dtype=torch.bool)
     for _ in range(_CLEARED):  # what stood before others hid them
-        rows, factors = _rows_before(cleared, camera, surface + gap, mask, reach)
+        rows, factors = _rows_before(cleared, camera, behind, mask, reach, pieces)
         if not len(rows):
             break
         cleared, moved = _move_back(cleared, camera, rows, factors), moved.index_fill(0, rows, True)
-    return Discs(added, cells, moved.nonzero()[:, 0], cleared)
+    return Discs(added, moved.nonzero()[:, 0], cleared)
+
+
+def _paint_surface(seen: Depth, camera: Camera) -> tuple[Array, NDArray[np.bool_], NDArray[np.int32]]:
+    """Depths on which paint lies, where the surface goes on to its neighbors, and its pieces. [H,W] each
+
+    It goes on where its depth changes less from pixel to pixel than a disc is turned. What is blended over a
+    rim lies on one side of it, not between.
+    """
+    surface = smooth_depth(seen.depth.numpy(), (seen.alpha > OPAQUE).numpy())
+    steepest = surface / float(camera.K[0, 0]) * (1 - _STEEP**2) ** 0.5 / _STEEP
+    down, right = (np.abs(np.diff(surface, axis=axis, append=surface.take([-1], axis))) for axis in (0, 1))
+    even = np.maximum(down, right) < steepest
+    away, nearest = ndimage.distance_transform_edt(~even, return_indices=True)
+    surface = np.where(away <= _MEDIAN, surface[tuple(nearest)], surface)
+    return surface, even, ndimage.label(even)[0][tuple(nearest)]
 
 
 def smooth_depth(depth: NDArray[np.float32], opaque: NDArray[np.bool_]) -> Array:
@@ -114,7 +148,9 @@ def smooth_depth(depth: NDArray[np.float32], opaque: NDArray[np.bool_]) -> Array
     return cast(Array, np.where(near, smooth, median))
 
 
-def merge_pixels(picture: NDArray[np.float32], mask: NDArray[np.bool_], flat: float) -> Array:
+def merge_pixels(
+    picture: NDArray[np.float32], mask: NDArray[np.bool_], flat: float, even: NDArray[np.bool_]
+) -> Array:
     """Pixels by rectangles that one disc shows well enough, the largest first.
 
     A disc is round and reaches over its rectangle: what it would be off is counted as far as it reaches.
@@ -123,6 +159,7 @@ def merge_pixels(picture: NDArray[np.float32], mask: NDArray[np.bool_], flat: fl
         picture: [H,W,3]
         mask: the pixels to be covered, each once. [H,W]
         flat: root mean square of color that it may be off, over the rectangle's pixels
+        even: pixels that may share a disc with neighbors. [H,W]
 
     Returns:
         Column and row of the centers, and both sides, in pixels. [B,4]
@@ -130,22 +167,22 @@ def merge_pixels(picture: NDArray[np.float32], mask: NDArray[np.bool_], flat: fl
     rows, columns = np.nonzero(mask)
     reach = 3 * _SIDES[0]
     top, left = max(0, rows.min() - reach), max(0, columns.min() - reach)
-    free = mask[top : rows.max() + reach + 1, left : columns.max() + reach + 1].copy()
-    image = picture[top : rows.max() + reach + 1, left : columns.max() + reach + 1].astype(np.float64)
-    found = []
+    window = slice(top, rows.max() + reach + 1), slice(left, columns.max() + reach + 1)
+    free, image = mask[window].copy(), picture[window].astype(np.float64)
+    cells = list[tuple[float, float, int, int]]()
     for height, width in _shapes():
-        whole = tuple(side // step * step for side, step in zip(free.shape, (height, width), strict=True))
-        blocks = free[: whole[0], : whole[1]].reshape(whole[0] // height, height, whole[1] // width, width)
-        fits = blocks.all(axis=(1, 3))
-        if height * width > 1 and fits.any():
-            fits &= _disc_error(image, height, width)[: fits.shape[0], : fits.shape[1]] <= flat**2
-        row, column = np.nonzero(fits)
-        for y, x in zip(row * height, column * width, strict=True):
-            free[y : y + height, x : x + width] = False
-        sides = np.full(len(row), width), np.full(len(row), height)
-        center = left + (column + 0.5) * width, top + (row + 0.5) * height
-        found.append(np.stack([*center, *sides], axis=1).astype(np.float64))
-    return np.concatenate(found)
+        fits = free
+        if height * width > 1:
+            fits = (
+                _box_means((free & even[window]).astype(float)[..., None], height, width)[..., 0] > 1 - 1e-9
+            )
+            if fits.any():
+                fits &= _disc_error(image, height, width) <= flat**2
+        for y, x in zip(*np.nonzero(fits), strict=True):
+            if free[y : y + height, x : x + width].all():
+                free[y : y + height, x : x + width] = False
+                cells.append((left + x + 0.5 * width, top + y + 0.5 * height, width, height))
+    return np.array(cells)
 
 
 def _shapes() -> Iterator[tuple[int, int]]:
@@ -154,24 +191,40 @@ def _shapes() -> Iterator[tuple[int, int]]:
     yield from sorted(shapes, key=lambda s: (-s[0] * s[1], abs(s[0] - s[1]), s))
 
 
+def _box_means(values: Array, height: int, width: int) -> Array:
+    """Means of the rectangles that begin at each pixel; 0 beyond the rim. [H,W,C] -> [H,W,C]"""
+    rows, columns = values.shape[:2]
+    sums = np.pad(values, ((1, height), (1, width), (0, 0))).cumsum(axis=0).cumsum(axis=1)
+    low, high = sums[:rows], sums[height : height + rows]
+    right = slice(width, width + columns)
+    boxes = high[:, right] - low[:, right] - high[:, :columns] + low[:, :columns]
+    return cast(Array, boxes / (height * width))
+
+
 def _disc_error(image: Array, height: int, width: int) -> Array:
-    """Mean square of what discs of the rectangles' mean colors are off. [H,W,3] -> [H/height,W/width]"""
-    spread = (_MERGED_SPREAD * height / 2**0.5, _MERGED_SPREAD * width / 2**0.5)
-    rows, columns = (side // step for side, step in zip(image.shape[:2], (height, width), strict=True))
-    blocks = image[: rows * height, : columns * width].reshape(rows, height, columns, width, 3)
-    color = blocks.mean(axis=(1, 3))
-
-    def weigh(values: Array) -> Array:
-        blurred = ndimage.gaussian_filter(values, spread, mode="nearest", truncate=4.0)
-        y = height * (np.arange(rows) + 0.5) - 0.5
-        x = width * (np.arange(columns) + 0.5) - 0.5
-        low = blurred[np.floor(y).astype(int)] + blurred[np.ceil(y).astype(int)]
-        return cast(Array, 0.25 * (low[:, np.floor(x).astype(int)] + low[:, np.ceil(x).astype(int)]))
-
-    channels = [weigh(image[..., c] ** 2) - 2 * color[..., c] * weigh(image[..., c]) for c in range(3)]
+    """Mean square of what discs of the mean colors of the rectangles that begin at each pixel are off there.
+    [H,W,3] -> [H,W]"""
+    spread = [
+        ((_MERGED_SPREAD * side if side > 1 else _SPREAD) ** 2 + _BLUR) ** 0.5 / 2**0.5
+        for side in (height, width)
+    ]
+    rows, columns = image.shape[:2]
+    padded = np.pad(image, ((0, height), (0, width), (0, 0)), mode="edge")
+    color = _box_means(padded, height, width)[:rows, :columns]
+    weighed = ndimage.gaussian_filter(
+        np.concatenate([padded, (padded**2).sum(axis=2, keepdims=True)], axis=2),
+        (*spread, 0.0),
+        mode="nearest",
+        truncate=4.0,
+    )
+    y, x = (slice(side // 2, side // 2 + size) for side, size in ((height, rows), (width, columns)))
+    above, before = (
+        slice((side - 1) // 2, (side - 1) // 2 + size) for side, size in ((height, rows), (width, columns))
+    )
+    seen = 0.25 * (weighed[y, x] + weighed[above, x] + weighed[y, before] + weighed[above, before])
     # the blur's weights add up to 1, a disc's to 2π times both standard deviations
     area = 2 * np.pi * spread[0] * spread[1] / (height * width)
-    return cast(Array, area * (sum(channels) + (color**2).sum(axis=2)) / 3)
+    return cast(Array, area * (seen[..., 3] + (color * (color - 2 * seen[..., :3])).sum(axis=2)) / 3)
 
 
 def _discs(camera: Camera, cells: Array, surface: Array, picture: Tensor) -> tuple[Gaussians, Array]:
@@ -187,8 +240,7 @@ def _discs(camera: Camera, cells: Array, surface: Array, picture: Tensor) -> tup
     rays = np.stack([*((np.stack([x, y], 1) - middle) / focal).T, np.ones_like(x)], axis=1)
     depth = sample(surface)
     pixel = depth / focal[0]
-    merged = width * height > 1
-    placed = depth + (_BACK + np.where(merged, _MERGED_BACK, 0.0)) * pixel
+    placed = depth + (_BACK + _RELIEF * _rise_beside(cells, picture)) * pixel
     right, down = (_step(rays, depth, slope, axis, focal) for axis, slope in enumerate(slopes))
     normal = np.cross(right, down)
     length = np.linalg.norm(rays, axis=1, keepdims=True)
@@ -216,6 +268,19 @@ def _discs(camera: Camera, cells: Array, surface: Array, picture: Tensor) -> tup
     return discs, placed
 
 
+def _rise_beside(cells: Array, picture: Tensor) -> Array:
+    """By how much cells are brighter than the darkest pixel beside them, at most over their own. [B] 0..1
+
+    The engine draws no disc smaller than about a pixel. Where one color ends, what the nearer disc adds to
+    its neighbor can be taken out of that one's own color only if it is the darker: none is below black.
+    """
+    brightness = picture.mean(dim=2).double().numpy()
+    rise = brightness - ndimage.minimum_filter(brightness, 3)
+    low, high = ((cells[:, :2] + side * cells[:, 2:]).astype(int) for side in (-0.5, 0.5))
+    boxes = zip(low.tolist(), high.tolist(), strict=True)
+    return np.array([rise[top:bottom, left:right].max() for (left, top), (right, bottom) in boxes])
+
+
 def _step(rays: Array, depth: Array, slope: Array, axis: int, focal: Array) -> Array:
     """What a step of one pixel is on the surface. [B,3]"""
     step = rays * slope[:, None]
@@ -224,17 +289,28 @@ def _step(rays: Array, depth: Array, slope: Array, axis: int, focal: Array) -> A
 
 
 def _rows_before(
-    scene: Gaussians, camera: Camera, behind: Array, mask: NDArray[np.bool_], reach: float
+    scene: Gaussians,
+    camera: Camera,
+    behind: Array,
+    mask: NDArray[np.bool_],
+    reach: float,
+    pieces: NDArray[np.int32],
 ) -> tuple[Tensor, Tensor]:
     """Rows of the surface whose centers lie before the depths `behind` [H,W] of some pixels.
 
-    What lies more than `reach` before them, world units, hides the paint as it hides the surface.
+    What lies more than `reach` before them, world units, hides the paint as it hides the surface; so does
+    what shows most in another of the `pieces` of the surface, [H,W], though it reaches over a rim.
 
     Returns:
         Their indices, and by what their depth grows. [M] int64, [M]
     """
     rows, columns = np.nonzero(mask)
-    box: Crop = (int(columns.min()), int(rows.min()), int(columns.max()) + 1, int(rows.max()) + 1)
+    box = (
+        max(0, int(columns.min()) - _MARGIN),
+        max(0, int(rows.min()) - _MARGIN),
+        min(camera.width, int(columns.max()) + _MARGIN + 1),
+        min(camera.height, int(rows.max()) + _MARGIN + 1),
+    )
     listed = color_map(activate(scene), camera, box, torch.arange(len(scene)))
     if not isinstance(listed, ListedWeights):
         raise TypeError("discs are placed by the CPU engine's lists")
@@ -244,13 +320,22 @@ def _rows_before(
     owner = np.repeat(runs.rows, counts)
     pixel = np.repeat(runs.firsts.astype(np.int64), counts) + runs.pixels
     window = slice(box[1], box[3]), slice(box[0], box[2])
+    piece = pieces[window].reshape(-1)[pixel]
     short = behind[window].reshape(-1)[pixel] - depths[owner]
     before = mask[window].reshape(-1)[pixel] & (short > _SETTLED * reach) & (runs.weights > _LEAST_LIGHT)
-    before &= short <= reach
+    before &= (short <= reach) & (piece == _main_pieces(owner, piece, runs.weights, len(scene))[owner])
     needed = np.zeros(len(scene))
     np.maximum.at(needed, owner[before], short[before])
     moved = np.nonzero(needed)[0]
     return torch.from_numpy(moved), torch.from_numpy(1.0 + needed[moved] / depths[moved])
+
+
+def _main_pieces(
+    owner: NDArray[np.int32], piece: NDArray[np.int32], weights: NDArray[np.float32], count: int
+) -> NDArray[np.int64]:
+    """The piece of the surface in which each row shows most. -> [N]"""
+    size = (count, int(piece.max()) + 1)
+    return cast(NDArray[np.int64], csr_array((weights, (owner, piece)), shape=size).argmax(axis=1))
 
 
 def _thickness(scene: Gaussians, camera: Camera, mask: NDArray[np.bool_]) -> float:
@@ -280,3 +365,97 @@ def _move_back(scene: Gaussians, camera: Camera, rows: Tensor, factors: Tensor) 
 def faint(added: Gaussians) -> Gaussians:
     """Added rows as they are at strength 0."""
     return replace(added, logit_opacities=torch.full((len(added),), ADDED_LOGIT))
+
+
+def sample_image(image: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    """Bilinear; 0 outside. [H,W,C], pixels [h,w] each -> [h,w,C]"""
+    grid = torch.stack([2 * x / image.shape[1] - 1, 2 * y / image.shape[0] - 1], dim=-1)[None].float()
+    return grid_sample(image.permute(2, 0, 1)[None], grid, align_corners=False)[0].permute(1, 2, 0)
+
+
+def lay_on(image: Tensor, drawn: Tensor) -> Tensor:
+    """Colors times alpha, and alpha, over a picture. [H,W,3], [H,W,4] -> [H,W,3]"""
+    return image * (1.0 - drawn[..., 3:]) + drawn[..., :3]
+
+
+def project_paint(scene: Gaussians, own: Camera, drawn: Tensor, camera: Camera) -> Tensor:
+    """What is drawn on the surface that one camera sees, as another sees it.
+
+    Args:
+        scene: whose surface
+        own: the camera in whose picture it was drawn
+        drawn: colors times alpha, and alpha. [H,W,4]
+        camera: the other
+
+    Returns:
+        Colors times alpha, and alpha, of the other camera's size. [h,w,4]
+    """
+    result = torch.zeros(camera.height, camera.width, 4)
+    rows, columns = (drawn[..., 3] > 0).nonzero().T.numpy()
+    if not len(rows):
+        return result
+    left, top = max(0, columns.min() - _MARGIN), max(0, rows.min() - _MARGIN)
+    window = left, top, min(own.width, columns.max() + _MARGIN + 1), min(own.height, rows.max() + _MARGIN + 1)
+    seen = render_depth(scene, own, crop=window)
+    surface, _, _ = _paint_surface(seen, own)
+    step = max(1, round(math.sqrt(surface.size / _KNOTS)))
+    y, x = np.mgrid[: surface.shape[0] : step, : surface.shape[1] : step]
+    K, there = own.K.double().numpy(), camera.K.double().numpy()
+    y, x, z = y + top + 0.5, x + left + 0.5, surface[y, x]
+    rays = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], axis=-1)
+    turn = (camera.viewmat.double() @ torch.linalg.inv(own.viewmat.double())).numpy()
+    points = (rays * z[..., None]) @ turn[:3, :3].T + turn[:3, 3]
+    front = points[..., 2] > camera.near
+    depth = np.where(front, points[..., 2], 1.0)
+    u, v = (points[..., i] / depth * there[i, i] + there[i, 2] for i in (0, 1))
+    if min(surface[::step, ::step].shape) < 2:
+        return result
+    (uy, ux), (vy, vx) = np.gradient(u), np.gradient(v)
+    front &= ux * vy - uy * vx > 0  # what turns away is hidden by what does not
+    if front.sum() < 3 or np.ptp(u[front]) < 1e-6 or np.ptp(v[front]) < 1e-6:
+        return result
+    box = [int(max(0.0, edge.min() - 1)) for edge in (u[front], v[front])]
+    box += [
+        int(min(size, edge.max() + 2)) for size, edge in ((camera.width, u[front]), (camera.height, v[front]))
+    ]
+    if box[0] >= box[2] or box[1] >= box[3]:
+        return result
+    rows, columns = np.mgrid[box[1] : box[3], box[0] : box[2]] + 0.5
+    maps = np.stack([u, v, ux, uy, vx, vy, x, y, depth, front.astype(float)])
+    found = torch.from_numpy(_invert(maps, columns, rows))
+    front_depth = render_depth(scene, camera, crop=(box[0], box[1], box[2], box[3])).depth
+    visible = found[..., 2] <= front_depth * (1.0 + _IN_FRONT)
+    laid = sample_image(drawn, found[..., 0], found[..., 1])
+    result[box[1] : box[3], box[0] : box[2]] = laid * visible[..., None]
+    return result
+
+
+def _invert(maps: Array, columns: Array, rows: Array) -> Array:
+    """What a grid of points shows at some pixels, by Newton's steps over the grid; far away where nothing is.
+
+    Args:
+        maps: where each point is seen, u and v; by how much these grow to the right and down: ux, uy, vx, vy;
+            three values and whether it counts. [10,I,J]
+        columns, rows: the pixels. [h,w] each
+
+    Returns:
+        [h,w,3]
+    """
+    u, v, front = maps[0], maps[1], maps[-1] > 0
+    size = np.array(u.shape)[:, None, None]
+    known = np.stack([u[front], v[front], np.ones(front.sum())], axis=1)
+    start = np.linalg.lstsq(known, np.stack(np.nonzero(front), axis=1).astype(float), rcond=None)[0]
+    at = np.moveaxis(np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ start, -1, 0)
+    for _ in range(_NEWTON):
+        at = at.clip(-0.5, size - 0.5)
+        u, v, ux, uy, vx, vy = (ndimage.map_coordinates(one, at, order=1, mode="nearest") for one in maps[:6])
+        right, down, area = columns - u, rows - v, ux * vy - uy * vx
+        area = np.where(np.abs(area) > 1e-9, area, 1e-9)
+        step = np.stack([ux * down - vx * right, vy * right - uy * down]) / area
+        at = at + step.clip(-0.1 * size, 0.1 * size)
+    at = at.clip(-0.5, size - 0.5)
+    values = np.stack([ndimage.map_coordinates(one, at, order=1, mode="nearest") for one in maps])
+    missed = np.hypot(values[0] - columns, values[1] - rows) > 0.5
+    return cast(
+        Array, np.where((missed | (values[-1] < 0.5))[..., None], -1e6, np.moveaxis(values[6:9], 0, -1))
+    )

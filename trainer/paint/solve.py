@@ -1,4 +1,4 @@
-"""The colors by which discs, and the rows that made way for them, show a painted picture.
+"""The colors by which discs, and the rows that made way for them, show painted pictures.
 
 Least squares: a view is linear in the colors that are drawn in it (`trainer.optimize.color_views`). What lies
 before a disc takes light, what shines through it adds some; both are in the weights.
@@ -6,6 +6,7 @@ before a disc takes light, what shines through it adds some; both are in the wei
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -20,9 +21,12 @@ from progdf.sh import C0
 from progdf.threads import one_thread
 from trainer.views.view import BACKGROUND, crop, seen_colors
 
+from .discs import Paint
+
 _STEPS, _ROUNDS = 40, 3  # of conjugate gradients; between them, colors below black are set to it
-_HELD = 0.05  # of a pixel: how much a moved row holds on to its own color
-_RIDGE = 1e-3  # the same of a disc
+_HELD = 0.05  # of a pixel: how much a row of the scene holds on to its own color
+_RIDGE = 0.02  # the same of a disc, on what was painted there
+_LEAST_BOX = 32  # pixels around the paint in which its colors are solved for
 
 
 def join(scene: Gaussians, added: Gaussians) -> Gaussians:
@@ -33,53 +37,76 @@ def join(scene: Gaussians, added: Gaussians) -> Gaussians:
     return replace(scene, **rows)
 
 
+def box_of(painted: Tensor, camera: Camera) -> Crop:
+    """The window around the paint in which moved rows may show: half as large again on each side."""
+    rows, columns = painted.nonzero().T
+    (top, bottom), (left, right) = ((int(axis.min()), int(axis.max()) + 1) for axis in (rows, columns))
+    margin = _LEAST_BOX + max(bottom - top, right - left) // 2
+    return (
+        max(0, left - margin),
+        max(0, top - margin),
+        min(camera.width, right + margin),
+        min(camera.height, bottom + margin),
+    )
+
+
 def solve_colors(
-    scene: Gaussians, moved: Tensor, added: Gaussians, camera: Camera, target: Tensor, box: Crop
+    scene: Gaussians, rows: Tensor, added: Gaussians, paints: Sequence[Paint]
 ) -> tuple[Gaussians, Gaussians]:
-    """Scene and added rows with the colors whose picture comes closest to `target`.
+    """Scene and added rows with the colors whose pictures come closest to what was painted, all together.
 
     Args:
         scene: with the moved rows where they go
-        moved: the rows that may change beside the added ones. [M] int64
+        rows: of the scene, which may change beside the added ones. [M] int64
         added: see `Discs`
-        camera: of the painted view
-        target: what it shall show. [H,W,3]
-        box: the window that counts
+        paints: of one thing
     """
-    joined, count = join(scene, added), len(moved)
-    rows = torch.cat([moved, torch.arange(len(scene), len(joined))])
-    colors = seen_colors(joined, camera)
-    own = colors[rows]
-    weights = color_map(activate(joined), camera, box, rows)
-    others = colors.index_fill(0, rows, 0.0)
-    rest = render(joined, camera, BACKGROUND, colors=others, crop=box).image
-    held = torch.full((len(rows), 1), _RIDGE)
+    joined, count = join(scene, added), len(rows)
+    free, activated = torch.cat([rows, torch.arange(len(scene), len(joined))]), activate(joined)
+    maps, missing, lowest = list[ColorMap](), list[Tensor](), torch.full((len(free), 3), -torch.inf)
+    for paint in paints:
+        box, colors = box_of(paint.mask, paint.camera), seen_colors(joined, paint.camera)
+        shown = render(joined, paint.camera, BACKGROUND, colors=colors, crop=box).image
+        maps.append(color_map(activated, paint.camera, box, free))
+        missing.append(crop(paint.picture, box) - shown)
+        lowest = torch.maximum(lowest, -colors[free])
+    held = torch.full((len(free), 1), _RIDGE)
     held[:count] = _HELD
-    change = (_least_squares(weights, crop(target, box) - rest, own, held) - own) / C0
+    change = _least_squares(maps, missing, lowest, held) / C0
     return (
-        replace(scene, sh0=scene.sh0.index_add(0, moved, change[:count])),
+        replace(scene, sh0=scene.sh0.index_add(0, rows, change[:count])),
         replace(added, sh0=added.sh0 + change[count:]),
     )
 
 
 @one_thread()
-def _least_squares(weights: ColorMap, target: Tensor, start: Tensor, held: Tensor) -> Tensor:
-    """Colors, not below black, by conjugate gradients. [h,w,3], [M,3], [M,1] -> [M,3]"""
-    diagonal = weights.gradient(weights.picture(torch.ones_like(start))) + held
-    colors = start
+def _least_squares(
+    maps: Sequence[ColorMap], targets: Sequence[Tensor], lowest: Tensor, held: Tensor
+) -> Tensor:
+    """Changes of color, not below `lowest`, by conjugate gradients. [h,w,3] each, [M,3], [M,1] -> [M,3]"""
+
+    def gradient(images: Sequence[Tensor]) -> Tensor:
+        parts = (weights.gradient(image) for weights, image in zip(maps, images, strict=True))
+        return torch.stack(list(parts)).sum(dim=0)
+
+    def normal(colors: Tensor) -> Tensor:
+        return gradient([weights.picture(colors) for weights in maps]) + held * colors
+
+    right, diagonal = gradient(targets), normal(torch.ones_like(lowest))
+    colors = torch.zeros_like(lowest)
     for _ in range(_ROUNDS):
-        residual = weights.gradient(target - weights.picture(colors)) + held * (start - colors)
-        free = ~((colors <= 0) & (residual < 0))
+        residual = right - normal(colors)
+        free = ~((colors <= lowest) & (residual < 0))
         residual = residual * free
         direction = residual / diagonal
         power = (residual * direction).sum(dim=0)
         for _ in range(_STEPS):
-            image = weights.gradient(weights.picture(direction)) * free + held * direction
+            image = normal(direction) * free
             length = power / (direction * image).sum(dim=0).clamp_min(1e-20)
             colors, residual = colors + length * direction, residual - length * image
             scaled = residual / diagonal
             now = (residual * scaled).sum(dim=0)
             direction = scaled + now / power.clamp_min(1e-30) * direction
             power = now
-        colors = colors.clamp_min(0.0)
+        colors = colors.maximum(lowest)
     return colors

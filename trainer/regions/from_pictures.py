@@ -83,6 +83,10 @@ def _mask(path: Path, camera: Camera, bent: bool) -> Tensor:
     return mask
 
 
+CHANGED = "changed"
+"""The region that changed pictures show."""
+
+
 @dataclass(frozen=True)
 class RegionRequest:
     """What pictures are to tell of a region, and where those that are made for it go."""
@@ -141,7 +145,7 @@ def region_kinds(request: RegionRequest) -> dict[str, Kind]:
         "masks": lambda text, scene: from_folder(text, scene, bent=False),
         "photomasks": lambda text, scene: from_folder(text, scene, bent=True),
         "text": from_text,
-        "changed": lambda text, scene: changed_region(
+        CHANGED: lambda text, scene: changed_region(
             scene,
             *_changed_pictures(text, request, scene.origin),
             request.options.lift_threshold,
@@ -161,7 +165,7 @@ def region_checks(request: RegionRequest) -> dict[str, Check]:
         "masks": lambda text: load_cameras(_mask_folder("masks", text, request)[1], ZERO),
         "photomasks": lambda text: load_cameras(_mask_folder("photomasks", text, request)[1], ZERO),
         "text": of_text,
-        "changed": lambda text: _changed_pictures(text, request, ZERO),
+        CHANGED: lambda text: _changed_pictures(text, request, ZERO),
     }
 
 

@@ -370,7 +370,7 @@ class PaintTaken:
 
 
 def measure_paint(
-    setup: TrainingSetup, painted: Sequence[Tensor], backgrounds: Sequence[Tensor], rows: Tensor
+    setup: TrainingSetup, painted: Sequence[Tensor], backgrounds: Sequence[Tensor], edited: Gaussians
 ) -> PaintTaken:
     """Compare the edit with the pictures that it was made of.
 
@@ -378,10 +378,9 @@ def measure_paint(
         setup: scene, region, and the pictures' views
         painted: the views as they were painted. [H,W,3] each
         backgrounds: what shows through the scene in each picture, rgb. [3] each
-        rows: raw member rows of the edit, packed. [M,C]
+        edited: the scene with the edit, rows that it adds last
     """
     scene, members = setup.scene, setup.region.members
-    edited = scene.replace_rows(members, rows)
     others = torch.ones(len(scene), dtype=torch.bool).index_fill(0, members, False)
     without = scene[others.nonzero()[:, 0]]
     change = missing = behind = 0.0
@@ -398,7 +397,7 @@ def measure_paint(
         pixels += int(changed.sum())
         weights += alpha_weights(scene, view.camera, changed)[:, (0, 2)]
     inside, weight = weights[members].unbind(1)
-    visible = int((inside > 0.5 * weight).sum())
+    visible = int((inside > 0.5 * weight).sum()) + len(edited) - len(scene)
     strength = (missing / max(1, 3 * pixels)) ** 0.5
     reached = max(0.0, 1.0 - missing / max(change, 1e-12))
     return PaintTaken(reached, strength, pixels, visible, behind > 0.5 * change)

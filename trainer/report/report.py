@@ -31,12 +31,13 @@ _TERMS = {"left": "L1 to the finished edit", "l1": "L1", "perceptual": "LPIPS"}
 
 
 def report_picture(
-    evaluator: Evaluator, measured: Measured, losses: Losses, title: str, held_out: int
+    evaluator: Evaluator, shown: Evaluator, measured: Measured, losses: Losses, title: str, held_out: int
 ) -> Tensor:
     """Thumbnails over curves: ours, the editor's own and two keyframes at five strengths; then the errors.
 
     Args:
         evaluator: the views that judge; the one that shows most of the region is shown
+        shown: the same with the Gaussians that the edit adds
         measured: see `Measured`
         losses: mean of every loss term per recording
         title: one line
@@ -47,7 +48,7 @@ def report_picture(
     sheet = to_picture(
         contact_sheet(
             [
-                strip(evaluator, chosen, columns),
+                strip(shown, chosen, columns),
                 editor_strip(evaluator, columns),
                 strip(evaluator, linear, columns),
             ],

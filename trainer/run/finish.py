@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from progdf.compose.added import extend
 from progdf.compose.reference import Layer, compose_layers
 from progdf.errors import ProgdfError
 from progdf.field.baked import identity_remap
@@ -35,16 +36,26 @@ from trainer.options import (
     TrainOptions,
     with_values,
 )
-from trainer.report.measures import PaintTaken, clip_curve, expected_measures, figures, measure, measure_paint
+from trainer.regions.from_pictures import CHANGED
+from trainer.report.measures import (
+    PaintTaken,
+    against_editor,
+    clip_curve,
+    expected_measures,
+    figures,
+    measure,
+    measure_paint,
+)
 from trainer.report.report import report_picture
 from trainer.resolve import check_field_options, use_threads
 from trainer.setup import TrainingSetup, whole_views, widen_views
 from trainer.store.progress import RunLog
-from trainer.store.run_folder import RunFolder, read_views, write_json
+from trainer.store.run_folder import RunFolder, read_views, write_json, write_views
 from trainer.store.state import Saved
 from trainer.views.crops import only_recolors
-from trainer.views.view import View
+from trainer.views.view import View, render_view
 
+from .paint import sharpen
 from .record import RunRecord, render_run_views, reopen_run
 
 _RANK_VIEWS = 4
@@ -124,10 +135,22 @@ def finish_run(
         added = None if trajectory.added is None else grown.scene[len(scene) :]
         given = differences(plan if added is not None else plain(with_values(options, grow=0.0)), DEFAULTS)
         gdf = Gdf(options.name, region, field, fingerprint(scene), options.editor.editor, given, added=added)
+        cameras = [view.camera for view in setup.train]
+        pictures = dict(zip(options.views.pictures, cameras, strict=False))
+        sharp = sharpen(scene, gdf, pictures, options.region.region != CHANGED, log)
         endpoint, outside = exactness(scene, gdf, end_rows(grown, trajectory))
         title = f"{options.name}: {options.editor.editor}"
-        picture = report_picture(evaluator, measured, record.losses, title, len(setup.held_out))
-    paint = _measure_paint(folder, grown, options.views.pictures, end_rows(grown, trajectory))
+        shown = evaluator
+        if sharp is not None:
+            gdf = sharp
+            shown = load_evaluator(folder, setup, setup.judging, trajectory, gdf)
+            drawn = against_editor(shown, {"slider": gdf.field}, measured.asked, perceptual)
+            measured = replace(measured, shown=gdf.field, editor={**measured.editor, **drawn})
+        picture = report_picture(evaluator, shown, measured, record.losses, title, len(setup.held_out))
+    edited = compose_layers(scene, [Layer(gdf, 1.0)])
+    if sharp is not None:
+        write_finals(setup, edited, folder, log)
+    paint = _measure_paint(folder, setup, options.views.pictures, edited)
     measures = figures(measured, endpoint, outside)
     if network is not None:
         measures["field"] |= network.figures()
@@ -195,8 +218,18 @@ def _fit(
         return fit_field(trajectory, seen, choosing, reporting, weights, options), None
 
 
+def write_finals(setup: TrainingSetup, edited: Gaussians, folder: RunFolder, log: RunLog) -> None:
+    """The finished edit's views."""
+    finals = {}
+    with log.looks("picture the edit", len(setup.views)) as looked:
+        for view in setup.views:
+            finals[view.camera.name] = render_view(edited, view.camera, setup.background)
+            looked()
+    write_views(folder, "final", finals)
+
+
 def _measure_paint(
-    folder: RunFolder, setup: TrainingSetup, files: Sequence[Path], end: Tensor
+    folder: RunFolder, setup: TrainingSetup, files: Sequence[Path], edited: Gaussians
 ) -> PaintTaken | None:
     """How much of changed pictures is in the edit; None where it was not made of such."""
     if not files:
@@ -206,7 +239,7 @@ def _measure_paint(
         picture_background(setup.scene, file, view.camera) if file.is_file() else setup.background
         for file, view in zip(files, setup.train, strict=True)
     ]
-    return measure_paint(setup, pictures, backgrounds, end)
+    return measure_paint(setup, pictures, backgrounds, edited)
 
 
 def _record_figures(record: RunRecord) -> dict[str, Any]:
@@ -273,13 +306,21 @@ def _write(
 
 
 def load_evaluator(
-    folder: RunFolder, setup: TrainingSetup, views: Sequence[View], trajectory: Trajectory
+    folder: RunFolder,
+    setup: TrainingSetup,
+    views: Sequence[View],
+    trajectory: Trajectory,
+    gdf: Gdf | None = None,
 ) -> Evaluator:
-    """Some views beside their edited pictures, as the run keeps them."""
+    """Some views beside their edited pictures, as the run keeps them; `gdf`: an edit that may add rows."""
     names = [view.camera.name for view in views]
     edited = {s: read_views(folder, "edited", names, s) for s in trajectory.strengths}
-    channels, still = trajectory.end.shape[1], only_recolors(trajectory.offsets)
-    return make_evaluator(setup.scene, setup.region, views, edited, setup.background, channels, still)
+    scene, region, channels = setup.scene, setup.region, trajectory.end.shape[1]
+    still = only_recolors(trajectory.offsets)
+    if gdf is not None and gdf.added is not None:
+        scene, (gdf,) = extend(scene, [gdf])
+        region, channels, still = gdf.region, gdf.field.channels, False
+    return make_evaluator(scene, region, views, edited, setup.background, channels, still)
 
 
 def end_rows(setup: TrainingSetup, trajectory: Trajectory) -> Tensor:

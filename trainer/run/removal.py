@@ -85,7 +85,8 @@ def vanished_share(setup: TrainingSetup, options: TrainOptions) -> float:
     scene, rest = setup.scene, _without(setup)
     change = behind = 0.0
     for view, path in zip(setup.train, options.views.pictures, strict=True):
-        target, background = read_edit(scene, view, path), picture_background(scene, path, view.camera)
+        target = read_edit(scene, view.camera, view.image, path)
+        background = picture_background(scene, path, view.camera)
         original, gone = (render_view(some, view.camera, background).clamp(0, 1) for some in (scene, rest))
         apart = target - view.image
         energy = apart.square().sum(dim=2) * (apart.abs().amax(dim=2) > _PAINTED)
@@ -202,7 +203,9 @@ def _painted_views(options: TrainOptions, setup: TrainingSetup) -> tuple[list[Vi
     if not options.views.pictures:
         setup = make_training_setup(replace(options.views, pictures=paths), setup.scene, setup.region)
     pairs = list(zip(setup.train, paths, strict=True))
-    return [view for view, _ in pairs], {v.camera.name: read_edit(setup.scene, v, path) for v, path in pairs}
+    return [view for view, _ in pairs], {
+        v.camera.name: read_edit(setup.scene, v.camera, v.image, path) for v, path in pairs
+    }
 
 
 def _views_around(options: TrainOptions, setup: TrainingSetup) -> TrainingSetup:

@@ -47,7 +47,7 @@ from trainer.optimize.growth import fade_in
 from trainer.optimize.losses import Perceptual, describe_loss, perceptual_loss
 from trainer.optimize.retime import resolve_slider
 from trainer.options import MOST_STAGES, EditKind, OptimizeOptions, TrainOptions
-from trainer.regions.from_pictures import RegionRequest, region_checks, region_kinds
+from trainer.regions.from_pictures import CHANGED, RegionRequest, region_checks, region_kinds
 from trainer.report.agreement import measure_agreement
 from trainer.resolve import recorded_options, resolve, use_threads
 from trainer.setup import (
@@ -74,12 +74,12 @@ from trainer.store.run_folder import (
 )
 from trainer.store.state import interrupt_on_signals
 from trainer.views.crops import only_recolors
-from trainer.views.view import BACKGROUND, fit_size, make_view, render_view, with_near_plane
+from trainer.views.view import BACKGROUND, fit_size, make_view, with_near_plane
 
 from .agree import AgreedEditor, Easel, agree_views
-from .decal import RING, TURNS, train_decal
-from .finish import RunResult, end_rows, finish_run, load_evaluator, load_result
+from .finish import RunResult, end_rows, finish_run, load_evaluator, load_result, write_finals
 from .kinds import Approach, choose_approach, resolve_approach
+from .paint import RING, TURNS, train_decal
 from .record import RunRecord, read_record
 from .removal import is_removal, remove_region
 from .resume import check_exists, decide_resume, explain_stop, load_region, picture_digests
@@ -262,7 +262,10 @@ def _run_training(
         )
         extra = {"members": region.members, "score": region.score}
         save_trajectory(folder.trajectory, trajectory, extra, plain(record))
-        _write_finals(setup.extend(trajectory.added), trajectory, folder, log)
+        with log.stage("final"):
+            grown = setup.extend(trajectory.added)
+            finals = grown.scene.replace_rows(grown.region.members, end_rows(grown, trajectory))
+            write_finals(setup, finals, folder, log)
         folder.state.save("recorded", {}, log.capture_state().values)
     else:
         log.restore(recorded)
@@ -282,7 +285,7 @@ def _paint(
         raise TypeError(f"{options.editor.editor} paints nothing")
     view = editor.view
     with log.stage("fit"):
-        painted = train_decal(editor, scene, options.name)
+        painted = train_decal(editor, scene, options.name, log)
     given = plain(recorded_options(options))
     decal = f"decal:{Path(options.editor.editor.partition(':')[2]).name}"
     gdf, figures = replace(painted.gdf, instruction=decal), painted.figures
@@ -409,7 +412,10 @@ def _edit_views(
     def edit(strengths: Sequence[float]) -> Pictures:
         new, is_confined = [s for s in strengths if s not in made], confines_edit(editor(), approach.kind)
         with log.steps("edit", len(views) * len(new)) as advance:
-            made.update(edit_views(editor(), views, new, folder, is_confined, advance))
+            within = views
+            if options.region.region == CHANGED:  # of paint finer than the Gaussians few are found
+                within = [view.with_painted([editor().edit(view, 1.0)]) for view in views]
+            made.update(edit_views(editor(), within, new, folder, is_confined, advance))
         log.say(f"{spec}: a {approach.kind} edit at strength {', '.join(f'{s:g}' for s in strengths)}")
         saved = {"strengths": list(strengths), **asdict(approach)}
         shared = painter.figures if isinstance(painter := editor(), AgreedEditor) else {}
@@ -563,15 +569,3 @@ def _choose_path(
     painter = None if options.editor.family in (*EXTERNAL, *COSTLY_STRENGTHS) else editor()
     retimed = partial(retime_trajectory, setup=setup, optimization=optimization, log=log)
     return choose_path(trajectory, setup, painter, bool(optimization.group_steps), retimed)
-
-
-def _write_finals(setup: TrainingSetup, trajectory: Trajectory, folder: RunFolder, log: RunLog) -> None:
-    """The finished edit's views."""
-    with log.stage("final"):
-        edited_scene = setup.scene.replace_rows(setup.region.members, end_rows(setup, trajectory))
-        finals = {}
-        with log.looks("picture the edit", len(setup.views)) as looked:
-            for view in setup.views:
-                finals[view.camera.name] = render_view(edited_scene, view.camera, setup.background)
-                looked()
-        write_views(folder, "final", finals)

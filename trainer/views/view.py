@@ -64,10 +64,14 @@ class View:
         """
         return torch.lerp(self.image, edited, (self.mask[..., None] / 0.2).clamp(0.0, 1.0))
 
+    def with_painted(self, edited: Sequence[Tensor]) -> View:
+        """The view whose mask has all that these pictures of it change visibly."""
+        changed = torch.stack([(picture - self.image).abs().amax(dim=2) for picture in edited]).amax(dim=0)
+        return replace(self, mask=torch.maximum(self.mask, (changed > _CHANGED).float()))
+
     def widen(self, edited: Sequence[Tensor]) -> View:
         """The view with its box grown to all that these pictures of it change visibly."""
-        changed = torch.stack([(picture - self.image).abs().amax(dim=2) for picture in edited]).amax(dim=0)
-        return replace(self, box=region_box(torch.maximum(self.mask, (changed > _CHANGED).float())))
+        return replace(self, box=region_box(self.with_painted(edited).mask))
 
 
 def crop(image: Tensor, box: Crop) -> Tensor:

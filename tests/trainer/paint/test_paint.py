@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,63 +10,23 @@ import pytest
 import torch
 from PIL import Image
 
-from progdf.camera import Camera, intrinsics, look_at
 from progdf.compose.layers import Layer
 from progdf.compose.reference import compose_layers
 from progdf.errors import ProgdfError
-from progdf.gaussians import Gaussians
+from progdf.gaussians import Gaussians, concatenate
 from progdf.gdf.file import load_gdf, save_gdf
 from progdf.io.cameras import save_cameras
 from progdf.metrics.image import psnr
+from progdf.quaternions import rotate_vectors
 from progdf.rasterize import render
 from progdf.region import whole_scene
 from tests.helpers.edits import bits
+from tests.trainer.painted_wall import CAMERA, SIDE, edit_of, letters, paint_on, picture, wall
 from trainer.editors.decal import DecalEditor, decal, parse_place
 from trainer.options import EditorOptions
-from trainer.paint.discs import Paint, merge_pixels, place_discs
-from trainer.run.decal import finished_scene, orbit, paint_gdf, train_decal
+from trainer.paint.discs import merge_pixels, place_discs
+from trainer.run.paint import choose_discs, finished_scene, orbit, train_decal
 from trainer.views.view import BACKGROUND
-
-SIDE = 128
-CAMERA = Camera(
-    look_at(torch.tensor([0.0, 0.0, -3.0]), torch.zeros(3), torch.tensor([0.0, -1.0, 0.0])),
-    intrinsics(math.radians(45), SIDE, SIDE),
-    SIDE,
-    SIDE,
-    near=0.01,
-)
-
-
-def wall(seed: int = 0, count: int = 2500, size: float = 0.09, rough: float = 0.05) -> Gaussians:
-    """A wall across the picture, whose Gaussians are 5 pixels large and lie up to 6 before and behind it."""
-    random = torch.Generator().manual_seed(seed)
-    means = torch.rand(count, 3, generator=random) * torch.tensor([3.2, 3.2, 0.0]) - torch.tensor(
-        [1.6, 1.6, 0.0]
-    )
-    means[:, 2] = rough * torch.randn(count, generator=random).clamp(-2, 2)
-    scales = torch.tensor([size, size, 0.2 * size]) * (0.7 + 0.6 * torch.rand(count, 3, generator=random))
-    colors = 0.6 + 0.05 * torch.randn(count, 3, generator=random)
-    return Gaussians(
-        means,
-        torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1),
-        scales.log(),
-        torch.full((count,), 0.5),
-        colors,
-        torch.zeros(count, 3, 3),
-    )
-
-
-def picture(scene: Gaussians) -> torch.Tensor:
-    return render(scene, CAMERA, BACKGROUND).image.clamp(0.0, 1.0)
-
-
-def letters(scene: Gaussians) -> Paint:
-    """Bars of five pixels in dark blue, as wide as what is between them, in the middle of the wall."""
-    painted = torch.zeros(SIDE, SIDE, dtype=torch.bool)
-    for left in range(45, 85, 10):
-        painted[50:78, left : left + 5] = True
-    image = torch.where(painted[..., None], torch.tensor([0.1, 0.15, 0.5]), picture(scene))
-    return Paint(CAMERA, image, painted)
 
 
 def put(folder: Path, image: np.ndarray) -> EditorOptions:
@@ -84,40 +43,40 @@ def make(options: EditorOptions, scene: Gaussians) -> DecalEditor:
 def test_letters_finer_than_the_gaussians_are_as_sharp_as_they_were_painted() -> None:
     scene = wall()
     paint = letters(scene)
-    gdf, _ = paint_gdf(scene, paint, "letters")
+    gdf, _ = edit_of(scene, paint)
     made = picture(compose_layers(scene, [Layer(gdf, 1.0)]))
-    # hard edges in all pixels of a bar: what the engine blurs over a pixel would need colors below black
-    assert psnr(made, paint.picture, paint.painted) > 26.0
-    near = torch.zeros_like(paint.painted)
+    assert psnr(made, paint.picture, paint.mask) > 34.0
+    near = torch.zeros_like(paint.mask)
     near[36:92, 34:92] = True
-    assert psnr(made, paint.picture, near & ~paint.painted) > 34.0
+    assert psnr(made, paint.picture, near & ~paint.mask) > 34.0
 
 
 def test_strength_zero_is_the_original_bit_for_bit_and_nothing_outside_the_region_changes() -> None:
     scene = wall()
-    gdf, discs = paint_gdf(scene, letters(scene), "letters")
+    gdf, laid = edit_of(scene, letters(scene))
     start = compose_layers(scene, [Layer(gdf, 0.0)])
     assert bits(start[: len(scene)]) == bits(scene)
     assert torch.equal(picture(start), picture(scene))
     finished = compose_layers(scene, [Layer(gdf, 1.0)])
-    outside = torch.ones(len(scene), dtype=torch.bool).index_fill(0, discs.moved, False)
+    outside = torch.ones(len(scene), dtype=torch.bool).index_fill(0, laid.rows, False)
     assert bits(finished[: len(scene)][outside]) == bits(scene[outside])
     assert bits(finished) == bits(finished_scene(scene, gdf))
 
 
-def test_paint_appears_in_the_middle_of_the_slider() -> None:
+def test_what_shows_of_paint_is_linear_along_the_slider() -> None:
     scene = wall()
     paint = letters(scene)
-    gdf, _ = paint_gdf(scene, paint, "letters")
-    half = picture(compose_layers(scene, [Layer(gdf, 0.5)]))
+    gdf, _ = edit_of(scene, paint)
     before, change = picture(scene), paint.picture - picture(scene)
-    share = ((half - before) * change)[paint.painted].sum() / change[paint.painted].square().sum()
-    assert 0.3 < float(share) < 0.8  # what makes way stands before the discs up to about there, then behind
+    for s in (0.1, 0.25, 0.5, 0.75, 0.9):
+        shown = picture(compose_layers(scene, [Layer(gdf, s)])) - before
+        share = (shown * change)[paint.mask].sum() / change[paint.mask].square().sum()
+        assert float(share) == pytest.approx(s, abs=0.05)
 
 
 def test_what_moves_back_keeps_its_outline_in_the_painted_view() -> None:
     scene = wall()
-    discs = place_discs(scene, letters(scene), 0.02)
+    discs = place_discs(scene, letters(scene), 0.02, 4.0)
     assert len(discs.moved) > 0
     row = discs.moved[:1]
     before, after = (render(some[row], CAMERA, (0.0, 0.0, 0.0)).image for some in (scene, discs.scene))
@@ -127,22 +86,22 @@ def test_what_moves_back_keeps_its_outline_in_the_painted_view() -> None:
 def test_what_stood_hidden_behind_others_does_not_cover_the_paint(tmp_path: Path) -> None:
     scene = wall(count=20_000, size=0.035, rough=0.01)
     logo = np.full((32, 32, 4), (200, 30, 40, 255), np.uint8)
-    discs = place_discs(scene, make(put(tmp_path, logo), scene).paint, 0.03)
+    discs = place_discs(scene, make(put(tmp_path, logo), scene).paint, 0.03, 4.0)
     assert float(discs.scene.means[discs.moved, 2].min()) > float(discs.added.means[:, 2].max())
 
 
 def test_an_untouched_picture_and_paint_beyond_the_silhouette_add_nothing() -> None:
     scene = wall()
     nothing = torch.zeros(SIDE, SIDE, dtype=torch.bool)
-    assert not len(place_discs(scene, Paint(CAMERA, picture(scene), nothing), 0.02).added)
+    assert not len(place_discs(scene, paint_on(scene, nothing), 0.02, 4.0).added)
     small = scene[(scene.means[:, 0] < -1.0).nonzero()[:, 0]]
     beyond = torch.zeros(SIDE, SIDE, dtype=torch.bool)
     beyond[60:70, 90:110] = True
-    discs = place_discs(small, Paint(CAMERA, picture(small), beyond), 0.02)
+    discs = place_discs(small, paint_on(small, beyond), 0.02, 4.0)
     assert not len(discs.added)
     assert discs.scene is small
     with pytest.raises(ProgdfError, match="opaque"):
-        paint_gdf(small, Paint(CAMERA, picture(small), beyond), "beyond")
+        choose_discs(small, [paint_on(small, beyond)], [], None)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -152,7 +111,7 @@ def test_every_pixel_is_in_one_rectangle_and_flat_paint_needs_few(seed: int) -> 
     top, left = random.integers(5, 20, 2)
     mask[top : top + 160, left : left + 176] = True
     flat = np.full((200, 220, 3), 0.4, np.float32)
-    cells = merge_pixels(flat, mask, 0.02)
+    cells = merge_pixels(flat, mask, 0.02, mask)
     covered = np.zeros(mask.shape, int)
     for x, y, width, height in cells:
         covered[
@@ -161,13 +120,13 @@ def test_every_pixel_is_in_one_rectangle_and_flat_paint_needs_few(seed: int) -> 
     assert (covered == mask).all()
     assert len(cells) <= 0.015 * mask.sum()
     noise = random.random((200, 220, 3)).astype(np.float32)
-    assert len(merge_pixels(noise, mask, 0.02)) == mask.sum()
+    assert len(merge_pixels(noise, mask, 0.02, mask)) == mask.sum()
 
 
 def test_paint_is_not_seen_through_a_thin_thing_from_behind() -> None:
     scene = replace(wall(), means=wall().means * torch.tensor([1.0, 1.0, 0.3]))
     paint = letters(scene)
-    gdf, _ = paint_gdf(scene, paint, "letters")
+    gdf, _ = edit_of(scene, paint)
     back = orbit(CAMERA, torch.zeros(3), 180.0)
     before, after = (
         render(some, back, BACKGROUND).image.clamp(0, 1) for some in (scene, finished_scene(scene, gdf))
@@ -194,8 +153,8 @@ def test_transparency_leaves_the_scene_as_it_is(tmp_path: Path) -> None:
     logo = np.full((30, 30, 4), 255, np.uint8)
     logo[:, 15:, 3] = 0
     editor = make(put(tmp_path, logo), scene)
-    assert not bool(editor.paint.painted[:, 70:].any())
-    assert bool(editor.paint.painted[:, 50:60].any())
+    assert not bool(editor.paint.mask[:, 70:].any())
+    assert bool(editor.paint.mask[:, 50:60].any())
     logo[..., 3] = 0
     with pytest.raises(ProgdfError, match="all transparent"):
         make(put(tmp_path, logo), scene)
@@ -256,3 +215,20 @@ def test_a_decal_that_is_no_picture_or_has_no_camera_is_one_line(tmp_path: Path)
         with pytest.raises(ProgdfError) as raised:
             check_new_editor(options)
         assert "\n" not in str(raised.value)
+
+
+def test_no_disc_lies_between_two_depths_and_what_stands_in_front_stays() -> None:
+    back, near = (wall(seed, count=20_000, size=0.035, rough=0.01) for seed in (0, 1))
+    near = replace(near, means=near.means - torch.tensor([0, 0, 0.6]))
+    near = near[(near.means[:, 0] > 0.0).nonzero()[:, 0]]
+    scene = concatenate([back, near])
+    painted = torch.zeros(SIDE, SIDE, dtype=torch.bool)
+    painted[40:90, 40:90] = True
+    discs = place_discs(scene, paint_on(scene, painted), 0.03, 4.0)
+    depth = discs.added.means[:, 2]
+    assert float(((depth > -0.5) & (depth < -0.1)).float().mean()) < 0.02
+    across = rotate_vectors(torch.tensor([[0.0, 0.0, 1.0]]).expand(len(depth), 3), discs.added.quats)
+    large = discs.added.log_scales.exp().amax(dim=1) > 0.02
+    assert float(across[large, 2].abs().min()) > 0.5
+    front = discs.moved[discs.moved >= len(back)]
+    assert float(discs.scene.means[front, 2].max()) < -0.3

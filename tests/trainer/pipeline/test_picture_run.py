@@ -12,7 +12,6 @@ import torch
 from progdf.compose.reference import Layer, compose_layers
 from progdf.errors import ProgdfError
 from progdf.formats.ply import load_ply
-from progdf.gaussians import pack
 from progdf.gdf.file import load_gdf
 from progdf.io.images import to_picture
 from progdf.io.picture_camera import camera_chunk, find_picture_camera
@@ -107,13 +106,12 @@ def test_painting_a_thing_away_is_said_to_remove_nothing(
         - render_view(scene, view.camera, behind).clamp(0, 1)
         for view in setup.train
     ]
-    rows = pack(scene[region.members], with_shN=True)
-    found = measure_paint(setup, painted, [behind] * len(painted), rows)
+    found = measure_paint(setup, painted, [behind] * len(painted), scene)
     assert found.reached == pytest.approx(0.0, abs=0.01)
     assert found.warning.startswith("0 % of what was painted is in the edit: the painting covers things")
     assert "nothing is removed by painting" in found.warning
     originals = [view.image for view in setup.train]
-    kept = measure_paint(setup, originals, [behind] * len(painted), rows)
+    kept = measure_paint(setup, originals, [behind] * len(painted), scene)
     assert (kept.pixels, kept.warning) == (0, "")
 
 
@@ -126,8 +124,7 @@ def test_a_thing_painted_in_a_color_of_its_own_is_not_told_as_removed(
     painted = [
         torch.where(view.mask[..., None] > 0.5, torch.tensor(color), view.image) for view in setup.train
     ]
-    rows = pack(scene[region.members], with_shN=True)
-    assert not measure_paint(setup, painted, [setup.background] * len(painted), rows).removes
+    assert not measure_paint(setup, painted, [setup.background] * len(painted), scene).removes
 
 
 def test_what_saving_does_beside_the_members_is_not_counted_as_painted(folder: Path) -> None:
@@ -135,8 +132,7 @@ def test_what_saving_does_beside_the_members_is_not_counted_as_painted(folder: P
     setup = make_training_setup(ViewOptions(views=6, image_size=96), scene, region)
     noise = torch.rand(96, 96, 3, generator=torch.Generator().manual_seed(0)) * 0.04
     saved = [torch.where(view.mask[..., None] > 0.5, view.image, view.image - noise) for view in setup.train]
-    rows = pack(scene[region.members], with_shN=True)
-    assert measure_paint(setup, saved, [setup.background] * len(saved), rows).pixels == 0
+    assert measure_paint(setup, saved, [setup.background] * len(saved), scene).pixels == 0
 
 
 def test_detail_finer_than_the_splats_is_said_with_both_counts() -> None:

@@ -1,0 +1,130 @@
+"""Changed pictures whose paint is finer than the Gaussians: what recoloring leaves becomes discs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from progdf.camera import Camera
+from progdf.compose.reference import Layer, compose_layers
+from progdf.formats.ply import load_ply, save_ply
+from progdf.gaussians import Gaussians
+from progdf.gdf.file import load_gdf
+from progdf.io.images import to_picture
+from progdf.io.picture_camera import camera_chunk
+from progdf.metrics.image import psnr
+from tests.helpers.edits import bits
+from tests.helpers.trained import train
+from tests.trainer.painted_wall import CAMERA, letters, paint_on, picture, wall
+from trainer.evaluate.command import evaluate
+from trainer.options import EditorOptions, EvaluateOptions, RegionOptions, TrainOptions, with_values
+from trainer.paint.discs import lay_on, place_discs, project_paint
+from trainer.run.finish import RunResult
+from trainer.run.paint import lay_discs, orbit
+from trainer.views.view import BACKGROUND, render_view
+
+
+def save(folder: Path, name: str, image: torch.Tensor, camera: Camera = CAMERA) -> Path:
+    to_picture(image).save(folder / f"{name}.png", pnginfo=camera_chunk(camera))
+    return folder / f"{name}.png"
+
+
+def options(folder: Path, pictures: Path, out: str) -> TrainOptions:
+    plain = TrainOptions(
+        folder / "wall.ply", folder / out, RegionOptions("changed"), EditorOptions(f"pictures:{pictures}")
+    )
+    return with_values(plain, threads=1)
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("wall")
+    save_ply(folder / "wall.ply", wall())
+    return folder
+
+
+@pytest.fixture(scope="module")
+def lettered(place: Path) -> RunResult:
+    image = letters(load_ply(place / "wall.ply")).picture
+    return train(options(place, save(place, "letters", image), "lettered"), quiet=True)
+
+
+def test_letters_on_a_picture_are_as_sharp_as_they_were_painted(place: Path, lettered: RunResult) -> None:
+    scene = load_ply(place / "wall.ply")
+    gdf = load_gdf(lettered.gdf, scene)
+    assert gdf.added is not None
+    paint = letters(scene)
+    assert psnr(picture(compose_layers(scene, [Layer(gdf, 1.0)])), paint.picture, paint.mask) > 32.0
+    assert bits(compose_layers(scene, [Layer(gdf, 0.0)])[: len(scene)]) == bits(scene)
+    log = lettered.folder.log.read_text()
+    assert "painted pixels are finer than the Gaussians" in log
+    assert "they are added" in log
+    assert "warning" not in log
+    assert lettered.report["edit"]["psnr_to_views"] > 30.0
+
+
+def test_a_run_with_discs_is_measured_as_it_is_shipped(lettered: RunResult) -> None:
+    (found,) = evaluate(EvaluateOptions(lettered.folder.root))
+    assert found.curves["slider"].psnr[-1] == pytest.approx(lettered.report["edit"]["psnr_to_views"], abs=0.1)
+
+
+def test_a_run_that_is_stopped_at_its_discs_goes_on_to_the_same_bits(
+    place: Path, lettered: RunResult, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    again = options(place, place / "letters.png", "stopped")
+    again = with_values(again, name="lettered")
+    with monkeypatch.context() as patch:
+        patch.setattr("trainer.run.finish.sharpen", stop)
+        with pytest.raises(KeyboardInterrupt):
+            train(again, quiet=True)
+    resumed = train(replace(again, resume=True), quiet=True)
+    assert resumed.gdf.read_bytes() == lettered.gdf.read_bytes()
+
+
+def test_a_change_that_recoloring_meets_adds_nothing(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = load_ply(place / "wall.ply")
+    colors = scene.sh0 - 0.5 * torch.exp(-4 * scene.means.square().sum(dim=1, keepdim=True))
+    image = save(place, "shade", picture(replace(scene, sh0=colors)))
+    done = train(with_values(options(place, image, "shaded"), name="shade"), quiet=True)
+    assert "finer than" not in done.folder.log.read_text()
+    monkeypatch.setattr("trainer.run.finish.sharpen", lambda *_: None)
+    plain = train(with_values(options(place, image, "plain"), name="shade"), quiet=True)
+    assert done.gdf.read_bytes() == plain.gdf.read_bytes()
+
+
+def test_discs_that_lose_from_the_sides_are_not_added(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def lift(scene: Gaussians, paint: object, *rest: object) -> object:
+        discs = place_discs(scene, paint, *rest)  # type: ignore[arg-type]
+        toward = 0.5 * (CAMERA.position - discs.added.means)
+        return replace(discs, added=replace(discs.added, means=discs.added.means + toward))
+
+    monkeypatch.setattr("trainer.run.paint.place_discs", lift)
+    done = train(options(place, save(place, "lifted", letters(wall()).picture), "lifted"), quiet=True)
+    assert "none is added" in done.folder.log.read_text()
+    assert load_gdf(done.gdf, load_ply(place / "wall.ply")).added is None
+
+
+def test_two_pictures_of_one_stripe_share_one_set_of_rows() -> None:
+    scene = wall(rough=0.01)
+    stripe = torch.zeros(CAMERA.height, CAMERA.width, dtype=torch.bool)
+    stripe[40:90, 58:66] = True
+    first = paint_on(scene, stripe)
+    camera = orbit(CAMERA, torch.zeros(3), 20.0)
+    seen = project_paint(scene, CAMERA, first.drawn, camera)
+    image = lay_on(render_view(scene, camera, torch.tensor(BACKGROUND)).clamp(0, 1), seen)
+    second = replace(first, camera=camera, picture=image, drawn=seen)
+    alone, both = (lay_discs(scene, paints, 4.0) for paints in ([first], [first, second]))
+    assert len(both.added) <= 1.05 * len(alone.added)
+    other = torch.zeros_like(stripe)
+    other[40:90, 30:38] = True
+    apart = lay_discs(scene, [first, paint_on(scene, other)], 4.0)
+    assert len(apart.added) > 1.8 * len(alone.added)
+    for paint in (first, second):
+        shown = render_view(both.end, paint.camera, torch.tensor(BACKGROUND)).clamp(0, 1)
+        assert psnr(shown, paint.picture, paint.mask) > 26.0
