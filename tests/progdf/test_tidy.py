@@ -271,7 +271,7 @@ def test_what_cannot_be_is_one_line_and_writes_nothing(
     assert not out.exists()
 
 
-@pytest.mark.parametrize("options", [["--clean", "-o", "a.gdf"], ["--delete", LEFT, "-o", "a.spz"]])
+@pytest.mark.parametrize("options", [["--clean", "-o", "a.gdf"], ["--delete", LEFT, "-o", "a.obj"]])
 def test_an_output_that_does_not_fit_is_refused(
     ply: Path,
     capsys: pytest.CaptureFixture[str],

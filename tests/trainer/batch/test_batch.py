@@ -200,6 +200,7 @@ def test_a_job_that_always_dies_fails_and_the_others_are_done(tmp_path: Path) ->
     assert "SIGKILL" in outcome.reason
 
 
+@pytest.mark.slow  # half a minute; a single run's Ctrl+C is tested in every run of the tests
 @pytest.mark.skipif(sys.platform == "win32", reason="signals")
 def test_ctrl_c_stops_all_and_resume_ends_with_the_same_bytes(
     catalogue: Path, singly: dict[str, bytes], tmp_path: Path
@@ -252,6 +253,7 @@ def cluster() -> Iterator[object]:
     made.shutdown()
 
 
+@pytest.mark.slow  # a quarter of a minute, most of it Ray's own start
 def test_on_a_cluster_a_lost_machine_s_job_goes_on_elsewhere(
     catalogue: Path, singly: dict[str, bytes], tmp_path: Path, cluster: object
 ) -> None:

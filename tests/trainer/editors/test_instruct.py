@@ -284,6 +284,7 @@ def test_a_text_edit_is_trained_in_stages_and_stopped_anywhere_comes_to_the_same
     assert all(torch.equal(whole.offsets(s), again.offsets(s)) for s in (0.25, 0.5, 1.0))
 
 
+@pytest.mark.slow  # four runs; that views follow an approved picture is tested in every run of the tests
 def test_a_run_follows_an_anchor_of_any_camera_and_not_another_one_when_it_goes_on(
     pix2pix: str, tmp_path: Path
 ) -> None:
