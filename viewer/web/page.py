@@ -33,6 +33,7 @@ from progdf.compose.reference import coverage
 from progdf.field.baked import AttributeBases, GradeForm
 from progdf.field.grade import sphere
 from progdf.field.separable import quantize_bases
+from progdf.formats.compressed_ply import morton_order
 from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.gdf.file import UNSEEN_LOGIT, Gdf
 from shaders import load_source
@@ -208,15 +209,10 @@ def _finite(scene: Gaussians) -> Gaussians:
 
 def _order(scene: Gaussians, members: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Rows in the page's order: members first, near ones together (by Morton's code)."""
-    means = scene.means.numpy().astype(np.float64)
-    small = np.sign(means) * np.log1p(np.abs(means))
-    low = small.min(axis=0, initial=0.0)
-    cells = ((small - low) / max(np.ptp(small) if small.size else 0.0, 1e-12) * 1023).astype(np.int64)
-    code = np.zeros(len(scene), np.int64)
-    for bit in range(10):
-        for axis in range(3):
-            code |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
-    return np.lexsort((code, ~members))
+    if not len(scene):
+        return np.zeros(0, np.int64)
+    order = morton_order(scene.means.sign() * scene.means.abs().log1p()).numpy()
+    return order[np.argsort(~members[order], kind="stable")]
 
 
 def _ascending(places: NDArray[np.int64]) -> Tensor:
