@@ -32,17 +32,17 @@ $(VENV)/.extras: $(VENV)/.ready
 # Headless OpenGL; installed only where apt is at hand, we are root and it is missing.
 gl:
 	@if [ "$(APT)" = apt ] && [ "$$(id -u)" = 0 ] && ! { ldconfig -p | grep -q libEGL.so.1 && ldconfig -p | grep -q libGL.so.1; }; then \
-	  apt-get update -qq && apt-get install -y -qq libegl1 libgl1 >/dev/null; fi
+	  apt-get update -qq && apt-get -o DPkg::Lock::Timeout=120 install -y -qq libegl1 libgl1 >/dev/null; fi
 
 # For the tests that drive the real window.
 window: gl
 	@if [ "$(APT)" = apt ] && [ "$$(id -u)" = 0 ] && ! { command -v Xvfb && command -v xdotool; } >/dev/null; then \
-	  apt-get update -qq && apt-get install -y -qq xvfb xdotool >/dev/null; fi
+	  apt-get update -qq && apt-get -o DPkg::Lock::Timeout=120 install -y -qq xvfb xdotool >/dev/null; fi
 
 # For the tests of the web page; without it they are skipped.
 browser:
 	@if [ "$(APT)" = apt ] && [ "$$(id -u)" = 0 ] && ! command -v chromium >/dev/null; then \
-	  apt-get update -qq && apt-get install -y -qq chromium >/dev/null; fi
+	  apt-get update -qq && apt-get -o DPkg::Lock::Timeout=120 install -y -qq chromium >/dev/null; fi
 
 demo: setup
 	$(BIN)/progdf demo --out demo

@@ -270,7 +270,7 @@ def painted(folder: Path, painter: Counting, recipe: dict[str, str] | None = Non
     return agree_views(easel, setup, STYLE, RunLog(folder / "log.txt", quiet=True))
 
 
-@pytest.mark.parametrize("references", [0, 2])
+@pytest.mark.parametrize("references", [pytest.param(0, marks=pytest.mark.slow), 2])
 @pytest.mark.parametrize("each", [5, pytest.param(1, marks=pytest.mark.slow)])
 def test_a_loop_that_is_killed_at_any_picture_goes_on_to_the_same_bits(
     tmp_path: Path, references: int, each: int

@@ -161,6 +161,7 @@ def test_a_course_of_any_recordings_keeps_both_ends_to_the_bit() -> None:
         assert torch.allclose(opacity[..., 0], expected, atol=4e-3)  # what is drawn by none at 0
 
 
+@pytest.mark.slow  # two runs
 def test_growth_that_does_not_pay_adds_nothing_and_writes_the_same_file(tmp_path: Path) -> None:
     """Ears that are gone leave a hole, which other pixels' rows do not fill."""
     options = write_growth(tmp_path, "no ears", steps=60, views=6, name="edit")

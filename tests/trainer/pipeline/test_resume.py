@@ -260,6 +260,7 @@ def test_a_run_that_moves_parts_goes_on_to_the_same_bits(
     assert (OUT / "trajectory.safetensors").read_bytes() == expected
 
 
+@pytest.mark.slow  # a plain run is killed wherever it writes in every run of the tests
 def test_a_run_that_decides_on_its_effort_goes_on_to_the_same_bits(
     bear_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -305,6 +306,7 @@ def test_what_is_found_in_a_folder_depends_on_the_options(
     assert find_run(small_run(bear_folder)) == "finished"
 
 
+@pytest.mark.slow  # a plain run is killed wherever it writes in every run of the tests
 def test_a_run_killed_while_it_grows_goes_on_to_the_same_bits(tmp_path: Path) -> None:
     options = write_growth(tmp_path, "hat", image_size=64)
     more = {"editor": options.editor.editor, "region": options.region.region, "views": options.views.views}
