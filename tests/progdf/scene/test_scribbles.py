@@ -113,3 +113,14 @@ def test_what_no_walk_reaches_is_outside() -> None:
     mask = Scribbles(far, np.full((80, 3), 0.5, np.float32)).select(np.array([0, 1]), NONE)
     assert mask[:40].all()
     assert not mask[40:].any()
+
+
+def test_a_border_is_where_the_color_changes_however_far_the_strokes() -> None:
+    rng = np.random.default_rng(0)
+    points = np.concatenate([rng.random((4000, 2)), np.zeros((4000, 1))], axis=1)
+    red = points[:, 0] < 0.8
+    colors = np.where(red[:, None], [0.6, 0.2, 0.1], [0.6, -0.05, 0.1]) + rng.normal(0, 0.02, (4000, 3))
+    inside, outside = np.flatnonzero(points[:, 0] < 0.02), np.flatnonzero(points[:, 0] > 0.98)
+    for scale in (1.0, 1e-3, 1e3):
+        mask = Scribbles(scale * points, colors.astype(np.float32)).select(inside, outside)
+        assert iou(mask, red) > 0.98
