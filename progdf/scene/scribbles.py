@@ -25,9 +25,7 @@ from .selection import Floats, Mask, Surface
 Rows = NDArray[np.int64]
 
 _NEAREST = 10  # steps that a walk may take
-_UNLIKE = (
-    2.0  # how much less likely a step is, as a logarithm, at the difference that neighbors commonly have
-)
+_UNLIKE = 2.0  # in e⁻²: how likely a step is over the difference in color that neighbors commonly have
 _WALL = 1e-6  # of a likely step: behind what no walk passes there would be no chances at all
 _HELD = 1e3  # of its steps: how firmly a stroke holds its Gaussians
 _LOOSE = 1e-6  # of its steps: how firmly what no stroke is connected with is held outside
