@@ -45,7 +45,7 @@ class Scribbles:
 
     def __init__(self, points: NDArray[np.floating], colors: Floats) -> None:
         self._levels = _Multigrid(likely_steps(points, colors))
-        self._chances = np.zeros(len(points), np.float32)
+        self._count = len(points)
 
     def select(self, inside: Rows, outside: Rows) -> Mask:
         """What belongs to the strokes on a thing rather than to those beside it.
@@ -57,13 +57,10 @@ class Scribbles:
         Returns:
             [N]; nothing without a stroke on the thing, what is connected with it without one beside it
         """
-        on, beside = np.zeros(len(self._chances), bool), np.zeros(len(self._chances), bool)
+        on, beside = np.zeros(self._count, bool), np.zeros(self._count, bool)
         on[inside], beside[outside] = True, True
         on, beside = on & ~beside, beside & ~on
-        if not on.any():
-            return on
-        self._chances = self._levels.chances(on, beside, self._chances)
-        return self._chances > 0.5
+        return self._levels.chances(on, beside) > 0.5 if on.any() else on
 
 
 def rows_under(painted: Mask, seen: Surface) -> Rows:
@@ -109,40 +106,46 @@ class _Multigrid:
             self._groups.append(groups)
         self._steps = [np.asarray(level.sum(axis=1), np.float32).ravel() for level in self._weights]
 
-    def chances(self, on: Mask, beside: Mask, start: Floats) -> Floats:
-        """How likely a walk from each node ends on the thing; `start`: about that. [N]"""
-        self._hold((_HELD * (on | beside) + _LOOSE).astype(np.float32) * self._steps[0])
-        x: Floats = np.where(on, np.float32(1.0), np.where(beside, np.float32(0.0), start))
+    def chances(self, on: Mask, beside: Mask) -> Floats:
+        """How likely a walk from each node ends on the thing, found on coarse graphs first. [N] 0..1"""
+        held: Floats = (_HELD * (on | beside) + _LOOSE).astype(np.float32) * self._steps[0]
         target: Floats = np.float32(_HELD) * on * self._steps[0]
-        residual: Floats = target - self._apply(0, x)
-        spread = np.sqrt(self._diagonals[0])
-        first = error = float(np.linalg.norm(residual / spread))
-        direction, before = np.zeros_like(x), np.inf
-        for _ in range(_MOST_STEPS):
-            if error <= _ERROR * first:
-                break
-            correction = self._cycle(0, residual)
-            along = float(residual @ correction)
-            direction = correction + np.float32(along / before) * direction
-            image = self._apply(0, direction)
-            step = np.float32(along / max(float(direction @ image), 1e-30))
-            x += step * direction
-            residual -= step * image
-            before = along
-            error = float(np.linalg.norm(residual / spread))
+        targets = [target]
+        self._diagonals = [self._steps[0] + held]
+        for level in range(len(self._groups)):
+            held, target = self._gather(level, held), self._gather(level, target)
+            self._diagonals.append(self._steps[level + 1] + held)
+            targets.append(target)
+        rest = self._weights[-1]
+        small = rest.shape[0] <= 4 * _SMALLEST
+        matrix = np.diag(self._diagonals[-1].astype(np.float64)) - rest.toarray() if small else None
+        self._factors = None if matrix is None else cho_factor(matrix)
+        x = np.zeros(rest.shape[0], np.float32)
+        for level in reversed(range(len(targets))):
+            x = self._solve(
+                level, targets[level], x if level == len(self._groups) else x[self._groups[level]]
+            )
         return x
 
-    def _hold(self, held: Floats) -> None:
-        self._diagonals = []
-        for level, steps in enumerate(self._steps):
-            self._diagonals.append(steps + held)
-            if level < len(self._groups):
-                held = self._gather(level, held)
-        rest = self._weights[-1]
-        if rest.shape[0] <= 4 * _SMALLEST:
-            self._factors = cho_factor(np.diag(self._diagonals[-1].astype(np.float64)) - rest.toarray())
-        else:
-            self._factors = None
+    def _solve(self, level: int, target: Floats, x: Floats) -> Floats:
+        """Conjugate gradients on a level. [N]"""
+        spread = np.sqrt(self._diagonals[level])
+        held = target / self._diagonals[level]
+        least = _ERROR * float(np.linalg.norm((target - self._apply(level, held)) / spread))
+        residual: Floats = target - self._apply(level, x)
+        direction, before = np.zeros_like(x), np.inf
+        for _ in range(_MOST_STEPS):
+            if float(np.linalg.norm(residual / spread)) <= least:
+                break
+            correction = self._cycle(level, residual)
+            along = float(residual @ correction)
+            direction = correction + np.float32(along / before) * direction
+            image = self._apply(level, direction)
+            step = np.float32(along / max(float(direction @ image), 1e-30))
+            x = x + step * direction
+            residual -= step * image
+            before = along
+        return x
 
     def _gather(self, level: int, values: Floats) -> Floats:
         count = self._weights[level + 1].shape[0]
