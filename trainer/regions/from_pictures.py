@@ -1,4 +1,4 @@
-"""Regions that pictures tell of: masks:DIR, photomasks:DIR and text:"…", lifted from 2D to Gaussians."""
+"""Regions that pictures tell of: masks:DIR, photomasks:DIR, scribbles:A.png and text:"…"."""
 
 from __future__ import annotations
 
@@ -20,13 +20,15 @@ from progdf.gaussians import ZERO, Gaussians, Origin
 from progdf.io.cameras import load_cameras, save_cameras
 from progdf.io.images import flatten_onto, open_picture
 from progdf.io.picture_camera import edits_in_picture
-from progdf.region import Region
+from progdf.region import Region, from_mask
 from progdf.scene.bounds import is_surrounding
 from progdf.scene.orbit_rig import orbit_rig
 from progdf.scene.regions import Check, Kind
+from progdf.scene.scribbles import Rows, Scribbles, rows_under
+from progdf.scene.selection import Surface, base_colors
 from progdf.scene.up_axis import find_up
 from trainer.editors.cache import KeptPictures, Recipe
-from trainer.editors.pictures import SUFFIXES, picture_paths, rendered_cameras
+from trainer.editors.pictures import SUFFIXES, picture_paths, read_change, rendered_cameras
 from trainer.options import VIEWS, RegionOptions, ViewOptions
 from trainer.store.pretrained import last_model
 from trainer.views.view import (
@@ -86,6 +88,8 @@ def _mask(path: Path, camera: Camera, bent: bool) -> Tensor:
 CHANGED = "changed"
 """The region that changed pictures show."""
 
+_STROKE = 0.25  # of color: by so much a stroke differs from the render, and its hue from gray
+
 
 @dataclass(frozen=True)
 class RegionRequest:
@@ -111,7 +115,8 @@ def region_kinds(request: RegionRequest) -> dict[str, Kind]:
     """The kinds of region that pictures tell of, for `parse_region`.
 
     masks:DIR are drawn over straight pictures, as RUN/views/original are; photomasks:DIR over photographs,
-    which are straightened where the cameras have lenses; `changed` is where pictures differ from the scene.
+    which are straightened where the cameras have lenses; scribbles:A.png are green strokes on a thing and red
+    ones beside it, painted on rendered views; `changed` is where pictures differ from the scene.
     """
 
     def from_folder(text: str, scene: Gaussians, bent: bool) -> Region:
@@ -145,6 +150,7 @@ def region_kinds(request: RegionRequest) -> dict[str, Kind]:
         "masks": lambda text, scene: from_folder(text, scene, bent=False),
         "photomasks": lambda text, scene: from_folder(text, scene, bent=True),
         "text": from_text,
+        "scribbles": lambda text, scene: _scribbles_region(text, scene, request),
         CHANGED: lambda text, scene: changed_region(
             scene,
             *_changed_pictures(text, request, scene.origin),
@@ -165,6 +171,7 @@ def region_checks(request: RegionRequest) -> dict[str, Check]:
         "masks": lambda text: load_cameras(_mask_folder("masks", text, request)[1], ZERO),
         "photomasks": lambda text: load_cameras(_mask_folder("photomasks", text, request)[1], ZERO),
         "text": of_text,
+        "scribbles": lambda text: _scribble_pictures(text, request, ZERO),
         CHANGED: lambda text: _changed_pictures(text, request, ZERO),
     }
 
@@ -184,8 +191,42 @@ def _changed_pictures(
                 f"{path} was taken with edits on ({edits}), which would count as changed; take the view "
                 "without them, or name the region with --region"
             )
+    return paths, _taken_from(paths, request, origin)
+
+
+def _taken_from(paths: Sequence[Path], request: RegionRequest, origin: Origin) -> list[Camera]:
     given = [] if request.views.cameras is None else load_cameras(request.views.cameras, origin)
-    return paths, rendered_cameras(paths, given, origin)
+    return rendered_cameras(paths, given, origin)
+
+
+def _scribble_pictures(text: str, request: RegionRequest, origin: Origin) -> tuple[list[Path], list[Camera]]:
+    """The pictures of `scribbles:A.png,B.png`, and their cameras."""
+    if not text:
+        raise ProgdfError(
+            "scribbles: needs rendered views with green strokes on the thing and red ones beside it; "
+            "write scribbles:A.png,B.png"
+        )
+    paths = list(picture_paths(text))
+    return paths, _taken_from(paths, request, origin)
+
+
+def _scribbles_region(text: str, scene: Gaussians, request: RegionRequest) -> Region:
+    """The thing under green strokes, and not under red ones."""
+    rows: dict[str, list[Rows]] = {"green": [], "red": []}
+    for path, camera in zip(*_scribble_pictures(text, request, scene.origin), strict=True):
+        original, picture = read_change(scene, path, camera)
+        seen = Surface(scene, replace(camera.resize(picture.shape[1], picture.shape[0]), lens=None))
+        stroke = (picture - original).abs().amax(dim=-1) > _STROKE
+        red, green, blue = picture.unbind(dim=-1)
+        for color, own, other in (("green", green, red), ("red", red, green)):
+            painted = stroke & (own - torch.maximum(other, blue) > _STROKE)
+            rows[color].append(rows_under(painted.numpy(), seen))
+    inside, outside = (np.concatenate(parts) for parts in rows.values())
+    for color, found, where in (("green", inside, "on"), ("red", outside, "beside")):
+        if not len(found):
+            raise ProgdfError(f"no {color} stroke in {text} lies on the scene; paint one {where} the thing")
+    scribbles = Scribbles(scene.means.nan_to_num().numpy(), base_colors(scene))
+    return from_mask(f"scribbles:{text}", torch.from_numpy(scribbles.select(inside, outside)))
 
 
 def _mask_folder(kind: str, text: str, request: RegionRequest) -> tuple[Path, Path]:

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from PIL import Image
+from PIL import Image, ImageDraw
+from PIL.PngImagePlugin import PngInfo
 
 from progdf.__main__ import main
 from progdf.demo_scenes import DemoScene
@@ -152,3 +153,51 @@ def test_views_overwrite_no_folder_of_views(
     assert "already exists" in refused(capsys, "views", scene, "--out", tmp_path)
     assert (tmp_path / "cameras.json").read_text() == "[]"
     assert not (tmp_path / "original").exists()
+
+
+def paint_strokes(view: Path, out: Path, **lines: list[tuple[int, int]]) -> Path:
+    """Lines of named colors drawn over a rendered view, as a painting program saves them."""
+    with Image.open(view) as opened:
+        info = PngInfo()
+        for key, text in opened.text.items():  # type: ignore[attr-defined]
+            info.add_text(key, text)
+        image = opened.convert("RGB")
+    for color, line in lines.items():
+        ImageDraw.Draw(image).line(line, fill=color, width=5)
+    image.save(out, pnginfo=info)
+    return out
+
+
+def test_strokes_painted_on_a_view_are_a_region(
+    demo: DemoScene, scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    view, out = tmp_path / "view.png", tmp_path / "rows.npy"
+    said(capsys, "render", scene, "-o", view, "--size", "320x240", "--engine", "cpu")
+    line, beside = [(10, 228), (60, 190), (75, 225)], [(100, 190), (160, 215), (220, 195), (190, 140)]
+    strokes = paint_strokes(view, tmp_path / "strokes.png", lime=line, red=beside)
+    said(capsys, "region", scene, f"scribbles:{strokes}", "-o", out)
+    ground = np.zeros(3000, bool)
+    ground[demo.members("grass").numpy()] = True
+    mask = np.zeros(3000, bool)
+    mask[np.load(out)] = True
+    assert (mask & ground).sum() > 0.9 * (mask | ground).sum()
+    for color, missing in (
+        ("lime", "no red stroke"),
+        ("red", "no green stroke"),
+        ("blue", "no green stroke"),
+    ):
+        one = paint_strokes(view, tmp_path / "one.png", **{color: line})
+        assert missing in refused(capsys, "region", scene, f"scribbles:{one}", "-o", tmp_path / "none.npy")
+    Image.open(strokes).convert("RGB").save(tmp_path / "bare.png")
+    (tmp_path / "broken.png").write_bytes(b"no picture")
+    for file in ("bare.png", "broken.png", "absent.png"):
+        assert (
+            refused(
+                capsys, "region", scene, f"scribbles:{tmp_path / file}", "-o", tmp_path / "none.npy"
+            ).count("\n")
+            == 1
+        )
+    assert "write scribbles:A.png" in refused(
+        capsys, "region", scene, "scribbles:", "-o", tmp_path / "none.npy"
+    )
+    assert not (tmp_path / "none.npy").exists()
