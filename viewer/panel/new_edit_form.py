@@ -6,6 +6,7 @@ from dataclasses import replace
 
 from imgui_bundle import imgui
 
+from progdf.color.edits import GRADE_RANGES
 from viewer.jobs.training import (
     ALL,
     BEST_STYLES,
@@ -40,6 +41,15 @@ from viewer.ui.widgets import (
 )
 
 COLUMN_PX = 66.0
+_GRADES = {
+    "exposure": "Stops of light: −1 is half of it, 1 twice as much",
+    "temperature": "From blue to amber light",
+    "tint": "From green to magenta light",
+    "contrast": "About middle gray",
+    "saturation": "−1 is gray, 1 twice the chroma",
+    "black": "What is as dark as this becomes black",
+    "white": "What is as bright as this becomes white",
+}
 
 
 def draw(work: Workspace, count: int, preview: PreviewState, ui: UiContext, actions: list[str]) -> Workspace:
@@ -178,6 +188,13 @@ def _settings(form: NewEdit, preview: PreviewState, column: float, ui: UiContext
             help_ = "Share of the light that is taken away"
             amount = slider_row("Amount", form.amount, (0.05, 0.98), 0.7, column, ui, help_)
             form = replace(form, amount=amount)
+        case "grade":
+            rows = zip(GRADE_RANGES.items(), form.grade, strict=True)
+            grade = [
+                slider_row(name.capitalize(), value, (low, high), neutral, column, ui, _GRADES[name])
+                for (name, (low, high, neutral)), value in rows
+            ]
+            form = replace(form, grade=tuple(grade))
         case "style":
             label("Style", column)
             form = _style(form, ui)

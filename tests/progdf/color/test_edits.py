@@ -31,13 +31,13 @@ def test_oklab_there_and_back_is_the_same_color() -> None:
     assert torch.allclose(white, torch.tensor([1.0, 0.0, 0.0]), atol=1e-4)
 
 
-@pytest.mark.parametrize("edit", ["recolor", "tint", "darken", "night", "stripes"])
+@pytest.mark.parametrize("edit", ["recolor", "tint", "darken", "night", "stripes", "grade"])
 def test_strength_zero_is_the_input_bit_for_bit(edit: str) -> None:
     rgb = torch.cat([_random(), torch.tensor([[-0.3, 1.4, 0.5], [0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])])
     assert torch.equal(_edited(edit, rgb, 0.0), rgb)
 
 
-@pytest.mark.parametrize("edit", ["recolor", "tint", "darken", "night", "stripes"])
+@pytest.mark.parametrize("edit", ["recolor", "tint", "darken", "night", "stripes", "grade"])
 def test_small_steps_of_strength_are_small_steps_of_color(edit: str) -> None:
     rgb = torch.cat([_random(), torch.full((4, 3), 0.5), torch.tensor([[-0.3, 1.4, 0.5]])])
     steps = torch.stack([_edited(edit, rgb, float(s)) for s in torch.linspace(0, 1, 101)])
@@ -53,6 +53,8 @@ def _edited(edit: str, rgb: Tensor, strength: float) -> Tensor:
         return color.darken(rgb, strength)
     if edit == "night":
         return color.night(rgb, strength)
+    if edit == "grade":
+        return color.grade_course(rgb, {"exposure": 1.0, "temperature": 0.5, "black": 0.1})(strength)
     return (color.recolor if edit == "recolor" else color.tint)(rgb, BLUE, strength)
 
 
@@ -102,6 +104,36 @@ def test_a_stop_halves_the_light() -> None:
     linear = ((0.8 + 0.055) / 1.055) ** 2.4
     darker = ((color.darken(gray, 1.0, stops=1.0) + 0.055) / 1.055) ** 2.4
     assert torch.allclose(darker, torch.full((1, 3), linear / 2), rtol=1e-3)
+
+
+def test_each_value_of_a_grade_does_what_its_name_says() -> None:
+    def graded(rgb: Tensor, **values: float) -> Tensor:
+        return color.grade_fully(rgb, values)
+
+    gray, some = torch.full((1, 3), 0.5), 0.2 + 0.6 * _random()
+    assert torch.allclose(graded(some), some, atol=1e-3), "neutral values change nothing"
+    linear = ((0.5 + 0.055) / 1.055) ** 2.4
+    brighter = ((graded(gray, exposure=0.5) + 0.055) / 1.055) ** 2.4
+    assert torch.allclose(brighter, torch.full((1, 3), linear * 2**0.5), rtol=2e-3)
+    red, green, blue = graded(gray, temperature=1.0)[0]
+    assert red > green > blue
+    red, green, blue = graded(gray, tint=1.0)[0]
+    assert min(red, blue) > green
+    assert graded(some, saturation=-1.0).std(dim=1).max() < 1e-3
+    more = _polar(graded(some, saturation=0.2))[1] / _polar(some)[1]
+    assert 1.15 < more.median() < 1.21
+    middle = torch.full((1, 3), 0.4613)  # of 18 % of the light
+    assert torch.allclose(graded(middle, contrast=0.8), middle, atol=2e-3)
+    steeper = graded(torch.tensor([[0.3, 0.3, 0.3], [0.7, 0.7, 0.7]]), contrast=0.5)
+    assert steeper[0].max() < 0.28
+    assert steeper[1].min() > 0.72
+    levels = graded(torch.tensor([[0.1, 0.1, 0.1], [0.5, 0.5, 0.5], [0.9, 0.9, 0.9]]), black=0.1, white=0.9)
+    assert torch.allclose(levels[:, 0], torch.tensor([0.0, 0.5, 1.0]), atol=2e-3)
+    extreme = [(name, end) for name, (low, high, _) in color.GRADE_RANGES.items() for end in (low, high)]
+    for name, end in extreme:
+        made = graded(torch.cat([_random(), torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])]), **{name: end})
+        assert made.isfinite().all()
+        assert 0 <= made.min() <= made.max() <= 1
 
 
 def test_strength_may_differ_from_pixel_to_pixel() -> None:

@@ -27,6 +27,7 @@ PROCEDURAL = (
     "stripes:#20a040",
     "darken:0.7",
     "night",
+    "grade:exposure=-0.8,temperature=0.6,contrast=0.3,saturation=0.4",
 )
 
 

@@ -40,7 +40,10 @@ def drafted(editor: str, folder: Path) -> Gdf:
     return load_gdf(folder / "draft.gdf", small("body").scene)
 
 
-@pytest.mark.parametrize("spec", ["recolor:#3060d0", "tint:#3060d0", "darken:0.6", "night"])
+GRADE = "grade:exposure=-0.8,saturation=0.4"
+
+
+@pytest.mark.parametrize("spec", ["recolor:#3060d0", "tint:#3060d0", "darken:0.6", "night", GRADE])
 def test_a_draft_shows_an_edit_at_every_strength_as_its_editor_does(spec: str, tmp_path: Path) -> None:
     case, gdf = small("body"), drafted(spec, tmp_path)
     editor = make_editor(EditorOptions(spec), case.scene, case.region, case.views)

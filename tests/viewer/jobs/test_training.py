@@ -24,6 +24,7 @@ from viewer.jobs.child import Progress
 from viewer.jobs.training import (
     ALL,
     CHANGED,
+    NEUTRAL,
     STYLES,
     TYPED,
     EditOrder,
@@ -207,8 +208,11 @@ def test_every_editor_of_the_form_is_one_of_the_trainer() -> None:
 def test_what_the_form_asks_for_is_what_the_trainer_takes(kind: str) -> None:
     word, _, what = form(kind).spec.partition(":")
     assert word == kind
-    CHECKS[kind](what)
-    CHECKS[kind](form(kind, amount=0.98, through_hues=True).spec.partition(":")[2])
+    if kind != "grade":  # which changes nothing until a slider is moved
+        CHECKS[kind](what)
+    moved = form(kind, amount=0.98, through_hues=True, grade=(1.0, -0.25, *NEUTRAL[2:]))
+    assert not moved.obstacle
+    CHECKS[kind](moved.spec.partition(":")[2])
 
 
 def test_the_trainer_has_as_many_paintings_as_the_form() -> None:
@@ -217,6 +221,8 @@ def test_the_trainer_has_as_many_paintings_as_the_form() -> None:
 
 def test_an_editor_says_what_is_missing_before_it_can_train() -> None:
     assert "Type what" in form("instruct").obstacle or "pip install" in form("instruct").obstacle
+    assert "slider" in form("grade").obstacle
+    assert form("grade", grade=(1.0, -0.25, *NEUTRAL[2:])).spec == "grade:exposure=1.00,temperature=-0.25"
     assert "folder" in form("folder").obstacle
     assert form("folder", folder="edited").obstacle == ""
     assert "pictures" in form("pictures").obstacle
