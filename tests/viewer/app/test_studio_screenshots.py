@@ -57,7 +57,7 @@ def test_the_menu(screenshot: Compare) -> None:
 def test_the_form_of_a_new_edit(screenshot: Compare) -> None:
     with rig(first_view(bear(), 0.7), SMALLEST) as hand:
         form = NewEdit(
-            TYPED, "sphere:0,0,0,1", editor=5, name="painted", error="the region holds no Gaussian"
+            TYPED, "sphere:0,0,0,1", editor=6, name="painted", error="the region holds no Gaussian"
         )
         hand.main_view.work = replace(hand.main_view.work, form=form)
         hand.key("Ctrl+N")
