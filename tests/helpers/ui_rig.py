@@ -17,13 +17,15 @@ from viewer.app.main_view import MainView
 from viewer.camera.view_camera import first_camera
 from viewer.files.document import Document
 from viewer.gl.present import read_rgb
-from viewer.panel import panel
+from viewer.panel import card, panel
 from viewer.render.engine import ViewEngine
 from viewer.render.gl_renderer import headless_context
 from viewer.state.view_state import LayerState, ViewState
 from viewer.ui.keys import NO_KEYS, Keys, Press
 
 STEP_S = 1.0 / 60.0
+HEAD, TRACK = 107.0, 131.0
+"""Heights of the middle of the name, and of the slider, on the top card."""
 BACKGROUND = (0.749, 0.847, 0.945)
 
 
@@ -155,8 +157,11 @@ class Rig:
         return read_rgb(self.screen, self.pixels)
 
     def picture(self) -> NDArray[np.uint8]:
-        """The part of it that shows the splats."""
-        return self.image()[:, : self.pixels[0] - round(panel.WIDTH_PX * self.pixels[0] / self.points[0])]
+        """The part of it that shows the splats, without what imgui draws over it."""
+        if self._unpainted is None:
+            self.frame()
+        wide = self.pixels[0] - round(panel.WIDTH_PX * self.pixels[0] / self.points[0])
+        return read_rgb(self.screen, self.pixels)[:, :wide]
 
     @property
     def strengths(self) -> list[float]:
@@ -167,7 +172,7 @@ class Rig:
         inset = 12 + 10 + 7  # the panel's and the card's padding, the handle's radius
         span = panel.WIDTH_PX - 2 * inset
         row = len(self.main_view.work.view.layers) - 1 - layer
-        return self.points[0] - panel.WIDTH_PX + inset + strength * span, 136.0 + 97.0 * row
+        return self.points[0] - panel.WIDTH_PX + inset + strength * span, TRACK + card.CARD_PX * row
 
 
 @contextmanager

@@ -40,7 +40,7 @@ STAGES = {
     "weigh the members": "Packing",
     "fit the field": "Packing",
     "field": "Packing",
-    "even the slider": "Evening the slider",
+    "even the slider": "Making the slider's steps alike",
     "measure the edit": "Measuring",
     "draw": "",
 }

@@ -12,7 +12,8 @@ from pathlib import Path
 from imgui_bundle import imgui
 
 from progdf.gdf.file import Gdf
-from viewer.files import exports
+from progdf.terminal import escape_text
+from viewer.files import exports, user_files
 from viewer.files.document import Document
 from viewer.render.engine import ViewEngine
 from viewer.state import workspace
@@ -116,6 +117,8 @@ class App:
         self.is_closed = False
         self._title = ""
         self._memory = memory
+        self._layout = user_files.read_layout(memory)
+        self.main_view.work = replace(self.main_view.work, layout=self._layout)
         self._failures: dict[str, tuple[int, float]] = {}  # by place: in which frame last, and when said
         self.main_view.report = self.report
         self.dropped: list[Path] = []
@@ -193,7 +196,7 @@ class App:
         arrived = time.perf_counter()
         seconds, self.last = arrived - self.last, arrived
         self.main_view.ui.make_current()
-        self.main_view.ui.set_scale(self.window.ui_scale)
+        self.main_view.ui.set_scale(self.window.ui_scale * self.main_view.work.layout.zoom)
         self.window.new_frame()
         screen = self.context.screen
         self.main_view.frame(screen, self.window.pixels, seconds, self.window.take_keys(), arrived)
@@ -290,8 +293,17 @@ class App:
         self.start.keep_picture(self.engine, view, self.document.path, self.file_actions.path)
 
     def _rename(self) -> None:
-        """The title bar says what is open, and with a dot that there are unsaved changes."""
-        title = _window_title(self.document.title, self.file_actions.has_unsaved)
+        """The title bar says what is open, and with a dot that there are unsaved changes; a new layout is
+        remembered."""
+        path, main_view = self.file_actions.path, self.main_view
+        name = escape_text(path.name.removesuffix(".session.json")) if path else ""
+        if name != main_view.work.session:
+            main_view.work = replace(main_view.work, session=name)
+            main_view.wake()
+        if main_view.work.layout != self._layout and not imgui.is_mouse_down(0):
+            self._layout = main_view.work.layout
+            user_files.keep_layout(self._layout, self._memory)
+        title = _window_title(name or self.document.title, self.file_actions.has_unsaved)
         if title != self._title:
             self.window.rename(title)
             self._title = title

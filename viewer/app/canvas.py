@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import moderngl
@@ -11,21 +12,22 @@ import numpy as np
 
 from progdf.errors import ProgdfError
 from progdf.io.picture_camera import camera_chunk
-from viewer.camera.view_camera import ViewCamera, to_camera
+from viewer.camera.view_camera import to_camera
 from viewer.files import exports
 from viewer.gl.present import picture_texture
+from viewer.panel.panel import Pictures
 from viewer.pictures.compare import Comparer, draw_labels
-from viewer.pictures.film import to_pixels
+from viewer.pictures.film import Pixels, to_pixels
 from viewer.render import dynamic_resolution, highlight
 from viewer.render.dynamic_resolution import FrameTimings
 from viewer.render.engine import ViewEngine
 from viewer.render.gl_renderer import Image
-from viewer.state.facts import RecordingFile
+from viewer.state.facts import LayerRow, RecordingFile
 from viewer.state.layers import visible_edits
 from viewer.state.selection import NOBODY
 from viewer.state.snapshots import SliderSnapshot, restore, with_original
 from viewer.state.view_state import Comparison, ViewState
-from viewer.state.workspace import Pointed, original
+from viewer.state.workspace import Pointed, Workspace, original
 from viewer.ui.context import PALETTE
 
 SIZE = (168, 126)
@@ -33,51 +35,28 @@ SIZE = (168, 126)
 
 
 class Thumbnails:
-    """The pictures of the snapshots on show.
+    """Small pictures on show. `ctx`: where textures live"""
 
-    Args:
-        ctx: where textures live
-        engine: draws them; stays the caller's
-    """
+    def __init__(self, ctx: moderngl.Context) -> None:
+        self._ctx = ctx
+        self._made: dict[object, moderngl.Texture] = {}
 
-    def __init__(self, ctx: moderngl.Context, engine: ViewEngine) -> None:
-        self._ctx, self._engine = ctx, engine
-        self._made: dict[tuple[object, ViewCamera], moderngl.Texture] = {}
+    def update(self, draws: Mapping[object, Callable[[], Pixels]]) -> tuple[tuple[int, ...], bool]:
+        """Texture names, 0 where one is not drawn yet, and whether any is missing.
 
-    def update(self, snapshots: Sequence[SliderSnapshot], view: ViewState) -> tuple[tuple[int, ...], bool]:
-        """Texture names of the snapshots, 0 where one is not drawn yet, and whether any is missing.
-
-        One is drawn a call, so that a session of many does not stop the hand.
+        One is drawn a call, so that a session of many does not stop the hand. `draws`: by what decides it
         """
-        keys = [_key(i, snapshot) for i, snapshot in enumerate(snapshots)]
-        for key in [key for key in self._made if key not in keys]:
+        for key in [key for key in self._made if key not in draws]:
             self._made.pop(key).release()
-        for i, key in enumerate(keys):
-            if key not in self._made:
-                self._made[key] = self._draw(i, snapshots[i], view)
-                break
-        missing = any(key not in self._made for key in keys)
-        return tuple(self._made[key].glo if key in self._made else 0 for key in keys), missing
+        missing = [key for key in draws if key not in self._made]
+        for key in missing[:1]:
+            self._made[key] = picture_texture(self._ctx, draws[key]())
+        return tuple(self._made[key].glo if key in self._made else 0 for key in draws), len(missing) > 1
 
     def release(self) -> None:
         for texture in self._made.values():
             texture.release()
         self._made.clear()
-
-    def _draw(self, index: int, snapshot: SliderSnapshot, view: ViewState) -> moderngl.Texture:
-        edited = replace(view, layers=()) if index == 0 else restore(view, snapshot)
-        target = replace(edited, camera=snapshot.camera, compare=Comparison())
-        try:
-            many = len(self._engine.scene) >= dynamic_resolution.MANY
-            pixels = to_pixels(self._engine.image(target, SIZE, pixels=2 if many else 1))
-        except ProgdfError:  # an edit that is not open
-            pixels = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
-        return picture_texture(self._ctx, pixels)
-
-
-def _key(index: int, snapshot: SliderSnapshot) -> tuple[object, ViewCamera]:
-    """What decides the picture; the original has no edit, however its layers are active."""
-    return (snapshot.edit if index else None), snapshot.camera
 
 
 class Canvas:
@@ -98,7 +77,7 @@ class Canvas:
         last: Canvas | None = None,
     ) -> None:
         self.comparer = Comparer(engine, context, recordings)
-        self._thumbnails = Thumbnails(context, engine)
+        self._thumbnails = Thumbnails(context)
         self.timings = FrameTimings()
         """Of the picture on screen."""
         self.pictures_drawn = 0
@@ -208,13 +187,28 @@ class Canvas:
         line = exports.picture(folder, title, pixels, chunk)
         return f"{line}; change it in any program, and drop it here" if to_change else line
 
-    def thumbnails(
-        self, snapshots: tuple[SliderSnapshot, ...], view: ViewState
-    ) -> tuple[tuple[int, ...], bool]:
-        """GL names of the snapshots' pictures, the original's first, and whether one is still to be drawn."""
-        if not snapshots:
-            return (), False
-        return self._thumbnails.update(with_original(snapshots, view), view)
+    def thumbnails(self, work: Workspace, rows: Sequence[LayerRow]) -> tuple[Pictures, bool]:
+        """Of the snapshots, that of the original first, and of the edits; whether one is missing."""
+        snapshots = with_original(work.snapshots, work.view) if work.snapshots else ()
+        draws: dict[object, Callable[[], Pixels]] = {
+            # the original has no edit, however its layers are active
+            (i, snapshot.edit if i else None, snapshot.camera): partial(
+                self._draw_snapshot, i, snapshot, work.view
+            )
+            for i, snapshot in enumerate(snapshots)
+        }
+        draws |= {(i, id(row.thumbnail)): partial(row.thumbnail, work.home) for i, row in enumerate(rows)}
+        names, missing = self._thumbnails.update(draws)
+        return Pictures(names[: len(snapshots)], names[len(snapshots) :]), missing
+
+    def _draw_snapshot(self, index: int, snapshot: SliderSnapshot, view: ViewState) -> Pixels:
+        edited = replace(view, layers=()) if index == 0 else restore(view, snapshot)
+        target, engine = replace(edited, camera=snapshot.camera, compare=Comparison()), self.comparer.engine
+        try:
+            many = len(engine.scene) >= dynamic_resolution.MANY
+            return to_pixels(engine.image(target, SIZE, pixels=2 if many else 1))
+        except ProgdfError:  # an edit that is not open
+            return np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
 
     def release(self) -> None:
         """Give back all but the engine."""

@@ -19,7 +19,7 @@ from progdf.terminal import escape_text
 from viewer.state.workspace import Dialog
 from viewer.ui.context import PALETTE, SMALL_PX, UiContext
 from viewer.ui.overlay import Area
-from viewer.ui.widgets import elide, section, small, tip, wrapped_text
+from viewer.ui.widgets import accent_button, elide, small, tip, wrapped_text
 
 from .studio import pages
 
@@ -30,6 +30,7 @@ TITLES = {
     "save": "Save session",
     "open": "Open",
     "replace": "Replace the layer's edit",
+    "rebind": "Rebind an edit of another scene",
     "leave": "Unsaved changes",
     "overwrite": "File already exists",
     "restore": "Recover unsaved work?",
@@ -47,6 +48,7 @@ _HINTS = {
     "save": "A .session.json file. The scene and its edits stay where they are.",
     "open": "A scene (.ply, .spz, .sog …), an edit (.gdf, .cube), a changed picture, a session or cameras.",
     "replace": "An edit (.gdf, .cube). The layer keeps its position, strength and gains.",
+    "rebind": "The scene that it was made for: the same as the open one, in another file or format.",
     "leave": "Save changes to {}?",
     "overwrite": "{} was not opened in this window. Replacing it cannot be undone.",
     "restore": "The last session was not closed properly. Its unsaved work was saved to {}.",
@@ -64,6 +66,7 @@ _SUBMIT = {
     "save": "Save",
     "open": "Open",
     "replace": "Replace",
+    "rebind": "Rebind",
     "export": "Export",
     "export_page": "Export",
     "render_picture": "Render",
@@ -208,6 +211,8 @@ def _submit(dialog: Dialog, path: str) -> Answer:
         return Answer(replace(dialog, text=path, chosen=""), (f"save_to:{path}",))
     if dialog.kind in _DELIVERS:
         return Answer(replace(dialog, text=path), (f"deliver:{dialog.kind}",))
+    if dialog.kind == "rebind":
+        return Answer(None, (f"rebind_from:{dialog.then}\n{path}",))
     if dialog.kind == "replace":
         return Answer(None, (f"replace_by:{dialog.then}:{path}",))
     return Answer(None, (f"open_file:{path}",))
@@ -254,7 +259,7 @@ def _recent(recent: Sequence[Path], bottom: float, down: bool, ui: UiContext) ->
     """
     if not recent:
         return None
-    section("Recent", ui)
+    small("Recent", PALETTE.dim)
     style = imgui.get_style()
     row = imgui.get_text_line_height_with_spacing()
     below = imgui.get_frame_height() + 3 * style.item_spacing.y + style.window_padding.y
@@ -308,11 +313,8 @@ def _buttons(names: Sequence[str], ui: UiContext) -> str | None:
     for i, name in enumerate(names):
         if i:
             imgui.same_line(0.0, gap)
-        color = PALETTE.field if i else PALETTE.accent_dark
-        imgui.push_style_color(imgui.Col_.button, imgui.ImVec4(*color))
-        if imgui.button(name, imgui.ImVec2(wide, 0.0)):
+        if (imgui.button if i else accent_button)(name, imgui.ImVec2(wide, 0.0)):
             pressed = name
-        imgui.pop_style_color()
     return pressed
 
 
@@ -362,7 +364,7 @@ class Browser:
             return replace(dialog, notice=missing)
         self.close()
         path = Path(dialog.text or near).expanduser().absolute()
-        if dialog.kind in ("open", "replace"):
+        if dialog.kind in ("open", "replace", "rebind"):
             folder = path if path.is_dir() else path.parent
             self._dialog = dialogs.open_file("Open", escape_text(f"{folder}/"), _OPEN)
         else:

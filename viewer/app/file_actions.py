@@ -87,9 +87,7 @@ def keep_camera(app: Application, session: Path | None) -> None:
     beside = session or app.document.path or main_view.pictures / app.document.title
     camera = to_camera(main_view.work.view.camera, *main_view.picture_size)
     path, count = exports.camera(beside, camera, main_view.facts.origin)
-    main_view.show_message(
-        f"Saved as camera {count} in {path.resolve()}; use it with progdf train … --cameras {path.name}"
-    )
+    main_view.show_message(f"Saved as camera {count} in {path.resolve()}")
 
 
 def open_timeline(main_view: MainView, path: Path) -> None:
@@ -298,6 +296,8 @@ class FileActions:
             self._save_to(argument, dialog.then if dialog else "", overwrite=name == "overwrite")
         elif name == "open":
             self._app.main_view.ask(Dialog("open"))
+        elif name == "decal":
+            self._app.main_view.ask(Dialog("open", notice="A picture; it is then laid on a surface by hand"))
         elif name == "browse":
             self._browse()
         elif name == "open_file":
@@ -416,8 +416,8 @@ class FileActions:
     def _open(self, path: Path, kind: str) -> None:
         if self._app.main_view.at_start and kind in ("picture", "cameras", "timeline", "gdf"):
             raise ProgdfError(f"{path.name} belongs to a scene; open that first")
+        main_view = self._app.main_view
         if kind == "picture":
-            main_view = self._app.main_view
             if is_decal(path) and self._app.document.path is not None:
                 main_view.gizmo = Decal.take(main_view.context, path)
                 main_view.wake()
@@ -431,7 +431,14 @@ class FileActions:
             open_timeline(self._app.main_view, path)
             return
         if kind == "gdf":
-            self._edits.add(path)
+            try:
+                self._edits.add(path)
+            except ProgdfError as error:
+                if "made for another scene" not in str(error):
+                    raise
+                line = f"{path.name} was made for another scene"
+                main_view.show_message(line, True, button=("Rebind…", f"rebind:{path}"))
+                return
         elif self.has_unsaved:
             self._app.main_view.ask(self._closing_question(f"open_file:{path}"))
             return
@@ -496,8 +503,8 @@ class FileActions:
         view, total = main_view.work.view, len(opened.original)
         selection = exports.keep_region(view.selection, name, folder, total)
         main_view.change(replace(view, selection=selection))
-        path = selection.regions[-1].path
-        main_view.show_message(f"Saved {path}; train it with --region file:{path.name}")
+        line = f"Region '{selection.regions[-1].name}' saved"
+        main_view.show_message(line, button=("New edit", "new_edit"))
 
     def _rename_region(self, index: str, name: str) -> None:
         view, total = self._app.main_view.work.view, len(self._app.document.original)

@@ -13,9 +13,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from viewer.camera.view_camera import to_camera
-from viewer.ui.context import FIXED, PALETTE, UNFOCUSED
 from viewer.ui.pointer import PointerContext
-from viewer.ui.widgets import accent_button
+from viewer.ui.widgets import accent_button, plate
 
 _OPERATION = im_guizmo.OPERATION
 _HANDLES = _OPERATION(_OPERATION.translate | _OPERATION.rotate | _OPERATION.scaleu)
@@ -88,15 +87,10 @@ def _buttons(gizmo: Gizmo, pointer: PointerContext) -> str:
     """At the top of the picture: what can be done with what was moved."""
     scale = pointer.ui.scale
     at = imgui.ImVec2(pointer.area.width / 2, 14.0 * scale)
-    imgui.set_next_window_pos(at, 0, imgui.ImVec2(0.5, 0.0))
-    imgui.push_style_color(imgui.Col_.window_bg, imgui.ImVec4(*PALETTE.scrim))
-    imgui.begin("placing", None, FIXED | UNFOCUSED | imgui.WindowFlags_.always_auto_resize.value)
-    imgui.align_text_to_frame_padding()
-    imgui.text("Copy" if gizmo.does == "duplicate" else "Move")
-    imgui.same_line()
-    asked = "keep_placed" if accent_button("Keep", imgui.ImVec2(72.0 * scale, 0.0)) else ""
-    imgui.same_line()
-    asked = "put_back" if imgui.button("Cancel", imgui.ImVec2(72.0 * scale, 0.0)) else asked
-    imgui.end()
-    imgui.pop_style_color()
-    return asked
+    with plate("placing", at, pointer.ui, (0.5, 0.0)):
+        imgui.align_text_to_frame_padding()
+        imgui.text("Copy" if gizmo.does == "duplicate" else "Move")
+        imgui.same_line()
+        asked = "keep_placed" if accent_button("Keep", imgui.ImVec2(72.0 * scale, 0.0)) else ""
+        imgui.same_line()
+        return "put_back" if imgui.button("Cancel", imgui.ImVec2(72.0 * scale, 0.0)) else asked

@@ -13,6 +13,7 @@ from viewer.panel import panel, timeline_bar, tools
 from viewer.pictures.compare import Labels
 from viewer.state import history, workspace
 from viewer.state.actions import GLIDES, perform
+from viewer.state.facts import obstacle
 from viewer.state.workspace import PreviewState, Workspace
 from viewer.ui import overlay
 from viewer.ui.context import FIXED, PALETTE, SMALL_PX, UNFOCUSED, UiContext
@@ -120,7 +121,7 @@ def _column(topics: Sequence[Topic], left: float, top: float, ui: UiContext) -> 
 
 def _heading(name: str, ui: UiContext) -> None:
     imgui.push_font(ui.fonts.bold, SMALL_PX)
-    imgui.text_colored(imgui.ImVec4(*PALETTE.accent), name)
+    imgui.text(name)
     imgui.pop_font()
 
 
@@ -138,19 +139,53 @@ def _pack(topics: Sequence[Topic], height: float) -> list[list[Topic]]:
 def panels(
     work: Workspace,
     pointer: PointerContext,
-    textures: Sequence[int],
+    pictures: panel.Pictures,
     preview: PreviewState,
     recent: Sequence[Path],
     reveal: bool,
+    compared: tuple[Labels, bool],
 ) -> Workspace:
-    """The panel and, where it is shown, the timeline. Arguments as of `panel.draw`."""
+    """The panel, the tools and, where it is shown, the timeline. Arguments as of `panel.draw`.
+
+    Args:
+        compared: the words of the comparison on screen, and whether the original is shown
+    """
     actions: list[str] = []
-    work = panel.draw(work, pointer.facts, textures, preview, recent, reveal, pointer.ui, actions)
+    area, ui = pointer.area, pointer.ui
+    work = panel.draw(work, pointer.facts, pictures, preview, recent, reveal, ui, actions)
     work = perform_actions(work, actions, pointer)
     if work.player.shown:
-        requested = timeline_bar.draw(work.view.timeline, work.player, pointer.area, pointer.ui)
+        requested = timeline_bar.draw(work.view.timeline, work.player, area, ui)
         work = perform_actions(work, requested, pointer)
-    return work
+    actions = []
+    above = replace(area, height=area.height - timeline_bar.height(work.player, area, ui))
+    tools.draw_toolbar(work.view, above, ui, actions)
+    work, foot = tools.draw_options(work, above, ui, actions)
+    work = replace(work, view=tools.draw_view(work.view, above, foot, ui, actions))
+    work, asked = draw_pill(work, pointer, compared, foot)
+    return perform_actions(work, [*actions, *asked], pointer)
+
+
+def draw_pill(
+    work: Workspace, pointer: PointerContext, compared: tuple[Labels, bool], foot: float
+) -> tuple[Workspace, list[str]]:
+    """What is compared with what, where there is anything to compare; what was asked for.
+
+    Args:
+        compared: as of `panels`
+        foot: of what lies above it, window pixels
+    """
+    words, original = compared
+    if not (work.view.layers or original or work.view.compare.mode != "off"):
+        return work, []
+    why = {"recorded": obstacle(pointer.facts.recordings)}
+    why["snapshots"] = "" if work.snapshots else "There is no snapshot"
+    scale, wide = pointer.ui.scale, pointer.area.width
+    free = wide - (0.0 if foot else tools.view_width(work.view, pointer.area, pointer.ui))
+    middle = min((wide + tools.TOOLBAR_PX * scale) / 2, free - 85.0 * scale)  # half of what it mostly takes
+    place = imgui.ImVec2(middle, foot + tools.EDGE_PX * scale)
+    work, asked = tools.draw_comparison(work, words, why, original, place, pointer.ui)
+    return work, [asked] * bool(asked)
 
 
 def over_picture(
@@ -178,10 +213,10 @@ def over_picture(
         tools.draw_ring(view, ui)
     overlay.draw_axes(view, area, on_axes or held.drag == overlay.AXES_DRAG, ui)
     select_tool.draw_gesture(held.gesture, view, ui, pointer.left)
-    if original:
-        overlay.banner("Original", area, ui)
-    else:
-        mouse.draw_comparison(view, labels, area, mouse.grips_divider(held, view, pointer), ui)
+    if not original:
+        mouse.draw_comparison(view, area, mouse.grips_divider(held, view, pointer), ui)
+    if not view.panel and (original or view.compare.mode != "off"):
+        work = draw_pill(work, pointer, (labels, original), 0.0)[0]
     if view.overlay:
         overlay.table(figures, ui)
     free = imgui.get_io().display_size
@@ -196,8 +231,9 @@ def over_picture(
         if clicked == "copy":
             imgui.set_clipboard_text(line.details)
             work = workspace.with_message(work, "Copied; paste it into a report of what you did", pointer.now)
-        elif clicked == "close" or pointer.now >= line.until:
+        elif clicked or pointer.now >= line.until:
             work = replace(work, message=None)
+            work = perform_actions(work, [line.button[1]] * (clicked == "do"), pointer)
     if work.help:
         draw_bindings(free, ui)
     return work

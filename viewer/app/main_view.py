@@ -182,7 +182,7 @@ class MainView:
 
     def restart(self, view: ViewState, snapshots: tuple[SliderSnapshot, ...] = ()) -> None:
         """A new state and snapshots, with nothing to undo, nothing in the hand or over the picture."""
-        self.work = workspace.new_workspace(view, snapshots)
+        self.work = replace(workspace.new_workspace(view, snapshots), layout=self.work.layout)
         self._tool, self._taps = MouseTool(), Taps()
         self.cover, self.up_strip, self.preview, self.gizmo = None, None, PreviewState(), None
         self.wake()
@@ -207,9 +207,11 @@ class MainView:
         where the processor draws the window too, that takes the time from it."""
         return self.next_frame_delay() == 0.0 or not self.canvas.awaits_picture()
 
-    def show_message(self, text: str, error: bool = False, details: str = "") -> None:
-        """Show one line at the bottom of the picture for a while."""
-        self.work = workspace.with_message(self.work, text, self._clock, error, details)
+    def show_message(
+        self, text: str, error: bool = False, details: str = "", button: tuple[str, str] = ("", "")
+    ) -> None:
+        """Show one line at the bottom of the picture for a while, with a button: its name and its action."""
+        self.work = workspace.with_message(self.work, text, self._clock, error, details, button=button)
         self.wake()
 
     def draw_splash(self, screen: moderngl.Framebuffer) -> None:
@@ -311,7 +313,7 @@ class MainView:
     def _area(self) -> overlay.Area:
         """The part of the window that shows the picture."""
         display = imgui.get_io().display_size
-        wide = panel.width(self.ui) if self.work.view.panel and not self.at_start else 0.0
+        wide = panel.width(self.work.layout, self.ui) if self.work.view.panel and not self.at_start else 0.0
         return overlay.Area(max(display.x - wide, 1.0), max(display.y, 1.0))
 
     def _handle_input(self, seconds: float) -> None:
@@ -350,11 +352,12 @@ class MainView:
             several = len(layer_selection.selected_layers(self.work)) > 1
             reveal = self._revealed != (self.work.focus, several)
             with self._guard():
-                textures, missing = self.canvas.thumbnails(self.work.snapshots, self.work.view)
+                pictures, missing = self.canvas.thumbnails(self.work, self.facts.rows)
                 if missing:
                     self.wake()
+                compared = self.canvas.comparer.labels(self.work.view), self._shows_original
                 self.work = interface.panels(
-                    self.work, self._pointer(), textures, self.preview, self.recent, reveal
+                    self.work, self._pointer(), pictures, self.preview, self.recent, reveal, compared
                 )
             self._revealed = self.work.focus, several
         held = self._tool.drag is None and self._move_gizmo()

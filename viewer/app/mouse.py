@@ -10,7 +10,6 @@ from viewer.camera import controls
 from viewer.camera.view_camera import ViewCamera
 from viewer.camera.views import AXES, look_at_view
 from viewer.panel import tools
-from viewer.pictures.compare import Labels
 from viewer.render.picking import layer_at, seen_at, surface_point
 from viewer.state import paint, workspace
 from viewer.state.layers import with_paint
@@ -18,7 +17,7 @@ from viewer.state.paint import Stroke
 from viewer.state.view_state import Brush, SelectTool, ViewState
 from viewer.state.workspace import Workspace
 from viewer.ui import overlay
-from viewer.ui.context import PALETTE, SMALL_PX, UiContext, u32
+from viewer.ui.context import PALETTE, UiContext, u32
 from viewer.ui.keys import any_button_down, modifier, started_drag
 from viewer.ui.overlay import Area
 from viewer.ui.pointer import PointerContext
@@ -55,35 +54,22 @@ def show_grip() -> None:
     imgui.set_mouse_cursor(imgui.MouseCursor_.resize_ew.value)
 
 
-def draw_comparison(view: ViewState, labels: Labels, area: Area, held: bool, ui: UiContext) -> None:
-    """Divider and labels, or the line over a difference; and why it is not what was asked for.
-
-    Args:
-        labels: the words
-        held: the mouse holds the divider, or is over it
-    """
-    if view.compare.mode == "difference":
-        overlay.banner(labels.line, area, ui)
+def draw_comparison(view: ViewState, area: Area, held: bool, ui: UiContext) -> None:
+    """The divider; `held`: the mouse holds it, or is over it."""
     if view.compare.mode == "split":
-        _divider(view.compare.divider, labels, area, held, ui)
+        _divider(view.compare.divider, area, held, ui)
         _knob(round(view.compare.divider * area.width), area.height / 2, held, ui)
     if view.compare.mode == "beside":
-        _divider(0.5, labels, area, False, ui)
-    if view.compare.mode != "off" and labels.notice:
-        overlay.banner(labels.notice, area, ui, row=1)
+        _divider(0.5, area, False, ui)
 
 
-def _divider(share: float, labels: Labels, area: Area, held: bool, ui: UiContext) -> None:
+def _divider(share: float, area: Area, held: bool, ui: UiContext) -> None:
     x = round(share * area.width)
     canvas = imgui.get_background_draw_list()
-    canvas.push_clip_rect(imgui.ImVec2(0.0, 0.0), imgui.ImVec2(area.width, area.height), False)
     ink = u32(PALETTE.accent if held else PALETTE.handle)
     top, bottom = imgui.ImVec2(x, 0.0), imgui.ImVec2(x, area.height)
     canvas.add_line(top, bottom, u32(PALETTE.scrim), 3.0 * ui.scale)
     canvas.add_line(top, bottom, ink, 1.5 * ui.scale)
-    _tag(canvas, x, labels.left, True, ui)
-    _tag(canvas, x, labels.right, False, ui)
-    canvas.pop_clip_rect()
 
 
 def _knob(x: float, y: float, held: bool, ui: UiContext) -> None:
@@ -99,24 +85,6 @@ def _knob(x: float, y: float, held: bool, ui: UiContext) -> None:
             imgui.ImVec2(x + way * 3.0 * s, y + way * 4.0 * s),
             ink,
         )
-
-
-def _tag(canvas: imgui.ImDrawList, x: float, text: str, left: bool, ui: UiContext) -> None:
-    s = ui.scale
-    imgui.push_font(ui.fonts.regular, SMALL_PX)
-    wide = imgui.calc_text_size(text).x
-    imgui.pop_font()
-    pad, gap, size = 8.0 * s, 10.0 * s, SMALL_PX * s
-    start = x - gap - wide - 2 * pad if left else x + gap
-    corner = imgui.ImVec2(start, 14.0 * s)
-    canvas.add_rect_filled(
-        corner,
-        imgui.ImVec2(start + wide + 2 * pad, 14.0 * s + size + pad),
-        u32(PALETTE.scrim),
-        5.0 * s,
-    )
-    at = imgui.ImVec2(round(start + pad), round(14.0 * s + pad / 2))
-    canvas.add_text(ui.fonts.regular, size, at, u32(PALETTE.text), text)
 
 
 CLICK_PX = 3.0  # a press that moves no further, at 1×, is a click

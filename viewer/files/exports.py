@@ -71,7 +71,7 @@ def timeline(folder: Path, title: str, view: ViewState, origin: Origin = ZERO) -
     with _writable(folder, "timeline"):
         path = free_path(folder, f"{Path(title).stem}_timeline", ".json")
         timeline_file.save(path, view.timeline, view.layers, origin)
-        return f"Saved {path.resolve()}; render it with progdf render … --timeline {path.name}"
+        return f"Saved {path.resolve()}"
 
 
 def camera(source: Path, viewpoint: Camera, origin: Origin = ZERO) -> tuple[Path, int]:

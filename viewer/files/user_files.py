@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import json
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,6 +16,8 @@ from PIL import Image
 from progdf.errors import ProgdfError
 from progdf.io.atomic import atomic_write, state_folder
 from progdf.io.images import flatten_onto, open_picture
+from progdf.io.json_values import plain, read_json
+from viewer.state.workspace import Layout
 
 from .session import session_of
 
@@ -50,6 +53,23 @@ def remember_recent(paths: Sequence[Path], folder: Path | None = None) -> tuple[
         with atomic_write(folder / "recent.txt") as temporary_file:
             temporary_file.write_text(lines, encoding="utf-8", errors="surrogateescape")
     return files
+
+
+def read_layout(folder: Path | None = None) -> Layout:
+    """How the window was laid out last; as at first where nothing can be read."""
+    try:
+        return read_json((folder or state_folder()) / "layout.json", Layout)
+    except ProgdfError:
+        return Layout()
+
+
+def keep_layout(layout: Layout, folder: Path | None = None) -> None:
+    """Remember it; what cannot be written is not remembered."""
+    folder = folder or state_folder()
+    with contextlib.suppress(OSError):
+        folder.mkdir(parents=True, exist_ok=True)
+        with atomic_write(folder / "layout.json") as temporary_file:
+            temporary_file.write_text(json.dumps(plain(layout)), encoding="utf-8")
 
 
 def keep_thumbnail(path: Path, pixels: NDArray[np.uint8], folder: Path | None = None) -> None:

@@ -206,7 +206,7 @@ def missing_package(choice: EditorChoice) -> str:
     """How to install what an editor needs; "" where it is there."""
     if not choice.package or find_spec(choice.package) is not None:
         return ""
-    return f"{choice.title} needs more: pip install progdf-studio[{choice.extra}]"
+    return f"{choice.title} needs the extra '{choice.extra}' of ProGDF Studio, which is not installed"
 
 
 def hex_color(color: Sequence[float]) -> str:

@@ -14,7 +14,6 @@ from viewer.state.layers import (
     largest_strength,
     rename_layer,
     slider_value,
-    toggle_details,
     toggle_solo,
     with_slider_value,
 )
@@ -23,20 +22,21 @@ from viewer.state.workspace import Workspace, is_compact
 from viewer.ui.context import PALETTE, SMALL_PX, Icon, Rgba, UiContext, u32
 from viewer.ui.keys import shortcut
 from viewer.ui.widgets import (
+    card,
     elide,
     grip,
     group_digits,
     icon_button,
     label,
     menu,
+    picture,
     right_edge,
-    small,
-    small_toggle,
     swatch,
     tip,
     typed_name,
     value_slider,
     with_added,
+    wrapped_text,
 )
 
 from . import slider
@@ -129,8 +129,8 @@ def _curve(row: LayerRow, strength: float, most: float, ui: UiContext) -> None:
     canvas.add_text(ui.fonts.regular, SMALL_PX * scale, corner, u32(p.dim), f"change {100 * share:.0f} %")
 
 
-TOGGLE_PX = 24.0
-CARD_PX = 97.0  # a whole card with what is between two, at 1×
+TOGGLE_PX, THUMBNAIL_PX = 20.0, 24.0
+CARD_PX = 66.0  # a whole card with what is between two, at 1×
 COMPACT_PX, SLIDER_PX, SLIM_PX = 7.0, 92.0, 16.0  # a compact row: its padding, its slider's width and height
 _MENU = "menu of a layer"
 _MENU_ITEMS = (
@@ -163,15 +163,22 @@ class CardTouch:
 
 
 def draw_card(
-    work: Workspace, index: int, active: bool, rows: Sequence[LayerRow], ui: UiContext, actions: list[str]
+    work: Workspace,
+    index: int,
+    active: bool,
+    rows: Sequence[LayerRow],
+    texture: int,
+    ui: UiContext,
+    actions: list[str],
 ) -> tuple[Workspace, CardTouch]:
-    """One card: eye, swatch, name and value; the slider; count and toggles; unfolded, curve and gains.
+    """One card: eye, thumbnail, name and value, under the mouse toggles; the slider; unfolded, the details.
 
     Where cards are compact, a row with the eye, the swatch, the name, a short slider and the value.
 
     Args:
         active: the layer takes part in the picture
         rows: one per .gdf, indexed by `LayerState.gdf`
+        texture: GL name of the edit's thumbnail, 0 before it is drawn
     """
     scale, p, compact = ui.scale, PALETTE, is_compact(work)
     layer, focused = work.view.layers[index], work.focus == index
@@ -180,67 +187,59 @@ def draw_card(
     imgui.push_id(index)
     canvas = imgui.get_window_draw_list()
     clip = canvas.get_clip_rect_min(), canvas.get_clip_rect_max()
-    _begin_card(selected, compact, scale)
-    right = right_edge()
-    work, touch = _head(work, index, row, active, ui)
-    number_at, layer = imgui.get_item_rect_min(), work.view.layers[index]
-    if compact:
-        imgui.same_line(right - SLIDER_PX * scale - _number_width(layer, compact) - 6.0 * scale)
-        imgui.set_cursor_pos_y(imgui.get_cursor_pos_y() + (imgui.get_frame_height() - SLIM_PX * scale) / 2)
-    imgui.begin_disabled(layer.locked)
-    strength = slider.draw(
-        "##strength",
-        layer.strength,
-        row.recorded,
-        SLIDER_PX * scale if compact else imgui.get_content_region_avail().x,
-        scale,
-        fill=p.accent if selected else p.accent_dark,
-        active=active,
-        most=most,
-        height=SLIM_PX if compact else slider.HEIGHT_PX,
-    )
-    touched = touch.touched or imgui.is_item_active()
-    imgui.end_disabled()
-    _number(number_at, strength, active, compact)
-    if strength != layer.strength:  # a new state takes its time, and most cards rest
-        work = _change_layer(work, index, lambda old: replace(old, strength=strength))
-    if not compact:
-        work = _foot(work, index, row, ui)
-    if layer.gdf in work.view.unfolded:
-        active_slider = work.active_slider if focused else None
-        unfolded = draw_details(work.view.layers[index], row, active_slider, most, ui)
-        work = _change_layer(work, index, lambda _: unfolded)
+    color, padding = p.card_focused if selected else p.card, (COMPACT_PX, 0.0) if compact else (10.0, 6.0)
+    with card("card", color, ui, padding=padding):
+        right = right_edge()
+        work, touch = _head(work, index, row, active, texture, ui, actions)
+        number_at, layer = imgui.get_item_rect_min(), work.view.layers[index]
         if compact:
-            imgui.dummy(imgui.ImVec2(0.0, 2.0 * scale))
-    over = imgui.is_window_hovered(imgui.HoveredFlags_.allow_when_blocked_by_active_item.value)
-    press = _press(touch.named) if over and imgui.is_mouse_clicked(imgui.MouseButton_.left.value) else ""
-    several, alone = len(work.selected) if selected else 0, imgui.get_id("alone")
-    if press:  # one of several may be dragged with the others: a click makes it the only one as it ends
-        imgui.get_state_storage().set_bool(alone, press == "one" and several > 1)
-        press = "keep" if press == "one" and several > 1 else press
-    if touch.drag == "clicked" and imgui.get_state_storage().get_bool(alone):
-        press = "one"
-    down = imgui.is_mouse_down(imgui.MouseButton_.left.value)  # then the right button cancels its drag
-    if over and not down and imgui.is_mouse_clicked(imgui.MouseButton_.right.value):
-        press = "keep"
-        imgui.open_popup(_MENU)
-    _menu(work.view, index, several, ui, actions)
-    if selected:
-        _focus_bar(clip, p.accent if focused else p.accent_dark, scale)
-    imgui.end_child()
-    imgui.pop_style_color()
+            imgui.same_line(right - SLIDER_PX * scale - _number_width(layer, compact) - 6.0 * scale)
+            imgui.set_cursor_pos_y(
+                imgui.get_cursor_pos_y() + (imgui.get_frame_height() - SLIM_PX * scale) / 2
+            )
+        else:
+            imgui.set_cursor_pos_y(imgui.get_cursor_pos_y() - 3.0 * scale)
+        imgui.begin_disabled(layer.locked)
+        strength = slider.draw(
+            "##strength",
+            layer.strength,
+            row.recorded,
+            SLIDER_PX * scale if compact else imgui.get_content_region_avail().x,
+            scale,
+            fill=p.accent if selected else p.faint,
+            active=active,
+            most=most,
+            height=SLIM_PX if compact else slider.HEIGHT_PX,
+        )
+        touched = touch.touched or imgui.is_item_active()
+        imgui.end_disabled()
+        _number(number_at, strength, active, compact)
+        if strength != layer.strength:  # a new state takes its time, and most cards rest
+            work = _change_layer(work, index, lambda old: replace(old, strength=strength))
+        if layer.gdf in work.view.unfolded:
+            work = _about(work, index, row, ui)
+            active_slider = work.active_slider if focused else None
+            unfolded = draw_details(work.view.layers[index], row, active_slider, most, ui)
+            work = _change_layer(work, index, lambda _: unfolded)
+            if compact:
+                imgui.dummy(imgui.ImVec2(0.0, 2.0 * scale))
+        over = imgui.is_window_hovered(imgui.HoveredFlags_.allow_when_blocked_by_active_item.value)
+        press = _press(touch.named) if over and imgui.is_mouse_clicked(imgui.MouseButton_.left.value) else ""
+        several, alone = len(work.selected) if selected else 0, imgui.get_id("alone")
+        if press:  # one of several may be dragged with the others: a click makes it the only one as it ends
+            imgui.get_state_storage().set_bool(alone, press == "one" and several > 1)
+            press = "keep" if press == "one" and several > 1 else press
+        if touch.drag == "clicked" and imgui.get_state_storage().get_bool(alone):
+            press = "one"
+        down = imgui.is_mouse_down(imgui.MouseButton_.left.value)  # then the right button cancels its drag
+        if over and not down and imgui.is_mouse_clicked(imgui.MouseButton_.right.value):
+            press = "keep"
+            imgui.open_popup(_MENU)
+        _menu(work.view, index, several, ui, actions)
+        if selected:
+            _focus_bar(clip, p.accent if focused else p.faint, scale)
     imgui.pop_id()
     return work, replace(touch, touched=touched or bool(press), press=press)
-
-
-def _begin_card(selected: bool, compact: bool, scale: float) -> None:
-    color = PALETTE.card_focused if selected else PALETTE.card
-    imgui.push_style_color(imgui.Col_.child_bg, imgui.ImVec4(*color))
-    padding = (COMPACT_PX, 0.0) if compact else (10.0, 8.0)
-    imgui.push_style_var(imgui.StyleVar_.window_padding, imgui.ImVec2(*(side * scale for side in padding)))
-    flags = imgui.ChildFlags_.auto_resize_y.value | imgui.ChildFlags_.always_use_window_padding.value
-    imgui.begin_child("card", imgui.ImVec2(0.0, 0.0), flags, imgui.WindowFlags_.no_nav.value)
-    imgui.pop_style_var()  # here, as tips and menus have paddings of their own
 
 
 def _change_layer(work: Workspace, index: int, change: Callable[[LayerState], LayerState]) -> Workspace:
@@ -300,11 +299,12 @@ def _focus_bar(clip: tuple[imgui.ImVec2, imgui.ImVec2], color: Rgba, scale: floa
 
 
 def _head(
-    work: Workspace, index: int, row: LayerRow, active: bool, ui: UiContext
+    work: Workspace, index: int, row: LayerRow, active: bool, texture: int, ui: UiContext, actions: list[str]
 ) -> tuple[Workspace, CardTouch]:
-    """Eye, swatch, name, and last the place of the number, which is drawn when the slider has its value."""
+    """Eye, thumbnail, name, toggles, and last the place of the number, which is drawn when the slider has its
+    value."""
     scale, compact, layer = ui.scale, is_compact(work), work.view.layers[index]
-    right, gap = right_edge(), 4.0 * scale if compact else imgui.get_style().item_spacing.x
+    right, gap = right_edge(), 4.0 * scale
     if icon_button("eye", Icon.SHOWN if layer.enabled else Icon.HIDDEN, ui, dim=not active):
         if imgui.get_io().key_alt:
             work = replace(work, view=toggle_solo(work.view, index))
@@ -312,18 +312,103 @@ def _head(
             work = _change_layer(work, index, lambda old: replace(old, enabled=not old.enabled))
     tip(f"Show or hide ({shortcut('hide')}). Alt+click: solo")
     imgui.same_line(0.0, gap)
-    swatch(row.swatch, 1.0 if active else 0.35, True, ui)
-    imgui.same_line(0.0, gap)
+    if compact:
+        swatch(row.swatch, 1.0 if active else 0.35, True, ui)
+    else:
+        work = _thumbnail(work, index, row, texture, active, ui)
+    imgui.same_line(0.0, 2 * gap)
     number_width = _number_width(layer, compact)
-    room = right - number_width - 10 * scale - imgui.get_cursor_pos_x()
-    room -= SLIDER_PX * scale if compact else 0.0
-    work, touch = _name(work, index, room, active, ui)
+    end = right - number_width - 6.0 * scale
+    over = imgui.is_window_hovered(imgui.HoveredFlags_.allow_when_blocked_by_active_item.value)
+    toggles = 0 if compact else 5 if over else 2 if layer.locked else int(layer.solo)
+    taken = SLIDER_PX * scale if compact else toggles * TOGGLE_PX * scale
+    work, touch = _name(work, index, end - taken - 4.0 * scale - imgui.get_cursor_pos_x(), active, ui)
+    if toggles:
+        imgui.same_line(end - taken)
+        _toggles(work, index, over, ui, actions)
     imgui.same_line(right - number_width)
     imgui.dummy(imgui.ImVec2(number_width, imgui.get_frame_height()))
     if imgui.is_item_clicked() and not layer.locked:
         slider.start_typing("##strength")
     tip(*("Locked", "lock") if layer.locked else ("Click to type a value",))
     return work, touch
+
+
+def _toggles(work: Workspace, index: int, over: bool, ui: UiContext, actions: list[str]) -> None:
+    """Menu, brush, details, lock and solo; of the last two what is on, where the mouse is elsewhere."""
+    view, layer, side = work.view, work.view.layers[index], TOGGLE_PX * ui.scale
+    lock = Icon.LOCKED if layer.locked else Icon.UNLOCKED
+    painting, unfolded = view.brush.active and work.focus == index, layer.gdf in view.unfolded
+    buttons = (
+        ("menu", Icon.MENU, False, "Rename, duplicate, replace or delete (right-click)"),
+        ("brush", Icon.BRUSH, painting, "Paint its strength"),
+        ("fold", Icon.GAINS, unfolded, "What it is, gains, and the curve of visible change"),
+        ("lock", lock, layer.locked, "Lock strength, gains and paint"),
+        ("solo", Icon.SOLO, layer.solo, "Solo: show only soloed layers"),
+    )
+    top = imgui.get_cursor_pos_y() + (imgui.get_frame_height() - side) / 2
+    imgui.push_font(None, SMALL_PX)
+    pressed = []
+    for action, icon, on, help_ in buttons if over else buttons[3 if layer.locked else 4 :]:
+        imgui.set_cursor_pos_y(top)
+        if not over and not on:
+            continue
+        pressed += [action] * icon_button(action, icon, ui, dim=not on, side=side)
+        tip(help_, action)
+        imgui.same_line(0.0, 0.0)
+    imgui.pop_font()
+    if "menu" in pressed:
+        imgui.open_popup(_MENU)
+    else:
+        actions += pressed  # of the focused layer, which this one has become
+
+
+def _thumbnail(
+    work: Workspace, index: int, row: LayerRow, texture: int, active: bool, ui: UiContext
+) -> Workspace:
+    """The edit by itself, rendered; the mouse on it tells what it is, and shows what it shares."""
+    side, (x, y) = THUMBNAIL_PX * ui.scale, imgui.get_cursor_screen_pos()
+    imgui.dummy(imgui.ImVec2(side, side))
+    picture(
+        texture, imgui.ImVec2(x, y), imgui.ImVec2(x + side, y + side), 3.0 * ui.scale, 1.0 if active else 0.4
+    )
+    return _tell(work, index, row)
+
+
+def _tell(work: Workspace, index: int, row: LayerRow) -> Workspace:
+    """The details as the tip of the last item, which shows in the picture what is shared with others."""
+    if imgui.is_item_hovered(imgui.HoveredFlags_.for_tooltip.value) and _overlaps(work, index, row):
+        work = replace(work, overlap=index)
+    tip(_details(work, index, row))
+    return work
+
+
+def _overlaps(work: Workspace, index: int, row: LayerRow) -> list[tuple[str, int]]:
+    """With which layers it shares how many splats."""
+    others = [(layer.name, layer.gdf) for i, layer in enumerate(work.view.layers) if i != index]
+    shared = [(name, row.shared[gdf]) for name, gdf in others if gdf < len(row.shared)]
+    return [(name, count) for name, count in shared if count]
+
+
+def _details(work: Workspace, index: int, row: LayerRow) -> str:
+    """What the layer is, a line each: its size, what was asked for, what it shares."""
+    about = f"{'Draft  ·  ' * row.draft}{with_added(row.count, row.added)} splats"
+    kind, _, rest = row.instruction.partition(":")
+    about += f"  ·  {kind.capitalize()} {rest}" if kind else ""
+    shares = (
+        f"Shares {'all' if count == row.count else group_digits(count)} with {name}"
+        for name, count in _overlaps(work, index, row)
+    )
+    return "\n".join((about, *shares))
+
+
+def _about(work: Workspace, index: int, row: LayerRow, ui: UiContext) -> Workspace:
+    """The details in small text, and the mean color of the edit."""
+    swatch(row.swatch, 1.0, True, ui)
+    imgui.same_line()
+    imgui.set_cursor_pos_y(imgui.get_cursor_pos_y() + 5.0 * ui.scale)
+    wrapped_text(_details(work, index, row), PALETTE.dim)
+    return _tell(work, index, row)
 
 
 def _digits(strength: float, compact: bool) -> str:
@@ -357,7 +442,7 @@ def _name(
     gesture, named = grip(ui), imgui.is_item_active()
     at = imgui.ImVec2(x, y + imgui.get_style().frame_padding.y)
     color, compact = PALETTE.text if active else PALETTE.dim, is_compact(work)
-    marks = f"{Icon.LOCKED} " * (layer.locked and compact) + "S " * (layer.solo and compact)
+    marks = f"{Icon.LOCKED} " * (layer.locked and compact) + f"{Icon.SOLO} " * (layer.solo and compact)
     imgui.get_window_draw_list().add_text(at, u32(color), elide(marks + layer.name, room))
     if imgui.is_item_hovered(imgui.HoveredFlags_.for_tooltip.value):
         work = replace(work, pointed=("layer", index))  # the picture shows its region
@@ -366,47 +451,3 @@ def _name(
     if imgui.is_item_hovered() and double:
         return replace(work, renaming=index), CardTouch(touched=True, named=named)
     return work, CardTouch(drag=gesture, named=named)
-
-
-def _foot(work: Workspace, index: int, row: LayerRow, ui: UiContext) -> Workspace:
-    """Count, overlap and instruction; at the right alone, lock, the fold and the menu."""
-    layer, wide = work.view.layers[index], TOGGLE_PX * ui.scale
-    right, left = right_edge(), imgui.get_cursor_pos_x()
-    overlaps = [
-        (other.name, row.shared[other.gdf])
-        for i, other in enumerate(work.view.layers)
-        if i != index and other.gdf < len(row.shared) and row.shared[other.gdf]
-    ]
-    size = f"{with_added(row.count, row.added)} splats"
-    note = f"{'Draft  ·  ' * row.draft}{size}"
-    if len(overlaps) == 1:
-        name, count = overlaps[0]
-        note += f"  ·  {'all' if count == row.count else group_digits(count)} in {name}"
-    elif overlaps:
-        note += f"  ·  overlaps {len(overlaps)} layers"
-    elif row.instruction:
-        note += f"  ·  {row.instruction}"
-    small(note, PALETTE.dim, right - left - 4 * wide - 6.0 * ui.scale)
-    if overlaps and imgui.is_item_hovered(imgui.HoveredFlags_.for_tooltip.value):
-        work = replace(work, overlap=index)
-    shared = [f"{group_digits(count)} of its splats are also in {name}" for name, count in overlaps]
-    shared += ["Highlighted in pink"] if overlaps else []
-    tip("\n".join((size, *filter(None, [row.instruction]), *shared)))
-    view = work.view
-    imgui.same_line(right - 4 * wide)
-    if small_toggle("solo", "S", layer.solo, wide, ui):
-        view = toggle_solo(view, index)
-    tip("Solo: show only soloed layers", "solo")
-    imgui.same_line(right - 3 * wide)
-    if small_toggle("lock", Icon.LOCKED if layer.locked else Icon.UNLOCKED, layer.locked, wide, ui):
-        view = change_layer(view, index, lambda old: replace(old, locked=not old.locked))
-    tip("Lock strength, gains and paint", "lock")
-    imgui.same_line(right - 2 * wide)
-    if small_toggle("fold", Icon.GAINS, layer.gdf in view.unfolded, wide, ui):
-        view = toggle_details(view, index)
-    tip("Show gains and the curve of visible change", "fold")
-    imgui.same_line(right - wide)
-    if small_toggle("menu", Icon.MENU, False, wide, ui):
-        imgui.open_popup(_MENU)
-    tip("Rename, duplicate, replace or delete (right-click)")
-    return work if view is work.view else replace(work, view=view)

@@ -24,11 +24,13 @@ from viewer.state.workspace import Workspace, is_compact
 from viewer.ui.context import PALETTE, SMALL_PX, Icon, UiContext, u32
 from viewer.ui.keys import shortcut
 from viewer.ui.widgets import (
-    drop_down,
+    accent_button,
     elide,
     grip,
     icon_button,
     menu,
+    menu_items,
+    more_button,
     right_edge,
     section,
     small,
@@ -50,14 +52,12 @@ _BUTTONS = (
 )
 
 
-def draw_search(work: Workspace, ui: UiContext, actions: list[str]) -> str:
-    """The field of the search and the switch of compact rows, where there are many layers; what is typed."""
+def draw_search(work: Workspace, ui: UiContext) -> str:
+    """The field of the search, where there are many layers; what is typed."""
     if not (len(work.view.layers) > UNSEARCHED or work.searching or work.search):
         return work.search
-    compact = is_compact(work)
     side, gap = imgui.get_frame_height(), 4.0 * ui.scale
-    buttons = 1 + bool(work.search)
-    imgui.set_next_item_width(imgui.get_content_region_avail().x - buttons * (side + gap))
+    imgui.set_next_item_width(imgui.get_content_region_avail().x - bool(work.search) * (side + gap))
     if work.searching:
         imgui.set_keyboard_focus_here()
     flags = imgui.InputTextFlags_.escape_clears_all.value | imgui.InputTextFlags_.auto_select_all.value
@@ -68,10 +68,6 @@ def draw_search(work: Workspace, ui: UiContext, actions: list[str]) -> str:
         if icon_button("clear", Icon.CLOSE, ui):
             text = ""
         tip("Show all layers")
-    imgui.same_line(0.0, gap)
-    if icon_button("cards", Icon.FULL if compact else Icon.COMPACT, ui, dim=False):
-        actions.append("cards")
-    tip("Whole cards" if compact else "Compact rows", "cards")
     return str(text)
 
 
@@ -90,18 +86,11 @@ def draw_selection(state: ViewState, chosen: Sequence[int], ui: UiContext, actio
     imgui.separator()
     right = right_edge()
     imgui.push_style_var(imgui.StyleVar_.frame_padding, imgui.ImVec2(6.0 * ui.scale, 3.0 * ui.scale))
-    section(f"{len(chosen)} layers", ui)
-    imgui.push_font(None, SMALL_PX)
-    gap = 4.0 * ui.scale
-    wide = [imgui.calc_text_size(name).x + 12.0 * ui.scale for name, _, _ in _BUTTONS]
-    imgui.same_line(right - sum(wide) - gap * (len(wide) - 1))
-    for i, (name, action, help_) in enumerate(_BUTTONS):
-        if i:
-            imgui.same_line(0.0, gap)
-        if imgui.button(f"{name}##layers", imgui.ImVec2(wide[i], 0.0)):
-            actions.append(action)
-        tip(help_, action)
-    imgui.pop_font()
+    imgui.align_text_to_frame_padding()
+    small(f"{len(chosen)} layers", PALETTE.dim)
+    imgui.same_line(right - imgui.get_frame_height())
+    more_button("of layers", _BUTTONS, ui, actions)
+    tip("Group, copy, paste, reset")
     imgui.pop_style_var()
     value, most = master_strength(state, chosen), largest_strength(state)
     number = imgui.calc_text_size(f"{value:.3f}").x
@@ -120,7 +109,7 @@ def draw_selection(state: ViewState, chosen: Sequence[int], ui: UiContext, actio
 
 
 _MENU = "menu of a group"
-_ITEMS = (("Rename…", ""), ("Select layers", ""), ("Ungroup", "ungroup"))
+_ITEMS = (("Rename…", "", ""), ("Select layers", "select_layers", ""), ("Ungroup", "ungroup", ""))
 
 
 def draw_group(
@@ -134,7 +123,8 @@ def draw_group(
     imgui.push_id(f"group {group.name}")
     imgui.begin_group()
     right = right_edge() - COMPACT_PX * scale
-    if _fold(folded, ui):
+    arrow = Icon.FOLDED if folded else Icon.UNFOLDED
+    if icon_button("fold", arrow, ui, side=imgui.get_frame_height()):
         state = toggle_collapsed(state, group.name)
     tip("List its layers, or not")
     imgui.same_line(0.0, 0.0)
@@ -156,7 +146,7 @@ def draw_group(
         (),
         SLIDER_PX * scale,
         scale,
-        PALETTE.accent_dark,
+        PALETTE.faint,
         group.enabled,
         height=SLIM_PX,
         default=LayerGroup.strength,
@@ -170,19 +160,6 @@ def draw_group(
     if strength == group.strength:
         return state, gesture
     return change_group(state, group.name, lambda old: replace(old, strength=strength)), gesture
-
-
-def _fold(folded: bool, ui: UiContext) -> bool:
-    """The arrow at the left; True when it was pressed."""
-    wide, tall = 16.0 * ui.scale, imgui.get_frame_height()
-    x, y = imgui.get_cursor_screen_pos()
-    pressed = imgui.invisible_button("fold", imgui.ImVec2(wide, tall))
-    arrow = Icon.FOLDED if folded else Icon.UNFOLDED
-    size = imgui.calc_text_size(arrow)
-    at = imgui.ImVec2(round(x + (wide - size.x) / 2), round(y + (tall - size.y) / 2))
-    color = PALETTE.text if imgui.is_item_hovered() else PALETTE.dim
-    imgui.get_window_draw_list().add_text(at, u32(color), arrow)
-    return bool(pressed)
 
 
 def _group_name(
@@ -214,14 +191,9 @@ def _group_name(
     color = PALETTE.handle if hovered else PALETTE.text if group.enabled else PALETTE.dim
     imgui.get_window_draw_list().add_text(corner, u32(color), elide(group.name, room))
     imgui.pop_font()
-    with menu(_MENU, ui) as is_open:
-        chosen = [
-            name for name, action in _ITEMS if is_open and imgui.menu_item(name, shortcut(action), False)[0]
-        ]
-    if chosen == ["Rename…"]:
-        storage.set_bool(naming, True)
-    elif chosen:
-        actions.append(f"{'ungroup' if chosen == ['Ungroup'] else 'select_layers'}:{group.name}")
+    for action in menu_items(_MENU, _ITEMS, ui):
+        storage.set_bool(naming, not action)
+        actions += [f"{action}:{group.name}"] if action else []
     return corner, gesture
 
 
@@ -248,63 +220,57 @@ class _Row:
     heads: bool = False  # it is the row over a group
 
 
-def heading(state: ViewState, form_open: bool, ui: UiContext, actions: list[str]) -> ViewState:
-    """The heading of the stack: a new edit, overshoot, and the blend rule where layers can overlap."""
+def draw_heading(work: Workspace, ui: UiContext, actions: list[str]) -> Workspace:
+    """The heading of the stack: a new edit, and the menu of what is about all layers."""
     right = right_edge()
-    section("Edits", ui)
-    imgui.same_line(0.0, 8.0 * ui.scale)
-    _new_button(form_open, actions)
-    if not state.layers:
-        return state
-    combo = 118.0 * ui.scale if len(state.layers) > 1 else 0.0
-    wide = 40.0 * ui.scale
-    imgui.same_line(right - combo - wide - (6.0 * ui.scale if combo else 0.0))
-    state = _overshoot(state, wide)
-    if not combo:
-        return state
-    imgui.same_line(right - combo)
-    imgui.set_next_item_width(combo)
-    titles, now = [BLEND_TITLES[blend] for blend in BLENDS], BLENDS.index(state.blend)
-    help_ = f"Where edits overlap ({shortcut('blend')}): " + BLEND_HELP[state.blend]
-    pressed = drop_down(
-        "##blend", titles[now], titles, now, ui, help_, [BLEND_HELP[blend] for blend in BLENDS]
-    )
-    return state if pressed is None else replace(state, blend=BLENDS[pressed])
-
-
-def _new_button(form_open: bool, actions: list[str]) -> None:
-    imgui.push_style_color(
-        imgui.Col_.button, imgui.ImVec4(*(PALETTE.accent_dark if form_open else PALETTE.field))
-    )
-    if imgui.button("+ New##edit"):
+    folded = section("Edits", work.layout.folded, ui)
+    work = replace(work, layout=replace(work.layout, folded=folded))
+    side, text = imgui.get_frame_height(), "+ New edit"
+    wide = imgui.calc_text_size(text).x + 2 * imgui.get_style().frame_padding.x
+    imgui.same_line(right - wide - (side + 4.0 * ui.scale) * bool(work.view.layers))
+    if (imgui.button if work.view.layers else accent_button)(text, imgui.ImVec2(wide, 0.0)):
         actions.append("new_edit")
-    imgui.pop_style_color()
-    tip(f"New edit ({shortcut('new_edit')}): choose a region and an editor, see it, train it")
+    tip("Choose a region and an editor, see it, train it", "new_edit")
+    if not work.view.layers:
+        return work
+    imgui.same_line(0.0, 4.0 * ui.scale)
+    if icon_button("about layers", Icon.MENU, ui):
+        imgui.open_popup("about layers")
+    tip("Where edits overlap, overshoot, rows")
+    with menu("about layers", ui) as is_open:
+        return replace(work, view=_choose_rules(work, ui, actions)) if is_open else work
 
 
-def _overshoot(state: ViewState, width: float) -> ViewState:
-    on = state.overshoot
-    for slot, color in (
-        (imgui.Col_.button, PALETTE.warning_dark if on else PALETTE.field),
-        (imgui.Col_.text, PALETTE.text if on else PALETTE.dim),
-    ):
-        imgui.push_style_color(slot, imgui.ImVec4(*color))
-    imgui.push_style_var(imgui.StyleVar_.frame_padding, imgui.ImVec2(0.0, imgui.get_style().frame_padding.y))
-    if imgui.button(f"{OVERSHOOT:g}##overshoot", imgui.ImVec2(width, 0.0)):
-        state = with_overshoot(state, not on)
-    imgui.pop_style_var()
-    imgui.pop_style_color(2)
-    tip(f"Overshoot to {OVERSHOOT:g} ({shortcut('overshoot')}): extrapolates past the trained range")
+def _choose_rules(work: Workspace, ui: UiContext, actions: list[str]) -> ViewState:
+    """What the menu is about: the blend rule, overshoot, compact rows."""
+    state = work.view
+    imgui.text_disabled(f"Where edits overlap ({shortcut('blend')})")
+    for blend in BLENDS:
+        if imgui.menu_item(BLEND_TITLES[blend], "", state.blend == blend)[0]:
+            state = replace(state, blend=blend)
+        tip(BLEND_HELP[blend])
+    imgui.separator()
+    if imgui.menu_item(f"Overshoot: sliders go to {OVERSHOOT:g}", shortcut("overshoot"), state.overshoot)[0]:
+        state = with_overshoot(state, not state.overshoot)
+    tip("Extrapolates past what was trained")
+    if imgui.menu_item("Compact rows", shortcut("cards"), is_compact(work))[0]:
+        actions.append("cards")
     return state
 
 
 def draw(
-    work: Workspace, rows: Sequence[LayerRow], reveal: bool, ui: UiContext, actions: list[str]
+    work: Workspace,
+    rows: Sequence[LayerRow],
+    thumbnails: Sequence[int],
+    reveal: bool,
+    ui: UiContext,
+    actions: list[str],
 ) -> Workspace:
     """All cards, under the rows of their groups.
 
     Args:
         rows: one per .gdf, indexed by `LayerState.gdf`
+        thumbnails: GL names of their pictures in the same order, 0 before one is drawn
         reveal: scroll to the focused layer, and to what is cut of the selected ones
     """
     if not (work.view.layers or work.jobs or work.form_open):
@@ -317,9 +283,11 @@ def draw(
         work,
         overlap=None,
         pointed=None,
-        search=draw_search(work, ui, actions) if work.view.layers else "",
+        search=draw_search(work, ui) if work.view.layers else "",
         searching=False,
     )
+    if "Edits" in work.layout.folded:
+        return work
     texts = [f"{row.region} {row.instruction}" for row in rows]
     # as seen: the top layer, which is the last one, first
     listed = filter_layers(work.view, texts, work.search)[::-1]
@@ -342,7 +310,15 @@ def draw(
             continue
         top, left = imgui.get_cursor_screen_pos().y, imgui.get_cursor_pos_x()
         imgui.set_cursor_pos_x(left + INSET_PX * ui.scale * bool(group))
-        work, touch = draw_card(work, i, layer.name in visible, rows, ui, actions)
+        work, touch = draw_card(
+            work,
+            i,
+            layer.name in visible,
+            rows,
+            thumbnails[layer.gdf] if layer.gdf < len(thumbnails) else 0,
+            ui,
+            actions,
+        )
         dragged, gesture = (len(lines), touch.drag) if touch.drag in _DRAGS else (dragged, gesture)
         lines.append(_Row(top, imgui.get_item_rect_max().y, (i,), group))
         _tighten(work, ui)

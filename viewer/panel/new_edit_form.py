@@ -156,7 +156,7 @@ def _region(form: NewEdit, selection: SelectionState, count: int, column: float,
     form = form if pressed is None else replace(form, region=offered[pressed], error="")
     if form.region == TYPED:
         form = replace(form, typed_region=_text_row("", "sphere:0,0,0,1", form.typed_region, column))
-        tip("As progdf train --region: labels:FILE.npy:ID, box:…, sphere:…, file:ROWS.npy; join by + -")
+        tip("labels:FILE.npy:ID, box:…, sphere:X,Y,Z,RADIUS, file:ROWS.npy; join by + -")
     return form
 
 
@@ -207,7 +207,7 @@ def _settings(form: NewEdit, preview: PreviewState, column: float, ui: UiContext
             tip(f"{taken} and changed in any program")
         case "folder":
             form = replace(form, folder=_text_row("Folder", "FOLDER", form.folder, column))
-            tip("Pictures of the training views, edited by any program; see progdf views")
+            tip("Pictures of the training views, edited by any program")
     return form
 
 
@@ -243,21 +243,13 @@ def _anchor(form: NewEdit, preview: PreviewState, column: float) -> tuple[NewEdi
 
 
 def _style(form: NewEdit, ui: UiContext) -> NewEdit:
-    """Back, number, on; those that agree best from all sides come first."""
+    """Those that agree best from all sides come first."""
     order = (*BEST_STYLES, *(i for i in range(STYLES) if i not in BEST_STYLES))
-    at, side, gap = order.index(form.style), imgui.get_frame_height(), 4.0 * ui.scale
-    if imgui.button("‹##style", imgui.ImVec2(side, 0.0)):
-        at -= 1
-    imgui.same_line(0.0, gap)
-    imgui.set_next_item_width(imgui.get_content_region_avail().x - side - gap)
-    titles, flags = [f"Painting {number}" for number in order], imgui.ComboFlags_.no_arrow_button.value
+    imgui.set_next_item_width(-1.0)
+    titles, at = [f"Painting {number}" for number in order], order.index(form.style)
     help_ = "Which painting; the first six look most alike from all sides"
-    pressed = drop_down("##number", titles[at], titles, at, ui, help_, flags=flags)
-    at = at if pressed is None else pressed
-    imgui.same_line(0.0, gap)
-    if imgui.button("›##style", imgui.ImVec2(side, 0.0)):
-        at += 1
-    return replace(form, style=order[at % len(order)])
+    pressed = drop_down("##number", titles[at], titles, at, ui, help_)
+    return form if pressed is None else replace(form, style=order[pressed])
 
 
 def _preview(form: NewEdit, preview: PreviewState, column: float, ui: UiContext) -> NewEdit:

@@ -5,152 +5,95 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 from imgui_bundle import imgui
 
 from progdf.terminal import escape_text
-from viewer.camera.view_camera import Vec3, ViewCamera, axes, with_up
 from viewer.state import history
-from viewer.state.facts import obstacle
 from viewer.state.layer_selection import selected_layers
-from viewer.state.view_state import AGAINST, COMPARE_MODES, MOST_AMPLIFIED, Comparison, ViewState
-from viewer.state.workspace import UNSAVED, PreviewState, SceneFacts, Workspace, has_unsaved, is_compact
-from viewer.ui.context import BEHIND, FIXED, PALETTE, Icon, UiContext
-from viewer.ui.keys import shortcut
+from viewer.state.selection import NamedRegion
+from viewer.state.workspace import (
+    UNSAVED,
+    Layout,
+    PreviewState,
+    SceneFacts,
+    Workspace,
+    has_unsaved,
+)
+from viewer.ui.context import BEHIND, FIXED, PALETTE, SMALL_PX, Icon, UiContext, u32
 from viewer.ui.widgets import (
-    choice,
-    choice_row,
     elide,
+    group_digits,
     icon_button,
+    icon_row,
     is_double_clicked,
-    label,
-    menu,
+    menu_items,
+    more_button,
     right_edge,
     section,
     small,
+    swatch,
     tip,
+    typed_name,
     with_added,
 )
 
-from . import card, cards, new_edit_form, snapshot_cards, tools, training_cards
+from . import card, cards, new_edit_form, snapshot_cards, training_cards
 
 NAME = "main menu"
 MOST_PX = 360.0
-_FILES = (("Open…", "open"),)
-_SAVES = (("Save", "save"), ("Save as…", "save_as"))
-_MAKES = (
-    ("New edit", "new_edit"),
-    ("Take this view", "take_view"),
-    ("Hide strays", "hide_strays"),
-    ("Export .ply…", "export"),
-    ("Export web page…", "export_page"),
-    ("Render picture…", "render_picture"),
-    ("Render film…", "render_film"),
+_MENU = (
+    ("", "", ""),
+    ("Save", "save", ""),
+    ("Save as…", "save_as", ""),
+    ("Take this view", "take_view", "A picture of it without edits, to be changed in any program"),
+    ("Hide strays", "hide_strays", "What a capture left where nothing is"),
+    ("", "", ""),
+    ("Shortcuts", "help", ""),
+    ("About", "about", ""),
+    ("Quit", "quit", ""),
 )
-_VIEWS = (
-    ("Front", "look:front"),
-    ("Back", "look:back"),
-    ("Right", "look:right"),
-    ("Left", "look:left"),
-    ("Top", "look:top"),
-    ("Bottom", "look:bottom"),
+_MOST_RECENT = 6
+_SHARES = (
+    ("Export scene…", "export", "The edited scene as a file of splats"),
+    ("Export web page…", "export_page", "A page with the sliders, for any browser"),
+    ("Render picture…", "render_picture", ""),
+    ("Render film…", "render_film", ""),
+    ("Save picture", "picture", "As it is on screen"),
 )
-_LAYERS = (
-    ("Select all", "select_layers"),
-    ("Search", "search"),
-    ("Group", "group"),
-    ("Ungroup", "ungroup"),
-    ("Copy values", "copy_values"),
-    ("Paste values", "paste_values"),
-    ("Reset", "reset"),
-    ("Reset all", "reset_all"),
-)
-_FRAMES = (("Frame", "frame"), ("Home", "home"))
-_HELP = (("Shortcuts", "help"), ("About", "about"), ("Quit", "quit"))
 
 
-def _menu_button(work: Workspace, recent: Sequence[Path], ui: UiContext, actions: list[str]) -> None:
-    """The button at the right of the present line, and its menu while it is open.
-
-    `recent`: files opened before, the last one first.
-    """
-    if icon_button("menu", Icon.BARS, ui):
-        imgui.open_popup(NAME)
+def _menu_button(recent: Sequence[Path], side: float, ui: UiContext, actions: list[str]) -> None:
+    """The menu at the right of the present line; `recent`: files opened before, the last one first."""
+    files = [
+        (elide(escape_text(path.name), MOST_PX * ui.scale), f"open_file:{path}", escape_text(str(path)))
+        for path in recent[:_MOST_RECENT]
+    ]
+    more_button(NAME, (("Open…", "open", ""), *files, *_MENU), ui, actions, Icon.BARS, side)
     tip("Menu")
-    with menu(NAME, ui) as is_open:
-        if is_open:
-            actions += _items(_FILES)
-            actions += _recent(recent, ui)
-            actions += _items(_SAVES)
-            imgui.separator()
-            actions += _items(_MAKES)
-            imgui.separator()
-            actions += _view_menu(work.view)
-            actions += _layers_menu(work)
-            imgui.separator()
-            actions += _items(_HELP)
 
 
-def _items(items: Sequence[tuple[str, str]]) -> list[str]:
-    return [action for name, action in items if imgui.menu_item(name, shortcut(action), False)[0]]
+WIDTH_PX = Layout.panel_px  # at 1×, before its edge is dragged
+_EDGE_PX = 6.0
 
 
-def _view_menu(view: ViewState) -> list[str]:
-    actions: list[str] = []
-    if imgui.begin_menu("View"):
-        actions += _items(_VIEWS)
-        imgui.separator()
-        actions += _items(_FRAMES)
-        imgui.separator()
-        for name, action, on in (("Ground grid", "grid", view.grid), ("Axes", "axes", view.axes)):
-            actions += [action] * bool(imgui.menu_item(name, shortcut(action), on)[0])
-        imgui.end_menu()
-    return actions
+class Pictures(NamedTuple):
+    """GL names of small pictures, 0 before one is drawn."""
+
+    snapshots: Sequence[int] = ()  # that of the original first
+    edits: Sequence[int] = ()  # one per .gdf
 
 
-def _layers_menu(work: Workspace) -> list[str]:
-    actions: list[str] = []
-    if imgui.begin_menu("Layers", bool(work.view.layers)):
-        actions += _items(_LAYERS)
-        imgui.separator()
-        actions += ["cards"] * bool(imgui.menu_item("Compact rows", shortcut("cards"), is_compact(work))[0])
-        imgui.end_menu()
-    return actions
-
-
-def _recent(recent: Sequence[Path], ui: UiContext) -> list[str]:
-    actions: list[str] = []
-    if imgui.begin_menu("Recent", bool(recent)):
-        for i, path in enumerate(recent):
-            name = elide(escape_text(path.name), MOST_PX * ui.scale)
-            if imgui.menu_item(f"{name}##{i}", "", False)[0]:
-                actions.append(f"open_file:{path}")
-            tip(escape_text(str(path)))
-        imgui.end_menu()
-    return actions
-
-
-WIDTH_PX = 300.0  # at 1×
-
-UPS: tuple[tuple[str, Vec3], ...] = (
-    ("+X", (1.0, 0.0, 0.0)),
-    ("−X", (-1.0, 0.0, 0.0)),
-    ("+Y", (0.0, 1.0, 0.0)),
-    ("−Y", (0.0, -1.0, 0.0)),
-    ("+Z", (0.0, 0.0, 1.0)),
-    ("−Z", (0.0, 0.0, -1.0)),
-)
-
-
-def width(ui: UiContext) -> float:
-    """The panel's width in window pixels."""
-    return WIDTH_PX * ui.scale
+def width(layout: Layout, ui: UiContext) -> float:
+    """The panel's width in window pixels, at most a little more than half of the window."""
+    return min(layout.panel_px, 0.6 * imgui.get_io().display_size.x / ui.scale) * ui.scale
 
 
 def draw(
     work: Workspace,
     facts: SceneFacts,
-    textures: Sequence[int],
+    pictures: Pictures,
     preview: PreviewState,
     recent: Sequence[Path],
     reveal: bool,
@@ -162,40 +105,53 @@ def draw(
     Args:
         work: what it shows and changes
         facts: of the open scene
-        textures: GL names of the snapshots' pictures, that of the original first; 0 before one is drawn
+        pictures: of snapshots and edits
         preview: what is said of the picture of a new edit
         recent: files opened before, the last one first
         reveal: scroll to the focused layer
         ui: fonts and scale
         actions: takes those that were asked for, see `perform`
     """
-    display = imgui.get_io().display_size
-    imgui.set_next_window_pos(imgui.ImVec2(display.x - width(ui), 0.0))
-    imgui.set_next_window_size(imgui.ImVec2(width(ui), display.y))
+    display, wide = imgui.get_io().display_size, width(work.layout, ui)
+    imgui.set_next_window_pos(imgui.ImVec2(display.x - wide, 0.0))
+    imgui.set_next_window_size(imgui.ImVec2(wide, display.y))
     imgui.begin("panel", None, FIXED | BEHIND | imgui.WindowFlags_.no_scroll_with_mouse.value)
+    work = replace(work, layout=_drag_edge(work.layout, ui))
     _title(work, facts, recent, ui, actions)
     footer = imgui.get_frame_height() + imgui.get_style().item_spacing.y * 2
+    footer += training_cards.height(work.jobs, ui)
     room = imgui.get_content_region_avail().y - footer - cards.HEADING_PX * ui.scale
     work = replace(work, cards_fit=len(work.view.layers) * card.CARD_PX * ui.scale <= room)
     selected = selected_layers(work)
     _begin_body(footer + cards.selection_height(selected, ui))
-    work = replace(work, view=cards.heading(work.view, work.form_open, ui, actions))
+    work = cards.draw_heading(work, ui, actions)
     work = new_edit_form.draw(work, facts.count, preview, ui, actions)
-    training_cards.draw(work.jobs, ui, actions)
-    work = cards.draw(work, facts.rows, reveal, ui, actions)
-    view, pointed = work.view, work.pointed
-    if view.brush.active:
-        view = tools.draw_brush(view, work.focus, ui, actions)
-    view, under = tools.draw(view, ui, actions)
-    pointed = pointed or under or tools.draw_regions(view.selection.regions, ui, actions)
-    view = _view(view, obstacle(facts.recordings), len(textures) > 1, ui, actions)
-    work = replace(work, view=view, pointed=pointed)
-    snapshot_cards.draw(work, facts.rows, textures, ui, actions)
+    work = cards.draw(work, facts.rows, pictures.edits, reveal, ui, actions)
+    work = _regions(work, ui, actions)
+    work = snapshot_cards.draw(work, facts.rows, pictures.snapshots, ui, actions)
     _end_body()
     cards.draw_selection(work.view, selected, ui, actions)
+    training_cards.draw(work.jobs, ui, actions)
     _footer(work, ui, actions)
     imgui.end()
     return work
+
+
+def _drag_edge(layout: Layout, ui: UiContext) -> Layout:
+    """The panel's left edge, which is dragged; a double click takes it back to its first place."""
+    start, (x, y) = imgui.get_cursor_screen_pos(), imgui.get_window_pos()
+    imgui.set_cursor_screen_pos(imgui.ImVec2(x, y))
+    imgui.invisible_button("edge", imgui.ImVec2(_EDGE_PX * ui.scale, imgui.get_window_height()))
+    if imgui.is_item_hovered() or imgui.is_item_active():
+        imgui.set_mouse_cursor(imgui.MouseCursor_.resize_ew.value)
+    if imgui.is_item_active() and imgui.get_io().mouse_delta.x:
+        io = imgui.get_io()
+        wide = (io.display_size.x - io.mouse_pos.x) / ui.scale
+        layout = layout.with_panel(wide)
+    if is_double_clicked():
+        layout = layout.with_panel(WIDTH_PX)
+    imgui.set_cursor_screen_pos(start)
+    return layout
 
 
 def _begin_body(footer: float) -> None:
@@ -208,10 +164,7 @@ def _begin_body(footer: float) -> None:
     flags = imgui.WindowFlags_
     wide = imgui.get_content_region_avail().x + imgui.get_style().scrollbar_size
     imgui.begin_child(
-        "body",
-        imgui.ImVec2(wide, -footer),
-        0,
-        flags.no_nav.value | flags.always_vertical_scrollbar.value,
+        "body", imgui.ImVec2(wide, -footer), 0, flags.no_nav.value | flags.always_vertical_scrollbar.value
     )
     if not overflows:
         imgui.pop_style_color(len(slots))
@@ -227,127 +180,109 @@ def _end_body() -> None:
 def _title(
     work: Workspace, facts: SceneFacts, recent: Sequence[Path], ui: UiContext, actions: list[str]
 ) -> None:
-    """The scene's name, after a dot where there are unsaved changes, its size, and the menu at the right."""
-    at, side = imgui.get_cursor_pos(), imgui.get_frame_height()
-    imgui.push_font(ui.fonts.bold, 0.0)
+    """The session's name, after a dot where there are unsaved changes; the scene and its size; the icons."""
+    at, side, scale = imgui.get_cursor_pos(), 24.0 * ui.scale, ui.scale
     room = imgui.get_content_region_avail().x
-    imgui.text(elide(UNSAVED * has_unsaved(work) + facts.title, room - side))
+    text = room - 3 * side - 8.0 * scale
+    imgui.push_font(ui.fonts.bold, 0.0)
+    imgui.text(elide(UNSAVED * has_unsaved(work) + (work.session or facts.title), text))
     imgui.pop_font()
-    small(f"{with_added(facts.count, facts.added)} splats", PALETTE.dim, room - side)
+    size = f"{with_added(facts.count, facts.added)} splats"
+    small(f"{facts.title}  ·  {size}" if work.session else size, PALETTE.dim, text)
+    tip(f"{facts.title}\n{size}")
     below = imgui.get_cursor_pos()
-    imgui.set_cursor_pos(imgui.ImVec2(at.x + room - side, at.y - 2.0 * ui.scale))
-    _menu_button(work, recent, ui, actions)
+    imgui.set_cursor_pos(imgui.ImVec2(at.x + room - 3 * side, at.y - 2.0 * scale))
+    actions += ["save"] * icon_button("save", Icon.SAVE, ui, side=side)
+    tip("Save the session", "save")
+    imgui.same_line(0.0, 0.0)
+    more_button("share", _SHARES, ui, actions, Icon.SHARE, side)
+    tip("Export and render")
+    imgui.same_line(0.0, 0.0)
+    _menu_button(recent, side, ui, actions)
     imgui.set_cursor_pos(below)
-    imgui.dummy(imgui.ImVec2(0.0, 2.0 * ui.scale))
+    imgui.dummy(imgui.ImVec2(0.0, 2.0 * scale))
 
 
-def _view(
-    state: ViewState, unrecorded: str, has_snapshots: bool, ui: UiContext, actions: list[str]
-) -> ViewState:
-    imgui.dummy(imgui.ImVec2(0.0, 4.0 * ui.scale))
-    section("View", ui)
-    column = 82.0 * ui.scale
-    camera = state.camera
-    modes, help_ = {"orbit": "Orbit", "fly": "Fly"}, "Orbit around a pivot, or fly"
-    camera = replace(camera, mode=choice_row("Navigate", modes, camera.mode, column, ui, help_, "fly"))
-    label("Up axis", column)
-    ups = (*UPS, ("View", axes(camera).up))
-    current = next((i for i, (_, up) in enumerate(UPS) if up == camera.up), len(UPS))
-    chosen = choice("up", tuple(name for name, _ in ups), current, ui)
-    tip("Up axis of the scene. View: use the current view's up direction")
-    if chosen is not None:
-        camera = with_up(camera, ups[chosen][1])
-    label("FOV", column)
-    imgui.set_next_item_width(-1.0)
-    changed, fov_y = imgui.slider_float("##fov", camera.fov_y, 10.0, 110.0, "%.0f°", _ALWAYS_CLAMP)
-    if is_double_clicked():
-        changed, fov_y = True, ViewCamera.fov_y
-    camera = replace(camera, fov_y=fov_y) if changed else camera  # unchanged, imgui still rounds to float32
-    tip(f"Vertical field of view. Double-click: reset to {ViewCamera.fov_y:g}°")
-    label("Background", column)
-    picker = imgui.ColorEditFlags_.no_inputs.value | imgui.ColorEditFlags_.no_alpha.value
-    changed, (red, green, blue) = imgui.color_edit3("##background", list(state.background), picker)
-    background = (red, green, blue) if changed else state.background
-    comparison = _comparison(state.compare, unrecorded, has_snapshots, column, ui)
-    label("Show", column)
-    half = (imgui.get_content_region_avail().x - 6.0 * ui.scale) / 2
-    if imgui.button(f"{Icon.FRAME}  Frame", imgui.ImVec2(half, 0.0)):
-        actions.append("frame")
-    tip("Frame the selection, the focused layer, or the scene", "frame")
-    imgui.same_line(0.0, 6.0 * ui.scale)
-    if imgui.button(f"{Icon.HOME}  Home", imgui.ImVec2(half, 0.0)):
-        actions.append("home")
-    tip("Reset the view", "home")
-    return replace(state, camera=camera, background=background, compare=comparison)
+_OF_REGION = "menu of a region"
+_ITEMS = (
+    ("Select", "region:{}:new", ""),
+    ("Add to selection", "region:{}:add", ""),
+    ("Subtract from selection", "region:{}:subtract", ""),
+    ("Rename…", "", ""),
+    ("Delete", "forget_region:{}", ""),
+)
 
 
-def _comparison(
-    compare: Comparison, unrecorded: str, has_snapshots: bool, column: float, ui: UiContext
-) -> Comparison:
-    """Off, beside each other or subtracted; with the original, what was recorded, or two snapshots.
-
-    `unrecorded`: why nothing is recorded; `has_snapshots`: whether there are snapshots.
-    """
-    label("Compare", column)
-    chosen = choice("compare", ("Off", "Side", "Split", "Diff"), COMPARE_MODES.index(compare.mode), ui)
-    beside, split = shortcut("beside"), shortcut("split")
-    tip(f"Side by side ({beside}), split view ({split}), or amplified difference", "difference")
-    if chosen is not None:
-        compare = replace(compare, mode=COMPARE_MODES[chosen])
-    if compare.mode == "off" and not has_snapshots:
-        return compare
-    label("Against", column)  # also while nothing is compared where there are snapshots: theirs lie below it
-    off = {i for i, no in ((1, unrecorded), (2, not has_snapshots)) if no}
-    against = None if compare.mode == "off" else AGAINST.index(compare.against)
-    chosen = choice("against", ("Original", "Recorded", "A | B"), 0 if against in off else against, ui, off)
-    recorded, pair = shortcut("against"), shortcut("compare_snapshots")
-    tip(
-        f"Compare with the original, with what training recorded ({recorded}), or snapshot A with B ({pair})"
-        + (f"\nNo recording: {unrecorded}" if unrecorded else "")
-    )
-    if chosen is not None:
-        mode = "split" if compare.mode == "off" else compare.mode
-        compare = replace(compare, mode=mode, against=AGAINST[chosen])
-    if compare.mode == "difference":
-        label("Amplify", column)
-        imgui.set_next_item_width(-1.0)
-        changed, times = imgui.slider_float(
-            "##amplify", compare.amplify, 1.0, MOST_AMPLIFIED, "× %.0f", _LOGARITHMIC
-        )
-        if is_double_clicked():
-            changed, times = True, Comparison.amplify
-        compare = replace(compare, amplify=float(round(times))) if changed else compare
-        tip(f"Gain of the difference. Double-click: reset to × {Comparison.amplify:g}")
-    return compare
+def _regions(work: Workspace, ui: UiContext, actions: list[str]) -> Workspace:
+    """The section "Regions", where there are some: a row for each."""
+    regions, layout = work.view.selection.regions, work.layout
+    if not regions:
+        return work
+    layout = replace(layout, folded=section("Regions", layout.folded, ui))
+    for i, region in enumerate(regions if "Regions" not in layout.folded else ()):
+        imgui.push_id(f"region {i}")
+        if _row(i, region, ui, actions):
+            work = replace(work, pointed=work.pointed or ("region", i))
+        imgui.pop_id()
+    return replace(work, layout=layout)
 
 
-_ALWAYS_CLAMP = imgui.SliderFlags_.always_clamp.value
-_LOGARITHMIC = _ALWAYS_CLAMP | imgui.SliderFlags_.logarithmic.value
+def _row(index: int, region: NamedRegion, ui: UiContext, actions: list[str]) -> bool:
+    """Eye, swatch, name and count; whether the mouse rests on it."""
+    right, scale = right_edge(), ui.scale
+    icon = Icon.SHOWN if region.visible else Icon.HIDDEN
+    if icon_button("eye", icon, ui, dim=not region.visible):
+        actions.append(f"show_region:{index}")
+    tip("Tint this region in the picture")
+    imgui.same_line()
+    swatch(region.color, 1.0, False, ui)
+    tall, canvas = imgui.get_frame_height(), imgui.get_window_draw_list()
+    imgui.same_line()
+    count = group_digits(region.count)
+    imgui.push_font(None, SMALL_PX)
+    wide = imgui.calc_text_size(count).x
+    imgui.pop_font()
+    room = right - wide - 10.0 * scale - imgui.get_cursor_pos_x()
+    naming, storage = imgui.get_id("naming"), imgui.get_state_storage()
+    if storage.get_bool(naming):
+        name = typed_name(region.name, room)
+        storage.set_bool(naming, name is None)
+        actions += [f"rename_region:{index}:{name}"] if name else []
+        return False
+    x, y = imgui.get_cursor_screen_pos()
+    io, mouse = imgui.get_io(), imgui.MouseButton_
+    if imgui.invisible_button("select", imgui.ImVec2(max(right - imgui.get_cursor_pos_x(), 1.0), tall)):
+        mode = "add" if io.key_shift else "subtract" if io.key_ctrl else "new"
+        actions.append(f"region:{index}:{mode}")
+    resting = imgui.is_item_hovered(imgui.HoveredFlags_.for_tooltip.value)
+    color = u32(PALETTE.text if imgui.is_item_hovered() else PALETTE.dim)
+    tip(f"{region.path}\nClick to select; Shift adds, Ctrl subtracts. Right-click: rename, delete")
+    if imgui.is_item_clicked(mouse.right.value):
+        imgui.open_popup(_OF_REGION)
+    above = imgui.get_style().frame_padding.y
+    canvas.add_text(imgui.ImVec2(x, y + above), u32(PALETTE.text), elide(region.name, room))
+    at = imgui.ImVec2(imgui.get_item_rect_max().x - wide, y + above + 1.0 * scale)
+    canvas.add_text(ui.fonts.regular, SMALL_PX * scale, at, color, count)
+    for action in menu_items(_OF_REGION, _ITEMS, ui):
+        actions += [action.format(index)] if action else []
+        storage.set_bool(naming, not action)
+    return bool(resting)
+
+
+_FOOT = (
+    ("timeline", Icon.FILM, "Timeline: animate the camera and the strengths"),
+    ("picture", Icon.PICTURE, "Save the image as PNG"),
+    ("help", Icon.HELP, "Keyboard and mouse shortcuts"),
+)
 
 
 def _footer(work: Workspace, ui: UiContext, actions: list[str]) -> None:
     imgui.separator()
     right = right_edge()
-    for action, icon, change in (
-        ("undo", Icon.UNDO, history.next_undo(work.past)),
-        ("redo", Icon.REDO, history.next_redo(work.past)),
-    ):
-        imgui.begin_disabled(not change)
-        if icon_button(action, icon, ui):
-            actions.append(action)
-        imgui.end_disabled()
-        tip(f"{action.capitalize()}{change and ': '}{change}", action)
-        imgui.same_line()
-    if work.view.layers and tools.brush_button(work.view, ui):
-        actions.append("brush")
+    changes = {"undo": history.next_undo(work.past), "redo": history.next_redo(work.past)}
+    named = zip(changes.items(), (Icon.UNDO, Icon.REDO), strict=True)
+    steps = [(name, icon, f"{name.capitalize()}{what and ': '}{what}") for (name, what), icon in named]
+    icon_row(steps, ui, actions, 8.0 * ui.scale, off=[name for name, what in changes.items() if not what])
     side, gap = imgui.get_frame_height(), 6.0 * ui.scale
     imgui.same_line(right - 3 * side - 2 * gap)
-    for action, icon, help_ in (
-        ("timeline", Icon.FILM, "Timeline: animate the camera and the strengths"),
-        ("picture", Icon.PICTURE, "Save the image as PNG"),
-        ("help", Icon.HELP, "Keyboard and mouse shortcuts"),
-    ):
-        if icon_button(action, icon, ui):
-            actions.append(action)
-        tip(help_, action)
-        imgui.same_line(0.0, gap)
+    icon_row(_FOOT, ui, actions, gap)

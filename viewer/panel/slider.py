@@ -14,7 +14,7 @@ from imgui_bundle import imgui
 from viewer.ui.context import PALETTE, Rgba, u32
 from viewer.ui.widgets import is_released, tip
 
-HEIGHT_PX = 25.0  # at 1×, as a text field, so that nothing moves when one types
+HEIGHT_PX = 20.0  # at 1×, as its text field, so that nothing moves when one types
 RADIUS_PX = 7.0  # of the handle
 FINE = 0.1
 DEFAULT = 0.0
@@ -118,8 +118,11 @@ def _text_field(label: str, value: float, width: float, most: float) -> float:
         imgui.set_keyboard_focus_here()
         storage.set_bool(_slot(label, "wants focus"), False)
     imgui.set_next_item_width(width)
+    padding = imgui.get_style().frame_padding
+    imgui.push_style_var(imgui.StyleVar_.frame_padding, imgui.ImVec2(padding.x, padding.y / 2))
     flags = imgui.InputTextFlags_.enter_returns_true.value | imgui.InputTextFlags_.auto_select_all.value
     entered, text = imgui.input_text(f"{label}/field", f"{value:.3f}", flags)
+    imgui.pop_style_var()
     left = imgui.is_item_deactivated()
     if entered or left:
         storage.set_bool(_slot(label, "typing"), False)
@@ -156,13 +159,12 @@ def _paint(
         if value > 1.0:
             end.x = at
             canvas.add_rect_filled(imgui.ImVec2(start + span, middle - half), end, u32(p.warning), half)
-    foot = middle + radius + 2.0 * scale
+    foot = middle + radius + 1.0 * scale
     for tick in ticks:
         x = round(start + tick * span) + 0.5
-        tall = 6.0 if tick in (0.0, 1.0) else 4.0
-        color = p.dim if tick <= value else p.faint
+        tall = 4.0 if tick in (0.0, 1.0) else 3.0
         canvas.add_line(
-            imgui.ImVec2(x, foot), imgui.ImVec2(x, foot + tall * scale), u32(color), max(1.0, scale)
+            imgui.ImVec2(x, foot), imgui.ImVec2(x, foot + tall * scale), u32(p.dim), max(1.0, scale)
         )
     canvas.add_circle_filled(imgui.ImVec2(at, middle), radius + 1.0 * scale, u32(p.card))
     canvas.add_circle_filled(imgui.ImVec2(at, middle), radius - (0.0 if lit else 1.0) * scale, u32(p.handle))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from imgui_bundle import imgui
 
@@ -17,7 +17,7 @@ from viewer.ui.widgets import (
     elide,
     grip,
     icon_button,
-    menu,
+    menu_items,
     picture,
     right_edge,
     section,
@@ -30,12 +30,12 @@ from . import slider
 COLUMNS = 3
 _MENU = "menu of a snapshot"
 _ITEMS = (
-    ("Rename…", ""),
-    ("Use as A", "choose_snapshot:a:"),
-    ("Use as B", "choose_snapshot:b:"),
-    ("Move left", ""),
-    ("Move right", ""),
-    ("Delete", "forget:"),
+    ("Rename…", "", ""),
+    ("Use as A", "choose_snapshot:a:{name}", ""),
+    ("Use as B", "choose_snapshot:b:{name}", ""),
+    ("Move left", "move_snapshot:{at}:{before}", ""),
+    ("Move right", "move_snapshot:{at}:{after}", ""),
+    ("Delete", "forget:{at}", ""),
 )
 
 
@@ -51,24 +51,23 @@ class _Cards:
 
 def draw(
     work: Workspace, rows: Sequence[LayerRow], textures: Sequence[int], ui: UiContext, actions: list[str]
-) -> None:
-    """Draw the section.
+) -> Workspace:
+    """Draw the section; the workspace with it folded or not.
 
     Args:
         rows: one per .gdf, indexed by `LayerState.gdf`
         textures: GL names of the pictures, that of the original first
     """
-    imgui.dummy(imgui.ImVec2(0.0, 4.0 * ui.scale))
     right = right_edge()
-    section("Snapshots", ui)
+    work = replace(work, layout=replace(work.layout, folded=section("Snapshots", work.layout.folded, ui)))
     name = "Add"
     wide = imgui.calc_text_size(name).x + 2 * imgui.get_style().frame_padding.x
     imgui.same_line(right - wide)
     if imgui.button(f"{name}##snapshot"):
         actions.append("snapshot")
     tip(f"Save the current sliders as a snapshot ({shortcut('snapshot')}); click a snapshot to restore it")
-    if len(textures) < 2:
-        return
+    if len(textures) < 2 or "Snapshots" in work.layout.folded:
+        return work
     snapshots = with_original(work.snapshots, work.view)
     cards = _Cards([s.name for s in snapshots], textures, *pair_of(snapshots, work.view.pair))
     current = is_blend(work.view, snapshots, lambda gdf: rows[gdf].count)
@@ -93,6 +92,7 @@ def draw(
             imgui.get_window_draw_list().add_rect(
                 corner, end, u32(PALETTE.accent), 4.0 * ui.scale, 3.0 * ui.scale
             )
+    return work
 
 
 def _slider(cards: _Cards, work: Workspace, current: bool, ui: UiContext, actions: list[str]) -> None:
@@ -156,13 +156,13 @@ def _card(index: int, cards: _Cards, wide: float, ui: UiContext, actions: list[s
     )
     if imgui.is_item_clicked(imgui.MouseButton_.right.value):
         imgui.open_popup(_MENU)
-    item, renaming = _menu(index, len(cards.names), ui), imgui.get_id("renaming")
-    if item == "Rename…":
-        imgui.get_state_storage().set_bool(renaming, True)
-    elif item.startswith("Move"):
-        actions.append(f"move_snapshot:{index}:{index + (1 if item == 'Move right' else -1)}")
-    elif item:
-        actions.append(dict(_ITEMS)[item] + (str(index) if item == "Delete" else name))
+    renaming, last = imgui.get_id("renaming"), len(cards.names) - 1
+    off = {_ITEMS[3][1]: index > 1, _ITEMS[4][1]: index < last}
+    items = _ITEMS if index else _ITEMS[1:3]  # the original is neither renamed nor moved
+    for action in menu_items(_MENU, items, ui, [action for action, can in off.items() if not can]):
+        imgui.get_state_storage().set_bool(renaming, not action)
+        names = {"name": name, "at": index, "before": index - 1, "after": index + 1}
+        actions += [action.format_map(names)] if action else []
     canvas, end = imgui.get_window_draw_list(), imgui.ImVec2(at.x + wide, at.y + tall)
     picture(cards.textures[index], at, end, 4.0 * ui.scale)
     if hovered or dragged:
@@ -194,17 +194,3 @@ def _badge(text: str, at: imgui.ImVec2, ui: UiContext) -> None:
     end = imgui.ImVec2(corner.x + size.x + 2 * pad, corner.y + size.y + 0.5 * pad)
     canvas.add_rect_filled(corner, end, u32(PALETTE.scrim), 3.0 * ui.scale)
     canvas.add_text(imgui.ImVec2(corner.x + pad, corner.y + 0.25 * pad), u32(PALETTE.text), text)
-
-
-def _menu(index: int, count: int, ui: UiContext) -> str:
-    """The item that was chosen, "" for none; the original is neither renamed nor moved."""
-    off = {"Move left": index < 2, "Move right": index == count - 1}
-    with menu(_MENU, ui) as is_open:
-        chosen = [
-            name
-            for name, _ in _ITEMS
-            if is_open
-            and (index or name.startswith("Use"))
-            and imgui.menu_item(name, "", False, not off.get(name, False))[0]
-        ]
-    return chosen[0] if chosen else ""

@@ -12,10 +12,10 @@ from imgui_bundle import imgui
 
 from viewer.state.timeline import EASINGS, Player, key_at, key_before
 from viewer.state.view_state import FASTEST, LONGEST, Timeline
-from viewer.ui.context import BEHIND, FIXED, PALETTE, SMALL_PX, UNFOCUSED, UiContext, u32
+from viewer.ui.context import PALETTE, SMALL_PX, UiContext, u32
 from viewer.ui.keys import shortcut
 from viewer.ui.overlay import Area
-from viewer.ui.widgets import icon_button, is_released, tip
+from viewer.ui.widgets import icon_button, icon_row, is_released, plate, tip
 
 HEIGHT_PX, ROW_PX = 46.0, 33.0  # at 1×: of the bar, and of a second row
 ROOMY_PX = 520.0  # a narrower bar has its settings in a second row
@@ -44,23 +44,17 @@ def draw(timeline: Timeline, player: Player, area: Area, ui: UiContext) -> tuple
         What was asked for: actions of the workspace.
     """
     tall, roomy = _bar_height(area, ui), _is_wide(area, ui)
-    imgui.set_next_window_pos(imgui.ImVec2(0.0, area.height - tall))
-    imgui.set_next_window_size(imgui.ImVec2(area.width, tall))
-    imgui.push_style_color(imgui.Col_.window_bg, imgui.ImVec4(*PALETTE.scrim))
-    imgui.push_style_var(imgui.StyleVar_.window_padding, imgui.ImVec2(10.0 * ui.scale, 10.0 * ui.scale))
-    imgui.begin("timeline", None, FIXED | BEHIND | UNFOCUSED)
     actions: list[str] = []
-    frame = min(player.frame, timeline.length)
-    _buttons(timeline, player, frame, actions, ui)
-    settings = SETTINGS_PX * ui.scale if roomy else 0.0
-    wide = max(imgui.get_content_region_avail().x - settings, 40.0 * ui.scale)
-    _ruler(timeline, frame, wide, actions, ui)
-    if roomy:
-        imgui.same_line(0.0, 12.0 * ui.scale)
-    _settings(timeline, frame, actions, ui)
-    imgui.end()
-    imgui.pop_style_var()
-    imgui.pop_style_color()
+    place = imgui.ImVec2(0.0, area.height - tall)
+    with plate("timeline", place, ui, pad=10.0, size=imgui.ImVec2(area.width, tall)):
+        frame = min(player.frame, timeline.length)
+        _buttons(timeline, player, frame, actions, ui)
+        settings = SETTINGS_PX * ui.scale if roomy else 0.0
+        wide = max(imgui.get_content_region_avail().x - settings, 40.0 * ui.scale)
+        _ruler(timeline, frame, wide, actions, ui)
+        if roomy:
+            imgui.same_line(0.0, 12.0 * ui.scale)
+        _settings(timeline, frame, actions, ui)
     return tuple(actions)
 
 
@@ -76,25 +70,16 @@ def label_step(timeline: Timeline, span: float, room: float) -> int:
 
 
 def _buttons(timeline: Timeline, player: Player, frame: int, actions: list[str], ui: UiContext) -> None:
-    gap = 2.0 * ui.scale
-    imgui.begin_disabled(len(timeline.keys) < 2)
     icon = icons.ICON_FA_PAUSE if player.playing else icons.ICON_FA_PLAY
-    if icon_button("play", icon, ui):
-        actions.append("play")
-    imgui.end_disabled()
-    can_play = len(timeline.keys) > 1
-    tip(*("Play or pause", "play") if can_play else ("Set at least two keyframes to play",))
-    imgui.same_line(0.0, gap)
-    on_key = key_at(timeline, frame) is not None
-    if icon_button("key", icons.ICON_FA_DIAMOND, ui):
-        actions.append("key")
-    tip("Update keyframe" if on_key else "Insert keyframe: camera and all strengths", "key")
-    imgui.same_line(0.0, gap)
-    imgui.begin_disabled(not on_key)
-    if icon_button("drop_key", icons.ICON_FA_TRASH_CAN, ui, dim=not on_key):
-        actions.append("drop_key")
-    imgui.end_disabled()
-    tip("Delete keyframe", "drop_key")
+    on_key, can_play = key_at(timeline, frame) is not None, len(timeline.keys) > 1
+    key = "Update keyframe" if on_key else "Insert keyframe: camera and all strengths"
+    items = (
+        ("play", icon, "Play or pause" if can_play else "Set at least two keyframes to play"),
+        ("key", icons.ICON_FA_DIAMOND, key),
+        ("drop_key", icons.ICON_FA_TRASH_CAN, "Delete keyframe"),
+    )
+    off = [*["play"] * (not can_play), *["drop_key"] * (not on_key)]
+    icon_row(items, ui, actions, 2.0 * ui.scale, off=off)
     imgui.same_line(0.0, 10.0 * ui.scale)
 
 
@@ -127,7 +112,7 @@ def _settings(timeline: Timeline, frame: int, actions: list[str], ui: UiContext)
     if icon_button("timeline_file", icons.ICON_FA_FILE_EXPORT, ui, dim=not timeline.keys):
         actions.append("timeline_file")
     imgui.end_disabled()
-    tip("Save the timeline for `progdf render --timeline`", "timeline_file")
+    tip("Save the timeline as a file", "timeline_file")
 
 
 def _ruler(timeline: Timeline, frame: int, wide: float, actions: list[str], ui: UiContext) -> None:

@@ -1,262 +1,271 @@
-"""The panel's parts for selecting and painting: tools, operations, regions, and the brush."""
+"""What lies over the picture's edges: the tools, the options of the one in hand, comparison and view."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
+from typing import TypeVar
 
 from imgui_bundle import imgui
 
+from viewer.camera.view_camera import Vec3, ViewCamera, axes, with_up
+from viewer.pictures.compare import FIELD, Labels
 from viewer.render import highlight
 from viewer.state.layers import is_visible
-from viewer.state.selection import NamedRegion
 from viewer.state.view_state import (
     LARGEST_PX,
+    MOST_AMPLIFIED,
     SELECT_MODES,
     SMALLEST_PX,
     Brush,
+    Comparison,
     SelectTool,
     ViewState,
 )
-from viewer.state.workspace import Pointed
-from viewer.ui.context import PALETTE, SMALL_PX, Icon, UiContext, u32
+from viewer.state.workspace import Pointed, Workspace
+from viewer.ui import overlay
+from viewer.ui.context import PALETTE, Icon, UiContext, u32
 from viewer.ui.keys import shortcut
+from viewer.ui.overlay import Area
 from viewer.ui.widgets import (
-    choice_row,
+    choice,
     elide,
     group_digits,
     icon_button,
+    icon_row,
     label,
     menu,
-    right_edge,
-    section,
-    slider_row,
+    more_button,
+    plate,
     small,
-    swatch,
     tip,
     typed_name,
     value_slider,
 )
 
+TOOLBAR_PX, EDGE_PX = 40.0, 8.0  # at 1×: its width; between it and the picture's edges
+NARROW_PX = 560.0  # of a picture whose bar may lie over the axes
+_SIDE_PX, _LEAST_PX, _PAD_PX = 32.0, 22.0, 4.0  # of a button, where the window is low; around the buttons
 _TOOLS = (
-    ("box", Icon.BOX, "Box", ""),
-    ("lasso", Icon.LASSO, "Lasso", ""),
-    ("polygon", Icon.POLYGON, "Polygon", ": click its corners; Enter or a double click closes it"),
-    ("brush", Icon.SELECT_BRUSH, "Brush", ""),
-    ("sphere", Icon.SPHERE, "Sphere", ": drag from its center on a surface"),
-    ("flood", Icon.FLOOD, "Flood", ": click a surface; what is connected and alike in color"),
-    ("color", Icon.COLOR, "Color", ": click; everything that is alike in color"),
+    (
+        ("navigate:orbit", Icon.ORBIT, "Orbit around a pivot"),
+        ("navigate:fly", Icon.FLY, "Fly: W A S D, Q E; right drag looks around"),
+    ),
+    (
+        ("select_tool:box", Icon.BOX, "Box"),
+        ("select_tool:lasso", Icon.LASSO, "Lasso"),
+        (
+            "select_tool:polygon",
+            Icon.POLYGON,
+            "Polygon: click its corners; Enter or a double click closes it",
+        ),
+        ("select_tool:brush", Icon.SELECT_BRUSH, "Brush"),
+        ("select_tool:sphere", Icon.SPHERE, "Sphere: drag from its center on a surface"),
+        ("select_tool:flood", Icon.FLOOD, "Flood: click a surface; what is connected and alike in color"),
+        ("select_tool:color", Icon.COLOR, "Color: click; everything that is alike in color"),
+    ),
+    (
+        ("brush", Icon.BRUSH, "Paint the strength of the selected layer"),
+        ("decal", Icon.DECAL, "Decal: lay a picture on a surface"),
+        ("move_selected", Icon.MOVE, "Move, turn and scale what is selected: a layer with a slider"),
+    ),
 )
 _MODES = "Shift adds, Ctrl subtracts, both intersect"
 _OPERATIONS = (
-    (
-        ("Grow", "select_grow", "Add the neighbors"),
-        ("Shrink", "select_shrink", "Drop what borders on others"),
-        ("Smooth", "select_smooth", "Straighten the border, drop strays, fill holes"),
-        ("Largest", "select_largest", "Keep only the largest connected part"),
-    ),
-    (
-        ("Invert", "select_invert", f"Select everything else ({shortcut('invert')})"),
-        ("None", "select_none", "Select nothing"),
-        ("Hide", "hide_selected", "Hide the selection"),
-        ("Isolate", "isolate", "Hide everything else"),
-    ),
-    (
-        ("Remove", "remove_selected", "A layer that lets the selection vanish along its slider"),
-        ("Move", "move_selected", "A layer that moves, turns and scales the selection along its slider"),
-        ("Copy", "duplicate_selected", "A layer with a copy of the selection, placed by hand"),
-    ),
+    ("Smooth", "select_smooth", "Straighten the border, drop strays, fill holes"),
+    ("Largest part", "select_largest", "Keep only the largest connected part"),
+    ("Invert", "select_invert", "Select everything else"),
+    ("Select nothing", "select_none", ""),
+    ("Hide", "hide_selected", "Hide the selection"),
+    ("Isolate", "isolate", "Hide everything else"),
+    ("Remove", "remove_selected", "A layer that lets the selection vanish along its slider"),
+    ("Move", "move_selected", "A layer that moves, turns and scales the selection along its slider"),
+    ("Copy", "duplicate_selected", "A layer with a copy of the selection, placed by hand"),
 )
-COLUMN_PX = 82.0  # at 1×: where what a row chooses begins
+COLUMN_PX = 88.0  # at 1×: where what a row chooses begins
 _DEPTHS = {False: "Front", True: "Through"}
 _SIZE_KEYS = f"{shortcut('brush_radius:0.8')} and {shortcut('brush_radius:1.25')}"
-_MENU = "menu of a region"
-_ITEMS = ("Select", "Add to selection", "Subtract from selection", "Rename…", "Delete")
 
 
-def draw(state: ViewState, ui: UiContext, actions: list[str]) -> tuple[ViewState, Pointed | None]:
-    """The section; the changed state and what the mouse rests on. What was asked for goes into `actions`."""
-    imgui.dummy(imgui.ImVec2(0.0, 4.0 * ui.scale))
-    right = right_edge()
-    section("Select", ui)
-    side, gap = imgui.get_frame_height(), 1.0 * ui.scale
-    imgui.same_line(right - len(_TOOLS) * (side + gap) + gap)
-    for tool, icon, name, how in _TOOLS:
-        if _lit_button(tool, icon, state.select.tool == tool, ui):
-            actions.append(f"select_tool:{tool}")
-        tip(f"{name} ({shortcut(f'select_tool:{tool}')}){how}\n{_MODES}")
-        imgui.same_line(0.0, gap)
-    imgui.new_line()
-    held, count = state.select, state.selection.count
-    if held.tool:
-        state = replace(state, select=_options(held, ui))
-    _hidden(state, ui, actions)
-    pointed: Pointed | None = None
-    if not (held.tool or count):
-        return state, pointed
-    small(f"{group_digits(count)} splats selected" if count else "Nothing selected", PALETTE.dim)
-    if count and imgui.is_item_hovered(imgui.HoveredFlags_.for_tooltip.value):
-        pointed = ("selection", 0)
-    imgui.begin_disabled(not count)
-    gap, wide = 4.0 * ui.scale, imgui.get_content_region_avail().x
-    imgui.push_style_var(imgui.StyleVar_.frame_padding, imgui.ImVec2(0.0, 4.0 * ui.scale))
-    for row in _OPERATIONS:
-        for i, (name, action, help_) in enumerate(row):
+def _open_below(share: float, ui: UiContext) -> None:
+    """The menu that comes next opens under the plate, `share` of the way along its foot."""
+    (x, y), size = imgui.get_window_pos(), imgui.get_window_size()
+    at = imgui.ImVec2(x + share * size.x, y + size.y + 4.0 * ui.scale)
+    imgui.set_next_window_pos(at, 0, imgui.ImVec2(share, 0.0))
+
+
+def draw_toolbar(view: ViewState, area: Area, ui: UiContext, actions: list[str]) -> None:
+    """The tools along the left edge of the picture; `area`: less what lies over its foot."""
+    tool = f"select_tool:{view.select.tool}" if view.select.tool else "brush" * view.brush.active
+    held = tool or f"navigate:{view.camera.mode}"
+    off = {"brush": not view.layers, "move_selected": not view.selection.count}
+    count, gap = sum(map(len, _TOOLS)), 6.0 * ui.scale
+    room = area.height - 2 * (EDGE_PX + _PAD_PX) * ui.scale - gap * (len(_TOOLS) - 1)
+    side = min(max(room / count, _LEAST_PX * ui.scale), _SIDE_PX * ui.scale)
+    imgui.push_style_var(imgui.StyleVar_.item_spacing, imgui.ImVec2(0.0, 0.0))
+    with plate("tools", imgui.ImVec2(EDGE_PX * ui.scale, EDGE_PX * ui.scale), ui, pad=_PAD_PX):
+        for i, group in enumerate(_TOOLS):
             if i:
-                imgui.same_line(0.0, gap)
-            each = (wide - (len(row) - 1) * gap) / len(row)
-            if imgui.button(f"{name}##{action}", imgui.ImVec2(each, 0.0)):
-                actions.append(action)
-            tip(help_, action)
+                imgui.dummy(imgui.ImVec2(1.0, gap))
+            for action, icon, help_ in group:
+                imgui.begin_disabled(off.get(action, False))
+                if icon_button(action, icon, ui, lit=action == held, side=side):
+                    actions.append(action)
+                imgui.end_disabled()
+                missing = ".\nSelect something first" if action == "move_selected" and off[action] else ""
+                keys = "fly" if action.startswith("navigate") else action
+                tip(help_ + missing + (f"\n{_MODES}" if "select_tool" in action else ""), keys)
     imgui.pop_style_var()
-    _save(len(state.selection.regions), ui, actions)
-    imgui.end_disabled()
-    return state, pointed
 
 
-def _options(tool: SelectTool, ui: UiContext) -> SelectTool:
+Value = TypeVar("Value")
+
+
+class _Bar:
+    """Lays items one beside the other and breaks the line where the next one would not fit."""
+
+    def __init__(self, limit: float, ui: UiContext) -> None:
+        self.limit, self.ui = limit, ui  # window pixels: where the line ends
+
+    def follow(self, wide: float) -> None:
+        """What comes next is so wide."""
+        gap = EDGE_PX * self.ui.scale
+        if imgui.get_item_rect_max().x + gap + wide <= self.limit:
+            imgui.same_line(0.0, gap)
+
+    def segments(
+        self, name: str, options: dict[Value, str], current: Value, help_: str, action: str
+    ) -> Value:
+        """One of a few values; the one that was chosen."""
+        wide = sum(imgui.calc_text_size(text).x + 14.0 * self.ui.scale for text in options.values())
+        self.follow(wide)
+        pressed = choice(name, [*options.values()], [*options].index(current), self.ui, wide)
+        tip(help_, action)
+        return current if pressed is None else [*options][pressed]
+
+    def slider(
+        self,
+        title: str,
+        value: float,
+        ends: tuple[float, float],
+        default: float,
+        help_: str,
+        form: str = "%.2f",
+    ) -> float:
+        """A number."""
+        wide = imgui.calc_text_size(f"{title} 0.00").x + 14.0 * self.ui.scale
+        self.follow(wide)
+        value = value_slider(f"##{title}", value, ends, f"{title} {form}", default, self.ui, wide)
+        tip(help_)
+        return value
+
+    def button(self, text: str, action: str, help_: str, actions: list[str]) -> None:
+        self.follow(imgui.calc_text_size(text).x + 2 * imgui.get_style().frame_padding.x)
+        if imgui.button(f"{text}##{action}"):
+            actions.append(action)
+        tip(help_, action)
+
+
+def draw_options(work: Workspace, area: Area, ui: UiContext, actions: list[str]) -> tuple[Workspace, float]:
+    """The bar above the picture: how the tool in hand works, and what is done with what is selected.
+
+    Returns:
+        The changed workspace; the height of the bar's foot, 0 where there is none.
+    """
+    view = work.view
+    if not (view.select.tool or view.brush.active or view.selection.count or view.selection.hidden):
+        return work, 0.0
+    left, right = (TOOLBAR_PX + 2 * EDGE_PX) * ui.scale, area.width - EDGE_PX * ui.scale
+    narrow = area.width < NARROW_PX * ui.scale  # else it leaves the axes free
+    bar = _Bar(right - (0.0 if narrow else view_width(view, area, ui)) - EDGE_PX * ui.scale, ui)
+    with plate("options", imgui.ImVec2(left, EDGE_PX * ui.scale), ui):
+        imgui.push_style_var(
+            imgui.StyleVar_.item_spacing, imgui.ImVec2(EDGE_PX * ui.scale, EDGE_PX * ui.scale)
+        )
+        imgui.align_text_to_frame_padding()
+        if view.brush.active:
+            imgui.text("Paint")
+            view = _brush_options(view, work.focus, bar, actions)
+        elif view.select.tool:
+            imgui.text(view.select.tool.capitalize())
+            view = replace(view, select=_select_options(view.select, bar))
+        else:
+            imgui.dummy(imgui.ImVec2(0.0, imgui.get_frame_height()))
+        pointed = None if view.brush.active else _selection(view, bar, actions)
+        foot = imgui.get_window_pos().y + imgui.get_window_size().y
+        imgui.pop_style_var()
+    return replace(work, view=view, pointed=work.pointed or pointed), foot
+
+
+def _selection(view: ViewState, bar: _Bar, actions: list[str]) -> Pointed | None:
+    """How much is selected and hidden, and what is done with it; whether the mouse rests on the number."""
+    count, pointed = view.selection.count, None
+    if count or view.select.tool:
+        text = f"{group_digits(count)} selected" if count else "Nothing selected"
+        bar.follow(imgui.calc_text_size(text).x)
+        imgui.align_text_to_frame_padding()
+        imgui.text_disabled(text)
+        if count and imgui.is_item_hovered(imgui.HoveredFlags_.for_tooltip.value):
+            pointed = ("selection", 0)
+        imgui.begin_disabled(not count)
+        bar.button("Grow", "select_grow", "Add the neighbors", actions)
+        bar.button("Shrink", "select_shrink", "Drop what borders on others", actions)
+        bar.follow(imgui.get_frame_height())
+        more_button("more", _OPERATIONS, bar.ui, actions)
+        tip("Smooth, invert, hide, remove, move, copy")
+        _save(len(view.selection.regions), bar, actions)
+        imgui.end_disabled()
+    if view.selection.hidden:
+        bar.button(f"{Icon.HIDDEN}  Show hidden", "show_hidden", "Some splats are hidden: show all", actions)
+    return pointed
+
+
+def _select_options(tool: SelectTool, bar: _Bar) -> SelectTool:
     """How the tool selects."""
-    column = COLUMN_PX * ui.scale
-    modes = dict(zip(SELECT_MODES, ("New", "Add", "Sub", "And"), strict=True))
+    modes = dict(zip(SELECT_MODES, ("New", "Add", "Subtract", "Intersect"), strict=True))
     help_ = f"What becomes of the present selection.\n{_MODES}"
-    tool = replace(tool, mode=choice_row("Mode", modes, tool.mode, column, ui, help_))
+    tool = replace(tool, mode=bar.segments("mode", modes, tool.mode, help_, ""))
     if tool.tool not in ("sphere", "flood"):
         help_ = "Select only the front surface, or everything behind it too"
-        through = choice_row("Depth", _DEPTHS, tool.through, column, ui, help_, "select_through")
+        through = bar.segments("depth", _DEPTHS, tool.through, help_, "select_through")
         tool = replace(tool, through=through)
     if tool.tool == "brush":
         ends, help_ = (SMALLEST_PX, LARGEST_PX), f"Brush radius ({_SIZE_KEYS})"
-        radius = slider_row("Radius", tool.radius, ends, SelectTool.radius, column, ui, help_, "%.0f px")
+        radius = bar.slider("Radius", tool.radius, ends, SelectTool.radius, help_, "%.0f px")
         tool = replace(tool, radius=radius)
     if tool.tool in ("flood", "color"):
-        ends = (0.01, 1.0)
         help_ = f"How unlike the clicked color a color may be ({_SIZE_KEYS}). The last click follows it"
-        tolerance = slider_row("Tolerance", tool.tolerance, ends, SelectTool.tolerance, column, ui, help_)
+        tolerance = bar.slider("Tolerance", tool.tolerance, (0.01, 1.0), SelectTool.tolerance, help_)
         tool = replace(tool, tolerance=tolerance)
     return tool
 
 
-def _hidden(state: ViewState, ui: UiContext, actions: list[str]) -> None:
-    """Where splats are hidden, that they are, and a way back."""
-    if state.selection.hidden:
-        right, name = right_edge(), "Show all"
-        small("Some splats are hidden", PALETTE.warning)
-        imgui.same_line(right - imgui.calc_text_size(name).x - 2 * imgui.get_style().frame_padding.x)
-        if imgui.small_button(f"{name}##hidden"):
-            actions.append("show_hidden")
-        tip("Show all splats again", "show_all")
-
-
-def _save(regions: int, ui: UiContext, actions: list[str]) -> None:
+def _save(regions: int, bar: _Bar, actions: list[str]) -> None:
     """The button that keeps the selection, in its place the field for the name."""
     storage, naming = imgui.get_state_storage(), imgui.get_id("naming a region")
+    text, wide = "Save as region…", 128.0 * bar.ui.scale
+    bar.follow(wide)
     if storage.get_bool(naming):
-        name = typed_name(f"region-{regions + 1}", imgui.get_content_region_avail().x)
+        name = typed_name(f"region-{regions + 1}", wide)
         storage.set_bool(naming, name is None)
         if name:
             actions.append(f"save_region:{name}")
-    elif imgui.button("Save as region…", imgui.ImVec2(imgui.get_content_region_avail().x, 0.0)):
+    elif imgui.button(text, imgui.ImVec2(wide, 0.0)):
         storage.set_bool(naming, True)
     else:
-        tip("Keep the selection as NAME.region.npy and as a row below")
-
-
-def _lit_button(name: str, icon: str, lit: bool, ui: UiContext) -> bool:
-    """An icon button with the accent behind it while it is on."""
-    if lit:
-        x, y = imgui.get_cursor_screen_pos()
-        side = imgui.get_frame_height()
-        corners = imgui.ImVec2(x, y), imgui.ImVec2(x + side, y + side)
-        canvas = imgui.get_window_draw_list()
-        canvas.add_rect_filled(
-            *corners, imgui.get_color_u32(imgui.ImVec4(*PALETTE.accent_dark)), 4 * ui.scale
-        )
-    return icon_button(f"select {name}", icon, ui, dim=False)
-
-
-def draw_regions(regions: tuple[NamedRegion, ...], ui: UiContext, actions: list[str]) -> Pointed | None:
-    """The section "Regions", where there are some: a row for each; the one that the mouse rests on."""
-    if not regions:
-        return None
-    imgui.dummy(imgui.ImVec2(0.0, 4.0 * ui.scale))
-    section("Regions", ui)
-    pointed: Pointed | None = None
-    for i, region in enumerate(regions):
-        imgui.push_id(f"region {i}")
-        if _row(i, region, ui, actions):
-            pointed = ("region", i)
-        imgui.pop_id()
-    return pointed
-
-
-def _row(index: int, region: NamedRegion, ui: UiContext, actions: list[str]) -> bool:
-    """Eye, swatch, name and count; whether the mouse rests on it."""
-    right, scale = right_edge(), ui.scale
-    icon = Icon.SHOWN if region.visible else Icon.HIDDEN
-    if icon_button("eye", icon, ui, dim=not region.visible):
-        actions.append(f"show_region:{index}")
-    tip("Tint this region in the picture")
-    imgui.same_line()
-    swatch(region.color, 1.0, False, ui)
-    tall, canvas = imgui.get_frame_height(), imgui.get_window_draw_list()
-    imgui.same_line()
-    count = group_digits(region.count)
-    imgui.push_font(None, SMALL_PX)
-    wide = imgui.calc_text_size(count).x
-    imgui.pop_font()
-    room = right - wide - 10.0 * scale - imgui.get_cursor_pos_x()
-    naming, storage = imgui.get_id("naming"), imgui.get_state_storage()
-    if storage.get_bool(naming):
-        name = typed_name(region.name, room)
-        storage.set_bool(naming, name is None)
-        actions += [f"rename_region:{index}:{name}"] if name else []
-        return False
-    x, y = imgui.get_cursor_screen_pos()
-    io, mouse = imgui.get_io(), imgui.MouseButton_
-    if imgui.invisible_button("select", imgui.ImVec2(max(right - imgui.get_cursor_pos_x(), 1.0), tall)):
-        mode = "add" if io.key_shift else "subtract" if io.key_ctrl else "new"
-        actions.append(f"region:{index}:{mode}")
-    resting = imgui.is_item_hovered(imgui.HoveredFlags_.for_tooltip.value)
-    color = u32(PALETTE.text if imgui.is_item_hovered() else PALETTE.dim)
-    tip(f"{region.path}\nClick to select; Shift adds, Ctrl subtracts. Right-click: rename, delete")
-    if imgui.is_item_clicked(mouse.right.value):
-        imgui.open_popup(_MENU)
-    above = imgui.get_style().frame_padding.y
-    canvas.add_text(imgui.ImVec2(x, y + above), u32(PALETTE.text), elide(region.name, room))
-    at = imgui.ImVec2(imgui.get_item_rect_max().x - wide, y + above + 1.0 * scale)
-    canvas.add_text(ui.fonts.regular, SMALL_PX * scale, at, color, count)
-    match _chosen(ui):
-        case "Rename…":
-            storage.set_bool(naming, True)
-        case "Delete":
-            actions.append(f"forget_region:{index}")
-        case "Select":
-            actions.append(f"region:{index}:new")
-        case "Add to selection":
-            actions.append(f"region:{index}:add")
-        case "Subtract from selection":
-            actions.append(f"region:{index}:subtract")
-    return bool(resting)
-
-
-def _chosen(ui: UiContext) -> str:
-    """The item of the menu that was chosen, "" for none."""
-    with menu(_MENU, ui) as is_open:
-        chosen = [name for name in _ITEMS if is_open and imgui.menu_item(name, "", False)[0]]
-    return chosen[0] if chosen else ""
+        tip("Keep the selection as a file and as a row under Regions")
 
 
 PAINT_DRAG = "brush"
 """What a left drag does while the brush is active, beside those of `keys.DRAGS`."""
 
-NAMES = {"add": "Add", "erase": "Erase", "smooth": "Smooth"}
 WHOLE = (
     ("Clear", "paint_clear", "Set all weights to 0"),
     ("Fill", "paint_fill", "Set all weights to 1"),
-    ("Invert", "paint_invert", f"Swap what is painted and what is not ({shortcut('invert')})"),
+    ("Invert", "paint_invert", "Swap what is painted and what is not"),
     ("Feather", "paint_feather", "Soften the edges of the paint; repeat for more"),
 )
-"""Buttons for all of a layer's paint: name, action of `keys.KEYS`, tip."""
+"""Of the menu for all of a layer's paint: name, action of `keys.KEYS`, tip."""
 
 
 def paint_obstacle(view: ViewState, focus: int | None) -> str:
@@ -271,79 +280,52 @@ def paint_obstacle(view: ViewState, focus: int | None) -> str:
     return ""
 
 
-def draw_brush(view: ViewState, focus: int | None, ui: UiContext, actions: list[str]) -> ViewState:
-    """The brush's controls."""
-    column, brush = COLUMN_PX * ui.scale, view.brush
-    imgui.push_id("brush")
-    imgui.dummy(imgui.ImVec2(0.0, 4.0 * ui.scale))
-    section("Paint", ui)
+def _brush_options(view: ViewState, focus: int | None, bar: _Bar, actions: list[str]) -> ViewState:
+    """How the brush paints."""
+    brush, modes = view.brush, {"add": "Add", "erase": "Erase", "smooth": "Smooth"}
     help_ = f"Brush mode ({shortcut('brush_mode')}). While painting, Ctrl inverts and Shift smooths"
-    brush = replace(brush, mode=choice_row("Brush", NAMES, brush.mode, column, ui, help_))
+    brush = replace(brush, mode=bar.segments("mode", modes, brush.mode, help_, ""))
     ends, help_ = (SMALLEST_PX, LARGEST_PX), f"Brush radius ({_SIZE_KEYS})"
-    radius = slider_row("Radius", brush.radius, ends, Brush.radius, column, ui, help_, "%.0f px")
+    radius = bar.slider("Radius", brush.radius, ends, Brush.radius, help_, "%.0f px")
     help_ = f"Brush softness ({shortcut('brush_softness:-0.1')} and ])"
-    softness = slider_row("Softness", brush.softness, (0.0, 1.0), Brush.softness, column, ui, help_)
+    softness = bar.slider("Softness", brush.softness, (0.0, 1.0), Brush.softness, help_)
     help_ = "How far one stroke goes; strokes over each other go further"
-    flow = slider_row("Flow", brush.flow, (0.0, 1.0), Brush.flow, column, ui, help_)
-    label("Value", column)
-    imgui.begin_disabled(brush.mode != "add")
-    value = value_slider("##value", brush.value, (0.0, 1.0), "%.2f", Brush.value, ui)
-    imgui.end_disabled()
-    tip("The share of the edit that Add paints")
+    flow, value = bar.slider("Flow", brush.flow, (0.0, 1.0), Brush.flow, help_), brush.value
+    if brush.mode == "add":
+        value = bar.slider("Value", value, (0.0, 1.0), Brush.value, "The share of the edit that Add paints")
     help_ = "Paint only the front surface, or everything under the brush"
-    through = choice_row("Depth", _DEPTHS, brush.through, column, ui, help_, "brush_through")
+    through = bar.segments("depth", _DEPTHS, brush.through, help_, "brush_through")
     help_ = "Tint lightly what has less than all of the edit, or show all weights from blue (0) to yellow (1)"
-    weights = choice_row(
-        "Weights", {False: "Tint", True: "Colors"}, brush.weights, column, ui, help_, "brush_weights"
-    )
-    brush = replace(
+    kinds = {False: "Tint", True: "Colors"}
+    weights = bar.segments("weights", kinds, brush.weights, help_, "brush_weights")
+    if weights:
+        _legend(bar)
+    imgui.begin_disabled(focus is None or view.layers[focus].locked)
+    bar.follow(imgui.get_frame_height())
+    more_button("paint", WHOLE, bar.ui, actions)
+    imgui.end_disabled()
+    tip("Clear, fill, invert or feather all paint of the layer")
+    changed = replace(
         brush, radius=radius, softness=softness, flow=flow, value=value, through=through, weights=weights
     )
-    if brush.weights:
-        _legend(column, ui)
-    label("Layer", column)
-    imgui.begin_disabled(focus is None or view.layers[focus].locked)
-    texts = [imgui.calc_text_size(text).x for text, *_ in WHOLE]
-    spare = imgui.get_content_region_avail().x - 4.0 * (len(WHOLE) - 1) * ui.scale - sum(texts)
-    imgui.push_style_var(
-        imgui.StyleVar_.frame_padding.value, imgui.ImVec2(0.0, imgui.get_style().frame_padding.y)
-    )
-    for wide, (text, action, help_) in zip(texts, WHOLE, strict=True):
-        if imgui.button(f"{text}##{action}", imgui.ImVec2(wide + spare / len(WHOLE), 0.0)):
-            actions.append(action)
-        tip(help_, action)
-        imgui.same_line(0.0, 4.0 * ui.scale)
-    imgui.pop_style_var()
-    imgui.end_disabled()
-    imgui.new_line()
-    imgui.pop_id()
-    return replace(view, brush=brush)
+    return replace(view, brush=changed)
 
 
-def _legend(column: float, ui: UiContext) -> None:
+def _legend(bar: _Bar) -> None:
     """The ramp of the weights with its ends named."""
-    imgui.set_cursor_pos_x(column)
-    left, top = imgui.get_cursor_screen_pos()
-    width, height, size = imgui.get_content_region_avail().x, 10.0 * ui.scale, SMALL_PX * ui.scale
-    canvas = imgui.get_window_draw_list()
+    wide, tall = 96.0 * bar.ui.scale, imgui.get_frame_height()
+    bar.follow(wide)
+    (left, top), canvas = imgui.get_cursor_screen_pos(), imgui.get_window_draw_list()
+    imgui.dummy(imgui.ImVec2(wide, tall))
     for (start, a), (end, b) in pairwise(highlight.RAMP):
         low, high = (u32(highlight.rgba(color)) for color in (a, b))
-        corners = imgui.ImVec2(left + start * width, top), imgui.ImVec2(left + end * width, top + height)
+        corners = imgui.ImVec2(left + start * wide, top), imgui.ImVec2(left + end * wide, top + tall)
         canvas.add_rect_filled_multi_color(*corners, low, high, high, low)
-    imgui.push_font(None, SMALL_PX)
-    wide = imgui.calc_text_size("1").x
-    imgui.pop_font()
-    for x, text in ((left, "0"), (left + width - wide, "1")):
-        at = imgui.ImVec2(round(x), round(top + height + 2.0 * ui.scale))
-        canvas.add_text(ui.fonts.regular, size, at, u32(PALETTE.dim), text)
-    imgui.dummy(imgui.ImVec2(width, height + size + 2.0 * ui.scale))
-
-
-def brush_button(view: ViewState, ui: UiContext) -> bool:
-    """The button that takes the brush up and puts it down; True when pressed."""
-    pressed = icon_button("brush", Icon.BRUSH, ui, dim=not view.brush.active)
-    tip("Paint the strength of the selected layer", "brush")
-    return pressed
+    for x, text, color in (
+        (left + 6.0 * bar.ui.scale, "0", PALETTE.handle),
+        (left + wide - 14.0 * bar.ui.scale, "1", PALETTE.ink),
+    ):
+        canvas.add_text(imgui.ImVec2(round(x), round(top + 5.0 * bar.ui.scale)), u32(color), text)
 
 
 def draw_ring(view: ViewState, ui: UiContext) -> None:
@@ -355,3 +337,157 @@ def draw_ring(view: ViewState, ui: UiContext) -> None:
         if size > 2.0 * ui.scale:
             canvas.add_circle(mouse, size, u32((0.0, 0.0, 0.0, 0.5 * alpha)), 0, 3.0 * ui.scale)
             canvas.add_circle(mouse, size, u32((*PALETTE.handle[:3], alpha)), 0, 1.25 * ui.scale)
+
+
+_COMPARISONS = (
+    ("off", "Edited alone", ""),
+    ("beside", "Side by side", "beside"),
+    ("split", "Split", "split"),
+    ("difference", "Difference", "difference"),
+)
+_AGAINST = (
+    ("original", "Against the original", ""),
+    ("recorded", "Against what training recorded", "against"),
+    ("snapshots", "Snapshot A against B", "compare_snapshots"),
+)
+
+
+def draw_comparison(
+    work: Workspace, words: Labels, off: dict[str, str], original: bool, place: imgui.ImVec2, ui: UiContext
+) -> tuple[Workspace, str]:
+    """The pill at the top of the picture: what is compared with what, and how.
+
+    Args:
+        words: of the comparison on screen
+        off: of `AGAINST`, what there is nothing of, and why
+        original: the original is shown
+        place: the middle of its upper edge, window pixels
+
+    Returns:
+        The changed workspace, and the action that was asked for, "" for none.
+    """
+    compare, asked = work.view.compare, ""
+    on = compare.mode != "off" and not original
+    right, _, figure = words.right.partition(" · ")
+    left = words.left
+    if right == FIELD:
+        left, right, figure = "as trained", "edited", f"{words.left} · {figure}"
+    figure = words.line if compare.mode == "difference" else figure
+    imgui.push_style_var(imgui.StyleVar_.item_spacing, imgui.ImVec2(0.0, 2.0 * ui.scale))
+    with plate("comparison", place, ui, (0.5, 0.0), _PAD_PX):
+        if _word("left", left.capitalize(), on or original, ui):
+            asked = "before"
+        tip("Show the original: tap, or hold", "before")
+        imgui.same_line()
+        if icon_button("split", Icon.SPLIT, ui, lit=on):
+            asked = compare.mode if on else "split"
+        tip(f"Compare in a split view ({shortcut('split')})" + (f"\n{figure}" if figure else ""))
+        imgui.same_line()
+        name = right.capitalize() + (f" × {compare.amplify:g}" if compare.mode == "difference" else "")
+        if _word("right", name, not original, ui):
+            asked = "before" if work.before else compare.mode if on else ""
+        tip(figure or "The scene with its edits")
+        imgui.same_line()
+        if icon_button("comparisons", Icon.UNFOLDED, ui):
+            imgui.open_popup("comparisons")
+        tip("How to compare, and with what")
+        if on and words.notice:
+            small(words.notice, PALETTE.warning)
+        imgui.pop_style_var()
+        _open_below(0.5, ui)
+        with menu("comparisons", ui) as is_open:
+            compare = _choose_comparison(compare, off, ui) if is_open else compare
+    return replace(work, view=replace(work.view, compare=compare)), asked
+
+
+def _word(name: str, text: str, bright: bool, ui: UiContext) -> bool:
+    """One side of the comparison; True when it was pressed."""
+    imgui.push_style_color(imgui.Col_.text, imgui.ImVec4(*(PALETTE.handle if bright else PALETTE.dim)))
+    imgui.push_style_color(imgui.Col_.button, imgui.ImVec4(0.0, 0.0, 0.0, 0.0))
+    pressed = imgui.button(f"{elide(text, 200.0 * ui.scale)}##{name}")
+    imgui.pop_style_color(2)
+    return bool(pressed)
+
+
+def _choose_comparison(compare: Comparison, off: dict[str, str], ui: UiContext) -> Comparison:
+    for mode, text, action in _COMPARISONS:
+        if imgui.menu_item(text, shortcut(action), compare.mode == mode)[0]:
+            compare = replace(compare, mode=mode)
+    imgui.separator()
+    for against, text, action in _AGAINST:
+        why = off.get(against, "")
+        if imgui.menu_item(text, shortcut(action), compare.against == against, not why)[0]:
+            compare = replace(
+                compare, against=against, mode="split" if compare.mode == "off" else compare.mode
+            )
+        if why:
+            tip(why)
+    if compare.mode == "difference":
+        ends = 1.0, MOST_AMPLIFIED
+        times = value_slider("##amplify", compare.amplify, ends, "Gain × %.0f", Comparison.amplify, ui)
+        compare = replace(compare, amplify=float(round(times)))
+    return compare
+
+
+UPS: tuple[tuple[str, Vec3], ...] = (
+    ("+X", (1.0, 0.0, 0.0)),
+    ("−X", (-1.0, 0.0, 0.0)),
+    ("+Y", (0.0, 1.0, 0.0)),
+    ("−Y", (0.0, -1.0, 0.0)),
+    ("+Z", (0.0, 0.0, 1.0)),
+    ("−Z", (0.0, 0.0, -1.0)),
+)
+
+
+_LOOKS = (
+    ("frame", Icon.FRAME, "Frame the selection, the focused layer, or the scene"),
+    ("home", Icon.HOME, "Reset the view"),
+)
+
+
+def view_width(view: ViewState, area: Area, ui: UiContext) -> float:
+    """How far the axes and the buttons under them reach into the picture, window pixels."""
+    buttons = 3 * imgui.get_frame_height() + 2 * (_PAD_PX + EDGE_PX) * ui.scale
+    return max(overlay.axes_height(view, area, ui), buttons)
+
+
+def draw_view(view: ViewState, area: Area, foot: float, ui: UiContext, actions: list[str]) -> ViewState:
+    """Under the axes: frame, home, and the popover of what one sets once; `foot`: of the bar."""
+    top = max(overlay.axes_height(view, area, ui), EDGE_PX * ui.scale)
+    if top < foot and area.width < NARROW_PX * ui.scale:
+        return view  # the bar lies over it
+    imgui.push_style_var(imgui.StyleVar_.item_spacing, imgui.ImVec2(0.0, 0.0))
+    with plate("view", imgui.ImVec2(area.width - EDGE_PX * ui.scale, top), ui, (1.0, 0.0), _PAD_PX):
+        icon_row(_LOOKS, ui, actions)
+        imgui.same_line()
+        if icon_button("view", Icon.VIEW, ui):
+            imgui.open_popup("view settings")
+        tip("Up axis, field of view, background, grid")
+        imgui.pop_style_var()
+        _open_below(1.0, ui)
+        with menu("view settings", ui) as is_open:
+            view = _view_rows(view, ui, actions) if is_open else view
+    return view
+
+
+def _view_rows(view: ViewState, ui: UiContext, actions: list[str]) -> ViewState:
+    column, wide, camera = COLUMN_PX * ui.scale, 232.0 * ui.scale, view.camera
+    label("Up axis", column)
+    ups = (*UPS, ("View", axes(camera).up))
+    current = next((i for i, (_, up) in enumerate(UPS) if up == camera.up), len(UPS))
+    chosen = choice("up", tuple(name for name, _ in ups), current, ui, wide)
+    tip("Up axis of the scene. View: use the current view's up direction")
+    if chosen is not None:
+        camera = with_up(camera, ups[chosen][1])
+    label("View angle", column)
+    fov_y = value_slider("##fov", camera.fov_y, (10.0, 110.0), "%.0f°", ViewCamera.fov_y, ui, wide)
+    camera = replace(camera, fov_y=fov_y)
+    tip(f"Vertical field of view. Double-click: reset to {ViewCamera.fov_y:g}°")
+    label("Background", column)
+    picker = imgui.ColorEditFlags_.no_inputs.value | imgui.ColorEditFlags_.no_alpha.value
+    changed, (red, green, blue) = imgui.color_edit3("##background", list(view.background), picker)
+    background = (red, green, blue) if changed else view.background
+    for name, action, on in (("Ground grid", "grid", view.grid), ("Axes", "axes", view.axes)):
+        if imgui.menu_item(name, shortcut(action), on)[0]:
+            actions.append(action)
+    return replace(view, camera=camera, background=background)

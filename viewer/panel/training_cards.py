@@ -1,75 +1,114 @@
-"""Jobs in the panel, training and deliveries: a card each, with its progress and buttons."""
+"""Jobs at the foot of the panel, training and deliveries: a strip that opens to a card for each."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 
 from imgui_bundle import imgui
 
-from viewer.jobs.job_queue import Job
+from viewer.jobs.job_queue import Delivery, Job
 from viewer.jobs.training import EditOrder, duration
-from viewer.ui.context import PALETTE, SMALL_PX, Icon, UiContext, u32
-from viewer.ui.widgets import card, elide, menu, right_edge, small, small_toggle, tip
+from viewer.ui.context import PALETTE, SMALL_PX, Icon, Rgba, UiContext, u32
+from viewer.ui.widgets import card, elide, menu_items, right_edge, small, tip, wrapped_text
 
-BAR_PX = 5.0
+BAR_PX, STRIP_PX = 5.0, 28.0
 STARVED = "Waits for the processor"
 _MENU = "menu of a training"
+_ITEMS = (("Show log…", "run_log", ""), ("Discard…", "ask_discard", ""))
 _UNWRITTEN = "Nothing is written"
 
 
+def height(jobs: Sequence[Job], ui: UiContext) -> float:
+    """Of the strip and, where it is open, the cards over it; window pixels."""
+    if not _shown_jobs(jobs):
+        return 0.0
+    storage = imgui.get_state_storage()
+    cards = storage.get_float(imgui.get_id(_TALL)) if storage.get_bool(imgui.get_id(_OPEN)) else 0.0
+    return (STRIP_PX + 1.0) * ui.scale + imgui.get_style().item_spacing.y * (1 + bool(cards)) + cards
+
+
 def draw(jobs: Sequence[Job], ui: UiContext, actions: list[str]) -> None:
-    """One card a job, the next one at the bottom."""
-    for job in jobs:
-        if job.status != "done" or job.warning:
+    """The strip, and over it one card a job while it is open; a failure opens it."""
+    listed, storage = _shown_jobs(jobs), imgui.get_state_storage()
+    if not listed:
+        return
+    is_open, seen, tall = imgui.get_id(_OPEN), imgui.get_id("seen failure"), imgui.get_id(_TALL)
+    failed = max((job.number for job in listed if _is_failed(job)), default=0)
+    if failed > storage.get_int(seen):
+        storage.set_int(seen, failed)
+        storage.set_bool(is_open, True)
+    imgui.separator()
+    if storage.get_bool(is_open):
+        room = 0.5 * imgui.get_window_height()
+        imgui.begin_child("jobs", imgui.ImVec2(0.0, max(min(storage.get_float(tall), room), 1.0)))
+        for job in listed:
             imgui.push_id(job.number)
-            actions += _card(_job_row(job), job.number, ui)
+            actions += _card(job, ui)
             imgui.pop_id()
+        needed = imgui.get_cursor_pos_y() - imgui.get_style().item_spacing.y
+        imgui.end_child()
+        storage.set_float(tall, min(needed, room))
+    if _strip(listed, storage.get_bool(is_open), ui):
+        storage.set_bool(is_open, not storage.get_bool(is_open))
 
 
-@dataclass(frozen=True)
-class _Row:
-    """A card: its name and tip, the word at the right, the bar, the line below, its buttons and its menu."""
-
-    name: str
-    tip: str
-    word: str
-    share: float
-    said: str
-    failed: bool
-    runs: bool
-    buttons: tuple[tuple[str, str, str], ...]
-    menu: tuple[tuple[str, str, bool], ...] = ()
+_OPEN, _TALL = "jobs are open", "height of the jobs"
 
 
-def _job_row(job: Job) -> _Row:
-    task, failed = job.task, job.status == "failed" or bool(job.warning)
-    about = str(task.out)
-    if isinstance(task, EditOrder):
-        about = f"{task.name}\n{task.editor} on {task.region}\n{task.out}"
-    line = (
-        (job.error or job.warning)
-        if failed
-        else f"For {job.elsewhere}  ·  " * bool(job.elsewhere) + _status_text(job)
-    )
-    runs = job.status == "running" and not job.starved
-    items = ("Show log…", "run_log", True), ("Discard…", "ask_discard", job.status in ("stopped", "failed"))
-    row = _Row(task.name, about, _status(job), job.progress.share, line, failed, runs, _buttons(job))
-    return replace(row, menu=items) if isinstance(task, EditOrder) and job.status != "queued" else row
+def _shown_jobs(jobs: Sequence[Job]) -> list[Job]:
+    """Those that have a card: a trained edit is a layer, and needs none."""
+    return [job for job in jobs if job.status != "done" or job.warning or isinstance(job.task, Delivery)]
 
 
-def _card(row: _Row, number: int, ui: UiContext) -> list[str]:
+def _is_failed(job: Job) -> bool:
+    return job.status == "failed" or bool(job.warning)
+
+
+def _strip(jobs: Sequence[Job], is_open: bool, ui: UiContext) -> bool:
+    """One line: the job that matters most, and how many more there are; True when it was pressed."""
+    order = ("failed", "running", "stopping", "done")
+    job = min(jobs, key=lambda job: order.index(job.status) if job.status in order else len(order))
+    start, right, tall = imgui.get_cursor_pos(), right_edge(), STRIP_PX * ui.scale
+    (x, y), dot = imgui.get_cursor_screen_pos(), 4.0 * ui.scale
+    pressed = imgui.invisible_button("strip", imgui.ImVec2(imgui.get_content_region_avail().x, tall))
+    tip("Show or hide the cards of all jobs")
+    color = PALETTE.error if _is_failed(job) else PALETTE.accent if job.status == "running" else PALETTE.dim
+    imgui.get_window_draw_list().add_circle_filled(imgui.ImVec2(x + dot, y + tall / 2), dot, u32(color))
+    end = (f"+{len(jobs) - 1}   " if len(jobs) > 1 else "") + (Icon.UNFOLDED if is_open else Icon.RAISED)
+    left = job.seconds_left
+    words = f"{_status(job)}  ·  {duration(left)}" if left is not None else _status(job)
+    below, sizes = imgui.get_cursor_pos(), [imgui.calc_text_size(text).x for text in (words, end)]
+    top = start.y + (tall - imgui.get_text_line_height()) / 2
+    imgui.set_cursor_pos(imgui.ImVec2(start.x + 4 * dot, top))
+    imgui.text(elide(job.task.name, right - start.x - sum(sizes) - 8 * dot))
+    for text, at in ((words, 0.0), (end, right - sizes[1])):
+        imgui.same_line(at)
+        imgui.text_disabled(text)
+    imgui.set_cursor_pos(below)
+    return bool(pressed)
+
+
+def _card(job: Job, ui: UiContext) -> list[str]:
+    """Name and status, how far it is, what it does, buttons; and a menu of what cannot be undone."""
+    task, failed, word = job.task, _is_failed(job), _status(job)
     with card("card", PALETTE.card, ui):
-        right = right_edge()
-        wide = imgui.calc_text_size(row.word).x
+        right, wide = right_edge(), imgui.calc_text_size(word).x
         imgui.align_text_to_frame_padding()
-        imgui.text(elide(row.name, right - wide - 16.0 * ui.scale))
-        tip(row.tip)
+        imgui.text(elide(task.name, right - wide - 16.0 * ui.scale))
+        about = f"{task.name}\n{task.editor} on {task.region}\n" if isinstance(task, EditOrder) else ""
+        tip(f"{about}{task.out}")
         imgui.same_line(right - wide)
-        imgui.text_colored(imgui.ImVec4(*(PALETTE.error if row.failed else PALETTE.dim)), row.word)
-        _bar(row, ui)
-        actions = _foot(row, right, ui) + _menu(row, ui)
-        return [f"{action}:{number}" for action in actions]
+        imgui.text_colored(imgui.ImVec4(*(PALETTE.error if failed else PALETTE.dim)), word)
+        runs = job.status == "running" and not job.starved
+        _bar(job.progress.share, PALETTE.error if failed else PALETTE.accent if runs else PALETTE.faint, ui)
+        menu = bool(about) and job.status != "queued"
+        actions = _foot(job, right, menu, ui)
+        right_click = imgui.is_mouse_clicked(imgui.MouseButton_.right.value) and imgui.is_window_hovered()
+        if _MENU in actions or (menu and right_click):
+            actions = []
+            imgui.open_popup(_MENU)
+        actions += menu_items(_MENU, _ITEMS, ui, () if job.status in ("stopped", "failed") else _ITEMS[1])
+        return [f"{action}:{job.number}" for action in actions]
 
 
 def _status(job: Job) -> str:
@@ -78,59 +117,42 @@ def _status(job: Job) -> str:
     return job.status.capitalize()
 
 
-def _bar(row: _Row, ui: UiContext) -> None:
+def _bar(share: float, color: Rgba, ui: UiContext) -> None:
     """How far it is."""
     x, y = imgui.get_cursor_screen_pos()
     wide, tall = imgui.get_content_region_avail().x, BAR_PX * ui.scale
     imgui.dummy(imgui.ImVec2(wide, tall))
-    canvas, end = imgui.get_window_draw_list(), imgui.ImVec2(x + wide, y + tall)
-    canvas.add_rect_filled(imgui.ImVec2(x, y), end, u32(PALETTE.field), tall / 2)
-    color = PALETTE.error if row.failed else PALETTE.accent if row.runs else PALETTE.faint
-    if row.share:
-        reached = imgui.ImVec2(x + max(row.share * wide, tall), y + tall)
-        canvas.add_rect_filled(imgui.ImVec2(x, y), reached, u32(color), tall / 2)
+    for reach, ink in ((1.0, PALETTE.field), (share, color)):
+        if reach:
+            end = imgui.ImVec2(x + max(reach * wide, tall), y + tall)
+            imgui.get_window_draw_list().add_rect_filled(imgui.ImVec2(x, y), end, u32(ink), tall / 2)
 
 
-def _foot(row: _Row, right: float, ui: UiContext) -> list[str]:
+def _foot(job: Job, right: float, menu: bool, ui: UiContext) -> list[str]:
     """What it does, or why it failed; at the right its buttons."""
+    buttons = (*_buttons(job), *[(Icon.MENU, _MENU, "Log, discard (right-click)")] * menu)
     imgui.push_font(None, SMALL_PX)
-    more = (Icon.MENU, _MENU, "Log, discard (right-click)")
-    buttons = (*row.buttons, more) if row.menu else row.buttons
-    widths = [imgui.calc_text_size(text).x + 12.0 * ui.scale for text, _, _ in buttons]
+    around = 2 * imgui.get_style().frame_padding.x
+    widths = [imgui.calc_text_size(text).x + around for text, _, _ in buttons]
     imgui.pop_font()
-    if row.failed:
-        imgui.push_text_wrap_pos(0.0)
-        imgui.text_colored(imgui.ImVec4(*PALETTE.error), row.said)
-        imgui.pop_text_wrap_pos()
+    if _is_failed(job):
+        wrapped_text(job.error or job.warning, PALETTE.error)
         small(" ", PALETTE.dim)
     else:
-        small(row.said, PALETTE.dim, right - imgui.get_cursor_pos_x() - sum(widths) - 6.0 * ui.scale)
-        tip(row.said)
-    actions: list[str] = []
-    x = right - sum(widths)
+        line = f"For {job.elsewhere}  ·  " * bool(job.elsewhere) + _status_text(job)
+        small(line, PALETTE.dim, right - imgui.get_cursor_pos_x() - sum(widths) - 6.0 * ui.scale)
+        tip(line)
+    actions, x = [], right - sum(widths)
+    imgui.push_style_color(imgui.Col_.button, imgui.ImVec4(0.0, 0.0, 0.0, 0.0))
     for (text, action, help_), wide in zip(buttons, widths, strict=True):
         imgui.same_line(x)
-        if small_toggle(action, text, False, wide, ui):
-            if action == _MENU:
-                imgui.open_popup(_MENU)
-            else:
-                actions.append(action)
+        imgui.push_font(None, SMALL_PX)
+        actions += [action] * bool(imgui.small_button(f"{text}##{action}"))
+        imgui.pop_font()
         if help_:
             tip(help_)
         x += wide
-    return actions
-
-
-def _menu(row: _Row, ui: UiContext) -> list[str]:
-    """What is seldom wanted, and what cannot be undone."""
-    actions = []
-    right = imgui.is_mouse_clicked(imgui.MouseButton_.right.value)
-    if row.menu and right and imgui.is_window_hovered():
-        imgui.open_popup(_MENU)
-    with menu(_MENU, ui) as is_open:
-        for name, action, can in row.menu if is_open else ():
-            if imgui.menu_item(name, "", False, can)[0]:
-                actions.append(action)
+    imgui.pop_style_color()
     return actions
 
 
@@ -153,6 +175,8 @@ def _status_text(job: Job) -> str:
             return "Saving what is done" if isinstance(job.task, EditOrder) else _UNWRITTEN
         case "elsewhere":
             return "Trains in another window"
+        case "done":
+            return ""
     return f"{100 * progress.share:.0f} % is done" if progress.share else "Can go on where it was"
 
 
@@ -172,6 +196,12 @@ def _buttons(job: Job) -> tuple[tuple[str, str, str], ...]:
             return (("Retry", "resume_run", "Try again"),)
         case "failed":
             return (("Close", "close_run", ""),)
-        case "done":
+        case "done" if trains:
             return (("Close", "close_run", "Takes the card away; the edit stays"),)
+        case "done":
+            return (
+                ("Show in folder", "show_file", ""),
+                ("Copy path", "copy_path", ""),
+                ("Close", "close_run", "Takes the card away; the file stays"),
+            )
     return ()

@@ -31,6 +31,8 @@ from .layers import (
 )
 from .view_state import ViewState, next_resolution_mode
 from .workspace import (
+    LEAST_ZOOM,
+    MOST_ZOOM,
     REQUESTS,
     SceneFacts,
     Workspace,
@@ -199,6 +201,19 @@ def _take_tool(workspace: Workspace, tool: str) -> Workspace:
             view, select=replace(view.select, tool=new_tool), brush=replace(view.brush, active=False)
         ),
     )
+
+
+def _navigate(workspace: Workspace, mode: str) -> Workspace:
+    """Orbit or fly, with no tool in the hand."""
+    workspace = _change_brush(workspace, active=False)
+    select, camera = replace(workspace.view.select, tool=""), replace(workspace.view.camera, mode=mode)
+    return with_camera(replace(workspace, view=replace(workspace.view, select=select)), camera)
+
+
+def _zoom(workspace: Workspace, times: str) -> Workspace:
+    """The interface so many times as large; 0 for its first size."""
+    zoom = min(max(round(workspace.layout.zoom * float(times), 3), LEAST_ZOOM), MOST_ZOOM)
+    return replace(workspace, layout=replace(workspace.layout, zoom=zoom if float(times) else 1.0))
 
 
 def _take_brush(workspace: Workspace, _: str) -> Workspace:
@@ -376,6 +391,8 @@ ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
     "choose_snapshot": _choose_snapshot,
     "undo": lambda w, _: _back(w, history.undo(w.past)),
     "redo": lambda w, _: _back(w, history.redo(w.past)),
+    "navigate": _navigate,
+    "zoom": _zoom,
     "fly": lambda w, _: with_camera(w, controls.toggle_fly(w.view.camera)),
     "look": _look,
     "grid": lambda w, _: replace(w, view=replace(w.view, grid=not w.view.grid)),

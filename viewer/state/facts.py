@@ -6,7 +6,7 @@ import math
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -36,14 +36,16 @@ Rgb = tuple[float, float, float]
 STEPS = 20
 """Of the slider from 0 to 1; the curve goes on to `OVERSHOOT` in steps of the same length."""
 
-SIDE_PX = 72
+SIDE_PX, THUMBNAIL_SIDE = 72, 48
 MOST_MEMBERS = 20_000
 """Of a larger region every so-manieth Gaussian is drawn, so that a row unfolds in a fraction of a second."""
 
+_GROUND, _NEAR = 56, 0.7  # of a thumbnail: the gray behind it, 0..255; the share of a framing distance
 _COVERED = 0.95  # transmittance of a pixel that shows the region
 _FROM = (20.0, 200.0)  # degrees around the scene: from before and behind
 
 
+Thumbnail = Callable[[ViewCamera], NDArray[np.uint8]]
 Curve = Callable[[], Sequence[float]]
 """Gives the visible change at 0, 1/`STEPS`, … up to `OVERSHOOT`, as shares of that at 1."""
 
@@ -67,6 +69,8 @@ class LayerRow:
     region: str = ""  # its name
     draft: bool = False  # a grade alone, until its training is done
     added: int = 0  # how many of its members the scene does not have
+    # its picture, see `draw_thumbnail`
+    thumbnail: Thumbnail = field(default=lambda _: np.zeros((48, 48, 3), np.uint8), compare=False)
 
 
 def layer_rows(scene: Gaussians, gdfs: Sequence[Gdf], added: Sequence[int] = ()) -> tuple[LayerRow, ...]:
@@ -92,6 +96,7 @@ def _row(scene: Gaussians, gdf: Gdf, gdfs: Sequence[Gdf], added: int) -> LayerRo
         region=gdf.region.name,
         draft="draft" in gdf.report,
         added=added,
+        thumbnail=partial(draw_thumbnail, scene, gdf),
     )
 
 
@@ -126,20 +131,13 @@ def visible_changes(scene: Gaussians, gdf: Gdf) -> tuple[float, ...]:
     Returns:
         At 0, 1/`STEPS`, … up to `OVERSHOOT`; 1 at strength 1, or all 0 where the edit shows nothing.
     """
-    members = gdf.region.members
     count = round(OVERSHOOT * STEPS) + 1
-    if not len(members):
+    if not len(gdf.region.members):
         return (0.0,) * count
-    every = -(-len(members) // MOST_MEMBERS)
-    region = scene[members[::every]]
-    cameras = _two_sides(region)
+    cameras = _two_sides(_region_at(scene, gdf, 0.0))
 
     def pictures(strength: float) -> list[Tensor]:
-        moved: dict[str, Any] = {}
-        for name in gdf.field.attributes:
-            old: Tensor = getattr(region, name)
-            moved[name] = old + gdf.field.attribute_offsets(name, strength)[::every].reshape(old.shape)
-        edited = replace(region, **moved)
+        edited = _region_at(scene, gdf, strength)
         with torch.no_grad():
             return [render(edited, camera, (0.5, 0.5, 0.5)).image for camera in cameras]
 
@@ -147,6 +145,29 @@ def visible_changes(scene: Gaussians, gdf: Gdf) -> tuple[float, ...]:
     changes = [visible_change(original, pictures(i / STEPS)) for i in range(count)]
     total = changes[STEPS]
     return tuple(change / total for change in changes) if total > 0.0 else (0.0,) * count
+
+
+def _region_at(scene: Gaussians, gdf: Gdf, strength: float) -> Gaussians:
+    """The region alone at a strength, of many members every so-manieth."""
+    every = max(-(-len(gdf.region.members) // MOST_MEMBERS), 1)
+    region, moved = scene[gdf.region.members[::every]], dict[str, Any]()
+    for name in gdf.field.attributes if strength else ():
+        old: Tensor = getattr(region, name)
+        moved[name] = old + gdf.field.attribute_offsets(name, strength)[::every].reshape(old.shape)
+    return replace(region, **moved)
+
+
+def draw_thumbnail(scene: Gaussians, gdf: Gdf, camera: ViewCamera) -> NDArray[np.uint8]:
+    """The region alone at full strength, from where `camera` looks. [THUMBNAIL_SIDE,THUMBNAIL_SIDE,3]"""
+    side, region = THUMBNAIL_SIDE, _region_at(scene, gdf, 1.0)
+    if not len(region):
+        return np.full((side, side, 3), _GROUND, np.uint8)
+    with torch.no_grad():
+        near = fit(camera, region, 1.0)
+        taken = to_camera(replace(near, distance=_NEAR * near.distance), side, side)
+        image = render(region, taken, (_GROUND / 255,) * 3).image
+    pixels: NDArray[np.uint8] = (image.nan_to_num().clamp(0.0, 1.0) * 255).round().byte().numpy()
+    return pixels
 
 
 def _two_sides(region: Gaussians) -> list[Camera]:

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
+
+from msgspec import Meta
 
 from progdf.gaussians import ZERO, Origin
 from progdf.scene.neighbors import Neighborhood
@@ -28,6 +30,7 @@ from .timeline import Player
 from .view_state import Comparison, ViewState
 
 MESSAGE_S, ERROR_S, DETAILS_S = 6.0, 15.0, 120.0  # how long a line stays, and one with details to copy
+LEAST_ZOOM, MOST_ZOOM, NARROWEST_PX, WIDEST_PX = 0.5, 3.0, 280.0, 520.0
 UNSAVED = "• "
 """Before the scene's name where there are unsaved changes."""
 REQUESTS = (
@@ -42,10 +45,12 @@ REQUESTS = (
         "discard_run",
         "close_run",
         "run_log",
+        "show_file",
+        "copy_path",
         "stop_and_quit",
     ),
     *("export", "export_page", "render_picture", "render_film", "deliver", "drop_and_quit"),
-    *("about", "demo"),
+    *("about", "demo", "decal", "rebind", "rebind_from"),
     *("overwrite", "restore_autosave", "discard_autosave", "duplicate", "replace", "replace_by"),
     *(
         "remove_selected",
@@ -105,6 +110,7 @@ class Message:
     until: float
     error: bool = False
     details: str = ""  # of a mistake of ours, to be copied into a report
+    button: tuple[str, str] = ("", "")  # what can be done now: its name and its action
 
 
 @dataclass(frozen=True)
@@ -123,6 +129,19 @@ class Dialog:
 
 Pointed = tuple[str, int]
 """What the mouse rests on in the panel: "layer" or "region" and which of them, or ("selection", 0)."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How the window is laid out, remembered from one day to the next."""
+
+    zoom: Annotated[float, Meta(ge=LEAST_ZOOM, le=MOST_ZOOM)] = 1.0  # of the interface
+    panel_px: Annotated[float, Meta(ge=NARROWEST_PX, le=WIDEST_PX)] = 300.0  # at 1×: the panel's width
+    folded: tuple[str, ...] = ()  # sections of the panel
+
+    def with_panel(self, wide: float) -> Layout:
+        """With the panel so wide, as far as it may be."""
+        return replace(self, panel_px=min(max(float(round(wide)), NARROWEST_PX), WIDEST_PX))
 
 
 @dataclass(frozen=True)
@@ -158,6 +177,8 @@ class Workspace:
     jobs: tuple[Job, ...] = ()
     before: bool = False  # the original is shown, until its key is tapped again or a slider moves
     glide: Glide | None = None  # the camera on its way to a view that was asked for, or None
+    layout: Layout = Layout()  # of the window
+    session: str = ""  # the name of its file, "" before it has one
 
 
 def new_workspace(view: ViewState, snapshots: tuple[SliderSnapshot, ...] = ()) -> Workspace:
@@ -195,10 +216,12 @@ def with_message(
     error: bool = False,
     details: str = "",
     seconds: float = MESSAGE_S,
+    button: tuple[str, str] = ("", ""),
 ) -> Workspace:
     """With one line at the bottom of the picture for a while; `now`: seconds of the window's clock."""
-    until = now + (DETAILS_S if details else ERROR_S if error else seconds)
-    return replace(workspace, message=Message(escape_text(" ".join(text.split())), until, error, details))
+    until = now + (DETAILS_S if details else ERROR_S if error or button[0] else seconds)
+    text = escape_text(" ".join(text.split()))
+    return replace(workspace, message=Message(text, until, error, details, button))
 
 
 def record_undo(workspace: Workspace) -> Workspace:

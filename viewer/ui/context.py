@@ -23,7 +23,8 @@ def _rgb(code: int, alpha: float = 1.0) -> Rgba:
 
 @dataclass(frozen=True)
 class Palette:
-    """Calm and neutral, so that the picture keeps its colors; one accent."""
+    """Calm and neutral, so that the picture keeps its colors; one blue, for what is likely wanted, for values
+    and for what has the keyboard or the focus. tests/viewer/app/test_theme.py computes the contrasts."""
 
     panel: Rgba = _rgb(0x1E2024)
     card: Rgba = _rgb(0x282B30)
@@ -31,14 +32,15 @@ class Palette:
     field: Rgba = _rgb(0x383C43)
     field_hovered: Rgba = _rgb(0x434850)
     field_active: Rgba = _rgb(0x4C525B)
+    chosen: Rgba = _rgb(0x59606B)
     line: Rgba = _rgb(0x3A3E45)
     text: Rgba = _rgb(0xDEE1E6)
-    dim: Rgba = _rgb(0x9BA1AB)
-    faint: Rgba = _rgb(0x6B717B)
+    dim: Rgba = _rgb(0xA6ACB6)
+    faint: Rgba = _rgb(0x868D98)
     accent: Rgba = _rgb(0x5A9CF0)
-    accent_dark: Rgba = _rgb(0x2E5F9E)
+    ink: Rgba = _rgb(0x14161A)  # on the accent
     handle: Rgba = _rgb(0xF2F4F7)
-    error: Rgba = _rgb(0xE8705F)
+    error: Rgba = _rgb(0xF08674)
     warning: Rgba = _rgb(0xE0A44A)
     warning_dark: Rgba = _rgb(0x6E5632)
     scrim: Rgba = _rgb(0x16181B, 0.86)
@@ -83,14 +85,20 @@ class Icon:
     FLOOD = icons.ICON_FA_WAND_MAGIC_SPARKLES
     COLOR = icons.ICON_FA_EYE_DROPPER
     CLOSE = icons.ICON_FA_XMARK
+    ORBIT = icons.ICON_FA_ARROWS_SPIN
+    FLY = icons.ICON_FA_PAPER_PLANE
+    DECAL = icons.ICON_FA_STAMP
+    MOVE = icons.ICON_FA_UP_DOWN_LEFT_RIGHT
+    SOLO = icons.ICON_FA_STAR
+    SAVE = icons.ICON_FA_FLOPPY_DISK
+    SHARE = icons.ICON_FA_ARROW_UP_FROM_BRACKET
+    VIEW = icons.ICON_FA_CUBE
     TRAIN = icons.ICON_FA_PLAY
-    DELETE = icons.ICON_FA_TRASH
     BARS = icons.ICON_FA_BARS
     OPEN = icons.ICON_FA_FOLDER_OPEN
-    COMPACT = icons.ICON_FA_LIST
-    FULL = icons.ICON_FA_TABLE_LIST
     FOLDED = icons.ICON_FA_CARET_RIGHT
     UNFOLDED = icons.ICON_FA_CARET_DOWN
+    RAISED = icons.ICON_FA_CARET_UP
     SPLIT = icons.ICON_FA_CIRCLE_HALF_STROKE
 
 
@@ -185,17 +193,18 @@ def _apply_style(scale: float) -> None:
         setattr(style, name, imgui.ImVec2(x * scale, y * scale))
     for name, size in {
         "frame_rounding": 4,
-        "popup_rounding": 5,
-        "child_rounding": 6,
+        "popup_rounding": 4,
+        "child_rounding": 4,
         "grab_rounding": 4,
         "grab_min_size": 10,
         "scrollbar_size": 10,
-        "scrollbar_rounding": 5,
+        "scrollbar_rounding": 4,
         "window_rounding": 0,
     }.items():
         setattr(style, name, size * scale)
     style.window_border_size = style.child_border_size = style.frame_border_size = 0.0
     style.popup_border_size = 1.0
+    style.disabled_alpha = 0.4
     style.hover_stationary_delay, style.hover_delay_normal = 0.3, 0.5
     p, col = PALETTE, imgui.Col_
     imgui.style_colors_dark()
@@ -223,7 +232,7 @@ def _apply_style(scale: float) -> None:
         col.scrollbar_grab: p.field,
         col.scrollbar_grab_hovered: p.field_hovered,
         col.scrollbar_grab_active: p.field_active,
-        col.text_selected_bg: p.accent_dark,
+        col.text_selected_bg: (*p.accent[:3], 0.4),
         col.nav_cursor: p.accent,
     }.items():
         style.set_color_(slot, imgui.ImVec4(*color))

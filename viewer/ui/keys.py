@@ -185,6 +185,12 @@ TOPICS: dict[str, tuple[KeyBinding, ...]] = {
         *_keys("render a film", "Ctrl+Shift+P render_film"),
         *_keys("show timings", "F10 overlay"),
         *_keys("dynamic resolution: auto, on, off", "Shift+F10 dynamic_resolution"),
+        *_keys(
+            "interface larger, smaller, first size",
+            *("Ctrl+= zoom:1.1", "Ctrl+Shift+= zoom:1.1"),
+            *("Ctrl+- zoom:0.9091", "Ctrl+0 zoom:0"),
+            listed="Ctrl + − 0",
+        ),
         *_keys("full screen", "F11 full_screen"),
         *_keys("show or hide the panel", "F12 panel"),
         *_keys("quit", "Ctrl+Q quit"),

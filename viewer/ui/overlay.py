@@ -14,8 +14,8 @@ from viewer.render.dynamic_resolution import FrameTimings
 from viewer.state.view_state import ViewState
 from viewer.state.workspace import Message
 
-from .context import FIXED, FONT_PX, PALETTE, SMALL_PX, UNFOCUSED, Rgba, UiContext, u32
-from .widgets import group_digits
+from .context import FONT_PX, PALETTE, SMALL_PX, Rgba, UiContext, u32
+from .widgets import group_digits, plate
 
 
 @dataclass(frozen=True)
@@ -79,11 +79,11 @@ def table(lines: Sequence[tuple[str, str]], ui: UiContext) -> None:
         _text(right - pad - _text_width(figure, size, ui), y, figure, size, PALETTE.text, ui)
 
 
-def banner(text: str, area: Area, ui: UiContext, row: int = 0) -> None:
-    """A word at the top center of the picture, or so many rows below."""
+def banner(text: str, area: Area, ui: UiContext) -> None:
+    """A word at the top center of the picture."""
     size, pad = FONT_PX * ui.scale, 8.0 * ui.scale
     wide = _text_width(text, size, ui)
-    x, y = (area.width - wide) / 2, (14.0 + 32.0 * row) * ui.scale
+    x, y = (area.width - wide) / 2, 14.0 * ui.scale
     corners = imgui.ImVec2(x - 1.5 * pad, y - pad / 2), imgui.ImVec2(x + wide + 1.5 * pad, y + size + pad / 2)
     imgui.get_background_draw_list().add_rect_filled(*corners, u32(PALETTE.scrim), 5 * ui.scale)
     _text(x, y, text, size, PALETTE.text, ui)
@@ -93,32 +93,30 @@ def message(line: Message, area: Area, ui: UiContext) -> tuple[str, float]:
     """One line at the bottom left, wrapped where the window is narrow.
 
     Returns:
-        What was clicked: "close", "copy" for its details, or ""; its upper edge in window pixels.
+        What was clicked: "close", "copy" for its details, "do" for its button, or ""; its upper edge in
+        window pixels.
     """
     pad = 12.0 * ui.scale
     widest = min(area.width - 2 * pad, 640.0 * ui.scale)
-    imgui.set_next_window_pos(imgui.ImVec2(pad, area.height - pad), 0, imgui.ImVec2(0.0, 1.0))
     imgui.set_next_window_size_constraints(imgui.ImVec2(0.0, 0.0), imgui.ImVec2(widest, area.height))
-    imgui.push_style_color(imgui.Col_.window_bg, imgui.ImVec4(*PALETTE.scrim))
-    imgui.push_style_var(imgui.StyleVar_.window_rounding, 5.0 * ui.scale)
-    imgui.begin("message", None, FIXED | UNFOCUSED | imgui.WindowFlags_.always_auto_resize.value)
-    buttons = {"Copy details": "copy", "×": "close"} if line.details else {"×": "close"}
-    around = 2 * imgui.get_style().frame_padding.x + imgui.get_style().item_spacing.x
-    room = widest - 2 * pad - sum(imgui.calc_text_size(text).x + around for text in buttons)
-    wrap = imgui.calc_text_size(line.text).x > room
-    imgui.push_text_wrap_pos(imgui.get_cursor_pos_x() + room if wrap else -1.0)
-    imgui.align_text_to_frame_padding()
-    color = PALETTE.error if line.error else PALETTE.text
-    imgui.text_colored(imgui.ImVec4(*color), line.text)
-    imgui.pop_text_wrap_pos()
-    clicked = ""
-    for text, name in buttons.items():
-        imgui.same_line()
-        clicked = name if imgui.small_button(text) else clicked
-    top = imgui.get_window_pos().y
-    imgui.end()
-    imgui.pop_style_var()
-    imgui.pop_style_color()
+    with plate("message", imgui.ImVec2(pad, area.height - pad), ui, (0.0, 1.0), 12.0):
+        buttons = (
+            {"Copy details": "copy"} if line.details else {line.button[0]: "do"} if line.button[0] else {}
+        )
+        buttons["×"] = "close"
+        around = 2 * imgui.get_style().frame_padding.x + imgui.get_style().item_spacing.x
+        room = widest - 2 * pad - sum(imgui.calc_text_size(text).x + around for text in buttons)
+        wrap = imgui.calc_text_size(line.text).x > room
+        imgui.push_text_wrap_pos(imgui.get_cursor_pos_x() + room if wrap else -1.0)
+        imgui.align_text_to_frame_padding()
+        color = PALETTE.error if line.error else PALETTE.text
+        imgui.text_colored(imgui.ImVec4(*color), line.text)
+        imgui.pop_text_wrap_pos()
+        clicked = ""
+        for text, name in buttons.items():
+            imgui.same_line()
+            clicked = name if imgui.small_button(text) else clicked
+        top = imgui.get_window_pos().y
     return clicked, top
 
 
@@ -202,6 +200,11 @@ def draw_axes(view: ViewState, area: Area, lit: bool, ui: UiContext) -> None:
             canvas.add_circle(at, (BALL_PX - 0.75) * s, u32(ink), 0, 1.75 * s)
             if end.name == on:
                 _letter(canvas, end, f"−{letter}", _LIGHT, ui)
+
+
+def axes_height(view: ViewState, area: Area, ui: UiContext) -> float:
+    """How far down they reach, and from the right edge inwards, window pixels; 0 where there are none."""
+    return 2 * (_REACH_PX + MARGIN_PX) * ui.scale if _has_axes(view, area, ui) else 0.0
 
 
 def _has_axes(view: ViewState, area: Area, ui: UiContext) -> bool:

@@ -2,30 +2,43 @@
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TypeVar
 
 from imgui_bundle import imgui
 
-from .context import PALETTE, SMALL_PX, Rgba, UiContext, u32
+from .context import BEHIND, FIXED, PALETTE, SMALL_PX, UNFOCUSED, Icon, Rgba, UiContext, u32
 from .keys import shortcut
 
 T = TypeVar("T")
 
+MenuItems = Sequence[tuple[str, str, str]]
 TYPING_S = 1.0
 """Between two letters of one word, at most, in a list."""
 _GRIP_PX = 4.0  # what moves no further is a click, at 1×
 
 
-def section(name: str, ui: UiContext) -> None:
-    """The heading of a part of the panel."""
+def section(name: str, folded: tuple[str, ...], ui: UiContext) -> tuple[str, ...]:
+    """The heading of a part of the panel, with an arrow; the sections that are folded after this frame."""
+    x, y = imgui.get_cursor_screen_pos()
     imgui.push_font(ui.fonts.bold, SMALL_PX)
-    imgui.push_style_color(imgui.Col_.text, imgui.ImVec4(*PALETTE.dim))
-    imgui.align_text_to_frame_padding()
-    imgui.text(name.upper())
-    imgui.pop_style_color()
+    text, tall, step = name.upper(), imgui.get_frame_height(), 16.0 * ui.scale
+    room = imgui.ImVec2(imgui.calc_text_size(text).x + step, tall + 2.0 * ui.scale)
+    pressed = imgui.invisible_button(f"section {name}", room)
+    color, canvas = (
+        u32(PALETTE.text if imgui.is_item_hovered() else PALETTE.dim),
+        imgui.get_window_draw_list(),
+    )
+    canvas.add_text(imgui.ImVec2(round(x + step), round(y + 6.0 * ui.scale)), color, text)
     imgui.pop_font()
+    arrow = Icon.FOLDED if name in folded else Icon.UNFOLDED
+    canvas.add_text(imgui.ImVec2(round(x), round(y + 5.0 * ui.scale)), color, arrow)
+    if not pressed:
+        return folded
+    return tuple(other for other in folded if other != name) if name in folded else (*folded, name)
 
 
 def right_edge() -> float:
@@ -57,36 +70,64 @@ def wrapped_text(text: str, color: Rgba) -> None:
     imgui.pop_font()
 
 
-def picture(texture: int, at: imgui.ImVec2, end: imgui.ImVec2, rounding: float) -> None:
+def picture(texture: int, at: imgui.ImVec2, end: imgui.ImVec2, rounding: float, opacity: float = 1.0) -> None:
     """A picture by its GL name; where there is none, 0, an empty card."""
     canvas = imgui.get_window_draw_list()
     if not texture:
         canvas.add_rect_filled(at, end, u32(PALETTE.card), rounding)
         return
-    corners, white = (imgui.ImVec2(0.0, 0.0), imgui.ImVec2(1.0, 1.0)), u32((1.0, 1.0, 1.0, 1.0))
+    corners, white = (imgui.ImVec2(0.0, 0.0), imgui.ImVec2(1.0, 1.0)), u32((1.0, 1.0, 1.0, opacity))
     canvas.add_image_rounded(imgui.ImTextureRef(texture), at, end, *corners, white, rounding)
 
 
 @contextmanager
-def card(name: str, color: Rgba, ui: UiContext, nav: bool = False) -> Iterator[None]:
+def card(
+    name: str, color: Rgba, ui: UiContext, nav: bool = False, padding: tuple[float, float] = (10.0, 8.0)
+) -> Iterator[None]:
     """What is drawn within lies on a card of its own height; `nav`: the keyboard goes through it."""
     imgui.push_style_color(imgui.Col_.child_bg, imgui.ImVec4(*color))
-    imgui.push_style_var(imgui.StyleVar_.window_padding, imgui.ImVec2(10 * ui.scale, 8 * ui.scale))
+    around = imgui.ImVec2(*(side * ui.scale for side in padding))
+    imgui.push_style_var(imgui.StyleVar_.window_padding, around)
     child = imgui.ChildFlags_
     flags = child.auto_resize_y.value | child.always_use_window_padding.value
     imgui.begin_child(name, imgui.ImVec2(0.0, 0.0), flags, 0 if nav else imgui.WindowFlags_.no_nav.value)
+    imgui.pop_style_var()  # here, as tips and menus have paddings of their own
     yield  # where this raises, the frame ends what is open
     imgui.end_child()
-    imgui.pop_style_var()
     imgui.pop_style_color()
+
+
+@contextmanager
+def plate(
+    name: str,
+    at: imgui.ImVec2,
+    ui: UiContext,
+    pivot: tuple[float, float] = (0.0, 0.0),
+    pad: float = 8.0,
+    size: imgui.ImVec2 | None = None,
+) -> Iterator[None]:
+    """What is drawn within lies on a plate over the picture; `size`: as large as what is on it if None."""
+    imgui.set_next_window_pos(at, 0, imgui.ImVec2(*pivot))
+    imgui.set_next_window_size(size or imgui.ImVec2(0.0, 0.0))
+    imgui.push_style_color(imgui.Col_.window_bg, imgui.ImVec4(*PALETTE.scrim))
+    imgui.push_style_var(imgui.StyleVar_.window_rounding, 4.0 * ui.scale)
+    imgui.push_style_var(imgui.StyleVar_.window_padding, imgui.ImVec2(pad * ui.scale, pad * ui.scale))
+    fits = imgui.WindowFlags_.always_auto_resize.value if size is None else 0
+    imgui.begin(name, None, FIXED | UNFOCUSED | BEHIND | fits)
+    imgui.pop_style_var(2)
+    imgui.pop_style_color()
+    yield  # where this raises, the frame ends what is open
+    imgui.end()
 
 
 def accent_button(text: str, size: imgui.ImVec2) -> bool:
     """The button that one is most likely here for; True when it was pressed."""
-    imgui.push_style_color(imgui.Col_.button, imgui.ImVec4(*PALETTE.accent_dark))
-    imgui.push_style_color(imgui.Col_.button_hovered, imgui.ImVec4(*PALETTE.accent))
+    col = imgui.Col_
+    colors = {col.button: PALETTE.accent, col.button_hovered: PALETTE.handle, col.text: PALETTE.ink}
+    for slot, color in colors.items():
+        imgui.push_style_color(slot, imgui.ImVec4(*color))
     pressed = imgui.button(text, size)
-    imgui.pop_style_color(2)
+    imgui.pop_style_color(len(colors))
     return bool(pressed)
 
 
@@ -100,16 +141,69 @@ def tip(text: str, action: str = "") -> None:
         imgui.set_tooltip(f"{text} ({chord})" if chord else text)
 
 
-def icon_button(name: str, icon: str, ui: UiContext, dim: bool = False) -> bool:
-    """A square button without a frame; True when it was pressed."""
-    side = imgui.get_frame_height()
-    imgui.push_style_color(imgui.Col_.button, imgui.ImVec4(0.0, 0.0, 0.0, 0.0))
-    imgui.push_style_color(imgui.Col_.text, imgui.ImVec4(*(PALETTE.faint if dim else PALETTE.text)))
-    imgui.push_style_var(imgui.StyleVar_.frame_padding, imgui.ImVec2(0.0, 5.0 * ui.scale))
-    pressed = imgui.button(f"{icon}##{name}", imgui.ImVec2(side, 0.0))
-    imgui.pop_style_var()
-    imgui.pop_style_color(2)
-    return bool(pressed)
+def icon_button(
+    name: str, icon: str, ui: UiContext, dim: bool = False, lit: bool = False, side: float = 0.0
+) -> bool:
+    """A square button of an icon alone; True when it was pressed.
+
+    Args:
+        dim: what it stands for is off
+        lit: it is in the hand, or on
+        side: window pixels; 0 for the height of a text field
+    """
+    side = side or imgui.get_frame_height()
+    x, y = imgui.get_cursor_screen_pos()
+    flags = imgui.ButtonFlags_.enable_nav.value
+    pressed = bool(imgui.invisible_button(name, imgui.ImVec2(side, side), flags))
+    hovered, canvas, size = imgui.is_item_hovered(), imgui.get_window_draw_list(), imgui.calc_text_size(icon)
+    if hovered or lit:
+        ground = u32(PALETTE.chosen if lit else PALETTE.field)
+        canvas.add_rect_filled(imgui.ImVec2(x, y), imgui.ImVec2(x + side, y + side), ground, 4.0 * ui.scale)
+    color = PALETTE.handle if hovered or lit else PALETTE.faint if dim else PALETTE.text
+    at = imgui.ImVec2(round(x + (side - size.x) / 2), round(y + (side - size.y) / 2))
+    canvas.add_text(at, u32(color), icon)
+    return pressed
+
+
+def icon_row(
+    items: MenuItems, ui: UiContext, actions: list[str], gap: float = 0.0, off: Collection[str] = ()
+) -> None:
+    """Buttons on a line: action, icon and help of each; those in `off` cannot be pressed."""
+    for i, (action, icon, help_) in enumerate(items):
+        if i:
+            imgui.same_line(0.0, gap)
+        imgui.begin_disabled(action in off)
+        actions += [action] * icon_button(action, icon, ui)
+        imgui.end_disabled()
+        tip(help_, action)
+
+
+def more_button(
+    name: str, items: MenuItems, ui: UiContext, actions: list[str], icon: str = Icon.MENU, side: float = 0.0
+) -> None:
+    """A button that opens a menu, see `menu_items`; what was chosen goes to `actions`."""
+    if icon_button(name, icon, ui, side=side):
+        imgui.open_popup(name)
+    actions += menu_items(name, items, ui)
+
+
+def menu_items(name: str, items: MenuItems, ui: UiContext, off: Collection[str] = ()) -> list[str]:
+    """The menu that `imgui.open_popup(name)` opens; the action that was chosen in it, if one was.
+
+    Args:
+        items: text, action and help of each, a line where there is no text
+        off: actions that cannot be chosen
+    """
+    asked: list[str] = []
+    with menu(name, ui) as is_open:
+        for text, action, help_ in items if is_open else ():
+            if not text:
+                imgui.separator()
+            elif imgui.menu_item(f"{text}##{action}", shortcut(action), False, action not in off)[0]:
+                asked.append(action)
+            if help_:
+                tip(help_)
+    return asked
 
 
 def typed_name(name: str, room: float) -> str | None:
@@ -217,22 +311,6 @@ def grip(ui: UiContext) -> str:
     return "" if not is_released() else "dropped" if far else "clicked"
 
 
-def small_toggle(name: str, text: str, lit: bool, width: float, ui: UiContext) -> bool:
-    """A button of small text on the present line, in the accent's color while on; True when pressed."""
-    colors = (PALETTE.accent, PALETTE.handle) if lit else (PALETTE.dim, PALETTE.text)
-    height = 3.0 * ui.scale  # reaches above its line, so that the hand finds it
-    x, y = imgui.get_cursor_screen_pos()
-    imgui.push_font(None, SMALL_PX)
-    line = imgui.get_text_line_height()
-    imgui.set_cursor_screen_pos(imgui.ImVec2(x, y - height))
-    pressed = bool(imgui.invisible_button(name, imgui.ImVec2(width, line + height)))
-    size = imgui.calc_text_size(text)
-    at = imgui.ImVec2(round(x + (width - size.x) / 2), round(y + (line - size.y) / 2))
-    imgui.get_window_draw_list().add_text(at, u32(colors[imgui.is_item_hovered()]), text)
-    imgui.pop_font()
-    return pressed
-
-
 def is_double_clicked() -> bool:
     """Whether the last item, a slider, was double-clicked, which takes it back to its default.
 
@@ -246,45 +324,48 @@ def is_double_clicked() -> bool:
 
 
 def value_slider(
-    name: str, value: float, ends: tuple[float, float], form: str, default: float, ui: UiContext
+    name: str,
+    value: float,
+    ends: tuple[float, float],
+    form: str,
+    default: float,
+    ui: UiContext,
+    wide: float = 0.0,
 ) -> float:
-    """A slider to the end of the line, its number beside it where no handle hides it.
+    """A field with its value in words, and along its foot how far that is from end to end.
 
     Ctrl+click types, a double click goes back to `default`. A range over orders of magnitude is logarithmic.
-    The value is as before, or what the number shows.
+    The value is as before, or what the field shows. `wide`: window pixels, 0 for the rest of the line
     """
-    room = 44.0 * ui.scale
-    imgui.set_next_item_width(imgui.get_content_region_avail().x - room)
     flags = imgui.SliderFlags_.always_clamp.value
-    if ends[0] > 0.0:
-        flags |= imgui.SliderFlags_.logarithmic.value
-    alpha = (
-        1.0
-        if imgui.get_io().want_text_input and imgui.internal.get_active_id() == imgui.get_id(name)
-        else 0.0
-    )
-    imgui.push_style_color(imgui.Col_.text, imgui.ImVec4(*PALETTE.text[:3], alpha))
+    flags |= imgui.SliderFlags_.logarithmic.value if ends[0] > 0.0 else 0
+    imgui.set_next_item_width(wide or -1.0)
+    for slot in (imgui.Col_.slider_grab, imgui.Col_.slider_grab_active):
+        imgui.push_style_color(slot, imgui.ImVec4(0.0, 0.0, 0.0, 0.0))
     changed, new = imgui.slider_float(name, value, *ends, form, flags)
-    imgui.pop_style_color()
+    imgui.pop_style_color(2)
     if is_double_clicked():
         changed, new = True, default
     low, high = imgui.get_item_rect_min(), imgui.get_item_rect_max()
-    number = form % (new if changed else value)
-    wide = imgui.calc_text_size(number).x
-    at = imgui.ImVec2(round(high.x + room - wide), round(low.y + imgui.get_style().frame_padding.y))
-    imgui.get_window_draw_list().add_text(at, imgui.get_color_u32(imgui.Col_.text), number)
+    now, base = new if changed else value, math.log(ends[0]) if ends[0] > 0.0 else ends[0]
+    share = (math.log(now) - base) / (math.log(ends[1]) - base) if ends[0] > 0.0 else now - base
+    share = min(max(share if ends[0] > 0.0 else share / (ends[1] - base), 0.0), 1.0)
+    left, end = imgui.ImVec2(low.x, high.y - 3.0 * ui.scale), imgui.ImVec2(high.x, high.y)
+    canvas, shut = imgui.get_window_draw_list(), imgui.ImVec2(low.x + share * (high.x - low.x), high.y)
+    canvas.add_rect_filled(left, end, u32(PALETTE.line), 2.0 * ui.scale)
+    canvas.add_rect_filled(left, shut, u32(PALETTE.accent), 2.0 * ui.scale)
     return round(new, 2) if changed else value  # unchanged, imgui still rounds to float32
 
 
 def choice(
-    name: str, options: Sequence[str], current: int | None, ui: UiContext, off: Collection[int] = ()
+    name: str, options: Sequence[str], current: int | None, ui: UiContext, wide: float = 0.0
 ) -> int | None:
-    """A row of joined buttons, `off` those that cannot be pressed; the index that was, or None."""
+    """A row of joined buttons, `wide` pixels or 0 for the rest of the line; the index that was pressed."""
     gap = 2.0 * ui.scale
-    room = imgui.get_content_region_avail().x - gap * (len(options) - 1)
+    room = (wide or imgui.get_content_region_avail().x) - gap * (len(options) - 1)
     widths = [room / len(options)] * len(options)
     texts = [imgui.calc_text_size(option).x for option in options]
-    if max(texts) > widths[0]:  # the same margin for each instead of the same width
+    if wide or max(texts) > widths[0]:  # the same margin for each instead of the same width
         widths = [text + (room - sum(texts)) / len(options) for text in texts]
     pressed = None
     imgui.begin_group()
@@ -293,11 +374,9 @@ def choice(
         if i:
             imgui.same_line(0.0, gap)
         for slot in _BUTTON_COLORS if i == current else ():
-            imgui.push_style_color(slot, imgui.ImVec4(*PALETTE.accent_dark))
-        imgui.begin_disabled(i in off)
+            imgui.push_style_color(slot, imgui.ImVec4(*PALETTE.chosen))
         if imgui.button(f"{option}##{name}", imgui.ImVec2(widths[i], 0.0)):
             pressed = i
-        imgui.end_disabled()
         imgui.pop_style_color(len(_BUTTON_COLORS) if i == current else 0)
     imgui.pop_style_var()
     imgui.end_group()
@@ -365,10 +444,12 @@ def with_added(total: int, added: int) -> str:
 
 
 def elide(text: str, room: float) -> str:
-    """The text, shortened with "…" to fit `room` window pixels in the present font."""
+    """The text, shortened with "…" to fit `room` window pixels in the present font: after a whole word, where
+    one fits."""
     if imgui.calc_text_size(text).x <= room:
         return text
     text_so_far = text
     while text_so_far and imgui.calc_text_size(text_so_far + "…").x > room:
         text_so_far = text_so_far[:-1]
-    return text_so_far.rstrip() + "…"
+    whole = re.match(r".*\w(?=\W)", text_so_far + text[len(text_so_far) :][:1])
+    return (whole[0] if whole else text_so_far.rstrip()) + "…"

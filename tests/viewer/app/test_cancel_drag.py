@@ -7,16 +7,15 @@ from dataclasses import replace
 
 import pytest
 
-from tests.helpers.ui_rig import Rig, bear, first_view, rig
+from tests.helpers.ui_rig import HEAD, Rig, bear, first_view, rig
 from viewer.panel.timeline_bar import HEIGHT_PX, ROW_PX
 from viewer.state.view_state import Brush, Keyframe, SelectTool, Timeline
 
 pytestmark = pytest.mark.gl
 POINTS = (700, 640)
 LEFT = POINTS[0] - 300.0
-HEADS = 112.0
 TIMELINE = round(HEIGHT_PX + ROW_PX)
-TOLERANCE = 519.0
+TOLERANCE = 62.0
 CallOff = Callable[[Rig], None]
 
 
@@ -108,7 +107,7 @@ def gain_row(hand: Rig) -> float:
 def test_a_layer_stays_in_its_place(hand: Rig, call_off: CallOff) -> None:
     hand.key("1")  # the card at the top
     dragged_and_called_off(
-        hand, call_off, (LEFT + 100, HEADS), (LEFT + 100, HEADS + 60), (LEFT + 100, HEADS + 400)
+        hand, call_off, (LEFT + 100, HEAD), (LEFT + 100, HEAD + 60), (LEFT + 100, HEAD + 400)
     )
 
 
@@ -173,7 +172,7 @@ def test_a_tools_tolerance_goes_back_with_what_it_selected(hand: Rig, call_off: 
     hand.key("J")
     hand.click(170.0, 320.0)
     hand.frame(2)
-    dragged_and_called_off(hand, call_off, (600.0, TOLERANCE), (640.0, TOLERANCE))
+    dragged_and_called_off(hand, call_off, (90.0, TOLERANCE), (140.0, TOLERANCE))
     hand.pause(0.5)  # no double click
-    hand.drag((600.0, TOLERANCE), (640.0, TOLERANCE))
+    hand.drag((90.0, TOLERANCE), (140.0, TOLERANCE))
     assert hand.main_view.work.view.select.tolerance > SelectTool.tolerance, "what was called off was a drag"

@@ -10,7 +10,7 @@ import pytest
 from imgui_bundle import imgui
 
 from tests.helpers.null_app import null_app
-from tests.helpers.ui_rig import Rig, bear, first_view, rig
+from tests.helpers.ui_rig import TRACK, Rig, bear, first_view, rig
 from viewer.app import app as application
 from viewer.files.document import Document
 from viewer.ui.window import DoubleClicks
@@ -69,7 +69,7 @@ def test_the_window_notes_when_it_heard_of_a_press(opened: application.App) -> N
     from viewer.ui.window import glfw
 
     handle = ctypes.cast(opened.window.handle, ctypes.c_void_p).value or 0
-    glfw.set_cursor_pos(opened.window.handle, 900 - 300 + 29 + 0.5 * 242, 136.0)  # the upper slider's handle
+    glfw.set_cursor_pos(opened.window.handle, 900 - 300 + 29 + 0.5 * 242, TRACK)  # the upper slider's handle
     for _ in range(3):
         opened.draw()
     for action in (1, 0, 1, 0):

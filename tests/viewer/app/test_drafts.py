@@ -121,7 +121,7 @@ def test_a_sentence_is_painted_when_it_is_asked_for_and_the_edit_follows_that_pi
     Previews.grade = None
     opened(window)
     Previews.asked = 0
-    with_form(window, editor=6, sentence="make it a statue")
+    with_form(window, editor=7, sentence="make it a statue")
     state = window.main_view.preview
     assert (state.text, state.models, state.painted) == ("tiny on the CPU", ("a/tiny",), False)
     assert (window.main_view.cover, Previews.asked) == (None, 1), "said what would paint, nothing painted"

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from imgui_bundle import imgui
 
-from tests.helpers.ui_rig import Rig, bear, first_view, rig
+from tests.helpers.ui_rig import HEAD, Rig, bear, first_view, rig
 from viewer.jobs.job_queue import DeliverOptions
 from viewer.jobs.training import EDITORS
 from viewer.state.selection import NamedRegion
@@ -181,7 +181,9 @@ def test_no_shortcut_acts_while_something_is_open(hand: Rig, what: str) -> None:
 
 
 def test_the_menu_goes_by_arrows_into_its_lists_and_out(hand: Rig) -> None:
-    hand.click(WINDOW[0] - 24.0, 24.0)
+    hand.move(WINDOW[0] - 200.0, HEAD)  # a layer's card
+    hand.press(1)
+    hand.release(1)
     assert imgui.is_popup_open("", imgui.PopupFlags_.any_popup.value)
     depth = len(imgui.get_current_context().open_popup_stack)
     for _ in range(20):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from imgui_bundle import imgui
 
-from tests.helpers.ui_rig import Rig, bear, first_view, rig
+from tests.helpers.ui_rig import TRACK, Rig, bear, first_view, rig
 from viewer.camera.view_camera import axes, eye, fit_subject
 from viewer.state.view_state import LayerState
 from viewer.ui.context import PALETTE
@@ -43,7 +43,7 @@ def test_a_slow_frame_that_holds_several_chords_does_all_in_their_order(hand: Ri
 
 def test_a_drag_that_begins_on_the_picture_goes_on_over_the_panel(hand: Rig) -> None:
     azimuth = hand.main_view.work.view.camera.azimuth
-    hand.drag((300.0, 136.0), (500.0, 136.0))
+    hand.drag((300.0, TRACK), (500.0, TRACK))
     assert hand.strengths == [0.5, 0.5]
     assert hand.main_view.work.view.camera.azimuth == pytest.approx(azimuth - 60.0)
 
@@ -121,11 +121,11 @@ def test_holding_backslash_shows_the_original_and_letting_go_brings_the_edit_bac
     with rig(first_view(bear(), 0.0, 0.0)) as untouched:
         original = untouched.picture()
     with rig() as hand:
-        edited = hand.picture()
+        edited, words = hand.picture(), hand.image()[:60]
         hand.frame(keys=Keys(held=frozenset("\\")))
-        shown = hand.picture()
-        assert np.array_equal(shown[60:], original[60:]), "below the word Original"
-        assert not np.array_equal(shown[:60], original[:60])
+        assert not np.array_equal(hand.image()[:60], words), "the word Original is lit"
+        hand.frame(keys=Keys(held=frozenset("\\")))
+        assert np.array_equal(hand.picture(), original)
         hand.frame()
         assert np.array_equal(hand.picture(), edited)
         assert hand.main_view.work.past.past == ()
@@ -181,7 +181,7 @@ def test_a_layer_that_is_focused_by_key_is_scrolled_into_sight() -> None:
         hand.frame(5)
         accent = np.round(np.array(PALETTE.accent[:3]) * 255)
         edge = np.abs(hand.image()[60:480, 353] - accent).max(axis=-1) <= 2
-        assert edge.sum() > 80, "the whole card of the focused layer is in sight"
+        assert edge.sum() > 50, "the whole card of the focused layer is in sight"
         hand.key("Shift+9")
         assert not hand.main_view.work.view.layers[0].enabled
 

@@ -37,7 +37,7 @@ ACTIONS = (
 DRAWN = {
     "a card": (cards, "draw_card"),
     "the head of a card": (card, "_number"),
-    "the tools": (tools, "_lit_button"),
+    "the tools": (tools, "draw_toolbar"),
     "the snapshots": (snapshot_cards, "draw"),
     "the timeline": (timeline_bar, "draw"),
     "the mouse": (mouse, "_drag"),

@@ -14,7 +14,7 @@ from imgui_bundle import imgui
 from progdf.scene.selection import inside_polygon, inside_rectangle, inside_stroke, project_centers
 from progdf.scene.strays import find_strays
 from tests.helpers.null_app import null_app, press
-from tests.helpers.ui_rig import Rig, bear, first_view, rig
+from tests.helpers.ui_rig import HEAD, Rig, bear, first_view, rig
 from viewer.camera.view_camera import to_camera
 from viewer.files.document import Document
 from viewer.state import selection
@@ -317,7 +317,7 @@ def test_keys_change_the_selection_as_a_whole(hand: Rig) -> None:
 
 def test_the_mouse_on_the_name_of_a_layer_shows_its_region(hand: Rig) -> None:
     before = hand.picture().astype(int)
-    hand.move(WINDOW[0] - 300 + 90, 112.0)
+    hand.move(WINDOW[0] - 300 + 90, HEAD)
     hand.pause(1.0)
     hand.frame(2)
     assert hand.main_view.work.pointed == ("layer", 1)
@@ -334,7 +334,7 @@ def test_the_panel_selects_shows_and_keeps_regions() -> None:
     some = selection.select(kept, np.arange(len(mask)) < 100)
     view = replace(first_view(bear(), 0.7, 0.5), selection=some, select=SelectTool("lasso"))
     with rig(view, (1024, 640)) as hand:
-        row, eye, save = (850.0, 574.0), (748.0, 574.0), (874.0, 504.0)
+        row, eye, save = (850.0, 265.0), (748.0, 265.0), (220.0, 61.0)
         hand.modifier(imgui.Key.mod_shift)
         hand.click(*row)
         hand.modifier(imgui.Key.mod_shift, False)

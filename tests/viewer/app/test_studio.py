@@ -10,8 +10,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from imgui_bundle import imgui
 
+from progdf.__main__ import main
 from progdf.formats.ply import save_ply
+from progdf.gdf.file import fingerprint, save_gdf
 from progdf.scene.regions import parse_region
 from tests.helpers.null_app import null_app, press
 from tests.helpers.sessions import bear_files, opened_document
@@ -151,8 +154,7 @@ def test_a_failure_is_one_line_with_its_log(window: application.App) -> None:
     turn(window)
     (job,) = window.main_view.work.jobs
     assert (job.status, job.error) == ("failed", "the disk is full")
-    assert window.main_view.work.message is not None
-    assert "the disk is full" in window.main_view.work.message.text
+    assert window.main_view.work.message is None, "its card says it, and nothing else"
     request(window, f"run_log:{job.number}")
     assert window.main_view.work.dialog is not None
     assert window.main_view.work.dialog.kind == "log"
@@ -236,6 +238,11 @@ def test_the_scene_is_exported_by_the_command(window: application.App, tmp_path:
     assert [job.status for job in window.main_view.work.jobs] == ["running"]
     Trainer.ended = 0
     turn(window)
+    (job,) = window.main_view.work.jobs
+    assert job.status == "done", "it stays until it is closed"
+    request(window, f"copy_path:{job.number}")
+    assert imgui.get_clipboard_text() == str(tmp_path / "bear_edited.ply")
+    request(window, f"close_run:{job.number}")
     assert window.main_view.work.jobs == ()
     Trainer.ended = None
     press(window, "Ctrl+P")
@@ -330,3 +337,49 @@ def test_what_runs_for_another_scene_goes_on_and_its_card_says_for_which(
     job, delivery = window.main_view.work.jobs
     assert (job.status, job.elsewhere) == ("failed", "")
     assert (delivery.status, delivery.elsewhere) == ("failed", "")
+
+
+def test_an_edit_of_another_scene_is_rebound_from_its_message(
+    window: application.App, tmp_path: Path
+) -> None:
+    scarf = bear().gdfs[0]
+    moved = replace(bear().scene, means=bear().scene.means + 0.001)
+    foreign, out = tmp_path / "foreign.gdf", tmp_path / "foreign-rebound.gdf"
+    save_gdf(foreign, replace(scarf, scene=fingerprint(moved)))
+    save_ply(tmp_path / "moved.ply", moved)
+    window.open(foreign)
+    said = window.main_view.work.message
+    assert said is not None
+    assert (said.text, said.button[0]) == ("foreign.gdf was made for another scene", "Rebind…")
+    request(window, said.button[1])
+    asked = window.main_view.work.dialog
+    assert asked is not None
+    window.main_view.ask(replace(asked, text=str(tmp_path / "moved.ply")))
+    press(window, "Enter")
+    turn(window)
+    scenes = (f"--from={tmp_path / 'moved.ply'}", f"--to={tmp_path / 'bear.ply'}")
+    assert tuple(Trainer.said) == ("rebind", str(foreign), *scenes, f"--out={out}")
+    assert main([*Trainer.said]) == 0, "what is queued does it"
+    Trainer.edit, Trainer.ended = None, 0
+    turn(window)
+    (layer,) = window.main_view.work.view.layers
+    assert layer.name == "scarf"
+    assert window.main_view.work.jobs == ()
+
+
+def test_a_saved_region_offers_a_new_edit(window: application.App) -> None:
+    press(window, "Ctrl+A")
+    request(window, "save_region:all of it")
+    said = window.main_view.work.message
+    assert said is not None
+    assert said.text == "Region 'all of it' saved"
+    for _ in range(3):
+        window.draw()
+    bar = imgui.internal.find_window_by_name("message")
+    for down in (True, False):
+        imgui.get_io().add_mouse_pos_event(bar.pos.x + bar.size.x - 75.0, bar.pos.y + 20.0)
+        imgui.get_io().add_mouse_button_event(0, down)
+        for _ in range(3):
+            window.draw()
+    assert window.main_view.work.form_open
+    assert window.main_view.work.message is None

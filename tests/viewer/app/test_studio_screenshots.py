@@ -23,7 +23,7 @@ from viewer.state.workspace import Dialog
 
 Compare = Callable[[str, np.ndarray], None]
 SMALLEST = (1024, 640)
-FOOT_Y = 146  # of the first card of a run
+FOOT_Y = 550  # of the card of a run
 pytestmark = [pytest.mark.gl, pytest.mark.usefixtures("software_gpu")]
 
 
@@ -57,7 +57,7 @@ def test_the_menu(screenshot: Compare) -> None:
 def test_the_form_of_a_new_edit(screenshot: Compare) -> None:
     with rig(first_view(bear(), 0.7), SMALLEST) as hand:
         form = NewEdit(
-            TYPED, "sphere:0,0,0,1", editor=5, name="painted", error="the region holds no Gaussian"
+            TYPED, "sphere:0,0,0,1", editor=6, name="painted", error="the region holds no Gaussian"
         )
         hand.main_view.work = replace(hand.main_view.work, form=form)
         hand.key("Ctrl+N")
@@ -99,6 +99,10 @@ def test_a_second_click_where_stop_was_goes_on(software_gpu: None) -> None:
     order = EditOrder(Path("bear.ply"), Path("/scenes/bear.edits/blue"), "blue", "all", "recolor:#3060d0")
     running = Job(1, order, "running", Progress(0.45, "Training", "0.0114"), 20.0)
     with rig(first_view(bear(), 0.7), SMALLEST) as hand:
+        hand.main_view.work = replace(hand.main_view.work, jobs=(running,))
+        hand.settle()
+        hand.click(SMALLEST[0] - 150.0, SMALLEST[1] - 55.0)  # the strip, which opens
+        hand.settle()
 
         def asked(job: Job, x: float, y: float) -> tuple[str, ...]:
             hand.main_view.work = replace(hand.main_view.work, jobs=(job,))

@@ -11,9 +11,9 @@ import pytest
 from imgui_bundle import imgui
 
 from tests.helpers.stacks import many_edits
-from tests.helpers.ui_rig import Rig, bear, first_view, rig
+from tests.helpers.ui_rig import TRACK, Rig, bear, first_view, rig
 from viewer.app.studio.pages import UpChoice, UpStrip
-from viewer.panel import panel
+from viewer.panel import panel, tools
 from viewer.render.dynamic_resolution import FrameTimings
 from viewer.state import selection
 from viewer.state.selection import SelectionState
@@ -95,7 +95,7 @@ def test_a_scene_without_edits_and_the_original_held(screenshot: Compare) -> Non
 def test_a_value_being_typed(screenshot: Compare) -> None:
     with rig(first_view(bear(), 0.7, 0.5), SMALLEST) as hand:
         hand.modifier(imgui.Key.mod_ctrl)
-        hand.move(900.0, 136.0)
+        hand.move(900.0, TRACK)
         hand.press()
         hand.release()
         hand.modifier(imgui.Key.mod_ctrl, False)
@@ -148,7 +148,6 @@ def test_snapshots_and_a_question(screenshot: Compare) -> None:
         for chord in ("F3", *["Shift+Left"] * 5, "F3"):
             hand.key(chord)
         hand.frame(5)
-        hand.wheel(900.0, 400.0, -100.0)
         hand.main_view.recent = (Path("/scenes/bear.ply"), Path("/scenes/edits/scarf.gdf"))
         hand.main_view.ask(Dialog("open"))
         hand.frame(3)
@@ -175,9 +174,8 @@ def test_a_blend_between_two_snapshots(screenshot: Compare) -> None:
     with rig(first_view(bear(), 1.0, 0.0), SMALLEST) as hand:
         for chord in ("F3", *["Shift+Right"] * 10, "2", *["Shift+Left"] * 10, "F3"):
             hand.key(chord)
-        hand.wheel(900.0, 400.0, -100.0)
         hand.rest()
-        hand.drag((743.0, 485.0), (860.0, 485.0))
+        hand.drag((743.0, 291.0), (860.0, 291.0))
         hand.move(300.0, 600.0)
         hand.frame(20)
         screenshot("ui_blend", hand.image())
@@ -207,7 +205,7 @@ def test_axes_the_grid_on_the_ground_and_the_question_which_way_is_up(screenshot
     view = replace(first_view(bear()), axes=True, grid=True, background=(0.11, 0.11, 0.12))
     view = replace(view, selection=selection.isolate(head, len(bear().scene)))
     with rig(view, SMALLEST) as hand:
-        choices = tuple(UpChoice(name, view.camera) for name, _ in panel.UPS[2:])
+        choices = tuple(UpChoice(name, view.camera) for name, _ in tools.UPS[2:])
         hand.main_view.up_strip = UpStrip(choices, "+Y")
         hand.main_view.show_message("Saved bear.session.json")
         hand.move(651.0, 53.0)

@@ -18,11 +18,11 @@ from PIL import Image
 from benchmarks.viewer.display import display, missing_tools
 from progdf.__main__ import main
 from tests.helpers.paths import ROOT
-from tests.helpers.ui_rig import bear
+from tests.helpers.ui_rig import TRACK, bear
 from viewer.app import app as application
 from viewer.camera.view_camera import first_camera, to_camera
 from viewer.files.session import open_session
-from viewer.panel import panel
+from viewer.panel import card, panel
 from viewer.ui.keys import HELD_ORIGINAL, KEYS
 
 PATIENCE_S = 120.0  # a busy machine may take long; what has happened is not waited for
@@ -149,7 +149,7 @@ def slider(layer: int, strength: float) -> tuple[float, float]:
     """Of two layers the last one lies on top."""
     inset = 12 + 10 + 7
     x = WIDTH - panel.WIDTH_PX + inset + strength * (panel.WIDTH_PX - 2 * inset)
-    return x, 136.0 + 97.0 * (1 - layer)
+    return x, TRACK + card.CARD_PX * (1 - layer)
 
 
 def changed(before: np.ndarray, after: np.ndarray, height: int = HEIGHT - 60) -> int:
@@ -168,7 +168,7 @@ def brightness(shot: np.ndarray) -> float:
 def test_a_slider_dragged_by_the_real_mouse_changes_the_picture_and_idle_costs_nothing(
     desktop: Desktop,
 ) -> None:
-    first = desktop.shot()
+    first = desktop.rest()
     assert first.shape == (HEIGHT, WIDTH, 3)
     desktop.drag(slider(0, 0.5), slider(0, 1.0))
     desktop.until("the edit", lambda: changed(first, desktop.shot()) > 200)
@@ -202,7 +202,7 @@ def test_a_slider_dragged_by_the_real_mouse_changes_the_picture_and_idle_costs_n
 @pytest.mark.gl
 @pytest.mark.slow
 def test_the_real_window_comes_back_as_it_was_after_it_was_out_of_sight(desktop: Desktop) -> None:
-    first = desktop.shot()
+    first = desktop.rest()
     desktop.xdotool("windowunmap", "--sync", desktop.window)  # what minimizing does to a window
     desktop.until_idle("a window that draws nothing when nobody can see it")
     desktop.xdotool("windowmap", "--sync", desktop.window)
@@ -220,7 +220,7 @@ def test_the_real_mouse_paints_undo_takes_the_stroke_away_and_closing_asks_and_s
 ) -> None:
     desktop.point(*slider(0, 0.5))  # where the brush's ring is not over the picture
     desktop.xdotool("key", "2")  # the lower card: the scarf
-    clean = desktop.shot()
+    clean = desktop.rest()
     desktop.xdotool("key", "b", "c")
     colors = desktop.rest()
     assert changed(clean, colors) > 200, "the weights are shown"
@@ -266,7 +266,7 @@ def scarf_on_screen() -> tuple[float, float]:
 @pytest.mark.gl
 @pytest.mark.slow
 def test_escape_takes_a_drag_of_the_real_mouse_back(desktop: Desktop) -> None:
-    first = desktop.shot()
+    first = desktop.rest()
     desktop.grip(slider(0, 0.5), slider(0, 1.0))
     desktop.until("the edit", lambda: changed(first, desktop.shot()) > 200)
     desktop.xdotool("key", "Escape")

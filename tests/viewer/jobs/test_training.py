@@ -229,7 +229,9 @@ def test_an_editor_says_what_is_missing_before_it_can_train() -> None:
     assert form("pictures", pictures="/a.png, /b.png").spec == "pictures:/a.png,/b.png"
     assert "region" in form("recolor", region=TYPED).obstacle
     unknown = replace(CHOICES[0], package="no_such_package_at_all", extra="more")
-    assert missing_package(unknown) == "Recolor needs more: pip install progdf-studio[more]"
+    assert (
+        missing_package(unknown) == "Recolor needs the extra 'more' of ProGDF Studio, which is not installed"
+    )
 
 
 def test_changed_pictures_find_their_own_region() -> None:

@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import pytest
 from imgui_bundle import imgui
 
+from tests.helpers.ui_rig import HEAD, TRACK
 from viewer.camera.view_camera import Bounds, ViewCamera, axes
-from viewer.panel import panel
+from viewer.panel import card, panel, tools
 from viewer.panel.slider import parse_strength
 from viewer.state import history, workspace
 from viewer.state.actions import perform
 from viewer.state.facts import LayerRow
 from viewer.state.view_state import LayerState, ViewState
-from viewer.state.workspace import SceneFacts, Workspace
+from viewer.state.workspace import PreviewState, SceneFacts, Workspace
 from viewer.ui import widgets
 from viewer.ui.context import UiContext
+from viewer.ui.overlay import Area
 
 SIZE = (1024, 640)
 ROW = LayerRow(3120, (0.2, 0.6, 0.3), (0.0, 0.25, 0.5, 0.75, 1.0), "stripes:#30a050", Bounds())
@@ -39,7 +41,12 @@ class Hand:
 
     def frame(self) -> None:
         imgui.new_frame()
-        self.work = panel.draw(self.work, FACTS, (), ("", False), (), False, self.ui, self.actions)
+        self.work = panel.draw(
+            self.work, FACTS, panel.Pictures(), PreviewState(), (), False, self.ui, self.actions
+        )
+        area = Area((SIZE[0] - panel.WIDTH_PX) * self.ui.scale, SIZE[1] * self.ui.scale)
+        view = tools.draw_view(self.work.view, area, 0.0, self.ui, self.actions)
+        self.work = replace(self.work, view=view)
         imgui.render()
         if not imgui.is_any_item_active():
             self.work = workspace.record_undo(self.work)
@@ -94,8 +101,8 @@ def hand(request: pytest.FixtureRequest) -> Iterator[Hand]:
 
 LEFT = SIZE[0] - panel.WIDTH_PX
 START, SPAN = LEFT + 12 + 10 + 7, panel.WIDTH_PX - 2 * (12 + 10 + 7)
-TRACKS = (233.0, 136.0)  # heights of the two sliders' tracks: the last layer lies on top
-EYES = (206.0, 109.0)
+TRACKS = (TRACK + card.CARD_PX, TRACK)  # heights of the two sliders' tracks: the last layer lies on top
+EYES = (HEAD + card.CARD_PX, HEAD)
 
 
 def at(strength: float) -> float:
@@ -239,8 +246,9 @@ def test_a_click_on_a_card_focuses_it(hand: Hand) -> None:
 
 
 def test_the_blend_rule_is_chosen_from_the_list_and_can_be_undone(hand: Hand) -> None:
-    hand.click(SIZE[0] - 60, 70)
-    hand.click(SIZE[0] - 80, 70 + 28 * 2 - 2)
+    hand.click(SIZE[0] - 25, 70)
+    place = imgui.get_current_context().open_popup_stack[0].window.pos / hand.ui.scale
+    hand.click(place.x + 40, place.y + 8 + 21 * 2 + 7)
     assert hand.work.view.blend == "sum"
     assert perform(hand.work, "undo", FACTS).view == STACK
 
@@ -261,7 +269,8 @@ def test_undo_is_grayed_while_there_is_nothing_to_undo(hand: Hand) -> None:
 
 def test_an_up_axis_button_rolls_the_camera_upright() -> None:
     hand = hand_on(ViewState())
-    hand.click(SIZE[0] - 65, 247)
+    hand.click(LEFT - 24, 129)
+    hand.click(LEFT - 64, 169)
     assert hand.work.view.camera.up == (0.0, 0.0, -1.0)
     assert history.next_undo(hand.work.past) == "up axis"
     hand.ui.close()
@@ -270,7 +279,8 @@ def test_an_up_axis_button_rolls_the_camera_upright() -> None:
 def test_what_is_up_in_the_picture_can_become_the_up_axis() -> None:
     hand = hand_on(ViewState())
     before = axes(hand.work.view.camera)
-    hand.click(SIZE[0] - 30, 247)
+    hand.click(LEFT - 24, 129)
+    hand.click(LEFT - 34, 169)
     after = axes(hand.work.view.camera)
     assert hand.work.view.camera.elevation == pytest.approx(0.0)
     for old, new in ((before.up, after.up), (before.right, after.right)):

@@ -60,8 +60,9 @@ def test_twenty_layers_in_800_px_are_rows_whose_strengths_move_together(
         assert not hand.main_view.work.cards_fit
         hand.click(TRACK + 0.25 * SPAN, row(0))
         assert hand.strengths[0] == pytest.approx(0.25, abs=0.01), "the last row is in reach"
-        hand.click(LEFT + 250.0, 70.0)
-        hand.click(LEFT + 220.0, 121.0)
+        hand.click(SIZE[0] - 25.0, 70.0)
+        place = imgui.get_current_context().open_popup_stack[0].window.pos
+        hand.click(place.x + 40.0, place.y + 8.0 + 21.0 * 2 + 7.0)
         assert hand.main_view.work.view.blend == "sum", "and so is the blend rule"
         hand.click(NAME, row(0))
         click_with(hand, imgui.Key.mod_shift, NAME, row(19))

@@ -13,7 +13,7 @@ import torch
 from progdf.gaussians import Gaussians
 from progdf.sh import C0
 from tests.helpers.stacks import Stack
-from tests.helpers.ui_rig import bear, first_view, rig
+from tests.helpers.ui_rig import HEAD, TRACK, bear, first_view, rig
 from viewer.render import highlight
 from viewer.render.engine import ViewEngine
 from viewer.render.highlight import Highlight
@@ -246,12 +246,12 @@ def test_the_mouse_on_the_line_of_an_overlap_shows_it_in_the_picture() -> None:
     stack = Stack(bear().demo, (scarf, replace(scarf, name="frost")))
     with rig(first_view(stack, 0.5, 0.5), (700, 640), stack=stack) as hand:
         before, saved = hand.picture().astype(int), hand.main_view.work.past
-        hand.move(700 - 300 + 60, 166.0)
+        hand.move(700 - 300 + 52, HEAD)
         hand.pause(1.0)
         hand.frame(2)
         assert hand.main_view.work.overlap == 1, "the upper layer's card is the first"
         assert np.abs(hand.picture() - before).max() > 60
-        hand.move(700 - 300 + 60, 136.0)
+        hand.move(700 - 300 + 60, TRACK)
         hand.frame(3)
         assert hand.main_view.work.overlap is None
         assert (hand.picture() == before).all()

@@ -18,10 +18,10 @@ from progdf.errors import ProgdfError
 from progdf.formats.ply import load_ply
 from progdf.gaussians import ATTRIBUTES
 from tests.helpers.stacks import Stack, bear_stack
-from tests.helpers.ui_rig import Rig, bear, first_view, rig
+from tests.helpers.ui_rig import HEAD, Rig, bear, first_view, rig
 from viewer.camera.view_camera import eye, to_camera
 from viewer.commands.options import StackOptions, stack_layers
-from viewer.panel import panel
+from viewer.panel import card, panel
 from viewer.panel.card import value_at
 from viewer.panel.slider import parse_strength
 from viewer.state import facts, timeline
@@ -49,8 +49,7 @@ from viewer.state.workspace import original
 
 POINTS = (700, 640)
 LEFT = POINTS[0] - panel.WIDTH_PX
-CARD_PX, HEADS, FOOTS = 97.0, 109.0, 166.0
-TOGGLES = {"solo": 106.0, "lock": 82.0, "fold": 58.0, "menu": 34.0}  # from the right edge
+TOGGLES = {"solo": 70.0, "lock": 90.0, "fold": 110.0, "paint": 130.0, "menu": 150.0}  # from the right edge
 THREE = ViewState(layers=(LayerState(0, "a", 0.5), LayerState(1, "b", 0.5), LayerState(2, "c", 0.5)))
 
 
@@ -67,12 +66,12 @@ def click(hand: Rig, x: float, y: float) -> None:
 
 
 def toggle(hand: Rig, name: str, layer: int) -> None:
-    click(hand, POINTS[0] - TOGGLES[name], FOOTS + row(layer))
+    click(hand, POINTS[0] - TOGGLES[name], HEAD + row(layer))
 
 
 def row(layer: int) -> float:
     """How far below the top one the card of a layer is: of two, the last one lies on top."""
-    return CARD_PX * (1 - layer)
+    return card.CARD_PX * (1 - layer)
 
 
 def layers(hand: Rig) -> tuple[LayerState, ...]:
@@ -94,7 +93,7 @@ def type_name(hand: Rig, text: str, end: imgui.Key = imgui.Key.enter) -> None:
 
 
 def test_the_number_shows_what_the_slider_says_in_the_same_frame(hand: Rig) -> None:
-    top, left = round(HEADS + row(0)) - 12, POINTS[0] - 80
+    top, left = round(HEAD + row(0)) - 12, POINTS[0] - 80
     hand.move(*hand.slider(0, 0.5))
     hand.press()
     before = hand.image()[top : top + 24, left:]
@@ -220,7 +219,7 @@ def test_the_toggles_of_a_card_turn_their_own_layer(hand: Rig, name: str, field:
 
 def test_alt_click_on_an_eye_shows_its_layer_alone(hand: Rig) -> None:
     hand.modifier(imgui.Key.mod_alt)
-    click(hand, LEFT + 34, HEADS + row(1))
+    click(hand, LEFT + 34, HEAD + row(1))
     hand.modifier(imgui.Key.mod_alt, False)
     assert [(layer.enabled, layer.solo) for layer in layers(hand)] == [(True, False), (True, True)]
 
@@ -243,7 +242,7 @@ def test_a_locked_slider_does_not_move(hand: Rig) -> None:
     toggle(hand, "lock", 0)
     hand.drag(hand.slider(0, 0.5), hand.slider(0, 0.9))
     assert hand.strengths == [0.5, 0.5]
-    click(hand, POINTS[0] - 40, HEADS + row(0))
+    click(hand, POINTS[0] - 40, HEAD + row(0))
     hand.frame(2)
     assert not imgui.get_io().want_text_input
 
@@ -251,7 +250,7 @@ def test_a_locked_slider_does_not_move(hand: Rig) -> None:
 def test_a_gain_is_dragged_in_the_fold_and_scales_its_kind_only(hand: Rig) -> None:
     toggle(hand, "fold", 1)
     before = hand.main_view.engine.gaussians(hand.main_view.work.view).sh0.clone()
-    y = 249.0 + row(1)  # the first gain
+    y = 244.0 + row(1)  # the first gain
     hand.drag((POINTS[0] - 76, y), (LEFT + 90, y))
     assert layers(hand)[1].gains == Gains(geometry=0.0)
     assert len(hand.main_view.work.past.past) == 1
@@ -264,9 +263,9 @@ def test_a_gain_is_dragged_in_the_fold_and_scales_its_kind_only(hand: Rig) -> No
 
 
 def test_dragging_a_name_down_moves_its_layer_as_one_entry(hand: Rig) -> None:
-    hand.move(LEFT + 100, HEADS)
+    hand.move(LEFT + 100, HEAD)
     hand.press()
-    for y in (HEADS + 10, HEADS + 60, HEADS + CARD_PX + 30):
+    for y in (HEAD + 10, HEAD + 60, HEAD + card.CARD_PX + 30):
         hand.move(LEFT + 100, y)
         assert names(hand) == ["scarf", "ears"], "the order changes with the release"
     hand.release()
@@ -279,12 +278,12 @@ def test_dragging_a_name_down_moves_its_layer_as_one_entry(hand: Rig) -> None:
 
 
 def test_a_name_dragged_and_brought_back_changes_nothing(hand: Rig) -> None:
-    hand.drag((LEFT + 100, HEADS), (LEFT + 100, HEADS + 30))
+    hand.drag((LEFT + 100, HEAD), (LEFT + 100, HEAD + 30))
     assert hand.main_view.work.past.past == ()
 
 
 def test_a_double_click_on_a_name_types_another(hand: Rig) -> None:
-    hand.double_click(LEFT + 100, HEADS + row(1))
+    hand.double_click(LEFT + 100, HEAD + row(1))
     type_name(hand, "golden ears")
     assert names(hand) == ["scarf", "golden ears"]
     assert len(hand.main_view.work.past.past) == 1
@@ -416,15 +415,15 @@ def test_a_sweep_of_a_layer_that_is_hidden_by_another_is_refused(
 def menu(hand: Rig, layer: int, item: int) -> None:
     """A right click on a layer's card, then one of Rename, Duplicate, Replace and Delete."""
     hand.pause(0.5)
-    hand.move(LEFT + 150, HEADS + row(layer))
+    hand.move(LEFT + 150, HEAD + row(layer))
     hand.press(1)
     hand.release(1)
-    click(hand, LEFT + 180, HEADS + row(layer) + 18.0 + 21.0 * item + (7.0 if item == 3 else 0.0))
+    click(hand, LEFT + 180, HEAD + row(layer) + 18.0 + 21.0 * item + (7.0 if item == 3 else 0.0))
 
 
 def test_the_top_of_the_list_lies_on_top(hand: Rig) -> None:
     """As the rule "over" has it: the last of the layers, and the first card."""
-    click(hand, LEFT + 150, HEADS)
+    click(hand, LEFT + 100, HEAD)
     assert hand.main_view.work.focus == 1
     hand.key("2")
     assert hand.main_view.work.focus == 0
@@ -432,7 +431,7 @@ def test_the_top_of_the_list_lies_on_top(hand: Rig) -> None:
     assert names(hand) == ["ears", "scarf"]
     hand.main_view.change(add_layer(hand.main_view.work.view, 0, "new"))
     hand.settle()
-    click(hand, LEFT + 150, HEADS)
+    click(hand, LEFT + 100, HEAD)
     assert layers(hand)[hand.main_view.work.focus or 0].name == "new"
 
 
@@ -473,8 +472,9 @@ def test_a_double_click_on_a_slider_takes_it_back_to_zero(hand: Rig) -> None:
     hand.double_click(*hand.slider(1, 0.5))
     assert hand.strengths == [0.5, 0.0]
     assert len(hand.main_view.work.past.past) == 1, "on the handle it is one step"
-    lens = (LEFT + 210, 437.0)
+    lens = (LEFT - 60, 96.0)  # in the popover of the view
     hand.pause(0.5)
+    click(hand, LEFT - 24, 24.0)
     click(hand, *lens)
     assert hand.main_view.work.view.camera.fov_y != 45.0
     hand.pause(0.5)

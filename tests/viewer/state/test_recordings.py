@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from imgui_bundle import imgui
 from PIL import Image
 
 from progdf.__main__ import main
@@ -214,36 +215,29 @@ def test_where_nothing_was_recorded_the_original_is_shown_and_the_reason_told() 
         assert said.notice == f"Against the original: {facts.NO_FILE}"
         left = beside_line(hand.picture().astype(float), 170)[0][BANNER:]
         assert np.abs(left - beside_line(original, 170)[0][BANNER:]).max() <= 0.51
-        shown = hand.picture()
+        shown = hand.image()[:100]
         hand.key("Alt+Y")
         assert hand.main_view.canvas.comparer.labels(hand.main_view.work.view).notice == ""
-        assert not np.array_equal(hand.picture()[:100], shown[:100]), "the notice is gone"
+        assert not np.array_equal(hand.image()[:100], shown), "the notice is gone"
 
 
 @pytest.mark.gl
-def test_the_panels_choice_is_dead_where_nothing_was_recorded_and_works_where_it_was(tall: Rig) -> None:
+def test_the_choice_is_dead_where_nothing_was_recorded_and_works_where_it_was(tall: Rig) -> None:
     tall.key("Shift+Y")
-    place = recorded_button(tall)
-    tall.click(*place)
+    choose_recorded(tall)
     assert tall.main_view.work.view.compare.against == "recorded"
     with rig(first_view(bear(), AT, AT), (640, 600)) as bare:
         bare.key("Shift+Y")
-        bare.click(*place)
+        choose_recorded(bare)
         assert bare.main_view.work.view.compare.against == "original"
 
 
-def recorded_button(hand: Rig) -> tuple[float, float]:
-    """Where the panel's button "Recorded" is: the first place in its column that chooses it."""
-    x = hand.points[0] - 109.0
-    for y in range(250, hand.points[1] - 40, 8):
-        before = hand.main_view.work.view
-        hand.click(x, y)
-        found = hand.main_view.work.view.compare.against == "recorded"
-        hand.main_view.change(before)
-        hand.settle()
-        if found:
-            return x, float(y)
-    raise AssertionError("there is no such button")
+def choose_recorded(hand: Rig) -> None:
+    """From the menu of the comparison at the top of the picture."""
+    pill = next(window for window in imgui.get_current_context().windows if window.name == "comparison")
+    hand.click(pill.pos.x + pill.size.x - 16.0, pill.pos.y + 16.0)
+    menu = imgui.get_current_context().open_popup_stack[0].window.pos
+    hand.click(menu.x + 40.0, menu.y + 127.5)
 
 
 @pytest.mark.gl

@@ -19,8 +19,8 @@ from viewer.state.actions import perform
 from viewer.state.layers import visible_layers
 from viewer.state.view_state import LayerGroup, SnapshotPair, ViewState
 
-SLIDER = 485.0  # between A and B, when the panel of a window of 640 px is scrolled to its end
-RENAME, DELETE = 517.0, 622.0  # in the menu of a snapshot at 874, 540, which the window's edge moves up
+SLIDER = 291.0  # between A and B
+CARD, RENAME, DELETE = 342.0, 358.0, 462.0  # a snapshot at 874, and in its menu
 
 
 def test_snapshots_are_one_undo_entry_to_go_back_to_and_begin_with_the_original() -> None:
@@ -128,12 +128,11 @@ def test_a_click_on_a_small_picture_goes_back_to_its_snapshot_and_its_menu_delet
         first = hand.picture()
         for chord in ("F3", "Shift+Left", "Shift+Left", "F3"):
             hand.key(chord)
-        hand.wheel(900.0, 400.0, -100.0)
         hand.rest()
         assert hand.main_view.next_frame_delay() is None, "the small pictures are there"
-        entries, drawn = len(hand.main_view.work.past.past), hand.image()[515:565, 745:1005]
+        entries, drawn = len(hand.main_view.work.past.past), hand.image()[317:367, 745:1005]
         assert len(np.unique(drawn.reshape(-1, 3), axis=0)) > 500, "pictures, not empty cards"
-        hand.move(874.0, 540.0)
+        hand.move(874.0, CARD)
         hand.press()
         hand.release()
         assert hand.strengths == [0.5, 0.5]
@@ -146,7 +145,7 @@ def test_a_click_on_a_small_picture_goes_back_to_its_snapshot_and_its_menu_delet
         assert [kept.name for kept in hand.main_view.work.snapshots] == ["2"]
         hand.key("Ctrl+Z")
         assert [kept.name for kept in hand.main_view.work.snapshots] == ["1", "2"]
-        hand.move(874.0, 540.0)
+        hand.move(874.0, CARD)
         hand.press(1)
         hand.release(1)
         hand.click(904.0, RENAME)
@@ -186,7 +185,6 @@ def test_two_snapshots_are_compared_until_something_is_edited_and_blended(
         assert said.right.startswith("2 · PSNR")
         hand.key("Shift+Left")
         assert hand.main_view.work.view.compare.mode == "off", "one sees what one does"
-        hand.wheel(900.0, 400.0, -100.0)
         hand.rest()
         entries, drawn = len(hand.main_view.work.past.past), hand.main_view.canvas.pictures_drawn
         composed = Count(monkeypatch, Composer, "update")
@@ -205,6 +203,6 @@ def test_two_snapshots_are_compared_until_something_is_edited_and_blended(
         hand.key("Ctrl+Z")
         assert hand.strengths == [0.0, 0.8]
         assert hand.main_view.work.view.pair.share == 0.0
-        hand.drag((968.0, 540.0), (880.0, 545.0))
+        hand.drag((968.0, CARD), (880.0, CARD + 5.0))
         assert [kept.name for kept in hand.main_view.work.snapshots] == ["2", "1"], "dragged before the other"
         assert hand.strengths == [0.0, 0.8], "and not gone back to"

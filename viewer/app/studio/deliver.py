@@ -47,6 +47,12 @@ class DeliverActions:
             error = failure_line(lambda: self._start(argument, dialog))
             main_view.work = replace(main_view.work, dialog=replace(dialog, error=error) if error else None)
             main_view.wake()
+        elif name == "rebind":
+            main_view.ask(Dialog("rebind", then=argument))
+        elif name == "rebind_from":
+            edit, _, source = argument.partition("\n")
+            if error := failure_line(lambda: self._rebind(Path(edit), parse_path(source))):
+                main_view.show_message(error, error=True)
         elif name == "about":
             main_view.ask(Dialog("about", f"ProGDF Studio {__version__}, Python {sys.version.split()[0]}"))
         else:
@@ -76,6 +82,17 @@ class DeliverActions:
         while free.exists() or free in written:
             free, number = out.with_stem(f"{out.stem}-{number}"), number + 1
         main_view.ask(Dialog(name, str(free), options=options))
+
+    def _rebind(self, edit: Path, source: Path) -> None:
+        """Queue what carries an edit of the scene at `source` over to the one that is open."""
+        path, out, number = self._app.document.path, edit.with_stem(f"{edit.stem}-rebound"), 2
+        if path is None:
+            raise ProgdfError("there is no scene yet; open one first")
+        while out.exists():
+            out, number = edit.with_stem(f"{edit.stem}-rebound-{number}"), number + 1
+        words = ("rebind", str(edit), f"--from={source}", f"--to={path.resolve()}", f"--out={out}")
+        log = self._queue.folder / f"rebind{len(list(self._queue.folder.iterdir()))}.log"
+        self._queue.add(Delivery(f"Rebinding {edit.name}", out, words, log, path.resolve()))
 
     def _start(self, kind: str, dialog: Dialog) -> None:
         out, options = parse_path(dialog.text).resolve(), dialog.options or DeliverOptions()

@@ -15,7 +15,7 @@ from viewer.camera.view_camera import ViewCamera
 from viewer.jobs.job_queue import FORMAT_NAMES, FORMATS, FPS, SIZES, DeliverOptions, film_title
 from viewer.state.view_state import ViewState
 from viewer.ui import overlay
-from viewer.ui.context import BEHIND, FIXED, PALETTE, SMALL_PX, UNFOCUSED, Icon, UiContext, u32
+from viewer.ui.context import BEHIND, FIXED, PALETTE, SMALL_PX, Icon, UiContext, u32
 from viewer.ui.overlay import Area
 from viewer.ui.widgets import (
     accent_button,
@@ -24,8 +24,9 @@ from viewer.ui.widgets import (
     elide,
     label,
     picture,
+    plate,
     right_edge,
-    section,
+    small,
     tip,
 )
 
@@ -61,7 +62,7 @@ def draw_start_page(recent: Sequence[RecentFile], ui: UiContext) -> list[str]:
     imgui.begin_child("middle", imgui.ImVec2(wide, 0.0))
     actions = _head(ui)
     if recent:
-        section("Recent", ui)
+        small("Recent", PALETTE.dim)
         actions += _grid(recent, cards, ui)
     _drop_target(wide, ui)
     imgui.end_child()
@@ -195,35 +196,26 @@ def draw_up_strip(strip: UpStrip, area: Area, ui: UiContext) -> tuple[str, ...]:
     """Draw it along the lower edge of `area`; the requests that come of it."""
     wide, scale, requests = _picture_width(strip, area, ui), ui.scale, list[str]()
     tall = up_strip_height(strip, area, ui) - _GAP_PX * scale
-    imgui.set_next_window_pos(
-        imgui.ImVec2(area.width / 2, area.height - _GAP_PX * scale), 0, imgui.ImVec2(0.5, 1.0)
-    )
     count = len(strip.choices)
     across = count * wide + ((count - 1) * _GAP_PX + 2 * _PAD_PX) * scale
-    imgui.set_next_window_size(imgui.ImVec2(across, tall))
-    imgui.push_style_color(imgui.Col_.window_bg, imgui.ImVec4(*PALETTE.scrim))
-    imgui.push_style_var(imgui.StyleVar_.window_rounding, 6.0 * scale)
-    imgui.push_style_var(imgui.StyleVar_.window_padding, imgui.ImVec2(_PAD_PX * scale, _PAD_PX * scale))
-    imgui.begin("up axis", None, FIXED | UNFOCUSED)
-    top, right = imgui.get_cursor_pos_y(), right_edge()
-    imgui.text("Which way is up?")
-    keep = f"Keep {strip.now} (Esc)"
-    imgui.push_font(None, SMALL_PX)
-    room = imgui.calc_text_size(keep).x + 2 * imgui.get_style().frame_padding.x
-    if right - room > imgui.get_item_rect_size().x + _PAD_PX * scale:
-        imgui.same_line(right - room)
-        if imgui.small_button(keep):
-            requests.append("keep_up")
-    imgui.pop_font()
-    for i, direction in enumerate(strip.choices):
-        imgui.set_cursor_pos(
-            imgui.ImVec2((_PAD_PX + i * _GAP_PX) * scale + i * wide, top + _TITLE_PX * scale)
-        )
-        if _up_picture(direction, wide, direction.name == strip.now, ui):
-            requests.append(f"set_up:{i}")
-    imgui.end()
-    imgui.pop_style_var(2)
-    imgui.pop_style_color()
+    place = imgui.ImVec2(area.width / 2, area.height - _GAP_PX * scale)
+    with plate("up axis", place, ui, (0.5, 1.0), _PAD_PX, imgui.ImVec2(across, tall)):
+        top, right = imgui.get_cursor_pos_y(), right_edge()
+        imgui.text("Which way is up?")
+        keep = f"Keep {strip.now} (Esc)"
+        imgui.push_font(None, SMALL_PX)
+        room = imgui.calc_text_size(keep).x + 2 * imgui.get_style().frame_padding.x
+        if right - room > imgui.get_item_rect_size().x + _PAD_PX * scale:
+            imgui.same_line(right - room)
+            if imgui.small_button(keep):
+                requests.append("keep_up")
+        imgui.pop_font()
+        for i, direction in enumerate(strip.choices):
+            imgui.set_cursor_pos(
+                imgui.ImVec2((_PAD_PX + i * _GAP_PX) * scale + i * wide, top + _TITLE_PX * scale)
+            )
+            if _up_picture(direction, wide, direction.name == strip.now, ui):
+                requests.append(f"set_up:{i}")
     return tuple(requests)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import webbrowser
 import zlib
 from collections.abc import Callable
 from dataclasses import replace
@@ -10,6 +11,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from imgui_bundle import imgui
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -85,6 +87,11 @@ class JobActions:
                 self._try(lambda: self.queue.discard(int(argument)))
             case "close_run":
                 self.queue.dismiss(int(argument))
+            case "show_file" | "copy_path" if (job := self.queue.job(int(argument))) is not None:
+                if name == "copy_path":
+                    imgui.set_clipboard_text(str(job.task.out))
+                else:
+                    webbrowser.open(job.task.out.parent.as_uri())
             case "run_log":
                 if (job := self.queue.job(int(argument))) is not None:
                     self._app.main_view.ask(Dialog("log", str(job.task.log)))
@@ -261,11 +268,14 @@ class JobActions:
     def _end(self, job: Job) -> None:
         """A job has ended: a new edit comes on top, else a line says what became of it."""
         task, main_view = job.task, self._app.main_view
-        if job.status == "done" and not job.warning:
+        if job.status == "done" and not job.warning and isinstance(task, EditOrder):
             self.queue.dismiss(job.number)
+        if job.status == "failed" and not main_view.work.view.panel:  # else its card says so
+            main_view.show_message(f"{task.name}: {job.error}", error=True)
         if isinstance(task, Delivery):
-            if job.status == "failed":
-                main_view.show_message(f"{task.name}: {job.error}", error=True)
+            if job.status == "done" and task.words[0] == "rebind":
+                self.queue.dismiss(job.number)
+                self._app.open(task.out)
             elif job.status == "done":
                 main_view.show_message(f"Wrote {task.out}")
             return
@@ -280,8 +290,6 @@ class JobActions:
             self._app.show(self._app.document)
         if job.status == "done":
             main_view.show_message(f"{task.name} is trained: {task.result}")
-        elif job.status == "failed":
-            main_view.show_message(f"{task.name} was not trained: {job.error}", error=True)
         elif job.status == "elsewhere" and task.result.is_file():
             main_view.show_message(f"{task.name} was trained in another window: {task.result}")
 
