@@ -40,7 +40,7 @@ from viewer.ui.widgets import (
     wrapped_text,
 )
 
-COLUMN_PX = 66.0
+COLUMN_PX = 84.0
 _GRADES = {
     "exposure": "Stops of light: −1 is half of it, 1 twice as much",
     "temperature": "From blue to amber light",
