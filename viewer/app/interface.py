@@ -212,6 +212,7 @@ def over_picture(
     if view.brush.active and not (io.want_capture_mouse or io.key_alt or on_axes):
         tools.draw_ring(view, ui)
     overlay.draw_axes(view, area, on_axes or held.drag == overlay.AXES_DRAG, ui)
+    select_tool.draw_strokes(held.strokes, work, pointer)
     select_tool.draw_gesture(held.gesture, view, ui, pointer.left)
     if not original:
         mouse.draw_comparison(view, area, mouse.grips_divider(held, view, pointer), ui)

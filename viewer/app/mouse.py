@@ -23,7 +23,7 @@ from viewer.ui.overlay import Area
 from viewer.ui.pointer import PointerContext
 
 from . import select_tool
-from .select_tool import Click, Gesture
+from .select_tool import Click, Gesture, Strokes
 
 REACH_PX = 8.0  # at 1×: so near to the divider the mouse grips it
 DIVIDER = "divider"
@@ -100,6 +100,7 @@ class MouseTool:
     gesture: Gesture | None = None  # of the tool that selects; of a polygon also between its clicks
     # the last of a tool that selects by one, while it follows the tool's tolerance
     click: Click | None = None
+    strokes: tuple[Strokes, ...] = ()  # that a tool spreads, as they became more
     divider: float = 0.5  # where that of a split stood when it was gripped, share of the picture's width
     axis: str = ""  # the end of an axis that was pressed, of `AXES`, or another part of the axes
     # of the tools that select and paint, as they were before a button was pressed
@@ -115,8 +116,11 @@ def handle_mouse(tool: MouseTool, work: Workspace, pointer: PointerContext) -> t
     if imgui.is_mouse_released(0) and tool.drag in ("orbit", "look") and not _has_traveled(pointer.ui):
         work = _focus_picked_layer(work, pointer)
     if tool.drag == select_tool.SELECT_DRAG and imgui.is_mouse_released(0) and tool.gesture is not None:
-        gesture, work = select_tool.release(tool.gesture, work, pointer)
-        tool = replace(tool, gesture=gesture)
+        strokes, held = tool.strokes, tool.gesture
+        if held.tool == "scribble":
+            strokes, work = select_tool.spread(strokes, held, work, pointer)
+        gesture, work = select_tool.release(held, work, pointer)
+        tool = replace(tool, gesture=gesture, strokes=strokes)
     if tool.drag == overlay.AXES_DRAG and imgui.is_mouse_released(0) and not _has_traveled(pointer.ui):
         work = _look_along(work, tool.axis)
     if not any_button_down():
@@ -126,7 +130,7 @@ def handle_mouse(tool: MouseTool, work: Workspace, pointer: PointerContext) -> t
     if grips_divider(tool, work.view, pointer):
         show_grip()
         if imgui.is_mouse_clicked(0):
-            return MouseTool(DIVIDER, divider=work.view.compare.divider), work
+            return replace(tool, drag=DIVIDER, divider=work.view.compare.divider), work
     axis, plain = overlay.axis_under(work.view, pointer.area, pointer.ui), not io.key_alt
     if axis and imgui.is_mouse_clicked(0):
         return replace(tool, drag=overlay.AXES_DRAG, axis=axis), work

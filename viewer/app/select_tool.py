@@ -10,6 +10,7 @@ import torch
 from imgui_bundle import imgui
 
 from progdf.scene.neighbors import Neighborhood, grow_along_surface
+from progdf.scene.scribbles import Rows
 from progdf.scene.selection import (
     Centers,
     Mask,
@@ -20,6 +21,7 @@ from progdf.scene.selection import (
     inside_polygon,
     inside_rectangle,
     inside_stroke,
+    project_centers,
 )
 from viewer.camera.view_camera import Vec3
 from viewer.render.picking import Seen, seen_at, surface_point
@@ -31,6 +33,7 @@ from viewer.ui.context import PALETTE, UiContext, u32
 from viewer.ui.keys import Keys
 from viewer.ui.pointer import PointerContext
 
+_STROKE_PX, _MOST_PLACES, _MOST_DOTS = 4.0, 16, 300  # at 1×: half a stroke's width; places looked at; dots
 _SEEDS = 0.1  # of a pixel's color that a Gaussian gives to be a seed
 
 Point = tuple[float, float]
@@ -64,6 +67,15 @@ class Gesture:
 
 
 @dataclass(frozen=True)
+class Strokes:
+    """What was drawn on a thing and beside it."""
+
+    on: Rows  # of the Gaussians under strokes on it
+    beside: Rows  # under those beside it
+    after: bytes  # what was selected by them, packed
+
+
+@dataclass(frozen=True)
 class Click:
     """A click of "flood" or "color", which follows its tolerance until something else is selected."""
 
@@ -85,7 +97,7 @@ def begin(tool: str, mode: str, before: bytes, at: Point, surface: Surface, thro
         through: also what lies behind the front surface
     """
     gesture = Gesture(tool, mode, before, (at,))
-    if tool == "brush":
+    if tool in ("brush", "scribble"):
         front = np.isfinite(surface.centers.points[:, 0])
         if not through:
             front = surface.front(np.arange(len(front)))
@@ -232,7 +244,8 @@ def follow(gesture: Gesture, work: Workspace, pointer: PointerContext) -> Held:
     if gesture.tool == "polygon":
         return gesture, work
     density = imgui.get_io().display_framebuffer_scale.x * pointer.ui.scale
-    gesture = extend(gesture, pointer.cursor, work.view.select.radius * density)
+    radius = _STROKE_PX if gesture.tool == "scribble" else work.view.select.radius
+    gesture = extend(gesture, pointer.cursor, radius * density)
     if gesture.tool in ("brush", "sphere"):
         work = _apply(gesture, work, _selected_rows(gesture, work, pointer), pointer)
     return gesture, work
@@ -252,6 +265,37 @@ def finish(gesture: Gesture, work: Workspace, pointer: PointerContext) -> Held:
     if not small:
         return None, _apply(gesture, work, _selected_rows(gesture, work, pointer), pointer)
     return None, _with(work, selection.select_none(work.view.selection)) if gesture.mode == "new" else work
+
+
+def spread(
+    strokes: tuple[Strokes, ...], gesture: Gesture, work: Workspace, pointer: PointerContext
+) -> tuple[tuple[Strokes, ...], Workspace]:
+    """A stroke is over: what belongs to those on the thing rather than to those beside it is selected.
+
+    Strokes count until something else is selected, and again where undo goes back to what they selected.
+    """
+    on, beside = strokes_of(strokes, work) or (np.zeros(0, np.int64),) * 2
+    touched = np.zeros(0, np.int64) if gesture.brushed is None else np.flatnonzero(gesture.brushed.touched)
+    path = gesture.path[:: len(gesture.path) // _MOST_PLACES + 1]
+    places = (seen_at(pointer.surface.scene, pointer.surface.camera, *at) for at in path)
+    # large ones show where their centers are not
+    rows = np.concatenate([touched, *(_seeds(seen) for seen in places if seen is not None)])
+    if gesture.mode == "subtract":
+        beside = np.union1d(beside, rows)
+    else:
+        on = np.union1d(on, rows)
+    mask = np.zeros(pointer.facts.count, bool)
+    mask[on] = True  # all that is known without a stroke beside the thing
+    if len(on) and len(beside):
+        mask = pointer.facts.scribbles().select(on, beside)
+    work = _with(work, selection.select(work.view.selection, mask))
+    return (*strokes, Strokes(on, beside, work.view.selection.members)), work
+
+
+def strokes_of(strokes: tuple[Strokes, ...], work: Workspace) -> tuple[Rows, Rows] | None:
+    """The rows on the thing and beside it that made the present selection; None where none did."""
+    made = (each for each in reversed(strokes) if each.after == work.view.selection.members)
+    return next(((each.on, each.beside) for each in made), None)
 
 
 def take_keys(
@@ -294,6 +338,21 @@ def _with(work: Workspace, state: selection.SelectionState) -> Workspace:
 _HALO, _LINE = 3.0, 1.25  # widths at 1×
 
 
+def draw_strokes(strokes: tuple[Strokes, ...], work: Workspace, pointer: PointerContext) -> None:
+    """Dots where strokes went, green on the thing and red beside it, from wherever one looks."""
+    rows = strokes_of(strokes, work) if work.view.select.tool == "scribble" else None
+    if rows is None:
+        return
+    density, canvas = imgui.get_io().display_framebuffer_scale, imgui.get_background_draw_list()
+    camera, scene = pointer.camera(work.view.camera), pointer.scene
+    for some, color in zip(rows, (_ON, _BESIDE), strict=True):
+        some = some[:: len(some) // _MOST_DOTS + 1]
+        at = project_centers(scene[torch.from_numpy(some)], camera).points
+        for x, y in at[np.isfinite(at).all(axis=1)].tolist():
+            center = imgui.ImVec2((x + pointer.left) / density.x, y / density.y)
+            canvas.add_circle_filled(center, 2.0 * pointer.ui.scale, u32(color))
+
+
 def draw_gesture(gesture: Gesture | None, view: ViewState, ui: UiContext, left: int = 0) -> None:
     """Draw it, in window coordinates; the ring of the brush also between its strokes.
 
@@ -314,6 +373,9 @@ def draw_gesture(gesture: Gesture | None, view: ViewState, ui: UiContext, left: 
         _line([first, *corners], True, ui)
     elif gesture.tool == "lasso":
         _line(path, True, ui)
+    elif gesture.tool == "scribble":
+        canvas, color = imgui.get_background_draw_list(), _BESIDE if gesture.mode == "subtract" else _ON
+        canvas.add_polyline([*path], u32(color), 2 * _STROKE_PX * ui.scale, 0)
     elif gesture.tool == "polygon":
         _line([*path, mouse] if over else path, False, ui)
         for corner in path:
@@ -343,3 +405,4 @@ def _dot(center: imgui.ImVec2, ui: UiContext) -> None:
 
 
 _DARK = (0.0, 0.0, 0.0, 0.5)
+_ON, _BESIDE = (0.30, 0.85, 0.35, 1.0), (0.95, 0.30, 0.25, 1.0)

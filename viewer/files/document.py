@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from pathlib import Path
+from typing import TypeVar
 
 import torch
 
@@ -16,11 +17,15 @@ from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf, load_gdf
 from progdf.region import Region
 from progdf.scene.neighbors import Neighborhood
+from progdf.scene.scribbles import Scribbles
+from progdf.scene.selection import base_colors
 from progdf.terminal import escape_text
 from progdf.threads import all_threads
 from viewer.camera.view_camera import SceneUp, bounds_of, find_scene_up, first_camera, fit, fit_all
 from viewer.state.facts import RecordingFile, find_recording, layer_rows
 from viewer.state.workspace import SceneFacts
+
+_Made = TypeVar("_Made")
 
 Place = Callable[[Gaussians, int, str], Region | None]
 """Gives the region of a scene that an edit's grade is applied to, by its number and its name; None where the
@@ -74,6 +79,7 @@ class Document:
             fit=lambda camera, aspect: fit_all(camera, self.original, aspect),
             fit_members=lambda camera, aspect, mask: fit(camera, scene[torch.tensor(mask)], aspect),
             neighborhood=_once(lambda: Neighborhood(scene)),
+            scribbles=_once(lambda: Scribbles(scene.means.nan_to_num().numpy(), base_colors(scene))),
             home=lambda camera, aspect: replace(
                 first_camera(self.original, (), aspect, camera.fov_y, camera.up), mode=camera.mode
             ),
@@ -90,13 +96,13 @@ class Document:
         return _free_name(name, self.edits)
 
 
-def _once(make: Callable[[], Neighborhood]) -> Callable[[], Neighborhood]:
+def _once(make: Callable[[], _Made]) -> Callable[[], _Made]:
     """Made when it is first asked for, by whichever thread; another one that asks meanwhile waits."""
-    lock, neighborhood = threading.Lock(), cache(make)
+    lock, made = threading.Lock(), cache(make)
 
-    def ask() -> Neighborhood:
+    def ask() -> _Made:
         with lock:
-            return neighborhood()
+            return made()
 
     return ask
 

@@ -40,7 +40,7 @@ from viewer.ui.widgets import (
     wrapped_text,
 )
 
-COLUMN_PX = 66.0
+COLUMN_PX = 84.0
 _GRADES = {
     "exposure": "Stops of light: −1 is half of it, 1 twice as much",
     "temperature": "From blue to amber light",
@@ -189,11 +189,11 @@ def _settings(form: NewEdit, preview: PreviewState, column: float, ui: UiContext
             amount = slider_row("Amount", form.amount, (0.05, 0.98), 0.7, column, ui, help_)
             form = replace(form, amount=amount)
         case "grade":
-            rows = zip(GRADE_RANGES.items(), form.grade, strict=True)
-            grade = [
-                slider_row(name.capitalize(), value, (low, high), neutral, column, ui, _GRADES[name])
-                for (name, (low, high, neutral)), value in rows
-            ]
+            grade = []
+            for (name, (low, high, neutral)), value in zip(GRADE_RANGES.items(), form.grade, strict=True):
+                label(name.capitalize(), column)
+                grade.append(value_slider(f"##{name}", value, (low, high), "%.2f", neutral, ui))
+                tip(_GRADES[name])
             form = replace(form, grade=tuple(grade))
         case "style":
             label("Style", column)

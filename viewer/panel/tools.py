@@ -60,6 +60,11 @@ _TOOLS = (
             "Polygon: click its corners; Enter or a double click closes it",
         ),
         ("select_tool:brush", Icon.SELECT_BRUSH, "Brush"),
+        (
+            "select_tool:scribble",
+            Icon.SCRIBBLE,
+            "Scribble: a stroke or two on a thing, a few beside it (Ctrl)",
+        ),
         ("select_tool:sphere", Icon.SPHERE, "Sphere: drag from its center on a surface"),
         ("select_tool:flood", Icon.FLOOD, "Flood: click a surface; what is connected and alike in color"),
         ("select_tool:color", Icon.COLOR, "Color: click; everything that is alike in color"),
@@ -224,8 +229,10 @@ def _select_options(tool: SelectTool, bar: _Bar) -> SelectTool:
     """How the tool selects."""
     modes = dict(zip(SELECT_MODES, ("New", "Add", "Subtract", "Intersect"), strict=True))
     help_ = f"What becomes of the present selection.\n{_MODES}"
+    if tool.tool == "scribble":
+        modes, help_ = {"new": "On it", "subtract": "Beside it"}, "Where the next stroke is. Ctrl: beside it"
     tool = replace(tool, mode=bar.segments("mode", modes, tool.mode, help_, ""))
-    if tool.tool not in ("sphere", "flood"):
+    if tool.tool not in ("sphere", "flood", "scribble"):
         help_ = "Select only the front surface, or everything behind it too"
         through = bar.segments("depth", _DEPTHS, tool.through, help_, "select_through")
         tool = replace(tool, through=through)

@@ -18,7 +18,7 @@ OVERSHOOT = 1.2
 """How far a slider goes where overshoot is on: beyond 1 the edit is extrapolated, not learned."""
 BRUSH_MODES = ("add", "erase", "smooth")
 SMALLEST_PX, LARGEST_PX = 4.0, 400.0
-SELECT_TOOLS = ("box", "lasso", "polygon", "brush", "sphere", "flood", "color")
+SELECT_TOOLS = ("box", "lasso", "polygon", "brush", "scribble", "sphere", "flood", "color")
 SELECT_MODES = ("new", "add", "subtract", "intersect")
 COMPARE_MODES = ("off", "beside", "split", "difference")
 AGAINST = ("original", "recorded", "snapshots")

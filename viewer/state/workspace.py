@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 from msgspec import Meta
 
 from progdf.gaussians import ZERO, Origin
 from progdf.scene.neighbors import Neighborhood
+from progdf.scene.scribbles import Scribbles
 from progdf.scene.selection import Mask
 from progdf.terminal import escape_text
 from viewer.camera.view_camera import Bounds, Fit, ViewCamera, keep_camera
@@ -79,7 +80,7 @@ class PreviewState(NamedTuple):
     models: tuple[str, ...] = ()  # that are on this machine
 
 
-def _no_neighborhood() -> Neighborhood:
+def _no_facts() -> Any:
     raise ValueError("nothing is known of this scene's neighborhood")
 
 
@@ -98,8 +99,9 @@ class SceneFacts:
     # the same for what is selected
     fit_members: Callable[[ViewCamera, float, Mask], ViewCamera] = lambda camera, *_: camera
     home: Fit = keep_camera  # gives the first camera for another up axis, which is the given camera's
-    # of the scene's Gaussians, made when it is first asked for
-    neighborhood: Callable[[], Neighborhood] = _no_neighborhood
+    # of the scene's Gaussians, made when it is first asked for; and what strokes spread over
+    neighborhood: Callable[[], Neighborhood] = _no_facts
+    scribbles: Callable[[], Scribbles] = _no_facts
 
 
 @dataclass(frozen=True)

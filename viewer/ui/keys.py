@@ -139,9 +139,10 @@ TOPICS: dict[str, tuple[KeyBinding, ...]] = {
             listed="R L P U",
         ),
         *_keys(
-            "sphere, connected and alike, alike",
-            *("Shift+R select_tool:sphere", "J select_tool:flood", "I select_tool:color"),
-            listed="Shift+R J I",
+            "scribble, sphere, connected and alike, alike",
+            *("Shift+U select_tool:scribble", "Shift+R select_tool:sphere"),
+            *("J select_tool:flood", "I select_tool:color"),
+            listed="Shift+U R J I",
         ),
         *_keys("front surface or all depths", "N select_through"),
         *_keys(

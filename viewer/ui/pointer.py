@@ -92,8 +92,8 @@ class PointerContext:
         if self.facts.count < MANY or not (tool or self.shown.brush.active):
             return
         another = self.surfaces.look(self._surface_key, self._copy_surface, tool in ("flood", "color"))
-        if another and tool == "flood":
-            beside(self.facts.neighborhood)
+        if another and tool in ("flood", "scribble"):
+            beside(self.facts.neighborhood if tool == "flood" else self.facts.scribbles)
 
     @property
     def _surface_key(self) -> object:

@@ -25,6 +25,7 @@ from viewer.ui import pointer
 pytestmark = pytest.mark.gl
 WINDOW = (700, 640)
 MIDDLE = (200.0, 320.0)
+ON_HEAD = (210.0, 190.0)
 LASSO = ((120.0, 200.0), (300.0, 220.0), (290.0, 400.0), (210.0, 330.0), (110.0, 390.0))
 
 
@@ -383,3 +384,34 @@ def test_strays_of_a_scene_that_is_no_longer_open_hide_nothing(tmp_path: Path) -
             time.sleep(0.05)
         assert not app.main_view.work.view.selection.hidden
         assert "strays (" not in app.main_view.work.message.text
+
+
+def test_strokes_on_a_thing_and_beside_it_select_it_and_undo_takes_the_last_one_back(hand: Rig) -> None:
+    """The head, by a stroke on it and one over the body; another beside takes what it lies on away."""
+
+    def beside(path: Sequence[tuple[float, float]]) -> None:
+        hand.modifier(imgui.Key.mod_ctrl)
+        drag_along(hand, path)
+        hand.modifier(imgui.Key.mod_ctrl, False)
+
+    x, y = ON_HEAD
+    hand.key("Shift+U")
+    drag_along(hand, [(x - 30, y), (x, y), (x + 30, y)])
+    stroke = selected(hand).copy()
+    assert 0 < stroke.sum() < 100, "all that is known as yet"
+    below = (x, y + 200)
+    beside([(below[0] - 60, below[1]), below, (below[0] + 60, below[1])])
+    first = selected(hand).copy()
+    assert (first | ~stroke).all()
+    assert stroke.sum() < first.sum() < 0.7 * len(first)
+    dots = hand.picture()
+    hand.key("Ctrl+Z")
+    assert (selected(hand) == stroke).all()
+    assert (hand.picture() != dots).any()
+    hand.key("Ctrl+Y")
+    assert (selected(hand) == first).all()
+    beside([(below[0] - 60, below[1] - 60), (below[0] + 60, below[1] - 60)])
+    assert selected(hand).sum() < first.sum(), "the strokes before count on"
+    hand.key("Ctrl+Shift+A")
+    drag_along(hand, [(below[0] - 20, below[1]), below])
+    assert selected(hand).sum() < 100, "and no more once nothing is selected"
