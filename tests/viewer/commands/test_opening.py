@@ -250,10 +250,10 @@ def test_frames_replace_no_file_that_is_read_and_half_of_them_are_none(
     here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     saved(here, filmed(moving=False))
-    Path("bear_001.ply").symlink_to("bear.ply")
+    Path("same_001.ply").symlink_to("bear.ply")
     given = ("work.session.json", "--timeline", "work.session.json")
-    assert run("export", *given, "-o", "bear.ply") == 2
-    assert "is one of the files to read" in capsys.readouterr().err
+    assert run("export", *given, "-o", "same.ply") == 2
+    assert "same_001.ply is one of the files to read" in capsys.readouterr().err
     whole = scene_file.save_scene
 
     def full(path: Path, scene: Gaussians) -> None:
