@@ -148,7 +148,9 @@ def panels(
     work = panel.draw(work, pointer.facts, textures, preview, recent, reveal, pointer.ui, actions)
     work = perform_actions(work, actions, pointer)
     if work.player.shown:
-        requested = timeline_bar.draw(work.view.timeline, work.player, pointer.area, pointer.ui)
+        requested = timeline_bar.draw(
+            work.view.timeline, work.player, work.view.safe_frame, pointer.area, pointer.ui
+        )
         work = perform_actions(work, requested, pointer)
     return work
 
