@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from progdf.compose.layers import Layer
     from progdf.formats.ply import load_ply, save_ply
-    from progdf.formats.scene_file import load_scene
+    from progdf.formats.scene_file import load_scene, save_scene
     from progdf.gdf.file import Gdf, load_gdf, save_gdf
     from progdf.io.cameras import load_cameras
 
@@ -33,6 +33,7 @@ __all__ = [
     "render",
     "save_gdf",
     "save_ply",
+    "save_scene",
 ]
 
 _MODULES = {
@@ -48,6 +49,7 @@ _MODULES = {
     "render": "rasterize",
     "save_gdf": "gdf.file",
     "save_ply": "formats.ply",
+    "save_scene": "formats.scene_file",
 }
 
 
