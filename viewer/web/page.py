@@ -2,9 +2,9 @@
 
 The page reads a container (src/data.js): the length of its header, the header (JSON), and its arrays, channel
 after channel, the bytes of one weight together, so that gzip finds what is alike. Members of edits come
-first, so that a slider sends one run of rows, and near ones lie together. The script is src/*.js put one
-after another, the shaders are the viewer's own, and the policy in the page's head lets nothing else run: a
-.gdf's names are a stranger's text.
+first, those of the same edits together, so that a slider sends few runs of rows, and near ones lie together.
+The script is src/*.js put one after another, the shaders are the viewer's own, and the policy in the page's
+head lets nothing else run: a .gdf's names are a stranger's text.
 """
 
 from __future__ import annotations
@@ -125,13 +125,12 @@ def pack(
     """
     scene = _finite(scene)
     kept = min(DRAWN_SH[degree], scene.shN.shape[1])
-    members = np.zeros(len(scene), bool)
-    for gdf in gdfs:
-        members[gdf.region.members.numpy()] = True
-    seen = members | (scene.logit_opacities.numpy() >= UNSEEN_LOGIT)
+    groups = _groups(len(scene), [gdf.region.members.numpy() for gdf in gdfs])
+    seen = (groups > 0) | (scene.logit_opacities.numpy() >= UNSEEN_LOGIT)
     seen = seen if stays is None else seen & stays
-    order = _order(scene, members)
-    order, count = order[seen[order]], int((members & seen).sum())
+    order = _order(scene, groups)
+    order = order[seen[order]]
+    count = int((groups[order] > 0).sum())
     place = np.full(len(scene), -1, np.int64)
     place[order] = np.arange(len(order))
     inside = [_ascending(place[gdf.region.members.numpy()]) for gdf in gdfs]
@@ -147,11 +146,12 @@ def pack(
         "paints": paints,
         "count": len(order),
         "members": count,
+        "segments": _segments(groups[order[:count]], order, gdfs),
         "sh": kept,
         "antialiased": scene.antialiased,
         "attributes": attributes,
         "edits": [
-            _edit(arrays, scene, gdf, place, rows, kept, exact, overlaps)
+            _edit(arrays, scene, gdf, rows, kept, exact, overlaps)
             for gdf, rows in zip(gdfs, inside, strict=True)
         ],
         "sphere": [
@@ -207,12 +207,33 @@ def _finite(scene: Gaussians) -> Gaussians:
     return replace(scene, **{name: changed[name].reshape(getattr(scene, name).shape) for name in ATTRIBUTES})
 
 
-def _order(scene: Gaussians, members: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Rows in the page's order: members first, near ones together (by Morton's code)."""
+def _groups(count: int, regions: Sequence[NDArray[np.int64]]) -> NDArray[np.int64]:
+    """A number for each row, alike where the same edits have it, 0 where none. [N]"""
+    groups = np.zeros(count + 1, np.int64)  # one more row, which is nobody's
+    for members in regions:
+        groups *= 2
+        groups[members] += 1
+        groups = np.unique(groups, return_inverse=True)[1]
+    return groups[:-1]
+
+
+def _order(scene: Gaussians, groups: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Rows in the page's order: members first, those of the same edits and near ones together (by Morton's
+    code)."""
     if not len(scene):
         return np.zeros(0, np.int64)
     order = morton_order(scene.means.sign() * scene.means.abs().log1p()).numpy()
-    return order[np.argsort(~members[order], kind="stable")]
+    return order[np.argsort(-groups[order], kind="stable")]
+
+
+def _segments(
+    groups: NDArray[np.int64], order: NDArray[np.int64], gdfs: Sequence[Gdf]
+) -> list[tuple[int, list[int]]]:
+    """How many members in turn belong to the same edits, and to which."""
+    starts = np.flatnonzero(np.diff(groups, prepend=-1))
+    inside = [np.isin(order[starts], gdf.region.members.numpy()) for gdf in gdfs]
+    edits = [[i for i, there in enumerate(inside) if there[k]] for k in range(len(starts))]
+    return list(zip(np.diff(starts, append=len(groups)).tolist(), edits, strict=True))
 
 
 def _ascending(places: NDArray[np.int64]) -> Tensor:
@@ -247,20 +268,17 @@ def _edit(
     arrays: Arrays,
     scene: Gaussians,
     gdf: Gdf,
-    place: NDArray[np.int64],
     order: Tensor,
     kept: int,
     exact: bool,
     overlaps: bool,
 ) -> dict[str, Any]:
     """An edit in the header, and its members in this order."""
-    rows = place[gdf.region.members.numpy()[order.numpy()]]
     form, widths = gdf.field.origin, {"shN": 3 * kept}
     record: dict[str, Any] = {
         "name": gdf.name,
         "recorded": list(gdf.field.recorded),
         "knots": _numbers(gdf.field.knots),
-        "members": arrays.add(np.diff(rows, prepend=0).astype("<i4")),
         "attributes": {
             name: _bases(arrays, name, bases, order, widths.get(name, bases.end_offset.shape[1]), exact)
             for name, bases in gdf.field.attributes.items()

@@ -315,6 +315,25 @@ def test_a_slider_is_dragged_and_moved_by_keys_and_shows_its_recordings(
     assert opened.tab.locator(".layer").last.locator("output").text_content() == "97"
 
 
+def test_the_rule_of_the_session_shows_and_another_one_is_taken(open_page: Any, tmp_path: Path) -> None:
+    scene = random_gaussians(300, seed=5)
+    gdfs = [
+        edit_of(scene, some_rows(scene, 150, i), curved_field(150, i, 14), name)
+        for i, name in enumerate("ab")
+    ]
+    document, view = document_of(scene, gdfs)
+    write_page(tmp_path / "page.html", document, replace(view, blend="over"), (), PageOptions())
+    opened = ready(open_page(tmp_path / "page.html"))
+    opened.slide([1.0, 1.0])
+    before, choice = opened.picture(), opened.tab.locator("select")
+    assert choice.locator("option:checked").inner_text() == "Over"
+    for text, rule in (("Average", "normalized"), ("Add", "sum"), ("Over", "over")):
+        choice.select_option(label=text)
+        opened.wait(f"progdf.composer.blend === '{rule}'")
+        assert (opened.picture() != before).any() == (rule != "over")
+    assert opened.complaints == []
+
+
 def test_space_compares_with_the_original_while_it_is_held(
     open_page: Any, bear_page: tuple[Path, Stack]
 ) -> None:

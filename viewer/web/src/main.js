@@ -214,8 +214,10 @@ class Page {
     if (!changed) return;
     this.renderer.update(this.composer, changed);
     if (changed.names.includes("means")) {
-      this.means.set(this.composer.after.means.subarray(3 * changed.first, 3 * changed.last), 3 * changed.first);
-      this.sorter.moved(changed.first, changed.last);
+      for (const [first, last] of changed.ranges) {
+        this.means.set(this.composer.after.means.subarray(3 * first, 3 * last), 3 * first);
+        this.sorter.moved(first, last);
+      }
       this.turned = true;
     }
   }
