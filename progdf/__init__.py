@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from progdf.compose.layers import Layer
     from progdf.formats.ply import load_ply, save_ply
-    from progdf.formats.scene_file import load_scene
+    from progdf.formats.scene_file import load_scene, save_scene
     from progdf.gdf.file import Gdf, load_gdf, save_gdf
     from progdf.io.cameras import load_cameras
 
@@ -33,21 +33,24 @@ __all__ = [
     "render",
     "save_gdf",
     "save_ply",
+    "save_scene",
 ]
 
 _MODULES = {
-    "Camera": "camera",
-    "Gaussians": "gaussians",
-    "Gdf": "gdf.file",
-    "Layer": "compose.layers",
-    "compose_layers": "compose.reference",
-    "load_cameras": "io.cameras",
-    "load_gdf": "gdf.file",
-    "load_ply": "formats.ply",
-    "load_scene": "formats.scene_file",
-    "render": "rasterize",
-    "save_gdf": "gdf.file",
-    "save_ply": "formats.ply",
+    "Camera": "progdf.camera",
+    "Gaussians": "progdf.gaussians",
+    "Gdf": "progdf.gdf.file",
+    "Layer": "progdf.compose.layers",
+    "Widget": "viewer.widget",  # by name alone, as the table of commands names its packages; not of `__all__`
+    "compose_layers": "progdf.compose.reference",
+    "load_cameras": "progdf.io.cameras",
+    "load_gdf": "progdf.gdf.file",
+    "load_ply": "progdf.formats.ply",
+    "load_scene": "progdf.formats.scene_file",
+    "render": "progdf.rasterize",
+    "save_gdf": "progdf.gdf.file",
+    "save_ply": "progdf.formats.ply",
+    "save_scene": "progdf.formats.scene_file",
 }
 
 
@@ -55,4 +58,4 @@ def __getattr__(name: str) -> Any:
     """A public name, imported when it is first asked for: `progdf --help` does not wait for torch."""
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
+    return getattr(importlib.import_module(_MODULES[name]), name)

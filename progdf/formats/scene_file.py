@@ -296,21 +296,38 @@ def save_scene(path: Path, scene: Gaussians) -> None:
                 shutil.copyfile(target, written)
 
 
-def save_frames(path: Path, scenes: Iterable[Gaussians]) -> list[Path]:
-    """Write the same rows again and again: a .usdc of time samples, else NAME_000.ply and so on; which files.
+def save_frames(path: Path, scenes: Iterable[Gaussians], rate: float = 24.0) -> list[Path]:
+    """Write scenes one after the other, see `frame_path`; which files. All appear, or none.
+
+    Args:
+        path: ends in one of `WRITTEN`
+        scenes: N Gaussians each; those of a .usdc have the same rows
+        rate: of a .usdc, samples a second
 
     Raises:
         ProgdfError: as `save_scene`.
     """
     if written_format(path) == usd.SUFFIX:
         with atomic_write(path) as written:
-            usd.write_usd(written, map(rotate_about_x, scenes))
+            usd.write_usd(written, map(rotate_about_x, scenes), rate)
         return [path]
-    stem, paths = path.name.removesuffix(written_format(path)), list[Path]()
-    for number, scene in enumerate(scenes):
-        paths.append(path.with_name(f"{stem}_{number:03d}{written_format(path)}"))
-        save_scene(paths[-1], scene)
+    paths = list[Path]()
+    try:
+        for number, scene in enumerate(scenes):
+            save_scene(frame_path(path, number), scene)
+            paths.append(frame_path(path, number))
+    except BaseException:  # also an interrupt
+        for half in paths:
+            half.unlink(missing_ok=True)
+        raise
     return paths
+
+
+def frame_path(path: Path, number: int) -> Path:
+    """The file of one of several scenes: NAME_000.ply and so on; a .usdc has all of them."""
+    ending = written_format(path)
+    stem = path.name[: -len(ending)]
+    return path if ending == usd.SUFFIX else path.with_name(f"{stem}_{number:03d}{path.name[len(stem) :]}")
 
 
 def written_format(path: Path) -> str:

@@ -39,6 +39,7 @@ def write_usd(path: Path, scenes: Iterable[Gaussians], rate: float = 24.0) -> No
 
     stage = Usd.Stage.CreateNew(str(path))
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)  # else centimeters: Blender would shrink it a hundredfold
     stage.SetTimeCodesPerSecond(rate)
     prim = UsdVol.ParticleField3DGaussianSplat.Define(stage, _PATH)
     stage.SetDefaultPrim(prim.GetPrim())

@@ -155,7 +155,7 @@ def panels(
     work = panel.draw(work, pointer.facts, pictures, preview, recent, reveal, ui, actions)
     work = perform_actions(work, actions, pointer)
     if work.player.shown:
-        requested = timeline_bar.draw(work.view.timeline, work.player, area, ui)
+        requested = timeline_bar.draw(work.view.timeline, work.player, work.view.safe_frame, area, ui)
         work = perform_actions(work, requested, pointer)
     actions = []
     above = replace(area, height=area.height - timeline_bar.height(work.player, area, ui))

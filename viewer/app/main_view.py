@@ -19,7 +19,7 @@ from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from viewer.files import exports
 from viewer.gl.present import read_rgb
-from viewer.panel import new_edit_form, panel
+from viewer.panel import new_edit_form, panel, timeline_bar
 from viewer.render.engine import ViewEngine, drawn_size
 from viewer.render.picking import Surfaces
 from viewer.state import actions, layer_selection, timeline, workspace
@@ -422,14 +422,22 @@ class MainView:
         )
 
     def _displayed_view(self) -> ViewState:
+        view, frame = self.work.view, self._frame()
+        if frame is not None:
+            view = overlay.fit_to_frame(view, frame, self._area())
         if self._shows_original:
-            return workspace.original(self.work.view)
-        view, sides = self.work.view, compare_sides(self.work.snapshots, self.work.view)
+            return workspace.original(view)
+        sides = compare_sides(self.work.snapshots, view)
         if sides is not None:
             return sides.right
         for layer in self.live:
             view = add_layer(view, layer.gdf, layer.name, layer.strength)
         return view
+
+    def _frame(self) -> overlay.Area | None:
+        """The size of the safe frame; none while something lies over the picture."""
+        area, covered = self._area(), timeline_bar.height(self.work.player, self._area(), self.ui)
+        return None if self.cover is not None else overlay.safe_frame(self.work.view, area, covered)
 
     @property
     def _shows_original(self) -> bool:
@@ -453,6 +461,8 @@ class MainView:
         with self._guard():
             if self.cover is not None and not original:
                 pages.draw_cover(self.cover, self.work.view, pointer.size, pointer.area, self.ui)
+        if (frame := self._frame()) is not None:
+            overlay.draw_frame(self.work.view.safe_frame, frame, pointer.area, self.ui)
         labels = self.canvas.comparer.labels(self.work.view)
         figures = self.figures() if self.work.view.overlay else []
         self.work = interface.over_picture(
@@ -499,7 +509,7 @@ class MainView:
                 self.show_message(self._save(request, screen, size))
 
     def _save(self, request: str, screen: moderngl.Framebuffer, size: tuple[int, int]) -> str:
-        title, view = self.facts.title, self._displayed_view()
+        title, view = self.facts.title, replace(self._displayed_view(), camera=self.work.view.camera)
         if request == "copy_values":
             text, what = layer_selection.copy_values(self.work)
             imgui.set_clipboard_text(text)

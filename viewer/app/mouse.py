@@ -191,8 +191,9 @@ def _drag(tool: MouseTool, work: Workspace, pointer: PointerContext) -> tuple[Mo
     if tool.drag and (dx or dy):
         # also where the button went up within this frame: a slow frame must not lose the end of a drag
         height, radius = pointer.scale * pointer.area.height / scale, pointer.facts.bounds.radius
-        camera = controls.drag(work.view.camera, tool.drag, dx, dy, height, radius)
-        return tool, workspace.with_camera(work, camera)
+        lens = pointer.shown.camera.fov_y  # wider than its own around a safe frame
+        camera = controls.drag(replace(work.view.camera, fov_y=lens), tool.drag, dx, dy, height, radius)
+        return tool, workspace.with_camera(work, replace(camera, fov_y=work.view.camera.fov_y))
     return tool, work
 
 
@@ -236,7 +237,7 @@ def _look_along(work: Workspace, axis: str) -> Workspace:
 def _focus_picked_layer(work: Workspace, pointer: PointerContext) -> Workspace:
     """A click on the picture: the layer there, if there is one, is focused."""
     engine, view = pointer.engine, pointer.shown
-    camera = pointer.camera(work.view.camera)
+    camera = pointer.camera(view.camera)
     seen = seen_at(pointer.scene, camera, *pointer.cursor, engine.near)
     layer = None if seen is None else layer_at(view, engine.gdfs, seen)
     return work if layer is None else workspace.focus_layer(work, layer)
@@ -245,5 +246,5 @@ def _focus_picked_layer(work: Workspace, pointer: PointerContext) -> Workspace:
 def _pick_pivot(camera: ViewCamera, pointer: PointerContext) -> ViewCamera:
     """A double click: what lies under the cursor becomes the pivot."""
     engine = pointer.engine
-    point = surface_point(pointer.scene, pointer.camera(camera), *pointer.cursor, engine.near)
+    point = surface_point(pointer.scene, pointer.camera(pointer.shown.camera), *pointer.cursor, engine.near)
     return camera if point is None else controls.pivot_on(camera, point, pointer.facts.bounds.radius)

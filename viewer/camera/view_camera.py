@@ -206,6 +206,16 @@ def to_camera(camera: ViewCamera, width: int, height: int) -> Camera:
     )
 
 
+SHAPES = {"16:9": 16 / 9, "1:1": 1.0, "9:16": 9 / 16}
+"""Of films and of the safe frame in the window: width / height."""
+
+
+def widen(camera: ViewCamera, scale: float) -> ViewCamera:
+    """The same place with a wider lens: what filled the height of the picture fills `scale` of it, 0..1."""
+    half = math.atan(math.tan(math.radians(camera.fov_y) / 2) / scale)
+    return camera if scale == 1.0 else replace(camera, fov_y=2 * math.degrees(half))
+
+
 def half_camera(camera: Camera) -> Camera:
     """The same view in a picture of half the width: the square in its middle stays in sight."""
     width, shrink = max(camera.width // 2, 1), half_scale(camera.width, camera.height)

@@ -163,7 +163,11 @@ class ExportOptions:
     file that any browser opens, with a slider for each edit; a .progdf.zip with the scene and its edits, to
     hand on; or a .cube file, for color programs, of what one grade does."""
     frames: Annotated[int | None, word("N", "one file")] = None
-    """As many steps from the original to the strengths: numbered files, of a .usdc its time samples."""
+    """As many steps from the original to the strengths, or of the --timeline: numbered files, of a .usdc its
+    time samples."""
+    timeline: Annotated[Path | None, word("FILE.json", "one file")] = None
+    """A scene for each frame of the keys in this file (Ctrl+K in the window), or in the session; its camera
+    is left out."""
     page: OmitArgPrefixes[PageOptions] = PageOptions()
     up: UpChoice = "auto"
     """The axis of the scene that is up in a page; auto: as the edits were trained, else from the ground."""

@@ -27,6 +27,7 @@ from progdf.formats.cube import SIDE, write_cube
 from progdf.formats.cube import SUFFIX as CUBE
 from progdf.formats.scene_file import (
     MOST_FRAMES,
+    frame_path,
     load_scene_with_report,
     save_frames,
     save_scene,
@@ -56,7 +57,7 @@ from viewer.camera.view_camera import (
     to_camera,
 )
 from viewer.files import session, timeline_file
-from viewer.files.document import empty
+from viewer.files.document import Document, empty
 from viewer.files.web_page import PAGE, PageOptions, write_page
 from viewer.pictures import film
 from viewer.pictures.compare import Comparer, draw_labels
@@ -116,12 +117,11 @@ def export(argv: Sequence[str]) -> int:
     out = options.out
     endings = (end for end in (CUBE, BUNDLE, PAGE) if out.name.lower().endswith(end))
     ending = next(endings, None) or written_format(out)
-    if options.frames is not None and (
-        ending in (CUBE, BUNDLE, PAGE) or not 2 <= options.frames <= MOST_FRAMES
-    ):
-        raise ProgdfError(
-            f"--frames takes 2 to {MOST_FRAMES} steps of a scene, not {options.frames} of {out.name}"
-        )
+    several = options.frames is not None or options.timeline is not None
+    if several and ending in (CUBE, BUNDLE, PAGE):
+        raise ProgdfError(f"--frames and --timeline write a scene again and again, which {out.name} is not")
+    if options.frames is not None and not 2 <= options.frames <= MOST_FRAMES:
+        raise ProgdfError(f"--frames takes 2 to {MOST_FRAMES} steps, not {options.frames}")
     if ending != PAGE and (options.page, options.up, options.background) != (PageOptions(), "auto", "white"):
         raise ProgdfError(f"{out} is no web page; leave out what only a .html page has")
     drawing = options.drawing if ending == PAGE else None
@@ -140,14 +140,10 @@ def export(argv: Sequence[str]) -> int:
         return _export_cube(out, opened)
     if ending == BUNDLE:
         return _export_bundle(out, opened)
+    if several:
+        return _export_frames(options, opened)
     document, strengths = opened.document, describe_strengths(opened.view)
-    if options.frames is not None:
-        shares = np.linspace(0.0, 1.0, options.frames).tolist()
-        paths = save_frames(out, (_compose(opened, share, whole=ending == usd.SUFFIX) for share in shares))
-        ends = f"{paths[0]} to {paths[-1].name}" if len(paths) > 1 else paths[0]
-        print_line(f"wrote {ends}: {options.frames} steps from the original to {strengths}")
-        return 0
-    edited = _compose(opened)
+    edited = _compose(opened.document, opened.view)
     save_scene(out, edited)
     far = (
         ", x y z as doubles as it is far from 0" if document.scene.origin != ZERO and ending == ".ply" else ""
@@ -159,12 +155,41 @@ def export(argv: Sequence[str]) -> int:
     return 0
 
 
-def _compose(opened: OpenStack, share: float = 1.0, whole: bool = False) -> Gaussians:
+def _export_frames(options: ExportOptions, opened: OpenStack) -> int:
+    """Numbered files, or the time samples of one: steps up to the strengths, or frames of a timeline."""
+    out, document, rate = options.out, opened.document, float(Timeline().fps)
+    whole = written_format(out) == usd.SUFFIX
+    if options.timeline is None:
+        steps = np.linspace(0.0, 1.0, options.frames or 0).tolist()
+        scenes = (_compose(document, opened.view, share, whole) for share in steps)
+        what = f"steps from the original to {describe_strengths(opened.view)}"
+    else:
+        keys = _keys(options.timeline, opened)
+        if not any(key.strengths for key in keys.keys):
+            raise ProgdfError(f"{options.timeline} moves no slider, so all frames would be alike")
+        steps, rate = [*timeline.film_frames(keys)], float(keys.fps)
+        if options.frames is not None:
+            steps = film.sheet_frames(keys, options.frames)
+            rate *= (len(steps) - 1) / keys.length  # it lasts as long
+        if len(steps) > MOST_FRAMES:
+            raise ProgdfError(f"{options.timeline} has {len(steps)} frames; say how many with --frames N")
+        states = (timeline.state_at(keys, frame, opened.view) for frame in steps)
+        scenes = (_compose(document, state, 1.0, whole) for state in states)
+        what = f"frames of {options.timeline}"
+    for number in range(len(steps)):
+        check_not_an_input(frame_path(out, number), opened.files)
+    paths = save_frames(out, scenes, rate)
+    ends = f"{paths[0]} to {paths[-1].name}" if len(paths) > 1 else paths[0]
+    print_line(f"wrote {ends}: {len(steps)} {what}")
+    return 0
+
+
+def _compose(document: Document, view: ViewState, share: float = 1.0, whole: bool = False) -> Gaussians:
     """The scene at a share of the strengths; without the rows that draw nothing, unless `whole`."""
-    states = visible_layers(opened.view)
-    layers = [layer_of(opened.document.gdfs[s.gdf], share * s.strength, s.gains, s.paint) for s in states]
-    edited = compose_layers(opened.document.scene, layers, opened.view.blend)
-    return edited if whole else edited[remaining_rows(opened.document.original, edited)]
+    states = visible_layers(view)
+    layers = [layer_of(document.gdfs[s.gdf], share * s.strength, s.gains, s.paint) for s in states]
+    edited = compose_layers(document.scene, layers, view.blend)
+    return edited if whole else edited[remaining_rows(document.original, edited)]
 
 
 def _describe_loss(out: Path, edited: Gaussians) -> str:
@@ -221,7 +246,11 @@ def render(argv: Sequence[str]) -> int:
     saved = None if opened.session is None else view.camera
     camera = choose_camera(options.viewpoint, scene, gdfs, saved, opened.up)
     if is_film:
-        keys = _keys(options, opened) if options.turntable is None else _turntable(options, opened, camera)
+        seen, path = options.viewpoint, options.timeline
+        keys = _turntable(options, opened, camera) if path is None else _keys(path, opened)
+        moves = path is not None and timeline.camera_at(keys, 0) is not None
+        if moves and (seen.camera or seen.orbit or seen.frame):
+            raise ProgdfError(f"{path} moves the camera; leave out --camera, --orbit and --frame")
         count = 0 if options.turntable is not None else _count(options.sheet)
         with _engine(scene, gdfs, options) as engine:
             print_line(film.write(options.out, keys, view, camera, engine, count, _say_frames()))
@@ -328,20 +357,15 @@ def _comparison(options: RenderOptions, saved: Comparison) -> Comparison:
     return replace(compare, against=options.against)
 
 
-def _keys(options: RenderOptions, opened: OpenStack) -> Timeline:
+def _keys(path: Path, opened: OpenStack) -> Timeline:
     """The timeline that was asked for: of a file of its own, or of the session."""
-    path, saved = options.timeline, opened.session
-    assert path is not None
+    saved = opened.session
     if saved is not None and path.exists() and path.samefile(saved):
         keys = opened.view.timeline
         if not keys.keys:
             raise ProgdfError(f"{path} has no keys on its timeline; set some with K in the window")
-    else:
-        keys = timeline_file.load(path, opened.view.layers, opened.document.scene.origin)
-    seen = options.viewpoint
-    if timeline.camera_at(keys, 0) is not None and (seen.camera or seen.orbit or seen.frame):
-        raise ProgdfError(f"{path} moves the camera; leave out --camera, --orbit and --frame")
-    return keys
+        return keys
+    return timeline_file.load(path, opened.view.layers, opened.document.scene.origin)
 
 
 def _turntable(options: RenderOptions, opened: OpenStack, camera: Camera) -> Timeline:

@@ -24,12 +24,13 @@ from viewer.state import snapshots, timeline
 from viewer.state.layers import largest_strength, visible_layers
 from viewer.state.paint import decode, layer_of
 from viewer.state.view_state import LayerState, Timeline, ViewState
-from viewer.web.page import DRAWN_SH, HOST, MAIL, build_page, pack
+from viewer.web.page import DRAWN_SH, HOST, MAIL, PageTexts, build_page, pack
 
 from .document import Document
 
 PAGE = ".html"
-_STILL = 1200, 800
+STILL = 1200, 800
+"""Width and height of what a page shows first, px."""
 _RANK_VIEWS, _RANK_SIZE = 24, (480, 320)
 _LEAST_SHARE = 0.01
 _EXACT_DB = 99.0
@@ -82,17 +83,17 @@ def write_page(
             the page cannot be written.
     """
     limit = _parse_size(options.max_size)
-    stage, edits = _stage(document, view, kept, options)
+    stage, edits = first_state(document, view, kept, options)
     gdfs, title = [document.gdfs[i] for i in edits], options.title or Path(document.title).stem
-    start = _picture(document.scene, document.gdfs, view)
-    pixels = (start * 255.0 + 0.5).to(torch.uint8).numpy()
+    start = picture(document.scene, document.gdfs, view, STILL)
+    texts = PageTexts(title, options.credit, view.background, start)
     rank = _rank(document, view) if limit is not None else None
 
     def make(quality: str, degree: int, share: float) -> _Page:
         stays = None if rank is None or share == 1.0 else (rank < share * len(rank)).numpy()
         packed = pack(document.scene, gdfs, quality, degree, stage, stays)
-        html = build_page(packed.data, title, options.credit, view.background, pixels)
-        error = psnr(_picture(packed.scene, document.gdfs, view, DRAWN_SH[degree]), start)
+        html = build_page(packed.data, texts)
+        error = psnr(picture(packed.scene, document.gdfs, view, STILL, DRAWN_SH[degree]), start)
         return _Page(html, quality, degree, share, error)
 
     degree = min(options.sh, document.scene.sh_degree)
@@ -156,14 +157,26 @@ def _parse_size(text: str | None) -> int | None:
     return int(float(match[1]) * {"": 1, "k": 1e3, "m": 1e6, "g": 1e9}[(match[2] or "").lower()])
 
 
-def _picture(
-    scene: Gaussians, gdfs: Sequence[Gdf], view: ViewState, bands: int = DRAWN_SH[-1]
+def picture(
+    scene: Gaussians,
+    gdfs: Sequence[Gdf],
+    view: ViewState,
+    size: tuple[int, int],
+    bands: int = DRAWN_SH[-1],
 ) -> torch.Tensor:
-    """What the CPU engine makes of the start with so many higher SH coefficients, 0..1. [H,W,3]"""
+    """What the CPU engine makes of a view with so many higher SH coefficients, 0..1. [H,W,3]
+
+    Args:
+        scene: the scene, or what a page has of it
+        gdfs: its edits
+        view: which of them show, and from where
+        size: width and height, px
+        bands: coefficients above the first that are drawn
+    """
     with torch.no_grad():
         edited = _compose(scene, gdfs, view)
         edited = replace(edited, shN=edited.shN * (torch.arange(edited.shN.shape[1]) < bands)[:, None])
-        camera = to_camera(view.camera, *_STILL)
+        camera = to_camera(view.camera, *size)
         return render(edited, camera, background=view.background, engine="cpu").image.clamp(0.0, 1.0)
 
 
@@ -175,8 +188,11 @@ def _compose(scene: Gaussians, gdfs: Sequence[Gdf], view: ViewState) -> Gaussian
     return compose_layers(scene, layers, view.blend)
 
 
-def _stage(
-    document: Document, view: ViewState, kept: Sequence[snapshots.SliderSnapshot], options: PageOptions
+def first_state(
+    document: Document,
+    view: ViewState,
+    kept: Sequence[snapshots.SliderSnapshot] = (),
+    options: PageOptions = PageOptions(),
 ) -> tuple[dict[str, Any], list[int]]:
     """What the page begins with, as viewer/web/src/main.js reads it, and the edits that it needs."""
     paints: list[tuple[int, Any]] = []
@@ -206,7 +222,7 @@ def _stage(
     listed = snapshots.with_original(kept, view)
     stage = {
         "background": view.background,
-        "camera": _camera(view.camera),
+        "camera": camera_json(view.camera),
         "radius": bounds_of(document.original).radius,
         "near": to_camera(view.camera, 1, 1).near,
         "blend": view.blend,
@@ -216,7 +232,7 @@ def _stage(
         "snapshots": [
             {
                 "name": each.name,
-                "camera": _camera(each.camera),
+                "camera": camera_json(each.camera),
                 "layers": [layer(state) for state in each.edit.layers if state.gdf in edits],
                 "groups": [asdict(group) for group in each.edit.groups],
                 "blend": each.edit.blend,
@@ -238,7 +254,7 @@ def _film(film: Timeline, edits: Sequence[int]) -> dict[str, Any] | None:
     for frame in range(film.length + 1):
         camera, strengths = timeline.camera_at(film, frame), timeline.strengths_at(film, frame)
         moved = [(edits.index(gdf), s) for gdf, s in strengths.items() if gdf in edits]
-        frames.append({"strengths": moved, "camera": None if camera is None else _camera(camera)})
+        frames.append({"strengths": moved, "camera": None if camera is None else camera_json(camera)})
     return {
         "frames": frames,
         "keys": [key.frame for key in film.keys],
@@ -259,5 +275,6 @@ def _sliders(view: ViewState, names: str | None) -> set[str]:
     return chosen
 
 
-def _camera(camera: ViewCamera) -> dict[str, Any]:
+def camera_json(camera: ViewCamera) -> dict[str, Any]:
+    """A camera as the page has it."""
     return {name: value for name, value in asdict(camera).items() if name != "mode"}

@@ -16,6 +16,7 @@ from typing import ClassVar, Literal
 
 from progdf.errors import ProgdfError
 from progdf.io.atomic import LockedError
+from viewer.camera.view_camera import SHAPES
 
 from .child import Child, Progress, last_line
 from .training import EditOrder
@@ -32,12 +33,18 @@ Status = Literal["queued", "running", "stopping", "stopped", "elsewhere", "faile
 FORMATS = (".mp4", ".gif", ".webp", "")
 """Of films: three kinds of files, and a folder of frames."""
 FORMAT_NAMES = ("MP4", "GIF", "WebP", "PNG frames")
-SIZES = ((1280, 720), (1920, 1080), (2560, 1440), (3840, 2160))
+SIDES = (720, 1080, 1440, 2160)
+"""Of pictures and films: the shorter one, pixels."""
 FPS = (12, 24, 25, 30, 60)
 
 
 ALL_SLIDERS, TURNTABLE = "\0sliders", "\0turntable"
 """Films of no layer's own, in `DeliverOptions.moves`."""
+
+
+def picture_size(side: int, shape: str) -> tuple[int, int]:
+    """Width and height of a picture of one of `SHAPES` whose shorter side has so many pixels."""
+    return round(side * max(SHAPES[shape], 1.0)), round(side / min(SHAPES[shape], 1.0))
 
 
 def film_title(moves: str) -> str:

@@ -19,7 +19,7 @@ from viewer.ui.widgets import icon_button, icon_row, is_released, plate, tip
 
 HEIGHT_PX, ROW_PX = 46.0, 33.0  # at 1×: of the bar, and of a second row
 ROOMY_PX = 520.0  # a narrower bar has its settings in a second row
-SETTINGS_PX = 262.0
+SETTINGS_PX = 291.0
 _KEY_PX, _GRIP_PX = 5.0, 8.0  # half a key's size; so near to a key the mouse takes it
 _NICE = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
 
@@ -37,8 +37,10 @@ def _bar_height(area: Area, ui: UiContext) -> float:
     return (HEIGHT_PX if _is_wide(area, ui) else HEIGHT_PX + ROW_PX) * ui.scale
 
 
-def draw(timeline: Timeline, player: Player, area: Area, ui: UiContext) -> tuple[str, ...]:
+def draw(timeline: Timeline, player: Player, frame: str, area: Area, ui: UiContext) -> tuple[str, ...]:
     """Draw the bar over the lower edge of `area`, between `imgui.new_frame` and `imgui.render`.
+
+    `frame`: the safe frame, see `ViewState`.
 
     Returns:
         What was asked for: actions of the workspace.
@@ -47,14 +49,18 @@ def draw(timeline: Timeline, player: Player, area: Area, ui: UiContext) -> tuple
     actions: list[str] = []
     place = imgui.ImVec2(0.0, area.height - tall)
     with plate("timeline", place, ui, pad=10.0, size=imgui.ImVec2(area.width, tall)):
-        frame = min(player.frame, timeline.length)
-        _buttons(timeline, player, frame, actions, ui)
+        at = min(player.frame, timeline.length)
+        _buttons(timeline, player, at, actions, ui)
         settings = SETTINGS_PX * ui.scale if roomy else 0.0
         wide = max(imgui.get_content_region_avail().x - settings, 40.0 * ui.scale)
-        _ruler(timeline, frame, wide, actions, ui)
+        _ruler(timeline, at, wide, actions, ui)
         if roomy:
             imgui.same_line(0.0, 12.0 * ui.scale)
-        _settings(timeline, frame, actions, ui)
+        _settings(timeline, at, actions, ui)
+        imgui.same_line(0.0, 4.0 * ui.scale)
+        if icon_button("safe_frame", icons.ICON_FA_CROP_SIMPLE, ui, dim=not frame):
+            actions.append("safe_frame")
+        tip(f"Safe frame ({shortcut('safe_frame')}): {frame or 'none'}")
     return tuple(actions)
 
 

@@ -29,7 +29,7 @@ from .layers import (
     with_overshoot,
     with_paint,
 )
-from .view_state import ViewState, next_resolution_mode
+from .view_state import ViewState, next_frame, next_resolution_mode
 from .workspace import (
     LEAST_ZOOM,
     MOST_ZOOM,
@@ -397,6 +397,7 @@ ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
     "look": _look,
     "grid": lambda w, _: replace(w, view=replace(w.view, grid=not w.view.grid)),
     "axes": lambda w, _: replace(w, view=replace(w.view, axes=not w.view.axes)),
+    "safe_frame": lambda w, _: replace(w, view=next_frame(w.view)),
     "help": lambda workspace, _: replace(workspace, help=not workspace.help),
     "before": lambda w, _: replace(w, before=not w.before),
     "beside": lambda w, _: replace(w, view=toggle_mode(w.view, "beside")),

@@ -9,7 +9,7 @@ from msgspec import Meta
 
 from progdf.compose.layers import BLENDS, Gains
 from progdf.io.json_values import one_of
-from viewer.camera.view_camera import ViewCamera
+from viewer.camera.view_camera import SHAPES, ViewCamera
 from viewer.camera.views import EASINGS
 
 from .selection import SelectionState
@@ -26,6 +26,8 @@ MOST_AMPLIFIED = 64.0
 LONGEST, FASTEST = 9999, 120  # frames, frames per second
 CARD_MODES = ("auto", "full", "compact")
 """`ViewState.cards`: rows of one line where cards would not fit, never, always."""
+FRAMES = ("", *SHAPES)
+"""`ViewState.safe_frame`: none, or a shape of films."""
 RESOLUTION_MODES = ("auto", "on", "off")
 """`ViewState.dynamic_resolution`: where it pays, always, never."""
 
@@ -153,6 +155,7 @@ class ViewState:
     pair: SnapshotPair = SnapshotPair()  # the snapshots that are compared and blended
     grid: bool = False  # the window draws a grid on the ground; pictures and films never have it
     axes: bool = True  # the window shows where the axes of the world point
+    safe_frame: Annotated[str, one_of(FRAMES)] = ""  # of `FRAMES`: what a film of this shape will show
     groups: tuple[LayerGroup, ...] = ()  # of layers, in no order
     collapsed: tuple[str, ...] = ()  # names of the groups whose layers the panel does not list
     cards: Annotated[str, one_of(CARD_MODES)] = "auto"  # of `CARD_MODES`
@@ -171,8 +174,14 @@ def on_another_scene(view: ViewState, camera: ViewCamera) -> ViewState:
         dynamic_resolution=view.dynamic_resolution,
         grid=view.grid,
         axes=view.axes,
+        safe_frame=view.safe_frame,
         cards=view.cards,
     )
+
+
+def next_frame(view: ViewState) -> ViewState:
+    """The state with the next of `FRAMES`."""
+    return replace(view, safe_frame=FRAMES[(FRAMES.index(view.safe_frame) + 1) % len(FRAMES)])
 
 
 def next_resolution_mode(view: ViewState) -> ViewState:

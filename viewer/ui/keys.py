@@ -168,6 +168,7 @@ TOPICS: dict[str, tuple[KeyBinding, ...]] = {
         *_keys("ping-pong", "Alt+K ping_pong"),
         *_keys("save the timeline as a file", "Ctrl+K timeline_file"),
         *_keys("show or hide the timeline", "T timeline"),
+        *_keys("safe frame: 16:9, square, 9:16, none", "Shift+T safe_frame"),
     ),
     "Window and files": (
         *_keys("this list", "F1 help"),

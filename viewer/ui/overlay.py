@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from imgui_bundle import imgui
 
-from viewer.camera.view_camera import ViewCamera, axes, dot
+from viewer.camera.view_camera import SHAPES, ViewCamera, axes, dot, widen
 from viewer.camera.views import AXES
 from viewer.render.dynamic_resolution import FrameTimings
 from viewer.state.view_state import ViewState
@@ -87,6 +87,44 @@ def banner(text: str, area: Area, ui: UiContext) -> None:
     corners = imgui.ImVec2(x - 1.5 * pad, y - pad / 2), imgui.ImVec2(x + wide + 1.5 * pad, y + size + pad / 2)
     imgui.get_background_draw_list().add_rect_filled(*corners, u32(PALETTE.scrim), 5 * ui.scale)
     _text(x, y, text, size, PALETTE.text, ui)
+
+
+def safe_frame(view: ViewState, area: Area, covered: float = 0.0) -> Area | None:
+    """The size of the safe frame, which lies in the middle of the picture; None where none is shown.
+
+    Args:
+        covered: so much of the lower edge is under the timeline, window pixels
+    """
+    if not view.safe_frame or not view.panel or view.compare.mode == "beside":
+        return None
+    shape = SHAPES[view.safe_frame]
+    height = max(min(area.height - 2.0 * covered, area.width / shape), 1.0)
+    return Area(height * shape, height)
+
+
+def fit_to_frame(view: ViewState, frame: Area, area: Area) -> ViewState:
+    """`view` through a lens so wide that the frame has the height of the picture, as a film of it has."""
+    return replace(view, camera=widen(view.camera, frame.height / area.height))
+
+
+def draw_frame(name: str, frame: Area, area: Area, ui: UiContext) -> None:
+    """The safe frame as a thin line with its name, and a shade over all that the film leaves out."""
+    canvas, shade = imgui.get_background_draw_list(), u32((*PALETTE.scrim[:3], 0.55))
+    left, top = round((area.width - frame.width) / 2), round((area.height - frame.height) / 2)
+    right, bottom = round(area.width) - left, round(area.height) - top
+    for corners in (
+        (0, 0, area.width, top),
+        (0, bottom, area.width, area.height),
+        (0, top, left, bottom),
+        (right, top, area.width, bottom),
+    ):
+        canvas.add_rect_filled(imgui.ImVec2(*corners[:2]), imgui.ImVec2(*corners[2:]), shade)
+    line, at = u32(PALETTE.handle), (imgui.ImVec2(left, top), imgui.ImVec2(right, bottom))
+    canvas.add_rect(*at, line, thickness=ui.scale)
+    size, pad = SMALL_PX * ui.scale, 5.0 * ui.scale
+    ends = left + _text_width(name, size, ui) + 2 * pad, top + size + pad
+    canvas.add_rect_filled(at[0], imgui.ImVec2(*ends), u32(PALETTE.scrim))
+    _text(left + pad, top + pad / 2, name, size, PALETTE.text, ui)
 
 
 def message(line: Message, area: Area, ui: UiContext) -> tuple[str, float]:

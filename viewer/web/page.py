@@ -2,9 +2,9 @@
 
 The page reads a container (src/data.js): the length of its header, the header (JSON), and its arrays, channel
 after channel, the bytes of one weight together, so that gzip finds what is alike. Members of edits come
-first, so that a slider sends one run of rows, and near ones lie together. The script is src/*.js put one
-after another, the shaders are the viewer's own, and the policy in the page's head lets nothing else run: a
-.gdf's names are a stranger's text.
+first, those of the same edits together, so that a slider sends few runs of rows, and near ones lie together.
+The script is src/*.js put one after another, the shaders are the viewer's own, and the policy in the page's
+head lets nothing else run: a .gdf's names are a stranger's text.
 """
 
 from __future__ import annotations
@@ -25,17 +25,18 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from PIL import Image
 from torch import Tensor
 
 from progdf import __version__
 from progdf.compose.reference import coverage
+from progdf.errors import ProgdfError
 from progdf.field.baked import AttributeBases, GradeForm
 from progdf.field.grade import sphere
 from progdf.field.separable import quantize_bases
 from progdf.formats.compressed_ply import morton_order
 from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.gdf.file import UNSEEN_LOGIT, Gdf
+from progdf.io.images import to_picture
 from shaders import load_source
 
 DRAWN_SH = (0, 3, 8, 15)
@@ -122,16 +123,20 @@ def pack(
         degree: of the spherical harmonics that stay, 0 to 3
         more: what else the header holds; in "paints" pairs of an edit and the weights of its members [M]
         stays: which Gaussians; None: all that can be seen. [N]
+
+    Raises:
+        ProgdfError: there is no such quality.
     """
+    if quality not in ("exact", "compact"):
+        raise ProgdfError(f"unknown quality '{quality}'; use exact or compact")
     scene = _finite(scene)
     kept = min(DRAWN_SH[degree], scene.shN.shape[1])
-    members = np.zeros(len(scene), bool)
-    for gdf in gdfs:
-        members[gdf.region.members.numpy()] = True
-    seen = members | (scene.logit_opacities.numpy() >= UNSEEN_LOGIT)
+    groups = _groups(len(scene), [gdf.region.members.numpy() for gdf in gdfs])
+    seen = (groups > 0) | (scene.logit_opacities.numpy() >= UNSEEN_LOGIT)
     seen = seen if stays is None else seen & stays
-    order = _order(scene, members)
-    order, count = order[seen[order]], int((members & seen).sum())
+    order = _order(scene, groups)
+    order = order[seen[order]]
+    count = int((groups[order] > 0).sum())
     place = np.full(len(scene), -1, np.int64)
     place[order] = np.arange(len(order))
     inside = [_ascending(place[gdf.region.members.numpy()]) for gdf in gdfs]
@@ -147,11 +152,12 @@ def pack(
         "paints": paints,
         "count": len(order),
         "members": count,
+        "segments": _segments(groups[order[:count]], order, gdfs),
         "sh": kept,
         "antialiased": scene.antialiased,
         "attributes": attributes,
         "edits": [
-            _edit(arrays, scene, gdf, place, rows, kept, exact, overlaps)
+            _edit(arrays, scene, gdf, rows, kept, exact, overlaps)
             for gdf, rows in zip(gdfs, inside, strict=True)
         ],
         "sphere": [
@@ -207,12 +213,33 @@ def _finite(scene: Gaussians) -> Gaussians:
     return replace(scene, **{name: changed[name].reshape(getattr(scene, name).shape) for name in ATTRIBUTES})
 
 
-def _order(scene: Gaussians, members: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Rows in the page's order: members first, near ones together (by Morton's code)."""
+def _groups(count: int, regions: Sequence[NDArray[np.int64]]) -> NDArray[np.int64]:
+    """A number for each row, alike where the same edits have it, 0 where none. [N]"""
+    groups = np.zeros(count + 1, np.int64)  # one more row, which is nobody's
+    for members in regions:
+        groups *= 2
+        groups[members] += 1
+        groups = np.unique(groups, return_inverse=True)[1]
+    return groups[:-1]
+
+
+def _order(scene: Gaussians, groups: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Rows in the page's order: members first, those of the same edits and near ones together (by Morton's
+    code)."""
     if not len(scene):
         return np.zeros(0, np.int64)
     order = morton_order(scene.means.sign() * scene.means.abs().log1p()).numpy()
-    return order[np.argsort(~members[order], kind="stable")]
+    return order[np.argsort(-groups[order], kind="stable")]
+
+
+def _segments(
+    groups: NDArray[np.int64], order: NDArray[np.int64], gdfs: Sequence[Gdf]
+) -> list[tuple[int, list[int]]]:
+    """How many members in turn belong to the same edits, and to which."""
+    starts = np.flatnonzero(np.diff(groups, prepend=-1))
+    inside = [np.isin(order[starts], gdf.region.members.numpy()) for gdf in gdfs]
+    edits = [[i for i, there in enumerate(inside) if there[k]] for k in range(len(starts))]
+    return list(zip(np.diff(starts, append=len(groups)).tolist(), edits, strict=True))
 
 
 def _ascending(places: NDArray[np.int64]) -> Tensor:
@@ -247,20 +274,17 @@ def _edit(
     arrays: Arrays,
     scene: Gaussians,
     gdf: Gdf,
-    place: NDArray[np.int64],
     order: Tensor,
     kept: int,
     exact: bool,
     overlaps: bool,
 ) -> dict[str, Any]:
     """An edit in the header, and its members in this order."""
-    rows = place[gdf.region.members.numpy()[order.numpy()]]
     form, widths = gdf.field.origin, {"shN": 3 * kept}
     record: dict[str, Any] = {
         "name": gdf.name,
         "recorded": list(gdf.field.recorded),
         "knots": _numbers(gdf.field.knots),
-        "members": arrays.add(np.diff(rows, prepend=0).astype("<i4")),
         "attributes": {
             name: _bases(arrays, name, bases, order, widths.get(name, bases.end_offset.shape[1]), exact)
             for name, bases in gdf.field.attributes.items()
@@ -322,7 +346,7 @@ def _numbers(tensor: Tensor) -> Any:
 
 
 MODULES = ("camera", "data", "grade", "compose", "sort", "renderer", "state", "panel", "input", "main")
-"""Of `src`, each after those that it imports when it is read."""
+"""Of `src`, each after those that it imports when it is read; then comes what the page is shown in."""
 STAGES = ("web.vert", "splat.frag", "present.vert", "present.frag", "stretch.frag")
 MAIL, HOST = 25e6, 100e6
 """Bytes: what mail takes, and common hosts."""
@@ -331,50 +355,76 @@ _IMPORT = re.compile(r"^import .*?;\n", re.MULTILINE | re.DOTALL)
 _LINK = re.compile(r"https?://[^\s<>\"']+[^\s<>\"'.,;:)]")
 
 
-def join(modules: Sequence[str] = MODULES, then: str = "") -> str:
+def join(modules: Sequence[str] = (*MODULES, "start"), then: str = "") -> str:
     """Modules of `src` one after another, and what follows them, in a function of their own."""
-    folder = resources.files("viewer.web") / "src"
-    parts = [(folder / f"{name}.js").read_text(encoding="utf-8") for name in modules]
+    parts = [_source(f"{name}.js") for name in modules]
     joined = "\n".join(re.sub(r"^export ", "", _IMPORT.sub("", part), flags=re.MULTILINE) for part in parts)
     return f'(() => {{\n"use strict";\n{joined}{then}}})();\n'
 
 
-def build_page(
-    container: bytes,
-    title: str,
-    credit: str,
-    background: tuple[float, float, float],
-    still: NDArray[np.uint8],
-) -> str:
-    """The page of a container, see `pack`.
+def build_widget() -> str:
+    """The module with which anywidget shows the page in a cell, see viewer/web/src/widget.js."""
+    made = join((*MODULES, "widget"), f"return (view) => render(view, {in_script(_shaders())});\n")
+    return f"const render = {made}export default {{ render }};\n"
 
-    Args:
-        container: the scene and its edits
-        title: above the sliders and of the browser's tab
-        credit: below them, with addresses as links
-        background: behind the scene, 0..1
-        still: what shows until the scene is there, and where WebGL2 is not. [H,W,3]
-    """
-    behind = "#" + "".join(f"{round(255 * channel):02x}" for channel in background)
-    folder = resources.files("viewer.web") / "src"
-    style = f":root {{ --behind: {behind}; }}\n" + (folder / "page.css").read_text(encoding="utf-8")
-    sources = {name: _body(load_source(name).text) for name in STAGES}
-    code, picture = join(), io.BytesIO()
-    Image.fromarray(still).save(picture, "WEBP", quality=82)
-    texts = {
-        "title": html.escape(title),
-        "credit": _with_links(credit),
+
+@dataclass(frozen=True)
+class PageTexts:
+    """What a page shows besides its scene."""
+
+    title: str  # above the sliders and of the browser's tab
+    credit: str  # below them, with addresses as links
+    background: tuple[float, float, float]  # behind the scene, 0..1
+    still: Tensor  # what shows until the scene is there, and where WebGL2 is not, 0..1. [H,W,3]
+
+    @property
+    def style(self) -> str:
+        """The style sheet."""
+        behind = "#" + "".join(f"{round(255 * channel):02x}" for channel in self.background)
+        return f":root, :host {{ --behind: {behind}; }}\n{_source('page.css')}"
+
+    @property
+    def body(self) -> str:
+        """The elements that the script fills."""
+        picture = io.BytesIO()
+        to_picture(self.still).save(picture, "WEBP", quality=82)
+        still = "data:image/webp;base64," + base64.b64encode(picture.getvalue()).decode()
+        texts = {"title": html.escape(self.title), "credit": _with_links(self.credit), "still": still}
+        return _fill("body.html", texts)
+
+    @property
+    def markup(self) -> str:
+        """The page in an element of its own, with its style, for a shadow root."""
+        return f'<style>{self.style}</style>\n<div class="page">\n{self.body}</div>'
+
+
+def build_page(container: bytes, texts: PageTexts) -> str:
+    """The page of a container, see `pack`, as a file of its own."""
+    style, code = texts.style, join()
+    parts = {
+        "title": html.escape(texts.title),
         "version": __version__,
         "style": style,
         "style_hash": _hash(style),
+        "body": texts.body,
         "script": code,
         "script_hash": _hash(code),
-        "still": "data:image/webp;base64," + base64.b64encode(picture.getvalue()).decode(),
-        "shaders": in_script(sources),
+        "shaders": in_script(_shaders()),
         "data": base64.b64encode(gzip.compress(container, 9, mtime=0)).decode(),
     }
-    template = (folder / "page.html").read_text(encoding="utf-8")
-    return re.sub(r"\{\{(\w+)\}\}", lambda found: texts[found[1]], template)
+    return _fill("page.html", parts)
+
+
+def _source(name: str) -> str:
+    return (resources.files("viewer.web") / "src" / name).read_text(encoding="utf-8")
+
+
+def _shaders() -> dict[str, str]:
+    return {name: _body(load_source(name).text) for name in STAGES}
+
+
+def _fill(template: str, texts: Mapping[str, str]) -> str:
+    return re.sub(r"\{\{(\w+)\}\}", lambda found: texts[found[1]], _source(template))
 
 
 def in_script(value: Mapping[str, Any]) -> str:

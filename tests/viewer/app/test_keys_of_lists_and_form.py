@@ -216,7 +216,7 @@ def test_escape_and_enter_in_a_list_of_a_question_leave_the_question(hand: Rig) 
     hand.main_view.ask(Dialog("render_film", "film.mp4", options=options))
     hand.frame(4)
     dialog = next(w for w in imgui.get_current_context().windows if w.name == "##dialog")
-    place = dialog.pos.x + 300.0, dialog.pos.y + 136.0
+    place = dialog.pos.x + 300.0, dialog.pos.y + 167.0
     hand.click(*place)
     assert len(imgui.get_current_context().open_popup_stack) == 2
     strike(hand, "Down")

@@ -13,8 +13,10 @@ from PIL import Image
 
 from progdf.__main__ import main
 from progdf.compose.layers import Gains
+from progdf.errors import ProgdfError
 from progdf.field.baked import GradeForm, identity_map, lattice_colors
 from progdf.field.grade import bake_grade, fit_grade, lattice_form, map_colors
+from progdf.formats import scene_file
 from progdf.formats.cube import read_cube, write_cube
 from progdf.formats.ply import load_ply
 from progdf.gaussians import ATTRIBUTES, Gaussians, pack
@@ -216,6 +218,71 @@ def test_a_contact_sheet_shows_frames_from_the_first_to_the_last_of_a_film(here:
     first = Path("sheet.png").read_bytes()
     assert run(*given, "--sheet", "5", "-o", "sheet.png") == 0
     assert Path("sheet.png").read_bytes() == first
+
+
+def test_the_sliders_of_a_timeline_are_numbered_scenes_as_the_film_draws_them(
+    here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    view = filmed(moving=True)
+    saved(here, view)
+    given = ("export", "work.session.json", "--timeline", "work.session.json")
+    assert run(*given, "-o", "film.PLY") == 0
+    assert "film_000.PLY to film_008.PLY: 9 frames of work.session.json" in capsys.readouterr().out
+    assert run(*given, "--frames", "3", "-o", "few.ply") == 0
+    engine = ViewEngine(None, bear().scene, bear().gdfs)
+    for frame, file in ((0, "few_000.ply"), (4, "few_001.ply"), (5, "film_005.PLY"), (8, "few_002.ply")):
+        state = timeline.state_at(view.timeline, frame, view)
+        found = ViewEngine(None, load_ply(file), []).image(replace(state, layers=()), (64, 48))
+        assert np.abs(found - engine.image(state, (64, 48))).max() < 1e-4, file
+
+
+def test_a_timeline_is_time_samples_of_its_own_pace(here: Path) -> None:
+    usd = pytest.importorskip("pxr.Usd", reason="pip install progdf-studio[usd]")
+    saved(here, replace(view := filmed(moving=False), timeline=replace(view.timeline, fps=12)))
+    given = ("export", "work.session.json", "--timeline", "work.session.json")
+    for more, rate, last in (((), 12.0, 8.0), (("--frames", "3"), 3.0, 2.0)):
+        assert run(*given, *more, "-o", f"{rate}.usdc") == 0
+        stage = usd.Stage.Open(f"{rate}.usdc")
+        assert (stage.GetTimeCodesPerSecond(), stage.GetEndTimeCode()) == (rate, last)
+
+
+def test_frames_replace_no_file_that_is_read_and_half_of_them_are_none(
+    here: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    saved(here, filmed(moving=False))
+    Path("same_001.ply").symlink_to("bear.ply")
+    given = ("work.session.json", "--timeline", "work.session.json")
+    assert run("export", *given, "-o", "same.ply") == 2
+    assert "same_001.ply is one of the files to read" in capsys.readouterr().err
+    whole = scene_file.save_scene
+
+    def full(path: Path, scene: Gaussians) -> None:
+        if path.name == "film_003.ply":
+            raise ProgdfError(f"{path} cannot be written: no space left on device")
+        whole(path, scene)
+
+    monkeypatch.setattr(scene_file, "save_scene", full)
+    assert run("export", *given, "-o", "film.ply") == 2
+    assert capsys.readouterr().err.count("\n") == 1
+    assert not list(here.glob("film*"))
+
+
+@pytest.mark.parametrize(
+    ("keys", "length", "said"),
+    [
+        ('{"frame": 0, "camera": {}}', 8, "moves no slider"),
+        ('{"frame": 0, "strengths": {"scarf": 0}}', 2000, "has 2001 frames; say how many with --frames"),
+    ],
+)
+def test_what_is_no_sequence_is_one_line(
+    here: Path, keys: str, length: int, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bear().save(here)
+    text = f'{{"progdf_timeline": 1, "length": {length}, "keys": [{keys}]}}'
+    Path("film.json").write_text(text, encoding="utf-8")
+    assert run("export", "bear.ply", "scarf.gdf", "--timeline", "film.json", "-o", "a.ply") == 2
+    assert said in capsys.readouterr().err
+    assert run("export", "bear.ply", "scarf.gdf", "--timeline", "film.json", "-o", "a.html") == 2
 
 
 def holds(page: np.ndarray, picture: np.ndarray) -> bool:

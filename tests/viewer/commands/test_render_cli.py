@@ -281,7 +281,7 @@ def test_a_mistake_is_one_line_and_leaves_no_file(
         ),
         (
             ("export", "bear.ply", "ears.gdf", "--frames", "1", "-o", "x.ply"),
-            "--frames takes 2 to 1000 steps of a scene, not 1 of x.ply",
+            "--frames takes 2 to 1000 steps, not 1",
         ),
         (
             ("export", "bear.ply", "ears.gdf", "--set", "ears=-1", "-o", "x.ply"),

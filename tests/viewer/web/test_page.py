@@ -7,7 +7,6 @@ import hashlib
 import io
 import json
 import re
-import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -40,21 +39,8 @@ from viewer.state.layers import visible_layers
 from viewer.state.view_state import Keyframe, LayerGroup, LayerState, SnapshotPair, Timeline, ViewState
 from viewer.web.page import join
 
-playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-SOFTWARE = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 SIZE = 660, 400
 PIXELS = 330, 200  # half as many each way, which the software renderer draws in a quarter of the time
-
-
-@pytest.fixture(scope="session")
-def browser() -> Iterator[Any]:
-    if CHROMIUM is None:
-        pytest.skip("no Chromium is installed")
-    with playwright.sync_playwright() as started:
-        chromium = started.chromium.launch(executable_path=CHROMIUM, args=SOFTWARE)
-        yield chromium
-        chromium.close()
 
 
 @dataclass
@@ -313,6 +299,25 @@ def test_a_slider_is_dragged_and_moved_by_keys_and_shows_its_recordings(
         opened.tab.keyboard.press("ArrowLeft")
     assert opened.strengths() == {"scarf": pytest.approx(0.97), "ears": 0.5}
     assert opened.tab.locator(".layer").last.locator("output").text_content() == "97"
+
+
+def test_the_rule_of_the_session_shows_and_another_one_is_taken(open_page: Any, tmp_path: Path) -> None:
+    scene = random_gaussians(300, seed=5)
+    gdfs = [
+        edit_of(scene, some_rows(scene, 150, i), curved_field(150, i, 14), name)
+        for i, name in enumerate("ab")
+    ]
+    document, view = document_of(scene, gdfs)
+    write_page(tmp_path / "page.html", document, replace(view, blend="over"), (), PageOptions())
+    opened = ready(open_page(tmp_path / "page.html"))
+    opened.slide([1.0, 1.0])
+    before, choice = opened.picture(), opened.tab.locator("select")
+    assert choice.locator("option:checked").inner_text() == "Over"
+    for text, rule in (("Average", "normalized"), ("Add", "sum"), ("Over", "over")):
+        choice.select_option(label=text)
+        opened.wait(f"progdf.composer.blend === '{rule}'")
+        assert (opened.picture() != before).any() == (rule != "over")
+    assert opened.complaints == []
 
 
 def test_space_compares_with_the_original_while_it_is_held(

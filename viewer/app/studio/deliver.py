@@ -14,7 +14,7 @@ from viewer.app.application import Application, failure_line
 from viewer.files import exports, session
 from viewer.files.session import WindowSession
 from viewer.files.user_files import parse_path
-from viewer.jobs.job_queue import ALL_SLIDERS, TURNTABLE, DeliverOptions, Delivery, JobQueue
+from viewer.jobs.job_queue import ALL_SLIDERS, TURNTABLE, DeliverOptions, Delivery, JobQueue, picture_size
 from viewer.state import timeline
 from viewer.state.view_state import Comparison, ViewState
 from viewer.state.workspace import Dialog
@@ -76,6 +76,9 @@ class DeliverActions:
             options = self._options.get(name, DeliverOptions(width=1280, height=720))
             fps = view.timeline.fps if keys else options.fps
             options = replace(options, moves=moves, can_move=moving, fps=fps)
+        if view.safe_frame:
+            width, height = picture_size(min(options.width, options.height), view.safe_frame)
+            options = replace(options, width=width, height=height)
         suffix = options.format if name == "render_film" else SUFFIXES[name]
         out, number = exports.folder_of(path) / f"{path.stem}_edited{suffix}", 2
         free, written = out, self._written()

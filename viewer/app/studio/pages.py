@@ -11,8 +11,8 @@ from imgui_bundle import imgui
 from progdf import __version__
 from progdf.io.session import SUFFIX
 from progdf.terminal import escape_text
-from viewer.camera.view_camera import ViewCamera
-from viewer.jobs.job_queue import FORMAT_NAMES, FORMATS, FPS, SIZES, DeliverOptions, film_title
+from viewer.camera.view_camera import SHAPES, ViewCamera
+from viewer.jobs.job_queue import FORMAT_NAMES, FORMATS, FPS, SIDES, DeliverOptions, film_title, picture_size
 from viewer.state.view_state import ViewState
 from viewer.ui import overlay
 from viewer.ui.context import BEHIND, FIXED, PALETTE, SMALL_PX, Icon, UiContext, u32
@@ -318,8 +318,14 @@ def _size_fields(options: DeliverOptions, column: float, ui: UiContext) -> Deliv
     _, height = imgui.input_int("##height", options.height, 0)
     imgui.same_line(0.0, 2 * gap)
     size = min(max(width, 1), _LARGEST), min(max(height, 1), _LARGEST)
-    pressed = choice(
-        "size", [f"{tall}p" for _, tall in SIZES], SIZES.index(size) if size in SIZES else None, ui
-    )
-    width, height = size if pressed is None else SIZES[pressed]
-    return replace(options, width=width, height=height)
+    shapes, side = tuple(SHAPES), min(size)
+    shape = next((name for name in shapes if picture_size(side, name) == size), None)
+    at = SIDES.index(side) if shape and side in SIDES else None
+    pressed = choice("size", [f"{side}p" for side in SIDES], at, ui)
+    if pressed is not None:
+        size = picture_size(SIDES[pressed], shape or shapes[0])
+    label("Shape", column)
+    pressed = choice("shape", shapes, shapes.index(shape) if shape else None, ui)
+    if pressed is not None:
+        size = picture_size(side, shapes[pressed])
+    return replace(options, width=size[0], height=size[1])

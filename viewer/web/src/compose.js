@@ -1,6 +1,7 @@
-// The scene under a stack of edits, members only: the numbers of progdf/compose/reference.py.
+// The scene under a stack of edits, members only: the numbers of progdf/compose/reference.py. Rows of the same
+// edits lie together, and are composed together: a segment.
 
-import { gradeChange } from "./grade.js";
+import { GradedColors, findSegment } from "./grade.js";
 
 export const WIDTHS = { means: 3, log_scales: 3, quats: 4, logit_opacities: 1, sh0: 3 };
 export const KINDS = {
@@ -10,22 +11,12 @@ export const KINDS = {
 const PARTNERS = { means: "logit_opacities", logit_opacities: "means" };  // share a texture
 const { fround } = Math;
 
-// The segment of ascending knots that holds x: the index of its right one, and the share of the way to that.
-export function findSegment(knots, x) {
-  const at = fround(x);
-  let right = 1;
-  while (right < knots.length - 1 && knots[right] < at) right++;
-  return [right, (x - knots[right - 1]) / (knots[right] - knots[right - 1])];
-}
-
 class Edit {
   constructor(container, record) {
     const read = (part) => part.map((row) => Float32Array.from(row));
     this.name = record.name;
     this.recorded = record.recorded;
     this.knots = Float32Array.from(record.knots);
-    this.members = container.stored(record.members);
-    for (let i = 1; i < this.members.length; i++) this.members[i] += this.members[i - 1];
     this.attributes = {};
     for (const [name, bases] of Object.entries(record.attributes)) {
       this.attributes[name] = {
@@ -44,16 +35,19 @@ class Edit {
     };
   }
 
-  // What each stored base of an attribute is multiplied with at a strength: pairs of numbers and a factor a channel.
-  factors(name, strength) {
+  // What it adds to the numbers of an attribute from `first` on. `levels`: as many more, for its bases.
+  offsets(name, strength, first, out, levels) {
     const { stored, scale, coefficients } = this.attributes[name];
     const [right, share] = findSegment(this.knots, strength);
-    const low = coefficients[right - 1], high = coefficients[right], used = [];
+    const low = coefficients[right - 1], high = coefficients[right];
+    out.fill(-0);
     stored.forEach((numbers, k) => {
       const a = share === 1 ? high[k] : fround(low[k] + fround(share) * (high[k] - low[k]));
-      if (a !== 0) used.push([numbers, scale[k].map((unit) => a * unit)]);
+      if (a === 0) return;
+      levels.set(numbers.subarray(first, first + out.length));  // one type for the loop, which is fast then
+      const factors = Float64Array.from(scale[k], (unit) => a * unit), width = factors.length;
+      for (let j = 0; j < out.length;) for (let c = 0; c < width; c++, j++) out[j] += fround(factors[c] * levels[j]);
     });
-    return used;
   }
 }
 
@@ -62,11 +56,10 @@ export class Composer {
     const { header } = container;
     this.count = header.members;
     this.edits = header.edits.map((record) => new Edit(container, record));
-    this.sphere = header.sphere.map((part) => Float32Array.from(part));
+    this.sphere = header.sphere;
     this.widths = { ...WIDTHS, shN: 3 * header.sh };
     this.before = {};
     this.after = {};
-    this.total = {};
     this.moving = new Set(this.edits.flatMap((edit) => Object.keys(edit.attributes)));
     for (const name of this.moving) {
       for (const each of [name, PARTNERS[name]]) {
@@ -76,140 +69,149 @@ export class Composer {
         this.before[each] = numbers;
         this.after[each] = this.moving.has(each) ? numbers.slice() : numbers;
       }
-      this.total[name] = new Float32Array(this.count * this.widths[name]);
     }
-    this.marked = new Uint8Array(this.count);
-    this.touched = new Uint8Array(this.count);
-    this.meets = this.edits.map((a) => {
-      this.marked.fill(0);
-      for (const row of a.members) this.marked[row] = 1;
-      return this.edits.map((b) => b.members.some((row) => this.marked[row]));
+    const known = this.edits.map(() => 0);  // members of the segments so far
+    let first = 0, most = 0;
+    this.segments = header.segments.map(([rows, edits]) => {
+      const names = [...this.moving].filter((name) => edits.some((edit) => this.edits[edit].attributes[name]));
+      const segment = { first, rows, names, members: {}, effects: [], maps: [] };
+      for (const edit of edits) {
+        segment.members[edit] = known[edit];
+        known[edit] += rows;
+      }
+      first += rows;
+      most = Math.max(most, ...names.map((name) => rows * this.widths[name]));
+      return segment;
     });
-    this.effects = this.edits.map(() => "");
+    this.scratch = [new Float32Array(most), new Float32Array(most)];
     this.blend = "";
   }
 
   // Makes `after` the scene under layers { edit, strength, gains, weights, paint }, lowest first.
-  // Gives the rows that changed, { first, last, names }, or null.
+  // Gives what changed, { ranges [first, last], names }, or null.
   update(layers, blend) {
-    const active = layers.filter((layer) => layer.strength !== 0);
-    const ordered = blend === "over" || blend === "adjust";
-    const effects = this.edits.map((_, edit) => JSON.stringify(active.flatMap((layer, order) =>
-      layer.edit === edit ? [[layer.strength, layer.gains, layer.paint, ordered ? order : 0]] : [])));
-    const changed = [...effects.keys()].filter((edit) =>
-      effects[edit] !== this.effects[edit] || (effects[edit] !== "[]" && blend !== this.blend));
-    this.effects = effects;
+    const active = layers.filter((layer) => layer.strength !== 0).map((layer) =>
+      ({ ...layer, effect: JSON.stringify([layer.edit, layer.strength, layer.gains, layer.paint]) }));
+    const ranges = [], names = new Set(), again = blend !== this.blend;
     this.blend = blend;
-    if (!changed.length) return null;
-    const { marked } = this;
-    marked.fill(0);
-    let first = this.count, last = 0;
-    for (const edit of changed) {
-      const { members } = this.edits[edit];
-      for (let i = 0; i < members.length; i++) marked[members[i]] = 1;
-      if (members.length) {
-        first = Math.min(first, members[0]);
-        last = Math.max(last, members[members.length - 1] + 1);
-      }
+    for (const segment of this.segments) {
+      const stack = active.filter((layer) => layer.edit in segment.members), { effects, first, rows } = segment;
+      let same = 0;
+      if (!again) while (same < stack.length && stack[same].effect === effects[same]) same++;
+      if (same === stack.length && same === effects.length) continue;
+      this.#compose(segment, stack, same);
+      segment.effects = stack.map((layer) => layer.effect);
+      for (const name of segment.names) names.add(name);
+      if (ranges.at(-1)?.[1] === first) ranges.at(-1)[1] = first + rows;
+      else ranges.push([first, first + rows]);
     }
-    const near = this.edits.map((_, edit) => changed.some((other) => this.meets[edit][other]));
-    const names = [...this.moving].filter((name) =>
-      this.edits.some((edit, i) => near[i] && edit.attributes[name]));
-    const stack = active.filter((layer) => near[layer.edit]);
-    for (const name of names) this.total[name].fill(-0, first * this.widths[name], last * this.widths[name]);
-    if (blend === "adjust") this.touched.fill(0);
-    for (const layer of stack) this.#add(layer, names, blend);
-    const divisors = blend === "normalized" ? this.#divisors(stack) : null;
-    for (const name of names) this.#finish(name, first, last, divisors);
-    return first < last ? { first, last, names } : null;
+    return ranges.length ? { ranges, names: [...names] } : null;
   }
 
-  #add(layer, names, blend) {
-    const edit = this.edits[layer.edit], { members } = edit, { weights } = layer, { marked, touched } = this;
-    const held = Math.min(Math.max(layer.strength, 0), 1);
-    const moved = names.filter((name) => edit.attributes[name] && layer.gains[KINDS[name]] !== 0);
+  // The layers below the lowest that changed, `same` of them, are kept for the next time.
+  #compose(segment, stack, same) {
+    const { first, rows, names } = segment, totals = {};
+    const kept = segment.below?.at === same ? segment.below : null;
+    segment.below = kept;
+    for (const name of names) {
+      const width = this.widths[name];
+      totals[name] = this.after[name].subarray(first * width, (first + rows) * width);
+      if (kept) totals[name].set(kept.totals[name]);
+      else totals[name].fill(-0);
+    }
+    for (let at = kept ? same : 0; at < stack.length; at++) {
+      if (at === same && at > 0 && !kept) {
+        segment.below = { at, totals: Object.fromEntries(names.map((name) => [name, totals[name].slice()])) };
+      }
+      this.#add(segment, stack, at, totals);
+    }
+    const divisors = this.blend === "normalized" ? this.#divisors(segment, stack) : null;
+    for (const name of names) {
+      const width = this.widths[name], total = totals[name];
+      const before = this.before[name].subarray(first * width, (first + rows) * width);
+      if (divisors) for (let j = 0; j < total.length; j++) total[j] /= divisors[Math.floor(j / width)];
+      for (let j = 0; j < total.length; j++) total[j] += before[j];
+    }
+  }
+
+  #add(segment, stack, at, totals) {
+    const layer = stack[at], edit = this.edits[layer.edit], member = segment.members[layer.edit], { rows } = segment;
+    const { weights } = layer, held = clampedStrength(layer);
+    const moved = segment.names.filter((name) => edit.attributes[name] && layer.gains[KINDS[name]] !== 0);
     const colors = moved.filter((name) => KINDS[name] === "color");
-    const maps = blend === "adjust" && edit.grade && colors.length > 0;
-    const below = maps ? this.#gather(edit, colors) : null;
+    const hides = at > 0 && (this.blend === "over" || this.blend === "adjust");
+    const map = hides && this.blend === "adjust" && edit.grade && colors.length
+      ? this.#graded(segment, stack, at, colors, totals) : null;
     for (const name of moved) {
-      const kind = KINDS[name], gain = fround(layer.gains[kind]), width = this.widths[name];
-      const total = this.total[name], used = edit.factors(name, layer.strength);
-      const covered = blend === "over" || blend === "adjust" ? edit.coverage[kind] : null;
-      const hidden = fround(held) * fround(Math.min(Math.abs(gain), 1));
-      for (let i = 0; i < members.length; i++) {
-        const row = members[i];
-        if (!marked[row]) continue;
-        const weight = weights ? weights[i] : 1;
-        if (weight === 0) continue;
-        const through = covered ? 1 - weight * hidden * covered[i] : 1, factor = weight * gain;
-        for (let c = 0, to = row * width, from = i * width; c < width; c++, to++, from++) {
-          let offset = 0;
-          for (let k = 0; k < used.length; k++) offset += fround(used[k][1][c] * used[k][0][from]);
-          total[to] = through * total[to] + factor * offset;
+      const kind = KINDS[name], gain = fround(layer.gains[kind]), width = this.widths[name], total = totals[name];
+      const [offsets, levels] = this.scratch.map((numbers) => numbers.subarray(0, rows * width));
+      edit.offsets(name, layer.strength, member * width, offsets, levels);
+      const covered = hides ? edit.coverage[kind].subarray(member, member + rows) : null;
+      const hidden = held * fround(Math.min(Math.abs(gain), 1));
+      if (!weights && !covered) for (let j = 0; j < total.length; j++) total[j] += gain * offsets[j];
+      else {
+        for (let i = 0, j = 0; i < rows; i++) {
+          const weight = weights ? weights[member + i] : 1, factor = weight * gain, end = j + width;
+          const through = covered ? 1 - weight * hidden * covered[i] : 1;
+          if (weight === 0) j = end;
+          for (; j < end; j++) total[j] = through * total[j] + factor * offsets[j];
         }
       }
     }
-    if (maps) this.#map(layer, edit, colors, below);
-    if (blend === "adjust") {
-      for (let i = 0; i < members.length; i++) if (!weights || weights[i]) touched[members[i]] = 1;
-    }
+    if (map) this.#adjust(layer, edit, member, colors, totals, map);
   }
 
-  // What lies below a grade where others have changed the color: members, and the sums of their bands.
-  #gather(edit, colors) {
-    const rows = [];
-    edit.members.forEach((row, i) => { if (this.marked[row] && this.touched[row]) rows.push(i); });
+  // A grade above others: rows of the segment that they have changed, the sums of their bands, what it adds.
+  #graded(segment, stack, at, colors, totals) {
+    const layer = stack[at], edit = this.edits[layer.edit], below = stack.slice(0, at), { first } = segment;
+    const key = [...below.map((each) => each.effect), JSON.stringify(layer.paint), ...colors].join();
+    if (segment.maps[at]?.key === key && segment.maps[at].edit === edit) return segment.maps[at];
+    const weightOf = (each, i) => each.weights?.[segment.members[each.edit] + i] ?? 1, rows = [];
+    for (let i = 0; i < segment.rows; i++) {
+      if (weightOf(layer, i) !== 0 && below.some((each) => weightOf(each, i) !== 0)) rows.push(i);
+    }
     const width = colors.reduce((sum, name) => sum + this.widths[name], 0);
-    const sums = new Float32Array(rows.length * width);
-    rows.forEach((i, at) => {
-      let to = at * width;
+    const sums = new Float32Array(rows.length * width), sh = new Float32Array(sums.length);
+    let to = 0;
+    for (const i of rows) {
       for (const name of colors) {
-        const w = this.widths[name], from = edit.members[i] * w;
-        for (let c = 0; c < w; c++) sums[to++] = this.total[name][from + c];
-      }
-    });
-    return { rows, width, sums };
-  }
-
-  #map(layer, edit, colors, { rows, width, sums }) {
-    const sh = new Float32Array(width), change = new Float32Array(width), gain = layer.gains.color;
-    const mapped = gradeChange(edit.grade, layer.strength, width / 3, this.sphere);
-    rows.forEach((i, at) => {
-      let to = 0;
-      for (const name of colors) {
-        const w = this.widths[name], from = edit.members[i] * w;
-        for (let c = 0; c < w; c++, to++) sh[to] = this.before[name][from + c] + sums[at * width + to];
-      }
-      mapped(sh, i, change);
-      const factor = (layer.weights ? layer.weights[i] : 1) * gain, share = edit.coverage.map[i];
-      to = 0;
-      for (const name of colors) {
-        const w = this.widths[name], total = this.total[name], from = edit.members[i] * w;
+        const w = this.widths[name];
         for (let c = 0; c < w; c++, to++) {
-          const made = sums[at * width + to] + factor * change[to];
-          total[from + c] += share * (made - total[from + c]);
+          sums[to] = totals[name][i * w + c];
+          sh[to] = this.before[name][(first + i) * w + c] + sums[to];
         }
       }
-    });
+    }
+    const members = Int32Array.from(rows, (i) => segment.members[layer.edit] + i);
+    const graded = new GradedColors(edit.grade, this.sphere, sh, members);
+    return (segment.maps[at] = { key, edit, rows, width, sums, graded });
   }
 
-  #divisors(stack) {
+  #adjust(layer, edit, member, colors, totals, { rows, width, sums, graded }) {
+    const change = graded.at(layer.strength), gain = layer.gains.color;
+    let from = 0;
+    for (const name of colors) {
+      const w = this.widths[name], total = totals[name];
+      for (let k = 0; k < rows.length; k++) {
+        const i = rows[k], factor = (layer.weights ? layer.weights[member + i] : 1) * gain;
+        const share = edit.coverage.map[member + i];
+        for (let c = 0, j = i * w, at = k * width + from; c < w; c++, j++, at++) {
+          total[j] += share * (sums[at] + factor * change[at] - total[j]);
+        }
+      }
+      from += w;
+    }
+  }
+
+  #divisors({ rows, members }, stack) {
     if (stack.reduce((sum, layer) => sum + Math.min(layer.strength, 1), 0) <= 1 - 1e-6) return null;
-    const sums = new Float32Array(this.count);
+    const sums = new Float32Array(rows);
     for (const layer of stack) {
-      const { members } = this.edits[layer.edit], held = fround(Math.min(Math.max(layer.strength, 0), 1));
-      for (let i = 0; i < members.length; i++) sums[members[i]] += held * (layer.weights ? layer.weights[i] : 1);
+      const held = clampedStrength(layer), member = members[layer.edit];
+      for (let i = 0; i < rows; i++) sums[i] += held * (layer.weights ? layer.weights[member + i] : 1);
     }
-    return sums;
-  }
-
-  #finish(name, first, last, divisors) {
-    const width = this.widths[name], total = this.total[name];
-    const before = this.before[name], after = this.after[name], { marked } = this;
-    for (let row = first; row < last; row++) {
-      if (!marked[row]) continue;
-      const divisor = divisors ? Math.max(divisors[row], 1) : 1;
-      for (let j = row * width; j < (row + 1) * width; j++) after[j] = before[j] + fround(total[j] / divisor);
-    }
+    return sums.map((sum) => Math.max(sum, 1));
   }
 }
+
+const clampedStrength = (layer) => fround(Math.min(Math.max(layer.strength, 0), 1));

@@ -1,10 +1,16 @@
 // What a grade makes of colors that others have changed: progdf/field/grade.py, adjust_colors.
 
-import { findSegment } from "./compose.js";
-
 const C0 = 0.28209479177387814;
 const MOST_COLOR = 1.5;
-const clamp = (x, low, high) => Math.min(Math.max(x, low), high);
+const clamp = (x, low, high) => (x > low ? (x < high ? x : high) : low);  // faster than Math.min and max
+
+// The segment of ascending knots that holds x: the index of its right one, and the share of the way to that.
+export function findSegment(knots, x) {
+  const at = Math.fround(x);
+  let right = 1;
+  while (right < knots.length - 1 && knots[right] < at) right++;
+  return [right, (x - knots[right - 1]) / (knots[right] - knots[right - 1])];
+}
 
 function interpolate(x, knots, values) {
   let right = 1;
@@ -13,9 +19,12 @@ function interpolate(x, knots, values) {
   return values[right - 1] + share * (values[right] - values[right - 1]);
 }
 
-// Gives a function that maps one color: (r, g, b, out [3]).
-function polynomial(t, degree) {
-  return (red, green, blue, out) => {
+const lerpAll = (low, high, share) => high.map((x, k) => (share === 1 ? x : low[k] + share * (x - low[k])));
+
+// Maps colors [D,3].
+function polynomial(colors, out, t, degree) {
+  for (let d = 0; d < out.length; d += 3) {
+    const red = colors[d], green = colors[d + 1], blue = colors[d + 2];
     const r = clamp(red, 0, MOST_COLOR), g = clamp(green, 0, MOST_COLOR), b = clamp(blue, 0, MOST_COLOR);
     const rr = r * r, gg = g * g, bb = b * b, rg = r * g, gb = g * b, br = b * r;
     for (let c = 0; c < 3; c++) {
@@ -27,106 +36,149 @@ function polynomial(t, degree) {
         sum += t[30 + c] * rr * r + t[33 + c] * gg * g + t[36 + c] * bb * b + t[39 + c] * rr * g + t[42 + c] * rr * b;
         sum += t[45 + c] * gg * r + t[48 + c] * gg * b + t[51 + c] * bb * r + t[54 + c] * bb * g + t[57 + c] * rg * b;
       }
-      out[c] = sum;
+      out[d + c] = colors[d + c] > MOST_COLOR ? sum + colors[d + c] - MOST_COLOR : sum;
     }
-    if (red > MOST_COLOR) out[0] += red - MOST_COLOR;
-    if (green > MOST_COLOR) out[1] += green - MOST_COLOR;
-    if (blue > MOST_COLOR) out[2] += blue - MOST_COLOR;
-  };
+  }
 }
 
-function lattice(table) {
-  const side = Math.round(Math.cbrt(table.length / 3)), at = new Float64Array(3), low = new Int32Array(3);
-  return (red, green, blue, out) => {
-    at[0] = clamp(red, 0, 1) * (side - 1);
-    at[1] = clamp(green, 0, 1) * (side - 1);
-    at[2] = clamp(blue, 0, 1) * (side - 1);
+function lattice(colors, out, table) {
+  const side = Math.round(Math.cbrt(table.length / 3)), at = [0, 0, 0], low = [0, 0, 0];
+  out.fill(0);
+  for (let d = 0; d < out.length; d += 3) {
     for (let axis = 0; axis < 3; axis++) {
+      at[axis] = clamp(colors[d + axis], 0, 1) * (side - 1);
       low[axis] = Math.min(Math.floor(at[axis]), side - 2);
       at[axis] -= low[axis];
     }
-    out.fill(0);
     for (let corner = 0; corner < 8; corner++) {
-      const [r, g, b] = [corner & 1, (corner >> 1) & 1, corner >> 2];
+      const r = corner & 1, g = (corner >> 1) & 1, b = corner >> 2;
       const weight = (r ? at[0] : 1 - at[0]) * (g ? at[1] : 1 - at[1]) * (b ? at[2] : 1 - at[2]);
       const index = 3 * (low[0] + r + side * (low[1] + g + side * (low[2] + b)));
-      for (let c = 0; c < 3; c++) out[c] += weight * table[index + c];
+      for (let c = 0; c < 3; c++) out[d + c] += weight * table[index + c];
     }
-  };
-}
-
-// Gives a function (sh, made [B,3]): harmonics that show what the map makes of what they showed.
-function bandMapper(bands, map, [values, inverse]) {
-  const mapped = new Float64Array(3);
-  if (bands === 1) {
-    return (sh, made) => {
-      map(sh[0] * C0 + 0.5, sh[1] * C0 + 0.5, sh[2] * C0 + 0.5, mapped);
-      for (let c = 0; c < 3; c++) {
-        made[c] = mapped[c] <= 0 && sh[c] * C0 + 0.5 <= 0 ? sh[c] : (mapped[c] - 0.5) / C0;
-      }
-    };
   }
-  const directions = values.length / bands, target = new Float64Array(3 * directions);
-  const color = new Float64Array(3 * directions), clamped = new Uint8Array(3);
-  const show = (sh, c) => {
-    for (let d = 0; d < directions; d++) {
-      let sum = 0.5;
-      for (let b = 0; b < bands; b++) sum += sh[3 * b + c] * values[d * bands + b];
-      color[3 * d + c] = sum;
-    }
-  };
-  const add = (made, c, missing) => {  // least squares: missing [D,3]
-    for (let b = 0; b < bands; b++) {
-      let sum = 0;
-      for (let d = 0; d < directions; d++) sum += missing[3 * d + c] * inverse[b * directions + d];
-      made[3 * b + c] += sum;
-    }
-  };
-  return (sh, made) => {
-    made.set(sh);
-    clamped.fill(0);
-    for (let c = 0; c < 3; c++) show(sh, c);
-    for (let d = 0; d < 3 * directions; d += 3) {
-      map(color[d], color[d + 1], color[d + 2], mapped);
-      for (let c = 0; c < 3; c++) {
-        target[d + c] = mapped[c];
-        if (color[d + c] < 0 || mapped[c] < 0) clamped[c] = 1;
-        color[d + c] = mapped[c] - Math.max(color[d + c], 0);
-      }
-    }
-    for (let c = 0; c < 3; c++) add(made, c, color);
-    for (let c = 0; c < 3; c++) {
-      if (!clamped[c]) continue;
-      show(made, c);
-      for (let j = c; j < color.length; j += 3) {
-        color[j] = target[j] <= 0 && color[j] <= 0 ? 0 : target[j] - color[j];
-      }
-      add(made, c, color);
-    }
-  };
 }
 
-// Gives a function (sh [B,3], member, change) of a grade at a strength, which writes what it adds to the bands.
-export function gradeChange(grade, strength, bands, sphere) {
-  const at = strength < 1 ? interpolate(strength, grade.new, grade.old) : strength;
-  const [right, share] = findSegment(grade.knots, at);
-  const low = grade.table[right - 1], high = grade.table[right];
-  const straight = grade.degree === 0;
-  const table = straight || share === 1 ? high : high.map((x, k) => low[k] + share * (x - low[k]));
-  const map = straight ? lattice(table) : polynomial(table, grade.degree);
-  const row = grade.coefficients[right].map((x, k) => {
-    const from = grade.coefficients[right - 1][k];
-    return from + share * (x - from);
-  });
-  const remap = bandMapper(bands, map, sphere), made = new Float64Array(3 * bands);
-  const width = grade.scale[0]?.length ?? 0, factors = grade.scale.map((units, k) => units.map((unit) => unit * row[k]));
-  return (sh, member, change) => {
-    remap(sh, made);
-    const part = (straight ? share : 1) * (grade.share ? grade.share[member] : 1);
-    for (let j = 0; j < change.length; j++) change[j] = part * (made[j] - sh[j]);
-    for (let k = 0; k < factors.length; k++) {
-      const basis = grade.residual[k], units = factors[k];
-      for (let j = 0; j < width; j++) change[j] += basis[member * width + j] * units[j];
+// What a grade adds to the bands sh [m,B,3] of some of its members. The map is linear in its table, so between
+// two knots a member goes the straight way, but for those that are black somewhere.
+export class GradedColors {
+  constructor(grade, [values, inverse], sh, members) {
+    const bands = sh.length / 3 / members.length, directions = bands > 1 ? values.length / bands : 1;
+    Object.assign(this, { grade, sh, members, bands, directions, values: Float64Array.from(values) });
+    this.inverse = Float64Array.from(inverse);
+    this.color = new Float64Array(3 * directions);
+    this.target = new Float64Array(3 * directions);
+    this.made = new Float64Array(3 * bands);
+    this.change = new Float32Array(sh.length);
+    this.knots = [];
+  }
+
+  // At a strength. [m,B,3], until it is called again
+  at(strength) {
+    const { grade, change, sh, members } = this, straight = grade.degree === 0;
+    const at = strength < 1 ? interpolate(strength, grade.new, grade.old) : strength;
+    const [right, share] = findSegment(grade.knots, at), width = 3 * this.bands;
+    const low = grade.table[right - 1], high = grade.table[right];
+    const table = straight ? high : lerpAll(low, high, share);
+    if (this.bands === 1 || share > 1 && !straight) {
+      for (let i = 0; i < members.length; i++) this.#map(table, i, change);
+    } else {
+      const ends = [straight || right === 1 ? null : this.#knot(right - 1), this.#knot(right)];
+      this.knots = this.knots.map((knot) => (ends.includes(knot) ? knot : null));
+      const [from, to] = ends, part = straight ? 1 : share;
+      if (from) for (let j = 0; j < sh.length; j++) change[j] = from.change[j] + part * (to.change[j] - from.change[j]);
+      else for (let j = 0; j < sh.length; j++) change[j] = part * to.change[j];
+      for (let i = 0; i < members.length; i++) if (to.black[i] || from?.black[i]) this.#map(table, i, change);
     }
-  };
+    if (straight || grade.share) {
+      for (let i = 0, j = 0; i < members.length; i++) {
+        const part = (straight ? share : 1) * (grade.share ? grade.share[members[i]] : 1);
+        for (const end = j + width; j < end; j++) change[j] *= part;
+      }
+    }
+    const row = lerpAll(grade.coefficients[right - 1], grade.coefficients[right], share);
+    grade.residual.forEach((basis, k) => {
+      const units = Float64Array.from(grade.scale[k], (unit) => unit * row[k]), own = units.length;
+      for (let i = 0; i < members.length; i++) {
+        for (let c = 0, j = i * width, from = members[i] * own; c < own; c++) change[j + c] += basis[from + c] * units[c];
+      }
+    });
+    return change;
+  }
+
+  #knot(k) {
+    if (!this.knots[k]) {
+      const change = new Float32Array(this.sh.length), black = new Uint8Array(this.members.length);
+      for (let i = 0; i < black.length; i++) black[i] = this.#map(this.grade.table[k], i, change, true);
+      this.knots[k] = { change, black };
+    }
+    return this.knots[k];
+  }
+
+  // What the map adds to a member; `once`: without a second look where that is black. Gives which channels are.
+  #map(table, member, change, once = false) {
+    const { sh, bands, directions, made, color, target, inverse } = this, first = 3 * bands * member;
+    for (let j = 0; j < made.length; j++) made[j] = sh[first + j];
+    const map = this.grade.degree === 0 ? lattice : polynomial;
+    if (bands === 1) {
+      for (let c = 0; c < 3; c++) color[c] = made[c] * C0 + 0.5;
+      map(color, target, table, this.grade.degree);
+      for (let c = 0; c < 3; c++) {
+        change[first + c] = target[c] <= 0 && color[c] <= 0 ? 0 : (target[c] - 0.5) / C0 - made[c];
+      }
+      return 0;
+    }
+    this.#show();
+    map(color, target, table, this.grade.degree);
+    let black = 0;
+    for (let d = 0; d < color.length; d += 3) {
+      for (let c = 0; c < 3; c++) {
+        const x = color[d + c], y = target[d + c];
+        if (x < 0 || y < 0) black |= 1 << c;
+        color[d + c] = x > 0 ? y - x : y;
+      }
+    }
+    this.#project(7);
+    if (black && !once) {
+      this.#show();
+      for (let j = 0; j < color.length; j++) color[j] = target[j] <= 0 && color[j] <= 0 ? 0 : target[j] - color[j];
+      this.#project(black);
+    }
+    for (let j = 0; j < made.length; j++) change[first + j] = made[j] - sh[first + j];
+    return black;
+  }
+
+  // The colors that `made` shows from everywhere.
+  #show() {
+    const { bands, made, color, values } = this;
+    for (let at = 0, to = 0; to < color.length; to += 3) {
+      let r = 0.5, g = 0.5, b = 0.5;
+      for (let j = 0; j < made.length; j += 3, at++) {
+        const value = values[at];
+        r += made[j] * value;
+        g += made[j + 1] * value;
+        b += made[j + 2] * value;
+      }
+      color[to] = r;
+      color[to + 1] = g;
+      color[to + 2] = b;
+    }
+  }
+
+  // Adds to `made`, in the channels of a mask, what is missing in `color`, by least squares.
+  #project(channels) {
+    const { made, color, inverse } = this, red = channels & 1, green = (channels >> 1) & 1, blue = channels >> 2;
+    for (let at = 0, to = 0; to < made.length; to += 3) {
+      let r = 0, g = 0, b = 0;
+      for (let j = 0; j < color.length; j += 3, at++) {
+        const value = inverse[at];
+        r += color[j] * value;
+        g += color[j + 1] * value;
+        b += color[j + 2] * value;
+      }
+      made[to] += red * r;
+      made[to + 1] += green * g;
+      made[to + 2] += blue * b;
+    }
+  }
 }

@@ -35,13 +35,14 @@ export function listen(canvas, page) {
   for (const name of ["pointerup", "pointercancel"]) {
     canvas.addEventListener(name, (event) => {
       if (!pointers.delete(event.pointerId) || name !== "pointerup" || pointers.size) return;
-      const { clientX: x, clientY: y, timeStamp: time } = event;
+      const { offsetX: x, offsetY: y, timeStamp: time } = event;
       const again = time - tap.time < TAP_MS && Math.hypot(x - tap.x, y - tap.y) < TAP_PX;
       if (again) page.pivotAt(x, y);
       tap = { time: again ? -Infinity : time, x, y };
     });
   }
   canvas.addEventListener("wheel", (event) => {
+    if (!page.takesWheel) return;
     event.preventDefault();
     const pixels = event.deltaY * [1, 33, 400][event.deltaMode];
     page.look(zoom(page.camera, Math.exp(ZOOM_PER_PIXEL * pixels * (event.ctrlKey ? 8 : 1)), page.radius));

@@ -1,8 +1,8 @@
-// The page: reads the container, and draws again whenever the view or the camera is another one.
+// A page in its root element: draws again whenever the view or the camera is another one.
 
 import { addScaled, pinhole, pivotOn } from "./camera.js";
 import { Composer } from "./compose.js";
-import { Container, inflate } from "./data.js";
+import { Container } from "./data.js";
 import { listen } from "./input.js";
 import { buildPanel } from "./panel.js";
 import { Renderer, depthRow } from "./renderer.js";
@@ -14,13 +14,15 @@ const SLOW_MS = 45;  // between frames while something moves: half the pixels ea
 const REST_MS = 180;
 const GLIDE_MS = 250;
 
-const get = (id) => document.getElementById(id);
-
 class Page {
-  constructor(container, shaders) {
+  get = (id) => this.root.querySelector(`#${id}`);
+  gone = new AbortController();
+
+  constructor(root, container, shaders) {
     const { header } = container;
+    this.root = root;
     this.header = header;
-    this.canvas = get("picture");
+    this.canvas = this.get("picture");
     this.renderer = new Renderer(this.canvas, shaders, container);
     this.composer = new Composer(container);
     this.means = new Float32Array(3 * header.count);
@@ -42,12 +44,12 @@ class Page {
     this.playing = false;
     this.comparing = false;
     this.coarse = false;
-    this.update = buildPanel(get("controls"), this);
+    this.update = buildPanel(this.get("controls"), this);
     this.#bind();
     const touch = matchMedia("(pointer: coarse)").matches;
-    get("notice").textContent = touch
+    this.get("notice").textContent = touch
       ? "Drag to turn · pinch to zoom · tap twice to center" : "Drag to turn · scroll to zoom · Space compares";
-    document.body.classList.add("ready");
+    root.classList.add("ready");
     this.resize();
     this.change(this.view);
   }
@@ -72,7 +74,7 @@ class Page {
   touched() {
     this.playing = false;
     this.glide = null;
-    document.body.classList.add("touched");
+    this.root.classList.add("touched");
   }
 
   choose(index) {
@@ -103,7 +105,7 @@ class Page {
   compare(on) {
     if (on === this.comparing) return;
     this.comparing = on;
-    get("compare").setAttribute("aria-pressed", on);
+    this.get("compare").setAttribute("aria-pressed", on);
     this.dirty = true;
     this.request();
   }
@@ -124,6 +126,11 @@ class Page {
 
   get focal() {
     return this.#pinhole().intrinsics[0] * (this.canvas.clientWidth / this.canvas.width);
+  }
+
+  // In a notebook the wheel goes on scrolling until somebody has clicked here.
+  get takesWheel() {
+    return this.root === document.body || this.root.matches(":focus-within");
   }
 
   resize() {
@@ -158,16 +165,20 @@ class Page {
   #pinhole() {
     const { canvas } = this, scale = canvas.width / Math.max(canvas.clientWidth, 1);
     const free = { x: 0, y: 0, width: canvas.width, height: canvas.height };
-    const panel = get("panel").getBoundingClientRect();
-    if (!document.body.classList.contains("folded")) {
-      if (panel.width < 0.7 * canvas.clientWidth) free.width = Math.round(panel.left * scale);
-      else free.height = Math.round(panel.top * scale);
+    const panel = this.get("panel");
+    if (!this.root.classList.contains("folded")) {
+      if (panel.offsetWidth < 0.7 * canvas.clientWidth) free.width = Math.round(panel.offsetLeft * scale);
+      else free.height = Math.round(panel.offsetTop * scale);
     }
     if (free.width < 40 || free.height < 40) Object.assign(free, { width: canvas.width, height: canvas.height });
     return pinhole(this.camera, canvas.width, canvas.height, free);
   }
 
   #draw(now) {
+    if (!this.canvas.clientWidth) {  // hidden, as all is while a notebook changes its theme
+      this.resting = setTimeout(() => this.request(), REST_MS);
+      return;
+    }
     this.#advance(now);
     if (this.dirty) this.#compose();
     const at = this.#pinhole(), row = depthRow(at);
@@ -187,7 +198,8 @@ class Page {
     this.coarse &&= moving;
     this.renderer.draw(at, this.header.background, this.coarse ? 0.5 : 1);
     this.drawnAt = now;
-    document.body.classList.add("drawn");
+    this.root.classList.add("drawn");
+    this.shown?.();
   }
 
   #advance(now) {
@@ -214,8 +226,10 @@ class Page {
     if (!changed) return;
     this.renderer.update(this.composer, changed);
     if (changed.names.includes("means")) {
-      this.means.set(this.composer.after.means.subarray(3 * changed.first, 3 * changed.last), 3 * changed.first);
-      this.sorter.moved(changed.first, changed.last);
+      for (const [first, last] of changed.ranges) {
+        this.means.set(this.composer.after.means.subarray(3 * first, 3 * last), 3 * first);
+        this.sorter.moved(first, last);
+      }
       this.turned = true;
     }
   }
@@ -227,11 +241,13 @@ class Page {
   }
 
   #bind() {
-    listen(this.canvas, this);
-    new ResizeObserver(() => this.resize()).observe(this.canvas);
+    const { root, get, canvas } = this, until = { signal: this.gone.signal };
+    listen(canvas, this);
+    this.sizes = new ResizeObserver(() => this.resize());
+    this.sizes.observe(canvas);
     const press = (id, act) => get(id).addEventListener("click", act);
     press("fold", () => {
-      const folded = document.body.classList.toggle("folded");
+      const folded = root.classList.toggle("folded");
       get("fold").setAttribute("aria-expanded", !folded);
       this.turned = true;
       this.request();
@@ -239,46 +255,53 @@ class Page {
     press("home", () => this.glideTo(this.home));
     press("full", () => {
       if (document.fullscreenElement) document.exitFullscreen();
-      else document.documentElement.requestFullscreen?.();
+      else root.requestFullscreen?.();
     });
     const hold = get("compare");
     hold.addEventListener("pointerdown", () => this.compare(true));
     for (const name of ["pointerup", "pointerleave", "pointercancel", "blur"]) {
       hold.addEventListener(name, () => this.compare(false));
     }
-    addEventListener("keydown", (event) => {
+    root.addEventListener("keydown", (event) => {
       if (event.ctrlKey || event.metaKey || event.altKey) return;
       if (event.key === " ") {
         event.preventDefault();
         this.compare(true);
       } else if (event.key === "p" && this.header.timeline) this.play();
-      else if (event.key === "Home" && event.target === document.body) this.glideTo(this.home);
+      else if (event.key === "Home" && event.target.type !== "range") this.glideTo(this.home);
     });
     addEventListener("keyup", (event) => {
-      if (event.key !== " ") return;
+      if (event.key !== " " || !this.comparing) return;
       event.preventDefault();
       this.compare(false);
-    });
-    addEventListener("blur", () => this.compare(false));
-    this.canvas.addEventListener("webglcontextlost", (event) => {
+    }, until);
+    addEventListener("blur", () => this.compare(false), until);
+    canvas.addEventListener("webglcontextlost", (event) => {
       event.preventDefault();
-      document.body.classList.remove("drawn");
+      root.classList.remove("drawn");
       get("notice").textContent = "The graphics card was reset; reload the page.";
-    });
+    }, until);
+  }
+
+  // Lets go of everything; nothing is drawn any more.
+  close() {
+    this.gone.abort();
+    this.sizes.disconnect();
+    clearTimeout(this.resting);
+    cancelAnimationFrame(this.pending);
+    this.sorter.worker?.terminate();
+    this.renderer.release();
   }
 }
 
-async function start() {
-  const data = get("data"), shaders = JSON.parse(get("shaders").textContent);
+// The page of a container's bytes, or of a promise of them, in `root`; null where that says why there is none.
+export async function show(root, bytes, shaders) {
   try {
-    const text = data.textContent;
-    data.remove();
-    globalThis.progdf = new Page(new Container(await inflate(text)), shaders);
+    return new Page(root, new Container(await bytes), shaders);
   } catch (error) {
-    get("notice").textContent = error.message === "no WebGL2"
+    root.querySelector("#notice").textContent = error.message === "no WebGL2"
       ? "This browser draws no 3D (WebGL2 is off), so this is a still picture."
       : `The scene cannot be shown here: ${error.message}`;
+    return null;
   }
 }
-
-start();

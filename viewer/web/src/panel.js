@@ -12,6 +12,8 @@ function make(kind, options = {}, ...children) {
   return element;
 }
 
+const RULES = { normalized: "Average", sum: "Add", over: "Over", adjust: "Adjust" };  // in the window's words
+
 const percent = (x) => `${Math.round(100 * x)}`;
 
 // A labelled range input 0..most; `ticks`: where recordings lie.
@@ -83,11 +85,23 @@ export function buildPanel(root, page) {
     box.append(add("layers", layer, "layer", { most: header.most, ticks: header.edits[layer.edit].recorded }));
   }
   root.append(layers);
-  const parts = [snapshots(root, page), timeline(root, page)].filter(Boolean);
+  const parts = [rule(layers, page), snapshots(root, page), timeline(root, page)].filter(Boolean);
   return () => {
     for (const list of ["layers", "groups"]) for (const each of page.view[list]) rows.get(`${list}/${each.name}`)?.update(each);
     for (const update of parts) update();
   };
+}
+
+// How layers go together where they meet.
+function rule(root, page) {
+  if (page.view.layers.length < 2) return null;
+  const options = Object.entries(RULES).map(([value, text]) => make("option", { value, textContent: text }));
+  const choice = make("select", {
+    title: "How edits go together where they meet", "aria-label": "Blend rule",
+    on: { change: () => page.change({ ...page.view, blend: choice.value }) },
+  }, ...options);
+  root.append(make("div", { class: "head rule" }, make("span", { class: "name", textContent: "Blend" }), choice));
+  return () => { choice.value = page.view.blend; };
 }
 
 function snapshots(root, page) {

@@ -46,20 +46,27 @@ export class Renderer {
     gl.bindVertexArray(gl.createVertexArray());
   }
 
-  // Sends rows first to last of the attributes `names` of a composer.
-  update(composer, { first, last, names }) {
+  // Sends ranges of rows of the attributes `names` of a composer.
+  update(composer, { ranges, names }) {
     for (const texture of new Set(names.map((name) => TEXTURE_OF[name]))) {
-      const channels = texture === "shN" ? 3 * this.sh : 4;
-      const begin = Math.floor(first / ROW) * ROW, end = Math.min(Math.ceil(last / ROW) * ROW, composer.count);
-      const numbers = new Float32Array((end - begin) * channels);
-      for (const [name, offset] of LAYOUT[texture]) {
-        const width = composer.widths[name], from = composer.after[name];
-        for (let row = begin, to = offset; row < end; row++, to += channels) {
-          for (let c = 0; c < width; c++) numbers[to + c] = from[row * width + c];
-        }
+      for (const [first, last] of ranges) {
+        const begin = Math.floor(first / ROW) * ROW, end = Math.min(Math.ceil(last / ROW) * ROW, composer.count);
+        this.#send(texture, begin, end - begin, ...this.#texels(composer, texture, begin, end));
       }
-      this.#send(texture, begin, end - begin, numbers, channels);
     }
+  }
+
+  #texels({ widths, after }, texture, begin, end) {
+    const [[name]] = LAYOUT[texture], channels = texture === "shN" ? widths.shN : 4;
+    if (widths[name] === channels) return [after[name].subarray(begin * channels, end * channels), channels];
+    const numbers = new Float32Array((end - begin) * channels);
+    for (const [each, offset] of LAYOUT[texture]) {
+      const width = widths[each], from = after[each];
+      for (let row = begin, to = offset; row < end; row++, to += channels) {
+        for (let c = 0; c < width; c++) numbers[to + c] = from[row * width + c];
+      }
+    }
+    return [numbers, channels];
   }
 
   setOrder(order, seen) {

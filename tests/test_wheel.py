@@ -1,0 +1,140 @@
+"""The wheel in a fresh environment: what it holds, what it installs, and a page that it exports."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import re
+import shutil
+import subprocess
+import sys
+import sysconfig
+import tomllib
+import zipfile
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+
+from progdf import save_ply
+from progdf.gdf.file import save_gdf
+from tests.helpers.edits import curved_field, edit_of, some_rows
+from tests.helpers.scenes import random_gaussians
+
+ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+PACKAGES = ("progdf", "trainer", "viewer", "shaders")
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("wheel")
+    run([sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(folder)], ROOT)
+    (built,) = folder.glob("*.whl")
+    return built
+
+
+@pytest.fixture(scope="module")
+def fresh(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The programs of an environment with the wheel in it; what it depends on is that of this environment."""
+    folder = tmp_path_factory.mktemp("fresh") / "venv"
+    run([sys.executable, "-m", "venv", "--without-pip", str(folder)], folder.parent)
+    names = {"base": str(folder), "platbase": str(folder)}
+    site = Path(sysconfig.get_path("purelib", "venv", names))
+    # a path in a .pth file does not follow the .pth files there, which may name a checkout
+    (site / "shared.pth").write_text(sysconfig.get_path("purelib") + "\n", encoding="utf-8")
+    programs = Path(sysconfig.get_path("scripts", "venv", names))
+    pip = [sys.executable, "-m", "pip", "--python", str(programs / "python"), "install"]
+    run([*pip, "-q", "--no-deps", "--no-index", "--force-reinstall", str(wheel)], folder.parent)
+    return programs
+
+
+def run(command: Sequence[str], folder: Path) -> str:
+    """What a command prints that starts in a folder and knows nothing of the checkout."""
+    environment = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "VIRTUAL_ENV")}
+    ended = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, ended.stderr
+    return ended.stdout
+
+
+def scene_and_edit(folder: Path) -> list[str]:
+    scene = random_gaussians(60, seed=3, sh_degree=1)
+    save_ply(folder / "scene.ply", scene)
+    save_gdf(
+        folder / "shirt.gdf", edit_of(scene, some_rows(scene, 20), curved_field(20, channels=23), "shirt")
+    )
+    return ["scene.ply", "shirt.gdf"]
+
+
+def test_the_wheel_has_every_file_of_the_packages_and_no_other(wheel: Path) -> None:
+    with zipfile.ZipFile(wheel) as archive:
+        packed = {name for name in archive.namelist() if ".dist-info/" not in name}
+        (metadata,) = (name for name in archive.namelist() if name.endswith("METADATA"))
+        text = archive.read(metadata).decode()
+    files = (path for package in PACKAGES for path in (ROOT / package).rglob("*") if path.is_file())
+    ours = {
+        path.relative_to(ROOT).as_posix() for path in files if path.suffix not in (".pyc", ".nbi", ".nbc")
+    }
+    assert packed == ours
+    kinds = {Path(name).suffix for name in packed}
+    assert {".py", ".vert", ".frag", ".glsl", ".js", ".html", ".css", ".typed"} <= kinds | {
+        Path(n).name for n in packed
+    }
+    assert "Name: progdf-studio\n" in text
+    assert set(re.findall(r"^Provides-Extra: (.*)$", text, re.MULTILINE)) == set(
+        PROJECT["optional-dependencies"]
+    )
+
+
+def test_what_is_installed_is_the_wheel_and_its_command_runs(fresh: Path, tmp_path: Path) -> None:
+    code = "import progdf, viewer.web.page, shaders; print(progdf.__file__, viewer.web.page.__file__)"
+    for file in run([str(fresh / "python"), "-P", "-c", code], tmp_path).split():
+        assert Path(file).is_relative_to(fresh.parent), "from the wheel, not from the checkout"
+    assert run([str(fresh / "progdf"), "--version"], tmp_path).split()[-1] == PROJECT["version"]
+    assert "export" in run([str(fresh / "progdf"), "--help"], tmp_path)
+    given = scene_and_edit(tmp_path)
+    assert "read back and compared" in run([str(fresh / "progdf"), "export", *given, "-o", "a.ply"], tmp_path)
+
+
+def test_extras_name_packages_and_messages_and_documents_name_extras() -> None:
+    extras = PROJECT["optional-dependencies"]
+    for name, packages in extras.items():
+        assert packages, name
+        for text in packages:
+            requirement = Requirement(text)
+            if name in ("quantize", "qwen"):  # for a graphics card, or with a torch of its own
+                continue
+            try:
+                found = importlib.metadata.version(requirement.name)
+            except importlib.metadata.PackageNotFoundError:
+                continue
+            assert found in requirement.specifier, f"{name}: {text}, and {found} is installed"
+    sources = [path for package in PACKAGES for path in (ROOT / package).rglob("*.py")]
+    sources += [ROOT / "README.md", ROOT / "Makefile", *(ROOT / "docs").glob("*.md")]
+    texts = [path.read_text(encoding="utf-8") for path in sources]
+    named = {n for text in texts for n in re.findall(r"progdf-studio\[([a-z,]+)\]", text)}
+    named |= {n for text in texts for n in re.findall(r"EXTRAS := (.*)", text)}
+    assert {n for group in named for n in group.split(",")} <= set(extras)
+    assert any("progdf-studio[" in text for text in texts)
+
+
+@pytest.mark.slow
+def test_a_page_that_the_wheel_exports_opens_in_a_browser(fresh: Path, tmp_path: Path) -> None:
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    if CHROMIUM is None:
+        pytest.skip("no Chromium is installed")
+    given = scene_and_edit(tmp_path)
+    assert "page.html" in run([str(fresh / "progdf"), "export", *given, "-o", "page.html"], tmp_path)
+    software = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+    with playwright.sync_playwright() as started:
+        browser = started.chromium.launch(executable_path=CHROMIUM, args=software)
+        tab = browser.new_page()
+        complaints: list[str] = []
+        tab.on("pageerror", lambda error: complaints.append(str(error)))
+        tab.goto((tmp_path / "page.html").as_uri())
+        tab.wait_for_selector("body.drawn", timeout=20_000)
+        assert tab.evaluate("progdf.view.layers.map((layer) => layer.name)") == ["shirt"]
+        assert complaints == []
+        browser.close()

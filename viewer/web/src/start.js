@@ -1,0 +1,12 @@
+// The page as a file of its own: all of the document shows the data that it holds.
+
+import { inflate } from "./data.js";
+import { show } from "./main.js";
+
+async function start() {
+  const [data, shaders] = ["data", "shaders"].map((id) => document.getElementById(id)), text = data.textContent;
+  data.remove();
+  globalThis.progdf = await show(document.body, inflate(text), JSON.parse(shaders.textContent));
+}
+
+start();

@@ -1,0 +1,230 @@
+"""The page in a cell of a notebook: `progdf.Widget`, by anywidget (`pip install progdf-studio[jupyter]`)."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+from PIL.Image import Image
+
+from progdf.compose.layers import Layer, check_layers
+from progdf.errors import ProgdfError
+from progdf.gaussians import Gaussians
+from progdf.gdf.file import Gdf, verify
+from progdf.io.images import to_picture
+from progdf.io.json_values import convert_json, plain
+
+from .camera.view_camera import ViewCamera, first_camera
+from .files.document import Document
+from .files.web_page import PageOptions, camera_json, first_state, picture, write_page
+from .state.layers import largest_strength
+from .state.paint import encode
+from .state.view_state import LayerState, ViewState
+from .web.page import PageTexts, build_widget, pack
+
+try:
+    import anywidget
+    import traitlets
+except ImportError as error:
+    raise ProgdfError("progdf.Widget needs anywidget; pip install 'progdf-studio[jupyter]'") from error
+
+_STILL = 720, 480
+LARGEST_SIDE = 16_384
+
+
+class RefusedError(ProgdfError, traitlets.TraitError):
+    """A value that a trait of a widget cannot have; the earlier one stays."""
+
+
+class Strengths(dict[str, float]):
+    """The strengths of a widget's layers; setting some moves their sliders."""
+
+    def __init__(self, values: Mapping[str, float], widget: Widget) -> None:
+        super().__init__(values)
+        self._widget = widget
+
+    def __setitem__(self, name: str, strength: float) -> None:
+        self.update({name: strength})
+
+    def update(self, strengths: Mapping[str, float]) -> None:  # type: ignore[override]
+        """Set those of some layers."""
+        self._widget.strengths = dict(strengths)
+        super().update(self._widget.strengths)
+
+
+class Widget(anywidget.AnyWidget):
+    """A scene under its layers, with their sliders; what is moved here or there is moved on both sides.
+
+    Raises ProgdfError for a layer that was made for another scene, and for numbers, names and rules that are
+    none; TypeError for what is no scene or no layer.
+    """
+
+    _esm = build_widget()
+    _markup = traitlets.Unicode().tag(sync=True)
+    scene = traitlets.Bytes(help="what the browser draws, see `viewer.web.page.pack`").tag(sync=True)
+    strengths = traitlets.Dict(
+        help="slider values by layer name; what a new dict leaves out stays as it is"
+    ).tag(sync=True)
+    hidden = traitlets.List(traitlets.Unicode(), help="names of layers whose eye is closed").tag(sync=True)
+    blend = traitlets.Unicode("adjust", help="how layers go together, of `BLENDS`").tag(sync=True)
+    camera = traitlets.Dict(
+        help="`ViewCamera` as a dict: pivot, distance, azimuth, elevation, fov_y, up; left out: as it is"
+    ).tag(sync=True)
+    height = traitlets.Int(480, min=100, max=4000, help="px").tag(sync=True)
+
+    def __init__(
+        self,
+        scene: Gaussians,
+        layers: Sequence[Layer | Gdf] = (),
+        *,
+        title: str = "",
+        credit: str = "",
+        background: tuple[float, float, float] = (1.0, 1.0, 1.0),
+        blend: str = "adjust",
+        quality: Literal["exact", "compact"] = "compact",
+        height: int = 480,
+    ) -> None:
+        """Pack the scene for the browser.
+
+        Args:
+            scene: the original
+            layers: the lowest first; an edit alone is a layer at strength 1
+            title: above the sliders
+            credit: below them; addresses become links
+            background: behind the scene, 0..1
+            blend: of `BLENDS`
+            quality: "exact", float32, or "compact", 8 and 16 bits, a third as large
+            height: px
+        """
+        stack = _stack(scene, layers, blend)
+        original, edits = scene.to("cpu"), tuple[Gdf, ...]()
+        for layer in stack:
+            name = Document("", original, edits).free_name(layer.gdf.name)
+            edits = (*edits, replace(layer.gdf, name=name))
+        self._document = Document(title or "scene", original, edits)
+        view = ViewState(
+            camera=first_camera(original),
+            layers=tuple(_state(i, edits[i].name, layer) for i, layer in enumerate(stack)),
+            blend=blend,
+            background=background,
+            overshoot=any(layer.strength > 1.0 for layer in stack),
+        )
+        self._view = convert_json(plain(view), ViewState)  # a ValueError where a number is beyond its range
+        still = picture(self._document.scene, self._document.gdfs, self._view, _STILL)
+        state, _ = first_state(self._document, self._view)
+        super().__init__(
+            _markup=PageTexts(title, credit, background, still).markup,
+            scene=pack(self._document.scene, self._document.gdfs, quality, 3, state).data,
+            strengths={layer.name: layer.strength for layer in self._view.layers},
+            hidden=[layer.name for layer in self._view.layers if not layer.enabled],
+            blend=blend,
+            camera=camera_json(self._view.camera),
+            height=height,
+        )
+
+    def snapshot(self, width: int = 960, height: int = 640) -> Image:
+        """What the CPU engine draws at the present strengths, from the present camera, in so many pixels."""
+        if not all(1 <= side <= LARGEST_SIDE for side in (width, height)):
+            raise ProgdfError(
+                f"{width} × {height} cannot be drawn; each side may be 1 to {LARGEST_SIDE} pixels"
+            )
+        view = self._present()
+        return to_picture(picture(self._document.scene, self._document.gdfs, view, (width, height)))
+
+    def to_html(
+        self,
+        path: str | Path,
+        *,
+        title: str = "",
+        credit: str = "",
+        quality: Literal["exact", "compact"] = "compact",
+        max_size: str | None = None,
+    ) -> str:
+        """Write the page as a file of its own, at the present strengths and camera; what it holds, in a line.
+
+        Args:
+            path: a .html file
+            title, credit, quality, max_size: see `PageOptions`
+
+        Raises:
+            ProgdfError: see `write_page`.
+        """
+        options = PageOptions(quality=quality, max_size=max_size, title=title or None, credit=credit)
+        return write_page(Path(path), self._document, self._present(), (), options)
+
+    def _present(self) -> ViewState:
+        layers = tuple(
+            replace(layer, strength=self.strengths[layer.name], enabled=layer.name not in self.hidden)
+            for layer in self._view.layers
+        )
+        camera = convert_json(self.camera, ViewCamera)
+        return replace(self._view, layers=layers, blend=self.blend, camera=camera)
+
+    @traitlets.validate("strengths", "hidden", "blend", "camera")
+    def _check(self, proposal: Mapping[str, Any]) -> Any:
+        checks: dict[str, Callable[[Any], Any]] = {
+            "strengths": self._merge_strengths,
+            "hidden": self._check_names,
+            "blend": _check_blend,
+            "camera": self._merge_camera,
+        }
+        try:
+            return checks[proposal["trait"].name](proposal["value"])
+        except ValueError as error:
+            raise RefusedError(str(error)) from None
+
+    def _merge_strengths(self, given: Mapping[str, Any]) -> Strengths:
+        values = {layer.name: layer.strength for layer in self._view.layers} | self.strengths
+        most = largest_strength(self._view)
+        for name in self._check_names(list(given)):
+            strength = given[name]
+            if not isinstance(strength, int | float) or not 0.0 <= strength <= most:
+                raise ProgdfError(f"the strength of {name} is {strength}; use a number, 0 to {most:g}")
+            values[name] = float(strength)
+        return Strengths(values, self)
+
+    def _merge_camera(self, given: Mapping[str, Any]) -> dict[str, Any]:
+        known = camera_json(self._view.camera) | self.camera
+        return camera_json(convert_json(known | dict(given), ViewCamera, closed=True))
+
+    def _check_names(self, names: list[str]) -> list[str]:
+        known = [layer.name for layer in self._view.layers]
+        for name in names:
+            if name not in known:
+                raise ProgdfError(f"there is no layer {name}; there are {', '.join(known) or 'none'}")
+        return names
+
+    def _repr_mimebundle_(self, **kwargs: Any) -> Any:
+        """With a still, for what shows a notebook and runs no widgets."""
+        data, about = super()._repr_mimebundle_(**kwargs)  # type: ignore[misc]
+        file = io.BytesIO()
+        self.snapshot(*_STILL).save(file, "JPEG", quality=85)
+        return {**data, "image/jpeg": base64.b64encode(file.getvalue()).decode()}, about
+
+
+def _check_blend(blend: str) -> str:
+    check_layers((), blend)
+    return blend
+
+
+def _stack(scene: Gaussians, layers: Sequence[Layer | Gdf], blend: str) -> list[Layer]:
+    """The layers of a scene, once they are known to be that."""
+    if not isinstance(scene, Gaussians):
+        raise TypeError(f"the scene is {type(scene).__name__}, expected Gaussians, see progdf.load_scene")
+    stack = []
+    for layer in layers:
+        if not isinstance(layer, Layer | Gdf):
+            raise TypeError(f"a layer is {type(layer).__name__}, expected Layer or Gdf, see progdf.load_gdf")
+        stack.append(Layer(layer) if isinstance(layer, Gdf) else layer)
+        verify(stack[-1].gdf, scene)
+    check_layers(stack, blend)
+    return stack
+
+
+def _state(index: int, name: str, layer: Layer) -> LayerState:
+    paint = "" if layer.weights is None else encode(layer.weights.numpy())
+    return LayerState(index, name, layer.strength, layer.enabled, layer.gains, paint=paint)
