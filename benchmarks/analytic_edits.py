@@ -50,11 +50,11 @@ class AnalyticEdit:
 
 
 def recolor_edit(target: Tensor) -> AnalyticEdit:
-    """`progdf.color.edits.recolor` of every Gaussian, seen from the members' own color; `target` [3] sRGB."""
+    """`edits.recolor_course` of every Gaussian, seen from the members' own color; `target` [3] sRGB."""
 
     def change(part: Gaussians, strength: float) -> Gaussians:
-        rgb = sh0_to_rgb(part.sh0)
-        return _with_color(part, color.recolor(rgb, target, strength, _own_color(part)), strength)
+        course = color.recolor_course(sh0_to_rgb(part.sh0), target, _own_color(part))
+        return _with_color(part, course(strength), strength)
 
     return AnalyticEdit("recolor", change)
 
@@ -63,19 +63,18 @@ def stripes_edit(target: Tensor, axis: Tensor, period: float) -> AnalyticEdit:
     """Stripes across `axis` [3], `period` world units apart, in the color `target` [3] sRGB."""
 
     def change(part: Gaussians, strength: float) -> Gaussians:
-        rgb = sh0_to_rgb(part.sh0)
-        pattern = color.stripe_pattern(part.means, axis, period)
-        edited = color.stripes(rgb, pattern, target, strength, _own_color(part))
-        return _with_color(part, edited, strength * pattern[:, None, None])
+        course = color.recolor_course(sh0_to_rgb(part.sh0), target, _own_color(part))
+        shares = strength * color.stripe_pattern(part.means, axis, period)
+        return _with_color(part, course(shares), shares[:, None, None])
 
     return AnalyticEdit("stripes", change)
 
 
 def darken_edit(stops: float = 3.0) -> AnalyticEdit:
-    """Night falls: `edits.night`, view-dependent light fading with the rest."""
+    """Night falls: `edits.night_course`, view-dependent light fading with the rest."""
 
     def change(part: Gaussians, strength: float) -> Gaussians:
-        dark = color.night(sh0_to_rgb(part.sh0), strength, stops)
+        dark = color.night_course(sh0_to_rgb(part.sh0), stops)(strength)
         # sRGB values fall about as the light to the power 1/2.2
         return replace(part, sh0=rgb_to_sh0(dark), shN=part.shN * 2 ** (-stops * strength / 2.2))
 

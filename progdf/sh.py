@@ -81,21 +81,13 @@ def shade(degree: int, directions: Tensor, sh: Tensor) -> Tensor:
     return ((weights[..., None] * sh[:, : weights.shape[-1]]).sum(dim=1) + 0.5).clamp_min(0.0)
 
 
-def rotate_bands(shN: Tensor, quats: Tensor) -> Tensor:
-    """Higher bands of Gaussians that turn: what was seen along d is then seen along the turned d.
+def rotation_change(shN: Tensor, quats: Tensor, part: Tensor | None = None) -> Tensor:
+    """What a turn adds to higher bands: what was seen along d is then seen along the turned d.
+
+    Exactly 0 where nothing turns; no gradient of the turn.
 
     Args:
         shN: bands 1 to d; band 4, which is not shown, stays. [N,K,3]
-        quats: unit quaternions. [N,4]
-    """
-    return shN + rotation_change(shN, quats)
-
-
-def rotation_change(shN: Tensor, quats: Tensor, part: Tensor | None = None) -> Tensor:
-    """What a turn adds to higher bands, exactly 0 where nothing turns; no gradient of the turn.
-
-    Args:
-        shN: see `rotate_bands`. [N,K,3]
         quats: unit quaternions, [N,4], or [P,4] of parts
         part: which part each Gaussian belongs to. [N] int64
 

@@ -49,7 +49,7 @@ def parse_color(text: str) -> Tensor:
 def typical_color(rgb: Tensor, weights: Tensor | None = None) -> Tensor:
     """The weighted mean color, averaged in OKLab. [...,3], [...] or None -> [3]
 
-    Take it once over the whole region (all views, all members) and pass it to every `recolor` of that region:
+    Take it once over the whole region (all views, all members) and pass it to every `recolor_course` there:
     the edit is then the same function of color in each view.
     """
     lab = srgb_to_oklab(rgb.clamp(0, 1)).reshape(-1, 3)
@@ -59,34 +59,22 @@ def typical_color(rgb: Tensor, weights: Tensor | None = None) -> Tensor:
     return oklab_to_srgb(mean).clamp(0, 1)
 
 
-def recolor(
-    rgb: Tensor,
-    target: Tensor,
-    strength: Strength = 1.0,
-    reference: Tensor | None = None,
-    path: ColorPath = "bowed",
-) -> Tensor:
+def recolor_course(rgb: Tensor, target: Tensor, reference: Tensor, path: ColorPath = "bowed") -> Course:
     """Give a thing another color and keep its shading: all of `recolor_fully`, or a part of the way there.
 
     Args:
         rgb: sRGB colors, 0..1; what lies outside (SH colors may) fades with the strength. [...,3]
         target: the color that `reference` has at strength 1, sRGB 0..1. [3]
-        strength: 0..1
-        reference: the region's own color, `typical_color` of `rgb` by default. [3]
+        reference: the region's own color, see `typical_color`. [3]
         path: see `bend_of`
     """
-    return recolor_course(rgb, target, typical_color(rgb) if reference is None else reference, path)(strength)
-
-
-def recolor_course(rgb: Tensor, target: Tensor, reference: Tensor, path: ColorPath = "bowed") -> Course:
-    """`recolor` for many strengths."""
     typical = _as_tensor(reference, rgb)
     bend = bend_of(typical, _as_tensor(target, rgb), path)
     return color_course(rgb, recolor_fully(rgb, target, typical), bend)
 
 
 def recolor_fully(rgb: Tensor, target: Tensor, reference: Tensor) -> Tensor:
-    """The finished `recolor`. [...,3] -> [...,3] 0..1
+    """The end of a `recolor_course`. [...,3] -> [...,3] 0..1
 
     Lightness is scaled so that `reference` becomes `target`; chroma follows the lightness; the hue is the
     target's, or stays where the target is too gray to have one. A dark source is lifted.
@@ -101,32 +89,19 @@ def recolor_fully(rgb: Tensor, target: Tensor, reference: Tensor) -> Tensor:
     return fit_gamut(torch.stack([lightness, chroma * torch.cos(hue), chroma * torch.sin(hue)], dim=-1))
 
 
-def tint(
-    rgb: Tensor,
-    target: Tensor,
-    strength: Strength = 1.0,
-    reference: Tensor | None = None,
-    path: ColorPath = "bowed",
-    share: float = 0.7,
-) -> Tensor:
-    """Wash with a color: lightness stays, hue and chroma go `share` of the way to the target's. [...,3]
-
-    See `recolor` for the arguments; here `reference` decides nothing but the bend.
-    """
-    reference = typical_color(rgb) if reference is None else reference
-    return tint_course(rgb, target, reference, path, share)(strength)
-
-
 def tint_course(
     rgb: Tensor, target: Tensor, reference: Tensor, path: ColorPath = "bowed", share: float = 0.7
 ) -> Course:
-    """`tint` for many strengths."""
+    """Wash with a color: lightness stays, hue and chroma go `share` of the way to the target's.
+
+    See `recolor_course` for the arguments; here `reference` decides nothing but the bend.
+    """
     bend = bend_of(_as_tensor(reference, rgb), _as_tensor(target, rgb), path)
     return color_course(rgb, tint_fully(rgb, target, share), bend)
 
 
 def tint_fully(rgb: Tensor, target: Tensor, share: float) -> Tensor:
-    """The finished `tint`. [...,3] -> [...,3] 0..1"""
+    """The end of a `tint_course`. [...,3] -> [...,3] 0..1"""
     lab, goal = srgb_to_oklab(rgb.clamp(0, 1)), srgb_to_oklab(_as_tensor(target, rgb))
     lightness = lab[..., :1]
     fade = torch.minimum(
@@ -144,13 +119,8 @@ def darken(rgb: Tensor, strength: Strength = 1.0, stops: float = 3.0) -> Tensor:
     return torch.where((s == 0)[..., None], rgb, edited + (1 - s)[..., None] * (rgb - inside))
 
 
-def night(rgb: Tensor, strength: Strength = 1.0, stops: float = 3.0) -> Tensor:
-    """Moonlight: `darken`, with colors fading to a cool blue as they do in scarce light. [...,3]"""
-    return night_course(rgb, stops)(strength)
-
-
 def night_course(rgb: Tensor, stops: float = 3.0) -> Course:
-    """`night` for many strengths."""
+    """Moonlight: `darken`, with colors fading to a cool blue as they do in scarce light."""
     bluer = color_course(rgb, tint_fully(rgb, rgb.new_tensor([0.35, 0.50, 0.85]), share=0.75), STRAIGHT)
     return lambda strength: darken(bluer(strength), strength, stops)
 
@@ -195,14 +165,7 @@ def grade_fully(rgb: Tensor, values: Mapping[str, float]) -> Tensor:
     return fit_gamut(torch.cat([steeper[..., None], chroma], dim=-1))
 
 
-def stripe_pattern(
-    points: Tensor,
-    axis: Tensor,
-    period: float,
-    phase: float = 0.0,
-    width: float = 0.5,
-    softness: float = 0.08,
-) -> Tensor:
+def stripe_pattern(points: Tensor, axis: Tensor, period: float, phase: float = 0.0) -> Tensor:
     """How much each 3D point lies in a stripe; a function of place, so every view sees the same stripes.
 
     Args:
@@ -210,33 +173,22 @@ def stripe_pattern(
         axis: direction across the stripes, any length but 0. [3]
         period: distance from stripe to stripe, world units, > 0
         phase: shift in periods
-        width: share of the period that is stripe, 0..1
-        softness: width of the edge in periods
 
     Returns:
         0 (between) to 1 (in a stripe). [...]
     """
     along = points @ (axis / axis.norm()).to(points) / period + phase
-    return stripe_profile(along, width, softness)
+    return stripe_profile(along)
 
 
 def stripe_profile(turns: Tensor, width: float = 0.5, softness: float = 0.08) -> Tensor:
-    """Stripes along any coordinate counted in periods, centered on whole numbers. [...] -> [...] in 0..1"""
+    """Stripes along any coordinate counted in periods, centered on whole numbers. [...] -> [...] in 0..1
+
+    `width`: share of the period that is stripe, 0..1; `softness`: width of the edge in periods
+    """
     distance = (turns - turns.round()).abs()
     edge = ((0.5 * width - distance) / max(softness, 1e-6) + 0.5).clamp(0, 1)
     return edge * edge * (3 - 2 * edge)
-
-
-def stripes(
-    rgb: Tensor,
-    pattern: Tensor,
-    target: Tensor,
-    strength: Strength = 1.0,
-    reference: Tensor | None = None,
-    path: ColorPath = "bowed",
-) -> Tensor:
-    """`recolor` where `pattern` ([...], 0..1) is 1, nothing where it is 0. [...,3] -> [...,3]"""
-    return recolor(rgb, target, torch.as_tensor(strength).to(pattern) * pattern, reference, path)
 
 
 def _as_tensor(color: Tensor, rgb: Tensor) -> Tensor:

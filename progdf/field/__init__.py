@@ -7,7 +7,7 @@ from .baked import AttributeBases, BakedField, NeuralForm
 from .choose import Candidate, FieldChoice, FieldEvaluator, choose_field
 from .keyframes import fit_keyframes, fit_lossless
 from .neural import NeuralField
-from .neural_fit import NeuralSettings, fit_neural
+from .neural_fit import NeuralSettings
 from .separable import fit_separable
 
 __all__ = [
@@ -23,6 +23,5 @@ __all__ = [
     "choose_field",
     "fit_keyframes",
     "fit_lossless",
-    "fit_neural",
     "fit_separable",
 ]

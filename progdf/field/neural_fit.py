@@ -29,7 +29,7 @@ from .neural import (
     encode,
     offsets_of_answer,
 )
-from .separable import channel_weights, check_trajectory, moving_attributes, quantize_bases
+from .separable import channel_weights, quantize_bases
 
 
 class PictureLoss(Protocol):
@@ -295,35 +295,6 @@ def _initial_weights(shape: NeuralShape, draws: torch.Generator) -> dict[str, Te
         else:
             weights[name] = torch.zeros(size)
     return weights
-
-
-def fit_neural(
-    strengths: Tensor,
-    offsets: Tensor,
-    rows: Tensor,
-    settings: NeuralSettings | None = None,
-    visibility: Tensor | None = None,
-) -> NeuralField:
-    """Train a neural field on a finished trajectory.
-
-    Args:
-        strengths: of the snapshots, ascending from 0 to 1. [T]
-        offsets: raw offsets of the members; the first row is 0, the last the recorded end. [T,M,C] float32
-        rows: raw values of the members before the edit, packed. [M,≥14]
-        settings: see NeuralSettings
-        visibility: how much each member shows. [M]; None is evenly
-
-    Raises:
-        ValueError: no trajectory, or one that moves nothing.
-    """
-    check_trajectory(strengths, offsets)
-    attributes = tuple(moving_attributes(offsets))
-    if not attributes:
-        raise ValueError("nothing moves, so there is nothing for a network to learn")
-    fit = NeuralFit(rows, offsets.shape[2], attributes, settings or NeuralSettings(), visibility)
-    fit.scale_to(offsets)
-    train_network(fit, strengths, offsets, fit.settings.steps)
-    return fit.field(tuple(strengths.tolist()))
 
 
 def train_network(

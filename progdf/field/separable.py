@@ -238,13 +238,12 @@ _OPACITY_KNOTS = (0.0, 0.002, 0.005, 0.01, 0.02, 0.04, 0.07, 0.11, 0.17, 0.25, 0
 """Where a logit bends most when an opacity rises from nothing; mirrored for one that falls to it."""
 
 
-def course_field(knots: Tensor, offsets: Tensor, kind: str = "separable") -> BakedField:
+def course_field(knots: Tensor, offsets: Tensor) -> BakedField:
     """The field of a course: at its last knot exactly what int16 makes of the end.
 
     Args:
         knots: strengths, ascending from 0 to 1. [S]
         offsets: packed, 0 at the first knot. [S,M,C]
-        kind: see `BakedField`
 
     Raises:
         ValueError: no course.
@@ -256,7 +255,7 @@ def course_field(knots: Tensor, offsets: Tensor, kind: str = "separable") -> Bak
         stored = quantize_bases(course[-1:], torch.int16)
         course[-1] = decode_bases(*stored)[0]
         attributes[name] = fit_course(course, stored)
-    return BakedField(kind, knots.float(), attributes, offsets.shape[2], ())
+    return BakedField("separable", knots.float(), attributes, offsets.shape[2], ())
 
 
 def fit_course(offsets: Tensor, stored: tuple[Tensor, Tensor] | None = None) -> AttributeBases:

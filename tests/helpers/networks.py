@@ -8,7 +8,9 @@ from functools import cache
 import torch
 from torch import Tensor
 
-from progdf.field import BakedField, NeuralField, NeuralSettings, bake_network, fit_neural
+from progdf.field import BakedField, NeuralField, NeuralSettings, bake_network
+from progdf.field.neural_fit import NeuralFit, train_network
+from progdf.field.separable import check_trajectory, moving_attributes
 from progdf.gaussians import Gaussians, pack
 from tests.helpers.edits import curved_trajectory, some_rows
 from tests.helpers.scenes import random_gaussians
@@ -35,6 +37,21 @@ def members() -> Tensor:
 
 def rows() -> Tensor:
     return pack(scene()[members()])
+
+
+def fit_neural(
+    strengths: Tensor,
+    offsets: Tensor,
+    rows: Tensor,
+    settings: NeuralSettings,
+    visibility: Tensor | None = None,
+) -> NeuralField:
+    """A neural field of a finished trajectory. [T], [T,M,C], raw member rows [M,≥14], visibility [M]"""
+    check_trajectory(strengths, offsets)
+    fit = NeuralFit(rows, offsets.shape[2], tuple(moving_attributes(offsets)), settings, visibility)
+    fit.scale_to(offsets)
+    train_network(fit, strengths, offsets, settings.steps)
+    return fit.field(tuple(strengths.tolist()))
 
 
 @cache

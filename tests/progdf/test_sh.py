@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from progdf.quaternions import multiply_quats, normalize_quats, rotate_vectors
-from progdf.sh import rotate_about_x, rotate_bands, rotation_change, shade
+from progdf.sh import rotate_about_x, rotation_change, shade
 from tests.helpers.draws import Draws
 
 COUNT = 200
@@ -18,6 +18,10 @@ def turns(seed: int = 0) -> torch.Tensor:
 
 def bands(degree: int) -> torch.Tensor:
     return 0.3 * Draws(1).normal(COUNT, (degree + 1) ** 2 - 1, 3)
+
+
+def rotate_bands(shN: torch.Tensor, quats: torch.Tensor) -> torch.Tensor:
+    return shN + rotation_change(shN, quats)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])

@@ -212,12 +212,10 @@ FRAMES = 5
 """From one held-out view to the next on the path."""
 
 
-def camera_path(cameras: Sequence[Camera], frames: int = FRAMES) -> list[Camera]:
+def camera_path(cameras: Sequence[Camera]) -> list[Camera]:
     """From each camera to the nearest that has not been passed, positions straight, rotations on the sphere.
 
-    Args:
-        cameras: at least one; the path begins at the first
-        frames: from one to the next
+    `cameras`: at least one; the path begins at the first
     """
     left, route = list(cameras[1:]), [cameras[0]]
     while left:
@@ -227,7 +225,7 @@ def camera_path(cameras: Sequence[Camera], frames: int = FRAMES) -> list[Camera]
     path = []
     for a, b in pairwise(route):
         turns = Slerp([0.0, 1.0], Rotation.from_matrix([c.viewmat[:3, :3].double().numpy() for c in (a, b)]))
-        path += [_between(a, b, turns, i / frames) for i in range(frames)]
+        path += [_between(a, b, turns, i / FRAMES) for i in range(FRAMES)]
     return [*path, route[-1]]
 
 

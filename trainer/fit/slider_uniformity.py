@@ -42,7 +42,7 @@ STEPS = 20
 _ASKED_VIEWS, _FIELD_VIEWS = 3, 6
 _COSTLY_STEPS = 8  # of the anchor view, where each picture costs a model's work
 _FINE = 2  # a step may begin at so many places per step
-_PASSES = 3
+_PASSES = 3  # of spreading the strengths; the best of all wins
 _LOOKS = 2  # how often all places are looked at
 _JUMP = 0.7  # of the change in one step of an editor's strength: no strength between can be relied on
 
@@ -158,7 +158,7 @@ def _ignore_progress(done: int, word: str) -> None:
     pass
 
 
-def equalizing_remap(seen: Callable[[float], Tensor], passes: int = _PASSES) -> SliderRemap:
+def equalizing_remap(seen: Callable[[float], Tensor]) -> SliderRemap:
     """The remap under which equal steps change what is seen equally, wherever they begin.
 
     Steps that begin between those of a ruler count as well: without them only the ruler's own get even (of a
@@ -167,14 +167,13 @@ def equalizing_remap(seen: Callable[[float], Tensor], passes: int = _PASSES) -> 
     Args:
         seen: strength -> what is seen, any fixed shape; asked at even strengths and those found, and taken
             to go straight between two of them
-        passes: how often to spread the strengths, the best of all wins
     """
     even = torch.linspace(0, 1, STEPS * _FINE + 1, dtype=torch.float64)
     places = even
     for _ in range(_LOOKS):
         looked, pictures = places, [seen(float(s)) for s in places]
         best, following = -1.0, places
-        for _ in range(passes + 1):
+        for _ in range(_PASSES + 1):
             current = following
             blended = [interpolate_at(looked, pictures, float(s)) for s in current]
             uniformity, following = _spread(current, blended, _FINE)

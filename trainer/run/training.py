@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from typing import Any
@@ -63,21 +63,8 @@ class _RecordingValues(msgspec.Struct):
     means: dict[str, float]
 
 
-@dataclass(frozen=True)
-class SavedSnapshot:
-    """A snapshot as it is kept."""
-
-    # step, stage, ends_stage, means: see `ParameterSnapshot`
-    step: int
-    stage: int
-    ends_stage: bool
-    offsets: Tensor  # of the members, in half precision. [M,C] float16
-    means: Mapping[str, float]
-    table: Tensor | None = None
-
-
 class Recordings:
-    """All recordings so far, a `state.Resumable`: each is written once, to a file of its own.
+    """All recordings so far, in half precision, a `state.Resumable`: each is written once, to its own file.
 
     Args:
         folder: where
@@ -85,16 +72,13 @@ class Recordings:
     """
 
     def __init__(self, folder: StateFolder, shape: torch.Size) -> None:
-        self.made: list[SavedSnapshot] = []
+        self.made: list[ParameterSnapshot] = []
         self._folder, self._shape, self._written = folder, shape, 0
 
     def add(self, snapshot: ParameterSnapshot) -> None:
         """Keep one."""
-        offsets, table = snapshot.offsets.half().cpu(), snapshot.table
-        table = table.cpu() if table is not None else None
-        self.made.append(
-            SavedSnapshot(snapshot.step, snapshot.stage, snapshot.ends_stage, offsets, snapshot.means, table)
-        )
+        table = None if snapshot.table is None else snapshot.table.cpu()
+        self.made.append(replace(snapshot, offsets=snapshot.offsets.half().cpu(), table=table))
 
     def capture_state(self) -> Saved:
         """How many there are; those that came since the last time are saved first."""
@@ -116,12 +100,12 @@ class Recordings:
             raise ProgdfError(f"recordings are missing in {self._folder.path}; delete it and train again")
         self.made = [self._read(kept) for kept in recordings if kept]
 
-    def _read(self, saved: Saved) -> SavedSnapshot:
+    def _read(self, saved: Saved) -> ParameterSnapshot:
         values, offsets = convert_json(saved.values, _RecordingValues), saved.tensors["offsets"]
         if offsets.shape != self._shape or offsets.dtype != torch.float16:
             raise ValueError("a recording is of other members")
         table = saved.tensors.get("table")
-        return SavedSnapshot(values.step, values.stage, values.ends_stage, offsets, values.means, table)
+        return ParameterSnapshot(values.step, values.stage, values.ends_stage, offsets, values.means, table)
 
 
 PART = "training"

@@ -175,9 +175,6 @@ class CropScene:
 GEOMETRY = ("means", "quats", "log_scales", "logit_opacities")
 """Attributes that decide which pixels a Gaussian contributes to."""
 
-COLORS = ("sh0", "shN")
-"""The others."""
-
 
 def member_colors(members: Gaussians, eye: Tensor) -> Tensor:
     """SH colors seen from `eye`; a channel clamped at 0 keeps the gradient that would raise it. [M,3]
@@ -270,10 +267,10 @@ def only_recolors(offsets: Tensor) -> bool:
     return not any(bool(offsets[..., slices[name]].any()) for name in GEOMETRY)
 
 
-def moving_attributes(offsets: Tensor, among: Collection[str] = ATTRIBUTES) -> list[str]:
-    """The attributes (`among` these) that these offsets [M,14] or [M,14+3K] move at all."""
+def moving_attributes(offsets: Tensor) -> list[str]:
+    """The attributes that these offsets [M,14] or [M,14+3K] move at all."""
     slices = attribute_slices(offsets.shape[1])
-    return [name for name, columns in slices.items() if name in among and bool(offsets[:, columns].any())]
+    return [name for name, columns in slices.items() if bool(offsets[:, columns].any())]
 
 
 class _ClampTowards(torch.autograd.Function):

@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from progdf.color import edits as color
-from progdf.color.edits import parse_color, recolor
+from progdf.color.edits import parse_color
 from progdf.color.oklab import ColorPath, bend_of, interpolate_colors, oklab_to_srgb, srgb_to_oklab
+from tests.helpers.color_edits import recolor
 
 PAIRS = {
     "skin to blue": ("#e0ac88", "#3060d0"),

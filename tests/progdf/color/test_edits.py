@@ -9,6 +9,7 @@ from torch import Tensor
 from progdf.color import edits as color
 from progdf.color.oklab import oklab_to_srgb, srgb_to_oklab
 from progdf.errors import ProgdfError
+from tests.helpers.color_edits import recolor, stripes, tint
 
 ORANGE = torch.tensor([1.0, 0.55, 0.1])
 BLUE = color.parse_color("#1133dd")
@@ -48,26 +49,26 @@ def test_small_steps_of_strength_are_small_steps_of_color(edit: str) -> None:
 
 def _edited(edit: str, rgb: Tensor, strength: float) -> Tensor:
     if edit == "stripes":
-        return color.stripes(rgb, torch.ones(len(rgb)), BLUE, strength)
+        return stripes(rgb, torch.ones(len(rgb)), BLUE, strength)
     if edit == "darken":
         return color.darken(rgb, strength)
     if edit == "night":
-        return color.night(rgb, strength)
+        return color.night_course(rgb)(strength)
     if edit == "grade":
         return color.grade_course(rgb, {"exposure": 1.0, "temperature": 0.5, "black": 0.1})(strength)
-    return (color.recolor if edit == "recolor" else color.tint)(rgb, BLUE, strength)
+    return (recolor if edit == "recolor" else tint)(rgb, BLUE, strength)
 
 
 def test_recoloring_takes_the_reference_to_the_target() -> None:
-    assert torch.allclose(color.recolor(ORANGE[None], BLUE)[0], BLUE, atol=2e-3)
+    assert torch.allclose(recolor(ORANGE[None], BLUE)[0], BLUE, atol=2e-3)
     black = torch.full((1, 3), 0.03)
-    assert torch.allclose(color.recolor(black, ORANGE)[0], ORANGE, atol=2e-3)
+    assert torch.allclose(recolor(black, ORANGE)[0], ORANGE, atol=2e-3)
 
 
 def test_recoloring_keeps_the_order_of_lightness() -> None:
     shades = torch.linspace(0.1, 1.0, 30)[:, None] * ORANGE
     before = _polar(shades)[0]
-    after = _polar(color.recolor(shades, BLUE, 1.0))[0]
+    after = _polar(recolor(shades, BLUE, 1.0))[0]
     assert (before.diff() > 0).all()
     assert (after.diff() > 0).all()
 
@@ -75,20 +76,20 @@ def test_recoloring_keeps_the_order_of_lightness() -> None:
 def test_gray_takes_the_hue_of_the_target() -> None:
     gray = torch.full((1, 3), 0.5)
     for s in (0.2, 0.6, 1.0):
-        hue = _polar(color.recolor(gray, BLUE, s))[2]
+        hue = _polar(recolor(gray, BLUE, s))[2]
         assert torch.allclose(hue, _polar(BLUE[None])[2], atol=3.0)
 
 
 def test_a_gray_target_keeps_the_source_hue_on_the_way() -> None:
-    half = color.recolor(ORANGE[None], torch.full((3,), 0.6), 0.5)
+    half = recolor(ORANGE[None], torch.full((3,), 0.6), 0.5)
     assert torch.allclose(_polar(half)[2], _polar(ORANGE[None])[2], atol=3.0)
-    assert float(_polar(color.recolor(ORANGE[None], torch.full((3,), 0.6)))[1]) < 0.01
+    assert float(_polar(recolor(ORANGE[None], torch.full((3,), 0.6)))[1]) < 0.01
 
 
 def test_edited_colors_can_be_shown() -> None:
     for strength in (0.3, 1.0):
         for target in (BLUE, ORANGE, torch.ones(3), torch.zeros(3)):
-            out = color.recolor(_random(), target, strength)
+            out = recolor(_random(), target, strength)
             assert out.isfinite().all()
             assert out.min() >= 0
             assert out.max() <= 1
@@ -96,7 +97,7 @@ def test_edited_colors_can_be_shown() -> None:
 
 def test_tinting_keeps_lightness() -> None:
     rgb = 0.2 + 0.6 * _random()
-    assert (_polar(color.tint(rgb, BLUE))[0] - _polar(rgb)[0]).abs().max() < 0.01
+    assert (_polar(tint(rgb, BLUE))[0] - _polar(rgb)[0]).abs().max() < 0.01
 
 
 def test_a_stop_halves_the_light() -> None:
@@ -140,8 +141,8 @@ def test_strength_may_differ_from_pixel_to_pixel() -> None:
     image = _random(64).reshape(8, 8, 3)
     strength = torch.linspace(0, 1, 64).reshape(8, 8)
     reference = color.typical_color(image)
-    whole = color.recolor(image, BLUE, strength, reference)
-    one = color.recolor(image[3, 5], BLUE, float(strength[3, 5]), reference)
+    whole = recolor(image, BLUE, strength, reference)
+    one = recolor(image[3, 5], BLUE, float(strength[3, 5]), reference)
     assert torch.allclose(whole[3, 5], one, atol=1e-5)
 
 

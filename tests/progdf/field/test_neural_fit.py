@@ -8,10 +8,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from progdf.field import NeuralSettings, bake_network, fit_neural
+from progdf.field import NeuralSettings, bake_network
 from progdf.field.neural_fit import NeuralFit, train_network
 from tests.helpers.edits import curved_trajectory
-from tests.helpers.networks import MEMBERS, SHORT, members, rows, scene, smooth_trajectory
+from tests.helpers.networks import MEMBERS, SHORT, fit_neural, members, rows, scene, smooth_trajectory
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -99,11 +99,6 @@ def test_a_loss_of_pictures_takes_the_place_of_the_one_of_offsets() -> None:
     loss = fit.step(strengths, offsets, pictures=pictures)
     found, recorded, _ = pictures.asked[0]
     assert loss == pytest.approx(float((found - recorded).detach().abs().mean()))
-
-
-def test_what_moves_nothing_cannot_be_learned() -> None:
-    with pytest.raises(ValueError, match="nothing moves"):
-        fit_neural(torch.linspace(0, 1, 3), torch.zeros(3, MEMBERS, 14), rows(), SHORT)
 
 
 @pytest.mark.parametrize("count", [0, 1])
