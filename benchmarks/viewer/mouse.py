@@ -17,7 +17,7 @@ from progdf.rasterize.cpu.pyramid import Pyramid
 from viewer.app.main_view import MainView
 from viewer.files.document import Document
 from viewer.gl.present import read_rgb
-from viewer.panel import panel
+from viewer.panel import card, panel
 from viewer.render.cpu_renderer import CpuRenderer
 from viewer.render.dynamic_resolution import REST_S
 from viewer.render.engine import ViewEngine
@@ -27,13 +27,13 @@ SIZE = (640, 480)
 """Of the picture; the panel stands beside it."""
 
 _STEP_S, _POLL_S = 1.0 / 60.0, 0.02
-_INSET, _FIRST, _NEXT = 12 + 10 + 7, 136.0, 97.0  # the panel's layout at 1×
+_INSET, _FIRST = 12 + 10 + 7, 131.0  # the panel's layout at 1×
 
 
 def slider_at(width: float, layer: int, strength: float) -> tuple[float, float]:
     """Where on a window of this width, at 1×, the handle of a folded layer stands at a strength."""
     x = width - panel.WIDTH_PX + _INSET + strength * (panel.WIDTH_PX - 2 * _INSET)
-    return x, _FIRST + _NEXT * layer
+    return x, _FIRST + card.CARD_PX * layer
 
 
 class Mouse:

@@ -35,7 +35,7 @@ from viewer.render.engine import ViewEngine
 from viewer.render.gl_renderer import headless_context
 from viewer.state.view_state import LayerState, ViewState
 
-SIZE = (160, 400)
+SIZE = (460, 400)
 
 
 @pytest.mark.gl
