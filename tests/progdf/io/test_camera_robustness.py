@@ -215,7 +215,7 @@ def test_f_shows_all_of_a_room_from_outside_and_of_nothing_the_origin() -> None:
 def test_narrow_and_wide_windows_can_be_worked_in(points: tuple[int, int]) -> None:
     with rig(points=points) as hand:
         before = hand.main_view.work.view.camera
-        hand.drag((30.0, 100.0), (60.0, 120.0))
+        hand.drag((100.0, 200.0), (130.0, 220.0))
         assert hand.main_view.work.view.camera != before
         hand.key("F")
         hand.key("T")
