@@ -7,13 +7,14 @@ import io
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, SupportsFloat
 
+import torch
 from PIL.Image import Image
 
 from progdf.compose.layers import Layer, check_layers
 from progdf.errors import ProgdfError
-from progdf.gaussians import Gaussians
+from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.gdf.file import Gdf, verify
 from progdf.io.images import to_picture
 from progdf.io.json_values import convert_json, plain
@@ -40,20 +41,29 @@ class RefusedError(ProgdfError, traitlets.TraitError):
     """A value that a trait of a widget cannot have; the earlier one stays."""
 
 
-class Strengths(dict[str, float]):
-    """The strengths of a widget's layers; setting some moves their sliders."""
+class Values(dict[str, Any]):
+    """The strengths of a widget, or its camera; setting some of them moves what is drawn."""
 
-    def __init__(self, values: Mapping[str, float], widget: Widget) -> None:
+    def __init__(self, values: Mapping[str, Any], widget: Widget, trait: str) -> None:
         super().__init__(values)
-        self._widget = widget
+        self._widget, self._trait = widget, trait
 
-    def __setitem__(self, name: str, strength: float) -> None:
-        self.update({name: strength})
+    def __setitem__(self, name: str, value: Any) -> None:
+        self.update({name: value})
 
-    def update(self, strengths: Mapping[str, float]) -> None:  # type: ignore[override]
-        """Set those of some layers."""
-        self._widget.strengths = dict(strengths)
-        super().update(self._widget.strengths)
+    def __ior__(self, values: Any) -> Values:  # type: ignore[misc, override]
+        self.update(values)
+        return self
+
+    def update(self, *values: Any, **more: Any) -> None:
+        """Set some, or raise RefusedError and leave all as they are."""
+        self._widget.set_trait(self._trait, dict(*values, **more))
+        super().update(getattr(self._widget, self._trait))
+
+    def _refuse(self, *_: Any) -> Any:
+        raise RefusedError(f"the names of {self._trait} stay as they are; set the value of one")
+
+    __delitem__ = pop = popitem = clear = setdefault = _refuse
 
 
 class Widget(anywidget.AnyWidget):
@@ -101,7 +111,7 @@ class Widget(anywidget.AnyWidget):
             height: px
         """
         stack = _stack(scene, layers, blend)
-        original, edits = scene.to("cpu"), tuple[Gdf, ...]()
+        original, edits = _drawable(scene), tuple[Gdf, ...]()
         for layer in stack:
             name = Document("", original, edits).free_name(layer.gdf.name)
             edits = (*edits, replace(layer.gdf, name=name))
@@ -177,19 +187,19 @@ class Widget(anywidget.AnyWidget):
         except ValueError as error:
             raise RefusedError(str(error)) from None
 
-    def _merge_strengths(self, given: Mapping[str, Any]) -> Strengths:
+    def _merge_strengths(self, given: Mapping[str, Any]) -> Values:
         values = {layer.name: layer.strength for layer in self._view.layers} | self.strengths
         most = largest_strength(self._view)
         for name in self._check_names(list(given)):
-            strength = given[name]
-            if not isinstance(strength, int | float) or not 0.0 <= strength <= most:
-                raise ProgdfError(f"the strength of {name} is {strength}; use a number, 0 to {most:g}")
+            strength = given[name]  # of numpy and torch as well
+            if not isinstance(strength, SupportsFloat) or not 0.0 <= float(strength) <= most:
+                raise ProgdfError(f"the strength of {name} is {strength!r:.40}; use a number, 0 to {most:g}")
             values[name] = float(strength)
-        return Strengths(values, self)
+        return Values(values, self, "strengths")
 
-    def _merge_camera(self, given: Mapping[str, Any]) -> dict[str, Any]:
+    def _merge_camera(self, given: Mapping[str, Any]) -> Values:
         known = camera_json(self._view.camera) | self.camera
-        return camera_json(convert_json(known | dict(given), ViewCamera, closed=True))
+        return Values(camera_json(convert_json(known | dict(given), ViewCamera, closed=True)), self, "camera")
 
     def _check_names(self, names: list[str]) -> list[str]:
         known = [layer.name for layer in self._view.layers]
@@ -223,6 +233,16 @@ def _stack(scene: Gaussians, layers: Sequence[Layer | Gdf], blend: str) -> list[
         verify(stack[-1].gdf, scene)
     check_layers(stack, blend)
     return stack
+
+
+def _drawable(scene: Gaussians) -> Gaussians:
+    """The scene as engines draw it: float32 on the CPU, without gradients. ProgdfError if not finite."""
+    plain_scene = scene.to("cpu", torch.float32)
+    tensors = {name: getattr(plain_scene, name).detach() for name in ATTRIBUTES}
+    for name, tensor in tensors.items():
+        if not bool(tensor.isfinite().all()):
+            raise ProgdfError(f"the scene cannot be shown: {name} holds NaN or infinity")
+    return replace(plain_scene, **tensors)
 
 
 def _state(index: int, name: str, layer: Layer) -> LayerState:

@@ -6,16 +6,18 @@ import base64
 import gzip
 import io
 import json
+import operator
 import re
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 import progdf
@@ -290,10 +292,46 @@ def test_the_page_of_a_widget_has_its_strengths_and_camera(tmp_path: Path) -> No
     assert "MB, compact" in line
 
 
+def test_each_way_to_set_a_part_moves_it() -> None:
+    widget, told = bear_widget(0.0, 0.0), list[Any]()
+    widget.observe(lambda change: told.append(dict(change.new)), ["strengths", "camera"])
+    widget.strengths["ears"] = 0.5
+    widget.strengths |= {"ears": np.float32(0.25)}
+    widget.strengths.update(scarf=torch.tensor(0.75))
+    widget.camera["azimuth"] = 70.0
+    assert [each.get("ears", each.get("azimuth")) for each in told] == [0.5, 0.25, 0.25, 70.0]
+    assert widget.strengths == {"scarf": 0.75, "ears": 0.25}
+    assert widget.camera["azimuth"] == 70.0
+
+
+def test_a_scene_that_is_being_trained_is_shown_as_it_is() -> None:
+    scene, gdfs = bear().scene, bear().gdfs
+    trained = replace(scene.to(dtype=torch.float64), means=scene.means.clone().requires_grad_())
+    shown, expected = (np.asarray(Widget(each, gdfs).snapshot(96, 64)) for each in (trained, scene))
+    assert (shown == expected).all()
+
+
+def test_values_that_are_none_stop_no_widget(show: Any) -> None:
+    """As another program may send them that speaks to the same model."""
+    widget = bear_widget(0.5, 0.5)
+    cells = show(widget)
+    before = cells.picture()
+    for strengths in ({"scarf": None, "ears": "x"}, {"hat": 1.0}, None):
+        cells.receive("strengths", strengths)
+    cells.receive("hidden", None)
+    cells.receive("hidden", ["hat"])
+    cells.receive("camera", {})
+    cells.receive("camera", None)
+    assert psnr(cells.picture(), before) > 90
+    cells.receive("strengths", {"scarf": 0.5, "ears": 1.0})
+    assert psnr(cells.picture(), before) < 40, "and it goes on"
+    assert cells.complaints == []
+
+
 def test_what_cannot_be_is_one_clear_line(tmp_path: Path) -> None:
     scene, (scarf, ears) = bear().scene, bear().gdfs
     widget = Widget(scene, [scarf, ears])
-    known = {**widget.strengths}
+    known, camera = {**widget.strengths}, {**widget.camera}
 
     def bad_trait(name: str, value: object) -> Any:
         return lambda: setattr(widget, name, value)
@@ -320,6 +358,11 @@ def test_what_cannot_be_is_one_clear_line(tmp_path: Path) -> None:
             ProgdfError,
             "ears is None",
         ),
+        (bad_trait("strengths", {"ears": "0.5"}), ProgdfError, "the strength of ears is '0.5'"),
+        (lambda: widget.strengths.pop("ears"), ProgdfError, "the names of strengths stay as they are"),
+        (lambda: operator.ior(widget.strengths, {"ears": float("nan")}), ProgdfError, "ears is nan"),
+        (lambda: operator.setitem(widget.camera, "distance", -1.0), ValueError, "distance is -1.0"),
+        (lambda: Widget(replace(scene, sh0=scene.sh0 / 0)), ProgdfError, "sh0 holds NaN or infinity"),
         (lambda: widget.snapshot(0, 10), ProgdfError, "0 × 10 cannot be drawn"),
         (lambda: widget.to_html(tmp_path / "no" / "page.html"), ProgdfError, "create it first"),
     ]
@@ -327,7 +370,7 @@ def test_what_cannot_be_is_one_clear_line(tmp_path: Path) -> None:
         with pytest.raises(kind, match=re.escape(message)) as caught:
             act()
         assert "\n" not in str(caught.value)
-    assert widget.strengths == known
+    assert (widget.strengths, widget.camera) == (known, camera)
     assert Widget(scene, [scarf, scarf]).strengths == {"scarf": 1.0, "scarf-2": 1.0}
 
 

@@ -6,8 +6,8 @@ const NAMES = ["strengths", "hidden", "blend", "camera"];
 const alike = (a, b) => JSON.stringify(a) === JSON.stringify(b);
 
 export async function render({ model, el }, shaders) {
-  const host = document.createElement("div"), shadow = host.attachShadow({ mode: "open" }), bytes = model.get("scene");
-  const size = () => host.style.setProperty("height", `${model.get("height")}px`);
+  const { buffer, byteOffset, byteLength } = model.get("scene"), host = document.createElement("div");
+  const shadow = host.attachShadow({ mode: "open" }), size = () => host.style.setProperty("height", `${model.get("height")}px`);
   shadow.innerHTML = model.get("_markup");
   el.append(host);
   size();
@@ -16,8 +16,7 @@ export async function render({ model, el }, shaders) {
     const { ctrlKey, metaKey, altKey, shiftKey, key } = event;
     if (!(ctrlKey || metaKey || altKey || key === "Escape" || (shiftKey && key === "Enter"))) event.stopPropagation();
   });
-  const numbers = new Uint8Array(bytes.buffer, bytes.byteOffset, bytes.byteLength);
-  const page = await show(shadow.querySelector(".page"), numbers, shaders);
+  const page = await show(shadow.querySelector(".page"), new Uint8Array(buffer, byteOffset, byteLength), shaders);
   if (!page) return;
   const state = () => {
     const { layers, blend } = page.view, hidden = layers.filter((l) => !l.enabled).map((l) => l.name);
@@ -25,11 +24,12 @@ export async function render({ model, el }, shaders) {
   };
   const take = (name) => {  // one at a time, as the others may be on their way out
     const given = model.get(name), { view } = page;
-    const change = (part) => page.change({ ...view, layers: view.layers.map((l) => ({ ...l, ...part(l.name) })) });
+    const change = (part) => page.change({ ...view, layers: view.layers.map((l) => ({ ...l, ...part(l) })) });
     if (alike(given, state()[name])) return;
-    if (name === "camera") page.look(given);
+    if (name === "camera") page.look({ ...page.camera, ...given });
     else if (name === "blend") page.change({ ...view, blend: given });
-    else change(name === "hidden" ? (l) => ({ enabled: !given.includes(l) }) : (l) => ({ strength: given[l] }));
+    else if (name === "hidden") change((l) => ({ enabled: !given?.includes(l.name) }));
+    else change((l) => ({ strength: Number.isFinite(given?.[l.name]) ? given[l.name] : l.strength }));
   };
   page.shown = () => {  // once a frame
     const now = state(), changed = NAMES.filter((name) => !alike(now[name], model.get(name)));
