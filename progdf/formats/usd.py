@@ -34,7 +34,7 @@ def write_usd(path: Path, scenes: Iterable[Gaussians], rate: float = 24.0) -> No
         ProgdfError: the package usd-core is not installed.
     """
     if importlib.util.find_spec("pxr") is None:
-        raise ProgdfError(f"{path}: .usdc needs the package usd-core; pip install progdf-studio[usd]")
+        raise ProgdfError(".usdc needs the package usd-core; pip install progdf-studio[usd]")
     from pxr import Gf, Usd, UsdGeom, UsdVol, Vt
 
     stage = Usd.Stage.CreateNew(str(path))

@@ -122,9 +122,9 @@ def draw_frame(name: str, frame: Area, area: Area, ui: UiContext) -> None:
     line, at = u32(PALETTE.handle), (imgui.ImVec2(left, top), imgui.ImVec2(right, bottom))
     canvas.add_rect(*at, line, thickness=ui.scale)
     size, pad = SMALL_PX * ui.scale, 5.0 * ui.scale
-    ends = left + _text_width(name, size, ui) + 2 * pad, top + size + pad
-    canvas.add_rect_filled(at[0], imgui.ImVec2(*ends), u32(PALETTE.scrim))
-    _text(left + pad, top + pad / 2, name, size, PALETTE.text, ui)
+    x, y = right - _text_width(name, size, ui) - 2 * pad, bottom - size - pad  # the tools lie at the left
+    canvas.add_rect_filled(imgui.ImVec2(x, y), at[1], u32(PALETTE.scrim))
+    _text(x + pad, y + pad / 2, name, size, PALETTE.text, ui)
 
 
 def message(line: Message, area: Area, ui: UiContext) -> tuple[str, float]:

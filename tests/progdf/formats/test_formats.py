@@ -277,6 +277,21 @@ def test_a_reader_that_crashes_hangs_or_is_missing_is_one_line(
     assert "pip install progdf-studio[formats]" in refusal(load_scene, path)
 
 
+@pytest.mark.parametrize(
+    ("name", "extra"), [("a.spz", "formats"), ("a.sog", "formats"), ("a.splat", "formats"), ("a.usdc", "usd")]
+)
+def test_a_format_without_its_package_is_one_line_that_names_the_extra_and_no_file_of_ours(
+    tmp_path: Path, name: str, extra: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(formats.importlib.util, "find_spec", lambda module: None)
+    path, scene = tmp_path / name, random_gaussians(3)
+    for write in (lambda: save_scene(path, scene), lambda: save_frames(path, [scene, scene])):
+        with pytest.raises(ProgdfError, match=rf"^[^\n]*\[{extra}\]$") as caught:
+            write()
+        assert ".progdf-" not in str(caught.value)
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_reader_gets_no_more_memory_than_a_file_can_need(tmp_path: Path) -> None:
     """A gigabyte asked for beyond the limit is a line, and no gigabyte."""
     script, here = tmp_path / "greedy.py", "    path = Path(source)\n"
