@@ -144,10 +144,18 @@ def random_layer(gdf: Gdf, draws: Draws) -> Layer:
 
 
 RUN = """([layers, blend]) => {
-  const { composer } = progdf;
+  const { composer } = progdf, top = layers.length - 1;  // its slider comes from elsewhere
+  composer.update(layers.with(top, { ...layers[top], strength: 0.3 }), blend);
   composer.update(layers, blend);
   return Object.fromEntries([...composer.moving].map((name) => [name, [...composer.after[name]]]));
 }"""
+
+
+def page_order(opened: Opened, scene: Gaussians) -> np.ndarray:
+    """Where the rows of an exact page lie in the scene. [N]"""
+    means = np.asarray(opened.tab.evaluate("[...progdf.means]"), np.float32).reshape(-1, 3)
+    rows = {row.tobytes(): i for i, row in enumerate(scene.means.numpy())}
+    return np.array([rows[row.tobytes()] for row in means])
 
 
 @pytest.mark.parametrize("degree", [0, 1])
@@ -166,9 +174,7 @@ def test_every_attribute_is_that_of_the_plain_form_under_every_rule(
     write_page(tmp_path / "page.html", document, view, (), PageOptions(quality="exact"))
     opened = ready(open_page(tmp_path / "page.html"))
     assert opened.complaints == []
-    means = np.asarray(opened.tab.evaluate("[...progdf.means]"), np.float32).reshape(-1, 3)
-    rows = {row.tobytes(): i for i, row in enumerate(document.scene.means.numpy())}
-    order = np.array([rows[row.tobytes()] for row in means])  # of the page's rows in the scene
+    order = page_order(opened, document.scene)
     place = np.empty(len(order), int)
     place[order] = np.arange(len(order))
     count = opened.tab.evaluate("progdf.composer.count")
@@ -180,6 +186,7 @@ def test_every_attribute_is_that_of_the_plain_form_under_every_rule(
         ([random_layer(document.gdfs[i], draws) for i in draws.order(4).tolist()], blend)
         for blend in BLENDS * 4
     ]
+    stacks.append(([Layer(document.gdfs[1], 0.1), Layer(document.gdfs[2], 0.8)], "adjust"))  # few are black
     for number, (layers, blend) in enumerate(stacks):
         sent = []
         for layer in layers:
@@ -303,20 +310,32 @@ def test_a_slider_is_dragged_and_moved_by_keys_and_shows_its_recordings(
 
 def test_the_rule_of_the_session_shows_and_another_one_is_taken(open_page: Any, tmp_path: Path) -> None:
     scene = random_gaussians(300, seed=5)
+    scene = replace(scene, logit_opacities=scene.logit_opacities.clamp(min=-4.0))  # all are on the page
     gdfs = [
         edit_of(scene, some_rows(scene, 150, i), curved_field(150, i, 14), name)
         for i, name in enumerate("ab")
     ]
     document, view = document_of(scene, gdfs)
-    write_page(tmp_path / "page.html", document, replace(view, blend="over"), (), PageOptions())
+    view = replace(view, blend="over")
+    write_page(tmp_path / "page.html", document, view, (), PageOptions(quality="exact"))
     opened = ready(open_page(tmp_path / "page.html"))
-    opened.slide([1.0, 1.0])
-    before, choice = opened.picture(), opened.tab.locator("select")
-    assert choice.locator("option:checked").inner_text() == "Over"
-    for text, rule in (("Average", "normalized"), ("Add", "sum"), ("Over", "over")):
-        choice.select_option(label=text)
+    order, choice = page_order(opened, scene), opened.tab.get_by_label("Blend rule")
+    opened.slide([0.8, 0.8])
+    opened.picture()
+    choice.focus()
+    for key, text, rule in (
+        ("", "Over", "over"),
+        ("ArrowUp", "Add", "sum"),
+        ("ArrowUp", "Average", "normalized"),
+        ("End", "Adjust", "adjust"),
+    ):
+        if key:
+            opened.tab.keyboard.press(key)
         opened.wait(f"progdf.composer.blend === '{rule}'")
-        assert (opened.picture() != before).any() == (rule != "over")
+        assert choice.locator("option:checked").inner_text() == text
+        colors = np.array(opened.tab.evaluate("[...progdf.composer.after.sh0]"), np.float32).reshape(-1, 3)
+        plain = compose_layers(scene, [Layer(gdf, 0.8) for gdf in gdfs], rule).sh0[order[: len(colors)]]
+        assert np.abs(colors - plain.numpy()).max() < 1e-5, text
     assert opened.complaints == []
 
 

@@ -64,23 +64,23 @@ function lattice(colors, out, table) {
 export class GradedColors {
   constructor(grade, [values, inverse], sh, members) {
     const bands = sh.length / 3 / members.length, directions = bands > 1 ? values.length / bands : 1;
-    Object.assign(this, { grade, sh, members, bands, directions, values: Float64Array.from(values) });
+    Object.assign(this, { grade, sh, members, bands, directions, values: Float64Array.from(values), knots: null });
     this.inverse = Float64Array.from(inverse);
     this.color = new Float64Array(3 * directions);
     this.target = new Float64Array(3 * directions);
     this.made = new Float64Array(3 * bands);
     this.change = new Float32Array(sh.length);
-    this.knots = [];
   }
 
-  // At a strength. [m,B,3], until it is called again
+  // At a strength; the first time without knots, as it may be what lies below that moves. [m,B,3], until the next
   at(strength) {
     const { grade, change, sh, members } = this, straight = grade.degree === 0;
     const at = strength < 1 ? interpolate(strength, grade.new, grade.old) : strength;
     const [right, share] = findSegment(grade.knots, at), width = 3 * this.bands;
     const low = grade.table[right - 1], high = grade.table[right];
     const table = straight ? high : lerpAll(low, high, share);
-    if (this.bands === 1 || share > 1 && !straight) {
+    if (this.bands === 1 || !this.knots || share > 1 && !straight) {
+      this.knots ??= [];
       for (let i = 0; i < members.length; i++) this.#map(table, i, change);
     } else {
       const ends = [straight || right === 1 ? null : this.#knot(right - 1), this.#knot(right)];
