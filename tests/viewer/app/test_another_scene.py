@@ -22,7 +22,16 @@ from viewer.state.selection import NamedRegion, SelectionState, pack
 from viewer.state.view_state import Brush, SelectTool, SnapshotPair, ViewState, on_another_scene
 from viewer.state.workspace import PreviewState, mark_saved, new_workspace
 
-OF_THE_WINDOW = {"background", "overlay", "panel", "dynamic_resolution", "grid", "axes", "cards"}
+OF_THE_WINDOW = {
+    "safe_frame",
+    "background",
+    "overlay",
+    "panel",
+    "dynamic_resolution",
+    "grid",
+    "axes",
+    "cards",
+}
 
 
 def all_in_use(view: ViewState, count: int) -> ViewState:
