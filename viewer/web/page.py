@@ -42,6 +42,7 @@ from shaders import load_source
 DRAWN_SH = (0, 3, 8, 15)
 """SH coefficients above the first, by degree."""
 LEVELS = {"i1": 127, "i2": 32767}
+_SEGMENT = 1 << 12  # members that are composed at once, which bounds the memory for that
 _SMALLEST = 1e-4  # of the scene's spread: a smaller axis is less than a pixel of any picture of it
 _UNSEEN = -1e3  # a logit
 _OPAQUE = 1 - 1 / 512  # and its opposite: opacities that 8 bits end at
@@ -129,8 +130,7 @@ def pack(
     """
     if quality not in ("exact", "compact"):
         raise ProgdfError(f"unknown quality '{quality}'; use exact or compact")
-    scene = _finite(scene)
-    kept = min(DRAWN_SH[degree], scene.shN.shape[1])
+    scene, kept = _finite(scene), min(DRAWN_SH[degree], scene.shN.shape[1])
     groups = _groups(len(scene), [gdf.region.members.numpy() for gdf in gdfs])
     seen = (groups > 0) | (scene.logit_opacities.numpy() >= UNSEEN_LOGIT)
     seen = seen if stays is None else seen & stays
@@ -235,8 +235,8 @@ def _order(scene: Gaussians, groups: NDArray[np.int64]) -> NDArray[np.int64]:
 def _segments(
     groups: NDArray[np.int64], order: NDArray[np.int64], gdfs: Sequence[Gdf]
 ) -> list[tuple[int, list[int]]]:
-    """How many members in turn belong to the same edits, and to which."""
-    starts = np.flatnonzero(np.diff(groups, prepend=-1))
+    """How many members in turn belong to the same edits, at most `_SEGMENT`, and to which."""
+    starts = np.flatnonzero((np.diff(groups, prepend=-1) != 0) | (np.arange(len(groups)) % _SEGMENT == 0))
     inside = [np.isin(order[starts], gdf.region.members.numpy()) for gdf in gdfs]
     edits = [[i for i, there in enumerate(inside) if there[k]] for k in range(len(starts))]
     return list(zip(np.diff(starts, append=len(groups)).tolist(), edits, strict=True))

@@ -398,6 +398,20 @@ def test_without_webgl_there_is_a_still_and_a_sentence(open_page: Any, bear_page
     assert opened.complaints == []
 
 
+def test_a_page_keeps_the_numbers_of_members_only(open_page: Any, tmp_path: Path) -> None:
+    scene = random_gaussians(10_000, seed=6, sh_degree=3)
+    members = torch.arange(2500)
+    document, view = document_of(scene, [edit_of(scene, members, curved_field(2500, 1, 59), "shirt")])
+    write_page(tmp_path / "page.html", document, view, (), PageOptions(quality="exact"))
+    opened = ready(open_page(tmp_path / "page.html"))
+    opened.wait("progdf.renderer.drawn > 0")
+    session = opened.tab.context.new_cdp_session(opened.tab)
+    session.send("HeapProfiler.collectGarbage")
+    used = session.send("Runtime.getHeapUsage")["backingStorageSize"]
+    before, levels = 2 * 2500 * 59 * 4, 2500 * 59 * (4 + 2)  # with what they become; the edit's end and bases
+    assert used < before + levels + 2.5e6, "what came is 2.4 MB more"
+
+
 def test_a_large_scene_is_sorted_by_a_worker_and_without_one_where_a_policy_forbids_it(
     open_page: Any, bear_page: tuple[Path, Stack], tmp_path: Path
 ) -> None:

@@ -27,7 +27,7 @@ class Page {
     this.composer = new Composer(container);
     this.means = new Float32Array(3 * header.count);
     container.attribute("means", 0, header.count, this.means, 3);
-    this.paints = header.paints.map((record) => container.real(record));
+    this.paints = header.paints.map(container.real, container);  // a closure would keep the container alive
     this.sorter = new Sorter(this.means, header.near, (order, seen) => {
       this.renderer.setOrder(order, seen);
       this.request();
