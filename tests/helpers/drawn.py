@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import importlib.util
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import pytest
 import torch
@@ -13,6 +13,7 @@ from torch import Tensor
 from progdf.camera import Camera
 from progdf.gaussians import Gaussians
 from progdf.rasterize import ENGINES, ActivatedGaussians, Crop, RasterInfo, Rendering, activate, render
+from progdf.rasterize.engines import engine_device
 from tests.helpers.draws import Draws
 from tests.helpers.scenes import hard_cases
 
@@ -42,19 +43,22 @@ def draw(
     engine: str,
     crop: Crop | None = None,
 ) -> Drawn:
-    dtype = torch.float64 if engine == "reference" else torch.float32
+    """Drawn where the engine draws: on the card, if there is one and it is warp. The results are the CPU's."""
+    dtype, device = torch.float64 if engine == "reference" else torch.float32, engine_device(engine)
     background = torch.tensor([0.2, 0.4, 0.6])
     inputs = (*activate(gaussians).tensors, camera.viewmat, camera.K, background)
     leaves = {
-        name: tensor.to(dtype).clone().requires_grad_() for name, tensor in zip(INPUTS, inputs, strict=True)
+        name: tensor.to(device, dtype).clone().requires_grad_()
+        for name, tensor in zip(INPUTS, inputs, strict=True)
     }
     image, transmittance, info = render_leaves(leaves, camera, gaussians.antialiased, engine, crop)
-    weights = Draws(11).normal(camera.height, camera.width, 4).to(dtype)
+    weights = Draws(11).normal(camera.height, camera.width, 4).to(device, dtype)
     if crop is not None:
         weights = weights[crop[1] : crop[3], crop[0] : crop[2]]
     ((image * weights[..., :3]).sum() + (transmittance * weights[..., 3]).sum()).backward()
-    gradients = {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
-    return Drawn(image.detach(), transmittance.detach(), info, gradients)
+    gradients = {name: leaf.grad.cpu() for name, leaf in leaves.items() if leaf.grad is not None}
+    there = RasterInfo(*(getattr(info, field.name).cpu() for field in fields(info)))
+    return Drawn(image.detach().cpu(), transmittance.detach().cpu(), there, gradients)
 
 
 def render_leaves(
