@@ -22,6 +22,7 @@ from tests.helpers.trained import WHITE, Small, quick_options, small, train, wri
 from trainer.optimize.losses import Objective, perceptual_loss
 from trainer.optimize.pgs import PgsSettings, PgsState, TargetStage, learning_rates, optimize
 from trainer.options import OptimizeOptions
+from trainer.resolve import resolve, resolve_kind
 from trainer.run import training
 from trainer.views.crops import crop_scene
 
@@ -31,12 +32,11 @@ from trainer.views.crops import crop_scene
     "asked",
     [
         {"kind": "style", "steps": 12, "stages": 1},
-        pytest.param({"steps": 40, "stages": 2}, marks=pytest.mark.slow),
         pytest.param(
             {"kind": "geometry", "group_steps": 10, "steps": 16, "stages": 1}, marks=pytest.mark.slow
         ),
     ],
-    ids=["style", "color", "geometry"],
+    ids=["style", "geometry"],
 )
 def test_a_run_on_warp_ends_at_the_cpu_engine_s_digits(folder: Path, asked: dict[str, object]) -> None:
     ends = []
@@ -66,6 +66,11 @@ def test_auto_is_warp_where_there_is_a_card_and_warp_and_else_the_cpu(
         monkeypatch.setattr(engines, "find_spec", lambda name, there=installed: object() if there else None)
         assert choose_engine("auto") == chosen
         assert choose_engine("cpu") == "cpu"
+
+
+def test_colors_are_solved_for_on_the_processor_whatever_draws_the_steps(folder: Path) -> None:
+    options = resolve(quick_options(folder, "either", part="scarf", engine="warp"))
+    assert [resolve_kind(options, kind, 0).engine for kind in ("color", "style")] == ["cpu", "warp"]
 
 
 def test_without_warp_the_run_is_refused_before_it_begins(
@@ -105,10 +110,9 @@ def card(monkeypatch: pytest.MonkeyPatch) -> Iterator[Card]:
     "asked",
     [
         {"kind": "style", "steps": 8, "stages": 1},
-        {"steps": 16, "stages": 2},
         {"kind": "geometry", "group_steps": 4, "steps": 8, "stages": 1},
     ],
-    ids=["style", "color", "geometry"],
+    ids=["style", "geometry"],
 )
 def test_a_whole_run_works_where_its_steps_are_on_a_card(
     tmp_path: Path, card: Card, asked: dict[str, object]
