@@ -43,7 +43,7 @@ def draw(
     engine: str,
     crop: Crop | None = None,
 ) -> Drawn:
-    """Drawn where the engine draws: on the card, if there is one and it is warp. The results are the CPU's."""
+    """Drawn where the engine draws: on the card, if there is one and it is warp. Results are the CPU's."""
     dtype, device = torch.float64 if engine == "reference" else torch.float32, engine_device(engine)
     background = torch.tensor([0.2, 0.4, 0.6])
     inputs = (*activate(gaussians).tensors, camera.viewmat, camera.K, background)
