@@ -72,8 +72,9 @@ bench: setup
 	$(BIN)/python -m benchmarks
 
 # Everything the README and the documents show that a command made.
-pictures: setup window
+pictures: setup extras window browser
 	$(BIN)/progdf demo --out demo --no-window
 	cp demo/hero.png demo/one-picture.png assets/
 	assets/window.sh $(BIN)/progdf demo assets/window.png
+	$(BIN)/python assets/page.py demo assets/page.jpg
 	$(BIN)/python -m benchmarks --markdown docs/*.md benchmarks/results/*.md --plots assets

@@ -250,6 +250,7 @@ def test_keys_and_the_wheel_are_the_notebooks_outside_and_ours_inside(show: Any)
         "globalThis.heard = []; addEventListener('keydown', (e) => heard.push(e.key));"
         "document.body.style.height = '3000px'"
     )
+    assert "click, then scroll to zoom" in cells.tab.get_by_text("Drag to turn").inner_text()
     edited, keyboard = cells.picture(), cells.tab.keyboard
     cells.tab.mouse.move(200, 150)
     cells.tab.mouse.wheel(0, 60)

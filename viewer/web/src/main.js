@@ -47,8 +47,9 @@ class Page {
     this.update = buildPanel(this.get("controls"), this);
     this.#bind();
     const touch = matchMedia("(pointer: coarse)").matches;
+    const zoom = this.takesWheel ? "scroll to zoom" : "click, then scroll to zoom";
     this.get("notice").textContent = touch
-      ? "Drag to turn · pinch to zoom · tap twice to center" : "Drag to turn · scroll to zoom · Space compares";
+      ? "Drag to turn · pinch to zoom · tap twice to center" : `Drag to turn · ${zoom} · Space compares`;
     root.classList.add("ready");
     this.resize();
     this.change(this.view);
