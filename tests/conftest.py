@@ -19,6 +19,7 @@ from filelock import FileLock
 from hypothesis import settings
 from PIL import Image
 
+from tests.helpers.browser import browser  # noqa: F401
 from tests.helpers.goldens import SCREENSHOTS, difference
 from tests.helpers.kernels import run_all_kernels
 from tests.helpers.paths import SHARED_DATA

@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.metadata
 import os
 import re
-import shutil
 import subprocess
 import sys
 import sysconfig
@@ -13,6 +12,7 @@ import tomllib
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 from packaging.requirements import Requirement
@@ -25,7 +25,6 @@ from tests.helpers.scenes import random_gaussians
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 PACKAGES = ("progdf", "trainer", "viewer", "shaders")
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 
 
 @pytest.fixture(scope="module")
@@ -121,20 +120,14 @@ def test_extras_name_packages_and_messages_and_documents_name_extras() -> None:
 
 
 @pytest.mark.slow
-def test_a_page_that_the_wheel_exports_opens_in_a_browser(fresh: Path, tmp_path: Path) -> None:
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    if CHROMIUM is None:
-        pytest.skip("no Chromium is installed")
+def test_a_page_that_the_wheel_exports_opens_in_a_browser(fresh: Path, tmp_path: Path, browser: Any) -> None:
     given = scene_and_edit(tmp_path)
     assert "page.html" in run([str(fresh / "progdf"), "export", *given, "-o", "page.html"], tmp_path)
-    software = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-    with playwright.sync_playwright() as started:
-        browser = started.chromium.launch(executable_path=CHROMIUM, args=software)
-        tab = browser.new_page()
-        complaints: list[str] = []
-        tab.on("pageerror", lambda error: complaints.append(str(error)))
-        tab.goto((tmp_path / "page.html").as_uri())
-        tab.wait_for_selector("body.drawn", timeout=20_000)
-        assert tab.evaluate("progdf.view.layers.map((layer) => layer.name)") == ["shirt"]
-        assert complaints == []
-        browser.close()
+    tab = browser.new_page()
+    complaints: list[str] = []
+    tab.on("pageerror", lambda error: complaints.append(str(error)))
+    tab.goto((tmp_path / "page.html").as_uri())
+    tab.wait_for_selector("body.drawn", timeout=20_000)
+    assert tab.evaluate("progdf.view.layers.map((layer) => layer.name)") == ["shirt"]
+    assert complaints == []
+    tab.close()
