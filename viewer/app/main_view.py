@@ -215,18 +215,6 @@ class MainView:
         self.work = workspace.with_message(self.work, text, self._clock, error, details, button=button)
         self.wake()
 
-    def draw_splash(self, screen: moderngl.Framebuffer) -> None:
-        """A word while the first picture is made: that may take seconds, and the window is already there."""
-        self.ui.make_current()
-        imgui.backends.opengl3_new_frame()
-        imgui.new_frame()
-        if not self.at_start:
-            overlay.banner(f"Opening {self.facts.title} …", self._area(), self.ui)
-        imgui.render()
-        screen.use()
-        screen.clear(*self.work.view.background)
-        imgui.backends.opengl3_render_draw_data(imgui.get_draw_data())
-
     def frame(
         self,
         screen: moderngl.Framebuffer,

@@ -11,12 +11,15 @@ import numpy as np
 import pytest
 from imgui_bundle import imgui
 
+from progdf.__main__ import main
+from progdf.errors import ProgdfError
 from tests.helpers.null_app import null_app
-from tests.helpers.ui_rig import Rig
+from tests.helpers.ui_rig import Rig, bear
 from viewer.app import app as application
 from viewer.app.main_view import MainView
 from viewer.app.studio.pages import StartFile
 from viewer.app.studio.start import EXAMPLE_TITLES
+from viewer.files import document as documents
 from viewer.files.document import empty
 from viewer.files.user_files import describe_age, keep_thumbnail, read_recent, remember_recent
 from viewer.render.engine import ViewEngine
@@ -142,3 +145,40 @@ def test_an_old_thumbnail_tells_when_the_file_was_open(tmp_path: Path) -> None:
     with null_app(empty(), ViewState(), tmp_path) as app:
         turn(app)
         assert app.main_view.start_files[0][0].line.startswith("3 days ago")
+
+
+def test_a_splash_is_shown_while_a_scene_is_read(
+    window: application.App, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bear().save(tmp_path)
+    load, shown = documents.load, list[float]()
+
+    def load_slowly(path: Path) -> documents.Document:
+        time.sleep(0.5)
+        return load(path)
+
+    def splash(*given: object) -> None:
+        assert given[2] == "Opening bear.ply …"
+        shown.append(time.perf_counter() - begun)
+
+    monkeypatch.setattr(documents, "load", load_slowly)
+    monkeypatch.setattr(application, "draw_splash", splash)
+    begun = time.perf_counter()
+    window.open(tmp_path / "bear.ply")
+    assert window.document.title == "bear.ply"
+    assert len(shown) >= 3
+    assert shown[0] < 0.3
+
+
+def test_what_cannot_be_opened_opens_no_window(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def no_window(*_: object) -> None:
+        raise ProgdfError("no window")
+
+    monkeypatch.setattr(application, "Window", no_window)
+    assert main(["view", str(tmp_path / "no.ply")]) == 2
+    assert "no.ply" in capsys.readouterr().err
+    monkeypatch.setattr(application, "SPLASH_AFTER_S", 0.0)  # read so slowly that there is a window by then
+    assert main(["view", str(tmp_path / "no.ply")]) == 2
+    assert "no.ply" in capsys.readouterr().err, "what is wrong with the file comes first"
