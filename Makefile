@@ -10,7 +10,7 @@ PYTEST := env -u PYTHONDONTWRITEBYTECODE OMP_WAIT_POLICY=PASSIVE $(BIN)/python -
 
 EXTRAS := styles,diffusion,segment,clip,colmap,video,formats,usd,cluster,gpu,jupyter,recipes
 
-.PHONY: setup extras gl window browser demo test test-cpus test-all lint bench pictures
+.PHONY: setup extras gl window browser demo test test-cpus test-all lint bench pictures examples
 .DELETE_ON_ERROR:
 
 setup: $(VENV)/.ready gl
@@ -78,3 +78,7 @@ pictures: setup extras window browser
 	assets/window.sh $(BIN)/progdf demo assets/window.png
 	$(BIN)/python assets/page.py demo assets/page.jpg
 	$(BIN)/python -m benchmarks --markdown docs/*.md benchmarks/results/*.md --plots assets
+
+# What the start page opens with, and the wheel holds: trained anew in some minutes.
+examples: setup
+	$(BIN)/python assets/examples.py runs/examples

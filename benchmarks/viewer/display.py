@@ -87,7 +87,7 @@ class Opened:
         """Find the window and give it the keyboard."""
         end = time.monotonic() + PATIENCE_S
         while not self.name and time.monotonic() < end:
-            self.name = self.xdotool("search", "--onlyvisible", "--name", "ProGDF Studio").split("\n")[0]
+            self.name = self.xdotool("search", "--onlyvisible", "--name", ". ProGDF Studio").split("\n")[0]
         self.xdotool("windowfocus", self.name)
 
     def processor_s(self) -> float:

@@ -5,20 +5,29 @@ from __future__ import annotations
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 
+import torch
 from imgui_bundle import imgui
 
+from progdf.errors import ProgdfError
+from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
 from progdf.terminal import escape_text
+from viewer.camera.view_camera import first_camera
 from viewer.files import exports, user_files
 from viewer.files.document import Document
-from viewer.render.engine import ViewEngine
+from viewer.files.session import WindowSession
+from viewer.render.engine import ViewEngine, draws_with
 from viewer.state import workspace
 from viewer.state.snapshots import SliderSnapshot
 from viewer.state.view_state import LayerState, ViewState
+from viewer.ui.context import UiContext
+from viewer.ui.overlay import draw_splash
 from viewer.ui.window import Window, interruptible
 
 from .application import error_details, error_line, log_error
@@ -30,54 +39,104 @@ from .studio.start import StartActions, UpActions
 from .studio.training import JobActions
 from .tidy import TidyActions
 
+_Made = TypeVar("_Made")
+
 SIZE = (1280, 800)
+SPLASH_AFTER_S, SPLASH_EVERY_S = 0.15, 0.04
+"""How long one waits before a splash is shown, and between two frames of it."""
+FIRST_S, FIRST_TEXT = 4.0, "(the first time on a machine this takes half a minute)"
+"""What is said of waiting so long."""
 SAY_AGAIN_S = 10.0
 """Until what still fails in each frame is said again."""
 RETRY_S = 1.0
 """Until the next look at what raised at the last one."""
 
 
-def run(
-    document: Document,
-    state: ViewState,
-    size: tuple[int, int] = SIZE,
-    session: Path | None = None,
-    snapshots: tuple[SliderSnapshot, ...] = (),
-    draw: str = "auto",
-    warning: str = "",
-) -> int:
-    """Open the window and stay until it is closed.
+Opened = tuple[WindowSession, Path | None]
+"""The scene, its edits and what to show first, and the session's file."""
+
+
+def run(opens: Callable[[], Opened], size: tuple[int, int] = SIZE, draw: str = "auto") -> int:
+    """Open the window and stay until it is closed; where reading takes its time, a splash says so.
 
     Args:
-        document: the scene and its edits
-        state: what to show first
+        opens: reads what to show, in another thread
         size: of the window, at 1×
-        session: the file it was opened from and is saved to
-        snapshots: kept states
         draw: what draws, see `ViewEngine`
-        warning: what to say first
 
     Returns:
         The exit status, 0.
 
     Raises:
-        ProgdfError: there is no display, or no OpenGL 3.3 on it.
+        ProgdfError: as `opens`; or there is no display, or no OpenGL 3.3 on it.
     """
-    window = Window(_window_title(document.title), size)
-    try:
-        app = App(window, document, state, session, draw=draw)
-        app.main_view.restart(state, snapshots)
-        if warning:
-            app.main_view.show_message(warning, error=True)
-        app.file_actions.offer_autosave()
+    with ThreadPoolExecutor(2) as workers:
+        opening = workers.submit(opens)
+        if wait([opening], SPLASH_AFTER_S).done:
+            opening.result()  # what is wrong is told before there is a window
+        try:
+            window = Window(_window_title(""), size)
+        except ProgdfError:
+            opening.result()
+            raise
         try:
             with interruptible():
-                app.loop()
+                app = _start(window, opening, workers, draw)
+                try:
+                    app.loop()
+                finally:
+                    app.close()
         finally:
-            app.close()
-    finally:
-        window.close()
+            window.close()
     return 0
+
+
+def _start(window: Window, opening: Future[Opened], workers: ThreadPoolExecutor, draw: str) -> App:
+    """The application, once all is read and what draws is ready."""
+    context, ui = window.context(), UiContext(window.density)
+    imgui.backends.opengl3_init("#version 330")
+
+    def splash(text: str, seconds: float) -> None:
+        ui.make_current()
+        imgui.get_io().display_size = imgui.ImVec2(*window.pixels)
+        draw_splash(context.screen, ui, text, seconds)
+
+    try:
+        splash("Opening …", 0.0)
+        window.present()
+        draws = workers.submit(_draw_once) if draws_with(context, draw) == "cpu" else None
+        opened, session = _wait(window, opening, "Opening …", splash)
+        if draws is not None:
+            _wait(window, draws, "Preparing to draw …", splash)
+    finally:
+        ui.make_current()
+        imgui.backends.opengl3_shutdown()
+        ui.close()
+    app = App(window, opened.document, opened.view, session, draw=draw)
+    app.main_view.restart(opened.view, opened.snapshots)
+    if opened.warning:
+        app.main_view.show_message(opened.warning, error=True)
+    app.file_actions.offer_autosave()
+    return app
+
+
+def _draw_once() -> None:
+    """A small picture, for which the kernels are loaded, or compiled the first time on a machine."""
+    corners = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3)
+    quats, none = torch.eye(4)[:1].expand(8, 4), corners[:, None, :][:, :0]
+    scene = Gaussians(corners, quats, corners - 2.0, corners[:, 0], corners, none)
+    ViewEngine(None, scene).image(ViewState(camera=first_camera(scene)), (32, 24))
+
+
+def _wait(window: Window, work: Future[_Made], text: str, splash: Callable[[str, float], None]) -> _Made:
+    """What another thread makes; meanwhile the window hears its events and soon shows a splash."""
+    begun, patience = time.perf_counter(), SPLASH_AFTER_S
+    while not wait([work], patience).done:
+        patience, seconds = SPLASH_EVERY_S, time.perf_counter() - begun
+        window.wait(0.0)
+        splash(text if seconds < FIRST_S else f"{text} {FIRST_TEXT}", seconds)
+        window.present()
+    return work.result()
 
 
 class App:
@@ -115,6 +174,7 @@ class App:
         self.strays = StrayActions(self)
         self.tidy = TidyActions(self, memory)
         self.is_closed = False
+        self._waits = False  # a splash is shown
         self._title = ""
         self._memory = memory
         self._layout = user_files.read_layout(memory)
@@ -166,9 +226,6 @@ class App:
 
     def loop(self) -> None:
         """Draw while something changes, sleep while nothing does."""
-        self.window.new_frame()
-        self.main_view.draw_splash(self.context.screen)
-        self.window.present()
         while not self.is_closed:
             waits = [wait for wait in self._wait_times() if wait is not None]
             with self._guard():
@@ -237,6 +294,8 @@ class App:
         return RETRY_S
 
     def _redraw(self) -> None:
+        if self._waits:
+            return
         try:
             with self._guard():
                 self.draw()
@@ -254,6 +313,27 @@ class App:
     def open(self, path: Path) -> None:
         """A dropped or chosen file, by what it is."""
         self.file_actions.open(path)
+
+    def wait_for(self, work: Callable[[], _Made], text: str) -> _Made:
+        """What it makes in another thread; meanwhile the window says so.
+
+        Raises:
+            Exception: what `work` raises.
+        """
+
+        def splash(text: str, seconds: float) -> None:
+            self.main_view.ui.make_current()
+            self.window.new_frame()
+            draw_splash(self.context.screen, self.main_view.ui, text, seconds)
+
+        self._waits = True
+        try:
+            with ThreadPoolExecutor(1) as worker:
+                return _wait(self.window, worker.submit(work), text, splash)
+        finally:
+            self._waits = False
+            self.window.take_keys()  # typed at the splash
+            self.main_view.wake()
 
     def show(
         self, document: Document, live: tuple[Gdf, ...] = (), layers: tuple[LayerState, ...] = ()

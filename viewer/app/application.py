@@ -9,7 +9,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from logging.handlers import RotatingFileHandler
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 from progdf import __version__
 from progdf.errors import ProgdfError
@@ -22,6 +22,7 @@ from viewer.state.view_state import LayerState, ViewState
 from .main_view import MainView
 
 LOG = "window.log"
+_Made = TypeVar("_Made")
 
 
 class Application(Protocol):
@@ -32,6 +33,9 @@ class Application(Protocol):
 
     def open(self, path: Path) -> None:
         """A file, by what it is."""
+
+    def wait_for(self, work: Callable[[], _Made], text: str) -> _Made:
+        """What it makes in another thread; meanwhile the window says so."""
 
     def show(
         self, document: Document, live: tuple[Gdf, ...] = (), layers: tuple[LayerState, ...] = ()

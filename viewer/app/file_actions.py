@@ -26,9 +26,10 @@ from progdf.region import Region, from_mask
 from progdf.scene.strays import Strays, clean, find_strays, picture_difference
 from progdf.terminal import group_digits
 from progdf.threads import all_threads
-from viewer.camera.view_camera import first_camera, from_camera, to_camera
+from viewer.camera.view_camera import ViewCamera, first_camera, from_camera, to_camera
 from viewer.files import document as documents
 from viewer.files import exports, session, timeline_file
+from viewer.files.document import Document
 from viewer.files.session import SessionAutosave, WindowSession, session_file
 from viewer.files.user_files import parse_path, read_recent, remember_recent
 from viewer.jobs.training import with_picture
@@ -449,7 +450,8 @@ class FileActions:
         self._app.main_view.recent = self._remember(path)
 
     def _open_session(self, path: Path) -> None:
-        opened, main_view = session.open_session(path, self._memory), self._app.main_view
+        main_view, memory = self._app.main_view, self._memory
+        opened = self._app.wait_for(lambda: session.open_session(path, memory), f"Opening {path.name} …")
         self._app.open_document(opened.document, opened.view, opened.snapshots)
         self.session_autosave.drop()
         if opened.warning:
@@ -488,8 +490,11 @@ class FileActions:
         self.offer_autosave()
 
     def _open_scene(self, path: Path) -> None:
-        opened = documents.load(path)
-        camera = first_camera(opened.scene, up=opened.detected_up.direction)
+        def load() -> tuple[Document, ViewCamera]:
+            opened = documents.load(path)
+            return opened, first_camera(opened.scene, up=opened.detected_up.direction)
+
+        opened, camera = self._app.wait_for(load, f"Opening {path.name} …")
         self._app.open_document(opened, on_another_scene(self._app.main_view.work.view, camera))
         self.session_autosave.drop()
         self.path = None

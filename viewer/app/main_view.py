@@ -124,7 +124,8 @@ class MainView:
         self.context, self.engine, self.facts, self.pictures = context, engine, facts, pictures
         self.canvas = Canvas(context, engine, facts.recordings)
         self.recent: tuple[Path, ...] = ()  # files opened before, for the dialogs
-        self.recent_files: tuple[pages.RecentFile, ...] = ()  # those of the start page
+        # of the start page: files opened before, and examples
+        self.start_files: tuple[Sequence[pages.StartFile], Sequence[pages.StartFile]] = (), ()
         self.up_strip: UpStrip | None = None  # asks which way is up
         self.cover: Cover | None = None  # what lies over the picture
         self.preview = PreviewState()  # of the picture of a new edit
@@ -213,18 +214,6 @@ class MainView:
         """Show one line at the bottom of the picture for a while, with a button: its name and its action."""
         self.work = workspace.with_message(self.work, text, self._clock, error, details, button=button)
         self.wake()
-
-    def draw_splash(self, screen: moderngl.Framebuffer) -> None:
-        """A word while the first picture is made: that may take seconds, and the window is already there."""
-        self.ui.make_current()
-        imgui.backends.opengl3_new_frame()
-        imgui.new_frame()
-        if not self.at_start:
-            overlay.banner(f"Opening {self.facts.title} …", self._area(), self.ui)
-        imgui.render()
-        screen.use()
-        screen.clear(*self.work.view.background)
-        imgui.backends.opengl3_render_draw_data(imgui.get_draw_data())
 
     def frame(
         self,
@@ -342,7 +331,7 @@ class MainView:
             if not asks or action == "window_picture":  # which shows what is open, and changes nothing
                 self._perform(action)
         if self.at_start:
-            for action in pages.draw_start_page(self.recent_files, self.ui):
+            for action in pages.draw_start_page(*self.start_files, self.ui):
                 self._perform(action)
             return
         if is_flying(self._keys):

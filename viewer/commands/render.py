@@ -58,6 +58,7 @@ from viewer.camera.view_camera import (
 )
 from viewer.files import session, timeline_file
 from viewer.files.document import Document, empty
+from viewer.files.session import WindowSession
 from viewer.files.web_page import PAGE, PageOptions, write_page
 from viewer.pictures import film
 from viewer.pictures.compare import Comparer, draw_labels
@@ -94,21 +95,18 @@ ONE_OF = ("sweep", "sheet", "split", "difference", "timeline", "turntable")
 def view(argv: Sequence[str]) -> int:
     """`progdf view`: open the window and stay until it is closed."""
     options: ViewOptions = parse(ViewOptions, argv, "progdf view")
-    has_scene = options.stack.scene != NO_SCENE
-    opened = open_stack(options.stack, options.drawing) if has_scene else OpenStack(empty(), ViewState())
-    from viewer.app.app import run  # imgui and glfw, which render and export do without
+    from viewer.app.app import Opened, run  # imgui and glfw, which render and export do without
 
-    state = opened.view if opened.session is not None else replace(opened.view, grid=True)
-    if opened.session is None and has_scene:
-        state = replace(state, camera=first_camera(opened.document.scene, up=opened.up))
-    return run(
-        opened.document,
-        state,
-        session=opened.session,
-        snapshots=opened.snapshots,
-        draw=options.drawing.engine,
-        warning=opened.warning,
-    )
+    def opens() -> Opened:
+        if options.stack.scene == NO_SCENE:
+            return WindowSession(empty(), ViewState(grid=True)), None
+        opened = open_stack(options.stack, options.drawing)
+        state = opened.view
+        if opened.session is None:
+            state = replace(state, grid=True, camera=first_camera(opened.document.scene, up=opened.up))
+        return WindowSession(opened.document, state, opened.snapshots, opened.warning), opened.session
+
+    return run(opens, draw=options.drawing.engine)
 
 
 def export(argv: Sequence[str]) -> int:
@@ -206,7 +204,7 @@ def _export_bundle(out: Path, opened: OpenStack) -> int:
     """The scene, its edits and the session in one file."""
     with tempfile.TemporaryDirectory(prefix="progdf-") as folder:
         source = Path(folder) / "stack.session.json"
-        session.save(source, session.WindowSession(opened.document, opened.view, opened.snapshots))
+        session.save(source, WindowSession(opened.document, opened.view, opened.snapshots))
         count = write_bundle(out, source)
     print_line(f"wrote {out}: {file_size(out.stat().st_size)}, {count} files; open it with progdf view")
     return 0

@@ -33,26 +33,46 @@ def is_listed(path: Path) -> bool:
     return path.suffix.lower() not in (".gdf", ".cube") and session_of(path) is None and "\n" not in str(path)
 
 
-def read_recent(folder: Path | None = None) -> tuple[Path, ...]:
-    """Those that are still there; none where nothing can be read."""
+def read_recent(folder: Path | None = None, missing: bool = False) -> tuple[Path, ...]:
+    """Those that are still there, and with `missing` the others; none where nothing can be read."""
     try:
         lines = ((folder or state_folder()) / "recent.txt").read_text("utf-8", "surrogateescape").splitlines()
-        return tuple(path for path in map(Path, lines) if is_listed(path) and path.is_file())[:MOST_RECENT]
+        known = [path for path in map(Path, lines) if is_listed(path)]
+        return tuple(path for path in known if missing or path.is_file())[:MOST_RECENT]
     except (OSError, ValueError):
         return ()
 
 
 def remember_recent(paths: Sequence[Path], folder: Path | None = None) -> tuple[Path, ...]:
-    """Put scenes and sessions in front, the last one first; what cannot be written is not remembered."""
+    """Put scenes and sessions in front, the last one first; what cannot be written is not remembered. Those
+    that are there."""
     folder = folder or state_folder()
-    known = dict.fromkeys([*(path.resolve() for path in reversed(paths)), *read_recent(folder)])
-    files = tuple(path for path in known if is_listed(path))[:MOST_RECENT]
+    known = dict.fromkeys([*(path.resolve() for path in reversed(paths)), *read_recent(folder, missing=True)])
+    return _write_recent([path for path in known if is_listed(path)], folder)
+
+
+def forget_recent(path: Path, folder: Path | None = None) -> tuple[Path, ...]:
+    """Take one off the list; those that are left and there."""
+    folder = folder or state_folder()
+    return _write_recent([other for other in read_recent(folder, missing=True) if other != path], folder)
+
+
+def _write_recent(files: Sequence[Path], folder: Path) -> tuple[Path, ...]:
+    files = files[:MOST_RECENT]
     lines = "".join(f"{path}\n" for path in files)
     with contextlib.suppress(OSError):
         folder.mkdir(parents=True, exist_ok=True)
         with atomic_write(folder / "recent.txt") as temporary_file:
             temporary_file.write_text(lines, encoding="utf-8", errors="surrogateescape")
-    return files
+    return tuple(path for path in files if path.is_file())
+
+
+def describe_age(seconds: float) -> str:
+    """ "just now", "5 min ago", "3 h ago", "yesterday", "12 days ago", "4 months ago"."""
+    minutes, days = int(seconds / 60.0), int(seconds / 86_400.0)
+    if days:
+        return "yesterday" if days == 1 else f"{days} days ago" if days < 60 else f"{days // 30} months ago"
+    return "just now" if minutes < 2 else f"{minutes} min ago" if minutes < 90 else f"{minutes // 60} h ago"
 
 
 def read_layout(folder: Path | None = None) -> Layout:
@@ -84,10 +104,22 @@ def keep_thumbnail(path: Path, pixels: NDArray[np.uint8], folder: Path | None = 
             old.unlink(missing_ok=True)
 
 
+def thumbnail_time(path: Path, folder: Path | None = None) -> float:
+    """When the picture of a file was kept, as it was left; seconds since 1970, 0 where there is none."""
+    with contextlib.suppress(OSError):
+        return _thumbnail(path, folder).stat().st_mtime
+    return 0.0
+
+
 def load_thumbnail(path: Path, folder: Path | None = None) -> NDArray[np.uint8] | None:
     """The picture of a file, None where there is none or it is damaged: it is made again. [H,W,3]"""
+    return read_thumbnail(_thumbnail(path, folder))
+
+
+def read_thumbnail(file: Path) -> NDArray[np.uint8] | None:
+    """A picture at the size of one, None where there is none or it is damaged. [H,W,3]"""
     try:
-        return np.asarray(flatten_onto(open_picture(_thumbnail(path, folder)), "white", THUMBNAIL_SIZE))
+        return np.asarray(flatten_onto(open_picture(file), "white", THUMBNAIL_SIZE))
     except ProgdfError:
         return None
 

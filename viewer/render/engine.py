@@ -82,7 +82,7 @@ class ViewEngine:
             raise ValueError("draw is 'gl', which needs a context")
         self.ctx, self.scene = ctx, scene
         self.gdfs = tuple(gdfs)
-        self.draws_with = draw if draw != "auto" else "cpu" if ctx is None or is_software(ctx) else "gl"
+        self.draws_with = draws_with(ctx, draw)
         self.timings = FrameTimings()
         """Of the last picture."""
         self.near = near_plane(bounds_of(scene).radius)
@@ -271,6 +271,11 @@ class ViewEngine:
                 f"a layer refers to edit {index + 1} of {len(self.gdfs)}; open its .gdf file too"
             )
         return self.gdfs[index]
+
+
+def draws_with(ctx: moderngl.Context | None, draw: str) -> str:
+    """What "auto" is in a context: "gl" where OpenGL has hardware behind it, else "cpu"."""
+    return draw if draw != "auto" else "cpu" if ctx is None or is_software(ctx) else "gl"
 
 
 def drawn_size(size: tuple[int, int], pixels: int) -> tuple[int, int]:

@@ -230,6 +230,11 @@ class Window:
         return int(width), int(height)
 
     @property
+    def density(self) -> float:
+        """Pixels of the framebuffer per design pixel."""
+        return max(float(glfw.get_window_content_scale(self.handle)[0]), 0.5)
+
+    @property
     def ui_scale(self) -> float:
         """Window coordinates per design pixel: the screen's density, less what the coordinates hide of it."""
         content = float(glfw.get_window_content_scale(self.handle)[0])

@@ -15,6 +15,7 @@ from PIL import Image
 from progdf.io.picture_camera import edits_in_picture, find_picture_camera
 from tests.helpers.ui_rig import BACKGROUND, Rig, rig
 from viewer.camera.view_camera import to_camera
+from viewer.ui.overlay import draw_splash
 
 pytestmark = pytest.mark.gl
 VIEW = (170.0, 270.0)  # the middle of the picture
@@ -150,13 +151,17 @@ def test_f10_tells_the_times_of_the_picture_on_screen(hand: Rig) -> None:
     assert hand.main_view.canvas.timings.total_ms > 0.0
 
 
-def test_the_window_says_what_it_opens_before_it_has_a_picture(hand: Rig) -> None:
-    drawn = hand.main_view.canvas.pictures_drawn
-    hand.main_view.draw_splash(hand.screen)
-    image = hand.image()
+def test_a_splash_says_what_is_opened_and_since_when_and_that_it_goes_on(hand: Rig) -> None:
+    drawn, images = hand.main_view.canvas.pictures_drawn, []
+    for seconds in (0.0, 1.0, 5.0):
+        draw_splash(hand.screen, hand.main_view.ui, "Opening bear.ply …", seconds)
+        images.append(hand.image().astype(int))
     assert hand.main_view.canvas.pictures_drawn == drawn
-    assert len(np.unique(image[:60].reshape(-1, 3), axis=0)) > 10, "a word"
-    assert len(np.unique(image[60:].reshape(-1, 3), axis=0)) == 1, "on the background alone"
+    middle = [image[230:290] for image in images]
+    assert len(np.unique(middle[0].reshape(-1, 3), axis=0)) > 10, "a word"
+    assert len(np.unique(images[0][:200].reshape(-1, 3), axis=0)) == 1, "on the window's color alone"
+    assert np.abs(middle[1] - middle[0])[40:].any(), "its bar moves"
+    assert np.abs(middle[2] - middle[0])[:25].any(), "and its seconds are told"
 
 
 def test_f12_gives_the_whole_window_to_the_picture(hand: Rig) -> None:

@@ -11,7 +11,8 @@ import pytest
 
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from viewer.app.main_view import MainView
-from viewer.app.studio.pages import RecentFile
+from viewer.app.studio.pages import StartFile
+from viewer.app.studio.start import EXAMPLE_TITLES
 from viewer.files.document import empty
 from viewer.jobs.child import Progress
 from viewer.jobs.job_queue import DeliverOptions, Delivery, Job
@@ -34,9 +35,13 @@ def test_the_start_page_with_files_that_were_open(screenshot: Compare) -> None:
     pixels = np.full((252, 336, 3), (96, 120, 150), np.uint8)
     texture = context.texture((336, 252), 3, pixels.tobytes(), alignment=1)
     names = ("bear.ply", "garden.session.json", "a scene with a name that is too long.spz")
-    main_view.recent_files = tuple(
-        RecentFile(Path("/scenes") / name, texture.glo * (i < 2)) for i, name in enumerate(names)
+    lines = ("just now  ·  ~/scenes", "Moved?  ·  ~/scenes", "3 days ago  ·  ~/work")
+    recent = tuple(
+        StartFile(Path("/scenes") / name, texture.glo * (i < 2), line=lines[i], missing=i == 1)
+        for i, name in enumerate(names)
     )
+    examples = tuple(StartFile(path, texture.glo, *about) for path, about in EXAMPLE_TITLES.items())
+    main_view.start_files = recent, examples
     try:
         screenshot("ui_start_page", Rig(main_view, SMALLEST, 1.0).image())
     finally:

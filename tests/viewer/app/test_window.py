@@ -54,7 +54,7 @@ class Desktop:
 
     def open(self) -> None:
         def found() -> str:
-            self.window = self.xdotool("search", "--onlyvisible", "--name", "ProGDF Studio").split("\n")[0]
+            self.window = self.xdotool("search", "--onlyvisible", "--name", ". ProGDF Studio").split("\n")[0]
             return self.window
 
         self.until("the window", found)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from viewer.ui.widgets import (
     choice,
     drop_down,
     elide,
+    icon_button,
     label,
     picture,
     plate,
@@ -32,46 +34,72 @@ from viewer.ui.widgets import (
 
 KEYS = ("open", "quit", "full_screen", "window_picture", "help", "unfocus", "about")
 """Actions of keys that mean something here."""
-CARD_PX, GAP_PX, MARGIN_PX, DROP_PX = 168.0, 16.0, 28.0, 84.0
-ROW_GAP_PX = 8.0
-WIDEST_PX = 4 * CARD_PX + 3 * GAP_PX
+CARD_PX, GAP_PX, MARGIN_PX, SIDE_PX = 168.0, 16.0, 28.0, 264.0
+WIDEST_PX, NARROW_PX = 1140.0, 760.0
+"""Of the whole page, at 1×; below the second its left part stands above the right one."""
+_TEXT_PX, _HEADING_PX, _TITLE_TALL_PX = 44.0, 32.0, 44.0  # two lines below a picture; a heading; the title
+_NO_NAV = imgui.ItemFlags_.no_nav.value
+DROP_TEXT = "Drop a scene or a session"
 
 
 @dataclass(frozen=True)
-class RecentFile:
-    """A scene or session that was open. `texture`: the GL name of its picture, 0 for none"""
+class StartFile:
+    """What the start page opens: a scene or session that was open, or an example.
 
-    path: Path
+    `texture`: the GL name of its picture, 0 for none; `missing`: the file is not there any more
+    """
+
+    path: Path  # of an example its bundle
     texture: int = 0
+    title: str = ""  # "" for the file's name
+    line: str = ""  # below it
+    missing: bool = False
 
 
-def draw_start_page(recent: Sequence[RecentFile], ui: UiContext) -> list[str]:
+def draw_start_page(recent: Sequence[StartFile], examples: Sequence[StartFile], ui: UiContext) -> list[str]:
     """The page, over the whole window; the actions that were asked for."""
     display, scale = imgui.get_io().display_size, ui.scale
     imgui.set_next_window_pos(imgui.ImVec2(0.0, 0.0))
     imgui.set_next_window_size(display)
-    imgui.push_style_var(imgui.StyleVar_.window_padding, imgui.ImVec2(0.0, 0.0))
-    imgui.begin("start page", None, FIXED | BEHIND)
-    imgui.pop_style_var()
-    wide = min(WIDEST_PX * scale, display.x - 2 * MARGIN_PX * scale)
-    cards = max(int((wide + GAP_PX * scale) // ((CARD_PX + GAP_PX) * scale)), 1)
-    rows = -(-len(recent) // cards)
-    tall = (126.0 + DROP_PX + GAP_PX + rows * (0.75 * CARD_PX + 46.0 + ROW_GAP_PX)) * scale
-    left = (display.x - wide) / 2
-    imgui.set_cursor_pos(imgui.ImVec2(left, max((display.y - tall) / 2.6, MARGIN_PX * scale)))
-    imgui.begin_child("middle", imgui.ImVec2(wide, 0.0))
-    actions = _head(ui)
-    if recent:
-        small("Recent", PALETTE.dim)
-        actions += _grid(recent, cards, ui)
-    _drop_target(wide, ui)
-    imgui.end_child()
+    imgui.begin("start page", None, (FIXED | BEHIND) & ~imgui.WindowFlags_.no_nav.value)
+    wide = min(display.x - 2 * MARGIN_PX * scale, WIDEST_PX * scale)
+    narrow = wide < NARROW_PX * scale
+    left, side = (display.x - wide) / 2, wide if narrow else SIDE_PX * scale
+    right = left if narrow else left + side + 3 * GAP_PX * scale
+    room = wide - (right - left)
+    thirds, small_card = _columns(room, 3, ui), _columns(room, max(int(room // (CARD_PX * scale)), 1), ui)
+    rows = -(-len(recent) // max(int(room // (CARD_PX * scale)), 1))
+    shown = (0.75 * thirds + (_TEXT_PX + _HEADING_PX) * scale) * bool(examples)
+    tall = shown + rows * (0.75 * small_card + (_TEXT_PX + GAP_PX) * scale)
+    top = max((display.y - tall - 2 * _HEADING_PX * scale) / 2.6, MARGIN_PX * scale)
+    imgui.set_cursor_pos(imgui.ImVec2(left, top))
+    imgui.begin_group()
+    actions = _head(side, 0.0 if narrow else max(0.75 * thirds, 120.0 * scale), ui)
+    imgui.end_group()
+    level = imgui.get_cursor_pos_y() + 0.5 * GAP_PX * scale if narrow else top + _TITLE_TALL_PX * scale
+    imgui.set_cursor_pos(imgui.ImVec2(right, level - (0.0 if narrow else 19.0 * scale)))
+    imgui.begin_group()
+    for heading, files, across in (("Examples", examples, thirds), ("Recent", recent, small_card)):
+        if files:
+            small(heading, PALETTE.dim)
+            actions += _grid(files, across, room, heading == "Recent", ui)
+            imgui.dummy(imgui.ImVec2(0.0, 0.5 * GAP_PX * scale))
+    imgui.end_group()
+    imgui.dummy(imgui.ImVec2(0.0, 0.5 * MARGIN_PX * scale))
     imgui.end()
     return actions
 
 
-def _head(ui: UiContext) -> list[str]:
-    scale, actions = ui.scale, []
+def _columns(room: float, count: int, ui: UiContext) -> float:
+    """How wide each of so many cards beside each other is."""
+    return float(int((room - (count - 1) * GAP_PX * ui.scale) / count))
+
+
+def _head(wide: float, tall: float, ui: UiContext) -> list[str]:
+    """The program's name, and what opens a file of one's own: a field to drop it on, so tall, or for 0 a
+    line; and the demo."""
+    scale, actions, flat = ui.scale, [], not tall
+    begin = imgui.get_cursor_pos()
     imgui.push_font(ui.fonts.bold, 26.0)
     imgui.text("ProGDF Studio")
     imgui.pop_font()
@@ -80,73 +108,109 @@ def _head(ui: UiContext) -> list[str]:
     imgui.set_cursor_pos_y(imgui.get_cursor_pos_y() + 11.0 * scale)
     imgui.text_disabled(__version__)
     imgui.pop_font()
-    imgui.dummy(imgui.ImVec2(0.0, 2.0 * scale))
-    size = imgui.ImVec2(150.0 * scale, 34.0 * scale)
-    if accent_button(f"{Icon.OPEN}  Open…", size):
+    x, y = begin.x, begin.y + _TITLE_TALL_PX * scale
+    button, frame = imgui.ImVec2(136.0 * scale, 34.0 * scale), imgui.ImVec2(wide, tall or 58.0 * scale)
+    text, side = imgui.calc_text_size(DROP_TEXT), (frame.y - button.y) / 2  # of a line: the margin around it
+    middle = x + (frame.x - button.x) / 2, y + frame.y / 2
+    imgui.set_cursor_pos(
+        imgui.ImVec2(x + button.x + 2 * side, y + (frame.y - text.y) / 2)
+        if flat
+        else imgui.ImVec2(x + (frame.x - text.x) / 2, middle[1] - 32.0 * scale)
+    )
+    imgui.text_disabled(DROP_TEXT)
+    imgui.set_cursor_pos(
+        imgui.ImVec2(x + side, y + side) if flat else imgui.ImVec2(middle[0], middle[1] - 2.0 * scale)
+    )
+    if accent_button(f"{Icon.OPEN}  Open…", button):
         actions.append("open")
     tip("A scene (.ply, .spz, .sog …) or a session (Ctrl+O)")
-    imgui.same_line(0.0, 10.0 * scale)
-    if imgui.button("Try the demo", size):
+    if flat:
+        imgui.set_cursor_pos(imgui.ImVec2(x + frame.x - button.x - side, y + side))
+    else:
+        imgui.set_cursor_pos(imgui.ImVec2(x, y + frame.y + 12.0 * scale))
+    imgui.push_item_flag(_NO_NAV, True)
+    if imgui.button("Train the demo", imgui.ImVec2(button.x if flat else wide, button.y)):
         actions.append("demo")
+    imgui.pop_item_flag()
     tip("Makes a small scene and trains four edits of it here: a minute or two")
-    imgui.dummy(imgui.ImVec2(0.0, 10.0 * scale))
+    imgui.set_cursor_pos(imgui.ImVec2(x, y))
+    _dashed_frame(frame, ui)
     return actions
 
 
-def _grid(recent: Sequence[RecentFile], cards: int, ui: UiContext) -> list[str]:
-    actions = []
-    for i, file in enumerate(recent):
-        if i % cards:
-            imgui.same_line(0.0, GAP_PX * ui.scale)
-        elif i:
-            imgui.dummy(imgui.ImVec2(0.0, ROW_GAP_PX * ui.scale))
-        imgui.push_id(i)
-        if _card(file, ui):
-            actions.append(f"open_file:{file.path}")
+def _grid(files: Sequence[StartFile], wide: float, room: float, own: bool, ui: UiContext) -> list[str]:
+    """Cards of so many pixels; what was asked for. `own`: they can be taken off the page"""
+    actions, gap = list[str](), GAP_PX * ui.scale
+    across = max(int((room + gap + 1.0) // (wide + gap)), 1)
+    for i, file in enumerate(files):
+        if i % across:
+            imgui.same_line(0.0, gap)
+        imgui.push_id(str(file.path))
+        actions += _card(file, wide, own, ui)
         imgui.pop_id()
     return actions
 
 
-def _card(file: RecentFile, ui: UiContext) -> bool:
-    """A picture, the name and the folder; whether it was clicked."""
-    wide, tall, rounding = CARD_PX * ui.scale, 0.75 * CARD_PX * ui.scale, 5.0 * ui.scale
+def _card(file: StartFile, wide: float, own: bool, ui: UiContext) -> list[str]:
+    """A picture and two lines; a click, Enter or the cross in its corner ask for something."""
+    tall, rounding, scale = 0.75 * wide, 5.0 * ui.scale, ui.scale
     imgui.begin_group()
-    at = imgui.get_cursor_screen_pos()
-    pressed = bool(imgui.invisible_button("file", imgui.ImVec2(wide, tall)))
-    hovered = imgui.is_item_hovered()
-    tip(escape_text(str(file.path)))
+    at, asked = imgui.get_cursor_screen_pos(), list[str]()
+    storage, known = imgui.get_state_storage(), int(imgui.internal.get_current_window().id_)
+    if not storage.get_bool(known):  # the first of all has the keyboard
+        storage.set_bool(known, True)
+        imgui.set_keyboard_focus_here()
+        imgui.set_nav_cursor_visible(True)
+    imgui.set_next_item_allow_overlap()
+    if imgui.invisible_button("file", imgui.ImVec2(wide, tall), imgui.ButtonFlags_.enable_nav.value):
+        asked = ["open"] if file.missing else [f"{'open_file' if own else 'example'}:{file.path}"]
+    hovered = imgui.is_item_hovered(
+        imgui.HoveredFlags_.no_nav_override.value
+    )  # imgui frames what has the keys
+    if own and imgui.is_item_focused() and imgui.is_key_pressed(imgui.Key.delete, False):
+        asked = [f"forget_file:{file.path}"]
+    path = escape_text(str(file.path))
+    tip(f"{path} is not there any more: open it from where it is now" if file.missing else path)
     canvas, end = imgui.get_window_draw_list(), imgui.ImVec2(at.x + wide, at.y + tall)
-    picture(file.texture, at, end, rounding)
+    picture(file.texture, at, end, rounding, 0.3 if file.missing else 1.0)
     if not file.texture:
         size = imgui.calc_text_size(Icon.PICTURE)
         middle = imgui.ImVec2(round(at.x + (wide - size.x) / 2), round(at.y + (tall - size.y) / 2))
         canvas.add_text(middle, u32(PALETTE.field_hovered), Icon.PICTURE)
+    if own and (file.missing or imgui.is_mouse_hovering_rect(at, end)):
+        below, side = imgui.get_cursor_screen_pos(), imgui.get_frame_height()
+        corner = imgui.ImVec2(end.x - side - 4.0 * scale, at.y + 4.0 * scale)
+        edge = imgui.ImVec2(corner.x + side, corner.y + side)
+        canvas.add_rect_filled(corner, edge, u32(PALETTE.scrim), rounding)
+        imgui.set_cursor_screen_pos(corner)
+        imgui.push_item_flag(_NO_NAV, True)  # the arrows lead from card to card
+        if icon_button("forget", Icon.CLOSE, ui):
+            asked = [f"forget_file:{file.path}"]
+        imgui.pop_item_flag()
+        tip("Remove from this page (Del); the file stays")
+        imgui.set_cursor_screen_pos(below)
     if hovered:
-        canvas.add_rect(at, end, u32(PALETTE.accent), rounding, 2.0 * ui.scale)
-    imgui.text(elide(escape_text(file.path.name.removesuffix(SUFFIX)), wide))
-    imgui.push_font(None, SMALL_PX)
-    imgui.text_disabled(elide(escape_text(_folder(file.path)), wide))
-    imgui.pop_font()
+        canvas.add_rect(at, end, u32(PALETTE.accent), rounding, 2.0 * scale)
+    name = file.title or escape_text(file.path.name.removesuffix(SUFFIX))
+    imgui.text_colored(imgui.ImVec4(*(PALETTE.dim if file.missing else PALETTE.text)), elide(name, wide))
+    small(file.line, PALETTE.dim, wide)
     imgui.end_group()
-    return pressed
+    return asked
 
 
-def _folder(path: Path) -> str:
-    """Where it lies, with ~ for the user's home."""
-    try:
-        return f"~/{path.parent.relative_to(Path.home())}"
-    except (ValueError, RuntimeError):
-        return str(path.parent)
+def folder_name(path: Path) -> str:
+    """Where it lies, with ~ for the user's home, on one printable line."""
+    with suppress(ValueError, RuntimeError):
+        return escape_text(f"~/{path.parent.relative_to(Path.home())}")
+    return escape_text(str(path.parent))
 
 
-def _drop_target(wide: float, ui: UiContext) -> None:
-    """A dashed frame; files may be dropped anywhere, and this says so."""
-    scale = ui.scale
-    imgui.dummy(imgui.ImVec2(0.0, 6.0 * scale))
+def _dashed_frame(size: imgui.ImVec2, ui: UiContext) -> None:
+    """Files may be dropped anywhere, and this says so."""
+    scale, dash = ui.scale, 7.0 * ui.scale
     x, y = imgui.get_cursor_screen_pos()
-    tall, dash = DROP_PX * scale, 7.0 * scale
-    imgui.dummy(imgui.ImVec2(wide, tall))
-    x, y, wide, tall = x + scale, y + scale, wide - 2 * scale, tall - 2 * scale
+    imgui.dummy(size)
+    x, y, wide, tall = x + scale, y + scale, size.x - 2 * scale, size.y - 2 * scale
     canvas, ink = imgui.get_window_draw_list(), u32(PALETTE.field_hovered)
     sides = ((x, y, wide, 1, 0), (x, y + tall, wide, 1, 0), (x, y, tall, 0, 1), (x + wide, y, tall, 0, 1))
     for left, top, length, dx, dy in sides:
@@ -155,10 +219,6 @@ def _drop_target(wide: float, ui: UiContext) -> None:
             begin = imgui.ImVec2(left + dx * low, top + dy * low)
             end = imgui.ImVec2(left + dx * high, top + dy * high)
             canvas.add_line(begin, end, ink, 1.5 * scale)
-    text = "Drop a scene or a session anywhere in this window"
-    size = imgui.calc_text_size(text)
-    at = imgui.ImVec2(round(x + (wide - size.x) / 2), round(y + (tall - size.y) / 2))
-    canvas.add_text(at, u32(PALETTE.dim), text)
 
 
 UP_SIZE = (160, 120)

@@ -2,20 +2,32 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from pathlib import Path
 
 import moderngl
 import torch
 
+import viewer
 from progdf.demo_scenes import SKY
 from progdf.errors import ProgdfError
-from progdf.io.atomic import state_folder
+from progdf.io.atomic import atomic_write, make_folder, read_file, state_folder
+from progdf.io.session import BUNDLE, sha256
 from progdf.scene import up_axis
 from progdf.scene.up_axis import direction_name
-from viewer.app.application import Application
+from viewer.app.application import Application, failure_line
 from viewer.camera.view_camera import Vec3, first_camera
-from viewer.files.user_files import THUMBNAIL_SIZE, keep_thumbnail, load_thumbnail
+from viewer.files.user_files import (
+    THUMBNAIL_SIZE,
+    describe_age,
+    forget_recent,
+    keep_thumbnail,
+    load_thumbnail,
+    read_recent,
+    read_thumbnail,
+    thumbnail_time,
+)
 from viewer.gl.present import picture_texture
 from viewer.jobs.job_queue import Delivery, JobQueue
 from viewer.pictures.film import to_pixels
@@ -23,9 +35,19 @@ from viewer.render.engine import ViewEngine
 from viewer.state import history, workspace
 from viewer.state.view_state import Comparison, ViewState
 
-from .pages import UP_SIZE, RecentFile, UpChoice, UpStrip
+from .pages import UP_SIZE, StartFile, UpChoice, UpStrip, folder_name
 
 POLL_S = 0.5
+EXAMPLES = Path(viewer.__file__).parent / "examples"
+EXAMPLE_TITLES = {
+    EXAMPLES / f"{name}{BUNDLE}": about
+    for name, about in {
+        "bear": ("Four looks of a bear", "Scarf, gold, frost; a panda from one picture"),
+        "room": ("A room at dusk", "To stand in: rug, walls, the light"),
+        "play": ("Shapes, and a film", "Head, twin, no scarf; Space plays"),
+    }.items()
+}
+"""The examples that come with the program, what each is called, and what is in it."""
 
 
 class StartActions:
@@ -53,9 +75,15 @@ class StartActions:
 
     def handle(self, request: str) -> bool:
         """Do what is asked for; False where it is nothing of ours."""
-        if request != "demo":
+        name, _, argument = request.partition(":")
+        if name == "demo":
+            self._start_demo()
+        elif name == "example":
+            self._open_example(Path(argument))
+        elif name == "forget_file":
+            self._app.main_view.recent = forget_recent(Path(argument), self._memory)
+        else:
             return False
-        self._start_demo()
         return True
 
     def poll(self) -> float | None:
@@ -109,22 +137,45 @@ class StartActions:
         self._queue.add(Delivery("Demo: four edits", folder, words, log, folder / "scene.ply"))
         self._app.main_view.show_message("Making the demo's scene …")
 
+    def _open_example(self, bundle: Path) -> None:
+        """Unpacked where the program keeps its state: what is saved in it stays there."""
+
+        def open_copy() -> None:
+            folder = (self._memory or state_folder()) / "examples" / sha256(bundle)[:8]
+            make_folder(folder)
+            copy = folder / bundle.name
+            if not copy.exists():
+                with atomic_write(copy) as temporary_file:
+                    temporary_file.write_bytes(read_file(bundle))
+            self._app.open(copy)
+
+        if error := failure_line(open_copy):
+            self._app.main_view.show_message(error, error=True)
+
     def _publish(self) -> None:
-        """Recent files as the page shows them, while it is shown."""
+        """The files of the page as they are, while it is shown."""
         main_view = self._app.main_view
         if not main_view.at_start:
             return
-        files = tuple(RecentFile(path, self._texture(path)) for path in main_view.recent)
-        if files != main_view.recent_files:
-            main_view.recent_files = files
+        recent = []
+        for path in read_recent(self._memory, missing=True):
+            used, missing = thumbnail_time(path, self._memory), not path.is_file()
+            age = describe_age(time.time() - used) if used else ""
+            line = "  ·  ".join(filter(None, ("Moved?" if missing else age, folder_name(path))))
+            recent.append(StartFile(path, self._texture(path), line=line, missing=missing))
+        examples = [StartFile(path, self._texture(path), *about) for path, about in EXAMPLE_TITLES.items()]
+        files = tuple(recent), tuple(examples)
+        if files != main_view.start_files:
+            main_view.start_files = files
             main_view.wake()
 
     def _texture(self, path: Path) -> int:
         if path not in self._textures:
-            self._textures[path] = None
-            pixels = load_thumbnail(path, self._memory)
-            if pixels is not None:
-                self._textures[path] = picture_texture(self._context, pixels)
+            example = path.with_name(path.name.replace(BUNDLE, ".jpg"))
+            pixels = (
+                read_thumbnail(example) if path.parent == EXAMPLES else load_thumbnail(path, self._memory)
+            )
+            self._textures[path] = picture_texture(self._context, pixels) if pixels is not None else None
         texture = self._textures[path]
         return int(texture.glo) if texture is not None else 0
 

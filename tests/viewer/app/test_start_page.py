@@ -1,0 +1,184 @@
+"""The start page: examples, files that were open, the mouse and the keyboard on it."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from imgui_bundle import imgui
+
+from progdf.__main__ import main
+from progdf.errors import ProgdfError
+from tests.helpers.null_app import null_app
+from tests.helpers.ui_rig import Rig, bear
+from viewer.app import app as application
+from viewer.app.main_view import MainView
+from viewer.app.studio.pages import StartFile
+from viewer.app.studio.start import EXAMPLE_TITLES
+from viewer.files import document as documents
+from viewer.files.document import empty
+from viewer.files.user_files import describe_age, keep_thumbnail, read_recent, remember_recent
+from viewer.render.engine import ViewEngine
+from viewer.render.gl_renderer import headless_context
+from viewer.state.view_state import ViewState
+
+pytestmark = pytest.mark.gl
+LARGEST = 6 << 20
+"""Bytes that all examples may add to the wheel."""
+
+
+@pytest.fixture
+def window(tmp_path: Path) -> Iterator[application.App]:
+    with null_app(empty(), ViewState(), tmp_path) as app:
+        turn(app)
+        yield app
+
+
+def turn(app: application.App) -> None:
+    app._wait_times()
+    app.main_view.wake()
+    app.draw()
+
+
+@pytest.fixture
+def hand() -> Iterator[Rig]:
+    """On a page with the examples, in a window of 900x640."""
+    context, document = headless_context(), empty()
+    engine = ViewEngine(context, document.scene, (), "cpu")
+    main_view = MainView(context, engine, document.facts(), ViewState())
+    recent = (StartFile(Path("/scenes/bear.ply")), StartFile(Path("/scenes/gone.ply"), missing=True))
+    main_view.start_files = recent, tuple(StartFile(path) for path in EXAMPLE_TITLES)
+    yield Rig(main_view, (900, 640), 1.0)
+    main_view.close()
+    engine.release()
+    context.release()
+
+
+def type_keys(hand: Rig, *keys: imgui.Key) -> None:
+    """As imgui itself hears them."""
+    for key in keys:
+        for down in (True, False):
+            hand.modifier(key, down)
+    hand.settle()
+
+
+@pytest.mark.parametrize("bundle", [*EXAMPLE_TITLES], ids=lambda path: path.name.partition(".")[0])
+def test_an_example_opens_with_its_edits(window: application.App, bundle: Path, tmp_path: Path) -> None:
+    window.main_view.request(f"example:{bundle}")
+    turn(window)
+    turn(window)
+    assert not window.main_view.at_start
+    layers = window.main_view.work.view.layers
+    assert len(layers) >= 3
+    assert any(layer.strength > 0.0 for layer in layers), "and shows one"
+    assert window.document.path is not None
+    assert window.document.path.is_relative_to(tmp_path), "a copy of the user's own"
+    assert not window.file_actions.has_unsaved
+
+
+def test_the_examples_are_small_and_are_all_there() -> None:
+    folder = next(iter(EXAMPLE_TITLES)).parent
+    assert {path.name.partition(".")[0] for path in folder.iterdir()} == {
+        path.name.partition(".")[0] for path in EXAMPLE_TITLES
+    }
+    assert sum(path.stat().st_size for path in folder.iterdir()) <= LARGEST
+
+
+def test_a_single_click_opens_an_example(hand: Rig) -> None:
+    hand.click(605.0, 160.0)  # the second
+    assert hand.main_view.take_requests() == (f"example:{[*EXAMPLE_TITLES][1]}",)
+
+
+def test_enter_opens_what_the_arrows_lead_to(hand: Rig) -> None:
+    right, down, enter = imgui.Key.right_arrow, imgui.Key.down_arrow, imgui.Key.enter
+    first, second, _ = EXAMPLE_TITLES
+    type_keys(hand, enter)
+    assert hand.main_view.take_requests() == (f"example:{first}",), "the first card has the keyboard"
+    type_keys(hand, right, enter)
+    assert hand.main_view.take_requests() == (f"example:{second}",)
+    type_keys(hand, imgui.Key.left_arrow, down, enter)
+    assert hand.main_view.take_requests() == ("open_file:/scenes/bear.ply",)
+    type_keys(hand, imgui.Key.delete)
+    assert hand.main_view.take_requests() == ("forget_file:/scenes/bear.ply",)
+    type_keys(hand, right, enter)
+    assert hand.main_view.take_requests() == ("open",), "what is gone is looked for"
+
+
+def test_a_file_that_is_gone_says_so_and_is_removed_from_the_page(tmp_path: Path) -> None:
+    memory, files = tmp_path / "memory", [tmp_path / "here.ply", tmp_path / "gone.ply"]
+    for file in files:
+        file.touch()
+    remember_recent(files, memory)
+    keep_thumbnail(files[0], np.zeros((12, 16, 3), np.uint8), memory)
+    files[1].unlink()
+    with null_app(empty(), ViewState(), tmp_path) as app:
+        turn(app)
+        gone, here = app.main_view.start_files[0]
+        assert (gone.path.name, gone.missing, here.missing) == ("gone.ply", True, False)
+        assert gone.line.startswith("Moved?")
+        assert here.line.startswith("just now  ·  ")
+        assert app.main_view.recent == (files[0],), "questions offer what is there"
+        app.main_view.request(f"forget_file:{gone.path}")
+        turn(app)
+        turn(app)
+        assert [file.path for file in app.main_view.start_files[0]] == [files[0]]
+    assert read_recent(memory, missing=True) == (files[0],)
+
+
+def test_the_age_of_a_file_is_told_in_words() -> None:
+    ages = {30.0: "just now", 300.0: "5 min ago", 7300.0: "2 h ago", 9e4: "yesterday", 1e6: "11 days ago"}
+    assert {seconds: describe_age(seconds) for seconds in ages} == ages
+    assert describe_age(1e7) == "3 months ago"
+
+
+def test_an_old_thumbnail_tells_when_the_file_was_open(tmp_path: Path) -> None:
+    memory, file = tmp_path / "memory", tmp_path / "bear.ply"
+    file.touch()
+    remember_recent([file], memory)
+    keep_thumbnail(file, np.zeros((12, 16, 3), np.uint8), memory)
+    (picture,) = (memory / "thumbnails").iterdir()
+    os.utime(picture, (time.time() - 3 * 86_400.0,) * 2)
+    with null_app(empty(), ViewState(), tmp_path) as app:
+        turn(app)
+        assert app.main_view.start_files[0][0].line.startswith("3 days ago")
+
+
+def test_a_splash_is_shown_while_a_scene_is_read(
+    window: application.App, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bear().save(tmp_path)
+    load, shown = documents.load, list[float]()
+
+    def load_slowly(path: Path) -> documents.Document:
+        time.sleep(0.5)
+        return load(path)
+
+    def splash(*given: object) -> None:
+        assert given[2] == "Opening bear.ply …"
+        shown.append(time.perf_counter() - begun)
+
+    monkeypatch.setattr(documents, "load", load_slowly)
+    monkeypatch.setattr(application, "draw_splash", splash)
+    begun = time.perf_counter()
+    window.open(tmp_path / "bear.ply")
+    assert window.document.title == "bear.ply"
+    assert len(shown) >= 3
+    assert shown[0] < 0.3
+
+
+def test_what_cannot_be_opened_opens_no_window(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def no_window(*_: object) -> None:
+        raise ProgdfError("no window")
+
+    monkeypatch.setattr(application, "Window", no_window)
+    assert main(["view", str(tmp_path / "no.ply")]) == 2
+    assert "no.ply" in capsys.readouterr().err
+    monkeypatch.setattr(application, "SPLASH_AFTER_S", 0.0)  # read so slowly that there is a window by then
+    assert main(["view", str(tmp_path / "no.ply")]) == 2
+    assert "no.ply" in capsys.readouterr().err, "what is wrong with the file comes first"
