@@ -38,6 +38,7 @@ from viewer.state.layers import add_layer, duplicate_layer, replace_edit
 from viewer.state.timeline import Player
 from viewer.state.view_state import ViewState, on_another_scene
 from viewer.state.workspace import Dialog, focus_layer, with_camera
+from viewer.ui.keys import shortcut
 
 from . import dialogs
 from .application import Application, error_details, failure_line, log_error
@@ -66,7 +67,9 @@ def edit_picture(main_view: MainView, path: Path) -> None:
     """
     camera = find_picture_camera(path, origin=main_view.facts.origin)
     if edits := edits_in_picture(path):
-        raise ProgdfError(f"{path.name} was taken with edits on ({edits}); take the view with Ctrl+F2")
+        raise ProgdfError(
+            f"{path.name} was taken with edits on ({edits}); take the view with {shortcut('take_view')}"
+        )
     _take_camera(main_view, camera)
     work = main_view.work
     main_view.work = replace(work, form=with_picture(work.form, path, work.form_open), form_open=True)
@@ -99,7 +102,7 @@ def open_timeline(main_view: MainView, path: Path) -> None:
     view = main_view.work.view
     main_view.change(replace(view, timeline=timeline_file.load(path, view.layers, main_view.facts.origin)))
     main_view.work = replace(main_view.work, player=Player(shown=True))
-    main_view.show_message(f"Opened {path.name}; press Space to play it")
+    main_view.show_message(f"Opened {path.name}; press {shortcut('play')} to play it")
 
 
 class EditActions:
@@ -255,9 +258,8 @@ class StrayActions:
         mask[strays.rows] = True
         main_view.change(replace(view, selection=selection.hide(view.selection, mask)))
         change = "no pixel differs" if db >= NO_DIFFERENCE else f"{db:.1f} dB to the pictures before"
-        main_view.show_message(
-            f"Hid {group_digits(len(strays.rows))} strays ({strays.describe()}): {change}; Alt+H shows them"
-        )
+        hid = f"Hid {group_digits(len(strays.rows))} strays ({strays.describe()})"
+        main_view.show_message(f"{hid}: {change}; {shortcut('show_all')} shows them")
 
 
 def _search(scene: Gaussians) -> tuple[Strays, float]:

@@ -83,7 +83,7 @@ FEATHER = 0.1
 
 
 def perform(workspace: Workspace, action: str, facts: SceneFacts, aspect: float = 1.0) -> Workspace:
-    """The workspace after an action of `keys.KEYS`.
+    """The workspace after an action of `keys.COMMANDS`.
 
     Args:
         action: its name, with an argument after a colon where it has one
@@ -234,7 +234,7 @@ def _resize(workspace: Workspace, times: str) -> Workspace:
 
 
 def _step_back(workspace: Workspace, _: str) -> Workspace:
-    """The list of bindings goes, or the tool in the hand, the form, the other selected layers, the focus."""
+    """The list of keys goes, or the tool in the hand, the form, the other selected layers, the focus."""
     if workspace.help:
         return replace(workspace, help=False)
     if workspace.view.brush.active:
@@ -398,7 +398,8 @@ ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
     "grid": lambda w, _: replace(w, view=replace(w.view, grid=not w.view.grid)),
     "axes": lambda w, _: replace(w, view=replace(w.view, axes=not w.view.axes)),
     "safe_frame": lambda w, _: replace(w, view=next_frame(w.view)),
-    "help": lambda workspace, _: replace(workspace, help=not workspace.help),
+    "help": lambda workspace, _: replace(workspace, help=not workspace.help, query=""),
+    "palette": lambda workspace, _: replace(workspace, palette=-1, query="", help=False),
     "before": lambda w, _: replace(w, before=not w.before),
     "beside": lambda w, _: replace(w, view=toggle_mode(w.view, "beside")),
     "split": lambda w, _: replace(w, view=toggle_mode(w.view, "split")),

@@ -161,7 +161,9 @@ class Workspace:
     cards_fit: bool = True  # whether the panel has room for a whole card of each layer
     active_slider: str = "strength"  # which of `layers.SLIDERS` of the focused layer the arrow keys move
     renaming: int | None = None  # the layer whose name is being typed, or None
-    help: bool = False  # whether the list of bindings is shown
+    help: bool = False  # whether the list of keys is shown
+    palette: int | None = None  # the line of the list of commands that Enter takes, −1 as it opens; or None
+    query: str = ""  # what is sought in either list
     message: Message | None = None  # the line at the bottom, or None
     snapshots: tuple[SliderSnapshot, ...] = ()  # kept states, without the original
     # what a session file holds of this; None where there is none

@@ -22,6 +22,7 @@ from viewer.ui.widgets import (
     choice,
     drop_down,
     elide,
+    hint,
     label,
     picture,
     plate,
@@ -30,8 +31,8 @@ from viewer.ui.widgets import (
     tip,
 )
 
-KEYS = ("open", "quit", "full_screen", "window_picture", "help", "unfocus", "about")
-"""Actions of keys that mean something here."""
+COMMANDS = ("open", "demo", "quit", "full_screen", "window_picture", "help", "palette", "unfocus", "about")
+"""Those that mean something here."""
 CARD_PX, GAP_PX, MARGIN_PX, DROP_PX = 168.0, 16.0, 28.0, 84.0
 ROW_GAP_PX = 8.0
 WIDEST_PX = 4 * CARD_PX + 3 * GAP_PX
@@ -84,11 +85,11 @@ def _head(ui: UiContext) -> list[str]:
     size = imgui.ImVec2(150.0 * scale, 34.0 * scale)
     if accent_button(f"{Icon.OPEN}  Open…", size):
         actions.append("open")
-    tip("A scene (.ply, .spz, .sog …) or a session (Ctrl+O)")
+    hint("open")
     imgui.same_line(0.0, 10.0 * scale)
     if imgui.button("Try the demo", size):
         actions.append("demo")
-    tip("Makes a small scene and trains four edits of it here: a minute or two")
+    hint("demo")
     imgui.dummy(imgui.ImVec2(0.0, 10.0 * scale))
     return actions
 
