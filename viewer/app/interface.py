@@ -139,6 +139,9 @@ def draw_lists(
     """
     if work.help and imgui.get_io().want_text_input and {"Escape", *chords("help")} & {*pressed}:
         work = replace(work, help=False)  # its own field has the keyboard, so that they are no commands
+    if work.history is not None:
+        work, chosen = draw_history(work, pointer.ui)
+        work = perform_actions(work, chosen, pointer)
     if work.palette is None:
         return work
     numbered = [f"{name}:{i}" for name in ("focus", "toggle") for i in range(len(work.view.layers) + 1, 10)]
@@ -381,9 +384,54 @@ def perform_actions(work: Workspace, actions: Sequence[str], pointer: PointerCon
             work = workspace.with_message(
                 work, f"{did}: {describe(before.past)}", pointer.now, seconds=UNDO_S
             )
+        elif action.startswith("go_to:"):
+            name = history.describe_entry(work.past, len(work.past.past))
+            work = workspace.with_message(work, f"Back to: {name}", pointer.now, seconds=UNDO_S)
     return work
 
 
 UNDO_S = 2.0
 """How long it is said what an undo took back."""
 _UNDOES = {"undo": ("Undid", history.next_undo), "redo": ("Redid", history.next_redo)}
+_HISTORY_PX = 280.0
+_FLAT = imgui.ChildFlags_.nav_flattened.value
+
+
+def draw_history(work: Workspace, ui: UiContext) -> tuple[Workspace, list[str]]:
+    """The list of what was done, the last of it at the foot, over the panel's buttons for undo.
+
+    Returns:
+        The workspace; what was chosen.
+    """
+    if work.history:
+        imgui.open_popup("history")
+    display, row, asked = imgui.get_io().display_size, imgui.get_text_line_height_with_spacing(), list[str]()
+    at = imgui.ImVec2(display.x - 12.0 * ui.scale, display.y - 44.0 * ui.scale)
+    imgui.set_next_window_pos(at, 0, imgui.ImVec2(1.0, 1.0))
+    with menu("history", ui) as is_open:
+        count, now = len(history.entries(work.past)), len(work.past.past)
+        wide = min(_HISTORY_PX * ui.scale, display.x)
+        if is_open and imgui.begin_child("entries", imgui.ImVec2(wide, row * min(count, ROWS)), _FLAT):
+            if work.history:
+                imgui.set_scroll_y(row * max(now - ROWS // 2, 0))
+            clipper = imgui.ListClipper()
+            clipper.begin(count, row)
+            clipper.include_item_by_index(now)
+            while clipper.step():
+                for i in range(clipper.display_start, clipper.display_end):
+                    asked += [f"go_to:{i}"] * _history_row(work.past, i, ui)
+        if is_open:
+            imgui.end_child()
+    return replace(work, history=False if is_open else None), asked
+
+
+def _history_row(past: history.History, index: int, ui: UiContext) -> bool:
+    now, keep = len(past.past), imgui.SelectableFlags_.no_auto_close_popups.value
+    name = history.describe_entry(past, index)
+    imgui.push_style_color(imgui.Col_.text, imgui.ImVec4(*(PALETTE.faint if index > now else PALETTE.text)))
+    line = elide(f"{name[:1].upper()}{name[1:]}", 0.9 * _HISTORY_PX * ui.scale)
+    pressed = imgui.selectable(f"{line}##{index}", index == now, keep)[0]
+    imgui.pop_style_color()
+    if index == now and imgui.is_window_appearing():
+        imgui.set_item_default_focus()
+    return bool(pressed)

@@ -290,8 +290,7 @@ class MainView:
         if self.work.view.layers != before.view.layers:
             self.work = replace(self.work, before=False)
         if self.work != before:
-            view = actions.end_at_edit(before.view, self.work.view)
-            self.work = replace(self.work, view=view)
+            self.work = actions.end_at_edit(before, self.work)
             self.wake()
 
     def _draw_picture(self, screen: moderngl.Framebuffer) -> None:

@@ -262,7 +262,7 @@ def _footer(work: Workspace, ui: UiContext, actions: list[str]) -> None:
     right = right_edge()
     changes = {"undo": history.next_undo(work.past), "redo": history.next_redo(work.past)}
     named = zip(changes.items(), (Icon.UNDO, Icon.REDO), strict=True)
-    steps = [(name, icon, what) for (name, what), icon in named]
+    steps = [*((name, icon, what) for (name, what), icon in named), ("history", Icon.HISTORY, "")]
     icon_row(steps, ui, actions, 8.0 * ui.scale, off=[name for name, what in changes.items() if not what])
     side, gap = imgui.get_frame_height(), 6.0 * ui.scale
     imgui.same_line(right - 3 * side - 2 * gap)

@@ -147,6 +147,7 @@ TOPICS: dict[str, tuple[Command, ...]] = {
         Command("unfocus", "Leave tool, deselect", "Escape"),
         Command("undo", "Undo", "Ctrl+Z", repeats=True),
         Command("redo", "Redo", "Ctrl+Shift+Z Ctrl+Y", repeats=True),
+        Command("history", "History…", "Ctrl+Alt+Z", "Everything that was done; one goes back to any of it"),
     ),
     "Brush": (
         Command("brush", "Paint strength", "B", "Of the selected layer, by a left drag"),
