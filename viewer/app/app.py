@@ -19,9 +19,10 @@ from viewer.render.engine import ViewEngine
 from viewer.state import workspace
 from viewer.state.snapshots import SliderSnapshot
 from viewer.state.view_state import LayerState, ViewState
+from viewer.ui.keys import bind
 from viewer.ui.window import Window, interruptible
 
-from .application import error_details, error_line, log_error
+from .application import LOG, error_details, error_line, log_error
 from .file_actions import FileActions, StrayActions
 from .main_view import MainView
 from .studio.deliver import DeliverActions
@@ -67,6 +68,7 @@ def run(
     try:
         app = App(window, document, state, session, draw=draw)
         app.main_view.restart(state, snapshots)
+        app.bind_keys()
         if warning:
             app.main_view.show_message(warning, error=True)
         app.file_actions.offer_autosave()
@@ -135,6 +137,16 @@ class App:
             for part in (self.jobs, self.strays, self.up, self.preview, self.start):
                 parts.callback(part.close)
             self._keep_picture()
+
+    def bind_keys(self) -> None:
+        """The keys that the person gave to commands; what is wrong with them is a line, and in the log."""
+        bind({})
+        with self._guard():
+            if problems := bind(user_files.read_keys(self._memory)):
+                where, more = user_files.keys_file(self._memory), len(problems) - 1
+                log_error("\n".join([f"{where}:", *problems]), self._memory)
+                text = f"{where.name}: {problems[0]}" + (f", and {more} more in {LOG}" if more else "")
+                self.main_view.show_message(text, error=True)
 
     def report(self, error: Exception) -> None:
         """What a part of the loop raised becomes a message; a mistake of ours is logged too, and what is

@@ -5,6 +5,7 @@ Everything that goes wrong here is one line in the window; the work stays as it 
 
 from __future__ import annotations
 
+import webbrowser
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
@@ -30,7 +31,7 @@ from viewer.camera.view_camera import first_camera, from_camera, to_camera
 from viewer.files import document as documents
 from viewer.files import exports, session, timeline_file
 from viewer.files.session import SessionAutosave, WindowSession, session_file
-from viewer.files.user_files import parse_path, read_recent, remember_recent
+from viewer.files.user_files import parse_path, read_recent, remember_recent, write_keys
 from viewer.jobs.training import with_picture
 from viewer.state import selection, workspace
 from viewer.state.facts import describe_applied
@@ -38,7 +39,7 @@ from viewer.state.layers import add_layer, duplicate_layer, replace_edit
 from viewer.state.timeline import Player
 from viewer.state.view_state import ViewState, on_another_scene
 from viewer.state.workspace import Dialog, focus_layer, with_camera
-from viewer.ui.keys import shortcut
+from viewer.ui.keys import COMMANDS, shortcut
 
 from . import dialogs
 from .application import Application, error_details, failure_line, log_error
@@ -323,8 +324,17 @@ class FileActions:
             self._report_errors(lambda: self._keep_region(argument))
         elif name == "rename_region":
             self._report_errors(lambda: self._rename_region(*argument.split(":", 1)))
+        elif name == "keys_file":
+            self._report_errors(self._open_keys)
         elif name == "quit":
             self._leave()
+
+    def _open_keys(self) -> None:
+        """The file of keys in the program that the desktop has for it, with all there are in it at first."""
+        keys = {action: command.keys.split() for action, command in COMMANDS.items()}
+        path = write_keys(keys, self._memory)
+        webbrowser.open(path.as_uri())
+        self._app.main_view.show_message(f"Keys are read from {path} when the window opens")
 
     def poll_dialog(self) -> float | None:
         """Look whether a file was chosen in the desktop's own dialog, and take it.

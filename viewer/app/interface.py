@@ -18,7 +18,7 @@ from viewer.state.facts import obstacle
 from viewer.state.workspace import PreviewState, Workspace
 from viewer.ui import overlay
 from viewer.ui.context import FIXED, PALETTE, SMALL_PX, UiContext, u32
-from viewer.ui.keys import JOINED, TOPICS, Command, chords, find_commands, match, shortcut
+from viewer.ui.keys import JOINED, TOPICS, Command, chords, find_commands, is_changed, match, shortcut
 from viewer.ui.pointer import PointerContext
 from viewer.ui.widgets import elide, menu, search_field
 
@@ -72,13 +72,17 @@ def topics() -> tuple[Topic, ...]:
 
 def _lines(commands: Sequence[Command]) -> Iterator[tuple[str, str]]:
     """Keys and text of each row; a key with Shift beside the same one is only spoken of in the text."""
+    shown = False  # the command is in the row before it
     for command, following in zip_longest(commands, commands[1:]):
-        keys = chords(command.action)
-        if following is not None and following.row == JOINED:
-            others = chords(following.action)
-            keys += [key for key in others if key.replace("Shift+", "") not in keys or "Shift" in keys[0]]
-        if keys and command.row != JOINED:
-            yield command.listed or ", ".join(keys), command.row or command.name
+        keys, joins = chords(command.action), following is not None and following.row == JOINED
+        changed = is_changed(command) or (joins and is_changed(following))
+        if joins and not changed:
+            keys += [key for key in chords(following.action) if key.replace("Shift+", "") not in keys]
+        if keys and not shown:
+            plain = changed or command.row == JOINED
+            listed, text = ("", "") if plain else (command.listed, command.row)
+            yield listed or ", ".join(keys), text or command.name
+        shown = joins and not changed
 
 
 def columns(topics: Sequence[Topic], count: int) -> list[list[Topic]]:

@@ -51,7 +51,7 @@ REQUESTS = (
         "stop_and_quit",
     ),
     *("export", "export_page", "render_picture", "render_film", "deliver", "drop_and_quit"),
-    *("about", "demo", "decal", "rebind", "rebind_from"),
+    *("about", "keys_file", "demo", "decal", "rebind", "rebind_from"),
     *("overwrite", "restore_autosave", "discard_autosave", "duplicate", "replace", "replace_by"),
     *(
         "remove_selected",

@@ -6,8 +6,9 @@ Menus, tips, the list of keys and that of all commands are made from it.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 from imgui_bundle import imgui
 
@@ -203,6 +204,7 @@ TOPICS: dict[str, tuple[Command, ...]] = {
     "Window and files": (
         Command("palette", "All commands…", "Ctrl+P F3", "Find one by its name", types=True),
         Command("help", "Keys and mouse", "F1", types=True),
+        Command("keys_file", "Change keys…", "", "The file in which each command has its keys"),
         Command("picture", "Save picture", "F2", "As it is on screen, as PNG"),
         Command("take_view", "Take this view", "Ctrl+F2", "Without edits, to be changed elsewhere"),
         Command("window_picture", "Save whole window", "Shift+F2", "As PNG"),
@@ -233,15 +235,65 @@ TOPICS: dict[str, tuple[Command, ...]] = {
 COMMANDS = {command.action: command for commands in TOPICS.values() for command in commands}
 KEYS: dict[str, Command] = {}
 """By its chord, what each key does; see `bind`."""
+NAMES = (
+    *"ABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789\\[],.=-",
+    *(f"F{i}" for i in range(1, 13)),
+    *("Left", "Right", "Up", "Down", "Escape", "Tab", "Enter", "Backspace", "Space", "Delete"),
+    *(f"Num{i}" for i in (*range(10), ".")),
+)
+"""Keys that the window tells apart."""
 
 
-def bind() -> None:
-    """The keys of the table."""
+def bind(changes: Mapping[str, Any]) -> list[str]:
+    """The keys of the table, but for those of some actions; what is wrong with these, a line for each.
+
+    Args:
+        changes: by its action a chord, several or "" for none; a key that was another one's is no longer that
+    """
+    problems, given, changed = list[str](), dict[str, Command](), list[Command]()
+    for action, value in changes.items():
+        texts = [value] * bool(value) if isinstance(value, str) else value
+        try:
+            if action not in COMMANDS:
+                raise ValueError("there is no such command")
+            if not (isinstance(texts, list) and all(isinstance(text, str) for text in texts)):
+                raise ValueError('keys are written as "F6" or ["F6", "Ctrl+B"]')
+            taken = dict.fromkeys(map(parse_chord, texts), COMMANDS[action])
+            if twice := [chord for chord in taken if chord in given]:
+                raise ValueError(f"{twice[0]} is that of {given[twice[0]].action} already")
+            if flies := [chord for chord in taken if chord in FLY_KEYS and not COMMANDS[action].tap]:
+                raise ValueError(f"{flies[0]} flies")
+            given.update(taken)
+            changed.append(COMMANDS[action])
+        except ValueError as error:
+            problems.append(f"{action}: {error}")
     KEYS.clear()
-    KEYS.update({chord: command for command in COMMANDS.values() for chord in command.keys.split()})
+    for command in COMMANDS.values():
+        mine = [chord for chord, other in given.items() if other is command]
+        kept = [] if command in changed else [chord for chord in command.keys.split() if chord not in given]
+        KEYS.update(dict.fromkeys([*mine, *kept], command))
+    return problems
 
 
-bind()
+def parse_chord(text: str) -> str:
+    """A chord as a person writes it, as in `KEYS`.
+
+    Raises:
+        ValueError: there is no such key.
+    """
+    *modifiers, key = (part.strip().capitalize() for part in text.strip().rsplit("+"))
+    if key not in NAMES or not {*modifiers} <= {*_MODIFIERS}:
+        raise ValueError(f"there is no key {text}")
+    return "+".join([*(name for name in _MODIFIERS if name in modifiers), key])
+
+
+_MODIFIERS = ("Ctrl", "Shift", "Alt")
+bind({})
+
+
+def is_changed(command: Command) -> bool:
+    """Whether the person has given it other keys, or its own to another one."""
+    return [chord for chord, other in KEYS.items() if other is command] != command.keys.split()
 
 
 def chords(action: str) -> list[str]:

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import json
 import sys
+import webbrowser
+from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from imgui_bundle import imgui
 
-from tests.helpers.ui_rig import Rig, rig
+from tests.helpers.null_app import null_app, press
+from tests.helpers.sessions import bear_files, opened_document
+from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from tests.viewer.app.test_keys_of_lists_and_form import strike, type_text
 from viewer.app import interface
 from viewer.state import actions, selection, workspace
 from viewer.ui.context import SMALL_PX
-from viewer.ui.keys import COMMANDS, JOINED, find_commands
+from viewer.ui.keys import COMMANDS, JOINED, KEYS, bind, find_commands, shortcut
 
 SMALLEST = (1024, 640)
 
@@ -37,22 +43,15 @@ INTERNAL = {
     *("replace_by", "place", "keep_placed", "put_back", "lay_decal", "save_region", "rename_region"),
     *("set_up", "keep_up", "press_layer", "master", "rename_group", "restore", "forget", "name_snapshot"),
     *("move_snapshot", "choose_snapshot", "blend_snapshots", "region", "show_region", "forget_region"),
-    *("select_invert", "move_key", "seek", "length", "fps"),
+    *("select_invert", "move_key", "seek", "length", "fps", "go_to"),
 }
 """Asked for by a button, a question or a drag, with what it is about: nothing to look up by its name."""
 
 
 def test_every_action_has_its_command_or_is_no_one_s_to_look_up() -> None:
     everything = {*actions.ACTIONS, *workspace.REQUESTS, *selection.CHANGES, "frame", "home", "invert"}
+    everything |= {"paint_clear", "paint_fill", "paint_invert", "paint_feather"}
     everything |= {"next_slider", "blend_snapshots"}
-    everything |= {
-        "paint_clear",
-        "paint_fill",
-        "paint_invert",
-        "paint_feather",
-        "next_slider",
-        "blend_snapshots",
-    }
     named = {action.partition(":")[0] for action in COMMANDS}
     assert named | INTERNAL == everything
     assert not named & INTERNAL
@@ -142,6 +141,87 @@ def test_columns_keep_all_topics_in_their_order_and_none_is_longer_than_need_be(
     assert tuple(topic for column in found for topic in column) == topics
     longest = max(sum(topic.height for topic in column) for column in found)
     assert longest <= sum(topic.height for topic in topics) / count + max(t.height for t in topics)
+
+
+@pytest.fixture
+def own_keys() -> Iterator[None]:
+    """The table's keys again, after the test."""
+    yield
+    bind({})
+
+
+@pytest.mark.usefixtures("own_keys")
+def test_a_command_gets_the_keys_it_is_given_and_another_one_loses_them() -> None:
+    given = {"snapshot": "f6", "beside": ["shift+ctrl+J", "Y"], "quit": "", "difference": "T", "before": "B"}
+    assert bind(given) == []
+    found = {
+        action: [chord for chord, command in KEYS.items() if command.action == action] for action in COMMANDS
+    }
+    assert (found["snapshot"], found["beside"], found["quit"]) == (["F6"], ["Ctrl+Shift+J", "Y"], [])
+    assert (found["timeline"], found["brush"]) == ([], []), "T and B do something else now"
+    assert found["undo"] == ["Ctrl+Z"]
+    assert (shortcut("snapshot"), shortcut("quit")) == ("F6", "")
+    rows = {does: keys for topic in interface.topics() for keys, does in topic.rows}
+    assert (rows["Add snapshot"], rows["Compare snapshots"]) == ("F6", "Shift+F5"), "each in a row of its own"
+    assert "Quit" not in rows
+    assert bind({}) == []
+    assert shortcut("snapshot") == "F5"
+
+
+WRONG = {
+    "snapsot": ("F6", "there is no such command"),
+    "snapshot": ("F13", "there is no key F13"),
+    "undo": ("Ctrl+", "there is no key Ctrl+"),
+    "redo": ("Hyper+Z", "there is no key Hyper+Z"),
+    "split": (["Y", 7], 'keys are written as "F6" or ["F6", "Ctrl+B"]'),
+    "hide": ({"key": "H"}, 'keys are written as "F6" or ["F6", "Ctrl+B"]'),
+    "solo": ("F7", "F7 is that of lock already"),
+    "fold": ("w", "W flies"),
+}
+
+
+@pytest.mark.usefixtures("own_keys")
+def test_what_is_wrong_with_a_key_is_a_line_and_its_command_keeps_what_it_had() -> None:
+    before = dict(KEYS)
+    problems = bind({"lock": "F7", **{action: value for action, (value, _) in WRONG.items()}})
+    assert problems == [f"{action}: {line}" for action, (_, line) in WRONG.items()]
+    assert {chord: key for chord, key in KEYS.items() if key.action != "lock"} == {
+        chord: key for chord, key in before.items() if key.action != "lock"
+    }
+
+
+@pytest.mark.gl
+@pytest.mark.usefixtures("own_keys")
+def test_the_file_of_keys_is_made_whole_and_read_when_the_window_opens(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened: list[str] = []
+    monkeypatch.setattr(webbrowser, "open", opened.append)
+    with null_app(opened_document(bear_files(tmp_path)), first_view(bear(), 0.5, 0.5), tmp_path) as app:
+        app.main_view.request("keys_file")
+        app.draw()
+        path = tmp_path / "memory" / "keys.json"
+        assert opened == [path.as_uri()]
+        assert [*json.loads(path.read_text())] == [*COMMANDS]
+        before = dict(KEYS)
+        app.bind_keys()
+        assert before == KEYS, "as it was made it changes nothing"
+        assert app.main_view.work.message is not None
+        assert app.main_view.work.message.text.startswith("Keys are read from")
+        path.write_text('{"grid": "F8", "undo": 3, "nothing": "F9"}')
+        app.bind_keys()
+        said = 'keys.json: undo: keys are written as "F6" or ["F6", "Ctrl+B"], and 1 more in window.log'
+        assert app.main_view.work.message.text == said
+        assert "nothing: there is no such command" in (tmp_path / "memory" / "window.log").read_text()
+        press(app, "Shift+G")
+        assert not app.main_view.work.view.grid
+        press(app, "F8")
+        assert app.main_view.work.view.grid
+        for damaged in ("{", "[1]", "\xff"):
+            path.write_bytes(damaged.encode("latin-1"))
+            app.bind_keys()
+            assert "keys.json is damaged" in app.main_view.work.message.text
+            assert before == KEYS
 
 
 def shown(hand: Rig) -> imgui.internal.Window:
