@@ -27,10 +27,11 @@ from viewer.state import workspace
 from viewer.state.snapshots import SliderSnapshot
 from viewer.state.view_state import LayerState, ViewState
 from viewer.ui.context import UiContext
+from viewer.ui.keys import bind
 from viewer.ui.overlay import draw_splash
 from viewer.ui.window import Window, interruptible
 
-from .application import error_details, error_line, log_error
+from .application import LOG, error_details, error_line, log_error
 from .file_actions import FileActions, StrayActions
 from .main_view import MainView
 from .studio.deliver import DeliverActions
@@ -114,6 +115,7 @@ def _start(window: Window, opening: Future[Opened], workers: ThreadPoolExecutor,
         ui.close()
     app = App(window, opened.document, opened.view, session, draw=draw)
     app.main_view.restart(opened.view, opened.snapshots)
+    app.bind_keys()
     if opened.warning:
         app.main_view.show_message(opened.warning, error=True)
     app.file_actions.offer_autosave()
@@ -195,6 +197,16 @@ class App:
             for part in (self.jobs, self.strays, self.up, self.preview, self.start):
                 parts.callback(part.close)
             self._keep_picture()
+
+    def bind_keys(self) -> None:
+        """The keys that the person gave to commands; what is wrong with them is a line, and in the log."""
+        bind({})
+        with self._guard():
+            if problems := bind(user_files.read_keys(self._memory)):
+                where, more = user_files.keys_file(self._memory), len(problems) - 1
+                log_error("\n".join([f"{where}:", *problems]), self._memory)
+                text = f"{where.name}: {problems[0]}" + (f", and {more} more in {LOG}" if more else "")
+                self.main_view.show_message(text, error=True)
 
     def report(self, error: Exception) -> None:
         """What a part of the loop raised becomes a message; a mistake of ours is logged too, and what is

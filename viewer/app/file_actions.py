@@ -5,6 +5,7 @@ Everything that goes wrong here is one line in the window; the work stays as it 
 
 from __future__ import annotations
 
+import webbrowser
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
@@ -31,7 +32,7 @@ from viewer.files import document as documents
 from viewer.files import exports, session, timeline_file
 from viewer.files.document import Document
 from viewer.files.session import SessionAutosave, WindowSession, session_file
-from viewer.files.user_files import parse_path, read_recent, remember_recent
+from viewer.files.user_files import parse_path, read_recent, remember_recent, write_keys
 from viewer.jobs.training import with_picture
 from viewer.state import selection, workspace
 from viewer.state.facts import describe_applied
@@ -39,6 +40,7 @@ from viewer.state.layers import add_layer, duplicate_layer, replace_edit
 from viewer.state.timeline import Player
 from viewer.state.view_state import ViewState, on_another_scene
 from viewer.state.workspace import Dialog, focus_layer, with_camera
+from viewer.ui.keys import COMMANDS, shortcut
 
 from . import dialogs
 from .application import Application, error_details, failure_line, log_error
@@ -67,7 +69,9 @@ def edit_picture(main_view: MainView, path: Path) -> None:
     """
     camera = find_picture_camera(path, origin=main_view.facts.origin)
     if edits := edits_in_picture(path):
-        raise ProgdfError(f"{path.name} was taken with edits on ({edits}); take the view with Ctrl+F2")
+        raise ProgdfError(
+            f"{path.name} was taken with edits on ({edits}); take the view with {shortcut('take_view')}"
+        )
     _take_camera(main_view, camera)
     work = main_view.work
     main_view.work = replace(work, form=with_picture(work.form, path, work.form_open), form_open=True)
@@ -100,7 +104,7 @@ def open_timeline(main_view: MainView, path: Path) -> None:
     view = main_view.work.view
     main_view.change(replace(view, timeline=timeline_file.load(path, view.layers, main_view.facts.origin)))
     main_view.work = replace(main_view.work, player=Player(shown=True))
-    main_view.show_message(f"Opened {path.name}; press Space to play it")
+    main_view.show_message(f"Opened {path.name}; press {shortcut('play')} to play it")
 
 
 class EditActions:
@@ -256,9 +260,8 @@ class StrayActions:
         mask[strays.rows] = True
         main_view.change(replace(view, selection=selection.hide(view.selection, mask)))
         change = "no pixel differs" if db >= NO_DIFFERENCE else f"{db:.1f} dB to the pictures before"
-        main_view.show_message(
-            f"Hid {group_digits(len(strays.rows))} strays ({strays.describe()}): {change}; Alt+H shows them"
-        )
+        hid = f"Hid {group_digits(len(strays.rows))} strays ({strays.describe()})"
+        main_view.show_message(f"{hid}: {change}; {shortcut('show_all')} shows them")
 
 
 def _search(scene: Gaussians) -> tuple[Strays, float]:
@@ -322,8 +325,17 @@ class FileActions:
             self._report_errors(lambda: self._keep_region(argument))
         elif name == "rename_region":
             self._report_errors(lambda: self._rename_region(*argument.split(":", 1)))
+        elif name == "keys_file":
+            self._report_errors(self._open_keys)
         elif name == "quit":
             self._leave()
+
+    def _open_keys(self) -> None:
+        """The file of keys in the program that the desktop has for it, with all there are in it at first."""
+        keys = {action: command.keys.split() for action, command in COMMANDS.items()}
+        path = write_keys(keys, self._memory)
+        webbrowser.open(path.as_uri())
+        self._app.main_view.show_message(f"Keys are read from {path} when the window opens")
 
     def poll_dialog(self) -> float | None:
         """Look whether a file was chosen in the desktop's own dialog, and take it.

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import zip_longest
 from pathlib import Path
 
 from imgui_bundle import imgui
@@ -16,9 +17,10 @@ from viewer.state.actions import GLIDES, perform
 from viewer.state.facts import obstacle
 from viewer.state.workspace import PreviewState, Workspace
 from viewer.ui import overlay
-from viewer.ui.context import FIXED, PALETTE, SMALL_PX, UNFOCUSED, UiContext
-from viewer.ui.keys import TOPICS
+from viewer.ui.context import FIXED, PALETTE, SMALL_PX, UiContext, u32
+from viewer.ui.keys import JOINED, TOPICS, Command, chords, find_commands, is_changed, match, shortcut
 from viewer.ui.pointer import PointerContext
+from viewer.ui.widgets import elide, menu, search_field
 
 from . import dialogs, mouse, select_tool
 from .mouse import MouseTool
@@ -26,26 +28,27 @@ from .studio import pages
 from .studio.pages import UpStrip
 
 MOUSE_HELP = (
-    ("Left drag", "orbit; with Alt also while a tool is on"),
-    ("Middle drag", "orbit; with Shift pan, with Ctrl dolly"),
-    ("Right drag", "pan; in fly mode look around"),
-    ("Wheel", "zoom"),
-    ("Click", "select the layer under the cursor"),
-    ("Double-click", "set the orbit pivot"),
-    ("Axes", "click an end to look from there"),
-    ("W A S D Q E", "fly; Shift faster, Alt slower"),
-    ("Shift on a slider", "fine adjustment"),
-    ("Ctrl+click a slider", "type a value"),
-    ("Double-click a slider", "reset it"),
-    ("Right-click", "menu of a layer or snapshot"),
-    ("Esc, right-click", "cancel a drag"),
+    ("Left drag", "Orbit"),
+    ("Alt+left drag", "Orbit, with a tool too"),
+    ("Middle drag", "Orbit; Shift pans"),
+    ("Ctrl+middle drag", "Dolly"),
+    ("Right drag", "Pan; look around in fly"),
+    ("Wheel", "Zoom"),
+    ("Click", "Layer under the mouse"),
+    ("Double-click", "Orbit pivot"),
+    ("Axes", "Look from an end"),
+    ("W A S D Q E", "Fly; Shift fast, Alt slow"),
+    ("Slider", "Drag; Shift fine"),
+    ("Ctrl+click it", "Type a value"),
+    ("Double-click it", "Reset"),
+    ("Right-click", "Menu; cancels a drag"),
 )
 
-_MAC = (("Cmd", "does what Ctrl does here; shortcuts take both"),)
+_MAC = (("Cmd", "Is Ctrl here; both work"),)
 
 _ROW, _BETWEEN = 1.24, 0.7  # in sizes of the small text: from row to row, and above a heading
-COLUMN_PX, _MARGIN_PX = 322.0, 14.0  # at 1×
-_MOST_COLUMNS = 3
+COLUMN_PX, _MARGIN_PX = 248.0, 14.0  # at 1×
+MOST_COLUMNS = 4
 
 
 @dataclass(frozen=True)
@@ -64,10 +67,22 @@ class Topic:
 def topics() -> tuple[Topic, ...]:
     """Everything that can be done, each once."""
     mouse = Topic("Mouse", MOUSE_HELP + (_MAC if sys.platform == "darwin" else ()))
-    return mouse, *(
-        Topic(name, tuple((key.listed or key.chord, key.help) for key in keys if key.help))
-        for name, keys in TOPICS.items()
-    )
+    return mouse, *(Topic(name, tuple(dict.fromkeys(_lines(commands)))) for name, commands in TOPICS.items())
+
+
+def _lines(commands: Sequence[Command]) -> Iterator[tuple[str, str]]:
+    """Keys and text of each row; a key with Shift beside the same one is only spoken of in the text."""
+    shown = False  # the command is in the row before it
+    for command, following in zip_longest(commands, commands[1:]):
+        keys, joins = chords(command.action), following is not None and following.row == JOINED
+        changed = is_changed(command) or (joins and is_changed(following))
+        if joins and not changed:
+            keys += [key for key in chords(following.action) if key.replace("Shift+", "") not in keys]
+        if keys and not shown:
+            plain = changed or command.row == JOINED
+            listed, text = ("", "") if plain else (command.listed, command.row)
+            yield listed or ", ".join(keys), text or command.name
+        shown = joins and not changed
 
 
 def columns(topics: Sequence[Topic], count: int) -> list[list[Topic]]:
@@ -77,27 +92,133 @@ def columns(topics: Sequence[Topic], count: int) -> list[list[Topic]]:
     return next(packed for height in sorted(heights) if len(packed := _pack(topics, height)) <= count)
 
 
-def draw_bindings(room: imgui.ImVec2, ui: UiContext) -> None:
-    """The list in the middle of a `room` at the upper left; it scrolls where it is longer than that."""
-    margin, wide = _MARGIN_PX * ui.scale, COLUMN_PX * ui.scale
-    count = max(1, min(_MOST_COLUMNS, int((room.x - 2 * margin) / wide)))
-    packed = columns(topics(), count)
-    needed = max(sum(topic.height for topic in column) for column in packed) * _ROW * SMALL_PX * ui.scale
-    size = imgui.ImVec2(min(len(packed) * wide + 2 * margin, room.x), min(needed + 2 * margin, room.y))
+def filter_topics(topics: Sequence[Topic], query: str) -> list[Topic]:
+    """What of them is called, or done by keys, like that."""
+    rows = [
+        tuple(row for row in topic.rows if match(query, row[1], f"{topic.name} {row[0]}") is not None)
+        for topic in topics
+    ]
+    return [Topic(topic.name, left) for topic, left in zip(topics, rows, strict=True) if left]
+
+
+def draw_keys(room: imgui.ImVec2, query: str, ui: UiContext) -> str:
+    """The list of keys in the middle of a `room` at the upper left; it scrolls where it is longer than that.
+
+    Returns:
+        What is sought in it.
+    """
+    margin, wide, everything = _MARGIN_PX * ui.scale, COLUMN_PX * ui.scale, topics()
+    count = max(1, min(MOST_COLUMNS, int((room.x - 2 * margin) / wide)))
+    packed = columns(everything, count)
+    tall = max(sum(topic.height for topic in column) for column in packed) * _ROW * SMALL_PX * ui.scale
+    field = 30.0 * ui.scale
+    size = imgui.ImVec2(min(len(packed) * wide + 2 * margin, room.x), min(tall + field + 2 * margin, room.y))
     imgui.set_next_window_pos(imgui.ImVec2((room.x - size.x) / 2, (room.y - size.y) / 2))
     imgui.set_next_window_size(size)
     imgui.push_style_color(imgui.Col_.window_bg, imgui.ImVec4(*PALETTE.scrim[:3], 0.97))
     imgui.push_style_var(imgui.StyleVar_.window_rounding, 6.0 * ui.scale)
     imgui.push_style_var(imgui.StyleVar_.window_padding, imgui.ImVec2(margin, margin))
     imgui.push_style_var(imgui.StyleVar_.item_spacing, imgui.ImVec2(8.0 * ui.scale, 0.0))
-    imgui.begin("bindings", None, FIXED & ~imgui.WindowFlags_.no_scrollbar.value | UNFOCUSED)
+    imgui.begin("keys", None, FIXED & ~imgui.WindowFlags_.no_scrollbar.value)
     imgui.internal.bring_window_to_display_front(imgui.internal.get_current_window())
     left, top = imgui.get_cursor_pos_x(), imgui.get_cursor_pos_y()
-    for i, column in enumerate(packed):
-        _column(column, left + i * wide, top, ui)
+    query = search_field("Search keys", query)
+    found = filter_topics(everything, query)
+    for i, column in enumerate(columns(found, count) if found else ()):
+        _column(column, left + i * wide, top + field, ui)
     imgui.end()
     imgui.pop_style_var(3)
     imgui.pop_style_color()
+    return query
+
+
+def draw_lists(
+    work: Workspace, pointer: PointerContext, offered: Sequence[str], pressed: Sequence[str]
+) -> Workspace:
+    """The list of all commands, where it was asked for.
+
+    Args:
+        offered: its actions
+        pressed: chords that went down in this frame
+    """
+    if work.help and imgui.get_io().want_text_input and {"Escape", *chords("help")} & {*pressed}:
+        work = replace(work, help=False)  # its own field has the keyboard, so that they are no commands
+    if work.history is not None:
+        work, chosen = draw_history(work, pointer.ui)
+        work = perform_actions(work, chosen, pointer)
+    if work.palette is None:
+        return work
+    numbered = [f"{name}:{i}" for name in ("focus", "toggle") for i in range(len(work.view.layers) + 1, 10)]
+    there = [action for action in offered if action not in numbered]
+    work, asked = draw_palette(work, there, pressed, pointer.ui, pointer.area)
+    return perform_actions(work, [asked] * bool(asked), pointer)
+
+
+PALETTE_PX, ROWS = 460.0, 12
+"""Width of the list of commands at 1×, and how many it shows at once."""
+
+
+def draw_palette(
+    work: Workspace, offered: Sequence[str], pressed: Sequence[str], ui: UiContext, area: overlay.Area
+) -> tuple[Workspace, str]:
+    """A field and under it the commands that are called like that, the best first.
+
+    Returns:
+        The workspace; the action that was chosen, "" for none.
+    """
+    if work.palette == -1:
+        imgui.open_popup("commands")
+    wide, row = min(PALETTE_PX * ui.scale, area.width), imgui.get_frame_height()
+    place = imgui.ImVec2(area.width / 2, max(0.12 * area.height, 8.0 * ui.scale))
+    imgui.set_next_window_pos(place, 0, imgui.ImVec2(0.5, 0.0))
+    imgui.set_next_window_size(imgui.ImVec2(wide, 0.0))
+    asked, at = "", work.palette or 0
+    with menu("commands", ui, imgui.WindowFlags_.no_nav.value) as is_open:
+        if not is_open:
+            return replace(work, palette=None), ""
+        query = search_field("Search all commands", work.query)
+        found = find_commands(query, offered)
+        moved = 0 if at == -1 else ("Down" in pressed) - ("Up" in pressed)
+        fresh, at = at == -1 or query != work.query, 0 if query != work.query else at + moved
+        at = min(max(at, 0), max(len(found) - 1, 0))
+        imgui.push_style_var(imgui.StyleVar_.item_spacing, imgui.ImVec2(0.0, 0.0))
+        imgui.begin_child("found", imgui.ImVec2(0.0, row * min(ROWS, max(len(found), 1))))
+        if not found:
+            imgui.text_disabled("No command is called like that")
+        for i, command in enumerate(found):
+            if _command_row(command, i == at, ui):
+                asked = command.action
+            if i == at and (moved or fresh):
+                imgui.set_scroll_here_y(0.5)
+        imgui.end_child()
+        imgui.pop_style_var()
+        if work.palette != -1 and "Enter" in pressed and found:
+            asked = found[at].action
+        closes = asked or (work.palette != -1 and "Escape" in pressed)
+        if closes:
+            imgui.close_current_popup()
+    return replace(work, query=query, palette=None if closes else at), asked
+
+
+def _command_row(command: Command, chosen: bool, ui: UiContext) -> bool:
+    """Name, what it does, and its key at the right; whether it was clicked."""
+    x, y = imgui.get_cursor_screen_pos()
+    wide, tall = imgui.get_content_region_avail().x, imgui.get_frame_height()
+    pressed = imgui.invisible_button(command.action, imgui.ImVec2(wide, tall))
+    canvas, pad = imgui.get_window_draw_list(), 8.0 * ui.scale
+    if chosen or imgui.is_item_hovered():
+        ground = u32(PALETTE.accent if chosen else PALETTE.field)
+        canvas.add_rect_filled(imgui.ImVec2(x, y), imgui.ImVec2(x + wide, y + tall), ground, 4.0 * ui.scale)
+    ink, dim = (u32(PALETTE.ink),) * 2 if chosen else (u32(PALETTE.text), u32(PALETTE.dim))
+    top, key = round(y + imgui.get_style().frame_padding.y), shortcut(command.action)
+    end = x + wide - pad - imgui.calc_text_size(key).x
+    canvas.add_text(imgui.ImVec2(round(x + pad), top), ink, command.name)
+    canvas.add_text(imgui.ImVec2(round(end), top), ink, key)
+    x += 2 * pad + imgui.calc_text_size(command.name).x
+    imgui.push_font(None, SMALL_PX)
+    canvas.add_text(imgui.ImVec2(round(x), top + ui.scale), dim, elide(command.help, end - x - pad))
+    imgui.pop_font()
+    return bool(pressed)
 
 
 def _column(topics: Sequence[Topic], left: float, top: float, ui: UiContext) -> None:
@@ -236,7 +357,7 @@ def over_picture(
             work = replace(work, message=None)
             work = perform_actions(work, [line.button[1]] * (clicked == "do"), pointer)
     if work.help:
-        draw_bindings(free, ui)
+        work = replace(work, query=draw_keys(free, work.query, ui))
     return work
 
 
@@ -267,9 +388,54 @@ def perform_actions(work: Workspace, actions: Sequence[str], pointer: PointerCon
             work = workspace.with_message(
                 work, f"{did}: {describe(before.past)}", pointer.now, seconds=UNDO_S
             )
+        elif action.startswith("go_to:"):
+            name = history.describe_entry(work.past, len(work.past.past))
+            work = workspace.with_message(work, f"Back to: {name}", pointer.now, seconds=UNDO_S)
     return work
 
 
 UNDO_S = 2.0
 """How long it is said what an undo took back."""
 _UNDOES = {"undo": ("Undid", history.next_undo), "redo": ("Redid", history.next_redo)}
+_HISTORY_PX = 280.0
+_FLAT = imgui.ChildFlags_.nav_flattened.value
+
+
+def draw_history(work: Workspace, ui: UiContext) -> tuple[Workspace, list[str]]:
+    """The list of what was done, the last of it at the foot, over the panel's buttons for undo.
+
+    Returns:
+        The workspace; what was chosen.
+    """
+    if work.history:
+        imgui.open_popup("history")
+    display, row, asked = imgui.get_io().display_size, imgui.get_text_line_height_with_spacing(), list[str]()
+    at = imgui.ImVec2(display.x - 12.0 * ui.scale, display.y - 44.0 * ui.scale)
+    imgui.set_next_window_pos(at, 0, imgui.ImVec2(1.0, 1.0))
+    with menu("history", ui) as is_open:
+        count, now = len(history.entries(work.past)), len(work.past.past)
+        wide = min(_HISTORY_PX * ui.scale, display.x)
+        if is_open and imgui.begin_child("entries", imgui.ImVec2(wide, row * min(count, ROWS)), _FLAT):
+            if work.history:
+                imgui.set_scroll_y(row * max(now - ROWS // 2, 0))
+            clipper = imgui.ListClipper()
+            clipper.begin(count, row)
+            clipper.include_item_by_index(now)
+            while clipper.step():
+                for i in range(clipper.display_start, clipper.display_end):
+                    asked += [f"go_to:{i}"] * _history_row(work.past, i, ui)
+        if is_open:
+            imgui.end_child()
+    return replace(work, history=False if is_open else None), asked
+
+
+def _history_row(past: history.History, index: int, ui: UiContext) -> bool:
+    now, keep = len(past.past), imgui.SelectableFlags_.no_auto_close_popups.value
+    name = history.describe_entry(past, index)
+    imgui.push_style_color(imgui.Col_.text, imgui.ImVec4(*(PALETTE.faint if index > now else PALETTE.text)))
+    line = elide(f"{name[:1].upper()}{name[1:]}", 0.9 * _HISTORY_PX * ui.scale)
+    pressed = imgui.selectable(f"{line}##{index}", index == now, keep)[0]
+    imgui.pop_style_color()
+    if index == now and imgui.is_window_appearing():
+        imgui.set_item_default_focus()
+    return bool(pressed)

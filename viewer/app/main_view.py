@@ -31,6 +31,7 @@ from viewer.state.workspace import Dialog, PreviewState, SceneFacts
 from viewer.ui import overlay
 from viewer.ui.context import UiContext
 from viewer.ui.keys import (
+    COMMANDS,
     NO_KEYS,
     Keys,
     PendingKeys,
@@ -42,6 +43,7 @@ from viewer.ui.keys import (
     is_flying,
     is_repeating,
     requested_actions,
+    shortcut,
     tapped_actions,
 )
 from viewer.ui.pointer import PointerContext
@@ -277,8 +279,7 @@ class MainView:
         if self.work.view.layers != before.view.layers:
             self.work = replace(self.work, before=False)
         if self.work != before:
-            view = actions.end_at_edit(before.view, self.work.view)
-            self.work = replace(self.work, view=view)
+            self.work = actions.end_at_edit(before, self.work)
             self.wake()
 
     def _draw_picture(self, screen: moderngl.Framebuffer) -> None:
@@ -326,7 +327,7 @@ class MainView:
             self._keys = Keys(self._keys.pressed)
         self._keys = self._taps.without(self._keys)
         for action in (*requested_actions(self._keys), *tapped):
-            if self.at_start and action not in pages.KEYS:
+            if self.at_start and action not in pages.COMMANDS:
                 continue
             if not asks or action == "window_picture":  # which shows what is open, and changes nothing
                 self._perform(action)
@@ -452,6 +453,9 @@ class MainView:
                 pages.draw_cover(self.cover, self.work.view, pointer.size, pointer.area, self.ui)
         if (frame := self._frame()) is not None:
             overlay.draw_frame(self.work.view.safe_frame, frame, pointer.area, self.ui)
+        with self._guard():
+            offered = pages.COMMANDS if self.at_start else tuple(COMMANDS)
+            self.work = interface.draw_lists(self.work, pointer, offered, pressed)
         labels = self.canvas.comparer.labels(self.work.view)
         figures = self.figures() if self.work.view.overlay else []
         self.work = interface.over_picture(
@@ -502,7 +506,7 @@ class MainView:
         if request == "copy_values":
             text, what = layer_selection.copy_values(self.work)
             imgui.set_clipboard_text(text)
-            return f"Copied strength and gains of {what}; Ctrl+V pastes them"
+            return f"Copied strength and gains of {what}; {shortcut('paste_values')} pastes them"
         if request == "paste_values":
             self.work, what = layer_selection.paste_values(self.work, imgui.get_clipboard_text())
             return f"Pasted strength and gains to {what}"

@@ -104,7 +104,7 @@ def load(path: Path, layers: Sequence[LayerState], origin: Origin = ZERO) -> Tim
     except ValueError:
         value = None
     if not isinstance(value, dict) or MARK not in value:
-        raise ProgdfError(f"{path} is not a timeline; give the .json file that Ctrl+K in the window writes")
+        raise ProgdfError(f"{path} is not a timeline; give the .json file as which the window saves one")
     if value[MARK] != VERSION:
         raise ProgdfError(f"{path} is a timeline of version {value[MARK]!r}; this progdf reads {VERSION}")
     try:

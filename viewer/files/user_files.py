@@ -6,15 +6,16 @@ import contextlib
 import hashlib
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
 from progdf.errors import ProgdfError
-from progdf.io.atomic import atomic_write, state_folder
+from progdf.io.atomic import atomic_write, make_folder, state_folder
 from progdf.io.images import flatten_onto, open_picture
 from progdf.io.json_values import plain, read_json
 from viewer.state.workspace import Layout
@@ -90,6 +91,38 @@ def keep_layout(layout: Layout, folder: Path | None = None) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         with atomic_write(folder / "layout.json") as temporary_file:
             temporary_file.write_text(json.dumps(plain(layout)), encoding="utf-8")
+
+
+def read_keys(folder: Path | None = None) -> dict[str, Any]:
+    """The keys that the person gave to actions, see `keys.bind`; none where there is no such file.
+
+    Raises:
+        ProgdfError: it cannot be read; one line.
+    """
+    path = keys_file(folder)
+    return read_json(path, dict[str, Any]) if path.is_file() else {}
+
+
+def keys_file(folder: Path | None = None) -> Path:
+    """Where they are."""
+    return (folder or state_folder()) / "keys.json"
+
+
+def write_keys(keys: Mapping[str, Sequence[str]], folder: Path | None = None) -> Path:
+    """Begin that file with all there are, where there is none; its path.
+
+    Raises:
+        ProgdfError: it cannot be written; one line.
+    """
+    path = keys_file(folder)
+    if not path.exists():
+        make_folder(path.parent)
+        with atomic_write(path) as temporary_file:
+            lines = ",\n".join(
+                f" {json.dumps(action)}: {json.dumps(chords)}" for action, chords in keys.items()
+            )
+            temporary_file.write_text(f"{{\n{lines}\n}}\n", encoding="utf-8")
+    return path
 
 
 def keep_thumbnail(path: Path, pixels: NDArray[np.uint8], folder: Path | None = None) -> None:

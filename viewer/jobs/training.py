@@ -84,9 +84,7 @@ EDITORS = (
     EditorChoice(
         "instruct", "Describe it", "sentence", "A sentence for a model", "diffusers", "diffusion", False
     ),
-    EditorChoice(
-        "pictures", "Edited pictures", "pictures", "Taken here (Ctrl+F2), changed anywhere", pictured=False
-    ),
+    EditorChoice("pictures", "Edited pictures", "pictures", "Taken here, changed anywhere", pictured=False),
     EditorChoice("folder", "Edited views", "folder", "Pictures of its views that you edited", pictured=False),
 )
 

@@ -26,9 +26,11 @@ from viewer.ui.widgets import (
     elide,
     grip,
     group_digits,
+    hint,
     icon_button,
     label,
     menu,
+    menu_item,
     picture,
     right_edge,
     swatch,
@@ -134,19 +136,8 @@ CARD_PX = 66.0  # a whole card with what is between two, at 1×
 COMPACT_PX, SLIDER_PX, SLIM_PX = 7.0, 92.0, 16.0  # a compact row: its padding, its slider's width and height
 _MENU = "menu of a layer"
 _MENU_ITEMS = (
-    ("Rename…", "rename"),
-    ("Duplicate", "duplicate"),
-    ("Replace…", "replace"),
-    ("", ""),
-    ("Delete", "remove"),
-    ("", ""),
-    ("Copy values", "copy_values"),
-    ("Paste values", "paste_values"),
-    ("Reset values", "reset"),
-    ("", ""),
-    ("Group", "group"),
-    ("Select all layers", "select_layers"),
-    ("Reset all layers", "reset_all"),
+    *("rename", "duplicate", "replace", "", "remove", "", "copy_values", "paste_values", "reset", ""),
+    *("group", "select_layers", "reset_all"),
 )
 _OF_ONE = ("rename", "duplicate", "replace", "remove")
 """Actions that are told which layer; the others are about all that are selected."""
@@ -264,28 +255,26 @@ def _menu(state: ViewState, index: int, several: int, ui: UiContext, actions: li
         several: how many layers are selected with it, 0 for it alone
     """
     with menu(_MENU, ui) as is_open:
-        for name, action in _MENU_ITEMS if is_open else ():
+        for action in _MENU_ITEMS if is_open else ():
             if action == "group":
                 _group_menu(state, state.layers[index], ui, actions)
-                continue
-            if name == "Delete" and several > 1:
-                name = f"Delete {several} layers"
-            if not name:
+            elif not action:
                 imgui.separator()
-            elif imgui.menu_item(name, shortcut(action), False)[0]:
-                actions.append(f"{action}:{index}" if action in _OF_ONE else action)
+            else:
+                name = f"Delete {several} layers" if action == "remove" and several > 1 else ""
+                asked = f"{action}:{index}" if action in _OF_ONE else action
+                actions += [asked] * menu_item(action, name=name)
 
 
 def _group_menu(state: ViewState, layer: LayerState, ui: UiContext, actions: list[str]) -> None:
     if imgui.begin_menu("Group"):
-        if imgui.menu_item("New group", shortcut("group"), False)[0]:
-            actions.append("group")
+        actions += ["group"] * menu_item("group")
         for group in state.groups:
             name = elide(group.name, 200.0 * ui.scale)
             if imgui.menu_item(f"{name}##{group.name}", "", group.name == layer.group)[0]:
                 actions.append(f"group:{group.name}")
-        if layer.group and imgui.menu_item("Ungroup", shortcut("ungroup"), False)[0]:
-            actions.append("ungroup")
+        if layer.group:
+            actions += ["ungroup"] * menu_item("ungroup")
         imgui.end_menu()
 
 
@@ -310,7 +299,7 @@ def _head(
             work = replace(work, view=toggle_solo(work.view, index))
         else:
             work = _change_layer(work, index, lambda old: replace(old, enabled=not old.enabled))
-    tip(f"Show or hide ({shortcut('hide')}). Alt+click: solo")
+    hint("hide")
     imgui.same_line(0.0, gap)
     if compact:
         swatch(row.swatch, 1.0 if active else 0.35, True, ui)
@@ -330,7 +319,7 @@ def _head(
     imgui.dummy(imgui.ImVec2(number_width, imgui.get_frame_height()))
     if imgui.is_item_clicked() and not layer.locked:
         slider.start_typing("##strength")
-    tip(*("Locked", "lock") if layer.locked else ("Click to type a value",))
+    tip("Locked" if layer.locked else "Click to type a value")
     return work, touch
 
 
@@ -340,21 +329,24 @@ def _toggles(work: Workspace, index: int, over: bool, ui: UiContext, actions: li
     lock = Icon.LOCKED if layer.locked else Icon.UNLOCKED
     painting, unfolded = view.brush.active and work.focus == index, layer.gdf in view.unfolded
     buttons = (
-        ("menu", Icon.MENU, False, "Rename, duplicate, replace or delete (right-click)"),
-        ("brush", Icon.BRUSH, painting, "Paint its strength"),
-        ("fold", Icon.GAINS, unfolded, "What it is, gains, and the curve of visible change"),
-        ("lock", lock, layer.locked, "Lock strength, gains and paint"),
-        ("solo", Icon.SOLO, layer.solo, "Solo: show only soloed layers"),
+        ("menu", Icon.MENU, False),
+        ("brush", Icon.BRUSH, painting),
+        ("fold", Icon.GAINS, unfolded),
+        ("lock", lock, layer.locked),
+        ("solo", Icon.SOLO, layer.solo),
     )
     top = imgui.get_cursor_pos_y() + (imgui.get_frame_height() - side) / 2
     imgui.push_font(None, SMALL_PX)
     pressed = []
-    for action, icon, on, help_ in buttons if over else buttons[3 if layer.locked else 4 :]:
+    for action, icon, on in buttons if over else buttons[3 if layer.locked else 4 :]:
         imgui.set_cursor_pos_y(top)
         if not over and not on:
             continue
         pressed += [action] * icon_button(action, icon, ui, dim=not on, side=side)
-        tip(help_, action)
+        if action == "menu":
+            tip("Rename, duplicate, replace or delete (right-click)")
+        else:
+            hint(action)
         imgui.same_line(0.0, 0.0)
     imgui.pop_font()
     if "menu" in pressed:
@@ -446,7 +438,7 @@ def _name(
     imgui.get_window_draw_list().add_text(at, u32(color), elide(marks + layer.name, room))
     if imgui.is_item_hovered(imgui.HoveredFlags_.for_tooltip.value):
         work = replace(work, pointed=("layer", index))  # the picture shows its region
-    tip(f"{layer.name}\nDrag to reorder (Alt+↑ ↓), double-click to rename", "rename")
+    tip(f"{layer.name}\nDrag to reorder, double-click to rename ({shortcut('rename')})")
     double = imgui.is_mouse_double_clicked(imgui.MouseButton_.left.value) and _press(named) == "one"
     if imgui.is_item_hovered() and double:
         return replace(work, renaming=index), CardTouch(touched=True, named=named)

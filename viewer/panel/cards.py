@@ -19,7 +19,7 @@ from viewer.state.layers import (
     visible_layers,
     with_overshoot,
 )
-from viewer.state.view_state import OVERSHOOT, LayerGroup, ViewState
+from viewer.state.view_state import LayerGroup, ViewState
 from viewer.state.workspace import Workspace, is_compact
 from viewer.ui.context import PALETTE, SMALL_PX, Icon, UiContext, u32
 from viewer.ui.keys import shortcut
@@ -27,8 +27,10 @@ from viewer.ui.widgets import (
     accent_button,
     elide,
     grip,
+    hint,
     icon_button,
     menu,
+    menu_item,
     menu_items,
     more_button,
     right_edge,
@@ -44,12 +46,7 @@ from .card import COMPACT_PX, SLIDER_PX, SLIM_PX, draw_card
 MASTER_PX = 20.0  # of its slider, at 1×
 UNSEARCHED = 6
 """Layers that one finds without a search."""
-_BUTTONS = (
-    ("Group", "group", "Put them into a group with a switch and a strength of its own"),
-    ("Copy", "copy_values", "Copy their strengths and gains, as text"),
-    ("Paste", "paste_values", "Paste copied strengths and gains"),
-    ("Reset", "reset", "Strengths to 0, gains to 1"),
-)
+_BUTTONS = ("group", "copy_values", "paste_values", "reset")
 
 
 def draw_search(work: Workspace, ui: UiContext) -> str:
@@ -109,7 +106,7 @@ def draw_selection(state: ViewState, chosen: Sequence[int], ui: UiContext, actio
 
 
 _MENU = "menu of a group"
-_ITEMS = (("Rename…", "", ""), ("Select layers", "select_layers", ""), ("Ungroup", "ungroup", ""))
+_ITEMS = (("Rename…", "", ""), ("Select its layers", "select_layers", ""), ("Ungroup", "ungroup", ""))
 
 
 def draw_group(
@@ -230,7 +227,7 @@ def draw_heading(work: Workspace, ui: UiContext, actions: list[str]) -> Workspac
     imgui.same_line(right - wide - (side + 4.0 * ui.scale) * bool(work.view.layers))
     if (imgui.button if work.view.layers else accent_button)(text, imgui.ImVec2(wide, 0.0)):
         actions.append("new_edit")
-    tip("Choose a region and an editor, see it, train it", "new_edit")
+    hint("new_edit")
     if not work.view.layers:
         return work
     imgui.same_line(0.0, 4.0 * ui.scale)
@@ -250,10 +247,9 @@ def _choose_rules(work: Workspace, ui: UiContext, actions: list[str]) -> ViewSta
             state = replace(state, blend=blend)
         tip(BLEND_HELP[blend])
     imgui.separator()
-    if imgui.menu_item(f"Overshoot: sliders go to {OVERSHOOT:g}", shortcut("overshoot"), state.overshoot)[0]:
+    if menu_item("overshoot", state.overshoot):
         state = with_overshoot(state, not state.overshoot)
-    tip("Extrapolates past what was trained")
-    if imgui.menu_item("Compact rows", shortcut("cards"), is_compact(work))[0]:
+    if menu_item("cards", is_compact(work)):
         actions.append("cards")
     return state
 

@@ -25,6 +25,7 @@ from viewer.ui.context import BEHIND, FIXED, PALETTE, SMALL_PX, Icon, UiContext,
 from viewer.ui.widgets import (
     elide,
     group_digits,
+    hint,
     icon_button,
     icon_row,
     is_double_clicked,
@@ -43,25 +44,9 @@ from . import card, cards, new_edit_form, snapshot_cards, training_cards
 
 NAME = "main menu"
 MOST_PX = 360.0
-_MENU = (
-    ("", "", ""),
-    ("Save", "save", ""),
-    ("Save as…", "save_as", ""),
-    ("Take this view", "take_view", "A picture of it without edits, to be changed in any program"),
-    ("Hide strays", "hide_strays", "What a capture left where nothing is"),
-    ("", "", ""),
-    ("Shortcuts", "help", ""),
-    ("About", "about", ""),
-    ("Quit", "quit", ""),
-)
+_MENU = ("", "save", "save_as", "take_view", "hide_strays", "", "palette", "help", "about", "quit")
 _MOST_RECENT = 6
-_SHARES = (
-    ("Export scene…", "export", "The edited scene as a file of splats"),
-    ("Export web page…", "export_page", "A page with the sliders, for any browser"),
-    ("Render picture…", "render_picture", ""),
-    ("Render film…", "render_film", ""),
-    ("Save picture", "picture", "As it is on screen"),
-)
+_SHARES = ("export", "export_page", "render_picture", "render_film", "picture")
 
 
 def _menu_button(recent: Sequence[Path], side: float, ui: UiContext, actions: list[str]) -> None:
@@ -70,7 +55,7 @@ def _menu_button(recent: Sequence[Path], side: float, ui: UiContext, actions: li
         (elide(escape_text(path.name), MOST_PX * ui.scale), f"open_file:{path}", escape_text(str(path)))
         for path in recent[:_MOST_RECENT]
     ]
-    more_button(NAME, (("Open…", "open", ""), *files, *_MENU), ui, actions, Icon.BARS, side)
+    more_button(NAME, ("open", *files, *_MENU), ui, actions, Icon.BARS, side)
     tip("Menu")
 
 
@@ -193,7 +178,7 @@ def _title(
     below = imgui.get_cursor_pos()
     imgui.set_cursor_pos(imgui.ImVec2(at.x + room - 3 * side, at.y - 2.0 * scale))
     actions += ["save"] * icon_button("save", Icon.SAVE, ui, side=side)
-    tip("Save the session", "save")
+    hint("save")
     imgui.same_line(0.0, 0.0)
     more_button("share", _SHARES, ui, actions, Icon.SHARE, side)
     tip("Export and render")
@@ -269,11 +254,7 @@ def _row(index: int, region: NamedRegion, ui: UiContext, actions: list[str]) -> 
     return bool(resting)
 
 
-_FOOT = (
-    ("timeline", Icon.FILM, "Timeline: animate the camera and the strengths"),
-    ("picture", Icon.PICTURE, "Save the image as PNG"),
-    ("help", Icon.HELP, "Keyboard and mouse shortcuts"),
-)
+_FOOT = (("timeline", Icon.FILM), ("picture", Icon.PICTURE), ("help", Icon.HELP))
 
 
 def _footer(work: Workspace, ui: UiContext, actions: list[str]) -> None:
@@ -281,7 +262,7 @@ def _footer(work: Workspace, ui: UiContext, actions: list[str]) -> None:
     right = right_edge()
     changes = {"undo": history.next_undo(work.past), "redo": history.next_redo(work.past)}
     named = zip(changes.items(), (Icon.UNDO, Icon.REDO), strict=True)
-    steps = [(name, icon, f"{name.capitalize()}{what and ': '}{what}") for (name, what), icon in named]
+    steps = [*((name, icon, what) for (name, what), icon in named), ("history", Icon.HISTORY, "")]
     icon_row(steps, ui, actions, 8.0 * ui.scale, off=[name for name, what in changes.items() if not what])
     side, gap = imgui.get_frame_height(), 6.0 * ui.scale
     imgui.same_line(right - 3 * side - 2 * gap)

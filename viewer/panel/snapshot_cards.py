@@ -11,11 +11,11 @@ from viewer.state.facts import LayerRow
 from viewer.state.snapshots import compare_sides, is_blend, pair_of, with_original
 from viewer.state.workspace import Workspace
 from viewer.ui.context import PALETTE, SMALL_PX, Icon, UiContext, u32
-from viewer.ui.keys import shortcut
 from viewer.ui.widgets import (
     drop_down,
     elide,
     grip,
+    hint,
     icon_button,
     menu_items,
     picture,
@@ -65,7 +65,7 @@ def draw(
     imgui.same_line(right - wide)
     if imgui.button(f"{name}##snapshot"):
         actions.append("snapshot")
-    tip(f"Save the current sliders as a snapshot ({shortcut('snapshot')}); click a snapshot to restore it")
+    hint("snapshot")
     if len(textures) < 2 or "Snapshots" in work.layout.folded:
         return work
     snapshots = with_original(work.snapshots, work.view)
@@ -108,7 +108,7 @@ def _slider(cards: _Cards, work: Workspace, current: bool, ui: UiContext, action
             imgui.same_line(0.0, gap)
             if icon_button("compare snapshots", Icon.SPLIT, ui, dim=not compared):
                 actions.append("compare_snapshots")
-            tip("Compare A with B in the picture", "compare_snapshots")
+            hint("compare_snapshots")
             imgui.same_line(0.0, gap)
         imgui.set_next_item_width(wide)
         label = f"{slot.upper()}   {cards.names[chosen]}"

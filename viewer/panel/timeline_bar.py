@@ -13,9 +13,8 @@ from imgui_bundle import imgui
 from viewer.state.timeline import EASINGS, Player, key_at, key_before
 from viewer.state.view_state import FASTEST, LONGEST, Timeline
 from viewer.ui.context import PALETTE, SMALL_PX, UiContext, u32
-from viewer.ui.keys import shortcut
 from viewer.ui.overlay import Area
-from viewer.ui.widgets import icon_button, icon_row, is_released, plate, tip
+from viewer.ui.widgets import hint, icon_button, icon_row, is_released, plate, tip
 
 HEIGHT_PX, ROW_PX = 46.0, 33.0  # at 1×: of the bar, and of a second row
 ROOMY_PX = 520.0  # a narrower bar has its settings in a second row
@@ -60,7 +59,7 @@ def draw(timeline: Timeline, player: Player, frame: str, area: Area, ui: UiConte
         imgui.same_line(0.0, 4.0 * ui.scale)
         if icon_button("safe_frame", icons.ICON_FA_CROP_SIMPLE, ui, dim=not frame):
             actions.append("safe_frame")
-        tip(f"Safe frame ({shortcut('safe_frame')}): {frame or 'none'}")
+        hint("safe_frame", f"Now {frame or 'none'}")
     return tuple(actions)
 
 
@@ -78,11 +77,10 @@ def label_step(timeline: Timeline, span: float, room: float) -> int:
 def _buttons(timeline: Timeline, player: Player, frame: int, actions: list[str], ui: UiContext) -> None:
     icon = icons.ICON_FA_PAUSE if player.playing else icons.ICON_FA_PLAY
     on_key, can_play = key_at(timeline, frame) is not None, len(timeline.keys) > 1
-    key = "Update keyframe" if on_key else "Insert keyframe: camera and all strengths"
     items = (
-        ("play", icon, "Play or pause" if can_play else "Set at least two keyframes to play"),
-        ("key", icons.ICON_FA_DIAMOND, key),
-        ("drop_key", icons.ICON_FA_TRASH_CAN, "Delete keyframe"),
+        ("play", icon, "" if can_play else "Set at least two keyframes to play"),
+        ("key", icons.ICON_FA_DIAMOND, "In place of the present one" if on_key else ""),
+        ("drop_key", icons.ICON_FA_TRASH_CAN),
     )
     off = [*["play"] * (not can_play), *["drop_key"] * (not on_key)]
     icon_row(items, ui, actions, 2.0 * ui.scale, off=off)
@@ -96,11 +94,11 @@ def _settings(timeline: Timeline, frame: int, actions: list[str], ui: UiContext)
     if imgui.button(f"{easing.capitalize()}##easing", imgui.ImVec2(62.0 * ui.scale, 0.0)):
         actions.append("easing")
     imgui.end_disabled()
-    tip("Interpolation after the keyframe at or before the playhead: smooth, linear or hold", "easing")
+    hint("easing")
     imgui.same_line(0.0, gap)
     if icon_button("ping_pong", icons.ICON_FA_RIGHT_LEFT, ui, dim=not timeline.ping_pong):
         actions.append("ping_pong")
-    tip(f"Ping-pong ({shortcut('ping_pong')}): " + ("on" if timeline.ping_pong else "off"))
+    hint("ping_pong", "Now " + ("on" if timeline.ping_pong else "off"))
     imgui.same_line(0.0, gap)
     for name, now, most, unit, what in (
         ("length", timeline.length, LONGEST, "f", "Length in frames"),
@@ -118,7 +116,7 @@ def _settings(timeline: Timeline, frame: int, actions: list[str], ui: UiContext)
     if icon_button("timeline_file", icons.ICON_FA_FILE_EXPORT, ui, dim=not timeline.keys):
         actions.append("timeline_file")
     imgui.end_disabled()
-    tip("Save the timeline as a file", "timeline_file")
+    hint("timeline_file")
 
 
 def _ruler(timeline: Timeline, frame: int, wide: float, actions: list[str], ui: UiContext) -> None:

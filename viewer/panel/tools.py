@@ -25,16 +25,18 @@ from viewer.state.view_state import (
 from viewer.state.workspace import Pointed, Workspace
 from viewer.ui import overlay
 from viewer.ui.context import PALETTE, Icon, UiContext, u32
-from viewer.ui.keys import shortcut
+from viewer.ui.keys import COMMANDS, MODES, shortcut
 from viewer.ui.overlay import Area
 from viewer.ui.widgets import (
     choice,
     elide,
     group_digits,
+    hint,
     icon_button,
     icon_row,
     label,
     menu,
+    menu_item,
     more_button,
     plate,
     small,
@@ -47,45 +49,22 @@ TOOLBAR_PX, EDGE_PX = 40.0, 8.0  # at 1×: its width; between it and the picture
 NARROW_PX = 560.0  # of a picture whose bar may lie over the axes
 _SIDE_PX, _LEAST_PX, _PAD_PX = 32.0, 22.0, 4.0  # of a button, where the window is low; around the buttons
 _TOOLS = (
+    (("navigate:orbit", Icon.ORBIT), ("navigate:fly", Icon.FLY)),
     (
-        ("navigate:orbit", Icon.ORBIT, "Orbit around a pivot"),
-        ("navigate:fly", Icon.FLY, "Fly: W A S D, Q E; right drag looks around"),
+        ("select_tool:box", Icon.BOX),
+        ("select_tool:lasso", Icon.LASSO),
+        ("select_tool:polygon", Icon.POLYGON),
+        ("select_tool:brush", Icon.SELECT_BRUSH),
+        ("select_tool:scribble", Icon.SCRIBBLE),
+        ("select_tool:sphere", Icon.SPHERE),
+        ("select_tool:flood", Icon.FLOOD),
+        ("select_tool:color", Icon.COLOR),
     ),
-    (
-        ("select_tool:box", Icon.BOX, "Box"),
-        ("select_tool:lasso", Icon.LASSO, "Lasso"),
-        (
-            "select_tool:polygon",
-            Icon.POLYGON,
-            "Polygon: click its corners; Enter or a double click closes it",
-        ),
-        ("select_tool:brush", Icon.SELECT_BRUSH, "Brush"),
-        (
-            "select_tool:scribble",
-            Icon.SCRIBBLE,
-            "Scribble: a stroke or two on a thing, a few beside it (Ctrl)",
-        ),
-        ("select_tool:sphere", Icon.SPHERE, "Sphere: drag from its center on a surface"),
-        ("select_tool:flood", Icon.FLOOD, "Flood: click a surface; what is connected and alike in color"),
-        ("select_tool:color", Icon.COLOR, "Color: click; everything that is alike in color"),
-    ),
-    (
-        ("brush", Icon.BRUSH, "Paint the strength of the selected layer"),
-        ("decal", Icon.DECAL, "Decal: lay a picture on a surface"),
-        ("move_selected", Icon.MOVE, "Move, turn and scale what is selected: a layer with a slider"),
-    ),
+    (("brush", Icon.BRUSH), ("decal", Icon.DECAL), ("move_selected", Icon.MOVE)),
 )
-_MODES = "Shift adds, Ctrl subtracts, both intersect"
 _OPERATIONS = (
-    ("Smooth", "select_smooth", "Straighten the border, drop strays, fill holes"),
-    ("Largest part", "select_largest", "Keep only the largest connected part"),
-    ("Invert", "select_invert", "Select everything else"),
-    ("Select nothing", "select_none", ""),
-    ("Hide", "hide_selected", "Hide the selection"),
-    ("Isolate", "isolate", "Hide everything else"),
-    ("Remove", "remove_selected", "A layer that lets the selection vanish along its slider"),
-    ("Move", "move_selected", "A layer that moves, turns and scales the selection along its slider"),
-    ("Copy", "duplicate_selected", "A layer with a copy of the selection, placed by hand"),
+    *("select_smooth", "select_largest", "invert", "select_none", "hide_selected", "isolate"),
+    *("remove_selected", "move_selected", "duplicate_selected"),
 )
 COLUMN_PX = 88.0  # at 1×: where what a row chooses begins
 _DEPTHS = {False: "Front", True: "Through"}
@@ -112,14 +91,12 @@ def draw_toolbar(view: ViewState, area: Area, ui: UiContext, actions: list[str])
         for i, group in enumerate(_TOOLS):
             if i:
                 imgui.dummy(imgui.ImVec2(1.0, gap))
-            for action, icon, help_ in group:
+            for action, icon in group:
                 imgui.begin_disabled(off.get(action, False))
                 if icon_button(action, icon, ui, lit=action == held, side=side):
                     actions.append(action)
                 imgui.end_disabled()
-                missing = ".\nSelect something first" if action == "move_selected" and off[action] else ""
-                keys = "fly" if action.startswith("navigate") else action
-                tip(help_ + missing + (f"\n{_MODES}" if "select_tool" in action else ""), keys)
+                hint(action, "Select something first" * (action == "move_selected" and off[action]))
     imgui.pop_style_var()
 
 
@@ -139,13 +116,16 @@ class _Bar:
             imgui.same_line(0.0, gap)
 
     def segments(
-        self, name: str, options: dict[Value, str], current: Value, help_: str, action: str
+        self, name: str, options: dict[Value, str], current: Value, help_: str, action: str = ""
     ) -> Value:
         """One of a few values; the one that was chosen."""
         wide = sum(imgui.calc_text_size(text).x + 14.0 * self.ui.scale for text in options.values())
         self.follow(wide)
         pressed = choice(name, [*options.values()], [*options].index(current), self.ui, wide)
-        tip(help_, action)
+        if action:
+            hint(action, help_)
+        else:
+            tip(help_)
         return current if pressed is None else [*options][pressed]
 
     def slider(
@@ -164,11 +144,11 @@ class _Bar:
         tip(help_)
         return value
 
-    def button(self, text: str, action: str, help_: str, actions: list[str]) -> None:
+    def button(self, action: str, actions: list[str], icon: str = "") -> None:
+        text = icon + COMMANDS[action].name
         self.follow(imgui.calc_text_size(text).x + 2 * imgui.get_style().frame_padding.x)
-        if imgui.button(f"{text}##{action}"):
-            actions.append(action)
-        tip(help_, action)
+        actions += [action] * imgui.button(f"{text}##{action}")
+        hint(action)
 
 
 def draw_options(work: Workspace, area: Area, ui: UiContext, actions: list[str]) -> tuple[Workspace, float]:
@@ -213,28 +193,27 @@ def _selection(view: ViewState, bar: _Bar, actions: list[str]) -> Pointed | None
         if count and imgui.is_item_hovered(imgui.HoveredFlags_.for_tooltip.value):
             pointed = ("selection", 0)
         imgui.begin_disabled(not count)
-        bar.button("Grow", "select_grow", "Add the neighbors", actions)
-        bar.button("Shrink", "select_shrink", "Drop what borders on others", actions)
+        bar.button("select_grow", actions)
+        bar.button("select_shrink", actions)
         bar.follow(imgui.get_frame_height())
         more_button("more", _OPERATIONS, bar.ui, actions)
         tip("Smooth, invert, hide, remove, move, copy")
         _save(len(view.selection.regions), bar, actions)
         imgui.end_disabled()
     if view.selection.hidden:
-        bar.button(f"{Icon.HIDDEN}  Show hidden", "show_hidden", "Some splats are hidden: show all", actions)
+        bar.button("show_hidden", actions, f"{Icon.HIDDEN}  ")
     return pointed
 
 
 def _select_options(tool: SelectTool, bar: _Bar) -> SelectTool:
     """How the tool selects."""
     modes = dict(zip(SELECT_MODES, ("New", "Add", "Subtract", "Intersect"), strict=True))
-    help_ = f"What becomes of the present selection.\n{_MODES}"
+    help_ = f"What becomes of the present selection.\n{MODES}"
     if tool.tool == "scribble":
         modes, help_ = {"new": "On it", "subtract": "Beside it"}, "Where the next stroke is. Ctrl: beside it"
-    tool = replace(tool, mode=bar.segments("mode", modes, tool.mode, help_, ""))
+    tool = replace(tool, mode=bar.segments("mode", modes, tool.mode, help_))
     if tool.tool not in ("sphere", "flood", "scribble"):
-        help_ = "Select only the front surface, or everything behind it too"
-        through = bar.segments("depth", _DEPTHS, tool.through, help_, "select_through")
+        through = bar.segments("depth", _DEPTHS, tool.through, "", "select_through")
         tool = replace(tool, through=through)
     if tool.tool == "brush":
         ends, help_ = (SMALLEST_PX, LARGEST_PX), f"Brush radius ({_SIZE_KEYS})"
@@ -266,13 +245,8 @@ def _save(regions: int, bar: _Bar, actions: list[str]) -> None:
 PAINT_DRAG = "brush"
 """What a left drag does while the brush is active, beside those of `keys.DRAGS`."""
 
-WHOLE = (
-    ("Clear", "paint_clear", "Set all weights to 0"),
-    ("Fill", "paint_fill", "Set all weights to 1"),
-    ("Invert", "paint_invert", "Swap what is painted and what is not"),
-    ("Feather", "paint_feather", "Soften the edges of the paint; repeat for more"),
-)
-"""Of the menu for all of a layer's paint: name, action of `keys.KEYS`, tip."""
+WHOLE = ("paint_clear", "paint_fill", "paint_invert", "paint_feather")
+"""Of the menu for all of a layer's paint."""
 
 
 def paint_obstacle(view: ViewState, focus: int | None) -> str:
@@ -281,17 +255,17 @@ def paint_obstacle(view: ViewState, focus: int | None) -> str:
         return "no layer is selected; click one, or press 1–9"
     layer = view.layers[focus]
     if layer.locked:
-        return f"{layer.name} is locked; press Shift+L to unlock it"
+        return f"{layer.name} is locked; press {shortcut('lock')} to unlock it"
     if not is_visible(view, layer):
-        return f"{layer.name} is hidden; press H to show it"
+        return f"{layer.name} is hidden; press {shortcut('hide')} to show it"
     return ""
 
 
 def _brush_options(view: ViewState, focus: int | None, bar: _Bar, actions: list[str]) -> ViewState:
     """How the brush paints."""
     brush, modes = view.brush, {"add": "Add", "erase": "Erase", "smooth": "Smooth"}
-    help_ = f"Brush mode ({shortcut('brush_mode')}). While painting, Ctrl inverts and Shift smooths"
-    brush = replace(brush, mode=bar.segments("mode", modes, brush.mode, help_, ""))
+    help_ = "While painting, Ctrl inverts and Shift smooths"
+    brush = replace(brush, mode=bar.segments("mode", modes, brush.mode, help_, "brush_mode"))
     ends, help_ = (SMALLEST_PX, LARGEST_PX), f"Brush radius ({_SIZE_KEYS})"
     radius = bar.slider("Radius", brush.radius, ends, Brush.radius, help_, "%.0f px")
     help_ = f"Brush softness ({shortcut('brush_softness:-0.1')} and ])"
@@ -300,9 +274,8 @@ def _brush_options(view: ViewState, focus: int | None, bar: _Bar, actions: list[
     flow, value = bar.slider("Flow", brush.flow, (0.0, 1.0), Brush.flow, help_), brush.value
     if brush.mode == "add":
         value = bar.slider("Value", value, (0.0, 1.0), Brush.value, "The share of the edit that Add paints")
-    help_ = "Paint only the front surface, or everything under the brush"
-    through = bar.segments("depth", _DEPTHS, brush.through, help_, "brush_through")
-    help_ = "Tint lightly what has less than all of the edit, or show all weights from blue (0) to yellow (1)"
+    through = bar.segments("depth", _DEPTHS, brush.through, "", "brush_through")
+    help_ = "A light tint over what has less than all of the edit, or all weights from blue (0) to yellow (1)"
     kinds = {False: "Tint", True: "Colors"}
     weights = bar.segments("weights", kinds, brush.weights, help_, "brush_weights")
     if weights:
@@ -346,12 +319,7 @@ def draw_ring(view: ViewState, ui: UiContext) -> None:
             canvas.add_circle(mouse, size, u32((*PALETTE.handle[:3], alpha)), 0, 1.25 * ui.scale)
 
 
-_COMPARISONS = (
-    ("off", "Edited alone", ""),
-    ("beside", "Side by side", "beside"),
-    ("split", "Split", "split"),
-    ("difference", "Difference", "difference"),
-)
+_COMPARISONS = ("beside", "split", "difference")
 _AGAINST = (
     ("original", "Against the original", ""),
     ("recorded", "Against what training recorded", "against"),
@@ -384,11 +352,11 @@ def draw_comparison(
     with plate("comparison", place, ui, (0.5, 0.0), _PAD_PX):
         if _word("left", left.capitalize(), on or original, ui):
             asked = "before"
-        tip("Show the original: tap, or hold", "before")
+        hint("before")
         imgui.same_line()
         if icon_button("split", Icon.SPLIT, ui, lit=on):
             asked = compare.mode if on else "split"
-        tip(f"Compare in a split view ({shortcut('split')})" + (f"\n{figure}" if figure else ""))
+        hint("split", figure)
         imgui.same_line()
         name = right.capitalize() + (f" × {compare.amplify:g}" if compare.mode == "difference" else "")
         if _word("right", name, not original, ui):
@@ -417,8 +385,10 @@ def _word(name: str, text: str, bright: bool, ui: UiContext) -> bool:
 
 
 def _choose_comparison(compare: Comparison, off: dict[str, str], ui: UiContext) -> Comparison:
-    for mode, text, action in _COMPARISONS:
-        if imgui.menu_item(text, shortcut(action), compare.mode == mode)[0]:
+    if imgui.menu_item("Edited alone", "", compare.mode == "off")[0]:
+        compare = replace(compare, mode="off")
+    for mode in _COMPARISONS:
+        if menu_item(mode, compare.mode == mode):
             compare = replace(compare, mode=mode)
     imgui.separator()
     for against, text, action in _AGAINST:
@@ -446,10 +416,7 @@ UPS: tuple[tuple[str, Vec3], ...] = (
 )
 
 
-_LOOKS = (
-    ("frame", Icon.FRAME, "Frame the selection, the focused layer, or the scene"),
-    ("home", Icon.HOME, "Reset the view"),
-)
+_LOOKS = (("frame", Icon.FRAME), ("home", Icon.HOME))
 
 
 def view_width(view: ViewState, area: Area, ui: UiContext) -> float:
@@ -494,7 +461,6 @@ def _view_rows(view: ViewState, ui: UiContext, actions: list[str]) -> ViewState:
     picker = imgui.ColorEditFlags_.no_inputs.value | imgui.ColorEditFlags_.no_alpha.value
     changed, (red, green, blue) = imgui.color_edit3("##background", list(view.background), picker)
     background = (red, green, blue) if changed else view.background
-    for name, action, on in (("Ground grid", "grid", view.grid), ("Axes", "axes", view.axes)):
-        if imgui.menu_item(name, shortcut(action), on)[0]:
-            actions.append(action)
+    for action, on in (("grid", view.grid), ("axes", view.axes)):
+        actions += [action] * menu_item(action, on)
     return replace(view, camera=camera, background=background)

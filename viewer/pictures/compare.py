@@ -210,7 +210,7 @@ class Comparer:
         target, against = view.compare.against, self.against(view)
         if self.sides is not None:
             return labels(view.compare, self.psnr, names=self.sides.names)
-        why = {"recorded": facts.obstacle(self.recordings), "snapshots": "there is no snapshot (F3)"}
+        why = {"recorded": facts.obstacle(self.recordings), "snapshots": "there is no snapshot"}
         obstacle = why[target] if target != against else ""
         recorded = facts.describe(view, self.engine.gdfs, self.recordings) if against == "recorded" else ""
         return labels(view.compare, self.psnr, recorded, obstacle)

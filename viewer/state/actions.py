@@ -69,13 +69,14 @@ def toggle_snapshots(view: ViewState) -> ViewState:
     return replace(view, compare=replace(compare, mode=mode, against="snapshots"))
 
 
-def end_at_edit(before: ViewState, view: ViewState) -> ViewState:
+def end_at_edit(before: Workspace, after: Workspace) -> Workspace:
     """No comparison of snapshots any more where layers have changed: one shall see what one does."""
-    edited = (view.layers, view.groups, view.blend) != (before.layers, before.groups, before.blend)
-    compare = view.compare
-    if not edited or compare.mode == "off" or compare.against != "snapshots":
-        return view
-    return replace(view, compare=replace(compare, mode="off", against="original"))
+    was, view = before.view, after.view
+    edited = (view.layers, view.groups, view.blend) != (was.layers, was.groups, was.blend)
+    if not edited or view.compare.mode == "off" or view.compare.against != "snapshots":
+        return after
+    alone = replace(view, compare=replace(view.compare, mode="off", against="original"))
+    return replace(after, view=alone, past=history.follow_look(after.past, view, alone))
 
 
 FEATHER = 0.1
@@ -83,7 +84,7 @@ FEATHER = 0.1
 
 
 def perform(workspace: Workspace, action: str, facts: SceneFacts, aspect: float = 1.0) -> Workspace:
-    """The workspace after an action of `keys.KEYS`.
+    """The workspace after an action of `keys.COMMANDS`.
 
     Args:
         action: its name, with an argument after a colon where it has one
@@ -234,7 +235,7 @@ def _resize(workspace: Workspace, times: str) -> Workspace:
 
 
 def _step_back(workspace: Workspace, _: str) -> Workspace:
-    """The list of bindings goes, or the tool in the hand, the form, the other selected layers, the focus."""
+    """The list of keys goes, or the tool in the hand, the form, the other selected layers, the focus."""
     if workspace.help:
         return replace(workspace, help=False)
     if workspace.view.brush.active:
@@ -285,7 +286,7 @@ def _timeline_action(name: str) -> Callable[[Workspace, str], Workspace]:
 
     def act(workspace: Workspace, argument: str) -> Workspace:
         view, player = timeline.perform(workspace.view, workspace.player, f"{name}:{argument}")
-        past = history.follow_camera(workspace.past, workspace.view, view)
+        past = history.follow_look(workspace.past, workspace.view, view)
         if loses_strengths(workspace, view):  # an entry of its own, or part of what is done to the keys
             past = past if name == "move_key" else history.record(past, view, workspace.snapshots)
         elif past.present.edit.layers == workspace.view.layers:
@@ -391,6 +392,8 @@ ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
     "choose_snapshot": _choose_snapshot,
     "undo": lambda w, _: _back(w, history.undo(w.past)),
     "redo": lambda w, _: _back(w, history.redo(w.past)),
+    "go_to": lambda w, index: _back(w, history.go_to(w.past, int(index))),
+    "history": lambda w, _: replace(w, history=True),
     "navigate": _navigate,
     "zoom": _zoom,
     "fly": lambda w, _: with_camera(w, controls.toggle_fly(w.view.camera)),
@@ -398,7 +401,8 @@ ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
     "grid": lambda w, _: replace(w, view=replace(w.view, grid=not w.view.grid)),
     "axes": lambda w, _: replace(w, view=replace(w.view, axes=not w.view.axes)),
     "safe_frame": lambda w, _: replace(w, view=next_frame(w.view)),
-    "help": lambda workspace, _: replace(workspace, help=not workspace.help),
+    "help": lambda workspace, _: replace(workspace, help=not workspace.help, query=""),
+    "palette": lambda workspace, _: replace(workspace, palette=-1, query="", help=False),
     "before": lambda w, _: replace(w, before=not w.before),
     "beside": lambda w, _: replace(w, view=toggle_mode(w.view, "beside")),
     "split": lambda w, _: replace(w, view=toggle_mode(w.view, "split")),

@@ -1,5 +1,5 @@
-"""Undo and redo: one entry per gesture, of what is edited, of snapshots, and of up axis, field of view and
-background where a person sets them; never of where one looks from.
+"""Undo, redo and the list of both: one entry per gesture, of what is edited, of snapshots, and of what of the
+view a person sets, such as background and comparison; never of where one looks from.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any
 from viewer.camera.view_camera import Vec3, ViewCamera, with_up
 
 from .selection import SelectionState
-from .view_state import Blend, LayerGroup, LayerState, SnapshotPair, Timeline, ViewState
+from .view_state import Blend, Comparison, LayerGroup, LayerState, SnapshotPair, Timeline, ViewState
 
 LONGEST = 1000  # entries; each is a few hundred bytes, with a selection some kilobytes
 
@@ -36,6 +36,11 @@ class Look:
     up: Vec3 = ViewCamera.up
     fov_y: float = ViewCamera.fov_y
     background: tuple[float, float, float] = ViewState.background
+    compare: Comparison = Comparison()
+    grid: bool = False
+    axes: bool = True
+    safe_frame: str = ""
+    dynamic_resolution: str = ViewState.dynamic_resolution
 
 
 @dataclass(frozen=True)
@@ -67,7 +72,7 @@ def _edit_values(part: ViewState | Edit) -> dict[str, Any]:
 
 
 def look_of(state: ViewState) -> Look:
-    return Look(state.camera.up, state.camera.fov_y, state.background)
+    return Look(state.camera.up, state.camera.fov_y, **{name: getattr(state, name) for name in _OF_VIEW})
 
 
 def begin(state: ViewState, snapshots: tuple[Any, ...] = ()) -> History:
@@ -85,7 +90,15 @@ def record(history: History, state: ViewState, snapshots: tuple[Any, ...] = ()) 
     step = HistoryEntry(edit_of(state), _take_changes(present.look, history.seen, seen), snapshots)
     if step == present:
         return history if seen == history.seen else replace(history, seen=seen)
+    if history.past and _only_compares(history.past[-1], present) and _only_compares(present, step):
+        *past, before = history.past  # one looks at this and at that: no trail of it
+        return History(step, tuple(past) if step == before else history.past, seen=seen)
     return History(step, (*history.past, present)[-LONGEST:], seen=seen)
+
+
+def _only_compares(before: HistoryEntry, after: HistoryEntry) -> bool:
+    """Whether nothing but the comparison is another one."""
+    return before != after == replace(before, look=replace(before.look, compare=after.look.compare))
 
 
 def merge(history: History) -> History:
@@ -104,32 +117,35 @@ def follow_playhead(history: History, before: ViewState, after: ViewState) -> Hi
     return replace(history, present=replace(history.present, edit=replace(edit, layers=layers)))
 
 
-def follow_camera(history: History, before: ViewState, after: ViewState) -> History:
-    """The camera went elsewhere: no entry; what a person has just set and is not recorded yet stays to be."""
+def follow_look(history: History, before: ViewState, after: ViewState) -> History:
+    """What is seen has changed by itself: no entry; what a person has just set and is not recorded yet stays
+    to be."""
     seen = _take_changes(history.seen, look_of(before), look_of(after))
     return history if seen == history.seen else replace(history, seen=seen)
 
 
 def undo(history: History) -> History:
     """One entry back; unchanged where there is none."""
-    if not history.past:
-        return history
-    *past, back = history.past
-    return _go_to(history, back, tuple(past), (history.present, *history.future))
+    return go_to(history, len(history.past) - 1)
 
 
 def redo(history: History) -> History:
     """One entry forward; unchanged where there is none."""
-    if not history.future:
+    return go_to(history, len(history.past) + 1)
+
+
+def entries(history: History) -> tuple[HistoryEntry, ...]:
+    """All there are, the first one first."""
+    return *history.past, history.present, *history.future
+
+
+def go_to(history: History, index: int) -> History:
+    """That of the `entries` is the present one; unchanged where there is no such, or it is already."""
+    steps = entries(history)
+    if index == len(history.past) or not 0 <= index < len(steps):
         return history
-    ahead, *future = history.future
-    return _go_to(history, ahead, (*history.past, history.present), tuple(future))
-
-
-def _go_to(
-    history: History, entry: HistoryEntry, past: tuple[HistoryEntry, ...], future: tuple[HistoryEntry, ...]
-) -> History:
-    return History(entry, past, future, _take_changes(history.seen, history.present.look, entry.look))
+    look = _take_changes(history.seen, history.present.look, steps[index].look)
+    return History(steps[index], steps[:index], steps[index + 1 :], look)
 
 
 def _take_changes(look: Look, before: Look, after: Look) -> Look:
@@ -153,7 +169,8 @@ def apply_present(state: ViewState, history: History) -> ViewState:
         camera = replace(with_up(camera, look.up), up=look.up)
     if camera.fov_y != look.fov_y:
         camera = replace(camera, fov_y=look.fov_y)
-    return replace(apply_edit(state, history.present.edit), camera=camera, background=look.background)
+    looks: dict[str, Any] = {name: getattr(look, name) for name in _OF_VIEW}
+    return replace(apply_edit(state, history.present.edit), camera=camera, **looks)
 
 
 _OF_LAYERS = {
@@ -174,17 +191,32 @@ _OF_EDITS = {
     "overshoot": "overshoot",
     "pair": "snapshot pair",
 }
-_OF_LOOKS = {"up": "up axis", "fov_y": "field of view", "background": "background"}
+_OF_VIEW = {
+    "background": "background",
+    "compare": "comparison",
+    "grid": "ground grid",
+    "axes": "axes",
+    "safe_frame": "safe frame",
+    "dynamic_resolution": "dynamic resolution",
+}
+"""Of `Look`, what stands in the view itself."""
+_OF_LOOKS = {"up": "up axis", "fov_y": "field of view", **_OF_VIEW}
 
 
 def next_undo(history: History) -> str:
     """What an undo takes back, in a few words; "" where there is nothing."""
-    return _describe_change(history.past[-1], history.present) if history.past else ""
+    return describe_entry(history, len(history.past)) if history.past else ""
 
 
 def next_redo(history: History) -> str:
     """What a redo brings back, in a few words; "" where there is nothing."""
-    return _describe_change(history.present, history.future[0]) if history.future else ""
+    return describe_entry(history, len(history.past) + 1) if history.future else ""
+
+
+def describe_entry(history: History, index: int) -> str:
+    """What that of the `entries` changed, in a few words."""
+    steps = entries(history)
+    return _describe_change(steps[index - 1], steps[index]) if index else "as opened"
 
 
 def _describe_change(before: HistoryEntry, after: HistoryEntry) -> str:

@@ -209,7 +209,7 @@ def paste_values(workspace: Workspace, text: str) -> tuple[Workspace, str]:
     try:
         copied = convert_json(decode_json(text), CopiedValues, closed=True)
     except ValueError:
-        raise ProgdfError("the clipboard holds no values of layers; copy some with Ctrl+C first") from None
+        raise ProgdfError("the clipboard holds no values of layers; copy some first") from None
     view, upper = workspace.view, largest_strength(workspace.view)
     if len(copied.layers) == 1:
         taken = {view.layers[i].name: copied.layers[0] for i in selected_layers(workspace)}

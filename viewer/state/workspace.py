@@ -51,7 +51,7 @@ REQUESTS = (
         "stop_and_quit",
     ),
     *("export", "export_page", "render_picture", "render_film", "deliver", "drop_and_quit"),
-    *("about", "demo", "example", "forget_file", "decal", "rebind", "rebind_from"),
+    *("about", "keys_file", "demo", "example", "forget_file", "decal", "rebind", "rebind_from"),
     *("overwrite", "restore_autosave", "discard_autosave", "duplicate", "replace", "replace_by"),
     *(
         "remove_selected",
@@ -161,7 +161,10 @@ class Workspace:
     cards_fit: bool = True  # whether the panel has room for a whole card of each layer
     active_slider: str = "strength"  # which of `layers.SLIDERS` of the focused layer the arrow keys move
     renaming: int | None = None  # the layer whose name is being typed, or None
-    help: bool = False  # whether the list of bindings is shown
+    help: bool = False  # whether the list of keys is shown
+    palette: int | None = None  # the line of the list of commands that Enter takes, −1 as it opens; or None
+    query: str = ""  # what is sought in either list
+    history: bool | None = None  # whether the list of the history is open; True as it opens, then False
     message: Message | None = None  # the line at the bottom, or None
     snapshots: tuple[SliderSnapshot, ...] = ()  # kept states, without the original
     # what a session file holds of this; None where there is none
@@ -248,7 +251,7 @@ def advance(workspace: Workspace, seconds: float) -> Workspace:
     view = workspace.view
     player = timeline.advance(workspace.player, view.timeline, seconds)
     view = timeline.state_at(view.timeline, player.frame, view, timeline.LEAST_KEYS)
-    past = history.follow_camera(workspace.past, workspace.view, view)
+    past = history.follow_look(workspace.past, workspace.view, view)
     if loses_strengths(workspace, view):
         past = history.record(past, view, workspace.snapshots)
     else:
@@ -267,7 +270,7 @@ def loses_strengths(workspace: Workspace, after: ViewState) -> bool:
 def with_camera(workspace: Workspace, camera: ViewCamera) -> Workspace:
     """Looking from elsewhere; never an undo entry."""
     view = replace(workspace.view, camera=camera)
-    return replace(workspace, view=view, past=history.follow_camera(workspace.past, workspace.view, view))
+    return replace(workspace, view=view, past=history.follow_look(workspace.past, workspace.view, view))
 
 
 def glide_from(workspace: Workspace, start: ViewCamera) -> Workspace:

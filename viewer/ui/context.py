@@ -67,6 +67,7 @@ class Icon:
     HIDDEN = icons.ICON_FA_EYE_SLASH
     UNDO = icons.ICON_FA_ROTATE_LEFT
     REDO = icons.ICON_FA_ROTATE_RIGHT
+    HISTORY = icons.ICON_FA_CLOCK_ROTATE_LEFT
     PICTURE = icons.ICON_FA_CAMERA
     HELP = icons.ICON_FA_QUESTION
     FILM = icons.ICON_FA_FILM

@@ -1,12 +1,14 @@
-"""The one table of keys and drags, and what the person does with them, as actions of the table.
+"""The one table of commands with their keys, and of drags; what the person does, as actions of the table.
 
-The list of shortcuts, menus and tips name keys by `shortcut`.
+Menus, tips, the list of keys and that of all commands are made from it.
 """
 
 from __future__ import annotations
 
 import itertools
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 from imgui_bundle import imgui
 
@@ -25,15 +27,18 @@ class DragBinding:
 
 
 @dataclass(frozen=True)
-class KeyBinding:
-    """A key: modifiers in the order Ctrl, Shift, Alt, then the key's name."""
+class Command:
+    """An action of `actions.perform` as a person meets it: in menus, tips, lists and, some day, speech."""
 
-    chord: str
     action: str
-    help: str  # in the list of shortcuts; "" where another row says it
-    repeats: bool = False  # while held
+    name: str  # what it is called everywhere, also by who cannot see its icon
+    keys: str = ""  # chords with blanks between: modifiers in the order Ctrl, Shift, Alt, then the key's name
+    help: str = ""  # what a tip says beside the name
+    repeats: bool = False  # while a key is held
     tap: bool = False  # done when the key is let go soon, as held it does something else
-    listed: str = ""  # chords in the list of shortcuts, where the row is about several
+    types: bool = False  # one types afterwards
+    row: str = ""  # in the list of keys, where it is about several commands; `JOINED` for the others of them
+    listed: str = ""  # its keys there, where they are too many
 
 
 DRAGS = (
@@ -49,176 +54,296 @@ DRAGS = (
 FLY_KEYS = {"W": (0, 0, 1), "S": (0, 0, -1), "A": (-1, 0, 0), "D": (1, 0, 0), "Q": (0, -1, 0), "E": (0, 1, 0)}
 """Physical keys (their places on a US keyboard) → right, up, ahead."""
 
-HELD_ORIGINAL = "\\"
 TAP_S = 0.25
 """A key that is let go sooner was tapped, not held."""
 NUDGES = (("", 0.01), ("Shift+", 0.10), ("Ctrl+", 0.001))
 
 
-def _keys(
-    help_: str, *chords: str, listed: str = "", repeats: bool = False, tap: bool = False
-) -> tuple[KeyBinding, ...]:
-    """A row of the list of shortcuts, and its keys, each as "chord action"."""
-    pairs = [text.split() for text in chords]
-    keys = [KeyBinding(chord, action, "", repeats, tap) for chord, action in pairs]
-    return replace(keys[0], help=help_, listed=listed), *keys[1:]
+JOINED = "-"
+"""The row of a command that the one before it in the table shows too."""
 
 
-_FOCUS = [f"{i} focus:{i}" for i in range(1, 10)] + [f"Shift+{i} toggle:{i}" for i in range(1, 10)]
-_NUDGE = [
-    f"{modifiers}{arrow} nudge:{sign * step:g}"
-    for modifiers, step in NUDGES
-    for arrow, sign in (("Left", -1), ("Right", 1), ("Down", -1), ("Up", 1))
-]
+def _row(listed: str, does: str, commands: Iterable[Command]) -> Iterator[Command]:
+    """Commands that share a line of the list of keys."""
+    return (replace(command, listed=listed, row=does) for command in commands)
 
-TOPICS: dict[str, tuple[KeyBinding, ...]] = {
-    "Layers": (
-        *_keys("select a layer; with Shift show or hide", *_FOCUS, listed="1–9"),
-        *_keys("strength or gain; Shift coarse, Ctrl fine", *_NUDGE, listed="← →", repeats=True),
-        *_keys("next slider for the arrow keys", "Tab next_slider:1", "Shift+Tab next_slider:-1"),
-        *_keys("show or hide the selected layer", "H hide"),
-        *_keys("solo (Alt+click the eye)", "Shift+H solo"),
-        *_keys("show all", "Alt+H show_all"),
-        *_keys("lock", "Shift+L lock"),
-        *_keys("gains and curve; with Alt compact rows", "G fold", "Alt+G cards"),
-        *_keys("rename (double-click the name)", "Enter rename"),
-        *_keys("duplicate", "Ctrl+D duplicate"),
-        *_keys("delete", "Ctrl+Delete remove"),
-        *_keys("move up or down (drag the name)", "Alt+Up move:-1", "Alt+Down move:1", listed="Alt+↑ ↓"),
-        *_keys("select all (Ctrl+click, Shift+click)", "Ctrl+Alt+A select_layers"),
-        *_keys("group; with Shift ungroup", "Ctrl+G group", "Ctrl+Shift+G ungroup"),
-        *_keys(
-            "copy, paste, reset strength and gains",
-            *("Ctrl+C copy_values", "Ctrl+V paste_values", "Ctrl+R reset", "Ctrl+Shift+R reset_all"),
-            listed="Ctrl+C, V, R",
-        ),
-        *_keys("search layers", "Ctrl+F search"),
-    ),
+
+def _numbers(action: str, name: str, modifier: str = "") -> Iterator[Command]:
+    return (Command(f"{action}:{i}", f"{name} {i}", f"{modifier}{i}") for i in range(1, 10))
+
+
+def _nudges() -> Iterator[Command]:
+    for modifier, step in NUDGES:
+        for (arrow, other), sign in ((("Right", "Up"), 1), (("Left", "Down"), -1)):
+            keys = f"{modifier}{arrow} {modifier}{other}"
+            yield Command(f"nudge:{sign * step:g}", f"Strength {100 * sign * step:+g} %", keys, repeats=True)
+
+
+def _looks() -> Iterator[Command]:
+    for key, side, other in (("Num1", "front", "back"), ("Num3", "right", "left"), ("Num7", "top", "bottom")):
+        yield Command(f"look:{side}", f"View from the {side}", key)
+        yield Command(f"look:{other}", f"View from the {other}", f"Ctrl+{key}")
+
+
+def _steps(action: str, what: str, modifier: str = "", repeats: bool = False) -> Iterator[Command]:
+    yield Command(f"{action}:-1", f"Previous {what}", f"{modifier},", repeats=repeats)
+    yield Command(f"{action}:1", f"Next {what}", f"{modifier}.", repeats=repeats)
+
+
+def _zooms() -> Iterator[Command]:
+    yield Command("zoom:1.1", "Larger interface", "Ctrl+= Ctrl+Shift+=")
+    yield Command("zoom:0.9091", "Smaller interface", "Ctrl+-")
+    yield Command("zoom:0", "Interface as at first", "Ctrl+0")
+
+
+MODES = "Shift adds, Ctrl subtracts, both intersect"
+_CORNERS = f"Click its corners; Enter or a double click closes it. {MODES}"
+
+TOPICS: dict[str, tuple[Command, ...]] = {
     "View": (
-        *_keys("orbit or fly mode", "V fly"),
-        *_keys("frame the selection, layer or scene", "F frame", "Num. frame"),
-        *_keys("reset the view (numpad 0)", "Shift+F home", "Num0 home"),
-        *_keys(
-            "front, right, top; Ctrl opposite",
-            *("Num1 look:front", "Num3 look:right", "Num7 look:top"),
-            *("Ctrl+Num1 look:back", "Ctrl+Num3 look:left", "Ctrl+Num7 look:bottom"),
-            listed="Numpad 1 3 7",
-        ),
-        *_keys("grid on the ground", "Shift+G grid"),
-        *_keys("original: tap, or hold", f"{HELD_ORIGINAL} before", tap=True),
-        *_keys("side by side; with Shift split view", "Y beside", "Shift+Y split"),
-        *_keys("difference (a tap; held it flies)", "D difference", tap=True),
-        *_keys("compare with the recording", "Alt+Y against"),
+        Command("fly", "Orbit or fly", "V"),
+        Command("navigate:orbit", "Orbit", "", "Around a pivot"),
+        Command("navigate:fly", "Fly", "", "W A S D, Q E; right drag looks around"),
+        Command("frame", "Frame", "F Num.", "The selection, the selected layer, or the scene"),
+        Command("home", "Reset the view", "Shift+F Num0"),
+        *_row("Numpad 1 3 7", "Front, right, top", _looks()),
+        Command("grid", "Ground grid", "Shift+G"),
+        Command("axes", "Axes"),
+        Command("before", "Original: tap, or hold", "\\", tap=True),
+        Command("beside", "Side by side", "Y"),
+        Command("split", "Split view", "Shift+Y"),
+        Command("difference", "Difference", "D", "Amplified, with its PSNR", tap=True),
+        Command("against", "Compare with recording", "Alt+Y", "The field against what training recorded"),
+    ),
+    "Layers": (
+        *_row("1–9", "Select a layer", _numbers("focus", "Select layer")),
+        *_row("Shift+1–9", "Show or hide a layer", _numbers("toggle", "Show or hide layer", "Shift+")),
+        *_row("← →", "Strength, or gain", _nudges()),
+        Command("next_slider:1", "Next gain for arrow keys", "Tab", row="Next gain; Shift previous"),
+        Command("next_slider:-1", "Previous gain", "Shift+Tab", row=JOINED),
+        Command("hide", "Show or hide", "H", "Alt+click: solo"),
+        Command("solo", "Solo", "Shift+H", "Show only soloed layers"),
+        Command("show_all", "Show all", "Alt+H", "All layers, and all that is hidden"),
+        Command("lock", "Lock", "Shift+L", "Strength, gains and paint stay as they are"),
+        Command("fold", "Details and gains", "G", "What it is, gains, and the curve of visible change"),
+        Command("cards", "Compact rows", "Alt+G"),
+        Command("rename", "Rename…", "Enter", types=True),
+        Command("duplicate", "Duplicate", "Ctrl+D"),
+        Command("replace", "Replace…", "", "Another edit in its place"),
+        Command("remove", "Delete", "Ctrl+Delete"),
+        Command("move:-1", "Move up", "Alt+Up", "The top layer lies on top", row="Move up, down"),
+        Command("move:1", "Move down", "Alt+Down", row=JOINED),
+        Command("select_layers", "Select all layers", "Ctrl+Alt+A"),
+        Command("group", "New group", "Ctrl+G", "With a switch and a strength", row="Group; Shift ungroups"),
+        Command("ungroup", "Ungroup", "Ctrl+Shift+G", row=JOINED),
+        Command("copy_values", "Copy values", "Ctrl+C", "Strength, gains; as text", row="Copy, paste values"),
+        Command("paste_values", "Paste values", "Ctrl+V", "That were copied", row=JOINED),
+        Command("reset", "Reset values", "Ctrl+R", "Strength 0, gains 1", row="Reset values; Shift all"),
+        Command("reset_all", "Reset all layers", "Ctrl+Shift+R", row=JOINED),
+        Command("search", "Search layers…", "Ctrl+F", types=True),
     ),
     "Edits": (
-        *_keys("next blend rule", "M blend"),
-        *_keys("overshoot to 1.2", "O overshoot"),
-        *_keys("close this list; leave the tool; deselect", "Escape unfocus", listed="Esc"),
-        *_keys("undo", "Ctrl+Z undo", repeats=True),
-        *_keys("redo", "Ctrl+Shift+Z redo", "Ctrl+Y redo", repeats=True),
+        Command("blend", "Next blend rule", "M"),
+        Command("overshoot", "Overshoot to 1.2", "O", "Sliders extrapolate past what was trained"),
+        Command("unfocus", "Leave tool, deselect", "Escape"),
+        Command("undo", "Undo", "Ctrl+Z", repeats=True),
+        Command("redo", "Redo", "Ctrl+Shift+Z Ctrl+Y", repeats=True),
+        Command("history", "History…", "Ctrl+Alt+Z", "Everything that was done; one goes back to any of it"),
     ),
     "Brush": (
-        *_keys("paint strength (left drag)", "B brush"),
-        *_keys("brush: erase, smooth, add", "X brush_mode"),
-        *_keys("brush: front surface or all depths", "Shift+B brush_through"),
-        *_keys("brush: tint or all weights as colors", "C brush_weights"),
-        *_keys(
-            "brush radius; with Shift softness",
-            *(f"[ brush_radius:{1 / 1.25:g}", "] brush_radius:1.25"),
-            *("Shift+[ brush_softness:-0.1", "Shift+] brush_softness:0.1"),
-            listed="[ ]",
-            repeats=True,
-        ),
-        *_keys("clear the paint; with Shift fill it", "Backspace paint_clear", "Shift+Backspace paint_fill"),
-        *_keys("feather the paint", "Shift+X paint_feather"),
+        Command("brush", "Paint strength", "B", "Of the selected layer, by a left drag"),
+        Command("brush_mode", "Erase, smooth, add", "X"),
+        Command("brush_through", "Front or through", "Shift+B", "The front surface, or all under it"),
+        Command("brush_weights", "Weights as colors", "C"),
+        Command("brush_radius:0.8", "Smaller", "[", repeats=True, row="Radius, or tolerance"),
+        Command("brush_radius:1.25", "Larger", "]", repeats=True, row=JOINED),
+        Command("brush_softness:-0.1", "Harder", "Shift+[", repeats=True, row="Harder, softer"),
+        Command("brush_softness:0.1", "Softer", "Shift+]", repeats=True, row=JOINED),
+        Command("paint_clear", "Clear the paint", "Backspace", "All to 0", row="Clear paint; Shift fills"),
+        Command("paint_fill", "Fill with paint", "Shift+Backspace", "All to 1", row=JOINED),
+        Command("paint_invert", "Invert the paint", "", "Swap what is painted and what is not"),
+        Command("paint_feather", "Feather the paint", "Shift+X", "Soften its edges; repeat for more"),
     ),
     "Select": (
-        *_keys(
-            "box, lasso, polygon, brush",
-            *("R select_tool:box", "L select_tool:lasso", "P select_tool:polygon", "U select_tool:brush"),
-            listed="R L P U",
-        ),
-        *_keys(
-            "scribble, sphere, connected and alike, alike",
-            *("Shift+U select_tool:scribble", "Shift+R select_tool:sphere"),
-            *("J select_tool:flood", "I select_tool:color"),
-            listed="Shift+U R J I",
-        ),
-        *_keys("front surface or all depths", "N select_through"),
-        *_keys(
-            "all, with Shift none; invert (paint too)",
-            *("Ctrl+A select_all", "Ctrl+Shift+A select_none", "Ctrl+I invert"),
-            listed="Ctrl+A, I",
-        ),
-        *_keys("shrink, grow", "Ctrl+[ select_shrink", "Ctrl+] select_grow", listed="Ctrl+[ ]", repeats=True),
-        *_keys("hide; with Shift isolate", "Ctrl+H hide_selected", "Ctrl+Shift+H isolate"),
-        *_keys(
-            "remove, move, copy: as a layer",
-            *("Alt+Delete remove_selected", "Alt+M move_selected", "Alt+D duplicate_selected"),
-            listed="Alt+Del M D",
-        ),
+        Command("select_tool:box", "Box", "R", MODES),
+        Command("select_tool:lasso", "Lasso", "L", MODES),
+        Command("select_tool:polygon", "Polygon", "P", _CORNERS),
+        Command("select_tool:brush", "Selection brush", "U", MODES),
+        Command("select_tool:scribble", "Scribble", "Shift+U", "Strokes on a thing, and beside it (Ctrl)"),
+        Command("select_tool:sphere", "Sphere", "Shift+R", f"Drag from its center on a surface. {MODES}"),
+        Command("select_tool:flood", "Connected and alike", "J", f"Click a surface. {MODES}"),
+        Command("select_tool:color", "Everything alike", "I", f"Click a color. {MODES}"),
+        Command("select_through", "Front or through", "N", "The front surface, or what lies behind it too"),
+        Command("select_all", "Select everything", "Ctrl+A", row="All; Shift nothing"),
+        Command("select_none", "Select nothing", "Ctrl+Shift+A", row=JOINED),
+        Command("invert", "Invert", "Ctrl+I", "Select everything else; while painting, the paint"),
+        Command("select_shrink", "Shrink", "Ctrl+[", "Less its border", repeats=True, row="Shrink, grow"),
+        Command("select_grow", "Grow", "Ctrl+]", "Add the neighbors", repeats=True, row=JOINED),
+        Command("select_smooth", "Smooth", "", "Straighten the border, drop strays, fill holes"),
+        Command("select_largest", "Largest part", "", "Keep only the largest connected part"),
+        Command("hide_selected", "Hide selection", "Ctrl+H", row="Hide; Shift isolates"),
+        Command("isolate", "Isolate selection", "Ctrl+Shift+H", "Hide everything else", row=JOINED),
+        Command("show_hidden", "Show hidden", "", "All splats that are hidden"),
+        Command("remove_selected", "Remove selection", "Alt+Delete", "A layer that lets it vanish"),
+        Command("move_selected", "Move selection", "Alt+M", "A layer that moves, turns and scales it"),
+        Command("duplicate_selected", "Copy selection", "Alt+D", "A layer with a copy, placed by hand"),
+        Command("hide_strays", "Hide strays", "", "What a capture left where nothing is"),
     ),
     "Timeline": (
-        *_keys("play or pause", "Space play"),
-        *_keys("insert a keyframe", "K key"),
-        *_keys("delete the keyframe", "Delete drop_key"),
-        *_keys("previous or next frame", ", step:-1", ". step:1", listed=", .", repeats=True),
-        *_keys("previous or next keyframe", "Shift+, jump:-1", "Shift+. jump:1", listed="Shift+, ."),
-        *_keys("interpolation: smooth, linear, hold", "Shift+K easing"),
-        *_keys("ping-pong", "Alt+K ping_pong"),
-        *_keys("save the timeline as a file", "Ctrl+K timeline_file"),
-        *_keys("show or hide the timeline", "T timeline"),
-        *_keys("safe frame: 16:9, square, 9:16, none", "Shift+T safe_frame"),
+        Command("play", "Play or pause", "Space"),
+        Command("key", "Insert keyframe", "K", "Camera and all strengths"),
+        Command("drop_key", "Delete keyframe", "Delete"),
+        *_row(", .", "Previous, next frame", _steps("step", "frame", repeats=True)),
+        *_row("Shift+, .", "Previous, next keyframe", _steps("jump", "keyframe", "Shift+")),
+        Command("easing", "Smooth, linear, hold", "Shift+K", "From the keyframe at or before the playhead"),
+        Command("ping_pong", "Ping-pong", "Alt+K"),
+        Command("timeline_file", "Save timeline as file", "Ctrl+K"),
+        Command("timeline", "Timeline", "T", "Animate the camera and the strengths"),
+        Command("safe_frame", "Safe frame", "Shift+T", "What a film of 16:9, 1:1 or 9:16 shows"),
     ),
     "Window and files": (
-        *_keys("this list", "F1 help"),
-        *_keys("save the picture as PNG", "F2 picture"),
-        *_keys("take this view without edits, to change it", "Ctrl+F2 take_view"),
-        *_keys("save the whole window as PNG", "Shift+F2 window_picture"),
-        *_keys("add a snapshot; with Shift compare two", "F3 snapshot", "Shift+F3 compare_snapshots"),
-        *_keys("save this view as a camera", "F4 camera"),
-        *_keys("new edit", "Ctrl+N new_edit"),
-        *_keys("save the session", "Ctrl+S save"),
-        *_keys("save the session as", "Ctrl+Shift+S save_as"),
-        *_keys("open a session, scene or edit", "Ctrl+O open"),
-        *_keys("export the edited scene as .ply", "Ctrl+E export"),
-        *_keys("export a web page with its sliders", "Ctrl+Shift+E export_page"),
-        *_keys("render a picture", "Ctrl+P render_picture"),
-        *_keys("render a film", "Ctrl+Shift+P render_film"),
-        *_keys("show timings", "F10 overlay"),
-        *_keys("dynamic resolution: auto, on, off", "Shift+F10 dynamic_resolution"),
-        *_keys(
-            "interface larger, smaller, first size",
-            *("Ctrl+= zoom:1.1", "Ctrl+Shift+= zoom:1.1"),
-            *("Ctrl+- zoom:0.9091", "Ctrl+0 zoom:0"),
-            listed="Ctrl + − 0",
+        Command("palette", "All commands…", "Ctrl+P F3", "Find one by its name", types=True),
+        Command("help", "Keys and mouse", "F1", types=True),
+        Command("keys_file", "Change keys…", "", "The file in which each command has its keys"),
+        Command("picture", "Save picture", "F2", "As it is on screen, as PNG"),
+        Command("take_view", "Take this view", "Ctrl+F2", "Without edits, to be changed elsewhere"),
+        Command("window_picture", "Save whole window", "Shift+F2", "As PNG"),
+        Command("camera", "Save view as camera", "F4"),
+        Command("snapshot", "Add snapshot", "F5", "Keep the present sliders", row="Snapshot; Shift compares"),
+        Command("compare_snapshots", "Compare snapshots", "Shift+F5", "Snapshot A against B", row=JOINED),
+        Command("new_edit", "New edit…", "Ctrl+N", "Choose region and editor, see it, train it", types=True),
+        Command("save", "Save session", "Ctrl+S", types=True, row="Save session; Shift as…"),
+        Command("save_as", "Save session as…", "Ctrl+Shift+S", types=True, row=JOINED),
+        Command("open", "Open…", "Ctrl+O", "A scene, a session or an edit", types=True),
+        Command("decal", "Decal…", "", "Lay a picture on a surface", types=True),
+        Command(
+            "export", "Export scene…", "Ctrl+E", "The edited scene", types=True, row="Export; Shift a page"
         ),
-        *_keys("full screen", "F11 full_screen"),
-        *_keys("show or hide the panel", "F12 panel"),
-        *_keys("quit", "Ctrl+Q quit"),
+        Command("export_page", "Export web page…", "Ctrl+Shift+E", "For any browser", types=True, row=JOINED),
+        Command("render_picture", "Render picture…", "Ctrl+Alt+P", "This view at any size", types=True),
+        Command("render_film", "Render film…", "Ctrl+Shift+P", types=True),
+        Command("overlay", "Show timings", "F10"),
+        Command("dynamic_resolution", "Dynamic resolution", "Shift+F10", "Auto, on, off"),
+        *_row("Ctrl + − 0", "Interface size", _zooms()),
+        Command("full_screen", "Full screen", "F11"),
+        Command("panel", "Panel", "F12", "Show or hide it and what lies over the picture"),
+        Command("demo", "Try the demo", "", "Makes a scene and trains four edits of it: a minute or two"),
+        Command("about", "About"),
+        Command("quit", "Quit", "Ctrl+Q"),
     ),
 }
-KEYS = tuple(key for keys in TOPICS.values() for key in keys)
-
-OPENS_TEXT = (
-    "rename",
-    "search",
-    "new_edit",
-    "save",
-    "save_as",
-    "open",
-    "export",
-    "export_page",
-    "render_picture",
-    "render_film",
+COMMANDS = {command.action: command for commands in TOPICS.values() for command in commands}
+KEYS: dict[str, Command] = {}
+"""By its chord, what each key does; see `bind`."""
+NAMES = (
+    *"ABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789\\[],.=-",
+    *(f"F{i}" for i in range(1, 13)),
+    *("Left", "Right", "Up", "Down", "Escape", "Tab", "Enter", "Backspace", "Space", "Delete"),
+    *(f"Num{i}" for i in (*range(10), ".")),
 )
-"""Actions after which one types."""
+"""Keys that the window tells apart."""
+
+
+def bind(changes: Mapping[str, Any]) -> list[str]:
+    """The keys of the table, but for those of some actions; what is wrong with these, a line for each.
+
+    Args:
+        changes: by its action a chord, several or "" for none; a key that was another one's is no longer that
+    """
+    problems, given, changed = list[str](), dict[str, Command](), list[Command]()
+    for action, value in changes.items():
+        texts = [value] * bool(value) if isinstance(value, str) else value
+        try:
+            if action not in COMMANDS:
+                raise ValueError("there is no such command")
+            if not (isinstance(texts, list) and all(isinstance(text, str) for text in texts)):
+                raise ValueError('keys are written as "F6" or ["F6", "Ctrl+B"]')
+            taken = dict.fromkeys(map(parse_chord, texts), COMMANDS[action])
+            if twice := [chord for chord in taken if chord in given]:
+                raise ValueError(f"{twice[0]} is that of {given[twice[0]].action} already")
+            if flies := [chord for chord in taken if chord in FLY_KEYS and not COMMANDS[action].tap]:
+                raise ValueError(f"{flies[0]} flies")
+            given.update(taken)
+            changed.append(COMMANDS[action])
+        except ValueError as error:
+            problems.append(f"{action}: {error}")
+    KEYS.clear()
+    for command in COMMANDS.values():
+        mine = [chord for chord, other in given.items() if other is command]
+        kept = [] if command in changed else [chord for chord in command.keys.split() if chord not in given]
+        KEYS.update(dict.fromkeys([*mine, *kept], command))
+    return problems
+
+
+def parse_chord(text: str) -> str:
+    """A chord as a person writes it, as in `KEYS`.
+
+    Raises:
+        ValueError: there is no such key.
+    """
+    *modifiers, key = (part.strip().capitalize() for part in text.strip().rsplit("+"))
+    if key not in NAMES or not {*modifiers} <= {*_MODIFIERS}:
+        raise ValueError(f"there is no key {text}")
+    return "+".join([*(name for name in _MODIFIERS if name in modifiers), key])
+
+
+_MODIFIERS = ("Ctrl", "Shift", "Alt")
+bind({})
+
+
+def is_changed(command: Command) -> bool:
+    """Whether the person has given it other keys, or its own to another one."""
+    return [chord for chord, other in KEYS.items() if other is command] != command.keys.split()
+
+
+def chords(action: str) -> list[str]:
+    """All keys of an action, in a person's words."""
+    bound = [chord for chord, command in KEYS.items() if command.action == action]
+    return [
+        chord.replace("Delete", "Del").replace("Num", "Numpad ").replace("Escape", "Esc") for chord in bound
+    ]
 
 
 def shortcut(action: str) -> str:
-    """The chord of an action, in a person's words; "" where there is none."""
-    chord = next((key.chord for key in KEYS if key.action == action), "")
-    return chord.replace("Delete", "Del").replace("Num", "Numpad ")
+    """The first key of an action, in a person's words; "" where there is none."""
+    return next(iter(chords(action)), "")
+
+
+def describe(action: str, more: str = "") -> str:
+    """A tip: the name with its key, what it does, and what there is to say beside."""
+    command, chord = COMMANDS[action], shortcut(action)
+    first = command.name + (f" ({chord})" if chord else "")
+    return "\n".join(line for line in (first, command.help, more) if line)
+
+
+def match(query: str, name: str, beside: str = "") -> int | None:
+    """How well a name answers to what is sought: 0 best, None not at all.
+
+    Args:
+        beside: what is read where the name does not answer
+    """
+    sought, text, letters = query.casefold().strip(), name.casefold(), iter(name.casefold())
+    answers = (
+        text.startswith(sought),
+        f" {sought}" in text,
+        "".join(word[0] for word in text.split()).startswith(sought),
+        sought in text,
+        sought in beside.casefold(),
+        all(letter in letters for letter in sought.replace(" ", "")),  # in this order, with others between
+    )
+    return next((i for i, answer in enumerate(answers) if answer), None)
+
+
+def find_commands(query: str, offered: Collection[str]) -> list[Command]:
+    """Those of the actions offered that are called like that, the best first; all for ""."""
+    ranks = [
+        (match(query, command.name, f"{command.help} {topic} {' '.join(chords(command.action))}"), command)
+        for topic, commands in TOPICS.items()
+        for command in commands
+        if command.action in offered
+    ]
+    found = [(rank, bool(command.listed), command) for rank, command in ranks if rank is not None]
+    return [command for *_, command in sorted(found, key=lambda answer: answer[:2])]
 
 
 def drag_for(button: str, modifier: str, mode: str) -> str | None:
@@ -278,8 +403,8 @@ def has_reached_imgui(press: Press) -> bool:
 
 def opens_text(press: Press) -> bool:
     """Whether a key asks for a text field: it needs some frames until it has the keyboard."""
-    opens = any(key.chord == press.chord and key.action in OPENS_TEXT for key in KEYS)
-    return opens and not imgui.get_io().want_text_input
+    command = KEYS.get(press.chord)
+    return command is not None and command.types and not imgui.get_io().want_text_input
 
 
 def has_pending_input() -> bool:
@@ -296,12 +421,8 @@ def requested_actions(keys: Keys) -> list[str]:
     """Actions of `KEYS` that were asked for; none while a text field is open."""
     if imgui.get_io().want_text_input:
         return []
-    return [
-        key.action
-        for press in keys.pressed
-        for key in KEYS
-        if key.chord == press.chord and not key.tap and (key.repeats or not press.again)
-    ]
+    pressed = [(KEYS[press.chord], press.again) for press in keys.pressed if press.chord in KEYS]
+    return [key.action for key, again in pressed if not key.tap and (key.repeats or not again)]
 
 
 def tapped_actions(taps: Taps, keys: Keys, now: float, flies: bool) -> tuple[Taps, list[str]]:
@@ -314,7 +435,7 @@ def tapped_actions(taps: Taps, keys: Keys, now: float, flies: bool) -> tuple[Tap
     """
     if imgui.get_io().want_text_input:
         return Taps(), []
-    actions = {key.chord: key.action for key in KEYS if key.tap}
+    actions = {chord: key.action for chord, key in KEYS.items() if key.tap}
     ignored = FLY_KEYS if flies or len(keys.fly) > 1 else ()
     down = {press.chord: now for press in keys.pressed if press.chord in actions and not press.again}
     since = {chord: at for chord, at in {**dict(taps.since), **down}.items() if chord not in ignored}
@@ -325,12 +446,13 @@ def tapped_actions(taps: Taps, keys: Keys, now: float, flies: bool) -> tuple[Tap
 
 def is_repeating(keys: Keys) -> bool:
     """Whether a key that repeats is held: what it does is not over yet."""
-    return any(key.repeats and key.chord.rpartition("+")[2] in keys.held for key in KEYS)
+    return any(key.repeats and chord.rpartition("+")[2] in keys.held for chord, key in KEYS.items())
 
 
 def holds_original(keys: Keys) -> bool:
     """Whether the key that shows the original is held."""
-    return HELD_ORIGINAL in keys.held and not imgui.get_io().want_text_input
+    held = any(key.action == "before" and chord in keys.held for chord, key in KEYS.items())
+    return held and not imgui.get_io().want_text_input
 
 
 def modifier() -> str:

@@ -11,11 +11,12 @@ from typing import TypeVar
 from imgui_bundle import imgui
 
 from .context import BEHIND, FIXED, PALETTE, SMALL_PX, UNFOCUSED, Icon, Rgba, UiContext, u32
-from .keys import shortcut
+from .keys import COMMANDS, describe, shortcut
 
 T = TypeVar("T")
 
-MenuItems = Sequence[tuple[str, str, str]]
+MenuItems = Sequence[str | tuple[str, str, str]]
+IconItems = Sequence[tuple[str, str] | tuple[str, str, str]]
 TYPING_S = 1.0
 """Between two letters of one word, at most, in a list."""
 _GRIP_PX = 4.0  # what moves no further is a click, at 1×
@@ -131,14 +132,13 @@ def accent_button(text: str, size: imgui.ImVec2) -> bool:
     return bool(pressed)
 
 
-def tip(text: str, action: str = "") -> None:
-    """What the last item does, shown when the mouse rests on it; with the shortcut of an action."""
+def tip(text: str) -> None:
+    """What the last item does, shown when the mouse rests on it."""
     flags = imgui.HoveredFlags_
     # no_nav_override: the tip of a field that merely has the keyboard would cover the next row
     rests = flags.for_tooltip.value | flags.allow_when_disabled.value | flags.no_nav_override.value
     if imgui.is_item_hovered(rests):
-        chord = shortcut(action)
-        imgui.set_tooltip(f"{text} ({chord})" if chord else text)
+        imgui.set_tooltip(text)
 
 
 def icon_button(
@@ -165,17 +165,22 @@ def icon_button(
     return pressed
 
 
+def hint(action: str, more: str = "") -> None:
+    """The tip of a command that the last item asks for, and what there is to say beside."""
+    tip(describe(action, more))
+
+
 def icon_row(
-    items: MenuItems, ui: UiContext, actions: list[str], gap: float = 0.0, off: Collection[str] = ()
+    items: IconItems, ui: UiContext, actions: list[str], gap: float = 0.0, off: Collection[str] = ()
 ) -> None:
-    """Buttons on a line: action, icon and help of each; those in `off` cannot be pressed."""
-    for i, (action, icon, help_) in enumerate(items):
+    """Buttons of commands on a line; those in `off` cannot be pressed."""
+    for i, (action, icon, *more) in enumerate(items):
         if i:
             imgui.same_line(0.0, gap)
         imgui.begin_disabled(action in off)
         actions += [action] * icon_button(action, icon, ui)
         imgui.end_disabled()
-        tip(help_, action)
+        hint(action, *more)
 
 
 def more_button(
@@ -191,19 +196,37 @@ def menu_items(name: str, items: MenuItems, ui: UiContext, off: Collection[str] 
     """The menu that `imgui.open_popup(name)` opens; the action that was chosen in it, if one was.
 
     Args:
-        items: text, action and help of each, a line where there is no text
+        items: commands of the table, a line for ""; or text, action and tip of what is none
         off: actions that cannot be chosen
     """
     asked: list[str] = []
     with menu(name, ui) as is_open:
-        for text, action, help_ in items if is_open else ():
-            if not text:
+        for item in items if is_open else ():
+            if not item:
                 imgui.separator()
-            elif imgui.menu_item(f"{text}##{action}", shortcut(action), False, action not in off)[0]:
-                asked.append(action)
-            if help_:
-                tip(help_)
+            elif isinstance(item, str):
+                asked += [item] * menu_item(item, enabled=item not in off)
+            else:
+                text, action, help_ = item
+                if imgui.menu_item(f"{text}##{action}", "", False, action not in off)[0]:
+                    asked.append(action)
+                if help_:
+                    tip(help_)
     return asked
+
+
+def menu_item(action: str, on: bool = False, enabled: bool = True, name: str = "") -> bool:
+    """A command in a menu that is open, with its key; True when it was chosen.
+
+    Args:
+        on: it has a check mark
+        name: in place of that of the table
+    """
+    command = COMMANDS[action]
+    chosen = imgui.menu_item(f"{name or command.name}##{action}", shortcut(action), on, enabled)[0]
+    if command.help:
+        tip(command.help)
+    return bool(chosen)
 
 
 def typed_name(name: str, room: float) -> str | None:
@@ -221,11 +244,19 @@ def typed_name(name: str, room: float) -> str | None:
     return text if entered or imgui.is_item_deactivated_after_edit() else ""
 
 
+def search_field(hint_: str, query: str) -> str:
+    """The text field over a list, which has the keyboard as it appears; what is sought."""
+    if imgui.is_window_appearing():
+        imgui.set_keyboard_focus_here()
+    imgui.set_next_item_width(-1.0)
+    return str(imgui.input_text_with_hint("##search", hint_, query)[1])
+
+
 @contextmanager
-def menu(name: str, ui: UiContext) -> Iterator[bool]:
-    """A context menu that `imgui.open_popup(name)` opens; whether it is open."""
+def menu(name: str, ui: UiContext, flags: int = 0) -> Iterator[bool]:
+    """A context menu that `imgui.open_popup(name)` opens; whether it is open. `flags`: of its window"""
     imgui.push_style_var(imgui.StyleVar_.window_padding, imgui.ImVec2(8.0 * ui.scale, 8.0 * ui.scale))
-    is_open = imgui.begin_popup(name)
+    is_open = imgui.begin_popup(name, flags)
     imgui.pop_style_var()
     yield bool(is_open)  # where this raises, the frame ends what is open
     if is_open:
@@ -390,13 +421,12 @@ def choice_row(
     column: float,
     ui: UiContext,
     help_: str,
-    action: str = "",
 ) -> T:
     """A named row of joined buttons; the value that was chosen of `options`, which give each its text."""
     label(title, column)
     values = [*options]
     pressed = choice(title, [*options.values()], values.index(current), ui)
-    tip(help_, action)
+    tip(help_)
     return current if pressed is None else values[pressed]
 
 

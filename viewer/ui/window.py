@@ -21,7 +21,7 @@ from imgui_bundle import imgui
 
 from progdf.errors import ProgdfError
 
-from .keys import FLY_KEYS, HELD_ORIGINAL, Keys, Press, next_event_id
+from .keys import FLY_KEYS, Keys, Press, next_event_id
 
 LONGEST_S = 0.3
 """Between the two presses of a double click, as imgui has it."""
@@ -76,7 +76,7 @@ KEY_NAMES = {
         getattr(glfw, f"KEY_{name.upper()}"): name
         for name in ("Left", "Right", "Up", "Down", "Escape", "Tab", "Enter", "Backspace", "Space", "Delete")
     },
-    glfw.KEY_BACKSLASH: HELD_ORIGINAL,
+    glfw.KEY_BACKSLASH: "\\",
     glfw.KEY_LEFT_BRACKET: "[",
     glfw.KEY_RIGHT_BRACKET: "]",
     glfw.KEY_COMMA: ",",

@@ -1,26 +1,136 @@
-"""The list of bindings: whole, readable at the smallest window, and never under a message."""
+"""The one table of commands and its lists: whole, readable at the smallest window, never under a message."""
 
 from __future__ import annotations
 
+import json
 import sys
+import webbrowser
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from imgui_bundle import imgui
 
-from tests.helpers.ui_rig import Rig, rig
+from tests.helpers.null_app import null_app, press
+from tests.helpers.sessions import bear_files, opened_document
+from tests.helpers.ui_rig import Rig, bear, first_view, rig
+from tests.viewer.app.test_keys_of_lists_and_form import strike, type_text
 from viewer.app import interface
+from viewer.state import actions, selection, workspace
 from viewer.ui.context import SMALL_PX
-from viewer.ui.keys import KEYS
+from viewer.ui.keys import COMMANDS, JOINED, KEYS, bind, find_commands, shortcut
 
 SMALLEST = (1024, 640)
 
 
-def test_every_key_that_has_a_help_text_is_listed_once_under_a_topic() -> None:
-    listed = [does for topic in interface.topics() for _, does in topic.rows]
-    assert sorted(listed) == sorted(
-        [does for _, does in interface.MOUSE_HELP] + [key.help for key in KEYS if key.help]
-    )
+def test_every_command_has_a_name_and_with_a_key_a_row_of_its_topic() -> None:
+    listed = [row for topic in interface.topics()[1:] for row in topic.rows]
+    assert len(listed) == len(set(listed))
+    for command in COMMANDS.values():
+        text, keys = command.row or command.name, {key for key, does in listed if does == command.row}
+        assert (text in [does for _, does in listed]) == (bool(command.keys) and text != JOINED), command
+        assert not command.listed or keys == {command.listed}
+    assert {("Ctrl+G", "Group; Shift ungroups"), ("Ctrl+C, Ctrl+V", "Copy, paste values")} <= {*listed}
     assert all(topic.rows for topic in interface.topics())
+    assert all(command.name for command in COMMANDS.values())
+
+
+INTERNAL = {
+    *("save_to", "open_file", "browse", "discard", "overwrite", "restore_autosave", "discard_autosave"),
+    *("train", "paint_over", "stop_run", "resume_run", "ask_discard", "discard_run", "close_run", "run_log"),
+    *("show_file", "copy_path", "deliver", "stop_and_quit", "drop_and_quit", "rebind", "rebind_from"),
+    *("replace_by", "place", "keep_placed", "put_back", "lay_decal", "save_region", "rename_region"),
+    *("set_up", "keep_up", "press_layer", "master", "rename_group", "restore", "forget", "name_snapshot"),
+    *("move_snapshot", "choose_snapshot", "blend_snapshots", "region", "show_region", "forget_region"),
+    *("select_invert", "move_key", "seek", "length", "fps", "go_to"),
+}
+"""Asked for by a button, a question or a drag, with what it is about: nothing to look up by its name."""
+
+
+def test_every_action_has_its_command_or_is_no_one_s_to_look_up() -> None:
+    everything = {*actions.ACTIONS, *workspace.REQUESTS, *selection.CHANGES, "frame", "home", "invert"}
+    everything |= {"paint_clear", "paint_fill", "paint_invert", "paint_feather"}
+    everything |= {"next_slider", "blend_snapshots"}
+    named = {action.partition(":")[0] for action in COMMANDS}
+    assert named | INTERNAL == everything
+    assert not named & INTERNAL
+
+
+@pytest.mark.parametrize(
+    ("query", "first"),
+    [
+        ("undo", "undo"),
+        ("split", "split"),
+        ("sv", "split"),  # initials
+        ("web", "export_page"),
+        ("rend pic", "render_picture"),
+        ("recording", "against"),
+        ("ctrl+shift+p", "render_film"),
+        ("expscn", "export"),  # letters in their order
+    ],
+)
+def test_a_command_is_found_by_what_one_remembers_of_it(query: str, first: str) -> None:
+    assert find_commands(query, COMMANDS)[0].action == first
+
+
+def test_what_no_command_is_called_finds_none_and_nothing_typed_finds_all() -> None:
+    assert find_commands("xyzzy", COMMANDS) == []
+    assert {command.action for command in find_commands("", COMMANDS)} == {*COMMANDS}
+
+
+@pytest.mark.gl
+def test_a_command_is_done_by_typing_its_name_and_enter_and_arrows_take_others() -> None:
+    with rig(None, (900, 700)) as hand:
+        before = hand.main_view.work.view
+        strike(hand, "Ctrl+P")
+        assert hand.main_view.work.palette == 0
+        type_text(hand, "view")
+        found = [command.action for command in find_commands("view", COMMANDS)]
+        for chord in ("Down", "Down", "Up"):
+            strike(hand, chord)
+        assert hand.main_view.work.palette == 1
+        assert hand.main_view.work.view == before, "no letter was a shortcut"
+        strike(hand, "Escape")
+        assert hand.main_view.work.palette is None
+        strike(hand, "F3")
+        type_text(hand, "ground")
+        strike(hand, "Enter")
+        assert hand.main_view.work.palette is None
+        assert hand.main_view.work.view == replace(before, grid=True)
+        strike(hand, "G")
+        assert hand.main_view.work.view.unfolded, "shortcuts are back"
+        assert len(found) > 2
+
+
+@pytest.mark.gl
+def test_a_click_beside_the_list_of_commands_closes_it_and_one_on_a_line_takes_it() -> None:
+    with rig(None, (900, 700)) as hand:
+        hand.key("F3")
+        hand.click(40.0, 650.0)
+        assert hand.main_view.work.palette is None
+        hand.key("F3")
+        type_text(hand, "timings")
+        hand.click(300.0, 134.0)
+        assert hand.main_view.work.view.overlay
+
+
+@pytest.mark.gl
+def test_what_is_typed_in_the_list_of_keys_leaves_what_is_called_like_that() -> None:
+    topics = interface.filter_topics(interface.topics(), "keyframe")
+    assert [topic.name for topic in topics] == ["Timeline"]
+    assert {does for _, does in topics[0].rows} >= {"Insert keyframe", "Delete keyframe"}
+    with rig(None, (900, 700)) as hand:
+        strike(hand, "F1")
+        type_text(hand, "mode")
+        assert hand.main_view.work.query == "mode"
+        assert hand.main_view.work.view.select.tool == "", "no letter was a shortcut"
+        strike(hand, "Escape")
+        assert not hand.main_view.work.help
+        strike(hand, "F1")
+        assert (hand.main_view.work.help, hand.main_view.work.query) == (True, "")
+        strike(hand, "F1")
+        assert not hand.main_view.work.help
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 9])
@@ -33,8 +143,89 @@ def test_columns_keep_all_topics_in_their_order_and_none_is_longer_than_need_be(
     assert longest <= sum(topic.height for topic in topics) / count + max(t.height for t in topics)
 
 
+@pytest.fixture
+def own_keys() -> Iterator[None]:
+    """The table's keys again, after the test."""
+    yield
+    bind({})
+
+
+@pytest.mark.usefixtures("own_keys")
+def test_a_command_gets_the_keys_it_is_given_and_another_one_loses_them() -> None:
+    given = {"snapshot": "f6", "beside": ["shift+ctrl+J", "Y"], "quit": "", "difference": "T", "before": "B"}
+    assert bind(given) == []
+    found = {
+        action: [chord for chord, command in KEYS.items() if command.action == action] for action in COMMANDS
+    }
+    assert (found["snapshot"], found["beside"], found["quit"]) == (["F6"], ["Ctrl+Shift+J", "Y"], [])
+    assert (found["timeline"], found["brush"]) == ([], []), "T and B do something else now"
+    assert found["undo"] == ["Ctrl+Z"]
+    assert (shortcut("snapshot"), shortcut("quit")) == ("F6", "")
+    rows = {does: keys for topic in interface.topics() for keys, does in topic.rows}
+    assert (rows["Add snapshot"], rows["Compare snapshots"]) == ("F6", "Shift+F5"), "each in a row of its own"
+    assert "Quit" not in rows
+    assert bind({}) == []
+    assert shortcut("snapshot") == "F5"
+
+
+WRONG = {
+    "snapsot": ("F6", "there is no such command"),
+    "snapshot": ("F13", "there is no key F13"),
+    "undo": ("Ctrl+", "there is no key Ctrl+"),
+    "redo": ("Hyper+Z", "there is no key Hyper+Z"),
+    "split": (["Y", 7], 'keys are written as "F6" or ["F6", "Ctrl+B"]'),
+    "hide": ({"key": "H"}, 'keys are written as "F6" or ["F6", "Ctrl+B"]'),
+    "solo": ("F7", "F7 is that of lock already"),
+    "fold": ("w", "W flies"),
+}
+
+
+@pytest.mark.usefixtures("own_keys")
+def test_what_is_wrong_with_a_key_is_a_line_and_its_command_keeps_what_it_had() -> None:
+    before = dict(KEYS)
+    problems = bind({"lock": "F7", **{action: value for action, (value, _) in WRONG.items()}})
+    assert problems == [f"{action}: {line}" for action, (_, line) in WRONG.items()]
+    assert {chord: key for chord, key in KEYS.items() if key.action != "lock"} == {
+        chord: key for chord, key in before.items() if key.action != "lock"
+    }
+
+
+@pytest.mark.gl
+@pytest.mark.usefixtures("own_keys")
+def test_the_file_of_keys_is_made_whole_and_read_when_the_window_opens(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened: list[str] = []
+    monkeypatch.setattr(webbrowser, "open", opened.append)
+    with null_app(opened_document(bear_files(tmp_path)), first_view(bear(), 0.5, 0.5), tmp_path) as app:
+        app.main_view.request("keys_file")
+        app.draw()
+        path = tmp_path / "memory" / "keys.json"
+        assert opened == [path.as_uri()]
+        assert [*json.loads(path.read_text())] == [*COMMANDS]
+        before = dict(KEYS)
+        app.bind_keys()
+        assert before == KEYS, "as it was made it changes nothing"
+        assert app.main_view.work.message is not None
+        assert app.main_view.work.message.text.startswith("Keys are read from")
+        path.write_text('{"grid": "F8", "undo": 3, "nothing": "F9"}')
+        app.bind_keys()
+        said = 'keys.json: undo: keys are written as "F6" or ["F6", "Ctrl+B"], and 1 more in window.log'
+        assert app.main_view.work.message.text == said
+        assert "nothing: there is no such command" in (tmp_path / "memory" / "window.log").read_text()
+        press(app, "Shift+G")
+        assert not app.main_view.work.view.grid
+        press(app, "F8")
+        assert app.main_view.work.view.grid
+        for damaged in ("{", "[1]", "\xff"):
+            path.write_bytes(damaged.encode("latin-1"))
+            app.bind_keys()
+            assert "keys.json is damaged" in app.main_view.work.message.text
+            assert before == KEYS
+
+
 def shown(hand: Rig) -> imgui.internal.Window:
-    return imgui.internal.find_window_by_name("bindings")
+    return imgui.internal.find_window_by_name("keys")
 
 
 @pytest.mark.gl
@@ -65,7 +256,7 @@ def fits_its_columns(hand: Rig) -> bool:
         + 14.0 * hand.main_view.ui.scale
         + max(imgui.calc_text_size(does).x for topic in column for _, does in topic.rows)
         <= room
-        for column in interface.columns(interface.topics(), 3)
+        for column in interface.columns(interface.topics(), interface.MOST_COLUMNS)
     )
     imgui.pop_font()
     imgui.end_frame()

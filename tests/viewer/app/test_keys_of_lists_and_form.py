@@ -163,12 +163,12 @@ def test_no_shortcut_acts_while_something_is_open(hand: Rig, what: str) -> None:
         hand.main_view.ask(Dialog("about", "1.0"))
         hand.frame(2)
     left_alone = ("Escape", "Enter", "Tab", "Shift+Tab", "Up", "Down", "Left", "Right", "Space", "Shift+F2")
-    for key in KEYS:
-        if key.chord in left_alone or key.chord.endswith(("Up", "Down", "Left", "Right")):
+    for chord in KEYS:
+        if chord in left_alone or chord.endswith(("Up", "Down", "Left", "Right")):
             continue
         before = hand.main_view.work
         hand.main_view.wake()
-        hand.frame(keys=Keys((Press(key.chord),), frozenset({key.chord}), frozenset("WASD")))
+        hand.frame(keys=Keys((Press(chord),), frozenset({chord}), frozenset("WASD")))
         hand.frame(3)
         after = hand.main_view.work
         assert (after.view, after.requests, after.dialog, after.help, after.form_open) == (
@@ -177,7 +177,7 @@ def test_no_shortcut_acts_while_something_is_open(hand: Rig, what: str) -> None:
             before.dialog,
             before.help,
             before.form_open,
-        ), key.chord
+        ), chord
 
 
 def test_the_menu_goes_by_arrows_into_its_lists_and_out(hand: Rig) -> None:

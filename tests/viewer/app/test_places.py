@@ -184,6 +184,6 @@ def test_a_session_gives_its_name_to_the_window_and_the_panel(tmp_path: Path) ->
     with null_app(opened_document(bear_files(tmp_path)), ViewState(), tmp_path) as app:
         assert (app.main_view.work.session, app._title) == ("", "bear.ply – ProGDF Studio")
         app.file_actions.save(tmp_path / "two looks.session.json")
-        press(app, "F3")
+        press(app, "F5")
         assert app.main_view.work.session == "two looks"
         assert app._title == "• two looks – ProGDF Studio"

@@ -245,7 +245,7 @@ def test_the_scene_is_exported_by_the_command(window: application.App, tmp_path:
     request(window, f"close_run:{job.number}")
     assert window.main_view.work.jobs == ()
     Trainer.ended = None
-    press(window, "Ctrl+P")
+    press(window, "Ctrl+Alt+P")
     (tmp_path / "bear_edited.png").touch()
     press(window, "Enter")
     asked = window.main_view.work.dialog
@@ -271,7 +271,7 @@ def test_the_scene_is_exported_by_the_command(window: application.App, tmp_path:
 
 
 def test_a_web_page_is_exported_by_the_command_with_the_snapshots(window: application.App) -> None:
-    press(window, "F3", "Ctrl+Shift+E")
+    press(window, "F5", "Ctrl+Shift+E")
     asked = window.main_view.work.dialog
     assert asked is not None
     assert asked.text.endswith("bear_edited.html")

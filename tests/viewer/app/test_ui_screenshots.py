@@ -145,7 +145,7 @@ def test_the_difference_from_the_original(screenshot: Compare) -> None:
 
 def test_snapshots_and_a_question(screenshot: Compare) -> None:
     with rig(first_view(bear(), 1.0, 0.0), SMALLEST) as hand:
-        for chord in ("F3", *["Shift+Left"] * 5, "F3"):
+        for chord in ("F5", *["Shift+Left"] * 5, "F5"):
             hand.key(chord)
         hand.frame(5)
         hand.main_view.recent = (Path("/scenes/bear.ply"), Path("/scenes/edits/scarf.gdf"))
@@ -172,7 +172,7 @@ def test_twenty_layers_as_rows_with_a_group_and_several_selected(screenshot: Com
 
 def test_a_blend_between_two_snapshots(screenshot: Compare) -> None:
     with rig(first_view(bear(), 1.0, 0.0), SMALLEST) as hand:
-        for chord in ("F3", *["Shift+Right"] * 10, "2", *["Shift+Left"] * 10, "F3"):
+        for chord in ("F5", *["Shift+Right"] * 10, "2", *["Shift+Left"] * 10, "F5"):
             hand.key(chord)
         hand.rest()
         hand.drag((743.0, 291.0), (860.0, 291.0))

@@ -10,6 +10,7 @@ import pytest
 
 from progdf.compose.layers import Gains
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
+from tests.viewer.app.test_keys_of_lists_and_form import strike
 from viewer.camera.view_camera import eye, with_up
 from viewer.state import history, layers, selection, snapshots, workspace
 from viewer.state.view_state import Keyframe, LayerState, Timeline, ViewState
@@ -84,6 +85,11 @@ CHANGES: dict[str, Callable[[ViewState], ViewState]] = {
     "up axis": lambda view: replace(view, camera=with_up(view.camera, TILTED)),
     "field of view": lambda view: replace(view, camera=replace(view.camera, fov_y=70.0)),
     "background": lambda view: replace(view, background=(0.0, 0.0, 0.0)),
+    "comparison": lambda view: replace(view, compare=replace(view.compare, mode="split")),
+    "ground grid": lambda view: replace(view, grid=True),
+    "axes": lambda view: replace(view, axes=False),
+    "safe frame": lambda view: replace(view, safe_frame="16:9"),
+    "dynamic resolution": lambda view: replace(view, dynamic_resolution="off"),
     "strength of ears": layer(strength=0.7),
     "strength of 2 layers": lambda v: replace(
         v, layers=tuple(replace(one, strength=0.1) for one in v.layers)
@@ -115,6 +121,72 @@ def test_undo_and_redo_say_what_they_take_back(words: str) -> None:
         history.look_of(PLAIN),
     )
     assert (history.next_undo(back.past), history.next_redo(back.past)) == ("", words)
+
+
+def test_one_goes_to_any_entry_and_those_after_it_stay_until_something_is_done() -> None:
+    work, changes = new_workspace(PLAIN), ("ground grid", "strength of ears", "safe frame", "blend rule")
+    for words in changes:
+        work = recorded(work, CHANGES[words](work.view))
+    last = work.view
+    listed = [history.describe_entry(work.past, i) for i in range(len(history.entries(work.past)))]
+    assert listed == ["as opened", *changes]
+    for index in (1, 4, 0, 3, 3, 4):
+        past = history.go_to(work.past, index)
+        work = replace(work, past=past, view=history.apply_present(work.view, past))
+        assert work.view.grid == (index > 0)
+        assert work.view.layers[1].strength == (0.7 if index > 1 else 0.5)
+        assert len(history.entries(past)) == 5
+        assert workspace.record_undo(work) == work, "to go there is no change"
+    assert work.view == last
+    for index in (-1, 5):
+        assert history.go_to(work.past, index) is work.past
+
+
+def test_looking_at_this_and_that_leaves_one_entry_and_none_where_it_ends_as_it_began() -> None:
+    work = recorded(new_workspace(PLAIN), CHANGES["ground grid"](PLAIN))
+    for mode in ("split", "beside", "difference"):
+        work = recorded(work, replace(work.view, compare=replace(work.view.compare, mode=mode)))
+    assert len(work.past.past) == 2
+    assert undone(work).view == replace(PLAIN, grid=True)
+    work = recorded(work, replace(PLAIN, grid=True))
+    assert history.next_undo(work.past) == "ground grid"
+
+
+@pytest.mark.gl
+def test_an_undo_that_ends_a_comparison_of_snapshots_leaves_what_can_be_redone() -> None:
+    with rig(first_view(bear(), 0.5, 0.5), (900, 640)) as hand:
+        for chord in ("F5", "Shift+Left", "F5", "Shift+F5", "Ctrl+Z", "Ctrl+Z"):
+            hand.key(chord)
+        hand.key("Ctrl+Shift+Z")
+        hand.key("Shift+F5")
+        assert hand.main_view.work.view.compare.against == "snapshots"
+        hand.key("Shift+Left")
+        assert hand.main_view.work.view.compare.mode == "off"
+        hand.key("Ctrl+Z")
+        hand.frame(3)
+        assert history.next_redo(hand.main_view.work.past) == "strength of ears"
+
+
+@pytest.mark.gl
+def test_a_click_in_the_list_of_the_history_and_arrows_and_enter_go_there() -> None:
+    with rig(first_view(bear(), 0.5, 0.5), (900, 640)) as hand:
+        for chord in ("Shift+Left", "H", "Shift+G"):
+            strike(hand, chord)
+        strike(hand, "Ctrl+Alt+Z")
+        for chord in ("Up", "Up", "Enter"):
+            strike(hand, chord)
+        layers = hand.main_view.work.view.layers
+        assert (layers[1].strength, layers[1].enabled, hand.main_view.work.view.grid) == (0.4, True, False)
+        assert hand.main_view.work.message is not None
+        assert hand.main_view.work.message.text == "Back to: strength of ears"
+        assert hand.main_view.work.history is False, "it stays, to go on from"
+        strike(hand, "Escape")
+        assert hand.main_view.work.history is None
+        hand.click(686.0, 618.0)
+        assert hand.main_view.work.history is False
+        hand.click(680.0, 566.0)
+        assert hand.main_view.work.view.grid
+        assert not hand.main_view.work.view.layers[1].enabled
 
 
 def test_a_snapshot_is_named_too() -> None:

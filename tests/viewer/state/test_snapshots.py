@@ -126,7 +126,7 @@ def test_snapshots_change_places_and_names_and_the_pair_goes_with_them() -> None
 def test_a_click_on_a_small_picture_goes_back_to_its_snapshot_and_its_menu_deletes_it() -> None:
     with rig(first_view(bear(), 0.5, 0.5), (1024, 640)) as hand:
         first = hand.picture()
-        for chord in ("F3", "Shift+Left", "Shift+Left", "F3"):
+        for chord in ("F5", "Shift+Left", "Shift+Left", "F5"):
             hand.key(chord)
         hand.rest()
         assert hand.main_view.next_frame_delay() is None, "the small pictures are there"
@@ -162,21 +162,21 @@ def test_two_snapshots_are_compared_until_something_is_edited_and_blended(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     with rig(first_view(bear(), 1.0, 0.0), (1024, 640)) as hand:
-        hand.key("Shift+F3")
+        hand.key("Shift+F5")
         assert (
             "there is no snapshot" in hand.main_view.canvas.comparer.labels(hand.main_view.work.view).notice
         )
-        hand.key("Shift+F3")
+        hand.key("Shift+F5")
         warm = hand.picture()
-        hand.key("F3")
+        hand.key("F5")
         hand.key("2")
-        for chord in (*["Shift+Left"] * 10, "1", *["Shift+Right"] * 10, "F3"):
+        for chord in (*["Shift+Left"] * 10, "1", *["Shift+Right"] * 10, "F5"):
             hand.key(chord)
         assert hand.strengths == [0.0, 1.0]
         gold = hand.picture()
         hand.key("1")
         hand.key("Shift+Left")
-        hand.key("Shift+F3")
+        hand.key("Shift+F5")
         seen, middle = hand.picture(), round(0.5 * 724)
         assert np.array_equal(*(beside_line(p, middle)[0] for p in (seen, warm)))
         assert np.array_equal(*(beside_line(p, middle)[1] for p in (seen, gold)))

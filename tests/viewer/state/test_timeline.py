@@ -316,7 +316,7 @@ def test_history_restores_the_timeline_with_the_rest() -> None:
 
 
 def test_every_action_of_the_timeline_that_a_key_names_exists() -> None:
-    named = {key.action.partition(":")[0] for key in KEYS}
+    named = {key.action.partition(":")[0] for key in KEYS.values()}
     assert {"key", "drop_key", "play", "step", "jump", "easing", "ping_pong", "timeline"} <= named
     assert set(timeline.ACTIONS) <= set(ACTIONS)
 

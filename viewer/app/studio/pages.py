@@ -23,6 +23,7 @@ from viewer.ui.widgets import (
     choice,
     drop_down,
     elide,
+    hint,
     icon_button,
     label,
     picture,
@@ -32,8 +33,8 @@ from viewer.ui.widgets import (
     tip,
 )
 
-KEYS = ("open", "quit", "full_screen", "window_picture", "help", "unfocus", "about")
-"""Actions of keys that mean something here."""
+COMMANDS = ("open", "demo", "quit", "full_screen", "window_picture", "help", "palette", "unfocus", "about")
+"""Those that mean something here."""
 CARD_PX, GAP_PX, MARGIN_PX, SIDE_PX = 168.0, 16.0, 28.0, 264.0
 WIDEST_PX, NARROW_PX = 1140.0, 760.0
 """Of the whole page, at 1×; below the second its left part stands above the right one."""
@@ -123,7 +124,7 @@ def _head(wide: float, tall: float, ui: UiContext) -> list[str]:
     )
     if accent_button(f"{Icon.OPEN}  Open…", button):
         actions.append("open")
-    tip("A scene (.ply, .spz, .sog …) or a session (Ctrl+O)")
+    hint("open")
     if flat:
         imgui.set_cursor_pos(imgui.ImVec2(x + frame.x - button.x - side, y + side))
     else:
@@ -132,7 +133,7 @@ def _head(wide: float, tall: float, ui: UiContext) -> list[str]:
     if imgui.button("Train the demo", imgui.ImVec2(button.x if flat else wide, button.y)):
         actions.append("demo")
     imgui.pop_item_flag()
-    tip("Makes a small scene and trains four edits of it here: a minute or two")
+    hint("demo")
     imgui.set_cursor_pos(imgui.ImVec2(x, y))
     _dashed_frame(frame, ui)
     return actions
