@@ -32,13 +32,13 @@ from viewer.ui.overlay import draw_splash
 from viewer.ui.window import Window, interruptible
 
 from .application import LOG, error_details, error_line, log_error
-from .file_actions import FileActions, StrayActions
+from .file_actions import FileActions
 from .main_view import MainView
 from .studio.deliver import DeliverActions
 from .studio.preview import PreviewActions
 from .studio.start import StartActions, UpActions
 from .studio.training import JobActions
-from .tidy import TidyActions
+from .tidy import StrayActions, TidyActions
 
 _Made = TypeVar("_Made")
 

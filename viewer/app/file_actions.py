@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import webbrowser
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,15 +16,11 @@ import torch
 from progdf.camera import Camera
 from progdf.cli.info import kind_of
 from progdf.errors import ProgdfError
-from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf, fingerprint, load_gdf
 from progdf.io.cameras import load_cameras
 from progdf.io.picture_camera import edits_in_picture, find_picture_camera
 from progdf.io.session import BUNDLE, unpack_bundle
-from progdf.metrics.image import NO_DIFFERENCE
 from progdf.region import Region, from_mask
-from progdf.scene.strays import Strays, clean, find_strays, picture_difference
-from progdf.terminal import group_digits
 from progdf.threads import all_threads
 from viewer.camera.view_camera import ViewCamera, first_camera, from_camera, to_camera
 from viewer.files import document as documents
@@ -211,65 +206,6 @@ class EditActions:
         main_view = self._app.main_view
         main_view.change(view)
         main_view.work = focus_layer(main_view.work, focus)
-
-
-class StrayActions:
-    """Hides what a capture left where nothing is, when it is asked to. `close` it with the window.
-
-    Args:
-        app: the window
-    """
-
-    def __init__(self, app: Application) -> None:
-        self._app = app
-        self._worker = ThreadPoolExecutor(1, thread_name_prefix="strays")
-        self._search: Future[tuple[Strays, float]] | None = None
-        self._scene: Gaussians | None = None  # that is searched
-
-    def handle(self, request: str) -> bool:
-        """Begin to look for strays, which takes seconds; False where something else is asked for."""
-        if request != "hide_strays":
-            return False
-        if self._search is None:
-            self._scene = self._app.document.original
-            self._search = self._worker.submit(_search, self._scene)
-            self._app.main_view.show_message("Looking for strays …")
-        return True
-
-    def poll(self) -> float | None:
-        """Hide what was found; seconds until the next look, None for ever."""
-        if self._search is None:
-            return None
-        if not self._search.done():
-            return _POLL_S
-        search, self._search = self._search, None
-        if self._scene is self._app.document.original:  # else another one was opened meanwhile
-            self._hide(*search.result())
-        return None
-
-    def close(self) -> None:
-        """Nobody waits for what is still looked for."""
-        self._worker.shutdown(wait=False, cancel_futures=True)
-
-    def _hide(self, strays: Strays, db: float) -> None:
-        main_view, count = self._app.main_view, len(self._app.document.scene)
-        if not len(strays.rows):
-            main_view.show_message("There are no strays")
-            return
-        view, mask = main_view.work.view, np.zeros(count, bool)
-        mask[strays.rows] = True
-        main_view.change(replace(view, selection=selection.hide(view.selection, mask)))
-        change = "no pixel differs" if db >= NO_DIFFERENCE else f"{db:.1f} dB to the pictures before"
-        hid = f"Hid {group_digits(len(strays.rows))} strays ({strays.describe()})"
-        main_view.show_message(f"{hid}: {change}; {shortcut('show_all')} shows them")
-
-
-def _search(scene: Gaussians) -> tuple[Strays, float]:
-    strays = find_strays(scene)
-    return strays, picture_difference(scene, clean(scene, strays))[0] if len(strays.rows) else NO_DIFFERENCE
-
-
-_POLL_S = 0.1
 
 
 class FileActions:

@@ -1,8 +1,10 @@
-"""What is done to a selection by hand: removed, moved, copied, each a layer with a slider."""
+"""What is done by hand: a selection removed, moved, copied, each a layer with a slider; and strays hidden."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -10,13 +12,18 @@ import numpy as np
 import torch
 
 from progdf.errors import ProgdfError
+from progdf.gaussians import Gaussians
 from progdf.gdf.file import save_gdf
 from progdf.io.atomic import make_folder
+from progdf.metrics.image import NO_DIFFERENCE
 from progdf.region import Region, from_mask
+from progdf.scene.strays import Strays, clean, find_strays, picture_difference
+from progdf.terminal import group_digits
 from progdf.tidy import Step, similarity, tidy
 from viewer.jobs.training import edits_folder
 from viewer.state import selection
 from viewer.state.view_state import LayerState
+from viewer.ui.keys import shortcut
 
 from .application import Application, failure_line
 from .file_actions import EditActions
@@ -125,3 +132,62 @@ class TidyActions:
         gdf = tidy(document.original, steps, name, _INSTRUCTIONS[does])
         save_gdf(path, gdf)
         self._edits.add(path, name, deselect=True)
+
+
+class StrayActions:
+    """Hides what a capture left where nothing is, when it is asked to. `close` it with the window.
+
+    Args:
+        app: the window
+    """
+
+    def __init__(self, app: Application) -> None:
+        self._app = app
+        self._worker = ThreadPoolExecutor(1, thread_name_prefix="strays")
+        self._search: Future[tuple[Strays, float]] | None = None
+        self._scene: Gaussians | None = None  # that is searched
+
+    def handle(self, request: str) -> bool:
+        """Begin to look for strays, which takes seconds; False where something else is asked for."""
+        if request != "hide_strays":
+            return False
+        if self._search is None:
+            self._scene = self._app.document.original
+            self._search = self._worker.submit(_search, self._scene)
+            self._app.main_view.show_message("Looking for strays …")
+        return True
+
+    def poll(self) -> float | None:
+        """Hide what was found; seconds until the next look, None for ever."""
+        if self._search is None:
+            return None
+        if not self._search.done():
+            return _POLL_S
+        search, self._search = self._search, None
+        if self._scene is self._app.document.original:  # else another one was opened meanwhile
+            self._hide(*search.result())
+        return None
+
+    def close(self) -> None:
+        """Nobody waits for what is still looked for."""
+        self._worker.shutdown(wait=False, cancel_futures=True)
+
+    def _hide(self, strays: Strays, db: float) -> None:
+        main_view, count = self._app.main_view, len(self._app.document.scene)
+        if not len(strays.rows):
+            main_view.show_message("There are no strays")
+            return
+        view, mask = main_view.work.view, np.zeros(count, bool)
+        mask[strays.rows] = True
+        main_view.change(replace(view, selection=selection.hide(view.selection, mask)))
+        change = "no pixel differs" if db >= NO_DIFFERENCE else f"{db:.1f} dB to the pictures before"
+        hid = f"Hid {group_digits(len(strays.rows))} strays ({strays.describe()})"
+        main_view.show_message(f"{hid}: {change}; {shortcut('show_all')} shows them")
+
+
+def _search(scene: Gaussians) -> tuple[Strays, float]:
+    strays = find_strays(scene)
+    return strays, picture_difference(scene, clean(scene, strays))[0] if len(strays.rows) else NO_DIFFERENCE
+
+
+_POLL_S = 0.1
