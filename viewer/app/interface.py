@@ -119,7 +119,9 @@ def draw_keys(room: imgui.ImVec2, query: str, ui: UiContext) -> str:
     imgui.push_style_var(imgui.StyleVar_.window_rounding, 6.0 * ui.scale)
     imgui.push_style_var(imgui.StyleVar_.window_padding, imgui.ImVec2(margin, margin))
     imgui.push_style_var(imgui.StyleVar_.item_spacing, imgui.ImVec2(8.0 * ui.scale, 0.0))
-    imgui.begin("keys", None, FIXED & ~imgui.WindowFlags_.no_scrollbar.value)
+    imgui.begin(
+        "keys", None, FIXED & ~imgui.WindowFlags_.no_scrollbar.value | imgui.WindowFlags_.no_nav.value
+    )
     imgui.internal.bring_window_to_display_front(imgui.internal.get_current_window())
     left, top = imgui.get_cursor_pos_x(), imgui.get_cursor_pos_y()
     query = search_field("Search keys", query)
@@ -335,6 +337,8 @@ def over_picture(
     overlay.draw_axes(view, area, on_axes or held.drag == overlay.AXES_DRAG, ui)
     select_tool.draw_strokes(held.strokes, work, pointer)
     select_tool.draw_gesture(held.gesture, view, ui, pointer.left)
+    if view.select.tool in select_tool.CLICKED and view.panel:
+        overlay.draw_cross(area, ui)
     if not original:
         mouse.draw_comparison(view, area, mouse.grips_divider(held, view, pointer), ui)
     if not view.panel and (original or view.compare.mode != "off"):
@@ -381,8 +385,11 @@ def perform_actions(work: Workspace, actions: Sequence[str], pointer: PointerCon
     for action in actions:
         before = work
         work = perform(work, action, pointer.facts, pointer.area.width / pointer.area.height)
-        if action.partition(":")[0] in GLIDES:
+        if action.partition(":")[0] in GLIDES and not work.layout.reduced_motion:
             work = workspace.glide_from(work, before.view.camera)
+        elif action == "reduced_motion":
+            said = f"Reduced motion is {'on' if work.layout.reduced_motion else 'off'}"
+            work = workspace.with_message(work, said, pointer.now)
         elif action in _UNDOES and work.past is not before.past:
             did, describe = _UNDOES[action]
             work = workspace.with_message(

@@ -5,6 +5,7 @@ The window (app.py) and the tests feed imgui's io and call `frame`: a scripted m
 
 from __future__ import annotations
 
+import re
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -27,7 +28,7 @@ from viewer.state.facts import RecordingFile
 from viewer.state.layers import add_layer
 from viewer.state.snapshots import SliderSnapshot, compare_sides
 from viewer.state.view_state import LayerState, ViewState
-from viewer.state.workspace import Dialog, PreviewState, SceneFacts
+from viewer.state.workspace import PLACES, Dialog, PreviewState, SceneFacts
 from viewer.ui import overlay
 from viewer.ui.context import UiContext
 from viewer.ui.keys import (
@@ -144,6 +145,7 @@ class MainView:
         self._revealed = (self.work.focus, False)  # the layer that the panel shows, and whether it has a bar
         self._keys = NO_KEYS  # of the present frame
         self._taps = Taps()
+        self._held = False  # something of the interface, by the mouse or the keyboard
         self._popups = 0, 0  # how many were open as the last frame began, and this one
         self._half = 0  # of two pictures side by side, the one that the mouse is in
         self._clock = 0.0
@@ -311,11 +313,19 @@ class MainView:
         if off:
             self._cancel_drag()
         view, asks = self.work.view, self._takes_keys()
+        self._follow_keyboard(asks)
         if not asks:
             gesture, self.work, self._keys = select_tool.take_keys(
                 self._tool.gesture, self.work, self._pointer(), self._keys
             )
             self._tool = replace(self._tool, gesture=gesture)
+            if (
+                any(p.chord == "Enter" for p in self._keys.pressed)
+                and view.select.tool in select_tool.CLICKED
+            ):
+                wide, tall = self._pointer().size
+                click, self.work = select_tool.click(self.work, self._pointer(), (wide / 2, tall / 2))
+                self._tool, self._keys = replace(self._tool, click=click), replace(self._keys, pressed=())
         free = not (asks or imgui.get_io().want_text_input or view.brush.active or view.select.tool)
         if self.up_strip is not None and free and any(p.chord == "Escape" for p in self._keys.pressed):
             self._keys = replace(self._keys, pressed=())
@@ -355,6 +365,26 @@ class MainView:
             tool, pointer, self._tool = self._tool, self._pointer(), MouseTool()  # put down if it raises
             with self._guard():
                 self._tool, self.work = mouse.handle_mouse(tool, self.work, pointer)
+
+    def _follow_keyboard(self, asks: bool) -> None:
+        """A part of the window that has the keyboard takes all keys but F1 to F12 and those with Ctrl, until
+        a click or Escape; `asks`: something lies over it."""
+        if self.work.keyboard and not asks:
+            pressed = {press.chord for press in self._keys.pressed}
+            leaves = "Escape" in pressed and not self._held
+            if leaves or any(imgui.is_mouse_clicked(button) for button in range(3)):
+                self.work = replace(self.work, keyboard="")
+            left = [
+                p for p in self._keys.pressed if p.chord.startswith("Ctrl+") or re.search(r"F\d", p.chord)
+            ]
+            self._keys = replace(self._keys, pressed=tuple(left), fly=frozenset())
+        windows = {name: imgui.internal.find_window_by_name(name) for name in PLACES}
+        shown = [name for name, window in windows.items() if window is not None and window.was_active]
+        while self.work.keyboard and self.work.keyboard not in shown:
+            self._perform(f"next_place:{self.work.keyboard_by}")
+        self.ui.keyboard = self.work.keyboard
+        self.ui.focused = self.ui.focused if self.work.keyboard else ""
+        self._held = bool(imgui.is_any_item_active())
 
     def _move_gizmo(self) -> bool:
         """Handles, or a decal, follow the mouse; whether it is theirs."""

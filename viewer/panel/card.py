@@ -28,6 +28,7 @@ from viewer.ui.widgets import (
     group_digits,
     hint,
     icon_button,
+    is_entered,
     label,
     menu,
     menu_item,
@@ -309,6 +310,7 @@ def _head(
     number_width = _number_width(layer, compact)
     end = right - number_width - 6.0 * scale
     over = imgui.is_window_hovered(imgui.HoveredFlags_.allow_when_blocked_by_active_item.value)
+    over |= ui.keyboard == "panel" and work.focus == index
     toggles = 0 if compact else 5 if over else 2 if layer.locked else int(layer.solo)
     taken = SLIDER_PX * scale if compact else toggles * TOGGLE_PX * scale
     work, touch = _name(work, index, end - taken - 4.0 * scale - imgui.get_cursor_pos_x(), active, ui)
@@ -430,7 +432,10 @@ def _name(
             work = replace(work, renaming=None, view=rename_layer(work.view, index, text))
         return work, CardTouch()
     x, y = imgui.get_cursor_screen_pos()
-    imgui.invisible_button("name", imgui.ImVec2(max(room, 1.0), imgui.get_frame_height()))
+    size, nav = imgui.ImVec2(max(room, 1.0), imgui.get_frame_height()), imgui.ButtonFlags_.enable_nav
+    imgui.invisible_button("name", size, nav.value)
+    if is_entered():
+        return work, CardTouch(touched=True)
     gesture, named = grip(ui), imgui.is_item_active()
     at = imgui.ImVec2(x, y + imgui.get_style().frame_padding.y)
     color, compact = PALETTE.text if active else PALETTE.dim, is_compact(work)

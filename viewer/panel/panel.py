@@ -100,7 +100,9 @@ def draw(
     display, wide = imgui.get_io().display_size, width(work.layout, ui)
     imgui.set_next_window_pos(imgui.ImVec2(display.x - wide, 0.0))
     imgui.set_next_window_size(imgui.ImVec2(wide, display.y))
-    imgui.begin("panel", None, FIXED | BEHIND | imgui.WindowFlags_.no_scroll_with_mouse.value)
+    still = imgui.WindowFlags_.no_scroll_with_mouse.value
+    imgui.begin("panel", None, FIXED | BEHIND | still | ui.nav_flags("panel"))
+    ui.take_keyboard("panel")
     work = replace(work, layout=_drag_edge(work.layout, ui))
     _title(work, facts, recent, ui, actions)
     footer = imgui.get_frame_height() + imgui.get_style().item_spacing.y * 2
@@ -108,7 +110,7 @@ def draw(
     room = imgui.get_content_region_avail().y - footer - cards.HEADING_PX * ui.scale
     work = replace(work, cards_fit=len(work.view.layers) * card.CARD_PX * ui.scale <= room)
     selected = selected_layers(work)
-    _begin_body(footer + cards.selection_height(selected, ui))
+    _begin_body(footer + cards.selection_height(selected, ui), ui)
     work = cards.draw_heading(work, ui, actions)
     work = new_edit_form.draw(work, facts.count, preview, ui, actions)
     work = cards.draw(work, facts.rows, pictures.edits, reveal, ui, actions)
@@ -139,7 +141,7 @@ def _drag_edge(layout: Layout, ui: UiContext) -> Layout:
     return layout
 
 
-def _begin_body(footer: float) -> None:
+def _begin_body(footer: float, ui: UiContext) -> None:
     """What scrolls; its scrollbar stands in the panel's margin, so that nothing moves when one is needed."""
     overflows = imgui.get_state_storage().get_bool(imgui.get_id("overflows"))
     clear = imgui.ImVec4(0.0, 0.0, 0.0, 0.0)
@@ -148,9 +150,8 @@ def _begin_body(footer: float) -> None:
         imgui.push_style_color(slot, clear)
     flags = imgui.WindowFlags_
     wide = imgui.get_content_region_avail().x + imgui.get_style().scrollbar_size
-    imgui.begin_child(
-        "body", imgui.ImVec2(wide, -footer), 0, flags.no_nav.value | flags.always_vertical_scrollbar.value
-    )
+    flags_of_body = flags.always_vertical_scrollbar.value | ui.nav_flags("panel")
+    imgui.begin_child("body", imgui.ImVec2(wide, -footer), ui.child_flags("panel"), flags_of_body)
     if not overflows:
         imgui.pop_style_color(len(slots))
 
@@ -236,7 +237,8 @@ def _row(index: int, region: NamedRegion, ui: UiContext, actions: list[str]) -> 
         return False
     x, y = imgui.get_cursor_screen_pos()
     io, mouse = imgui.get_io(), imgui.MouseButton_
-    if imgui.invisible_button("select", imgui.ImVec2(max(right - imgui.get_cursor_pos_x(), 1.0), tall)):
+    size, nav = imgui.ImVec2(max(right - imgui.get_cursor_pos_x(), 1.0), tall), imgui.ButtonFlags_.enable_nav
+    if imgui.invisible_button("select", size, nav.value):
         mode = "add" if io.key_shift else "subtract" if io.key_ctrl else "new"
         actions.append(f"region:{index}:{mode}")
     resting = imgui.is_item_hovered(imgui.HoveredFlags_.for_tooltip.value)

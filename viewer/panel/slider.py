@@ -12,7 +12,8 @@ from collections.abc import Sequence
 from imgui_bundle import imgui
 
 from viewer.ui.context import PALETTE, Rgba, u32
-from viewer.ui.widgets import is_released, tip
+from viewer.ui.keys import NUDGES
+from viewer.ui.widgets import is_entered, is_released, tip
 
 HEIGHT_PX = 20.0  # at 1×, as its text field, so that nothing moves when one types
 RADIUS_PX = 7.0  # of the handle
@@ -66,12 +67,21 @@ def draw(
     if storage.get_bool(_slot(label, "typing")):
         return _text_field(label, value, width, most)
     left, top = imgui.get_cursor_screen_pos()
-    imgui.invisible_button(label, imgui.ImVec2(width, height * scale))
+    if storage.get_bool(_slot(label, "entered")):  # what was typed by keys alone goes on by them
+        storage.set_bool(_slot(label, "entered"), False)
+        imgui.set_keyboard_focus_here()
+        imgui.set_nav_cursor_visible(True)
+    imgui.invisible_button(label, imgui.ImVec2(width, height * scale), imgui.ButtonFlags_.enable_nav.value)
     hovered, pressed = imgui.is_item_hovered(), imgui.is_item_active()
     radius = RADIUS_PX * scale
     start, span = left + radius, max(width - 2 * radius, 1.0) / most
     mouse = imgui.get_io().mouse_pos.x
-    if imgui.is_item_activated():
+    if imgui.is_item_focused() and imgui.get_current_context().nav_cursor_visible:
+        value = min(most, max(0.0, value + _key_step()))
+    if is_entered():
+        start_typing(label)
+        storage.set_bool(_slot(label, "entered"), True)
+    elif imgui.is_item_activated():
         if imgui.get_io().key_ctrl:
             start_typing(label)
             imgui.set_cursor_screen_pos(imgui.ImVec2(left, top))
@@ -92,6 +102,15 @@ def draw(
     ticks = ticks if height >= HEIGHT_PX else ()
     _paint((start, top, span), value, ticks, scale, color, hovered or pressed, most)
     return value
+
+
+def _key_step() -> float:
+    """How far the arrow keys move the slider that has the keyboard: as those of the focused layer do."""
+    io, step = imgui.get_io(), 0.0
+    for key, sign in ((imgui.Key.left_arrow, -1.0), (imgui.Key.right_arrow, 1.0)):
+        imgui.internal.set_key_owner(key, imgui.get_item_id())  # else they would lead to another item
+        step += sign * bool(imgui.is_key_pressed(key))
+    return step * dict(NUDGES)["Shift+" if io.key_shift else "Ctrl+" if io.key_ctrl else ""]
 
 
 def start_typing(label: str) -> None:

@@ -17,6 +17,7 @@ from viewer.ui.widgets import (
     grip,
     hint,
     icon_button,
+    is_entered,
     menu_items,
     picture,
     right_edge,
@@ -143,8 +144,8 @@ def _card(index: int, cards: _Cards, wide: float, ui: UiContext, actions: list[s
     imgui.begin_group()
     at = imgui.get_cursor_screen_pos()
     tall = 0.75 * wide
-    imgui.invisible_button(f"restore{index}", imgui.ImVec2(wide, tall))
-    gesture = grip(ui)
+    imgui.invisible_button(f"restore{index}", imgui.ImVec2(wide, tall), imgui.ButtonFlags_.enable_nav.value)
+    gesture = "clicked" if is_entered() else grip(ui)
     dragged = f"{gesture}:{index}" if index and gesture in ("dragged", "dropped") else ""
     if gesture == "clicked":
         actions.append(f"restore:{index}")

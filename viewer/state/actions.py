@@ -33,6 +33,7 @@ from .view_state import ViewState, next_frame, next_resolution_mode
 from .workspace import (
     LEAST_ZOOM,
     MOST_ZOOM,
+    PLACES,
     REQUESTS,
     SceneFacts,
     Workspace,
@@ -333,6 +334,13 @@ def _blend_snapshots(workspace: Workspace, share: str, facts: SceneFacts) -> Wor
     return with_layers_of(workspace, view)
 
 
+def _give_keyboard(workspace: Workspace, by: str) -> Workspace:
+    """To the next part of the window, or back; after the last one to the picture."""
+    places = ("", *PLACES)
+    at = (places.index(workspace.keyboard) + int(by)) % len(places)
+    return replace(workspace, keyboard=places[at], keyboard_by=int(by))
+
+
 def _new_edit(workspace: Workspace, _: str) -> Workspace:
     """Open the form of a new edit, of what is selected where something is; or close it."""
     form, selection = workspace.form, workspace.view.selection
@@ -393,9 +401,13 @@ ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
     "undo": lambda w, _: _back(w, history.undo(w.past)),
     "redo": lambda w, _: _back(w, history.redo(w.past)),
     "go_to": lambda w, index: _back(w, history.go_to(w.past, int(index))),
+    "next_place": _give_keyboard,
     "history": lambda w, _: replace(w, history=True),
     "navigate": _navigate,
     "zoom": _zoom,
+    "reduced_motion": lambda w, _: replace(
+        w, layout=replace(w.layout, reduced_motion=not w.layout.reduced_motion)
+    ),
     "fly": lambda w, _: with_camera(w, controls.toggle_fly(w.view.camera)),
     "look": _look,
     "grid": lambda w, _: replace(w, view=replace(w.view, grid=not w.view.grid)),

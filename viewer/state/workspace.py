@@ -70,6 +70,10 @@ layer, the focused one where none is named; `replace:INDEX` asks for its new edi
 `save_region:NAME`, `rename_region:INDEX:NAME`."""
 
 
+PLACES = ("panel", "tools", "options", "view", "comparison", "timeline")
+"""Parts of the window through which the keyboard goes, in its order; not all are always shown."""
+
+
 class PreviewState(NamedTuple):
     """What the form of a new edit says of its picture."""
 
@@ -140,6 +144,7 @@ class Layout:
     zoom: Annotated[float, Meta(ge=LEAST_ZOOM, le=MOST_ZOOM)] = 1.0  # of the interface
     panel_px: Annotated[float, Meta(ge=NARROWEST_PX, le=WIDEST_PX)] = 300.0  # at 1×: the panel's width
     folded: tuple[str, ...] = ()  # sections of the panel
+    reduced_motion: bool = False  # the camera jumps where it would glide
 
     def with_panel(self, wide: float) -> Layout:
         """With the panel so wide, as far as it may be."""
@@ -162,6 +167,8 @@ class Workspace:
     active_slider: str = "strength"  # which of `layers.SLIDERS` of the focused layer the arrow keys move
     renaming: int | None = None  # the layer whose name is being typed, or None
     help: bool = False  # whether the list of keys is shown
+    keyboard: str = ""  # of `PLACES`: the part of the window that has the keyboard, "" for the picture
+    keyboard_by: int = 1  # which way it went there
     palette: int | None = None  # the line of the list of commands that Enter takes, −1 as it opens; or None
     query: str = ""  # what is sought in either list
     history: bool | None = None  # whether the list of the history is open; True as it opens, then False

@@ -52,9 +52,8 @@ FIXED = (
     imgui.WindowFlags_.no_decoration.value
     | imgui.WindowFlags_.no_move.value
     | imgui.WindowFlags_.no_saved_settings.value
-    | imgui.WindowFlags_.no_nav.value
 )
-"""Flags of a part of the window that stays where it is."""
+"""Flags of a part of the window that stays where it is, beside `UiContext.nav_flags`."""
 
 BEHIND = imgui.WindowFlags_.no_bring_to_front_on_focus.value
 UNFOCUSED = imgui.WindowFlags_.no_focus_on_appearing.value
@@ -129,12 +128,30 @@ class UiContext:
         io.config_flags |= imgui.ConfigFlags_.nav_enable_keyboard.value  # in lists, menus and the form
         self.context.config_nav_windowing_key_next = self.context.config_nav_windowing_key_prev = 0
         self.typed = ("", 0.0)  # into the list that is open, and when
+        self.keyboard = ""  # the part of the window that has the keyboard, "" for the picture
+        self.focused = ""  # the one that was given it last
         self.fonts = _load_fonts(io.fonts)
         self.scale = 0.0
         self.set_scale(scale)
 
     def make_current(self) -> None:
         imgui.set_current_context(self.context)
+
+    def nav_flags(self, name: str) -> int:
+        """Flags for a part of the window, and for what scrolls in it: the keyboard goes through it or not."""
+        return 0 if self.keyboard == name else imgui.WindowFlags_.no_nav.value
+
+    def child_flags(self, name: str) -> int:
+        """Flags for what scrolls in a part of the window: the keyboard does not stop at its edge."""
+        return imgui.ChildFlags_.nav_flattened.value if self.keyboard == name else 0
+
+    def take_keyboard(self, name: str) -> None:
+        """Within a part of the window: it gets the keyboard, where it was just given to it."""
+        if self.keyboard == name != self.focused:
+            imgui.set_window_focus()
+            imgui.internal.nav_init_window(imgui.internal.get_current_window(), True)
+            imgui.set_nav_cursor_visible(True)
+            self.focused = name
 
     def set_scale(self, scale: float) -> None:
         """Fonts and spacing for this many window pixels per design pixel."""

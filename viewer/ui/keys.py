@@ -119,8 +119,8 @@ TOPICS: dict[str, tuple[Command, ...]] = {
         *_row("1–9", "Select a layer", _numbers("focus", "Select layer")),
         *_row("Shift+1–9", "Show or hide a layer", _numbers("toggle", "Show or hide layer", "Shift+")),
         *_row("← →", "Strength, or gain", _nudges()),
-        Command("next_slider:1", "Next gain for arrow keys", "Tab", row="Next gain; Shift previous"),
-        Command("next_slider:-1", "Previous gain", "Shift+Tab", row=JOINED),
+        Command("next_slider:1", "Next gain for arrow keys", "Alt+Right", row="Next, previous gain"),
+        Command("next_slider:-1", "Previous gain", "Alt+Left", row=JOINED),
         Command("hide", "Show or hide", "H", "Alt+click: solo"),
         Command("solo", "Solo", "Shift+H", "Show only soloed layers"),
         Command("show_all", "Show all", "Alt+H", "All layers, and all that is hidden"),
@@ -225,6 +225,11 @@ TOPICS: dict[str, tuple[Command, ...]] = {
         Command("overlay", "Show timings", "F10"),
         Command("dynamic_resolution", "Dynamic resolution", "Shift+F10", "Auto, on, off"),
         *_row("Ctrl + − 0", "Interface size", _zooms()),
+        Command(
+            "next_place:1", "Keyboard to next part", "F6 Tab", "Esc leaves it", row="Keys to panel, tools"
+        ),
+        Command("next_place:-1", "Keyboard to part before", "Shift+F6 Shift+Tab", row=JOINED),
+        Command("reduced_motion", "Reduced motion", "", "The camera jumps where it would glide"),
         Command("full_screen", "Full screen", "F11"),
         Command("panel", "Panel", "F12", "Show or hide it and what lies over the picture"),
         Command("demo", "Try the demo", "", "Makes a scene and trains four edits of it: a minute or two"),

@@ -129,6 +129,15 @@ def fit_to_frame(view: ViewState, frame: Area, area: Area) -> ViewState:
     return replace(view, camera=widen(view.camera, frame.height / area.height))
 
 
+def draw_cross(area: Area, ui: UiContext) -> None:
+    """The middle of the picture."""
+    x, y, canvas = round(area.width / 2), round(area.height / 2), imgui.get_background_draw_list()
+    for color, thick in ((PALETTE.scrim, 3.0), (PALETTE.handle, 1.0)):
+        for dx, dy in ((6.0 * ui.scale, 0.0), (0.0, 6.0 * ui.scale)):
+            ends = imgui.ImVec2(x - dx, y - dy), imgui.ImVec2(x + dx, y + dy)
+            canvas.add_line(*ends, u32(color), thick * ui.scale)
+
+
 def draw_frame(name: str, frame: Area, area: Area, ui: UiContext) -> None:
     """The safe frame as a thin line with its name, and a shade over all that the film leaves out."""
     canvas, shade = imgui.get_background_draw_list(), u32((*PALETTE.scrim[:3], 0.55))

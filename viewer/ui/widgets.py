@@ -28,7 +28,7 @@ def section(name: str, folded: tuple[str, ...], ui: UiContext) -> tuple[str, ...
     imgui.push_font(ui.fonts.bold, SMALL_PX)
     text, tall, step = name.upper(), imgui.get_frame_height(), 16.0 * ui.scale
     room = imgui.ImVec2(imgui.calc_text_size(text).x + step, tall + 2.0 * ui.scale)
-    pressed = imgui.invisible_button(f"section {name}", room)
+    pressed = imgui.invisible_button(f"section {name}", room, imgui.ButtonFlags_.enable_nav.value)
     color, canvas = (
         u32(PALETTE.text if imgui.is_item_hovered() else PALETTE.dim),
         imgui.get_window_draw_list(),
@@ -91,7 +91,8 @@ def card(
     imgui.push_style_var(imgui.StyleVar_.window_padding, around)
     child = imgui.ChildFlags_
     flags = child.auto_resize_y.value | child.always_use_window_padding.value
-    imgui.begin_child(name, imgui.ImVec2(0.0, 0.0), flags, 0 if nav else imgui.WindowFlags_.no_nav.value)
+    flags |= 0 if nav else ui.child_flags("panel")
+    imgui.begin_child(name, imgui.ImVec2(0.0, 0.0), flags, 0 if nav else ui.nav_flags("panel"))
     imgui.pop_style_var()  # here, as tips and menus have paddings of their own
     yield  # where this raises, the frame ends what is open
     imgui.end_child()
@@ -114,9 +115,10 @@ def plate(
     imgui.push_style_var(imgui.StyleVar_.window_rounding, 4.0 * ui.scale)
     imgui.push_style_var(imgui.StyleVar_.window_padding, imgui.ImVec2(pad * ui.scale, pad * ui.scale))
     fits = imgui.WindowFlags_.always_auto_resize.value if size is None else 0
-    imgui.begin(name, None, FIXED | UNFOCUSED | BEHIND | fits)
+    imgui.begin(name, None, FIXED | UNFOCUSED | BEHIND | fits | ui.nav_flags(name))
     imgui.pop_style_var(2)
     imgui.pop_style_color()
+    ui.take_keyboard(name)
     yield  # where this raises, the frame ends what is open
     imgui.end()
 
@@ -153,8 +155,9 @@ def icon_button(
     """
     side = side or imgui.get_frame_height()
     x, y = imgui.get_cursor_screen_pos()
-    flags = imgui.ButtonFlags_.enable_nav.value
-    pressed = bool(imgui.invisible_button(name, imgui.ImVec2(side, side), flags))
+    pressed = bool(
+        imgui.invisible_button(name, imgui.ImVec2(side, side), imgui.ButtonFlags_.enable_nav.value)
+    )
     hovered, canvas, size = imgui.is_item_hovered(), imgui.get_window_draw_list(), imgui.calc_text_size(icon)
     if hovered or lit:
         ground = u32(PALETTE.chosen if lit else PALETTE.field)
@@ -340,6 +343,11 @@ def grip(ui: UiContext) -> str:
     if far and imgui.is_item_active():
         return "dragged"
     return "" if not is_released() else "dropped" if far else "clicked"
+
+
+def is_entered() -> bool:
+    """Whether the keyboard has just pressed the last item."""
+    return bool(imgui.get_current_context().nav_activate_id == imgui.get_item_id() != 0)
 
 
 def is_double_clicked() -> bool:

@@ -117,7 +117,7 @@ def test_gains_and_the_curve_unfolded_one_layer_alone_one_locked(screenshot: Com
     first, second = view.layers
     layers = (replace(first, solo=True), replace(second, locked=True))
     with rig(replace(view, layers=layers), SMALLEST) as hand:
-        hand.key("Tab")
+        hand.key("Alt+Right")
         hand.frame(3)
         screenshot("ui_gains", hand.image())
 

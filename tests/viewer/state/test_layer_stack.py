@@ -176,13 +176,13 @@ def test_the_keys_do_all_that_the_cards_do(hand: Rig) -> None:
 
 def test_tab_brings_the_arrows_to_the_gains_that_the_edit_has(hand: Rig) -> None:
     hand.key("2")
-    hand.key("Tab")
+    hand.key("Alt+Right")
     assert hand.main_view.work.active_slider == "color", "a change of color has no other gain"
     assert hand.main_view.work.view.unfolded == (0,)
     hand.key("Shift+Left")
     assert layers(hand)[0].gains == Gains(color=0.9)
     assert hand.strengths == [0.5, 0.5]
-    hand.key("Tab")
+    hand.key("Alt+Right")
     assert hand.main_view.work.active_slider == "strength"
     hand.key("1")
     hand.key("Shift+Tab")

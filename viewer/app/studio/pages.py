@@ -62,7 +62,7 @@ def draw_start_page(recent: Sequence[StartFile], examples: Sequence[StartFile], 
     display, scale = imgui.get_io().display_size, ui.scale
     imgui.set_next_window_pos(imgui.ImVec2(0.0, 0.0))
     imgui.set_next_window_size(display)
-    imgui.begin("start page", None, (FIXED | BEHIND) & ~imgui.WindowFlags_.no_nav.value)
+    imgui.begin("start page", None, FIXED | BEHIND)
     wide = min(display.x - 2 * MARGIN_PX * scale, WIDEST_PX * scale)
     narrow = wide < NARROW_PX * scale
     left, side = (display.x - wide) / 2, wide if narrow else SIDE_PX * scale

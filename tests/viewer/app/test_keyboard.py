@@ -1,0 +1,154 @@
+"""The whole window by keys alone: its parts in turn, what one does in them, the way back to the picture."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import pytest
+from imgui_bundle import imgui
+
+from tests.helpers.ui_rig import Rig, bear, first_view, rig
+from tests.viewer.app.test_keys_of_lists_and_form import list_is_open, strike, type_text
+from viewer.state.workspace import PLACES
+
+pytestmark = pytest.mark.gl
+
+
+@pytest.fixture
+def hand() -> Iterator[Rig]:
+    with rig(first_view(bear(), 0.5, 0.5), (1000, 700)) as made:
+        yield made
+
+
+def focused() -> int:
+    """What has the keyboard, and shows it; 0 for nothing."""
+    context = imgui.get_current_context()
+    return context.nav_id if context.nav_cursor_visible and context.nav_window is not None else 0
+
+
+def reach(hand: Rig, label: str, most: int = 40) -> None:
+    """Tab to something of the panel by the end of its id's path."""
+    panel = imgui.internal.find_window_by_name("panel")
+    windows = [w for w in imgui.get_current_context().windows if w.name.startswith("panel") and w.was_active]
+    wanted = {window.get_id(label) for window in (panel, *windows)}
+    for _ in range(most):
+        if focused() in wanted:
+            return
+        strike(hand, "Tab")
+    raise AssertionError(f"no Tab leads to {label}")
+
+
+def test_f6_leads_through_all_parts_that_are_shown_and_back_to_the_picture(hand: Rig) -> None:
+    shown = [name for name in PLACES if name not in ("options", "timeline")]
+    for chord, names in (("F6", [*shown, ""]), ("Shift+F6", [*shown[::-1], ""])):
+        for name in names:
+            strike(hand, chord)
+            assert hand.main_view.work.keyboard == name
+            assert bool(focused()) or not name, "one sees where it is"
+    strike(hand, "J")
+    strike(hand, "T")
+    for name in (*PLACES, ""):
+        strike(hand, "F6")
+        assert hand.main_view.work.keyboard == name
+
+
+def test_in_a_part_tab_goes_from_one_to_the_next_and_keys_are_no_shortcuts_but_those_with_ctrl(
+    hand: Rig,
+) -> None:
+    strike(hand, "Tab")
+    before, seen = hand.main_view.work, set()
+    for _ in range(20):
+        strike(hand, "Tab")
+        seen.add(focused())
+    assert len(seen) >= 15
+    for chord in ("H", "R", "G", "Space", "Delete", "Left"):
+        if chord != "Space":
+            strike(hand, chord)
+    assert hand.main_view.work.view == before.view
+    strike(hand, "Ctrl+A")
+    assert hand.main_view.work.view.selection.count == 1500
+    strike(hand, "Escape")
+    assert hand.main_view.work.keyboard == ""
+    strike(hand, "H")
+    assert not hand.main_view.work.view.layers[1].enabled, "shortcuts are back"
+
+
+def test_a_click_gives_the_keyboard_back_to_the_picture(hand: Rig) -> None:
+    strike(hand, "Tab")
+    hand.click(300.0, 600.0)
+    assert hand.main_view.work.keyboard == ""
+    before = hand.strengths[-1]
+    strike(hand, "1")
+    strike(hand, "Left")
+    assert hand.strengths[-1] == pytest.approx(before - 0.01)
+
+
+def test_a_slider_with_the_keyboard_takes_arrows_and_enter_types_into_it(hand: Rig) -> None:
+    strike(hand, "Alt+G")  # rows, where there is something beside it
+    strike(hand, "Tab")
+    reach(hand, "##strength")
+    at = focused()
+    for chord in ("Right", "Right", "Left", "Right"):
+        strike(hand, chord)
+    assert hand.strengths == pytest.approx([0.5, 0.52])
+    assert focused() == at, "they lead nowhere else"
+    strike(hand, "Enter")
+    type_text(hand, "0.25")
+    strike(hand, "Enter")
+    assert hand.strengths == pytest.approx([0.5, 0.25])
+    strike(hand, "Enter")
+    type_text(hand, "0.9")
+    strike(hand, "Escape")
+    assert hand.strengths == pytest.approx([0.5, 0.25]), "it ends the typing, and no more"
+    assert hand.main_view.work.keyboard == "panel"
+    strike(hand, "Up")
+    assert focused() not in (0, at)
+
+
+def test_menus_of_the_panel_open_and_close_by_keys(hand: Rig) -> None:
+    strike(hand, "Tab")
+    reach(hand, "main menu")
+    strike(hand, "Enter")
+    assert list_is_open()
+    strike(hand, "Down")
+    strike(hand, "Escape")
+    assert not list_is_open()
+    assert hand.main_view.work.keyboard == "panel"
+
+
+def test_a_tool_is_taken_and_enter_picks_what_is_in_the_middle_of_the_picture(hand: Rig) -> None:
+    for chord in (
+        "F6",
+        "F6",
+        "Down",
+        "Down",
+        "Down",
+        "Down",
+        "Down",
+        "Down",
+        "Down",
+        "Down",
+        "Enter",
+        "Escape",
+    ):
+        strike(hand, chord)
+    work = hand.main_view.work
+    assert (work.keyboard, work.view.select.tool) == ("", "flood")
+    assert not work.view.selection.count
+    strike(hand, "Enter")
+    picked = hand.main_view.work.view.selection
+    assert 0 < picked.count < 1500
+    assert hand.main_view.work.renaming is None
+    strike(hand, "Ctrl+Z")
+    hand.click((1000 - 300) / 2, 350.0)
+    assert hand.main_view.work.view.selection.members == picked.members, "as a click there"
+
+
+def test_with_reduced_motion_the_camera_jumps(hand: Rig) -> None:
+    for on in (False, True):
+        work = hand.main_view.work
+        hand.main_view.work = replace(work, layout=replace(work.layout, reduced_motion=on), glide=None)
+        hand.main_view._perform("look:top" if on else "look:right")
+        assert (hand.main_view.work.glide is None) == on
+        hand.settle()
