@@ -119,13 +119,15 @@ def draw(dialog: Dialog, recent: Sequence[Path], pressed: Sequence[str], ui: UiC
     imgui.set_next_window_pos(imgui.ImVec2(area.width / 2, top), 0, imgui.ImVec2(0.5, 0.0))
     imgui.set_next_window_size(imgui.ImVec2(min(WIDTH_PX * ui.scale, area.width - 2 * margin), 0.0))
     flags = imgui.WindowFlags_
-    fixed = flags.no_move.value | flags.no_nav.value
-    flags_of_popup = flags.no_decoration.value | flags.no_saved_settings.value | fixed
+    flags_of_popup = flags.no_decoration.value | flags.no_saved_settings.value | flags.no_move.value
     imgui.push_style_var(imgui.StyleVar_.window_rounding, 6.0 * ui.scale)
     imgui.push_style_var(imgui.StyleVar_.window_padding, imgui.ImVec2(16.0 * ui.scale, 14.0 * ui.scale))
     imgui.push_style_color(imgui.Col_.modal_window_dim_bg, imgui.ImVec4(0.0, 0.0, 0.0, 0.45))
     answer = Answer(dialog)
     if imgui.begin_popup_modal(_POPUP, None, flags_of_popup)[0]:
+        context, at_button = imgui.get_current_context(), not imgui.get_io().want_text_input
+        if context.nav_cursor_visible and at_button and context.nav_id not in (0, imgui.get_id("##path")):
+            pressed = [chord for chord in pressed if chord != "Enter"]  # it is of what has the keyboard
         answer = _content(dialog, recent, pressed, ui, area.height - margin)
         if answer.dialog is None:
             imgui.close_current_popup()

@@ -10,7 +10,8 @@ from imgui_bundle import imgui
 
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from tests.viewer.app.test_keys_of_lists_and_form import list_is_open, strike, type_text
-from viewer.state.workspace import PLACES
+from viewer.jobs.job_queue import DeliverOptions
+from viewer.state.workspace import PLACES, Dialog
 
 pytestmark = pytest.mark.gl
 
@@ -143,6 +144,21 @@ def test_a_tool_is_taken_and_enter_picks_what_is_in_the_middle_of_the_picture(ha
     strike(hand, "Ctrl+Z")
     hand.click((1000 - 300) / 2, 350.0)
     assert hand.main_view.work.view.selection.members == picked.members, "as a click there"
+
+
+def test_a_question_is_answered_by_tab_and_enter_and_enter_alone_takes_the_marked_button(hand: Rig) -> None:
+    options = DeliverOptions(640, 480)
+    for chords, width in ((("Enter",), 640), ((*["Tab"] * 8, "Enter"), 853)):  # the eighth is its shape 16:9
+        hand.main_view.ask(Dialog("render_picture", "view.png", options=options))
+        hand.settle()
+        for chord in chords:
+            strike(hand, chord)
+        asked = hand.main_view.work.dialog
+        assert asked is not None
+        assert asked.options is not None
+        assert (asked.options.width, asked.options.height) == (width, 480)
+        assert hand.main_view.take_requests() == ("deliver:render_picture",) * (width == 640)
+        strike(hand, "Escape")
 
 
 def test_with_reduced_motion_the_camera_jumps(hand: Rig) -> None:
