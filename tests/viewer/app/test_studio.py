@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -146,6 +147,24 @@ def test_what_cannot_be_trained_stands_in_the_form(window: application.App) -> N
     assert window.main_view.work.form_open
     assert window.main_view.work.form.error.startswith("unknown region 'cube:1'")
     assert window.main_view.work.jobs == ()
+
+
+def test_what_is_packed_takes_the_drafts_place_while_it_is_measured(window: application.App) -> None:
+    request(window, "train")
+    (job,) = window.main_view.work.jobs
+    order, packed = job.task, job.task.out / "draft.gdf"
+    packed.parent.mkdir(parents=True)
+    scarf = bear().gdfs[0]
+    save_gdf(packed, replace(scarf, instruction="a draft"))
+    turn(window)
+    (layer,) = window.main_view.work.view.layers
+    assert window.document.edits[layer.gdf].instruction == "a draft"
+    save_gdf(packed, replace(scarf, instruction="packed"))
+    os.utime(packed, ns=(order.draft.stat().st_mtime_ns + 1_000_000,) * 2)
+    window.jobs._live_due = 0.0
+    turn(window)
+    assert [edit.instruction for edit in window.document.edits] == ["packed"]
+    assert window.main_view.work.view.layers == (layer,), "the layer stays as it is"
 
 
 def test_a_failure_is_one_line_with_its_log(window: application.App) -> None:
@@ -316,6 +335,35 @@ def test_without_a_scene_there_is_a_start_page_until_one_is_opened(tmp_path: Pat
         press(app, "Ctrl+N")
         assert app.main_view.work.form_open
     assert load_thumbnail(folder / "bear.ply", folder / "memory") is not None, "for the next start page"
+
+
+def test_the_demos_card_counts_its_edits_and_each_is_one_layer_from_its_draft_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(job_queue, "Child", Trainer)
+    monkeypatch.setattr(job_queue, "LOOK_S", 0.0)
+    Trainer.ended, Trainer.edit = None, None
+    made = bear_files(tmp_path)
+    demo, scarf = tmp_path / "memory" / "demo", tmp_path / "memory" / "demo" / "scarf"
+    with null_app(empty(), ViewState(), tmp_path) as app:
+        request(app, "demo")
+        (job,) = app.jobs.queue.jobs
+        assert job.progress.label == "", "no line of a log"
+        (scarf / "state").mkdir(parents=True)
+        shutil.copy(made / "bear.ply", demo / "scene.ply")
+        job.task.log.write_text("24000 Gaussians\n\n1 of 4: scarf: recolor:#1b6972 on scarf\nloss: L2\n")
+        (scarf / "state" / "progress.json").write_text('{"share": 0.5, "label": "Training", "seconds": 9}')
+        for name, strength in (("draft.gdf", 1.0), ("draft.gdf", 0.3), ("scarf.gdf", 0.3)):
+            shutil.copy(made / "edits" / "scarf.gdf", scarf / name)
+            for _ in range(3):
+                turn(app)
+            view = app.main_view.work.view
+            assert [(layer.name, layer.strength) for layer in view.layers] == [("scarf", strength)]
+            assert app.document.gdf_paths == (scarf / name,)
+            app.main_view.change(replace(view, layers=(replace(view.layers[0], strength=0.3),)))
+        (job,) = app.main_view.work.jobs
+        assert (job.progress.label, job.progress.share) == ("1 of 4: scarf", 0.125)
+        Trainer.ended = 0
 
 
 def test_what_runs_for_another_scene_goes_on_and_its_card_says_for_which(
