@@ -22,7 +22,7 @@ from viewer.jobs.training import (
 from viewer.state.selection import SelectionState
 from viewer.state.workspace import PreviewState, Workspace
 from viewer.ui.context import PALETTE, Icon, UiContext
-from viewer.ui.keys import shortcut
+from viewer.ui.keys import COMMANDS, shortcut
 from viewer.ui.widgets import (
     accent_button,
     card,
@@ -45,7 +45,6 @@ PAINT_VIEW = "Paint over this view…"
 PAINT_HELP = (
     "Opens a picture of it in your painting program; what you save there is shown here, ready to train"
 )
-_HELPS = [editor.help for editor in EDITORS]
 _GRADES = {
     "exposure": "Stops of light: −1 is half of it, 1 twice as much",
     "temperature": "From blue to amber light",
@@ -169,9 +168,12 @@ def _editor(form: NewEdit, action: str, column: float, ui: UiContext) -> tuple[N
     """The list of editors; first of all what takes this view to another program ("paint_view")."""
     label("Editor", column)
     imgui.set_next_item_width(-1.0)
-    missing = ["", *map(missing_package, EDITORS)]
-    titles = [PAINT_VIEW, *(editor.title for editor in EDITORS)]
-    tips = [reason or help_ for reason, help_ in zip(missing, (PAINT_HELP, *_HELPS), strict=True)]
+    missing, first = ["", *map(missing_package, EDITORS)], COMMANDS["paint_view"]
+    titles, helps = [first.name], [first.help]
+    for editor in EDITORS:
+        titles.append(editor.title)
+        helps.append(editor.help)
+    tips = [reason or help_ for reason, help_ in zip(missing, helps, strict=True)]
     faint = [i for i, reason in enumerate(missing) if reason]
     now, help_ = form.editor + 1, form.choice.help
     pressed = drop_down("##editor", form.choice.title, titles, now, ui, help_, tips, faint)
