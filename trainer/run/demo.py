@@ -256,9 +256,9 @@ def _train(options: DemoOptions, show: Show, scene: DemoScene) -> dict[str, Path
             _paint_picture(options.out / f"{edit.name}.png", scene, scene.cameras[show.view], edit.paint)
     runs = {edit.name: _train_options(options, show, scene, edit) for edit in show.edits}
     here = {name: find_run(run) for name, run in runs.items()}
-    for edit in show.edits:
+    for number, edit in enumerate(show.edits, 1):
         how = f"{edit.editor} on {', '.join(edit.parts)}" if edit.paint is None else f"{edit.name}.png"
-        print(f"\n{edit.name}: {how}", flush=True)
+        print(f"\n{number} of {len(show.edits)}: {edit.name}: {how}", flush=True)
         out = options.out / edit.name
         goes_on = "stopped" in here.values() and here[edit.name] != "nothing"
         if not goes_on:

@@ -128,9 +128,6 @@ def finish_run(
         clip = clip_curve(evaluator, setup.judging, field, options.texts)
         if clip.reason and options.texts.asked:
             log.say(f"CLIP directional similarity is not measured: {clip.reason}")
-        with log.looks("measure the edit", expected_measures(trajectory)) as looked:
-            judges = replace(evaluator, looked=looked), replace(reporting, looked=looked)
-            measured = measure(judges, trajectory, fitted, field, remap, perceptual, clip)
         plan = plain(options)
         added = None if trajectory.added is None else grown.scene[len(scene) :]
         given = differences(plan if added is not None else plain(with_values(options, grow=0.0)), DEFAULTS)
@@ -138,6 +135,10 @@ def finish_run(
         cameras = [view.camera for view in setup.train]
         pictures = dict(zip(options.views.pictures, cameras, strict=False))
         sharp = sharpen(scene, gdf, pictures, options.region.region != CHANGED, log)
+        save_gdf(folder.draft, gdf if sharp is None else sharp)  # a window shows it while it is measured
+        with log.looks("measure the edit", expected_measures(trajectory)) as looked:
+            judges = replace(evaluator, looked=looked), replace(reporting, looked=looked)
+            measured = measure(judges, trajectory, fitted, field, remap, perceptual, clip)
         endpoint, outside = exactness(scene, gdf, end_rows(grown, trajectory))
         title = f"{options.name}: {options.editor.editor}"
         shown = evaluator

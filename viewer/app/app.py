@@ -31,7 +31,7 @@ from viewer.ui.keys import bind
 from viewer.ui.overlay import draw_splash
 from viewer.ui.window import Window, interruptible
 
-from .application import LOG, error_details, error_line, log_error
+from .application import LOG, Part, error_details, error_line, log_error
 from .file_actions import FileActions
 from .main_view import MainView
 from .studio.deliver import DeliverActions
@@ -172,7 +172,7 @@ class App:
         self.deliver = DeliverActions(self, self.jobs.queue)
         self.start = StartActions(self, self.context, self.jobs.queue, memory)
         self.up = UpActions(self, self.context)
-        self.preview = PreviewActions(self, self.context, self.jobs.region_spec)
+        self.preview = PreviewActions(self, self.context, self.jobs.region_spec, memory)
         self.strays = StrayActions(self)
         self.tidy = TidyActions(self, memory)
         self.is_closed = False
@@ -282,10 +282,8 @@ class App:
             self.file_actions.handle(request)
 
     @property
-    def _parts(
-        self,
-    ) -> tuple[JobActions | DeliverActions | StartActions | UpActions | StrayActions | TidyActions, ...]:
-        return self.jobs, self.deliver, self.start, self.up, self.strays, self.tidy
+    def _parts(self) -> tuple[Part, ...]:
+        return self.jobs, self.preview, self.deliver, self.start, self.up, self.strays, self.tidy
 
     def _wait_times(self) -> tuple[float | None, ...]:
         """How long the next look at each part may take, seconds; None is for ever."""

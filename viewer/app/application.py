@@ -51,6 +51,13 @@ class Application(Protocol):
         """Close the window, without a question."""
 
 
+class Part(Protocol):
+    """One of them."""
+
+    def handle(self, request: str) -> bool:
+        """Do what is asked for; False where it is nothing of its own."""
+
+
 def failure_line(act: Callable[[], object]) -> str:
     """Do it; what went wrong, in one line, "" for nothing. Mistakes of ours go on."""
     try:

@@ -162,30 +162,35 @@ class Canvas:
         """The picture as an array, in full; see `Comparer.image`. [H,W,3]"""
         return self.comparer.image(view, size)
 
-    def save(
-        self, folder: Path, title: str, view: ViewState, size: tuple[int, int], to_change: bool = False
-    ) -> str:
+    def save(self, folder: Path, title: str, view: ViewState, size: tuple[int, int]) -> str:
         """Write the picture of a view, with the camera from which it was taken; a line that tells where.
 
         Args:
             folder: where; the file's name begins with `title`
-            to_change: all of the scene without its edits, for a program that changes pictures
 
         Raises:
             ProgdfError: see `exports.picture`.
         """
-        if to_change:
-            view = original(view)
-            view = replace(view, selection=replace(view.selection, hidden=NOBODY))
         image = self.image(view, size)
         pixels = draw_labels(image, view.compare, self.comparer.labels(view))
         if view.compare.mode != "off":  # which is no view that could be edited and trained on
-            return exports.picture(folder, title, pixels)
+            return f"Saved {exports.picture(folder, title, pixels)}"
         camera = to_camera(view.camera, image.shape[1], image.shape[0])
         origin = self.comparer.engine.scene.origin
         chunk = camera_chunk(camera, visible_edits(view), origin, view.camera.up)
-        line = exports.picture(folder, title, pixels, chunk)
-        return f"{line}; change it in any program, and drop it here" if to_change else line
+        return f"Saved {exports.picture(folder, title, pixels, chunk)}"
+
+    def save_original(self, folder: Path, title: str, view: ViewState, size: tuple[int, int]) -> Path:
+        """Write the picture of all of the scene without its edits, for a program that changes pictures.
+
+        Raises:
+            ProgdfError: see `exports.picture`.
+        """
+        view = original(view)
+        view = replace(view, selection=replace(view.selection, hidden=NOBODY))
+        camera = to_camera(view.camera, *size)
+        chunk = camera_chunk(camera, (), self.comparer.engine.scene.origin, view.camera.up)
+        return exports.picture(folder, title, to_pixels(self.image(view, size)), chunk)
 
     def thumbnails(self, work: Workspace, rows: Sequence[LayerRow]) -> tuple[Pictures, bool]:
         """Of the snapshots, that of the original first, and of the edits; whether one is missing."""

@@ -543,7 +543,8 @@ class MainView:
         if request == "timeline_file":
             return exports.timeline(self.pictures, title, view, self.facts.origin)
         if request == "window_picture":
-            return exports.picture(self.pictures, title, read_rgb(screen, size))
-        taken = request == "take_view"
-        seen = self.work.view if taken else view
-        return self.canvas.save(self.pictures, title, seen, self._pointer().size, taken)
+            return f"Saved {exports.picture(self.pictures, title, read_rgb(screen, size))}"
+        if request == "take_view":
+            taken = self.canvas.save_original(self.pictures, title, self.work.view, self._pointer().size)
+            return f"Saved {taken}; change it in any program, and drop it here"
+        return self.canvas.save(self.pictures, title, view, self._pointer().size)

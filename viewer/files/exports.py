@@ -47,8 +47,8 @@ def folder_of(scene: Path | None) -> Path:
     return beside if beside is not None and takes_files(beside) else pictures_folder()
 
 
-def picture(folder: Path, title: str, image: NDArray[np.uint8], info: PngInfo | None = None) -> str:
-    """Save `image` [H,W,3] under the scene's name; the line that says where.
+def picture(folder: Path, title: str, image: NDArray[np.uint8], info: PngInfo | None = None) -> Path:
+    """Save `image` [H,W,3] under the scene's name; its file.
 
     Args:
         folder, title: where, and the scene's name
@@ -59,7 +59,7 @@ def picture(folder: Path, title: str, image: NDArray[np.uint8], info: PngInfo | 
         ProgdfError: it cannot be written.
     """
     with _writable(folder, "picture"):
-        return f"Saved {save_picture(folder, Path(title).stem, image, info).resolve()}"
+        return save_picture(folder, Path(title).stem, image, info).resolve()
 
 
 def timeline(folder: Path, title: str, view: ViewState, origin: Origin = ZERO) -> str:

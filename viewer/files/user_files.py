@@ -6,6 +6,8 @@ import contextlib
 import hashlib
 import json
 import os
+import subprocess
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -160,6 +162,19 @@ def read_thumbnail(file: Path) -> NDArray[np.uint8] | None:
 def _thumbnail(path: Path, folder: Path | None) -> Path:
     digest = hashlib.sha256(str(path.resolve()).encode("utf-8", "surrogateescape")).hexdigest()[:24]
     return (folder or state_folder()) / "thumbnails" / f"{digest}.png"
+
+
+def open_in_program(path: Path) -> bool:
+    """Open a file in the program that the desktop has for it; whether there is one to ask."""
+    try:
+        if sys.platform == "win32":
+            os.startfile(path, "edit")
+        else:
+            command = "open" if sys.platform == "darwin" else "xdg-open"
+            subprocess.Popen([command, str(path)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    except OSError:
+        return False
+    return True
 
 
 def parse_path(text: str) -> Path:

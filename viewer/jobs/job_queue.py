@@ -16,6 +16,7 @@ from typing import ClassVar, Literal
 
 from progdf.errors import ProgdfError
 from progdf.io.atomic import LockedError
+from progdf.io.json_values import read_json
 from viewer.camera.view_camera import SHAPES
 
 from .child import Child, Progress, last_line
@@ -67,6 +68,10 @@ class DeliverOptions:
     can_move: tuple[str, ...] = ()  # what there is to choose from
 
 
+_DEMO_EDIT = re.compile(r"^(\d+) of (\d+): ([^:\n]+)", re.MULTILINE)
+"""A line of `progdf demo` that says which edit it trains now."""
+
+
 @dataclass(frozen=True)
 class Delivery:
     """A command that writes a file or a folder; stopped, it leaves nothing."""
@@ -90,12 +95,26 @@ class Delivery:
         return self.words
 
     def read_progress(self, before: Progress) -> Progress:
-        """How far it is, by the line that it printed last."""
+        """How far it is, by the line that it printed last; the demo by what its edits have written down."""
+        if self.words[0] == "demo":
+            return self._demo_progress(before)
         line = last_line(self.log)
         frames = re.search(r"frame (\d+)/(\d+)", line)
         if frames is None:
             return Progress(before.share, line)
         return Progress(int(frames[1]) / int(frames[2]), f"frame {frames[1]} of {frames[2]}")
+
+    def _demo_progress(self, before: Progress) -> Progress:
+        with suppress(OSError):
+            edits = _DEMO_EDIT.findall(self.log.read_text("utf-8", "replace"))
+            if edits:
+                number, count, name = edits[-1]
+                run = Progress()
+                with suppress(ProgdfError):
+                    run = read_json(self.out / name / "state" / "progress.json", Progress)
+                share = max((int(number) - 1 + run.share) / int(count), before.share)
+                return Progress(min(share, 1.0), f"{number} of {count}: {name}")
+        return before
 
     def lock(self) -> AbstractContextManager[None]:
         """Nothing: each is one window's own."""

@@ -26,7 +26,7 @@ from typing import Any, Literal
 import msgspec
 import torch
 
-from progdf.color.edits import GRADE_RANGES
+from progdf.color.edits import GRADE_RANGES, parse_color
 from progdf.errors import ProgdfError
 from progdf.field.keyframes import fit_lossless
 from progdf.gaussians import Gaussians
@@ -188,6 +188,43 @@ def with_editor(form: NewEdit, editor: int) -> NewEdit:
     elif not finds and region == CHANGED:
         region = ALL
     return replace(form, editor=editor, region=region, error="")
+
+
+def with_settings(form: NewEdit, instruction: str) -> NewEdit | None:
+    """The form with the editor and the settings of an edit; None where no editor of the form makes such.
+
+    Args:
+        instruction: of the edit, as `progdf train --editor` has it
+    """
+    kind, _, rest = instruction.partition(":")
+    editor = next((i for i, choice in enumerate(EDITORS) if choice.kind == kind), None)
+    if editor is None:
+        return None
+    form = replace(with_editor(form, editor), asks=0, anchor="")
+    try:
+        match form.choice.setting:
+            case "color":
+                color, *words = rest.split(",")
+                red, green, blue = parse_color(color).tolist()
+                return replace(form, color=(red, green, blue), through_hues="path=hue" in words)
+            case "amount":
+                amount = float(rest)
+                return replace(form, amount=amount) if 0.0 <= amount <= 1.0 else None
+            case "grade":
+                values = dict(pair.split("=") for pair in rest.split(","))
+                grade = {name: float(values.get(name, x)) for name, (_, _, x) in GRADE_RANGES.items()}
+                fits = all(low <= grade[name] <= high for name, (low, high, _) in GRADE_RANGES.items())
+                return replace(form, grade=tuple(grade.values())) if fits else None
+            case "style":
+                return replace(form, style=int(rest)) if int(rest) in range(STYLES) else None
+            case "sentence":
+                return replace(form, sentence=rest)
+            case "pictures":
+                return replace(form, pictures=", ".join(rest.split(",")))
+            case "folder":
+                return replace(form, folder=rest)
+    except ValueError:  # of another version
+        return None
 
 
 def with_picture(form: NewEdit, path: Path, further: bool) -> NewEdit:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 from imgui_bundle import imgui
 
+from viewer.jobs.training import NewEdit, with_settings
 from viewer.state.facts import STEPS, LayerRow
 from viewer.state.layers import (
     SLIDERS,
@@ -137,10 +138,11 @@ CARD_PX = 66.0  # a whole card with what is between two, at 1×
 COMPACT_PX, SLIDER_PX, SLIM_PX = 7.0, 92.0, 16.0  # a compact row: its padding, its slider's width and height
 _MENU = "menu of a layer"
 _MENU_ITEMS = (
-    *("rename", "duplicate", "replace", "", "remove", "", "copy_values", "paste_values", "reset", ""),
+    *("rename", "duplicate", "replace", "again", "", "remove", ""),
+    *("limit_to_selection", "select_painted", "", "copy_values", "paste_values", "reset", ""),
     *("group", "select_layers", "reset_all"),
 )
-_OF_ONE = ("rename", "duplicate", "replace", "remove")
+_OF_ONE = ("rename", "duplicate", "replace", "again", "remove", "limit_to_selection", "select_painted")
 """Actions that are told which layer; the others are about all that are selected."""
 
 
@@ -227,7 +229,7 @@ def draw_card(
         if over and not down and imgui.is_mouse_clicked(imgui.MouseButton_.right.value):
             press = "keep"
             imgui.open_popup(_MENU)
-        _menu(work.view, index, several, ui, actions)
+        _menu(work.view, index, row, several, ui, actions)
         if selected:
             _focus_bar(clip, p.accent if focused else p.faint, scale)
     imgui.pop_id()
@@ -249,13 +251,18 @@ def _press(named: bool) -> str:
     return "toggle" if io.key_ctrl else "range" if io.key_shift else "one"
 
 
-def _menu(state: ViewState, index: int, several: int, ui: UiContext, actions: list[str]) -> None:
+def _menu(
+    state: ViewState, index: int, row: LayerRow, several: int, ui: UiContext, actions: list[str]
+) -> None:
     """What can be done with a layer as a whole.
 
     Args:
+        row: of its .gdf
         several: how many layers are selected with it, 0 for it alone
     """
     with menu(_MENU, ui) as is_open:
+        unknown = is_open and with_settings(NewEdit(), row.instruction) is None
+        off = ["again"] * unknown + ["limit_to_selection"] * (not state.selection.count)
         for action in _MENU_ITEMS if is_open else ():
             if action == "group":
                 _group_menu(state, state.layers[index], ui, actions)
@@ -264,7 +271,7 @@ def _menu(state: ViewState, index: int, several: int, ui: UiContext, actions: li
             else:
                 name = f"Delete {several} layers" if action == "remove" and several > 1 else ""
                 asked = f"{action}:{index}" if action in _OF_ONE else action
-                actions += [asked] * menu_item(action, name=name)
+                actions += [asked] * menu_item(action, enabled=action not in off, name=name)
 
 
 def _group_menu(state: ViewState, layer: LayerState, ui: UiContext, actions: list[str]) -> None:

@@ -22,7 +22,7 @@ from viewer.jobs.training import (
 from viewer.state.selection import SelectionState
 from viewer.state.workspace import PreviewState, Workspace
 from viewer.ui.context import PALETTE, Icon, UiContext
-from viewer.ui.keys import shortcut
+from viewer.ui.keys import COMMANDS, shortcut
 from viewer.ui.widgets import (
     accent_button,
     card,
@@ -41,6 +41,10 @@ from viewer.ui.widgets import (
 )
 
 COLUMN_PX = 84.0
+PAINT_VIEW = "Paint over this view…"
+PAINT_HELP = (
+    "Opens a picture of it in your painting program; what you save there is shown here, ready to train"
+)
 _GRADES = {
     "exposure": "Stops of light: −1 is half of it, 1 twice as much",
     "temperature": "From blue to amber light",
@@ -103,7 +107,7 @@ def _content(work: Workspace, count: int, preview: PreviewState, ui: UiContext) 
     tip(f"Close ({shortcut('new_edit')}). What is being trained goes on")
     column = COLUMN_PX * ui.scale
     form = _region(form, selection, count, column, ui)
-    form = _editor(form, column, ui)
+    form, action = _editor(form, action, column, ui)
     form = _settings(form, preview, column, ui)
     if form.choice.setting == "sentence":
         if replace(form, asks=0, anchor="") != replace(work.form, asks=0, anchor=""):
@@ -160,15 +164,22 @@ def _region(form: NewEdit, selection: SelectionState, count: int, column: float,
     return form
 
 
-def _editor(form: NewEdit, column: float, ui: UiContext) -> NewEdit:
+def _editor(form: NewEdit, action: str, column: float, ui: UiContext) -> tuple[NewEdit, str]:
+    """The list of editors; first of all what takes this view to another program ("paint_view")."""
     label("Editor", column)
     imgui.set_next_item_width(-1.0)
-    titles, missing = [editor.title for editor in EDITORS], [missing_package(editor) for editor in EDITORS]
-    tips = [reason or editor.help for reason, editor in zip(missing, EDITORS, strict=True)]
+    missing, first = ["", *map(missing_package, EDITORS)], COMMANDS["paint_view"]
+    titles, helps = [first.name], [first.help]
+    for editor in EDITORS:
+        titles.append(editor.title)
+        helps.append(editor.help)
+    tips = [reason or help_ for reason, help_ in zip(missing, helps, strict=True)]
     faint = [i for i, reason in enumerate(missing) if reason]
-    help_ = form.choice.help
-    pressed = drop_down("##editor", form.choice.title, titles, form.editor, ui, help_, tips, faint)
-    return form if pressed is None else with_editor(form, pressed)
+    now, help_ = form.editor + 1, form.choice.help
+    pressed = drop_down("##editor", form.choice.title, titles, now, ui, help_, tips, faint)
+    if pressed is None:
+        return form, action
+    return (with_editor(form, pressed - 1), action) if pressed else (form, "paint_view")
 
 
 def _settings(form: NewEdit, preview: PreviewState, column: float, ui: UiContext) -> NewEdit:
@@ -257,6 +268,8 @@ def _preview(form: NewEdit, preview: PreviewState, column: float, ui: UiContext)
     if not form.choice.pictured:
         if form.choice.setting == "folder":
             small("No picture in advance: this editor takes its time", PALETTE.dim)
+        if form.choice.setting == "pictures" and preview.text:
+            wrapped_text(preview.text, PALETTE.error if preview.failed else PALETTE.dim)
         return form
     label("Preview", column)
     side = imgui.get_frame_height()

@@ -15,7 +15,7 @@ from progdf.compose.layers import BLENDS
 from viewer.camera import controls
 from viewer.camera.view_camera import FARTHEST
 from viewer.camera.views import look_at_view
-from viewer.jobs.training import ALL, CHANGED, SELECTION, TYPED
+from viewer.jobs.training import ALL, CHANGED, SELECTION, TYPED, with_settings
 
 from . import history, layer_selection, paint, selection, snapshots, timeline
 from .history import History
@@ -112,7 +112,48 @@ def perform(workspace: Workspace, action: str, facts: SceneFacts, aspect: float 
         return _blend_snapshots(workspace, argument, facts)
     if name == "next_slider":
         return _select_slider(workspace, int(argument), facts)
+    if name in OF_EDITS:
+        at = int(argument) if argument else workspace.focus
+        return workspace if at is None else OF_EDITS[name](workspace, at, facts)
     return ACTIONS[name](workspace, argument)
+
+
+def _again(workspace: Workspace, index: int, facts: SceneFacts) -> Workspace:
+    """The form with the settings of a layer's edit, where an editor of the form made it."""
+    layer, regions = workspace.view.layers[index], workspace.view.selection.regions
+    row = facts.rows[layer.gdf]
+    form = with_settings(replace(workspace.form, name=layer.name, error=""), row.instruction)
+    if form is None:
+        return workspace
+    kept = [region.name for region in regions if row.region_spec == f"file:{region.path}"]
+    if kept or row.region_spec in (ALL, CHANGED):
+        form = replace(form, region=kept[0] if kept else row.region_spec)
+    elif row.region_spec:
+        form = replace(form, region=TYPED, typed_region=row.region_spec)
+    return replace(workspace, form=form, form_open=True, form_opening=True)
+
+
+def _limit(workspace: Workspace, index: int, facts: SceneFacts) -> Workspace:
+    """A layer's paint only where something is selected too."""
+    view, row = workspace.view, facts.rows[workspace.view.layers[index].gdf]
+    if not view.selection.count:
+        return workspace
+    weights = selection.unpack(view.selection.members, facts.count)[row.members].astype(np.float32)
+    painted = paint.decode(view.layers[index].paint, row.count)
+    weights = weights if painted is None else weights * painted.numpy()
+    return replace(workspace, view=with_paint(view, index, paint.encode(weights)))
+
+
+def _select_painted(workspace: Workspace, index: int, facts: SceneFacts) -> Workspace:
+    """What a layer's paint lets through at least half of, all of it where it is not painted."""
+    view, row = workspace.view, facts.rows[workspace.view.layers[index].gdf]
+    painted, mask = paint.decode(view.layers[index].paint, row.count), np.zeros(facts.count, bool)
+    mask[row.members if painted is None else row.members[painted.numpy() >= 0.5]] = True
+    return replace(workspace, view=replace(view, selection=selection.select(view.selection, mask)))
+
+
+OF_EDITS = {"again": _again, "limit_to_selection": _limit, "select_painted": _select_painted}
+"""Actions on one layer, the focused one where none is named, that ask what is known of its edit."""
 
 
 def _frame(workspace: Workspace, facts: SceneFacts, aspect: float) -> Workspace:

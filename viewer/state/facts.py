@@ -67,6 +67,9 @@ class LayerRow:
     points: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 3), np.float32), compare=False)
     fit: Fit = keep_camera  # gives the camera that frames this layer
     region: str = ""  # its name
+    region_spec: str = ""  # as it was given to the training, "" where that is not known
+    # its rows of the scene that is drawn. [M] int64
+    members: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64), compare=False)
     draft: bool = False  # a grade alone, until its training is done
     added: int = 0  # how many of its members the scene does not have
     # its picture, see `draw_thumbnail`
@@ -81,7 +84,7 @@ def layer_rows(scene: Gaussians, gdfs: Sequence[Gdf], added: Sequence[int] = ())
 
 
 def _row(scene: Gaussians, gdf: Gdf, gdfs: Sequence[Gdf], added: int) -> LayerRow:
-    members = gdf.region.members
+    members, given = gdf.region.members, gdf.options.get("region")
     return LayerRow(
         count=len(members),
         swatch=_mean_color(scene, gdf),
@@ -94,6 +97,8 @@ def _row(scene: Gaussians, gdf: Gdf, gdfs: Sequence[Gdf], added: int) -> LayerRo
         points=scene.means[members].numpy(),
         fit=lambda camera, aspect: fit(camera, scene[members], aspect),
         region=gdf.region.name,
+        region_spec=str(given.get("region", "")) if isinstance(given, dict) else "",
+        members=members.numpy(),
         draft="draft" in gdf.report,
         added=added,
         thumbnail=partial(draw_thumbnail, scene, gdf),

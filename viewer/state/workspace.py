@@ -39,6 +39,7 @@ REQUESTS = (
     *("save", "save_as", "save_to", "open", "open_file", "browse", "discard"),
     *(
         "train",
+        "paint_view",
         "paint_over",
         "stop_run",
         "resume_run",

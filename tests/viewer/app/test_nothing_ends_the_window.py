@@ -27,6 +27,7 @@ pytestmark = pytest.mark.gl
 
 ACTIONS = (
     *actions.ACTIONS,
+    *actions.OF_EDITS,
     *selection.CHANGES,
     "frame",
     "home",

@@ -3,30 +3,37 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 
 import numpy as np
 import pytest
 from imgui_bundle import imgui
+from PIL import Image
 
 from progdf.__main__ import main
 from progdf.formats.ply import save_ply
 from progdf.gdf.file import fingerprint, save_gdf
+from progdf.io.picture_camera import find_picture_camera
 from progdf.scene.regions import parse_region
 from tests.helpers.null_app import null_app, press
 from tests.helpers.sessions import bear_files, opened_document
 from tests.helpers.ui_rig import bear, first_view
 from viewer.app import app as application
+from viewer.app.studio.preview import PAINT_TEXT
 from viewer.camera.view_camera import first_camera
+from viewer.files import user_files
 from viewer.files.document import empty
 from viewer.files.session import open_session
 from viewer.files.user_files import load_thumbnail
 from viewer.jobs import job_queue
 from viewer.jobs.job_queue import TURNTABLE
-from viewer.jobs.training import SELECTION, TYPED
+from viewer.jobs.training import CHANGED, SELECTION, TYPED
 from viewer.state import selection
 from viewer.state.view_state import ViewState
 
@@ -146,6 +153,69 @@ def test_what_cannot_be_trained_stands_in_the_form(window: application.App) -> N
     assert window.main_view.work.form_open
     assert window.main_view.work.form.error.startswith("unknown region 'cube:1'")
     assert window.main_view.work.jobs == ()
+
+
+def test_what_is_packed_takes_the_drafts_place_while_it_is_measured(window: application.App) -> None:
+    request(window, "train")
+    (job,) = window.main_view.work.jobs
+    order, packed = job.task, job.task.out / "draft.gdf"
+    packed.parent.mkdir(parents=True)
+    scarf = bear().gdfs[0]
+    save_gdf(packed, replace(scarf, instruction="a draft"))
+    turn(window)
+    (layer,) = window.main_view.work.view.layers
+    assert window.document.edits[layer.gdf].instruction == "a draft"
+    save_gdf(packed, replace(scarf, instruction="packed"))
+    os.utime(packed, ns=(order.draft.stat().st_mtime_ns + 1_000_000,) * 2)
+    window.jobs._live_due = 0.0
+    turn(window)
+    assert [edit.instruction for edit in window.document.edits] == ["packed"]
+    assert window.main_view.work.view.layers == (layer,), "the layer stays as it is"
+
+
+def test_a_view_is_painted_over_in_another_program_and_each_save_is_shown(
+    window: application.App, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened = list[Path]()
+    monkeypatch.setattr(user_files, "open_in_program", lambda path: opened.append(path) or True)
+    press(window, "Ctrl+N")
+    request(window, "paint_view")
+    (path,) = opened
+    form, size = window.main_view.work.form, window.main_view.picture_size
+    assert (form.choice.kind, form.region, form.pictures) == ("pictures", CHANGED, str(path))
+    turn(window)
+    assert (window.main_view.cover, window.main_view.preview.text) == (None, PAINT_TEXT)
+
+    def save(picture: Image.Image | bytes) -> str:
+        if isinstance(picture, bytes):
+            path.write_bytes(picture)
+        else:
+            picture.save(path)
+        os.utime(path, ns=(time.time_ns() + next(later),) * 2)
+        turn(window)
+        return window.main_view.preview.text
+
+    later, taken = count(1_000_000, 1_000_000), Image.open(path).convert("RGB")
+    assert taken.size == size
+    taken.paste((250, 0, 250), (10, 10, 60, 60))
+    save(taken)
+    cover = window.main_view.cover
+    assert cover is not None
+    assert (cover.camera, cover.size, cover.name) == (window.main_view.work.view.camera, size, "Painted")
+    whole = path.read_bytes()
+    assert save(whole[:4000]) == "This is what you saved; Train makes it an edit", (
+        "half a file is not looked at"
+    )
+    told = f"is 40×30 pixels now, and was {size[0]}×{size[1]}; keep its size"
+    assert save(taken.resize((40, 30))).endswith(told)
+    assert window.main_view.cover is None
+    save(taken)
+    assert window.main_view.cover is not None
+    assert find_picture_camera(path).height == size[1], "though the program dropped what the picture carried"
+    request(window, "train")
+    assert f"--editor=pictures:{path}" in Trainer.said
+    turn(window)
+    assert window.main_view.cover is None, "the form is closed"
 
 
 def test_a_failure_is_one_line_with_its_log(window: application.App) -> None:
@@ -316,6 +386,35 @@ def test_without_a_scene_there_is_a_start_page_until_one_is_opened(tmp_path: Pat
         press(app, "Ctrl+N")
         assert app.main_view.work.form_open
     assert load_thumbnail(folder / "bear.ply", folder / "memory") is not None, "for the next start page"
+
+
+def test_the_demos_card_counts_its_edits_and_each_is_one_layer_from_its_draft_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(job_queue, "Child", Trainer)
+    monkeypatch.setattr(job_queue, "LOOK_S", 0.0)
+    Trainer.ended, Trainer.edit = None, None
+    made = bear_files(tmp_path)
+    demo, scarf = tmp_path / "memory" / "demo", tmp_path / "memory" / "demo" / "scarf"
+    with null_app(empty(), ViewState(), tmp_path) as app:
+        request(app, "demo")
+        (job,) = app.jobs.queue.jobs
+        assert job.progress.label == "", "no line of a log"
+        (scarf / "state").mkdir(parents=True)
+        shutil.copy(made / "bear.ply", demo / "scene.ply")
+        job.task.log.write_text("24000 Gaussians\n\n1 of 4: scarf: recolor:#1b6972 on scarf\nloss: L2\n")
+        (scarf / "state" / "progress.json").write_text('{"share": 0.5, "label": "Training", "seconds": 9}')
+        for name, strength in (("draft.gdf", 1.0), ("draft.gdf", 0.3), ("scarf.gdf", 0.3)):
+            shutil.copy(made / "edits" / "scarf.gdf", scarf / name)
+            for _ in range(3):
+                turn(app)
+            view = app.main_view.work.view
+            assert [(layer.name, layer.strength) for layer in view.layers] == [("scarf", strength)]
+            assert app.document.gdf_paths == (scarf / name,)
+            app.main_view.change(replace(view, layers=(replace(view.layers[0], strength=0.3),)))
+        (job,) = app.main_view.work.jobs
+        assert (job.progress.label, job.progress.share) == ("1 of 4: scarf", 0.125)
+        Trainer.ended = 0
 
 
 def test_what_runs_for_another_scene_goes_on_and_its_card_says_for_which(

@@ -32,6 +32,7 @@ from viewer.jobs.training import (
     missing_package,
     with_editor,
     with_picture,
+    with_settings,
 )
 from viewer.jobs.training import EDITORS as CHOICES
 
@@ -266,3 +267,17 @@ def test_an_order_is_a_command_line_that_the_trainer_reads_back() -> None:
     assert options.quick
     assert options.resume
     assert options.threads == 1
+
+
+@pytest.mark.parametrize(
+    "spec",
+    [
+        *("recolor:#1b6972", "recolor:#1b6972,path=hue", "tint:#4f6fd8", "stripes:#ffffff", "darken:0.30"),
+        *("night:0.95", "grade:exposure=0.70,white=0.80", "style:23", "instruct:make it gold, please"),
+        *("pictures:/a/b.png,/a/c.png", "folder:/a/views"),
+    ],
+)
+def test_the_form_is_filled_in_from_an_edit_s_instruction(spec: str) -> None:
+    form = with_settings(NewEdit(sentence="x", color=(1.0, 0.0, 0.0)), spec)
+    assert form is not None
+    assert form.spec == spec

@@ -11,7 +11,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -24,9 +24,13 @@ from PIL import Image
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.gdf.file import Gdf, load_gdf
+from progdf.io.atomic import make_folder
+from progdf.io.cameras import save_cameras
 from progdf.io.json_values import convert_json, decode_json
-from viewer.app.application import Application
+from viewer.app.application import Application, failure_line
 from viewer.camera.view_camera import Vec3, ViewCamera, to_camera
+from viewer.files import user_files
+from viewer.jobs import training
 from viewer.jobs.child import Child
 from viewer.jobs.training import EDITORS, NewEdit
 from viewer.state.view_state import LayerState
@@ -38,6 +42,9 @@ LONGEST_SIDE = 960
 """Pixels of a picture; larger windows show it enlarged."""
 REST_S, POLL_S = 0.12, 0.04
 """The camera rests so long before a picture is asked for; between two looks for it."""
+WATCH_S = 0.5
+"""Between two looks at a picture that another program changes."""
+PAINT_TEXT = "Paint in the program that opens, and save: what you saved is shown here"
 KEPT_S = 120.0
 """So long the child waits for the form to be opened again."""
 
@@ -163,6 +170,25 @@ class PreviewChild:
                 self._answers.append(line.decode("utf-8", "replace"))
 
 
+@dataclass(frozen=True)
+class PaintedView:
+    """A picture of a view that another program changes."""
+
+    path: Path
+    camera: ViewCamera  # of the view
+    size: tuple[int, int]  # pixels
+    state: tuple[int, int]  # of the file when it was last looked at, see `_file_state`
+
+
+def _file_state(path: Path) -> tuple[int, int]:
+    """When it was written, and its size in bytes; (0, 0) where it is not there."""
+    try:
+        state = path.stat()
+    except OSError:
+        return 0, 0
+    return state.st_mtime_ns, state.st_size
+
+
 class PreviewActions:
     """Asks the child for what the form says and shows it. `close` it with the window.
 
@@ -170,12 +196,17 @@ class PreviewActions:
         app: the window
         context: the GL context
         region: a form's region as `progdf train` has it; files that it needs go into the folder
+        memory: folder of the program's state; the user's own if None
     """
 
     def __init__(
-        self, app: Application, context: moderngl.Context, region: Callable[[NewEdit, Path], str]
+        self,
+        app: Application,
+        context: moderngl.Context,
+        region: Callable[[NewEdit, Path], str],
+        memory: Path | None = None,
     ) -> None:
-        self._app, self._context, self._region = app, context, region
+        self._app, self._context, self._region, self._memory = app, context, region, memory
         self._child: PreviewChild | None = None
         self._texture: moderngl.Texture | None = None
         self._sent: _Request | None = None
@@ -187,9 +218,21 @@ class PreviewActions:
         self._pose: tuple[int, ViewCamera, tuple[int, int]] | None = None  # of which a sentence's picture is
         self._painted: tuple[_Request, NDArray[np.uint8]] | None = None  # that picture
         self._sent_at = 0.0
+        self._painting: PaintedView | None = None
+
+    def handle(self, request: str) -> bool:
+        """Do what is asked for; False where it is nothing of ours."""
+        if request != "paint_view":
+            return False
+        if error := failure_line(self._paint_view):
+            self._app.main_view.show_message(error, error=True)
+        return True
 
     def poll(self) -> float | None:
         """Ask for the preview and show what has come; seconds until the next look, None for ever."""
+        if self._painting is not None and self._is_painting(self._painting):
+            self._end_live()
+            return self._follow(self._painting)
         now, scene, request = time.monotonic(), self._app.document.path, self._request()
         if request is None or scene is None:
             self._show("", None)
@@ -223,6 +266,55 @@ class PreviewActions:
             self._send(request, self._child)
         return POLL_S if self._outstanding or request != self._sent else None
 
+    def _paint_view(self) -> None:
+        """A picture of this view of the original goes to another program, and into the form.
+
+        Raises:
+            ProgdfError: the scene has no file, or the picture cannot be written.
+        """
+        main_view, scene = self._app.main_view, self._app.document.path
+        if scene is None:
+            raise ProgdfError("the scene has no file yet; open one first")
+        self._end_live()
+        camera, size = main_view.work.view.camera, main_view.picture_size
+        folder = training.edits_folder(scene, self._memory)
+        make_folder(folder)
+        path = main_view.canvas.save_original(folder, scene.stem, main_view.work.view, size)
+        beside = path.with_name(f"{path.stem}.camera.json")  # a program may drop what the picture carries
+        save_cameras(beside, [to_camera(camera, *size)], self._app.document.scene.origin)
+        form = training.with_picture(main_view.work.form, path, further=False)
+        main_view.work = replace(main_view.work, form=form, form_open=True)
+        self._painting = PaintedView(path, camera, size, _file_state(path))
+        self._show(PAINT_TEXT, None)
+        if not user_files.open_in_program(path):
+            main_view.show_message(f"No program opens pictures by itself here: open {path} in yours")
+
+    def _is_painting(self, painted: PaintedView) -> bool:
+        """Whether the form is about the picture that is painted."""
+        work = self._app.main_view.work
+        return work.form_open and work.view.panel and str(painted.path) in work.form.pictures.split(", ")
+
+    def _follow(self, painted: PaintedView) -> float:
+        """What was saved of it lies over the view; seconds until the next look."""
+        state = _file_state(painted.path)
+        if state == painted.state:
+            return WATCH_S
+        try:
+            with Image.open(painted.path) as picture:
+                pixels = np.asarray(picture.convert("RGB"))
+        except (OSError, SyntaxError, ValueError):  # not whole yet
+            return WATCH_S
+        self._painting = replace(painted, state=state)
+        height, width = pixels.shape[:2]
+        if (width, height) != painted.size:
+            what = "{} is {}×{} pixels now, and was {}×{}; keep its size"
+            self._show(what.format(painted.path.name, width, height, *painted.size), None, failed=True)
+        else:
+            cover = Cover(self._upload(pixels), painted.camera, painted.size, "Painted")
+            self._show("This is what you saved; Train makes it an edit", cover)
+            self._app.main_view.wake()
+        return WATCH_S
+
     def anchor(self, form: NewEdit) -> tuple[NDArray[np.uint8], Camera] | None:
         """A sentence's picture of one view, and its camera, which the edit is to follow; None for none."""
         request = self._request()
@@ -241,7 +333,7 @@ class PreviewActions:
     def leave_scene(self) -> None:
         """The child is for a scene that is not open any more."""
         self._end()
-        self._grade = None
+        self._grade = self._painting = None
         self._broken = False
 
     def close(self) -> None:

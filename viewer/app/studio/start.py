@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import moderngl
@@ -17,17 +18,9 @@ from progdf.io.session import BUNDLE, sha256
 from progdf.scene import up_axis
 from progdf.scene.up_axis import direction_name
 from viewer.app.application import Application, failure_line
+from viewer.app.file_actions import EditActions
 from viewer.camera.view_camera import Vec3, first_camera
-from viewer.files.user_files import (
-    THUMBNAIL_SIZE,
-    describe_age,
-    forget_recent,
-    keep_thumbnail,
-    load_thumbnail,
-    read_recent,
-    read_thumbnail,
-    thumbnail_time,
-)
+from viewer.files import user_files
 from viewer.gl.present import picture_texture
 from viewer.jobs.job_queue import Delivery, JobQueue
 from viewer.pictures.film import to_pixels
@@ -71,7 +64,8 @@ class StartActions:
         self._memory = memory
         self._textures: dict[Path, moderngl.Texture | None] = {}
         self._demo: Path | None = None  # its folder while it is being made
-        self._added: set[Path] = set()  # edits of it that are open
+        self._edits = EditActions(app)
+        self._added: dict[Path, tuple[Path, int]] = {}  # of the folders of its edits: which file is open
 
     def handle(self, request: str) -> bool:
         """Do what is asked for; False where it is nothing of ours."""
@@ -81,7 +75,7 @@ class StartActions:
         elif name == "example":
             self._open_example(Path(argument))
         elif name == "forget_file":
-            self._app.main_view.recent = forget_recent(Path(argument), self._memory)
+            self._app.main_view.recent = user_files.forget_recent(Path(argument), self._memory)
         else:
             return False
         return True
@@ -101,11 +95,10 @@ class StartActions:
             main_view = self._app.main_view
             view = replace(main_view.work.view, background=SKY)
             main_view.work = replace(main_view.work, view=view, past=history.begin(view))
-        edits = sorted(self._demo.glob("*/*.gdf"), key=lambda path: path.stat().st_mtime)
-        for path in edits if self._app.document.path is not None else ():
-            if path not in self._added:
-                self._added.add(path)
-                self._app.open(path)
+        folders = sorted(file.parent for file in self._demo.glob("*/*.gdf") if self._app.document.path)
+        for folder in dict.fromkeys(folders):
+            if error := failure_line(partial(self._show_edit, folder)):
+                self._app.main_view.show_message(error, error=True)
         if not self._queue.busy(Delivery):
             self._demo = None
         return POLL_S
@@ -117,11 +110,11 @@ class StartActions:
             return
         try:
             seen = ViewState(view.camera, view.layers, view.blend, view.background, compare=Comparison())
-            pixels = to_pixels(engine.image(seen, THUMBNAIL_SIZE))
+            pixels = to_pixels(engine.image(seen, user_files.THUMBNAIL_SIZE))
         except ProgdfError:
             return
         for path in known:
-            keep_thumbnail(path, pixels, self._memory)
+            user_files.keep_thumbnail(path, pixels, self._memory)
 
     def close(self) -> None:
         """Give back the pictures."""
@@ -132,10 +125,20 @@ class StartActions:
 
     def _start_demo(self) -> None:
         folder = ((self._memory or state_folder()) / "demo").resolve()
-        self._demo, self._added = folder, set()
+        self._demo, self._added = folder, {}
         words, log = ("demo", "--quick", "--no-window", f"--out={folder}"), self._queue.folder / "demo.log"
         self._queue.add(Delivery("Demo: four edits", folder, words, log, folder / "scene.ply"))
         self._app.main_view.show_message("Making the demo's scene …")
+
+    def _show_edit(self, folder: Path) -> None:
+        """An edit of the demo: its draft, in place of that what is packed, and at last the finished file."""
+        draft, result = folder / "draft.gdf", folder / f"{folder.name}.gdf"
+        path, before = result if result.is_file() else draft, self._added.get(folder)
+        now = path, path.stat().st_mtime_ns
+        if now != before:
+            self._added[folder] = now
+            if before is None or not self._edits.finish(before[0], path):
+                self._edits.add(path, folder.name)
 
     def _open_example(self, bundle: Path) -> None:
         """Unpacked where the program keeps its state: what is saved in it stays there."""
@@ -158,9 +161,9 @@ class StartActions:
         if not main_view.at_start:
             return
         recent = []
-        for path in read_recent(self._memory, missing=True):
-            used, missing = thumbnail_time(path, self._memory), not path.is_file()
-            age = describe_age(time.time() - used) if used else ""
+        for path in user_files.read_recent(self._memory, missing=True):
+            used, missing = user_files.thumbnail_time(path, self._memory), not path.is_file()
+            age = user_files.describe_age(time.time() - used) if used else ""
             line = "  ·  ".join(filter(None, ("Moved?" if missing else age, folder_name(path))))
             recent.append(StartFile(path, self._texture(path), line=line, missing=missing))
         examples = [StartFile(path, self._texture(path), *about) for path, about in EXAMPLE_TITLES.items()]
@@ -171,10 +174,10 @@ class StartActions:
 
     def _texture(self, path: Path) -> int:
         if path not in self._textures:
-            example = path.with_name(path.name.replace(BUNDLE, ".jpg"))
-            pixels = (
-                read_thumbnail(example) if path.parent == EXAMPLES else load_thumbnail(path, self._memory)
-            )
+            if path.parent == EXAMPLES:
+                pixels = user_files.read_thumbnail(path.with_name(path.name.replace(BUNDLE, ".jpg")))
+            else:
+                pixels = user_files.load_thumbnail(path, self._memory)
             self._textures[path] = picture_texture(self._context, pixels) if pixels is not None else None
         texture = self._textures[path]
         return int(texture.glo) if texture is not None else 0

@@ -36,6 +36,15 @@ LIVE_EVERY_S = 3.0
 LIVE_SHARE = 0.05
 """Of the window's time, at most, that showing them may take."""
 
+
+def is_newer(file: Path, other: Path) -> bool:
+    """Whether both are there and the first was written later."""
+    try:
+        return file.stat().st_mtime_ns > other.stat().st_mtime_ns
+    except OSError:
+        return False
+
+
 _KINDS = ("masks", "photomasks", "text", "changed")
 """Of regions, besides those that every command knows."""
 
@@ -200,6 +209,12 @@ class JobActions:
             temporary_file.write_bytes(read_file(draft))
         self._edits.add(order.draft, order.name, strength)
 
+    def _take_packed(self, order: EditOrder, packed: Path) -> None:
+        """What is trained and only measured yet takes the place of the draft's file and layer."""
+        with atomic_write(order.draft) as temporary_file:
+            temporary_file.write_bytes(read_file(packed))
+        self._edits.finish(order.draft, order.draft)
+
     def _write_anchor(self, form: NewEdit, run: Path) -> str:
         """The file of the picture that a sentence is to follow, beside its run; "" for none.
 
@@ -316,11 +331,13 @@ class JobActions:
         order = next((task for task in orders if isinstance(task, EditOrder)), None)
         if order is None or order.scene != self._scene or now < self._live_due:
             return
-        live = self._app.main_view.live
+        live, packed = self._app.main_view.live, order.out / "draft.gdf"
+        if order.draft in self._app.document.gdf_paths and is_newer(packed, order.draft):
+            self._try(partial(self._take_packed, order, packed))
         if order.draft in self._app.document.gdf_paths or (live and live != self._live_layers):
             return  # there is a layer of it, or of what the form says
-        if (order.out / "draft.gdf").is_file() and not order.draft.exists():
-            self._try(partial(self._add_draft, order, order.out / "draft.gdf"))
+        if packed.is_file() and not order.draft.exists():
+            self._try(partial(self._add_draft, order, packed))
             return
         recording = order.newest_recording()
         if recording is None or recording == self._live:

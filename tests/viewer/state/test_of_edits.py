@@ -1,0 +1,98 @@
+"""Actions on one layer that ask what is known of its edit: again, limited to a selection, selected."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.helpers.ui_rig import Rig, bear, first_view, rig
+from viewer.jobs.training import ALL, TYPED
+from viewer.state import paint, selection
+from viewer.state.actions import perform
+from viewer.state.selection import NamedRegion
+from viewer.state.workspace import SceneFacts, Workspace
+
+pytestmark = pytest.mark.gl
+SCARF, EARS = 0, 1
+
+
+@pytest.fixture(scope="module")
+def hand() -> Iterator[Rig]:
+    with rig(first_view(bear(), 0.5, 0.5)) as hand:
+        yield hand
+
+
+def of_edit(facts: SceneFacts, instruction: str, spec: str) -> SceneFacts:
+    """The facts, with this said by the scarf's edit."""
+    row = replace(facts.rows[SCARF], instruction=instruction, region_spec=spec)
+    return replace(facts, rows=(row, *facts.rows[1:]))
+
+
+def selecting(work: Workspace, rows: np.ndarray, count: int) -> Workspace:
+    mask = np.zeros(count, bool)
+    mask[rows] = True
+    return replace(work, view=replace(work.view, selection=selection.select(work.view.selection, mask)))
+
+
+def test_again_opens_the_form_with_the_edits_own_settings(hand: Rig) -> None:
+    work = hand.main_view.work
+    facts = of_edit(hand.main_view.facts, "recolor:#1b6972,path=hue", "labels:parts.npy:5")
+    form = perform(work, f"again:{SCARF}", facts)
+    assert (form.form_open, form.form_opening) == (True, True)
+    assert form.form.spec == "recolor:#1b6972,path=hue"
+    assert (form.form.region, form.form.typed_region) == (TYPED, "labels:parts.npy:5")
+    assert form.form.name == work.view.layers[SCARF].name
+    everywhere = perform(work, f"again:{SCARF}", of_edit(facts, "night:0.40", "all")).form
+    assert (everywhere.region, everywhere.spec) == (ALL, "night:0.40")
+    regions = (NamedRegion("hands", Path("/scenes/hands.region.npy"), b"", 3),)
+    view = replace(work.view, selection=replace(work.view.selection, regions=regions))
+    named = of_edit(facts, "tint:#ff0000", "file:/scenes/hands.region.npy")
+    assert perform(replace(work, view=view), f"again:{SCARF}", named).form.region == "hands"
+
+
+def test_again_leaves_alone_what_no_editor_of_the_form_has_made(hand: Rig) -> None:
+    work = hand.main_view.work
+    for instruction in (
+        "edit --scale head:2",
+        "decal:logo.png",
+        "style:99",
+        "recolor:#nothex",
+        "grade:x",
+        "",
+    ):
+        assert perform(work, f"again:{SCARF}", of_edit(hand.main_view.facts, instruction, "all")) == work
+
+
+def test_a_layer_is_limited_to_what_is_selected_and_again_to_less(hand: Rig) -> None:
+    facts, work = hand.main_view.facts, hand.main_view.work
+    row = facts.rows[SCARF]
+    assert perform(work, f"limit_to_selection:{SCARF}", facts) == work, "nothing is selected"
+    half, third = row.members[::2], row.members[::3]
+    work = perform(selecting(work, half, facts.count), f"limit_to_selection:{SCARF}", facts)
+    weights = paint.decode(work.view.layers[SCARF].paint, row.count)
+    assert weights is not None
+    assert row.members[weights.numpy() == 1.0].tolist() == half.tolist()
+    assert work.view.layers[EARS].paint == paint.FULL
+    work = perform(selecting(work, third, facts.count), f"limit_to_selection:{SCARF}", facts)
+    weights = paint.decode(work.view.layers[SCARF].paint, row.count)
+    assert weights is not None
+    assert row.members[weights.numpy() == 1.0].tolist() == row.members[::6].tolist()
+
+
+def test_what_a_layer_shows_is_selected_by_its_paint(hand: Rig) -> None:
+    facts, work = hand.main_view.facts, hand.main_view.work
+    row = facts.rows[SCARF]
+
+    def selected(work: Workspace) -> list[int]:
+        found = perform(replace(work, focus=SCARF), "select_painted", facts).view.selection
+        return np.flatnonzero(selection.unpack(found.members, facts.count)).tolist()
+
+    assert selected(work) == row.members.tolist(), "all of its region where nothing is painted"
+    weights = np.linspace(0.0, 1.0, row.count, dtype=np.float32)
+    layers = (replace(work.view.layers[SCARF], paint=paint.encode(weights)), work.view.layers[EARS])
+    half = row.members[np.round(255 * weights) >= 127.5]
+    assert selected(replace(work, view=replace(work.view, layers=layers))) == half.tolist()
