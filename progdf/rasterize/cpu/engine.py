@@ -175,8 +175,9 @@ class _Rasterize(torch.autograd.Function):
         if camera.degree < 0:
             arrays[4] = arrays[4].reshape(-1, 1, 3)
         scene = Scene(*arrays)
-        out = _new_picture(camera)
-        splats, lists = _project_and_bin(scene, camera, any(ctx.needs_input_grad))
+        with_gradient = any(ctx.needs_input_grad)
+        out = _new_picture(camera, with_gradient)
+        splats, lists = _project_and_bin(scene, camera, with_gradient)
         share_tiles(blend, camera, splats, lists, camera, background, out)
         projected[:] = splats.means2d, splats.depths, splats.visible
         ctx.set_materialize_grads(False)
@@ -214,11 +215,11 @@ class _Rasterize(torch.autograd.Function):
         return None, None, None, *results
 
 
-def _new_picture(camera: Pinhole) -> Picture:
+def _new_picture(camera: Pinhole, with_last: bool) -> Picture:
     x0, y0, x1, y1 = camera.window
-    height, width = y1 - y0, x1 - x0
-    planes = (np.empty((height, width), np.float32) for _ in range(2))
-    return Picture(np.empty((height, width, 3), np.float32), *planes)
+    size = y1 - y0, x1 - x0
+    last = np.empty(size, np.float32) if with_last else None
+    return Picture(np.empty((*size, 3), np.float32), np.empty(size, np.float32), last)
 
 
 def _array(gradient: Tensor | None, like: Array) -> Array:
