@@ -260,7 +260,7 @@ def _blend_tile(
     state: Array, x: int, y: int, members: Array, splats: Splats, bounds: Array, batch: Array,
     last: Array | None,
 ) -> None:  # fmt: skip
-    """Blend a tile; state, set up here, is [5·PLANE] float32; last as in `Picture`, else as in `find_spans`."""
+    """Blend a tile; state, set up here, is [5·PLANE] float32; last as in `Picture`, else as `find_spans`."""
     plane = np.int64(PLANE)
     state[:plane] = ONE
     state[plane : 4 * plane] = ZERO

@@ -41,6 +41,7 @@ from .forward import (
     cross,
     dot,
     footprint,
+    extents,
     largest_extents,
     rotation_rows,
     shade_splat,
@@ -77,10 +78,16 @@ FINEST = 1e-3
 ENOUGH = 0.85
 """Of what was asked for: with so many the limit is not sought any further."""
 
+LONGEST, DETAIL, SOUND, WEIGHT, SPREAD = range(3, 8)
+"""Columns of a node beside its mean: the largest scale; what merging loses, spread · root of the weight, world
+units², infinite where too little is left to be drawn; density, negative where something below cannot be drawn; Σ opacity · area of what is below, world
+units², 0 for nothing; root of the summed variances of the centers below, world units."""
+
 _ONE = int(np.float32(1.0).view(np.int32))
 _SLICE_SHIFT = 19  # of a float's bits: sixteen slices for a factor of two
 _TOP = 5  # levels of which each node is a chunk of its own
 _AHEAD = 8  # rows that are fetched before it is their turn: they lie far apart
+_DARK = math.exp(0.5 * DARKEST)  # times the limit, beyond which no darkness brings a loss below it
 _MOST = 1e30  # of a weight
 _LEAST = 1e-30
 _TRIALS = 12  # for a limit
@@ -91,9 +98,9 @@ class Nodes(NamedTuple):
     """The tree, level after level: node i has the halves 2i + 1 and 2i + 2, and leaf l of L = 2^levels the
     rows order[l·N // L : (l + 1)·N // L]."""
 
-    gaussians: Scene  # what stands for each node; opacities as densities, beyond 1 too. [2L-1, …]
-    weights: Array  # Σ opacity · area of what is below, world units². [2L-1] float32
-    spreads: Array  # root of the summed variances of the centers below, world units. [2L-1] float32
+    # what stands for each node: opacities as densities, beyond 1 too; means with the columns above, so that a
+    # cut touches one line of the cache for two nodes. [2L-1, …]
+    gaussians: Scene
     order: Array  # rows of the scene. [N] int32
     levels: int
 
@@ -112,13 +119,8 @@ class Pyramid:
         levels = max((count // LEAF).bit_length() - 1, 0)
         order = _sort(self.scene.means, levels)
         total = (2 << levels) - 1
-        self.nodes = Nodes(
-            Scene(*(np.zeros((total, *array.shape[1:]), np.float32) for array in self.scene)),
-            np.zeros(total, np.float32),
-            np.zeros(total, np.float32),
-            order,
-            levels,
-        )
+        gaussians = Scene(*(np.zeros((total, *array.shape[1:]), np.float32) for array in self.scene))
+        self.nodes = Nodes(gaussians._replace(means=np.zeros((total, SPREAD + 1), np.float32)), order, levels)
         self.limit = 1.0  # of what a node may lose, pixels²: where the last search ended
         self._places: Array | None = None  # of each row in the order, once one is asked for. [N] int32
         for level in range(levels, -1, -1):
@@ -293,10 +295,12 @@ def _merge(
         if leaf:
             first, last = (indices[at] * count) >> level, ((indices[at] + 1) * count) >> level
         total = x = y = z = 0.0
+        sound = True
         colors[:] = 0.0
         for k in range(first, last):
             i = nodes.order[k] if leaf else k
-            weight = _weight(scene, i) if leaf else np.float64(nodes.weights[i])
+            weight = _weight(scene, i) if leaf else np.float64(out.means[i, WEIGHT])
+            sound = sound and (weight > 0.0 if leaf else out.means[i, SOUND] > 0.0)
             if weight > 0.0:
                 total += weight
                 x, y, z = (
@@ -317,10 +321,10 @@ def _merge(
         matrix[:] = 0.0
         for k in range(first, last):
             i = nodes.order[k] if leaf else k
-            weight = (_weight(scene, i) if leaf else np.float64(nodes.weights[i])) * share
+            weight = (_weight(scene, i) if leaf else np.float64(out.means[i, WEIGHT])) * share
             if weight > 0.0:
                 own += weight * _add_moments(below, i, weight, (x, y, z), matrix)
-                own -= 0.0 if leaf else weight * nodes.spreads[i] * nodes.spreads[i]
+                own -= 0.0 if leaf else weight * out.means[i, SPREAD] * out.means[i, SPREAD]
         spread = math.sqrt(max(matrix[0, 0] + matrix[1, 1] + matrix[2, 2] - own, 0.0))
         _diagonalize(matrix, quat)
         out.means[me, 0], out.means[me, 1], out.means[me, 2] = x, y, z
@@ -330,7 +334,10 @@ def _merge(
             out.scales[me, k] = math.sqrt(max(matrix[k, k], 0.0))
         longest, middle = _two_largest(out, me)
         out.opacities[me] = total / max(longest * middle, _LEAST)
-        nodes.weights[me], nodes.spreads[me] = total, spread
+        mine = out.means[me]
+        mine[LONGEST], mine[WEIGHT], mine[SPREAD] = longest, total, spread
+        mine[DETAIL] = spread * math.sqrt(total) if out.opacities[me] >= ALPHA_MIN else np.inf
+        mine[SOUND] = out.opacities[me] if sound else -out.opacities[me]
 
 
 @kernel(contract=True, inline=True)
@@ -404,6 +411,13 @@ def _is_outside(camera: Pinhole, x: float, y: float, wide2: float, high2: float)
     return bool(out_x * out_x > wide2 or out_y * out_y > high2)
 
 
+@kernel(contract=True, inline=True)
+def _is_inside(camera: Pinhole, x: float, y: float, wide2: float, high2: float) -> bool:
+    """Whether the window shows all of such a box."""
+    in_x, in_y = min(x, camera.window[2] - x), min(y, camera.window[3] - y)
+    return bool(in_x > 0.0 and in_x * in_x >= wide2 and in_y > 0.0 and in_y * in_y >= high2)
+
+
 @kernel(contract=True, cache=True)
 def _walk(
     root: int,
@@ -426,25 +440,31 @@ def _walk(
     Returns:
         how many are picked
     """
-    merged, focal, first_leaf = nodes.gaussians, math.sqrt(camera.fx * camera.fy), (1 << nodes.levels) - 1
+    means, focal, first_leaf = (
+        nodes.gaussians.means,
+        math.sqrt(camera.fx * camera.fy),
+        (1 << nodes.levels) - 1,
+    )
     count: int = 0
     top = 1
     stack[0] = root
     while top > 0:
         top -= 1
         i = stack[top]
-        longest = max(merged.scales[i, 0], max(merged.scales[i, 1], merged.scales[i, 2]))
-        nearest = dot(camera.rows[2], vec(merged.means, i)) + camera.shift[2] - camera.near
-        if nodes.weights[i] <= 0.0 or nearest + _REACH * longest < 0.0:
+        longest, density = np.float64(means[i, LONGEST]), abs(np.float64(means[i, SOUND]))
+        z = dot(camera.rows[2], vec(means, i)) + camera.shift[2]
+        reach = _REACH * longest
+        if means[i, WEIGHT] <= 0.0 or z - camera.near + reach < 0.0:
             continue
-        loss = np.inf
-        usable, x, y, z, wide2, high2 = largest_extents(camera, merged, i)
-        if usable and nearest > _REACH * longest:
+        loss, inside = np.inf, False
+        if z - camera.near > reach:
+            x, y, wide2, high2 = extents(camera, vec(means, i), z, longest, density)
             if _is_outside(camera, x, y, wide2, high2):
                 continue
+            inside = _is_inside(camera, x, y, wide2, high2) and means[i, SOUND] > 0.0
             scaled = focal / z
-            loss = nodes.spreads[i] * math.sqrt(nodes.weights[i]) * scaled * scaled
-            if depths.size > 1:
+            loss = np.float64(means[i, DETAIL]) * scaled * scaled
+            if depths.size > 1 and limit < loss < limit * _DARK:
                 loss *= math.exp(-0.5 * min(depths[_cell(x, y, z - longest, camera)], DARKEST))
         if loss <= limit:
             picks[count] = i
@@ -452,12 +472,17 @@ def _walk(
         elif i >= first_leaf:
             leaf, rows = i - first_leaf, nodes.order.shape[0]
             for k in range((leaf * rows) >> nodes.levels, ((leaf + 1) * rows) >> nodes.levels):
-                usable, x, y, z, wide2, high2 = largest_extents(camera, scene, nodes.order[k])
+                picks[count] = ~nodes.order[k]
+                if inside:
+                    count += 1
+                    continue
+                usable, x, y, _, wide2, high2 = largest_extents(camera, scene, nodes.order[k])
                 if usable and not _is_outside(camera, x, y, wide2, high2):
-                    picks[count] = ~nodes.order[k]
                     count += 1
         else:
             stack[top], stack[top + 1] = 2 * i + 1, 2 * i + 2
+            prefetch(means, 4 * i + 3)
+            prefetch(means, 4 * i + 5)
             top += 2
     return count
 
