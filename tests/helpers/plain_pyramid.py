@@ -96,7 +96,12 @@ class PlainCut:
         for pick in coarse:
             mean, covariance, opacity, _ = self._parts(pick)
             x, y, z = self._project(mean)
-            if 0 <= x <= camera.width and 0 <= y <= camera.height:
+            if (
+                z > camera.near
+                and opacity >= ALPHA_MIN
+                and 0 <= x <= camera.width
+                and 0 <= y <= camera.height
+            ):
                 nearer = self._focal2 / z**2
                 sizes = torch.linalg.eigvalsh(covariance)[1:].clamp_min(0.0) * nearer + self._dilation
                 part = min(2 * math.pi * float(sizes.prod().sqrt()) / CELL**2, 1.0)
@@ -171,9 +176,10 @@ class PlainCut:
             if self._depths is not None:
                 depth = float(self._depths[self._cell(x, y, z - largest)])
                 loss *= math.exp(-0.5 * min(depth, DARKEST))
-        if loss <= limit:
+        leaf = 2 * index + 1 >= len(self._nodes)
+        if loss <= limit or (leaf and self._depths is None):  # a leaf as it is tells the light
             return [index]
-        if 2 * index + 1 >= len(self._nodes):
+        if leaf:
             means, scales = self._gaussians.means.double(), self._gaussians.scales.double()
             return [
                 ~row

@@ -267,7 +267,7 @@ def largest_extents(camera: Pinhole, scene: Scene, i: int) -> tuple[bool, float,
 def extents(
     camera: Pinhole, mean: Vec, z: float, largest: float, opacity: float
 ) -> tuple[float, float, float, float]:
-    """Center, and squares of half the sides of a box around a Gaussian's support, pixels; largest: its scale."""
+    """Center and squares of half the sides of a box around the support, in pixels; largest: of the scales."""
     inv_z = 1.0 / z
     tan_x = (dot(camera.rows[0], mean) + camera.shift[0]) * inv_z
     tan_y = (dot(camera.rows[1], mean) + camera.shift[1]) * inv_z

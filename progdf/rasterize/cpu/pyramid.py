@@ -40,8 +40,8 @@ from .forward import (
     camera_center,
     cross,
     dot,
-    footprint,
     extents,
+    footprint,
     largest_extents,
     rotation_rows,
     shade_splat,
@@ -79,9 +79,10 @@ ENOUGH = 0.85
 """Of what was asked for: with so many the limit is not sought any further."""
 
 LONGEST, DETAIL, SOUND, WEIGHT, SPREAD = range(3, 8)
-"""Columns of a node beside its mean: the largest scale; what merging loses, spread · root of the weight, world
-units², infinite where too little is left to be drawn; density, negative where something below cannot be drawn; Σ opacity · area of what is below, world
-units², 0 for nothing; root of the summed variances of the centers below, world units."""
+"""Columns of a node beside its mean: the largest scale; what merging loses, spread · root of the weight, in
+world units², infinite where it is too thin to be drawn; density, negative where something below cannot be
+drawn; Σ opacity · area of what is below, world units², 0 for nothing; root of the summed variances of the
+centers below, world units."""
 
 _ONE = int(np.float32(1.0).view(np.int32))
 _SLICE_SHIFT = 19  # of a float's bits: sixteen slices for a factor of two
@@ -433,7 +434,7 @@ def _walk(
 
     Args:
         limit: of what a node may lose, pixels²
-        depths: optical depth before each slice, or [1]: all in the light
+        depths: optical depth before each slice; [1]: all in the light, and leaves are not looked into
         stack: scratch, more than the levels
         picks: out, as in `Pyramid.cut`
 
@@ -466,7 +467,7 @@ def _walk(
             loss = np.float64(means[i, DETAIL]) * scaled * scaled
             if depths.size > 1 and limit < loss < limit * _DARK:
                 loss *= math.exp(-0.5 * min(depths[_cell(x, y, z - longest, camera)], DARKEST))
-        if loss <= limit:
+        if loss <= limit or (i >= first_leaf and depths.size == 1):
             picks[count] = i
             count += 1
         elif i >= first_leaf:
@@ -494,8 +495,8 @@ def _add_depths(
     """Add the optical depth of each pick to its cell of the flat grid, in which it fills no more than all."""
     for k in range(picks.size):
         source, i = (merged, picks[k]) if picks[k] >= 0 else (scene, ~picks[k])
-        _, x, y, z, _, _ = largest_extents(camera, source, i)
-        if 0.0 <= x <= camera.window[2] and 0.0 <= y <= camera.window[3]:
+        usable, x, y, z, _, _ = largest_extents(camera, source, i)
+        if usable and 0.0 <= x <= camera.window[2] and 0.0 <= y <= camera.window[3]:
             longest, middle = _two_largest(source, i)
             nearer = camera.fx * camera.fy / (z * z)
             area = math.sqrt((longest * longest * nearer + dilation) * (middle * middle * nearer + dilation))
