@@ -276,25 +276,18 @@ def _blend_tile(
             break
 
 
-@kernel(inline=True)
-def _write_last(state: Array, p: Number, last: Array | None, i: Number, left: Number, width: Number) -> None:
-    if last is not None:
-        for k in range(width):
-            last[i, left + k] = state[p + _LAST + k]
-
-
 @kernel(cache=True)
 def blend(
     begin: int, end: int, scratch: TileScratch, splats: Splats, lists: TileLists, camera: Pinhole,
-    background: Array, out: Picture,
+    background: Array, out: Picture, last: Array | None,
 ) -> None:  # fmt: skip
-    """Blend tiles begin … end − 1 into the picture. background: [3] float32"""
+    """Blend tiles begin … end − 1 into the picture. background: [3] float32; last: the picture's"""
     state, batch, bounds = scratch
     for tile in range(begin, end):
         x, y = tile_corner(camera, tile)
         tile_bounds(camera, x, y, bounds)
         members = lists.members[lists.starts[tile] : lists.starts[tile + 1]]
-        _blend_tile(state, x, y, members, splats, bounds, batch, out.last)
+        _blend_tile(state, x, y, members, splats, bounds, batch, last)
         tile_bounds(camera, x, y, bounds)  # blending narrowed it
         left, width = np.uint64(x + bounds[0] - camera.window[0]), np.uint64(bounds[2] - bounds[0])
         for row in range(np.uint64(bounds[1]), np.uint64(bounds[3])):
@@ -302,7 +295,9 @@ def blend(
             p = row * np.uint64(TILE_W) + np.uint64(bounds[0])
             for k in range(width):
                 out.transmittance[i, left + k] = abs(state[p + k])
-            _write_last(state, p, out.last, i, left, width)
+            if last is not None:
+                for k in range(width):
+                    last[i, left + k] = state[p + _LAST + k]
             for k in range(width):
                 through = abs(state[p + k])
                 out.image[i, left + k, 0] = state[p + _R + k] + through * background[0]

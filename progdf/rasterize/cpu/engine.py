@@ -57,6 +57,7 @@ _T = TypeVar("_T")
 
 _LEAST_TILES = 4  # fewer are not worth a call
 _CHUNKS = 4  # for each thread: tiles take unequally long
+_MOST_TILES, _MOST_GAUSSIANS = 24, 32 * BLOCK  # of a chunk: a picture that is dropped stops between two
 TILE_ROOM = 8  # tiles of a Gaussian that there is room for; where chunks have more, these are listed twice
 _ALL = np.empty(0, np.bool_)
 
@@ -113,18 +114,19 @@ def bin_view(gaussians: ActivatedGaussians, camera: Pinhole) -> tuple[Splats, Ti
 def share_tiles(kernel: Any, camera: Pinhole, *arguments: Any) -> None:
     """Run `kernel(begin, end, scratch, *arguments)` so that every tile is one kernel's."""
     tiles = camera.grid[2] * camera.grid[3]
-    _share(lambda begin, end: kernel(begin, end, new_scratch(), *arguments), tiles, _LEAST_TILES)
+    _share(lambda begin, end: kernel(begin, end, new_scratch(), *arguments), tiles, _LEAST_TILES, _MOST_TILES)
 
 
 def share_gaussians(kernel: Callable[[int, int], _T], count: int) -> list[_T]:
     """Run `kernel(begin, end)` so that each Gaussian is one kernel's; what they return, in order."""
-    return _share(kernel, count, BLOCK)
+    return _share(kernel, count, BLOCK, _MOST_GAUSSIANS)
 
 
-def _share(kernel: Callable[[int, int], _T], count: int, block: int) -> list[_T]:
-    """Run `kernel(begin, end)` over `count` things in ranges of whole blocks."""
+def _share(kernel: Callable[[int, int], _T], count: int, block: int, most: int) -> list[_T]:
+    """Run `kernel(begin, end)` over `count` things in ranges of whole blocks, `most` in each at most."""
     blocks = max(1, -(-count // block))
-    chunks = 1 if threads() == 1 else min(blocks, _CHUNKS * threads())
+    least = _CHUNKS * threads() if threads() > 1 else 1
+    chunks = min(blocks, max(least, count // most))
     cuts = [min(count, blocks * chunk // chunks * block) for chunk in range(chunks + 1)]
     return run_chunks(lambda chunk: kernel(cuts[chunk], cuts[chunk + 1]), chunks)
 
@@ -178,7 +180,7 @@ class _Rasterize(torch.autograd.Function):
         with_gradient = any(ctx.needs_input_grad)
         out = _new_picture(camera, with_gradient)
         splats, lists = _project_and_bin(scene, camera, with_gradient)
-        share_tiles(blend, camera, splats, lists, camera, background, out)
+        share_tiles(blend, camera, splats, lists, camera, background, out, out.last)
         projected[:] = splats.means2d, splats.depths, splats.visible
         ctx.set_materialize_grads(False)
         ctx.forward_pass = camera, grad_rows, scene, background, splats, lists, out

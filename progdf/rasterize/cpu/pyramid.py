@@ -120,8 +120,9 @@ class Pyramid:
         levels = max((count // LEAF).bit_length() - 1, 0)
         order = _sort(self.scene.means, levels)
         total = (2 << levels) - 1
-        gaussians = Scene(*(np.zeros((total, *array.shape[1:]), np.float32) for array in self.scene))
-        self.nodes = Nodes(gaussians._replace(means=np.zeros((total, SPREAD + 1), np.float32)), order, levels)
+        means, *others = (np.zeros((total, *array.shape[1:]), np.float32) for array in self.scene)
+        means = np.zeros((total, SPREAD + 1), np.float32)
+        self.nodes = Nodes(Scene(means, *others), order, levels)
         self.limit = 1.0  # of what a node may lose, pixels²: where the last search ended
         self._places: Array | None = None  # of each row in the order, once one is asked for. [N] int32
         for level in range(levels, -1, -1):
@@ -524,11 +525,11 @@ def _take(
     for at in range(begin, end):
         source, i = (merged, picks[at]) if picks[at] >= 0 else (scene, ~picks[at])
         following = picks[min(at + _AHEAD, end - 1)]
-        if following < 0:
-            prefetch(scene.means, ~following)
-            prefetch(scene.quats, ~following)
-            prefetch(scene.scales, ~following)
-            prefetch(scene.colors, ~following)
+        ahead, row = (merged, following) if following >= 0 else (scene, ~following)
+        prefetch(ahead.means, row)
+        prefetch(ahead.quats, row)
+        prefetch(ahead.scales, row)
+        prefetch(ahead.colors, row)
         seen = footprint(camera, source, i)
         density = np.float64(source.opacities[i])  # of a node; more than 1 where several cover each other
         grow = 1.0 + SWELL * math.log(density) if picks[at] >= 0 and density > 1.0 else 1.0
