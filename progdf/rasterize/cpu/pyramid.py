@@ -8,7 +8,9 @@ as it shows.
   the visible area, as errors add up in squares; and it shows as far as light reaches it, which a coarser cut
   of the same view tells, added up in a grid of cells and slices of depth.
 - The limit is sought so that about as many are drawn as asked for, beginning at the last picture's.
-- The dilation, wider in a coarse picture, is taken off the size, and the remainder off the opacity.
+- Each Gaussian has a dilation of its own in the fine picture: a node of many small ones is as dense as these
+  are together. That of the coarse picture, which is wider, is taken off the size, and the remainder off the
+  opacity.
 
 The plain version is in tests/helpers/plain_pyramid.py.
 """
@@ -78,11 +80,10 @@ FINEST = 1e-3
 ENOUGH = 0.85
 """Of what was asked for: with so many the limit is not sought any further."""
 
-LONGEST, DETAIL, SOUND, WEIGHT, SPREAD = range(3, 8)
-"""Columns of a node beside its mean: the largest scale; what merging loses, spread · root of the weight, in
-world units², infinite where it is too thin to be drawn; density, negative where something below cannot be
-drawn; Σ opacity · area of what is below, world units², 0 for nothing; root of the summed variances of the
-centers below, world units."""
+LONGEST, DENSITY, WEIGHT, POINTS, SPREAD = range(3, 8)
+"""Columns of a node beside its mean: the largest scale; density, negative where something below cannot be
+drawn; Σ opacity · area of what is below, world units², 0 for nothing; Σ opacity; root of the summed variances
+of the centers below, world units."""
 
 _ONE = int(np.float32(1.0).view(np.int32))
 _SLICE_SHIFT = 19  # of a float's bits: sixteen slices for a factor of two
@@ -171,10 +172,10 @@ class Pyramid:
         low, high = 0.0, math.inf
         for _ in range(_TRIALS):
             depths = np.zeros(shape, np.float32)
-            coarse = self._cut(view, self.limit * COARSER, np.zeros(1, np.float32))
+            coarse = self._cut(view, self.limit * COARSER, dilation, np.zeros(1, np.float32))
             _add_depths(coarse, self.scene, self.nodes.gaussians, view, dilation, depths.reshape(-1))
             _sum_depths(depths)
-            picks = self._cut(view, self.limit, depths.reshape(-1))
+            picks = self._cut(view, self.limit, dilation, depths.reshape(-1))
             if len(picks) > budget:
                 low = self.limit
             elif len(picks) >= ENOUGH * budget or self.limit <= FINEST:
@@ -188,7 +189,7 @@ class Pyramid:
             self.limit = max(guess, FINEST)
         return picks
 
-    def _cut(self, view: Pinhole, limit: float, depths: Array) -> Array:
+    def _cut(self, view: Pinhole, limit: float, dilation: float, depths: Array) -> Array:
         top = min(_TOP, self.nodes.levels)
         room = -(-len(self.nodes.order) >> top) + 1
 
@@ -196,7 +197,7 @@ class Pyramid:
             picks = np.empty(room, np.int32)
             root = (1 << top) - 1 + chunk
             stack = np.empty(64, np.int32)
-            return picks[: _walk(root, self.scene, self.nodes, view, limit, depths, stack, picks)]
+            return picks[: _walk(root, self.scene, self.nodes, view, limit, dilation, depths, stack, picks)]
 
         return np.concatenate(run_chunks(walk, 1 << top))
 
@@ -296,15 +297,16 @@ def _merge(
         first, last = 2 * me + 1, 2 * me + 3
         if leaf:
             first, last = (indices[at] * count) >> level, ((indices[at] + 1) * count) >> level
-        total = x = y = z = 0.0
+        total = points = x = y = z = 0.0
         sound = True
         colors[:] = 0.0
         for k in range(first, last):
             i = nodes.order[k] if leaf else k
             weight = _weight(scene, i) if leaf else np.float64(out.means[i, WEIGHT])
-            sound = sound and (weight > 0.0 if leaf else out.means[i, SOUND] > 0.0)
+            sound = sound and (weight > 0.0 if leaf else out.means[i, DENSITY] > 0.0)
             if weight > 0.0:
                 total += weight
+                points += np.float64(scene.opacities[i] if leaf else out.means[i, POINTS])
                 x, y, z = (
                     x + weight * below.means[i, 0],
                     y + weight * below.means[i, 1],
@@ -337,9 +339,8 @@ def _merge(
         longest, middle = _two_largest(out, me)
         out.opacities[me] = total / max(longest * middle, _LEAST)
         mine = out.means[me]
-        mine[LONGEST], mine[WEIGHT], mine[SPREAD] = longest, total, spread
-        mine[DETAIL] = spread * math.sqrt(total) if out.opacities[me] >= ALPHA_MIN else np.inf
-        mine[SOUND] = out.opacities[me] if sound else -out.opacities[me]
+        mine[LONGEST], mine[WEIGHT], mine[POINTS], mine[SPREAD] = longest, total, points, spread
+        mine[DENSITY] = out.opacities[me] if sound else -out.opacities[me]
 
 
 @kernel(contract=True, inline=True)
@@ -427,6 +428,7 @@ def _walk(
     nodes: Nodes,
     camera: Pinhole,
     limit: float,
+    dilation: float,
     depths: Array,
     stack: Array,
     picks: Array,
@@ -453,19 +455,21 @@ def _walk(
     while top > 0:
         top -= 1
         i = stack[top]
-        longest, density = np.float64(means[i, LONGEST]), abs(np.float64(means[i, SOUND]))
+        longest, density = np.float64(means[i, LONGEST]), abs(np.float64(means[i, DENSITY]))
         z = dot(camera.rows[2], vec(means, i)) + camera.shift[2]
         reach = _REACH * longest
         if means[i, WEIGHT] <= 0.0 or z - camera.near + reach < 0.0:
             continue
         loss, inside = np.inf, False
-        if z - camera.near > reach:
+        wide = 0.0 if camera.antialiased else dilation * z * z / (focal * focal)
+        least = (means[i, WEIGHT] + wide * means[i, POINTS]) / max(longest * longest + wide, _LEAST)
+        if z - camera.near > reach and max(density, least) >= ALPHA_MIN:
             x, y, wide2, high2 = extents(camera, vec(means, i), z, longest, density)
             if _is_outside(camera, x, y, wide2, high2):
                 continue
-            inside = _is_inside(camera, x, y, wide2, high2) and means[i, SOUND] > 0.0
+            inside = _is_inside(camera, x, y, wide2, high2) and means[i, DENSITY] > 0.0
             scaled = focal / z
-            loss = np.float64(means[i, DETAIL]) * scaled * scaled
+            loss = np.float64(means[i, SPREAD]) * math.sqrt(means[i, WEIGHT]) * scaled * scaled
             if depths.size > 1 and limit < loss < limit * _DARK:
                 loss *= math.exp(-0.5 * min(depths[_cell(x, y, z - longest, camera)], DARKEST))
         if loss <= limit or (i >= first_leaf and depths.size == 1):
@@ -532,10 +536,16 @@ def _take(
         prefetch(ahead.colors, row)
         seen = footprint(camera, source, i)
         density = np.float64(source.opacities[i])  # of a node; more than 1 where several cover each other
+        unit = 1.0 / (camera.fx * camera.fy * seen.inv_z * seen.inv_z)  # world units² of a pixel
+        if picks[at] >= 0 and not camera.antialiased:
+            longest, middle = _two_largest(source, i)
+            wide, own = dilation * unit, source.means[i]
+            dilated = math.sqrt((longest * longest + wide) * (middle * middle + wide))
+            density = max(density, (own[WEIGHT] + wide * own[POINTS]) / max(dilated, _LEAST))
         grow = 1.0 + SWELL * math.log(density) if picks[at] >= 0 and density > 1.0 else 1.0
         opacity = min(density, ALPHA_MAX) if picks[at] >= 0 else density
         # the coarse picture's dilation instead of the fine one's: off the size, as far as that goes
-        more = (dilation - DILATION) / (camera.fx * camera.fy * seen.inv_z * seen.inv_z)
+        more = (dilation - DILATION) * unit
         a, b, c = vec(source.scales, i)
         size = (
             math.sqrt(max(grow * a * a + more, 0.0)), math.sqrt(max(grow * b * b + more, 0.0)),

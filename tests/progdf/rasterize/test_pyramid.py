@@ -106,6 +106,15 @@ def test_a_quarter_of_the_gaussians_on_a_quarter_of_the_pixels_is_as_bright(whit
     assert abs(float(plain.mean()) / float(fine.mean()) - 1.0) > 0.02, "every fourth alone is not"
 
 
+def test_specks_below_a_pixel_are_as_dense_as_all_their_dilations() -> None:
+    scene, camera = cloud(8000, 0.05), orbit_camera(WIDTH, HEIGHT)
+    fewer = Pyramid(scene).simplify(camera, 1500)
+    assert len(fewer.means) <= 1500
+    full, merged = (1.0 - render(some, camera).transmittance for some in (scene, fewer))
+    # by their areas alone merged ones have a quarter of it
+    assert float(merged.mean()) == pytest.approx(float(full.mean()), rel=0.12)
+
+
 def test_a_few_more_or_less_do_not_show() -> None:
     scene, camera = activate(bear(6000).gaussians), orbit_camera(2 * WIDTH, 2 * HEIGHT, distance=6.0)
     pyramid, full = Pyramid(scene), picture(scene, camera)
