@@ -307,11 +307,9 @@ def _merge(
             if weight > 0.0:
                 total += weight
                 points += np.float64(scene.opacities[i] if leaf else out.means[i, POINTS])
-                x, y, z = (
-                    x + weight * below.means[i, 0],
-                    y + weight * below.means[i, 1],
-                    z + weight * below.means[i, 2],
-                )
+                x += weight * below.means[i, 0]
+                y += weight * below.means[i, 1]
+                z += weight * below.means[i, 2]
                 for band in range(colors.shape[0]):
                     for channel in range(3):
                         colors[band, channel] += weight * below.colors[i, band, channel]
@@ -423,16 +421,9 @@ def _is_inside(camera: Pinhole, x: float, y: float, wide2: float, high2: float) 
 
 @kernel(contract=True, cache=True)
 def _walk(
-    root: int,
-    scene: Scene,
-    nodes: Nodes,
-    camera: Pinhole,
-    limit: float,
-    dilation: float,
-    depths: Array,
-    stack: Array,
-    picks: Array,
-) -> int:
+    root: int, scene: Scene, nodes: Nodes, camera: Pinhole, limit: float, dilation: float, depths: Array,
+    stack: Array, picks: Array,
+) -> int:  # fmt: skip
     """Cut the tree below a node.
 
     Args:
@@ -565,8 +556,5 @@ def _take(
         for k in range(4):
             out.quats[at, k] = source.quats[i, k]
         red, green, blue = shade_splat(source, i, camera.degree, eye, basis)
-        out.colors[at, 0], out.colors[at, 1], out.colors[at, 2] = (
-            max(red, 0.0),
-            max(green, 0.0),
-            max(blue, 0.0),
-        )
+        color = out.colors[at]
+        color[0], color[1], color[2] = max(red, 0.0), max(green, 0.0), max(blue, 0.0)
