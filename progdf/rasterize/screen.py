@@ -40,8 +40,8 @@ def fill_screen(image: Array, screen: Array) -> None:
         if (height, width) == (rows, columns):
             _copy(cuts[chunk], cuts[chunk + 1], image, screen)
         else:
-            mixed = np.empty((columns + 1, 3), np.float32)
-            _stretch(cuts[chunk], cuts[chunk + 1], image, lefts, shares, screen, mixed)
+            mixed, line = np.empty(3 * columns + 3, np.float32), np.ones(4 * width, np.float32)
+            _stretch(cuts[chunk], cuts[chunk + 1], image, lefts, shares, screen, mixed, line)
 
     run_chunks(fill, chunks)
 
@@ -65,31 +65,32 @@ def _copy(begin: int, end: int, image: Array, screen: Array) -> None:
 
 @kernel(fast=True, cache=True)
 def _stretch(
-    begin: int, end: int, image: Array, lefts: Array, shares: Array, screen: Array, mixed: Array
+    begin: int, end: int, image: Array, lefts: Array, shares: Array, screen: Array, mixed: Array, line: Array
 ) -> None:
-    """Rows begin … end − 1 of the stretched picture.
+    """Rows begin … end − 1 of the stretched picture; plain runs over numbers, which LLVM makes vectors of.
 
     Args:
         lefts, shares: of each column: which of the picture's is to the left of it, and what it has of the
             next one. [W] int32, float32
-        mixed: scratch. [w+1,3] float32
+        mixed: scratch. [3w+3] float32
+        line: scratch, ones for the opaque channel. [4W] float32
     """
-    rows, columns, height, width = image.shape[0], image.shape[1], screen.shape[0], screen.shape[1]
+    rows, height, count = image.shape[0], screen.shape[0], np.uint64(3 * image.shape[1])
     for row in range(begin, end):
         at = min(max((row + 0.5) * rows / height - 0.5, 0.0), rows - 1.0)
-        upper, lower = image[int(at)], image[min(int(at) + 1, rows - 1)]
+        upper, lower = image[int(at)].reshape(-1), image[min(int(at) + 1, rows - 1)].reshape(-1)
         share = np.float32(at - int(at))
-        for column in range(columns):
-            for k in range(3):
-                mixed[column, k] = upper[column, k] + share * (lower[column, k] - upper[column, k])
-        for k in range(3):
-            mixed[columns, k] = mixed[columns - 1, k]
-        out = screen[height - 1 - row]
-        for column in range(width):
-            left, share = np.uint64(lefts[column]), shares[column]
-            for k in range(3):
-                out[column, k] = _byte(mixed[left, k] + share * (mixed[left + 1, k] - mixed[left, k]))
-            out[column, 3] = 255
+        for k in range(count):
+            mixed[k] = upper[k] + share * (lower[k] - upper[k])
+        for k in range(np.uint64(3)):
+            mixed[count + k] = mixed[count - np.uint64(3) + k]
+        for column in range(np.uint64(screen.shape[1])):
+            first, to, share = np.uint64(3) * np.uint64(lefts[column]), np.uint64(4) * column, shares[column]
+            for k in range(first, first + np.uint64(3)):
+                line[to + k - first] = mixed[k] + share * (mixed[k + np.uint64(3)] - mixed[k])
+        out = screen[height - 1 - row].reshape(-1)
+        for k in range(np.uint64(out.size)):
+            out[k] = _byte(line[k])
 
 
 @contextmanager

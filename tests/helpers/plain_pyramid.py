@@ -34,6 +34,7 @@ class Node(NamedTuple):
     covariance: Tensor  # [3,3]
     spread: float
     opacity: float  # as a density, beyond 1 too
+    points: float  # Σ opacity
     colors: Tensor  # [K,3]
 
 
@@ -72,6 +73,7 @@ def merge_rows(gaussians: ActivatedGaussians, rows: Tensor) -> Node:
     spread = math.sqrt(float(between.trace()))
     return Node(
         rows, float(weights.sum()), mean, covariance, spread, opacity,
+        float(opacities[opacities >= ALPHA_MIN].sum()),
         torch.einsum("n,nkc->kc", share, colors),
     )  # fmt: skip
 
@@ -96,7 +98,12 @@ class PlainCut:
         for pick in coarse:
             mean, covariance, opacity, _ = self._parts(pick)
             x, y, z = self._project(mean)
-            if 0 <= x <= camera.width and 0 <= y <= camera.height:
+            if (
+                z > camera.near
+                and opacity >= ALPHA_MIN
+                and 0 <= x <= camera.width
+                and 0 <= y <= camera.height
+            ):
                 nearer = self._focal2 / z**2
                 sizes = torch.linalg.eigvalsh(covariance)[1:].clamp_min(0.0) * nearer + self._dilation
                 part = min(2 * math.pi * float(sizes.prod().sqrt()) / CELL**2, 1.0)
@@ -116,6 +123,14 @@ class PlainCut:
         points = mean @ rotation.T + translation
         more = (self._dilation - DILATION) * points[:, 2:] ** 2 / self._focal2
         merged = torch.tensor(picks) >= 0
+        if not self._gaussians.antialiased:
+            own = torch.tensor(
+                [(node.weight, node.points) for node in (self._nodes[max(pick, 0)] for pick in picks)]
+            ).double()
+            wide = self._dilation * points[:, 2] ** 2 / self._focal2
+            dilated = (values[:, 1:].clamp_min(0.0) + wide[:, None]).prod(1).sqrt()
+            dense = torch.maximum(opacity, (own[:, 0] + wide * own[:, 1]) / dilated)
+            opacity = torch.where(merged, dense, opacity)
         grow = torch.where(merged, 1.0 + SWELL * opacity.clamp_min(1.0).log(), 1.0)[:, None]
         opacity = torch.where(merged, opacity.clamp_max(ALPHA_MAX), opacity)
         sizes = (grow * scales**2 + more).clamp_min(0.0).sqrt()
@@ -164,16 +179,19 @@ class PlainCut:
         if node.weight <= 0.0 or z + 3.0 * largest < near:
             return []
         loss = math.inf
-        if z - 3.0 * largest > near and node.opacity >= ALPHA_MIN:
+        wide = 0.0 if self._gaussians.antialiased else self._dilation * z**2 / self._focal2
+        least = (node.weight + wide * node.points) / (largest**2 + wide)  # dense, each dilated
+        if z - 3.0 * largest > near and max(node.opacity, least) >= ALPHA_MIN:
             if not self._in_window(node.mean, largest):
                 return []
             loss = node.spread * math.sqrt(node.weight) * self._focal2 / z**2
             if self._depths is not None:
                 depth = float(self._depths[self._cell(x, y, z - largest)])
                 loss *= math.exp(-0.5 * min(depth, DARKEST))
-        if loss <= limit:
+        leaf = 2 * index + 1 >= len(self._nodes)
+        if loss <= limit or (leaf and self._depths is None):  # a leaf as it is tells the light
             return [index]
-        if 2 * index + 1 >= len(self._nodes):
+        if leaf:
             means, scales = self._gaussians.means.double(), self._gaussians.scales.double()
             return [
                 ~row

@@ -31,8 +31,9 @@ SH = ("sh0", "shN")
 BUDGETS = 20_000, 50_000, 500_000
 """How many Gaussians a picture in motion has at most: on a slow machine, at first, on a quick one."""
 
-MOVING_MS = 27.0, 36.0
-"""What such a picture shall take; with more or less time, the next one has fewer or more Gaussians."""
+MOVING_MS = 20.0, 27.0
+"""What such a picture shall take, some ms less than its frame; with more or less time, the next one has fewer
+or more Gaussians."""
 
 SLOW_MS = 40.0
 """What a picture may take before "auto" halves its sides: 25 pictures a second."""

@@ -204,11 +204,15 @@ class Picture(NamedTuple):
 
     image: Array  # [h,w,3] float32
     transmittance: Array  # [h,w] float32
-    last: Array  # index in the tile's list of each pixel's last contributor, -1 if none. [h,w] float32
+    # index in the tile's list of each pixel's last contributor, -1 if none; None where no gradient is wanted:
+    # without it a picture takes a third less time. [h,w] float32
+    last: Array | None
 
 
 @kernel(fast=True, inline=True)
-def _blend_row(state: Array, batch: Array, splat: Number, row: Number, index: Number) -> None:
+def _blend_row(
+    state: Array, batch: Array, splat: Number, row: Number, index: Number, last: Array | None
+) -> None:
     """Blend one row of a splat into a tile's state; `splat` is where its spans begin."""
     start, stop, p, u_peak, top = row_span(batch, splat, row)
     step, red, green, blue = step_and_color(batch, splat)
@@ -226,7 +230,8 @@ def _blend_row(state: Array, batch: Array, splat: Number, row: Number, index: Nu
         store(state, p + _R, load(state, p + _R) + weight * red)
         store(state, p + _G, load(state, p + _G) + weight * green)
         store(state, p + _B, load(state, p + _B) + weight * blue)
-        store(state, p + _LAST, select(weight > ZERO, index, load(state, p + _LAST)))
+        if last is not None:  # numba leaves out what its type rules out
+            store(state, p + _LAST, select(weight > ZERO, index, load(state, p + _LAST)))
         p += np.uint64(WIDTH)
         offset += EIGHT
         start += EIGHT
@@ -252,9 +257,10 @@ def _is_done(state: Array, row: int, bounds: Array) -> Number:
 
 @kernel(fast=True)
 def _blend_tile(
-    state: Array, x: int, y: int, members: Array, splats: Splats, bounds: Array, batch: Array
-) -> None:
-    """Blend a tile; state is [5·PLANE] float32, set up here, all else as in `find_spans`."""
+    state: Array, x: int, y: int, members: Array, splats: Splats, bounds: Array, batch: Array,
+    last: Array | None,
+) -> None:  # fmt: skip
+    """Blend a tile; state, set up here, is [5·PLANE] float32; last as in `Picture`, else as `find_spans`."""
     plane = np.int64(PLANE)
     state[:plane] = ONE
     state[plane : 4 * plane] = ZERO
@@ -265,7 +271,7 @@ def _blend_tile(
         for index in range(begin, end):
             splat = np.uint64(index - begin) * SPLAT
             for line in range(np.int32(batch[splat + FIRST]), np.int32(batch[splat + END])):
-                _blend_row(state, batch, splat, np.uint64(line), np.float32(index))
+                _blend_row(state, batch, splat, np.uint64(line), np.float32(index), last)
         if not _skip_done_rows(state, bounds):
             break
 
@@ -273,15 +279,15 @@ def _blend_tile(
 @kernel(cache=True)
 def blend(
     begin: int, end: int, scratch: TileScratch, splats: Splats, lists: TileLists, camera: Pinhole,
-    background: Array, out: Picture,
+    background: Array, out: Picture, last: Array | None,
 ) -> None:  # fmt: skip
-    """Blend tiles begin … end − 1 into the picture. background: [3] float32"""
+    """Blend tiles begin … end − 1 into the picture. background: [3] float32; last: the picture's"""
     state, batch, bounds = scratch
     for tile in range(begin, end):
         x, y = tile_corner(camera, tile)
         tile_bounds(camera, x, y, bounds)
         members = lists.members[lists.starts[tile] : lists.starts[tile + 1]]
-        _blend_tile(state, x, y, members, splats, bounds, batch)
+        _blend_tile(state, x, y, members, splats, bounds, batch, last)
         tile_bounds(camera, x, y, bounds)  # blending narrowed it
         left, width = np.uint64(x + bounds[0] - camera.window[0]), np.uint64(bounds[2] - bounds[0])
         for row in range(np.uint64(bounds[1]), np.uint64(bounds[3])):
@@ -289,8 +295,9 @@ def blend(
             p = row * np.uint64(TILE_W) + np.uint64(bounds[0])
             for k in range(width):
                 out.transmittance[i, left + k] = abs(state[p + k])
-            for k in range(width):
-                out.last[i, left + k] = state[p + _LAST + k]
+            if last is not None:
+                for k in range(width):
+                    last[i, left + k] = state[p + _LAST + k]
             for k in range(width):
                 through = abs(state[p + k])
                 out.image[i, left + k, 0] = state[p + _R + k] + through * background[0]
@@ -423,7 +430,7 @@ def blend_backward(
                 state[p + _G2 + k] = by_image[i, left + k, 2]
             for k in range(width):
                 state[p + k] = out.transmittance[i, left + k]
-                state[p + _DEEPEST + k] = out.last[i, left + k]
+                state[p + _DEEPEST + k] = out.last[i, left + k]  # type: ignore[index]
             for k in range(width):
                 behind = state[p + _G0 + k] * background[0] + state[p + _G1 + k] * background[1]
                 behind += state[p + _G2 + k] * background[2] + by_transmittance[i, left + k]

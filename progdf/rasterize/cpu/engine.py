@@ -57,6 +57,7 @@ _T = TypeVar("_T")
 
 _LEAST_TILES = 4  # fewer are not worth a call
 _CHUNKS = 4  # for each thread: tiles take unequally long
+_MOST_TILES, _MOST_GAUSSIANS = 24, 32 * BLOCK  # of a chunk: a picture that is dropped stops between two
 TILE_ROOM = 8  # tiles of a Gaussian that there is room for; where chunks have more, these are listed twice
 _ALL = np.empty(0, np.bool_)
 
@@ -113,18 +114,19 @@ def bin_view(gaussians: ActivatedGaussians, camera: Pinhole) -> tuple[Splats, Ti
 def share_tiles(kernel: Any, camera: Pinhole, *arguments: Any) -> None:
     """Run `kernel(begin, end, scratch, *arguments)` so that every tile is one kernel's."""
     tiles = camera.grid[2] * camera.grid[3]
-    _share(lambda begin, end: kernel(begin, end, new_scratch(), *arguments), tiles, _LEAST_TILES)
+    _share(lambda begin, end: kernel(begin, end, new_scratch(), *arguments), tiles, _LEAST_TILES, _MOST_TILES)
 
 
 def share_gaussians(kernel: Callable[[int, int], _T], count: int) -> list[_T]:
     """Run `kernel(begin, end)` so that each Gaussian is one kernel's; what they return, in order."""
-    return _share(kernel, count, BLOCK)
+    return _share(kernel, count, BLOCK, _MOST_GAUSSIANS)
 
 
-def _share(kernel: Callable[[int, int], _T], count: int, block: int) -> list[_T]:
-    """Run `kernel(begin, end)` over `count` things in ranges of whole blocks."""
+def _share(kernel: Callable[[int, int], _T], count: int, block: int, most: int) -> list[_T]:
+    """Run `kernel(begin, end)` over `count` things in ranges of whole blocks, `most` in each at most."""
     blocks = max(1, -(-count // block))
-    chunks = 1 if threads() == 1 else min(blocks, _CHUNKS * threads())
+    least = _CHUNKS * threads() if threads() > 1 else 1
+    chunks = min(blocks, max(least, count // most))
     cuts = [min(count, blocks * chunk // chunks * block) for chunk in range(chunks + 1)]
     return run_chunks(lambda chunk: kernel(cuts[chunk], cuts[chunk + 1]), chunks)
 
@@ -175,9 +177,10 @@ class _Rasterize(torch.autograd.Function):
         if camera.degree < 0:
             arrays[4] = arrays[4].reshape(-1, 1, 3)
         scene = Scene(*arrays)
-        out = _new_picture(camera)
-        splats, lists = _project_and_bin(scene, camera, any(ctx.needs_input_grad))
-        share_tiles(blend, camera, splats, lists, camera, background, out)
+        with_gradient = any(ctx.needs_input_grad)
+        out = _new_picture(camera, with_gradient)
+        splats, lists = _project_and_bin(scene, camera, with_gradient)
+        share_tiles(blend, camera, splats, lists, camera, background, out, out.last)
         projected[:] = splats.means2d, splats.depths, splats.visible
         ctx.set_materialize_grads(False)
         ctx.forward_pass = camera, grad_rows, scene, background, splats, lists, out
@@ -214,11 +217,11 @@ class _Rasterize(torch.autograd.Function):
         return None, None, None, *results
 
 
-def _new_picture(camera: Pinhole) -> Picture:
+def _new_picture(camera: Pinhole, with_last: bool) -> Picture:
     x0, y0, x1, y1 = camera.window
-    height, width = y1 - y0, x1 - x0
-    planes = (np.empty((height, width), np.float32) for _ in range(2))
-    return Picture(np.empty((height, width, 3), np.float32), *planes)
+    size = y1 - y0, x1 - x0
+    last = np.empty(size, np.float32) if with_last else None
+    return Picture(np.empty((*size, 3), np.float32), np.empty(size, np.float32), last)
 
 
 def _array(gradient: Tensor | None, like: Array) -> Array:

@@ -258,6 +258,16 @@ def largest_extents(camera: Pinhole, scene: Scene, i: int) -> tuple[bool, float,
     total = abs(mean[0]) + abs(mean[1]) + abs(mean[2]) + abs(scale[0]) + abs(scale[1]) + abs(scale[2])
     if not (z > camera.near and opacity >= ALPHA_MIN and total + opacity < np.inf):
         return False, 0.0, 0.0, 0.0, 0.0, 0.0
+    largest = max(abs(scale[0]), max(abs(scale[1]), abs(scale[2])))
+    x, y, wide2, high2 = extents(camera, mean, z, largest, opacity)
+    return True, x, y, z, wide2, high2
+
+
+@kernel(contract=True, inline=True)
+def extents(
+    camera: Pinhole, mean: Vec, z: float, largest: float, opacity: float
+) -> tuple[float, float, float, float]:
+    """Center and squares of half the sides of a box around the support, in pixels; largest: of the scales."""
     inv_z = 1.0 / z
     tan_x = (dot(camera.rows[0], mean) + camera.shift[0]) * inv_z
     tan_y = (dot(camera.rows[1], mean) + camera.shift[1]) * inv_z
@@ -266,11 +276,10 @@ def largest_extents(camera: Pinhole, scene: Scene, i: int) -> tuple[bool, float,
     tan_y = min(max(tan_y, camera.limits_y[0]), camera.limits_y[1])
     # ln x ≤ x − 1; 1.001: the viewmat's rotation is one only within rounding
     radius2 = 1.001 * (_CUT_RADIUS2 + 2.0 * max(opacity - 1.0, 0.0))
-    largest = max(abs(scale[0]), max(abs(scale[1]), abs(scale[2]))) * inv_z
-    jx, jy = camera.fx * largest, camera.fy * largest
+    jx, jy = camera.fx * largest * inv_z, camera.fy * largest * inv_z
     wide2 = radius2 * (jx * jx * (1.0 + tan_x * tan_x) + DILATION)
     high2 = radius2 * (jy * jy * (1.0 + tan_y * tan_y) + DILATION)
-    return True, px, py, z, wide2, high2
+    return px, py, wide2, high2
 
 
 @kernel(contract=True, inline=True)

@@ -8,7 +8,9 @@ as it shows.
   the visible area, as errors add up in squares; and it shows as far as light reaches it, which a coarser cut
   of the same view tells, added up in a grid of cells and slices of depth.
 - The limit is sought so that about as many are drawn as asked for, beginning at the last picture's.
-- The dilation, wider in a coarse picture, is taken off the size, and the remainder off the opacity.
+- Each Gaussian has a dilation of its own in the fine picture: a node of many small ones is as dense as these
+  are together. That of the coarse picture, which is wider, is taken off the size, and the remainder off the
+  opacity.
 
 The plain version is in tests/helpers/plain_pyramid.py.
 """
@@ -40,6 +42,7 @@ from .forward import (
     camera_center,
     cross,
     dot,
+    extents,
     footprint,
     largest_extents,
     rotation_rows,
@@ -77,10 +80,16 @@ FINEST = 1e-3
 ENOUGH = 0.85
 """Of what was asked for: with so many the limit is not sought any further."""
 
+LONGEST, DENSITY, WEIGHT, POINTS, SPREAD = range(3, 8)
+"""Columns of a node beside its mean: the largest scale; density, negative where something below cannot be
+drawn; Σ opacity · area of what is below, world units², 0 for nothing; Σ opacity; root of the summed variances
+of the centers below, world units."""
+
 _ONE = int(np.float32(1.0).view(np.int32))
 _SLICE_SHIFT = 19  # of a float's bits: sixteen slices for a factor of two
 _TOP = 5  # levels of which each node is a chunk of its own
 _AHEAD = 8  # rows that are fetched before it is their turn: they lie far apart
+_DARK = math.exp(0.5 * DARKEST)  # times the limit, beyond which no darkness brings a loss below it
 _MOST = 1e30  # of a weight
 _LEAST = 1e-30
 _TRIALS = 12  # for a limit
@@ -91,9 +100,9 @@ class Nodes(NamedTuple):
     """The tree, level after level: node i has the halves 2i + 1 and 2i + 2, and leaf l of L = 2^levels the
     rows order[l·N // L : (l + 1)·N // L]."""
 
-    gaussians: Scene  # what stands for each node; opacities as densities, beyond 1 too. [2L-1, …]
-    weights: Array  # Σ opacity · area of what is below, world units². [2L-1] float32
-    spreads: Array  # root of the summed variances of the centers below, world units. [2L-1] float32
+    # what stands for each node: opacities as densities, beyond 1 too; means with the columns above, so that a
+    # cut touches one line of the cache for two nodes. [2L-1, …]
+    gaussians: Scene
     order: Array  # rows of the scene. [N] int32
     levels: int
 
@@ -112,13 +121,9 @@ class Pyramid:
         levels = max((count // LEAF).bit_length() - 1, 0)
         order = _sort(self.scene.means, levels)
         total = (2 << levels) - 1
-        self.nodes = Nodes(
-            Scene(*(np.zeros((total, *array.shape[1:]), np.float32) for array in self.scene)),
-            np.zeros(total, np.float32),
-            np.zeros(total, np.float32),
-            order,
-            levels,
-        )
+        means, *others = (np.zeros((total, *array.shape[1:]), np.float32) for array in self.scene)
+        means = np.zeros((total, SPREAD + 1), np.float32)
+        self.nodes = Nodes(Scene(means, *others), order, levels)
         self.limit = 1.0  # of what a node may lose, pixels²: where the last search ended
         self._places: Array | None = None  # of each row in the order, once one is asked for. [N] int32
         for level in range(levels, -1, -1):
@@ -167,10 +172,10 @@ class Pyramid:
         low, high = 0.0, math.inf
         for _ in range(_TRIALS):
             depths = np.zeros(shape, np.float32)
-            coarse = self._cut(view, self.limit * COARSER, np.zeros(1, np.float32))
+            coarse = self._cut(view, self.limit * COARSER, dilation, np.zeros(1, np.float32))
             _add_depths(coarse, self.scene, self.nodes.gaussians, view, dilation, depths.reshape(-1))
             _sum_depths(depths)
-            picks = self._cut(view, self.limit, depths.reshape(-1))
+            picks = self._cut(view, self.limit, dilation, depths.reshape(-1))
             if len(picks) > budget:
                 low = self.limit
             elif len(picks) >= ENOUGH * budget or self.limit <= FINEST:
@@ -184,7 +189,7 @@ class Pyramid:
             self.limit = max(guess, FINEST)
         return picks
 
-    def _cut(self, view: Pinhole, limit: float, depths: Array) -> Array:
+    def _cut(self, view: Pinhole, limit: float, dilation: float, depths: Array) -> Array:
         top = min(_TOP, self.nodes.levels)
         room = -(-len(self.nodes.order) >> top) + 1
 
@@ -192,7 +197,7 @@ class Pyramid:
             picks = np.empty(room, np.int32)
             root = (1 << top) - 1 + chunk
             stack = np.empty(64, np.int32)
-            return picks[: _walk(root, self.scene, self.nodes, view, limit, depths, stack, picks)]
+            return picks[: _walk(root, self.scene, self.nodes, view, limit, dilation, depths, stack, picks)]
 
         return np.concatenate(run_chunks(walk, 1 << top))
 
@@ -292,18 +297,19 @@ def _merge(
         first, last = 2 * me + 1, 2 * me + 3
         if leaf:
             first, last = (indices[at] * count) >> level, ((indices[at] + 1) * count) >> level
-        total = x = y = z = 0.0
+        total = points = x = y = z = 0.0
+        sound = True
         colors[:] = 0.0
         for k in range(first, last):
             i = nodes.order[k] if leaf else k
-            weight = _weight(scene, i) if leaf else np.float64(nodes.weights[i])
+            weight = _weight(scene, i) if leaf else np.float64(out.means[i, WEIGHT])
+            sound = sound and (weight > 0.0 if leaf else out.means[i, DENSITY] > 0.0)
             if weight > 0.0:
                 total += weight
-                x, y, z = (
-                    x + weight * below.means[i, 0],
-                    y + weight * below.means[i, 1],
-                    z + weight * below.means[i, 2],
-                )
+                points += np.float64(scene.opacities[i] if leaf else out.means[i, POINTS])
+                x += weight * below.means[i, 0]
+                y += weight * below.means[i, 1]
+                z += weight * below.means[i, 2]
                 for band in range(colors.shape[0]):
                     for channel in range(3):
                         colors[band, channel] += weight * below.colors[i, band, channel]
@@ -317,10 +323,10 @@ def _merge(
         matrix[:] = 0.0
         for k in range(first, last):
             i = nodes.order[k] if leaf else k
-            weight = (_weight(scene, i) if leaf else np.float64(nodes.weights[i])) * share
+            weight = (_weight(scene, i) if leaf else np.float64(out.means[i, WEIGHT])) * share
             if weight > 0.0:
                 own += weight * _add_moments(below, i, weight, (x, y, z), matrix)
-                own -= 0.0 if leaf else weight * nodes.spreads[i] * nodes.spreads[i]
+                own -= 0.0 if leaf else weight * out.means[i, SPREAD] * out.means[i, SPREAD]
         spread = math.sqrt(max(matrix[0, 0] + matrix[1, 1] + matrix[2, 2] - own, 0.0))
         _diagonalize(matrix, quat)
         out.means[me, 0], out.means[me, 1], out.means[me, 2] = x, y, z
@@ -330,7 +336,9 @@ def _merge(
             out.scales[me, k] = math.sqrt(max(matrix[k, k], 0.0))
         longest, middle = _two_largest(out, me)
         out.opacities[me] = total / max(longest * middle, _LEAST)
-        nodes.weights[me], nodes.spreads[me] = total, spread
+        mine = out.means[me]
+        mine[LONGEST], mine[WEIGHT], mine[POINTS], mine[SPREAD] = longest, total, points, spread
+        mine[DENSITY] = out.opacities[me] if sound else -out.opacities[me]
 
 
 @kernel(contract=True, inline=True)
@@ -404,60 +412,74 @@ def _is_outside(camera: Pinhole, x: float, y: float, wide2: float, high2: float)
     return bool(out_x * out_x > wide2 or out_y * out_y > high2)
 
 
+@kernel(contract=True, inline=True)
+def _is_inside(camera: Pinhole, x: float, y: float, wide2: float, high2: float) -> bool:
+    """Whether the window shows all of such a box."""
+    in_x, in_y = min(x, camera.window[2] - x), min(y, camera.window[3] - y)
+    return bool(in_x > 0.0 and in_x * in_x >= wide2 and in_y > 0.0 and in_y * in_y >= high2)
+
+
 @kernel(contract=True, cache=True)
 def _walk(
-    root: int,
-    scene: Scene,
-    nodes: Nodes,
-    camera: Pinhole,
-    limit: float,
-    depths: Array,
-    stack: Array,
-    picks: Array,
-) -> int:
+    root: int, scene: Scene, nodes: Nodes, camera: Pinhole, limit: float, dilation: float, depths: Array,
+    stack: Array, picks: Array,
+) -> int:  # fmt: skip
     """Cut the tree below a node.
 
     Args:
         limit: of what a node may lose, pixels²
-        depths: optical depth before each slice, or [1]: all in the light
+        depths: optical depth before each slice; [1]: all in the light, and leaves are not looked into
         stack: scratch, more than the levels
         picks: out, as in `Pyramid.cut`
 
     Returns:
         how many are picked
     """
-    merged, focal, first_leaf = nodes.gaussians, math.sqrt(camera.fx * camera.fy), (1 << nodes.levels) - 1
+    means, focal, first_leaf = (
+        nodes.gaussians.means,
+        math.sqrt(camera.fx * camera.fy),
+        (1 << nodes.levels) - 1,
+    )
     count: int = 0
     top = 1
     stack[0] = root
     while top > 0:
         top -= 1
         i = stack[top]
-        longest = max(merged.scales[i, 0], max(merged.scales[i, 1], merged.scales[i, 2]))
-        nearest = dot(camera.rows[2], vec(merged.means, i)) + camera.shift[2] - camera.near
-        if nodes.weights[i] <= 0.0 or nearest + _REACH * longest < 0.0:
+        longest, density = np.float64(means[i, LONGEST]), abs(np.float64(means[i, DENSITY]))
+        z = dot(camera.rows[2], vec(means, i)) + camera.shift[2]
+        reach = _REACH * longest
+        if means[i, WEIGHT] <= 0.0 or z - camera.near + reach < 0.0:
             continue
-        loss = np.inf
-        usable, x, y, z, wide2, high2 = largest_extents(camera, merged, i)
-        if usable and nearest > _REACH * longest:
+        loss, inside = np.inf, False
+        wide = 0.0 if camera.antialiased else dilation * z * z / (focal * focal)
+        least = (means[i, WEIGHT] + wide * means[i, POINTS]) / max(longest * longest + wide, _LEAST)
+        if z - camera.near > reach and max(density, least) >= ALPHA_MIN:
+            x, y, wide2, high2 = extents(camera, vec(means, i), z, longest, density)
             if _is_outside(camera, x, y, wide2, high2):
                 continue
+            inside = _is_inside(camera, x, y, wide2, high2) and means[i, DENSITY] > 0.0
             scaled = focal / z
-            loss = nodes.spreads[i] * math.sqrt(nodes.weights[i]) * scaled * scaled
-            if depths.size > 1:
+            loss = np.float64(means[i, SPREAD]) * math.sqrt(means[i, WEIGHT]) * scaled * scaled
+            if depths.size > 1 and limit < loss < limit * _DARK:
                 loss *= math.exp(-0.5 * min(depths[_cell(x, y, z - longest, camera)], DARKEST))
-        if loss <= limit:
+        if loss <= limit or (i >= first_leaf and depths.size == 1):
             picks[count] = i
             count += 1
         elif i >= first_leaf:
             leaf, rows = i - first_leaf, nodes.order.shape[0]
             for k in range((leaf * rows) >> nodes.levels, ((leaf + 1) * rows) >> nodes.levels):
-                usable, x, y, z, wide2, high2 = largest_extents(camera, scene, nodes.order[k])
+                picks[count] = ~nodes.order[k]
+                if inside:
+                    count += 1
+                    continue
+                usable, x, y, _, wide2, high2 = largest_extents(camera, scene, nodes.order[k])
                 if usable and not _is_outside(camera, x, y, wide2, high2):
-                    picks[count] = ~nodes.order[k]
                     count += 1
         else:
             stack[top], stack[top + 1] = 2 * i + 1, 2 * i + 2
+            prefetch(means, 4 * i + 3)
+            prefetch(means, 4 * i + 5)
             top += 2
     return count
 
@@ -469,8 +491,8 @@ def _add_depths(
     """Add the optical depth of each pick to its cell of the flat grid, in which it fills no more than all."""
     for k in range(picks.size):
         source, i = (merged, picks[k]) if picks[k] >= 0 else (scene, ~picks[k])
-        _, x, y, z, _, _ = largest_extents(camera, source, i)
-        if 0.0 <= x <= camera.window[2] and 0.0 <= y <= camera.window[3]:
+        usable, x, y, z, _, _ = largest_extents(camera, source, i)
+        if usable and 0.0 <= x <= camera.window[2] and 0.0 <= y <= camera.window[3]:
             longest, middle = _two_largest(source, i)
             nearer = camera.fx * camera.fy / (z * z)
             area = math.sqrt((longest * longest * nearer + dilation) * (middle * middle * nearer + dilation))
@@ -498,17 +520,23 @@ def _take(
     for at in range(begin, end):
         source, i = (merged, picks[at]) if picks[at] >= 0 else (scene, ~picks[at])
         following = picks[min(at + _AHEAD, end - 1)]
-        if following < 0:
-            prefetch(scene.means, ~following)
-            prefetch(scene.quats, ~following)
-            prefetch(scene.scales, ~following)
-            prefetch(scene.colors, ~following)
+        ahead, row = (merged, following) if following >= 0 else (scene, ~following)
+        prefetch(ahead.means, row)
+        prefetch(ahead.quats, row)
+        prefetch(ahead.scales, row)
+        prefetch(ahead.colors, row)
         seen = footprint(camera, source, i)
         density = np.float64(source.opacities[i])  # of a node; more than 1 where several cover each other
+        unit = 1.0 / (camera.fx * camera.fy * seen.inv_z * seen.inv_z)  # world units² of a pixel
+        if picks[at] >= 0 and not camera.antialiased:
+            longest, middle = _two_largest(source, i)
+            wide, own = dilation * unit, source.means[i]
+            dilated = math.sqrt((longest * longest + wide) * (middle * middle + wide))
+            density = max(density, (own[WEIGHT] + wide * own[POINTS]) / max(dilated, _LEAST))
         grow = 1.0 + SWELL * math.log(density) if picks[at] >= 0 and density > 1.0 else 1.0
         opacity = min(density, ALPHA_MAX) if picks[at] >= 0 else density
         # the coarse picture's dilation instead of the fine one's: off the size, as far as that goes
-        more = (dilation - DILATION) / (camera.fx * camera.fy * seen.inv_z * seen.inv_z)
+        more = (dilation - DILATION) * unit
         a, b, c = vec(source.scales, i)
         size = (
             math.sqrt(max(grow * a * a + more, 0.0)), math.sqrt(max(grow * b * b + more, 0.0)),
@@ -528,8 +556,5 @@ def _take(
         for k in range(4):
             out.quats[at, k] = source.quats[i, k]
         red, green, blue = shade_splat(source, i, camera.degree, eye, basis)
-        out.colors[at, 0], out.colors[at, 1], out.colors[at, 2] = (
-            max(red, 0.0),
-            max(green, 0.0),
-            max(blue, 0.0),
-        )
+        color = out.colors[at]
+        color[0], color[1], color[2] = max(red, 0.0), max(green, 0.0), max(blue, 0.0)

@@ -116,6 +116,13 @@ def test_inputs_changed_in_place_before_the_backward_pass_are_noticed() -> None:
         image.sum().backward()  # type: ignore[no-untyped-call]
 
 
+def test_a_picture_for_gradients_has_the_same_bits_as_one_without() -> None:
+    scene, camera = activate(random_gaussians(300, seed=4)), orbit_camera()
+    learned = scene._replace(means=scene.means.clone().requires_grad_())
+    for plain, other in zip(render(scene, camera)[:2], render(learned, camera)[:2], strict=True):
+        assert torch.equal(plain, other.detach())
+
+
 @pytest.mark.parametrize("count", [0, 1, 1000, 200_000])
 @pytest.mark.parametrize("values", ["equal", "many", "of all sizes"])
 def test_depth_order_is_numpys_stable_sort(count: int, values: str) -> None:
