@@ -174,7 +174,7 @@ def test_the_keys_do_all_that_the_cards_do(hand: Rig) -> None:
     assert hand.strengths == [1.0, 0.5]
 
 
-def test_tab_brings_the_arrows_to_the_gains_that_the_edit_has(hand: Rig) -> None:
+def test_a_key_brings_the_arrows_to_the_gains_that_the_edit_has(hand: Rig) -> None:
     hand.key("2")
     hand.key("Alt+Right")
     assert hand.main_view.work.active_slider == "color", "a change of color has no other gain"
@@ -185,8 +185,8 @@ def test_tab_brings_the_arrows_to_the_gains_that_the_edit_has(hand: Rig) -> None
     hand.key("Alt+Right")
     assert hand.main_view.work.active_slider == "strength"
     hand.key("1")
-    hand.key("Shift+Tab")
-    hand.key("Shift+Tab")
+    hand.key("Alt+Left")
+    hand.key("Alt+Left")
     assert hand.main_view.work.active_slider == "geometry"
 
 
@@ -413,12 +413,12 @@ def test_a_sweep_of_a_layer_that_is_hidden_by_another_is_refused(
 
 
 def menu(hand: Rig, layer: int, item: int) -> None:
-    """A right click on a layer's card, then one of Rename, Duplicate, Replace and Delete."""
+    """A right click on a layer's card, then one of Rename, Duplicate, Replace, Again and Delete."""
     hand.pause(0.5)
     hand.move(LEFT + 150, HEAD + row(layer))
     hand.press(1)
     hand.release(1)
-    click(hand, LEFT + 180, HEAD + row(layer) + 18.0 + 21.0 * item + (7.0 if item == 3 else 0.0))
+    click(hand, LEFT + 180, HEAD + row(layer) + 18.0 + 21.0 * item + (7.0 if item == 4 else 0.0))
 
 
 def test_the_top_of_the_list_lies_on_top(hand: Rig) -> None:
@@ -437,7 +437,7 @@ def test_the_top_of_the_list_lies_on_top(hand: Rig) -> None:
 
 def test_a_layer_is_deleted_from_its_menu_and_undo_brings_it_back(hand: Rig) -> None:
     before, picture = hand.main_view.work.view, hand.picture()
-    menu(hand, 1, 3)
+    menu(hand, 1, 4)
     assert names(hand) == ["scarf"]
     assert hand.main_view.work.focus == 0
     assert not np.array_equal(hand.picture(), picture)
