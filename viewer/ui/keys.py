@@ -194,14 +194,22 @@ TOPICS: dict[str, tuple[Command, ...]] = {
     ),
     "Timeline": (
         Command("play", "Play or pause", "Space"),
-        Command("key", "Insert keyframe", "K", "Camera and all strengths"),
+        Command(
+            "key", "Insert keyframe", "K", "Camera and all strengths", row="Keyframe; Ctrl+Shift auto-key"
+        ),
+        Command(
+            "auto_key", "Auto-key", "Ctrl+Shift+K", "A slider that is dragged gets a keyframe", row=JOINED
+        ),
         Command("drop_key", "Delete keyframe", "Delete"),
         *_row(", .", "Previous, next frame", _steps("step", "frame", repeats=True)),
         *_row("Shift+, .", "Previous, next keyframe", _steps("jump", "keyframe", "Shift+")),
         Command("easing", "Smooth, linear, hold", "Shift+K", "From the keyframe at or before the playhead"),
         Command("ping_pong", "Ping-pong", "Alt+K"),
         Command("timeline_file", "Save timeline as file", "Ctrl+K"),
-        Command("timeline", "Timeline", "T", "Animate the camera and the strengths"),
+        Command(
+            "timeline", "Timeline", "T", "Animate the camera and the strengths", row="Timeline; Alt its rows"
+        ),
+        Command("timeline_rows", "Timeline rows", "Alt+T", "The camera and each layer", row=JOINED),
         Command("safe_frame", "Safe frame", "Shift+T", "What a film of 16:9, 1:1 or 9:16 shows"),
     ),
     "Window and files": (
