@@ -41,9 +41,10 @@ def drafted(editor: str, folder: Path) -> Gdf:
 
 
 GRADE = "grade:exposure=-0.8,saturation=0.4"
+PALETTE = "grade:#b97a30=#3060d0,#e0c898,curve=0.3:0.25+0.7:0.8"
 
 
-@pytest.mark.parametrize("spec", ["recolor:#3060d0", "tint:#3060d0", "darken:0.6", "night", GRADE])
+@pytest.mark.parametrize("spec", ["recolor:#3060d0", "tint:#3060d0", "darken:0.6", "night", GRADE, PALETTE])
 def test_a_draft_shows_an_edit_at_every_strength_as_its_editor_does(spec: str, tmp_path: Path) -> None:
     case, gdf = small("body"), drafted(spec, tmp_path)
     editor = make_editor(EditorOptions(spec), case.scene, case.region, case.views)
@@ -70,6 +71,14 @@ def test_what_a_map_of_color_leaves_too_much_of_has_no_draft(monkeypatch: pytest
     monkeypatch.setattr(draft, "CARRIED", 1e-5)
     monkeypatch.setattr(draft, "ROUNDING", 0.0)
     assert draft_grade(views(), EditorOptions("recolor:#3060d0"), "blue") is None
+
+
+def test_a_grade_by_hand_is_live_however_little_a_map_carries_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(draft, "CARRIED", 1e-5)
+    monkeypatch.setattr(draft, "ROUNDING", 0.0)
+    made = draft_grade(views(), EditorOptions(GRADE), "grade")
+    assert made is not None
+    assert made.report["draft"]["psnr"] > 25.0
 
 
 def test_a_region_that_no_view_shows_has_no_draft() -> None:
