@@ -183,6 +183,7 @@ TOPICS: dict[str, tuple[Command, ...]] = {
         Command("select_shrink", "Shrink", "Ctrl+[", "Less its border", repeats=True, row="Shrink, grow"),
         Command("select_grow", "Grow", "Ctrl+]", "Add the neighbors", repeats=True, row=JOINED),
         Command("select_smooth", "Smooth", "", "Straighten the border, drop strays, fill holes"),
+        Command("select_refine", "Refine", "", "Put a rough rim where color and gaps have it"),
         Command("select_largest", "Largest part", "", "Keep only the largest connected part"),
         Command("hide_selected", "Hide selection", "Ctrl+H", row="Hide; Shift isolates"),
         Command("isolate", "Isolate selection", "Ctrl+Shift+H", "Hide everything else", row=JOINED),
@@ -194,12 +195,8 @@ TOPICS: dict[str, tuple[Command, ...]] = {
     ),
     "Timeline": (
         Command("play", "Play or pause", "Space"),
-        Command(
-            "key", "Insert keyframe", "K", "Camera and all strengths", row="Keyframe; Ctrl+Shift auto-key"
-        ),
-        Command(
-            "auto_key", "Auto-key", "Ctrl+Shift+K", "A slider that is dragged gets a keyframe", row=JOINED
-        ),
+        Command("key", "Insert keyframe", "K", "Camera and all strengths", row="Key; Ctrl+Shift auto-key"),
+        Command("auto_key", "Auto-key", "Ctrl+Shift+K", "A dragged slider gets a keyframe", row=JOINED),
         Command("drop_key", "Delete keyframe", "Delete"),
         *_row(", .", "Previous, next frame", _steps("step", "frame", repeats=True)),
         *_row("Shift+, .", "Previous, next keyframe", _steps("jump", "keyframe", "Shift+")),

@@ -30,6 +30,13 @@ def test_a_palette_has_the_large_colors_first_and_a_small_one_that_is_unlike_the
     assert len(find_palette(LAWN.expand(50, 3), torch.ones(50))) == 1
 
 
+def test_a_scarf_is_a_main_color_beside_two_like_greens_of_a_lawn() -> None:
+    pale, dark = color.parse_color("#a4c860"), color.parse_color("#201810")
+    rgb = scene({30_000: LAWN, 29_000: pale, 9000: BEAR, 8000: STONE, 7000: dark, 200: SCARF})
+    found = find_palette(rgb, torch.ones(len(rgb)))
+    assert (found - SCARF).abs().amax(dim=1).min() < 0.1
+
+
 def test_what_is_not_seen_is_in_no_palette() -> None:
     rgb, weights = torch.stack([LAWN, SCARF]), torch.tensor([1.0, 0.0])
     assert torch.allclose(find_palette(rgb, weights), LAWN[None], atol=1e-5)
@@ -44,6 +51,14 @@ def test_sources_become_their_targets_and_colors_that_are_held_stay() -> None:
     assert (color.grade_fully(lawn, asked).mean(dim=0) - blue).abs().max() < 0.06
     ends = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
     assert torch.allclose(color.grade_fully(ends, asked), ends, atol=5e-3)
+
+
+def test_of_several_colors_each_goes_all_the_way_with_its_nearest_one() -> None:
+    blue = color.parse_color("#3060d0")
+    lab = srgb_to_oklab(torch.stack([LAWN, BEAR, STONE, blue, color.parse_color("#a8d860")]))
+    targets = torch.stack([lab[3], lab[1], lab[2]])
+    lime = shift_palette(lab[4:], lab[:3], targets)[0]
+    assert torch.allclose(lime - lab[4], lab[3] - lab[0], atol=0.02)
 
 
 def test_a_single_color_takes_those_near_it_along_and_leaves_far_ones() -> None:

@@ -19,6 +19,8 @@ from trainer.editors import make_editor
 from trainer.fit import draft
 from trainer.fit.draft import DraftViews, draft_grade, draft_views
 from trainer.options import EditorOptions, ViewOptions
+from trainer.setup import edit_views
+from trainer.store.run_folder import RunFolder
 from trainer.views.view import render_view
 
 
@@ -91,3 +93,10 @@ def test_a_scene_to_stand_inside_has_no_draft_without_cameras() -> None:
     scene = room(SMALLEST_ROOM).gaussians
     region = from_mask("all", torch.ones(len(scene), dtype=torch.bool))
     assert draft_views(ViewOptions(), "night", scene, region) is None
+
+
+def test_no_further_strengths_are_no_pictures(tmp_path: Path) -> None:
+    """Where the slider is even with one recording already."""
+    case = small("body")
+    editor = make_editor(EditorOptions(GRADE), case.scene, case.region, case.views)
+    assert edit_views(editor, case.views, (), RunFolder(tmp_path), True, lambda *_: None) == {}
