@@ -32,7 +32,7 @@ def test_a_palette_has_the_large_colors_first_and_a_small_one_that_is_unlike_the
 
 def test_a_scarf_is_a_main_color_beside_two_like_greens_of_a_lawn() -> None:
     pale, dark = color.parse_color("#a4c860"), color.parse_color("#201810")
-    rgb = scene({30_000: LAWN, 29_000: pale, 9000: BEAR, 8000: STONE, 7000: dark, 200: SCARF})
+    rgb = scene({30_000: LAWN, 29_000: pale, 9000: BEAR, 8000: STONE, 7000: dark, 1000: SCARF})
     found = find_palette(rgb, torch.ones(len(rgb)))
     assert (found - SCARF).abs().amax(dim=1).min() < 0.1
 
