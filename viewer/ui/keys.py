@@ -195,13 +195,13 @@ TOPICS: dict[str, tuple[Command, ...]] = {
     ),
     "Timeline": (
         Command("play", "Play or pause", "Space"),
-        Command("key", "Insert keyframe", "K", "Camera and all strengths", row="Key; Ctrl+Shift auto-key"),
-        Command("auto_key", "Auto-key", "Ctrl+Shift+K", "A dragged slider gets a keyframe", row=JOINED),
+        Command("key", "Insert keyframe", "K", "Camera and all strengths"),
         Command("drop_key", "Delete keyframe", "Delete"),
         *_row(", .", "Previous, next frame", _steps("step", "frame", repeats=True)),
         *_row("Shift+, .", "Previous, next keyframe", _steps("jump", "keyframe", "Shift+")),
         Command("easing", "Smooth, linear, hold", "Shift+K", "From the keyframe at or before the playhead"),
-        Command("ping_pong", "Ping-pong", "Alt+K"),
+        Command("ping_pong", "Ping-pong", "Alt+K", row="Ping-pong; Ctrl auto-key"),
+        Command("auto_key", "Auto-key", "Ctrl+Alt+K", "A dragged slider gets a keyframe", row=JOINED),
         Command("timeline_file", "Save timeline as file", "Ctrl+K"),
         Command(
             "timeline", "Timeline", "T", "Animate the camera and the strengths", row="Timeline; Alt its rows"

@@ -197,7 +197,7 @@ def test_a_rows_key_is_dragged_alone_with_ctrl_a_copy_of_it_and_deleted(hand: Ri
 
 def test_auto_key_keys_only_the_slider_that_is_dragged(hand: Rig) -> None:
     hand.drag(at(hand, 30), at(hand, 30))
-    hand.key("Ctrl+Shift+K")
+    hand.key("Ctrl+Alt+K")
     hand.drag(hand.slider(1, hand.strengths[1]), hand.slider(1, 0.75))
     keys = timeline.split_keys(hand.main_view.work.view.timeline)
     assert [key for key in keys if key[1] == 30] == [(1, 30)]
