@@ -50,7 +50,15 @@ INTERNAL = {
 
 
 def test_every_action_has_its_command_or_is_no_one_s_to_look_up() -> None:
-    everything = {*actions.ACTIONS, *workspace.REQUESTS, *selection.CHANGES, "frame", "home", "invert"}
+    everything = {
+        *actions.ACTIONS,
+        *actions.OF_EDITS,
+        *workspace.REQUESTS,
+        *selection.CHANGES,
+        "frame",
+        "home",
+        "invert",
+    }
     everything |= {"paint_clear", "paint_fill", "paint_invert", "paint_feather"}
     everything |= {"next_slider", "blend_snapshots"}
     named = {action.partition(":")[0] for action in COMMANDS}

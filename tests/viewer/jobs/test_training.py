@@ -226,6 +226,10 @@ def test_a_grade_says_its_palette_only_where_a_color_of_it_moves() -> None:
     moved = form("grade", palette=(("#7eae44", "#3060d0"), colors[1]), curve=((0.3, 0.2), (0.7, 0.8)))
     assert moved.spec == "grade:#7eae44=#3060d0,#b97a30,curve=0.30:0.20+0.70:0.80"
     CHECKS["grade"](moved.spec.partition(":")[2])
+    again = with_settings(NewEdit(), moved.spec)
+    assert again is not None
+    assert (again.spec, again.palette) == (moved.spec, moved.palette)
+    assert with_settings(NewEdit(), "grade:curve=none") is None
 
 
 def test_a_picked_color_stands_in_the_palette_in_place_of_one_like_it() -> None:
