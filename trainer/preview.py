@@ -5,7 +5,8 @@
     {"number": 3, "error": "", "made": "grade", "note": "", "models": []}
 
 Where one map of color carries the edit the answer is a grade of it, 3.gdf beside 3.png, for every strength
-and from every side; else the editor's own picture of the view. Requests that a later one has overtaken are
+and from every side; else the editor's own picture of the view. The editor "grade" alone asks for the region's
+main colors. Requests that a later one has overtaken are
 passed over. A sentence is asked of `model`, again with another `seed`; with `seed` -1
 nothing is painted and `note` says what would paint, and where, and `models` which ones are on this machine.
 It ends when its input does.
@@ -30,6 +31,7 @@ from torch import Tensor
 
 from progdf.camera import Camera
 from progdf.cli.options import parse_options
+from progdf.color.palette import find_palette
 from progdf.errors import ProgdfError
 from progdf.formats.scene_file import load_scene
 from progdf.gaussians import Gaussians
@@ -83,10 +85,11 @@ class Answer(msgspec.Struct):
 
     number: int
     error: str = ""
-    made: Literal["picture", "grade", "note"] = "picture"
+    made: Literal["picture", "grade", "note", "palette"] = "picture"
     note: str = ""
     models: list[str] = msgspec.field(default_factory=list)
     follows: bool = False  # whether the edit of a sentence can follow this picture
+    palette: list[str] = msgspec.field(default_factory=list)  # the region's main colors, #rrggbb
 
 
 class Previewer:
@@ -115,12 +118,28 @@ class Previewer:
         check_new_editor(options)
         if options.family not in COLOR_FUNCTIONS:
             return None
+        views = self._views(request, request.editor)
+        return None if views is None else draft_grade(views, options, options.family)
+
+    def palette(self, request: Request) -> list[str]:
+        """The main colors of the region as it is seen, #rrggbb; none where nothing of it is.
+
+        Raises:
+            ProgdfError: the region does not work.
+        """
+        views = self._views(request, "grade:exposure=0.5")
+        if views is None:
+            return []
+        row = views.fitted.row
+        colors = find_palette(row.inside.reshape(-1, 3), row.mask.reshape(-1))
+        return ["#" + "".join(f"{round(255 * x):02x}" for x in color) for color in colors.tolist()]
+
+    def _views(self, request: Request, editor: str) -> DraftViews | None:
         if self._draft[0] != request.region:
             region = self._region(request.region)
-            views = draft_views(ViewOptions(scene=self._path), request.editor, self._scene, region)
+            views = draft_views(ViewOptions(scene=self._path), editor, self._scene, region)
             self._draft = request.region, views
-        views = self._draft[1]
-        return None if views is None else draft_grade(views, options, options.family)
+        return self._draft[1]
 
     def picture(self, request: Request) -> Tensor:
         """The view as the editor makes it. [H,W,3] 0..1
@@ -216,9 +235,12 @@ def answer(previewer: Previewer, line: str) -> Answer:
     except msgspec.MsgspecError as error:
         return Answer(-1, f"the request cannot be read: {error}")
     try:
+        if request.editor == "grade":
+            return Answer(request.number, made="palette", palette=previewer.palette(request))
         if (draft := previewer.grade(request)) is not None:
             save_gdf(Path(request.out).with_suffix(".gdf"), draft)
-            return Answer(request.number, made="grade")
+            about = draft.report["draft"]
+            return Answer(request.number, made="grade", note=f"{about['psnr']:.0f} dB to the exact colors")
         if request.seed < 0:
             return Answer(request.number, "", "note", previewer.note(request), models_here())
         write_image(Path(request.out), previewer.picture(request))

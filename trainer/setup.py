@@ -267,7 +267,7 @@ def edit_views(
     edited: dict[float, list[Tensor]] = {strength: [] for strength in strengths}
     together = isinstance(editor, ColorEditor)  # the others have a network, or draw: these use all cores
     requests = [[(strength, i)] for strength in strengths for i in range(len(views))]
-    if together:
+    if together and strengths:
         requests = [[(strength, i) for strength in strengths] for i in range(len(views))]
     with ThreadPoolExecutor(threads()) as pool:
         made = pool.map(edit, requests) if together else map(edit, requests)

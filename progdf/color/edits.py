@@ -9,6 +9,7 @@ lightness are those of `progdf.color.oklab`; what lies between the original and 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -26,6 +27,7 @@ from .oklab import (
     oklab_to_srgb,
     srgb_to_oklab,
 )
+from .palette import bend_lightness, shift_palette
 
 Course = Callable[[Strength], Tensor]
 """Some colors [...,3] at a strength."""
@@ -139,19 +141,41 @@ goes from blue to amber, tint from green to magenta, saturation from gray to twi
 sRGB values that become 0 and 1."""
 
 
-def grade_course(rgb: Tensor, values: Mapping[str, float]) -> Course:
+@dataclass(frozen=True)
+class ColorGrade:
+    """What a person asks of colors."""
+
+    values: Mapping[str, float] = field(default_factory=dict)  # of some of `GRADE_RANGES`
+    palette: tuple[tuple[Tensor, Tensor], ...] = ()  # sources and targets, sRGB [3]; see `shift_palette`
+    curve: tuple[tuple[float, float], ...] = ()  # of lightness, see `bend_lightness`
+
+    @property
+    def is_neutral(self) -> bool:
+        """Whether it changes nothing."""
+        still = all(self.values.get(name, neutral) == neutral for name, (*_, neutral) in GRADE_RANGES.items())
+        stays = all(torch.equal(source, target) for source, target in self.palette)
+        return still and stays and all(x == y for x, y in self.curve)
+
+
+def grade_course(rgb: Tensor, grade: ColorGrade) -> Course:
     """`grade_fully` at many strengths, straight in OKLab."""
-    return color_course(rgb, grade_fully(rgb, values), STRAIGHT)
+    return color_course(rgb, grade_fully(rgb, grade), STRAIGHT)
 
 
-def grade_fully(rgb: Tensor, values: Mapping[str, float]) -> Tensor:
-    """Levels, exposure, white balance, contrast and saturation, in this order. [...,3] -> [...,3] 0..1
+def grade_fully(rgb: Tensor, grade: ColorGrade) -> Tensor:
+    """Palette, levels, exposure, white balance, contrast, curve and saturation, in this order.
 
     Args:
         rgb: sRGB colors, 0..1. [...,3]
-        values: of some of `GRADE_RANGES`
+        grade: what is asked
+
+    Returns:
+        [...,3] 0..1
     """
-    of = {name: values.get(name, neutral) for name, (_, _, neutral) in GRADE_RANGES.items()}
+    of = {name: grade.values.get(name, neutral) for name, (_, _, neutral) in GRADE_RANGES.items()}
+    if grade.palette:
+        sources, targets = (srgb_to_oklab(torch.stack(colors)) for colors in zip(*grade.palette, strict=True))
+        rgb = fit_gamut(shift_palette(srgb_to_oklab(rgb.clamp(0, 1)), sources, targets))
     levels = ((rgb.clamp(0, 1) - of["black"]) / (of["white"] - of["black"])).clamp(0, 1)
     lab = srgb_to_oklab(levels) * 2.0 ** (of["exposure"] / 3)  # homogeneous of degree 1/3 in linear light
     lightness = lab[..., 0].clamp(0, 1)
@@ -160,6 +184,8 @@ def grade_fully(rgb: Tensor, values: Mapping[str, float]) -> Tensor:
     low = _MIDDLE * (lightness / _MIDDLE).clamp_max(1).pow(power)
     high = (1 - _MIDDLE) * ((1 - lightness) / (1 - _MIDDLE)).clamp_max(1).pow(power)
     steeper = torch.where(lightness < _MIDDLE, low, 1 - high)
+    if grade.curve:
+        steeper = bend_lightness(steeper, grade.curve)
     fade = (steeper / lightness.clamp_min(1e-6)).clamp_max(1)  # less light on the same surface
     chroma = (lab[..., 1:] + cast) * (1 + of["saturation"]) * fade[..., None]
     return fit_gamut(torch.cat([steeper[..., None], chroma], dim=-1))

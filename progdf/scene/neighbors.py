@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -13,11 +15,14 @@ from torch import Tensor
 from progdf.gaussians import Gaussians
 from progdf.threads import threads
 
-from .selection import Floats, Mask, alike_in_color
+from .scribbles import Scribbles
+from .selection import Floats, Mask, alike_in_color, base_colors
 
 _RING, _AROUND, _LINKS = 8, 24, 8  # neighbors: of a step, of a vote, of a connection
 _REACH = 3.0  # times how far neighbors commonly are; what is farther is none, also where none is nearer
 _TOUCH = 1.0
+RIM_PERCENT = 35
+_MIDDLE, _DEEP = 0.6, 0.95  # what is held lies as deep as this share of the rim, or of what a thin part has
 _WORTH_THREADS = 2000  # Gaussians of which the neighbors are sought
 
 
@@ -29,6 +34,7 @@ class Neighborhood:
     """
 
     def __init__(self, scene: Gaussians) -> None:
+        self._scene = scene
         self._points = np.nan_to_num(scene.means.numpy().astype(np.float64))
         self._sizes = np.exp(scene.log_scales.numpy().max(axis=1))
         self._tree = cKDTree(self._points, balanced_tree=False, compact_nodes=False)
@@ -61,6 +67,30 @@ class Neighborhood:
         smoothed = mask.copy()
         smoothed[rows] = 2 * votes > voters
         return smoothed
+
+    @cached_property
+    def scribbles(self) -> Scribbles:
+        """What strokes spread over, made when it is first asked for."""
+        return Scribbles(self._points, base_colors(self._scene))
+
+    def refine(self, mask: Mask, percent: int = RIM_PERCENT) -> Mask:
+        """With its rim where color and gaps have it, for a lasso that was drawn roughly. [N]
+
+        What lies well inside and well outside stays, and a random walk from there decides on what lies
+        between (see `Scribbles`). A part that is thin for the rim is held along its middle.
+
+        Args:
+            percent: width of the rim outside, of the selection's radius; inside it is `_MIDDLE` of that
+        """
+        inside, outside = np.flatnonzero(mask), np.flatnonzero(~mask)
+        if not (len(inside) and len(outside)):
+            return mask
+        radius = float(np.sqrt(self._points[inside].var(axis=0).sum()))
+        width = max(percent / 100.0 * radius, 1e-30)
+        depths = np.minimum(_distances(self._points, outside, inside, width), width)
+        held = inside[depths >= _MIDDLE * float(np.quantile(depths, _DEEP))]
+        far = outside[np.isinf(_distances(self._points, inside, outside, width))]
+        return self.scribbles.select(held, far)
 
     def largest_part(self, mask: Mask) -> Mask:
         """Only the connected part that has most members; nothing of nothing. [N]"""
@@ -114,6 +144,17 @@ class Neighborhood:
         sizes = self._sizes[rows]
         touch = distances <= _TOUCH * (sizes[some][:, None] + sizes[near])
         return np.broadcast_to(some[:, None], near.shape)[touch], near[touch]
+
+
+def _distances(
+    points: NDArray[np.float64], to: NDArray[np.int64], rows: NDArray[np.int64], most: float
+) -> NDArray[np.float64]:
+    """From each of some rows to the nearest of others, infinite beyond `most`. [R]"""
+    tree = cKDTree(points[to], balanced_tree=False, compact_nodes=False)
+    found: NDArray[np.float64] = tree.query(
+        points[rows], distance_upper_bound=most, workers=threads() if len(rows) > _WORTH_THREADS else 1
+    )[0]
+    return found
 
 
 def grow_along_surface(

@@ -48,7 +48,7 @@ from progdf.region import (
 )
 from progdf.terminal import format_count, format_place
 
-from .neighbors import Neighborhood, grow_along_surface
+from .neighbors import RIM_PERCENT, Neighborhood, grow_along_surface
 from .selection import (
     Mask,
     alike_in_color,
@@ -115,10 +115,12 @@ def read_step(text: str) -> Callable[[Neighborhood, Mask], Mask]:
     """
     name, _, times = text.partition(":")
     count = int(times) if re.fullmatch(r"[0-9]{1,9}", times) else 1 if not times else 0
+    if name == "refine" and 1 <= count <= 100:
+        return lambda neighborhood, mask: neighborhood.refine(mask, count if times else RIM_PERCENT)
     if name not in STEPS or not 1 <= count <= (1 if name == "largest" else MOST_TIMES):
         raise ProgdfError(
             f"'{shorten(text)}' is no step of a region; write grow, shrink or smooth:TIMES, "
-            f"at most {MOST_TIMES}, or largest"
+            f"at most {MOST_TIMES}, refine:PERCENT, or largest"
         )
 
     def step(neighborhood: Neighborhood, mask: Mask) -> Mask:
@@ -216,6 +218,7 @@ STEPS: dict[str, Callable[[Neighborhood, Mask], Mask]] = {
     "shrink": Neighborhood.shrink,
     "smooth": Neighborhood.smooth,
     "largest": Neighborhood.largest_part,
+    "refine": Neighborhood.refine,
 }
 
 

@@ -64,6 +64,23 @@ def test_an_edit_that_a_map_of_color_carries_is_answered_with_a_grade(scene: Pat
         assert not (tmp_path / f"{number}.png").exists()
 
 
+def test_the_main_colors_of_a_region_come_first_and_a_grade_says_how_near_it_is(
+    scene: Path, tmp_path: Path
+) -> None:
+    previewer = Previewer(scene, tmp_path / "kept")
+    told = answer(previewer, request(1, tmp_path, editor="grade"))
+    assert (told.error, told.made) == ("", "palette")
+    assert 3 <= len(told.palette) <= 5
+    spec = "grade:" + ",".join([f"{told.palette[0]}=#3060d0", *told.palette[1:]])
+    graded = answer(previewer, request(2, tmp_path, editor=spec))
+    assert (graded.error, graded.made) == ("", "grade")
+    assert graded.note.endswith("dB to the exact colors")
+    assert (
+        "holds no Gaussian"
+        in answer(previewer, request(3, tmp_path, editor="grade", region="sphere:99,99,99,1")).error
+    )
+
+
 def test_what_does_not_work_is_one_line_and_the_next_request_does(scene: Path, tmp_path: Path) -> None:
     previewer = Previewer(scene, tmp_path / "kept")
     assert "holds no Gaussian" in answer(previewer, request(1, tmp_path, region="sphere:99,99,99,1")).error

@@ -155,7 +155,8 @@ def _error(picture: Tensor, expected: Tensor) -> float:
 
 def draft_grade(views: DraftViews, options: EditorOptions, name: str) -> Gdf | None:
     """The grade that comes nearest to an edit at strengths that are evenly visible, its field not baked; None
-    where it leaves more than `CARRIED` of it, or the editor is no function of color.
+    where it leaves more than `CARRIED` of it, unless it is a grade by hand, or the editor is no function of
+    color.
 
     `draft` in its report has the map's degree, and its dB at strength 1 to the editor's own pictures of the
     views that it was not fitted to.
@@ -175,7 +176,8 @@ def draft_grade(views: DraftViews, options: EditorOptions, name: str) -> Gdf | N
     errors = {degree: _error(judged.picture(end), expected[-1]) for degree, end in ends.items()}
     degree = min(d for d in errors if MORE_PAYS * errors[d] <= min(errors.values()))
     error = _drawn_error(views, ends[degree], degree, expected[-1])
-    if error > CARRIED * _error(judged.row.image[0], expected[-1]) + ROUNDING:
+    carried = CARRIED * _error(judged.row.image[0], expected[-1]) + ROUNDING
+    if error > carried and options.family != "grade":  # by hand one judges what one sees
         return None
     solve = partial(fitted.maps.solve, degree)
     table = torch.stack([identity_map(degree), *(solve([target]) for target in targets)])

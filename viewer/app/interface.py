@@ -278,10 +278,10 @@ def panels(
     work = panel.draw(work, pointer.facts, pictures, preview, recent, reveal, ui, actions)
     work = perform_actions(work, actions, pointer)
     if work.player.shown:
-        requested = timeline_bar.draw(work.view.timeline, work.player, work.view.safe_frame, area, ui)
+        requested = timeline_bar.draw(work, area, ui)
         work = perform_actions(work, requested, pointer)
     actions = []
-    above = replace(area, height=area.height - timeline_bar.height(work.player, area, ui))
+    above = replace(area, height=area.height - timeline_bar.height(work, area, ui))
     tools.draw_toolbar(work.view, above, ui, actions)
     work, foot = tools.draw_options(work, above, ui, actions)
     work = replace(work, view=tools.draw_view(work.view, above, foot, ui, actions))
@@ -346,7 +346,7 @@ def over_picture(
     if view.overlay:
         overlay.table(figures, ui)
     free = imgui.get_io().display_size
-    bar = timeline_bar.height(work.player, area, ui) if view.panel else 0.0
+    bar = timeline_bar.height(work, area, ui) if view.panel else 0.0
     above = replace(area, height=area.height - bar)
     if strip is not None and work.dialog is None:
         work = replace(work, requests=(*work.requests, *pages.draw_up_strip(strip, above, ui)))

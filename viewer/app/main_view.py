@@ -276,7 +276,8 @@ class MainView:
         before = self.work
         self._keys = self._pending.take(keys)
         self._handle_input(seconds)
-        if not imgui.is_any_item_active() and self._tool.drag is None and not is_repeating(keys):
+        held = imgui.is_any_item_active() or self._tool.drag is not None
+        if not (held or is_repeating(keys) or is_flying(self._keys)):
             self.work = workspace.record_undo(self.work)
         if self.work.view.layers != before.view.layers:
             self.work = replace(self.work, before=False)
@@ -456,7 +457,7 @@ class MainView:
 
     def _frame(self) -> overlay.Area | None:
         """The size of the safe frame; none while something lies over the picture."""
-        area, covered = self._area(), timeline_bar.height(self.work.player, self._area(), self.ui)
+        area, covered = self._area(), timeline_bar.height(self.work, self._area(), self.ui)
         return None if self.cover is not None else overlay.safe_frame(self.work.view, area, covered)
 
     @property

@@ -134,6 +134,8 @@ def handle_mouse(tool: MouseTool, work: Workspace, pointer: PointerContext) -> t
     axis, plain = overlay.axis_under(work.view, pointer.area, pointer.ui), not io.key_alt
     if axis and imgui.is_mouse_clicked(0):
         return replace(tool, drag=overlay.AXES_DRAG, axis=axis), work
+    if work.form_open and work.form.picks and plain and imgui.is_mouse_clicked(0):
+        return replace(tool, drag=select_tool.SELECT_DRAG), select_tool.pick_color(work, pointer)
     if work.view.brush.active and plain and imgui.is_mouse_clicked(0):
         return _begin_stroke(tool, work, pointer)
     if work.view.select.tool in ("flood", "color") and plain and imgui.is_mouse_clicked(0):

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from imgui_bundle import imgui
 
+from progdf.color.oklab import oklab_to_srgb
 from progdf.scene.neighbors import Neighborhood, grow_along_surface
 from progdf.scene.scribbles import Rows
 from progdf.scene.selection import (
@@ -16,6 +17,7 @@ from progdf.scene.selection import (
     Mask,
     Surface,
     alike_in_color,
+    base_colors,
     combine,
     inside_ball,
     inside_polygon,
@@ -24,11 +26,12 @@ from progdf.scene.selection import (
     project_centers,
 )
 from viewer.camera.view_camera import Vec3
+from viewer.jobs.training import hex_color, with_color
 from viewer.render.picking import Seen, seen_at, surface_point
 from viewer.state import history, selection
 from viewer.state.selection import unpack
 from viewer.state.view_state import ViewState
-from viewer.state.workspace import Workspace
+from viewer.state.workspace import Workspace, original
 from viewer.ui.context import PALETTE, UiContext, u32
 from viewer.ui.keys import Keys
 from viewer.ui.pointer import PointerContext
@@ -142,6 +145,17 @@ def rows_inside(gesture: Gesture, surface: Surface, through: bool) -> Mask:
         rows = np.flatnonzero(mask)
         mask[rows] = surface.front(rows)
     return mask
+
+
+def pick_color(work: Workspace, pointer: PointerContext) -> Workspace:
+    """The color that the original has under the mouse goes into the palette of the form."""
+    scene = pointer.engine.gaussians(original(pointer.shown))
+    seen = seen_at(scene, pointer.camera(pointer.shown.camera), *pointer.cursor)
+    if seen is None:
+        return replace(work, form=replace(work.form, picks=False))
+    colors = base_colors(scene[torch.from_numpy(seen.rows)])
+    color = oklab_to_srgb(torch.from_numpy(np.average(colors, axis=0, weights=seen.shares))).tolist()
+    return replace(work, form=with_color(work.form, hex_color(color)))
 
 
 def rows_at_click(

@@ -17,8 +17,6 @@ from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf, load_gdf
 from progdf.region import Region
 from progdf.scene.neighbors import Neighborhood
-from progdf.scene.scribbles import Scribbles
-from progdf.scene.selection import base_colors
 from progdf.terminal import escape_text
 from progdf.threads import all_threads
 from viewer.camera.view_camera import SceneUp, bounds_of, find_scene_up, first_camera, fit, fit_all
@@ -68,6 +66,7 @@ class Document:
     def facts(self) -> SceneFacts:
         """What the panel and the camera need to know of it."""
         scene, added = self.scene, [gdf.members - len(gdf.region) for gdf in self.edits]
+        neighborhood = _once(lambda: Neighborhood(scene))
         return SceneFacts(
             title=self.title,
             count=len(scene),
@@ -78,8 +77,8 @@ class Document:
             recordings=self.recordings(),
             fit=lambda camera, aspect: fit_all(camera, self.original, aspect),
             fit_members=lambda camera, aspect, mask: fit(camera, scene[torch.tensor(mask)], aspect),
-            neighborhood=_once(lambda: Neighborhood(scene)),
-            scribbles=_once(lambda: Scribbles(scene.means.nan_to_num().numpy(), base_colors(scene))),
+            neighborhood=neighborhood,
+            scribbles=_once(lambda: neighborhood().scribbles),
             home=lambda camera, aspect: replace(
                 first_camera(self.original, (), aspect, camera.fov_y, camera.up), mode=camera.mode
             ),

@@ -10,7 +10,8 @@
     }
 
 Cameras are in the world. A key without one leaves the camera alone; with none in any key, a film is taken
-from one place. A key need not name every edit. What a key leaves out lies between its neighbors that do not.
+from one place. A key need not name every edit: what it leaves out lies between its neighbors that do not, and
+several keys stand at one frame where they move different things.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from progdf.gaussians import ZERO, Origin
 from progdf.io.atomic import atomic_write, read_file
 from progdf.io.json_values import convert_json, decode_json, plain
 from viewer.camera.view_camera import Vec3, ViewCamera, move_camera
+from viewer.state.timeline import split_keys
 from viewer.state.view_state import Easing, Fps, Frame, Keyframe, LayerState, Length, Strength, Timeline
 
 VERSION = 1
@@ -128,8 +130,9 @@ def check(timeline: Timeline, where: str) -> None:
             raise ValueError(f"{where}[{i}].frame is {key.frame}, outside 0 to the length, {timeline.length}")
         if key.camera is not None and not any(key.camera.up):
             raise ValueError(f"{where}[{i}].camera has an up axis without a direction")
-    if any(before.frame >= after.frame for before, after in pairwise(timeline.keys)):
-        raise ValueError(f"{where} has two keys at one frame, or not in their order")
+    rows = [row for key in timeline.keys for row in split_keys(Timeline((key,))) or [(None, key.frame)]]
+    if len(set(rows)) < len(rows) or any(a.frame > b.frame for a, b in pairwise(timeline.keys)):
+        raise ValueError(f"{where} has two keys of one row at one frame, or not in their order")
 
 
 def _of_layers(file: TimelineFile, layers: Sequence[LayerState]) -> Timeline:

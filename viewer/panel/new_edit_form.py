@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
+import torch
 from imgui_bundle import imgui
 
-from progdf.color.edits import GRADE_RANGES
+from progdf.color.edits import GRADE_RANGES, parse_color
+from progdf.color.palette import bend_lightness
 from viewer.jobs.training import (
     ALL,
     BEST_STYLES,
@@ -16,12 +19,14 @@ from viewer.jobs.training import (
     STYLES,
     TYPED,
     NewEdit,
+    Point,
+    hex_color,
     missing_package,
     with_editor,
 )
 from viewer.state.selection import SelectionState
 from viewer.state.workspace import PreviewState, Workspace
-from viewer.ui.context import PALETTE, Icon, UiContext
+from viewer.ui.context import PALETTE, Icon, UiContext, u32
 from viewer.ui.keys import COMMANDS, shortcut
 from viewer.ui.widgets import (
     accent_button,
@@ -45,6 +50,7 @@ PAINT_VIEW = "Paint over this view…"
 PAINT_HELP = (
     "Opens a picture of it in your painting program; what you save there is shown here, ready to train"
 )
+_CURVE_PX, _MOST_POINTS, _LEAST_GAP = 92.0, 6, 0.02
 _GRADES = {
     "exposure": "Stops of light: −1 is half of it, 1 twice as much",
     "temperature": "From blue to amber light",
@@ -201,11 +207,12 @@ def _settings(form: NewEdit, preview: PreviewState, column: float, ui: UiContext
             form = replace(form, amount=amount)
         case "grade":
             grade = []
+            form = _palette(form, column, ui)
             for (name, (low, high, neutral)), value in zip(GRADE_RANGES.items(), form.grade, strict=True):
                 label(name.capitalize(), column)
                 grade.append(value_slider(f"##{name}", value, (low, high), "%.2f", neutral, ui))
                 tip(_GRADES[name])
-            form = replace(form, grade=tuple(grade))
+            form = replace(form, grade=tuple(grade), curve=_curve(form.curve, column, ui))
         case "style":
             label("Style", column)
             form = _style(form, ui)
@@ -220,6 +227,88 @@ def _settings(form: NewEdit, preview: PreviewState, column: float, ui: UiContext
             form = replace(form, folder=_text_row("Folder", "FOLDER", form.folder, column))
             tip("Pictures of the training views, edited by any program")
     return form
+
+
+def _palette(form: NewEdit, column: float, ui: UiContext) -> NewEdit:
+    """The region's main colors; another one is chosen for any, also for one that is picked in the picture."""
+    label("Palette", column)
+    flags, side = imgui.ColorEditFlags_, imgui.get_frame_height()
+    pairs, canvas = list(form.palette), imgui.get_window_draw_list()
+    room = right_edge() - side - imgui.get_cursor_pos_x()
+    wide = min(room / max(len(pairs), 1) - 2.0 * ui.scale, 34.0 * ui.scale)
+    for i, (source, target) in enumerate(pairs):
+        (x, y), color = imgui.get_cursor_screen_pos(), imgui.ImVec4(*_rgb(target), 1.0)
+        if imgui.color_button(f"##color {i}", color, flags.no_tooltip.value, imgui.ImVec2(wide, side)):
+            form = replace(form, picked=i)
+        if imgui.is_item_clicked(1):
+            pairs[i] = source, source
+        tip(f"{source} becomes {target}; right-click: as it was" if source != target else f"{source} stays")
+        if source != target:  # what it was, in a corner
+            low, corner = imgui.ImVec2(x, y + side), u32((*_rgb(source), 1.0))
+            canvas.add_triangle_filled(
+                imgui.ImVec2(x, y + side / 2), low, imgui.ImVec2(x + side / 2, y + side), corner
+            )
+        if form.picked == i:
+            imgui.open_popup(f"color {i}")
+            form = replace(form, picked=-1)
+        if imgui.begin_popup(f"color {i}"):
+            rgb, shown = list(_rgb(target)), flags.display_hex.value | flags.no_side_preview.value
+            changed, chosen = imgui.color_picker3("##picker", rgb, shown)
+            pairs[i] = (source, hex_color(chosen)) if changed else pairs[i]
+            imgui.end_popup()
+        imgui.same_line(0.0, 2.0 * ui.scale)
+    imgui.set_cursor_pos_x(right_edge() - side)
+    picks = form.picks != icon_button("pick", Icon.COLOR, ui, lit=form.picks)
+    tip("Pick a color in the picture, and choose what becomes of it")
+    return replace(form, palette=tuple(pairs), picks=picks)
+
+
+def _rgb(color: str) -> tuple[float, float, float]:
+    red, green, blue = parse_color(color).tolist()
+    return red, green, blue
+
+
+def _curve(curve: tuple[Point, ...], column: float, ui: UiContext) -> tuple[Point, ...]:
+    """Lightness after over lightness before: a press makes a point and drags it."""
+    label("Curve", column)
+    tall, reach = _CURVE_PX * ui.scale, 9.0 * ui.scale
+    x, y = imgui.get_cursor_screen_pos()
+    wide = imgui.get_content_region_avail().x
+    imgui.invisible_button("curve", imgui.ImVec2(wide, tall))
+    tip("Lightness: press for a point and drag it, right-click it to take it away")
+    storage, held, mouse = imgui.get_state_storage(), imgui.get_id("curve/held"), imgui.get_io().mouse_pos
+    at = (mouse.x - x) / wide, 1.0 - (mouse.y - y) / tall
+
+    def apart(point: Point) -> float:
+        return math.hypot((point[0] - at[0]) * wide, (point[1] - at[1]) * tall)
+
+    points = list(curve)
+    near = min(range(len(points)), key=lambda i: apart(points[i]), default=-1)
+    near = near if near >= 0 and apart(points[near]) <= reach else -1
+    if imgui.is_item_clicked(1):
+        points = [point for i, point in enumerate(points) if i != near]
+        storage.set_int(held, -1)
+    elif imgui.is_item_clicked(0):
+        if near < 0 and len(points) < _MOST_POINTS and all(abs(p[0] - at[0]) > _LEAST_GAP for p in points):
+            points = sorted([*points, (round(at[0], 2), round(at[1], 2))])
+            near = min(range(len(points)), key=lambda i: apart(points[i]))
+        storage.set_int(held, near)
+    elif imgui.is_item_active() and 0 <= (i := storage.get_int(held, -1)) < len(points):
+        low = points[i - 1][0] if i else 0.0
+        high = points[i + 1][0] if i + 1 < len(points) else 1.0
+        across = min(max(at[0], low + _LEAST_GAP), high - _LEAST_GAP)
+        points[i] = round(across, 2), round(min(max(at[1], 0.0), 1.0), 2)
+    canvas, p = imgui.get_window_draw_list(), PALETTE
+    canvas.add_rect_filled(imgui.ImVec2(x, y), imgui.ImVec2(x + wide, y + tall), u32(p.field), 4.0 * ui.scale)
+    canvas.add_line(imgui.ImVec2(x, y + tall), imgui.ImVec2(x + wide, y), u32(p.chosen), ui.scale)
+    steps = [i / 48 for i in range(49)]
+    shown = bend_lightness(torch.tensor(steps), points).tolist()
+    line = [imgui.ImVec2(x + wide * s, y + tall * (1.0 - l)) for s, l in zip(steps, shown, strict=True)]
+    canvas.add_polyline([*line], u32(p.handle), 1.5 * ui.scale, 0)
+    for i, (across, up) in enumerate(points):
+        center = imgui.ImVec2(x + wide * across, y + tall * (1.0 - up))
+        canvas.add_circle_filled(center, (4.0 + (i == near)) * ui.scale, u32(p.accent))
+    return tuple(points)
 
 
 def _model(form: NewEdit, preview: PreviewState, column: float, ui: UiContext) -> NewEdit:

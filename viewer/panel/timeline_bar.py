@@ -1,4 +1,4 @@
-"""The timeline along the lower edge of the picture: keys and playhead to drag, and its few settings.
+"""The timeline along the lower edge of the picture: keys and playhead to drag, rows, and its few settings.
 
 It changes nothing itself: it returns actions of `timeline.ACTIONS`, as keys do.
 """
@@ -6,60 +6,108 @@ It changes nothing itself: it returns actions of `timeline.ACTIONS`, as keys do.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 from imgui_bundle import icons_fontawesome_6 as icons
 from imgui_bundle import imgui
 
-from viewer.state.timeline import EASINGS, Player, key_at, key_before
-from viewer.state.view_state import FASTEST, LONGEST, Timeline
-from viewer.ui.context import PALETTE, SMALL_PX, UiContext, u32
+from viewer.camera.views import value_between
+from viewer.state.timeline import (
+    CAMERA,
+    EASINGS,
+    Player,
+    RowKey,
+    chosen_keys,
+    key_before,
+    keys_at,
+    shift_keys,
+    split_keys,
+    tracks,
+)
+from viewer.state.view_state import FASTEST, LONGEST, Keyframe, Timeline
+from viewer.state.workspace import Workspace
+from viewer.ui.context import PALETTE, ROW_COLORS, SMALL_PX, Icon, Rgba, UiContext, u32
 from viewer.ui.overlay import Area
-from viewer.ui.widgets import hint, icon_button, icon_row, is_released, plate, tip
+from viewer.ui.widgets import elide, hint, icon_button, icon_row, is_released, plate, tip
 
-HEIGHT_PX, ROW_PX = 46.0, 33.0  # at 1×: of the bar, and of a second row
-ROOMY_PX = 520.0  # a narrower bar has its settings in a second row
-SETTINGS_PX = 291.0
+HEIGHT_PX, ROW_PX = 46.0, 33.0  # at 1×: of the bar, and of a second line
+TRACK_PX, _MOST_SHARE = 20.0, 0.35  # of a row of keys; the rows take at most so much of the picture's height
+ROOMY_PX = 640.0  # a narrower bar has its settings in a second line
+SETTINGS_PX, BUTTONS_PX = 322.0, 143.0
 _KEY_PX, _GRIP_PX = 5.0, 8.0  # half a key's size; so near to a key the mouse takes it
+_CURVE_PX, _GAP_PX = 3.0, 4.0  # from point to point; under the rows
 _NICE = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
 
 
-def height(player: Player, area: Area, ui: UiContext) -> float:
+@dataclass(frozen=True)
+class _Ruler:
+    """A timeline on the screen."""
+
+    timeline: Timeline
+    player: Player
+    keys: Mapping[RowKey, Keyframe]  # of each row, see `split_keys`
+    start: float  # start, span: where frame 0 stands, and how far from there the last one, window pixels
+    span: float
+    ui: UiContext
+
+    @property
+    def frame(self) -> int:
+        """Of the playhead."""
+        return min(self.player.frame, self.timeline.length)
+
+    def x(self, frame: float) -> float:
+        return place(self.timeline, frame, self.start, self.span)
+
+    def frame_at(self, x: float) -> int:
+        length = self.timeline.length
+        return max(0, min(length, round((x - self.start) / self.span * length)))
+
+
+def height(work: Workspace, area: Area, ui: UiContext) -> float:
     """How much of the picture it covers, window pixels."""
-    return _bar_height(area, ui) if player.shown else 0.0
+    return _bar_height(work, area, ui) if work.player.shown else 0.0
 
 
 def _is_wide(area: Area, ui: UiContext) -> bool:
     return area.width >= ROOMY_PX * ui.scale
 
 
-def _bar_height(area: Area, ui: UiContext) -> float:
-    return (HEIGHT_PX if _is_wide(area, ui) else HEIGHT_PX + ROW_PX) * ui.scale
+def _bar_height(work: Workspace, area: Area, ui: UiContext) -> float:
+    tall = (HEIGHT_PX if _is_wide(area, ui) else HEIGHT_PX + ROW_PX) * ui.scale
+    return tall + _rows_height(work, area, ui)
 
 
-def draw(timeline: Timeline, player: Player, frame: str, area: Area, ui: UiContext) -> tuple[str, ...]:
+def _rows_height(work: Workspace, area: Area, ui: UiContext) -> float:
+    most = max(2, int(_MOST_SHARE * area.height / (TRACK_PX * ui.scale)))
+    rows = min(len(work.view.layers) + 1, most) * TRACK_PX
+    return (rows + _GAP_PX) * ui.scale if work.player.unfolded else 0.0
+
+
+def draw(work: Workspace, area: Area, ui: UiContext) -> tuple[str, ...]:
     """Draw the bar over the lower edge of `area`, between `imgui.new_frame` and `imgui.render`.
-
-    `frame`: the safe frame, see `ViewState`.
 
     Returns:
         What was asked for: actions of the workspace.
     """
-    tall, roomy = _bar_height(area, ui), _is_wide(area, ui)
-    actions: list[str] = []
-    place = imgui.ImVec2(0.0, area.height - tall)
-    with plate("timeline", place, ui, pad=10.0, size=imgui.ImVec2(area.width, tall)):
-        at = min(player.frame, timeline.length)
-        _buttons(timeline, player, at, actions, ui)
-        settings = SETTINGS_PX * ui.scale if roomy else 0.0
-        wide = max(imgui.get_content_region_avail().x - settings, 40.0 * ui.scale)
-        _ruler(timeline, at, wide, actions, ui)
+    tall, roomy, scale = _bar_height(work, area, ui), _is_wide(area, ui), ui.scale
+    timeline, actions, corner = work.view.timeline, list[str](), imgui.ImVec2(0.0, area.height - tall)
+    with plate("timeline", corner, ui, pad=10.0, size=imgui.ImVec2(area.width, tall)):
+        left, keys = imgui.get_cursor_screen_pos().x, split_keys(timeline)
+        _buttons(timeline, work.player, actions, ui)
+        imgui.same_line(BUTTONS_PX * scale + 10.0 * scale)
+        settings = SETTINGS_PX * scale if roomy else 0.0
+        wide = max(imgui.get_content_region_avail().x - settings, 40.0 * scale)
+        start = left + (BUTTONS_PX + 8.0) * scale
+        ruler = _Ruler(timeline, work.player, keys, start, max(wide - 16.0 * scale, 1.0), ui)
+        _draw_ruler(ruler, wide, actions)
         if roomy:
-            imgui.same_line(0.0, 12.0 * ui.scale)
-        _settings(timeline, at, actions, ui)
-        imgui.same_line(0.0, 4.0 * ui.scale)
-        if icon_button("safe_frame", icons.ICON_FA_CROP_SIMPLE, ui, dim=not frame):
-            actions.append("safe_frame")
-        hint("safe_frame", f"Now {frame or 'none'}")
+            imgui.same_line(0.0, 12.0 * scale)
+            _settings(work, ruler, actions)
+        if work.player.unfolded:
+            _rows(work, ruler, left, _rows_height(work, area, ui), actions)
+        if not roomy:
+            _settings(work, ruler, actions)
     return tuple(actions)
 
 
@@ -74,111 +122,234 @@ def label_step(timeline: Timeline, span: float, room: float) -> int:
     return next((step for step in _NICE if step >= least), _NICE[-1])
 
 
-def _buttons(timeline: Timeline, player: Player, frame: int, actions: list[str], ui: UiContext) -> None:
+def _buttons(timeline: Timeline, player: Player, actions: list[str], ui: UiContext) -> None:
+    gap, auto = 2.0 * ui.scale, player.auto_key is not None
+    folds = Icon.UNFOLDED if player.unfolded else Icon.FOLDED
+    icon_row((("timeline_rows", folds),), ui, actions)
+    imgui.same_line(0.0, gap)
     icon = icons.ICON_FA_PAUSE if player.playing else icons.ICON_FA_PLAY
-    on_key, can_play = key_at(timeline, frame) is not None, len(timeline.keys) > 1
+    here, can_play = keys_at(timeline, player.frame), len(timeline.keys) > 1
+    chosen = chosen_keys(timeline, player)
     items = (
         ("play", icon, "" if can_play else "Set at least two keyframes to play"),
-        ("key", icons.ICON_FA_DIAMOND, "In place of the present one" if on_key else ""),
-        ("drop_key", icons.ICON_FA_TRASH_CAN),
+        ("key", icons.ICON_FA_DIAMOND, "In place of the present one" if here else ""),
+        ("drop_key", icons.ICON_FA_TRASH_CAN, "Those chosen" if chosen else ""),
     )
-    off = [*["play"] * (not can_play), *["drop_key"] * (not on_key)]
-    icon_row(items, ui, actions, 2.0 * ui.scale, off=off)
-    imgui.same_line(0.0, 10.0 * ui.scale)
+    off = [*["play"] * (not can_play), *["drop_key"] * (not (here or chosen))]
+    icon_row(items, ui, actions, gap, off=off)
+    imgui.same_line(0.0, gap)
+    imgui.push_style_color(imgui.Col_.text, imgui.ImVec4(*(PALETTE.error if auto else PALETTE.faint)))
+    if imgui.button(f"{icons.ICON_FA_CIRCLE}##auto", imgui.ImVec2(imgui.get_frame_height(), 0.0)):
+        actions.append("auto_key")
+    imgui.pop_style_color()
+    hint("auto_key", "Now " + ("on" if auto else "off"))
 
 
-def _settings(timeline: Timeline, frame: int, actions: list[str], ui: UiContext) -> None:
+def _settings(work: Workspace, ruler: _Ruler, actions: list[str]) -> None:
+    timeline, ui = ruler.timeline, ruler.ui
     gap = 4.0 * ui.scale
     imgui.begin_disabled(not timeline.keys)
-    easing = key_before(timeline, frame).easing if timeline.keys else EASINGS[0]
-    if imgui.button(f"{easing.capitalize()}##easing", imgui.ImVec2(62.0 * ui.scale, 0.0)):
+    easing = EASINGS[0]
+    if timeline.keys:
+        chosen = chosen_keys(timeline, ruler.player)
+        easing = (ruler.keys[min(chosen)] if chosen else key_before(timeline, ruler.frame)).easing
+    if imgui.button(f"{easing.capitalize()}##easing", imgui.ImVec2(58.0 * ui.scale, 0.0)):
         actions.append("easing")
     imgui.end_disabled()
-    hint("easing")
+    hint("easing", "The chosen ones first")
     imgui.same_line(0.0, gap)
     if icon_button("ping_pong", icons.ICON_FA_RIGHT_LEFT, ui, dim=not timeline.ping_pong):
         actions.append("ping_pong")
     hint("ping_pong", "Now " + ("on" if timeline.ping_pong else "off"))
     imgui.same_line(0.0, gap)
-    for name, now, most, unit, what in (
-        ("length", timeline.length, LONGEST, "f", "Length in frames"),
-        ("fps", timeline.fps, FASTEST, "fps", "Frames per second"),
+    count = timeline.length + 1
+    for name, now, ends, unit, what in (
+        ("length", count, (2, LONGEST + 1), "f", f"0 to {timeline.length}: {count / timeline.fps:.2f} s"),
+        ("fps", timeline.fps, (1, FASTEST), "fps", "Frames per second"),
     ):
-        imgui.set_next_item_width(58.0 * ui.scale)
-        changed, value = imgui.drag_int(
-            f"##{name}", now, 0.25, 1, most, f"%d {unit}", imgui.SliderFlags_.always_clamp.value
-        )
+        imgui.set_next_item_width(54.0 * ui.scale)
+        clamp = imgui.SliderFlags_.always_clamp.value
+        changed, value = imgui.drag_int(f"##{name}", now, 0.25, *ends, f"%d {unit}", clamp)
         if changed and value != now:
-            actions.append(f"{name}:{value}")
+            actions.append(f"{name}:{value - (name == 'length')}")
         tip(f"{what}; drag, or Ctrl+click to type")
         imgui.same_line(0.0, gap)
+    if imgui.button("Film…"):
+        actions.append("render_film")
+    hint("render_film")
+    imgui.same_line(0.0, gap)
     imgui.begin_disabled(not timeline.keys)
     if icon_button("timeline_file", icons.ICON_FA_FILE_EXPORT, ui, dim=not timeline.keys):
         actions.append("timeline_file")
     imgui.end_disabled()
     hint("timeline_file")
+    imgui.same_line(0.0, gap)
+    frame = work.view.safe_frame
+    if icon_button("safe_frame", icons.ICON_FA_CROP_SIMPLE, ui, dim=not frame):
+        actions.append("safe_frame")
+    hint("safe_frame", f"Now {frame or 'none'}")
 
 
-def _ruler(timeline: Timeline, frame: int, wide: float, actions: list[str], ui: UiContext) -> None:
-    """The ruler: press or drag moves the playhead, or the key that was under the mouse."""
-    scale = ui.scale
-    left, top = imgui.get_cursor_screen_pos()
-    tall = imgui.get_frame_height()
-    inset = 8.0 * scale
-    start, span = left + inset, max(wide - 2 * inset, 1.0)
-    imgui.invisible_button("ruler", imgui.ImVec2(max(wide, 1.0), tall))
-    lit = imgui.is_item_hovered() or imgui.is_item_active()
-    mouse = imgui.get_io().mouse_pos.x
-    under = _key_under(timeline, start, span, mouse, scale) if lit else None
-    storage, slot = imgui.get_state_storage(), imgui.get_id("ruler/held")
-    to = max(0, min(timeline.length, round((mouse - start) / span * timeline.length)))
+def _draw_ruler(ruler: _Ruler, wide: float, actions: list[str]) -> None:
+    """Keys of all rows at once, numbers and the playhead."""
+    frames: dict[int, list[RowKey]] = {}
+    for key in ruler.keys:
+        frames.setdefault(key[1], []).append(key)
+    top, tall = imgui.get_cursor_screen_pos().y, imgui.get_frame_height()
+    under = _drag("ruler", frames, imgui.ImVec2(max(wide, 1.0), tall), ruler, actions)
+    _paint(ruler, frames, top, top + tall - 6.0 * ruler.ui.scale, under)
+
+
+def _drag(
+    name: str,
+    frames: Mapping[int, Sequence[RowKey]],
+    size: imgui.ImVec2,
+    ruler: _Ruler,
+    actions: list[str],
+) -> int | None:
+    """What is pressed and dragged: the keys under the mouse, with Ctrl copies of them; else the playhead.
+
+    Returns:
+        The frame of the keys under the mouse, if any are.
+    """
+    imgui.invisible_button(name, size)
+    io, timeline, player = imgui.get_io(), ruler.timeline, ruler.player
+    mouse, under = io.mouse_pos.x, None
+    if imgui.is_item_hovered() or imgui.is_item_active():
+        distance, nearest = min(((abs(mouse - ruler.x(f)), f) for f in frames), default=(math.inf, 0))
+        under = nearest if distance <= _GRIP_PX * ruler.ui.scale else None
+    storage, held, copies = (
+        imgui.get_state_storage(),
+        imgui.get_id(f"{name}/held"),
+        imgui.get_id(f"{name}/copies"),
+    )
+    to = ruler.frame_at(mouse)
     if imgui.is_item_activated():
-        storage.set_int(slot, -1 if under is None else under)
+        storage.set_int(held, -1 if under is None else under)
+        storage.set_int(copies, int(io.key_ctrl))
+        keys = () if under is None else frames[under]
+        if io.key_shift or not keys or not set(keys) <= player.chosen:
+            names = ",".join(f"{row}@{frame}" for row, frame in keys)
+            actions.append(f"choose_keys:{'+' * io.key_shift}{names}")
         actions.append(f"seek:{to if under is None else under}")
     elif imgui.is_item_active() or is_released():  # a slow frame may hold move and release
-        origin = storage.get_int(slot, -1)
-        moved = imgui.get_mouse_drag_delta(0, 3.0 * scale).x != 0.0 or imgui.is_item_deactivated()
-        if origin < 0 and to != frame:
+        origin = storage.get_int(held, -1)
+        moved = imgui.get_mouse_drag_delta(0, 3.0 * ruler.ui.scale).x != 0.0 or imgui.is_item_deactivated()
+        if origin < 0 and to != ruler.frame:
             actions.append(f"seek:{to}")
-        elif origin >= 0 and moved and to != origin and key_at(timeline, to) is None:
-            actions.append(f"move_key:{origin}>{to}")
-            storage.set_int(slot, to)
+        elif origin >= 0 and moved and to != origin:
+            copy, chosen = bool(storage.get_int(copies, 0)), chosen_keys(timeline, player)
+            if shift_keys(timeline, chosen, to - origin, copy) is not timeline:
+                actions.append(f"{'clone' if copy else 'move'}_keys:{to - origin}")
+                storage.set_int(held, to)
+                storage.set_int(copies, 0)
     if under is not None:
         imgui.set_mouse_cursor(imgui.MouseCursor_.resize_ew.value)
-    _paint(timeline, frame, start, span, top, top + tall - 6.0 * scale, under, ui)
+    return under
 
 
-def _key_under(timeline: Timeline, start: float, span: float, mouse: float, scale: float) -> int | None:
-    """The frame of the nearest key within reach of the mouse."""
-    places = [(abs(mouse - place(timeline, key.frame, start, span)), key.frame) for key in timeline.keys]
-    distance, frame = min(places, default=(math.inf, 0))
-    return frame if distance <= _GRIP_PX * scale else None
+def _rows(work: Workspace, ruler: _Ruler, left: float, tall: float, actions: list[str]) -> None:
+    """A row of keys for the camera and each layer, as the panel has them; they scroll where they are many."""
+    layers = list(enumerate(reversed(work.view.layers), 1))
+    curves = tracks(ruler.timeline)
+    imgui.push_style_var(imgui.StyleVar_.item_spacing, imgui.ImVec2(0.0, 0.0))
+    imgui.begin_child("rows", imgui.ImVec2(0.0, tall - _GAP_PX * ruler.ui.scale))
+    _row(CAMERA, "Camera", PALETTE.handle, (), ruler, left, False, actions)
+    for number, layer in layers:
+        focused = work.focus == len(layers) - number
+        color, points = ROW_COLORS[layer.gdf % len(ROW_COLORS)], curves.get(layer.gdf, ())
+        if _row(layer.gdf, layer.name, color, points, ruler, left, focused, actions):
+            actions.append(f"focus:{number}")
+    imgui.end_child()
+    imgui.pop_style_var()
+
+
+def _row(
+    row: int,
+    name: str,
+    color: Rgba,
+    points: Sequence[tuple[int, str, float]],
+    ruler: _Ruler,
+    left: float,
+    focused: bool,
+    actions: list[str],
+) -> bool:
+    """The name, a button for the key at the playhead, the keys and the curve; True if the name is pressed."""
+    canvas, p, scale, tall = imgui.get_window_draw_list(), PALETTE, ruler.ui.scale, TRACK_PX * ruler.ui.scale
+    top, end = imgui.get_cursor_screen_pos().y, ruler.start + ruler.span + 8.0 * scale
+    imgui.push_id(row)
+    imgui.push_font(None, SMALL_PX)
+    names = ruler.start - 8.0 * scale - left - tall
+    pressed = imgui.invisible_button("name", imgui.ImVec2(names, tall))
+    lit = focused or (imgui.is_item_hovered() and row != CAMERA)
+    if focused:
+        corner = imgui.ImVec2(end, top + tall)
+        canvas.add_rect_filled(imgui.ImVec2(left, top), corner, u32(p.card_focused), 3.0 * scale)
+    at, ink = imgui.ImVec2(round(left + 6.0 * scale), round(top + 3.0 * scale)), u32(p.text if lit else p.dim)
+    canvas.add_text(at, ink, elide(name, names - 8.0 * scale))
+    imgui.same_line(0.0, 0.0)
+    here = (row, ruler.frame) in ruler.keys
+    if imgui.invisible_button("key", imgui.ImVec2(tall, tall)):
+        actions.append(f"{'drop_key' if here else 'key'}:{row}")
+    ink = u32(p.handle if imgui.is_item_hovered() else color if here else p.faint)
+    middle = imgui.ImVec2(left + names + tall / 2, top + tall / 2)
+    canvas.add_ngon_filled(middle, 4.5 * scale, ink, 4) if here else canvas.add_ngon(
+        middle, 4.5 * scale, ink, 4
+    )
+    tip(f"{'Delete' if here else 'Insert'} a keyframe of {name} at the playhead")
+    imgui.pop_font()
+    imgui.same_line(0.0, 0.0)
+    frames = {frame: [(row, frame)] for r, frame in ruler.keys if r == row}
+    under = _drag("keys", frames, imgui.ImVec2(end - ruler.start + 8.0 * scale, tall), ruler, actions)
+    imgui.pop_id()
+    line, low, high = max(1.0, scale), top + tall - 3.0 * scale, top + 3.0 * scale
+    ends = imgui.ImVec2(ruler.start, low), imgui.ImVec2(ruler.start + ruler.span, low)
+    canvas.add_line(*ends, u32(p.line), line)
+    if points:
+        count = max(2, int(ruler.span / (_CURVE_PX * scale)))
+        frames_shown = [ruler.timeline.length * i / count for i in range(count + 1)]
+        curve = [
+            imgui.ImVec2(ruler.x(f), low - min(value_between(points, f), 1.0) * (low - high))
+            for f in frames_shown
+        ]
+        canvas.add_polyline([*curve], u32((*color[:3], 0.75)), line, 0)
+    _paint_keys(ruler, frames, top + tall / 2, under, color)
+    x = round(ruler.x(ruler.frame)) + 0.5
+    canvas.add_line(imgui.ImVec2(x, top), imgui.ImVec2(x, top + tall), u32(p.accent), line)
+    return bool(pressed and row != CAMERA)
+
+
+def _paint_keys(
+    ruler: _Ruler, frames: Mapping[int, Sequence[RowKey]], y: float, under: int | None, color: Rgba
+) -> None:
+    """The keys on a line: those chosen, or under the mouse, are white; of a row they are ringed too."""
+    canvas, scale = imgui.get_window_draw_list(), ruler.ui.scale
+    for frame, keys in frames.items():
+        size = (_KEY_PX - 0.5 * (len(frames[frame]) == 1) + (frame == under)) * scale
+        chosen = not ruler.player.chosen.isdisjoint(keys)
+        ink = u32(PALETTE.handle if chosen or frame == under else color)
+        _paint_key(canvas, ruler.x(frame), y, size, ink, ruler.keys[keys[0]].easing)
 
 
 def _paint(
-    timeline: Timeline,
-    frame: int,
-    start: float,
-    span: float,
-    top: float,
-    line: float,
-    under: int | None,
-    ui: UiContext,
+    ruler: _Ruler, frames: Mapping[int, Sequence[RowKey]], top: float, line: float, under: int | None
 ) -> None:
+    timeline, ui, start, span = ruler.timeline, ruler.ui, ruler.start, ruler.span
     canvas, p, scale = imgui.get_window_draw_list(), PALETTE, ui.scale
     thin = max(1.0, scale)
     canvas.add_line(imgui.ImVec2(start, line), imgui.ImVec2(start + span, line), u32(p.faint), thin)
-    _paint_numbers(timeline, frame, start, span, top, line, ui)
-    for key in timeline.keys:
-        x, size = place(timeline, key.frame, start, span), (_KEY_PX + (key.frame == under)) * scale
-        color = u32(p.handle if key.frame in (frame, under) else p.dim)
-        _paint_key(canvas, x, line, size, color, key.easing)
+    _paint_numbers(timeline, ruler.frame, start, span, top, line, ui)
+    here = {frame: keys for frame, keys in frames.items() if frame == ruler.frame}
+    _paint_keys(
+        ruler, {frame: keys for frame, keys in frames.items() if frame not in here}, line, under, p.dim
+    )
+    _paint_keys(ruler, here, line, under, p.handle)
     if not timeline.keys:
         hint = "Press K to insert a keyframe"
         size = SMALL_PX * scale
         at = imgui.ImVec2(round(start + 40.0 * scale), round(line - size - 3.0 * scale))
         canvas.add_text(ui.fonts.regular, size, at, u32(p.dim), hint)
-    x = round(place(timeline, frame, start, span)) + 0.5
+    x = round(ruler.x(ruler.frame)) + 0.5
     canvas.add_line(imgui.ImVec2(x, top - 2.0 * scale), imgui.ImVec2(x, line), u32(p.accent), 1.5 * scale)
     canvas.add_triangle_filled(
         imgui.ImVec2(x - 5.0 * scale, top - 4.0 * scale),

@@ -63,6 +63,7 @@ _TOOLS = (
     (("brush", Icon.BRUSH), ("decal", Icon.DECAL), ("move_selected", Icon.MOVE)),
 )
 _OPERATIONS = (
+    *("select_grow", "select_shrink"),
     *("select_smooth", "select_largest", "invert", "select_none", "hide_selected", "isolate"),
     *("remove_selected", "move_selected", "duplicate_selected"),
 )
@@ -193,11 +194,10 @@ def _selection(view: ViewState, bar: _Bar, actions: list[str]) -> Pointed | None
         if count and imgui.is_item_hovered(imgui.HoveredFlags_.for_tooltip.value):
             pointed = ("selection", 0)
         imgui.begin_disabled(not count)
-        bar.button("select_grow", actions)
-        bar.button("select_shrink", actions)
+        bar.button("select_refine", actions)
         bar.follow(imgui.get_frame_height())
         more_button("more", _OPERATIONS, bar.ui, actions)
-        tip("Smooth, invert, hide, remove, move, copy")
+        tip("Grow, shrink, smooth, invert, hide, remove, move, copy")
         _save(len(view.selection.regions), bar, actions)
         imgui.end_disabled()
     if view.selection.hidden:

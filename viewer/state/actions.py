@@ -98,6 +98,7 @@ def perform(workspace: Workspace, action: str, facts: SceneFacts, aspect: float 
     name, _, argument = action.partition(":")
     if name == "invert":
         name = "paint_invert" if workspace.view.brush.active else "select_invert"
+    name, workspace = _of_keys(name, workspace)
     if name in REQUESTS:
         return replace(workspace, requests=(*workspace.requests, action))
     if name in ("frame", "home"):
@@ -154,6 +155,23 @@ def _select_painted(workspace: Workspace, index: int, facts: SceneFacts) -> Work
 
 OF_EDITS = {"again": _again, "limit_to_selection": _limit, "select_painted": _select_painted}
 """Actions on one layer, the focused one where none is named, that ask what is known of its edit."""
+
+
+def _of_keys(name: str, workspace: Workspace) -> tuple[str, Workspace]:
+    """Copy and paste go for keys where some are chosen, or were copied last; a taken layer lets them go."""
+    player = workspace.player
+    if name == "copy_values":
+        chosen = player.shown and timeline.chosen_keys(workspace.view.timeline, player)
+        return (
+            ("copy_keys", workspace)
+            if chosen
+            else (name, replace(workspace, player=replace(player, copied=())))
+        )
+    if name == "paste_values" and player.copied and player.shown:
+        return "paste_keys", workspace
+    if name in ("focus", "press_layer", "unfocus") and player.chosen:
+        workspace = replace(workspace, player=replace(player, chosen=frozenset()))
+    return name, workspace
 
 
 def _frame(workspace: Workspace, facts: SceneFacts, aspect: float) -> Workspace:
@@ -330,7 +348,11 @@ def _timeline_action(name: str) -> Callable[[Workspace, str], Workspace]:
         view, player = timeline.perform(workspace.view, workspace.player, f"{name}:{argument}")
         past = history.follow_look(workspace.past, workspace.view, view)
         if loses_strengths(workspace, view):  # an entry of its own, or part of what is done to the keys
-            past = past if name == "move_key" else history.record(past, view, workspace.snapshots)
+            past = (
+                past
+                if name in ("move_keys", "clone_keys")
+                else history.record(past, view, workspace.snapshots)
+            )
         elif past.present.edit.layers == workspace.view.layers:
             past = history.follow_playhead(past, workspace.view, view)
         return replace(workspace, view=view, player=player, past=past)

@@ -169,6 +169,7 @@ CHANGES_BY_NEIGHBORS: dict[str, Callable[[Neighborhood, Mask], Mask]] = {
     "select_shrink": Neighborhood.shrink,
     "select_smooth": Neighborhood.smooth,
     "select_largest": Neighborhood.largest_part,
+    "select_refine": Neighborhood.refine,
 }
 CHANGES = (
     *("select_all", "select_none", "select_invert", "hide_selected", "isolate", "show_hidden"),

@@ -2,50 +2,90 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from viewer.camera import views
 from viewer.camera.view_camera import ViewCamera
 
-from .view_state import FASTEST, LONGEST, Keyframe, Timeline, ViewState
+from .view_state import FASTEST, LONGEST, Keyframe, LayerState, Timeline, ViewState
 
 EASINGS = views.EASINGS
 
 
-def key_at(timeline: Timeline, frame: int) -> Keyframe | None:
-    """The key that stands at a frame."""
-    return next((key for key in timeline.keys if key.frame == frame), None)
+CAMERA = -1
+"""The row of the camera; that of an edit is its `LayerState.gdf`."""
+RowKey = tuple[int, int]
+"""A row's key: the row, and its frame."""
 
 
-def with_key(timeline: Timeline, frame: int, view: ViewState) -> Timeline:
-    """What `view` shows becomes the key at a frame, in place of the one there, whose easing stays."""
-    old = key_at(timeline, frame)
-    easing = old.easing if old else key_before(timeline, frame).easing if timeline.keys else EASINGS[0]
-    strengths = {layer.gdf: layer.strength for layer in view.layers}
-    key = Keyframe(frame, tuple(strengths.items()), view.camera, easing)
-    return _with(without_key(timeline, frame), key)
+def split_keys(timeline: Timeline) -> dict[RowKey, Keyframe]:
+    """What each row has at a frame, as a key of that row alone."""
+    found = {}
+    for key in timeline.keys:
+        if key.camera is not None:
+            found[CAMERA, key.frame] = replace(key, strengths=())
+        for strength in key.strengths:
+            found[strength[0], key.frame] = replace(key, strengths=(strength,), camera=None)
+    return found
 
 
-def without_key(timeline: Timeline, frame: int) -> Timeline:
-    """The key at a frame taken away; unchanged where there is none."""
-    return replace(timeline, keys=tuple(key for key in timeline.keys if key.frame != frame))
+def join_keys(timeline: Timeline, keys: Mapping[RowKey, Keyframe]) -> Timeline:
+    """A timeline of these keys; those of one frame that go on in the same way are one `Keyframe`."""
+    joined: dict[tuple[int, str], Keyframe] = {}
+    for (_, frame), key in sorted(keys.items(), key=lambda item: item[0]):
+        same = joined.get((frame, key.easing), Keyframe(frame, easing=key.easing))
+        strengths, camera = (*same.strengths, *key.strengths), key.camera or same.camera
+        joined[frame, key.easing] = replace(same, strengths=strengths, camera=camera)
+    ordered = tuple(sorted(joined.values(), key=lambda key: key.frame))
+    return replace(timeline, keys=ordered, length=max((timeline.length, *(key.frame for key in ordered))))
 
 
-def move_key(timeline: Timeline, frame: int, to: int) -> Timeline:
-    """The key at `frame` at another place; unchanged where another key stands there, or off the timeline."""
-    key = key_at(timeline, frame)
-    if key is None or key_at(timeline, to) or not 0 <= to <= timeline.length:
+def keys_at(timeline: Timeline, frame: int) -> list[RowKey]:
+    """The keys of all rows that stand at a frame."""
+    return [key for key in split_keys(timeline) if key[1] == frame]
+
+
+def with_key(timeline: Timeline, frame: int, view: ViewState, rows: Sequence[int] | None = None) -> Timeline:
+    """What `view` shows becomes the key at a frame, in place of the one there, whose easing stays.
+
+    Args:
+        rows: which rows it is set for; all if None
+    """
+    keys = split_keys(timeline)
+    for row in (CAMERA, *(layer.gdf for layer in view.layers)) if rows is None else rows:
+        strengths = tuple((layer.gdf, layer.strength) for layer in view.layers if layer.gdf == row)
+        before = [key for (r, f), key in keys.items() if r == row and f <= frame]
+        latest = max(before, key=lambda key: key.frame) if before else None
+        if latest is None and timeline.keys:
+            latest = key_before(timeline, frame)
+        easing = latest.easing if latest else EASINGS[0]
+        keys[row, frame] = Keyframe(frame, strengths, view.camera if row == CAMERA else None, easing)
+    return join_keys(timeline, keys)
+
+
+def without_keys(timeline: Timeline, chosen: Collection[RowKey]) -> Timeline:
+    """These keys taken away, as far as there are any."""
+    return join_keys(timeline, {at: key for at, key in split_keys(timeline).items() if at not in chosen})
+
+
+def shift_keys(timeline: Timeline, chosen: Collection[RowKey], by: int, copy: bool = False) -> Timeline:
+    """These keys so many frames later, or copies of them; unchanged where one would stand on another key of
+    its row, or off the timeline."""
+    keys = split_keys(timeline)
+    moved = {(row, frame + by): replace(keys[row, frame], frame=frame + by) for row, frame in chosen}
+    rest = {at: key for at, key in keys.items() if copy or at not in chosen}
+    if rest.keys() & moved.keys() or not all(0 <= frame <= timeline.length for _, frame in moved):
         return timeline
-    return _with(without_key(timeline, frame), replace(key, frame=to))
+    return join_keys(timeline, rest | moved)
 
 
-def set_easing(timeline: Timeline, frame: int, easing: str) -> Timeline:
-    """Another way to go on from the key at a frame, or from the last one before it."""
-    if not timeline.keys or easing not in EASINGS:
-        return timeline
-    key = key_before(timeline, frame)
-    return _with(without_key(timeline, key.frame), replace(key, easing=easing))
+def set_easing(timeline: Timeline, chosen: Collection[RowKey], easing: str) -> Timeline:
+    """Another way to go on from these keys."""
+    keys = split_keys(timeline)
+    return join_keys(
+        timeline, {at: replace(k, easing=easing) if at in chosen else k for at, k in keys.items()}
+    )
 
 
 def key_before(timeline: Timeline, frame: int) -> Keyframe:
@@ -122,16 +162,20 @@ def camera_at(timeline: Timeline, frame: float, least: int = 1) -> ViewCamera | 
 
 def strengths_at(timeline: Timeline, frame: float, least: int = 1) -> dict[int, float]:
     """The strength of each edit that at least `least` keys mention, by `LayerState.gdf`."""
-    tracks: dict[int, list[views.Point]] = {}
+    return {
+        g: views.value_between(points, frame)
+        for g, points in tracks(timeline).items()
+        if len(points) >= least
+    }
+
+
+def tracks(timeline: Timeline) -> dict[int, list[views.Point]]:
+    """The keys of each edit's strength, by `LayerState.gdf`."""
+    found: dict[int, list[views.Point]] = {}
     for key in timeline.keys:
         for gdf, strength in key.strengths:
-            tracks.setdefault(gdf, []).append((key.frame, key.easing, strength))
-    return {gdf: views.value_between(points, frame) for gdf, points in tracks.items() if len(points) >= least}
-
-
-def _with(timeline: Timeline, key: Keyframe) -> Timeline:
-    keys = sorted((*timeline.keys, key), key=lambda k: k.frame)
-    return replace(timeline, keys=tuple(keys), length=max(timeline.length, key.frame))
+            found.setdefault(gdf, []).append((key.frame, key.easing, strength))
+    return found
 
 
 LEAST_KEYS = 2
@@ -140,13 +184,32 @@ LEAST_KEYS = 2
 
 @dataclass(frozen=True)
 class Player:
-    """Where the playhead stands."""
+    """Where the playhead stands, and what is done to the keys."""
 
     frame: int = 0  # 0 to the timeline's length
     playing: bool = False  # it goes on by itself
     backwards: bool = False  # on the way back of a ping-pong
     part: float = 0.0  # how much of this frame's time is over, 0..1
     shown: bool = False  # whether the bar is on screen
+    unfolded: bool = False  # with a row for the camera and one for each layer
+    chosen: frozenset[RowKey] = frozenset()  # what is moved, copied and deleted
+    copied: tuple[tuple[int, Keyframe], ...] = ()  # rows and their keys, to be pasted
+    # a row that the hand changes gets a key at the playhead: the camera as it was last seen, None for off
+    auto_key: ViewCamera | None = None
+
+
+def auto_key(view: ViewState, player: Player, before: Sequence[LayerState]) -> tuple[ViewState, Player]:
+    """The state with keys for what a hand has changed: strengths that were others in `before`, and the camera
+    where it has a key already, as one may only have looked around."""
+    if player.auto_key is None or player.playing:
+        return view, player
+    was = {layer.gdf: layer.strength for layer in before}
+    rows = [layer.gdf for layer in view.layers if layer.strength != was.get(layer.gdf, layer.strength)]
+    there = camera_at(view.timeline, player.frame)
+    if there is not None and view.camera not in (player.auto_key, replace(there, mode=view.camera.mode)):
+        rows.append(CAMERA)
+    made = with_key(view.timeline, player.frame, view, rows) if rows else view.timeline
+    return replace(view, timeline=made), replace(player, auto_key=view.camera)
 
 
 def advance(player: Player, timeline: Timeline, seconds: float) -> Player:
@@ -188,20 +251,57 @@ def _step_frames(timeline: Timeline, frame: int, backwards: bool, steps: int) ->
     return (step, False) if step < last else (2 * last - step, True)
 
 
-def _key(view: ViewState, player: Player, _: str) -> tuple[Timeline, Player]:
-    return with_key(view.timeline, player.frame, view), replace(player, shown=True)
+def _key(view: ViewState, player: Player, row: str) -> tuple[Timeline, Player]:
+    """Of the row that is named, or of all."""
+    rows = [int(row)] if row else None
+    return with_key(view.timeline, player.frame, view, rows), replace(player, shown=True)
 
 
-def _drop_key(view: ViewState, player: Player, _: str) -> tuple[Timeline, Player]:
-    return without_key(view.timeline, player.frame), player
+def _drop_key(view: ViewState, player: Player, row: str) -> tuple[Timeline, Player]:
+    """The chosen keys; else those at the playhead, or the one of the row that is named."""
+    here = [key for key in keys_at(view.timeline, player.frame) if row in ("", str(key[0]))]
+    chosen = () if row else chosen_keys(view.timeline, player)
+    return without_keys(view.timeline, chosen or here), replace(player, chosen=frozenset())
 
 
-def _move_key(view: ViewState, player: Player, places: str) -> tuple[Timeline, Player]:
-    """`FROM>TO`; the playhead goes with the key."""
-    frame, _, to = places.partition(">")
-    moved = move_key(view.timeline, int(frame), int(to))
-    went = moved is not view.timeline
-    return moved, replace(player, frame=int(to), playing=False, part=0.0) if went else player
+def chosen_keys(timeline: Timeline, player: Player) -> frozenset[RowKey]:
+    """The chosen keys that there still are."""
+    return player.chosen & split_keys(timeline).keys()
+
+
+def _choose_keys(view: ViewState, player: Player, names: str) -> tuple[Timeline, Player]:
+    """`ROW@FRAME,ROW@FRAME`; "" for none, with a plus sign before it beside the others, or not any more."""
+    pairs = [name.split("@") for name in names.removeprefix("+").split(",") if name]
+    keys = frozenset((int(row), int(frame)) for row, frame in pairs)
+    if names.startswith("+"):
+        keys = player.chosen - keys if keys <= player.chosen else player.chosen | keys
+    return view.timeline, replace(player, chosen=keys)
+
+
+def _move_keys(view: ViewState, player: Player, by: str, copy: bool = False) -> tuple[Timeline, Player]:
+    """The chosen ones; the playhead goes with the key at it."""
+    chosen, step = chosen_keys(view.timeline, player), int(by)
+    moved = shift_keys(view.timeline, chosen, step, copy)
+    if moved is view.timeline:
+        return moved, player
+    if any(frame == player.frame for _, frame in chosen):
+        player = replace(player, frame=player.frame + step, playing=False, part=0.0)
+    return moved, replace(player, chosen=frozenset((row, frame + step) for row, frame in chosen))
+
+
+def _copy_keys(view: ViewState, player: Player, _: str) -> tuple[Timeline, Player]:
+    chosen = chosen_keys(view.timeline, player)
+    keys = ((row, key) for (row, frame), key in split_keys(view.timeline).items() if (row, frame) in chosen)
+    return view.timeline, replace(player, copied=tuple(keys))
+
+
+def _paste_keys(view: ViewState, player: Player, _: str) -> tuple[Timeline, Player]:
+    """The first at the playhead, in place of what stands there; beyond the end the timeline grows."""
+    by = player.frame - min((key.frame for _, key in player.copied), default=0)
+    pasted = {(row, key.frame + by): replace(key, frame=key.frame + by) for row, key in player.copied}
+    pasted = {at: key for at, key in pasted.items() if at[1] <= LONGEST}
+    joined = join_keys(view.timeline, split_keys(view.timeline) | pasted)
+    return joined, replace(player, chosen=frozenset(pasted))
 
 
 def _play(view: ViewState, player: Player, _: str) -> tuple[Timeline, Player]:
@@ -226,13 +326,18 @@ def _at(player: Player, frame: int) -> Player:
     return replace(player, frame=frame, playing=False, backwards=False, part=0.0)
 
 
-def _easing(view: ViewState, player: Player, chosen: str) -> tuple[Timeline, Player]:
-    """Of the key that decides at the playhead; the next one of the list where none is named."""
+def _easing(view: ViewState, player: Player, name: str) -> tuple[Timeline, Player]:
+    """Of the chosen keys, else of those that decide at the playhead; the next one where none is named."""
     if not view.timeline.keys:
         return view.timeline, player
-    now = key_before(view.timeline, player.frame).easing
-    after = chosen or EASINGS[(EASINGS.index(now) + 1) % len(EASINGS)]
-    return set_easing(view.timeline, player.frame, after), player
+    chosen, deciding = chosen_keys(view.timeline, player), key_before(view.timeline, player.frame)
+    now = split_keys(view.timeline)[min(chosen)].easing if chosen else deciding.easing
+    name = name or EASINGS[(EASINGS.index(now) + 1) % len(EASINGS)]
+    return set_easing(view.timeline, chosen or keys_at(view.timeline, deciding.frame), name), player
+
+
+def _auto_key(view: ViewState, player: Player, _: str) -> tuple[Timeline, Player]:
+    return view.timeline, replace(player, auto_key=None if player.auto_key else view.camera, shown=True)
 
 
 def _ping_pong(view: ViewState, player: Player, _: str) -> tuple[Timeline, Player]:
@@ -248,7 +353,16 @@ def _bar(view: ViewState, player: Player, _: str) -> tuple[Timeline, Player]:
 ACTIONS: dict[str, Callable[[ViewState, Player, str], tuple[Timeline, Player]]] = {
     "key": _key,
     "drop_key": _drop_key,
-    "move_key": _move_key,
+    "choose_keys": _choose_keys,
+    "move_keys": _move_keys,
+    "clone_keys": lambda view, player, by: _move_keys(view, player, by, copy=True),
+    "copy_keys": _copy_keys,
+    "paste_keys": _paste_keys,
+    "auto_key": _auto_key,
+    "timeline_rows": lambda view, player, _: (
+        view.timeline,
+        replace(player, unfolded=not (player.unfolded and player.shown), shown=True),
+    ),
     "play": _play,
     "seek": _seek,
     "step": _step,

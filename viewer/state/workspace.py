@@ -238,7 +238,12 @@ def with_message(
 
 
 def record_undo(workspace: Workspace) -> Workspace:
-    """Call when no gesture is under way: what it changed becomes one undo entry."""
+    """Call when no gesture is under way: what it changed becomes one undo entry, with its keys."""
+    if workspace.glide is None:
+        layers = workspace.past.present.edit.layers
+        view, player = timeline.auto_key(workspace.view, workspace.player, layers)
+        if player is not workspace.player:
+            workspace = replace(workspace, view=view, player=player)
     past = history.record(workspace.past, workspace.view, workspace.snapshots)
     return workspace if past is workspace.past else replace(workspace, past=past)
 

@@ -47,6 +47,8 @@ class Palette:
 
 
 PALETTE = Palette()
+ROW_COLORS = tuple(map(_rgb, (0x7FC08A, 0xD9A441, 0xC792D6, 0xE08C7A, 0x5DBDB5, 0xB9BE5C)))
+"""Of the timeline's rows, alike in lightness; none is the blue."""
 
 FIXED = (
     imgui.WindowFlags_.no_decoration.value

@@ -183,6 +183,7 @@ TOPICS: dict[str, tuple[Command, ...]] = {
         Command("select_shrink", "Shrink", "Ctrl+[", "Less its border", repeats=True, row="Shrink, grow"),
         Command("select_grow", "Grow", "Ctrl+]", "Add the neighbors", repeats=True, row=JOINED),
         Command("select_smooth", "Smooth", "", "Straighten the border, drop strays, fill holes"),
+        Command("select_refine", "Refine", "", "Put a rough rim where color and gaps have it"),
         Command("select_largest", "Largest part", "", "Keep only the largest connected part"),
         Command("hide_selected", "Hide selection", "Ctrl+H", row="Hide; Shift isolates"),
         Command("isolate", "Isolate selection", "Ctrl+Shift+H", "Hide everything else", row=JOINED),
@@ -199,9 +200,13 @@ TOPICS: dict[str, tuple[Command, ...]] = {
         *_row(", .", "Previous, next frame", _steps("step", "frame", repeats=True)),
         *_row("Shift+, .", "Previous, next keyframe", _steps("jump", "keyframe", "Shift+")),
         Command("easing", "Smooth, linear, hold", "Shift+K", "From the keyframe at or before the playhead"),
-        Command("ping_pong", "Ping-pong", "Alt+K"),
+        Command("ping_pong", "Ping-pong", "Alt+K", row="Ping-pong; Ctrl auto-key"),
+        Command("auto_key", "Auto-key", "Ctrl+Alt+K", "A dragged slider gets a keyframe", row=JOINED),
         Command("timeline_file", "Save timeline as file", "Ctrl+K"),
-        Command("timeline", "Timeline", "T", "Animate the camera and the strengths"),
+        Command(
+            "timeline", "Timeline", "T", "Animate the camera and the strengths", row="Timeline; Alt its rows"
+        ),
+        Command("timeline_rows", "Timeline rows", "Alt+T", "The camera and each layer", row=JOINED),
         Command("safe_frame", "Safe frame", "Shift+T", "What a film of 16:9, 1:1 or 9:16 shows"),
     ),
     "Window and files": (

@@ -55,7 +55,9 @@ def _edited(edit: str, rgb: Tensor, strength: float) -> Tensor:
     if edit == "night":
         return color.night_course(rgb)(strength)
     if edit == "grade":
-        return color.grade_course(rgb, {"exposure": 1.0, "temperature": 0.5, "black": 0.1})(strength)
+        return color.grade_course(rgb, color.ColorGrade({"exposure": 1.0, "temperature": 0.5, "black": 0.1}))(
+            strength
+        )
     return (recolor if edit == "recolor" else tint)(rgb, BLUE, strength)
 
 
@@ -109,7 +111,7 @@ def test_a_stop_halves_the_light() -> None:
 
 def test_each_value_of_a_grade_does_what_its_name_says() -> None:
     def graded(rgb: Tensor, **values: float) -> Tensor:
-        return color.grade_fully(rgb, values)
+        return color.grade_fully(rgb, color.ColorGrade(values))
 
     gray, some = torch.full((1, 3), 0.5), 0.2 + 0.6 * _random()
     assert torch.allclose(graded(some), some, atol=1e-3), "neutral values change nothing"

@@ -88,6 +88,7 @@ def test_what_is_in_both_parts_is_kept_and_steps_change_all_before_them(scene: G
     grown = members(f"{spec} | grow:2", scene)
     assert grown == members(f"{spec}|grow|grow", scene) > members(spec, scene)
     assert members(f"{spec}|grow:2-sphere:0,0,0,1.2", scene) == grown - rows(near)
+    assert members(f"{spec}|refine", scene) == members(f"{spec}|refine:35", scene)
     assert members("all|largest", scene) <= members("all", scene)
 
 
@@ -198,6 +199,7 @@ def refusal(spec: str, scene: Gaussians) -> str:
         ("all|grow:1000", "no step of a region"),
         ("sphere:0,0,0,1|grow:-3", "'grow:-3' is no step of a region"),
         ("all|largest:2", "no step of a region"),
+        ("sphere:0,0,0,1|refine:101", "'refine:101' is no step of a region"),
         ("all|grow|GROW", "'grow|GROW' is no step of a region"),
         ("all|largest||", "'largest||' is no step of a region"),
         ("all|smooth+100", "'smooth+100' is no step of a region"),
@@ -305,7 +307,7 @@ WHOLE = st.sampled_from(
     ]
 )
 SIGNS = st.sampled_from(["+", "-", " & ", "|grow+", "|smooth:2&", "|"])
-STEPS = st.sampled_from(["|grow", "|shrink:2", "| smooth", "|largest", "|grow:100"])
+STEPS = st.sampled_from(["|grow", "|shrink:2", "| smooth", "|largest", "|grow:100", "|refine:9"])
 KIND = st.sampled_from(["box:", "sphere:", "flood:", "lasso:C:", "brush:C:", "rectangle:C:", "labels:l.npy:"])
 NUMBERS = st.lists(
     st.sampled_from(

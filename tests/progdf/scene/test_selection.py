@@ -162,7 +162,7 @@ def test_growing_and_shrinking_move_the_border_by_a_neighbor() -> None:
 
 def test_nothing_grows_from_nothing_and_all_stays_all() -> None:
     near = Neighborhood(sheet(gray()))
-    for change in (near.grow, near.shrink, near.smooth, near.largest_part):
+    for change in (near.grow, near.shrink, near.smooth, near.largest_part, near.refine):
         assert not change(np.zeros(400, bool)).any()
         assert change(np.ones(400, bool)).all()
 
@@ -183,6 +183,39 @@ def test_smoothing_drops_strays_and_fills_holes() -> None:
     assert (noisy != left).sum() == 4
     assert (Neighborhood(scene).smooth(noisy) == left).mean() > 0.99
     assert (Neighborhood(scene).smooth(noisy) == left)[[45, 130, 205, 290]].all()
+
+
+@pytest.mark.parametrize(("shift", "percent"), [(-1, 35), (1, 35), (-3, 70), (3, 70)])
+def test_a_rough_rim_goes_where_the_color_changes(shift: int, percent: int) -> None:
+    colors = gray(40).reshape(40, 40, 3)
+    truth = np.zeros((40, 40), bool)
+    truth[10:28, 8:30] = True
+    colors[torch.from_numpy(truth)] = torch.tensor([0.8, 0.3, 0.1])
+    rough = np.zeros_like(truth)
+    rough[10 + shift : 28 + shift, 8 : 30 + abs(shift)] = True
+    near = Neighborhood(sheet(colors.reshape(-1, 3), side=40))
+    assert (near.refine(rough.ravel(), percent) == truth.ravel()).all()
+    assert not (rough == truth).all()
+
+
+def test_a_rough_rim_goes_where_a_gap_is() -> None:
+    scene = joined(
+        sheet(gray()), replace(sheet(gray()), means=sheet(gray()).means + torch.tensor([2.6, 0, 0]))
+    )
+    truth, rough = (scene.means[:, 0].numpy() < limit for limit in (1.3, 1.75))
+    assert (Neighborhood(scene).refine(rough, 60) == truth).all()
+
+
+def test_a_thin_part_is_held_along_its_middle() -> None:
+    colors = gray(40).reshape(40, 40, 3)
+    truth = np.zeros((40, 40), bool)
+    truth[18:21, 4:36] = True
+    colors[torch.from_numpy(truth)] = torch.tensor([0.8, 0.3, 0.1])
+    rough = np.zeros_like(truth)
+    rough[17:22, 4:36] = True
+    near = Neighborhood(sheet(colors.reshape(-1, 3), side=40))
+    made = near.refine(rough.ravel(), 60).reshape(40, 40)
+    assert (made & truth).sum() / (made | truth).sum() > 0.95
 
 
 def test_the_largest_part_is_that_of_most_members() -> None:

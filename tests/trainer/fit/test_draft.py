@@ -19,6 +19,8 @@ from trainer.editors import make_editor
 from trainer.fit import draft
 from trainer.fit.draft import DraftViews, draft_grade, draft_views
 from trainer.options import EditorOptions, ViewOptions
+from trainer.setup import edit_views
+from trainer.store.run_folder import RunFolder
 from trainer.views.view import render_view
 
 
@@ -41,9 +43,10 @@ def drafted(editor: str, folder: Path) -> Gdf:
 
 
 GRADE = "grade:exposure=-0.8,saturation=0.4"
+PALETTE = "grade:#b97a30=#3060d0,#e0c898,curve=0.3:0.25+0.7:0.8"
 
 
-@pytest.mark.parametrize("spec", ["recolor:#3060d0", "tint:#3060d0", "darken:0.6", "night", GRADE])
+@pytest.mark.parametrize("spec", ["recolor:#3060d0", "tint:#3060d0", "darken:0.6", "night", GRADE, PALETTE])
 def test_a_draft_shows_an_edit_at_every_strength_as_its_editor_does(spec: str, tmp_path: Path) -> None:
     case, gdf = small("body"), drafted(spec, tmp_path)
     editor = make_editor(EditorOptions(spec), case.scene, case.region, case.views)
@@ -72,6 +75,14 @@ def test_what_a_map_of_color_leaves_too_much_of_has_no_draft(monkeypatch: pytest
     assert draft_grade(views(), EditorOptions("recolor:#3060d0"), "blue") is None
 
 
+def test_a_grade_by_hand_is_live_however_little_a_map_carries_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(draft, "CARRIED", 1e-5)
+    monkeypatch.setattr(draft, "ROUNDING", 0.0)
+    made = draft_grade(views(), EditorOptions(GRADE), "grade")
+    assert made is not None
+    assert made.report["draft"]["psnr"] > 25.0
+
+
 def test_a_region_that_no_view_shows_has_no_draft() -> None:
     case = small("body")
     hidden = replace(case.scene, logit_opacities=torch.full_like(case.scene.logit_opacities, -30.0))
@@ -82,3 +93,10 @@ def test_a_scene_to_stand_inside_has_no_draft_without_cameras() -> None:
     scene = room(SMALLEST_ROOM).gaussians
     region = from_mask("all", torch.ones(len(scene), dtype=torch.bool))
     assert draft_views(ViewOptions(), "night", scene, region) is None
+
+
+def test_no_further_strengths_are_no_pictures(tmp_path: Path) -> None:
+    """Where the slider is even with one recording already."""
+    case = small("body")
+    editor = make_editor(EditorOptions(GRADE), case.scene, case.region, case.views)
+    assert edit_views(editor, case.views, (), RunFolder(tmp_path), True, lambda *_: None) == {}

@@ -43,7 +43,8 @@ INTERNAL = {
     *("replace_by", "place", "keep_placed", "put_back", "lay_decal", "save_region", "rename_region"),
     *("set_up", "keep_up", "press_layer", "master", "rename_group", "restore", "forget", "name_snapshot"),
     *("move_snapshot", "choose_snapshot", "blend_snapshots", "region", "show_region", "forget_region"),
-    *("select_invert", "move_key", "seek", "length", "fps", "go_to", "example", "forget_file"),
+    *("select_invert", "choose_keys", "move_keys", "clone_keys", "copy_keys", "paste_keys"),
+    *("seek", "length", "fps", "go_to", "example", "forget_file"),
 }
 """Asked for by a button, a question or a drag, with what it is about: nothing to look up by its name."""
 

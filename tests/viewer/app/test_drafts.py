@@ -22,6 +22,7 @@ from viewer.app.studio import preview
 from viewer.camera.view_camera import to_camera
 from viewer.files.session import open_session
 from viewer.jobs import job_queue
+from viewer.jobs.training import EDITORS
 from viewer.state import paint
 from viewer.state.layers import visible_layers
 from viewer.state.view_state import LayerState
@@ -104,6 +105,34 @@ def test_a_grade_is_a_live_layer_that_the_form_drives_from_every_side(window: ap
     assert (Previews.asked, len(window.main_view.live)) == (2, 1)
     with_form(window, preview=False)
     assert window.main_view.live == ()
+
+
+def test_a_grade_by_hand_gets_the_main_colors_of_its_region(
+    window: application.App, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+
+    def ask(self: Previews, region: str, request: preview._Request, _: Camera) -> int:
+        self._number += 1
+        asked.append(request.editor)
+        palette = ("#7eae44", f"#0000{self._number:02x}") if request.editor == "grade" else None
+        grade = Previews.grade if palette is None else None
+        self._answers.append(preview.Preview(self._number, grade=grade, palette=palette))
+        return self._number
+
+    monkeypatch.setattr(Previews, "ask", ask)
+    opened(window, editor=next(i for i, e in enumerate(EDITORS) if e.kind == "grade"))
+    form = window.main_view.work.form
+    assert form.palette == (("#7eae44", "#7eae44"), ("#000001", "#000001"))
+    assert (asked, window.main_view.live) == (["grade"], ())
+    with_form(window, palette=(("#7eae44", "#3060d0"), form.palette[1]))
+    assert asked[1:] == ["grade:#7eae44=#3060d0,#000001"]
+    assert len(window.main_view.live) == 1
+    with_form(window, region="typed", typed_region="sphere:0,0,0,9")
+    assert asked[2] == "grade"
+    assert window.main_view.work.form.palette[0] == ("#7eae44", "#3060d0"), "nothing that was chosen is lost"
+    with_form(window, region="all", palette=form.palette)
+    assert window.main_view.work.form.palette[1][0] not in ("#000001", "#000003")
 
 
 def test_what_no_grade_carries_is_the_editors_own_picture_as_before(window: application.App) -> None:

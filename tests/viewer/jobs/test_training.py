@@ -24,12 +24,15 @@ from viewer.jobs.child import Progress
 from viewer.jobs.training import (
     ALL,
     CHANGED,
+    MOST_PAIRS,
     NEUTRAL,
+    STILL,
     STYLES,
     TYPED,
     EditOrder,
     NewEdit,
     missing_package,
+    with_color,
     with_editor,
     with_picture,
     with_settings,
@@ -214,6 +217,31 @@ def test_what_the_form_asks_for_is_what_the_trainer_takes(kind: str) -> None:
     moved = form(kind, amount=0.98, through_hues=True, grade=(1.0, -0.25, *NEUTRAL[2:]))
     assert not moved.obstacle
     CHECKS[kind](moved.spec.partition(":")[2])
+
+
+def test_a_grade_says_its_palette_only_where_a_color_of_it_moves() -> None:
+    colors = (("#7eae44", "#7eae44"), ("#b97a30", "#b97a30"))
+    still = form("grade", palette=colors)
+    assert (still.spec, still.obstacle) == ("grade", STILL)
+    moved = form("grade", palette=(("#7eae44", "#3060d0"), colors[1]), curve=((0.3, 0.2), (0.7, 0.8)))
+    assert moved.spec == "grade:#7eae44=#3060d0,#b97a30,curve=0.30:0.20+0.70:0.80"
+    CHECKS["grade"](moved.spec.partition(":")[2])
+    again = with_settings(NewEdit(), moved.spec)
+    assert again is not None
+    assert (again.spec, again.palette) == (moved.spec, moved.palette)
+    assert with_settings(NewEdit(), "grade:curve=none") is None
+
+
+def test_a_picked_color_stands_in_the_palette_in_place_of_one_like_it() -> None:
+    colors = (("#7eae44", "#3060d0"), ("#b97a30", "#b97a30"))
+    alike = with_color(form("grade", palette=colors, picks=True), "#7fad44")
+    assert alike.palette == (("#7fad44", "#3060d0"), colors[1])
+    assert (alike.picks, alike.picked) == (False, 0)
+    other = with_color(form("grade", palette=colors), "#c01830")
+    assert other.palette == (*colors, ("#c01830", "#c01830"))
+    assert other.picked == 2
+    many = form("grade", palette=tuple((f"#{i:02x}0000", "#ffffff") for i in range(30, 250, 28)))
+    assert len(with_color(many, "#20c0f0").palette) == MOST_PAIRS
 
 
 def test_the_trainer_has_as_many_paintings_as_the_form() -> None:

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from imgui_bundle import imgui
 from PIL import Image
 
 from progdf.__main__ import main
@@ -24,6 +25,7 @@ from viewer.panel import panel, timeline_bar
 from viewer.pictures import film
 from viewer.state import timeline
 from viewer.state.view_state import Keyframe, Timeline, ViewState
+from viewer.ui import overlay
 
 pytestmark = pytest.mark.gl
 WINDOW = (1024, 640)
@@ -37,7 +39,7 @@ def keyed(view: ViewState | None = None, length: int = 40) -> ViewState:
     there = replace(view, camera=replace(view.camera, azimuth=view.camera.azimuth + 60.0))
     layers = (replace(view.layers[0], strength=1.0), view.layers[1])
     made = timeline.with_key(made, length // 2, replace(there, layers=layers))
-    return replace(view, timeline=timeline.set_easing(made, length // 2, "linear"))
+    return replace(view, timeline=timeline.set_easing(made, timeline.keys_at(made, length // 2), "linear"))
 
 
 @pytest.fixture
@@ -49,7 +51,7 @@ def hand(tmp_path: Path) -> Iterator[Rig]:
 
 def at(hand: Rig, frame: float) -> tuple[float, float]:
     """Where a frame of the ruler stands on the window."""
-    left = 10.0 + 3 * 25.0 + 2 * 2.0 + 10.0
+    left = 10.0 + timeline_bar.BUTTONS_PX
     wide = WINDOW[0] - panel.WIDTH_PX - 10.0 - left - timeline_bar.SETTINGS_PX
     shown = hand.main_view.work.view.timeline
     return timeline_bar.place(shown, frame, left + 8.0, wide - 16.0), WINDOW[1] - 24.0
@@ -133,12 +135,12 @@ def test_commas_and_periods_step_and_with_shift_jump_from_key_to_key(hand: Rig) 
 def test_the_bars_buttons_do_what_they_say(hand: Rig) -> None:
     y, gap = WINDOW[1] - 24.0, 27.0
     hand.drag(at(hand, 30), at(hand, 30))
-    for x, expected in ((10.0 + gap + 12.0, [0, 20, 30]), (10.0 + 2 * gap + 12.0, [0, 20])):
+    for x, expected in ((22.0 + 2 * gap, [0, 20, 30]), (22.0 + 3 * gap, [0, 20])):
         hand.move(x, y)
         hand.press()
         hand.release()
         assert frames_of(hand) == expected
-    hand.move(22.0, y)
+    hand.move(22.0 + gap, y)
     hand.press()
     hand.release()
     assert hand.main_view.work.player.playing
@@ -156,6 +158,59 @@ def test_the_bars_buttons_do_what_they_say(hand: Rig) -> None:
     assert hand.main_view.work.view.timeline.ping_pong
     hand.drag((settings + 120.0, y), (settings + 160.0, y))
     assert hand.main_view.work.view.timeline.length > 40
+
+
+def row(hand: Rig, number: int, frame: float) -> tuple[float, float]:
+    """Where a frame of a row stands: 0 the camera, then the layers as the panel has them."""
+    tall = timeline_bar.TRACK_PX
+    top = WINDOW[1] - timeline_bar.height(hand.main_view.work, overlay.Area(724, 640), hand.main_view.ui)
+    return at(hand, frame)[0], top + timeline_bar.HEIGHT_PX - 6.0 + tall * (number + 0.5)
+
+
+def test_a_rows_key_is_dragged_alone_with_ctrl_a_copy_of_it_and_deleted(hand: Rig) -> None:
+    hand.key("Alt+T")
+    before = hand.main_view.work.view.timeline
+
+    def frames() -> dict[int, list[int]]:
+        keys = sorted(timeline.split_keys(hand.main_view.work.view.timeline))
+        return {r: [f for other, f in keys if other == r] for r, _ in keys}
+
+    assert frames() == {-1: [0, 20], 0: [0, 20], 1: [0, 20]}
+    hand.drag(row(hand, 2, 20), row(hand, 2, 30))  # the scarf is the lower layer
+    assert frames() == {-1: [0, 20], 0: [0, 30], 1: [0, 20]}
+    hand.modifier(imgui.Key.mod_ctrl)
+    hand.drag(row(hand, 0, 20), row(hand, 0, 35))
+    hand.modifier(imgui.Key.mod_ctrl, down=False)
+    assert frames() == {-1: [0, 20, 35], 0: [0, 30], 1: [0, 20]}
+    assert len(hand.main_view.work.past.past) == 2
+    hand.key("Delete")
+    assert frames() == {-1: [0, 20], 0: [0, 30], 1: [0, 20]}
+    hand.drag(row(hand, 1, 20), row(hand, 1, 20))
+    hand.key("Ctrl+C")
+    hand.drag(at(hand, 8), at(hand, 8))
+    hand.key("Ctrl+V")
+    assert frames()[1] == [0, 8, 20]
+    for _ in range(4):
+        hand.key("Ctrl+Z")
+    assert hand.main_view.work.view.timeline == before
+
+
+def test_auto_key_keys_only_the_slider_that_is_dragged(hand: Rig) -> None:
+    hand.drag(at(hand, 30), at(hand, 30))
+    hand.key("Ctrl+Alt+K")
+    hand.drag(hand.slider(1, hand.strengths[1]), hand.slider(1, 0.75))
+    keys = timeline.split_keys(hand.main_view.work.view.timeline)
+    assert [key for key in keys if key[1] == 30] == [(1, 30)]
+    assert keys[1, 30].strengths[0][1] == hand.strengths[1] > 0.6
+
+
+def test_the_bar_and_the_film_agree_on_the_number_of_frames(
+    hand: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real, shown = imgui.drag_int, {}
+    monkeypatch.setattr(imgui, "drag_int", lambda *a: shown.update({a[0]: a[1]}) or real(*a))
+    hand.frame()
+    assert shown["##length"] == len(list(timeline.film_frames(hand.main_view.work.view.timeline))) == 41
 
 
 def test_what_the_bar_covers_is_not_the_pictures_to_orbit(hand: Rig) -> None:

@@ -9,7 +9,10 @@ import numpy as np
 import pytest
 
 from progdf.errors import ProgdfError
+from progdf.scene.neighbors import Neighborhood
+from progdf.scene.regions import read_step
 from tests.helpers.ui_rig import bear, first_view
+from viewer.camera.view_camera import Bounds
 from viewer.state import selection, workspace
 from viewer.state.actions import perform
 from viewer.state.selection import NOBODY, SelectionState
@@ -33,6 +36,18 @@ def test_a_mask_comes_back_as_it_was_packed() -> None:
         mask = rng.random(TOTAL) < share
         assert (selection.unpack(selection.pack(mask), TOTAL) == mask).all()
     assert selection.pack(np.zeros(TOTAL, bool)) == NOBODY
+
+
+def test_the_button_that_refines_does_what_the_step_of_a_region_does() -> None:
+    scene = bear().scene
+    near = Neighborhood(scene)
+    facts = SceneFacts("bear.ply", len(scene), Bounds(), (), neighborhood=lambda: near)
+    rough = scene.means[:, 1].numpy() > 0.3
+    work = selecting(workspace.new_workspace(first_view(bear())), rough)
+    refined = perform(work, "select_refine", facts).view.selection
+    made = selection.unpack(refined.members, len(scene))
+    assert np.array_equal(made, read_step("refine")(near, rough))
+    assert refined.count == made.sum() != rough.sum()
 
 
 @pytest.mark.parametrize("members", [b"not packed", selection.pack(every(3))[:-9]])

@@ -36,7 +36,12 @@ def view(scarf: float = 0.2, ears: float = 0.4, **camera: object) -> ViewState:
 def two_keys(easing: str = "smooth", length: int = 20) -> Timeline:
     made = timeline.with_key(Timeline(length=length), 0, view(0.0, 1.0, azimuth=170.0, distance=1.0))
     made = timeline.with_key(made, length, view(1.0, 0.5, azimuth=-170.0, distance=100.0))
-    return timeline.set_easing(made, 0, easing)
+    return timeline.set_easing(made, timeline.keys_at(made, 0), easing)
+
+
+def shift(made: Timeline, frame: int, to: int) -> Timeline:
+    """The keys of all rows at a frame, elsewhere."""
+    return timeline.shift_keys(made, timeline.keys_at(made, frame), to - frame)
 
 
 def act(work: Workspace, *actions: str) -> Workspace:
@@ -132,7 +137,7 @@ def test_between_any_two_up_axes_the_picture_turns_along_one_arc(
 
 
 def test_before_the_first_key_and_after_the_last_everything_rests() -> None:
-    made = timeline.set_length(timeline.move_key(two_keys(), 0, 5), 40)
+    made = timeline.set_length(shift(two_keys(), 0, 5), 40)
     assert timeline.state_at(made, 0, view()).layers == timeline.state_at(made, 5, view()).layers
     assert timeline.state_at(made, 40, view()).camera == timeline.state_at(made, 20, view()).camera
 
@@ -146,11 +151,11 @@ def test_an_edit_opened_after_the_keys_is_left_alone_and_one_that_is_gone_is_no_
 def test_keys_stay_in_order_and_none_stands_on_another_or_off_the_timeline() -> None:
     made = timeline.with_key(two_keys(), 7, view())
     assert [key.frame for key in made.keys] == [0, 7, 20]
-    assert timeline.move_key(made, 7, 20) == made
-    assert timeline.move_key(made, 7, 21) == made
-    assert timeline.move_key(made, 7, -1) == made
-    assert [key.frame for key in timeline.move_key(made, 0, 12).keys] == [7, 12, 20]
-    assert [key.frame for key in timeline.without_key(made, 7).keys] == [0, 20]
+    assert shift(made, 7, 20) == made
+    assert shift(made, 7, 21) == made
+    assert shift(made, 7, -1) == made
+    assert [key.frame for key in shift(made, 0, 12).keys] == [7, 12, 20]
+    assert [key.frame for key in timeline.without_keys(made, timeline.keys_at(made, 7)).keys] == [0, 20]
 
 
 def test_a_timeline_is_never_shorter_than_its_last_key() -> None:
@@ -277,9 +282,89 @@ def test_a_gesture_under_way_is_still_one_entry_when_the_film_plays_on() -> None
 
 def test_a_moved_key_takes_the_playhead_along_and_the_picture_stays() -> None:
     work = act(workspace.new_workspace(replace(view(), timeline=two_keys())), "seek:20", "length:40")
-    moved = act(work, "move_key:20>31")
+    moved = act(work, "choose_keys:-1@20,0@20,1@20", "move_keys:11")
     assert moved.player.frame == 31
     assert (moved.view.layers, moved.view.camera) == (work.view.layers, work.view.camera)
+
+
+def frames_of(work: Workspace, row: int) -> list[int]:
+    return [frame for r, frame in sorted(timeline.split_keys(work.view.timeline)) if r == row]
+
+
+def test_a_timeline_of_whole_keys_is_the_same_film_as_its_rows() -> None:
+    made = timeline.with_key(two_keys(), 7, view(0.9))
+    rows = timeline.split_keys(made)
+    assert sorted(rows) == [(row, frame) for row in (-1, 0, 1) for frame in (0, 7, 20)]
+    assert timeline.join_keys(made, rows) == made
+    assert timeline.join_keys(made, dict(reversed(rows.items()))) == made
+
+
+def test_one_rows_key_is_moved_and_the_other_rows_stay() -> None:
+    work = act(workspace.new_workspace(replace(view(), timeline=two_keys(length=20))), "length:40")
+    moved = act(work, "choose_keys:0@20", "move_keys:5")
+    assert [frames_of(moved, row) for row in (timeline.CAMERA, 0, 1)] == [[0, 20], [0, 25], [0, 20]]
+    assert timeline.strengths_at(moved.view.timeline, 20)[1] == 0.5
+    assert timeline.strengths_at(moved.view.timeline, 25)[0] == 1.0
+    eased = act(moved, "easing:hold").view.timeline
+    assert {row: key.easing for row, key in timeline.split_keys(eased).items() if key.easing == "hold"} == {
+        (0, 25): "hold"
+    }
+    assert act(moved, "move_keys:-25") == moved, "its row has a key there"
+    assert act(moved, "undo").view.timeline == work.view.timeline
+
+
+def test_keys_of_one_frame_go_on_each_in_its_own_way_also_in_a_file(tmp_path: Path) -> None:
+    made = timeline.set_easing(two_keys("linear"), [(0, 0)], "hold")
+    assert timeline.strengths_at(made, 10) == {0: 0.0, 1: 0.75}
+    timeline_file.save(tmp_path / "film.json", made, LAYERS)
+    assert timeline_file.load(tmp_path / "film.json", LAYERS) == made
+
+
+def test_copied_keys_are_pasted_at_the_playhead_in_place_of_what_stands_there() -> None:
+    work = act(workspace.new_workspace(replace(view(), timeline=two_keys())), "timeline")
+    work = act(work, "choose_keys:0@0,0@20", "copy_values", "seek:10", "paste_values")
+    assert not work.requests, "keys were copied, not the sliders"
+    assert frames_of(work, 0) == [0, 10, 20, 30]
+    assert work.view.timeline.length == 30
+    assert timeline.strengths_at(work.view.timeline, 30)[0] == 1.0
+    assert work.player.chosen == {(0, 10), (0, 30)}
+    dropped = act(work, "drop_key")
+    assert (frames_of(dropped, 0), frames_of(dropped, 1)) == ([0, 20], [0, 20])
+    layers = act(work, "focus:1", "copy_values", "paste_values")
+    assert layers.requests == ("copy_values", "paste_values"), "a layer was taken since"
+
+
+def test_copies_are_dragged_off_and_what_they_come_from_stays() -> None:
+    work = act(workspace.new_workspace(replace(view(), timeline=two_keys())), "choose_keys:1@20")
+    assert act(work, "clone_keys:0").view.timeline == work.view.timeline
+    work = act(work, "clone_keys:-5", "move_keys:-1")
+    assert (frames_of(work, 1), frames_of(work, 0)) == ([0, 14, 20], [0, 20])
+    assert act(work, "choose_keys:+1@20").player.chosen == {(1, 14), (1, 20)}
+
+
+def test_auto_key_keys_what_the_hand_has_changed_and_nothing_else_as_one_entry() -> None:
+    work = act(workspace.new_workspace(view()), "auto_key", "seek:10", "focus:2", "nudge:0.3")
+    assert work.view.timeline.keys == (Keyframe(10, ((0, 0.5),)),)
+    assert len(work.past.past) == 1
+    assert act(work, "undo").view.timeline.keys == ()
+    work = act(work, "seek:20", "nudge:0.1", "seek:5", "seek:10")
+    assert [frames_of(work, row) for row in (timeline.CAMERA, 0, 1)] == [[], [10, 20], []]
+    off = act(work, "auto_key", "seek:15", "nudge:0.1")
+    assert frames_of(off, 0) == [10, 20]
+
+
+def test_auto_key_keys_the_camera_once_its_row_has_a_key() -> None:
+    def look(work: Workspace, azimuth: float) -> Workspace:
+        turned = replace(work.view.camera, azimuth=azimuth)
+        return workspace.record_undo(workspace.with_camera(work, turned))
+
+    work = look(act(workspace.new_workspace(view()), "auto_key", "seek:10"), 30.0)
+    assert work.view.timeline.keys == ()
+    work = look(act(work, "key:-1", "seek:20"), 60.0)
+    assert frames_of(work, timeline.CAMERA) == [10, 20]
+    work = act(work, "seek:15", "seek:10", "play")
+    work = workspace.record_undo(workspace.advance(work, 0.2))
+    assert frames_of(work, timeline.CAMERA) == [10, 20], "the playhead is no hand"
 
 
 def test_easing_goes_round_for_the_key_before_the_playhead() -> None:
@@ -349,7 +434,7 @@ def test_a_file_written_by_hand_needs_only_frames_and_strengths(tmp_path: Path) 
         ({"keys": [{"frame": 0, "strengths": {"hat": 1.0}}]}, "'hat', which is not open"),
         ({"keys": [{"frame": 0, "strengths": {"ears": 7.0}}]}, "is {'ears': 7.0}, expected float <= 1.2"),
         ({"keys": [{"frame": 99}]}, "outside 0 to the length"),
-        ({"keys": [{"frame": 1}, {"frame": 1}]}, "two keys at one frame"),
+        ({"keys": [{"frame": 1}, {"frame": 1}]}, "two keys of one row at one frame"),
         ({"keys": [{"frame": 0, "easing": "bouncy"}]}, "is 'bouncy', expected one of (smooth|linear|hold)"),
         ({"keys": [{"frame": 0, "camera": {"distance": 0.0}}]}, "camera.distance is 0.0, expected float > 0"),
         ({"keys": [{"frame": 0, "camera": {"elevation": 91.0}}]}, "elevation is 91.0, expected float <= 90"),

@@ -32,7 +32,7 @@ from viewer.camera.view_camera import Vec3, ViewCamera, to_camera
 from viewer.files import user_files
 from viewer.jobs import training
 from viewer.jobs.child import Child
-from viewer.jobs.training import EDITORS, NewEdit
+from viewer.jobs.training import EDITORS, STILL, NewEdit
 from viewer.state.view_state import LayerState
 from viewer.state.workspace import PreviewState
 
@@ -79,15 +79,17 @@ class Preview:
     note: str = ""  # what would paint a sentence
     models: tuple[str, ...] = ()  # that are on this machine
     follows: bool = False  # whether the edit of a sentence can follow this picture
+    palette: tuple[str, ...] | None = None  # the region's main colors, #rrggbb
 
 
 class _Answer(msgspec.Struct):
     number: int
     error: str = ""
-    made: Literal["picture", "grade", "note"] = "picture"
+    made: Literal["picture", "grade", "note", "palette"] = "picture"
     note: str = ""
     models: list[str] = msgspec.field(default_factory=list)
     follows: bool = False
+    palette: list[str] = msgspec.field(default_factory=list)
 
 
 class PreviewChild:
@@ -147,7 +149,10 @@ class PreviewChild:
             if answer.made == "note":
                 return Preview(answer.number, note=answer.note, models=tuple(answer.models))
             if answer.made == "grade":
-                return Preview(answer.number, grade=self._picture(answer.number).with_suffix(".gdf"))
+                file = self._picture(answer.number).with_suffix(".gdf")
+                return Preview(answer.number, grade=file, note=answer.note)
+            if answer.made == "palette":
+                return Preview(answer.number, palette=tuple(answer.palette))
             with Image.open(self._picture(answer.number)) as picture:
                 pixels = np.asarray(picture.convert("RGB"))
             return Preview(answer.number, pixels, follows=answer.follows)
@@ -218,6 +223,7 @@ class PreviewActions:
         self._pose: tuple[int, ViewCamera, tuple[int, int]] | None = None  # of which a sentence's picture is
         self._painted: tuple[_Request, NDArray[np.uint8]] | None = None  # that picture
         self._sent_at = 0.0
+        self._palette_of = ""  # the region whose colors the form has
         self._painting: PaintedView | None = None
 
     def handle(self, request: str) -> bool:
@@ -333,7 +339,7 @@ class PreviewActions:
     def leave_scene(self) -> None:
         """The child is for a scene that is not open any more."""
         self._end()
-        self._grade = self._painting = None
+        self._grade, self._painting, self._palette_of = None, None, ""
         self._broken = False
 
     def close(self) -> None:
@@ -349,9 +355,13 @@ class PreviewActions:
         form, view = work.form, work.view
         of_sentence = form.choice.setting == "sentence"
         pictured = (form.preview and form.choice.pictured) or of_sentence
-        if not (work.form_open and view.panel and pictured) or form.obstacle:
+        if not (work.form_open and view.panel and pictured) or form.obstacle not in ("", STILL):
             return None
         region = f"{form.region}|{form.typed_region}|{hash(view.selection.members)}"
+        if form.choice.setting == "grade" and self._palette_of != region:
+            return _Request(region, "grade", 1.0, ViewCamera(), size, view.background)
+        if form.obstacle:
+            return None
         if of_sentence:  # a picture takes its time: it is of the view in which it was asked for
             if self._pose is None or self._pose[0] != form.asks:
                 self._pose = form.asks, view.camera, size
@@ -390,13 +400,19 @@ class PreviewActions:
                 self._end()
             self._end_live()
             self._show(answer.error, None, failed=True, models=answer.models)
-        elif answer.note and answer.number == self._number:
+        elif answer.palette is not None and self._sent is not None and answer.number == self._number:
+            self._palette_of, work = self._sent.region, self._app.main_view.work
+            if all(source == target for source, target in work.form.palette):
+                form = replace(work.form, palette=tuple((color, color) for color in answer.palette))
+                self._app.main_view.work = replace(work, form=form)
+            self._app.main_view.wake()
+        elif answer.note and answer.grade is None and answer.number == self._number:
             self._show(answer.note, None, models=answer.models)
         elif answer.grade is not None and self._sent is not None and answer.number == self._number:
             gdf = load_gdf(answer.grade, self._app.document.original)
             self._grade = self._sent, gdf, answer.grade
             self._app.main_view.live = ()  # of the last color
-            self._show("Live: turn it, slide it", None)
+            self._show(f"Live: {answer.note}", None)
         elif answer.pixels is not None and self._sent is not None and answer.number == self._number:
             kind, _, what = self._sent.editor.partition(":")
             title = next(choice.title for choice in EDITORS if choice.kind == kind)

@@ -1,0 +1,104 @@
+"""The main colors of a region, and the maps of color that a hand makes: a palette, a curve of lightness."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from progdf.color import edits as color
+from progdf.color.oklab import srgb_to_oklab
+from progdf.color.palette import COLORS, bend_lightness, find_palette, shift_palette
+from tests.helpers.draws import Draws
+
+LAWN, BEAR, SCARF, STONE = (color.parse_color(c) for c in ("#7eae44", "#b97a30", "#c01830", "#a09a90"))
+
+
+def scene(counts: dict[int, torch.Tensor]) -> torch.Tensor:
+    """So many colors about each of some."""
+    draws = Draws(5)
+    return torch.cat([c + 0.02 * draws.normal(n, 3).float() for n, c in counts.items()]).clamp(0, 1)
+
+
+def test_a_palette_has_the_large_colors_first_and_a_small_one_that_is_unlike_them() -> None:
+    rgb = scene({6000: LAWN, 3000: BEAR, 1000: STONE, 150: SCARF})
+    found = find_palette(rgb, torch.ones(len(rgb)))
+    assert len(found) <= COLORS
+    for place, expected in enumerate((LAWN, BEAR, STONE)):
+        assert (found[place] - expected).abs().max() < 0.04
+    assert (found - SCARF).abs().amax(dim=1).min() < 0.05
+    assert len(find_palette(rgb, torch.zeros(len(rgb)))) == 0
+    assert len(find_palette(LAWN.expand(50, 3), torch.ones(50))) == 1
+
+
+def test_a_scarf_is_a_main_color_beside_two_like_greens_of_a_lawn() -> None:
+    pale, dark = color.parse_color("#a4c860"), color.parse_color("#201810")
+    rgb = scene({30_000: LAWN, 29_000: pale, 9000: BEAR, 8000: STONE, 7000: dark, 1000: SCARF})
+    found = find_palette(rgb, torch.ones(len(rgb)))
+    assert (found - SCARF).abs().amax(dim=1).min() < 0.1
+
+
+def test_what_is_not_seen_is_in_no_palette() -> None:
+    rgb, weights = torch.stack([LAWN, SCARF]), torch.tensor([1.0, 0.0])
+    assert torch.allclose(find_palette(rgb, weights), LAWN[None], atol=1e-5)
+
+
+def test_sources_become_their_targets_and_colors_that_are_held_stay() -> None:
+    blue = color.parse_color("#3060d0")
+    asked = color.ColorGrade(palette=((LAWN, blue), (BEAR, BEAR), (STONE, STONE)))
+    made = color.grade_fully(torch.stack([LAWN, BEAR, STONE]), asked)
+    assert torch.allclose(made, torch.stack([blue, BEAR, STONE]), atol=2e-3)
+    lawn = scene({500: LAWN})
+    assert (color.grade_fully(lawn, asked).mean(dim=0) - blue).abs().max() < 0.06
+    ends = torch.tensor([[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
+    assert torch.allclose(color.grade_fully(ends, asked), ends, atol=5e-3)
+
+
+def test_of_several_colors_each_goes_all_the_way_with_its_nearest_one() -> None:
+    blue = color.parse_color("#3060d0")
+    lab = srgb_to_oklab(torch.stack([LAWN, BEAR, STONE, blue, color.parse_color("#a8d860")]))
+    targets = torch.stack([lab[3], lab[1], lab[2]])
+    lime = shift_palette(lab[4:], lab[:3], targets)[0]
+    assert torch.allclose(lime - lab[4], lab[3] - lab[0], atol=0.02)
+
+
+def test_a_single_color_takes_those_near_it_along_and_leaves_far_ones() -> None:
+    lab = srgb_to_oklab(torch.stack([SCARF, LAWN, STONE]))
+    target = srgb_to_oklab(torch.tensor([[0.2, 0.3, 0.9]]))
+    made = shift_palette(lab, lab[:1], target)
+    assert torch.allclose(made[0], target[0], atol=1e-5)
+    assert (made[1:] - lab[1:]).abs().max() < 0.02
+
+
+def test_the_map_of_a_palette_has_no_steps() -> None:
+    sources = srgb_to_oklab(torch.stack([LAWN, BEAR, STONE, SCARF]))
+    targets = sources.clone()
+    targets[0] = torch.tensor([0.5, 0.0, -0.15])
+    line = torch.lerp(sources[0], sources[1], torch.linspace(0, 1, 2001)[:, None])
+    steps = (shift_palette(line, sources, targets) - line).diff(dim=0).norm(dim=1)
+    assert steps.max() < 12 * (targets[0] - sources[0]).norm() / 2000
+
+
+@pytest.mark.parametrize("curve", [((0.25, 0.1), (0.75, 0.9)), ((0.5, 0.3),), ((0.0, 0.2), (1.0, 0.7))])
+def test_a_curve_passes_its_points_and_never_leaves_their_range(
+    curve: tuple[tuple[float, float], ...],
+) -> None:
+    at = torch.tensor([x for x, _ in curve])
+    assert torch.allclose(bend_lightness(at, curve), torch.tensor([y for _, y in curve]), atol=1e-3)
+    made = bend_lightness(torch.linspace(0, 1, 500), curve)
+    assert (made.diff() >= -1e-6).all()
+    assert torch.allclose(bend_lightness(torch.linspace(0, 1, 9), ()), torch.linspace(0, 1, 9), atol=1e-6)
+
+
+def test_a_curve_moves_lightness_and_keeps_the_hue() -> None:
+    asked = color.ColorGrade(curve=((0.5, 0.35),))
+    rgb = torch.stack([LAWN, BEAR])
+    before, after = srgb_to_oklab(rgb), srgb_to_oklab(color.grade_fully(rgb, asked))
+    assert (after[:, 0] < before[:, 0] - 0.05).all()
+    hues = [torch.atan2(lab[:, 2], lab[:, 1]) for lab in (before, after)]
+    assert torch.allclose(*hues, atol=0.02)
+
+
+def test_a_grade_of_palette_and_curve_is_exact_at_strength_0() -> None:
+    asked = color.ColorGrade(palette=((LAWN, SCARF),), curve=((0.5, 0.3),))
+    rgb = scene({50: LAWN})
+    assert torch.equal(color.grade_course(rgb, asked)(0.0), rgb)

@@ -1,0 +1,85 @@
+"""A grade in the form of a new edit, by mouse: its palette, its curve, and a color picked in the picture."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import pytest
+from imgui_bundle import imgui
+
+from progdf.color.edits import parse_color
+from tests.helpers.ui_rig import Rig, bear, first_view, rig
+from viewer.jobs.training import EDITORS, NewEdit
+from viewer.panel import new_edit_form, panel
+
+pytestmark = pytest.mark.gl
+WINDOW = (1024, 800)
+COLORS = ("#7eae44", "#b97a30", "#a09a90")
+FORM = NewEdit(
+    editor=next(i for i, editor in enumerate(EDITORS) if editor.kind == "grade"),
+    palette=tuple((color, color) for color in COLORS),
+)
+LEFT = WINDOW[0] - panel.WIDTH_PX + 12.0 + 10.0 + new_edit_form.COLUMN_PX
+
+
+@pytest.fixture
+def hand() -> Iterator[Rig]:
+    with rig(first_view(bear(), 0.0, 0.0), WINDOW) as made:
+        made.main_view.work = replace(made.main_view.work, form=FORM, form_open=True)
+        made.frame(3)
+        yield made
+
+
+def form(hand: Rig) -> NewEdit:
+    return hand.main_view.work.form
+
+
+def test_a_press_on_the_curve_makes_a_point_and_drags_it_and_a_right_click_takes_it_away(hand: Rig) -> None:
+    tall, wide = new_edit_form._CURVE_PX, WINDOW[0] - 22.0 - LEFT
+    top = 438.0
+
+    def place(x: float, y: float) -> tuple[float, float]:
+        return LEFT - 10.0 + x * wide, top + (1.0 - y) * tall
+
+    hand.drag(place(0.3, 0.3), place(0.3, 0.15))
+    ((x, y),) = form(hand).curve
+    assert x == pytest.approx(0.3, abs=0.06)
+    assert y == pytest.approx(0.15, abs=0.06)
+    hand.drag(place(0.7, 0.7), place(0.1, 0.9))
+    assert [round(b > a) for a, b in form(hand).curve] == [0, 1]
+    assert form(hand).curve[0][0] < form(hand).curve[1][0], "points never pass each other"
+    hand.move(*place(x, y))
+    hand.press(1)
+    hand.release(1)
+    assert len(form(hand).curve) == 1
+
+
+def test_a_swatch_opens_a_picker_and_a_right_click_takes_the_change_back(hand: Rig) -> None:
+    y, x = 202.0, LEFT + 4.0
+    moved = ((COLORS[0], "#3060d0"), *FORM.palette[1:])
+    hand.main_view.work = replace(hand.main_view.work, form=replace(form(hand), palette=moved))
+    hand.frame(2)
+    hand.move(x, y)
+    hand.press(1)
+    hand.release(1)
+    assert form(hand).palette == FORM.palette
+    hand.click(x, y)
+    hand.frame(2)
+    assert len(imgui.get_current_context().open_popup_stack) == 1
+
+
+def test_a_click_on_the_picture_takes_its_color_into_the_palette_and_moves_nothing(hand: Rig) -> None:
+    before = hand.main_view.work
+    hand.main_view.work = replace(before, form=replace(FORM, picks=True))
+    hand.frame(2)
+    x, y = (WINDOW[0] - panel.WIDTH_PX) / 2, 0.33 * WINDOW[1]
+    shown = hand.picture()[round(y), round(x)] / 255
+    hand.click(x, y)
+    hand.frame(2)
+    picked = form(hand).palette[-1][0]
+    assert abs(parse_color(picked).numpy() - shown).max() < 0.12, (
+        "the pixel's color, as it has it from no side"
+    )
+    assert not form(hand).picks
+    assert (hand.main_view.work.view, hand.main_view.work.focus) == (before.view, before.focus)
