@@ -232,7 +232,8 @@ def with_settings(form: NewEdit, instruction: str) -> NewEdit | None:
                 fits = all(low <= grade[name] <= high for name, (low, high, _) in GRADE_RANGES.items())
                 curve = tuple((float(x), float(y)) for x, y in points)
                 made = replace(form, grade=tuple(grade.values()), palette=palette, curve=curve)
-                return made if fits else None
+                known = {name for name in values if not name.startswith("#")} <= {*grade, "curve", ""}
+                return made if fits and known else None
             case "style":
                 return replace(form, style=int(rest)) if int(rest) in range(STYLES) else None
             case "sentence":
