@@ -156,18 +156,19 @@ def fit_grades(
     recorded = torch.stack([trajectory.node(i) for i in nodes])
     course = lowest_bands(recorded, trajectory.bands) - mapped[:, :, : 3 * trajectory.bands]
     evaluator, budget = field_evaluator(trajectory, choosing, options.target_psnr), options.bytes_budget
-    tried, serving = list[Candidate](), 0
+    tried, serving, smallest = list[Candidate](), 0, math.inf
     for rank in range(rank_limit(course) + 1):
         for coarser in COARSER[: None if rank else 1]:
             form = fit_grade(trajectory.s[nodes], degree, table, course, rank, weights, mask, coarser)
-            if tried and form.bytes_per_member > (budget or math.inf):
+            if tried and form.bytes_per_member > (smallest if budget is None else budget):
                 continue
             field = replace(bake_grade(form, rows, mapped), recorded=tuple(trajectory.s.tolist()))
             tried.append(evaluator.candidate(field, form.label))
-            if tried[-1].excess > 1.0 and budget is None:
+            if budget is None and tried[-1].excess > 1.0:
                 break
-        serving += tried[-1].excess <= 1.0 or coarser > 1
-        if budget is None and (serving > 1 or (serving and not rank)):
+            smallest = form.bytes_per_member
+        serving += smallest < math.inf
+        if budget is None and (serving > 1 or (not rank and serving)):
             break
     return _measure_choice(pick_candidate(tried, evaluator.wanted, budget), trajectory, reporting)
 

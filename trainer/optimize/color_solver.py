@@ -10,8 +10,9 @@ views that are not solved for, at the full strength: the least of which more wou
 twentieth of the error. They also say when a strength has had enough steps.
 
 A handful of pictures (`trainer.optimize.ties`) leaves most members undecided. There neighbors on one surface
-have residuals alike, what hardly shines through others is not asked, and how far a residual travels before it
-fades into the map is decided on squares of the pictures that are not solved for.
+have residuals alike, what hardly shines through others is not asked where one picture alone shows it, and how
+far a residual travels before it fades into the map is decided on squares of the pictures that are not solved
+for.
 """
 
 from __future__ import annotations
@@ -62,6 +63,7 @@ _RIDGE = 0.002  # of a typical member's weight: holds the residual of what hardl
 _TIES = 0.001  # of a typical member's weight: ties neighbors, where views are few
 _TRUSTED = 0.1  # of the same: a member of less is rather as its neighbors are
 _HOLDS = (1e-8, 1e-5, 1e-3)  # ridges tried there: a residual goes around all, some way, to its neighbors
+_SHOWS = 0.5  # pixels of a member in each of two pictures, from which on these say what it is
 _PATTERN = 0.15  # of what a map alone leaves of the members' changes: a mask that leaves more is none
 _SHARES = (1.0, 0.5, 0.2)  # of a step, where the whole of it would run into clamps
 _LOOKS = 3  # steps over which that is taken: a single one may gain nothing in other views
@@ -336,7 +338,9 @@ def make_solver(views: Sequence[ColorView], original: Tensor, ties: Ties | None 
         csr_matrix((len(original), len(original)), dtype=np.float32),
     )
     if ties is not None:
-        asked = ties.clear.to(weights.device) & (weights[:, 0, 0] > 0.0)
+        shown = torch.stack(map_views(lambda view: view.map.gradient(view.counts * ones[:1])[:, 0], views))
+        twice = (shown > _SHOWS).sum(dim=0) > 1
+        asked = (ties.clear.to(weights.device) | twice) & (weights[:, 0, 0] > 0.0)
         held = ties.of(asked.cpu()) * np.float32(_TIES * float(weights[asked, 0].mean()))
     share = original.new_ones(len(original))
     return Solver(views, member_bands(original), weights, fit_maps(views, share), share, ties, asked, held)
