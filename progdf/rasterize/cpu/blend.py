@@ -586,17 +586,15 @@ def list_weights(
     """List what the splats weigh in tiles begin … end − 1.
 
     Args:
-        rows: the row under which a Gaussian is listed, −1: not at all. [N] int32
-        places: the number under which a pixel of the window is listed, −1: not at all. [h·w] int32
-        write: whether to fill the lists, or only to count
+        rows, places: of each Gaussian and pixel in the lists, −1: not listed. [N], [h·w] int32
+        write: whether to fill `out`, or only to count
         cursors: runs and entries of each tile, out; where they begin if `write`. [tiles,2] int64
-        out: where `write`
     """
     for tile in range(begin, end):
         run, entry = (cursors[tile, 0], cursors[tile, 1]) if write else (0, 0)
-        members = lists.members[lists.starts[tile] : lists.starts[tile + 1]]
+        own = lists.members[lists.starts[tile] : lists.starts[tile + 1]]
         run, entry = _list_tile(
-            tile, splats, rows, places, camera, members, scratch.state, write, run, entry, out
+            tile, splats, rows, places, camera, own, scratch.state, write, run, entry, out
         )
         if not write:
             cursors[tile, 0], cursors[tile, 1] = run, entry
