@@ -9,12 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from progdf.gaussians import ShownInNotebooks, attribute_slices
+from progdf.io.tensors import deflate
 
 from .neural import NeuralField
 
@@ -298,10 +300,16 @@ class GradeForm:
         side = 0 if self.degree else lattice_side(self.table.shape[1])
         return f"grade of {f'degree {self.degree}' if self.degree else f'{side}³ colors'}, {beside}"
 
+    @cached_property
+    def packed_levels(self) -> dict[str, Tensor]:
+        """What there is by member, as a file keeps it: see `deflate`, channel by channel. [B] uint8 each"""
+        packed = {"residual": deflate(self.residual.movedim(2, 1))} if len(self.residual) else {}
+        return packed if self.mask is None else packed | {"mask": deflate(self.mask)}
+
     @property
     def bytes_per_member(self) -> float:
         """Stored bytes for one member; the map is the region's."""
-        return float(self.residual.shape[0] * self.residual.shape[2] + (self.mask is not None))
+        return sum(map(len, self.packed_levels.values())) / max(1, self.members)
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,7 @@ from .baked import (
     lattice_side,
     remap_slider,
 )
-from .separable import fit_course, quantize_bases
+from .separable import fit_course
 
 MOST_COLOR = 1.5
 """Colors above this, which no screen shows, are mapped as this."""
@@ -44,6 +44,8 @@ _DIRECTIONS = 32  # in which a member's color is mapped; twice the functions of 
 _CHUNK = 1 << 11  # members at once
 MOST_RESIDUALS = 4
 """Bases of a residual that are tried."""
+COARSER = (1, 2, 3, 4, 6, 8)
+"""Steps of a residual's levels that are tried, the finest of 8 bits 1."""
 _WITHIN = 0.999  # share of the members whose residual is reached: few must not take the levels of all
 
 
@@ -274,6 +276,7 @@ def fit_grade(
     rank: int,
     weights: Tensor,
     mask: Tensor | None = None,
+    coarser: int = 1,
 ) -> GradeForm:
     """A grade whose residual has so many bases.
 
@@ -285,6 +288,7 @@ def fit_grade(
         rank: number of bases, at most `rank_limit`
         weights: how much an error of each member shows, ≥ 0. [M]
         mask: see `GradeForm`
+        coarser: how many of the steps that 8 bits have one of its steps is; they compress the better
     """
     root = weights.sqrt()[:, None]
     reach = course.abs().amax(dim=0).kthvalue(max(1, math.ceil(_WITHIN * course.shape[1])), dim=0).values
@@ -293,7 +297,9 @@ def fit_grade(
     _, vectors = torch.linalg.eigh((rows @ rows.T).double())
     mix = vectors.flip(1)[:, :rank].T.float()
     exact = (mix @ course.flatten(1)).reshape(rank, *course.shape[1:])
-    levels, scale = quantize_bases(exact, torch.int8)
+    # one step for all, as all are of colors: channels that hardly move take few levels, and compress
+    step = coarser / 127.0 * (float(exact.abs().max()) if exact.numel() else 0.0) or 1.0
+    levels, scale = (exact / step).round().to(torch.int8), torch.full((rank, exact.shape[2]), step)
     columns = (levels * scale[:, None] * root).flatten(1)
     normal = (columns @ columns.T).double()
     coefficients = (rows @ columns.T).double() @ torch.linalg.pinv(normal, rtol=1e-9, hermitian=True)

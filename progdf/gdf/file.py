@@ -274,7 +274,7 @@ def _unpack(header: GdfHeader, tensors: Mapping[str, Tensor]) -> Gdf:
         raise ValueError(f"{broken} has a number that is not finite")
     if not 0 <= header.scene.count <= MOST_GAUSSIANS or header.members > header.scene.count:
         raise ValueError(f"{header.members} members of a scene of {header.scene.count} Gaussians")
-    field = unpack_field(header.field, tensors)
+    field = unpack_field(header.field, tensors, header.members)
     _check_reach(field)
     members = field.members if field.attributes else header.members + header.added
     if field.origin is not None:

@@ -24,9 +24,10 @@ from progdf.field.baked import AttributeBases, BakedField, BakePlan, GradeForm, 
 from progdf.field.neural import NeuralField, NeuralShape
 from progdf.gaussians import ATTRIBUTES, ZERO, Gaussians, Origin
 from progdf.io.json_values import convert_json, decode_json
+from progdf.io.tensors import inflate
 from progdf.region import Region
 
-FORMAT = 5
+FORMAT = 6
 """The version of the file format."""
 
 MOST_GAUSSIANS = 1 << 26
@@ -36,6 +37,7 @@ _MOST_HEADER = 1 << 24  # bytes; a report takes a few kB, and JSON of 100 MB cou
 _METADATA = "progdf"  # the one key: the library writes several in an order that differs from run to run
 _PARTS = ("end_offset", "residual_basis", "scale", "coefficients")  # of `AttributeBases`
 _GRADE = ("knots", "table", "residual", "scale", "coefficients")  # of `GradeForm`
+_PACKED = ".packed"  # of what a grade has by member, see `GradeForm.packed_levels`
 _ADDED = "added."
 _NETWORK = "network."
 _END_CORRECTION = "end_correction."
@@ -190,11 +192,9 @@ def pack_field(field: BakedField) -> tuple[FieldHeader, dict[str, Tensor]]:
         return header, tensors
     form = field.origin
     if isinstance(form, GradeForm):
-        tensors = {name: getattr(form, name) for name in _GRADE} | {
-            "remap": torch.stack([form.remap.old, form.remap.new])
-        }
-        if form.mask is not None:
-            tensors["mask"] = form.mask
+        tensors = {name: getattr(form, name) for name in _GRADE if name not in form.packed_levels}
+        tensors |= {name + _PACKED: levels for name, levels in form.packed_levels.items()}
+        tensors["remap"] = torch.stack([form.remap.old, form.remap.new])
         return msgspec.structs.replace(header, attributes=[], grade=form.degree), tensors
     network, plan = form.network, form.plan
     tensors = {_NETWORK + name: tensor for name, tensor in network.tensors.items()}
@@ -206,8 +206,10 @@ def pack_field(field: BakedField) -> tuple[FieldHeader, dict[str, Tensor]]:
     return msgspec.structs.replace(header, network=part), tensors
 
 
-def unpack_field(header: FieldHeader, tensors: Mapping[str, Tensor]) -> BakedField:
+def unpack_field(header: FieldHeader, tensors: Mapping[str, Tensor], members: int) -> BakedField:
     """The inverse of `pack_field`; of a network, a field that is not baked yet and moves nothing.
+
+    `members`: that a grade has
 
     Raises:
         ValueError, KeyError, TypeError: the parts do not fit each other.
@@ -218,12 +220,13 @@ def unpack_field(header: FieldHeader, tensors: Mapping[str, Tensor]) -> BakedFie
             raise ValueError(f"unknown attribute {name}")
     if header.grade is not None:
         old, new = tensors["remap"].double()
-        grade = GradeForm(
-            header.grade,
-            **{name: tensors[name] for name in _GRADE},
-            remap=SliderRemap(old, new),
-            mask=tensors.get("mask"),
-        )
+        parts = {name: tensors[name] for name in (*_GRADE, "mask") if name in tensors}
+        bases, channels = tensors["scale"].shape
+        if (levels := tensors.get("residual" + _PACKED)) is not None:  # since format 6
+            parts["residual"] = inflate(levels, (bases, channels, members), torch.int8).movedim(1, 2)
+        if (levels := tensors.get("mask" + _PACKED)) is not None:
+            parts["mask"] = inflate(levels, (members,), torch.uint8)
+        grade = GradeForm(header.grade, **parts, remap=SliderRemap(old, new))
         return BakedField("grade", torch.tensor([0.0, 1.0]), {}, header.channels, recorded, grade)
     if header.network is None:
         attributes = {

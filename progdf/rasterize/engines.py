@@ -122,14 +122,17 @@ class RasterView:
 
 
 class ColorMap(Protocol):
-    """What each of M Gaussians weighs in each pixel of a window: αT, for as long as nothing moves."""
+    """What each of M Gaussians weighs in each pixel of a window: αT, for as long as nothing moves.
+
+    [h,w,3] of the whole window, [P,3] where it is of some pixels.
+    """
 
     def picture(self, colors: Tensor) -> Tensor:
-        """Σ αT·c of every pixel, on black. [M,3] -> [h,w,3]"""
+        """Σ αT·c of every pixel, on black. [M,3] -> [h,w,3] or [P,3]"""
         ...
 
     def gradient(self, image: Tensor) -> Tensor:
-        """The transpose: Σ αT·g of every Gaussian. [h,w,3] -> [M,3]"""
+        """The transpose: Σ αT·g of every Gaussian. [h,w,3] or [P,3] -> [M,3]"""
         ...
 
 
@@ -146,7 +149,9 @@ class RasterEngine(Protocol):
         """See `progdf.rasterize.alpha_weights`; colors are not read."""
         ...
 
-    def color_map(self, gaussians: ActivatedGaussians, view: RasterView, rows: Tensor) -> ColorMap:
+    def color_map(
+        self, gaussians: ActivatedGaussians, view: RasterView, rows: Tensor, pixels: Tensor | None
+    ) -> ColorMap:
         """See `color_map`; colors are not read."""
         ...
 
@@ -256,7 +261,12 @@ def alpha_weights(gaussians: Gaussians, camera: Camera, mask: Tensor, engine: st
 
 
 def color_map(
-    gaussians: ActivatedGaussians, camera: Camera, crop: Crop, rows: Tensor, engine: str = "cpu"
+    gaussians: ActivatedGaussians,
+    camera: Camera,
+    crop: Crop,
+    rows: Tensor,
+    engine: str = "cpu",
+    pixels: Tensor | None = None,
 ) -> ColorMap:
     """What some Gaussians weigh in a window of a view, as `render` draws it.
 
@@ -266,9 +276,10 @@ def color_map(
         crop: x0, y0, x1, y1 of the window
         rows: which of the N Gaussians, distinct. [M] int64
         engine: a key of `ENGINES`
+        pixels: which of the window's alone, numbered row by row, ascending; None: all. [P] int64
     """
     black = gaussians._replace(colors=torch.zeros_like(gaussians.means))
-    return get_engine(engine).color_map(black, RasterView.of(camera, black, crop), rows)
+    return get_engine(engine).color_map(black, RasterView.of(camera, black, crop), rows, pixels)
 
 
 def check_intersections(splats: int, pairs: int) -> None:

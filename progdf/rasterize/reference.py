@@ -60,12 +60,15 @@ def of_rows(gaussians: ActivatedGaussians, rows: Tensor | None) -> ActivatedGaus
     return gaussians.each(lambda tensor: tensor.detach().index_copy(0, rows, tensor[rows]))
 
 
-def color_map(gaussians: ActivatedGaussians, view: RasterView, rows: Tensor) -> ColorMap:
+def color_map(
+    gaussians: ActivatedGaussians, view: RasterView, rows: Tensor, pixels: Tensor | None
+) -> ColorMap:
     """See `progdf.rasterize.color_map`."""
     with torch.no_grad():
         splats, _ = project(gaussians, view)
     black = splats.colors.new_zeros(3)
-    return DrawnColors(splats, rows, len(gaussians.means), lambda some: blend(some, view.crop, black)[0])
+    count = len(gaussians.means)
+    return DrawnColors(splats, rows, count, pixels, lambda some: blend(some, view.crop, black)[0])
 
 
 @dataclass(frozen=True)
@@ -75,12 +78,14 @@ class DrawnColors:
     splats: ReferenceSplats
     rows: Tensor  # which of the N Gaussians have colors, the others are black. [M] int64
     count: int  # N
+    pixels: Tensor | None  # which of the window's; None: all. [P] int64
     draw: Callable[[ReferenceSplats], Tensor]  # on black, differentiable in the splats' colors. -> [h,w,3]
 
     def picture(self, colors: Tensor) -> Tensor:
         """See `ColorMap`."""
         every = colors.new_zeros(self.count, 3).index_copy(0, self.rows, colors)
-        return self.draw(replace(self.splats, colors=every[self.splats.rows].to(self.splats.colors)))
+        image = self.draw(replace(self.splats, colors=every[self.splats.rows].to(self.splats.colors)))
+        return image if self.pixels is None else image.flatten(0, 1)[self.pixels]
 
     def gradient(self, image: Tensor) -> Tensor:
         """See `ColorMap`."""

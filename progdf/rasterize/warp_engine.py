@@ -256,13 +256,15 @@ def rasterize(
     return image + transmittance[..., None] * background.to(image), transmittance, info
 
 
-def color_map(gaussians: ActivatedGaussians, view: RasterView, rows: Tensor) -> ColorMap:
+def color_map(
+    gaussians: ActivatedGaussians, view: RasterView, rows: Tensor, pixels: Tensor | None
+) -> ColorMap:
     """See `progdf.rasterize.color_map`."""
     with torch.no_grad():
         splats, info = project(gaussians.each(Tensor.double), view)
     lists, wanted = list_tiles(splats, view.crop), is_listed(splats, info, rows)
     return DrawnColors(
-        splats, rows, len(gaussians.means), lambda some: blend(some, lists, view.crop, wanted)[0]
+        splats, rows, len(gaussians.means), pixels, lambda some: blend(some, lists, view.crop, wanted)[0]
     )
 
 

@@ -43,6 +43,7 @@ _SIZE = 192  # pixels of a view; smaller ones mix colors, and the region's typic
 _ROUNDS, _VIEWS = 5, 3  # most rounds of new views, and views of a round, of which one is not fitted to
 _SECONDS = 0.5  # of the processor, after which no round follows
 _SETTLED = 0.99  # of the error: what the views of a round must get it below, for another round to follow
+_EVERY = 5  # which of its pixels, along the rows, are looked at
 _FITTED, _JUDGED = 1500, 500  # pixels that represent those of all views; a map has 60 numbers at most
 _EVENED = 6  # every such one of them decides how fast the slider goes
 
@@ -106,23 +107,25 @@ def draft_views(options: ViewOptions, editor: str, scene: Gaussians, region: Reg
 
 
 def _look(scene: Gaussians, region: Region, camera: Camera) -> tuple[View, ColorView]:
-    """`make_view` and `color_view` of a whole picture, of which each Gaussian is projected twice at most."""
+    """`make_view` and `color_view` of some pixels, as one row, of which each Gaussian is projected twice at
+    most."""
     members, background = region.members, torch.tensor(BACKGROUND)
     weights = basis(min(scene.sh_degree, 3), torch.nn.functional.normalize(scene.means - camera.position))
     colors = torch.einsum("nb,nbc->nc", weights, scene.sh[:, : weights.shape[1]]) + 0.5
-    box, shown = (0, 0, camera.width, camera.height), colors[members]
-    activated = activate(scene, colors.clamp_min(0.0))
-    weighed = color_map(activated, camera, box, members)
+    pixels, shown = torch.arange(camera.width * camera.height)[::_EVERY], colors[members]
+    count, activated = len(pixels), activate(scene, colors.clamp_min(0.0))
+    weighed = color_map(activated, camera, (0, 0, camera.width, camera.height), members, pixels=pixels)
     share = weighed.picture(torch.ones(len(members), 3))[..., :1]
     drawn = weighed.picture(shown.clamp_min(0.0))
     others = (1.0 - share) * background
     if len(members) < len(scene):
         with torch.no_grad():
-            others = render(activated, camera, background).image - drawn
+            others = render(activated, camera, background).image.flatten(0, 1)[pixels] - drawn
+    image, mask = (others + drawn).clamp(0.0, 1.0), share[:, 0].clamp(0.0, 1.0)
     inside = (drawn / share.clamp_min(1e-4)).clamp(0.0, 1.0)
-    view = View(camera, (others + drawn).clamp(0.0, 1.0), share[..., 0].clamp(0.0, 1.0), inside, box)
-    counts = torch.ones_like(share, dtype=torch.bool)
-    return view, ColorView(weighed, others, weights[members], shown, counts)
+    view = View(camera, image[None], mask[None], inside[None], (0, 0, count, 1))
+    row, counts = torch.arange(count), torch.ones_like(share, dtype=torch.bool)
+    return view, ColorView(weighed, others, weights[members], shown, (1, count), row, counts)
 
 
 def _sample(looked: Sequence[tuple[View, ColorView]], most: int) -> _Pixels:
@@ -216,6 +219,6 @@ def _drawn_error(views: DraftViews, table: Tensor, degree: int, expected: Tensor
     scene, judged = views.scene[views.region.members], views.judged
     sh = member_bands(pack(scene, with_shN=scene.sh_degree > 0))
     offsets = map_colors(sh, table, degree) - sh
-    pictures = [view.picture(view.colors(offsets)).clamp(0.0, 1.0).reshape(-1, 3) for view in judged.views]
+    pictures = [view.picture(view.colors(offsets)).clamp(0.0, 1.0) for view in judged.views]
     shown = [picture[places] for picture, places in zip(pictures, judged.places, strict=True)]
     return _error(torch.cat(shown), expected)

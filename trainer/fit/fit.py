@@ -13,7 +13,7 @@ from torch import Tensor
 from progdf.field import BakedField, Candidate, FieldChoice, FieldEvaluator, choose_field, fit_keyframes
 from progdf.field.baked import MONOMIALS, GradeForm, NeuralForm, identity_map
 from progdf.field.choose import MOST_SNAPSHOTS, SAMPLES, pick_candidate
-from progdf.field.grade import bake_grade, fit_grade, lowest_bands, mapped_bands, rank_limit
+from progdf.field.grade import COARSER, bake_grade, fit_grade, lowest_bands, mapped_bands, rank_limit
 from progdf.field.separable import moving_attributes
 from progdf.field.trajectory import Trajectory
 from progdf.gaussians import BASE_CHANNELS, Gaussians, attribute_slices
@@ -138,7 +138,8 @@ def fit_grades(
     weights: Tensor,
     options: FieldOptions,
 ) -> Fitted:
-    """The grade of a recorded map with the fewest bases beside it that serve, see `fit_field`.
+    """The grade of a recorded map with the smallest residual beside it that serves, see `fit_field`: the
+    fewest bases or one more, in levels as coarse as may be.
 
     Args:
         trajectory: what was recorded, with its maps
@@ -155,14 +156,19 @@ def fit_grades(
     recorded = torch.stack([trajectory.node(i) for i in nodes])
     course = lowest_bands(recorded, trajectory.bands) - mapped[:, :, : 3 * trajectory.bands]
     evaluator, budget = field_evaluator(trajectory, choosing, options.target_psnr), options.bytes_budget
-    tried = list[Candidate]()
+    tried, serving, smallest = list[Candidate](), 0, math.inf
     for rank in range(rank_limit(course) + 1):
-        form = fit_grade(trajectory.s[nodes], degree, table, course, rank, weights, mask)
-        if tried and form.bytes_per_member > (budget or math.inf):
-            break
-        field = replace(bake_grade(form, rows, mapped), recorded=tuple(trajectory.s.tolist()))
-        tried.append(evaluator.candidate(field, form.label))
-        if tried[-1].excess <= 1.0 and budget is None:
+        for coarser in COARSER[: None if rank else 1]:
+            form = fit_grade(trajectory.s[nodes], degree, table, course, rank, weights, mask, coarser)
+            if tried and form.bytes_per_member > (smallest if budget is None else budget):
+                continue
+            field = replace(bake_grade(form, rows, mapped), recorded=tuple(trajectory.s.tolist()))
+            tried.append(evaluator.candidate(field, form.label))
+            if budget is None and tried[-1].excess > 1.0:
+                break
+            smallest = form.bytes_per_member
+        serving += smallest < math.inf
+        if budget is None and (serving > 1 or (not rank and serving)):
             break
     return _measure_choice(pick_candidate(tried, evaluator.wanted, budget), trajectory, reporting)
 

@@ -10,8 +10,9 @@ views that are not solved for, at the full strength: the least of which more wou
 twentieth of the error. They also say when a strength has had enough steps.
 
 A handful of pictures (`trainer.optimize.ties`) leaves most members undecided. There neighbors on one surface
-have residuals alike, what hardly shines through others is not asked, and how far a residual travels before it
-fades into the map is decided on squares of the pictures that are not solved for.
+have residuals alike, what hardly shines through others is not asked where one picture alone shows it, and how
+far a residual travels before it fades into the map is decided on squares of the pictures that are not solved
+for.
 """
 
 from __future__ import annotations
@@ -62,6 +63,8 @@ _RIDGE = 0.002  # of a typical member's weight: holds the residual of what hardl
 _TIES = 0.001  # of a typical member's weight: ties neighbors, where views are few
 _TRUSTED = 0.1  # of the same: a member of less is rather as its neighbors are
 _HOLDS = (1e-8, 1e-5, 1e-3)  # ridges tried there: a residual goes around all, some way, to its neighbors
+_SHOWS = 0.5  # pixels of a member in each of two pictures, from which on these say what it is
+_PATTERN = 0.15  # of what a map alone leaves of the members' changes: a mask that leaves more is none
 _SHARES = (1.0, 0.5, 0.2)  # of a step, where the whole of it would run into clamps
 _LOOKS = 3  # steps over which that is taken: a single one may gain nothing in other views
 
@@ -141,7 +144,7 @@ class _Pull:
 
     descent: Tensor  # against the gradient of half the error. [M,b,3]
     error: float  # squared, with what holds the residual
-    # of each view, members' channels and pixels' that a clamp lets through. [M,3], [h,w,3] bool
+    # of each view, members' channels and pixels' that a clamp lets through. [M,3], [P,3] bool
     clamps: Sequence[tuple[Tensor, Tensor]]
 
 
@@ -172,7 +175,7 @@ class Solver:
 
     def find_mask(self, change: Tensor, targets: Sequence[Tensor], spreads: bool) -> Solver | None:
         """The same with the mask that these pictures ask for, in 255ths; None where it explains the members'
-        changes no better than a map alone.
+        changes little better than a map alone: stripes leave .01 to .1 of that, recolors .3 and more.
 
         Args:
             change: of the members, a guess. [M,B,3]
@@ -181,7 +184,7 @@ class Solver:
         """
         weights = self.weights[:, 0, 0]
         share, off = mask_of_members(self.sh[:, 0] * C0 + 0.5, change[:, 0] * C0, weights)
-        if off >= MORE_PAYS:
+        if off >= _PATTERN:
             return None
         if self.ties is not None:
             mean, say = weights @ share / weights.sum(), self.asked * weights / (_TRUSTED * self.typical)
@@ -219,6 +222,7 @@ class Solver:
             tell: called after each step
         """
         ridge, base = hold * self.typical, map_views(lambda view: view.colors(mapped), self.views)
+        targets = [view.pick(target) for view, target in zip(self.views, targets, strict=True)]
         look = None if judge is None else lambda now: judge.error(add_bands(mapped, now))
         start = start * self.asked[:, None, None]
         residual, first = self._descend(base, start, targets, ridge, steps, tell, look, floor)
@@ -334,7 +338,9 @@ def make_solver(views: Sequence[ColorView], original: Tensor, ties: Ties | None 
         csr_matrix((len(original), len(original)), dtype=np.float32),
     )
     if ties is not None:
-        asked = ties.clear.to(weights.device) & (weights[:, 0, 0] > 0.0)
+        shown = torch.stack(map_views(lambda view: view.map.gradient(view.counts * ones[:1])[:, 0], views))
+        twice = (shown > _SHOWS).sum(dim=0) > 1
+        asked = (ties.clear.to(weights.device) | twice) & (weights[:, 0, 0] > 0.0)
         held = ties.of(asked.cpu()) * np.float32(_TIES * float(weights[asked, 0].mean()))
     share = original.new_ones(len(original))
     return Solver(views, member_bands(original), weights, fit_maps(views, share), share, ties, asked, held)

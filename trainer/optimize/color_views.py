@@ -47,61 +47,79 @@ _B = TypeVar("_B")
 
 @dataclass(frozen=True)
 class ColorView:
-    """One training view's box as a function of the members' colors."""
+    """Pixels of one training view's box as a function of the members' colors."""
 
-    map: ColorMap  # what each member weighs in each pixel
-    others: Tensor  # what all but the members show, unclamped. [h,w,3]
+    map: ColorMap  # what each member weighs in each of the pixels
+    others: Tensor  # what all but the members show there, unclamped. [P,3]
     basis: Tensor  # weight of each band in each member's color from here. [M,B]
     original: Tensor  # the members' unclamped colors as they were. [M,3]
-    counts: Tensor  # the pixels that are looked at. [h,w,1] bool
+    size: tuple[int, int]  # height and width of the box
+    pixels: Tensor  # which of the box's, row by row. [P] int64
+    counts: Tensor  # which of these count. [P,1] bool
 
     def colors(self, offsets: Tensor) -> Tensor:
         """Unclamped. Offsets of the lowest bands [M,b,3] -> [M,3]"""
         return self.original + torch.einsum("mb,mbc->mc", self.basis[:, : offsets.shape[1]], offsets)
 
     def picture(self, colors: Tensor) -> Tensor:
-        """Unclamped. [M,3] -> [h,w,3]"""
+        """Unclamped. [M,3] -> [P,3]"""
         return self.others + self.map.picture(colors.clamp_min(0.0))
+
+    def pick(self, image: Tensor) -> Tensor:
+        """The pixels of the box. [h,w,3] -> [P,3]"""
+        return image.flatten(0, 1)[self.pixels]
 
     def error(self, offsets: Tensor, target: Tensor, power: float) -> float:
         """Sum of differences to some power, of colors 0..1. [M,b,3], [h,w,3]"""
         image = self.picture(self.colors(offsets)).clamp(0.0, 1.0)
-        return float(((image - target) * self.counts).abs().pow(power).sum())
+        return float(((image - self.pick(target)) * self.counts).abs().pow(power).sum())
 
     def halves(self) -> tuple[ColorView, ColorView]:
         """The view with every other square of its pixels, and with the others."""
-        height, width = self.counts.shape[:2]
-        side = max(1, max(height, width) // _SQUARES)
-        rows, columns = torch.arange(height)[:, None, None] // side, torch.arange(width)[:, None] // side
-        even = ((rows + columns) % 2 == 0).to(self.counts.device)
+        side = max(1, max(self.size) // _SQUARES)
+        rows, columns = self.pixels // self.size[1] // side, self.pixels % self.size[1] // side
+        even = ((rows + columns) % 2 == 0)[:, None].to(self.counts.device)
         return replace(self, counts=self.counts & even), replace(self, counts=self.counts & ~even)
 
 
-def color_view(crop: CropScene, original: Tensor, bands: int) -> ColorView:
-    """Prepare a view. `original`: raw member rows [M,14+]; `bands`: how many may change, DC among them."""
+def color_view(crop: CropScene, original: Tensor, bands: int, pixels: Tensor) -> ColorView:
+    """Prepare a view.
+
+    Args:
+        crop: its box
+        original: raw member rows [M,14+]
+        bands: how many may change, DC among them
+        pixels: which of the box's are looked at, row by row, ascending. [P] int64
+    """
     camera = crop.camera
     members = unpack(original, crop.member_shN)
     directions = torch.nn.functional.normalize(members.means - camera.position, dim=1)
     weights = basis(min(members.sh_degree, 3), directions)
     colors = (weights[..., None] * members.sh[:, : weights.shape[1]]).sum(dim=1) + 0.5
-    weighed = color_map(crop.gaussians, camera, crop.box, crop.rows, crop.engine)
+    weighed = color_map(crop.gaussians, camera, crop.box, crop.rows, crop.engine, pixels)
     picture = crop.original()
     if crop.cached is not None:
         live, constant = crop.cached
         picture = torch.where(live, picture, constant)
-    return ColorView(
-        weighed,
-        picture - weighed.picture(colors.clamp_min(0.0)),
-        weights[:, :bands].contiguous(),
-        colors,
-        torch.ones_like(picture[..., :1], dtype=torch.bool),
-    )
+    others = picture.flatten(0, 1)[pixels] - weighed.picture(colors.clamp_min(0.0))
+    counts = torch.ones_like(others[:, :1], dtype=torch.bool)
+    return ColorView(weighed, others, weights[:, :bands].contiguous(), colors, crop.size, pixels, counts)
 
 
-def color_views(crops: Sequence[CropScene], original: Tensor) -> list[ColorView]:
-    """All views, with all bands that are drawn. Each crop is looked at once, and not needed any more."""
+def color_views(crops: Sequence[CropScene], original: Tensor, every: int = 1) -> list[ColorView]:
+    """All views, with all bands that are drawn. Each crop is looked at once, and not needed any more.
+
+    `every`: of so many pixels one is looked at, in each view others: 1, 2, 4 or 8.
+    """
     bands = member_bands(original).shape[1]
-    return map_views(lambda i: color_view(crops[i], original, bands), range(len(crops)))
+
+    def make(index: int) -> ColorView:
+        crop = crops[index]
+        height, width = crop.size
+        place = torch.arange(width) + every // 2 * torch.arange(height)[:, None] + index
+        return color_view(crop, original, bands, (place % every == 0).flatten().nonzero()[:, 0])
+
+    return map_views(make, range(len(crops)))
 
 
 @dataclass(frozen=True)
@@ -110,7 +128,7 @@ class MapFit:
 
     design: Tensor  # what each pixel shows of every monomial. [P,20] float32
     original: Tensor  # what it showed before the edit, unclamped. [P,3]
-    pixels: Sequence[Tensor]  # which pixels of each view these are, one view after another. [p] int64
+    pixels: Sequence[Tensor]  # which of each view's box these are, one view after another. [p] int64
     normal: Tensor  # products of all pixels' monomials. [20,20] float64
     held: Tensor  # the same of the members', hidden or not, as far as they count. [20,20] float64
 
@@ -171,8 +189,8 @@ def fit_maps(views: Sequence[ColorView], share: Tensor, most: int = _MOST_PIXELS
         view, some = views[index], pixels[index]
         terms = monomials(view.original.T.clamp(0.0, MOST_COLOR), 3)
         planes: tuple[Tensor, ...] = torch.split(torch.cat([share * terms, terms[:1]]), 3)
-        shown = torch.cat([view.map.picture(plane.T).reshape(-1, 3)[some] for plane in planes], dim=1)
-        original = view.picture(view.original).reshape(-1, 3)[some]
+        shown = torch.cat([view.map.picture(plane.T)[some] for plane in planes], dim=1)
+        original = view.picture(view.original)[some]
         return shown[:, :20], original, (terms @ terms.T).double()
 
     covered = map_views(find_covered, views)
@@ -183,6 +201,7 @@ def fit_maps(views: Sequence[ColorView], share: Tensor, most: int = _MOST_PIXELS
     members = torch.stack([one[2] for one in laid]).sum(dim=0)
     wide = design.double()
     say = _MAP_HELD * len(design) / max(1, len(views) * len(views[0].original))
+    pixels = [view.pixels[some] for view, some in zip(views, pixels, strict=True)]
     return MapFit(design, original, pixels, wide.T @ wide, say * members)
 
 
@@ -239,7 +258,8 @@ def improve_mask(
         targets: pictures of the views
     """
     changes = [torch.einsum("mb,mbc->mc", view.basis, full) for view in views]
-    pairs = list(zip(views, changes, targets, strict=True))
+    picked = [view.pick(target) for view, target in zip(views, targets, strict=True)]
+    pairs = list(zip(views, changes, picked, strict=True))
 
     def weigh(pair: tuple[ColorView, Tensor, Tensor]) -> Tensor:
         view, size = pair[0], pair[1].abs()

@@ -36,7 +36,8 @@ class ErrorCurve:
 
     s: tuple[float, ...]  # slider values, ascending
     psnr: tuple[float, ...]  # over the pixels that count, dB, at most 99
-    ssim: tuple[float, ...]  # over the same, at most 1
+    seen_s: tuple[float, ...]  # those of them at which the others are taken, the last among them
+    ssim: tuple[float, ...]  # over the same pixels, at most 1
     # of the views' boxes, ≥ 0 (or what stands in for LPIPS, see `Evaluator.perceptual`)
     lpips: tuple[float, ...]
 
@@ -47,6 +48,7 @@ def error_curves(
     strengths: Sequence[float],
     truth: Pictures,
     perceptual: Perceptual,
+    most: int | None = None,
 ) -> dict[str, ErrorCurve]:
     """Each field's errors on held-out views, over the slider; see `picture_courses`."""
 
@@ -54,7 +56,7 @@ def error_curves(
         return lambda s: evaluator.pictures(field.offsets(s))
 
     pictures = {name: pictures_of(field) for name, field in fields.items()}
-    return picture_courses(evaluator, pictures, strengths, truth, perceptual)
+    return picture_courses(evaluator, pictures, strengths, truth, perceptual, most)
 
 
 def picture_courses(
@@ -63,6 +65,7 @@ def picture_courses(
     strengths: Sequence[float],
     truth: Pictures,
     perceptual: Perceptual,
+    most: int | None = None,
 ) -> dict[str, ErrorCurve]:
     """The errors of whatever shows the held-out views, over the slider.
 
@@ -72,23 +75,23 @@ def picture_courses(
         strengths: slider values, ascending
         truth: what the pictures should be at one of them. -> [h,w,3] each
         perceptual: LPIPS, or its stand-in
+        most: about how many strengths SSIM and LPIPS are taken at, which cost far more; None: all
     """
-    rows: dict[str, list[tuple[float, float, float]]] = {name: [] for name in pictures}
+    every = 1 if most is None else max(1, round(len(strengths) / most))
+    seen = tuple(strengths[::-1][::every][::-1])
+    psnr, rows = ({name: list[Any]() for name in pictures} for _ in range(2))
     for s in strengths:
         expected = truth(s)
         for name, picture_at in pictures.items():
             pictures_at = picture_at(s)
-            rows[name].append(
-                (
-                    evaluator.psnr(pictures_at, expected),
-                    evaluator.ssim(pictures_at, expected),
-                    evaluator.perceptual(pictures_at, expected, perceptual, "measured"),
-                )
-            )
+            psnr[name].append(evaluator.psnr(pictures_at, expected))
+            if s in seen:
+                ssim = evaluator.ssim(pictures_at, expected)
+                rows[name].append((ssim, evaluator.perceptual(pictures_at, expected, perceptual, "measured")))
         perceptual.forget()
     return {
-        name: ErrorCurve(tuple(strengths), *(tuple(row[i] for row in pictures_at) for i in range(3)))
-        for name, pictures_at in rows.items()
+        name: ErrorCurve(tuple(strengths), tuple(psnr[name]), seen, *zip(*rows[name], strict=True))
+        for name in pictures
     }
 
 
@@ -97,6 +100,7 @@ def against_editor(
     fields: Mapping[str, BakedField],
     stages: Sequence[tuple[float, float]],
     perceptual: Perceptual,
+    most: int | None = None,
 ) -> dict[str, ErrorCurve]:
     """Each field's errors against the editor's own pictures.
 
@@ -105,17 +109,18 @@ def against_editor(
         fields: by name
         stages: slider value and the strength that the editor was asked at, ascending
         perceptual: LPIPS, or its stand-in
+        most: see `picture_courses`
     """
     strength = dict(stages)
     return error_curves(
-        evaluator, fields, tuple(strength), lambda s: evaluator.edited[strength[s]], perceptual
+        evaluator, fields, tuple(strength), lambda s: evaluator.edited[strength[s]], perceptual, most
     )
 
 
 COMPARED = "keyframes2"
 """The baseline whose courses stand beside the field's: what anyone would do first."""
 
-_EVERY = 2  # of the strengths at which PSNR is taken, as SSIM and LPIPS cost more
+_SEEN = 4  # strengths at which SSIM and LPIPS are taken
 _ROUNDED = 1.5 / 255  # two images in 8 bits differ by as much
 _ALIKE = 0.05  # of color, by which `changed` tells a painted pixel where it knows nothing of how it was saved
 _NODES = 6  # recordings at which the field is looked at
@@ -177,13 +182,14 @@ def measure(
     (evaluator, reporting), field = judges, fitted.chosen.field
     fields = {"slider": field, COMPARED: fitted.baselines[COMPARED].field}
     slider = slider_statistics(lambda s: evaluator.pictures(shipped.offsets(s)), masks=evaluator.pixels)
-    samples = sample_strengths()[::_EVERY]
+    samples = sample_strengths()[:: len(sample_strengths()) // _SEEN]
     recorded = error_curves(
         reporting, fields, samples, lambda s: reporting.pictures(trajectory.at(s)), perceptual
     )
-    recorded = {n: replace(c, s=tuple(remap.at(s) for s in c.s)) for n, c in recorded.items()}
+    places = tuple(remap.at(s) for s in samples)
+    recorded = {n: replace(c, s=places, seen_s=places) for n, c in recorded.items()}
     stages = tuple((remap.at(s), strength) for s, strength in trajectory.stage_strengths)
-    drawn = against_editor(evaluator, {**fields, "slider": shipped}, stages, perceptual)
+    drawn = against_editor(evaluator, {**fields, "slider": shipped}, stages, perceptual, _SEEN)
     nodes = trajectory.s[1:-1][:: max(1, -(-(len(trajectory) - 2) // _NODES))].tolist()
     worst = min(
         (
@@ -208,7 +214,7 @@ def measure(
 
 def expected_measures(trajectory: Trajectory) -> int:
     """About how often `measure` looks at its views, for a progress bar."""
-    return 30 + 3 * len(sample_strengths()[::_EVERY]) + 2 * len(trajectory.stage_strengths) + 2 * _NODES
+    return 30 + 3 * (_SEEN + 1) + 2 * len(trajectory.stage_strengths) + 2 * _NODES
 
 
 def clip_curve(
@@ -318,6 +324,7 @@ def _to_lists(course: ErrorCurve) -> dict[str, list[float]]:
     return {
         "s": [_four(s) for s in course.s],
         "psnr": [round(value, 2) for value in course.psnr],
+        "seen_s": [_four(s) for s in course.seen_s],
         "ssim": [_four(value) for value in course.ssim],
         "lpips": [_four(value) for value in course.lpips],
     }

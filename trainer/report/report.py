@@ -132,14 +132,14 @@ def _against_trajectory(measured: Measured) -> list[Plot]:
         Plot("PSNR to the recorded trajectory, dB", curves, "slider", span=_SPAN),
         Plot(
             "SSIM to the trajectory",
-            _lines(measured.trajectory, lambda c: c.ssim),
+            _lines(measured.trajectory, lambda c: (c.seen_s, c.ssim)),
             "slider",
             high=1.0,
             span=_SPAN,
         ),
         Plot(
             f"{_distance(measured)} to the trajectory",
-            _lines(measured.trajectory, lambda c: c.lpips),
+            _lines(measured.trajectory, lambda c: (c.seen_s, c.lpips)),
             "slider",
             low=0.0,
             span=_SPAN,
@@ -151,14 +151,21 @@ def _against_editor(measured: Measured) -> list[Plot]:
     courses = measured.editor
     return [
         Plot(
-            "PSNR to the editor's own pictures, dB", _lines(courses, lambda c: c.psnr), "slider", span=_SPAN
+            "PSNR to the editor's own pictures, dB",
+            _lines(courses, lambda c: (c.s, c.psnr)),
+            "slider",
+            span=_SPAN,
         ),
         Plot(
-            "SSIM to the editor's pictures", _lines(courses, lambda c: c.ssim), "slider", high=1.0, span=_SPAN
+            "SSIM to the editor's pictures",
+            _lines(courses, lambda c: (c.seen_s, c.ssim)),
+            "slider",
+            high=1.0,
+            span=_SPAN,
         ),
         Plot(
             f"{_distance(measured)} to the editor's pictures",
-            _lines(courses, lambda c: c.lpips),
+            _lines(courses, lambda c: (c.seen_s, c.lpips)),
             "slider",
             low=0.0,
             span=_SPAN,
@@ -204,10 +211,8 @@ def _clip(direction: Direction) -> Plot:
     return Plot("CLIP directional similarity", {"slider": line}, "slider", low=0.0, span=_SPAN)
 
 
-def _lines(
-    courses: Mapping[str, ErrorCurve], value: Callable[[ErrorCurve], Sequence[float]]
-) -> dict[str, Points]:
-    return {_label(name): (course.s, value(course)) for name, course in courses.items()}
+def _lines(courses: Mapping[str, ErrorCurve], points: Callable[[ErrorCurve], Points]) -> dict[str, Points]:
+    return {_label(name): points(course) for name, course in courses.items()}
 
 
 def _distance(measured: Measured) -> str:

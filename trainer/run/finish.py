@@ -59,6 +59,7 @@ from .paint import sharpen
 from .record import RunRecord, render_run_views, reopen_run
 
 _RANK_VIEWS = 4
+_WEIGHED_EVERY = 2  # of the training views one says how visible the members are
 _REPORT_ALONE = (
     *("plan", "time", "memory_mb", "memory_by_stage_mb", "curves", "views", "pictures"),
     *("losses", "trajectory", "effort", "choice"),
@@ -196,12 +197,13 @@ def _fit(
         log.say("one view alone is held out: the field is chosen and reported on it")
     if not setup.held_out:
         log.say("no view is held out: all figures are of the views that were trained on")
-    with log.looks("weigh the members", len(setup.train)) as looked:
+    weighing = setup.train[::_WEIGHED_EVERY]
+    with log.looks("weigh the members", len(weighing)) as looked:
         members, scene = setup.region.members, setup.scene
         if trajectory.added is not None:
             count = len(trajectory.added)
             scene = scene.replace_rows(members[-count:], end_rows(setup, trajectory)[-count:])
-        weights = visibility(scene, members, setup.train, looked)
+        weights = visibility(scene, members, weighing, looked)
     few = setup.train[:: max(1, len(setup.train) // _RANK_VIEWS)][:_RANK_VIEWS]
     if options.field == "neural":
         seen = load_evaluator(folder, setup, few, trajectory)

@@ -531,7 +531,9 @@ def _record(
     setup = setup.extend(trajectory.added)
     with log.stage("retime"):
         costs: dict[str, float] = {}
-        if not only_recolors(trajectory.offsets) or trajectory.end.shape[1] > BASE_CHANNELS:
+        recolors = only_recolors(trajectory.offsets)
+        # of a grade nothing is dropped
+        if trajectory.maps is None and (not recolors or trajectory.end.shape[1] > BASE_CHANNELS):
             choosing, _ = load_evaluator(folder, setup, setup.judging, trajectory).halves()
             prunes = not optimization.as_printed
             trajectory, costs = drop_idle_attributes(trajectory, choosing, prunes)

@@ -114,6 +114,9 @@ PART = "training"
 _TIMED_VIEWS = 4  # in which the slider is timed; 8 or all at full size time it no better
 
 
+_ENOUGH = 12  # pixels for each number of a color that is solved for
+
+
 Way = Callable[[OnStep], Iterator[ParameterSnapshot]]
 """Optimizes from the state on, and yields recordings."""
 
@@ -260,10 +263,12 @@ def _prepare_colors(
     """The views to solve for, how much is modelled, the strengths; and what says when each is done."""
     engine = optimization.engine
     with log.stage("weights"):
-        drawn = color_views(crops, original)
-        judging = _judging(setup, drawn, original, edited, engine)
+        few = bool(options.views.pictures)
+        every = 1 if few else _stride(setup, original)
+        drawn = color_views(crops, original, every)
+        judging = _judging(setup, drawn, original, edited, engine, every)
         cameras = [view.camera for view in setup.train]
-        ties = surface_ties(setup.scene, setup.region.members, cameras) if options.views.pictures else None
+        ties = surface_ties(setup.scene, setup.region.members, cameras) if few else None
     with log.stage("model"):
         judge, finished = judging(edited[max(edited)]), _boxes(edited[max(edited)], setup.train, engine)
         solver, most = make_solver(drawn, original, ties), iterations(optimization.steps)
@@ -279,14 +284,27 @@ def _prepare_colors(
     return solver, model, edited, stages, [judging(pictures) for pictures in edited.values()]
 
 
+def _stride(setup: TrainingSetup, original: Tensor) -> int:
+    """Of how many pixels of the training views one is solved for, see `color_views`: half of them say as much
+    to some hundredths of a dB (docs/experiments.md, Pixels), fewer where many show each member."""
+    bands = 1 if original.shape[1] == BASE_CHANNELS else 4
+    pixels = sum(int((view.mask > 0.0).sum()) for view in setup.train) / (bands * len(original))
+    return next(every for every in (8, 4, 2) if every == 2 or pixels >= _ENOUGH * every)
+
+
 def _judging(
-    setup: TrainingSetup, drawn: Sequence[ColorView], original: Tensor, edited: Pictures, engine: str
+    setup: TrainingSetup,
+    drawn: Sequence[ColorView],
+    original: Tensor,
+    edited: Pictures,
+    engine: str,
+    every: int,
 ) -> Callable[[Sequence[Tensor]], Judge]:
     """All views' whole pictures of an edit -> the held-out views that choose, or all where there are none."""
     views, count = split_held_out(setup.held_out)[0], len(setup.train)
     if not views or len(edited[max(edited)]) <= count:
         return lambda pictures: Judge(drawn, _boxes(pictures, setup.train, engine))
-    choosing = color_views(_crops(setup, views, True, engine), original)
+    choosing = color_views(_crops(setup, views, True, engine), original, every)
     return lambda pictures: Judge(choosing, _boxes(split_held_out(pictures[count:])[0], views, engine))
 
 

@@ -527,8 +527,8 @@ def accumulate_weights(
 
 @kernel(contract=True, inline=True)
 def _list_tile(
-    tile: int, splats: Splats, rows: Array, camera: Pinhole, members: Array, through: Array, write: bool,
-    run: int, entry: int, out: Runs,
+    tile: int, splats: Splats, rows: Array, places: Array, camera: Pinhole, members: Array, through: Array,
+    write: bool, run: int, entry: int, out: Runs,
 ) -> tuple[int, int]:  # fmt: skip
     """One tile's runs and entries, written from `run` and `entry` on; those one past the last."""
     x, y = tile_corner(camera, tile)
@@ -562,9 +562,11 @@ def _list_tile(
                     through[i * TILE_W + j] = -before
                     continue
                 through[i * TILE_W + j] = after
-                if rows[s] >= 0:
+                if rows[s] < 0:
+                    continue
+                pixel = places[(y - camera.window[1] + i) * width + x - camera.window[0] + j]
+                if pixel >= 0:
                     if write:
-                        pixel = (y - camera.window[1] + i) * width + x - camera.window[0] + j
                         base = pixel if entry == begun else base
                         out.pixels[entry] = pixel - base
                         out.weights[entry] = alpha * before
@@ -579,19 +581,20 @@ def _list_tile(
 @kernel(cache=True)
 def list_weights(
     begin: int, end: int, scratch: TileScratch, splats: Splats, lists: TileLists, camera: Pinhole,
-    rows: Array, write: bool, cursors: Array, out: Runs,
+    rows: Array, places: Array, write: bool, cursors: Array, out: Runs,
 ) -> None:  # fmt: skip
     """List what the splats weigh in tiles begin … end − 1.
 
     Args:
-        rows: the row under which a Gaussian is listed, −1: not at all. [N] int32
-        write: whether to fill the lists, or only to count
+        rows, places: of each Gaussian and pixel in the lists, −1: not listed. [N], [h·w] int32
+        write: whether to fill `out`, or only to count
         cursors: runs and entries of each tile, out; where they begin if `write`. [tiles,2] int64
-        out: where `write`
     """
     for tile in range(begin, end):
         run, entry = (cursors[tile, 0], cursors[tile, 1]) if write else (0, 0)
-        members = lists.members[lists.starts[tile] : lists.starts[tile + 1]]
-        run, entry = _list_tile(tile, splats, rows, camera, members, scratch.state, write, run, entry, out)
+        own = lists.members[lists.starts[tile] : lists.starts[tile + 1]]
+        run, entry = _list_tile(
+            tile, splats, rows, places, camera, own, scratch.state, write, run, entry, out
+        )
         if not write:
             cursors[tile, 0], cursors[tile, 1] = run, entry

@@ -6,6 +6,7 @@ The image and the gradients are the same bits in every run and for every number 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -268,12 +269,12 @@ class ListedWeights:
     """A color map as lists of weights."""
 
     count: int  # M
-    size: tuple[int, int]  # height and width of the window
+    size: tuple[int, ...]  # height and width of the window, or how many of its pixels
     runs: Runs
 
     def picture(self, colors: Tensor) -> Tensor:
         """See `ColorMap`."""
-        image = np.zeros((self.size[0] * self.size[1], 3), np.float32)
+        image = np.zeros((math.prod(self.size), 3), np.float32)
         add_images(self.runs, to_float32(colors).numpy(), image)
         return torch.from_numpy(image).view(*self.size, 3)
 
@@ -284,21 +285,28 @@ class ListedWeights:
         return torch.from_numpy(colors)
 
 
-def color_map(gaussians: ActivatedGaussians, view: RasterView, rows: Tensor) -> ListedWeights:
+def color_map(
+    gaussians: ActivatedGaussians, view: RasterView, rows: Tensor, pixels: Tensor | None
+) -> ListedWeights:
     """See `progdf.rasterize.engines.color_map`."""
-    pinhole, crop = make_pinhole(view), view.crop
+    pinhole, (x0, y0, x1, y1) = make_pinhole(view), view.crop
+    window = (y1 - y0) * (x1 - x0)
+    chosen = np.arange(window) if pixels is None else pixels.numpy()
+    places = np.full(window, -1, np.int32)
+    places[chosen] = np.arange(len(chosen), dtype=np.int32)
     listed = np.full(len(gaussians.means), -1, np.int32)
     listed[rows.numpy()] = np.arange(len(rows), dtype=np.int32)
     splats, lists = bin_view(gaussians, pinhole)
     counts = np.zeros((len(lists.starts) - 1, 2), np.int64)
-    index = np.dtype(np.uint16 if TILE_H * (crop[2] - crop[0]) < 1 << 16 else np.uint32)
-    share_tiles(list_weights, pinhole, splats, lists, pinhole, listed, False, counts, _new_runs(0, 0, index))
+    index = np.dtype(np.uint16 if TILE_H * (x1 - x0) < 1 << 16 else np.uint32)
+    share_tiles(
+        list_weights, pinhole, splats, lists, pinhole, listed, places, False, counts, _new_runs(0, 0, index)
+    )
     run_count, entries = counts.sum(axis=0).tolist()
     runs = _new_runs(run_count, entries, index)
     cursors = np.cumsum(counts, axis=0) - counts
-    share_tiles(list_weights, pinhole, splats, lists, pinhole, listed, True, cursors, runs)
-    x0, y0, x1, y1 = crop
-    return ListedWeights(len(rows), (y1 - y0, x1 - x0), runs)
+    share_tiles(list_weights, pinhole, splats, lists, pinhole, listed, places, True, cursors, runs)
+    return ListedWeights(len(rows), (y1 - y0, x1 - x0) if pixels is None else (len(pixels),), runs)
 
 
 def _new_runs(runs: int, entries: int, index: np.dtype[Any]) -> Runs:

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import safetensors.torch
 import torch
 from torch import Tensor
 
@@ -13,6 +14,7 @@ from progdf.compose.reference import Layer, compose_layers
 from progdf.errors import ProgdfError
 from progdf.field.baked import MONOMIALS, GradeForm, SliderRemap, identity_map, identity_remap, remap_slider
 from progdf.field.grade import (
+    COARSER,
     MOST_COLOR,
     bake_grade,
     band_offsets,
@@ -27,9 +29,11 @@ from progdf.field.grade import (
 from progdf.formats.cube import read_cube, write_cube
 from progdf.gaussians import Gaussians, pack
 from progdf.gdf.file import apply_grade, load_gdf, read_gdf, save_gdf
+from progdf.io.tensors import deflate
 from progdf.region import from_mask, whole_scene
 from progdf.sh import C0, basis
 from tests.helpers.edits import curved_field, edit_of, some_rows
+from tests.helpers.fuzz_changes import header_of, signed_gdf
 from tests.helpers.scenes import random_gaussians
 
 KNOTS = torch.tensor([0.0, 0.4, 1.0])
@@ -115,7 +119,7 @@ def some_mask(members: int) -> Tensor:
 
 @pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize("sh_degree", [0, 2])
-def test_a_file_gives_the_same_field_and_a_byte_a_number_of_mask_and_residual(
+def test_a_file_gives_the_same_field_and_at_most_a_byte_a_number_of_mask_and_residual(
     tmp_path: Path, sh_degree: int, masked: bool
 ) -> None:
     scene = random_gaussians(400, sh_degree=sh_degree)
@@ -128,7 +132,8 @@ def test_a_file_gives_the_same_field_and_a_byte_a_number_of_mask_and_residual(
     save_gdf(tmp_path / "edit.gdf", gdf)
     again = load_gdf(tmp_path / "edit.gdf", scene)
     assert again.field.kind == "grade"
-    assert field.bytes_per_member == 2 * 3 * (4 if sh_degree else 1) + masked
+    numbers = 2 * 3 * (4 if sh_degree else 1) + masked
+    assert numbers / 2 < field.bytes_per_member < numbers + 0.5, "they are drawn: hardly any repeats"
     for s in (0.0, 0.3, 0.7, 1.0):
         assert torch.equal(again.field.offsets(s), field.offsets(s))
     assert not bool(field.offsets(0.0).any())
@@ -138,6 +143,73 @@ def test_a_file_gives_the_same_field_and_a_byte_a_number_of_mask_and_residual(
     assert (stored.mask is not None) == masked
     with pytest.raises(ProgdfError, match="keeps a grade field, which is baked on its scene"):
         load_gdf(tmp_path / "edit.gdf")
+
+
+@pytest.fixture
+def packed(tmp_path: Path) -> tuple[dict[str, object], dict[str, Tensor], GradeForm]:
+    """The header, the tensors and the grade of a file of 150 members."""
+    scene = random_gaussians(400)
+    members = some_rows(scene, 150)
+    rows = pack(scene[members], with_shN=False)
+    form = replace(some_form(rows), mask=some_mask(150))
+    save_gdf(tmp_path / "edit.gdf", edit_of(scene, members, bake_grade(form, rows)))
+    content = (tmp_path / "edit.gdf").read_bytes()
+    return header_of(content), safetensors.torch.load(content), form
+
+
+def test_a_file_from_before_levels_were_packed_gives_the_same_grade(
+    packed: tuple[dict[str, object], dict[str, Tensor], GradeForm], tmp_path: Path
+) -> None:
+    header, tensors, form = packed
+    assert form.mask is not None
+    assert not {"residual", "mask"} & set(tensors)
+    tensors = {name: tensor for name, tensor in tensors.items() if not name.endswith(".packed")}
+    older = tensors | {"residual": form.residual, "mask": form.mask}
+    (tmp_path / "older.gdf").write_bytes(signed_gdf(header | {"format": 5}, older))
+    stored = read_gdf(tmp_path / "older.gdf").field.origin
+    assert isinstance(stored, GradeForm)
+    assert stored.mask is not None
+    assert torch.equal(stored.residual, form.residual)
+    assert torch.equal(stored.mask, form.mask)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"residual.packed": torch.zeros(20, dtype=torch.uint8)},
+        {"residual.packed": deflate(torch.zeros(899, dtype=torch.int8))},
+        {"residual.packed": deflate(torch.zeros(1 << 22, dtype=torch.int8))},
+        {"residual.packed": deflate(torch.zeros(900, dtype=torch.int8)).short()},
+        {"mask.packed": deflate(torch.zeros(149, dtype=torch.uint8))},
+        {"scale": torch.ones(1 << 20, 3), "coefficients": torch.zeros(3, 1 << 20)},
+        {"scale": torch.ones(3)},
+    ],
+)
+def test_packed_levels_that_are_not_as_many_as_said_are_refused(
+    packed: tuple[dict[str, object], dict[str, Tensor], GradeForm], tmp_path: Path, wrong: dict[str, Tensor]
+) -> None:
+    header, tensors, _ = packed
+    (tmp_path / "wrong.gdf").write_bytes(signed_gdf(header, tensors | wrong))
+    with pytest.raises(ProgdfError, match="is inconsistent"):
+        read_gdf(tmp_path / "wrong.gdf")
+
+
+def test_coarser_levels_take_fewer_bytes_and_are_off_by_half_a_step_at_most() -> None:
+    rows = pack(random_gaussians(2000), with_shN=False)
+    draws = torch.Generator().manual_seed(4)
+    course = torch.zeros(2, len(rows), 3)
+    course[1] = 0.1 * torch.randn(len(rows), 3, generator=draws).clamp(-2, 2)
+    table = torch.stack([identity_map(1), some_table(1)])
+    forms = {
+        k: fit_grade(torch.tensor([0.0, 1.0]), 1, table, course, 1, torch.ones(len(rows)), coarser=k)
+        for k in COARSER
+    }
+    sizes = [form.bytes_per_member for form in forms.values()]
+    assert sizes == sorted(sizes, reverse=True)
+    assert sizes[-1] < 0.7 * sizes[0], "of some 7.9 bits three go"
+    for k, form in forms.items():
+        found = form.coefficients[1, 0] * form.residual[0] * form.scale[0]
+        assert float((found - course[1]).abs().max()) < 1.1 * k * 0.2 / 127 / 2 + 0.003
 
 
 def test_both_ends_are_what_the_file_says(tmp_path: Path) -> None:

@@ -118,3 +118,15 @@ def test_a_color_map_draws_its_rows_and_its_gradient_is_the_transpose(engine: st
     torch.testing.assert_close(picture, drawn, rtol=0, atol=2e-6)
     forth, back = (picture.double() * seen).sum(), (colors.double() * weighed.gradient(seen)).sum()
     assert float(forth) == pytest.approx(float(back), rel=1e-6)
+
+
+@pytest.mark.parametrize("engine", EVERY)
+def test_a_color_map_of_some_pixels_is_that_of_all_where_they_are(engine: str) -> None:
+    scene, camera, window = random_gaussians(300, seed=11), orbit_camera(90, 61), (21, 13, 70, 44)
+    rows, pixels = torch.arange(0, 300, 2), torch.arange(31 * 49)[1::3]
+    whole = color_map(activate(scene), camera, window, rows, engine)
+    some = color_map(activate(scene), camera, window, rows, engine, pixels)
+    colors, seen = torch.rand(150, 3), torch.rand(len(pixels), 3)
+    everywhere = torch.zeros(31 * 49, 3).index_copy(0, pixels, seen).view(31, 49, 3)
+    torch.testing.assert_close(some.picture(colors), whole.picture(colors).flatten(0, 1)[pixels])
+    torch.testing.assert_close(some.gradient(seen), whole.gradient(everywhere))

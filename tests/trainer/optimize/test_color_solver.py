@@ -108,6 +108,20 @@ def test_a_color_map_draws_and_differentiates_as_the_rasterizer_does() -> None:
     torch.testing.assert_close(weighed.gradient(pull), colors.grad[rows], atol=2e-4, rtol=1e-4)
 
 
+def test_of_some_pixels_each_view_looks_at_others_and_the_edit_is_as_good() -> None:
+    scene = replace(dense_ball(600), sh0=0.5 * torch.rand(600, 3, generator=torch.Generator().manual_seed(7)))
+    edited, cameras = replace(scene, sh0=scene.sh0.flip(1) + 0.3), orbit(8, 64)
+    crops, original = prepared(scene, cameras)
+    views = color_views(crops, original, 4)
+    assert len({int(view.pixels[0]) for view in views}) == 4
+    assert all(len(view.pixels) == view.size[0] * view.size[1] // 4 for view in views)
+    targets, solver = render_all(crops, pack(edited, False)), make_solver(views, original)
+    model = model_of(solver, targets, 40)
+    stages = [TargetStage(1.0, targets, 1)]
+    offsets = solve_all(original, solver, model, stages, PgsState(original), 40)[-1].offsets
+    assert psnr(scene, edited, offsets, cameras) > 45.0
+
+
 def test_members_smaller_than_a_pixel_learn_their_color() -> None:
     scene = dense_ball(6000)
     edited = replace(scene, sh0=scene.sh0.flip(1) + 0.3)

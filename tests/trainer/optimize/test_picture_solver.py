@@ -8,9 +8,12 @@ import torch
 from torch import Tensor
 
 from progdf.camera import Camera, intrinsics, look_at
-from progdf.gaussians import ATTRIBUTES, Gaussians
+from progdf.gaussians import ATTRIBUTES, Gaussians, pack
 from progdf.sh import C0, rgb_to_sh0
 from tests.helpers.trained import edit_few
+from trainer.optimize.color_solver import make_solver
+from trainer.optimize.color_views import color_views
+from trainer.optimize.ties import Ties, surface_graph
 from trainer.views.crops import crop_scene
 from trainer.views.view import render_view
 
@@ -59,6 +62,16 @@ def test_a_hidden_wall_is_not_painted_with_the_one_before_it() -> None:
     front, back = middle & (scene.means[:, 2] == 0.0), middle & (scene.means[:, 2] > 0.0)
     assert float(change[front, 2].mean()) > 0.6  # of .7: it is blue
     assert float(change[back].abs().max()) < 0.05
+
+
+def test_what_is_seen_through_others_is_asked_where_a_second_picture_shows_it() -> None:
+    scene, cameras = wall(0.0, torch.zeros(3)), (ahead(), ahead(0.8))
+    crops = [crop_scene(scene, torch.arange(len(scene)), c, (0, 0, 96, 96), WHITE, True) for c in cameras]
+    original, nobody = pack(scene, with_shN=False), torch.zeros(len(scene), dtype=torch.bool)
+    ties = Ties(surface_graph(scene, nobody), nobody)  # no picture shows any of it clearly
+    asked = [make_solver(color_views(crops[:n], original), original, ties).asked for n in (1, 2)]
+    assert not bool(asked[0].any())
+    assert float(asked[1].float().mean()) > 0.9
 
 
 def test_what_lies_beside_the_picture_follows_a_fill() -> None:
