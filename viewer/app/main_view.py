@@ -453,6 +453,8 @@ class MainView:
             return sides.right
         for layer in self.live:
             view = add_layer(view, layer.gdf, layer.name, layer.strength)
+        if self.live:  # is what one looks at: of the selection a trace is left
+            view = replace(view, select=replace(view.select, tool=""))
         return view
 
     def _frame(self) -> overlay.Area | None:

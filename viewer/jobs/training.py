@@ -7,7 +7,8 @@ SCENE.edits/NAME.train.json    what was asked for, so that a stopped run can go 
 SCENE.edits/NAME.train.log     what it printed
 SCENE.edits/NAME.train.lock    locked by the window that has it in its queue: it alone writes these files
 SCENE.edits/NAME.region.npy    the selection that it was made for
-SCENE.edits/NAME.draft.gdf     a grade alone, its layer until it is trained; sessions may name it: it stays
+SCENE.edits/NAME.draft.gdf     a grade alone, its layer until it is packed; sessions may name it: it stays
+SCENE.edits/NAME.packed.gdf    what is trained, its layer until it is measured; so too
 """
 
 from __future__ import annotations
@@ -48,7 +49,13 @@ from progdf.region import Region
 
 from .child import Progress
 
-ORDER, LOG, WINDOW_LOCK, DRAFT = ".train.json", ".train.log", ".train.lock", ".draft.gdf"
+ORDER, LOG, WINDOW_LOCK, DRAFT, PACKED = (
+    ".train.json",
+    ".train.log",
+    ".train.lock",
+    ".draft.gdf",
+    ".packed.gdf",
+)
 
 Setting = Literal["color", "amount", "grade", "style", "sentence", "folder", "pictures"]
 """What an editor is asked besides its kind."""
@@ -324,6 +331,11 @@ class EditOrder:
         return self._beside(DRAFT)
 
     @property
+    def packed(self) -> Path:
+        """The edit once it is packed, while it is measured; may be absent."""
+        return self._beside(PACKED)
+
+    @property
     def log(self) -> Path:
         """What the run printed."""
         return self._beside(LOG)
@@ -452,16 +464,18 @@ def edits_folder(scene: Path, memory: Path | None = None) -> Path:
 def free_run(folder: Path, name: str) -> Path:
     """A folder for a run of this name: NAME, or NAME-2 where something has that."""
     free, number = folder / name, 2
-    while free.exists() or any(free.with_name(free.name + suffix).exists() for suffix in (ORDER, DRAFT)):
+    while free.exists() or any(
+        free.with_name(free.name + suffix).exists() for suffix in (ORDER, DRAFT, PACKED)
+    ):
         free, number = folder / f"{name}-{number}", number + 1
     return free
 
 
 def finished_edit(draft: Path) -> Path | None:
     """What was trained of a draft since a session was saved with it."""
-    name = draft.name.removesuffix(DRAFT)
+    name = draft.name.removesuffix(DRAFT).removesuffix(PACKED)
     result = draft.with_name(name) / f"{name}.gdf"
-    return result if draft.name.endswith(DRAFT) and os.path.isfile(result) else None
+    return result if name != draft.name and os.path.isfile(result) else None
 
 
 def stopped_orders(folder: Path, scene: Path) -> Iterator[EditOrder]:

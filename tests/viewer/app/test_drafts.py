@@ -101,6 +101,11 @@ def test_a_grade_is_a_live_layer_that_the_form_drives_from_every_side(window: ap
     press(window, "Home", "5")
     assert [live.strength for live in visible_layers(window.main_view._displayed_view())] == [0.75]
     assert Previews.asked == 1, "neither the strength nor the camera asks for another"
+    work = window.main_view.work
+    selecting = replace(work.view, select=replace(work.view.select, tool="lasso"))
+    window.main_view.work = replace(work, view=selecting)
+    assert not window.main_view._displayed_view().select.tool, "a selection would hide the colors"
+    window.main_view.work = work
     with_form(window, color=(1.0, 0.0, 0.0))
     assert (Previews.asked, len(window.main_view.live)) == (2, 1)
     with_form(window, preview=False)

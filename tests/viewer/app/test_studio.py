@@ -165,12 +165,19 @@ def test_what_is_packed_takes_the_drafts_place_while_it_is_measured(window: appl
     turn(window)
     (layer,) = window.main_view.work.view.layers
     assert window.document.edits[layer.gdf].instruction == "a draft"
+    before = order.draft.read_bytes()
     save_gdf(packed, replace(scarf, instruction="packed"))
     os.utime(packed, ns=(order.draft.stat().st_mtime_ns + 1_000_000,) * 2)
     window.jobs._live_due = 0.0
     turn(window)
     assert [edit.instruction for edit in window.document.edits] == ["packed"]
     assert window.main_view.work.view.layers == (layer,), "the layer stays as it is"
+    assert order.draft.read_bytes() == before, "a film of it and a saved session name it"
+    turn(window)
+    assert window.main_view.work.view.layers == (layer,), "no recording beside it"
+    save_gdf(order.result, replace(scarf, instruction="measured"))
+    window.jobs._end(replace(job, status="done"))
+    assert [edit.instruction for edit in window.document.edits] == ["measured"]
 
 
 def test_a_view_is_painted_over_in_another_program_and_each_save_is_shown(

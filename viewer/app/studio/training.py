@@ -210,10 +210,10 @@ class JobActions:
         self._edits.add(order.draft, order.name, strength)
 
     def _take_packed(self, order: EditOrder, packed: Path) -> None:
-        """What is trained and only measured yet takes the place of the draft's file and layer."""
-        with atomic_write(order.draft) as temporary_file:
+        """What is trained and only measured yet takes the place of the draft's layer."""
+        with atomic_write(order.packed) as temporary_file:
             temporary_file.write_bytes(read_file(packed))
-        self._edits.finish(order.draft, order.draft)
+        self._edits.finish(order.draft, order.packed)
 
     def _write_anchor(self, form: NewEdit, run: Path) -> str:
         """The file of the picture that a sentence is to follow, beside its run; "" for none.
@@ -296,7 +296,7 @@ class JobActions:
             return
         if job.status == "done" and self._scene == task.scene:  # it takes the place of its recordings
             self._live = None
-            if not self._edits.finish(task.draft, task.result):
+            if not any(self._edits.finish(path, task.result) for path in (task.draft, task.packed)):
                 self._app.open(task.result)
             main_view.show_message(f"{task.name} is trained; drag its slider")
             return
@@ -332,9 +332,10 @@ class JobActions:
         if order is None or order.scene != self._scene or now < self._live_due:
             return
         live, packed = self._app.main_view.live, order.out / "draft.gdf"
-        if order.draft in self._app.document.gdf_paths and is_newer(packed, order.draft):
+        layers = {order.draft, order.packed}.intersection(self._app.document.gdf_paths)
+        if order.draft in layers and is_newer(packed, order.draft):
             self._try(partial(self._take_packed, order, packed))
-        if order.draft in self._app.document.gdf_paths or (live and live != self._live_layers):
+        if layers or (live and live != self._live_layers):
             return  # there is a layer of it, or of what the form says
         if packed.is_file() and not order.draft.exists():
             self._try(partial(self._add_draft, order, packed))
