@@ -331,7 +331,7 @@ class EditOrder:
         return self._beside(DRAFT)
 
     @property
-    def packed(self) -> Path:
+    def packed_edit(self) -> Path:
         """The edit once it is packed, while it is measured; may be absent."""
         return self._beside(PACKED)
 

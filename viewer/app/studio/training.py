@@ -211,9 +211,9 @@ class JobActions:
 
     def _take_packed(self, order: EditOrder, packed: Path) -> None:
         """What is trained and only measured yet takes the place of the draft's layer."""
-        with atomic_write(order.packed) as temporary_file:
+        with atomic_write(order.packed_edit) as temporary_file:
             temporary_file.write_bytes(read_file(packed))
-        self._edits.finish(order.draft, order.packed)
+        self._edits.finish(order.draft, order.packed_edit)
 
     def _write_anchor(self, form: NewEdit, run: Path) -> str:
         """The file of the picture that a sentence is to follow, beside its run; "" for none.
@@ -296,7 +296,7 @@ class JobActions:
             return
         if job.status == "done" and self._scene == task.scene:  # it takes the place of its recordings
             self._live = None
-            if not any(self._edits.finish(path, task.result) for path in (task.draft, task.packed)):
+            if not any(self._edits.finish(path, task.result) for path in (task.draft, task.packed_edit)):
                 self._app.open(task.result)
             main_view.show_message(f"{task.name} is trained; drag its slider")
             return
@@ -332,7 +332,7 @@ class JobActions:
         if order is None or order.scene != self._scene or now < self._live_due:
             return
         live, packed = self._app.main_view.live, order.out / "draft.gdf"
-        layers = {order.draft, order.packed}.intersection(self._app.document.gdf_paths)
+        layers = {order.draft, order.packed_edit}.intersection(self._app.document.gdf_paths)
         if order.draft in layers and is_newer(packed, order.draft):
             self._try(partial(self._take_packed, order, packed))
         if layers or (live and live != self._live_layers):
