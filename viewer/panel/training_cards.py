@@ -20,7 +20,7 @@ _UNWRITTEN = "Nothing is written"
 
 def height(jobs: Sequence[Job], ui: UiContext) -> float:
     """Of the strip and, where it is open, the cards over it; window pixels."""
-    if not _shown_jobs(jobs):
+    if not _visible_jobs(jobs):
         return 0.0
     storage = imgui.get_state_storage()
     cards = storage.get_float(imgui.get_id(_TALL)) if storage.get_bool(imgui.get_id(_OPEN)) else 0.0
@@ -29,7 +29,7 @@ def height(jobs: Sequence[Job], ui: UiContext) -> float:
 
 def draw(jobs: Sequence[Job], ui: UiContext, actions: list[str]) -> None:
     """The strip, and over it one card a job while it is open; a failure opens it."""
-    listed, storage = _shown_jobs(jobs), imgui.get_state_storage()
+    listed, storage = _visible_jobs(jobs), imgui.get_state_storage()
     if not listed:
         return
     is_open, seen, tall = imgui.get_id(_OPEN), imgui.get_id("seen failure"), imgui.get_id(_TALL)
@@ -55,7 +55,7 @@ def draw(jobs: Sequence[Job], ui: UiContext, actions: list[str]) -> None:
 _OPEN, _TALL = "jobs are open", "height of the jobs"
 
 
-def _shown_jobs(jobs: Sequence[Job]) -> list[Job]:
+def _visible_jobs(jobs: Sequence[Job]) -> list[Job]:
     """Those that have a card: a trained edit is a layer, and needs none."""
     return [job for job in jobs if job.status != "done" or job.warning or isinstance(job.task, Delivery)]
 
