@@ -60,7 +60,7 @@ class Decal:
             size = min(max(size * _STEP**notches, _SIZES[0]), _SIZES[1])
         at = (io.mouse_pos.x, io.mouse_pos.y) if over else self.at or (area.width / 2, area.height / 2)
         moved = replace(self, size=size, angle=angle, at=at)
-        a, b, c, d = (imgui.ImVec2(*corner) for corner in moved.corners)
+        a, b, c, d = (corner for corner in moved.corners)
         imgui.get_background_draw_list().add_image_quad(imgui.ImTextureRef(self.texture.glo), a, b, c, d)
         overlay.banner(_HINT, area, pointer.ui)
         return moved, "lay_decal" if over and imgui.is_mouse_clicked(0) else ""

@@ -116,13 +116,13 @@ def draw(dialog: Dialog, recent: Sequence[Path], pressed: Sequence[str], ui: UiC
         imgui.open_popup(_POPUP)
     margin = 8.0 * ui.scale
     top = max(margin, 0.25 * area.height - 90.0 * ui.scale)
-    imgui.set_next_window_pos(imgui.ImVec2(area.width / 2, top), 0, imgui.ImVec2(0.5, 0.0))
-    imgui.set_next_window_size(imgui.ImVec2(min(WIDTH_PX * ui.scale, area.width - 2 * margin), 0.0))
+    imgui.set_next_window_pos((area.width / 2, top), 0, (0.5, 0.0))
+    imgui.set_next_window_size((min(WIDTH_PX * ui.scale, area.width - 2 * margin), 0.0))
     flags = imgui.WindowFlags_
     flags_of_popup = flags.no_decoration.value | flags.no_saved_settings.value | flags.no_move.value
     imgui.push_style_var(imgui.StyleVar_.window_rounding, 6.0 * ui.scale)
-    imgui.push_style_var(imgui.StyleVar_.window_padding, imgui.ImVec2(16.0 * ui.scale, 14.0 * ui.scale))
-    imgui.push_style_color(imgui.Col_.modal_window_dim_bg, imgui.ImVec4(0.0, 0.0, 0.0, 0.45))
+    imgui.push_style_var(imgui.StyleVar_.window_padding, (16.0 * ui.scale, 14.0 * ui.scale))
+    imgui.push_style_color(imgui.Col_.modal_window_dim_bg, (0.0, 0.0, 0.0, 0.45))
     answer = Answer(dialog)
     if imgui.begin_popup_modal(_POPUP, None, flags_of_popup)[0]:
         context, at_button = imgui.get_current_context(), not imgui.get_io().want_text_input
@@ -145,7 +145,7 @@ def _content(
     imgui.text(TITLES[dialog.kind])
     imgui.pop_font()
     wrapped_text(_HINTS[dialog.kind].format(escape_text(Path(dialog.text).name)), PALETTE.dim)
-    imgui.dummy(imgui.ImVec2(0.0, 2.0 * ui.scale))
+    imgui.dummy((0.0, 2.0 * ui.scale))
     if "Escape" in pressed:
         return Answer(None)
     if dialog.chosen and dialog.kind in _DELIVERS:
@@ -158,7 +158,7 @@ def _content(
             _log(Path(dialog.text), bottom, ui)
         if dialog.kind == "about":
             wrapped_text(dialog.text, PALETTE.text)
-            imgui.dummy(imgui.ImVec2(0.0, 2.0 * ui.scale))
+            imgui.dummy((0.0, 2.0 * ui.scale))
         return _answer(dialog, _pressed_button(_CHOICES[dialog.kind], pressed, ui))
     if _is_new(dialog.kind) or (dialog.error and not imgui.is_any_item_active()):
         imgui.set_keyboard_focus_here()  # Enter lets go of the field, and the path is to be corrected
@@ -171,7 +171,7 @@ def _content(
     dialog = replace(dialog, text=text)
     imgui.same_line(0.0, gap)
     imgui.begin_disabled(dialog.choosing)
-    browse = imgui.button("…", imgui.ImVec2(more, 0.0))
+    browse = imgui.button("…", (more, 0.0))
     imgui.end_disabled()
     tip("Browse with the system file dialog (Ctrl+B)")
     if browse or ("Ctrl+B" in pressed and not dialog.choosing):
@@ -188,7 +188,7 @@ def _content(
         chosen = _recent(recent, bottom, "Down" in pressed, ui)
         if chosen is not None:
             return _submit(dialog, str(chosen))
-    imgui.dummy(imgui.ImVec2(0.0, 2.0 * ui.scale))
+    imgui.dummy((0.0, 2.0 * ui.scale))
     name = _SUBMIT[dialog.kind]
     button = _buttons((name, "Cancel"), ui)
     if button == "Cancel":
@@ -267,7 +267,7 @@ def _recent(recent: Sequence[Path], bottom: float, down: bool, ui: UiContext) ->
     below = imgui.get_frame_height() + 3 * style.item_spacing.y + style.window_padding.y
     space = max(bottom - imgui.get_cursor_screen_pos().y - below, 2 * row)
     chosen = None
-    imgui.begin_child("recent", imgui.ImVec2(0.0, min(len(recent) * row, space)))
+    imgui.begin_child("recent", (0.0, min(len(recent) * row, space)))
     if down and not imgui.is_window_focused():
         imgui.set_keyboard_focus_here()
         imgui.set_nav_cursor_visible(True)
@@ -290,15 +290,15 @@ def _log(path: Path, bottom: float, ui: UiContext) -> None:
     except OSError as error:
         text = error.strerror or str(error)
     tall = max(min(260.0 * ui.scale, bottom - imgui.get_cursor_screen_pos().y - 60.0 * ui.scale), 40.0)
-    imgui.push_style_color(imgui.Col_.child_bg, imgui.ImVec4(*PALETTE.scrim))
+    imgui.push_style_color(imgui.Col_.child_bg, PALETTE.scrim)
     padded = imgui.ChildFlags_.always_use_window_padding.value
-    imgui.begin_child("log", imgui.ImVec2(0.0, tall), padded)
+    imgui.begin_child("log", (0.0, tall), padded)
     wrapped_text(_escape_lines(text), PALETTE.text)
     if imgui.is_window_appearing():
         imgui.set_scroll_here_y(1.0)
     imgui.end_child()
     imgui.pop_style_color()
-    imgui.dummy(imgui.ImVec2(0.0, 2.0 * ui.scale))
+    imgui.dummy((0.0, 2.0 * ui.scale))
 
 
 def _escape_lines(text: str) -> str:
@@ -315,7 +315,7 @@ def _buttons(names: Sequence[str], ui: UiContext) -> str | None:
     for i, name in enumerate(names):
         if i:
             imgui.same_line(0.0, gap)
-        if (imgui.button if i else accent_button)(name, imgui.ImVec2(wide, 0.0)):
+        if (imgui.button if i else accent_button)(name, (wide, 0.0)):
             pressed = name
     return pressed
 

@@ -86,11 +86,11 @@ def _projection(fov_y: float, aspect: float, near: float) -> NDArray[np.float64]
 def _buttons(gizmo: Gizmo, pointer: PointerContext) -> str:
     """At the top of the picture: what can be done with what was moved."""
     scale = pointer.ui.scale
-    at = imgui.ImVec2(pointer.area.width / 2, 14.0 * scale)
+    at = (pointer.area.width / 2, 14.0 * scale)
     with plate("placing", at, pointer.ui, (0.5, 0.0)):
         imgui.align_text_to_frame_padding()
         imgui.text("Copy" if gizmo.does == "duplicate" else "Move")
         imgui.same_line()
-        asked = "keep_placed" if accent_button("Keep", imgui.ImVec2(72.0 * scale, 0.0)) else ""
+        asked = "keep_placed" if accent_button("Keep", (72.0 * scale, 0.0)) else ""
         imgui.same_line()
-        return "put_back" if imgui.button("Cancel", imgui.ImVec2(72.0 * scale, 0.0)) else asked
+        return "put_back" if imgui.button("Cancel", (72.0 * scale, 0.0)) else asked

@@ -113,12 +113,12 @@ def draw_keys(room: imgui.ImVec2, query: str, ui: UiContext) -> str:
     tall = max(sum(topic.height for topic in column) for column in packed) * _ROW * SMALL_PX * ui.scale
     field = 30.0 * ui.scale
     size = imgui.ImVec2(min(len(packed) * wide + 2 * margin, room.x), min(tall + field + 2 * margin, room.y))
-    imgui.set_next_window_pos(imgui.ImVec2((room.x - size.x) / 2, (room.y - size.y) / 2))
+    imgui.set_next_window_pos(((room.x - size.x) / 2, (room.y - size.y) / 2))
     imgui.set_next_window_size(size)
     imgui.push_style_color(imgui.Col_.window_bg, imgui.ImVec4(*PALETTE.scrim[:3], 0.97))
     imgui.push_style_var(imgui.StyleVar_.window_rounding, 6.0 * ui.scale)
-    imgui.push_style_var(imgui.StyleVar_.window_padding, imgui.ImVec2(margin, margin))
-    imgui.push_style_var(imgui.StyleVar_.item_spacing, imgui.ImVec2(8.0 * ui.scale, 0.0))
+    imgui.push_style_var(imgui.StyleVar_.window_padding, (margin, margin))
+    imgui.push_style_var(imgui.StyleVar_.item_spacing, (8.0 * ui.scale, 0.0))
     imgui.begin(
         "keys", None, FIXED & ~imgui.WindowFlags_.no_scrollbar.value | imgui.WindowFlags_.no_nav.value
     )
@@ -171,9 +171,9 @@ def draw_palette(
     if work.palette == -1:
         imgui.open_popup("commands")
     wide, row = min(PALETTE_PX * ui.scale, area.width), imgui.get_frame_height()
-    place = imgui.ImVec2(area.width / 2, max(0.12 * area.height, 8.0 * ui.scale))
-    imgui.set_next_window_pos(place, 0, imgui.ImVec2(0.5, 0.0))
-    imgui.set_next_window_size(imgui.ImVec2(wide, 0.0))
+    place = (area.width / 2, max(0.12 * area.height, 8.0 * ui.scale))
+    imgui.set_next_window_pos(place, 0, (0.5, 0.0))
+    imgui.set_next_window_size((wide, 0.0))
     asked, at = "", work.palette or 0
     with menu("commands", ui, imgui.WindowFlags_.no_nav.value) as is_open:
         if not is_open:
@@ -183,8 +183,8 @@ def draw_palette(
         moved = 0 if at == -1 else ("Down" in pressed) - ("Up" in pressed)
         fresh, at = at == -1 or query != work.query, 0 if query != work.query else at + moved
         at = min(max(at, 0), max(len(found) - 1, 0))
-        imgui.push_style_var(imgui.StyleVar_.item_spacing, imgui.ImVec2(0.0, 0.0))
-        imgui.begin_child("found", imgui.ImVec2(0.0, row * min(ROWS, max(len(found), 1))))
+        imgui.push_style_var(imgui.StyleVar_.item_spacing, (0.0, 0.0))
+        imgui.begin_child("found", (0.0, row * min(ROWS, max(len(found), 1))))
         if not found:
             imgui.text_disabled("No command is called like that")
         for i, command in enumerate(found):
@@ -206,19 +206,19 @@ def _command_row(command: Command, chosen: bool, ui: UiContext) -> bool:
     """Name, what it does, and its key at the right; whether it was clicked."""
     x, y = imgui.get_cursor_screen_pos()
     wide, tall = imgui.get_content_region_avail().x, imgui.get_frame_height()
-    pressed = imgui.invisible_button(command.action, imgui.ImVec2(wide, tall))
+    pressed = imgui.invisible_button(command.action, (wide, tall))
     canvas, pad = imgui.get_window_draw_list(), 8.0 * ui.scale
     if chosen or imgui.is_item_hovered():
         ground = u32(PALETTE.accent if chosen else PALETTE.field)
-        canvas.add_rect_filled(imgui.ImVec2(x, y), imgui.ImVec2(x + wide, y + tall), ground, 4.0 * ui.scale)
+        canvas.add_rect_filled((x, y), (x + wide, y + tall), ground, 4.0 * ui.scale)
     ink, dim = (u32(PALETTE.ink),) * 2 if chosen else (u32(PALETTE.text), u32(PALETTE.dim))
     top, key = round(y + imgui.get_style().frame_padding.y), shortcut(command.action)
     end = x + wide - pad - imgui.calc_text_size(key).x
-    canvas.add_text(imgui.ImVec2(round(x + pad), top), ink, command.name)
-    canvas.add_text(imgui.ImVec2(round(end), top), ink, key)
+    canvas.add_text((round(x + pad), top), ink, command.name)
+    canvas.add_text((round(end), top), ink, key)
     x += 2 * pad + imgui.calc_text_size(command.name).x
     imgui.push_font(None, SMALL_PX)
-    canvas.add_text(imgui.ImVec2(round(x), top + ui.scale), dim, elide(command.help, end - x - pad))
+    canvas.add_text((round(x), top + ui.scale), dim, elide(command.help, end - x - pad))
     imgui.pop_font()
     return bool(pressed)
 
@@ -230,13 +230,13 @@ def _column(topics: Sequence[Topic], left: float, top: float, ui: UiContext) -> 
     y = top - _BETWEEN * step
     for topic in topics:
         y += _BETWEEN * step
-        imgui.set_cursor_pos(imgui.ImVec2(left, y))
+        imgui.set_cursor_pos((left, y))
         _heading(topic.name, ui)
         for chord, does in topic.rows:
             y += _ROW * step
-            imgui.set_cursor_pos(imgui.ImVec2(left, y))
+            imgui.set_cursor_pos((left, y))
             imgui.text(chord)
-            imgui.set_cursor_pos(imgui.ImVec2(left + wide, y))
+            imgui.set_cursor_pos((left + wide, y))
             imgui.text_disabled(does)
         y += _ROW * step
     imgui.pop_font()
@@ -306,7 +306,7 @@ def draw_pill(
     scale, wide = pointer.ui.scale, pointer.area.width
     free = wide - (0.0 if foot else tools.view_width(work.view, pointer.area, pointer.ui))
     middle = min((wide + tools.TOOLBAR_PX * scale) / 2, free - 85.0 * scale)  # half of what it mostly takes
-    place = imgui.ImVec2(middle, foot + tools.EDGE_PX * scale)
+    place = (middle, foot + tools.EDGE_PX * scale)
     work, asked = tools.draw_comparison(work, words, why, original, place, pointer.ui)
     return work, [asked] * bool(asked)
 
@@ -417,12 +417,12 @@ def draw_history(work: Workspace, ui: UiContext) -> tuple[Workspace, list[str]]:
     if work.history:
         imgui.open_popup("history")
     display, row, asked = imgui.get_io().display_size, imgui.get_text_line_height_with_spacing(), list[str]()
-    at = imgui.ImVec2(display.x - 12.0 * ui.scale, display.y - 44.0 * ui.scale)
-    imgui.set_next_window_pos(at, 0, imgui.ImVec2(1.0, 1.0))
+    at = (display.x - 12.0 * ui.scale, display.y - 44.0 * ui.scale)
+    imgui.set_next_window_pos(at, 0, (1.0, 1.0))
     with menu("history", ui) as is_open:
         count, now = len(history.entries(work.past)), len(work.past.past)
         wide = min(_HISTORY_PX * ui.scale, display.x)
-        if is_open and imgui.begin_child("entries", imgui.ImVec2(wide, row * min(count, ROWS)), _FLAT):
+        if is_open and imgui.begin_child("entries", (wide, row * min(count, ROWS)), _FLAT):
             if work.history:
                 imgui.set_scroll_y(row * max(now - ROWS // 2, 0))
             clipper = imgui.ListClipper()
@@ -439,7 +439,7 @@ def draw_history(work: Workspace, ui: UiContext) -> tuple[Workspace, list[str]]:
 def _history_row(past: history.History, index: int, ui: UiContext) -> bool:
     now, keep = len(past.past), imgui.SelectableFlags_.no_auto_close_popups.value
     name = history.describe_entry(past, index)
-    imgui.push_style_color(imgui.Col_.text, imgui.ImVec4(*(PALETTE.faint if index > now else PALETTE.text)))
+    imgui.push_style_color(imgui.Col_.text, PALETTE.faint if index > now else PALETTE.text)
     line = elide(f"{name[:1].upper()}{name[1:]}", 0.9 * _HISTORY_PX * ui.scale)
     pressed = imgui.selectable(f"{line}##{index}", index == now, keep)[0]
     imgui.pop_style_color()

@@ -67,7 +67,7 @@ def _divider(share: float, area: Area, held: bool, ui: UiContext) -> None:
     x = round(share * area.width)
     canvas = imgui.get_background_draw_list()
     ink = u32(PALETTE.accent if held else PALETTE.handle)
-    top, bottom = imgui.ImVec2(x, 0.0), imgui.ImVec2(x, area.height)
+    top, bottom = (x, 0.0), (x, area.height)
     canvas.add_line(top, bottom, u32(PALETTE.scrim), 3.0 * ui.scale)
     canvas.add_line(top, bottom, ink, 1.5 * ui.scale)
 
@@ -76,13 +76,13 @@ def _knob(x: float, y: float, held: bool, ui: UiContext) -> None:
     """A round grip with an arrow to either side."""
     s, canvas = ui.scale, imgui.get_background_draw_list()
     ink = u32(PALETTE.accent if held else PALETTE.handle)
-    canvas.add_circle_filled(imgui.ImVec2(x, y), 12.0 * s, u32(PALETTE.scrim))
-    canvas.add_circle(imgui.ImVec2(x, y), 12.0 * s, ink, 0, 1.5 * s)
+    canvas.add_circle_filled((x, y), 12.0 * s, u32(PALETTE.scrim))
+    canvas.add_circle((x, y), 12.0 * s, ink, 0, 1.5 * s)
     for way in (-1.0, 1.0):
         canvas.add_triangle_filled(
-            imgui.ImVec2(x + way * 7.5 * s, y),
-            imgui.ImVec2(x + way * 3.0 * s, y - way * 4.0 * s),
-            imgui.ImVec2(x + way * 3.0 * s, y + way * 4.0 * s),
+            (x + way * 7.5 * s, y),
+            (x + way * 3.0 * s, y - way * 4.0 * s),
+            (x + way * 3.0 * s, y + way * 4.0 * s),
             ink,
         )
 

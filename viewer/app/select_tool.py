@@ -366,7 +366,7 @@ def draw_strokes(strokes: tuple[Strokes, ...], work: Workspace, pointer: Pointer
         some = some[:: len(some) // _MOST_DOTS + 1]
         at = project_centers(scene[torch.from_numpy(some)], camera).points
         for x, y in at[np.isfinite(at).all(axis=1)].tolist():
-            center = imgui.ImVec2((x + pointer.left) / density.x, y / density.y)
+            center = ((x + pointer.left) / density.x, y / density.y)
             canvas.add_circle_filled(center, 2.0 * pointer.ui.scale, u32(color))
 
 
@@ -386,7 +386,7 @@ def draw_gesture(gesture: Gesture | None, view: ViewState, ui: UiContext, left: 
     path = [imgui.ImVec2((x + left) / density.x, y / density.y) for x, y in gesture.path]
     first, last = path[0], path[-1]
     if gesture.tool == "box":
-        corners = (imgui.ImVec2(last.x, first.y), last, imgui.ImVec2(first.x, last.y))
+        corners = ((last.x, first.y), last, (first.x, last.y))
         _line([first, *corners], True, ui)
     elif gesture.tool == "lasso":
         _line(path, True, ui)
@@ -402,20 +402,20 @@ def draw_gesture(gesture: Gesture | None, view: ViewState, ui: UiContext, left: 
         _dot(first, ui)
 
 
-def _line(path: Sequence[imgui.ImVec2], closed: bool, ui: UiContext) -> None:
+def _line(path: Sequence[imgui.ImVec2Like], closed: bool, ui: UiContext) -> None:
     canvas = imgui.get_background_draw_list()
     flags = imgui.ImDrawFlags_.closed.value if closed else 0
     for color, width in ((_DARK, _HALO), (PALETTE.handle, _LINE)):
         canvas.add_polyline([*path], u32(color), width * ui.scale, flags)
 
 
-def _circle(center: imgui.ImVec2, radius: float, ui: UiContext) -> None:
+def _circle(center: imgui.ImVec2Like, radius: float, ui: UiContext) -> None:
     canvas = imgui.get_background_draw_list()
     for color, width in ((_DARK, _HALO), (PALETTE.handle, _LINE)):
         canvas.add_circle(center, radius, u32(color), 0, width * ui.scale)
 
 
-def _dot(center: imgui.ImVec2, ui: UiContext) -> None:
+def _dot(center: imgui.ImVec2Like, ui: UiContext) -> None:
     canvas = imgui.get_background_draw_list()
     for color, radius in ((_DARK, 4.5), (PALETTE.handle, 3.0)):
         canvas.add_circle_filled(center, radius * ui.scale, u32(color))

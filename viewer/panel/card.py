@@ -72,7 +72,7 @@ def draw_details(
 def _gain(layer: LayerState, kind: str, moves: bool, active: bool, ui: UiContext) -> LayerState:
     """One gain: a slider as the others of the panel."""
     if active:
-        imgui.push_style_color(imgui.Col_.text_disabled, imgui.ImVec4(*PALETTE.accent))
+        imgui.push_style_color(imgui.Col_.text_disabled, PALETTE.accent)
     label(kind.capitalize(), 84.0 * ui.scale)
     if active:
         imgui.pop_style_color()
@@ -103,7 +103,7 @@ def _curve(row: LayerRow, strength: float, most: float, ui: UiContext) -> None:
     scale, p = ui.scale, PALETTE
     left, top = imgui.get_cursor_screen_pos()
     width, height = imgui.get_content_region_avail().x, CURVE_PX * scale
-    imgui.dummy(imgui.ImVec2(width, height))
+    imgui.dummy((width, height))
     tip(
         "Visible change against strength, measured in small renders of this region; 1 is the full edit."
         f"\nTicks: {len(row.recorded)} recorded snapshots."
@@ -111,25 +111,23 @@ def _curve(row: LayerRow, strength: float, most: float, ui: UiContext) -> None:
     canvas, radius = imgui.get_window_draw_list(), 7.0 * scale
     start, span = left + radius, (width - 2 * radius) / most
     foot, rise = top + height - 4.0 * scale, (height - 10.0 * scale) / max(1.0, *curve)
-    canvas.add_rect_filled(
-        imgui.ImVec2(left, top), imgui.ImVec2(left + width, top + height), u32(p.panel), 4 * scale
-    )
+    canvas.add_rect_filled((left, top), (left + width, top + height), u32(p.panel), 4 * scale)
     if most > 1.0:
-        beyond = imgui.ImVec2(start + span, top), imgui.ImVec2(left + width, top + height)
+        beyond = (start + span, top), (left + width, top + height)
         canvas.add_rect_filled(*beyond, u32((*p.warning_dark[:3], 0.35)), 4 * scale)
     for tick in row.recorded:
         x = round(start + tick * span) + 0.5
-        ends = imgui.ImVec2(x, foot - 6 * scale), imgui.ImVec2(x, foot)
+        ends = (x, foot - 6 * scale), (x, foot)
         canvas.add_line(*ends, u32(p.faint), max(1.0, scale))
-    canvas.add_line(imgui.ImVec2(start, foot), imgui.ImVec2(start + most * span, foot), u32(p.line), scale)
+    canvas.add_line((start, foot), (start + most * span, foot), u32(p.line), scale)
     for i in range(len(curve) - 1):
-        a, b = (imgui.ImVec2(start + j / STEPS * span, foot - curve[j] * rise) for j in (i, i + 1))
+        a, b = ((start + j / STEPS * span, foot - curve[j] * rise) for j in (i, i + 1))
         canvas.add_line(a, b, u32(p.warning if i >= STEPS else p.accent), 1.5 * scale)
     share = value_at(curve, strength)
-    at = imgui.ImVec2(start + strength * span, foot - share * rise)
+    at = (start + strength * span, foot - share * rise)
     canvas.add_circle_filled(at, 4.5 * scale, u32(p.panel))
     canvas.add_circle_filled(at, 3.0 * scale, u32(p.handle))
-    corner = imgui.ImVec2(round(left + 6 * scale), round(top + 3 * scale))
+    corner = (round(left + 6 * scale), round(top + 3 * scale))
     canvas.add_text(ui.fonts.regular, SMALL_PX * scale, corner, u32(p.dim), f"change {100 * share:.0f} %")
 
 
@@ -216,7 +214,7 @@ def draw_card(
             unfolded = draw_details(work.view.layers[index], row, active_slider, most, ui)
             work = _change_layer(work, index, lambda _: unfolded)
             if compact:
-                imgui.dummy(imgui.ImVec2(0.0, 2.0 * scale))
+                imgui.dummy((0.0, 2.0 * scale))
         over = imgui.is_window_hovered(imgui.HoveredFlags_.allow_when_blocked_by_active_item.value)
         press = _press(touch.named) if over and imgui.is_mouse_clicked(imgui.MouseButton_.left.value) else ""
         several, alone = len(work.selected) if selected else 0, imgui.get_id("alone")
@@ -289,7 +287,7 @@ def _group_menu(state: ViewState, layer: LayerState, ui: UiContext, actions: lis
 def _focus_bar(clip: tuple[imgui.ImVec2, imgui.ImVec2], color: Rgba, scale: float) -> None:
     """A stripe along the left edge of the card that is being drawn, in the panel's clip."""
     canvas, corner = imgui.get_window_draw_list(), imgui.get_window_pos()
-    edge = imgui.ImVec2(corner.x + 3 * scale, corner.y + imgui.get_window_size().y)
+    edge = (corner.x + 3 * scale, corner.y + imgui.get_window_size().y)
     canvas.push_clip_rect(*clip, False)
     canvas.add_rect_filled(corner, edge, u32(color), 3 * scale)
     canvas.pop_clip_rect()
@@ -325,7 +323,7 @@ def _head(
         imgui.same_line(end - taken)
         _toggles(work, index, over, ui, actions)
     imgui.same_line(right - number_width)
-    imgui.dummy(imgui.ImVec2(number_width, imgui.get_frame_height()))
+    imgui.dummy((number_width, imgui.get_frame_height()))
     if imgui.is_item_clicked() and not layer.locked:
         slider.start_typing("##strength")
     tip("Locked" if layer.locked else "Click to type a value")
@@ -369,10 +367,8 @@ def _thumbnail(
 ) -> Workspace:
     """The edit by itself, rendered; the mouse on it tells what it is, and shows what it shares."""
     side, (x, y) = THUMBNAIL_PX * ui.scale, imgui.get_cursor_screen_pos()
-    imgui.dummy(imgui.ImVec2(side, side))
-    picture(
-        texture, imgui.ImVec2(x, y), imgui.ImVec2(x + side, y + side), 3.0 * ui.scale, 1.0 if active else 0.4
-    )
+    imgui.dummy((side, side))
+    picture(texture, (x, y), (x + side, y + side), 3.0 * ui.scale, 1.0 if active else 0.4)
     return _tell(work, index, row)
 
 
@@ -423,7 +419,7 @@ def _number_width(layer: LayerState, compact: bool) -> float:
 def _number(corner: imgui.ImVec2, strength: float, active: bool, compact: bool) -> None:
     """The strength in the card's upper right corner; every digit is equally wide."""
     beyond = PALETTE.warning if strength > 1.0 else PALETTE.text
-    at = imgui.ImVec2(corner.x, corner.y + imgui.get_style().frame_padding.y)
+    at = (corner.x, corner.y + imgui.get_style().frame_padding.y)
     text = _digits(strength, compact)
     imgui.get_window_draw_list().add_text(at, u32(beyond if active else PALETTE.dim), text)
 
@@ -439,12 +435,12 @@ def _name(
             work = replace(work, renaming=None, view=rename_layer(work.view, index, text))
         return work, CardTouch()
     x, y = imgui.get_cursor_screen_pos()
-    size, nav = imgui.ImVec2(max(room, 1.0), imgui.get_frame_height()), imgui.ButtonFlags_.enable_nav
+    size, nav = (max(room, 1.0), imgui.get_frame_height()), imgui.ButtonFlags_.enable_nav
     imgui.invisible_button("name", size, nav.value)
     if is_entered():
         return work, CardTouch(touched=True)
     gesture, named = grip(ui), imgui.is_item_active()
-    at = imgui.ImVec2(x, y + imgui.get_style().frame_padding.y)
+    at = (x, y + imgui.get_style().frame_padding.y)
     color, compact = PALETTE.text if active else PALETTE.dim, is_compact(work)
     marks = f"{Icon.LOCKED} " * (layer.locked and compact) + f"{Icon.SOLO} " * (layer.solo and compact)
     imgui.get_window_draw_list().add_text(at, u32(color), elide(marks + layer.name, room))

@@ -82,7 +82,7 @@ def draw_selection(state: ViewState, chosen: Sequence[int], ui: UiContext, actio
         return
     imgui.separator()
     right = right_edge()
-    imgui.push_style_var(imgui.StyleVar_.frame_padding, imgui.ImVec2(6.0 * ui.scale, 3.0 * ui.scale))
+    imgui.push_style_var(imgui.StyleVar_.frame_padding, (6.0 * ui.scale, 3.0 * ui.scale))
     imgui.align_text_to_frame_padding()
     small(f"{len(chosen)} layers", PALETTE.dim)
     imgui.same_line(right - imgui.get_frame_height())
@@ -99,7 +99,7 @@ def draw_selection(state: ViewState, chosen: Sequence[int], ui: UiContext, actio
         "##master", value, (), room, ui.scale, PALETTE.accent, most=most, height=MASTER_PX, help_=help_
     )
     imgui.end_disabled()
-    corner = imgui.ImVec2(at.x + room + 8.0 * ui.scale, at.y)
+    corner = (at.x + room + 8.0 * ui.scale, at.y)
     imgui.get_window_draw_list().add_text(corner, u32(PALETTE.text), f"{new:.3f}")
     if new != value:
         actions.append(f"master:{new!r}")
@@ -149,7 +149,7 @@ def draw_group(
         default=LayerGroup.strength,
         help_="What the strengths of its layers are multiplied by. Double-click: reset to 1",
     )
-    number_at = imgui.ImVec2(imgui.get_item_rect_max().x + 6.0 * scale, corner.y)
+    number_at = (imgui.get_item_rect_max().x + 6.0 * scale, corner[1])
     color = u32(PALETTE.text if group.enabled else PALETTE.dim)
     imgui.get_window_draw_list().add_text(number_at, color, f"{strength:.2f}")
     imgui.end_group()
@@ -161,20 +161,20 @@ def draw_group(
 
 def _group_name(
     state: ViewState, group: LayerGroup, count: int, room: float, ui: UiContext, actions: list[str]
-) -> tuple[imgui.ImVec2, str]:
+) -> tuple[tuple[float, float], str]:
     """The name and its menu; the corner of its text, and what the hand does with it.
 
     A click selects the layers, a second one renames, a drag moves them.
     """
     storage, naming = imgui.get_state_storage(), imgui.get_id("naming")
     x, y = imgui.get_cursor_screen_pos()
-    corner = imgui.ImVec2(x, y + imgui.get_style().frame_padding.y)
+    corner = (x, y + imgui.get_style().frame_padding.y)
     if storage.get_bool(naming):
         name = typed_name(group.name, room)
         storage.set_bool(naming, name is None)
         actions += [f"rename_group:{state.groups.index(group)}:{name}"] if name else []
         return corner, ""
-    imgui.invisible_button("name", imgui.ImVec2(max(room, 1.0), imgui.get_frame_height()))
+    imgui.invisible_button("name", (max(room, 1.0), imgui.get_frame_height()))
     gesture = grip(ui)
     if gesture == "clicked":
         actions.append(f"select_layers:{group.name}")
@@ -225,7 +225,7 @@ def draw_heading(work: Workspace, ui: UiContext, actions: list[str]) -> Workspac
     side, text = imgui.get_frame_height(), "+ New edit"
     wide = imgui.calc_text_size(text).x + 2 * imgui.get_style().frame_padding.x
     imgui.same_line(right - wide - (side + 4.0 * ui.scale) * bool(work.view.layers))
-    if (imgui.button if work.view.layers else accent_button)(text, imgui.ImVec2(wide, 0.0)):
+    if (imgui.button if work.view.layers else accent_button)(text, (wide, 0.0)):
         actions.append("new_edit")
     hint("new_edit")
     if not work.view.layers:
@@ -404,11 +404,11 @@ def _show_place(
     right = left + imgui.get_content_region_avail().x
     for row in rows:
         if {*row.layers} <= {*layers}:
-            veil = imgui.ImVec2(left, row.top), imgui.ImVec2(right, row.bottom)
+            veil = (left, row.top), (right, row.bottom)
             canvas.add_rect_filled(*veil, u32((*PALETTE.panel[:3], 0.6)), 6.0 * ui.scale)
     if y is not None:
         start = left + INSET_PX * ui.scale * joins
-        ends = imgui.ImVec2(start, y - ui.scale), imgui.ImVec2(right, y + ui.scale)
+        ends = (start, y - ui.scale), (right, y + ui.scale)
         canvas.add_rect_filled(*ends, u32(PALETTE.accent), ui.scale)
     canvas.pop_clip_rect()
     mouse, margin, step = imgui.get_mouse_pos().y, 24.0 * ui.scale, 6.0 * ui.scale

@@ -98,8 +98,8 @@ def draw(
         actions: takes those that were asked for, see `perform`
     """
     display, wide = imgui.get_io().display_size, width(work.layout, ui)
-    imgui.set_next_window_pos(imgui.ImVec2(display.x - wide, 0.0))
-    imgui.set_next_window_size(imgui.ImVec2(wide, display.y))
+    imgui.set_next_window_pos((display.x - wide, 0.0))
+    imgui.set_next_window_size((wide, display.y))
     still = imgui.WindowFlags_.no_scroll_with_mouse.value
     imgui.begin("panel", None, FIXED | BEHIND | still | ui.nav_flags("panel"))
     ui.take_keyboard("panel")
@@ -127,8 +127,8 @@ def draw(
 def _drag_edge(layout: Layout, ui: UiContext) -> Layout:
     """The panel's left edge, which is dragged; a double click takes it back to its first place."""
     start, (x, y) = imgui.get_cursor_screen_pos(), imgui.get_window_pos()
-    imgui.set_cursor_screen_pos(imgui.ImVec2(x, y))
-    imgui.invisible_button("edge", imgui.ImVec2(_EDGE_PX * ui.scale, imgui.get_window_height()))
+    imgui.set_cursor_screen_pos((x, y))
+    imgui.invisible_button("edge", (_EDGE_PX * ui.scale, imgui.get_window_height()))
     if imgui.is_item_hovered() or imgui.is_item_active():
         imgui.set_mouse_cursor(imgui.MouseCursor_.resize_ew.value)
     if imgui.is_item_active() and imgui.get_io().mouse_delta.x:
@@ -144,14 +144,14 @@ def _drag_edge(layout: Layout, ui: UiContext) -> Layout:
 def _begin_body(footer: float, ui: UiContext) -> None:
     """What scrolls; its scrollbar stands in the panel's margin, so that nothing moves when one is needed."""
     overflows = imgui.get_state_storage().get_bool(imgui.get_id("overflows"))
-    clear = imgui.ImVec4(0.0, 0.0, 0.0, 0.0)
+    clear = (0.0, 0.0, 0.0, 0.0)
     slots = (imgui.Col_.scrollbar_grab, imgui.Col_.scrollbar_grab_hovered, imgui.Col_.scrollbar_grab_active)
     for slot in () if overflows else slots:
         imgui.push_style_color(slot, clear)
     flags = imgui.WindowFlags_
     wide = imgui.get_content_region_avail().x + imgui.get_style().scrollbar_size
     flags_of_body = flags.always_vertical_scrollbar.value | ui.nav_flags("panel")
-    imgui.begin_child("body", imgui.ImVec2(wide, -footer), ui.child_flags("panel"), flags_of_body)
+    imgui.begin_child("body", (wide, -footer), ui.child_flags("panel"), flags_of_body)
     if not overflows:
         imgui.pop_style_color(len(slots))
 
@@ -177,7 +177,7 @@ def _title(
     small(f"{facts.title}  ·  {size}" if work.session else size, PALETTE.dim, text)
     tip(f"{facts.title}\n{size}")
     below = imgui.get_cursor_pos()
-    imgui.set_cursor_pos(imgui.ImVec2(at.x + room - 3 * side, at.y - 2.0 * scale))
+    imgui.set_cursor_pos((at.x + room - 3 * side, at.y - 2.0 * scale))
     actions += ["save"] * icon_button("save", Icon.SAVE, ui, side=side)
     hint("save")
     imgui.same_line(0.0, 0.0)
@@ -186,7 +186,7 @@ def _title(
     imgui.same_line(0.0, 0.0)
     _menu_button(recent, side, ui, actions)
     imgui.set_cursor_pos(below)
-    imgui.dummy(imgui.ImVec2(0.0, 2.0 * scale))
+    imgui.dummy((0.0, 2.0 * scale))
 
 
 _OF_REGION = "menu of a region"
@@ -237,7 +237,7 @@ def _row(index: int, region: NamedRegion, ui: UiContext, actions: list[str]) -> 
         return False
     x, y = imgui.get_cursor_screen_pos()
     io, mouse = imgui.get_io(), imgui.MouseButton_
-    size, nav = imgui.ImVec2(max(right - imgui.get_cursor_pos_x(), 1.0), tall), imgui.ButtonFlags_.enable_nav
+    size, nav = (max(right - imgui.get_cursor_pos_x(), 1.0), tall), imgui.ButtonFlags_.enable_nav
     if imgui.invisible_button("select", size, nav.value):
         mode = "add" if io.key_shift else "subtract" if io.key_ctrl else "new"
         actions.append(f"region:{index}:{mode}")
@@ -247,8 +247,8 @@ def _row(index: int, region: NamedRegion, ui: UiContext, actions: list[str]) -> 
     if imgui.is_item_clicked(mouse.right.value):
         imgui.open_popup(_OF_REGION)
     above = imgui.get_style().frame_padding.y
-    canvas.add_text(imgui.ImVec2(x, y + above), u32(PALETTE.text), elide(region.name, room))
-    at = imgui.ImVec2(imgui.get_item_rect_max().x - wide, y + above + 1.0 * scale)
+    canvas.add_text((x, y + above), u32(PALETTE.text), elide(region.name, room))
+    at = (imgui.get_item_rect_max().x - wide, y + above + 1.0 * scale)
     canvas.add_text(ui.fonts.regular, SMALL_PX * scale, at, color, count)
     for action in menu_items(_OF_REGION, _ITEMS, ui):
         actions += [action.format(index)] if action else []

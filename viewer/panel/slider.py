@@ -71,7 +71,7 @@ def draw(
         storage.set_bool(_slot(label, "entered"), False)
         imgui.set_keyboard_focus_here()
         imgui.set_nav_cursor_visible(True)
-    imgui.invisible_button(label, imgui.ImVec2(width, height * scale), imgui.ButtonFlags_.enable_nav.value)
+    imgui.invisible_button(label, (width, height * scale), imgui.ButtonFlags_.enable_nav.value)
     hovered, pressed = imgui.is_item_hovered(), imgui.is_item_active()
     radius = RADIUS_PX * scale
     start, span = left + radius, max(width - 2 * radius, 1.0) / most
@@ -84,7 +84,7 @@ def draw(
     elif imgui.is_item_activated():
         if imgui.get_io().key_ctrl:
             start_typing(label)
-            imgui.set_cursor_screen_pos(imgui.ImVec2(left, top))
+            imgui.set_cursor_screen_pos((left, top))
             return _text_field(label, value, width, most)  # at once: what is typed next is not lost
         on_handle = abs(mouse - (start + value * span)) <= radius + 2.0 * scale
         value = value if on_handle else min(most, max(0.0, (mouse - start) / span))
@@ -138,7 +138,7 @@ def _text_field(label: str, value: float, width: float, most: float) -> float:
         storage.set_bool(_slot(label, "wants focus"), False)
     imgui.set_next_item_width(width)
     padding = imgui.get_style().frame_padding
-    imgui.push_style_var(imgui.StyleVar_.frame_padding, imgui.ImVec2(padding.x, padding.y / 2))
+    imgui.push_style_var(imgui.StyleVar_.frame_padding, (padding.x, padding.y / 2))
     flags = imgui.InputTextFlags_.enter_returns_true.value | imgui.InputTextFlags_.auto_select_all.value
     entered, text = imgui.input_text(f"{label}/field", f"{value:.3f}", flags)
     imgui.pop_style_var()
@@ -164,26 +164,16 @@ def _paint(
     middle, half = top + radius + 1.0 * scale, 2.0 * scale
     at = start + value * span
     canvas.add_rect_filled(
-        imgui.ImVec2(start - half, middle - half),
-        imgui.ImVec2(start + span * most + half, middle + half),
-        u32(p.field),
-        half,
+        (start - half, middle - half), (start + span * most + half, middle + half), u32(p.field), half
     )
-    canvas.add_rect_filled(
-        imgui.ImVec2(start - half, middle - half), imgui.ImVec2(at, middle + half), u32(fill), half
-    )
+    canvas.add_rect_filled((start - half, middle - half), (at, middle + half), u32(fill), half)
     if most > 1.0:
-        end = imgui.ImVec2(start + span * most + half, middle + half)
-        canvas.add_rect_filled(imgui.ImVec2(start + span, middle - half), end, u32(p.warning_dark), half)
-        if value > 1.0:
-            end.x = at
-            canvas.add_rect_filled(imgui.ImVec2(start + span, middle - half), end, u32(p.warning), half)
+        for end, ink in ((start + span * most + half, p.warning_dark), (max(at, start + span), p.warning)):
+            canvas.add_rect_filled((start + span, middle - half), (end, middle + half), u32(ink), half)
     foot = middle + radius + 1.0 * scale
     for tick in ticks:
         x = round(start + tick * span) + 0.5
         tall = 4.0 if tick in (0.0, 1.0) else 3.0
-        canvas.add_line(
-            imgui.ImVec2(x, foot), imgui.ImVec2(x, foot + tall * scale), u32(p.dim), max(1.0, scale)
-        )
-    canvas.add_circle_filled(imgui.ImVec2(at, middle), radius + 1.0 * scale, u32(p.card))
-    canvas.add_circle_filled(imgui.ImVec2(at, middle), radius - (0.0 if lit else 1.0) * scale, u32(p.handle))
+        canvas.add_line((x, foot), (x, foot + tall * scale), u32(p.dim), max(1.0, scale))
+    canvas.add_circle_filled((at, middle), radius + 1.0 * scale, u32(p.card))
+    canvas.add_circle_filled((at, middle), radius - (0.0 if lit else 1.0) * scale, u32(p.handle))

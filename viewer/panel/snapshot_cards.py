@@ -89,7 +89,7 @@ def draw(
             actions.append(f"move_snapshot:{index}:{to}")
         elif kind == "dragged":
             corner = imgui.ImVec2(start.x + (to % COLUMNS) * (each + gap), start.y + to // COLUMNS * tall)
-            end = imgui.ImVec2(corner.x + each, corner.y + 0.75 * each)
+            end = (corner.x + each, corner.y + 0.75 * each)
             imgui.get_window_draw_list().add_rect(
                 corner, end, u32(PALETTE.accent), 4.0 * ui.scale, 3.0 * ui.scale
             )
@@ -130,7 +130,7 @@ def _slider(cards: _Cards, work: Workspace, current: bool, ui: UiContext, action
         current,
         help_="Blend from A to B. Ctrl+click: type a value. Shift+drag: fine adjustment.",
     )
-    corner = imgui.ImVec2(at.x + room + 8.0 * ui.scale, at.y)
+    corner = (at.x + room + 8.0 * ui.scale, at.y)
     color = PALETTE.text if current else PALETTE.dim
     imgui.get_window_draw_list().add_text(corner, u32(color), f"{share:.2f}")
     if share != work.view.pair.share:
@@ -144,7 +144,7 @@ def _card(index: int, cards: _Cards, wide: float, ui: UiContext, actions: list[s
     imgui.begin_group()
     at = imgui.get_cursor_screen_pos()
     tall = 0.75 * wide
-    imgui.invisible_button(f"restore{index}", imgui.ImVec2(wide, tall), imgui.ButtonFlags_.enable_nav.value)
+    imgui.invisible_button(f"restore{index}", (wide, tall), imgui.ButtonFlags_.enable_nav.value)
     gesture = "clicked" if is_entered() else grip(ui)
     dragged = f"{gesture}:{index}" if index and gesture in ("dragged", "dropped") else ""
     if gesture == "clicked":
@@ -164,7 +164,7 @@ def _card(index: int, cards: _Cards, wide: float, ui: UiContext, actions: list[s
         imgui.get_state_storage().set_bool(renaming, not action)
         names = {"name": name, "at": index, "before": index - 1, "after": index + 1}
         actions += [action.format_map(names)] if action else []
-    canvas, end = imgui.get_window_draw_list(), imgui.ImVec2(at.x + wide, at.y + tall)
+    canvas, end = imgui.get_window_draw_list(), (at.x + wide, at.y + tall)
     picture(cards.textures[index], at, end, 4.0 * ui.scale)
     if hovered or dragged:
         canvas.add_rect(at, end, u32(PALETTE.accent), 4.0 * ui.scale, 2.0 * ui.scale)
@@ -192,6 +192,6 @@ def _badge(text: str, at: imgui.ImVec2, ui: UiContext) -> None:
     """The letter of a snapshot of the pair, over its picture."""
     canvas, size, pad = imgui.get_window_draw_list(), imgui.calc_text_size(text), 4.0 * ui.scale
     corner = imgui.ImVec2(at.x + pad, at.y + pad)
-    end = imgui.ImVec2(corner.x + size.x + 2 * pad, corner.y + size.y + 0.5 * pad)
+    end = (corner.x + size.x + 2 * pad, corner.y + size.y + 0.5 * pad)
     canvas.add_rect_filled(corner, end, u32(PALETTE.scrim), 3.0 * ui.scale)
-    canvas.add_text(imgui.ImVec2(corner.x + pad, corner.y + 0.25 * pad), u32(PALETTE.text), text)
+    canvas.add_text((corner.x + pad, corner.y + 0.25 * pad), u32(PALETTE.text), text)

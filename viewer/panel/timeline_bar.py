@@ -91,8 +91,8 @@ def draw(work: Workspace, area: Area, ui: UiContext) -> tuple[str, ...]:
         What was asked for: actions of the workspace.
     """
     tall, roomy, scale = _bar_height(work, area, ui), _is_wide(area, ui), ui.scale
-    timeline, actions, corner = work.view.timeline, list[str](), imgui.ImVec2(0.0, area.height - tall)
-    with plate("timeline", corner, ui, pad=10.0, size=imgui.ImVec2(area.width, tall)):
+    timeline, actions, corner = work.view.timeline, list[str](), (0.0, area.height - tall)
+    with plate("timeline", corner, ui, pad=10.0, size=(area.width, tall)):
         left, keys = imgui.get_cursor_screen_pos().x, split_keys(timeline)
         _buttons(timeline, work.player, actions, ui)
         imgui.same_line(BUTTONS_PX * scale + 10.0 * scale)
@@ -138,8 +138,8 @@ def _buttons(timeline: Timeline, player: Player, actions: list[str], ui: UiConte
     off = [*["play"] * (not can_play), *["drop_key"] * (not (here or chosen))]
     icon_row(items, ui, actions, gap, off=off)
     imgui.same_line(0.0, gap)
-    imgui.push_style_color(imgui.Col_.text, imgui.ImVec4(*(PALETTE.error if auto else PALETTE.faint)))
-    if imgui.button(f"{icons.ICON_FA_CIRCLE}##auto", imgui.ImVec2(imgui.get_frame_height(), 0.0)):
+    imgui.push_style_color(imgui.Col_.text, PALETTE.error if auto else PALETTE.faint)
+    if imgui.button(f"{icons.ICON_FA_CIRCLE}##auto", (imgui.get_frame_height(), 0.0)):
         actions.append("auto_key")
     imgui.pop_style_color()
     hint("auto_key", "Now " + ("on" if auto else "off"))
@@ -153,7 +153,7 @@ def _settings(work: Workspace, ruler: _Ruler, actions: list[str]) -> None:
     if timeline.keys:
         chosen = chosen_keys(timeline, ruler.player)
         easing = (ruler.keys[min(chosen)] if chosen else key_before(timeline, ruler.frame)).easing
-    if imgui.button(f"{easing.capitalize()}##easing", imgui.ImVec2(58.0 * ui.scale, 0.0)):
+    if imgui.button(f"{easing.capitalize()}##easing", (58.0 * ui.scale, 0.0)):
         actions.append("easing")
     imgui.end_disabled()
     hint("easing", "The chosen ones first")
@@ -196,14 +196,14 @@ def _draw_ruler(ruler: _Ruler, wide: float, actions: list[str]) -> None:
     for key in ruler.keys:
         frames.setdefault(key[1], []).append(key)
     top, tall = imgui.get_cursor_screen_pos().y, imgui.get_frame_height()
-    under = _drag("ruler", frames, imgui.ImVec2(max(wide, 1.0), tall), ruler, actions)
+    under = _drag("ruler", frames, (max(wide, 1.0), tall), ruler, actions)
     _paint(ruler, frames, top, top + tall - 6.0 * ruler.ui.scale, under)
 
 
 def _drag(
     name: str,
     frames: Mapping[int, Sequence[RowKey]],
-    size: imgui.ImVec2,
+    size: imgui.ImVec2Like,
     ruler: _Ruler,
     actions: list[str],
 ) -> int | None:
@@ -252,8 +252,8 @@ def _rows(work: Workspace, ruler: _Ruler, left: float, tall: float, actions: lis
     """A row of keys for the camera and each layer, as the panel has them; they scroll where they are many."""
     layers = list(enumerate(reversed(work.view.layers), 1))
     curves = tracks(ruler.timeline)
-    imgui.push_style_var(imgui.StyleVar_.item_spacing, imgui.ImVec2(0.0, 0.0))
-    imgui.begin_child("rows", imgui.ImVec2(0.0, tall - _GAP_PX * ruler.ui.scale))
+    imgui.push_style_var(imgui.StyleVar_.item_spacing, (0.0, 0.0))
+    imgui.begin_child("rows", (0.0, tall - _GAP_PX * ruler.ui.scale))
     _row(CAMERA, "Camera", PALETTE.handle, (), ruler, left, False, actions)
     for number, layer in layers:
         focused = work.focus == len(layers) - number
@@ -280,19 +280,19 @@ def _row(
     imgui.push_id(row)
     imgui.push_font(None, SMALL_PX)
     names = ruler.start - 8.0 * scale - left - tall
-    pressed = imgui.invisible_button("name", imgui.ImVec2(names, tall))
+    pressed = imgui.invisible_button("name", (names, tall))
     lit = focused or (imgui.is_item_hovered() and row != CAMERA)
     if focused:
-        corner = imgui.ImVec2(end, top + tall)
-        canvas.add_rect_filled(imgui.ImVec2(left, top), corner, u32(p.card_focused), 3.0 * scale)
-    at, ink = imgui.ImVec2(round(left + 6.0 * scale), round(top + 3.0 * scale)), u32(p.text if lit else p.dim)
+        corner = (end, top + tall)
+        canvas.add_rect_filled((left, top), corner, u32(p.card_focused), 3.0 * scale)
+    at, ink = (round(left + 6.0 * scale), round(top + 3.0 * scale)), u32(p.text if lit else p.dim)
     canvas.add_text(at, ink, elide(name, names - 8.0 * scale))
     imgui.same_line(0.0, 0.0)
     here = (row, ruler.frame) in ruler.keys
-    if imgui.invisible_button("key", imgui.ImVec2(tall, tall)):
+    if imgui.invisible_button("key", (tall, tall)):
         actions.append(f"{'drop_key' if here else 'key'}:{row}")
     ink = u32(p.handle if imgui.is_item_hovered() else color if here else p.faint)
-    middle = imgui.ImVec2(left + names + tall / 2, top + tall / 2)
+    middle = (left + names + tall / 2, top + tall / 2)
     canvas.add_ngon_filled(middle, 4.5 * scale, ink, 4) if here else canvas.add_ngon(
         middle, 4.5 * scale, ink, 4
     )
@@ -300,22 +300,19 @@ def _row(
     imgui.pop_font()
     imgui.same_line(0.0, 0.0)
     frames = {frame: [(row, frame)] for r, frame in ruler.keys if r == row}
-    under = _drag("keys", frames, imgui.ImVec2(end - ruler.start + 8.0 * scale, tall), ruler, actions)
+    under = _drag("keys", frames, (end - ruler.start + 8.0 * scale, tall), ruler, actions)
     imgui.pop_id()
     line, low, high = max(1.0, scale), top + tall - 3.0 * scale, top + 3.0 * scale
-    ends = imgui.ImVec2(ruler.start, low), imgui.ImVec2(ruler.start + ruler.span, low)
+    ends = (ruler.start, low), (ruler.start + ruler.span, low)
     canvas.add_line(*ends, u32(p.line), line)
     if points:
         count = max(2, int(ruler.span / (_CURVE_PX * scale)))
         frames_shown = [ruler.timeline.length * i / count for i in range(count + 1)]
-        curve = [
-            imgui.ImVec2(ruler.x(f), low - min(value_between(points, f), 1.0) * (low - high))
-            for f in frames_shown
-        ]
+        curve = [(ruler.x(f), low - min(value_between(points, f), 1.0) * (low - high)) for f in frames_shown]
         canvas.add_polyline([*curve], u32((*color[:3], 0.75)), line, 0)
     _paint_keys(ruler, frames, top + tall / 2, under, color)
     x = round(ruler.x(ruler.frame)) + 0.5
-    canvas.add_line(imgui.ImVec2(x, top), imgui.ImVec2(x, top + tall), u32(p.accent), line)
+    canvas.add_line((x, top), (x, top + tall), u32(p.accent), line)
     return bool(pressed and row != CAMERA)
 
 
@@ -337,7 +334,7 @@ def _paint(
     timeline, ui, start, span = ruler.timeline, ruler.ui, ruler.start, ruler.span
     canvas, p, scale = imgui.get_window_draw_list(), PALETTE, ui.scale
     thin = max(1.0, scale)
-    canvas.add_line(imgui.ImVec2(start, line), imgui.ImVec2(start + span, line), u32(p.faint), thin)
+    canvas.add_line((start, line), (start + span, line), u32(p.faint), thin)
     _paint_numbers(timeline, ruler.frame, start, span, top, line, ui)
     here = {frame: keys for frame, keys in frames.items() if frame == ruler.frame}
     _paint_keys(
@@ -347,14 +344,14 @@ def _paint(
     if not timeline.keys:
         hint = "Press K to insert a keyframe"
         size = SMALL_PX * scale
-        at = imgui.ImVec2(round(start + 40.0 * scale), round(line - size - 3.0 * scale))
+        at = (round(start + 40.0 * scale), round(line - size - 3.0 * scale))
         canvas.add_text(ui.fonts.regular, size, at, u32(p.dim), hint)
     x = round(ruler.x(ruler.frame)) + 0.5
-    canvas.add_line(imgui.ImVec2(x, top - 2.0 * scale), imgui.ImVec2(x, line), u32(p.accent), 1.5 * scale)
+    canvas.add_line((x, top - 2.0 * scale), (x, line), u32(p.accent), 1.5 * scale)
     canvas.add_triangle_filled(
-        imgui.ImVec2(x - 5.0 * scale, top - 4.0 * scale),
-        imgui.ImVec2(x + 5.0 * scale, top - 4.0 * scale),
-        imgui.ImVec2(x, top + 3.0 * scale),
+        (x - 5.0 * scale, top - 4.0 * scale),
+        (x + 5.0 * scale, top - 4.0 * scale),
+        (x, top + 3.0 * scale),
         u32(p.accent),
     )
 
@@ -370,7 +367,7 @@ def _paint_numbers(
     for tick in range(0, timeline.length + 1, fine):
         x = round(place(timeline, tick, start, span)) + 0.5
         high = (5.0 if tick % step == 0 else 2.5) * scale
-        canvas.add_line(imgui.ImVec2(x, line - high), imgui.ImVec2(x, line), u32(p.faint), max(1.0, scale))
+        canvas.add_line((x, line - high), (x, line), u32(p.faint), max(1.0, scale))
     here = place(timeline, frame, start, span)
     numbers = range(0, timeline.length + 1, step) if timeline.keys else ()
     for number in (*(n for n in numbers if n != frame), frame):
@@ -382,7 +379,7 @@ def _paint_numbers(
         after = x - 3.2 * scale * len(text)
         if number == frame:
             after = x + 7.0 * scale if x < start + span - 20.0 * scale else x - (7 + 6.4 * len(text)) * scale
-        at = imgui.ImVec2(round(after), round(top - 4.0 * scale))
+        at = (round(after), round(top - 4.0 * scale))
         canvas.add_text(ui.fonts.regular, size, at, color, text)
 
 
@@ -390,12 +387,12 @@ def _paint_key(canvas: imgui.ImDrawList, x: float, y: float, size: float, color:
     """Smooth is round, linear a diamond, hold a square."""
     edge = u32(PALETTE.panel)
     if easing == "smooth":
-        canvas.add_circle_filled(imgui.ImVec2(x, y), size + 1.5, edge)
-        canvas.add_circle_filled(imgui.ImVec2(x, y), size, color)
+        canvas.add_circle_filled((x, y), size + 1.5, edge)
+        canvas.add_circle_filled((x, y), size, color)
         return
     corners = 4
     turn = 0.0 if easing == "linear" else math.pi / 4
     for radius, ink in ((size * 1.2 + 2.0, edge), (size * 1.2, color)):
         points = [turn + 2 * math.pi * i / corners for i in range(corners)]
-        a, b, c, d = (imgui.ImVec2(x + radius * math.cos(t), y + radius * math.sin(t)) for t in points)
+        a, b, c, d = ((x + radius * math.cos(t), y + radius * math.sin(t)) for t in points)
         canvas.add_quad_filled(a, b, c, d, ink)

@@ -75,8 +75,8 @@ _SIZE_KEYS = f"{shortcut('brush_radius:0.8')} and {shortcut('brush_radius:1.25')
 def _open_below(share: float, ui: UiContext) -> None:
     """The menu that comes next opens under the plate, `share` of the way along its foot."""
     (x, y), size = imgui.get_window_pos(), imgui.get_window_size()
-    at = imgui.ImVec2(x + share * size.x, y + size.y + 4.0 * ui.scale)
-    imgui.set_next_window_pos(at, 0, imgui.ImVec2(share, 0.0))
+    at = (x + share * size.x, y + size.y + 4.0 * ui.scale)
+    imgui.set_next_window_pos(at, 0, (share, 0.0))
 
 
 def draw_toolbar(view: ViewState, area: Area, ui: UiContext, actions: list[str]) -> None:
@@ -87,11 +87,11 @@ def draw_toolbar(view: ViewState, area: Area, ui: UiContext, actions: list[str])
     count, gap = sum(map(len, _TOOLS)), 6.0 * ui.scale
     room = area.height - 2 * (EDGE_PX + _PAD_PX) * ui.scale - gap * (len(_TOOLS) - 1)
     side = min(max(room / count, _LEAST_PX * ui.scale), _SIDE_PX * ui.scale)
-    imgui.push_style_var(imgui.StyleVar_.item_spacing, imgui.ImVec2(0.0, 0.0))
-    with plate("tools", imgui.ImVec2(EDGE_PX * ui.scale, EDGE_PX * ui.scale), ui, pad=_PAD_PX):
+    imgui.push_style_var(imgui.StyleVar_.item_spacing, (0.0, 0.0))
+    with plate("tools", (EDGE_PX * ui.scale, EDGE_PX * ui.scale), ui, pad=_PAD_PX):
         for i, group in enumerate(_TOOLS):
             if i:
-                imgui.dummy(imgui.ImVec2(1.0, gap))
+                imgui.dummy((1.0, gap))
             for action, icon in group:
                 imgui.begin_disabled(off.get(action, False))
                 if icon_button(action, icon, ui, lit=action == held, side=side):
@@ -164,10 +164,8 @@ def draw_options(work: Workspace, area: Area, ui: UiContext, actions: list[str])
     left, right = (TOOLBAR_PX + 2 * EDGE_PX) * ui.scale, area.width - EDGE_PX * ui.scale
     narrow = area.width < NARROW_PX * ui.scale  # else it leaves the axes free
     bar = _Bar(right - (0.0 if narrow else view_width(view, area, ui)) - EDGE_PX * ui.scale, ui)
-    with plate("options", imgui.ImVec2(left, EDGE_PX * ui.scale), ui):
-        imgui.push_style_var(
-            imgui.StyleVar_.item_spacing, imgui.ImVec2(EDGE_PX * ui.scale, EDGE_PX * ui.scale)
-        )
+    with plate("options", (left, EDGE_PX * ui.scale), ui):
+        imgui.push_style_var(imgui.StyleVar_.item_spacing, (EDGE_PX * ui.scale, EDGE_PX * ui.scale))
         imgui.align_text_to_frame_padding()
         if view.brush.active:
             imgui.text("Paint")
@@ -176,7 +174,7 @@ def draw_options(work: Workspace, area: Area, ui: UiContext, actions: list[str])
             imgui.text(view.select.tool.capitalize())
             view = replace(view, select=_select_options(view.select, bar))
         else:
-            imgui.dummy(imgui.ImVec2(0.0, imgui.get_frame_height()))
+            imgui.dummy((0.0, imgui.get_frame_height()))
         pointed = None if view.brush.active else _selection(view, bar, actions)
         foot = imgui.get_window_pos().y + imgui.get_window_size().y
         imgui.pop_style_var()
@@ -236,7 +234,7 @@ def _save(regions: int, bar: _Bar, actions: list[str]) -> None:
         storage.set_bool(naming, name is None)
         if name:
             actions.append(f"save_region:{name}")
-    elif imgui.button(text, imgui.ImVec2(wide, 0.0)):
+    elif imgui.button(text, (wide, 0.0)):
         storage.set_bool(naming, True)
     else:
         tip("Keep the selection as a file and as a row under Regions")
@@ -296,16 +294,16 @@ def _legend(bar: _Bar) -> None:
     wide, tall = 96.0 * bar.ui.scale, imgui.get_frame_height()
     bar.follow(wide)
     (left, top), canvas = imgui.get_cursor_screen_pos(), imgui.get_window_draw_list()
-    imgui.dummy(imgui.ImVec2(wide, tall))
+    imgui.dummy((wide, tall))
     for (start, a), (end, b) in pairwise(highlight.RAMP):
         low, high = (u32(highlight.rgba(color)) for color in (a, b))
-        corners = imgui.ImVec2(left + start * wide, top), imgui.ImVec2(left + end * wide, top + tall)
+        corners = (left + start * wide, top), (left + end * wide, top + tall)
         canvas.add_rect_filled_multi_color(*corners, low, high, high, low)
     for x, text, color in (
         (left + 6.0 * bar.ui.scale, "0", PALETTE.handle),
         (left + wide - 14.0 * bar.ui.scale, "1", PALETTE.ink),
     ):
-        canvas.add_text(imgui.ImVec2(round(x), round(top + 5.0 * bar.ui.scale)), u32(color), text)
+        canvas.add_text((round(x), round(top + 5.0 * bar.ui.scale)), u32(color), text)
 
 
 def draw_ring(view: ViewState, ui: UiContext) -> None:
@@ -328,7 +326,12 @@ _AGAINST = (
 
 
 def draw_comparison(
-    work: Workspace, words: Labels, off: dict[str, str], original: bool, place: imgui.ImVec2, ui: UiContext
+    work: Workspace,
+    words: Labels,
+    off: dict[str, str],
+    original: bool,
+    place: imgui.ImVec2Like,
+    ui: UiContext,
 ) -> tuple[Workspace, str]:
     """The pill at the top of the picture: what is compared with what, and how.
 
@@ -348,7 +351,7 @@ def draw_comparison(
     if right == FIELD:
         left, right, figure = "as trained", "edited", f"{words.left} · {figure}"
     figure = words.line if compare.mode == "difference" else figure
-    imgui.push_style_var(imgui.StyleVar_.item_spacing, imgui.ImVec2(0.0, 2.0 * ui.scale))
+    imgui.push_style_var(imgui.StyleVar_.item_spacing, (0.0, 2.0 * ui.scale))
     with plate("comparison", place, ui, (0.5, 0.0), _PAD_PX):
         if _word("left", left.capitalize(), on or original, ui):
             asked = "before"
@@ -377,8 +380,8 @@ def draw_comparison(
 
 def _word(name: str, text: str, bright: bool, ui: UiContext) -> bool:
     """One side of the comparison; True when it was pressed."""
-    imgui.push_style_color(imgui.Col_.text, imgui.ImVec4(*(PALETTE.handle if bright else PALETTE.dim)))
-    imgui.push_style_color(imgui.Col_.button, imgui.ImVec4(0.0, 0.0, 0.0, 0.0))
+    imgui.push_style_color(imgui.Col_.text, PALETTE.handle if bright else PALETTE.dim)
+    imgui.push_style_color(imgui.Col_.button, (0.0, 0.0, 0.0, 0.0))
     pressed = imgui.button(f"{elide(text, 200.0 * ui.scale)}##{name}")
     imgui.pop_style_color(2)
     return bool(pressed)
@@ -430,8 +433,8 @@ def draw_view(view: ViewState, area: Area, foot: float, ui: UiContext, actions: 
     top = max(overlay.axes_height(view, area, ui), EDGE_PX * ui.scale)
     if top < foot and area.width < NARROW_PX * ui.scale:
         return view  # the bar lies over it
-    imgui.push_style_var(imgui.StyleVar_.item_spacing, imgui.ImVec2(0.0, 0.0))
-    with plate("view", imgui.ImVec2(area.width - EDGE_PX * ui.scale, top), ui, (1.0, 0.0), _PAD_PX):
+    imgui.push_style_var(imgui.StyleVar_.item_spacing, (0.0, 0.0))
+    with plate("view", (area.width - EDGE_PX * ui.scale, top), ui, (1.0, 0.0), _PAD_PX):
         icon_row(_LOOKS, ui, actions)
         imgui.same_line()
         if icon_button("view", Icon.VIEW, ui):

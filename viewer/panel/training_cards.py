@@ -40,7 +40,7 @@ def draw(jobs: Sequence[Job], ui: UiContext, actions: list[str]) -> None:
     imgui.separator()
     if storage.get_bool(is_open):
         room = 0.5 * imgui.get_window_height()
-        imgui.begin_child("jobs", imgui.ImVec2(0.0, max(min(storage.get_float(tall), room), 1.0)))
+        imgui.begin_child("jobs", (0.0, max(min(storage.get_float(tall), room), 1.0)))
         for job in listed:
             imgui.push_id(job.number)
             actions += _card(job, ui)
@@ -70,16 +70,16 @@ def _strip(jobs: Sequence[Job], is_open: bool, ui: UiContext) -> bool:
     job = min(jobs, key=lambda job: order.index(job.status) if job.status in order else len(order))
     start, right, tall = imgui.get_cursor_pos(), right_edge(), STRIP_PX * ui.scale
     (x, y), dot = imgui.get_cursor_screen_pos(), 4.0 * ui.scale
-    pressed = imgui.invisible_button("strip", imgui.ImVec2(imgui.get_content_region_avail().x, tall))
+    pressed = imgui.invisible_button("strip", (imgui.get_content_region_avail().x, tall))
     tip("Show or hide the cards of all jobs")
     color = PALETTE.error if _is_failed(job) else PALETTE.accent if job.status == "running" else PALETTE.dim
-    imgui.get_window_draw_list().add_circle_filled(imgui.ImVec2(x + dot, y + tall / 2), dot, u32(color))
+    imgui.get_window_draw_list().add_circle_filled((x + dot, y + tall / 2), dot, u32(color))
     end = (f"+{len(jobs) - 1}   " if len(jobs) > 1 else "") + (Icon.UNFOLDED if is_open else Icon.RAISED)
     left = job.seconds_left
     words = f"{_status(job)}  ·  {duration(left)}" if left is not None else _status(job)
     below, sizes = imgui.get_cursor_pos(), [imgui.calc_text_size(text).x for text in (words, end)]
     top = start.y + (tall - imgui.get_text_line_height()) / 2
-    imgui.set_cursor_pos(imgui.ImVec2(start.x + 4 * dot, top))
+    imgui.set_cursor_pos((start.x + 4 * dot, top))
     imgui.text(elide(job.task.name, right - start.x - sum(sizes) - 8 * dot))
     for text, at in ((words, 0.0), (end, right - sizes[1])):
         imgui.same_line(at)
@@ -98,7 +98,7 @@ def _card(job: Job, ui: UiContext) -> list[str]:
         about = f"{task.name}\n{task.editor} on {task.region}\n" if isinstance(task, EditOrder) else ""
         tip(f"{about}{task.out}")
         imgui.same_line(right - wide)
-        imgui.text_colored(imgui.ImVec4(*(PALETTE.error if failed else PALETTE.dim)), word)
+        imgui.text_colored(PALETTE.error if failed else PALETTE.dim, word)
         runs = job.status == "running" and not job.starved
         _bar(job.progress.share, PALETTE.error if failed else PALETTE.accent if runs else PALETTE.faint, ui)
         menu = bool(about) and job.status != "queued"
@@ -121,11 +121,11 @@ def _bar(share: float, color: Rgba, ui: UiContext) -> None:
     """How far it is."""
     x, y = imgui.get_cursor_screen_pos()
     wide, tall = imgui.get_content_region_avail().x, BAR_PX * ui.scale
-    imgui.dummy(imgui.ImVec2(wide, tall))
+    imgui.dummy((wide, tall))
     for reach, ink in ((1.0, PALETTE.field), (share, color)):
         if reach:
-            end = imgui.ImVec2(x + max(reach * wide, tall), y + tall)
-            imgui.get_window_draw_list().add_rect_filled(imgui.ImVec2(x, y), end, u32(ink), tall / 2)
+            end = (x + max(reach * wide, tall), y + tall)
+            imgui.get_window_draw_list().add_rect_filled((x, y), end, u32(ink), tall / 2)
 
 
 def _foot(job: Job, right: float, menu: bool, ui: UiContext) -> list[str]:
@@ -143,7 +143,7 @@ def _foot(job: Job, right: float, menu: bool, ui: UiContext) -> list[str]:
         small(line, PALETTE.dim, right - imgui.get_cursor_pos_x() - sum(widths) - 6.0 * ui.scale)
         tip(line)
     actions, x = [], right - sum(widths)
-    imgui.push_style_color(imgui.Col_.button, imgui.ImVec4(0.0, 0.0, 0.0, 0.0))
+    imgui.push_style_color(imgui.Col_.button, (0.0, 0.0, 0.0, 0.0))
     for (text, action, help_), wide in zip(buttons, widths, strict=True):
         imgui.same_line(x)
         imgui.push_font(None, SMALL_PX)

@@ -211,7 +211,7 @@ def _apply_style(scale: float) -> None:
         "item_inner_spacing": (6, 4),
         "cell_padding": (6, 3),
     }.items():
-        setattr(style, name, imgui.ImVec2(x * scale, y * scale))
+        setattr(style, name, (x * scale, y * scale))
     for name, size in {
         "frame_rounding": 4,
         "popup_rounding": 4,
@@ -256,9 +256,9 @@ def _apply_style(scale: float) -> None:
         col.text_selected_bg: (*p.accent[:3], 0.4),
         col.nav_cursor: p.accent,
     }.items():
-        style.set_color_(slot, imgui.ImVec4(*color))
+        style.set_color_(slot, color)
 
 
 def u32(color: Rgba) -> int:
     """A packed color for draw lists."""
-    return imgui.get_color_u32(imgui.ImVec4(*color))
+    return imgui.get_color_u32(color)

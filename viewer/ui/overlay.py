@@ -72,9 +72,7 @@ def table(lines: Sequence[tuple[str, str]], ui: UiContext) -> None:
     right = left + names + figures + gap + 2 * pad
     bottom = top + step * len(lines) + 2 * pad - (step - size)
     canvas = imgui.get_background_draw_list()
-    canvas.add_rect_filled(
-        imgui.ImVec2(left, top), imgui.ImVec2(right, bottom), u32(PALETTE.scrim), 5 * ui.scale
-    )
+    canvas.add_rect_filled((left, top), (right, bottom), u32(PALETTE.scrim), 5 * ui.scale)
     for i, (name, figure) in enumerate(lines):
         y = top + pad + i * step
         _text(left + pad, y, name, size, PALETTE.dim, ui)
@@ -86,7 +84,7 @@ def banner(text: str, area: Area, ui: UiContext) -> None:
     size, pad = FONT_PX * ui.scale, 8.0 * ui.scale
     wide = _text_width(text, size, ui)
     x, y = (area.width - wide) / 2, 14.0 * ui.scale
-    corners = imgui.ImVec2(x - 1.5 * pad, y - pad / 2), imgui.ImVec2(x + wide + 1.5 * pad, y + size + pad / 2)
+    corners = (x - 1.5 * pad, y - pad / 2), (x + wide + 1.5 * pad, y + size + pad / 2)
     imgui.get_background_draw_list().add_rect_filled(*corners, u32(PALETTE.scrim), 5 * ui.scale)
     _text(x, y, text, size, PALETTE.text, ui)
 
@@ -134,7 +132,7 @@ def draw_cross(area: Area, ui: UiContext) -> None:
     x, y, canvas = round(area.width / 2), round(area.height / 2), imgui.get_background_draw_list()
     for color, thick in ((PALETTE.scrim, 3.0), (PALETTE.handle, 1.0)):
         for dx, dy in ((6.0 * ui.scale, 0.0), (0.0, 6.0 * ui.scale)):
-            ends = imgui.ImVec2(x - dx, y - dy), imgui.ImVec2(x + dx, y + dy)
+            ends = (x - dx, y - dy), (x + dx, y + dy)
             canvas.add_line(*ends, u32(color), thick * ui.scale)
 
 
@@ -149,12 +147,12 @@ def draw_frame(name: str, frame: Area, area: Area, ui: UiContext) -> None:
         (0, top, left, bottom),
         (right, top, area.width, bottom),
     ):
-        canvas.add_rect_filled(imgui.ImVec2(*corners[:2]), imgui.ImVec2(*corners[2:]), shade)
-    line, at = u32(PALETTE.handle), (imgui.ImVec2(left, top), imgui.ImVec2(right, bottom))
+        canvas.add_rect_filled(corners[:2], corners[2:], shade)
+    line, at = u32(PALETTE.handle), ((left, top), (right, bottom))
     canvas.add_rect(*at, line, thickness=ui.scale)
     size, pad = SMALL_PX * ui.scale, 5.0 * ui.scale
     x, y = right - _text_width(name, size, ui) - 2 * pad, bottom - size - pad  # the tools lie at the left
-    canvas.add_rect_filled(imgui.ImVec2(x, y), at[1], u32(PALETTE.scrim))
+    canvas.add_rect_filled((x, y), at[1], u32(PALETTE.scrim))
     _text(x + pad, y + pad / 2, name, size, PALETTE.text, ui)
 
 
@@ -167,8 +165,8 @@ def message(line: Message, area: Area, ui: UiContext) -> tuple[str, float]:
     """
     pad = 12.0 * ui.scale
     widest = min(area.width - 2 * pad, 640.0 * ui.scale)
-    imgui.set_next_window_size_constraints(imgui.ImVec2(0.0, 0.0), imgui.ImVec2(widest, area.height))
-    with plate("message", imgui.ImVec2(pad, area.height - pad), ui, (0.0, 1.0), 12.0):
+    imgui.set_next_window_size_constraints((0.0, 0.0), (widest, area.height))
+    with plate("message", (pad, area.height - pad), ui, (0.0, 1.0), 12.0):
         buttons = (
             {"Copy details": "copy"} if line.details else {line.button[0]: "do"} if line.button[0] else {}
         )
@@ -179,7 +177,7 @@ def message(line: Message, area: Area, ui: UiContext) -> tuple[str, float]:
         imgui.push_text_wrap_pos(imgui.get_cursor_pos_x() + room if wrap else -1.0)
         imgui.align_text_to_frame_padding()
         color = PALETTE.error if line.error else PALETTE.text
-        imgui.text_colored(imgui.ImVec4(*color), line.text)
+        imgui.text_colored(color, line.text)
         imgui.pop_text_wrap_pos()
         clicked = ""
         for text, name in buttons.items():
@@ -199,7 +197,7 @@ def _text_width(text: str, size: float, ui: UiContext) -> float:
 def _text(
     x: float, y: float, text: str, size: float, color: tuple[float, float, float, float], ui: UiContext
 ) -> None:
-    at = imgui.ImVec2(round(x), round(y))
+    at = (round(x), round(y))
     imgui.get_background_draw_list().add_text(ui.fonts.regular, size, at, u32(color), text)
 
 
@@ -253,14 +251,14 @@ def draw_axes(view: ViewState, area: Area, lit: bool, ui: UiContext) -> None:
         return
     canvas, (x, y), s = imgui.get_background_draw_list(), _center(area, ui), ui.scale
     if lit:
-        canvas.add_circle_filled(imgui.ImVec2(x, y), _REACH_PX * s, u32(_DISC))
+        canvas.add_circle_filled((x, y), _REACH_PX * s, u32(_DISC))
     on = axis_under(view, area, ui) if lit else ""
     for end in _ends(view.camera, area, ui):
         sign, letter = end.name[0], end.name[1]
-        ink, at = _dim(_INKS[letter], end.nearness), imgui.ImVec2(end.x, end.y)
+        ink, at = _dim(_INKS[letter], end.nearness), (end.x, end.y)
         if sign == "+":
-            canvas.add_line(imgui.ImVec2(x, y), at, u32(_SHADE), 3.5 * s)
-            canvas.add_line(imgui.ImVec2(x, y), at, u32(ink), 2.0 * s)
+            canvas.add_line((x, y), at, u32(_SHADE), 3.5 * s)
+            canvas.add_line((x, y), at, u32(ink), 2.0 * s)
             canvas.add_circle_filled(at, (BALL_PX + 0.75) * s, u32(_SHADE))
             canvas.add_circle_filled(at, BALL_PX * s, u32(ink))
             _letter(canvas, end, letter, _LIGHT if end.name == on else _DARK, ui)
@@ -312,5 +310,5 @@ def _letter(canvas: imgui.ImDrawList, end: _End, text: str, color: Rgba, ui: UiC
     imgui.push_font(ui.fonts.bold, LETTER_PX)
     wide = imgui.calc_text_size(text).x
     imgui.pop_font()
-    at = imgui.ImVec2(round(end.x - wide / 2), round(end.y - size / 2))
+    at = (round(end.x - wide / 2), round(end.y - size / 2))
     canvas.add_text(ui.fonts.bold, size, at, u32(color), text)

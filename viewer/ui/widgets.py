@@ -27,16 +27,16 @@ def section(name: str, folded: tuple[str, ...], ui: UiContext) -> tuple[str, ...
     x, y = imgui.get_cursor_screen_pos()
     imgui.push_font(ui.fonts.bold, SMALL_PX)
     text, tall, step = name.upper(), imgui.get_frame_height(), 16.0 * ui.scale
-    room = imgui.ImVec2(imgui.calc_text_size(text).x + step, tall + 2.0 * ui.scale)
+    room = (imgui.calc_text_size(text).x + step, tall + 2.0 * ui.scale)
     pressed = imgui.invisible_button(f"section {name}", room, imgui.ButtonFlags_.enable_nav.value)
     color, canvas = (
         u32(PALETTE.text if imgui.is_item_hovered() else PALETTE.dim),
         imgui.get_window_draw_list(),
     )
-    canvas.add_text(imgui.ImVec2(round(x + step), round(y + 6.0 * ui.scale)), color, text)
+    canvas.add_text((round(x + step), round(y + 6.0 * ui.scale)), color, text)
     imgui.pop_font()
     arrow = Icon.FOLDED if name in folded else Icon.UNFOLDED
-    canvas.add_text(imgui.ImVec2(round(x), round(y + 5.0 * ui.scale)), color, arrow)
+    canvas.add_text((round(x), round(y + 5.0 * ui.scale)), color, arrow)
     if not pressed:
         return folded
     return tuple(other for other in folded if other != name) if name in folded else (*folded, name)
@@ -58,7 +58,7 @@ def small(text: str, color: Rgba, room: float | None = None) -> None:
     """Small text, shortened to `room` window pixels, or to the line."""
     imgui.push_font(None, SMALL_PX)
     room = imgui.get_content_region_avail().x if room is None else room
-    imgui.text_colored(imgui.ImVec4(*color), elide(text, room))
+    imgui.text_colored(color, elide(text, room))
     imgui.pop_font()
 
 
@@ -66,18 +66,20 @@ def wrapped_text(text: str, color: Rgba) -> None:
     """Small text in as many lines as it takes."""
     imgui.push_font(None, SMALL_PX)
     imgui.push_text_wrap_pos(0.0)
-    imgui.text_colored(imgui.ImVec4(*color), text)
+    imgui.text_colored(color, text)
     imgui.pop_text_wrap_pos()
     imgui.pop_font()
 
 
-def picture(texture: int, at: imgui.ImVec2, end: imgui.ImVec2, rounding: float, opacity: float = 1.0) -> None:
+def picture(
+    texture: int, at: imgui.ImVec2Like, end: imgui.ImVec2Like, rounding: float, opacity: float = 1.0
+) -> None:
     """A picture by its GL name; where there is none, 0, an empty card."""
     canvas = imgui.get_window_draw_list()
     if not texture:
         canvas.add_rect_filled(at, end, u32(PALETTE.card), rounding)
         return
-    corners, white = (imgui.ImVec2(0.0, 0.0), imgui.ImVec2(1.0, 1.0)), u32((1.0, 1.0, 1.0, opacity))
+    corners, white = ((0.0, 0.0), (1.0, 1.0)), u32((1.0, 1.0, 1.0, opacity))
     canvas.add_image_rounded(imgui.ImTextureRef(texture), at, end, *corners, white, rounding)
 
 
@@ -86,13 +88,12 @@ def card(
     name: str, color: Rgba, ui: UiContext, nav: bool = False, padding: tuple[float, float] = (10.0, 8.0)
 ) -> Iterator[None]:
     """What is drawn within lies on a card of its own height; `nav`: the keyboard goes through it."""
-    imgui.push_style_color(imgui.Col_.child_bg, imgui.ImVec4(*color))
-    around = imgui.ImVec2(*(side * ui.scale for side in padding))
-    imgui.push_style_var(imgui.StyleVar_.window_padding, around)
+    imgui.push_style_color(imgui.Col_.child_bg, color)
+    imgui.push_style_var(imgui.StyleVar_.window_padding, imgui.ImVec2(*padding) * ui.scale)
     child = imgui.ChildFlags_
     flags = child.auto_resize_y.value | child.always_use_window_padding.value
     flags |= 0 if nav else ui.child_flags("panel")
-    imgui.begin_child(name, imgui.ImVec2(0.0, 0.0), flags, 0 if nav else ui.nav_flags("panel"))
+    imgui.begin_child(name, (0.0, 0.0), flags, 0 if nav else ui.nav_flags("panel"))
     imgui.pop_style_var()  # here, as tips and menus have paddings of their own
     yield  # where this raises, the frame ends what is open
     imgui.end_child()
@@ -102,18 +103,18 @@ def card(
 @contextmanager
 def plate(
     name: str,
-    at: imgui.ImVec2,
+    at: imgui.ImVec2Like,
     ui: UiContext,
     pivot: tuple[float, float] = (0.0, 0.0),
     pad: float = 8.0,
-    size: imgui.ImVec2 | None = None,
+    size: imgui.ImVec2Like | None = None,
 ) -> Iterator[None]:
     """What is drawn within lies on a plate over the picture; `size`: as large as what is on it if None."""
-    imgui.set_next_window_pos(at, 0, imgui.ImVec2(*pivot))
-    imgui.set_next_window_size(size or imgui.ImVec2(0.0, 0.0))
-    imgui.push_style_color(imgui.Col_.window_bg, imgui.ImVec4(*PALETTE.scrim))
+    imgui.set_next_window_pos(at, 0, pivot)
+    imgui.set_next_window_size(size or (0.0, 0.0))
+    imgui.push_style_color(imgui.Col_.window_bg, PALETTE.scrim)
     imgui.push_style_var(imgui.StyleVar_.window_rounding, 4.0 * ui.scale)
-    imgui.push_style_var(imgui.StyleVar_.window_padding, imgui.ImVec2(pad * ui.scale, pad * ui.scale))
+    imgui.push_style_var(imgui.StyleVar_.window_padding, (pad * ui.scale, pad * ui.scale))
     fits = imgui.WindowFlags_.always_auto_resize.value if size is None else 0
     imgui.begin(name, None, FIXED | UNFOCUSED | BEHIND | fits | ui.nav_flags(name))
     imgui.pop_style_var(2)
@@ -123,12 +124,12 @@ def plate(
     imgui.end()
 
 
-def accent_button(text: str, size: imgui.ImVec2) -> bool:
+def accent_button(text: str, size: imgui.ImVec2Like) -> bool:
     """The button that one is most likely here for; True when it was pressed."""
     col = imgui.Col_
     colors = {col.button: PALETTE.accent, col.button_hovered: PALETTE.handle, col.text: PALETTE.ink}
     for slot, color in colors.items():
-        imgui.push_style_color(slot, imgui.ImVec4(*color))
+        imgui.push_style_color(slot, color)
     pressed = imgui.button(text, size)
     imgui.pop_style_color(len(colors))
     return bool(pressed)
@@ -155,15 +156,13 @@ def icon_button(
     """
     side = side or imgui.get_frame_height()
     x, y = imgui.get_cursor_screen_pos()
-    pressed = bool(
-        imgui.invisible_button(name, imgui.ImVec2(side, side), imgui.ButtonFlags_.enable_nav.value)
-    )
+    pressed = bool(imgui.invisible_button(name, (side, side), imgui.ButtonFlags_.enable_nav.value))
     hovered, canvas, size = imgui.is_item_hovered(), imgui.get_window_draw_list(), imgui.calc_text_size(icon)
     if hovered or lit:
         ground = u32(PALETTE.chosen if lit else PALETTE.field)
-        canvas.add_rect_filled(imgui.ImVec2(x, y), imgui.ImVec2(x + side, y + side), ground, 4.0 * ui.scale)
+        canvas.add_rect_filled((x, y), (x + side, y + side), ground, 4.0 * ui.scale)
     color = PALETTE.handle if hovered or lit else PALETTE.faint if dim else PALETTE.text
-    at = imgui.ImVec2(round(x + (side - size.x) / 2), round(y + (side - size.y) / 2))
+    at = (round(x + (side - size.x) / 2), round(y + (side - size.y) / 2))
     canvas.add_text(at, u32(color), icon)
     return pressed
 
@@ -258,7 +257,7 @@ def search_field(hint_: str, query: str) -> str:
 @contextmanager
 def menu(name: str, ui: UiContext, flags: int = 0) -> Iterator[bool]:
     """A context menu that `imgui.open_popup(name)` opens; whether it is open. `flags`: of its window"""
-    imgui.push_style_var(imgui.StyleVar_.window_padding, imgui.ImVec2(8.0 * ui.scale, 8.0 * ui.scale))
+    imgui.push_style_var(imgui.StyleVar_.window_padding, (8.0 * ui.scale, 8.0 * ui.scale))
     is_open = imgui.begin_popup(name, flags)
     imgui.pop_style_var()
     yield bool(is_open)  # where this raises, the frame ends what is open
@@ -299,9 +298,7 @@ def drop_down(
         if i == goal:
             imgui.set_keyboard_focus_here()
             imgui.set_nav_cursor_visible(True)
-        imgui.push_style_color(
-            imgui.Col_.text, imgui.ImVec4(*(PALETTE.faint if i in faint else PALETTE.text))
-        )
+        imgui.push_style_color(imgui.Col_.text, PALETTE.faint if i in faint else PALETTE.text)
         if imgui.selectable(f"{title}##{i}", i == current)[0]:
             chosen = i
         imgui.pop_style_color()
@@ -380,7 +377,7 @@ def value_slider(
     flags |= imgui.SliderFlags_.logarithmic.value if ends[0] > 0.0 else 0
     imgui.set_next_item_width(wide or -1.0)
     for slot in (imgui.Col_.slider_grab, imgui.Col_.slider_grab_active):
-        imgui.push_style_color(slot, imgui.ImVec4(0.0, 0.0, 0.0, 0.0))
+        imgui.push_style_color(slot, (0.0, 0.0, 0.0, 0.0))
     changed, new = imgui.slider_float(name, value, *ends, form, flags)
     imgui.pop_style_color(2)
     if is_double_clicked():
@@ -389,8 +386,8 @@ def value_slider(
     now, base = new if changed else value, math.log(ends[0]) if ends[0] > 0.0 else ends[0]
     share = (math.log(now) - base) / (math.log(ends[1]) - base) if ends[0] > 0.0 else now - base
     share = min(max(share if ends[0] > 0.0 else share / (ends[1] - base), 0.0), 1.0)
-    left, end = imgui.ImVec2(low.x, high.y - 3.0 * ui.scale), imgui.ImVec2(high.x, high.y)
-    canvas, shut = imgui.get_window_draw_list(), imgui.ImVec2(low.x + share * (high.x - low.x), high.y)
+    left, end = (low.x, high.y - 3.0 * ui.scale), (high.x, high.y)
+    canvas, shut = imgui.get_window_draw_list(), (low.x + share * (high.x - low.x), high.y)
     canvas.add_rect_filled(left, end, u32(PALETTE.line), 2.0 * ui.scale)
     canvas.add_rect_filled(left, shut, u32(PALETTE.accent), 2.0 * ui.scale)
     return round(new, 2) if changed else value  # unchanged, imgui still rounds to float32
@@ -408,13 +405,13 @@ def choice(
         widths = [text + (room - sum(texts)) / len(options) for text in texts]
     pressed = None
     imgui.begin_group()
-    imgui.push_style_var(imgui.StyleVar_.frame_padding, imgui.ImVec2(0.0, 5.0 * ui.scale))
+    imgui.push_style_var(imgui.StyleVar_.frame_padding, (0.0, 5.0 * ui.scale))
     for i, option in enumerate(options):
         if i:
             imgui.same_line(0.0, gap)
         for slot in _BUTTON_COLORS if i == current else ():
-            imgui.push_style_color(slot, imgui.ImVec4(*PALETTE.chosen))
-        if imgui.button(f"{option}##{name}", imgui.ImVec2(widths[i], 0.0)):
+            imgui.push_style_color(slot, PALETTE.chosen)
+        if imgui.button(f"{option}##{name}", (widths[i], 0.0)):
             pressed = i
         imgui.pop_style_color(len(_BUTTON_COLORS) if i == current else 0)
     imgui.pop_style_var()
@@ -460,8 +457,8 @@ def swatch(color: tuple[float, float, float], alpha: float, edge: bool, ui: UiCo
     side, tall = 12.0 * ui.scale, imgui.get_frame_height()
     x, y = imgui.get_cursor_screen_pos()
     top = y + (tall - side) / 2
-    corners = imgui.ImVec2(x, top), imgui.ImVec2(x + side, top + side)
-    imgui.dummy(imgui.ImVec2(side, tall))
+    corners = (x, top), (x + side, top + side)
+    imgui.dummy((side, tall))
     canvas = imgui.get_window_draw_list()
     canvas.add_rect_filled(*corners, u32((*color, alpha)), 3 * ui.scale)
     if edge:

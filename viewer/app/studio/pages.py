@@ -60,7 +60,7 @@ class StartFile:
 def draw_start_page(recent: Sequence[StartFile], examples: Sequence[StartFile], ui: UiContext) -> list[str]:
     """The page, over the whole window; the actions that were asked for."""
     display, scale = imgui.get_io().display_size, ui.scale
-    imgui.set_next_window_pos(imgui.ImVec2(0.0, 0.0))
+    imgui.set_next_window_pos((0.0, 0.0))
     imgui.set_next_window_size(display)
     imgui.begin("start page", None, FIXED | BEHIND)
     wide = min(display.x - 2 * MARGIN_PX * scale, WIDEST_PX * scale)
@@ -73,20 +73,20 @@ def draw_start_page(recent: Sequence[StartFile], examples: Sequence[StartFile], 
     shown = (0.75 * thirds + (_TEXT_PX + _HEADING_PX) * scale) * bool(examples)
     tall = shown + rows * (0.75 * small_card + (_TEXT_PX + GAP_PX) * scale)
     top = max((display.y - tall - 2 * _HEADING_PX * scale) / 2.6, MARGIN_PX * scale)
-    imgui.set_cursor_pos(imgui.ImVec2(left, top))
+    imgui.set_cursor_pos((left, top))
     imgui.begin_group()
     actions = _head(side, 0.0 if narrow else max(0.75 * thirds, 120.0 * scale), ui)
     imgui.end_group()
     level = imgui.get_cursor_pos_y() + 0.5 * GAP_PX * scale if narrow else top + _TITLE_TALL_PX * scale
-    imgui.set_cursor_pos(imgui.ImVec2(right, level - (0.0 if narrow else 19.0 * scale)))
+    imgui.set_cursor_pos((right, level - (0.0 if narrow else 19.0 * scale)))
     imgui.begin_group()
     for heading, files, across in (("Examples", examples, thirds), ("Recent", recent, small_card)):
         if files:
             small(heading, PALETTE.dim)
             actions += _grid(files, across, room, heading == "Recent", ui)
-            imgui.dummy(imgui.ImVec2(0.0, 0.5 * GAP_PX * scale))
+            imgui.dummy((0.0, 0.5 * GAP_PX * scale))
     imgui.end_group()
-    imgui.dummy(imgui.ImVec2(0.0, 0.5 * MARGIN_PX * scale))
+    imgui.dummy((0.0, 0.5 * MARGIN_PX * scale))
     imgui.end()
     return actions
 
@@ -114,27 +114,25 @@ def _head(wide: float, tall: float, ui: UiContext) -> list[str]:
     text, side = imgui.calc_text_size(DROP_TEXT), (frame.y - button.y) / 2  # of a line: the margin around it
     middle = x + (frame.x - button.x) / 2, y + frame.y / 2
     imgui.set_cursor_pos(
-        imgui.ImVec2(x + button.x + 2 * side, y + (frame.y - text.y) / 2)
+        (x + button.x + 2 * side, y + (frame.y - text.y) / 2)
         if flat
-        else imgui.ImVec2(x + (frame.x - text.x) / 2, middle[1] - 32.0 * scale)
+        else (x + (frame.x - text.x) / 2, middle[1] - 32.0 * scale)
     )
     imgui.text_disabled(DROP_TEXT)
-    imgui.set_cursor_pos(
-        imgui.ImVec2(x + side, y + side) if flat else imgui.ImVec2(middle[0], middle[1] - 2.0 * scale)
-    )
+    imgui.set_cursor_pos((x + side, y + side) if flat else (middle[0], middle[1] - 2.0 * scale))
     if accent_button(f"{Icon.OPEN}  Open…", button):
         actions.append("open")
     hint("open")
     if flat:
-        imgui.set_cursor_pos(imgui.ImVec2(x + frame.x - button.x - side, y + side))
+        imgui.set_cursor_pos((x + frame.x - button.x - side, y + side))
     else:
-        imgui.set_cursor_pos(imgui.ImVec2(x, y + frame.y + 12.0 * scale))
+        imgui.set_cursor_pos((x, y + frame.y + 12.0 * scale))
     imgui.push_item_flag(_NO_NAV, True)
-    if imgui.button("Train the demo", imgui.ImVec2(button.x if flat else wide, button.y)):
+    if imgui.button("Train the demo", (button.x if flat else wide, button.y)):
         actions.append("demo")
     imgui.pop_item_flag()
     hint("demo")
-    imgui.set_cursor_pos(imgui.ImVec2(x, y))
+    imgui.set_cursor_pos((x, y))
     _dashed_frame(frame, ui)
     return actions
 
@@ -163,7 +161,7 @@ def _card(file: StartFile, wide: float, own: bool, ui: UiContext) -> list[str]:
         imgui.set_keyboard_focus_here()
         imgui.set_nav_cursor_visible(True)
     imgui.set_next_item_allow_overlap()
-    if imgui.invisible_button("file", imgui.ImVec2(wide, tall), imgui.ButtonFlags_.enable_nav.value):
+    if imgui.invisible_button("file", (wide, tall), imgui.ButtonFlags_.enable_nav.value):
         asked = ["open"] if file.missing else [f"{'open_file' if own else 'example'}:{file.path}"]
     hovered = imgui.is_item_hovered(
         imgui.HoveredFlags_.no_nav_override.value
@@ -176,12 +174,12 @@ def _card(file: StartFile, wide: float, own: bool, ui: UiContext) -> list[str]:
     picture(file.texture, at, end, rounding, 0.3 if file.missing else 1.0)
     if not file.texture:
         size = imgui.calc_text_size(Icon.PICTURE)
-        middle = imgui.ImVec2(round(at.x + (wide - size.x) / 2), round(at.y + (tall - size.y) / 2))
+        middle = (round(at.x + (wide - size.x) / 2), round(at.y + (tall - size.y) / 2))
         canvas.add_text(middle, u32(PALETTE.field_hovered), Icon.PICTURE)
     if own and (file.missing or imgui.is_mouse_hovering_rect(at, end)):
         below, side = imgui.get_cursor_screen_pos(), imgui.get_frame_height()
         corner = imgui.ImVec2(end.x - side - 4.0 * scale, at.y + 4.0 * scale)
-        edge = imgui.ImVec2(corner.x + side, corner.y + side)
+        edge = (corner.x + side, corner.y + side)
         canvas.add_rect_filled(corner, edge, u32(PALETTE.scrim), rounding)
         imgui.set_cursor_screen_pos(corner)
         imgui.push_item_flag(_NO_NAV, True)  # the arrows lead from card to card
@@ -193,7 +191,7 @@ def _card(file: StartFile, wide: float, own: bool, ui: UiContext) -> list[str]:
     if hovered:
         canvas.add_rect(at, end, u32(PALETTE.accent), rounding, 2.0 * scale)
     name = file.title or escape_text(file.path.name.removesuffix(SUFFIX))
-    imgui.text_colored(imgui.ImVec4(*(PALETTE.dim if file.missing else PALETTE.text)), elide(name, wide))
+    imgui.text_colored(PALETTE.dim if file.missing else PALETTE.text, elide(name, wide))
     small(file.line, PALETTE.dim, wide)
     imgui.end_group()
     return asked
@@ -217,8 +215,8 @@ def _dashed_frame(size: imgui.ImVec2, ui: UiContext) -> None:
     for left, top, length, dx, dy in sides:
         for i in range(int(length / (2 * dash)) + 1):
             low, high = 2 * i * dash, min((2 * i + 1) * dash, length)
-            begin = imgui.ImVec2(left + dx * low, top + dy * low)
-            end = imgui.ImVec2(left + dx * high, top + dy * high)
+            begin = (left + dx * low, top + dy * low)
+            end = (left + dx * high, top + dy * high)
             canvas.add_line(begin, end, ink, 1.5 * scale)
 
 
@@ -259,8 +257,8 @@ def draw_up_strip(strip: UpStrip, area: Area, ui: UiContext) -> tuple[str, ...]:
     tall = up_strip_height(strip, area, ui) - _GAP_PX * scale
     count = len(strip.choices)
     across = count * wide + ((count - 1) * _GAP_PX + 2 * _PAD_PX) * scale
-    place = imgui.ImVec2(area.width / 2, area.height - _GAP_PX * scale)
-    with plate("up axis", place, ui, (0.5, 1.0), _PAD_PX, imgui.ImVec2(across, tall)):
+    place = (area.width / 2, area.height - _GAP_PX * scale)
+    with plate("up axis", place, ui, (0.5, 1.0), _PAD_PX, (across, tall)):
         top, right = imgui.get_cursor_pos_y(), right_edge()
         imgui.text("Which way is up?")
         keep = f"Keep {strip.now} (Esc)"
@@ -272,9 +270,7 @@ def draw_up_strip(strip: UpStrip, area: Area, ui: UiContext) -> tuple[str, ...]:
                 requests.append("keep_up")
         imgui.pop_font()
         for i, direction in enumerate(strip.choices):
-            imgui.set_cursor_pos(
-                imgui.ImVec2((_PAD_PX + i * _GAP_PX) * scale + i * wide, top + _TITLE_PX * scale)
-            )
+            imgui.set_cursor_pos(((_PAD_PX + i * _GAP_PX) * scale + i * wide, top + _TITLE_PX * scale))
             if _up_picture(direction, wide, direction.name == strip.now, ui):
                 requests.append(f"set_up:{i}")
     return tuple(requests)
@@ -289,8 +285,8 @@ def _picture_width(strip: UpStrip, area: Area, ui: UiContext) -> float:
 
 def _up_picture(direction: UpChoice, wide: float, now: bool, ui: UiContext) -> bool:
     at, rounding = imgui.get_cursor_screen_pos(), 4.0 * ui.scale
-    pressed = bool(imgui.invisible_button(direction.name, imgui.ImVec2(wide, 0.75 * wide)))
-    canvas, end = imgui.get_window_draw_list(), imgui.ImVec2(at.x + wide, at.y + 0.75 * wide)
+    pressed = bool(imgui.invisible_button(direction.name, (wide, 0.75 * wide)))
+    canvas, end = imgui.get_window_draw_list(), (at.x + wide, at.y + 0.75 * wide)
     picture(direction.texture, at, end, rounding)
     if now or imgui.is_item_hovered():
         ink = PALETTE.accent if imgui.is_item_hovered() else PALETTE.dim
@@ -299,10 +295,10 @@ def _up_picture(direction: UpChoice, wide: float, now: bool, ui: UiContext) -> b
     imgui.push_font(ui.fonts.bold, SMALL_PX)
     text = imgui.calc_text_size(direction.name)
     imgui.pop_font()
-    corner = imgui.ImVec2(at.x + text.x + 2 * pad, at.y + size + pad)
+    corner = (at.x + text.x + 2 * pad, at.y + size + pad)
     canvas.add_rect_filled(at, corner, u32(PALETTE.scrim), rounding)
-    at = imgui.ImVec2(round(at.x + pad), round(at.y + pad / 2))
-    canvas.add_text(ui.fonts.bold, size, at, u32(PALETTE.text), direction.name)
+    text_at = (round(at.x + pad), round(at.y + pad / 2))
+    canvas.add_text(ui.fonts.bold, size, text_at, u32(PALETTE.text), direction.name)
     return pressed
 
 
@@ -320,7 +316,7 @@ def draw_cover(cover: Cover, view: ViewState, size: tuple[int, int], area: Area,
     """Draw it over the view, where it belongs there."""
     if (cover.camera, cover.size) != (view.camera, size) or view.compare.mode != "off":
         return
-    corners = imgui.ImVec2(0.0, 0.0), imgui.ImVec2(area.width, area.height)
+    corners = (0.0, 0.0), (area.width, area.height)
     imgui.get_background_draw_list().add_image(imgui.ImTextureRef(cover.texture), *corners)
     overlay.banner(cover.name, area, ui)
 
