@@ -70,7 +70,7 @@ def use_session(path: Path) -> None:
         return {file: file.stat().st_mtime_ns for file in files if not file.match("s/*.region.npy")}
 
     before = others()
-    opened = session.open_session(path, path.parents[1] / "memory")
+    opened = session.open_session(path)
     state, total = opened.view.selection, len(opened.document.scene)
     for i, region in enumerate(state.regions):
         exports.region_file(region, total)

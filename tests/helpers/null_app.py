@@ -27,7 +27,7 @@ def null_app(document: Document, view: ViewState, folder: Path) -> Iterator[App]
         window = Window("test", (900, 640))
     finally:
         glfw.init_hint(glfw.PLATFORM, glfw.ANY_PLATFORM)
-    app = App(window, document, view, memory=folder / "memory")
+    app = App(window, document, view)
     app.draw()
     yield app
     app.close()

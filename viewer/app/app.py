@@ -150,7 +150,6 @@ class App:
         document: Document,
         state: ViewState,
         session: Path | None = None,
-        memory: Path | None = None,
         draw: str = "auto",
     ) -> None:
         self.window, self.document = window, document
@@ -165,21 +164,20 @@ class App:
             window.ui_scale,
             exports.folder_of(document.path),
         )
-        self.file_actions = FileActions(self, session, memory)
+        self.file_actions = FileActions(self, session)
         self.jobs = JobActions(
-            self, memory, lambda form: self.preview.draft(form), lambda form: self.preview.anchor(form)
+            self, lambda form: self.preview.draft(form), lambda form: self.preview.anchor(form)
         )
         self.deliver = DeliverActions(self, self.jobs.queue)
-        self.start = StartActions(self, self.context, self.jobs.queue, memory)
+        self.start = StartActions(self, self.context, self.jobs.queue)
         self.up = UpActions(self, self.context)
-        self.preview = PreviewActions(self, self.context, self.jobs.region_spec, memory)
+        self.preview = PreviewActions(self, self.context, self.jobs.region_spec)
         self.strays = StrayActions(self)
-        self.tidy = TidyActions(self, memory)
+        self.tidy = TidyActions(self)
         self.is_closed = False
         self._waits = False  # a splash is shown
         self._title = ""
-        self._memory = memory
-        self._layout = user_files.read_layout(memory)
+        self._layout = user_files.read_layout()
         self.main_view.work = replace(self.main_view.work, layout=self._layout)
         self._failures: dict[str, tuple[int, float]] = {}  # by place: in which frame last, and when said
         self.main_view.report = self.report
@@ -202,9 +200,9 @@ class App:
         """The keys that the person gave to commands; what is wrong with them is a line, and in the log."""
         bind({})
         with self._guard():
-            if problems := bind(user_files.read_keys(self._memory)):
-                where, more = user_files.keys_file(self._memory), len(problems) - 1
-                log_error("\n".join([f"{where}:", *problems]), self._memory)
+            if problems := bind(user_files.read_keys()):
+                where, more = user_files.keys_file(), len(problems) - 1
+                log_error("\n".join([f"{where}:", *problems]))
                 text = f"{where.name}: {problems[0]}" + (f", and {more} more in {LOG}" if more else "")
                 self.main_view.show_message(text, error=True)
 
@@ -224,7 +222,7 @@ class App:
         if not line:
             details = error_details(error)
             if before < 0:
-                log_error(details, self._memory)
+                log_error(details)
             what = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
             line = f"Internal error ({what[:200]}); {self.file_actions.keep_work()}"
         self.main_view.show_message(line, True, details)
@@ -392,7 +390,7 @@ class App:
             main_view.wake()
         if main_view.work.layout != self._layout and not imgui.is_mouse_down(0):
             self._layout = main_view.work.layout
-            user_files.keep_layout(self._layout, self._memory)
+            user_files.keep_layout(self._layout)
         title = _window_title(name or self.document.title, self.file_actions.has_unsaved)
         if title != self._title:
             self.window.rename(title)

@@ -82,9 +82,9 @@ def error_details(error: Exception) -> str:
     return f"{system}\n\n{''.join(traceback.format_exception(error))}"
 
 
-def log_error(details: str, folder: Path | None = None) -> None:
+def log_error(details: str) -> None:
     """Add it to window.log in the folder of the program's state, which keeps the last 1-2 MB."""
-    folder = folder or state_folder()
+    folder = state_folder()
     with suppress(OSError):  # where no log can be written, the message still has the details
         folder.mkdir(parents=True, exist_ok=True)
         file = RotatingFileHandler(

@@ -214,11 +214,10 @@ class FileActions:
     Args:
         app: the window
         path: the session's file, None before it has one
-        memory: folder of the list of recent files; the user's own if None
     """
 
-    def __init__(self, app: Application, path: Path | None = None, memory: Path | None = None) -> None:
-        self._app, self.path, self._memory = app, path, memory
+    def __init__(self, app: Application, path: Path | None = None) -> None:
+        self._app, self.path = app, path
         self.session_autosave = SessionAutosave()
         self._put_off: set[Path] = set()  # autosaves that were found and are to be decided about later
         self._browser = dialogs.Browser()
@@ -269,7 +268,7 @@ class FileActions:
     def _open_keys(self) -> None:
         """The file of keys in the program that the desktop has for it, with all there are in it at first."""
         keys = {action: command.keys.split() for action, command in COMMANDS.items()}
-        path = write_keys(keys, self._memory)
+        path = write_keys(keys)
         webbrowser.open(path.as_uri())
         self._app.main_view.show_message(f"Keys are read from {path} when the window opens")
 
@@ -351,7 +350,7 @@ class FileActions:
             path = self.session_autosave.write(unsaved, self._autosave_base, self._write)
             return f"unsaved work is kept in {path}"
         except Exception as error:  # what is wrong may be the work itself
-            log_error(error_details(error), self._memory)
+            log_error(error_details(error))
             return f"unsaved work could not be kept ({error}); save it under another name"
 
     def on_close(self) -> None:
@@ -398,8 +397,8 @@ class FileActions:
         self._app.main_view.recent = self._remember(path)
 
     def _open_session(self, path: Path) -> None:
-        main_view, memory = self._app.main_view, self._memory
-        opened = self._app.wait_for(lambda: session.open_session(path, memory), f"Opening {path.name} …")
+        main_view = self._app.main_view
+        opened = self._app.wait_for(lambda: session.open_session(path), f"Opening {path.name} …")
         self._app.open_document(opened.document, opened.view, opened.snapshots)
         self.session_autosave.drop()
         if opened.warning:
@@ -469,7 +468,7 @@ class FileActions:
         main_view, scene = self._app.main_view, self._app.document.path
         view = main_view.work.view
         if scene is not None and view.selection.regions:
-            folders = exports.region_folders(path, scene, self._memory)
+            folders = exports.region_folders(path, scene)
             main_view.change(replace(view, selection=exports.claim_regions(view.selection, folders)))
 
     def _write(self, path: Path) -> None:
@@ -535,6 +534,4 @@ class FileActions:
         return self.path or session.free_session(self._session_name(), self.session_autosave.path)
 
     def _remember(self, *paths: Path) -> tuple[Path, ...]:
-        if not paths:
-            return read_recent(self._memory)
-        return remember_recent(paths, self._memory)
+        return remember_recent(paths) if paths else read_recent()

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -43,11 +42,10 @@ class TidyActions:
 
     Args:
         app: the window
-        memory: folder of the program's state; the user's own if None
     """
 
-    def __init__(self, app: Application, memory: Path | None = None) -> None:
-        self._app, self._memory = app, memory
+    def __init__(self, app: Application) -> None:
+        self._app = app
         self._edits = EditActions(app)
         self._region: Region | None = None  # that is being moved
 
@@ -123,7 +121,7 @@ class TidyActions:
         """Write the edit, and have it as a layer on top."""
         document = self._app.document
         assert document.path is not None
-        folder = edits_folder(document.path, self._memory)
+        folder = edits_folder(document.path)
         make_folder(folder)
         name, number = document.free_name(_NAMES[does]), 2
         path = folder / f"{name}.gdf"

@@ -197,9 +197,9 @@ def write_region(region: NamedRegion, total: int) -> None:
     save_npy(region.path, np.flatnonzero(unpack(region.members, total)).astype(np.int64))
 
 
-def region_folders(session: Path, scene: Path, memory: Path | None = None) -> tuple[Path, ...]:
+def region_folders(session: Path, scene: Path) -> tuple[Path, ...]:
     """Where a session's regions have their files: its own folder, and those of new edits of its scene."""
-    scene, edits = scene.resolve(), edits_folder(scene, memory)
+    scene, edits = scene.resolve(), edits_folder(scene)
     # the folder of edits itself may be a link out, and is not followed
     beside = scene.with_name(f"{scene.stem}.edits")
     return session.resolve().parent, beside, edits.parent.resolve() / edits.name

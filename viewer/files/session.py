@@ -111,12 +111,8 @@ def _edit_ref(gdf: Gdf, path: Path, folder: Path) -> EditRef:
     return EditRef(file.file, file.sha256, gdf.region.name, pack(mask))
 
 
-def open_session(path: Path, memory: Path | None = None) -> WindowSession:
+def open_session(path: Path) -> WindowSession:
     """Read a session with its scene and edits; what is to be said about it is logged as a warning.
-
-    Args:
-        path: its file
-        memory: folder of the program's state; the user's own if None
 
     Raises:
         ProgdfError: it is no session, damaged or of a newer version; or a file it names is missing, broken or
@@ -139,7 +135,7 @@ def open_session(path: Path, memory: Path | None = None) -> WindowSession:
     view = _with_region_paths(view, lambda region: Path(os.path.normpath(folder / region)))
     for layer in (*view.layers, *(layer for s in snapshots for layer in s.edit.layers)):
         paint.decode(layer.paint, len(opened.gdfs[layer.gdf].region))  # raises where they do not fit
-    claimed = exports.claim_regions(view.selection, exports.region_folders(path, scene, memory))
+    claimed = exports.claim_regions(view.selection, exports.region_folders(path, scene))
     foreign = [
         f"{old.name:.60} ({str(old.path)[:80]})"
         for old, resolved, new in zip(named, view.selection.regions, claimed.regions, strict=True)

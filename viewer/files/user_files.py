@@ -36,38 +36,40 @@ def is_listed(path: Path) -> bool:
     return path.suffix.lower() not in (".gdf", ".cube") and session_of(path) is None and "\n" not in str(path)
 
 
-def read_recent(folder: Path | None = None, missing: bool = False) -> tuple[Path, ...]:
+def read_recent(missing: bool = False) -> tuple[Path, ...]:
     """Those that are still there, and with `missing` the others; none where nothing can be read."""
     try:
-        lines = ((folder or state_folder()) / "recent.txt").read_text("utf-8", "surrogateescape").splitlines()
+        lines = (state_folder() / "recent.txt").read_text("utf-8", "surrogateescape").splitlines()
         known = [path for path in map(Path, lines) if is_listed(path)]
         return tuple(path for path in known if missing or path.is_file())[:MOST_RECENT]
     except (OSError, ValueError):
         return ()
 
 
-def remember_recent(paths: Sequence[Path], folder: Path | None = None) -> tuple[Path, ...]:
+def remember_recent(paths: Sequence[Path]) -> tuple[Path, ...]:
     """Put scenes and sessions in front, the last one first; what cannot be written is not remembered. Those
     that are there."""
-    folder = folder or state_folder()
-    known = dict.fromkeys([*(path.resolve() for path in reversed(paths)), *read_recent(folder, missing=True)])
-    return _write_recent([path for path in known if is_listed(path)], folder)
+    known = dict.fromkeys([*(path.resolve() for path in reversed(paths)), *read_recent(missing=True)])
+    return _write_recent([path for path in known if is_listed(path)])
 
 
-def forget_recent(path: Path, folder: Path | None = None) -> tuple[Path, ...]:
+def forget_recent(path: Path) -> tuple[Path, ...]:
     """Take one off the list; those that are left and there."""
-    folder = folder or state_folder()
-    return _write_recent([other for other in read_recent(folder, missing=True) if other != path], folder)
+    return _write_recent([other for other in read_recent(missing=True) if other != path])
 
 
-def _write_recent(files: Sequence[Path], folder: Path) -> tuple[Path, ...]:
+def _write_recent(files: Sequence[Path]) -> tuple[Path, ...]:
     files = files[:MOST_RECENT]
-    lines = "".join(f"{path}\n" for path in files)
-    with contextlib.suppress(OSError):
-        folder.mkdir(parents=True, exist_ok=True)
-        with atomic_write(folder / "recent.txt") as temporary_file:
-            temporary_file.write_text(lines, encoding="utf-8", errors="surrogateescape")
+    _remember("recent.txt", "".join(f"{path}\n" for path in files))
     return tuple(path for path in files if path.is_file())
+
+
+def _remember(name: str, text: str) -> None:
+    """Write a file of the program's state; what cannot be written is not remembered."""
+    with contextlib.suppress(OSError):
+        state_folder().mkdir(parents=True, exist_ok=True)
+        with atomic_write(state_folder() / name) as temporary_file:
+            temporary_file.write_text(text, encoding="utf-8", errors="surrogateescape")
 
 
 def describe_age(seconds: float) -> str:
@@ -78,45 +80,41 @@ def describe_age(seconds: float) -> str:
     return "just now" if minutes < 2 else f"{minutes} min ago" if minutes < 90 else f"{minutes // 60} h ago"
 
 
-def read_layout(folder: Path | None = None) -> Layout:
+def read_layout() -> Layout:
     """How the window was laid out last; as at first where nothing can be read."""
     try:
-        return read_json((folder or state_folder()) / "layout.json", Layout)
+        return read_json(state_folder() / "layout.json", Layout)
     except ProgdfError:
         return Layout()
 
 
-def keep_layout(layout: Layout, folder: Path | None = None) -> None:
+def keep_layout(layout: Layout) -> None:
     """Remember it; what cannot be written is not remembered."""
-    folder = folder or state_folder()
-    with contextlib.suppress(OSError):
-        folder.mkdir(parents=True, exist_ok=True)
-        with atomic_write(folder / "layout.json") as temporary_file:
-            temporary_file.write_text(json.dumps(plain(layout)), encoding="utf-8")
+    _remember("layout.json", json.dumps(plain(layout)))
 
 
-def read_keys(folder: Path | None = None) -> dict[str, Any]:
+def read_keys() -> dict[str, Any]:
     """The keys that the person gave to actions, see `keys.bind`; none where there is no such file.
 
     Raises:
         ProgdfError: it cannot be read; one line.
     """
-    path = keys_file(folder)
+    path = keys_file()
     return read_json(path, dict[str, Any]) if path.is_file() else {}
 
 
-def keys_file(folder: Path | None = None) -> Path:
+def keys_file() -> Path:
     """Where they are."""
-    return (folder or state_folder()) / "keys.json"
+    return state_folder() / "keys.json"
 
 
-def write_keys(keys: Mapping[str, Sequence[str]], folder: Path | None = None) -> Path:
+def write_keys(keys: Mapping[str, Sequence[str]]) -> Path:
     """Begin that file with all there are, where there is none; its path.
 
     Raises:
         ProgdfError: it cannot be written; one line.
     """
-    path = keys_file(folder)
+    path = keys_file()
     if not path.exists():
         make_folder(path.parent)
         with atomic_write(path) as temporary_file:
@@ -127,9 +125,9 @@ def write_keys(keys: Mapping[str, Sequence[str]], folder: Path | None = None) ->
     return path
 
 
-def keep_thumbnail(path: Path, pixels: NDArray[np.uint8], folder: Path | None = None) -> None:
+def keep_thumbnail(path: Path, pixels: NDArray[np.uint8]) -> None:
     """Keep the picture [H,W,3] of a file; where that cannot be, there is none."""
-    file = _thumbnail(path, folder)
+    file = _thumbnail(path)
     with contextlib.suppress(OSError, ProgdfError):
         file.parent.mkdir(parents=True, exist_ok=True)
         with atomic_write(file) as temporary_file:
@@ -139,16 +137,16 @@ def keep_thumbnail(path: Path, pixels: NDArray[np.uint8], folder: Path | None = 
             old.unlink(missing_ok=True)
 
 
-def thumbnail_time(path: Path, folder: Path | None = None) -> float:
+def thumbnail_time(path: Path) -> float:
     """When the picture of a file was kept, as it was left; seconds since 1970, 0 where there is none."""
     with contextlib.suppress(OSError):
-        return _thumbnail(path, folder).stat().st_mtime
+        return _thumbnail(path).stat().st_mtime
     return 0.0
 
 
-def load_thumbnail(path: Path, folder: Path | None = None) -> NDArray[np.uint8] | None:
+def load_thumbnail(path: Path) -> NDArray[np.uint8] | None:
     """The picture of a file, None where there is none or it is damaged: it is made again. [H,W,3]"""
-    return read_thumbnail(_thumbnail(path, folder))
+    return read_thumbnail(_thumbnail(path))
 
 
 def read_thumbnail(file: Path) -> NDArray[np.uint8] | None:
@@ -159,9 +157,9 @@ def read_thumbnail(file: Path) -> NDArray[np.uint8] | None:
         return None
 
 
-def _thumbnail(path: Path, folder: Path | None) -> Path:
+def _thumbnail(path: Path) -> Path:
     digest = hashlib.sha256(str(path.resolve()).encode("utf-8", "surrogateescape")).hexdigest()[:24]
-    return (folder or state_folder()) / "thumbnails" / f"{digest}.png"
+    return state_folder() / "thumbnails" / f"{digest}.png"
 
 
 def open_in_program(path: Path) -> bool:

@@ -446,19 +446,14 @@ class EditOrder:
         return self.out.with_name(self.out.name + suffix)
 
 
-def edits_folder(scene: Path, memory: Path | None = None) -> Path:
-    """Where new edits of a scene are trained: beside it, or in the user's own folder if that is read-only.
-
-    Args:
-        scene: its file
-        memory: folder of the program's state; the user's own if None
-    """
+def edits_folder(scene: Path) -> Path:
+    """Where new edits of a scene are trained: beside it, or in the user's own folder if that is read-only."""
     scene = scene.resolve()
     beside = scene.with_name(f"{scene.stem}.edits")
     if takes_files(beside if beside.is_dir() else scene.parent):
         return beside
     digest = hashlib.sha256(str(scene).encode("utf-8", "surrogateescape")).hexdigest()[:8]
-    return (memory or state_folder()) / "edits" / f"{scene.stem}-{digest}"
+    return state_folder() / "edits" / f"{scene.stem}-{digest}"
 
 
 def free_run(folder: Path, name: str) -> Path:

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 from imgui_bundle import imgui
 
+from progdf.io.atomic import state_folder
 from tests.helpers.null_app import null_app, press
 from tests.helpers.sessions import bear_files, opened_document
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
@@ -209,7 +210,7 @@ def test_the_file_of_keys_is_made_whole_and_read_when_the_window_opens(
     with null_app(opened_document(bear_files(tmp_path)), first_view(bear(), 0.5, 0.5), tmp_path) as app:
         app.main_view.request("keys_file")
         app.draw()
-        path = tmp_path / "memory" / "keys.json"
+        path = state_folder() / "keys.json"
         assert opened == [path.as_uri()]
         assert [*json.loads(path.read_text())] == [*COMMANDS]
         before = dict(KEYS)
@@ -221,7 +222,7 @@ def test_the_file_of_keys_is_made_whole_and_read_when_the_window_opens(
         app.bind_keys()
         said = 'keys.json: undo: keys are written as "F6" or ["F6", "Ctrl+B"], and 1 more in window.log'
         assert app.main_view.work.message.text == said
-        assert "nothing: there is no such command" in (tmp_path / "memory" / "window.log").read_text()
+        assert "nothing: there is no such command" in (state_folder() / "window.log").read_text()
         press(app, "Shift+G")
         assert not app.main_view.work.view.grid
         press(app, "F8")

@@ -40,7 +40,7 @@ def opened(tmp_path: Path) -> Iterator[application.App]:
     finally:
         glfw.init_hint(glfw.PLATFORM, glfw.ANY_PLATFORM)
     document = application.Document("bear.ply", stack.scene, stack.gdfs[:1])
-    app = application.App(window, document, first_view(stack, 0.5), memory=tmp_path / "memory")
+    app = application.App(window, document, first_view(stack, 0.5))
     app.draw()
     yield app
     app.close()

@@ -12,6 +12,7 @@ import torch
 from imgui_bundle import imgui
 
 from progdf.formats.ply import save_ply
+from progdf.io.atomic import state_folder
 from progdf.io.cameras import load_cameras, save_cameras
 from tests.helpers.null_app import null_app, press
 from tests.helpers.sessions import bear_files, full_view, opened_document, saved_session, spoilt
@@ -55,30 +56,31 @@ def test_the_recent_files_are_scenes_and_sessions_the_last_twelve(tmp_path: Path
     others = [tmp_path / name for name in ("e.gdf", "1.autosave.session.json", "1.discarded-2.session.json")]
     for file in (*files, *others):
         file.touch()
-    (tmp_path / "memory").mkdir()
-    (tmp_path / "memory" / "recent.txt").write_text(
-        "".join(f"{file}\n" for file in others)
-    )  # of an older version
-    assert read_recent(tmp_path / "memory") == ()
+    state_folder().mkdir(parents=True)
+    (state_folder() / "recent.txt").write_text("".join(f"{file}\n" for file in others))  # of an older version
+    assert read_recent() == ()
     for file in (*files, *others):
-        remember_recent([file], tmp_path / "memory")
-    assert read_recent(tmp_path / "memory") == tuple(files[:-13:-1])
+        remember_recent([file])
+    assert read_recent() == tuple(files[:-13:-1])
 
 
-def test_recent_files_are_remembered_the_last_one_first(tmp_path: Path) -> None:
+def test_recent_files_are_remembered_the_last_one_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     files = [tmp_path / name for name in ("a.ply", "b.session.json", "c.ply")]
     for file in files:
         file.touch()
-    remember_recent(files[:2], tmp_path / "memory")
-    assert remember_recent([files[2], files[0]], tmp_path / "memory") == (
+    remember_recent(files[:2])
+    assert remember_recent([files[2], files[0]]) == (
         files[0],
         files[2],
         files[1],
     )
     files[2].unlink()
-    assert read_recent(tmp_path / "memory") == (files[0], files[1])
+    assert read_recent() == (files[0], files[1])
     (tmp_path / "blocked").touch()
-    assert remember_recent([files[0]], tmp_path / "blocked") == (files[0],), "no place for it is no error"
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "blocked"))
+    assert remember_recent([files[0]]) == (files[0],), "no place for it is no error"
 
 
 @pytest.mark.gl

@@ -34,7 +34,7 @@ def test_the_title_and_the_recent_files_are_shown_and_the_file_is_found_again(
 ) -> None:
     assert opened.document.title == "b\\udce4r.ply"
     press(opened, "Ctrl+O")
-    assert opened.main_view.recent == (opened.document.path,) == user_files.read_recent(tmp_path / "memory")
+    assert opened.main_view.recent == (opened.document.path,) == user_files.read_recent()
 
 
 def test_saving_says_in_one_line_that_a_session_cannot_name_it(opened: application.App) -> None:

@@ -11,6 +11,7 @@ import pytest
 from imgui_bundle import imgui
 
 from progdf.errors import ProgdfError
+from progdf.io.atomic import state_folder
 from tests.helpers.null_app import null_app, press
 from tests.helpers.sessions import bear_files, opened_document
 from tests.helpers.ui_rig import bear, first_view
@@ -88,7 +89,7 @@ def message(app: application.App) -> Message:
 
 
 def log(folder: Path) -> str:
-    return (folder / "memory" / LOG).read_text()
+    return (state_folder() / LOG).read_text()
 
 
 def test_no_action_ends_the_window(
@@ -188,7 +189,7 @@ def test_what_the_person_can_mend_is_one_line_without_a_log(
         monkeypatch.setattr(window.jobs, "poll", raises(error))
         turns(window)
         assert (message(window).text, message(window).details) == (line, "")
-    assert not (tmp_path / "memory" / LOG).exists()
+    assert not (state_folder() / LOG).exists()
 
 
 def test_unsaved_work_is_kept_at_once_and_the_details_are_copied(

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from imgui_bundle import imgui
 
+from progdf.io.atomic import state_folder
 from tests.helpers.null_app import null_app, press
 from tests.helpers.sessions import bear_files, opened_document
 from tests.helpers.stacks import many_edits
@@ -141,7 +142,7 @@ def test_a_layout_is_remembered(tmp_path: Path) -> None:
             assert app.main_view.ui.scale == pytest.approx(app.window.ui_scale * zoom * 1.1, rel=1e-3)
     with null_app(document, ViewState(), tmp_path) as app:
         press(app, "Ctrl+0")
-    (tmp_path / "memory" / "layout.json").write_text('{"zoom": 99}')
+    (state_folder() / "layout.json").write_text('{"zoom": 99}')
     with null_app(document, ViewState(), tmp_path) as app:
         assert app.main_view.work.layout == Layout(), "what makes no sense is not followed"
 

@@ -13,6 +13,7 @@ from imgui_bundle import imgui
 
 from progdf.__main__ import main
 from progdf.errors import ProgdfError
+from progdf.io.atomic import state_folder
 from tests.helpers.null_app import null_app
 from tests.helpers.ui_rig import Rig, bear
 from viewer.app import app as application
@@ -109,11 +110,11 @@ def test_enter_opens_what_the_arrows_lead_to(hand: Rig) -> None:
 
 
 def test_a_file_that_is_gone_says_so_and_is_removed_from_the_page(tmp_path: Path) -> None:
-    memory, files = tmp_path / "memory", [tmp_path / "here.ply", tmp_path / "gone.ply"]
+    files = [tmp_path / "here.ply", tmp_path / "gone.ply"]
     for file in files:
         file.touch()
-    remember_recent(files, memory)
-    keep_thumbnail(files[0], np.zeros((12, 16, 3), np.uint8), memory)
+    remember_recent(files)
+    keep_thumbnail(files[0], np.zeros((12, 16, 3), np.uint8))
     files[1].unlink()
     with null_app(empty(), ViewState(), tmp_path) as app:
         turn(app)
@@ -126,7 +127,7 @@ def test_a_file_that_is_gone_says_so_and_is_removed_from_the_page(tmp_path: Path
         turn(app)
         turn(app)
         assert [file.path for file in app.main_view.start_files[0]] == [files[0]]
-    assert read_recent(memory, missing=True) == (files[0],)
+    assert read_recent(missing=True) == (files[0],)
 
 
 def test_the_age_of_a_file_is_told_in_words() -> None:
@@ -136,11 +137,11 @@ def test_the_age_of_a_file_is_told_in_words() -> None:
 
 
 def test_an_old_thumbnail_tells_when_the_file_was_open(tmp_path: Path) -> None:
-    memory, file = tmp_path / "memory", tmp_path / "bear.ply"
+    file = tmp_path / "bear.ply"
     file.touch()
-    remember_recent([file], memory)
-    keep_thumbnail(file, np.zeros((12, 16, 3), np.uint8), memory)
-    (picture,) = (memory / "thumbnails").iterdir()
+    remember_recent([file])
+    keep_thumbnail(file, np.zeros((12, 16, 3), np.uint8))
+    (picture,) = (state_folder() / "thumbnails").iterdir()
     os.utime(picture, (time.time() - 3 * 86_400.0,) * 2)
     with null_app(empty(), ViewState(), tmp_path) as app:
         turn(app)

@@ -19,6 +19,7 @@ from PIL import Image
 from progdf.__main__ import main
 from progdf.formats.ply import save_ply
 from progdf.gdf.file import fingerprint, save_gdf
+from progdf.io.atomic import state_folder
 from progdf.io.picture_camera import find_picture_camera
 from progdf.scene.regions import parse_region
 from tests.helpers.null_app import null_app, press
@@ -392,7 +393,7 @@ def test_without_a_scene_there_is_a_start_page_until_one_is_opened(tmp_path: Pat
         assert app.main_view.work.view.camera.distance == first_camera(app.document.scene).distance
         press(app, "Ctrl+N")
         assert app.main_view.work.form_open
-    assert load_thumbnail(folder / "bear.ply", folder / "memory") is not None, "for the next start page"
+    assert load_thumbnail(folder / "bear.ply") is not None, "for the next start page"
 
 
 def test_the_demos_card_counts_its_edits_and_each_is_one_layer_from_its_draft_on(
@@ -402,7 +403,7 @@ def test_the_demos_card_counts_its_edits_and_each_is_one_layer_from_its_draft_on
     monkeypatch.setattr(job_queue, "LOOK_S", 0.0)
     Trainer.ended, Trainer.edit = None, None
     made = bear_files(tmp_path)
-    demo, scarf = tmp_path / "memory" / "demo", tmp_path / "memory" / "demo" / "scarf"
+    demo, scarf = state_folder() / "demo", state_folder() / "demo" / "scarf"
     with null_app(empty(), ViewState(), tmp_path) as app:
         request(app, "demo")
         (job,) = app.jobs.queue.jobs

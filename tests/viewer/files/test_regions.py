@@ -123,7 +123,7 @@ def test_a_session_of_a_stranger_writes_and_removes_nothing_outside_of_its_folde
     paths = tuple(path.format(outside=outside) for path in FOREIGN)
     file = foreign_session(folder, *paths)
     before = contents(outside)
-    opened = session.open_session(file, tmp_path / "memory")
+    opened = session.open_session(file)
     state = opened.view.selection
     assert f"region r0 (../victim.txt) and {len(paths) - 1} more named no" in opened.warning
     for i, region in enumerate(state.regions):
@@ -141,7 +141,7 @@ def test_files_of_a_sessions_own_folders_stay_with_their_regions(tmp_path: Path)
     (tmp_path / "bear.edits").mkdir()
     (tmp_path / "below").mkdir()
     names = ("a.region.npy", "bear.edits/b.region.npy", "below/c.region.npy")
-    opened = session.open_session(foreign_session(tmp_path, *names), tmp_path / "memory")
+    opened = session.open_session(foreign_session(tmp_path, *names))
     assert opened.warning == ""
     assert [region.path for region in opened.view.selection.regions] == [tmp_path / name for name in names]
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from progdf.io.atomic import state_folder
 from viewer.files import user_files
 
 
@@ -14,8 +15,8 @@ def test_a_damaged_thumbnail_is_none_and_is_made_again(tmp_path: Path) -> None:
     width, height = user_files.THUMBNAIL_SIZE
     pixels = rng.integers(0, 256, (height, width, 3), np.uint8)  # noise takes several chunks of the file
     scene = tmp_path / "bear.ply"
-    user_files.keep_thumbnail(scene, pixels, tmp_path)
-    (file,) = (tmp_path / "thumbnails").iterdir()
+    user_files.keep_thumbnail(scene, pixels)
+    (file,) = (state_folder() / "thumbnails").iterdir()
     whole = file.read_bytes()
     cut = [whole[:size] for size in (0, 1, 8, 20, 33, 40, len(whole) // 2, len(whole) - 1)]
     flipped = []
@@ -31,11 +32,11 @@ def test_a_damaged_thumbnail_is_none_and_is_made_again(tmp_path: Path) -> None:
         flipped.append(bytes(damaged))
     for content in (*cut, *flipped, b"\xff" * 100):
         file.write_bytes(content)
-        found = user_files.load_thumbnail(scene, tmp_path)
+        found = user_files.load_thumbnail(scene)
         assert found is None or found.shape == (height, width, 3)
     file.write_bytes(whole[: len(whole) // 2])
-    assert user_files.load_thumbnail(scene, tmp_path) is None
-    user_files.keep_thumbnail(scene, pixels, tmp_path)
-    found = user_files.load_thumbnail(scene, tmp_path)
+    assert user_files.load_thumbnail(scene) is None
+    user_files.keep_thumbnail(scene, pixels)
+    found = user_files.load_thumbnail(scene)
     assert found is not None
     assert np.array_equal(found, pixels)

@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from progdf.errors import ProgdfError
+from progdf.io.atomic import state_folder
 from progdf.region import Region
 from tests.helpers.ui_rig import bear
 from trainer.cli import train_options
@@ -45,7 +46,7 @@ KINDS = [choice.kind for choice in CHOICES]
 def order(folder: Path, name: str = "blue") -> EditOrder:
     scene = folder / "bear.ply"
     scene.touch()
-    home = training.edits_folder(scene, folder / "memory")
+    home = training.edits_folder(scene)
     return EditOrder(scene.resolve(), training.free_run(home, name), name, "all", "recolor:#3060d0")
 
 
@@ -53,13 +54,13 @@ def test_runs_lie_beside_their_scene_or_where_the_user_may_write(tmp_path: Path)
     scene = tmp_path / "there" / "bear.ply"
     scene.parent.mkdir()
     scene.touch()
-    assert training.edits_folder(scene, tmp_path / "memory") == scene.parent / "bear.edits"
+    assert training.edits_folder(scene) == scene.parent / "bear.edits"
     scene.parent.chmod(0o555)
     try:
-        elsewhere = training.edits_folder(scene, tmp_path / "memory")
+        elsewhere = training.edits_folder(scene)
     finally:
         scene.parent.chmod(0o755)
-    assert elsewhere.parent == tmp_path / "memory" / "edits"
+    assert elsewhere.parent == state_folder() / "edits"
     assert elsewhere.name.startswith("bear-")
 
 

@@ -201,17 +201,12 @@ class PreviewActions:
         app: the window
         context: the GL context
         region: a form's region as `progdf train` has it; files that it needs go into the folder
-        memory: folder of the program's state; the user's own if None
     """
 
     def __init__(
-        self,
-        app: Application,
-        context: moderngl.Context,
-        region: Callable[[NewEdit, Path], str],
-        memory: Path | None = None,
+        self, app: Application, context: moderngl.Context, region: Callable[[NewEdit, Path], str]
     ) -> None:
-        self._app, self._context, self._region, self._memory = app, context, region, memory
+        self._app, self._context, self._region = app, context, region
         self._child: PreviewChild | None = None
         self._texture: moderngl.Texture | None = None
         self._sent: _Request | None = None
@@ -283,7 +278,7 @@ class PreviewActions:
             raise ProgdfError("the scene has no file yet; open one first")
         self._end_live()
         camera, size = main_view.work.view.camera, main_view.picture_size
-        folder = training.edits_folder(scene, self._memory)
+        folder = training.edits_folder(scene)
         make_folder(folder)
         path = main_view.canvas.save_original(folder, scene.stem, main_view.work.view, size)
         beside = path.with_name(f"{path.stem}.camera.json")  # a program may drop what the picture carries

@@ -50,18 +50,10 @@ class StartActions:
         app: the window
         context: the GL context
         queue: runs the demo's command
-        memory: folder of the program's state; the user's own if None
     """
 
-    def __init__(
-        self,
-        app: Application,
-        context: moderngl.Context,
-        queue: JobQueue,
-        memory: Path | None = None,
-    ) -> None:
+    def __init__(self, app: Application, context: moderngl.Context, queue: JobQueue) -> None:
         self._app, self._context, self._queue = app, context, queue
-        self._memory = memory
         self._textures: dict[Path, moderngl.Texture | None] = {}
         self._demo: Path | None = None  # its folder while it is being made
         self._edits = EditActions(app)
@@ -75,7 +67,7 @@ class StartActions:
         elif name == "example":
             self._open_example(Path(argument))
         elif name == "forget_file":
-            self._app.main_view.recent = user_files.forget_recent(Path(argument), self._memory)
+            self._app.main_view.recent = user_files.forget_recent(Path(argument))
         else:
             return False
         return True
@@ -114,7 +106,7 @@ class StartActions:
         except ProgdfError:
             return
         for path in known:
-            user_files.keep_thumbnail(path, pixels, self._memory)
+            user_files.keep_thumbnail(path, pixels)
 
     def close(self) -> None:
         """Give back the pictures."""
@@ -124,7 +116,7 @@ class StartActions:
         self._textures.clear()
 
     def _start_demo(self) -> None:
-        folder = ((self._memory or state_folder()) / "demo").resolve()
+        folder = (state_folder() / "demo").resolve()
         self._demo, self._added = folder, {}
         words, log = ("demo", "--quick", "--no-window", f"--out={folder}"), self._queue.folder / "demo.log"
         self._queue.add(Delivery("Demo: four edits", folder, words, log, folder / "scene.ply"))
@@ -144,7 +136,7 @@ class StartActions:
         """Unpacked where the program keeps its state: what is saved in it stays there."""
 
         def open_copy() -> None:
-            folder = (self._memory or state_folder()) / "examples" / sha256(bundle)[:8]
+            folder = state_folder() / "examples" / sha256(bundle)[:8]
             make_folder(folder)
             copy = folder / bundle.name
             if not copy.exists():
@@ -161,8 +153,8 @@ class StartActions:
         if not main_view.at_start:
             return
         recent = []
-        for path in user_files.read_recent(self._memory, missing=True):
-            used, missing = user_files.thumbnail_time(path, self._memory), not path.is_file()
+        for path in user_files.read_recent(missing=True):
+            used, missing = user_files.thumbnail_time(path), not path.is_file()
             age = user_files.describe_age(time.time() - used) if used else ""
             line = "  ·  ".join(filter(None, ("Moved?" if missing else age, folder_name(path))))
             recent.append(StartFile(path, self._texture(path), line=line, missing=missing))
@@ -177,7 +169,7 @@ class StartActions:
             if path.parent == EXAMPLES:
                 pixels = user_files.read_thumbnail(path.with_name(path.name.replace(BUNDLE, ".jpg")))
             else:
-                pixels = user_files.load_thumbnail(path, self._memory)
+                pixels = user_files.load_thumbnail(path)
             self._textures[path] = picture_texture(self._context, pixels) if pixels is not None else None
         texture = self._textures[path]
         return int(texture.glo) if texture is not None else 0

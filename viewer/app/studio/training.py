@@ -54,7 +54,6 @@ class JobActions:
 
     Args:
         app: the window
-        memory: folder of the program's state; the user's own if None
         draft: gives the file of a grade that shows what the form says
         anchor: gives the picture of one view that the form's sentence is to follow
     """
@@ -62,11 +61,10 @@ class JobActions:
     def __init__(
         self,
         app: Application,
-        memory: Path | None = None,
         draft: Callable[[NewEdit], Path | None] = lambda _: None,
         anchor: Callable[[NewEdit], tuple[NDArray[np.uint8], Camera] | None] = lambda _: None,
     ) -> None:
-        self._app, self._memory, self._draft, self._anchor = app, memory, draft, anchor
+        self._app, self._draft, self._anchor = app, draft, anchor
         self._edits = EditActions(app)
         self.queue = JobQueue()
         self._scene: Path | None = None
@@ -148,7 +146,7 @@ class JobActions:
         scene = self._app.document.path
         if scene is None:
             raise ProgdfError("the scene has no file yet; open one first")
-        out = training.free_run(training.edits_folder(scene, self._memory), form.layer_name)
+        out = training.free_run(training.edits_folder(scene), form.layer_name)
         region, threads = self.region_spec(form, out.parent, out.name), training.spare_threads()
         model = anchor = ""
         if form.choice.setting == "sentence":
@@ -182,7 +180,7 @@ class JobActions:
             return
         path, camera, at = placed
         name = replace(NewEdit(), name=path.stem).layer_name
-        out = training.free_run(training.edits_folder(scene, self._memory), name)
+        out = training.free_run(training.edits_folder(scene), name)
         make_folder(out.parent)
         camera_file = out.with_name(f"{out.name}.camera.json")
         save_cameras(camera_file, [camera], self._app.document.scene.origin)
@@ -237,7 +235,7 @@ class JobActions:
         if scene is None:
             raise ProgdfError("the scene has no file yet; open one first")
         form = main_view.work.form
-        run = training.free_run(training.edits_folder(scene, self._memory), form.layer_name)
+        run = training.free_run(training.edits_folder(scene), form.layer_name)
         if path := self._write_anchor(form, run):
             main_view.work = replace(main_view.work, form=replace(form, anchor=path))
             main_view.show_message(f"Change {path}, save it, and press Train")
@@ -322,7 +320,7 @@ class JobActions:
             for draft in dict.fromkeys(self._app.document.gdf_paths):
                 if (result := training.finished_edit(draft)) is not None:
                     self._try(partial(self._edits.finish, draft, result))
-            for order in training.stopped_orders(training.edits_folder(scene, self._memory), scene):
+            for order in training.stopped_orders(training.edits_folder(scene), scene):
                 self.queue.add_stopped(order)
 
     def _show_live(self, now: float) -> None:
