@@ -31,7 +31,7 @@ from viewer.ui.keys import bind
 from viewer.ui.overlay import draw_splash
 from viewer.ui.window import Window, interruptible
 
-from .application import LOG, Part, error_details, error_line, log_error
+from .application import LOG, attempt, error_details, error_line, log_error
 from .file_actions import FileActions
 from .main_view import MainView
 from .studio.deliver import DeliverActions
@@ -174,6 +174,19 @@ class App:
         self.preview = PreviewActions(self, self.context, self.jobs.region_spec)
         self.strays = StrayActions(self)
         self.tidy = TidyActions(self)
+        parts = (
+            self.file_actions,
+            self.jobs,
+            self.deliver,
+            self.start,
+            self.up,
+            self.preview,
+            self.strays,
+            self.tidy,
+        )
+        self.requests = {name: act for part in parts for name, act in part.requests.items()}
+        self.requests["full_screen"] = lambda _: window.toggle_full_screen()
+        self.requests["quit"] = lambda _: None if self.jobs.holds_window() else self.file_actions.leave()
         self.is_closed = False
         self._waits = False  # a splash is shown
         self._title = ""
@@ -270,18 +283,13 @@ class App:
         self.window.present()
         self._rename()
         for request in self.main_view.take_requests():
-            with self._guard():
-                self._handle(request)
+            self.handle(request)
 
-    def _handle(self, request: str) -> None:
-        if request == "full_screen":
-            self.window.toggle_full_screen()
-        elif not any(part.handle(request) for part in self._parts):
-            self.file_actions.handle(request)
-
-    @property
-    def _parts(self) -> tuple[Part, ...]:
-        return self.jobs, self.preview, self.deliver, self.start, self.up, self.strays, self.tidy
+    def handle(self, request: str) -> None:
+        """Do what only the window can, of `requests`."""
+        name, _, argument = request.partition(":")
+        with self._guard():
+            attempt(self.main_view, lambda: self.requests[name](argument))
 
     def _wait_times(self) -> tuple[float | None, ...]:
         """How long the next look at each part may take, seconds; None is for ever."""

@@ -51,11 +51,14 @@ class Application(Protocol):
         """Close the window, without a question."""
 
 
-class Part(Protocol):
-    """One of them."""
+Requests = dict[str, Callable[[str], object]]
+"""What a part of the application does when asked: by the request's name, with what follows its colon."""
 
-    def handle(self, request: str) -> bool:
-        """Do what is asked for; False where it is nothing of its own."""
+
+def attempt(main_view: MainView, act: Callable[[], object]) -> None:
+    """Do it; what goes wrong is a line in the window."""
+    if error := failure_line(act):
+        main_view.show_message(error, error=True)
 
 
 def failure_line(act: Callable[[], object]) -> str:

@@ -6,7 +6,6 @@ Everything that goes wrong here is one line in the window; the work stays as it 
 from __future__ import annotations
 
 import webbrowser
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -38,7 +37,7 @@ from viewer.state.workspace import Dialog, focus_layer, with_camera
 from viewer.ui.keys import COMMANDS, shortcut
 
 from . import dialogs
-from .application import Application, error_details, failure_line, log_error
+from .application import Application, Requests, attempt, error_details, failure_line, log_error
 from .decal import Decal, is_decal
 from .main_view import MainView
 
@@ -157,15 +156,15 @@ class EditActions:
         path = document.gdf_paths[gdf] if gdf < len(document.gdf_paths) else None
         self._apply(duplicate_layer(view, index, self._open(document.edits[gdf], path)), index + 1)
 
-    def replace(self, index: int, path: Path) -> None:
+    def replace(self, layer: str, path: str) -> None:
         """Another edit in a layer's place; a grade of another scene or of none takes the layer's region.
 
         Raises:
             ProgdfError: as for `add`.
         """
-        view = self._app.main_view.work.view
-        gdf = self._load(path, self._app.document.edits[view.layers[index].gdf].region)
-        self._apply(replace_edit(view, index, self._open(gdf, path), gdf.name), index)
+        view, index, file = self._app.main_view.work.view, self.layer(layer), parse_path(path)
+        gdf = self._load(file, self._app.document.edits[view.layers[index].gdf].region)
+        self._apply(replace_edit(view, index, self._open(gdf, file), gdf.name), index)
 
     def layer(self, index: str) -> int:
         """The layer that a request is about: the focused one where none is named.
@@ -225,47 +224,34 @@ class FileActions:
         opened = app.document
         app.main_view.recent = self._remember(*(file for file in (opened.path, path) if file is not None))
 
-    def handle(self, request: str) -> None:
-        """One request of `workspace.REQUESTS` that is about files, or "quit"."""
-        name, _, argument = request.partition(":")
-        if name in ("save", "save_as"):
-            self._save_where(argument, ask=name == "save_as")
-        elif name in ("save_to", "overwrite"):
-            dialog = self._app.main_view.work.dialog
-            self._save_to(argument, dialog.then if dialog else "", overwrite=name == "overwrite")
-        elif name == "open":
-            self._app.main_view.ask(Dialog("open"))
-        elif name == "decal":
-            self._app.main_view.ask(Dialog("open", notice="A picture; it is then laid on a surface by hand"))
-        elif name == "browse":
-            self._browse()
-        elif name == "open_file":
-            self._report_errors(lambda: self.open(parse_path(argument)))
-        elif name == "camera":
-            self._report_errors(lambda: keep_camera(self._app, self.path))
-        elif name == "discard":
-            self._report_errors(self._discard)
-        elif name == "restore_autosave":
-            self.open(Path(argument))
-        elif name == "discard_autosave":
-            self._report_errors(lambda: self._discard_autosave(Path(argument)))
-        elif name == "duplicate":
-            self._report_errors(lambda: self._edits.duplicate(self._edits.layer(argument)))
-        elif name == "replace":
-            self._app.main_view.ask(Dialog("replace", then=argument))
-        elif name == "replace_by":
-            index, _, path = argument.partition(":")
-            self._report_errors(lambda: self._edits.replace(self._edits.layer(index), parse_path(path)))
-        elif name == "save_region":
-            self._report_errors(lambda: self._keep_region(argument))
-        elif name == "rename_region":
-            self._report_errors(lambda: self._rename_region(*argument.split(":", 1)))
-        elif name == "keys_file":
-            self._report_errors(self._open_keys)
-        elif name == "quit":
-            self._leave()
+    @property
+    def requests(self) -> Requests:
+        """`save:THEN` and `save_as:THEN` ask for THEN afterwards; `save_to`, `overwrite`, `open_file`,
+        `restore_autosave` and `discard_autosave` name a file, `duplicate` and `replace` a layer's index, the
+        focused one's without; `browse` shows the desktop's own dialog beside the question that is open."""
+        ask, edits = self._app.main_view.ask, self._edits
+        return {
+            "save": lambda then: self._save_where(then, ask=False),
+            "save_as": lambda then: self._save_where(then, ask=True),
+            "save_to": self._save_to,
+            "overwrite": lambda path: self._save_to(path, overwrite=True),
+            "open": lambda _: ask(Dialog("open")),
+            "decal": lambda _: ask(Dialog("open", notice="A picture; it is then laid on a surface by hand")),
+            "browse": self._browse,
+            "open_file": lambda path: self.open(parse_path(path)),
+            "camera": lambda _: keep_camera(self._app, self.path),
+            "discard": self._discard,
+            "restore_autosave": lambda path: self.open(Path(path)),
+            "discard_autosave": self._discard_autosave,
+            "duplicate": lambda index: edits.duplicate(edits.layer(index)),
+            "replace": lambda index: ask(Dialog("replace", then=index)),
+            "replace_by": lambda edit: edits.replace(*edit.split(":", 1)),
+            "save_region": self._keep_region,
+            "rename_region": lambda region: self._rename_region(*region.split(":", 1)),
+            "keys_file": self._open_keys,
+        }
 
-    def _open_keys(self) -> None:
+    def _open_keys(self, _: str) -> None:
         """The file of keys in the program that the desktop has for it, with all there are in it at first."""
         keys = {action: command.keys.split() for action, command in COMMANDS.items()}
         path = write_keys(keys)
@@ -298,7 +284,7 @@ class FileActions:
             picture = file.suffix.lower() in PICTURES
             self._open(file, "picture" if picture else kind_of(file))
 
-        self._report_errors(open_kind)
+        attempt(self._app.main_view, open_kind)
 
     def save(self, path: Path) -> None:
         """Save the session there from now on.
@@ -426,13 +412,13 @@ class FileActions:
             self._put_off.add(new[0])  # if it is not decided now
             self._app.main_view.ask(Dialog("restore", str(new[0])))
 
-    def _discard(self) -> None:
+    def _discard(self, _: str) -> None:
         """Unsaved work is given up; its autosave stays under another name."""
         self._app.main_view.work = workspace.mark_saved(self._app.main_view.work)
         self.session_autosave.discard()
 
-    def _discard_autosave(self, path: Path) -> None:
-        aside = session.put_aside(path)
+    def _discard_autosave(self, path: str) -> None:
+        aside = session.put_aside(Path(path))
         self._app.main_view.show_message(f"Discarded; a copy is kept in {aside.name}")
         self.offer_autosave()
 
@@ -484,12 +470,14 @@ class FileActions:
             return
         self._save_to(str(self.path), then)
 
-    def _save_to(self, path: str, then: str, overwrite: bool = False) -> None:
-        """Save there, then do what was put off; where that fails, ask for another place and say why.
+    def _save_to(self, path: str, then: str | None = None, overwrite: bool = False) -> None:
+        """Save there, then do what was put off (None: for the question that is open); where that fails, ask
+        for another place and say why.
 
         A file that is not this session's own is replaced only where the person says so.
         """
-        main_view = self._app.main_view
+        main_view, dialog = self._app.main_view, self._app.main_view.work.dialog
+        then = (dialog.then if dialog else "") if then is None else then
 
         def save() -> None:
             file = session_file(parse_path(path))
@@ -504,14 +492,15 @@ class FileActions:
         if error := failure_line(save):
             main_view.ask(Dialog("save", path, then, error=error))
 
-    def _browse(self) -> None:
+    def _browse(self, _: str) -> None:
         """The desktop's own dialog beside the question that is open."""
         main_view = self._app.main_view
         if main_view.work.dialog is not None:
             near = self.path or self._app.document.path or Path("file")
             main_view.ask(self._browser.open(main_view.work.dialog, near))
 
-    def _leave(self) -> None:
+    def leave(self) -> None:
+        """Close the window, after a question where something is unsaved."""
         if self.has_unsaved:
             self._app.main_view.ask(self._closing_question("quit"))
         else:
@@ -519,11 +508,6 @@ class FileActions:
 
     def _closing_question(self, then: str) -> Dialog:
         return Dialog("leave", str(self._autosave_base()), then)
-
-    def _report_errors(self, act: Callable[[], None]) -> None:
-        """Do it; what goes wrong is a line in the window."""
-        if error := failure_line(act):
-            self._app.main_view.show_message(error, error=True)
 
     def _session_name(self) -> Path:
         """The session's file, or what it is called where it never had one."""

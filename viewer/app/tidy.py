@@ -24,17 +24,12 @@ from viewer.state import selection
 from viewer.state.view_state import LayerState
 from viewer.ui.keys import shortcut
 
-from .application import Application, failure_line
+from .application import Application, Requests
 from .file_actions import EditActions
 from .gizmo import Gizmo
 
 _NAMES = {"remove": "removed", "transform": "moved", "duplicate": "copy"}
 _INSTRUCTIONS = {"remove": "remove", "transform": "move", "duplicate": "copy"}
-_REQUESTS = {
-    "remove_selected": "remove",
-    "move_selected": "transform",
-    "duplicate_selected": "duplicate",
-}
 
 
 class TidyActions:
@@ -49,22 +44,17 @@ class TidyActions:
         self._edits = EditActions(app)
         self._region: Region | None = None  # that is being moved
 
-    def handle(self, request: str) -> bool:
-        """Do what is asked for; False where it is nothing of ours."""
-        act = {
+    @property
+    def requests(self) -> Requests:
+        """What is done to the selection, and with what is moved."""
+        return {
+            "remove_selected": lambda _: self._begin("remove"),
+            "move_selected": lambda _: self._begin("transform"),
+            "duplicate_selected": lambda _: self._begin("duplicate"),
             "place": self._place,
             "keep_placed": self._keep,
             "put_back": self._put_back,
-        }.get(request)
-        if request in _REQUESTS:
-            error = failure_line(lambda: self._begin(_REQUESTS[request]))
-        elif act is not None:
-            error = failure_line(act)
-        else:
-            return False
-        if error:
-            self._app.main_view.show_message(error, error=True)
-        return True
+        }
 
     def leave_scene(self) -> None:
         """Another scene is open."""
@@ -93,7 +83,7 @@ class TidyActions:
             return []
         return [Step(gizmo.does, self._region, similarity(*gizmo.step))]
 
-    def _place(self) -> None:
+    def _place(self, _: str) -> None:
         """Show what is moved where the handles are."""
         if steps := self._steps():
             document = self._app.document
@@ -101,13 +91,13 @@ class TidyActions:
             live = (LayerState(len(document.edits), gdf.name, 1.0),)
             self._app.show(document, (gdf,), live)
 
-    def _keep(self) -> None:
+    def _keep(self, _: str) -> None:
         gizmo, steps = self._app.main_view.gizmo, self._steps()
         if isinstance(gizmo, Gizmo) and steps and (gizmo.does == "duplicate" or gizmo.is_moved):
             self._add(steps[0].does, steps)
         self._end()
 
-    def _put_back(self) -> None:
+    def _put_back(self, _: str) -> None:
         moved = self._region is not None
         self._end()
         if moved:
@@ -145,15 +135,17 @@ class StrayActions:
         self._search: Future[tuple[Strays, float]] | None = None
         self._scene: Gaussians | None = None  # that is searched
 
-    def handle(self, request: str) -> bool:
-        """Begin to look for strays, which takes seconds; False where something else is asked for."""
-        if request != "hide_strays":
-            return False
+    @property
+    def requests(self) -> Requests:
+        """What there is to ask of it."""
+        return {"hide_strays": self._begin}
+
+    def _begin(self, _: str) -> None:
+        """Begin to look for strays, which takes seconds."""
         if self._search is None:
             self._scene = self._app.document.original
             self._search = self._worker.submit(_search, self._scene)
             self._app.main_view.show_message("Looking for strays …")
-        return True
 
     def poll(self) -> float | None:
         """Hide what was found; seconds until the next look, None for ever."""

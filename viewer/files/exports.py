@@ -38,7 +38,7 @@ from . import timeline_file
 CAMERAS = ".cameras.json"
 
 REQUESTS = ("picture", "take_view", "window_picture", "timeline_file")
-"""Those of `workspace.REQUESTS` that end here."""
+"""Those that the main view serves."""
 
 
 def folder_of(scene: Path | None) -> Path:

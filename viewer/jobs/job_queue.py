@@ -182,9 +182,16 @@ class JobQueue:
         """The first job of this kind of task that runs, or waits to."""
         return next((job for job in self.jobs if job.busy and isinstance(job.task, kind)), None)
 
-    def job(self, number: int) -> Job | None:
-        """The job of that number."""
-        return next((job for job in self.jobs if job.number == number), None)
+    def job(self, number: int) -> Job:
+        """The job of that number.
+
+        Raises:
+            ProgdfError: it is not in the queue any more.
+        """
+        for job in self.jobs:
+            if job.number == number:
+                return job
+        raise ProgdfError("this job is not in the queue any more")
 
     def add(self, task: EditOrder | Delivery) -> int:
         """Queue a task; its number.
@@ -216,7 +223,7 @@ class JobQueue:
             ProgdfError: another window trains it, or has discarded it.
         """
         job = self.job(number)
-        if job is not None and job.status in ("stopped", "failed"):
+        if job.status in ("stopped", "failed"):
             self._lock(job)
             resumes = job.task.is_begun
             if job.status == "stopped" and not resumes:
@@ -228,12 +235,12 @@ class JobQueue:
     def stop(self, number: int) -> None:
         """Stop a job; what is done of a run is kept. One that waits is taken out."""
         job = self.job(number)
-        if job is not None and job.status == "queued" and job.resumes:
+        if job.status == "queued" and job.resumes:
             self._unlock(job)
             self._change(replace(job, status="stopped"))
-        elif job is not None and job.status == "queued":
+        elif job.status == "queued":
             self._drop(job)
-        elif job is not None and job.status == "running":
+        elif job.status == "running":
             self._children[number].stop()
             self._change(replace(job, status="stopping"))
 
@@ -244,7 +251,7 @@ class JobQueue:
             ProgdfError: another window trains it, or it cannot be removed.
         """
         job = self.job(number)
-        if job is not None and job.status in ("stopped", "failed", "done"):
+        if job.status in ("stopped", "failed", "done"):
             self._lock(job)
             try:
                 self._drop(job)

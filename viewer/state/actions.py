@@ -34,7 +34,6 @@ from .workspace import (
     LEAST_ZOOM,
     MOST_ZOOM,
     PLACES,
-    REQUESTS,
     SceneFacts,
     Workspace,
     change_focused,
@@ -85,22 +84,17 @@ FEATHER = 0.1
 
 
 def perform(workspace: Workspace, action: str, facts: SceneFacts, aspect: float = 1.0) -> Workspace:
-    """The workspace after an action of `keys.COMMANDS`.
+    """The workspace after an action of `keys.COMMANDS`; what is none of ours is a request to the window.
 
     Args:
         action: its name, with an argument after a colon where it has one
         facts: of the open scene
         aspect: width / height of the picture
-
-    Raises:
-        KeyError: there is no such action.
     """
     name, _, argument = action.partition(":")
     if name == "invert":
         name = "paint_invert" if workspace.view.brush.active else "select_invert"
     name, workspace = _of_keys(name, workspace)
-    if name in REQUESTS:
-        return replace(workspace, requests=(*workspace.requests, action))
     if name in ("frame", "home"):
         return (_frame if name == "frame" else _home)(workspace, facts, aspect)
     if name in ("paint_clear", "paint_fill", "paint_invert", "paint_feather"):
@@ -116,7 +110,9 @@ def perform(workspace: Workspace, action: str, facts: SceneFacts, aspect: float 
     if name in OF_EDITS:
         at = int(argument) if argument else workspace.focus
         return workspace if at is None else OF_EDITS[name](workspace, at, facts)
-    return ACTIONS[name](workspace, argument)
+    if name in ACTIONS:
+        return ACTIONS[name](workspace, argument)
+    return replace(workspace, requests=(*workspace.requests, action))
 
 
 def _again(workspace: Workspace, index: int, facts: SceneFacts) -> Workspace:

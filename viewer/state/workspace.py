@@ -34,43 +34,6 @@ MESSAGE_S, ERROR_S, DETAILS_S = 6.0, 15.0, 120.0  # how long a line stays, and o
 LEAST_ZOOM, MOST_ZOOM, NARROWEST_PX, WIDEST_PX = 0.5, 3.0, 280.0, 520.0
 UNSAVED = "• "
 """Before the scene's name where there are unsaved changes."""
-REQUESTS = (
-    *("picture", "take_view", "window_picture", "timeline_file", "camera", "full_screen", "quit"),
-    *("save", "save_as", "save_to", "open", "open_file", "browse", "discard"),
-    *(
-        "train",
-        "paint_view",
-        "paint_over",
-        "stop_run",
-        "resume_run",
-        "ask_discard",
-        "discard_run",
-        "close_run",
-        "run_log",
-        "show_file",
-        "copy_path",
-        "stop_and_quit",
-    ),
-    *("export", "export_page", "render_picture", "render_film", "deliver", "drop_and_quit"),
-    *("about", "keys_file", "demo", "example", "forget_file", "decal", "rebind", "rebind_from"),
-    *("overwrite", "restore_autosave", "discard_autosave", "duplicate", "replace", "replace_by"),
-    *(
-        "remove_selected",
-        "move_selected",
-        "duplicate_selected",
-        "place",
-        "keep_placed",
-        "put_back",
-        "lay_decal",
-    ),
-    *("save_region", "rename_region", "copy_values", "paste_values", "set_up", "keep_up", "hide_strays"),
-)
-"""What only the window can do: `save_to:PATH`, `overwrite:PATH`, `open_file:PATH`; `save:THEN` asks for THEN
-afterwards; `browse` shows the desktop's own dialog beside the question that is open; `duplicate:INDEX` of a
-layer, the focused one where none is named; `replace:INDEX` asks for its new edit, `replace_by:INDEX:PATH`;
-`save_region:NAME`, `rename_region:INDEX:NAME`."""
-
-
 PLACES = ("panel", "tools", "options", "view", "comparison", "timeline")
 """Parts of the window through which the keyboard goes, in its order; not all are always shown."""
 
@@ -178,7 +141,7 @@ class Workspace:
     # what a session file holds of this; None where there is none
     saved: tuple[Edit, tuple[SliderSnapshot, ...]] | None = None
     dialog: Dialog | None = None  # the question being asked, or None
-    requests: tuple[str, ...] = ()  # what the window has still to do, see `REQUESTS`
+    requests: tuple[str, ...] = ()  # what only the window can do, and has still to
     player: Player = Player()  # the playhead of `view.timeline`
     # the layer of which the panel asks to see what it shares with the others, or None
     overlap: int | None = None

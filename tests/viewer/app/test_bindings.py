@@ -18,7 +18,10 @@ from tests.helpers.sessions import bear_files, opened_document
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from tests.viewer.app.test_keys_of_lists_and_form import strike, type_text
 from viewer.app import interface
-from viewer.state import actions, selection, workspace
+from viewer.files import exports
+from viewer.files.document import empty
+from viewer.state import actions, selection
+from viewer.state.view_state import ViewState
 from viewer.ui.context import SMALL_PX
 from viewer.ui.keys import COMMANDS, JOINED, KEYS, bind, find_commands, shortcut
 
@@ -50,16 +53,11 @@ INTERNAL = {
 """Asked for by a button, a question or a drag, with what it is about: nothing to look up by its name."""
 
 
-def test_every_action_has_its_command_or_is_no_one_s_to_look_up() -> None:
-    everything = {
-        *actions.ACTIONS,
-        *actions.OF_EDITS,
-        *workspace.REQUESTS,
-        *selection.CHANGES,
-        "frame",
-        "home",
-        "invert",
-    }
+@pytest.mark.gl
+def test_every_action_has_its_command_or_is_no_one_s_to_look_up(tmp_path: Path) -> None:
+    with null_app(empty(), ViewState(), tmp_path) as app:
+        everything = {*app.requests, *exports.REQUESTS, "copy_values", "paste_values"}
+    everything |= {*actions.ACTIONS, *actions.OF_EDITS, *selection.CHANGES, "frame", "home", "invert"}
     everything |= {"paint_clear", "paint_fill", "paint_invert", "paint_feather"}
     everything |= {"next_slider", "blend_snapshots"}
     named = {action.partition(":")[0] for action in COMMANDS}

@@ -76,7 +76,7 @@ def test_a_dropped_table_goes_on_what_is_selected_else_everywhere_and_in_a_layer
     total, some = len(opened.document.scene), int(mask.sum())
     assert [row.count for row in opened.main_view.facts.rows][1:] == [total, some]
     assert [row.region for row in opened.main_view.facts.rows][1:] == ["all", "selection"]
-    opened.file_actions.handle(f"replace_by:0:{tmp_path / 'look.cube'}")
+    opened.handle(f"replace_by:0:{tmp_path / 'look.cube'}")
     assert opened.document.gdfs[-1].region == opened.document.gdfs[0].region
 
 

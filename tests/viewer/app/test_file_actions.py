@@ -181,7 +181,7 @@ def left_over(window: application.App, folder: Path) -> Path:
     window.file_actions.autosave(session.AUTOSAVE_S)
     beside = folder / "bear.autosave.session.json"
     kept = beside.read_bytes()
-    window.file_actions.handle("discard")
+    window.handle("discard")
     for discarded in folder.glob("*.discarded*"):
         discarded.unlink()
     beside.write_bytes(kept)
@@ -224,13 +224,13 @@ def test_discarded_work_stays_under_another_name_the_last_three(
         strengths.append(window.main_view.work.view.layers[-1].strength)
         window.file_actions.offer_autosave()
         assert window.main_view.work.dialog is None, "its own autosave is nothing that was left"
-        window.file_actions.handle(f"discard_autosave:{left_over_now}")
+        window.handle(f"discard_autosave:{left_over_now}")
         window.file_actions.session_autosave = session.SessionAutosave()
     kept = sorted(folder.glob("bear.discarded*"), key=lambda path: path.stat().st_mtime_ns)
     assert len(kept) == session.MOST_DISCARDED
     found = [session.open_session(path).view.layers[-1].strength for path in kept]
     assert sorted(found) == sorted(strengths[-session.MOST_DISCARDED :])
-    window.file_actions.handle("discard")
+    window.handle("discard")
     window.open(kept[-1])
     assert window.file_actions.path is None, "saving it asks where"
     assert window.file_actions.has_unsaved
@@ -255,7 +255,7 @@ def test_a_name_that_a_session_has_is_asked_about(window: application.App, folde
     yesterday = saved.read_bytes()
     press(window, "Shift+Left")
     for answer in ("Escape", "Enter"):  # Cancel; Rename…, which asks where again
-        window.file_actions.handle(f"save_to:{saved}")
+        window.handle(f"save_to:{saved}")
         assert question(window).kind == "overwrite"
         press(window, answer)
     assert question(window).kind == "save"
@@ -263,7 +263,7 @@ def test_a_name_that_a_session_has_is_asked_about(window: application.App, folde
     by_hand(window, text="another name")
     assert question(window).text == "another name", "the field has the keyboard"
     assert saved.read_bytes() == yesterday
-    window.file_actions.handle(f"overwrite:{saved}")
+    window.handle(f"overwrite:{saved}")
     assert window.main_view.work.dialog is None
     assert session.open_session(saved).view.layers == window.main_view.work.view.layers
     press(window, "Shift+Left", "Ctrl+S")
@@ -291,7 +291,7 @@ def test_a_layer_is_duplicated_replaced_and_saved_without_what_was_deleted(
     assert layers() == [("scarf", 0), ("scarf-2", 2), ("ears", 1)]
     assert window.main_view.work.focus == 1
     assert window.main_view.work.view.layers[1].strength == 0.5
-    window.file_actions.handle(f"replace_by:1:{folder / 'edits' / 'ears.gdf'}")
+    window.handle(f"replace_by:1:{folder / 'edits' / 'ears.gdf'}")
     assert layers() == [("scarf", 0), ("ears-2", 3), ("ears", 1)]
     assert window.main_view.work.view.layers[1].strength == 0.5
     press(window, "Ctrl+Z")
@@ -313,7 +313,7 @@ def test_an_edit_of_another_scene_replaces_nothing_and_is_one_line(
     window: application.App, folder: Path, tmp_path: Path
 ) -> None:
     before = window.main_view.work.view
-    window.file_actions.handle(f"replace_by:0:{folder / 'bear.ply'}")
+    window.handle(f"replace_by:0:{folder / 'bear.ply'}")
     assert window.main_view.work.view == before
     assert "\n" not in message(window)
     assert window.main_view.work.message is not None
@@ -330,7 +330,7 @@ def test_files_are_told_apart_by_content_however_they_are_called(
     (folder / "edits" / "scarf.gdf").rename(folder / "scarf.bin")
     window.open(folder / "scarf.bin")
     assert [layer.name for layer in window.main_view.work.view.layers][-1] == "scarf-2", message(window)
-    window.file_actions.handle("discard")
+    window.handle("discard")
     (folder / "bear.ply").rename(folder / "scene.dat")
     window.open(folder / "scene.dat")
     assert window.main_view.facts.title == "scene.dat", message(window)
@@ -373,7 +373,7 @@ def test_a_session_for_another_scene_changes_nothing_and_is_one_line(
 def test_saving_never_writes_over_another_kind_of_file(window: application.App, folder: Path) -> None:
     save_cameras(folder / "cameras.json", list(bear().demo.cameras[:1]))
     before = (folder / "cameras.json").read_bytes()
-    window.file_actions.handle(f"save_to:{folder / 'cameras.json'}")
+    window.handle(f"save_to:{folder / 'cameras.json'}")
     assert (folder / "cameras.json").read_bytes() == before
     assert "is not a session" in question(window).error
 
@@ -435,9 +435,9 @@ def test_what_was_put_off_for_a_save_waits_until_it_is_saved(window: application
 
 @pytest.mark.gl
 def test_the_home_of_an_unknown_user_is_a_folder_that_does_not_exist(window: application.App) -> None:
-    window.file_actions.handle("save_to:~nobody-here/bear")
+    window.handle("save_to:~nobody-here/bear")
     assert "~nobody-here does not exist" in question(window).error
-    window.file_actions.handle("open_file:~nobody-here/bear.ply")
+    window.handle("open_file:~nobody-here/bear.ply")
     assert "~nobody-here/bear.ply" in message(window)
 
 
@@ -445,12 +445,12 @@ def test_the_home_of_an_unknown_user_is_a_folder_that_does_not_exist(window: app
 @pytest.mark.parametrize("name", ["x" * 300, "/".join(["x" * 200] * 30), "a\0b", "\x1b[2J\n"])
 def test_a_path_that_no_file_can_have_is_one_line(window: application.App, name: str) -> None:
     for request in (f"open_file:{name}", f"replace_by:0:{name}"):
-        window.file_actions.handle(request)
+        window.handle(request)
         assert message(window)
         assert "\x1b" not in message(window)
         window.draw()
     for path in (f"no folder/{name}", "/"):
-        window.file_actions.handle(f"save_to:{path}")
+        window.handle(f"save_to:{path}")
         assert question(window).error
         window.draw()
 

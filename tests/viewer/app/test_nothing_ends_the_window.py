@@ -18,10 +18,10 @@ from tests.helpers.ui_rig import bear, first_view
 from viewer.app import app as application
 from viewer.app import interface, mouse
 from viewer.app.application import LOG
-from viewer.files import session
+from viewer.files import exports, session
 from viewer.panel import card, cards, snapshot_cards, timeline_bar, tools
 from viewer.state import actions, selection
-from viewer.state.workspace import REQUESTS, Message
+from viewer.state.workspace import Message
 from viewer.ui import overlay
 
 pytestmark = pytest.mark.gl
@@ -107,11 +107,10 @@ def test_no_action_ends_the_window(
 
 
 def test_no_request_ends_the_window(window: application.App, monkeypatch: pytest.MonkeyPatch) -> None:
-    for part in (window.jobs, window.deliver, window.start, window.up, window.file_actions):
-        monkeypatch.setattr(part, "handle", raises(BrokenError("in a request")))
+    by_the_view = (*exports.REQUESTS, "copy_values", "paste_values")
+    window.requests = dict.fromkeys(window.requests, raises(BrokenError("in a request")))
     monkeypatch.setattr(window.main_view, "_save", raises(BrokenError("in a request")))
-    monkeypatch.setattr(window.window, "toggle_full_screen", raises(BrokenError("in a request")))
-    for request in REQUESTS:
+    for request in (*window.requests, *by_the_view):
         window.main_view.work = replace(window.main_view.work, message=None)
         window.main_view.request(request)
         turns(window, 2)

@@ -378,7 +378,7 @@ def test_strays_are_hidden_when_asked_for_and_undo_shows_them_again(tmp_path: Pa
 
 def test_strays_of_a_scene_that_is_no_longer_open_hide_nothing(tmp_path: Path) -> None:
     with null_app(Document("a", bear().scene), first_view(bear()), tmp_path) as app:
-        app.strays.handle("hide_strays")
+        app.handle("hide_strays")
         app.show(Document("b", bear(1000).scene))
         while app.strays.poll() is not None:
             time.sleep(0.05)

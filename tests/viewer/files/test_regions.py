@@ -167,7 +167,7 @@ def test_the_window_says_which_regions_it_did_not_take_and_saves_them_beside_the
         said = app.main_view.work.message
         assert said is not None
         assert "region r0 (../victim.txt) named no .region.npy file in the session's folder" in said.text
-        app.file_actions.handle("save")
+        app.handle("save")
         assert (folder / "r0.region.npy").exists()
         (tmp_path / "elsewhere").mkdir()
         app.file_actions.save(tmp_path / "elsewhere" / "moved")
@@ -182,8 +182,8 @@ def test_the_window_keeps_a_region_beside_the_scene_and_in_the_session(tmp_path:
     view = first_view(bear(), 0.5, 0.5)
     view = replace(view, selection=selection.select(SelectionState(), MASK))
     with null_app(document, view, tmp_path) as app:
-        app.file_actions.handle("save_region: jacket ")
-        app.file_actions.handle("rename_region:0:coat")
+        app.handle("save_region: jacket ")
+        app.handle("rename_region:0:coat")
         work = app.main_view.work
         assert [region.name for region in work.view.selection.regions] == ["coat"]
         assert (tmp_path / "coat.region.npy").exists()

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from progdf import __version__
 from progdf.errors import ProgdfError
 from progdf.formats.scene_file import WRITTEN
 from progdf.io.session import BUNDLE
-from viewer.app.application import Application, failure_line
+from viewer.app.application import Application, Requests, failure_line
 from viewer.files import exports, session
 from viewer.files.session import WindowSession
 from viewer.files.user_files import parse_path
@@ -35,31 +36,27 @@ class DeliverActions:
         self._app, self._queue = app, queue
         self._options: dict[str, DeliverOptions] = {}  # the last of each kind, for the next
 
-    def handle(self, request: str) -> bool:
-        """Do what is asked for; False where it is nothing of ours."""
-        name, _, argument = request.partition(":")
+    @property
+    def requests(self) -> Requests:
+        """The questions of `SUFFIXES`; `deliver:QUESTION`; `rebind:EDIT`, `rebind_from:EDIT\\nSCENE`."""
+        ask, version = self._app.main_view.ask, sys.version.split()[0]
+        return {
+            **{name: partial(self._ask, name) for name in SUFFIXES},
+            "deliver": self._deliver,
+            "rebind": lambda edit: ask(Dialog("rebind", then=edit)),
+            "rebind_from": lambda files: self._rebind(*files.split("\n", 1)),
+            "about": lambda _: ask(Dialog("about", f"ProGDF Studio {__version__}, Python {version}")),
+        }
+
+    def _deliver(self, kind: str) -> None:
+        """What is wrong stands in the question."""
         main_view = self._app.main_view
-        dialog = main_view.work.dialog
-        if name in SUFFIXES:
-            if error := failure_line(lambda: self._ask(name)):
-                main_view.show_message(error, error=True)
-        elif name == "deliver" and dialog is not None:  # what is wrong stands in the question
-            error = failure_line(lambda: self._start(argument, dialog))
+        if (dialog := main_view.work.dialog) is not None:
+            error = failure_line(lambda: self._start(kind, dialog))
             main_view.work = replace(main_view.work, dialog=replace(dialog, error=error) if error else None)
             main_view.wake()
-        elif name == "rebind":
-            main_view.ask(Dialog("rebind", then=argument))
-        elif name == "rebind_from":
-            edit, _, source = argument.partition("\n")
-            if error := failure_line(lambda: self._rebind(Path(edit), parse_path(source))):
-                main_view.show_message(error, error=True)
-        elif name == "about":
-            main_view.ask(Dialog("about", f"ProGDF Studio {__version__}, Python {sys.version.split()[0]}"))
-        else:
-            return False
-        return True
 
-    def _ask(self, name: str) -> None:
+    def _ask(self, name: str, _: str) -> None:
         path, main_view = self._app.document.path, self._app.main_view
         if path is None:
             raise ProgdfError("there is no scene yet; open one first")
@@ -86,14 +83,21 @@ class DeliverActions:
             free, number = out.with_stem(f"{out.stem}-{number}"), number + 1
         main_view.ask(Dialog(name, str(free), options=options))
 
-    def _rebind(self, edit: Path, source: Path) -> None:
+    def _rebind(self, file: str, source: str) -> None:
         """Queue what carries an edit of the scene at `source` over to the one that is open."""
-        path, out, number = self._app.document.path, edit.with_stem(f"{edit.stem}-rebound"), 2
+        edit, path, number = Path(file), self._app.document.path, 2
+        out = edit.with_stem(f"{edit.stem}-rebound")
         if path is None:
             raise ProgdfError("there is no scene yet; open one first")
         while out.exists():
             out, number = edit.with_stem(f"{edit.stem}-rebound-{number}"), number + 1
-        words = ("rebind", str(edit), f"--from={source}", f"--to={path.resolve()}", f"--out={out}")
+        words = (
+            "rebind",
+            str(edit),
+            f"--from={parse_path(source)}",
+            f"--to={path.resolve()}",
+            f"--out={out}",
+        )
         log = self._queue.folder / f"rebind{len(list(self._queue.folder.iterdir()))}.log"
         self._queue.add(Delivery(f"Rebinding {edit.name}", out, words, log, path.resolve()))
 

@@ -27,7 +27,7 @@ from progdf.gdf.file import Gdf, load_gdf
 from progdf.io.atomic import make_folder
 from progdf.io.cameras import save_cameras
 from progdf.io.json_values import convert_json, decode_json
-from viewer.app.application import Application, failure_line
+from viewer.app.application import Application, Requests
 from viewer.camera.view_camera import Vec3, ViewCamera, to_camera
 from viewer.files import user_files
 from viewer.jobs import training
@@ -221,13 +221,10 @@ class PreviewActions:
         self._palette_of = ""  # the region whose colors the form has
         self._painting: PaintedView | None = None
 
-    def handle(self, request: str) -> bool:
-        """Do what is asked for; False where it is nothing of ours."""
-        if request != "paint_view":
-            return False
-        if error := failure_line(self._paint_view):
-            self._app.main_view.show_message(error, error=True)
-        return True
+    @property
+    def requests(self) -> Requests:
+        """What there is to ask of it."""
+        return {"paint_view": self._paint_view}
 
     def poll(self) -> float | None:
         """Ask for the preview and show what has come; seconds until the next look, None for ever."""
@@ -267,7 +264,7 @@ class PreviewActions:
             self._send(request, self._child)
         return POLL_S if self._outstanding or request != self._sent else None
 
-    def _paint_view(self) -> None:
+    def _paint_view(self, _: str) -> None:
         """A picture of this view of the original goes to another program, and into the form.
 
         Raises:

@@ -17,7 +17,7 @@ from progdf.io.atomic import atomic_write, make_folder, read_file, state_folder
 from progdf.io.session import BUNDLE, sha256
 from progdf.scene import up_axis
 from progdf.scene.up_axis import direction_name
-from viewer.app.application import Application, failure_line
+from viewer.app.application import Application, Requests, attempt
 from viewer.app.file_actions import EditActions
 from viewer.camera.view_camera import Vec3, first_camera
 from viewer.files import user_files
@@ -59,18 +59,13 @@ class StartActions:
         self._edits = EditActions(app)
         self._added: dict[Path, tuple[Path, int]] = {}  # of the folders of its edits: which file is open
 
-    def handle(self, request: str) -> bool:
-        """Do what is asked for; False where it is nothing of ours."""
-        name, _, argument = request.partition(":")
-        if name == "demo":
-            self._start_demo()
-        elif name == "example":
-            self._open_example(Path(argument))
-        elif name == "forget_file":
-            self._app.main_view.recent = user_files.forget_recent(Path(argument))
-        else:
-            return False
-        return True
+    @property
+    def requests(self) -> Requests:
+        """`example:BUNDLE`, `forget_file:PATH`"""
+        return {"demo": self._start_demo, "example": self._open_example, "forget_file": self._forget}
+
+    def _forget(self, path: str) -> None:
+        self._app.main_view.recent = user_files.forget_recent(Path(path))
 
     def poll(self) -> float | None:
         """Open what of the demo is ready; seconds until the next look, None for ever."""
@@ -89,8 +84,7 @@ class StartActions:
             main_view.work = replace(main_view.work, view=view, past=history.begin(view))
         folders = sorted(file.parent for file in self._demo.glob("*/*.gdf") if self._app.document.path)
         for folder in dict.fromkeys(folders):
-            if error := failure_line(partial(self._show_edit, folder)):
-                self._app.main_view.show_message(error, error=True)
+            attempt(self._app.main_view, partial(self._show_edit, folder))
         if not self._queue.busy(Delivery):
             self._demo = None
         return POLL_S
@@ -115,7 +109,7 @@ class StartActions:
                 texture.release()
         self._textures.clear()
 
-    def _start_demo(self) -> None:
+    def _start_demo(self, _: str) -> None:
         folder = (state_folder() / "demo").resolve()
         self._demo, self._added = folder, {}
         words, log = ("demo", "--quick", "--no-window", f"--out={folder}"), self._queue.folder / "demo.log"
@@ -132,20 +126,15 @@ class StartActions:
             if before is None or not self._edits.finish(before[0], path):
                 self._edits.add(path, folder.name)
 
-    def _open_example(self, bundle: Path) -> None:
+    def _open_example(self, bundle: str) -> None:
         """Unpacked where the program keeps its state: what is saved in it stays there."""
-
-        def open_copy() -> None:
-            folder = state_folder() / "examples" / sha256(bundle)[:8]
-            make_folder(folder)
-            copy = folder / bundle.name
-            if not copy.exists():
-                with atomic_write(copy) as temporary_file:
-                    temporary_file.write_bytes(read_file(bundle))
-            self._app.open(copy)
-
-        if error := failure_line(open_copy):
-            self._app.main_view.show_message(error, error=True)
+        folder = state_folder() / "examples" / sha256(Path(bundle))[:8]
+        make_folder(folder)
+        copy = folder / Path(bundle).name
+        if not copy.exists():
+            with atomic_write(copy) as temporary_file:
+                temporary_file.write_bytes(read_file(Path(bundle)))
+        self._app.open(copy)
 
     def _publish(self) -> None:
         """The files of the page as they are, while it is shown."""
@@ -194,22 +183,24 @@ class UpActions:
         self._path: Path | None = None  # its file
         self._up: Vec3 | None = None  # and what a person had set as up at the last look
 
-    def handle(self, request: str) -> bool:
-        """Do what is asked for; False where it is nothing of ours."""
-        name, _, index = request.partition(":")
-        strip, main_view = self._app.main_view.up_strip, self._app.main_view
-        if name not in ("set_up", "keep_up"):
-            return False
+    @property
+    def requests(self) -> Requests:
+        """`set_up:CHOICE`"""
+        return {"set_up": self._set_up, "keep_up": self._keep_up}
+
+    def _set_up(self, choice: str) -> None:
+        main_view = self._app.main_view
         before = main_view.work.view.camera
-        if strip is not None and name == "set_up":
-            home = strip.choices[int(index)].camera
+        if (strip := main_view.up_strip) is not None:
+            home = strip.choices[int(choice)].camera
             view = replace(main_view.work.view, camera=replace(home, mode=before.mode))
             work = workspace.record_undo(replace(main_view.work, home=home, view=view))
             main_view.work = workspace.glide_from(work, before)
             self._answer(home.up)
-        elif strip is not None:
-            self._answer(before.up)
-        return True
+
+    def _keep_up(self, _: str) -> None:
+        if self._app.main_view.up_strip is not None:
+            self._answer(self._app.main_view.work.view.camera.up)
 
     def poll(self, session: Path | None, engine: ViewEngine) -> float | None:
         """Ask where a scene was opened that does not tell, and remember what is chosen, in the panel too.

@@ -21,7 +21,7 @@ from progdf.io.atomic import atomic_write, make_folder, read_file
 from progdf.io.cameras import save_cameras
 from progdf.io.picture_camera import camera_chunk
 from progdf.scene.regions import check_region
-from viewer.app.application import Application, failure_line
+from viewer.app.application import Application, Requests, attempt, failure_line
 from viewer.app.file_actions import EditActions
 from viewer.files import exports
 from viewer.jobs import training
@@ -74,48 +74,45 @@ class JobActions:
         self._live_due = 0.0
         self._quits: type | None = None  # once no such task is busy
 
-    def handle(self, request: str) -> bool:
-        """Do what is asked for; False where it is nothing of ours."""
-        name, _, argument = request.partition(":")
-        match name:
-            case "train":
-                self._train()
-            case "paint_over":
-                self._try(self._paint_over)
-            case "lay_decal":
-                self._try(self._lay_decal)
-            case "stop_run":
-                self.queue.stop(int(argument))
-            case "resume_run":
-                self._try(lambda: self.queue.resume(int(argument)))
-            case "ask_discard":
-                self._ask_discard(int(argument))
-            case "discard_run":
-                self._try(lambda: self.queue.discard(int(argument)))
-            case "close_run":
-                self.queue.dismiss(int(argument))
-            case "show_file" | "copy_path" if (job := self.queue.job(int(argument))) is not None:
-                if name == "copy_path":
-                    imgui.set_clipboard_text(str(job.task.out))
-                else:
-                    webbrowser.open(job.task.out.parent.as_uri())
-            case "run_log":
-                if (job := self.queue.job(int(argument))) is not None:
-                    self._app.main_view.ask(Dialog("log", str(job.task.log)))
-            case "quit" if self._quits is None and (job := self.queue.busy(EditOrder) or self.queue.busy()):
-                kind = "training" if isinstance(job.task, EditOrder) else "delivery"
-                self._app.main_view.ask(Dialog(kind, job.task.name))
-            case "stop_and_quit" | "drop_and_quit":
-                self._quits = EditOrder if name == "stop_and_quit" else Delivery
-                for job in self.queue.jobs:
-                    if isinstance(job.task, self._quits):
-                        self.queue.stop(job.number)
-                if self._quits is EditOrder:
-                    self._app.main_view.show_message("Saving what is trained so far …")
-            case _:
-                return False
-        self._publish()
-        return True
+    @property
+    def requests(self) -> Requests:
+        """What the form and the cards ask for; these name a job by its number."""
+        queue = self.queue
+        return {
+            "train": self._train,
+            "paint_over": self._paint_over,
+            "lay_decal": self._lay_decal,
+            "stop_run": lambda number: queue.stop(int(number)),
+            "resume_run": lambda number: queue.resume(int(number)),
+            "ask_discard": self._ask_discard,
+            "discard_run": lambda number: queue.discard(int(number)),
+            "close_run": lambda number: queue.dismiss(int(number)),
+            "show_file": lambda number: webbrowser.open(queue.job(int(number)).task.out.parent.as_uri()),
+            "copy_path": lambda number: imgui.set_clipboard_text(str(queue.job(int(number)).task.out)),
+            "run_log": self._show_log,
+            "stop_and_quit": lambda _: self._quit(EditOrder),
+            "drop_and_quit": lambda _: self._quit(Delivery),
+        }
+
+    def holds_window(self) -> bool:
+        """Whether a job runs, so that it is asked what becomes of it before the window closes."""
+        job = None if self._quits else self.queue.busy(EditOrder) or self.queue.busy()
+        if job is not None:
+            kind = "training" if isinstance(job.task, EditOrder) else "delivery"
+            self._app.main_view.ask(Dialog(kind, job.task.name))
+        return job is not None
+
+    def _quit(self, kind: type) -> None:
+        """Stop such jobs, and close the window once they have ended."""
+        self._quits = kind
+        for job in self.queue.jobs:
+            if isinstance(job.task, kind):
+                self.queue.stop(job.number)
+        if kind is EditOrder:
+            self._app.main_view.show_message("Saving what is trained so far …")
+
+    def _show_log(self, number: str) -> None:
+        self._app.main_view.ask(Dialog("log", str(self.queue.job(int(number)).task.log)))
 
     def poll(self) -> float | None:
         """Look at the jobs; seconds until the next look, None for ever."""
@@ -133,7 +130,7 @@ class JobActions:
         """Stop what runs."""
         self.queue.close()
 
-    def _train(self) -> None:
+    def _train(self, _: str) -> None:
         """What the form asks for goes into the queue; what is wrong stands in the form."""
         main_view = self._app.main_view
         form = main_view.work.form
@@ -164,7 +161,7 @@ class JobActions:
         )
         self.queue.add(order)
         if (draft := self._draft(form)) is not None:
-            self._try(partial(self._add_draft, order, draft, form.strength))
+            attempt(self._app.main_view, partial(self._add_draft, order, draft, form.strength))
         if form.region == SELECTION:  # it becomes a region: its highlight would hide what is trained
             main_view = self._app.main_view
             view = main_view.work.view
@@ -172,7 +169,7 @@ class JobActions:
             selection = replace(add_region(view.selection, name, path), members=NOBODY, count=0)
             main_view.change(replace(view, selection=selection))
 
-    def _lay_decal(self) -> None:
+    def _lay_decal(self, _: str) -> None:
         """The decal in the hand goes into the queue, as it lies in the picture."""
         main_view, scene = self._app.main_view, self._app.document.path
         placed, main_view.gizmo = main_view.decal_place, None
@@ -229,7 +226,7 @@ class JobActions:
             Image.fromarray(taken[0]).save(temporary_file, "PNG", pnginfo=chunk)
         return str(path)
 
-    def _paint_over(self) -> None:
+    def _paint_over(self, _: str) -> None:
         """Write the picture where any program can change it, and follow that file from now on."""
         main_view, scene = self._app.main_view, self._app.document.path
         if scene is None:
@@ -264,19 +261,14 @@ class JobActions:
         exports.write_region(NamedRegion(name, path, members, selection.count), total)
         return f"file:{path}"
 
-    def _try(self, act: Callable[[], object]) -> None:
-        """Do it, or say why it cannot be done."""
-        if error := failure_line(act):
-            self._app.main_view.show_message(error, error=True)
-
-    def _ask_discard(self, number: int) -> None:
+    def _ask_discard(self, number: str) -> None:
         """What was trained cannot be brought back: ask. What has not begun is no loss."""
-        job = self.queue.job(number)
-        if job is not None and job.task.is_begun:
+        job = self.queue.job(int(number))
+        if job.task.is_begun:
             spent = job.task.read_progress(job.progress).seconds
-            self._app.main_view.ask(Dialog("discard_run", training.duration(spent), str(number)))
+            self._app.main_view.ask(Dialog("discard_run", training.duration(spent), number))
         else:
-            self._try(lambda: self.queue.discard(number))
+            self.queue.discard(job.number)
 
     def _end(self, job: Job) -> None:
         """A job has ended: a new edit comes on top, else a line says what became of it."""
@@ -319,7 +311,7 @@ class JobActions:
         if (scene := self._scene) is not None:
             for draft in dict.fromkeys(self._app.document.gdf_paths):
                 if (result := training.finished_edit(draft)) is not None:
-                    self._try(partial(self._edits.finish, draft, result))
+                    attempt(self._app.main_view, partial(self._edits.finish, draft, result))
             for order in training.stopped_orders(training.edits_folder(scene), scene):
                 self.queue.add_stopped(order)
 
@@ -332,11 +324,11 @@ class JobActions:
         live, packed = self._app.main_view.live, order.out / "draft.gdf"
         layers = {order.draft, order.packed_edit}.intersection(self._app.document.gdf_paths)
         if order.draft in layers and is_newer(packed, order.draft):
-            self._try(partial(self._take_packed, order, packed))
+            attempt(self._app.main_view, partial(self._take_packed, order, packed))
         if layers or (live and live != self._live_layers):
             return  # there is a layer of it, or of what the form says
         if packed.is_file() and not order.draft.exists():
-            self._try(partial(self._add_draft, order, packed))
+            attempt(self._app.main_view, partial(self._add_draft, order, packed))
             return
         recording = order.newest_recording()
         if recording is None or recording == self._live:
