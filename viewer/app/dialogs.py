@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from imgui_bundle import imgui
+from imgui_bundle import imgui, imgui_ctx
 from imgui_bundle import portable_file_dialogs as dialogs
 
 from progdf.terminal import escape_text
@@ -141,9 +141,8 @@ def _content(
     dialog: Dialog, recent: Sequence[Path], pressed: Sequence[str], ui: UiContext, bottom: float
 ) -> Answer:
     """`bottom`: where the question has to end, window pixels"""
-    imgui.push_font(ui.fonts.bold, 0.0)
-    imgui.text(TITLES[dialog.kind])
-    imgui.pop_font()
+    with imgui_ctx.push_font(ui.fonts.bold, 0.0):
+        imgui.text(TITLES[dialog.kind])
     wrapped_text(_HINTS[dialog.kind].format(escape_text(Path(dialog.text).name)), PALETTE.dim)
     imgui.dummy((0.0, 2.0 * ui.scale))
     if "Escape" in pressed:
@@ -170,9 +169,8 @@ def _content(
     text = dialog.text if text == escaped else text  # a name that is not UTF-8 stays the file's own
     dialog = replace(dialog, text=text)
     imgui.same_line(0.0, gap)
-    imgui.begin_disabled(dialog.choosing)
-    browse = imgui.button("…", (more, 0.0))
-    imgui.end_disabled()
+    with inert(dialog.choosing):
+        browse = imgui.button("…", (more, 0.0))
     tip("Browse with the system file dialog (Ctrl+B)")
     if browse or ("Ctrl+B" in pressed and not dialog.choosing):
         return Answer(dialog, ("browse",))
@@ -276,9 +274,8 @@ def _recent(recent: Sequence[Path], bottom: float, down: bool, ui: UiContext) ->
         if imgui.selectable(f"{elide(escape_text(path.name), 0.4 * room)}##{i}", False)[0]:
             chosen = path
         imgui.same_line(0.42 * room)
-        imgui.push_font(None, SMALL_PX)
-        imgui.text_disabled(elide(escape_text(str(path.parent)), 0.56 * room))
-        imgui.pop_font()
+        with imgui_ctx.push_font(None, SMALL_PX):
+            imgui.text_disabled(elide(escape_text(str(path.parent)), 0.56 * room))
     imgui.end_child()
     return chosen
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from itertools import zip_longest
 from pathlib import Path
 
-from imgui_bundle import imgui
+from imgui_bundle import imgui, imgui_ctx
 
 from viewer.panel import panel, timeline_bar, tools
 from viewer.pictures.compare import Labels
@@ -217,35 +217,35 @@ def _command_row(command: Command, chosen: bool, ui: UiContext) -> bool:
     canvas.add_text((round(x + pad), top), ink, command.name)
     canvas.add_text((round(end), top), ink, key)
     x += 2 * pad + imgui.calc_text_size(command.name).x
-    imgui.push_font(None, SMALL_PX)
-    canvas.add_text((round(x), top + ui.scale), dim, elide(command.help, end - x - pad))
-    imgui.pop_font()
+    with imgui_ctx.push_font(None, SMALL_PX):
+        canvas.add_text((round(x), top + ui.scale), dim, elide(command.help, end - x - pad))
     return bool(pressed)
 
 
 def _column(topics: Sequence[Topic], left: float, top: float, ui: UiContext) -> None:
     step = SMALL_PX * ui.scale
-    imgui.push_font(None, SMALL_PX)
-    wide = max(imgui.calc_text_size(chord).x for topic in topics for chord, _ in topic.rows) + 14.0 * ui.scale
-    y = top - _BETWEEN * step
-    for topic in topics:
-        y += _BETWEEN * step
-        imgui.set_cursor_pos((left, y))
-        _heading(topic.name, ui)
-        for chord, does in topic.rows:
-            y += _ROW * step
+    with imgui_ctx.push_font(None, SMALL_PX):
+        wide = (
+            max(imgui.calc_text_size(chord).x for topic in topics for chord, _ in topic.rows)
+            + 14.0 * ui.scale
+        )
+        y = top - _BETWEEN * step
+        for topic in topics:
+            y += _BETWEEN * step
             imgui.set_cursor_pos((left, y))
-            imgui.text(chord)
-            imgui.set_cursor_pos((left + wide, y))
-            imgui.text_disabled(does)
-        y += _ROW * step
-    imgui.pop_font()
+            _heading(topic.name, ui)
+            for chord, does in topic.rows:
+                y += _ROW * step
+                imgui.set_cursor_pos((left, y))
+                imgui.text(chord)
+                imgui.set_cursor_pos((left + wide, y))
+                imgui.text_disabled(does)
+            y += _ROW * step
 
 
 def _heading(name: str, ui: UiContext) -> None:
-    imgui.push_font(ui.fonts.bold, SMALL_PX)
-    imgui.text(name)
-    imgui.pop_font()
+    with imgui_ctx.push_font(ui.fonts.bold, SMALL_PX):
+        imgui.text(name)
 
 
 def _pack(topics: Sequence[Topic], height: float) -> list[list[Topic]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from imgui_bundle import imgui
+from imgui_bundle import imgui, imgui_ctx
 
 from viewer.jobs.training import NewEdit, with_settings
 from viewer.state.facts import STEPS, LayerRow
@@ -29,6 +29,7 @@ from viewer.ui.widgets import (
     group_digits,
     hint,
     icon_button,
+    inert,
     is_entered,
     label,
     menu,
@@ -62,10 +63,9 @@ def draw_details(
         ui: fonts and scale
     """
     _curve(row, layer.strength, most, ui)
-    imgui.begin_disabled(layer.locked)
-    for kind in GAINS:
-        layer = _gain(layer, kind, kind in row.kinds, kind == active_slider, ui)
-    imgui.end_disabled()
+    with inert(layer.locked):
+        for kind in GAINS:
+            layer = _gain(layer, kind, kind in row.kinds, kind == active_slider, ui)
     return layer
 
 
@@ -76,10 +76,9 @@ def _gain(layer: LayerState, kind: str, moves: bool, active: bool, ui: UiContext
     label(kind.capitalize(), 84.0 * ui.scale)
     if active:
         imgui.pop_style_color()
-    imgui.begin_disabled(not moves)
-    value = slider_value(layer, kind)
-    new = value_slider(f"##{kind}", value, (0.0, 1.0), "%.2f", 1.0, ui)
-    imgui.end_disabled()
+    with inert(not moves):
+        value = slider_value(layer, kind)
+        new = value_slider(f"##{kind}", value, (0.0, 1.0), "%.2f", 1.0, ui)
     if moves:
         tip(f"How much of the {kind} change is applied (Tab, then arrow keys). Double-click: reset to 1")
     else:
@@ -191,20 +190,19 @@ def draw_card(
             )
         else:
             imgui.set_cursor_pos_y(imgui.get_cursor_pos_y() - 3.0 * scale)
-        imgui.begin_disabled(layer.locked)
-        strength = slider.draw(
-            "##strength",
-            layer.strength,
-            row.recorded,
-            SLIDER_PX * scale if compact else imgui.get_content_region_avail().x,
-            scale,
-            fill=p.accent if selected else p.faint,
-            active=active,
-            most=most,
-            height=SLIM_PX if compact else slider.HEIGHT_PX,
-        )
-        touched = touch.touched or imgui.is_item_active()
-        imgui.end_disabled()
+        with inert(layer.locked):
+            strength = slider.draw(
+                "##strength",
+                layer.strength,
+                row.recorded,
+                SLIDER_PX * scale if compact else imgui.get_content_region_avail().x,
+                scale,
+                fill=p.accent if selected else p.faint,
+                active=active,
+                most=most,
+                height=SLIM_PX if compact else slider.HEIGHT_PX,
+            )
+            touched = touch.touched or imgui.is_item_active()
         _number(number_at, strength, active, compact)
         if strength != layer.strength:  # a new state takes its time, and most cards rest
             work = _change_layer(work, index, lambda old: replace(old, strength=strength))
@@ -343,19 +341,18 @@ def _toggles(work: Workspace, index: int, over: bool, ui: UiContext, actions: li
         ("solo", Icon.SOLO, layer.solo),
     )
     top = imgui.get_cursor_pos_y() + (imgui.get_frame_height() - side) / 2
-    imgui.push_font(None, SMALL_PX)
-    pressed = []
-    for action, icon, on in buttons if over else buttons[3 if layer.locked else 4 :]:
-        imgui.set_cursor_pos_y(top)
-        if not over and not on:
-            continue
-        pressed += [action] * icon_button(action, icon, ui, dim=not on, side=side)
-        if action == "menu":
-            tip("Rename, duplicate, replace or delete (right-click)")
-        else:
-            hint(action)
-        imgui.same_line(0.0, 0.0)
-    imgui.pop_font()
+    with imgui_ctx.push_font(None, SMALL_PX):
+        pressed = []
+        for action, icon, on in buttons if over else buttons[3 if layer.locked else 4 :]:
+            imgui.set_cursor_pos_y(top)
+            if not over and not on:
+                continue
+            pressed += [action] * icon_button(action, icon, ui, dim=not on, side=side)
+            if action == "menu":
+                tip("Rename, duplicate, replace or delete (right-click)")
+            else:
+                hint(action)
+            imgui.same_line(0.0, 0.0)
     if "menu" in pressed:
         imgui.open_popup(_MENU)
     else:

@@ -6,7 +6,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
-from imgui_bundle import imgui
+from imgui_bundle import imgui, imgui_ctx
 
 from progdf.compose.reference import BLENDS
 from viewer.state.facts import LayerRow
@@ -29,6 +29,7 @@ from viewer.ui.widgets import (
     grip,
     hint,
     icon_button,
+    inert,
     menu,
     menu_item,
     menu_items,
@@ -91,14 +92,15 @@ def draw_selection(state: ViewState, chosen: Sequence[int], ui: UiContext, actio
     imgui.pop_style_var()
     value, most = master_strength(state, chosen), largest_strength(state)
     number = imgui.calc_text_size(f"{value:.3f}").x
-    imgui.begin_disabled(all(state.layers[i].locked for i in chosen))
-    at = imgui.get_cursor_screen_pos()
-    room = imgui.get_content_region_avail().x - number - 8.0 * ui.scale
-    help_ = "Strength of all selected layers: that of the strongest; the others keep their proportion to it"
-    new = slider.draw(
-        "##master", value, (), room, ui.scale, PALETTE.accent, most=most, height=MASTER_PX, help_=help_
-    )
-    imgui.end_disabled()
+    with inert(all(state.layers[i].locked for i in chosen)):
+        at = imgui.get_cursor_screen_pos()
+        room = imgui.get_content_region_avail().x - number - 8.0 * ui.scale
+        help_ = (
+            "Strength of all selected layers: that of the strongest; the others keep their proportion to it"
+        )
+        new = slider.draw(
+            "##master", value, (), room, ui.scale, PALETTE.accent, most=most, height=MASTER_PX, help_=help_
+        )
     corner = (at.x + room + 8.0 * ui.scale, at.y)
     imgui.get_window_draw_list().add_text(corner, u32(PALETTE.text), f"{new:.3f}")
     if new != value:
@@ -184,10 +186,9 @@ def _group_name(
         storage.set_bool(naming, True)
     if imgui.is_item_clicked(imgui.MouseButton_.right.value):
         imgui.open_popup(_MENU)
-    imgui.push_font(ui.fonts.bold, 0.0)
-    color = PALETTE.handle if hovered else PALETTE.text if group.enabled else PALETTE.dim
-    imgui.get_window_draw_list().add_text(corner, u32(color), elide(group.name, room))
-    imgui.pop_font()
+    with imgui_ctx.push_font(ui.fonts.bold, 0.0):
+        color = PALETTE.handle if hovered else PALETTE.text if group.enabled else PALETTE.dim
+        imgui.get_window_draw_list().add_text(corner, u32(color), elide(group.name, room))
     for action in menu_items(_MENU, _ITEMS, ui):
         storage.set_bool(naming, not action)
         actions += [f"{action}:{group.name}"] if action else []
@@ -270,11 +271,10 @@ def draw(
         reveal: scroll to the focused layer, and to what is cut of the selected ones
     """
     if not (work.view.layers or work.jobs or work.form_open):
-        imgui.push_text_wrap_pos(0.0)
-        imgui.text_disabled(
-            f"No edits yet. Make one ({shortcut('new_edit')}), or drop a .gdf file on the window."
-        )
-        imgui.pop_text_wrap_pos()
+        with imgui_ctx.push_text_wrap_pos(0.0):
+            imgui.text_disabled(
+                f"No edits yet. Make one ({shortcut('new_edit')}), or drop a .gdf file on the window."
+            )
     work = replace(
         work,
         overlap=None,

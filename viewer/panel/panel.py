@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
-from imgui_bundle import imgui
+from imgui_bundle import imgui, imgui_ctx
 
 from progdf.terminal import escape_text
 from viewer.state import history
@@ -170,9 +170,8 @@ def _title(
     at, side, scale = imgui.get_cursor_pos(), 24.0 * ui.scale, ui.scale
     room = imgui.get_content_region_avail().x
     text = room - 3 * side - 8.0 * scale
-    imgui.push_font(ui.fonts.bold, 0.0)
-    imgui.text(elide(UNSAVED * has_unsaved(work) + (work.session or facts.title), text))
-    imgui.pop_font()
+    with imgui_ctx.push_font(ui.fonts.bold, 0.0):
+        imgui.text(elide(UNSAVED * has_unsaved(work) + (work.session or facts.title), text))
     size = f"{with_added(facts.count, facts.added)} splats"
     small(f"{facts.title}  ·  {size}" if work.session else size, PALETTE.dim, text)
     tip(f"{facts.title}\n{size}")
@@ -206,10 +205,9 @@ def _regions(work: Workspace, ui: UiContext, actions: list[str]) -> Workspace:
         return work
     layout = replace(layout, folded=section("Regions", layout.folded, ui))
     for i, region in enumerate(regions if "Regions" not in layout.folded else ()):
-        imgui.push_id(f"region {i}")
-        if _row(i, region, ui, actions):
-            work = replace(work, pointed=work.pointed or ("region", i))
-        imgui.pop_id()
+        with imgui_ctx.push_id(f"region {i}"):
+            if _row(i, region, ui, actions):
+                work = replace(work, pointed=work.pointed or ("region", i))
     return replace(work, layout=layout)
 
 
@@ -225,9 +223,8 @@ def _row(index: int, region: NamedRegion, ui: UiContext, actions: list[str]) -> 
     tall, canvas = imgui.get_frame_height(), imgui.get_window_draw_list()
     imgui.same_line()
     count = group_digits(region.count)
-    imgui.push_font(None, SMALL_PX)
-    wide = imgui.calc_text_size(count).x
-    imgui.pop_font()
+    with imgui_ctx.push_font(None, SMALL_PX):
+        wide = imgui.calc_text_size(count).x
     room = right - wide - 10.0 * scale - imgui.get_cursor_pos_x()
     naming, storage = imgui.get_id("naming"), imgui.get_state_storage()
     if storage.get_bool(naming):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from imgui_bundle import imgui
+from imgui_bundle import imgui, imgui_ctx
 
 from viewer.state.facts import LayerRow
 from viewer.state.snapshots import compare_sides, is_blend, pair_of, with_original
@@ -168,21 +168,19 @@ def _card(index: int, cards: _Cards, wide: float, ui: UiContext, actions: list[s
     picture(cards.textures[index], at, end, 4.0 * ui.scale)
     if hovered or dragged:
         canvas.add_rect(at, end, u32(PALETTE.accent), 4.0 * ui.scale, 2.0 * ui.scale)
-    imgui.push_font(ui.fonts.bold, SMALL_PX)
-    if badge:
-        _badge(badge, at, ui)
-    imgui.pop_font()
-    imgui.push_font(None, SMALL_PX)
-    if imgui.get_state_storage().get_bool(renaming):
-        typed = typed_name(name, wide)
-        imgui.get_state_storage().set_bool(renaming, typed is None)
-        actions += [f"name_snapshot:{index}:{typed}"] if typed else []
-    else:
-        imgui.text_disabled(elide(name, wide))
-        left = imgui.MouseButton_.left.value
-        if index and imgui.is_item_hovered() and imgui.is_mouse_double_clicked(left):
-            imgui.get_state_storage().set_bool(renaming, True)
-    imgui.pop_font()
+    with imgui_ctx.push_font(ui.fonts.bold, SMALL_PX):
+        if badge:
+            _badge(badge, at, ui)
+    with imgui_ctx.push_font(None, SMALL_PX):
+        if imgui.get_state_storage().get_bool(renaming):
+            typed = typed_name(name, wide)
+            imgui.get_state_storage().set_bool(renaming, typed is None)
+            actions += [f"name_snapshot:{index}:{typed}"] if typed else []
+        else:
+            imgui.text_disabled(elide(name, wide))
+            left = imgui.MouseButton_.left.value
+            if index and imgui.is_item_hovered() and imgui.is_mouse_double_clicked(left):
+                imgui.get_state_storage().set_bool(renaming, True)
     imgui.end_group()
     imgui.pop_id()
     return dragged

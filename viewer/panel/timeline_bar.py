@@ -29,7 +29,7 @@ from viewer.state.view_state import FASTEST, LONGEST, Keyframe, Timeline
 from viewer.state.workspace import Workspace
 from viewer.ui.context import PALETTE, ROW_COLORS, SMALL_PX, Icon, Rgba, UiContext, u32
 from viewer.ui.overlay import Area
-from viewer.ui.widgets import elide, hint, icon_button, icon_row, is_released, plate, tip
+from viewer.ui.widgets import elide, hint, icon_button, icon_row, inert, is_released, plate, tip
 
 HEIGHT_PX, ROW_PX = 46.0, 33.0  # at 1×: of the bar, and of a second line
 TRACK_PX, _MOST_SHARE = 20.0, 0.35  # of a row of keys; the rows take at most so much of the picture's height
@@ -148,14 +148,13 @@ def _buttons(timeline: Timeline, player: Player, actions: list[str], ui: UiConte
 def _settings(work: Workspace, ruler: _Ruler, actions: list[str]) -> None:
     timeline, ui = ruler.timeline, ruler.ui
     gap = 4.0 * ui.scale
-    imgui.begin_disabled(not timeline.keys)
-    easing = EASINGS[0]
-    if timeline.keys:
-        chosen = chosen_keys(timeline, ruler.player)
-        easing = (ruler.keys[min(chosen)] if chosen else key_before(timeline, ruler.frame)).easing
-    if imgui.button(f"{easing.capitalize()}##easing", (58.0 * ui.scale, 0.0)):
-        actions.append("easing")
-    imgui.end_disabled()
+    with inert(not timeline.keys):
+        easing = EASINGS[0]
+        if timeline.keys:
+            chosen = chosen_keys(timeline, ruler.player)
+            easing = (ruler.keys[min(chosen)] if chosen else key_before(timeline, ruler.frame)).easing
+        if imgui.button(f"{easing.capitalize()}##easing", (58.0 * ui.scale, 0.0)):
+            actions.append("easing")
     hint("easing", "The chosen ones first")
     imgui.same_line(0.0, gap)
     if icon_button("ping_pong", icons.ICON_FA_RIGHT_LEFT, ui, dim=not timeline.ping_pong):
@@ -178,10 +177,9 @@ def _settings(work: Workspace, ruler: _Ruler, actions: list[str]) -> None:
         actions.append("render_film")
     hint("render_film")
     imgui.same_line(0.0, gap)
-    imgui.begin_disabled(not timeline.keys)
-    if icon_button("timeline_file", icons.ICON_FA_FILE_EXPORT, ui, dim=not timeline.keys):
-        actions.append("timeline_file")
-    imgui.end_disabled()
+    with inert(not timeline.keys):
+        if icon_button("timeline_file", icons.ICON_FA_FILE_EXPORT, ui, dim=not timeline.keys):
+            actions.append("timeline_file")
     hint("timeline_file")
     imgui.same_line(0.0, gap)
     frame = work.view.safe_frame

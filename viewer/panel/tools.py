@@ -34,6 +34,7 @@ from viewer.ui.widgets import (
     hint,
     icon_button,
     icon_row,
+    inert,
     label,
     menu,
     menu_item,
@@ -93,10 +94,9 @@ def draw_toolbar(view: ViewState, area: Area, ui: UiContext, actions: list[str])
             if i:
                 imgui.dummy((1.0, gap))
             for action, icon in group:
-                imgui.begin_disabled(off.get(action, False))
-                if icon_button(action, icon, ui, lit=action == held, side=side):
-                    actions.append(action)
-                imgui.end_disabled()
+                with inert(off.get(action, False)):
+                    if icon_button(action, icon, ui, lit=action == held, side=side):
+                        actions.append(action)
                 hint(action, "Select something first" * (action == "move_selected" and off[action]))
     imgui.pop_style_var()
 
@@ -191,13 +191,12 @@ def _selection(view: ViewState, bar: _Bar, actions: list[str]) -> Pointed | None
         imgui.text_disabled(text)
         if count and imgui.is_item_hovered(imgui.HoveredFlags_.for_tooltip.value):
             pointed = ("selection", 0)
-        imgui.begin_disabled(not count)
-        bar.button("select_refine", actions)
-        bar.follow(imgui.get_frame_height())
-        more_button("more", _OPERATIONS, bar.ui, actions)
-        tip("Grow, shrink, smooth, invert, hide, remove, move, copy")
-        _save(len(view.selection.regions), bar, actions)
-        imgui.end_disabled()
+        with inert(not count):
+            bar.button("select_refine", actions)
+            bar.follow(imgui.get_frame_height())
+            more_button("more", _OPERATIONS, bar.ui, actions)
+            tip("Grow, shrink, smooth, invert, hide, remove, move, copy")
+            _save(len(view.selection.regions), bar, actions)
     if view.selection.hidden:
         bar.button("show_hidden", actions, f"{Icon.HIDDEN}  ")
     return pointed
@@ -278,10 +277,9 @@ def _brush_options(view: ViewState, focus: int | None, bar: _Bar, actions: list[
     weights = bar.segments("weights", kinds, brush.weights, help_, "brush_weights")
     if weights:
         _legend(bar)
-    imgui.begin_disabled(focus is None or view.layers[focus].locked)
-    bar.follow(imgui.get_frame_height())
-    more_button("paint", WHOLE, bar.ui, actions)
-    imgui.end_disabled()
+    with inert(focus is None or view.layers[focus].locked):
+        bar.follow(imgui.get_frame_height())
+        more_button("paint", WHOLE, bar.ui, actions)
     tip("Clear, fill, invert or feather all paint of the layer")
     changed = replace(
         brush, radius=radius, softness=softness, flow=flow, value=value, through=through, weights=weights

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from imgui_bundle import imgui
+from imgui_bundle import imgui, imgui_ctx
 
 from viewer.jobs.job_queue import Delivery, Job
 from viewer.jobs.training import EditOrder, duration
@@ -42,9 +42,8 @@ def draw(jobs: Sequence[Job], ui: UiContext, actions: list[str]) -> None:
         room = 0.5 * imgui.get_window_height()
         imgui.begin_child("jobs", (0.0, max(min(storage.get_float(tall), room), 1.0)))
         for job in listed:
-            imgui.push_id(job.number)
-            actions += _card(job, ui)
-            imgui.pop_id()
+            with imgui_ctx.push_id(str(job.number)):
+                actions += _card(job, ui)
         needed = imgui.get_cursor_pos_y() - imgui.get_style().item_spacing.y
         imgui.end_child()
         storage.set_float(tall, min(needed, room))
@@ -131,10 +130,9 @@ def _bar(share: float, color: Rgba, ui: UiContext) -> None:
 def _foot(job: Job, right: float, menu: bool, ui: UiContext) -> list[str]:
     """What it does, or why it failed; at the right its buttons."""
     buttons = (*_buttons(job), *[(Icon.MENU, _MENU, "Log, discard (right-click)")] * menu)
-    imgui.push_font(None, SMALL_PX)
-    around = 2 * imgui.get_style().frame_padding.x
-    widths = [imgui.calc_text_size(text).x + around for text, _, _ in buttons]
-    imgui.pop_font()
+    with imgui_ctx.push_font(None, SMALL_PX):
+        around = 2 * imgui.get_style().frame_padding.x
+        widths = [imgui.calc_text_size(text).x + around for text, _, _ in buttons]
     if _is_failed(job):
         wrapped_text(job.error or job.warning, PALETTE.error)
         small(" ", PALETTE.dim)
@@ -146,9 +144,8 @@ def _foot(job: Job, right: float, menu: bool, ui: UiContext) -> list[str]:
     imgui.push_style_color(imgui.Col_.button, (0.0, 0.0, 0.0, 0.0))
     for (text, action, help_), wide in zip(buttons, widths, strict=True):
         imgui.same_line(x)
-        imgui.push_font(None, SMALL_PX)
-        actions += [action] * bool(imgui.small_button(f"{text}##{action}"))
-        imgui.pop_font()
+        with imgui_ctx.push_font(None, SMALL_PX):
+            actions += [action] * bool(imgui.small_button(f"{text}##{action}"))
         if help_:
             tip(help_)
         x += wide

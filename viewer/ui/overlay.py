@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import moderngl
 import numpy as np
-from imgui_bundle import imgui
+from imgui_bundle import imgui, imgui_ctx
 
 from viewer.camera.view_camera import SHAPES, ViewCamera, axes, dot, widen
 from viewer.camera.views import AXES
@@ -174,11 +174,10 @@ def message(line: Message, area: Area, ui: UiContext) -> tuple[str, float]:
         around = 2 * imgui.get_style().frame_padding.x + imgui.get_style().item_spacing.x
         room = widest - 2 * pad - sum(imgui.calc_text_size(text).x + around for text in buttons)
         wrap = imgui.calc_text_size(line.text).x > room
-        imgui.push_text_wrap_pos(imgui.get_cursor_pos_x() + room if wrap else -1.0)
-        imgui.align_text_to_frame_padding()
-        color = PALETTE.error if line.error else PALETTE.text
-        imgui.text_colored(color, line.text)
-        imgui.pop_text_wrap_pos()
+        with imgui_ctx.push_text_wrap_pos(imgui.get_cursor_pos_x() + room if wrap else -1.0):
+            imgui.align_text_to_frame_padding()
+            color = PALETTE.error if line.error else PALETTE.text
+            imgui.text_colored(color, line.text)
         clicked = ""
         for text, name in buttons.items():
             imgui.same_line()
@@ -188,10 +187,8 @@ def message(line: Message, area: Area, ui: UiContext) -> tuple[str, float]:
 
 
 def _text_width(text: str, size: float, ui: UiContext) -> float:
-    imgui.push_font(ui.fonts.regular, size / ui.scale)
-    wide = float(imgui.calc_text_size(text).x)
-    imgui.pop_font()
-    return wide
+    with imgui_ctx.push_font(ui.fonts.regular, size / ui.scale):
+        return float(imgui.calc_text_size(text).x)
 
 
 def _text(
@@ -307,8 +304,7 @@ def _dim(ink: Rgba, nearness: float) -> Rgba:
 
 def _letter(canvas: imgui.ImDrawList, end: _End, text: str, color: Rgba, ui: UiContext) -> None:
     size = LETTER_PX * ui.scale
-    imgui.push_font(ui.fonts.bold, LETTER_PX)
-    wide = imgui.calc_text_size(text).x
-    imgui.pop_font()
+    with imgui_ctx.push_font(ui.fonts.bold, LETTER_PX):
+        wide = imgui.calc_text_size(text).x
     at = (round(end.x - wide / 2), round(end.y - size / 2))
     canvas.add_text(ui.fonts.bold, size, at, u32(color), text)

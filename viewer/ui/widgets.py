@@ -8,7 +8,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TypeVar
 
-from imgui_bundle import imgui
+from imgui_bundle import imgui, imgui_ctx
 
 from .context import BEHIND, FIXED, PALETTE, SMALL_PX, UNFOCUSED, Icon, Rgba, UiContext, u32
 from .keys import COMMANDS, describe, shortcut
@@ -25,16 +25,15 @@ _GRIP_PX = 4.0  # what moves no further is a click, at 1×
 def section(name: str, folded: tuple[str, ...], ui: UiContext) -> tuple[str, ...]:
     """The heading of a part of the panel, with an arrow; the sections that are folded after this frame."""
     x, y = imgui.get_cursor_screen_pos()
-    imgui.push_font(ui.fonts.bold, SMALL_PX)
-    text, tall, step = name.upper(), imgui.get_frame_height(), 16.0 * ui.scale
-    room = (imgui.calc_text_size(text).x + step, tall + 2.0 * ui.scale)
-    pressed = imgui.invisible_button(f"section {name}", room, imgui.ButtonFlags_.enable_nav.value)
-    color, canvas = (
-        u32(PALETTE.text if imgui.is_item_hovered() else PALETTE.dim),
-        imgui.get_window_draw_list(),
-    )
-    canvas.add_text((round(x + step), round(y + 6.0 * ui.scale)), color, text)
-    imgui.pop_font()
+    with imgui_ctx.push_font(ui.fonts.bold, SMALL_PX):
+        text, tall, step = name.upper(), imgui.get_frame_height(), 16.0 * ui.scale
+        room = (imgui.calc_text_size(text).x + step, tall + 2.0 * ui.scale)
+        pressed = imgui.invisible_button(f"section {name}", room, imgui.ButtonFlags_.enable_nav.value)
+        color, canvas = (
+            u32(PALETTE.text if imgui.is_item_hovered() else PALETTE.dim),
+            imgui.get_window_draw_list(),
+        )
+        canvas.add_text((round(x + step), round(y + 6.0 * ui.scale)), color, text)
     arrow = Icon.FOLDED if name in folded else Icon.UNFOLDED
     canvas.add_text((round(x), round(y + 5.0 * ui.scale)), color, arrow)
     if not pressed:
@@ -56,19 +55,15 @@ def label(text: str, column: float) -> None:
 
 def small(text: str, color: Rgba, room: float | None = None) -> None:
     """Small text, shortened to `room` window pixels, or to the line."""
-    imgui.push_font(None, SMALL_PX)
-    room = imgui.get_content_region_avail().x if room is None else room
-    imgui.text_colored(color, elide(text, room))
-    imgui.pop_font()
+    with imgui_ctx.push_font(None, SMALL_PX):
+        room = imgui.get_content_region_avail().x if room is None else room
+        imgui.text_colored(color, elide(text, room))
 
 
 def wrapped_text(text: str, color: Rgba) -> None:
     """Small text in as many lines as it takes."""
-    imgui.push_font(None, SMALL_PX)
-    imgui.push_text_wrap_pos(0.0)
-    imgui.text_colored(color, text)
-    imgui.pop_text_wrap_pos()
-    imgui.pop_font()
+    with imgui_ctx.push_font(None, SMALL_PX), imgui_ctx.push_text_wrap_pos(0.0):
+        imgui.text_colored(color, text)
 
 
 def picture(
@@ -81,6 +76,14 @@ def picture(
         return
     corners, white = ((0.0, 0.0), (1.0, 1.0)), u32((1.0, 1.0, 1.0, opacity))
     canvas.add_image_rounded(imgui.ImTextureRef(texture), at, end, *corners, white, rounding)
+
+
+@contextmanager
+def inert(when: bool) -> Iterator[None]:
+    """What is drawn within is dim and takes no input, or is as always."""
+    imgui.begin_disabled(when)
+    yield  # where this raises, the frame ends what is open
+    imgui.end_disabled()
 
 
 @contextmanager
@@ -179,9 +182,8 @@ def icon_row(
     for i, (action, icon, *more) in enumerate(items):
         if i:
             imgui.same_line(0.0, gap)
-        imgui.begin_disabled(action in off)
-        actions += [action] * icon_button(action, icon, ui)
-        imgui.end_disabled()
+        with inert(action in off):
+            actions += [action] * icon_button(action, icon, ui)
         hint(action, *more)
 
 
@@ -404,18 +406,17 @@ def choice(
     if wide or max(texts) > widths[0]:  # the same margin for each instead of the same width
         widths = [text + (room - sum(texts)) / len(options) for text in texts]
     pressed = None
-    imgui.begin_group()
-    imgui.push_style_var(imgui.StyleVar_.frame_padding, (0.0, 5.0 * ui.scale))
-    for i, option in enumerate(options):
-        if i:
-            imgui.same_line(0.0, gap)
-        for slot in _BUTTON_COLORS if i == current else ():
-            imgui.push_style_color(slot, PALETTE.chosen)
-        if imgui.button(f"{option}##{name}", (widths[i], 0.0)):
-            pressed = i
-        imgui.pop_style_color(len(_BUTTON_COLORS) if i == current else 0)
-    imgui.pop_style_var()
-    imgui.end_group()
+    with imgui_ctx.begin_group():
+        imgui.push_style_var(imgui.StyleVar_.frame_padding, (0.0, 5.0 * ui.scale))
+        for i, option in enumerate(options):
+            if i:
+                imgui.same_line(0.0, gap)
+            for slot in _BUTTON_COLORS if i == current else ():
+                imgui.push_style_color(slot, PALETTE.chosen)
+            if imgui.button(f"{option}##{name}", (widths[i], 0.0)):
+                pressed = i
+            imgui.pop_style_color(len(_BUTTON_COLORS) if i == current else 0)
+        imgui.pop_style_var()
     return pressed
 
 

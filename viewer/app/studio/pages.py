@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from imgui_bundle import imgui
+from imgui_bundle import imgui, imgui_ctx
 
 from progdf import __version__
 from progdf.io.session import SUFFIX
@@ -74,18 +74,16 @@ def draw_start_page(recent: Sequence[StartFile], examples: Sequence[StartFile], 
     tall = shown + rows * (0.75 * small_card + (_TEXT_PX + GAP_PX) * scale)
     top = max((display.y - tall - 2 * _HEADING_PX * scale) / 2.6, MARGIN_PX * scale)
     imgui.set_cursor_pos((left, top))
-    imgui.begin_group()
-    actions = _head(side, 0.0 if narrow else max(0.75 * thirds, 120.0 * scale), ui)
-    imgui.end_group()
+    with imgui_ctx.begin_group():
+        actions = _head(side, 0.0 if narrow else max(0.75 * thirds, 120.0 * scale), ui)
     level = imgui.get_cursor_pos_y() + 0.5 * GAP_PX * scale if narrow else top + _TITLE_TALL_PX * scale
     imgui.set_cursor_pos((right, level - (0.0 if narrow else 19.0 * scale)))
-    imgui.begin_group()
-    for heading, files, across in (("Examples", examples, thirds), ("Recent", recent, small_card)):
-        if files:
-            small(heading, PALETTE.dim)
-            actions += _grid(files, across, room, heading == "Recent", ui)
-            imgui.dummy((0.0, 0.5 * GAP_PX * scale))
-    imgui.end_group()
+    with imgui_ctx.begin_group():
+        for heading, files, across in (("Examples", examples, thirds), ("Recent", recent, small_card)):
+            if files:
+                small(heading, PALETTE.dim)
+                actions += _grid(files, across, room, heading == "Recent", ui)
+                imgui.dummy((0.0, 0.5 * GAP_PX * scale))
     imgui.dummy((0.0, 0.5 * MARGIN_PX * scale))
     imgui.end()
     return actions
@@ -101,14 +99,12 @@ def _head(wide: float, tall: float, ui: UiContext) -> list[str]:
     line; and the demo."""
     scale, actions, flat = ui.scale, [], not tall
     begin = imgui.get_cursor_pos()
-    imgui.push_font(ui.fonts.bold, 26.0)
-    imgui.text("ProGDF Studio")
-    imgui.pop_font()
+    with imgui_ctx.push_font(ui.fonts.bold, 26.0):
+        imgui.text("ProGDF Studio")
     imgui.same_line()
-    imgui.push_font(None, SMALL_PX)
-    imgui.set_cursor_pos_y(imgui.get_cursor_pos_y() + 11.0 * scale)
-    imgui.text_disabled(__version__)
-    imgui.pop_font()
+    with imgui_ctx.push_font(None, SMALL_PX):
+        imgui.set_cursor_pos_y(imgui.get_cursor_pos_y() + 11.0 * scale)
+        imgui.text_disabled(__version__)
     x, y = begin.x, begin.y + _TITLE_TALL_PX * scale
     button, frame = imgui.ImVec2(136.0 * scale, 34.0 * scale), imgui.ImVec2(wide, tall or 58.0 * scale)
     text, side = imgui.calc_text_size(DROP_TEXT), (frame.y - button.y) / 2  # of a line: the margin around it
@@ -144,9 +140,8 @@ def _grid(files: Sequence[StartFile], wide: float, room: float, own: bool, ui: U
     for i, file in enumerate(files):
         if i % across:
             imgui.same_line(0.0, gap)
-        imgui.push_id(str(file.path))
-        actions += _card(file, wide, own, ui)
-        imgui.pop_id()
+        with imgui_ctx.push_id(str(file.path)):
+            actions += _card(file, wide, own, ui)
     return actions
 
 
@@ -262,13 +257,12 @@ def draw_up_strip(strip: UpStrip, area: Area, ui: UiContext) -> tuple[str, ...]:
         top, right = imgui.get_cursor_pos_y(), right_edge()
         imgui.text("Which way is up?")
         keep = f"Keep {strip.now} (Esc)"
-        imgui.push_font(None, SMALL_PX)
-        room = imgui.calc_text_size(keep).x + 2 * imgui.get_style().frame_padding.x
-        if right - room > imgui.get_item_rect_size().x + _PAD_PX * scale:
-            imgui.same_line(right - room)
-            if imgui.small_button(keep):
-                requests.append("keep_up")
-        imgui.pop_font()
+        with imgui_ctx.push_font(None, SMALL_PX):
+            room = imgui.calc_text_size(keep).x + 2 * imgui.get_style().frame_padding.x
+            if right - room > imgui.get_item_rect_size().x + _PAD_PX * scale:
+                imgui.same_line(right - room)
+                if imgui.small_button(keep):
+                    requests.append("keep_up")
         for i, direction in enumerate(strip.choices):
             imgui.set_cursor_pos(((_PAD_PX + i * _GAP_PX) * scale + i * wide, top + _TITLE_PX * scale))
             if _up_picture(direction, wide, direction.name == strip.now, ui):
@@ -292,9 +286,8 @@ def _up_picture(direction: UpChoice, wide: float, now: bool, ui: UiContext) -> b
         ink = PALETTE.accent if imgui.is_item_hovered() else PALETTE.dim
         canvas.add_rect(at, end, u32(ink), rounding, 2.0 * ui.scale)
     size, pad = SMALL_PX * ui.scale, 4.0 * ui.scale
-    imgui.push_font(ui.fonts.bold, SMALL_PX)
-    text = imgui.calc_text_size(direction.name)
-    imgui.pop_font()
+    with imgui_ctx.push_font(ui.fonts.bold, SMALL_PX):
+        text = imgui.calc_text_size(direction.name)
     corner = (at.x + text.x + 2 * pad, at.y + size + pad)
     canvas.add_rect_filled(at, corner, u32(PALETTE.scrim), rounding)
     text_at = (round(at.x + pad), round(at.y + pad / 2))
