@@ -44,7 +44,6 @@ from viewer.ui.keys import (
     is_flying,
     is_repeating,
     requested_actions,
-    shortcut,
     tapped_actions,
 )
 from viewer.ui.pointer import PointerContext
@@ -526,8 +525,7 @@ class MainView:
 
     def _save_files(self, screen: moderngl.Framebuffer, size: tuple[int, int]) -> None:
         """Serve the requests for files that the main view can make by itself."""
-        known = (*exports.REQUESTS, "copy_values", "paste_values")
-        served = [request for request in self.work.requests if request in known]
+        served = [request for request in self.work.requests if request in exports.REQUESTS]
         unserved = tuple(request for request in self.work.requests if request not in served)
         self.work = replace(self.work, requests=unserved)
         for request in served:
@@ -536,13 +534,6 @@ class MainView:
 
     def _save(self, request: str, screen: moderngl.Framebuffer, size: tuple[int, int]) -> str:
         title, view = self.facts.title, replace(self._displayed_view(), camera=self.work.view.camera)
-        if request == "copy_values":
-            text, what = layer_selection.copy_values(self.work)
-            imgui.set_clipboard_text(text)
-            return f"Copied strength and gains of {what}; {shortcut('paste_values')} pastes them"
-        if request == "paste_values":
-            self.work, what = layer_selection.paste_values(self.work, imgui.get_clipboard_text())
-            return f"Pasted strength and gains to {what}"
         if request == "timeline_file":
             return exports.timeline(self.pictures, title, view, self.facts.origin)
         if request == "window_picture":

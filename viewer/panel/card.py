@@ -136,7 +136,7 @@ COMPACT_PX, SLIDER_PX, SLIM_PX = 7.0, 92.0, 16.0  # a compact row: its padding, 
 _MENU = "menu of a layer"
 _MENU_ITEMS = (
     *("rename", "duplicate", "replace", "again", "", "remove", ""),
-    *("limit_to_selection", "select_painted", "", "copy_values", "paste_values", "reset", ""),
+    *("limit_to_selection", "select_painted", "", "reset", ""),
     *("group", "select_layers", "reset_all"),
 )
 _OF_ONE = ("rename", "duplicate", "replace", "again", "remove", "limit_to_selection", "select_painted")

@@ -47,7 +47,7 @@ from .card import COMPACT_PX, SLIDER_PX, SLIM_PX, draw_card
 MASTER_PX = 20.0  # of its slider, at 1×
 UNSEARCHED = 6
 """Layers that one finds without a search."""
-_BUTTONS = ("group", "copy_values", "paste_values", "reset")
+_BUTTONS = ("group", "reset")
 
 
 def draw_search(work: Workspace, ui: UiContext) -> str:
@@ -88,7 +88,7 @@ def draw_selection(state: ViewState, chosen: Sequence[int], ui: UiContext, actio
     small(f"{len(chosen)} layers", PALETTE.dim)
     imgui.same_line(right - imgui.get_frame_height())
     more_button("of layers", _BUTTONS, ui, actions)
-    tip("Group, copy, paste, reset")
+    tip("Group, reset")
     imgui.pop_style_var()
     value, most = master_strength(state, chosen), largest_strength(state)
     number = imgui.calc_text_size(f"{value:.3f}").x

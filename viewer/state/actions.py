@@ -94,7 +94,8 @@ def perform(workspace: Workspace, action: str, facts: SceneFacts, aspect: float 
     name, _, argument = action.partition(":")
     if name == "invert":
         name = "paint_invert" if workspace.view.brush.active else "select_invert"
-    name, workspace = _of_keys(name, workspace)
+    if name in ("focus", "press_layer", "unfocus"):  # a taken layer lets the keys go
+        workspace = replace(workspace, player=replace(workspace.player, chosen=frozenset()))
     if name in ("frame", "home"):
         return (_frame if name == "frame" else _home)(workspace, facts, aspect)
     if name in ("paint_clear", "paint_fill", "paint_invert", "paint_feather"):
@@ -151,23 +152,6 @@ def _select_painted(workspace: Workspace, index: int, facts: SceneFacts) -> Work
 
 OF_EDITS = {"again": _again, "limit_to_selection": _limit, "select_painted": _select_painted}
 """Actions on one layer, the focused one where none is named, that ask what is known of its edit."""
-
-
-def _of_keys(name: str, workspace: Workspace) -> tuple[str, Workspace]:
-    """Copy and paste go for keys where some are chosen, or were copied last; a taken layer lets them go."""
-    player = workspace.player
-    if name == "copy_values":
-        chosen = player.shown and timeline.chosen_keys(workspace.view.timeline, player)
-        return (
-            ("copy_keys", workspace)
-            if chosen
-            else (name, replace(workspace, player=replace(player, copied=())))
-        )
-    if name == "paste_values" and player.copied and player.shown:
-        return "paste_keys", workspace
-    if name in ("focus", "press_layer", "unfocus") and player.chosen:
-        workspace = replace(workspace, player=replace(player, chosen=frozenset()))
-    return name, workspace
 
 
 def _frame(workspace: Workspace, facts: SceneFacts, aspect: float) -> Workspace:

@@ -5,16 +5,11 @@ The focused layer is always selected; `Workspace.selected` names the others besi
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import Annotated, Any
-
-from msgspec import Meta
+from dataclasses import replace
+from typing import Any
 
 from progdf.compose.layers import Gains
-from progdf.errors import ProgdfError
-from progdf.io.json_values import convert_json, decode_json, plain
 
 from .layers import (
     dissolve_groups,
@@ -26,7 +21,7 @@ from .layers import (
     step_layers,
     with_slider_value,
 )
-from .view_state import Blend, LayerState, Strength, ViewState
+from .view_state import LayerState, ViewState
 from .workspace import Workspace
 
 PRESSES = ("one", "keep", "toggle", "range")
@@ -162,75 +157,6 @@ def remove(workspace: Workspace, index: str) -> Workspace:
         view = remove_layer(view, i)
     focus = max(gone[0] - 1, 0) if view.layers else None
     return replace(workspace, view=view, focus=focus, selected=frozenset(), renaming=None, overlap=None)
-
-
-@dataclass(frozen=True)
-class LayerValues:
-    """What is copied of a layer."""
-
-    name: str
-    strength: Strength
-    gains: Gains = Gains()
-
-
-@dataclass(frozen=True)
-class CopiedValues:
-    """What the clipboard holds, as JSON. `blend`: the rule of the stack they are from"""
-
-    layers: Annotated[tuple[LayerValues, ...], Meta(min_length=1)]
-    blend: Blend = "normalized"
-    progdf_values: Annotated[int, Meta(ge=1, le=1)] = 1
-
-
-def copy_values(workspace: Workspace) -> tuple[str, str]:
-    """Strengths and gains of the selected layers as a text, and of which.
-
-    Raises:
-        ProgdfError: none is selected.
-    """
-    view = workspace.view
-    chosen = tuple(view.layers[i] for i in selected_layers(workspace))
-    if not chosen:
-        raise ProgdfError("no layer is selected; click one first")
-    values = tuple(LayerValues(layer.name, layer.strength, layer.gains) for layer in chosen)
-    text = json.dumps(plain(CopiedValues(values, view.blend)), ensure_ascii=False)
-    return text, _name_layers([layer.name for layer in chosen])
-
-
-def paste_values(workspace: Workspace, text: str) -> tuple[Workspace, str]:
-    """With what `copy_values` gave, and which layers took it.
-
-    One layer's values go to all selected layers; those of several go by name, with the blend rule. Locked
-    layers stay.
-
-    Raises:
-        ProgdfError: the text holds something else, or no layer has its names.
-    """
-    try:
-        copied = convert_json(decode_json(text), CopiedValues, closed=True)
-    except ValueError:
-        raise ProgdfError("the clipboard holds no values of layers; copy some first") from None
-    view, upper = workspace.view, largest_strength(workspace.view)
-    if len(copied.layers) == 1:
-        taken = {view.layers[i].name: copied.layers[0] for i in selected_layers(workspace)}
-    else:
-        taken = {values.name: values for values in copied.layers}
-        view = replace(view, blend=copied.blend)
-
-    def take(layer: LayerState) -> LayerState:
-        values = taken.get(layer.name)
-        if values is None or layer.locked:
-            return layer
-        return replace(layer, strength=min(upper, values.strength), gains=values.gains)
-
-    took = [layer.name for layer in view.layers if layer.name in taken and not layer.locked]
-    if not took:
-        raise ProgdfError("no layer takes these values: none has their names, or those that do are locked")
-    return replace(workspace, view=replace(view, layers=tuple(map(take, view.layers)))), _name_layers(took)
-
-
-def _name_layers(names: Sequence[str]) -> str:
-    return names[0] if len(names) == 1 else f"{len(names)} layers"
 
 
 def group(workspace: Workspace, name: str) -> Workspace:

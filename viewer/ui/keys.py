@@ -139,8 +139,6 @@ TOPICS: dict[str, tuple[Command, ...]] = {
         Command("select_layers", "Select all layers", "Ctrl+Alt+A"),
         Command("group", "New group", "Ctrl+G", "With a switch and a strength", row="Group; Shift ungroups"),
         Command("ungroup", "Ungroup", "Ctrl+Shift+G", row=JOINED),
-        Command("copy_values", "Copy values", "Ctrl+C", "Strength, gains; as text", row="Copy, paste values"),
-        Command("paste_values", "Paste values", "Ctrl+V", "That were copied", row=JOINED),
         Command("reset", "Reset values", "Ctrl+R", "Strength 0, gains 1", row="Reset values; Shift all"),
         Command("reset_all", "Reset all layers", "Ctrl+Shift+R", row=JOINED),
         Command("search", "Search layers…", "Ctrl+F", types=True),
@@ -151,6 +149,8 @@ TOPICS: dict[str, tuple[Command, ...]] = {
         Command("unfocus", "Leave tool, deselect", "Escape"),
         Command("undo", "Undo", "Ctrl+Z", repeats=True),
         Command("redo", "Redo", "Ctrl+Shift+Z Ctrl+Y", repeats=True),
+        Command("copy_keys", "Copy keyframes", "Ctrl+C", "Those chosen", row="Copy, paste keys"),
+        Command("paste_keys", "Paste keyframes", "Ctrl+V", "At the playhead", row=JOINED),
         Command("history", "History…", "Ctrl+Alt+Z", "Everything that was done; one goes back to any of it"),
     ),
     "Brush": (

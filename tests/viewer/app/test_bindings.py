@@ -35,7 +35,7 @@ def test_every_command_has_a_name_and_with_a_key_a_row_of_its_topic() -> None:
         text, keys = command.row or command.name, {key for key, does in listed if does == command.row}
         assert (text in [does for _, does in listed]) == (bool(command.keys) and text != JOINED), command
         assert not command.listed or keys == {command.listed}
-    assert {("Ctrl+G", "Group; Shift ungroups"), ("Ctrl+C, Ctrl+V", "Copy, paste values")} <= {*listed}
+    assert {("Ctrl+G", "Group; Shift ungroups"), ("Ctrl+C, Ctrl+V", "Copy, paste keys")} <= {*listed}
     assert all(topic.rows for topic in interface.topics())
     assert all(command.name for command in COMMANDS.values())
 
@@ -47,7 +47,7 @@ INTERNAL = {
     *("replace_by", "place", "keep_placed", "put_back", "lay_decal", "save_region", "rename_region"),
     *("set_up", "keep_up", "press_layer", "master", "rename_group", "restore", "forget", "name_snapshot"),
     *("move_snapshot", "choose_snapshot", "blend_snapshots", "region", "show_region", "forget_region"),
-    *("select_invert", "choose_keys", "move_keys", "clone_keys", "copy_keys", "paste_keys"),
+    *("select_invert", "choose_keys", "move_keys", "clone_keys"),
     *("seek", "length", "fps", "go_to", "example", "forget_file"),
 }
 """Asked for by a button, a question or a drag, with what it is about: nothing to look up by its name."""
@@ -56,7 +56,7 @@ INTERNAL = {
 @pytest.mark.gl
 def test_every_action_has_its_command_or_is_no_one_s_to_look_up(tmp_path: Path) -> None:
     with null_app(empty(), ViewState(), tmp_path) as app:
-        everything = {*app.requests, *exports.REQUESTS, "copy_values", "paste_values"}
+        everything = {*app.requests, *exports.REQUESTS}
     everything |= {*actions.ACTIONS, *actions.OF_EDITS, *selection.CHANGES, "frame", "home", "invert"}
     everything |= {"paint_clear", "paint_fill", "paint_invert", "paint_feather"}
     everything |= {"next_slider", "blend_snapshots"}

@@ -107,10 +107,9 @@ def test_no_action_ends_the_window(
 
 
 def test_no_request_ends_the_window(window: application.App, monkeypatch: pytest.MonkeyPatch) -> None:
-    by_the_view = (*exports.REQUESTS, "copy_values", "paste_values")
     window.requests = dict.fromkeys(window.requests, raises(BrokenError("in a request")))
     monkeypatch.setattr(window.main_view, "_save", raises(BrokenError("in a request")))
-    for request in (*window.requests, *by_the_view):
+    for request in (*window.requests, *exports.REQUESTS):
         window.main_view.work = replace(window.main_view.work, message=None)
         window.main_view.request(request)
         turns(window, 2)

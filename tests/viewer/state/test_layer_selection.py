@@ -6,8 +6,6 @@ from dataclasses import replace
 
 import pytest
 
-from progdf.compose.layers import Gains
-from progdf.errors import ProgdfError
 from viewer.camera.view_camera import Bounds
 from viewer.state import layer_selection, layers, workspace
 from viewer.state.actions import perform
@@ -101,37 +99,6 @@ def test_switches_resets_and_deletions_are_for_all_that_are_selected() -> None:
     gone = act(work, "remove")
     assert (order(gone), gone.focus) == ("abc", 2)
     assert order(act(work, "remove:0")) == "bcdef", "a layer outside of the selection goes alone"
-
-
-def test_values_go_from_one_layer_to_all_selected_ones_and_from_several_by_name() -> None:
-    work = six(0.1, 0.2)
-    gained = replace(work.view.layers[1], gains=Gains(0.5, 1.0, 0.25))
-    work = workspace.new_workspace(
-        replace(work.view, layers=(work.view.layers[0], gained, *work.view.layers[2:]))
-    )
-    one, what = layer_selection.copy_values(press(work, "one", "b"))
-    assert what == "b"
-    pasted, what = layer_selection.paste_values(press(press(work, "one", "d"), "toggle", "f"), one)
-    assert what == "2 layers"
-    assert [pasted.view.layers[i].gains for i in (3, 5)] == [gained.gains] * 2
-    assert strengths(pasted) == [0.1, 0.2, 0.5, 0.2, 0.5, 0.2]
-    two, _ = layer_selection.copy_values(press(press(act(work, "blend"), "one", "a"), "toggle", "b"))
-    other, what = layer_selection.paste_values(six(), two)
-    assert (what, strengths(other)[:3], other.view.blend) == ("2 layers", [0.1, 0.2, 0.5], "normalized")
-    for text in (
-        "",
-        "hello",
-        "[]",
-        '{"layers": []}',
-        two.replace("0.1", "7"),
-        two.replace('"b"', '"b", "x": 1'),
-    ):
-        with pytest.raises(ProgdfError, match="the clipboard holds no values"):
-            layer_selection.paste_values(work, text)
-    with pytest.raises(ProgdfError, match="no layer is selected"):
-        layer_selection.copy_values(act(work, "unfocus"))
-    with pytest.raises(ProgdfError, match="no layer takes these values"):
-        layer_selection.paste_values(work, two.replace('"a"', '"x"').replace('"b"', '"y"'))
 
 
 def test_a_group_gathers_its_layers_switches_and_dims_them_and_dissolves() -> None:

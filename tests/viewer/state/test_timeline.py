@@ -322,16 +322,15 @@ def test_keys_of_one_frame_go_on_each_in_its_own_way_also_in_a_file(tmp_path: Pa
 
 def test_copied_keys_are_pasted_at_the_playhead_in_place_of_what_stands_there() -> None:
     work = act(workspace.new_workspace(replace(view(), timeline=two_keys())), "timeline")
-    work = act(work, "choose_keys:0@0,0@20", "copy_values", "seek:10", "paste_values")
-    assert not work.requests, "keys were copied, not the sliders"
+    work = act(work, "choose_keys:0@0,0@20", "copy_keys", "seek:10", "paste_keys")
     assert frames_of(work, 0) == [0, 10, 20, 30]
     assert work.view.timeline.length == 30
     assert timeline.strengths_at(work.view.timeline, 30)[0] == 1.0
     assert work.player.chosen == {(0, 10), (0, 30)}
     dropped = act(work, "drop_key")
     assert (frames_of(dropped, 0), frames_of(dropped, 1)) == ([0, 20], [0, 20])
-    layers = act(work, "focus:1", "copy_values", "paste_values")
-    assert layers.requests == ("copy_values", "paste_values"), "a layer was taken since"
+    layers = act(work, "focus:1", "copy_keys", "paste_keys")
+    assert layers.view == replace(work.view), "a layer was taken since, and no key is chosen"
 
 
 def test_copies_are_dragged_off_and_what_they_come_from_stays() -> None:
