@@ -30,28 +30,9 @@ DIVIDER = "divider"
 """The name of its drag, beside those of `keys.DRAGS`."""
 
 
-def near_divider(view: ViewState, area: Area, ui: UiContext) -> bool:
-    """Whether the mouse is where a press grips the divider; the cursor then says so."""
-    if view.compare.mode != "split":
-        return False
-    mouse = imgui.get_io().mouse_pos
-    within = abs(mouse.x - view.compare.divider * area.width) <= REACH_PX * ui.scale
-    return within and 0.0 <= mouse.y < area.height
-
-
-def move_divider(view: ViewState, area: Area) -> ViewState:
-    """The divider under the mouse, never out of the picture."""
-    return place_divider(view, max(0.0, min(1.0, imgui.get_io().mouse_pos.x / area.width)))
-
-
 def place_divider(view: ViewState, divider: float) -> ViewState:
-    """The divider at this share of the picture's width, 0..1."""
-    return replace(view, compare=replace(view.compare, divider=divider))
-
-
-def show_grip() -> None:
-    """The cursor of something that moves sideways."""
-    imgui.set_mouse_cursor(imgui.MouseCursor_.resize_ew.value)
+    """The divider at this share of the picture's width, held to 0..1."""
+    return replace(view, compare=replace(view.compare, divider=max(0.0, min(1.0, divider))))
 
 
 def draw_comparison(view: ViewState, area: Area, held: bool, ui: UiContext) -> None:
@@ -128,7 +109,7 @@ def handle_mouse(tool: MouseTool, work: Workspace, pointer: PointerContext) -> t
     if io.want_capture_mouse:
         return tool, work
     if grips_divider(tool, work.view, pointer):
-        show_grip()
+        imgui.set_mouse_cursor(imgui.MouseCursor_.resize_ew.value)
         if imgui.is_mouse_clicked(0):
             return replace(tool, drag=DIVIDER, divider=work.view.compare.divider), work
     axis, plain = overlay.axis_under(work.view, pointer.area, pointer.ui), not io.key_alt
@@ -169,8 +150,10 @@ def grips_divider(tool: MouseTool, view: ViewState, pointer: PointerContext) -> 
     """Whether the divider of a split is in the tool, or under it."""
     if tool.drag is not None:
         return tool.drag == DIVIDER
-    over = imgui.get_io().want_capture_mouse
-    return not over and near_divider(view, pointer.area, pointer.ui)
+    mouse, area = imgui.get_io().mouse_pos, pointer.area
+    within = abs(mouse.x - view.compare.divider * area.width) <= REACH_PX * pointer.ui.scale
+    over = imgui.get_io().want_capture_mouse or not 0.0 <= mouse.y < area.height
+    return view.compare.mode == "split" and within and not over
 
 
 def _drag(tool: MouseTool, work: Workspace, pointer: PointerContext) -> tuple[MouseTool, Workspace]:
@@ -178,7 +161,7 @@ def _drag(tool: MouseTool, work: Workspace, pointer: PointerContext) -> tuple[Mo
     io, scale = imgui.get_io(), pointer.ui.scale
     dx, dy = io.mouse_delta.x / scale, io.mouse_delta.y / scale
     if tool.drag == DIVIDER:
-        return tool, replace(work, view=move_divider(work.view, pointer.area))
+        return tool, replace(work, view=place_divider(work.view, io.mouse_pos.x / pointer.area.width))
     if tool.drag == tools.PAINT_DRAG:
         return _paint(tool, work, pointer)
     if tool.drag == select_tool.SELECT_DRAG:

@@ -37,16 +37,6 @@ class SceneUp:
     reason: str = ""  # for a person; "" of an edit that knew
 
 
-def up_of(
-    scene: Gaussians,
-    gdfs: Sequence[Gdf] = (),
-    axis: str = "auto",
-    cameras: Sequence[Camera] = (),
-) -> Vec3:
-    """The direction of `find_scene_up`."""
-    return find_scene_up(scene, gdfs, axis, cameras).direction
-
-
 def find_scene_up(
     scene: Gaussians,
     gdfs: Sequence[Gdf] = (),
@@ -338,7 +328,7 @@ def first_camera(
         fov_y: vertical field of view, degrees
         up: unit vector; None asks the cameras and the scene
     """
-    up = up_of(scene, cameras=cameras) if up is None else up
+    up = find_scene_up(scene, cameras=cameras).direction if up is None else up
     camera, axis = ViewCamera(up=up, azimuth=20.0, fov_y=fov_y), torch.tensor(up)
     if not len(scene):
         return frame(camera, Bounds(), aspect)

@@ -26,7 +26,7 @@ from progdf.io.tensors import open_npy
 from progdf.region import Region
 from progdf.scene.regions import check_region, parse_region
 from progdf.scene.up_axis import UpChoice
-from viewer.camera.view_camera import Vec3, up_of, with_up
+from viewer.camera.view_camera import Vec3, find_scene_up, with_up
 from viewer.files import document, session
 from viewer.files.document import Document
 from viewer.files.web_page import PageOptions
@@ -205,7 +205,7 @@ class OpenStack:
         opened = self.document
         if self.up_option == "auto":
             return opened.detected_up.direction
-        return up_of(opened.scene, opened.gdfs, self.up_option)
+        return find_scene_up(opened.scene, opened.gdfs, self.up_option).direction
 
     @property
     def files(self) -> tuple[Path, ...]:

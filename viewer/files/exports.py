@@ -48,18 +48,21 @@ def folder_of(scene: Path | None) -> Path:
 
 
 def picture(folder: Path, title: str, image: NDArray[np.uint8], info: PngInfo | None = None) -> Path:
-    """Save `image` [H,W,3] under the scene's name; its file.
+    """Save `image` [H,W,3] under the scene's name as NAME_001.png, or the next free number; its file.
 
     Args:
         folder, title: where, and the scene's name
         image: pixels
-        info: what the file carries: with a camera, what is changed in it can be trained on
+        info: what the file carries, see `camera_chunk`; with a camera it can be changed and trained on
 
     Raises:
         ProgdfError: it cannot be written.
     """
     with _writable(folder, "picture"):
-        return save_picture(folder, Path(title).stem, image, info).resolve()
+        path = free_path(folder, Path(title).stem, ".png")
+        with atomic_write(path) as temporary_file:
+            Image.fromarray(image).save(temporary_file, pnginfo=info)
+        return path.resolve()
 
 
 def timeline(folder: Path, title: str, view: ViewState, origin: Origin = ZERO) -> str:
@@ -103,24 +106,6 @@ def _writable(folder: Path, what: str) -> Iterator[None]:
         yield
     except OSError as error:
         raise ProgdfError(f"no {what} was saved in {folder.resolve()}: {error.strerror}") from None
-
-
-def save_picture(folder: Path, stem: str, image: NDArray[np.uint8], info: PngInfo | None = None) -> Path:
-    """Write `image` [H,W,3] as STEM_001.png, or the next free number; returns the path.
-
-    Args:
-        folder, stem: where, and how it is named
-        image: pixels
-        info: what the file carries, see `camera_chunk`
-
-    Raises:
-        ProgdfError: the folder does not exist.
-        OSError: it cannot be written.
-    """
-    path = free_path(folder, stem, ".png")
-    with atomic_write(path) as temporary_file:
-        Image.fromarray(image).save(temporary_file, pnginfo=info)
-    return path
 
 
 def free_path(folder: Path, stem: str, suffix: str) -> Path:

@@ -120,9 +120,11 @@ def test_a_grade_by_hand_gets_the_main_colors_of_its_region(
     def ask(self: Previews, region: str, request: preview._Request, _: Camera) -> int:
         self._number += 1
         asked.append(request.editor)
-        palette = ("#7eae44", f"#0000{self._number:02x}") if request.editor == "grade" else None
-        grade = Previews.grade if palette is None else None
-        self._answers.append(preview.Preview(self._number, grade=grade, palette=palette))
+        made = preview.Preview(self._number, grade=Previews.grade, made="grade")
+        if request.editor == "grade":
+            colors = ("#7eae44", f"#0000{self._number:02x}")
+            made = preview.Preview(self._number, made="palette", palette=colors)
+        self._answers.append(made)
         return self._number
 
     monkeypatch.setattr(Previews, "ask", ask)

@@ -19,8 +19,7 @@ from progdf.io.picture_camera import camera_chunk
 from tests.helpers.ui_rig import bear, first_view
 from viewer.app import app as application
 from viewer.camera.view_camera import to_camera
-from viewer.files import timeline_file
-from viewer.files.exports import save_picture
+from viewer.files import exports, timeline_file
 from viewer.state import selection
 from viewer.state.view_state import Keyframe, Timeline
 
@@ -106,7 +105,7 @@ def test_a_dropped_picture_stands_in_the_form_and_one_looks_from_where_it_was_ta
     before = main_view.work.view.camera
     image = np.zeros((300, 400, 3), np.uint8)
     taken = to_camera(replace(before, azimuth=before.azimuth + 20.0), 400, 300)
-    picture = save_picture(tmp_path, "helmet", image, camera_chunk(taken))
+    picture = exports.picture(tmp_path, "helmet", image, camera_chunk(taken))
     opened.open(picture)
     opened.draw()
     assert main_view.work.form_open
@@ -116,7 +115,7 @@ def test_a_dropped_picture_stands_in_the_form_and_one_looks_from_where_it_was_ta
         ("worn", camera_chunk(taken, ["scarf"]), "with edits on (scarf)"),
         ("lost", None, "does not say from where"),
     ):
-        opened.open(save_picture(tmp_path, name, image, carried))
+        opened.open(exports.picture(tmp_path, name, image, carried))
         assert main_view.work.message is not None
         assert line in main_view.work.message.text
         assert main_view.work.form.pictures == str(picture)

@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import moderngl
 import msgspec
@@ -70,26 +70,17 @@ class _Request:
 
 @dataclass(frozen=True)
 class Preview:
-    """What came of a request: a picture [H,W,3], or the file of a grade, or why there is neither."""
+    """What came of a request: a picture, the file of a grade, a palette or a note, or why there is none."""
 
     number: int  # -1: the child has ended, or what it wrote cannot be read
-    pixels: NDArray[np.uint8] | None = None
+    pixels: Any = None  # the picture. [H,W,3] uint8
     grade: Path | None = None
     error: str = ""
+    made: Literal["picture", "grade", "note", "palette"] = "picture"
     note: str = ""  # what would paint a sentence
     models: tuple[str, ...] = ()  # that are on this machine
     follows: bool = False  # whether the edit of a sentence can follow this picture
-    palette: tuple[str, ...] | None = None  # the region's main colors, #rrggbb
-
-
-class _Answer(msgspec.Struct):
-    number: int
-    error: str = ""
-    made: Literal["picture", "grade", "note", "palette"] = "picture"
-    note: str = ""
-    models: list[str] = msgspec.field(default_factory=list)
-    follows: bool = False
-    palette: list[str] = msgspec.field(default_factory=list)
+    palette: tuple[str, ...] = ()  # the region's main colors, #rrggbb
 
 
 class PreviewChild:
@@ -143,19 +134,13 @@ class PreviewChild:
             ended = self._child.status is not None
             return Preview(-1, error=self._child.error() or "the preview ended") if ended else None
         try:
-            answer = convert_json(decode_json(line), _Answer)
-            if answer.error:
-                return Preview(answer.number, error=answer.error, models=tuple(answer.models))
-            if answer.made == "note":
-                return Preview(answer.number, note=answer.note, models=tuple(answer.models))
+            answer = convert_json(decode_json(line), Preview)
+            if answer.error or answer.made in ("note", "palette"):
+                return answer
             if answer.made == "grade":
-                file = self._picture(answer.number).with_suffix(".gdf")
-                return Preview(answer.number, grade=file, note=answer.note)
-            if answer.made == "palette":
-                return Preview(answer.number, palette=tuple(answer.palette))
+                return replace(answer, grade=self._picture(answer.number).with_suffix(".gdf"))
             with Image.open(self._picture(answer.number)) as picture:
-                pixels = np.asarray(picture.convert("RGB"))
-            return Preview(answer.number, pixels, follows=answer.follows)
+                return replace(answer, pixels=np.asarray(picture.convert("RGB")))
         except (OSError, ValueError) as error:
             return Preview(-1, error=f"the preview cannot be read: {error}")
 
@@ -392,20 +377,22 @@ class PreviewActions:
                 self._end()
             self._end_live()
             self._show(answer.error, None, failed=True, models=answer.models)
-        elif answer.palette is not None and self._sent is not None and answer.number == self._number:
+        elif self._sent is None or answer.number != self._number:
+            return  # of a request that is no longer the last
+        elif answer.made == "palette":
             self._palette_of, work = self._sent.region, self._app.main_view.work
             if all(source == target for source, target in work.form.palette):
                 form = replace(work.form, palette=tuple((color, color) for color in answer.palette))
                 self._app.main_view.work = replace(work, form=form)
             self._app.main_view.wake()
-        elif answer.note and answer.grade is None and answer.number == self._number:
+        elif answer.note and answer.grade is None:
             self._show(answer.note, None, models=answer.models)
-        elif answer.grade is not None and self._sent is not None and answer.number == self._number:
+        elif answer.grade is not None:
             gdf = load_gdf(answer.grade, self._app.document.original)
             self._grade = self._sent, gdf, answer.grade
             self._app.main_view.live = ()  # of the last color
             self._show(f"Live: {answer.note}", None)
-        elif answer.pixels is not None and self._sent is not None and answer.number == self._number:
+        elif answer.pixels is not None:
             kind, _, what = self._sent.editor.partition(":")
             title = next(choice.title for choice in EDITORS if choice.kind == kind)
             self._end_live()
