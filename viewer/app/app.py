@@ -170,21 +170,13 @@ class App:
         )
         self.deliver = DeliverActions(self, self.jobs.queue)
         self.start = StartActions(self, self.context, self.jobs.queue)
-        self.up = UpActions(self, self.context)
+        self.up = UpActions(self)
         self.preview = PreviewActions(self, self.context, self.jobs.region_spec)
         self.strays = StrayActions(self)
         self.tidy = TidyActions(self)
-        parts = (
-            self.file_actions,
-            self.jobs,
-            self.deliver,
-            self.start,
-            self.up,
-            self.preview,
-            self.strays,
-            self.tidy,
-        )
-        self.requests = {name: act for part in parts for name, act in part.requests.items()}
+        studio = self.jobs, self.deliver, self.start, self.preview
+        by_part = [part.requests for part in (self.file_actions, *studio, self.strays, self.tidy)]
+        self.requests = {name: act for acts in by_part for name, act in acts.items()}
         self.requests["full_screen"] = lambda _: window.toggle_full_screen()
         self.requests["quit"] = lambda _: None if self.jobs.holds_window() else self.file_actions.leave()
         self.is_closed = False
@@ -205,7 +197,7 @@ class App:
                 parts.callback(close)
             parts.callback(self.main_view.ui.make_current)
             parts.callback(self.file_actions.release)
-            for part in (self.jobs, self.strays, self.up, self.preview, self.start):
+            for part in (self.jobs, self.strays, self.preview, self.start):
                 parts.callback(part.close)
             self._keep_picture()
 
@@ -299,7 +291,7 @@ class App:
         return (
             self._look(self.file_actions.poll_dialog),
             *looks,
-            self._look(lambda: self.up.poll(self.file_actions.path, self.engine)),
+            self._look(lambda: self.up.poll(self.file_actions.path)),
             self._look(self.main_view.next_frame_delay),
             self._look(lambda: self.file_actions.autosave(time.perf_counter())),
         )

@@ -24,8 +24,6 @@ from viewer.ui.widgets import elide, menu, search_field
 
 from . import dialogs, mouse, select_tool
 from .mouse import MouseTool
-from .studio import pages
-from .studio.pages import UpStrip
 
 MOUSE_HELP = (
     ("Left drag", "Orbit"),
@@ -318,7 +316,6 @@ def over_picture(
     labels: Labels,
     figures: Sequence[tuple[str, str]],
     original: bool,
-    strip: UpStrip | None = None,
 ) -> Workspace:
     """The brush, the comparison, timings, bindings and the message, which leaves when its time is over.
 
@@ -327,7 +324,6 @@ def over_picture(
         labels: over the comparison on screen
         figures: of the table of timings
         original: the key that shows it is held
-        strip: asks which way is up
     """
     area, ui, view = pointer.area, pointer.ui, work.view
     io = imgui.get_io()
@@ -348,9 +344,6 @@ def over_picture(
     free = imgui.get_io().display_size
     bar = timeline_bar.height(work, area, ui) if view.panel else 0.0
     above = replace(area, height=area.height - bar)
-    if strip is not None and work.dialog is None:
-        work = replace(work, requests=(*work.requests, *pages.draw_up_strip(strip, above, ui)))
-        above = replace(above, height=above.height - pages.up_strip_height(strip, area, ui))
     if (line := work.message) is not None:
         clicked, top = overlay.message(line, above, ui)
         free = imgui.ImVec2(free.x, top)

@@ -54,7 +54,7 @@ from .decal import Decal
 from .gizmo import Gizmo
 from .mouse import MouseTool
 from .studio import pages
-from .studio.pages import Cover, UpStrip
+from .studio.pages import Cover
 
 SETTLE_FRAMES = 3  # imgui takes a frame or two until hovering and layout have followed an event
 LINGER_S = 0.65
@@ -128,7 +128,6 @@ class MainView:
         self.recent: tuple[Path, ...] = ()  # files opened before, for the dialogs
         # of the start page: files opened before, and examples
         self.start_files: tuple[Sequence[pages.StartFile], Sequence[pages.StartFile]] = (), ()
-        self.up_strip: UpStrip | None = None  # asks which way is up
         self.cover: Cover | None = None  # what lies over the picture
         self.preview = PreviewState()  # of the picture of a new edit
         self.live: tuple[LayerState, ...] = ()  # what is being trained, on top of the stack
@@ -188,7 +187,7 @@ class MainView:
         """A new state and snapshots, with nothing to undo, nothing in the hand or over the picture."""
         self.work = replace(workspace.new_workspace(view, snapshots), layout=self.work.layout)
         self._tool, self._taps = MouseTool(), Taps()
-        self.cover, self.up_strip, self.preview, self.gizmo = None, None, PreviewState(), None
+        self.cover, self.preview, self.gizmo = None, PreviewState(), None
         self.wake()
 
     def next_frame_delay(self) -> float | None:
@@ -326,10 +325,6 @@ class MainView:
                 wide, tall = self._pointer().size
                 click, self.work = select_tool.click(self.work, self._pointer(), (wide / 2, tall / 2))
                 self._tool, self._keys = replace(self._tool, click=click), replace(self._keys, pressed=())
-        free = not (asks or imgui.get_io().want_text_input or view.brush.active or view.select.tool)
-        if self.up_strip is not None and free and any(p.chord == "Escape" for p in self._keys.pressed):
-            self._keys = replace(self._keys, pressed=())
-            self.request("keep_up")
         flies = view.camera.mode == "fly"
         self._taps, tapped = tapped_actions(self._taps, self._keys, self._clock, flies)
         if asks:  # no key is a shortcut or flies
@@ -490,9 +485,7 @@ class MainView:
             self.work = interface.draw_lists(self.work, pointer, offered, pressed)
         labels = self.canvas.comparer.labels(self.work.view)
         figures = self.figures() if self.work.view.overlay else []
-        self.work = interface.over_picture(
-            self.work, pointer, self._tool, labels, figures, original, self.up_strip
-        )
+        self.work = interface.over_picture(self.work, pointer, self._tool, labels, figures, original)
         gone = (before.dialog, self.work.dialog), (before.message, self.work.message)
         if any(was is not None and now is None for was, now in gone):
             self.wake()

@@ -29,11 +29,10 @@ Vec3 = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class SceneUp:
-    """The world direction that is up, unit length, whether that is certain, and what else it may be."""
+    """The world direction that is up, unit length, and whether that is certain."""
 
     direction: Vec3
     certain: bool
-    candidates: tuple[Vec3, ...] = ()  # the likeliest first
     reason: str = ""  # for a person; "" of an edit that knew
 
 
@@ -60,8 +59,7 @@ def find_scene_up(
         known = guess.direction
     x, y, z = (0.0, 1.0, 0.0) if known is None else (float(c) for c in known)
     reason = "" if guess is None else f"{guess.name}, {guess.reason}"
-    others = () if guess is None else tuple((a, b, c) for a, b, c in (up.tolist() for up in guess.candidates))
-    return SceneUp((x, y, z), guess is None or guess.certain, others, reason)
+    return SceneUp((x, y, z), guess is None or guess.certain, reason)
 
 
 FARTHEST = 1e9  # world units: float32 matrices stay finite with plenty to spare

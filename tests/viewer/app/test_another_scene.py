@@ -98,7 +98,7 @@ def test_another_scene_opens_while_everything_of_the_old_one_is_in_use(
     assert work.view.selection.regions == ()
     assert not work.view.brush.active
     assert (work.form_open, work.form, work.player) == (fresh.form_open, fresh.form, fresh.player)
-    assert (main_view.cover, main_view.preview, main_view.up_strip) == (None, PreviewState(), None)
+    assert (main_view.cover, main_view.preview) == (None, PreviewState())
 
 
 @pytest.mark.gl

@@ -12,8 +12,7 @@ from imgui_bundle import imgui
 
 from tests.helpers.stacks import many_edits
 from tests.helpers.ui_rig import TRACK, Rig, bear, first_view, rig
-from viewer.app.studio.pages import UpChoice, UpStrip
-from viewer.panel import panel, tools
+from viewer.panel import panel
 from viewer.render.dynamic_resolution import FrameTimings
 from viewer.state import selection
 from viewer.state.selection import SelectionState
@@ -200,13 +199,11 @@ def test_a_lasso_its_selection_and_a_region(screenshot: Compare) -> None:
         screenshot("ui_select", hand.image())
 
 
-def test_axes_the_grid_on_the_ground_and_the_question_which_way_is_up(screenshot: Compare) -> None:
+def test_axes_and_the_grid_on_the_ground(screenshot: Compare) -> None:
     head = selection.select(SelectionState(), np.isin(bear().demo.labels.numpy(), (1, 2)))
     view = replace(first_view(bear()), axes=True, grid=True, background=(0.11, 0.11, 0.12))
     view = replace(view, selection=selection.isolate(head, len(bear().scene)))
     with rig(view, SMALLEST) as hand:
-        choices = tuple(UpChoice(name, view.camera) for name, _ in tools.UPS[2:])
-        hand.main_view.up_strip = UpStrip(choices, "+Y")
         hand.main_view.show_message("Saved bear.session.json")
         hand.move(651.0, 53.0)
         hand.frame(3)

@@ -1,4 +1,4 @@
-"""What is drawn over the window: the start page, which way is up, a preview, the fields of a delivery."""
+"""What is drawn over the window: the start page, a preview, the fields of a delivery."""
 
 from __future__ import annotations
 
@@ -27,8 +27,6 @@ from viewer.ui.widgets import (
     icon_button,
     label,
     picture,
-    plate,
-    right_edge,
     small,
     tip,
 )
@@ -213,86 +211,6 @@ def _dashed_frame(size: imgui.ImVec2, ui: UiContext) -> None:
             begin = (left + dx * low, top + dy * low)
             end = (left + dx * high, top + dy * high)
             canvas.add_line(begin, end, ink, 1.5 * scale)
-
-
-UP_SIZE = (160, 120)
-"""Pixels of a picture."""
-_PICTURE_PX = 128.0
-"""Of a picture at 1×, where there is room."""
-_GAP_PX, _PAD_PX, _TITLE_PX = 8.0, 10.0, 24.0
-
-
-@dataclass(frozen=True)
-class UpChoice:
-    """A direction that may be up."""
-
-    name: str  # as "+Y"
-    camera: ViewCamera  # the first view if it is
-    texture: int = 0  # GL name of its picture, 0 while there is none
-
-
-@dataclass(frozen=True)
-class UpStrip:
-    """The question while it is asked; `now` is what counts as up meanwhile."""
-
-    choices: tuple[UpChoice, ...]
-    now: str
-
-
-def up_strip_height(strip: UpStrip | None, area: Area, ui: UiContext) -> float:
-    """How much of the lower edge of the picture it covers, window pixels."""
-    if strip is None:
-        return 0.0
-    return 0.75 * _picture_width(strip, area, ui) + (2 * _PAD_PX + _TITLE_PX + _GAP_PX) * ui.scale
-
-
-def draw_up_strip(strip: UpStrip, area: Area, ui: UiContext) -> tuple[str, ...]:
-    """Draw it along the lower edge of `area`; the requests that come of it."""
-    wide, scale, requests = _picture_width(strip, area, ui), ui.scale, list[str]()
-    tall = up_strip_height(strip, area, ui) - _GAP_PX * scale
-    count = len(strip.choices)
-    across = count * wide + ((count - 1) * _GAP_PX + 2 * _PAD_PX) * scale
-    place = (area.width / 2, area.height - _GAP_PX * scale)
-    with plate("up axis", place, ui, (0.5, 1.0), _PAD_PX, (across, tall)):
-        top, right = imgui.get_cursor_pos_y(), right_edge()
-        imgui.text("Which way is up?")
-        keep = f"Keep {strip.now} (Esc)"
-        with imgui_ctx.push_font(None, SMALL_PX):
-            room = imgui.calc_text_size(keep).x + 2 * imgui.get_style().frame_padding.x
-            if right - room > imgui.get_item_rect_size().x + _PAD_PX * scale:
-                imgui.same_line(right - room)
-                if imgui.small_button(keep):
-                    requests.append("keep_up")
-        for i, direction in enumerate(strip.choices):
-            imgui.set_cursor_pos(((_PAD_PX + i * _GAP_PX) * scale + i * wide, top + _TITLE_PX * scale))
-            if _up_picture(direction, wide, direction.name == strip.now, ui):
-                requests.append(f"set_up:{i}")
-    return tuple(requests)
-
-
-def _picture_width(strip: UpStrip, area: Area, ui: UiContext) -> float:
-    """Of a picture, window pixels."""
-    count = len(strip.choices)
-    room = area.width - (2 * _PAD_PX + (count + 1) * _GAP_PX) * ui.scale
-    return max(min(_PICTURE_PX * ui.scale, room / count), 24.0 * ui.scale)
-
-
-def _up_picture(direction: UpChoice, wide: float, now: bool, ui: UiContext) -> bool:
-    at, rounding = imgui.get_cursor_screen_pos(), 4.0 * ui.scale
-    pressed = bool(imgui.invisible_button(direction.name, (wide, 0.75 * wide)))
-    canvas, end = imgui.get_window_draw_list(), (at.x + wide, at.y + 0.75 * wide)
-    picture(direction.texture, at, end, rounding)
-    if now or imgui.is_item_hovered():
-        ink = PALETTE.accent if imgui.is_item_hovered() else PALETTE.dim
-        canvas.add_rect(at, end, u32(ink), rounding, 2.0 * ui.scale)
-    size, pad = SMALL_PX * ui.scale, 4.0 * ui.scale
-    with imgui_ctx.push_font(ui.fonts.bold, SMALL_PX):
-        text = imgui.calc_text_size(direction.name)
-    corner = (at.x + text.x + 2 * pad, at.y + size + pad)
-    canvas.add_rect_filled(at, corner, u32(PALETTE.scrim), rounding)
-    text_at = (round(at.x + pad), round(at.y + pad / 2))
-    canvas.add_text(ui.fonts.bold, size, text_at, u32(PALETTE.text), direction.name)
-    return pressed
 
 
 @dataclass(frozen=True)

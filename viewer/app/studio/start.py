@@ -19,16 +19,16 @@ from progdf.scene import up_axis
 from progdf.scene.up_axis import direction_name
 from viewer.app.application import Application, Requests, attempt
 from viewer.app.file_actions import EditActions
-from viewer.camera.view_camera import Vec3, first_camera
+from viewer.camera.view_camera import Vec3
 from viewer.files import user_files
 from viewer.gl.present import picture_texture
 from viewer.jobs.job_queue import Delivery, JobQueue
 from viewer.pictures.film import to_pixels
 from viewer.render.engine import ViewEngine
-from viewer.state import history, workspace
+from viewer.state import history
 from viewer.state.view_state import Comparison, ViewState
 
-from .pages import UP_SIZE, StartFile, UpChoice, UpStrip, folder_name
+from .pages import StartFile, folder_name
 
 POLL_S = 0.5
 EXAMPLES = Path(viewer.__file__).parent / "examples"
@@ -164,114 +164,39 @@ class StartActions:
         return int(texture.glo) if texture is not None else 0
 
 
-MOST_UPS = 4
-"""Directions that are offered, the likeliest first."""
-
-
 class UpActions:
-    """Asks, draws the pictures one by one, and remembers the answer. `close` it with the window.
+    """Says where it is a guess which way is up, and remembers what a person sets.
 
     Args:
         app: the window
-        context: the GL context
     """
 
-    def __init__(self, app: Application, context: moderngl.Context) -> None:
-        self._app, self._context = app, context
-        self._textures: list[moderngl.Texture] = []
+    def __init__(self, app: Application) -> None:
+        self._app = app
         self._looked = False  # at the scene
-        self._path: Path | None = None  # its file
-        self._up: Vec3 | None = None  # and what a person had set as up at the last look
+        self._up: Vec3 | None = None  # what a person had set as up at the last look
 
-    @property
-    def requests(self) -> Requests:
-        """`set_up:CHOICE`"""
-        return {"set_up": self._set_up, "keep_up": self._keep_up}
-
-    def _set_up(self, choice: str) -> None:
-        main_view = self._app.main_view
-        before = main_view.work.view.camera
-        if (strip := main_view.up_strip) is not None:
-            home = strip.choices[int(choice)].camera
-            view = replace(main_view.work.view, camera=replace(home, mode=before.mode))
-            work = workspace.record_undo(replace(main_view.work, home=home, view=view))
-            main_view.work = workspace.glide_from(work, before)
-            self._answer(home.up)
-
-    def _keep_up(self, _: str) -> None:
-        if self._app.main_view.up_strip is not None:
-            self._answer(self._app.main_view.work.view.camera.up)
-
-    def poll(self, session: Path | None, engine: ViewEngine) -> float | None:
-        """Ask where a scene was opened that does not tell, and remember what is chosen, in the panel too.
-
-        Returns:
-            Seconds until the next look, None for ever.
+    def poll(self, session: Path | None) -> None:
+        """Look at the scene that is open, and at the up axis.
 
         Args:
             session: that is open, which knows
-            engine: draws the pictures
         """
         main_view, document = self._app.main_view, self._app.document
         # what a person sets, also by undo; not where a film, a picture or a snapshot leads the camera
         up, before = main_view.work.past.present.look.up, self._up
         self._up = up
-        if not self._looked:
-            self._looked, self._path = True, document.path
-            if document.path is None or session is not None:
-                return None
-            if document.detected_up.certain or up != document.detected_up.direction:
-                return None  # it tells, or somebody said
-            main_view.up_strip = self._question()
-        elif up != before:
-            self._answer(up)  # as the panel was told
-            return None
-        strip = main_view.up_strip
-        if strip is None:
-            return None
-        missing = next((i for i, choice in enumerate(strip.choices) if not choice.texture), None)
-        if missing is None:
-            return None
-        choices = [*strip.choices]
-        choices[missing] = replace(choices[missing], texture=self._draw(choices[missing], engine))
-        main_view.up_strip = replace(strip, choices=tuple(choices))
-        main_view.wake()
-        return 0.0
-
-    def _answer(self, up: Vec3) -> None:
-        if self._path is not None:
-            up_axis.remember(self._app.document.scene, up)
-            self._up = up
-        self.close()
-        self._app.main_view.wake()
+        if document.path is None:
+            return
+        if self._looked and up != before:
+            up_axis.remember(document.scene, up)
+        guess = not (self._looked or session or document.detected_up.certain)
+        if guess and up == document.detected_up.direction and main_view.work.message is None:
+            name = direction_name(torch.tensor(up)).upper().replace("-", "−")
+            where = "Up axis in the popover under the axes sets it"
+            main_view.show_message(f"That {name} is up in {document.title} is a guess: {where}")
+        self._looked = True
 
     def leave_scene(self) -> None:
-        """There is another scene to ask about."""
-        self.close()
+        """There is another scene to look at."""
         self._looked = False
-
-    def close(self) -> None:
-        """No question any more."""
-        self._app.main_view.up_strip = None
-        for texture in self._textures:
-            texture.release()
-        self._textures.clear()
-
-    def _question(self) -> UpStrip:
-        scene, camera = self._app.document.scene, self._app.main_view.work.view.camera
-        ups = self._app.document.detected_up.candidates
-        names = [direction_name(torch.tensor(up)).upper().replace("-", "−") for up in ups]
-        choices = tuple(
-            UpChoice(name, first_camera(scene, aspect=UP_SIZE[0] / UP_SIZE[1], fov_y=camera.fov_y, up=up))
-            for name, up in zip(names[:MOST_UPS], ups[:MOST_UPS], strict=True)
-        )
-        return UpStrip(
-            choices, next((choice.name for choice in choices if choice.camera.up == camera.up), "")
-        )
-
-    def _draw(self, choice: UpChoice, engine: ViewEngine) -> int:
-        background = self._app.main_view.work.view.background
-        pixels = to_pixels(engine.image(ViewState(choice.camera, background=background), UP_SIZE))
-        texture = picture_texture(self._context, pixels)
-        self._textures.append(texture)
-        return int(texture.glo)
