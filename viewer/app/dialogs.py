@@ -19,7 +19,7 @@ from progdf.terminal import escape_text
 from viewer.state.workspace import Dialog
 from viewer.ui.context import PALETTE, SMALL_PX, UiContext
 from viewer.ui.overlay import Area
-from viewer.ui.widgets import accent_button, elide, small, tip, wrapped_text
+from viewer.ui.widgets import accent_button, elide, inert, small, tip, wrapped_text
 
 from .studio import pages
 
