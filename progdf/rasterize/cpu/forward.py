@@ -283,17 +283,17 @@ def extents(
 
 
 @kernel(contract=True, inline=True)
-def shade_splat(scene: Scene, i: int, degree: int, eye: Vec, basis: Array) -> Vec:
-    """The color of a Gaussian; basis: scratch, [16] float64"""
+def shade_splat(mean: Vec, colors: Array, degree: int, eye: Vec, basis: Array) -> Vec:
+    """The color of a Gaussian; colors: its own, as `Scene` has them; basis: scratch, [16] float64"""
     if degree < 0:
-        return vec(scene.colors[i], 0)
-    dx, dy, dz, _ = view_direction(vec(scene.means, i), eye)
+        return vec(colors, 0)
+    dx, dy, dz, _ = view_direction(mean, eye)
     fill_basis(degree, dx, dy, dz, basis)
     red = green = blue = 0.5
     for band in range((degree + 1) ** 2):
-        red += basis[band] * scene.colors[i, band, 0]
-        green += basis[band] * scene.colors[i, band, 1]
-        blue += basis[band] * scene.colors[i, band, 2]
+        red += basis[band] * colors[band, 0]
+        green += basis[band] * colors[band, 1]
+        blue += basis[band] * colors[band, 2]
     return red, green, blue
 
 
@@ -327,7 +327,7 @@ def project(begin: int, end: int, scene: Scene, camera: Pinhole, splats: Splats,
         in_x = px + extent_x >= x0 and px - extent_x <= x1
         if not (opacity >= ALPHA_MIN and in_x and py + extent_y >= y0 and py - extent_y <= y1):
             continue
-        red, green, blue = shade_splat(scene, i, camera.degree, eye, basis)
+        red, green, blue = shade_splat(vec(scene.means, i), scene.colors[i], camera.degree, eye, basis)
         if not abs(red) + abs(green) + abs(blue) < np.inf:
             continue
         if camera.degree >= 0:

@@ -52,9 +52,16 @@ def test_a_node_has_the_moments_of_all_that_is_below_it() -> None:
     first = len(plain) // 2
     leaves = np.array_split(pyramid.nodes.order, [(k * 1003) // (first + 1) for k in range(1, first + 1)])
     assert [set(leaf) for leaf in leaves] == [set(node.rows.tolist()) for node in plain[first:]]
+    # eight bits of colors are kept, so each of eight levels is half a bit off, most often not the same way
+    halves = (pyramid.nodes.colors.astype(np.uint32) << 16).view(np.float32)
+    torch.testing.assert_close(
+        torch.from_numpy(halves).double(),
+        torch.stack([node.colors for node in plain]),
+        rtol=2**-7,
+        atol=2**-9,
+    )
     for name, fast, expected in (
         ("means", nodes.means[:, :3], torch.stack([node.mean for node in plain])),
-        ("colors", nodes.colors, torch.stack([node.colors for node in plain])),
         ("spreads", nodes.means[:, SPREAD], torch.tensor([node.spread for node in plain])),
         ("opacities", nodes.opacities, torch.tensor([node.opacity for node in plain])),
         (
@@ -89,8 +96,10 @@ def test_the_fast_one_draws_what_the_plain_one_draws(count: int, budget: int, an
     both = [pick in plain.picks for pick in picks]
     fast = pyramid.simplify(camera, budget, PIXELS).select(torch.tensor(both))
     expected = plain.taken([pick for pick, shared in zip(picks, both, strict=True) if shared])
-    for name in ("means", "opacities", "colors"):
+    for name in ("means", "opacities"):
         torch.testing.assert_close(getattr(fast, name), getattr(expected, name), rtol=1e-3, atol=1e-4)
+    # what nodes keep of colors: half a step of a picture of eight bits
+    torch.testing.assert_close(fast.colors, expected.colors, rtol=0.0, atol=0.5 / 255.0)
     sizes = covariances(fast.scales, fast.quats), covariances(expected.scales, expected.quats)
     torch.testing.assert_close(*sizes, rtol=1e-3, atol=1e-6)
 
@@ -177,7 +186,9 @@ def test_a_change_is_carried_to_the_nodes(changed: str) -> None:
     assert not torch.equal(before.colors, after.colors[: len(before.colors)])
     if changed == "colors":
         assert all(map(torch.equal, after.tensors, anew.tensors)), "the same cut, to the bit"
-    for node, other in zip(pyramid.nodes.gaussians, Pyramid(scene).nodes.gaussians, strict=True):
+    fresh = Pyramid(scene).nodes
+    assert np.array_equal(pyramid.nodes.colors, fresh.colors)
+    for node, other in zip(pyramid.nodes.gaussians, fresh.gaussians, strict=True):
         assert np.array_equal(node, other)
 
 
