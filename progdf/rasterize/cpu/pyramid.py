@@ -305,6 +305,12 @@ def _merge(
         colors[:] = 0.0
         for k in range(first, last):
             i = nodes.order[k] if leaf else k
+            if leaf:  # the rows of neighbors lie far apart, the leaves that change together do not
+                ahead = nodes.order[min(k + _AHEAD, count - 1)]
+                prefetch(scene.means, ahead)
+                prefetch(scene.scales, ahead)
+                prefetch(scene.opacities, ahead)
+                prefetch(scene.colors, ahead)
             weight = _weight(scene, i) if leaf else np.float64(out.means[i, WEIGHT])
             sound = sound and (weight > 0.0 if leaf else out.means[i, DENSITY] > 0.0)
             if weight > 0.0:
