@@ -72,6 +72,8 @@ def test_the_wheel_has_every_file_of_the_packages_and_no_other(wheel: Path) -> N
         packed = {name for name in archive.namelist() if ".dist-info/" not in name}
         (metadata,) = (name for name in archive.namelist() if name.endswith("METADATA"))
         text = archive.read(metadata).decode()
+        (entries,) = (name for name in archive.namelist() if name.endswith("entry_points.txt"))
+        assert "progdf = progdf.__main__:main" in archive.read(entries).decode().splitlines()
     files = (path for package in PACKAGES for path in (ROOT / package).rglob("*") if path.is_file())
     ours = {
         path.relative_to(ROOT).as_posix() for path in files if path.suffix not in (".pyc", ".nbi", ".nbc")
@@ -87,6 +89,7 @@ def test_the_wheel_has_every_file_of_the_packages_and_no_other(wheel: Path) -> N
     )
 
 
+@pytest.mark.slow  # what the wheel holds, its command's name too, is tested in every run of the tests
 def test_what_is_installed_is_the_wheel_and_its_command_runs(fresh: Path, tmp_path: Path) -> None:
     code = "import progdf, viewer.web.page, shaders; print(progdf.__file__, viewer.web.page.__file__)"
     for file in run([str(fresh / "python"), "-P", "-c", code], tmp_path).split():

@@ -75,7 +75,7 @@ def _lines(commands: Sequence[Command]) -> Iterator[tuple[str, str]]:
         keys, joins = chords(command.action), following is not None and following.row == JOINED
         changed = is_changed(command) or (joins and is_changed(following))
         if joins and not changed:
-            keys += [key for key in chords(following.action) if key.replace("Shift+", "") not in keys]
+            keys += tuple(k for k in chords(following.action) if k.replace("Shift+", "") not in keys)
         if keys and not shown:
             plain = changed or command.row == JOINED
             listed, text = ("", "") if plain else (command.listed, command.row)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 from imgui_bundle import imgui
@@ -282,6 +283,7 @@ def bind(changes: Mapping[str, Any]) -> list[str]:
         except ValueError as error:
             problems.append(f"{action}: {error}")
     KEYS.clear()
+    chords.cache_clear()
     for command in COMMANDS.values():
         mine = [chord for chord, other in given.items() if other is command]
         kept = [] if command in changed else [chord for chord in command.keys.split() if chord not in given]
@@ -302,7 +304,6 @@ def parse_chord(text: str) -> str:
 
 
 _MODIFIERS = ("Ctrl", "Shift", "Alt")
-bind({})
 
 
 def is_changed(command: Command) -> bool:
@@ -310,12 +311,16 @@ def is_changed(command: Command) -> bool:
     return [chord for chord, other in KEYS.items() if other is command] != command.keys.split()
 
 
-def chords(action: str) -> list[str]:
+@cache  # each frame's tips and menus ask for a hundred
+def chords(action: str) -> tuple[str, ...]:
     """All keys of an action, in a person's words."""
     bound = [chord for chord, command in KEYS.items() if command.action == action]
-    return [
+    return tuple(
         chord.replace("Delete", "Del").replace("Num", "Numpad ").replace("Escape", "Esc") for chord in bound
-    ]
+    )
+
+
+bind({})
 
 
 def shortcut(action: str) -> str:

@@ -104,7 +104,7 @@ def one_by_one(kind: str, *sizes: int, seed: int = 0) -> float:
     return some.nearest(Fit(some.setup, fit_colors(seen, len(some.setup.region.members))).render)
 
 
-@pytest.mark.parametrize("kind", ["hue", "stripes"])
+@pytest.mark.parametrize("kind", ["hue", pytest.param("stripes", marks=pytest.mark.slow)])
 def test_views_that_follow_one_picture_show_one_edit(kind: str) -> None:
     calls, nearest, _ = followed(kind)
     assert calls == 2 * 16

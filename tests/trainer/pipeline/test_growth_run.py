@@ -89,7 +89,7 @@ def test_what_a_row_is_worth_is_close_to_the_error_without_it(spec: str) -> None
 def hat(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the run `grown`, which may grow a hat, and `plain`, which may not."""
     folder = tmp_path_factory.mktemp("hat")
-    options = write_growth(folder, "hat")
+    options = write_growth(folder, "hat", views=8)
     train(replace(options, out=folder / "plain"))
     train(with_values(replace(options, out=folder / "grown"), grow=0.5))
     return folder

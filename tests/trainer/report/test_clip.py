@@ -26,12 +26,11 @@ from trainer.report.measures import clip_curve
 from trainer.resolve import resolve
 from trainer.run.finish import refit
 
-pytest.importorskip("transformers")
-
 
 @pytest.fixture(scope="module")
 def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a tiny CLIP."""
+    pytest.importorskip("transformers")
     return tiny_clip(tmp_path_factory.mktemp("clip"))
 
 
@@ -113,6 +112,7 @@ def test_pictures_are_scaled_as_pillow_does_it_for_clip() -> None:
 def test_what_is_missing_or_no_clip_is_one_line_that_names_the_remedy(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    pytest.importorskip("transformers")
     with pytest.raises(ProgdfError, match="hf download nobody/no-such-clip"):
         load_clip("nobody/no-such-clip")
     with pytest.raises(ProgdfError, match="does not hold a complete CLIP model"):

@@ -20,9 +20,6 @@ from PIL import Image
 
 from tests.helpers.paths import ROOT
 
-pytest.importorskip("anywidget", reason="anywidget is not installed")
-pytest.importorskip("jupyterlab", reason="JupyterLab is not installed")
-
 NOTEBOOK = ROOT / "docs" / "notebook.ipynb"
 KEPT = """
   const context = HTMLCanvasElement.prototype.getContext;
@@ -48,6 +45,8 @@ CELL = "jupyterapp.shell.currentWidget.content.activeCellIndex"
 @pytest.fixture
 def jupyter(tmp_path: Path) -> Iterator[str]:
     """The address of a JupyterLab of its own on a copy of the notebook."""
+    for name in ("anywidget", "jupyterlab"):  # asked for here, as their imports take seconds
+        pytest.importorskip(name, reason=f"{name} is not installed")
     shutil.copy(NOTEBOOK, tmp_path)
     settings = tmp_path / "settings" / "labconfig"
     settings.mkdir(parents=True)
