@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 import torch
@@ -17,7 +18,7 @@ from progdf.gdf.file import Gdf, fingerprint, save_gdf
 from progdf.region import Region
 from progdf.sh import rgb_to_sh0
 from tests.helpers.demo_scenes import bear
-from viewer.camera.view_camera import first_camera
+from viewer.camera.view_camera import ViewCamera, first_camera
 from viewer.state.view_state import LayerState, ViewState
 
 NODES = torch.tensor([0.0, 0.25, 0.5, 0.75, 1.0])
@@ -35,6 +36,10 @@ class Stack:
     @property
     def scene(self) -> Gaussians:
         return self.demo.gaussians
+
+    @cached_property
+    def first_camera(self) -> ViewCamera:
+        return first_camera(self.scene, self.demo.cameras)
 
     def save(self, folder: Path) -> list[Path]:
         """bear.ply, scarf.gdf, ears.gdf in `folder`; their paths in this order."""
@@ -141,5 +146,5 @@ def _gdf(scene: Gaussians, name: str, members: Tensor, instruction: str, offsets
 def view_of(stack: Stack, scarf: float = 0.0, ears: float = 0.0) -> ViewState:
     """The bear's head and scarf from the front, its edits at these strengths."""
     layers = (LayerState(SCARF, "scarf", scarf), LayerState(EARS, "ears", ears))
-    camera = replace(first_camera(stack.scene, stack.demo.cameras), pivot=(0.0, 0.75, 0.2), distance=5.5)
+    camera = replace(stack.first_camera, pivot=(0.0, 0.75, 0.2), distance=5.5)
     return ViewState(camera=camera, layers=layers)

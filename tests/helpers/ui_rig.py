@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from tests.helpers.stacks import Stack, bear_stack
 from viewer.app.main_view import MainView
-from viewer.camera.view_camera import first_camera
 from viewer.files.document import Document
 from viewer.gl.present import read_rgb
 from viewer.panel import card, panel
@@ -38,9 +37,12 @@ def first_view(stack: Stack, *strengths: float) -> ViewState:
     """The bear from the front, its edits at these strengths; never coarse, however slow the machine is, and
     without axes over it."""
     layers = tuple(LayerState(i, stack.gdfs[i].name, s) for i, s in enumerate(strengths))
-    camera = first_camera(stack.scene, stack.demo.cameras)
     return ViewState(
-        camera=camera, layers=layers, background=BACKGROUND, dynamic_resolution="off", axes=False
+        camera=stack.first_camera,
+        layers=layers,
+        background=BACKGROUND,
+        dynamic_resolution="off",
+        axes=False,
     )
 
 

@@ -10,8 +10,6 @@ from progdf.gaussians import attribute_slices
 from tests.helpers.edits import curved_trajectory
 from tests.helpers.networks import FORMS, MEMBERS, network, rows
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 
 @pytest.mark.parametrize("form", FORMS)
 def test_a_network_answers_exactly_zero_at_zero(form: str) -> None:

@@ -13,8 +13,6 @@ from progdf.field.choose import FieldEvaluator, sample_strengths
 from tests.helpers.edits import curved_trajectory
 from tests.helpers.networks import FORMS, MEMBERS, baked, network, rows
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 
 @pytest.mark.parametrize("form", FORMS)
 def test_the_ends_of_a_baked_network_are_exact(form: str) -> None:

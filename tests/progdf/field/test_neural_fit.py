@@ -13,8 +13,6 @@ from progdf.field.neural_fit import NeuralFit, train_network
 from tests.helpers.edits import curved_trajectory
 from tests.helpers.networks import MEMBERS, SHORT, fit_neural, members, rows, scene, smooth_trajectory
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 
 def test_the_same_seed_gives_the_same_network_and_another_seed_another() -> None:
     strengths, offsets = curved_trajectory(MEMBERS)

@@ -23,8 +23,6 @@ from tests.helpers.fuzz_changes import header_of, signed_gdf
 from tests.helpers.networks import FORMS, MEMBERS, baked, members, rows, scene
 from tests.helpers.scenes import random_gaussians
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 
 @pytest.fixture(scope="module")
 def edit() -> Gdf:

@@ -6,7 +6,7 @@ import inspect
 import json
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -40,13 +40,9 @@ BATMAN = 'instruct:"turn him into Batman"'
 
 
 @pytest.fixture(scope="module")
-def diffusers() -> Iterator[None]:
+def diffusers() -> None:
     for package in ("diffusers", "transformers", "accelerate"):
         pytest.importorskip(package, reason="pip install progdf-studio[diffusion]")
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # networks this small only wait for each other on more
-    yield
-    torch.set_num_threads(threads)
 
 
 @pytest.fixture(scope="module")

@@ -25,14 +25,11 @@ Ask = Callable[[Sequence[Tensor]], dict[str, object]]
 
 
 @pytest.fixture(scope="module", autouse=True)
-def one_thread() -> Iterator[None]:
+def small_pictures() -> Iterator[None]:
     for package in ("diffusers", "transformers", "accelerate"):
         pytest.importorskip(package, reason="pip install progdf-studio[diffusion]")
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
     with small_megapixels(SIDE):
         yield
-    torch.set_num_threads(threads)
     made.cache_clear()
 
 

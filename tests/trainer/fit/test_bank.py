@@ -28,15 +28,12 @@ from trainer.run.run import RunResult
 
 @pytest.fixture(scope="module", autouse=True)
 def short_fits() -> Iterator[None]:
-    """Networks of a few hundred steps, on one thread."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
+    """Networks of a few hundred steps."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(neural_fit, "EFFORT", {"tiny": (200, 256, 5e-3)})
         patch.setattr("trainer.fit.network.EFFORT", neural_fit.EFFORT)
         patch.setattr("trainer.fit.network.PICTURE_STEPS", 20)
         yield
-    torch.set_num_threads(threads)
 
 
 def train_jointly(folder: Path, out: str, resume: bool = False) -> RunResult:

@@ -273,7 +273,7 @@ def test_what_was_stopped_goes_on_to_the_same_bits() -> None:
         assert again.step == whole.step == 3
 
 
-def test_one_thread_and_two_solve_to_the_same_bits(one_thread: None) -> None:
+def test_one_thread_and_two_solve_to_the_same_bits() -> None:
     scene = dense_ball(20_000, bands=3)
     cameras = orbit(3, 48)
     crops, original = prepared(scene, cameras)
