@@ -35,6 +35,10 @@ MOVING_MS = 20.0, 27.0
 """What such a picture shall take, some ms less than its frame; with more or less time, the next one has fewer
 or more Gaussians."""
 
+FINE, FINE_MS = (0.25, 4.0), (7.0, 10.0)
+"""With what a node may lose here, pixels², a picture in motion is fine enough (29 dB and more, see
+docs/experiments.md); it is finer only as far as it takes no longer than this, a sixtieth of a second."""
+
 SLOW_MS = 40.0
 """What a picture may take before "auto" halves its sides: 25 pictures a second."""
 
@@ -159,7 +163,7 @@ class LiveScene:
         )
         self._scene = scene
         self._highlights: Array | None = None  # rgb and its share, 0..1; None is no highlight. [N,4]
-        self._budget = BUDGETS[1]
+        self._budget, self._finest = BUDGETS[1], FINE[1]
         self._pyramid: Future[Pyramid] | None = None
         # what the pyramid lacks of each row: nothing, its colors, or more. [N] uint8
         self._behind = np.zeros(len(scene), np.uint8)
@@ -205,17 +209,19 @@ class LiveScene:
         pyramid = self._pyramid or self.begin_pyramid()
         if not pyramid.done():
             return None
-        started = time.perf_counter()
+        started, merged = time.perf_counter(), pyramid.result()
         for lacks in (2, 1):
             if len(rows := np.flatnonzero(self._behind == lacks)):
-                pyramid.result().refresh(rows, colors_only=lacks == 1)
-        self._behind[:] = 0
-        fewer = pyramid.result().simplify(camera, self._budget, pixels)
+                merged.refresh(rows, colors_only=lacks == 1)
+        self._behind[:], merged.finest = 0, self._finest
+        fewer = merged.simplify(camera, self._budget, pixels)
         picture = draw(fewer)
         taken, (low, high) = 1e3 * (time.perf_counter() - started), MOVING_MS
         if taken > high or (taken < low and len(fewer.means) > 0.8 * self._budget):
             budget = int(self._budget * (0.85 if taken > high else 1.15))
             self._budget = min(max(budget, BUDGETS[0]), BUDGETS[2])
+        finest = self._finest * (1.15 if taken > FINE_MS[1] else 0.85 if taken < FINE_MS[0] else 1.0)
+        self._finest = min(max(finest, FINE[0]), FINE[1])
         return picture
 
     def _write(self, scene: Gaussians, name: str, part: slice) -> None:

@@ -127,6 +127,7 @@ class Pyramid:
         colors = np.zeros((total, *self.scene.colors.shape[1:]), np.uint16)
         self.nodes = Nodes(merged, colors, order, levels)
         self.limit = 1.0  # of what a node may lose, pixels²: where the last search ended
+        self.finest = FINEST  # the least one that it ends at
         self._places: Array | None = None  # of each row in the order, once one is asked for. [N] int32
         for level in range(levels, -1, -1):
             self._merge(level, np.arange(1 << level))
@@ -172,7 +173,7 @@ class Pyramid:
     def cut(self, view: Pinhole, budget: int, dilation: float) -> Array:
         """What a view takes: nodes, and rows of the scene as their complement (~row). [M] int32"""
         shape = -(-view.window[3] // CELL), -(-view.window[2] // CELL), SLICES
-        low, high = 0.0, math.inf
+        low, high, self.limit = 0.0, math.inf, max(self.limit, self.finest)
         for _ in range(_TRIALS):
             depths = np.zeros(shape, np.float32)
             coarse = self._cut(view, self.limit * COARSER, dilation, np.zeros(1, np.float32))
@@ -181,15 +182,15 @@ class Pyramid:
             picks = self._cut(view, self.limit, dilation, depths.reshape(-1))
             if len(picks) > budget:
                 low = self.limit
-            elif len(picks) >= ENOUGH * budget or self.limit <= FINEST:
+            elif len(picks) >= ENOUGH * budget or self.limit <= self.finest:
                 break
             else:
                 high = self.limit
             # a limit twice as high leaves about half as many
             guess = self.limit * (len(picks) + 1) / (0.5 * (1.0 + ENOUGH) * budget)
             if not low < guess < high:
-                guess = math.sqrt(max(low, FINEST) * high) if high < math.inf else 2.0 * low
-            self.limit = max(guess, FINEST)
+                guess = math.sqrt(max(low, self.finest) * high) if high < math.inf else 2.0 * low
+            self.limit = max(guess, self.finest)
         return picks
 
     def _cut(self, view: Pinhole, limit: float, dilation: float, depths: Array) -> Array:

@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from progdf.camera import Camera
+from progdf.demo_scenes import bear
 from progdf.field.baked import AttributeBases, BakedField
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf, fingerprint
@@ -134,6 +135,7 @@ def test_a_moving_picture_follows_sliders_and_highlights(
     ctx: moderngl.Context, stack: Stack, monkeypatch: pytest.MonkeyPatch, draw: str
 ) -> None:
     monkeypatch.setattr(dynamic_resolution, "BUDGETS", (len(stack.scene),) * 3)
+    monkeypatch.setattr(dynamic_resolution, "FINE", (1e-3, 1e-3))
     slid, afresh = (ViewEngine(ctx, stack.scene, stack.gdfs, draw) for _ in range(2))
     framebuffer = ctx.simple_framebuffer(SIZE)
 
@@ -160,6 +162,21 @@ def test_a_moving_picture_follows_sliders_and_highlights(
     assert all(map(np.array_equal, merged, pyramid.nodes.gaussians)), "nothing was behind"
     for engine in (slid, afresh):
         engine.release()
+
+
+def test_a_moving_picture_that_is_fine_enough_becomes_finer_only_if_that_is_quick(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    scene = bear(6000).gaussians
+    live, camera = dynamic_resolution.LiveScene(scene), to_camera(first_camera(scene), *SIZE)
+    pyramid = live.begin_pyramid().result()
+    monkeypatch.setattr(dynamic_resolution, "FINE_MS", (0.0, 0.0))
+    slow = [live.draw_fewer(lambda fewer: len(fewer.means), camera, 2) for _ in range(3)]
+    assert pyramid.limit == dynamic_resolution.FINE[1]
+    monkeypatch.setattr(dynamic_resolution, "FINE_MS", (1e9, 1e9))
+    quick = [live.draw_fewer(lambda fewer: len(fewer.means), camera, 2) for _ in range(30)]
+    assert pyramid.limit == dynamic_resolution.FINE[0]
+    assert slow[0] == slow[2] == quick[0] < quick[1] < quick[29], "the time has changed, not the view"
 
 
 def test_a_small_picture_of_a_large_scene_leaves_the_one_in_full_as_it_is(stack: Stack) -> None:
