@@ -32,7 +32,8 @@ class Node(NamedTuple):
     weight: float
     mean: Tensor  # [3]
     covariance: Tensor  # [3,3]
-    spread: float
+    spread: float  # of the centers
+    contrast: float  # the same of the colors of band 0
     opacity: float  # as a density, beyond 1 too
     points: float  # Σ opacity
     colors: Tensor  # [K,3]
@@ -70,11 +71,11 @@ def merge_rows(gaussians: ActivatedGaussians, rows: Tensor) -> Node:
     covariance = between + torch.einsum("n,nij,nkj->ik", share, turned, turned)
     area = float(torch.linalg.eigvalsh(covariance)[1:].clamp_min(0.0).prod().sqrt())
     opacity = float(weights.sum()) / area
-    spread = math.sqrt(float(between.trace()))
+    spread, merged = math.sqrt(float(between.trace())), torch.einsum("n,nkc->kc", share, colors)
+    contrast = math.sqrt(float(share @ (colors[:, 0] - merged[0]).square().sum(1)))
     return Node(
-        rows, float(weights.sum()), mean, covariance, spread, opacity,
-        float(opacities[opacities >= ALPHA_MIN].sum()),
-        torch.einsum("n,nkc->kc", share, colors),
+        rows, float(weights.sum()), mean, covariance, spread, contrast, opacity,
+        float(opacities[opacities >= ALPHA_MIN].sum()), merged,
     )  # fmt: skip
 
 
@@ -184,7 +185,8 @@ class PlainCut:
         if z - 3.0 * largest > near and max(node.opacity, least) >= ALPHA_MIN:
             if not self._in_window(node.mean, largest):
                 return []
-            loss = node.spread * math.sqrt(node.weight) * self._focal2 / z**2
+            loss = node.spread * (1.0 + node.contrast) * math.sqrt(node.weight)
+            loss *= self._focal2 / z**2
             if self._depths is not None:
                 depth = float(self._depths[self._cell(x, y, z - largest)])
                 loss *= math.exp(-0.5 * min(depth, DARKEST))

@@ -36,7 +36,7 @@ MOVING_MS = 20.0, 27.0
 or more Gaussians."""
 
 FINE, FINE_MS = (0.25, 4.0), (7.0, 10.0)
-"""With what a node may lose here, pixels², a picture in motion is fine enough (29 dB and more, see
+"""With what a node may lose here, pixels², a picture in motion is fine enough (30 dB and more, see
 docs/experiments.md); it is finer only as far as it takes no longer than this, a sixtieth of a second."""
 
 SLOW_MS = 40.0

@@ -5,8 +5,8 @@ as it shows.
   node is one Gaussian with the moments of those below it, weighed by opacity times area.
 - A view takes a node whose detail does not show, and else looks at its two halves, or at the Gaussians of a
   leaf. What merging loses is estimated in pixels² as the spread of the centers, in pixels, times the root of
-  the visible area, as errors add up in squares; and it shows as far as light reaches it, which a coarser cut
-  of the same view tells, added up in a grid of cells and slices of depth.
+  the visible area, as errors add up in squares, and more where colors differ; and it shows as far as light
+  reaches it, which a coarser cut of the same view tells, added up in a grid of cells and slices of depth.
 - The limit is sought so that about as many are drawn as asked for, beginning at the last picture's.
 - Each Gaussian has a dilation of its own in the fine picture: a node of many small ones is as dense as these
   are together. That of the coarse picture, which is wider, is taken off the size, and the remainder off the
@@ -80,10 +80,10 @@ FINEST = 1e-3
 ENOUGH = 0.85
 """Of what was asked for: with so many the limit is not sought any further."""
 
-LONGEST, DENSITY, WEIGHT, POINTS, SPREAD = range(3, 8)
+LONGEST, DENSITY, WEIGHT, POINTS, LOSS = range(3, 8)
 """Columns of a node beside its mean: the largest scale; density, negative where something below cannot be
-drawn; Σ opacity · area of what is below, world units², 0 for nothing; Σ opacity; root of the summed variances
-of the centers below, world units."""
+drawn; Σ opacity · area of what is below, world units², 0 for nothing; Σ opacity; the spread of its centers,
+world units, times 1 and that of its colors, in coefficients of band 0."""
 
 _ONE = int(np.float32(1.0).view(np.int32))
 _SLICE_SHIFT = 19  # of a float's bits: sixteen slices for a factor of two
@@ -103,7 +103,10 @@ class Nodes(NamedTuple):
     # what stands for each node, but for colors: opacities as densities, beyond 1 too; means with the columns
     # above, so that a cut touches one line of the cache for two nodes. [2L-1, …]
     gaussians: Scene
-    colors: Array  # the upper halves of float32: errors of .2 %, a fifth less memory. [2L-1,K,3] uint16
+    # these two as the upper halves of float32: errors of .2 %, a fifth less memory
+    colors: Array  # [2L-1,K,3] uint16
+    # roots of the summed variances of the centers below, world units, and of their band 0. [2L-1,2] uint16
+    spreads: Array
     order: Array  # rows of the scene. [N] int32
     levels: int
 
@@ -122,10 +125,10 @@ class Pyramid:
         levels = max((count // LEAF).bit_length() - 1, 0)
         order = _sort(self.scene.means, levels)
         total = (2 << levels) - 1
-        means, quats, scales = (np.zeros((total, width), np.float32) for width in (SPREAD + 1, 4, 3))
+        means, quats, scales = (np.zeros((total, width), np.float32) for width in (LOSS + 1, 4, 3))
         merged = Scene(means, quats, scales, np.zeros(total, np.float32), self.scene.colors[:0])
         colors = np.zeros((total, *self.scene.colors.shape[1:]), np.uint16)
-        self.nodes = Nodes(merged, colors, order, levels)
+        self.nodes = Nodes(merged, colors, np.zeros((total, 2), np.uint16), order, levels)
         self.limit = 1.0  # of what a node may lose, pixels²: where the last search ended
         self.finest = FINEST  # the least one that it ends at
         self._places: Array | None = None  # of each row in the order, once one is asked for. [N] int32
@@ -301,7 +304,7 @@ def _merge(
         first, last = 2 * me + 1, 2 * me + 3
         if leaf:
             first, last = (indices[at] * count) >> level, ((indices[at] + 1) * count) >> level
-        total = points = x = y = z = 0.0
+        total = points = square = x = y = z = own = 0.0
         sound = True
         colors[:] = 0.0
         for k in range(first, last):
@@ -320,36 +323,39 @@ def _merge(
                 x += weight * below.means[i, 0]
                 y += weight * below.means[i, 1]
                 z += weight * below.means[i, 2]
+                square += 0.0 if leaf else weight * _unpack(nodes.spreads[i, 1]) ** 2
                 for band in range(colors.shape[0]):
                     for c in range(3):
                         color = scene.colors[i, band, c] if leaf else _unpack(nodes.colors[i, band, c])
                         colors[band, c] += weight * color
-        share = 1.0 / max(total, _LEAST)
+                        square += weight * color * color if band == 0 else 0.0
+        share, mine = 1.0 / max(total, _LEAST), out.means[me]
         for band in range(colors.shape[0]):
             for c in range(3):
-                nodes.colors[me, band, c] = _pack(colors[band, c] * share)
-        if colors_only:
-            continue
-        x, y, z, own = x * share, y * share, z * share, 0.0
-        matrix[:] = 0.0
-        for k in range(first, last):
-            i = nodes.order[k] if leaf else k
-            weight = (_weight(scene, i) if leaf else np.float64(out.means[i, WEIGHT])) * share
-            if weight > 0.0:
-                own += weight * _add_moments(below, i, weight, (x, y, z), matrix)
-                own -= 0.0 if leaf else weight * out.means[i, SPREAD] * out.means[i, SPREAD]
-        spread = math.sqrt(max(matrix[0, 0] + matrix[1, 1] + matrix[2, 2] - own, 0.0))
-        _diagonalize(matrix, quat)
-        out.means[me, 0], out.means[me, 1], out.means[me, 2] = x, y, z
-        for k in range(4):
-            out.quats[me, k] = quat[k]
-        for k in range(3):
-            out.scales[me, k] = math.sqrt(max(matrix[k, k], 0.0))
-        longest, middle = _two_largest(out, me)
-        out.opacities[me] = total / max(longest * middle, _LEAST)
-        mine = out.means[me]
-        mine[LONGEST], mine[WEIGHT], mine[POINTS], mine[SPREAD] = longest, total, points, spread
-        mine[DENSITY] = out.opacities[me] if sound else -out.opacities[me]
+                colors[band, c] *= share
+                nodes.colors[me, band, c] = _pack(colors[band, c])
+        nodes.spreads[me, 1] = _pack(math.sqrt(max(square * share - dot(colors[0], colors[0]), 0.0)))
+        if not colors_only:
+            x, y, z = x * share, y * share, z * share
+            matrix[:] = 0.0
+            for k in range(first, last):
+                i = nodes.order[k] if leaf else k
+                weight = (_weight(scene, i) if leaf else np.float64(out.means[i, WEIGHT])) * share
+                if weight > 0.0:
+                    own += weight * _add_moments(below, i, weight, (x, y, z), matrix)
+                    own -= 0.0 if leaf else weight * _unpack(nodes.spreads[i, 0]) ** 2
+            between = matrix[0, 0] + matrix[1, 1] + matrix[2, 2] - own
+            nodes.spreads[me, 0] = _pack(math.sqrt(max(between, 0.0)))
+            _diagonalize(matrix, quat)
+            mine[0], mine[1], mine[2], mine[WEIGHT], mine[POINTS] = x, y, z, total, points
+            for k in range(4):
+                out.quats[me, k] = quat[k]
+            for k in range(3):
+                out.scales[me, k] = math.sqrt(max(matrix[k, k], 0.0))
+            mine[LONGEST], middle = _two_largest(out, me)
+            out.opacities[me] = total / max(mine[LONGEST] * middle, _LEAST)
+            mine[DENSITY] = out.opacities[me] if sound else -out.opacities[me]
+        mine[LOSS] = _unpack(nodes.spreads[me, 0]) * (1.0 + _unpack(nodes.spreads[me, 1]))
 
 
 @kernel(inline=True)
@@ -482,7 +488,7 @@ def _walk(
                 continue
             inside = _is_inside(camera, x, y, wide2, high2) and means[i, DENSITY] > 0.0
             scaled = focal / z
-            loss = np.float64(means[i, SPREAD]) * math.sqrt(means[i, WEIGHT]) * scaled * scaled
+            loss = np.float64(means[i, LOSS]) * math.sqrt(means[i, WEIGHT]) * scaled * scaled
             if depths.size > 1 and limit < loss < limit * _DARK:
                 loss *= math.exp(-0.5 * min(depths[_cell(x, y, z - longest, camera)], DARKEST))
         if loss <= limit or (i >= first_leaf and depths.size == 1):

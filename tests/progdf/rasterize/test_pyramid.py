@@ -16,7 +16,7 @@ from progdf.metrics.image import psnr
 from progdf.quaternions import normalize_quats, rotation_matrices
 from progdf.rasterize import ActivatedGaussians, activate, render
 from progdf.rasterize.cpu.engine import make_pinhole
-from progdf.rasterize.cpu.pyramid import ENOUGH, SPREAD, Pyramid
+from progdf.rasterize.cpu.pyramid import ENOUGH, Pyramid
 from progdf.rasterize.engines import DILATION, RasterView
 from tests.helpers.plain_pyramid import PlainCut, merge_rows, plain_tree
 from tests.helpers.scenes import front_camera, orbit_camera, random_gaussians
@@ -52,17 +52,15 @@ def test_a_node_has_the_moments_of_all_that_is_below_it() -> None:
     first = len(plain) // 2
     leaves = np.array_split(pyramid.nodes.order, [(k * 1003) // (first + 1) for k in range(1, first + 1)])
     assert [set(leaf) for leaf in leaves] == [set(node.rows.tolist()) for node in plain[first:]]
-    # eight bits of colors are kept, so each of eight levels is half a bit off, most often not the same way
-    halves = (pyramid.nodes.colors.astype(np.uint32) << 16).view(np.float32)
-    torch.testing.assert_close(
-        torch.from_numpy(halves).double(),
-        torch.stack([node.colors for node in plain]),
-        rtol=2**-7,
-        atol=2**-9,
-    )
+    for halves, sums in (
+        (pyramid.nodes.colors, torch.stack([node.colors for node in plain])),
+        (pyramid.nodes.spreads, torch.tensor([(node.spread, node.contrast) for node in plain])),
+    ):
+        # of eight bits each level is half a one off, most often not the same way
+        whole = torch.from_numpy((halves.astype(np.uint32) << 16).view(np.float32))
+        torch.testing.assert_close(whole.double(), sums.double(), rtol=2**-7, atol=2**-9)
     for name, fast, expected in (
         ("means", nodes.means[:, :3], torch.stack([node.mean for node in plain])),
-        ("spreads", nodes.means[:, SPREAD], torch.tensor([node.spread for node in plain])),
         ("opacities", nodes.opacities, torch.tensor([node.opacity for node in plain])),
         (
             "covariances",
@@ -182,14 +180,15 @@ def test_a_change_is_carried_to_the_nodes(changed: str) -> None:
     before = pyramid.simplify(camera, 500)
     getattr(scene, changed)[rows] *= 0.5
     pyramid.refresh(rows.numpy(), changed == "colors")
-    after, anew = pyramid.simplify(camera, 500), Pyramid(scene).simplify(camera, 500)
+    other = Pyramid(scene)
+    other.limit = pyramid.limit  # the search begins alike
+    after, anew = pyramid.simplify(camera, 500), other.simplify(camera, 500)
     assert not torch.equal(before.colors, after.colors[: len(before.colors)])
     if changed == "colors":
         assert all(map(torch.equal, after.tensors, anew.tensors)), "the same cut, to the bit"
-    fresh = Pyramid(scene).nodes
-    assert np.array_equal(pyramid.nodes.colors, fresh.colors)
-    for node, other in zip(pyramid.nodes.gaussians, fresh.gaussians, strict=True):
-        assert np.array_equal(node, other)
+    halves = (pyramid.nodes.colors, other.nodes.colors), (pyramid.nodes.spreads, other.nodes.spreads)
+    for mine, fresh in (*halves, *zip(pyramid.nodes.gaussians, other.nodes.gaussians, strict=True)):
+        assert np.array_equal(mine, fresh)
 
 
 def test_moved_gaussians_are_where_they_moved() -> None:
