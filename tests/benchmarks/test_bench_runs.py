@@ -20,7 +20,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run of a few seconds."""
     folder = tmp_path_factory.mktemp("bear")
     write_bear(folder)
-    return train(quick_options(folder, steps=24, stages=2), quiet=True).folder.root
+    options = quick_options(folder, steps=24, stages=2, views=10, image_size=72)
+    return train(options, quiet=True).folder.root
 
 
 def test_far_views_are_raised_lowered_and_zoomed_and_look_at_the_region() -> None:

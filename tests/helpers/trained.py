@@ -99,8 +99,8 @@ def quick_options(folder: Path, out: str = "run", part: str = "body", **more: ob
     """Options of a run that takes a few seconds on the bear of `write_bear` in `folder`."""
     number = LABELS.index(part)
     settings: dict[str, object] = {
-        "views": 10,
-        "image_size": 72,
+        "views": 6,
+        "image_size": 56,
         "steps": 200,
         "stages": 4,
         "threads": 1,

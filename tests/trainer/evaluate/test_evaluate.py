@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
+from contextlib import redirect_stdout
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +26,16 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def rows(run: Path) -> dict[str, Any]:
+def printed(run: Path) -> str:
+    """What the command prints that measures the run."""
+    with redirect_stdout(StringIO()) as out:
+        assert main(["evaluate", str(run), "--threads", "1"]) == 0
+    return out.getvalue()
+
+
+@pytest.fixture(scope="module")
+def rows(run: Path, printed: str) -> dict[str, Any]:
     """evaluation.json's rows."""
-    assert main(["evaluate", str(run), "--threads", "1"]) == 0
     found: dict[str, Any] = json.loads((run / "evaluation.json").read_text())["rows"]
     return found
 
@@ -67,11 +76,7 @@ def test_views_are_compared_with_the_unedited_scene_and_what_lies_outside_hardly
     assert rows["outside"]["slider"] < 1.0
 
 
-def test_the_table_is_printed_and_the_picture_written(
-    run: Path, capsys: pytest.CaptureFixture[str], rows: dict[str, Any]
-) -> None:
-    assert main(["evaluate", str(run), "--threads", "1"]) == 0
-    printed = capsys.readouterr().out
+def test_the_table_is_printed_and_the_picture_written(run: Path, printed: str, rows: dict[str, Any]) -> None:
     assert "| slider | 2 keyframes | cross-fade | the editor | unedited |" in printed
     assert "CLIP direction similarity at 1: not measured, --text-before was not given" in printed
     assert (run / "evaluation.png").stat().st_size > 10_000

@@ -33,19 +33,22 @@ from trainer.run.finish import load_evaluator, refit
 from trainer.run.record import render_run_views, reopen_run
 from trainer.run.run import RunResult
 
+WHOLE = {"views": 10, "image_size": 72}
+"""As many views, and as large, as it takes that their halves differ and that a map alone is too little."""
+
 
 @pytest.fixture(scope="module")
 def done(folder: Path) -> RunResult:
     """A finished run of a few seconds, shared by the tests that only look; with its curves drawn."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("trainer.report.report.draw_plot", draw_plot)
-        return train(quick_options(folder), quiet=True)
+        return train(quick_options(folder, **WHOLE), quiet=True)
 
 
 @pytest.fixture(scope="module")
 def brief(folder: Path) -> RunResult:
     """A run of few steps whose field may have one byte a Gaussian; tests that change it take a copy."""
-    return train(quick_options(folder, "brief", steps=16, stages=2, bytes_budget=1.0), quiet=True)
+    return train(quick_options(folder, "brief", steps=16, stages=2, bytes_budget=1.0, **WHOLE), quiet=True)
 
 
 def copy_of(run: RunResult, folder: Path) -> Path:
@@ -217,7 +220,7 @@ def test_the_kept_pictures_of_a_run_are_a_folder_that_can_be_trained_from(
     folder: Path, done: RunResult
 ) -> None:
     options = quick_options(
-        folder, "again", editor=f"folder:{done.folder.root / 'views' / 'edited'}", kind="color"
+        folder, "again", editor=f"folder:{done.folder.root / 'views' / 'edited'}", kind="color", **WHOLE
     )
     result = train(options, quiet=True)
     assert result.report["edit"]["psnr_to_views"] > 32.0
@@ -226,7 +229,7 @@ def test_the_kept_pictures_of_a_run_are_a_folder_that_can_be_trained_from(
 
 
 def test_the_same_seed_gives_the_same_bits(folder: Path, brief: RunResult) -> None:
-    again = train(quick_options(folder, "twice", steps=16, stages=2, bytes_budget=1.0), quiet=True)
+    again = train(quick_options(folder, "twice", steps=16, stages=2, bytes_budget=1.0, **WHOLE), quiet=True)
     first, second = (load_trajectory(run.folder.trajectory)[0].offsets for run in (brief, again))
     assert torch.equal(first, second)
 
@@ -332,7 +335,7 @@ def test_bad_input_is_one_line_and_leaves_no_edit(folder: Path, tmp_path: Path, 
 def test_an_edit_that_changes_nothing_is_told_before_training(folder: Path, done: RunResult) -> None:
     originals = done.folder.root / "views" / "original"
     with pytest.raises(ProgdfError, match="changes none of the views; "):
-        train(quick_options(folder, "nothing", editor=f"folder:{originals}"), quiet=True)
+        train(quick_options(folder, "nothing", editor=f"folder:{originals}", **WHOLE), quiet=True)
 
 
 def test_fitting_what_is_no_run_is_one_line(tmp_path: Path) -> None:
