@@ -22,7 +22,7 @@ from PIL import Image
 
 from tests.helpers.browser import browser  # noqa: F401
 from tests.helpers.goldens import SCREENSHOTS, difference
-from tests.helpers.kernels import run_all_kernels
+from tests.helpers.kernels import PARTS, run_kernels
 from tests.helpers.paths import SHARED_DATA
 
 if TYPE_CHECKING:
@@ -80,14 +80,18 @@ def own_state_folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]
 
 @pytest.fixture(scope="session", autouse=True)
 def compiled_kernels(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """One worker compiles the kernels, the others wait and find them in the cache."""
-    if "PYTEST_XDIST_WORKER" not in os.environ:
+    """One worker compiles one part of the kernels, another one the other; all find both in the cache."""
+    worker = os.environ.get("PYTEST_XDIST_WORKER")
+    if worker is None:
         return
-    shared = tmp_path_factory.getbasetemp().parent
-    with FileLock(shared / "kernels.lock"):
-        if not (shared / "kernels.ready").exists():
-            run_all_kernels()
-            (shared / "kernels.ready").touch()
+    shared, count = tmp_path_factory.getbasetemp().parent, len(PARTS)
+    for part in range(count):
+        mine = (part + int(worker.removeprefix("gw"))) % count
+        ready = shared / f"kernels.{mine}.ready"
+        with FileLock(ready.with_suffix(".lock")):
+            if not ready.exists():
+                run_kernels(PARTS[mine])
+                ready.touch()
 
 
 @pytest.fixture

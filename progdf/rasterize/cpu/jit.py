@@ -87,7 +87,7 @@ def _compile_when_called(compile_now: Callable[[_F], _F]) -> Callable[[_F], _F]:
         def call_first(*arguments: Any) -> Any:
             """Load or compile it: one process at a time, as two would write the same files."""
             nonlocal compiled
-            with _first_call, FileLock(kernel_cache() / "compiling.lock"):
+            with _first_call, FileLock(kernel_cache() / f"{function.__name__}.lock"):
                 made = compiled or _with_cache_folder(compile_now, function)
                 try:
                     result = made(*arguments)

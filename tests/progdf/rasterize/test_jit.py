@@ -140,7 +140,7 @@ def test_a_second_process_waits_for_the_kernels_that_another_compiles(cache: Pat
     """Both would write the same files."""
     results: list[float] = []
     drawing = threading.Thread(target=lambda: results.append(twice(cache)(4)))
-    with FileLock(cache / "compiling.lock"):
+    with FileLock(cache / "twice.lock"):
         drawing.start()
         drawing.join(0.3)
         assert not results
