@@ -13,10 +13,13 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
+from progdf.field.baked import GradeForm
+from progdf.field.grade import bake_grade
 from progdf.field.separable import fit_bands
-from progdf.gaussians import ATTRIBUTES, Gaussians
-from progdf.gdf.file import UNSEEN_LOGIT, Gdf, apply_grade, fingerprint, verify
+from progdf.gaussians import ATTRIBUTES, Gaussians, pack
+from progdf.gdf.file import UNSEEN_LOGIT, Gdf, fingerprint, verify
 from progdf.region import Region, whole_scene
 
 
@@ -29,7 +32,8 @@ def extend(scene: Gaussians, gdfs: Sequence[Gdf]) -> tuple[Gaussians, tuple[Gdf,
 
     Returns:
         N + ΣB Gaussians, the added rows in the order of the edits; and for each edit one of M + B members
-        that adds nothing any more. Both as they were given where no edit adds a row.
+        that adds nothing any more; a grade of the whole scene is one of all N + ΣB. Both as they were given
+        where no edit adds a row.
 
     Raises:
         ProgdfError: an edit was made for another scene.
@@ -43,8 +47,11 @@ def extend(scene: Gaussians, gdfs: Sequence[Gdf]) -> tuple[Gaussians, tuple[Gdf,
     total, scene_print, first = len(extended), fingerprint(extended), len(scene)
     moved = []
     for gdf in gdfs:
-        if gdf.applied and len(gdf.region) == len(scene):  # on all that is there, whoever brings it
-            moved.append(apply_grade(gdf, extended, replace(whole_scene(extended), name=gdf.region.name)))
+        form = gdf.field.origin
+        if isinstance(form, GradeForm) and gdf.members == len(
+            scene
+        ):  # on all that is there, whoever brings it
+            moved.append(_grade_all(gdf, form, extended))
             continue
         rows = torch.arange(first, first + gdf.members - len(gdf.region))
         first += len(rows)
@@ -54,6 +61,18 @@ def extend(scene: Gaussians, gdfs: Sequence[Gdf]) -> tuple[Gaussians, tuple[Gdf,
         region = Region(gdf.region.name, torch.cat([gdf.region.members, rows]), score)
         moved.append(replace(gdf, region=region, scene=scene_print, added=None))
     return extended, tuple(moved)
+
+
+def _grade_all(gdf: Gdf, form: GradeForm, extended: Gaussians) -> Gdf:
+    """A grade of the whole scene on what other edits add as well: no residual there, and the mean mask."""
+    more, mask = len(extended) - form.members, form.mask
+    if mask is not None:
+        mask = pad(mask, (0, more), value=round(float(mask.float().mean())))
+    form = replace(form, residual=pad(form.residual, (0, 0, 0, more)), mask=mask)
+    field = bake_grade(form, pack(extended, with_shN=extended.sh_degree > 0))
+    region = replace(whole_scene(extended), name=gdf.region.name)
+    field = replace(field, recorded=gdf.field.recorded)
+    return replace(gdf, region=region, field=field, scene=fingerprint(extended))
 
 
 @lru_cache(maxsize=1)  # the same object for the same edits, so that what is known of it stays known

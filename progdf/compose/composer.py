@@ -207,14 +207,8 @@ class Composer:
     ) -> float:
         """Write these attributes of rows first to last; the largest squared step of a center."""
         rows, parts = rows[first:last], [_between(part, first, last) for part in parts]
-        weight_sum = _NOTHING
-        # a little below 1: sums in float32 may round up to where they count
-        if blend == "normalized" and sum(part.layer.clamped_strength for part in parts) > 1 - 1e-6:
-            weight_sum = np.zeros(len(rows), np.float32)
-            for part in parts:
-                weights = part.weights[part.members] if len(part.weights) else np.float32(1.0)
-                weight_sum[part.at] += weights * np.float32(part.layer.clamped_strength)
-            np.maximum(weight_sum, np.float32(1.0), out=weight_sum)
+        kinds = {KINDS[name] for name in names} if blend == "normalized" else ()
+        weight_sums = {kind: _weight_sum(parts, kind, len(rows)) for kind in kinds}
         largest = 0.0
         for name in names:
             after = self._after[name]
@@ -229,6 +223,7 @@ class Composer:
                 selection = part.at, part.members, part.weights
                 stored, scale = (bases.end, bases.residual), np.float32(gain)
                 _add_offsets(total, selection, stored, used, factors, scale, hidden, covered)
+            weight_sum = weight_sums.get(KINDS[name], _NOTHING)
             moved = _finish(after, self._before[name], rows, total, weight_sum, name == "means")
             largest = max(largest, moved)
         return largest
@@ -282,6 +277,19 @@ def _between(part: _Part, first: int, last: int) -> _Part:
     if (first, begin, end) == (0, 0, len(part.at)):
         return part
     return part._replace(members=part.members[begin:end], at=part.at[begin:end] - first)
+
+
+def _weight_sum(parts: Sequence[_Part], kind: str, count: int) -> Floats:
+    """max(1, Σ m s) over the layers that make a kind of change; empty where it is 1 everywhere. [U]"""
+    parts = [part for part in parts if kind in part.layer.kinds]
+    # a little below 1: sums in float32 may round up to where they count
+    if sum(part.layer.clamped_strength for part in parts) <= 1 - 1e-6:
+        return _NOTHING
+    sums = np.zeros(count, np.float32)
+    for part in parts:
+        weights = part.weights[part.members] if len(part.weights) else np.float32(1.0)
+        sums[part.at] += weights * np.float32(part.layer.clamped_strength)
+    return np.maximum(sums, np.float32(1.0))
 
 
 @kernel(cache=True, allocates=True)

@@ -64,6 +64,11 @@ class Layer:
         """The strength without its overshoot, 0..1."""
         return min(max(self.strength, 0.0), 1.0)
 
+    @property
+    def kinds(self) -> frozenset[str]:
+        """The kinds of change that the edit makes, see `KINDS`."""
+        return frozenset(KINDS[name] for name in self.gdf.field.attributes)
+
     def gain(self, attribute: str) -> float:
         """The gain for an attribute, by its kind."""
         return float(getattr(self.gains, KINDS[attribute]))

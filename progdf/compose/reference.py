@@ -115,8 +115,9 @@ def compose_layers(scene: Gaussians, layers: Sequence[Layer], blend: str = "norm
 
     With m the layer's weights, g its gain for the kind of attribute, and Δ(s) its field at strength s:
 
-    - "normalized": Σ m g Δ(s) / max(1, Σ m s). One layer alone is untouched, order does not matter, and it
-      is the plain sum while the strengths on a Gaussian add up to no more than 1.
+    - "normalized": Σ m g Δ(s) / max(1, Σ m s), the lower sum over the layers that make this kind of change.
+      One layer alone is untouched, order does not matter, and it is the plain sum while the strengths on a
+      Gaussian add up to no more than 1.
     - "sum": Σ m g Δ(s).
     - "over": in the order given, Δ ← Δ · (1 − m s c min(1, |g|)) + m g Δ(s), where c is how much the layer
       itself changes of that kind, see `progdf.compose.reference`; the last layer lies on top, and what it
@@ -174,9 +175,10 @@ def changed_rows(
         Sorted rows [U] int64, and by attribute that a layer moves what they become [U,...]
     """
     rows, parts = _parts(scene, layers, blend, covers)
-    weight_sum = torch.zeros(len(rows))  # Σ m s
+    weight_sums = {kind: torch.zeros(len(rows)) for kind in KINDS.values()}  # Σ m s
     for part in parts:
-        weight_sum[part.rows] += part.weights * part.layer.clamped_strength
+        for kind in part.layer.kinds:
+            weight_sums[kind][part.rows] += part.weights * part.layer.clamped_strength
 
     adjusted = _adjusted_colors(scene, rows, parts) if blend == "adjust" else {}
     changed: dict[str, Any] = {}
@@ -189,7 +191,7 @@ def changed_rows(
         for part in movers if name not in adjusted else ():
             part.add(total, name, hides=blend in ORDERED)
         if blend == "normalized":
-            total = total / weight_sum.clamp(min=1.0)[:, None]
+            total = total / weight_sums[KINDS[name]].clamp(min=1.0)[:, None]
         changed[name] = old[rows] + total.reshape(-1, *old.shape[1:]).to(old.dtype)
     return rows, changed
 

@@ -9,9 +9,11 @@ import torch
 from torch import Tensor
 
 from progdf.field import BakedField, fit_separable
+from progdf.field.baked import identity_map
 from progdf.field.choose import Render
+from progdf.field.grade import bake_grade, fit_grade
 from progdf.field.separable import course_field, opacity_course, quantize_bases
-from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians, attribute_slices
+from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians, attribute_slices, pack
 from progdf.gdf.file import ADDED_LOGIT, Gdf, fingerprint
 from progdf.region import Region
 from tests.helpers.draws import Draws
@@ -103,6 +105,18 @@ def growing(scene: Gaussians, members: torch.Tensor, count: int, seed: int, name
 
 def grown(offsets: torch.Tensor, knots: torch.Tensor, added: Gaussians) -> dict[str, object]:
     return {"field": course_field(knots, offsets), "added": added}
+
+
+def whole_grade(scene: Gaussians) -> Gdf:
+    """Half of the light everywhere; a residual and a mask of single rows."""
+    knots, count = torch.tensor([0.0, 0.5, 1.0]), len(scene)
+    table = torch.stack([identity_map(1) * (1.0 - 0.5 * float(s)) for s in knots])
+    course = torch.zeros(3, count, 3)
+    course[1:] = 0.1 * Draws(4).uniform(2, count, 3)
+    mask = torch.full((count,), 255, dtype=torch.uint8)
+    mask[::3] = 230
+    form = fit_grade(knots, 1, table, course, 1, torch.ones(count), mask)
+    return edit_of(scene, torch.arange(count), bake_grade(form, pack(scene, with_shN=True)), "dark")
 
 
 def some_rows(scene: Gaussians, count: int, seed: int = 0) -> Tensor:

@@ -385,8 +385,8 @@ def _read_weights(path: Path, gdf: Gdf) -> NDArray[np.float32]:
         raise ProgdfError(f"--paint: {error}") from None
     members, count = gdf.region.members.numpy(), gdf.scene.count
     if weights.shape not in ((len(members),), (count,)):
-        shape = list(weights.shape)
-        raise ProgdfError(f"--paint: {path} has shape {shape}, expected [{len(members)}] or [{count}]")
+        shape, expected = list(weights.shape), " or ".join(f"[{n}]" for n in sorted({len(members), count}))
+        raise ProgdfError(f"--paint: {path} has shape {shape}, expected {expected}")
     if not ((weights >= 0) & (weights <= 1)).all():
         raise ProgdfError(f"--paint: {path} has a number outside 0 to 1")
     return np.asarray(weights if len(weights) == len(members) else weights[members], np.float32)

@@ -186,10 +186,18 @@ def prune(session: WindowSession) -> WindowSession:
     used = sorted({layer.gdf for layers in stacks for layer in layers})
     places = {gdf: i for i, gdf in enumerate(used)}
 
-    def renumber(layers: tuple[LayerState, ...]) -> tuple[LayerState, ...]:
-        return tuple(replace(layer, gdf=places[layer.gdf]) for layer in layers)
-
     opened = session.document
+    rows = np.arange(len(opened.scene))
+
+    def renumber(layers: tuple[LayerState, ...]) -> tuple[LayerState, ...]:
+        return tuple(replace(layer, gdf=places[layer.gdf], paint=paint_left(layer)) for layer in layers)
+
+    def paint_left(layer: LayerState) -> str:
+        """Of an edit of all that is there, the paint of the rows that are left."""
+        weights = paint.decode(layer.paint, len(opened.gdfs[layer.gdf].region))
+        whole = weights is not None and len(weights) == len(opened.scene) > len(rows)
+        return paint.encode(weights[rows].numpy()) if whole and weights is not None else layer.paint
+
     if opened.scene is not opened.original:  # masks of the rows that the file's own edits bring
         added = [opened.gdfs[gdf] for gdf in used if opened.edits[gdf].added is not None]
         count, members = len(opened.original), [gdf.region.members.numpy() for gdf in added]

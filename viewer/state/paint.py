@@ -75,10 +75,11 @@ def encode(weights: Floats) -> str:
 
 @lru_cache(maxsize=48)  # the composer knows weights by their identity
 def decode(paint: str, members: int) -> Tensor | None:
-    """Weight of every member, None for `FULL`. [M] float32
+    """Weight of every member, None for `FULL`; 1 for rows that came with an edit after it was painted.
+    [M] float32
 
     Raises:
-        ProgdfError: the text is damaged or holds weights of another number of members.
+        ProgdfError: the text is damaged or holds weights of more members.
     """
     if paint == FULL:
         return None
@@ -87,9 +88,11 @@ def decode(paint: str, members: int) -> Tensor | None:
         levels = unpacker.decompress(base64.b64decode(paint, validate=True), members + 1)
     except (ValueError, binascii.Error, zlib.error):
         raise ProgdfError("the painted weights of a layer are damaged; paint it again") from None
-    if len(levels) != members:
+    if len(levels) > members:
         raise ProgdfError(f"a layer's painted weights do not fit its {members} members; paint it again")
-    return torch.from_numpy(np.frombuffer(levels, np.uint8).astype(np.float32) / 255.0)
+    return torch.from_numpy(
+        np.frombuffer(levels.ljust(members, b"\xff"), np.uint8).astype(np.float32) / 255.0
+    )
 
 
 def layer_of(gdf: Gdf, strength: float, gains: Gains, paint: str) -> Layer:

@@ -16,12 +16,14 @@ from progdf.compose.composer import Composer
 from progdf.compose.reference import BLENDS, Gains, Layer, compose_layers
 from progdf.errors import ProgdfError
 from progdf.field import BakedField
+from progdf.field.baked import identity_map
+from progdf.field.grade import map_colors
 from progdf.formats.ply import load_ply, save_ply
 from progdf.gaussians import ATTRIBUTES, Gaussians, attribute_slices
 from progdf.gdf.file import Gdf, load_gdf, read_gdf, save_gdf
 from progdf.rasterize import render
 from tests.helpers.draws import Draws
-from tests.helpers.edits import bits, curved_field, edit_of, growing, some_rows
+from tests.helpers.edits import bits, curved_field, edit_of, growing, some_rows, whole_grade
 from tests.helpers.fuzz_changes import header_of, signed_gdf
 from tests.helpers.scenes import front_camera, random_gaussians
 
@@ -208,3 +210,41 @@ def test_a_field_without_members_for_the_added_rows_is_refused(scene: Gaussians,
 def test_info_says_how_many_rows_an_edit_adds(hat: Gdf, tmp_path: Path) -> None:
     save_gdf(tmp_path / "hat.gdf", hat)
     assert read_gdf(tmp_path / "hat.gdf").members == 65
+
+
+@pytest.mark.parametrize("blend", BLENDS)
+@pytest.mark.parametrize("first", [True, False])
+def test_a_grade_of_the_whole_scene_reaches_the_rows_that_others_add(
+    scene: Gaussians, hat: Gdf, blend: str, first: bool
+) -> None:
+    dark = whole_grade(scene)
+    gdfs = [dark, hat] if first else [hat, dark]
+    alone = compose_layers(scene, [Layer(hat, 1.0)])
+    for s in (0.3, 1.0):
+        layers = [Layer(gdf, s if gdf is dark else 1.0) for gdf in gdfs]
+        both = compose_layers(scene, layers, blend)
+        taken = round(255 * (2 + 230 / 255) / 3) / 255
+        expected = torch.lerp(
+            alone.sh[COUNT:], map_colors(alone.sh[COUNT:], identity_map(1) * (1 - s / 2), 1), taken
+        )
+        torch.testing.assert_close(both.sh[COUNT:], expected, atol=2e-3, rtol=0)
+        assert torch.equal(both.logit_opacities[COUNT:], alone.logit_opacities[COUNT:]), (
+            "it hides none of them"
+        )
+        assert torch.equal(both.means[COUNT:], alone.means[COUNT:])
+        composer = Composer(scene, gdfs)
+        composer.update(layers, blend)
+        assert bits(composer.gaussians) == bits(both)
+        composer.update([Layer(gdfs[0], 0.0), Layer(gdfs[1], 0.0)], blend)
+        assert bits(composer.gaussians[:COUNT]) == bits(scene)
+
+
+def test_an_average_shares_the_kinds_of_change_that_a_layer_makes(scene: Gaussians) -> None:
+    dark, shirt = whole_grade(scene), edit_of(scene, torch.arange(90), curved_field(90, 2), "shirt")
+    both = compose_layers(scene, [Layer(shirt, 1.0), Layer(dark, 1.0)])
+    alone, graded = (compose_layers(scene, [Layer(edit, 1.0)]) for edit in (shirt, dark))
+    for name in ("means", "log_scales", "quats", "logit_opacities"):
+        assert torch.equal(getattr(both, name), getattr(alone, name)), name
+    shared = (alone.sh0 + graded.sh0)[:90] / 2
+    torch.testing.assert_close(both.sh0[:90], shared, atol=1e-5, rtol=0)
+    assert torch.equal(both.sh0[90:], graded.sh0[90:])

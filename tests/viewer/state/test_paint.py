@@ -15,13 +15,17 @@ from progdf.camera import Camera
 from progdf.compose.reference import Layer, compose_layers
 from progdf.errors import ProgdfError
 from progdf.scene.selection import Surface
+from tests.helpers.edits import growing, some_rows, whole_grade
 from tests.helpers.hostile import NPY_HEADERS, npy
+from tests.helpers.scenes import random_gaussians
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from viewer.camera.view_camera import to_camera
 from viewer.commands.options import StackOptions, stack_layers
+from viewer.files.document import Document
+from viewer.files.session import WindowSession, prune
 from viewer.state import paint
 from viewer.state.paint import Stroke, near_mean
-from viewer.state.view_state import LARGEST_PX, Brush
+from viewer.state.view_state import LARGEST_PX, Brush, LayerState, ViewState
 
 POINTS = (700, 640)
 LINE = Stroke(
@@ -310,3 +314,26 @@ def test_a_hostile_header_of_weights_is_one_line(tmp_path: Path) -> None:
     npy(tmp_path / "deep.npy", NPY_HEADERS["a deep literal"])
     with pytest.raises(ProgdfError, match=r"--paint: .* is not a readable \.npy file of weights"):
         stack_layers(bear().gdfs, painted(f"scarf={tmp_path / 'deep.npy'}"))
+
+
+def test_weights_from_before_another_edit_added_rows_are_one_line(tmp_path: Path) -> None:
+    scene = random_gaussians(90, seed=2, sh_degree=1)
+    gdfs = Document("s", scene, (whole_grade(scene), growing(scene, some_rows(scene, 10, 1), 25, 7))).gdfs
+    np.save(tmp_path / "old.npy", np.zeros(90, np.float32))
+    with pytest.raises(ProgdfError, match=r"--paint: .*old.npy has shape \[90\], expected \[115\]$"):
+        stack_layers(gdfs, painted(f"dark={tmp_path / 'old.npy'}"))
+
+
+def test_paint_lasts_when_rows_come_and_go_with_another_edit() -> None:
+    scene = random_gaussians(90, seed=2, sh_degree=1)
+    drawn = np.linspace(0, 0.8, 90, dtype=np.float32)
+    edits = whole_grade(scene), growing(scene, some_rows(scene, 10, 1), 25, 7)
+    layers = (LayerState(0, "dark", paint=paint.encode(drawn)),)
+    document = Document("s", scene, edits, gdf_paths=(Path("dark.gdf"), Path("hat.gdf")))
+    with_hat = paint.layer_of(document.gdfs[0], 1.0, layers[0].gains, layers[0].paint).weights
+    assert with_hat is not None
+    assert with_hat.tolist() == pytest.approx([*drawn, *np.ones(25)], abs=0.003)
+    wider = replace(layers[0], paint=paint.encode(with_hat.numpy()))
+    pruned = prune(WindowSession(document, ViewState(layers=(wider,))))
+    assert pruned.view.layers == layers
+    assert len(pruned.document.scene) == 90

@@ -25,6 +25,7 @@ class Edit {
         coefficients: read(bases.coefficients),
       };
     }
+    this.kinds = new Set(Object.keys(record.attributes).map((name) => KINDS[name]));
     this.coverage = {};
     for (const [kind, part] of Object.entries(record.coverage ?? {})) this.coverage[kind] = container.real(part);
     this.grade = record.grade && {
@@ -125,8 +126,11 @@ export class Composer {
       }
       this.#add(segment, stack, at, totals);
     }
-    const divisors = this.blend === "normalized" ? this.#divisors(segment, stack) : null;
+    const shares = this.blend === "normalized", sums = {};
     for (const name of names) {
+      const kind = KINDS[name];
+      if (shares && !(kind in sums)) sums[kind] = this.#divisors(segment, stack, kind);
+      const divisors = sums[kind];
       const width = this.widths[name], total = totals[name];
       const before = this.before[name].subarray(first * width, (first + rows) * width);
       if (divisors) for (let j = 0; j < total.length; j++) total[j] /= divisors[Math.floor(j / width)];
@@ -203,7 +207,9 @@ export class Composer {
     }
   }
 
-  #divisors({ rows, members }, stack) {
+  // max(1, Σ m s) over the layers that make a kind of change; null where it is 1 everywhere.
+  #divisors({ rows, members }, all, kind) {
+    const stack = all.filter((layer) => this.edits[layer.edit].kinds.has(kind));
     if (stack.reduce((sum, layer) => sum + Math.min(layer.strength, 1), 0) <= 1 - 1e-6) return null;
     const sums = new Float32Array(rows);
     for (const layer of stack) {
