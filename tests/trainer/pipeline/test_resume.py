@@ -92,6 +92,7 @@ def test_ctrl_c_before_the_optimization_is_kept_too(
     gone_on(bear_folder, uninterrupted)
 
 
+@pytest.mark.usefixtures("default_signals")
 def test_a_draft_is_there_until_the_edit_is(
     bear_folder: Path, uninterrupted: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
