@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Protocol, TypeVar
 
 from progdf import __version__
-from progdf.errors import ProgdfError
+from progdf.errors import ProgdfError, without_commands
 from progdf.gdf.file import Gdf
 from progdf.io.atomic import state_folder
 from viewer.files.document import Document
@@ -71,9 +71,9 @@ def failure_line(act: Callable[[], object]) -> str:
 
 
 def error_line(error: Exception) -> str:
-    """An error that the person can mend, in one line; "" for a mistake of ours."""
+    """An error that the person can mend, in one line of no commands; "" for a mistake of ours."""
     if isinstance(error, ProgdfError):
-        return " ".join(str(error).split())
+        return without_commands(str(error))
     if isinstance(error, OSError):
         return f"{error.filename or 'the file'} cannot be read or written: {error.strerror or error}"
     return ""

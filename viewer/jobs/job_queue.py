@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar, Literal
 
-from progdf.errors import ProgdfError
+from progdf.errors import ProgdfError, without_commands
 from progdf.io.atomic import LockedError
 from progdf.io.json_values import read_json
 from viewer.camera.view_camera import SHAPES
@@ -338,16 +338,15 @@ class JobQueue:
         if begun or job.status != "stopping":  # else it is discarded first
             self._unlock(job)
         if status == 0 and job.task.result.exists():
-            return self._change(
-                replace(job, status="done", progress=Progress(1.0), warning=job.task.warning())
-            )
+            warning = without_commands(job.task.warning())
+            return self._change(replace(job, status="done", progress=Progress(1.0), warning=warning))
         if job.status == "stopping" and begun:
             return self._change(replace(job, status="stopped", resumes=True))
         if job.status == "stopping":  # nothing was done yet
             with suppress(ProgdfError):
                 self._drop(job)
             return replace(job, status="stopped")
-        error = child.error() or f"the command ended with status {status}"
+        error = without_commands(child.error()) or f"the command ended with status {status}"
         return self._change(replace(job, status="failed", error=error, resumes=begun))
 
     def _change(self, job: Job) -> Job:

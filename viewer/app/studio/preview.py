@@ -22,12 +22,12 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from progdf.camera import Camera
-from progdf.errors import ProgdfError
+from progdf.errors import ProgdfError, without_commands
 from progdf.gdf.file import Gdf, load_gdf
 from progdf.io.atomic import make_folder
 from progdf.io.cameras import save_cameras
 from progdf.io.json_values import convert_json, decode_json
-from viewer.app.application import Application, Requests
+from viewer.app.application import Application, Requests, error_line
 from viewer.camera.view_camera import Vec3, ViewCamera, to_camera
 from viewer.files import user_files
 from viewer.jobs import training
@@ -132,11 +132,15 @@ class PreviewChild:
             line = self._answers.popleft()
         if line is None:
             ended = self._child.status is not None
-            return Preview(-1, error=self._child.error() or "the preview ended") if ended else None
+            return (
+                Preview(-1, error=without_commands(self._child.error()) or "the preview ended")
+                if ended
+                else None
+            )
         try:
             answer = convert_json(decode_json(line), Preview)
             if answer.error or answer.made in ("note", "palette"):
-                return answer
+                return replace(answer, error=without_commands(answer.error))
             if answer.made == "grade":
                 return replace(answer, grade=self._picture(answer.number).with_suffix(".gdf"))
             with Image.open(self._picture(answer.number)) as picture:
@@ -355,7 +359,7 @@ class PreviewActions:
             region = self._region(self._app.main_view.work.form, child.folder)
         except (ProgdfError, OSError) as error:
             self._outstanding = False
-            self._show(" ".join(str(error).split()), None, failed=True)
+            self._show(error_line(error), None, failed=True)
             return
         self._number = child.ask(region, request, to_camera(request.camera, width, height))
         self._outstanding = True

@@ -1,0 +1,63 @@
+"""What the window shows of an error: no command line, whichever of our errors it is."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import progdf
+from progdf.__main__ import COMMANDS
+from progdf.errors import without_commands
+
+ROOT = Path(progdf.__file__).resolve().parents[1]
+TYPED = re.compile(rf"(?<![\w/.-])--[a-z]|pip install|hf download|progdf ({'|'.join(COMMANDS)})\b")
+
+
+def raised_texts(package: str) -> Iterator[str]:
+    """The messages of what a package raises, its values as X."""
+    for path in sorted((ROOT / package).rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call):
+                for text in node.exc.args:
+                    if isinstance(text, ast.JoinedStr):
+                        yield "".join(
+                            str(part.value) if isinstance(part, ast.Constant) else "X" for part in text.values
+                        )
+                    elif isinstance(text, ast.Constant) and isinstance(text.value, str):
+                        yield text.value
+
+
+def test_no_error_of_ours_has_a_command_line_in_the_window() -> None:
+    texts = [text for package in ("progdf", "trainer", "viewer") for text in raised_texts(package)]
+    assert len([text for text in texts if TYPED.search(text)]) > 80, "there are such"
+    for text in texts:
+        shown = without_commands(text)
+        assert not TYPED.search(shown), shown
+        assert shown.strip() or not text.strip(), text
+        if shown == text:
+            continue
+        assert TYPED.search(text), text
+        assert not re.search(r"[,;:] *$|; (or|and) ", shown) or text.endswith(": "), shown
+
+
+@pytest.mark.parametrize(
+    ("error", "shown"),
+    [
+        ("--threads must be between 0 and 9, got -1", "threads must be between 0 and 9, got -1"),
+        ("no place; change more, or name the region with --region", "no place; change more"),
+        ("it is long; pip install progdf-studio[clip]; close others", "it is long; close others"),
+        ("none is seen; give --image-size or --views more", "none is seen"),
+        ("x is no run of progdf train; give --out another folder", "x is no run of ProGDF"),
+        (
+            "a.ply does not exist; give another, or draw one",
+            "a.ply does not exist; give another, or draw one",
+        ),
+        ("/work/a--b.ply is damaged; load it again", "/work/a--b.ply is damaged; load it again"),
+    ],
+)
+def test_what_is_wrong_stays_and_what_one_can_do_by_hand(error: str, shown: str) -> None:
+    assert without_commands(error) == shown
