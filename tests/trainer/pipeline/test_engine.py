@@ -132,7 +132,7 @@ def test_a_whole_run_works_where_its_steps_are_on_a_card(
 @pytest.fixture(scope="module")
 def case() -> Small:
     """Made before there is a card, on which all takes ten times as long."""
-    return small("scarf", 400, 2, 40)
+    return small("scarf", 400, 2, 32)
 
 
 @pytest.mark.parametrize("kind", ["color", "style", "geometry"])
@@ -146,7 +146,7 @@ def test_no_step_moves_anything_to_the_card_or_back(case: Small, card: Card, kin
     targets = [crop_.original().clamp(0.0, 1.0).flip(2) for crop_ in crops]
     objective = Objective(perceptual_loss()[0], OptimizeOptions(perceptual_weight=0.3, sharpness="hinge"))
     rates = learning_rates(kind, original.shape[1], 1.0)
-    for steps in (1, 1, 3):
+    for steps in (1, 1, 2):
         before = card.moved
         stages = [TargetStage(1.0, targets, steps)]
         assert list(optimize(original, crops, [], stages, objective, PgsSettings(rates, ramp=0.0)))
