@@ -33,6 +33,7 @@ from trainer.optimize.color_solver import (
 from trainer.optimize.color_solver import Model, add_bands, choose_model, iterations, make_solver, solve
 from trainer.optimize.color_views import Judge, color_views
 from trainer.optimize.pgs import PgsState, TargetStage
+from trainer.optimize.retime import smooth_course
 from trainer.options import EditorOptions, FieldOptions, OptimizeOptions, ViewOptions
 from trainer.resolve import use_threads
 from trainer.setup import TrainingSetup, make_training_setup, quantize_image, widen_views
@@ -236,6 +237,7 @@ class Edit:
             bands,
             mask,
         )
+        trajectory = smooth_course(trajectory)
         choosing = self.evaluator(self.choosing, {s: self.aside(s) for s in strengths})
         one = replace(choosing, crops=choosing.crops[:1], pixels=choosing.pixels[:1], edited={})
         began = time.process_time()

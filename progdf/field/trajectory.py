@@ -53,7 +53,7 @@ class Trajectory:
     # what the editor was asked for, of each stage; `s[stage_ends]` is where that is
     strengths: tuple[float, ...]
     # of an edit of colors that is a map of the region and a residual of its members' lowest bands: the map of
-    # each stage [stages,K,3], and how many bands that are
+    # each recording but the first [S-1,K,3], and how many bands that are
     maps: Tensor | None = None
     bands: int = 0
     mask: Tensor | None = None  # how much of the maps each member takes, see `GradeForm.mask`. [M] uint8
@@ -137,7 +137,7 @@ def load_trajectory(path: Path) -> tuple[Trajectory, dict[str, Tensor], dict[str
 
 
 def peek_trajectory(path: Path, maps: bool = False) -> tuple[Tensor, Tensor]:
-    """The end [M,C], or the maps [stages,K,3], and the members [M] of a file, without its recordings: enough
+    """The end [M,C], or the maps [S-1,K,3], and the members [M] of a file, without its recordings: enough
     to tell whose they are.
 
     Raises:
@@ -196,11 +196,11 @@ def _check(path: Path, trajectory: Trajectory) -> None:
     if maps is not None and (
         maps.dtype != torch.float32
         or maps.shape[1:] not in [(count, 3) for count in MONOMIALS.values()]
-        or len(maps) != len(ends)
+        or len(maps) != len(s) - 1
         or not bool(maps.isfinite().all())
         or trajectory.bands not in (0, 1, 4)
     ):
-        raise _damage_error(path, "its maps of color do not fit its stages")
+        raise _damage_error(path, "its maps of color do not fit its recordings")
     mask = trajectory.mask
     if mask is not None and (mask.dtype != torch.uint8 or mask.shape != shape[1:2]):
         raise _damage_error(path, "its mask does not fit its members")

@@ -147,19 +147,19 @@ def fit_grades(
         choosing, reporting, weights, options: see `fit_field`
     """
     assert trajectory.maps is not None
-    nodes = [0, *trajectory.stage_ends]
     degree = next(d for d, count in MONOMIALS.items() if count == trajectory.maps.shape[1])
     table = torch.cat([identity_map(degree)[None], trajectory.maps])
     mask, share = trajectory.mask, torch.ones(len(rows))
     share = share if mask is None else mask.float() / 255.0
     mapped = mapped_bands(degree, table, rows, share)
-    recorded = torch.stack([trajectory.node(i) for i in nodes])
-    course = lowest_bands(recorded, trajectory.bands) - mapped[:, :, : 3 * trajectory.bands]
+    course = (
+        lowest_bands(_recorded_offsets(trajectory), trajectory.bands) - mapped[:, :, : 3 * trajectory.bands]
+    )
     evaluator, budget = field_evaluator(trajectory, choosing, options.target_psnr), options.bytes_budget
     tried, serving, smallest = list[Candidate](), 0, math.inf
     for rank in range(rank_limit(course) + 1):
         for coarser in COARSER[: None if rank else 1]:
-            form = fit_grade(trajectory.s[nodes], degree, table, course, rank, weights, mask, coarser)
+            form = fit_grade(trajectory.s, degree, table, course, rank, weights, mask, coarser)
             if tried and form.bytes_per_member > (smallest if budget is None else budget):
                 continue
             field = replace(bake_grade(form, rows, mapped), recorded=tuple(trajectory.s.tolist()))

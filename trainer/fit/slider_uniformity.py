@@ -21,6 +21,7 @@ from progdf.field import BakedField
 from progdf.field.baked import (
     NeuralForm,
     SliderRemap,
+    find_segment,
     identity_remap,
     interpolate,
     interpolate_at,
@@ -31,6 +32,7 @@ from progdf.metrics.image import ROUNDING
 from trainer.editors import COSTLY_STRENGTHS, check_editor
 from trainer.editors.base import ImageEditor
 from trainer.editors.procedural import edit_course
+from trainer.optimize.retime import smooth_weights
 from trainer.setup import TrainingSetup, probe_views
 from trainer.store.progress import RunLog
 from trainer.views.crops import GEOMETRY, render_all
@@ -65,8 +67,9 @@ def equalized_strengths(
         spec: what it was made of, `KIND:WHAT`
         views: of which a few are looked at
         plain: shares of the visible change, ascending, the last 1
-        missed: share of the change (mean square) that straight lines between the pictures may miss, less
-            where less of it is there; with it shares are halves, quarters …, as many as that takes
+        missed: share of the change (mean square) that a smooth course through the pictures may miss, see
+            `smooth_course`, less where less of it is there; with it shares are halves, quarters …, as many
+            as that takes
     """
     if editor.stages or len(plain) == 1:
         return plain
@@ -93,10 +96,8 @@ def equalized_strengths(
     return rounded if rises else plain
 
 
-def _bends(
-    even: Tensor, pictures: Sequence[Tensor], due: Tensor, allowed: float, low: float = 0.0, high: float = 1.0
-) -> tuple[float, ...]:
-    """Shares of the visible change at which a course is to be met for straight lines between to miss little.
+def _bends(even: Tensor, pictures: Sequence[Tensor], due: Tensor, allowed: float) -> tuple[float, ...]:
+    """Shares of the visible change at which a course is to be met for `smooth_course` to miss little between.
 
     Args:
         even: strengths. [n] float64
@@ -104,21 +105,23 @@ def _bends(
         due: strengths at which the change is as far along as `even` says. [n]
         allowed: share of the change that may be missed (mean square), less where less of it is there; what
             rounding to 8 bits misses always may
-        low, high: shares between which one looks; halved where a straight line will not do
     """
-    first, last = interpolate(torch.tensor([low, high], dtype=torch.float64), even, due).tolist()
-    start, end = interpolate_at(even, pictures, first), interpolate_at(even, pictures, last)
     change = pictures[-1] - pictures[0]
     rounding = ROUNDING * int((change.abs() > 1 / 255).sum())
-    for s, picture in zip(even.tolist(), pictures, strict=True):
-        if first < s < last and high - low > 2 / STEPS:
-            share = (s - first) / (last - first)
-            most = max(rounding, allowed * _power(change) * (low + share * (high - low)))
-            if _power(torch.lerp(start, end, share) - picture) > most:
-                middle = (low + high) / 2
-                halves = (low, middle), (middle, high)
-                return tuple(s for half in halves for s in _bends(even, pictures, due, allowed, *half))
-    return (high,)
+    shares, rough = [0.0, 1.0], {0}
+    while rough:
+        nodes, at = interpolate(torch.tensor(shares, dtype=torch.float64), even, due), even.new_tensor(shares)
+        places, weights = smooth_weights(nodes.tolist())
+        known = torch.stack([interpolate_at(even, pictures, x) for x in nodes.tolist()])
+        rough = set()
+        for s, picture, progress in zip(even.tolist(), pictures, interpolate(even, nodes, at), strict=True):
+            left = find_segment(nodes, s).right - 1
+            if left not in rough and shares[left + 1] - shares[left] > 2 / STEPS:
+                met = torch.tensordot(interpolate_at(places, weights, s).float(), known, 1)
+                most = max(rounding, allowed * _power(change) * float(progress))
+                rough |= {left} if _power(met - picture) > most else set()
+        shares = sorted([*shares, *((shares[left] + shares[left + 1]) / 2 for left in rough)])
+    return tuple(shares[1:])
 
 
 def _power(change: Tensor) -> float:

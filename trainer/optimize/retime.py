@@ -11,9 +11,10 @@ from dataclasses import replace
 from itertools import pairwise
 
 import torch
+from scipy.interpolate import CubicSpline
 from torch import Tensor
 
-from progdf.field.baked import interpolate, interpolate_at
+from progdf.field.baked import MONOMIALS, identity_map, interpolate, interpolate_at
 from progdf.field.trajectory import Trajectory
 from trainer.options import Slider
 
@@ -43,6 +44,36 @@ def record(
     ends = tuple(i + 1 for i, (_, _, last, _) in enumerate(snapshots) if last)
     s = steps.float() / float(steps[-1])
     return Trajectory(s, offsets, end, steps, ends, tuple(strengths))
+
+
+def smooth_weights(strengths: Sequence[float]) -> tuple[Tensor, Tensor]:
+    """These strengths and the middles between them, and of which weights of the values at the strengths a
+    cubic through them consists at each. [n] -> [2n-1], [2n-1,n] float64, rows of one 1 at the strengths"""
+    nodes, unit = torch.tensor(strengths, dtype=torch.float64), torch.eye(len(strengths), dtype=torch.float64)
+    places = torch.stack([nodes, nodes + 0.5 * nodes.diff(append=nodes[-1:])], dim=1).flatten()[:-1]
+    weights = torch.from_numpy(CubicSpline(nodes.numpy(), unit.numpy())(places.numpy()))
+    weights[::2] = unit
+    return places, weights
+
+
+def smooth_course(trajectory: Trajectory) -> Trajectory:
+    """A recording more between each two stages of an edit of colors, map and residual on the cubic through
+    them, so that half as many are solved for; any other as it is. Each lies at its strength."""
+    if trajectory.maps is None or len(trajectory.strengths) == 1:
+        return trajectory
+    places, weights = smooth_weights((0.0, *trajectory.strengths))
+    degree = next(d for d, count in MONOMIALS.items() if count == trajectory.maps.shape[1])
+    known = torch.stack([trajectory.node(i) for i in range(len(trajectory))])
+    offsets = torch.stack([torch.tensordot(row.float(), known, 1).half() for row in weights])
+    maps = torch.tensordot(weights.float(), torch.cat([identity_map(degree)[None], trajectory.maps]), 1)
+    return replace(
+        trajectory,
+        s=places.float(),
+        offsets=offsets,
+        steps=torch.arange(len(places)),
+        stage_ends=tuple(range(2, len(places), 2)),
+        maps=maps[1:],
+    )
 
 
 def retime(

@@ -42,7 +42,14 @@ from trainer.optimize.pgs import (
     optimize,
     pgs_settings,
 )
-from trainer.optimize.retime import record, resolve_slider, retime, select_recordings, straight_recordings
+from trainer.optimize.retime import (
+    record,
+    resolve_slider,
+    retime,
+    select_recordings,
+    smooth_course,
+    straight_recordings,
+)
 from trainer.optimize.ties import surface_ties
 from trainer.options import OptimizeOptions, TrainOptions
 from trainer.setup import Pictures, TrainingSetup, probe_views
@@ -218,7 +225,7 @@ def optimize_members(
         log.say(f"growth: {effort['added']} Gaussians added, of {len(seeds)}; the others contribute nothing")
     if model is not None:
         maps = torch.stack([made.table for made in recordings.made if made.table is not None])
-        trajectory = replace(trajectory, maps=maps, bands=model.bands, mask=model.mask)
+        trajectory = smooth_course(replace(trajectory, maps=maps, bands=model.bands, mask=model.mask))
         counts = (
             f"in {', '.join(map(str, taken))} steps, of {most} each at most" if taken else "by maps alone"
         )
@@ -425,7 +432,7 @@ def retime_trajectory(
             images = render_all(small, original + trajectory.node(i), moving)
             pictures.append(torch.cat([image.flatten() for image in images]))
             advance(i + 1, "recordings")
-    if not optimization.as_printed:
+    if not optimization.as_printed and trajectory.maps is None:
         rows = straight_recordings(trajectory, pictures)
         trajectory, pictures = select_recordings(trajectory, rows), [pictures[i] for i in rows]
     return retime(trajectory, pictures, resolve_slider(optimization.slider, trajectory.strengths))

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from progdf.errors import ProgdfError
+from progdf.field.baked import identity_map
 from progdf.field.trajectory import (
     Trajectory,
     load_trajectory,
@@ -21,7 +22,7 @@ from progdf.field.trajectory import (
     save_trajectory,
 )
 from progdf.io.tensors import write_tensors
-from trainer.optimize.retime import record, retime, select_recordings, straight_recordings
+from trainer.optimize.retime import record, retime, select_recordings, smooth_course, straight_recordings
 from trainer.options import Slider
 
 CHANNELS = 14
@@ -105,6 +106,37 @@ def test_chords_as_long_as_a_step_make_steps_even_where_shorter_ones_count_jitte
     ours, fine = (even_chords(retimed(noisy, "even", samples=samples)) for samples in (20, 60))
     assert float(ours.min() / ours.max()) > 0.7
     assert float(ours.min() / ours.max()) > float(fine.min() / fine.max()) + 0.05
+
+
+@pytest.mark.parametrize("strengths", [(1.0,), (0.6, 1.0), (0.1, 0.35, 0.5, 0.8, 1.0)])
+def test_a_smooth_course_meets_its_stages_and_what_is_cubic_between(strengths: tuple[float, ...]) -> None:
+    """With two stages: what is a parabola."""
+    random = torch.Generator().manual_seed(1)
+    terms = (
+        torch.randn(3, 3, CHANNELS, generator=random)
+        * torch.tensor([1, 1, len(strengths) > 2])[:, None, None]
+    )
+
+    def offsets(s: float) -> Tensor:
+        return s * terms[0] + s * s * terms[1] + s**3 * terms[2]
+
+    def table(s: float) -> Tensor:
+        return identity_map(2) + s * (1.0 - 0.4 * s) * torch.ones(10, 3)
+
+    snapshots = [(i + 1, i, True, offsets(s).half()) for i, s in enumerate(strengths)]
+    maps = torch.stack([table(s) for s in strengths])
+    recorded = replace(record(snapshots, offsets(1.0), strengths), maps=maps, bands=1)
+    course = smooth_course(recorded)
+    if len(strengths) > 1:
+        assert [float(course.s[end]) for end in course.stage_ends] == pytest.approx(strengths)
+    assert course.maps is not None
+    for i, s in enumerate(course.s.tolist()):
+        torch.testing.assert_close(course.node(i), offsets(s), atol=4e-3, rtol=2e-3)
+        if i:
+            torch.testing.assert_close(course.maps[i - 1], table(s), atol=1e-5, rtol=1e-5)
+    for index, end in enumerate(course.stage_ends, 1):
+        assert torch.equal(course.node(end), recorded.node(index)), "stages are kept bit for bit"
+    assert torch.equal(smooth_course(replace(recorded, maps=None)).offsets, recorded.offsets)
 
 
 def test_stage_ends_keep_their_strengths_whatever_happens_between() -> None:
