@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -120,7 +120,6 @@ def against_editor(
 COMPARED = "keyframes2"
 """The baseline whose courses stand beside the field's: what anyone would do first."""
 
-_SEEN = 4  # strengths at which SSIM and LPIPS are taken
 _ROUNDED = 1.5 / 255  # two images in 8 bits differ by as much
 _ALIKE = 0.05  # of color, by which `changed` tells a painted pixel where it knows nothing of how it was saved
 _NODES = 6  # recordings at which the field is looked at
@@ -152,8 +151,7 @@ class Measured:
     asked: Sequence[tuple[float, float]]
     slider: SliderStatistics  # how the slider feels
     at_recordings: float  # worst PSNR of the field at the recordings themselves, dB
-    trajectory: Mapping[str, ErrorCurve]  # "slider" and the compared baseline against the recorded trajectory
-    # the same against the editor's own pictures, at the strengths it was asked for
+    # "slider" and the compared baseline against the editor's own pictures, at the strengths it was asked for
     editor: Mapping[str, ErrorCurve]
     perceptual: str  # name of the perceptual distance
     clip: Direction  # see `Direction`
@@ -180,16 +178,10 @@ def measure(
         clip: measured already, or the reason why not
     """
     (evaluator, reporting), field = judges, fitted.chosen.field
-    fields = {"slider": field, COMPARED: fitted.baselines[COMPARED].field}
+    linear = fitted.baselines[COMPARED].field
     slider = slider_statistics(lambda s: evaluator.pictures(shipped.offsets(s)), masks=evaluator.pixels)
-    samples = sample_strengths()[:: len(sample_strengths()) // _SEEN]
-    recorded = error_curves(
-        reporting, fields, samples, lambda s: reporting.pictures(trajectory.at(s)), perceptual
-    )
-    places = tuple(remap.at(s) for s in samples)
-    recorded = {n: replace(c, s=places, seen_s=places) for n, c in recorded.items()}
     stages = tuple((remap.at(s), strength) for s, strength in trajectory.stage_strengths)
-    drawn = against_editor(evaluator, {**fields, "slider": shipped}, stages, perceptual, _SEEN)
+    drawn = against_editor(evaluator, {"slider": shipped, COMPARED: linear}, stages, perceptual, most=1)
     nodes = trajectory.s[1:-1][:: max(1, -(-(len(trajectory) - 2) // _NODES))].tolist()
     worst = min(
         (
@@ -205,7 +197,6 @@ def measure(
         asked=stages,
         slider=slider,
         at_recordings=worst,
-        trajectory=recorded,
         editor=drawn,
         perceptual=perceptual.name,
         clip=clip,
@@ -214,7 +205,7 @@ def measure(
 
 def expected_measures(trajectory: Trajectory) -> int:
     """About how often `measure` looks at its views, for a progress bar."""
-    return 30 + 3 * (_SEEN + 1) + 2 * len(trajectory.stage_strengths) + 2 * _NODES
+    return 30 + 2 * len(trajectory.stage_strengths) + 2 * _NODES
 
 
 def clip_curve(
@@ -251,21 +242,13 @@ def clip_curve(
 def figures(measured: Measured, endpoint_error: float, outside_change: float) -> dict[str, Any]:
     """The part of report.json that depends on the field (see docs of the command line)."""
     fitted, slider = measured.fitted, measured.slider
-    course, drawn, linear = (
-        measured.trajectory["slider"],
-        measured.editor["slider"],
-        measured.editor[COMPARED],
-    )
+    drawn, linear = measured.editor["slider"], measured.editor[COMPARED]
     similarity = measured.clip.similarity
     return {
         "field": {
             **field_figures(fitted.chosen),
             "parameters": stored_numbers(measured.shown),
             "psnr_at_recordings": round(measured.at_recordings, 2),
-            "ssim_mean": _four(sum(course.ssim) / len(course.ssim)),
-            "ssim_worst": _four(min(course.ssim)),
-            "lpips_mean": _four(sum(course.lpips) / len(course.lpips)),
-            "lpips_worst": _four(max(course.lpips)),
             "endpoint_error": endpoint_error,
             "outside_change": outside_change,
             "target_met": fitted.met,
@@ -293,7 +276,11 @@ def figures(measured: Measured, endpoint_error: float, outside_change: float) ->
             **({"clip_model": measured.clip.model} if similarity else {"clip_reason": measured.clip.reason}),
         },
         "curves": {
-            "against_trajectory": {name: _to_lists(found) for name, found in measured.trajectory.items()},
+            "against_trajectory": {
+                "s": [_four(measured.remap.at(s)) for s in sample_strengths()],
+                "slider": [round(psnr, 2) for psnr in fitted.chosen.curve],
+                COMPARED: [round(psnr, 2) for psnr in fitted.baselines[COMPARED].curve],
+            },
             "against_editor": {name: _to_lists(found) for name, found in measured.editor.items()},
             "change": {
                 "from_original": [_four(distance) for distance in slider.distances],

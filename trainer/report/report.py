@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -16,7 +16,6 @@ from trainer.fit.evaluate import Evaluator
 from trainer.optimize.losses import Losses
 from trainer.report.measures import COMPARED, Direction, Measured
 
-from .measures import ErrorCurve
 from .plots import PAPER, Plot, Points, draw_plot
 
 SHOWN = (0.0, 0.25, 0.5, 0.75, 1.0)
@@ -59,11 +58,7 @@ def report_picture(
             + ("; gray: the editor was not asked" if any(at is None for _, at in columns[1:]) else ""),
         )
     )
-    rows = [_against_trajectory(measured)]
-    if len(evaluator.edited) > 1:
-        rows.append(_against_editor(measured))
-    rows.append(_uniformity_plots(measured, losses))
-    return stack_plots(sheet, rows)
+    return stack_plots(sheet, [_error_plots(measured), _uniformity_plots(measured, losses)])
 
 
 def view_caption(evaluator: Evaluator, held_out: int) -> str:
@@ -120,57 +115,19 @@ def thumbnail(image: Tensor, width: int) -> Tensor:
     return torch.from_numpy(np.asarray(page, dtype=np.float32) / 255.0)
 
 
-def _against_trajectory(measured: Measured) -> list[Plot]:
-    fitted = measured.fitted
-    s = [measured.remap.at(s) for s in sample_strengths()]
+def _error_plots(measured: Measured) -> list[Plot]:
+    """Of all fields that were measured against what was recorded; of two against the editor."""
+    fitted, s = measured.fitted, [measured.remap.at(s) for s in sample_strengths()]
     fields = {fitted.chosen.field.kind: fitted.chosen, **fitted.baselines}
-    curves: dict[str, Points] = {
+    recorded: dict[str, Points] = {
         f"{_label(name)}, {found.field.bytes_per_member:.0f} B": (s, found.curve)
         for name, found in fields.items()
     }
-    return [
-        Plot("PSNR to the recorded trajectory, dB", curves, "slider", span=_SPAN),
-        Plot(
-            "SSIM to the trajectory",
-            _lines(measured.trajectory, lambda c: (c.seen_s, c.ssim)),
-            "slider",
-            high=1.0,
-            span=_SPAN,
-        ),
-        Plot(
-            f"{_distance(measured)} to the trajectory",
-            _lines(measured.trajectory, lambda c: (c.seen_s, c.lpips)),
-            "slider",
-            low=0.0,
-            span=_SPAN,
-        ),
-    ]
-
-
-def _against_editor(measured: Measured) -> list[Plot]:
-    courses = measured.editor
-    return [
-        Plot(
-            "PSNR to the editor's own pictures, dB",
-            _lines(courses, lambda c: (c.s, c.psnr)),
-            "slider",
-            span=_SPAN,
-        ),
-        Plot(
-            "SSIM to the editor's pictures",
-            _lines(courses, lambda c: (c.seen_s, c.ssim)),
-            "slider",
-            high=1.0,
-            span=_SPAN,
-        ),
-        Plot(
-            f"{_distance(measured)} to the editor's pictures",
-            _lines(courses, lambda c: (c.seen_s, c.lpips)),
-            "slider",
-            low=0.0,
-            span=_SPAN,
-        ),
-    ]
+    plots = [Plot("PSNR to the recorded trajectory, dB", recorded, "slider", span=_SPAN)]
+    if len(measured.asked) > 1:
+        edited = {_label(name): (curve.s, curve.psnr) for name, curve in measured.editor.items()}
+        plots.append(Plot("PSNR to the editor's own pictures, dB", edited, "slider", span=_SPAN))
+    return plots
 
 
 def _uniformity_plots(measured: Measured, losses: Losses) -> list[Plot]:
@@ -209,14 +166,6 @@ def _clip(direction: Direction) -> Plot:
     defined = [(s, v) for s, v in zip(direction.s, direction.similarity, strict=True) if v is not None]
     line = ([s for s, _ in defined], [v for _, v in defined])
     return Plot("CLIP directional similarity", {"slider": line}, "slider", low=0.0, span=_SPAN)
-
-
-def _lines(courses: Mapping[str, ErrorCurve], points: Callable[[ErrorCurve], Points]) -> dict[str, Points]:
-    return {_label(name): points(course) for name, course in courses.items()}
-
-
-def _distance(measured: Measured) -> str:
-    return "LPIPS" if measured.perceptual.startswith("lpips") else measured.perceptual
 
 
 def column_heading(s: float, strength: float | None) -> str:

@@ -146,7 +146,7 @@ def finish_run(
         if sharp is not None:
             gdf = sharp
             shown = load_evaluator(folder, setup, setup.judging, trajectory, gdf)
-            drawn = against_editor(shown, {"slider": gdf.field}, measured.asked, perceptual)
+            drawn = against_editor(shown, {"slider": gdf.field}, measured.asked, perceptual, most=1)
             measured = replace(measured, shown=gdf.field, editor={**measured.editor, **drawn})
         picture = report_picture(evaluator, shown, measured, record.losses, title, len(setup.held_out))
     edited = compose_layers(scene, [Layer(gdf, 1.0)])
