@@ -1,13 +1,33 @@
-"""The window's tests remember nothing of each other."""
+"""The viewer's tests remember nothing of each other; a hand on the bear, and its files."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+from tests.helpers.sessions import bear_files, saved_session
+from tests.helpers.ui_rig import Rig, rig
 
 
 @pytest.fixture(autouse=True)
 def empty_state_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What the window remembers for its user begins empty."""
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "memory"))
+
+
+@pytest.fixture
+def hand() -> Iterator[Rig]:
+    with rig() as made:
+        yield made
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    return bear_files(tmp_path)
+
+
+@pytest.fixture
+def saved(folder: Path) -> Path:
+    return saved_session(folder)

@@ -159,25 +159,14 @@ def test_resuming_where_nothing_was_saved_starts(bear_folder: Path, uninterrupte
 
 
 @pytest.mark.usefixtures("stopped")
-def test_views_that_are_edited_are_not_edited_again(
+def test_no_view_is_edited_and_no_region_looked_for_again(
     bear_folder: Path, uninterrupted: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    def again(*_: object) -> None:
+        raise AssertionError("made again")
 
-    def make_editor(*_: object) -> None:
-        raise AssertionError("edited again")
-
-    monkeypatch.setattr(trainer.run.run, "make_editor", make_editor)
-    gone_on(bear_folder, uninterrupted)
-
-
-@pytest.mark.usefixtures("stopped")
-def test_the_region_is_not_looked_for_again(
-    bear_folder: Path, uninterrupted: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def parse_region(*_: object) -> None:
-        raise AssertionError("looked for again")
-
-    monkeypatch.setattr(trainer.run.run, "parse_region", parse_region)
+    for name in ("make_editor", "parse_region"):
+        monkeypatch.setattr(trainer.run.run, name, again)
     gone_on(bear_folder, uninterrupted)
 
 

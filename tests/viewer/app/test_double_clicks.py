@@ -10,18 +10,12 @@ import pytest
 from imgui_bundle import imgui
 
 from tests.helpers.null_app import null_app
-from tests.helpers.ui_rig import TRACK, Rig, bear, first_view, rig
+from tests.helpers.ui_rig import TRACK, Rig, bear, first_view
 from viewer.app import app as application
 from viewer.files.document import Document
 from viewer.ui.window import DoubleClicks
 
 pytestmark = pytest.mark.gl
-
-
-@pytest.fixture
-def hand() -> Iterator[Rig]:
-    with rig() as made:
-        yield made
 
 
 def click_twice(hand: Rig, gap: float, frame: float, unheard: float = 0.0) -> None:

@@ -15,7 +15,7 @@ from progdf.formats.ply import save_ply
 from progdf.io.atomic import state_folder
 from progdf.io.cameras import load_cameras, save_cameras
 from tests.helpers.null_app import null_app, press
-from tests.helpers.sessions import bear_files, full_view, opened_document, saved_session, spoilt
+from tests.helpers.sessions import full_view, opened_document, spoilt
 from tests.helpers.ui_rig import bear, first_view
 from viewer.app import app as application
 from viewer.camera.view_camera import to_camera
@@ -23,16 +23,6 @@ from viewer.files import exports, session
 from viewer.files.user_files import read_recent, remember_recent
 from viewer.state import workspace
 from viewer.state.workspace import Dialog
-
-
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    return bear_files(tmp_path)
-
-
-@pytest.fixture
-def saved(folder: Path) -> Path:
-    return saved_session(folder)
 
 
 @pytest.fixture

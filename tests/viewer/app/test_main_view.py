@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,12 +18,6 @@ from viewer.ui.overlay import draw_splash
 
 pytestmark = pytest.mark.gl
 VIEW = (170.0, 270.0)  # the middle of the picture
-
-
-@pytest.fixture
-def hand() -> Iterator[Rig]:
-    with rig() as made:
-        yield made
 
 
 def test_dragging_a_slider_changes_the_picture_and_makes_exactly_one_undo_entry(hand: Rig) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -17,12 +16,6 @@ from viewer.ui.keys import Keys, Press
 
 pytestmark = pytest.mark.gl
 VIEW = (170.0, 270.0)  # the middle of the picture
-
-
-@pytest.fixture
-def hand() -> Iterator[Rig]:
-    with rig() as made:
-        yield made
 
 
 def test_a_slow_frame_that_holds_a_whole_orbit_still_turns_the_camera(hand: Rig) -> None:

@@ -13,7 +13,7 @@ import torch
 from progdf.formats.ply import load_ply
 from tests.helpers.edits import bits
 from tests.helpers.null_app import null_app, press
-from tests.helpers.sessions import bear_files, opened_document
+from tests.helpers.sessions import opened_document
 from tests.helpers.ui_rig import bear, first_view
 from viewer.app.app import App
 from viewer.commands.render import export
@@ -22,11 +22,6 @@ from viewer.files.session import WindowSession
 from viewer.state import selection
 
 pytestmark = pytest.mark.gl
-
-
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    return bear_files(tmp_path)
 
 
 @pytest.fixture

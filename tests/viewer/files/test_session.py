@@ -17,7 +17,7 @@ from progdf.errors import ProgdfError
 from progdf.formats.ply import save_ply
 from progdf.io.json_values import plain
 from progdf.io.session import SessionFile, read_session, sha256
-from tests.helpers.sessions import bear_files, full_view, opened_document, saved_session, spoilt
+from tests.helpers.sessions import full_view, opened_document, spoilt
 from tests.helpers.ui_rig import bear, first_view
 from viewer.app import app as application
 from viewer.camera.view_camera import eye, from_camera, to_camera
@@ -26,16 +26,6 @@ from viewer.files.session import WindowSession
 from viewer.state import selection
 from viewer.state.selection import SelectionState
 from viewer.state.view_state import Comparison, SnapshotPair
-
-
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    return bear_files(tmp_path)
-
-
-@pytest.fixture
-def saved(folder: Path) -> Path:
-    return saved_session(folder)
 
 
 def test_a_session_brings_back_exactly_what_was_saved(saved: Path) -> None:
