@@ -36,7 +36,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run."""
     made = tmp_path_factory.mktemp("bear")
     write_bear(made, 400)
-    options = quick_options(made, views=4, image_size=48, steps=64, stages=2)
+    options = quick_options(made, views=4, image_size=48, steps=16, stages=2)
     train(options, quiet=True)
     return options.out
 

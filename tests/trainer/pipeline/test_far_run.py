@@ -40,9 +40,9 @@ def runs(folder: Path) -> dict[str, RunResult]:
         write(folder / f"{name}.ply", moved_columns(bear, origin))
         box = ",".join(map(repr, np.add(BOX, 2 * origin).tolist()))
         more = {
-            "views": 6,
+            "views": 4,
             "image_size": 48,
-            "steps": 40,
+            "steps": 16,
             "stages": 2,
             "region": f"box:{box}",
             "name": "coat",
