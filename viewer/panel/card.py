@@ -1,4 +1,4 @@
-"""One layer in the panel: eye, name, strength, slider, and below it the curve of its change and its gains."""
+"""One layer in the panel: eye, name, strength, slider, and below it its gains."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from imgui_bundle import imgui, imgui_ctx
 
 from viewer.jobs.training import NewEdit, with_settings
-from viewer.state.facts import STEPS, LayerRow
+from viewer.state.facts import LayerRow
 from viewer.state.layers import (
     SLIDERS,
     change_layer,
@@ -46,23 +46,18 @@ from viewer.ui.widgets import (
 
 from . import slider
 
-CURVE_PX = 52.0  # at 1×
 GAINS = SLIDERS[1:]
 
 
-def draw_details(
-    layer: LayerState, row: LayerRow, active_slider: str | None, most: float, ui: UiContext
-) -> LayerState:
-    """Draw the curve and the gains.
+def draw_details(layer: LayerState, row: LayerRow, active_slider: str | None, ui: UiContext) -> LayerState:
+    """Draw the gains.
 
     Args:
         layer: what they show
         row: of its .gdf
         active_slider: what the arrow keys move; None where they move another layer
-        most: the upper end of the strength
         ui: fonts and scale
     """
-    _curve(row, layer.strength, most, ui)
     with inert(layer.locked):
         for kind in GAINS:
             layer = _gain(layer, kind, kind in row.kinds, kind == active_slider, ui)
@@ -84,50 +79,6 @@ def _gain(layer: LayerState, kind: str, moves: bool, active: bool, ui: UiContext
     else:
         tip(f"This edit does not change the {kind}")
     return layer if new == value else with_slider_value(layer, kind, new)
-
-
-def value_at(curve: Sequence[float], strength: float) -> float:
-    """The curve at a strength, linear between its points; its last value beyond them."""
-    step = max(strength, 0.0) * STEPS
-    low = min(int(step), len(curve) - 1)
-    high = min(low + 1, len(curve) - 1)
-    return curve[low] + (curve[high] - curve[low]) * min(step - low, 1.0)
-
-
-def _curve(row: LayerRow, strength: float, most: float, ui: UiContext) -> None:
-    """Visible change over the strength, under the slider's track and to its measure."""
-    curve = row.curve()[: round(most * STEPS) + 1]
-    if not curve:
-        return
-    scale, p = ui.scale, PALETTE
-    left, top = imgui.get_cursor_screen_pos()
-    width, height = imgui.get_content_region_avail().x, CURVE_PX * scale
-    imgui.dummy((width, height))
-    tip(
-        "Visible change against strength, measured in small renders of this region; 1 is the full edit."
-        f"\nTicks: {len(row.recorded)} recorded snapshots."
-    )
-    canvas, radius = imgui.get_window_draw_list(), 7.0 * scale
-    start, span = left + radius, (width - 2 * radius) / most
-    foot, rise = top + height - 4.0 * scale, (height - 10.0 * scale) / max(1.0, *curve)
-    canvas.add_rect_filled((left, top), (left + width, top + height), u32(p.panel), 4 * scale)
-    if most > 1.0:
-        beyond = (start + span, top), (left + width, top + height)
-        canvas.add_rect_filled(*beyond, u32((*p.warning_dark[:3], 0.35)), 4 * scale)
-    for tick in row.recorded:
-        x = round(start + tick * span) + 0.5
-        ends = (x, foot - 6 * scale), (x, foot)
-        canvas.add_line(*ends, u32(p.faint), max(1.0, scale))
-    canvas.add_line((start, foot), (start + most * span, foot), u32(p.line), scale)
-    for i in range(len(curve) - 1):
-        a, b = ((start + j / STEPS * span, foot - curve[j] * rise) for j in (i, i + 1))
-        canvas.add_line(a, b, u32(p.warning if i >= STEPS else p.accent), 1.5 * scale)
-    share = value_at(curve, strength)
-    at = (start + strength * span, foot - share * rise)
-    canvas.add_circle_filled(at, 4.5 * scale, u32(p.panel))
-    canvas.add_circle_filled(at, 3.0 * scale, u32(p.handle))
-    corner = (round(left + 6 * scale), round(top + 3 * scale))
-    canvas.add_text(ui.fonts.regular, SMALL_PX * scale, corner, u32(p.dim), f"change {100 * share:.0f} %")
 
 
 TOGGLE_PX, THUMBNAIL_PX = 20.0, 24.0
@@ -209,7 +160,7 @@ def draw_card(
         if layer.gdf in work.view.unfolded:
             work = _about(work, index, row, ui)
             active_slider = work.active_slider if focused else None
-            unfolded = draw_details(work.view.layers[index], row, active_slider, most, ui)
+            unfolded = draw_details(work.view.layers[index], row, active_slider, ui)
             work = _change_layer(work, index, lambda _: unfolded)
             if compact:
                 imgui.dummy((0.0, 2.0 * scale))

@@ -6,7 +6,7 @@ import math
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,18 +23,14 @@ from progdf.field.grade import map_drawn
 from progdf.field.trajectory import FILE_NAME, load_trajectory, peek_trajectory, recorded_field
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
-from progdf.metrics.slider import visible_change
 from progdf.rasterize import render
 from progdf.sh import sh0_to_rgb, shade
 from viewer.camera.view_camera import Bounds, Fit, ViewCamera, bounds_of, fit, frame, keep_camera, to_camera
 
 from .layers import visible_layers
-from .view_state import OVERSHOOT, ViewState
+from .view_state import ViewState
 
 Rgb = tuple[float, float, float]
-
-STEPS = 20
-"""Of the slider from 0 to 1; the curve goes on to `OVERSHOOT` in steps of the same length."""
 
 SIDE_PX, THUMBNAIL_SIDE = 72, 48
 MOST_MEMBERS = 20_000
@@ -46,8 +42,6 @@ _FROM = (20.0, 200.0)  # degrees around the scene: from before and behind
 
 
 Thumbnail = Callable[[ViewCamera], NDArray[np.uint8]]
-Curve = Callable[[], Sequence[float]]
-"""Gives the visible change at 0, 1/`STEPS`, … up to `OVERSHOOT`, as shares of that at 1."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +56,6 @@ class LayerRow:
     # per edit, in their order: how many Gaussians of this one are also in it (in itself: all)
     shared: tuple[int, ...] = ()
     kinds: frozenset[str] = frozenset(KINDS.values())  # which gains of `Gains` have something to scale
-    curve: Curve = tuple  # the visible change over the strength, measured when it is first asked for
     # centers of its members in the original, world units. [M,3] float32
     points: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 3), np.float32), compare=False)
     fit: Fit = keep_camera  # gives the camera that frames this layer
@@ -93,7 +86,6 @@ def _row(scene: Gaussians, gdf: Gdf, gdfs: Sequence[Gdf], added: int) -> LayerRo
         bounds=bounds_of(scene[members]),
         shared=tuple(_in_both(gdf, other) for other in gdfs),
         kinds=frozenset(KINDS[name] for name in gdf.field.attributes),
-        curve=cache(lambda: visible_changes(scene, gdf)),
         points=scene.means[members].numpy(),
         fit=lambda camera, aspect: fit(camera, scene[members], aspect),
         region=gdf.region.name,
@@ -126,45 +118,19 @@ def _mean_color(scene: Gaussians, gdf: Gdf) -> Rgb:
     return red, green, blue
 
 
-def visible_changes(scene: Gaussians, gdf: Gdf) -> tuple[float, ...]:
-    """Mean absolute difference of small renders of the region alone, from two sides, to those at 0.
-
-    Args:
-        scene: the original
-        gdf: the edit
-
-    Returns:
-        At 0, 1/`STEPS`, … up to `OVERSHOOT`; 1 at strength 1, or all 0 where the edit shows nothing.
-    """
-    count = round(OVERSHOOT * STEPS) + 1
-    if not len(gdf.region.members):
-        return (0.0,) * count
-    cameras = _two_sides(_region_at(scene, gdf, 0.0))
-
-    def pictures(strength: float) -> list[Tensor]:
-        edited = _region_at(scene, gdf, strength)
-        with torch.no_grad():
-            return [render(edited, camera, (0.5, 0.5, 0.5)).image for camera in cameras]
-
-    original = pictures(0.0)
-    changes = [visible_change(original, pictures(i / STEPS)) for i in range(count)]
-    total = changes[STEPS]
-    return tuple(change / total for change in changes) if total > 0.0 else (0.0,) * count
-
-
-def _region_at(scene: Gaussians, gdf: Gdf, strength: float) -> Gaussians:
-    """The region alone at a strength, of many members every so-manieth."""
+def _finished_region(scene: Gaussians, gdf: Gdf) -> Gaussians:
+    """The region alone at full strength, of many members every so-manieth."""
     every = max(-(-len(gdf.region.members) // MOST_MEMBERS), 1)
     region, moved = scene[gdf.region.members[::every]], dict[str, Any]()
-    for name in gdf.field.attributes if strength else ():
+    for name in gdf.field.attributes:
         old: Tensor = getattr(region, name)
-        moved[name] = old + gdf.field.attribute_offsets(name, strength)[::every].reshape(old.shape)
+        moved[name] = old + gdf.field.attribute_offsets(name, 1.0)[::every].reshape(old.shape)
     return replace(region, **moved)
 
 
 def draw_thumbnail(scene: Gaussians, gdf: Gdf, camera: ViewCamera) -> NDArray[np.uint8]:
     """The region alone at full strength, from where `camera` looks. [THUMBNAIL_SIDE,THUMBNAIL_SIDE,3]"""
-    side, region = THUMBNAIL_SIDE, _region_at(scene, gdf, 1.0)
+    side, region = THUMBNAIL_SIDE, _finished_region(scene, gdf)
     if not len(region):
         return np.full((side, side, 3), _GROUND, np.uint8)
     with torch.no_grad():

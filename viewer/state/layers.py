@@ -206,7 +206,7 @@ def with_overshoot(view: ViewState, on: bool) -> ViewState:
 
 
 def toggle_details(view: ViewState, index: int) -> ViewState:
-    """Show or hide the gains and the curve of the layer at `index`."""
+    """Show or hide the gains of the layer at `index`."""
     if not 0 <= index < len(view.layers):
         return view
     gdf = view.layers[index].gdf

@@ -145,7 +145,7 @@ class ViewState:
     panel: bool = True
     compare: Comparison = Comparison()
     overshoot: bool = False  # sliders go on to `OVERSHOOT`, which extrapolates
-    unfolded: tuple[int, ...] = ()  # which edits (`LayerState.gdf`) show their gains and curve
+    unfolded: tuple[int, ...] = ()  # which edits (`LayerState.gdf`) show their gains
     brush: Brush = Brush()  # what paints
     timeline: Timeline = Timeline()
     # of `RESOLUTION_MODES`: when the window draws coarsely while something moves

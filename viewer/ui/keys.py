@@ -126,7 +126,7 @@ TOPICS: dict[str, tuple[Command, ...]] = {
         Command("solo", "Solo", "Shift+H", "Show only soloed layers"),
         Command("show_all", "Show all", "Alt+H", "All layers, and all that is hidden"),
         Command("lock", "Lock", "Shift+L", "Strength, gains and paint stay as they are"),
-        Command("fold", "Details and gains", "G", "What it is, gains, and the curve of visible change"),
+        Command("fold", "Details and gains", "G", "What it is, and gains"),
         Command("cards", "Compact rows", "Alt+G"),
         Command("rename", "Rename…", "Enter", types=True),
         Command("duplicate", "Duplicate", "Ctrl+D"),
