@@ -31,7 +31,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "views": ("trainer.cli:views", "write views of a scene to draw masks or edits on"),
     "fit": ("trainer.cli:fit", "refit a field to a recorded trajectory"),
     "evaluate": ("trainer.cli:evaluate", "measure a run as papers do"),
-    "view": ("viewer.commands.render:view", "open the window: splats, layers, sliders"),
+    "view": ("viewer.commands.view:main", "open the window: splats, layers, sliders"),
     "render": ("viewer.commands.render:render", "write a picture, a sweep or a sheet without a window"),
     "rebind": ("progdf.cli.rebind:main", "carry an edit over to the same scene in another file or format"),
     "edit": ("progdf.cli.edit:main", "write a scene again without strays"),

@@ -16,7 +16,7 @@ from tyro.conf import Fixed
 from progdf.cli.options import absent_option
 from progdf.errors import ProgdfError
 from progdf.field.neural import Size
-from progdf.scene.up_axis import UpChoice
+from progdf.scene import UpChoice
 
 EditKind = Literal["color", "style", "geometry"]
 """What an edit moves, which chooses learning rates and loss weights (docs/method.md 3)."""

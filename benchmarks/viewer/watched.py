@@ -17,12 +17,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from viewer.commands.render import view
+from viewer.commands.view import main as view
 
 
 def main(arguments: list[str]) -> int:
     """Open the window and stay as `progdf view` does; "leave" closes it after the first picture."""
     from viewer.app import app as application  # where `progdf view` imports it
+    from viewer.ui import splash
 
     imported = time.time()
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs start deaf to it
@@ -47,15 +48,15 @@ def main(arguments: list[str]) -> int:
                 if not stays:
                     self.leave()
 
-    real, run = application.App, application.run
+    real, opened = application.App, splash.Splash
     application.App = Watched  # type: ignore[misc]
-    application.run = partial(run, size=(int(size[0]), int(size[1])))
+    splash.Splash = partial(opened, size=(int(size[0]), int(size[1])))  # type: ignore[assignment, misc]
     try:
         return view(arguments[3:])
     except KeyboardInterrupt:
         return 0
     finally:
-        application.App, application.run = real, run  # type: ignore[misc]
+        application.App, splash.Splash = real, opened  # type: ignore[misc]
         if watched and stays:
             shown = watched[0].main_view
             _say(

@@ -19,7 +19,7 @@ from benchmarks.table import Table
 from progdf.formats.ply import save_ply
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import save_gdf
-from viewer.app.app import SIZE
+from viewer.ui.splash import SIZE
 
 from . import display as bench_display
 from .display import Opened

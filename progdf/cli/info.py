@@ -24,9 +24,10 @@ from progdf.io import session as session_file
 from progdf.io.atomic import read_file
 from progdf.io.cameras import load_cameras
 from progdf.io.json_values import convert_json, decode_json
+from progdf.scene import UpChoice
 from progdf.scene.bounds import is_surrounding, scene_sphere
 from progdf.scene.strays import find_strays
-from progdf.scene.up_axis import UpAxis, UpChoice, find_up
+from progdf.scene.up_axis import UpAxis, find_up
 from progdf.terminal import file_size, format_count, format_place, group_digits, print_line
 
 from .options import absent_option, parse_options

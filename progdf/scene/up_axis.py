@@ -8,7 +8,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 import torch
@@ -21,6 +21,7 @@ from progdf.io.atomic import atomic_write, state_folder
 from progdf.io.cameras import cameras_beside
 from progdf.io.json_values import decode_json
 
+from . import Axis
 from .bounds import drop_background, front_direction, long_axes, normals_of, scene_sphere
 
 MOST = 200
@@ -60,9 +61,6 @@ def _read() -> dict[str, object]:
 def _place() -> Path:
     return state_folder() / "up_axes.json"
 
-
-Axis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
-UpChoice = Literal["auto", "+x", "-x", "+y", "-y", "+z", "-z"]
 
 AXES: tuple[Axis, ...] = get_args(Axis)
 

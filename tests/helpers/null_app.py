@@ -17,6 +17,7 @@ from viewer.ui.keys import Keys, Press
 @contextmanager
 def null_app(document: Document, view: ViewState, folder: Path) -> Iterator[App]:
     """The application on `document`, after its first frame; what it remembers goes to `folder`."""
+    from viewer.ui.splash import Splash
     from viewer.ui.window import Window, glfw
 
     glfw.init_hint(glfw.PLATFORM, glfw.PLATFORM_NULL)
@@ -24,14 +25,14 @@ def null_app(document: Document, view: ViewState, folder: Path) -> Iterator[App]
         pytest.skip("glfw has no null platform here")
     glfw.window_hint(glfw.CONTEXT_CREATION_API, glfw.EGL_CONTEXT_API)
     try:
-        window = Window("test", (900, 640))
+        window = Window(Splash("test", (900, 640)))
     finally:
         glfw.init_hint(glfw.PLATFORM, glfw.ANY_PLATFORM)
     app = App(window, document, view)
     app.draw()
     yield app
     app.close()
-    window.close()
+    window.splash.close()
 
 
 def press(app: App, *chords: str) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -14,10 +14,10 @@ from typing import TypeVar
 import torch
 from imgui_bundle import imgui
 
-from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
 from progdf.terminal import escape_text
+from progdf.threads import one_thread
 from viewer.camera.view_camera import first_camera
 from viewer.files import exports, user_files
 from viewer.files.document import Document
@@ -26,9 +26,8 @@ from viewer.render.engine import ViewEngine, draws_with
 from viewer.state import workspace
 from viewer.state.snapshots import SliderSnapshot
 from viewer.state.view_state import LayerState, ViewState
-from viewer.ui.context import UiContext
 from viewer.ui.keys import bind
-from viewer.ui.overlay import draw_splash
+from viewer.ui.splash import TITLE, Splash
 from viewer.ui.window import Window, interruptible
 
 from .application import LOG, attempt, error_details, error_line, log_error
@@ -42,11 +41,6 @@ from .tidy import StrayActions, TidyActions
 
 _Made = TypeVar("_Made")
 
-SIZE = (1280, 800)
-SPLASH_AFTER_S, SPLASH_EVERY_S = 0.15, 0.04
-"""How long one waits before a splash is shown, and between two frames of it."""
-FIRST_S, FIRST_TEXT = 4.0, "(the first time on a machine this takes half a minute)"
-"""What is said of waiting so long."""
 SAY_AGAIN_S = 10.0
 """Until what still fails in each frame is said again."""
 RETRY_S = 1.0
@@ -57,69 +51,37 @@ Opened = tuple[WindowSession, Path | None]
 """The scene, its edits and what to show first, and the session's file."""
 
 
-def run(opens: Callable[[], Opened], size: tuple[int, int] = SIZE, draw: str = "auto") -> int:
-    """Open the window and stay until it is closed; where reading takes its time, a splash says so.
+@one_thread()
+def run(splash: Splash, opens: Callable[[], Opened], draw: str = "auto") -> int:
+    """Stay in the window until it is asked to close; where reading takes its time, the splash says so.
 
     Args:
+        splash: the window
         opens: reads what to show, in another thread
-        size: of the window, at 1×
         draw: what draws, see `ViewEngine`
 
     Returns:
         The exit status, 0.
 
     Raises:
-        ProgdfError: as `opens`; or there is no display, or no OpenGL 3.3 on it.
+        ProgdfError: as `opens`.
     """
-    with ThreadPoolExecutor(2) as workers:
-        opening = workers.submit(opens)
-        if wait([opening], SPLASH_AFTER_S).done:
-            opening.result()  # what is wrong is told before there is a window
-        try:
-            window = Window(_window_title(""), size)
-        except ProgdfError:
-            opening.result()
-            raise
-        try:
-            with interruptible():
-                app = _start(window, opening, workers, draw)
-                try:
-                    app.loop()
-                finally:
-                    app.close()
-        finally:
-            window.close()
-    return 0
-
-
-def _start(window: Window, opening: Future[Opened], workers: ThreadPoolExecutor, draw: str) -> App:
-    """The application, once all is read and what draws is ready."""
-    context, ui = window.context(), UiContext(window.density)
-    imgui.backends.opengl3_init("#version 330")
-
-    def splash(text: str, seconds: float) -> None:
-        ui.make_current()
-        imgui.get_io().display_size = imgui.ImVec2(*window.pixels)
-        draw_splash(context.screen, ui, text, seconds)
-
-    try:
-        splash("Opening …", 0.0)
-        window.present()
-        draws = workers.submit(_draw_once) if draws_with(context, draw) == "cpu" else None
-        opened, session = _wait(window, opening, "Opening …", splash)
+    with interruptible(), ThreadPoolExecutor(2) as workers:
+        draws = workers.submit(_draw_once) if draws_with(splash.context, draw) == "cpu" else None
+        opened, session = splash.wait(workers.submit(opens), "Opening …")
         if draws is not None:
-            _wait(window, draws, "Preparing to draw …", splash)
-    finally:
-        ui.make_current()
-        imgui.backends.opengl3_shutdown()
-        ui.close()
-    app = App(window, opened.document, opened.view, session, draw=draw)
-    app.main_view.restart(opened.view, opened.snapshots)
-    app.bind_keys()
-    if opened.warning:
-        app.main_view.show_message(opened.warning, error=True)
-    app.file_actions.offer_autosave()
-    return app
+            splash.wait(draws, "Preparing to draw …")
+        app = App(Window(splash), opened.document, opened.view, session, draw=draw)
+        try:
+            app.main_view.restart(opened.view, opened.snapshots)
+            app.bind_keys()
+            if opened.warning:
+                app.main_view.show_message(opened.warning, error=True)
+            app.file_actions.offer_autosave()
+            app.loop()
+        finally:
+            app.close()
+    return 0
 
 
 def _draw_once() -> None:
@@ -128,17 +90,6 @@ def _draw_once() -> None:
     quats, none = torch.eye(4)[:1].expand(8, 4), corners[:, None, :][:, :0]
     scene = Gaussians(corners, quats, corners - 2.0, corners[:, 0], corners, none)
     ViewEngine(None, scene).image(ViewState(camera=first_camera(scene)), (32, 24))
-
-
-def _wait(window: Window, work: Future[_Made], text: str, splash: Callable[[str, float], None]) -> _Made:
-    """What another thread makes; meanwhile the window hears its events and soon shows a splash."""
-    begun, patience = time.perf_counter(), SPLASH_AFTER_S
-    while not wait([work], patience).done:
-        patience, seconds = SPLASH_EVERY_S, time.perf_counter() - begun
-        window.wait(0.0)
-        splash(text if seconds < FIRST_S else f"{text} {FIRST_TEXT}", seconds)
-        window.present()
-    return work.result()
 
 
 class App:
@@ -153,7 +104,7 @@ class App:
         draw: str = "auto",
     ) -> None:
         self.window, self.document = window, document
-        self.context = window.context()
+        self.context = window.context
         self._draw = draw
         self.engine = self._engine(document)
         self.main_view = MainView(
@@ -329,15 +280,18 @@ class App:
             Exception: what `work` raises.
         """
 
-        def splash(text: str, seconds: float) -> None:
+        def listen() -> None:
+            self.window.wait(0.0)
             self.main_view.ui.make_current()
             self.window.new_frame()
-            draw_splash(self.context.screen, self.main_view.ui, text, seconds)
+            imgui.backends.opengl3_new_frame()
+            imgui.new_frame()  # what is typed and clicked at the splash is nobody's
+            imgui.end_frame()
 
         self._waits = True
         try:
             with ThreadPoolExecutor(1) as worker:
-                return _wait(self.window, worker.submit(work), text, splash)
+                return self.window.splash.wait(worker.submit(work), text, listen)
         finally:
             self._waits = False
             self.window.take_keys()  # typed at the splash
@@ -407,4 +361,4 @@ class App:
 
 
 def _window_title(name: str, unsaved: bool = False) -> str:
-    return f"{workspace.UNSAVED * unsaved}{name} – ProGDF Studio" if name else "ProGDF Studio"
+    return f"{workspace.UNSAVED * unsaved}{name} – {TITLE}" if name else TITLE

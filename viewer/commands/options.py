@@ -1,22 +1,20 @@
-"""The options of `progdf view`, `render` and `export`, and what they name: a scene under its edits."""
+"""The options of `progdf render` and `export`, and what all options name: a scene under its edits."""
 
 from __future__ import annotations
 
 import logging
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol
+from typing import Annotated, Literal, Protocol
 
 import numpy as np
-import tyro
 from numpy.typing import NDArray
-from tyro.conf import OmitArgPrefixes, Positional, UseAppendAction
+from tyro.conf import OmitArgPrefixes
 
 from progdf.cli.info import kind_of
-from progdf.cli.options import parse_options
 from progdf.color.edits import parse_color
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
@@ -24,9 +22,9 @@ from progdf.gdf.file import Gdf
 from progdf.io.session import BUNDLE, unpack_bundle
 from progdf.io.tensors import open_npy
 from progdf.region import Region
+from progdf.scene import UpChoice
 from progdf.scene.regions import check_region, parse_region
-from progdf.scene.up_axis import UpChoice
-from viewer.camera.view_camera import Vec3, find_scene_up, with_up
+from viewer.camera.view_camera import Vec3, find_scene_up, first_camera, with_up
 from viewer.files import document, session
 from viewer.files.document import Document
 from viewer.files.web_page import PageOptions
@@ -36,70 +34,12 @@ from viewer.state.paint import encode
 from viewer.state.snapshots import SliderSnapshot
 from viewer.state.view_state import OVERSHOOT, LayerState, ViewState
 
+from .stack_options import NO_SCENE, DrawingOptions, StackOptions, Switch, is_number, word
+
 _log = logging.getLogger(__name__)
 
-Blend = Literal["normalized", "sum", "over", "adjust"]
 Against = Literal["original", "recorded"]
-NO_SCENE = Path()
-"""What stands for the scene where none is given."""
-SESSION = "--session"
-_BARE = {"--split": "0.5", "--difference": "4"}  # what an option without a value means
 _SAID_BY_SESSION = ("gdfs", "region", "gain", "solo", "paint", "overshoot", "background")
-
-
-def word(metavar: str | None = None, absent: str | Callable[[str], str] | None = None, **more: Any) -> Any:
-    """How help shows an option: what stands for its value, and what happens without it."""
-    hint = f"(default: {absent})" if isinstance(absent, str) else absent
-    return tyro.conf.arg(metavar=metavar, help_behavior_hint=hint, **more)
-
-
-def _switch(default: str) -> str:
-    return f"(default: {'on' if default == 'True' else 'off'})"
-
-
-def _scene(default: str) -> str:
-    return "(required)" if default != str(NO_SCENE) else "(default: a start page)"
-
-
-Switch = Annotated[bool, word(absent=_switch)]
-
-
-@dataclass(frozen=True, kw_only=True)
-class StackOptions:
-    """A scene under a stack of edits."""
-
-    scene: Annotated[Path, Positional, word("SCENE", _scene)]
-    """The scene: a .ply, .spz, .splat, .ksplat or .sog; or a session (Ctrl+S), also as --session FILE."""
-    gdfs: Annotated[tuple[Path, ...], Positional, word("EDIT.gdf", "the scene alone")] = ()
-    """Edits of this scene, the lowest layer first; also .cube files, which change colors everywhere."""
-    region: Annotated[tuple[str, ...], UseAppendAction, word("NAME=REGION")] = ()
-    """Apply the grade of an edit, of whatever scene, or a .cube file to a region of this scene: all, or as
-    `progdf train` has it."""
-    set: Annotated[tuple[str, ...], UseAppendAction, word("NAME=S")] = ()
-    """Strength of an edit, 0 to 1; repeat it for several edits. An edit that is not named is at 1 in `render`
-    and `export`, at 0 in `view`, --sweep and --sheet, and as a session has it."""
-    gain: Annotated[tuple[str, ...], UseAppendAction, word("NAME:KIND=G")] = ()
-    """How much of one kind of change an edit lets through, 0 to 1: geometry, opacity or color."""
-    solo: Annotated[tuple[str, ...], UseAppendAction, word("NAME")] = ()
-    """Show this edit alone. Repeat it for several edits."""
-    paint: Annotated[tuple[str, ...], UseAppendAction, word("NAME=FILE.npy")] = ()
-    """Painted strength of an edit: a .npy of weights 0 to 1, one per member or per Gaussian."""
-    overshoot: Switch = False
-    """Overshoot to 1.2: extrapolates past the trained range."""
-    blend: Annotated[Blend | None, word("{normalized,sum,over,adjust}", "the session's, else adjust")] = None
-    """How edits that share Gaussians add up."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class DrawingOptions:
-    """How the stack is drawn."""
-
-    up: UpChoice = "auto"
-    """The axis of the scene that is up; auto: as the edits were trained, else from the ground, else −y."""
-    background: Annotated[str, word("COLOR")] = "white"
-    """#rrggbb, white or black."""
-    engine: Annotated[Literal["auto", "gl", "cpu"], word(aliases=["--draw"])] = "auto"
-    """What draws: OpenGL or the CPU rasterizer; auto takes OpenGL where a graphics card does the work."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,14 +54,6 @@ class ViewpointOptions:
     """What fills the picture: an edit's region, or the whole scene."""
     size: Annotated[str | None, word("WIDTHxHEIGHT", "the camera's own, or 640x480")] = None
     """Pixels."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ViewOptions:
-    """Open the window: the splats, one slider per edit. Without a scene it opens on a start page."""
-
-    stack: OmitArgPrefixes[StackOptions] = StackOptions(scene=NO_SCENE)
-    drawing: OmitArgPrefixes[DrawingOptions] = DrawingOptions()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -219,32 +151,6 @@ class OpenStack:
         return name if name in named.values() else named.get(name, name)
 
 
-def parse(kind: type[Any], argv: Sequence[str], command: str) -> Any:
-    """The options of a command. `--session FILE` is FILE in the scene's place; `--split` and `--difference`
-    without a number get theirs.
-
-    Raises:
-        ProgdfError: an option is missing, unknown or of the wrong kind.
-    """
-    first: list[str] = []
-    words: list[str] = []
-    remaining = iter(argv)
-    for argument in remaining:
-        if argument == SESSION:
-            file = next(remaining, None)
-            if file is None:
-                raise ProgdfError(f"{SESSION} needs a file; write {SESSION} FILE")
-            first.append(file)
-        elif argument.startswith(f"{SESSION}="):
-            first.append(argument.removeprefix(f"{SESSION}="))
-        elif words and words[-1] in _BARE and _is_number(argument):
-            words[-1] += f"={argument}"
-        else:
-            words.append(argument)
-    words = [f"{argument}={_BARE[argument]}" if argument in _BARE else argument for argument in words]
-    return parse_options(kind, [*first, *words], command)
-
-
 def open_stack(stack: StackOptions, drawing: DrawingOptions | None = None, unset: float = 0.0) -> OpenStack:
     """Open what the options name.
 
@@ -280,6 +186,17 @@ def open_stack(stack: StackOptions, drawing: DrawingOptions | None = None, unset
     layers = stack_layers(opened.gdfs, stack, unset)
     up = drawing.up if drawing else "auto"
     return OpenStack(opened, replace(view, layers=layers), up_option=up, warning="; ".join(notes))
+
+
+def open_view(stack: StackOptions, drawing: DrawingOptions) -> tuple[session.WindowSession, Path | None]:
+    """What `progdf view` shows first, and the session's file."""
+    if stack.scene == NO_SCENE:
+        return session.WindowSession(document.empty(), ViewState(grid=True)), None
+    opened = open_stack(stack, drawing)
+    state = opened.view
+    if opened.session is None:
+        state = replace(state, grid=True, camera=first_camera(opened.document.scene, up=opened.up))
+    return session.WindowSession(opened.document, state, opened.snapshots, opened.warning), opened.session
 
 
 def _placing(texts: Sequence[str]) -> document.Place:
@@ -409,17 +326,10 @@ def _parse_gain(text: str, gdfs: Sequence[Gdf]) -> tuple[str, str, float]:
 
 def parse_number(text: str, low: float, high: float, problem: str) -> float:
     """A number from `low` to `high`; ProgdfError says `problem` where it is none."""
-    number = float(text) if _is_number(text) else math.nan
+    number = float(text) if is_number(text) else math.nan
     if not low <= number <= high:
         raise ProgdfError(problem)
     return number
-
-
-def _is_number(text: str) -> bool:
-    try:
-        return math.isfinite(float(text))
-    except ValueError:
-        return False
 
 
 def parse_background(text: str) -> Vec3:

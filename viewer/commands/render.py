@@ -1,4 +1,4 @@
-"""The commands `progdf view` and `export`, and `render`: pictures, comparisons, contact sheets and films."""
+"""The commands `progdf render` and `export`: pictures, comparisons, sheets and films; scenes and pages."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ from viewer.camera.view_camera import (
     to_camera,
 )
 from viewer.files import session, timeline_file
-from viewer.files.document import Document, empty
+from viewer.files.document import Document
 from viewer.files.session import WindowSession
 from viewer.files.web_page import PAGE, PageOptions, write_page
 from viewer.pictures import film
@@ -71,17 +71,15 @@ from viewer.state.snapshots import compare_sides
 from viewer.state.view_state import MOST_AMPLIFIED, Comparison, Timeline, ViewState
 
 from .options import (
-    NO_SCENE,
     ExportOptions,
     OpenStack,
     RenderOptions,
-    ViewOptions,
     ViewpointOptions,
     check_edit,
     open_stack,
-    parse,
     parse_number,
 )
+from .stack_options import parse
 
 DEFAULT_SIZE = (640, 480)
 LARGEST_SIDE = 16_384
@@ -89,24 +87,6 @@ _SAY_EVERY_S = 0.5
 _LONGEST_S = 120.0  # of a turntable
 ONE_OF = ("sweep", "sheet", "split", "difference", "timeline", "turntable")
 """Options that each say what the picture is; only a timeline goes with a sheet."""
-
-
-@one_thread()
-def view(argv: Sequence[str]) -> int:
-    """`progdf view`: open the window and stay until it is closed."""
-    options: ViewOptions = parse(ViewOptions, argv, "progdf view")
-    from viewer.app.app import Opened, run  # imgui and glfw, which render and export do without
-
-    def opens() -> Opened:
-        if options.stack.scene == NO_SCENE:
-            return WindowSession(empty(), ViewState(grid=True)), None
-        opened = open_stack(options.stack, options.drawing)
-        state = opened.view
-        if opened.session is None:
-            state = replace(state, grid=True, camera=first_camera(opened.document.scene, up=opened.up))
-        return WindowSession(opened.document, state, opened.snapshots, opened.warning), opened.session
-
-    return run(opens, draw=options.drawing.engine)
 
 
 def export(argv: Sequence[str]) -> int:

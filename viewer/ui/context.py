@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 
-import imgui_bundle
 from imgui_bundle import icons_fontawesome_6 as icons
 from imgui_bundle import imgui
 
+from .splash import ACCENT, FIELD, FONTS, PANEL, REGULAR, TEXT, TEXT_PX
+
 Rgba = tuple[float, float, float, float]
 
-FONT_PX = 15.0  # at 1×
+FONT_PX = TEXT_PX  # at 1×
 SMALL_PX = 13.0
 
 
@@ -26,18 +26,18 @@ class Palette:
     """Calm and neutral, so that the picture keeps its colors; one blue, for what is likely wanted, for values
     and for what has the keyboard or the focus. tests/viewer/app/test_theme.py computes the contrasts."""
 
-    panel: Rgba = _rgb(0x1E2024)
+    panel: Rgba = _rgb(PANEL)
     card: Rgba = _rgb(0x282B30)
     card_focused: Rgba = _rgb(0x2F333A)
-    field: Rgba = _rgb(0x383C43)
+    field: Rgba = _rgb(FIELD)
     field_hovered: Rgba = _rgb(0x434850)
     field_active: Rgba = _rgb(0x4C525B)
     chosen: Rgba = _rgb(0x59606B)
     line: Rgba = _rgb(0x3A3E45)
-    text: Rgba = _rgb(0xDEE1E6)
+    text: Rgba = _rgb(TEXT)
     dim: Rgba = _rgb(0xA6ACB6)
     faint: Rgba = _rgb(0x868D98)
-    accent: Rgba = _rgb(0x5A9CF0)
+    accent: Rgba = _rgb(ACCENT)
     ink: Rgba = _rgb(0x14161A)  # on the accent
     handle: Rgba = _rgb(0xF2F4F7)
     error: Rgba = _rgb(0xF08674)
@@ -190,13 +190,12 @@ def _silence_imgui(silent: bool) -> None:
 
 
 def _load_fonts(atlas: imgui.ImFontAtlas) -> Fonts:
-    folder = Path(imgui_bundle.__file__).parent / "assets" / "fonts"
-    regular = atlas.add_font_from_file_ttf(str(folder / "Roboto" / "Roboto-Regular.ttf"), FONT_PX)
+    regular = atlas.add_font_from_file_ttf(str(REGULAR), FONT_PX)
     merged = imgui.ImFontConfig()
     merged.merge_mode = True
     merged.glyph_min_advance_x = FONT_PX
-    atlas.add_font_from_file_ttf(str(folder / "Font_Awesome_6_Free-Solid-900.otf"), FONT_PX - 2, merged)
-    bold = atlas.add_font_from_file_ttf(str(folder / "Roboto" / "Roboto-Bold.ttf"), FONT_PX)
+    atlas.add_font_from_file_ttf(str(FONTS / "Font_Awesome_6_Free-Solid-900.otf"), FONT_PX - 2, merged)
+    bold = atlas.add_font_from_file_ttf(str(FONTS / "Roboto" / "Roboto-Bold.ttf"), FONT_PX)
     return Fonts(regular, bold)
 
 

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import moderngl
 import numpy as np
 from imgui_bundle import imgui, imgui_ctx
 
@@ -87,26 +85,6 @@ def banner(text: str, area: Area, ui: UiContext) -> None:
     corners = (x - 1.5 * pad, y - pad / 2), (x + wide + 1.5 * pad, y + size + pad / 2)
     imgui.get_background_draw_list().add_rect_filled(*corners, u32(PALETTE.scrim), 5 * ui.scale)
     _text(x, y, text, size, PALETTE.text, ui)
-
-
-def draw_splash(screen: moderngl.Framebuffer, ui: UiContext, text: str, seconds: float) -> None:
-    """A frame of its own: what is waited for, since how many seconds, and a bar that moves."""
-    ui.make_current()
-    imgui.backends.opengl3_new_frame()
-    imgui.new_frame()
-    canvas, display, scale = imgui.get_background_draw_list(), imgui.get_io().display_size, ui.scale
-    words = f"{text}  ·  {seconds:.0f} s" if seconds >= 2.0 else text
-    size, wide, tall = FONT_PX * scale, min(240.0 * scale, display.x), 4.0 * scale
-    x, y = (display.x - wide) / 2, display.y / 2
-    _text((display.x - _text_width(words, size, ui)) / 2, y - 2.0 * size, words, size, PALETTE.text, ui)
-    at = x + 0.7 * wide * (0.5 - 0.5 * math.cos(2.0 * seconds))
-    for left, length, color in ((x, wide, PALETTE.field), (at, 0.3 * wide, PALETTE.accent)):
-        ends = imgui.ImVec2(left, y), imgui.ImVec2(left + length, y + tall)
-        canvas.add_rect_filled(*ends, u32(color), tall / 2)
-    imgui.render()
-    screen.use()
-    screen.clear(*PALETTE.panel)
-    imgui.backends.opengl3_render_draw_data(imgui.get_draw_data())
 
 
 def safe_frame(view: ViewState, area: Area, covered: float = 0.0) -> Area | None:

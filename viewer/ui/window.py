@@ -1,4 +1,4 @@
-"""A glfw window with OpenGL 3.3: opened, listened to, scaled, closed. Nothing of ours is drawn here."""
+"""The glfw window: listened to, scaled, renamed. Nothing is drawn here."""
 
 from __future__ import annotations
 
@@ -15,11 +15,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import glfw
-import moderngl
-from imgui_bundle import imgui
+from .splash import Splash  # first: it says which library glfw loads
 
-from progdf.errors import ProgdfError
+# isort: split
+
+import glfw
+from imgui_bundle import imgui
 
 from .keys import FLY_KEYS, Keys, Press, next_event_id
 
@@ -62,12 +63,6 @@ class DoubleClicks:
         io.mouse_double_click_time, io.mouse_single_click_delay = limit, 2.0 * _ALWAYS_S
 
 
-# before glfw: it makes glfw load the library that imgui was built with
-
-# isort: split
-
-
-LEAST = (640, 400)
 _FLY_KEYS = {name: getattr(glfw, f"KEY_{name}") for name in FLY_KEYS}
 KEY_NAMES = {
     **{getattr(glfw, f"KEY_{c}"): c for c in "ABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789"},
@@ -91,42 +86,17 @@ KEY_NAMES = {
 }
 _X11_LINE_FEED = 109
 """Scancode of a key that glfw does not name: what programs that type for one press as Enter."""
-_HINTS = (
-    (glfw.CONTEXT_VERSION_MAJOR, 3),
-    (glfw.CONTEXT_VERSION_MINOR, 3),
-    (glfw.OPENGL_PROFILE, glfw.OPENGL_CORE_PROFILE),
-    (glfw.OPENGL_FORWARD_COMPAT, True),
-    (glfw.SCALE_TO_MONITOR, True),
-    (glfw.DEPTH_BITS, 0),
-    (glfw.STENCIL_BITS, 0),
-)
 
 
 class Window:
-    """The window, with its GL context current.
+    """The window that a splash opened, once there is an interface in it.
 
     Args:
-        title: in the title bar
-        size: width and height at 1×
-
-    Raises:
-        ProgdfError: there is no display, or no OpenGL 3.3 on it.
+        splash: goes on to be drawn while something is waited for
     """
 
-    def __init__(self, title: str, size: tuple[int, int]) -> None:
-        errors: list[str] = []
-        glfw.set_error_callback(lambda _, text: errors.append(_decode(text)))
-        if not glfw.init():
-            raise _no_window("no window can be opened here", errors)
-        for hint, value in _HINTS:
-            glfw.window_hint(hint, value)
-        self.handle: Any = glfw.create_window(*size, title, None, None)
-        if not self.handle:
-            glfw.terminate()
-            raise _no_window("no window with OpenGL 3.3 can be opened here", errors)
-        glfw.set_window_size_limits(self.handle, *LEAST, glfw.DONT_CARE, glfw.DONT_CARE)
-        glfw.make_context_current(self.handle)
-        glfw.swap_interval(1)
+    def __init__(self, splash: Splash) -> None:
+        self.splash, self.handle, self.context = splash, splash.handle, splash.context
         self._pressed: list[Press] = []
         self._down: dict[int, str] = {}  # names of the keys that are down
         self._chorded: set[int] = set()  # those of them that went down with Ctrl, and do not fly without it
@@ -134,15 +104,6 @@ class Window:
         self._clicks = DoubleClicks()
         self._heard_until = time.perf_counter()  # when it last stopped listening, to draw
         self._unheard_s = 0.0  # how long it had not listened when it last began to
-
-    def context(self) -> moderngl.Context:
-        """Its GL context, for drawing; through glfw's own loader, so that GLX, EGL, WGL and Cocoa all do."""
-        moderngl.init_context(_GlfwLoader())
-        return moderngl.get_context()
-
-    def close(self) -> None:
-        glfw.destroy_window(self.handle)
-        glfw.terminate()
 
     def listen(
         self, wake: Callable[[], None], dropped: Callable[[Sequence[Path]], None], redraw: Callable[[], None]
@@ -322,22 +283,3 @@ def chord(name: str, mods: int) -> str:
     ctrl = glfw.MOD_CONTROL | (glfw.MOD_SUPER if sys.platform == "darwin" else 0)
     modifiers = (("Ctrl+", ctrl), ("Shift+", glfw.MOD_SHIFT), ("Alt+", glfw.MOD_ALT))
     return "".join(prefix for prefix, bit in modifiers if mods & bit) + name
-
-
-class _GlfwLoader:
-    """What moderngl asks for the addresses of OpenGL's functions."""
-
-    def load_opengl_function(self, name: str) -> int:
-        return ctypes.cast(glfw.get_proc_address(name), ctypes.c_void_p).value or 0
-
-    def release(self) -> None:
-        """Nothing is held."""
-
-
-def _no_window(what: str, errors: Sequence[str]) -> ProgdfError:
-    why = f" ({errors[-1]})" if errors else ""
-    return ProgdfError(f"{what}{why}; `progdf render` works without a window")
-
-
-def _decode(text: str | bytes) -> str:
-    return text.decode(errors="replace") if isinstance(text, bytes) else text

@@ -216,7 +216,7 @@ def test_a_signal_that_ends_a_command_takes_its_temporary_files_along(
             os.kill(os.getpid(), getattr(signal, number))
 
     monkeypatch.setattr("progdf.cli.info.main", writing)
-    monkeypatch.setattr("viewer.commands.render.view", writing)
+    monkeypatch.setattr("viewer.commands.view.main", writing)
     assert main([command, "scene.ply"]) == 130
     assert capsys.readouterr().err == "progdf: interrupted\n"
     assert not list(tmp_path.iterdir())

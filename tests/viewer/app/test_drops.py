@@ -27,6 +27,7 @@ from viewer.state.view_state import Keyframe, Timeline
 @pytest.fixture
 def opened(tmp_path: Path) -> Iterator[application.App]:
     """The application on a window of glfw's null platform: everything but a screen."""
+    from viewer.ui.splash import Splash
     from viewer.ui.window import Window, glfw
 
     glfw.init_hint(glfw.PLATFORM, glfw.PLATFORM_NULL)
@@ -35,7 +36,7 @@ def opened(tmp_path: Path) -> Iterator[application.App]:
     glfw.window_hint(glfw.CONTEXT_CREATION_API, glfw.EGL_CONTEXT_API)
     stack = bear()
     try:
-        window = Window("test", (800, 600))
+        window = Window(Splash("test", (800, 600)))
     finally:
         glfw.init_hint(glfw.PLATFORM, glfw.ANY_PLATFORM)
     document = application.Document("bear.ply", stack.scene, stack.gdfs[:1])
@@ -43,7 +44,7 @@ def opened(tmp_path: Path) -> Iterator[application.App]:
     app.draw()
     yield app
     app.close()
-    window.close()
+    window.splash.close()
 
 
 @pytest.mark.gl

@@ -14,7 +14,7 @@ from PIL import Image
 from progdf.io.picture_camera import edits_in_picture, find_picture_camera
 from tests.helpers.ui_rig import BACKGROUND, Rig, rig
 from viewer.camera.view_camera import to_camera
-from viewer.ui.overlay import draw_splash
+from viewer.ui.splash import SplashPicture
 
 pytestmark = pytest.mark.gl
 VIEW = (170.0, 270.0)  # the middle of the picture
@@ -146,9 +146,11 @@ def test_f10_tells_the_times_of_the_picture_on_screen(hand: Rig) -> None:
 
 def test_a_splash_says_what_is_opened_and_since_when_and_that_it_goes_on(hand: Rig) -> None:
     drawn, images = hand.main_view.canvas.pictures_drawn, []
+    picture = SplashPicture(hand.screen.ctx)
     for seconds in (0.0, 1.0, 5.0):
-        draw_splash(hand.screen, hand.main_view.ui, "Opening bear.ply …", seconds)
+        picture.draw(hand.screen, hand.pixels, 1.0, "Opening bear.ply …", seconds)
         images.append(hand.image().astype(int))
+    picture.release()
     assert hand.main_view.canvas.pictures_drawn == drawn
     middle = [image[230:290] for image in images]
     assert len(np.unique(middle[0].reshape(-1, 3), axis=0)) > 10, "a word"

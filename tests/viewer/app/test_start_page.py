@@ -26,6 +26,7 @@ from viewer.files.user_files import describe_age, keep_thumbnail, read_recent, r
 from viewer.render.engine import ViewEngine
 from viewer.render.gl_renderer import headless_context
 from viewer.state.view_state import ViewState
+from viewer.ui.splash import Splash
 
 pytestmark = pytest.mark.gl
 LARGEST = 6 << 20
@@ -158,12 +159,12 @@ def test_a_splash_is_shown_while_a_scene_is_read(
         time.sleep(0.5)
         return load(path)
 
-    def splash(*given: object) -> None:
-        assert given[2] == "Opening bear.ply …"
+    def splash(_: Splash, text: str, __: float) -> None:
+        assert text == "Opening bear.ply …"
         shown.append(time.perf_counter() - begun)
 
     monkeypatch.setattr(documents, "load", load_slowly)
-    monkeypatch.setattr(application, "draw_splash", splash)
+    monkeypatch.setattr(Splash, "draw", splash)
     begun = time.perf_counter()
     window.open(tmp_path / "bear.ply")
     assert window.document.title == "bear.ply"
@@ -177,9 +178,11 @@ def test_what_cannot_be_opened_opens_no_window(
     def no_window(*_: object) -> None:
         raise ProgdfError("no window")
 
-    monkeypatch.setattr(application, "Window", no_window)
+    monkeypatch.setattr("viewer.ui.splash.Splash", no_window)
     assert main(["view", str(tmp_path / "no.ply")]) == 2
     assert "no.ply" in capsys.readouterr().err
-    monkeypatch.setattr(application, "SPLASH_AFTER_S", 0.0)  # read so slowly that there is a window by then
-    assert main(["view", str(tmp_path / "no.ply")]) == 2
-    assert "no.ply" in capsys.readouterr().err, "what is wrong with the file comes first"
+    (tmp_path / "broken.ply").write_text("ply")
+    assert main(["view", str(tmp_path / "broken.ply")]) == 2
+    assert "broken.ply" in capsys.readouterr().err, "what is wrong with the file comes first"
+    assert main(["view", "--background"]) == 2
+    assert "--background" in capsys.readouterr().err

@@ -19,14 +19,14 @@ from benchmarks.viewer.display import display, missing_tools
 from progdf.__main__ import main
 from tests.helpers.paths import ROOT
 from tests.helpers.ui_rig import TRACK, bear
-from viewer.app import app as application
 from viewer.camera.view_camera import first_camera, to_camera
 from viewer.files.session import open_session
 from viewer.panel import card, panel
 from viewer.ui.keys import KEYS, NAMES
+from viewer.ui.splash import SIZE
 
 PATIENCE_S = 120.0  # a busy machine may take long; what has happened is not waited for
-WIDTH, HEIGHT = application.SIZE
+WIDTH, HEIGHT = SIZE
 
 
 @dataclass
@@ -324,3 +324,46 @@ def test_what_the_real_keyboard_types_fast_arrives_whole(desktop: Desktop) -> No
     path = desktop.folder / "bear.session.json"
     desktop.until("the session", path.exists)
     assert open_session(path).view.layers[0].strength == pytest.approx(0.1122)
+
+
+FIRST_FRAME = """
+import sys
+from pathlib import Path
+from viewer.ui.splash import glfw
+swap = glfw.swap_buffers
+
+def first(window):
+    loaded = {"torch", "numba", "imgui_bundle"} & {*sys.modules}
+    print("glfw of", Path(glfw._glfw._name).parent.name, *loaded, file=sys.stderr)
+    glfw.swap_buffers = swap
+    swap(window)
+
+glfw.swap_buffers = first
+from progdf.__main__ import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def view_first(screen: str, *words: object) -> tuple[int, list[str]]:
+    """What a process of its own tells: its status, and which of what is slow to import was there at its first
+    frame; then what it says itself."""
+    command = [sys.executable, "-c", FIRST_FRAME, "view", *map(str, words)]
+    environment = os.environ | {"DISPLAY": screen}
+    for name in ("WAYLAND_DISPLAY", "PYGLFW_LIBRARY"):
+        environment.pop(name, None)
+    ran = subprocess.run(command, env=environment, capture_output=True, text=True, cwd=ROOT, timeout=120.0)
+    return ran.returncode, ran.stderr.splitlines()
+
+
+@pytest.mark.window
+@pytest.mark.gl
+def test_a_window_is_there_before_what_is_slow_to_import(screen: str, tmp_path: Path) -> None:
+    scene, edit, *_ = bear().save(tmp_path)
+    status, lines = view_first(screen, scene, edit, "--set", "hat=0.5")
+    assert status == 2
+    # without any of it, and of two copies of glfw one would know nothing of the other's window
+    assert lines[0] == "glfw of imgui_bundle"
+    assert "there is no edit of that name" in lines[1], "then what only the files tell"
+    assert len(lines) == 2
+    status, lines = view_first(screen, scene, "--blend", "hat")
+    assert (status, len(lines)) == (2, 1), "a wrong option opens no window"

@@ -20,7 +20,8 @@ from tests.helpers.hostile import NPY_HEADERS, npy
 from tests.helpers.scenes import random_gaussians
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from viewer.camera.view_camera import to_camera
-from viewer.commands.options import StackOptions, stack_layers
+from viewer.commands.options import stack_layers
+from viewer.commands.stack_options import StackOptions
 from viewer.files.document import Document
 from viewer.files.session import WindowSession, prune
 from viewer.state import paint

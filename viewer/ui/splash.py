@@ -1,0 +1,170 @@
+"""The window and its first frames, by OpenGL alone: imgui, torch and numba take seconds to import."""
+
+from __future__ import annotations
+
+import ctypes
+import importlib.util
+import math
+import os
+import sys
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, wait
+from pathlib import Path
+from typing import Any, TypeVar
+
+import moderngl
+from PIL import Image, ImageDraw, ImageFont
+
+from progdf.errors import ProgdfError
+from viewer.gl.programs import load_program
+
+_BUNDLE = Path(getattr(importlib.util.find_spec("imgui_bundle"), "origin", "")).parent
+_GLFW = _BUNDLE / {"darwin": "libglfw.3.dylib", "win32": "glfw3.dll"}.get(sys.platform, "libglfw.so.3")
+if _GLFW.exists():  # what imgui was built with, as its import would have it: there is one window of them both
+    os.environ.setdefault("PYGLFW_LIBRARY", str(_GLFW))
+
+# isort: split
+
+import glfw  # noqa: E402
+
+_Made = TypeVar("_Made")
+
+SIZE, LEAST = (1280, 800), (640, 400)
+TITLE = "ProGDF Studio"
+PANEL, FIELD, TEXT, ACCENT = 0x1E2024, 0x383C43, 0xDEE1E6, 0x5A9CF0
+"""Colors of the palette, 0xRRGGBB."""
+_INKS = [f"#{color:06x}" for color in (PANEL, FIELD, TEXT, ACCENT)]
+TEXT_PX = 15.0
+FONTS = _BUNDLE / "assets" / "fonts"
+REGULAR = FONTS / "Roboto" / "Roboto-Regular.ttf"
+AFTER_S, EVERY_S = 0.15, 0.1
+"""How long one waits before a splash is shown, and between two frames of it."""
+FIRST_S, FIRST_TEXT = 4.0, "(the first time on a machine this takes half a minute)"
+"""What is said of waiting so long."""
+_HINTS = (
+    (glfw.CONTEXT_VERSION_MAJOR, 3),
+    (glfw.CONTEXT_VERSION_MINOR, 3),
+    (glfw.OPENGL_PROFILE, glfw.OPENGL_CORE_PROFILE),
+    (glfw.OPENGL_FORWARD_COMPAT, True),
+    (glfw.SCALE_TO_MONITOR, True),
+    (glfw.DEPTH_BITS, 0),
+    (glfw.STENCIL_BITS, 0),
+)
+
+
+class Splash:
+    """A glfw window with OpenGL 3.3, its context current, that says what is waited for.
+
+    Args:
+        title: in the title bar
+        size: width and height at 1×
+
+    Raises:
+        ProgdfError: there is no display, or no OpenGL 3.3 on it.
+    """
+
+    def __init__(self, title: str = TITLE, size: tuple[int, int] = SIZE) -> None:
+        errors: list[str] = []
+        glfw.set_error_callback(lambda _, text: errors.append(_decode(text)))
+        if not glfw.init():
+            raise _no_window("no window can be opened here", errors)
+        for hint, value in _HINTS:
+            glfw.window_hint(hint, value)
+        self.handle: Any = glfw.create_window(*size, title, None, None)
+        if not self.handle:
+            glfw.terminate()
+            raise _no_window("no window with OpenGL 3.3 can be opened here", errors)
+        glfw.set_window_size_limits(self.handle, *LEAST, glfw.DONT_CARE, glfw.DONT_CARE)
+        glfw.make_context_current(self.handle)
+        glfw.swap_interval(1)
+        # through glfw's own loader, so that GLX, EGL, WGL and Cocoa all do
+        moderngl.init_context(_GlfwLoader())
+        self.context: moderngl.Context = moderngl.get_context()
+        self._picture = SplashPicture(self.context)
+
+    def close(self) -> None:
+        glfw.destroy_window(self.handle)
+        glfw.terminate()
+
+    def draw(self, text: str, seconds: float) -> None:
+        """A frame: what is waited for, since how many seconds, and a bar that moves."""
+        size, scale = glfw.get_framebuffer_size(self.handle), glfw.get_window_content_scale(self.handle)[0]
+        if 0 not in size:
+            self._picture.draw(self.context.screen, size, scale, text, seconds)
+            glfw.swap_buffers(self.handle)
+
+    def wait(self, work: Future[_Made], text: str, listen: Callable[[], object] = glfw.poll_events) -> _Made:
+        """What another thread makes; meanwhile the window hears its events and soon shows a splash."""
+        begun, patience = time.perf_counter(), AFTER_S
+        while not wait([work], patience).done:
+            patience, seconds = EVERY_S, time.perf_counter() - begun
+            listen()
+            self.draw(text if seconds < FIRST_S else f"{text} {FIRST_TEXT}", seconds)
+        return work.result()
+
+
+class SplashPicture:
+    """Says in a framebuffer what is waited for; `release` it when done."""
+
+    def __init__(self, context: moderngl.Context) -> None:
+        self._context = context
+        self._program = load_program(context, "present.vert", "present.frag")
+        self._vao = context.vertex_array(self._program, [])
+
+    def draw(
+        self, screen: moderngl.Framebuffer, size: tuple[int, int], scale: float, text: str, seconds: float
+    ) -> None:
+        """Fill the framebuffer.
+
+        Args:
+            size: its width and height, pixels
+            scale: pixels per design pixel
+            text: what is waited for
+            seconds: since when; a bar moves with it
+        """
+        panel, field, ink, accent = _INKS
+        words = f"{text}  ·  {seconds:.0f} s" if seconds >= 2.0 else text
+        font = ImageFont.truetype(REGULAR, TEXT_PX * scale)
+        wide, tall, middle = 240.0 * scale, 4.0 * scale, size[1] // 2
+        width = min(round(max(font.getlength(words), wide)), size[0])
+        image = Image.new("RGBA", (width, middle + round(3.0 * TEXT_PX * scale)), panel)
+        canvas, y, x = ImageDraw.Draw(image), image.height - middle, (width - wide) / 2
+        canvas.text((width / 2, y - 1.2 * TEXT_PX * scale), words, ink, font, anchor="mm")
+        at = x + 0.7 * wide * (0.5 - 0.5 * math.cos(2.0 * seconds))
+        for left, length, color in ((x, wide, field), (at, 0.3 * wide, accent)):
+            canvas.rounded_rectangle((left, y, left + length, y + tall), tall / 2, color)
+        screen.use()
+        self._context.viewport = (0, 0, *size)
+        red, green, blue = PANEL.to_bytes(3, "big")
+        screen.clear(red / 255, green / 255, blue / 255)
+        picture, left = self._context.texture(image.size, 4, image.tobytes()), (size[0] - width) // 2
+        picture.use(0)
+        self._program["picture"], self._program["left"] = 0, left
+        self._context.viewport = (left, 0, *image.size)
+        self._context.enable_only(moderngl.NOTHING)
+        self._vao.render(moderngl.TRIANGLES, vertices=3)
+        picture.release()
+
+    def release(self) -> None:
+        self._vao.release()
+        self._program.release()
+
+
+class _GlfwLoader:
+    """What moderngl asks for the addresses of OpenGL's functions."""
+
+    def load_opengl_function(self, name: str) -> int:
+        return ctypes.cast(glfw.get_proc_address(name), ctypes.c_void_p).value or 0
+
+    def release(self) -> None:
+        """Nothing is held."""
+
+
+def _no_window(what: str, errors: Sequence[str]) -> ProgdfError:
+    why = f" ({errors[-1]})" if errors else ""
+    return ProgdfError(f"{what}{why}; `progdf render` works without a window")
+
+
+def _decode(text: str | bytes) -> str:
+    return text.decode(errors="replace") if isinstance(text, bytes) else text
