@@ -143,7 +143,7 @@ class MainView:
         self._revealed = (self.work.focus, False)  # the layer that the panel shows, and whether it has a bar
         self._keys = NO_KEYS  # of the present frame
         self._taps = Taps()
-        self._held = False  # something of the interface, by the mouse or the keyboard
+        self._held = False  # something of the interface in the last frame, by the mouse or the keyboard
         self._popups = 0, 0  # how many were open as the last frame began, and this one
         self._half = 0  # of two pictures side by side, the one that the mouse is in
         self._clock = 0.0
@@ -274,7 +274,8 @@ class MainView:
         before = self.work
         self._keys = self._pending.take(keys)
         self._handle_input(seconds)
-        held = imgui.is_any_item_active() or self._tool.drag is not None
+        self._held = bool(imgui.is_any_item_active())
+        held = self._held or self._tool.drag is not None
         if not (held or is_repeating(keys) or is_flying(self._keys)):
             self.work = workspace.record_undo(self.work)
         if self.work.view.layers != before.view.layers:
@@ -308,7 +309,7 @@ class MainView:
         return overlay.Area(max(display.x - wide, 1.0), max(display.y, 1.0))
 
     def _handle_input(self, seconds: float) -> None:
-        off = cancels_drag(self._keys, self._tool.drag)
+        off = cancels_drag(self._keys, self._held, self._tool.drag)
         if off:
             self._cancel_drag()
         view, asks = self.work.view, self._takes_keys()
@@ -379,7 +380,6 @@ class MainView:
             self._perform(f"next_place:{self.work.keyboard_by}")
         self.ui.keyboard = self.work.keyboard
         self.ui.focused = self.ui.focused if self.work.keyboard else ""
-        self._held = bool(imgui.is_any_item_active())
 
     def _move_gizmo(self) -> bool:
         """Handles, or a decal, follow the mouse; whether it is theirs."""

@@ -492,14 +492,15 @@ def any_button_down() -> bool:
     return any(imgui.is_mouse_down(button) for _, button in _BUTTONS)
 
 
-def cancels_drag(keys: Keys, drag: str | None) -> bool:
+def cancels_drag(keys: Keys, held: bool, drag: str | None) -> bool:
     """Whether Escape or the right button takes back what the left button is dragging.
 
     Args:
+        held: something of the interface was held in the last frame: imgui lets go of it at Escape
         drag: what is held on the picture, see `mouse.MouseTool`; the camera stays where it was turned
     """
     io, buttons = imgui.get_io(), imgui.MouseButton_
-    holds = imgui.is_any_item_active() or (drag is not None and all(drag != d.does for d in DRAGS))
+    holds = held or (drag is not None and all(drag != d.does for d in DRAGS))
     if not holds or io.want_text_input or not imgui.is_mouse_down(buttons.left.value):
         return False
     escape = any(press.chord == "Escape" for press in keys.pressed)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import pytest
+from imgui_bundle import imgui
 
 from tests.helpers.ui_rig import HEAD, Rig, bear, first_view, rig
 from viewer.panel.timeline_bar import HEIGHT_PX, ROW_PX
@@ -23,12 +24,19 @@ def by_escape(hand: Rig) -> None:
     hand.key("Escape")
 
 
+def by_escape_that_imgui_hears_too(hand: Rig) -> None:
+    """As in the window: imgui itself lets go of what is held."""
+    hand.io.add_key_event(imgui.Key.escape, True)
+    hand.key("Escape")
+    hand.io.add_key_event(imgui.Key.escape, False)
+
+
 def by_right_click(hand: Rig) -> None:
     hand.press(1)
     hand.release(1)
 
 
-WAYS = (by_escape, by_right_click)
+WAYS = (by_escape, by_escape_that_imgui_hears_too, by_right_click)
 ways = pytest.mark.parametrize("call_off", WAYS)
 
 
