@@ -30,7 +30,15 @@ from trainer.fit.slider_uniformity import equalized_strengths
 from trainer.optimize.color_solver import (
     STEPS as TAKEN,
 )
-from trainer.optimize.color_solver import Model, add_bands, choose_model, iterations, make_solver, solve
+from trainer.optimize.color_solver import (
+    Model,
+    add_bands,
+    choose_model,
+    enrich,
+    iterations,
+    make_solver,
+    solve,
+)
 from trainer.optimize.color_views import Judge, color_views
 from trainer.optimize.pgs import PgsState, TargetStage
 from trainer.optimize.retime import smooth_course
@@ -162,7 +170,8 @@ class Edit:
         strengths = self.strengths(8, model.allowed_share)
         stages = [TargetStage(s, self.targets(s), 1) for s in strengths]
         judges, state = [choosing(s) for s in strengths], PgsState(self.original)
-        began = time.process_time()
+        began, middle = time.process_time(), (len(strengths) - 1) // 2
+        model = enrich(model, solver, stages[middle], judges[middle], most)
         made = list(solve(self.original, solver, model, stages, judges, state, lambda step, left: None, most))
         spent += time.process_time() - began
         steps = ", ".join(f"{snapshot.means.get(TAKEN, 0):.0f}" for snapshot in made)

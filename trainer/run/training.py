@@ -25,6 +25,7 @@ from trainer.optimize.color_solver import (
     Model,
     Solver,
     choose_model,
+    enrich,
     iterations,
     make_solver,
     solve,
@@ -282,13 +283,16 @@ def _prepare_colors(
         trials = [(solver, judge)] if ties is None else split_solver(solver, original, finished)
         solver, model = choose_model(solver, trials, finished, most, 1 if optimization.sh == "off" else 4)
     on = "all views, as none is held out" if judge.views is drawn else "views that are held out"
+    edited = edited if between is None else between(model.allowed_share)
+    stages = [TargetStage(s, _boxes(some, setup.train, engine), 1) for s, some in edited.items()]
+    judges, middle = [judging(pictures) for pictures in edited.values()], (len(stages) - 1) // 2
+    with log.stage("model"):
+        model = enrich(model, solver, stages[middle], judges[middle], most)
     log.say(f"{model.line}, on {on if ties is None else 'squares of the pictures that are held out'}")
     if ties is not None:
         unseen = len(original) - int(solver.asked.sum())
         log.say(f"{unseen} members that no picture shows follow the map and their own surface")
-    edited = edited if between is None else between(model.allowed_share)
-    stages = [TargetStage(s, _boxes(some, setup.train, engine), 1) for s, some in edited.items()]
-    return solver, model, edited, stages, [judging(pictures) for pictures in edited.values()]
+    return solver, model, edited, stages, judges
 
 
 def _stride(setup: TrainingSetup, original: Tensor) -> int:

@@ -15,7 +15,7 @@ from progdf.rasterize.engines import color_map
 from progdf.region import Region
 from progdf.sh import rgb_to_sh0
 from tests.helpers.scenes import random_gaussians
-from trainer.optimize.color_solver import Model, Solver, add_bands, choose_model, make_solver, solve
+from trainer.optimize.color_solver import Model, Solver, add_bands, choose_model, enrich, make_solver, solve
 from trainer.optimize.color_views import Judge, color_views
 from trainer.optimize.pgs import OnStep, ParameterSnapshot, PgsState, TargetStage
 from trainer.setup import unresolved_share
@@ -210,6 +210,35 @@ def test_a_pattern_of_many_colors_gets_a_residual_and_only_as_many_bands_as_pay(
     turned = replace(edited, shN=scene.shN * (1.0 - 2.0 * side[..., None]))
     assert bands_of(turned) == 4
     assert bands_of(turned, most=1) == 1
+
+
+@pytest.mark.parametrize(("turns", "bands"), [(2.0, 4), (0.0, 1)])
+def test_a_second_band_that_hardly_pays_at_the_end_is_taken_where_it_pays_on_the_way(
+    turns: float, bands: int
+) -> None:
+    scene = dense_ball(1500, bands=3)
+    side = (scene.means[:, :1] > 0).float()
+    moved = (
+        scene.sh0 + side * torch.tensor([[1.0, -0.8, 0.3]]) + (1 - side) * torch.tensor([[-0.7, 0.2, 0.9]])
+    )
+    shN = scene.shN * (1.0 - turns * side[..., None])
+    crops, original = prepared(scene, orbit(8, 64))
+    others, _ = prepared(scene, orbit(11, 64)[8:])
+    solver, aside = make_solver(color_views(crops, original), original), color_views(others, original)
+
+    def pictures(some: list[CropScene], s: float) -> list[Tensor]:
+        edited = replace(scene, sh0=torch.lerp(scene.sh0, moved, s), shN=shN)
+        return render_all(some, pack(edited, with_shN=True))
+
+    # what no residual can show hides at the end what a band is worth
+    rng = torch.Generator().manual_seed(0)
+    noisy = [image + 0.085 * torch.randn(image.shape, generator=rng) for image in pictures(others, 1.0)]
+    solver, model = choose_model(solver, [(solver, Judge(aside, noisy))], pictures(crops, 1.0), 40, 4)
+    assert model.bands == 1
+    stage = TargetStage(0.1, pictures(crops, 0.1), 1)
+    richer = enrich(model, solver, stage, Judge(aside, pictures(others, 0.1)), 40)
+    assert richer.bands == bands, richer.line
+    assert enrich(richer, solver, stage, Judge(aside, pictures(others, 0.1)), 40) is richer
 
 
 @pytest.mark.parametrize(("members", "size", "most"), [(200, 64, 60), (6000, 40, 40)])
