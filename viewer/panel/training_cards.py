@@ -34,19 +34,24 @@ def draw(jobs: Sequence[Job], ui: UiContext, actions: list[str]) -> None:
         return
     is_open, seen, tall = imgui.get_id(_OPEN), imgui.get_id("seen failure"), imgui.get_id(_TALL)
     failed = max((job.number for job in listed if _is_failed(job)), default=0)
-    if failed > storage.get_int(seen):
-        storage.set_int(seen, failed)
+    unseen = failed > storage.get_int(seen)
+    if unseen:
         storage.set_bool(is_open, True)
     imgui.separator()
     if storage.get_bool(is_open):
-        room = 0.5 * imgui.get_window_height()
-        imgui.begin_child("jobs", (0.0, max(min(storage.get_float(tall), room), 1.0)))
+        room, before = 0.5 * imgui.get_window_height(), storage.get_float(tall)
+        bar = imgui.WindowFlags_.no_scrollbar.value * (before < room)  # not for a frame while cards grow
+        imgui.begin_child("jobs", (0.0, max(min(before, room), 1.0)), 0, bar)
         for job in listed:
             with imgui_ctx.push_id(str(job.number)):
                 actions += _card(job, ui)
+            if unseen and job.number == failed:
+                imgui.set_scroll_here_y(1.0)
         needed = imgui.get_cursor_pos_y() - imgui.get_style().item_spacing.y
         imgui.end_child()
         storage.set_float(tall, min(needed, room))
+        if before == min(needed, room):  # the cards have their heights
+            storage.set_int(seen, failed)
     if _strip(listed, storage.get_bool(is_open), ui):
         storage.set_bool(is_open, not storage.get_bool(is_open))
 

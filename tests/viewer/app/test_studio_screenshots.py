@@ -21,6 +21,7 @@ from viewer.render.engine import ViewEngine
 from viewer.render.gl_renderer import headless_context
 from viewer.state.view_state import ViewState
 from viewer.state.workspace import Dialog
+from viewer.ui.splash import LEAST
 
 Compare = Callable[[str, np.ndarray], None]
 SMALLEST = (1024, 640)
@@ -98,6 +99,25 @@ def test_the_question_about_a_film(screenshot: Compare) -> None:
         hand.main_view.ask(Dialog("render_film", "/scenes/bear_edited.mp4", options=options))
         hand.frame(4)
         screenshot("ui_film", hand.image()[:420, :720])
+
+
+def test_the_buttons_of_the_second_failure_are_whole(screenshot: Compare) -> None:
+    film = Delivery("Rendering film.mp4", Path("/scenes/film.mp4"), (), Path("film.log"), Path("bear.ply"))
+    line = "no frame could be written: the disk takes no more, free some space"
+    jobs = tuple(Job(number, replace(film), "failed", error=line) for number in (1, 2))
+    with rig(first_view(bear(), 0.7), LEAST) as hand:
+        for count in (1, 2):
+            hand.main_view.work = replace(hand.main_view.work, jobs=jobs[:count])
+            hand.main_view.wake()
+            hand.settle()
+        screenshot("ui_failures", hand.image()[:, 330:])
+        closes = [
+            y
+            for y in range(LEAST[1] - 120, LEAST[1] - 60, 2)
+            if not hand.click(LEAST[0] - 60.0, float(y))
+            and hand.main_view.take_requests() == ("close_run:2",)
+        ]
+        assert closes[-1] - closes[0] >= 12, "one hits it anywhere"
 
 
 def test_a_second_click_where_stop_was_goes_on(software_gpu: None) -> None:
