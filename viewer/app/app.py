@@ -223,6 +223,7 @@ class App:
         self.window.new_frame()
         screen = self.context.screen
         self.main_view.frame(screen, self.window.pixels, seconds, self.window.take_keys(), arrived)
+        self.window.point(self.main_view.pointed.at)
         self.window.present()
         self._rename()
         for request in self.main_view.take_requests():

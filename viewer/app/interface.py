@@ -316,6 +316,7 @@ def over_picture(
     labels: Labels,
     figures: Sequence[tuple[str, str]],
     original: bool,
+    at: tuple[float, float] | None,
 ) -> Workspace:
     """The brush, the comparison, timings, bindings and the message, which leaves when its time is over.
 
@@ -324,6 +325,7 @@ def over_picture(
         labels: over the comparison on screen
         figures: of the table of timings
         original: the key that shows it is held
+        at: where keys moved the pointer
     """
     area, ui, view = pointer.area, pointer.ui, work.view
     io = imgui.get_io()
@@ -333,8 +335,8 @@ def over_picture(
     overlay.draw_axes(view, area, on_axes or held.drag == overlay.AXES_DRAG, ui)
     select_tool.draw_strokes(held.strokes, work, pointer)
     select_tool.draw_gesture(held.gesture, view, ui, pointer.left)
-    if view.select.tool in select_tool.CLICKED and view.panel:
-        overlay.draw_cross(area, ui)
+    if at is not None:
+        overlay.draw_cross(at, ui)
     if not original:
         mouse.draw_comparison(view, area, mouse.grips_divider(held, view, pointer), ui)
     if not view.panel and (original or view.compare.mode != "off"):

@@ -52,7 +52,7 @@ from . import interface, mouse, select_tool
 from .canvas import Canvas
 from .decal import Decal
 from .gizmo import Gizmo
-from .mouse import MouseTool
+from .mouse import KeyPointer, MouseTool
 from .studio import pages
 from .studio.pages import Cover
 
@@ -140,6 +140,7 @@ class MainView:
         self.frames = 0  # all that were drawn
         self.latencies_ms: deque[float] = deque(maxlen=120)  # from a slider's event to finished pixels
         self._tool = MouseTool()
+        self.pointed = KeyPointer()
         self._revealed = (self.work.focus, False)  # the layer that the panel shows, and whether it has a bar
         self._keys = NO_KEYS  # of the present frame
         self._taps = Taps()
@@ -319,13 +320,7 @@ class MainView:
                 self._tool.gesture, self.work, self._pointer(), self._keys
             )
             self._tool = replace(self._tool, gesture=gesture)
-            if (
-                any(p.chord == "Enter" for p in self._keys.pressed)
-                and view.select.tool in select_tool.CLICKED
-            ):
-                wide, tall = self._pointer().size
-                click, self.work = select_tool.click(self.work, self._pointer(), (wide / 2, tall / 2))
-                self._tool, self._keys = replace(self._tool, click=click), replace(self._keys, pressed=())
+        self._point_by_keys(asks)
         flies = view.camera.mode == "fly"
         self._taps, tapped = tapped_actions(self._taps, self._keys, self._clock, flies)
         if asks:  # no key is a shortcut or flies
@@ -361,6 +356,20 @@ class MainView:
             tool, pointer, self._tool = self._tool, self._pointer(), MouseTool()  # put down if it raises
             with self._guard():
                 self._tool, self.work = mouse.handle_mouse(tool, self.work, pointer)
+
+    def _point_by_keys(self, asks: bool) -> None:
+        """Keys move the pointer of what is in the hand."""
+        work, decal = self.work, isinstance(self.gizmo, Decal)
+        picks = work.form_open and work.form.picks
+        if decal or picks or work.view.select.tool or work.view.brush.active:
+            clicks = decal or picks or work.view.select.tool in select_tool.CLICKED
+            if not (asks or self.at_start or imgui.get_io().want_text_input):
+                self.pointed, self._keys = mouse.point_by_keys(
+                    self.pointed, self._keys, self._pointer(), clicks
+                )
+        elif self.pointed.at or self.pointed.down:
+            mouse.let_go(self.pointed)
+            self.pointed = KeyPointer()
 
     def _follow_keyboard(self, asks: bool) -> None:
         """A part of the window that has the keyboard takes all keys but F1 to F12 and those with Ctrl, until
@@ -413,6 +422,7 @@ class MainView:
     def _cancel_drag(self) -> None:
         """What is dragged goes back to where it was, and nothing is held any more."""
         self.work, self._tool = mouse.cancel_drag(self._tool, self.work), MouseTool()
+        self.pointed = mouse.let_go(self.pointed)
         imgui.internal.clear_active_id()
         self._keys = replace(self._keys, pressed=())
 
@@ -481,11 +491,12 @@ class MainView:
         if (frame := self._frame()) is not None:
             overlay.draw_frame(self.work.view.safe_frame, frame, pointer.area, self.ui)
         with self._guard():
-            offered = pages.COMMANDS if self.at_start else tuple(COMMANDS)
+            offered = pages.COMMANDS if self.at_start else [a for a, c in COMMANDS.items() if not c.in_hand]
             self.work = interface.draw_lists(self.work, pointer, offered, pressed)
         labels = self.canvas.comparer.labels(self.work.view)
         figures = self.figures() if self.work.view.overlay else []
-        self.work = interface.over_picture(self.work, pointer, self._tool, labels, figures, original)
+        at = self.pointed.at
+        self.work = interface.over_picture(self.work, pointer, self._tool, labels, figures, original, at)
         gone = (before.dialog, self.work.dialog), (before.message, self.work.message)
         if any(was is not None and now is None for was, now in gone):
             self.wake()

@@ -18,7 +18,7 @@ from viewer.state.view_state import Brush, SelectTool, ViewState
 from viewer.state.workspace import Workspace
 from viewer.ui import overlay
 from viewer.ui.context import PALETTE, UiContext, u32
-from viewer.ui.keys import any_button_down, modifier, started_drag
+from viewer.ui.keys import HAND_KEYS, Keys, any_button_down, has_pending_input, modifier, started_drag
 from viewer.ui.overlay import Area
 from viewer.ui.pointer import PointerContext
 
@@ -86,6 +86,54 @@ class MouseTool:
     axis: str = ""  # the end of an axis that was pressed, of `AXES`, or another part of the axes
     # of the tools that select and paint, as they were before a button was pressed
     settings: tuple[SelectTool, Brush] | None = None
+
+
+@dataclass(frozen=True)
+class KeyPointer:
+    """The pointer of a tool as keys move it."""
+
+    at: tuple[float, float] | None = None  # in the window; None while the mouse moves it
+    down: bool = False  # keys pressed the button
+
+
+def point_by_keys(
+    held: KeyPointer, keys: Keys, pointer: PointerContext, clicks: bool
+) -> tuple[KeyPointer, Keys]:
+    """Keys move the pointer and press its button, and imgui hears of it as of the mouse; others go on.
+
+    Args:
+        clicks: what is in the hand needs no more than a click, by which it is let go
+    """
+    io, area, at, down = imgui.get_io(), pointer.area, held.at, held.down
+    if (
+        at is not None
+        and not has_pending_input()
+        and max(abs(io.mouse_pos.x - at[0]), abs(io.mouse_pos.y - at[1])) > 1.0
+    ):
+        at = None  # the mouse was moved
+    for press in keys.pressed:
+        if (command := HAND_KEYS.get(press.chord)) is None:
+            continue
+        at = at or (area.width / 2, area.height / 2)
+        if command.action == "point_press" and press.again:
+            continue
+        if way := command.action.partition(":")[2]:
+            x, y = (a + float(step) * pointer.ui.scale for a, step in zip(at, way.split(","), strict=True))
+            at = round(min(max(x, 0.0), area.width - 1.0)), round(min(max(y, 0.0), area.height - 1.0))
+        io.add_mouse_pos_event(*at)
+        if not way:
+            for pressed in (True, False) if clicks else (not down,):
+                io.add_mouse_button_event(0, pressed)
+            down = not (clicks or down)
+    unused = tuple(press for press in keys.pressed if press.chord not in HAND_KEYS)
+    return KeyPointer(at, down), replace(keys, pressed=unused)
+
+
+def let_go(held: KeyPointer) -> KeyPointer:
+    """The button that keys pressed goes up."""
+    if held.down:
+        imgui.get_io().add_mouse_button_event(0, False)
+    return replace(held, down=False)
 
 
 def handle_mouse(tool: MouseTool, work: Workspace, pointer: PointerContext) -> tuple[MouseTool, Workspace]:

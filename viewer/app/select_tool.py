@@ -217,15 +217,16 @@ def press(gesture: Gesture | None, work: Workspace, pointer: PointerContext) -> 
     return (None, work) if begun_at is None else follow(begun_at, work, pointer)
 
 
-CLICKED = ("flood", "color")
-"""Tools that need no more than a click, also Enter's at the cross in the middle of the picture."""
+CLICKED = ("flood", "color", "polygon")
+"""Tools that need no more than clicks."""
 
 
-def click(work: Workspace, pointer: PointerContext, at: Point | None = None) -> tuple[Click, Workspace]:
-    """The left button went down over the picture, with one of `CLICKED`; or Enter, `at` a pixel of it."""
+def click(work: Workspace, pointer: PointerContext) -> tuple[Click, Workspace]:
+    """The left button went down over the picture, with a tool that selects what is like that."""
     tool, before = work.view.select, work.view.selection.members
-    at = pointer.cursor if at is None else at
-    made = Click(tool.tool, mode(tool.mode), before, at, pointer.surface, (0.0, False), before, before)
+    made = Click(
+        tool.tool, mode(tool.mode), before, pointer.cursor, pointer.surface, (0.0, False), before, before
+    )
     made, work = _click(made, work, pointer)
     return replace(made, recorded=made.after), work
 

@@ -40,6 +40,7 @@ class Command:
     types: bool = False  # one types afterwards
     row: str = ""  # in the list of keys, where it is about several commands; `JOINED` for the others of them
     listed: str = ""  # its keys there, where they are too many
+    in_hand: bool = False  # of a tool or a decal in the hand, which then has these keys before others
 
 
 DRAGS = (
@@ -78,6 +79,13 @@ def _nudges() -> Iterator[Command]:
         for (arrow, other), sign in ((("Right", "Up"), 1), (("Left", "Down"), -1)):
             keys = f"{modifier}{arrow} {modifier}{other}"
             yield Command(f"nudge:{sign * step:g}", f"Strength {100 * sign * step:+g} %", keys, repeats=True)
+
+
+def _points() -> Iterator[Command]:
+    for modifier, step in (("", 4), ("Shift+", 40)):
+        for arrow, x, y in (("Left", -1, 0), ("Right", 1, 0), ("Up", 0, -1), ("Down", 0, 1)):
+            name = f"Pointer {arrow.lower()} by {step} px"
+            yield Command(f"point:{x * step},{y * step}", name, f"{modifier}{arrow}", in_hand=True)
 
 
 def _looks() -> Iterator[Command]:
@@ -177,6 +185,16 @@ TOPICS: dict[str, tuple[Command, ...]] = {
         Command("select_tool:sphere", "Sphere", "Shift+R", f"Drag from its center on a surface. {MODES}"),
         Command("select_tool:flood", "Connected and alike", "J", f"Click a surface. {MODES}"),
         Command("select_tool:color", "Everything alike", "I", f"Click a color. {MODES}"),
+        *_row("← → ↑ ↓", "Tool's pointer; Shift far", _points()),
+        Command(
+            "point_press",
+            "Press, or let go",
+            "Space Enter Shift+Space Ctrl+Space Ctrl+Shift+Space",
+            "As the mouse button does: corners, clicks, or a drag until it is pressed again",
+            row="Tool: press, let go",
+            listed="Space Enter",
+            in_hand=True,
+        ),
         Command("select_through", "Front or through", "N", "The front surface, or what lies behind it too"),
         Command("select_all", "Select everything", "Ctrl+A", row="All; Shift nothing"),
         Command("select_none", "Select nothing", "Ctrl+Shift+A", row=JOINED),
@@ -249,7 +267,8 @@ TOPICS: dict[str, tuple[Command, ...]] = {
 }
 COMMANDS = {command.action: command for commands in TOPICS.values() for command in commands}
 KEYS: dict[str, Command] = {}
-"""By its chord, what each key does; see `bind`."""
+HAND_KEYS: dict[str, Command] = {}
+"""By its chord, what each key does, and what it does before that with a tool in the hand; see `bind`."""
 NAMES = (
     *"ABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789\\[],.=-",
     *(f"F{i}" for i in range(1, 13)),
@@ -265,7 +284,8 @@ def bind(changes: Mapping[str, Any]) -> list[str]:
     Args:
         changes: by its action a chord, several or "" for none; a key that was another one's is no longer that
     """
-    problems, given, changed = list[str](), dict[str, Command](), list[Command]()
+    problems, changed = list[str](), list[Command]()
+    given: dict[tuple[str, bool], Command] = {}
     for action, value in changes.items():
         texts = [value] * bool(value) if isinstance(value, str) else value
         try:
@@ -273,21 +293,24 @@ def bind(changes: Mapping[str, Any]) -> list[str]:
                 raise ValueError("there is no such command")
             if not (isinstance(texts, list) and all(isinstance(text, str) for text in texts)):
                 raise ValueError('keys are written as "F6" or ["F6", "Ctrl+B"]')
-            taken = dict.fromkeys(map(parse_chord, texts), COMMANDS[action])
-            if twice := [chord for chord in taken if chord in given]:
-                raise ValueError(f"{twice[0]} is that of {given[twice[0]].action} already")
-            if flies := [chord for chord in taken if chord in FLY_KEYS and not COMMANDS[action].tap]:
+            command = COMMANDS[action]
+            taken = {(parse_chord(text), command.in_hand): command for text in texts}
+            if twice := [key for key in taken if key in given]:
+                raise ValueError(f"{twice[0][0]} is that of {given[twice[0]].action} already")
+            if flies := [chord for chord, _ in taken if chord in FLY_KEYS and not COMMANDS[action].tap]:
                 raise ValueError(f"{flies[0]} flies")
             given.update(taken)
             changed.append(COMMANDS[action])
         except ValueError as error:
             problems.append(f"{action}: {error}")
     KEYS.clear()
+    HAND_KEYS.clear()
     chords.cache_clear()
     for command in COMMANDS.values():
-        mine = [chord for chord, other in given.items() if other is command]
-        kept = [] if command in changed else [chord for chord in command.keys.split() if chord not in given]
-        KEYS.update(dict.fromkeys([*mine, *kept], command))
+        mine = [chord for (chord, _), other in given.items() if other is command]
+        own = [] if command in changed else command.keys.split()
+        kept = [chord for chord in own if (chord, command.in_hand) not in given]
+        (HAND_KEYS if command.in_hand else KEYS).update(dict.fromkeys([*mine, *kept], command))
     return problems
 
 
@@ -308,15 +331,21 @@ _MODIFIERS = ("Ctrl", "Shift", "Alt")
 
 def is_changed(command: Command) -> bool:
     """Whether the person has given it other keys, or its own to another one."""
-    return [chord for chord, other in KEYS.items() if other is command] != command.keys.split()
+    return bound_chords(command) != command.keys.split()
+
+
+def bound_chords(command: Command) -> list[str]:
+    """The keys that a command has."""
+    keys = HAND_KEYS if command.in_hand else KEYS
+    return [chord for chord, other in keys.items() if other is command]
 
 
 @cache  # each frame's tips and menus ask for a hundred
 def chords(action: str) -> tuple[str, ...]:
     """All keys of an action, in a person's words."""
-    bound = [chord for chord, command in KEYS.items() if command.action == action]
     return tuple(
-        chord.replace("Delete", "Del").replace("Num", "Numpad ").replace("Escape", "Esc") for chord in bound
+        chord.replace("Delete", "Del").replace("Num", "Numpad ").replace("Escape", "Esc")
+        for chord in bound_chords(COMMANDS[action])
     )
 
 

@@ -105,11 +105,11 @@ def fit_to_frame(view: ViewState, frame: Area, area: Area) -> ViewState:
     return replace(view, camera=widen(view.camera, frame.height / area.height))
 
 
-def draw_cross(area: Area, ui: UiContext) -> None:
-    """The middle of the picture."""
-    x, y, canvas = round(area.width / 2), round(area.height / 2), imgui.get_background_draw_list()
-    for color, thick in ((PALETTE.scrim, 3.0), (PALETTE.handle, 1.0)):
-        for dx, dy in ((6.0 * ui.scale, 0.0), (0.0, 6.0 * ui.scale)):
+def draw_cross(at: tuple[float, float], ui: UiContext) -> None:
+    """The pointer that keys move."""
+    (x, y), canvas = at, imgui.get_background_draw_list()
+    for color, thick in ((PALETTE.scrim, 4.0), (PALETTE.handle, 1.5)):
+        for dx, dy in ((9.0 * ui.scale, 0.0), (0.0, 9.0 * ui.scale)):
             ends = (x - dx, y - dy), (x + dx, y + dy)
             canvas.add_line(*ends, u32(color), thick * ui.scale)
 

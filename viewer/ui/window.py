@@ -97,6 +97,7 @@ class Window:
 
     def __init__(self, splash: Splash) -> None:
         self.splash, self.handle, self.context = splash, splash.handle, splash.context
+        self._pointed: tuple[float, float] | None = None
         self._pressed: list[Press] = []
         self._down: dict[int, str] = {}  # names of the keys that are down
         self._chorded: set[int] = set()  # those of them that went down with Ctrl, and do not fly without it
@@ -209,6 +210,12 @@ class Window:
         keys = Keys(tuple(self._pressed), frozenset(self._down.values()), fly)
         self._pressed.clear()
         return keys
+
+    def point(self, at: tuple[float, float] | None) -> None:
+        """The mouse goes where keys have moved the pointer, where the system lets it."""
+        if at not in (None, self._pointed):
+            glfw.set_cursor_pos(self.handle, *at)
+        self._pointed = at
 
     def _note_key(self, key: int, scancode: int, action: int, mods: int) -> None:
         if action == glfw.RELEASE:

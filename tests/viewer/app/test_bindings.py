@@ -59,7 +59,7 @@ def test_every_action_has_its_command_or_is_no_one_s_to_look_up(tmp_path: Path) 
         everything = {*app.requests, *exports.REQUESTS}
     everything |= {*actions.ACTIONS, *actions.OF_EDITS, *selection.CHANGES, "frame", "home", "invert"}
     everything |= {"paint_clear", "paint_fill", "paint_invert", "paint_feather"}
-    everything |= {"next_slider", "blend_snapshots"}
+    everything |= {"next_slider", "blend_snapshots", "point", "point_press"}
     named = {action.partition(":")[0] for action in COMMANDS}
     assert named | INTERNAL == everything
     assert not named & INTERNAL
@@ -311,9 +311,9 @@ def test_on_a_mac_command_does_what_control_does_and_the_list_says_so(
 
 
 def test_the_window_asks_for_the_only_context_that_a_mac_gives() -> None:
-    from viewer.ui import window
+    from viewer.ui import splash
 
-    asked, glfw = dict(window._HINTS), window.glfw
+    asked, glfw = dict(splash._HINTS), splash.glfw
     assert (asked[glfw.CONTEXT_VERSION_MAJOR], asked[glfw.CONTEXT_VERSION_MINOR]) == (3, 3)
     assert asked[glfw.OPENGL_PROFILE] == glfw.OPENGL_CORE_PROFILE
     assert asked[glfw.OPENGL_FORWARD_COMPAT]

@@ -34,7 +34,7 @@ from viewer.state.actions import perform
 from viewer.state.facts import LayerRow
 from viewer.state.view_state import LayerState, ViewState
 from viewer.state.workspace import SceneFacts
-from viewer.ui.keys import COMMANDS, FLY_KEYS, KEYS, drag_for
+from viewer.ui.keys import COMMANDS, FLY_KEYS, HAND_KEYS, KEYS, drag_for
 
 AXES: tuple[Vec3, ...] = ((0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1), (1, 0, 0), (-1, 0, 0))
 RADII = st.sampled_from([1e-3, 0.1, 1.0, 30.0, 1e4])
@@ -231,7 +231,7 @@ def test_a_drag_means_what_the_table_says() -> None:
 
 
 def test_no_key_is_bound_twice_and_only_what_is_tapped_is_also_a_flight_key() -> None:
-    assert len(KEYS) == sum(len(command.keys.split()) for command in COMMANDS.values())
+    assert len(KEYS) + len(HAND_KEYS) == sum(len(command.keys.split()) for command in COMMANDS.values())
     assert not {chord for chord, key in KEYS.items() if not key.tap} & set(FLY_KEYS)
 
 
