@@ -56,6 +56,7 @@ class _Pixels:
     maps: MapFit
     views: Sequence[ColorView]
     places: Sequence[Tensor]  # which pixels of each view these are. [p] int64
+    seen: Tensor  # which of the region's members show in any of them. [m] int64
 
     def picture(self, table: Tensor) -> Tensor:
         """The row under a map. [K,3] -> [P,3] 0..1"""
@@ -138,7 +139,11 @@ def _sample(looked: Sequence[tuple[View, ColorView]], most: int) -> _Pixels:
 
     image, mask, inside = (gather([getattr(v, n) for v, _ in looked]) for n in ("image", "mask", "inside"))
     row = View(looked[0][0].camera, image, mask, inside, (0, 0, image.shape[1], 1))
-    return _Pixels(row, replace(maps, pixels=[torch.arange(image.shape[1])]), views, maps.pixels)
+    weights = torch.zeros(len(views[0].original))
+    for view, places in zip(views, maps.pixels, strict=True):
+        weights += view.map.gradient(torch.zeros_like(view.others).index_fill_(0, places, 1.0))[:, 0]
+    seen = weights.nonzero()[:, 0]
+    return _Pixels(row, replace(maps, pixels=[torch.arange(image.shape[1])]), views, maps.pixels, seen)
 
 
 def _gains(last: DraftViews, views: DraftViews, spec: str) -> bool:
@@ -216,9 +221,11 @@ def _knots(judged: _Pixels, table: Tensor, expected: Sequence[Tensor]) -> int:
 
 def _drawn_error(views: DraftViews, table: Tensor, degree: int, expected: Tensor) -> float:
     """What is left where the map is held as the members' own spherical harmonics, as a scene has it."""
-    scene, judged = views.scene[views.region.members], views.judged
+    judged, seen = views.judged, views.judged.seen
+    scene = views.scene[views.region.members[seen]]
     sh = member_bands(pack(scene, with_shN=scene.sh_degree > 0))
-    offsets = map_colors(sh, table, degree) - sh
+    offsets = sh.new_zeros(len(views.region), *sh.shape[1:])
+    offsets[seen] = map_colors(sh, table, degree) - sh
     pictures = [view.picture(view.colors(offsets)).clamp(0.0, 1.0) for view in judged.views]
     shown = [picture[places] for picture, places in zip(pictures, judged.places, strict=True)]
     return _error(torch.cat(shown), expected)

@@ -251,6 +251,11 @@ class Window:
             )
 
 
+def wake_window() -> None:
+    """Let `Window.wait` return; from any thread."""
+    glfw.post_empty_event()
+
+
 @contextmanager
 def interruptible() -> Iterator[None]:
     """Let Ctrl+C in the terminal end a wait for events; Python alone would hear of it with the next event."""

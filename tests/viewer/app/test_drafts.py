@@ -112,6 +112,42 @@ def test_a_grade_is_a_live_layer_that_the_form_drives_from_every_side(window: ap
     assert window.main_view.live == ()
 
 
+def test_while_a_color_is_dragged_each_grade_that_comes_is_shown_and_the_newest_asked_next(
+    window: application.App, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked, waits = [], []
+
+    def ask(self: Previews, region: str, request: preview._Request, _: Camera) -> int:
+        self._number += 1
+        asked.append(request.editor)
+        waits.append((self, preview.Preview(self._number, grade=Previews.grade, made="grade")))
+        return self._number
+
+    def answer() -> None:
+        child, made = waits.pop()
+        child._answers.append(made)
+
+    monkeypatch.setattr(Previews, "ask", ask)
+    opened(window, color=(0.1, 0.0, 0.0))
+    for red in (0.2, 0.3, 0.4):
+        with_form(window, color=(red, 0.0, 0.0))
+    assert (asked, window.main_view.live) == (["recolor:#1a0000"], ()), "one at a time"
+    answer()
+    with_form(window, color=(0.5, 0.0, 0.0))
+    assert asked[1:] == ["recolor:#800000"], "what was passed by meanwhile is never asked"
+    assert len(window.main_view.live) == 1, "what has come is seen, though the color has moved on"
+    with_form(window, color=(0.1, 0.0, 0.0))  # back at what is shown, while another is made
+    answer()
+    turn(window)
+    assert asked[2:] == ["recolor:#1a0000"], "the layer is that of the color that was asked for"
+    shown = window.main_view.engine.gdfs[-1]
+    with_form(window, region="typed", typed_region="sphere:0,0,0,9")
+    answer()
+    turn(window)
+    assert asked[3:] == ["recolor:#1a0000"], "another region, asked for"
+    assert window.main_view.engine.gdfs[-1] is shown, "of the region before nothing more is shown"
+
+
 def test_a_grade_by_hand_gets_the_main_colors_of_its_region(
     window: application.App, monkeypatch: pytest.MonkeyPatch
 ) -> None:

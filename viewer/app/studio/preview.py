@@ -35,6 +35,7 @@ from viewer.jobs.child import Child
 from viewer.jobs.training import EDITORS, STILL, NewEdit
 from viewer.state.view_state import LayerState
 from viewer.state.workspace import PreviewState
+from viewer.ui.window import wake_window
 
 from .pages import Cover
 
@@ -66,6 +67,11 @@ class _Request:
     def of_all_views(self) -> tuple[str, str]:
         """What a grade depends on."""
         return self.region, self.editor
+
+    @property
+    def kind(self) -> tuple[str, str]:
+        """What a hand does not change by the way, as it does a slider or the camera."""
+        return self.region, self.editor.partition(":")[0]
 
 
 @dataclass(frozen=True)
@@ -162,6 +168,7 @@ class PreviewChild:
         with contextlib.suppress(OSError, ValueError):
             for line in self._child.output:
                 self._answers.append(line.decode("utf-8", "replace"))
+                wake_window()
 
 
 @dataclass(frozen=True)
@@ -236,20 +243,22 @@ class PreviewActions:
                 self._broken = True
                 self._show(f"No preview: {error.strerror or error}", None, failed=True)
         if self._child is not None:
-            self._take(self._child)
+            self._take(self._child, request)
         if self._outstanding and request.editor.startswith("instruct:") and request.seed >= 0:
             self._show(f"Painting … {now - self._sent_at:.0f} s", self._app.main_view.cover)
         self._show_live()
         if self._child is None or self._broken:
             return None
-        if self._grade is not None and request.of_all_views == self._grade[0].of_all_views:
+        made = self._grade is not None and request.of_all_views == self._grade[0].of_all_views
+        if made and not self._outstanding:
             self._sent = self._seen = request  # one grade is for every strength and view
         if request != self._seen:
             moved = (
                 self._seen is None or request.camera != self._seen.camera or request.size != self._seen.size
             )
             self._seen, self._seen_at = request, now if moved else now - REST_S
-        if request != self._sent and now - self._seen_at >= REST_S:
+        # one at a time: what moves on while it is made is asked for next, and each answer is shown
+        if request != self._sent and not self._outstanding and now - self._seen_at >= REST_S:
             self._send(request, self._child)
         return POLL_S if self._outstanding or request != self._sent else None
 
@@ -368,8 +377,8 @@ class PreviewActions:
         text = "Looking for models …" if request.seed < 0 else "Drawing …"
         self._show("" if in_place or self._grade else text, cover)
 
-    def _take(self, child: PreviewChild) -> None:
-        """What the child has answered."""
+    def _take(self, child: PreviewChild, now: _Request) -> None:
+        """What the child has answered: shown, unless region or kind of edit are others by now."""
         answer = child.take()
         if answer is None:
             return
@@ -381,8 +390,8 @@ class PreviewActions:
                 self._end()
             self._end_live()
             self._show(answer.error, None, failed=True, models=answer.models)
-        elif self._sent is None or answer.number != self._number:
-            return  # of a request that is no longer the last
+        elif self._sent is None or self._sent.kind != now.kind:
+            return
         elif answer.made == "palette":
             self._palette_of, work = self._sent.region, self._app.main_view.work
             if all(source == target for source, target in work.form.palette):
