@@ -342,10 +342,10 @@ def bound_chords(command: Command) -> list[str]:
 
 @cache  # each frame's tips and menus ask for a hundred
 def chords(action: str) -> tuple[str, ...]:
-    """All keys of an action, in a person's words."""
+    """All keys of an action, in a person's words; none of what is no command."""
+    bound = bound_chords(COMMANDS[action]) if action in COMMANDS else []
     return tuple(
-        chord.replace("Delete", "Del").replace("Num", "Numpad ").replace("Escape", "Esc")
-        for chord in bound_chords(COMMANDS[action])
+        chord.replace("Delete", "Del").replace("Num", "Numpad ").replace("Escape", "Esc") for chord in bound
     )
 
 
