@@ -216,3 +216,29 @@ def test_a_brush_on_the_picture_and_its_controls(screenshot: Compare) -> None:
         hand.drag((360.0, 300.0), (420.0, 320.0))
         hand.frame(3)
         screenshot("ui_paint", hand.image())
+
+
+def test_all_commands_and_a_search_among_them(screenshot: Compare) -> None:
+    with rig(first_view(bear(), 0.7, 0.5), SMALLEST) as hand:
+        hand.key("Ctrl+P")
+        hand.frame(3)
+        screenshot("ui_palette", hand.image())
+        hand.io.add_input_characters_utf8("snap")
+        hand.frame(3)
+        screenshot("ui_palette_search", hand.image())
+
+
+def test_everything_that_was_done_by_its_name(screenshot: Compare) -> None:
+    with rig(first_view(bear(), 0.7, 0.5), SMALLEST) as hand:
+        for chord in ("1", "Shift+Right", "H", "2", "Right", "Ctrl+A", "Ctrl+Z", "Ctrl+Alt+Z"):
+            hand.key(chord)
+        hand.frame(3)
+        screenshot("ui_history", hand.image())
+
+
+def test_a_tool_that_keys_move(screenshot: Compare) -> None:
+    with rig(first_view(bear(), 0.7, 0.5), SMALLEST) as hand:
+        for chord in ("U", *["Shift+Up"] * 2, "Space", *["Shift+Right"] * 2, "Shift+Down"):
+            hand.key(chord)
+        hand.frame(2)
+        screenshot("ui_tool_by_keys", hand.image())
