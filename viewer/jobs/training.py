@@ -66,6 +66,9 @@ ALL, SELECTION, TYPED, CHANGED = "all", "selection", "typed", "changed"
 STYLES = 26
 BEST_STYLES = (14, 23, 20, 7, 12, 0)
 """Of `style:N`, those that are most alike from all sides; they are offered first."""
+STYLE_ORDER = (*BEST_STYLES, *(i for i in range(STYLES) if i not in BEST_STYLES))
+SHEET_PX, SHEET_COLUMNS = (96, 72), 6
+"""Of the sheet of all paintings: pixels of one, and how many lie side by side; in their order."""
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,9 @@ from viewer.jobs.training import (
     CHANGED,
     EDITORS,
     SELECTION,
-    STYLES,
+    SHEET_COLUMNS,
+    SHEET_PX,
+    STYLE_ORDER,
     TYPED,
     NewEdit,
     Point,
@@ -215,7 +217,7 @@ def _settings(form: NewEdit, preview: PreviewState, column: float, ui: UiContext
             form = replace(form, grade=tuple(grade), curve=_curve(form.curve, column, ui))
         case "style":
             label("Style", column)
-            form = _style(form, ui)
+            form = _style(form, preview, ui)
         case "sentence":
             form = replace(form, sentence=_text_row("Text", "turn him into a statue", form.sentence, column))
             form = _model(form, preview, column, ui)
@@ -342,14 +344,29 @@ def _anchor(form: NewEdit, preview: PreviewState, column: float) -> tuple[NewEdi
     return form, action
 
 
-def _style(form: NewEdit, ui: UiContext) -> NewEdit:
-    """Those that agree best from all sides come first."""
-    order = (*BEST_STYLES, *(i for i in range(STYLES) if i not in BEST_STYLES))
-    imgui.set_next_item_width(-1.0)
-    titles, at = [f"Painting {number}" for number in order], order.index(form.style)
-    help_ = "Which painting; the first six look most alike from all sides"
-    pressed = drop_down("##number", titles[at], titles, at, ui, help_)
-    return form if pressed is None else replace(form, style=order[pressed])
+def _style(form: NewEdit, preview: PreviewState, ui: UiContext) -> NewEdit:
+    """This view in every style, numbers until they are painted; what agrees best from all sides first."""
+    small(f"Painting {form.style}", PALETTE.text)
+    gap, canvas = 2.0 * ui.scale, imgui.get_window_draw_list()
+    wide = (imgui.get_content_region_avail().x - (SHEET_COLUMNS - 1) * gap) / SHEET_COLUMNS
+    side, rows = imgui.ImVec2(wide, wide * SHEET_PX[1] / SHEET_PX[0]), -(-len(STYLE_ORDER) // SHEET_COLUMNS)
+    for place, number in enumerate(STYLE_ORDER):
+        row, column = divmod(place, SHEET_COLUMNS)
+        if column:
+            imgui.same_line(0.0, gap)
+        if imgui.button(f"{number}##style", side):
+            form = replace(form, style=number)
+        low, high = imgui.get_item_rect_min(), imgui.get_item_rect_max()
+        if number in preview.styles:
+            ends = ((column + i) / SHEET_COLUMNS for i in (0, 1)), ((row + i) / rows for i in (0, 1))
+            (left, right), (top, foot) = ends
+            image, white = imgui.ImTextureRef(preview.sheet), u32((1.0, 1.0, 1.0, 1.0))
+            canvas.add_image_rounded(image, low, high, (left, top), (right, foot), white, 3.0 * ui.scale)
+        if number == form.style:
+            canvas.add_rect(low, high, u32(PALETTE.accent), 3.0 * ui.scale, 2.0 * ui.scale)
+        best = "; looks alike from all sides" if number in BEST_STYLES else ""
+        tip(f"Painting {number}{best}")
+    return form
 
 
 def _preview(form: NewEdit, preview: PreviewState, column: float, ui: UiContext) -> NewEdit:

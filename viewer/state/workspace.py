@@ -46,6 +46,8 @@ class PreviewState(NamedTuple):
     busy: bool = False  # a model paints
     painted: bool = False  # a sentence's picture is there
     models: tuple[str, ...] = ()  # that are on this machine
+    sheet: int = 0  # GL name of the paintings of this view, see `SHEET_PX`
+    styles: frozenset[int] = frozenset()  # which of them are there
 
 
 def _no_facts() -> Any:

@@ -22,7 +22,7 @@ from viewer.app.studio import preview
 from viewer.camera.view_camera import to_camera
 from viewer.files.session import open_session
 from viewer.jobs import job_queue
-from viewer.jobs.training import EDITORS
+from viewer.jobs.training import EDITORS, SHEET_COLUMNS, SHEET_PX, STYLE_ORDER
 from viewer.state import paint
 from viewer.state.layers import visible_layers
 from viewer.state.view_state import LayerState
@@ -176,6 +176,50 @@ def test_a_grade_by_hand_gets_the_main_colors_of_its_region(
     assert window.main_view.work.form.palette[0] == ("#7eae44", "#3060d0"), "nothing that was chosen is lost"
     with_form(window, region="all", palette=form.palette)
     assert window.main_view.work.form.palette[1][0] not in ("#000001", "#000003")
+
+
+def test_the_view_is_painted_in_every_style_one_after_the_other_behind_the_picture(
+    window: application.App, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[tuple[str, bool]] = []
+
+    def ask(self: Previews, region: str, request: preview._Request, camera: Camera) -> int:
+        self._number += 1
+        small = (camera.width, camera.height) == SHEET_PX
+        asked.append((request.editor, small))
+        pixels = np.full(
+            (camera.height, camera.width, 3), 9 * int(request.editor.partition(":")[2]), np.uint8
+        )
+        failed = "no" if asked[-1] == ("style:3", True) else ""
+        made = preview.Preview(self._number, pixels if not failed else None, error=failed)
+        self._answers.append(made)
+        return self._number
+
+    monkeypatch.setattr(Previews, "ask", ask)
+    opened(window, editor=next(i for i, e in enumerate(EDITORS) if e.kind == "style"))
+    for _ in range(30):
+        turn(window)
+    order = [(f"style:{number}", True) for number in STYLE_ORDER]
+    assert asked == [("style:14", False), *order], "what the form says first, then each style once"
+    shown = window.main_view.preview
+    assert shown.styles == {*STYLE_ORDER} - {3}, "what cannot be painted stays a number"
+    assert not shown.failed
+    assert window.preview._sheet is not None
+    (width, height), pixels = SHEET_PX, np.frombuffer(window.preview._sheet.read(alignment=1), np.uint8)
+    tiles = pixels.reshape(-1, height, SHEET_COLUMNS, width, 3)[:, height // 2, :, width // 2, 0].flatten()
+    expected = [0 if number == 3 else 9 * number for number in STYLE_ORDER]
+    assert tiles[: len(STYLE_ORDER)].tolist() == expected, "each in its place"
+    with_form(window, strength=0.5)
+    assert asked[27:] == [("style:14", False)], "another strength is another picture, and the same sheet"
+    work = window.main_view.work
+    camera = replace(work.view.camera, azimuth=work.view.camera.azimuth + 20.0)
+    window.main_view.work = replace(work, view=replace(work.view, camera=camera))
+    for _ in range(3):
+        turn(window)
+    assert asked[28:30] == [("style:14", False), order[0]], "another view is painted anew"
+    assert window.main_view.preview.styles == shown.styles, "over the last, which stays until then"
+    with_form(window, style=23)
+    assert ("style:23", False) in asked[30:32], "and what the form says does not wait for it"
 
 
 def test_what_no_grade_carries_is_the_editors_own_picture_as_before(window: application.App) -> None:

@@ -32,7 +32,7 @@ from viewer.camera.view_camera import Vec3, ViewCamera, to_camera
 from viewer.files import user_files
 from viewer.jobs import training
 from viewer.jobs.child import Child
-from viewer.jobs.training import EDITORS, STILL, NewEdit
+from viewer.jobs.training import EDITORS, SHEET_COLUMNS, SHEET_PX, STILL, STYLE_ORDER, NewEdit
 from viewer.state.view_state import LayerState
 from viewer.state.workspace import PreviewState
 from viewer.ui.window import wake_window
@@ -215,6 +215,14 @@ class PreviewActions:
         self._painted: tuple[_Request, NDArray[np.uint8]] | None = None  # that picture
         self._sent_at = 0.0
         self._palette_of = ""  # the region whose colors the form has
+        self._sheet: moderngl.Texture | None = None  # of paintings
+        self._sheet_of: _Request | None = None  # the view that is painted
+        self._tiles: frozenset[int] = frozenset()  # styles that it was painted in already
+        self._drawn: frozenset[int] = frozenset()  # those in the sheet, also of another view
+        self._tile, self._region_sent = (
+            -1,
+            "",
+        )  # the style that is asked for; the region, as the child knows it
         self._painting: PaintedView | None = None
 
     @property
@@ -260,6 +268,8 @@ class PreviewActions:
         # one at a time: what moves on while it is made is asked for next, and each answer is shown
         if request != self._sent and not self._outstanding and now - self._seen_at >= REST_S:
             self._send(request, self._child)
+        elif request == self._sent and not self._outstanding and request.editor.startswith("style:"):
+            self._ask_painting(request, self._child)
         return POLL_S if self._outstanding or request != self._sent else None
 
     def _paint_view(self, _: str) -> None:
@@ -335,9 +345,10 @@ class PreviewActions:
     def close(self) -> None:
         """End the child."""
         self._end()
-        if self._texture is not None:
-            self._texture.release()
-            self._texture = None
+        for texture in (self._texture, self._sheet):
+            if texture is not None:
+                texture.release()
+        self._texture = self._sheet = None
 
     def _request(self) -> _Request | None:
         """What the form and the view ask for; None for no picture."""
@@ -371,11 +382,41 @@ class PreviewActions:
             self._show(error_line(error), None, failed=True)
             return
         self._number = child.ask(region, request, to_camera(request.camera, width, height))
-        self._outstanding = True
+        self._outstanding, self._region_sent = True, region
         cover = self._app.main_view.cover
         in_place = cover is not None and (cover.camera, cover.size) == (request.camera, request.size)
         text = "Looking for models …" if request.seed < 0 else "Drawing …"
         self._show("" if in_place or self._grade else text, cover)
+
+    def _ask_painting(self, request: _Request, child: PreviewChild) -> None:
+        """The next of the sheet's: this view in one style, small. What the form says goes first."""
+        view = replace(request, editor="", strength=1.0)
+        if view != self._sheet_of:
+            if self._sheet_of is None or view.region != self._sheet_of.region:
+                self._drawn = frozenset()
+            self._sheet_of, self._tiles = view, frozenset()
+        missing = next((style for style in STYLE_ORDER if style not in self._tiles), None)
+        if missing is not None:
+            painted = replace(view, editor=f"style:{missing}")
+            self._number = child.ask(self._region_sent, painted, to_camera(view.camera, *SHEET_PX))
+            self._tile, self._outstanding = missing, True
+
+    def _take_painting(self, pixels: NDArray[np.uint8] | None) -> None:
+        """A picture for the sheet; None where that style could not be painted."""
+        style, self._tile = self._tile, -1
+        self._tiles |= {style}
+        if pixels is None:
+            return
+        (width, height), place = SHEET_PX, STYLE_ORDER.index(style)
+        if self._sheet is None:
+            rows = -(-len(STYLE_ORDER) // SHEET_COLUMNS)
+            self._sheet = self._context.texture((SHEET_COLUMNS * width, rows * height), 3, alignment=1)
+        at = place % SHEET_COLUMNS * width, place // SHEET_COLUMNS * height
+        self._sheet.write(np.ascontiguousarray(pixels).tobytes(), (*at, width, height), alignment=1)
+        self._drawn |= {style}
+        main_view = self._app.main_view
+        main_view.preview = main_view.preview._replace(sheet=int(self._sheet.glo), styles=self._drawn)
+        main_view.wake()
 
     def _take(self, child: PreviewChild, now: _Request) -> None:
         """What the child has answered: shown, unless region or kind of edit are others by now."""
@@ -384,7 +425,9 @@ class PreviewActions:
             return
         if answer.number in (self._number, -1):
             self._outstanding = False
-        if answer.error:
+        if self._tile >= 0 and answer.number == self._number:
+            self._take_painting(answer.pixels)
+        elif answer.error:
             if answer.number < 0:
                 self._broken = True
                 self._end()
@@ -458,7 +501,8 @@ class PreviewActions:
         main_view = self._app.main_view
         known = main_view.preview.models if models is None else models
         painted = self._painted is not None and self._painted[0] == self._request()
-        state = PreviewState(text, failed, self._outstanding, painted, known)
+        sheet = 0 if self._sheet is None else int(self._sheet.glo)
+        state = PreviewState(text, failed, self._outstanding, painted, known, sheet, self._drawn)
         if (main_view.cover, main_view.preview) != (cover, state):
             main_view.cover, main_view.preview = cover, state
             main_view.wake()
@@ -467,4 +511,4 @@ class PreviewActions:
         if self._child is not None:
             self._child.close()
             self._child = None
-        self._sent, self._seen, self._outstanding = None, None, False
+        self._sent, self._seen, self._outstanding, self._tile = None, None, False, -1
