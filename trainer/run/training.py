@@ -43,14 +43,7 @@ from trainer.optimize.pgs import (
     optimize,
     pgs_settings,
 )
-from trainer.optimize.retime import (
-    record,
-    resolve_slider,
-    retime,
-    select_recordings,
-    smooth_course,
-    straight_recordings,
-)
+from trainer.optimize.retime import drop_jitter, record, resolve_slider, retime, smooth_course
 from trainer.optimize.ties import surface_ties
 from trainer.options import OptimizeOptions, TrainOptions
 from trainer.setup import Pictures, TrainingSetup, probe_views
@@ -437,8 +430,7 @@ def retime_trajectory(
             pictures.append(torch.cat([image.flatten() for image in images]))
             advance(i + 1, "recordings")
     if not optimization.as_printed and trajectory.maps is None:
-        rows = straight_recordings(trajectory, pictures)
-        trajectory, pictures = select_recordings(trajectory, rows), [pictures[i] for i in rows]
+        trajectory, pictures = drop_jitter(trajectory, pictures)
     return retime(trajectory, pictures, resolve_slider(optimization.slider, trajectory.strengths))
 
 
