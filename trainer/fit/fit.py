@@ -18,6 +18,7 @@ from progdf.field.separable import moving_attributes
 from progdf.field.trajectory import Trajectory
 from progdf.gaussians import BASE_CHANNELS, Gaussians, attribute_slices
 from progdf.rasterize import alpha_weights
+from progdf.threads import one_thread
 from trainer.editors.base import ImageEditor
 from trainer.options import FieldKind, FieldOptions
 from trainer.setup import TrainingSetup
@@ -130,6 +131,7 @@ def fit_field(
     return _measure_choice(choice, trajectory, reporting)
 
 
+@one_thread()  # thousands of small pictures: torch's threads wait for each other longer than they work
 def fit_grades(
     trajectory: Trajectory,
     rows: Tensor,

@@ -47,7 +47,7 @@ from viewer.ui.widgets import (
     wrapped_text,
 )
 
-COLUMN_PX = 84.0
+COLUMN_PX = 90.0
 PAINT_VIEW = "Paint over this view…"
 PAINT_HELP = (
     "Opens a picture of it in your painting program; what you save there is shown here, ready to train"
