@@ -117,7 +117,10 @@ class App:
         )
         self.file_actions = FileActions(self, session)
         self.jobs = JobActions(
-            self, lambda form: self.preview.draft(form), lambda form: self.preview.anchor(form)
+            self,
+            lambda form: self.preview.draft(form),
+            lambda form: self.preview.anchor(form),
+            lambda path: self.preview.follow_anchor(path),
         )
         self.deliver = DeliverActions(self, self.jobs.queue)
         self.start = StartActions(self, self.context, self.jobs.queue)

@@ -338,7 +338,9 @@ def _anchor(form: NewEdit, preview: PreviewState, column: float) -> tuple[NewEdi
     if imgui.button("Paint over", imgui.ImVec2(half, 0.0)):
         action = "paint_over"
     imgui.end_disabled()
-    tip(form.anchor or "Write the picture into a file: change it in any program, save it, and train")
+    tip(
+        form.anchor or "Opens the picture in your painting program; what you save there is shown, and trained"
+    )
     if preview.text:
         wrapped_text(preview.text, PALETTE.error if preview.failed else PALETTE.dim)
     return form, action

@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from progdf.camera import Camera
 from progdf.gdf.file import load_gdf, save_gdf
@@ -20,6 +22,7 @@ from tests.viewer.app.test_studio import Trainer, request, turn
 from viewer.app import app as application
 from viewer.app.studio import preview
 from viewer.camera.view_camera import to_camera
+from viewer.files import user_files
 from viewer.files.session import open_session
 from viewer.jobs import job_queue
 from viewer.jobs.training import EDITORS, SHEET_COLUMNS, SHEET_PX, STYLE_ORDER
@@ -231,8 +234,10 @@ def test_what_no_grade_carries_is_the_editors_own_picture_as_before(window: appl
 
 
 def test_a_sentence_is_painted_when_it_is_asked_for_and_the_edit_follows_that_picture(
-    window: application.App,
+    window: application.App, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    given = list[Path]()
+    monkeypatch.setattr(user_files, "open_in_program", lambda path: given.append(path) or True)
     pytest.importorskip("diffusers", reason="pip install progdf-studio[diffusion]")
     Previews.grade = None
     opened(window)
@@ -252,6 +257,15 @@ def test_a_sentence_is_painted_when_it_is_asked_for_and_the_edit_follows_that_pi
     request(window, "paint_over")
     anchor = Path(window.main_view.work.form.anchor)
     assert torch.allclose(find_picture_camera(anchor).viewmat, painted.viewmat, atol=1e-6)
+    assert given == [anchor], "the program that paints pictures has it"
+    assert window.main_view.cover.name == "Anchor: make it a statue", "seen until something is saved"
+    with Image.open(anchor) as picture:
+        size, chunk = picture.size, PngInfo()
+        for key, text in picture.text.items():
+            chunk.add_text(key, text)
+    Image.new("RGB", size, (200, 30, 30)).save(anchor, pnginfo=chunk)
+    turn(window)
+    assert window.main_view.cover.name == "Painted", "what was saved lies over the view"
     with_form(window, asks=1, model="a/tiny", anchor="")
     assert "cannot follow a picture" in window.main_view.preview.text
     assert not window.main_view.preview.painted

@@ -290,15 +290,29 @@ class PreviewActions:
         save_cameras(beside, [to_camera(camera, *size)], self._app.document.scene.origin)
         form = training.with_picture(main_view.work.form, path, further=False)
         main_view.work = replace(main_view.work, form=form, form_open=True)
+        self._open_painter(path, camera, size, None)
+
+    def follow_anchor(self, path: Path) -> None:
+        """A sentence's picture, written at `path`, goes to another program; what is saved of it is shown."""
+        if self._pose is not None and self._painted is not None:
+            height, width = self._painted[1].shape[:2]
+            self._open_painter(path, self._pose[1], (width, height), self._app.main_view.cover)
+
+    def _open_painter(
+        self, path: Path, camera: ViewCamera, size: tuple[int, int], cover: Cover | None
+    ) -> None:
         self._painting = PaintedView(path, camera, size, _file_state(path))
-        self._show(PAINT_TEXT, None)
+        self._show(PAINT_TEXT, cover)
         if not user_files.open_in_program(path):
-            main_view.show_message(f"No program opens pictures by itself here: open {path} in yours")
+            self._app.main_view.show_message(
+                f"No program opens pictures by itself here: open {path} in yours"
+            )
 
     def _is_painting(self, painted: PaintedView) -> bool:
         """Whether the form is about the picture that is painted."""
-        work = self._app.main_view.work
-        return work.form_open and work.view.panel and str(painted.path) in work.form.pictures.split(", ")
+        work, path = self._app.main_view.work, str(painted.path)
+        of_form = path in work.form.pictures.split(", ") or path == work.form.anchor
+        return work.form_open and work.view.panel and of_form
 
     def _follow(self, painted: PaintedView) -> float:
         """What was saved of it lies over the view; seconds until the next look."""

@@ -56,6 +56,7 @@ class JobActions:
         app: the window
         draft: gives the file of a grade that shows what the form says
         anchor: gives the picture of one view that the form's sentence is to follow
+        follow: opens that picture's file in another program, and shows what is saved of it
     """
 
     def __init__(
@@ -63,8 +64,9 @@ class JobActions:
         app: Application,
         draft: Callable[[NewEdit], Path | None] = lambda _: None,
         anchor: Callable[[NewEdit], tuple[NDArray[np.uint8], Camera] | None] = lambda _: None,
+        follow: Callable[[Path], None] = lambda _: None,
     ) -> None:
-        self._app, self._draft, self._anchor = app, draft, anchor
+        self._app, self._draft, self._anchor, self._follow = app, draft, anchor, follow
         self._edits = EditActions(app)
         self.queue = JobQueue()
         self._scene: Path | None = None
@@ -235,7 +237,7 @@ class JobActions:
         run = training.free_run(training.edits_folder(scene), form.layer_name)
         if path := self._write_anchor(form, run):
             main_view.work = replace(main_view.work, form=replace(form, anchor=path))
-            main_view.show_message(f"Change {path}, save it, and press Train")
+            self._follow(Path(path))
 
     def region_spec(self, form: NewEdit, folder: Path, name: str = "") -> str:
         """The form's region as `progdf train --region` has it; one that has no file gets one in the folder.
