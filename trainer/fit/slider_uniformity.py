@@ -111,8 +111,8 @@ def _bends(even: Tensor, pictures: Sequence[Tensor], due: Tensor, allowed: float
     shares, rough = [0.0, 1.0], {0}
     while rough:
         nodes, at = interpolate(torch.tensor(shares, dtype=torch.float64), even, due), even.new_tensor(shares)
-        places, weights = smooth_weights(nodes.tolist())
         known = torch.stack([interpolate_at(even, pictures, x) for x in nodes.tolist()])
+        places, weights = smooth_weights(nodes.tolist(), known)
         rough = set()
         for s, picture, progress in zip(even.tolist(), pictures, interpolate(even, nodes, at), strict=True):
             left = find_segment(nodes, s).right - 1

@@ -46,13 +46,28 @@ def record(
     return Trajectory(s, offsets, end, steps, ends, tuple(strengths))
 
 
-def smooth_weights(strengths: Sequence[float]) -> tuple[Tensor, Tensor]:
-    """These strengths and the middles between them, and of which weights of the values at the strengths a
-    cubic through them consists at each. [n] -> [2n-1], [2n-1,n] float64, rows of one 1 at the strengths"""
+def smooth_weights(strengths: Sequence[float], known: Tensor) -> tuple[Tensor, Tensor]:
+    """The way through what is known at some strengths: these and the middles between them, and of which
+    weights of the known each consists. A middle lies on the cubic through all; but on the straight line where
+    the cubic is off that by more than a quarter of the interval's change, as no parabola is that only rises:
+    there it rings, as beside a jump.
+
+    Args:
+        strengths: ascending. [n]
+        known: the values there. [n,...]
+
+    Returns:
+        Strengths [2n-1], and weights [2n-1,n] with rows of one 1 at the given strengths; float64
+    """
     nodes, unit = torch.tensor(strengths, dtype=torch.float64), torch.eye(len(strengths), dtype=torch.float64)
     places = torch.stack([nodes, nodes + 0.5 * nodes.diff(append=nodes[-1:])], dim=1).flatten()[:-1]
     weights = torch.from_numpy(CubicSpline(nodes.numpy(), unit.numpy())(places.numpy()))
     weights[::2] = unit
+    for left in range(len(nodes) - 1):
+        straight = 0.5 * (unit[left] + unit[left + 1])
+        bend = torch.tensordot((weights[2 * left + 1] - straight).to(known), known, 1)
+        if float(bend.norm()) > 0.25 * float((known[left + 1] - known[left]).norm()):
+            weights[2 * left + 1] = straight
     return places, weights
 
 
@@ -61,9 +76,9 @@ def smooth_course(trajectory: Trajectory) -> Trajectory:
     them, so that half as many are solved for; any other as it is. Each lies at its strength."""
     if trajectory.maps is None or len(trajectory.strengths) == 1:
         return trajectory
-    places, weights = smooth_weights((0.0, *trajectory.strengths))
     degree = next(d for d, count in MONOMIALS.items() if count == trajectory.maps.shape[1])
     known = torch.stack([trajectory.node(i) for i in range(len(trajectory))])
+    places, weights = smooth_weights((0.0, *trajectory.strengths), known)
     offsets = torch.stack([torch.tensordot(row.float(), known, 1).half() for row in weights])
     maps = torch.tensordot(weights.float(), torch.cat([identity_map(degree)[None], trajectory.maps]), 1)
     return replace(

@@ -91,8 +91,8 @@ def missed_by(strengths: Sequence[float], editor: ImageEditor, views: Sequence[V
     def picture(s: float) -> Tensor:
         return torch.stack([editor.edit(view, s) for view in views]).double()
 
-    places, weights = smooth_weights((0.0, *strengths))
     known = torch.stack([picture(s) for s in (0.0, *strengths)])
+    places, weights = smooth_weights((0.0, *strengths), known)
     met = torch.tensordot(weights, known, 1)
     change = float((known[-1] - known[0]).square().sum())
     even = torch.linspace(0, 1, 41).tolist()

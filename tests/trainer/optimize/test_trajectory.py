@@ -139,6 +139,19 @@ def test_a_smooth_course_meets_its_stages_and_what_is_cubic_between(strengths: t
     assert torch.equal(smooth_course(replace(recorded, maps=None)).offsets, recorded.offsets)
 
 
+@pytest.mark.parametrize("jump", [1, 4, 8])
+def test_beside_a_jump_the_course_does_not_ring(jump: int) -> None:
+    strengths = [(i + 1) / 8 for i in range(8)]
+    values = torch.tensor([0.0, *(float(i + 1 >= jump) for i in range(8))])[:, None].expand(-1, CHANNELS)
+    snapshots = [(i + 1, i, True, values[i + 1].expand(3, -1).half()) for i in range(8)]
+    maps = torch.stack([identity_map(1) + value[0] for value in values[1:]])
+    recorded = replace(record(snapshots, values[-1].expand(3, -1), strengths), maps=maps, bands=1)
+    course = smooth_course(recorded)
+    offsets = torch.stack([course.node(i) for i in range(len(course))])
+    assert -1e-3 <= float(offsets.min()) <= float(offsets.max()) <= 1 + 1e-3
+    assert bool((offsets.diff(dim=0) >= -1e-3).all()), "it only rises"
+
+
 def test_stage_ends_keep_their_strengths_whatever_happens_between() -> None:
     progress = [0.01, 0.02, 0.05, 0.1, 0.3, 0.95, 1.0]
     trajectory = retimed(along(progress, [2, 4, 5, 7]), "stages")
