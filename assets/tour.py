@@ -1,8 +1,6 @@
 """Takes the README's tour: the real interface on a real scene, drawn without a window.
 
 usage: python assets/tour.py NAME SCENE.ply EDIT.gdf... -o OUT.png
-
-"recorded" needs the edits in their run folders.
 """
 
 from __future__ import annotations
@@ -24,7 +22,6 @@ from viewer.camera.view_camera import first_camera
 from viewer.files.document import load_edits
 from viewer.panel import panel
 from viewer.state import selection
-from viewer.state.actions import perform
 from viewer.state.view_state import LayerState, ViewState
 
 SIZE = (1280, 800)
@@ -47,20 +44,14 @@ def compare(hand: Rig) -> None:
     hand.frame(3)
 
 
-def recorded(hand: Rig) -> None:
-    """The field beside what training recorded at the same strengths, with the PSNR."""
-    hand.key("Alt+Y")
-
-
 def session(hand: Rig) -> None:
-    """Snapshots of two mixtures in the panel, and a blend of them."""
+    """Snapshots of two mixtures in the panel, and one against the other."""
     for strengths in ((1.0, 0.2), (0.3, 1.0)):
         _at(hand, strengths)
-        hand.key("F3")
+        hand.key("F5")
+    hand.key("Shift+F5")
     hand.key("Alt+G")
     hand.frame(8)
-    hand.main_view.work = perform(hand.main_view.work, "blend_snapshots:0.4", hand.main_view.facts)
-    hand.main_view.wake()
 
 
 def timeline(hand: Rig) -> None:
@@ -127,7 +118,6 @@ SHOTS: dict[str, Callable[[Rig], None]] = {
     "paint": painted,
     "select": selected,
     "compare": compare,
-    "recorded": recorded,
     "session": session,
     "timeline": timeline,
 }
@@ -150,7 +140,7 @@ def main() -> None:
     scene = load_ply(asked.scene)
     gdfs = load_edits(asked.gdfs, scene, asked.scene)
     view = replace(first_state(gdfs), camera=first_camera(scene, aspect=(SIZE[0] - panel.WIDTH_PX) / SIZE[1]))
-    with rig(view, SIZE, stack=_Opened(scene, gdfs), gdf_paths=asked.gdfs) as hand:
+    with rig(view, SIZE, stack=_Opened(scene, gdfs)) as hand:
         hand.main_view.facts = replace(hand.main_view.facts, title=asked.scene.name)
         SHOTS[asked.name](hand)
         hand.frame(3)

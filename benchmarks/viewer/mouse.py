@@ -84,7 +84,7 @@ class Mouse:
         began, used = time.perf_counter(), time.process_time()
         if event:
             self.main_view.wake()
-        self.main_view.frame(self._screen, self.pixels, seconds, arrived=began)
+        self.main_view.frame(self._screen, self.pixels, seconds)
         self._ctx.finish()
         self.processor_ms = 1e3 * (time.process_time() - used)
         return 1e3 * (time.perf_counter() - began)

@@ -13,6 +13,7 @@ import json
 import signal
 import sys
 import time
+from collections import deque
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -29,12 +30,18 @@ def main(arguments: list[str]) -> int:
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs start deaf to it
     began, size, stays = float(arguments[0]), arguments[1].split("x"), arguments[2] == "stay"
     watched: list[application.App] = []
+    slider_ms: deque[float] = deque(maxlen=120)
 
     class Watched(application.App):
-        """Tells when its first picture is on the screen."""
+        """Tells when its first picture is on the screen, and takes the time of sliders."""
 
         def draw(self) -> None:
+            before, arrived = self.main_view.work.view.layers, time.perf_counter()
             super().draw()
+            layers = self.main_view.work.view.layers
+            if [layer.strength for layer in layers] != [layer.strength for layer in before]:
+                self.context.finish()
+                slider_ms.append(1e3 * (time.perf_counter() - arrived))
             if not watched and self.main_view.canvas.pictures_drawn:
                 self.context.finish()
                 watched.append(self)
@@ -62,7 +69,7 @@ def main(arguments: list[str]) -> int:
             _say(
                 frames=shown.frames,
                 pictures=shown.canvas.pictures_drawn,
-                slider_ms=list(shown.latencies_ms),
+                slider_ms=list(slider_ms),
             )
 
 

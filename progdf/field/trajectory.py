@@ -1,13 +1,12 @@
 """The recorded trajectory of an edit: how every member moved, and at which slider value it was where.
 
-Training leaves it in the run folder as trajectory.safetensors. `progdf fit` makes new fields of it, and the
-viewer shows it beside the field that was made of it.
+Training leaves it in the run folder as trajectory.safetensors; `progdf fit` makes new fields of it.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -22,8 +21,7 @@ from progdf.io.atomic import atomic_write, open_error
 from progdf.io.json_values import convert_json, decode_json
 from progdf.io.tensors import read_tensors, write_tensors
 
-from .baked import MONOMIALS, BakedField, find_segment
-from .keyframes import fit_lossless
+from .baked import MONOMIALS, find_segment
 
 FILE_NAME = "trajectory.safetensors"
 """Its name in a run folder, beside the .gdf."""
@@ -136,31 +134,13 @@ def load_trajectory(path: Path) -> tuple[Trajectory, dict[str, Tensor], dict[str
     return trajectory, tensors, about
 
 
-def peek_trajectory(path: Path, maps: bool = False) -> tuple[Tensor, Tensor]:
-    """The end [M,C], or the maps [S-1,K,3], and the members [M] of a file, without its recordings: enough
-    to tell whose they are.
-
-    Raises:
-        ProgdfError: see `load_trajectory`.
-    """
-    what = "maps" if maps else "end"
-    tensors, _ = _read(path, (what, "members"))
-    return tensors[what], tensors["members"]
-
-
-def recorded_field(trajectory: Trajectory) -> BakedField:
-    """The recording as a field: `Trajectory.at` bit for bit at the recordings, straight between them."""
-    offsets = torch.stack([trajectory.node(i) for i in range(len(trajectory))])
-    return fit_lossless(trajectory.s, offsets)
-
-
-def _read(path: Path, names: Sequence[str] = ()) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Tensors, all of them where none are named, and the file's metadata."""
+def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Tensors, and the file's metadata."""
     try:
-        tensors, header = read_tensors(path, names)
+        tensors, header = read_tensors(path)
         if header.get("format") != _FORMAT:
             raise ProgdfError(f"{path} is not a recorded trajectory; give a run folder of progdf train")
-        if not names and (missing := _NEEDED - set(tensors)):
+        if missing := _NEEDED - set(tensors):
             raise _damage_error(path, f"it has no {min(missing)}")
         return tensors, convert_json(decode_json(header["about"]), dict[str, Any])
     except OSError as error:

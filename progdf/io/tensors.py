@@ -10,7 +10,7 @@ import io
 import math
 import os
 import zlib
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -75,17 +75,17 @@ def write_tensors(
     path.write_bytes(save(arrays, {METADATA: text}))
 
 
-def read_tensors(path: Path, names: Collection[str] = ()) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """The tensors of a file, all of them where none are named, and its metadata.
+def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """The tensors of a file and its metadata.
 
     Raises:
         OSError: it cannot be read.
-        ValueError: it is no safetensors file, lacks a tensor, or was damaged. Some are not checked.
+        ValueError: it is no safetensors file, or was damaged.
     """
     try:
         with safe_open(path, framework="pt") as opened:
             metadata = msgspec.json.decode((opened.metadata() or {})[METADATA], type=dict[str, str])
-            tensors = {name: opened.get_tensor(name) for name in names or opened.keys()}
+            tensors = {name: opened.get_tensor(name) for name in sorted(opened.keys())}
     except OSError:
         raise
     except KeyError:
@@ -93,7 +93,7 @@ def read_tensors(path: Path, names: Collection[str] = ()) -> tuple[dict[str, Ten
     except Exception as error:  # the library's own, and torch's where a shape overflows
         raise ValueError(" ".join(str(error).split())) from None
     sum_ = metadata.pop(_CHECKSUM, None)
-    if not names and sum_ is not None and sum_ != _checksum(metadata, tensors):
+    if sum_ is not None and sum_ != _checksum(metadata, tensors):
         raise ValueError("checksum mismatch")
     return tensors, metadata
 

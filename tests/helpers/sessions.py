@@ -38,7 +38,7 @@ def full_view() -> ViewState:
     compare = Comparison("split", 0.3, 8.0)
     view = replace(view, layers=layers, camera=camera, blend="over", compare=compare, timeline=film)
     groups = (LayerGroup("warm", strength=0.5),)
-    pair = SnapshotPair("original", "1", 0.25)
+    pair = SnapshotPair("original", "1")
     return replace(view, groups=groups, collapsed=("warm",), cards="compact", pair=pair)
 
 

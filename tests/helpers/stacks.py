@@ -11,7 +11,7 @@ from torch import Tensor
 
 from progdf.demo_scenes import DemoScene
 from progdf.field.baked import AttributeBases, BakedField
-from progdf.field.trajectory import FILE_NAME, Trajectory, save_trajectory
+from progdf.field.trajectory import Trajectory
 from progdf.formats.ply import save_ply
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf, fingerprint, save_gdf
@@ -47,18 +47,6 @@ class Stack:
         save_ply(paths[0], self.scene)
         for path, gdf in zip(paths[1:], self.gdfs, strict=True):
             save_gdf(path, gdf)
-        return paths
-
-    def save_runs(self, folder: Path) -> list[Path]:
-        """bear.ply, and each edit in a run folder of its name with what was recorded; their paths."""
-        save_ply(folder / "bear.ply", self.scene)
-        paths = [folder / "bear.ply"]
-        for gdf in self.gdfs:
-            (folder / gdf.name).mkdir()
-            paths.append(folder / gdf.name / f"{gdf.name}.gdf")
-            save_gdf(paths[-1], gdf)
-            extra = {"members": gdf.region.members, "score": gdf.region.score}
-            save_trajectory(paths[-1].with_name(FILE_NAME), recording_of(gdf), extra, {})
         return paths
 
 

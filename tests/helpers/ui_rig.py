@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
@@ -186,7 +186,6 @@ def rig(
     stack: Stack | None = None,
     pictures: Path = Path(),
     draw: str = "cpu",
-    gdf_paths: Sequence[Path] = (),
 ) -> Iterator[Rig]:
     """A main view on the bear.
 
@@ -196,12 +195,11 @@ def rig(
         density: framebuffer pixels per window coordinate, as on a Mac
         scale: window coordinates per design pixel, as on Windows and X11
         draw: what draws the splats, as for the engine
-        gdf_paths: where the edits were opened from, one for each; none is not from files
     """
     stack = stack or bear()
     context = headless_context()
     engine = ViewEngine(context, stack.scene, stack.gdfs, draw)
-    facts = Document("bear.ply", stack.scene, stack.gdfs, gdf_paths=tuple(gdf_paths)).facts()
+    facts = Document("bear.ply", stack.scene, stack.gdfs).facts()
     main_view = MainView(context, engine, facts, view or first_view(stack, 0.5, 0.5), scale, pictures)
     made = Rig(main_view, points, density)
     try:

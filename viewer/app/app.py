@@ -219,13 +219,13 @@ class App:
         if 0 in self.window.pixels:
             self.main_view.rest()
             return
-        arrived = time.perf_counter()
-        seconds, self.last = arrived - self.last, arrived
+        now = time.perf_counter()
+        seconds, self.last = now - self.last, now
         self.main_view.ui.make_current()
         self.main_view.ui.set_scale(self.window.ui_scale * self.main_view.work.layout.zoom)
         self.window.new_frame()
         screen = self.context.screen
-        self.main_view.frame(screen, self.window.pixels, seconds, self.window.take_keys(), arrived)
+        self.main_view.frame(screen, self.window.pixels, seconds, self.window.take_keys())
         self.window.point(self.main_view.pointed.at)
         self.window.present()
         self._rename()

@@ -22,7 +22,7 @@ from viewer.render import dynamic_resolution, highlight
 from viewer.render.dynamic_resolution import FrameTimings
 from viewer.render.engine import ViewEngine
 from viewer.render.gl_renderer import Image
-from viewer.state.facts import LayerRow, RecordingFile
+from viewer.state.facts import LayerRow
 from viewer.state.layers import visible_edits
 from viewer.state.selection import NOBODY
 from viewer.state.snapshots import SliderSnapshot, restore, with_original
@@ -65,18 +65,11 @@ class Canvas:
     Args:
         context: the GL context of the engine
         engine: draws them; stays the caller's
-        found: where the engine's edits were recorded, one for each
         last: the canvas of the same scene under other edits; its picture stays until there is one of these
     """
 
-    def __init__(
-        self,
-        context: moderngl.Context,
-        engine: ViewEngine,
-        recordings: Sequence[RecordingFile] = (),
-        last: Canvas | None = None,
-    ) -> None:
-        self.comparer = Comparer(engine, context, recordings)
+    def __init__(self, context: moderngl.Context, engine: ViewEngine, last: Canvas | None = None) -> None:
+        self.comparer = Comparer(engine, context)
         self._thumbnails = Thumbnails(context)
         self.timings = FrameTimings()
         """Of the picture on screen."""

@@ -14,7 +14,6 @@ from viewer.panel import panel, timeline_bar, tools
 from viewer.pictures.compare import Labels
 from viewer.state import history, workspace
 from viewer.state.actions import GLIDES, perform
-from viewer.state.facts import obstacle
 from viewer.state.workspace import PreviewState, Workspace
 from viewer.ui import overlay
 from viewer.ui.context import FIXED, PALETTE, SMALL_PX, UiContext, u32
@@ -299,13 +298,11 @@ def draw_pill(
     words, original = compared
     if not (work.view.layers or original or work.view.compare.mode != "off"):
         return work, []
-    why = {"recorded": obstacle(pointer.facts.recordings)}
-    why["snapshots"] = "" if work.snapshots else "There is no snapshot"
     scale, wide = pointer.ui.scale, pointer.area.width
     free = wide - (0.0 if foot else tools.view_width(work.view, pointer.area, pointer.ui))
     middle = min((wide + tools.TOOLBAR_PX * scale) / 2, free - 85.0 * scale)  # half of what it mostly takes
     place = (middle, foot + tools.EDGE_PX * scale)
-    work, asked = tools.draw_comparison(work, words, why, original, place, pointer.ui)
+    work, asked = tools.draw_comparison(work, words, original, place, pointer.ui)
     return work, [asked] * bool(asked)
 
 
@@ -314,16 +311,14 @@ def over_picture(
     pointer: PointerContext,
     held: MouseTool,
     labels: Labels,
-    figures: Sequence[tuple[str, str]],
     original: bool,
     at: tuple[float, float] | None,
 ) -> Workspace:
-    """The brush, the comparison, timings, bindings and the message, which leaves when its time is over.
+    """The brush, the comparison, bindings and the message, which leaves when its time is over.
 
     Args:
         held: what the mouse holds
         labels: over the comparison on screen
-        figures: of the table of timings
         original: the key that shows it is held
         at: where keys moved the pointer
     """
@@ -341,8 +336,6 @@ def over_picture(
         mouse.draw_comparison(view, area, mouse.grips_divider(held, view, pointer), ui)
     if not view.panel and (original or view.compare.mode != "off"):
         work = draw_pill(work, pointer, (labels, original), 0.0)[0]
-    if view.overlay:
-        overlay.table(figures, ui)
     free = imgui.get_io().display_size
     bar = timeline_bar.height(work, area, ui) if view.panel else 0.0
     above = replace(area, height=area.height - bar)

@@ -6,8 +6,6 @@ The window (app.py) and the tests feed imgui's io and call `frame`: a scripted m
 from __future__ import annotations
 
 import re
-import time
-from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
@@ -21,10 +19,9 @@ from progdf.errors import ProgdfError
 from viewer.files import exports
 from viewer.gl.present import read_rgb
 from viewer.panel import new_edit_form, panel, timeline_bar
-from viewer.render.engine import ViewEngine, drawn_size
+from viewer.render.engine import ViewEngine
 from viewer.render.picking import Surfaces
 from viewer.state import actions, layer_selection, timeline, workspace
-from viewer.state.facts import RecordingFile
 from viewer.state.layers import add_layer
 from viewer.state.snapshots import SliderSnapshot, compare_sides
 from viewer.state.view_state import LayerState, ViewState
@@ -124,7 +121,7 @@ class MainView:
         pictures: Path = Path(),
     ) -> None:
         self.context, self.engine, self.facts, self.pictures = context, engine, facts, pictures
-        self.canvas = Canvas(context, engine, facts.recordings)
+        self.canvas = Canvas(context, engine)
         self.recent: tuple[Path, ...] = ()  # files opened before, for the dialogs
         # of the start page: files opened before, and examples
         self.start_files: tuple[Sequence[pages.StartFile], Sequence[pages.StartFile]] = (), ()
@@ -138,7 +135,6 @@ class MainView:
         imgui.backends.opengl3_init("#version 330")
         self.work = workspace.new_workspace(view)
         self.frames = 0  # all that were drawn
-        self.latencies_ms: deque[float] = deque(maxlen=120)  # from a slider's event to finished pixels
         self._tool = MouseTool()
         self.pointed = KeyPointer()
         self._revealed = (self.work.focus, False)  # the layer that the panel shows, and whether it has a bar
@@ -174,9 +170,8 @@ class MainView:
         """
         self.canvas.release()
         self.surfaces.drop()
-        recordings = (*facts.recordings, *(RecordingFile() for _ in live))
         self.engine, self.facts, self.live = engine, facts, live
-        self.canvas = Canvas(self.context, engine, recordings, self.canvas)
+        self.canvas = Canvas(self.context, engine, self.canvas)
         self.wake()
 
     def change(self, view: ViewState) -> None:
@@ -224,7 +219,6 @@ class MainView:
         size: tuple[int, int],
         seconds: float,
         keys: Keys = NO_KEYS,
-        arrived: float | None = None,
     ) -> None:
         """Handle the input that imgui's io holds, and draw.
 
@@ -233,9 +227,7 @@ class MainView:
             size: its width and height in pixels: io.display_size times io.display_framebuffer_scale
             seconds: since the last frame
             keys: what the keyboard did
-            arrived: time.perf_counter() when the input came; now if None
         """
-        arrived = time.perf_counter() if arrived is None else arrived
         self.ui.make_current()
         imgui.get_io().delta_time = max(seconds, 1e-5)
         self._clock += max(seconds, 0.0)
@@ -243,7 +235,6 @@ class MainView:
         self._resting = False
         with self._guard():
             self.work = workspace.advance(self.work, seconds)
-        before = self.work
         imgui.backends.opengl3_new_frame()
         imgui.new_frame()
         with self._guard():
@@ -256,9 +247,6 @@ class MainView:
         screen.use()
         imgui.backends.opengl3_render_draw_data(imgui.get_draw_data())
         self.frames += 1
-        if [l.strength for l in self.work.view.layers] != [l.strength for l in before.view.layers]:
-            self.context.finish()
-            self.latencies_ms.append(1e3 * (time.perf_counter() - arrived))
         self._save_files(screen, size)
 
     def _guard(self) -> AbstractContextManager[None]:
@@ -494,18 +482,11 @@ class MainView:
             offered = pages.COMMANDS if self.at_start else [a for a, c in COMMANDS.items() if not c.in_hand]
             self.work = interface.draw_lists(self.work, pointer, offered, pressed)
         labels = self.canvas.comparer.labels(self.work.view)
-        figures = self.figures() if self.work.view.overlay else []
         at = self.pointed.at
-        self.work = interface.over_picture(self.work, pointer, self._tool, labels, figures, original, at)
+        self.work = interface.over_picture(self.work, pointer, self._tool, labels, original, at)
         gone = (before.dialog, self.work.dialog), (before.message, self.work.message)
         if any(was is not None and now is None for was, now in gone):
             self.wake()
-
-    def figures(self) -> list[tuple[str, str]]:
-        """What the overlay shows of the picture on screen."""
-        pixels, count, by = self.canvas.pixels, self.facts.count, self.engine.draws_with
-        drawn = drawn_size(self._pointer().size, pixels)
-        return overlay.figures(self.canvas.timings, self.latencies_ms, count, by, drawn, pixels)
 
     @property
     def picture_size(self) -> tuple[int, int]:

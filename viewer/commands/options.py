@@ -8,7 +8,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Annotated, Literal, Protocol
+from typing import Annotated, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,7 +38,6 @@ from .stack_options import NO_SCENE, DrawingOptions, StackOptions, Switch, is_nu
 
 _log = logging.getLogger(__name__)
 
-Against = Literal["original", "recorded"]
 _SAID_BY_SESSION = ("gdfs", "region", "gain", "solo", "paint", "overshoot", "background")
 
 
@@ -77,8 +76,6 @@ class RenderOptions:
     """The original beside the edited picture, which begins at this share of the width (0.5)."""
     difference: Annotated[str | None, word("[AMPLIFY]", "the session's comparison, else none")] = None
     """What differs from the original, amplified (4), with the PSNR."""
-    against: Annotated[Against | None, word("{original,recorded}", "the session's, else the original")] = None
-    """What --split and --difference compare with: the original, or what training recorded."""
     timeline: Annotated[Path | None, word("FILE.json", "a still picture")] = None
     """A film of the keys in this file (Ctrl+K in the window), or in the session: .gif, .mp4, or a folder for
     .png frames; with --sheet N a contact sheet of N of them."""

@@ -22,18 +22,9 @@ from progdf.compose.reference import compose_layers
 from progdf.errors import ProgdfError
 from progdf.field.baked import GradeForm, lattice_colors, lattice_side
 from progdf.field.grade import mapped_lattice
-from progdf.formats import usd
+from progdf.formats import scene_file, usd
 from progdf.formats.cube import SIDE, write_cube
 from progdf.formats.cube import SUFFIX as CUBE
-from progdf.formats.scene_file import (
-    MOST_FRAMES,
-    frame_path,
-    load_scene_with_report,
-    save_frames,
-    save_scene,
-    scene_format,
-    written_format,
-)
 from progdf.gaussians import ZERO, Gaussians
 from progdf.gdf.file import Gdf
 from progdf.io.atomic import atomic_write, check_not_an_input
@@ -44,18 +35,8 @@ from progdf.metrics.image import NO_DIFFERENCE
 from progdf.scene.strays import picture_difference
 from progdf.terminal import file_size, format_count, print_line
 from progdf.threads import one_thread
-from viewer.camera.view_camera import (
-    FARTHEST,
-    Vec3,
-    ViewCamera,
-    bounds_of,
-    first_camera,
-    fit,
-    fit_subject,
-    frame,
-    from_camera,
-    to_camera,
-)
+from viewer.camera import view_camera
+from viewer.camera.view_camera import FARTHEST, Vec3, ViewCamera, bounds_of
 from viewer.files import session, timeline_file
 from viewer.files.document import Document
 from viewer.files.session import WindowSession
@@ -64,7 +45,7 @@ from viewer.pictures import film
 from viewer.pictures.compare import Comparer, draw_labels
 from viewer.render.engine import ViewEngine
 from viewer.render.gl_renderer import headless_context
-from viewer.state import facts, timeline
+from viewer.state import timeline
 from viewer.state.layers import visible_edits, visible_layers
 from viewer.state.paint import layer_of
 from viewer.state.snapshots import compare_sides
@@ -94,12 +75,12 @@ def export(argv: Sequence[str]) -> int:
     options: ExportOptions = parse(ExportOptions, argv, "progdf export")
     out = options.out
     endings = (end for end in (CUBE, BUNDLE, PAGE) if out.name.lower().endswith(end))
-    ending = next(endings, None) or written_format(out)
+    ending = next(endings, None) or scene_file.written_format(out)
     several = options.frames is not None or options.timeline is not None
     if several and ending in (CUBE, BUNDLE, PAGE):
         raise ProgdfError(f"--frames and --timeline write a scene again and again, which {out.name} is not")
-    if options.frames is not None and not 2 <= options.frames <= MOST_FRAMES:
-        raise ProgdfError(f"--frames takes 2 to {MOST_FRAMES} steps, not {options.frames}")
+    if options.frames is not None and not 2 <= options.frames <= scene_file.MOST_FRAMES:
+        raise ProgdfError(f"--frames takes 2 to {scene_file.MOST_FRAMES} steps, not {options.frames}")
     if ending != PAGE and (options.page, options.up, options.background) != (PageOptions(), "auto", "white"):
         raise ProgdfError(f"{out} is no web page; leave out what only a .html page has")
     drawing = options.drawing if ending == PAGE else None
@@ -107,7 +88,7 @@ def export(argv: Sequence[str]) -> int:
     check_not_an_input(out, opened.files)
     if ending == PAGE:
         camera = (
-            first_camera(opened.document.original, up=opened.up)
+            view_camera.first_camera(opened.document.original, up=opened.up)
             if opened.session is None
             else opened.view.camera
         )
@@ -122,13 +103,14 @@ def export(argv: Sequence[str]) -> int:
         return _export_frames(options, opened)
     document, strengths = opened.document, describe_strengths(opened.view)
     edited = _compose(opened.document, opened.view)
-    save_scene(out, edited)
+    scene_file.save_scene(out, edited)
     far = (
         ", x y z as doubles as it is far from 0" if document.scene.origin != ZERO and ending == ".ply" else ""
     )
     how = "read back and compared" if ending == ".ply" else _describe_loss(out, edited)
     print_line(f"wrote {out}: {format_count(len(edited))}, {strengths}{far}; {how}")
-    if ending == ".ply" and document.path is not None and (kind := scene_format(document.path)) != "ply":
+    kind = "ply" if document.path is None else scene_file.scene_format(document.path)
+    if ending == ".ply" and kind != "ply":
         print_line(f"{document.title} is a .{kind}, this is a plain .ply")
     return 0
 
@@ -136,7 +118,7 @@ def export(argv: Sequence[str]) -> int:
 def _export_frames(options: ExportOptions, opened: OpenStack) -> int:
     """Numbered files, or the time samples of one: steps up to the strengths, or frames of a timeline."""
     out, document, rate = options.out, opened.document, float(Timeline().fps)
-    whole = written_format(out) == usd.SUFFIX
+    whole = scene_file.written_format(out) == usd.SUFFIX
     if options.timeline is None:
         steps = np.linspace(0.0, 1.0, options.frames or 0).tolist()
         scenes = (_compose(document, opened.view, share, whole) for share in steps)
@@ -149,14 +131,14 @@ def _export_frames(options: ExportOptions, opened: OpenStack) -> int:
         if options.frames is not None:
             steps = film.sheet_frames(keys, options.frames)
             rate *= (len(steps) - 1) / keys.length  # it lasts as long
-        if len(steps) > MOST_FRAMES:
+        if len(steps) > scene_file.MOST_FRAMES:
             raise ProgdfError(f"{options.timeline} has {len(steps)} frames; say how many with --frames N")
         states = (timeline.state_at(keys, frame, opened.view) for frame in steps)
         scenes = (_compose(document, state, 1.0, whole) for state in states)
         what = f"frames of {options.timeline}"
     for number in range(len(steps)):
-        check_not_an_input(frame_path(out, number), opened.files)
-    paths = save_frames(out, scenes, rate)
+        check_not_an_input(scene_file.frame_path(out, number), opened.files)
+    paths = scene_file.save_frames(out, scenes, rate)
     ends = f"{paths[0]} to {paths[-1].name}" if len(paths) > 1 else paths[0]
     print_line(f"wrote {ends}: {len(steps)} {what}")
     return 0
@@ -175,7 +157,7 @@ def _describe_loss(out: Path, edited: Gaussians) -> str:
     size = f"{file_size(out.stat().st_size)}, {out.stat().st_size / len(edited):.1f} bytes each"
     if out.suffix.lower() == usd.SUFFIX:
         return f"{size}, exact float32"
-    mean, worst = picture_difference(edited, load_scene_with_report(out)[0])
+    mean, worst = picture_difference(edited, scene_file.load_scene_with_report(out)[0])
     shown = "no pixel differs" if mean == NO_DIFFERENCE else f"{mean:.1f} dB to it, {worst:.1f} at worst"
     return f"{size}; read back: {shown}"
 
@@ -289,13 +271,7 @@ def _render_still(
         with atomic_write(options.out) as temporary_file:
             picture.save(temporary_file, pnginfo=camera_chunk(camera, visible_edits(view), origin, opened.up))
         return ""
-    where = opened.document.recordings()
-    missing = facts.obstacle(where)
-    if view.compare.mode != "off" and view.compare.against == "recorded" and missing:
-        raise ProgdfError(
-            f"there is nothing recorded to compare with: {missing}; give the .gdf in its run folder"
-        )
-    comparer = Comparer(engine, engine.ctx, where)
+    comparer = Comparer(engine, engine.ctx)
     comparer.sides = compare_sides(opened.snapshots, view)
     view = comparer.sides.right if comparer.sides else view
     try:
@@ -308,31 +284,23 @@ def _render_still(
             labelled.save(temporary_file, pnginfo=carried)
         if view.compare.mode == "off":
             return ""
-        if comparer.against(view) == "original":
+        if comparer.sides is None:
             return f"PSNR of edited against original {comparer.psnr:.2f} dB"
-        if comparer.sides is not None:
-            return "PSNR of snapshot {1} against {0} {2:.2f} dB".format(*comparer.sides.names, comparer.psnr)
-        recorded = facts.describe(view, engine.gdfs, comparer.recordings)
-        return f"PSNR of the field against what was recorded {comparer.psnr:.2f} dB ({recorded})"
+        return "PSNR of snapshot {1} against {0} {2:.2f} dB".format(*comparer.sides.names, comparer.psnr)
     finally:
         comparer.release()
 
 
 def _comparison(options: RenderOptions, saved: Comparison) -> Comparison:
     """What was asked for; else what the session shows."""
-    compare = saved
     if options.split is not None:
         problem = f"--split must be between 0 and 1, got {options.split}"
-        compare = Comparison("split", divider=parse_number(options.split, 0.0, 1.0, problem))
-    elif options.difference is not None:
+        return Comparison("split", divider=parse_number(options.split, 0.0, 1.0, problem))
+    if options.difference is not None:
         amplify = options.difference
         problem = f"--difference must be between 1 and {MOST_AMPLIFIED:g}, got {amplify}"
-        compare = Comparison("difference", amplify=parse_number(amplify, 1.0, MOST_AMPLIFIED, problem))
-    if options.against is None:
-        return compare
-    if compare.mode == "off":
-        raise ProgdfError(f"--against {options.against} needs a comparison; add --split or --difference")
-    return replace(compare, against=options.against)
+        return Comparison("difference", amplify=parse_number(amplify, 1.0, MOST_AMPLIFIED, problem))
+    return saved
 
 
 def _keys(path: Path, opened: OpenStack) -> Timeline:
@@ -353,7 +321,7 @@ def _turntable(options: RenderOptions, opened: OpenStack, camera: Camera) -> Tim
     seconds = parse_number(options.turntable, 1.0, _LONGEST_S, problem)
     scene = opened.document.original
     return timeline.turntable(
-        from_camera(ViewCamera(up=opened.up), camera, bounds_of(scene)), Timeline().fps, seconds
+        view_camera.from_camera(ViewCamera(up=opened.up), camera, bounds_of(scene)), Timeline().fps, seconds
     )
 
 
@@ -495,14 +463,14 @@ def choose_camera(
         return camera if size is None else fit_camera(camera, size)
     width, height = size or DEFAULT_SIZE
     aspect = width / height
-    view = saved or first_camera(scene, aspect=aspect, up=up)
+    view = saved or view_camera.first_camera(scene, aspect=aspect, up=up)
     if viewpoint.orbit is not None:
         view = parse_orbit(viewpoint.orbit, view)
     if viewpoint.frame is not None or (viewpoint.orbit is not None and saved is None):
         view = _frame_on(view, viewpoint.frame, scene, gdfs, aspect)
         if viewpoint.orbit is not None:  # a distance that was said holds
             view = parse_orbit(viewpoint.orbit, view)
-    return to_camera(view, width, height)
+    return view_camera.to_camera(view, width, height)
 
 
 def _frame_on(
@@ -510,12 +478,12 @@ def _frame_on(
 ) -> ViewCamera:
     """The same direction, filled by what --frame names."""
     if name is None:
-        return fit_subject(view, scene, aspect)
+        return view_camera.fit_subject(view, scene, aspect)
     if name == "all" and name not in [gdf.name for gdf in gdfs]:
-        return frame(view, bounds_of(scene), aspect)
+        return view_camera.frame(view, bounds_of(scene), aspect)
     check_edit(name, gdfs, "--frame")
     (members,) = (gdf.region.members for gdf in gdfs if gdf.name == name)
-    return fit(view, scene[members], aspect)
+    return view_camera.fit(view, scene[members], aspect)
 
 
 def parse_size(text: str) -> tuple[int, int]:

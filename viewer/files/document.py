@@ -20,7 +20,7 @@ from progdf.scene.neighbors import Neighborhood
 from progdf.terminal import escape_text
 from progdf.threads import all_threads
 from viewer.camera.view_camera import SceneUp, bounds_of, find_scene_up, first_camera, fit, fit_all
-from viewer.state.facts import RecordingFile, find_recording, layer_rows
+from viewer.state.facts import layer_rows
 from viewer.state.workspace import SceneFacts
 
 _Made = TypeVar("_Made")
@@ -74,7 +74,6 @@ class Document:
             bounds=bounds_of(self.original),
             origin=scene.origin,
             rows=layer_rows(scene, self.gdfs, added),
-            recordings=self.recordings(),
             fit=lambda camera, aspect: fit_all(camera, self.original, aspect),
             fit_members=lambda camera, aspect, mask: fit(camera, scene[torch.tensor(mask)], aspect),
             neighborhood=neighborhood,
@@ -83,12 +82,6 @@ class Document:
                 first_camera(self.original, (), aspect, camera.fov_y, camera.up), mode=camera.mode
             ),
         )
-
-    def recordings(self) -> tuple[RecordingFile, ...]:
-        """Where each edit was recorded."""
-        if len(self.gdf_paths) != len(self.edits):
-            return (RecordingFile(),) * len(self.edits)
-        return tuple(find_recording(gdf, path) for gdf, path in zip(self.edits, self.gdf_paths, strict=True))
 
     def free_name(self, name: str) -> str:
         """An edit's name, with a number where another edit has it."""

@@ -219,7 +219,6 @@ def first_state(
             "group": state.group,
         }
 
-    listed = snapshots.with_original(kept, view)
     stage = {
         "background": view.background,
         "camera": camera_json(view.camera),
@@ -239,7 +238,6 @@ def first_state(
             }
             for each in kept
         ],
-        "pair": snapshots.pair_of(listed, view.pair),
         "timeline": _film(view.timeline, edits),
         "paints": paints,
     }

@@ -115,7 +115,7 @@ def draw(
     work = new_edit_form.draw(work, facts.count, preview, ui, actions)
     work = cards.draw(work, facts.rows, pictures.edits, reveal, ui, actions)
     work = _regions(work, ui, actions)
-    work = snapshot_cards.draw(work, facts.rows, pictures.snapshots, ui, actions)
+    work = snapshot_cards.draw(work, pictures.snapshots, ui, actions)
     _end_body()
     cards.draw_selection(work.view, selected, ui, actions)
     training_cards.draw(work.jobs, ui, actions)

@@ -1,4 +1,4 @@
-"""The panel's part for snapshots: small pictures to go back to, and a slider between two of them."""
+"""The panel's part for snapshots: small pictures to go back to, and which two of them are compared."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 
 from imgui_bundle import imgui, imgui_ctx
 
-from viewer.state.facts import LayerRow
-from viewer.state.snapshots import compare_sides, is_blend, pair_of, with_original
+from viewer.state.snapshots import compare_sides, pair_of, with_original
 from viewer.state.workspace import Workspace
 from viewer.ui.context import PALETTE, SMALL_PX, Icon, UiContext, u32
 from viewer.ui.widgets import (
@@ -25,8 +24,6 @@ from viewer.ui.widgets import (
     tip,
     typed_name,
 )
-
-from . import slider
 
 COLUMNS = 3
 _MENU = "menu of a snapshot"
@@ -46,17 +43,14 @@ class _Cards:
 
     names: Sequence[str]
     textures: Sequence[int]  # GL names of their pictures, 0 before they are drawn
-    a: int  # places of the two that the slider lies between
+    a: int  # places of the two that are compared
     b: int
 
 
-def draw(
-    work: Workspace, rows: Sequence[LayerRow], textures: Sequence[int], ui: UiContext, actions: list[str]
-) -> Workspace:
+def draw(work: Workspace, textures: Sequence[int], ui: UiContext, actions: list[str]) -> Workspace:
     """Draw the section; the workspace with it folded or not.
 
     Args:
-        rows: one per .gdf, indexed by `LayerState.gdf`
         textures: GL names of the pictures, that of the original first
     """
     right = right_edge()
@@ -71,8 +65,7 @@ def draw(
         return work
     snapshots = with_original(work.snapshots, work.view)
     cards = _Cards([s.name for s in snapshots], textures, *pair_of(snapshots, work.view.pair))
-    current = is_blend(work.view, snapshots, lambda gdf: rows[gdf].count)
-    _slider(cards, work, current, ui, actions)
+    _pair(cards, compare_sides(work.snapshots, work.view) is not None, ui, actions)
     gap = 6.0 * ui.scale
     each = (imgui.get_content_region_avail().x - (COLUMNS - 1) * gap) / COLUMNS
     start, dragged = imgui.get_cursor_screen_pos(), ""
@@ -96,12 +89,8 @@ def draw(
     return work
 
 
-def _slider(cards: _Cards, work: Workspace, current: bool, ui: UiContext, actions: list[str]) -> None:
-    """Which two, whether they are compared, and where between them the picture stands.
-
-    `current`: what is on screen is what the slider made.
-    """
-    compared = compare_sides(work.snapshots, work.view) is not None
+def _pair(cards: _Cards, compared: bool, ui: UiContext, actions: list[str]) -> None:
+    """Which two, and whether they are compared."""
     side, gap = imgui.get_frame_height(), 4.0 * ui.scale
     wide = (imgui.get_content_region_avail().x - side - 2 * gap) / 2
     for slot, chosen in (("a", cards.a), ("b", cards.b)):
@@ -114,27 +103,10 @@ def _slider(cards: _Cards, work: Workspace, current: bool, ui: UiContext, action
         imgui.set_next_item_width(wide)
         label = f"{slot.upper()}   {cards.names[chosen]}"
         room = wide - side - 2 * imgui.get_style().frame_padding.x
-        help_ = f"Snapshot {slot.upper()}, the {'left' if slot == 'a' else 'right'} end of the slider below"
+        help_ = f"Snapshot {slot.upper()}, at the {'left' if slot == 'a' else 'right'} of a comparison"
         pressed = drop_down(f"##snapshot {slot}", elide(label, room), cards.names, chosen, ui, help_)
         if pressed is not None:
             actions.append(f"choose_snapshot:{slot}:{cards.names[pressed]}")
-    number = imgui.calc_text_size("0.00").x
-    at, room = imgui.get_cursor_screen_pos(), imgui.get_content_region_avail().x - number - 8.0 * ui.scale
-    share = slider.draw(
-        "##blend snapshots",
-        work.view.pair.share,
-        (0.0, 0.5, 1.0),
-        room,
-        ui.scale,
-        PALETTE.accent,
-        current,
-        help_="Blend from A to B. Ctrl+click: type a value. Shift+drag: fine adjustment.",
-    )
-    corner = (at.x + room + 8.0 * ui.scale, at.y)
-    color = PALETTE.text if current else PALETTE.dim
-    imgui.get_window_draw_list().add_text(corner, u32(color), f"{share:.2f}")
-    if share != work.view.pair.share:
-        actions.append(f"blend_snapshots:{share!r}")
 
 
 def _card(index: int, cards: _Cards, wide: float, ui: UiContext, actions: list[str]) -> str:

@@ -9,7 +9,7 @@ from typing import TypeVar
 from imgui_bundle import imgui
 
 from viewer.camera.view_camera import Vec3, ViewCamera, axes, with_up
-from viewer.pictures.compare import FIELD, Labels
+from viewer.pictures.compare import Labels
 from viewer.render import highlight
 from viewer.state.layers import is_visible
 from viewer.state.view_state import (
@@ -40,7 +40,6 @@ from viewer.ui.widgets import (
     menu_item,
     more_button,
     plate,
-    small,
     tip,
     typed_name,
     value_slider,
@@ -318,24 +317,17 @@ def draw_ring(view: ViewState, ui: UiContext) -> None:
 _COMPARISONS = ("beside", "split", "difference")
 _AGAINST = (
     ("original", "Against the original", ""),
-    ("recorded", "Against what training recorded", "against"),
     ("snapshots", "Snapshot A against B", "compare_snapshots"),
 )
 
 
 def draw_comparison(
-    work: Workspace,
-    words: Labels,
-    off: dict[str, str],
-    original: bool,
-    place: imgui.ImVec2Like,
-    ui: UiContext,
+    work: Workspace, words: Labels, original: bool, place: imgui.ImVec2Like, ui: UiContext
 ) -> tuple[Workspace, str]:
     """The pill at the top of the picture: what is compared with what, and how.
 
     Args:
         words: of the comparison on screen
-        off: of `AGAINST`, what there is nothing of, and why
         original: the original is shown
         place: the middle of its upper edge, window pixels
 
@@ -345,13 +337,10 @@ def draw_comparison(
     compare, asked = work.view.compare, ""
     on = compare.mode != "off" and not original
     right, _, figure = words.right.partition(" · ")
-    left = words.left
-    if right == FIELD:
-        left, right, figure = "as trained", "edited", f"{words.left} · {figure}"
     figure = words.line if compare.mode == "difference" else figure
     imgui.push_style_var(imgui.StyleVar_.item_spacing, (0.0, 2.0 * ui.scale))
     with plate("comparison", place, ui, (0.5, 0.0), _PAD_PX):
-        if _word("left", left.capitalize(), on or original, ui):
+        if _word("left", words.left.capitalize(), on or original, ui):
             asked = "before"
         hint("before")
         imgui.same_line()
@@ -367,12 +356,10 @@ def draw_comparison(
         if icon_button("comparisons", Icon.UNFOLDED, ui):
             imgui.open_popup("comparisons")
         tip("How to compare, and with what")
-        if on and words.notice:
-            small(words.notice, PALETTE.warning)
         imgui.pop_style_var()
         _open_below(0.5, ui)
         with menu("comparisons", ui) as is_open:
-            compare = _choose_comparison(compare, off, ui) if is_open else compare
+            compare = _choose_comparison(compare, bool(work.snapshots), ui) if is_open else compare
     return replace(work, view=replace(work.view, compare=compare)), asked
 
 
@@ -385,7 +372,7 @@ def _word(name: str, text: str, bright: bool, ui: UiContext) -> bool:
     return bool(pressed)
 
 
-def _choose_comparison(compare: Comparison, off: dict[str, str], ui: UiContext) -> Comparison:
+def _choose_comparison(compare: Comparison, snapshots: bool, ui: UiContext) -> Comparison:
     if imgui.menu_item("Edited alone", "", compare.mode == "off")[0]:
         compare = replace(compare, mode="off")
     for mode in _COMPARISONS:
@@ -393,13 +380,13 @@ def _choose_comparison(compare: Comparison, off: dict[str, str], ui: UiContext) 
             compare = replace(compare, mode=mode)
     imgui.separator()
     for against, text, action in _AGAINST:
-        why = off.get(against, "")
-        if imgui.menu_item(text, shortcut(action), compare.against == against, not why)[0]:
+        there = snapshots or against == "original"
+        if imgui.menu_item(text, shortcut(action), compare.against == against, there)[0]:
             compare = replace(
                 compare, against=against, mode="split" if compare.mode == "off" else compare.mode
             )
-        if why:
-            tip(why)
+        if not there:
+            tip("There is no snapshot")
     if compare.mode == "difference":
         ends = 1.0, MOST_AMPLIFIED
         times = value_slider("##amplify", compare.amplify, ends, "Gain × %.0f", Comparison.amplify, ui)

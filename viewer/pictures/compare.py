@@ -1,14 +1,13 @@
 """Two pictures in one: each in a half, or split at a divider, or their difference amplified, with PSNR.
 
-Beside the edited picture stands the original, the same edits as they were recorded, or one snapshot beside
-another. That side is drawn by a second engine, made when it is first asked for: against the original a slider
-then moves only one of the two pictures, the divider neither.
+Beside the edited picture stands the original, or one snapshot beside another. That side is drawn by a second
+engine, made when it is first asked for: against the original a slider then moves only one of the two
+pictures, the divider neither.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import moderngl
@@ -18,22 +17,18 @@ from PIL import Image as Pillow
 from PIL import ImageDraw, ImageFont
 
 from progdf.camera import Camera
-from progdf.errors import ProgdfError
-from progdf.gdf.file import Gdf
 from progdf.metrics.image import psnr
 from viewer.camera.view_camera import half_camera, to_camera
 from viewer.gl.present import Presenter
 from viewer.render.dynamic_resolution import FrameTimings
 from viewer.render.engine import ViewEngine, drawn_size
 from viewer.render.gl_renderer import Image
-from viewer.state import facts
-from viewer.state.facts import RecordingFile
 from viewer.state.snapshots import SnapshotSides
 from viewer.state.view_state import Comparison, ViewState
 
 from .film import Pixels, to_pixels
 
-ORIGINAL, EDITED, FIELD = "original", "edited", "field"
+ORIGINAL, EDITED = "original", "edited"
 _SHADE, _INK = (22, 24, 27), (222, 225, 230)
 _PLAIN = str.maketrans({"×": "x", "–": "-"})  # Pillow's own font has no others
 
@@ -45,35 +40,24 @@ class Labels:
     left: str = ORIGINAL  # left, right: the two sides
     right: str = EDITED
     line: str = ""  # over a difference
-    notice: str = ""  # why it is not against what was asked for, "" where it is
 
 
-def labels(
-    compare: Comparison,
-    decibels: float,
-    recorded: str = "",
-    obstacle: str = "",
-    names: tuple[str, str] | None = None,
-) -> Labels:
+def labels(compare: Comparison, decibels: float, names: tuple[str, str] | None = None) -> Labels:
     """What to say over a comparison.
 
     Args:
         compare: what is compared, and how
         decibels: PSNR of the two pictures; NaN where it was not taken
-        recorded: which snapshots are on the other side, "" for the original
-        obstacle: why the recording was asked for and is not shown
-        names: of the snapshots on the two sides
+        names: of the snapshots on the two sides; None for the original and the edited
     """
     if math.isinf(decibels):
         line, figure = "difference: none", " · no difference"
     else:
         figure = "" if math.isnan(decibels) else f" · PSNR {decibels:.1f} dB"
         line = f"difference × {compare.amplify:g}{figure}"
-    if names is not None:
-        return Labels(names[0], names[1] + figure, f"{line} · {names[0]} against {names[1]}")
-    if recorded:
-        return Labels(recorded, FIELD + figure, f"{line} · {recorded}")
-    return Labels(line=line, notice=f"Against the original: {obstacle}" if obstacle else "")
+    if names is None:
+        return Labels(line=line)
+    return Labels(names[0], names[1] + figure, f"{line} · {names[0]} against {names[1]}")
 
 
 def draw_labels(image: Image, compare: Comparison, words: Labels) -> Pixels:
@@ -121,22 +105,17 @@ class Comparer:
     Args:
         engine: draws the edited scene; stays the caller's
         ctx: the engine's context; None for `image` only
-        found: where the engine's edits were recorded, one for each
     """
 
-    def __init__(
-        self, engine: ViewEngine, ctx: moderngl.Context | None, recordings: Sequence[RecordingFile] = ()
-    ) -> None:
+    def __init__(self, engine: ViewEngine, ctx: moderngl.Context | None) -> None:
         self.engine = engine
         self.psnr = math.nan
         """Of the last comparison, dB; infinite where nothing differs, NaN where it was not taken."""
-        self.recordings = tuple(recordings) or (RecordingFile(),) * len(engine.gdfs)
-        """Where the edits were recorded; one that turned out to be broken is none."""
         self.sides: SnapshotSides | None = None
         """The snapshots that the next view compares; that view is then `sides.right`."""
         self._ctx = ctx
         self._other: ViewEngine | None = None
-        self._against = ""  # what `_other` draws, of `AGAINST`
+        self._of_snapshots = False  # whether `_other` draws one of them
         self._presenter: Presenter | None = None
         self._texture: moderngl.Texture | None = None
         self._amplified: float | None = None  # how much the difference in the texture is amplified
@@ -150,7 +129,7 @@ class Comparer:
         if view.compare.mode == "off":
             return False
         another = view.compare.mode == "difference" and self._amplified != view.compare.amplify
-        return another or self._second(view).needs_draw(self._other_view(view), drawn, camera)
+        return another or self._second().needs_draw(self._other_view(view), drawn, camera)
 
     def draw(
         self,
@@ -180,7 +159,7 @@ class Comparer:
         camera = half_camera(camera) if mode == "beside" else camera
         if not self.engine.prepare(view, camera):
             return False
-        return mode == "off" or self._second(view).prepare(self._other_view(view), camera)
+        return mode == "off" or self._second().prepare(self._other_view(view), camera)
 
     def image(self, view: ViewState, size: tuple[int, int] = (0, 0), camera: Camera | None = None) -> Image:
         """The same as an array, without labels. [H,W,3] float32, see `ViewEngine.image`"""
@@ -190,7 +169,7 @@ class Comparer:
             full = camera or to_camera(view.camera, *size)
             camera = half_camera(full)
         edited = self.engine.image(view, size, camera)
-        other = self._second(view).image(self._other_view(view), size, camera)
+        other = self._second().image(self._other_view(view), size, camera)
         self.psnr = _psnr(other, edited)
         if view.compare.mode == "beside":
             gap = np.ones((edited.shape[0], full.width - 2 * edited.shape[1], 3), np.float32)
@@ -200,20 +179,9 @@ class Comparer:
             return np.concatenate([other[:, :at], edited[:, at:]], axis=1)
         return difference(other, edited, view.compare.amplify)
 
-    def against(self, view: ViewState) -> str:
-        """What the picture of `view` is set against, of `AGAINST`: what it asks for, if that exists."""
-        missing = {"recorded": facts.obstacle(self.recordings), "snapshots": self.sides is None}
-        return "original" if missing.get(view.compare.against) else view.compare.against
-
     def labels(self, view: ViewState) -> Labels:
         """What to say over the last comparison, of `view`."""
-        target, against = view.compare.against, self.against(view)
-        if self.sides is not None:
-            return labels(view.compare, self.psnr, names=self.sides.names)
-        why = {"recorded": facts.obstacle(self.recordings), "snapshots": "there is no snapshot"}
-        obstacle = why[target] if target != against else ""
-        recorded = facts.describe(view, self.engine.gdfs, self.recordings) if against == "recorded" else ""
-        return labels(view.compare, self.psnr, recorded, obstacle)
+        return labels(view.compare, self.psnr, self.sides.names if self.sides else None)
 
     def release(self) -> None:
         """Give back all but the engine."""
@@ -221,42 +189,27 @@ class Comparer:
             if resource is not None:
                 resource.release()
 
-    def _second(self, view: ViewState) -> ViewEngine:
-        """What draws the other side of `view`."""
-        if self._other is None or self._against != self.against(view):
-            gdfs = self.engine.gdfs if self.sides else ()
-            gdfs = self._load_recorded() if self.against(view) == "recorded" else gdfs
+    def _second(self) -> ViewEngine:
+        """What draws the other side."""
+        if self._other is None or self._of_snapshots != bool(self.sides):
             if self._other is not None:
                 self._other.release()
-            self._against = self.against(view)  # reading a recording may have shown that it is none
+            self._of_snapshots = bool(self.sides)
+            gdfs = self.engine.gdfs if self.sides else ()
             self._other = ViewEngine(self._ctx, self.engine.scene, gdfs, self.engine.draws_with)
         return self._other
 
-    def _load_recorded(self) -> tuple[Gdf, ...]:
-        """The edits as they were recorded."""
-        gdfs, read = [], []
-        for gdf, recording in zip(self.engine.gdfs, self.recordings, strict=True):
-            try:
-                gdfs.append(facts.load_recorded(gdf, recording))
-                read.append(recording)
-            except ProgdfError as error:
-                gdfs.append(gdf)
-                read.append(RecordingFile(reason=str(error)))
-        self.recordings = tuple(read)
-        return tuple(gdfs)
-
     def _other_view(self, view: ViewState) -> ViewState:
         """What the other side of `view` shows."""
-        if self.sides is not None:
-            left = self.sides.left
-            return replace(view, layers=left.layers, groups=left.groups, blend=left.blend)
-        recorded = self.against(view) == "recorded"
-        return facts.clamp_to_recorded(view, self.recordings) if recorded else replace(view, layers=())
+        if self.sides is None:
+            return replace(view, layers=())
+        left = self.sides.left
+        return replace(view, layers=left.layers, groups=left.groups, blend=left.blend)
 
     def _draw_sides(
         self, view: ViewState, framebuffer: moderngl.Framebuffer, size: tuple[int, int], pixels: int
     ) -> FrameTimings:
-        new, other, its_view = self.needs_draw(view, size, pixels), self._second(view), self._other_view(view)
+        new, other, its_view = self.needs_draw(view, size, pixels), self._second(), self._other_view(view)
         camera = None
         if view.compare.mode == "beside":
             camera = half_camera(to_camera(view.camera, *size))
@@ -269,7 +222,7 @@ class Comparer:
                 original = other.draw(its_view, framebuffer, size, pixels)
             finally:
                 framebuffer.scissor = None  # type: ignore[assignment]  # its annotation forgets None
-        if new and pixels == 1 and self._against != "original":
+        if new and pixels == 1 and self.sides:
             self.psnr = _psnr(other.image(its_view, size, camera), self.engine.image(view, size, camera))
         elif new:
             self.psnr = math.nan  # of no use: an edit shall differ, and a coarse picture hides errors
@@ -287,7 +240,7 @@ class Comparer:
                 self._texture = self._ctx.texture(size, 3, dtype="f4")
             self._texture.write(image)
             self._amplified = view.compare.amplify
-            timings = _add_timings(self.engine.timings, self._second(view).timings)
+            timings = _add_timings(self.engine.timings, self._second().timings)
         else:
             timings = FrameTimings(drawn=self.engine.timings.drawn)
         self._presenter = self._presenter or Presenter(self._ctx)

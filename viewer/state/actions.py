@@ -51,15 +51,6 @@ def toggle_mode(view: ViewState, mode: str) -> ViewState:
     return replace(view, compare=replace(view.compare, mode=mode))
 
 
-def toggle_against(view: ViewState) -> ViewState:
-    """Against the recording instead of the original, or back; where nothing is compared, side by side."""
-    compare = view.compare
-    if compare.mode == "off":
-        return replace(view, compare=replace(compare, mode="split", against="recorded"))
-    against = "original" if compare.against == "recorded" else "recorded"
-    return replace(view, compare=replace(compare, against=against))
-
-
 def toggle_snapshots(view: ViewState) -> ViewState:
     """One snapshot against the other, or what was on the screen before; where nothing is compared, split."""
     compare = view.compare
@@ -104,8 +95,6 @@ def perform(workspace: Workspace, action: str, facts: SceneFacts, aspect: float 
         state = workspace.view.selection
         changed = selection.change(state, name, argument, facts.count, facts.neighborhood)
         return replace(workspace, view=replace(workspace.view, selection=changed))
-    if name == "blend_snapshots":
-        return _blend_snapshots(workspace, argument, facts)
     if name == "next_slider":
         return _select_slider(workspace, int(argument), facts)
     if name in OF_EDITS:
@@ -349,7 +338,7 @@ def _restore(workspace: Workspace, index: str) -> Workspace:
 
 
 def _name_snapshot(workspace: Workspace, argument: str) -> Workspace:
-    """`INDEX:NAME`; the pair that is blended follows."""
+    """`INDEX:NAME`; the pair that is compared follows."""
     index, _, name = argument.partition(":")
     old, new = workspace.snapshots, snapshots.rename(workspace.snapshots, int(index) - 1, name)
     was, now, pair = old[int(index) - 1].name, new[int(index) - 1].name, workspace.view.pair
@@ -367,14 +356,6 @@ def _choose_snapshot(workspace: Workspace, argument: str) -> Workspace:
     """`SLOT:NAME`, of which SLOT is a or b"""
     slot, _, name = argument.partition(":")
     return replace(workspace, view=snapshots.choose(workspace.view, slot, name))
-
-
-def _blend_snapshots(workspace: Workspace, share: str, facts: SceneFacts) -> Workspace:
-    if not workspace.snapshots:
-        return workspace
-    listed = snapshots.with_original(workspace.snapshots, workspace.view)
-    view = snapshots.blend(workspace.view, listed, float(share), lambda gdf: facts.rows[gdf].count)
-    return with_layers_of(workspace, view)
 
 
 def _give_keyboard(workspace: Workspace, by: str) -> Workspace:
@@ -462,11 +443,9 @@ ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
     "beside": lambda w, _: replace(w, view=toggle_mode(w.view, "beside")),
     "split": lambda w, _: replace(w, view=toggle_mode(w.view, "split")),
     "difference": lambda w, _: replace(w, view=toggle_mode(w.view, "difference")),
-    "against": lambda w, _: replace(w, view=toggle_against(w.view)),
-    "compare_snapshots": lambda w, _: replace(w, view=toggle_snapshots(w.view)),
+    "compare_snapshots": lambda w, _: replace(w, view=toggle_snapshots(w.view)) if w.snapshots else w,
     "dynamic_resolution": lambda w, _: replace(w, view=next_resolution_mode(w.view)),
     "new_edit": _new_edit,
-    "overlay": lambda w, _: replace(w, view=replace(w.view, overlay=not w.view.overlay)),
     "panel": lambda w, _: replace(w, view=replace(w.view, panel=not w.view.panel)),
     **{name: _timeline_action(name) for name in timeline.ACTIONS},
 }

@@ -1,13 +1,11 @@
-"""What is known of the open scene's edits: their rows in the panel, and what training recorded of them."""
+"""What is known of the open scene's edits: their rows in the panel."""
 
 from __future__ import annotations
 
 import math
-from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,18 +15,13 @@ from torch import Tensor
 
 from progdf.camera import Camera
 from progdf.compose.layers import KINDS
-from progdf.errors import ProgdfError
 from progdf.field.baked import GradeForm
 from progdf.field.grade import map_drawn
-from progdf.field.trajectory import FILE_NAME, load_trajectory, peek_trajectory, recorded_field
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
 from progdf.rasterize import render
 from progdf.sh import sh0_to_rgb, shade
 from viewer.camera.view_camera import Bounds, Fit, ViewCamera, bounds_of, fit, frame, keep_camera, to_camera
-
-from .layers import visible_layers
-from .view_state import ViewState
 
 Rgb = tuple[float, float, float]
 
@@ -173,93 +166,3 @@ def describe_applied(scene: Gaussians, gdf: Gdf) -> str:
     if errors and (levels := 255 * float(torch.cat(errors).square().mean().sqrt())) > 1:
         lines.append(f"pictures are {levels:.1f}/255 (rms) off its map, as its colors turn with the view")
     return f"{gdf.name} on {gdf.region.name}: {'; '.join(lines)}" if lines else ""
-
-
-NO_FILE = "the edit was not opened from a file"
-
-
-@dataclass(frozen=True)
-class RecordingFile:
-    """Where the recording of one edit lies."""
-
-    path: Path | None = None  # its file; None where there is none to show
-    reason: str = ""  # why there is none
-
-
-def find_recording(gdf: Gdf, path: Path) -> RecordingFile:
-    """The recording in the run folder that the edit at `path` lies in, if it is this edit's."""
-    beside = path.with_name(FILE_NAME)
-    if gdf.applied:
-        return RecordingFile(reason=f"{path.name} was not trained on this region")
-    if not beside.is_file():
-        return RecordingFile(reason=f"there is no {FILE_NAME} beside {path.name}")
-    field, form = gdf.field, gdf.field.origin
-    try:
-        recorded, members = peek_trajectory(beside, isinstance(form, GradeForm))
-    except ProgdfError as error:
-        return RecordingFile(reason=str(error))
-    if isinstance(form, GradeForm):
-        same = torch.equal(recorded, form.table[1:])
-    else:
-        same = torch.equal(recorded, field.offsets(1.0)) if field.attributes else not bool(recorded.any())
-    if not same or not torch.equal(members, gdf.region.members):
-        return RecordingFile(reason=f"the {FILE_NAME} beside {path.name} belongs to another edit")
-    return RecordingFile(beside)
-
-
-def load_recorded(gdf: Gdf, recording: RecordingFile) -> Gdf:
-    """The edit with its recording, where the field shows it, as the field; as it is where there is none.
-
-    Raises:
-        ProgdfError: the file is gone or damaged.
-    """
-    if recording.path is None:
-        return gdf
-    trajectory, s = load_trajectory(recording.path)[0], torch.tensor(gdf.field.recorded, dtype=torch.float32)
-    ascends = len(s) > 1 and float(s[0]) == 0.0 and float(s[-1]) == 1.0 and bool((s.diff() > 0).all())
-    if trajectory.end.shape[0] != gdf.members or len(trajectory) != len(s) or not ascends:
-        raise ProgdfError(f"{recording.path} belongs to another edit; train again")
-    return replace(gdf, field=recorded_field(replace(trajectory, s=s)))
-
-
-def obstacle(recordings: Sequence[RecordingFile]) -> str:
-    """Why there is nothing recorded to compare with; "" where there is."""
-    if any(recording.path is not None for recording in recordings):
-        return ""
-    return (recordings[0].reason or NO_FILE) if recordings else "no edit is open"
-
-
-def clamp_to_recorded(view: ViewState, recordings: Sequence[RecordingFile]) -> ViewState:
-    """`view` with no recorded edit beyond its last snapshot: past 1 nothing was recorded."""
-    layers = (
-        replace(layer, strength=min(layer.strength, 1.0)) if recordings[layer.gdf].path else layer
-        for layer in view.layers
-    )
-    return replace(view, layers=tuple(layers))
-
-
-def describe(view: ViewState, gdfs: Sequence[Gdf], recordings: Sequence[RecordingFile]) -> str:
-    """Which snapshots are shown, and which edits have none: "recorded, between 0.42 and 0.47"."""
-    active = [layer for layer in visible_layers(view) if layer.strength != 0.0]
-    places, fields = {}, []
-    for layer in active:
-        if recordings[layer.gdf].path is None:
-            fields.append(layer.name)
-        else:
-            places[layer.name] = _neighbors(gdfs[layer.gdf].field.recorded, layer.strength)
-    if len(places) < 2 and not fields:
-        ends = [f"{s:.3g}" for s in next(iter(places.values()), (0.0,))]
-        return f"recorded, between {ends[0]} and {ends[1]}" if len(ends) == 2 else f"recorded at {ends[0]}"
-    recorded = [f"{name} {'–'.join(f'{s:.3g}' for s in ends)}" for name, ends in places.items()]
-    parts = (
-        "recorded: " + ", ".join(recorded) if recorded else "",
-        "field: " + ", ".join(fields) if fields else "",
-    )
-    return "; ".join(part for part in parts if part)
-
-
-def _neighbors(nodes: Sequence[float], strength: float) -> tuple[float, ...]:
-    """The snapshot at a strength, or those on either side of it."""
-    right = min(bisect_left(nodes, strength), len(nodes) - 1)
-    exact = nodes[right] <= strength
-    return (nodes[right],) if exact or right == 0 else (nodes[right - 1], nodes[right])

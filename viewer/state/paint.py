@@ -173,20 +173,6 @@ def invert(paint: str, members: int) -> str:
     return encode(np.zeros(members, np.float32) if weights is None else (1.0 - weights).numpy())
 
 
-@lru_cache(maxsize=48)
-def blend(first: str, second: str, share: float, members: int) -> str:
-    """The paint whose weights lie between those of two others: (1 − share) · first + share · second.
-
-    Raises:
-        ProgdfError: see `decode`.
-    """
-    if first == second:
-        return first
-    ends = (decode(paint, members) for paint in (first, second))
-    a, b = (np.ones(members, np.float32) if weights is None else weights.numpy() for weights in ends)
-    return encode(a + np.float32(share) * (b - a))
-
-
 def feather(paint: str, points: Floats, width: float) -> str:
     """The paint with its edges softened, wherever one looks from.
 

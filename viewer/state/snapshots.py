@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from progdf.compose.layers import Gains
 from viewer.camera.view_camera import ViewCamera
 
-from . import history, paint
+from . import history
 from .history import Edit
-from .layers import LONGEST_NAME, SLIDERS, visible_layers
+from .layers import LONGEST_NAME
 from .selection import SelectionState
-from .view_state import LayerGroup, LayerState, SnapshotPair, Timeline, ViewState
+from .view_state import SnapshotPair, Timeline, ViewState
 
 MOST = 200
 ORIGINAL = "original"
@@ -97,113 +96,13 @@ def compare_sides(snapshots: Sequence[SliderSnapshot], view: ViewState) -> Snaps
 
 
 def choose(view: ViewState, slot: str, name: str) -> ViewState:
-    """Another snapshot as A or B ("a" or "b") of the pair; the slider between them goes back to A."""
-    changes: dict[str, Any] = {slot: name, "share": 0.0}
+    """Another snapshot as A or B ("a" or "b") of the pair."""
+    changes: dict[str, Any] = {slot: name}
     return replace(view, pair=replace(view.pair, **changes))
 
 
-def blend(
-    view: ViewState, snapshots: Sequence[SliderSnapshot], share: float, counts: Callable[[int], int]
-) -> ViewState:
-    """`view` between A and B of its pair: as A at 0, as B at 1, each exactly.
-
-    Strengths, gains, group strengths and painted weights lie between those of the two, in a straight line; a
-    layer that only one of them shows fades with that one's gains and paint. The order of layers, the blend
-    rule and locks cannot lie between: they change half way.
-
-    Args:
-        snapshots: the snapshots with the original
-        counts: gives how many members an edit has
-
-    Raises:
-        ProgdfError: painted weights do not fit their edit.
-    """
-    share = min(1.0, max(0.0, share))
-    a, b = pair_of(snapshots, view.pair)
-    pair = replace(view.pair, a=snapshots[a].name, b=snapshots[b].name, share=share)
-    ends = [restore(view, snapshots[i] if i else _faded_snapshot(snapshots[j])) for i, j in ((a, b), (b, a))]
-    if share in (0.0, 1.0):
-        return replace(ends[round(share)], pair=pair)
-    near, far = ends if share < 0.5 else ends[::-1]
-    known = {layer.gdf for layer in near.layers}
-    stack = (*near.layers, *(replace(layer, group="") for layer in far.layers if layer.gdf not in known))
-    members = [_members(end) for end in ends]
-    shared = {name for name in members[0] if members[0][name] == members[1].get(name)}  # groups of both
-    if any(layer.solo for end in ends for layer in end.layers):
-        shared = set()  # soloed layers are shown whatever becomes of their groups
-    groups = (
-        _group_between(group, ends, share) if group.name in shared else LayerGroup(group.name)
-        for group in near.groups
-    )
-    layers_of = [{layer.gdf: layer for layer in end.layers} for end in ends]
-    seen = [{layer.gdf: layer.strength for layer in visible_layers(end)} for end in ends]
-
-    def between(layer: LayerState) -> LayerState:
-        first, second = (of.get(layer.gdf, replace(layer, strength=0.0, enabled=False)) for of in layers_of)
-        visible = [layer.gdf in of for of in seen]
-        strengths = [of.get(layer.gdf, end.strength) for of, end in zip(seen, (first, second), strict=True)]
-        if layer.group in shared:
-            visible, strengths = [first.enabled, second.enabled], [first.strength, second.strength]
-        strength = _fade(visible, strengths, share)
-        on = [here and s != 0.0 for here, s in zip(visible, strengths, strict=True)]
-        if on[0] != on[1]:
-            first = second = first if on[0] else second
-        gains = {
-            kind: _lerp(getattr(first.gains, kind), getattr(second.gains, kind), share)
-            for kind in SLIDERS[1:]
-        }
-        weights = paint.blend(first.paint, second.paint, share, counts(layer.gdf))
-        return replace(
-            layer, strength=strength, enabled=any(visible), solo=False, gains=Gains(**gains), paint=weights
-        )
-
-    return replace(
-        near,
-        layers=tuple(map(between, stack)),
-        groups=tuple(groups),
-        overshoot=near.overshoot or far.overshoot,
-        pair=pair,
-    )
-
-
-def is_blend(view: ViewState, snapshots: Sequence[SliderSnapshot], counts: Callable[[int], int]) -> bool:
-    """Whether `view` is still what its slider between two snapshots made of it."""
-    made = blend(view, snapshots, view.pair.share, counts)
-    return (made.layers, made.groups, made.blend) == (view.layers, view.groups, view.blend)
-
-
-def _faded_snapshot(snapshot: SliderSnapshot) -> SliderSnapshot:
-    """The original as the other end of a slider: that snapshot with every strength at 0."""
-    layers = tuple(replace(layer, strength=0.0) for layer in snapshot.edit.layers)
-    return replace(snapshot, edit=replace(snapshot.edit, layers=layers))
-
-
-def _members(view: ViewState) -> dict[str, frozenset[int]]:
-    """The edits in each group."""
-    return {
-        group.name: frozenset(layer.gdf for layer in view.layers if layer.group == group.name)
-        for group in view.groups
-    }
-
-
-def _group_between(group: LayerGroup, ends: Sequence[ViewState], share: float) -> LayerGroup:
-    both = [next(g for g in end.groups if g.name == group.name) for end in ends]
-    on = [g.enabled for g in both]
-    return replace(group, enabled=any(on), strength=_fade(on, [g.strength for g in both], share))
-
-
-def _fade(on: Sequence[bool], values: Sequence[float], share: float) -> float:
-    """Between two values; what is off at one end is 0 there, unless it is off at both."""
-    a, b = (value if here or not any(on) else 0.0 for here, value in zip(on, values, strict=True))
-    return _lerp(a, b, share)
-
-
-def _lerp(a: float, b: float, share: float) -> float:
-    return a + share * (b - a)
-
-
 def _sliders(view: ViewState) -> Edit:
-    """What a snapshot keeps: all that undo knows but the film, the selection and the blend of snapshots."""
+    """What a snapshot keeps: all that undo knows but the film, the selection and the pair of snapshots."""
     edit = history.edit_of(view)
     return replace(edit, timeline=Timeline(), selection=SelectionState(), pair=SnapshotPair())
 

@@ -21,7 +21,7 @@ SMALLEST_PX, LARGEST_PX = 4.0, 400.0
 SELECT_TOOLS = ("box", "lasso", "polygon", "brush", "scribble", "sphere", "flood", "color")
 SELECT_MODES = ("new", "add", "subtract", "intersect")
 COMPARE_MODES = ("off", "beside", "split", "difference")
-AGAINST = ("original", "recorded", "snapshots")
+AGAINST = ("original", "snapshots")
 MOST_AMPLIFIED = 64.0
 LONGEST, FASTEST = 9999, 120  # frames, frames per second
 CARD_MODES = ("auto", "full", "compact")
@@ -99,8 +99,7 @@ class Comparison:
     divider: Share = 0.5  # where the edited side of a split begins, share of the picture's width
     # what a difference is multiplied by, 1 to 64
     amplify: Annotated[float, Meta(ge=1.0, le=MOST_AMPLIFIED)] = 4.0
-    # "original", or "recorded": the same strengths as training recorded them, where it did; or "snapshots": A
-    # of `ViewState.pair` against its B, whatever the sliders say
+    # "original", or "snapshots": A of `ViewState.pair` against its B, whatever the sliders say
     against: Annotated[str, one_of(AGAINST)] = "original"
 
 
@@ -108,9 +107,8 @@ class Comparison:
 class SnapshotPair:
     """Two snapshots by their names, "" for the last two there are (see snapshots.py)."""
 
-    a: str = ""  # a, b: what is compared, and what lies at the ends of the slider between them
-    b: str = ""
-    share: Share = 0.0  # where that slider was left, 0 at A
+    a: str = ""  # left in the comparison
+    b: str = ""  # right
 
 
 @dataclass(frozen=True)
@@ -141,7 +139,6 @@ class ViewState:
     layers: tuple[LayerState, ...] = ()
     blend: Blend = "adjust"
     background: tuple[Share, Share, Share] = (1.0, 1.0, 1.0)
-    overlay: bool = False
     panel: bool = True
     compare: Comparison = Comparison()
     overshoot: bool = False  # sliders go on to `OVERSHOOT`, which extrapolates
@@ -152,7 +149,7 @@ class ViewState:
     dynamic_resolution: Annotated[str, one_of(RESOLUTION_MODES)] = "auto"
     selection: SelectionState = SelectionState()  # what is selected and hidden, and the regions
     select: SelectTool = SelectTool()  # what selects
-    pair: SnapshotPair = SnapshotPair()  # the snapshots that are compared and blended
+    pair: SnapshotPair = SnapshotPair()  # the snapshots that are compared
     grid: bool = False  # the window draws a grid on the ground; pictures and films never have it
     axes: bool = True  # the window shows where the axes of the world point
     safe_frame: Annotated[str, one_of(FRAMES)] = ""  # of `FRAMES`: what a film of this shape will show
@@ -169,7 +166,6 @@ def on_another_scene(view: ViewState, camera: ViewCamera) -> ViewState:
     return ViewState(
         camera,
         background=view.background,
-        overlay=view.overlay,
         panel=view.panel,
         dynamic_resolution=view.dynamic_resolution,
         grid=view.grid,

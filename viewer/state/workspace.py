@@ -23,7 +23,7 @@ from viewer.jobs.job_queue import DeliverOptions, Job
 from viewer.jobs.training import NewEdit
 
 from . import history, timeline
-from .facts import LayerRow, RecordingFile
+from .facts import LayerRow
 from .history import Edit, History
 from .selection import SelectionState
 from .snapshots import SliderSnapshot
@@ -63,7 +63,6 @@ class SceneFacts:
     bounds: Bounds  # of the bulk of the scene
     rows: Sequence[LayerRow]  # one per .gdf, indexed by `LayerState.gdf`
     added: int = 0  # of these, how many edits have added
-    recordings: Sequence[RecordingFile] = ()  # where each .gdf was recorded, in the same order
     origin: Origin = ZERO  # where in the world the scene and its cameras begin, see `Gaussians.origin`
     fit: Fit = keep_camera  # gives the camera that `frame` takes with nothing selected and no layer focused
     # the same for what is selected

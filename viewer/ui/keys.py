@@ -122,7 +122,6 @@ TOPICS: dict[str, tuple[Command, ...]] = {
         Command("beside", "Side by side", "Y"),
         Command("split", "Split view", "Shift+Y"),
         Command("difference", "Difference", "D", "Amplified, with its PSNR", tap=True),
-        Command("against", "Compare with recording", "Alt+Y", "The field against what training recorded"),
     ),
     "Layers": (
         *_row("1–9", "Select a layer", _numbers("focus", "Select layer")),
@@ -250,8 +249,7 @@ TOPICS: dict[str, tuple[Command, ...]] = {
         Command("export_page", "Export web page…", "Ctrl+Shift+E", "For any browser", types=True, row=JOINED),
         Command("render_picture", "Render picture…", "Ctrl+Alt+P", "This view at any size", types=True),
         Command("render_film", "Render film…", "Ctrl+Shift+P", types=True),
-        Command("overlay", "Show timings", "F10", row="Timings; Shift resolution"),
-        Command("dynamic_resolution", "Dynamic resolution", "Shift+F10", "Auto, on, off", row=JOINED),
+        Command("dynamic_resolution", "Dynamic resolution", "Shift+F10", "Auto, on, off"),
         *_row("Ctrl + − 0", "Interface size", _zooms()),
         Command(
             "next_place:1", "Keyboard to next part", "F6 Tab", "Esc leaves it", row="Keys to panel, tools"

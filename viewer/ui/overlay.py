@@ -1,21 +1,18 @@
-"""What is drawn over the picture: timings, messages, the word "Original"."""
+"""What is drawn over the picture: messages, a banner, the safe frame, the axes of the world."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
 from imgui_bundle import imgui, imgui_ctx
 
 from viewer.camera.view_camera import SHAPES, ViewCamera, axes, dot, widen
 from viewer.camera.views import AXES
-from viewer.render.dynamic_resolution import FrameTimings
 from viewer.state.view_state import ViewState
 from viewer.state.workspace import Message
 
 from .context import FONT_PX, PALETTE, SMALL_PX, Rgba, UiContext, u32
-from .widgets import group_digits, plate
+from .widgets import plate
 
 
 @dataclass(frozen=True)
@@ -24,57 +21,6 @@ class Area:
 
     width: float
     height: float
-
-
-def figures(
-    timings: FrameTimings,
-    latencies_ms: Sequence[float],
-    count: int,
-    draws_with: str,
-    size: tuple[int, int],
-    pixels: int = 1,
-) -> list[tuple[str, str]]:
-    """Names and figures of a picture.
-
-    Args:
-        timings: where its time went
-        latencies_ms: from a slider's event to finished pixels, the last ones
-        count: Gaussians in the scene
-        draws_with: "gl" or "cpu"
-        size: of the picture as drawn: width, height
-        pixels: of the window that each of its pixels fills, each way; more than 1 while it is coarse
-    """
-    lines = [
-        ("frame", f"{timings.total_ms:.1f} ms"),
-        ("  compose", f"{timings.compose_ms:.1f} ms"),
-        ("  upload", f"{timings.upload_ms:.1f} ms"),
-        ("  sort", f"{timings.sort_ms:.1f} ms"),
-        ("  draw", f"{timings.draw_ms:.1f} ms"),
-        ("picture", f"{size[0]}×{size[1]}" + (", coarse" if pixels > 1 else "")),
-    ]
-    if latencies_ms:
-        median, late = np.percentile(latencies_ms, (50, 95))
-        lines.append(("slider p50 / p95", f"{median:.0f} / {late:.0f} ms"))
-    lines.append(("splats", f"{group_digits(timings.drawn)} of {group_digits(count)}"))
-    lines.append(("drawn by", {"gl": "OpenGL", "cpu": "CPU"}[draws_with]))
-    return lines
-
-
-def table(lines: Sequence[tuple[str, str]], ui: UiContext) -> None:
-    """A small table at the upper left: names, and figures aligned at the right."""
-    size, pad, gap = SMALL_PX * ui.scale, 8.0 * ui.scale, 14.0 * ui.scale
-    names = max((_text_width(name, size, ui) for name, _ in lines), default=0.0)
-    figures = max((_text_width(figure, size, ui) for _, figure in lines), default=0.0)
-    step = size * 1.35
-    left = top = 10.0 * ui.scale
-    right = left + names + figures + gap + 2 * pad
-    bottom = top + step * len(lines) + 2 * pad - (step - size)
-    canvas = imgui.get_background_draw_list()
-    canvas.add_rect_filled((left, top), (right, bottom), u32(PALETTE.scrim), 5 * ui.scale)
-    for i, (name, figure) in enumerate(lines):
-        y = top + pad + i * step
-        _text(left + pad, y, name, size, PALETTE.dim, ui)
-        _text(right - pad - _text_width(figure, size, ui), y, figure, size, PALETTE.text, ui)
 
 
 def banner(text: str, area: Area, ui: UiContext) -> None:

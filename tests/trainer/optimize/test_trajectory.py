@@ -17,8 +17,6 @@ from progdf.field.baked import identity_map
 from progdf.field.trajectory import (
     Trajectory,
     load_trajectory,
-    peek_trajectory,
-    recorded_field,
     save_trajectory,
 )
 from progdf.io.tensors import write_tensors
@@ -203,15 +201,6 @@ def test_a_trajectory_round_trips_through_its_file(tmp_path: Path) -> None:
     assert about == {"scene": "bär.ply"}
 
 
-def test_whose_recording_it_is_can_be_told_without_reading_the_recordings(tmp_path: Path) -> None:
-    trajectory = along([0.3, 1.0])
-    extra = {"members": torch.tensor([3, 5, 8])}
-    save_trajectory(tmp_path / "trajectory.safetensors", trajectory, extra, {})
-    end, members = peek_trajectory(tmp_path / "trajectory.safetensors")
-    assert torch.equal(end, trajectory.end)
-    assert torch.equal(members, extra["members"])
-
-
 @pytest.mark.parametrize(
     "part", [("end", torch.zeros(2, CHANNELS)), ("s", torch.tensor([0.0, 0.9, 1.1])), ("s", torch.ones(3))]
 )
@@ -227,16 +216,6 @@ def test_a_file_that_lacks_a_part_is_one_line(tmp_path: Path) -> None:
     write_tensors(path, {"s": torch.zeros(2)}, {"format": "progdf-trajectory-1", "about": "{}"})
     with pytest.raises(ProgdfError, match="it has no end"):
         load_trajectory(path)
-
-
-def test_a_recording_is_a_field_that_tells_the_same_at_and_between_the_snapshots() -> None:
-    trajectory = retimed(along([0.2, 0.3, 0.75, 1.0], noise=0.1))
-    field = recorded_field(trajectory)
-    assert field.recorded == tuple(trajectory.s.tolist())
-    for s in trajectory.s.tolist():
-        assert torch.equal(field.offsets(s), trajectory.at(s))
-    for s in (0.01, 0.4, 0.61, 0.99):
-        assert torch.allclose(field.offsets(s), trajectory.at(s), rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize("content", [b"", b"no tensors", b"\x08\x00\x00\x00\x00\x00\x00\x00{}      "])

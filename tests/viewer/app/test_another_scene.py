@@ -25,7 +25,6 @@ from viewer.state.workspace import PreviewState, mark_saved, new_workspace
 OF_THE_WINDOW = {
     "safe_frame",
     "background",
-    "overlay",
     "panel",
     "dynamic_resolution",
     "grid",
@@ -52,8 +51,8 @@ def window(tmp_path: Path) -> Iterator[application.App]:
 
 def test_a_new_scene_takes_over_nothing_but_the_settings_of_the_window() -> None:
     view = all_in_use(full_view(), len(bear().scene))
-    view = replace(view, overlay=True, panel=False, grid=True, select=SelectTool("flood"), overshoot=True)
-    view = replace(view, dynamic_resolution="on", pair=SnapshotPair("1", "2", 0.5), safe_frame="1:1")
+    view = replace(view, panel=False, grid=True, select=SelectTool("flood"), overshoot=True)
+    view = replace(view, dynamic_resolution="on", pair=SnapshotPair("1", "2"), safe_frame="1:1")
     plain = ViewState()
     changed = {
         field.name for field in fields(ViewState) if getattr(view, field.name) != getattr(plain, field.name)

@@ -46,7 +46,7 @@ INTERNAL = {
     *("show_file", "copy_path", "deliver", "stop_and_quit", "drop_and_quit", "rebind", "rebind_from"),
     *("replace_by", "place", "keep_placed", "put_back", "lay_decal", "save_region", "rename_region"),
     *("press_layer", "master", "rename_group", "restore", "forget", "name_snapshot"),
-    *("move_snapshot", "choose_snapshot", "blend_snapshots", "region", "show_region", "forget_region"),
+    *("move_snapshot", "choose_snapshot", "region", "show_region", "forget_region"),
     *("select_invert", "choose_keys", "move_keys", "clone_keys"),
     *("seek", "length", "fps", "go_to", "example", "forget_file"),
 }
@@ -59,7 +59,7 @@ def test_every_action_has_its_command_or_is_no_one_s_to_look_up(tmp_path: Path) 
         everything = {*app.requests, *exports.REQUESTS}
     everything |= {*actions.ACTIONS, *actions.OF_EDITS, *selection.CHANGES, "frame", "home", "invert"}
     everything |= {"paint_clear", "paint_fill", "paint_invert", "paint_feather"}
-    everything |= {"next_slider", "blend_snapshots", "point", "point_press"}
+    everything |= {"next_slider", "point", "point_press"}
     named = {action.partition(":")[0] for action in COMMANDS}
     assert named | INTERNAL == everything
     assert not named & INTERNAL
@@ -73,7 +73,6 @@ def test_every_action_has_its_command_or_is_no_one_s_to_look_up(tmp_path: Path) 
         ("sv", "split"),  # initials
         ("web", "export_page"),
         ("rend pic", "render_picture"),
-        ("recording", "against"),
         ("ctrl+shift+p", "render_film"),
         ("expscn", "export"),  # letters in their order
     ],
@@ -118,9 +117,9 @@ def test_a_click_beside_the_list_of_commands_closes_it_and_one_on_a_line_takes_i
         hand.click(40.0, 650.0)
         assert hand.main_view.work.palette is None
         hand.key("F3")
-        type_text(hand, "timings")
+        type_text(hand, "ground")
         hand.click(300.0, 134.0)
-        assert hand.main_view.work.view.overlay
+        assert hand.main_view.work.view.grid
 
 
 @pytest.mark.gl

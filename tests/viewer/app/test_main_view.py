@@ -134,16 +134,6 @@ def test_messages_leave_by_themselves(hand: Rig) -> None:
     assert hand.main_view.work.message is None
 
 
-def test_f10_tells_the_times_of_the_picture_on_screen(hand: Rig) -> None:
-    hand.key("F10")
-    assert hand.main_view.work.view.overlay
-    assert hand.main_view.canvas.pictures_drawn == 1, "showing figures draws no splats"
-    hand.drag(hand.slider(0, 0.5), hand.slider(0, 0.9))
-    names = [name.strip() for name, _ in hand.main_view.figures()]
-    assert {"frame", "sort", "draw", "slider p50 / p95", "splats"} <= set(names)
-    assert hand.main_view.canvas.timings.total_ms > 0.0
-
-
 def test_a_splash_says_what_is_opened_and_since_when_and_that_it_goes_on(hand: Rig) -> None:
     drawn, images = hand.main_view.canvas.pictures_drawn, []
     picture = SplashPicture(hand.screen.ctx)

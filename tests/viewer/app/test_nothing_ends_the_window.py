@@ -33,7 +33,6 @@ ACTIONS = (
     "frame",
     "home",
     "paint_fill",
-    "blend_snapshots",
     "next_slider",
 )
 DRAWN = {

@@ -13,7 +13,6 @@ from imgui_bundle import imgui
 from tests.helpers.stacks import many_edits
 from tests.helpers.ui_rig import TRACK, Rig, bear, first_view, rig
 from viewer.panel import panel
-from viewer.render.dynamic_resolution import FrameTimings
 from viewer.state import selection
 from viewer.state.selection import SelectionState
 from viewer.state.view_state import Brush, LayerGroup, LayerState, ViewState
@@ -102,15 +101,6 @@ def test_a_value_being_typed(screenshot: Compare) -> None:
         screenshot("ui_typing", the_panel(hand))
 
 
-def test_the_timings_of_a_picture(screenshot: Compare) -> None:
-    with rig(first_view(bear(), 0.7, 0.5), SMALLEST) as hand:
-        hand.key("F10")
-        hand.main_view.canvas.timings = FrameTimings(1.25, 0.5, 6.25, 12.5, changed=26, drawn=1500)
-        hand.main_view.latencies_ms.extend([20.0, 21.0, 34.0])
-        hand.frame()
-        screenshot("ui_timings", hand.image()[:210, :240])
-
-
 def test_gains_and_the_curve_unfolded_one_layer_alone_one_locked(screenshot: Compare) -> None:
     view = replace(first_view(bear(), 1.1, 0.5), overshoot=True, unfolded=(0,))
     first, second = view.layers
@@ -127,13 +117,6 @@ def test_the_original_beside_the_edited(screenshot: Compare) -> None:
         hand.move(362.0, 250.0)
         hand.frame(3)
         screenshot("ui_split", hand.image())
-
-
-def test_the_field_beside_what_was_recorded(screenshot: Compare, tmp_path: Path) -> None:
-    runs = bear().save_runs(tmp_path)[1:]
-    with rig(first_view(bear(), 0.62, 0.0), SMALLEST, gdf_paths=runs) as hand:
-        hand.key("Alt+Y")
-        screenshot("ui_recorded", hand.image())
 
 
 def test_the_difference_from_the_original(screenshot: Compare) -> None:
@@ -169,15 +152,15 @@ def test_twenty_layers_as_rows_with_a_group_and_several_selected(screenshot: Com
         screenshot("ui_rows", the_panel(hand))
 
 
-def test_a_blend_between_two_snapshots(screenshot: Compare) -> None:
+def test_two_snapshots_compared(screenshot: Compare) -> None:
     with rig(first_view(bear(), 1.0, 0.0), SMALLEST) as hand:
         for chord in ("F5", *["Shift+Right"] * 10, "2", *["Shift+Left"] * 10, "F5"):
             hand.key(chord)
         hand.rest()
-        hand.drag((743.0, 291.0), (860.0, 291.0))
+        hand.key("Shift+F5")
         hand.move(300.0, 600.0)
         hand.frame(20)
-        screenshot("ui_blend", hand.image())
+        screenshot("ui_compared", hand.image())
 
 
 def test_a_lasso_its_selection_and_a_region(screenshot: Compare) -> None:

@@ -311,7 +311,6 @@ def test_a_contact_sheet_never_shows_a_frame_twice(count: int) -> None:
         (("--sheet", "0"), "from 1 to 100"),
         (("--sheet", "4", "-o", "x.gif"), "x.gif holds an animation"),
         (("--sheet", "4", "--frame", "all"), "moves the camera"),
-        (("--against", "recorded"), "add --split or --difference"),
     ],
 )
 def test_a_sheet_or_comparison_that_makes_no_sense_is_one_line(

@@ -132,6 +132,19 @@ def test_backslash_shows_the_whole_original_over_any_comparison(hand: Rig) -> No
 
 
 @pytest.mark.gl
+def test_at_a_difference_left_and_come_back_to_after_a_slider_moved_the_new_one_is_shown(hand: Rig) -> None:
+    hand.key("D")
+    before, psnr_before = hand.picture(), hand.main_view.canvas.comparer.psnr
+    hand.key("Shift+Y")
+    for _ in range(5):
+        hand.key("2")  # the lower layer, the scarf
+        hand.key("Shift+Left")
+    hand.key("D")
+    assert not np.array_equal(hand.picture()[BANNER:], before[BANNER:])
+    assert hand.main_view.canvas.comparer.psnr != psnr_before
+
+
+@pytest.mark.gl
 def test_idle_in_a_comparison_draws_nothing(hand: Rig) -> None:
     for chord in ("Shift+Y", "D"):
         hand.key(chord)

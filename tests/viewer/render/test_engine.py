@@ -123,8 +123,8 @@ def test_the_same_state_draws_nothing(
     engine.image(view, SIZE)
     draws = Count(monkeypatch, engine.renderer, "draw")
     assert not engine.needs_draw(view, SIZE)
-    assert not engine.needs_draw(replace(view, overlay=True, panel=False), SIZE)
-    engine.image(replace(view, overlay=True), SIZE)
+    assert not engine.needs_draw(replace(view, axes=False, panel=False), SIZE)
+    engine.image(replace(view, axes=False), SIZE)
     assert draws.calls == 0
 
 

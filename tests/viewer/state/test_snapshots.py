@@ -8,19 +8,13 @@ import numpy as np
 import pytest
 from imgui_bundle import imgui
 
-from progdf.compose.composer import Composer
-from progdf.compose.layers import Gains
-from tests.helpers.count import Count
 from tests.helpers.divided import beside_line
 from tests.helpers.ui_rig import bear, first_view, rig
 from viewer.app import app as application
-from viewer.state import paint, snapshots, workspace
+from viewer.state import snapshots, workspace
 from viewer.state.actions import perform
-from viewer.state.layers import visible_layers
-from viewer.state.view_state import LayerGroup, SnapshotPair, ViewState
 
-SLIDER = 291.0  # between A and B
-CARD, RENAME, DELETE = 342.0, 358.0, 462.0  # a snapshot at 874, and in its menu
+CARD, RENAME, DELETE = 316.0, 332.0, 436.0  # a snapshot at 874, and in its menu
 
 
 def test_snapshots_are_one_undo_entry_to_go_back_to_and_begin_with_the_original() -> None:
@@ -58,54 +52,6 @@ def test_going_back_keeps_edits_that_were_opened_since_at_zero() -> None:
     assert [(layer.name, layer.strength) for layer in back.layers] == [("scarf", 0.5), ("ears", 0.0)]
 
 
-def two_snapshots() -> tuple[ViewState, tuple[snapshots.SliderSnapshot, ...]]:
-    """A view whose scarf is in A alone; its ears stand at .2 in A and, painted, at 1 in B."""
-    view = first_view(bear(), 0.8, 0.2)
-    kept = snapshots.take((), replace(view, blend="sum"))
-    scarf, ears = view.layers
-    painted = paint.encode(np.zeros(len(bear().gdfs[1].region), np.float32))
-    ears = replace(ears, strength=1.0, paint=painted, gains=Gains(geometry=0.5), group="warm")
-    grouped = replace(
-        view, layers=(replace(scarf, enabled=False), ears), groups=(LayerGroup("warm", strength=0.5),)
-    )
-    return view, snapshots.with_original(snapshots.take(kept, grouped), view)
-
-
-def members(gdf: int) -> int:
-    return len(bear().gdfs[gdf].region)
-
-
-def test_a_blend_is_each_snapshot_at_its_end_and_straight_between_them() -> None:
-    view, kept = two_snapshots()
-
-    def at(share: float) -> ViewState:
-        return snapshots.blend(view, kept, share, members)
-
-    assert replace(at(0.0), pair=view.pair) == snapshots.restore(view, kept[1])
-    assert replace(at(1.0), pair=view.pair) == snapshots.restore(view, kept[2])
-    seen = {share: {l.name: l for l in visible_layers(at(share))} for share in (0.25, 0.75)}
-    assert [seen[share]["scarf"].strength for share in seen] == pytest.approx([0.6, 0.2]), "fades"
-    assert [seen[share]["ears"].strength for share in seen] == pytest.approx([0.275, 0.425])
-    assert [seen[share]["ears"].gains.geometry for share in seen] == pytest.approx([0.875, 0.625])
-    weights = [paint.decode(seen[share]["ears"].paint, members(1)) for share in seen]
-    assert [float(w.mean()) for w in weights if w is not None] == pytest.approx([0.75, 0.25], abs=0.003)
-    assert [at(share).blend for share in seen] == ["sum", "adjust"], "a rule changes half way"
-    assert at(0.25).pair == SnapshotPair("1", "2", 0.25)
-    assert snapshots.is_blend(at(0.25), kept, members)
-    assert not snapshots.is_blend(replace(at(0.25), layers=view.layers), kept, members)
-
-
-def test_a_blend_with_the_original_does_not_depend_on_how_one_came_there() -> None:
-    view, kept = two_snapshots()
-    view = snapshots.choose(view, "a", "original")
-    straight = snapshots.blend(view, kept, 0.25, members)
-    far = snapshots.blend(view, kept, 0.75, members)
-    kept = snapshots.with_original(kept[1:], far)
-    assert snapshots.blend(far, kept, 0.25, members) == straight
-    assert [l.strength for l in visible_layers(straight)] == pytest.approx([0.125])
-    assert [l.strength for l in snapshots.blend(far, kept, 0.0, members).layers] == [0.0, 0.0]
-
-
 def test_snapshots_change_places_and_names_and_the_pair_goes_with_them() -> None:
     work = workspace.new_workspace(first_view(bear(), 0.5, 0.5))
     facts = application.Document("bear.ply", bear().scene, bear().gdfs).facts()
@@ -130,7 +76,7 @@ def test_a_click_on_a_small_picture_goes_back_to_its_snapshot_and_its_menu_delet
             hand.key(chord)
         hand.rest()
         assert hand.main_view.next_frame_delay() is None, "the small pictures are there"
-        entries, drawn = len(hand.main_view.work.past.past), hand.image()[317:367, 745:1005]
+        entries, drawn = len(hand.main_view.work.past.past), hand.image()[291:341, 745:1005]
         assert len(np.unique(drawn.reshape(-1, 3), axis=0)) > 500, "pictures, not empty cards"
         hand.move(874.0, CARD)
         hand.press()
@@ -158,15 +104,10 @@ def test_a_click_on_a_small_picture_goes_back_to_its_snapshot_and_its_menu_delet
 
 
 @pytest.mark.gl
-def test_two_snapshots_are_compared_until_something_is_edited_and_blended(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_two_snapshots_are_compared_until_something_is_edited() -> None:
     with rig(first_view(bear(), 1.0, 0.0), (1024, 640)) as hand:
         hand.key("Shift+F5")
-        assert (
-            "there is no snapshot" in hand.main_view.canvas.comparer.labels(hand.main_view.work.view).notice
-        )
-        hand.key("Shift+F5")
+        assert hand.main_view.work.view.compare.mode == "off", "there is no snapshot"
         warm = hand.picture()
         hand.key("F5")
         hand.key("2")
@@ -185,24 +126,6 @@ def test_two_snapshots_are_compared_until_something_is_edited_and_blended(
         assert said.right.startswith("2 · PSNR")
         hand.key("Shift+Left")
         assert hand.main_view.work.view.compare.mode == "off", "one sees what one does"
-        hand.rest()
-        entries, drawn = len(hand.main_view.work.past.past), hand.main_view.canvas.pictures_drawn
-        composed = Count(monkeypatch, Composer, "update")
-        hand.move(743.0, SLIDER)
-        hand.press()
-        for x in (802.0, 860.0, 918.0, 976.0):
-            hand.move(x, SLIDER)
-        assert composed.calls == 4, "once per change"
-        assert hand.main_view.canvas.pictures_drawn == drawn + 4
-        assert hand.strengths == pytest.approx([0.0, 1.0])
-        assert np.array_equal(hand.picture(), gold), "the end is the snapshot"
-        hand.move(860.0, SLIDER)
-        hand.release()
-        assert hand.strengths == pytest.approx([0.5, 0.5], abs=0.01)
-        assert len(hand.main_view.work.past.past) == entries + 1
-        hand.key("Ctrl+Z")
-        assert hand.strengths == [0.0, 0.8]
-        assert hand.main_view.work.view.pair.share == 0.0
         hand.drag((968.0, CARD), (880.0, CARD + 5.0))
         assert [kept.name for kept in hand.main_view.work.snapshots] == ["2", "1"], "dragged before the other"
         assert hand.strengths == [0.0, 0.8], "and not gone back to"

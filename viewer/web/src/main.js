@@ -7,7 +7,7 @@ import { listen } from "./input.js";
 import { buildPanel } from "./panel.js";
 import { Renderer, depthRow } from "./renderer.js";
 import { Sorter } from "./sort.js";
-import { between, mixCameras, restore, stateAt, visibleLayers } from "./state.js";
+import { mixCameras, restore, stateAt, visibleLayers } from "./state.js";
 
 const MOST_PIXELS = 4e6;
 const SLOW_MS = 45;  // between frames while something moves: half the pixels each way then
@@ -35,11 +35,10 @@ class Page {
     this.view = { layers: header.layers, groups: header.groups, blend: header.blend };
     this.home = this.camera = header.camera;
     this.radius = header.radius;
-    const original = { name: "original", original: true, ...this.view };
+    const original = { name: "original", ...this.view };
     original.layers = original.layers.map((layer) => ({ ...layer, strength: 0 }));
     this.snapshots = [original, ...header.snapshots];
-    this.pair = header.pair;
-    this.share = null;  // of the slider between two snapshots, once that moved
+    this.chosen = null;  // the index of a snapshot, as long as it is shown
     this.frame = 0;
     this.playing = false;
     this.comparing = false;
@@ -56,9 +55,9 @@ class Page {
   }
 
   // Shows another view.
-  change(view, share = null) {
+  change(view, chosen = null) {
     this.view = view;
-    this.share = share;
+    this.chosen = chosen;
     this.dirty = true;
     this.update();
     this.request();
@@ -79,16 +78,9 @@ class Page {
   }
 
   choose(index) {
-    if (this.pair[1] !== index) this.pair = [this.pair[1], index];
     this.#film(false);
-    this.change(restore(this.view, this.snapshots[index]), 1);
+    this.change(restore(this.view, this.snapshots[index]), index);
     if (this.snapshots[index].camera) this.glideTo(this.snapshots[index].camera);
-  }
-
-  blend(share) {
-    const [a, b] = this.pair.map((index) => this.snapshots[index]);
-    this.#film(false);
-    this.change(between(this.view, a, b, share), share);
   }
 
   play() {
@@ -222,7 +214,7 @@ class Page {
   #compose() {
     this.dirty = false;
     const layers = this.comparing ? [] : visibleLayers(this.view);
-    for (const layer of layers) layer.weights = this.#weights(layer.paint);
+    for (const layer of layers) layer.weights = this.paints[layer.paint] ?? null;
     const changed = this.composer.update(layers, this.view.blend);
     if (!changed) return;
     this.renderer.update(this.composer, changed);
@@ -233,12 +225,6 @@ class Page {
       }
       this.turned = true;
     }
-  }
-
-  #weights(paint) {
-    if (!Array.isArray(paint)) return paint < 0 ? null : this.paints[paint];
-    const [a, b, share] = paint, [from, to] = [a, b].map((index) => (index < 0 ? null : this.paints[index]));
-    return (from ?? to).map((_, i) => (1 - share) * (from ? from[i] : 1) + share * (to ? to[i] : 1));
   }
 
   #bind() {

@@ -107,20 +107,11 @@ function rule(root, page) {
 function snapshots(root, page) {
   const { snapshots: kept } = page;
   if (kept.length < 2) return null;
-  const blend = slider("Blend of two snapshots", 1, [], (share) => page.blend(share));
-  const [from, to] = [make("span", { class: "name" }), make("span", { class: "name end" })];
   const chips = kept.map((snapshot, index) => make("button", {
     type: "button", class: "chip", textContent: snapshot.name, title: snapshot.name, on: { click: () => page.choose(index) },
   }));
-  root.append(make("section", { class: "snapshots" }, make("div", { class: "chips" }, ...chips),
-    make("div", { class: "head ends" }, from, to), blend.track));
-  return () => {
-    const [a, b] = page.pair;
-    from.textContent = kept[a].name;
-    to.textContent = kept[b].name;
-    chips.forEach((chip, i) => chip.classList.toggle("on", page.share !== null && i === (page.share < 0.5 ? a : b)));
-    blend.show(page.share ?? 0);
-  };
+  root.append(make("section", { class: "snapshots" }, make("div", { class: "chips" }, ...chips)));
+  return () => chips.forEach((chip, i) => chip.classList.toggle("on", i === page.chosen));
 }
 
 function timeline(root, page) {

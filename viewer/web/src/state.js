@@ -20,49 +20,6 @@ export function restore(view, snapshot) {
 
 const lerp = (a, b, share) => a + share * (b - a);
 
-// Between two values; what is off at one end is 0 there, unless it is off at both.
-function fade(on, values, share) {
-  const [a, b] = values.map((value, i) => (on[i] || !(on[0] || on[1]) ? value : 0));
-  return lerp(a, b, share);
-}
-
-const setsOf = (view) => Object.fromEntries(view.groups.map(({ name }) =>
-  [name, view.layers.filter((l) => l.group === name).map((l) => l.edit).sort().join()]));
-
-// The view between snapshots: as `a` at 0, as `b` at 1, each exactly.
-export function between(view, a, b, share) {
-  const faded = (snapshot) => ({ ...snapshot, layers: snapshot.layers.map((l) => ({ ...l, strength: 0 })) });
-  const ends = [restore(view, a.original ? faded(b) : a), restore(view, b.original ? faded(a) : b)];
-  if (share <= 0 || share >= 1) return ends[share <= 0 ? 0 : 1];
-  const [near, far] = share < 0.5 ? ends : [ends[1], ends[0]];
-  const known = new Set(near.layers.map((layer) => layer.edit));
-  const stack = [...near.layers, ...far.layers.filter((l) => !known.has(l.edit)).map((l) => ({ ...l, group: "" }))];
-  const alone = ends.some((end) => end.layers.some((layer) => layer.solo));
-  const [one, two] = ends.map(setsOf), shared = (name) => !alone && one[name] !== undefined && one[name] === two[name];
-  const groups = near.groups.map((group) => {
-    if (!shared(group.name)) return { ...group, enabled: true, strength: 1 };
-    const both = ends.map((end) => end.groups.find((each) => each.name === group.name));
-    const on = both.map((each) => each.enabled);
-    return { ...group, enabled: on[0] || on[1], strength: fade(on, both.map((each) => each.strength), share) };
-  });
-  const seen = ends.map((end) => new Map(visibleLayers(end).map((layer) => [layer.edit, layer.strength])));
-  const layers = stack.map((layer) => {
-    let both = ends.map((end) => end.layers.find((l) => l.edit === layer.edit) ?? { ...layer, strength: 0, enabled: false });
-    let visible = seen.map((of) => of.has(layer.edit));
-    let strengths = seen.map((of, i) => of.get(layer.edit) ?? both[i].strength);
-    if (shared(layer.group)) [visible, strengths] = [both.map((l) => l.enabled), both.map((l) => l.strength)];
-    const on = visible.map((here, i) => here && strengths[i] !== 0);
-    if (on[0] !== on[1]) both = on[0] ? [both[0], both[0]] : [both[1], both[1]];
-    const gains = Object.fromEntries(Object.keys(layer.gains).map((kind) =>
-      [kind, lerp(both[0].gains[kind], both[1].gains[kind], share)]));
-    const paint = both[0].paint === both[1].paint ? both[0].paint : [both[0].paint, both[1].paint, share];
-    return {
-      ...layer, gains, paint, solo: false, enabled: visible[0] || visible[1], strength: fade(visible, strengths, share),
-    };
-  });
-  return { ...near, layers, groups };
-}
-
 // A camera between two others, the shortest way around.
 export function mixCameras(a, b, share) {
   if (share <= 0 || share >= 1) return share <= 0 ? a : b;
