@@ -112,7 +112,7 @@ def run_chunks(kernel: Callable[[int], _T], chunks: int) -> list[_T]:
 
 @cache
 def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(max(1, _cores() - 1), thread_name_prefix="kernels")
+    return ThreadPoolExecutor(max(1, _cores() - 1), "kernels", torch.set_num_threads, (1,))
 
 
 if hasattr(os, "register_at_fork"):  # a forked process has its parent's pool without the threads

@@ -2,8 +2,8 @@
 
 The map is a least squares over all views (`trainer.optimize.color_views`). What it cannot say is a residual
 of the members' lowest bands, by conjugate gradients that know the clamps, each member preconditioned by its
-own weight, as in tomography: one that is a hundredth of a pixel gets its answer as a large one does. A member
-that no view shows follows the map.
+own block of bands and weights, as in tomography: one that is a hundredth of a pixel, or seen from one side,
+gets its answer as another does. A member that no view shows follows the map.
 
 How much of this a region gets (degree of the map; no residual, one of DC, or one of two bands) is decided on
 views that are not solved for, at the full strength: the least of which more would take away less than a
@@ -43,7 +43,6 @@ from .color_views import (
     MapFit,
     fit_maps,
     improve_mask,
-    iterate_views,
     map_views,
     mask_of_members,
 )
@@ -156,8 +155,8 @@ class Solver:
 
     views: Sequence[ColorView]  # see `ColorView`
     sh: Tensor  # the members' own. [M,B,3]
-    # bound of the curvature of each member's lowest bands: Σ w·m over the pixels, m its own weight, times the
-    # basis squared. [M,b,1]
+    # bound of the curvature among each member's lowest bands: Σ w·m over the pixels, m its own weight, times
+    # the products of the basis. [M,b,b]
     weights: Tensor
     maps: MapFit
     share: Tensor  # how much of a map each member takes, 0..1. [M]
@@ -168,7 +167,7 @@ class Solver:
     def fit_map(self, degree: int, targets: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
         """The map that comes nearest to these pictures, of degree 0 the identity, and what the members take
         of it. [K,3], [M,B,3]"""
-        table = self.maps.solve(degree, targets) if degree else identity_map(1).to(self.sh)
+        table = self.maps.solve(degree, targets) if degree else identity_map(1)
         return table, self.share[:, None, None] * (map_colors(self.sh, table, max(1, degree)) - self.sh)
 
     def with_mask(self, share: Tensor) -> Solver:
@@ -248,11 +247,11 @@ class Solver:
         floor: float,
     ) -> tuple[Tensor, int]:
         """See `residual`; `base`: the colors in each view without it [M,3]; `look`: the judge's error."""
-        curvature = self.weights[:, : start.shape[1]]
-        tied = torch.from_numpy(self.held.diagonal()).to(curvature)[:, None, None]
-        inverse = self.asked[:, None, None] / (curvature + tied + ridge)
+        count, held = start.shape[1], torch.from_numpy(self.held.diagonal()) + max(ridge, 1e-30)
+        curvature = self.weights[:, :count, :count] + held[:, None, None] * torch.eye(count)
+        inverse = torch.linalg.inv(curvature.double()).float() * self.asked[:, None, None]
         now, pull = start, self._pull(base, start, targets, ridge)
-        conditioned = along = inverse * pull.descent
+        conditioned = along = inverse @ pull.descent
         best, taken = now, 0
         looks = [math.inf] * (_LOOKS - 1) + [math.inf if look is None else look(now)]
         while taken < steps:
@@ -275,7 +274,7 @@ class Solver:
                 looks.append(error)
                 if looks[-1 - _LOOKS] - error <= _LOOKS * SETTLED * max(error, floor, LEVEL):
                     break
-            conditioned = inverse * pull.descent
+            conditioned = inverse @ pull.descent
             turn = (_inner(pull.descent, conditioned) - _inner(pull.descent, last)) / power
             along = conditioned + max(0.0, turn) * along
             tell()
@@ -284,66 +283,61 @@ class Solver:
     @property
     def typical(self) -> float:
         """The mean weight of the members that are asked."""
-        return float(self.weights[self.asked, 0].mean())
+        return float(self.weights[self.asked, 0, 0].mean())
 
     def _hold(self, x: Tensor, ridge: float) -> Tensor:
         """The gradient of half of what a residual costs beside the pixels. [M,b,3] -> [M,b,3]"""
         if self.ties is None:
             return ridge * x
-        return ridge * x + torch.from_numpy(self.held @ x.flatten(1).cpu().numpy()).to(x).view_as(x)
+        return ridge * x + torch.from_numpy(self.held @ x.flatten(1).numpy()).view_as(x)
 
     def _pull(
         self, base: Sequence[Tensor], residual: Tensor, targets: Sequence[Tensor], ridge: float
     ) -> _Pull:
-        """See `_Pull`. A clamp passes what would bring its value back into the range."""
+        """See `_Pull`."""
 
         def look(index: int) -> tuple[Tensor, Tensor, Tensor, float]:
-            view, target = self.views[index], targets[index]
+            view = self.views[index]
             colors = base[index] + torch.einsum("mb,mbc->mc", view.basis[:, : residual.shape[1]], residual)
-            image = view.picture(colors)
-            squared = float(((target - image.clamp(0.0, 1.0)) * view.counts).double().square().sum())
-            counts = view.counts & ~(((image <= 0.0) & (target <= 0.0)) | ((image >= 1.0) & (target >= 1.0)))
-            pull = view.map.gradient((target - image) * counts)
+            pull, passed, squared = view.pull(colors, targets[index])
             drawn = (colors > 0.0) | (pull > 0.0)
-            return drawn, counts, pull * drawn, squared
+            return drawn, passed, pull * drawn, squared
 
         descent, clamps = -self._hold(residual, ridge), list[tuple[Tensor, Tensor]]()
         error = _inner(residual, self._hold(residual, ridge))
-        looks = iterate_views(look, range(len(self.views)))
-        for view, (drawn, counts, pull, squared) in zip(self.views, looks, strict=True):
+        looks = map_views(look, range(len(self.views)))
+        for view, (drawn, passed, pull, squared) in zip(self.views, looks, strict=True):
             descent += view.basis[:, : residual.shape[1], None] * pull[:, None]
             error += squared
-            clamps.append((drawn, counts))
+            clamps.append((drawn, passed))
         return _Pull(descent, error, clamps)
 
     def _curvature(self, pull: _Pull, along: Tensor, ridge: float) -> float:
         """Of half the squared error in a direction, where the clamps stay as they are. [M,b,3]"""
 
         def look(index: int) -> float:
-            view, (drawn, counts) = self.views[index], pull.clamps[index]
+            view, (drawn, passed) = self.views[index], pull.clamps[index]
             colors = torch.einsum("mb,mbc->mc", view.basis[:, : along.shape[1]], along) * drawn
-            return float((view.map.picture(colors) * counts).double().square().sum())
+            changed = (view.map.picture(colors) * passed).flatten()
+            return float(changed @ changed)
 
         return sum(map_views(look, range(len(self.views)))) + _inner(along, self._hold(along, ridge))
 
 
 def make_solver(views: Sequence[ColorView], original: Tensor, ties: Ties | None = None) -> Solver:
     """The views, prepared. `original`: raw member rows [M,14+]; `ties`: where the views are few."""
-    ones = original.new_ones(len(original), 3)
-
-    def weigh(view: ColorView) -> Tensor:
-        return view.basis[:, :4].square() * view.map.gradient(view.map.picture(ones) * view.counts)[:, :1]
-
-    weights = torch.stack(map_views(weigh, views)).sum(dim=0)[..., None]
-    asked, held = (
-        torch.ones_like(original[:, 0], dtype=torch.bool),
-        csr_matrix((len(original), len(original)), dtype=np.float32),
-    )
+    ones, weights = original.new_ones(len(original), 3), torch.zeros(())
+    weighed = map_views(lambda view: view.map.gradient(view.map.picture(ones) * view.counts)[:, 0], views)
+    for view, weight in zip(views, weighed, strict=True):
+        bands = view.basis[:, :4]
+        weights = weights + (weight[:, None] * bands)[:, :, None] * bands[:, None]
+    asked = torch.ones_like(original[:, 0], dtype=torch.bool)
+    held = csr_matrix((len(original), len(original)), dtype=np.float32)
     if ties is not None:
         shown = torch.stack(map_views(lambda view: view.map.gradient(view.counts * ones[:1])[:, 0], views))
         twice = (shown > _SHOWS).sum(dim=0) > 1
-        asked = (ties.clear.to(weights.device) | twice) & (weights[:, 0, 0] > 0.0)
-        held = ties.of(asked.cpu()) * np.float32(_TIES * float(weights[asked, 0].mean()))
+        asked = (ties.clear | twice) & (weights[:, 0, 0] > 0.0)
+        held = ties.of(asked) * np.float32(_TIES * float(weights[asked, 0, 0].mean()))
     share = original.new_ones(len(original))
     return Solver(views, member_bands(original), weights, fit_maps(views, share), share, ties, asked, held)
 
@@ -403,15 +397,9 @@ def choose_model(
     # of what no picture shows a map is a guess: where it is the worse one for most that is shown, for less
     # than about half of that is painted, there is none
     degrees = (0,) if few and left_by(bases[0]) <= min(left_by(bases[d]) for d in MONOMIALS) else MONOMIALS
-    by_degree = [
-        attempt(
-            bases[degree],
-            f"map of degree {degree}" if degree else "no map",
-            int(few),
-            _HOLDS[0] if few else _RIDGE,
-        )
-        for degree in degrees
-    ]
+    names = {degree: f"map of degree {degree}" if degree else "no map" for degree in degrees}
+    hold = _HOLDS[0] if few else _RIDGE
+    by_degree = [attempt(bases[degree], name, int(few), hold) for degree, name in names.items()]
     best = last = _least(by_degree, lambda one: one.degree)
     sizes = [(1, _RIDGE), (4, _RIDGE)][: 1 + (most_bands > 1)]
     for bands, hold in [(1, hold) for hold in _HOLDS[1:]] if few else sizes:
@@ -434,7 +422,7 @@ def choose_model(
     chosen, residual = best.solvers[0], best.residuals[0]
     if few:
         chosen, residual = _solve_whole(solver, best, targets, steps, spreads)
-    mask = (chosen.share * 255.0).round().to(torch.uint8).cpu() if best.masked else None
+    mask = (chosen.share * 255.0).round().to(torch.uint8) if best.masked else None
     unedited = sum(judge.error(torch.zeros_like(solver.sh)) for judge in judges) / len(trials)
     decided = [(one.name, decibels(one.error)) for one in tried]
     richer = None if best.masked else richer

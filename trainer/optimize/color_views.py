@@ -7,12 +7,13 @@ its coefficients too: its least squares over all views take a tenth of a second.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import pad
 
@@ -20,9 +21,10 @@ from progdf.field.baked import MONOMIALS, identity_map
 from progdf.field.grade import MOST_COLOR, member_bands, monomials
 from progdf.gaussians import unpack
 from progdf.metrics.image import ROUNDING
+from progdf.rasterize.cpu.jit import Number, kernel
 from progdf.rasterize.engines import ColorMap, color_map
 from progdf.sh import basis
-from progdf.threads import one_thread, threads
+from progdf.threads import one_thread, run_chunks
 from trainer.views.crops import CropScene
 
 _SQUARES = 6  # of a view's longer side, every other one of which is in one of its halves
@@ -41,6 +43,7 @@ _MASK_RIDGE = 0.01  # of a typical curvature, for members that hardly show
 MORE_PAYS = 0.95
 """Share of the error that a larger model must leave at most, to be worth its bytes."""
 
+Array = NDArray[Any]
 _A = TypeVar("_A")
 _B = TypeVar("_B")
 
@@ -69,6 +72,19 @@ class ColorView:
         """The pixels of the box. [h,w,3] -> [P,3]"""
         return image.flatten(0, 1)[self.pixels]
 
+    def pull(self, colors: Tensor, target: Tensor) -> tuple[Tensor, Tensor, float]:
+        """Against the gradient of half the squared error to a picture, of what the clamps pass: they do what
+        would bring a value back into the range. [M,3], [P,3]
+
+        Returns:
+            By color [M,3]; channels of the pixels that are passed [P,3] bool; the squared error
+        """
+        missing = self.map.picture(colors.clamp_min(0.0))
+        passed = torch.empty_like(missing, dtype=torch.bool)
+        pixels = (missing, self.others, target, self.counts[:, 0], passed)
+        squared = _compare(*(tensor.numpy() for tensor in pixels))
+        return self.map.gradient(missing), passed, squared
+
     def error(self, offsets: Tensor, target: Tensor, power: float) -> float:
         """Sum of differences to some power, of colors 0..1. [M,b,3], [h,w,3]"""
         image = self.picture(self.colors(offsets)).clamp(0.0, 1.0)
@@ -78,8 +94,24 @@ class ColorView:
         """The view with every other square of its pixels, and with the others."""
         side = max(1, max(self.size) // _SQUARES)
         rows, columns = self.pixels // self.size[1] // side, self.pixels % self.size[1] // side
-        even = ((rows + columns) % 2 == 0)[:, None].to(self.counts.device)
+        even = ((rows + columns) % 2 == 0)[:, None]
         return replace(self, counts=self.counts & even), replace(self, counts=self.counts & ~even)
+
+
+@kernel(contract=True, cache=True)
+def _compare(shown: Array, others: Array, target: Array, counts: Array, passed: Array) -> Number:
+    """See `ColorView.pull`. shown: in, what the members show; out, what is missing where it is passed.
+    [P,3] float32, [P] and [P,3] bool -> float64"""
+    squared = 0.0
+    for p in range(len(shown)):
+        for c in range(3):
+            image, wanted = others[p, c] + shown[p, c], target[p, c]
+            error = np.float64(wanted - min(max(image, np.float32(0.0)), np.float32(1.0)))
+            squared += error * error if counts[p] else 0.0
+            held = (image <= 0.0 and wanted <= 0.0) or (image >= 1.0 and wanted >= 1.0)
+            passed[p, c] = counts[p] and not held
+            shown[p, c] = wanted - image if passed[p, c] else np.float32(0.0)
+    return squared
 
 
 def color_view(crop: CropScene, original: Tensor, bands: int, pixels: Tensor) -> ColorView:
@@ -268,9 +300,8 @@ def improve_mask(
     def look(share: Tensor) -> tuple[Tensor, float]:
         def pull(pair: tuple[ColorView, Tensor, Tensor]) -> tuple[Tensor, float]:
             view, change, target = pair
-            image = view.picture(view.original + share[:, None] * change).clamp(0.0, 1.0)
-            missing = (target - image) * view.counts
-            return (view.map.gradient(missing) * change).sum(dim=1), float(missing.double().square().sum())
+            by_color, _, squared = view.pull(view.original + share[:, None] * change, target)
+            return (by_color * change).sum(dim=1), squared
 
         looks = map_views(pull, pairs)
         return torch.stack([one for one, _ in looks]).sum(dim=0), sum(error for _, error in looks)
@@ -313,13 +344,4 @@ class Judge:
 
 def map_views(work: Callable[[_A], _B], items: Sequence[_A]) -> list[_B]:
     """`work` of every item, on as many threads as the rasterizer has; the same bits on any number."""
-    return list(iterate_views(work, items))
-
-
-def iterate_views(work: Callable[[_A], _B], items: Sequence[_A]) -> Iterator[_B]:
-    """The same one by one, for what need not be kept."""
-    if threads() == 1 or len(items) == 1:
-        yield from map(work, items)
-        return
-    with ThreadPoolExecutor(threads()) as pool:
-        yield from pool.map(work, items)
+    return run_chunks(lambda index: work(items[index]), len(items))

@@ -43,9 +43,9 @@ class Ties:
             weights: of the members, in units of a member's ties together; 0: the residual means nothing. [M]
             ridge: the pull to 0 in the same unit
         """
-        weight = weights.double().cpu().numpy()[:, None]
+        weight = weights.double().numpy()[:, None]
         system = csr_matrix(self.graph + diags(weight[:, 0] + ridge))
-        known = residual.flatten(1).double().cpu().numpy()
+        known = residual.flatten(1).double().numpy()
         scale = diags(1.0 / system.diagonal())
         columns = [
             cg(system, weight[:, 0] * column, column, rtol=_EXACT, maxiter=_STEPS, M=scale)[0]

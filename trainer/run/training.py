@@ -172,10 +172,8 @@ def optimize_members(
     if seeds is not None:
         setup, settings = setup.extend(seeds), replace(settings, ramp=0.0)
         original = torch.cat([original, pack(seeds, with_shN=scene.sh_degree > 0).to(device)])
-        crops, stages = (
-            _crops(setup, setup.train, still, engine),
-            [place_seeds(s, len(seeds)) for s in stages],
-        )
+        crops = _crops(setup, setup.train, still, engine)
+        stages = [place_seeds(s, len(seeds)) for s in stages]
     state, recordings = PgsState(original, settings.seed), Recordings(folder, original.shape)
     way: Way
     model: Model | None = None
@@ -237,12 +235,14 @@ def _stages(optimization: OptimizeOptions, setup: TrainingSetup, edited: Picture
     ]
 
 
-def _boxes(pictures: Sequence[Tensor], views: Sequence[View], engine: str) -> Sequence[Tensor]:
+def _boxes(pictures: Sequence[Tensor], views: Sequence[View], engine: str = "cpu") -> Sequence[Tensor]:
     device, pairs = engine_device(engine), zip(pictures, views, strict=False)
     return stored_pictures(crop(picture, view.box).to(device) for picture, view in pairs)
 
 
-def _crops(setup: TrainingSetup, views: Sequence[View], still: bool, engine: str) -> Sequence[CropScene]:
+def _crops(
+    setup: TrainingSetup, views: Sequence[View], still: bool, engine: str = "cpu"
+) -> Sequence[CropScene]:
     """Of an edit of colors each is made when it is looked at: once, by `color_views`."""
     scene, members = setup.scene.to(engine_device(engine)), setup.region.members
     crops = LazySequence(
@@ -262,22 +262,21 @@ def _prepare_colors(
     log: RunLog,
 ) -> tuple[Solver, Model, Pictures, list[TargetStage], list[Judge]]:
     """The views to solve for, how much is modelled, the strengths; and what says when each is done."""
-    engine = optimization.engine
     with log.stage("weights"):
         few = bool(options.views.pictures)
         every = 1 if few else _stride(setup, original)
         drawn = color_views(crops, original, every)
-        judging = _judging(setup, drawn, original, edited, engine, every)
+        judging = _judging(setup, drawn, original, edited, every)
         cameras = [view.camera for view in setup.train]
         ties = surface_ties(setup.scene, setup.region.members, cameras) if few else None
     with log.stage("model"):
-        judge, finished = judging(edited[max(edited)]), _boxes(edited[max(edited)], setup.train, engine)
+        judge, finished = judging(edited[max(edited)]), _boxes(edited[max(edited)], setup.train)
         solver, most = make_solver(drawn, original, ties), iterations(optimization.steps)
         trials = [(solver, judge)] if ties is None else split_solver(solver, original, finished)
         solver, model = choose_model(solver, trials, finished, most, 1 if optimization.sh == "off" else 4)
     on = "all views, as none is held out" if judge.views is drawn else "views that are held out"
     edited = edited if between is None else between(model.allowed_share)
-    stages = [TargetStage(s, _boxes(some, setup.train, engine), 1) for s, some in edited.items()]
+    stages = [TargetStage(s, _boxes(some, setup.train), 1) for s, some in edited.items()]
     judges, middle = [judging(pictures) for pictures in edited.values()], (len(stages) - 1) // 2
     with log.stage("model"):
         model = enrich(model, solver, stages[middle], judges[middle], most)
@@ -301,15 +300,14 @@ def _judging(
     drawn: Sequence[ColorView],
     original: Tensor,
     edited: Pictures,
-    engine: str,
     every: int,
 ) -> Callable[[Sequence[Tensor]], Judge]:
     """All views' whole pictures of an edit -> the held-out views that choose, or all where there are none."""
     views, count = split_held_out(setup.held_out)[0], len(setup.train)
     if not views or len(edited[max(edited)]) <= count:
-        return lambda pictures: Judge(drawn, _boxes(pictures, setup.train, engine))
-    choosing = color_views(_crops(setup, views, True, engine), original, every)
-    return lambda pictures: Judge(choosing, _boxes(split_held_out(pictures[count:])[0], views, engine))
+        return lambda pictures: Judge(drawn, _boxes(pictures, setup.train))
+    choosing = color_views(_crops(setup, views, True), original, every)
+    return lambda pictures: Judge(choosing, _boxes(split_held_out(pictures[count:])[0], views))
 
 
 def _record_way(

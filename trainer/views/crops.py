@@ -8,7 +8,6 @@ the box.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -21,7 +20,7 @@ from progdf.rasterize import ActivatedGaussians, Crop, Rendering, activate, rend
 from progdf.rasterize.cpu.forward import TILE_H, TILE_W
 from progdf.rasterize.engines import ColorMap, color_map
 from progdf.sh import C0, basis
-from progdf.threads import threads
+from progdf.threads import run_chunks, threads
 
 from .view import seen_colors
 
@@ -256,8 +255,8 @@ def render_all(
     """Every prepared view with these member rows, without gradients. [M,C] -> images [h,w,3]"""
     with torch.no_grad():
         if len(crops) > 1 and threads() > 1 and all(crop.still for crop in crops):
-            with ThreadPoolExecutor(threads()) as pool:  # the maps work on one thread each
-                return list(pool.map(lambda crop: crop.render(packed, moving)[0].detach(), crops))
+            # the maps work on one thread each; a thread of the pool has gradients of its own to forget
+            return run_chunks(lambda i: crops[i].render(packed, moving)[0].detach(), len(crops))
         return [crop.render(packed, moving)[0] for crop in crops]
 
 

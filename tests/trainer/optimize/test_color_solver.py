@@ -302,6 +302,25 @@ def test_what_was_stopped_goes_on_to_the_same_bits() -> None:
         assert again.step == whole.step == 3
 
 
+def test_a_view_says_what_its_clamps_pass() -> None:
+    """The fused pass over the pixels against the same in torch, with colors and pixels beyond both ends."""
+    crops, original = prepared(dense_ball(400), orbit(1, 40))
+    view, rng = color_views(crops, original, 2)[0], torch.Generator().manual_seed(5)
+    view, _ = replace(view, others=view.others - 0.2).halves()
+    colors = 3.0 * torch.rand(400, 3, generator=rng) - 1.0
+    target = torch.rand(view.others.shape, generator=rng).sub(0.2).clamp(0.0, 1.0)
+    pull, passed, squared = view.pull(colors, target)
+    image = view.picture(colors)
+    held = ((image <= 0.0) & (target <= 0.0)) | ((image >= 1.0) & (target >= 1.0))
+    assert held.any()
+    assert (image < 0.0).any()
+    assert (image > 1.0).any()
+    assert torch.equal(passed, view.counts & ~held)
+    torch.testing.assert_close(pull, view.map.gradient((target - image) * passed))
+    wanted = (((target - image.clamp(0.0, 1.0)) * view.counts).double() ** 2).sum()
+    assert squared == pytest.approx(float(wanted), rel=1e-6)
+
+
 def test_one_thread_and_two_solve_to_the_same_bits() -> None:
     scene = dense_ball(20_000, bands=3)
     cameras = orbit(3, 48)
