@@ -48,9 +48,8 @@ def extend(scene: Gaussians, gdfs: Sequence[Gdf]) -> tuple[Gaussians, tuple[Gdf,
     moved = []
     for gdf in gdfs:
         form = gdf.field.origin
-        if isinstance(form, GradeForm) and gdf.members == len(
-            scene
-        ):  # on all that is there, whoever brings it
+        # on all that is there, whoever brings it
+        if isinstance(form, GradeForm) and gdf.members == len(scene):
             moved.append(_grade_all(gdf, form, extended))
             continue
         rows = torch.arange(first, first + gdf.members - len(gdf.region))
@@ -72,7 +71,7 @@ def _grade_all(gdf: Gdf, form: GradeForm, extended: Gaussians) -> Gdf:
     field = bake_grade(form, pack(extended, with_shN=extended.sh_degree > 0))
     region = replace(whole_scene(extended), name=gdf.region.name)
     field = replace(field, recorded=gdf.field.recorded)
-    return replace(gdf, region=region, field=field, scene=fingerprint(extended))
+    return replace(gdf, region=region, field=field, scene=fingerprint(extended), from_others=more)
 
 
 @lru_cache(maxsize=1)  # the same object for the same edits, so that what is known of it stays known

@@ -70,6 +70,7 @@ class Gdf(ShownInNotebooks):
     # B Gaussians that the scene does not have, as they are at strength 0, where nothing of them is drawn: the
     # field's last B members, see `progdf.compose.added`
     added: Gaussians | None = None
+    from_others: int = 0  # how many of the last members other edits add, see `extend`
 
     def __post_init__(self) -> None:
         if (self.field.attributes or self.added is not None) and self.field.members != self.members:

@@ -134,7 +134,8 @@ def open_session(path: Path) -> WindowSession:
     named, folder = view.selection.regions, path.resolve().parent
     view = _with_region_paths(view, lambda region: Path(os.path.normpath(folder / region)))
     for layer in (*view.layers, *(layer for s in snapshots for layer in s.edit.layers)):
-        paint.decode(layer.paint, len(opened.gdfs[layer.gdf].region))  # raises where they do not fit
+        gdf = opened.gdfs[layer.gdf]
+        paint.decode(layer.paint, len(gdf.region), gdf.from_others)  # raises where they do not fit
     claimed = exports.claim_regions(view.selection, exports.region_folders(path, scene))
     foreign = [
         f"{old.name:.60} ({str(old.path)[:80]})"
@@ -194,7 +195,8 @@ def prune(session: WindowSession) -> WindowSession:
 
     def paint_left(layer: LayerState) -> str:
         """Of an edit of all that is there, the paint of the rows that are left."""
-        weights = paint.decode(layer.paint, len(opened.gdfs[layer.gdf].region))
+        gdf = opened.gdfs[layer.gdf]
+        weights = paint.decode(layer.paint, len(gdf.region), gdf.from_others)
         whole = weights is not None and len(weights) == len(opened.scene) > len(rows)
         return paint.encode(weights[rows].numpy()) if whole and weights is not None else layer.paint
 

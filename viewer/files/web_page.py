@@ -203,7 +203,8 @@ def first_state(
     edits = sorted(needed | {gdf for key in view.timeline.keys for gdf, s in key.strengths if s > 0.0})
 
     def layer(state: LayerState) -> dict[str, Any]:
-        weights = decode(state.paint, document.gdfs[state.gdf].members)
+        gdf = document.gdfs[state.gdf]
+        weights = decode(state.paint, gdf.members, gdf.from_others)
         if weights is not None and (state.gdf, state.paint) not in known:
             known[state.gdf, state.paint] = len(paints)
             paints.append((edits.index(state.gdf), weights))

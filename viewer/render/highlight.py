@@ -129,14 +129,15 @@ def highlight_colors(highlight: Highlight, gdfs: Sequence[Gdf], total: int) -> B
     if highlight.region is not None:
         colors[gdfs[highlight.region].region.members.numpy()] = _tint(SELECTED, TINT)
     if highlight.gdf is not None:
-        members = gdfs[highlight.gdf].region.members.numpy()
+        gdf = gdfs[highlight.gdf]
+        members = gdf.region.members.numpy()
         if highlight.others:
             others = np.concatenate([gdfs[i].region.members.numpy() for i in highlight.others])
             members = members[np.isin(members, others)]
             colors[members, :3] = np.round(255.0 * np.array(rgba(SHARED)[:3]))
             colors[members, 3] = round(255 * SHARE)
         else:
-            decoded = paint.decode(highlight.paint, len(members))
+            decoded = paint.decode(highlight.paint, len(members), gdf.from_others)
             weights = np.ones(len(members), np.float32) if decoded is None else decoded.numpy()
             colors[members, :3] = ramp_colors(weights)
             shares = THIN * (1.0 - weights) if highlight.thin else np.full_like(weights, SHARE)

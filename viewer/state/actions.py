@@ -126,7 +126,7 @@ def _limit(workspace: Workspace, index: int, facts: SceneFacts) -> Workspace:
     if not view.selection.count:
         return workspace
     weights = selection.unpack(view.selection.members, facts.count)[row.members].astype(np.float32)
-    painted = paint.decode(view.layers[index].paint, row.count)
+    painted = paint.decode(view.layers[index].paint, row.count, row.from_others)
     weights = weights if painted is None else weights * painted.numpy()
     return replace(workspace, view=with_paint(view, index, paint.encode(weights)))
 
@@ -134,7 +134,8 @@ def _limit(workspace: Workspace, index: int, facts: SceneFacts) -> Workspace:
 def _select_painted(workspace: Workspace, index: int, facts: SceneFacts) -> Workspace:
     """What a layer's paint lets through at least half of, all of it where it is not painted."""
     view, row = workspace.view, facts.rows[workspace.view.layers[index].gdf]
-    painted, mask = paint.decode(view.layers[index].paint, row.count), np.zeros(facts.count, bool)
+    painted = paint.decode(view.layers[index].paint, row.count, row.from_others)
+    mask = np.zeros(facts.count, bool)
     mask[row.members if painted is None else row.members[painted.numpy() >= 0.5]] = True
     return replace(workspace, view=replace(view, selection=selection.select(view.selection, mask)))
 
@@ -212,9 +213,9 @@ def _repaint(workspace: Workspace, how: str, facts: SceneFacts) -> Workspace:
         row = facts.rows[layer.gdf]
         if how == "paint_feather":
             width = max(FEATHER * row.bounds.radius, FARTHEST**-1)
-            return with_paint(view, index, paint.feather(layer.paint, row.points, width))
+            return with_paint(view, index, paint.feather(layer.paint, row.points, width, row.from_others))
         if how == "paint_invert":
-            return with_paint(view, index, paint.invert(layer.paint, row.count))
+            return with_paint(view, index, paint.invert(layer.paint, row.count, row.from_others))
         even = np.full(row.count, how == "paint_fill", np.float32)
         return with_paint(view, index, paint.encode(even))
 

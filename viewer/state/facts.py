@@ -58,6 +58,7 @@ class LayerRow:
     members: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64), compare=False)
     draft: bool = False  # a grade alone, until its training is done
     added: int = 0  # how many of its members the scene does not have
+    from_others: int = 0  # how many of the last of them other edits add
     # its picture, see `draw_thumbnail`
     thumbnail: Thumbnail = field(default=lambda _: np.zeros((48, 48, 3), np.uint8), compare=False)
 
@@ -86,6 +87,7 @@ def _row(scene: Gaussians, gdf: Gdf, gdfs: Sequence[Gdf], added: int) -> LayerRo
         members=members.numpy(),
         draft="draft" in gdf.report,
         added=added,
+        from_others=gdf.from_others,
         thumbnail=partial(draw_thumbnail, scene, gdf),
     )
 

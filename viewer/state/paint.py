@@ -74,12 +74,16 @@ def encode(weights: Floats) -> str:
 
 
 @lru_cache(maxsize=48)  # the composer knows weights by their identity
-def decode(paint: str, members: int) -> Tensor | None:
-    """Weight of every member, None for `FULL`; 1 for rows that came with an edit after it was painted.
-    [M] float32
+def decode(paint: str, members: int, from_others: int = 0) -> Tensor | None:
+    """Weight of every member, None for `FULL`. [M] float32
+
+    Args:
+        paint: as `encode` writes it
+        members: M
+        from_others: how many of the last members other edits add; what came after it was painted has 1
 
     Raises:
-        ProgdfError: the text is damaged or holds weights of more members.
+        ProgdfError: the text is damaged, or holds weights of more members, or of fewer than that.
     """
     if paint == FULL:
         return None
@@ -88,7 +92,7 @@ def decode(paint: str, members: int) -> Tensor | None:
         levels = unpacker.decompress(base64.b64decode(paint, validate=True), members + 1)
     except (ValueError, binascii.Error, zlib.error):
         raise ProgdfError("the painted weights of a layer are damaged; paint it again") from None
-    if len(levels) > members:
+    if not members - from_others <= len(levels) <= members:
         raise ProgdfError(f"a layer's painted weights do not fit its {members} members; paint it again")
     return torch.from_numpy(
         np.frombuffer(levels.ljust(members, b"\xff"), np.uint8).astype(np.float32) / 255.0
@@ -101,7 +105,7 @@ def layer_of(gdf: Gdf, strength: float, gains: Gains, paint: str) -> Layer:
     Raises:
         ProgdfError: see `decode`.
     """
-    return Layer(gdf, strength, True, gains, decode(paint, len(gdf.region)))
+    return Layer(gdf, strength, True, gains, decode(paint, len(gdf.region), gdf.from_others))
 
 
 def begin_stroke(paint: str, gdf: Gdf, surface: Surface, through: bool, mode: str = "erase") -> Stroke:
@@ -114,7 +118,8 @@ def begin_stroke(paint: str, gdf: Gdf, surface: Surface, through: bool, mode: st
         through: also what lies behind the front surface
         mode: of `BRUSH_MODES`
     """
-    weights, count = decode(paint, len(gdf.region)), len(gdf.region)
+    count = len(gdf.region)
+    weights = decode(paint, count, gdf.from_others)
     before = np.ones(count, np.float32) if weights is None else weights.numpy()
     members = gdf.region.members.numpy()
     points, depths = surface.centers.points[members], surface.centers.depths[members]
@@ -163,28 +168,29 @@ def apply_stroke(stroke: Stroke, brush: Brush, density: float = 1.0) -> str:
     return encode(stroke.before + (goal - stroke.before) * stroke.reached * np.float32(brush.flow))
 
 
-def invert(paint: str, members: int) -> str:
-    """The paint with each weight w replaced by 1 − w.
+def invert(paint: str, members: int, from_others: int = 0) -> str:
+    """The paint with each weight w replaced by 1 − w; arguments as of `decode`.
 
     Raises:
         ProgdfError: see `decode`.
     """
-    weights = decode(paint, members)
+    weights = decode(paint, members, from_others)
     return encode(np.zeros(members, np.float32) if weights is None else (1.0 - weights).numpy())
 
 
-def feather(paint: str, points: Floats, width: float) -> str:
+def feather(paint: str, points: Floats, width: float, from_others: int = 0) -> str:
     """The paint with its edges softened, wherever one looks from.
 
     Args:
         paint: of a layer
         points: the centers of its members, world units. [M,3]
         width: see `near_mean`, world units, > 0
+        from_others: see `decode`
 
     Raises:
         ProgdfError: see `decode`.
     """
-    weights = decode(paint, len(points))
+    weights = decode(paint, len(points), from_others)
     if weights is None:
         return FULL
     soft, somewhere = weights.numpy().copy(), np.isfinite(points).all(1)

@@ -24,6 +24,7 @@ from viewer.camera.view_camera import eye, from_camera, to_camera
 from viewer.files import session
 from viewer.files.session import WindowSession
 from viewer.state import selection
+from viewer.state.paint import encode
 from viewer.state.selection import SelectionState
 from viewer.state.view_state import Comparison, SnapshotPair
 
@@ -131,6 +132,7 @@ BROKEN: list[tuple[tuple[str | int, ...], Any, str]] = [
     (("view", "layers", 0, "enabled"), 1, "enabled"),
     (("view", "layers", 0, "gains", "color"), -1.0, "gains"),
     (("view", "layers", 0, "paint"), "AAAA", "paint"),
+    (("view", "layers", 0, "paint"), encode(np.zeros(3, np.float32)), "do not fit its"),
     (("view", "brush", "mode"), "spray", "spray"),
     (("view", "brush", "radius"), 0.0, "radius"),
     (("view", "blend"), "multiply", "multiply"),

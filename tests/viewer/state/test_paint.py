@@ -68,10 +68,20 @@ def test_paint_survives_its_text_to_a_255th_and_full_paint_is_no_text() -> None:
     assert paint.decode(paint.FULL, 300) is None
 
 
-@pytest.mark.parametrize("text", ["no base64!", "AAAA", paint.encode(np.zeros(7, np.float32))])
+@pytest.mark.parametrize(
+    "text", ["no base64!", "AAAA", *(paint.encode(np.zeros(n, np.float32)) for n in (4, 7))]
+)
 def test_damaged_or_foreign_paint_is_refused_in_one_line(text: str) -> None:
     with pytest.raises(ProgdfError, match="paint it again"):
         paint.decode(text, 5)
+
+
+def test_paint_may_lack_the_rows_that_other_edits_add_and_no_more() -> None:
+    found = paint.decode(paint.encode(np.zeros(5, np.float32)), 7, 2)
+    assert found is not None
+    assert found.tolist() == [0.0] * 5 + [1.0] * 2
+    with pytest.raises(ProgdfError, match="do not fit its 7 members; paint it again"):
+        paint.decode(paint.encode(np.zeros(4, np.float32)), 7, 2)
 
 
 def test_a_brush_is_full_inside_fades_to_its_edge_and_reaches_no_further() -> None:
@@ -334,6 +344,9 @@ def test_paint_lasts_when_rows_come_and_go_with_another_edit() -> None:
     with_hat = paint.layer_of(document.gdfs[0], 1.0, layers[0].gains, layers[0].paint).weights
     assert with_hat is not None
     assert with_hat.tolist() == pytest.approx([*drawn, *np.ones(25)], abs=0.003)
+    for gdf, count in zip(document.gdfs, (89, 34), strict=True):  # the hat's own rows are painted with it
+        with pytest.raises(ProgdfError, match="paint it again"):
+            paint.layer_of(gdf, 1.0, layers[0].gains, paint.encode(np.zeros(count, np.float32)))
     wider = replace(layers[0], paint=paint.encode(with_hat.numpy()))
     pruned = prune(WindowSession(document, ViewState(layers=(wider,))))
     assert pruned.view.layers == layers
