@@ -84,7 +84,7 @@ class Mouse:
         began, used = time.perf_counter(), time.process_time()
         if event:
             self.main_view.wake()
-        self.main_view.frame(self._screen, self.pixels, seconds)
+        self.main_view.frame(self._screen, seconds)
         self._ctx.finish()
         self.processor_ms = 1e3 * (time.process_time() - used)
         return 1e3 * (time.perf_counter() - began)
@@ -107,7 +107,7 @@ class Mouse:
     def settle(self) -> None:
         """Frames until nothing is left to draw at once."""
         while self.main_view.next_frame_delay() == 0.0:
-            self.main_view.frame(self._screen, self.pixels, _STEP_S)
+            self.main_view.frame(self._screen, _STEP_S)
 
     def move(self, x: float, y: float) -> float:
         """Move the mouse there, window pixels; milliseconds to finished pixels."""

@@ -68,7 +68,7 @@ class Rig:
 
     def frame(self, count: int = 1, keys: Keys = NO_KEYS) -> None:
         for _ in range(count):
-            self.main_view.frame(self.screen, self.pixels, STEP_S, keys)
+            self.main_view.frame(self.screen, STEP_S, keys)
 
     def settle(self) -> None:
         """What the window's loop does while the main view has no patience."""
@@ -79,12 +79,12 @@ class Rig:
         """What the window's loop does for so long while nothing comes in."""
         while seconds > 0.0 and (wait := self.main_view.next_frame_delay()) is not None:
             passed = max(min(wait, seconds), STEP_S)
-            self.main_view.frame(self.screen, self.pixels, passed)
+            self.main_view.frame(self.screen, passed)
             seconds -= passed
 
     def pause(self, seconds: float) -> None:
         """One frame that comes so much later."""
-        self.main_view.frame(self.screen, self.pixels, seconds)
+        self.main_view.frame(self.screen, seconds)
 
     def event(self) -> None:
         """Something came in: the window wakes the main view and draws."""

@@ -225,7 +225,7 @@ class App:
         self.main_view.ui.set_scale(self.window.ui_scale * self.main_view.work.layout.zoom)
         self.window.new_frame()
         screen = self.context.screen
-        self.main_view.frame(screen, self.window.pixels, seconds, self.window.take_keys())
+        self.main_view.frame(screen, seconds, self.window.take_keys())
         self.window.point(self.main_view.pointed.at)
         self.window.present()
         self._rename()

@@ -92,15 +92,13 @@ class Canvas:
         dragging: bool,
         now: float,
         focus: int | None = None,
-        overlap: int | None = None,
         pointed: Pointed | None = None,
     ) -> None:
         """Show `view` in the lower left `size` pixels of `screen`.
 
         Args:
             focus: the layer whose painted weights are shown while the brush is out, or None
-            overlap: the layer of which is shown what it shares with the others, or None
-            pointed: what else the panel is asked about
+            pointed: what the panel is asked about
             dragging: the mouse holds something, so that more will follow
             now: seconds on the main view's clock
 
@@ -115,9 +113,7 @@ class Canvas:
         mode = "off" if view.compare.mode == "difference" else view.dynamic_resolution
         before = self._resolution
         self._resolution = dynamic_resolution.before_draw(before, mode, dragging, turned, slid, now)
-        self.comparer.engine.highlight = highlight.requested_highlight(
-            view, focus, overlap, pointed, self._sliding
-        )
+        self.comparer.engine.highlight = highlight.requested_highlight(view, focus, pointed, self._sliding)
         target = aim, edits, self.comparer.engine.highlight
         has_picture, self._begun = self.pictures_drawn or self._follows, None
         if mode != "off" and has_picture and dynamic_resolution.takes_long(before, self._resolution):

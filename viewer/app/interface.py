@@ -319,7 +319,7 @@ def over_picture(
     Args:
         held: what the mouse holds
         labels: over the comparison on screen
-        original: the key that shows it is held
+        original: it is shown
         at: where keys moved the pointer
     """
     area, ui, view = pointer.area, pointer.ui, work.view

@@ -33,15 +33,12 @@ from viewer.ui.keys import (
     NO_KEYS,
     Keys,
     PendingKeys,
-    Taps,
     cancels_drag,
     fly_by_keys,
     has_pending_input,
-    holds_original,
     is_flying,
     is_repeating,
     requested_actions,
-    tapped_actions,
 )
 from viewer.ui.pointer import PointerContext
 
@@ -139,7 +136,6 @@ class MainView:
         self.pointed = KeyPointer()
         self._revealed = (self.work.focus, False)  # the layer that the panel shows, and whether it has a bar
         self._keys = NO_KEYS  # of the present frame
-        self._taps = Taps()
         self._held = False  # something of the interface in the last frame, by the mouse or the keyboard
         self._popups = 0, 0  # how many were open as the last frame began, and this one
         self._half = 0  # of two pictures side by side, the one that the mouse is in
@@ -182,7 +178,7 @@ class MainView:
     def restart(self, view: ViewState, snapshots: tuple[SliderSnapshot, ...] = ()) -> None:
         """A new state and snapshots, with nothing to undo, nothing in the hand or over the picture."""
         self.work = replace(workspace.new_workspace(view, snapshots), layout=self.work.layout)
-        self._tool, self._taps = MouseTool(), Taps()
+        self._tool = MouseTool()
         self.cover, self.preview, self.gizmo = None, PreviewState(), None
         self.wake()
 
@@ -191,7 +187,7 @@ class MainView:
         self.ui.make_current()
         if not self._resting and (has_pending_input() or self.opening):
             return 0.0
-        waits = [FLIGHT_S] if is_flying(self._keys) or self._taps.since else []
+        waits = [FLIGHT_S] if is_flying(self._keys) else []
         if self.work.glide is not None:
             waits.append(0.0)
         if self.work.message is not None:
@@ -213,18 +209,11 @@ class MainView:
         self.work = workspace.with_message(self.work, text, self._clock, error, details, button=button)
         self.wake()
 
-    def frame(
-        self,
-        screen: moderngl.Framebuffer,
-        size: tuple[int, int],
-        seconds: float,
-        keys: Keys = NO_KEYS,
-    ) -> None:
+    def frame(self, screen: moderngl.Framebuffer, seconds: float, keys: Keys = NO_KEYS) -> None:
         """Handle the input that imgui's io holds, and draw.
 
         Args:
             screen: where to draw
-            size: its width and height in pixels: io.display_size times io.display_framebuffer_scale
             seconds: since the last frame
             keys: what the keyboard did
         """
@@ -247,7 +236,7 @@ class MainView:
         screen.use()
         imgui.backends.opengl3_render_draw_data(imgui.get_draw_data())
         self.frames += 1
-        self._save_files(screen, size)
+        self._save_files(screen)
 
     def _guard(self) -> AbstractContextManager[None]:
         return self.ui.guard(self.report)
@@ -276,8 +265,8 @@ class MainView:
     def _draw_picture(self, screen: moderngl.Framebuffer) -> None:
         view, area = self._displayed_view(), self._pointer().size
         self.canvas.comparer.sides = compare_sides(self.work.snapshots, view)
-        pointed = (self.work.overlap, self.work.pointed) if view.panel else (None, None)
-        self.canvas.draw(view, screen, area, self._is_held(), self._clock, self.work.focus, *pointed)
+        pointed = self.work.pointed if view.panel else None
+        self.canvas.draw(view, screen, area, self._is_held(), self._clock, self.work.focus, pointed)
         if self.canvas.pixels == 1 and not self._is_held():
             self._pointer().look_ahead()
 
@@ -301,7 +290,7 @@ class MainView:
         off = cancels_drag(self._keys, self._held, self._tool.drag)
         if off:
             self._cancel_drag()
-        view, asks = self.work.view, self._takes_keys()
+        asks = self._takes_keys()
         self._follow_keyboard(asks)
         if not asks:
             gesture, self.work, self._keys = select_tool.take_keys(
@@ -309,13 +298,9 @@ class MainView:
             )
             self._tool = replace(self._tool, gesture=gesture)
         self._point_by_keys(asks)
-        flies = view.camera.mode == "fly"
-        self._taps, tapped = tapped_actions(self._taps, self._keys, self._clock, flies)
         if asks:  # no key is a shortcut or flies
-            self._taps, tapped = Taps(), []
             self._keys = Keys(self._keys.pressed)
-        self._keys = self._taps.without(self._keys)
-        for action in (*requested_actions(self._keys), *tapped):
+        for action in requested_actions(self._keys):
             if self.at_start and action not in pages.COMMANDS:
                 continue
             if not asks or action == "window_picture":  # which shows what is open, and changes nothing
@@ -334,7 +319,7 @@ class MainView:
                 pictures, missing = self.canvas.thumbnails(self.work, self.facts.rows)
                 if missing:
                     self.wake()
-                compared = self.canvas.comparer.labels(self.work.view), self._shows_original
+                compared = self.canvas.comparer.labels(self.work.view), self.work.before
                 self.work = interface.panels(
                     self.work, self._pointer(), pictures, self.preview, self.recent, reveal, compared
                 )
@@ -438,7 +423,7 @@ class MainView:
         view, frame = self.work.view, self._frame()
         if frame is not None:
             view = overlay.fit_to_frame(view, frame, self._area())
-        if self._shows_original:
+        if self.work.before:
             return workspace.original(view)
         sides = compare_sides(self.work.snapshots, view)
         if sides is not None:
@@ -454,10 +439,6 @@ class MainView:
         area, covered = self._area(), timeline_bar.height(self.work, self._area(), self.ui)
         return None if self.cover is not None else overlay.safe_frame(self.work.view, area, covered)
 
-    @property
-    def _shows_original(self) -> bool:
-        return self.work.before or holds_original(self._keys)
-
     def _is_held(self) -> bool:
         """Whether the user holds something that moves the picture, or a film plays."""
         if self._tool.drag is not None or imgui.is_any_item_active() or imgui.get_io().mouse_wheel:
@@ -472,7 +453,7 @@ class MainView:
         pressed = [] if over else [press.chord for press in self._keys.pressed]
         with self._guard():
             self.work = interface.draw_dialog(self.work, pointer, self.recent, pressed)
-        original = self._shows_original
+        original = self.work.before
         with self._guard():
             if self.cover is not None and not original:
                 pages.draw_cover(self.cover, self.work.view, pointer.size, pointer.area, self.ui)
@@ -508,21 +489,23 @@ class MainView:
         requests, self.work = self.work.requests, replace(self.work, requests=())
         return requests
 
-    def _save_files(self, screen: moderngl.Framebuffer, size: tuple[int, int]) -> None:
+    def _save_files(self, screen: moderngl.Framebuffer) -> None:
         """Serve the requests for files that the main view can make by itself."""
         served = [request for request in self.work.requests if request in exports.REQUESTS]
         unserved = tuple(request for request in self.work.requests if request not in served)
         self.work = replace(self.work, requests=unserved)
         for request in served:
             with self._guard():
-                self.show_message(self._save(request, screen, size))
+                self.show_message(self._save(request, screen))
 
-    def _save(self, request: str, screen: moderngl.Framebuffer, size: tuple[int, int]) -> str:
+    def _save(self, request: str, screen: moderngl.Framebuffer) -> str:
         title, view = self.facts.title, replace(self._displayed_view(), camera=self.work.view.camera)
         if request == "timeline_file":
             return exports.timeline(self.pictures, title, view, self.facts.origin)
         if request == "window_picture":
-            return f"Saved {exports.picture(self.pictures, title, read_rgb(screen, size))}"
+            display, density = imgui.get_io().display_size, imgui.get_io().display_framebuffer_scale
+            whole = round(display.x * density.x), round(display.y * density.y)
+            return f"Saved {exports.picture(self.pictures, title, read_rgb(screen, whole))}"
         if request == "take_view":
             taken = self.canvas.save_original(self.pictures, title, self.work.view, self._pointer().size)
             return f"Saved {taken}; change it in any program, and drop it here"

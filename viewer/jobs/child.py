@@ -29,9 +29,6 @@ NICE = 10
 """As by nice(1): a child gets a tenth of a core that the window, or another program, keeps busy. SCHED_IDLE
 would give it nothing, and a process without privileges cannot leave that again."""
 
-STARVED_S = 5.0
-"""Between two looks at whether a child gets the processor."""
-
 _TALKS = "--talks"
 
 
@@ -80,7 +77,6 @@ class Child:
                 os.setpriority(os.PRIO_PROCESS, self._process.pid, nice)
         self.log = log
         self._stopped_at: float | None = None
-        self._starved, self._seen = False, (time.monotonic(), 0.0, 0.0)
 
     @property
     def status(self) -> int | None:
@@ -94,30 +90,6 @@ class Child:
     def pid(self) -> int:
         """Of its process, and of its group where there are such."""
         return self._process.pid
-
-    @property
-    def processor_s(self) -> tuple[float, float] | None:
-        """Seconds that its threads have run, and that they were ready to but waited; None where unknown."""
-        ran = waited = 0
-        try:
-            for task in Path(f"/proc/{self.pid}/task").iterdir():
-                times = (task / "schedstat").read_text(encoding="ascii").split()
-                ran, waited = ran + int(times[0]), waited + int(times[1])
-        except (OSError, ValueError, IndexError):  # not Linux, or a thread that ends just now
-            return None
-        return 1e-9 * ran, 1e-9 * waited
-
-    @property
-    def is_starved(self) -> bool:
-        """Whether other programs keep the processor from it: ready for half of the last seconds, it had less
-        than a tenth of a core. False where that is unknown."""
-        times, now, (since, had, waited) = self.processor_s, time.monotonic(), self._seen
-        if times is None:
-            return False
-        if (span := now - since) >= STARVED_S:
-            self._seen = now, *times
-            self._starved = times[0] - had < 0.1 * span and times[1] - waited > 0.5 * span
-        return self._starved
 
     @property
     def output(self) -> IO[bytes]:

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import ClassVar, Literal
 
 from progdf.errors import ProgdfError, without_commands
-from progdf.io.atomic import LockedError
 from progdf.io.json_values import read_json
 from viewer.camera.view_camera import SHAPES
 
@@ -28,7 +27,7 @@ POLL_S = 0.3
 LOOK_S = 1.0
 """Between two at how far it is: the window draws its card at each."""
 
-Status = Literal["queued", "running", "stopping", "stopped", "elsewhere", "failed", "done"]
+Status = Literal["queued", "running", "stopping", "stopped", "failed", "done"]
 
 
 FORMATS = (".mp4", ".gif", ".webp", "")
@@ -137,14 +136,13 @@ class Job:
 
     number: int  # what requests call it by
     task: EditOrder | Delivery
-    status: Status = "queued"  # "elsewhere": another window or process trains it
+    status: Status = "queued"
     progress: Progress = Progress()
     seconds: float = 0.0  # that it has run, in this session of it
     error: str = ""  # the one line of a failure
     warning: str = ""  # the one line of a run that came out poor
     resumes: bool = False  # it goes on with what was stopped
     began_at: float = 0.0  # the share that was done when this session of it began
-    starved: bool = False  # other programs keep the processor
     elsewhere: str = ""  # the name of its scene where another one is open
 
     @property
@@ -210,10 +208,9 @@ class JobQueue:
         return job.number
 
     def add_stopped(self, order: EditOrder) -> None:
-        """Show a run that was stopped another day, or is trained elsewhere, unless it is there."""
-        if all(job.task.out != order.out for job in self.jobs):
-            status: Status = "elsewhere" if order.is_locked else "stopped"
-            job = Job(next(self._numbers), order, status, order.read_progress(Progress()), resumes=True)
+        """Show a run that was stopped another day, unless it is there, or another process has it."""
+        if not order.is_locked and all(job.task.out != order.out for job in self.jobs):
+            job = Job(next(self._numbers), order, "stopped", order.read_progress(Progress()), resumes=True)
             self.jobs = (*self.jobs, job)
 
     def resume(self, number: int) -> None:
@@ -273,9 +270,7 @@ class JobQueue:
             if child is not None and (status := child.status) is not None:
                 ended.append(self._end(job, child, status))
             elif child is not None and looks:
-                self._follow(job, child)
-            elif job.status == "elsewhere" and looks:
-                ended.append(self._look_elsewhere(job))
+                self._follow(job)
         for job in self.jobs:
             trains = any(isinstance(j.task, EditOrder) and j.number in self._children for j in self.jobs)
             if job.status == "queued" and not (trains and isinstance(job.task, EditOrder)):
@@ -284,9 +279,7 @@ class JobQueue:
 
     def next_poll(self) -> float | None:
         """Seconds until the next look; None while there is nothing to see."""
-        if self.busy():
-            return POLL_S
-        return LOOK_S if any(job.status == "elsewhere" for job in self.jobs) else None
+        return POLL_S if self.busy() else None
 
     def close(self) -> None:
         """Stop what runs, and wait until it has saved its state and gone; what waits is forgotten."""
@@ -303,21 +296,12 @@ class JobQueue:
             self._unlock(job)
         self._folder.cleanup()
 
-    def _follow(self, job: Job, child: Child) -> None:
+    def _follow(self, job: Job) -> None:
         progress, now = job.task.read_progress(job.progress), time.monotonic()
         if progress.share == job.began_at:  # it is still starting, which takes as long as it takes
             self._began[job.number] = now
         seconds = now - self._began[job.number]
-        self._change(replace(job, progress=progress, seconds=seconds, starved=child.is_starved))
-
-    def _look_elsewhere(self, job: Job) -> Job | None:
-        """How far a run is that another window trains; the job once that has finished or discarded it."""
-        job = replace(job, progress=job.task.read_progress(job.progress))
-        if job.task.is_locked or job.task.is_begun:
-            self._change(job if job.task.is_locked else replace(job, status="stopped"))
-            return None
-        self.dismiss(job.number)
-        return job
+        self._change(replace(job, progress=progress, seconds=seconds))
 
     def _start(self, job: Job) -> Job | None:
         """Start a job; what became of it where that cannot be."""
@@ -334,7 +318,7 @@ class JobQueue:
 
     def _end(self, job: Job, child: Child, status: int) -> Job:
         self._children.pop(job.number).close()
-        job, begun = replace(job, starved=False), job.task.is_begun
+        begun = job.task.is_begun
         if begun or job.status != "stopping":  # else it is discarded first
             self._unlock(job)
         if status == 0 and job.task.result.exists():
@@ -360,13 +344,9 @@ class JobQueue:
         self.dismiss(job.number)
 
     def _lock(self, job: Job) -> None:
-        """Keep other windows from the run. Raises ProgdfError where one has it; its card says so then."""
+        """Keep other windows from the run. Raises ProgdfError where one has it."""
         with ExitStack() as locks:
-            try:
-                locks.enter_context(job.task.lock())
-            except LockedError:
-                self._change(replace(job, status="elsewhere"))
-                raise
+            locks.enter_context(job.task.lock())
             self._locks[job.number] = locks.pop_all()
 
     def _unlock(self, job: Job) -> None:

@@ -321,18 +321,11 @@ def _thumbnail(
 
 
 def _tell(work: Workspace, index: int, row: LayerRow) -> Workspace:
-    """The details as the tip of the last item, which shows in the picture what is shared with others."""
-    if imgui.is_item_hovered(imgui.HoveredFlags_.for_tooltip.value) and _overlaps(work, index, row):
-        work = replace(work, overlap=index)
+    """The details as the tip of the last item, which shows the layer's region in the picture."""
+    if imgui.is_item_hovered(imgui.HoveredFlags_.for_tooltip.value):
+        work = replace(work, pointed=("layer", index))
     tip(_details(work, index, row))
     return work
-
-
-def _overlaps(work: Workspace, index: int, row: LayerRow) -> list[tuple[str, int]]:
-    """With which layers it shares how many splats."""
-    others = [(layer.name, layer.gdf) for i, layer in enumerate(work.view.layers) if i != index]
-    shared = [(name, row.shared[gdf]) for name, gdf in others if gdf < len(row.shared)]
-    return [(name, count) for name, count in shared if count]
 
 
 def _details(work: Workspace, index: int, row: LayerRow) -> str:
@@ -341,8 +334,9 @@ def _details(work: Workspace, index: int, row: LayerRow) -> str:
     kind, _, rest = row.instruction.partition(":")
     about += f"  ·  {kind.capitalize()} {rest}" if kind else ""
     shares = (
-        f"Shares {'all' if count == row.count else group_digits(count)} with {name}"
-        for name, count in _overlaps(work, index, row)
+        f"Shares {'all' if count == row.count else group_digits(count)} with {layer.name}"
+        for i, layer in enumerate(work.view.layers)
+        if i != index and layer.gdf < len(row.shared) and (count := row.shared[layer.gdf])
     )
     return "\n".join((about, *shares))
 

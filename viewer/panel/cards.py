@@ -277,7 +277,6 @@ def draw(
             )
     work = replace(
         work,
-        overlap=None,
         pointed=None,
         search=draw_search(work, ui) if work.view.layers else "",
         searching=False,

@@ -12,7 +12,6 @@ from viewer.ui.context import PALETTE, SMALL_PX, Icon, Rgba, UiContext, u32
 from viewer.ui.widgets import card, elide, menu_items, right_edge, small, tip, wrapped_text
 
 BAR_PX, STRIP_PX = 5.0, 28.0
-STARVED = "Waits for the processor"
 _MENU = "menu of a training"
 _ITEMS = (("Show log…", "run_log", ""), ("Discard…", "ask_discard", ""))
 _UNWRITTEN = "Nothing is written"
@@ -103,8 +102,8 @@ def _card(job: Job, ui: UiContext) -> list[str]:
         tip(f"{about}{task.out}")
         imgui.same_line(right - wide)
         imgui.text_colored(PALETTE.error if failed else PALETTE.dim, word)
-        runs = job.status == "running" and not job.starved
-        _bar(job.progress.share, PALETTE.error if failed else PALETTE.accent if runs else PALETTE.faint, ui)
+        color = PALETTE.accent if job.status == "running" else PALETTE.faint
+        _bar(job.progress.share, PALETTE.error if failed else color, ui)
         menu = bool(about) and job.status != "queued"
         actions = _foot(job, right, menu, ui)
         right_click = imgui.is_mouse_clicked(imgui.MouseButton_.right.value) and imgui.is_window_hovered()
@@ -116,7 +115,7 @@ def _card(job: Job, ui: UiContext) -> list[str]:
 
 
 def _status(job: Job) -> str:
-    if job.status in ("running", "elsewhere"):
+    if job.status == "running":
         return f"{100 * job.progress.share:.0f} %" if job.progress.share else ""
     return job.status.capitalize()
 
@@ -161,8 +160,6 @@ def _foot(job: Job, right: float, menu: bool, ui: UiContext) -> list[str]:
 def _status_text(job: Job) -> str:
     progress = job.progress
     match job.status:
-        case "running" if job.starved:
-            return STARVED
         case "running":
             left = job.seconds_left
             finds = isinstance(job.task, EditOrder) and job.task.region == "changed"
@@ -175,8 +172,6 @@ def _status_text(job: Job) -> str:
             return "Waits for the one before"
         case "stopping":
             return "Saving what is done" if isinstance(job.task, EditOrder) else _UNWRITTEN
-        case "elsewhere":
-            return "Trains in another window"
         case "done":
             return ""
     return f"{100 * progress.share:.0f} % is done" if progress.share else "Can go on where it was"

@@ -1,5 +1,5 @@
-"""Colors over the splats: the selection and regions, painted weights from blue (none of the edit) to yellow,
-what layers share; and what is hidden.
+"""Colors over the splats: the selection and regions, painted weights from blue (none of the edit) to yellow;
+and what is hidden.
 """
 
 from __future__ import annotations
@@ -26,9 +26,6 @@ THIN = 0.2
 RAMP = ((0.0, 0x2B3FA8), (0.25, 0x7A35B5), (0.5, 0xC8407A), (0.75, 0xF08A3C), (1.0, 0xF9E558))
 """Weights and their colors, rgb; lightness rises with the weight, so that also gray tells them apart."""
 
-SHARED = 0xFF3FA0
-"""The color of what is in several layers."""
-
 SELECTED: Color = (1.0, 0.72, 0.05)
 TINT, TRACE, HIDDEN = 140, 45, 255
 """Shares of 255 that a tint takes, and that of a selection while no tool selects; and the one that means that
@@ -44,8 +41,6 @@ class Highlight:
     # an edit whose members show their weights, as `LayerState.gdf` counts; None for none
     gdf: int | None = None
     paint: str = paint.FULL  # its weights, as `paint.encode` writes them
-    # edits of which to show, in place of weights, the members that they share with this one
-    others: tuple[int, ...] = ()
     thin: bool = False  # only a tint over what has less than all of the edit
     # packed masks, their colors and shares of 255, later ones over earlier ones
     tinted: tuple[tuple[bytes, Color, int], ...] = ()
@@ -56,7 +51,6 @@ class Highlight:
 def requested_highlight(
     view: ViewState,
     focus: int | None,
-    overlap: int | None = None,
     pointed: Pointed | None = None,
     sliding: bool = False,
 ) -> Highlight | None:
@@ -68,15 +62,11 @@ def requested_highlight(
 
     Args:
         focus: the focused layer, an index into `view.layers`, or None
-        overlap: the layer of which to show what it shares with the others, or None
-        pointed: what else the mouse rests on in the panel
+        pointed: what the mouse rests on in the panel
         sliding: edits are being moved, and are what one looks at
     """
     if view.compare.mode != "off":
         return None
-    if overlap is not None and overlap < len(view.layers):
-        gdf = view.layers[overlap].gdf
-        return Highlight(gdf, others=tuple(layer.gdf for layer in view.layers if layer.gdf != gdf))
     state, kind, index = view.selection, *(pointed or ("", 0))
     if kind == "layer" and index < len(view.layers):
         return Highlight(region=view.layers[index].gdf)
@@ -131,17 +121,11 @@ def highlight_colors(highlight: Highlight, gdfs: Sequence[Gdf], total: int) -> B
     if highlight.gdf is not None:
         gdf = gdfs[highlight.gdf]
         members = gdf.region.members.numpy()
-        if highlight.others:
-            others = np.concatenate([gdfs[i].region.members.numpy() for i in highlight.others])
-            members = members[np.isin(members, others)]
-            colors[members, :3] = np.round(255.0 * np.array(rgba(SHARED)[:3]))
-            colors[members, 3] = round(255 * SHARE)
-        else:
-            decoded = paint.decode(highlight.paint, len(members), gdf.from_others)
-            weights = np.ones(len(members), np.float32) if decoded is None else decoded.numpy()
-            colors[members, :3] = ramp_colors(weights)
-            shares = THIN * (1.0 - weights) if highlight.thin else np.full_like(weights, SHARE)
-            colors[members, 3] = np.round(255.0 * shares)
+        decoded = paint.decode(highlight.paint, len(members), gdf.from_others)
+        weights = np.ones(len(members), np.float32) if decoded is None else decoded.numpy()
+        colors[members, :3] = ramp_colors(weights)
+        shares = THIN * (1.0 - weights) if highlight.thin else np.full_like(weights, SHARE)
+        colors[members, 3] = np.round(255.0 * shares)
     colors[hidden, 3] = HIDDEN
     return colors
 

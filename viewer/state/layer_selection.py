@@ -156,7 +156,7 @@ def remove(workspace: Workspace, index: str) -> Workspace:
     for i in reversed(gone):
         view = remove_layer(view, i)
     focus = max(gone[0] - 1, 0) if view.layers else None
-    return replace(workspace, view=view, focus=focus, selected=frozenset(), renaming=None, overlap=None)
+    return replace(workspace, view=view, focus=focus, selected=frozenset(), renaming=None)
 
 
 def group(workspace: Workspace, name: str) -> Workspace:

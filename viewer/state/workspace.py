@@ -144,15 +144,13 @@ class Workspace:
     dialog: Dialog | None = None  # the question being asked, or None
     requests: tuple[str, ...] = ()  # what only the window can do, and has still to
     player: Player = Player()  # the playhead of `view.timeline`
-    # the layer of which the panel asks to see what it shares with the others, or None
-    overlap: int | None = None
-    pointed: Pointed | None = None  # what else the mouse rests on in the panel, to be seen in the picture
+    pointed: Pointed | None = None  # what the mouse rests on in the panel, to be seen in the picture
     form: NewEdit = NewEdit()  # of a new edit, as it was last left
     form_open: bool = False  # whether it is shown
     form_opening: bool = False  # it was opened and has no keyboard yet
     # what is being trained, exported and rendered, or waits for that, as the window last looked
     jobs: tuple[Job, ...] = ()
-    before: bool = False  # the original is shown, until its key is tapped again or a slider moves
+    before: bool = False  # the original is shown, until its key is pressed again or a slider moves
     glide: Glide | None = None  # the camera on its way to a view that was asked for, or None
     layout: Layout = Layout()  # of the window
     session: str = ""  # the name of its file, "" before it has one

@@ -36,7 +36,6 @@ class Command:
     keys: str = ""  # chords with blanks between: modifiers in the order Ctrl, Shift, Alt, then the key's name
     help: str = ""  # what a tip says beside the name
     repeats: bool = False  # while a key is held
-    tap: bool = False  # done when the key is let go soon, as held it does something else
     types: bool = False  # one types afterwards
     row: str = ""  # in the list of keys, where it is about several commands; `JOINED` for the others of them
     listed: str = ""  # its keys there, where they are too many
@@ -56,8 +55,6 @@ DRAGS = (
 FLY_KEYS = {"W": (0, 0, 1), "S": (0, 0, -1), "A": (-1, 0, 0), "D": (1, 0, 0), "Q": (0, -1, 0), "E": (0, 1, 0)}
 """Physical keys (their places on a US keyboard) → right, up, ahead."""
 
-TAP_S = 0.25
-"""A key that is let go sooner was tapped, not held."""
 NUDGES = (("", 0.01), ("Shift+", 0.10), ("Ctrl+", 0.001))
 
 
@@ -118,10 +115,10 @@ TOPICS: dict[str, tuple[Command, ...]] = {
         *_row("Numpad 1 3 7", "Front, right, top", _looks()),
         Command("grid", "Ground grid", "Shift+G"),
         Command("axes", "Axes"),
-        Command("before", "Original: tap, or hold", "\\", tap=True),
+        Command("before", "Original", "\\", "Until it is pressed again, or a slider moves"),
         Command("beside", "Side by side", "Y"),
         Command("split", "Split view", "Shift+Y"),
-        Command("difference", "Difference", "D", "Amplified, with its PSNR", tap=True),
+        Command("difference", "Difference", "Alt+Y", "Amplified, with its PSNR"),
     ),
     "Layers": (
         *_row("1–9", "Select a layer", _numbers("focus", "Select layer")),
@@ -295,7 +292,7 @@ def bind(changes: Mapping[str, Any]) -> list[str]:
             taken = {(parse_chord(text), command.in_hand): command for text in texts}
             if twice := [key for key in taken if key in given]:
                 raise ValueError(f"{twice[0][0]} is that of {given[twice[0]].action} already")
-            if flies := [chord for chord, _ in taken if chord in FLY_KEYS and not COMMANDS[action].tap]:
+            if flies := [chord for chord, _ in taken if chord in FLY_KEYS]:
                 raise ValueError(f"{flies[0]} flies")
             given.update(taken)
             changed.append(COMMANDS[action])
@@ -427,17 +424,6 @@ class Keys:
 NO_KEYS = Keys()
 
 
-@dataclass(frozen=True)
-class Taps:
-    """Keys that are down and may yet have been tapped, and since when."""
-
-    since: tuple[tuple[str, float], ...] = ()
-
-    def without(self, keys: Keys) -> Keys:
-        """The keys, of which these do not fly yet."""
-        return replace(keys, fly=keys.fly - {chord for chord, _ in self.since})
-
-
 def has_reached_imgui(press: Press) -> bool:
     """Whether imgui, which takes text and keys in over several frames, has come to this key.
 
@@ -468,37 +454,12 @@ def requested_actions(keys: Keys) -> list[str]:
     if imgui.get_io().want_text_input:
         return []
     pressed = [(KEYS[press.chord], press.again) for press in keys.pressed if press.chord in KEYS]
-    return [key.action for key, again in pressed if not key.tap and (key.repeats or not again)]
-
-
-def tapped_actions(taps: Taps, keys: Keys, now: float, flies: bool) -> tuple[Taps, list[str]]:
-    """Actions of keys that were let go soon after they went down; none while a text field is open.
-
-    Args:
-        taps: as it was after the last frame
-        now: seconds on the main view's clock
-        flies: flight keys fly at once, so that none of them is tapped
-    """
-    if imgui.get_io().want_text_input:
-        return Taps(), []
-    actions = {chord: key.action for chord, key in KEYS.items() if key.tap}
-    ignored = FLY_KEYS if flies or len(keys.fly) > 1 else ()
-    down = {press.chord: now for press in keys.pressed if press.chord in actions and not press.again}
-    since = {chord: at for chord, at in {**dict(taps.since), **down}.items() if chord not in ignored}
-    tapped = [c for c, at in since.items() if c not in keys.held and now - at <= TAP_S]
-    undecided = tuple((c, at) for c, at in since.items() if c in keys.held and now - at <= TAP_S)
-    return Taps(undecided), [actions[chord] for chord in tapped]
+    return [key.action for key, again in pressed if key.repeats or not again]
 
 
 def is_repeating(keys: Keys) -> bool:
     """Whether a key that repeats is held: what it does is not over yet."""
     return any(key.repeats and chord.rpartition("+")[2] in keys.held for chord, key in KEYS.items())
-
-
-def holds_original(keys: Keys) -> bool:
-    """Whether the key that shows the original is held."""
-    held = any(key.action == "before" and chord in keys.held for chord, key in KEYS.items())
-    return held and not imgui.get_io().want_text_input
 
 
 def modifier() -> str:

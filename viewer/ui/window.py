@@ -84,8 +84,6 @@ KEY_NAMES = {
     **{getattr(glfw, f"KEY_KP_{i}"): f"Num{i}" for i in range(10)},
     glfw.KEY_KP_DECIMAL: "Num.",
 }
-_X11_LINE_FEED = 109
-"""Scancode of a key that glfw does not name: what programs that type for one press as Enter."""
 
 
 class Window:
@@ -121,11 +119,7 @@ class Window:
             wake()
 
         def on_key(_: object, key: int, scancode: int, action: int, mods: int) -> None:
-            if key == glfw.KEY_UNKNOWN and scancode == _X11_LINE_FEED:
-                key = glfw.KEY_ENTER
             self._note_key(key, scancode, action, mods)
-            if scancode == _X11_LINE_FEED and action != glfw.REPEAT:  # imgui's own callback does not know it
-                imgui.get_io().add_key_event(imgui.Key.enter, action == glfw.PRESS)
             wake()
 
         def on_button(_: object, button: int, action: int, __: int) -> None:

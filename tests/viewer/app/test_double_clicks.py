@@ -28,7 +28,7 @@ def click_twice(hand: Rig, gap: float, frame: float, unheard: float = 0.0) -> No
             hand.io.add_mouse_button_event(0, down)
         for _ in range(3):
             clicks.apply()
-            hand.main_view.frame(hand.screen, hand.pixels, frame)
+            hand.main_view.frame(hand.screen, frame)
 
 
 @pytest.mark.parametrize("frame", [1 / 60, 0.12, 0.5])

@@ -130,7 +130,7 @@ def test_messages_leave_by_themselves(hand: Rig) -> None:
     hand.main_view.show_message("hello")
     hand.settle()
     assert hand.main_view.next_frame_delay() is not None
-    hand.main_view.frame(hand.screen, hand.pixels, 7.0)
+    hand.main_view.frame(hand.screen, 7.0)
     assert hand.main_view.work.message is None
 
 

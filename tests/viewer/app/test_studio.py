@@ -48,7 +48,6 @@ class Trainer:
     ended: int | None = None
     line = ""
     edit: Path | None = None
-    is_starved = False
 
     def __init__(self, arguments: Sequence[str], log: Path, talks: bool = False) -> None:
         type(self).said = arguments
@@ -279,15 +278,8 @@ def test_what_trains_in_another_window_stays_its_own(window: application.App) ->
             if asked == "resume_run":
                 assert told is not None
                 assert told.text == "blue trains in another window; stop it there first"
-            assert window.main_view.work.jobs[0].status == "elsewhere"
+            assert window.main_view.work.jobs[0].status == "stopped"
     assert (job.task.out / "state" / "run.json").is_file()
-    (job.task.out / "state" / "run.json").unlink()
-    job.task.result.touch()
-    window.jobs.queue._look_at = 0.0
-    turn(window)
-    assert (window.main_view.work.jobs, window.main_view.work.view.layers) == ((), ())
-    assert window.main_view.work.message is not None
-    assert window.main_view.work.message.text.startswith("blue was trained in another window: ")
 
 
 def test_quitting_asks_while_a_training_runs(window: application.App) -> None:

@@ -17,7 +17,6 @@ from viewer.state import selection
 from viewer.state.selection import SelectionState
 from viewer.state.view_state import Brush, LayerGroup, LayerState, ViewState
 from viewer.state.workspace import Dialog
-from viewer.ui.keys import Keys
 
 Compare = Callable[[str, np.ndarray], None]
 
@@ -84,9 +83,10 @@ def test_the_list_of_bindings_and_a_message(screenshot: Compare) -> None:
         screenshot("ui_help", hand.image())
 
 
-def test_a_scene_without_edits_and_the_original_held(screenshot: Compare) -> None:
+def test_a_scene_without_edits_and_the_original(screenshot: Compare) -> None:
     with rig(first_view(bear()), SMALLEST) as hand:
-        hand.frame(3, Keys(held=frozenset("\\")))
+        hand.key("\\")
+        hand.frame(2)
         screenshot("ui_original", hand.image())
 
 
@@ -121,7 +121,7 @@ def test_the_original_beside_the_edited(screenshot: Compare) -> None:
 
 def test_the_difference_from_the_original(screenshot: Compare) -> None:
     with rig(first_view(bear(), 1.0, 1.0), SMALLEST) as hand:
-        hand.key("D")
+        hand.key("Alt+Y")
         screenshot("ui_difference", hand.image())
 
 

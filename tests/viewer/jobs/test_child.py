@@ -6,14 +6,13 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
 from trainer.run import demo
-from viewer.jobs.child import NICE, STARVED_S, Child
+from viewer.jobs.child import NICE, Child
 
 MODULES = ("numpy", "threading", "torch", "signal", "json", "progdf", "trainer")
 """Of a stranger's folder; a package `viewer` beside them."""
@@ -84,42 +83,6 @@ def test_a_child_is_nice_and_no_more(child: Callable[..., Child]) -> None:
     assert os.sched_getscheduler(started.pid) == os.SCHED_OTHER, "SCHED_IDLE gets nothing on a busy machine"
     talking = child("preview", "no.ply", talks=True)
     assert os.getpriority(os.PRIO_PROCESS, talking.pid) == mine, "somebody waits for it"
-
-
-@pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells")
-def test_a_child_tells_how_long_it_ran_and_waited(child: Callable[..., Child]) -> None:
-    started = child("info", "no.ply")
-    before = started.processor_s
-    assert before is not None
-    while started.status is None:
-        after = started.processor_s
-        if after is not None and after[0] > before[0]:
-            break
-    else:
-        pytest.fail("it never ran")
-    started.close()
-    assert started.processor_s is None, "it has ended"
-
-
-def test_a_child_is_starved_that_is_ready_and_gets_next_to_nothing(
-    child: Callable[..., Child], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    clock = [0.0]
-    times: list[tuple[float, float] | None] = [(0.0, 0.0)]
-    monkeypatch.setattr(time, "monotonic", lambda: clock[0])
-    monkeypatch.setattr(Child, "processor_s", property(lambda _: times[0]))
-    started = child("--version")
-    assert not started.is_starved
-    for now, starved in (
-        ((5.0, 1.0), False),  # it works
-        ((5.1, 5.9), True),  # ready all the time, it had a fiftieth
-        ((5.2, 6.0), False),  # it waits for the disk
-        ((6.7, 30.0), False),  # its threads wait for each other
-        (None, False),  # a system that does not tell
-    ):
-        clock[0] += STARVED_S
-        times[0] = now
-        assert started.is_starved == starved
 
 
 def test_a_child_stops_though_the_window_was_started_with_interrupts_ignored() -> None:

@@ -20,7 +20,6 @@ from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from viewer.camera.view_camera import half_camera, to_camera
 from viewer.state.actions import toggle_mode
 from viewer.state.view_state import Comparison, ViewState
-from viewer.state.workspace import Dialog
 
 
 @cache
@@ -95,7 +94,7 @@ def test_a_slider_in_split_changes_the_right_side_alone(hand: Rig) -> None:
 
 @pytest.mark.gl
 def test_the_difference_is_amplified_black_where_nothing_changed_and_tells_the_psnr(hand: Rig) -> None:
-    hand.key("D")
+    hand.key("Alt+Y")
     view = hand.main_view.work.view
     edited = hand.main_view.engine.image(view, SIZE).clip(0, 1)
     original = hand.main_view.engine.image(replace(view, layers=()), SIZE).clip(0, 1)
@@ -113,7 +112,7 @@ def test_the_difference_is_amplified_black_where_nothing_changed_and_tells_the_p
 @pytest.mark.gl
 def test_equal_pictures_have_no_difference() -> None:
     with rig(first_view(bear(), 0.0, 0.0)) as hand:
-        hand.key("D")
+        hand.key("Alt+Y")
         assert hand.picture()[BANNER:].max() == 0
         assert hand.main_view.canvas.comparer.psnr == math.inf
         assert hand.main_view.canvas.comparer.labels(hand.main_view.work.view).line == "difference: none"
@@ -121,32 +120,30 @@ def test_equal_pictures_have_no_difference() -> None:
 
 @pytest.mark.gl
 def test_backslash_shows_the_whole_original_over_any_comparison(hand: Rig) -> None:
-    from viewer.ui.keys import Keys
-
     original = whole(0.0, 0.0)
-    for chord in ("Shift+Y", "D"):
+    for chord in ("Shift+Y", "Alt+Y"):
         hand.key(chord)
-        hand.frame(2, Keys(held=frozenset("\\")))
+        hand.key("\\")
         assert np.array_equal(hand.picture()[BANNER:], original[BANNER:])
-        hand.frame()
+        hand.key("\\")
 
 
 @pytest.mark.gl
 def test_at_a_difference_left_and_come_back_to_after_a_slider_moved_the_new_one_is_shown(hand: Rig) -> None:
-    hand.key("D")
+    hand.key("Alt+Y")
     before, psnr_before = hand.picture(), hand.main_view.canvas.comparer.psnr
     hand.key("Shift+Y")
     for _ in range(5):
         hand.key("2")  # the lower layer, the scarf
         hand.key("Shift+Left")
-    hand.key("D")
+    hand.key("Alt+Y")
     assert not np.array_equal(hand.picture()[BANNER:], before[BANNER:])
     assert hand.main_view.canvas.comparer.psnr != psnr_before
 
 
 @pytest.mark.gl
 def test_idle_in_a_comparison_draws_nothing(hand: Rig) -> None:
-    for chord in ("Shift+Y", "D"):
+    for chord in ("Shift+Y", "Alt+Y"):
         hand.key(chord)
         hand.pause(1.0)
         hand.frame(2)  # a tooltip may wait for a second of rest
@@ -199,50 +196,15 @@ def test_y_shows_two_pictures_that_turn_together_and_can_be_picked_in(hand: Rig,
 
 
 @pytest.mark.gl
-def test_a_tap_of_backslash_stays_with_the_original_until_the_next_or_a_slider_moves(hand: Rig) -> None:
-    from viewer.ui.keys import Keys, Press
-
+def test_backslash_stays_with_the_original_until_it_is_pressed_again_or_a_slider_moves(hand: Rig) -> None:
     edited = hand.picture()
     hand.key("\\")
     assert np.array_equal(hand.picture()[BANNER:], whole(0.0, 0.0)[BANNER:])
     hand.key("\\")
     assert np.array_equal(hand.picture(), edited)
-    held = Keys(held=frozenset("\\"))
-    hand.frame(keys=replace(held, pressed=(Press("\\"),)))
-    hand.frame(30, held)
-    hand.frame()
-    assert np.array_equal(hand.picture(), edited), "it was held, not tapped"
     hand.key("\\")
     hand.key("Shift+Left")
     assert not hand.main_view.work.before
-
-
-@pytest.mark.gl
-def test_d_flies_where_it_is_held_and_is_the_difference_where_it_is_tapped(hand: Rig) -> None:
-    from viewer.ui.keys import Keys, Press
-
-    camera = hand.main_view.work.view.camera
-    down = Keys(held=frozenset("D"), fly=frozenset("D"))
-    hand.frame(keys=replace(down, pressed=(Press("D"),)))
-    hand.frame(5, down)
-    hand.frame()
-    assert hand.main_view.work.view.compare.mode == "difference"
-    assert hand.main_view.work.view.camera == camera
-    hand.frame(keys=replace(down, pressed=(Press("D"),)))
-    hand.frame(30, down)
-    hand.frame()
-    assert hand.main_view.work.view.compare.mode == "difference"
-    assert hand.main_view.work.view.camera != camera
-    hand.key("V")
-    hand.frame(keys=replace(down, pressed=(Press("D"),)))
-    hand.frame()
-    assert hand.main_view.work.view.compare.mode == "difference", "in fly mode it only flies"
-    hand.key("V")
-    hand.main_view.ask(Dialog("leave", "bear.session.json", "quit"))
-    hand.frame(3)
-    hand.key("D")
-    assert hand.main_view.work.dialog is None
-    assert hand.main_view.work.view.compare.mode == "difference", "it answered the question"
 
 
 def test_each_mode_goes_on_and_off_and_takes_over_from_the_other() -> None:

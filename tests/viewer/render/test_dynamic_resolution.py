@@ -143,7 +143,7 @@ def hold_and_orbit(hand: Rig) -> None:
 
 
 def wait(hand: Rig, seconds: float) -> None:
-    hand.main_view.frame(hand.screen, hand.pixels, seconds)
+    hand.main_view.frame(hand.screen, seconds)
 
 
 @pytest.mark.gl
@@ -243,7 +243,7 @@ def test_a_split_is_coarse_on_both_sides_and_a_difference_never(hand: Rig) -> No
     assert hand.main_view.canvas.pixels == COARSE
     hand.release()
     wait(hand, REST_S)
-    hand.key("D")
+    hand.key("Alt+Y")
     hold_and_orbit(hand)
     assert hand.main_view.canvas.pixels == 1
     hand.release()

@@ -170,8 +170,8 @@ def test_the_selection_is_tinted_while_a_tool_selects_and_a_trace_without_one(
     assert highlight.requested_highlight(replace(still, panel=False), 0) is None
     tinted = highlight.requested_highlight(replace(still, select=SelectTool("lasso")), 0)
     assert tinted == Highlight(tinted=((chosen.members, highlight.SELECTED, highlight.TINT),))
-    assert highlight.requested_highlight(still, 0, None, ("selection", 0)) == tinted
-    assert highlight.requested_highlight(still, 0, None, ("layer", SCARF)) == Highlight(region=SCARF)
+    assert highlight.requested_highlight(still, 0, ("selection", 0)) == tinted
+    assert highlight.requested_highlight(still, 0, ("layer", SCARF)) == Highlight(region=SCARF)
     engine = ViewEngine(ctx, bear().scene, bear().gdfs, draw)
     engine.highlight = tinted
     found = shown(engine, still, ctx)
@@ -226,22 +226,8 @@ def test_c_shows_all_weights_and_saved_pictures_never_show_them() -> None:
         assert hand.main_view.work.past.past == (), "looking is no edit"
 
 
-def test_an_overlap_colors_what_both_edits_have_and_nothing_else() -> None:
-    scarf, ears = bear().gdfs
-    moved = torch.cat([scarf.region.members[10:40], torch.arange(len(scarf.region) - 30)]).unique()
-    assert len(moved) == len(scarf.region), "the bear's first splats are not of its scarf"
-    part = replace(scarf, region=replace(scarf.region, members=moved))
-    total = len(bear().scene)
-    found = highlight.highlight_colors(Highlight(0, others=(1, 2)), (scarf, part, ears), total)
-    assert found.shape == (total, 4)
-    found = found[scarf.region.members]
-    assert (np.flatnonzero(found[:, 3]) == np.arange(10, 40)).all()
-    assert (found[10, :3] == (0xFF, 0x3F, 0xA0)).all()
-    assert (highlight.highlight_colors(Highlight(1, others=(0,)), (scarf, part), total)[:, 3] > 0).sum() == 30
-
-
 @pytest.mark.gl
-def test_the_mouse_on_the_line_of_an_overlap_shows_it_in_the_picture() -> None:
+def test_the_mouse_on_the_small_picture_of_a_layer_shows_its_region() -> None:
     scarf = bear().gdfs[0]
     stack = Stack(bear().demo, (scarf, replace(scarf, name="frost")))
     with rig(first_view(stack, 0.5, 0.5), (700, 640), stack=stack) as hand:
@@ -249,10 +235,10 @@ def test_the_mouse_on_the_line_of_an_overlap_shows_it_in_the_picture() -> None:
         hand.move(700 - 300 + 52, HEAD)
         hand.pause(1.0)
         hand.frame(2)
-        assert hand.main_view.work.overlap == 1, "the upper layer's card is the first"
+        assert hand.main_view.work.pointed == ("layer", 1), "the upper layer's card is the first"
         assert np.abs(hand.picture() - before).max() > 60
         hand.move(700 - 300 + 60, TRACK)
         hand.frame(3)
-        assert hand.main_view.work.overlap is None
+        assert hand.main_view.work.pointed is None
         assert (hand.picture() == before).all()
         assert hand.main_view.work.past == saved

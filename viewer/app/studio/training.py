@@ -297,8 +297,6 @@ class JobActions:
             self._app.show(self._app.document)
         if job.status == "done":
             main_view.show_message(f"{task.name} is trained: {task.result}")
-        elif job.status == "elsewhere" and task.result.is_file():
-            main_view.show_message(f"{task.name} was trained in another window: {task.result}")
 
     def leave_scene(self) -> None:
         """There is another scene; what is trained for this one goes on, and its card says for which."""
