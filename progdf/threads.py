@@ -13,7 +13,7 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
-from functools import cache
+from functools import cache, partial
 from typing import TypeVar
 
 import torch
@@ -27,27 +27,20 @@ _stops = threading.local()
 
 
 @contextmanager
-def one_thread() -> Iterator[None]:
-    """Let torch work on one thread meanwhile; also as a decorator."""
-    with _torch_threads(1):
-        yield
-
-
-@contextmanager
-def all_threads() -> Iterator[None]:
-    """Let torch work on as many threads as when the program began: for networks that are baked."""
-    with _torch_threads(MOST_THREADS):
-        yield
-
-
-@contextmanager
 def _torch_threads(count: int) -> Iterator[None]:
     before = torch.get_num_threads()
-    torch.set_num_threads(count)
+    torch.set_num_threads(count or MOST_THREADS)
     try:
         yield
     finally:
         torch.set_num_threads(before)
+
+
+one_thread = partial(_torch_threads, 1)
+"""Let torch work on one thread meanwhile; also as a decorator."""
+
+all_threads = partial(_torch_threads, 0)
+"""Let torch work on as many threads as when the program began: for networks that are baked."""
 
 
 def set_threads(count: int | None) -> None:

@@ -318,8 +318,7 @@ class Solver:
         def look(index: int) -> float:
             view, (drawn, passed) = self.views[index], pull.clamps[index]
             colors = torch.einsum("mb,mbc->mc", view.basis[:, : along.shape[1]], along) * drawn
-            changed = (view.map.picture(colors) * passed).flatten()
-            return float(changed @ changed)
+            return float((view.map.picture(colors) * passed).square().sum())
 
         return sum(map_views(look, range(len(self.views)))) + _inner(along, self._hold(along, ridge))
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, TypeVar
 
 import numpy as np
@@ -81,14 +82,13 @@ class ColorView:
         """
         missing = self.map.picture(colors.clamp_min(0.0))
         passed = torch.empty_like(missing, dtype=torch.bool)
-        pixels = (missing, self.others, target, self.counts[:, 0], passed)
-        squared = _compare(*(tensor.numpy() for tensor in pixels))
+        squared = _compare(*(x.numpy() for x in (missing, self.others, target, self.counts[:, 0], passed)))
         return self.map.gradient(missing), passed, squared
 
     def error(self, offsets: Tensor, target: Tensor, power: float) -> float:
-        """Sum of differences to some power, of colors 0..1. [M,b,3], [h,w,3]"""
+        """Sum of differences to some power, of colors 0..1. [M,b,3], [P,3]"""
         image = self.picture(self.colors(offsets)).clamp(0.0, 1.0)
-        return float(((image - self.pick(target)) * self.counts).abs().pow(power).sum())
+        return float(((image - target) * self.counts).abs().pow(power).sum())
 
     def halves(self) -> tuple[ColorView, ColorView]:
         """The view with every other square of its pixels, and with the others."""
@@ -331,14 +331,17 @@ class Judge:
     views: Sequence[ColorView]
     targets: Sequence[Tensor]  # [h,w,3] each
 
+    @cached_property
+    def _pairs(self) -> list[tuple[ColorView, Tensor]]:
+        return [(view, view.pick(target)) for view, target in zip(self.views, self.targets, strict=True)]
+
     def error(self, offsets: Tensor) -> float:
         """Mean squared difference, with that of the pictures' own rounding. [M,B,3]"""
         return ROUNDING + self.mean(offsets, 2.0)
 
     def mean(self, offsets: Tensor, power: float) -> float:
         """Mean difference to some power. [M,B,3]"""
-        pairs = list(zip(self.views, self.targets, strict=True))
-        total = sum(map_views(lambda pair: pair[0].error(offsets, pair[1], power), pairs))
+        total = sum(map_views(lambda pair: pair[0].error(offsets, pair[1], power), self._pairs))
         return total / max(1, 3 * sum(int(view.counts.sum()) for view in self.views))
 
 
