@@ -193,7 +193,7 @@ def _pyramid(mouse: Mouse) -> tuple[float, float]:
     drawn, began = mouse.engine.renderer._scene.drawn, time.process_time()
     nodes = Pyramid(drawn).nodes
     seconds = time.process_time() - began
-    arrays = (*nodes.gaussians, nodes.colors, nodes.spreads, nodes.order)
+    arrays = nodes.means, nodes.shapes, nodes.order
     held = sum(tensor.numel() * tensor.element_size() for tensor in drawn.tensors)
     return seconds, sum(array.nbytes for array in arrays) / held
 

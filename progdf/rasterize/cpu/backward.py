@@ -30,6 +30,7 @@ from .forward import (
     dot,
     fill_basis,
     footprint,
+    quat_of,
     row_times,
     times,
     vec,
@@ -242,19 +243,12 @@ def project_backward(
             _set(gradients.colors[i], 0, by_rgb)
         else:
             by_ray = shade_backward(
-                i,
-                scene.colors,
-                camera.degree,
-                mean,
-                eye,
-                by_rgb,
-                scratch.basis,
-                scratch.slopes,
+                i, scene.colors, camera.degree, mean, eye, by_rgb, scratch.basis, scratch.slopes,
                 gradients.colors,
-            )
+            )  # fmt: skip
         g = (total[3], total[4], total[5], total[6], total[7], total[8])
         gradients.opacities[i] = g[0] / np.float64(scene.opacities[i])
-        seen = footprint(camera, scene, i)
+        seen = footprint(camera, mean, scale, quat_of(scene.quats, i))
         grad_px, grad_py, d0, d1 = _axes_gradient(seen, g, camera.antialiased)
         _set(gradients.scales, i, blend2(1.0, times(d0, seen.turned0), 1.0, times(d1, seen.turned1)))
         d0, d1 = times(d0, scale), times(d1, scale)

@@ -22,6 +22,7 @@ from .jit import Number, kernel, prefetch
 
 Array = NDArray[Any]
 Vec = tuple[float, float, float]
+Quat = tuple[float, float, float, float]
 
 TILE_W, TILE_H = 64, 8
 """Pixels of a tile. Wide: a row of a tile is what the pixel loops vectorize over."""
@@ -87,7 +88,7 @@ class Footprint(NamedTuple):
     tan_y: float
     free_x: bool  # whether it was inside the limits
     free_y: bool
-    quat: tuple[float, float, float, float]  # unit, wxyz
+    quat: Quat  # unit, wxyz
     inv_length: float  # 1 / length of the quaternion as given; 0 where it is replaced by the identity
     rotation: tuple[Vec, Vec, Vec]  # rows
     a0: Vec  # rows of Jacobian · world → camera
@@ -190,6 +191,12 @@ def vec(rows: Array, i: int) -> Vec:
 
 
 @kernel(inline=True)
+def quat_of(rows: Array, i: int) -> Quat:
+    """Row i of an [N,4] array."""
+    return np.float64(rows[i, 0]), np.float64(rows[i, 1]), np.float64(rows[i, 2]), np.float64(rows[i, 3])
+
+
+@kernel(inline=True)
 def camera_center(camera: Pinhole) -> Vec:
     """−RᵀT"""
     turned = row_times(camera.shift, camera.rows)
@@ -217,9 +224,8 @@ def rotation_rows(w: float, x: float, y: float, z: float) -> tuple[Vec, Vec, Vec
 
 
 @kernel(contract=True, inline=True)
-def footprint(camera: Pinhole, scene: Scene, i: int) -> Footprint:
-    """Project Gaussian i, which is in front of the camera."""
-    mean, scale = vec(scene.means, i), vec(scene.scales, i)
+def footprint(camera: Pinhole, mean: Vec, scale: Vec, quat: Quat) -> Footprint:
+    """Project a Gaussian that is in front of the camera."""
     x, y = dot(camera.rows[0], mean) + camera.shift[0], dot(camera.rows[1], mean) + camera.shift[1]
     inv_z = 1.0 / (dot(camera.rows[2], mean) + camera.shift[2])
     ratio_x, ratio_y = x * inv_z, y * inv_z
@@ -228,10 +234,7 @@ def footprint(camera: Pinhole, scene: Scene, i: int) -> Footprint:
     jx, jy = camera.fx * inv_z, camera.fy * inv_z
     a0 = blend2(jx, camera.rows[0], -jx * tan_x, camera.rows[2])
     a1 = blend2(jy, camera.rows[1], -jy * tan_y, camera.rows[2])
-    qw, qx, qy, qz, inv_length = unit_quat(
-        np.float64(scene.quats[i, 0]), np.float64(scene.quats[i, 1]),
-        np.float64(scene.quats[i, 2]), np.float64(scene.quats[i, 3]),
-    )  # fmt: skip
+    qw, qx, qy, qz, inv_length = unit_quat(quat[0], quat[1], quat[2], quat[3])
     rotation = rotation_rows(qw, qx, qy, qz)
     turned0, turned1 = row_times(a0, rotation), row_times(a1, rotation)
     p0, p1 = times(turned0, scale), times(turned1, scale)
@@ -316,7 +319,7 @@ def project(begin: int, end: int, scene: Scene, camera: Pinhole, splats: Splats,
         out_x, out_y = max(max(x0 - px, px - x1), 0.0), max(max(y0 - py, py - y1), 0.0)
         if not (usable and out_x * out_x <= wide2 and out_y * out_y <= high2):
             continue
-        seen = footprint(camera, scene, i)
+        seen = footprint(camera, vec(scene.means, i), vec(scene.scales, i), quat_of(scene.quats, i))
         opacity = np.float64(scene.opacities[i])
         if camera.antialiased:
             opacity = opacity * math.sqrt(max(ANTIALIAS_FLOOR, seen.det0 / seen.det))

@@ -38,13 +38,16 @@ from progdf.threads import run_chunks
 from .engine import make_pinhole, share_gaussians
 from .forward import (
     Pinhole,
+    Quat,
     Scene,
+    Vec,
     camera_center,
     cross,
     dot,
     extents,
     footprint,
     largest_extents,
+    quat_of,
     rotation_rows,
     shade_splat,
     times,
@@ -85,6 +88,11 @@ LONGEST, DENSITY, WEIGHT, POINTS, LOSS = range(3, 8)
 drawn; Σ opacity · area of what is below, world units², 0 for nothing; Σ opacity; the spread of its centers,
 world units, times 1 and that of its colors, in coefficients of band 0."""
 
+SCALES, SPREAD, CONTRAST, COLORS = 4, 7, 8, 9
+"""Columns of a node in 16 bits after its rotation, wxyz / 32767: its scales, of the largest / 65535; the
+spreads of centers and of colors (roots of summed variances); and colors, band by band. All but rotation and
+scales are upper halves of float32: errors of .2 %."""
+
 _ONE = int(np.float32(1.0).view(np.int32))
 _SLICE_SHIFT = 19  # of a float's bits: sixteen slices for a factor of two
 _TOP = 5  # levels of which each node is a chunk of its own
@@ -100,13 +108,10 @@ class Nodes(NamedTuple):
     """The tree, level after level: node i has the halves 2i + 1 and 2i + 2, and leaf l of L = 2^levels the
     rows order[l·N // L : (l + 1)·N // L]."""
 
-    # what stands for each node, but for colors: opacities as densities, beyond 1 too; means with the columns
-    # above, so that a cut touches one line of the cache for two nodes. [2L-1, …]
-    gaussians: Scene
-    # these two as the upper halves of float32: errors of .2 %, a fifth less memory
-    colors: Array  # [2L-1,K,3] uint16
-    # roots of the summed variances of the centers below, world units, and of their band 0. [2L-1,2] uint16
-    spreads: Array
+    # means with the columns above: all that a cut looks at
+    means: Array  # [2L-1,8] float32
+    shapes: Array  # the columns of 16 bits. [2L-1,9+3K] uint16
+    quats: Array  # the first of these, as numbers with a sign. [2L-1,4] int16
     order: Array  # rows of the scene. [N] int32
     levels: int
 
@@ -125,10 +130,9 @@ class Pyramid:
         levels = max((count // LEAF).bit_length() - 1, 0)
         order = _sort(self.scene.means, levels)
         total = (2 << levels) - 1
-        means, quats, scales = (np.zeros((total, width), np.float32) for width in (LOSS + 1, 4, 3))
-        merged = Scene(means, quats, scales, np.zeros(total, np.float32), self.scene.colors[:0])
-        colors = np.zeros((total, *self.scene.colors.shape[1:]), np.uint16)
-        self.nodes = Nodes(merged, colors, np.zeros((total, 2), np.uint16), order, levels)
+        shapes = np.zeros((total, COLORS + 3 * self.scene.colors.shape[1]), np.uint16)
+        means, quats = np.zeros((total, LOSS + 1), np.float32), shapes[:, :SCALES].view(np.int16)
+        self.nodes = Nodes(means, shapes, quats, order, levels)
         self.limit = 1.0  # of what a node may lose, pixels²: where the last search ended
         self.finest = FINEST  # the least one that it ends at
         self._places: Array | None = None  # of each row in the order, once one is asked for. [N] int32
@@ -180,7 +184,7 @@ class Pyramid:
         for _ in range(_TRIALS):
             depths = np.zeros(shape, np.float32)
             coarse = self._cut(view, self.limit * COARSER, dilation, np.zeros(1, np.float32))
-            _add_depths(coarse, self.scene, self.nodes.gaussians, view, dilation, depths.reshape(-1))
+            _add_depths(coarse, self.nodes, view, dilation, depths.reshape(-1))
             _sum_depths(depths)
             picks = self._cut(view, self.limit, dilation, depths.reshape(-1))
             if len(picks) > budget:
@@ -275,17 +279,21 @@ def _select(points: Array, order: Array, axis: int, begin: int, end: int, middle
 
 
 @kernel(contract=True, inline=True)
-def _two_largest(scene: Scene, i: int) -> tuple[float, float]:
-    a, b, c = vec(scene.scales, i)
-    a, b, c = abs(a), abs(b), abs(c)
+def _two_largest(scale: Vec) -> tuple[float, float]:
+    a, b, c = abs(scale[0]), abs(scale[1]), abs(scale[2])
     return max(a, max(b, c)), max(min(a, b), min(max(a, b), c))
+
+
+@kernel(inline=True)
+def _roots(a: float, b: float, c: float) -> Vec:
+    return math.sqrt(max(a, 0.0)), math.sqrt(max(b, 0.0)), math.sqrt(max(c, 0.0))
 
 
 @kernel(contract=True, inline=True)
 def _weight(scene: Scene, i: int) -> float:
     """Opacity times area; 0 for one that cannot be drawn."""
     mean, opacity = vec(scene.means, i), np.float64(scene.opacities[i])
-    longest, middle = _two_largest(scene, i)
+    longest, middle = _two_largest(vec(scene.scales, i))
     weight = opacity * longest * middle
     drawn = opacity >= ALPHA_MIN and abs(mean[0]) + abs(mean[1]) + abs(mean[2]) < np.inf and weight < _MOST
     return max(weight, _LEAST) if drawn else 0.0
@@ -297,65 +305,61 @@ def _merge(
     matrix: Array, quat: Array, colors: Array,
 ) -> None:  # fmt: skip
     """Merge nodes indices[begin … end − 1] of a level of what is right below them; at last, scratch."""
-    out, count, leaf = nodes.gaussians, nodes.order.shape[0], level == nodes.levels
-    below = scene if leaf else out
+    means, shapes, count, leaf = nodes.means, nodes.shapes, nodes.order.shape[0], level == nodes.levels
     for at in range(begin, end):
         me = (1 << level) - 1 + indices[at]
         first, last = 2 * me + 1, 2 * me + 3
         if leaf:
             first, last = (indices[at] * count) >> level, ((indices[at] + 1) * count) >> level
-        total = points = square = x = y = z = own = 0.0
+        total = points = square = x = y = z = between = 0.0
         sound = True
         colors[:] = 0.0
         for k in range(first, last):
             i = nodes.order[k] if leaf else k
             if leaf:  # the rows of neighbors lie far apart, the leaves that change together do not
-                ahead = nodes.order[min(k + _AHEAD, count - 1)]
-                prefetch(scene.means, ahead)
-                prefetch(scene.scales, ahead)
-                prefetch(scene.opacities, ahead)
-                prefetch(scene.colors, ahead)
-            weight = _weight(scene, i) if leaf else np.float64(out.means[i, WEIGHT])
-            sound = sound and (weight > 0.0 if leaf else out.means[i, DENSITY] > 0.0)
+                _fetch(~nodes.order[min(k + _AHEAD, count - 1)], scene, nodes, not colors_only)
+            weight = _weight(scene, i) if leaf else np.float64(means[i, WEIGHT])
+            sound = sound and (weight > 0.0 if leaf else means[i, DENSITY] > 0.0)
             if weight > 0.0:
+                mean = vec(scene.means, i) if leaf else vec(means, i)
                 total += weight
-                points += np.float64(scene.opacities[i] if leaf else out.means[i, POINTS])
-                x += weight * below.means[i, 0]
-                y += weight * below.means[i, 1]
-                z += weight * below.means[i, 2]
-                square += 0.0 if leaf else weight * _unpack(nodes.spreads[i, 1]) ** 2
+                points += np.float64(scene.opacities[i] if leaf else means[i, POINTS])
+                x, y, z = x + weight * mean[0], y + weight * mean[1], z + weight * mean[2]
+                square += 0.0 if leaf else weight * _unpack(shapes[i, CONTRAST]) ** 2
                 for band in range(colors.shape[0]):
                     for c in range(3):
-                        color = scene.colors[i, band, c] if leaf else _unpack(nodes.colors[i, band, c])
+                        color = _color(i, leaf, band, c, scene, nodes)
                         colors[band, c] += weight * color
                         square += weight * color * color if band == 0 else 0.0
-        share, mine = 1.0 / max(total, _LEAST), out.means[me]
+        share, mine = 1.0 / max(total, _LEAST), means[me]
         for band in range(colors.shape[0]):
             for c in range(3):
                 colors[band, c] *= share
-                nodes.colors[me, band, c] = _pack(colors[band, c])
-        nodes.spreads[me, 1] = _pack(math.sqrt(max(square * share - dot(colors[0], colors[0]), 0.0)))
+                shapes[me, COLORS + 3 * band + c] = _pack(colors[band, c])
+        shapes[me, CONTRAST] = _pack(math.sqrt(max(square * share - dot(colors[0], colors[0]), 0.0)))
         if not colors_only:
             x, y, z = x * share, y * share, z * share
             matrix[:] = 0.0
             for k in range(first, last):
                 i = nodes.order[k] if leaf else k
-                weight = (_weight(scene, i) if leaf else np.float64(out.means[i, WEIGHT])) * share
+                weight = (_weight(scene, i) if leaf else np.float64(means[i, WEIGHT])) * share
                 if weight > 0.0:
-                    own += weight * _add_moments(below, i, weight, (x, y, z), matrix)
-                    own -= 0.0 if leaf else weight * _unpack(nodes.spreads[i, 0]) ** 2
-            between = matrix[0, 0] + matrix[1, 1] + matrix[2, 2] - own
-            nodes.spreads[me, 0] = _pack(math.sqrt(max(between, 0.0)))
+                    mean, scale, turn = _part(i, leaf, scene, nodes)
+                    off = mean[0] - x, mean[1] - y, mean[2] - z
+                    _add_moments(off, scale, turn, weight, matrix)
+                    between += weight * (dot(off, off) + (0.0 if leaf else _unpack(shapes[i, SPREAD]) ** 2))
+            shapes[me, SPREAD] = _pack(math.sqrt(between))
             _diagonalize(matrix, quat)
             mine[0], mine[1], mine[2], mine[WEIGHT], mine[POINTS] = x, y, z, total, points
             for k in range(4):
-                out.quats[me, k] = quat[k]
+                nodes.quats[me, k] = np.rint(32767.0 * quat[k])
+            sizes = _roots(matrix[0, 0], matrix[1, 1], matrix[2, 2])
+            mine[LONGEST], middle = _two_largest(sizes)
             for k in range(3):
-                out.scales[me, k] = math.sqrt(max(matrix[k, k], 0.0))
-            mine[LONGEST], middle = _two_largest(out, me)
-            out.opacities[me] = total / max(mine[LONGEST] * middle, _LEAST)
-            mine[DENSITY] = out.opacities[me] if sound else -out.opacities[me]
-        mine[LOSS] = _unpack(nodes.spreads[me, 0]) * (1.0 + _unpack(nodes.spreads[me, 1]))
+                shapes[me, SCALES + k] = np.uint16(np.rint(65535.0 * sizes[k] / max(mine[LONGEST], _LEAST)))
+            density = total / max(mine[LONGEST] * middle, _LEAST)
+            mine[DENSITY] = density if sound else -density
+        mine[LOSS] = _unpack(shapes[me, SPREAD]) * (1.0 + _unpack(shapes[me, CONTRAST]))
 
 
 @kernel(inline=True)
@@ -369,23 +373,44 @@ def _unpack(half: Number) -> Number:
     return np.uint32(np.uint32(half) << np.uint32(16)).view(np.float32)
 
 
+@kernel(inline=True)
+def _fetch(pick: int, scene: Scene, nodes: Nodes, turned: bool) -> None:
+    """Have what is known of a pick fetched before it is its turn, its rotation too where it is `turned`."""
+    if pick >= 0:
+        prefetch(nodes.means, pick)
+        prefetch(nodes.shapes, pick)
+    else:
+        prefetch(scene.means, ~pick)
+        prefetch(scene.quats if turned else scene.means, ~pick)
+        prefetch(scene.scales, ~pick)
+        prefetch(scene.opacities, ~pick)
+        prefetch(scene.colors, ~pick)
+
+
+@kernel(inline=True)
+def _part(i: int, is_row: bool, scene: Scene, nodes: Nodes) -> tuple[Vec, Vec, Quat]:
+    """Mean, scales and rotation of a row or a node."""
+    if is_row:
+        return vec(scene.means, i), vec(scene.scales, i), quat_of(scene.quats, i)
+    shape, unit = nodes.shapes[i], nodes.means[i, LONGEST] / 65535.0
+    scale = unit * shape[SCALES], unit * shape[SCALES + 1], unit * shape[SCALES + 2]
+    return vec(nodes.means, i), scale, quat_of(nodes.quats, i)
+
+
+@kernel(inline=True)
+def _color(i: int, is_row: bool, band: int, k: int, scene: Scene, nodes: Nodes) -> Number:
+    return scene.colors[i, band, k] if is_row else _unpack(nodes.shapes[i, COLORS + 3 * band + k])
+
+
 @kernel(contract=True, inline=True)
-def _add_moments(
-    scene: Scene, i: int, weight: float, center: tuple[float, float, float], matrix: Array
-) -> float:
-    """Add a Gaussian's second moments about a center to a matrix; gives the sum of its own variances."""
-    mean, scale = vec(scene.means, i), vec(scene.scales, i)
-    off = mean[0] - center[0], mean[1] - center[1], mean[2] - center[2]
-    qw, qx, qy, qz, _ = unit_quat(
-        np.float64(scene.quats[i, 0]), np.float64(scene.quats[i, 1]),
-        np.float64(scene.quats[i, 2]), np.float64(scene.quats[i, 3]),
-    )  # fmt: skip
+def _add_moments(off: Vec, scale: Vec, quat: Quat, weight: float, matrix: Array) -> None:
+    """Add a Gaussian's second moments about a point to a matrix."""
+    qw, qx, qy, qz, _ = unit_quat(quat[0], quat[1], quat[2], quat[3])
     rotation = rotation_rows(qw, qx, qy, qz)
     turned = times(rotation[0], scale), times(rotation[1], scale), times(rotation[2], scale)
     for row in range(3):
         for column in range(3):
             matrix[row, column] += weight * (dot(turned[row], turned[column]) + off[row] * off[column])
-    return dot(scale, scale)
 
 
 @kernel(contract=True)
@@ -463,11 +488,7 @@ def _walk(
     Returns:
         how many are picked
     """
-    means, focal, first_leaf = (
-        nodes.gaussians.means,
-        math.sqrt(camera.fx * camera.fy),
-        (1 << nodes.levels) - 1,
-    )
+    means, focal, first_leaf = nodes.means, math.sqrt(camera.fx * camera.fy), (1 << nodes.levels) - 1
     count: int = 0
     top = 1
     stack[0] = root
@@ -513,18 +534,21 @@ def _walk(
 
 
 @kernel(contract=True, cache=True)
-def _add_depths(
-    picks: Array, scene: Scene, merged: Scene, camera: Pinhole, dilation: float, depths: Array
-) -> None:
-    """Add the optical depth of each pick to its cell of the flat grid, in which it fills no more than all."""
-    for k in range(picks.size):
-        source, i = (merged, picks[k]) if picks[k] >= 0 else (scene, ~picks[k])
-        usable, x, y, z, _, _ = largest_extents(camera, source, i)
-        if usable and 0.0 <= x <= camera.window[2] and 0.0 <= y <= camera.window[3]:
-            longest, middle = _two_largest(source, i)
+def _add_depths(picks: Array, nodes: Nodes, camera: Pinhole, dilation: float, depths: Array) -> None:
+    """Add the optical depth of each node to its cell of the flat grid, in which it fills no more than all."""
+    for i in picks:
+        density = abs(np.float64(nodes.means[i, DENSITY]))
+        z, longest = (
+            dot(camera.rows[2], vec(nodes.means, i)) + camera.shift[2],
+            np.float64(nodes.means[i, LONGEST]),
+        )
+        x, y, _, _ = extents(camera, vec(nodes.means, i), z, longest, density)
+        inside = 0.0 <= x <= camera.window[2] and 0.0 <= y <= camera.window[3]
+        if z > camera.near and density >= ALPHA_MIN and inside:
             nearer = camera.fx * camera.fy / (z * z)
+            middle = nodes.means[i, WEIGHT] / max(density * longest, _LEAST)
             area = math.sqrt((longest * longest * nearer + dilation) * (middle * middle * nearer + dilation))
-            depth = -math.log(1.0 - min(np.float64(source.opacities[i]), ALPHA_MAX))
+            depth = -math.log(1.0 - min(density, ALPHA_MAX))
             depths[_cell(x, y, z, camera)] += depth * min(2.0 * math.pi * area / (CELL * CELL), 1.0)
 
 
@@ -544,33 +568,32 @@ def _take(
     out: Scene, basis: Array, bands: Array,
 ) -> None:  # fmt: skip
     """Take picks begin … end − 1 as they are drawn; at last, scratch."""
-    eye, merged = camera_center(camera), nodes.gaussians
+    eye = camera_center(camera)
     for at in range(begin, end):
-        source, i = (merged, picks[at]) if picks[at] >= 0 else (scene, ~picks[at])
-        following = picks[min(at + _AHEAD, end - 1)]
-        ahead, row = (merged, following) if following >= 0 else (scene, ~following)
-        prefetch(ahead.means, row)
-        prefetch(ahead.quats, row)
-        prefetch(ahead.scales, row)
-        prefetch(nodes.colors, following)
-        prefetch(scene.colors, ~following)
-        seen = footprint(camera, source, i)
-        density = np.float64(source.opacities[i])  # of a node; more than 1 where several cover each other
+        _fetch(picks[min(at + _AHEAD, end - 1)], scene, nodes, True)
+        merged = picks[at] >= 0
+        i = picks[at] if merged else ~picks[at]
+        mean, scale, quat = _part(i, not merged, scene, nodes)
+        seen = footprint(camera, mean, scale, quat)
         unit = 1.0 / (camera.fx * camera.fy * seen.inv_z * seen.inv_z)  # world units² of a pixel
-        if picks[at] >= 0 and not camera.antialiased:
-            longest, middle = _two_largest(source, i)
-            wide, own = dilation * unit, source.means[i]
-            dilated = math.sqrt((longest * longest + wide) * (middle * middle + wide))
-            density = max(density, (own[WEIGHT] + wide * own[POINTS]) / max(dilated, _LEAST))
-        grow = 1.0 + SWELL * math.log(density) if picks[at] >= 0 and density > 1.0 else 1.0
-        opacity = min(density, ALPHA_MAX) if picks[at] >= 0 else density
+        grow = 1.0
+        if merged:
+            own = nodes.means[i]
+            opacity = abs(float(own[DENSITY]))  # more than 1 where several cover each other
+            if not camera.antialiased:
+                longest, middle = _two_largest(scale)
+                wide = dilation * unit
+                dilated = math.sqrt((longest * longest + wide) * (middle * middle + wide))
+                opacity = max(opacity, (own[WEIGHT] + wide * own[POINTS]) / max(dilated, _LEAST))
+            if opacity > 1.0:
+                grow = 1.0 + SWELL * math.log(opacity)
+            opacity = min(opacity, ALPHA_MAX)
+        else:
+            opacity = float(scene.opacities[i])
         # the coarse picture's dilation instead of the fine one's: off the size, as far as that goes
         more = (dilation - DILATION) * unit
-        a, b, c = vec(source.scales, i)
-        size = (
-            math.sqrt(max(grow * a * a + more, 0.0)), math.sqrt(max(grow * b * b + more, 0.0)),
-            math.sqrt(max(grow * c * c + more, 0.0)),
-        )  # fmt: skip
+        a, b, c = scale
+        size = _roots(grow * a * a + more, grow * b * b + more, grow * c * c + more)
         p0, p1 = times(seen.turned0, size), times(seen.turned1, size)
         normal = cross(p0, p1)
         det0 = grow * grow * seen.det0
@@ -579,15 +602,12 @@ def _take(
         if camera.antialiased:
             opacity *= math.sqrt(max(ANTIALIAS_FLOOR, det0 / fine))
         out.opacities[at, 0] = opacity * math.sqrt(fine / coarse)
-        for k in range(3):
-            out.means[at, k] = source.means[i, k]
+        out.means[at, 0], out.means[at, 1], out.means[at, 2] = mean
         out.scales[at, 0], out.scales[at, 1], out.scales[at, 2] = size
-        for k in range(4):
-            out.quats[at, k] = source.quats[i, k]
-        colors = bands if picks[at] >= 0 else scene.colors[i]
-        for band in range(bands.shape[0] if picks[at] >= 0 else 0):
-            for c in range(3):
-                bands[band, c] = _unpack(nodes.colors[i, band, c])
-        red, green, blue = shade_splat(vec(source.means, i), colors, camera.degree, eye, basis)
+        out.quats[at, 0], out.quats[at, 1], out.quats[at, 2], out.quats[at, 3] = seen.quat
+        for band in range(bands.shape[0]):
+            for k in range(3):
+                bands[band, k] = _color(i, not merged, band, k, scene, nodes)
+        red, green, blue = shade_splat(mean, bands, camera.degree, eye, basis)
         color = out.colors[at]
         color[0], color[1], color[2] = max(red, 0.0), max(green, 0.0), max(blue, 0.0)

@@ -157,9 +157,9 @@ def test_a_moving_picture_follows_sliders_and_highlights(
     assert psnr(torch.from_numpy(after), torch.from_numpy(expected)) > 45.0
     live = slid.renderer._scene if isinstance(slid.renderer, CpuRenderer) else slid.renderer._moving[0]
     pyramid = live._pyramid.result()
-    merged = [array.copy() for array in pyramid.nodes.gaussians]
+    merged = [array.copy() for array in pyramid.nodes[:2]]
     pyramid.refresh(np.arange(len(stack.scene)), colors_only=False)
-    assert all(map(np.array_equal, merged, pyramid.nodes.gaussians)), "nothing was behind"
+    assert all(map(np.array_equal, merged, pyramid.nodes[:2])), "nothing was behind"
     for engine in (slid, afresh):
         engine.release()
 
