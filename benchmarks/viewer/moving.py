@@ -95,6 +95,8 @@ def measure(
     with Mouse(ctx, engine, scene, (), view, size) as mouse:
         build, memory = _pyramid(mouse)
         mouse.grip_picture()
+        mouse.turn(TURN_PX)
+        mouse.wait_sharp()  # the hand's first rest, which tells how fine is fine enough
         turning, processor, beside, db, luminance = [], [], [], math.inf, 0.0
         for step in range(-WARM_UP, steps):
             turning.append(mouse.turn(TURN_PX))

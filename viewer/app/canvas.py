@@ -19,7 +19,6 @@ from viewer.panel.panel import Pictures
 from viewer.pictures.compare import Comparer, draw_labels
 from viewer.pictures.film import Pixels, to_pixels
 from viewer.render import dynamic_resolution, highlight
-from viewer.render.dynamic_resolution import FrameTimings
 from viewer.render.engine import ViewEngine
 from viewer.render.gl_renderer import Image
 from viewer.state.facts import LayerRow
@@ -71,7 +70,7 @@ class Canvas:
     def __init__(self, context: moderngl.Context, engine: ViewEngine, last: Canvas | None = None) -> None:
         self.comparer = Comparer(engine, context)
         self._thumbnails = Thumbnails(context)
-        self.timings = FrameTimings()
+        self.timings = dynamic_resolution.FrameTimings()
         """Of the picture on screen."""
         self.pictures_drawn = 0
         """How many pictures were drawn."""
@@ -144,8 +143,10 @@ class Canvas:
         return dynamic_resolution.next_frame_delay(self._resolution, now)
 
     def awaits_picture(self) -> bool:
-        """Whether a picture is being made that is not done yet."""
-        return self._begun is not None and not self.comparer.prepare(*self._begun)
+        """Whether a picture is being made of which there is nothing new to show yet."""
+        if self._begun is None or self.comparer.prepare(*self._begun):
+            return False
+        return not self.comparer.engine.renderer.has_parts
 
     def image(self, view: ViewState, size: tuple[int, int]) -> Image:
         """The picture as an array, in full; see `Comparer.image`. [H,W,3]"""

@@ -65,9 +65,10 @@ class ScreenCopy:
         self._framebuffer = ctx.framebuffer([self._texture])
         self._screen = np.empty((size[1], size[0], 4), np.uint8)
 
-    def write(self, image: NDArray[np.float32]) -> None:
-        """Take a whole picture. [H,W,3]"""
-        fill_screen(image, self._screen)
+    def write(self, image: NDArray[np.float32], top: int | None = None) -> None:
+        """Take a whole picture, or, as it is, the rows from `top` on. [H,W,3]"""
+        last = self.size[1] - (top or 0)
+        fill_screen(image, self._screen if top is None else self._screen[last - len(image) : last])
         self._texture.write(self._screen, viewport=(self.left, 0, *self.size))
 
     def show(self, framebuffer: moderngl.Framebuffer) -> None:

@@ -100,8 +100,10 @@ def draw(
     display, wide = imgui.get_io().display_size, width(work.layout, ui)
     imgui.set_next_window_pos((display.x - wide, 0.0))
     imgui.set_next_window_size((wide, display.y))
-    still = imgui.WindowFlags_.no_scroll_with_mouse.value
-    imgui.begin("panel", None, FIXED | BEHIND | still | ui.nav_flags("panel"))
+    # the cleared framebuffer is its background: software GL takes a millisecond to fill that once more
+    imgui.get_background_draw_list().push_clip_rect((0.0, 0.0), (display.x - wide, display.y))
+    flags = imgui.WindowFlags_.no_scroll_with_mouse.value | imgui.WindowFlags_.no_background.value
+    imgui.begin("panel", None, FIXED | BEHIND | flags | ui.nav_flags("panel"))
     ui.take_keyboard("panel")
     work = replace(work, layout=_drag_edge(work.layout, ui))
     _title(work, facts, recent, ui, actions)

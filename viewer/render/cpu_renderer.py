@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Iterable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
 
@@ -16,17 +16,19 @@ from numpy.typing import NDArray
 
 from progdf.camera import Camera
 from progdf.gaussians import Gaussians
-from progdf.rasterize import ActivatedGaussians, render
+from progdf.rasterize import ActivatedGaussians, Crop, render
 from progdf.rasterize.screen import fill_screen, lines_behind
 from progdf.threads import stopped_by
 from viewer.camera.view_camera import Vec3
 from viewer.gl.present import ScreenCopy
 
 from .dynamic_resolution import LiveScene
-from .gl_renderer import Renderer
+from .gl_renderer import Image, Size, require_picture
 from .ground_grid import CLEAR, Lines
 
-Image = NDArray[np.float32]
+BAND, MOST_BANDS, LEAST_ROWS = 300_000, 5, 64
+"""Gaussians for which a picture in full is made in one more band, so that some of it shows early and what
+moves has little to wait for; each band costs a look at all of them. Rows of one, nearly."""
 
 
 @dataclass(frozen=True)
@@ -37,13 +39,21 @@ class _Kept:
     through: Image
     camera: Camera
     background: Vec3
+    pixels: int  # of the picture in full that one of its pixels covers, each way
 
-    def shows(self, camera: Camera, background: Vec3) -> bool:
-        return _same(self.camera, self.background, camera, background)
+    def shows(self, camera: Camera, background: Vec3, pixels: int = 1) -> bool:
+        """Whether it is what a camera sees; as a coarse picture where it is drawn with more `pixels`."""
+        mine = self.camera.resize(camera.width, camera.height) if pixels > 1 else self.camera
+        return (
+            (pixels, background) == (self.pixels, self.background)
+            and (camera.width, camera.height) == (mine.width, mine.height)
+            and torch.equal(camera.viewmat, mine.viewmat)
+            and torch.allclose(camera.K, mine.K, rtol=0.01 * (pixels - 1), atol=0.0)
+        )
 
 
 class _Begun:
-    """A picture that is being made by another thread.
+    """A picture that is being made by another thread, band by band.
 
     Args:
         gaussians: what it shows
@@ -51,29 +61,23 @@ class _Begun:
     """
 
     def __init__(self, gaussians: ActivatedGaussians, camera: Camera, background: Vec3) -> None:
-        self._camera, self._background = camera, background
-        self._stop, self._ms = threading.Event(), 0.0
-        self._found: Future[tuple[Image, Image]] = _worker().submit(self._draw, gaussians)
+        size, self.stop = (camera.height, camera.width), threading.Event()
+        image, through = np.empty((*size, 3), np.float32), np.empty(size, np.float32)
+        self.picture = _Kept(image, through, camera, background, 1)
+        self.bands: list[tuple[int, int]] = []  # that are done: first row, and one past the last
+        self.drawn = _worker().submit(self._draw, gaussians)
 
-    def shows(self, camera: Camera, background: Vec3) -> bool:
-        return _same(self._camera, self._background, camera, background)
-
-    def done(self) -> bool:
-        return self._found.done()
-
-    def result(self) -> tuple[tuple[Image, Image], float]:
-        """The picture, as `_draw`, waited for, and the milliseconds it took."""
-        return self._found.result(), self._ms
-
-    def drop(self) -> None:
-        self._stop.set()
-
-    def _draw(self, gaussians: ActivatedGaussians) -> tuple[Image, Image]:
-        began = time.perf_counter()
-        with stopped_by(self._stop):
-            picture = _draw(gaussians, self._camera, self._background)
-        self._ms = 1e3 * (time.perf_counter() - began)
-        return picture
+    def _draw(self, gaussians: ActivatedGaussians) -> float:
+        """Gives the milliseconds it took."""
+        began, (height, width) = time.perf_counter(), self.picture.through.shape
+        count = min(1 + len(gaussians.means) // BAND, MOST_BANDS, -(-height // LEAST_ROWS))
+        bands = [(height * k // count, height * (k + 1) // count) for k in range(count)]
+        with stopped_by(self.stop):
+            for top, end in sorted(bands, key=lambda band: abs(sum(band) - height)):  # the middle first
+                part = _draw(gaussians, self.picture.camera, self.picture.background, (0, top, width, end))
+                self.picture.image[top:end], self.picture.through[top:end] = part
+                self.bands.append((top, end))
+        return 1e3 * (time.perf_counter() - began)
 
 
 class CpuRenderer:
@@ -88,6 +92,7 @@ class CpuRenderer:
     def __init__(self, ctx: moderngl.Context | None = None) -> None:
         self._ctx = ctx
         self._copy: ScreenCopy | None = None
+        self._bands = 0  # of what was begun that the copy shows
         self._stale = True  # whether the copy is behind the picture
         self._kept: _Kept | None = None
         self._grid: Lines | None = None  # what the copy shows of it
@@ -111,7 +116,7 @@ class CpuRenderer:
         self._scene.update(scene, attributes, rows)
 
     def highlight(self, rows: NDArray[np.int64], highlights: NDArray[np.uint8]) -> None:
-        """See `Renderer.highlight`."""
+        """See `GlRenderer.highlight`."""
         self._drop()
         self._changed = self._changed or len(rows) > 0
         self._scene.highlight(rows, highlights)
@@ -119,65 +124,80 @@ class CpuRenderer:
     def draw(self, camera: Camera, background: Vec3, order: NDArray[np.uint32], pixels: int = 1) -> None:
         """Make the picture; `order` is not used, the rasterizer sorts by itself. With more `pixels` than one
         it has fewer Gaussians."""
-        begun, self.begun_ms, picture = self._begun, 0.0, None
+        begun, last, self.begun_ms, picture = self._begun, self._kept, 0.0, None
         if pixels > 1:
             picture = self._scene.draw_fewer(lambda fewer: _draw(fewer, camera, background), camera, pixels)
-        elif begun is not None and begun.shows(camera, background):
-            picture, self.begun_ms = begun.result()
+        elif begun is not None and begun.picture.shows(camera, background):
+            self.begun_ms = begun.drawn.result()
+            picture = begun.picture.image, begun.picture.through
         picture = picture or _draw(self._scene.drawn, camera, background)
+        if pixels == 1 and last is not None and self._stands_for(camera, background):
+            self._scene.measure(_error(last.image, picture[0]))
         self._drop()
-        self._kept, self._stale, self._changed = _Kept(*picture, camera, background), True, pixels > 1
+        self._kept, self._stale, self._changed = _Kept(*picture, camera, background, pixels), True, False
 
     def prepare(self, camera: Camera, background: Vec3) -> bool:
-        """See `Renderer.prepare`."""
+        """See `GlRenderer.prepare`."""
         if self._kept is not None and not self._changed and self._kept.shows(camera, background):
             return True
-        if self._begun is None or not self._begun.shows(camera, background):
+        if self._begun is None or not self._begun.picture.shows(camera, background):
             self._drop()
             self._begun = _Begun(self._scene.drawn, camera, background)
-        return self._begun.done()
+        return self._begun.drawn.done()
 
     def _drop(self) -> None:
         if self._begun is not None:
-            self._begun.drop()
+            self._begun.stop.set()
             self._begun = None
 
-    def follow(self, last: Renderer) -> bool:
-        """See `Renderer.follow`."""
+    def follow(self, last: object) -> bool:
+        """See `GlRenderer.follow`."""
         if isinstance(last, CpuRenderer) and last._kept is not None:
             self._kept, self._stale, self._changed = last._kept, True, True
         return self._kept is not None
 
     def pixels(self) -> Image:
         """The picture, upper row first, not clamped; it stays as it is when the next one is drawn. [H,W,3]"""
-        return self._picture().image
+        return require_picture(self._kept).image
 
     def show(
-        self,
-        framebuffer: moderngl.Framebuffer,
-        size: tuple[int, int] | None = None,
-        left: int = 0,
-        grid: Lines | None = None,
+        self, screen: moderngl.Framebuffer, size: Size, left: int = 0, grid: Lines | None = None
     ) -> None:
-        """See `Renderer.show`."""
+        """See `GlRenderer.show`."""
         assert self._ctx is not None, "nothing to show on without a context"
-        picture = self._picture()
-        image = picture.image
-        size = size or (image.shape[1], image.shape[0])
+        picture, begun = require_picture(self._kept), self._begun
         if self._copy is None or (self._copy.size, self._copy.left) != (size, left):
             if self._copy is not None:
                 self._copy.release()
             self._copy, self._stale = ScreenCopy(self._ctx, size, left), True
-        if grid is not self._grid:
-            self._grid, self._stale = grid, True
-        if self._stale and grid is None:
-            self._copy.write(image)
-        elif self._stale and grid is not None:  # cheaper than another picture, or another pass of software GL
-            lines = grid.view(np.float32).reshape(len(grid), -1)
-            with lines_behind(image, picture.through, lines, CLEAR):
-                self._copy.write(image)
-        self._stale = False
-        self._copy.show(framebuffer)
+        lines = (
+            np.zeros((0, 14), np.float32) if grid is None else grid.view(np.float32).reshape(len(grid), -1)
+        )
+        if self._stale or grid is not self._grid:
+            self._stale, self._grid, self._bands = False, grid, 0
+            with lines_behind(picture.image, picture.through, lines, CLEAR):
+                self._copy.write(picture.image)
+        while begun is not None and self.has_parts:
+            top, end = begun.bands[self._bands]
+            image, through = begun.picture.image[top:end], begun.picture.through[top:end]
+            here = lines * ([picture.pixels] * 4 + [1] * 10) - ([0, top] * 2 + [0] * 10)
+            with lines_behind(image, through, here.astype(np.float32), CLEAR):
+                self._copy.write(image, top)
+            self._bands += 1
+        self._copy.show(screen)
+
+    @property
+    def has_parts(self) -> bool:
+        """See `GlRenderer.has_parts`."""
+        begun = self._begun
+        if begun is None or len(begun.bands) <= self._bands:
+            return False
+        return self._stands_for(begun.picture.camera, begun.picture.background)
+
+    def _stands_for(self, camera: Camera, background: Vec3) -> bool:
+        """Whether the last picture is a coarse one of what a camera sees."""
+        kept = None if self._changed else self._kept
+        return kept is not None and kept.pixels > 1 and kept.shows(camera, background, kept.pixels)
 
     def release(self) -> None:
         """Give back what it holds."""
@@ -185,27 +205,21 @@ class CpuRenderer:
         if self._copy is not None:
             self._copy.release()
 
-    def _picture(self) -> _Kept:
-        if self._kept is None:
-            raise ValueError("there is no picture yet; draw first")
-        return self._kept
 
-
-def _draw(gaussians: ActivatedGaussians, camera: Camera, background: Vec3) -> tuple[Image, Image]:
+def _draw(
+    gaussians: ActivatedGaussians, camera: Camera, background: Vec3, crop: Crop | None = None
+) -> tuple[Image, Image]:
     """The picture and what shines through it."""
     with torch.no_grad():
-        rendered = render(gaussians, camera, background)
+        rendered = render(gaussians, camera, background, crop=crop)
     return rendered.image.numpy(), rendered.transmittance.numpy()
 
 
-def _same(camera: Camera, background: Vec3, other: Camera, other_background: Vec3) -> bool:
-    """Whether two cameras take the same picture, on the same background."""
-    return (
-        background == other_background
-        and (camera.width, camera.height) == (other.width, other.height)
-        and torch.equal(camera.viewmat, other.viewmat)
-        and torch.equal(camera.K, other.K)
-    )
+def _error(coarse: Image, full: Image) -> float:
+    """Mean squared difference on the screen, of every eighth row."""
+    screen = np.empty((*full.shape[:2], 4), np.uint8)
+    fill_screen(coarse, screen)
+    return float(np.square(screen[::-8, :, :3] / np.float32(255.0) - full[::8].clip(0.0, 1.0)).mean())
 
 
 @cache

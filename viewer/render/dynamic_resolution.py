@@ -35,9 +35,12 @@ MOVING_MS = 20.0, 27.0
 """What such a picture shall take, some ms less than its frame; with more or less time, the next one has fewer
 or more Gaussians."""
 
-FINE, FINE_MS = (0.25, 4.0), (7.0, 10.0)
-"""With what a node may lose here, pixels², a picture in motion is fine enough (30 dB and more, see
-docs/experiments.md); it is finer only as far as it takes no longer than this, a sixtieth of a second."""
+FINE, FINE_ERROR = (0.25, 4.0, 64.0), 1e-3
+"""Least, first and largest limit of what a node may lose, pixels². A picture in motion is fine enough with a
+mean squared error like this, 30 dB; the limit for it is measured where the picture in full follows one."""
+
+FINE_MS = 4.5, 6.5
+"""It is finer than that only as far as it takes no longer."""
 
 SLOW_MS = 40.0
 """What a picture may take before "auto" halves its sides: 25 pictures a second."""
@@ -163,13 +166,14 @@ class LiveScene:
         )
         self._scene = scene
         self._highlights: Array | None = None  # rgb and its share, 0..1; None is no highlight. [N,4]
-        self._budget, self._finest = BUDGETS[1], FINE[1]
+        self._budget, self._finest, self._enough = BUDGETS[1], FINE[1], FINE[1]
+        self._limit = 0.0  # of the last picture in motion; 0 while these have all Gaussians
         self._pyramid: Future[Pyramid] | None = None
         # what the pyramid lacks of each row: nothing, its colors, or more. [N] uint8
         self._behind = np.zeros(len(scene), np.uint8)
 
     def update(self, scene: Gaussians, attributes: Iterable[str], rows: NDArray[np.int64]) -> None:
-        """See `Renderer.update`."""
+        """See `GlRenderer.update`."""
         self._scene, names = scene, tuple(attributes)
         highlighted = self._highlights is not None and any(name in SH for name in names)
         names = tuple(dict.fromkeys((*names, *SH))) if highlighted else names
@@ -183,7 +187,7 @@ class LiveScene:
         self._behind[rows] = np.maximum(self._behind[rows], lacks)
 
     def highlight(self, rows: NDArray[np.int64], highlights: NDArray[np.uint8]) -> None:
-        """See `Renderer.highlight`."""
+        """See `GlRenderer.highlight`."""
         if self._highlights is None:
             self._highlights = np.zeros((len(self.drawn.means), 4), np.float32)
         hidden = self._highlights[rows, 3] == 1.0
@@ -215,14 +219,21 @@ class LiveScene:
                 merged.refresh(rows, colors_only=lacks == 1)
         self._behind[:], merged.finest = 0, self._finest
         fewer = merged.simplify(camera, self._budget, pixels)
+        self._limit = merged.limit
         picture = draw(fewer)
         taken, (low, high) = 1e3 * (time.perf_counter() - started), MOVING_MS
         if taken > high or (taken < low and len(fewer.means) > 0.8 * self._budget):
             budget = int(self._budget * (0.85 if taken > high else 1.15))
             self._budget = min(max(budget, BUDGETS[0]), BUDGETS[2])
         finest = self._finest * (1.15 if taken > FINE_MS[1] else 0.85 if taken < FINE_MS[0] else 1.0)
-        self._finest = min(max(finest, FINE[0]), FINE[1])
+        self._finest = min(max(finest, FINE[0]), self._enough)
         return picture
+
+    def measure(self, error: float) -> None:
+        """Learn what a node may lose here. error: of the last picture in motion, mean squared"""
+        # it grows with the limit's power of .6 to 1.5 (docs/experiments.md, The viewer)
+        enough = self._limit * (FINE_ERROR / max(error, 1e-9)) ** (1 / 1.5)
+        self._enough = min(max(enough, FINE[0]), FINE[2]) if self._limit else self._enough
 
     def _write(self, scene: Gaussians, name: str, part: slice) -> None:
         means, quats, scales, opacities, sh = (tensor.numpy() for tensor in self.drawn.tensors)

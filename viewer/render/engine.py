@@ -28,7 +28,7 @@ from viewer.state.view_state import ViewState
 
 from .cpu_renderer import CpuRenderer
 from .dynamic_resolution import FrameTimings
-from .gl_renderer import GlRenderer, Image, Renderer, back_to_front, is_software
+from .gl_renderer import GlRenderer, Image, back_to_front, is_software
 from .ground_grid import GroundPlane, Lines, grid_lines, ground_plane
 from .highlight import Highlight, highlight_colors
 
@@ -98,11 +98,9 @@ class ViewEngine:
         self._ground: tuple[Vec3, GroundPlane] | None = None  # the plane that is the ground where this is up
         self._highlighted: tuple[Highlight, NDArray[np.uint8]] | None = None  # and its colors. [N,4]
         self.composer = Composer(scene, self.gdfs)
-        self.renderer: Renderer
-        if ctx is None or self.draws_with == "cpu":
-            self.renderer = CpuRenderer(ctx)
-        else:
-            self.renderer = GlRenderer(ctx)
+        self.renderer: CpuRenderer | GlRenderer = (
+            CpuRenderer(ctx) if ctx is None or self.draws_with == "cpu" else GlRenderer(ctx)
+        )
         self.renderer.upload(self.composer.gaussians)
 
     def needs_draw(self, view: ViewState, size: tuple[int, int], camera: Camera | None = None) -> bool:
@@ -164,7 +162,7 @@ class ViewEngine:
             view: what to draw
             size: width, height in pixels
             camera: takes the place of the view's own camera and of `size`
-            pixels: of the picture at rest that one of this one stands for, see `Renderer.draw`
+            pixels: of the picture at rest that one of this one stands for, see `GlRenderer.draw`
 
         Returns:
             [H,W,3] float32

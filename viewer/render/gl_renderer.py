@@ -1,9 +1,9 @@
-"""Drawing with OpenGL: a context without a window, the depth sort, and what every renderer does."""
+"""Drawing with OpenGL: a context without a window, and the depth sort."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import moderngl
 import numpy as np
@@ -24,6 +24,7 @@ from .dynamic_resolution import LiveScene
 from .ground_grid import Lines
 
 Image = NDArray[np.float32]
+Size = tuple[int, int]  # width and height, pixels
 
 _ROOM = 1 << 14  # Gaussians that textures grow by
 _LEAST = 1e-30  # what is taken for zero has a logarithm
@@ -31,70 +32,17 @@ _LEAST = 1e-30  # what is taken for zero has a logarithm
 T = TypeVar("T")
 
 
-class Renderer(Protocol):
-    """Keeps a scene ready for drawing and the last picture of it."""
-
-    wants_order: bool
-    """Whether `draw` uses the order it is given."""
-
-    begun_ms: float
-    """What the last picture took before `draw` was called for it, milliseconds."""
-
-    def upload(self, scene: Gaussians) -> None:
-        """Take a whole scene."""
-
-    def update(self, scene: Gaussians, attributes: Iterable[str], rows: NDArray[np.int64]) -> None:
-        """Take the changed attributes of the changed rows (sorted)."""
-
-    def highlight(self, rows: NDArray[np.int64], highlights: NDArray[np.uint8]) -> None:
-        """Draw Gaussians (sorted) in other colors from now on, whatever becomes of their own.
-
-        Args:
-            highlights: rgb and the share that it takes of a Gaussian's color, 0..255; 0 takes none, 255
-                hides the Gaussian. [R,4]
-        """
-
-    def draw(self, camera: Camera, background: Vec3, order: NDArray[np.uint32], pixels: int = 1) -> None:
-        """Make the picture and wait until it is done.
-
-        Args:
-            order: farthest first, from `back_to_front`
-            pixels: of the picture at rest that one of this one stands for, each way
-        """
-
-    def prepare(self, camera: Camera, background: Vec3) -> bool:
-        """Begin the picture, if making it may take long, without waiting for it; whether `draw` now has it at
-        once. Any other call drops what was begun."""
-
-    def follow(self, last: Renderer) -> bool:
-        """Take over another's picture, to be shown until there is a new one; whether there was one."""
-
-    def pixels(self) -> Image:
-        """The picture, upper row first, not clamped. [H,W,3]"""
-
-    def show(
-        self,
-        framebuffer: moderngl.Framebuffer,
-        size: tuple[int, int] | None = None,
-        left: int = 0,
-        grid: Lines | None = None,
-    ) -> None:
-        """Fill the framebuffer's lower `size` pixels from `left` on with the picture; None: as many as it
-        has.
-
-        Args:
-            grid: lines behind the splats, in pixels of the picture
-        """
-
-    def release(self) -> None:
-        """Give back what it holds."""
-
-
 class GlRenderer:
-    """Draws with OpenGL (see `SplatRenderer`)."""
+    """Keeps a scene ready for drawing and the last picture of it, with OpenGL (see `SplatRenderer`)."""
 
     wants_order = True
+    """Whether `draw` uses the order it is given."""
+
     begun_ms = 0.0
+    """What the last picture took before `draw` was called for it, milliseconds."""
+
+    has_parts = False
+    """Whether `show` would show more of the picture that was begun."""
 
     def __init__(self, ctx: moderngl.Context) -> None:
         self._ctx = ctx
@@ -105,12 +53,14 @@ class GlRenderer:
         self._grid: GridPass | None = None
 
     def upload(self, scene: Gaussians) -> None:
+        """Take a whole scene."""
         self._scene = scene
         self._release_moving()
         self._renderer.upload(scene)
         self._ctx.finish()
 
     def update(self, scene: Gaussians, attributes: Iterable[str], rows: NDArray[np.int64]) -> None:
+        """Take the changed attributes of the changed rows (sorted)."""
         self._scene, names = scene, tuple(attributes)
         self._renderer.update(scene, names, rows)
         if self._moving is not None:
@@ -118,11 +68,23 @@ class GlRenderer:
         self._ctx.finish()
 
     def highlight(self, rows: NDArray[np.int64], highlights: NDArray[np.uint8]) -> None:
+        """Draw Gaussians (sorted) in other colors from now on, whatever becomes of their own.
+
+        Args:
+            highlights: rgb and the share that it takes of a Gaussian's color, 0..255; 0 takes none, 255
+                hides the Gaussian. [R,4]
+        """
         self._renderer.highlight(rows, highlights)
         if self._moving is not None:
             self._moving[0].highlight(rows, highlights)
 
     def draw(self, camera: Camera, background: Vec3, order: NDArray[np.uint32], pixels: int = 1) -> None:
+        """Make the picture and wait until it is done.
+
+        Args:
+            order: farthest first, from `back_to_front`
+            pixels: of the picture at rest that one of this one stands for, each way
+        """
         self._picture = self._draw_fewer(camera, background, pixels) if pixels > 1 else None
         if self._picture is None:
             self._renderer.set_order(
@@ -149,30 +111,36 @@ class GlRenderer:
         return live.draw_fewer(draw, camera, pixels)
 
     def prepare(self, camera: Camera, background: Vec3) -> bool:
+        """Begin the picture, if making it may take long, without waiting for it; whether `draw` now has it at
+        once. Any other call drops what was begun."""
         return True
 
-    def follow(self, last: Renderer) -> bool:
+    def follow(self, last: object) -> bool:
+        """Take over another's picture, to be shown until there is a new one; whether there was one."""
         return False
 
     def pixels(self) -> Image:
-        picture = _require_picture(self._picture)
+        """The picture, upper row first, not clamped. [H,W,3]"""
+        picture = require_picture(self._picture)
         rgba = np.frombuffer(picture.read(), np.float32).reshape(picture.height, picture.width, 4)
         return np.ascontiguousarray(rgba[..., :3])
 
     def show(
-        self,
-        framebuffer: moderngl.Framebuffer,
-        size: tuple[int, int] | None = None,
-        left: int = 0,
-        grid: Lines | None = None,
+        self, screen: moderngl.Framebuffer, size: Size, left: int = 0, grid: Lines | None = None
     ) -> None:
-        picture = _require_picture(self._picture)
-        self._presenter.show(picture, framebuffer, size, left)
+        """Fill the framebuffer's lower `size` pixels from `left` on with the picture.
+
+        Args:
+            grid: lines behind the splats, in pixels of the picture
+        """
+        picture = require_picture(self._picture)
+        self._presenter.show(picture, screen, size, left)
         if grid is not None:
             self._grid = self._grid or GridPass(self._ctx)
-            self._grid.draw(grid, picture, framebuffer, size or picture.size, left)
+            self._grid.draw(grid, picture, screen, size, left)
 
     def release(self) -> None:
+        """Give back what it holds."""
         self._presenter.release()
         self._renderer.release()
         self._release_moving()
@@ -197,7 +165,7 @@ def _to_raw(fewer: ActivatedGaussians) -> Gaussians:
     )  # fmt: skip
 
 
-def _require_picture(thing: T | None) -> T:
+def require_picture(thing: T | None) -> T:
     if thing is None:
         raise ValueError("there is no picture yet; draw first")
     return thing

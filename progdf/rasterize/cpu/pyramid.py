@@ -61,11 +61,9 @@ Array = NDArray[Any]
 LEAF = 4
 """Gaussians of a leaf at least; fewer cost memory, more lose .7 dB (docs/experiments.md, The viewer)."""
 
-CELL = 8
-"""Side of a cell of the grid in which optical depth is added up, pixels."""
-
-SLICES = 224
-"""Of a cell's depth from the near plane on, sixteen to a factor of two."""
+CELL, SLICES = 8, 224
+"""Side of a cell of the grid in which optical depth is added up, pixels; the slices of its depth from the
+near plane on, sixteen to a factor of two."""
 
 DARKEST = 3.0
 """Optical depth beyond which it makes no more difference: cells know nothing of gaps."""
@@ -98,8 +96,7 @@ _SLICE_SHIFT = 19  # of a float's bits: sixteen slices for a factor of two
 _TOP = 5  # levels of which each node is a chunk of its own
 _AHEAD = 8  # rows that are fetched before it is their turn: they lie far apart
 _DARK = math.exp(0.5 * DARKEST)  # times the limit, beyond which no darkness brings a loss below it
-_MOST = 1e30  # of a weight
-_LEAST = 1e-30
+_LEAST, _MOST = 1e-30, 1e30  # of a weight
 _TRIALS = 12  # for a limit
 _REACH = 3.0  # standard deviations of a node that are in front of the near plane, or it is not drawn
 
@@ -150,8 +147,7 @@ class Pyramid:
         marks[((self._places[rows].astype(np.int64) + 1 << levels) - 1) // max(count, 1)] = True
         for level in range(levels, -1, -1):
             self._merge(level, np.flatnonzero(marks), colors_only)
-            if level:
-                marks = marks[0::2] | marks[1::2]
+            marks = marks[0::2] | marks[1::2]
 
     def simplify(self, camera: Camera, budget: int, pixels: int = 1) -> ActivatedGaussians:
         """What `render` draws in place of the scene while something moves.
@@ -167,13 +163,12 @@ class Pyramid:
         view, dilation = make_pinhole(RasterView.of(camera, self._gaussians)), DILATION / pixels**2
         picks = self.cut(view, budget, dilation)
         out = Scene(*(np.empty((len(picks), width), np.float32) for width in (3, 4, 3, 1, 3)))
-        share_gaussians(
-            lambda begin, end: _take(
-                begin, end, picks, self.scene, self.nodes, view, dilation, out, np.empty(16),
-                np.empty_like(self.scene.colors, shape=self.scene.colors.shape[1:]),
-            ),
-            len(picks),
-        )  # fmt: skip
+
+        def take(begin: int, end: int) -> None:
+            scratch = np.empty(16), np.empty(self.scene.colors.shape[1:], np.float32)
+            _take(begin, end, picks, self.scene, self.nodes, view, dilation, out, *scratch)
+
+        share_gaussians(take, len(picks))
         means, quats, scales, opacities, rgb = map(torch.from_numpy, out)
         return ActivatedGaussians(means, quats, scales, opacities[:, 0], rgb)
 
@@ -205,23 +200,20 @@ class Pyramid:
         room = -(-len(self.nodes.order) >> top) + 1
 
         def walk(chunk: int) -> Array:
-            picks = np.empty(room, np.int32)
+            picks, stack = np.empty(room, np.int32), np.empty(64, np.int32)
             root = (1 << top) - 1 + chunk
-            stack = np.empty(64, np.int32)
             return picks[: _walk(root, self.scene, self.nodes, view, limit, dilation, depths, stack, picks)]
 
         return np.concatenate(run_chunks(walk, 1 << top))
 
     def _merge(self, level: int, nodes: Array, colors_only: bool = False) -> None:
         """Merge some nodes of a level, counted from its first one, of what is right below them."""
-        bands = self.scene.colors.shape[1]
-        share_gaussians(
-            lambda begin, end: _merge(
-                begin, end, nodes, level, self.scene, self.nodes, colors_only, np.empty((3, 3)), np.empty(4),
-                np.empty((bands, 3)),
-            ),
-            len(nodes),
-        )  # fmt: skip
+
+        def merge(begin: int, end: int) -> None:
+            scratch = np.empty((3, 3)), np.empty(4), np.empty(self.scene.colors.shape[1:])
+            _merge(begin, end, nodes, level, self.scene, self.nodes, colors_only, *scratch)
+
+        share_gaussians(merge, len(nodes))
 
 
 def _sort(means: Array, levels: int) -> Array:
@@ -489,9 +481,7 @@ def _walk(
         how many are picked
     """
     means, focal, first_leaf = nodes.means, math.sqrt(camera.fx * camera.fy), (1 << nodes.levels) - 1
-    count: int = 0
-    top = 1
-    stack[0] = root
+    count, top, stack[0] = 0, 1, root
     while top > 0:
         top -= 1
         i = stack[top]
@@ -538,11 +528,9 @@ def _add_depths(picks: Array, nodes: Nodes, camera: Pinhole, dilation: float, de
     """Add the optical depth of each node to its cell of the flat grid, in which it fills no more than all."""
     for i in picks:
         density = abs(np.float64(nodes.means[i, DENSITY]))
-        z, longest = (
-            dot(camera.rows[2], vec(nodes.means, i)) + camera.shift[2],
-            np.float64(nodes.means[i, LONGEST]),
-        )
-        x, y, _, _ = extents(camera, vec(nodes.means, i), z, longest, density)
+        mean, longest = vec(nodes.means, i), np.float64(nodes.means[i, LONGEST])
+        z = dot(camera.rows[2], mean) + camera.shift[2]
+        x, y, _, _ = extents(camera, mean, z, longest, density)
         inside = 0.0 <= x <= camera.window[2] and 0.0 <= y <= camera.window[3]
         if z > camera.near and density >= ALPHA_MIN and inside:
             nearer = camera.fx * camera.fy / (z * z)
@@ -602,12 +590,10 @@ def _take(
         if camera.antialiased:
             opacity *= math.sqrt(max(ANTIALIAS_FLOOR, det0 / fine))
         out.opacities[at, 0] = opacity * math.sqrt(fine / coarse)
-        out.means[at, 0], out.means[at, 1], out.means[at, 2] = mean
-        out.scales[at, 0], out.scales[at, 1], out.scales[at, 2] = size
         out.quats[at, 0], out.quats[at, 1], out.quats[at, 2], out.quats[at, 3] = seen.quat
         for band in range(bands.shape[0]):
             for k in range(3):
                 bands[band, k] = _color(i, not merged, band, k, scene, nodes)
-        red, green, blue = shade_splat(mean, bands, camera.degree, eye, basis)
-        color = out.colors[at]
-        color[0], color[1], color[2] = max(red, 0.0), max(green, 0.0), max(blue, 0.0)
+        rgb = shade_splat(mean, bands, camera.degree, eye, basis)
+        for k in range(3):
+            out.means[at, k], out.scales[at, k], out.colors[at, k] = mean[k], size[k], max(rgb[k], 0.0)

@@ -187,3 +187,54 @@ def test_a_small_picture_of_a_large_scene_leaves_the_one_in_full_as_it_is(stack:
     full = engine.image(view_of(stack, 0.4, 0.6), SIZE)
     assert not np.array_equal(full, small)
     assert np.array_equal(full, afresh.image(view_of(stack, 0.4, 0.6), SIZE))
+
+
+def test_what_is_enough_is_measured_where_a_picture_in_full_follows_one_in_motion() -> None:
+    scene = bear(6000).gaussians
+    live, camera = dynamic_resolution.LiveScene(scene), to_camera(first_camera(scene), *SIZE)
+    live.measure(1.0)
+    assert live._enough == dynamic_resolution.FINE[1], "there is no pyramid yet"
+    live.begin_pyramid().result()
+    live.draw_fewer(lambda fewer: None, camera, 2)
+    for share in (8.0, 0.5):
+        live.measure(share * dynamic_resolution.FINE_ERROR)
+        assert live._enough == pytest.approx(live._limit / share ** (1 / 1.5))
+    live.measure(0.0)
+    assert live._enough == dynamic_resolution.FINE[2]
+    full = np.full((40, 60, 3), 0.5, np.float32)
+    assert cpu_renderer._error(full[::2, ::2] + np.float32(0.2), full) == pytest.approx(0.04, rel=0.05)
+
+
+@pytest.mark.gl
+@pytest.mark.parametrize("done", [1, 3])
+def test_what_is_done_of_a_picture_shows_before_the_rest(
+    ctx: moderngl.Context, stack: Stack, monkeypatch: pytest.MonkeyPatch, done: int
+) -> None:
+    monkeypatch.setattr(cpu_renderer, "BAND", len(stack.scene) // 2)
+    monkeypatch.setattr(cpu_renderer, "LEAST_ROWS", 40)
+    screen, view = ctx.framebuffer([ctx.texture(SIZE, 4)]), view_of(stack, 0.2, 0.6)
+    view = replace(view, grid=True)
+    engine = ViewEngine(ctx, stack.scene, stack.gdfs, draw="cpu")
+    engine.draw(view, screen, SIZE)
+    full = read_rgb(screen, SIZE)
+    engine.draw(view, screen, SIZE, pixels=2)
+    coarse = read_rgb(screen, SIZE)
+    while not engine.prepare(view, to_camera(view.camera, *SIZE)):
+        pass
+    assert isinstance(engine.renderer, CpuRenderer)
+    assert engine.renderer._begun is not None
+    bands = engine.renderer._begun.bands
+    assert bands == [(40, 80), (0, 40), (80, 120)], "the middle first"
+    del bands[done:]
+    assert engine.renderer.has_parts
+    engine.draw(view, screen, SIZE, pixels=2)
+    assert not engine.renderer.has_parts
+    shown = read_rgb(screen, SIZE)
+    for top, end in bands:
+        coarse[top:end] = full[top:end]
+    # lines of the grid are those of the coarse picture, stretched: where they end may round otherwise
+    assert np.abs(shown.astype(int) - coarse).mean() < 0.02
+    engine.draw(view, screen, SIZE)
+    assert np.array_equal(read_rgb(screen, SIZE), full)
+    screen.release()
+    engine.release()
