@@ -152,18 +152,17 @@ class Widget(anywidget.AnyWidget):
         title: str = "",
         credit: str = "",
         quality: Literal["exact", "compact"] = "compact",
-        max_size: str | None = None,
     ) -> str:
         """Write the page as a file of its own, at the present strengths and camera; what it holds, in a line.
 
         Args:
             path: a .html file
-            title, credit, quality, max_size: see `PageOptions`
+            title, credit, quality: see `PageOptions`
 
         Raises:
             ProgdfError: see `write_page`.
         """
-        options = PageOptions(quality=quality, max_size=max_size, title=title or None, credit=credit)
+        options = PageOptions(quality=quality, title=title or None, credit=credit)
         return write_page(Path(path), self._document, self._present(), (), options)
 
     def _present(self) -> ViewState:

@@ -10,8 +10,6 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Protocol
 
-import numpy as np
-from numpy.typing import NDArray
 from tyro.conf import OmitArgPrefixes
 
 from progdf.cli.info import kind_of
@@ -20,7 +18,6 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
 from progdf.io.session import BUNDLE, unpack_bundle
-from progdf.io.tensors import open_npy
 from progdf.region import Region
 from progdf.scene import UpChoice
 from progdf.scene.regions import check_region, parse_region
@@ -30,7 +27,6 @@ from viewer.files.document import Document
 from viewer.files.web_page import PageOptions
 from viewer.state import layers as stacks
 from viewer.state.facts import describe_applied
-from viewer.state.paint import encode
 from viewer.state.snapshots import SliderSnapshot
 from viewer.state.view_state import OVERSHOOT, LayerState, ViewState
 
@@ -38,7 +34,7 @@ from .stack_options import NO_SCENE, DrawingOptions, StackOptions, Switch, is_nu
 
 _log = logging.getLogger(__name__)
 
-_SAID_BY_SESSION = ("gdfs", "region", "gain", "solo", "paint", "overshoot", "background")
+_SAID_BY_SESSION = ("gdfs", "region", "gain", "solo", "overshoot", "background")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,15 +66,15 @@ class RenderOptions:
     """Move this edit's slider from 0 to 1 and back, or of all in turn: an animation."""
     turntable: Annotated[str | None, word("SECONDS", "a still picture")] = None
     """A film that circles the scene once, at the strengths that are set."""
-    sheet: Annotated[str | None, word("NAME[,NAME2]|N", "one picture")] = None
-    """A contact sheet over this edit's slider, a grid over two sliders, or N pictures of the --timeline."""
+    sheet: Annotated[str | None, word("NAME[,NAME2]", "one picture")] = None
+    """A contact sheet over this edit's slider, or a grid over two sliders."""
     split: Annotated[str | None, word("[X]", "the session's comparison, else none")] = None
     """The original beside the edited picture, which begins at this share of the width (0.5)."""
     difference: Annotated[str | None, word("[AMPLIFY]", "the session's comparison, else none")] = None
     """What differs from the original, amplified (4), with the PSNR."""
     timeline: Annotated[Path | None, word("FILE.json", "a still picture")] = None
     """A film of the keys in this file (Ctrl+K in the window), or in the session: .gif, .mp4, or a folder for
-    .png frames; with --sheet N a contact sheet of N of them."""
+    .png frames."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -251,12 +247,6 @@ def stack_layers(gdfs: Sequence[Gdf], stack: StackOptions, unset: float = 0.0) -
     for name in stack.solo:
         check_edit(name, gdfs, "--solo")
         layers[name] = replace(layers[name], solo=True)
-    for text in stack.paint:
-        name, equals, file = text.partition("=")
-        if not equals or not file:
-            raise ProgdfError(f"--paint {text} has no NAME=FILE; write NAME=WEIGHTS.npy")
-        gdf = gdfs[layers[check_edit(name, gdfs, "--paint")].gdf]
-        layers[name] = replace(layers[name], paint=encode(_read_weights(Path(file), gdf)))
     return tuple(layers.values())
 
 
@@ -289,21 +279,6 @@ def check_edit(name: str, edits: Sequence[Named], option: str) -> str:
         raise ProgdfError(f"{option} {name}: no .gdf file was given; name one after the scene")
     names = f"{'is' if len(edits) == 1 else 'are'} {', '.join(edit.name for edit in edits)}"
     raise ProgdfError(f"{option} {name}: there is no edit of that name; there {names}")
-
-
-def _read_weights(path: Path, gdf: Gdf) -> NDArray[np.float32]:
-    """Weights of the members, from a file that has them or those of the whole scene. [M]"""
-    try:
-        weights = open_npy(path, "weights")
-    except ProgdfError as error:
-        raise ProgdfError(f"--paint: {error}") from None
-    members, count = gdf.region.members.numpy(), gdf.scene.count
-    if weights.shape not in ((len(members),), (count,)):
-        shape, expected = list(weights.shape), " or ".join(f"[{n}]" for n in sorted({len(members), count}))
-        raise ProgdfError(f"--paint: {path} has shape {shape}, expected {expected}")
-    if not ((weights >= 0) & (weights <= 1)).all():
-        raise ProgdfError(f"--paint: {path} has a number outside 0 to 1")
-    return np.asarray(weights if len(weights) == len(members) else weights[members], np.float32)
 
 
 def _parse_gain(text: str, gdfs: Sequence[Gdf]) -> tuple[str, str, float]:

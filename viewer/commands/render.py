@@ -65,9 +65,9 @@ from .stack_options import parse
 DEFAULT_SIZE = (640, 480)
 LARGEST_SIDE = 16_384
 _SAY_EVERY_S = 0.5
-_LONGEST_S = 120.0  # of a turntable
+_LONGEST_S, _SWEEP_S = 120.0, 2.0  # of a turntable; of a slider there and back
 ONE_OF = ("sweep", "sheet", "split", "difference", "timeline", "turntable")
-"""Options that each say what the picture is; only a timeline goes with a sheet."""
+"""Options that each say what the picture is."""
 
 
 def export(argv: Sequence[str]) -> int:
@@ -195,35 +195,37 @@ def render(argv: Sequence[str]) -> int:
     """`progdf render`: one picture, a comparison, a contact sheet, a sweep or a film."""
     options: RenderOptions = parse(RenderOptions, argv, "progdf render")
     _check_output(options)
-    one_moves = options.sweep is not None or (options.sheet is not None and options.timeline is None)
+    films = options.sweep is not None or options.timeline is not None or options.turntable is not None
+    one_moves = options.sweep is not None or options.sheet is not None
     opened = open_stack(options.stack, options.drawing, 0.0 if one_moves else 1.0)
     check_not_an_input(options.out, opened.files)
     scene, gdfs, view = opened.document.scene, opened.document.gdfs, opened.view
     view = replace(view, compare=_comparison(options, view.compare))
-    is_film = options.timeline is not None or options.turntable is not None
-    if options.alpha and (view.compare.mode != "off" or one_moves or is_film):
+    if options.alpha and (view.compare.mode != "off" or one_moves or films):
         raise ProgdfError("--alpha goes with a single picture; leave out comparisons, sheets and films")
     saved = None if opened.session is None else view.camera
     camera = choose_camera(options.viewpoint, scene, gdfs, saved, opened.up)
-    if is_film:
+    swept = _swept_layers(options, opened)
+    if films:
         seen, path = options.viewpoint, options.timeline
-        keys = _turntable(options, opened, camera) if path is None else _keys(path, opened)
+        view = film.with_strengths(view, dict.fromkeys(swept, 0.0))
+        keys = _film(options, opened, view, swept, camera) if path is None else _keys(path, opened)
         moves = path is not None and timeline.camera_at(keys, 0) is not None
         if moves and (seen.camera or seen.orbit or seen.frame):
             raise ProgdfError(f"{path} moves the camera; leave out --camera, --orbit and --frame")
-        count = 0 if options.turntable is not None else _count(options.sheet)
         with _engine(scene, gdfs, options) as engine:
-            print_line(film.write(options.out, keys, view, camera, engine, count, _say_frames()))
+            print_line(film.write(options.out, keys, view, camera, engine, _say_frames()))
         return 0
-    swept = _swept_layers(options, opened)
     with _engine(scene, gdfs, options) as engine:
+        comparison = ""
         if swept:
-            _render_film(options, swept, view, camera, engine)
-            comparison = ""
+            sheet = film.contact_sheet(swept, lambda state: engine.image(state, camera=camera), view)
+            with atomic_write(options.out) as temporary_file:
+                Image.fromarray(sheet).save(temporary_file)
         else:
             comparison = _render_still(options, opened, view, camera, engine)
         drawn_by = engine.draws_with
-    each = "each " if options.sheet is not None else ""
+    each = "each " if swept else ""
     strengths = "" if swept else f": {describe_strengths(view)}"
     print_line(f"wrote {options.out} ({each}{camera.width}x{camera.height}, drawn by {drawn_by}){strengths}")
     if comparison:
@@ -240,25 +242,6 @@ def render(argv: Sequence[str]) -> int:
             f"every slider is at 0, so this is the original; --set {view.layers[0].name}=1 shows an edit"
         )
     return 0
-
-
-def _render_film(
-    options: RenderOptions, swept: Sequence[str], view: ViewState, camera: Camera, engine: ViewEngine
-) -> None:
-    """An animation of one slider, or a contact sheet of one or two."""
-
-    def picture(state: ViewState) -> film.Pixels:
-        return film.to_pixels(engine.image(state, camera=camera))
-
-    with atomic_write(options.out) as temporary_file:
-        if options.sweep is not None:
-            frames = (picture(moved) for moved in film.sweep(view, swept))
-            write = film.write_mp4 if options.out.suffix.lower() == ".mp4" else film.write_animation
-            write(temporary_file, frames)
-        elif len(swept) == 2:
-            Image.fromarray(film.grid(swept[0], swept[1], picture, view)).save(temporary_file)
-        else:
-            Image.fromarray(film.contact_sheet(swept[0], picture, view)).save(temporary_file)
 
 
 def _render_still(
@@ -314,25 +297,18 @@ def _keys(path: Path, opened: OpenStack) -> Timeline:
     return timeline_file.load(path, opened.view.layers, opened.document.scene.origin)
 
 
-def _turntable(options: RenderOptions, opened: OpenStack, camera: Camera) -> Timeline:
-    """Once around what stands in the scene, from the camera that was chosen."""
-    assert options.turntable is not None
+def _film(
+    options: RenderOptions, opened: OpenStack, view: ViewState, swept: Sequence[str], camera: Camera
+) -> Timeline:
+    """Sliders there and back; or once around what stands in the scene, from the camera that was chosen."""
+    if options.turntable is None:
+        gdfs = [layer.gdf for layer in view.layers if layer.name in swept]
+        return timeline.slider_film(view, gdfs, Timeline().fps, _SWEEP_S)
     problem = f"--turntable must be 1 to {_LONGEST_S:g} seconds, got {options.turntable}"
     seconds = parse_number(options.turntable, 1.0, _LONGEST_S, problem)
     scene = opened.document.original
-    return timeline.turntable(
-        view_camera.from_camera(ViewCamera(up=opened.up), camera, bounds_of(scene)), Timeline().fps, seconds
-    )
-
-
-def _count(sheet: str | None) -> int:
-    """How many pictures of a film a contact sheet shall show; 0 where none was asked for."""
-    if sheet is None:
-        return 0
-    if not (sheet.isdecimal() and len(sheet) < 9) or not 1 <= int(sheet) <= film.MOST_SHOWN:
-        most = film.MOST_SHOWN
-        raise ProgdfError(f"--sheet {sheet} is not a number of pictures; give one from 1 to {most}")
-    return int(sheet)
+    around = view_camera.from_camera(ViewCamera(up=opened.up), camera, bounds_of(scene))
+    return timeline.turntable(around, Timeline().fps, seconds)
 
 
 def _swept_layers(options: RenderOptions, opened: OpenStack) -> list[str]:
@@ -397,19 +373,13 @@ def _check_output(options: RenderOptions) -> None:
     """Whether the file's name fits what goes into it."""
     suffix = options.out.suffix.lower()
     given = [name for name in ONE_OF if getattr(options, name) is not None]
-    if len(given) > 1 and given != ["sheet", "timeline"]:
+    if len(given) > 1:
         raise ProgdfError(f"--{given[0]} and --{given[1]} cannot be combined; give only one of them")
-    films = options.turntable is not None or (options.timeline is not None and options.sheet is None)
-    if films:
+    if options.sweep is not None or options.turntable is not None or options.timeline is not None:
         film.check_output(options.out)
-    if options.sweep is not None and suffix not in film.ANIMATIONS:
-        raise ProgdfError(
-            f"{options.out} cannot hold an animation; --sweep writes a .gif, a .webp or an .mp4"
-        )
-    moves = options.sweep is not None or films
-    if not moves and suffix in film.ANIMATIONS:
+    elif suffix in film.ANIMATIONS:
         raise ProgdfError(f"{options.out} holds an animation; say what moves: --sweep NAME or --turntable 4")
-    if not moves and suffix != ".png":
+    elif suffix != ".png":
         raise ProgdfError(f"{options.out} is not a .png file; pictures are written as .png")
     film.check_encoder(options.out)
 

@@ -57,8 +57,6 @@ class StackOptions:
     """How much of one kind of change an edit lets through, 0 to 1: geometry, opacity or color."""
     solo: Annotated[tuple[str, ...], UseAppendAction, word("NAME")] = ()
     """Show this edit alone. Repeat it for several edits."""
-    paint: Annotated[tuple[str, ...], UseAppendAction, word("NAME=FILE.npy")] = ()
-    """Painted strength of an edit: a .npy of weights 0 to 1, one per member or per Gaussian."""
     overshoot: Switch = False
     """Overshoot to 1.2: extrapolates past the trained range."""
     blend: Annotated[Blend | None, word("{normalized,sum,over,adjust}", "the session's, else adjust")] = None

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -17,8 +16,7 @@ from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf, fingerprint
 from progdf.io.atomic import atomic_write
 from progdf.metrics.image import psnr
-from progdf.rasterize import alpha_weights, render
-from progdf.scene.orbit_rig import orbit_rig
+from progdf.rasterize import render
 from viewer.camera.view_camera import ViewCamera, bounds_of, to_camera
 from viewer.state import snapshots, timeline
 from viewer.state.layers import largest_strength, visible_layers
@@ -31,8 +29,6 @@ from .document import Document
 PAGE = ".html"
 STILL = 1200, 800
 """Width and height of what a page shows first, px."""
-_RANK_VIEWS, _RANK_SIZE = 24, (480, 320)
-_LEAST_SHARE = 0.01
 _EXACT_DB = 99.0
 
 
@@ -44,29 +40,12 @@ class PageOptions:
     """Of a .html page: float32, or 8 and 16 bits, a third as large."""
     sh: Literal[0, 1, 2, 3] = 3
     """Degree of the spherical harmonics that stay in a page."""
-    max_size: Annotated[str | None, absent_option("SIZE", "as large as it is")] = None
-    """Largest page, as in 25MB: drops what shows least, and says what."""
     layers: Annotated[str | None, absent_option("NAME[,NAME2]", "all")] = None
     """Layers that get a slider; the others stay as they are."""
     title: Annotated[str | None, absent_option("TEXT", "the scene's name")] = None
     """Above the sliders."""
     credit: Annotated[str, absent_option("TEXT", "none")] = ""
     """Below them: whose scene it is, and its license; addresses become links."""
-
-
-@dataclass(frozen=True)
-class _Page:
-    """A page, and what it holds of the scene."""
-
-    html: str
-    quality: str
-    degree: int
-    share: float  # of the Gaussians
-    psnr: float  # of its start to that of the scene, dB
-
-    @property
-    def size(self) -> int:
-        return len(self.html.encode())
 
 
 def write_page(
@@ -79,82 +58,25 @@ def write_page(
     """Write the page; the line that says what it holds.
 
     Raises:
-        ProgdfError: an option names a layer that is not there, or a size that is none or cannot be met, or
-            the page cannot be written.
+        ProgdfError: an option names a layer that is not there, or the page cannot be written.
     """
-    limit = _parse_size(options.max_size)
     stage, edits = first_state(document, view, kept, options)
     gdfs, title = [document.gdfs[i] for i in edits], options.title or Path(document.title).stem
     start = picture(document.scene, document.gdfs, view, STILL)
     texts = PageTexts(title, options.credit, view.background, start)
-    rank = _rank(document, view) if limit is not None else None
-
-    def make(quality: str, degree: int, share: float) -> _Page:
-        stays = None if rank is None or share == 1.0 else (rank < share * len(rank)).numpy()
-        packed = pack(document.scene, gdfs, quality, degree, stage, stays)
-        html = build_page(packed.data, texts)
-        error = psnr(picture(packed.scene, document.gdfs, view, STILL, DRAWN_SH[degree]), start)
-        return _Page(html, quality, degree, share, error)
-
     degree = min(options.sh, document.scene.sh_degree)
-    page = make(options.quality, degree, 1.0)
-    if limit is not None and page.size > limit:
-        page = _shrink(make, page, limit)
+    packed = pack(document.scene, gdfs, options.quality, degree, stage)
+    html = build_page(packed.data, texts)
     with atomic_write(out) as temporary_file:
-        temporary_file.write_text(page.html, encoding="utf-8")
-    return f"wrote {out}: {_describe(page, document.scene.sh_degree)}"
-
-
-def _shrink(make: Callable[[str, int, float], _Page], page: _Page, limit: int) -> _Page:
-    """A page of at most `limit` bytes: compact; then without a degree of SH, or without as many bytes of the
-    Gaussians that show least, whichever costs the start fewer dB, until it fits."""
-    least = make("compact", 0, _LEAST_SHARE)
-    if least.size > limit:
-        raise ProgdfError(
-            f"--max-size: a page of this scene has {least.size / 1e6:.2f} MB at least; give more"
-        )
-    if page.quality == "exact":
-        page = make("compact", page.degree, page.share)
-    while page.size > limit:
-        fewer = [make("compact", page.degree - 1, page.share)] if page.degree else []
-        target = max(limit, fewer[0].size) if fewer else limit
-        part = (target - least.size) / (page.size - least.size)
-        share = max(_LEAST_SHARE, page.share * min(0.99, part))
-        page = max([*fewer, make("compact", page.degree, share)], key=lambda each: each.psnr)
-    return page
-
-
-def _rank(document: Document, view: ViewState) -> torch.Tensor:
-    """Each Gaussian's place by what it contributes to views around the scene, with its edits or without."""
-    cameras = [*orbit_rig(document.original, _RANK_VIEWS, *_RANK_SIZE), to_camera(view.camera, *_RANK_SIZE)]
-    weights, everywhere = torch.zeros(len(document.scene)), torch.ones(_RANK_SIZE[::-1])
-    for strength in (0.0, 1.0):
-        layers = tuple(replace(layer, strength=strength, enabled=True, solo=False) for layer in view.layers)
-        edited = _compose(document.scene, document.gdfs, replace(view, layers=layers, groups=()))
-        for camera in cameras:
-            weights = weights.maximum(alpha_weights(edited, camera, everywhere)[:, 2].float())
-    return weights.argsort(descending=True, stable=True).argsort()
-
-
-def _describe(page: _Page, degree: int) -> str:
-    """What a page holds, and where it is too large to go."""
-    parts = [f"{page.size / 1e6:.2f} MB", page.quality]
-    parts += [f"SH of degree {page.degree} of {degree}"] if page.degree < degree else []
-    parts += [f"{100 * page.share:.0f} % of the Gaussians"] if page.share < 1.0 else []
-    parts += [f"{page.psnr:.1f} dB to the scene"] if page.psnr < _EXACT_DB else []
-    takes = "common hosts take" if page.size > HOST else "most mail takes"
-    warning = f"; more than {takes}, --max-size makes it smaller" if page.size > MAIL else ""
-    return ", ".join(parts) + warning
-
-
-def _parse_size(text: str | None) -> int | None:
-    """Bytes of "25MB", "900 kB" or a plain number."""
-    if text is None:
-        return None
-    match = re.fullmatch(r"(\d{1,9}(?:\.\d{1,6})?)\s*(k|M|G)?B?", text.strip(), re.IGNORECASE)
-    if match is None or float(match[1]) <= 0:
-        raise ProgdfError(f"--max-size {text} is no size; write, for example, --max-size 25MB")
-    return int(float(match[1]) * {"": 1, "k": 1e3, "m": 1e6, "g": 1e9}[(match[2] or "").lower()])
+        temporary_file.write_text(html, encoding="utf-8")
+    error = psnr(picture(packed.scene, document.gdfs, view, STILL, DRAWN_SH[degree]), start)
+    size, whole = len(html.encode()), document.scene.sh_degree
+    parts = [f"{size / 1e6:.2f} MB", options.quality]
+    parts += [f"SH of degree {degree} of {whole}"] if degree < whole else []
+    parts += [f"{error:.1f} dB to the scene"] if error < _EXACT_DB else []
+    takes = "common hosts take" if size > HOST else "most mail takes"
+    warning = f"; more than {takes}, --sh 0 or fewer Gaussians make it smaller" if size > MAIL else ""
+    return f"wrote {out}: {', '.join(parts)}{warning}"
 
 
 def picture(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import math
 import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -26,10 +25,8 @@ from viewer.state import timeline
 from viewer.state.view_state import Timeline, ViewState
 
 Pixels = NDArray[np.uint8]
-Draw = Callable[[ViewState], Pixels]
+Draw = Callable[[ViewState], NDArray[np.float32]]
 
-SWEEP_STEPS = 24
-FRAME_MS, HOLD_MS = 50, 600  # an animation rests at both ends
 _WEBP_QUALITY = 85  # of 100: no block is seen in a still
 _PALETTE_REACH = 8  # levels: Pillow looks up the nearest color of a palette in steps of 4
 ANIMATIONS = (".gif", ".webp", ".mp4")
@@ -52,47 +49,17 @@ def with_strengths(view: ViewState, strengths: dict[str, float]) -> ViewState:
     return replace(view, layers=moved, groups=groups)
 
 
-def sweep(view: ViewState, names: Sequence[str], steps: int = SWEEP_STEPS) -> Iterator[ViewState]:
-    """`view` with these layers at 0, then each in turn at 1/steps, …, 1: a state more than steps."""
-    yield with_strengths(view, dict.fromkeys(names, 0.0))
-    for at, name in enumerate(names):
-        for step in range(1, steps + 1):
-            before = {done: float(i < at) for i, done in enumerate(names)}
-            yield with_strengths(view, before | {name: step / steps})
-
-
-def contact_sheet(name: str, draw: Draw, view: ViewState) -> Pixels:
-    """`view` with layer `name` at five strengths, in a row."""
-    row = [draw(with_strengths(view, {name: s})) for s in SHEET_STRENGTHS]
-    return _sheet([row], [], [f"{name} {s:g}" for s in SHEET_STRENGTHS])
-
-
-def grid(down: str, across: str, draw: Draw, view: ViewState) -> Pixels:
-    """`view` under two sliders: `down` grows from row to row, `across` from column to column."""
-    rows = [
-        [draw(with_strengths(view, {down: s, across: t})) for t in SHEET_STRENGTHS] for s in SHEET_STRENGTHS
+def contact_sheet(names: Sequence[str], draw: Draw, view: ViewState) -> Pixels:
+    """`view` with a layer at five strengths, in a row; of a second one too, from row to row the first."""
+    *down, across = names
+    rows: list[dict[str, float]] = [dict.fromkeys(down, s) for s in (SHEET_STRENGTHS if down else (0.0,))]
+    drawn = [
+        [torch.from_numpy(draw(with_strengths(view, row | {across: s}))) for s in SHEET_STRENGTHS]
+        for row in rows
     ]
-    return _sheet(
-        rows, [f"{down} {s:g}" for s in SHEET_STRENGTHS], [f"{across} {t:g}" for t in SHEET_STRENGTHS]
-    )
-
-
-def _sheet(rows: list[list[Pixels]], row_labels: list[str], column_labels: list[str]) -> Pixels:
-    tensors = [[torch.from_numpy(picture).float() / 255.0 for picture in row] for row in rows]
-    return to_pixels(images.contact_sheet(tensors, row_labels, column_labels).numpy())
-
-
-def write_animation(path: Path, frames: Iterable[Pixels]) -> None:
-    """An endless animation there and back again; in a .gif with one palette, so that nothing flickers.
-
-    Args:
-        path: a .gif or .webp file
-        frames: from one end of the slider to the other. [H,W,3] each
-    """
-    there = _prepare(path, frames)
-    there_and_back = there + there[-2:0:-1]
-    rests = {0, len(there) - 1}
-    _save(path, there_and_back, [HOLD_MS if i in rests else FRAME_MS for i in range(len(there_and_back))])
+    labels = [f"{name} {s:g}" for row in rows for name, s in row.items()]
+    columns = [f"{across} {s:g}" for s in SHEET_STRENGTHS]
+    return to_pixels(images.contact_sheet(drawn, labels, columns).numpy())
 
 
 def write_film(path: Path, frames: Iterable[Pixels], frames_per_second: int) -> None:
@@ -185,14 +152,6 @@ def check_encoder(path: Path) -> None:
         raise ProgdfError(f"{path} needs a video encoder; pip install progdf-studio[video], or write a .gif")
 
 
-def write_mp4(path: Path, frames: Iterable[Pixels], frames_per_second: int = 20) -> None:
-    """A film there and back again, H.264; the codec wants even sides, so an odd last row is doubled."""
-    there = list(frames)
-    hold = round(HOLD_MS * frames_per_second / 1000)
-    there_and_back = [there[0]] * hold + there[1:-1] + [there[-1]] * hold + there[-2:0:-1]
-    _encode_mp4(path, there_and_back, frames_per_second)
-
-
 def _encode_mp4(path: Path, frames: Iterable[Pixels], frames_per_second: int) -> None:
     """H.264, frame by frame, so that a long film needs no memory."""
     import imageio_ffmpeg  # an extra, see check_encoder
@@ -215,9 +174,6 @@ def _encode_mp4(path: Path, frames: Iterable[Pixels], frames_per_second: int) ->
 
 
 Advance = Callable[[int, int], None]
-
-MOST_SHOWN = 100
-"""Pictures of a contact sheet."""
 
 
 def check_output(out: Path) -> None:
@@ -254,31 +210,15 @@ def sheet_frames(keys: Timeline, count: int) -> list[int]:
     return sorted({round(i * keys.length / steps) for i in range(count)})
 
 
-def sheet(keys: Timeline, view: ViewState, still: Camera, engine: ViewEngine, count: int) -> Pixels:
-    """A contact sheet of `count` frames, row by row, each with its number and its time. [H,W,3]"""
-    numbers = sheet_frames(keys, count)
-    drawn = [
-        torch.from_numpy(picture).float() / 255.0 for picture in frames(keys, view, still, engine, numbers)
-    ]
-    notes = [f"frame {number}, {number / keys.fps:.2f} s" for number in numbers]
-    columns = math.ceil(math.sqrt(len(numbers)))
-    rows = range(0, len(numbers), columns)
-    page = images.contact_sheet(
-        [drawn[i : i + columns] for i in rows], notes=[notes[i : i + columns] for i in rows]
-    )
-    return to_pixels(page.numpy())
-
-
 def write(
     out: Path,
     keys: Timeline,
     view: ViewState,
     still: Camera,
     engine: ViewEngine,
-    count: int = 0,
     advance: Advance | None = None,
 ) -> str:
-    """Write the film: .gif, .webp, .mp4, or a folder of .png files; or a contact sheet of `count` frames.
+    """Write the film: .gif, .webp, .mp4, or a folder of .png files.
 
     `advance` hears how many frames of how many are drawn.
 
@@ -289,12 +229,6 @@ def write(
         ProgdfError: see `check_output`.
     """
     size = f"{still.width}x{still.height}"
-    if count:
-        page = sheet(keys, view, still, engine, count)
-        with atomic_write(out) as temporary_file:
-            Image.fromarray(page).save(temporary_file)
-        count = len(sheet_frames(keys, count))
-        return f"wrote {out} ({count} pictures of {size}, drawn by {engine.draws_with})"
     check_output(out)
     total = sum(1 for _ in timeline.film_frames(keys))
     drawn = _count_frames(frames(keys, view, still, engine, timeline.film_frames(keys)), total, advance)

@@ -113,7 +113,6 @@ def pack(
     quality: str,
     degree: int,
     more: Mapping[str, Any],
-    stays: NDArray[np.bool_] | None = None,
 ) -> Packed:
     """The container of a scene and edits of it that add nothing any more.
 
@@ -123,7 +122,6 @@ def pack(
         quality: "exact", float32 and the numbers of the edits' files, or "compact", 8 and 16 bits
         degree: of the spherical harmonics that stay, 0 to 3
         more: what else the header holds; in "paints" pairs of an edit and the weights of its members [M]
-        stays: which Gaussians; None: all that can be seen. [N]
 
     Raises:
         ProgdfError: there is no such quality.
@@ -133,7 +131,6 @@ def pack(
     scene, kept = _finite(scene), min(DRAWN_SH[degree], scene.shN.shape[1])
     groups = _groups(len(scene), [gdf.region.members.numpy() for gdf in gdfs])
     seen = (groups > 0) | (scene.logit_opacities.numpy() >= UNSEEN_LOGIT)
-    seen = seen if stays is None else seen & stays
     order = _order(scene, groups)
     order = order[seen[order]]
     count = int((groups[order] > 0).sum())

@@ -128,7 +128,6 @@ def test_a_blend_rule_given_beside_the_session_takes_the_place_of_its_own(here: 
     ("argv", "told"),
     [
         (("--out", "bear.ply"), "bear.ply is one of the files to read"),
-        (("--out", "x.ply", "--paint", "ears=w.npy"), "--paint was given with the session"),
         (("--out", "x.ply", "--set", "hat=1"), "there is no edit of that name; there are ears → gold, scarf"),
         (("--out", "x.ply", "ears.gdf"), "an edit was given with the session"),
     ],
@@ -205,21 +204,6 @@ def test_the_sessions_own_timeline_can_be_filmed(here: Path) -> None:
     assert np.abs(found - film.to_pixels(expected)).max() <= 1
 
 
-def test_a_contact_sheet_shows_frames_from_the_first_to_the_last_of_a_film(here: Path) -> None:
-    view = filmed(moving=False)
-    saved(here, view)
-    given = ("render", "work.session.json", "--timeline", "work.session.json", *SMALL)
-    assert run(*given, "-o", "frames") == 0
-    assert run(*given, "--sheet", "5", "-o", "sheet.png") == 0
-    page = np.asarray(Image.open("sheet.png"))
-    for frame in (0, 2, 4, 6, 8):
-        assert holds(page, np.asarray(Image.open(f"frames/frame_{frame:04d}.png")))
-    assert not holds(page, np.asarray(Image.open("frames/frame_0003.png")))
-    first = Path("sheet.png").read_bytes()
-    assert run(*given, "--sheet", "5", "-o", "sheet.png") == 0
-    assert Path("sheet.png").read_bytes() == first
-
-
 def test_the_sliders_of_a_timeline_are_numbered_scenes_as_the_film_draws_them(
     here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -285,17 +269,8 @@ def test_what_is_no_sequence_is_one_line(
     assert run("export", "bear.ply", "scarf.gdf", "--timeline", "film.json", "-o", "a.html") == 2
 
 
-def holds(page: np.ndarray, picture: np.ndarray) -> bool:
-    """Whether the picture is somewhere on the page, pixel for pixel."""
-    height, width = picture.shape[:2]
-    ys, xs = np.nonzero((page == picture[0, 0]).all(-1))
-    return any(
-        np.array_equal(page[y : y + height, x : x + width], picture) for y, x in zip(ys, xs, strict=True)
-    )
-
-
 @pytest.mark.parametrize("count", [1, 2, 7, 30])
-def test_a_contact_sheet_never_shows_a_frame_twice(count: int) -> None:
+def test_steps_of_a_film_are_no_frame_twice(count: int) -> None:
     from viewer.pictures.film import sheet_frames
 
     found = sheet_frames(Timeline(length=12, ping_pong=True), count)
@@ -304,25 +279,11 @@ def test_a_contact_sheet_never_shows_a_frame_twice(count: int) -> None:
     assert count == 1 or found[-1] == 12
 
 
-@pytest.mark.parametrize(
-    ("options", "told"),
-    [
-        (("--sheet", "ears"), "--sheet ears is not a number of pictures"),
-        (("--sheet", "0"), "from 1 to 100"),
-        (("--sheet", "4", "-o", "x.gif"), "x.gif holds an animation"),
-        (("--sheet", "4", "--frame", "all"), "moves the camera"),
-    ],
-)
-def test_a_sheet_or_comparison_that_makes_no_sense_is_one_line(
-    here: Path, options: tuple[str, ...], told: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_sheet_of_a_film_is_one_line(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     saved(here, filmed(moving=True))
-    film_of = ("--timeline", "work.session.json") if "--sheet" in options else ()
-    out = () if "-o" in options else ("-o", "x.png")
-    assert run("render", "work.session.json", *film_of, *SMALL, *options, *out) == 2
-    error = capsys.readouterr().err
-    assert told in error
-    assert error.count("\n") == 1
+    film_of = ("--timeline", "work.session.json", "--sheet", "ears")
+    assert run("render", "work.session.json", *film_of, *SMALL, "-o", "x.png") == 2
+    assert "--sheet and --timeline cannot be combined; give only one of them" in capsys.readouterr().err
     assert not list(here.glob("x.*"))
 
 

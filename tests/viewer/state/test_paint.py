@@ -16,12 +16,9 @@ from progdf.compose.reference import Layer, compose_layers
 from progdf.errors import ProgdfError
 from progdf.scene.selection import Surface
 from tests.helpers.edits import growing, some_rows, whole_grade
-from tests.helpers.hostile import NPY_HEADERS, npy
 from tests.helpers.scenes import random_gaussians
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from viewer.camera.view_camera import to_camera
-from viewer.commands.options import stack_layers
-from viewer.commands.stack_options import StackOptions
 from viewer.files.document import Document
 from viewer.files.session import WindowSession, prune
 from viewer.state import paint
@@ -291,48 +288,6 @@ def test_the_keys_of_the_brush_do_what_its_controls_do(hand: Rig) -> None:
     hand.key("Shift+Backspace")
     assert hand.main_view.work.view.layers[0].paint == paint.FULL
     assert hand.main_view.work.past.past[0].edit.layers[0].paint == paint.FULL
-
-
-def painted(text: str) -> StackOptions:
-    return StackOptions(scene=Path("bear.ply"), paint=(text,))
-
-
-def test_weights_come_from_a_file_of_the_region_or_of_the_scene(tmp_path: Path) -> None:
-    gdf = bear().gdfs[0]
-    of_scene = np.linspace(0, 1, len(bear().scene), dtype=np.float32)
-    of_region = of_scene[gdf.region.members.numpy()]
-    for name, array in (("scene", of_scene), ("region", of_region)):
-        np.save(tmp_path / f"{name}.npy", array)
-    layers = [
-        stack_layers(bear().gdfs, painted(f"scarf={tmp_path / name}.npy"))[0] for name in ("scene", "region")
-    ]
-    assert layers[0] == layers[1]
-    assert layers[0].paint == paint.encode(of_region)
-    np.save(tmp_path / "long.npy", np.zeros(3))
-    np.save(tmp_path / "large.npy", of_region + 1.0)
-    for text, told in (
-        ("scarf", "NAME=WEIGHTS.npy"),
-        (f"hat={tmp_path / 'scene.npy'}", "no edit of that name"),
-        (f"scarf={tmp_path / 'none.npy'}", "none.npy does not exist"),
-        (f"scarf={tmp_path / 'long.npy'}", "expected"),
-        (f"scarf={tmp_path / 'large.npy'}", "outside 0 to 1"),
-    ):
-        with pytest.raises(ProgdfError, match=told):
-            stack_layers(bear().gdfs, painted(text))
-
-
-def test_a_hostile_header_of_weights_is_one_line(tmp_path: Path) -> None:
-    npy(tmp_path / "deep.npy", NPY_HEADERS["a deep literal"])
-    with pytest.raises(ProgdfError, match=r"--paint: .* is not a readable \.npy file of weights"):
-        stack_layers(bear().gdfs, painted(f"scarf={tmp_path / 'deep.npy'}"))
-
-
-def test_weights_from_before_another_edit_added_rows_are_one_line(tmp_path: Path) -> None:
-    scene = random_gaussians(90, seed=2, sh_degree=1)
-    gdfs = Document("s", scene, (whole_grade(scene), growing(scene, some_rows(scene, 10, 1), 25, 7))).gdfs
-    np.save(tmp_path / "old.npy", np.zeros(90, np.float32))
-    with pytest.raises(ProgdfError, match=r"--paint: .*old.npy has shape \[90\], expected \[115\]$"):
-        stack_layers(gdfs, painted(f"dark={tmp_path / 'old.npy'}"))
 
 
 def test_paint_lasts_when_rows_come_and_go_with_another_edit() -> None:

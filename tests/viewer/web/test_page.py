@@ -564,7 +564,7 @@ def test_a_snapshot_is_what_the_window_has(open_page: Any, tmp_path: Path) -> No
             assert mine["gains"] == pytest.approx(asdict(theirs.gains))
 
 
-def test_a_page_gets_as_small_as_it_must_and_says_what_that_costs(tmp_path: Path) -> None:
+def test_a_page_says_how_large_it_is_and_what_fewer_harmonics_cost(tmp_path: Path) -> None:
     document, view = document_of(bear(600).scene, bear(600).gdfs)
     out = tmp_path / "page.html"
 
@@ -575,10 +575,11 @@ def test_a_page_gets_as_small_as_it_must_and_says_what_that_costs(tmp_path: Path
     size, _ = written()
     assert size < written(quality="exact")[0]
     assert size > written(layers="scarf")[0], "an edit that is at 0 and has no slider is left out"
-    limit = size - 9_000
-    smaller, line = written(max_size=f"{limit / 1000}kB")
-    assert smaller <= limit
-    assert re.search(r"(SH of degree 0 of 1|\d+ % of the Gaussians).*, \d\d\.\d dB to the scene", line), line
+    smaller, line = written(sh=0)
+    assert smaller < size
+    assert re.search(
+        rf"{smaller / 1e6:.2f} MB, compact, SH of degree 0 of 1, \d\d\.\d dB to the scene", line
+    ), line
 
 
 def test_what_cannot_be_is_one_line_and_what_was_there_stays(
@@ -589,8 +590,6 @@ def test_what_cannot_be_is_one_line_and_what_was_there_stays(
     out.write_text("earlier")
     (tmp_path / "broken.session.json").write_text('{"view": [1, ')
     bad: list[tuple[list[str], str]] = [
-        ([scene, *edits, "--max-size", "9kB"], "MB at least"),
-        ([scene, *edits, "--max-size", "small"], "no size"),
         ([scene, *edits, "--layers", "hat"], "no layer of that name; there are ears, scarf"),
         ([scene, "-o", str(tmp_path / "page.ply"), "--title", "x"], "no web page"),
         ([str(tmp_path / "broken.session.json")], "broken.session.json"),
