@@ -17,9 +17,9 @@ from imgui_bundle import portable_file_dialogs as dialogs
 
 from progdf.terminal import escape_text
 from viewer.state.workspace import Dialog
-from viewer.ui.context import PALETTE, SMALL_PX, UiContext
+from viewer.ui.context import PALETTE, UiContext
 from viewer.ui.overlay import Area
-from viewer.ui.widgets import accent_button, elide, inert, small, tip, wrapped_text
+from viewer.ui.widgets import accent_button, inert, small, tip, wrapped_text
 
 from .studio import pages
 
@@ -63,16 +63,16 @@ _HINTS = {
     "about": "Edit a trained 3D Gaussian Splatting scene once, then drag a slider through it.",
 }
 _SUBMIT = {
-    "save": "Save",
-    "open": "Open",
-    "replace": "Replace",
-    "rebind": "Rebind",
-    "export": "Export",
-    "export_page": "Export",
-    "render_picture": "Render",
-    "render_film": "Render",
+    "save": ("Save", "save_to:{path}"),
+    "open": ("Open", "open_file:{path}"),
+    "replace": ("Replace", "replace_by:{then}:{path}"),
+    "rebind": ("Rebind", "rebind_from:{then}\n{path}"),
+    "export": ("Export", "deliver:export"),
+    "export_page": ("Export", "deliver:export_page"),
+    "render_picture": ("Render", "deliver:render_picture"),
+    "render_film": ("Render", "deliver:render_film"),
 }
-"""The button of each question that has a path field."""
+"""The button of each question that has a path field, and what it asks for."""
 _DELIVERS = ("export", "export_page", "render_picture", "render_film")
 
 
@@ -94,6 +94,17 @@ _CHOICES = {
     "about": (_Button("Close", ("Enter",)),),
     "restore": (_Button("Restore", ("Enter", "R")), _Button("Discard", ("D",)), _Button("Later")),
 }
+_REQUESTS = {
+    ("leave", "Save"): ("save:{then}",),
+    ("leave", "Discard"): ("discard", "{then}"),
+    ("overwrite", "Replace"): ("overwrite:{path}",),
+    ("training", "Stop and quit"): ("stop_and_quit",),
+    ("discard_run", "Discard"): ("discard_run:{then}",),
+    ("delivery", "Stop and quit"): ("drop_and_quit",),
+    ("restore", "Restore"): ("restore_autosave:{path}",),
+    ("restore", "Discard"): ("discard_autosave:{path}",),
+}
+"""What the buttons ask for that do more than to close the question."""
 
 
 @dataclass(frozen=True)
@@ -104,11 +115,10 @@ class Answer:
     requests: tuple[str, ...] = ()
 
 
-def draw(dialog: Dialog, recent: Sequence[Path], pressed: Sequence[str], ui: UiContext, area: Area) -> Answer:
+def draw(dialog: Dialog, pressed: Sequence[str], ui: UiContext, area: Area) -> Answer:
     """Draw the question and take its answer.
 
     Args:
-        recent: files opened before, the last one first
         pressed: chords that went down in this frame
         area: the picture; the question is in its upper part
     """
@@ -128,7 +138,7 @@ def draw(dialog: Dialog, recent: Sequence[Path], pressed: Sequence[str], ui: UiC
         context, at_button = imgui.get_current_context(), not imgui.get_io().want_text_input
         if context.nav_cursor_visible and at_button and context.nav_id not in (0, imgui.get_id("##path")):
             pressed = [chord for chord in pressed if chord != "Enter"]  # it is of what has the keyboard
-        answer = _content(dialog, recent, pressed, ui, area.height - margin)
+        answer = _content(dialog, pressed, ui, area.height - margin)
         if answer.dialog is None:
             imgui.close_current_popup()
         imgui.end_popup()
@@ -137,9 +147,7 @@ def draw(dialog: Dialog, recent: Sequence[Path], pressed: Sequence[str], ui: UiC
     return answer
 
 
-def _content(
-    dialog: Dialog, recent: Sequence[Path], pressed: Sequence[str], ui: UiContext, bottom: float
-) -> Answer:
+def _content(dialog: Dialog, pressed: Sequence[str], ui: UiContext, bottom: float) -> Answer:
     """`bottom`: where the question has to end, window pixels"""
     with imgui_ctx.push_font(ui.fonts.bold, 0.0):
         imgui.text(TITLES[dialog.kind])
@@ -182,12 +190,8 @@ def _content(
         kind = dialog.kind.removeprefix("render_")
         text, options = pages.draw_fields(kind, dialog.text, dialog.options, ui)
         dialog = replace(dialog, text=text, options=options)
-    if dialog.kind == "open":
-        chosen = _recent(recent, bottom, "Down" in pressed, ui)
-        if chosen is not None:
-            return _submit(dialog, str(chosen))
     imgui.dummy((0.0, 2.0 * ui.scale))
-    name = _SUBMIT[dialog.kind]
+    name, _ = _SUBMIT[dialog.kind]
     button = _buttons((name, "Cancel"), ui)
     if button == "Cancel":
         return Answer(None)
@@ -206,16 +210,9 @@ def _is_new(kind: str) -> bool:
 
 
 def _submit(dialog: Dialog, path: str) -> Answer:
-    """The file that was asked for."""
-    if dialog.kind == "save":
-        return Answer(replace(dialog, text=path, chosen=""), (f"save_to:{path}",))
-    if dialog.kind in _DELIVERS:
-        return Answer(replace(dialog, text=path), (f"deliver:{dialog.kind}",))
-    if dialog.kind == "rebind":
-        return Answer(None, (f"rebind_from:{dialog.then}\n{path}",))
-    if dialog.kind == "replace":
-        return Answer(None, (f"replace_by:{dialog.then}:{path}",))
-    return Answer(None, (f"open_file:{path}",))
+    """The file that was asked for; the question stays where the file may not serve."""
+    stays = replace(dialog, text=path, chosen="") if dialog.kind in ("save", *_DELIVERS) else None
+    return Answer(stays, (_SUBMIT[dialog.kind][1].format(path=path, then=dialog.then),))
 
 
 def _pressed_button(choices: Sequence[_Button], pressed: Sequence[str], ui: UiContext) -> str:
@@ -227,57 +224,13 @@ def _pressed_button(choices: Sequence[_Button], pressed: Sequence[str], ui: UiCo
 
 def _answer(dialog: Dialog, button: str) -> Answer:
     """What follows from a button of a question without a path field."""
-    path = dialog.text
-    match dialog.kind, button:
-        case _, "":
-            return Answer(dialog)
-        case "leave", "Save":
-            return Answer(None, (f"save:{dialog.then}",))
-        case "leave", "Discard":
-            return Answer(None, ("discard", dialog.then))
-        case "overwrite", "Replace":
-            return Answer(dialog, (f"overwrite:{path}",))
-        case "overwrite", "Rename…":
-            return Answer(Dialog("save", path, dialog.then))
-        case "training", "Stop and quit":
-            return Answer(None, ("stop_and_quit",))
-        case "discard_run", "Discard":
-            return Answer(None, (f"discard_run:{dialog.then}",))
-        case "delivery", "Stop and quit":
-            return Answer(None, ("drop_and_quit",))
-        case "restore", "Restore":
-            return Answer(None, (f"restore_autosave:{path}",))
-        case "restore", "Discard":
-            return Answer(None, (f"discard_autosave:{path}",))
-    return Answer(None)  # Cancel, Later
-
-
-def _recent(recent: Sequence[Path], bottom: float, down: bool, ui: UiContext) -> Path | None:
-    """The list of files opened before, scrolled where it would reach beyond `bottom`; the one chosen.
-
-    `down`: the arrow that leads from the path field into it was pressed.
-    """
-    if not recent:
-        return None
-    small("Recent", PALETTE.dim)
-    style = imgui.get_style()
-    row = imgui.get_text_line_height_with_spacing()
-    below = imgui.get_frame_height() + 3 * style.item_spacing.y + style.window_padding.y
-    space = max(bottom - imgui.get_cursor_screen_pos().y - below, 2 * row)
-    chosen = None
-    imgui.begin_child("recent", (0.0, min(len(recent) * row, space)))
-    if down and not imgui.is_window_focused():
-        imgui.set_keyboard_focus_here()
-        imgui.set_nav_cursor_visible(True)
-    for i, path in enumerate(recent):
-        room = imgui.get_content_region_avail().x
-        if imgui.selectable(f"{elide(escape_text(path.name), 0.4 * room)}##{i}", False)[0]:
-            chosen = path
-        imgui.same_line(0.42 * room)
-        with imgui_ctx.push_font(None, SMALL_PX):
-            imgui.text_disabled(elide(escape_text(str(path.parent)), 0.56 * room))
-    imgui.end_child()
-    return chosen
+    if not button:
+        return Answer(dialog)
+    if button == "Rename…":
+        return Answer(Dialog("save", dialog.text, dialog.then))
+    requests = _REQUESTS.get((dialog.kind, button), ())
+    stays = dialog if button == "Replace" else None  # until it is written
+    return Answer(stays, tuple(each.format(path=dialog.text, then=dialog.then) for each in requests))
 
 
 def _log(path: Path, bottom: float, ui: UiContext) -> None:

@@ -187,7 +187,7 @@ class EditActions:
 
         with all_threads():
             gdf = load_gdf(path, scene, place=place)
-        if note := describe_applied(scene, gdf):
+        if note := describe_applied(gdf):
             self._app.main_view.show_message(note)
         return gdf
 

@@ -17,7 +17,7 @@ from viewer.state.actions import GLIDES, perform
 from viewer.state.workspace import PreviewState, Workspace
 from viewer.ui import overlay
 from viewer.ui.context import FIXED, PALETTE, SMALL_PX, UiContext, u32
-from viewer.ui.keys import JOINED, TOPICS, Command, chords, find_commands, is_changed, match, shortcut
+from viewer.ui.keys import JOINED, TOPICS, Command, chords, find_commands, is_changed, shortcut
 from viewer.ui.pointer import PointerContext
 from viewer.ui.widgets import elide, menu, search_field
 
@@ -89,27 +89,12 @@ def columns(topics: Sequence[Topic], count: int) -> list[list[Topic]]:
     return next(packed for height in sorted(heights) if len(packed := _pack(topics, height)) <= count)
 
 
-def filter_topics(topics: Sequence[Topic], query: str) -> list[Topic]:
-    """What of them is called, or done by keys, like that."""
-    rows = [
-        tuple(row for row in topic.rows if match(query, row[1], f"{topic.name} {row[0]}") is not None)
-        for topic in topics
-    ]
-    return [Topic(topic.name, left) for topic, left in zip(topics, rows, strict=True) if left]
-
-
-def draw_keys(room: imgui.ImVec2, query: str, ui: UiContext) -> str:
-    """The list of keys in the middle of a `room` at the upper left; it scrolls where it is longer than that.
-
-    Returns:
-        What is sought in it.
-    """
-    margin, wide, everything = _MARGIN_PX * ui.scale, COLUMN_PX * ui.scale, topics()
-    count = max(1, min(MOST_COLUMNS, int((room.x - 2 * margin) / wide)))
-    packed = columns(everything, count)
+def draw_keys(room: imgui.ImVec2, ui: UiContext) -> None:
+    """The list of keys in the middle of a `room` at the upper left; it scrolls where it is longer."""
+    margin, wide = _MARGIN_PX * ui.scale, COLUMN_PX * ui.scale
+    packed = columns(topics(), max(1, min(MOST_COLUMNS, int((room.x - 2 * margin) / wide))))
     tall = max(sum(topic.height for topic in column) for column in packed) * _ROW * SMALL_PX * ui.scale
-    field = 30.0 * ui.scale
-    size = imgui.ImVec2(min(len(packed) * wide + 2 * margin, room.x), min(tall + field + 2 * margin, room.y))
+    size = imgui.ImVec2(min(len(packed) * wide + 2 * margin, room.x), min(tall + 2 * margin, room.y))
     imgui.set_next_window_pos(((room.x - size.x) / 2, (room.y - size.y) / 2))
     imgui.set_next_window_size(size)
     imgui.push_style_color(imgui.Col_.window_bg, imgui.ImVec4(*PALETTE.scrim[:3], 0.97))
@@ -121,14 +106,11 @@ def draw_keys(room: imgui.ImVec2, query: str, ui: UiContext) -> str:
     )
     imgui.internal.bring_window_to_display_front(imgui.internal.get_current_window())
     left, top = imgui.get_cursor_pos_x(), imgui.get_cursor_pos_y()
-    query = search_field("Search keys", query)
-    found = filter_topics(everything, query)
-    for i, column in enumerate(columns(found, count) if found else ()):
-        _column(column, left + i * wide, top + field, ui)
+    for i, column in enumerate(packed):
+        _column(column, left + i * wide, top, ui)
     imgui.end()
     imgui.pop_style_var(3)
     imgui.pop_style_color()
-    return query
 
 
 def draw_lists(
@@ -140,8 +122,6 @@ def draw_lists(
         offered: its actions
         pressed: chords that went down in this frame
     """
-    if work.help and imgui.get_io().want_text_input and {"Escape", *chords("help")} & {*pressed}:
-        work = replace(work, help=False)  # its own field has the keyboard, so that they are no commands
     if work.history is not None:
         work, chosen = draw_history(work, pointer.ui)
         work = perform_actions(work, chosen, pointer)
@@ -349,22 +329,15 @@ def over_picture(
             work = replace(work, message=None)
             work = perform_actions(work, [line.button[1]] * (clicked == "do"), pointer)
     if work.help:
-        work = replace(work, query=draw_keys(free, work.query, ui))
+        draw_keys(free, ui)
     return work
 
 
-def draw_dialog(
-    work: Workspace, pointer: PointerContext, recent: Sequence[Path], pressed: Sequence[str]
-) -> Workspace:
-    """The question that is open, if one is.
-
-    Args:
-        recent: files opened before, the last one first
-        pressed: chords that went down in this frame
-    """
+def draw_dialog(work: Workspace, pointer: PointerContext, pressed: Sequence[str]) -> Workspace:
+    """The question that is open, if one is; `pressed`: chords that went down in this frame."""
     if work.dialog is None:
         return work
-    answer = dialogs.draw(work.dialog, recent, pressed, pointer.ui, pointer.area)
+    answer = dialogs.draw(work.dialog, pressed, pointer.ui, pointer.area)
     return replace(work, dialog=answer.dialog, requests=(*work.requests, *answer.requests))
 
 

@@ -452,7 +452,7 @@ class MainView:
         over = max(self._popups) > 1  # a list over the question takes its keys
         pressed = [] if over else [press.chord for press in self._keys.pressed]
         with self._guard():
-            self.work = interface.draw_dialog(self.work, pointer, self.recent, pressed)
+            self.work = interface.draw_dialog(self.work, pointer, pressed)
         original = self.work.before
         with self._guard():
             if self.cover is not None and not original:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -43,6 +44,7 @@ class TidyActions:
         self._app = app
         self._edits = EditActions(app)
         self._region: Region | None = None  # that is being moved
+        self._folder = Path()  # of new edits
 
     @property
     def requests(self) -> Requests:
@@ -62,8 +64,7 @@ class TidyActions:
 
     def _begin(self, does: str) -> None:
         main_view, scene = self._app.main_view, self._app.document.original
-        if self._app.document.path is None:
-            raise ProgdfError("the scene has no file yet; open one first")
+        self._folder = edits_folder(self._app.document.file)
         mask = selection.unpack(main_view.work.view.selection.members, len(scene))
         if not mask.any():
             raise ProgdfError("nothing of the scene is selected; select it first")
@@ -110,8 +111,7 @@ class TidyActions:
     def _add(self, does: str, steps: Sequence[Step]) -> None:
         """Write the edit, and have it as a layer on top."""
         document = self._app.document
-        assert document.path is not None
-        folder = edits_folder(document.path)
+        folder = self._folder
         make_folder(folder)
         name, number = document.free_name(_NAMES[does]), 2
         path = folder / f"{name}.gdf"

@@ -157,12 +157,8 @@ def axes(camera: ViewCamera) -> Axes:
     ahead = front(up)
     side = cross(up, ahead)
     azimuth, elevation = math.radians(camera.azimuth), math.radians(camera.elevation)
-    cos_a, sin_a, cos_e, sin_e = (
-        math.cos(azimuth),
-        math.sin(azimuth),
-        math.cos(elevation),
-        math.sin(elevation),
-    )
+    cos_a, sin_a = math.cos(azimuth), math.sin(azimuth)
+    cos_e, sin_e = math.cos(elevation), math.sin(elevation)
     level = add_scaled((0.0, 0.0, 0.0), (cos_a, ahead), (sin_a, side))
     zero = (0.0, 0.0, 0.0)
     return Axes(

@@ -173,7 +173,7 @@ def open_stack(stack: StackOptions, drawing: DrawingOptions | None = None, unset
     opened = document.load(stack.scene, stack.gdfs, _placing(stack.region))
     for text in stack.region:
         check_edit(text.partition("=")[0], opened.gdfs, "--region")
-    notes = [note for gdf in opened.gdfs if (note := describe_applied(opened.scene, gdf))]
+    notes = [note for gdf in opened.gdfs if (note := describe_applied(gdf))]
     for note in notes:
         _log.warning(note)
     layers = stack_layers(opened.gdfs, stack, unset)

@@ -12,6 +12,7 @@ from typing import TypeVar
 import torch
 
 from progdf.compose.added import extend
+from progdf.errors import ProgdfError
 from progdf.formats.scene_file import load_scene, scene_file, scene_name
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf, load_gdf
@@ -82,6 +83,13 @@ class Document:
                 first_camera(self.original, (), aspect, camera.fov_y, camera.up), mode=camera.mode
             ),
         )
+
+    @property
+    def file(self) -> Path:
+        """The scene's file. Raises ProgdfError where it has none."""
+        if self.path is None:
+            raise ProgdfError("the scene has no file yet; open one first")
+        return self.path
 
     def free_name(self, name: str) -> str:
         """An edit's name, with a number where another edit has it."""

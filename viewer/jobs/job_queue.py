@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import ClassVar, Literal
 
 from progdf.errors import ProgdfError, without_commands
-from progdf.io.json_values import read_json
 from viewer.camera.view_camera import SHAPES
 
 from .child import Child, Progress, last_line
@@ -67,8 +66,8 @@ class DeliverOptions:
     can_move: tuple[str, ...] = ()  # what there is to choose from
 
 
-_DEMO_EDIT = re.compile(r"^(\d+) of (\d+): ([^:\n]+)", re.MULTILINE)
-"""A line of `progdf demo` that says which edit it trains now."""
+_COUNT = re.compile(r"^((?:frame )?(\d+)(?:/| of )(\d+)(?:: [^:\n]+)?)", re.MULTILINE)
+"""What a line begins with that says which frame is drawn, or edit of the demo trained, and of how many."""
 
 
 @dataclass(frozen=True)
@@ -94,26 +93,12 @@ class Delivery:
         return self.words
 
     def read_progress(self, before: Progress) -> Progress:
-        """How far it is, by the line that it printed last; the demo by what its edits have written down."""
-        if self.words[0] == "demo":
-            return self._demo_progress(before)
-        line = last_line(self.log)
-        frames = re.search(r"frame (\d+)/(\d+)", line)
-        if frames is None:
-            return Progress(before.share, line)
-        return Progress(int(frames[1]) / int(frames[2]), f"frame {frames[1]} of {frames[2]}")
-
-    def _demo_progress(self, before: Progress) -> Progress:
+        """How far it is, by the line with a count that it printed last."""
         with suppress(OSError):
-            edits = _DEMO_EDIT.findall(self.log.read_text("utf-8", "replace"))
-            if edits:
-                number, count, name = edits[-1]
-                run = Progress()
-                with suppress(ProgdfError):
-                    run = read_json(self.out / name / "state" / "progress.json", Progress)
-                share = max((int(number) - 1 + run.share) / int(count), before.share)
-                return Progress(min(share, 1.0), f"{number} of {count}: {name}")
-        return before
+            if counts := _COUNT.findall(self.log.read_text("utf-8", "replace")):
+                label, number, count = counts[-1]
+                return Progress((int(number) - 1) / int(count), label)
+        return Progress(before.share, last_line(self.log))
 
     def lock(self) -> AbstractContextManager[None]:
         """Nothing: each is one window's own."""

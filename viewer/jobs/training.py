@@ -33,29 +33,15 @@ from progdf.errors import ProgdfError
 from progdf.field.keyframes import fit_lossless
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf, fingerprint
-from progdf.io.atomic import (
-    LOCK,
-    LockedError,
-    atomic_write,
-    hold_lock,
-    is_locked,
-    is_portable,
-    make_folder,
-    state_folder,
-)
+from progdf.io import atomic
 from progdf.io.json_values import convert_json, plain, read_json
 from progdf.io.tensors import read_tensors
 from progdf.region import Region
 
 from .child import Progress
 
-ORDER, LOG, WINDOW_LOCK, DRAFT, PACKED = (
-    ".train.json",
-    ".train.log",
-    ".train.lock",
-    ".draft.gdf",
-    ".packed.gdf",
-)
+ORDER, LOG, WINDOW_LOCK = ".train.json", ".train.log", ".train.lock"
+DRAFT, PACKED = ".draft.gdf", ".packed.gdf"
 
 Setting = Literal["color", "amount", "grade", "style", "sentence", "folder", "pictures"]
 """What an editor is asked besides its kind."""
@@ -174,7 +160,7 @@ class NewEdit:
         """The name that the layer and its file will have."""
         words = self.name.strip() or self.suggested_name
         name = re.sub(r"[<>:\"/\\|?*\x00-\x1f]", "-", words).lstrip(".")[:80].rstrip(" .") or "edit"
-        return name if is_portable(name) else f"edit {name}"
+        return name if atomic.is_portable(name) else f"edit {name}"
 
     @property
     def suggested_name(self) -> str:
@@ -351,7 +337,7 @@ class EditOrder:
     @property
     def is_locked(self) -> bool:
         """Whether another window, or a process, has the run; this one must not hold it itself."""
-        return is_locked(self._beside(WINDOW_LOCK)) or is_locked(self.out / LOCK)
+        return atomic.is_locked(self._beside(WINDOW_LOCK)) or atomic.is_locked(self.out / atomic.LOCK)
 
     @contextlib.contextmanager
     def lock(self) -> Iterator[None]:
@@ -361,15 +347,16 @@ class EditOrder:
             LockedError: another window has it in its queue, or a process trains it.
             ProgdfError: its folder cannot be written to.
         """
-        make_folder(self.out.parent)
+        atomic.make_folder(self.out.parent)
         lock = self._beside(WINDOW_LOCK)
         try:
-            with hold_lock(lock):
-                if is_locked(self.out / LOCK):  # by a command, or by the child of a window that was killed
-                    raise LockedError(str(lock))
+            with atomic.hold_lock(lock):
+                # by a command, or by the child of a window that was killed
+                if atomic.is_locked(self.out / atomic.LOCK):
+                    raise atomic.LockedError(str(lock))
                 yield
-        except LockedError:
-            raise LockedError(f"{self.name} trains in another window; stop it there first") from None
+        except atomic.LockedError:
+            raise atomic.LockedError(f"{self.name} trains in another window; stop it there first") from None
         if not self._beside(ORDER).exists():  # it was discarded
             with contextlib.suppress(OSError):
                 lock.unlink(missing_ok=True)
@@ -380,10 +367,10 @@ class EditOrder:
         Raises:
             ProgdfError: the folder cannot be made or written to.
         """
-        make_folder(self.out.parent)
+        atomic.make_folder(self.out.parent)
         values = plain(self) | {"scene": str(self.scene)}
         del values["out"]  # it is where the file is
-        with atomic_write(self._beside(ORDER)) as temporary_file:
+        with atomic.atomic_write(self._beside(ORDER)) as temporary_file:
             temporary_file.write_bytes(msgspec.json.format(msgspec.json.encode(values)))
 
     def discard(self) -> None:
@@ -456,7 +443,7 @@ def edits_folder(scene: Path) -> Path:
     if takes_files(beside if beside.is_dir() else scene.parent):
         return beside
     digest = hashlib.sha256(str(scene).encode("utf-8", "surrogateescape")).hexdigest()[:8]
-    return state_folder() / "edits" / f"{scene.stem}-{digest}"
+    return atomic.state_folder() / "edits" / f"{scene.stem}-{digest}"
 
 
 def free_run(folder: Path, name: str) -> Path:

@@ -221,8 +221,7 @@ class _Row:
 def draw_heading(work: Workspace, ui: UiContext, actions: list[str]) -> Workspace:
     """The heading of the stack: a new edit, and the menu of what is about all layers."""
     right = right_edge()
-    folded = section("Edits", work.layout.folded, ui)
-    work = replace(work, layout=replace(work.layout, folded=folded))
+    work = replace(work, layout=section("Edits", work.layout, ui))
     side, text = imgui.get_frame_height(), "+ New edit"
     wide = imgui.calc_text_size(text).x + 2 * imgui.get_style().frame_padding.x
     imgui.same_line(right - wide - (side + 4.0 * ui.scale) * bool(work.view.layers))

@@ -6,7 +6,7 @@ import math
 from dataclasses import replace
 
 import torch
-from imgui_bundle import imgui
+from imgui_bundle import imgui, imgui_ctx
 
 from progdf.color.edits import GRADE_RANGES, parse_color
 from progdf.color.palette import bend_lightness
@@ -38,6 +38,7 @@ from viewer.ui.widgets import (
     elide,
     group_digits,
     icon_button,
+    inert,
     label,
     right_edge,
     slider_row,
@@ -48,10 +49,6 @@ from viewer.ui.widgets import (
 )
 
 COLUMN_PX = 90.0
-PAINT_VIEW = "Paint over this view…"
-PAINT_HELP = (
-    "Opens a picture of it in your painting program; what you save there is shown here, ready to train"
-)
 _CURVE_PX, _MOST_POINTS, _LEAST_GAP = 92.0, 6, 0.02
 _GRADES = {
     "exposure": "Stops of light: −1 is half of it, 1 twice as much",
@@ -105,10 +102,9 @@ def _content(work: Workspace, count: int, preview: PreviewState, ui: UiContext) 
     """The form as the hand leaves it, and what was asked for: "train", "paint_over", "new_edit" to close it,
     or ""."""
     form, selection, action, right = work.form, work.view.selection, "", right_edge()
-    imgui.push_font(ui.fonts.bold, 0.0)
-    imgui.align_text_to_frame_padding()
-    imgui.text("New edit")
-    imgui.pop_font()
+    with imgui_ctx.push_font(ui.fonts.bold, 0.0):
+        imgui.align_text_to_frame_padding()
+        imgui.text("New edit")
     imgui.same_line(right - imgui.get_frame_height())
     if icon_button("close form", Icon.CLOSE, ui, dim=True):
         action = "new_edit"
@@ -132,10 +128,9 @@ def _content(work: Workspace, count: int, preview: PreviewState, ui: UiContext) 
     error = form.error or missing_package(form.choice)
     if error:
         wrapped_text(error, PALETTE.error)
-    imgui.begin_disabled(bool(form.obstacle))
-    if accent_button(f"{Icon.TRAIN}  Train", imgui.ImVec2(-1.0, 0.0)):
-        action = "train"
-    imgui.end_disabled()
+    with inert(bool(form.obstacle)):
+        if accent_button(f"{Icon.TRAIN}  Train", imgui.ImVec2(-1.0, 0.0)):
+            action = "train"
     tip(form.obstacle or f"Train it; it comes as a layer with a slider. {_effort(form)}")
     return form, action
 
@@ -327,17 +322,14 @@ def _model(form: NewEdit, preview: PreviewState, column: float, ui: UiContext) -
 def _anchor(form: NewEdit, preview: PreviewState, column: float) -> tuple[NewEdit, str]:
     """The picture that all views follow: painted, painted again, or painted over by hand ("paint_over")."""
     label("Anchor", column)
-    half, action = 0.5 * (imgui.get_content_region_avail().x - imgui.get_style().item_spacing.x), ""
-    imgui.begin_disabled(bool(form.obstacle) or preview.busy)
-    if imgui.button("Again" if form.asks else "Paint this view", imgui.ImVec2(half, 0.0)):
-        form = replace(form, asks=form.asks + 1, anchor="")
-    imgui.end_disabled()
+    half = 0.5 * (imgui.get_content_region_avail().x - imgui.get_style().item_spacing.x)
+    with inert(bool(form.obstacle) or preview.busy):
+        if imgui.button("Again" if form.asks else "Paint this view", imgui.ImVec2(half, 0.0)):
+            form = replace(form, asks=form.asks + 1, anchor="")
     tip("Paint the view that you see. All views will follow this picture; without one, the front decides")
     imgui.same_line()
-    imgui.begin_disabled(not preview.painted)
-    if imgui.button("Paint over", imgui.ImVec2(half, 0.0)):
-        action = "paint_over"
-    imgui.end_disabled()
+    with inert(not preview.painted):
+        action = "paint_over" if imgui.button("Paint over", imgui.ImVec2(half, 0.0)) else ""
     tip(
         form.anchor or "Opens the picture in your painting program; what you save there is shown, and trained"
     )
@@ -385,9 +377,9 @@ def _preview(form: NewEdit, preview: PreviewState, column: float, ui: UiContext)
         form = replace(form, preview=not form.preview)
     tip("What the editor makes of the original in this view, before anything is trained")
     imgui.same_line(column + side)
-    imgui.begin_disabled(not form.preview)
-    form = replace(form, strength=value_slider("##strength", form.strength, (0.0, 1.0), "%.2f", 1.0, ui))
-    imgui.end_disabled()
+    with inert(not form.preview):
+        strength = value_slider("##strength", form.strength, (0.0, 1.0), "%.2f", 1.0, ui)
+    form = replace(form, strength=strength)
     tip("Strength of the preview. Training learns all strengths")
     if form.preview and preview.failed:
         wrapped_text(preview.text, PALETTE.error)

@@ -21,24 +21,8 @@ from viewer.state.workspace import (
     Workspace,
     has_unsaved,
 )
+from viewer.ui import widgets
 from viewer.ui.context import BEHIND, FIXED, PALETTE, SMALL_PX, Icon, UiContext, u32
-from viewer.ui.widgets import (
-    elide,
-    group_digits,
-    hint,
-    icon_button,
-    icon_row,
-    is_double_clicked,
-    menu_items,
-    more_button,
-    right_edge,
-    section,
-    small,
-    swatch,
-    tip,
-    typed_name,
-    with_added,
-)
 
 from . import card, cards, new_edit_form, snapshot_cards, training_cards
 
@@ -51,12 +35,13 @@ _SHARES = ("export", "export_page", "render_picture", "render_film", "picture")
 
 def _menu_button(recent: Sequence[Path], side: float, ui: UiContext, actions: list[str]) -> None:
     """The menu at the right of the present line; `recent`: files opened before, the last one first."""
+    room = MOST_PX * ui.scale
     files = [
-        (elide(escape_text(path.name), MOST_PX * ui.scale), f"open_file:{path}", escape_text(str(path)))
+        (widgets.elide(escape_text(path.name), room), f"open_file:{path}", escape_text(str(path)))
         for path in recent[:_MOST_RECENT]
     ]
-    more_button(NAME, ("open", *files, *_MENU), ui, actions, Icon.BARS, side)
-    tip("Menu")
+    widgets.more_button(NAME, ("open", *files, *_MENU), ui, actions, Icon.BARS, side)
+    widgets.tip("Menu")
 
 
 WIDTH_PX = Layout.panel_px  # at 1×, before its edge is dragged
@@ -137,7 +122,7 @@ def _drag_edge(layout: Layout, ui: UiContext) -> Layout:
         io = imgui.get_io()
         wide = (io.display_size.x - io.mouse_pos.x) / ui.scale
         layout = layout.with_panel(wide)
-    if is_double_clicked():
+    if widgets.is_double_clicked():
         layout = layout.with_panel(WIDTH_PX)
     imgui.set_cursor_screen_pos(start)
     return layout
@@ -173,17 +158,17 @@ def _title(
     room = imgui.get_content_region_avail().x
     text = room - 3 * side - 8.0 * scale
     with imgui_ctx.push_font(ui.fonts.bold, 0.0):
-        imgui.text(elide(UNSAVED * has_unsaved(work) + (work.session or facts.title), text))
-    size = f"{with_added(facts.count, facts.added)} splats"
-    small(f"{facts.title}  ·  {size}" if work.session else size, PALETTE.dim, text)
-    tip(f"{facts.title}\n{size}")
+        imgui.text(widgets.elide(UNSAVED * has_unsaved(work) + (work.session or facts.title), text))
+    size = f"{widgets.with_added(facts.count, facts.added)} splats"
+    widgets.small(f"{facts.title}  ·  {size}" if work.session else size, PALETTE.dim, text)
+    widgets.tip(f"{facts.title}\n{size}")
     below = imgui.get_cursor_pos()
     imgui.set_cursor_pos((at.x + room - 3 * side, at.y - 2.0 * scale))
-    actions += ["save"] * icon_button("save", Icon.SAVE, ui, side=side)
-    hint("save")
+    actions += ["save"] * widgets.icon_button("save", Icon.SAVE, ui, side=side)
+    widgets.hint("save")
     imgui.same_line(0.0, 0.0)
-    more_button("share", _SHARES, ui, actions, Icon.SHARE, side)
-    tip("Export and render")
+    widgets.more_button("share", _SHARES, ui, actions, Icon.SHARE, side)
+    widgets.tip("Export and render")
     imgui.same_line(0.0, 0.0)
     _menu_button(recent, side, ui, actions)
     imgui.set_cursor_pos(below)
@@ -205,7 +190,7 @@ def _regions(work: Workspace, ui: UiContext, actions: list[str]) -> Workspace:
     regions, layout = work.view.selection.regions, work.layout
     if not regions:
         return work
-    layout = replace(layout, folded=section("Regions", layout.folded, ui))
+    layout = widgets.section("Regions", layout, ui)
     for i, region in enumerate(regions if "Regions" not in layout.folded else ()):
         with imgui_ctx.push_id(f"region {i}"):
             if _row(i, region, ui, actions):
@@ -215,22 +200,22 @@ def _regions(work: Workspace, ui: UiContext, actions: list[str]) -> Workspace:
 
 def _row(index: int, region: NamedRegion, ui: UiContext, actions: list[str]) -> bool:
     """Eye, swatch, name and count; whether the mouse rests on it."""
-    right, scale = right_edge(), ui.scale
+    right, scale = widgets.right_edge(), ui.scale
     icon = Icon.SHOWN if region.visible else Icon.HIDDEN
-    if icon_button("eye", icon, ui, dim=not region.visible):
+    if widgets.icon_button("eye", icon, ui, dim=not region.visible):
         actions.append(f"show_region:{index}")
-    tip("Tint this region in the picture")
+    widgets.tip("Tint this region in the picture")
     imgui.same_line()
-    swatch(region.color, 1.0, False, ui)
+    widgets.swatch(region.color, 1.0, False, ui)
     tall, canvas = imgui.get_frame_height(), imgui.get_window_draw_list()
     imgui.same_line()
-    count = group_digits(region.count)
+    count = widgets.group_digits(region.count)
     with imgui_ctx.push_font(None, SMALL_PX):
         wide = imgui.calc_text_size(count).x
     room = right - wide - 10.0 * scale - imgui.get_cursor_pos_x()
     naming, storage = imgui.get_id("naming"), imgui.get_state_storage()
     if storage.get_bool(naming):
-        name = typed_name(region.name, room)
+        name = widgets.typed_name(region.name, room)
         storage.set_bool(naming, name is None)
         actions += [f"rename_region:{index}:{name}"] if name else []
         return False
@@ -242,14 +227,14 @@ def _row(index: int, region: NamedRegion, ui: UiContext, actions: list[str]) -> 
         actions.append(f"region:{index}:{mode}")
     resting = imgui.is_item_hovered(imgui.HoveredFlags_.for_tooltip.value)
     color = u32(PALETTE.text if imgui.is_item_hovered() else PALETTE.dim)
-    tip(f"{region.path}\nClick to select; Shift adds, Ctrl subtracts. Right-click: rename, delete")
+    widgets.tip(f"{region.path}\nClick to select; Shift adds, Ctrl subtracts. Right-click: rename, delete")
     if imgui.is_item_clicked(mouse.right.value):
         imgui.open_popup(_OF_REGION)
     above = imgui.get_style().frame_padding.y
-    canvas.add_text((x, y + above), u32(PALETTE.text), elide(region.name, room))
+    canvas.add_text((x, y + above), u32(PALETTE.text), widgets.elide(region.name, room))
     at = (imgui.get_item_rect_max().x - wide, y + above + 1.0 * scale)
     canvas.add_text(ui.fonts.regular, SMALL_PX * scale, at, color, count)
-    for action in menu_items(_OF_REGION, _ITEMS, ui):
+    for action in widgets.menu_items(_OF_REGION, _ITEMS, ui):
         actions += [action.format(index)] if action else []
         storage.set_bool(naming, not action)
     return bool(resting)
@@ -260,11 +245,12 @@ _FOOT = (("timeline", Icon.FILM), ("picture", Icon.PICTURE), ("help", Icon.HELP)
 
 def _footer(work: Workspace, ui: UiContext, actions: list[str]) -> None:
     imgui.separator()
-    right = right_edge()
+    right = widgets.right_edge()
     changes = {"undo": history.next_undo(work.past), "redo": history.next_redo(work.past)}
     named = zip(changes.items(), (Icon.UNDO, Icon.REDO), strict=True)
     steps = [*((name, icon, what) for (name, what), icon in named), ("history", Icon.HISTORY, "")]
-    icon_row(steps, ui, actions, 8.0 * ui.scale, off=[name for name, what in changes.items() if not what])
+    off = [name for name, what in changes.items() if not what]
+    widgets.icon_row(steps, ui, actions, 8.0 * ui.scale, off=off)
     side, gap = imgui.get_frame_height(), 6.0 * ui.scale
     imgui.same_line(right - 3 * side - 2 * gap)
-    icon_row(_FOOT, ui, actions, gap)
+    widgets.icon_row(_FOOT, ui, actions, gap)

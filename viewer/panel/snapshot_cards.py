@@ -9,21 +9,8 @@ from imgui_bundle import imgui, imgui_ctx
 
 from viewer.state.snapshots import compare_sides, pair_of, with_original
 from viewer.state.workspace import Workspace
+from viewer.ui import widgets
 from viewer.ui.context import PALETTE, SMALL_PX, Icon, UiContext, u32
-from viewer.ui.widgets import (
-    drop_down,
-    elide,
-    grip,
-    hint,
-    icon_button,
-    is_entered,
-    menu_items,
-    picture,
-    right_edge,
-    section,
-    tip,
-    typed_name,
-)
 
 COLUMNS = 3
 _MENU = "menu of a snapshot"
@@ -53,14 +40,14 @@ def draw(work: Workspace, textures: Sequence[int], ui: UiContext, actions: list[
     Args:
         textures: GL names of the pictures, that of the original first
     """
-    right = right_edge()
-    work = replace(work, layout=replace(work.layout, folded=section("Snapshots", work.layout.folded, ui)))
+    right = widgets.right_edge()
+    work = replace(work, layout=widgets.section("Snapshots", work.layout, ui))
     name = "Add"
     wide = imgui.calc_text_size(name).x + 2 * imgui.get_style().frame_padding.x
     imgui.same_line(right - wide)
     if imgui.button(f"{name}##snapshot"):
         actions.append("snapshot")
-    hint("snapshot")
+    widgets.hint("snapshot")
     if len(textures) < 2 or "Snapshots" in work.layout.folded:
         return work
     snapshots = with_original(work.snapshots, work.view)
@@ -68,24 +55,10 @@ def draw(work: Workspace, textures: Sequence[int], ui: UiContext, actions: list[
     _pair(cards, compare_sides(work.snapshots, work.view) is not None, ui, actions)
     gap = 6.0 * ui.scale
     each = (imgui.get_content_region_avail().x - (COLUMNS - 1) * gap) / COLUMNS
-    start, dragged = imgui.get_cursor_screen_pos(), ""
     for i in range(len(textures)):
         if i % COLUMNS:
             imgui.same_line(0.0, gap)
-        dragged = _card(i, cards, each, ui, actions) or dragged
-    if dragged:
-        mouse, tall = imgui.get_mouse_pos(), 0.75 * each + SMALL_PX * ui.scale + 2 * gap
-        column = max(0, min(COLUMNS - 1, int((mouse.x - start.x) / (each + gap))))
-        to = max(1, min(len(textures) - 1, COLUMNS * max(0, int((mouse.y - start.y) / tall)) + column))
-        kind, _, index = dragged.partition(":")
-        if kind == "dropped" and to != int(index):
-            actions.append(f"move_snapshot:{index}:{to}")
-        elif kind == "dragged":
-            corner = imgui.ImVec2(start.x + (to % COLUMNS) * (each + gap), start.y + to // COLUMNS * tall)
-            end = (corner.x + each, corner.y + 0.75 * each)
-            imgui.get_window_draw_list().add_rect(
-                corner, end, u32(PALETTE.accent), 4.0 * ui.scale, 3.0 * ui.scale
-            )
+        _card(i, cards, each, ui, actions)
     return work
 
 
@@ -96,34 +69,32 @@ def _pair(cards: _Cards, compared: bool, ui: UiContext, actions: list[str]) -> N
     for slot, chosen in (("a", cards.a), ("b", cards.b)):
         if slot == "b":
             imgui.same_line(0.0, gap)
-            if icon_button("compare snapshots", Icon.SPLIT, ui, dim=not compared):
+            if widgets.icon_button("compare snapshots", Icon.SPLIT, ui, dim=not compared):
                 actions.append("compare_snapshots")
-            hint("compare_snapshots")
+            widgets.hint("compare_snapshots")
             imgui.same_line(0.0, gap)
         imgui.set_next_item_width(wide)
         label = f"{slot.upper()}   {cards.names[chosen]}"
         room = wide - side - 2 * imgui.get_style().frame_padding.x
         help_ = f"Snapshot {slot.upper()}, at the {'left' if slot == 'a' else 'right'} of a comparison"
-        pressed = drop_down(f"##snapshot {slot}", elide(label, room), cards.names, chosen, ui, help_)
+        shown = widgets.elide(label, room)
+        pressed = widgets.drop_down(f"##snapshot {slot}", shown, cards.names, chosen, ui, help_)
         if pressed is not None:
             actions.append(f"choose_snapshot:{slot}:{cards.names[pressed]}")
 
 
-def _card(index: int, cards: _Cards, wide: float, ui: UiContext, actions: list[str]) -> str:
-    """One picture with its name; "dragged:INDEX" while it is moved, "dropped:INDEX" where it is let go."""
+def _card(index: int, cards: _Cards, wide: float, ui: UiContext, actions: list[str]) -> None:
+    """One picture with its name, and its menu."""
     name, badge = cards.names[index], "A" * (index == cards.a) + "B" * (index == cards.b)
     imgui.push_id(index)
     imgui.begin_group()
     at = imgui.get_cursor_screen_pos()
     tall = 0.75 * wide
-    imgui.invisible_button(f"restore{index}", (wide, tall), imgui.ButtonFlags_.enable_nav.value)
-    gesture = "clicked" if is_entered() else grip(ui)
-    dragged = f"{gesture}:{index}" if index and gesture in ("dragged", "dropped") else ""
-    if gesture == "clicked":
+    if imgui.invisible_button(f"restore{index}", (wide, tall), imgui.ButtonFlags_.enable_nav.value):
         actions.append(f"restore:{index}")
     hovered = imgui.is_item_hovered()
-    tip(
-        "Restore. Drag to reorder; right-click: rename, A, B, delete"
+    widgets.tip(
+        "Restore. Right-click: rename, A, B, reorder, delete"
         if index
         else "Restore the original: all sliders at 0"
     )
@@ -132,30 +103,29 @@ def _card(index: int, cards: _Cards, wide: float, ui: UiContext, actions: list[s
     renaming, last = imgui.get_id("renaming"), len(cards.names) - 1
     off = {_ITEMS[3][1]: index > 1, _ITEMS[4][1]: index < last}
     items = _ITEMS if index else _ITEMS[1:3]  # the original is neither renamed nor moved
-    for action in menu_items(_MENU, items, ui, [action for action, can in off.items() if not can]):
+    for action in widgets.menu_items(_MENU, items, ui, [action for action, can in off.items() if not can]):
         imgui.get_state_storage().set_bool(renaming, not action)
         names = {"name": name, "at": index, "before": index - 1, "after": index + 1}
         actions += [action.format_map(names)] if action else []
     canvas, end = imgui.get_window_draw_list(), (at.x + wide, at.y + tall)
-    picture(cards.textures[index], at, end, 4.0 * ui.scale)
-    if hovered or dragged:
+    widgets.picture(cards.textures[index], at, end, 4.0 * ui.scale)
+    if hovered:
         canvas.add_rect(at, end, u32(PALETTE.accent), 4.0 * ui.scale, 2.0 * ui.scale)
     with imgui_ctx.push_font(ui.fonts.bold, SMALL_PX):
         if badge:
             _badge(badge, at, ui)
     with imgui_ctx.push_font(None, SMALL_PX):
         if imgui.get_state_storage().get_bool(renaming):
-            typed = typed_name(name, wide)
+            typed = widgets.typed_name(name, wide)
             imgui.get_state_storage().set_bool(renaming, typed is None)
             actions += [f"name_snapshot:{index}:{typed}"] if typed else []
         else:
-            imgui.text_disabled(elide(name, wide))
+            imgui.text_disabled(widgets.elide(name, wide))
             left = imgui.MouseButton_.left.value
             if index and imgui.is_item_hovered() and imgui.is_mouse_double_clicked(left):
                 imgui.get_state_storage().set_bool(renaming, True)
     imgui.end_group()
     imgui.pop_id()
-    return dragged
 
 
 def _badge(text: str, at: imgui.ImVec2, ui: UiContext) -> None:

@@ -216,12 +216,8 @@ def _drag(
     if imgui.is_item_hovered() or imgui.is_item_active():
         distance, nearest = min(((abs(mouse - ruler.x(f)), f) for f in frames), default=(math.inf, 0))
         under = nearest if distance <= _GRIP_PX * ruler.ui.scale else None
-    storage, held, copies = (
-        imgui.get_state_storage(),
-        imgui.get_id(f"{name}/held"),
-        imgui.get_id(f"{name}/copies"),
-    )
-    to = ruler.frame_at(mouse)
+    storage, to = imgui.get_state_storage(), ruler.frame_at(mouse)
+    held, copies = imgui.get_id(f"{name}/held"), imgui.get_id(f"{name}/copies")
     if imgui.is_item_activated():
         storage.set_int(held, -1 if under is None else under)
         storage.set_int(copies, int(io.key_ctrl))

@@ -438,7 +438,7 @@ ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
     "grid": lambda w, _: replace(w, view=replace(w.view, grid=not w.view.grid)),
     "axes": lambda w, _: replace(w, view=replace(w.view, axes=not w.view.axes)),
     "safe_frame": lambda w, _: replace(w, view=next_frame(w.view)),
-    "help": lambda workspace, _: replace(workspace, help=not workspace.help, query=""),
+    "help": lambda workspace, _: replace(workspace, help=not workspace.help),
     "palette": lambda workspace, _: replace(workspace, palette=-1, query="", help=False),
     "before": lambda w, _: replace(w, before=not w.before),
     "beside": lambda w, _: replace(w, view=toggle_mode(w.view, "beside")),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -13,25 +12,20 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from progdf.camera import Camera
 from progdf.compose.layers import KINDS
-from progdf.field.baked import GradeForm
-from progdf.field.grade import map_drawn
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
 from progdf.rasterize import render
-from progdf.sh import sh0_to_rgb, shade
-from viewer.camera.view_camera import Bounds, Fit, ViewCamera, bounds_of, fit, frame, keep_camera, to_camera
+from progdf.sh import sh0_to_rgb
+from viewer.camera.view_camera import Bounds, Fit, ViewCamera, bounds_of, fit, keep_camera, to_camera
 
 Rgb = tuple[float, float, float]
 
-SIDE_PX, THUMBNAIL_SIDE = 72, 48
+THUMBNAIL_SIDE = 48
 MOST_MEMBERS = 20_000
 """Of a larger region every so-manieth Gaussian is drawn, so that a row unfolds in a fraction of a second."""
 
 _GROUND, _NEAR = 56, 0.7  # of a thumbnail: the gray behind it, 0..255; the share of a framing distance
-_COVERED = 0.95  # transmittance of a pixel that shows the region
-_FROM = (20.0, 200.0)  # degrees around the scene: from before and behind
 
 
 Thumbnail = Callable[[ViewCamera], NDArray[np.uint8]]
@@ -136,35 +130,8 @@ def draw_thumbnail(scene: Gaussians, gdf: Gdf, camera: ViewCamera) -> NDArray[np
     return pixels
 
 
-def _two_sides(region: Gaussians) -> list[Camera]:
-    bounds = bounds_of(region)
-    return [to_camera(frame(ViewCamera(azimuth=azimuth), bounds), SIDE_PX, SIDE_PX) for azimuth in _FROM]
-
-
-def describe_applied(scene: Gaussians, gdf: Gdf) -> str:
-    """What is not shown of a grade that was applied to a region, in one line; "" where all is, to 1/255.
-
-    Colors that turn with the view follow its map as far as their bands can; how far they are off is measured
-    on small renders of the region alone, whose Gaussians have the very colors that the map makes of theirs.
-    """
-    form, lines = gdf.field.origin, []
-    if not gdf.applied or not isinstance(form, GradeForm):
-        return ""
-    if parts := gdf.report["left_out"]:
-        lines.append(f"without its {parts}, which fits the scene it was trained on alone")
-    every = -(-len(gdf.region) // MOST_MEMBERS)
-    region, moved = scene[gdf.region.members[::every]], gdf.field.attributes
-    sh = region.sh[:, :16].clone()
-    for name, bands in (("sh0", sh[:, :1]), ("shN", sh[:, 1:])):
-        if name in moved:
-            bands += moved[name].end[::every].reshape(len(sh), -1, 3)[:, : bands.shape[1]]
-    errors: list[Tensor] = []
-    for camera in _two_sides(region) if sh.shape[1] > 1 else ():
-        toward = torch.nn.functional.normalize(region.means - camera.position, dim=1)
-        drawn = shade(math.isqrt(sh.shape[1]) - 1, toward, region.sh)
-        exact = map_drawn(drawn.T, form.table[-1], form.degree).T.clamp_min(0.0).contiguous()
-        a, b = (render(region, camera, colors=colors) for colors in (exact, sh))
-        errors.append((a.image.clamp(0.0, 1.0) - b.image.clamp(0.0, 1.0))[a.transmittance < _COVERED])
-    if errors and (levels := 255 * float(torch.cat(errors).square().mean().sqrt())) > 1:
-        lines.append(f"pictures are {levels:.1f}/255 (rms) off its map, as its colors turn with the view")
-    return f"{gdf.name} on {gdf.region.name}: {'; '.join(lines)}" if lines else ""
+def describe_applied(gdf: Gdf) -> str:
+    """What is not shown of a grade that was applied to a region, in one line; "" where all is."""
+    parts = gdf.report.get("left_out") if gdf.applied else ""
+    left_out = f"without its {parts}, which fits the scene it was trained on alone"
+    return f"{gdf.name} on {gdf.region.name}: {left_out}" if parts else ""

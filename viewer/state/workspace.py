@@ -135,7 +135,7 @@ class Workspace:
     keyboard: str = ""  # of `PLACES`: the part of the window that has the keyboard, "" for the picture
     keyboard_by: int = 1  # which way it went there
     palette: int | None = None  # the line of the list of commands that Enter takes, −1 as it opens; or None
-    query: str = ""  # what is sought in either list
+    query: str = ""  # what is sought in that list
     history: bool | None = None  # whether the list of the history is open; True as it opens, then False
     message: Message | None = None  # the line at the bottom, or None
     snapshots: tuple[SliderSnapshot, ...] = ()  # kept states, without the original

@@ -129,7 +129,6 @@ class UiContext:
         io.config_input_text_cursor_blink = False  # or an open text field has the window drawn all the time
         io.config_flags |= imgui.ConfigFlags_.nav_enable_keyboard.value  # in lists, menus and the form
         self.context.config_nav_windowing_key_next = self.context.config_nav_windowing_key_prev = 0
-        self.typed = ("", 0.0)  # into the list that is open, and when
         self.keyboard = ""  # the part of the window that has the keyboard, "" for the picture
         self.focused = ""  # the one that was given it last
         self.fonts = _load_fonts(io.fonts)

@@ -226,7 +226,7 @@ TOPICS: dict[str, tuple[Command, ...]] = {
     ),
     "Window and files": (
         Command("palette", "All commands…", "Ctrl+P F3", "Find one by its name", types=True),
-        Command("help", "Keys and mouse", "F1", types=True),
+        Command("help", "Keys and mouse", "F1"),
         Command("keys_file", "Change keys…", "", "The file in which each command has its keys"),
         Command("picture", "Save picture", "F2", "As it is on screen, as PNG"),
         Command("paint_view", "Paint over this view…", "", "In your painting program; saves are shown"),

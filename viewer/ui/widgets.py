@@ -6,9 +6,12 @@ import math
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import TypeVar
 
 from imgui_bundle import imgui, imgui_ctx
+
+from viewer.state.workspace import Layout
 
 from .context import BEHIND, FIXED, PALETTE, SMALL_PX, UNFOCUSED, Icon, Rgba, UiContext, u32
 from .keys import COMMANDS, describe, shortcut
@@ -17,28 +20,26 @@ T = TypeVar("T")
 
 MenuItems = Sequence[str | tuple[str, str, str]]
 IconItems = Sequence[tuple[str, str] | tuple[str, str, str]]
-TYPING_S = 1.0
-"""Between two letters of one word, at most, in a list."""
 _GRIP_PX = 4.0  # what moves no further is a click, at 1×
 
 
-def section(name: str, folded: tuple[str, ...], ui: UiContext) -> tuple[str, ...]:
-    """The heading of a part of the panel, with an arrow; the sections that are folded after this frame."""
+def section(name: str, layout: Layout, ui: UiContext) -> Layout:
+    """The heading of a part of the panel, with an arrow; the layout with it folded or not, as it was left."""
     x, y = imgui.get_cursor_screen_pos()
     with imgui_ctx.push_font(ui.fonts.bold, SMALL_PX):
         text, tall, step = name.upper(), imgui.get_frame_height(), 16.0 * ui.scale
         room = (imgui.calc_text_size(text).x + step, tall + 2.0 * ui.scale)
         pressed = imgui.invisible_button(f"section {name}", room, imgui.ButtonFlags_.enable_nav.value)
-        color, canvas = (
-            u32(PALETTE.text if imgui.is_item_hovered() else PALETTE.dim),
-            imgui.get_window_draw_list(),
-        )
+        color = u32(PALETTE.text if imgui.is_item_hovered() else PALETTE.dim)
+        canvas = imgui.get_window_draw_list()
         canvas.add_text((round(x + step), round(y + 6.0 * ui.scale)), color, text)
+    folded = layout.folded
     arrow = Icon.FOLDED if name in folded else Icon.UNFOLDED
     canvas.add_text((round(x), round(y + 5.0 * ui.scale)), color, arrow)
     if not pressed:
-        return folded
-    return tuple(other for other in folded if other != name) if name in folded else (*folded, name)
+        return layout
+    others = tuple(other for other in folded if other != name)
+    return replace(layout, folded=others if name in folded else (*folded, name))
 
 
 def right_edge() -> float:
@@ -280,8 +281,6 @@ def drop_down(
 ) -> int | None:
     """A list that opens below what it shows; the index that was chosen, or None.
 
-    Arrows, Enter and Escape are imgui's own; letters go to the title that begins with them.
-
     Args:
         name: for imgui, shown nowhere
         shown: of the present choice
@@ -295,11 +294,8 @@ def drop_down(
     if not imgui.begin_combo(name, shown, flags):
         tip(help_)
         return None
-    goal, chosen = _typed_goal(titles, ui), None
+    chosen = None
     for i, title in enumerate(titles):
-        if i == goal:
-            imgui.set_keyboard_focus_here()
-            imgui.set_nav_cursor_visible(True)
         imgui.push_style_color(imgui.Col_.text, PALETTE.faint if i in faint else PALETTE.text)
         if imgui.selectable(f"{title}##{i}", i == current)[0]:
             chosen = i
@@ -310,21 +306,6 @@ def drop_down(
             tip(tips[i])
     imgui.end_combo()
     return chosen
-
-
-def _typed_goal(titles: Sequence[str], ui: UiContext) -> int | None:
-    """The title that begins with what was just typed, None where nothing was."""
-    now, (typed, at) = imgui.get_time(), ui.typed
-    letters = "".join(chr(code) for code in imgui.get_io().input_queue_characters)
-    if now - at > TYPING_S or imgui.is_window_appearing():
-        typed = ""
-    if typed:  # then a blank belongs to the name, and chooses nothing
-        imgui.internal.set_key_owner(imgui.Key.space, imgui.get_id("typed"))
-    if not letters:
-        return None
-    ui.typed = (typed + letters).lstrip(), now
-    begun = ui.typed[0].casefold()
-    return next((i for i, title in enumerate(titles) if begun and title.casefold().startswith(begun)), None)
 
 
 def is_released() -> bool:

@@ -11,7 +11,6 @@ from imgui_bundle import imgui
 
 from tests.helpers.ui_rig import HEAD, Rig, bear, first_view, rig
 from viewer.jobs.job_queue import DeliverOptions
-from viewer.jobs.training import EDITORS
 from viewer.state.selection import NamedRegion
 from viewer.state.workspace import Dialog
 from viewer.ui.keys import KEYS, Keys, Press, next_event_id
@@ -132,25 +131,6 @@ def test_escape_closes_a_list_and_nothing_else(form: Rig) -> None:
     assert not form.main_view.work.form_open
 
 
-def test_letters_go_to_what_begins_with_them(form: Rig) -> None:
-    before = form.main_view.work.view
-    for word, chosen in (("s", "shoes"), ("red j", "red jacket"), ("RED H", "red hat"), ("a", "arm")):
-        form.click(*LIST)
-        form.pause(2.0)
-        type_text(form, word.lower())
-        strike(form, "Enter")
-        assert form.main_view.work.form.region == chosen
-    assert form.main_view.work.view == before
-
-
-def test_an_editor_is_chosen_by_its_first_letters(form: Rig) -> None:
-    form.click(LIST[0], LIST[1] + 31.0)
-    assert list_is_open()
-    type_text(form, "ni")
-    strike(form, "Enter")
-    assert EDITORS[form.main_view.work.form.editor].title == "Night"
-
-
 @pytest.mark.parametrize("what", ["menu", "list", "question", "form"])
 def test_no_shortcut_acts_while_something_is_open(hand: Rig, what: str) -> None:
     if what in ("list", "form"):
@@ -198,16 +178,6 @@ def test_the_menu_goes_by_arrows_into_its_lists_and_out(hand: Rig) -> None:
     strike(hand, "Escape")
     assert not list_is_open()
     assert hand.main_view.work.focus is not None
-
-
-def test_down_leads_from_the_path_into_the_recent_files_and_enter_opens_one(hand: Rig) -> None:
-    hand.main_view.recent = tuple(Path(f"/scenes/{name}.ply") for name in ("a", "b", "c"))
-    hand.main_view.ask(Dialog("open"))
-    hand.frame(4)
-    for chord in ("Down", "Down", "Down", "Up", "Enter"):
-        strike(hand, chord)
-    assert hand.main_view.take_requests()[-1] == "open_file:/scenes/b.ply"
-    assert hand.main_view.work.dialog is None
 
 
 def test_escape_and_enter_in_a_list_of_a_question_leave_the_question(hand: Rig) -> None:

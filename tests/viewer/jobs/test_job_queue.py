@@ -233,7 +233,7 @@ def test_deliveries_go_on_beside_a_training_and_leave_nothing_when_they_are_stop
     assert [job.status for job in queue.jobs] == ["running", "running"]
     log.write_text("frame 3/12\n")
     queue.poll()
-    assert queue.jobs[1].progress == Progress(0.25, "frame 3 of 12")
+    assert queue.jobs[1].progress == Progress(2 / 12, "frame 3/12")
     queue.stop(2)
     assert [(job.number, job.status) for job in queue.poll()] == [(2, "stopped")]
     assert [job.number for job in queue.jobs] == [1]

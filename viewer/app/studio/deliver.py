@@ -57,9 +57,7 @@ class DeliverActions:
             main_view.wake()
 
     def _ask(self, name: str, _: str) -> None:
-        path, main_view = self._app.document.path, self._app.main_view
-        if path is None:
-            raise ProgdfError("there is no scene yet; open one first")
+        path, main_view = self._app.document.file, self._app.main_view
         view, focus = main_view.work.view, main_view.work.focus
         options = self._options.get(name, DeliverOptions())
         if name == "render_film":
@@ -85,21 +83,19 @@ class DeliverActions:
 
     def _rebind(self, file: str, source: str) -> None:
         """Queue what carries an edit of the scene at `source` over to the one that is open."""
-        edit, path, number = Path(file), self._app.document.path, 2
+        edit, scene, number = Path(file), self._app.document.file.resolve(), 2
         out = edit.with_stem(f"{edit.stem}-rebound")
-        if path is None:
-            raise ProgdfError("there is no scene yet; open one first")
         while out.exists():
             out, number = edit.with_stem(f"{edit.stem}-rebound-{number}"), number + 1
         words = (
             "rebind",
             str(edit),
             f"--from={parse_path(source)}",
-            f"--to={path.resolve()}",
+            f"--to={scene}",
             f"--out={out}",
         )
         log = self._queue.folder / f"rebind{len(list(self._queue.folder.iterdir()))}.log"
-        self._queue.add(Delivery(f"Rebinding {edit.name}", out, words, log, path.resolve()))
+        self._queue.add(Delivery(f"Rebinding {edit.name}", out, words, log, scene))
 
     def _start(self, kind: str, dialog: Dialog) -> None:
         out, options = parse_path(dialog.text).resolve(), dialog.options or DeliverOptions()
@@ -130,9 +126,8 @@ class DeliverActions:
             "render_film": ["render", f"--out={out}", size, f"--timeline={stack}"],
         }[kind]
         title = f"{'Exporting' if kind.startswith('export') else 'Rendering'} {out.name}"
-        assert document.path is not None
         self._queue.add(
-            Delivery(title, out, (*words, str(stack)), stack.with_suffix(".log"), document.path.resolve())
+            Delivery(title, out, (*words, str(stack)), stack.with_suffix(".log"), document.file.resolve())
         )
         self._options[kind] = options
 

@@ -219,10 +219,8 @@ class PreviewActions:
         self._sheet_of: _Request | None = None  # the view that is painted
         self._tiles: frozenset[int] = frozenset()  # styles that it was painted in already
         self._drawn: frozenset[int] = frozenset()  # those in the sheet, also of another view
-        self._tile, self._region_sent = (
-            -1,
-            "",
-        )  # the style that is asked for; the region, as the child knows it
+        self._tile = -1  # the style that is asked for
+        self._region_sent = ""  # the region, as the child knows it
         self._painting: PaintedView | None = None
 
     @property
@@ -278,9 +276,7 @@ class PreviewActions:
         Raises:
             ProgdfError: the scene has no file, or the picture cannot be written.
         """
-        main_view, scene = self._app.main_view, self._app.document.path
-        if scene is None:
-            raise ProgdfError("the scene has no file yet; open one first")
+        main_view, scene = self._app.main_view, self._app.document.file
         self._end_live()
         camera, size = main_view.work.view.camera, main_view.picture_size
         folder = training.edits_folder(scene)

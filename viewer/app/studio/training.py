@@ -142,9 +142,7 @@ class JobActions:
         main_view.wake()
 
     def _enqueue(self, form: NewEdit) -> None:
-        scene = self._app.document.path
-        if scene is None:
-            raise ProgdfError("the scene has no file yet; open one first")
+        scene = self._app.document.file
         out = training.free_run(training.edits_folder(scene), form.layer_name)
         region, threads = self.region_spec(form, out.parent, out.name), training.spare_threads()
         model = anchor = ""
@@ -230,9 +228,7 @@ class JobActions:
 
     def _paint_over(self, _: str) -> None:
         """Write the picture where any program can change it, and follow that file from now on."""
-        main_view, scene = self._app.main_view, self._app.document.path
-        if scene is None:
-            raise ProgdfError("the scene has no file yet; open one first")
+        main_view, scene = self._app.main_view, self._app.document.file
         form = main_view.work.form
         run = training.free_run(training.edits_folder(scene), form.layer_name)
         if path := self._write_anchor(form, run):
