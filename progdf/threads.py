@@ -23,7 +23,7 @@ _T = TypeVar("_T")
 MOST_THREADS = torch.get_num_threads()
 
 _thread_count: int | None = None
-_stops = threading.local()
+_local = threading.local()
 
 
 @contextmanager
@@ -66,11 +66,11 @@ class StoppedError(Exception):
 @contextmanager
 def stopped_by(event: threading.Event) -> Iterator[None]:
     """Cancel what this thread does, between two chunks, once the event is set: StoppedError."""
-    _stops.event = event
+    _local.stop = event
     try:
         yield
     finally:
-        del _stops.event
+        del _local.stop
 
 
 def run_chunks(kernel: Callable[[int], _T], chunks: int) -> list[_T]:
@@ -78,21 +78,26 @@ def run_chunks(kernel: Callable[[int], _T], chunks: int) -> list[_T]:
 
     A pool thread that has not begun when this one has run out of chunks is not waited for: waking one takes
     50 µs, as long as a small kernel. Kernels release the interpreter's lock. numba's own parallel loops are
-    no replacement: see docs/experiments.md, The rasterizer's threads.
+    no replacement: see docs/experiments.md, The rasterizer's threads. What a kernel calls this for stays on
+    its thread: the pool is busy with the others, and would keep what it is asked for until they are done.
 
     Returns:
         what the calls returned, by chunk
     """
-    stop: threading.Event | None = getattr(_stops, "event", None)
-    following, results = itertools.count(), {}
+    stop: threading.Event | None = getattr(_local, "stop", None)
+    following, results, is_inner = itertools.count(), {}, getattr(_local, "is_inner", False)
 
     def work() -> None:
-        while (chunk := next(following)) < chunks:
-            if stop is not None and stop.is_set():
-                raise StoppedError
-            results[chunk] = kernel(chunk)
+        _local.is_inner = is_inner or chunks > 1
+        try:
+            while (chunk := next(following)) < chunks:
+                if stop is not None and stop.is_set():
+                    raise StoppedError
+                results[chunk] = kernel(chunk)
+        finally:
+            _local.is_inner = is_inner
 
-    others = [_pool().submit(work) for _ in range(min(threads(), chunks) - 1)]
+    others = [_pool().submit(work) for _ in range(0 if is_inner else min(threads(), chunks) - 1)]
     try:
         work()
     finally:

@@ -10,7 +10,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from progdf.threads import StoppedError, run_chunks, set_threads, stopped_by
+from progdf.threads import StoppedError, _local, run_chunks, set_threads, stopped_by
 
 pytestmark = pytest.mark.usefixtures("two_threads")
 
@@ -108,3 +108,20 @@ def test_what_was_cancelled_stops_between_two_chunks(count: int) -> None:
         run_chunks(one, 100)
     assert len(done) <= count
     assert run_chunks(lambda chunk: chunk, 3) == [0, 1, 2], "the next one goes on"
+
+
+def test_what_a_kernel_asks_for_stays_on_its_thread_and_leaves_nothing_behind() -> None:
+    """Else the pool, busy with others, would hold what was asked for, and its arrays, until all are done."""
+    set_threads(2)
+    seen: list[set[str]] = []
+
+    def inner(chunk: int) -> str:
+        return threading.current_thread().name
+
+    def outer(chunk: int) -> str:
+        seen.append(set(run_chunks(inner, 4)))
+        return threading.current_thread().name
+
+    names = run_chunks(outer, 8)
+    assert sorted(map(tuple, seen)) == sorted((name,) for name in names)
+    assert not _local.is_inner, "what comes after may be shared again"
