@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-import msgspec
 import torch
 import tyro
 
@@ -23,7 +22,6 @@ from progdf.gdf.file import read_gdf
 from progdf.io import session as session_file
 from progdf.io.atomic import read_file
 from progdf.io.cameras import load_cameras
-from progdf.io.json_values import convert_json, decode_json
 from progdf.scene import UpChoice
 from progdf.scene.bounds import is_surrounding, scene_sphere
 from progdf.scene.strays import find_strays
@@ -110,10 +108,6 @@ def _box(corners: tuple[float, ...]) -> str:
     return "box:" + ",".join(f"{corner:.{places}f}" for corner in rounded)
 
 
-TIMELINE_MARK = "progdf_timeline"
-"""The first key of every timeline file of the window, which identifies its kind."""
-
-
 @dataclass(frozen=True)
 class InfoOptions:
     """Show the contents of a scene, a .gdf edit, a session or a camera file. Nothing is written.
@@ -148,7 +142,7 @@ def describe(path: Path, cameras: Path | None = None, up: UpChoice = "auto") -> 
 
 
 def kind_of(path: str | os.PathLike[str]) -> str:
-    """ "scene", "gdf", "session", "timeline" or "cameras", by content, else by name.
+    """ "scene", "gdf", "session" or "cameras", by content, else by name.
 
     Raises:
         ProgdfError: it cannot be read, or is nothing we know.
@@ -161,8 +155,6 @@ def kind_of(path: str | os.PathLike[str]) -> str:
         return "scene"
     if start.lstrip()[:1] == b"{" and f'"{session_file.MARK}"'.encode() in start:
         return "session"
-    if start.lstrip()[:1] == b"{" and f'"{TIMELINE_MARK}"'.encode() in start:
-        return "timeline"
     if start.lstrip()[:1] in (b"{", b"[") or start.startswith(b"\x89PNG"):
         return "cameras"
     if path.suffix.lower() in (".gdf", CUBE):
@@ -225,23 +217,6 @@ def _session_lines(path: Path) -> Iterator[str]:
     yield f"snapshots: {len(session.snapshots)}"
 
 
-def _timeline_lines(path: Path) -> Iterator[str]:
-    try:
-        keys = [key.frame for key in convert_json(decode_json(path.read_bytes()), _Timeline).keys]
-    except ValueError:
-        raise ProgdfError(f"{path} is a damaged timeline; save it again with Ctrl+K in the window") from None
-    yield f"{path.name}: a timeline of the window, {format_count(len(keys), 'key')}"
-    yield f"keys at frames: {_short_text(keys)}"
-
-
-class _Key(msgspec.Struct):
-    frame: int
-
-
-class _Timeline(msgspec.Struct):
-    keys: list[_Key] = []
-
-
 def _describe_field(field: BakedField) -> str:
     """What a field is made of."""
     form = field.origin
@@ -271,7 +246,6 @@ def _camera_lines(path: Path) -> Iterator[str]:
 _DESCRIBE = {
     "gdf": _edit_lines,
     "session": _session_lines,
-    "timeline": _timeline_lines,
     "cameras": _camera_lines,
 }
 

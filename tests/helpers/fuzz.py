@@ -42,7 +42,7 @@ from tests.helpers.scenes import orbit_camera, random_gaussians
 from tests.helpers.sessions import bear_files, saved_session
 from tests.helpers.stacks import recording_of
 from trainer.store.state import StateFolder
-from viewer.files import exports, session, timeline_file
+from viewer.files import exports, session
 from viewer.state.selection import SelectionState, add_region, select
 
 SECONDS, BYTES = 10, 1 << 30
@@ -108,10 +108,6 @@ def inputs(folder: Path, reader: str) -> dict[str, tuple[str, Callable[[Path], A
          "fx": 50.0, "fy": 50.0}
     ]  # fmt: skip
     camera_files = [(folder / "own.json").read_bytes(), json.dumps(nerf).encode(), json.dumps(inria).encode()]
-    timeline = {
-        "progdf_timeline": 1, "fps": 24, "length": 72, "ping_pong": False,
-        "keys": [{"frame": 0, "strengths": {}, "camera": {"pivot": [0, 1, 0], "distance": 4}}, {"frame": 9}],
-    }  # fmt: skip
     write_cube(folder / "a.cube", lattice_colors(3), "colors")
     np.save(folder / "a.npy", np.arange(40, dtype=np.float32))
     exif = Image.Exif()
@@ -151,7 +147,6 @@ def inputs(folder: Path, reader: str) -> dict[str, tuple[str, Callable[[Path], A
         "ply": ("x.ply", load_ply, plys),
         "gdf": ("x.gdf", read_gdf, [changed_gdf(gdf), changed_gdf(gdf), changed_bytes(gdf)]),
         "session": ("s/x.session.json", use_session, both(read(saved))),
-        "timeline": ("x.json", lambda p: timeline_file.load(p, ()), both(json.dumps(timeline).encode())),
         "cameras": ("x.json", load_cameras, [c for content in camera_files for c in both(content)]),
         "cube": ("x.cube", read_cube, [changed_bytes(read(folder / "a.cube"))]),
         "npy": ("x.npy", open_npy, [changed_bytes(read(folder / "a.npy"))]),
@@ -175,7 +170,6 @@ def inputs(folder: Path, reader: str) -> dict[str, tuple[str, Callable[[Path], A
                 changed_gdf(gdf),
                 changed_gdf(gdf),
                 *both(read(saved)),
-                *both(json.dumps(timeline).encode()),
             ],
         ),
     }
@@ -185,7 +179,6 @@ READERS = (
     "ply",
     "gdf",
     "session",
-    "timeline",
     "cameras",
     "cube",
     "npy",

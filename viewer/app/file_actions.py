@@ -23,7 +23,7 @@ from progdf.region import Region, from_mask
 from progdf.threads import all_threads
 from viewer.camera.view_camera import ViewCamera, first_camera, from_camera, to_camera
 from viewer.files import document as documents
-from viewer.files import exports, session, timeline_file
+from viewer.files import exports, session
 from viewer.files.document import Document
 from viewer.files.session import SessionAutosave, WindowSession, session_file
 from viewer.files.user_files import parse_path, read_recent, remember_recent, write_keys
@@ -31,7 +31,6 @@ from viewer.jobs.training import with_picture
 from viewer.state import selection, workspace
 from viewer.state.facts import describe_applied
 from viewer.state.layers import add_layer, duplicate_layer, replace_edit
-from viewer.state.timeline import Player
 from viewer.state.view_state import ViewState, on_another_scene
 from viewer.state.workspace import Dialog, focus_layer, with_camera
 from viewer.ui.keys import COMMANDS, shortcut
@@ -87,18 +86,6 @@ def keep_camera(app: Application, session: Path | None) -> None:
     camera = to_camera(main_view.work.view.camera, *main_view.picture_size)
     path, count = exports.camera(beside, camera, main_view.facts.origin)
     main_view.show_message(f"Saved as camera {count} in {path.resolve()}")
-
-
-def open_timeline(main_view: MainView, path: Path) -> None:
-    """The keys of a file take the place of those there are; undo brings them back.
-
-    Raises:
-        ProgdfError: see `timeline_file.load`.
-    """
-    view = main_view.work.view
-    main_view.change(replace(view, timeline=timeline_file.load(path, view.layers, main_view.facts.origin)))
-    main_view.work = replace(main_view.work, player=Player(shown=True))
-    main_view.show_message(f"Opened {path.name}; press {shortcut('play')} to play it")
 
 
 class EditActions:
@@ -348,7 +335,7 @@ class FileActions:
         self._browser.close()
 
     def _open(self, path: Path, kind: str) -> None:
-        if self._app.main_view.at_start and kind in ("picture", "cameras", "timeline", "gdf"):
+        if self._app.main_view.at_start and kind in ("picture", "cameras", "gdf"):
             raise ProgdfError(f"{path.name} belongs to a scene; open that first")
         main_view = self._app.main_view
         if kind == "picture":
@@ -360,9 +347,6 @@ class FileActions:
             return
         if kind == "cameras":
             look_through(self._app.main_view, path)
-            return
-        if kind == "timeline":
-            open_timeline(self._app.main_view, path)
             return
         if kind == "gdf":
             try:

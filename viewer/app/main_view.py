@@ -500,8 +500,6 @@ class MainView:
 
     def _save(self, request: str, screen: moderngl.Framebuffer) -> str:
         title, view = self.facts.title, replace(self._displayed_view(), camera=self.work.view.camera)
-        if request == "timeline_file":
-            return exports.timeline(self.pictures, title, view, self.facts.origin)
         if request == "window_picture":
             display, density = imgui.get_io().display_size, imgui.get_io().display_framebuffer_scale
             whole = round(display.x * density.x), round(display.y * density.y)

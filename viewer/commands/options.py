@@ -72,9 +72,8 @@ class RenderOptions:
     """The original beside the edited picture, which begins at this share of the width (0.5)."""
     difference: Annotated[str | None, word("[AMPLIFY]", "the session's comparison, else none")] = None
     """What differs from the original, amplified (4), with the PSNR."""
-    timeline: Annotated[Path | None, word("FILE.json", "a still picture")] = None
-    """A film of the keys in this file (Ctrl+K in the window), or in the session: .gif, .mp4, or a folder for
-    .png frames."""
+    timeline: Switch = False
+    """A film of the session's timeline: .gif, .webp, .mp4, or a folder for .png frames."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,9 +89,8 @@ class ExportOptions:
     frames: Annotated[int | None, word("N", "one file")] = None
     """As many steps from the original to the strengths, or of the --timeline: numbered files, of a .usdc its
     time samples."""
-    timeline: Annotated[Path | None, word("FILE.json", "one file")] = None
-    """A scene for each frame of the keys in this file (Ctrl+K in the window), or in the session; its camera
-    is left out."""
+    timeline: Switch = False
+    """A scene for each frame of the session's timeline; its camera is left out."""
     page: OmitArgPrefixes[PageOptions] = PageOptions()
     up: UpChoice = "auto"
     """The axis of the scene that is up in a page; auto: as the edits were trained, else from the ground."""

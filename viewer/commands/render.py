@@ -37,7 +37,7 @@ from progdf.terminal import file_size, format_count, print_line
 from progdf.threads import one_thread
 from viewer.camera import view_camera
 from viewer.camera.view_camera import FARTHEST, Vec3, ViewCamera, bounds_of
-from viewer.files import session, timeline_file
+from viewer.files import session
 from viewer.files.document import Document
 from viewer.files.session import WindowSession
 from viewer.files.web_page import PAGE, PageOptions, write_page
@@ -76,7 +76,7 @@ def export(argv: Sequence[str]) -> int:
     out = options.out
     endings = (end for end in (CUBE, BUNDLE, PAGE) if out.name.lower().endswith(end))
     ending = next(endings, None) or scene_file.written_format(out)
-    several = options.frames is not None or options.timeline is not None
+    several = options.frames is not None or options.timeline
     if several and ending in (CUBE, BUNDLE, PAGE):
         raise ProgdfError(f"--frames and --timeline write a scene again and again, which {out.name} is not")
     if options.frames is not None and not 2 <= options.frames <= scene_file.MOST_FRAMES:
@@ -119,23 +119,23 @@ def _export_frames(options: ExportOptions, opened: OpenStack) -> int:
     """Numbered files, or the time samples of one: steps up to the strengths, or frames of a timeline."""
     out, document, rate = options.out, opened.document, float(Timeline().fps)
     whole = scene_file.written_format(out) == usd.SUFFIX
-    if options.timeline is None:
+    if not options.timeline:
         steps = np.linspace(0.0, 1.0, options.frames or 0).tolist()
         scenes = (_compose(document, opened.view, share, whole) for share in steps)
         what = f"steps from the original to {describe_strengths(opened.view)}"
     else:
-        keys = _keys(options.timeline, opened)
+        keys = _keys(opened)
         if not any(key.strengths for key in keys.keys):
-            raise ProgdfError(f"{options.timeline} moves no slider, so all frames would be alike")
+            raise ProgdfError("--timeline: it moves no slider, so all frames would be alike")
         steps, rate = [*timeline.film_frames(keys)], float(keys.fps)
         if options.frames is not None:
             steps = film.sheet_frames(keys, options.frames)
             rate *= (len(steps) - 1) / keys.length  # it lasts as long
         if len(steps) > scene_file.MOST_FRAMES:
-            raise ProgdfError(f"{options.timeline} has {len(steps)} frames; say how many with --frames N")
+            raise ProgdfError(f"--timeline: it has {len(steps)} frames; say how many with --frames N")
         states = (timeline.state_at(keys, frame, opened.view) for frame in steps)
         scenes = (_compose(document, state, 1.0, whole) for state in states)
-        what = f"frames of {options.timeline}"
+        what = "frames of the timeline"
     for number in range(len(steps)):
         check_not_an_input(scene_file.frame_path(out, number), opened.files)
     paths = scene_file.save_frames(out, scenes, rate)
@@ -195,7 +195,7 @@ def render(argv: Sequence[str]) -> int:
     """`progdf render`: one picture, a comparison, a contact sheet, a sweep or a film."""
     options: RenderOptions = parse(RenderOptions, argv, "progdf render")
     _check_output(options)
-    films = options.sweep is not None or options.timeline is not None or options.turntable is not None
+    films = options.sweep is not None or options.timeline or options.turntable is not None
     one_moves = options.sweep is not None or options.sheet is not None
     opened = open_stack(options.stack, options.drawing, 0.0 if one_moves else 1.0)
     check_not_an_input(options.out, opened.files)
@@ -207,12 +207,12 @@ def render(argv: Sequence[str]) -> int:
     camera = choose_camera(options.viewpoint, scene, gdfs, saved, opened.up)
     swept = _swept_layers(options, opened)
     if films:
-        seen, path = options.viewpoint, options.timeline
+        seen = options.viewpoint
         view = film.with_strengths(view, dict.fromkeys(swept, 0.0))
-        keys = _film(options, opened, view, swept, camera) if path is None else _keys(path, opened)
-        moves = path is not None and timeline.camera_at(keys, 0) is not None
+        keys = _keys(opened) if options.timeline else _film(options, opened, view, swept, camera)
+        moves = options.timeline and timeline.camera_at(keys, 0) is not None
         if moves and (seen.camera or seen.orbit or seen.frame):
-            raise ProgdfError(f"{path} moves the camera; leave out --camera, --orbit and --frame")
+            raise ProgdfError("--timeline moves the camera; leave out --camera, --orbit and --frame")
         with _engine(scene, gdfs, options) as engine:
             print_line(film.write(options.out, keys, view, camera, engine, _say_frames()))
         return 0
@@ -286,15 +286,13 @@ def _comparison(options: RenderOptions, saved: Comparison) -> Comparison:
     return saved
 
 
-def _keys(path: Path, opened: OpenStack) -> Timeline:
-    """The timeline that was asked for: of a file of its own, or of the session."""
-    saved = opened.session
-    if saved is not None and path.exists() and path.samefile(saved):
-        keys = opened.view.timeline
-        if not keys.keys:
-            raise ProgdfError(f"{path} has no keys on its timeline; set some with K in the window")
-        return keys
-    return timeline_file.load(path, opened.view.layers, opened.document.scene.origin)
+def _keys(opened: OpenStack) -> Timeline:
+    """The timeline of the session."""
+    if not opened.view.timeline.keys:
+        raise ProgdfError(
+            "--timeline: there is no key on it; set some with K in the window, and save a session"
+        )
+    return opened.view.timeline
 
 
 def _film(
@@ -372,10 +370,10 @@ def _say_frames() -> film.Advance:
 def _check_output(options: RenderOptions) -> None:
     """Whether the file's name fits what goes into it."""
     suffix = options.out.suffix.lower()
-    given = [name for name in ONE_OF if getattr(options, name) is not None]
+    given = [name for name in ONE_OF if getattr(options, name) not in (None, False)]
     if len(given) > 1:
         raise ProgdfError(f"--{given[0]} and --{given[1]} cannot be combined; give only one of them")
-    if options.sweep is not None or options.turntable is not None or options.timeline is not None:
+    if options.sweep is not None or options.turntable is not None or options.timeline:
         film.check_output(options.out)
     elif suffix in film.ANIMATIONS:
         raise ProgdfError(f"{options.out} holds an animation; say what moves: --sweep NAME or --turntable 4")

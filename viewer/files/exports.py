@@ -1,4 +1,4 @@
-"""Files that the window makes of its work: pictures, timelines, cameras, and regions for `progdf train`.
+"""Files that the window makes of its work: pictures, cameras, and regions for `progdf train`.
 
 A region is NAME.region.npy, the rows of a selection. A session may be a stranger's: of what it names, nothing
 but regular files of that ending in the folders of `region_folders` is ever written or removed.
@@ -31,13 +31,10 @@ from viewer.jobs.training import edits_folder, takes_files
 from viewer.state import selection
 from viewer.state.selection import SUFFIX as REGION_SUFFIX
 from viewer.state.selection import NamedRegion, SelectionState, unpack
-from viewer.state.view_state import ViewState
-
-from . import timeline_file
 
 CAMERAS = ".cameras.json"
 
-REQUESTS = ("picture", "take_view", "window_picture", "timeline_file")
+REQUESTS = ("picture", "take_view", "window_picture")
 """Those that the main view serves."""
 
 
@@ -63,18 +60,6 @@ def picture(folder: Path, title: str, image: NDArray[np.uint8], info: PngInfo | 
         with atomic_write(path) as temporary_file:
             Image.fromarray(image).save(temporary_file, pnginfo=info)
         return path.resolve()
-
-
-def timeline(folder: Path, title: str, view: ViewState, origin: Origin = ZERO) -> str:
-    """Save the keys of `view` under the scene's name; the line that says where, and what for.
-
-    Raises:
-        ProgdfError: it cannot be written.
-    """
-    with _writable(folder, "timeline"):
-        path = free_path(folder, f"{Path(title).stem}_timeline", ".json")
-        timeline_file.save(path, view.timeline, view.layers, origin)
-        return f"Saved {path.resolve()}"
 
 
 def camera(source: Path, viewpoint: Camera, origin: Origin = ZERO) -> tuple[Path, int]:

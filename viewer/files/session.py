@@ -12,6 +12,7 @@ import os
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -39,9 +40,10 @@ from viewer.state.selection import SUFFIX as REGION_SUFFIX
 from viewer.state.selection import check as check_selection
 from viewer.state.selection import pack, take_rows, unpack
 from viewer.state.snapshots import SliderSnapshot
-from viewer.state.view_state import LayerState, ViewState
+from viewer.state.timeline import split_keys
+from viewer.state.view_state import LayerState, Timeline, ViewState
 
-from . import document, exports, timeline_file
+from . import document, exports
 from .document import Document
 
 _log = logging.getLogger(__name__)
@@ -72,7 +74,7 @@ class WindowFile(SessionFile, frozen=True, forbid_unknown_fields=True):
 
     def __post_init__(self) -> None:
         """Every value is one that the window could have made."""
-        timeline_file.check(self.view.timeline, "view.timeline.keys")
+        _check_keys(self.view.timeline, "view.timeline.keys")
         stacks = {"view": self.view.layers}
         stacks |= {f"snapshots[{i}].edit": snapshot.edit.layers for i, snapshot in enumerate(self.snapshots)}
         for where, layers in stacks.items():
@@ -165,8 +167,35 @@ def _move(
 ) -> tuple[ViewState, tuple[SliderSnapshot, ...]]:
     """The same for a scene that lies elsewhere: a session has its cameras in the world."""
     moved = tuple(replace(snapshot, camera=move_camera(snapshot.camera, by)) for snapshot in snapshots)
-    timeline = timeline_file.move_keys(view.timeline, by)
+    timeline = _move_keys(view.timeline, by)
     return replace(view, camera=move_camera(view.camera, by), timeline=timeline), moved
+
+
+def _move_keys(timeline: Timeline, by: Vec3) -> Timeline:
+    """The same film of a scene that lies elsewhere; see `move_camera`."""
+    return replace(
+        timeline,
+        keys=tuple(
+            replace(key, camera=None if key.camera is None else move_camera(key.camera, by))
+            for key in timeline.keys
+        ),
+    )
+
+
+def _check_keys(timeline: Timeline, where: str) -> None:
+    """Whether the keys fit each other and the length.
+
+    Raises:
+        ValueError: they do not; the message names the key.
+    """
+    for i, key in enumerate(timeline.keys):
+        if key.frame > timeline.length:
+            raise ValueError(f"{where}[{i}].frame is {key.frame}, outside 0 to the length, {timeline.length}")
+        if key.camera is not None and not any(key.camera.up):
+            raise ValueError(f"{where}[{i}].camera has an up axis without a direction")
+    rows = [row for key in timeline.keys for row in split_keys(Timeline((key,))) or [(None, key.frame)]]
+    if len(set(rows)) < len(rows) or any(a.frame > b.frame for a, b in pairwise(timeline.keys)):
+        raise ValueError(f"{where} has two keys of one row at one frame, or not in their order")
 
 
 def _with_region_paths(view: ViewState, change: Callable[[Path], Path]) -> ViewState:

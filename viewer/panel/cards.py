@@ -119,43 +119,40 @@ def draw_group(
     What was asked for goes into `actions`.
     """
     scale, folded = ui.scale, group.name in state.collapsed
-    imgui.push_id(f"group {group.name}")
-    imgui.begin_group()
-    right = right_edge() - COMPACT_PX * scale
-    arrow = Icon.FOLDED if folded else Icon.UNFOLDED
-    if icon_button("fold", arrow, ui, side=imgui.get_frame_height()):
-        state = toggle_collapsed(state, group.name)
-    tip("List its layers, or not")
-    imgui.same_line(0.0, 0.0)
-    if icon_button("eye", Icon.SHOWN if group.enabled else Icon.HIDDEN, ui, dim=not group.enabled):
-        state = change_group(state, group.name, lambda old: replace(old, enabled=not old.enabled))
-    tip("Show or hide the group")
-    imgui.same_line(0.0, 4.0 * scale)
-    number = f"{group.strength:.2f}"
-    wide = imgui.calc_text_size(number).x
-    slider_at = right - wide - (SLIDER_PX + 6.0) * scale
-    corner, gesture = _group_name(
-        state, group, count, slider_at - 6.0 * scale - imgui.get_cursor_pos_x(), ui, actions
-    )
-    imgui.same_line(slider_at)
-    imgui.set_cursor_pos_y(imgui.get_cursor_pos_y() + (imgui.get_frame_height() - SLIM_PX * scale) / 2)
-    strength = slider.draw(
-        "##factor",
-        group.strength,
-        (),
-        SLIDER_PX * scale,
-        scale,
-        PALETTE.faint,
-        group.enabled,
-        height=SLIM_PX,
-        default=LayerGroup.strength,
-        help_="What the strengths of its layers are multiplied by. Double-click: reset to 1",
-    )
-    number_at = (imgui.get_item_rect_max().x + 6.0 * scale, corner[1])
-    color = u32(PALETTE.text if group.enabled else PALETTE.dim)
-    imgui.get_window_draw_list().add_text(number_at, color, f"{strength:.2f}")
-    imgui.end_group()
-    imgui.pop_id()
+    with imgui_ctx.push_id(f"group {group.name}"), imgui_ctx.begin_group():
+        right = right_edge() - COMPACT_PX * scale
+        arrow = Icon.FOLDED if folded else Icon.UNFOLDED
+        if icon_button("fold", arrow, ui, side=imgui.get_frame_height()):
+            state = toggle_collapsed(state, group.name)
+        tip("List its layers, or not")
+        imgui.same_line(0.0, 0.0)
+        if icon_button("eye", Icon.SHOWN if group.enabled else Icon.HIDDEN, ui, dim=not group.enabled):
+            state = change_group(state, group.name, lambda old: replace(old, enabled=not old.enabled))
+        tip("Show or hide the group")
+        imgui.same_line(0.0, 4.0 * scale)
+        number = f"{group.strength:.2f}"
+        wide = imgui.calc_text_size(number).x
+        slider_at = right - wide - (SLIDER_PX + 6.0) * scale
+        corner, gesture = _group_name(
+            state, group, count, slider_at - 6.0 * scale - imgui.get_cursor_pos_x(), ui, actions
+        )
+        imgui.same_line(slider_at)
+        imgui.set_cursor_pos_y(imgui.get_cursor_pos_y() + (imgui.get_frame_height() - SLIM_PX * scale) / 2)
+        strength = slider.draw(
+            "##factor",
+            group.strength,
+            (),
+            SLIDER_PX * scale,
+            scale,
+            PALETTE.faint,
+            group.enabled,
+            height=SLIM_PX,
+            default=LayerGroup.strength,
+            help_="What the strengths of its layers are multiplied by. Double-click: reset to 1",
+        )
+        number_at = (imgui.get_item_rect_max().x + 6.0 * scale, corner[1])
+        color = u32(PALETTE.text if group.enabled else PALETTE.dim)
+        imgui.get_window_draw_list().add_text(number_at, color, f"{strength:.2f}")
     if strength == group.strength:
         return state, gesture
     return change_group(state, group.name, lambda old: replace(old, strength=strength)), gesture

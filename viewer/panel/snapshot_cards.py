@@ -86,46 +86,45 @@ def _pair(cards: _Cards, compared: bool, ui: UiContext, actions: list[str]) -> N
 def _card(index: int, cards: _Cards, wide: float, ui: UiContext, actions: list[str]) -> None:
     """One picture with its name, and its menu."""
     name, badge = cards.names[index], "A" * (index == cards.a) + "B" * (index == cards.b)
-    imgui.push_id(index)
-    imgui.begin_group()
-    at = imgui.get_cursor_screen_pos()
-    tall = 0.75 * wide
-    if imgui.invisible_button(f"restore{index}", (wide, tall), imgui.ButtonFlags_.enable_nav.value):
-        actions.append(f"restore:{index}")
-    hovered = imgui.is_item_hovered()
-    widgets.tip(
-        "Restore. Right-click: rename, A, B, reorder, delete"
-        if index
-        else "Restore the original: all sliders at 0"
-    )
-    if imgui.is_item_clicked(imgui.MouseButton_.right.value):
-        imgui.open_popup(_MENU)
-    renaming, last = imgui.get_id("renaming"), len(cards.names) - 1
-    off = {_ITEMS[3][1]: index > 1, _ITEMS[4][1]: index < last}
-    items = _ITEMS if index else _ITEMS[1:3]  # the original is neither renamed nor moved
-    for action in widgets.menu_items(_MENU, items, ui, [action for action, can in off.items() if not can]):
-        imgui.get_state_storage().set_bool(renaming, not action)
-        names = {"name": name, "at": index, "before": index - 1, "after": index + 1}
-        actions += [action.format_map(names)] if action else []
-    canvas, end = imgui.get_window_draw_list(), (at.x + wide, at.y + tall)
-    widgets.picture(cards.textures[index], at, end, 4.0 * ui.scale)
-    if hovered:
-        canvas.add_rect(at, end, u32(PALETTE.accent), 4.0 * ui.scale, 2.0 * ui.scale)
-    with imgui_ctx.push_font(ui.fonts.bold, SMALL_PX):
-        if badge:
-            _badge(badge, at, ui)
-    with imgui_ctx.push_font(None, SMALL_PX):
-        if imgui.get_state_storage().get_bool(renaming):
-            typed = widgets.typed_name(name, wide)
-            imgui.get_state_storage().set_bool(renaming, typed is None)
-            actions += [f"name_snapshot:{index}:{typed}"] if typed else []
-        else:
-            imgui.text_disabled(widgets.elide(name, wide))
-            left = imgui.MouseButton_.left.value
-            if index and imgui.is_item_hovered() and imgui.is_mouse_double_clicked(left):
-                imgui.get_state_storage().set_bool(renaming, True)
-    imgui.end_group()
-    imgui.pop_id()
+    with imgui_ctx.push_id(index), imgui_ctx.begin_group():
+        at = imgui.get_cursor_screen_pos()
+        tall = 0.75 * wide
+        if imgui.invisible_button(f"restore{index}", (wide, tall), imgui.ButtonFlags_.enable_nav.value):
+            actions.append(f"restore:{index}")
+        hovered = imgui.is_item_hovered()
+        widgets.tip(
+            "Restore. Right-click: rename, A, B, reorder, delete"
+            if index
+            else "Restore the original: all sliders at 0"
+        )
+        if imgui.is_item_clicked(imgui.MouseButton_.right.value):
+            imgui.open_popup(_MENU)
+        renaming, last = imgui.get_id("renaming"), len(cards.names) - 1
+        off = {_ITEMS[3][1]: index > 1, _ITEMS[4][1]: index < last}
+        items = _ITEMS if index else _ITEMS[1:3]  # the original is neither renamed nor moved
+        for action in widgets.menu_items(
+            _MENU, items, ui, [action for action, can in off.items() if not can]
+        ):
+            imgui.get_state_storage().set_bool(renaming, not action)
+            names = {"name": name, "at": index, "before": index - 1, "after": index + 1}
+            actions += [action.format_map(names)] if action else []
+        canvas, end = imgui.get_window_draw_list(), (at.x + wide, at.y + tall)
+        widgets.picture(cards.textures[index], at, end, 4.0 * ui.scale)
+        if hovered:
+            canvas.add_rect(at, end, u32(PALETTE.accent), 4.0 * ui.scale, 2.0 * ui.scale)
+        with imgui_ctx.push_font(ui.fonts.bold, SMALL_PX):
+            if badge:
+                _badge(badge, at, ui)
+        with imgui_ctx.push_font(None, SMALL_PX):
+            if imgui.get_state_storage().get_bool(renaming):
+                typed = widgets.typed_name(name, wide)
+                imgui.get_state_storage().set_bool(renaming, typed is None)
+                actions += [f"name_snapshot:{index}:{typed}"] if typed else []
+            else:
+                imgui.text_disabled(widgets.elide(name, wide))
+                left = imgui.MouseButton_.left.value
+                if index and imgui.is_item_hovered() and imgui.is_mouse_double_clicked(left):
+                    imgui.get_state_storage().set_bool(renaming, True)
 
 
 def _badge(text: str, at: imgui.ImVec2, ui: UiContext) -> None:

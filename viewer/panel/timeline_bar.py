@@ -34,7 +34,7 @@ from viewer.ui.widgets import elide, hint, icon_button, icon_row, inert, is_rele
 HEIGHT_PX, ROW_PX = 46.0, 33.0  # at 1×: of the bar, and of a second line
 TRACK_PX, _MOST_SHARE = 20.0, 0.35  # of a row of keys; the rows take at most so much of the picture's height
 ROOMY_PX = 640.0  # a narrower bar has its settings in a second line
-SETTINGS_PX, BUTTONS_PX = 322.0, 143.0
+SETTINGS_PX, BUTTONS_PX = 293.0, 143.0
 _KEY_PX, _GRIP_PX = 5.0, 8.0  # half a key's size; so near to a key the mouse takes it
 _CURVE_PX, _GAP_PX = 3.0, 4.0  # from point to point; under the rows
 _NICE = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
@@ -176,11 +176,6 @@ def _settings(work: Workspace, ruler: _Ruler, actions: list[str]) -> None:
     if imgui.button("Film…"):
         actions.append("render_film")
     hint("render_film")
-    imgui.same_line(0.0, gap)
-    with inert(not timeline.keys):
-        if icon_button("timeline_file", icons.ICON_FA_FILE_EXPORT, ui, dim=not timeline.keys):
-            actions.append("timeline_file")
-    hint("timeline_file")
     imgui.same_line(0.0, gap)
     frame = work.view.safe_frame
     if icon_button("safe_frame", icons.ICON_FA_CROP_SIMPLE, ui, dim=not frame):

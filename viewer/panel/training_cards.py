@@ -133,7 +133,8 @@ def _bar(share: float, color: Rgba, ui: UiContext) -> None:
 
 def _foot(job: Job, right: float, menu: bool, ui: UiContext) -> list[str]:
     """What it does, or why it failed; at the right its buttons."""
-    buttons = (*_buttons(job), *[(Icon.MENU, _MENU, "Log, discard (right-click)")] * menu)
+    offered = _BUTTONS.get((job.status, isinstance(job.task, EditOrder)), ())
+    buttons = (*offered, *[(Icon.MENU, _MENU, "Log, discard (right-click)")] * menu)
     with imgui_ctx.push_font(None, SMALL_PX):
         around = 2 * imgui.get_style().frame_padding.x
         widths = [imgui.calc_text_size(text).x + around for text, _, _ in buttons]
@@ -177,28 +178,18 @@ def _status_text(job: Job) -> str:
     return f"{100 * progress.share:.0f} % is done" if progress.share else "Can go on where it was"
 
 
-def _buttons(job: Job) -> tuple[tuple[str, str, str], ...]:
-    """Text, action and help."""
-    trains = isinstance(job.task, EditOrder)
-    match job.status:
-        case "running":
-            return (
-                ("Stop", "stop_run", "Stop; it can be resumed, also another day" if trains else _UNWRITTEN),
-            )
-        case "queued":
-            return (("Cancel", "stop_run", "Take it off the queue"),)
-        case "stopped":
-            return (("Resume", "resume_run", "Go on where it was stopped"),)
-        case "failed" if trains:
-            return (("Retry", "resume_run", "Try again"),)
-        case "failed":
-            return (("Close", "close_run", ""),)
-        case "done" if trains:
-            return (("Close", "close_run", "Takes the card away; the edit stays"),)
-        case "done":
-            return (
-                ("Show in folder", "show_file", ""),
-                ("Copy path", "copy_path", ""),
-                ("Close", "close_run", "Takes the card away; the file stays"),
-            )
-    return ()
+_RUNS = "Stop; it can be resumed, also another day"
+_CANCEL = ("Cancel", "stop_run", "Take it off the queue")
+_CLOSE = ("Close", "close_run", "Take the card away; what was made stays")
+_BUTTONS = {
+    ("running", True): (("Stop", "stop_run", _RUNS),),
+    ("running", False): (("Stop", "stop_run", _UNWRITTEN),),
+    ("queued", True): (_CANCEL,),
+    ("queued", False): (_CANCEL,),
+    ("stopped", True): (("Resume", "resume_run", "Go on where it was stopped"),),
+    ("failed", True): (("Retry", "resume_run", "Try again"),),
+    ("failed", False): (_CLOSE,),
+    ("done", True): (_CLOSE,),
+    ("done", False): (("Show in folder", "show_file", ""), ("Copy path", "copy_path", ""), _CLOSE),
+}
+"""Text, action and help by status, of a training or of what is delivered."""

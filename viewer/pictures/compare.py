@@ -209,10 +209,9 @@ class Comparer:
     def _draw_sides(
         self, view: ViewState, framebuffer: moderngl.Framebuffer, size: tuple[int, int], pixels: int
     ) -> FrameTimings:
-        new, other, its_view = self.needs_draw(view, size, pixels), self._second(), self._other_view(view)
-        camera = None
+        other, its_view = self._second(), self._other_view(view)
+        self.psnr = math.nan  # of no use: an edit shall differ
         if view.compare.mode == "beside":
-            camera = half_camera(to_camera(view.camera, *size))
             edited = self.engine.draw(view, framebuffer, size, pixels, half=1)
             original = other.draw(its_view, framebuffer, size, pixels, half=0)
         else:
@@ -222,10 +221,6 @@ class Comparer:
                 original = other.draw(its_view, framebuffer, size, pixels)
             finally:
                 framebuffer.scissor = None  # type: ignore[assignment]  # its annotation forgets None
-        if new and pixels == 1 and self.sides:
-            self.psnr = _psnr(other.image(its_view, size, camera), self.engine.image(view, size, camera))
-        elif new:
-            self.psnr = math.nan  # of no use: an edit shall differ, and a coarse picture hides errors
         return _add_timings(edited, original)
 
     def _draw_difference(

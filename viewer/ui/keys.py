@@ -217,7 +217,6 @@ TOPICS: dict[str, tuple[Command, ...]] = {
         Command("easing", "Smooth, linear, hold", "Shift+K", "From the keyframe at or before the playhead"),
         Command("ping_pong", "Ping-pong", "Alt+K", row="Ping-pong; Ctrl auto-key"),
         Command("auto_key", "Auto-key", "Ctrl+Alt+K", "A dragged slider gets a keyframe", row=JOINED),
-        Command("timeline_file", "Save timeline as file", "Ctrl+K"),
         Command(
             "timeline", "Timeline", "T", "Animate the camera and the strengths", row="Timeline; Alt its rows"
         ),

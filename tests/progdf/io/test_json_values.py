@@ -13,7 +13,6 @@ from progdf.io.json_values import DEEPEST, decode_json
 from progdf.io.session import SessionFile, read_session
 from tests.helpers.hostile import JSON_TEXTS
 from trainer.store.state import StateFolder
-from viewer.files import timeline_file
 
 
 @pytest.mark.parametrize("content", JSON_TEXTS.values(), ids=JSON_TEXTS.keys())
@@ -39,16 +38,15 @@ def test_ordinary_values_come_as_they_are() -> None:
     "frame",
     [
         '{"progdf_session": 1, "scene": {"file": "a", "sha256": ""}, "view": {"layers": %s}}',
-        '{"progdf_timeline": 1, "keys": [{"frame": %s}]}',
         '{"cameras": [{"width": 4, "height": 4, "K": %s}]}',
     ],
-    ids=["session", "timeline", "cameras"],
+    ids=["session", "cameras"],
 )
 def test_every_reader_refuses_it_in_one_line(frame: str, content: str, tmp_path: Path) -> None:
     path = tmp_path / "a.json"
     path.write_text(frame % content)
     readers = [lambda: info([str(path)]), lambda: load_cameras(path), lambda: read_session(path, SessionFile)]
-    for read in [*readers, lambda: timeline_file.load(path, ())]:
+    for read in readers:
         with pytest.raises(ProgdfError) as refused:
             read()
         assert "\n" not in str(refused.value)

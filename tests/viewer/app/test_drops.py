@@ -19,9 +19,8 @@ from progdf.io.picture_camera import camera_chunk
 from tests.helpers.ui_rig import bear, first_view
 from viewer.app import app as application
 from viewer.camera.view_camera import to_camera
-from viewer.files import exports, timeline_file
+from viewer.files import exports
 from viewer.state import selection
-from viewer.state.view_state import Keyframe, Timeline
 
 
 @pytest.fixture
@@ -78,24 +77,6 @@ def test_a_dropped_table_goes_on_what_is_selected_else_everywhere_and_in_a_layer
     assert [row.region for row in opened.main_view.facts.rows][1:] == ["all", "selection"]
     opened.handle(f"replace_by:0:{tmp_path / 'look.cube'}")
     assert opened.document.gdfs[-1].region == opened.document.gdfs[0].region
-
-
-@pytest.mark.gl
-def test_a_dropped_timeline_is_ready_to_play_and_can_be_undone(
-    opened: application.App, tmp_path: Path
-) -> None:
-    layers = opened.main_view.work.view.layers
-    keys = (Keyframe(0, ((0, 0.0),)), Keyframe(9, ((0, 1.0),)))
-    timeline_file.save(tmp_path / "film.json", Timeline(keys, 9), layers)
-    opened.open(tmp_path / "film.json")
-    opened.draw()
-    assert opened.main_view.work.view.timeline.keys == keys
-    assert opened.main_view.work.player.shown
-    assert len(opened.main_view.work.past.past) == 1
-    save_ply(tmp_path / "half.ply", bear().scene[:700])
-    opened.main_view.restart(opened.main_view.work.view)
-    opened.open(tmp_path / "half.ply")
-    assert opened.main_view.work.view.timeline == Timeline()
 
 
 @pytest.mark.gl

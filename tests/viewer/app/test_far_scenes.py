@@ -19,8 +19,8 @@ from tests.helpers.null_app import null_app, press
 from tests.helpers.ply_files import moved_columns, write
 from tests.helpers.ui_rig import bear, first_view
 from viewer.app import app as application
-from viewer.camera.view_camera import move_camera, to_camera
-from viewer.files import document, session, timeline_file
+from viewer.camera.view_camera import to_camera
+from viewer.files import document, session
 from viewer.files.session import WindowSession
 from viewer.state import snapshots, workspace
 from viewer.state.view_state import Keyframe, Timeline, ViewState
@@ -74,18 +74,6 @@ def test_a_session_of_a_scene_near_zero_is_what_it_was(tmp_path: Path) -> None:
     text = json.loads((tmp_path / "near.session.json").read_text())
     assert text["view"]["camera"]["pivot"] == list(seen.camera.pivot)
     assert session.open_session(tmp_path / "near.session.json").view == seen
-
-
-def test_a_timeline_file_has_its_cameras_in_the_world(tmp_path: Path) -> None:
-    seen = view()
-    timeline_file.save(tmp_path / "film.json", seen.timeline, seen.layers, FAR)
-    camera = seen.timeline.keys[1].camera
-    assert camera is not None
-    moved = timeline_file.load(tmp_path / "film.json", seen.layers).keys[1].camera
-    assert moved == move_camera(camera, FAR)
-    back = timeline_file.load(tmp_path / "film.json", seen.layers, FAR).keys[1].camera
-    assert back is not None
-    assert np.allclose(back.pivot, camera.pivot, rtol=0, atol=1e-9)
 
 
 @pytest.mark.gl

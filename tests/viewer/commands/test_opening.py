@@ -28,12 +28,13 @@ from tests.helpers.edits import edit_of
 from tests.helpers.scenes import random_gaussians
 from tests.helpers.sessions import full_view
 from tests.helpers.ui_rig import bear
+from viewer.camera.view_camera import ViewCamera
 from viewer.files import document, session
 from viewer.files.session import WindowSession
 from viewer.pictures import film
 from viewer.render.engine import ViewEngine
 from viewer.state import timeline
-from viewer.state.view_state import Comparison, LayerState, Timeline, ViewState
+from viewer.state.view_state import Comparison, Keyframe, LayerState, Timeline, ViewState
 
 SMALL = ("--size", "64x48", "--engine", "cpu")
 
@@ -194,7 +195,7 @@ def filmed(moving: bool) -> ViewState:
 def test_the_sessions_own_timeline_can_be_filmed(here: Path) -> None:
     view = filmed(moving=True)
     saved(here, view)
-    given = ("render", "--session", "work.session.json", "--timeline", "work.session.json", *SMALL)
+    given = ("render", "--session", "work.session.json", "--timeline", *SMALL)
     assert run(*given, "-o", "frames") == 0
     assert len(list(Path("frames").iterdir())) == 9
     expected = ViewEngine(None, bear().scene, bear().gdfs).image(
@@ -209,9 +210,9 @@ def test_the_sliders_of_a_timeline_are_numbered_scenes_as_the_film_draws_them(
 ) -> None:
     view = filmed(moving=True)
     saved(here, view)
-    given = ("export", "work.session.json", "--timeline", "work.session.json")
+    given = ("export", "work.session.json", "--timeline")
     assert run(*given, "-o", "film.PLY") == 0
-    assert "film_000.PLY to film_008.PLY: 9 frames of work.session.json" in capsys.readouterr().out
+    assert "film_000.PLY to film_008.PLY: 9 frames of the timeline" in capsys.readouterr().out
     assert run(*given, "--frames", "3", "-o", "few.ply") == 0
     engine = ViewEngine(None, bear().scene, bear().gdfs)
     for frame, file in ((0, "few_000.ply"), (4, "few_001.ply"), (5, "film_005.PLY"), (8, "few_002.ply")):
@@ -223,7 +224,7 @@ def test_the_sliders_of_a_timeline_are_numbered_scenes_as_the_film_draws_them(
 def test_a_timeline_is_time_samples_of_its_own_pace(here: Path) -> None:
     usd = pytest.importorskip("pxr.Usd", reason="pip install progdf-studio[usd]")
     saved(here, replace(view := filmed(moving=False), timeline=replace(view.timeline, fps=12)))
-    given = ("export", "work.session.json", "--timeline", "work.session.json")
+    given = ("export", "work.session.json", "--timeline")
     for more, rate, last in (((), 12.0, 8.0), (("--frames", "3"), 3.0, 2.0)):
         assert run(*given, *more, "-o", f"{rate}.usdc") == 0
         stage = usd.Stage.Open(f"{rate}.usdc")
@@ -235,7 +236,7 @@ def test_frames_replace_no_file_that_is_read_and_half_of_them_are_none(
 ) -> None:
     saved(here, filmed(moving=False))
     Path("same_001.ply").symlink_to("bear.ply")
-    given = ("work.session.json", "--timeline", "work.session.json")
+    given = ("work.session.json", "--timeline")
     assert run("export", *given, "-o", "same.ply") == 2
     assert "same_001.ply is one of the files to read" in capsys.readouterr().err
     whole = scene_file.save_scene
@@ -252,21 +253,19 @@ def test_frames_replace_no_file_that_is_read_and_half_of_them_are_none(
 
 
 @pytest.mark.parametrize(
-    ("keys", "length", "said"),
+    ("keys", "said"),
     [
-        ('{"frame": 0, "camera": {}}', 8, "moves no slider"),
-        ('{"frame": 0, "strengths": {"scarf": 0}}', 2000, "has 2001 frames; say how many with --frames"),
+        (Timeline((Keyframe(0, camera=ViewCamera()),), 8), "moves no slider"),
+        (Timeline((Keyframe(0, ((0, 0.0),)),), 2000), "has 2001 frames; say how many with --frames"),
     ],
 )
 def test_what_is_no_sequence_is_one_line(
-    here: Path, keys: str, length: int, said: str, capsys: pytest.CaptureFixture[str]
+    here: Path, keys: Timeline, said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    bear().save(here)
-    text = f'{{"progdf_timeline": 1, "length": {length}, "keys": [{keys}]}}'
-    Path("film.json").write_text(text, encoding="utf-8")
-    assert run("export", "bear.ply", "scarf.gdf", "--timeline", "film.json", "-o", "a.ply") == 2
+    saved(here, replace(full_view(), timeline=keys))
+    assert run("export", "work.session.json", "--timeline", "-o", "a.ply") == 2
     assert said in capsys.readouterr().err
-    assert run("export", "bear.ply", "scarf.gdf", "--timeline", "film.json", "-o", "a.html") == 2
+    assert run("export", "work.session.json", "--timeline", "-o", "a.html") == 2
 
 
 @pytest.mark.parametrize("count", [1, 2, 7, 30])
@@ -281,7 +280,7 @@ def test_steps_of_a_film_are_no_frame_twice(count: int) -> None:
 
 def test_a_sheet_of_a_film_is_one_line(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     saved(here, filmed(moving=True))
-    film_of = ("--timeline", "work.session.json", "--sheet", "ears")
+    film_of = ("--timeline", "--sheet", "ears")
     assert run("render", "work.session.json", *film_of, *SMALL, "-o", "x.png") == 2
     assert "--sheet and --timeline cannot be combined; give only one of them" in capsys.readouterr().err
     assert not list(here.glob("x.*"))
@@ -289,8 +288,8 @@ def test_a_sheet_of_a_film_is_one_line(here: Path, capsys: pytest.CaptureFixture
 
 def test_a_session_without_keys_cannot_be_filmed(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     saved(here, replace(full_view(), timeline=Timeline()))
-    assert run("render", "work.session.json", "--timeline", "work.session.json", "-o", "a.gif") == 2
-    assert "has no keys on its timeline" in capsys.readouterr().err
+    assert run("render", "work.session.json", "--timeline", "-o", "a.gif") == 2
+    assert "there is no key on it" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("command", ["view", "render", "export"])

@@ -20,7 +20,8 @@ from progdf.errors import ProgdfError
 from progdf.io.atomic import temporary_subfolder
 from tests.helpers.full_disk import files_up_to
 from tests.helpers.ui_rig import STEP_S, Rig, bear, first_view, rig
-from viewer.files import timeline_file
+from viewer.files import document, session
+from viewer.files.session import WindowSession
 from viewer.panel import panel, timeline_bar
 from viewer.pictures import film
 from viewer.state import timeline
@@ -226,29 +227,26 @@ def test_hiding_the_interface_hides_the_bar(hand: Rig) -> None:
         assert np.array_equal(shown, bare.image()[-40:, :100])
 
 
-def test_ctrl_k_saves_the_timeline_and_render_makes_the_frames_of_it_that_the_window_showed(
-    hand: Rig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    hand.key("Ctrl+K")
-    saved = tmp_path / "bear_timeline_001.json"
+def save_session(path: Path, view: ViewState) -> None:
+    """A session of the bear and its edits, which are saved beside it."""
+    scene, *gdfs = bear().save(path.parent)
+    session.save(path, WindowSession(document.load(scene, gdfs), view))
+
+
+def test_render_makes_the_frames_of_a_session_that_the_window_showed(hand: Rig, tmp_path: Path) -> None:
     view = hand.main_view.work.view
-    assert timeline_file.load(saved, view.layers) == view.timeline
-    message = hand.main_view.work.message
-    assert message is not None
-    assert saved.name in message.text
-    monkeypatch.chdir(tmp_path)
-    scene, *gdfs = (str(path) for path in bear().save(tmp_path))
-    blue = "#" + "".join(f"{round(255 * c):02x}" for c in view.background)
-    command = ("render", scene, *gdfs, "--timeline", str(saved), "--background", blue, *SMALL)
-    assert main([*command, "-o", "shown"]) == 0
-    assert main([*command, "-o", "again"]) == 0
-    names = sorted(path.name for path in Path("shown").iterdir())
+    save_session(tmp_path / "film.session.json", view)
+    command = ("render", str(tmp_path / "film.session.json"), "--timeline", *SMALL)
+    assert main([*command, "-o", str(tmp_path / "shown")]) == 0
+    assert main([*command, "-o", str(tmp_path / "again")]) == 0
+    names = sorted(path.name for path in (tmp_path / "shown").iterdir())
     assert names == [f"frame_{i:04d}.png" for i in range(41)]
-    assert all((Path("shown") / n).read_bytes() == (Path("again") / n).read_bytes() for n in names)
+    shown, again = tmp_path / "shown", tmp_path / "again"
+    assert all((shown / n).read_bytes() == (again / n).read_bytes() for n in names)
     for frame in (0, 13, 20):
         state = timeline.state_at(view.timeline, frame, view)
         expected = film.to_pixels(hand.main_view.engine.image(state, (64, 48)))
-        found = np.asarray(Image.open(f"shown/frame_{frame:04d}.png"))
+        found = np.asarray(Image.open(shown / f"frame_{frame:04d}.png"))
         assert np.abs(found.astype(int) - expected).max() <= 1
 
 
@@ -256,11 +254,10 @@ def test_ctrl_k_saves_the_timeline_and_render_makes_the_frames_of_it_that_the_wi
 def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
     """`progdf render` of a film of four frames of the scarf, without a moving camera."""
     monkeypatch.chdir(tmp_path)
-    bear().save(tmp_path)
     keys = (Keyframe(0, ((0, 0.0),)), Keyframe(3, ((0, 1.0),), easing="linear"))
     view = first_view(bear(), 0.0, 0.0)
-    timeline_file.save(Path("film.json"), Timeline(keys, 3, fps=24), view.layers)
-    given = ("render", "bear.ply", "scarf.gdf", "ears.gdf", "--timeline", "film.json", *SMALL)
+    save_session(Path("film.session.json"), replace(view, timeline=Timeline(keys, 3, fps=24)))
+    given = ("render", "film.session.json", "--timeline", *SMALL)
     return lambda *arguments: main([*given, *arguments])
 
 
@@ -300,7 +297,6 @@ def test_a_film_as_mp4_has_every_frame_at_its_size(run: Callable[..., int]) -> N
         (("-o", "/proc/frames"), "/proc/frames cannot be written ("),
         (("-o", "dangling"), "dangling exists and is not an empty folder"),
         (("-o", "x.gif", "--sweep", "scarf"), "cannot be combined"),
-        (("-o", "x.gif", "--orbit", "0,0", "--timeline", "moving.json"), "moving.json moves the camera"),
     ],
 )
 def test_a_film_that_cannot_be_made_is_one_line_and_leaves_no_file(
@@ -309,14 +305,21 @@ def test_a_film_that_cannot_be_made_is_one_line_and_leaves_no_file(
     Path("taken").mkdir()
     Path("taken/notes.txt").write_text("mine")
     Path("dangling").symlink_to("nowhere")
-    view = keyed()
-    timeline_file.save(Path("moving.json"), view.timeline, view.layers)
     before = sorted(Path().iterdir())
     assert run(*arguments) == 2
     error = capsys.readouterr().err
     assert told in error
     assert error.count("\n") == 1
     assert sorted(Path().iterdir()) == before
+
+
+def test_a_film_that_moves_the_camera_takes_no_other(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_session(tmp_path / "moving.session.json", keyed())
+    command = ("render", str(tmp_path / "moving.session.json"), "--timeline", "--orbit", "0,0")
+    assert main([*command, "-o", str(tmp_path / "x.gif")]) == 2
+    assert "--timeline moves the camera; leave out --camera, --orbit" in capsys.readouterr().err
 
 
 def test_an_empty_folder_is_filled_where_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from progdf.cli.info import kind_of
-from progdf.errors import ProgdfError
 from viewer.camera import views
 from viewer.camera.view_camera import Bounds, ViewCamera, axes, cross, dot, to_camera
-from viewer.files import timeline_file
 from viewer.state import history, timeline, workspace
 from viewer.state.actions import ACTIONS, perform
 from viewer.state.facts import LayerRow
@@ -313,11 +308,9 @@ def test_one_rows_key_is_moved_and_the_other_rows_stay() -> None:
     assert act(moved, "undo").view.timeline == work.view.timeline
 
 
-def test_keys_of_one_frame_go_on_each_in_its_own_way_also_in_a_file(tmp_path: Path) -> None:
+def test_keys_of_one_frame_go_on_each_in_its_own_way() -> None:
     made = timeline.set_easing(two_keys("linear"), [(0, 0)], "hold")
     assert timeline.strengths_at(made, 10) == {0: 0.0, 1: 0.75}
-    timeline_file.save(tmp_path / "film.json", made, LAYERS)
-    assert timeline_file.load(tmp_path / "film.json", LAYERS) == made
 
 
 def test_copied_keys_are_pasted_at_the_playhead_in_place_of_what_stands_there() -> None:
@@ -403,66 +396,3 @@ def test_every_action_of_the_timeline_that_a_key_names_exists() -> None:
     named = {key.action.partition(":")[0] for key in KEYS.values()}
     assert {"key", "drop_key", "play", "step", "jump", "easing", "ping_pong", "timeline"} <= named
     assert set(timeline.ACTIONS) <= set(ACTIONS)
-
-
-def test_a_timeline_in_a_file_comes_back_whole_under_its_edits_names(tmp_path: Path) -> None:
-    made = replace(two_keys("hold"), ping_pong=True, fps=30)
-    timeline_file.save(tmp_path / "film.json", made, LAYERS)
-    assert timeline_file.load(tmp_path / "film.json", LAYERS) == made
-    swapped = (replace(LAYERS[0], gdf=1), replace(LAYERS[1], gdf=0))
-    other = timeline_file.load(tmp_path / "film.json", swapped)
-    assert dict(other.keys[1].strengths) == {1: 1.0, 0: 0.5}
-    assert next(iter(json.loads((tmp_path / "film.json").read_text()))) == "progdf_timeline"
-    assert kind_of(tmp_path / "film.json") == "timeline"
-
-
-def test_a_file_written_by_hand_needs_only_frames_and_strengths(tmp_path: Path) -> None:
-    path = tmp_path / "film.json"
-    keys = [{"frame": 10, "strengths": {"scarf": 1}}, {"frame": 0, "strengths": {"scarf": 0}}]
-    path.write_text(json.dumps({"progdf_timeline": 1, "length": 10, "keys": keys}))
-    found = timeline_file.load(path, LAYERS)
-    assert [key.frame for key in found.keys] == [0, 10]
-    assert timeline.camera_at(found, 5) is None
-    assert timeline.strengths_at(found, 5) == {0: pytest.approx(0.5)}
-
-
-@pytest.mark.parametrize(
-    ("change", "told"),
-    [
-        ({"progdf_timeline": 2}, "version 2"),
-        ({"keys": [{"frame": 0, "strengths": {"hat": 1.0}}]}, "'hat', which is not open"),
-        ({"keys": [{"frame": 0, "strengths": {"ears": 7.0}}]}, "is {'ears': 7.0}, expected float <= 1.2"),
-        ({"keys": [{"frame": 99}]}, "outside 0 to the length"),
-        ({"keys": [{"frame": 1}, {"frame": 1}]}, "two keys of one row at one frame"),
-        ({"keys": [{"frame": 0, "easing": "bouncy"}]}, "is 'bouncy', expected one of (smooth|linear|hold)"),
-        ({"keys": [{"frame": 0, "camera": {"distance": 0.0}}]}, "camera.distance is 0.0, expected float > 0"),
-        ({"keys": [{"frame": 0, "camera": {"elevation": 91.0}}]}, "elevation is 91.0, expected float <= 90"),
-        ({"keys": [{"frame": 0, "camera": {"up": [0, 0, 0]}}]}, "up axis"),
-        ({"keys": [{"frame": 0.5}]}, "frame"),
-        ({"fps": 0}, "fps is 0, expected int >= 1"),
-        ({"music": "loud"}, "music is unknown"),
-    ],
-)
-def test_a_mistake_in_a_file_is_one_line_that_names_it(
-    change: dict[str, object], told: str, tmp_path: Path
-) -> None:
-    path = tmp_path / "film.json"
-    path.write_text(json.dumps({"progdf_timeline": 1, **change}))
-    with pytest.raises(ProgdfError) as raised:
-        timeline_file.load(path, LAYERS)
-    assert told in str(raised.value)
-    assert "film.json" in str(raised.value)
-    assert "\n" not in str(raised.value)
-
-
-@pytest.mark.parametrize("content", ["", "{", "[]", '{"a": 1}', "[" * 100_000, "\x00\xff"])
-def test_what_is_no_timeline_is_refused_in_one_line(content: str, tmp_path: Path) -> None:
-    path = tmp_path / "film.json"
-    path.write_text(content)
-    with pytest.raises(ProgdfError, match="is not a timeline"):
-        timeline_file.load(path, LAYERS)
-
-
-def test_a_file_that_is_missing_is_one_line(tmp_path: Path) -> None:
-    with pytest.raises(ProgdfError, match="does not exist"):
-        timeline_file.load(tmp_path / "none.json", LAYERS)

@@ -123,7 +123,7 @@ class DeliverActions:
             "export": ["export", f"--out={out}"],
             "export_page": ["export", f"--out={out}", f"--title={Path(document.title).stem}"],
             "render_picture": ["render", f"--out={out}", size, *["--alpha"] * options.alpha],
-            "render_film": ["render", f"--out={out}", size, f"--timeline={stack}"],
+            "render_film": ["render", f"--out={out}", size, "--timeline"],
         }[kind]
         title = f"{'Exporting' if kind.startswith('export') else 'Rendering'} {out.name}"
         self._queue.add(

@@ -26,7 +26,7 @@ from progdf.errors import ProgdfError, without_commands
 from progdf.gdf.file import Gdf, load_gdf
 from progdf.io.atomic import make_folder
 from progdf.io.cameras import save_cameras
-from progdf.io.json_values import convert_json, decode_json
+from progdf.io.json_values import convert_json, decode_json, plain
 from viewer.app.application import Application, Requests, error_line
 from viewer.camera.view_camera import Vec3, ViewCamera, to_camera
 from viewer.files import user_files
@@ -114,20 +114,9 @@ class PreviewChild:
     def ask(self, region: str, request: _Request, camera: Camera) -> int:
         """Ask for a grade or a picture; its number."""
         number = next(self._numbers)
-        values = {
-            "number": number,
-            "out": str(self._picture(number)),
-            "region": region,
-            "editor": request.editor,
-            "strength": request.strength,
-            "background": request.background,
-            "viewmat": camera.viewmat.tolist(),
-            "K": camera.K.tolist(),
-            "width": camera.width,
-            "height": camera.height,
-            "model": request.model,
-            "seed": request.seed,
-        }
+        values = plain(request) | {"number": number, "out": str(self._picture(number)), "region": region}
+        values |= {"viewmat": camera.viewmat.tolist(), "K": camera.K.tolist()}
+        values |= {"width": camera.width, "height": camera.height}
         self._child.send(msgspec.json.encode(values).decode())
         return number
 
