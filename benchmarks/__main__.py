@@ -39,12 +39,13 @@ BENCHES: dict[str, str] = {
     "select": "benchmarks.viewer.selection:tables",
     "frames": "benchmarks.viewer.frames:tables",
     "moving": "benchmarks.viewer.moving:tables",
+    "popping": "benchmarks.viewer.popping:tables",
     "window": "benchmarks.viewer.window:tables",
     "warps": "benchmarks.warps:tables",
     "pictures": "benchmarks.pictures:tables",
 }
 
-PAGE = ("training", "field", "viewer", "rasterize", "warp", "moving", "frames", "hard")
+PAGE = ("training", "field", "viewer", "rasterize", "warp", "moving", "popping", "frames", "hard")
 """What docs/speed-and-error.md is made of."""
 
 ROOT = Path(__file__).parents[1]
@@ -56,7 +57,7 @@ class BenchOptions:
 
     what: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
     """page (all of docs/speed-and-error.md), training, rasterize, warp, hard, field, edits, networks,
-    viewer, select, frames, moving, window, warps, pictures; none named is all."""
+    viewer, select, frames, moving, popping, window, warps, pictures; none named is all."""
     json: Path | None = None
     """also write the tables to this JSON file."""
     markdown: tuple[Path, ...] = ()
@@ -66,8 +67,8 @@ class BenchOptions:
     plots: Path | None = None
     """`training` and `field` also draw their errors into PNG files of their names in this folder."""
     scenes: tuple[Path, ...] = ()
-    """.ply files that viewer, select, frames, moving and window take in place of the bears, training,
-    field and warps beside them, and pictures alone; those of `page` are for training and fields."""
+    """.ply files that viewer, select, frames, moving, popping and window take in place of the bears,
+    training, field and warps beside them, and pictures alone; those of `page` are for training and fields."""
     seconds: float | None = None
     """how long `window` drags its slider; 60 where not said."""
 
@@ -96,7 +97,7 @@ def main(argv: Sequence[str]) -> int:
     trained = ("edits", "networks")
     if options.runs and options.what and not set(trained) & set(options.what):
         raise ProgdfError(f"--runs are for {', '.join(trained)}; use python -m benchmarks {trained[0]}")
-    drawing = (*plotted, "viewer", "select", "frames", "moving", "window", "warps", "pictures")
+    drawing = (*plotted, "viewer", "select", "frames", "moving", "popping", "window", "warps", "pictures")
     if options.scenes and options.what and not set(drawing) & set(options.what):
         raise ProgdfError(f"--scenes are for {', '.join(drawing)}; use python -m benchmarks viewer")
     if options.seconds is not None and options.what and "window" not in options.what:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,7 +15,7 @@ import torch
 from benchmarks import __main__ as front
 from benchmarks.table import Table
 from benchmarks.viewer import frames as bench_frames
-from benchmarks.viewer import moving
+from benchmarks.viewer import moving, popping
 from benchmarks.viewer import slider as bench
 from benchmarks.viewer import window as bench_window
 from benchmarks.viewer.display import missing_tools
@@ -120,6 +121,18 @@ def test_a_picture_at_rest_is_looked_at_once_it_is_sharp(
     assert [turning.at_rest for turning in turnings] == [0, 0]
 
 
+def test_a_film_of_moving_pictures_has_what_changes_in_it_alone() -> None:
+    scene = bear(1500).gaussians
+    views = [replace(first_camera(scene), azimuth=turn) for turn in (0.0, 1.0, 2.0)]
+    turned, still = (popping.film("a path", scene, path, (240, 200)) for path in (views, views[:1] * 2))
+    assert popping.table([turned]).rows[0][:2] == ("a path", "1 500")
+    assert turned.sharp > 0.1
+    assert 0.0 < turned.apart < turned.moving + turned.sharp
+    assert still.sharp == still.moving == still.apart == still.blocks == 0.0
+    assert turned.db > 25.0
+
+
+@pytest.mark.gl
 def test_a_moving_picture_is_compared_as_the_screen_stretches_it(monkeypatch: pytest.MonkeyPatch) -> None:
     size, drawn = (43, 30), np.random.default_rng(0).random((15, 22, 3), np.float32)
     screen = np.zeros((size[1], size[0], 4), np.uint8)

@@ -108,7 +108,8 @@ class PlainCut:
                 nearer = self._focal2 / z**2
                 sizes = torch.linalg.eigvalsh(covariance)[1:].clamp_min(0.0) * nearer + self._dilation
                 part = min(2 * math.pi * float(sizes.prod().sqrt()) / CELL**2, 1.0)
-                depths[self._cell(x, y, z)] -= math.log(1.0 - min(opacity, ALPHA_MAX)) * part
+                for cell, share in self._cells(x, y, z):
+                    depths[cell] -= math.log(1.0 - min(opacity, ALPHA_MAX)) * part * share
         self._depths = depths.cumsum(2) - depths
         self.picks = self._cut(0, limit)
 
@@ -165,12 +166,22 @@ class PlainCut:
         K = self._camera.K
         return float(K[0, 0]) * x / z + float(K[0, 2]), float(K[1, 1]) * y / z + float(K[1, 2]), z
 
-    def _cell(self, x: float, y: float, z: float) -> tuple[int, int, int]:
+    def _cells(self, x: float, y: float, z: float) -> list[tuple[tuple[int, int, int], float]]:
+        """The cells about a point, and its shares of them."""
         near = torch.tensor(z / self._camera.near).float().view(torch.int32)
-        slices = int(near - torch.tensor(1.0).view(torch.int32)) >> 19
-        column = int(min(max(x, 0.0), self._camera.width - 1.0) / CELL)
-        row = int(min(max(y, 0.0), self._camera.height - 1.0) / CELL)
-        return row, column, min(max(slices, 0), SLICES - 1)
+        slices = int(near - torch.tensor(1.0).view(torch.int32)) / 2**19
+        sides = -(-self._camera.height // CELL), -(-self._camera.width // CELL), SLICES
+        axes = []
+        for at, side in zip((y / CELL, x / CELL, slices), sides, strict=True):
+            at = min(max(at - 0.5, 0.0), side - (2.0 if side == SLICES else 1.0))
+            low = math.floor(at)
+            axes.append(((low, 1.0 - at + low), (min(low + 1, side - 1), at - low)))
+        return [
+            ((row, column, part), down * across * along)
+            for row, down in axes[0]
+            for column, across in axes[1]
+            for part, along in axes[2]
+        ]
 
     def _cut(self, index: int, limit: float) -> list[int]:
         """Picks below a node, in no order."""
@@ -188,7 +199,8 @@ class PlainCut:
             loss = node.spread * (1.0 + node.contrast) * math.sqrt(node.weight)
             loss *= self._focal2 / z**2
             if self._depths is not None:
-                depth = float(self._depths[self._cell(x, y, z - largest)])
+                cells = self._cells(x, y, (z - largest) * 2 ** (-1 / 32))
+                depth = sum(share * float(self._depths[cell]) for cell, share in cells)
                 loss *= math.exp(-0.5 * min(depth, DARKEST))
         leaf = 2 * index + 1 >= len(self._nodes)
         if loss <= limit or (leaf and self._depths is None):  # a leaf as it is tells the light

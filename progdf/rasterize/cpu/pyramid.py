@@ -18,11 +18,10 @@ The plain version is in tests/helpers/plain_pyramid.py.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from progdf.camera import Camera
 from progdf.rasterize.engines import (
@@ -37,6 +36,7 @@ from progdf.threads import run_chunks
 
 from .engine import make_pinhole, share_gaussians
 from .forward import (
+    Array,
     Pinhole,
     Quat,
     Scene,
@@ -55,8 +55,6 @@ from .forward import (
     vec,
 )
 from .jit import Number, kernel, prefetch
-
-Array = NDArray[Any]
 
 LEAF = 4
 """Gaussians of a leaf at least; fewer cost memory, more lose .7 dB (docs/experiments.md, The viewer)."""
@@ -92,7 +90,8 @@ spreads of centers and of colors (roots of summed variances); and colors, band b
 scales are upper halves of float32: errors of .2 %."""
 
 _ONE = int(np.float32(1.0).view(np.int32))
-_SLICE_SHIFT = 19  # of a float's bits: sixteen slices for a factor of two
+_PER_SLICE = 2.0**-19  # of a float's bits: sixteen slices for a factor of two
+_BEFORE = 2.0 ** (-1 / 32)  # of a depth: half a slice nearer, so that no surface is in its own shadow
 _TOP = 5  # levels of which each node is a chunk of its own
 _AHEAD = 8  # rows that are fetched before it is their turn: they lie far apart
 _DARK = math.exp(0.5 * DARKEST)  # times the limit, beyond which no darkness brings a loss below it
@@ -174,25 +173,17 @@ class Pyramid:
 
     def cut(self, view: Pinhole, budget: int, dilation: float) -> Array:
         """What a view takes: nodes, and rows of the scene as their complement (~row). [M] int32"""
-        shape = -(-view.window[3] // CELL), -(-view.window[2] // CELL), SLICES
-        low, high, self.limit = 0.0, math.inf, max(self.limit, self.finest)
         for _ in range(_TRIALS):
-            depths = np.zeros(shape, np.float32)
+            self.limit = max(self.limit, self.finest)
+            depths = np.zeros((-(-view.window[3] // CELL), -(-view.window[2] // CELL), SLICES), np.float32)
             coarse = self._cut(view, self.limit * COARSER, dilation, np.zeros(1, np.float32))
             _add_depths(coarse, self.nodes, view, dilation, depths.reshape(-1))
             _sum_depths(depths)
             picks = self._cut(view, self.limit, dilation, depths.reshape(-1))
-            if len(picks) > budget:
-                low = self.limit
-            elif len(picks) >= ENOUGH * budget or self.limit <= self.finest:
+            if len(picks) <= budget and (len(picks) >= ENOUGH * budget or self.limit <= self.finest):
                 break
-            else:
-                high = self.limit
             # a limit twice as high leaves about half as many
-            guess = self.limit * (len(picks) + 1) / (0.5 * (1.0 + ENOUGH) * budget)
-            if not low < guess < high:
-                guess = math.sqrt(max(low, self.finest) * high) if high < math.inf else 2.0 * low
-            self.limit = max(guess, self.finest)
+            self.limit *= (len(picks) + 1) / (0.5 * (1.0 + ENOUGH) * budget)
         return picks
 
     def _cut(self, view: Pinhole, limit: float, dilation: float, depths: Array) -> Array:
@@ -439,14 +430,20 @@ def _diagonalize(matrix: Array, quat: Array) -> None:
 
 
 @kernel(contract=True, inline=True)
-def _cell(x: float, y: float, z: float, camera: Pinhole) -> int:
-    """Index in the flat grid of a point at pixel (x, y) and depth z; at the edge for one outside."""
-    column = int(min(max(x, 0.0), camera.window[2] - 1.0) / CELL)
-    row = int(min(max(y, 0.0), camera.window[3] - 1.0) / CELL)
+def _cell(x: float, y: float, z: float, corner: int, camera: Pinhole) -> tuple[int, float]:
+    """One of the eight cells about pixel (x, y) at depth z: its index in the flat grid, and the point's share
+    of it, so that neither jumps as the point moves. corner: 0..7"""
+    columns, rows = -(-camera.window[2] // CELL), -(-camera.window[3] // CELL)
     # of the logarithm of the depth, nearly
-    at: Number = (np.float32(z / camera.near).view(np.int32) - _ONE) >> _SLICE_SHIFT
-    slice_index: int = min(max(at, 0), SLICES - 1)
-    return (row * -(-camera.window[2] // CELL) + column) * SLICES + slice_index
+    bits: Number = np.float32(z / camera.near).view(np.int32) - _ONE
+    across = min(max(x / CELL - 0.5, 0.0), columns - 1.0)
+    down = min(max(y / CELL - 0.5, 0.0), rows - 1.0)
+    along = min(max(bits * _PER_SLICE - 0.5, 0.0), SLICES - 2.0)
+    column, row, slice_index = int(across), int(down), int(along)
+    a, b, c = corner & 1, corner >> 1 & 1, corner >> 2
+    share = abs(1 - a - across + column) * abs(1 - b - down + row) * abs(1 - c - along + slice_index)
+    cell = min(row + b, rows - 1) * columns + min(column + a, columns - 1)
+    return cell * SLICES + slice_index + c, share
 
 
 @kernel(contract=True, inline=True)
@@ -475,10 +472,7 @@ def _walk(
         limit: of what a node may lose, pixels²
         depths: optical depth before each slice; [1]: all in the light, and leaves are not looked into
         stack: scratch, more than the levels
-        picks: out, as in `Pyramid.cut`
-
-    Returns:
-        how many are picked
+        picks: out, as in `Pyramid.cut`; how many is given back
     """
     means, focal, first_leaf = nodes.means, math.sqrt(camera.fx * camera.fy), (1 << nodes.levels) - 1
     count, top, stack[0] = 0, 1, root
@@ -501,7 +495,11 @@ def _walk(
             scaled = focal / z
             loss = np.float64(means[i, LOSS]) * math.sqrt(means[i, WEIGHT]) * scaled * scaled
             if depths.size > 1 and limit < loss < limit * _DARK:
-                loss *= math.exp(-0.5 * min(depths[_cell(x, y, z - longest, camera)], DARKEST))
+                depth = 0.0
+                for corner in range(8):
+                    cell, share = _cell(x, y, (z - longest) * _BEFORE, corner, camera)
+                    depth += share * depths[cell]
+                loss *= math.exp(-0.5 * min(depth, DARKEST))
         if loss <= limit or (i >= first_leaf and depths.size == 1):
             picks[count] = i
             count += 1
@@ -536,8 +534,10 @@ def _add_depths(picks: Array, nodes: Nodes, camera: Pinhole, dilation: float, de
             nearer = camera.fx * camera.fy / (z * z)
             middle = nodes.means[i, WEIGHT] / max(density * longest, _LEAST)
             area = math.sqrt((longest * longest * nearer + dilation) * (middle * middle * nearer + dilation))
-            depth = -math.log(1.0 - min(density, ALPHA_MAX))
-            depths[_cell(x, y, z, camera)] += depth * min(2.0 * math.pi * area / (CELL * CELL), 1.0)
+            depth = -math.log(1.0 - min(density, ALPHA_MAX)) * min(2.0 * math.pi * area / (CELL * CELL), 1.0)
+            for corner in range(8):
+                cell, share = _cell(x, y, z, corner, camera)
+                depths[cell] += share * depth
 
 
 @kernel(cache=True)
@@ -559,12 +559,10 @@ def _take(
     eye = camera_center(camera)
     for at in range(begin, end):
         _fetch(picks[min(at + _AHEAD, end - 1)], scene, nodes, True)
-        merged = picks[at] >= 0
-        i = picks[at] if merged else ~picks[at]
+        merged, i = picks[at] >= 0, max(picks[at], ~picks[at])
         mean, scale, quat = _part(i, not merged, scene, nodes)
         seen = footprint(camera, mean, scale, quat)
         unit = 1.0 / (camera.fx * camera.fy * seen.inv_z * seen.inv_z)  # world units² of a pixel
-        grow = 1.0
         if merged:
             own = nodes.means[i]
             opacity = abs(float(own[DENSITY]))  # more than 1 where several cover each other
@@ -573,11 +571,10 @@ def _take(
                 wide = dilation * unit
                 dilated = math.sqrt((longest * longest + wide) * (middle * middle + wide))
                 opacity = max(opacity, (own[WEIGHT] + wide * own[POINTS]) / max(dilated, _LEAST))
-            if opacity > 1.0:
-                grow = 1.0 + SWELL * math.log(opacity)
+            grow = 1.0 + SWELL * math.log(max(opacity, 1.0))
             opacity = min(opacity, ALPHA_MAX)
         else:
-            opacity = float(scene.opacities[i])
+            grow, opacity = 1.0, float(scene.opacities[i])
         # the coarse picture's dilation instead of the fine one's: off the size, as far as that goes
         more = (dilation - DILATION) * unit
         a, b, c = scale
