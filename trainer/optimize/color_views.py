@@ -345,6 +345,7 @@ class Judge:
         return total / max(1, 3 * sum(int(view.counts.sum()) for view in self.views))
 
 
+@one_thread()  # as those of the pool have: else who gets a view would decide on its last bits
 def map_views(work: Callable[[_A], _B], items: Sequence[_A]) -> list[_B]:
     """`work` of every item, on as many threads as the rasterizer has; the same bits on any number."""
     return run_chunks(lambda index: work(items[index]), len(items))

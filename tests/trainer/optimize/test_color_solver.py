@@ -16,7 +16,7 @@ from progdf.region import Region
 from progdf.sh import rgb_to_sh0
 from tests.helpers.scenes import random_gaussians
 from trainer.optimize.color_solver import Model, Solver, add_bands, choose_model, enrich, make_solver, solve
-from trainer.optimize.color_views import Judge, color_views
+from trainer.optimize.color_views import Judge, color_views, map_views
 from trainer.optimize.pgs import OnStep, ParameterSnapshot, PgsState, TargetStage
 from trainer.setup import unresolved_share
 from trainer.views.crops import CropScene, crop_scene, render_all
@@ -300,6 +300,14 @@ def test_what_was_stopped_goes_on_to_the_same_bits() -> None:
         solve_all(original, solver, model, stages, again, 20)
         assert torch.equal(again.moved, whole.moved)
         assert again.step == whole.step == 3
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_torch_works_on_one_thread_whoever_gets_a_view() -> None:
+    """Sums are added in an order that depends on torch's threads: two runs would not have the same bits."""
+    torch.set_num_threads(2)
+    assert set(map_views(lambda _: torch.get_num_threads(), range(20))) == {1}
+    assert torch.get_num_threads() == 2
 
 
 def test_a_view_says_what_its_clamps_pass() -> None:
