@@ -20,7 +20,7 @@ from progdf.region import Region, from_mask
 from progdf.scene.strays import Strays, clean, find_strays, picture_difference
 from progdf.terminal import group_digits
 from progdf.tidy import Step, similarity, tidy
-from viewer.jobs.training import edits_folder
+from viewer.jobs.training import edits_folder, free_path
 from viewer.state import selection
 from viewer.state.view_state import LayerState
 from viewer.ui.keys import shortcut
@@ -111,12 +111,9 @@ class TidyActions:
     def _add(self, does: str, steps: Sequence[Step]) -> None:
         """Write the edit, and have it as a layer on top."""
         document = self._app.document
-        folder = self._folder
-        make_folder(folder)
-        name, number = document.free_name(_NAMES[does]), 2
-        path = folder / f"{name}.gdf"
-        while path.exists():
-            path, number = folder / f"{name}-{number}.gdf", number + 1
+        make_folder(self._folder)
+        name = document.free_name(_NAMES[does])
+        path = free_path(self._folder, name, ".gdf")
         gdf = tidy(document.original, steps, name, _INSTRUCTIONS[does])
         save_gdf(path, gdf)
         self._edits.add(path, name, deselect=True)

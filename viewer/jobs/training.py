@@ -15,10 +15,11 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import itertools
 import os
 import re
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -448,12 +449,19 @@ def edits_folder(scene: Path) -> Path:
 
 def free_run(folder: Path, name: str) -> Path:
     """A folder for a run of this name: NAME, or NAME-2 where something has that."""
-    free, number = folder / name, 2
-    while free.exists() or any(
-        free.with_name(free.name + suffix).exists() for suffix in (ORDER, DRAFT, PACKED)
-    ):
-        free, number = folder / f"{name}-{number}", number + 1
-    return free
+
+    def is_taken(run: Path) -> bool:
+        return any(run.with_name(run.name + suffix).exists() for suffix in ("", ORDER, DRAFT, PACKED))
+
+    return free_path(folder, name, is_taken=is_taken)
+
+
+def free_path(
+    folder: Path, name: str, suffix: str = "", is_taken: Callable[[Path], bool] = Path.exists
+) -> Path:
+    """NAME with a suffix, or NAME-2, NAME-3 … where that is taken."""
+    names = itertools.chain([name], (f"{name}-{number}" for number in itertools.count(2)))
+    return next(path for each in names if not is_taken(path := folder / f"{each}{suffix}"))
 
 
 def finished_edit(draft: Path) -> Path | None:

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from imgui_bundle import icons_fontawesome_6 as icons
-from imgui_bundle import imgui
+from imgui_bundle import imgui, imgui_ctx
 
 from viewer.camera.views import value_between
 from viewer.state.timeline import (
@@ -266,31 +266,27 @@ def _row(
     """The name, a button for the key at the playhead, the keys and the curve; True if the name is pressed."""
     canvas, p, scale, tall = imgui.get_window_draw_list(), PALETTE, ruler.ui.scale, TRACK_PX * ruler.ui.scale
     top, end = imgui.get_cursor_screen_pos().y, ruler.start + ruler.span + 8.0 * scale
-    imgui.push_id(row)
-    imgui.push_font(None, SMALL_PX)
-    names = ruler.start - 8.0 * scale - left - tall
-    pressed = imgui.invisible_button("name", (names, tall))
-    lit = focused or (imgui.is_item_hovered() and row != CAMERA)
-    if focused:
-        corner = (end, top + tall)
-        canvas.add_rect_filled((left, top), corner, u32(p.card_focused), 3.0 * scale)
-    at, ink = (round(left + 6.0 * scale), round(top + 3.0 * scale)), u32(p.text if lit else p.dim)
-    canvas.add_text(at, ink, elide(name, names - 8.0 * scale))
-    imgui.same_line(0.0, 0.0)
-    here = (row, ruler.frame) in ruler.keys
-    if imgui.invisible_button("key", (tall, tall)):
-        actions.append(f"{'drop_key' if here else 'key'}:{row}")
-    ink = u32(p.handle if imgui.is_item_hovered() else color if here else p.faint)
-    middle = (left + names + tall / 2, top + tall / 2)
-    canvas.add_ngon_filled(middle, 4.5 * scale, ink, 4) if here else canvas.add_ngon(
-        middle, 4.5 * scale, ink, 4
-    )
-    tip(f"{'Delete' if here else 'Insert'} a keyframe of {name} at the playhead")
-    imgui.pop_font()
-    imgui.same_line(0.0, 0.0)
-    frames = {frame: [(row, frame)] for r, frame in ruler.keys if r == row}
-    under = _drag("keys", frames, (end - ruler.start + 8.0 * scale, tall), ruler, actions)
-    imgui.pop_id()
+    with imgui_ctx.push_id(row):
+        with imgui_ctx.push_font(None, SMALL_PX):
+            names = ruler.start - 8.0 * scale - left - tall
+            pressed = imgui.invisible_button("name", (names, tall))
+            lit = focused or (imgui.is_item_hovered() and row != CAMERA)
+            if focused:
+                corner = (end, top + tall)
+                canvas.add_rect_filled((left, top), corner, u32(p.card_focused), 3.0 * scale)
+            at, ink = (round(left + 6.0 * scale), round(top + 3.0 * scale)), u32(p.text if lit else p.dim)
+            canvas.add_text(at, ink, elide(name, names - 8.0 * scale))
+            imgui.same_line(0.0, 0.0)
+            here = (row, ruler.frame) in ruler.keys
+            if imgui.invisible_button("key", (tall, tall)):
+                actions.append(f"{'drop_key' if here else 'key'}:{row}")
+            ink = u32(p.handle if imgui.is_item_hovered() else color if here else p.faint)
+            middle = (left + names + tall / 2, top + tall / 2)
+            (canvas.add_ngon_filled if here else canvas.add_ngon)(middle, 4.5 * scale, ink, 4)
+            tip(f"{'Delete' if here else 'Insert'} a keyframe of {name} at the playhead")
+        imgui.same_line(0.0, 0.0)
+        frames = {frame: [(row, frame)] for r, frame in ruler.keys if r == row}
+        under = _drag("keys", frames, (end - ruler.start + 8.0 * scale, tall), ruler, actions)
     line, low, high = max(1.0, scale), top + tall - 3.0 * scale, top + 3.0 * scale
     ends = (ruler.start, low), (ruler.start + ruler.span, low)
     canvas.add_line(*ends, u32(p.line), line)

@@ -16,6 +16,7 @@ from viewer.files import exports, session
 from viewer.files.session import WindowSession
 from viewer.files.user_files import parse_path
 from viewer.jobs.job_queue import ALL_SLIDERS, TURNTABLE, DeliverOptions, Delivery, JobQueue, picture_size
+from viewer.jobs.training import free_path
 from viewer.state import timeline
 from viewer.state.view_state import Comparison, ViewState
 from viewer.state.workspace import Dialog
@@ -75,25 +76,15 @@ class DeliverActions:
             width, height = picture_size(min(options.width, options.height), view.safe_frame)
             options = replace(options, width=width, height=height)
         suffix = options.format if name == "render_film" else SUFFIXES[name]
-        out, number = exports.folder_of(path) / f"{path.stem}_edited{suffix}", 2
-        free, written = out, self._written()
-        while free.exists() or free in written:
-            free, number = out.with_stem(f"{out.stem}-{number}"), number + 1
+        folder, written = exports.folder_of(path), self._written()
+        free = free_path(folder, f"{path.stem}_edited", suffix, lambda out: out.exists() or out in written)
         main_view.ask(Dialog(name, str(free), options=options))
 
     def _rebind(self, file: str, source: str) -> None:
         """Queue what carries an edit of the scene at `source` over to the one that is open."""
-        edit, scene, number = Path(file), self._app.document.file.resolve(), 2
-        out = edit.with_stem(f"{edit.stem}-rebound")
-        while out.exists():
-            out, number = edit.with_stem(f"{edit.stem}-rebound-{number}"), number + 1
-        words = (
-            "rebind",
-            str(edit),
-            f"--from={parse_path(source)}",
-            f"--to={scene}",
-            f"--out={out}",
-        )
+        edit, scene = Path(file), self._app.document.file.resolve()
+        out = free_path(edit.parent, f"{edit.stem}-rebound", edit.suffix)
+        words = ("rebind", str(edit), f"--from={parse_path(source)}", f"--to={scene}", f"--out={out}")
         log = self._queue.folder / f"rebind{len(list(self._queue.folder.iterdir()))}.log"
         self._queue.add(Delivery(f"Rebinding {edit.name}", out, words, log, scene))
 
