@@ -239,11 +239,13 @@ def _run_training(
         edited, approach, trial, between = _edit_views(options, setup, editor, folder, log)
         train_edits = {s: pictures[: len(setup.train)] for s, pictures in edited.items()}
         setup = whole_views(setup) if options.optimize.as_printed else widen_views(setup, train_edits)
+    optimization = resolve_approach(options, approach)
+    if optimization.solver == "colors":  # its sums are small: torch's threads spun for 100 s on 16 cores
+        torch.set_num_threads(1)
     recorded = folder.state.load("recorded")
     if recorded is None:
         with log.stage("agree"):
             agreement = _agreement(options, setup, edited, approach.kind, folder, log)
-        optimization = resolve_approach(options, approach)
         trajectory, outcome = _record(
             options, optimization, setup, edited, between, editor, perceptual, folder=folder, log=log
         )
