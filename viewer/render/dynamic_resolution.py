@@ -39,8 +39,8 @@ FINE, FINE_ERROR = (0.25, 4.0, 64.0), 1e-3
 """Least, first and largest limit of what a node may lose, pixels². A picture in motion is fine enough with a
 mean squared error like this, 30 dB; the limit for it is measured where the picture in full follows one."""
 
-FINE_MS = 4.5, 6.5
-"""It is finer than that only as far as it takes no longer."""
+FINE_MS = 6.0, 7.5
+"""It is finer than that only as far as it takes no longer: with the window's own time a frame has 12 ms."""
 
 SLOW_MS = 40.0
 """What a picture may take before "auto" halves its sides: 25 pictures a second."""

@@ -92,7 +92,7 @@ scales are upper halves of float32: errors of .2 %."""
 _ONE = int(np.float32(1.0).view(np.int32))
 _PER_SLICE = 2.0**-19  # of a float's bits: sixteen slices for a factor of two
 _BEFORE = 2.0 ** (-1 / 32)  # of a depth: half a slice nearer, so that no surface is in its own shadow
-_TOP = 5  # levels of which each node is a chunk of its own
+_TOP = 4  # levels of which each node is a chunk of its own
 _AHEAD = 8  # rows that are fetched before it is their turn: they lie far apart
 _DARK = math.exp(0.5 * DARKEST)  # times the limit, beyond which no darkness brings a loss below it
 _LEAST, _MOST = 1e-30, 1e30  # of a weight
