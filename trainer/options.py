@@ -39,7 +39,7 @@ Device = Literal["auto", "cpu"]
 Engine = Literal["auto", "cpu", "warp"]
 
 DETECTOR, SAM_MODEL = "IDEA-Research/grounding-dino-tiny", "facebook/sam-vit-base"
-FieldKind = Literal["auto", "separable", "keyframes", "lossless", "neural"]
+FieldKind = Literal["auto", "separable", "lossless", "neural"]
 
 MOST_STAGES = 8
 """Strengths that an editor with a strength control is asked for if nobody says how many, at most."""
@@ -227,9 +227,6 @@ class FieldOptions:
     target_psnr: Annotated[float | None, absent_option("FLOAT", "a tenth of the edit's own error")] = None
     """The field's worst PSNR against the recorded trajectory over the slider, on held-out views, dB, in place
     of that rule."""
-    bytes_budget: Annotated[float | None, absent_option("FLOAT", "as many as it takes")] = None
-    """Bytes per Gaussian of the region that the field may take; the best one within is kept, whatever its
-    PSNR. Not for neural."""
     as_printed: Fixed[bool] = (
         False  # a network sees positions alone, through hard bins of the slider, with no codes
     )
@@ -449,8 +446,6 @@ class BatchOptions:
     """Go on with the batch in OUT: finished runs are kept, stopped ones continued, the others begun."""
     only: Annotated[str, absent_option("PATTERN", "all")] = ""
     """Jobs whose SCENE/NAME or NAME matches, such as "shoes/*" or "blue*"."""
-    failed: bool = False
-    """Of the batch in OUT, those jobs that failed."""
     keep_going: bool = False
     """Start although some jobs cannot be trained; these count as failed."""
     dry_run: bool = False

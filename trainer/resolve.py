@@ -246,11 +246,6 @@ def check_field_options(options: FieldOptions, preset: Preset = "default") -> No
         if options.field != "neural" and getattr(options, name) not in defaults:
             option = "--" + name.replace("_", "-")
             raise ProgdfError(f"{option} does not apply to --field {options.field}; add --field neural")
-    if options.bytes_budget is not None:
-        if options.field in ("neural", "lossless"):
-            raise ProgdfError(f"--bytes-budget does not apply to --field {options.field}; leave one out")
-        if not 1 <= options.bytes_budget < math.inf:
-            raise ProgdfError(f"--bytes-budget must be at least 1 byte, got {options.bytes_budget:g}")
 
 
 def use_threads(threads: int) -> None:

@@ -25,7 +25,7 @@ from torch import Tensor
 from progdf.metrics.image import LEVEL, ROUNDING, decibels
 
 from .baked import END_TYPES, BakedField, interpolate_at
-from .keyframes import fit_keyframes, fit_lossless
+from .keyframes import fit_lossless
 from .separable import (
     AttributeTrajectory,
     channel_weights,
@@ -38,7 +38,7 @@ from .separable import (
     store_attribute,
 )
 
-Kind = Literal["separable", "keyframes", "lossless"]
+Kind = Literal["separable", "lossless"]
 
 ADDED = 0.1
 """Share of the error that an edit has against its editor which its field may add."""
@@ -49,8 +49,6 @@ def allowed_error(own: float) -> float:
     as much as brings both there."""
     return (1.0 + ADDED) * max(own, LEVEL) - own
 
-
-KEYFRAMES = (2, 3, 4, 5, 6, 9, 12, 17)
 
 SAMPLES = 13
 """Strengths at which errors are taken."""
@@ -197,7 +195,7 @@ class FieldChoice:
     """What was chosen and why."""
 
     best: Candidate  # the field
-    met: bool  # whether it reaches what was asked of it: the target, or the budget where there is no target
+    met: bool  # whether it serves
     tried: tuple[Candidate, ...]  # everything that was looked at
     why: str = ""  # in words, as "the smallest of 6 that reach 40 dB"
 
@@ -208,19 +206,17 @@ def choose_field(
     render: Render,
     weights: Tensor | None = None,
     kind: Kind = "separable",
-    budget: float | None = None,
     evaluator: FieldEvaluator | None = None,
     recorded: Sequence[float] | None = None,
 ) -> FieldChoice:
-    """The smallest field that serves, or the best in a budget.
+    """The smallest field that serves.
 
     Args:
         strengths: of the snapshots, ascending from 0 to 1. [T]
         offsets: raw offsets of the members; the first row is 0, the last the recorded end. [T,M,C] float32
         render: of a few views and their interesting pixels; the ranks are chosen on it
         weights: how much an error of each number shows: visibility [M] or [M,C]; None is evenly
-        kind: "keyframes" is the baseline, "lossless" every snapshot, whatever it takes
-        budget: most bytes a member; the best field within it is chosen, whether it serves or not
+        kind: "lossless" is every snapshot, whatever it takes
         evaluator: decides in the end, best on views that `render` does not show; None decides by `render`
         recorded: strengths for the slider's ticks; `strengths` when None
 
@@ -236,39 +232,24 @@ def choose_field(
         everything = fit_lossless(strengths, offsets, recorded)
         candidate = evaluator.candidate(everything, f"all {len(strengths)} snapshots")
         return FieldChoice(candidate, candidate.excess <= 1.0, (candidate,), "nothing is left out")
-    if kind == "keyframes":
-        tried = _even_keyframes(strengths, offsets, budget, evaluator, recorded)
-    else:
-        spread = channel_weights(weights, offsets.shape[1], offsets.shape[2])
-        ends = store_ends(offsets, evaluator, budget)
-        seen = render_trajectories(offsets, spread, render, ends)
-        tried = _grow_fields(seen, strengths, budget, evaluator, recorded)
-    return pick_candidate(tried, evaluator.wanted, budget)
+    spread = channel_weights(weights, offsets.shape[1], offsets.shape[2])
+    seen = render_trajectories(offsets, spread, render, store_ends(offsets, evaluator))
+    return pick_candidate(_grow_fields(seen, strengths, evaluator, recorded), evaluator.wanted)
 
 
-def pick_candidate(tried: Sequence[Candidate], wanted: str, budget: float | None = None) -> FieldChoice:
-    """The smallest that serves, else the best; with a budget the best of those within it."""
+def pick_candidate(tried: Sequence[Candidate], wanted: str) -> FieldChoice:
+    """The smallest that serves, else the best."""
     looked = f"{len(tried)} field{'s'[: len(tried) != 1]}"
-    within = [c for c in tried if budget is None or c.field.bytes_per_member <= budget]
-    good = [c for c in within if c.excess <= 1.0]
-    small, met, why = good, True, f"the smallest of {looked} that {wanted}"
-    if not within:
-        small, met, why = list(tried), False, f"the smallest of {looked}; none fits into {budget:g} bytes"
-    elif budget is not None or not good:
-        small, met = [min(within, key=lambda c: c.excess)], budget is not None
-        why = f"the best of {looked}" + (f" within {budget:g} bytes" if met else f"; none {wanted}")
-    best = min(small, key=lambda c: (c.field.bytes_per_member, c.excess))
-    return FieldChoice(best, met, tuple(tried), why)
+    if good := [c for c in tried if c.excess <= 1.0]:
+        best = min(good, key=lambda c: (c.field.bytes_per_member, c.excess))
+        return FieldChoice(best, True, tuple(tried), f"the smallest of {looked} that {wanted}")
+    best = min(tried, key=lambda c: c.excess)
+    return FieldChoice(best, False, tuple(tried), f"the best of {looked}; none {wanted}")
 
 
-def store_ends(offsets: Tensor, evaluator: FieldEvaluator, budget: float | None = None) -> Ends:
+def store_ends(offsets: Tensor, evaluator: FieldEvaluator) -> Ends:
     """Each attribute's end in integers: all in the smallest, then the one that shows most per byte in larger
-    ones, until what they decode to serves or the budget is spent.
-
-    Args:
-        offsets: [T,M,C]
-        evaluator: says what serves
-        budget: most bytes a member
+    ones, until what they decode to serves. [T,M,C]
     """
     moving, end = moving_attributes(offsets), offsets[-1]
     kinds = {
@@ -290,7 +271,6 @@ def store_ends(offsets: Tensor, evaluator: FieldEvaluator, budget: float | None 
     now = excess(chosen)
     while now > 1.0:
         larger = [{**chosen, name: k + 1} for name, k in chosen.items() if k + 1 < len(END_TYPES)]
-        larger = [c for c in larger if budget is None or size(c) <= budget]
         if not larger:
             break
         gains = [(now - excess(c)) / (size(c) - size(chosen)) for c in larger]
@@ -302,25 +282,22 @@ def store_ends(offsets: Tensor, evaluator: FieldEvaluator, budget: float | None 
 def _grow_fields(
     seen: RenderedTrajectories,
     strengths: Tensor,
-    budget: float | None,
     evaluator: FieldEvaluator,
     recorded: Sequence[float] | None,
 ) -> list[Candidate]:
     """Separable fields along the path of growing ranks, in ever longer steps until one serves and back by
-    halves; with a budget the last alone."""
-    path, tried = grow_ranks(seen, budget or math.inf), dict[int, Candidate]()
+    halves."""
+    path, tried = grow_ranks(seen), dict[int, Candidate]()
 
     def serves(i: int) -> bool:
         if i not in tried:
             tried[i] = _separable(seen, strengths, path[i], evaluator, recorded)
         return tried[i].excess <= 1.0
 
-    last = len(path) - 1
-    reach = 0 if budget is None else last
+    reach, last = 0, len(path) - 1
     while not serves(reach) and reach < last:
         reach = min(2 * reach + 1, last)
-    if budget is None:
-        bisect_left(range(reach), True, lo=reach // 2, key=serves)
+    bisect_left(range(reach), True, lo=reach // 2, key=serves)
     return list(tried.values())
 
 
@@ -351,34 +328,16 @@ def _separable(
     return min(candidates, key=lambda candidate: candidate.excess)
 
 
-def _even_keyframes(
-    strengths: Tensor,
-    offsets: Tensor,
-    budget: float | None,
-    evaluator: FieldEvaluator,
-    recorded: Sequence[float] | None,
-) -> list[Candidate]:
-    """Ever more keyframes at even strengths, until they serve or the budget is spent."""
-    tried: list[Candidate] = []
-    for count in (count for count in KEYFRAMES if count <= len(strengths)):
-        field = fit_keyframes(strengths, offsets, count, recorded, torch.int8)
-        if tried and (tried[-1].excess <= 1.0 or field.bytes_per_member > (budget or math.inf)):
-            break
-        tried.append(evaluator.candidate(field, f"{count} keyframes"))
-    return tried
-
-
-def grow_ranks(seen: RenderedTrajectories, most_bytes: float) -> list[dict[str, int]]:
+def grow_ranks(seen: RenderedTrajectories) -> list[dict[str, int]]:
     """Ranks from none upwards; each step adds the basis that takes most rendered error per byte."""
     widths = {name: trajectory.offsets.shape[2] for name, trajectory in seen.trajectories.items()}
     ranks = dict.fromkeys(seen.trajectories, 0)
-    stored = sum(trajectory.end_bytes for trajectory in seen.trajectories.values())
     path = [dict(ranks)]
     now = float(seen.mse(ranks).mean())
     while now > 0:
         best: tuple[float, str, float] | None = None
         for name, width in widths.items():
-            if ranks[name] >= seen.modes[name].shape[1] or stored + width > most_bytes:
+            if ranks[name] >= seen.modes[name].shape[1]:
                 continue
             then = float(seen.mse({**ranks, name: ranks[name] + 1}).mean())
             gain = math.log(now / max(then, 1e-30)) / width
@@ -388,7 +347,6 @@ def grow_ranks(seen: RenderedTrajectories, most_bytes: float) -> list[dict[str, 
             break
         _, name, now = best
         ranks[name] += 1
-        stored += widths[name]
         path.append(dict(ranks))
     return path
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from .baked import AttributeBases, BakedField
-from .separable import check_trajectory, moving_attributes, quantize_bases
+from .separable import check_trajectory, moving_attributes
 
 
 def fit_keyframes(
@@ -25,7 +25,7 @@ def fit_keyframes(
         offsets: raw offsets of the members; the first row is 0, the last the recorded end. [T,M,C] float32
         count: snapshots kept, both ends among them, ≥ 2; as many as there are or more keeps all
         recorded: strengths for the slider's ticks; `strengths` when None
-        basis_type: float32 keeps the snapshots exactly; int8 what each differs from s times the end
+        basis_type: float32, or float16 for snapshots of such numbers
 
     Returns:
         A field with those snapshots as knots; attributes that never move are absent.
@@ -40,21 +40,14 @@ def fit_keyframes(
     rows = torch.unique((strengths[:, None] - even).abs().argmin(dim=0))
     if count >= len(strengths):
         rows = torch.arange(len(strengths))
-    inner_strengths = strengths[rows].double()[1:-1]
-    straight = inner_strengths if basis_type == torch.int8 else torch.zeros_like(inner_strengths)
     table = torch.zeros(len(rows), len(rows) - 1)
-    table[1:-1, 0], table[-1, 0] = straight.float(), 1.0
+    table[-1, 0] = 1.0
     table[1:-1, 1:] = torch.eye(len(rows) - 2)
     attributes = {}
     for name, columns in moving_attributes(offsets).items():
         full = offsets[-1, :, columns].contiguous()
-        inner = offsets[rows[1:-1]][:, :, columns]
-        if basis_type != torch.int8 and torch.equal(inner.to(basis_type).float(), inner):
-            # as it is: a unit of another size would round it
-            basis, scale = inner.to(basis_type), torch.ones(len(inner), full.shape[1])
-        else:
-            basis, scale = quantize_bases(inner - straight.float()[:, None, None] * full, basis_type)
-        units = torch.cat([torch.ones(1, full.shape[1]), scale])
+        basis = offsets[rows[1:-1]][:, :, columns].to(basis_type)
+        units = torch.ones(1 + len(basis), full.shape[1])  # of another size they would round it
         attributes[name] = AttributeBases(full, basis, units, table.clone())
     ticks = strengths.tolist() if recorded is None else recorded
     return BakedField("keyframes", strengths[rows].float(), attributes, offsets.shape[2], tuple(ticks))

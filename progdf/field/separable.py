@@ -40,12 +40,6 @@ class AttributeTrajectory:
     end: tuple[Tensor, Tensor] | None = None
 
     @property
-    def end_bytes(self) -> int:
-        """Stored bytes of one member's end."""
-        stored = self.offsets if self.end is None else self.end[0]
-        return stored.shape[2] * stored.element_size()
-
-    @property
     def residual(self) -> Tensor:
         """What a_0 times the full offset leaves; 0 at both ends. [T,M,c]"""
         residual = torch.addcmul(self.offsets, self.amplitude[:, None, None], self.offsets[-1], value=-1)

@@ -41,13 +41,7 @@ _PACKED = ".packed"  # of what a grade has by member, see `GradeForm.packed_leve
 _ADDED = "added."
 _NETWORK = "network."
 _END_CORRECTION = "end_correction."
-_RENAMED = {  # parts of tensors' names in format 1
-    "nodes": "knots",
-    "full": "end_offset",
-    "rest": "residual_basis",
-    "step": "scale",
-    "pull": "end_correction",
-}
+_OLDEST = 3  # format that is read
 
 
 class SceneFingerprint(msgspec.Struct, frozen=True):
@@ -94,13 +88,6 @@ class GdfHeader(msgspec.Struct, frozen=True):
     sha256: str = ""
 
 
-class _Format1(msgspec.Struct):
-    """The metadata of format 1: the header as its own text, and the checksum beside it."""
-
-    header: msgspec.Raw
-    sha256: str
-
-
 def pack_file(header: GdfHeader, tensors: Mapping[str, Tensor]) -> bytes:
     """The bytes of a .gdf file; the header gets its checksum. Tensors lie on the CPU, row by row."""
     sha256 = checksum(_encode(header), tensors)
@@ -130,31 +117,18 @@ def unpack_file(content: bytes, name: str) -> tuple[GdfHeader, dict[str, Tensor]
     damage = ProgdfError(f"{name} is damaged (checksum mismatch); copy it again or make it again")
     try:
         value = decode_json(text)
-        if older := "header" in value:
-            old = msgspec.json.decode(text, type=_Format1)
-            signed, sha256 = bytes(old.header).decode(), old.sha256
-            value = decode_json(signed) | {"sha256": sha256}
-        else:
-            sha256 = convert_json(value["sha256"], str)
-            signed = text.replace(sha256, "")
-        version = convert_json(value["format"], int)
-        intact = checksum(signed, tensors) == sha256 and version in ((1,) if older else range(2, FORMAT + 1))
-    except (msgspec.MsgspecError, ValueError, KeyError, TypeError, RuntimeError):
+        sha256, version = convert_json(value["sha256"], str), convert_json(value["format"], int)
+        intact = checksum(text.replace(sha256, ""), tensors) == sha256 and version >= _OLDEST
+    except (ValueError, KeyError, TypeError, RuntimeError):
         raise damage from None
     if version > FORMAT:
         raise ProgdfError(f"{name} has format {version}, this progdf reads format {FORMAT}; update progdf")
     if not intact:
         raise damage
-    if older:
-        tensors = {".".join(_RENAMED.get(p, p) for p in key.split(".")): t for key, t in tensors.items()}
     try:
-        if version < 3:  # where the end was always in float32
-            for key in [key for key in tensors if key.endswith(".end_offset")]:
-                scale = f"{key.removesuffix('end_offset')}scale"
-                tensors[scale] = torch.nn.functional.pad(tensors[scale], (0, 0, 1, 0), value=1.0)
         # a key that is unknown may be of a later version, which reads the file in another way
         return convert_json(value, GdfHeader, closed=True), tensors
-    except (ValueError, KeyError, RuntimeError) as error:
+    except ValueError as error:
         raise contradiction_error(name, error) from error
 
 

@@ -31,7 +31,7 @@ OUT = Path("run")
 
 def small_run(scene_folder: Path, **more: object) -> TrainOptions:
     """Options of a run of a second or two into `run`, on the bear of `write_bear` in `scene_folder`."""
-    settings = {"views": 6, "image_size": 48, "steps": 24, "stages": 2, "field": "keyframes"}
+    settings = {"views": 6, "image_size": 48, "steps": 24, "stages": 2, "field": "lossless"}
     settings |= {"perceptual_weight": 0.1, **more}  # descends view by view, in steps of a few milliseconds
     return replace(quick_options(scene_folder, **settings), out=OUT)
 

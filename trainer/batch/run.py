@@ -323,9 +323,9 @@ def batch(options: BatchOptions) -> int:
     check_ranges(("--workers", options.workers, 0, 4096))
     jobs, faults = read_catalogue(options.catalogue, options.out)
     rows = read_rows(options.out)
-    if rows and not (options.resume or options.failed or options.dry_run):
+    if rows and not (options.resume or options.dry_run):
         raise ProgdfError(f"{options.out} holds a batch; add --resume to go on with it")
-    selected = [job for job in jobs if _is_selected(job, options, rows)]
+    selected = [job for job in jobs if _is_selected(job, options.only)]
     if not selected and not faults:
         raise ProgdfError("no job matches; --dry-run lists them")
     kept = {job.key for job in selected if _is_finished(job)}
@@ -418,11 +418,8 @@ def _run_batch(
         write()
 
 
-def _is_selected(job: Job, options: BatchOptions, rows: Mapping[str, Row]) -> bool:
-    name = job.key.rpartition("/")[2]
-    if options.only and not any(fnmatchcase(text, options.only) for text in (job.key, name)):
-        return False
-    return not options.failed or (job.key in rows and rows[job.key].status == "failed")
+def _is_selected(job: Job, only: str) -> bool:
+    return not only or any(fnmatchcase(text, only) for text in (job.key, job.key.rpartition("/")[2]))
 
 
 def _is_finished(job: Job) -> bool:

