@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from progdf.gaussians import ShownInNotebooks, attribute_slices
-from progdf.io.tensors import deflate
+from progdf.io.tensors import check_ascent, check_tensor, deflate
 
 from .neural import NeuralField
 
@@ -76,32 +76,11 @@ class AttributeBases:
     coefficients: Tensor  # a_k at the knots; row 0 all 0, the last row 1, 0, …, 0. [S,1+R] float32
 
     def __post_init__(self) -> None:
-        if self.end_offset.ndim != 2 or self.residual_basis.ndim != 3:
-            raise ValueError(
-                f"end_offset is {list(self.end_offset.shape)}, residual_basis "
-                f"{list(self.residual_basis.shape)}; expected [M,c], [R,M,c]"
-            )
-        members, width = self.end_offset.shape
-        ranks = self.residual_basis.shape[0]
-        if self.residual_basis.dtype not in BASIS_TYPES:
-            raise ValueError(
-                f"residual_basis is {self.residual_basis.dtype}, expected int8, float16 or float32"
-            )
-        if self.end_offset.dtype not in END_TYPES:
-            raise ValueError(f"end_offset is {self.end_offset.dtype}, expected int8, int16 or float32")
-        for name in ("scale", "coefficients"):
-            if getattr(self, name).dtype != torch.float32:
-                raise ValueError(f"{name} is {getattr(self, name).dtype}, expected float32")
-        if tuple(self.residual_basis.shape[1:]) != (members, width) or tuple(self.scale.shape) != (
-            1 + ranks,
-            width,
-        ):
-            raise ValueError(
-                f"residual_basis {list(self.residual_basis.shape)} or scale {list(self.scale.shape)} "
-                "does not fit end_offset"
-            )
-        if self.coefficients.ndim != 2 or self.coefficients.shape[1] != 1 + ranks:
-            raise ValueError(f"coefficients is {list(self.coefficients.shape)}, expected [S, {1 + ranks}]")
+        check_tensor("end_offset", self.end_offset, (None, None), *END_TYPES)
+        check_tensor("residual_basis", self.residual_basis, (None, *self.end_offset.shape), *BASIS_TYPES)
+        ranks, _, width = self.residual_basis.shape
+        check_tensor("scale", self.scale, (1 + ranks, width), torch.float32)
+        check_tensor("coefficients", self.coefficients, (None, 1 + ranks), torch.float32)
         if not len(self.coefficients):
             raise ValueError("coefficients has no knots")
         ends = self.coefficients[[0, -1]]
@@ -142,10 +121,7 @@ class BakePlan:
             if not 0 <= rank <= MOST_RANK:
                 raise ValueError(f"a bake of {name} with {rank} bases, expected 0 to {MOST_RANK}")
         for name, share in self.end_correction.items():
-            if share.shape != self.knots.shape or share.dtype != torch.float32:
-                raise ValueError(
-                    f"the end correction of {name} is {list(share.shape)}, expected {len(self.knots)} knots"
-                )
+            check_tensor(f"the end correction of {name}", share, self.knots.shape, torch.float32)
 
 
 @dataclass(frozen=True)
@@ -182,8 +158,7 @@ class SliderRemap:
         if self.old.shape != self.new.shape:
             raise ValueError(f"{list(self.old.shape)} old knots for {list(self.new.shape)} new ones")
         for knots in (self.old, self.new):
-            if float(knots[0]) != 0.0 or float(knots[-1]) != 1.0 or bool((knots.diff() <= 0).any()):
-                raise ValueError("the knots of a remap must ascend from 0 to 1")
+            check_ascent("the knots of a remap", knots)
 
     def __call__(self, s: Tensor) -> Tensor:
         """New strengths of old ones, 0..1; both ends exact. [n] -> [n] float64"""
@@ -255,27 +230,18 @@ class GradeForm:
         if self.degree not in (LATTICE, *MONOMIALS) or self.table.ndim != 3:
             raise ValueError(f"a grade of degree {self.degree}, expected 0 to 3")
         knots, numbers = len(self.knots), MONOMIALS.get(self.degree, self.table.shape[1])
-        shapes = {
-            "table": (self.table, (knots, numbers, 3)),
-            "coefficients": (self.coefficients, (knots, len(self.residual))),
-            "scale": (self.scale, (len(self.residual), self.residual.shape[-1])),
-        }
-        for name, (tensor, shape) in shapes.items():
-            if tuple(tensor.shape) != shape or tensor.dtype != torch.float32:
-                raise ValueError(
-                    f"{name} is {list(tensor.shape)} {tensor.dtype}, expected {list(shape)} float32"
-                )
-        if self.knots.ndim != 1 or knots < 2 or float(self.knots[0]) != 0.0 or float(self.knots[-1]) != 1.0:
-            raise ValueError("knots must run from 0 to 1")
-        if bool((self.knots.diff() <= 0).any()) or (self.degree == LATTICE and knots > 2):
-            raise ValueError("knots must ascend, and a lattice has two")
-        if self.residual.dtype != torch.int8 or self.residual.ndim != 3 or len(self.residual) > MOST_RANK:
-            raise ValueError(f"residual is {list(self.residual.shape)} {self.residual.dtype}, expected int8")
-        if self.residual.shape[2] not in (0, 3, 12, 27, 48):
-            raise ValueError(f"residual has {self.residual.shape[2]} channels, expected whole bands")
-        mask = self.mask
-        if mask is not None and (mask.shape != (self.members,) or mask.dtype != torch.uint8):
-            raise ValueError(f"mask is {list(mask.shape)} {mask.dtype}, expected [{self.members}] uint8")
+        check_tensor("residual", self.residual, (None, None, None), torch.int8)
+        ranks, members, channels = self.residual.shape
+        check_tensor("table", self.table, (knots, numbers, 3), torch.float32)
+        check_tensor("coefficients", self.coefficients, (knots, ranks), torch.float32)
+        check_tensor("scale", self.scale, (ranks, channels), torch.float32)
+        check_ascent("knots", self.knots)
+        if ranks > MOST_RANK or (self.degree == LATTICE and knots > 2):
+            raise ValueError(f"{ranks} bases at {knots} knots; the most are {MOST_RANK}, and 2 of a lattice")
+        if channels not in (0, 3, 12, 27, 48):
+            raise ValueError(f"residual has {channels} channels, expected whole bands")
+        if self.mask is not None:
+            check_tensor("mask", self.mask, (members,), torch.uint8)
         if bool(self.coefficients[0].any()) or not torch.equal(
             self.table[0], identity_map(self.degree, numbers)
         ):
@@ -324,12 +290,8 @@ class BakedField(ShownInNotebooks):
     origin: NeuralForm | GradeForm | None = None  # what it was baked from and a file stores instead
 
     def __post_init__(self) -> None:
-        if self.knots.ndim != 1 or self.knots.dtype != torch.float32:
-            raise ValueError(f"knots is {list(self.knots.shape)} {self.knots.dtype}, expected float32 [S]")
-        if len(self.knots) < 2 or float(self.knots[0]) != 0.0 or float(self.knots[-1]) != 1.0:
-            raise ValueError("knots must run from 0 to 1")
-        if bool((self.knots[1:] <= self.knots[:-1]).any()):
-            raise ValueError("knots must ascend")
+        check_tensor("knots", self.knots, (None,), torch.float32)
+        check_ascent("knots", self.knots)
         slices = attribute_slices(self.channels)
         counts = {bases.end_offset.shape[0] for bases in self.attributes.values()}
         if len(counts) > 1:

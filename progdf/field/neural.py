@@ -22,6 +22,7 @@ from torch import Tensor
 from torch.nn.functional import linear, silu
 
 from progdf.gaussians import BASE_CHANNELS, attribute_slices
+from progdf.io.tensors import check_tensor
 
 Inputs = Literal["own", "position"]
 Bins = Literal["smooth", "hard"]
@@ -135,20 +136,11 @@ class NeuralField:
         if set(self.tensors) != set(expected):
             raise ValueError(f"the network's tensors are not those of {shape.layers} layers")
         for name, size in expected.items():
-            types = (torch.float16, torch.float32) if name in shape.weights() else (torch.float32,)
-            tensor = self.tensors[name]
-            if tuple(tensor.shape) != size or tensor.dtype not in types:
-                raise ValueError(f"{name} is {list(tensor.shape)} {tensor.dtype}, expected {list(size)}")
-        members = self.end.shape[0] if self.end.ndim else 0
-        for name, tensor, size, dtype in (
-            ("end", self.end, (members, len(shape.columns)), torch.float32),
-            ("codes", self.codes, (members, shape.code), torch.int8),
-            ("code_step", self.code_step, (shape.code,), torch.float32),
-        ):
-            if tuple(tensor.shape) != size or tensor.dtype != dtype:
-                raise ValueError(
-                    f"{name} is {list(tensor.shape)} {tensor.dtype}, expected {list(size)} {dtype}"
-                )
+            halves = (torch.float16,) if name in shape.weights() else ()
+            check_tensor(name, self.tensors[name], size, torch.float32, *halves)
+        check_tensor("end", self.end, (None, len(shape.columns)), torch.float32)
+        check_tensor("codes", self.codes, (len(self.end), shape.code), torch.int8)
+        check_tensor("code_step", self.code_step, (shape.code,), torch.float32)
 
     @property
     def members(self) -> int:

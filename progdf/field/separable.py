@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 
 from progdf.gaussians import attribute_slices
+from progdf.io.tensors import check_ascent
 
 from .baked import AttributeBases, BakedField
 
@@ -57,10 +58,7 @@ def check_trajectory(strengths: Tensor, offsets: Tensor) -> None:
     count = len(strengths)
     if offsets.ndim != 3 or offsets.shape[0] != count or strengths.ndim != 1:
         raise ValueError(f"offsets is {list(offsets.shape)} for {count} strengths, expected [T,M,C]")
-    if count < 2 or float(strengths[0]) != 0 or float(strengths[-1]) != 1:
-        raise ValueError("strengths must run from 0 to 1")
-    if bool((strengths[1:] <= strengths[:-1]).any()):
-        raise ValueError("strengths must ascend")
+    check_ascent("strengths", strengths)
     if not bool(torch.isfinite(offsets).all()):
         raise ValueError("an offset is not finite")
     if bool(offsets[0].any()):

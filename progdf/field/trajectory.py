@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.io.atomic import atomic_write, open_error
 from progdf.io.json_values import convert_json, decode_json
-from progdf.io.tensors import read_tensors, write_tensors
+from progdf.io.tensors import check_ascent, check_tensor, read_tensors, write_tensors
 
 from .baked import MONOMIALS, find_segment
 
@@ -27,15 +26,6 @@ FILE_NAME = "trajectory.safetensors"
 """Its name in a run folder, beside the .gdf."""
 
 _FORMAT = "progdf-trajectory-1"
-_NEEDED_FORMS = (
-    ("s", torch.float32, 1),
-    ("offsets", torch.float16, 3),
-    ("end", torch.float32, 2),
-    ("steps", torch.int64, 1),
-    ("stage_ends", torch.int64, 1),
-    ("strengths", torch.float64, 1),
-)
-_NEEDED = {name for name, _, _ in _NEEDED_FORMS}
 
 
 @dataclass(frozen=True)
@@ -103,7 +93,7 @@ def save_trajectory(
         tensors |= {f"added.{name}": getattr(trajectory.added, name) for name in ATTRIBUTES}
     header = {"format": _FORMAT, "about": json.dumps(dict(about))}
     with atomic_write(path) as temporary_file:
-        write_tensors(temporary_file, tensors, header, checksum=True)
+        write_tensors(temporary_file, tensors, header)
 
 
 def load_trajectory(path: Path) -> tuple[Trajectory, dict[str, Tensor], dict[str, Any]]:
@@ -112,83 +102,49 @@ def load_trajectory(path: Path) -> tuple[Trajectory, dict[str, Tensor], dict[str
     Raises:
         ProgdfError: the file is absent, damaged or something else.
     """
-    tensors, about = _read(path)
-    for name, dtype, sides in _NEEDED_FORMS:
-        tensor = tensors[name]
-        if tensor.dtype != dtype or tensor.ndim != sides:
-            raise _damage_error(path, f"{name} is {list(tensor.shape)} {tensor.dtype}")
-    added = {name: tensors.pop(f"added.{name}") for name in ATTRIBUTES if f"added.{name}" in tensors}
-    trajectory = Trajectory(
-        tensors.pop("s"),
-        tensors.pop("offsets"),
-        tensors.pop("end"),
-        tensors.pop("steps"),
-        tuple(tensors.pop("stage_ends").tolist()),
-        tuple(tensors.pop("strengths").tolist()),
-        maps=tensors.pop("maps", None),
-        bands=int(tensors.pop("bands", torch.tensor(0))),
-        mask=tensors.pop("mask", None),
-        added=_unpack_added(path, added) if added else None,
-    )
-    _check(path, trajectory)
-    return trajectory, tensors, about
-
-
-def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Tensors, and the file's metadata."""
     try:
         tensors, header = read_tensors(path)
         if header.get("format") != _FORMAT:
             raise ProgdfError(f"{path} is not a recorded trajectory; give a run folder of progdf train")
-        if missing := _NEEDED - set(tensors):
-            raise _damage_error(path, f"it has no {min(missing)}")
-        return tensors, convert_json(decode_json(header["about"]), dict[str, Any])
+        about = convert_json(decode_json(header["about"]), dict[str, Any])
+        return _unpack(tensors), tensors, about
     except OSError as error:
         raise open_error(path, error) from error
-    except ProgdfError:
-        raise
-    except (KeyError, ValueError) as error:
-        raise _damage_error(path, error) from error
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        reason = f"it has no {error.args[0]}" if isinstance(error, KeyError) else error
+        raise ProgdfError(f"{path} is damaged ({reason}); train again") from error
 
 
-def _unpack_added(path: Path, rows: Mapping[str, Any]) -> Gaussians:
-    try:
-        added = Gaussians(**rows)
-    except (TypeError, ValueError) as error:
-        raise _damage_error(path, error) from error
-    if not all(part.dtype == torch.float32 and bool(part.isfinite().all()) for part in rows.values()):
-        raise _damage_error(path, "an added row has numbers that are none")
-    return added
-
-
-def _check(path: Path, trajectory: Trajectory) -> None:
-    s, shape = trajectory.s, trajectory.offsets.shape
-    fits = s.ndim == 1 and len(s) >= 2 and len(shape) == 3 and len(s) == shape[0]
-    if not fits or trajectory.end.shape != shape[1:]:
-        raise _damage_error(path, "its tensors do not fit each other")
-    if float(s[0]) != 0.0 or float(s[-1]) != 1.0 or not bool((s.diff() > 0).all()):
-        raise _damage_error(path, "its slider values do not ascend from 0 to 1")
-    ends = trajectory.stage_ends
-    ascend = all(before < after for before, after in pairwise((0, *ends)))
-    if not ends or len(ends) != len(trajectory.strengths) or not ascend or ends[-1] != len(s) - 1:
-        raise _damage_error(path, "its stages do not fit its recordings")
-    maps = trajectory.maps
-    if maps is not None and (
-        maps.dtype != torch.float32
-        or maps.shape[1:] not in [(count, 3) for count in MONOMIALS.values()]
-        or len(maps) != len(s) - 1
-        or not bool(maps.isfinite().all())
-        or trajectory.bands not in (0, 1, 4)
-    ):
-        raise _damage_error(path, "its maps of color do not fit its recordings")
-    mask = trajectory.mask
-    if mask is not None and (mask.dtype != torch.uint8 or mask.shape != shape[1:2]):
-        raise _damage_error(path, "its mask does not fit its members")
-    if len(trajectory.steps) != len(s) or not bool(
-        trajectory.offsets.isfinite().all() & trajectory.end.isfinite().all()
-    ):
-        raise _damage_error(path, "it has numbers that are not finite, or not one step a recording")
-
-
-def _damage_error(path: Path, reason: object) -> ProgdfError:
-    return ProgdfError(f"{path} is damaged ({reason}); train again")
+def _unpack(tensors: dict[str, Tensor]) -> Trajectory:
+    """The trajectory, whose tensors are taken out. Raises ValueError and the like: they do not fit."""
+    added: dict[str, Any] = {
+        name: tensors.pop(f"added.{name}") for name in ATTRIBUTES if f"added.{name}" in tensors
+    }
+    s, offsets, end, steps = (tensors.pop(name) for name in ("s", "offsets", "end", "steps"))
+    ends, strengths = tensors.pop("stage_ends"), tensors.pop("strengths")
+    maps, mask = tensors.pop("maps", None), tensors.pop("mask", None)
+    bands = int(tensors.pop("bands", torch.tensor(0)))
+    check_tensor("s", s, (None,), torch.float32)
+    check_ascent("s", s)
+    check_tensor("offsets", offsets, (len(s), None, None), torch.float16)
+    check_tensor("end", end, offsets.shape[1:], torch.float32)
+    check_tensor("steps", steps, s.shape, torch.int64)
+    check_tensor("stage_ends", ends, (None,), torch.int64)
+    check_tensor("strengths", strengths, ends.shape, torch.float64)
+    if not len(ends) or bool((ends.diff(prepend=ends.new_zeros(1)) <= 0).any()) or ends[-1] != len(s) - 1:
+        raise ValueError("its stages do not fit its recordings")
+    if maps is not None:
+        check_tensor("maps", maps, (len(s) - 1, None, 3), torch.float32)
+        if maps.shape[1] not in MONOMIALS.values() or bands not in (0, 1, 4):
+            raise ValueError(f"a map of {maps.shape[1]} numbers, and a residual of {bands} bands")
+    if mask is not None:
+        check_tensor("mask", mask, offsets.shape[1:2], torch.uint8)
+    for name, part in added.items():
+        check_tensor(name, part, part.shape, torch.float32)
+    numbers = [offsets, end, *added.values(), *([] if maps is None else [maps])]
+    if not all(bool(part.isfinite().all()) for part in numbers):
+        raise ValueError("it has numbers that are not finite")
+    stages = tuple(ends.tolist()), tuple(strengths.tolist())
+    return Trajectory(
+        s, offsets, end, steps, *stages, maps, bands, mask, added=Gaussians(**added) if added else None
+    )

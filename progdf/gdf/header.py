@@ -24,7 +24,7 @@ from progdf.field.baked import AttributeBases, BakedField, BakePlan, GradeForm, 
 from progdf.field.neural import NeuralField, NeuralShape
 from progdf.gaussians import ATTRIBUTES, ZERO, Gaussians, Origin
 from progdf.io.json_values import convert_json, decode_json
-from progdf.io.tensors import inflate
+from progdf.io.tensors import check_tensor, inflate
 from progdf.region import Region
 
 FORMAT = 6
@@ -283,8 +283,7 @@ def unpack_region(
     if "score.levels" in tensors:
         levels = tensors["score.levels"]
         soft = _unpack_rows("score", tensors, count, levels.numel())
-        if levels.dtype != torch.uint8 or levels.shape != soft.shape:
-            raise ValueError(f"{len(soft)} soft scores have levels {list(levels.shape)} {levels.dtype}")
+        check_tensor("score.levels", levels, soft.shape, torch.uint8)
         score[soft] = levels.float() / 255
     return Region(name, members, score)
 
@@ -313,16 +312,14 @@ def _unpack_rows(key: str, tensors: Mapping[str, Tensor], count: int, expected: 
     as eight bytes of a run can name millions. [M] int64"""
     if f"{key}.bits" in tensors:
         bits = tensors[f"{key}.bits"]
-        if bits.dtype != torch.uint8 or list(bits.shape) != [(count + 7) // 8]:
-            raise ValueError(f"{key}.bits is {list(bits.shape)} {bits.dtype} for {count} Gaussians")
+        check_tensor(f"{key}.bits", bits, ((count + 7) // 8,), torch.uint8)
         mask = np.unpackbits(bits.numpy())
         if mask[count:].any():
             raise ValueError(f"{key}.bits names rows beyond {count}")
         return torch.from_numpy(np.flatnonzero(mask[:count]).astype(np.int64))
     if f"{key}.runs" in tensors:
         runs = tensors[f"{key}.runs"]
-        if runs.dtype != torch.int32 or runs.ndim != 2 or runs.shape[1] != 2:
-            raise ValueError(f"{key}.runs is {list(runs.shape)} {runs.dtype}")
+        check_tensor(f"{key}.runs", runs, (None, 2), torch.int32)
         starts, lengths = runs.numpy().astype(np.int64).T
         ends = starts + lengths
         if len(runs) and (
@@ -334,8 +331,7 @@ def _unpack_rows(key: str, tensors: Mapping[str, Tensor], count: int, expected: 
         before = np.repeat(np.cumsum(lengths) - lengths, lengths)
         return torch.from_numpy(np.repeat(starts, lengths) + np.arange(int(lengths.sum())) - before)
     rows = tensors[f"{key}.rows"]
-    if rows.dtype != torch.int32 or rows.ndim != 1:
-        raise ValueError(f"{key}.rows is {list(rows.shape)} {rows.dtype}")
+    check_tensor(f"{key}.rows", rows, (None,), torch.int32)
     indices = rows.numpy().astype(np.int64)
     if len(indices) and (indices[0] < 0 or indices[-1] >= count or (np.diff(indices) <= 0).any()):
         raise ValueError(f"{key}.rows are not sorted rows of the scene")

@@ -53,23 +53,38 @@ def table_of(tensors: Mapping[str, Tensor]) -> dict[str, tuple[tuple[int, ...], 
     return {name: (tuple(tensor.shape), _TYPES[tensor.dtype]) for name, tensor in tensors.items()}
 
 
-def write_tensors(
-    path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str], checksum: bool = False
-) -> None:
+def check_tensor(name: str, tensor: Tensor, shape: Sequence[int | None], *types: torch.dtype) -> None:
+    """Raises ValueError where a tensor has another shape, None standing for any number, or another type."""
+    fits = len(shape) == tensor.ndim and all(
+        n in (None, side) for n, side in zip(shape, tensor.shape, strict=True)
+    )
+    if not fits or tensor.dtype not in types:
+        sides = ", ".join("any" if side is None else str(side) for side in shape)
+        kinds = " or ".join(str(kind).removeprefix("torch.") for kind in types)
+        kind = str(tensor.dtype).removeprefix("torch.")
+        raise ValueError(f"{name} is {list(tensor.shape)} {kind}, expected [{sides}] {kinds}")
+
+
+def check_ascent(name: str, numbers: Tensor) -> None:
+    """Raises ValueError where numbers do not ascend from 0 to 1. [n]"""
+    ends = numbers[[0, -1]].tolist() if numbers.ndim == 1 and len(numbers) > 1 else []
+    if ends != [0.0, 1.0] or not bool((numbers.diff() > 0).all()):
+        raise ValueError(f"{name} must ascend from 0 to 1")
+
+
+def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: Mapping[str, str]) -> None:
     """Write a safetensors file.
 
     Args:
         path: where to; see `atomic.atomic_write` for a file that is whole or absent
         tensors: by name, of the types in the table above; on the CPU
-        metadata: texts by name
-        checksum: add one of everything, which `read_tensors` compares
+        metadata: texts by name; a checksum of everything, which `read_tensors` compares, is added
 
     Raises:
         KeyError: a tensor of another type.
         OSError: the place cannot be written.
     """
-    if checksum:
-        metadata = {**metadata, _CHECKSUM: _checksum(metadata, tensors)}
+    metadata = {**metadata, _CHECKSUM: _checksum(metadata, tensors)}
     text = msgspec.json.encode(dict(sorted(metadata.items()))).decode()
     arrays = {name: tensor.detach().contiguous().numpy() for name, tensor in tensors.items()}
     path.write_bytes(save(arrays, {METADATA: text}))
@@ -92,8 +107,7 @@ def read_tensors(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
         raise ValueError("it was not written by progdf") from None
     except Exception as error:  # the library's own, and torch's where a shape overflows
         raise ValueError(" ".join(str(error).split())) from None
-    sum_ = metadata.pop(_CHECKSUM, None)
-    if sum_ is not None and sum_ != _checksum(metadata, tensors):
+    if metadata.pop(_CHECKSUM, None) != _checksum(metadata, tensors):
         raise ValueError("checksum mismatch")
     return tensors, metadata
 

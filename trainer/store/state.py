@@ -203,7 +203,7 @@ class StateFolder:
             if index is not None and self.path.is_dir():
                 path.parent.mkdir(exist_ok=True)
             with atomic_write(path) as temporary_file:
-                write_tensors(temporary_file, tensors, header, checksum=True)
+                write_tensors(temporary_file, tensors, header)
                 _flush(temporary_file)
             return time.perf_counter() - begun
 

@@ -93,7 +93,7 @@ def test_an_edit_that_returns_to_its_start_is_followed() -> None:
 @pytest.mark.parametrize(
     ("strengths", "offsets", "message"),
     [
-        (torch.tensor([0.0, 0.5]), torch.zeros(2, 3, 14), "run from 0 to 1"),
+        (torch.tensor([0.0, 0.5]), torch.zeros(2, 3, 14), "ascend from 0 to 1"),
         (torch.tensor([0.0, 0.6, 0.5, 1.0]), torch.zeros(4, 3, 14), "must ascend"),
         (torch.tensor([0.0, 1.0]), torch.ones(2, 3, 14), "must be 0"),
         (torch.tensor([0.0, 1.0]), torch.zeros(3, 3, 14), r"expected .T,M,C."),

@@ -298,7 +298,7 @@ def test_a_slider_that_is_laid_anew_is_kept_by_the_file(tmp_path: Path) -> None:
         ({"knots": torch.tensor([0.0, 0.5, 0.4, 1.0])}, "table is"),
         ({"coefficients": torch.ones(3, 2)}, "residual 0 at strength 0"),
         ({"residual": torch.zeros(2, 120, 5, dtype=torch.int8)}, "scale is"),
-        ({"residual": torch.zeros(2, 120, 3)}, "expected int8"),
+        ({"residual": torch.zeros(2, 120, 3)}, "expected .* int8"),
     ],
 )
 def test_parts_that_do_not_fit_each_other_are_refused(change: dict[str, object], message: str) -> None:

@@ -40,7 +40,9 @@ def test_the_library_reads_every_type_and_shape(tmp_path: Path, dtype: torch.dty
         assert torch.equal(found[name], tensor)
     with safe_open(tmp_path / "x", framework="pt") as opened:
         metadata = opened.metadata()
-    assert json.loads(metadata.pop("progdf")) == {"z": "ä", "a": '"{}"'}
+    texts = json.loads(metadata.pop("progdf"))
+    assert len(texts.pop("crc32")) == 8
+    assert texts == {"z": "ä", "a": '"{}"'}
     assert not metadata
 
 
@@ -60,22 +62,17 @@ def test_every_tensor_lies_where_its_type_is_aligned(tmp_path: Path) -> None:
     assert content[8 + size : 16 + size] == b"\0\0\0\0\0\0\xf0\x3f"  # 1.0 comes first
 
 
-def test_every_flipped_bit_is_noticed_where_there_is_a_checksum(tmp_path: Path) -> None:
+def test_every_flipped_bit_is_noticed(tmp_path: Path) -> None:
     path = tmp_path / "x"
-    write_tensors(path, {"a": torch.arange(4.0), "b": torch.arange(3)}, {"about": "it"}, checksum=True)
+    write_tensors(path, {"a": torch.arange(4.0), "b": torch.arange(3)}, {"about": "it"})
     tensors, metadata = read_tensors(path)
     assert torch.equal(tensors["a"], torch.arange(4.0))
     assert metadata == {"about": "it"}
     content = path.read_bytes()
-    # a flip in the name of the checksum loses the checksum alone
     for place in range(len(content)):
         path.write_bytes(content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :])
-        try:
-            found, told = read_tensors(path)
-        except ValueError:
-            continue
-        assert told.get("about") == "it", place
-        assert all(torch.equal(found[name], tensors[name]) for name in tensors), place
+        with pytest.raises(ValueError):  # noqa: PT011  the library's words
+            read_tensors(path)
     for kept in range(len(content)):
         path.write_bytes(content[:kept])
         with pytest.raises(ValueError):  # noqa: PT011  the library's words

@@ -214,7 +214,7 @@ def test_recordings_that_do_not_hold_together_are_one_line(tmp_path: Path, part:
 def test_a_file_that_lacks_a_part_is_one_line(tmp_path: Path) -> None:
     path = tmp_path / "trajectory.safetensors"
     write_tensors(path, {"s": torch.zeros(2)}, {"format": "progdf-trajectory-1", "about": "{}"})
-    with pytest.raises(ProgdfError, match="it has no end"):
+    with pytest.raises(ProgdfError, match="it has no offsets"):
         load_trajectory(path)
 
 
