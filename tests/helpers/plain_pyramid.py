@@ -196,7 +196,8 @@ class PlainCut:
         if z - 3.0 * largest > near and max(node.opacity, least) >= ALPHA_MIN:
             if not self._in_window(node.mean, largest):
                 return []
-            loss = node.spread * (1.0 + node.contrast) * math.sqrt(node.weight)
+            area = node.weight * math.sqrt(max(node.opacity, 1.0))
+            loss = node.spread * (1.0 + node.contrast) * math.sqrt(area)
             loss *= self._focal2 / z**2
             if self._depths is not None:
                 cells = self._cells(x, y, (z - largest) * 2 ** (-1 / 32))

@@ -5,8 +5,9 @@ as it shows.
   node is one Gaussian with the moments of those below it, weighed by opacity times area.
 - A view takes a node whose detail does not show, and else looks at its two halves, or at the Gaussians of a
   leaf. What merging loses is estimated in pixels² as the spread of the centers, in pixels, times the root of
-  the visible area, as errors add up in squares, and more where colors differ; and it shows as far as light
-  reaches it, which a coarser cut of the same view tells, added up in a grid of cells and slices of depth.
+  the visible area, as errors add up in squares, and more where colors differ or several cover each other;
+  and it shows as far as light reaches it, which a coarser cut of the same view tells, added up in a grid of
+  cells and slices of depth.
 - The limit is sought so that about as many are drawn as asked for, beginning at the last picture's.
 - Each Gaussian has a dilation of its own in the fine picture: a node of many small ones is as dense as these
   are together. That of the coarse picture, which is wider, is taken off the size, and the remainder off the
@@ -492,8 +493,8 @@ def _walk(
             if _is_outside(camera, x, y, wide2, high2):
                 continue
             inside = _is_inside(camera, x, y, wide2, high2) and means[i, DENSITY] > 0.0
-            scaled = focal / z
-            loss = np.float64(means[i, LOSS]) * math.sqrt(means[i, WEIGHT]) * scaled * scaled
+            area = math.sqrt(max(density, 1.0)) * means[i, WEIGHT]
+            loss = np.float64(means[i, LOSS]) * math.sqrt(area) * focal * focal / (z * z)
             if depths.size > 1 and limit < loss < limit * _DARK:
                 depth = 0.0
                 for corner in range(8):
