@@ -7,7 +7,6 @@ So it works on one, but where it has much to do at once.
 
 from __future__ import annotations
 
-import itertools
 import os
 import threading
 from collections.abc import Callable, Iterator
@@ -85,12 +84,12 @@ def run_chunks(kernel: Callable[[int], _T], chunks: int) -> list[_T]:
         what the calls returned, by chunk
     """
     stop: threading.Event | None = getattr(_local, "stop", None)
-    following, results, is_inner = itertools.count(), {}, getattr(_local, "is_inner", False)
+    following, results, is_inner = iter(range(chunks)), {}, getattr(_local, "is_inner", False)
 
     def work() -> None:
         _local.is_inner = is_inner or chunks > 1
         try:
-            while (chunk := next(following)) < chunks:
+            for chunk in following:  # each is one thread's
                 if stop is not None and stop.is_set():
                     raise StoppedError
                 results[chunk] = kernel(chunk)

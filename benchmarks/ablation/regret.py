@@ -53,7 +53,7 @@ from ..table import Table
 
 MEASURED = (0.12, 0.38, 0.64, 0.88, 1.0)
 """Strengths at which the editor is asked for what it means."""
-STAGES, STEPS, BANDS, VIEWS = (8, 4, 2), (5, 12, 24), (0, 1, 4), (20, 30)
+STAGES, STEPS, BANDS, VIEWS = (8, 4, 2), (5, 12, 24), (0, 1, 4, 9), (20, 30)
 """What is swept: even strengths; steps of conjugate gradients for each, where nothing ends them before; SH
 functions of the residual; fewer views than a run's own, with what was best for those."""
 REPORTING = 13
@@ -165,7 +165,7 @@ class Edit:
         self.picture(1.0)
         began = time.process_time()
         solver = make_solver(self.drawn, self.original)
-        solver, model = choose_model(solver, [(solver, choosing(1.0))], self.targets(1.0), most, 4)
+        solver, model = choose_model(solver, [(solver, choosing(1.0))], self.targets(1.0), most, 9)
         spent = time.process_time() - began
         strengths = self.strengths(8, model.allowed_share)
         stages = [TargetStage(s, self.targets(s), 1) for s in strengths]

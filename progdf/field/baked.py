@@ -260,7 +260,10 @@ class GradeForm:
     @property
     def label(self) -> str:
         """What it is, as in "grade of degree 2, a mask, 2 bases of DC"."""
-        bases, parts = len(self.residual), "DC" if self.residual.shape[2] == 3 else "two bands"
+        bases, parts = (
+            len(self.residual),
+            {12: "two bands", 27: "three bands"}.get(self.residual.shape[2], "DC"),
+        )
         beside = f"{bases} bas{'is' if bases == 1 else 'es'} of {parts}" if bases else "no residual"
         beside = beside if self.mask is None else f"a mask, {beside}"
         side = 0 if self.degree else lattice_side(self.table.shape[1])

@@ -44,7 +44,7 @@ _DIRECTIONS = 32  # in which a member's color is mapped; twice the functions of 
 _CHUNK = 1 << 11  # members at once
 MOST_RESIDUALS = 4
 """Bases of a residual that are tried."""
-COARSER = (1, 2, 3, 4, 6, 8)
+COARSER = tuple(2.0 ** (i / 4) for i in range(13))
 """Steps of a residual's levels that are tried, the finest of 8 bits 1."""
 _WITHIN = 0.999  # share of the members whose residual is reached: few must not take the levels of all
 
@@ -276,7 +276,7 @@ def fit_grade(
     rank: int,
     weights: Tensor,
     mask: Tensor | None = None,
-    coarser: int = 1,
+    coarser: float = 1.0,
 ) -> GradeForm:
     """A grade whose residual has so many bases.
 

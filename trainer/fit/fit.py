@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -158,16 +160,20 @@ def fit_grades(
     )
     evaluator = field_evaluator(trajectory, choosing, options.target_psnr)
     tried, serving, smallest = list[Candidate](), 0, math.inf
+
+    def is_too_coarse(rank: int, index: int) -> bool:
+        nonlocal smallest
+        form = fit_grade(trajectory.s, degree, table, course, rank, weights, mask, COARSER[index])
+        if form.bytes_per_member > smallest:
+            return False
+        field = replace(bake_grade(form, rows, mapped), recorded=tuple(trajectory.s.tolist()))
+        tried.append(evaluator.candidate(field, form.label))
+        serves = tried[-1].excess <= 1.0
+        smallest = form.bytes_per_member if serves else smallest
+        return not serves
+
     for rank in range(rank_limit(course) + 1):
-        for coarser in COARSER[: None if rank else 1]:
-            form = fit_grade(trajectory.s, degree, table, course, rank, weights, mask, coarser)
-            if form.bytes_per_member > smallest:
-                continue
-            field = replace(bake_grade(form, rows, mapped), recorded=tuple(trajectory.s.tolist()))
-            tried.append(evaluator.candidate(field, form.label))
-            if tried[-1].excess > 1.0:
-                break
-            smallest = form.bytes_per_member
+        bisect_left(range(len(COARSER) if rank else 1), True, key=partial(is_too_coarse, rank))
         serving += smallest < math.inf
         if serving > 1 or (not rank and serving):
             break

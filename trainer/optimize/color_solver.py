@@ -5,9 +5,9 @@ of the members' lowest bands, by conjugate gradients that know the clamps, each 
 own block of bands and weights, as in tomography: one that is a hundredth of a pixel, or seen from one side,
 gets its answer as another does. A member that no view shows follows the map.
 
-How much of this a region gets (degree of the map; no residual, one of DC, or one of two bands) is decided on
-views that are not solved for, at the full strength: the least of which more would take away less than a
-twentieth of the error. They also say when a strength has had enough steps.
+How much of this a region gets (degree of the map; no residual, one of DC, of two bands or of three) is
+decided on views that are not solved for, at the full strength: the least of which more would take away less
+than a twentieth of the error. They also say when a strength has had enough steps.
 
 A handful of pictures (`trainer.optimize.ties`) leaves most members undecided. There neighbors on one surface
 have residuals alike, what hardly shines through others is not asked where one picture alone shows it, and how
@@ -58,6 +58,9 @@ SETTLED = 0.001
 STEPS = "steps"
 """Of a recording's means: the steps that it took."""
 
+BANDS = (1, 4, 9)
+"""SH functions of a residual that are tried, each where the one before it was better than less."""
+
 _RIDGE = 0.002  # of a typical member's weight: holds the residual of what hardly shows at 0
 _TIES = 0.001  # of a typical member's weight: ties neighbors, where views are few
 _TRUSTED = 0.1  # of the same: a member of less is rather as its neighbors are
@@ -74,12 +77,12 @@ class Model:
 
     degree: int  # of the map; 0: none
     hold: float  # of the residual at 0, as a share of a typical member's weight
-    residual: Tensor  # of the finished edit: b of 0, 1 or 4 bands. [M,b,3]
+    residual: Tensor  # of the finished edit: b of 0, 1, 4 or 9 functions. [M,b,3]
     mask: Tensor | None  # see `GradeForm.mask`
     error: float  # mean square, of the finished edit in views not solved for: what is finer is not chased
     unedited: float  # the same of the original
     tried: Sequence[tuple[str, float]]  # what was tried, and its error on views not solved for, dB
-    # residual and error with a second band, where that is better, but by less than a twentieth
+    # residual and error with another band, where that is better, but by less than a twentieth
     richer: tuple[Tensor, float] | None = None
 
     @property
@@ -328,7 +331,7 @@ def make_solver(views: Sequence[ColorView], original: Tensor, ties: Ties | None 
     ones, weights = original.new_ones(len(original), 3), torch.zeros(())
     weighed = map_views(lambda view: view.map.gradient(view.map.picture(ones) * view.counts)[:, 0], views)
     for view, weight in zip(views, weighed, strict=True):
-        bands = view.basis[:, :4]
+        bands = view.basis[:, : BANDS[-1]]
         weights = weights + (weight[:, None] * bands)[:, :, None] * bands[:, None]
     asked = torch.ones_like(original[:, 0], dtype=torch.bool)
     held = csr_matrix((len(original), len(original)), dtype=np.float32)
@@ -365,11 +368,11 @@ def choose_model(
         trials: solvers to try it with, and views or pixels that these do not know; see `split_solver`
         targets: the finished edit in the solver's views
         steps: most steps of conjugate gradients for a residual
-        most_bands: that a residual may have: 1 or 4
+        most_bands: SH functions that a residual may have: 1, 4 or 9
     """
     tried: list[_Attempt] = []
     few, judges = solver.ties is not None, [judge for _, judge in trials]
-    most_bands = min(most_bands, 1 if few or solver.sh.shape[1] == 1 else 4)
+    most_bands = min(most_bands, 1 if few else solver.sh.shape[1])
 
     def attempt(base: _Attempt, name: str, bands: int, hold: float) -> _Attempt:
         """With a residual that begins where that of `base` ended."""
@@ -400,10 +403,12 @@ def choose_model(
     hold = _HOLDS[0] if few else _RIDGE
     by_degree = [attempt(bases[degree], name, int(few), hold) for degree, name in names.items()]
     best = last = _least(by_degree, lambda one: one.degree)
-    sizes = [(1, _RIDGE), (4, _RIDGE)][: 1 + (most_bands > 1)]
+    sizes = [(bands, _RIDGE) for bands in BANDS if bands <= most_bands]
     for bands, hold in [(1, hold) for hold in _HOLDS[1:]] if few else sizes:
         name = f"residual held by {hold:g}" if few else f"with a residual of {bands}"
         last = attempt(last, name, bands, hold)
+        if last.error >= best.error and not few:
+            break
         if max(last.error, LEVEL) < MORE_PAYS * best.error:
             best = last
     richer = (
@@ -415,8 +420,9 @@ def choose_model(
         base = others[_least(masked, lambda one: one.degree).degree - 1]
         masked = [] if few else masked
         masked.append(attempt(base, "with a mask and a residual of 1", 1, best.hold))
-        if most_bands > 1 and masked[-1].error < MORE_PAYS * best.error:
-            masked.append(attempt(masked[-1], "with a mask and a residual of 4", 4, best.hold))
+        for bands in BANDS[1:]:
+            if bands <= most_bands and masked[-1].error < MORE_PAYS * best.error:
+                masked.append(attempt(masked[-1], f"with a mask and a residual of {bands}", bands, best.hold))
         best = _least([best, *masked], lambda one: one.size, LEVEL)  # degrees take no bytes, these do
     chosen, residual = best.solvers[0], best.residuals[0]
     if few:
@@ -429,7 +435,7 @@ def choose_model(
 
 
 def enrich(model: Model, solver: Solver, stage: TargetStage, judge: Judge, steps: int) -> Model:
-    """The model with a second band where that pays on the way: less than a twentieth at the end can be
+    """The model with another band where that pays on the way: less than a twentieth at the end can be
     half of the error at a tenth of the slider, where a map leaves little but what turns with the view.
 
     Args:
@@ -447,7 +453,10 @@ def enrich(model: Model, solver: Solver, stage: TargetStage, judge: Judge, steps
         made, _ = solver.residual(mapped, start, stage.targets, steps, judge, model.error, model.hold)
         errors.append(max(error, LEVEL) + max(judge.error(add_bands(mapped, made)), LEVEL))
     pays = errors[1] < MORE_PAYS * errors[0]
-    decided = f"with a residual of 4, at {stage.strength:g} too", decibels(errors[1] / 2)
+    decided = (
+        f"with a residual of {model.richer[0].shape[1]}, at {stage.strength:g} too",
+        decibels(errors[1] / 2),
+    )
     residual, error = model.richer if pays else (model.residual, model.error)
     return replace(model, residual=residual, error=error, tried=[*model.tried, decided], richer=None)
 

@@ -10,11 +10,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import pad
 
@@ -22,6 +21,7 @@ from progdf.field.baked import MONOMIALS, identity_map
 from progdf.field.grade import MOST_COLOR, member_bands, monomials
 from progdf.gaussians import unpack
 from progdf.metrics.image import ROUNDING
+from progdf.rasterize.cpu.engine import Array
 from progdf.rasterize.cpu.jit import Number, kernel
 from progdf.rasterize.engines import ColorMap, color_map
 from progdf.sh import basis
@@ -44,7 +44,6 @@ _MASK_RIDGE = 0.01  # of a typical curvature, for members that hardly show
 MORE_PAYS = 0.95
 """Share of the error that a larger model must leave at most, to be worth its bytes."""
 
-Array = NDArray[Any]
 _A = TypeVar("_A")
 _B = TypeVar("_B")
 

@@ -273,7 +273,7 @@ def _prepare_colors(
         judge, finished = judging(edited[max(edited)]), _boxes(edited[max(edited)], setup.train)
         solver, most = make_solver(drawn, original, ties), iterations(optimization.steps)
         trials = [(solver, judge)] if ties is None else split_solver(solver, original, finished)
-        solver, model = choose_model(solver, trials, finished, most, 1 if optimization.sh == "off" else 4)
+        solver, model = choose_model(solver, trials, finished, most, 1 if optimization.sh == "off" else 9)
     on = "all views, as none is held out" if judge.views is drawn else "views that are held out"
     edited = edited if between is None else between(model.allowed_share)
     stages = [TargetStage(s, _boxes(some, setup.train), 1) for s, some in edited.items()]
