@@ -173,7 +173,8 @@ def fit_grades(
         return not serves
 
     for rank in range(rank_limit(course) + 1):
-        bisect_left(range(len(COARSER) if rank else 1), True, key=partial(is_too_coarse, rank))
+        if not is_too_coarse(rank, 0) and rank:
+            bisect_left(range(1, len(COARSER)), True, key=partial(is_too_coarse, rank))
         serving += smallest < math.inf
         if serving > 1 or (not rank and serving):
             break

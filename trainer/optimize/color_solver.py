@@ -43,6 +43,7 @@ from .color_views import (
     MapFit,
     fit_maps,
     improve_mask,
+    iterate_views,
     map_views,
     mask_of_members,
 )
@@ -225,22 +226,22 @@ class Solver:
             hold: see `Model.hold`
             tell: called after each step
         """
-        ridge, base = hold * self.typical, map_views(lambda view: view.colors(mapped), self.views)
+        ridge = hold * self.typical
         targets = [view.pick(target) for view, target in zip(self.views, targets, strict=True)]
         look = None if judge is None else lambda now: judge.error(add_bands(mapped, now))
         start = start * self.asked[:, None, None]
-        residual, first = self._descend(base, start, targets, ridge, steps, tell, look, floor)
+        residual, first = self._descend(mapped, start, targets, ridge, steps, tell, look, floor)
         if self.ties is None:
             return residual, first
         weights = self.asked * self.weights[:, 0, 0] / (_TRUSTED * self.typical)
         around = self.ties.spread(residual, weights, hold / _TIES)
         start = around * self.asked[:, None, None]
-        residual, more = self._descend(base, start, targets, ridge, steps, tell, look, floor)
+        residual, more = self._descend(mapped, start, targets, ridge, steps, tell, look, floor)
         return torch.where(self.asked[:, None, None], residual, around), first + more
 
     def _descend(
         self,
-        base: Sequence[Tensor],
+        mapped: Tensor,
         start: Tensor,
         targets: Sequence[Tensor],
         ridge: float,
@@ -249,11 +250,11 @@ class Solver:
         look: Callable[[Tensor], float] | None,
         floor: float,
     ) -> tuple[Tensor, int]:
-        """See `residual`; `base`: the colors in each view without it [M,3]; `look`: the judge's error."""
+        """See `residual`; `look`: the judge's error."""
         count, held = start.shape[1], torch.from_numpy(self.held.diagonal()) + max(ridge, 1e-30)
         curvature = self.weights[:, :count, :count] + held[:, None, None] * torch.eye(count)
         inverse = torch.linalg.inv(curvature.double()).float() * self.asked[:, None, None]
-        now, pull = start, self._pull(base, start, targets, ridge)
+        now, pull = start, self._pull(mapped, start, targets, ridge)
         conditioned = along = inverse @ pull.descent
         best, taken = now, 0
         looks = [math.inf] * (_LOOKS - 1) + [math.inf if look is None else look(now)]
@@ -261,7 +262,7 @@ class Solver:
             length = _inner(pull.descent, along) / max(self._curvature(pull, along, ridge), 1e-30)
             for share in _SHARES:
                 ahead = now + share * length * along
-                next_pull = self._pull(base, ahead, targets, ridge)
+                next_pull = self._pull(mapped, ahead, targets, ridge)
                 if next_pull.error < pull.error:
                     break
             else:
@@ -294,21 +295,19 @@ class Solver:
             return ridge * x
         return ridge * x + torch.from_numpy(self.held @ x.flatten(1).numpy()).view_as(x)
 
-    def _pull(
-        self, base: Sequence[Tensor], residual: Tensor, targets: Sequence[Tensor], ridge: float
-    ) -> _Pull:
+    def _pull(self, mapped: Tensor, residual: Tensor, targets: Sequence[Tensor], ridge: float) -> _Pull:
         """See `_Pull`."""
+        offsets = add_bands(mapped, residual)
 
         def look(index: int) -> tuple[Tensor, Tensor, Tensor, float]:
-            view = self.views[index]
-            colors = base[index] + torch.einsum("mb,mbc->mc", view.basis[:, : residual.shape[1]], residual)
-            pull, passed, squared = view.pull(colors, targets[index])
+            colors = self.views[index].colors(offsets)
+            pull, passed, squared = self.views[index].pull(colors, targets[index])
             drawn = (colors > 0.0) | (pull > 0.0)
             return drawn, passed, pull * drawn, squared
 
         descent, clamps = -self._hold(residual, ridge), list[tuple[Tensor, Tensor]]()
         error = _inner(residual, self._hold(residual, ridge))
-        looks = map_views(look, range(len(self.views)))
+        looks = iterate_views(look, range(len(self.views)))
         for view, (drawn, passed, pull, squared) in zip(self.views, looks, strict=True):
             descent += view.basis[:, : residual.shape[1], None] * pull[:, None]
             error += squared

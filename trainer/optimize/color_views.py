@@ -7,7 +7,7 @@ its coefficients too: its least squares over all views take a tenth of a second.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TypeVar
@@ -28,6 +28,7 @@ from progdf.sh import basis
 from progdf.threads import one_thread, run_chunks
 from trainer.views.crops import CropScene
 
+_AT_ONCE = 8  # views, whose results are there at the same time
 _SQUARES = 6  # of a view's longer side, every other one of which is in one of its halves
 _COVERED = 0.05  # the region's weight in a pixel that the map is fitted to
 _MOST_PIXELS = 250_000  # for the some twenty coefficients of the map; of more, evenly spread ones
@@ -348,3 +349,9 @@ class Judge:
 def map_views(work: Callable[[_A], _B], items: Sequence[_A]) -> list[_B]:
     """`work` of every item, on as many threads as the rasterizer has; the same bits on any number."""
     return run_chunks(lambda index: work(items[index]), len(items))
+
+
+def iterate_views(work: Callable[[_A], _B], items: Sequence[_A]) -> Iterator[_B]:
+    """The same some at a time, for what need not be kept."""
+    for begin in range(0, len(items), _AT_ONCE):
+        yield from map_views(work, items[begin : begin + _AT_ONCE])
