@@ -22,7 +22,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import msgspec
 import torch
@@ -41,6 +41,7 @@ from progdf.region import Region, whole_scene
 from progdf.scene.regions import parse_region
 from trainer.editors import COLOR_FUNCTIONS, ImageEditor, check_new_editor, make_editor
 from trainer.editors.adapters import models_here
+from trainer.editors.base import EditorInput
 from trainer.editors.instruct import InstructEditor, instruct
 from trainer.fit.draft import DraftViews, draft_grade, draft_views
 from trainer.options import EditorOptions, RegionOptions, ViewOptions
@@ -78,6 +79,17 @@ class Request(msgspec.Struct, frozen=True):
     height: _Side
     model: str = ""
     seed: int = 0
+
+
+class _Sight(NamedTuple):
+    """What a request looks at, and from where."""
+
+    region: str
+    background: _Row3
+    viewmat: tuple[_Row4, ...]
+    K: tuple[_Row3, ...]
+    width: int
+    height: int
 
 
 class Answer(msgspec.Struct):
@@ -147,20 +159,14 @@ class Previewer:
         Raises:
             ProgdfError: region or editor do not work, or the view shows nothing of the region.
         """
-        seen = (
-            request.region,
-            request.viewmat,
-            request.K,
-            (request.width, request.height),
-            request.background,
-        )
-        view = self._view(*seen)
+        seen = _Sight(**{name: getattr(request, name) for name in _Sight._fields})
+        view = self._view(seen)
         if not bool((view.mask > 0.0).any()):
             return view.image
         options = EditorOptions(
             request.editor, model=request.model, seed=max(0, request.seed), cache=self._cache
         )
-        return self._editor(options, *seen).edit(view, request.strength)
+        return self._editor(options, seen).edit(view, request.strength)
 
     def note(self, request: Request) -> str:
         """What would paint a sentence, where, and what that takes.
@@ -178,36 +184,20 @@ class Previewer:
     def _painter(self, request: Request) -> InstructEditor:
         options = EditorOptions(request.editor, model=request.model)
         what, region = options.editor.partition(":")[2], whole_scene(self._scene)
-        return instruct(what, self._scene, region, (), options)
+        return instruct(EditorInput(what, self._scene, region, (), options))
 
     def _find_region(self, spec: str) -> Region:
         request = RegionRequest(RegionOptions(spec), ViewOptions(scene=self._path), _no_masks, quiet=True)
         return parse_region(spec, self._scene, kinds=region_kinds(request))
 
-    def _make_view(
-        self,
-        region: str,
-        viewmat: tuple[_Row4, ...],
-        K: tuple[_Row3, ...],
-        size: tuple[int, int],
-        background: _Row3,
-    ) -> View:
-        camera = Camera(torch.tensor(viewmat), torch.tensor(K), *size, name="view")
-        camera = with_near_plane([camera], self._scene)[0]
-        return make_view(self._scene, self._region(region), camera, torch.tensor(background))
+    def _make_view(self, seen: _Sight) -> View:
+        K, viewmat = torch.tensor(seen.K), torch.tensor(seen.viewmat)
+        (camera,) = with_near_plane([Camera(viewmat, K, seen.width, seen.height, "view")], self._scene)
+        return make_view(self._scene, self._region(seen.region), camera, torch.tensor(seen.background))
 
-    def _make_editor(
-        self,
-        options: EditorOptions,
-        region: str,
-        viewmat: tuple[_Row4, ...],
-        K: tuple[_Row3, ...],
-        size: tuple[int, int],
-        background: _Row3,
-    ) -> ImageEditor:
+    def _make_editor(self, options: EditorOptions, seen: _Sight) -> ImageEditor:
         check_new_editor(options)
-        view = self._view(region, viewmat, K, size, background)
-        return make_editor(options, self._scene, self._region(region), [view])
+        return make_editor(options, self._scene, self._region(seen.region), [self._view(seen)])
 
     @property
     def scene(self) -> Gaussians:

@@ -11,14 +11,14 @@ from progdf.region import Region
 from trainer.options import EditorOptions
 from trainer.views.view import View
 
-from .base import ImageEditor, Painter
+from .base import EditorInput, ImageEditor, Painter
 from .decal import check_decal, decal
 from .instruct import check_instruct, instruct
 from .pictures import folder, folder_of, photograph_folders, photographs, picture_paths, pictures
 from .procedural import darken, grade, grade_of, night, paint_of, recolor, remove, stops_of, stripes, tint
 from .style import check_style, style
 
-Factory = Callable[[str, Gaussians, Region, Sequence[View], EditorOptions], ImageEditor]
+Factory = Callable[[EditorInput], ImageEditor]
 
 EDITORS: dict[str, Factory] = {
     "recolor": recolor,
@@ -35,8 +35,7 @@ EDITORS: dict[str, Factory] = {
     "instruct": instruct,
     "remove": remove,
 }
-"""Kind of editor → its factory, given the text after the colon, the scene, the region, the views
-and all options of editors."""
+"""Kind of editor → its factory."""
 
 PER_VIEW = ("folder", "photographs", "style", "instruct")
 """Kinds whose views are edited one by one, so that nothing makes them agree."""
@@ -109,7 +108,7 @@ def make_editor(
 ) -> ImageEditor:
     """The editor that the options name, for one region and its views; ProgdfError says what is wrong."""
     kind, what = check_editor(options.editor)
-    return EDITORS[kind](what, scene, region, views, options)
+    return EDITORS[kind](EditorInput(what, scene, region, views, options))
 
 
 __all__ = [

@@ -3,14 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 from torch import Tensor
 
 from progdf.camera import Camera
+from progdf.gaussians import Gaussians
 from progdf.rasterize import Crop
-from trainer.options import EditKind
+from progdf.region import Region
+from trainer.options import EditKind, EditorOptions
 from trainer.views.view import View
+
+
+@dataclass(frozen=True)
+class EditorInput:
+    """What an editor is made from."""
+
+    what: str  # the text after the colon
+    scene: Gaussians  # the original
+    region: Region
+    views: Sequence[View]
+    options: EditorOptions
 
 
 class ImageEditor(Protocol):

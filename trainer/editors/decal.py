@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,10 +17,11 @@ from progdf.gaussians import ZERO, Gaussians, Origin
 from progdf.io.cameras import load_cameras
 from progdf.io.images import open_picture
 from progdf.rasterize.engines import render_depth
-from progdf.region import Region
 from trainer.options import EditKind, EditorOptions
 from trainer.paint.discs import LEAST_ALPHA, OPAQUE, Paint, lay_on, project_paint, sample_image
 from trainer.views.view import BACKGROUND, View, make_view, with_near_plane
+
+from .base import EditorInput
 
 _MOST_SIDE = 512  # pixels of a decal's longer side: of a larger one the view is shrunk
 
@@ -135,14 +135,13 @@ class DecalEditor:
         return lay_on(view.image, strength * drawn)
 
 
-def decal(
-    what: str, scene: Gaussians, region: Region, views: Sequence[View], options: EditorOptions
-) -> DecalEditor:
+def decal(given: EditorInput) -> DecalEditor:
     """`decal:LOGO.png` with --at and --camera: on what that camera sees of the region, where it is opaque.
 
     Raises:
         ProgdfError: the picture, the place or the camera will not do, or nothing lies on the region.
     """
+    scene, region, options = given.scene, given.region, given.options
     camera = decal_camera(options.camera, scene.origin)
     place = parse_place(options.at, camera)
     if (shrunk := _MOST_SIDE / place.size) < 1.0:
@@ -153,12 +152,12 @@ def decal(
         )
     (camera,) = with_near_plane([camera], scene)
     view = make_view(scene, region, camera, torch.tensor(BACKGROUND))
-    drawn = draw_decal(Path(what).expanduser(), place, camera)
+    drawn = draw_decal(Path(given.what).expanduser(), place, camera)
     alpha = render_depth(scene, camera).alpha
     drawn = drawn * ((alpha > OPAQUE) & (view.mask > 0.5 * alpha))[..., None]
     if not bool((drawn[..., 3] > LEAST_ALPHA).any()):
         raise ProgdfError(
-            f"{what} does not lie on the region '{region.name}': nothing opaque of it is seen there; "
+            f"{given.what} does not lie on the region '{region.name}': nothing opaque of it is seen there; "
             "give another place with --at"
         )
     return DecalEditor(scene, view, drawn)

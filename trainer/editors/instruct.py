@@ -22,7 +22,6 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import ZERO, Gaussians
 from progdf.io.picture_camera import find_picture_camera
 from progdf.rasterize import Crop
-from progdf.region import Region
 from trainer.options import EditKind, EditorOptions
 from trainer.store.pretrained import last_model
 from trainer.views.view import BACKGROUND, View, region_box, render_view
@@ -39,6 +38,7 @@ from .adapters import (
     pipeline_folder,
     place,
 )
+from .base import EditorInput
 from .cache import KeptPictures, Recipe
 from .mixed_steps import MixedSteps, network_steps
 
@@ -159,11 +159,9 @@ class InstructEditor:
         return (painted * 255.0).round() / 255.0
 
 
-def instruct(
-    what: str, scene: Gaussians, region: Region, views: Sequence[View], options: EditorOptions
-) -> InstructEditor:
+def instruct(given: EditorInput) -> InstructEditor:
     """`instruct:"…"`: the model and its options are checked now, its weights are loaded when first needed."""
-    request = resolve_request(what, options)
+    options, request = given.options, resolve_request(given.what, given.options)
 
     @cache
     def pipeline() -> MixedSteps:
@@ -175,7 +173,7 @@ def instruct(
         return loaded
 
     placement = place(request, options.device)
-    return InstructEditor(scene, request, placement, pipeline, KeptPictures(options.cache))
+    return InstructEditor(given.scene, request, placement, pipeline, KeptPictures(options.cache))
 
 
 def check_instruct(what: str, options: EditorOptions) -> None:

@@ -31,9 +31,10 @@ from progdf.gaussians import ZERO, Gaussians, Origin
 from progdf.io.images import picture_size, read_picture, save_as
 from progdf.io.picture_camera import find_picture_camera
 from progdf.rasterize import render
-from progdf.region import Region
-from trainer.options import EditKind, EditorOptions
+from trainer.options import EditKind
 from trainer.views.view import BACKGROUND, View, seen_colors
+
+from .base import EditorInput
 
 MOST_PICTURES = 32
 """More are a folder of views: what a handful needs would take long."""
@@ -69,34 +70,32 @@ class PicturesEditor:
         return interpolate_colors(given[before], given[after], share, self.bends[after])
 
 
-def pictures(
-    what: str, scene: Gaussians, region: Region, views: Sequence[View], options: EditorOptions
-) -> PicturesEditor:
+def pictures(given: EditorInput) -> PicturesEditor:
     """`pictures:A.png[,B.png…]`: see the module's head; the views are the pictures', in their order.
 
     Raises:
         ProgdfError: a picture is missing or broken.
     """
-    found = [strengths_of(path) for path in picture_paths(what)]
+    found = [strengths_of(path) for path in picture_paths(given.what)]
     stages = sorted({strength for strengths in found for strength in strengths})
     for strengths in found:
         for strength in stages:
             if strength not in strengths:
                 path = strengths[1.0].parent / f"{strength:g}" / strengths[1.0].name
                 raise ProgdfError(f"{path} is missing; every picture needs one of each strength")
-    given = {
+    images = {
         view.camera.name: {0.0: view.image}
-        | {s: read_edit(scene, view.camera, view.image, path) for s, path in some.items()}
-        for view, some in zip(views, found, strict=True)
+        | {s: read_edit(given.scene, view.camera, view.image, path) for s, path in some.items()}
+        for view, some in zip(given.views, found, strict=True)
     }
     bends, ways = {}, list(pairwise((0.0, *stages)))
     for before, after in ways:
-        first, last = (torch.cat([some[s] for some in given.values()]) for s in (before, after))
+        first, last = (torch.cat([some[s] for some in images.values()]) for s in (before, after))
         weights = (last - first).norm(dim=2)
         bends[after] = bend_of(typical_color(first, weights), typical_color(last, weights))
     parts = -(-_LEAST_STRENGTHS // len(stages))
     between = [a + (b - a) * (k + 1) / parts for a, b in ways for k in range(parts - 1)]
-    return PicturesEditor(given, bends, tuple(sorted({*between, *stages})) if len(stages) > 1 else ())
+    return PicturesEditor(images, bends, tuple(sorted({*between, *stages})) if len(stages) > 1 else ())
 
 
 def read_edit(scene: Gaussians, camera: Camera, image: Tensor, path: Path) -> Tensor:
@@ -369,11 +368,9 @@ def photograph_folders(what: str) -> tuple[Path, Path | None]:
     return roots[0], roots[1] if len(roots) > 1 else None
 
 
-def folder(
-    what: str, scene: Gaussians, region: Region, views: Sequence[View], options: EditorOptions
-) -> FolderEditor:
+def folder(given: EditorInput) -> FolderEditor:
     """`folder:DIR`: see the module's head. Every view's picture is looked for before training starts."""
-    return _make_editor(folder_of(what), views)
+    return _make_editor(folder_of(given.what), given.views)
 
 
 def _make_editor(root: Path, views: Sequence[View], bent: bool = False) -> FolderEditor:
@@ -393,15 +390,13 @@ def _make_editor(root: Path, views: Sequence[View], bent: bool = False) -> Folde
     return editor
 
 
-def photographs(
-    what: str, scene: Gaussians, region: Region, views: Sequence[View], options: EditorOptions
-) -> FolderEditor:
+def photographs(given: EditorInput) -> FolderEditor:
     """`photographs:EDITED,ORIGINALS` or `photographs:EDITED`: see the module's head."""
-    edited, originals = photograph_folders(what)
+    edited, originals = photograph_folders(given.what)
     if originals is not None:
-        for view in views:
+        for view in given.views:
             _picture(originals, view.camera.name, bent=True)
-    return replace(_make_editor(edited, views, bent=True), originals=originals)
+    return replace(_make_editor(edited, given.views, bent=True), originals=originals)
 
 
 def _strength(name: str) -> float | None:

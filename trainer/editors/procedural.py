@@ -20,11 +20,10 @@ from progdf.color.oklab import ColorPath, bend_of, interpolate_colors, path_of
 from progdf.color.palette import are_alike
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
-from progdf.region import Region
-from trainer.options import EditKind, EditorOptions
+from trainer.options import EditKind
 from trainer.views.view import BACKGROUND, View, render_colors, render_view, seen_colors
 
-from .base import ImageEditor
+from .base import EditorInput, ImageEditor
 
 _COVER = 0.75  # of the old contrast is lost under a stripe
 _STRIPES = 7  # across the longest side of the region
@@ -114,62 +113,49 @@ def edit_course(editor: ImageEditor, view: View) -> Callable[[float], Tensor]:
     return editor.course(view) if isinstance(editor, ColorEditor) else partial(editor.edit, view)
 
 
-def recolor(
-    what: str, scene: Gaussians, region: Region, views: Sequence[View], options: EditorOptions
-) -> ColorEditor:
+def recolor(given: EditorInput) -> ColorEditor:
     """`recolor:#rrggbb[,path=hue]`: another color, the shading kept."""
-    (target, path), typical = paint_of(what), region_color(views)
+    (target, path), typical = paint_of(given.what), region_color(given.views)
     return ColorEditor(lambda rgb: color.recolor_course(rgb, target, typical, path))
 
 
-def tint(
-    what: str, scene: Gaussians, region: Region, views: Sequence[View], options: EditorOptions
-) -> ColorEditor:
+def tint(given: EditorInput) -> ColorEditor:
     """`tint:#rrggbb[,path=hue]`: a wash of color, lightness kept."""
-    (target, path), typical = paint_of(what), region_color(views)
+    (target, path), typical = paint_of(given.what), region_color(given.views)
     return ColorEditor(lambda rgb: color.tint_course(rgb, target, typical, path))
 
 
-def darken(
-    what: str, scene: Gaussians, region: Region, views: Sequence[View], options: EditorOptions
-) -> ColorEditor:
+def darken(given: EditorInput) -> ColorEditor:
     """`darken:AMOUNT`: that share of the light is taken away, 0..1, by default 0.875 (three stops)."""
-    stops = stops_of(what, "darken")
+    stops = stops_of(given.what, "darken")
     return ColorEditor(lambda rgb: partial(color.darken, rgb, stops=stops))
 
 
-def night(
-    what: str, scene: Gaussians, region: Region, views: Sequence[View], options: EditorOptions
-) -> ColorEditor:
+def night(given: EditorInput) -> ColorEditor:
     """`night` or `night:AMOUNT`: as `darken`, with colors fading to the blue of moonlight."""
-    stops = stops_of(what, "night")
+    stops = stops_of(given.what, "night")
     return ColorEditor(lambda rgb: color.night_course(rgb, stops))
 
 
-def grade(
-    what: str, scene: Gaussians, region: Region, views: Sequence[View], options: EditorOptions
-) -> ColorEditor:
+def grade(given: EditorInput) -> ColorEditor:
     """`grade:exposure=0.5,#8a5a2b=#2b5a8a,curve=0.3:0.2`: what a hand does to colors, see `grade_of`."""
-    asked = grade_of(what)
+    asked = grade_of(given.what)
     return ColorEditor(lambda rgb: color.grade_course(rgb, asked))
 
 
-def stripes(
-    what: str, scene: Gaussians, region: Region, views: Sequence[View], options: EditorOptions
-) -> StripesEditor:
+def stripes(given: EditorInput) -> StripesEditor:
     """`stripes:#rrggbb[,path=hue]`: seven stripes across the region's longest side, painted in 3D."""
-    target, path = paint_of(what)
-    points = scene.means[region.members]
+    target, path = paint_of(given.what)
+    members = given.region.members
+    points = given.scene.means[members]
     axis, period, phase = stripe_frame(points)
     pattern = color.stripe_pattern(points, axis, period, phase)
-    return StripesEditor(scene, region.members, pattern, target, region_color(views), path)
+    return StripesEditor(given.scene, members, pattern, target, region_color(given.views), path)
 
 
-def remove(
-    what: str, scene: Gaussians, region: Region, views: Sequence[View], options: EditorOptions
-) -> RemoveEditor:
+def remove(given: EditorInput) -> RemoveEditor:
     """`remove` or `remove:A.png`: the region is taken away."""
-    return RemoveEditor(scene, region.members, torch.tensor(BACKGROUND))
+    return RemoveEditor(given.scene, given.region.members, torch.tensor(BACKGROUND))
 
 
 def stripe_frame(points: Tensor) -> tuple[Tensor, float, float]:

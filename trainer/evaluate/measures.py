@@ -51,10 +51,8 @@ def evaluate_run(opened: OpenedRun, perceptual: Perceptual, texts: TextOptions) 
         texts: what CLIP is asked
     """
     evaluator, contenders = opened.evaluator, opened.contenders()
-    strength = dict(opened.trajectory.stage_strengths)
-    curves = picture_courses(
-        evaluator, contenders, tuple(strength), lambda s: evaluator.edited[strength[s]], perceptual
-    )
+    truth = {s: evaluator.edited[strength] for s, strength in opened.trajectory.stage_strengths}
+    curves = picture_courses(evaluator, contenders, tuple(truth), truth.__getitem__, perceptual)
     paths = {name: slider_path(evaluator, pictures, perceptual) for name, pictures in contenders.items()}
     consistency = view_consistency(opened, perceptual)
     lpips = "LPIPS" if perceptual.name.startswith("lpips") else perceptual.name
@@ -233,10 +231,7 @@ def summary_table(names: Sequence[str], evaluations: Sequence[Evaluation]) -> st
 def evaluation_json(evaluation: Evaluation) -> dict[str, Any]:
     """As evaluation.json has it: rows by name, their figures by column, or why there are none."""
     rows = {row.name: {"missing": row.missing} if row.missing else _round_row(row) for row in evaluation.rows}
-    curves = {
-        name: {"s": curve.s, "psnr": curve.psnr, "ssim": curve.ssim, "lpips": curve.lpips}
-        for name, curve in evaluation.curves.items()
-    }
+    curves = {name: curve.to_json() for name, curve in evaluation.curves.items()}
     pairs = [
         {"source": pair.source, "target": pair.target, "shared": round(pair.shared, 3)}
         for pair in evaluation.consistency.pairs

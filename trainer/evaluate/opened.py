@@ -54,11 +54,8 @@ class OpenedRun:
         def fade(s: float) -> list[Tensor]:
             return [torch.lerp(a, b, s) for a, b in zip(first, last, strict=True)]
 
-        return {
-            SLIDER: lambda s: self.evaluator.pictures(field.offsets(s)),
-            KEYFRAMES: lambda s: self.evaluator.pictures(keyframes.offsets(s)),
-            FADE: fade,
-        }
+        course = self.evaluator.course
+        return {SLIDER: course(field), KEYFRAMES: course(keyframes), FADE: fade}
 
 
 def open_run(root: Path, scene: Path | None = None) -> OpenedRun:

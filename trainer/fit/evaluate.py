@@ -12,8 +12,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from progdf.field import BakedField
 from progdf.gaussians import Gaussians, pack
 from progdf.metrics.image import decibels, ssim
+from progdf.metrics.slider import Pictures
 from progdf.region import Region
 from trainer.optimize.losses import Perceptual
 from trainer.views.choose import split_held_out
@@ -40,6 +42,10 @@ class Evaluator:
             self.looked()
         rows = self.original[:, : offsets.shape[1]] + offsets
         return render_all(self.crops, rows, moving_attributes(offsets))
+
+    def course(self, field: BakedField) -> Pictures:
+        """Every view at a slider value of a field."""
+        return lambda s: self.pictures(field.offsets(s))
 
     def picture(self, offsets: Tensor, view: int) -> Tensor:
         """One view with these offsets. [M,C] -> [h,w,3]"""

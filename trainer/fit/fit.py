@@ -94,11 +94,8 @@ class Fitted:
 
     # the field with its errors against the trajectory, on views that the choice has not seen
     chosen: Candidate
-    met: bool  # whether it serves on the views that it was chosen on
-    # the fields that were looked at, with their errors on the views that the choice was made on
-    tried: tuple[Candidate, ...]
+    choice: FieldChoice  # with the errors on the views that it was made on
     baselines: Mapping[str, Candidate]  # keyframe fields by name, on the same views as `chosen`
-    why: str  # it was chosen, in words
 
 
 def fit_field(
@@ -194,12 +191,17 @@ def field_evaluator(trajectory: Trajectory, views: Evaluator, target: float | No
 
 def _measure_choice(choice: FieldChoice, trajectory: Trajectory, reporting: Evaluator) -> Fitted:
     """The choice with its errors, and baselines with theirs, on views that it has not seen."""
-    offsets, best, why = _recorded_offsets(trajectory), choice.best, choice.why
+    offsets, best = _recorded_offsets(trajectory), choice.best
     errors = FieldEvaluator(trajectory.s, offsets, reporting.counted_pixels)
     if best.to_editor is not None:
-        why += f", with it {best.to_editor:.1f} dB"
-    chosen = errors.candidate(best.field, best.label)
-    return Fitted(chosen, choice.met, choice.tried, _baselines(trajectory, offsets, errors), why)
+        choice = replace(choice, why=f"{choice.why}, with it {best.to_editor:.1f} dB")
+    baselines = {
+        f"keyframes{count}": errors.candidate(
+            fit_keyframes(trajectory.s, offsets, count, trajectory.s.tolist()), f"{count} keyframes"
+        )
+        for count in BASELINES
+    }
+    return Fitted(errors.candidate(best.field, best.label), choice, baselines)
 
 
 def _recorded_offsets(trajectory: Trajectory) -> Tensor:
@@ -225,16 +227,6 @@ def evaluate_field(
     return _measure_choice(choice, trajectory, reporting)
 
 
-def _baselines(trajectory: Trajectory, offsets: Tensor, errors: FieldEvaluator) -> dict[str, Candidate]:
-    return {
-        f"keyframes{count}": errors.candidate(
-            fit_keyframes(trajectory.s, offsets, count, [float(s) for s in trajectory.s]),
-            f"{count} keyframes",
-        )
-        for count in BASELINES
-    }
-
-
 def field_figures(candidate: Candidate) -> dict[str, Any]:
     """A field's size and errors as report.json has them."""
     field = candidate.field
@@ -252,14 +244,12 @@ def choice_figures(fitted: Fitted) -> dict[str, Any]:
     tried = [
         {
             "field": candidate.label,
-            "bytes_per_gaussian": round(candidate.field.bytes_per_member, 1),
-            "psnr_mean": round(candidate.mean, 2),
-            "psnr_worst": round(candidate.worst, 2),
+            **field_figures(candidate),
             "psnr_to_editor": None if candidate.to_editor is None else round(candidate.to_editor, 2),
         }
-        for candidate in fitted.tried
+        for candidate in fitted.choice.tried
     ]
-    return {"chosen": fitted.chosen.label, "why": fitted.why, "tried": tried}
+    return {"chosen": fitted.chosen.label, "why": fitted.choice.why, "tried": tried}
 
 
 def visibility(

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from progdf.gaussians import BASE_CHANNELS, attribute_slices
-from progdf.io.json_values import convert_json
+from progdf.io.json_values import convert_json, plain
 from trainer.options import OptimizeOptions
 from trainer.store.state import Saved, generator
 from trainer.views.crops import CropScene, render_all
@@ -32,6 +32,7 @@ from .losses import Moment, Objective, TermMeans, l1, total_loss
 EPSILON = 0.1
 """Of the root mean square of an attribute's gradient: Adam's ε where it is raised."""
 
+_COUNTS = ("step", "stage", "local", "recorded")
 _ROWS = ("moved", "previous", "average", "first", "second")
 
 
@@ -136,16 +137,9 @@ class PgsState:
             tensors["average"] = self.average
         tensors |= {f"picture{i}": picture for i, picture in enumerate(self.pictures)}
         tensors["order"] = self._order.get_state()
-        values = {
-            "step": self.step,
-            "stage": self.stage,
-            "local": self.local,
-            "recorded": self.recorded,
-            "running": self.running if self.step else None,
-            "means": {name: list(sums) for name, sums in self.means.sums.items()},
-            "queue": self._queue,
-        }
-        return Saved(tensors, values)
+        running, sums = self.running if self.step else None, self.means.sums
+        counts = {name: getattr(self, name) for name in _COUNTS}
+        return Saved(tensors, plain(_StateValues(**counts, running=running, means=sums, queue=self._queue)))
 
     def restore(self, saved: Saved) -> None:
         """See `state.Resumable`."""
@@ -158,8 +152,8 @@ class PgsState:
             tensors[f"picture{i}"].to(self.first)
             for i in range(sum(k.startswith("picture") for k in tensors))
         ]
-        self.step, self.stage, self.local = values.step, values.stage, values.local
-        self.recorded = values.recorded
+        for name in _COUNTS:
+            setattr(self, name, getattr(values, name))
         self.running = math.nan if values.running is None else values.running
         self.means.sums = dict(values.means)
         self._order, self._queue = generator(tensors["order"]), list(values.queue)

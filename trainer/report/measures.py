@@ -41,22 +41,9 @@ class ErrorCurve:
     # of the views' boxes, ≥ 0 (or what stands in for LPIPS, see `Evaluator.perceptual`)
     lpips: tuple[float, ...]
 
-
-def error_curves(
-    evaluator: Evaluator,
-    fields: Mapping[str, BakedField],
-    strengths: Sequence[float],
-    truth: Pictures,
-    perceptual: Perceptual,
-    most: int | None = None,
-) -> dict[str, ErrorCurve]:
-    """Each field's errors on held-out views, over the slider; see `picture_courses`."""
-
-    def pictures_of(field: BakedField) -> Pictures:
-        return lambda s: evaluator.pictures(field.offsets(s))
-
-    pictures = {name: pictures_of(field) for name, field in fields.items()}
-    return picture_courses(evaluator, pictures, strengths, truth, perceptual, most)
+    def to_json(self) -> dict[str, list[float]]:
+        """As report.json and evaluation.json have it."""
+        return {name: [round(x, 2 if name == "psnr" else 4) for x in xs] for name, xs in asdict(self).items()}
 
 
 def picture_courses(
@@ -111,10 +98,9 @@ def against_editor(
         perceptual: LPIPS, or its stand-in
         most: see `picture_courses`
     """
-    strength = dict(stages)
-    return error_curves(
-        evaluator, fields, tuple(strength), lambda s: evaluator.edited[strength[s]], perceptual, most
-    )
+    pictures = {name: evaluator.course(field) for name, field in fields.items()}
+    truth = {s: evaluator.edited[at] for s, at in stages}
+    return picture_courses(evaluator, pictures, tuple(truth), truth.__getitem__, perceptual, most)
 
 
 COMPARED = "keyframes2"
@@ -179,7 +165,7 @@ def measure(
     """
     (evaluator, reporting), field = judges, fitted.chosen.field
     linear = fitted.baselines[COMPARED].field
-    slider = slider_statistics(lambda s: evaluator.pictures(shipped.offsets(s)), masks=evaluator.pixels)
+    slider = slider_statistics(evaluator.course(shipped), masks=evaluator.pixels)
     stages = tuple((remap.at(s), strength) for s, strength in trajectory.stage_strengths)
     drawn = against_editor(evaluator, {"slider": shipped, COMPARED: linear}, stages, perceptual, most=1)
     nodes = trajectory.s[1:-1][:: max(1, -(-(len(trajectory) - 2) // _NODES))].tolist()
@@ -251,7 +237,7 @@ def figures(measured: Measured, endpoint_error: float, outside_change: float) ->
             "psnr_at_recordings": round(measured.at_recordings, 2),
             "endpoint_error": endpoint_error,
             "outside_change": outside_change,
-            "target_met": fitted.met,
+            "target_met": fitted.choice.met,
         },
         "choice": choice_figures(fitted),
         "baselines": {name: field_figures(errors) for name, errors in fitted.baselines.items()},
@@ -281,7 +267,7 @@ def figures(measured: Measured, endpoint_error: float, outside_change: float) ->
                 "slider": [round(psnr, 2) for psnr in fitted.chosen.curve],
                 COMPARED: [round(psnr, 2) for psnr in fitted.baselines[COMPARED].curve],
             },
-            "against_editor": {name: _to_lists(found) for name, found in measured.editor.items()},
+            "against_editor": {name: found.to_json() for name, found in measured.editor.items()},
             "change": {
                 "from_original": [_four(distance) for distance in slider.distances],
                 "per_step": [_four(step) for step in slider.steps],
@@ -305,16 +291,6 @@ def _clip_features(clip: Clip, evaluator: Evaluator, views: Sequence[View], offs
 def _mean(values: Sequence[float | None]) -> float | None:
     known = [value for value in values if value is not None]
     return _four(sum(known) / len(known)) if known else None
-
-
-def _to_lists(course: ErrorCurve) -> dict[str, list[float]]:
-    return {
-        "s": [_four(s) for s in course.s],
-        "psnr": [round(value, 2) for value in course.psnr],
-        "seen_s": [_four(s) for s in course.seen_s],
-        "ssim": [_four(value) for value in course.ssim],
-        "lpips": [_four(value) for value in course.lpips],
-    }
 
 
 def _four(value: float) -> float:

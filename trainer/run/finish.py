@@ -79,7 +79,12 @@ class RunResult:
     gdf: Path
     report: Mapping[str, Any]  # what report.json holds
     # what was recorded, at the slider values where the field shows it; None of what is not trained
-    trajectory: Trajectory | None
+    trajectory: Trajectory | None = None
+
+    @property
+    def line(self) -> str:
+        """What was written, for the log."""
+        return f"wrote {self.gdf}: {file_size(self.report['file']['bytes'])}"
 
 
 def finish_run(
@@ -119,7 +124,7 @@ def finish_run(
             trajectory = replace(trajectory, end=field.offsets(1.0))
         shipped = replace(trajectory, s=remap(trajectory.s).float())
     log.say(
-        f"{fitted.chosen.label}, {fitted.why}: "
+        f"{fitted.chosen.label}, {fitted.choice.why}: "
         f"{field.bytes_per_member:.0f} bytes per Gaussian without the header, "
         f"worst {fitted.chosen.worst:.1f} dB, "
         f"mean {fitted.chosen.mean:.1f} dB against {len(trajectory)} recordings "
@@ -283,15 +288,11 @@ def _write(
     log: RunLog,
 ) -> RunResult:
     """Write all files, and say what is in them."""
-    path = folder.gdf(gdf.name)
     # the .gdf has the options beside it, is small, and the same training writes the same file
-    save_gdf(path, replace(gdf, report={k: v for k, v in report.items() if k not in _REPORT_ALONE}))
-    if path != folder.draft:
+    gdf = replace(gdf, report={k: v for k, v in report.items() if k not in _REPORT_ALONE})
+    result = replace(write_result(folder, gdf, report, picture), trajectory=trajectory)
+    if result.gdf != folder.draft:
         folder.draft.unlink(missing_ok=True)
-    size, members = path.stat().st_size, max(1, gdf.members)
-    report["file"] = {"bytes": size, "bytes_per_gaussian": round(size / members, 1)}
-    write_json(folder.report, report)
-    write_image(folder.picture, picture)
     edit = report["edit"]
     log.say(
         f"{setup.judged_on}: {edit['psnr_to_views']} dB, {edit['perceptual']} {edit['lpips_to_views']}"
@@ -300,12 +301,22 @@ def _write(
             for s, e in report["between"].items()
         )
     )
-    log.say(
-        f"wrote {path}: {file_size(size)}, {size / members:.0f} bytes per Gaussian with all that is in it"
-    )
+    each = report["file"]["bytes_per_gaussian"]
+    log.say(f"{result.line}, {each:.0f} bytes per Gaussian with all that is in it")
     if paint is not None:
         log.say(f"warning: {paint.warning}" if paint.warning else paint.share)
-    return RunResult(folder, path, report, trajectory)
+    return result
+
+
+def write_result(folder: RunFolder, gdf: Gdf, report: dict[str, Any], picture: Tensor) -> RunResult:
+    """Write NAME.gdf, report.json, which gets the file's size, and report.png."""
+    path = folder.gdf(gdf.name)
+    save_gdf(path, gdf)
+    size = path.stat().st_size
+    report["file"] = {"bytes": size, "bytes_per_gaussian": round(size / max(1, gdf.members), 1)}
+    write_json(folder.report, report)
+    write_image(folder.picture, picture)
+    return RunResult(folder, path, report)
 
 
 def load_evaluator(

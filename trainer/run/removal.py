@@ -13,14 +13,14 @@ from progdf.camera import Camera
 from progdf.compose.reference import Layer, compose_layers
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians, concatenate
-from progdf.gdf.file import Gdf, save_gdf
-from progdf.io.images import contact_sheet, write_image
+from progdf.gdf.file import Gdf
+from progdf.io.images import contact_sheet
 from progdf.io.json_values import plain
 from progdf.metrics.image import decibels
 from progdf.rasterize import render
 from progdf.region import Region, from_mask
 from progdf.scene.strays import find_strays
-from progdf.terminal import file_size, format_count
+from progdf.terminal import format_count
 from progdf.tidy import Step, tidy
 from trainer.editors.pictures import picture_background, picture_paths, read_edit, strengths_of
 from trainer.fill import Fill, fill_holes
@@ -28,10 +28,10 @@ from trainer.options import TrainOptions
 from trainer.resolve import recorded_options
 from trainer.setup import TrainingSetup, make_training_setup
 from trainer.store.progress import RunLog
-from trainer.store.run_folder import RunFolder, write_json, write_views
+from trainer.store.run_folder import RunFolder, write_views
 from trainer.views.view import View, render_view
 
-from .finish import DEFAULTS, RunResult, differences
+from .finish import DEFAULTS, RunResult, differences, write_result
 
 BACKGROUNDS = ("white", "black", "checker")
 _ALIKE = 0.05  # of color, as what was painted is told from what was not
@@ -173,19 +173,14 @@ def _write(
     finals = {view.camera.name: render_view(removed, view.camera, setup.background) for view in setup.views}
     write_views(folder, "final", finals)
     folder.trajectory.unlink(missing_ok=True)  # of an earlier run that recolored
-    path, given = folder.gdf(options.name), differences(report["plan"], DEFAULTS)
-    save_gdf(path, replace(gdf, options=given, report={name: report[name] for name in ("edit", "removal")}))
-    report["file"] = {
-        "bytes": path.stat().st_size,
-        "bytes_per_gaussian": round(path.stat().st_size / max(1, gdf.members), 1),
-    }
-    write_json(folder.report, report)
-    write_image(folder.picture, picture)
+    about = {name: report[name] for name in ("edit", "removal")}
+    gdf = replace(gdf, options=differences(report["plan"], DEFAULTS), report=about)
+    result = write_result(folder, gdf, report, picture)
     edit = report["edit"]["psnr_by_background"]
     said = ", ".join(f"{psnr:.1f} dB on {name}" for name, psnr in edit.items())
     log.say(f"to a render without the region, at its pixels in views not filled from: {said}")
-    log.say(f"wrote {path}: {file_size(path.stat().st_size)}; shadows and reflections stay")
-    return RunResult(folder, path, report, None)
+    log.say(f"{result.line}; shadows and reflections stay")
+    return result
 
 
 def _without(setup: TrainingSetup) -> Gaussians:

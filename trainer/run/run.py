@@ -19,13 +19,13 @@ from progdf.gaussians import BASE_CHANNELS, ZERO, Gaussians
 from progdf.gdf.file import save_gdf
 from progdf.io.atomic import read_file
 from progdf.io.cameras import load_cameras, save_cameras
-from progdf.io.images import contact_sheet, read_picture, write_image
+from progdf.io.images import contact_sheet, read_picture
 from progdf.io.json_values import plain
 from progdf.io.picture_camera import find_picture_camera
 from progdf.rasterize.engines import get_engine
 from progdf.region import Region
 from progdf.scene.regions import check_region, parse_region
-from progdf.terminal import file_size, group_digits
+from progdf.terminal import group_digits
 from trainer.editors import (
     COLOR_FUNCTIONS,
     COSTLY_STRENGTHS,
@@ -69,7 +69,6 @@ from trainer.store.run_folder import (
     open_run_folder,
     read_views,
     remove_stale_views,
-    write_json,
     write_views,
 )
 from trainer.store.state import interrupt_on_signals
@@ -77,7 +76,7 @@ from trainer.views.crops import only_recolors
 from trainer.views.view import BACKGROUND, fit_size, make_view, with_near_plane
 
 from .agree import AgreedEditor, Easel, agree_views
-from .finish import RunResult, end_rows, finish_run, load_evaluator, load_result, write_finals
+from .finish import RunResult, end_rows, finish_run, load_evaluator, load_result, write_finals, write_result
 from .kinds import Approach, choose_approach, resolve_approach
 from .paint import RING, TURNS, train_decal
 from .record import RunRecord, read_record
@@ -288,45 +287,38 @@ def _paint(
     view = editor.view
     with log.stage("fit"):
         painted = train_decal(editor, scene, options.name, log)
-    given = plain(recorded_options(options))
     decal = f"decal:{Path(options.editor.editor.partition(':')[2]).name}"
-    gdf, figures = replace(painted.gdf, instruction=decal), painted.figures
+    figures, name = painted.figures, view.camera.name
     own, turned = figures["own"], figures["turned"]
-    report = {"edit": {"psnr_to_views": own}, "paint": figures}
-    path = folder.gdf(options.name)
-    save_gdf(path, replace(gdf, report=report))
-    name = view.camera.name
+    about = {"edit": {"psnr_to_views": own}, "paint": figures}
     save_cameras(folder.cameras, [view.camera], scene.origin)
     middle = TURNS.index(0)
     mask = view.mask[..., None].expand(-1, -1, 3)
     pictures = {"original": view.image, "mask": mask, "edited": painted.expected[middle]}
     for kind, picture in (pictures | {"final": painted.shown[middle]}).items():
         write_views(folder, kind, {name: picture})
-    rows, labels = (
-        [painted.expected, painted.shown],
-        [f"{degrees:+d}°" if degrees else "0°" for degrees in TURNS],
-    )
+    labels = [f"{degrees:+d}°" if degrees else "0°" for degrees in TURNS]
     title = f"{options.name}: {options.editor.editor}"
     notes = [[], [f"{error} dB" if error is not None else "" for error in turned.values()]]
-    size = path.stat().st_size
-    rest = {
+    report = {
+        **about,
         "views": {"held_out": False, "edit": [name]},
-        "file": {"bytes": size, "bytes_per_gaussian": round(size / max(1, gdf.members), 1)},
         "time": log.rounded_seconds(),
         "memory_mb": log.memory.peak(),
-        "plan": given,
+        "plan": plain(recorded_options(options)),
         "pictures": picture_digests(options),
     }
-    write_image(folder.picture, contact_sheet(rows, ["projected", "the edit"], labels, title, notes=notes))
-    write_json(folder.report, report | rest)
+    rows = [painted.expected, painted.shown]
+    sheet = contact_sheet(rows, ["projected", "the edit"], labels, title, notes=notes)
+    result = write_result(folder, replace(painted.gdf, instruction=decal, report=about), report, sheet)
     added, pixels, moved = (group_digits(figures[name]) for name in ("added", "pixels", "moved"))
     log.say(
         f"{added} Gaussians added for {pixels} painted pixels, {moved} of the scene moved behind them; "
         f"{own} dB in the decal's own view, {figures['ring']} dB in the {RING} pixels around it, "
         f"{turned['-30']} and {turned['+30']} dB from 30° to its sides"
     )
-    log.say(f"wrote {path}: {file_size(size)}")
-    return RunResult(folder, path, report | rest, None)
+    log.say(result.line)
+    return result
 
 
 def _write_draft(

@@ -85,11 +85,10 @@ class Recordings:
         """How many there are; those that came since the last time are saved first."""
         for index in range(self._written, len(self.made)):
             snapshot = self.made[index]
-            values = {"step": snapshot.step, "stage": snapshot.stage, "ends_stage": snapshot.ends_stage}
+            values = {name: getattr(snapshot, name) for name in ("step", "stage", "ends_stage", "means")}
             tensors = {"offsets": snapshot.offsets}
-            if snapshot.table is not None:
-                tensors["table"] = snapshot.table
-            self._folder.save_later("recordings", tensors, values | {"means": snapshot.means}, index)
+            tensors |= {} if snapshot.table is None else {"table": snapshot.table}
+            self._folder.save_later("recordings", tensors, values, index)
         self._written = len(self.made)
         return Saved({}, {"count": self._written})
 
