@@ -5,7 +5,7 @@ The command line is flat. `Fixed` fields are no option of it: a preset sets them
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -46,20 +46,10 @@ MOST_STAGES = 8
 
 MOST_THREADS = 1024
 """More than any machine has: what --threads says at most."""
-MOST_STEPS = 1_000_000
-"""Hours on any machine: what --steps says at most."""
-LONGEST_NAME = 255
-"""Bytes that every file system takes."""
 LARGEST_SEED = 2**32 - 1
 """What every generator of random numbers takes."""
-STAGE_STEPS = 40
-"""A stage needs so many: with fewer each view is seen once or twice, and the next target is there before this
-one is met. `QUICK_STAGES` are asked for then (docs/experiments.md, Stages)."""
 VIEWS, MOST_VIEWS = 30, 40
 """How many views are edited by default, and how many of an edit of colors (see `trainer.views.setup`)."""
-SMALLEST_VIEW = 32
-"""Pixels of a view's longer side, at least."""
-QUICK_STEPS, QUICK_STAGES, QUICK_VIEWS = 240, 4, 12
 
 
 @dataclass(frozen=True)
@@ -321,6 +311,16 @@ def apply_preset(options: TrainOptions, preset: Preset) -> TrainOptions:
     """The options with a preset's values in the fields that it names; `replace` what should differ."""
     parts = {part: replace(getattr(options, part), **values) for part, values in PRESETS[preset].items()}
     return replace(options, preset=preset, **parts)
+
+
+def flat_values(part: Any) -> Iterator[tuple[str, bool, Any]]:
+    """All values of options in order: name, whether it is typed, value."""
+    for field in fields(part):
+        value = getattr(part, field.name)
+        if is_dataclass(value):
+            yield from flat_values(value)
+        else:
+            yield field.name, not str(field.type).startswith("Fixed"), value
 
 
 _Options = TypeVar("_Options")

@@ -28,16 +28,9 @@ from trainer.options import EditKind
 
 from .options import (
     LARGEST_SEED,
-    LONGEST_NAME,
     MOST_STAGES,
-    MOST_STEPS,
     MOST_THREADS,
     PRESETS,
-    QUICK_STAGES,
-    QUICK_STEPS,
-    QUICK_VIEWS,
-    SMALLEST_VIEW,
-    STAGE_STEPS,
     VIEWS,
     EditorOptions,
     Engine,
@@ -54,6 +47,14 @@ SHARPNESS: Mapping[EditKind, Sharpness] = {"color": "off", "style": "hinge", "ge
 STAGES: Mapping[EditKind, int] = {"color": MOST_STAGES, "style": 1, "geometry": MOST_STAGES}
 COSTLY_STAGES: Mapping[EditKind, int] = {"color": 4, "style": 4, "geometry": 1}
 """Of what paints each strength anew; where things move its pictures between show two of them."""
+
+STAGE_STEPS = 40
+"""A stage needs so many: with fewer each view is seen once or twice, and the next target is there before this
+one is met. `QUICK_STAGES` are asked for then (docs/experiments.md, Stages)."""
+QUICK_STEPS, QUICK_STAGES, QUICK_VIEWS = 240, 4, 12
+_MOST_STEPS = 1_000_000  # hours on any machine
+_LONGEST_NAME = 255  # bytes that every file system takes
+_SMALLEST_VIEW = 32  # pixels of a view's longer side
 
 INSTRUCT_SIZE = 512
 """Longer side of views that a diffusion model paints, shrunk from what it paints at its own size."""
@@ -154,7 +155,7 @@ def check_options(options: TrainOptions) -> None:
     region, editor, optimize = options.region, options.editor, options.optimize
     check_ranges(
         ("--views", options.views.views or VIEWS, 3, 96),
-        ("--image-size", options.views.image_size or SMALLEST_VIEW, SMALLEST_VIEW, 2048),
+        ("--image-size", options.views.image_size or _SMALLEST_VIEW, _SMALLEST_VIEW, 2048),
         ("--stages", optimize.stages, 0, 16),
         ("--group-steps", optimize.group_steps, 0, 10_000),
         ("--grow", optimize.grow, 0, 1),
@@ -166,9 +167,10 @@ def check_options(options: TrainOptions) -> None:
         ("--box-threshold", region.box_threshold, 0, 1),
     )
     stages = optimize.stages or MOST_STAGES
-    if not 4 * stages <= optimize.steps <= MOST_STEPS:
+    if not 4 * stages <= optimize.steps <= _MOST_STEPS:
+        least, most = 4 * stages, _MOST_STEPS
         raise ProgdfError(
-            f"--steps must be between {4 * stages} and {MOST_STEPS} for {stages} stages, got {optimize.steps}"
+            f"--steps must be between {least} and {most} for {stages} stages, got {optimize.steps}"
         )
     weight = optimize.perceptual_weight
     if weight is not None and not 0 <= weight < math.inf:
@@ -195,7 +197,7 @@ def check_name(name: str) -> str:
             f"'{name}' is not a valid layer name, as Windows cannot have a file of that name; "
             "choose one with --name, for example --name shirt"
         )
-    if len(f"{name}.gdf".encode()) > LONGEST_NAME:
+    if len(f"{name}.gdf".encode()) > _LONGEST_NAME:
         raise ProgdfError(f"the name '{name[:20]}…' is too long for a file; choose another one with --name")
     return name
 

@@ -15,8 +15,9 @@ from progdf.io.json_values import plain
 from trainer.editors import make_editor
 from trainer.fit.evaluate import Evaluator, make_evaluator
 from trainer.fit.fit import visibility
-from trainer.options import QUICK_STAGES, QUICK_STEPS, QUICK_VIEWS, EditKind, TrainOptions, with_values
+from trainer.options import EditKind, TrainOptions, with_values
 from trainer.report.report import Columns, columns_of
+from trainer.resolve import QUICK_STAGES, QUICK_STEPS, QUICK_VIEWS
 from trainer.run.record import FinishedRun, render_run_views
 from trainer.setup import (
     Pictures,

@@ -25,20 +25,8 @@ from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, ZERO, Gaussians, Origin,
 from progdf.io.atomic import atomic_write, read_file
 from progdf.region import Region, whole_scene
 
-from .header import (
-    MOST_GAUSSIANS,
-    GdfHeader,
-    SceneFingerprint,
-    contradiction_error,
-    pack_added,
-    pack_field,
-    pack_file,
-    pack_region,
-    unpack_added,
-    unpack_field,
-    unpack_file,
-    unpack_region,
-)
+from . import header
+from .header import SceneFingerprint
 
 _FINGERPRINTS: MutableMapping[Tensor, tuple[tuple[int, Origin] | None, str]] = WeakIdKeyDictionary()
 """Version, origin and hash of the centers of scenes that are alive."""
@@ -154,12 +142,12 @@ def save_gdf(path: str | os.PathLike[str], gdf: Gdf) -> None:
         ValueError: a number of the field is not finite.
         TypeError: options or report hold something JSON cannot.
     """
-    field, tensors = pack_field(gdf.field)
+    field, tensors = header.pack_field(gdf.field)
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    tensors |= pack_region(gdf.region) | pack_added(gdf.added)
+    tensors |= header.pack_region(gdf.region) | header.pack_added(gdf.added)
     if broken := _infinite(tensors):
         raise ValueError(f"{broken} of {gdf.name} has a number that is not finite")
-    header = GdfHeader(
+    head = header.GdfHeader(
         name=gdf.name,
         instruction=gdf.instruction,
         scene=gdf.scene,
@@ -171,7 +159,7 @@ def save_gdf(path: str | os.PathLike[str], gdf: Gdf) -> None:
         added=gdf.members - len(gdf.region),
         added_origin=ZERO if gdf.added is None else gdf.added.origin,
     )
-    content = pack_file(header, tensors)
+    content = header.pack_file(head, tensors)
     try:
         with atomic_write(path) as temporary_file:
             temporary_file.write_bytes(content)
@@ -222,7 +210,7 @@ def load_gdf(
         _check_reach(baked)
         return replace(gdf, field=replace(baked, recorded=gdf.field.recorded))
     except (ValueError, RuntimeError) as error:
-        raise contradiction_error(name, error) from error
+        raise header.contradiction_error(name, error) from error
 
 
 def apply_grade(gdf: Gdf, scene: Gaussians, region: Region) -> Gdf:
@@ -243,7 +231,7 @@ def apply_grade(gdf: Gdf, scene: Gaussians, region: Region) -> Gdf:
     try:
         _check_reach(field)
     except ValueError as error:
-        raise contradiction_error(gdf.name, error) from error
+        raise header.contradiction_error(gdf.name, error) from error
     parts = {"mask": stored.mask is not None, "residual": len(stored.residual) > 0}
     report = {"left_out": " and ".join(name for name, there in parts.items() if there)}
     return Gdf(gdf.name, region, field, fingerprint(scene), gdf.instruction, report=report, applied=True)
@@ -263,39 +251,39 @@ def read_gdf(path: str | os.PathLike[str]) -> Gdf:
         ends, form = torch.tensor([0.0, 1.0]), lattice_form(read_cube(path))
         field = BakedField("grade", ends, {}, BASE_CHANNELS, origin=form)
         return Gdf(Path(path).stem, nobody, field, ANY_SCENE, name)
-    header, tensors = unpack_file(read_file(path), name)
+    head, tensors = header.unpack_file(read_file(path), name)
     try:
-        return _unpack(header, tensors)
+        return _unpack(head, tensors)
     except (KeyError, TypeError, ValueError, RuntimeError, OverflowError) as error:
-        raise contradiction_error(name, error) from error
+        raise header.contradiction_error(name, error) from error
 
 
-def _unpack(header: GdfHeader, tensors: Mapping[str, Tensor]) -> Gdf:
+def _unpack(head: header.GdfHeader, tensors: Mapping[str, Tensor]) -> Gdf:
     if broken := _infinite(tensors):
         raise ValueError(f"{broken} has a number that is not finite")
-    if not 0 <= header.scene.count <= MOST_GAUSSIANS or header.members > header.scene.count:
-        raise ValueError(f"{header.members} members of a scene of {header.scene.count} Gaussians")
-    field = unpack_field(header.field, tensors, header.members)
+    if not 0 <= head.scene.count <= header.MOST_GAUSSIANS or head.members > head.scene.count:
+        raise ValueError(f"{head.members} members of a scene of {head.scene.count} Gaussians")
+    field = header.unpack_field(head.field, tensors, head.members)
     _check_reach(field)
-    members = field.members if field.attributes else header.members + header.added
+    members = field.members if field.attributes else head.members + head.added
     if field.origin is not None:
         members = field.origin.members
-        if header.added:
+        if head.added:
             raise ValueError(f"rows are added to a {field.kind} field, which has none")
-    if header.members + header.added != members:
-        raise ValueError(f"the header has {header.members + header.added} members, the field {members}")
-    region = unpack_region(header.region, tensors, header.scene.count, header.members)
-    if header.members != len(region):
-        raise ValueError(f"the header has {header.members} members, the region {len(region)}")
+    if head.members + head.added != members:
+        raise ValueError(f"the header has {head.members + head.added} members, the field {members}")
+    region = header.unpack_region(head.region, tensors, head.scene.count, head.members)
+    if head.members != len(region):
+        raise ValueError(f"the header has {head.members} members, the region {len(region)}")
     return Gdf(
-        name=header.name,
+        name=head.name,
         region=region,
         field=field,
-        scene=header.scene,
-        instruction=header.instruction,
-        options=header.options,
-        report=header.report,
-        added=unpack_added(header, tensors),
+        scene=head.scene,
+        instruction=head.instruction,
+        options=head.options,
+        report=head.report,
+        added=header.unpack_added(head, tensors),
     )
 
 

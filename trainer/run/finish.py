@@ -61,7 +61,7 @@ from .record import RunRecord, render_run_views, reopen_run
 _RANK_VIEWS = 4
 _WEIGHED_EVERY = 2  # of the training views one says how visible the members are
 _REPORT_ALONE = (
-    *("plan", "time", "memory_mb", "memory_by_stage_mb", "curves", "views", "pictures"),
+    *("plan", "time", "memory_mb", "curves", "views", "pictures"),
     *("losses", "trajectory", "effort", "choice"),
 )
 DEFAULTS = plain(TrainOptions(Path(), Path(), RegionOptions(""), EditorOptions("")))
@@ -180,7 +180,8 @@ def finish_run(
         },
         **_record_figures(record),
         "paint": paint.figures() if paint is not None else None,
-        **_cost_figures(folder, log),
+        "time": {**(_earlier_seconds(folder) if log.refits else {}), **log.rounded_seconds()},
+        "memory_mb": log.peak_mb(),
         "plan": plan,
     }
     return _write(folder, gdf, report, picture, shipped, setup, paint, log)
@@ -262,18 +263,6 @@ def differences(values: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[
         name: differences(value, defaults[name]) if isinstance(value, dict) else value
         for name, value in values.items()
         if value != defaults[name]
-    }
-
-
-def _cost_figures(folder: RunFolder, log: RunLog) -> dict[str, Any]:
-    """Seconds and memory; of a refit those of the stages that it did not run again too."""
-    return {
-        "time": {**(_earlier_figures(folder, "time") if log.refits else {}), **log.rounded_seconds()},
-        "memory_mb": log.memory.peak(),
-        "memory_by_stage_mb": {
-            **(_earlier_figures(folder, "memory_by_stage_mb") if log.refits else {}),
-            **log.memory.by_stage,
-        },
     }
 
 
@@ -361,10 +350,10 @@ def exactness(scene: Gaussians, gdf: Gdf, end: Tensor) -> tuple[float, float]:
     return endpoint, change
 
 
-def _earlier_figures(folder: RunFolder, part: str) -> dict[str, float]:
-    """Figures of the stages that this command did not run again."""
+def _earlier_seconds(folder: RunFolder) -> dict[str, float]:
+    """Of the stages that a refit does not run again."""
     try:
-        stages = decode_json(folder.report.read_bytes())[part]
+        stages = decode_json(folder.report.read_bytes())["time"]
         return {str(stage): figure for stage, figure in stages.items() if isinstance(figure, int | float)}
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return {}

@@ -144,7 +144,7 @@ def remove_region(options: TrainOptions, setup: TrainingSetup, folder: RunFolder
             },
             "views": {"held_out": bool(around.held_out), "edit": [view.camera.name for view in judging]},
             "time": log.rounded_seconds(),
-            "memory_mb": log.memory.peak(),
+            "memory_mb": log.peak_mb(),
             "plan": plain(recorded_options(options)),
         }
         picture = _sheet(scene, gdf, judging, f"{options.name}: {options.editor.editor}")

@@ -6,7 +6,7 @@ import hashlib
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -20,7 +20,7 @@ from progdf.io.atomic import disk_full
 from progdf.io.json_values import convert_json, decode_json, plain
 from progdf.region import Region
 from trainer.editors.pictures import picture_paths, strengths_of
-from trainer.options import MOST_THREADS, TrainOptions
+from trainer.options import MOST_THREADS, TrainOptions, flat_values
 from trainer.resolve import count_threads, recorded_options, resolve
 from trainer.store.run_folder import RunFolder, begin_log, remove_leftovers
 
@@ -215,10 +215,9 @@ def _saved_identity(folder: RunFolder) -> _Identity | None:
 
 def plan_difference(was: TrainOptions, now: TrainOptions) -> str:
     """A value that differs, in words, "--steps 24, not 40"; "" where none does. What was typed goes first."""
-    pairs = zip(_values(was), _values(now), strict=True)
-    differing = [
-        (name, typed, before, after) for (name, typed, before), (*_, after) in pairs if before != after
-    ]
+    pairs = zip(flat_values(was), flat_values(now), strict=True)
+    compared = ((name, typed, _plain(name, a), _plain(name, b)) for (name, typed, a), (*_, b) in pairs)
+    differing = [value for value in compared if value[2] != value[3]]
     if not differing:
         return ""
     name, typed, before, after = min(differing, key=lambda value: not value[1])
@@ -226,17 +225,11 @@ def plan_difference(was: TrainOptions, now: TrainOptions) -> str:
     return f"{option} {_spell_value(before)}, not {_spell_value(after)}"
 
 
-def _values(part: Any) -> Iterator[tuple[str, bool, Any]]:
-    """All values of options in order: name, whether it is typed, value; paths absolute."""
-    for field in fields(part):
-        value = getattr(part, field.name)
-        if is_dataclass(value):
-            yield from _values(value)
-        else:
-            typed = not str(field.type).startswith("Fixed")
-            if field.name in ("views", "image_size", "stages"):
-                value = value or None  # 0: by default
-            yield field.name, typed, value.resolve() if isinstance(value, Path) else value
+def _plain(name: str, value: Any) -> Any:
+    """A value as it is compared: paths absolute, and None where 0 stands for the default."""
+    if name in ("views", "image_size", "stages"):
+        value = value or None
+    return value.resolve() if isinstance(value, Path) else value
 
 
 def _spell_value(value: object) -> object:

@@ -304,7 +304,7 @@ def _paint(
         **about,
         "views": {"held_out": False, "edit": [name]},
         "time": log.rounded_seconds(),
-        "memory_mb": log.memory.peak(),
+        "memory_mb": log.peak_mb(),
         "plan": plain(recorded_options(options)),
         "pictures": picture_digests(options),
     }

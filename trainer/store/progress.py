@@ -65,8 +65,7 @@ _FILE_EVERY_S = 0.4
 
 
 class RunLog:
-    """Writes what happens to log.txt and, unless quiet, to stderr; measures each stage's seconds, and
-    the peak memory at its end.
+    """Writes what happens to log.txt and, unless quiet, to stderr; measures each stage's seconds.
 
     The seconds are part of a run's saved state (`state.Resumable`): those of all its sessions add up.
 
@@ -89,7 +88,7 @@ class RunLog:
         self._work: Mapping[str, float] = {"views": 1.0, "edit": 1.0, "optimize": 5.0, **LATER}
         self._took: dict[str, float] = {}  # seconds of the stages that have ended
         self._running: dict[str, float] = {}
-        self.memory = PeakMemory()
+        self._earlier_mb = 0
         self._start = time.perf_counter()
         self._file = path.open("a", encoding="utf-8", buffering=1)
         self._console = Console(stderr=True, quiet=quiet, highlight=False)
@@ -107,15 +106,18 @@ class RunLog:
         seconds = {
             name: self.seconds.get(name, 0.0) + running.get(name, 0.0) for name in self.seconds | running
         }
-        memory = {"by_stage": self.memory.by_stage, "peak": self.memory.peak()}
-        return Saved({}, {"seconds": seconds, "total": self._total(), "memory": memory})
+        return Saved({}, {"seconds": seconds, "total": self._total(), "memory": self.peak_mb()})
 
     def restore(self, saved: Saved) -> None:
         """Add the seconds of the sessions before, and remember their peaks of memory."""
         for name, seconds in saved.values["seconds"].items():
             self.seconds[name] = self.seconds.get(name, 0.0) + seconds
         self._earlier = saved.values["total"]
-        self.memory.restore(**saved.values["memory"])
+        self._earlier_mb = saved.values["memory"] or 0
+
+    def peak_mb(self) -> int | None:
+        """Of the process and of earlier sessions of the same run, see `peak_mb`; None where it is unknown."""
+        return max(round(peak_mb()), self._earlier_mb) or None
 
     def expect(self, work: Mapping[str, float]) -> None:
         """How much work the stages of this run are, in any unit; how fast it goes is measured.
@@ -167,7 +169,6 @@ class RunLog:
         try:
             yield
         finally:
-            self.memory.end(name)
             del self._running[name]
             self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begun
             if not STAGES.get(name, name):
@@ -260,35 +261,8 @@ def _escape(text: str) -> str:
 _STATUS = Path("/proc/self/status")
 
 
-class PeakMemory:
-    """Peak resident memory of the process, MB (2²⁰ bytes): what `/usr/bin/time -v` and VmHWM say.
-
-    A stage's figure is the peak until its end; it is higher than the one before where the stage needed more
-    than all that came earlier. On Windows Python cannot tell, and there is none.
-    """
-
-    def __init__(self) -> None:
-        self.by_stage: dict[str, int] = {}
-        self._earlier = 0
-
-    def end(self, stage: str) -> None:
-        """A stage ends."""
-        if peak := round(_peak_mb()):
-            self.by_stage[stage] = max(peak, self.by_stage.get(stage, 0))
-
-    def peak(self) -> int | None:
-        """Of the process and of earlier sessions of the same run; None where it is unknown."""
-        return max(round(_peak_mb()), self._earlier) or None
-
-    def restore(self, by_stage: Mapping[str, int], peak: int | None) -> None:
-        """Take over the peaks of an earlier session of the same run."""
-        for stage, earlier in by_stage.items():
-            self.by_stage[stage] = max(earlier, self.by_stage.get(stage, 0))
-        self._earlier = max(self._earlier, peak or 0)
-
-
-def _peak_mb() -> float:
-    """Peak since the process began; 0 where it is unknown.
+def peak_mb() -> float:
+    """Peak resident memory since the process began, MB (2²⁰ bytes), as VmHWM; 0 where it is unknown.
 
     On Linux not `getrusage`, whose figure begins with what the parent held when it started this process.
     """

@@ -46,7 +46,7 @@ def test_the_gradient_stand_in_is_zero_for_equal_images_and_sees_lost_texture() 
 def test_absent_lpips_weights_mean_the_stand_in_and_a_line_that_says_so(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def absent(net: str) -> Lpips:
+    def absent() -> Lpips:
         raise ProgdfError("the LPIPS weights are not installed; pip install something")
 
     monkeypatch.setattr(losses.Lpips, "load", absent)

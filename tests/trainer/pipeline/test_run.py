@@ -168,7 +168,6 @@ def test_the_report_has_what_others_read_from_it(done: RunResult) -> None:
         "edit": {"psnr_to_views", "lpips_to_views", "perceptual", "clip_direction"},
         "curves": {"against_trajectory", "against_editor", "change", "clip_direction"},
         "time": {"views", "edit", "optimize", "fit", "total"},
-        "memory_by_stage_mb": {"views", "edit", "optimize", "fit", "report"},
         "plan": {"scene", "editor", "optimize", "field"},
     }
     for part, keys in expected.items():

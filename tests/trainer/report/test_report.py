@@ -6,6 +6,7 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,7 +26,8 @@ from trainer.optimize.losses import GradientL1
 from trainer.report.measures import picture_courses
 from trainer.report.plots import LINES, Plot, draw_plot
 from trainer.report.report import best_view, columns_of, editor_strip, strip, thumbnail
-from trainer.store.progress import PeakMemory
+from trainer.store.progress import RunLog
+from trainer.store.state import Saved
 from trainer.views.crops import moving_attributes
 
 
@@ -153,15 +155,13 @@ def test_a_legend_that_is_too_wide_goes_on_in_a_second_row() -> None:
 PEAKS = """
 import resource
 from pathlib import Path
-from trainer.store.progress import PeakMemory
-memory = PeakMemory()
+from trainer.store.progress import peak_mb
 block = bytearray(128 << 20)
-memory.end("large")
+large = peak_mb()
 del block
-memory.end("small")
 (line,) = [l for l in Path("/proc/self/status").read_text().splitlines() if l.startswith("VmHWM:")]
 # the kernel counts pages in batches, so that two looks may differ a little
-peaks = [memory.peak(), int(line.split()[1]) / 1024, memory.by_stage["large"], memory.by_stage["small"]]
+peaks = [large, peak_mb(), int(line.split()[1]) / 1024]
 assert min(peaks) >= 128 and max(peaks) - min(peaks) <= 2, peaks
 """
 
@@ -172,12 +172,11 @@ def test_the_peak_of_memory_is_the_one_that_the_system_reports() -> None:
     subprocess.run([sys.executable, "-c", PEAKS], check=True, timeout=600)
 
 
-def test_a_resumed_run_remembers_the_peaks_of_its_first_session() -> None:
-    memory = PeakMemory()
-    memory.end("views")
-    memory.restore({"views": 1 << 20, "edit": 7}, 1 << 21)
-    assert memory.by_stage == {"views": 1 << 20, "edit": 7}
-    assert memory.peak() == 1 << 21
+def test_a_resumed_run_remembers_the_peak_of_its_first_session(tmp_path: Path) -> None:
+    log = RunLog(tmp_path / "log.txt", quiet=True)
+    log.restore(Saved({}, {"seconds": {}, "total": 0.0, "memory": 1 << 21}))
+    assert log.peak_mb() == 1 << 21
+    log.close()
 
 
 def test_the_judge_takes_narrow_offsets_where_the_scene_has_more_bands() -> None:
