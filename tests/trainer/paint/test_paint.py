@@ -22,6 +22,7 @@ from progdf.rasterize import render
 from progdf.region import whole_scene
 from tests.helpers.edits import bits
 from tests.trainer.painted_wall import CAMERA, SIDE, edit_of, letters, paint_on, picture, wall
+from trainer.editors.base import EditorInput
 from trainer.editors.decal import DecalEditor, decal, parse_place
 from trainer.options import EditorOptions
 from trainer.paint.discs import merge_pixels, place_discs
@@ -37,7 +38,7 @@ def put(folder: Path, image: np.ndarray) -> EditorOptions:
 
 
 def make(options: EditorOptions, scene: Gaussians) -> DecalEditor:
-    return decal(options.editor.partition(":")[2], scene, whole_scene(scene), (), options)
+    return decal(EditorInput(options.editor.partition(":")[2], scene, whole_scene(scene), (), options))
 
 
 def test_letters_finer_than_the_gaussians_are_as_sharp_as_they_were_painted() -> None:
