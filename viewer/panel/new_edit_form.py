@@ -48,6 +48,8 @@ from viewer.ui.widgets import (
     wrapped_text,
 )
 
+from .slider import key_step
+
 COLUMN_PX = 90.0
 _CURVE_PX, _MOST_POINTS, _LEAST_GAP = 92.0, 6, 0.02
 _GRADES = {
@@ -241,10 +243,8 @@ def _palette(form: NewEdit, column: float, ui: UiContext) -> NewEdit:
             pairs[i] = source, source
         tip(f"{source} becomes {target}; right-click: as it was" if source != target else f"{source} stays")
         if source != target:  # what it was, in a corner
-            low, corner = imgui.ImVec2(x, y + side), u32((*_rgb(source), 1.0))
-            canvas.add_triangle_filled(
-                imgui.ImVec2(x, y + side / 2), low, imgui.ImVec2(x + side / 2, y + side), corner
-            )
+            low, corner = (x, y + side), u32((*_rgb(source), 1.0))
+            canvas.add_triangle_filled((x, y + side / 2), low, (x + side / 2, y + side), corner)
         if form.picked == i:
             imgui.open_popup(f"color {i}")
             form = replace(form, picked=-1)
@@ -266,31 +266,45 @@ def _rgb(color: str) -> tuple[float, float, float]:
 
 
 def _curve(curve: tuple[Point, ...], column: float, ui: UiContext) -> tuple[Point, ...]:
-    """Lightness after over lightness before: a press makes a point and drags it."""
+    """Lightness after over lightness before: a press makes a point and drags it.
+
+    By keys Space goes to the next point, behind the last to a new one in the widest gap; arrows move it.
+    """
     label("Curve", column)
     tall, reach = _CURVE_PX * ui.scale, 9.0 * ui.scale
     x, y = imgui.get_cursor_screen_pos()
     wide = imgui.get_content_region_avail().x
-    imgui.invisible_button("curve", imgui.ImVec2(wide, tall))
-    tip("Lightness: press for a point and drag it, right-click it to take it away")
+    imgui.invisible_button("curve", (wide, tall), imgui.ButtonFlags_.enable_nav.value)
+    tip("Lightness: press for a point and drag it, right-click it to take it away; or Space, arrows, Del")
+    keyed = imgui.is_item_focused() and imgui.get_current_context().nav_cursor_visible
     storage, held, mouse = imgui.get_state_storage(), imgui.get_id("curve/held"), imgui.get_io().mouse_pos
     at = (mouse.x - x) / wide, 1.0 - (mouse.y - y) / tall
 
     def apart(point: Point) -> float:
         return math.hypot((point[0] - at[0]) * wide, (point[1] - at[1]) * tall)
 
-    points = list(curve)
+    points, chosen, key = list(curve), storage.get_int(held, -1), imgui.Key
     near = min(range(len(points)), key=lambda i: apart(points[i]), default=-1)
     near = near if near >= 0 and apart(points[near]) <= reach else -1
-    if imgui.is_item_clicked(1):
+    near = chosen if keyed else near
+    if goes_on := keyed and imgui.is_key_pressed(key.space, False):
+        ends = [0.0, *(across for across, _ in points), 1.0]
+        widest = max(range(len(points) + 1), key=lambda i: ends[i + 1] - ends[i])
+        middle = torch.tensor((ends[widest] + ends[widest + 1]) / 2)
+        at = float(middle), float(bend_lightness(middle, points))
+        near = chosen + 1 if chosen + 1 < len(points) else -1
+    if imgui.is_item_clicked(1) or (keyed and imgui.is_key_pressed(key.delete)):
         points = [point for i, point in enumerate(points) if i != near]
         storage.set_int(held, -1)
-    elif imgui.is_item_clicked(0):
+    elif imgui.is_item_clicked(0) or goes_on:
         if near < 0 and len(points) < _MOST_POINTS and all(abs(p[0] - at[0]) > _LEAST_GAP for p in points):
             points = sorted([*points, (round(at[0], 2), round(at[1], 2))])
             near = min(range(len(points)), key=lambda i: apart(points[i]))
         storage.set_int(held, near)
-    elif imgui.is_item_active() and 0 <= (i := storage.get_int(held, -1)) < len(points):
+    elif (keyed or imgui.is_item_active()) and 0 <= (i := chosen) < len(points):
+        if keyed:
+            by = key_step(key.left_arrow, key.right_arrow), key_step(key.down_arrow, key.up_arrow)
+            at = points[i][0] + by[0], points[i][1] + by[1]
         low = points[i - 1][0] if i else 0.0
         high = points[i + 1][0] if i + 1 < len(points) else 1.0
         across = min(max(at[0], low + _LEAST_GAP), high - _LEAST_GAP)
@@ -330,9 +344,7 @@ def _anchor(form: NewEdit, preview: PreviewState, column: float) -> tuple[NewEdi
     imgui.same_line()
     with inert(not preview.painted):
         action = "paint_over" if imgui.button("Paint over", imgui.ImVec2(half, 0.0)) else ""
-    tip(
-        form.anchor or "Opens the picture in your painting program; what you save there is shown, and trained"
-    )
+    tip(form.anchor or "Opens the picture in your painting program; each save is shown, and the last trained")
     if preview.text:
         wrapped_text(preview.text, PALETTE.error if preview.failed else PALETTE.dim)
     return form, action

@@ -77,7 +77,7 @@ def draw(
     start, span = left + radius, max(width - 2 * radius, 1.0) / most
     mouse = imgui.get_io().mouse_pos.x
     if imgui.is_item_focused() and imgui.get_current_context().nav_cursor_visible:
-        value = min(most, max(0.0, value + _key_step()))
+        value = min(most, max(0.0, value + key_step(imgui.Key.left_arrow, imgui.Key.right_arrow)))
     if is_entered():
         start_typing(label)
         storage.set_bool(_slot(label, "entered"), True)
@@ -104,10 +104,10 @@ def draw(
     return value
 
 
-def _key_step() -> float:
-    """How far the arrow keys move the slider that has the keyboard: as those of the focused layer do."""
+def key_step(less: imgui.Key, more: imgui.Key) -> float:
+    """How far two arrow keys move the last item, which has the keyboard: as those of the focused layer do."""
     io, step = imgui.get_io(), 0.0
-    for key, sign in ((imgui.Key.left_arrow, -1.0), (imgui.Key.right_arrow, 1.0)):
+    for key, sign in ((less, -1.0), (more, 1.0)):
         imgui.internal.set_key_owner(key, imgui.get_item_id())  # else they would lead to another item
         step += sign * bool(imgui.is_key_pressed(key))
     return step * dict(NUDGES)["Shift+" if io.key_shift else "Ctrl+" if io.key_ctrl else ""]

@@ -443,6 +443,13 @@ def has_pending_input() -> bool:
     return not imgui.get_current_context().input_events_queue.empty()
 
 
+def end_frame_here() -> None:
+    """What imgui hears from now on is of its next frame: else a slow frame, which hears at once that Tab went
+    down and Shift up, would take a quick Shift+Tab for Tab."""
+    for down in (True, False):  # the second event of a key waits for the next frame; no keyboard has this one
+        imgui.get_io().add_key_event(imgui.Key.f24, down)
+
+
 def next_event_id() -> int:
     """The place that the next event takes among imgui's input events."""
     return int(imgui.get_current_context().input_events_next_event_id)

@@ -22,7 +22,7 @@ from .splash import Splash  # first: it says which library glfw loads
 import glfw
 from imgui_bundle import imgui
 
-from .keys import FLY_KEYS, Keys, Press, next_event_id
+from .keys import FLY_KEYS, Keys, Press, end_frame_here, has_pending_input, next_event_id
 
 LONGEST_S = 0.3
 """Between the two presses of a double click, as imgui has it."""
@@ -64,6 +64,7 @@ class DoubleClicks:
 
 
 _FLY_KEYS = {name: getattr(glfw, f"KEY_{name}") for name in FLY_KEYS}
+_MODIFIERS = range(glfw.KEY_LEFT_SHIFT, glfw.KEY_RIGHT_SUPER + 1)
 KEY_NAMES = {
     **{getattr(glfw, f"KEY_{c}"): c for c in "ABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789"},
     **{getattr(glfw, f"KEY_F{i}"): f"F{i}" for i in range(1, 13)},
@@ -215,6 +216,8 @@ class Window:
         if action == glfw.RELEASE:
             self._down.pop(key, None)
             self._chorded.discard(key)
+            if key in _MODIFIERS and has_pending_input():
+                end_frame_here()  # imgui adds its own event after this one
             return
         name = key_name(key, scancode)
         pressed = chord(name, mods)

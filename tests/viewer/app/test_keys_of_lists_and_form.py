@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import pytest
 from imgui_bundle import imgui
@@ -14,6 +16,8 @@ from viewer.jobs.job_queue import DeliverOptions
 from viewer.state.selection import NamedRegion
 from viewer.state.workspace import Dialog
 from viewer.ui.keys import KEYS, Keys, Press, next_event_id
+from viewer.ui.splash import Splash
+from viewer.ui.window import Window, glfw
 
 pytestmark = pytest.mark.gl
 
@@ -104,6 +108,26 @@ def test_tab_goes_through_the_form_both_ways_and_enter_presses_no_button_of_it(f
     strike(form, "Enter")
     assert form.main_view.work.form.quick == quick
     assert form.main_view.take_requests() == ("train",)
+
+
+def test_a_shift_that_ends_within_a_slow_frame_still_goes_with_its_tab(form: Rig) -> None:
+    window = Window(cast(Splash, SimpleNamespace(handle=None, context=None)))
+
+    def event(key: int, token: imgui.Key, down: bool) -> None:
+        window._note_key(key, 0, glfw.PRESS if down else glfw.RELEASE, 0)
+        form.io.add_key_event(token, down)
+
+    strike(form, "Tab")
+    before = imgui.get_current_context().nav_id
+    strike(form, "Tab")
+    event(glfw.KEY_LEFT_SHIFT, imgui.Key.mod_shift, True)
+    form.frame()
+    event(glfw.KEY_TAB, imgui.Key.tab, True)
+    event(glfw.KEY_LEFT_SHIFT, imgui.Key.mod_shift, False)
+    event(glfw.KEY_TAB, imgui.Key.tab, False)
+    form.frame(5)
+    assert imgui.get_current_context().nav_id == before
+    assert not form.io.key_shift
 
 
 def test_a_list_takes_arrows_and_enter(form: Rig) -> None:

@@ -86,6 +86,13 @@ def test_the_bar_over_the_picture_is_there_while_a_tool_or_a_selection_is() -> N
         assert bar.pos.x + bar.size.x < window_at("view").pos.x
 
 
+@pytest.mark.parametrize("count", [9, 10])
+def test_where_the_last_card_would_be_cut_below_the_search_there_are_rows(count: int) -> None:
+    stack, view = many_edits(bear(), count)
+    with rig(view, (1280, 800), stack=stack) as hand:
+        assert hand.main_view.work.cards_fit == (count == 9)
+
+
 def test_six_layers_have_whole_cards_of_two_lines_without_scrolling() -> None:
     stack, view = many_edits(bear(), 6)
     with rig(view, SIZE, stack=stack) as hand:

@@ -55,6 +55,25 @@ def test_a_press_on_the_curve_makes_a_point_and_drags_it_and_a_right_click_takes
     assert len(form(hand).curve) == 1
 
 
+def test_the_curve_goes_by_keys_alone(hand: Rig) -> None:
+    def strike(*names: str) -> list[tuple[float, float]]:
+        for name in names:
+            hand.modifier(getattr(imgui.Key, name))
+            hand.modifier(getattr(imgui.Key, name), False)
+        return list(form(hand).curve)
+
+    hand.click(LEFT + 40.0, 557.0)  # the field of the name, below the curve
+    hand.modifier(imgui.Key.mod_shift)
+    strike("tab")
+    hand.modifier(imgui.Key.mod_shift, False)
+    assert strike("space") == [(0.5, 0.5)], "a point on the curve"
+    assert strike("up_arrow", "up_arrow", "left_arrow") == [(0.49, 0.52)]
+    ((x, y), _) = strike("space", "down_arrow")
+    assert (x, y) == (0.49, 0.52), "behind the last one is another, which the arrows move now"
+    assert strike("delete") == [(0.49, 0.52)]
+    assert strike("space", "up_arrow") == [(0.49, 0.53)]
+
+
 def test_a_swatch_opens_a_picker_and_a_right_click_takes_the_change_back(hand: Rig) -> None:
     y, x = 202.0, LEFT + 4.0
     moved = ((COLORS[0], "#3060d0"), *FORM.palette[1:])
