@@ -27,7 +27,7 @@ from .oklab import (
     oklab_to_srgb,
     srgb_to_oklab,
 )
-from .palette import bend_lightness, shift_palette
+from .palette import Curve, bend_lightness, less_light, shift_palette
 
 Course = Callable[[Strength], Tensor]
 """Some colors [...,3] at a strength."""
@@ -147,14 +147,16 @@ class ColorGrade:
 
     values: Mapping[str, float] = field(default_factory=dict)  # of some of `GRADE_RANGES`
     palette: tuple[tuple[Tensor, Tensor], ...] = ()  # sources and targets, sRGB [3]; see `shift_palette`
-    curve: tuple[tuple[float, float], ...] = ()  # of lightness, see `bend_lightness`
+    palette_curves: tuple[Curve, ...] = ()  # of the lightness near each source; none at all, or one of each
+    curve: Curve = ()  # of lightness
 
     @property
     def is_neutral(self) -> bool:
         """Whether it changes nothing."""
         still = all(self.values.get(name, neutral) == neutral for name, (*_, neutral) in GRADE_RANGES.items())
         stays = all(torch.equal(source, target) for source, target in self.palette)
-        return still and stays and all(x == y for x, y in self.curve)
+        curves = (*self.palette_curves, self.curve)
+        return still and stays and all(x == y for curve in curves for x, y in curve)
 
 
 def grade_course(rgb: Tensor, grade: ColorGrade) -> Course:
@@ -175,7 +177,8 @@ def grade_fully(rgb: Tensor, grade: ColorGrade) -> Tensor:
     of = {name: grade.values.get(name, neutral) for name, (_, _, neutral) in GRADE_RANGES.items()}
     if grade.palette:
         sources, targets = (srgb_to_oklab(torch.stack(colors)) for colors in zip(*grade.palette, strict=True))
-        rgb = fit_gamut(shift_palette(srgb_to_oklab(rgb.clamp(0, 1)), sources, targets))
+        lab = srgb_to_oklab(rgb.clamp(0, 1))
+        rgb = fit_gamut(shift_palette(lab, sources, targets, grade.palette_curves))
     levels = ((rgb.clamp(0, 1) - of["black"]) / (of["white"] - of["black"])).clamp(0, 1)
     lab = srgb_to_oklab(levels) * 2.0 ** (of["exposure"] / 3)  # homogeneous of degree 1/3 in linear light
     lightness = lab[..., 0].clamp(0, 1)
@@ -186,8 +189,7 @@ def grade_fully(rgb: Tensor, grade: ColorGrade) -> Tensor:
     steeper = torch.where(lightness < _MIDDLE, low, 1 - high)
     if grade.curve:
         steeper = bend_lightness(steeper, grade.curve)
-    fade = (steeper / lightness.clamp_min(1e-6)).clamp_max(1)  # less light on the same surface
-    chroma = (lab[..., 1:] + cast) * (1 + of["saturation"]) * fade[..., None]
+    chroma = (lab[..., 1:] + cast) * (1 + of["saturation"]) * less_light(lightness, steeper)[..., None]
     return fit_gamut(torch.cat([steeper[..., None], chroma], dim=-1))
 
 

@@ -4,7 +4,8 @@ The map moves a color x by Σ_i w_i(x) f_i(x) (t_i − p_i), in OKLab, for sourc
 weights are a Gaussian kernel's interpolation (Chang et al., Palette-based Photo Recoloring, SIGGRAPH 2015):
 1 at their own source and 0 at the others, so every source becomes its target exactly, and one whose target is
 itself stays. Of several they are a partition: each color goes with those that are near. What is far from a
-single one stays. f_i fades what is darker than its source, as in less light, and what is nearly white.
+single one stays. f_i fades what is darker than its source, as in less light, and what is nearly white. By the
+same weights each source's curve bends the lightness.
 """
 
 from __future__ import annotations
@@ -29,6 +30,9 @@ _WIDTH, _NARROWEST, _ALONE = 0.5, 0.04, 0.08
 _ROUNDS, _CELL = 20, 0.04  # of k-means; side of the cells in which colors are counted
 _LEAST_SHARE = 0.003  # of what is seen, for a color to be a main one
 _STEPS = 1024  # of a curve, linear between
+
+Curve = tuple[tuple[float, float], ...]
+"""Lightness from and to, 0..1, by rising from; see `bend_lightness`. An empty one bends nothing."""
 
 
 def find_palette(rgb: Tensor, weights: Tensor, count: int = COLORS) -> Tensor:
@@ -74,10 +78,13 @@ def are_alike(a: Tensor, b: Tensor) -> bool:
     return float((_kernel_space(srgb_to_oklab(a)) - _kernel_space(srgb_to_oklab(b))).norm()) < CLOSEST
 
 
-def shift_palette(lab: Tensor, sources: Tensor, targets: Tensor) -> Tensor:
+def shift_palette(lab: Tensor, sources: Tensor, targets: Tensor, curves: Sequence[Curve] = ()) -> Tensor:
     """What becomes of colors where sources become targets, all OKLab. [...,3], [k,3], [k,3] -> [...,3]
 
     The sources are at least `CLOSEST` apart. What comes out may lie outside of the gamut.
+
+    Args:
+        curves: of the lightness of what has become of each source; none at all, or k
     """
     places, colors = _kernel_space(sources.double()), _kernel_space(lab.reshape(-1, 3).double())
     apart, away = torch.cdist(places, places), torch.cdist(colors, places)
@@ -98,7 +105,18 @@ def shift_palette(lab: Tensor, sources: Tensor, targets: Tensor) -> Tensor:
     fade = torch.minimum(dark, bright)
     moved = (weights * fade.clamp(0, 1)) @ (targets - sources).double()
     shifted: Tensor = lab + moved.to(lab).reshape(lab.shape)
-    return shifted
+    if not any(curves):
+        return shifted
+    before = shifted[..., :1].clamp(0, 1)
+    bent = torch.cat([bend_lightness(before, curve) - before for curve in curves], dim=-1)
+    after = before + (weights.to(lab).reshape(bent.shape) * bent).sum(dim=-1, keepdim=True)
+    return torch.cat([after, shifted[..., 1:] * less_light(before, after)], dim=-1)
+
+
+def less_light(before: Tensor, after: Tensor) -> Tensor:
+    """What is left of the chroma where lightness changes: all where it rises, else as in less light on the
+    same surface. [...] -> [...]"""
+    return (after / before.clamp_min(1e-6)).clamp_max(1)
 
 
 def bend_lightness(lightness: Tensor, curve: Sequence[tuple[float, float]]) -> Tensor:

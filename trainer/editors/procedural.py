@@ -17,7 +17,7 @@ from torch import Tensor
 
 from progdf.color import edits as color
 from progdf.color.oklab import ColorPath, bend_of, interpolate_colors, path_of
-from progdf.color.palette import are_alike
+from progdf.color.palette import Curve, are_alike
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from trainer.options import EditKind
@@ -190,21 +190,25 @@ def paint_of(what: str) -> tuple[Tensor, ColorPath]:
 
 def grade_of(what: str) -> color.ColorGrade:
     """The grade that a text says: values of `GRADE_RANGES` as NAME=NUMBER; colors that become others as
-    #rrggbb=#rrggbb, or one alone that stays; a curve of lightness as curve=FROM:TO+FROM:TO.
+    #rrggbb=#rrggbb, or one alone that stays; a curve of lightness as curve=FROM:TO+FROM:TO, of what is near a
+    color as #rrggbb=#rrggbb/FROM:TO+FROM:TO.
 
     Raises:
         ProgdfError: it says something else, or nothing.
     """
     values: dict[str, float] = {}
     pairs: list[tuple[Tensor, Tensor]] = []
-    curve: tuple[tuple[float, float], ...] = ()
+    curves: list[Curve] = []
+    curve: Curve = ()
     for part in what.split(","):
         name, equals, number = (word.strip() for word in part.partition("="))
         if name.startswith("#"):
-            pair = color.parse_color(name), color.parse_color(number if equals else name)
+            target, bends, points = number.partition("/")
+            pair = color.parse_color(name), color.parse_color(target if equals else name)
             if any(are_alike(pair[0], source) for source, _ in pairs):
                 raise ProgdfError(f"grade:{what:.80} has two colors as near as {name}; leave one of them out")
             pairs.append(pair)
+            curves.append(_curve_of(what, points) if bends else ())
         elif name == "curve" and not curve:
             curve = _curve_of(what, number)
         elif name not in color.GRADE_RANGES or name in values:
@@ -220,7 +224,7 @@ def grade_of(what: str) -> color.ColorGrade:
                 raise ProgdfError(f"in grade:{what:.80} {name} is '{number:.40}'; write {low:g} to {high:g}")
     if len(pairs) > MOST_PAIRS:
         raise ProgdfError(f"grade:{what:.80} has {len(pairs)} colors; the most are {MOST_PAIRS}")
-    asked = color.ColorGrade(values, tuple(pairs), curve)
+    asked = color.ColorGrade(values, tuple(pairs), tuple(curves), curve)
     if asked.is_neutral:
         raise ProgdfError(f"grade:{what:.80} changes nothing; write, for example, grade:exposure=0.7")
     return asked
@@ -230,7 +234,7 @@ MOST_PAIRS = 16
 """Colors that a grade moves or holds."""
 
 
-def _curve_of(what: str, text: str) -> tuple[tuple[float, float], ...]:
+def _curve_of(what: str, text: str) -> Curve:
     """The points of `0.3:0.2+0.7:0.8`."""
     points = [tuple(_number(n) for n in point.split(":")) for point in text.split("+")]
     curve = tuple((p[0], p[1]) for p in points if len(p) == 2 and all(0.0 <= x <= 1.0 for x in p))

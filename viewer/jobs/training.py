@@ -106,9 +106,10 @@ class NewEdit:
     through_hues: bool = False  # the way to the color goes around the color wheel, not through gray
     amount: float = 0.7  # of light that is taken away, 0..1
     grade: tuple[float, ...] = NEUTRAL  # in the order of `GRADE_RANGES`
-    # of a grade: colors #rrggbb of the region and what becomes of them, see `find_palette`
+    # of a grade: colors #rrggbb of the region and what becomes of them, see `find_palette`; with a curve of
+    # the lightness near one #rrggbb/0.30:0.20+0.70:0.80
     palette: tuple[tuple[str, str], ...] = ()
-    curve: tuple[Point, ...] = ()  # of a grade: lightness, see `bend_lightness`
+    curve: str = ""  # of a grade: lightness, see `parse_curve`
     picks: bool = False  # the next click on the picture takes a color into the palette
     picked: int = -1  # which of it was just taken, and is to be chosen another color for
     style: int = BEST_STYLES[0]  # number of a painting
@@ -144,7 +145,7 @@ class NewEdit:
                 if any(source != target for source, target in self.palette):
                     parts += [a if a == b else f"{a}={b}" for a, b in self.palette]
                 if self.curve:
-                    parts.append("curve=" + "+".join(f"{x:.2f}:{y:.2f}" for x, y in self.curve))
+                    parts.append(f"curve={self.curve}")
                 return f"{kind}:{','.join(parts)}" if parts else kind
             case "style":
                 return f"{kind}:{self.style}"
@@ -190,6 +191,11 @@ class NewEdit:
         return STILL if self.choice.setting == "grade" and self.spec == "grade" else ""
 
 
+def parse_curve(text: str) -> list[Point]:
+    """The points of 0.30:0.20+0.70:0.80, for `bend_lightness`; a ValueError where they are none."""
+    return [(float(x), float(y)) for x, y in (point.split(":") for point in text.split("+") if point)]
+
+
 def with_editor(form: NewEdit, editor: int) -> NewEdit:
     """The form with another editor; a few changed pictures know their own region."""
     region, finds = form.region, EDITORS[editor].kind == "pictures"
@@ -224,11 +230,12 @@ def with_settings(form: NewEdit, instruction: str) -> NewEdit | None:
                 parts = [part.partition("=")[::2] for part in rest.split(",")]
                 values = dict(parts)
                 palette = tuple((name, value or name) for name, value in parts if name.startswith("#"))
-                points = [point.split(":") for point in values.get("curve", "").split("+") if point]
                 grade = {name: float(values.get(name, x)) for name, (_, _, x) in GRADE_RANGES.items()}
                 fits = all(low <= grade[name] <= high for name, (low, high, _) in GRADE_RANGES.items())
-                curve = tuple((float(x), float(y)) for x, y in points)
-                made = replace(form, grade=tuple(grade.values()), palette=palette, curve=curve)
+                curves = [values.get("curve", ""), *(target.partition("/")[2] for _, target in palette)]
+                for curve in curves:
+                    parse_curve(curve)
+                made = replace(form, grade=tuple(grade.values()), palette=palette, curve=curves[0])
                 known = {name for name in values if not name.startswith("#")} <= {*grade, "curve", ""}
                 return made if fits and known else None
             case "style":

@@ -24,6 +24,7 @@ from viewer.jobs.training import (
     Point,
     hex_color,
     missing_package,
+    parse_curve,
     with_editor,
 )
 from viewer.state.selection import SelectionState
@@ -236,22 +237,24 @@ def _palette(form: NewEdit, column: float, ui: UiContext) -> NewEdit:
     room = right_edge() - side - imgui.get_cursor_pos_x()
     wide = min(room / max(len(pairs), 1) - 2.0 * ui.scale, 34.0 * ui.scale)
     for i, (source, target) in enumerate(pairs):
-        (x, y), color = imgui.get_cursor_screen_pos(), imgui.ImVec4(*_rgb(target), 1.0)
+        becomes, _, curve = target.partition("/")
+        (x, y), color = imgui.get_cursor_screen_pos(), (*parse_color(becomes).tolist(), 1.0)
         if imgui.color_button(f"##color {i}", color, flags.no_tooltip.value, imgui.ImVec2(wide, side)):
             form = replace(form, picked=i)
         if imgui.is_item_clicked(1):
             pairs[i] = source, source
-        tip(f"{source} becomes {target}; right-click: as it was" if source != target else f"{source} stays")
+        tip(f"{source} becomes {becomes}; right-click: as it was" if source != target else f"{source} stays")
         if source != target:  # what it was, in a corner
-            low, corner = (x, y + side), u32((*_rgb(source), 1.0))
+            low, corner = (x, y + side), u32((*parse_color(source).tolist(), 1.0))
             canvas.add_triangle_filled((x, y + side / 2), low, (x + side / 2, y + side), corner)
         if form.picked == i:
             imgui.open_popup(f"color {i}")
             form = replace(form, picked=-1)
         if imgui.begin_popup(f"color {i}"):
-            rgb, shown = list(_rgb(target)), flags.display_hex.value | flags.no_side_preview.value
-            changed, chosen = imgui.color_picker3("##picker", rgb, shown)
-            pairs[i] = (source, hex_color(chosen)) if changed else pairs[i]
+            shown = flags.display_hex.value | flags.no_side_preview.value
+            changed, chosen = imgui.color_picker3("##picker", parse_color(becomes).tolist(), shown)
+            parts = hex_color(chosen) if changed else becomes, _curve(curve, column, ui)
+            pairs[i] = source, "/".join(filter(None, parts))
             imgui.end_popup()
         imgui.same_line(0.0, 2.0 * ui.scale)
     imgui.set_cursor_pos_x(right_edge() - side)
@@ -260,12 +263,7 @@ def _palette(form: NewEdit, column: float, ui: UiContext) -> NewEdit:
     return replace(form, palette=tuple(pairs), picks=picks)
 
 
-def _rgb(color: str) -> tuple[float, float, float]:
-    red, green, blue = parse_color(color).tolist()
-    return red, green, blue
-
-
-def _curve(curve: tuple[Point, ...], column: float, ui: UiContext) -> tuple[Point, ...]:
+def _curve(curve: str, column: float, ui: UiContext) -> str:
     """Lightness after over lightness before: a press makes a point and drags it.
 
     By keys Space goes to the next point, behind the last to a new one in the widest gap; arrows move it.
@@ -283,7 +281,7 @@ def _curve(curve: tuple[Point, ...], column: float, ui: UiContext) -> tuple[Poin
     def apart(point: Point) -> float:
         return math.hypot((point[0] - at[0]) * wide, (point[1] - at[1]) * tall)
 
-    points, chosen, key = list(curve), storage.get_int(held, -1), imgui.Key
+    points, chosen, key = parse_curve(curve), storage.get_int(held, -1), imgui.Key
     near = min(range(len(points)), key=lambda i: apart(points[i]), default=-1)
     near = near if near >= 0 and apart(points[near]) <= reach else -1
     near = chosen if keyed else near
@@ -319,7 +317,7 @@ def _curve(curve: tuple[Point, ...], column: float, ui: UiContext) -> tuple[Poin
     for i, (across, up) in enumerate(points):
         center = imgui.ImVec2(x + wide * across, y + tall * (1.0 - up))
         canvas.add_circle_filled(center, (4.0 + (i == near)) * ui.scale, u32(p.accent))
-    return tuple(points)
+    return "+".join(f"{x:.2f}:{y:.2f}" for x, y in points)
 
 
 def _model(form: NewEdit, preview: PreviewState, column: float, ui: UiContext) -> NewEdit:

@@ -102,3 +102,28 @@ def test_a_grade_of_palette_and_curve_is_exact_at_strength_0() -> None:
     asked = color.ColorGrade(palette=((LAWN, SCARF),), curve=((0.5, 0.3),))
     rgb = scene({50: LAWN})
     assert torch.equal(color.grade_course(rgb, asked)(0.0), rgb)
+
+
+def test_a_curve_of_one_color_bends_what_is_near_it_and_nothing_else() -> None:
+    held = tuple((c, c) for c in (LAWN, BEAR, STONE))
+    colors, lightness = torch.stack([LAWN, BEAR, STONE]), srgb_to_oklab(LAWN)[0].item()
+    darker = color.ColorGrade(palette=held, palette_curves=(((lightness, lightness - 0.2),), (), ()))
+    made = srgb_to_oklab(color.grade_fully(colors, darker))
+    before = srgb_to_oklab(colors)
+    assert made[0, 0].item() == pytest.approx(lightness - 0.2, abs=5e-3)
+    assert torch.allclose(made[1:], before[1:], atol=2e-3)
+    assert torch.allclose(made[0, 1:] / made[0, 0], before[0, 1:] / before[0, 0], atol=5e-3), "in less light"
+    assert torch.equal(color.grade_course(colors, darker)(0.0), colors), "exact at strength 0"
+    assert not darker.is_neutral
+    straight = color.ColorGrade(palette=held, palette_curves=(((0.5, 0.5),), (), ()))
+    assert straight.is_neutral
+    assert torch.allclose(color.grade_fully(colors, straight), colors, atol=2e-3)
+
+
+def test_the_curve_of_a_color_has_no_steps() -> None:
+    bent = color.ColorGrade(
+        palette=((LAWN, BEAR), (STONE, STONE)), palette_curves=(((0.4, 0.6), (0.8, 0.7)), ((0.5, 0.3),))
+    )
+    way = torch.lerp(LAWN, STONE, torch.linspace(0, 1, 2001)[:, None])
+    steps = color.grade_fully(way, bent).diff(dim=0).abs()
+    assert steps.max() < 30 * way.diff(dim=0).abs().max()

@@ -224,13 +224,24 @@ def test_a_grade_says_its_palette_only_where_a_color_of_it_moves() -> None:
     colors = (("#7eae44", "#7eae44"), ("#b97a30", "#b97a30"))
     still = form("grade", palette=colors)
     assert (still.spec, still.obstacle) == ("grade", STILL)
-    moved = form("grade", palette=(("#7eae44", "#3060d0"), colors[1]), curve=((0.3, 0.2), (0.7, 0.8)))
+    moved = form("grade", palette=(("#7eae44", "#3060d0"), colors[1]), curve="0.30:0.20+0.70:0.80")
     assert moved.spec == "grade:#7eae44=#3060d0,#b97a30,curve=0.30:0.20+0.70:0.80"
     CHECKS["grade"](moved.spec.partition(":")[2])
     again = with_settings(NewEdit(), moved.spec)
     assert again is not None
     assert (again.spec, again.palette) == (moved.spec, moved.palette)
-    assert with_settings(NewEdit(), "grade:curve=none") is None
+    for broken in ("curve=none", "#7eae44=#3060d0/none"):
+        assert with_settings(NewEdit(), f"grade:{broken}") is None
+
+
+def test_a_grade_says_the_curve_of_a_color_with_what_becomes_of_it() -> None:
+    bent = form("grade", palette=(("#7eae44", "#7eae44/0.50:0.30"), ("#b97a30", "#b97a30")))
+    assert bent.spec == "grade:#7eae44=#7eae44/0.50:0.30,#b97a30"
+    assert not bent.obstacle
+    CHECKS["grade"](bent.spec.partition(":")[2])
+    again = with_settings(NewEdit(), bent.spec)
+    assert again is not None
+    assert again.palette == bent.palette
 
 
 def test_a_picked_color_stands_in_the_palette_in_place_of_one_like_it() -> None:
