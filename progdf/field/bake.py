@@ -160,9 +160,5 @@ def _ranks(trajectory: Tensor, tolerance: float) -> dict[str, int]:
     ranks = {}
     for name, columns in moving_attributes(trajectory).items():
         fitted = fit_amplitude(trajectory[:, :, columns], torch.ones_like(trajectory[0, :, columns]))
-        allowed = tolerance**2 * float(fitted.offsets.double().square().sum())
-        power = torch.linalg.eigvalsh(fitted.gram).flip(0).clamp(min=0)
-        remaining = float(power.sum()) - power.cumsum(0)
-        needed = 0 if float(power.sum()) <= allowed else 1 + int((remaining > allowed).sum())
-        ranks[name] = min(needed, MOST_RANK, principal_modes(fitted.gram).shape[1])
+        ranks[name] = min(fitted.needed_rank(tolerance), MOST_RANK, principal_modes(fitted.gram).shape[1])
     return ranks

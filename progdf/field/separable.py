@@ -47,6 +47,13 @@ class AttributeTrajectory:
         residual[[0, -1]] = 0.0
         return residual
 
+    def needed_rank(self, tolerance: float) -> int:
+        """The fewest bases that leave at most this share of the trajectory's own root mean square."""
+        allowed = tolerance**2 * float(self.offsets.double().square().sum())
+        power = torch.linalg.eigvalsh(self.gram).flip(0).clamp(min=0)
+        remaining = float(power.sum()) - power.cumsum(0)
+        return 0 if float(power.sum()) <= allowed else 1 + int((remaining > allowed).sum())
+
 
 def check_trajectory(strengths: Tensor, offsets: Tensor) -> None:
     """Refuse what is no trajectory.
@@ -211,16 +218,15 @@ def fit_separable(
     check_trajectory(strengths, offsets)
     spread = channel_weights(weights, offsets.shape[1], offsets.shape[2])
     attributes = {
-        name: _fit_attribute(
-            fit_amplitude(offsets[:, :, columns], spread[:, columns]), ranks.get(name, 0), basis_type
-        )
+        name: _fit_attribute(offsets[:, :, columns], spread[:, columns], ranks.get(name, 0), basis_type)
         for name, columns in moving_attributes(offsets).items()
     }
     ticks = strengths.tolist() if recorded is None else recorded
     return BakedField("separable", strengths.float(), attributes, offsets.shape[2], tuple(ticks))
 
 
-def _fit_attribute(trajectory: AttributeTrajectory, rank: int, basis_type: torch.dtype) -> AttributeBases:
+def _fit_attribute(offsets: Tensor, weights: Tensor, rank: int, basis_type: torch.dtype) -> AttributeBases:
+    trajectory = fit_amplitude(offsets, weights)
     return store_attribute(trajectory, principal_modes(trajectory.gram)[:, :rank], basis_type)
 
 
@@ -256,11 +262,8 @@ def fit_course(offsets: Tensor, stored: tuple[Tensor, Tensor] | None = None) -> 
     `stored`: what its last row was decoded from, see `quantize_bases`.
     """
     fitted = fit_amplitude(offsets, torch.ones_like(offsets[0]), stored)
-    allowed = _COURSE_TOLERANCE**2 * float(fitted.offsets.double().square().sum())
-    power = torch.linalg.eigvalsh(fitted.gram).flip(0).clamp(min=0)
-    remaining = float(power.sum()) - power.cumsum(0)
-    needed = 0 if float(power.sum()) <= allowed else 1 + int((remaining > allowed).sum())
-    return store_attribute(fitted, principal_modes(fitted.gram)[:, : min(needed, _MOST_COURSE_RANK)])
+    rank = min(fitted.needed_rank(_COURSE_TOLERANCE), _MOST_COURSE_RANK)
+    return store_attribute(fitted, principal_modes(fitted.gram)[:, :rank])
 
 
 def opacity_course(start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:

@@ -103,31 +103,28 @@ def _replace_unusable(scene: Gaussians) -> tuple[Gaussians, dict[str, int]]:
     if _is_clean(scene, lengths):
         return replace(scene, quats=quats), counts
 
-    bad_means = ~(scene.means.abs() <= LARGEST_MEAN).all(dim=1)
     flat = scene.log_scales == -torch.inf
-    bad_scales = ~((scene.log_scales <= LARGEST_LOG_SCALE) | flat).all(dim=1)
-    bad_quats = ~scene.quats.isfinite().all(dim=1)
     zero_quats = scene.quats.abs().amax(dim=1) < LEAST_QUAT
-    bad_opacities = scene.logit_opacities.isnan()
     opaque = scene.logit_opacities == torch.inf
     transparent = scene.logit_opacities == -torch.inf
-    bad_colors = ~scene.sh0.isfinite().all(dim=1)
-    bad_sh = ~scene.shN.flatten(1).isfinite().all(dim=1)
-    hidden = bad_means | bad_scales | bad_quats | bad_opacities | bad_colors
-    counts = {
-        "scaled_quats": int(((lengths != 1) & ~zero_quats & ~bad_quats).sum()),
-        "hidden": int(hidden.sum()),
-        "bad_means": int(bad_means.sum()),
-        "bad_scales": int(bad_scales.sum()),
-        "bad_quats": int(bad_quats.sum()),
-        "bad_opacities": int(bad_opacities.sum()),
-        "bad_colors": int(bad_colors.sum()),
-        "bad_sh": int(bad_sh.sum()),
-        "flat_scales": int((flat.any(dim=1) & ~hidden).sum()),
-        "opaque": int((opaque & ~hidden).sum()),
-        "transparent": int((transparent & ~hidden).sum()),
-        "zero_quats": int(zero_quats.sum()),
+    bad = {
+        "bad_means": ~(scene.means.abs() <= LARGEST_MEAN).all(dim=1),
+        "bad_scales": ~((scene.log_scales <= LARGEST_LOG_SCALE) | flat).all(dim=1),
+        "bad_quats": ~scene.quats.isfinite().all(dim=1),
+        "bad_opacities": scene.logit_opacities.isnan(),
+        "bad_colors": ~scene.sh0.isfinite().all(dim=1),
     }
+    hidden = torch.stack([*bad.values()]).any(dim=0)
+    rows = bad | {
+        "scaled_quats": (lengths != 1) & ~zero_quats & ~bad["bad_quats"],
+        "hidden": hidden,
+        "bad_sh": ~scene.shN.flatten(1).isfinite().all(dim=1),
+        "flat_scales": flat.any(dim=1) & ~hidden,
+        "opaque": opaque & ~hidden,
+        "transparent": transparent & ~hidden,
+        "zero_quats": zero_quats,
+    }
+    counts = {name: int(mask.sum()) for name, mask in rows.items()}
     good = scene.means[~hidden]
     # in the middle of the scene, where it changes neither its bounds nor the rig
     middle = good.median(dim=0).values if len(good) else torch.zeros(3)

@@ -15,7 +15,6 @@ from functools import cache
 
 import torch
 from torch import Tensor
-from torch.nn.functional import interpolate
 
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
@@ -24,7 +23,7 @@ from progdf.io.picture_camera import find_picture_camera
 from progdf.rasterize import Crop
 from trainer.options import EditKind, EditorOptions
 from trainer.store.pretrained import last_model
-from trainer.views.view import BACKGROUND, View, region_box, render_view
+from trainer.views.view import BACKGROUND, View, region_box, render_view, shrink_image
 
 from .adapters import (
     ADAPTERS,
@@ -121,10 +120,8 @@ class InstructEditor:
         The change, not the picture: a render shrunk is some 32 dB off the smaller render that is trained.
         """
         x0, y0, x1, y1 = self.frame(view)[0]
-        change = (painted - self.original(view)).permute(2, 0, 1)[None]
-        shrunk = interpolate(change, (y1 - y0, x1 - x0), mode="area")[0].permute(1, 2, 0)
         edited = view.image.clone()
-        edited[y0:y1, x0:x1] += shrunk
+        edited[y0:y1, x0:x1] += shrink_image(painted - self.original(view), (y1 - y0, x1 - x0))
         return edited.clamp(0.0, 1.0)
 
     def paint(

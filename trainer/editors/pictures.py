@@ -21,7 +21,6 @@ import torch
 from PIL import Image
 from scipy import ndimage
 from torch import Tensor
-from torch.nn.functional import interpolate
 
 from progdf.camera import Camera, undistort
 from progdf.color.edits import typical_color
@@ -32,7 +31,7 @@ from progdf.io.images import picture_size, read_picture, save_as
 from progdf.io.picture_camera import find_picture_camera
 from progdf.rasterize import render
 from trainer.options import EditKind
-from trainer.views.view import BACKGROUND, View, seen_colors
+from trainer.views.view import BACKGROUND, View, seen_colors, shrink_image
 
 from .base import EditorInput
 
@@ -105,9 +104,8 @@ def read_edit(scene: Gaussians, camera: Camera, image: Tensor, path: Path) -> Te
     from a small render wherever the scene is fine.
     """
     original, picture = read_change(scene, path, camera.resize(*picture_size(path)))
-    change = (lay_over(original, picture) - original).permute(2, 0, 1)[None]
-    shrunk = interpolate(change, size=(camera.height, camera.width), mode="area")[0].permute(1, 2, 0)
-    return (image + shrunk).clamp(0.0, 1.0)
+    change = lay_over(original, picture) - original
+    return (image + shrink_image(change, (camera.height, camera.width))).clamp(0.0, 1.0)
 
 
 def picture_paths(what: str) -> tuple[Path, ...]:

@@ -19,6 +19,8 @@ from trainer.report.report import (
     column_heading,
     columns_of,
     editor_strip,
+    even,
+    middles,
     stack_plots,
     thumbnail,
     view_caption,
@@ -84,8 +86,8 @@ def _plots(evaluation: Evaluation) -> list[list[Plot]]:
     curves, paths = evaluation.curves, evaluation.paths
     psnr = {name: (curve.s, curve.psnr) for name, curve in curves.items()}
     perceptual = {name: (curve.s, curve.lpips) for name, curve in curves.items()}
-    steps = {name: (_middles(len(path.steps)), path.steps) for name, path in paths.items()}
-    change = {name: (_ends(len(path.from_original)), path.from_original) for name, path in paths.items()}
+    steps = {name: (middles(len(path.steps)), path.steps) for name, path in paths.items()}
+    change = {name: (even(len(path.from_original)), path.from_original) for name, path in paths.items()}
     return [
         [
             Plot("PSNR to the edited views, dB", psnr, "slider", span=_SPAN),
@@ -106,14 +108,6 @@ def _join_sheets(sheets: Sequence[Image.Image]) -> Image.Image:
         page.paste(sheet, (0, top))
         top += sheet.height
     return page
-
-
-def _middles(count: int) -> list[float]:
-    return [(i + 0.5) / count for i in range(count)]
-
-
-def _ends(count: int) -> list[float]:
-    return [i / (count - 1) for i in range(count)]
 
 
 def evaluate(options: EvaluateOptions) -> list[Evaluation]:

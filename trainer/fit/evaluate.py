@@ -87,10 +87,11 @@ class Evaluator:
 
     def halves(self) -> tuple[Evaluator, Evaluator]:
         """The views that fields are chosen on, and those that their errors are reported on."""
-        choosing, reporting = (self._only(views) for views in split_held_out(range(len(self.crops))))
+        choosing, reporting = (self.only(views) for views in split_held_out(range(len(self.crops))))
         return choosing, reporting
 
-    def _only(self, views: Sequence[int]) -> Evaluator:
+    def only(self, views: Sequence[int]) -> Evaluator:
+        """Some of the views."""
         return replace(
             self,
             crops=[self.crops[i] for i in views],

@@ -38,6 +38,7 @@ from trainer.views.view import (
     name_cameras,
     region_rig,
     render_view,
+    shrink_image,
     with_near_plane,
 )
 
@@ -280,9 +281,7 @@ def _lift(
 def _scale_mask(mask: Tensor, camera: Camera) -> Tensor:
     """The mask in the camera's size, averaged. [H,W] -> [h,w]"""
     size = (camera.height, camera.width)
-    if tuple(mask.shape) == size:
-        return mask.float()
-    return torch.nn.functional.interpolate(mask.float()[None, None], size=size, mode="area")[0, 0]
+    return mask.float() if tuple(mask.shape) == size else shrink_image(mask.float()[..., None], size)[..., 0]
 
 
 def _masks_with_pixels(masks: Sequence[Tensor], prompt: str, request: RegionRequest) -> list[Tensor | None]:

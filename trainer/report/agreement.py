@@ -19,13 +19,13 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, interpolate
+from torch.nn.functional import avg_pool2d
 
 from progdf.metrics.image import NO_DIFFERENCE, decibels
 from progdf.rasterize import render
 from trainer.setup import TrainingSetup
 from trainer.views.crops import CropScene, crop_scene
-from trainer.views.view import View, crop
+from trainer.views.view import View, crop, shrink_image
 
 _MOST_UNEXPLAINED = 0.4  # half way between the edits that agree and those that do not, see above
 _MOST_FINE = 0.5  # calm styles leave up to .47, stripes of random phase .55 and more
@@ -202,9 +202,7 @@ def view_change(setup: TrainingSetup, view: View, edited: Tensor, shrink: int = 
     box = (x0 // shrink, y0 // shrink, right, bottom)
 
     def small(picture: Tensor) -> Tensor:
-        stack = picture.permute(2, 0, 1)[None]
-        smaller = interpolate(stack, (camera.height, camera.width), mode="area")
-        return crop(smaller[0].permute(1, 2, 0), box)
+        return crop(shrink_image(picture, (camera.height, camera.width)), box)
 
     change = edited - view.image
     counts = (view.mask > 0.05) | (change.abs().amax(dim=2) > 2 / 255)

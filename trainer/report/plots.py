@@ -34,10 +34,7 @@ class Plot:
     across: str = ""  # name of the axis below, "" for none
     # of the axis at the left; "log" needs values above 0, others are left out
     scale: Literal["linear", "log"] = "linear"
-    form: Literal["lines", "bars"] = "lines"  # "lines", or "bars" side by side from 0
-    # low, high: what the axis at the left shows at least; None is as the values are
-    low: float | None = None
-    high: float | None = None
+    low: float | None = None  # what the axis at the left shows at least; None is as the values are
     span: tuple[float, float] | None = None  # what the axis below shows at least
 
 
@@ -58,22 +55,17 @@ def draw_plot(plot: Plot, width: int, height: int) -> Image.Image:
         return _image(figure)
     for i, (name, (xs, ys)) in enumerate(lines.items()):
         color, dash = _shade(LINES[i % len(LINES)]), _DASHES[i // len(LINES) % len(_DASHES)]
-        if plot.form == "bars":
-            axes.bar(range(len(ys)), ys, width=0.72, color=color, label=name)
-        else:
-            marker = "o" if len(xs) <= _MARKED else ""
-            axes.plot(xs, ys, dash, color=color, linewidth=1.5, marker=marker, markersize=3.5, label=name)
+        marker = "o" if len(xs) <= _MARKED else ""
+        axes.plot(xs, ys, dash, color=color, linewidth=1.5, marker=marker, markersize=3.5, label=name)
     axes.set_axisbelow(True)
-    axes.grid(color=grid, axis="y" if plot.form == "bars" else "both")
-    if plot.form == "bars":
-        axes.set_xticks([])
+    axes.grid(color=grid)
     if plot.scale == "log":
         highest = max(max(ys) for _, ys in lines.values())
         axes.set_yscale("log")
         axes.set_ylim(bottom=max(axes.get_ylim()[0], highest * 10.0**-_DECADES))
     # the axes show at least this: points that nobody sees stretch them
-    for name, limits in (("x", plot.span or ()), ("y", [y for y in (plot.low, plot.high) if y is not None])):
-        axes.update_datalim([(x, x) for x in limits], updatex=name == "x", updatey=name == "y")
+    axes.update_datalim([(x, 0.0) for x in plot.span or ()], updatey=False)
+    axes.update_datalim([] if plot.low is None else [(0.0, plot.low)], updatex=False)
     if plot.scale == "linear":
         axes.autoscale_view()
     legend = 0

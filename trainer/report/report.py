@@ -135,15 +135,16 @@ def _uniformity_plots(measured: Measured, losses: Losses) -> list[Plot]:
     plots = [
         Plot(
             "visible change from the original",
-            {"change": (_even(len(slider.distances)), slider.distances)},
+            {"change": (even(len(slider.distances)), slider.distances)},
             "slider",
             span=_SPAN,
         ),
         Plot(
             f"visible change of each 1/{len(slider.steps)} of the slider",
-            {"change": (_even(len(slider.steps)), slider.steps)},
-            f"slider, 0 to 1; least over largest {slider.uniformity:.2f}",
-            form="bars",
+            {"change": (middles(len(slider.steps)), slider.steps)},
+            f"slider; least over largest {slider.uniformity:.2f}",
+            low=0.0,
+            span=_SPAN,
         ),
         _training(losses, measured.perceptual),
     ]
@@ -178,8 +179,14 @@ def _label(name: str) -> str:
     return name.replace("keyframes", "") + " keyframes" if name.startswith("keyframes") else name
 
 
-def _even(count: int) -> list[float]:
+def even(count: int) -> list[float]:
+    """So many slider values from end to end."""
     return [i / max(1, count - 1) for i in range(count)]
+
+
+def middles(count: int) -> list[float]:
+    """Slider values in the middle of so many steps."""
+    return [(i + 0.5) / count for i in range(count)]
 
 
 def stack_plots(sheet: Image.Image, rows: Sequence[Sequence[Plot]]) -> Tensor:

@@ -14,12 +14,12 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn.functional import interpolate
 
 from progdf.gaussians import pack
-from progdf.metrics.image import ROUNDING, decibels
+from progdf.metrics.image import ROUNDING
 from progdf.scene.bounds import scene_sphere
 from trainer.editors import KIND_UNKNOWN, ImageEditor
+from trainer.fit.evaluate import Evaluator
 from trainer.optimize.groups import GROUP_STEPS, group_stage
 from trainer.optimize.growth import place_seeds, seed_rows
 from trainer.optimize.losses import GradientL1, Objective
@@ -28,8 +28,8 @@ from trainer.options import EditKind, OptimizeOptions, TrainOptions, with_values
 from trainer.resolve import resolve_kind
 from trainer.setup import TrainingSetup, confines_edit
 from trainer.store.progress import Advance, RunLog
-from trainer.views.crops import CropScene, crop_scene, render_all
-from trainer.views.view import View, crop, fit_size
+from trainer.views.crops import CropScene, crop_scene
+from trainer.views.view import View, crop, fit_size, shrink_image
 
 _SIZE = 128  # longer side of the small views, pixels
 _VIEWS = 12  # of those that change most; every third judges
@@ -208,7 +208,7 @@ def try_approaches(
     most = sorted(zip(setup.train, edited, strict=True), key=lambda pair: -_change(*pair))[:_VIEWS]
     trained = [pair for i, pair in enumerate(most) if i % 3 != 1]
     plain = _small_views(setup, most)
-    unedited = _psnr(plain[1::3] or plain, pack(setup.scene[setup.region.members], with_shN=True))
+    unedited = _psnr(plain, torch.zeros_like(plain.original))
     steps = max(_LEAST_STEPS, min(_MOST_STEPS, round(_SHARE * options.optimize.steps)))
     psnrs: dict[Approach, float] = {}
     for way in ways:
@@ -229,13 +229,12 @@ def _try_approach(
     way: Approach,
     setup: TrainingSetup,
     seeds: int,
-    small: Sequence[_Small],
+    small: Evaluator,
     steps: int,
 ) -> float:
     """PSNR in the judging views, dB. `seeds`: how many members, the last, are none of the scene's"""
-    members, taught = setup.region.members, [one for i, one in enumerate(small) if i % 3 != 1]
-    crops, targets = [one.scene for one in taught], [one.target for one in taught]
-    original = pack(setup.scene[members], with_shN=setup.scene.sh_degree > 0)
+    taught = small.only([i for i in range(len(small.crops)) if i % 3 != 1])
+    original, crops, targets = small.original, taught.crops, taught.edited[1.0]
     stage = TargetStage(1.0, targets, steps)
     if way.group_steps:
         # how far parts get as wholes; what the members add to that takes longer than a trial
@@ -243,7 +242,7 @@ def _try_approach(
         end = groups.to_stages(original, crops, [stage])[0].place(torch.zeros_like(original))
     else:
         resolved = resolve_kind(with_values(options, steps=steps), way.kind, 0)
-        extent = 2.0 * scene_sphere(setup.scene[members])[1]
+        extent = 2.0 * scene_sphere(setup.scene[setup.region.members])[1]
         settings = pgs_settings(resolved, True, original.shape[1], extent, 1)
         settings = replace(settings, smoothing=0.9, every=0, snapshots=1)
         if seeds:
@@ -251,7 +250,7 @@ def _try_approach(
         objective = Objective(GradientL1(), OptimizeOptions(perceptual_weight=0.0))
         *_, last = optimize(original, crops, [], [stage], objective, settings)
         end = last.offsets
-    return _psnr(small[1::3] or small, original + end)
+    return _psnr(small, end)
 
 
 def resolve_approach(options: TrainOptions, way: Approach) -> OptimizeOptions:
@@ -259,20 +258,16 @@ def resolve_approach(options: TrainOptions, way: Approach) -> OptimizeOptions:
     return resolve_kind(options, way.kind, way.group_steps, way.grow)
 
 
-@dataclass(frozen=True)
-class _Small:
-    """One view, small: what is rendered, what it should be, and which pixels count."""
-
-    scene: CropScene
-    target: Tensor
-    counts: Tensor
-
-
-def _small_views(setup: TrainingSetup, pairs: Sequence[tuple[View, Tensor]]) -> list[_Small]:
-    return [_small(setup, view.widen([picture]), picture) for view, picture in pairs]
+def _small_views(setup: TrainingSetup, pairs: Sequence[tuple[View, Tensor]]) -> Evaluator:
+    """Views and their edited pictures, small."""
+    small = [_small(setup, view.widen([picture]), picture) for view, picture in pairs]
+    crops, targets, pixels = zip(*small, strict=True)
+    original = pack(setup.scene[setup.region.members], with_shN=setup.scene.sh_degree > 0)
+    return Evaluator(original, crops, pixels, {1.0: targets}, [view.camera.name for view, _ in pairs])
 
 
-def _small(setup: TrainingSetup, view: View, picture: Tensor) -> _Small:
+def _small(setup: TrainingSetup, view: View, picture: Tensor) -> tuple[CropScene, Tensor, Tensor]:
+    """What is rendered, what it should be, and which pixels count."""
     camera = fit_size(view.camera, _SIZE)
     across, down = camera.width / view.camera.width, camera.height / view.camera.height
     x0, y0, x1, y1 = view.box
@@ -280,21 +275,18 @@ def _small(setup: TrainingSetup, view: View, picture: Tensor) -> _Small:
     box = (math.floor(x0 * across), math.floor(y0 * down), right, bottom)
 
     def small(image: Tensor) -> Tensor:
-        planes = interpolate(image.permute(2, 0, 1)[None], (camera.height, camera.width), mode="area")
-        return crop(planes[0].permute(1, 2, 0), box)
+        return crop(shrink_image(image, (camera.height, camera.width)), box)
 
     counts = (view.mask > 0.05) | ((picture - view.image).abs().amax(dim=2) > 2 / 255)
     scene = crop_scene(setup.scene, setup.region.members, camera, box, setup.background)
-    return _Small(scene, small(picture), small(counts.float()[..., None])[..., 0] > 0.5)
+    return scene, small(picture), small(counts.float()[..., None])[..., 0] > 0.5
 
 
-def _psnr(judges: Sequence[_Small], rows: Tensor) -> float:
-    """Over the pixels that count, all views together, dB; 99 where nothing differs."""
-    error = count = 0.0
-    for one, picture in zip(judges, render_all([one.scene for one in judges], rows), strict=True):
-        error += float((picture - one.target)[one.counts].square().sum())
-        count += 3 * int(one.counts.sum())
-    return decibels(error / max(count, 1))
+def _psnr(small: Evaluator, offsets: Tensor) -> float:
+    """In the views that judge, or all where there is one alone, dB."""
+    count = len(small.crops)
+    judges = small.only(range(1, count, 3) or range(count))
+    return judges.psnr(judges.pictures(offsets), judges.edited[1.0])
 
 
 def _change(view: View, picture: Tensor) -> float:

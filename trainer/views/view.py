@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+from torch.nn.functional import interpolate
 
 from progdf.camera import Camera, intrinsics, look_at
 from progdf.gaussians import Gaussians
@@ -78,6 +79,11 @@ def crop(image: Tensor, box: Crop) -> Tensor:
     """The pixels of a box. [H,W,...] -> [h,w,...]"""
     x0, y0, x1, y1 = box
     return image[y0:y1, x0:x1]
+
+
+def shrink_image(image: Tensor, size: tuple[int, int]) -> Tensor:
+    """The image in another height and width, averaged over areas. [H,W,C] -> [h,w,C]"""
+    return interpolate(image.permute(2, 0, 1)[None], size, mode="area")[0].permute(1, 2, 0)
 
 
 def make_view(scene: Gaussians, region: Region, camera: Camera, background: Tensor) -> View:

@@ -134,16 +134,6 @@ def test_gaps_zeros_and_empty_lines_do_not_break_a_plot() -> None:
     assert _color_count(empty, LINES[0]) == 0
 
 
-def test_bars_stand_on_zero_and_are_as_high_as_their_values() -> None:
-    values = [1.0, 2.0, 4.0]
-    picture = np.asarray(draw_plot(Plot("t", {"b": ([0, 1, 2], values)}, form="bars"), 300, 220), dtype=int)
-    blue = np.abs(picture - np.array(LINES[0])).max(axis=2) <= 12
-    columns = blue.sum(axis=0)
-    heights = [int(part.max()) for part in np.array_split(columns[30:], 3)]
-    assert heights[1] == pytest.approx(2 * heights[0], abs=3)
-    assert heights[2] == pytest.approx(4 * heights[0], abs=5)
-
-
 def test_a_legend_that_is_too_wide_goes_on_in_a_second_row() -> None:
     lines = {f"a name of some length {k}": ([0.0, 1.0], [k, k + 1.0]) for k in range(4)}
     picture = np.asarray(draw_plot(Plot("t", lines), 400, 270), dtype=int)
