@@ -18,8 +18,7 @@ from progdf.field.baked import BakedField
 from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.gdf.file import Gdf
 from progdf.rasterize import render
-from progdf.scene.bounds import front_direction
-from progdf.scene.subject import fit_eye, is_room, richest_turn, standpoint, subject_rows
+from progdf.scene.subject import fit_camera, is_room, richest_turn, standpoint, subject_rows
 from progdf.scene.up_axis import guess_up
 from progdf.terminal import escape_text, file_size, format_count
 
@@ -84,21 +83,11 @@ def _still(scene: Gaussians) -> str:
 
 def _first_camera(scene: Gaussians) -> Camera:
     """As the window meets a scene: its subject from the front and a little above, a room from inside."""
-    up, fov, (width, height) = guess_up(scene), math.radians(45.0), _SIZE
+    up = guess_up(scene)
     if is_room(scene, up):
-        eye, target = standpoint(scene, up)
-        fov = math.radians(60.0)
-    else:
-        subject, ahead = scene[subject_rows(scene, up)], front_direction(up)
-        turn = math.radians(20.0 + richest_turn(subject, up, 20.0, 15.0))
-        level = math.cos(turn) * ahead + math.sin(turn) * torch.linalg.cross(up, ahead)
-        back = math.cos(math.radians(15.0)) * level + math.sin(math.radians(15.0)) * up
-        right = torch.nn.functional.normalize(torch.linalg.cross(up, back), dim=0)
-        axes = torch.stack([right, torch.linalg.cross(back, right), back])
-        radius, tangent = 2 * float(subject.scales.amax(dim=1).median()), 0.72 * math.tan(fov / 2)
-        eye = fit_eye(subject.means, radius, axes, (tangent * width / height, tangent))
-        target = eye - back
-    return Camera(look_at(eye, target, up), intrinsics(fov, width, height), width, height)
+        return Camera(look_at(*standpoint(scene, up), up), intrinsics(math.radians(60.0), *_SIZE), *_SIZE)
+    turn = 20.0 + richest_turn(scene[subject_rows(scene, up)], up, 20.0, 15.0)
+    return fit_camera(scene, up, (turn, 15.0), _SIZE, math.radians(45.0), 0.72)
 
 
 def _chart(shown: BakedField | Gdf) -> str:

@@ -392,10 +392,8 @@ class ShowRegionOptions:
     cameras: Annotated[Path | None, absent_option("PATH", "none")] = None
     """masks: their cameras, where DIR holds none; text: views in which to look for it."""
     camera: Annotated[str | None, absent_option("FILE[:INDEX]", "four sides")] = None
-    """Look through a camera of this file, the first where no INDEX is given."""
-    orbit: Annotated[str | None, absent_option("AZ,EL[,DISTANCE]", "four sides")] = None
-    """Look from degrees around the scene, degrees above it, world units away (fitting); without camera and
-    orbit the picture shows four sides."""
+    """Look through a camera of this file, the first where no INDEX is given; without it the picture shows
+    four sides."""
     size: Annotated[str, tyro.conf.arg(metavar="WxH")] = "640x480"
     """Pixels of the picture, or of each side; a camera's own if it is one."""
     up: UpChoice = "auto"

@@ -16,19 +16,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import linear
 
-from .neural import (
-    LAYOUT,
-    Bins,
-    Inputs,
-    NeuralField,
-    NeuralShape,
-    Size,
-    appearance,
-    apply_later_layers,
-    control_signal,
-    encode,
-    offsets_of_answer,
-)
+from . import neural
+from .neural import LAYOUT, Bins, Inputs, NeuralField, NeuralShape, Size
 from .separable import channel_weights, quantize_bases
 
 
@@ -65,13 +54,12 @@ class NeuralSettings:
     bins: Bins = "smooth"  # "smooth", or "hard" as the paper's
     steps: int = 0  # 0 is what the size needs
     batch: int = 0  # members drawn in each step; 0 is what the size needs
-    rate: float = 0.0  # largest learning rate; 0 is what the size needs
     seed: int = 0  # of the first weights and of what is drawn
 
     def resolve(self) -> NeuralSettings:
         """The same with every 0 replaced by the size's own value."""
-        steps, batch, rate = EFFORT[self.size]
-        return replace(self, steps=self.steps or steps, batch=self.batch or batch, rate=self.rate or rate)
+        steps, batch, _ = EFFORT[self.size]
+        return replace(self, steps=self.steps or steps, batch=self.batch or batch)
 
 
 class NeuralFit:
@@ -93,7 +81,7 @@ class NeuralFit:
         settings: NeuralSettings,
         visibility: Tensor | None = None,
     ) -> None:
-        self.settings = settings.resolve()
+        self.settings, self._rate = settings.resolve(), EFFORT[settings.size][2]
         width, layers = LAYOUT[settings.size]
         self.shape = NeuralShape(
             width, layers, attributes, channels, settings.inputs, settings.code, hard=settings.bins == "hard"
@@ -107,7 +95,7 @@ class NeuralFit:
             self._learned["codes"] = 0.1 * torch.randn(len(rows), self.shape.code, generator=self._draws)
         for tensor in self._learned.values():
             tensor.requires_grad_()
-        self._adam = torch.optim.Adam(list(self._learned.values()), lr=self.settings.rate, fused=True)
+        self._adam = torch.optim.Adam(list(self._learned.values()), lr=self._rate, fused=True)
         visible = channel_weights(visibility, len(rows), 1)[:, 0]
         self._shown = visible / visible.mean().clamp_min(1e-12)
         self._importance = torch.full((len(self.shape.columns),), 1.0 / len(self.shape.columns))
@@ -144,11 +132,11 @@ class NeuralFit:
                     self._learned[name].mul_(factor[:, None] if name == "heads.weight" else factor)
         self._frame["spread"] = after
         if self.shape.inputs == "own" and len(self._rows):
-            look = appearance(self._rows, self._end)
+            look = neural.appearance(self._rows, self._end)
             spread = look.std(dim=0, correction=0)
             self._frame["look_mean"] = look.mean(dim=0)
             self._frame["look_spread"] = torch.where(spread > 1e-6, spread, torch.ones_like(spread))
-        self._told = encode(self.shape, self._frame, self._rows, self._end)
+        self._told = neural.encode(self.shape, self._frame, self._rows, self._end)
 
     def step(
         self,
@@ -183,7 +171,7 @@ class NeuralFit:
         if not math.isfinite(value):
             raise FloatingPointError(f"the field's loss is {value} at step {self.steps}")
         for group in self._adam.param_groups:
-            group["lr"] = self.settings.rate * factor * min(1.0, self.steps / _WARMUP)
+            group["lr"] = self._rate * factor * min(1.0, self.steps / _WARMUP)
         self._adam.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         self._adam.step()
@@ -212,15 +200,17 @@ class NeuralFit:
 
     def _answer(self, rows: Tensor, s: Tensor) -> Tensor:
         """The field's offsets for drawn members and strengths. [B], [B] -> [B,c]"""
-        signal = control_signal(self.shape, self._learned["control"], s)
+        signal = neural.control_signal(self.shape, self._learned["control"], s)
         parts = [self._told[rows], signal]
         if self.shape.code:
             parts.insert(1, self._learned["codes"].index_select(0, rows))
         hidden = linear(
             torch.cat(parts, dim=1), self._learned["layers.0.weight"], self._learned["layers.0.bias"]
         )
-        answer = apply_later_layers(self.shape, {**self._learned, "spread": self._frame["spread"]}, hidden)
-        return offsets_of_answer(self.shape, s, answer, self._end[rows])
+        answer = neural.apply_later_layers(
+            self.shape, {**self._learned, "spread": self._frame["spread"]}, hidden
+        )
+        return neural.offsets_of_answer(self.shape, s, answer, self._end[rows])
 
     def capture_state(self) -> dict[str, Tensor]:
         """Everything that the next steps depend on, by name; the snapshots aside."""
@@ -244,7 +234,7 @@ class NeuralFit:
         self._end, self._importance = saved["end"].clone(), saved["importance"].clone()
         self.steps = int(saved["steps"])
         self._draws.set_state(saved["draws"])
-        self._told = encode(self.shape, self._frame, self._rows, self._end)
+        self._told = neural.encode(self.shape, self._frame, self._rows, self._end)
 
     def adopt(self, shape: NeuralShape, saved: Mapping[str, Tensor]) -> None:
         """Begin with the weights of another fit of the same members, whose outputs may be more than ours.

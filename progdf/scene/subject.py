@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from progdf.camera import Camera, intrinsics, look_at
 from progdf.gaussians import Gaussians
 
 from .bounds import front_direction, has_ceiling, has_long_tail
@@ -93,6 +94,34 @@ def fit_eye(points: Tensor, radius: float, axes: Tensor, tangents: tuple[float, 
         best.append(0.5 * (high - low))
         away = max(away, 0.5 * (high + low) / tangent)
     return torch.tensor([*best, away], dtype=torch.float64) @ axes.double()
+
+
+def fit_camera(
+    scene: Gaussians,
+    up: Tensor,
+    turn: tuple[float, float],
+    size: tuple[int, int],
+    fov: float,
+    filled: float,
+) -> Camera:
+    """A camera that what the scene is about fills; as `progdf render --orbit`.
+
+    Args:
+        scene: what the picture is of
+        up: [3]
+        turn: azimuth and elevation of the eye, degrees, see `front_direction`
+        size: width and height, pixels
+        fov: vertical, radians
+        filled: share of the picture, 0..1
+    """
+    ahead, (around, above) = front_direction(up), map(math.radians, turn)
+    level = math.cos(around) * ahead + math.sin(around) * torch.linalg.cross(up, ahead)
+    back = math.cos(above) * level + math.sin(above) * up
+    axes = look_at(back, torch.zeros(3), up)[:3, :3] * torch.tensor([[1.0], [-1.0], [-1.0]])
+    subject, tangent = scene[subject_rows(scene, up)], filled * math.tan(0.5 * fov)
+    radius = 2 * float(subject.log_scales.amax(dim=1).median().exp())
+    eye = fit_eye(subject.means, radius, axes, (tangent * size[0] / size[1], tangent)).float()
+    return Camera(look_at(eye, eye - back, up), intrinsics(fov, *size), *size)
 
 
 def is_room(scene: Gaussians, up: Tensor) -> bool:

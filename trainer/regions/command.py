@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from progdf.camera import Camera, intrinsics, look_at
+from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.formats.scene_file import load_scene
 from progdf.gaussians import Gaussians
@@ -19,10 +19,10 @@ from progdf.io.cameras import load_cameras, read_camera, save_cameras
 from progdf.io.images import write_image
 from progdf.io.tensors import save_npy
 from progdf.region import Region, whole_scene
-from progdf.scene.bounds import front_direction, is_surrounding
+from progdf.scene.bounds import is_surrounding
 from progdf.scene.orbit_rig import orbit_rig
 from progdf.scene.regions import parse_region
-from progdf.scene.subject import fit_eye, subject_rows
+from progdf.scene.subject import fit_camera
 from progdf.scene.up_axis import find_up
 from progdf.terminal import format_count, group_digits
 from trainer.options import RegionOptions, ShowRegionOptions, ViewOptions, WriteViewsOptions, check_ranges
@@ -61,8 +61,6 @@ def show(options: ShowRegionOptions) -> list[str]:
         raise ProgdfError(
             f"{options.out} is not a .png or .npy file; use .png to show the region, .npy to keep it"
         )
-    if options.camera is not None and options.orbit is not None:
-        raise ProgdfError("--camera and --orbit cannot be combined; give only one of them")
     check_ranges(("--lift-threshold", options.lift_threshold, 0, 1))
     size = _size(options.size)
     scene = load_scene(options.scene)
@@ -100,41 +98,7 @@ def picture(scene: Gaussians, region: Region, camera: Camera) -> Tensor:
 def _cameras(options: ShowRegionOptions, scene: Gaussians, up: Tensor, size: tuple[int, int]) -> list[Camera]:
     if options.camera is not None:
         return [replace(read_camera(options.camera, scene.origin), lens=None)]
-    if options.orbit is None:
-        return [_fit_camera(scene, up, azimuth, elevation, None, size) for azimuth, elevation in _SIDES]
-    words = options.orbit.split(",")
-    try:
-        numbers = [float(word) for word in words]
-    except ValueError:
-        numbers = []
-    if len(numbers) not in (2, 3) or not all(map(math.isfinite, numbers)) or not -90 <= numbers[1] <= 90:
-        raise ProgdfError(
-            f"--orbit {options.orbit} is not AZIMUTH,ELEVATION[,DISTANCE] with an elevation of -90 to 90; "
-            "write for example --orbit 30,15"
-        )
-    away = numbers[2] if len(numbers) == 3 else None
-    if away is not None and not 0 < away <= 1e9:
-        raise ProgdfError(f"--orbit {options.orbit}: the distance must be above 0 and up to 1e9")
-    return [_fit_camera(scene, up, numbers[0], numbers[1], away, size)]
-
-
-def _fit_camera(
-    scene: Gaussians, up: Tensor, azimuth: float, elevation: float, away: float | None, size: tuple[int, int]
-) -> Camera:
-    """A camera that what the scene is about fills, from this direction; as `progdf render --orbit`."""
-    ahead = front_direction(up)
-    side = torch.linalg.cross(up, ahead)
-    around, above = math.radians(azimuth), math.radians(elevation)
-    back = math.cos(above) * (math.cos(around) * ahead + math.sin(around) * side) + math.sin(above) * up
-    axes = look_at(back, torch.zeros(3), up)[:3, :3] * torch.tensor([[1.0], [-1.0], [-1.0]])
-    subject = scene[subject_rows(scene, up)]
-    tangent = _FILLED * math.tan(0.5 * _FOV)
-    radius = 2 * float(subject.log_scales.amax(dim=1).median().exp())
-    eye = fit_eye(subject.means, radius, axes, (tangent * size[0] / size[1], tangent)).float()
-    if away is not None:
-        depth = float(eye @ back - (subject.means @ back).median())
-        eye = eye + (away - depth) * back
-    return Camera(look_at(eye, eye - back, up), intrinsics(_FOV, *size), *size)
+    return [fit_camera(scene, up, turn, size, _FOV, _FILLED) for turn in _SIDES]
 
 
 def _sheet(pictures: Sequence[Tensor]) -> Tensor:

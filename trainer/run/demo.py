@@ -48,7 +48,6 @@ MOST_GAUSSIANS = 5_000_000
 """As many as large trained scenes have: what --size says at most."""
 _HERO_HEIGHT = 400
 _TURNS = (-4, 3, 6)  # cameras from the one of the picture, 11 degrees each
-_GRID = (0.0, 1 / 3, 2 / 3, 1.0)
 
 
 @dataclass(frozen=True)
@@ -195,16 +194,16 @@ def write_scene(folder: Path, scene: DemoScene) -> None:
 
 
 def write_pictures(folder: Path, scene: DemoScene, gdfs: Mapping[str, Gdf], view: int) -> list[Path]:
-    """Write what sliders do: each alone, two against each other, in large, and of one picture.
+    """Write what sliders do: each alone, in large, and of one picture.
 
     Args:
         folder: where scene.ply lies and the pictures go
         scene: its cameras and background
-        gdfs: the edits by name; the first two share no Gaussian
+        gdfs: the edits by name
         view: which camera
 
     Returns:
-        sliders.png, two-sliders.png, hero.png, and for an edit made of a changed picture one-picture.png: the
+        sliders.png, hero.png, and for an edit made of a changed picture one-picture.png: the
         render, the picture, and the edit from three sides
     """
     gaussians = load_ply(folder / "scene.ply")
@@ -217,7 +216,6 @@ def write_pictures(folder: Path, scene: DemoScene, gdfs: Mapping[str, Gdf], view
             return render(compose_layers(gaussians, layers), sized, background=scene.background).image
 
     names = list(gdfs)
-    first, second, third, *_ = names
     sliders = contact_sheet(
         [[shot(300, {name: strength}) for strength in STRENGTHS] for name in names],
         names,
@@ -225,15 +223,8 @@ def write_pictures(folder: Path, scene: DemoScene, gdfs: Mapping[str, Gdf], view
         "One slider per edit",
         "  ·  ".join(f"{name}: {gdf.instruction}" for name, gdf in gdfs.items()),
     )
-    steps = [f"{strength:.0%}" for strength in _GRID]
-    grid = contact_sheet(
-        [[shot(260, {first: a, second: b}) for b in _GRID] for a in _GRID],
-        [f"{first} {step}" for step in steps],
-        [f"{second} {step}" for step in steps],
-        "Two sliders, every mixture",
-    )
-    hero = torch.cat([shot(_HERO_HEIGHT, {third: strength}) for strength in STRENGTHS], dim=1)
-    pictures = [("sliders", sliders), ("two-sliders", grid), ("hero", hero)]
+    hero = torch.cat([shot(_HERO_HEIGHT, {names[2]: strength}) for strength in STRENGTHS], dim=1)
+    pictures = [("sliders", sliders), ("hero", hero)]
     for name in names:
         if (folder / f"{name}.png").is_file():
             given = shot(_HERO_HEIGHT, {}), read_picture(folder / f"{name}.png", (_HERO_HEIGHT, _HERO_HEIGHT))

@@ -103,8 +103,6 @@ def test_the_region_is_shown_from_four_sides_or_as_one_asks(
     out = tmp_path / "r.png"
     for asked, size in (
         ((), (128, 96)),
-        (("--orbit", "-30,15"), (64, 48)),
-        (("--orbit", "0,0,3"), (64, 48)),
         (("--camera", f"{tmp_path}/c.json:1"), (40, 30)),
     ):
         said(capsys, "region", scene, "all", "--size", "64x48", "-o", out, *asked)
@@ -117,7 +115,6 @@ def test_what_region_cannot_do_is_one_line_and_leaves_nothing(
     out = tmp_path / "r.png"
     assert "not a .png or .npy" in refused(capsys, "region", scene, "all", "-o", tmp_path / "r.jpg")
     assert "holds no Gaussian" in refused(capsys, "region", scene, "sphere:99,0,0,1", "-o", out)
-    assert "--orbit" in refused(capsys, "region", scene, "all", "-o", out, "--orbit", "1,99")
     assert "--size" in refused(capsys, "region", scene, "all", "-o", out, "--size", "0x9")
     assert not out.exists()
 
