@@ -130,7 +130,7 @@ def deflate(levels: Tensor) -> Tensor:
     content = levels.contiguous().numpy().tobytes()
 
     def pack(strategy: int) -> bytes:
-        packing = zlib.compressobj(9, strategy=strategy)
+        packing = zlib.compressobj(6, strategy=strategy)  # 9 takes seven times as long for .6 %
         return packing.compress(content) + packing.flush()
 
     packed = min(map(pack, (zlib.Z_HUFFMAN_ONLY, zlib.Z_DEFAULT_STRATEGY)), key=len)

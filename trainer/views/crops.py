@@ -7,6 +7,7 @@ the box.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -19,7 +20,7 @@ from progdf.gaussians import ATTRIBUTES, Gaussians, attribute_slices, unpack
 from progdf.rasterize import ActivatedGaussians, Crop, Rendering, activate, render
 from progdf.rasterize.cpu.forward import TILE_H, TILE_W
 from progdf.rasterize.engines import ColorMap, color_map
-from progdf.sh import C0, basis
+from progdf.sh import basis
 from progdf.threads import one_thread, run_chunks, threads
 
 from .view import seen_colors
@@ -131,7 +132,8 @@ class CropScene:
             image [h,w,3], 0..1 (see `clamp_towards`); transmittance [h,w]
         """
         members = unpack(packed.to(self.background.device), self.member_shN)
-        colors = member_colors(members, self.camera.position)
+        weights = self._still_weights if self.still else self._weights(members.means)
+        colors = clamp_towards((weights * members.sh[:, : weights.shape[1]]).sum(dim=1) + 0.5, 0.0, math.inf)
         if self.still and not colors.requires_grad:
             weighed, others, transmittance = self._linear
             image = others + weighed.picture(colors)
@@ -150,6 +152,18 @@ class CropScene:
             live, original = self.cached
             image = torch.where(live, image, original)
         return clamp_towards(image, 0.0, 1.0), transmittance
+
+    def _weights(self, means: Tensor) -> Tensor:
+        """What each band weighs in the members' colors from here. [M,3] -> [M,B,1]
+
+        Directions are constants: their share of the means' gradient is small and mostly noise.
+        """
+        directions = torch.nn.functional.normalize(means.detach() - self.camera.position, dim=1)
+        return basis(min(math.isqrt(self.member_shN.shape[1] + 1) - 1, 3), directions)[..., None]
+
+    @cached_property
+    def _still_weights(self) -> Tensor:
+        return self._weights(self.gaussians.means[self.rows])
 
     @cached_property
     def _linear(self) -> tuple[ColorMap, Tensor, Tensor]:
@@ -173,20 +187,6 @@ class CropScene:
 
 GEOMETRY = ("means", "quats", "log_scales", "logit_opacities")
 """Attributes that decide which pixels a Gaussian contributes to."""
-
-
-def member_colors(members: Gaussians, eye: Tensor) -> Tensor:
-    """SH colors seen from `eye`; a channel clamped at 0 keeps the gradient that would raise it. [M,3]
-
-    Directions are constants here: their share of the means' gradient is small and mostly noise.
-    """
-    degree = min(members.sh_degree, 3)
-    if degree == 0:
-        return clamp_towards(members.sh0 * C0 + 0.5, 0.0, float("inf"))
-    directions = torch.nn.functional.normalize(members.means.detach() - eye, dim=1)
-    weights = basis(degree, directions)
-    raw = (weights[..., None] * members.sh[:, : weights.shape[1]]).sum(dim=1) + 0.5
-    return clamp_towards(raw, 0.0, float("inf"))
 
 
 def crop_scene(
