@@ -20,7 +20,7 @@ from progdf.io.atomic import atomic_write, open_error
 from progdf.io.json_values import convert_json, decode_json
 from progdf.io.tensors import check_ascent, check_tensor, read_tensors, write_tensors
 
-from .baked import MONOMIALS, find_segment
+from .baked import MONOMIALS, find_segment, identity_map
 
 FILE_NAME = "trajectory.safetensors"
 """Its name in a run folder, beside the .gdf."""
@@ -59,6 +59,13 @@ class Trajectory:
         """Offsets at slider value `s`, linear between recordings, exact at both ends. [M,C] float32"""
         right, share = find_segment(self.s, s)
         return torch.lerp(self.node(right - 1), self.node(right), min(max(share, 0.0), 1.0))
+
+    @property
+    def map_course(self) -> tuple[int, Tensor]:
+        """The degree of the maps, and the map of each recording, the identity first. [S,K,3]"""
+        assert self.maps is not None
+        degree = next(d for d, count in MONOMIALS.items() if count == self.maps.shape[1])
+        return degree, torch.cat([identity_map(degree)[None], self.maps])
 
     def node(self, index: int) -> Tensor:
         """Offsets of one recording. [M,C] float32"""

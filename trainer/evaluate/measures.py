@@ -56,6 +56,7 @@ def evaluate_run(opened: OpenedRun, perceptual: Perceptual, texts: TextOptions) 
     paths = {name: slider_path(evaluator, pictures, perceptual) for name, pictures in contenders.items()}
     consistency = view_consistency(opened, perceptual)
     lpips = "LPIPS" if perceptual.name.startswith("lpips") else perceptual.name
+    outside: dict[str, float | None] = {whose: 255 * x for whose, x in outside_change(opened).items()}
     views = (
         "to the run's own pictures, trained on,",
         "to the one edited view held out,",
@@ -65,7 +66,7 @@ def evaluate_run(opened: OpenedRun, perceptual: Perceptual, texts: TextOptions) 
         *_edited_rows(curves, lpips, views[min(len(opened.setup.held_out), 2)]),
         *_path_rows(paths, lpips),
         *_consistency_rows(consistency, lpips),
-        Row("outside", "outside the region, mean change, of 255", _scale_values(outside_change(opened), 255)),
+        Row("outside", "outside the region, mean change, of 255", outside),
         *_clip_rows(opened, texts),
         *_cost_rows(opened),
     )
@@ -150,10 +151,6 @@ def _cost_rows(opened: OpenedRun) -> list[Row]:
             "memory_mb", "peak memory, MB", {SLIDER: memory}, 0, "" if memory else "report.json does not say"
         ),
     ]
-
-
-def _scale_values(values: Mapping[str, float], factor: float) -> dict[str, float | None]:
-    return {name: factor * value for name, value in values.items()}
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from progdf.field import BakedField, Candidate, FieldChoice, FieldEvaluator, choose_field, fit_keyframes
-from progdf.field.baked import MONOMIALS, GradeForm, NeuralForm, identity_map
+from progdf.field.baked import GradeForm, NeuralForm
 from progdf.field.choose import MOST_SNAPSHOTS, SAMPLES, pick_candidate
 from progdf.field.grade import COARSER, bake_grade, fit_grade, lowest_bands, mapped_bands, rank_limit
 from progdf.field.separable import moving_attributes
@@ -22,6 +22,7 @@ from progdf.gaussians import BASE_CHANNELS, Gaussians, attribute_slices
 from progdf.rasterize import alpha_weights
 from progdf.threads import one_thread
 from trainer.editors.base import ImageEditor
+from trainer.optimize.retime import select_recordings
 from trainer.options import FieldKind, FieldOptions
 from trainer.setup import TrainingSetup
 from trainer.views.choose import split_held_out
@@ -32,18 +33,6 @@ from .evaluate import Evaluator, make_evaluator
 _VIEWS = 3
 _BETTER = 0.5  # dB by which the own way has to be nearer: it takes several times the bytes
 _HALFWAY = (0.3, 0.4, 0.5, 0.6, 0.7)  # a way is judged where it comes nearest to the half
-
-
-def straight_path(trajectory: Trajectory) -> Trajectory:
-    """The two ends alone."""
-    ends = [0, len(trajectory) - 1]
-    return replace(
-        trajectory,
-        s=torch.tensor([0.0, 1.0]),
-        offsets=trajectory.offsets[ends],
-        steps=trajectory.steps[ends],
-        stage_ends=(1,),
-    )
 
 
 def choose_path(
@@ -64,7 +53,7 @@ def choose_path(
     """
     if in_parts:
         return retimed(trajectory), "as the parts move"
-    line = straight_path(trajectory)
+    line = select_recordings(trajectory, [0, len(trajectory) - 1])
     if editor is None or editor.stages:
         return line, "straight: the editor pictures the end alone"
     trajectory = retimed(trajectory)
@@ -146,9 +135,7 @@ def fit_grades(
         rows: raw values of the members before the edit, packed. [M,14+3K]
         choosing, reporting, weights, options: see `fit_field`
     """
-    assert trajectory.maps is not None
-    degree = next(d for d, count in MONOMIALS.items() if count == trajectory.maps.shape[1])
-    table = torch.cat([identity_map(degree)[None], trajectory.maps])
+    degree, table = trajectory.map_course
     mask, share = trajectory.mask, torch.ones(len(rows))
     share = share if mask is None else mask.float() / 255.0
     mapped = mapped_bands(degree, table, rows, share)

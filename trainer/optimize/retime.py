@@ -14,7 +14,7 @@ import torch
 from scipy.interpolate import CubicSpline
 from torch import Tensor
 
-from progdf.field.baked import MONOMIALS, identity_map, interpolate, interpolate_at
+from progdf.field.baked import interpolate, interpolate_at
 from progdf.field.trajectory import Trajectory
 from trainer.options import Slider
 
@@ -76,11 +76,10 @@ def smooth_course(trajectory: Trajectory) -> Trajectory:
     them, so that half as many are solved for; any other as it is. Each lies at its strength."""
     if trajectory.maps is None or len(trajectory.strengths) == 1:
         return trajectory
-    degree = next(d for d, count in MONOMIALS.items() if count == trajectory.maps.shape[1])
     known = torch.stack([trajectory.node(i) for i in range(len(trajectory))])
     places, weights = smooth_weights((0.0, *trajectory.strengths), known)
     offsets = torch.stack([torch.tensordot(row.float(), known, 1).half() for row in weights])
-    maps = torch.tensordot(weights.float(), torch.cat([identity_map(degree)[None], trajectory.maps]), 1)
+    maps = torch.tensordot(weights.float(), trajectory.map_course[1], 1)
     return replace(
         trajectory,
         s=places.float(),

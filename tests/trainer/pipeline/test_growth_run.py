@@ -22,8 +22,8 @@ from tests.helpers.growth import things, write_growth
 from tests.helpers.trained import WHITE, quick_options, small, train
 from trainer.editors import make_editor
 from trainer.evaluate.opened import SLIDER, open_run
-from trainer.fit.fit import straight_path
 from trainer.optimize.growth import fade_in, removal_costs, seed_rows
+from trainer.optimize.retime import select_recordings
 from trainer.options import EditorOptions, FitOptions, with_values
 from trainer.resolve import resolve
 from trainer.run.finish import refit
@@ -151,7 +151,7 @@ def test_a_course_of_any_recordings_keeps_both_ends_to_the_bit() -> None:
     s = torch.tensor([0.0, *torch.rand(7, generator=draw).sort().values.tolist(), 1.0])
     given = Trajectory(s, offsets.half(), offsets[-1], torch.arange(9), (8,), (1.0,), added=added)
     stages = replace(given, stage_ends=(4, 8), strengths=(0.5, 1.0))
-    for trajectory in (given, stages, straight_path(given)):
+    for trajectory in (given, stages, select_recordings(given, [0, len(given) - 1])):
         laid = fade_in(trajectory)
         assert torch.equal(laid.at(1.0), trajectory.end)
         assert not bool(laid.at(0.0).any())
