@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import torch
-
 from progdf.field import FieldEvaluator
 from trainer.fit.fit import visibility
 from trainer.run.finish import load_evaluator
@@ -32,7 +30,7 @@ def recorded_edit(root: Path) -> KnownEdit:
         load_evaluator(run.folder, setup, views, trajectory).counted_pixels
         for views in (few, choosing[:JUDGED], reporting[:JUDGED])
     )
-    offsets = torch.stack([trajectory.node(i) for i in range(len(trajectory))])
+    offsets = trajectory.nodes
     return KnownEdit(
         f"{run.region.name} (recorded)",
         run.scene,

@@ -39,7 +39,7 @@ def fit_variant(
 ) -> tuple[BakedField, Mapping[float, float]]:
     """The variant's field, and where on its slider it was shown which of the editor's strengths."""
     if variant.linear:
-        offsets = torch.stack([trajectory.node(i) for i in range(len(trajectory))])
+        offsets = trajectory.nodes
         return fit_keyframes(trajectory.s, offsets, 2), {}
     evaluator, seen = shared.evaluators(trajectory.offsets)
     remap, (choosing, reporting) = identity_remap(), evaluator.halves()

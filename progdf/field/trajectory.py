@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -70,6 +71,11 @@ class Trajectory:
     def node(self, index: int) -> Tensor:
         """Offsets of one recording. [M,C] float32"""
         return self.end if index == len(self) - 1 else self.offsets[index].float()
+
+    @cached_property
+    def nodes(self) -> Tensor:
+        """Offsets of all recordings. [S,M,C] float32"""
+        return torch.stack([self.node(i) for i in range(len(self))])
 
 
 def save_trajectory(

@@ -108,7 +108,7 @@ def fit_field(
     assert options.field != "neural"
     choice = choose_field(
         trajectory.s,
-        _recorded_offsets(trajectory),
+        trajectory.nodes,
         seen.counted_pixels,
         weights,
         "separable" if options.field == "auto" else options.field,
@@ -139,9 +139,7 @@ def fit_grades(
     mask, share = trajectory.mask, torch.ones(len(rows))
     share = share if mask is None else mask.float() / 255.0
     mapped = mapped_bands(degree, table, rows, share)
-    course = (
-        lowest_bands(_recorded_offsets(trajectory), trajectory.bands) - mapped[:, :, : 3 * trajectory.bands]
-    )
+    course = lowest_bands(trajectory.nodes, trajectory.bands) - mapped[:, :, : 3 * trajectory.bands]
     evaluator = field_evaluator(trajectory, choosing, options.target_psnr)
     tried, serving, smallest = list[Candidate](), 0, math.inf
 
@@ -170,7 +168,7 @@ def field_evaluator(trajectory: Trajectory, views: Evaluator, target: float | No
     which there are some; or a target in dB."""
     known = [(s, strength) for s, strength in trajectory.stage_strengths if strength in views.edited]
     edited = {s: views.count(views.edited[strength]) for s, strength in known}
-    offsets, render = _recorded_offsets(trajectory), views.counted_pixels
+    offsets, render = trajectory.nodes, views.counted_pixels
     if target is None:
         return FieldEvaluator(trajectory.s, offsets, render, edited=edited)
     return FieldEvaluator(trajectory.s, offsets, render, target=target)
@@ -178,7 +176,7 @@ def field_evaluator(trajectory: Trajectory, views: Evaluator, target: float | No
 
 def _measure_choice(choice: FieldChoice, trajectory: Trajectory, reporting: Evaluator) -> Fitted:
     """The choice with its errors, and baselines with theirs, on views that it has not seen."""
-    offsets, best = _recorded_offsets(trajectory), choice.best
+    offsets, best = trajectory.nodes, choice.best
     errors = FieldEvaluator(trajectory.s, offsets, reporting.counted_pixels)
     if best.to_editor is not None:
         choice = replace(choice, why=f"{choice.why}, with it {best.to_editor:.1f} dB")
@@ -189,10 +187,6 @@ def _measure_choice(choice: FieldChoice, trajectory: Trajectory, reporting: Eval
         for count in BASELINES
     }
     return Fitted(errors.candidate(best.field, best.label), choice, baselines)
-
-
-def _recorded_offsets(trajectory: Trajectory) -> Tensor:
-    return torch.stack([trajectory.node(i) for i in range(len(trajectory))])
 
 
 def expected_looks(trajectory: Trajectory, kind: FieldKind) -> int:

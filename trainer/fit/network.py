@@ -258,7 +258,7 @@ def fit_network(
     Raises:
         ProgdfError: the edit moves nothing, or the training breaks down.
     """
-    offsets = torch.stack([trajectory.node(i) for i in range(len(trajectory))])
+    offsets = trajectory.nodes
     attributes = tuple(moving_attributes(offsets))
     if not attributes:
         raise ProgdfError("the edit moves nothing that a network could learn; use --field auto")

@@ -76,7 +76,7 @@ def smooth_course(trajectory: Trajectory) -> Trajectory:
     them, so that half as many are solved for; any other as it is. Each lies at its strength."""
     if trajectory.maps is None or len(trajectory.strengths) == 1:
         return trajectory
-    known = torch.stack([trajectory.node(i) for i in range(len(trajectory))])
+    known = trajectory.nodes
     places, weights = smooth_weights((0.0, *trajectory.strengths), known)
     offsets = torch.stack([torch.tensordot(row.float(), known, 1).half() for row in weights])
     maps = torch.tensordot(weights.float(), trajectory.map_course[1], 1)

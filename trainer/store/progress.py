@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import json
 import sys
 import time
@@ -59,6 +60,9 @@ LATER = {
 
 
 _EDITOR = ("try kinds", "edit")
+
+# glibc keeps what was freed between what was not: .8 GB after the views of 200 000 members
+_TRIM = getattr(ctypes.CDLL(None), "malloc_trim", None) if sys.platform == "linux" else None
 
 _EVERY_S = 5.0
 _FILE_EVERY_S = 0.4
@@ -170,6 +174,8 @@ class RunLog:
             yield
         finally:
             del self._running[name]
+            if _TRIM is not None:
+                _TRIM(0)
             self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begun
             if not STAGES.get(name, name):
                 self._took[name] = time.perf_counter() - begun
