@@ -14,9 +14,11 @@ import torch
 from torch import Tensor
 
 from progdf.errors import ProgdfError
+from progdf.field.baked import MONOMIALS
 from progdf.field.trajectory import Trajectory
 from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians, pack
 from progdf.io.json_values import convert_json
+from progdf.io.tensors import check_tensor
 from progdf.rasterize.engines import engine_device
 from progdf.scene.bounds import scene_sphere
 from trainer.fit.network import JointTraining, begin_joint_training, save_network
@@ -70,11 +72,12 @@ class Recordings:
     Args:
         folder: where
         shape: of the offsets
+        model: of an edit of colors, whose recordings have the map with them
     """
 
-    def __init__(self, folder: StateFolder, shape: torch.Size) -> None:
+    def __init__(self, folder: StateFolder, shape: torch.Size, model: Model | None) -> None:
         self.made: list[ParameterSnapshot] = []
-        self._folder, self._shape, self._written = folder, shape, 0
+        self._folder, self._shape, self._model, self._written = folder, shape, model, 0
 
     def add(self, snapshot: ParameterSnapshot) -> None:
         """Keep one."""
@@ -102,9 +105,10 @@ class Recordings:
 
     def _read(self, saved: Saved) -> ParameterSnapshot:
         values, offsets = convert_json(saved.values, _RecordingValues), saved.tensors["offsets"]
-        if offsets.shape != self._shape or offsets.dtype != torch.float16:
-            raise ValueError("a recording is of other members")
-        table = saved.tensors.get("table")
+        check_tensor("offsets", offsets, self._shape, torch.float16)
+        table = None if self._model is None else saved.tensors["table"]
+        if self._model is not None and table is not None:
+            check_tensor("table", table, (MONOMIALS[max(1, self._model.degree)], 3), torch.float32)
         return ParameterSnapshot(values.step, values.stage, values.ends_stage, offsets, values.means, table)
 
 
@@ -173,7 +177,7 @@ def optimize_members(
         original = torch.cat([original, pack(seeds, with_shN=scene.sh_degree > 0).to(device)])
         crops = _crops(setup, setup.train, still, engine)
         stages = [place_seeds(s, len(seeds)) for s in stages]
-    state, recordings = PgsState(original, settings.seed), Recordings(folder, original.shape)
+    state = PgsState(original, settings.seed)
     way: Way
     model: Model | None = None
     if optimization.solver == "colors":
@@ -192,6 +196,7 @@ def optimize_members(
         joint = begin_joint_training(
             options.field, optimization, setup, settings.rates, stages, crops, perceptual
         )
+    recordings = Recordings(folder, original.shape, model)
     saver = _record_way(way, sum(stage.steps for stage in stages), state, recordings, joint, folder, log)
     distances = [made.means["left"] for made in recordings.made]
     log.say(f"L1 to the finished edit: {distances[0]:.4f} at first, {distances[-1]:.4f} at the end")

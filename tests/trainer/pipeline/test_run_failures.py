@@ -13,13 +13,18 @@ import torch
 
 from progdf.__main__ import main
 from progdf.errors import ProgdfError
+from progdf.field.baked import identity_map
 from progdf.io.tensors import read_tensors, write_tensors
 from tests.helpers.full_disk import files_up_to, refuse_temporary_files
 from tests.helpers.stopped import OUT, small_run
 from tests.helpers.stopped_runs import NEVER, at_step, gone_on, saved_step, words
 from tests.helpers.trained import quick_options, train
 from trainer.optimize import pgs
+from trainer.optimize.color_solver import Model
+from trainer.optimize.pgs import ParameterSnapshot
+from trainer.run.training import Recordings
 from trainer.store.run_folder import RunFolder, lock_folder
+from trainer.store.state import StateFolder
 
 pytest_plugins = ["tests.helpers.stopped_runs"]
 pytestmark = pytest.mark.usefixtures("elsewhere")
@@ -131,6 +136,18 @@ def test_a_damaged_state_is_one_line(bear_folder: Path, part: str) -> None:
     path.write_bytes(path.read_bytes()[:100])
     with pytest.raises(ProgdfError, match=r"is damaged .*; delete .*state and train again"):
         train(replace(small_run(bear_folder), resume=True), quiet=True)
+
+
+def test_a_recording_with_a_map_of_another_degree_is_no_recording_of_the_run(tmp_path: Path) -> None:
+    offsets, no_mask = torch.zeros(3, 12), torch.zeros(3, 0, 3)
+    models = [Model(degree, 1.0, no_mask, None, 0.1, 1.0, ()) for degree in (1, 2)]
+    made = ParameterSnapshot(4, 0, True, offsets, {"left": 0.5}, identity_map(1))
+    before, after = (Recordings(StateFolder(tmp_path), offsets.shape, model) for model in models)
+    before.add(made)
+    saved = before.capture_state()
+    before.restore(saved)
+    with pytest.raises(ValueError, match=r"table is \[4, 3\] float32, expected \[10, 3\] float32"):
+        after.restore(saved)
 
 
 @pytest.mark.parametrize(
