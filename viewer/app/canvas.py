@@ -92,12 +92,14 @@ class Canvas:
         now: float,
         focus: int | None = None,
         pointed: Pointed | None = None,
+        live: bool = False,
     ) -> None:
         """Show `view` in the lower left `size` pixels of `screen`.
 
         Args:
             focus: the layer whose painted weights are shown while the brush is out, or None
             pointed: what the panel is asked about
+            live: an edit that is being made is on top, and is what one looks at
             dragging: the mouse holds something, so that more will follow
             now: seconds on the main view's clock
 
@@ -112,7 +114,8 @@ class Canvas:
         mode = "off" if view.compare.mode == "difference" else view.dynamic_resolution
         before = self._resolution
         self._resolution = dynamic_resolution.before_draw(before, mode, dragging, turned, slid, now)
-        self.comparer.engine.highlight = highlight.requested_highlight(view, focus, pointed, self._sliding)
+        looks = self._sliding or live
+        self.comparer.engine.highlight = highlight.requested_highlight(view, focus, pointed, looks)
         target = aim, edits, self.comparer.engine.highlight
         has_picture, self._begun = self.pictures_drawn or self._follows, None
         if mode != "off" and has_picture and dynamic_resolution.takes_long(before, self._resolution):

@@ -266,7 +266,8 @@ class MainView:
         view, area = self._displayed_view(), self._pointer().size
         self.canvas.comparer.sides = compare_sides(self.work.snapshots, view)
         pointed = self.work.pointed if view.panel else None
-        self.canvas.draw(view, screen, area, self._is_held(), self._clock, self.work.focus, pointed)
+        held, live = self._is_held(), bool(self.live)
+        self.canvas.draw(view, screen, area, held, self._clock, self.work.focus, pointed, live)
         if self.canvas.pixels == 1 and not self._is_held():
             self._pointer().look_ahead()
 
@@ -430,7 +431,8 @@ class MainView:
             return sides.right
         for layer in self.live:
             view = add_layer(view, layer.gdf, layer.name, layer.strength)
-        if self.live:  # is what one looks at: of the selection a trace is left
+        moved = self.work.form_open or self.gizmo is not None  # by a form or handles, not trained behind it
+        if self.live and moved and self._tool.gesture is None:
             view = replace(view, select=replace(view.select, tool=""))
         return view
 

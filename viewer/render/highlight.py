@@ -52,18 +52,18 @@ def requested_highlight(
     view: ViewState,
     focus: int | None,
     pointed: Pointed | None = None,
-    sliding: bool = False,
+    looks: bool = False,
 ) -> Highlight | None:
     """What `view` shows: what the panel is asked about, weights while the brush is out, or the selection,
     with the regions that are shown.
 
     Not in a comparison, and no weights of a hidden layer. A selection is a trace while no tool selects, and
-    none where the panel is hidden or the edits move. What is hidden is the engine's to know.
+    none where the panel is hidden or one looks at the edits. What is hidden is the engine's to know.
 
     Args:
         focus: the focused layer, an index into `view.layers`, or None
         pointed: what the mouse rests on in the panel
-        sliding: edits are being moved, and are what one looks at
+        looks: edits are being moved or made, and are what one looks at
     """
     if view.compare.mode != "off":
         return None
@@ -81,7 +81,7 @@ def requested_highlight(
         if region.visible or (kind, index) == ("region", i)
     ]
     strong = bool(view.select.tool) or kind == "selection"
-    if state.count and (strong or (view.panel and not sliding)):
+    if state.count and (strong or (view.panel and not looks)):
         tinted.append((state.members, SELECTED, TINT if strong else TRACE))
     return Highlight(tinted=tuple(tinted)) if tinted else None
 

@@ -465,7 +465,8 @@ def requested_actions(keys: Keys) -> list[str]:
 
 def is_repeating(keys: Keys) -> bool:
     """Whether a key that repeats is held: what it does is not over yet."""
-    return any(key.repeats and chord.rpartition("+")[2] in keys.held for chord, key in KEYS.items())
+    held = keys.held
+    return bool(held) and any(key.repeats and chord.rpartition("+")[2] in held for chord, key in KEYS.items())
 
 
 def modifier() -> str:

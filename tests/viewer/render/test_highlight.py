@@ -13,13 +13,13 @@ import torch
 from progdf.gaussians import Gaussians
 from progdf.sh import C0
 from tests.helpers.stacks import Stack
-from tests.helpers.ui_rig import HEAD, TRACK, bear, first_view, rig
+from tests.helpers.ui_rig import HEAD, TRACK, Rig, bear, first_view, rig
 from viewer.render import highlight
 from viewer.render.engine import ViewEngine
 from viewer.render.highlight import Highlight
 from viewer.state import paint, selection
 from viewer.state.selection import SelectionState
-from viewer.state.view_state import Brush, Comparison, SelectTool, ViewState
+from viewer.state.view_state import Brush, Comparison, LayerState, SelectTool, ViewState
 
 SIZE = (160, 120)
 SCARF = 0
@@ -166,7 +166,7 @@ def test_the_selection_is_tinted_while_a_tool_selects_and_a_trace_without_one(
     still = replace(view(0.6), selection=chosen)
     trace = Highlight(tinted=((chosen.members, highlight.SELECTED, highlight.TRACE),))
     assert highlight.requested_highlight(still, 0) == trace
-    assert highlight.requested_highlight(still, 0, sliding=True) is None
+    assert highlight.requested_highlight(still, 0, looks=True) is None
     assert highlight.requested_highlight(replace(still, panel=False), 0) is None
     tinted = highlight.requested_highlight(replace(still, select=SelectTool("lasso")), 0)
     assert tinted == Highlight(tinted=((chosen.members, highlight.SELECTED, highlight.TINT),))
@@ -180,6 +180,30 @@ def test_the_selection_is_tinted_while_a_tool_selects_and_a_trace_without_one(
     engine.highlight = None
     assert np.abs(shown(engine, still, ctx) - found).max() > 0.1
     engine.release()
+
+
+@pytest.mark.gl
+def test_the_selection_steps_aside_for_the_colors_of_what_is_being_made(hand: Rig) -> None:
+    main_view, everything = hand.main_view, np.ones(len(bear().scene), bool)
+    view = replace(main_view.work.view, selection=selection.select(SelectionState(), everything))
+
+    def is_tinted(tool: str, form_open: bool = True) -> bool:
+        work = replace(main_view.work, view=replace(view, select=SelectTool(tool)), form_open=form_open)
+        main_view.work = work
+        hand.frame(2)
+        return main_view.engine.highlight is not None
+
+    assert is_tinted("")
+    main_view.live = (LayerState(0, "what the form says", 1.0),)
+    assert not is_tinted("")
+    assert not is_tinted("lasso"), "it is the form that changes the picture"
+    hand.move(300.0, 300.0)
+    hand.press()
+    hand.settle()
+    assert main_view.engine.highlight is not None, "one sees what one selects"
+    hand.release()
+    assert is_tinted("lasso", form_open=False), "of a training behind it too"
+    assert not is_tinted("", form_open=False)
 
 
 def test_regions_that_are_shown_have_their_own_colors_and_the_selection_lies_over_them() -> None:
