@@ -131,7 +131,9 @@ def measure_turning(
         full = _turn(mice, steps)
         for mouse in mice.values():
             mouse.main_view.change(replace(mouse.main_view.work.view, dynamic_resolution="on"))
-            mouse.wait_pyramid()
+            mouse.grip_picture()
+            mouse.learn_detail()
+            mouse.release()
         coarse = _turn(mice, steps)
         for way, mouse in mice.items():
             wrong = sum(not np.array_equal(image, _draw_anew(mouse, view)) for view, image in full[way].kept)

@@ -98,11 +98,22 @@ class Mouse:
             self.frame(seconds=_POLL_S, event=False)
 
     def wait_pyramid(self) -> Pyramid | None:
-        """What moving pictures are drawn of, once it is built; None where OpenGL draws all."""
-        if not isinstance(self.engine.renderer, CpuRenderer):
+        """What moving pictures are drawn of, once it is built; None where OpenGL has drawn none yet."""
+        renderer = self.engine.renderer
+        if isinstance(renderer, CpuRenderer):
+            live = renderer._scene
+        elif renderer._moving is None:
             return None
-        live = self.engine.renderer._scene
+        else:
+            live = renderer._moving[0]
         return (live._pyramid or live.begin_pyramid()).result()
+
+    def learn_detail(self) -> None:
+        """Turn the picture and let the hand rest on it, which tells how fine is fine enough."""
+        for _ in range(2):  # OpenGL begins its pyramid with the first picture in motion
+            self.turn(1.0)
+            self.wait_pyramid()
+        self.wait_sharp()
 
     def settle(self) -> None:
         """Frames until nothing is left to draw at once."""

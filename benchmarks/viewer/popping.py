@@ -23,8 +23,7 @@ from progdf.scene.bounds import near_plane
 from progdf.threads import one_thread
 from viewer.camera.view_camera import ViewCamera, add_scaled, axes, bounds_of, eye, first_camera, to_camera
 from viewer.render.cpu_renderer import CpuRenderer
-from viewer.render.dynamic_resolution import BUDGETS, COARSE
-from viewer.render.engine import drawn_size
+from viewer.render.dynamic_resolution import BUDGETS, COARSE, drawn_size
 
 from .scenes import copies, scenes_of
 

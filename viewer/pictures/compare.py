@@ -20,8 +20,8 @@ from progdf.camera import Camera
 from progdf.metrics.image import psnr
 from viewer.camera.view_camera import half_camera, to_camera
 from viewer.gl.present import Presenter
-from viewer.render.dynamic_resolution import FrameTimings
-from viewer.render.engine import ViewEngine, drawn_size
+from viewer.render.dynamic_resolution import FrameTimings, drawn_size
+from viewer.render.engine import ViewEngine
 from viewer.render.gl_renderer import Image
 from viewer.state.snapshots import SnapshotSides
 from viewer.state.view_state import Comparison, ViewState

@@ -22,7 +22,7 @@ from progdf.threads import stopped_by
 from viewer.camera.view_camera import Vec3
 from viewer.gl.present import ScreenCopy
 
-from .dynamic_resolution import LiveScene
+from .dynamic_resolution import LiveScene, Shown
 from .gl_renderer import Image, Size, require_picture
 from .ground_grid import CLEAR, Lines
 
@@ -37,33 +37,15 @@ class _Kept:
 
     image: Image
     through: Image
-    camera: Camera
-    background: Vec3
-    pixels: int  # of the picture in full that one of its pixels covers, each way
-
-    def shows(self, camera: Camera, background: Vec3, pixels: int = 1) -> bool:
-        """Whether it is what a camera sees; as a coarse picture where it is drawn with more `pixels`."""
-        mine = self.camera.resize(camera.width, camera.height) if pixels > 1 else self.camera
-        return (
-            (pixels, background) == (self.pixels, self.background)
-            and (camera.width, camera.height) == (mine.width, mine.height)
-            and torch.equal(camera.viewmat, mine.viewmat)
-            and torch.allclose(camera.K, mine.K, rtol=0.01 * (pixels - 1), atol=0.0)
-        )
+    shown: Shown
 
 
 class _Begun:
-    """A picture that is being made by another thread, band by band.
+    """A picture that is being made by another thread, band by band."""
 
-    Args:
-        gaussians: what it shows
-        camera, background: how
-    """
-
-    def __init__(self, gaussians: ActivatedGaussians, camera: Camera, background: Vec3) -> None:
-        size, self.stop = (camera.height, camera.width), threading.Event()
-        image, through = np.empty((*size, 3), np.float32), np.empty(size, np.float32)
-        self.picture = _Kept(image, through, camera, background, 1)
+    def __init__(self, gaussians: ActivatedGaussians, shown: Shown) -> None:
+        size, self.stop = (shown.camera.height, shown.camera.width), threading.Event()
+        self.picture = _Kept(np.empty((*size, 3), np.float32), np.empty(size, np.float32), shown)
         self.bands: list[tuple[int, int]] = []  # that are done: first row, and one past the last
         self.drawn = _worker().submit(self._draw, gaussians)
 
@@ -74,7 +56,7 @@ class _Begun:
         bands = [(height * k // count, height * (k + 1) // count) for k in range(count)]
         with stopped_by(self.stop):
             for top, end in sorted(bands, key=lambda band: abs(sum(band) - height)):  # the middle first
-                part = _draw(gaussians, self.picture.camera, self.picture.background, (0, top, width, end))
+                part = _draw(gaussians, self.picture.shown, (0, top, width, end))
                 self.picture.image[top:end], self.picture.through[top:end] = part
                 self.bands.append((top, end))
         return 1e3 * (time.perf_counter() - began)
@@ -124,25 +106,27 @@ class CpuRenderer:
     def draw(self, camera: Camera, background: Vec3, order: NDArray[np.uint32], pixels: int = 1) -> None:
         """Make the picture; `order` is not used, the rasterizer sorts by itself. With more `pixels` than one
         it has fewer Gaussians."""
-        begun, last, self.begun_ms, picture = self._begun, self._kept, 0.0, None
+        begun, self.begun_ms, picture = self._begun, 0.0, None
+        shown = Shown(camera, background, pixels)
         if pixels > 1:
-            picture = self._scene.draw_fewer(lambda fewer: _draw(fewer, camera, background), camera, pixels)
-        elif begun is not None and begun.picture.shows(camera, background):
+            picture = self._scene.draw_fewer(lambda fewer: _draw(fewer, shown), camera, pixels)
+        elif begun is not None and begun.picture.shown == shown:
             self.begun_ms = begun.drawn.result()
             picture = begun.picture.image, begun.picture.through
-        picture = picture or _draw(self._scene.drawn, camera, background)
-        if pixels == 1 and last is not None and self._stands_for(camera, background):
-            self._scene.measure(_error(last.image, picture[0]))
+        picture = picture or _draw(self._scene.drawn, shown)
+        if (coarse := self._coarse(shown)) is not None:
+            self._scene.measure(coarse.image, picture[0])
         self._drop()
-        self._kept, self._stale, self._changed = _Kept(*picture, camera, background, pixels), True, False
+        self._kept, self._stale, self._changed = _Kept(*picture, shown), True, False
 
     def prepare(self, camera: Camera, background: Vec3) -> bool:
         """See `GlRenderer.prepare`."""
-        if self._kept is not None and not self._changed and self._kept.shows(camera, background):
+        shown, kept = Shown(camera, background), None if self._changed else self._kept
+        if kept is not None and kept.shown == shown:
             return True
-        if self._begun is None or not self._begun.picture.shows(camera, background):
+        if self._begun is None or self._begun.picture.shown != shown:
             self._drop()
-            self._begun = _Begun(self._scene.drawn, camera, background)
+            self._begun = _Begun(self._scene.drawn, shown)
         return self._begun.drawn.done()
 
     def _drop(self) -> None:
@@ -180,7 +164,7 @@ class CpuRenderer:
         while begun is not None and self.has_parts:
             top, end = begun.bands[self._bands]
             image, through = begun.picture.image[top:end], begun.picture.through[top:end]
-            here = lines * ([picture.pixels] * 4 + [1] * 10) - ([0, top] * 2 + [0] * 10)
+            here = lines * ([picture.shown.pixels] * 4 + [1] * 10) - ([0, top] * 2 + [0] * 10)
             with lines_behind(image, through, here.astype(np.float32), CLEAR):
                 self._copy.write(image, top)
             self._bands += 1
@@ -192,12 +176,12 @@ class CpuRenderer:
         begun = self._begun
         if begun is None or len(begun.bands) <= self._bands:
             return False
-        return self._stands_for(begun.picture.camera, begun.picture.background)
+        return self._coarse(begun.picture.shown) is not None
 
-    def _stands_for(self, camera: Camera, background: Vec3) -> bool:
-        """Whether the last picture is a coarse one of what a camera sees."""
-        kept = None if self._changed else self._kept
-        return kept is not None and kept.pixels > 1 and kept.shows(camera, background, kept.pixels)
+    def _coarse(self, full: Shown) -> _Kept | None:
+        """The last picture, if that is `full` in fewer pixels."""
+        kept = self._kept
+        return None if kept is None or self._changed or not kept.shown.is_coarse(full) else kept
 
     def release(self) -> None:
         """Give back what it holds."""
@@ -206,20 +190,11 @@ class CpuRenderer:
             self._copy.release()
 
 
-def _draw(
-    gaussians: ActivatedGaussians, camera: Camera, background: Vec3, crop: Crop | None = None
-) -> tuple[Image, Image]:
+def _draw(gaussians: ActivatedGaussians, shown: Shown, crop: Crop | None = None) -> tuple[Image, Image]:
     """The picture and what shines through it."""
     with torch.no_grad():
-        rendered = render(gaussians, camera, background, crop=crop)
+        rendered = render(gaussians, shown.camera, shown.background, crop=crop)
     return rendered.image.numpy(), rendered.transmittance.numpy()
-
-
-def _error(coarse: Image, full: Image) -> float:
-    """Mean squared difference on the screen, of every eighth row."""
-    screen = np.empty((*full.shape[:2], 4), np.uint8)
-    fill_screen(coarse, screen)
-    return float(np.square(screen[::-8, :, :3] / np.float32(255.0) - full[::8].clip(0.0, 1.0)).mean())
 
 
 @cache

@@ -18,7 +18,9 @@ from progdf.camera import Camera
 from progdf.gaussians import Gaussians
 from progdf.rasterize import ActivatedGaussians
 from progdf.rasterize.cpu.pyramid import Pyramid
+from progdf.rasterize.screen import fill_screen
 from progdf.sh import C0
+from viewer.camera.view_camera import Vec3
 from viewer.gl.scene_textures import SPLATS_PER_ROW, row_runs
 
 from .highlight import HIDDEN
@@ -59,6 +61,11 @@ JUMP_MS = 100.0
 
 COARSE = 2
 """How many pixels of the window one pixel of a coarse picture covers, each way."""
+
+
+def drawn_size(size: tuple[int, int], pixels: int) -> tuple[int, int]:
+    """Width and height of a picture of which each pixel fills `pixels` of `size`, each way."""
+    return -(-size[0] // pixels), -(-size[1] // pixels)
 
 
 @dataclass(frozen=True)
@@ -148,6 +155,31 @@ class FrameTimings:
         return self.compose_ms + self.upload_ms + self.sort_ms + self.draw_ms
 
 
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """What a picture shows of a scene."""
+
+    camera: Camera
+    background: Vec3
+    pixels: int = 1  # of the picture in full that one of its pixels covers, each way
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Shown) and self.pixels == other.pixels and self._has(other)
+
+    def is_coarse(self, full: Shown) -> bool:
+        """Whether it is `full`, in fewer pixels."""
+        return self.pixels > full.pixels and self._has(full)
+
+    def _has(self, full: Shown) -> bool:
+        mine, pixels = self.camera.resize(full.camera.width, full.camera.height), self.pixels // full.pixels
+        return (
+            (self.background, self.camera.width, self.camera.height)
+            == (full.background, *drawn_size((mine.width, mine.height), pixels))
+            and torch.equal(full.camera.viewmat, mine.viewmat)
+            and torch.allclose(full.camera.K, mine.K, rtol=0.01 * (pixels - 1), atol=0.0)
+        )
+
+
 class LiveScene:
     """The scene as it is drawn, activated, under its highlights; and a pyramid over it for what moves.
 
@@ -229,10 +261,13 @@ class LiveScene:
         self._finest = min(max(finest, FINE[0]), self._enough)
         return picture
 
-    def measure(self, error: float) -> None:
-        """Learn what a node may lose here. error: of the last picture in motion, mean squared"""
+    def measure(self, moving: Array, full: Array) -> None:
+        """Learn what a node may lose here, of the last picture in motion and of the same in full. [H,W,3]"""
+        screen = np.empty((*full.shape[:2], 4), np.uint8)
+        fill_screen(moving, screen)
+        off = screen[::-8, :, :3] / np.float32(255.0) - full[::8].clip(0.0, 1.0)
         # it grows with the limit's power of .6 to 1.5 (docs/experiments.md, The viewer)
-        enough = self._limit * (FINE_ERROR / max(error, 1e-9)) ** (1 / 1.5)
+        enough = self._limit * (FINE_ERROR / max(float(np.square(off).mean()), 1e-9)) ** (1 / 1.5)
         self._enough = min(max(enough, FINE[0]), FINE[2]) if self._limit else self._enough
 
     def _write(self, scene: Gaussians, name: str, part: slice) -> None:

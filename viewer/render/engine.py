@@ -27,7 +27,7 @@ from viewer.state.paint import layer_of
 from viewer.state.view_state import ViewState
 
 from .cpu_renderer import CpuRenderer
-from .dynamic_resolution import FrameTimings
+from .dynamic_resolution import FrameTimings, Shown, drawn_size
 from .gl_renderer import GlRenderer, Image, back_to_front, is_software
 from .ground_grid import GroundPlane, Lines, grid_lines, ground_plane
 from .highlight import Highlight, highlight_colors
@@ -48,11 +48,8 @@ class _Picture:
     """What decides the picture."""
 
     edits: _Edits
-    background: tuple[float, float, float]
-    viewmat: bytes
-    K: bytes
-    size: tuple[int, int]
-    highlight: Highlight | None = None
+    shown: Shown
+    highlight: Highlight | None
 
 
 class ViewEngine:
@@ -105,8 +102,8 @@ class ViewEngine:
 
     def needs_draw(self, view: ViewState, size: tuple[int, int], camera: Camera | None = None) -> bool:
         """Whether `view` at `size` (width, height in pixels) is another picture than the last one."""
-        target = self._describe_picture(view, camera or to_camera(view.camera, *size))
-        return replace(target, highlight=_with_hidden(self.highlight, view)) != self._picture
+        shown = Shown(camera or to_camera(view.camera, *size), view.background)
+        return _Picture(_edits(view), shown, _with_hidden(self.highlight, view)) != self._picture
 
     def draw(
         self,
@@ -187,38 +184,29 @@ class ViewEngine:
         """The grid on the ground in the picture, the same object as long as it is the same."""
         if not view.grid:
             return None
-        up, size = view.camera.up, (camera.width, camera.height)
+        up = view.camera.up
         if self._ground is None or self._ground[0] != up:
             self._ground = up, ground_plane(self.scene, up)
-        seen = up, camera.viewmat.numpy().tobytes(), camera.K.numpy().tobytes(), size, view.background
+        seen = up, Shown(camera, view.background)
         if self._grid is None or self._grid[0] != seen:
             self._grid = seen, grid_lines(self._ground[1], camera, view.background)
         return self._grid[1]
-
-    def _describe_picture(self, view: ViewState, camera: Camera) -> _Picture:
-        return _Picture(
-            _edits(view),
-            view.background,
-            camera.viewmat.numpy().tobytes(),
-            camera.K.numpy().tobytes(),
-            (camera.width, camera.height),
-        )
 
     def _update_picture(
         self, view: ViewState, camera: Camera, highlight: Highlight | None = None, pixels: int = 1
     ) -> FrameTimings:
         """Do what lies between the last picture and this one."""
         highlight = _with_hidden(highlight, view)
-        target = replace(self._describe_picture(view, camera), highlight=highlight)
+        target = _Picture(_edits(view), Shown(camera, view.background), highlight)
         if target == self._picture:
             return FrameTimings(drawn=self.timings.drawn)
         compose_ms, upload_ms, changed = self._compose(target.edits)
         highlight_ms = self._apply_highlight(highlight)
         started = time.perf_counter()
-        camera = replace(camera, near=self.near)
-        if self.renderer.wants_order and pixels == 1 and self._ordered_for != target.viewmat:
+        camera, viewmat = replace(camera, near=self.near), camera.viewmat.numpy().tobytes()
+        if self.renderer.wants_order and pixels == 1 and self._ordered_for != viewmat:
             self.order = back_to_front(self.composer.gaussians.means.numpy(), camera)
-            self._ordered_for = target.viewmat
+            self._ordered_for = viewmat
         sorted_at = time.perf_counter()
         self.renderer.draw(camera, view.background, self.order, pixels)
         drawn_at = time.perf_counter()
@@ -274,11 +262,6 @@ class ViewEngine:
 def draws_with(ctx: moderngl.Context | None, draw: str) -> str:
     """What "auto" is in a context: "gl" where OpenGL has hardware behind it, else "cpu"."""
     return draw if draw != "auto" else "cpu" if ctx is None or is_software(ctx) else "gl"
-
-
-def drawn_size(size: tuple[int, int], pixels: int) -> tuple[int, int]:
-    """Width and height of a picture of which each pixel fills `pixels` of `size`, each way."""
-    return -(-size[0] // pixels), -(-size[1] // pixels)
 
 
 def _with_hidden(highlight: Highlight | None, view: ViewState) -> Highlight | None:

@@ -20,7 +20,7 @@ from viewer.camera.view_camera import Vec3
 from viewer.gl.present import Presenter
 from viewer.gl.splats import GridPass, SplatRenderer
 
-from .dynamic_resolution import LiveScene
+from .dynamic_resolution import LiveScene, Shown
 from .ground_grid import Lines
 
 Image = NDArray[np.float32]
@@ -50,18 +50,19 @@ class GlRenderer:
         self._moving: tuple[LiveScene, SplatRenderer] | None = None  # what is drawn while something moves
         self._presenter = Presenter(ctx)
         self._picture: moderngl.Texture | None = None
+        self._shown: Shown | None = None  # by it, unless Gaussians have changed since
         self._grid: GridPass | None = None
 
     def upload(self, scene: Gaussians) -> None:
         """Take a whole scene."""
-        self._scene = scene
+        self._scene, self._shown = scene, None
         self._release_moving()
         self._renderer.upload(scene)
         self._ctx.finish()
 
     def update(self, scene: Gaussians, attributes: Iterable[str], rows: NDArray[np.int64]) -> None:
         """Take the changed attributes of the changed rows (sorted)."""
-        self._scene, names = scene, tuple(attributes)
+        self._scene, self._shown, names = scene, None, tuple(attributes)
         self._renderer.update(scene, names, rows)
         if self._moving is not None:
             self._moving[0].update(scene, names, rows)
@@ -74,6 +75,7 @@ class GlRenderer:
             highlights: rgb and the share that it takes of a Gaussian's color, 0..255; 0 takes none, 255
                 hides the Gaussian. [R,4]
         """
+        self._shown = None
         self._renderer.highlight(rows, highlights)
         if self._moving is not None:
             self._moving[0].highlight(rows, highlights)
@@ -85,13 +87,16 @@ class GlRenderer:
             order: farthest first, from `back_to_front`
             pixels: of the picture at rest that one of this one stands for, each way
         """
+        last, self._shown = self._shown, Shown(camera, background, pixels)
+        coarse = self.pixels() if last is not None and last.is_coarse(self._shown) else None
         self._picture = self._draw_fewer(camera, background, pixels) if pixels > 1 else None
         if self._picture is None:
-            self._renderer.set_order(
-                order if pixels == 1 else back_to_front(self._scene.means.numpy(), camera)
-            )
+            order = order if pixels == 1 else back_to_front(self._scene.means.numpy(), camera)
+            self._renderer.set_order(order)
             self._picture = self._renderer.draw(camera, background)
         self._ctx.finish()
+        if coarse is not None and self._moving is not None:
+            self._moving[0].measure(coarse, self.pixels())
 
     def _draw_fewer(self, camera: Camera, background: Vec3, pixels: int) -> moderngl.Texture | None:
         if self._moving is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import moderngl
@@ -192,17 +193,53 @@ def test_a_small_picture_of_a_large_scene_leaves_the_one_in_full_as_it_is(stack:
 def test_what_is_enough_is_measured_where_a_picture_in_full_follows_one_in_motion() -> None:
     scene = bear(6000).gaussians
     live, camera = dynamic_resolution.LiveScene(scene), to_camera(first_camera(scene), *SIZE)
-    live.measure(1.0)
+    full = np.full((SIZE[1], SIZE[0], 3), 0.5, np.float32)
+
+    def measure(share: float) -> None:
+        """The picture in motion has so many times the error that it may have."""
+        error = np.float32(math.sqrt(share * dynamic_resolution.FINE_ERROR))
+        live.measure(full[::2, ::2] + error, full)
+
+    measure(10.0)
     assert live._enough == dynamic_resolution.FINE[1], "there is no pyramid yet"
     live.begin_pyramid().result()
     live.draw_fewer(lambda fewer: None, camera, 2)
     for share in (8.0, 0.5):
-        live.measure(share * dynamic_resolution.FINE_ERROR)
-        assert live._enough == pytest.approx(live._limit / share ** (1 / 1.5))
-    live.measure(0.0)
+        measure(share)
+        assert live._enough == pytest.approx(live._limit / share ** (1 / 1.5), rel=0.1), "of bytes"
+    measure(0.0)
     assert live._enough == dynamic_resolution.FINE[2]
-    full = np.full((40, 60, 3), 0.5, np.float32)
-    assert cpu_renderer._error(full[::2, ::2] + np.float32(0.2), full) == pytest.approx(0.04, rel=0.05)
+
+
+@pytest.mark.gl
+@pytest.mark.parametrize("draw", ["cpu", "gl"])
+def test_only_the_same_view_in_full_tells_how_good_a_moving_picture_was(
+    ctx: moderngl.Context, stack: Stack, draw: str
+) -> None:
+    engine, view = ViewEngine(ctx, stack.scene, stack.gdfs, draw), view_of(stack, 0.1, 0.6)
+    turned = replace(view, camera=replace(view.camera, azimuth=view.camera.azimuth + 30.0))
+    slid, black = view_of(stack, 0.9, 0.6), replace(view, background=(0.0, 0.0, 0.0))
+    framebuffer, first = ctx.simple_framebuffer(SIZE), dynamic_resolution.FINE[1]
+
+    def rest(moving: ViewState, rested: ViewState, grown: int = 0) -> float:
+        engine.draw(moving, framebuffer, SIZE, pixels=2)
+        dynamic_resolution._worker().submit(int).result()  # now there is a pyramid
+        engine.draw(replace(moving, background=(0.5, 0.5, 0.5)), framebuffer, SIZE, pixels=2)
+        engine.draw(moving, framebuffer, SIZE, pixels=2)
+        engine.draw(rested, framebuffer, (SIZE[0] + grown, SIZE[1]))
+        live = (
+            engine.renderer._scene if isinstance(engine.renderer, CpuRenderer) else engine.renderer._moving[0]
+        )
+        return live._enough
+
+    for other in (turned, slid, black):
+        assert rest(view, other) == first
+    assert rest(view, view, grown=16) == first
+    enough = rest(view, view)
+    assert enough != first
+    assert rest(turned, turned) != enough
+    framebuffer.release()
+    engine.release()
 
 
 @pytest.mark.gl

@@ -11,8 +11,15 @@ import pytest
 
 from tests.helpers.ui_rig import Rig, bear, first_view, rig
 from viewer.render import dynamic_resolution
-from viewer.render.dynamic_resolution import COARSE, REST_S, SLOW_MS, DynamicResolution, FrameTimings
-from viewer.render.engine import ViewEngine, drawn_size
+from viewer.render.dynamic_resolution import (
+    COARSE,
+    REST_S,
+    SLOW_MS,
+    DynamicResolution,
+    FrameTimings,
+    drawn_size,
+)
+from viewer.render.engine import ViewEngine
 from viewer.ui.keys import Keys, Press
 
 SLOW = FrameTimings(draw_ms=SLOW_MS + 1.0)
