@@ -50,7 +50,7 @@ from .courses import edit_of, known_edit, milliseconds, processor_milliseconds
 from .table import Table, Wall
 from .training import Point, edit_of_task, save_plot, tasks
 
-STAGES, STEPS, RANKS = 8, 12, (0, 1, 2)
+STEPS, RANKS = 12, (0, 1, 2)
 """Even strengths at most; steps of conjugate gradients of a residual at each; its ranks."""
 
 TARGETS = (40.0, 50.0, 60.0)
@@ -137,8 +137,7 @@ def color_forms(name: str, edit: Edit) -> list[Form]:
         psnrs = (judge.psnr(judge.pictures(field.offsets(s)), judge.edited[s]) for s in MEASURED)
         forms.append(Form(name, kind, label, size, tuple(psnrs), seconds))
 
-    model, _, automatic = edit.automatic(judge)
-    strengths = edit.strengths(STAGES, model.allowed_share)
+    model, strengths, _, automatic = edit.automatic(judge)
     knots = torch.tensor([0.0, *strengths])
     plain, recording = make_solver(edit.drawn, edit.original), torch.zeros(0)
     for degree, mask in [(d, mask) for mask in dict.fromkeys((None, model.mask)) for d in MONOMIALS]:
@@ -285,7 +284,7 @@ def field_table(forms: Sequence[Form]) -> Table:
         rows=tuple(rows),
         note="Bold: what a run ships. Edits of colors: PSNR to the editor's own pictures in "
         f"{REPORTING - 1} views in which nobody trained or chose; all forms but the bold one are of the "
-        f"same recording, {STEPS} steps of the residual at each of up to {STAGES} strengths, and a map costs "
+        f"same recording, {STEPS} steps of the residual at each of the run's strengths, and a map costs "
         "its numbers once for all members. The motion: PSNR to its true course, over the pixels that it "
         "changes. Seconds: to fit; of the bold grade with its solving.",
     )  # fmt: skip

@@ -26,10 +26,9 @@ from trainer.editors import make_editor
 from trainer.editors.base import ImageEditor
 from trainer.fit.evaluate import Evaluator, make_evaluator
 from trainer.fit.fit import fit_grades, visibility
-from trainer.fit.slider_uniformity import equalized_strengths
-from trainer.optimize.color_solver import (
-    STEPS as TAKEN,
-)
+from trainer.fit.slider_uniformity import equalized_strengths, strength_ruler
+from trainer.optimize.color_course import STEPS as TAKEN
+from trainer.optimize.color_course import Course, Target, solve
 from trainer.optimize.color_solver import (
     Model,
     add_bands,
@@ -37,10 +36,9 @@ from trainer.optimize.color_solver import (
     enrich,
     iterations,
     make_solver,
-    solve,
 )
 from trainer.optimize.color_views import Judge, color_views
-from trainer.optimize.pgs import PgsState, TargetStage
+from trainer.optimize.pgs import ParameterSnapshot, PgsState, TargetStage
 from trainer.optimize.retime import smooth_course
 from trainer.options import EditorOptions, FieldOptions, OptimizeOptions, ViewOptions
 from trainer.resolve import use_threads
@@ -129,10 +127,10 @@ class Edit:
         self.weights = visibility(self.scene, self.region.members, self.setup.train)
         self.solved: dict[tuple[int, int, float, int], tuple[Tensor, Tensor, float]] = {}
 
-    def strengths(self, count: int, missed: float | None = None) -> tuple[float, ...]:
-        """As a run asks for them."""
+    def strengths(self, count: int) -> tuple[float, ...]:
+        """So many, evenly visible apart."""
         plain = tuple((i + 1) / count for i in range(count))
-        return equalized_strengths(self.painter, self.editor, self.setup.views, plain, missed)
+        return equalized_strengths(self.painter, self.editor, self.setup.views, plain)
 
     def picture(self, s: float) -> list[Tensor]:
         """All views, as they are kept."""
@@ -151,36 +149,47 @@ class Edit:
         """The whole pictures of the views that choose."""
         return list(split_held_out(self.picture(s)[len(self.setup.train) :])[0])
 
-    def automatic(self, judge: Evaluator) -> tuple[Model, str, Result]:
-        """How much is modelled, all that was decided in words, and what came of it."""
-        most, drawn = (
-            iterations(OptimizeOptions().steps),
-            color_views(self._crops(self.choosing), self.original),
-        )
+    def automatic(self, judge: Evaluator) -> tuple[Model, tuple[float, ...], str, Result]:
+        """How much is modelled, at which strengths, all that was decided in words, and what came of it."""
+        most = iterations(OptimizeOptions().steps)
+        drawn = color_views(self._crops(self.choosing), self.original)
+        waited = 0.0  # for the training views' pictures, which are counted by `measure`
 
-        def choosing(s: float) -> Judge:
-            boxes = [crop(p, view.box) for p, view in zip(self.aside(s), self.choosing, strict=True)]
-            return Judge(drawn, boxes)
+        def judge_at(s: float) -> Judge:
+            pictures = [quantize_image(self.painter.edit(view, s)) for view in self.choosing]
+            return Judge(drawn, [crop(p, v.box) for p, v in zip(pictures, self.choosing, strict=True)])
+
+        def ask(strengths: Sequence[float]) -> list[Target]:
+            nonlocal waited
+            began = time.process_time()
+            targets = [TargetStage(s, self.targets(s), 1) for s in strengths]
+            waited += time.process_time() - began
+            return [(stage, judge_at(stage.strength)) for stage in targets]
 
         self.picture(1.0)
         began = time.process_time()
-        solver = make_solver(self.drawn, self.original)
-        solver, model = choose_model(solver, [(solver, choosing(1.0))], self.targets(1.0), most, 9)
-        spent = time.process_time() - began
-        strengths = self.strengths(8, model.allowed_share)
-        stages = [TargetStage(s, self.targets(s), 1) for s in strengths]
-        judges, state = [choosing(s) for s in strengths], PgsState(self.original)
-        began, middle = time.process_time(), (len(strengths) - 1) // 2
-        model = enrich(model, solver, stages[middle], judges[middle], most)
-        made = list(solve(self.original, solver, model, stages, judges, state, lambda step, left: None, most))
-        spent += time.process_time() - began
+        (finished,), solver = ask([1.0]), make_solver(self.drawn, self.original)
+        solver, model = choose_model(solver, [(solver, finished[1])], finished[0].targets, most, 9)
+        ruler = strength_ruler(self.painter, self.editor, self.setup.views)
+        half = [] if model.richer is None else [ruler[len(ruler) // 2]]
+        course, made = Course(ask(half), finished, ruler, judge_at, ask), list[ParameterSnapshot]()
+        model = enrich(model, solver, *[*course.targets, finished][0], most)
+        state = PgsState(self.original)
+        for snapshot in solve(
+            self.original, solver, model, course, made, state, lambda step, left: None, most
+        ):
+            made.append(snapshot)
+        spent = time.process_time() - began - waited
+        asked = [*(stage.strength for stage, _ in course.targets), 1.0]
+        strengths = tuple(sorted(asked))
+        made = [made[asked.index(s)] for s in strengths]
         steps = ", ".join(f"{snapshot.means.get(TAKEN, 0):.0f}" for snapshot in made)
         at = ", ".join(f"{s:g}" for s in strengths)
         tables = [snapshot.table for snapshot in made if snapshot.table is not None]
         name = f"automatic: {len(self.setup.views)} views, {len(strengths)} strengths, {model.bands} SH"
         offsets = [snapshot.offsets for snapshot in made]
         result = self.measure(name, judge, strengths, model.bands, tables, offsets, spent, model.mask)
-        return model, f"{model.line}; strengths {at} in {steps} steps", result
+        return model, strengths, f"{model.line}; strengths {at} in {steps} steps", result
 
     def sweep(
         self,
@@ -293,7 +302,7 @@ def run_regret(options: RegretOptions) -> Table:
 
     edit = edit_from(0)
     judge = edit.judge()
-    model, line, automatic = edit.automatic(judge)
+    model, _, line, automatic = edit.automatic(judge)
     print_line(line)
     results = [automatic]
     print_line(" | ".join(automatic.cells))

@@ -21,18 +21,15 @@ from progdf.field import BakedField
 from progdf.field.baked import (
     NeuralForm,
     SliderRemap,
-    find_segment,
     identity_remap,
     interpolate,
     interpolate_at,
     remap_slider,
 )
 from progdf.gaussians import BASE_CHANNELS, pack
-from progdf.metrics.image import ROUNDING
 from trainer.editors import COSTLY_STRENGTHS, check_editor
 from trainer.editors.base import ImageEditor
 from trainer.editors.procedural import edit_course
-from trainer.optimize.retime import smooth_weights
 from trainer.setup import TrainingSetup, probe_views
 from trainer.store.progress import RunLog
 from trainer.views.crops import GEOMETRY, render_all
@@ -41,6 +38,7 @@ from trainer.views.view import View
 STEPS = 20
 """Equal steps that a user makes over the whole slider."""
 
+_MARKS = 16  # of the ruler on which further strengths of a course lie
 _ASKED_VIEWS, _FIELD_VIEWS = 3, 6
 _COSTLY_STEPS = 8  # of the anchor view, where each picture costs a model's work
 _FINE = 2  # a step may begin at so many places per step
@@ -54,7 +52,6 @@ def equalized_strengths(
     spec: str,
     views: Sequence[View],
     plain: tuple[float, ...],
-    missed: float | None = None,
 ) -> tuple[float, ...]:
     """Strengths at which the editor's own pictures are as far along as `plain` says, the last 1.
 
@@ -67,9 +64,6 @@ def equalized_strengths(
         spec: what it was made of, `KIND:WHAT`
         views: of which a few are looked at
         plain: shares of the visible change, ascending, the last 1
-        missed: share of the change (mean square) that a smooth course through the pictures may miss, see
-            `smooth_course`, less where less of it is there; with it shares are halves, quarters …, as many
-            as that takes
     """
     if editor.stages or len(plain) == 1:
         return plain
@@ -89,43 +83,16 @@ def equalized_strengths(
     if max(steps) > _JUMP * sum(steps):
         return plain
     _, due = _spread(even, pictures, 1)
-    shares = plain if missed is None else _bends(even, pictures, due, missed)
-    at = interpolate(torch.tensor(shares, dtype=torch.float64), even, due)
+    at = interpolate(torch.tensor(plain, dtype=torch.float64), even, due)
     rounded = (*(round(float(s), 3) for s in at[:-1]), 1.0)
     rises = all(b - a > 5e-4 for a, b in zip((0.0, *rounded), rounded, strict=False))
     return rounded if rises else plain
 
 
-def _bends(even: Tensor, pictures: Sequence[Tensor], due: Tensor, allowed: float) -> tuple[float, ...]:
-    """Shares of the visible change at which a course is to be met for `smooth_course` to miss little between.
-
-    Args:
-        even: strengths. [n] float64
-        pictures: what is seen there
-        due: strengths at which the change is as far along as `even` says. [n]
-        allowed: share of the change that may be missed (mean square), less where less of it is there; what
-            rounding to 8 bits misses always may
-    """
-    change = pictures[-1] - pictures[0]
-    rounding = ROUNDING * int((change.abs() > 1 / 255).sum())
-    shares, rough = [0.0, 1.0], {0}
-    while rough:
-        nodes, at = interpolate(torch.tensor(shares, dtype=torch.float64), even, due), even.new_tensor(shares)
-        known = torch.stack([interpolate_at(even, pictures, x) for x in nodes.tolist()])
-        places, weights = smooth_weights(nodes.tolist(), known)
-        rough = set()
-        for s, picture, progress in zip(even.tolist(), pictures, interpolate(even, nodes, at), strict=True):
-            left = find_segment(nodes, s).right - 1
-            if left not in rough and shares[left + 1] - shares[left] > 2 / STEPS:
-                met = torch.tensordot(interpolate_at(places, weights, s).float(), known, 1)
-                most = max(rounding, allowed * _power(change) * float(progress))
-                rough |= {left} if _power(met - picture) > most else set()
-        shares = sorted([*shares, *((shares[left] + shares[left + 1]) / 2 for left in rough)])
-    return tuple(shares[1:])
-
-
-def _power(change: Tensor) -> float:
-    return float(change.double().square().sum())
+def strength_ruler(editor: ImageEditor, spec: str, views: Sequence[View]) -> tuple[float, ...]:
+    """Strengths from 0 to 1 that are evenly visible apart, 2^n + 1 of them; see `equalized_strengths`."""
+    plain = tuple((i + 1) / _MARKS for i in range(_MARKS))
+    return 0.0, *equalized_strengths(editor, spec, views, plain)
 
 
 def equalize_slider(

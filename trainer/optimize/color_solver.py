@@ -18,9 +18,8 @@ for.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -30,8 +29,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from progdf.field.baked import MONOMIALS, identity_map
-from progdf.field.choose import allowed_error
-from progdf.field.grade import band_offsets, map_colors, member_bands
+from progdf.field.grade import map_colors, member_bands
 from progdf.metrics.image import LEVEL, decibels
 from progdf.sh import C0
 from progdf.threads import one_thread
@@ -47,7 +45,7 @@ from .color_views import (
     map_views,
     mask_of_members,
 )
-from .pgs import OnStep, ParameterSnapshot, PgsState, TargetStage
+from .pgs import TargetStage
 from .ties import Ties
 
 STEPS_OF_OTHERS = 8
@@ -55,9 +53,6 @@ STEPS_OF_OTHERS = 8
 
 SETTLED = 0.001
 """Share of the error in views not solved for that a step takes away at least, for another to follow."""
-
-STEPS = "steps"
-"""Of a recording's means: the steps that it took."""
 
 BANDS = (1, 4, 9)
 """SH functions of a residual that are tried, each where the one before it was better than less."""
@@ -81,7 +76,6 @@ class Model:
     residual: Tensor  # of the finished edit: b of 0, 1, 4 or 9 functions. [M,b,3]
     mask: Tensor | None  # see `GradeForm.mask`
     error: float  # mean square, of the finished edit in views not solved for: what is finer is not chased
-    unedited: float  # the same of the original
     tried: Sequence[tuple[str, float]]  # what was tried, and its error on views not solved for, dB
     # residual and error with another band, where that is better, but by less than a twentieth
     richer: tuple[Tensor, float] | None = None
@@ -90,11 +84,6 @@ class Model:
     def bands(self) -> int:
         """How many bands the residual has."""
         return self.residual.shape[1]
-
-    @property
-    def allowed_share(self) -> float:
-        """Share of the change that strengths between may miss beside the finished edit's own, mean square."""
-        return allowed_error(self.error) / self.unedited
 
     def figures(self) -> dict[str, Any]:
         """As report.json has it."""
@@ -172,7 +161,11 @@ class Solver:
         """The map that comes nearest to these pictures, of degree 0 the identity, and what the members take
         of it. [K,3], [M,B,3]"""
         table = self.maps.solve(degree, targets) if degree else identity_map(1)
-        return table, self.share[:, None, None] * (map_colors(self.sh, table, max(1, degree)) - self.sh)
+        return table, self.map_offsets(degree, table)
+
+    def map_offsets(self, degree: int, table: Tensor) -> Tensor:
+        """What the members take of a map. [K,3] -> [M,B,3]"""
+        return self.share[:, None, None] * (map_colors(self.sh, table, max(1, degree)) - self.sh)
 
     def with_mask(self, share: Tensor) -> Solver:
         """The same with a mask. [M] 0..1"""
@@ -427,10 +420,9 @@ def choose_model(
     if few:
         chosen, residual = _solve_whole(solver, best, targets, steps, spreads)
     mask = (chosen.share * 255.0).round().to(torch.uint8) if best.masked else None
-    unedited = sum(judge.error(torch.zeros_like(solver.sh)) for judge in judges) / len(trials)
     decided = [(one.name, decibels(one.error)) for one in tried]
     richer = None if best.masked else richer
-    return chosen, Model(best.degree, best.hold, residual, mask, best.error, unedited, decided, richer)
+    return chosen, Model(best.degree, best.hold, residual, mask, best.error, decided, richer)
 
 
 def enrich(model: Model, solver: Solver, stage: TargetStage, judge: Judge, steps: int) -> Model:
@@ -514,63 +506,3 @@ def add_bands(offsets: Tensor, residual: Tensor) -> Tensor:
 def iterations(steps: int) -> int:
     """Most steps of conjugate gradients for `--steps` of one view each."""
     return max(1, round(steps / STEPS_OF_OTHERS))
-
-
-def solve(
-    original: Tensor,
-    solver: Solver,
-    model: Model,
-    stages: Sequence[TargetStage],
-    judges: Sequence[Judge],
-    state: PgsState,
-    on_step: OnStep,
-    steps: int,
-) -> Iterator[ParameterSnapshot]:
-    """Solve for the stages in turn and yield each one's end, with its map.
-
-    Args:
-        original: raw member rows, packed. [M,C]
-        solver: the views
-        model: how much is modelled
-        stages: strengths ascending
-        judges: of each stage, views that say when it is done
-        state: where to go on from, changed in place; a step is a stage
-        on_step: progress; here, and only here, the state is whole and may be saved
-        steps: most steps of conjugate gradients of a stage
-
-    Raises:
-        FloatingPointError: the loss or where it leads is not finite; the state is that of the stage before.
-    """
-    finished, last = Judge(solver.views, stages[-1].targets), None
-    for index in range(state.stage, len(stages)):
-        targets = stages[index].targets
-        table, mapped = solver.fit_map(model.degree, targets)
-        offsets = mapped
-        if model.bands:
-            start, before = torch.zeros_like(model.residual), 0.0
-            if index:
-                before = stages[index - 1].strength
-                if last is None:
-                    _, last = solver.fit_map(model.degree, stages[index - 1].targets)
-                start = (member_bands(state.moved.detach()) - last)[:, : model.bands]
-            share = (stages[index].strength - before) / (stages[-1].strength - before)
-            start = torch.lerp(start, model.residual, share)
-            told = partial(on_step, state.step, state.running)
-            residual, taken = solver.residual(
-                mapped, start, targets, steps, judges[index], model.error, model.hold, told
-            )
-            state.means.add({STEPS: taken})
-            offsets = add_bands(mapped, residual)
-        last = mapped
-        left = finished.mean(offsets, 1.0)
-        if not math.isfinite(left) or not bool(offsets.isfinite().all()):
-            raise FloatingPointError(f"the loss is {left} at step {state.step}")
-        with torch.no_grad():
-            state.moved.copy_(band_offsets(offsets, original.shape[1]))
-        state.average.copy_(state.moved.detach())
-        state.running = left
-        state.means.add({"l2": Judge(solver.views, targets).error(offsets), "left": left})
-        state.step, state.recorded = state.step + 1, state.recorded + 1
-        state.stage, state.local = index + 1, 0
-        yield ParameterSnapshot(state.step, index, True, state.average.clone(), state.means.read(), table)
-        on_step(state.step, state.running)

@@ -30,7 +30,7 @@ from trainer.views.crops import CropScene
 
 _AT_ONCE = 8  # views, whose results are there at the same time
 _SQUARES = 6  # of a view's longer side, every other one of which is in one of its halves
-_COVERED = 0.05  # the region's weight in a pixel that the map is fitted to
+_COVERED = 0.05  # the region's weight in a pixel that shows it
 _MOST_PIXELS = 250_000  # for the some twenty coefficients of the map; of more, evenly spread ones
 _CLAMP_ROUNDS = 3  # of the map's least squares, for pixels that are white or black anyway
 _MAP_RIDGE = 1e-6  # of the diagonal of a map's normal equations, for regions of few colors
@@ -68,6 +68,12 @@ class ColorView:
     def picture(self, colors: Tensor) -> Tensor:
         """Unclamped. [M,3] -> [P,3]"""
         return self.others + self.map.picture(colors.clamp_min(0.0))
+
+    @cached_property
+    def own_pixels(self) -> Tensor:
+        """Which of its pixels show the members and count. [P] bool"""
+        share = self.map.picture(torch.ones_like(self.original))[:, 0]
+        return (share > _COVERED) & self.counts[:, 0]
 
     def pick(self, image: Tensor) -> Tensor:
         """The pixels of the box. [h,w,3] -> [P,3]"""
@@ -213,10 +219,6 @@ def fit_maps(views: Sequence[ColorView], share: Tensor, most: int = _MOST_PIXELS
         most: pixels that the maps are fitted to
     """
 
-    def find_covered(view: ColorView) -> Tensor:
-        share = view.map.picture(torch.ones_like(view.original))[..., :1]
-        return ((share > _COVERED) & view.counts).flatten().nonzero()[:, 0]
-
     def lay_out(index: int) -> tuple[Tensor, Tensor, Tensor]:
         view, some = views[index], pixels[index]
         terms = monomials(view.original.T.clamp(0.0, MOST_COLOR), 3)
@@ -225,7 +227,7 @@ def fit_maps(views: Sequence[ColorView], share: Tensor, most: int = _MOST_PIXELS
         original = view.picture(view.original)[some]
         return shown[:, :20], original, (terms @ terms.T).double()
 
-    covered = map_views(find_covered, views)
+    covered = map_views(lambda view: view.own_pixels.nonzero()[:, 0], views)
     stride = max(1, -(-sum(map(len, covered)) // most))
     pixels = [some[::stride].clone() for some in covered]
     laid = map_views(lay_out, range(len(views)))
@@ -340,9 +342,9 @@ class Judge:
         return ROUNDING + self.mean(offsets, 2.0)
 
     def mean(self, offsets: Tensor, power: float) -> float:
-        """Mean difference to some power. [M,B,3]"""
+        """Mean difference to some power, of the pixels that show the members. [M,B,3]"""
         total = sum(map_views(lambda pair: pair[0].error(offsets, pair[1], power), self._pairs))
-        return total / max(1, 3 * sum(int(view.counts.sum()) for view in self.views))
+        return total / max(1, 3 * sum(int(view.own_pixels.sum()) for view in self.views))
 
 
 @one_thread()  # as those of the pool have: else who gets a view would decide on its last bits

@@ -42,11 +42,11 @@ from trainer.editors.pictures import FolderEditor, picture_cameras
 from trainer.fit.draft import draft_grade, draft_views
 from trainer.fit.fit import choose_path, drop_idle_attributes
 from trainer.fit.network import PART as NETWORK
-from trainer.fit.slider_uniformity import equalized_strengths
+from trainer.fit.slider_uniformity import equalized_strengths, strength_ruler
 from trainer.optimize.growth import fade_in
 from trainer.optimize.losses import Perceptual, describe_loss, perceptual_loss
 from trainer.optimize.retime import resolve_slider
-from trainer.options import MOST_STAGES, EditKind, OptimizeOptions, TrainOptions
+from trainer.options import EditKind, OptimizeOptions, TrainOptions
 from trainer.regions.from_pictures import CHANGED, RegionRequest, region_checks, region_kinds
 from trainer.report.agreement import measure_agreement
 from trainer.resolve import recorded_options, resolve, use_threads
@@ -73,7 +73,7 @@ from trainer.store.run_folder import (
 )
 from trainer.store.state import interrupt_on_signals
 from trainer.views.crops import only_recolors
-from trainer.views.view import BACKGROUND, fit_size, make_view, with_near_plane
+from trainer.views.view import BACKGROUND, View, fit_size, make_view, with_near_plane
 
 from .agree import AgreedEditor, Easel, agree_views
 from .finish import RunResult, end_rows, finish_run, load_evaluator, load_result, write_finals, write_result
@@ -82,7 +82,7 @@ from .paint import RING, TURNS, train_decal
 from .record import RunRecord, read_record
 from .removal import is_removal, remove_region
 from .resume import check_exists, decide_resume, explain_stop, load_region, picture_digests
-from .training import optimize_members, retime_trajectory
+from .training import Strengths, optimize_members, retime_trajectory
 
 
 def check_command(options: TrainOptions) -> None:
@@ -236,9 +236,11 @@ def _run_training(
     editor = cache(partial(_make_editor, options, setup, folder, log))
     with log.stage("edit"):
         edited, approach, trial, between = _edit_views(options, setup, editor, folder, log)
-        train_edits = {s: pictures[: len(setup.train)] for s, pictures in edited.items()}
+        optimization = resolve_approach(options, approach)
+        # where more may be asked for, whether they are there already must not matter
+        strengths = (1.0,) if _asks_for_more(options, optimization) else edited
+        train_edits = {s: edited[s][: len(setup.train)] for s in strengths}
         setup = whole_views(setup) if options.optimize.as_printed else widen_views(setup, train_edits)
-    optimization = resolve_approach(options, approach)
     if optimization.solver == "colors":  # its sums are small: torch's threads spun for 100 s on 16 cores
         torch.set_num_threads(1)
     recorded = folder.state.load("recorded")
@@ -393,10 +395,9 @@ def _edit_views(
     editor: Callable[[], ImageEditor],
     folder: RunFolder,
     log: RunLog,
-) -> tuple[Pictures, Approach, dict[str, Any] | None, Callable[[float], Pictures]]:
+) -> tuple[Pictures, Approach, dict[str, Any] | None, Callable[[], Strengths | None]]:
     """What the editor makes of all views, by strength, read where it is on disk; how to train towards it;
-    what a trial found of that; and, given what the finished edit misses, all strengths that its course
-    calls for.
+    what a trial found of that; and what makes more strengths, where a course may call for them.
     """
     views, spec = setup.views, options.editor.editor
     names = [view.camera.name for view in views]
@@ -411,18 +412,21 @@ def _edit_views(
                 within = [view.with_painted([editor().edit(view, 1.0)]) for view in views]
             made.update(edit_views(editor(), within, new, folder, is_confined, advance))
         log.say(f"{spec}: a {approach.kind} edit at strength {', '.join(f'{s:g}' for s in strengths)}")
-        saved = {"strengths": list(strengths), **asdict(approach)}
+        saved = {"strengths": list(made), **asdict(approach)}
         shared = painter.figures if isinstance(painter := editor(), AgreedEditor) else {}
         folder.state.save("edited", {}, saved | {"trial": trial, "shared": shared})
-        return {s: made[s] for s in strengths}
+        return made
 
-    def between(missed: float) -> Pictures:
-        if len(made) > 1 or not _waits_for_error(options, resolve_approach(options, approach)):
-            return made
-        plain = tuple((i + 1) / MOST_STAGES for i in range(MOST_STAGES))
-        strengths = equalized_strengths(editor(), spec, views, plain, missed)
-        log.expect(expected_work(setup, resolve_approach(options, approach), len(strengths)))
-        return edit(strengths)
+    def look(s: float, some: Sequence[View]) -> list[Tensor]:
+        pictures = [editor().edit(view, s) for view in some]
+        if confines_edit(editor(), approach.kind):
+            pictures = [view.confine(picture) for view, picture in zip(some, pictures, strict=True)]
+        return [quantize_image(picture) for picture in pictures]
+
+    def between() -> Strengths | None:
+        if not _asks_for_more(options, resolve_approach(options, approach)):
+            return None
+        return Strengths(strength_ruler(editor(), spec, views), edit, look)
 
     done = folder.state.load("edited")
     if done is not None:
@@ -443,7 +447,7 @@ def _edit_views(
     optimization = resolve_approach(options, approach)
     strengths = editor_strengths(editor(), optimization.stages)
     log.expect(expected_work(setup, optimization, len(strengths)))
-    if _waits_for_error(options, optimization):
+    if _asks_for_more(options, optimization):
         strengths = (1.0,)
     elif not optimization.as_printed and resolve_slider(optimization.slider, strengths) == "even":
         strengths = equalized_strengths(editor(), spec, views, strengths)
@@ -457,8 +461,8 @@ def _edit_views(
     return edited, approach, trial, between
 
 
-def _waits_for_error(options: TrainOptions, optimization: OptimizeOptions) -> bool:
-    """Whether strengths between are chosen when it is known what the finished edit misses."""
+def _asks_for_more(options: TrainOptions, optimization: OptimizeOptions) -> bool:
+    """Whether strengths between are chosen when it is known what others miss."""
     known = options.optimize.stages or options.editor.family in (*EXTERNAL, *COSTLY_STRENGTHS)
     return optimization.solver == "colors" and not known
 
@@ -507,7 +511,7 @@ def _record(
     optimization: OptimizeOptions,
     setup: TrainingSetup,
     edited: Pictures,
-    between: Callable[[float], Pictures],
+    between: Callable[[], Strengths | None],
     editor: Callable[[], ImageEditor],
     perceptual: Perceptual,
     folder: RunFolder,
@@ -520,7 +524,7 @@ def _record(
         log.say(f"--group-steps: without effect on this {optimization.kind} edit, whose loss is {objective}")
     with log.stage("optimize"):
         trajectory, losses, effort = optimize_members(
-            options, optimization, setup, edited, perceptual, folder.state, log, between=between
+            options, optimization, setup, edited, perceptual, folder.state, log, between()
         )
     setup = setup.extend(trajectory.added)
     with log.stage("retime"):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
-from functools import partial
+from dataclasses import dataclass, replace
+from functools import cache, partial
 from itertools import pairwise
 from typing import Any
 
@@ -22,15 +22,14 @@ from progdf.io.tensors import check_tensor
 from progdf.rasterize.engines import engine_device
 from progdf.scene.bounds import scene_sphere
 from trainer.fit.network import JointTraining, begin_joint_training, save_network
+from trainer.optimize.color_course import MISSED, STEPS, Course, Target, solve
 from trainer.optimize.color_solver import (
-    STEPS,
     Model,
     Solver,
     choose_model,
     enrich,
     iterations,
     make_solver,
-    solve,
     split_solver,
 )
 from trainer.optimize.color_views import ColorView, Judge, color_views
@@ -47,7 +46,7 @@ from trainer.optimize.pgs import (
 )
 from trainer.optimize.retime import drop_jitter, record, resolve_slider, retime, smooth_course
 from trainer.optimize.ties import surface_ties
-from trainer.options import OptimizeOptions, TrainOptions
+from trainer.options import MOST_STAGES, OptimizeOptions, TrainOptions
 from trainer.setup import Pictures, TrainingSetup, probe_views
 from trainer.store.progress import RunLog
 from trainer.store.run_folder import LazySequence, stored_pictures
@@ -101,7 +100,7 @@ class Recordings:
         recordings = [self._folder.load("recordings", index) for index in range(self._written)]
         if None in recordings:
             raise ProgdfError(f"recordings are missing in {self._folder.path}; delete it and train again")
-        self.made = [self._read(kept) for kept in recordings if kept]
+        self.made[:] = [self._read(kept) for kept in recordings if kept]
 
     def _read(self, saved: Saved) -> ParameterSnapshot:
         values, offsets = convert_json(saved.values, _RecordingValues), saved.tensors["offsets"]
@@ -125,6 +124,15 @@ Way = Callable[[OnStep], Iterator[ParameterSnapshot]]
 """Optimizes from the state on, and yields recordings."""
 
 
+@dataclass(frozen=True)
+class Strengths:
+    """Of an edit of colors: strengths that are edited when it is known that they are called for."""
+
+    ruler: Sequence[float]  # see `Course.ruler`
+    edit: Callable[[Sequence[float]], Pictures]  # all views, which stay on disk
+    look: Callable[[float, Sequence[View]], Sequence[Tensor]]  # some views, as they would be
+
+
 def optimize_members(
     options: TrainOptions,
     optimization: OptimizeOptions,
@@ -133,7 +141,7 @@ def optimize_members(
     perceptual: Perceptual,
     folder: StateFolder,
     log: RunLog,
-    between: Callable[[float], Pictures] | None = None,
+    between: Strengths | None = None,
 ) -> tuple[Trajectory, Losses, Mapping[str, Any]]:
     """Optimize the members, from the beginning or from the saved state.
 
@@ -145,8 +153,7 @@ def optimize_members(
         perceptual: distance of pictures
         folder: where the state is saved
         log: of the run
-        between: of colors that are solved for, the share of the change that may be missed (mean square) ->
-            `edited` at as many strengths as that calls for; None: as many as there are
+        between: of colors that are solved for, what more strengths there may be; None: those of `edited`
 
     Returns:
         The trajectory, even in time; mean of every loss term, and what is left to the edit, per recording;
@@ -180,13 +187,16 @@ def optimize_members(
     state = PgsState(original, settings.seed)
     way: Way
     model: Model | None = None
+    steps, recordings_of = sum(stage.steps for stage in stages), partial(Recordings, folder, original.shape)
     if optimization.solver == "colors":
-        most = iterations(optimization.steps)
-        colors, model, edited, stages, judges = _prepare_colors(
+        most, steps = iterations(optimization.steps), len(edited) if between is None else MOST_STAGES
+        colors, model, course = _prepare_colors(
             options, optimization, setup, edited, crops, original, between, log
         )
-        way = partial(solve, original, colors, model, stages, judges, state, steps=most)
+        stages, recordings = [course.finished[0]], recordings_of(model)
+        way = partial(solve, original, colors, model, course, recordings.made, state, steps=most)
     else:
+        recordings = recordings_of(None)
         inside = [erode(crop(view.mask, view.box)).to(device) for view in setup.train]
         objective = Objective(perceptual, optimization, inside)
         probes = probe_views(setup, engine=engine)
@@ -196,22 +206,27 @@ def optimize_members(
         joint = begin_joint_training(
             options.field, optimization, setup, settings.rates, stages, crops, perceptual
         )
-    recordings = Recordings(folder, original.shape, model)
-    saver = _record_way(way, sum(stage.steps for stage in stages), state, recordings, joint, folder, log)
+    saver = _record_way(way, steps, state, recordings, joint, folder, log)
     distances = [made.means["left"] for made in recordings.made]
     log.say(f"L1 to the finished edit: {distances[0]:.4f} at first, {distances[-1]:.4f} at the end")
     log.say(f"the state was saved {saver.saves} times, in {saver.seconds:.2f} s")
     end = stages[-1].place(state.average).cpu().clone()
-    snapshots = [(made.step, made.stage, made.ends_stage, made.offsets[:own]) for made in recordings.made]
+    ordered, strengths = recordings.made, list(edited)
+    if model is not None:
+        asked = [*(stage.strength for stage, _ in course.targets), 1.0]
+        strengths = sorted(asked)
+        ordered = [replace(ordered[asked.index(s)], step=i + 1, stage=i) for i, s in enumerate(strengths)]
+    snapshots = [(made.step, made.stage, made.ends_stage, made.offsets[:own]) for made in ordered]
     if groups is not None:
         ends = [made for made in recordings.made if made.ends_stage]
         offsets = [*(made.offsets.float() for made in ends[:-1]), end]
         snapshots = group_path(original, groups, offsets, [made.step for made in ends], settings.snapshots)
-    taken = [int(made.means[STEPS]) for made in recordings.made if STEPS in made.means]
+    taken = [int(made.means[STEPS]) for made in ordered if STEPS in made.means]
     rows = [
-        (m.step, {name: mean for name, mean in m.means.items() if name != STEPS}) for m in recordings.made
+        (m.step, {name: mean for name, mean in m.means.items() if name not in (STEPS, MISSED)})
+        for m in ordered
     ]
-    trajectory, effort = record(snapshots, end[:own], list(edited)), {"strengths": list(edited), STEPS: taken}
+    trajectory, effort = record(snapshots, end[:own], strengths), {"strengths": strengths, STEPS: taken}
     if seeds is not None:
         finished = original + end.to(device)
         costs = removal_costs(crops, finished, stages[-1].targets, optimization.seed)[own:].cpu()
@@ -220,12 +235,12 @@ def optimize_members(
         effort["added"] = 0 if trajectory.added is None else len(trajectory.added)
         log.say(f"growth: {effort['added']} Gaussians added, of {len(seeds)}; the others contribute nothing")
     if model is not None:
-        maps = torch.stack([made.table for made in recordings.made if made.table is not None])
+        maps = torch.stack([made.table for made in ordered if made.table is not None])
         trajectory = smooth_course(replace(trajectory, maps=maps, bands=model.bands, mask=model.mask))
         counts = (
             f"in {', '.join(map(str, taken))} steps, of {most} each at most" if taken else "by maps alone"
         )
-        log.say(f"{len(edited)} strengths {counts}")
+        log.say(f"{len(strengths)} strengths {counts}")
         effort |= model.figures() | {"most_steps": most, "views": len(colors.views)}
     return trajectory, loss_table(rows), effort
 
@@ -262,33 +277,51 @@ def _prepare_colors(
     edited: Pictures,
     crops: Sequence[CropScene],
     original: Tensor,
-    between: Callable[[float], Pictures] | None,
+    between: Strengths | None,
     log: RunLog,
-) -> tuple[Solver, Model, Pictures, list[TargetStage], list[Judge]]:
-    """The views to solve for, how much is modelled, the strengths; and what says when each is done."""
+) -> tuple[Solver, Model, Course]:
+    """The views to solve for, how much is modelled, and the strengths."""
     with log.stage("weights"):
         few = bool(options.views.pictures)
         every = 1 if few else _stride(setup, original)
         drawn = color_views(crops, original, every)
-        judging = _judging(setup, drawn, original, edited, every)
+        aside = _look_aside(setup, drawn, original, edited, every)
         cameras = [view.camera for view in setup.train]
         ties = surface_ties(setup.scene, setup.region.members, cameras) if few else None
+
+    def target(s: float, pictures: Sequence[Tensor]) -> Target:
+        return TargetStage(s, _boxes(pictures, setup.train), 1), aside.judge(aside.pick(pictures))
+
+    def ask(strengths: Sequence[float]) -> list[Target]:
+        made = between.edit(strengths) if between is not None else edited
+        return [target(s, made[s]) for s in strengths]
+
+    def look(s: float) -> Judge:
+        assert between is not None
+        return aside.judge(between.look(s, aside.views))
+
     with log.stage("model"):
-        judge, finished = judging(edited[max(edited)]), _boxes(edited[max(edited)], setup.train)
-        solver, most = make_solver(drawn, original, ties), iterations(optimization.steps)
-        trials = [(solver, judge)] if ties is None else split_solver(solver, original, finished)
-        solver, model = choose_model(solver, trials, finished, most, 1 if optimization.sh == "off" else 9)
-    on = "all views, as none is held out" if judge.views is drawn else "views that are held out"
-    edited = edited if between is None else between(model.allowed_share)
-    stages = [TargetStage(s, _boxes(some, setup.train), 1) for s, some in edited.items()]
-    judges, middle = [judging(pictures) for pictures in edited.values()], (len(stages) - 1) // 2
+        (stage, judge), most = target(1.0, edited[1.0]), iterations(optimization.steps)
+        solver = make_solver(drawn, original, ties)
+        trials = [(solver, judge)] if ties is None else split_solver(solver, original, stage.targets)
+        solver, model = choose_model(
+            solver, trials, stage.targets, most, 1 if optimization.sh == "off" else 9
+        )
+    strengths = [s for s in edited if s < 1.0]
+    if between is not None and model.richer is not None:  # which is decided there
+        strengths = strengths or [between.ruler[len(between.ruler) // 2]]
+    course = Course(ask(strengths), (stage, judge))
+    if between is not None:
+        course = replace(course, ruler=between.ruler, look=cache(look), ask=ask)
     with log.stage("model"):
-        model = enrich(model, solver, stages[middle], judges[middle], most)
+        middle = len(course.targets) // 2 if between is None else 0
+        model = enrich(model, solver, *[*course.targets, course.finished][middle], most)
+    on = "all views, as none is held out" if aside.drawn is drawn else "views that are held out"
     log.say(f"{model.line}, on {on if ties is None else 'squares of the pictures that are held out'}")
     if ties is not None:
         unseen = len(original) - int(solver.asked.sum())
         log.say(f"{unseen} members that no picture shows follow the map and their own surface")
-    return solver, model, edited, stages, judges
+    return solver, model, course
 
 
 def _stride(setup: TrainingSetup, original: Tensor) -> int:
@@ -299,19 +332,32 @@ def _stride(setup: TrainingSetup, original: Tensor) -> int:
     return next(every for every in (8, 4, 2) if every == 2 or pixels >= _ENOUGH * every)
 
 
-def _judging(
+@dataclass(frozen=True)
+class _Aside:
+    """The views that judge what is solved for: the held-out ones that choose, or all where there are none."""
+
+    views: Sequence[View]
+    drawn: Sequence[ColorView]
+    pick: Callable[[Sequence[Tensor]], Sequence[Tensor]]  # their pictures, of all views'
+
+    def judge(self, pictures: Sequence[Tensor]) -> Judge:
+        """How far from these views' pictures. [H,W,3] each"""
+        return Judge(self.drawn, _boxes(pictures, self.views))
+
+
+def _look_aside(
     setup: TrainingSetup,
     drawn: Sequence[ColorView],
     original: Tensor,
     edited: Pictures,
     every: int,
-) -> Callable[[Sequence[Tensor]], Judge]:
-    """All views' whole pictures of an edit -> the held-out views that choose, or all where there are none."""
+) -> _Aside:
+    """See `_Aside`. `drawn`: the training views."""
     views, count = split_held_out(setup.held_out)[0], len(setup.train)
-    if not views or len(edited[max(edited)]) <= count:
-        return lambda pictures: Judge(drawn, _boxes(pictures, setup.train))
+    if not views or len(edited[1.0]) <= count:
+        return _Aside(setup.train, drawn, lambda pictures: pictures[:count])
     choosing = color_views(_crops(setup, views, True), original, every)
-    return lambda pictures: Judge(choosing, _boxes(split_held_out(pictures[count:])[0], views))
+    return _Aside(views, choosing, lambda pictures: split_held_out(pictures[count:])[0])
 
 
 def _record_way(
@@ -337,7 +383,7 @@ def _record_way(
             nonlocal saved_at
             if joint is not None:
                 joint.step()
-            advance(step, "" if math.isnan(left) else f"loss to the edit {left:.4f}")
+            advance(min(step, steps), "" if math.isnan(left) else f"loss to the edit {left:.4f}")
             if stopped():
                 saver.save()
                 raise KeyboardInterrupt

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -13,13 +12,12 @@ import torch
 from torch import Tensor
 
 from progdf.field import fit_separable
-from progdf.field.baked import interpolate_at
 from progdf.gaussians import pack
 from progdf.metrics.slider import slider_statistics
 from tests.helpers.trained import WHITE, quick_options, small
-from trainer.editors import ImageEditor, make_editor
+from trainer.editors import make_editor
 from trainer.fit.slider_uniformity import equalize_slider, equalized_strengths, equalizing_remap
-from trainer.optimize.retime import resolve_slider, smooth_weights
+from trainer.optimize.retime import resolve_slider
 from trainer.options import EditKind, EditorOptions, Slider
 from trainer.resolve import resolve
 from trainer.setup import TrainingSetup
@@ -83,35 +81,6 @@ def test_given_strengths_and_single_targets_are_not_asked_around(
 ) -> None:
     assert equalized_strengths(editor, spec, small(count=4).views, plain) == plain
     assert editor.asked == 0
-
-
-def missed_by(strengths: Sequence[float], editor: ImageEditor, views: Sequence[View]) -> float:
-    """Largest share of the change, mean square, that the smooth course through these strengths misses."""
-
-    def picture(s: float) -> Tensor:
-        return torch.stack([editor.edit(view, s) for view in views]).double()
-
-    known = torch.stack([picture(s) for s in (0.0, *strengths)])
-    places, weights = smooth_weights((0.0, *strengths), known)
-    met = torch.tensordot(weights, known, 1)
-    change = float((known[-1] - known[0]).square().sum())
-    even = torch.linspace(0, 1, 41).tolist()
-    return max(float((interpolate_at(places, met, s) - picture(s)).square().sum()) for s in even) / change
-
-
-def test_strengths_are_as_many_as_the_course_bends_and_the_edit_is_good() -> None:
-    views = small(count=4).views
-
-    def asked(editor: ImageEditor, missed: float) -> tuple[float, ...]:
-        return equalized_strengths(editor, "darken:0.5", views, QUARTERS, missed)
-
-    assert asked(Late(power=1.0), 1e-9) == (1.0,), "a straight course needs no more than its end"
-    bent = make_editor(EditorOptions("recolor:#3060d0"), small().scene, small().region, views)
-    rough, fine = asked(bent, 3e-3), asked(bent, 1e-5)
-    assert 1 <= len(rough) < len(fine) <= 16
-    assert missed_by(rough, bent, views) <= 3.3e-3, "with strengths between those that are looked at"
-    assert missed_by(fine, bent, views) < missed_by(fine[1::2], bent, views)
-    assert asked(bent, 1e9) == (1.0,)
 
 
 def test_an_edit_that_jumps_is_asked_at_the_plain_strengths() -> None:

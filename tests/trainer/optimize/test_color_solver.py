@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import threading
+from collections.abc import Sequence
 from dataclasses import replace
 
 import pytest
@@ -16,7 +18,15 @@ from progdf.rasterize.engines import color_map
 from progdf.region import Region
 from progdf.sh import rgb_to_sh0
 from tests.helpers.scenes import random_gaussians
-from trainer.optimize.color_solver import Model, Solver, add_bands, choose_model, enrich, make_solver, solve
+from trainer.optimize.color_course import Course, Target, solve
+from trainer.optimize.color_solver import (
+    Model,
+    Solver,
+    add_bands,
+    choose_model,
+    enrich,
+    make_solver,
+)
 from trainer.optimize.color_views import Judge, color_views, map_views
 from trainer.optimize.pgs import OnStep, ParameterSnapshot, PgsState, TargetStage
 from trainer.setup import unresolved_share
@@ -68,10 +78,14 @@ def solve_all(
     state: PgsState,
     steps: int,
     on_step: OnStep = lambda step, left: None,
+    made: list[ParameterSnapshot] | None = None,
 ) -> list[ParameterSnapshot]:
-    """The recordings; all views say when a stage is done."""
-    judges = [Judge(solver.views, stage.targets) for stage in stages]
-    return list(solve(original, solver, model, stages, judges, state, on_step, steps))
+    """The recordings, in half precision as a run has them; all views say when a stage is done."""
+    targets = [(stage, Judge(solver.views, stage.targets)) for stage in stages]
+    course, made = Course(targets[:-1], targets[-1]), [] if made is None else made
+    for snapshot in solve(original, solver, model, course, made, state, on_step, steps):
+        made.append(replace(snapshot, offsets=snapshot.offsets.half()))
+    return made
 
 
 def solved(scene: Gaussians, edited: Gaussians, cameras: list[Camera], steps: int = 40) -> Tensor:
@@ -242,6 +256,52 @@ def test_a_second_band_that_hardly_pays_at_the_end_is_taken_where_it_pays_on_the
     assert enrich(richer, solver, stage, Judge(aside, pictures(others, 0.1)), 40) is richer
 
 
+@pytest.mark.parametrize(
+    ("bend", "asked"), [("straight", {0.5}), ("bent", {0.5, 0.25, 0.75}), ("late", {0.5, 0.75})]
+)
+def test_strengths_are_asked_for_where_the_course_of_those_that_are_solved_misses(
+    bend: str, asked: set[float]
+) -> None:
+    """A change that goes straight, one that turns all the way, and one that begins at the half."""
+    scene = dense_ball(800)
+    side = torch.where(scene.means[:, :1] > 0, 1.0, -0.5)
+    courses = {
+        "straight": lambda s: s * side,
+        "bent": lambda s: side * torch.tensor([math.sin(3 * s), s, math.cos(4 * s) - 1]),
+        "late": lambda s: side * max(0.0, s - 0.5),
+    }
+    (crops, original), (others, _) = (prepared(scene, c) for c in (orbit(6, 48), orbit(9, 48)[6:]))
+    solver, aside = make_solver(color_views(crops, original), original), color_views(others, original)
+
+    def pictures(some: list[CropScene], s: float) -> list[Tensor]:
+        return render_all(some, pack(replace(scene, sh0=scene.sh0 + courses[bend](s)), with_shN=False))
+
+    def look(s: float) -> Judge:
+        return Judge(aside, pictures(others, s))
+
+    def ask(strengths: Sequence[float]) -> list[Target]:
+        return [(TargetStage(s, pictures(crops, s), 1), look(s)) for s in strengths]
+
+    def way() -> tuple[Course, PgsState, list[ParameterSnapshot]]:
+        (finished,) = ask([1.0])
+        return (
+            Course(ask([0.5]), finished, torch.linspace(0, 1, 9).tolist(), look, ask),
+            PgsState(original),
+            [],
+        )
+
+    (course, state, made), (_, model) = (
+        way(),
+        choose_model(solver, [(solver, look(1.0))], pictures(crops, 1.0), 40, 1),
+    )
+    for snapshot in solve(original, solver, model, course, made, state, lambda step, left: None, 40):
+        made.append(snapshot)
+    found = {stage.strength for stage, _ in course.targets}
+    assert found >= asked, found
+    assert len(found) <= len(asked) + 2
+    assert len(made) == len(course.targets) + 1
+
+
 @pytest.mark.parametrize(("members", "size", "most"), [(200, 64, 60), (6000, 40, 40)])
 def test_steps_end_where_other_views_gain_little_and_go_on_where_members_are_dense(
     members: int, size: int, most: int
@@ -287,7 +347,7 @@ def test_what_was_stopped_goes_on_to_the_same_bits() -> None:
     whole = PgsState(original)
     solve_all(original, solver, model, stages, whole, 20)
     for at in (1, 2):  # between two rounds of a stage, and at its end
-        stopped, again, calls = PgsState(original), PgsState(original), [0]
+        stopped, again, calls, made = PgsState(original), PgsState(original), [0], list[ParameterSnapshot]()
 
         def stop(step: int, left: float, at: int = at, calls: list[int] = calls) -> None:
             calls[0] += step == at
@@ -295,10 +355,11 @@ def test_what_was_stopped_goes_on_to_the_same_bits() -> None:
                 raise KeyboardInterrupt
 
         with pytest.raises(KeyboardInterrupt):
-            solve_all(original, solver, model, stages, stopped, 20, stop)
+            solve_all(original, solver, model, stages, stopped, 20, stop, made)
         again.restore(stopped.capture_state())
         assert again.step == at
-        solve_all(original, solver, model, stages, again, 20)
+        assert len(made) == at
+        solve_all(original, solver, model, stages, again, 20, made=made)
         assert torch.equal(again.moved, whole.moved)
         assert again.step == whole.step == 3
 

@@ -1,0 +1,147 @@
+"""The course of an edit of colors: the strengths that are solved for, as many as it calls for."""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_left
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import pairwise
+
+import torch
+from torch import Tensor
+
+from progdf.field.grade import band_offsets, member_bands
+from progdf.metrics.image import LEVEL
+
+from .color_solver import Model, Solver, add_bands
+from .color_views import MORE_PAYS, Judge
+from .pgs import OnStep, ParameterSnapshot, PgsState, TargetStage
+from .retime import smooth_weights
+
+STEPS, MISSED = "steps", "missed"
+"""Of a recording's means: the steps that it took, and what is left in views not solved for, see `Judge`."""
+
+Target = tuple[TargetStage, Judge]
+"""A strength's pictures, and views not solved for that say when these are met."""
+
+
+@dataclass
+class Course:
+    """The strengths that are solved for."""
+
+    targets: list[Target]  # in this order, the finished edit after them
+    finished: Target
+    # where further ones may be: evenly visible apart, from 0 to 1, 2^n + 1 of them; none: there are no others
+    ruler: Sequence[float] = ()
+    look: Callable[[float], Judge] | None = None
+    ask: Callable[[Sequence[float]], Sequence[Target]] | None = None
+
+    def extend(self, known: Mapping[float, tuple[Tensor, float]]) -> bool:
+        """Ask for those that would each take a twentieth from the error of the whole way (its geometric mean
+        over what is to be seen): in the middle of what is asked for, `smooth_course` misses by so much more
+        than a solution would, whose differences lie half way between those of its neighbors. False: none.
+
+        Args:
+            known: strength → what is solved for there, its offset [M,B,3], and what that misses; 0 and 1 too
+        """
+        if self.look is None or self.ask is None:
+            return False
+        at = sorted(known)
+        offsets, asked = torch.stack([known[s][0] for s in at]), list[float]()
+        missed = [max(known[s][1], LEVEL) for s in at]
+        places, weights = smooth_weights(at, offsets)
+        for i, (begin, end) in enumerate(pairwise(bisect_left(self.ruler, s) for s in at)):
+            width = (end - begin) / (len(self.ruler) - 1)
+            if end - begin < 2:
+                continue
+            smooth = torch.tensordot(weights[2 * i + 1].float(), offsets, 1)
+            error = max(self.look(float(places[2 * i + 1])).error(smooth), LEVEL)
+            expected = (0.5 * math.sqrt(missed[i]) * (i > 0) + 0.5 * math.sqrt(missed[i + 1])) ** 2
+            if width * math.log(error / max(expected, LEVEL)) > -math.log(MORE_PAYS):
+                asked.append(self.ruler[(begin + end) // 2])
+        self.targets += self.ask(asked) if asked else ()
+        return bool(asked)
+
+
+def solve(
+    original: Tensor,
+    solver: Solver,
+    model: Model,
+    course: Course,
+    made: Sequence[ParameterSnapshot],
+    state: PgsState,
+    on_step: OnStep,
+    steps: int,
+) -> Iterator[ParameterSnapshot]:
+    """Solve for the strengths of a course, which grows as is needed, and yield each one's end, with its map.
+
+    Each begins between the solutions of its neighbors.
+
+    Args:
+        original: raw member rows, packed. [M,C]
+        solver: the views
+        model: how much is modelled
+        course: strengths, changed in place
+        made: what was yielded, one for each target up to `state.stage`; kept by who calls, in any precision
+        state: where to go on from, changed in place; a step is a stage
+        on_step: progress; here, and only here, the state is whole and may be saved
+        steps: most steps of conjugate gradients of a stage
+
+    Raises:
+        FloatingPointError: the loss or where it leads is not finite; the state is that of the stage before.
+    """
+    finished, judge = Judge(solver.views, course.finished[0].targets), course.finished[1]
+    _, mapped = solver.fit_map(model.degree, course.finished[0].targets)
+    end = add_bands(mapped, model.residual)
+    residuals = {0.0: torch.zeros_like(model.residual), 1.0: model.residual}
+    known = {0.0: (torch.zeros_like(end), 0.0), 1.0: (end, judge.error(end))}
+
+    def learn(index: int) -> None:
+        """What was yielded of a target is known."""
+        strength, table = course.targets[index][0].strength, made[index].table
+        assert table is not None
+        offsets = member_bands(made[index].offsets.float())
+        residuals[strength] = (offsets - solver.map_offsets(model.degree, table))[:, : model.bands]
+        known[strength] = offsets, made[index].means[MISSED]
+
+    def solve_target(target: Target) -> ParameterSnapshot:
+        stage, judge = target
+        table, mapped = solver.fit_map(model.degree, stage.targets)
+        offsets = mapped
+        if model.bands:
+            left = max(s for s in residuals if s < stage.strength)
+            right = min(s for s in residuals if s >= stage.strength)
+            share = (stage.strength - left) / (right - left)
+            start = torch.lerp(residuals[left], residuals[right], share)
+            told = partial(on_step, state.step, state.running)
+            residual, taken = solver.residual(
+                mapped, start, stage.targets, steps, judge, model.error, model.hold, told
+            )
+            state.means.add({STEPS: taken})
+            offsets = add_bands(mapped, residual)
+        left_over = finished.mean(offsets, 1.0)
+        if not math.isfinite(left_over) or not bool(offsets.isfinite().all()):
+            raise FloatingPointError(f"the loss is {left_over} at step {state.step}")
+        with torch.no_grad():
+            state.moved.copy_(band_offsets(offsets, original.shape[1]))
+        state.average.copy_(state.moved.detach())
+        state.running = left_over
+        l2 = Judge(solver.views, stage.targets).error(offsets)
+        state.means.add({"l2": l2, "left": left_over, MISSED: judge.error(offsets)})
+        state.step, state.recorded = state.step + 1, state.recorded + 1
+        state.stage, state.local = state.stage + 1, 0
+        return ParameterSnapshot(
+            state.step, state.stage - 1, True, state.average.clone(), state.means.read(), table
+        )
+
+    for index in range(min(state.stage, len(course.targets))):
+        learn(index)
+    while state.stage < len(course.targets) or (state.stage == len(course.targets) and course.extend(known)):
+        yield solve_target(course.targets[state.stage])
+        learn(state.stage - 1)
+        on_step(state.step, state.running)
+    if state.stage == len(course.targets):
+        yield solve_target(course.finished)
+        on_step(state.step, state.running)
