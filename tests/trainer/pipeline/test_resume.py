@@ -298,9 +298,9 @@ def test_what_is_found_in_a_folder_depends_on_the_options(
 
 @pytest.mark.slow  # a plain run is killed wherever it writes in every run of the tests
 def test_a_run_killed_while_it_grows_goes_on_to_the_same_bits(tmp_path: Path) -> None:
-    options = write_growth(tmp_path, "hat", image_size=64)
+    options = write_growth(tmp_path, "hat", views=8, image_size=64)
     more = {"editor": options.editor.editor, "region": options.region.region, "views": options.views.views}
-    more |= {"grow": 0.5, "kind": "geometry", "group_steps": 0, "save_every": 0}
+    more |= {"grow": 0.5, "kind": "geometry", "group_steps": 0, "save_every": 0, "image_size": 64}
     for name in ("whole", "cut"):
         (tmp_path / name).mkdir()
     killed(tmp_path, tmp_path / "whole", [], **more)

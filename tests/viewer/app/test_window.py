@@ -318,7 +318,8 @@ def test_what_the_real_keyboard_types_fast_arrives_whole(desktop: Desktop) -> No
     desktop.point(*slider(0, 0.2))
     desktop.xdotool("click", 1)
     desktop.xdotool("keyup", "ctrl")
-    desktop.xdotool("type", "--delay", "10", "0.1122\n")  # its Enter is the line feed key
+    desktop.xdotool("type", "--delay", "10", "0.1122")
+    desktop.xdotool("key", "Return")
     desktop.shot()
     desktop.xdotool("key", "ctrl+s", "Return")
     path = desktop.folder / "bear.session.json"
