@@ -8,8 +8,10 @@ lightness are those of `progdf.color.oklab`; what lies between the original and 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import torch
 from torch import Tensor
@@ -27,7 +29,7 @@ from .oklab import (
     oklab_to_srgb,
     srgb_to_oklab,
 )
-from .palette import Curve, bend_lightness, less_light, shift_palette
+from .palette import Curve, are_alike, bend_lightness, less_light, shift_palette
 
 Course = Callable[[Strength], Tensor]
 """Some colors [...,3] at a strength."""
@@ -157,6 +159,72 @@ class ColorGrade:
         stays = all(torch.equal(source, target) for source, target in self.palette)
         curves = (*self.palette_curves, self.curve)
         return still and stays and all(x == y for curve in curves for x, y in curve)
+
+
+def parse_grade(what: str) -> ColorGrade:
+    """The grade that a text says: values of `GRADE_RANGES` as NAME=NUMBER; colors that become others as
+    #rrggbb=#rrggbb, or one alone that stays; a curve of lightness as curve=FROM:TO+FROM:TO, of what is near a
+    color as #rrggbb=#rrggbb/FROM:TO+FROM:TO.
+
+    Raises:
+        ProgdfError: it says something else, or nothing.
+    """
+    values: dict[str, float] = {}
+    pairs: list[tuple[Tensor, Tensor]] = []
+    curves: list[Curve] = []
+    curve: Curve = ()
+    for part in what.split(","):
+        name, equals, number = (word.strip() for word in part.partition("="))
+        if name.startswith("#"):
+            target, bends, points = number.partition("/")
+            pair = parse_color(name), parse_color(target if equals else name)
+            if any(are_alike(pair[0], source) for source, _ in pairs):
+                raise ProgdfError(f"grade:{what:.80} has two colors as near as {name}; leave one of them out")
+            pairs.append(pair)
+            curves.append(_curve_of(what, points) if bends else ())
+        elif name == "curve" and not curve:
+            curve = _curve_of(what, number)
+        elif name not in GRADE_RANGES or name in values:
+            names = ", ".join(GRADE_RANGES)
+            raise ProgdfError(
+                f"grade:{what:.80} has '{part:.40}'; write NAME=NUMBER, each name once: {names}; "
+                "#rrggbb=#rrggbb; or curve=0.3:0.2"
+            )
+        else:
+            low, high, _ = GRADE_RANGES[name]
+            values[name] = number_of(number)
+            if not low <= values[name] <= high:
+                raise ProgdfError(f"in grade:{what:.80} {name} is '{number:.40}'; write {low:g} to {high:g}")
+    if len(pairs) > MOST_PAIRS:
+        raise ProgdfError(f"grade:{what:.80} has {len(pairs)} colors; the most are {MOST_PAIRS}")
+    asked = ColorGrade(values, tuple(pairs), tuple(curves), curve)
+    if asked.is_neutral:
+        raise ProgdfError(f"grade:{what:.80} changes nothing; write, for example, grade:exposure=0.7")
+    return asked
+
+
+MOST_PAIRS = 16
+"""Colors that a grade moves or holds."""
+
+
+def _curve_of(what: str, text: str) -> Curve:
+    """The points of `0.3:0.2+0.7:0.8`."""
+    points = [tuple(number_of(n) for n in point.split(":")) for point in text.split("+")]
+    curve = tuple((p[0], p[1]) for p in points if len(p) == 2 and all(0.0 <= x <= 1.0 for x in p))
+    rises = all(a[0] < b[0] for a, b in pairwise(curve))
+    if len(curve) < len(points) or not rises:
+        raise ProgdfError(
+            f"in grade:{what:.80} the curve is '{text:.40}'; write FROM:TO+FROM:TO, each 0 to 1, FROM rising"
+        )
+    return curve
+
+
+def number_of(text: str) -> float:
+    """NaN where it is none."""
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
 
 
 def grade_course(rgb: Tensor, grade: ColorGrade) -> Course:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 
+from progdf.color.edits import parse_grade
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.region import Region
@@ -15,7 +16,7 @@ from .base import EditorInput, ImageEditor, Painter
 from .decal import check_decal, decal
 from .instruct import check_instruct, instruct
 from .pictures import folder, folder_of, photograph_folders, photographs, picture_paths, pictures
-from .procedural import darken, grade, grade_of, night, paint_of, recolor, remove, stops_of, stripes, tint
+from .procedural import darken, grade, night, paint_of, recolor, remove, stops_of, stripes, tint
 from .style import check_style, style
 
 Factory = Callable[[EditorInput], ImageEditor]
@@ -74,7 +75,7 @@ CHECKS: dict[str, Callable[[str], object]] = {
     "stripes": paint_of,
     "darken": partial(stops_of, editor="darken"),
     "night": partial(stops_of, editor="night"),
-    "grade": grade_of,
+    "grade": parse_grade,
     "folder": folder_of,
     "photographs": photograph_folders,
     "pictures": picture_paths,

@@ -10,14 +10,12 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import pairwise
 
 import torch
 from torch import Tensor
 
 from progdf.color import edits as color
 from progdf.color.oklab import ColorPath, bend_of, interpolate_colors, path_of
-from progdf.color.palette import Curve, are_alike
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from trainer.options import EditKind
@@ -138,8 +136,8 @@ def night(given: EditorInput) -> ColorEditor:
 
 
 def grade(given: EditorInput) -> ColorEditor:
-    """`grade:exposure=0.5,#8a5a2b=#2b5a8a,curve=0.3:0.2`: what a hand does to colors, see `grade_of`."""
-    asked = grade_of(given.what)
+    """`grade:exposure=0.5,#8a5a2b=#2b5a8a,curve=0.3:0.2`: what a hand does to colors, see `parse_grade`."""
+    asked = color.parse_grade(given.what)
     return ColorEditor(lambda rgb: color.grade_course(rgb, asked))
 
 
@@ -188,75 +186,9 @@ def paint_of(what: str) -> tuple[Tensor, ColorPath]:
     return target, path_of(name.strip())
 
 
-def grade_of(what: str) -> color.ColorGrade:
-    """The grade that a text says: values of `GRADE_RANGES` as NAME=NUMBER; colors that become others as
-    #rrggbb=#rrggbb, or one alone that stays; a curve of lightness as curve=FROM:TO+FROM:TO, of what is near a
-    color as #rrggbb=#rrggbb/FROM:TO+FROM:TO.
-
-    Raises:
-        ProgdfError: it says something else, or nothing.
-    """
-    values: dict[str, float] = {}
-    pairs: list[tuple[Tensor, Tensor]] = []
-    curves: list[Curve] = []
-    curve: Curve = ()
-    for part in what.split(","):
-        name, equals, number = (word.strip() for word in part.partition("="))
-        if name.startswith("#"):
-            target, bends, points = number.partition("/")
-            pair = color.parse_color(name), color.parse_color(target if equals else name)
-            if any(are_alike(pair[0], source) for source, _ in pairs):
-                raise ProgdfError(f"grade:{what:.80} has two colors as near as {name}; leave one of them out")
-            pairs.append(pair)
-            curves.append(_curve_of(what, points) if bends else ())
-        elif name == "curve" and not curve:
-            curve = _curve_of(what, number)
-        elif name not in color.GRADE_RANGES or name in values:
-            names = ", ".join(color.GRADE_RANGES)
-            raise ProgdfError(
-                f"grade:{what:.80} has '{part:.40}'; write NAME=NUMBER, each name once: {names}; "
-                "#rrggbb=#rrggbb; or curve=0.3:0.2"
-            )
-        else:
-            low, high, _ = color.GRADE_RANGES[name]
-            values[name] = _number(number)
-            if not low <= values[name] <= high:
-                raise ProgdfError(f"in grade:{what:.80} {name} is '{number:.40}'; write {low:g} to {high:g}")
-    if len(pairs) > MOST_PAIRS:
-        raise ProgdfError(f"grade:{what:.80} has {len(pairs)} colors; the most are {MOST_PAIRS}")
-    asked = color.ColorGrade(values, tuple(pairs), tuple(curves), curve)
-    if asked.is_neutral:
-        raise ProgdfError(f"grade:{what:.80} changes nothing; write, for example, grade:exposure=0.7")
-    return asked
-
-
-MOST_PAIRS = 16
-"""Colors that a grade moves or holds."""
-
-
-def _curve_of(what: str, text: str) -> Curve:
-    """The points of `0.3:0.2+0.7:0.8`."""
-    points = [tuple(_number(n) for n in point.split(":")) for point in text.split("+")]
-    curve = tuple((p[0], p[1]) for p in points if len(p) == 2 and all(0.0 <= x <= 1.0 for x in p))
-    rises = all(a[0] < b[0] for a, b in pairwise(curve))
-    if len(curve) < len(points) or not rises:
-        raise ProgdfError(
-            f"in grade:{what:.80} the curve is '{text:.40}'; write FROM:TO+FROM:TO, each 0 to 1, FROM rising"
-        )
-    return curve
-
-
-def _number(text: str) -> float:
-    """NaN where it is none."""
-    try:
-        return float(text)
-    except ValueError:
-        return math.nan
-
-
 def stops_of(what: str, editor: str) -> float:
     """How many stops darker `what`, a share of the light, is; ProgdfError where it is none."""
-    amount = _number(what) if what else 0.875
+    amount = color.number_of(what) if what else 0.875
     if not 0.0 < amount < 1.0:
         raise ProgdfError(
             f"{editor}:{what} is not a number between 0 and 1; write, for example, {editor}:0.7"

@@ -351,6 +351,9 @@ def perform_actions(work: Workspace, actions: Sequence[str], pointer: PointerCon
         elif action == "reduced_motion":
             said = f"Reduced motion is {'on' if work.layout.reduced_motion else 'off'}"
             work = workspace.with_message(work, said, pointer.now)
+        elif action == "compare_snapshots" and not work.snapshots:
+            said = f"There is no snapshot to compare; {shortcut('snapshot')} adds one"
+            work = workspace.with_message(work, said, pointer.now)
         elif action in _UNDOES and work.past is not before.past:
             did, describe = _UNDOES[action]
             work = workspace.with_message(

@@ -28,7 +28,7 @@ from typing import Any, Literal
 import msgspec
 import torch
 
-from progdf.color.edits import GRADE_RANGES, parse_color
+from progdf.color.edits import GRADE_RANGES, parse_color, parse_grade
 from progdf.color.palette import are_alike
 from progdf.errors import ProgdfError
 from progdf.field.keyframes import fit_lossless
@@ -227,17 +227,12 @@ def with_settings(form: NewEdit, instruction: str) -> NewEdit | None:
                 amount = float(rest)
                 return replace(form, amount=amount) if 0.0 <= amount <= 1.0 else None
             case "grade":
-                parts = [part.partition("=")[::2] for part in rest.split(",")]
-                values = dict(parts)
-                palette = tuple((name, value or name) for name, value in parts if name.startswith("#"))
-                grade = {name: float(values.get(name, x)) for name, (_, _, x) in GRADE_RANGES.items()}
-                fits = all(low <= grade[name] <= high for name, (low, high, _) in GRADE_RANGES.items())
-                curves = [values.get("curve", ""), *(target.partition("/")[2] for _, target in palette)]
-                for curve in curves:
-                    parse_curve(curve)
-                made = replace(form, grade=tuple(grade.values()), palette=palette, curve=curves[0])
-                known = {name for name in values if not name.startswith("#")} <= {*grade, "curve", ""}
-                return made if fits and known else None
+                values = parse_grade(rest).values
+                grade = tuple(values.get(name, neutral) for name, (*_, neutral) in GRADE_RANGES.items())
+                pairs = [[word.strip() for word in part.partition("=")] for part in rest.split(",")]
+                palette = tuple((name, text or name) for name, _, text in pairs if name.startswith("#"))
+                curve = next((text for name, _, text in pairs if name == "curve"), "")
+                return replace(form, grade=grade, palette=palette, curve=curve)
             case "style":
                 return replace(form, style=int(rest)) if int(rest) in range(STYLES) else None
             case "sentence":

@@ -40,6 +40,7 @@ from viewer.ui.widgets import (
     group_digits,
     icon_button,
     inert,
+    key_step,
     label,
     right_edge,
     slider_row,
@@ -48,8 +49,6 @@ from viewer.ui.widgets import (
     value_slider,
     wrapped_text,
 )
-
-from .slider import key_step
 
 COLUMN_PX = 90.0
 _CURVE_PX, _MOST_POINTS, _LEAST_GAP = 92.0, 6, 0.02

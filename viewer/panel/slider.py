@@ -12,8 +12,7 @@ from collections.abc import Sequence
 from imgui_bundle import imgui
 
 from viewer.ui.context import PALETTE, Rgba, u32
-from viewer.ui.keys import NUDGES
-from viewer.ui.widgets import is_entered, is_released, tip
+from viewer.ui.widgets import is_entered, is_released, key_step, tip
 
 HEIGHT_PX = 20.0  # at 1×, as its text field, so that nothing moves when one types
 RADIUS_PX = 7.0  # of the handle
@@ -102,15 +101,6 @@ def draw(
     ticks = ticks if height >= HEIGHT_PX else ()
     _paint((start, top, span), value, ticks, scale, color, hovered or pressed, most)
     return value
-
-
-def key_step(less: imgui.Key, more: imgui.Key) -> float:
-    """How far two arrow keys move the last item, which has the keyboard: as those of the focused layer do."""
-    io, step = imgui.get_io(), 0.0
-    for key, sign in ((less, -1.0), (more, 1.0)):
-        imgui.internal.set_key_owner(key, imgui.get_item_id())  # else they would lead to another item
-        step += sign * bool(imgui.is_key_pressed(key))
-    return step * dict(NUDGES)["Shift+" if io.key_shift else "Ctrl+" if io.key_ctrl else ""]
 
 
 def start_typing(label: str) -> None:

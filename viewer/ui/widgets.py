@@ -14,7 +14,7 @@ from imgui_bundle import imgui, imgui_ctx
 from viewer.state.workspace import Layout
 
 from .context import BEHIND, FIXED, PALETTE, SMALL_PX, UNFOCUSED, Icon, Rgba, UiContext, u32
-from .keys import COMMANDS, describe, shortcut
+from .keys import COMMANDS, NUDGES, describe, shortcut
 
 T = TypeVar("T")
 
@@ -330,6 +330,15 @@ def is_entered() -> bool:
     return bool(imgui.get_current_context().nav_activate_id == imgui.get_item_id() != 0)
 
 
+def key_step(less: imgui.Key, more: imgui.Key) -> float:
+    """How far two arrow keys move the last item, which has the keyboard: as those of the focused layer do."""
+    io, step = imgui.get_io(), 0.0
+    for key, sign in ((less, -1.0), (more, 1.0)):
+        imgui.internal.set_key_owner(key, imgui.get_item_id())  # else they would lead to another item
+        step += sign * bool(imgui.is_key_pressed(key))
+    return step * dict(NUDGES)["Shift+" if io.key_shift else "Ctrl+" if io.key_ctrl else ""]
+
+
 def is_double_clicked() -> bool:
     """Whether the last item, a slider, was double-clicked, which takes it back to its default.
 
@@ -353,22 +362,36 @@ def value_slider(
 ) -> float:
     """A field with its value in words, and along its foot how far that is from end to end.
 
-    Ctrl+click types, a double click goes back to `default`. A range over orders of magnitude is logarithmic.
-    The value is as before, or what the field shows. `wide`: window pixels, 0 for the rest of the line
+    Ctrl+click types, a double click goes back to `default`, arrows move it where it has the keyboard. A range
+    over orders of magnitude is logarithmic. The value is as before, or what the field shows. `wide`: window
+    pixels, 0 for the rest of the line
     """
+    logarithmic, context = ends[0] > 0.0, imgui.get_current_context()
+    tabbed = context.nav_activate_flags & imgui.internal.ActivateFlags_.from_tabbing.value
     flags = imgui.SliderFlags_.always_clamp.value
-    flags |= imgui.SliderFlags_.logarithmic.value if ends[0] > 0.0 else 0
+    flags |= imgui.SliderFlags_.logarithmic.value if logarithmic else 0
+    flags |= imgui.SliderFlags_.no_input.value if tabbed else 0  # else Tab would open a text field
     imgui.set_next_item_width(wide or -1.0)
     for slot in (imgui.Col_.slider_grab, imgui.Col_.slider_grab_active):
         imgui.push_style_color(slot, (0.0, 0.0, 0.0, 0.0))
     changed, new = imgui.slider_float(name, value, *ends, form, flags)
     imgui.pop_style_color(2)
+    if tabbed and imgui.is_item_activated():
+        imgui.internal.clear_active_id()
     if is_double_clicked():
         changed, new = True, default
+    first, last, now = (math.log(x) if logarithmic else x for x in (*ends, new if changed else value))
+    share = (now - first) / (last - first)
+    if imgui.is_item_focused() and context.nav_cursor_visible and not imgui.is_item_active():
+        step = key_step(imgui.Key.left_arrow, imgui.Key.right_arrow)
+        if step:
+            moved = first + (share + step) * (last - first)
+            moved = math.exp(moved) if logarithmic else moved
+            least = value + math.copysign(0.01, step)  # that the field shows
+            changed, new = True, max(moved, least) if step > 0.0 else min(moved, least)
+            new = min(max(new, ends[0]), ends[1])
+    share = min(max(share, 0.0), 1.0)
     low, high = imgui.get_item_rect_min(), imgui.get_item_rect_max()
-    now, base = new if changed else value, math.log(ends[0]) if ends[0] > 0.0 else ends[0]
-    share = (math.log(now) - base) / (math.log(ends[1]) - base) if ends[0] > 0.0 else now - base
-    share = min(max(share if ends[0] > 0.0 else share / (ends[1] - base), 0.0), 1.0)
     left, end = (low.x, high.y - 3.0 * ui.scale), (high.x, high.y)
     canvas, shut = imgui.get_window_draw_list(), (low.x + share * (high.x - low.x), high.y)
     canvas.add_rect_filled(left, end, u32(PALETTE.line), 2.0 * ui.scale)

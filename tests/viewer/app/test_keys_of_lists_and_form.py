@@ -110,6 +110,26 @@ def test_tab_goes_through_the_form_both_ways_and_enter_presses_no_button_of_it(f
     assert form.main_view.take_requests() == ("train",)
 
 
+def test_a_slider_that_tab_comes_to_goes_by_arrows_and_types_nothing(form: Rig) -> None:
+    def strength() -> float:
+        return form.main_view.work.form.strength
+
+    for _ in ("draft", "full", "the eye", "the slider"):
+        strike(form, "Tab")
+    strike(form, "Left")
+    assert strength() == 0.99
+    assert not form.io.want_text_input
+    for chord, now in (("Shift+Left", 0.89), ("Ctrl+Left", 0.88), ("Right", 0.89), ("Shift+Right", 0.99)):
+        strike(form, chord)
+        assert strength() == pytest.approx(now, abs=1e-6), chord
+    strike(form, "Shift+Right")
+    assert strength() == 1.0
+    before = imgui.get_current_context().nav_id
+    strike(form, "Tab")
+    assert imgui.get_current_context().nav_id != before
+    assert not imgui.is_any_item_active() or form.io.want_text_input
+
+
 def test_a_shift_that_ends_within_a_slow_frame_still_goes_with_its_tab(form: Rig) -> None:
     window = Window(cast(Splash, SimpleNamespace(handle=None, context=None)))
 

@@ -230,8 +230,10 @@ def test_a_grade_says_its_palette_only_where_a_color_of_it_moves() -> None:
     again = with_settings(NewEdit(), moved.spec)
     assert again is not None
     assert (again.spec, again.palette) == (moved.spec, moved.palette)
-    for broken in ("curve=none", "#7eae44=#3060d0/none"):
-        assert with_settings(NewEdit(), f"grade:{broken}") is None
+    for foreign in ("#7eae4=#3060d0", "#7eae44=blue", "#", "#7eae44=#3060d0/none"):
+        assert with_settings(NewEdit(), f"grade:{foreign}") is None, "a form would draw what is no color"
+    for foreign in ("curve=none", "curve=0.2", "curve=0.5:0.2+0.4:0.3", "exposure=9", "tint=nan", "gamma=1"):
+        assert with_settings(NewEdit(), f"grade:{foreign}") is None
 
 
 def test_a_grade_says_the_curve_of_a_color_with_what_becomes_of_it() -> None:

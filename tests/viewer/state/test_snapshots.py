@@ -107,7 +107,10 @@ def test_a_click_on_a_small_picture_goes_back_to_its_snapshot_and_its_menu_delet
 def test_two_snapshots_are_compared_until_something_is_edited() -> None:
     with rig(first_view(bear(), 1.0, 0.0), (1024, 640)) as hand:
         hand.key("Shift+F5")
-        assert hand.main_view.work.view.compare.mode == "off", "there is no snapshot"
+        assert hand.main_view.work.view.compare.mode == "off"
+        said = hand.main_view.work.message
+        assert said is not None
+        assert said.text == "There is no snapshot to compare; F5 adds one"
         warm = hand.picture()
         hand.key("F5")
         hand.key("2")
