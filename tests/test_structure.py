@@ -46,15 +46,15 @@ MOST_LINES = 600
 
 # What a package may hold: modules, and lines of code (no blank, comment, docstring or import). A feature
 # says in its commit what it adds and what it replaces; these only fall.
-BUDGETS = {"progdf": (84, 11337), "trainer": (71, 10884), "viewer": (74, 12493)}
+BUDGETS = {"progdf": (83, 11368), "trainer": (71, 10836), "viewer": (74, 12504)}
 MOST_IMPORTS = 0.073  # of all lines
 MOST_SCRIPT_LINES = 1271  # of the JavaScript of the web page, counted alike
 MOST_FUNCTION_LINES = 80
 MOST_POSITIONAL = 8
 LEAST_LINES = 80  # of a module that one other imports alone; it is a section of that one
 
-# What looks like a section of its only importer and is none: entry points, children that are run as programs.
-SMALL = {"progdf.__main__", "progdf.formats.gaussforge_child", "progdf.io.colmap_child"}
+# What looks like a section of its only importer and is none: entry points.
+SMALL = {"progdf.__main__"}
 
 Graph = dict[str, set[str]]
 

@@ -1,7 +1,7 @@
 """Scenes in every format that people have: .ply, compressed .ply, .spz, .splat, .ksplat, .sog, .glb, .ckpt.
 
 Recognized by content, else by name. The code for .spz, .sog and .splat is that of gaussforge, in a process of
-its own (see `gaussforge_child`), as native code may crash on a broken file.
+its own (see `native_child`), as native code may crash on a broken file.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ import pickle
 import shutil
 import signal
 import subprocess
-import sys
 import tempfile
 import zipfile
 import zlib
@@ -26,11 +25,12 @@ import torch
 from progdf import sh
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
+from progdf.io import native_child
 from progdf.io.atomic import atomic_write, read_file
 from progdf.io.json_values import decode_json
 from progdf.terminal import escape_text
 
-from . import gaussforge_child, gltf, usd
+from . import gltf, usd
 from .compressed_ply import is_compressed, morton_order, read_compressed_ply, write_compressed_ply
 from .ksplat import read_ksplat
 from .ply import load_ply_with_report, read_header, save_ply, save_ply_checked
@@ -233,19 +233,10 @@ def _convert(source: Path, kind: str, target: Path, to: str) -> str:
     """A scene file through gaussforge into another format; what went wrong, or nothing."""
     size, patience = _size(source), 1 if to == "ply" else _PATIENCE
     memory, output, seconds = (int(base + each * size) for base, each in (_MEMORY, _OUTPUT, SECONDS))
-    limits = map(str, (memory, output, patience * seconds))
+    words = "convert", kind, str(source.resolve()), to, str(target)
     try:
         ended = subprocess.run(
-            [
-                sys.executable,
-                "-P",
-                gaussforge_child.__file__,
-                kind,
-                str(source.resolve()),
-                to,
-                str(target),
-                *limits,
-            ],
+            native_child.command(memory, output, patience * seconds, *words),
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,

@@ -9,7 +9,6 @@ from __future__ import annotations
 import importlib.util
 import shutil
 import subprocess
-import sys
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +19,7 @@ import torch
 from progdf.camera import Camera, Lens
 from progdf.errors import ProgdfError
 
-from . import colmap_child
+from . import native_child
 from .atomic import open_error
 from .json_values import convert_json, decode_json
 
@@ -97,10 +96,10 @@ def load_model(model: Path) -> list[Camera]:
 
 
 def _images(folder: Path) -> list[_Image] | None:
-    """What pycolmap reads, in a process of its own (see `colmap_child`); None: nothing that it can."""
+    """What pycolmap reads, in a process of its own (see `native_child`); None: nothing that it can."""
     size = sum(file.stat().st_size for file in folder.iterdir())
     memory, seconds = (1 << 30) + 64 * size, 10 + int(2e-6 * size)
-    words = [sys.executable, "-P", colmap_child.__file__, str(folder), str(memory), str(seconds)]
+    words = native_child.command(memory, 0, seconds, "cameras", str(folder))
     try:
         ended = subprocess.run(
             words, stdin=subprocess.DEVNULL, capture_output=True, timeout=6 * seconds, check=False

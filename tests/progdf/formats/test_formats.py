@@ -20,7 +20,6 @@ import torch
 from progdf.__main__ import main
 from progdf.cli.info import kind_of
 from progdf.errors import ProgdfError
-from progdf.formats import gaussforge_child
 from progdf.formats import scene_file as formats
 from progdf.formats.ply import load_ply
 from progdf.formats.scene_file import (
@@ -33,6 +32,7 @@ from progdf.formats.scene_file import (
     scene_format,
 )
 from progdf.gaussians import ATTRIBUTES, Gaussians
+from progdf.io import native_child
 from progdf.quaternions import rotation_matrices
 from progdf.rasterize import render
 from progdf.sh import rgb_to_sh0, sh0_to_rgb, shade
@@ -259,7 +259,7 @@ def test_a_reader_that_crashes_hangs_or_is_missing_is_one_line(
 ) -> None:
     path = write_scene(tmp_path / "a.splat", scene_of())
     script = tmp_path / "child.py"
-    monkeypatch.setattr(gaussforge_child, "__file__", str(script))
+    monkeypatch.setattr(native_child, "__file__", str(script))
     monkeypatch.setattr(formats, "SECONDS", (1, 0.0))
     for body, said in (
         ("import os; os.kill(os.getpid(), 11)", "crashed (SIGSEGV)"),
@@ -267,7 +267,7 @@ def test_a_reader_that_crashes_hangs_or_is_missing_is_one_line(
         ("raise SystemExit(3)", "said nothing"),
         ("import sys; sys.stderr.write('bad \\x1b[2J\\nworse \\x1b]0;x\\x07'); sys.exit(3)", "said: worse"),
         ("pass", "said nothing"),
-        ("import sys; open(sys.argv[4], 'w').write('ply')", "returned no scene"),
+        ("import sys; open(sys.argv[8], 'w').write('ply')", "returned no scene"),
     ):
         script.write_text(body)
         message = refusal(load_scene, path)
@@ -295,20 +295,10 @@ def test_a_format_without_its_package_is_one_line_that_names_the_extra_and_no_fi
 def test_a_reader_gets_no_more_memory_than_a_file_can_need(tmp_path: Path) -> None:
     """A gigabyte asked for beyond the limit is a line, and no gigabyte."""
     script, here = tmp_path / "greedy.py", "    path = Path(source)\n"
-    own = Path(gaussforge_child.__file__).read_text()
+    own = Path(native_child.__file__).read_text()
     script.write_text(own.replace(here, f"    bytes(1 << 30)\n{here}"))
-    words = [
-        sys.executable,
-        "-P",
-        str(script),
-        "splat",
-        "missing",
-        "ply",
-        "out",
-        str(1 << 30),
-        "1000000",
-        "10",
-    ]
+    limits = map(str, (1 << 30, 1_000_000, 10))
+    words = [sys.executable, "-P", str(script), *limits, "convert", "splat", "missing", "ply", "out"]
     ended = subprocess.run(words, capture_output=True, text=True, check=False)
     assert ended.returncode == 3
     assert ended.stderr.startswith("MemoryError")

@@ -1,0 +1,103 @@
+"""Run as a script of its own, within bounds: what native code of others makes of a stranger's files.
+
+    python -P native_child.py MEMORY OUTPUT SECONDS convert FORMAT IN FORMAT OUT   a scene by gaussforge
+    python -P native_child.py MEMORY OUTPUT SECONDS cameras FOLDER                 a COLMAP model by pycolmap
+
+Such code may crash on a broken file, or believe what it says of its own length: a few hundred bytes keep it
+busy for hours, where no Ctrl-C reaches. So it works in a process with so much memory (bytes, beyond what it
+has when it begins), output (bytes) and processor time (seconds). Nothing of progdf is imported, as that would
+take seconds. What is wrong is one line on stderr, exit 3.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import sys
+import zipfile
+from contextlib import suppress
+from pathlib import Path
+
+
+def _convert(kind: str, source: str, to: str, target: str) -> None:
+    """Write a scene in another format."""
+    import gaussforge
+
+    path = Path(source)
+    content = _bundle(path) if path.name.lower() == "meta.json" else path.read_bytes()
+    converted = gaussforge.GaussForge().convert(content, kind, to)
+    if "data" not in converted:
+        raise ValueError(str(converted.get("error", "it gives no scene")))
+    Path(target).write_bytes(converted["data"])
+
+
+def _bundle(meta: Path) -> bytes:
+    """An unpacked .sog as the archive that it would be: meta.json and the images that it names.
+
+    Raises:
+        ValueError: an image is no regular file of the folder: a pipe is waited for, a link may lead out.
+    """
+    table = json.loads(meta.read_bytes())
+    named = [name for part in table.values() if isinstance(part, dict) for name in part.get("files", ())]
+    archive = io.BytesIO()
+    with zipfile.ZipFile(archive, "w") as out:
+        out.writestr("meta.json", meta.read_bytes())
+        for name in dict.fromkeys(map(str, named)):
+            if Path(name).name != name:
+                raise ValueError("meta.json names images outside its folder")
+            image = meta.parent / name
+            if image.is_symlink() or not image.is_file():
+                raise ValueError(f"{name} is missing, a link or no regular file")
+            out.writestr(name, image.read_bytes())
+    return archive.getvalue()
+
+
+def _cameras(folder: str) -> None:
+    """Write the cameras of a COLMAP model as JSON to stdout."""
+    import pycolmap
+
+    model = pycolmap.Reconstruction(folder)
+    table = [
+        {
+            "name": image.name,
+            "pose": image.cam_from_world().matrix().tolist(),
+            "K": image.camera.calibration_matrix().tolist(),
+            "width": image.camera.width,
+            "height": image.camera.height,
+            "model": image.camera.model.name,
+            "params": [float(number) for number in image.camera.params],
+        }
+        for _, image in sorted(model.images.items())
+        if image.has_pose
+    ]
+    sys.stdout.write(json.dumps(table))
+
+
+def _limit(memory: int, output: int, seconds: int) -> None:
+    if sys.platform == "win32":  # which has no such limits: the time limit of the caller has to do there
+        return
+    import resource
+
+    limits = {resource.RLIMIT_FSIZE: output, resource.RLIMIT_CPU: seconds, resource.RLIMIT_CORE: 0}
+    with suppress(OSError):  # macOS has no /proc, and takes no RLIMIT_AS
+        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
+        limits[resource.RLIMIT_AS] = pages * resource.getpagesize() + memory
+    for limit, most in limits.items():
+        with suppress(ValueError, OSError):
+            resource.setrlimit(limit, (most, most))
+
+
+def command(memory: int, output: int, seconds: int, *words: str) -> list[str]:
+    """The command line of this script: limits, and what it shall do."""
+    return [sys.executable, "-P", __file__, *map(str, (memory, output, seconds)), *words]
+
+
+if __name__ == "__main__":
+    converts = sys.argv[4] == "convert"
+    try:
+        __import__("gaussforge" if converts else "pycolmap")  # its own memory does not count
+        _limit(*map(int, sys.argv[1:4]))
+        _convert(*sys.argv[5:]) if converts else _cameras(*sys.argv[5:])
+    except Exception as error:  # reported by the caller
+        print(f"{type(error).__name__}: {error}", file=sys.stderr)
+        sys.exit(3)
