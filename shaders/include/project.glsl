@@ -20,6 +20,7 @@ uniform vec3 eye_low;        // … and what the rounding left over
 uniform vec4 intrinsics;     // fx, fy, cx, cy
 uniform vec2 size;           // width, height
 uniform bool antialiased;    // opacity × sqrt(det before dilation / det after)
+uniform bool activated;      // what stands for logits are opacities, which may be more than 1
 uniform bool highlighted;         // whether `highlight` is there
 uniform sampler2D highlight;      // rgb, and how much of it takes the place of the Gaussian's own color; 1 hides it
 
@@ -52,7 +53,7 @@ void project(uint splat) {
     vec3 offset = (mean_and_logit.xyz - eye_high) - eye_low;
     if (logit_is_nan || scales_are_bad || not_finite(offset)) return;
 
-    float opacity = 1.0 / (1.0 + exp(-clamp(logit, -80.0, 80.0)));
+    float opacity = activated ? logit : 1.0 / (1.0 + exp(-clamp(logit, -80.0, 80.0)));
     vec3 p = rotation * offset;
     if (opacity < ALPHA_MIN || p.z <= 0.0) return;
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from progdf.camera import Camera
 from progdf.gaussians import normalize_quats
 from progdf.quaternions import matrix_quats, rotation_matrices
-from progdf.rasterize.cpu.pyramid import CELL, COARSER, DARKEST, LEAF, SLICES, SWELL
+from progdf.rasterize.cpu.pyramid import CELL, COARSER, CROWD, DARKEST, LEAF, SLICES
 from progdf.rasterize.engines import (
     ALPHA_MAX,
     ALPHA_MIN,
@@ -133,10 +133,9 @@ class PlainCut:
             dilated = (values[:, 1:].clamp_min(0.0) + wide[:, None]).prod(1).sqrt()
             dense = torch.maximum(opacity, (own[:, 0] + wide * own[:, 1]) / dilated)
             opacity = torch.where(merged, dense, opacity)
-        grow = torch.where(merged, 1.0 + SWELL * opacity.clamp_min(1.0).log(), 1.0)[:, None]
-        opacity = torch.where(merged, opacity.clamp_max(ALPHA_MAX), opacity)
-        sizes = (grow * scales**2 + more).clamp_min(0.0).sqrt()
-        a, _, c, det0 = covariances(points, quats, grow.sqrt() * scales, view)
+        opacity = torch.where(merged, opacity.minimum(opacity**CROWD), opacity)
+        sizes = (scales**2 + more).clamp_min(0.0).sqrt()
+        a, _, c, det0 = covariances(points, quats, scales, view)
         fine = det0 + self._dilation * (a + c) + self._dilation**2
         a, _, c, det = covariances(points, quats, sizes, view)
         opacity = opacity * (fine / (det + DILATION * (a + c) + DILATION**2)).sqrt()

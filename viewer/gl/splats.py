@@ -62,7 +62,8 @@ class SplatRenderer:
         self._buffers: _Buffers | None = None
         self._target: _Target | None = None
         self._drawn = 0
-        self._antialiased = False  # whether the scene is drawn so
+        # antialiased: whether the scene is drawn so; activated: whether it has opacities for logits
+        self._antialiased = self._activated = False
 
     @property
     def textures(self) -> SplatTextures:
@@ -77,8 +78,12 @@ class SplatRenderer:
             return np.zeros(0, np.int64), np.zeros((0, 4), np.uint8)
         return self._highlights.read()
 
-    def upload(self, scene: Gaussians) -> int:
-        """Take a whole scene; gives the bytes sent. The order has to be set anew."""
+    def upload(self, scene: Gaussians, activated: bool = False) -> int:
+        """Take a whole scene; gives the bytes sent. The order has to be set anew.
+
+        Args:
+            activated: its logits are opacities, which may be more than 1
+        """
         count, coefficients = len(scene), min(int(scene.shN.shape[1]), SHOWN_SH)
         size = (count, coefficients)
         scene_textures = self._scene
@@ -87,7 +92,7 @@ class SplatRenderer:
             self._scene = SplatTextures(self.ctx, count, coefficients)
             self._buffers = self._make_buffers(max(count, 1))
         self._drawn = 0
-        self._antialiased = scene.antialiased
+        self._antialiased, self._activated = scene.antialiased, activated
         return self.textures.write(scene)
 
     def update(self, scene: Gaussians, attributes: Iterable[str], rows: NDArray[np.int64]) -> int:
@@ -129,7 +134,7 @@ class SplatRenderer:
         if self._drawn and self._scene is not None and self._buffers is not None:
             self._scene.bind(self._project)
             _set_camera(self._project, camera)
-            self._project["antialiased"] = self._antialiased
+            self._project["antialiased"], self._project["activated"] = self._antialiased, self._activated
             self._project["highlighted"] = self._highlights is not None
             if self._highlights is not None:
                 self._highlights.bind(self._project, len(self._scene.textures))
@@ -152,8 +157,7 @@ class SplatRenderer:
     def _make_buffers(self, count: int) -> _Buffers:
         order = self.ctx.buffer(reserve=count * ORDER.itemsize, dynamic=True)
         projected = self.ctx.buffer(reserve=count * PROJECTED.itemsize, dynamic=True)
-        names = PROJECTED.names or ()
-        per_instance = (projected, f"{vertex_format(PROJECTED)}/i", *names)
+        per_instance = (projected, f"{vertex_format(PROJECTED)}/i", *(PROJECTED.names or ()))
         return _Buffers(
             order,
             projected,
@@ -174,13 +178,10 @@ class SplatRenderer:
             self._target = None
 
     def _release_scene(self) -> None:
-        if self._buffers is not None:
-            self._buffers.release()
-        if self._scene is not None:
-            self._scene.release()
-        if self._highlights is not None:
-            self._highlights.release()
-            self._highlights = None
+        for held in (self._buffers, self._scene, self._highlights):
+            if held is not None:
+                held.release()
+        self._highlights = None
 
 
 def vertex_format(dtype: np.dtype[Any]) -> str:

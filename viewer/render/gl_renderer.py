@@ -27,7 +27,7 @@ Image = NDArray[np.float32]
 Size = tuple[int, int]  # width and height, pixels
 
 _ROOM = 1 << 14  # Gaussians that textures grow by
-_LEAST = 1e-30  # what is taken for zero has a logarithm
+_LEAST = 1e-30  # of a scale, which has a logarithm
 
 T = TypeVar("T")
 
@@ -107,7 +107,7 @@ class GlRenderer:
 
         def draw(fewer: ActivatedGaussians) -> moderngl.Texture:
             gaussians = _to_raw(fewer)
-            renderer.upload(gaussians)
+            renderer.upload(gaussians, activated=True)
             renderer.set_order(back_to_front(gaussians.means[: len(fewer.means)].numpy(), camera))
             picture = renderer.draw(camera, background)
             self._ctx.finish()
@@ -159,13 +159,13 @@ class GlRenderer:
 
 
 def _to_raw(fewer: ActivatedGaussians) -> Gaussians:
-    """As textures hold them, with empty ones behind them up to one of few sizes."""
+    """As textures hold them, but for opacities, with empty ones behind them up to one of few sizes."""
     room = -(-max(len(fewer.means), 1) // _ROOM) * _ROOM - len(fewer.means)
     means, quats, scales, opacities, rgb = (
         torch.nn.functional.pad(tensor, (0, 0) * (tensor.ndim - 1) + (0, room)) for tensor in fewer.tensors
     )
     return Gaussians(
-        means, quats, scales.clamp_min(_LEAST).log(), opacities.clamp(_LEAST, 1.0 - 1e-6).logit(),
+        means, quats, scales.clamp_min(_LEAST).log(), opacities,
         (rgb - 0.5) / C0, rgb.new_zeros(len(rgb), 0, 3),
     )  # fmt: skip
 

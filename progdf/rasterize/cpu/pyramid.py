@@ -9,6 +9,7 @@ as it shows.
   and it shows as far as light reaches it, which a coarser cut of the same view tells, added up in a grid of
   cells and slices of depth.
 - The limit is sought so that about as many are drawn as asked for, beginning at the last picture's.
+- A node that is dense has an opacity beyond 1, which engines cut off where they blend: flat in its middle.
 - Each Gaussian has a dilation of its own in the fine picture: a node of many small ones is as dense as these
   are together. That of the coarse picture, which is wider, is taken off the size, and the remainder off the
   opacity.
@@ -67,9 +68,9 @@ near plane on, sixteen to a factor of two."""
 DARKEST = 3.0
 """Optical depth beyond which it makes no more difference: cells know nothing of gaps."""
 
-SWELL = 0.25
-"""How much the area of a node grows with the logarithm of its density beyond 1: opaque patches have no soft
-rims, and a surface of nodes would have holes."""
+CROWD = 0.6
+"""Power of a node's density beyond 1 that is its opacity. With more than 1 its middle is opaque and its rim
+steep, as that of several which cover each other: a surface of nodes as soft as one Gaussian has holes."""
 
 COARSER = 4.0
 """Times the limit, with which the cut is made that tells the light."""
@@ -572,21 +573,19 @@ def _take(
                 wide = dilation * unit
                 dilated = math.sqrt((longest * longest + wide) * (middle * middle + wide))
                 opacity = max(opacity, (own[WEIGHT] + wide * own[POINTS]) / max(dilated, _LEAST))
-            grow = 1.0 + SWELL * math.log(max(opacity, 1.0))
-            opacity = min(opacity, ALPHA_MAX)
+            opacity = min(opacity, opacity**CROWD)
         else:
-            grow, opacity = 1.0, float(scene.opacities[i])
+            opacity = float(scene.opacities[i])
         # the coarse picture's dilation instead of the fine one's: off the size, as far as that goes
         more = (dilation - DILATION) * unit
         a, b, c = scale
-        size = _roots(grow * a * a + more, grow * b * b + more, grow * c * c + more)
+        size = _roots(a * a + more, b * b + more, c * c + more)
         p0, p1 = times(seen.turned0, size), times(seen.turned1, size)
         normal = cross(p0, p1)
-        det0 = grow * grow * seen.det0
-        fine = det0 + dilation * (grow * (seen.a + seen.c) + dilation)
+        fine = seen.det0 + dilation * (seen.a + seen.c + dilation)
         coarse = dot(normal, normal) + DILATION * (dot(p0, p0) + dot(p1, p1)) + DILATION * DILATION
         if camera.antialiased:
-            opacity *= math.sqrt(max(ANTIALIAS_FLOOR, det0 / fine))
+            opacity *= math.sqrt(max(ANTIALIAS_FLOOR, seen.det0 / fine))
         out.opacities[at, 0] = opacity * math.sqrt(fine / coarse)
         out.quats[at, 0], out.quats[at, 1], out.quats[at, 2], out.quats[at, 3] = seen.quat
         for band in range(bands.shape[0]):

@@ -160,9 +160,9 @@ def test_an_opaque_surface_hides_most_of_what_is_behind_it() -> None:
         picture(some, camera)[10:-10, 10:-10] for some in (wall, Pyramid(wall).simplify(camera, 500))
     )
     assert float(full.max()) < 0.23, "a dark wall before white"
-    # soft nodes let through .47 where they meet; without a larger area for the dense ones .62, on average .40
-    assert float(merged.max()) < 0.5
-    assert float(merged.mean()) < 0.35
+    # nodes let through .34 where they meet; as soft as one Gaussian .62, and .40 on average
+    assert float(merged.max()) < 0.36
+    assert float(merged.mean()) == pytest.approx(float(full.mean()), abs=0.02)
 
 
 def test_what_others_hide_is_coarser() -> None:
