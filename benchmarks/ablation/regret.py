@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 
 import torch
@@ -24,6 +25,7 @@ from progdf.scene.regions import parse_region
 from progdf.terminal import print_line
 from trainer.editors import make_editor
 from trainer.editors.base import ImageEditor
+from trainer.editors.procedural import edit_course
 from trainer.fit.evaluate import Evaluator, make_evaluator
 from trainer.fit.fit import fit_grades, visibility
 from trainer.fit.slider_uniformity import equalized_strengths, strength_ruler
@@ -154,9 +156,11 @@ class Edit:
         most = iterations(OptimizeOptions().steps)
         drawn = color_views(self._crops(self.choosing), self.original)
         waited = 0.0  # for the training views' pictures, which are counted by `measure`
+        courses = [edit_course(self.painter, view) for view in self.choosing]
 
+        @cache
         def judge_at(s: float) -> Judge:
-            pictures = [quantize_image(self.painter.edit(view, s)) for view in self.choosing]
+            pictures = [quantize_image(picture_at(s)) for picture_at in courses]
             return Judge(drawn, [crop(p, v.box) for p, v in zip(pictures, self.choosing, strict=True)])
 
         def ask(strengths: Sequence[float]) -> list[Target]:

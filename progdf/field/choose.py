@@ -115,8 +115,8 @@ class FieldEvaluator:
     """Renders fields and says whether they serve.
 
     Beside the editor's own pictures a field serves that adds at most `allowed_error` of what the trajectory
-    has against them: where there are such pictures, all together, and on the way, against the trajectory, on
-    the mean. Without them its worst PSNR against the trajectory decides.
+    has against them: where there are such pictures, all together, and at the finished edit alone; and on the
+    way, against the trajectory, on the mean. Without them its worst PSNR against the trajectory decides.
 
     Args:
         strengths: of the snapshots. [T]
@@ -163,6 +163,8 @@ class FieldEvaluator:
         found = self._errors(lambda s: self._offsets(field, s))
         on_the_way = fmean(curve) if self._rule else max(curve)
         excess = max(fmean(found) - fmean(self._own), on_the_way) / self._allowed
+        if self._rule:
+            excess = max(excess, (found[-1] - self._own[-1]) / allowed_error(self._own[-1]))
         to_editor = decibels(fmean(found)) if self._rule else None
         return Candidate(field, tuple(decibels(e) for e in curve), label, excess, to_editor)
 

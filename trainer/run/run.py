@@ -39,6 +39,7 @@ from trainer.editors.base import ImageEditor
 from trainer.editors.decal import DecalEditor
 from trainer.editors.instruct import InstructEditor
 from trainer.editors.pictures import FolderEditor, picture_cameras
+from trainer.editors.procedural import edit_course
 from trainer.fit.draft import draft_grade, draft_views
 from trainer.fit.fit import choose_path, drop_idle_attributes
 from trainer.fit.network import PART as NETWORK
@@ -417,8 +418,12 @@ def _edit_views(
         folder.state.save("edited", {}, saved | {"trial": trial, "shared": shared})
         return made
 
+    @cache
+    def course(view: View) -> Callable[[float], Tensor]:
+        return edit_course(editor(), view)
+
     def look(s: float, some: Sequence[View]) -> list[Tensor]:
-        pictures = [editor().edit(view, s) for view in some]
+        pictures = [course(view)(s) for view in some]
         if confines_edit(editor(), approach.kind):
             pictures = [view.confine(picture) for view, picture in zip(some, pictures, strict=True)]
         return [quantize_image(picture) for picture in pictures]

@@ -21,6 +21,7 @@ from progdf.field import (
 )
 from progdf.field.baked import END_TYPES, interpolate_at
 from progdf.field.choose import FieldChoice, grow_ranks, render_trajectories, store_ends
+from progdf.field.keyframes import fit_lossless
 from progdf.field.separable import (
     channel_weights,
     decode_bases,
@@ -256,6 +257,18 @@ def test_the_choice_says_that_its_field_is_the_smallest_that_serves() -> None:
     assert chosen.why == f"the smallest of {len(chosen.tried)} fields that reaches 40 dB"
     sizes = [c.field.bytes_per_member for c in chosen.tried if c.excess <= 1]
     assert chosen.best.field.bytes_per_member == min(sizes)
+
+
+@pytest.mark.parametrize(("at", "serves"), [(2, True), (4, False)])
+def test_a_field_serves_that_is_near_at_the_finished_edit_too(at: int, serves: bool) -> None:
+    """One strength of four is off by 1.3 levels of 8 bits, which the mean of all hides."""
+    strengths = torch.linspace(0, 1, 5)
+    offsets = strengths[:, None, None].expand(5, 40, 14).contiguous()
+    edited = {float(s): o[:, :3] for s, o in zip(strengths[1:], offsets[1:], strict=True)}
+    evaluator = FieldEvaluator(strengths, offsets, lambda rows: rows[:, :3], edited=edited)
+    off = offsets.clone()
+    off[at] += 1.3 / 255
+    assert (evaluator.candidate(fit_lossless(strengths, off), "off").excess <= 1.0) is serves
 
 
 def test_what_an_edit_misses_of_its_editor_decides_how_much_is_stored() -> None:
