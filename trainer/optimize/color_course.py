@@ -20,8 +20,8 @@ from .color_views import MORE_PAYS, Judge
 from .pgs import OnStep, ParameterSnapshot, PgsState, TargetStage
 from .retime import smooth_weights
 
-STEPS, MISSED = "steps", "missed"
-"""Of a recording's means: the steps that it took, and what is left in views not solved for, see `Judge`."""
+STEPS = "steps"
+"""Of a recording's means: the steps that it took."""
 
 Target = tuple[TargetStage, Judge]
 """A strength's pictures, and views not solved for that say when these are met."""
@@ -100,11 +100,11 @@ def solve(
 
     def learn(index: int) -> None:
         """What was yielded of a target is known."""
-        strength, table = course.targets[index][0].strength, made[index].table
+        (stage, judge), table = course.targets[index], made[index].table
         assert table is not None
         offsets = member_bands(made[index].offsets.float())
-        residuals[strength] = (offsets - solver.map_offsets(model.degree, table))[:, : model.bands]
-        known[strength] = offsets, made[index].means[MISSED]
+        residuals[stage.strength] = (offsets - solver.map_offsets(model.degree, table))[:, : model.bands]
+        known[stage.strength] = offsets, judge.error(offsets)
 
     def solve_target(target: Target) -> ParameterSnapshot:
         stage, judge = target
@@ -129,7 +129,7 @@ def solve(
         state.average.copy_(state.moved.detach())
         state.running = left_over
         l2 = Judge(solver.views, stage.targets).error(offsets)
-        state.means.add({"l2": l2, "left": left_over, MISSED: judge.error(offsets)})
+        state.means.add({"l2": l2, "left": left_over})
         state.step, state.recorded = state.step + 1, state.recorded + 1
         state.stage, state.local = state.stage + 1, 0
         return ParameterSnapshot(

@@ -22,7 +22,7 @@ from progdf.io.tensors import check_tensor
 from progdf.rasterize.engines import engine_device
 from progdf.scene.bounds import scene_sphere
 from trainer.fit.network import JointTraining, begin_joint_training, save_network
-from trainer.optimize.color_course import MISSED, STEPS, Course, Target, solve
+from trainer.optimize.color_course import STEPS, Course, Target, solve
 from trainer.optimize.color_solver import (
     Model,
     Solver,
@@ -222,10 +222,7 @@ def optimize_members(
         offsets = [*(made.offsets.float() for made in ends[:-1]), end]
         snapshots = group_path(original, groups, offsets, [made.step for made in ends], settings.snapshots)
     taken = [int(made.means[STEPS]) for made in ordered if STEPS in made.means]
-    rows = [
-        (m.step, {name: mean for name, mean in m.means.items() if name not in (STEPS, MISSED)})
-        for m in ordered
-    ]
+    rows = [(m.step, {name: mean for name, mean in m.means.items() if name != STEPS}) for m in ordered]
     trajectory, effort = record(snapshots, end[:own], strengths), {"strengths": strengths, STEPS: taken}
     if seeds is not None:
         finished = original + end.to(device)
