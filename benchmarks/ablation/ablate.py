@@ -26,6 +26,7 @@ from progdf.io.images import read_picture, write_image
 from progdf.io.json_values import decode_json, plain
 from trainer.fit.fit import drop_idle_attributes
 from trainer.optimize.losses import Perceptual, describe_loss, perceptual_loss
+from trainer.optimize.retime import smooth_course
 from trainer.options import TrainOptions
 from trainer.report.report import SHOWN, best_view, editor_strip, strip
 from trainer.resolve import resolve_kind, use_threads
@@ -198,7 +199,7 @@ def _record(
             log,
         )
     choosing, _ = shared.evaluators(trajectory.offsets)[0].halves()
-    trajectory, _ = drop_idle_attributes(trajectory, choosing, not optimization.as_printed)
+    trajectory, _ = drop_idle_attributes(smooth_course(trajectory), choosing, not optimization.as_printed)
     return retime_trajectory(trajectory, setup, optimization, log)
 
 

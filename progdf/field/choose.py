@@ -138,7 +138,7 @@ class FieldEvaluator:
     ) -> None:
         course = truth or (lambda s: interpolate_at(strengths, offsets, s))
         self._render, self._rule = render, bool(edited)
-        self._nothing = torch.zeros_like(offsets[0])
+        self._nothing = torch.zeros(offsets.shape[1:])
         with torch.no_grad():
             self._expected = [render(course(s)) for s in sample_strengths()]
             self._edited = edited or {1.0: render(course(1.0))}

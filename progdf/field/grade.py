@@ -158,13 +158,13 @@ def mapped_bands(degree: int, table: Tensor, rows: Tensor, share: Tensor) -> Ten
 
 
 def lowest_bands(offsets: Tensor, bands: int) -> Tensor:
-    """The columns of the lowest bands of packed offsets. [S,M,C] -> [S,M,3·bands]"""
-    slices = attribute_slices(offsets.shape[2])
-    columns = list(range(*slices["sh0"].indices(offsets.shape[2])))[: 3 * bands]
+    """The columns of the lowest bands of packed offsets. [...,C] -> [...,3·bands]"""
+    slices = attribute_slices(offsets.shape[-1])
+    columns = list(range(*slices["sh0"].indices(offsets.shape[-1])))[: 3 * bands]
     if bands > 1:
         first = slices["shN"].start
         columns += range(first, first + 3 * (bands - 1))
-    return offsets[:, :, columns]
+    return offsets[..., columns]
 
 
 def bake_grade(form: GradeForm, rows: Tensor, mapped: Tensor | None = None) -> BakedField:

@@ -11,6 +11,13 @@ from .baked import AttributeBases, BakedField
 from .separable import check_trajectory, moving_attributes
 
 
+def keyframe_rows(strengths: Tensor, count: int) -> list[int]:
+    """The snapshots that `fit_keyframes` keeps, ascending. [T]"""
+    even = torch.linspace(0, 1, count, dtype=strengths.dtype)
+    nearest = (strengths[:, None] - even).abs().argmin(dim=0)
+    return sorted({*(nearest if count < len(strengths) else torch.arange(len(strengths))).tolist()})
+
+
 def fit_keyframes(
     strengths: Tensor,
     offsets: Tensor,
@@ -36,10 +43,7 @@ def fit_keyframes(
     check_trajectory(strengths, offsets)
     if count < 2:
         raise ValueError(f"{count} keyframes, expected at least 2")
-    even = torch.linspace(0, 1, count, dtype=strengths.dtype)
-    rows = torch.unique((strengths[:, None] - even).abs().argmin(dim=0))
-    if count >= len(strengths):
-        rows = torch.arange(len(strengths))
+    rows = keyframe_rows(strengths, count)
     table = torch.zeros(len(rows), len(rows) - 1)
     table[-1, 0] = 1.0
     table[1:-1, 1:] = torch.eye(len(rows) - 2)

@@ -105,7 +105,7 @@ def fit_amplitude(
         amplitude = ((offsets * root).flatten(1) @ end).double() / power
     amplitude[0], amplitude[-1] = 0.0, 1.0
     trajectory = AttributeTrajectory(offsets, weights, amplitude.float(), torch.zeros(0), stored)
-    rows = (trajectory.residual * root).flatten(1)
+    rows = trajectory.residual.mul_(root).flatten(1)
     return replace(trajectory, gram=(rows @ rows.T).double())
 
 
@@ -137,7 +137,7 @@ def store_attribute(
         mix: how each basis beside the full offset is mixed from what that leaves. [T,R]
         basis_type: int8, float16 or float32
     """
-    full = trajectory.offsets[-1].contiguous()
+    full = trajectory.offsets[-1].clone()  # a view would keep all rows
     end, unit = trajectory.end or (full[None], torch.ones(1, full.shape[1]))
     exact = (mix.T.float() @ trajectory.residual.flatten(1)).reshape(-1, *full.shape)
     levels, step = quantize_bases(exact, basis_type)

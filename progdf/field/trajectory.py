@@ -8,7 +8,6 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -72,7 +71,7 @@ class Trajectory:
         """Offsets of one recording. [M,C] float32"""
         return self.end if index == len(self) - 1 else self.offsets[index].float()
 
-    @cached_property
+    @property
     def nodes(self) -> Tensor:
         """Offsets of all recordings. [S,M,C] float32"""
         return torch.stack([self.node(i) for i in range(len(self))])

@@ -12,10 +12,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from progdf.field import BakedField, Candidate, FieldChoice, FieldEvaluator, choose_field, fit_keyframes
+from progdf.field import BakedField, Candidate, FieldChoice, FieldEvaluator, choose_field
 from progdf.field.baked import GradeForm, NeuralForm
 from progdf.field.choose import MOST_SNAPSHOTS, SAMPLES, pick_candidate
 from progdf.field.grade import COARSER, bake_grade, fit_grade, lowest_bands, mapped_bands, rank_limit
+from progdf.field.keyframes import fit_keyframes, keyframe_rows
 from progdf.field.separable import moving_attributes
 from progdf.field.trajectory import Trajectory
 from progdf.gaussians import BASE_CHANNELS, Gaussians, attribute_slices
@@ -25,6 +26,7 @@ from trainer.editors.base import ImageEditor
 from trainer.optimize.retime import select_recordings
 from trainer.options import FieldKind, FieldOptions
 from trainer.setup import TrainingSetup
+from trainer.store.progress import release_memory
 from trainer.views.choose import split_held_out
 from trainer.views.view import View
 
@@ -139,7 +141,8 @@ def fit_grades(
     mask, share = trajectory.mask, torch.ones(len(rows))
     share = share if mask is None else mask.float() / 255.0
     mapped = mapped_bands(degree, table, rows, share)
-    course = lowest_bands(trajectory.nodes, trajectory.bands) - mapped[:, :, : 3 * trajectory.bands]
+    course = torch.stack([lowest_bands(trajectory.node(i), trajectory.bands) for i in range(len(table))])
+    course -= mapped[:, :, : 3 * trajectory.bands]
     evaluator = field_evaluator(trajectory, choosing, options.target_psnr)
     tried, serving, smallest = list[Candidate](), 0, math.inf
 
@@ -148,6 +151,7 @@ def fit_grades(
         form = fit_grade(trajectory.s, degree, table, course, rank, weights, mask, COARSER[index])
         if form.bytes_per_member > smallest:
             return False
+        release_memory()
         field = replace(bake_grade(form, rows, mapped), recorded=tuple(trajectory.s.tolist()))
         tried.append(evaluator.candidate(field, form.label))
         serves = tried[-1].excess <= 1.0
@@ -168,24 +172,25 @@ def field_evaluator(trajectory: Trajectory, views: Evaluator, target: float | No
     which there are some; or a target in dB."""
     known = [(s, strength) for s, strength in trajectory.stage_strengths if strength in views.edited]
     edited = {s: views.count(views.edited[strength]) for s, strength in known}
-    offsets, render = trajectory.nodes, views.counted_pixels
+    course = trajectory.s, trajectory.offsets, views.counted_pixels, trajectory.at
     if target is None:
-        return FieldEvaluator(trajectory.s, offsets, render, edited=edited)
-    return FieldEvaluator(trajectory.s, offsets, render, target=target)
+        return FieldEvaluator(*course, edited=edited)
+    return FieldEvaluator(*course, target=target)
 
 
 def _measure_choice(choice: FieldChoice, trajectory: Trajectory, reporting: Evaluator) -> Fitted:
     """The choice with its errors, and baselines with theirs, on views that it has not seen."""
-    offsets, best = trajectory.nodes, choice.best
-    errors = FieldEvaluator(trajectory.s, offsets, reporting.counted_pixels)
+    release_memory()
+    best = choice.best
+    errors = FieldEvaluator(trajectory.s, trajectory.offsets, reporting.counted_pixels, trajectory.at)
     if best.to_editor is not None:
         choice = replace(choice, why=f"{choice.why}, with it {best.to_editor:.1f} dB")
-    baselines = {
-        f"keyframes{count}": errors.candidate(
-            fit_keyframes(trajectory.s, offsets, count, trajectory.s.tolist()), f"{count} keyframes"
-        )
-        for count in BASELINES
-    }
+    baselines = dict[str, Candidate]()
+    for count in BASELINES:
+        rows = keyframe_rows(trajectory.s, count)
+        nodes = torch.stack([trajectory.node(i) for i in rows])
+        field = fit_keyframes(trajectory.s[rows], nodes, count, trajectory.s.tolist())
+        baselines[f"keyframes{count}"] = errors.candidate(field, f"{count} keyframes")
     return Fitted(errors.candidate(best.field, best.label), choice, baselines)
 
 

@@ -39,6 +39,7 @@ from .color_views import (
     ColorView,
     Judge,
     MapFit,
+    add_colors,
     fit_maps,
     improve_mask,
     iterate_views,
@@ -138,8 +139,8 @@ class _Pull:
 
     descent: Tensor  # against the gradient of half the error. [M,b,3]
     error: float  # squared, with what holds the residual
-    # of each view, members' channels and pixels' that a clamp lets through. [M,3], [P,3] bool
-    clamps: Sequence[tuple[Tensor, Tensor]]
+    drawn: Tensor  # members' channels that a clamp lets through, of each view. [V,M,3] bool
+    passed: Sequence[Tensor]  # pixels' of which it does, of each view. [P,3] bool
 
 
 @dataclass(frozen=True)
@@ -291,29 +292,31 @@ class Solver:
     def _pull(self, mapped: Tensor, residual: Tensor, targets: Sequence[Tensor], ridge: float) -> _Pull:
         """See `_Pull`."""
         offsets = add_bands(mapped, residual)
+        drawn = torch.empty(len(self.views), len(residual), 3, dtype=torch.bool)
 
-        def look(index: int) -> tuple[Tensor, Tensor, Tensor, float]:
+        def look(index: int) -> tuple[Tensor, Tensor, float]:
             colors = self.views[index].colors(offsets)
             pull, passed, squared = self.views[index].pull(colors, targets[index])
-            drawn = (colors > 0.0) | (pull > 0.0)
-            return drawn, passed, pull * drawn, squared
+            np.logical_or(colors.numpy() > 0.0, pull.numpy() > 0.0, out=drawn[index].numpy())
+            return passed, pull.mul_(drawn[index]), squared
 
-        descent, clamps = -self._hold(residual, ridge), list[tuple[Tensor, Tensor]]()
+        descent, all_passed = -self._hold(residual, ridge), list[Tensor]()
         error = _inner(residual, self._hold(residual, ridge))
         looks = iterate_views(look, range(len(self.views)))
-        for view, (drawn, passed, pull, squared) in zip(self.views, looks, strict=True):
-            descent += view.basis[:, : residual.shape[1], None] * pull[:, None]
+        for view, (passed, pull, squared) in zip(self.views, looks, strict=True):
+            descent.addcmul_(view.basis[:, : residual.shape[1], None], pull[:, None])
             error += squared
-            clamps.append((drawn, passed))
-        return _Pull(descent, error, clamps)
+            all_passed.append(passed)
+        return _Pull(descent, error, drawn, all_passed)
 
     def _curvature(self, pull: _Pull, along: Tensor, ridge: float) -> float:
         """Of half the squared error in a direction, where the clamps stay as they are. [M,b,3]"""
 
         def look(index: int) -> float:
-            view, (drawn, passed) = self.views[index], pull.clamps[index]
-            colors = torch.einsum("mb,mbc->mc", view.basis[:, : along.shape[1]], along) * drawn
-            return float((view.map.picture(colors) * passed).square().sum())
+            view, colors = self.views[index], np.zeros(pull.drawn.shape[1:], np.float32)
+            add_colors(view.basis.numpy(), along.numpy(), colors)
+            picture = view.map.picture(torch.from_numpy(colors * pull.drawn[index].numpy()))
+            return float((picture * pull.passed[index]).square().sum())
 
         return sum(map_views(look, range(len(self.views)))) + _inner(along, self._hold(along, ridge))
 
@@ -321,7 +324,7 @@ class Solver:
 def make_solver(views: Sequence[ColorView], original: Tensor, ties: Ties | None = None) -> Solver:
     """The views, prepared. `original`: raw member rows [M,14+]; `ties`: where the views are few."""
     ones, weights = original.new_ones(len(original), 3), torch.zeros(())
-    weighed = map_views(lambda view: view.map.gradient(view.map.picture(ones) * view.counts)[:, 0], views)
+    weighed = iterate_views(lambda view: view.map.gradient(view.map.picture(ones) * view.counts)[:, 0], views)
     for view, weight in zip(views, weighed, strict=True):
         bands = view.basis[:, : BANDS[-1]]
         weights = weights + (weight[:, None] * bands)[:, :, None] * bands[:, None]

@@ -62,12 +62,14 @@ class ColorView:
     counts: Tensor  # which of these count. [P,1] bool
 
     def colors(self, offsets: Tensor) -> Tensor:
-        """Unclamped. Offsets of the lowest bands [M,b,3] -> [M,3]"""
-        return self.original + torch.einsum("mb,mbc->mc", self.basis[:, : offsets.shape[1]], offsets)
+        """What is drawn, not below 0. Offsets of the lowest bands [M,b,3] -> [M,3]"""
+        colors = self.original.numpy().copy()
+        add_colors(self.basis.numpy(), offsets.numpy(), colors)
+        return torch.from_numpy(np.maximum(colors, 0.0, out=colors))
 
     def picture(self, colors: Tensor) -> Tensor:
-        """Unclamped. [M,3] -> [P,3]"""
-        return self.others + self.map.picture(colors.clamp_min(0.0))
+        """Unclamped. Colors not below 0 [M,3] -> [P,3]"""
+        return self.others + self.map.picture(colors)
 
     @cached_property
     def own_pixels(self) -> Tensor:
@@ -81,12 +83,12 @@ class ColorView:
 
     def pull(self, colors: Tensor, target: Tensor) -> tuple[Tensor, Tensor, float]:
         """Against the gradient of half the squared error to a picture, of what the clamps pass: they do what
-        would bring a value back into the range. [M,3], [P,3]
+        would bring a value back into the range. Colors not below 0 [M,3], [P,3]
 
         Returns:
             By color [M,3]; channels of the pixels that are passed [P,3] bool; the squared error
         """
-        missing = self.map.picture(colors.clamp_min(0.0))
+        missing = self.map.picture(colors)
         passed = torch.empty_like(missing, dtype=torch.bool)
         squared = _compare(*(x.numpy() for x in (missing, self.others, target, self.counts[:, 0], passed)))
         return self.map.gradient(missing), passed, squared
@@ -118,6 +120,16 @@ def _compare(shown: Array, others: Array, target: Array, counts: Array, passed: 
             passed[p, c] = counts[p] and not held
             shown[p, c] = wanted - image if passed[p, c] else np.float32(0.0)
     return squared
+
+
+@kernel(cache=True)
+def add_colors(basis: Array, offsets: Array, colors: Array) -> None:
+    """colors += Σ basis · offset. Torch's own sums leave holes between what stays, .2 GB of 200 000 members:
+    glibc before 2.38 puts aligned memory into no hole of its size. [M,B], [M,b,3], [M,3] float32"""
+    for m in range(len(colors)):
+        for c in range(3):
+            for b in range(offsets.shape[1]):
+                colors[m, c] += basis[m, b] * offsets[m, b, c]
 
 
 def color_view(crop: CropScene, original: Tensor, bands: int, pixels: Tensor) -> ColorView:
@@ -157,7 +169,9 @@ def color_views(crops: Sequence[CropScene], original: Tensor, every: int = 1) ->
         place = torch.arange(width) + every // 2 * torch.arange(height)[:, None] + index
         return color_view(crop, original, bands, (place % every == 0).flatten().nonzero()[:, 0])
 
-    return map_views(make, range(len(crops)))
+    views = map_views(make, range(len(crops)))
+    alike = bands == 1  # from everywhere
+    return [replace(v, basis=views[0].basis, original=views[0].original) for v in views] if alike else views
 
 
 @dataclass(frozen=True)
@@ -183,15 +197,16 @@ class MapFit:
         may have such: at all members' colors it is held to the affine map, and
         that one to the same change of all.
         """
-        change = self._change(MONOMIALS[degree], targets)
+        pixels = [image.reshape(-1, 3)[p] for image, p in zip(targets, self.pixels, strict=True)]
+        change = self._change(MONOMIALS[degree], torch.cat(pixels))
         return identity_map(degree).to(change) + change
 
-    def _change(self, count: int, targets: Sequence[Tensor]) -> Tensor:
-        """What is added to the identity's first coefficients: 1, 4, 10 or 20. [count,3]"""
-        design, target = self.design[:, :count].contiguous(), self._pixels(targets)
+    def _change(self, count: int, target: Tensor) -> Tensor:
+        """What is added to the identity's first coefficients: 1, 4, 10 or 20. [P,3] -> [count,3]"""
+        design = self.design[:, :count].contiguous()
         normal, pull = self.normal[:count, :count], self.normal.new_zeros(count, 3)
         if count > 1:
-            coarse = self._change(4 if count > 4 else 1, targets).double()
+            coarse = self._change(4 if count > 4 else 1, target).double()
             held = self.held[:count, :count] * (1.0 if count > 4 else _SHIFT_HELD)
             normal, pull = normal + held, held[:, : len(coarse)] @ coarse
         normal = normal + _MAP_RIDGE * (normal.diagonal() + 1e-12).diag()
@@ -203,10 +218,6 @@ class MapFit:
             right = (design.T @ goal).double() + pull
             change = torch.linalg.solve(normal, right).float()
         return change
-
-    def _pixels(self, images: Sequence[Tensor]) -> Tensor:
-        """[h,w,3] each -> [P,3]"""
-        return torch.cat([image.reshape(-1, 3)[p] for image, p in zip(images, self.pixels, strict=True)])
 
 
 @one_thread()
@@ -222,9 +233,9 @@ def fit_maps(views: Sequence[ColorView], share: Tensor, most: int = _MOST_PIXELS
     def lay_out(index: int) -> tuple[Tensor, Tensor, Tensor]:
         view, some = views[index], pixels[index]
         terms = monomials(view.original.T.clamp(0.0, MOST_COLOR), 3)
-        planes: tuple[Tensor, ...] = torch.split(torch.cat([share * terms, terms[:1]]), 3)
-        shown = torch.cat([view.map.picture(plane.T)[some] for plane in planes], dim=1)
-        original = view.picture(view.original)[some]
+        planes: tuple[Tensor, ...] = torch.split(torch.arange(21) % 20, 3)
+        shown = torch.cat([view.map.picture((share * terms[rows]).T)[some] for rows in planes], dim=1)
+        original = view.picture(view.original.clamp_min(0.0))[some]
         return shown[:, :20], original, (terms @ terms.T).double()
 
     covered = map_views(lambda view: view.own_pixels.nonzero()[:, 0], views)
@@ -302,7 +313,7 @@ def improve_mask(
     def look(share: Tensor) -> tuple[Tensor, float]:
         def pull(pair: tuple[ColorView, Tensor, Tensor]) -> tuple[Tensor, float]:
             view, change, target = pair
-            by_color, _, squared = view.pull(view.original + share[:, None] * change, target)
+            by_color, _, squared = view.pull((view.original + share[:, None] * change).clamp_min(0.0), target)
             return (by_color * change).sum(dim=1), squared
 
         looks = map_views(pull, pairs)

@@ -316,9 +316,8 @@ def _rows_before(
         raise TypeError("discs are placed by the CPU engine's lists")
     runs, axis = listed.runs, camera.viewmat[2]
     depths = (scene.means.double() @ axis[:3].double() + axis[3].double()).numpy()
-    counts = np.diff(runs.starts)
-    owner = np.repeat(runs.rows, counts)
-    pixel = np.repeat(runs.firsts.astype(np.int64), counts) + runs.pixels
+    owner = np.repeat(runs.rows, runs.counts)
+    pixel = np.repeat(runs.firsts.astype(np.int64), runs.counts) + runs.pixels
     window = slice(box[1], box[3]), slice(box[0], box[2])
     piece = pieces[window].reshape(-1)[pixel]
     short = behind[window].reshape(-1)[pixel] - depths[owner]

@@ -46,7 +46,7 @@ from trainer.fit.network import PART as NETWORK
 from trainer.fit.slider_uniformity import equalized_strengths, strength_ruler
 from trainer.optimize.growth import fade_in
 from trainer.optimize.losses import Perceptual, describe_loss, perceptual_loss
-from trainer.optimize.retime import resolve_slider
+from trainer.optimize.retime import resolve_slider, smooth_course
 from trainer.options import EditKind, OptimizeOptions, TrainOptions
 from trainer.regions.from_pictures import CHANGED, RegionRequest, region_checks, region_kinds
 from trainer.report.agreement import measure_agreement
@@ -271,6 +271,7 @@ def _run_training(
             finals = grown.scene.replace_rows(grown.region.members, end_rows(grown, trajectory))
             write_finals(setup, finals, folder, log)
         folder.state.save("recorded", {}, log.capture_state().values)
+        del trajectory, grown, finals  # all is read anew, as it is on disk
     else:
         log.restore(recorded)
         log.say("the trajectory is recorded")
@@ -533,6 +534,7 @@ def _record(
         )
     setup = setup.extend(trajectory.added)
     with log.stage("retime"):
+        trajectory = smooth_course(trajectory)
         costs: dict[str, float] = {}
         recolors = only_recolors(trajectory.offsets)
         # of a grade nothing is dropped

@@ -44,11 +44,11 @@ from trainer.optimize.pgs import (
     optimize,
     pgs_settings,
 )
-from trainer.optimize.retime import drop_jitter, record, resolve_slider, retime, smooth_course
+from trainer.optimize.retime import drop_jitter, record, resolve_slider, retime
 from trainer.optimize.ties import surface_ties
 from trainer.options import MOST_STAGES, OptimizeOptions, TrainOptions
 from trainer.setup import Pictures, TrainingSetup, probe_views
-from trainer.store.progress import RunLog
+from trainer.store.progress import RunLog, release_memory
 from trainer.store.run_folder import LazySequence, stored_pictures
 from trainer.store.state import PeriodicSave, Resumable, Saved, StateFolder, defer_signals
 from trainer.views.choose import split_held_out
@@ -80,6 +80,7 @@ class Recordings:
 
     def add(self, snapshot: ParameterSnapshot) -> None:
         """Keep one."""
+        release_memory()
         table = None if snapshot.table is None else snapshot.table.cpu()
         self.made.append(replace(snapshot, offsets=snapshot.offsets.half().cpu(), table=table))
 
@@ -233,12 +234,12 @@ def optimize_members(
         log.say(f"growth: {effort['added']} Gaussians added, of {len(seeds)}; the others contribute nothing")
     if model is not None:
         maps = torch.stack([made.table for made in ordered if made.table is not None])
-        trajectory = smooth_course(replace(trajectory, maps=maps, bands=model.bands, mask=model.mask))
+        trajectory = replace(trajectory, maps=maps, bands=model.bands, mask=model.mask)
         counts = (
             f"in {', '.join(map(str, taken))} steps, of {most} each at most" if taken else "by maps alone"
         )
         log.say(f"{len(strengths)} strengths {counts}")
-        effort |= model.figures() | {"most_steps": most, "views": len(colors.views)}
+        effort |= model.figures() | {"most_steps": most, "views": len(crops)}
     return trajectory, loss_table(rows), effort
 
 

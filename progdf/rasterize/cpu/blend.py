@@ -451,11 +451,9 @@ class Runs(NamedTuple):
     """What each of M Gaussians weighs in each pixel of a window, run by run of one Gaussian in one tile."""
 
     rows: Array  # the Gaussian of each run, 0..M−1. [R] int32
-    starts: Array  # first entry of each run, and the number of entries. [R+1] int64
+    counts: Array  # entries of each run, one run's after another's. [R] uint16
     firsts: Array  # pixel of each run's first entry, in the window, row by row. [R] int32
-    pixels: (
-        Array  # of each entry, counted from its run's first. [E] uint16, in windows too wide for it uint32
-    )
+    pixels: Array  # of each entry, from its run's first. [E] uint16, in windows too wide for it uint32
     weights: Array  # αT of each entry. [E] float32
 
 
@@ -573,7 +571,7 @@ def _list_tile(
                     entry += 1
         if entry > begun:
             if write:
-                out.rows[run], out.starts[run], out.firsts[run] = rows[s], begun, base
+                out.rows[run], out.counts[run], out.firsts[run] = rows[s], entry - begun, base
             run += 1
     return run, entry
 

@@ -311,20 +311,20 @@ def color_map(
 
 def _new_runs(runs: int, entries: int, index: np.dtype[Any]) -> Runs:
     """Room for them; `index`: of a pixel in its run."""
-    rows, firsts, starts = np.empty(runs, np.int32), np.empty(runs, np.int32), np.full(runs + 1, entries)
-    return Runs(rows, starts, firsts, np.empty(entries, index), np.empty(entries, np.float32))
+    rows, counts, firsts = np.empty(runs, np.int32), np.empty(runs, np.uint16), np.empty(runs, np.int32)
+    return Runs(rows, counts, firsts, np.empty(entries, index), np.empty(entries, np.float32))
 
 
 @kernel(fast=True, cache=True)
 def add_images(runs: Runs, colors: Array, image: Array) -> None:
     """image += Σ w·c. colors: [M,3] float32; image: [h·w,3] float32"""
+    end = np.uint64(0)
     for run in range(runs.rows.size):
-        row = runs.rows[run]
+        row, begin = runs.rows[run], end
+        end = begin + np.uint64(runs.counts[run])
         red, green, blue = colors[row, 0], colors[row, 1], colors[row, 2]
-        first = np.uint64(
-            runs.firsts[run]
-        )  # unsigned: numba looks at signed ones whether they count from the end
-        for k in range(np.uint64(runs.starts[run]), np.uint64(runs.starts[run + 1])):
+        first = np.uint64(runs.firsts[run])  # unsigned: of signed ones numba asks if they count from the end
+        for k in range(begin, end):
             p, w = first + np.uint64(runs.pixels[k]), runs.weights[k]
             image[p, 0] += w * red
             image[p, 1] += w * green
@@ -334,10 +334,12 @@ def add_images(runs: Runs, colors: Array, image: Array) -> None:
 @kernel(fast=True, cache=True)
 def add_gradients(runs: Runs, gradient: Array, by_colors: Array) -> None:
     """by_colors += Σ w·g. gradient: of the image, [h·w,3] float32; by_colors: [M,3] float32"""
+    end = np.uint64(0)
     for run in range(runs.rows.size):
         red = green = blue = np.float32(0.0)
+        begin, end = end, end + np.uint64(runs.counts[run])
         first = np.uint64(runs.firsts[run])
-        for k in range(np.uint64(runs.starts[run]), np.uint64(runs.starts[run + 1])):
+        for k in range(begin, end):
             p, w = first + np.uint64(runs.pixels[k]), runs.weights[k]
             red += w * gradient[p, 0]
             green += w * gradient[p, 1]
