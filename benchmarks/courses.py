@@ -68,7 +68,19 @@ def known_edit(
     )
     weights = visible / visible.mean() + 1e-3
     look = _changed_pixels(scene, members, offsets, seen)
-    return KnownEdit(name, scene, members, strengths, offsets, truth, judge, chooser, look, weights, shown)
+    return KnownEdit(
+        name=name,
+        scene=scene,
+        members=members,
+        strengths=strengths,
+        offsets=offsets,
+        truth=truth,
+        judge=judge,
+        chooser=chooser,
+        look=look,
+        weights=weights,
+        unseen=shown,
+    )
 
 
 def _changed_pixels(scene: Gaussians, members: Tensor, offsets: Tensor, cameras: Sequence[Camera]) -> Render:

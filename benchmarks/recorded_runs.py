@@ -32,15 +32,15 @@ def recorded_edit(root: Path) -> KnownEdit:
     )
     offsets = trajectory.nodes
     return KnownEdit(
-        f"{run.region.name} (recorded)",
-        run.scene,
-        run.region.members,
-        trajectory.s,
-        offsets,
-        trajectory.at,
-        FieldEvaluator(trajectory.s, offsets, judge),
-        FieldEvaluator(trajectory.s, offsets, chooser),
-        look,
-        visibility(run.scene, run.region.members, setup.train),
-        judge,
+        name=f"{run.region.name} (recorded)",
+        scene=run.scene,
+        members=run.region.members,
+        strengths=trajectory.s,
+        offsets=offsets,
+        truth=trajectory.at,
+        judge=FieldEvaluator(trajectory.s, offsets, judge),
+        chooser=FieldEvaluator(trajectory.s, offsets, chooser),
+        look=look,
+        weights=visibility(run.scene, run.region.members, setup.train),
+        unseen=judge,
     )

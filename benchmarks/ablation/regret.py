@@ -249,15 +249,15 @@ class Edit:
         """The field that a run would keep of these, its slider the editor's own strength."""
         count = len(strengths)
         trajectory = Trajectory(
-            torch.tensor([0.0, *strengths]),
-            torch.stack([torch.zeros_like(offsets[0]), *offsets]).half(),
-            offsets[-1],
-            torch.arange(count + 1),
-            tuple(range(1, count + 1)),
-            tuple(strengths),
-            torch.stack(list(tables)),
-            bands,
-            mask,
+            s=torch.tensor([0.0, *strengths]),
+            offsets=torch.stack([torch.zeros_like(offsets[0]), *offsets]).half(),
+            end=offsets[-1],
+            steps=torch.arange(count + 1),
+            stage_ends=tuple(range(1, count + 1)),
+            strengths=tuple(strengths),
+            maps=torch.stack(list(tables)),
+            bands=bands,
+            mask=mask,
         )
         trajectory = smooth_course(trajectory)
         choosing = self.evaluator(self.choosing, {s: self.aside(s) for s in strengths})

@@ -103,17 +103,17 @@ def make_ablation_setup(run: FinishedRun, plan: TrainOptions, kind: EditKind, qu
     for view in (*setup.train, *setup.held_out):
         digest.update(view.image.numpy().tobytes())
     return AblationSetup(
-        run,
-        plan,
-        kind,
-        setup,
-        edited,
-        evaluator(setup.held_out, drawn, False),
-        (evaluator(setup.held_out, drawn, True), evaluator(few, learned, True)),
-        columns,
-        evaluator(few, learned, False),
-        visibility(run.scene, run.region.members, setup.train),
-        digest.hexdigest(),
+        run=run,
+        plan=plan,
+        kind=kind,
+        setup=setup,
+        edited=edited,
+        evaluator=evaluator(setup.held_out, drawn, False),
+        still=(evaluator(setup.held_out, drawn, True), evaluator(few, learned, True)),
+        columns=columns,
+        seen=evaluator(few, learned, False),
+        weights=visibility(run.scene, run.region.members, setup.train),
+        digest=digest.hexdigest(),
     )
 
 

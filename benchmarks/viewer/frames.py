@@ -140,18 +140,18 @@ def measure_turning(
             errors = [_psnr(image, _draw_anew(mouse, view)) for view, image in coarse[way].kept]
             results.append(
                 Turning(
-                    mouse.main_view.facts.count,
-                    way,
-                    tuple(full[way].frames_ms[WARM_UP:]),
-                    tuple(full[way].draws_ms[WARM_UP:]),
-                    len(full[way].kept),
-                    wrong,
-                    opened_s[way],
-                    tuple(coarse[way].frames_ms[WARM_UP:]),
-                    float(np.median(full[way].processor_ms[WARM_UP:])),
-                    float(np.median(coarse[way].processor_ms[WARM_UP:])),
-                    min(errors),
-                    _at_rest(mouse),
+                    count=mouse.main_view.facts.count,
+                    way=way,
+                    frames_ms=tuple(full[way].frames_ms[WARM_UP:]),
+                    draws_ms=tuple(full[way].draws_ms[WARM_UP:]),
+                    checked=len(full[way].kept),
+                    wrong=wrong,
+                    opened_s=opened_s[way],
+                    coarse_ms=tuple(coarse[way].frames_ms[WARM_UP:]),
+                    processor_ms=float(np.median(full[way].processor_ms[WARM_UP:])),
+                    coarse_processor_ms=float(np.median(coarse[way].processor_ms[WARM_UP:])),
+                    coarse_db=min(errors),
+                    at_rest=_at_rest(mouse),
                 )
             )
     return results

@@ -127,9 +127,20 @@ def measure(
     engine.release()
     turned, used = tuple(turning[WARM_UP:]), float(np.median(processor[WARM_UP:]))
     return Moving(
-        len(scene), turned, tuple(beside), sharp, meanwhile, used, build, memory, click, lasso, full, db,
-        luminance,
-    )  # fmt: skip
+        count=len(scene),
+        turning=turned,
+        beside=tuple(beside),
+        sharp=sharp,
+        meanwhile=meanwhile,
+        processor=used,
+        build=build,
+        memory=memory,
+        click=click,
+        lasso=lasso,
+        full=full,
+        db=db,
+        luminance=luminance,
+    )
 
 
 def table(results: Sequence[Moving]) -> Table:

@@ -116,7 +116,17 @@ def film(title: str, scene: Gaussians, views: Sequence[ViewCamera], size: tuple[
     most, least = (float(np.percentile(np.abs(parts), 99)) for parts in (blocks, halved))
     sharp, moving, apart = np.mean(means, axis=0).tolist()
     db = 10.0 * math.log10(255.0**2 / worst)
-    return Film(title, len(scene), limit, sharp, moving, apart, most, least, db)
+    return Film(
+        title=title,
+        count=len(scene),
+        limit=limit,
+        sharp=sharp,
+        moving=moving,
+        apart=apart,
+        blocks=most,
+        halved=least,
+        db=db,
+    )
 
 
 def _blocks(change: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -123,13 +123,7 @@ def finish_run(
         if field.attributes:  # its end is what its file says, not what was recorded
             trajectory = replace(trajectory, end=field.offsets(1.0))
         shipped = replace(trajectory, s=remap(trajectory.s).float())
-    log.say(
-        f"{fitted.chosen.label}, {fitted.choice.why}: "
-        f"{field.bytes_per_member:.0f} bytes per Gaussian without the header, "
-        f"worst {fitted.chosen.worst:.1f} dB, "
-        f"mean {fitted.chosen.mean:.1f} dB against {len(trajectory)} recordings "
-        f"in {format_count(len(reporting.names), 'view')}"
-    )
+    log.say(_choice_line(fitted, field.bytes_per_member, len(trajectory), len(reporting.names)))
     with log.stage("report"):
         clip = clip_curve(evaluator, setup.judging, field, options.texts)
         if clip.reason and options.texts.asked:
@@ -170,14 +164,7 @@ def finish_run(
             "field": list(reporting.names),
             "lpips_over": _LPIPS_OVER,
         },
-        "trajectory": {
-            "recordings": len(trajectory),
-            "slider": slider,
-            "s": [round(float(s), 4) for s in shipped.s],
-            "stages": list(trajectory.strengths),
-            "stages_at": [round(s, 4) for s, _ in shipped.stage_strengths],
-            "attribute_worth_db": record.attribute_worth_db,
-        },
+        "trajectory": _course_figures(shipped, slider, record),
         **_record_figures(record),
         "paint": paint.figures() if paint is not None else None,
         "time": {**(_earlier_seconds(folder) if log.refits else {}), **log.rounded_seconds()},
@@ -185,6 +172,28 @@ def finish_run(
         "plan": plan,
     }
     return _write(folder, gdf, report, picture, shipped, setup, paint, log)
+
+
+def _course_figures(shipped: Trajectory, slider: str, record: RunRecord) -> dict[str, Any]:
+    """As report.json has the recordings, on the slider as it is shipped."""
+    return {
+        "recordings": len(shipped),
+        "slider": slider,
+        "s": [round(float(s), 4) for s in shipped.s],
+        "stages": list(shipped.strengths),
+        "stages_at": [round(s, 4) for s, _ in shipped.stage_strengths],
+        "attribute_worth_db": record.attribute_worth_db,
+    }
+
+
+def _choice_line(fitted: Fitted, size: float, recordings: int, views: int) -> str:
+    """The field that was chosen, why, and how near it comes to the recordings; `size`: bytes per Gaussian"""
+    chosen = fitted.chosen
+    return (
+        f"{chosen.label}, {fitted.choice.why}: {size:.0f} bytes per Gaussian without "
+        f"the header, worst {chosen.worst:.1f} dB, mean {chosen.mean:.1f} dB against {recordings} recordings "
+        f"in {format_count(views, 'view')}"
+    )
 
 
 def _fit(
