@@ -33,6 +33,14 @@ def file_size(count: int) -> str:
     return f"{count / 1e6:.1f} MB" if count >= 1e6 else f"{count / 1e3:.1f} kB"
 
 
+def format_duration(seconds: float) -> str:
+    """ "12 s", "3 min", "1 h 20 min"."""
+    if seconds < 90:
+        return f"{max(round(seconds), 1)} s"
+    minutes = round(seconds / 60)
+    return f"{minutes} min" if minutes < 90 else f"{minutes // 60} h {minutes % 60} min"
+
+
 def format_place(at: float, size: float, digits: int) -> str:
     """A coordinate of something of this size: so many digits, and those by which it is farther off."""
     beyond = math.log10(abs(at) / size) if at and size > 0 else 0.0

@@ -31,6 +31,7 @@ from torch import Tensor
 
 from progdf.camera import Camera
 from progdf.cli.options import parse_options
+from progdf.color.edits import hex_color
 from progdf.color.palette import find_palette
 from progdf.errors import ProgdfError
 from progdf.formats.scene_file import load_scene
@@ -144,7 +145,7 @@ class Previewer:
             return []
         row = views.fitted.row
         colors = find_palette(row.inside.reshape(-1, 3), row.mask.reshape(-1))
-        return ["#" + "".join(f"{round(255 * x):02x}" for x in color) for color in colors.tolist()]
+        return [hex_color(color) for color in colors.tolist()]
 
     def _views(self, request: Request, editor: str) -> DraftViews | None:
         if self._draft[0] != request.region:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -35,10 +36,12 @@ from .views.view import (
     BACKGROUND,
     INSIDE,
     View,
+    crop,
     fit_size,
     make_view,
     name_cameras,
     region_rig,
+    shrink_image,
     with_near_plane,
 )
 
@@ -293,6 +296,24 @@ def whole_views(setup: TrainingSetup) -> TrainingSetup:
     return replace(
         setup, train=[replace(v, box=(0, 0, v.camera.width, v.camera.height)) for v in setup.train]
     )
+
+
+def shrink_view(
+    setup: TrainingSetup, view: View, edited: Tensor, camera: Camera
+) -> tuple[CropScene, Callable[[Tensor], Tensor], Tensor]:
+    """A view with a smaller camera: what is rendered of it, how its pictures come to that, and how much of
+    each pixel counts, as the region's or edited. [H,W,3] -> [h,w,1]"""
+    across, down = camera.width / view.camera.width, camera.height / view.camera.height
+    x0, y0, x1, y1 = view.box
+    right, bottom = min(camera.width, math.ceil(x1 * across)), min(camera.height, math.ceil(y1 * down))
+    box = (math.floor(x0 * across), math.floor(y0 * down), right, bottom)
+
+    def shrink(picture: Tensor) -> Tensor:
+        return crop(shrink_image(picture, (camera.height, camera.width)), box)
+
+    counts = (view.mask > 0.05) | ((edited - view.image).abs().amax(dim=2) > 2 / 255)
+    scene = crop_scene(setup.scene, setup.region.members, camera, box, setup.background)
+    return scene, shrink, shrink(counts.float()[..., None])
 
 
 def probe_views(

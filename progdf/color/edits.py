@@ -9,7 +9,7 @@ lightness are those of `progdf.color.oklab`; what lies between the original and 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 
@@ -48,6 +48,11 @@ def parse_color(text: str) -> Tensor:
     if len(digits) != 6 or any(digit not in "0123456789abcdefABCDEF" for digit in digits):
         raise ProgdfError(f"'{text}' is not a color; write it as #rrggbb, for example #d4af37")
     return torch.tensor([int(digits[i : i + 2], 16) / 255 for i in (0, 2, 4)])
+
+
+def hex_color(color: Sequence[float]) -> str:
+    """`#rrggbb` of a color 0..1."""
+    return "#" + "".join(f"{round(255 * min(max(channel, 0.0), 1.0)):02x}" for channel in color)
 
 
 def typical_color(rgb: Tensor, weights: Tensor | None = None) -> Tensor:

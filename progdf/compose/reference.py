@@ -110,6 +110,11 @@ _COLORS = ("sh0", "shN")
 _DRAWN = 16  # bands that are drawn
 
 
+def edited_scene(scene: Gaussians, gdf: Gdf, strength: float = 1.0) -> Gaussians:
+    """The scene under one edit, the rows that it adds after its own."""
+    return compose_layers(scene, [Layer(gdf, strength)])
+
+
 def compose_layers(scene: Gaussians, layers: Sequence[Layer], blend: str = "normalized") -> Gaussians:
     """The scene under a stack of edits.
 

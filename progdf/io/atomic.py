@@ -15,6 +15,7 @@ import time
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from itertools import count
 from pathlib import Path
 
 from platformdirs import user_cache_path, user_pictures_path, user_state_path
@@ -135,6 +136,11 @@ def _copy_into(target: Path) -> Iterator[Path]:
 def is_portable(name: str) -> bool:
     """Whether every system can have a file of this name, also with an ending: Windows is the strictest."""
     return not (_DEVICE.fullmatch(name) or set('<>:"/\\|?*') & set(name) or name.endswith((".", " ")))
+
+
+def numbered_names(stem: str, suffix: str = "") -> Iterator[str]:
+    """STEM, STEM-2, STEM-3 …, each with the suffix."""
+    return (f"{stem}-{number}{suffix}" if number > 1 else f"{stem}{suffix}" for number in count(1))
 
 
 def is_temporary(name: str) -> bool:

@@ -32,6 +32,7 @@ import msgspec
 
 from progdf.errors import ProgdfError
 
+from . import atomic
 from .atomic import atomic_write, check_regular, is_portable, open_error, read_file, temporary_subfolder
 from .json_values import convert_json, decode_json, plain
 
@@ -190,9 +191,8 @@ def write_bundle(path: Path, source: Path) -> int:
         raise ProgdfError(f"{scene.parent} is an unpacked .sog; export the scene as a .ply first")
     names: dict[Path, str] = {}
     for file in (scene, *edits):
-        numbered = (f"{file.stem}-{n}{file.suffix}" if n > 1 else file.name for n in range(1, _MOST_FILES))
-        taken = {name.lower() for name in names.values()}
-        names.setdefault(file, next(name for name in numbered if name.lower() not in taken))
+        taken, free = {name.lower() for name in names.values()}, atomic.numbered_names(file.stem, file.suffix)
+        names.setdefault(file, next(name for name in free if name.lower() not in taken))
     view = session.view
     for region in view.get("selection", {}).get("regions", ()):
         region["path"] = PureWindowsPath(region["path"]).name

@@ -77,7 +77,7 @@ def is_surrounding(scene: Gaussians, up: Tensor) -> bool:
 def has_long_tail(means: Tensor) -> bool:
     """Whether the far 3 % begin more than five times as far out as the middle. [N,3], N ≥ 1"""
     distances = (means - means.median(dim=0).values).norm(dim=1)
-    return float(_quantile(distances, 0.97)) > _LONG_TAIL * float(distances.median())
+    return float(quantile(distances, 0.97)) > _LONG_TAIL * float(distances.median())
 
 
 def has_ceiling(scene: Gaussians, up: Tensor) -> bool:
@@ -86,7 +86,7 @@ def has_ceiling(scene: Gaussians, up: Tensor) -> bool:
     if len(sample) < _ENOUGH:
         return False
     height = sample.means @ up
-    low, high = (_quantile(height, q) for q in (0.02, 0.98))
+    low, high = (quantile(height, q) for q in (0.02, 0.98))
     cells = plan_cells(sample, up)
     covered = len(torch.unique(cells))
     slab = 0.06 * (high - low)
@@ -101,7 +101,7 @@ def plan_cells(scene: Gaussians, up: Tensor, per_side: int = 8) -> Tensor:
     """The cell of a square grid over the ground plan that each Gaussian's mean falls in. [N] int64"""
     ahead = front_direction(up)
     plan = scene.means @ torch.stack([ahead, torch.linalg.cross(up, ahead)], dim=1)
-    low, high = (torch.stack([_quantile(c, q) for c in plan.unbind(1)]) for q in (0.02, 0.98))
+    low, high = (torch.stack([quantile(c, q) for c in plan.unbind(1)]) for q in (0.02, 0.98))
     cell = ((plan - low) / (high - low).clamp_min(1e-12) * per_side).long().clamp(0, per_side - 1)
     return cell[:, 0] * per_side + cell[:, 1]
 
@@ -116,7 +116,8 @@ def drop_background(scene: Gaussians) -> Gaussians | None:
     return sample[(distances <= _CORE * distances.median()).nonzero()[:, 0]]
 
 
-def _quantile(values: Tensor, share: float) -> Tensor:
+def quantile(values: Tensor, share: float) -> Tensor:
+    """The value that so large a share of them, 0..1, does not exceed. [N] -> []"""
     return values.kthvalue(min(max(round(share * len(values)), 1), len(values))).values
 
 

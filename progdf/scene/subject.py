@@ -16,7 +16,7 @@ from torch import Tensor
 from progdf.camera import Camera, intrinsics, look_at
 from progdf.gaussians import Gaussians
 
-from .bounds import front_direction, has_ceiling, has_long_tail
+from .bounds import front_direction, has_ceiling, has_long_tail, quantile
 
 _SAMPLE = 60_000
 _ENOUGH = 64
@@ -89,8 +89,8 @@ def fit_eye(points: Tensor, radius: float, axes: Tensor, tangents: tuple[float, 
     for along, tangent in ((right, tangents[0]), (up, tangents[1])):
         # |along − place| ≤ tangent · (away − back) for every point: two planes, which meet at the eye
         margin = radius * math.sqrt(1 + tangent**2)
-        high = float(_quantile(along + tangent * back, 0.995)) + margin
-        low = float(_quantile(tangent * back - along, 0.995)) + margin
+        high = float(quantile(along + tangent * back, 0.995)) + margin
+        low = float(quantile(tangent * back - along, 0.995)) + margin
         best.append(0.5 * (high - low))
         away = max(away, 0.5 * (high + low) / tangent)
     return torch.tensor([*best, away], dtype=torch.float64) @ axes.double()
@@ -140,7 +140,7 @@ def standpoint(scene: Gaussians, up: Tensor) -> tuple[Tensor, Tensor]:
     axes = torch.stack([ahead, torch.linalg.cross(up, ahead), up])
     middle = means.median(dim=0).values
     inside = (means - middle) @ axes.T
-    low, high = (torch.stack([_quantile(c, q) for c in inside.unbind(1)]) for q in (0.02, 0.98))
+    low, high = (torch.stack([quantile(c, q) for c in inside.unbind(1)]) for q in (0.02, 0.98))
     center, half = 0.5 * (low + high), 0.5 * (high - low)
     some = inside[:: -(-len(inside) // _LOOKED_AT)]
     near = _FREE * float(half[:2].min())
@@ -193,7 +193,7 @@ def _visible(places: Tensor, back: Tensor, wide: float = 0.0) -> Tensor:
     """
     right = torch.nn.functional.normalize(torch.linalg.cross(torch.tensor([0.0, 0.0, 1.0]), back), dim=0)
     x, y, depth = (places @ torch.stack([right, torch.linalg.cross(back, right), -back]).T).unbind(1)
-    size = float(_quantile(places.norm(dim=1), 0.95).clamp_min(1e-12))
+    size = float(quantile(places.norm(dim=1), 0.95).clamp_min(1e-12))
     unit = wide * depth.clamp_min(1e-6 * size) if wide else torch.full_like(depth, size)
     cells = [((c / unit + 1) * 12).floor() for c in (x, y)]
     within = (depth > 0) if wide else torch.ones_like(depth, dtype=torch.bool)
@@ -215,7 +215,7 @@ def ground_height(scene: Gaussians, up: Tensor) -> float:
     if not len(solid):
         return 0.0
     visible = scene[_without_background(scene, solid)]
-    height = float(_quantile(visible.means @ up, _FEET))
+    height = float(quantile(visible.means @ up, _FEET))
     return height if math.isfinite(height) else 0.0
 
 
@@ -239,7 +239,7 @@ def _heights_and_plan(means: Tensor, up: Tensor) -> tuple[Tensor, Tensor]:
     """Heights [R] and places in plan [R,2], both over the plan's half diagonal, the plan about its middle."""
     ahead = front_direction(up)
     plan = means @ torch.stack([ahead, torch.linalg.cross(up, ahead)], dim=1)
-    low, high = (torch.stack([_quantile(c, q) for c in plan.unbind(1)]) for q in (0.01, 0.99))
+    low, high = (torch.stack([quantile(c, q) for c in plan.unbind(1)]) for q in (0.01, 0.99))
     unit = (0.5 * (high - low)).norm().clamp_min(1e-12)
     height = means @ up
     return (height - height.median()) / unit, (plan - 0.5 * (low + high)) / unit
@@ -294,7 +294,7 @@ def _powers(plan: Tensor) -> Tensor:
 
 def _rows_of_large_things(places: Tensor) -> Tensor:
     """Which rows belong to large connected things. [R,3] -> [R] bool, at least one"""
-    low, high = (torch.stack([_quantile(c, q) for c in places.unbind(1)]) for q in (0.01, 0.99))
+    low, high = (torch.stack([quantile(c, q) for c in places.unbind(1)]) for q in (0.01, 0.99))
     side = float((high - low).amax().clamp_min(1e-9)) / _ACROSS
     span = 2 * _ACROSS + 2
     keys = ((places - low) / side + 0.5 * _ACROSS).clamp(0, span - 3).long() + 1
@@ -318,7 +318,3 @@ def _connected_cells(boxes: Tensor, span: int) -> Tensor:
         if torch.equal(least, thing):
             return thing
         thing = least
-
-
-def _quantile(values: Tensor, share: float) -> Tensor:
-    return values.kthvalue(min(max(round(share * len(values)), 1), len(values))).values

@@ -22,7 +22,7 @@ from rich.text import Text
 from progdf.errors import ProgdfError
 from progdf.io.atomic import atomic_write
 from progdf.io.json_values import convert_json, decode_json
-from progdf.terminal import escape_text, file_size, format_count
+from progdf.terminal import escape_text, file_size, format_count, format_duration
 from trainer.store.run_folder import RunFolder
 
 from .jobs import Job
@@ -259,7 +259,7 @@ class Screen:
         self.event("progress", running=states, ended=ended, failed=failed, seconds_left=remaining)
         if live:
             lines = [f"  {key:<40} {_state(state)}" for key, state in states.items()]
-            time_left = f", about {duration(remaining)} left" if remaining else ""
+            time_left = f", about {format_duration(remaining)} left" if remaining else ""
             lines.append(f"{ended} of {len(self._jobs)} ended, {failed} failed{time_left}")
             self._live.start()
             self._live.update(Text("\n".join(map(escape_text, lines))), refresh=True)
@@ -271,7 +271,7 @@ class Screen:
         self.event("total", done=done, failed=failed, jobs=len(rows), seconds=seconds)
         self.say(
             f"{done} of {format_count(len(rows), 'job')} done{f', {failed} failed' if failed else ''} "
-            f"in {duration(seconds)}; see {out / PAGE} and {CSV}"
+            f"in {format_duration(seconds)}; see {out / PAGE} and {CSV}"
         )
         return SOME_FAILED if failed else 0
 
@@ -292,12 +292,5 @@ class Screen:
 
 def _state(state: Mapping[str, Any]) -> str:
     share, seconds = state.get("share", 0.0), state.get("seconds", 0.0)
-    time_left = f"{duration(seconds / share * (1 - share))} left" if share > 0.1 else ""
+    time_left = f"{format_duration(seconds / share * (1 - share))} left" if share > 0.1 else ""
     return f"{share:4.0%} {state.get('label', ''):<20} {time_left}"
-
-
-def duration(seconds: float) -> str:
-    """Seconds for a person: "40 s", "12 min", "3.5 h"."""
-    if seconds < 90:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

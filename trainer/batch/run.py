@@ -24,13 +24,13 @@ from typing import Any, BinaryIO, Protocol, cast
 
 from progdf.errors import ProgdfError
 from progdf.io.atomic import LOCK, LockedError, hold_lock, make_folder
-from progdf.terminal import escape_text, file_size, format_count, print_line
+from progdf.terminal import escape_text, file_size, format_count, format_duration, print_line
 from trainer.options import BatchOptions, check_ranges
 from trainer.resolve import count_threads
 from trainer.run.resume import find_run
 
 from .jobs import Cost, Job, estimate_cost, read_catalogue
-from .report import SOME_FAILED, Row, Screen, duration, finished_row, read_rows, write_page, write_rows
+from .report import SOME_FAILED, Row, Screen, finished_row, read_rows, write_page, write_rows
 from .worker import Finding, Lost, inspect_scene, run_job
 
 _log = logging.getLogger(__name__)
@@ -449,7 +449,7 @@ def _print_plan(jobs: Sequence[Job], kept: Collection[str], costs: Mapping[str, 
     seconds = sum(cost.seconds for cost in costs.values()) / max(1, workers)
     longest = max((cost.seconds for cost in costs.values()), default=0.0)
     print_line(
-        f"{format_count(len(costs), 'job')} to train, about {duration(max(seconds, longest))} with "
+        f"{format_count(len(costs), 'job')} to train, about {format_duration(max(seconds, longest))} with "
         f"{format_count(workers, 'worker')} and {file_size(sum(cost.disk for cost in costs.values()))}; "
         f"the largest takes {file_size(max((cost.memory for cost in costs.values()), default=0))} of memory"
     )

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from progdf.compose.reference import Layer, compose_layers
+from progdf.compose.reference import edited_scene
 from progdf.errors import ProgdfError, is_out_of_memory
 from progdf.formats.scene_file import load_scene
 from progdf.gaussians import Gaussians
@@ -139,8 +139,7 @@ def _write_preview(result: RunResult, scene: Gaussians) -> None:
     small = camera.resize(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
     with torch.no_grad():
         pictures = [
-            render(compose_layers(scene, [Layer(gdf, s)]), small, background=BACKGROUND).image
-            for s in (0.5, 1.0)
+            render(edited_scene(scene, gdf, s), small, background=BACKGROUND).image for s in (0.5, 1.0)
         ]
     with atomic_write(folder.root / PREVIEW) as temporary_file:
         to_picture(torch.cat(pictures, dim=1)).save(temporary_file, format="JPEG", quality=88)

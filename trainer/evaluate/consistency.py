@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from progdf.camera import Camera
-from progdf.compose.reference import Layer, compose_layers
+from progdf.compose.reference import edited_scene
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.metrics.image import psnr
@@ -63,7 +63,7 @@ def view_consistency(opened: OpenedRun, perceptual: Perceptual) -> Consistency:
     after it; the others are taken from the target, so that they differ in nothing.
     """
     scene, views, background = opened.run.scene, opened.setup.judging, opened.setup.background
-    edited = finished_scene(opened)
+    edited = edited_scene(opened.setup.scene, opened.gdf)
     pictures_by_side = {
         EDITED: [render_view(edited, view.camera, background).clamp(0, 1) for view in views],
         EDITOR: judging_pictures(opened, "edited"),
@@ -100,7 +100,7 @@ def outside_change(opened: OpenedRun) -> dict[str, float]:
     """Mean absolute change of the pixels in the held-out boxes that show the region neither before the edit
     nor after it, 0..1: of the finished edit, and of what the editor made."""
     views, evaluator = opened.setup.judging, opened.evaluator
-    edited = finished_scene(opened)
+    edited = edited_scene(opened.setup.scene, opened.gdf)
     after = [make_view(edited, opened.setup.region, view.camera, opened.setup.background) for view in views]
     boxes = [scene.box for scene in evaluator.crops]
     outside = [
@@ -113,11 +113,6 @@ def outside_change(opened: OpenedRun) -> dict[str, float]:
         EDITED: _mean_change(original, shown, outside),
         EDITOR: _mean_change(original, evaluator.edited[1.0], outside),
     }
-
-
-def finished_scene(opened: OpenedRun) -> Gaussians:
-    """The edited scene at strength 1."""
-    return compose_layers(opened.setup.scene, [Layer(opened.gdf, 1.0)])
 
 
 def _warp(
@@ -240,7 +235,7 @@ def clip_consistency(opened: OpenedRun) -> tuple[float | None, str]:
     path = camera_path([view.camera for view in opened.setup.judging])
     before, after = (
         clip.pictures([render_view(scene, camera, opened.setup.background) for camera in path])
-        for scene in (opened.run.scene, finished_scene(opened))
+        for scene in (opened.run.scene, edited_scene(opened.setup.scene, opened.gdf))
     )
     similarity = neighbor_similarity(before, after)
     return similarity, "" if similarity is not None else "the edit changes nothing that CLIP sees"

@@ -23,9 +23,9 @@ from torch.nn.functional import avg_pool2d
 
 from progdf.metrics.image import NO_DIFFERENCE, decibels
 from progdf.rasterize import render
-from trainer.setup import TrainingSetup
-from trainer.views.crops import CropScene, crop_scene
-from trainer.views.view import View, crop, shrink_image
+from trainer.setup import TrainingSetup, shrink_view
+from trainer.views.crops import CropScene
+from trainer.views.view import View
 
 _MOST_UNEXPLAINED = 0.4  # half way between the edits that agree and those that do not, see above
 _MOST_FINE = 0.5  # calm styles leave up to .47, stripes of random phase .55 and more
@@ -197,15 +197,6 @@ def robust_colors(seen: Sequence[ViewChange], members: int) -> Tensor:
 def view_change(setup: TrainingSetup, view: View, edited: Tensor, shrink: int = 2) -> ViewChange:
     """The change of a view at a fraction of its size. [H,W,3]"""
     camera = view.camera.resize(max(1, view.camera.width // shrink), max(1, view.camera.height // shrink))
-    x0, y0, x1, y1 = view.box
-    right, bottom = min(camera.width, -(-x1 // shrink)), min(camera.height, -(-y1 // shrink))
-    box = (x0 // shrink, y0 // shrink, right, bottom)
-
-    def small(picture: Tensor) -> Tensor:
-        return crop(shrink_image(picture, (camera.height, camera.width)), box)
-
-    change = edited - view.image
-    counts = (view.mask > 0.05) | (change.abs().amax(dim=2) > 2 / 255)
-    counting = (small(counts.float()[..., None]) > 0.5).float()
-    scene = crop_scene(setup.scene, setup.region.members, camera, box, setup.background)
-    return ViewChange(scene, small(change) * counting, counting)
+    scene, small, share = shrink_view(setup, view, edited, camera)
+    counting = (share > 0.5).float()
+    return ViewChange(scene, small(edited - view.image) * counting, counting)

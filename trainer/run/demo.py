@@ -19,6 +19,7 @@ from torch import Tensor
 
 from progdf.camera import Camera
 from progdf.cli.options import absent_option, parse_options
+from progdf.color.edits import hex_color
 from progdf.compose.reference import Layer, compose_layers
 from progdf.demo_scenes import DemoScene, bear, paint_panda, room
 from progdf.errors import ProgdfError
@@ -159,7 +160,7 @@ def main(argv: Sequence[str]) -> int:
     for picture in write_pictures(options.out, scene, gdfs, show.view):
         print_line(f"look at {picture}")
     command = ["view", str(options.out / "scene.ply"), *(str(_gdf(options.out, edit)) for edit in show.edits)]
-    command += ["--background", _hex(scene.background)]
+    command += ["--background", hex_color(scene.background)]
     print(f"\ndone in {time.perf_counter() - begun:.0f} s; drag the sliders:")
     print_line(f"  progdf {shlex.join(command)}")
     sys.stdout.flush()
@@ -302,10 +303,6 @@ def _paint_picture(path: Path, scene: DemoScene, camera: Camera, paint: Paint) -
 
 def _gdf(folder: Path, edit: DemoEdit) -> Path:
     return folder / edit.name / f"{edit.name}.gdf"
-
-
-def _hex(color: tuple[float, float, float]) -> str:
-    return "#" + "".join(f"{round(255 * channel):02x}" for channel in color)
 
 
 def _has_display() -> bool:

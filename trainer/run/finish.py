@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from progdf.compose.added import extend
-from progdf.compose.reference import Layer, compose_layers
+from progdf.compose.reference import edited_scene
 from progdf.errors import ProgdfError
 from progdf.field.baked import identity_remap
 from progdf.field.trajectory import Trajectory, load_trajectory
@@ -148,7 +148,7 @@ def finish_run(
             drawn = against_editor(shown, {"slider": gdf.field}, measured.asked, perceptual, most=1)
             measured = replace(measured, shown=gdf.field, editor={**measured.editor, **drawn})
         picture = report_picture(evaluator, shown, measured, record.losses, title, len(setup.held_out))
-    edited = compose_layers(scene, [Layer(gdf, 1.0)])
+    edited = edited_scene(scene, gdf)
     if sharp is not None:
         write_finals(setup, edited, folder, log)
     paint = _measure_paint(folder, setup, options.views.pictures, edited)
@@ -345,13 +345,13 @@ def exactness(scene: Gaussians, gdf: Gdf, end: Tensor) -> tuple[float, float]:
     """Largest difference of a raw number: at s = 1 from the recorded end, and outside the region."""
     outside = torch.ones(len(scene), dtype=torch.bool)
     outside[gdf.region.members] = False
-    finished = compose_layers(scene, [Layer(gdf, 1.0)])
+    finished = edited_scene(scene, gdf)
     members = torch.cat([gdf.region.members, torch.arange(len(scene), len(finished))])
     packed = pack(finished[members], with_shN=end.shape[1] > BASE_CHANNELS)
     endpoint = float((packed - end).abs().max())
     change = 0.0
     for s in (0.3, 1.0):
-        edited = compose_layers(scene, [Layer(gdf, s)])
+        edited = edited_scene(scene, gdf, s)
         for name in ATTRIBUTES:
             before, after = getattr(scene, name)[outside], getattr(edited, name)[: len(scene)][outside]
             if before.numel() and not torch.equal(before, after):

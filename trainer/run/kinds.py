@@ -7,7 +7,6 @@ and judged by views that they did not see (docs/experiments.md, The trial that f
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -26,10 +25,10 @@ from trainer.optimize.losses import GradientL1, Objective
 from trainer.optimize.pgs import TargetStage, optimize, pgs_settings
 from trainer.options import EditKind, OptimizeOptions, TrainOptions, with_values
 from trainer.resolve import resolve_kind
-from trainer.setup import TrainingSetup, confines_edit
+from trainer.setup import TrainingSetup, confines_edit, shrink_view
 from trainer.store.progress import Advance, RunLog
-from trainer.views.crops import CropScene, crop_scene
-from trainer.views.view import View, crop, fit_size, shrink_image
+from trainer.views.crops import CropScene
+from trainer.views.view import View, fit_size
 
 _SIZE = 128  # longer side of the small views, pixels
 _VIEWS = 12  # of those that change most; every third judges
@@ -268,18 +267,8 @@ def _small_views(setup: TrainingSetup, pairs: Sequence[tuple[View, Tensor]]) -> 
 
 def _small(setup: TrainingSetup, view: View, picture: Tensor) -> tuple[CropScene, Tensor, Tensor]:
     """What is rendered, what it should be, and which pixels count."""
-    camera = fit_size(view.camera, _SIZE)
-    across, down = camera.width / view.camera.width, camera.height / view.camera.height
-    x0, y0, x1, y1 = view.box
-    right, bottom = min(camera.width, math.ceil(x1 * across)), min(camera.height, math.ceil(y1 * down))
-    box = (math.floor(x0 * across), math.floor(y0 * down), right, bottom)
-
-    def small(image: Tensor) -> Tensor:
-        return crop(shrink_image(image, (camera.height, camera.width)), box)
-
-    counts = (view.mask > 0.05) | ((picture - view.image).abs().amax(dim=2) > 2 / 255)
-    scene = crop_scene(setup.scene, setup.region.members, camera, box, setup.background)
-    return scene, small(picture), small(counts.float()[..., None])[..., 0] > 0.5
+    scene, shrink, counting = shrink_view(setup, view, picture, fit_size(view.camera, _SIZE))
+    return scene, shrink(picture), counting[..., 0] > 0.5
 
 
 def _psnr(small: Evaluator, offsets: Tensor) -> float:

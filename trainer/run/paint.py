@@ -14,7 +14,7 @@ from scipy import ndimage
 from torch import Tensor
 
 from progdf.camera import Camera
-from progdf.compose.reference import Layer, compose_layers
+from progdf.compose.reference import edited_scene
 from progdf.errors import ProgdfError
 from progdf.field.baked import interpolate_at
 from progdf.field.separable import course_field, opacity_course
@@ -264,7 +264,7 @@ def sharpen(
         is_named: paint stays within the edit's region, which was not found by the pictures
         log: of the run
     """
-    end = compose_layers(scene, [Layer(recolored, 1.0)])
+    end = edited_scene(scene, recolored)
     paints, light = list[Paint](), torch.zeros(len(scene), 2)
     for path, camera in pictures.items():
         view = make_view(
@@ -342,7 +342,7 @@ def train_decal(editor: DecalEditor, scene: Gaussians, name: str, log: RunLog | 
 
 def measure_discs(gdf: Gdf, scene: Gaussians, base: Gaussians, paints: Sequence[Paint]) -> Painted:
     """How the edit shows the paint, in its own view and around it."""
-    edited, background = finished_scene(scene, gdf), torch.tensor(BACKGROUND)
+    edited, background = edited_scene(scene, gdf), torch.tensor(BACKGROUND)
     looks = look_around(base, paints[:1], TURNS)
     shown = [render_view(edited, look.camera, background).clamp(0.0, 1.0) for look in looks]
     errors = [
@@ -359,11 +359,6 @@ def measure_discs(gdf: Gdf, scene: Gaussians, base: Gaussians, paints: Sequence[
         "turned": {f"{degrees:+d}": error for degrees, error in zip(TURNS, errors, strict=True)},
     }
     return Painted(gdf, figures, [look.expected for look in looks], shown)
-
-
-def finished_scene(scene: Gaussians, gdf: Gdf) -> Gaussians:
-    """The scene as the edit's field has it at strength 1, the added rows after its own."""
-    return compose_layers(scene, [Layer(gdf, 1.0)])
 
 
 def _pivot(scene: Gaussians, paint: Paint) -> Tensor:

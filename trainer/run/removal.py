@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from progdf.camera import Camera
-from progdf.compose.reference import Layer, compose_layers
+from progdf.compose.reference import edited_scene
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians, concatenate
 from progdf.gdf.file import Gdf
@@ -129,7 +129,7 @@ def remove_region(options: TrainOptions, setup: TrainingSetup, folder: RunFolder
         gdf = tidy(scene, [Step("remove", region)], options.name, options.editor.editor, fill.rows)
         removed = rest if fill.rows is None else concatenate([rest, fill.rows])
         judging = around.judging
-        errors = _measure(compose_layers(scene, [Layer(gdf, 1.0)]), removed, judging)
+        errors = _measure(edited_scene(scene, gdf), removed, judging)
         report = {
             "edit": {"psnr_to_views": min(errors.values()), "psnr_by_background": errors},
             "removal": {
@@ -242,7 +242,7 @@ def _off_linear(scene: Gaussians, gdf: Gdf) -> float:
     off = [0.0]
     for i in range(1, _STEPS + 1):
         s = i / _STEPS
-        now = compose_layers(scene, [Layer(gdf, s)]).opacities[members].sum()
+        now = edited_scene(scene, gdf, s).opacities[members].sum()
         off.append(abs(float(now) / whole - (1.0 - s)))
     return max(off)
 
@@ -265,7 +265,7 @@ def _sheet(scene: Gaussians, gdf: Gdf, views: Sequence[View], title: str) -> Ten
     """The view that shows most of the region, at five strengths on three backgrounds."""
     view = max(views, key=lambda one: float(one.mask.sum()))
     strengths = (0.0, 0.25, 0.5, 0.75, 1.0)
-    columns = [on_backgrounds(compose_layers(scene, [Layer(gdf, s)]), view.camera) for s in strengths]
+    columns = [on_backgrounds(edited_scene(scene, gdf, s), view.camera) for s in strengths]
     rows = [list(row) for row in zip(*columns, strict=True)]
     return contact_sheet(
         rows, BACKGROUNDS, [f"s = {s:g}" for s in strengths], title, f"view {view.camera.name}"

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from imgui_bundle import imgui
 
+from progdf.color.edits import hex_color
 from progdf.color.oklab import oklab_to_srgb
 from progdf.scene.neighbors import Neighborhood, grow_along_surface
 from progdf.scene.scribbles import Rows
@@ -26,7 +27,7 @@ from progdf.scene.selection import (
     project_centers,
 )
 from viewer.camera.view_camera import Vec3
-from viewer.jobs.training import hex_color, with_color
+from viewer.jobs.training import with_color
 from viewer.render.picking import Seen, seen_at, surface_point
 from viewer.state import history, selection
 from viewer.state.selection import unpack

@@ -16,6 +16,7 @@ from progdf.errors import ProgdfError
 from progdf.formats.scene_file import load_scene, scene_file, scene_name
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf, load_gdf
+from progdf.io.atomic import numbered_names
 from progdf.region import Region
 from progdf.scene.neighbors import Neighborhood
 from progdf.terminal import escape_text
@@ -155,5 +156,4 @@ def load_edits(
 
 def _free_name(name: str, gdfs: Sequence[Gdf]) -> str:
     taken = {gdf.name for gdf in gdfs}
-    names = (name, *(f"{name}-{number}" for number in range(2, len(taken) + 2)))
-    return next(free for free in names if free not in taken)
+    return next(free for free in numbered_names(name) if free not in taken)

@@ -21,7 +21,7 @@ import torch
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
-from progdf.io.atomic import replace_file
+from progdf.io.atomic import numbered_names, replace_file
 from progdf.io.session import (
     SUFFIX,
     EditRef,
@@ -389,7 +389,5 @@ def stem(session: Path) -> str:
 
 def _numbered_paths(session: Path, kind: str = "") -> Iterator[Path]:
     """NAME, NAME-2, NAME-3 …; with a kind NAME.kind, NAME.kind-2 …"""
-    name, number = stem(session) + f".{kind}" * bool(kind), 1
-    while True:
-        yield session.with_name(name + f"-{number}" * (number > 1) + SUFFIX)
-        number += 1
+    names = numbered_names(stem(session) + f".{kind}" * bool(kind), SUFFIX)
+    return map(session.with_name, names)

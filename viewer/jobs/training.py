@@ -15,11 +15,10 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import itertools
 import os
 import re
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -28,7 +27,7 @@ from typing import Any, Literal
 import msgspec
 import torch
 
-from progdf.color.edits import GRADE_RANGES, parse_color, parse_grade
+from progdf.color.edits import GRADE_RANGES, hex_color, parse_color, parse_grade
 from progdf.color.palette import are_alike
 from progdf.errors import ProgdfError
 from progdf.field.keyframes import fit_lossless
@@ -273,11 +272,6 @@ def missing_package(choice: EditorChoice) -> str:
     return f"{choice.title} needs the extra '{choice.extra}' of ProGDF Studio, which is not installed"
 
 
-def hex_color(color: Sequence[float]) -> str:
-    """`#rrggbb` of a color 0..1."""
-    return "#" + "".join(f"{round(255 * min(max(channel, 0.0), 1.0)):02x}" for channel in color)
-
-
 class _Paint(msgspec.Struct):
     warning: str = ""  # why little of the paint is in the edit, "" if enough is
 
@@ -462,8 +456,7 @@ def free_path(
     folder: Path, name: str, suffix: str = "", is_taken: Callable[[Path], bool] = Path.exists
 ) -> Path:
     """NAME with a suffix, or NAME-2, NAME-3 … where that is taken."""
-    names = itertools.chain([name], (f"{name}-{number}" for number in itertools.count(2)))
-    return next(path for each in names if not is_taken(path := folder / f"{each}{suffix}"))
+    return next(p for n in atomic.numbered_names(name, suffix) if not is_taken(p := folder / n))
 
 
 def finished_edit(draft: Path) -> Path | None:
@@ -492,14 +485,6 @@ def takes_files(folder: Path) -> bool:
         return bool(folder.stat().st_mode & 0o222) and os.access(folder, os.W_OK)
     except OSError:
         return False
-
-
-def duration(seconds: float) -> str:
-    """ "12 s", "3 min", "1 h 20 min"."""
-    if seconds < 90:
-        return f"{max(round(seconds), 1)} s"
-    minutes = round(seconds / 60)
-    return f"{minutes} min" if minutes < 90 else f"{minutes // 60} h {minutes % 60} min"
 
 
 def spare_threads() -> int:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 from imgui_bundle import imgui, imgui_ctx
 
-from progdf.color.edits import GRADE_RANGES, parse_color
+from progdf.color.edits import GRADE_RANGES, hex_color, parse_color
 from progdf.color.palette import bend_lightness
 from viewer.jobs.training import (
     ALL,
@@ -22,7 +22,6 @@ from viewer.jobs.training import (
     TYPED,
     NewEdit,
     Point,
-    hex_color,
     missing_package,
     parse_curve,
     with_editor,

@@ -13,14 +13,7 @@ from progdf.terminal import escape_text
 from viewer.state import history
 from viewer.state.layer_selection import selected_layers
 from viewer.state.selection import NamedRegion
-from viewer.state.workspace import (
-    UNSAVED,
-    Layout,
-    PreviewState,
-    SceneFacts,
-    Workspace,
-    has_unsaved,
-)
+from viewer.state.workspace import UNSAVED, Layout, PreviewState, SceneFacts, Workspace, has_unsaved
 from viewer.ui import widgets
 from viewer.ui.context import BEHIND, FIXED, PALETTE, SMALL_PX, Icon, UiContext, u32
 

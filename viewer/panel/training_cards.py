@@ -6,8 +6,9 @@ from collections.abc import Sequence
 
 from imgui_bundle import imgui, imgui_ctx
 
+from progdf.terminal import format_duration
 from viewer.jobs.job_queue import Delivery, Job
-from viewer.jobs.training import EditOrder, duration
+from viewer.jobs.training import EditOrder
 from viewer.ui.context import PALETTE, SMALL_PX, Icon, Rgba, UiContext, u32
 from viewer.ui.widgets import card, elide, menu_items, right_edge, small, tip, wrapped_text
 
@@ -79,7 +80,7 @@ def _strip(jobs: Sequence[Job], is_open: bool, ui: UiContext) -> bool:
     imgui.get_window_draw_list().add_circle_filled((x + dot, y + tall / 2), dot, u32(color))
     end = (f"+{len(jobs) - 1}   " if len(jobs) > 1 else "") + (Icon.UNFOLDED if is_open else Icon.RAISED)
     left = job.seconds_left
-    words = f"{_status(job)}  ·  {duration(left)}" if left is not None else _status(job)
+    words = f"{_status(job)}  ·  {format_duration(left)}" if left is not None else _status(job)
     below, sizes = imgui.get_cursor_pos(), [imgui.calc_text_size(text).x for text in (words, end)]
     top = start.y + (tall - imgui.get_text_line_height()) / 2
     imgui.set_cursor_pos((start.x + 4 * dot, top))
@@ -166,7 +167,7 @@ def _status_text(job: Job) -> str:
             finds = isinstance(job.task, EditOrder) and job.task.region == "changed"
             starting = "Finding what changed" if finds else "Starting"
             words = [progress.label or starting]
-            words += [f"{duration(left)} left"] if left is not None else []
+            words += [f"{format_duration(left)} left"] if left is not None else []
             words += [f"loss {progress.loss}"] if progress.loss else []
             return "  ·  ".join(words)
         case "queued":

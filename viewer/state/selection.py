@@ -18,7 +18,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from progdf.errors import ProgdfError
-from progdf.io.atomic import is_portable
+from progdf.io.atomic import is_portable, numbered_names
 from progdf.scene.neighbors import Neighborhood
 from progdf.scene.selection import Mask, combine
 
@@ -184,10 +184,8 @@ def free_name(state: SelectionState, text: str, is_taken: Callable[[str], bool] 
     cleaned = "".join(c if c.isalnum() or c in " -_." else "_" for c in " ".join(text.split()))
     name = cleaned.strip(" .")[:LONGEST_NAME].rstrip(" .") or "region"
     name = name if is_portable(name) else f"region {name}"
-    taken, free, number = {region.name.lower() for region in state.regions}, name, 2
-    while free.lower() in taken or is_taken(free):
-        free, number = f"{name}-{number}", number + 1
-    return free
+    taken = {region.name.lower() for region in state.regions}
+    return next(free for free in numbered_names(name) if not (free.lower() in taken or is_taken(free)))
 
 
 def add_region(state: SelectionState, name: str, path: Path) -> SelectionState:

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from progdf import __version__
+from progdf.color.edits import hex_color
 from progdf.compose.reference import coverage
 from progdf.errors import ProgdfError
 from progdf.field.baked import AttributeBases, GradeForm
@@ -377,8 +378,7 @@ class PageTexts:
     @property
     def style(self) -> str:
         """The style sheet."""
-        behind = "#" + "".join(f"{round(255 * channel):02x}" for channel in self.background)
-        return f":root, :host {{ --behind: {behind}; }}\n{_source('page.css')}"
+        return f":root, :host {{ --behind: {hex_color(self.background)}; }}\n{_source('page.css')}"
 
     @property
     def body(self) -> str:

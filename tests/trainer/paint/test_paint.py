@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 
 from progdf.compose.layers import Layer
-from progdf.compose.reference import compose_layers
+from progdf.compose.reference import compose_layers, edited_scene
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians, concatenate
 from progdf.gdf.file import load_gdf, save_gdf
@@ -26,7 +26,7 @@ from trainer.editors.base import EditorInput
 from trainer.editors.decal import DecalEditor, decal, parse_place
 from trainer.options import EditorOptions
 from trainer.paint.discs import merge_pixels, place_discs
-from trainer.run.paint import choose_discs, finished_scene, orbit, train_decal
+from trainer.run.paint import choose_discs, orbit, train_decal
 from trainer.views.view import BACKGROUND
 
 
@@ -61,7 +61,7 @@ def test_strength_zero_is_the_original_bit_for_bit_and_nothing_outside_the_regio
     finished = compose_layers(scene, [Layer(gdf, 1.0)])
     outside = torch.ones(len(scene), dtype=torch.bool).index_fill(0, laid.rows, False)
     assert bits(finished[: len(scene)][outside]) == bits(scene[outside])
-    assert bits(finished) == bits(finished_scene(scene, gdf))
+    assert bits(finished) == bits(edited_scene(scene, gdf))
 
 
 def test_what_shows_of_paint_is_linear_along_the_slider() -> None:
@@ -130,7 +130,7 @@ def test_paint_is_not_seen_through_a_thin_thing_from_behind() -> None:
     gdf, _ = edit_of(scene, paint)
     back = orbit(CAMERA, torch.zeros(3), 180.0)
     before, after = (
-        render(some, back, BACKGROUND).image.clamp(0, 1) for some in (scene, finished_scene(scene, gdf))
+        render(some, back, BACKGROUND).image.clamp(0, 1) for some in (scene, edited_scene(scene, gdf))
     )
     shown = torch.zeros(SIDE, SIDE, dtype=torch.bool)
     shown[50:78, 45:80] = True

@@ -13,12 +13,13 @@ from progdf.errors import ProgdfError
 from progdf.formats.ply import save_ply
 from progdf.gdf.file import read_gdf
 from progdf.io.atomic import LOCK, LockedError, hold_lock
+from progdf.terminal import format_duration
 from tests.helpers.count import Count
 from tests.helpers.demo_scenes import bear
 from viewer.jobs import child, job_queue, training
 from viewer.jobs.child import Progress
 from viewer.jobs.job_queue import LOOK_S, Delivery, Job, JobQueue
-from viewer.jobs.training import EditOrder, duration
+from viewer.jobs.training import EditOrder
 
 PATIENCE_S = 600.0
 
@@ -251,4 +252,4 @@ def test_time_left_is_said_once_something_is_done() -> None:
 
 
 def test_durations_are_read_at_a_glance() -> None:
-    assert [duration(s) for s in (0.2, 75.0, 200.0, 5400.0)] == ["1 s", "75 s", "3 min", "1 h 30 min"]
+    assert [format_duration(s) for s in (0.2, 75.0, 200.0, 5400.0)] == ["1 s", "75 s", "3 min", "1 h 30 min"]

@@ -21,6 +21,7 @@ from progdf.io.atomic import atomic_write, make_folder, read_file
 from progdf.io.cameras import save_cameras
 from progdf.io.picture_camera import camera_chunk
 from progdf.scene.regions import check_region
+from progdf.terminal import format_duration
 from viewer.app.application import Application, Requests, attempt, failure_line
 from viewer.app.file_actions import EditActions
 from viewer.files import exports
@@ -264,7 +265,7 @@ class JobActions:
         job = self.queue.job(int(number))
         if job.task.is_begun:
             spent = job.task.read_progress(job.progress).seconds
-            self._app.main_view.ask(Dialog("discard_run", training.duration(spent), number))
+            self._app.main_view.ask(Dialog("discard_run", format_duration(spent), number))
         else:
             self.queue.discard(job.number)
 
