@@ -196,7 +196,7 @@ class PlainCut:
             if not self._in_window(node.mean, largest):
                 return []
             area = node.weight * math.sqrt(max(node.opacity, 1.0))
-            loss = node.spread * (1.0 + node.contrast) * math.sqrt(area)
+            loss = node.spread * (1.0 + node.contrast**2) * math.sqrt(area)
             loss *= self._focal2 / z**2
             if self._depths is not None:
                 cells = self._cells(x, y, (z - largest) * 2 ** (-1 / 32))

@@ -84,7 +84,7 @@ ENOUGH = 0.85
 LONGEST, DENSITY, WEIGHT, POINTS, LOSS = range(3, 8)
 """Columns of a node beside its mean: the largest scale; density, negative where something below cannot be
 drawn; Σ opacity · area of what is below, world units², 0 for nothing; Σ opacity; the spread of its centers,
-world units, times 1 and that of its colors, in coefficients of band 0."""
+world units, times 1 and the summed variances of its colors, in coefficients of band 0."""
 
 SCALES, SPREAD, CONTRAST, COLORS = 4, 7, 8, 9
 """Columns of a node in 16 bits after its rotation, wxyz / 32767: its scales, of the largest / 65535; the
@@ -344,7 +344,7 @@ def _merge(
                 shapes[me, SCALES + k] = np.uint16(np.rint(65535.0 * sizes[k] / max(mine[LONGEST], _LEAST)))
             density = total / max(mine[LONGEST] * middle, _LEAST)
             mine[DENSITY] = density if sound else -density
-        mine[LOSS] = _unpack(shapes[me, SPREAD]) * (1.0 + _unpack(shapes[me, CONTRAST]))
+        mine[LOSS] = _unpack(shapes[me, SPREAD]) * (1.0 + _unpack(shapes[me, CONTRAST]) ** 2)
 
 
 @kernel(inline=True)
