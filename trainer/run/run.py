@@ -271,10 +271,11 @@ def _run_training(
             finals = grown.scene.replace_rows(grown.region.members, end_rows(grown, trajectory))
             write_finals(setup, finals, folder, log)
         folder.state.save("recorded", {}, log.capture_state().values)
-        del trajectory, grown, finals  # all is read anew, as it is on disk
+        del trajectory, grown, finals
     else:
         log.restore(recorded)
         log.say("the trajectory is recorded")
+    del edited, train_edits, between  # what is needed of all this is read anew, as it is on disk
     trajectory, _, about = load_trajectory(folder.trajectory)
     begun = folder.state.load(NETWORK)
     return finish_run(folder, setup, trajectory, read_record(about), perceptual, log, begun)

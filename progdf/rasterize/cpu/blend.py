@@ -526,9 +526,9 @@ def accumulate_weights(
 @kernel(contract=True, inline=True)
 def _list_tile(
     tile: int, splats: Splats, rows: Array, places: Array, camera: Pinhole, members: Array, through: Array,
-    write: bool, run: int, entry: int, out: Runs,
+    run: int, entry: int, out: Runs,
 ) -> tuple[int, int]:  # fmt: skip
-    """One tile's runs and entries, written from `run` and `entry` on; those one past the last."""
+    """One tile's runs and entries, written from `run` and `entry` on, as far as there is room; how far."""
     x, y = tile_corner(camera, tile)
     left, right = max(0, camera.window[0] - x), min(TILE_W, camera.window[2] - x)
     top, bottom = max(0, camera.window[1] - y), min(TILE_H, camera.window[3] - y)
@@ -564,14 +564,13 @@ def _list_tile(
                     continue
                 pixel = places[(y - camera.window[1] + i) * width + x - camera.window[0] + j]
                 if pixel >= 0:
-                    if write:
+                    if entry < out.weights.size:
                         base = pixel if entry == begun else base
                         out.pixels[entry] = pixel - base
                         out.weights[entry] = alpha * before
                     entry += 1
         if entry > begun:
-            if write:
-                out.rows[run], out.counts[run], out.firsts[run] = rows[s], entry - begun, base
+            out.rows[run], out.counts[run], out.firsts[run] = rows[s], entry - begun, base
             run += 1
     return run, entry
 
@@ -579,20 +578,17 @@ def _list_tile(
 @kernel(cache=True)
 def list_weights(
     begin: int, end: int, scratch: TileScratch, splats: Splats, lists: TileLists, camera: Pinhole,
-    rows: Array, places: Array, write: bool, cursors: Array, out: Runs,
-) -> None:  # fmt: skip
-    """List what the splats weigh in tiles begin … end − 1.
+    rows: Array, places: Array, out: Runs,
+) -> tuple[int, int]:  # fmt: skip
+    """List what the splats weigh in tiles begin … end − 1: how many runs, and entries, which may be more than
+    there was room for.
 
     Args:
         rows, places: of each Gaussian and pixel in the lists, −1: not listed. [N], [h·w] int32
-        write: whether to fill `out`, or only to count
-        cursors: runs and entries of each tile, out; where they begin if `write`. [tiles,2] int64
+        out: room for a run of each splat in each of the tiles, and for some entries
     """
+    run = entry = 0
     for tile in range(begin, end):
-        run, entry = (cursors[tile, 0], cursors[tile, 1]) if write else (0, 0)
         own = lists.members[lists.starts[tile] : lists.starts[tile + 1]]
-        run, entry = _list_tile(
-            tile, splats, rows, places, camera, own, scratch.state, write, run, entry, out
-        )
-        if not write:
-            cursors[tile, 0], cursors[tile, 1] = run, entry
+        run, entry = _list_tile(tile, splats, rows, places, camera, own, scratch.state, run, entry, out)
+    return run, entry

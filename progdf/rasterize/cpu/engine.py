@@ -60,6 +60,7 @@ _LEAST_TILES = 4  # fewer are not worth a call
 _CHUNKS = 4  # for each thread: tiles take unequally long
 _MOST_TILES, _MOST_GAUSSIANS = 24, 32 * BLOCK  # of a chunk: a picture that is dropped stops between two
 TILE_ROOM = 8  # tiles of a Gaussian that there is room for; where chunks have more, these are listed twice
+ENTRY_ROOM = 16  # and pixels that a Gaussian weighs in of a tile
 _ALL = np.empty(0, np.bool_)
 
 
@@ -297,15 +298,18 @@ def color_map(
     listed = np.full(len(gaussians.means), -1, np.int32)
     listed[rows.numpy()] = np.arange(len(rows), dtype=np.int32)
     splats, lists = bin_view(gaussians, pinhole)
-    counts = np.zeros((len(lists.starts) - 1, 2), np.int64)
     index = np.dtype(np.uint16 if TILE_H * (x1 - x0) < 1 << 16 else np.uint32)
-    share_tiles(
-        list_weights, pinhole, splats, lists, pinhole, listed, places, False, counts, _new_runs(0, 0, index)
-    )
-    run_count, entries = counts.sum(axis=0).tolist()
-    runs = _new_runs(run_count, entries, index)
-    cursors = np.cumsum(counts, axis=0) - counts
-    share_tiles(list_weights, pinhole, splats, lists, pinhole, listed, places, True, cursors, runs)
+
+    def list_tiles(begin: int, end: int, room: int = ENTRY_ROOM) -> list[Array]:
+        most = int(lists.starts[end] - lists.starts[begin])
+        out = _new_runs(most, room * most, index)
+        run, entry = list_weights(begin, end, new_scratch(), splats, lists, pinhole, listed, places, out)
+        if entry > room * most:
+            return list_tiles(begin, end, -(-entry // most))
+        return [*(part[:run] for part in out[:3]), *(part[:entry] for part in out[3:])]
+
+    parts = _share(list_tiles, len(lists.starts) - 1, _LEAST_TILES, _MOST_TILES)
+    runs = Runs(*map(np.concatenate, zip(*parts, strict=True)))
     return ListedWeights(len(rows), (y1 - y0, x1 - x0) if pixels is None else (len(pixels),), runs)
 
 
