@@ -67,7 +67,7 @@ class BenchOptions:
     plots: Path | None = None
     """`training` and `field` also draw their errors into PNG files of their names in this folder."""
     scenes: tuple[Path, ...] = ()
-    """.ply files that viewer, select, frames, moving, popping and window take in place of the bears,
+    """scene files that viewer, select, frames, moving, popping and window take in place of the bears,
     training, field and warps beside them, and pictures alone; those of `page` are for training and fields."""
     seconds: float | None = None
     """how long `window` drags its slider; 60 where not said."""
