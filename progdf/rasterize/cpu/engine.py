@@ -300,13 +300,13 @@ def color_map(
     splats, lists = bin_view(gaussians, pinhole)
     index = np.dtype(np.uint16 if TILE_H * (x1 - x0) < 1 << 16 else np.uint32)
 
-    def list_tiles(begin: int, end: int, room: int = ENTRY_ROOM) -> list[Array]:
-        most = int(lists.starts[end] - lists.starts[begin])
-        out = _new_runs(most, room * most, index)
-        run, entry = list_weights(begin, end, new_scratch(), splats, lists, pinhole, listed, places, out)
-        if entry > room * most:
-            return list_tiles(begin, end, -(-entry // most))
-        return [*(part[:run] for part in out[:3]), *(part[:entry] for part in out[3:])]
+    def list_tiles(begin: int, end: int) -> list[Array]:
+        most, room = int(lists.starts[end] - lists.starts[begin]), -1
+        entry = ENTRY_ROOM * most
+        while entry > room:
+            room, out = entry, _new_runs(most, entry, index)
+            run, entry = list_weights(begin, end, new_scratch(), splats, lists, pinhole, listed, places, out)
+        return [*(part[:run].copy() for part in out[:3]), *(part[:entry].copy() for part in out[3:])]
 
     parts = _share(list_tiles, len(lists.starts) - 1, _LEAST_TILES, _MOST_TILES)
     runs = Runs(*map(np.concatenate, zip(*parts, strict=True)))

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -130,3 +132,16 @@ def test_a_color_map_of_some_pixels_is_that_of_all_where_they_are(engine: str) -
     everywhere = torch.zeros(31 * 49, 3).index_copy(0, pixels, seen).view(31, 49, 3)
     torch.testing.assert_close(some.picture(colors), whole.picture(colors).flatten(0, 1)[pixels])
     torch.testing.assert_close(some.gradient(seen), whole.gradient(everywhere))
+
+
+def test_a_color_map_lets_go_of_what_it_was_made_of() -> None:
+    scene, camera = activate(random_gaussians(300, seed=11)), orbit_camera(90, 61)
+    make = partial(color_map, scene, camera, (0, 0, 90, 61), torch.arange(300))
+    make()  # loads kernels
+    gc.collect()
+    gc.disable()
+    try:
+        make()
+        assert gc.collect() == 0, "a cycle would hold the lists of all views until the next collection"
+    finally:
+        gc.enable()
