@@ -214,8 +214,8 @@ class Solver:
             start: a guess. [M,b,3]
             targets: pictures of the views
             steps: most steps
-            judge: the best in its views is kept, and steps end when they gain little there, see `SETTLED`;
-                None takes all
+            judge: the best in its views is kept, and steps end when they gain little there, see `SETTLED`, or
+                what is left does not show; None takes all
             floor: error in these views that counts as none, see `Model.error`; one of `LEVEL` always does
             hold: see `Model.hold`
             tell: called after each step
@@ -270,7 +270,8 @@ class Solver:
                 error = look(now)
                 best = now if error < min(looks) else best
                 looks.append(error)
-                if looks[-1 - _LOOKS] - error <= _LOOKS * SETTLED * max(error, floor, LEVEL):
+                settled = looks[-1 - _LOOKS] - error <= _LOOKS * SETTLED * max(error, floor, LEVEL)
+                if settled or error <= LEVEL:
                     break
             conditioned = inverse @ pull.descent
             turn = (_inner(pull.descent, conditioned) - _inner(pull.descent, last)) / power
