@@ -67,7 +67,7 @@ NOTE = (
     f"{REPORTING - 1} views of a rig in which nobody trained or chose, over the pixels that show the region; "
     "mean: of the end and the mean of the in-betweens, what lies beyond a level of 8 bits (48.1 dB) taken as "
     "that. Seconds: of the processor, one thread, for the pictures, their weights, the model, the solving "
-    "and the choice of the field. The sweep's strengths are solved for once, each from the finished edit's, and "
+    "and the choice of the field. The sweep's strengths are solved for once, each from the finished edit's; "
     "fewer are every other of them."
 )
 
