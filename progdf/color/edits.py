@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from progdf.errors import ProgdfError
+from progdf.threads import one_thread
 
 from .oklab import (
     STRAIGHT,
@@ -55,6 +56,7 @@ def hex_color(color: Sequence[float]) -> str:
     return "#" + "".join(f"{round(255 * min(max(channel, 0.0), 1.0)):02x}" for channel in color)
 
 
+@one_thread()  # sums of many are added in an order that depends on the number of threads
 def typical_color(rgb: Tensor, weights: Tensor | None = None) -> Tensor:
     """The weighted mean color, averaged in OKLab. [...,3], [...] or None -> [3]
 

@@ -24,6 +24,16 @@ def _polar(rgb: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return lightness, torch.hypot(a, b), torch.rad2deg(torch.atan2(b, a))
 
 
+def test_the_typical_color_of_many_pixels_is_the_same_on_any_number_of_threads() -> None:
+    rgb, found = torch.rand(1_000_000, 3, generator=torch.Generator().manual_seed(1)), list[Tensor]()
+    before = torch.get_num_threads()
+    for threads in (1, 2, 3, 4):
+        torch.set_num_threads(threads)
+        found.append(color.typical_color(rgb))
+    torch.set_num_threads(before)
+    assert all(torch.equal(found[0], other) for other in found[1:])
+
+
 def test_oklab_there_and_back_is_the_same_color() -> None:
     rgb = _random()
     # single precision through two cubes and a power of 2.4
