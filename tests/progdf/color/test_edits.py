@@ -25,11 +25,12 @@ def _polar(rgb: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def test_the_typical_color_of_many_pixels_is_the_same_on_any_number_of_threads() -> None:
-    rgb, found = torch.rand(1_000_000, 3, generator=torch.Generator().manual_seed(1)), list[Tensor]()
+    rng, found = torch.Generator().manual_seed(1), list[Tensor]()
+    rgb, weights = torch.rand(1_000_000, 3, generator=rng), torch.rand(1_000_000, generator=rng)
     before = torch.get_num_threads()
     for threads in (1, 2, 3, 4):
         torch.set_num_threads(threads)
-        found.append(color.typical_color(rgb))
+        found.append(color.typical_color(rgb, weights))
     torch.set_num_threads(before)
     assert all(torch.equal(found[0], other) for other in found[1:])
 
