@@ -308,7 +308,7 @@ def _prepare_colors(
     strengths = [s for s in edited if s < 1.0]
     if between is not None and model.richer is not None:  # which is decided there
         strengths = strengths or [between.ruler[len(between.ruler) // 2]]
-    course = Course(ask(strengths), (stage, judge))
+    course = Course(ask(strengths) if strengths else [], (stage, judge))
     if between is not None:
         course = replace(course, ruler=between.ruler, look=cache(look), ask=ask)
     with log.stage("model"):
