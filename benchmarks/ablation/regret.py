@@ -187,16 +187,14 @@ class Edit:
         ):
             made.append(snapshot)
         spent = time.process_time() - began - waited
-        asked = [*(stage.strength for stage, _ in course.targets), 1.0]
-        strengths = tuple(sorted(asked))
-        made = [made[asked.index(s)] for s in strengths]
+        strengths, made = course.sort_recordings(made)
         steps = ", ".join(f"{snapshot.means.get(TAKEN, 0):.0f}" for snapshot in made)
         at = ", ".join(f"{s:g}" for s in strengths)
         tables = [snapshot.table for snapshot in made if snapshot.table is not None]
         name = f"automatic: {len(self.setup.views)} views, {len(strengths)} strengths, {model.bands} SH"
         offsets = [snapshot.offsets for snapshot in made]
         result = self.measure(name, judge, strengths, model.bands, tables, offsets, spent, model.mask)
-        return model, strengths, f"{model.line}; strengths {at} in {steps} steps", result
+        return model, tuple(strengths), f"{model.line}; strengths {at} in {steps} steps", result
 
     def sweep(
         self,

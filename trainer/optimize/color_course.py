@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_left
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 
@@ -63,6 +63,14 @@ class Course:
                 asked.append(self.ruler[(begin + end) // 2])
         self.targets += self.ask(asked) if asked else ()
         return bool(asked)
+
+    def sort_recordings(
+        self, made: Sequence[ParameterSnapshot]
+    ) -> tuple[list[float], list[ParameterSnapshot]]:
+        """All strengths, ascending, and what `solve` yielded of each, counted anew."""
+        pairs = zip([*(stage.strength for stage, _ in self.targets), 1.0], made, strict=True)
+        strengths, recordings = zip(*sorted(pairs, key=lambda pair: pair[0]), strict=True)
+        return list(strengths), [replace(one, step=i + 1, stage=i) for i, one in enumerate(recordings)]
 
 
 def solve(

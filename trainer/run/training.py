@@ -214,9 +214,7 @@ def optimize_members(
     end = stages[-1].place(state.average).cpu().clone()
     ordered, strengths = recordings.made, list(edited)
     if model is not None:
-        asked = [*(stage.strength for stage, _ in course.targets), 1.0]
-        strengths = sorted(asked)
-        ordered = [replace(ordered[asked.index(s)], step=i + 1, stage=i) for i, s in enumerate(strengths)]
+        strengths, ordered = course.sort_recordings(ordered)
     snapshots = [(made.step, made.stage, made.ends_stage, made.offsets[:own]) for made in ordered]
     if groups is not None:
         ends = [made for made in recordings.made if made.ends_stage]
