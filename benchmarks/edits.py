@@ -29,7 +29,7 @@ from trainer.views.choose import split_held_out
 from trainer.views.view import View, crop, make_view
 
 from .ablation.setup import editor_pictures
-from .table import Table
+from .table import Table, mean_worst
 
 RAISED, ZOOM = (30.0, -15.0), 3.0
 """Degrees of elevation that far views stand above and below a held-out one; how near the third comes."""
@@ -69,6 +69,11 @@ def tables(runs: Sequence[Path] = ()) -> list[Table]:
 def edit_table(opened: Sequence[OpenedRun]) -> Table:
     """Each edit against the editor's own pictures."""
     perceptual, _ = perceptual_loss()
+    courses = {
+        "slider, about s = ¼ / ½ / ¾, dB": SLIDER,
+        "2 keyframes, re-timed": KEYFRAMES,
+        "cross-fade": FADE,
+    }
     rows = []
     for run in opened:
         strength = dict(run.trajectory.stage_strengths)
@@ -83,42 +88,23 @@ def edit_table(opened: Sequence[OpenedRun]) -> Table:
             min(range(len(strength)), key=lambda i, q=q: abs(list(strength)[i] - q))  # type: ignore[misc]
             for q in (0.25, 0.5, 0.75)
         ]
-        between = len(strength) > 1
+        between, size = len(strength) > 1, run.gdf.field.bytes_per_member
         rows.append(
-            (
-                _title(run),
-                *(
-                    " / ".join(f"{curves[name].psnr[i]:.1f}" for i in quarters) if between else "-"
-                    for name in (SLIDER, KEYFRAMES, FADE)
-                ),
-                *worst_places(run),
-                f"{curves[SLIDER].psnr[-1]:.1f}",
-                f"{curves[SLIDER].lpips[-1]:.4f}",
-                f"{run.report['slider']['uniformity']:.2f}",
-                f"{run.gdf.field.bytes_per_member:.0f} / {_file_bytes(run):.0f}",
-                f"{run.report['time']['total']:.0f}",
-            )
+            {
+                "edit": _title(run),
+                **{
+                    heading: " / ".join(f"{curves[name].psnr[i]:.1f}" for i in quarters) if between else "-"
+                    for heading, name in courses.items()
+                },
+                **worst_places(run),
+                "all at 1": f"{curves[SLIDER].psnr[-1]:.1f}",
+                f"{perceptual.name} at 1": f"{curves[SLIDER].lpips[-1]:.4f}",
+                "even": f"{run.report['slider']['uniformity']:.2f}",
+                "bytes a Gaussian, field / file": f"{size:.0f} / {_file_bytes(run):.0f}",
+                "run, s": f"{run.report['time']['total']:.0f}",
+            }
         )
-    return Table(
-        name="edits",
-        title="Edits against the editor's own pictures",
-        columns=(
-            "edit",
-            "slider, about s = ¼ / ½ / ¾, dB",
-            "2 keyframes, re-timed",
-            "cross-fade",
-            "worst of the slider, at s",
-            "of 2 keyframes",
-            "of the cross-fade",
-            "all at 1",
-            f"{perceptual.name} at 1",
-            "even",
-            "bytes a Gaussian, field / file",
-            "run, s",
-        ),
-        rows=tuple(rows),
-        note=EDIT_NOTE,
-    )
+    return Table.of("edits", "Edits against the editor's own pictures", rows, EDIT_NOTE)
 
 
 def slider_table(opened: Sequence[OpenedRun]) -> Table:
@@ -128,43 +114,29 @@ def slider_table(opened: Sequence[OpenedRun]) -> Table:
         _, reporting = run.evaluator.halves()
         inner = [i / (VALUES - 1) for i in range(1, VALUES - 1)]
         few = sample_strengths()
-        report = run.report
+        ours, plain = run.report["field"], run.report["baselines"][COMPARED]
         far = far_evaluator(run)
         rows.append(
-            (
-                _title(run),
-                f"{report['field']['psnr_mean']:.1f} / {report['field']['psnr_worst']:.1f}",
-                f"{report['baselines'][COMPARED]['psnr_mean']:.1f} / "
-                f"{report['baselines'][COMPARED]['psnr_worst']:.1f}",
-                f"{min(_against_recording(run, reporting, inner)):.1f}",
-                _mean_worst(_against_recording(run, far, few)),
-                *_from_elsewhere(run, far),
-            )
+            {
+                "edit": _title(run),
+                "field, mean / worst of 13 values, dB": f"{ours['psnr_mean']:.1f} / {ours['psnr_worst']:.1f}",
+                "2 keyframes": f"{plain['psnr_mean']:.1f} / {plain['psnr_worst']:.1f}",
+                f"worst of {VALUES} values": f"{min(_against_recording(run, reporting, inner)):.1f}",
+                "far views, mean / worst of 13": mean_worst(_against_recording(run, far, few)),
+                **_from_elsewhere(run, far),
+            }
         )
-    return Table(
-        name="slider values",
-        title="Fields against their recordings, and edits from elsewhere",
-        columns=(
-            "edit",
-            "field, mean / worst of 13 values, dB",
-            "2 keyframes",
-            f"worst of {VALUES} values",
-            "far views, mean / worst of 13",
-            "far views: to the editor's pictures at 1",
-            "between, mean / worst",
-            "2 keyframes, between",
-        ),
-        rows=tuple(rows),
-        note=SLIDER_NOTE,
-    )
+    title = "Fields against their recordings, and edits from elsewhere"
+    return Table.of("slider values", title, rows, SLIDER_NOTE)
 
 
-def worst_places(run: OpenedRun) -> tuple[str, ...]:
+def worst_places(run: OpenedRun) -> dict[str, str]:
     """The lowest PSNR of the slider and of what is simpler, and the slider value that has it."""
+    headings = "worst of the slider, at s", "of 2 keyframes", "of the cross-fade"
     strengths = [(i + 1) / ASKED for i in range(ASKED)]
     pictures = _editor_pictures(run, run.setup.judging, strengths)
     if not pictures:
-        return ("-",) * 3
+        return dict.fromkeys(headings, "-")
     at, asked = zip((0.0, 0.0), *run.trajectory.stage_strengths, strict=True)
     knots, values = (torch.tensor(some, dtype=torch.float64) for some in (asked, at))
     found = []
@@ -177,7 +149,7 @@ def worst_places(run: OpenedRun) -> tuple[str, ...]:
             ]
             errors.append((run.evaluator.psnr(shown(s), boxes), s))
         found.append("{:.1f} at {:.2f}".format(*min(errors)))
-    return tuple(found)
+    return dict(zip(headings, found, strict=True))
 
 
 def _editor_pictures(run: OpenedRun, views: Sequence[View], strengths: Sequence[float]) -> Pictures:
@@ -229,21 +201,19 @@ def _against_recording(run: OpenedRun, views: Evaluator, values: Sequence[float]
     ]
 
 
-def _from_elsewhere(run: OpenedRun, far: Evaluator) -> tuple[str, str, str]:
+def _from_elsewhere(run: OpenedRun, far: Evaluator) -> dict[str, str]:
     """The shipped field at 1 and between, and two keyframes between, against the editor's pictures."""
+    headings = "far views: to the editor's pictures at 1", "between, mean / worst", "2 keyframes, between"
     if not far.edited:
-        return "-", "-", "-"
+        return dict.fromkeys(headings, "-")
 
     def errors(field: BakedField) -> list[float]:
         asked = run.trajectory.stage_strengths
         return [far.psnr(far.pictures(field.offsets(s)), far.edited[strength]) for s, strength in asked]
 
     ours, plain = errors(run.gdf.field), errors(run.keyframes)
-    return f"{ours[-1]:.1f}", _mean_worst(ours[:-1]), _mean_worst(plain[:-1])
-
-
-def _mean_worst(values: Sequence[float]) -> str:
-    return f"{sum(values) / len(values):.1f} / {min(values):.1f}" if values else "-"
+    figures = f"{ours[-1]:.1f}", mean_worst(ours[:-1]), mean_worst(plain[:-1])
+    return dict(zip(headings, figures, strict=True))
 
 
 def _title(run: OpenedRun) -> str:

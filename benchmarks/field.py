@@ -262,32 +262,28 @@ def trained_network(
 
 def field_table(forms: Sequence[Form]) -> Table:
     """The table of all fields of all edits, in their order."""
+    strengths = ", ".join(f"{s:g}" for s in MEASURED)
     rows = [
-        (
-            form.edit,
-            f"**{form.label}**" if form.chosen else form.label,
-            f"{form.bytes:.1f}",
-            f"{min(form.psnrs):.1f}",
-            " ".join(f"{psnr:.1f}" for psnr in form.psnrs),
-            f"{form.seconds:.1f}",
-        )
+        {
+            "edit": form.edit,
+            "field": f"**{form.label}**" if form.chosen else form.label,
+            "bytes a member, no header": f"{form.bytes:.1f}",
+            "worst, dB": f"{min(form.psnrs):.1f}",
+            f"at {strengths}": " ".join(f"{psnr:.1f}" for psnr in form.psnrs),
+            "processor, s": f"{form.seconds:.1f}",
+        }
         for form in forms
     ]
-    strengths = ", ".join(f"{s:g}" for s in MEASURED)
-    return Table(
-        name="field",
-        title="Fields: error over bytes",
-        columns=(
-            "edit", "field", "bytes a member, no header", "worst, dB", f"at {strengths}",
-            "processor, s",
-        ),
-        rows=tuple(rows),
-        note="Bold: what a run ships. Edits of colors: PSNR to the editor's own pictures in "
+    return Table.of(
+        "field",
+        "Fields: error over bytes",
+        rows,
+        "Bold: what a run ships. Edits of colors: PSNR to the editor's own pictures in "
         f"{REPORTING - 1} views in which nobody trained or chose; all forms but the bold one are of the "
         f"same recording, {STEPS} steps of the residual at each of the run's strengths, and a map costs "
         "its numbers once for all members. The motion: PSNR to its true course, over the pixels that it "
         "changes. Seconds: to fit; of the bold grade with its solving.",
-    )  # fmt: skip
+    )
 
 
 def _compose_table() -> Table:
@@ -304,31 +300,18 @@ def _compose_table() -> Table:
             scene, chosen[:1], fit_separable(strengths, offsets[:, :1], dict.fromkeys(ATTRIBUTES, 2))
         )
         rows.append(_compose_row(scene, edit, one))
-    return Table(
-        name="compose",
-        title="A slider step: new attributes of all members",
-        columns=(
-            "members / Gaussians",
-            "MB moved",
-            Wall("copying, ms"),
-            "compose, processor ms",
-            Wall("Composer 1 thread, ms"),
-            "of the processor, ms",
-            Wall("2 threads, ms"),
-            Wall("of these for one member"),
-            Wall("ratio to copying, 1 / 2 threads"),
-            "largest difference",
-            "the paper's network asked, processor ms",
-        ),
-        rows=tuple(rows),
-        note="Medians, taken in turns. Moved: what a step must read (bases, the original, the last centers, "
+    return Table.of(
+        "compose",
+        "A slider step: new attributes of all members",
+        rows,
+        "Medians, taken in turns. Moved: what a step must read (bases, the original, the last centers, "
         "row numbers) and write; copying: a NumPy copy that reads and writes as much, one thread. What one "
         "member takes does not grow. The plain compose also checks that the edit belongs to the scene. A "
         "network is asked once, untrained.",
-    )  # fmt: skip
+    )
 
 
-def _compose_row(scene: Gaussians, edit: Gdf, single: Gdf) -> tuple[str, ...]:
+def _compose_row(scene: Gaussians, edit: Gdf, single: Gdf) -> dict[str, str]:
     composer, alone = Composer(scene, [edit]), Composer(scene, [single])
     rows, knots = pack(scene[edit.region.members]), torch.tensor([0.0, 1.0])
     ends = torch.stack([edit.field.offsets(s) for s in (0.0, 1.0)])
@@ -360,20 +343,22 @@ def _compose_row(scene: Gaussians, edit: Gdf, single: Gdf) -> tuple[str, ...]:
                 difference = max(difference, float((pack(composer.gaussians) - plain).abs().max()))
     finally:
         set_threads(before)
+    answer = processor_milliseconds(partial(asked.offsets, 0.5))
     took = {key: statistics.median(found) for key, found in times.items()}
-    return (
-        f"{len(edit.region)} / {len(scene)}",
-        f"{traffic / 1e6:.2f}",
-        f"{took['copy']:.3f}",
-        f"{took['plain']:.1f}",
-        f"{took['1']:.3f}",
-        f"{took['processor']:.3f}",
-        f"{took['2']:.3f}",
-        f"{took['one']:.3f}",
-        f"{took['1'] / took['copy']:.1f} / {took['2'] / took['copy']:.1f}",
-        f"{difference:g}",
-        f"{processor_milliseconds(partial(asked.offsets, 0.5)):.0f}",
-    )
+    ratios = (f"{took[key] / took['copy']:.1f}" for key in ("1", "2"))
+    return {
+        "members / Gaussians": f"{len(edit.region)} / {len(scene)}",
+        "MB moved": f"{traffic / 1e6:.2f}",
+        Wall("copying, ms"): f"{took['copy']:.3f}",
+        "compose, processor ms": f"{took['plain']:.1f}",
+        Wall("Composer 1 thread, ms"): f"{took['1']:.3f}",
+        "of the processor, ms": f"{took['processor']:.3f}",
+        Wall("2 threads, ms"): f"{took['2']:.3f}",
+        Wall("of these for one member"): f"{took['one']:.3f}",
+        Wall("ratio to copying, 1 / 2 threads"): " / ".join(ratios),
+        "largest difference": f"{difference:g}",
+        "the paper's network asked, processor ms": f"{answer:.0f}",
+    }
 
 
 def _cloud(count: int, rng: torch.Generator) -> Gaussians:

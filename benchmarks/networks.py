@@ -28,19 +28,19 @@ from progdf.field import (
     fit_keyframes,
 )
 from progdf.field.baked import NeuralForm
-from progdf.field.choose import Field
 from progdf.field.neural_fit import NeuralFit, train_network
 from progdf.field.separable import moving_attributes
 from progdf.gaussians import Gaussians, pack
 from progdf.gdf.file import Gdf, load_gdf, save_gdf
 from progdf.io.atomic import make_folder
 from progdf.rasterize import set_threads
+from progdf.terminal import group_digits
 from trainer.fit.fit import stored_numbers
 from trainer.fit.network import rendered_importance
 
 from .courses import KnownEdit, edit_of, processor_milliseconds
 from .recorded_runs import recorded_edit
-from .table import Table
+from .table import Table, mean_worst
 
 NETWORKS: Mapping[str, NeuralSettings] = {
     "tiny": NeuralSettings("tiny"),
@@ -92,31 +92,10 @@ def tables(runs: Sequence[Path] = ()) -> list[Table]:
     finally:
         torch.set_num_threads(before)
         set_threads(None)
-    return [
-        Table(
-            name="networks",
-            title="Networks, trained to the end",
-            columns=(
-                "edit",
-                "field",
-                "numbers",
-                "bytes a Gaussian, no header",
-                "steps",
-                "processor s to fit",
-                "as it answers: mean / worst, dB",
-                "baked: mean / worst, dB",
-                "asked: ms a slider step",
-                "µs a Gaussian",
-                "baked: ms a slider step",
-                "asked / baked",
-            ),
-            rows=tuple(rows),
-            note=NOTE,
-        )
-    ]
+    return [Table.of("networks", "Networks, trained to the end", rows, NOTE)]
 
 
-def _rows(run: Path, course: KnownEdit) -> list[tuple[str, ...]]:
+def _rows(run: Path, course: KnownEdit) -> list[dict[str, str]]:
     before = pack(course.scene[course.members])
     make_folder(run / "networks")
     baked: dict[str, BakedField] = {}
@@ -132,6 +111,7 @@ def _rows(run: Path, course: KnownEdit) -> list[tuple[str, ...]]:
     seconds["auto"] = time.process_time() - begin
     networks = {name: _trained(run, name, settings, course) for name, settings in NETWORKS.items()}
     baked |= {name: found.baked for name, found in networks.items()}
+    seconds |= {name: found.seconds for name, found in networks.items()}
     asked = {name: found.network.bind(before) for name, found in networks.items()}
     works: dict[str, Callable[[float], object]] = {
         f"{name}, baked": _composed(course.scene, edit_of(course.scene, course.members, field))
@@ -140,32 +120,29 @@ def _rows(run: Path, course: KnownEdit) -> list[tuple[str, ...]]:
     works |= {name: bound.offsets for name, bound in asked.items()}
     ms = turns_ms(works)
 
-    def judged(field: Field) -> str:
-        curve = course.judge.curve(field)
-        return f"{statistics.mean(curve):.1f} / {min(curve):.1f}"
-
-    rows: list[tuple[str, ...]] = []
+    rows: list[dict[str, str]] = []
     for name, field in baked.items():
         network = networks.get(name)
         trained = network is None or network.steps > 0
-        size = field.bytes_per_member
         step, composed = ms.get(name), ms[f"{name}, baked"]
         count = network.network.parameters if network else stored_numbers(field)
         rows.append(
-            (
-                f"{course.name}, {len(course.members)} members",
-                f"auto at 40 dB: {best.label}" if name == "auto" else name,
-                f"{count:,}".replace(",", " "),
-                f"{size:.0f}",
-                str(network.steps) if network and trained else "-",
-                f"{network.seconds if network else seconds[name]:.1f}" if trained else "-",
-                judged(asked[name]) if network and trained else "-",
-                judged(field) if trained else "-",
-                "-" if step is None else f"{step:.2f}",
-                "-" if step is None else f"{1e3 * step / len(course.members):.1f}",
-                f"{composed:.3f}",
-                "-" if step is None else f"{step / composed:.0f}×",
-            )
+            {
+                "edit": f"{course.name}, {len(course.members)} members",
+                "field": f"auto at 40 dB: {best.label}" if name == "auto" else name,
+                "numbers": group_digits(count),
+                "bytes a Gaussian, no header": f"{field.bytes_per_member:.0f}",
+                "steps": str(network.steps) if network and trained else "-",
+                "processor s to fit": f"{seconds[name]:.1f}" if trained else "-",
+                "as it answers: mean / worst, dB": mean_worst(course.judge.curve(asked[name]))
+                if network and trained
+                else "-",
+                "baked: mean / worst, dB": mean_worst(course.judge.curve(field)) if trained else "-",
+                "asked: ms a slider step": "-" if step is None else f"{step:.2f}",
+                "µs a Gaussian": "-" if step is None else f"{1e3 * step / len(course.members):.1f}",
+                "baked: ms a slider step": f"{composed:.3f}",
+                "asked / baked": "-" if step is None else f"{step / composed:.0f}×",
+            }
         )
     return rows
 

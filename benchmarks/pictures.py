@@ -37,7 +37,7 @@ from trainer.views.view import (
     with_near_plane,
 )
 
-from .table import Table
+from .table import Table, mean_worst
 
 EDITS = ("stripes:#20a040", "recolor:#3060d0")
 RIG, SIZE, LARGE, NEAR, STEPS = 36, 256, 512, 45.0, 100
@@ -103,9 +103,7 @@ def _rows(path: Path, edit: str) -> list[tuple[str, ...]]:
             cosine = max(float(toward[i] @ toward[k]) for k in given)
             (near if cosine >= math.cos(math.radians(NEAR)) else far).append(error)
         numbers = ", ".join(str(i) for i in given)
-        rows.append((f"{path.stem}, {edit}", numbers, *map(_said, (near, far, near + far)), f"{took:.1f}"))
+        rows.append(
+            (f"{path.stem}, {edit}", numbers, *map(mean_worst, (near, far, near + far)), f"{took:.1f}")
+        )
     return rows
-
-
-def _said(values: Sequence[float]) -> str:
-    return f"{sum(values) / len(values):.1f} / {min(values):.1f}" if values else "-"

@@ -28,6 +28,7 @@ from progdf.gaussians import Gaussians, pack
 from progdf.rasterize import reference, render, set_threads
 from progdf.rasterize.engines import ActivatedGaussians, RasterView, engine_device
 from progdf.sh import C0
+from progdf.terminal import group_digits
 from trainer.optimize.losses import Objective, perceptual_loss
 from trainer.optimize.pgs import PgsSettings, TargetStage, learning_rates, optimize
 from trainer.options import OptimizeOptions
@@ -225,34 +226,24 @@ def tables() -> list[Table]:
         worst = max(result.gradient_errors, key=lambda name: result.gradient_errors[name], default="")
         baseline = "not run" if not case.baseline else ""
         rows += [
-            (
-                f"{case.count:,}".replace(",", " "),
-                f"{case.size}²",
-                str(duel.threads),
-                _spread(duel.forward),
-                _spread(duel.both),
-                f"{statistics.median(duel.processor):.1f}",
-                baseline or _spread(duel.torch),
-                baseline or f"{duel.ratio:.0f}×",
-                f"{result.plain:.0f}",
-                f"{result.image_error:.1e}",
-                f"{result.gradient_errors[worst]:.1e} ({worst})" if worst else "not run",
-            )
+            {
+                "Gaussians": group_digits(case.count),
+                "pixels": f"{case.size}²",
+                "threads": str(duel.threads),
+                Wall("forward (ms)"): _spread(duel.forward),
+                Wall("forward + backward (ms)"): _spread(duel.both),
+                "of the processor (ms)": f"{statistics.median(duel.processor):.1f}",
+                Wall("tiled torch (ms)"): baseline or _spread(duel.torch),
+                "ratio": baseline or f"{duel.ratio:.0f}×",
+                "plain version, of the processor (ms)": f"{result.plain:.0f}",
+                "image error": f"{result.image_error:.1e}",
+                "worst gradient error": f"{result.gradient_errors[worst]:.1e} ({worst})"
+                if worst
+                else "not run",
+            }
             for duel in result.duels
         ]
-    columns = (
-        "Gaussians",
-        "pixels",
-        "threads",
-        Wall("forward (ms)"),
-        Wall("forward + backward (ms)"),
-        "of the processor (ms)",
-        Wall("tiled torch (ms)"),
-        "ratio",
-        "plain version, of the processor (ms)",
-        "image error",
-        "worst gradient error",
-    )
+
     note = (
         "Median and range; the engines take turns in one process. The plain version is "
         "`progdf.rasterize.reference` in float64, forward alone where no gradient error is given. Errors are "
@@ -260,7 +251,7 @@ def tables() -> list[Table]:
         "tiles of torch are the easy opponent: OpenSplat's CPU engine, in one run with an earlier engine of "
         "ours, took 4.5 to 8.9 times as long as that, its gradients of quats and scales being wrong."
     )
-    return [Table("rasterize", "CPU rasterizer", columns, tuple(rows), note)]
+    return [Table.of("rasterize", "CPU rasterizer", rows, note)]
 
 
 def warp_tables(cases: Sequence[RasterCase] | None = None, rounds: int = 5) -> list[Table]:
@@ -298,7 +289,7 @@ def warp_tables(cases: Sequence[RasterCase] | None = None, rounds: int = 5) -> l
                 if case.baseline or engine == "warp"
                 else ["", ""]
             )
-        count = f"{case.count:,}".replace(",", " ")
+        count = group_digits(case.count)
         size = f"{camera.width}×{camera.height}"
         rows.append((card, count, size, *(_spread(some) for some in times), *figures))
     if device.type == "cuda":
@@ -366,7 +357,7 @@ def hard_tables() -> list[Table]:
     engines = ("cpu", "warp") if find_spec("warp") else ("cpu",)
     for name, case in HARD.items():
         plain = drawn_case(name, "reference")
-        row = [name, f"{len(case.gaussians):,}".replace(",", " ")]
+        row = [name, group_digits(len(case.gaussians))]
         for engine in engines:
             fast = drawn_case(name, engine)
             errors = relative_errors(fast, plain)

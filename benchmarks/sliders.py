@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from statistics import fmean
 from typing import Any, Literal
 
 import tyro
@@ -41,6 +42,7 @@ from trainer.store.run_folder import write_json
 from trainer.views.view import crop, render_view
 
 from .analytic_edits import AnalyticEdit, bear_edits
+from .table import mean_worst
 
 STRENGTHS = tuple(i / 10 for i in range(11))
 """At which sliders are compared with the truth; 0 is exact for all."""
@@ -260,8 +262,8 @@ def suite_rows(results: Sequence[CaseResult]) -> tuple[tuple[str, ...], list[tup
         (
             result.case.name,
             str(result.members),
-            *(_decibels(result.curves[name]) for name in _SHOWN),
-            *(f"{_mean(result.curves[name].lpips[1:]):.4f}" for name in _SHOWN),
+            *(mean_worst(result.curves[name].psnr[1:]) for name in _SHOWN),
+            *(f"{fmean(result.curves[name].lpips[1:]):.4f}" for name in _SHOWN),
             f"{result.curves[SLIDER].psnr[-1]:.1f}",
             f"{result.bytes_per_member:.0f}",
         )
@@ -314,14 +316,6 @@ def suite_picture(results: Sequence[CaseResult]) -> Tensor:
     ]
     lines = [plots[i : i + _PLOTS_A_ROW] for i in range(0, len(plots), _PLOTS_A_ROW)]
     return stack_plots(to_picture(sheet), lines)
-
-
-def _decibels(curve: ErrorCurve) -> str:
-    return f"{_mean(curve.psnr[1:]):.1f} / {min(curve.psnr[1:]):.1f}"
-
-
-def _mean(values: Sequence[float]) -> float:
-    return sum(values) / len(values)
 
 
 def _square(image: Tensor) -> Tensor:

@@ -7,11 +7,12 @@ import hashlib
 import os
 import platform
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
+from statistics import fmean
 
 BEGIN, END = "<!-- bench {name} -->", "<!-- end {name} -->"
 
@@ -35,6 +36,11 @@ class Table:
     rows: tuple[tuple[str, ...], ...]  # one text a column
     note: str = ""  # what was measured and how, one or two lines
 
+    @classmethod
+    def of(cls, name: str, title: str, rows: Sequence[Mapping[str, str]], note: str) -> Table:
+        """A table of at least one row, which has its texts by their headings."""
+        return cls(name, title, tuple(rows[0]), tuple(tuple(row.values()) for row in rows), note)
+
     def markdown(self) -> str:
         """The table as GitHub Markdown, with its title and note."""
         lines = [f"**{self.title}**", "", "| " + " | ".join(self.columns) + " |"]
@@ -51,6 +57,11 @@ class Table:
             tuple("–" if w else cell for w, cell in zip(walls, row, strict=True)) for row in self.rows
         )
         return replace(self, rows=rows)
+
+
+def mean_worst(values: Sequence[float]) -> str:
+    """The cell of some dB; a dash where there are none."""
+    return f"{fmean(values):.1f} / {min(values):.1f}" if values else "-"
 
 
 def busy_share() -> float:

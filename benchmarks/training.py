@@ -134,27 +134,22 @@ def tables(scenes: Sequence[Path] = (), plot: Path | None = None) -> list[Table]
 
 def table(found: Mapping[Task, Sequence[Trained]]) -> Table:
     """A row a run."""
-    rows = []
+    rows, strengths = [], ", ".join(f"{s:g}" for s in MEASURED[:-1])
     for task, runs in found.items():
         for run in runs:
             between = " ".join(f"{psnr:.1f}" for psnr in run.psnrs[:-1])
             rows.append(
-                (
-                    f"{task.scene.stem}, {task.editor}",
-                    f"`{run.way}`" if run.way else "(default)",
-                    f"{run.psnrs[-1]:.1f}",
-                    f"{min(run.psnrs[:-1]):.1f}",
-                    between,
-                    f"{run.processor:.0f}",
-                    f"{run.seconds:.0f}",
-                    f"{run.bytes:.0f}",
-                )
+                {
+                    "edit": f"{task.scene.stem}, {task.editor}",
+                    "`progdf train` with": f"`{run.way}`" if run.way else "(default)",
+                    "dB at 1": f"{run.psnrs[-1]:.1f}",
+                    "worst between, dB": f"{min(run.psnrs[:-1]):.1f}",
+                    f"at {strengths}": between,
+                    "processor, s": f"{run.processor:.0f}",
+                    Wall("wall, s"): f"{run.seconds:.0f}",
+                    "bytes a member": f"{run.bytes:.0f}",
+                }
             )
-    strengths = ", ".join(f"{s:g}" for s in MEASURED[:-1])
-    columns = (
-        "edit", "`progdf train` with", "dB at 1", "worst between, dB", f"at {strengths}",
-        "processor, s", Wall("wall, s"), "bytes a member",
-    )  # fmt: skip
     commands = ", ".join(
         f"`progdf train {task.scene.name} --region {_short(task.region)} --editor {task.editor} "
         "--slider stages --out RUN`"
@@ -165,7 +160,7 @@ def table(found: Mapping[Task, Sequence[Trained]]) -> Table:
         "chose, over the pixels that show the region; whole processes, imports and the report's pictures "
         f"included. Each row is that option added to: {commands}."
     )
-    return Table("training", "Training: error over time", columns, tuple(rows), note)
+    return Table.of("training", "Training: error over time", rows, note)
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from benchmarks.table import Table, Wall
 from progdf.formats.ply import save_ply
 from progdf.metrics.image import psnr
+from progdf.terminal import group_digits
 from progdf.threads import one_thread
 from viewer.camera.view_camera import first_camera
 from viewer.files import document as documents
@@ -34,7 +35,7 @@ from viewer.state.view_state import ViewState
 
 from . import display as bench_display
 from .mouse import SIZE, Mouse
-from .scenes import COPIES, copies, scenes_of
+from .scenes import COPIES, WAYS, copies, scenes_of
 
 WARM_UP, STEPS, STARTS, KEPT = 2, 20, 3, 4
 LEAST, TURN_S, STARTS_S = 3, 20.0, 30.0
@@ -45,8 +46,6 @@ MOST_COPIED = 1_000_000
 
 TURN_PX = 10.0
 """How far the mouse goes from one frame to the next: three degrees."""
-
-WAYS = {"gl": "OpenGL", "cpu": "CPU"}
 
 
 @dataclass(frozen=True)
@@ -182,33 +181,24 @@ def frames_table(turnings: Sequence[Turning], starts: Sequence[Start], renderer:
         middle, late = np.percentile(result.frames_ms, (50, 95))
         start = starts[i] if starts else None
         rows.append(
-            (
-                f"{result.count:,}".replace(",", " "),
-                WAYS[result.way],
-                f"{np.median(result.draws_ms):.1f}",
-                f"**{middle:.1f}** / {late:.1f}",
-                f"{result.processor_ms:.1f}",
-                f"{result.checked - result.wrong} of {result.checked}",
-                f"{result.opened_s:.2f}",
-                "-" if start is None else f"{start.first_s:.2f} ({start.imports_s:.2f})",
-                "-" if start is None else f"{start.memory_mb:.0f}",
-            )
+            {
+                "Gaussians": group_digits(result.count),
+                "drawn by": WAYS[result.way],
+                Wall("sort and draw, ms"): f"{np.median(result.draws_ms):.1f}",
+                Wall("whole frame p50 / p95, ms"): f"**{middle:.1f}** / {late:.1f}",
+                "of the processor, ms": f"{result.processor_ms:.1f}",
+                "the same drawn afresh": f"{result.checked - result.wrong} of {result.checked}",
+                Wall("first picture of an opened file, s"): f"{result.opened_s:.2f}",
+                Wall("of `progdf view`, s (imports)"): "-"
+                if start is None
+                else f"{start.first_s:.2f} ({start.imports_s:.2f})",
+                "memory by then, MB": "-" if start is None else f"{start.memory_mb:.0f}",
+            }
         )
-    return Table(
+    return Table.of(
         "frames",
         "Frames while orbiting, 640×480, and the first picture",
-        (
-            "Gaussians",
-            "drawn by",
-            Wall("sort and draw, ms"),
-            Wall("whole frame p50 / p95, ms"),
-            "of the processor, ms",
-            "the same drawn afresh",
-            Wall("first picture of an opened file, s"),
-            Wall("of `progdf view`, s (imports)"),
-            "memory by then, MB",
-        ),
-        tuple(rows),
+        rows,
         f"OpenGL by {renderer}. Every frame turns three degrees and has its own exact depth order; a whole "
         "frame goes from the mouse's event to finished pixels of picture and panel. A file is opened in a "
         "window that is there; `progdf view` counts from the start of its process, kernels compiled before.",
@@ -221,31 +211,23 @@ def coarse_table(turnings: Sequence[Turning], renderer: str) -> Table:
     for result in turnings:
         full, coarse = np.median(result.frames_ms), np.median(result.coarse_ms)
         rows.append(
-            (
-                f"{result.count:,}".replace(",", " "),
-                WAYS[result.way],
-                f"{full:.1f}",
-                f"{coarse:.1f}",
-                f"{full / coarse:.1f}×",
-                f"{result.processor_ms:.1f} / {result.coarse_processor_ms:.1f}",
-                f"{result.coarse_db:.1f}",
-                str(result.at_rest),
-            )
+            {
+                "Gaussians": group_digits(result.count),
+                "drawn by": WAYS[result.way],
+                Wall("frame in full, ms"): f"{full:.1f}",
+                Wall("coarse, ms"): f"{coarse:.1f}",
+                Wall("ratio"): f"{full / coarse:.1f}×",
+                "of the processor, ms: full / coarse": " / ".join(
+                    f"{ms:.1f}" for ms in (result.processor_ms, result.coarse_processor_ms)
+                ),
+                Wall("PSNR while moving, dB"): f"{result.coarse_db:.1f}",
+                "difference at rest, of 255": str(result.at_rest),
+            }
         )
-    return Table(
+    return Table.of(
         "coarse",
         "A picture that is coarse while it moves, 640×480",
-        (
-            "Gaussians",
-            "drawn by",
-            Wall("frame in full, ms"),
-            Wall("coarse, ms"),
-            Wall("ratio"),
-            "of the processor, ms: full / coarse",
-            Wall("PSNR while moving, dB"),
-            "difference at rest, of 255",
-        ),
-        tuple(rows),
+        rows,
         f"OpenGL by {renderer}. Medians of whole frames while orbiting; one pixel drawn fills "
         f"{COARSE}×{COARSE} of the window. The error is the worst of {KEPT} frames.",
     )

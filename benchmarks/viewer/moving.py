@@ -23,6 +23,7 @@ from progdf.demo_scenes import bear
 from progdf.gaussians import Gaussians
 from progdf.metrics.image import psnr
 from progdf.rasterize.cpu.pyramid import Pyramid
+from progdf.terminal import group_digits
 from progdf.threads import one_thread
 from viewer.camera.view_camera import first_camera
 from viewer.render.cpu_renderer import CpuRenderer
@@ -149,39 +150,25 @@ def table(results: Sequence[Moving]) -> Table:
     for result in results:
         alone, beside = (np.percentile(frames, (50, 95)) for frames in (result.turning, result.beside))
         rows.append(
-            (
-                f"{result.count:,}".replace(",", " "),
-                f"{result.full:.0f}",
-                f"**{alone[0]:.0f}** / {alone[1]:.0f}",
-                f"{result.processor:.0f}",
-                f"{beside[0]:.0f} / {beside[1]:.0f}",
-                f"{result.sharp:.0f} ({result.meanwhile:.0f})",
-                f"{result.click:.0f}",
-                f"{result.lasso:.0f}",
-                f"{result.db:.1f}",
-                f"{100 * result.luminance:+.2f} %",
-                f"{result.build:.2f}",
-                f"{result.memory:.2f}",
-            )
+            {
+                "Gaussians": group_digits(result.count),
+                Wall("picture in full"): f"{result.full:.0f}",
+                Wall("frame while turning p50 / p95"): f"**{alone[0]:.0f}** / {alone[1]:.0f}",
+                "of the processor": f"{result.processor:.0f}",
+                Wall("beside a training"): f"{beside[0]:.0f} / {beside[1]:.0f}",
+                Wall("sharp after (longest frame)"): f"{result.sharp:.0f} ({result.meanwhile:.0f})",
+                Wall("click"): f"{result.click:.0f}",
+                Wall("lasso let go"): f"{result.lasso:.0f}",
+                Wall("PSNR while turning, dB"): f"{result.db:.1f}",
+                Wall("luminance while turning"): f"{100 * result.luminance:+.2f} %",
+                "pyramid, s of the processor": f"{result.build:.2f}",
+                "its memory, of the scene's": f"{result.memory:.2f}",
+            }
         )
-    return Table(
+    return Table.of(
         "moving",
         f"A scene in the hand without a graphics card, {SIZE[0]}×{SIZE[1]}, ms",
-        (
-            "Gaussians",
-            Wall("picture in full"),
-            Wall("frame while turning p50 / p95"),
-            "of the processor",
-            Wall("beside a training"),
-            Wall("sharp after (longest frame)"),
-            Wall("click"),
-            Wall("lasso let go"),
-            Wall("PSNR while turning, dB"),
-            Wall("luminance while turning"),
-            "pyramid, s of the processor",
-            "its memory, of the scene's",
-        ),
-        tuple(rows),
+        rows,
         "Whole frames, from the mouse's event to finished pixels of picture and panel; each step of "
         f"{STEPS} turns three degrees. The errors are the worst of {JUDGED} pictures, on white, as they are "
         "shown: stretched smoothly. The pyramid is built before.",

@@ -20,6 +20,7 @@ from progdf.demo_scenes import room
 from progdf.gaussians import Gaussians
 from progdf.rasterize.screen import fill_screen
 from progdf.scene.bounds import near_plane
+from progdf.terminal import group_digits
 from progdf.threads import one_thread
 from viewer.camera.view_camera import ViewCamera, add_scaled, axes, bounds_of, eye, first_camera, to_camera
 from viewer.render.cpu_renderer import CpuRenderer
@@ -139,34 +140,23 @@ def _blocks(change: NDArray[np.float32]) -> NDArray[np.float32]:
 
 def table(films: Sequence[Film]) -> Table:
     """A row a film."""
-    return Table(
+    return Table.of(
         "popping",
         f"Films of moving pictures, {SIZE[0]}×{SIZE[1]}: what changes from frame to frame, of 255",
-        (
-            "path",
-            "Gaussians",
-            "limit, pixels²",
-            "sharp film",
-            "moving film",
-            "what changes apart",
-            "blocks: 99th percentile",
-            "of all Gaussians in as few pixels",
-            "PSNR, the worst frame, dB",
-        ),
-        tuple(
-            (
-                film.title,
-                f"{film.count:,}".replace(",", " "),
-                f"{film.limit:.1f}",
-                f"{film.sharp:.2f}",
-                f"{film.moving:.2f}",
-                f"{film.apart:.2f}",
-                f"{film.blocks:.1f}",
-                f"{film.halved:.1f}",
-                f"{film.db:.1f}",
-            )
+        [
+            {
+                "path": film.title,
+                "Gaussians": group_digits(film.count),
+                "limit, pixels²": f"{film.limit:.1f}",
+                "sharp film": f"{film.sharp:.2f}",
+                "moving film": f"{film.moving:.2f}",
+                "what changes apart": f"{film.apart:.2f}",
+                "blocks: 99th percentile": f"{film.blocks:.1f}",
+                "of all Gaussians in as few pixels": f"{film.halved:.1f}",
+                "PSNR, the worst frame, dB": f"{film.db:.1f}",
+            }
             for film in films
-        ),
+        ],
         f"{FRAMES} frames, each {TURN:.0f}° on. The moving picture is as fine as it is found to need to be "
         "where the hand rests before, whatever time that takes; what changes in it and does not in the sharp "
         f"film is popping (or detail that it lacks), on average and of the means of {BLOCK}×{BLOCK} pixels.",

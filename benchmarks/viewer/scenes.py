@@ -26,6 +26,9 @@ SIZES = (31_000, 125_000)
 COPIES = 4
 """How many times the largest scene is laid over itself for one that is larger still."""
 
+WAYS = {"gl": "OpenGL", "cpu": "CPU"}
+"""Of drawing, of `engine.DRAWS`, and what tables call them."""
+
 RANKS = 3
 _SHIFT, _JITTER = 0.003, 0.002  # of the scene's radius
 

@@ -13,6 +13,7 @@ from benchmarks.table import Table, machine
 from progdf.gaussians import Gaussians
 from progdf.scene import selection as shapes
 from progdf.scene.neighbors import Neighborhood, grow_along_surface
+from progdf.terminal import group_digits
 from viewer.camera.view_camera import first_camera, to_camera
 from viewer.state import selection
 
@@ -36,7 +37,7 @@ def tables(scenes: Sequence[Path] = ()) -> list[Table]:
     opened.append(copies(opened[-1], -(-1_000_000 // len(opened[-1]))))
     columns = [measure(scene) for scene in opened]
     rows = tuple((name, *(f"{times[name]:.0f}" for times in columns)) for name in columns[0])
-    heads = tuple(f"{len(scene):,}".replace(",", " ") for scene in opened)
+    heads = tuple(group_digits(len(scene)) for scene in opened)
     note = f"Processor time in ms, median of {TIMES}, picture of {SIZE[0]}×{SIZE[1]}. {machine()}."
     return [Table("select", "A selection by hand", ("of Gaussians", *heads), rows, note)]
 

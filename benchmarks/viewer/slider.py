@@ -20,6 +20,7 @@ from benchmarks.table import Table, Wall
 from progdf.gaussians import Gaussians
 from progdf.metrics.image import psnr
 from progdf.rasterize import render
+from progdf.terminal import group_digits
 from progdf.threads import one_thread
 from viewer.camera.view_camera import first_camera, to_camera
 from viewer.render.dynamic_resolution import FrameTimings
@@ -28,24 +29,10 @@ from viewer.render.gl_renderer import headless_context
 from viewer.state.view_state import LayerState, ViewState
 
 from .mouse import SIZE, Mouse, slider_at
-from .scenes import edit_for, scenes_of
+from .scenes import WAYS, edit_for, scenes_of
 
 WARM_UP, STEPS = 2, 24
-PARTS = ("compose_ms", "upload_ms", "sort_ms", "draw_ms")
-
-
-@dataclass(frozen=True)
-class Way:
-    """One way to bring a slider's change to the screen; what is to be compared gets a row here."""
-
-    title: str  # in the table
-    draw: str  # of `engine.DRAWS`
-
-
-WAYS = {
-    "gl": Way("OpenGL", "gl"),
-    "cpu": Way("CPU", "cpu"),
-}
+PARTS = "compose", "upload", "sort", "draw"
 
 
 @dataclass(frozen=True)
@@ -125,8 +112,8 @@ def rows(
     parts: dict[str, list[FrameTimings]] = {way: [] for way in WAYS}
     with ExitStack() as held:
         mice: dict[str, Mouse] = {}
-        for name, way in WAYS.items():
-            engine = ViewEngine(ctx, scene, [gdf], way.draw)
+        for name in WAYS:
+            engine = ViewEngine(ctx, scene, [gdf], name)
             held.callback(engine.release)
             mice[name] = held.enter_context(Mouse(ctx, engine, scene, [gdf], view, size))
             mice[name].grip_slider()
@@ -152,42 +139,28 @@ def rows(
 
 def table(results: Sequence[SliderTimes], renderer: str) -> Table:
     """The measurements, named after what OpenGL was drawn by."""
-    return Table(
-        "viewer",
-        "Slider event to finished pixels, 640×480, ms",
-        (
-            "Gaussians",
-            "members",
-            "edit of",
-            "drawn by",
-            Wall("compose"),
-            Wall("upload"),
-            Wall("sort"),
-            Wall("draw"),
-            Wall("panel, screen"),
-            Wall("in all p50 / p95"),
-            "processor",
-            "PSNR to the CPU engine, dB",
-        ),
-        tuple(_cells(result) for result in results),
+    note = (
         f"OpenGL by {renderer}. A hand drags the slider of a window without a screen; wall clock, the GPU "
-        "waited for, the parts are medians; processor: of all cores. The CPU rasterizer sorts as it draws.",
+        "waited for, the parts are medians; processor: of all cores. The CPU rasterizer sorts as it draws."
     )
+    rows = [_cells(result) for result in results]
+    return Table.of("viewer", "Slider event to finished pixels, 640×480, ms", rows, note)
 
 
-def _cells(result: SliderTimes) -> tuple[str, ...]:
+def _cells(result: SliderTimes) -> dict[str, str]:
     middle, late = np.percentile(result.events_ms, (50, 95))
-    return (
-        f"{result.count:,}".replace(",", " "),
-        f"{result.case.members:,}".replace(",", " "),
-        result.case.title,
-        WAYS[result.way].title,
-        *(f"{np.median([getattr(part, name) for part in result.parts]):.1f}" for name in PARTS),
-        f"{result.rest_ms:.1f}",
-        f"**{middle:.1f}** / {late:.1f}",
-        f"{np.median(result.processor_ms):.1f}",
-        "exact" if math.isinf(result.psnr_db) else f"{result.psnr_db:.0f}",
-    )
+    parts = {name: np.median([getattr(part, f"{name}_ms") for part in result.parts]) for name in PARTS}
+    return {
+        "Gaussians": group_digits(result.count),
+        "members": group_digits(result.case.members),
+        "edit of": result.case.title,
+        "drawn by": WAYS[result.way],
+        **{Wall(name): f"{part:.1f}" for name, part in parts.items()},
+        Wall("panel, screen"): f"{result.rest_ms:.1f}",
+        Wall("in all p50 / p95"): f"**{middle:.1f}** / {late:.1f}",
+        "processor": f"{np.median(result.processor_ms):.1f}",
+        "PSNR to the CPU engine, dB": "exact" if math.isinf(result.psnr_db) else f"{result.psnr_db:.0f}",
+    }
 
 
 def _fitting(scenes: Sequence[Gaussians], members: int) -> Gaussians:
