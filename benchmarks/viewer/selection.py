@@ -60,10 +60,7 @@ def measure(scene: Gaussians) -> dict[str, float]:
         """From the mouse's release to the state: seen, enclosed, in front, packed."""
         surface = surface or shapes.Surface(scene, camera)
         mask = shapes.inside_polygon(surface.centers.points, outline)
-        if not through:
-            rows = np.flatnonzero(mask)
-            mask[rows] = surface.front(rows)
-        return selection.pack(mask)
+        return selection.pack(mask if through else surface.in_front(mask))
 
     works: dict[str, Callable[[], object]] = {
         "lasso, through": lambda: lasso(True),

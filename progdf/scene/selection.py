@@ -217,6 +217,12 @@ class Surface:
                 return self._front[rows]
             return front_surface(self.scene, self.camera, self.centers, rows)
 
+    def in_front(self, mask: Mask) -> Mask:
+        """What of a mask lies on what one sees. [N]"""
+        rows, seen = np.flatnonzero(mask), np.zeros_like(mask)
+        seen[rows] = self.front(rows)
+        return seen
+
     def prepare(self, colors: bool = False) -> None:
         """Work out the whole front, and the colors, ahead; until `drop`."""
         with self._lock, stopped_by(self._stop), suppress(StoppedError):

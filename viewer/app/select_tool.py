@@ -142,10 +142,7 @@ def rows_inside(gesture: Gesture, surface: Surface, through: bool) -> Mask:
         mask = inside_rectangle(points, gesture.path[0], gesture.path[-1])
     else:
         mask = inside_polygon(points, gesture.path)
-    if not through:
-        rows = np.flatnonzero(mask)
-        mask[rows] = surface.front(rows)
-    return mask
+    return mask if through else surface.in_front(mask)
 
 
 def pick_color(work: Workspace, pointer: PointerContext) -> Workspace:
@@ -178,10 +175,7 @@ def rows_at_click(
         return grow_along_surface(neighborhood(), colors, seeds, color, tolerance)
     mask = alike_in_color(colors, color, tolerance)
     mask[seeds] = True
-    if not through:
-        rows = np.flatnonzero(mask)
-        mask[rows] = surface.front(rows)
-    return mask
+    return mask if through else surface.in_front(mask)
 
 
 def _seeds(seen: Seen) -> np.ndarray:

@@ -29,9 +29,8 @@ LOOK_S = 1.0
 Status = Literal["queued", "running", "stopping", "stopped", "failed", "done"]
 
 
-FORMATS = (".mp4", ".gif", ".webp", "")
+FORMATS = {".mp4": "MP4", ".gif": "GIF", ".webp": "WebP", "": "PNG frames"}
 """Of films: three kinds of files, and a folder of frames."""
-FORMAT_NAMES = ("MP4", "GIF", "WebP", "PNG frames")
 SIDES = (720, 1080, 1440, 2160)
 """Of pictures and films: the shorter one, pixels."""
 FPS = (12, 24, 25, 30, 60)

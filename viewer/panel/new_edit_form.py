@@ -42,7 +42,6 @@ from viewer.ui.widgets import (
     key_step,
     label,
     right_edge,
-    slider_row,
     small,
     tip,
     value_slider,
@@ -201,8 +200,9 @@ def _settings(form: NewEdit, preview: PreviewState, column: float, ui: UiContext
             form = replace(form, through_hues=choice_row("Path", paths, form.through_hues, column, ui, help_))
         case "amount":
             help_ = "Share of the light that is taken away"
-            amount = slider_row("Amount", form.amount, (0.05, 0.98), 0.7, column, ui, help_)
-            form = replace(form, amount=amount)
+            label("Amount", column)
+            form = replace(form, amount=value_slider("##Amount", form.amount, (0.05, 0.98), "%.2f", 0.7, ui))
+            tip(help_)
         case "grade":
             grade = []
             form = _palette(form, column, ui)

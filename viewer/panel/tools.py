@@ -121,12 +121,12 @@ class _Bar:
         """One of a few values; the one that was chosen."""
         wide = sum(imgui.calc_text_size(text).x + 14.0 * self.ui.scale for text in options.values())
         self.follow(wide)
-        pressed = choice(name, [*options.values()], [*options].index(current), self.ui, wide)
+        pressed = choice(name, options, current, self.ui, wide)
         if action:
             hint(action, help_)
         else:
             tip(help_)
-        return current if pressed is None else [*options][pressed]
+        return current if pressed is None else pressed
 
     def slider(
         self,
@@ -394,14 +394,14 @@ def _choose_comparison(compare: Comparison, snapshots: bool, ui: UiContext) -> C
     return compare
 
 
-UPS: tuple[tuple[str, Vec3], ...] = (
-    ("+X", (1.0, 0.0, 0.0)),
-    ("−X", (-1.0, 0.0, 0.0)),
-    ("+Y", (0.0, 1.0, 0.0)),
-    ("−Y", (0.0, -1.0, 0.0)),
-    ("+Z", (0.0, 0.0, 1.0)),
-    ("−Z", (0.0, 0.0, -1.0)),
-)
+UPS: dict[str, Vec3] = {
+    "+X": (1.0, 0.0, 0.0),
+    "−X": (-1.0, 0.0, 0.0),
+    "+Y": (0.0, 1.0, 0.0),
+    "−Y": (0.0, -1.0, 0.0),
+    "+Z": (0.0, 0.0, 1.0),
+    "−Z": (0.0, 0.0, -1.0),
+}
 
 
 _LOOKS = (("frame", Icon.FRAME), ("home", Icon.HOME))
@@ -435,12 +435,12 @@ def draw_view(view: ViewState, area: Area, foot: float, ui: UiContext, actions: 
 def _view_rows(view: ViewState, ui: UiContext, actions: list[str]) -> ViewState:
     column, wide, camera = COLUMN_PX * ui.scale, 232.0 * ui.scale, view.camera
     label("Up axis", column)
-    ups = (*UPS, ("View", axes(camera).up))
-    current = next((i for i, (_, up) in enumerate(UPS) if up == camera.up), len(UPS))
-    chosen = choice("up", tuple(name for name, _ in ups), current, ui, wide)
+    current = next((name for name, up in UPS.items() if up == camera.up), "View")
+    ups = {**UPS, "View": axes(camera).up}
+    chosen = choice("up", {name: name for name in ups}, current, ui, wide)
     tip("Up axis of the scene. View: use the current view's up direction")
     if chosen is not None:
-        camera = with_up(camera, ups[chosen][1])
+        camera = with_up(camera, ups[chosen])
     label("View angle", column)
     fov_y = value_slider("##fov", camera.fov_y, (10.0, 110.0), "%.0f°", ViewCamera.fov_y, ui, wide)
     camera = replace(camera, fov_y=fov_y)

@@ -5,7 +5,7 @@ What only the window can do (write a file, go full screen) is left in `requests`
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -29,7 +29,7 @@ from .layers import (
     with_overshoot,
     with_paint,
 )
-from .view_state import ViewState, next_frame, next_resolution_mode
+from .view_state import BRUSH_MODES, FRAMES, RESOLUTION_MODES, ViewState, following
 from .workspace import (
     LEAST_ZOOM,
     MOST_ZOOM,
@@ -298,9 +298,10 @@ def _toggle_cards(workspace: Workspace, _: str) -> Workspace:
     return replace(workspace, view=replace(workspace.view, cards=cards))
 
 
-def _blend(workspace: Workspace, _: str) -> Workspace:
-    after = BLENDS[(BLENDS.index(workspace.view.blend) + 1) % len(BLENDS)]
-    return replace(workspace, view=replace(workspace.view, blend=after))
+def _next_value(workspace: Workspace, name: str, values: Sequence[str]) -> Workspace:
+    """The value of the view after the present one."""
+    changes: dict[str, Any] = {name: following(values, getattr(workspace.view, name))}
+    return replace(workspace, view=replace(workspace.view, **changes))
 
 
 def _back(workspace: Workspace, past: History) -> Workspace:
@@ -403,13 +404,13 @@ ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
     "rename_group": _rename_group,
     "search": lambda workspace, _: replace(workspace, searching=bool(workspace.view.layers)),
     "cards": _toggle_cards,
-    "blend": _blend,
+    "blend": lambda w, _: _next_value(w, "blend", BLENDS),
     "select_tool": _take_tool,
     "select_through": lambda w, _: replace(
         w, view=replace(w.view, select=replace(w.view.select, through=not w.view.select.through))
     ),
     "brush": _take_brush,
-    "brush_mode": lambda w, _: _change_brush(w, mode=paint.next_mode(w.view.brush.mode)),
+    "brush_mode": lambda w, _: _change_brush(w, mode=following(BRUSH_MODES, w.view.brush.mode)),
     "brush_weights": lambda w, _: _change_brush(w, weights=not w.view.brush.weights),
     "brush_through": lambda w, _: _change_brush(w, through=not w.view.brush.through),
     "brush_radius": _resize,
@@ -437,7 +438,7 @@ ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
     "look": _look,
     "grid": lambda w, _: replace(w, view=replace(w.view, grid=not w.view.grid)),
     "axes": lambda w, _: replace(w, view=replace(w.view, axes=not w.view.axes)),
-    "safe_frame": lambda w, _: replace(w, view=next_frame(w.view)),
+    "safe_frame": lambda w, _: _next_value(w, "safe_frame", FRAMES),
     "help": lambda workspace, _: replace(workspace, help=not workspace.help),
     "palette": lambda workspace, _: replace(workspace, palette=-1, query="", help=False),
     "before": lambda w, _: replace(w, before=not w.before),
@@ -445,7 +446,7 @@ ACTIONS: dict[str, Callable[[Workspace, str], Workspace]] = {
     "split": lambda w, _: replace(w, view=toggle_mode(w.view, "split")),
     "difference": lambda w, _: replace(w, view=toggle_mode(w.view, "difference")),
     "compare_snapshots": lambda w, _: replace(w, view=toggle_snapshots(w.view)) if w.snapshots else w,
-    "dynamic_resolution": lambda w, _: replace(w, view=next_resolution_mode(w.view)),
+    "dynamic_resolution": lambda w, _: _next_value(w, "dynamic_resolution", RESOLUTION_MODES),
     "new_edit": _new_edit,
     "panel": lambda w, _: replace(w, view=replace(w.view, panel=not w.view.panel)),
     **{name: _timeline_action(name) for name in timeline.ACTIONS},

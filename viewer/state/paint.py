@@ -22,7 +22,7 @@ from progdf.errors import ProgdfError
 from progdf.gdf.file import Gdf
 from progdf.scene.selection import Surface
 
-from .view_state import BRUSH_MODES, LARGEST_PX, SMALLEST_PX, Brush
+from .view_state import LARGEST_PX, SMALLEST_PX, Brush
 
 FULL = ""
 """The paint of a layer that was never painted: weight 1 everywhere."""
@@ -41,11 +41,6 @@ class Stroke:
     reached: Floats  # largest touch of the brush so far, 0..1. [M]
     mode: str = "erase"  # of `BRUSH_MODES`
     last: tuple[float, float] | None = None  # where the brush was last, pixels
-
-
-def next_mode(mode: str) -> str:
-    """The mode after this one."""
-    return BRUSH_MODES[(BRUSH_MODES.index(mode) + 1) % len(BRUSH_MODES)]
 
 
 def mode_while(mode: str, modifier: str) -> str:

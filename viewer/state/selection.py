@@ -134,21 +134,10 @@ def change(
         neighborhood: of the scene, made when it is first asked for
     """
     mask = unpack(state.members, total)
-    match name:
-        case "select_all":
-            return select(state, np.ones(total, bool))
-        case "select_none":
-            return select_none(state)
-        case "select_invert":
-            return select(state, ~mask)
-        case "hide_selected":
-            return hide(state, mask)
-        case "isolate":
-            return isolate(state, total)
-        case "show_hidden":
-            return show_all(state)
-        case "region" | "show_region" | "forget_region":
-            return _change_region(state, name, argument, mask)
+    if name in _CHANGES:
+        return _CHANGES[name](state, mask)
+    if name in _OF_REGIONS:
+        return _change_region(state, name, argument, mask)
     return select(state, CHANGES_BY_NEIGHBORS[name](neighborhood(), mask)) if state.count else state
 
 
@@ -171,11 +160,16 @@ CHANGES_BY_NEIGHBORS: dict[str, Callable[[Neighborhood, Mask], Mask]] = {
     "select_largest": Neighborhood.largest_part,
     "select_refine": Neighborhood.refine,
 }
-CHANGES = (
-    *("select_all", "select_none", "select_invert", "hide_selected", "isolate", "show_hidden"),
-    *("region", "show_region", "forget_region"),
-    *CHANGES_BY_NEIGHBORS,
-)
+_CHANGES: dict[str, Callable[[SelectionState, Mask], SelectionState]] = {
+    "select_all": lambda state, mask: select(state, np.ones_like(mask)),
+    "select_none": lambda state, _: select_none(state),
+    "select_invert": lambda state, mask: select(state, ~mask),
+    "hide_selected": hide,
+    "isolate": lambda state, mask: isolate(state, len(mask)),
+    "show_hidden": lambda state, _: show_all(state),
+}
+_OF_REGIONS = ("region", "show_region", "forget_region")
+CHANGES = (*_CHANGES, *_OF_REGIONS, *CHANGES_BY_NEIGHBORS)
 """Actions on the selection, and `region:INDEX[:MODE]`, `show_region:INDEX`, `forget_region:INDEX`."""
 
 

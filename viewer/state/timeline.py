@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from viewer.camera import views
 from viewer.camera.view_camera import ViewCamera
 
-from .view_state import FASTEST, LONGEST, Keyframe, LayerState, Timeline, ViewState
+from .view_state import FASTEST, LONGEST, Keyframe, LayerState, Timeline, ViewState, following
 
 EASINGS = views.EASINGS
 
@@ -332,7 +332,7 @@ def _easing(view: ViewState, player: Player, name: str) -> tuple[Timeline, Playe
         return view.timeline, player
     chosen, deciding = chosen_keys(view.timeline, player), key_before(view.timeline, player.frame)
     now = split_keys(view.timeline)[min(chosen)].easing if chosen else deciding.easing
-    name = name or EASINGS[(EASINGS.index(now) + 1) % len(EASINGS)]
+    name = name or following(EASINGS, now)
     return set_easing(view.timeline, chosen or keys_at(view.timeline, deciding.frame), name), player
 
 

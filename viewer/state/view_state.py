@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Annotated
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, TypeVar
 
 from msgspec import Meta
 
@@ -13,6 +14,8 @@ from viewer.camera.view_camera import SHAPES, ViewCamera
 from viewer.camera.views import EASINGS
 
 from .selection import SelectionState
+
+Value = TypeVar("Value")
 
 OVERSHOOT = 1.2
 """How far a slider goes where overshoot is on: beyond 1 the edit is extrapolated, not learned."""
@@ -175,12 +178,6 @@ def on_another_scene(view: ViewState, camera: ViewCamera) -> ViewState:
     )
 
 
-def next_frame(view: ViewState) -> ViewState:
-    """The state with the next of `FRAMES`."""
-    return replace(view, safe_frame=FRAMES[(FRAMES.index(view.safe_frame) + 1) % len(FRAMES)])
-
-
-def next_resolution_mode(view: ViewState) -> ViewState:
-    """The state with the next of `RESOLUTION_MODES`."""
-    following = RESOLUTION_MODES.index(view.dynamic_resolution) + 1
-    return replace(view, dynamic_resolution=RESOLUTION_MODES[following % len(RESOLUTION_MODES)])
+def following(values: Sequence[Value], value: Value) -> Value:
+    """The next of some values, the first after the last."""
+    return values[(values.index(value) + 1) % len(values)]

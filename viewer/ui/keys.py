@@ -18,16 +18,6 @@ from viewer.camera.view_camera import ViewCamera
 
 
 @dataclass(frozen=True)
-class DragBinding:
-    """A mouse drag on the picture. `mode`: only in this camera mode; empty is both."""
-
-    button: str
-    modifier: str
-    does: str
-    mode: str = ""
-
-
-@dataclass(frozen=True)
 class Command:
     """An action of `actions.perform` as a person meets it: in menus, tips, lists and, some day, speech."""
 
@@ -42,15 +32,16 @@ class Command:
     in_hand: bool = False  # of a tool or a decal in the hand, which then has these keys before others
 
 
-DRAGS = (
-    DragBinding("left", "", "orbit"),
-    DragBinding("left", "Alt", "orbit"),
-    DragBinding("middle", "", "orbit"),
-    DragBinding("middle", "Shift", "pan"),
-    DragBinding("middle", "Ctrl", "dolly"),
-    DragBinding("right", "", "look", mode="fly"),
-    DragBinding("right", "", "pan"),
-)
+DRAGS = {
+    "left": "orbit",
+    "Alt+left": "orbit",
+    "middle": "orbit",
+    "Shift+middle": "pan",
+    "Ctrl+middle": "dolly",
+    "right": "pan",
+}
+"""What a mouse drag on the picture does; in fly, the bare right one looks around."""
+
 
 FLY_KEYS = {"W": (0, 0, 1), "S": (0, 0, -1), "A": (-1, 0, 0), "D": (1, 0, 0), "Q": (0, -1, 0), "E": (0, 1, 0)}
 """Physical keys (their places on a US keyboard) → right, up, ahead."""
@@ -390,10 +381,9 @@ def find_commands(query: str, offered: Collection[str]) -> list[Command]:
 
 def drag_for(button: str, modifier: str, mode: str) -> str | None:
     """What a drag does, or None where nothing is bound. `modifier`: "", "Shift", "Ctrl" or "Alt"."""
-    for drag in DRAGS:
-        if drag.button == button and drag.modifier == modifier and drag.mode in ("", mode):
-            return drag.does
-    return None
+    if (button, modifier, mode) == ("right", "", "fly"):
+        return "look"
+    return DRAGS.get(f"{modifier}+{button}" if modifier else button)
 
 
 _BUTTONS = (("left", 0), ("right", 1), ("middle", 2))
@@ -495,7 +485,7 @@ def cancels_drag(keys: Keys, held: bool, drag: str | None) -> bool:
         drag: what is held on the picture, see `mouse.MouseTool`; the camera stays where it was turned
     """
     io, buttons = imgui.get_io(), imgui.MouseButton_
-    holds = held or (drag is not None and all(drag != d.does for d in DRAGS))
+    holds = held or drag not in (None, "look", *DRAGS.values())
     if not holds or io.want_text_input or not imgui.is_mouse_down(buttons.left.value):
         return False
     escape = any(press.chord == "Escape" for press in keys.pressed)

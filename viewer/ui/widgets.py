@@ -277,7 +277,6 @@ def drop_down(
     help_: str,
     tips: Sequence[str] = (),
     faint: Collection[int] = (),
-    flags: int = 0,
 ) -> int | None:
     """A list that opens below what it shows; the index that was chosen, or None.
 
@@ -291,7 +290,7 @@ def drop_down(
         faint: which titles are drawn so
         flags: of `imgui.ComboFlags_`
     """
-    if not imgui.begin_combo(name, shown, flags):
+    if not imgui.begin_combo(name, shown):
         tip(help_)
         return None
     chosen = None
@@ -400,26 +399,28 @@ def value_slider(
 
 
 def choice(
-    name: str, options: Sequence[str], current: int | None, ui: UiContext, wide: float = 0.0
-) -> int | None:
-    """A row of joined buttons, `wide` pixels or 0 for the rest of the line; the index that was pressed."""
+    name: str, options: Mapping[T, str], current: T | None, ui: UiContext, wide: float = 0.0
+) -> T | None:
+    """A row of joined buttons, `wide` pixels or 0 for the rest of the line; the value that was chosen of
+    `options`, which give each its text, or None."""
     gap = 2.0 * ui.scale
     room = (wide or imgui.get_content_region_avail().x) - gap * (len(options) - 1)
     widths = [room / len(options)] * len(options)
-    texts = [imgui.calc_text_size(option).x for option in options]
+    texts = [imgui.calc_text_size(text).x for text in options.values()]
     if wide or max(texts) > widths[0]:  # the same margin for each instead of the same width
         widths = [text + (room - sum(texts)) / len(options) for text in texts]
     pressed = None
     with imgui_ctx.begin_group():
         imgui.push_style_var(imgui.StyleVar_.frame_padding, (0.0, 5.0 * ui.scale))
-        for i, option in enumerate(options):
+        for i, (option, text) in enumerate(options.items()):
             if i:
                 imgui.same_line(0.0, gap)
-            for slot in _BUTTON_COLORS if i == current else ():
+            slots = _BUTTON_COLORS if option == current else ()
+            for slot in slots:
                 imgui.push_style_color(slot, PALETTE.chosen)
-            if imgui.button(f"{option}##{name}", (widths[i], 0.0)):
-                pressed = i
-            imgui.pop_style_color(len(_BUTTON_COLORS) if i == current else 0)
+            if imgui.button(f"{text}##{name}", (widths[i], 0.0)):
+                pressed = option
+            imgui.pop_style_color(len(slots))
         imgui.pop_style_var()
     return pressed
 
@@ -432,29 +433,11 @@ def choice_row(
     ui: UiContext,
     help_: str,
 ) -> T:
-    """A named row of joined buttons; the value that was chosen of `options`, which give each its text."""
+    """A named row of joined buttons, see `choice`; the value as it is now."""
     label(title, column)
-    values = [*options]
-    pressed = choice(title, [*options.values()], values.index(current), ui)
+    pressed = choice(title, options, current, ui)
     tip(help_)
-    return current if pressed is None else values[pressed]
-
-
-def slider_row(
-    title: str,
-    value: float,
-    ends: tuple[float, float],
-    default: float,
-    column: float,
-    ui: UiContext,
-    help_: str,
-    form: str = "%.2f",
-) -> float:
-    """A named slider, see `value_slider`."""
-    label(title, column)
-    value = value_slider(f"##{title}", value, ends, form, default, ui)
-    tip(help_)
-    return value
+    return current if pressed is None else pressed
 
 
 def swatch(color: tuple[float, float, float], alpha: float, edge: bool, ui: UiContext) -> None:

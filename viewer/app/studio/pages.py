@@ -13,7 +13,7 @@ from progdf import __version__
 from progdf.io.session import SUFFIX
 from progdf.terminal import escape_text
 from viewer.camera.view_camera import SHAPES, ViewCamera
-from viewer.jobs.job_queue import FORMAT_NAMES, FORMATS, FPS, SIDES, DeliverOptions, film_title, picture_size
+from viewer.jobs.job_queue import FORMATS, FPS, SIDES, DeliverOptions, film_title, picture_size
 from viewer.state.view_state import ViewState
 from viewer.ui import overlay
 from viewer.ui.context import BEHIND, FIXED, PALETTE, SMALL_PX, Icon, UiContext, u32
@@ -246,8 +246,8 @@ def draw_fields(kind: str, path: str, options: DeliverOptions, ui: UiContext) ->
     options = _size_fields(options, column, ui)
     if kind == "picture":
         label("Background", column)
-        pressed = choice("alpha", ("As shown", "Transparent"), int(options.alpha), ui)
-        return path, options if pressed is None else replace(options, alpha=pressed == 1)
+        alpha = choice("alpha", {False: "As shown", True: "Transparent"}, options.alpha, ui)
+        return path, options if alpha is None else replace(options, alpha=alpha)
     label("Moves", column)
     imgui.set_next_item_width(-1.0)
     titles = [film_title(name) for name in options.can_move]
@@ -255,14 +255,13 @@ def draw_fields(kind: str, path: str, options: DeliverOptions, ui: UiContext) ->
     pressed = drop_down("##moves", titles[now], titles, now, ui, "What moves in the film")
     options = options if pressed is None else replace(options, moves=options.can_move[pressed])
     label("Format", column)
-    pressed = choice("format", FORMAT_NAMES, FORMATS.index(options.format), ui)
-    if pressed is not None:
-        options = replace(options, format=FORMATS[pressed])
+    chosen = choice("format", FORMATS, options.format, ui)
+    if chosen is not None:
+        options = replace(options, format=chosen)
         path = str(Path(path).with_suffix(options.format)) if path.strip() else path
     label("Frames/s", column)
-    at = FPS.index(options.fps) if options.fps in FPS else None
-    pressed = choice("fps", [str(fps) for fps in FPS], at, ui)
-    options = options if pressed is None else replace(options, fps=FPS[pressed])
+    pace = choice("fps", {fps: str(fps) for fps in FPS}, options.fps, ui)
+    options = options if pace is None else replace(options, fps=pace)
     if options.moves != "timeline":
         label("Seconds", column)
         imgui.set_next_item_width(-1.0)
@@ -288,12 +287,11 @@ def _size_fields(options: DeliverOptions, column: float, ui: UiContext) -> Deliv
     size = min(max(width, 1), _LARGEST), min(max(height, 1), _LARGEST)
     shapes, side = tuple(SHAPES), min(size)
     shape = next((name for name in shapes if picture_size(side, name) == size), None)
-    at = SIDES.index(side) if shape and side in SIDES else None
-    pressed = choice("size", [f"{side}p" for side in SIDES], at, ui)
-    if pressed is not None:
-        size = picture_size(SIDES[pressed], shape or shapes[0])
+    high = choice("size", {side: f"{side}p" for side in SIDES}, side if shape else None, ui)
+    if high is not None:
+        size = picture_size(high, shape or shapes[0])
     label("Shape", column)
-    pressed = choice("shape", shapes, shapes.index(shape) if shape else None, ui)
-    if pressed is not None:
-        size = picture_size(side, shapes[pressed])
+    chosen = choice("shape", {name: name for name in shapes}, shape, ui)
+    if chosen is not None:
+        size = picture_size(side, chosen)
     return replace(options, width=size[0], height=size[1])
