@@ -19,6 +19,9 @@ from progdf.sh import rgb_to_sh0, sh0_to_rgb
 Change = Callable[[Gaussians, float], Gaussians]
 """The members before the edit and a strength in (0, 1] -> the members at that strength."""
 
+Warp = Callable[[Tensor, float], Tensor]
+"""Points [M,3] float64 and a strength in (0, 1] -> where they are then. [M,3]"""
+
 
 @dataclass(frozen=True)
 class AnalyticEdit:
@@ -119,28 +122,26 @@ def swing_edit(degrees: float, axis: Tensor, pivots: Tensor) -> AnalyticEdit:
     return AnalyticEdit("swing", change)
 
 
-def deform_edit(name: str, move: Callable[[Tensor, Tensor], Tensor]) -> AnalyticEdit:
-    """A bent space: centres move, and each Gaussian is turned and stretched by the map's own derivative.
-
-    Args:
-        name: what it does
-        move: one place [3] and the strength [] -> where it goes [3], differentiable
-    """
+def warp_edit(name: str, warp: Warp) -> AnalyticEdit:
+    """A bent space: centers go where the warp takes them, covariances follow its Jacobian: Σ' = J Σ Jᵀ."""
 
     def change(part: Gaussians, strength: float) -> Gaussians:
-        means, s = part.means.double(), torch.tensor(strength, dtype=torch.float64)
-        derivative = torch.func.vmap(torch.func.jacrev(move), (0, None))(means, s)
+        points = part.means.double()
+        columns = [
+            torch.func.jvp(lambda p: warp(p, strength), (points,), (axis.expand_as(points),))[1]
+            for axis in torch.eye(3, dtype=torch.float64)
+        ]
         axes = Rotation.from_quat(part.unit_quats.double().numpy(), scalar_first=True).as_matrix()
-        shape = derivative @ (torch.from_numpy(axes) * part.scales.double()[:, None, :])
+        shape = torch.stack(columns, dim=2) @ (torch.from_numpy(axes) * part.scales.double()[:, None, :])
         # the covariance is shape · shapeᵀ, whose axes are the left singular vectors
         turned, scales, _ = torch.linalg.svd(shape)
         turned = turned * torch.where(torch.linalg.det(turned) < 0, -1.0, 1.0)[:, None, None]
         quats = Rotation.from_matrix(turned.numpy()).as_quat(scalar_first=True)
         return replace(
             part,
-            means=torch.func.vmap(move, (0, None))(means, s).to(part.means),
+            means=warp(points, strength).to(part.means),
             quats=torch.from_numpy(quats).to(part.quats),
-            log_scales=scales.log().to(part.log_scales),
+            log_scales=scales.clamp_min(1e-12).log().to(part.log_scales),
         )
 
     return AnalyticEdit(name, change)
@@ -150,11 +151,11 @@ def stretch_edit(factor: float, axis: Tensor, pivot: Tensor) -> AnalyticEdit:
     """Longer by `factor` along `axis` [3], all beyond the plane through `pivot` [3] moving away from it."""
     unit, root = (axis / axis.norm()).double(), pivot.double()
 
-    def move(place: Tensor, s: Tensor) -> Tensor:
-        moved: Tensor = place + s * (factor - 1) * ((place - root) @ unit) * unit
+    def warp(points: Tensor, strength: float) -> Tensor:
+        moved: Tensor = points + strength * (factor - 1) * ((points - root) @ unit)[:, None] * unit
         return moved
 
-    return deform_edit("stretch", move)
+    return warp_edit("stretch", warp)
 
 
 def bend_edit(degrees: float, axis: Tensor, along: Tensor, pivot: Tensor, length: float) -> AnalyticEdit:
@@ -167,15 +168,15 @@ def bend_edit(degrees: float, axis: Tensor, along: Tensor, pivot: Tensor, length
     """
     turn, out, root = (axis / axis.norm()).double(), (along / along.norm()).double(), pivot.double()
 
-    def move(place: Tensor, s: Tensor) -> Tensor:
-        arm = place - root
-        angle = s * math.radians(degrees) * ((arm @ out) / length).clamp_min(0)
-        across = torch.linalg.cross(turn, arm)
-        kept = turn * (turn @ arm) * (1 - angle.cos())
+    def warp(points: Tensor, strength: float) -> Tensor:
+        arm = points - root
+        angle = strength * math.radians(degrees) * ((arm @ out) / length).clamp_min(0)[:, None]
+        across = torch.linalg.cross(turn.expand_as(arm), arm)
+        kept = turn * (arm @ turn)[:, None] * (1 - angle.cos())
         moved: Tensor = root + arm * angle.cos() + across * angle.sin() + kept
         return moved
 
-    return deform_edit("bend", move)
+    return warp_edit("bend", warp)
 
 
 def bear_edits(scene: DemoScene) -> dict[str, tuple[AnalyticEdit, Tensor]]:
@@ -226,40 +227,7 @@ def _with_color(part: Gaussians, rgb: Tensor, share: float | Tensor) -> Gaussian
     return replace(part, sh0=rgb_to_sh0(rgb), shN=part.shN + share * (highlight - part.shN))
 
 
-Warp = Callable[[Tensor, float], Tensor]
-"""Points [M,3] float64 and a strength in (0, 1] -> where they are then. [M,3]"""
-
 _FACTOR, _DEGREES = 1.35, 40.0
-_STEP = 1e-4  # of a central difference, share of the region's size
-
-
-def warp_edit(name: str, warp: Warp) -> AnalyticEdit:
-    """Centers go where the warp takes them, covariances follow its Jacobian: Σ' = J Σ Jᵀ."""
-
-    def change(part: Gaussians, strength: float) -> Gaussians:
-        points = part.means.double()
-        step = _STEP * float((points.amax(dim=0) - points.amin(dim=0)).max().clamp_min(1e-6))
-        columns = [
-            (warp(points + step * axis, strength) - warp(points - step * axis, strength)) / (2 * step)
-            for axis in torch.eye(3, dtype=torch.float64)
-        ]
-        jacobian = torch.stack(columns, dim=2)
-        turned = torch.from_numpy(
-            Rotation.from_quat(part.unit_quats.double().numpy()[:, [1, 2, 3, 0]]).as_matrix()
-        )
-        axes, scales, _ = torch.linalg.svd(jacobian @ turned * part.scales.double()[:, None, :])
-        axes[:, :, 2] *= torch.linalg.det(axes).sign()[:, None]
-        quats = torch.from_numpy(Rotation.from_matrix(axes.numpy()).as_quat()[:, [3, 0, 1, 2]])
-        return Gaussians(
-            warp(points, strength).to(part.means),
-            quats.to(part.quats),
-            scales.clamp_min(1e-12).log().to(part.log_scales),
-            part.logit_opacities,
-            part.sh0,
-            part.shN,
-        )
-
-    return AnalyticEdit(name, change)
 
 
 def stretch_warp(base: Tensor, up: Tensor, factor: float) -> Warp:
@@ -286,9 +254,10 @@ def bend_warp(base: Tensor, up: Tensor, towards: Tensor, length: float, degrees:
         axis, side = up.to(points), towards.to(points)
         arm = points - base.to(points)
         height, out = arm @ axis, arm @ side
-        angle = curvature * height.clamp_min(0.0)
+        above = height.clamp_min(0.0)  # below its base the column stays straight
+        angle = curvature * above
         radius = 1 / curvature - out
-        lifted = radius * angle.sin() + height.clamp_max(0.0)
+        lifted = radius * angle.sin() + height - above
         moved = 1 / curvature - radius * angle.cos()
         return points + (lifted - height)[:, None] * axis + (moved - out)[:, None] * side
 
@@ -299,7 +268,7 @@ def pull_warp(handles: Tensor, pulls: Tensor, radius: float) -> Warp:
     """What lies around `handles` [P,3] is pulled by `pulls` [P,3], less and less over a `radius`."""
 
     def warp(points: Tensor, strength: float) -> Tensor:
-        weights = (-0.5 * (torch.cdist(points, handles.to(points)) / radius).square()).exp()
+        weights = (-0.5 * (points[:, None] - handles.to(points)).square().sum(dim=2) / radius**2).exp()
         return points + strength * weights @ pulls.to(points)
 
     return warp

@@ -214,13 +214,13 @@ def test_a_deformation_that_is_a_turn_or_a_growth_looks_like_one(bear: scenes.De
     ears, pivot, camera = bear.members("ears"), torch.tensor([0.0, 1.0, 0.0]), bear.cameras[3].resize(96, 96)
     axis = torch.tensor([1.0, 0.0, 0.0])
 
-    def turned(place: torch.Tensor, s: torch.Tensor) -> torch.Tensor:
-        x, y, z = place - pivot.double()
-        c, d = (s * math.radians(30)).cos(), (s * math.radians(30)).sin()
-        return pivot.double() + torch.stack([x, c * y - d * z, d * y + c * z])
+    def turned(places: torch.Tensor, s: float) -> torch.Tensor:
+        x, y, z = (places - pivot).unbind(1)
+        c, d = math.cos(s * math.radians(30)), math.sin(s * math.radians(30))
+        return pivot + torch.stack([x, c * y - d * z, d * y + c * z], dim=1)
 
-    def larger(place: torch.Tensor, s: torch.Tensor) -> torch.Tensor:
-        return pivot + (1 + 0.5 * s) * (place - pivot.double())
+    def larger(places: torch.Tensor, s: float) -> torch.Tensor:
+        return pivot + (1 + 0.5 * s) * (places - pivot)
 
     for move, plain in (
         (turned, analytic_edits.swing_edit(30.0, axis, pivot[None])),
@@ -228,7 +228,7 @@ def test_a_deformation_that_is_a_turn_or_a_growth_looks_like_one(bear: scenes.De
     ):
         pictures = [
             render(edit.apply(bear.gaussians, ears, 0.6), camera).image
-            for edit in (analytic_edits.deform_edit("same", move), plain)
+            for edit in (analytic_edits.warp_edit("same", move), plain)
         ]
         assert float((pictures[0] - pictures[1]).abs().max()) < 1e-3
 
