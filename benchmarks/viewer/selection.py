@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import statistics
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from benchmarks.courses import processor_milliseconds
 from benchmarks.table import Table, machine
 from progdf.gaussians import Gaussians
 from progdf.scene import selection as shapes
@@ -77,9 +77,4 @@ def measure(scene: Gaussians) -> dict[str, float]:
 
 def _median(work: Callable[[], object]) -> float:
     work()
-    taken = []
-    for _ in range(TIMES):
-        before = time.process_time()
-        work()
-        taken.append(1e3 * (time.process_time() - before))
-    return statistics.median(taken)
+    return statistics.median(processor_milliseconds(work) for _ in range(TIMES))

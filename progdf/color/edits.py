@@ -28,6 +28,7 @@ from .oklab import (
     fit_gamut,
     hue_of,
     oklab_to_srgb,
+    smoothstep,
     srgb_to_oklab,
 )
 from .palette import Curve, are_alike, bend_lightness, less_light, shift_palette
@@ -290,8 +291,7 @@ def stripe_profile(turns: Tensor, width: float = 0.5, softness: float = 0.08) ->
     `width`: share of the period that is stripe, 0..1; `softness`: width of the edge in periods
     """
     distance = (turns - turns.round()).abs()
-    edge = ((0.5 * width - distance) / max(softness, 1e-6) + 0.5).clamp(0, 1)
-    return edge * edge * (3 - 2 * edge)
+    return smoothstep((0.5 * width - distance) / max(softness, 1e-6) + 0.5)
 
 
 def _as_tensor(color: Tensor, rgb: Tensor) -> Tensor:

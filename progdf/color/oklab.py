@@ -154,7 +154,7 @@ def _oklab_course(a: Tensor, b: Tensor, bend: Bend) -> Callable[[Tensor], Tensor
     """From OKLab to OKLab; sRGB at strengths [...]. [...,3], [...,3]"""
     chroma_a, chroma_b, hue = a[..., 1:].norm(dim=-1), b[..., 1:].norm(dim=-1), hue_of(a)
     turn = bend.direction * _wrap(hue_of(b) - hue)  # -pi..pi, the region's sense being positive
-    alone = _rise(turn + math.pi, bend.whole, bend.none)
+    alone = smoothstep(turn + math.pi, bend.whole, bend.none)
     bow = bend.bow * 4 * chroma_a * chroma_b / (chroma_a + chroma_b).clamp_min(1e-6).square()
 
     def colors_at(s: Tensor) -> Tensor:
@@ -176,7 +176,7 @@ def _wrap(angle: Tensor) -> Tensor:
     return torch.remainder(angle + math.pi, 2 * math.pi) - math.pi
 
 
-def _rise(values: Tensor, low: float, high: float) -> Tensor:
-    """0 up to `low`, 1 from `high`, smooth between."""
+def smoothstep(values: Tensor, low: float = 0.0, high: float = 1.0) -> Tensor:
+    """0 up to `low`, 1 from `high`, smooth between. [...] -> [...]"""
     x = ((values - low) / (high - low)).clamp(0, 1)
     return x * x * (3 - 2 * x)

@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from progdf.color.oklab import smoothstep
 from progdf.field.baked import BakedField, GradeForm
 from progdf.field.grade import adjust_colors, map_share
 from progdf.gaussians import ATTRIBUTES, Gaussians
@@ -63,8 +64,7 @@ def _rise(size: Tensor, floor: float) -> Tensor:
         return size
     few = size[:: 1 + len(size) // _MOST]
     largest = float(few.kthvalue(1 + int(0.9 * (len(few) - 1))).values)
-    x = (size / max(floor, _SHARE_OF_LARGEST * largest)).clamp(0.0, 1.0)
-    return (x * x * (3.0 - 2.0 * x)).float()
+    return smoothstep(size / max(floor, _SHARE_OF_LARGEST * largest)).float()
 
 
 def _color_change(field: BakedField) -> Tensor:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from progdf.camera import Camera
 from progdf.color.edits import parse_color
+from progdf.color.oklab import smoothstep
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians, concatenate
 from progdf.quaternions import matrix_quats
@@ -53,8 +54,7 @@ def noise(points: Tensor, table: Tensor, frequency: float, octaves: int = 1) -> 
 
 def _value_noise(places: Tensor, table: Tensor) -> Tensor:
     cell = places.floor()
-    f = places - cell
-    f = f * f * (3 - 2 * f)
+    f = smoothstep(places - cell)
     low = cell.long() & (_SIDE - 1)
     high = (low + 1) & (_SIDE - 1)
     x = (low[:, 0] * _SIDE * _SIDE, high[:, 0] * _SIDE * _SIDE)
@@ -128,12 +128,6 @@ def flat(color: str, points: Tensor) -> Tensor:
 def mix(under: Tensor, over: Tensor, share: Tensor) -> Tensor:
     """`over` where `share` is 1. [N,3], [N,3], [N] -> [N,3]"""
     return torch.lerp(under, over, share.clamp(0, 1)[:, None])
-
-
-def step(value: Tensor, low: float, high: float) -> Tensor:
-    """0 up to `low`, 1 from `high`, smooth between. [...] -> [...]"""
-    share = ((value - low) / (high - low)).clamp(0, 1)
-    return share * share * (3 - 2 * share)
 
 
 _PROBES = 600

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 
 import torch
 from torch import Tensor
 
 from progdf.camera import Camera, intrinsics, look_at
 from progdf.color.edits import parse_color, recolor_fully, stripe_profile, typical_color
+from progdf.color.oklab import smoothstep
 from progdf.errors import ProgdfError
 
-from .assemble import DemoScene, Paint, Pelt, assemble, bumps, flat, mix, mix_colors, noise, step, swirl
+from .assemble import DemoScene, Paint, Pelt, assemble, bumps, flat, mix, mix_colors, noise, swirl
 from .surface import Part, Samples, ball, dome, ring
 
 FUR = ("body", "tail", "head", "muzzle", "ear", "arm", "leg", "foot")
@@ -55,20 +57,20 @@ def _fur(part: Part, at: Samples, table: Tensor) -> Paint:
     ragged = 0.07 * noise(p, table, 14.0, 2)
     color = brown
     if part.name == "muzzle":
-        color = mix(brown, cream, step(at.local[:, 2] + ragged, -0.10, 0.10))
+        color = mix(brown, cream, smoothstep(at.local[:, 2] + ragged, -0.10, 0.10))
     elif part.name == "body":
         belly = torch.hypot(p[:, 0] / 0.31, (p[:, 1] - 0.50) / 0.36)
-        front = step(at.normals[:, 2], 0.0, 0.25)
-        color = mix(brown, cream, step(1.0 - belly + 1.3 * ragged, -0.10, 0.06) * front)
+        front = smoothstep(at.normals[:, 2], 0.0, 0.25)
+        color = mix(brown, cream, smoothstep(1.0 - belly + 1.3 * ragged, -0.10, 0.06) * front)
     elif part.name == "ear":
         inner = at.local[:, 0] ** 2 + (at.local[:, 1] + 0.06) ** 2
         rose = mix_colors("#b97f5c", "#e3b08c", 0.5 + 0.5 * tufts)
         color = mix(
-            brown, rose, step(0.46 - inner + 1.2 * ragged, -0.08, 0.08) * (at.local[:, 2] > 0).float()
+            brown, rose, smoothstep(0.46 - inner + 1.2 * ragged, -0.08, 0.08) * (at.local[:, 2] > 0).float()
         )
     elif part.name in ("head", "arm"):
         color = mix(
-            brown, mix_colors("#55301a", "#8a5228", 0.5 + 0.5 * tufts), 0.35 * step(patches, 0.1, 0.5)
+            brown, mix_colors("#55301a", "#8a5228", 0.5 + 0.5 * tufts), 0.35 * smoothstep(patches, 0.1, 0.5)
         )
     down = swirl(p, table, (0.0, -1.0, 0.0))
     return Paint(color, bumps(p, table, 15.0, 0.34), 0.17, 0.02, down, _COAT)
@@ -84,7 +86,7 @@ def _wool(part: Part, at: Samples, table: Tensor) -> Paint:
         turns, ribs = along / (0.30 if part.name == "knot" else 0.135), along / 0.0145
     red = stripe_profile(turns, width=0.52, softness=0.05)
     color = mix(mix_colors("#e9dfcc", "#fffaf0", 0.6 + 0.4 * noise(p, table, 25.0)), flat("#c8102e", p), red)
-    knit = (ribs * 2 * math.pi).sin() * step(0.013 - at.spacing, 0.0, 0.006)
+    knit = (ribs * 2 * math.pi).sin() * smoothstep(0.013 - at.spacing, 0.0, 0.006)
     fuzz = 1 + 0.07 * noise(p, table, 40.0) + 0.10 * knit
     color = (color * fuzz[:, None]).clamp(0, 1)
     # along the stripes, which keeps their edges crisp
@@ -100,9 +102,10 @@ def _stone(at: Samples, table: Tensor) -> Paint:
     color = mix_colors("#6f6a64", "#bdb6a8", 0.52 + 0.55 * grain + 0.12 * speckle)
     vein = 1 - (noise(p, table, 2.3, 3).abs() / 0.035).clamp(0, 1)
     color = mix(color, flat("#4b4742", p), 0.55 * vein)
-    low = step(-p[:, 1], 0.10, 0.30) + step(grain, 0.25, 0.5) * step(-at.normals[:, 1], -0.8, 0.0)
+    level = smoothstep(-at.normals[:, 1], -0.8, 0.0)
+    low = smoothstep(-p[:, 1], 0.10, 0.30) + smoothstep(grain, 0.25, 0.5) * level
     moss = mix_colors("#4c5a2a", "#7a8a3c", 0.5 + 0.5 * noise(p, table, 20.0))
-    color = mix(color, moss, 0.55 * low.clamp(0, 1) * step(noise(p, table, 5.0, 2), -0.25, 0.3))
+    color = mix(color, moss, 0.55 * low.clamp(0, 1) * smoothstep(noise(p, table, 5.0, 2), -0.25, 0.3))
     return Paint(color, bumps(p, table, 7.0, 0.30), gloss=0.05)
 
 
@@ -121,7 +124,7 @@ def _glass(part: Part, at: Samples) -> Paint:
     color = flat("#17100d" if part.name == "eye" else "#1d1412", p)
     if part.name == "nose":
         shine = at.local @ torch.tensor([-0.252, 0.806, 0.554])
-        color = mix(color, flat("#cfc9c6", p), 0.7 * step(shine, 0.90, 0.985))
+        color = mix(color, flat("#cfc9c6", p), 0.7 * smoothstep(shine, 0.90, 0.985))
     return Paint(color, torch.zeros_like(p), gloss=0.12)
 
 
@@ -167,17 +170,8 @@ def ellipsoid(
     )
 
 
-def _detail(
-    name: str,
-    label: str,
-    center: Triple,
-    radii: Triple,
-    turn: Triple = (0.0, 0.0, 0.0),
-    weight: float = 7.0,
-    clears: float = 0.16,
-) -> Part:
-    """A small part drawn finely, with no fur over it and no shadow of its own."""
-    return ellipsoid(name, label, center, radii, turn, weight, casts_shadow=False, clears=clears)
+_detail = partial(ellipsoid, weight=7.0, casts_shadow=False, clears=0.16)
+"""A small part drawn finely, with no fur over it and no shadow of its own."""
 
 
 def _eye(x: float) -> list[Part]:
@@ -294,7 +288,7 @@ def paint_panda(picture: Tensor, camera: Camera, cover: Callable[[tuple[str, ...
     painted = _wash(picture, cover(("head", "body")), _CREAM)
     painted = _wash(painted, cover(("ears", "arms", "legs")), _CHARCOAL)
     painted = _wash(painted, patches, _CHARCOAL)
-    dark = 1 - step(picture.mean(dim=2), _DARK - 0.12, _DARK)
+    dark = 1 - smoothstep(picture.mean(dim=2), _DARK - 0.12, _DARK)
     mask = torch.maximum(eyes, features * dark) * head
     return torch.lerp(painted, picture, mask[..., None])
 

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from progdf.color.oklab import smoothstep
+
 from .surface import Part
 
 _SH_C1 = math.sqrt(3 / (4 * math.pi))
@@ -128,8 +130,7 @@ def _key_light_share(local: Tensor, part: Part) -> Tensor:
     closest = (local + ahead[:, None] * towards).norm(dim=1)
     world_ahead = ahead.clamp_min(0) / reach
     blur = 0.06 + 0.16 * world_ahead
-    share = ((closest - 1 + blur) / (2 * blur)).clamp(0, 1)
-    passed = share * share * (3 - 2 * share)
+    passed = smoothstep((closest - 1 + blur) / (2 * blur))
     begins = (world_ahead / 0.03).clamp(0, 1)
     light: Tensor = 1 - (1 - passed) * begins
     return light

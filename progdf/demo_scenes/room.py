@@ -9,9 +9,10 @@ import torch
 from torch import Tensor
 
 from progdf.camera import Camera, intrinsics, look_at
+from progdf.color.oklab import smoothstep
 from progdf.errors import ProgdfError
 
-from .assemble import DemoScene, Paint, Pelt, assemble, bumps, flat, mix, mix_colors, noise, step
+from .assemble import DemoScene, Paint, Pelt, assemble, bumps, flat, mix, mix_colors, noise
 from .bear import Triple, ellipsoid
 from .light import KEY, Daylight
 from .surface import Part, Samples, lathe, panel
@@ -37,7 +38,8 @@ def _planks(part: Part, at: Samples, table: Tensor) -> Paint:
     tone = noise(board + 0.5, table, 1.7)
     grain = noise(p * torch.tensor([1.0, 1.0, 0.07]) + 0.3 * board, table, 26.0, 2)
     color = mix_colors("#7c4e2a", "#cf9a5f", 0.5 + 0.35 * tone + 0.35 * grain)
-    gap = 1 - step(_edge(p[:, 0] / 0.22) * 0.22, 0.002, 0.008) * step(_edge(along) * 1.3, 0.002, 0.008)
+    side, end = _edge(p[:, 0] / 0.22) * 0.22, _edge(along) * 1.3
+    gap = 1 - smoothstep(side, 0.002, 0.008) * smoothstep(end, 0.002, 0.008)
     return Paint(mix(color, flat("#3a2314", p), 0.8 * gap), bumps(p, table, 6.0, 0.05), gloss=0.06)
 
 
@@ -45,9 +47,9 @@ def _wall(part: Part, at: Samples, table: Tensor) -> Paint:
     p = at.points
     color = mix_colors("#9fc0b4", "#c3dccd", 0.5 + 0.5 * noise(p, table, 3.0, 3))
     across = p[:, 2] if float(part.matrix[0, 1].abs()) > 0.5 else p[:, 0]
-    stripe = step(_edge(across / 0.25 + 0.5), 0.18, 0.22)
+    stripe = smoothstep(_edge(across / 0.25 + 0.5), 0.18, 0.22)
     color = mix(color, mix_colors("#e4e6d2", "#f8f6e4", 0.5 + 0.5 * noise(p, table, 3.0, 3)), stripe)
-    board = step(0.14 - p[:, 1], -0.004, 0.004)
+    board = smoothstep(0.14 - p[:, 1], -0.004, 0.004)
     return Paint(mix(color, flat("#f1ece0", p), board), bumps(p, table, 9.0, 0.06))
 
 
@@ -57,9 +59,9 @@ def _ceiling(part: Part, at: Samples, table: Tensor) -> Paint:
 
 def _window(part: Part, at: Samples, table: Tensor) -> Paint:
     up, across = at.local[:, 0], at.local[:, 2]
-    clouds = step(noise(at.points, table, 3.5, 3), -0.05, 0.45)
+    clouds = smoothstep(noise(at.points, table, 3.5, 3), -0.05, 0.45)
     sky = mix(mix_colors("#cfe4f7", "#6da7e0", 0.5 + 0.5 * up), flat("#ffffff", at.points), clouds)
-    hills = step(-0.45 + 0.22 * noise(at.points, table, 2.2, 2) - up, -0.03, 0.03)
+    hills = smoothstep(-0.45 + 0.22 * noise(at.points, table, 2.2, 2) - up, -0.03, 0.03)
     color = mix(sky, mix_colors("#4f7f3a", "#93b85a", 0.5 + noise(at.points, table, 9.0)), hills)
     frame = torch.maximum(up.abs(), across.abs()) > 0.93
     bars = torch.minimum(up.abs(), across.abs()) < 0.035
@@ -69,7 +71,7 @@ def _window(part: Part, at: Samples, table: Tensor) -> Paint:
 def _picture(part: Part, at: Samples, table: Tensor) -> Paint:
     p, x, y = at.points, at.local[:, 0], -at.local[:, 2]
     sky = mix_colors("#f6a54a", "#4a5fae", 0.5 + 0.75 * y)
-    sun = step(0.22 - torch.hypot((x - 0.3) * 1.38, y - 0.12), -0.02, 0.02)
+    sun = smoothstep(0.22 - torch.hypot((x - 0.3) * 1.38, y - 0.12), -0.02, 0.02)
     color = mix(sky, flat("#fff0b8", p), sun)
     for i, tone in enumerate(("#8b5a8c", "#5a4478", "#33294f")):
         ridge = (
@@ -77,7 +79,7 @@ def _picture(part: Part, at: Samples, table: Tensor) -> Paint:
             - 0.26 * i
             + 0.22 * noise(torch.stack([p[:, 0] + 3.7 * i, 0 * x, 0 * x], 1), table, 2.5 + i, 2)
         )
-        color = mix(color, flat(tone, p), step(ridge - y, -0.02, 0.02))
+        color = mix(color, flat(tone, p), smoothstep(ridge - y, -0.02, 0.02))
     mount = (torch.maximum((x.abs() - 0.80) * 1.38, y.abs() - 0.74) > 0).float()
     color = mix(color, flat("#f5f1e6", p), mount)
     frame = (torch.maximum((x.abs() - 0.93) * 1.38, y.abs() - 0.905) > 0).float()
@@ -96,12 +98,12 @@ def _rug(part: Part, at: Samples, table: Tensor) -> Paint:
     angle = torch.atan2(at.local[:, 2], at.local[:, 0])
     color = mix_colors("#8c2a31", "#b8454a", 0.5 + 0.5 * noise(p, table, 20.0))
     cream = mix_colors("#e2d3b0", "#f3e8cc", 0.5 + 0.5 * noise(p, table, 20.0))
-    star = step(0.42 + 0.16 * (10 * angle).cos() - radius, -0.02, 0.02) * step(radius, 0.18, 0.22)
-    bands = step(0.03 - (radius - 0.88).abs(), -0.008, 0.008) + step(
+    star = smoothstep(0.42 + 0.16 * (10 * angle).cos() - radius, -0.02, 0.02) * smoothstep(radius, 0.18, 0.22)
+    bands = smoothstep(0.03 - (radius - 0.88).abs(), -0.008, 0.008) + smoothstep(
         0.015 - (radius - 0.78).abs(), -0.006, 0.006
     )
     color = mix(color, cream, torch.maximum(star, bands))
-    blue = step(0.05 - (radius - 0.68).abs(), -0.008, 0.008)
+    blue = smoothstep(0.05 - (radius - 0.68).abs(), -0.008, 0.008)
     color = mix(color, mix_colors("#27496d", "#3b6a96", 0.5 + 0.5 * noise(p, table, 20.0)), blue)
     return Paint(color, bumps(p, table, 30.0, 0.25), velvet=0.05, pelt=_SHAG)
 
@@ -110,8 +112,9 @@ def _vase(part: Part, at: Samples, table: Tensor) -> Paint:
     y = at.local[:, 1]
     color = mix_colors("#e9eef2", "#ffffff", 0.5 + 0.5 * noise(at.points, table, 6.0))
     angle = torch.atan2(at.local[:, 2], at.local[:, 0])
-    wave = step(0.035 - (y - 0.17 - 0.025 * (6 * angle).sin()).abs(), -0.005, 0.005)
-    bands = step(0.008 - (y - 0.25).abs(), -0.003, 0.003) + step(0.012 - (y - 0.05).abs(), -0.003, 0.003)
+    wave = smoothstep(0.035 - (y - 0.17 - 0.025 * (6 * angle).sin()).abs(), -0.005, 0.005)
+    upper, lower = 0.008 - (y - 0.25).abs(), 0.012 - (y - 0.05).abs()
+    bands = smoothstep(upper, -0.003, 0.003) + smoothstep(lower, -0.003, 0.003)
     return Paint(
         mix(color, flat("#1d4e9e", at.points), torch.maximum(wave, bands)), 0 * at.points, gloss=0.14
     )
@@ -120,7 +123,7 @@ def _vase(part: Part, at: Samples, table: Tensor) -> Paint:
 def _flower(part: Part, at: Samples, table: Tensor) -> Paint:
     kind = int(float(part.center.sum()) * 1000) % len(_PETALS)
     color = mix_colors(_PETALS[kind], "#ffffff", 0.15 + 0.25 * noise(at.points, table, 30.0))
-    heart = step(at.local[:, 1], 0.80, 0.92)
+    heart = smoothstep(at.local[:, 1], 0.80, 0.92)
     return Paint(
         mix(color, flat("#6b4a12", at.points), heart), bumps(at.points, table, 35.0, 0.45), velvet=0.08
     )
@@ -143,7 +146,7 @@ def _shade(part: Part, at: Samples, table: Tensor) -> Paint:
 def _cushion(part: Part, at: Samples, table: Tensor) -> Paint:
     p = at.points
     angle = torch.atan2(at.local[:, 2], at.local[:, 0])
-    seams = 1 - step(_edge(angle / (math.pi / 4)), 0.03, 0.08)
+    seams = 1 - smoothstep(_edge(angle / (math.pi / 4)), 0.03, 0.08)
     color = mix_colors("#1f6f78", "#3aa3a8", 0.5 + 0.5 * noise(p, table, 30.0, 2))
     return Paint(mix(color, flat("#124a52", p), 0.7 * seams), bumps(p, table, 30.0, 0.2), velvet=0.10)
 
@@ -151,7 +154,7 @@ def _cushion(part: Part, at: Samples, table: Tensor) -> Paint:
 def _ball(part: Part, at: Samples, table: Tensor) -> Paint:
     slice_ = torch.remainder((torch.atan2(at.local[:, 2], at.local[:, 0]) / (math.pi / 3)).floor(), 3).long()
     colors = torch.cat([flat(c, at.points[:1]) for c in ("#e23b34", "#f7f4ea", "#2c6fd1")])
-    cap = step(at.local[:, 1].abs(), 0.93, 0.95)
+    cap = smoothstep(at.local[:, 1].abs(), 0.93, 0.95)
     return Paint(mix(colors[slice_], flat("#f7c531", at.points), cap), 0 * at.points, gloss=0.12)
 
 

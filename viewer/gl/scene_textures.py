@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import moderngl
 import numpy as np
@@ -129,16 +130,7 @@ class SplatTextures:
                 memory[begin:end] = numbers[begin:end]
             if texel.texture not in dirty:
                 dirty.append(texel.texture)
-        return sum(self._send(name, runs) for name in dirty)
-
-    def _send(self, name: str, runs: list[tuple[int, int]]) -> int:
-        texture, memory = self.textures[name], self._memory[name]
-        sent = 0
-        for first, last in runs:
-            part = memory[first * SPLATS_PER_ROW : last * SPLATS_PER_ROW]
-            texture.write(part, viewport=(0, first, texture.width, last - first))
-            sent += part.nbytes
-        return sent
+        return sum(_send(self._memory[name], self.textures[name], runs) for name in dirty)
 
     def bind(self, program: moderngl.Program) -> None:
         """Make them what the samplers of `include/raw_splats.glsl` read."""
@@ -150,6 +142,16 @@ class SplatTextures:
     def release(self) -> None:
         for texture in self.textures.values():
             texture.release()
+
+
+def _send(memory: NDArray[Any], texture: moderngl.Texture, runs: Iterable[tuple[int, int]]) -> int:
+    """Upload texture rows [first, last); the bytes sent."""
+    sent = 0
+    for first, last in runs:
+        part = memory[first * SPLATS_PER_ROW : last * SPLATS_PER_ROW]
+        texture.write(part, viewport=(0, first, texture.width, last - first))
+        sent += part.nbytes
+    return sent
 
 
 def row_runs(rows: NDArray[np.int64]) -> Iterator[tuple[int, int]]:
@@ -182,9 +184,7 @@ class HighlightTexture:
     def write(self, rows: NDArray[np.int64], highlights: NDArray[np.uint8]) -> None:
         """Take other highlights [R,4] for Gaussians (sorted)."""
         self._memory[rows] = highlights
-        for first, last in row_runs(rows):
-            part = self._memory[first * SPLATS_PER_ROW : last * SPLATS_PER_ROW]
-            self._texture.write(part, viewport=(0, first, SPLATS_PER_ROW, last - first))
+        _send(self._memory, self._texture, row_runs(rows))
 
     def read(self) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
         """Which Gaussians are not in their own colors, and in which. [R] and [R,4]"""

@@ -34,11 +34,12 @@ from viewer.ui.widgets import (
     menu_item,
     menu_items,
     more_button,
+    name_field,
     right_edge,
     section,
     small,
+    start_naming,
     tip,
-    typed_name,
 )
 
 from . import slider
@@ -165,13 +166,9 @@ def _group_name(
 
     A click selects the layers, a second one renames, a drag moves them.
     """
-    storage, naming = imgui.get_state_storage(), imgui.get_id("naming")
     x, y = imgui.get_cursor_screen_pos()
     corner = (x, y + imgui.get_style().frame_padding.y)
-    if storage.get_bool(naming):
-        name = typed_name(group.name, room)
-        storage.set_bool(naming, name is None)
-        actions += [f"rename_group:{state.groups.index(group)}:{name}"] if name else []
+    if name_field(group.name, room, f"rename_group:{state.groups.index(group)}", actions):
         return corner, ""
     imgui.invisible_button("name", (max(room, 1.0), imgui.get_frame_height()))
     gesture = grip(ui)
@@ -180,14 +177,14 @@ def _group_name(
     hovered = imgui.is_item_hovered()
     tip(f"{group.name}, {count} layers\nClick to select them, drag to reorder, double-click to rename")
     if hovered and imgui.is_mouse_double_clicked(imgui.MouseButton_.left.value):
-        storage.set_bool(naming, True)
+        start_naming()
     if imgui.is_item_clicked(imgui.MouseButton_.right.value):
         imgui.open_popup(_MENU)
     with imgui_ctx.push_font(ui.fonts.bold, 0.0):
         color = PALETTE.handle if hovered else PALETTE.text if group.enabled else PALETTE.dim
         imgui.get_window_draw_list().add_text(corner, u32(color), elide(group.name, room))
     for action in menu_items(_MENU, _ITEMS, ui):
-        storage.set_bool(naming, not action)
+        start_naming(not action)
         actions += [f"{action}:{group.name}"] if action else []
     return corner, gesture
 

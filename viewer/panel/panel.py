@@ -207,11 +207,7 @@ def _row(index: int, region: NamedRegion, ui: UiContext, actions: list[str]) -> 
     with imgui_ctx.push_font(None, SMALL_PX):
         wide = imgui.calc_text_size(count).x
     room = right - wide - 10.0 * scale - imgui.get_cursor_pos_x()
-    naming, storage = imgui.get_id("naming"), imgui.get_state_storage()
-    if storage.get_bool(naming):
-        name = widgets.typed_name(region.name, room)
-        storage.set_bool(naming, name is None)
-        actions += [f"rename_region:{index}:{name}"] if name else []
+    if widgets.name_field(region.name, room, f"rename_region:{index}", actions):
         return False
     x, y = imgui.get_cursor_screen_pos()
     io, mouse = imgui.get_io(), imgui.MouseButton_
@@ -230,7 +226,7 @@ def _row(index: int, region: NamedRegion, ui: UiContext, actions: list[str]) -> 
     canvas.add_text(ui.fonts.regular, SMALL_PX * scale, at, color, count)
     for action in widgets.menu_items(_OF_REGION, _ITEMS, ui):
         actions += [action.format(index)] if action else []
-        storage.set_bool(naming, not action)
+        widgets.start_naming(not action)
     return bool(resting)
 
 

@@ -99,13 +99,13 @@ def _card(index: int, cards: _Cards, wide: float, ui: UiContext, actions: list[s
         )
         if imgui.is_item_clicked(imgui.MouseButton_.right.value):
             imgui.open_popup(_MENU)
-        renaming, last = imgui.get_id("renaming"), len(cards.names) - 1
+        last = len(cards.names) - 1
         off = {_ITEMS[3][1]: index > 1, _ITEMS[4][1]: index < last}
         items = _ITEMS if index else _ITEMS[1:3]  # the original is neither renamed nor moved
         for action in widgets.menu_items(
             _MENU, items, ui, [action for action, can in off.items() if not can]
         ):
-            imgui.get_state_storage().set_bool(renaming, not action)
+            widgets.start_naming(not action)
             names = {"name": name, "at": index, "before": index - 1, "after": index + 1}
             actions += [action.format_map(names)] if action else []
         canvas, end = imgui.get_window_draw_list(), (at.x + wide, at.y + tall)
@@ -116,15 +116,11 @@ def _card(index: int, cards: _Cards, wide: float, ui: UiContext, actions: list[s
             if badge:
                 _badge(badge, at, ui)
         with imgui_ctx.push_font(None, SMALL_PX):
-            if imgui.get_state_storage().get_bool(renaming):
-                typed = widgets.typed_name(name, wide)
-                imgui.get_state_storage().set_bool(renaming, typed is None)
-                actions += [f"name_snapshot:{index}:{typed}"] if typed else []
-            else:
+            if not widgets.name_field(name, wide, f"name_snapshot:{index}", actions):
                 imgui.text_disabled(widgets.elide(name, wide))
                 left = imgui.MouseButton_.left.value
                 if index and imgui.is_item_hovered() and imgui.is_mouse_double_clicked(left):
-                    imgui.get_state_storage().set_bool(renaming, True)
+                    widgets.start_naming()
 
 
 def _badge(text: str, at: imgui.ImVec2, ui: UiContext) -> None:

@@ -39,9 +39,10 @@ from viewer.ui.widgets import (
     menu,
     menu_item,
     more_button,
+    name_field,
     plate,
+    start_naming,
     tip,
-    typed_name,
     value_slider,
 )
 
@@ -224,16 +225,12 @@ def _select_options(tool: SelectTool, bar: _Bar) -> SelectTool:
 
 def _save(regions: int, bar: _Bar, actions: list[str]) -> None:
     """The button that keeps the selection, in its place the field for the name."""
-    storage, naming = imgui.get_state_storage(), imgui.get_id("naming a region")
     text, wide = "Save as region…", 128.0 * bar.ui.scale
     bar.follow(wide)
-    if storage.get_bool(naming):
-        name = typed_name(f"region-{regions + 1}", wide)
-        storage.set_bool(naming, name is None)
-        if name:
-            actions.append(f"save_region:{name}")
-    elif imgui.button(text, (wide, 0.0)):
-        storage.set_bool(naming, True)
+    if name_field(f"region-{regions + 1}", wide, "save_region", actions):
+        return
+    if imgui.button(text, (wide, 0.0)):
+        start_naming()
     else:
         tip("Keep the selection as a file and as a row under Regions")
 

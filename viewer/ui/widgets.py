@@ -249,6 +249,22 @@ def typed_name(name: str, room: float) -> str | None:
     return text if entered or imgui.is_item_deactivated_after_edit() else ""
 
 
+def start_naming(starts: bool = True) -> None:
+    """In place of a name its text field from now on, or not."""
+    imgui.get_state_storage().set_bool(imgui.get_id("naming"), starts)
+
+
+def name_field(name: str, room: float, action: str, actions: list[str]) -> bool:
+    """The text field of a name, where `start_naming` has asked for it, and whether it has; what was typed
+    follows `action`."""
+    if not imgui.get_state_storage().get_bool(imgui.get_id("naming")):
+        return False
+    typed = typed_name(name, room)
+    start_naming(typed is None)
+    actions += [f"{action}:{typed}"] if typed else []
+    return True
+
+
 def search_field(hint_: str, query: str) -> str:
     """The text field over a list, which has the keyboard as it appears; what is sought."""
     if imgui.is_window_appearing():
