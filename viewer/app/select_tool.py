@@ -30,7 +30,6 @@ from viewer.camera.view_camera import Vec3
 from viewer.jobs.training import with_color
 from viewer.render.picking import Seen, seen_at, surface_point
 from viewer.state import history, selection
-from viewer.state.selection import unpack
 from viewer.state.view_state import ViewState
 from viewer.state.workspace import Workspace, original
 from viewer.ui.context import PALETTE, UiContext, u32
@@ -340,7 +339,7 @@ def _selected_rows(gesture: Gesture, work: Workspace, pointer: PointerContext) -
 
 
 def _apply(gesture: Gesture | Click, work: Workspace, mask: Mask, pointer: PointerContext) -> Workspace:
-    before = unpack(gesture.before, pointer.facts.count)
+    before = selection.unpack(gesture.before, pointer.facts.count)
     return _with(work, selection.select(work.view.selection, combine(before, mask, gesture.mode)))
 
 

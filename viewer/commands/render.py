@@ -18,7 +18,6 @@ from PIL import Image
 
 from progdf.camera import Camera
 from progdf.compose.added import remaining_rows
-from progdf.compose.reference import compose_layers
 from progdf.errors import ProgdfError
 from progdf.field.baked import GradeForm, lattice_colors, lattice_side
 from progdf.field.grade import mapped_lattice
@@ -40,14 +39,13 @@ from viewer.camera.view_camera import FARTHEST, Vec3, ViewCamera, bounds_of
 from viewer.files import session
 from viewer.files.document import Document
 from viewer.files.session import WindowSession
-from viewer.files.web_page import PAGE, PageOptions, write_page
+from viewer.files.web_page import PAGE, PageOptions, compose_view, write_page
 from viewer.pictures import film
 from viewer.pictures.compare import Comparer, draw_labels
 from viewer.render.engine import ViewEngine
 from viewer.render.gl_renderer import headless_context
 from viewer.state import timeline
 from viewer.state.layers import visible_edits, visible_layers
-from viewer.state.paint import layer_of
 from viewer.state.snapshots import compare_sides
 from viewer.state.view_state import MOST_AMPLIFIED, Comparison, Timeline, ViewState
 
@@ -87,12 +85,9 @@ def export(argv: Sequence[str]) -> int:
     opened = open_stack(options.stack, drawing, unset=1.0)
     check_not_an_input(out, opened.files)
     if ending == PAGE:
-        camera = (
-            view_camera.first_camera(opened.document.original, up=opened.up)
-            if opened.session is None
-            else opened.view.camera
-        )
-        view = replace(opened.view, camera=camera)
+        view = opened.view
+        if opened.session is None:
+            view = replace(view, camera=view_camera.first_camera(opened.document.original, up=opened.up))
         print_line(write_page(out, opened.document, view, opened.snapshots, options.page))
         return 0
     if ending == CUBE:
@@ -146,9 +141,7 @@ def _export_frames(options: ExportOptions, opened: OpenStack) -> int:
 
 def _compose(document: Document, view: ViewState, share: float = 1.0, whole: bool = False) -> Gaussians:
     """The scene at a share of the strengths; without the rows that draw nothing, unless `whole`."""
-    states = visible_layers(view)
-    layers = [layer_of(document.gdfs[s.gdf], share * s.strength, s.gains, s.paint) for s in states]
-    edited = compose_layers(document.scene, layers, view.blend)
+    edited = compose_view(document.scene, document.gdfs, view, share)
     return edited if whole else edited[remaining_rows(document.original, edited)]
 
 

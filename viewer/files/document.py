@@ -111,15 +111,8 @@ def _once(make: Callable[[], _Made]) -> Callable[[], _Made]:
 def empty() -> Document:
     """No document yet: one splat that nothing shows, and no title."""
     row = torch.zeros(1, 3)
-    unseen = Gaussians(
-        row,
-        torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
-        row - 5.0,
-        torch.tensor([-20.0]),
-        row,
-        row[:, None, :][:, :0],
-    )
-    return Document("", unseen)
+    none, logit = row[:, None, :][:, :0], torch.tensor([-20.0])
+    return Document("", Gaussians(row, torch.eye(4)[:1], row - 5.0, logit, row, none))
 
 
 def load(scene: Path, gdfs: Sequence[Path] = (), place: Place = _where_trained) -> Document:

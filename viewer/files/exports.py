@@ -29,7 +29,6 @@ from progdf.io.session import SUFFIX
 from progdf.io.tensors import save_npy
 from viewer.jobs.training import edits_folder, takes_files
 from viewer.state import selection
-from viewer.state.selection import SUFFIX as REGION_SUFFIX
 from viewer.state.selection import NamedRegion, SelectionState, unpack
 
 CAMERAS = ".cameras.json"
@@ -114,7 +113,7 @@ def keep_region(state: SelectionState, name: str, folder: Path, total: int) -> S
     if not state.count:
         raise ProgdfError("nothing is selected; select something first")
     path = _free_region_path(state, name, folder)
-    state = selection.add_region(state, path.name.removesuffix(REGION_SUFFIX), path)
+    state = selection.add_region(state, path.name.removesuffix(selection.SUFFIX), path)
     write_region(state.regions[-1], total)
     return state
 
@@ -137,7 +136,7 @@ def rename_region(state: SelectionState, index: int, name: str, total: int) -> S
     if removes and filecmp.cmp(region.path, path, shallow=False):
         region.path.unlink()
     return selection.change_region(
-        state, index, replace(region, name=path.name.removesuffix(REGION_SUFFIX), path=path)
+        state, index, replace(region, name=path.name.removesuffix(selection.SUFFIX), path=path)
     )
 
 
@@ -161,7 +160,7 @@ def write_region(region: NamedRegion, total: int) -> None:
     """
     if not _is_region_file(region.path):
         raise ProgdfError(
-            f"{region.path} is not a regular file that ends in {REGION_SUFFIX}; "
+            f"{region.path} is not a regular file that ends in {selection.SUFFIX}; "
             "rename the region to give it one"
         )
     save_npy(region.path, np.flatnonzero(unpack(region.members, total)).astype(np.int64))
@@ -184,7 +183,7 @@ def claim_regions(state: SelectionState, folders: Sequence[Path]) -> SelectionSt
     for i, region in enumerate(state.regions):
         if not _is_inside(region.path, folders):
             path = _free_region_path(selection.change_region(state, i, None), region.name, folders[0])
-            named = replace(region, name=path.name.removesuffix(REGION_SUFFIX), path=path)
+            named = replace(region, name=path.name.removesuffix(selection.SUFFIX), path=path)
             state = selection.change_region(state, i, named)
     return state
 
@@ -205,7 +204,7 @@ def _is_inside(path: Path, folders: Sequence[Path]) -> bool:
 def _is_region_file(path: Path) -> bool:
     """Whether it is a regular file that is called as a region's, or nothing yet; a link is neither."""
     try:
-        return path.name.endswith(REGION_SUFFIX) and stat.S_ISREG(os.lstat(path).st_mode)
+        return path.name.endswith(selection.SUFFIX) and stat.S_ISREG(os.lstat(path).st_mode)
     except FileNotFoundError:
         return True
     except (OSError, ValueError):  # a name that no file can have
@@ -216,7 +215,7 @@ def _free_region_path(state: SelectionState, name: str, folder: Path, current: P
     """A file in `folder` that no region and no other file has."""
 
     def path(free: str) -> Path:
-        return folder / f"{free}{REGION_SUFFIX}"
+        return folder / f"{free}{selection.SUFFIX}"
 
     others = {region.path for region in state.regions}
 

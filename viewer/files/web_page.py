@@ -18,7 +18,7 @@ from progdf.io.atomic import atomic_write
 from progdf.metrics.image import psnr
 from progdf.rasterize import render
 from viewer.camera.view_camera import ViewCamera, bounds_of, to_camera
-from viewer.state import snapshots, timeline
+from viewer.state import history, snapshots, timeline
 from viewer.state.layers import largest_strength, visible_layers
 from viewer.state.paint import decode, layer_of
 from viewer.state.view_state import LayerState, Timeline, ViewState
@@ -96,17 +96,17 @@ def picture(
         bands: coefficients above the first that are drawn
     """
     with torch.no_grad():
-        edited = _compose(scene, gdfs, view)
+        same = fingerprint(scene)  # also of what a page has of it
+        edited = compose_view(scene, [replace(gdf, scene=same) for gdf in gdfs], view)
         edited = replace(edited, shN=edited.shN * (torch.arange(edited.shN.shape[1]) < bands)[:, None])
         camera = to_camera(view.camera, *size)
         return render(edited, camera, background=view.background, engine="cpu").image.clamp(0.0, 1.0)
 
 
-def _compose(scene: Gaussians, gdfs: Sequence[Gdf], view: ViewState) -> Gaussians:
-    """The scene, or what a page has of it, under the layers of a view."""
-    same = fingerprint(scene)
+def compose_view(scene: Gaussians, gdfs: Sequence[Gdf], view: ViewState, share: float = 1.0) -> Gaussians:
+    """The scene under the layers of a view, at a share of their strengths."""
     states = visible_layers(view)
-    layers = [layer_of(replace(gdfs[s.gdf], scene=same), s.strength, s.gains, s.paint) for s in states]
+    layers = [layer_of(gdfs[s.gdf], share * s.strength, s.gains, s.paint) for s in states]
     return compose_layers(scene, layers, view.blend)
 
 
@@ -142,25 +142,21 @@ def first_state(
             "group": state.group,
         }
 
+    def stack(camera: ViewCamera, of: ViewState | history.Edit) -> dict[str, Any]:
+        return {
+            "camera": camera_json(camera),
+            "blend": of.blend,
+            "layers": [layer(state) for state in of.layers if state.gdf in edits],
+            "groups": [asdict(group) for group in of.groups],
+        }
+
     stage = {
+        **stack(view.camera, view),
         "background": view.background,
-        "camera": camera_json(view.camera),
         "radius": bounds_of(document.original).radius,
         "near": to_camera(view.camera, 1, 1).near,
-        "blend": view.blend,
         "most": largest_strength(view),
-        "layers": [layer(state) for state in view.layers if state.gdf in edits],
-        "groups": [asdict(group) for group in view.groups],
-        "snapshots": [
-            {
-                "name": each.name,
-                "camera": camera_json(each.camera),
-                "layers": [layer(state) for state in each.edit.layers if state.gdf in edits],
-                "groups": [asdict(group) for group in each.edit.groups],
-                "blend": each.edit.blend,
-            }
-            for each in kept
-        ],
+        "snapshots": [{"name": each.name, **stack(each.camera, each.edit)} for each in kept],
         "timeline": _film(view.timeline, edits),
         "paints": paints,
     }

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import moderngl
 import numpy as np
@@ -144,7 +143,7 @@ class SplatTextures:
             texture.release()
 
 
-def _send(memory: NDArray[Any], texture: moderngl.Texture, runs: Iterable[tuple[int, int]]) -> int:
+def _send(memory: np.ndarray, texture: moderngl.Texture, runs: Iterable[tuple[int, int]]) -> int:
     """Upload texture rows [first, last); the bytes sent."""
     sent = 0
     for first, last in runs:

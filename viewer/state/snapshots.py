@@ -9,7 +9,6 @@ from typing import Any
 from viewer.camera.view_camera import ViewCamera
 
 from . import history
-from .history import Edit
 from .layers import LONGEST_NAME
 from .selection import SelectionState
 from .view_state import SnapshotPair, Timeline, ViewState
@@ -24,7 +23,7 @@ class SliderSnapshot:
     """One kept state."""
 
     name: str  # under its picture
-    edit: Edit  # what going back to it restores, as one undo entry
+    edit: history.Edit  # what going back to it restores, as one undo entry
     camera: ViewCamera = ViewCamera()  # where its small picture is taken from
 
 
@@ -101,7 +100,7 @@ def choose(view: ViewState, slot: str, name: str) -> ViewState:
     return replace(view, pair=replace(view.pair, **changes))
 
 
-def _sliders(view: ViewState) -> Edit:
+def _sliders(view: ViewState) -> history.Edit:
     """What a snapshot keeps: all that undo knows but the film, the selection and the pair of snapshots."""
     edit = history.edit_of(view)
     return replace(edit, timeline=Timeline(), selection=SelectionState(), pair=SnapshotPair())

@@ -442,17 +442,13 @@ def choice(
 
 
 def choice_row(
-    title: str,
-    options: Mapping[T, str],
-    current: T,
-    column: float,
-    ui: UiContext,
-    help_: str,
+    title: str, options: Mapping[T, str], current: T, column: float, ui: UiContext, help_: str = ""
 ) -> T:
     """A named row of joined buttons, see `choice`; the value as it is now."""
     label(title, column)
     pressed = choice(title, options, current, ui)
-    tip(help_)
+    if help_:
+        tip(help_)
     return current if pressed is None else pressed
 
 

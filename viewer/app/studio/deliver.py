@@ -13,7 +13,6 @@ from progdf.formats.scene_file import WRITTEN
 from progdf.io.session import BUNDLE
 from viewer.app.application import Application, Requests, failure_line
 from viewer.files import exports, session
-from viewer.files.session import WindowSession
 from viewer.files.user_files import parse_path
 from viewer.jobs.job_queue import ALL_SLIDERS, TURNTABLE, DeliverOptions, Delivery, JobQueue, picture_size
 from viewer.jobs.training import free_path
@@ -108,7 +107,7 @@ class DeliverActions:
             view = replace(view, timeline=replace(view.timeline, fps=options.fps))
         number = len(list(self._queue.folder.iterdir()))
         stack = self._queue.folder / f"stack{number}.session.json"
-        session.save(stack, WindowSession(document, view, self._app.main_view.work.snapshots))
+        session.save(stack, session.WindowSession(document, view, self._app.main_view.work.snapshots))
         size = f"--size={options.width}x{options.height}"
         words = {
             "export": ["export", f"--out={out}"],

@@ -17,10 +17,10 @@ from viewer.jobs.job_queue import FORMATS, FPS, SIDES, DeliverOptions, film_titl
 from viewer.state.view_state import ViewState
 from viewer.ui import overlay
 from viewer.ui.context import BEHIND, FIXED, PALETTE, SMALL_PX, Icon, UiContext, u32
-from viewer.ui.overlay import Area
 from viewer.ui.widgets import (
     accent_button,
     choice,
+    choice_row,
     drop_down,
     elide,
     hint,
@@ -223,7 +223,9 @@ class Cover:
     name: str = ""  # the banner above it
 
 
-def draw_cover(cover: Cover, view: ViewState, size: tuple[int, int], area: Area, ui: UiContext) -> None:
+def draw_cover(
+    cover: Cover, view: ViewState, size: tuple[int, int], area: overlay.Area, ui: UiContext
+) -> None:
     """Draw it over the view, where it belongs there."""
     if (cover.camera, cover.size) != (view.camera, size) or view.compare.mode != "off":
         return
@@ -245,9 +247,8 @@ def draw_fields(kind: str, path: str, options: DeliverOptions, ui: UiContext) ->
     column = _COLUMN_PX * ui.scale
     options = _size_fields(options, column, ui)
     if kind == "picture":
-        label("Background", column)
-        alpha = choice("alpha", {False: "As shown", True: "Transparent"}, options.alpha, ui)
-        return path, options if alpha is None else replace(options, alpha=alpha)
+        kinds = {False: "As shown", True: "Transparent"}
+        return path, replace(options, alpha=choice_row("Background", kinds, options.alpha, column, ui))
     label("Moves", column)
     imgui.set_next_item_width(-1.0)
     titles = [film_title(name) for name in options.can_move]
@@ -259,9 +260,8 @@ def draw_fields(kind: str, path: str, options: DeliverOptions, ui: UiContext) ->
     if chosen is not None:
         options = replace(options, format=chosen)
         path = str(Path(path).with_suffix(options.format)) if path.strip() else path
-    label("Frames/s", column)
-    pace = choice("fps", {fps: str(fps) for fps in FPS}, options.fps, ui)
-    options = options if pace is None else replace(options, fps=pace)
+    paces = {fps: str(fps) for fps in FPS}
+    options = replace(options, fps=choice_row("Frames/s", paces, options.fps, column, ui))
     if options.moves != "timeline":
         label("Seconds", column)
         imgui.set_next_item_width(-1.0)

@@ -16,7 +16,6 @@ from progdf.errors import ProgdfError
 from progdf.io.atomic import atomic_write, make_folder, read_file, state_folder
 from progdf.io.session import BUNDLE, sha256
 from progdf.scene import up_axis
-from progdf.scene.up_axis import direction_name
 from viewer.app.application import Application, Requests, attempt
 from viewer.app.file_actions import EditActions
 from viewer.camera.view_camera import Vec3
@@ -192,7 +191,7 @@ class UpActions:
             up_axis.remember(document.scene, up)
         guess = not (self._looked or session or document.detected_up.certain)
         if guess and up == document.detected_up.direction and main_view.work.message is None:
-            name = direction_name(torch.tensor(up)).upper().replace("-", "−")
+            name = up_axis.direction_name(torch.tensor(up)).upper().replace("-", "−")
             where = "Up axis in the popover under the axes sets it"
             main_view.show_message(f"That {name} is up in {document.title} is a guess: {where}")
         self._looked = True
