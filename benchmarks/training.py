@@ -30,11 +30,9 @@ from progdf.gdf.file import load_gdf
 from progdf.io.atomic import atomic_write
 from progdf.scene.regions import parse_region
 from trainer.fit.evaluate import Evaluator
-from trainer.options import ViewOptions
 from trainer.report.plots import GRID, INK, LINES, PAPER
-from trainer.setup import make_training_setup
 
-from .ablation.regret import MEASURED, REPORTING, Edit
+from .ablation.regret import MEASURED, REPORTING, Edit, begin_edit
 from .table import Table, Wall
 
 WAYS = ("", "--quick", "--steps 40", "--views 12", "--stages 4", "--preset paper --field auto --quick")
@@ -85,7 +83,7 @@ def edit_of_task(task: Task) -> Edit:
     """With the views, the pictures and the judge that it takes."""
     scene = load_scene(task.scene)
     region = parse_region(task.region, scene)
-    return Edit(scene, region, task.editor, make_training_setup(ViewOptions(), scene, region))
+    return begin_edit(scene, region, task.editor)
 
 
 def train(task: Task, scene: Gaussians, judge: Evaluator, way: str, out: Path) -> Trained:

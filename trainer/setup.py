@@ -29,7 +29,7 @@ from .editors.pictures import picture_cameras
 from .editors.procedural import ColorEditor, edit_course
 from .options import MOST_VIEWS, VIEWS, Kind, ViewOptions
 from .store.progress import Advance
-from .store.run_folder import LazySequence, RunFolder, add_pictures, from_bytes, to_bytes
+from .store.run_folder import LazySequence, RunFolder, add_pictures, from_bytes, stored_pictures, to_bytes
 from .views.choose import choose_views, split_views
 from .views.crops import CropScene, crop_scene
 from .views.view import (
@@ -283,6 +283,14 @@ def edit_views(
             pool.shutdown(cancel_futures=True)
             raise
     return {strength: LazySequence(pictures, from_bytes) for strength, pictures in edited.items()}
+
+
+def boxed_pictures(
+    pictures: Sequence[Tensor], views: Sequence[View], engine: str = "cpu"
+) -> Sequence[Tensor]:
+    """What the views' boxes hold of their whole pictures, on the engine's device. [h,w,3] each"""
+    device, pairs = engine_device(engine), zip(pictures, views, strict=False)
+    return stored_pictures(crop(picture, view.box).to(device) for picture, view in pairs)
 
 
 def widen_views(setup: TrainingSetup, edited: Pictures) -> TrainingSetup:

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field, replace
-from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import torch
 import tyro
@@ -31,21 +32,16 @@ from trainer.fit.evaluate import Evaluator, make_evaluator
 from trainer.fit.fit import fit_grades, visibility
 from trainer.fit.slider_uniformity import equalized_strengths, strength_ruler
 from trainer.optimize.color_course import STEPS as TAKEN
-from trainer.optimize.color_course import Course, Target, solve
-from trainer.optimize.color_solver import (
-    Model,
-    add_bands,
-    choose_model,
-    enrich,
-    iterations,
-    make_solver,
-)
-from trainer.optimize.color_views import Judge, color_views
-from trainer.optimize.pgs import ParameterSnapshot, PgsState, TargetStage
+from trainer.optimize.color_course import solve
+from trainer.optimize.color_solver import Model, add_bands, make_solver
+from trainer.optimize.color_views import color_views
+from trainer.optimize.pgs import ParameterSnapshot, PgsState
 from trainer.optimize.retime import smooth_course
 from trainer.options import EditorOptions, FieldOptions, OptimizeOptions, ViewOptions
 from trainer.resolve import use_threads
-from trainer.setup import TrainingSetup, make_training_setup, quantize_image, widen_views
+from trainer.run.training import Strengths, plan_colors
+from trainer.setup import Pictures, TrainingSetup, make_training_setup, quantize_image, widen_views
+from trainer.store.progress import RunLog
 from trainer.views.choose import choose_views, split_held_out
 from trainer.views.crops import CropScene, crop_scene
 from trainer.views.view import View, crop, name_cameras, region_rig, with_near_plane
@@ -54,9 +50,9 @@ from ..table import Table
 
 MEASURED = (0.12, 0.38, 0.64, 0.88, 1.0)
 """Strengths at which the editor is asked for what it means."""
-STAGES, STEPS, BANDS, VIEWS = (8, 4, 2), (5, 12, 24), (0, 1, 4, 9), (20, 30)
+STAGES, STEPS, BANDS, VIEWS = (8, 4, 2), (5, 12, 24), (0, 1, 4, 9), (20, 30, 60)
 """What is swept: even strengths; steps of conjugate gradients for each, where nothing ends them before; SH
-functions of the residual; fewer views than a run's own, with what was best for those."""
+functions of the residual; other numbers of views than a run's own, with what was best for those."""
 REPORTING = 13
 """Cameras of a rig that stand where no training view does."""
 NEAR = 0.3
@@ -113,15 +109,13 @@ class Edit:
     scene: Gaussians
     region: Region
     editor: str
+    painter: ImageEditor  # the same of all sets of views: what it takes for the region's color is of one
     setup: TrainingSetup
     seconds: float = 0.0  # of the processor, for what every way needs
     pictures: dict[float, list[Tensor]] = field(default_factory=dict)  # of all views, by strength
     a_strength: float = 0.0  # of the processor, for all views' pictures at one strength
 
     def __post_init__(self) -> None:
-        self.painter: ImageEditor = make_editor(
-            EditorOptions(self.editor), self.scene, self.region, self.setup.views
-        )
         self.original = pack(self.scene[self.region.members], with_shN=self.scene.sh_degree > 0)
         finished = self.picture(1.0)[: len(self.setup.train)]
         self.setup = widen_views(self.setup, {1.0: finished})
@@ -154,47 +148,46 @@ class Edit:
         """The whole pictures of the views that choose."""
         return list(split_held_out(self.picture(s)[len(self.setup.train) :])[0])
 
-    def automatic(self, judge: Evaluator) -> tuple[Model, tuple[float, ...], str, Result]:
+    def automatic(self, judge: Evaluator) -> tuple[Model, Sequence[float], str, Result]:
         """How much is modelled, at which strengths, all that was decided in words, and what came of it."""
-        most = iterations(OptimizeOptions().steps)
-        drawn = color_views(self._crops(self.choosing), self.original)
-        waited = 0.0  # for the training views' pictures, which are counted by `measure`
-        courses = [edit_course(self.painter, view) for view in self.choosing]
+        waited = 0.0  # for pictures, which are counted by `measure`
+        courses = {view.camera.name: edit_course(self.painter, view) for view in self.choosing}
 
-        @cache
-        def judge_at(s: float) -> Judge:
-            pictures = [quantize_image(picture_at(s)) for picture_at in courses]
-            return Judge(drawn, [crop(p, v.box) for p, v in zip(pictures, self.choosing, strict=True)])
-
-        def ask(strengths: Sequence[float]) -> list[Target]:
+        def edit(strengths: Sequence[float]) -> Pictures:
             nonlocal waited
             began = time.process_time()
-            targets = [TargetStage(s, self.targets(s), 1) for s in strengths]
+            made = {s: self.picture(s) for s in strengths}
             waited += time.process_time() - began
-            return [(stage, judge_at(stage.strength)) for stage in targets]
+            return made
 
-        self.picture(1.0)
-        began = time.process_time()
-        (finished,), solver = ask([1.0]), make_solver(self.drawn, self.original)
-        solver, model = choose_model(solver, [(solver, finished[1])], finished[0].targets, most, 9)
-        ruler = strength_ruler(self.painter, self.editor, self.setup.views)
-        half = [] if model.richer is None else [ruler[len(ruler) // 2]]
-        course, made = Course(ask(half), finished, ruler, judge_at, ask), list[ParameterSnapshot]()
-        model = enrich(model, solver, *[*course.targets, finished][0], most)
-        state = PgsState(self.original)
+        def look(s: float, views: Sequence[View]) -> list[Tensor]:
+            return [quantize_image(courses[view.camera.name](s)) for view in views]
+
+        whole, waited, began = edit([1.0]), 0.0, time.process_time()
+        between = Strengths(strength_ruler(self.painter, self.editor, self.setup.views), edit, look)
+        with TemporaryDirectory() as folder, closing(RunLog(Path(folder) / "log.txt", quiet=True)) as log:
+            plan = plan_colors(OptimizeOptions(), self.setup, whole, between, False, log)
+        made = list[ParameterSnapshot]()
         for snapshot in solve(
-            self.original, solver, model, course, made, state, lambda step, left: None, most
+            self.original,
+            plan.solver,
+            plan.model,
+            plan.course,
+            made,
+            PgsState(self.original),
+            lambda step, left: None,
+            plan.steps,
         ):
             made.append(snapshot)
         spent = time.process_time() - began - waited
-        strengths, made = course.sort_recordings(made)
+        strengths, made = plan.course.sort_recordings(made)
         steps = ", ".join(f"{snapshot.means.get(TAKEN, 0):.0f}" for snapshot in made)
         at = ", ".join(f"{s:g}" for s in strengths)
         tables = [snapshot.table for snapshot in made if snapshot.table is not None]
+        model, offsets = plan.model, [snapshot.offsets for snapshot in made]
         name = f"automatic: {len(self.setup.views)} views, {len(strengths)} strengths, {model.bands} SH"
-        offsets = [snapshot.offsets for snapshot in made]
         result = self.measure(name, judge, strengths, model.bands, tables, offsets, spent, model.mask)
-        return model, tuple(strengths), f"{model.line}; strengths {at} in {steps} steps", result
+        return model, strengths, f"{model.line}; strengths {at} in {steps} steps", result
 
     def sweep(
         self,
@@ -291,6 +284,12 @@ class Edit:
         return [crop_scene(self.scene, members, v.camera, v.box, background, True) for v in views]
 
 
+def begin_edit(scene: Gaussians, region: Region, editor: str) -> Edit:
+    """From the views that a run takes by itself."""
+    setup = make_training_setup(ViewOptions(), scene, region)
+    return Edit(scene, region, editor, make_editor(EditorOptions(editor), scene, region, setup.views), setup)
+
+
 def run_regret(options: RegretOptions) -> Table:
     """Sweep; a line as soon as there is a result, the table at the end.
 
@@ -301,11 +300,8 @@ def run_regret(options: RegretOptions) -> Table:
     scene = load_scene(options.scene)
     region = parse_region(options.region, scene)
 
-    def edit_from(views: int) -> Edit:
-        setup = make_training_setup(ViewOptions(views=views), scene, region)
-        return Edit(scene, region, options.editor, setup)
-
-    edit = edit_from(0)
+    edit = begin_edit(scene, region, options.editor)
+    camera = edit.setup.train[0].camera
     judge = edit.judge()
     model, _, line, automatic = edit.automatic(judge)
     print_line(line)
@@ -318,9 +314,10 @@ def run_regret(options: RegretOptions) -> Table:
             results.append(result)
     used = max(results[1:], key=lambda result: result.mean).name.split()[-2]
     for views in VIEWS:
-        for result in edit_from(views).sweep(
-            judge, model.degree, int(used), STEPS[-2], STAGES[:1], model.mask
-        ):
+        size = max(camera.width, camera.height)
+        others = make_training_setup(ViewOptions(views=views, image_size=size), scene, region)
+        other = Edit(scene, region, options.editor, edit.painter, others)
+        for result in other.sweep(judge, model.degree, int(used), STEPS[-2], STAGES[:1], model.mask):
             print_line(" | ".join(result.cells))
             results.append(result)
     best = max(results, key=lambda result: result.mean)

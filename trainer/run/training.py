@@ -19,6 +19,7 @@ from progdf.field.trajectory import Trajectory
 from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians, pack
 from progdf.io.json_values import convert_json
 from progdf.io.tensors import check_tensor
+from progdf.metrics.image import decibels
 from progdf.rasterize.engines import engine_device
 from progdf.scene.bounds import scene_sphere
 from trainer.fit.network import JointTraining, begin_joint_training, save_network
@@ -28,6 +29,7 @@ from trainer.optimize.color_solver import (
     Solver,
     choose_model,
     enrich,
+    gain_of_views,
     iterations,
     make_solver,
     split_solver,
@@ -47,9 +49,9 @@ from trainer.optimize.pgs import (
 from trainer.optimize.retime import drop_jitter, record, resolve_slider, retime
 from trainer.optimize.ties import surface_ties
 from trainer.options import MOST_STAGES, OptimizeOptions, TrainOptions
-from trainer.setup import Pictures, TrainingSetup, probe_views
+from trainer.setup import Pictures, TrainingSetup, boxed_pictures, probe_views
 from trainer.store.progress import RunLog, release_memory
-from trainer.store.run_folder import LazySequence, stored_pictures
+from trainer.store.run_folder import LazySequence
 from trainer.store.state import PeriodicSave, Resumable, Saved, StateFolder, defer_signals
 from trainer.views.choose import split_held_out
 from trainer.views.crops import CropScene, crop_scene, moving_attributes, only_recolors, render_all
@@ -124,10 +126,14 @@ _ENOUGH = 12  # pixels for each number of a color that is solved for
 Way = Callable[[OnStep], Iterator[ParameterSnapshot]]
 """Optimizes from the state on, and yields recordings."""
 
+Optimized = tuple[Trajectory, Losses, Mapping[str, Any]]
+"""The trajectory, even in time; mean of every loss term, and what is left to the edit, per recording; the
+effort that was decided on, as report.json has it."""
+
 
 @dataclass(frozen=True)
 class Strengths:
-    """Of an edit of colors: strengths that are edited when it is known that they are called for."""
+    """Strengths that are edited when it is known that they are called for."""
 
     ruler: Sequence[float]  # see `Course.ruler`
     edit: Callable[[Sequence[float]], Pictures]  # all views, which stay on disk
@@ -143,7 +149,7 @@ def optimize_members(
     folder: StateFolder,
     log: RunLog,
     between: Strengths | None = None,
-) -> tuple[Trajectory, Losses, Mapping[str, Any]]:
+) -> Optimized:
     """Optimize the members, from the beginning or from the saved state.
 
     Args:
@@ -156,14 +162,26 @@ def optimize_members(
         log: of the run
         between: of colors that are solved for, what more strengths there may be; None: those of `edited`
 
-    Returns:
-        The trajectory, even in time; mean of every loss term, and what is left to the edit, per recording;
-        the effort that was decided on, as report.json has it
-
     Raises:
         ProgdfError: the loss is not finite.
         KeyboardInterrupt: interrupted; the state is saved.
     """
+    if optimization.solver == "colors":
+        plan = plan_colors(optimization, setup, edited, between, bool(options.views.pictures), log)
+        return _solve(plan, folder, log)
+    return _descend(options, optimization, setup, edited, perceptual, folder, log)
+
+
+def _descend(
+    options: TrainOptions,
+    optimization: OptimizeOptions,
+    setup: TrainingSetup,
+    edited: Pictures,
+    perceptual: Perceptual,
+    folder: StateFolder,
+    log: RunLog,
+) -> Optimized:
+    """View by view."""
     scene, members = setup.scene, setup.region.members
     bands = optimization.sh != "off"
     engine, device = optimization.engine, engine_device(optimization.engine)
@@ -172,7 +190,7 @@ def optimize_members(
         log.say(f"the steps are drawn by warp on {card}")
     original = pack(scene[members], with_shN=scene.sh_degree > 0).to(device)
     still = optimization.kind == "color" and optimization.rates == "kind"
-    crops = _crops(setup, setup.train, still, engine)
+    crops = _crops(setup, still, engine)
     stages, groups = _stages(optimization, setup, edited), None
     if optimization.group_steps:
         groups = _groups(optimization, original, crops, stages, folder, log)
@@ -183,46 +201,27 @@ def optimize_members(
     if seeds is not None:
         setup, settings = setup.extend(seeds), replace(settings, ramp=0.0)
         original = torch.cat([original, pack(seeds, with_shN=scene.sh_degree > 0).to(device)])
-        crops = _crops(setup, setup.train, still, engine)
+        crops = _crops(setup, still, engine)
         stages = [place_seeds(s, len(seeds)) for s in stages]
-    state = PgsState(original, settings.seed)
-    way: Way
-    model: Model | None = None
-    steps, recordings_of = sum(stage.steps for stage in stages), partial(Recordings, folder, original.shape)
-    if optimization.solver == "colors":
-        most, steps = iterations(optimization.steps), len(edited) if between is None else MOST_STAGES
-        colors, model, course = _prepare_colors(
-            options, optimization, setup, edited, crops, original, between, log
-        )
-        stages, recordings = [course.finished[0]], recordings_of(model)
-        way = partial(solve, original, colors, model, course, recordings.made, state, steps=most)
-    else:
-        recordings = recordings_of(None)
-        inside = [erode(crop(view.mask, view.box)).to(device) for view in setup.train]
-        objective = Objective(perceptual, optimization, inside)
-        probes = probe_views(setup, engine=engine)
-        way = partial(optimize, original, crops, probes, stages, objective, settings, state=state)
+    state, recordings = PgsState(original, settings.seed), Recordings(folder, original.shape, None)
+    inside = [erode(crop(view.mask, view.box)).to(device) for view in setup.train]
+    objective = Objective(perceptual, optimization, inside)
+    probes = probe_views(setup, engine=engine)
+    way = partial(optimize, original, crops, probes, stages, objective, settings, state=state)
     joint = None
     if optimization.as_printed and options.field.field == "neural":
         joint = begin_joint_training(
             options.field, optimization, setup, settings.rates, stages, crops, perceptual
         )
-    saver = _record_way(way, steps, state, recordings, joint, folder, log)
-    distances = [made.means["left"] for made in recordings.made]
-    log.say(f"L1 to the finished edit: {distances[0]:.4f} at first, {distances[-1]:.4f} at the end")
-    log.say(f"the state was saved {saver.saves} times, in {saver.seconds:.2f} s")
+    made = _record_way(way, sum(stage.steps for stage in stages), state, recordings, joint, folder, log)
     end = stages[-1].place(state.average).cpu().clone()
-    ordered, strengths = recordings.made, list(edited)
-    if model is not None:
-        strengths, ordered = course.sort_recordings(ordered)
-    snapshots = [(made.step, made.stage, made.ends_stage, made.offsets[:own]) for made in ordered]
+    snapshots = [(one.step, one.stage, one.ends_stage, one.offsets[:own]) for one in made]
     if groups is not None:
-        ends = [made for made in recordings.made if made.ends_stage]
-        offsets = [*(made.offsets.float() for made in ends[:-1]), end]
-        snapshots = group_path(original, groups, offsets, [made.step for made in ends], settings.snapshots)
-    taken = [int(made.means[STEPS]) for made in ordered if STEPS in made.means]
-    rows = [(m.step, {name: mean for name, mean in m.means.items() if name != STEPS}) for m in ordered]
-    trajectory, effort = record(snapshots, end[:own], strengths), {"strengths": strengths, STEPS: taken}
+        ends = [one for one in made if one.ends_stage]
+        offsets = [*(one.offsets.float() for one in ends[:-1]), end]
+        snapshots = group_path(original, groups, offsets, [one.step for one in ends], settings.snapshots)
+    trajectory = record(snapshots, end[:own], list(edited))
+    effort: dict[str, Any] = {"strengths": list(edited)}
     if seeds is not None:
         finished = original + end.to(device)
         costs = removal_costs(crops, finished, stages[-1].targets, optimization.seed)[own:].cpu()
@@ -230,63 +229,54 @@ def optimize_members(
         trajectory = add_rows(trajectory, trained[costs > 0.0])
         effort["added"] = 0 if trajectory.added is None else len(trajectory.added)
         log.say(f"growth: {effort['added']} Gaussians added, of {len(seeds)}; the others contribute nothing")
-    if model is not None:
-        maps = torch.stack([made.table for made in ordered if made.table is not None])
-        trajectory = replace(trajectory, maps=maps, bands=model.bands, mask=model.mask)
-        counts = (
-            f"in {', '.join(map(str, taken))} steps, of {most} each at most" if taken else "by maps alone"
-        )
-        log.say(f"{len(strengths)} strengths {counts}")
-        effort |= model.figures() | {"most_steps": most, "views": len(crops)}
-    return trajectory, loss_table(rows), effort
+    return trajectory, loss_table([(one.step, one.means) for one in made]), effort
 
 
-def _stages(optimization: OptimizeOptions, setup: TrainingSetup, edited: Pictures) -> list[TargetStage]:
-    """The strengths to optimize towards, and the steps that each gets."""
-    steps = max(optimization.steps, len(edited) + 1)  # each stage is to have one
-    return [
-        TargetStage(s, _boxes(pictures, setup.train, optimization.engine), steps)
-        for (s, pictures), steps in zip(edited.items(), _steps_by_stage(steps, len(edited)), strict=True)
-    ]
+@dataclass(frozen=True)
+class ColorPlan:
+    """What there is to solve for."""
+
+    original: Tensor  # raw member rows. [M,C]
+    solver: Solver
+    model: Model
+    course: Course
+    steps: int  # at most, of conjugate gradients
 
 
-def _boxes(pictures: Sequence[Tensor], views: Sequence[View], engine: str = "cpu") -> Sequence[Tensor]:
-    device, pairs = engine_device(engine), zip(pictures, views, strict=False)
-    return stored_pictures(crop(picture, view.box).to(device) for picture, view in pairs)
-
-
-def _crops(
-    setup: TrainingSetup, views: Sequence[View], still: bool, engine: str = "cpu"
-) -> Sequence[CropScene]:
-    """Of an edit of colors each is made when it is looked at: once, by `color_views`."""
-    scene, members = setup.scene.to(engine_device(engine)), setup.region.members
-    crops = LazySequence(
-        views, lambda v: crop_scene(scene, members, v.camera, v.box, setup.background, still, engine)
-    )
-    return crops if still else list(crops)
-
-
-def _prepare_colors(
-    options: TrainOptions,
+def plan_colors(
     optimization: OptimizeOptions,
     setup: TrainingSetup,
     edited: Pictures,
-    crops: Sequence[CropScene],
-    original: Tensor,
     between: Strengths | None,
+    few: bool,
     log: RunLog,
-) -> tuple[Solver, Model, Course]:
-    """The views to solve for, how much is modelled, and the strengths."""
-    with log.stage("weights"):
-        few = bool(options.views.pictures)
-        every = 1 if few else _stride(setup, original)
-        drawn = color_views(crops, original, every)
-        aside = _look_aside(setup, drawn, original, edited, every)
-        cameras = [view.camera for view in setup.train]
-        ties = surface_ties(setup.scene, setup.region.members, cameras) if few else None
+) -> ColorPlan:
+    """Solve for the finished edit, and decide by that how much is modelled and which strengths come next.
+
+    Args:
+        optimization: nothing left open, see `resolve_kind`
+        setup: scene, region, views with boxes that hold the edit
+        edited: strength → the edited views, whole
+        between: what more strengths there may be; None: those of `edited`
+        few: whether the views are a handful of pictures, see `surface_ties`
+        log: of the run
+    """
+    scene, members, count = setup.scene, setup.region.members, len(setup.train)
+    original = pack(scene[members], with_shN=scene.sh_degree > 0)
+    every, most = 1 if few else _stride(setup, original), iterations(optimization.steps)
+    held_out = split_held_out(setup.held_out)[0] if len(edited[1.0]) > count else []
+    judging = held_out or setup.train
+
+    def draw(views: Sequence[View]) -> list[ColorView]:
+        make = partial(crop_scene, scene, members, background=setup.background, still=True)
+        return color_views(LazySequence(views, lambda v: make(v.camera, v.box)), original, every)
+
+    def judge(pictures: Sequence[Tensor]) -> Judge:
+        return Judge(aside, boxed_pictures(pictures, judging))
 
     def target(s: float, pictures: Sequence[Tensor]) -> Target:
-        return TargetStage(s, _boxes(pictures, setup.train), 1), aside.judge(aside.pick(pictures))
+        stage = TargetStage(s, boxed_pictures(pictures, setup.train), 1)
+        return stage, judge(split_held_out(pictures[count:])[0] if held_out else pictures[:count])
 
     def ask(strengths: Sequence[float]) -> list[Target]:
         made = between.edit(strengths) if between is not None else edited
@@ -294,30 +284,39 @@ def _prepare_colors(
 
     def look(s: float) -> Judge:
         assert between is not None
-        return aside.judge(between.look(s, aside.views))
+        return judge(between.look(s, judging))
 
+    with log.stage("weights"):
+        drawn = draw(setup.train)
+        aside = draw(held_out) if held_out else drawn
+        ties = surface_ties(scene, members, [view.camera for view in setup.train]) if few else None
     with log.stage("model"):
-        (stage, judge), most = target(1.0, edited[1.0]), iterations(optimization.steps)
-        solver = make_solver(drawn, original, ties)
-        trials = [(solver, judge)] if ties is None else split_solver(solver, original, stage.targets)
-        solver, model = choose_model(
-            solver, trials, stage.targets, most, 1 if optimization.sh == "off" else 9
-        )
+        finished, solver = target(1.0, edited[1.0]), make_solver(drawn, original, ties)
+        targets = finished[0].targets
+        trials = [(solver, finished[1])] if ties is None else split_solver(solver, original, targets)
+        solver, model = choose_model(solver, trials, targets, most, 1 if optimization.sh == "off" else 9)
     strengths = [s for s in edited if s < 1.0]
     if between is not None and model.richer is not None:  # which is decided there
         strengths = strengths or [between.ruler[len(between.ruler) // 2]]
-    course = Course(ask(strengths) if strengths else [], (stage, judge))
+    course = Course(ask(strengths) if strengths else [], finished)
     if between is not None:
         course = replace(course, ruler=between.ruler, look=cache(look), ask=ask)
     with log.stage("model"):
         middle = len(course.targets) // 2 if between is None else 0
-        model = enrich(model, solver, *[*course.targets, course.finished][middle], most)
-    on = "all views, as none is held out" if aside.drawn is drawn else "views that are held out"
+        model = enrich(model, solver, *[*course.targets, finished][middle], most)
+    on = "views that are held out" if held_out else "all views, as none is held out"
     log.say(f"{model.line}, on {on if ties is None else 'squares of the pictures that are held out'}")
     if ties is not None:
         unseen = len(original) - int(solver.asked.sum())
         log.say(f"{unseen} members that no picture shows follow the map and their own surface")
-    return solver, model, course
+    elif held_out:
+        seen = Judge(drawn, targets).error(solver.offsets(model, targets))
+        if (better := gain_of_views(seen, model.error)) is not None:
+            log.say(
+                f"in the views that are solved for the edit is at {decibels(seen):.1f} dB: twice as many "
+                f"(--views) would make it {better:.1f} dB better in others"
+            )
+    return ColorPlan(original, solver, model, course, most)
 
 
 def _stride(setup: TrainingSetup, original: Tensor) -> int:
@@ -328,32 +327,41 @@ def _stride(setup: TrainingSetup, original: Tensor) -> int:
     return next(every for every in (8, 4, 2) if every == 2 or pixels >= _ENOUGH * every)
 
 
-@dataclass(frozen=True)
-class _Aside:
-    """The views that judge what is solved for: the held-out ones that choose, or all where there are none."""
+def _solve(plan: ColorPlan, folder: StateFolder, log: RunLog) -> Optimized:
+    """All views at once, for colors alone."""
+    model, course, state = plan.model, plan.course, PgsState(plan.original)
+    recordings = Recordings(folder, plan.original.shape, model)
+    way = partial(solve, plan.original, plan.solver, model, course, recordings.made, state, steps=plan.steps)
+    most = MOST_STAGES if course.ruler else len(course.targets) + 1
+    made = _record_way(way, most, state, recordings, None, folder, log)
+    strengths, made = course.sort_recordings(made)
+    snapshots = [(one.step, one.stage, one.ends_stage, one.offsets) for one in made]
+    trajectory = record(snapshots, course.finished[0].place(state.average).cpu().clone(), strengths)
+    maps = torch.stack([one.table for one in made if one.table is not None])
+    taken = [int(one.means[STEPS]) for one in made if STEPS in one.means]
+    rows = [(one.step, {name: mean for name, mean in one.means.items() if name != STEPS}) for one in made]
+    steps = (
+        f"in {', '.join(map(str, taken))} steps, of {plan.steps} each at most" if taken else "by maps alone"
+    )
+    log.say(f"{len(strengths)} strengths {steps}")
+    effort = {"strengths": strengths, STEPS: taken, "most_steps": plan.steps, "views": len(plan.solver.views)}
+    trajectory = replace(trajectory, maps=maps, bands=model.bands, mask=model.mask)
+    return trajectory, loss_table(rows), effort | model.figures()
 
-    views: Sequence[View]
-    drawn: Sequence[ColorView]
-    pick: Callable[[Sequence[Tensor]], Sequence[Tensor]]  # their pictures, of all views'
 
-    def judge(self, pictures: Sequence[Tensor]) -> Judge:
-        """How far from these views' pictures. [H,W,3] each"""
-        return Judge(self.drawn, _boxes(pictures, self.views))
+def _stages(optimization: OptimizeOptions, setup: TrainingSetup, edited: Pictures) -> list[TargetStage]:
+    """The strengths to optimize towards, and the steps that each gets."""
+    steps = max(optimization.steps, len(edited) + 1)  # each stage is to have one
+    return [
+        TargetStage(s, boxed_pictures(pictures, setup.train, optimization.engine), steps)
+        for (s, pictures), steps in zip(edited.items(), _steps_by_stage(steps, len(edited)), strict=True)
+    ]
 
 
-def _look_aside(
-    setup: TrainingSetup,
-    drawn: Sequence[ColorView],
-    original: Tensor,
-    edited: Pictures,
-    every: int,
-) -> _Aside:
-    """See `_Aside`. `drawn`: the training views."""
-    views, count = split_held_out(setup.held_out)[0], len(setup.train)
-    if not views or len(edited[1.0]) <= count:
-        return _Aside(setup.train, drawn, lambda pictures: pictures[:count])
-    choosing = color_views(_crops(setup, views, True), original, every)
-    return _Aside(views, choosing, lambda pictures: split_held_out(pictures[count:])[0])
+def _crops(setup: TrainingSetup, still: bool, engine: str) -> list[CropScene]:
+    scene, members = setup.scene.to(engine_device(engine)), setup.region.members
+    make = partial(crop_scene, scene, members, background=setup.background, still=still, engine=engine)
+    return [make(view.camera, view.box) for view in setup.train]
 
 
 def _record_way(
@@ -364,8 +372,12 @@ def _record_way(
     joint: JointTraining | None,
     folder: StateFolder,
     log: RunLog,
-) -> PeriodicSave:
-    """Go the way to its end, from the saved state on, and a jointly trained network with it."""
+) -> Sequence[ParameterSnapshot]:
+    """Go the way to its end, from the saved state on, and a jointly trained network with it.
+
+    Returns:
+        All recordings.
+    """
     parts: dict[str, Resumable] = {"pgs": state, "recordings": recordings, "log": log}
     saver = PeriodicSave(folder, PART, parts | ({"field": joint} if joint else {}))
     if saver.restore():
@@ -402,7 +414,10 @@ def _record_way(
     saver.save(waits=False)
     if joint is not None:
         save_network(joint, folder)
-    return saver
+    distances = [made.means["left"] for made in recordings.made]
+    log.say(f"L1 to the finished edit: {distances[0]:.4f} at first, {distances[-1]:.4f} at the end")
+    log.say(f"the state was saved {saver.saves} times, in {saver.seconds:.2f} s")
+    return recordings.made
 
 
 def _groups(
