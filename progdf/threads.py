@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from functools import cache, partial
@@ -17,6 +17,7 @@ from typing import TypeVar
 
 import torch
 
+_A = TypeVar("_A")
 _T = TypeVar("_T")
 
 MOST_THREADS = torch.get_num_threads()
@@ -105,6 +106,12 @@ def run_chunks(kernel: Callable[[int], _T], chunks: int) -> list[_T]:
     for other in started:
         other.result()  # raises what was raised there
     return [results[chunk] for chunk in range(chunks)]
+
+
+@one_thread()  # as those of the pool have: else who gets an item would decide on its last bits
+def map_threads(work: Callable[[_A], _T], items: Sequence[_A]) -> list[_T]:
+    """`work` of every item, on as many threads as the cpu engine has; the same bits on any number."""
+    return run_chunks(lambda index: work(items[index]), len(items))
 
 
 @cache

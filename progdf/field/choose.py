@@ -14,7 +14,7 @@ import math
 from bisect import bisect_left
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import pairwise
 from statistics import fmean
 from typing import Literal, Protocol
@@ -23,6 +23,7 @@ import torch
 from torch import Tensor
 
 from progdf.metrics.image import LEVEL, ROUNDING, decibels
+from progdf.threads import map_threads
 
 from .baked import END_TYPES, BakedField, interpolate_at
 from .keyframes import fit_lossless
@@ -139,9 +140,8 @@ class FieldEvaluator:
         course = truth or (lambda s: interpolate_at(strengths, offsets, s))
         self._render, self._rule = render, bool(edited)
         self._nothing = torch.zeros(offsets.shape[1:])
-        with torch.no_grad():
-            self._expected = [render(course(s)) for s in sample_strengths()]
-            self._edited = edited or {1.0: render(course(1.0))}
+        self._expected = self._pictures(course, sample_strengths())
+        self._edited = edited or {1.0: self._pictures(course, [1.0])[0]}
         self._own = self._errors(course)
         self._allowed = allowed_error(fmean(self._own)) if edited else 10 ** (-target / 10)
         own = decibels(fmean(self._own))
@@ -173,15 +173,21 @@ class FieldEvaluator:
         return tuple(decibels(e) for e in self._deviations(field))
 
     def _deviations(self, field: Field) -> list[float]:
-        with torch.no_grad():
-            return [
-                _difference(self._render(self._offsets(field, s)), expected)
-                for s, expected in zip(sample_strengths(), self._expected, strict=True)
-            ]
+        pictures = self._pictures(partial(self._offsets, field), sample_strengths())
+        return list(map(_difference, pictures, self._expected))
 
     def _errors(self, course: Callable[[float], Tensor]) -> list[float]:
-        with torch.no_grad():
-            return [ROUNDING + _difference(self._render(course(s)), e) for s, e in self._edited.items()]
+        pictures = self._pictures(course, [*self._edited])
+        return [ROUNDING + _difference(*pair) for pair in zip(pictures, self._edited.values(), strict=True)]
+
+    def _pictures(self, course: Callable[[float], Tensor], strengths: Sequence[float]) -> list[Tensor]:
+        """The pixels that count, each strength's on one thread."""
+
+        @torch.no_grad()
+        def render(s: float) -> Tensor:
+            return self._render(course(s))
+
+        return map_threads(render, strengths)
 
     def _offsets(self, field: Field, s: float) -> Tensor:
         # a field that moves nothing does not know how many members it has

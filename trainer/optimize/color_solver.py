@@ -32,7 +32,7 @@ from progdf.field.baked import MONOMIALS, identity_map
 from progdf.field.grade import map_colors, member_bands
 from progdf.metrics.image import LEVEL, decibels
 from progdf.sh import C0
-from progdf.threads import one_thread
+from progdf.threads import map_threads, one_thread
 
 from .color_views import (
     MORE_PAYS,
@@ -43,7 +43,6 @@ from .color_views import (
     fit_maps,
     improve_mask,
     iterate_views,
-    map_views,
     mask_of_members,
 )
 from .pgs import TargetStage
@@ -323,7 +322,7 @@ class Solver:
             picture = view.map.picture(torch.from_numpy(colors * pull.drawn[index].numpy()))
             return float((picture * pull.passed[index]).square().sum())
 
-        return sum(map_views(look, range(len(self.views)))) + _inner(along, self._hold(along, ridge))
+        return sum(map_threads(look, range(len(self.views)))) + _inner(along, self._hold(along, ridge))
 
 
 def make_solver(views: Sequence[ColorView], original: Tensor, ties: Ties | None = None) -> Solver:
@@ -336,7 +335,7 @@ def make_solver(views: Sequence[ColorView], original: Tensor, ties: Ties | None 
     asked = torch.ones_like(original[:, 0], dtype=torch.bool)
     held = csr_matrix((len(original), len(original)), dtype=np.float32)
     if ties is not None:
-        shown = torch.stack(map_views(lambda view: view.map.gradient(view.counts * ones[:1])[:, 0], views))
+        shown = torch.stack(map_threads(lambda view: view.map.gradient(view.counts * ones[:1])[:, 0], views))
         twice = (shown > _SHOWS).sum(dim=0) > 1
         asked = (ties.clear | twice) & (weights[:, 0, 0] > 0.0)
         held = ties.of(asked) * np.float32(_TIES * float(weights[asked, 0, 0].mean()))

@@ -25,7 +25,7 @@ from progdf.rasterize.cpu.engine import Array
 from progdf.rasterize.cpu.jit import Number, kernel
 from progdf.rasterize.engines import ColorMap, color_map
 from progdf.sh import basis
-from progdf.threads import one_thread, run_chunks
+from progdf.threads import map_threads, one_thread
 from trainer.views.crops import CropScene
 
 _AT_ONCE = 8  # views, whose results are there at the same time
@@ -169,7 +169,7 @@ def color_views(crops: Sequence[CropScene], original: Tensor, every: int = 1) ->
         place = torch.arange(width) + every // 2 * torch.arange(height)[:, None] + index
         return color_view(crop, original, bands, (place % every == 0).flatten().nonzero()[:, 0])
 
-    views = map_views(make, range(len(crops)))
+    views = map_threads(make, range(len(crops)))
     alike = bands == 1  # from everywhere
     return [replace(v, basis=views[0].basis, original=views[0].original) for v in views] if alike else views
 
@@ -238,10 +238,10 @@ def fit_maps(views: Sequence[ColorView], share: Tensor, most: int = _MOST_PIXELS
         original = view.picture(view.original.clamp_min(0.0))[some]
         return shown[:, :20], original, (terms @ terms.T).double()
 
-    covered = map_views(lambda view: view.own_pixels.nonzero()[:, 0], views)
+    covered = map_threads(lambda view: view.own_pixels.nonzero()[:, 0], views)
     stride = max(1, -(-sum(map(len, covered)) // most))
     pixels = [some[::stride].clone() for some in covered]
-    laid = map_views(lay_out, range(len(views)))
+    laid = map_threads(lay_out, range(len(views)))
     design, original = (torch.cat([one[i] for one in laid]) for i in (0, 1))
     members = torch.stack([one[2] for one in laid]).sum(dim=0)
     wide = design.double()
@@ -316,10 +316,10 @@ def improve_mask(
             by_color, _, squared = view.pull((view.original + share[:, None] * change).clamp_min(0.0), target)
             return (by_color * change).sum(dim=1), squared
 
-        looks = map_views(pull, pairs)
+        looks = map_threads(pull, pairs)
         return torch.stack([one for one, _ in looks]).sum(dim=0), sum(error for _, error in looks)
 
-    curvature = torch.stack(map_views(weigh, pairs)).sum(dim=0)
+    curvature = torch.stack(map_threads(weigh, pairs)).sum(dim=0)
     curvature = curvature + _MASK_RIDGE * curvature.mean() + 1e-12
     descent, error = look(share)
     for _ in range(_MASK_STEPS):
@@ -354,17 +354,11 @@ class Judge:
 
     def mean(self, offsets: Tensor, power: float) -> float:
         """Mean difference to some power, of the pixels that show the members. [M,B,3]"""
-        total = sum(map_views(lambda pair: pair[0].error(offsets, pair[1], power), self._pairs))
+        total = sum(map_threads(lambda pair: pair[0].error(offsets, pair[1], power), self._pairs))
         return total / max(1, 3 * sum(int(view.own_pixels.sum()) for view in self.views))
-
-
-@one_thread()  # as those of the pool have: else who gets a view would decide on its last bits
-def map_views(work: Callable[[_A], _B], items: Sequence[_A]) -> list[_B]:
-    """`work` of every item, on as many threads as the rasterizer has; the same bits on any number."""
-    return run_chunks(lambda index: work(items[index]), len(items))
 
 
 def iterate_views(work: Callable[[_A], _B], items: Sequence[_A]) -> Iterator[_B]:
     """The same some at a time, for what need not be kept."""
     for begin in range(0, len(items), _AT_ONCE):
-        yield from map_views(work, items[begin : begin + _AT_ONCE])
+        yield from map_threads(work, items[begin : begin + _AT_ONCE])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 import json
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -216,13 +217,14 @@ class RunLog:
     @contextmanager
     def looks(self, what: str, total: int) -> Iterator[Callable[[], None]]:
         """The same for a stage whose work comes in about `total` equal parts: call it at each."""
-        done = 0
+        done, lock = 0, threading.Lock()  # any thread may look
         with self.steps(what, total) as advance:
 
             def count_look() -> None:
                 nonlocal done
-                done += 1
-                advance(min(done, total), "")
+                with lock:
+                    done += 1
+                    advance(min(done, total), "")
 
             yield count_look
 

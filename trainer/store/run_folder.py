@@ -28,6 +28,7 @@ from progdf.field.trajectory import FILE_NAME
 from progdf.io.atomic import LOCK, LockedError, atomic_write, hold_lock, is_temporary, remove_abandoned
 from progdf.io.images import read_picture, write_image
 from progdf.io.json_values import decode_json
+from progdf.threads import map_threads
 
 from .state import StateFolder
 
@@ -233,8 +234,7 @@ def remove_leftovers(folder: RunFolder) -> None:
 def write_views(folder: RunFolder, kind: str, pictures: Mapping[str, Tensor], strength: float = 1.0) -> None:
     """One PNG per view. Pictures by view name, [H,W,3] or [H,W]."""
     paths = [folder.view(kind, name, strength) for name in pictures]
-    for path, image in zip(paths, pictures.values(), strict=True):
-        write_image(path, image)
+    map_threads(lambda pair: write_image(*pair), list(zip(paths, pictures.values(), strict=True)))
     add_pictures(folder.views, paths)
 
 

@@ -21,6 +21,7 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.rasterize import alpha_weights
 from progdf.region import Region
+from progdf.threads import map_threads
 
 from .view import View, fit_size, make_view
 
@@ -98,7 +99,7 @@ def choose_views(
     visibility = _Shown(_relative_visibility(weights[good]), toward, _reach(count))
     taken = _greedy(visibility, count) if len(good) > count else list(range(len(good)))
     return ViewChoice(
-        tuple(make_view(scene, region, cameras[looked[good[k]]], background) for k in taken),
+        tuple(map_threads(lambda k: make_view(scene, region, cameras[looked[good[k]]], background), taken)),
         _likeness(visibility, taken),
         len(cameras),
         int((~framed.any(dim=1)).sum()) + int((~seeing).sum()),
@@ -205,14 +206,14 @@ def _measure_visibility(
     scene: Gaussians, region: Region, rows: Tensor, cameras: Sequence[Camera]
 ) -> tuple[Tensor, Tensor]:
     """The region's share of each picture [V], and each sample's blended weight in it [V,S]."""
-    cover = torch.zeros(len(cameras))
-    weights = torch.zeros(len(cameras), len(rows))
-    for i, camera in enumerate(cameras):
+
+    def look(camera: Camera) -> tuple[Tensor, Tensor]:
         small = fit_size(camera, _LOOK)
         found = alpha_weights(scene, small, torch.ones(small.height, small.width))[:, 2]
-        cover[i] = found[region.members].sum() / (small.width * small.height)
-        weights[i] = found[rows]
-    return cover, weights
+        return found[region.members].sum() / (small.width * small.height), found[rows]
+
+    cover, weights = zip(*map_threads(look, cameras), strict=True)
+    return torch.stack(cover), torch.stack(weights)
 
 
 def _relative_visibility(weights: Tensor) -> Tensor:

@@ -21,7 +21,7 @@ from progdf.rasterize import ActivatedGaussians, Crop, Rendering, activate, rend
 from progdf.rasterize.cpu.forward import TILE_H, TILE_W
 from progdf.rasterize.engines import ColorMap, color_map
 from progdf.sh import basis
-from progdf.threads import one_thread, run_chunks, threads
+from progdf.threads import map_threads, threads
 
 from .view import seen_colors
 
@@ -255,8 +255,8 @@ def render_all(
     """Every prepared view with these member rows, without gradients. [M,C] -> images [h,w,3]"""
     with torch.no_grad():
         if len(crops) > 1 and threads() > 1 and all(crop.still for crop in crops):
-            with one_thread():  # as in `map_views`; a thread of the pool has gradients of its own to forget
-                return run_chunks(lambda i: crops[i].render(packed, moving)[0].detach(), len(crops))
+            # a thread of the pool has gradients of its own to forget
+            return map_threads(lambda crop: crop.render(packed, moving)[0].detach(), crops)
         return [crop.render(packed, moving)[0] for crop in crops]
 
 

@@ -19,6 +19,7 @@ from progdf.rasterize import activate, render, set_threads
 from progdf.rasterize.engines import color_map
 from progdf.region import Region
 from progdf.sh import rgb_to_sh0
+from progdf.threads import map_threads
 from tests.helpers.scenes import random_gaussians
 from trainer.optimize.color_course import Course, Target, solve
 from trainer.optimize.color_solver import (
@@ -30,7 +31,7 @@ from trainer.optimize.color_solver import (
     gain_of_views,
     make_solver,
 )
-from trainer.optimize.color_views import Judge, color_views, map_views
+from trainer.optimize.color_views import Judge, color_views
 from trainer.optimize.pgs import OnStep, ParameterSnapshot, PgsState, TargetStage
 from trainer.setup import unresolved_share
 from trainer.views.crops import CropScene, crop_scene, render_all
@@ -414,7 +415,7 @@ def test_torch_works_on_one_thread_whoever_gets_a_view() -> None:
         both.wait()
         return torch.get_num_threads()
 
-    assert map_views(look, range(2)) == [1, 1]
+    assert map_threads(look, range(2)) == [1, 1]
     assert torch.get_num_threads() == 2
 
 
