@@ -26,7 +26,7 @@ from progdf.threads import threads
 
 from .editors.base import ImageEditor
 from .editors.pictures import picture_cameras
-from .editors.procedural import ColorEditor, edit_course
+from .editors.procedural import ColorEditor
 from .options import MOST_VIEWS, VIEWS, Kind, ViewOptions
 from .store.progress import Advance
 from .store.run_folder import LazySequence, RunFolder, add_pictures, from_bytes, stored_pictures, to_bytes
@@ -243,6 +243,7 @@ def edit_views(
     folder: RunFolder,
     is_confined: bool,
     advance: Advance,
+    course: Callable[[View], Callable[[float], Tensor]],
 ) -> dict[float, Sequence[Tensor]]:
     """Every view edited once per strength. What is kept on disk, in 8 bits, is what is trained on.
 
@@ -253,15 +254,16 @@ def edit_views(
         folder: where the pictures go
         is_confined: put back what changed outside the region; members would be pulled over it otherwise
         advance: progress
+        course: the editor's way of a view, see `edit_course`
     """
     paths = {
         strength: [folder.view("edited", v.camera.name, strength) for v in views] for strength in strengths
     }
 
     def edit(request: Sequence[tuple[float, int]]) -> list[Tensor]:
-        made, course = [], edit_course(editor, views[request[0][1]])
+        made = []
         for strength, i in request:
-            whole = course(strength)
+            whole = course(views[i])(strength)
             made.append(to_bytes(views[i].confine(whole) if is_confined else whole))
             write_image(paths[strength][i], from_bytes(made[-1]))
         return made

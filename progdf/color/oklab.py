@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Literal, get_args
 
 import torch
@@ -28,17 +29,25 @@ _LAB_FROM_LMS = (
 _GAMUT_SLACK = 1e-3  # less than a third of an 8-bit step
 
 
+@cache
+def _matrices(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Linear to LMS, LMS to Lab, and the inverses of both, transposed: for colors in rows."""
+    to_lms, to_lab = (torch.tensor(m, dtype=dtype, device=device) for m in (_LMS_FROM_LINEAR, _LAB_FROM_LMS))
+    return to_lms.T, to_lab.T, torch.linalg.inv(to_lms).T, torch.linalg.inv(to_lab).T
+
+
 def srgb_to_oklab(rgb: Tensor) -> Tensor:
     """Lightness 0..1 and the two opponent axes a, b of sRGB colors. [...,3] -> [...,3]"""
     linear = torch.where(rgb <= 0.04045, rgb / 12.92, ((rgb.clamp_min(0.04045) + 0.055) / 1.055) ** 2.4)
-    lms = linear @ rgb.new_tensor(_LMS_FROM_LINEAR).T
-    return (lms.sign() * lms.abs() ** (1 / 3)) @ rgb.new_tensor(_LAB_FROM_LMS).T
+    to_lms, to_lab, *_ = _matrices(rgb.dtype, rgb.device)
+    lms = linear @ to_lms
+    return (lms.sign() * lms.abs() ** (1 / 3)) @ to_lab
 
 
 def oklab_to_srgb(lab: Tensor) -> Tensor:
     """The inverse of `srgb_to_oklab`; colors that sRGB cannot show leave 0..1. [...,3] -> [...,3]"""
-    lms = (lab @ torch.linalg.inv(lab.new_tensor(_LAB_FROM_LMS)).T) ** 3
-    linear = lms @ torch.linalg.inv(lab.new_tensor(_LMS_FROM_LINEAR)).T
+    *_, to_linear, to_lms = _matrices(lab.dtype, lab.device)
+    linear = (lab @ to_lms) ** 3 @ to_linear
     return torch.where(
         linear <= 0.0031308, linear * 12.92, 1.055 * linear.clamp_min(0.0031308) ** (1 / 2.4) - 0.055
     )

@@ -413,7 +413,7 @@ def _edit_views(
             within = views
             if options.region.region == CHANGED:  # of paint finer than the Gaussians few are found
                 within = [view.with_painted([editor().edit(view, 1.0)]) for view in views]
-            made.update(edit_views(editor(), within, new, folder, is_confined, advance))
+            made.update(edit_views(editor(), within, new, folder, is_confined, advance, course))
         log.say(f"{spec}: a {approach.kind} edit at strength {', '.join(f'{s:g}' for s in strengths)}")
         saved = {"strengths": list(made), **asdict(approach)}
         shared = painter.figures if isinstance(painter := editor(), AgreedEditor) else {}

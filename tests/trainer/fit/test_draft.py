@@ -99,4 +99,4 @@ def test_no_further_strengths_are_no_pictures(tmp_path: Path) -> None:
     """Where the slider is even with one recording already."""
     case = small("body")
     editor = make_editor(EditorOptions(GRADE), case.scene, case.region, case.views)
-    assert edit_views(editor, case.views, (), RunFolder(tmp_path), True, lambda *_: None) == {}
+    assert edit_views(editor, case.views, (), RunFolder(tmp_path), True, lambda *_: None, editor.course) == {}
