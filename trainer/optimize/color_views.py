@@ -32,6 +32,7 @@ _AT_ONCE = 8  # views, whose results are there at the same time
 _SQUARES = 6  # of a view's longer side, every other one of which is in one of its halves
 _COVERED = 0.05  # the region's weight in a pixel that shows it
 _MOST_PIXELS = 250_000  # for the some twenty coefficients of the map; of more, evenly spread ones
+_PART = 1 << 14  # of these, that a thread has at a time
 _CLAMP_ROUNDS = 3  # of the map's least squares, for pixels that are white or black anyway
 _MAP_RIDGE = 1e-6  # of the diagonal of a map's normal equations, for regions of few colors
 _MAP_HELD = 1e-2  # say of the members' own colors beside the pixels: there a map is held to the affine one
@@ -211,11 +212,18 @@ class MapFit:
             normal, pull = normal + held, held[:, : len(coarse)] @ coarse
         normal = normal + _MAP_RIDGE * (normal.diagonal() + 1e-12).diag()
         change = design.new_zeros(count, 3)
-        for _ in range(_CLAMP_ROUNDS):
-            image = self.original + design @ change
+
+        def project(part: tuple[Tensor, Tensor, Tensor]) -> Tensor:
+            design, original, target = part
+            image = original + design @ change
             clamped = ((image >= 1.0) & (target >= 1.0)) | ((image <= 0.0) & (target <= 0.0))
-            goal = torch.where(clamped, image, target) - self.original
-            right = (design.T @ goal).double() + pull
+            return (design.T @ (torch.where(clamped, image, target) - original)).double()
+
+        parts = list(
+            zip(*(torch.split(rows, _PART) for rows in (design, self.original, target)), strict=True)
+        )
+        for _ in range(_CLAMP_ROUNDS):
+            right = torch.stack(map_threads(project, parts)).sum(dim=0) + pull
             change = torch.linalg.solve(normal, right).float()
         return change
 
