@@ -206,14 +206,17 @@ def _measure_visibility(
     scene: Gaussians, region: Region, rows: Tensor, cameras: Sequence[Camera]
 ) -> tuple[Tensor, Tensor]:
     """The region's share of each picture [V], and each sample's blended weight in it [V,S]."""
+    cover = torch.zeros(len(cameras))
+    weights = torch.zeros(len(cameras), len(rows))
 
-    def look(camera: Camera) -> tuple[Tensor, Tensor]:
-        small = fit_size(camera, _LOOK)
+    def look(i: int) -> None:
+        small = fit_size(cameras[i], _LOOK)
         found = alpha_weights(scene, small, torch.ones(small.height, small.width))[:, 2]
-        return found[region.members].sum() / (small.width * small.height), found[rows]
+        cover[i] = found[region.members].sum() / (small.width * small.height)
+        weights[i] = found[rows]
 
-    cover, weights = zip(*map_threads(look, cameras), strict=True)
-    return torch.stack(cover), torch.stack(weights)
+    map_threads(look, range(len(cameras)))
+    return cover, weights
 
 
 def _relative_visibility(weights: Tensor) -> Tensor:
