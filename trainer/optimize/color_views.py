@@ -160,7 +160,7 @@ def color_view(crop: CropScene, original: Tensor, bands: int, pixels: Tensor) ->
 def color_views(crops: Sequence[CropScene], original: Tensor, every: int = 1) -> list[ColorView]:
     """All views, with all bands that are drawn. Each crop is looked at once, and not needed any more.
 
-    `every`: of so many pixels one is looked at, in each view others: 1, 2, 4 or 8.
+    `every`: of so many pixels one is looked at, in each view others: 1, 2 or 4.
     """
     bands = member_bands(original).shape[1]
 

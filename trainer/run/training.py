@@ -263,7 +263,7 @@ def plan_colors(
     """
     scene, members, count = setup.scene, setup.region.members, len(setup.train)
     original = pack(scene[members], with_shN=scene.sh_degree > 0)
-    every, most = 1 if few else _stride(setup, original), iterations(optimization.steps)
+    every, most = 1 if few else _stride(setup), iterations(optimization.steps)
     held_out = split_held_out(setup.held_out)[0] if len(edited[1.0]) > count else []
     judging = held_out or setup.train
 
@@ -319,12 +319,11 @@ def plan_colors(
     return ColorPlan(original, solver, model, course, most)
 
 
-def _stride(setup: TrainingSetup, original: Tensor) -> int:
+def _stride(setup: TrainingSetup) -> int:
     """Of how many pixels of the training views one is solved for, see `color_views`: half of them say as much
-    to some hundredths of a dB (docs/experiments.md, Pixels), fewer where many show each member."""
-    bands = 1 if original.shape[1] == BASE_CHANNELS else 4
-    pixels = sum(int((view.mask > 0.0).sum()) for view in setup.train) / (bands * len(original))
-    return next(every for every in (8, 4, 2) if every == 2 or pixels >= _ENOUGH * every)
+    to some hundredths of a dB (docs/experiments.md, Pixels), a quarter where many show each member."""
+    numbers = min(9, (setup.scene.sh_degree + 1) ** 2) * len(setup.region)  # of a channel, at most
+    return 4 if sum(int((view.mask > 0.0).sum()) for view in setup.train) >= 4 * _ENOUGH * numbers else 2
 
 
 def _solve(plan: ColorPlan, folder: StateFolder, log: RunLog) -> Optimized:
