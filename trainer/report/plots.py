@@ -57,6 +57,8 @@ def draw_plot(plot: Plot, width: int, height: int) -> Image.Image:
         color, dash = _shade(LINES[i % len(LINES)]), _DASHES[i // len(LINES) % len(_DASHES)]
         marker = "o" if len(xs) <= _MARKED else ""
         axes.plot(xs, ys, dash, color=color, linewidth=1.5, marker=marker, markersize=3.5, label=name)
+    if all(float(x).is_integer() for xs, _ in lines.values() for x in xs):
+        axes.locator_params("x", integer=True)
     axes.set_axisbelow(True)
     axes.grid(color=grid)
     if plot.scale == "log":
