@@ -85,6 +85,8 @@ from .removal import is_removal, remove_region
 from .resume import check_exists, decide_resume, explain_stop, load_region, picture_digests
 from .training import Strengths, optimize_members, retime_trajectory
 
+_KEPT_PIXELS = 1_000_000  # of which what no strength changes is kept: up to 80 bytes each
+
 
 def check_command(options: TrainOptions) -> None:
     """Look at everything that the command names, as far as it can be seen without the scene.
@@ -409,11 +411,13 @@ def _edit_views(
 
     def edit(strengths: Sequence[float]) -> Pictures:
         new, is_confined = [s for s in strengths if s not in made], confines_edit(editor(), approach.kind)
+        kept = sum(int((view.mask > 0.0).sum()) for view in views) <= _KEPT_PIXELS
+        way = course if kept else partial(edit_course, editor())
         with log.steps("edit", len(views) * len(new)) as advance:
             within = views
             if options.region.region == CHANGED:  # of paint finer than the Gaussians few are found
                 within = [view.with_painted([editor().edit(view, 1.0)]) for view in views]
-            made.update(edit_views(editor(), within, new, folder, is_confined, advance, course))
+            made.update(edit_views(editor(), within, new, folder, is_confined, advance, way))
         log.say(f"{spec}: a {approach.kind} edit at strength {', '.join(f'{s:g}' for s in strengths)}")
         saved = {"strengths": list(made), **asdict(approach)}
         shared = painter.figures if isinstance(painter := editor(), AgreedEditor) else {}
