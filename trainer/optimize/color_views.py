@@ -148,11 +148,7 @@ def color_view(crop: CropScene, original: Tensor, bands: int, pixels: Tensor) ->
     weights = basis(min(members.sh_degree, 3), directions)
     colors = (weights[..., None] * members.sh[:, : weights.shape[1]]).sum(dim=1) + 0.5
     weighed = color_map(crop.gaussians, camera, crop.box, crop.rows, crop.engine, pixels)
-    picture = crop.original()
-    if crop.cached is not None:
-        live, constant = crop.cached
-        picture = torch.where(live, picture, constant)
-    others = picture.flatten(0, 1)[pixels] - weighed.picture(colors.clamp_min(0.0))
+    others = crop.original().flatten(0, 1)[pixels] - weighed.picture(colors.clamp_min(0.0))
     counts = torch.ones_like(others[:, :1], dtype=torch.bool)
     return ColorView(weighed, others, weights[:, :bands].contiguous(), colors, crop.size, pixels, counts)
 

@@ -119,7 +119,8 @@ class CropScene:
 
     def original(self) -> Tensor:
         """The box of the unedited view, not clamped. [h,w,3]"""
-        return self._draw(self.gaussians).image
+        image = self._draw(self.gaussians).image
+        return image if self.cached is None else torch.where(self.cached[0], image, self.cached[1])
 
     def render(self, packed: Tensor, moving: Collection[str] = ATTRIBUTES) -> tuple[Tensor, Tensor]:
         """The box with these raw values in the region's rows, differentiable in them.

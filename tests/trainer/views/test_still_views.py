@@ -26,6 +26,18 @@ def test_a_still_view_without_gradients_is_the_picture_of_the_whole_box() -> Non
         )
 
 
+def test_a_still_view_has_the_original_where_no_member_shows_too() -> None:
+    case = small(count=2)
+    for view in case.views:
+        box = (0, 0, view.camera.width, view.camera.height)
+        still, whole = (
+            crop_scene(case.scene, case.region.members, view.camera, box, WHITE, still)
+            for still in (True, False)
+        )
+        assert still.cached is not None
+        assert float((still.original() - whole.original()).abs().max()) < 2e-6
+
+
 def test_what_moves_is_not_only_recolored() -> None:
     offsets = torch.zeros(4, 5, 14)
     offsets[2, 3, 12] = 0.1
