@@ -181,15 +181,19 @@ def make_training_setup(options: ViewOptions, scene: Gaussians, region: Region) 
     if options.cameras is None and is_surrounding(scene, up.direction):
         raise ProgdfError(f"the scene {INSIDE}")
 
-    def cameras_of(image_size: int, views: int) -> list[Camera]:
+    def cameras_of(image_size: int, count: int) -> list[Camera]:
         if options.cameras is not None:
             fitted = [fit_size(camera, image_size) for camera in given]
-        else:  # half as many again, as some will find the region hidden
-            fitted = region_rig(scene, region, views + views // 2, image_size, up.direction)
+        else:
+            fitted = region_rig(scene, region, count, image_size, up.direction)
         return with_near_plane(name_cameras(fitted), scene)
 
     cameras, views, unresolved = choose_resolution(options, scene, region, cameras_of)
     choice = choose_views(scene, region, cameras, views, background)
+    if options.cameras is None and len(choice.views) < views:  # hidden from some: a larger rig
+        count = min(-(-views * views // len(choice.views)), views + views // 2)
+        cameras = cameras_of(max(cameras[0].width, cameras[0].height), count)
+        choice = choose_views(scene, region, cameras, views, background)
     aside = len(choice.views) // 5
     train, held_out = split_views(choice, max(1, aside if options.views else min(aside, VIEWS // 5)))
     notes = [f"up is {up.name}, {up.reason}"]

@@ -179,7 +179,7 @@ class Edit:
             plan.steps,
         ):
             made.append(snapshot)
-        spent = time.process_time() - began - waited
+        spent = time.process_time() - began - waited - self.seconds  # it prepared the views for itself
         strengths, made = plan.course.sort_recordings(made)
         steps = ", ".join(f"{snapshot.means.get(TAKEN, 0):.0f}" for snapshot in made)
         at = ", ".join(f"{s:g}" for s in strengths)

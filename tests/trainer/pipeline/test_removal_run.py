@@ -38,7 +38,7 @@ from trainer.run.removal import on_backgrounds, with_crumbs
 from trainer.run.resume import picture_digests
 from trainer.run.run import train
 from trainer.setup import TrainingSetup, make_training_setup
-from trainer.views.view import render_view
+from trainer.views.view import View, render_view
 
 WHITE = torch.ones(3)
 TABLE = "box:-9,-0.005,-9,9,9,9"
@@ -195,15 +195,16 @@ def test_without_a_fill_the_rows_are_gone_and_nothing_is_added(scene_file: Path,
         assert all(float((a - b).abs().max()) < 1e-5 for a, b in pairs)  # an ulp, see test_tidy.py
 
 
-def paint(path: Path, image: Tensor, setup: TrainingSetup) -> Path:
-    to_picture(image).save(path, pnginfo=camera_chunk(setup.train[0].camera))
+def paint(path: Path, image: Tensor, view: View) -> Path:
+    to_picture(image).save(path, pnginfo=camera_chunk(view.camera))
     return path
 
 
 @pytest.mark.parametrize("removal", ["auto", "never"])
 def test_a_picture_of_what_is_behind_is_a_removal(scene_file: Path, tmp_path: Path, removal: str) -> None:
     _, rest, setup = case()
-    picture = paint(tmp_path / "A.png", render_view(rest, setup.train[0].camera, WHITE).clamp(0, 1), setup)
+    view = setup.train[0]
+    picture = paint(tmp_path / "A.png", render_view(rest, view.camera, WHITE).clamp(0, 1), view)
     out = tmp_path / "run"
     options = options_of(scene_file, out, f"pictures:{picture}", removal=removal, steps=40, stages=1)
     result = train(options, quiet=True)
@@ -215,7 +216,7 @@ def test_a_picture_of_what_is_behind_is_a_removal(scene_file: Path, tmp_path: Pa
 def test_a_picture_in_another_color_is_no_removal(scene_file: Path, tmp_path: Path) -> None:
     view = case()[2].train[0]
     blue = view.blend(torch.tensor([0.2, 0.3, 0.9]).expand_as(view.image))
-    picture = paint(tmp_path / "A.png", blue, case()[2])
+    picture = paint(tmp_path / "A.png", blue, view)
     result = train(
         options_of(scene_file, tmp_path / "run", f"pictures:{picture}", steps=40, stages=1), quiet=True
     )
@@ -224,11 +225,11 @@ def test_a_picture_in_another_color_is_no_removal(scene_file: Path, tmp_path: Pa
 
 def test_a_painted_picture_gives_the_hole_its_colors(scene_file: Path, tmp_path: Path) -> None:
     _, rest, setup = case()
-    view = setup.train[0]
+    view = max(setup.train, key=lambda view: int(find_hole(rest, view, []).mask.sum()))
     hole = find_hole(rest, view, []).mask
     green = torch.tensor([0.1, 0.8, 0.2])
     drawn = render_view(rest, view.camera, WHITE).clamp(0, 1)
-    picture = paint(tmp_path / "A.png", torch.where(hole[..., None], green, drawn), setup)
+    picture = paint(tmp_path / "A.png", torch.where(hole[..., None], green, drawn), view)
     result = train(options_of(scene_file, tmp_path / "run", f"remove:{picture}"), quiet=True)
     scene = load_ply(scene_file)
     made = compose_layers(scene, [Layer(load_gdf(result.gdf, scene), 1.0)])
@@ -259,11 +260,11 @@ def test_what_would_float_alone_without_the_region_goes_with_it(scene_file: Path
 def test_a_removal_with_another_picture_is_not_the_same_run(scene_file: Path, tmp_path: Path) -> None:
     setup = case()[2]
     picture = paint(
-        tmp_path / "A.png", render_view(case()[1], setup.train[0].camera, WHITE).clamp(0, 1), setup
+        tmp_path / "A.png", render_view(case()[1], setup.train[0].camera, WHITE).clamp(0, 1), setup.train[0]
     )
     options = options_of(scene_file, tmp_path / "run", f"remove:{picture}")
     before = picture_digests(options)
-    paint(picture, render_view(case()[0], setup.train[0].camera, WHITE).clamp(0, 1), setup)
+    paint(picture, render_view(case()[0], setup.train[0].camera, WHITE).clamp(0, 1), setup.train[0])
     assert list(before) == [str(picture.resolve())]
     assert picture_digests(options) != before
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -274,3 +275,23 @@ def test_members_are_sampled_all_over_the_region() -> None:
     assert int(rows[0]) - 1000 <= 4
     assert 1999 - int(rows[-1]) <= 4
     assert int(rows.diff().max()) <= 5
+
+
+def test_a_rig_is_as_large_as_the_views_that_are_asked_for_and_larger_where_some_see_nothing() -> None:
+    """Every camera of an even rig: the best of a larger one crowd where the region shows most."""
+    case = small("head")
+    settings = ViewOptions(views=8, image_size=48)
+    setup = make_training_setup(settings, case.scene, case.region)
+    assert {view.camera.name for view in setup.views} == {f"orbit_{i:03d}" for i in range(8)}
+    wall = [
+        one_gaussian((0.0, 0.2, -0.5 - 0.1 * i), (0.6, 0.6, 0.01), (1, 0, 0, 0), opacity=0.999)
+        for i in range(6)
+    ]
+    member = one_gaussian(mean=(0.0, 0.0, 0.0), scales=(0.1, 0.1, 0.1))
+    scene = concatenate(member, *wall)
+    region = from_mask("hidden", torch.arange(len(scene)) == 0)
+    hidden = make_training_setup(replace(settings, up="+y"), scene, region)
+    assert 4 < len(hidden.views) <= 8
+    offered = re.fullmatch(r"\d of (\d+) cameras; \d+ do not see the region.*", hidden.notes[-1])
+    assert offered is not None, hidden.notes
+    assert int(offered[1]) > 8, "a larger rig"
