@@ -22,7 +22,7 @@ from progdf.rasterize.engines import engine_device
 from progdf.region import Region
 from progdf.scene.bounds import is_surrounding
 from progdf.scene.up_axis import UpAxis, find_up, up_from_json
-from progdf.threads import threads
+from progdf.threads import map_threads, threads
 
 from .editors.base import ImageEditor
 from .editors.pictures import picture_cameras
@@ -30,7 +30,7 @@ from .editors.procedural import ColorEditor
 from .options import MOST_VIEWS, VIEWS, Kind, ViewOptions
 from .store.progress import Advance
 from .store.run_folder import LazySequence, RunFolder, add_pictures, from_bytes, stored_pictures, to_bytes
-from .views.choose import choose_views, split_views
+from .views.choose import ViewChoice, choose_views, split_views
 from .views.crops import CropScene, crop_scene
 from .views.view import (
     BACKGROUND,
@@ -189,13 +189,15 @@ def make_training_setup(options: ViewOptions, scene: Gaussians, region: Region) 
         return with_near_plane(name_cameras(fitted), scene)
 
     cameras, views, unresolved = choose_resolution(options, scene, region, cameras_of)
-    choice = choose_views(scene, region, cameras, views, background)
-    if options.cameras is None and len(choice.views) < views:  # hidden from some: a larger rig
-        count = min(-(-views * views // len(choice.views)), views + views // 2)
-        cameras = cameras_of(max(cameras[0].width, cameras[0].height), count)
+    aside = max(1, views // 5 if options.views else min(views // 5, VIEWS // 5))
+    if options.cameras is None:
+        size = max(cameras[0].width, cameras[0].height)
+        choice, train, held_out = _rig_views(
+            scene, region, lambda count: cameras_of(size, count), views - aside, aside, background
+        )
+    else:
         choice = choose_views(scene, region, cameras, views, background)
-    aside = len(choice.views) // 5
-    train, held_out = split_views(choice, max(1, aside if options.views else min(aside, VIEWS // 5)))
+        train, held_out = split_views(choice, min(aside, max(1, len(choice.views) // 5)))
     notes = [f"up is {up.name}, {up.reason}"]
     notes += [unresolved] if unresolved else []
     notes += [choice.line()] if len(choice.views) < choice.offered else []
@@ -205,6 +207,36 @@ def make_training_setup(options: ViewOptions, scene: Gaussians, region: Region) 
             "edited copies of photographs go in with --editor photographs:EDITED,ORIGINALS"
         )
     return TrainingSetup(scene, region, train, held_out, background, notes, up)
+
+
+def _rig_views(
+    scene: Gaussians,
+    region: Region,
+    rig: Callable[[int], Sequence[Camera]],
+    count: int,
+    aside: int,
+    background: Tensor,
+) -> tuple[ViewChoice, list[View], list[View]]:
+    """Views of a rig to train with, which leaves no gap, and others half way from one of these to the next.
+
+    Args:
+        scene, region: what they look at
+        rig: number -> so many cameras
+        count, aside: how many of each; of a rig up to half as large again where some see nothing
+        background: rgb. [3]
+    """
+    cameras = rig(count)
+    choice = choose_views(scene, region, cameras, count, background)
+    if len(choice.views) < count:
+        cameras = rig(min(-(-count * count // len(choice.views)), count + count // 2))
+        choice = choose_views(scene, region, cameras, count, background)
+    train, places = list(choice.views), {camera.name: i for i, camera in enumerate(cameras)}
+    between = rig(2 * len(cameras))[1::2]
+    following = (places[train[k * len(train) // aside].camera.name] for k in range(aside))
+    others = [replace(between[i], name=f"between_{i:03d}") for i in sorted({*following})]
+    views = map_threads(lambda camera: make_view(scene, region, camera, background), others)
+    held_out = [view for view in views if bool((view.mask > 0.0).any())]
+    return choice, *((train, held_out) if held_out else split_views(choice, aside))
 
 
 def _up_of_pictures(paths: Sequence[Path]) -> UpAxis | None:

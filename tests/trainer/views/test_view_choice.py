@@ -278,11 +278,16 @@ def test_members_are_sampled_all_over_the_region() -> None:
 
 
 def test_a_rig_is_as_large_as_the_views_that_are_asked_for_and_larger_where_some_see_nothing() -> None:
-    """Every camera of an even rig: the best of a larger one crowd where the region shows most."""
+    """Every camera of an even rig: the best of a larger one crowd where the region shows most, and one that
+    is taken out of it leaves a gap."""
     case = small("head")
-    settings = ViewOptions(views=8, image_size=48)
+    settings = ViewOptions(views=10, image_size=48)
     setup = make_training_setup(settings, case.scene, case.region)
-    assert {view.camera.name for view in setup.views} == {f"orbit_{i:03d}" for i in range(8)}
+    assert [view.camera.name for view in setup.train] == [f"orbit_{i:03d}" for i in range(8)]
+    assert [view.camera.name for view in setup.held_out] == ["between_000", "between_004"]
+    azimuths = azimuths_of(case, [view.camera for view in setup.views])
+    steps = [b - a for a, b in zip(azimuths, [*azimuths[1:], azimuths[0] + 360], strict=True)]
+    assert sorted(steps) == pytest.approx([22.5] * 4 + [45.0] * 6, abs=2.0)
     wall = [
         one_gaussian((0.0, 0.2, -0.5 - 0.1 * i), (0.6, 0.6, 0.01), (1, 0, 0, 0), opacity=0.999)
         for i in range(6)
@@ -291,7 +296,8 @@ def test_a_rig_is_as_large_as_the_views_that_are_asked_for_and_larger_where_some
     scene = concatenate(member, *wall)
     region = from_mask("hidden", torch.arange(len(scene)) == 0)
     hidden = make_training_setup(replace(settings, up="+y"), scene, region)
-    assert 4 < len(hidden.views) <= 8
+    assert 4 < len(hidden.train) <= 8
+    assert 1 <= len(hidden.held_out) <= 2
     offered = re.fullmatch(r"\d of (\d+) cameras; \d+ do not see the region.*", hidden.notes[-1])
     assert offered is not None, hidden.notes
     assert int(offered[1]) > 8, "a larger rig"
