@@ -160,7 +160,7 @@ def region_rig(
     cameras = []
     for i, camera in enumerate(orbit_rig(scene, count, image_size, image_size, up=up)):
         distance = float((camera.position - center).norm())
-        share = 0.8 - 0.3 * (i / _PLASTIC % 1.0)
+        share = 0.8 - 0.3 * ((0.5 + i / _PLASTIC) % 1.0)
         fov = 2 * math.asin(min(0.7, radius / (share * max(distance, radius))))
         aimed = look_at(camera.position, center, up)
         cameras.append(replace(camera, viewmat=aimed, K=intrinsics(fov, image_size, image_size)))

@@ -26,7 +26,10 @@ def setup() -> TrainingSetup:
 
 
 def body() -> Small:
-    return small("body", count=12, image_size=96)
+    """Its last three views stand between the others."""
+    case = small("body", count=12, image_size=96)
+    others = [view for i, view in enumerate(case.views) if i % 4 != 1]
+    return replace(case, views=(*others, *case.views[1::4]))
 
 
 def judged(pictures: list[Tensor]) -> Agreement:
@@ -68,7 +71,7 @@ def test_edits_that_are_the_same_from_everywhere_agree(spec: str) -> None:
 def test_stripes_painted_differently_in_every_view_disagree(period: float) -> None:
     found = judged(stripes_of_its_own(period, seed=1))
     assert not found.agree
-    assert found.unexplained > 0.45
+    assert found.unexplained > 0.4
 
 
 def test_another_hue_in_every_view_disagrees() -> None:
