@@ -459,21 +459,6 @@ def enrich(model: Model, solver: Solver, stage: TargetStage, judge: Judge, steps
     return replace(model, residual=residual, error=error, tried=[*model.tried, decided], richer=None)
 
 
-def gain_of_views(seen: float, unseen: float) -> float | None:
-    """By how many dB twice as many views would make an edit better in others; None: by less than a twentieth.
-
-    Least squares of p numbers over n observations leave 1 − p/n of the noise where they look and 1 + p/n
-    elsewhere: twice n takes a quarter of the difference away.
-
-    Args:
-        seen: mean square in the views that are solved for
-        unseen: the same in others
-    """
-    seen, unseen = max(seen, LEVEL), max(unseen, LEVEL)
-    left = 1.0 - 0.25 * (unseen - seen) / unseen
-    return decibels(left) if left < MORE_PAYS else None
-
-
 def _solve_whole(
     solver: Solver, best: _Attempt, targets: Sequence[Tensor], steps: int, spreads: bool
 ) -> tuple[Solver, Tensor]:

@@ -19,7 +19,6 @@ from progdf.field.trajectory import Trajectory
 from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians, pack
 from progdf.io.json_values import convert_json
 from progdf.io.tensors import check_tensor
-from progdf.metrics.image import decibels
 from progdf.rasterize.engines import engine_device
 from progdf.scene.bounds import scene_sphere
 from trainer.fit.network import JointTraining, begin_joint_training, save_network
@@ -29,7 +28,6 @@ from trainer.optimize.color_solver import (
     Solver,
     choose_model,
     enrich,
-    gain_of_views,
     iterations,
     make_solver,
     split_solver,
@@ -309,13 +307,6 @@ def plan_colors(
     if ties is not None:
         unseen = len(original) - int(solver.asked.sum())
         log.say(f"{unseen} members that no picture shows follow the map and their own surface")
-    elif held_out:
-        seen = Judge(drawn, targets).error(solver.offsets(model, targets))
-        if (better := gain_of_views(seen, model.error)) is not None:
-            log.say(
-                f"in the views that are solved for the edit is at {decibels(seen):.1f} dB: twice as many "
-                f"(--views) would make it {better:.1f} dB better in others"
-            )
     return ColorPlan(original, solver, model, course, most)
 
 

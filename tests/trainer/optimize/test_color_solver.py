@@ -7,14 +7,12 @@ import threading
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from progdf.camera import Camera, intrinsics, look_at
 from progdf.gaussians import Gaussians, pack
-from progdf.metrics.image import decibels
 from progdf.rasterize import activate, render, set_threads
 from progdf.rasterize.engines import color_map
 from progdf.region import Region
@@ -28,7 +26,6 @@ from trainer.optimize.color_solver import (
     add_bands,
     choose_model,
     enrich,
-    gain_of_views,
     make_solver,
 )
 from trainer.optimize.color_views import Judge, color_views
@@ -339,24 +336,6 @@ def test_steps_end_where_other_views_gain_little_and_go_on_where_members_are_den
     further, all_steps = solver.residual(mapped, start, targets, most)
     assert all_steps == most or members == 200
     assert judge.error(add_bands(mapped, found)) <= 1.02 * judge.error(add_bands(mapped, further))
-
-
-def test_more_views_are_named_where_they_would_pay() -> None:
-    rng = np.random.default_rng(0)
-
-    def errors(observed: int, numbers: int = 20) -> tuple[float, float]:
-        """Mean squares of many fits to noise, where they look and elsewhere."""
-        designs = rng.standard_normal((400, 2, observed, numbers))
-        noise = rng.standard_normal((400, 2, observed))
-        fits = np.stack([np.linalg.lstsq(d[0], y[0])[0] for d, y in zip(designs, noise, strict=True)])
-        left = noise - np.einsum("rsop,rp->rso", designs, fits)
-        return float(np.square(left[:, 0]).mean()), float(np.square(left[:, 1]).mean())
-
-    once, twice = errors(100), errors(200)
-    gain = gain_of_views(*once)
-    assert gain == pytest.approx(decibels(twice[1] / once[1]), abs=0.2)
-    assert gain_of_views(*errors(1000)) is None
-    assert gain_of_views(1e-6, 1e-5) is None  # no screen shows either
 
 
 def test_a_member_that_no_view_shows_follows_the_map() -> None:
