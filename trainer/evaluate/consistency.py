@@ -1,4 +1,4 @@
-"""Consistency between held-out views, and what changed beside the region, of a finished edit."""
+"""Consistency of held-out views with others, and what changed beside the region, of a finished edit."""
 
 from __future__ import annotations
 
@@ -20,9 +20,10 @@ from progdf.rasterize.engines import Depth, render_depth
 from trainer.fit.evaluate import Evaluator
 from trainer.optimize.losses import Perceptual
 from trainer.report.clip import CLIP_MODEL, load_clip
-from trainer.views.view import crop, make_view, render_view
+from trainer.store.run_folder import read_views
+from trainer.views.view import View, crop, make_view, render_view
 
-from .opened import OpenedRun, judging_pictures
+from .opened import OpenedRun
 
 EDITED, EDITOR, UNEDITED = "slider", "the editor", "unedited"
 """Whose pictures are warped: the finished edit's, the editor's own, the original's, which is the floor."""
@@ -33,7 +34,7 @@ _SHOWS = 0.05  # a pixel shows the region where the members' weight is above thi
 
 @dataclass(frozen=True)
 class WarpedPair:
-    """One held-out view warped onto another."""
+    """A view warped onto a held-out one."""
 
     # source, target: the views' names
     source: str
@@ -52,21 +53,23 @@ class Consistency:
     # lpips, psnr: whose -> mean over the pairs, LPIPS in the targets' boxes, PSNR over what both see, dB
     lpips: dict[str, float]
     psnr: dict[str, float]
-    # what was compared; none where no two held-out views see enough of the same
+    # what was compared; none where no other view sees enough of the same
     pairs: tuple[WarpedPair, ...]
 
 
 def view_consistency(opened: OpenedRun, perceptual: Perceptual) -> Consistency:
-    """Each held-out view beside the other one that sees most of the same, warped onto it.
+    """Each held-out view beside the view of the run that sees most of the same, warped onto it.
 
     Compared are the pixels that count (see `Evaluator`) and whose surface both views see, before the edit and
     after it; the others are taken from the target, so that they differ in nothing.
     """
-    scene, views, background = opened.run.scene, opened.setup.judging, opened.setup.background
+    scene, background, targets = opened.run.scene, opened.setup.background, opened.setup.judging
+    names = {view.camera.name for view in targets}
+    views = [*targets, *(view for view in opened.setup.train if view.camera.name not in names)]
     edited = edited_scene(opened.setup.scene, opened.gdf)
     pictures_by_side = {
         EDITED: [render_view(edited, view.camera, background).clamp(0, 1) for view in views],
-        EDITOR: judging_pictures(opened, "edited"),
+        EDITOR: read_views(opened.run.folder, "edited", [view.camera.name for view in views]),
         UNEDITED: [view.image for view in views],
     }
     seen = {
@@ -75,12 +78,12 @@ def view_consistency(opened: OpenedRun, perceptual: Perceptual) -> Consistency:
     }
     seen[EDITOR] = seen[EDITED]  # what it shows has no depth of its own
     pairs = []
-    for target in range(len(views)):
+    for target in range(len(targets)):
         best = None
         for source in range(len(views)):
             if source == target:
                 continue
-            pair = _warp(opened.evaluator, pictures_by_side, seen, source, target)
+            pair = _warp(views, opened.evaluator, pictures_by_side, seen, source, target)
             best = pair if best is None or pair.shared > best.shared else best
         if best is not None and best.shared >= _LEAST_SHARED:
             pairs.append(best)
@@ -116,6 +119,7 @@ def outside_change(opened: OpenedRun) -> dict[str, float]:
 
 
 def _warp(
+    views: Sequence[View],
     evaluator: Evaluator,
     whole: dict[str, Sequence[Tensor]],
     seen: dict[str, list[SeenDepth]],
@@ -132,10 +136,14 @@ def _warp(
         target_picture = crop(whole[whose][target], box)
         pictures[whose] = (target_picture, torch.where(both[..., None], crop(picture, box), target_picture))
     depth, alpha = (crop(plane, box) for plane in seen[EDITED][target].depth)
-    names = evaluator.names
     shared = float(both.sum()) / max(1, int(counted.sum()))
     return WarpedPair(
-        names[source], names[target], shared, pictures, both, torch.where(alpha > 0.5, depth, 0.0)
+        views[source].camera.name,
+        views[target].camera.name,
+        shared,
+        pictures,
+        both,
+        torch.where(alpha > 0.5, depth, 0.0),
     )
 
 
@@ -204,7 +212,9 @@ def warp_view(image: Tensor, source: SeenDepth, target: SeenDepth) -> tuple[Tens
 
 
 FRAMES = 5
-"""From one held-out view to the next on the path."""
+"""From one view to the next on the path."""
+
+_STOPS = 6  # of the run's views on the path, at most: straight from one side to the other it leads through
 
 
 def camera_path(cameras: Sequence[Camera]) -> list[Camera]:
@@ -230,9 +240,10 @@ def clip_consistency(opened: OpenedRun) -> tuple[float | None, str]:
         clip = load_clip(CLIP_MODEL)
     except ProgdfError as error:
         return None, str(error)
-    if len(opened.setup.judging) < 2:
+    views = opened.setup.views
+    if len(views) < 2:
         return None, "there is one view alone, which is no path"
-    path = camera_path([view.camera for view in opened.setup.judging])
+    path = camera_path([view.camera for view in views[:: -(-len(views) // _STOPS)]])
     before, after = (
         clip.pictures([render_view(scene, camera, opened.setup.background) for camera in path])
         for scene in (opened.run.scene, edited_scene(opened.setup.scene, opened.gdf))

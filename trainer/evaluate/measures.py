@@ -120,7 +120,7 @@ def _path_rows(paths: Mapping[str, SliderPath], lpips: str) -> list[Row]:
 
 
 def _consistency_rows(consistency: Consistency, lpips: str) -> list[Row]:
-    missing = "" if consistency.pairs else "no two held-out views see enough of the same"
+    missing = "" if consistency.pairs else "no other view sees enough of what a held-out one does"
     return [
         Row("warped_lpips", f"one view warped onto another, {lpips}", dict(consistency.lpips), 3, missing),
         Row("warped_psnr", "one view warped onto another, PSNR, dB", dict(consistency.psnr), 1, missing),

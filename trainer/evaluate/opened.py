@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -97,8 +97,3 @@ def _two_keyframes(gdf: Gdf, setup: TrainingSetup, report: Mapping[str, Any]) ->
     field = fit_keyframes(torch.tensor([0.0, 1.0]), torch.stack([torch.zeros_like(end), end]), 2)
     even = report.get("trajectory", {}).get("slider") == "even"
     return equalize_slider(field, setup)[0] if even else field
-
-
-def judging_pictures(opened: OpenedRun, kind: str) -> Sequence[Tensor]:
-    """The judging views' whole pictures of the run folder: "edited", "final". [H,W,3] each"""
-    return read_views(opened.run.folder, kind, [view.camera.name for view in opened.setup.judging])

@@ -41,10 +41,12 @@ from trainer.options import EditKind
 from trainer.report.agreement import ViewChange, fine_energy, fit_colors, robust_colors, view_change
 from trainer.setup import TrainingSetup
 from trainer.store.progress import Advance, RunLog
-from trainer.views.view import View, render_view
+from trainer.views.view import View, frame_sphere, make_view, region_sphere, render_view
 
 ANCHOR = "anchor"
 """Folder of the pictures that decide."""
+
+_FRONT = 0.8  # of a picture that the region fills where sides are compared
 
 SIDE = math.radians(60)
 """Angle around the region from which on a view shows another side, which gets an anchor of its own."""
@@ -291,15 +293,19 @@ def painting_order(setup: TrainingSetup, side: float = SIDE) -> tuple[list[View]
     eyes = torch.stack([view.camera.position for view in views])
     toward = torch.nn.functional.normalize((eyes - center).double(), dim=1)
     angles = (toward @ toward.T).clamp(-1.0, 1.0).acos()
-    anchors = [max(range(train), key=lambda i: _front(views[i]))]
+    anchors = [max(range(train), key=lambda i: _front(setup, views[i].camera))]
     while float((nearest := angles[:, anchors].amin(dim=1))[:train].max()) > side:
         anchors.append(int(nearest[:train].argmax()))
     others = sorted(set(range(len(views))) - set(anchors), key=lambda i: float(nearest[i]))
     return [views[i] for i in (*anchors, *others)], len(anchors)
 
 
-def _front(view: View) -> float:
-    """How much a view shows, of the region and of detail around it: faces have more than backs."""
+def _front(setup: TrainingSetup, camera: Camera) -> float:
+    """How much is to be seen from there, of the region and of detail around it, with all equally large: faces
+    have more than backs."""
+    sphere = region_sphere(setup.scene, setup.region)
+    framed = frame_sphere(camera, *sphere, _FRONT, -camera.viewmat[1, :3])
+    view = make_view(setup.scene, setup.region, framed, setup.background)
     image = view.image
     slope = (image[1:] - image[:-1]).abs().sum() + (image[:, 1:] - image[:, :-1]).abs().sum()
     return float(slope * view.mask.sum().sqrt())

@@ -155,16 +155,27 @@ def region_rig(
         up: world direction that is up, [3]; None guesses it
     """
     up = guess_up(scene) if up is None else up
+    center, radius = region_sphere(scene, region)
+    rig = orbit_rig(scene, count, image_size, image_size, up=up)
+    shares = (0.8 - 0.3 * ((0.5 + i / _PLASTIC) % 1.0) for i in range(count))
+    return [frame_sphere(camera, center, radius, next(shares), up) for camera in rig]
+
+
+def region_sphere(scene: Gaussians, region: Region) -> tuple[Tensor, float]:
+    """Center [3] and radius of what a region shows."""
     center, radius = scene_sphere(scene[region.members])
-    radius += float(scene.scales[region.members].amax(dim=1).median())
-    cameras = []
-    for i, camera in enumerate(orbit_rig(scene, count, image_size, image_size, up=up)):
-        distance = float((camera.position - center).norm())
-        share = 0.8 - 0.3 * ((0.5 + i / _PLASTIC) % 1.0)
-        fov = 2 * math.asin(min(0.7, radius / (share * max(distance, radius))))
-        aimed = look_at(camera.position, center, up)
-        cameras.append(replace(camera, viewmat=aimed, K=intrinsics(fov, image_size, image_size)))
-    return cameras
+    return center, radius + float(scene.scales[region.members].amax(dim=1).median())
+
+
+def frame_sphere(camera: Camera, center: Tensor, radius: float, share: float, up: Tensor) -> Camera:
+    """A camera with a square picture, from the same place, that a sphere fills to some share, 0..1.
+
+    `up`: world direction, [3]
+    """
+    distance = float((camera.position - center).norm())
+    fov = 2 * math.asin(min(0.7, radius / (share * max(distance, radius))))
+    aimed, side = look_at(camera.position, center, up), min(camera.width, camera.height)
+    return replace(camera, viewmat=aimed, K=intrinsics(fov, side, side), width=side, height=side)
 
 
 def with_near_plane(cameras: Sequence[Camera], scene: Gaussians) -> list[Camera]:

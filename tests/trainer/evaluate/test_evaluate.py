@@ -21,7 +21,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run of a small bear."""
     folder = tmp_path_factory.mktemp("evaluate")
     write_bear(folder)
-    train(quick_options(folder, steps=40, stages=2, views=30, image_size=56, threads=1), quiet=True)
+    train(quick_options(folder, steps=40, stages=2, views=12, image_size=56, threads=1), quiet=True)
     return folder / "run"
 
 

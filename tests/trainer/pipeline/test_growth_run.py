@@ -98,9 +98,9 @@ def hat(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_hat_is_grown_and_nothing_else_changes_outside(hat: Path) -> None:
     plain, grown = (open_run(hat / name) for name in ("plain", "grown"))
     assert "taken: geometry with growth" in (hat / "grown" / "log.txt").read_text(encoding="utf-8")
-    # a hat that members are stretched over has 20.9 dB, a grown one 23.4; of a fifth of these pixels and
-    # steps 31
-    assert grown.report["edit"]["psnr_to_views"] > plain.report["edit"]["psnr_to_views"] + 2
+    # a hat that members are stretched over has 19.6 to 19.8 dB, a grown one 23.7, on two kinds of processor;
+    # of a fifth of these pixels and steps 31
+    assert grown.report["edit"]["psnr_to_views"] > plain.report["edit"]["psnr_to_views"] + 3
     scene = load_ply(hat / "scene.ply")
     gdf, other = (load_gdf(hat / name / f"{name}.gdf", scene) for name in ("grown", "plain"))
     assert gdf.added is not None

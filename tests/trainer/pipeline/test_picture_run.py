@@ -155,7 +155,7 @@ def test_the_way_is_neither_gray_nor_raw(done: RunResult) -> None:
 def test_such_a_run_can_be_evaluated(done: RunResult, capsys: pytest.CaptureFixture[str]) -> None:
     evaluate(EvaluateOptions(done.folder.root))
     said = capsys.readouterr().out
-    assert "no two held-out views see enough of the same" in said
+    assert "no other view sees enough of what a held-out one does" in said
     assert "to the run's own pictures, trained on, at 1, PSNR" in said
 
 

@@ -28,8 +28,8 @@ def setup() -> TrainingSetup:
 def body() -> Small:
     """Its last three views stand between the others."""
     case = small("body", count=12, image_size=96)
-    others = [view for i, view in enumerate(case.views) if i % 4 != 1]
-    return replace(case, views=(*others, *case.views[1::4]))
+    others = [view for i, view in enumerate(case.views) if i % 4]
+    return replace(case, views=(*others, *case.views[::4]))
 
 
 def judged(pictures: list[Tensor]) -> Agreement:
@@ -71,7 +71,7 @@ def test_edits_that_are_the_same_from_everywhere_agree(spec: str) -> None:
 def test_stripes_painted_differently_in_every_view_disagree(period: float) -> None:
     found = judged(stripes_of_its_own(period, seed=1))
     assert not found.agree
-    assert found.unexplained > 0.4
+    assert found.unexplained > 0.45
 
 
 def test_another_hue_in_every_view_disagrees() -> None:
