@@ -48,7 +48,8 @@ def draw_plot(plot: Plot, width: int, height: int) -> Image.Image:
     axes.tick_params(which="both", length=0, labelsize=8.5, labelcolor=pale)
     axes.spines[:].set_visible(False)
     lines = {name: _drawable(points, plot.scale) for name, points in plot.lines.items()}
-    lines = {name: points for name, points in lines.items() if points[0]}
+    least = max((y for _, ys in lines.values() for y in ys), default=0.0) * 10.0**-_DECADES
+    lines = {n: p for n, p in lines.items() if p[0] and (plot.scale == "linear" or max(p[1]) > least)}
     if not lines:
         axes.set(xticks=[], yticks=[])
         axes.text(0.5, 0.5, "nothing to show", color=pale, ha="center", transform=axes.transAxes)
@@ -62,9 +63,8 @@ def draw_plot(plot: Plot, width: int, height: int) -> Image.Image:
     axes.set_axisbelow(True)
     axes.grid(color=grid)
     if plot.scale == "log":
-        highest = max(max(ys) for _, ys in lines.values())
         axes.set_yscale("log")
-        axes.set_ylim(bottom=max(axes.get_ylim()[0], highest * 10.0**-_DECADES))
+        axes.set_ylim(bottom=max(axes.get_ylim()[0], least))
     # the axes show at least this: points that nobody sees stretch them
     axes.update_datalim([(x, 0.0) for x in plot.span or ()], updatey=False)
     axes.update_datalim([] if plot.low is None else [(0.0, plot.low)], updatex=False)

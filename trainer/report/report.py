@@ -160,7 +160,7 @@ def _training(losses: Losses, perceptual: str) -> Plot:
         paid = [(step, value) for step, value in rows if step is not None and value is not None]
         if term != "step":
             lines[names.get(term, term)] = ([step for step, _ in paid], [value for _, value in paid])
-    return Plot("loss terms as weighted", lines, "optimizer steps", "log")
+    return Plot("loss terms as weighted", lines, "steps", "log")
 
 
 def _clip(direction: Direction) -> Plot:
