@@ -19,7 +19,7 @@ _DASHES = ("-", "--", ":")  # of lines beyond as many as there are colors
 _DPI = 100
 _LEFT, _RIGHT, _TOP, _BOTTOM, _LEGEND = 56, 16, 30, 44, 20  # pixels around the axes; a legend's line is below
 _MARKED = 20  # lines of at most so many points show them
-_DECADES = 4  # a logarithmic axis shows no more, the least values lie below its floor
+_DECADES = 4  # a logarithmic axis shows no more of any line, the least values lie below its floor
 
 Points = tuple[Sequence[float], Sequence[float]]
 """xs and ys; what is not finite is left out."""
@@ -48,8 +48,7 @@ def draw_plot(plot: Plot, width: int, height: int) -> Image.Image:
     axes.tick_params(which="both", length=0, labelsize=8.5, labelcolor=pale)
     axes.spines[:].set_visible(False)
     lines = {name: _drawable(points, plot.scale) for name, points in plot.lines.items()}
-    least = max((y for _, ys in lines.values() for y in ys), default=0.0) * 10.0**-_DECADES
-    lines = {n: p for n, p in lines.items() if p[0] and (plot.scale == "linear" or max(p[1]) > least)}
+    lines = {name: points for name, points in lines.items() if points[0]}
     if not lines:
         axes.set(xticks=[], yticks=[])
         axes.text(0.5, 0.5, "nothing to show", color=pale, ha="center", transform=axes.transAxes)
@@ -63,8 +62,9 @@ def draw_plot(plot: Plot, width: int, height: int) -> Image.Image:
     axes.set_axisbelow(True)
     axes.grid(color=grid)
     if plot.scale == "log":
+        lowest = min(max(ys) for _, ys in lines.values())
         axes.set_yscale("log")
-        axes.set_ylim(bottom=max(axes.get_ylim()[0], least))
+        axes.set_ylim(bottom=max(axes.get_ylim()[0], lowest * 10.0**-_DECADES))
     # the axes show at least this: points that nobody sees stretch them
     axes.update_datalim([(x, 0.0) for x in plot.span or ()], updatey=False)
     axes.update_datalim([] if plot.low is None else [(0.0, plot.low)], updatex=False)

@@ -134,11 +134,9 @@ def test_gaps_zeros_and_empty_lines_do_not_break_a_plot() -> None:
     assert _color_count(empty, LINES[0]) == 0
 
 
-def test_a_line_below_a_logarithmic_axis_is_not_in_the_legend() -> None:
+def test_a_line_far_below_another_is_drawn_on_a_logarithmic_axis() -> None:
     lines = {"high": ([0.0, 1.0], [1.0, 0.5]), "low": ([0.0, 1.0], [1e-6, 3e-6])}
-    assert _color_count(draw_plot(Plot("t", lines, scale="log"), 400, 270), LINES[1]) == 0
-    seen = {**lines, "low": ([0.0, 1.0], [1e-6, 1e-2])}
-    assert _color_count(draw_plot(Plot("t", seen, scale="log"), 400, 270), LINES[1]) > 0
+    assert _color_count(draw_plot(Plot("t", lines, scale="log"), 400, 270), LINES[1]) > 150
 
 
 def test_a_legend_that_is_too_wide_goes_on_in_a_second_row() -> None:
