@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -150,6 +151,10 @@ class TrainingSetup:
             torch.cat([self.region.score, torch.ones(len(rows))]),
         )
         return replace(self, scene=concatenate([self.scene, added]), region=region)
+
+    def keep_solved(self, effort: Mapping[str, Any]) -> TrainingSetup:
+        """With those training views that an edit of colors was solved for: all, or every other one."""
+        return replace(self, train=self.train[:: -(-len(self.train) // effort.get("views", len(self.train)))])
 
     @property
     def judging(self) -> Sequence[View]:

@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
+from itertools import compress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -153,20 +154,21 @@ class Edit:
         waited = 0.0  # for pictures, which are counted by `measure`
         courses = {view.camera.name: edit_course(self.painter, view) for view in self.choosing}
 
-        def edit(strengths: Sequence[float]) -> Pictures:
+        def edit(strengths: Sequence[float], views: Sequence[View]) -> Pictures:
             nonlocal waited
-            began = time.process_time()
-            made = {s: self.picture(s) for s in strengths}
+            began, chosen = time.process_time(), {view.camera.name for view in views}
+            kept = [view.camera.name in chosen for view in self.setup.views]
+            made = {s: list(compress(self.picture(s), kept)) for s in strengths}
             waited += time.process_time() - began
             return made
 
         def look(s: float, views: Sequence[View]) -> list[Tensor]:
             return [quantize_image(courses[view.camera.name](s)) for view in views]
 
-        whole, waited, began = edit([1.0]), 0.0, time.process_time()
+        whole, waited, began = edit([1.0], self.setup.views), 0.0, time.process_time()
         between = Strengths(strength_ruler(self.painter, self.editor, self.setup.views), edit, look)
         with TemporaryDirectory() as folder, closing(RunLog(Path(folder) / "log.txt", quiet=True)) as log:
-            plan = plan_colors(OptimizeOptions(), self.setup, whole, between, False, log)
+            plan = plan_colors(OptimizeOptions(), self.setup, whole, between, ViewOptions(), log)
         made = list[ParameterSnapshot]()
         for snapshot in solve(
             self.original,
@@ -185,7 +187,10 @@ class Edit:
         at = ", ".join(f"{s:g}" for s in strengths)
         tables = [snapshot.table for snapshot in made if snapshot.table is not None]
         model, offsets = plan.model, [snapshot.offsets for snapshot in made]
-        name = f"automatic: {len(self.setup.views)} views, {len(strengths)} strengths, {model.bands} SH"
+        views = len(self.setup.held_out) + len(plan.solver.views)
+        spent -= (1.0 - views / len(self.setup.views)) * (len(made) - 1) * self.a_strength  # not asked for
+        views = len(self.setup.views) - len(self.setup.train) + len(plan.solver.views)
+        name = f"automatic: {views} views, {len(strengths)} strengths, {model.bands} SH"
         result = self.measure(name, judge, strengths, model.bands, tables, offsets, spent, model.mask)
         return model, strengths, f"{model.line}; strengths {at} in {steps} steps", result
 

@@ -268,6 +268,7 @@ def _run_training(
         )
         extra = {"members": region.members, "score": region.score}
         save_trajectory(folder.trajectory, trajectory, extra, plain(record))
+        setup = _keep_solved(setup, record.effort, folder)
         with log.stage("final"):
             grown = setup.extend(trajectory.added)
             finals = grown.scene.replace_rows(grown.region.members, end_rows(grown, trajectory))
@@ -279,8 +280,17 @@ def _run_training(
         log.say("the trajectory is recorded")
     del edited, train_edits, between  # what is needed of all this is read anew, as it is on disk
     trajectory, _, about = load_trajectory(folder.trajectory)
-    begun = folder.state.load(NETWORK)
-    return finish_run(folder, setup, trajectory, read_record(about), perceptual, log, begun)
+    record, begun = read_record(about), folder.state.load(NETWORK)
+    setup = _keep_solved(setup, record.effort, folder)
+    return finish_run(folder, setup, trajectory, record, perceptual, log, begun)
+
+
+def _keep_solved(setup: TrainingSetup, effort: Mapping[str, Any], folder: RunFolder) -> TrainingSetup:
+    """Without the training views that a run did not solve for, on disk too."""
+    setup = setup.keep_solved(effort)
+    save_cameras(folder.cameras, [view.camera for view in setup.views], setup.scene.origin)
+    remove_stale_views(folder, [view.camera.name for view in setup.views])
+    return setup
 
 
 def _paint(
@@ -407,9 +417,11 @@ def _edit_views(
     views, spec = setup.views, options.editor.editor
     names = [view.camera.name for view in views]
     made: dict[float, Sequence[Tensor]] = {}
+    on_the_way = names  # views that strengths other than 1 have pictures of
     approach, trial = Approach("color"), None
 
-    def edit(strengths: Sequence[float]) -> Pictures:
+    def edit(strengths: Sequence[float], views: Sequence[View] = views) -> Pictures:
+        nonlocal on_the_way
         new, is_confined = [s for s in strengths if s not in made], confines_edit(editor(), approach.kind)
         kept = sum(int((view.mask > 0.0).sum()) for view in views) <= _KEPT_PIXELS
         way = course if kept else partial(edit_course, editor())
@@ -419,7 +431,8 @@ def _edit_views(
                 within = [view.with_painted([editor().edit(view, 1.0)]) for view in views]
             made.update(edit_views(editor(), within, new, folder, is_confined, advance, way))
         log.say(f"{spec}: a {approach.kind} edit at strength {', '.join(f'{s:g}' for s in strengths)}")
-        saved = {"strengths": list(made), **asdict(approach)}
+        on_the_way = [view.camera.name for view in views]
+        saved = {"strengths": list(made), "on_the_way": on_the_way, **asdict(approach)}
         shared = painter.figures if isinstance(painter := editor(), AgreedEditor) else {}
         folder.state.save("edited", {}, saved | {"trial": trial, "shared": shared})
         return made
@@ -442,7 +455,10 @@ def _edit_views(
     done = folder.state.load("edited")
     if done is not None:
         try:
-            made.update({s: read_views(folder, "edited", names, s) for s in done.values["strengths"]})
+            on_the_way = done.values["between"]
+            every = {1.0: names}
+            for s in done.values["strengths"]:
+                made[s] = read_views(folder, "edited", every.get(s, on_the_way), s)
             approach = Approach(*(done.values[name] for name in ("kind", "group_steps", "grow")))
             trial = done.values["trial"]
             log.say("the edited views are on disk")
@@ -537,7 +553,7 @@ def _record(
         trajectory, losses, effort = optimize_members(
             options, optimization, setup, edited, perceptual, folder.state, log, between()
         )
-    setup = setup.extend(trajectory.added)
+    setup = setup.keep_solved(effort).extend(trajectory.added)
     with log.stage("retime"):
         trajectory = smooth_course(trajectory)
         costs: dict[str, float] = {}

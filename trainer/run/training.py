@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from itertools import pairwise
+from itertools import islice, pairwise
 from typing import Any
 
 import msgspec
@@ -19,6 +19,7 @@ from progdf.field.trajectory import Trajectory
 from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians, pack
 from progdf.io.json_values import convert_json
 from progdf.io.tensors import check_tensor
+from progdf.metrics.image import LEVEL
 from progdf.rasterize.engines import engine_device
 from progdf.scene.bounds import scene_sphere
 from trainer.fit.network import JointTraining, begin_joint_training, save_network
@@ -46,7 +47,7 @@ from trainer.optimize.pgs import (
 )
 from trainer.optimize.retime import drop_jitter, record, resolve_slider, retime
 from trainer.optimize.ties import surface_ties
-from trainer.options import MOST_STAGES, OptimizeOptions, TrainOptions
+from trainer.options import MOST_STAGES, OptimizeOptions, TrainOptions, ViewOptions
 from trainer.setup import Pictures, TrainingSetup, boxed_pictures, probe_views
 from trainer.store.progress import RunLog, release_memory
 from trainer.store.run_folder import LazySequence
@@ -134,7 +135,7 @@ class Strengths:
     """Strengths that are edited when it is known that they are called for."""
 
     ruler: Sequence[float]  # see `Course.ruler`
-    edit: Callable[[Sequence[float]], Pictures]  # all views, which stay on disk
+    edit: Callable[[Sequence[float], Sequence[View]], Pictures]  # some views, which stay on disk
     look: Callable[[float, Sequence[View]], Sequence[Tensor]]  # some views, as they would be
 
 
@@ -165,7 +166,7 @@ def optimize_members(
         KeyboardInterrupt: interrupted; the state is saved.
     """
     if optimization.solver == "colors":
-        plan = plan_colors(optimization, setup, edited, between, bool(options.views.pictures), log)
+        plan = plan_colors(optimization, setup, edited, between, options.views, log)
         return _solve(plan, folder, log)
     return _descend(options, optimization, setup, edited, perceptual, folder, log)
 
@@ -246,7 +247,7 @@ def plan_colors(
     setup: TrainingSetup,
     edited: Pictures,
     between: Strengths | None,
-    few: bool,
+    options: ViewOptions,
     log: RunLog,
 ) -> ColorPlan:
     """Solve for the finished edit, and decide by that how much is modelled and which strengths come next.
@@ -256,14 +257,16 @@ def plan_colors(
         setup: scene, region, views with boxes that hold the edit
         edited: strength → the edited views, whole
         between: what more strengths there may be; None: those of `edited`
-        few: whether the views are a handful of pictures, see `surface_ties`
+        options: whether the views are a handful of pictures, see `surface_ties`, or their number is open:
+            then every other one is solved for, and all only where that leaves something that shows
         log: of the run
     """
     scene, members, count = setup.scene, setup.region.members, len(setup.train)
-    original = pack(scene[members], with_shN=scene.sh_degree > 0)
+    original, few = pack(scene[members], with_shN=scene.sh_degree > 0), bool(options.pictures)
     every, most = 1 if few else _stride(setup), iterations(optimization.steps)
     held_out = split_held_out(setup.held_out)[0] if len(edited[1.0]) > count else []
     judging = held_out or setup.train
+    train = setup.train[:: 2 if held_out and between is not None and not options.views else 1]
 
     def draw(views: Sequence[View]) -> list[ColorView]:
         make = partial(crop_scene, scene, members, background=setup.background, still=True)
@@ -272,27 +275,36 @@ def plan_colors(
     def judge(pictures: Sequence[Tensor]) -> Judge:
         return Judge(aside, boxed_pictures(pictures, judging))
 
-    def target(s: float, pictures: Sequence[Tensor]) -> Target:
-        stage = TargetStage(s, boxed_pictures(pictures, setup.train), 1)
+    def target(s: float, pictures: Sequence[Tensor], count: int) -> Target:
+        each = count // len(train) if len(train) < count else 1
+        stage = TargetStage(s, boxed_pictures(pictures[:count:each], train), 1)
         return stage, judge(split_held_out(pictures[count:])[0] if held_out else pictures[:count])
 
     def ask(strengths: Sequence[float]) -> list[Target]:
-        made = between.edit(strengths) if between is not None else edited
-        return [target(s, made[s]) for s in strengths]
+        made = between.edit(strengths, [*train, *setup.held_out]) if between is not None else edited
+        return [target(s, made[s], len(train)) for s in strengths]
 
     def look(s: float) -> Judge:
         assert between is not None
         return judge(between.look(s, judging))
 
+    def choose(drawn: Sequence[ColorView], begun: Mapping[str, Tensor]) -> tuple[Target, Solver, Model]:
+        finished, solver = target(1.0, edited[1.0], count), make_solver(drawn, original, ties)
+        targets = finished[0].targets
+        trials = [(solver, finished[1])] if ties is None else split_solver(solver, original, targets)
+        bands = 1 if optimization.sh == "off" else 9
+        return finished, *choose_model(solver, trials, targets, most, bands, begun)
+
     with log.stage("weights"):
-        drawn = draw(setup.train)
+        drawn = draw(train)
         aside = draw(held_out) if held_out else drawn
         ties = surface_ties(scene, members, [view.camera for view in setup.train]) if few else None
     with log.stage("model"):
-        finished, solver = target(1.0, edited[1.0]), make_solver(drawn, original, ties)
-        targets = finished[0].targets
-        trials = [(solver, finished[1])] if ties is None else split_solver(solver, original, targets)
-        solver, model = choose_model(solver, trials, targets, most, 1 if optimization.sh == "off" else 9)
+        finished, solver, model = choose(drawn, {})
+        if len(train) < count and model.error > LEVEL:
+            others, train = iter(draw(setup.train[1::2])), setup.train
+            drawn = [view for one in drawn for view in (one, *islice(others, 1))]
+            finished, solver, model = choose(drawn, model.residuals)
     strengths = [s for s in edited if s < 1.0]
     if between is not None and model.richer is not None:  # which is decided there
         strengths = strengths or [between.ruler[len(between.ruler) // 2]]
@@ -303,6 +315,8 @@ def plan_colors(
         middle = len(course.targets) // 2 if between is None else 0
         model = enrich(model, solver, *[*course.targets, finished][middle], most)
     on = "views that are held out" if held_out else "all views, as none is held out"
+    if len(train) < count:
+        log.say(f"{len(train)} of {count} views are solved for: what they leave does not show")
     log.say(f"{model.line}, on {on if ties is None else 'squares of the pictures that are held out'}")
     if ties is not None:
         unseen = len(original) - int(solver.asked.sum())
