@@ -455,10 +455,9 @@ def _edit_views(
     done = folder.state.load("edited")
     if done is not None:
         try:
-            on_the_way = done.values["between"]
-            every = {1.0: names}
+            on_the_way = done.values["on_the_way"]
             for s in done.values["strengths"]:
-                made[s] = read_views(folder, "edited", every.get(s, on_the_way), s)
+                made[s] = read_views(folder, "edited", names if s == 1.0 else on_the_way, s)
             approach = Approach(*(done.values[name] for name in ("kind", "group_steps", "grow")))
             trial = done.values["trial"]
             log.say("the edited views are on disk")
