@@ -18,9 +18,8 @@ for.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from types import MappingProxyType
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -58,8 +57,7 @@ SETTLED = 0.001
 BANDS = (1, 4, 9)
 """SH functions of a residual that are tried, each where the one before it was better than less."""
 
-_RIDGE = 0.001  # of a typical member's weight: holds the residual of what hardly shows at 0
-_TURNS = (1, 3, 3, 3, 7, 7, 7, 7, 7)  # times that, by SH function: 1 + l (l + 1), with its mean squared slope
+_RIDGE = 0.002  # of a typical member's weight: holds the residual of what hardly shows at 0
 _TIES = 0.001  # of a typical member's weight: ties neighbors, where views are few
 _TRUSTED = 0.1  # of the same: a member of less is rather as its neighbors are
 _HOLDS = (1e-8, 1e-5, 1e-3)  # ridges tried there: a residual goes around all, some way, to its neighbors
@@ -81,7 +79,6 @@ class Model:
     tried: Sequence[tuple[str, float]]  # what was tried, and its error on views not solved for, dB
     # residual and error with another band, where that is better, but by less than a twentieth
     richer: tuple[Tensor, float] | None = None
-    residuals: Mapping[str, Tensor] = field(default_factory=dict)  # of each that was tried
 
     @property
     def bands(self) -> int:
@@ -251,9 +248,8 @@ class Solver:
         floor: float,
     ) -> tuple[Tensor, int]:
         """See `residual`; `look`: the judge's error."""
-        count, held = start.shape[1], torch.from_numpy(self.held.diagonal())[:, None]
-        held = held + max(ridge, 1e-30) * torch.tensor(_TURNS[:count])
-        curvature = self.weights[:, :count, :count] + torch.diag_embed(held)
+        count, held = start.shape[1], torch.from_numpy(self.held.diagonal()) + max(ridge, 1e-30)
+        curvature = self.weights[:, :count, :count] + held[:, None, None] * torch.eye(count)
         inverse = torch.linalg.inv(curvature.double()).float() * self.asked[:, None, None]
         now, pull = start, self._pull(mapped, start, targets, ridge)
         conditioned = along = inverse @ pull.descent
@@ -293,10 +289,9 @@ class Solver:
 
     def _hold(self, x: Tensor, ridge: float) -> Tensor:
         """The gradient of half of what a residual costs beside the pixels. [M,b,3] -> [M,b,3]"""
-        held = ridge * torch.tensor(_TURNS[: x.shape[1]])[:, None] * x
         if self.ties is None:
-            return held
-        return held + torch.from_numpy(self.held @ x.flatten(1).numpy()).view_as(x)
+            return ridge * x
+        return ridge * x + torch.from_numpy(self.held @ x.flatten(1).numpy()).view_as(x)
 
     def _pull(self, mapped: Tensor, residual: Tensor, targets: Sequence[Tensor], ridge: float) -> _Pull:
         """See `_Pull`."""
@@ -360,7 +355,6 @@ def choose_model(
     targets: Sequence[Tensor],
     steps: int,
     most_bands: int,
-    begun: Mapping[str, Tensor] = MappingProxyType({}),
 ) -> tuple[Solver, Model]:
     """The smallest model of which a larger one would take away less than a twentieth of the error that shows;
     and the solver with its mask.
@@ -374,7 +368,6 @@ def choose_model(
         targets: the finished edit in the solver's views
         steps: most steps of conjugate gradients for a residual
         most_bands: SH functions that a residual may have: 1, 4 or 9
-        begun: see `Model.residuals`, where the same was chosen from fewer views
     """
     tried: list[_Attempt] = []
     few, judges = solver.ties is not None, [judge for _, judge in trials]
@@ -383,7 +376,6 @@ def choose_model(
     def attempt(base: _Attempt, name: str, bands: int, hold: float) -> _Attempt:
         """With a residual that begins where that of `base` ended."""
         residuals = [pad(one[:, :bands], (0, 0, 0, max(0, bands - base.bands))) for one in base.residuals]
-        residuals = [begun[name]] if name in begun else residuals
         if bands:
             residuals = [
                 by.residual(made, one, targets, steps, judge, hold=hold)[0]
@@ -437,8 +429,26 @@ def choose_model(
     mask = (chosen.share * 255.0).round().to(torch.uint8) if best.masked else None
     decided = [(one.name, decibels(one.error)) for one in tried]
     richer = None if best.masked else richer
-    residuals = {one.name: one.residuals[0] for one in tried if one.bands}
-    return chosen, Model(best.degree, best.hold, residual, mask, best.error, decided, richer, residuals)
+    return chosen, Model(best.degree, best.hold, residual, mask, best.error, decided, richer)
+
+
+def solve_again(
+    model: Model, solver: Solver, targets: Sequence[Tensor], judge: Judge, steps: int
+) -> tuple[Solver, Model]:
+    """The model, solved for from other views: these, with its mask, and what comes of it.
+
+    Args:
+        model: what the finished edit called for
+        solver: the views
+        targets: the finished edit in these
+        judge: views not solved for
+        steps: most steps of conjugate gradients
+    """
+    solver = solver if model.mask is None else solver.with_mask(model.mask.float() / 255.0)
+    mapped, residual = solver.fit_map(model.degree, targets)[1], torch.zeros_like(model.residual)
+    if model.bands:
+        residual, _ = solver.residual(mapped, residual, targets, steps, judge, hold=model.hold)
+    return solver, replace(model, residual=residual, error=judge.error(add_bands(mapped, residual)))
 
 
 def enrich(model: Model, solver: Solver, stage: TargetStage, judge: Judge, steps: int) -> Model:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from itertools import islice, pairwise
+from itertools import pairwise
 from typing import Any
 
 import msgspec
@@ -31,6 +31,7 @@ from trainer.optimize.color_solver import (
     enrich,
     iterations,
     make_solver,
+    solve_again,
     split_solver,
 )
 from trainer.optimize.color_views import ColorView, Judge, color_views
@@ -258,15 +259,14 @@ def plan_colors(
         edited: strength → the edited views, whole
         between: what more strengths there may be; None: those of `edited`
         options: whether the views are a handful of pictures, see `surface_ties`, or their number is open:
-            then every other one is solved for, and all only where that leaves something that shows
+            then every other one is solved for where nothing that this leaves shows
         log: of the run
     """
     scene, members, count = setup.scene, setup.region.members, len(setup.train)
     original, few = pack(scene[members], with_shN=scene.sh_degree > 0), bool(options.pictures)
     every, most = 1 if few else _stride(setup), iterations(optimization.steps)
     held_out = split_held_out(setup.held_out)[0] if len(edited[1.0]) > count else []
-    judging = held_out or setup.train
-    train = setup.train[:: 2 if held_out and between is not None and not options.views else 1]
+    train, judging = setup.train, held_out or setup.train
 
     def draw(views: Sequence[View]) -> list[ColorView]:
         make = partial(crop_scene, scene, members, background=setup.background, still=True)
@@ -275,36 +275,32 @@ def plan_colors(
     def judge(pictures: Sequence[Tensor]) -> Judge:
         return Judge(aside, boxed_pictures(pictures, judging))
 
-    def target(s: float, pictures: Sequence[Tensor], count: int) -> Target:
-        each = count // len(train) if len(train) < count else 1
-        stage = TargetStage(s, boxed_pictures(pictures[:count:each], train), 1)
-        return stage, judge(split_held_out(pictures[count:])[0] if held_out else pictures[:count])
+    def target(s: float, pictures: Sequence[Tensor]) -> Target:
+        stage = TargetStage(s, boxed_pictures(pictures, train), 1)
+        return stage, judge(split_held_out(pictures[len(train) :])[0] if held_out else pictures)
 
     def ask(strengths: Sequence[float]) -> list[Target]:
         made = between.edit(strengths, [*train, *setup.held_out]) if between is not None else edited
-        return [target(s, made[s], len(train)) for s in strengths]
+        return [target(s, made[s]) for s in strengths]
 
     def look(s: float) -> Judge:
         assert between is not None
         return judge(between.look(s, judging))
 
-    def choose(drawn: Sequence[ColorView], begun: Mapping[str, Tensor]) -> tuple[Target, Solver, Model]:
-        finished, solver = target(1.0, edited[1.0], count), make_solver(drawn, original, ties)
-        targets = finished[0].targets
-        trials = [(solver, finished[1])] if ties is None else split_solver(solver, original, targets)
-        bands = 1 if optimization.sh == "off" else 9
-        return finished, *choose_model(solver, trials, targets, most, bands, begun)
-
     with log.stage("weights"):
         drawn = draw(train)
         aside = draw(held_out) if held_out else drawn
-        ties = surface_ties(scene, members, [view.camera for view in setup.train]) if few else None
+        ties = surface_ties(scene, members, [view.camera for view in train]) if few else None
     with log.stage("model"):
-        finished, solver, model = choose(drawn, {})
-        if len(train) < count and model.error > LEVEL:
-            others, train = iter(draw(setup.train[1::2])), setup.train
-            drawn = [view for one in drawn for view in (one, *islice(others, 1))]
-            finished, solver, model = choose(drawn, model.residuals)
+        finished, solver = target(1.0, edited[1.0]), make_solver(drawn, original, ties)
+        targets = finished[0].targets
+        trials = [(solver, finished[1])] if ties is None else split_solver(solver, original, targets)
+        solver, model = choose_model(solver, trials, targets, most, 1 if optimization.sh == "off" else 9)
+        if model.error <= LEVEL and held_out and between is not None and not options.views:
+            half = replace(finished[0], targets=targets[::2]), finished[1]
+            fewer = solve_again(model, make_solver(drawn[::2], original), targets[::2], half[1], most)
+            if fewer[1].error <= LEVEL:
+                (solver, model), finished, train = fewer, half, train[::2]
     strengths = [s for s in edited if s < 1.0]
     if between is not None and model.richer is not None:  # which is decided there
         strengths = strengths or [between.ruler[len(between.ruler) // 2]]
@@ -316,7 +312,7 @@ def plan_colors(
         model = enrich(model, solver, *[*course.targets, finished][middle], most)
     on = "views that are held out" if held_out else "all views, as none is held out"
     if len(train) < count:
-        log.say(f"{len(train)} of {count} views are solved for: what they leave does not show")
+        log.say(f"{len(train)} of {count} views are solved for: all would change nothing that shows")
     log.say(f"{model.line}, on {on if ties is None else 'squares of the pictures that are held out'}")
     if ties is not None:
         unseen = len(original) - int(solver.asked.sum())
