@@ -62,7 +62,6 @@ _TIES = 0.001  # of a typical member's weight: ties neighbors, where views are f
 _TRUSTED = 0.1  # of the same: a member of less is rather as its neighbors are
 _HOLDS = (1e-8, 1e-5, 1e-3)  # ridges tried there: a residual goes around all, some way, to its neighbors
 _SHOWS = 0.5  # pixels of a member in each of two pictures, from which on these say what it is
-_PATTERN = 0.15  # of what a map alone leaves of the members' changes: a mask that leaves more is none
 _SHARES = (1.0, 0.5, 0.2)  # of a step, where the whole of it would run into clamps
 _LOOKS = 3  # steps over which that is taken: a single one may gain nothing in other views
 
@@ -175,26 +174,25 @@ class Solver:
         """The same with a mask. [M] 0..1"""
         return replace(self, maps=fit_maps(self.views, share), share=share)
 
-    def find_mask(self, change: Tensor, targets: Sequence[Tensor], spreads: bool) -> Solver | None:
-        """The same with the mask that these pictures ask for, in 255ths; None where it explains the members'
-        changes little better than a map alone: stripes leave .01 to .1 of that, recolors .3 and more.
+    def guess_mask(self, change: Tensor, spreads: bool) -> Solver:
+        """The same with the mask that the members' changes ask for.
 
         Args:
-            change: of the members, a guess. [M,B,3]
-            targets: pictures of the views
+            change: a guess. [M,B,3]
             spreads: whether what no picture shows takes as much of the map as most, else none
         """
         weights = self.weights[:, 0, 0]
-        share, off = mask_of_members(self.sh[:, 0] * C0 + 0.5, change[:, 0] * C0, weights)
-        if off >= _PATTERN:
-            return None
+        share = mask_of_members(self.sh[:, 0] * C0 + 0.5, change[:, 0] * C0, weights)
         if self.ties is not None:
             mean, say = weights @ share / weights.sum(), self.asked * weights / (_TRUSTED * self.typical)
             mean = mean * spreads
             share = mean + self.ties.spread((share - mean)[:, None, None], say, _HOLDS[0] / _TIES)[:, 0, 0]
-            share = share.clamp(0.0, 1.0)
-        full = map_colors(self.sh, self.with_mask(share).maps.solve(1, targets), 1) - self.sh
-        share = torch.where(self.asked, improve_mask(self.views, full, share, targets), share)
+        return self.with_mask(share.clamp(0.0, 1.0))
+
+    def improve_mask(self, targets: Sequence[Tensor]) -> Solver:
+        """The same with the mask that these pictures of the views ask for, in 255ths."""
+        full = map_colors(self.sh, self.maps.solve(1, targets), 1) - self.sh
+        share = torch.where(self.asked, improve_mask(self.views, full, self.share, targets), self.share)
         return self.with_mask((share * 255.0).round() / 255.0)
 
     @one_thread()  # sums of members are added in an order that depends on the number of threads
@@ -414,13 +412,16 @@ def choose_model(
         (last.residuals[0], last.error) if last.bands > best.bands > 0 and last.error < best.error else None
     )
     spreads = best.degree > 0  # what no picture shows follows the map, masked or not
-    if best.bands and (others := _with_masks(best, targets)):
+    least_map = min(by_degree, key=lambda one: one.error)
+    if best.bands and (others := _with_masks(best, least_map, judges, targets)):
         masked = [attempt(base, f"a mask of degree {base.degree}", 0, best.hold) for base in others]
         base = others[_least(masked, lambda one: one.degree).degree - 1]
         masked = [] if few else masked
+        unmasked = {one.bands: one.error for one in tried if not one.masked}
         masked.append(attempt(base, "with a mask and a residual of 1", 1, best.hold))
         for bands in BANDS[1:]:
-            if bands <= most_bands and masked[-1].error < MORE_PAYS * best.error:
+            pays = LEVEL < masked[-1].error < MORE_PAYS * unmasked.get(masked[-1].bands, 0.0)
+            if pays and bands <= most_bands:
                 masked.append(attempt(masked[-1], f"with a mask and a residual of {bands}", bands, best.hold))
         best = _least([best, *masked], lambda one: one.size, LEVEL)  # degrees take no bytes, these do
     chosen, residual = best.solvers[0], best.residuals[0]
@@ -485,7 +486,7 @@ def _solve_whole(
     residual. [M,1,3]"""
     total, begin = torch.stack(best.changes).mean(dim=0), torch.zeros_like(best.residuals[0])
     if best.masked:
-        solver = solver.find_mask(total, targets, spreads) or solver.with_mask(best.solvers[0].share)
+        solver = solver.guess_mask(total, spreads).improve_mask(targets)
     made = solver.fit_map(best.degree, targets)[1]
     if best.masked:
         begin = (total - made)[:, :1]
@@ -500,20 +501,25 @@ def _least(attempts: Sequence[_Attempt], size: Callable[[_Attempt], int], floor:
     return min((one for one in attempts if MORE_PAYS * one.error <= least), key=size)
 
 
-def _with_masks(best: _Attempt, targets: Sequence[Tensor]) -> list[_Attempt]:
+def _with_masks(
+    best: _Attempt, least_map: _Attempt, judges: Sequence[Judge], targets: Sequence[Tensor]
+) -> list[_Attempt]:
     """The same change by masks of the trials' own and maps of each degree, what is missing in the residuals;
-    none where a mask is no better a guess than a map alone."""
+    none where the mask that the members' changes ask for is no better than a map alone."""
     solvers = [
-        by.find_mask(change, targets, best.degree > 0)
-        for by, change in zip(best.solvers, best.changes, strict=True)
+        by.guess_mask(change, best.degree > 0) for by, change in zip(best.solvers, best.changes, strict=True)
     ]
-    masked = [by for by in solvers if by is not None]
-    bases = list[_Attempt]()
-    for degree in MONOMIALS if len(masked) == len(solvers) else ():
-        offsets = [by.fit_map(degree, targets)[1] for by in masked]
+    degree = max(1, least_map.degree)
+    guesses = [by.fit_map(degree, targets)[1] for by in solvers]
+    error = sum(judge.error(made) for judge, made in zip(judges, guesses, strict=True)) / len(judges)
+    if error >= MORE_PAYS * least_map.error:
+        return []
+    solvers, bases = [by.improve_mask(targets) for by in solvers], list[_Attempt]()
+    for degree in MONOMIALS:
+        offsets = [by.fit_map(degree, targets)[1] for by in solvers]
         residuals = [(change - made)[:, :1] for change, made in zip(best.changes, offsets, strict=True)]
         bases.append(
-            replace(best, solvers=masked, degree=degree, offsets=offsets, residuals=residuals, masked=True)
+            replace(best, solvers=solvers, degree=degree, offsets=offsets, residuals=residuals, masked=True)
         )
     return bases
 

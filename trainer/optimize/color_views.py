@@ -254,7 +254,7 @@ def fit_maps(views: Sequence[ColorView], share: Tensor, most: int = _MOST_PIXELS
     return MapFit(design, original, pixels, wide.T @ wide, say * members)
 
 
-def mask_of_members(colors: Tensor, change: Tensor, weights: Tensor) -> tuple[Tensor, float]:
+def mask_of_members(colors: Tensor, change: Tensor, weights: Tensor) -> Tensor:
     """How much of one affine map each member takes, if its change is to be that, as between stripes.
 
     Maps by least squares over the members and their shares of it, in turn. The largest share is 1.
@@ -265,7 +265,7 @@ def mask_of_members(colors: Tensor, change: Tensor, weights: Tensor) -> tuple[Te
         weights: how much each shows, ≥ 0. [M]
 
     Returns:
-        The shares, 0..1 [M]; what the changes are off these, as a share of what they are off a map alone
+        The shares, 0..1. [M]
     """
     weights, change = weights.double(), change.double()
     terms = monomials(colors.T.clamp(0.0, MOST_COLOR), 1).double()
@@ -277,10 +277,7 @@ def mask_of_members(colors: Tensor, change: Tensor, weights: Tensor) -> tuple[Te
         table: Tensor = torch.linalg.solve(normal, (design * weights) @ change)
         return terms.T @ table
 
-    def error_of(share: Tensor, full: Tensor) -> float:
-        return float((weights @ (change - share[:, None] * full).square()).sum())
-
-    whole, size = torch.ones_like(weights), change.norm(dim=1)
+    size = change.norm(dim=1)
     typical = ((weights @ size.square()) / weights.sum().clamp_min(1e-30)).sqrt()
     share = (size / typical.clamp_min(1e-12)).clamp(0.0, 1.0)
     for _ in range(_MASK_TURNS):
@@ -290,8 +287,8 @@ def mask_of_members(colors: Tensor, change: Tensor, weights: Tensor) -> tuple[Te
         order = along.argsort()
         reached = evidence[order].cumsum(0) >= _MASK_WITHIN * evidence.sum()
         share = (along / along[order][reached][0].clamp_min(1e-6)).clamp(0.0, 1.0)
-    plain = error_of(whole, fit_change(whole))
-    return share.float(), error_of(share, fit_change(share)) / max(plain, 1e-30)
+    result: Tensor = share.float()
+    return result
 
 
 @one_thread()
