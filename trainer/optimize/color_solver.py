@@ -380,8 +380,7 @@ def choose_model(
                 for by, judge, made, one in zip(base.solvers, judges, base.offsets, residuals, strict=True)
             ]
         made = replace(base, name=name, residuals=residuals, hold=hold)
-        error = sum(judge.error(one) for judge, one in zip(judges, made.changes, strict=True)) / len(trials)
-        tried.append(replace(made, error=error))
+        tried.append(replace(made, error=_error(judges, made.changes)))
         return tried[-1]
 
     def start(degree: int) -> _Attempt:
@@ -412,8 +411,8 @@ def choose_model(
         (last.residuals[0], last.error) if last.bands > best.bands > 0 and last.error < best.error else None
     )
     spreads = best.degree > 0  # what no picture shows follows the map, masked or not
-    least_map = min(by_degree, key=lambda one: one.error)
-    if best.bands and (others := _with_masks(best, least_map, judges, targets)):
+    alone = min(_error(judges, bases[degree].offsets) for degree in MONOMIALS)
+    if best.bands and (others := _with_masks(best, alone, judges, targets)):
         masked = [attempt(base, f"a mask of degree {base.degree}", 0, best.hold) for base in others]
         base = others[_least(masked, lambda one: one.degree).degree - 1]
         masked = [] if few else masked
@@ -502,17 +501,16 @@ def _least(attempts: Sequence[_Attempt], size: Callable[[_Attempt], int], floor:
 
 
 def _with_masks(
-    best: _Attempt, least_map: _Attempt, judges: Sequence[Judge], targets: Sequence[Tensor]
+    best: _Attempt, alone: float, judges: Sequence[Judge], targets: Sequence[Tensor]
 ) -> list[_Attempt]:
     """The same change by masks of the trials' own and maps of each degree, what is missing in the residuals;
-    none where the mask that the members' changes ask for is no better than a map alone."""
+    none where the mask that the members' changes ask for is no better than a map without, which leaves `alone`.
+    """
     solvers = [
         by.guess_mask(change, best.degree > 0) for by, change in zip(best.solvers, best.changes, strict=True)
     ]
-    degree = max(1, least_map.degree)
-    guesses = [by.fit_map(degree, targets)[1] for by in solvers]
-    error = sum(judge.error(made) for judge, made in zip(judges, guesses, strict=True)) / len(judges)
-    if error >= MORE_PAYS * least_map.error:
+    guesses = {degree: [by.fit_map(degree, targets)[1] for by in solvers] for degree in MONOMIALS}
+    if min(_error(judges, made) for made in guesses.values()) >= MORE_PAYS * alone:
         return []
     solvers, bases = [by.improve_mask(targets) for by in solvers], list[_Attempt]()
     for degree in MONOMIALS:
@@ -522,6 +520,10 @@ def _with_masks(
             replace(best, solvers=solvers, degree=degree, offsets=offsets, residuals=residuals, masked=True)
         )
     return bases
+
+
+def _error(judges: Sequence[Judge], changes: Sequence[Tensor]) -> float:
+    return sum(judge.error(change) for judge, change in zip(judges, changes, strict=True)) / len(judges)
 
 
 def _inner(a: Tensor, b: Tensor) -> float:
