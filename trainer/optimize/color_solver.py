@@ -504,7 +504,8 @@ def _with_masks(
     best: _Attempt, alone: float, judges: Sequence[Judge], targets: Sequence[Tensor]
 ) -> list[_Attempt]:
     """The same change by masks of the trials' own and maps of each degree, what is missing in the residuals;
-    none where the mask that the members' changes ask for is no better than a map without, which leaves `alone`.
+    none where the mask that the members' changes ask for is no better than one without,
+    which leaves `alone`.
     """
     solvers = [
         by.guess_mask(change, best.degree > 0) for by, change in zip(best.solvers, best.changes, strict=True)
