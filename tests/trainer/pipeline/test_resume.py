@@ -17,11 +17,14 @@ import trainer.run.run
 from progdf.__main__ import main
 from progdf.errors import ProgdfError
 from progdf.formats.ply import load_ply
+from progdf.gaussians import ZERO
 from progdf.gdf.file import load_gdf
+from progdf.io.cameras import load_cameras
 from tests.helpers.growth import write_growth
 from tests.helpers.stopped import OUT, bits, small_run
 from tests.helpers.stopped_runs import NEVER, at_step, gone_on, killed, saved_step, words
-from tests.helpers.trained import train
+from tests.helpers.trained import quick_options, train
+from trainer.options import EditorOptions
 from trainer.run import training
 from trainer.run.resume import find_run, processor_kind
 from trainer.store.state import StateFolder
@@ -310,3 +313,27 @@ def test_a_run_killed_while_it_grows_goes_on_to_the_same_bits(tmp_path: Path) ->
     lines = killed(tmp_path, tmp_path / "cut", [31.0, 44.0, 15.0, 19.0, 24.0], **more)
     assert sum(line.endswith("-9") for line in lines) == 5, lines
     assert bits(tmp_path / "cut" / OUT) == bits(tmp_path / "whole" / OUT)
+
+
+def test_an_edit_that_needs_half_of_the_views_keeps_no_others_and_goes_on_with_these(
+    bear_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options = quick_options(bear_folder, views=0, stages=0, image_size=48)
+    options = replace(options, out=OUT, editor=EditorOptions("stripes:#20a040"))
+    whole = train(options)
+    effort, names = whole.report["effort"], {path.stem for path in (OUT / "views/original").glob("*.png")}
+    solved = effort["views"]
+    assert len(effort["strengths"]) > 2
+    assert len(names) == solved + len(whole.report["views"]["edit"])
+    assert f"{solved} of {2 * solved} views are solved for" in (OUT / "log.txt").read_text(encoding="utf-8")
+    assert {camera.name for camera in load_cameras(OUT / "cameras.json", ZERO)} == names
+    for s in effort["strengths"][:-1]:
+        assert {path.stem for path in (OUT / "views/edited" / f"{s:g}").glob("*.png")} == names
+    expected = bits(OUT)
+    shutil.rmtree(OUT)
+
+    at_step(monkeypatch, 2, lambda: os.kill(os.getpid(), signal.SIGINT))
+    with pytest.raises(KeyboardInterrupt):
+        train(options)
+    train(replace(options, resume=True))
+    assert bits(OUT) == expected
