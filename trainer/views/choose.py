@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import torch
@@ -41,11 +41,27 @@ _LEAST_COVER = 0.25
 
 
 @dataclass(frozen=True)
+class Shown:
+    """What each of V cameras shows of S members: how well [V,S] 0..1, and from where (unit vectors from the
+    member to the eye) [V,S,3]; `reach` is the angle in radians at which another direction is another side."""
+
+    visible: Tensor
+    toward: Tensor
+    reach: float
+
+    def coverage_by(self, camera: int) -> Tensor:
+        """How far one camera serves what each shows of each member. [V,S] 0..1"""
+        cosine = (self.toward * self.toward[camera]).sum(dim=2)
+        near = torch.exp(-(1 - cosine) / (1 - math.cos(self.reach)))
+        return self.visible[camera] * near
+
+
+@dataclass(frozen=True)
 class ViewChoice:
     """The views an edit works on."""
 
     views: tuple[View, ...]  # in the order of the cameras' list
-    likeness: Tensor  # how far view j shows what view i shows, from near the same side. [V,V] 0..1
+    shown: Shown  # what each of them shows
     offered: int  # how many cameras there were
     unseeing: int  # how many of them do not see the region
     scant: int  # how many show less than a quarter of what the median view shows
@@ -85,7 +101,7 @@ def choose_views(
     most = _MOST_LOOKED_THROUGH * count
     if len(looked) > most:
         toward = _toward(places, [cameras[i] for i in looked])
-        looked = [looked[k] for k in _greedy(_Shown(framed[looked].float(), toward, _reach(most)), most)]
+        looked = [looked[k] for k in _greedy(Shown(framed[looked].float(), toward, _reach(most)), most)]
     cover, weights = _measure_visibility(scene, region, rows, [cameras[i] for i in looked])
     seeing = cover > 0
     if not bool(seeing.any()):
@@ -96,11 +112,11 @@ def choose_views(
     enough = cover >= _LEAST_COVER * cover[seeing].median()
     good = enough.nonzero()[:, 0].tolist()
     toward = _toward(places, [cameras[looked[k]] for k in good])
-    visibility = _Shown(_relative_visibility(weights[good]), toward, _reach(count))
+    visibility = Shown(_relative_visibility(weights[good]), toward, _reach(count))
     taken = _greedy(visibility, count) if len(good) > count else list(range(len(good)))
     return ViewChoice(
         tuple(map_threads(lambda k: make_view(scene, region, cameras[looked[good[k]]], background), taken)),
-        _likeness(visibility, taken),
+        Shown(visibility.visible[taken], visibility.toward[taken], visibility.reach),
         len(cameras),
         int((~framed.any(dim=1)).sum()) + int((~seeing).sum()),
         int((seeing & ~enough).sum()),
@@ -116,42 +132,16 @@ def split_held_out(held_out: Sequence[T]) -> tuple[Sequence[T], Sequence[T]]:
 
 
 def split_views(choice: ViewChoice, held_out: int) -> tuple[list[View], list[View]]:
-    """Views to train with, and up to `held_out` that the others resemble most, spread over all sides.
+    """Views to train with, and up to `held_out` that show most of what all show, from as many sides.
 
     At most a third is held out, which of two is none.
     """
-    views = choice.views
-    held_out = min(held_out, len(views) // 3)
-    if held_out <= 0:
-        return list(views), []
-    represented = torch.zeros(len(views))
-    chosen: list[int] = []
-    for _ in range(held_out):
-        gain = (choice.likeness - represented[:, None]).clamp_min(0.0).sum(dim=0)
-        gain[chosen] = -1.0
-        chosen.append(int(gain.argmax()))
-        represented = torch.maximum(represented, choice.likeness[:, chosen[-1]])
-    train = [view for i, view in enumerate(views) if i not in chosen]
-    return train, [views[i] for i in sorted(chosen)]
+    views, count = choice.views, min(held_out, len(choice.views) // 3)
+    chosen = _greedy(replace(choice.shown, reach=_reach(count)), count) if count > 0 else []
+    return [view for i, view in enumerate(views) if i not in chosen], [views[i] for i in chosen]
 
 
-@dataclass(frozen=True)
-class _Shown:
-    """What each of V cameras shows of S members: how well [V,S] 0..1, and from where (unit vectors from the
-    member to the eye) [V,S,3]; `reach` is the angle in radians at which another direction is another side."""
-
-    visible: Tensor
-    toward: Tensor
-    reach: float
-
-    def coverage_by(self, camera: int) -> Tensor:
-        """How far one camera serves what each shows of each member. [V,S] 0..1"""
-        cosine = (self.toward * self.toward[camera]).sum(dim=2)
-        near = torch.exp(-(1 - cosine) / (1 - math.cos(self.reach)))
-        return self.visible[camera] * near
-
-
-def _greedy(visibility: _Shown, count: int) -> list[int]:
+def _greedy(visibility: Shown, count: int) -> list[int]:
     """The cameras that add most, one after the other, in the order of the list; ties by that order."""
     served = torch.zeros_like(visibility.visible)
     left = torch.ones(len(served), dtype=torch.bool)
@@ -161,15 +151,6 @@ def _greedy(visibility: _Shown, count: int) -> list[int]:
         left[best] = False
         served = torch.maximum(served, visibility.coverage_by(best))
     return (~left).nonzero()[:, 0].tolist()
-
-
-def _likeness(visibility: _Shown, taken: Sequence[int]) -> Tensor:
-    some = _Shown(visibility.visible[taken], visibility.toward[taken], visibility.reach)
-    columns = [
-        (some.visible * some.coverage_by(k)).sum(dim=1) / some.visible.sum(dim=1).clamp_min(1e-12)
-        for k in range(len(taken))
-    ]
-    return torch.stack(columns, dim=1)
 
 
 def _reach(count: int) -> float:

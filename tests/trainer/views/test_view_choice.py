@@ -23,6 +23,7 @@ from tests.helpers.trained import WHITE, Small, small
 from trainer.options import ViewOptions
 from trainer.setup import make_training_setup
 from trainer.views.choose import (
+    Shown,
     ViewChoice,
     choose_views,
     in_frame,
@@ -173,10 +174,11 @@ def test_a_scene_to_stand_inside_asks_for_its_cameras(tmp_path: Path) -> None:
     assert "photographs:EDITED,ORIGINALS" in setup.notes[2]
 
 
-def picked(likeness: Tensor, held_out: int) -> list[int]:
-    """Which of the views are held out that are so much alike."""
-    views = tuple(replace(small().views[0], box=(i, 0, 64, 64)) for i in range(len(likeness)))
-    train, held = split_views(ViewChoice(views, likeness, len(views), 0, 0), held_out)
+def picked(visible: Tensor, held_out: int) -> list[int]:
+    """Which of the views are held out that show so much of some members, all from one side. [V,S]"""
+    views = tuple(replace(small().views[0], box=(i, 0, 64, 64)) for i in range(len(visible)))
+    toward = torch.tensor([0.0, 0.0, 1.0]).expand(*visible.shape, 3)
+    train, held = split_views(ViewChoice(views, Shown(visible, toward, 1.0), len(views), 0, 0), held_out)
     assert [view.box[0] for view in train] == [
         i for i in range(len(views)) if i not in {v.box[0] for v in held}
     ]
@@ -184,13 +186,14 @@ def picked(likeness: Tensor, held_out: int) -> list[int]:
 
 
 def test_views_that_show_what_the_others_show_are_held_out_one_from_each_side() -> None:
-    likeness = torch.eye(6)
-    likeness[:3, 1] = 0.95  # view 1 shows what 0 and 2 show, but they do not show all that it shows
-    likeness[3:, 5] = 1.0
-    likeness[3:, 0] = 0.65  # which is nothing new once 5 is held out
-    assert picked(likeness, 1) == [5]
-    assert picked(likeness, 2) == [1, 5], "in the order of the list"
-    assert picked(likeness.T.contiguous(), 2) != [1, 5]
+    visible = torch.zeros(6, 4)
+    visible[:3, 0] = visible[3:, 2] = 1.0
+    visible[1, :2] = 1.0  # view 1 shows what 0 and 2 show, but they do not show all that it shows
+    visible[5, 2:] = 1.0
+    visible[0, 2:] = 0.4  # which is nothing new once 5 is held out
+    visible[5, 0] = 0.1
+    assert picked(visible, 1) == [5]
+    assert picked(visible, 2) == [1, 5], "in the order of the list"
 
 
 def test_one_half_of_the_held_out_views_chooses_and_the_other_reports_unless_there_is_one() -> None:
@@ -199,10 +202,8 @@ def test_one_half_of_the_held_out_views_chooses_and_the_other_reports_unless_the
 
 
 def test_no_more_than_a_third_is_held_out_and_no_view_twice() -> None:
-    assert picked(torch.ones(6, 6), 5) == [0, 1]
-    few = tuple(small().views[:2])
-    train, held = split_views(ViewChoice(few, torch.eye(2), 2, 0, 0), 1)
-    assert (train, held) == (list(few), [])
+    assert picked(torch.ones(6, 3), 5) == [0, 1]
+    assert picked(torch.ones(2, 3), 1) == []
 
 
 def test_a_camera_that_shows_the_region_small_is_left_out_and_said_so() -> None:
@@ -262,9 +263,13 @@ def test_a_wide_view_shows_what_a_narrow_one_does_and_not_the_other_way_round() 
         wide, K=wide.K + torch.tensor([[0.0, 0, 40], [0, 0, 0], [0, 0, 0]])
     )  # the left one alone
     region = from_mask("both", torch.ones(2, dtype=torch.bool))
-    likeness = choose_views(scene, region, [wide, narrow], 2, WHITE).likeness
-    assert float(likeness[1, 0]) > 0.9
-    assert float(likeness[0, 1]) < 0.6
+    shown = choose_views(scene, region, [wide, narrow], 2, WHITE).shown
+    shares = [
+        float((shown.visible * shown.coverage_by(k))[1 - k].sum() / shown.visible[1 - k].sum())
+        for k in (0, 1)
+    ]
+    assert shares[0] > 0.9
+    assert shares[1] < 0.6
 
 
 def test_members_are_sampled_all_over_the_region() -> None:
