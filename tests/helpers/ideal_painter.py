@@ -30,18 +30,18 @@ UP = torch.tensor([0.0, 1.0, 0.0])
 
 
 class WholeViews:
-    """Paints all of a view, at its own size; see `Painter`."""
+    """Paints all of a view, at its own size; see `InstructEditor`."""
 
     def frame(self, view: View) -> tuple[Crop, Camera]:
         """All of it."""
         return (0, 0, view.camera.width, view.camera.height), view.camera
 
     def original(self, view: View) -> Tensor:
-        """See `Painter.original`."""
+        """See `InstructEditor.original`."""
         return view.image
 
     def paste(self, view: View, painted: Tensor) -> Tensor:
-        """See `Painter.paste`."""
+        """See `InstructEditor.paste`."""
         return painted
 
 
@@ -75,7 +75,7 @@ class IdealPainter(WholeViews):
         source: Tensor | None = None,
         seed: int | None = None,
     ) -> Tensor:
-        """See `Painter.paint`."""
+        """See `InstructEditor.paint`."""
         self.calls += 1
         index = self.view_of(picture)
         shows = self.views[index].mask > 0.05

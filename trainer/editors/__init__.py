@@ -12,7 +12,7 @@ from progdf.region import Region
 from trainer.options import EditorOptions
 from trainer.views.view import View
 
-from .base import EditorInput, ImageEditor, Painter
+from .base import EditorInput, ImageEditor
 from .decal import check_decal, decal
 from .instruct import check_instruct, instruct
 from .pictures import folder, folder_of, photograph_folders, photographs, picture_paths, pictures
@@ -120,7 +120,6 @@ __all__ = [
     "KIND_UNKNOWN",
     "PER_VIEW",
     "ImageEditor",
-    "Painter",
     "check_editor",
     "check_new_editor",
     "make_editor",

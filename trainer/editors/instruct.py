@@ -46,7 +46,7 @@ _MARGIN = 0.4  # of the region's box: what is added to each of its sides in all
 
 @dataclass(frozen=True)
 class InstructEditor:
-    """Edits pictures as a sentence says; a `Painter` too."""
+    """Edits pictures as a sentence says, and paints one as told: of a view, what is around the region."""
 
     scene: Gaussians
     request: Request
@@ -60,7 +60,7 @@ class InstructEditor:
 
     @property
     def references(self) -> int:
-        """See `Painter`."""
+        """How many pictures beside the view's own one call can take."""
         return self.request.adapter.references
 
     @property
@@ -134,7 +134,15 @@ class InstructEditor:
         source: Tensor | None = None,
         seed: int | None = None,
     ) -> Tensor:
-        """See `Painter.paint`; in 8 bits.
+        """The picture painted anew, at the size that the model works at, in 8 bits. -> [H,W,3] 0..1
+
+        Args:
+            picture: what is painted over, the condition. [H,W,3] 0..1
+            references: further pictures that the model looks at, at most `references`. [H,W,3] each
+            strength: 0 gives `source`, 1 what the model makes of its condition
+            softness: over which share of the steps the model's say grows from none to all of it
+            source: where strength 0 ends; None: `picture`. As large as it. [H,W,3]
+            seed: of the noise; None: the editor's
 
         Raises:
             ProgdfError: weights are missing or broken, or the card's memory runs out.

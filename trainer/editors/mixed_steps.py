@@ -87,7 +87,7 @@ class MixedSteps:
             ask: pictures -> the arguments of a call; the same noise each time
             pictures: the view's own first
             source: what strength 0 gives
-            strength, softness: see `Painter.paint`
+            strength, softness: see `InstructEditor.paint`
         """
         if strength <= 0.0:
             return source

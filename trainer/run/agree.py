@@ -34,8 +34,9 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import attribute_slices, pack
 from progdf.scene.bounds import scene_sphere
 from progdf.sh import C0
-from trainer.editors.base import ImageEditor, Painter
+from trainer.editors.base import ImageEditor
 from trainer.editors.cache import KeptPictures, Recipe, digest
+from trainer.editors.instruct import InstructEditor
 from trainer.editors.style import cross_fade
 from trainer.options import EditKind
 from trainer.report.agreement import ViewChange, fine_energy, fit_colors, robust_colors, view_change
@@ -174,8 +175,8 @@ class Easel:
     The note beside a picture holds the digests of all that it was made from.
     """
 
-    painter: Painter
-    recipe: Recipe  # what a picture depends on besides what `Painter.paint` is given
+    painter: InstructEditor
+    recipe: Recipe  # what a picture depends on besides what `InstructEditor.paint` is given
     kept: KeptPictures
     seed: int
 
@@ -203,7 +204,7 @@ class Easel:
         Args:
             view: what is painted
             place: folder of the picture
-            references, source, strength, softness: see `Painter.paint`
+            references, source, strength, softness: see `InstructEditor.paint`
         """
         references, original = references[: self.painter.references], self.painter.original(view)
         beside, moved = beside_region(self.crop(view, view.mask[..., None])[..., 0]), 0.0

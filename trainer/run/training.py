@@ -169,19 +169,6 @@ def optimize_members(
     if optimization.solver == "colors":
         plan = plan_colors(optimization, setup, edited, between, options.views, log)
         return _solve(plan, folder, log)
-    return _descend(options, optimization, setup, edited, perceptual, folder, log)
-
-
-def _descend(
-    options: TrainOptions,
-    optimization: OptimizeOptions,
-    setup: TrainingSetup,
-    edited: Pictures,
-    perceptual: Perceptual,
-    folder: StateFolder,
-    log: RunLog,
-) -> Optimized:
-    """View by view."""
     scene, members = setup.scene, setup.region.members
     bands = optimization.sh != "off"
     engine, device = optimization.engine, engine_device(optimization.engine)
