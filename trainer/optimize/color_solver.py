@@ -76,6 +76,7 @@ class Model:
     mask: Tensor | None  # see `GradeForm.mask`
     error: float  # mean square, of the finished edit in views not solved for: what is finer is not chased
     tried: Sequence[tuple[str, float]]  # what was tried, and its error on views not solved for, dB
+    steps: int  # that all of this took
     # residual and error with another band, where that is better, but by less than a twentieth
     richer: tuple[Tensor, float] | None = None
 
@@ -367,7 +368,7 @@ def choose_model(
         steps: most steps of conjugate gradients for a residual
         most_bands: SH functions that a residual may have: 1, 4 or 9
     """
-    tried: list[_Attempt] = []
+    tried, taken = list[_Attempt](), list[int]()
     few, judges = solver.ties is not None, [judge for _, judge in trials]
     most_bands = min(most_bands, 1 if few else solver.sh.shape[1])
 
@@ -375,10 +376,12 @@ def choose_model(
         """With a residual that begins where that of `base` ended."""
         residuals = [pad(one[:, :bands], (0, 0, 0, max(0, bands - base.bands))) for one in base.residuals]
         if bands:
-            residuals = [
-                by.residual(made, one, targets, steps, judge, hold=hold)[0]
+            found = [
+                by.residual(made, one, targets, steps, judge, hold=hold)
                 for by, judge, made, one in zip(base.solvers, judges, base.offsets, residuals, strict=True)
             ]
+            residuals, counts = [residual for residual, _ in found], [count for _, count in found]
+            taken.append(max(counts))
         made = replace(base, name=name, residuals=residuals, hold=hold)
         tried.append(replace(made, error=_error(judges, made.changes)))
         return tried[-1]
@@ -412,7 +415,8 @@ def choose_model(
     )
     spreads = best.degree > 0  # what no picture shows follows the map, masked or not
     alone = min(_error(judges, bases[degree].offsets) for degree in MONOMIALS)
-    if best.bands and (others := _with_masks(best, alone, judges, targets)):
+    is_enough = best.bands <= 1 and best.error <= LEVEL and not few
+    if best.bands and not is_enough and (others := _with_masks(best, alone, judges, targets)):
         masked = [attempt(base, f"a mask of degree {base.degree}", 0, best.hold) for base in others]
         base = others[_least(masked, lambda one: one.degree).degree - 1]
         masked = [] if few else masked
@@ -429,25 +433,24 @@ def choose_model(
     mask = (chosen.share * 255.0).round().to(torch.uint8) if best.masked else None
     decided = [(one.name, decibels(one.error)) for one in tried]
     richer = None if best.masked else richer
-    return chosen, Model(best.degree, best.hold, residual, mask, best.error, decided, richer)
+    return chosen, Model(best.degree, best.hold, residual, mask, best.error, decided, sum(taken), richer)
 
 
 def solve_again(
-    model: Model, solver: Solver, targets: Sequence[Tensor], judge: Judge, steps: int
+    model: Model, solver: Solver, targets: Sequence[Tensor], judge: Judge
 ) -> tuple[Solver, Model]:
-    """The model, solved for from other views: these, with its mask, and what comes of it.
+    """The model, solved for from other views, in as many steps: these, with its mask, and what comes of it.
 
     Args:
         model: what the finished edit called for
         solver: the views
         targets: the finished edit in these
         judge: views not solved for
-        steps: most steps of conjugate gradients
     """
     solver = solver if model.mask is None else solver.with_mask(model.mask.float() / 255.0)
     mapped, residual = solver.fit_map(model.degree, targets)[1], torch.zeros_like(model.residual)
     if model.bands:
-        residual, _ = solver.residual(mapped, residual, targets, steps, judge, hold=model.hold)
+        residual, _ = solver.residual(mapped, residual, targets, model.steps, judge, hold=model.hold)
     return solver, replace(model, residual=residual, error=judge.error(add_bands(mapped, residual)))
 
 

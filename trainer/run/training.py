@@ -285,7 +285,7 @@ def plan_colors(
         solver, model = choose_model(solver, trials, targets, most, 1 if optimization.sh == "off" else 9)
         if model.error <= LEVEL and held_out and between is not None and not options.views:
             half = replace(finished[0], targets=targets[::2]), finished[1]
-            fewer = solve_again(model, make_solver(drawn[::2], original), targets[::2], half[1], most)
+            fewer = solve_again(model, make_solver(drawn[::2], original), targets[::2], half[1])
             if fewer[1].error <= LEVEL:
                 (solver, model), finished, train = fewer, half, train[::2]
     strengths = [s for s in edited if s < 1.0]
