@@ -27,7 +27,7 @@ from progdf.threads import map_threads, threads
 
 from .editors.base import ImageEditor
 from .editors.pictures import picture_cameras
-from .editors.procedural import ColorEditor
+from .editors.procedural import ColorEditor, StripesEditor
 from .options import MOST_VIEWS, VIEWS, Kind, ViewOptions
 from .store.progress import Advance
 from .store.run_folder import LazySequence, RunFolder, add_pictures, from_bytes, stored_pictures, to_bytes
@@ -311,7 +311,7 @@ def edit_views(
 
     add_pictures(folder.views, [path for some in paths.values() for path in some])
     edited: dict[float, list[Tensor]] = {strength: [] for strength in strengths}
-    together = isinstance(editor, ColorEditor)  # the others have a network, or draw: these use all cores
+    together = isinstance(editor, ColorEditor | StripesEditor)
     requests = [[(strength, i)] for strength in strengths for i in range(len(views))]
     if together and strengths:
         requests = [[(strength, i) for strength in strengths] for i in range(len(views))]
