@@ -24,6 +24,7 @@ from progdf.sh import C0, basis
 
 from .baked import (
     LATTICE,
+    MOST_RANK,
     BakedField,
     GradeForm,
     Segment,
@@ -42,11 +43,11 @@ MOST_COLOR = 1.5
 
 _DIRECTIONS = 32  # in which a member's color is mapped; twice the functions of three bands
 _CHUNK = 1 << 11  # members at once
-MOST_RESIDUALS = 4
-"""Bases of a residual that are tried."""
-COARSER = tuple(2.0 ** (i / 4) for i in range(13))
-"""Steps of a residual's levels that are tried, the finest of 8 bits 1."""
-_WITHIN = 0.999  # share of the members whose residual is reached: few must not take the levels of all
+MOST_RESIDUALS = MOST_RANK // 2
+"""Bases of a residual that are tried, each in up to two."""
+COARSER = tuple(2.0 ** (i / 4) for i in range(-4, 13))
+"""Steps of a residual's levels that are tried; with 1 nearly all members take 8 bits."""
+_WITHIN = 0.999  # share of the members that do: few must not take the levels of all
 
 
 def monomials(colors: Tensor, degree: int) -> Tensor:
@@ -291,15 +292,18 @@ def fit_grade(
         coarser: how many of the steps that 8 bits have one of its steps is; they compress the better
     """
     root = weights.sqrt()[:, None]
-    reach = course.abs().amax(dim=0).kthvalue(max(1, math.ceil(_WITHIN * course.shape[1])), dim=0).values
-    course = course.clamp(-reach, reach)
     rows = (course * root).flatten(1)
     _, vectors = torch.linalg.eigh((rows @ rows.T).double())
     mix = vectors.flip(1)[:, :rank].T.float()
     exact = (mix @ course.flatten(1)).reshape(rank, *course.shape[1:])
     # one step for all, as all are of colors: channels that hardly move take few levels, and compress
-    step = coarser / 127.0 * (float(exact.abs().max()) if exact.numel() else 0.0) or 1.0
-    levels, scale = (exact / step).round().to(torch.int8), torch.full((rank, exact.shape[2]), step)
+    nearly_all = max(1, math.ceil(_WITHIN * exact.shape[1]))
+    step = coarser / 127.0 * (float(exact.abs().kthvalue(nearly_all, dim=1).values.max()) if rank else 0.0)
+    whole = (exact / (step or 1.0)).round()
+    levels = whole.clamp(-127.0, 127.0)
+    beyond = (whole - levels).clamp(-127.0, 127.0)  # of few members, in bases of their own
+    levels = torch.cat([levels, beyond[beyond.flatten(1).any(dim=1)]]).to(torch.int8)
+    scale = torch.full((len(levels), exact.shape[2]), step or 1.0)
     columns = (levels * scale[:, None] * root).flatten(1)
     normal = (columns @ columns.T).double()
     coefficients = (rows @ columns.T).double() @ torch.linalg.pinv(normal, rtol=1e-9, hermitian=True)

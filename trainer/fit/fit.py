@@ -144,26 +144,27 @@ def fit_grades(
     course = torch.stack([lowest_bands(trajectory.node(i), trajectory.bands) for i in range(len(table))])
     course -= mapped[:, :, : 3 * trajectory.bands]
     evaluator = field_evaluator(trajectory, choosing, options.target_psnr)
-    tried, serving, smallest = list[Candidate](), 0, math.inf
+    tried, smallest = list[Candidate](), math.inf
 
-    def is_too_coarse(rank: int, index: int) -> bool:
+    def fails(rank: int, index: int = 0) -> bool:
         nonlocal smallest
         form = fit_grade(trajectory.s, degree, table, course, rank, weights, mask, COARSER[index])
         if form.bytes_per_member > smallest:
             return False
         release_memory()
         field = replace(bake_grade(form, rows, mapped), recorded=tuple(trajectory.s.tolist()))
+        if index and evaluator.end_excess(field.offsets(1.0)) > 1.0:  # one look instead of twenty
+            return True
         tried.append(evaluator.candidate(field, form.label))
-        serves = tried[-1].excess <= 1.0
-        smallest = form.bytes_per_member if serves else smallest
-        return not serves
+        smallest = min(smallest, math.inf if tried[-1].excess > 1.0 else form.bytes_per_member)
+        return tried[-1].excess > 1.0
 
-    for rank in range(rank_limit(course) + 1):
-        if not is_too_coarse(rank, 0) and rank:
-            bisect_left(range(1, len(COARSER)), True, key=partial(is_too_coarse, rank))
-        serving += smallest < math.inf
-        if serving > 1 or (not rank and serving):
-            break
+    limit, low, fewest = rank_limit(course), 0, 0
+    while fails(fewest) and fewest < limit:
+        low, fewest = fewest + 1, min(2 * fewest + 1, limit)
+    fewest = bisect_left(range(fewest), True, lo=low, key=lambda rank: not fails(rank))
+    for rank in range(max(1, fewest), min(fewest + 1, limit) + 1):
+        bisect_left(range(1, len(COARSER)), True, key=partial(fails, rank))
     return _measure_choice(pick_candidate(tried, evaluator.wanted), trajectory, reporting)
 
 
