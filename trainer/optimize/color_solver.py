@@ -415,8 +415,10 @@ def choose_model(
     )
     spreads = best.degree > 0  # what no picture shows follows the map, masked or not
     alone = min(_error(judges, bases[degree].offsets) for degree in MONOMIALS)
-    is_enough = best.bands <= 1 and best.error <= LEVEL and not few
-    if best.bands and not is_enough and (others := _with_masks(best, alone, judges, targets)):
+    is_met = best.bands <= 1 and best.error <= LEVEL and not few
+    of_dc = min((one.error for one in tried if one.bands == 1), default=alone)
+    enough = alone * (of_dc / alone) ** (1 / 3)  # a mask's byte takes away what one of the three of DC does
+    if best.bands and not is_met and (others := _with_masks(best, enough, judges, targets)):
         masked = [attempt(base, f"a mask of degree {base.degree}", 0, best.hold) for base in others]
         base = others[_least(masked, lambda one: one.degree).degree - 1]
         masked = [] if few else masked
@@ -504,17 +506,16 @@ def _least(attempts: Sequence[_Attempt], size: Callable[[_Attempt], int], floor:
 
 
 def _with_masks(
-    best: _Attempt, alone: float, judges: Sequence[Judge], targets: Sequence[Tensor]
+    best: _Attempt, enough: float, judges: Sequence[Judge], targets: Sequence[Tensor]
 ) -> list[_Attempt]:
     """The same change by masks of the trials' own and maps of each degree, what is missing in the residuals;
-    none where the mask that the members' changes ask for is no better than one without,
-    which leaves `alone`.
+    none where the mask that the members' changes ask for leaves more than `enough`.
     """
     solvers = [
         by.guess_mask(change, best.degree > 0) for by, change in zip(best.solvers, best.changes, strict=True)
     ]
     guesses = {degree: [by.fit_map(degree, targets)[1] for by in solvers] for degree in MONOMIALS}
-    if min(_error(judges, made) for made in guesses.values()) >= MORE_PAYS * alone:
+    if min(_error(judges, made) for made in guesses.values()) >= enough:
         return []
     solvers, bases = [by.improve_mask(targets) for by in solvers], list[_Attempt]()
     for degree in MONOMIALS:
