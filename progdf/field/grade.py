@@ -299,10 +299,10 @@ def fit_grade(
     # one step for all, as all are of colors: channels that hardly move take few levels, and compress
     nearly_all = max(1, math.ceil(_WITHIN * exact.shape[1]))
     step = coarser / 127.0 * (float(exact.abs().kthvalue(nearly_all, dim=1).values.max()) if rank else 0.0)
-    whole = (exact / (step or 1.0)).round()
-    levels = whole.clamp(-127.0, 127.0)
-    beyond = (whole - levels).clamp(-127.0, 127.0)  # of few members, in bases of their own
-    levels = torch.cat([levels, beyond[beyond.flatten(1).any(dim=1)]]).to(torch.int8)
+    whole = (exact / (step or 1.0)).round().clamp(-254.0, 254.0)
+    levels = whole.clamp(-127.0, 127.0).to(torch.int8)
+    beyond = (whole - levels).to(torch.int8)  # of few members, in bases of their own
+    levels = torch.cat([levels, beyond[beyond.flatten(1).any(dim=1)]])
     scale = torch.full((len(levels), exact.shape[2]), step or 1.0)
     columns = (levels * scale[:, None] * root).flatten(1)
     normal = (columns @ columns.T).double()

@@ -155,7 +155,8 @@ def fit_grades(
         field = replace(bake_grade(form, rows, mapped), recorded=tuple(trajectory.s.tolist()))
         if index and evaluator.end_excess(field.offsets(1.0)) > 1.0:  # one look instead of twenty
             return True
-        tried.append(evaluator.candidate(field, form.label))
+        candidate = evaluator.candidate(field, form.label)
+        tried.append(replace(candidate, field=replace(field, attributes={})))  # which are large
         smallest = min(smallest, math.inf if tried[-1].excess > 1.0 else form.bytes_per_member)
         return tried[-1].excess > 1.0
 
@@ -165,7 +166,12 @@ def fit_grades(
     fewest = bisect_left(range(fewest), True, lo=low, key=lambda rank: not fails(rank))
     for rank in range(max(1, fewest), min(fewest + 1, limit) + 1):
         bisect_left(range(1, len(COARSER)), True, key=partial(fails, rank))
-    return _measure_choice(pick_candidate(tried, evaluator.wanted), trajectory, reporting)
+    choice = pick_candidate(tried, evaluator.wanted)
+    form = choice.best.field.origin
+    assert isinstance(form, GradeForm)
+    attributes = bake_grade(form, rows, mapped).attributes
+    best = replace(choice.best, field=replace(choice.best.field, attributes=attributes))
+    return _measure_choice(replace(choice, best=best), trajectory, reporting)
 
 
 def field_evaluator(trajectory: Trajectory, views: Evaluator, target: float | None) -> FieldEvaluator:
