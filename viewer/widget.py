@@ -19,7 +19,7 @@ from progdf.gdf.file import Gdf, verify
 from progdf.io.images import to_picture
 from progdf.io.json_values import convert_json, plain
 
-from .camera.view_camera import ViewCamera, first_camera
+from .camera.view_camera import LARGEST_SIDE, ViewCamera, first_camera
 from .files.document import Document
 from .files.web_page import PageOptions, camera_json, first_state, picture, write_page
 from .state.layers import largest_strength
@@ -34,7 +34,6 @@ except ImportError as error:
     raise ProgdfError("progdf.Widget needs anywidget; pip install 'progdf-studio[jupyter]'") from error
 
 _STILL = 720, 480
-LARGEST_SIDE = 16_384
 
 
 class RefusedError(ProgdfError, traitlets.TraitError):

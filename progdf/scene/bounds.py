@@ -56,7 +56,7 @@ def front_direction(up: Tensor) -> Tensor:
     same as azimuth 0 in the viewer.
     """
     largest = int(up.abs().argmax())
-    towards = torch.zeros(3)
+    towards = torch.zeros_like(up)
     towards[1 if largest == 2 else 2] = math.copysign(1.0, float(up[largest])) * (
         -1.0 if largest == 2 else 1.0
     )

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Annotated
 
@@ -20,11 +21,14 @@ from progdf.camera import Camera, intrinsics
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
 from progdf.io.json_values import one_of
-from progdf.scene.bounds import scene_sphere
+from progdf.scene.bounds import front_direction, scene_sphere
 from progdf.scene.subject import fit_eye, is_room, richest_turn, standpoint, subject_rows
 from progdf.scene.up_axis import find_up, up_from_json
 
 Vec3 = tuple[float, float, float]
+
+LARGEST_SIDE = 16_384
+"""Of a picture that can be asked for, in pixels."""
 
 
 @dataclass(frozen=True)
@@ -140,15 +144,11 @@ def unit(v: Vec3, otherwise: Vec3) -> Vec3:
     return x / length, y / length, z / length
 
 
+@cache
 def front(up: Vec3) -> Vec3:
-    """Where the eye stands at azimuth 0, elevation 0: +Z for y-up, −Z for y-down, −Y for z-up, +Y for z-down.
-
-    So a y-down scene (COLMAP, most trained splats) is met from the side its cameras looked from.
-    """
-    largest = max(range(3), key=lambda i: abs(up[i]))
-    sign = math.copysign(1.0, up[largest])
-    facing: Vec3 = ((0.0, 0.0, sign), (0.0, 0.0, sign), (0.0, -sign, 0.0))[largest]
-    return unit(add_scaled(facing, (-dot(facing, up), up)), (1.0, 0.0, 0.0))
+    """Where the eye stands at azimuth 0, elevation 0, see `front_direction`."""
+    x, y, z = front_direction(torch.tensor(up, dtype=torch.float64)).tolist()
+    return x, y, z
 
 
 def axes(camera: ViewCamera) -> Axes:

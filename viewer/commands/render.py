@@ -35,7 +35,7 @@ from progdf.scene.strays import picture_difference
 from progdf.terminal import file_size, format_count, print_line
 from progdf.threads import one_thread
 from viewer.camera import view_camera
-from viewer.camera.view_camera import FARTHEST, Vec3, ViewCamera, bounds_of
+from viewer.camera.view_camera import FARTHEST, LARGEST_SIDE, Vec3, ViewCamera, bounds_of
 from viewer.files import session
 from viewer.files.document import Document
 from viewer.files.session import WindowSession
@@ -61,7 +61,6 @@ from .options import (
 from .stack_options import parse
 
 DEFAULT_SIZE = (640, 480)
-LARGEST_SIDE = 16_384
 _SAY_EVERY_S = 0.5
 _LONGEST_S, _SWEEP_S = 120.0, 2.0  # of a turntable; of a slider there and back
 ONE_OF = ("sweep", "sheet", "split", "difference", "timeline", "turntable")

@@ -12,7 +12,7 @@ from imgui_bundle import imgui, imgui_ctx
 from progdf import __version__
 from progdf.io.session import SUFFIX
 from progdf.terminal import escape_text
-from viewer.camera.view_camera import SHAPES, ViewCamera
+from viewer.camera.view_camera import LARGEST_SIDE, SHAPES, ViewCamera
 from viewer.jobs.job_queue import FORMATS, FPS, SIDES, DeliverOptions, film_title, picture_size
 from viewer.state.view_state import ViewState
 from viewer.ui import overlay
@@ -235,7 +235,6 @@ def draw_cover(
 
 
 _COLUMN_PX = 100.0
-_LARGEST = 16_384
 
 
 def draw_fields(kind: str, path: str, options: DeliverOptions, ui: UiContext) -> tuple[str, DeliverOptions]:
@@ -284,7 +283,7 @@ def _size_fields(options: DeliverOptions, column: float, ui: UiContext) -> Deliv
     imgui.set_next_item_width(0.22 * room)
     _, height = imgui.input_int("##height", options.height, 0)
     imgui.same_line(0.0, 2 * gap)
-    size = min(max(width, 1), _LARGEST), min(max(height, 1), _LARGEST)
+    size = min(max(width, 1), LARGEST_SIDE), min(max(height, 1), LARGEST_SIDE)
     shapes, side = tuple(SHAPES), min(size)
     shape = next((name for name in shapes if picture_size(side, name) == size), None)
     high = choice("size", {side: f"{side}p" for side in SIDES}, side if shape else None, ui)
