@@ -97,12 +97,9 @@ def choose_resolution(
         scene, region: what they look at
         cameras_of: longer side in pixels, number of views -> cameras
     """
-    tried = [(size, MOST_VIEWS) for size in SIZES] if options.dense else []
-    if options.dense and options.cameras is None and not options.views:
-        tried.pop()
-    tried = [
-        (options.image_size or size, options.views or views) for size, views in tried or [(SIZES[0], VIEWS)]
-    ]
+    sizes = SIZES if options.cameras is not None or options.views else SIZES[:-1]
+    tried = [(size, MOST_VIEWS) for size in sizes] if options.dense else [(SIZES[0], VIEWS)]
+    tried = [(options.image_size or size, options.views or views) for size, views in tried]
     for size, views in tried:
         cameras = cameras_of(size, views)
         count = min(views, len(cameras)) * 4 // 5  # every fifth is held out
@@ -311,7 +308,7 @@ def edit_views(
 
     add_pictures(folder.views, [path for some in paths.values() for path in some])
     edited: dict[float, list[Tensor]] = {strength: [] for strength in strengths}
-    together = isinstance(editor, ColorEditor | StripesEditor)
+    together = isinstance(editor, ColorEditor | StripesEditor)  # the others have a network, or use all cores
     requests = [[(strength, i)] for strength in strengths for i in range(len(views))]
     if together and strengths:
         requests = [[(strength, i) for strength in strengths] for i in range(len(views))]

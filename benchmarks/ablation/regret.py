@@ -189,7 +189,6 @@ class Edit:
         model, offsets = plan.model, [snapshot.offsets for snapshot in made]
         views = len(self.setup.held_out) + len(plan.solver.views)
         spent -= (1.0 - views / len(self.setup.views)) * (len(made) - 1) * self.a_strength  # not asked for
-        views = len(self.setup.views) - len(self.setup.train) + len(plan.solver.views)
         name = f"automatic: {views} views, {len(strengths)} strengths, {model.bands} SH"
         result = self.measure(name, judge, strengths, model.bands, tables, offsets, spent, model.mask)
         return model, strengths, f"{model.line}; strengths {at} in {steps} steps", result

@@ -169,9 +169,8 @@ def fit_grades(
     choice = pick_candidate(tried, evaluator.wanted)
     form = choice.best.field.origin
     assert isinstance(form, GradeForm)
-    attributes = bake_grade(form, rows, mapped).attributes
-    best = replace(choice.best, field=replace(choice.best.field, attributes=attributes))
-    return _measure_choice(replace(choice, best=best), trajectory, reporting)
+    field = replace(choice.best.field, attributes=bake_grade(form, rows, mapped).attributes)
+    return _measure_choice(replace(choice, best=replace(choice.best, field=field)), trajectory, reporting)
 
 
 def field_evaluator(trajectory: Trajectory, views: Evaluator, target: float | None) -> FieldEvaluator:

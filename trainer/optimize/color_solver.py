@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -88,15 +88,18 @@ class Model:
     def figures(self) -> dict[str, Any]:
         """As report.json has it."""
         tried = {name: round(error, 2) for name, error in self.tried}
-        masked = self.mask is not None
-        return {"degree": self.degree, "mask": masked, "sh_functions": self.bands, "tried_psnr": tried}
+        return {
+            "degree": self.degree,
+            "mask": self.mask is not None,
+            "sh_functions": self.bands,
+            "tried_psnr": tried,
+        }
 
     @property
     def line(self) -> str:
         """What was chosen and over what, for the log."""
-        residual = (
-            f"and a residual of {self.bands} SH function{'s' * (self.bands > 1)}" if self.bands else "alone"
-        )
+        functions = f"{self.bands} SH function{'s' * (self.bands > 1)}"
+        residual = f"and a residual of {functions}" if self.bands else "alone"
         over = ", ".join(f"{name} {error:.1f}" for name, error in self.tried)
         of_color = f"a map of color of degree {self.degree}" if self.degree else "no map"
         of_color += "" if self.mask is None else ", a mask of it"
@@ -120,11 +123,6 @@ class _Attempt:
     def bands(self) -> int:
         """See `Model.bands`."""
         return self.residuals[0].shape[1]
-
-    @property
-    def size(self) -> int:
-        """Bytes by member, of one basis of a residual."""
-        return 3 * self.bands + self.masked
 
     @property
     def changes(self) -> list[Tensor]:
@@ -348,6 +346,80 @@ def split_solver(solver: Solver, original: Tensor, targets: Sequence[Tensor]) ->
     return [(make_solver(folds[i], original, solver.ties), Judge(folds[1 - i], targets)) for i in (0, 1)]
 
 
+@dataclass
+class _Trials:
+    """What is tried, on views or pixels that the solvers do not know."""
+
+    trials: Sequence[tuple[Solver, Judge]]
+    targets: Sequence[Tensor]  # the finished edit in the solvers' views
+    most_steps: int  # of conjugate gradients for a residual
+    tried: list[_Attempt] = field(default_factory=list)
+    steps: int = 0  # that all of these took
+
+    def start(self, degree: int) -> _Attempt:
+        """A map alone, not judged."""
+        solvers = [by for by, _ in self.trials]
+        offsets = [by.fit_map(degree, self.targets)[1] for by in solvers]
+        return _Attempt("", math.inf, solvers, degree, offsets, [made[:, :0] for made in offsets], _RIDGE)
+
+    def error(self, changes: Sequence[Tensor]) -> float:
+        """Mean over the trials of what changes leave. [M,B,3] each"""
+        return sum(by.error(made) for (_, by), made in zip(self.trials, changes, strict=True)) / len(changes)
+
+    def attempt(self, base: _Attempt, name: str, bands: int, hold: float) -> _Attempt:
+        """With a residual that begins where that of `base` ended."""
+        residuals = [pad(one[:, :bands], (0, 0, 0, max(0, bands - base.bands))) for one in base.residuals]
+        if bands:
+            each = zip(base.solvers, self.trials, base.offsets, residuals, strict=True)
+            found = [
+                by.residual(made, one, self.targets, self.most_steps, judge, hold=hold)
+                for by, (_, judge), made, one in each
+            ]
+            residuals = [residual for residual, _ in found]
+            self.steps += max(taken for _, taken in found)
+        made = replace(base, name=name, residuals=residuals, hold=hold)
+        self.tried.append(replace(made, error=self.error(made.changes)))
+        return self.tried[-1]
+
+    def try_masks(self, best: _Attempt, alone: float, most_bands: int) -> _Attempt:
+        """The best with a mask, where one pays: band for band beside what there is without.
+
+        `alone`: what maps alone leave
+        """
+        without = {one.bands: one.error for one in sorted(self.tried, key=lambda one: -one.error)}
+        enough = alone * (without.get(1, alone) / alone) ** (1 / 3)  # what one of the three bytes of DC does
+        if not (others := self._with_masks(best, enough)):
+            return best
+        masked = [self.attempt(base, f"a mask of degree {base.degree}", 0, best.hold) for base in others]
+        base = others[_least(masked, lambda one: one.degree).degree - 1]
+        masked = masked if self.trials[0][0].ties is None else []  # of a few pictures no mask alone
+        for bands in (bands for bands in BANDS if bands <= most_bands):
+            base = self.attempt(base, f"with a mask and a residual of {bands}", bands, best.hold)
+            masked.append(base)
+            if not LEVEL < base.error < MORE_PAYS * without.get(bands, 0.0):
+                break
+        # by the bytes of a member, of one basis: degrees take none
+        return _least([best, *masked], lambda one: 3 * one.bands + one.masked, LEVEL)
+
+    def _with_masks(self, best: _Attempt, enough: float) -> list[_Attempt]:
+        """The same change by masks of the trials' own and maps of each degree, what is missing in the
+        residuals; none where the mask that the members' changes ask for leaves more than `enough`."""
+        solvers = [
+            by.guess_mask(change, best.degree > 0)
+            for by, change in zip(best.solvers, best.changes, strict=True)
+        ]
+        guesses = [[by.fit_map(degree, self.targets)[1] for by in solvers] for degree in MONOMIALS]
+        if min(map(self.error, guesses)) >= enough:
+            return []
+        solvers = [by.improve_mask(self.targets) for by in solvers]
+        bases, masked = list[_Attempt](), replace(best, solvers=solvers, masked=True)
+        for degree in MONOMIALS:
+            offsets = [by.fit_map(degree, self.targets)[1] for by in solvers]
+            residuals = [(change - made)[:, :1] for change, made in zip(best.changes, offsets, strict=True)]
+            bases.append(replace(masked, degree=degree, offsets=offsets, residuals=residuals))
+        return bases
+
+
 def choose_model(
     solver: Solver,
     trials: Sequence[tuple[Solver, Judge]],
@@ -368,74 +440,40 @@ def choose_model(
         steps: most steps of conjugate gradients for a residual
         most_bands: SH functions that a residual may have: 1, 4 or 9
     """
-    tried, taken = list[_Attempt](), list[int]()
-    few, judges = solver.ties is not None, [judge for _, judge in trials]
+    tries, few = _Trials(trials, targets, steps), solver.ties is not None
     most_bands = min(most_bands, 1 if few else solver.sh.shape[1])
-
-    def attempt(base: _Attempt, name: str, bands: int, hold: float) -> _Attempt:
-        """With a residual that begins where that of `base` ended."""
-        residuals = [pad(one[:, :bands], (0, 0, 0, max(0, bands - base.bands))) for one in base.residuals]
-        if bands:
-            found = [
-                by.residual(made, one, targets, steps, judge, hold=hold)
-                for by, judge, made, one in zip(base.solvers, judges, base.offsets, residuals, strict=True)
-            ]
-            residuals, counts = [residual for residual, _ in found], [count for _, count in found]
-            taken.append(max(counts))
-        made = replace(base, name=name, residuals=residuals, hold=hold)
-        tried.append(replace(made, error=_error(judges, made.changes)))
-        return tried[-1]
-
-    def start(degree: int) -> _Attempt:
-        solvers = [by for by, _ in trials]
-        offsets = [by.fit_map(degree, targets)[1] for by in solvers]
-        return _Attempt("", math.inf, solvers, degree, offsets, [made[:, :0] for made in offsets], _RIDGE)
-
-    def left_by(base: _Attempt) -> float:
-        return sum(judge.mean(made, 1.0) for judge, made in zip(judges, base.offsets, strict=True))
-
-    bases = {degree: start(degree) for degree in (0, *MONOMIALS)}
+    bases = {degree: tries.start(degree) for degree in (0, *MONOMIALS)}
     # of what no picture shows a map is a guess: where it is the worse one for most that is shown, for less
     # than about half of that is painted, there is none
-    degrees = (0,) if few and left_by(bases[0]) <= min(left_by(bases[d]) for d in MONOMIALS) else MONOMIALS
+    left = [
+        sum(judge.mean(made, 1.0) for (_, judge), made in zip(trials, base.offsets, strict=True))
+        for base in bases.values()
+    ]
+    degrees = (0,) if few and left[0] <= min(left[1:]) else MONOMIALS
     names = {degree: f"map of degree {degree}" if degree else "no map" for degree in degrees}
     hold = _HOLDS[0] if few else _RIDGE
-    by_degree = [attempt(bases[degree], name, int(few), hold) for degree, name in names.items()]
+    by_degree = [tries.attempt(bases[degree], name, int(few), hold) for degree, name in names.items()]
     best = last = _least(by_degree, lambda one: one.degree)
     sizes = [(bands, _RIDGE) for bands in BANDS if bands <= most_bands]
     for bands, hold in [(1, hold) for hold in _HOLDS[1:]] if few else sizes:
         name = f"residual held by {hold:g}" if few else f"with a residual of {bands}"
-        last = attempt(last, name, bands, hold)
+        last = tries.attempt(last, name, bands, hold)
         if last.error >= best.error and not few:
             break
         if max(last.error, LEVEL) < MORE_PAYS * best.error:
             best = last
-    richer = (
-        (last.residuals[0], last.error) if last.bands > best.bands > 0 and last.error < best.error else None
-    )
+    is_richer = last.bands > best.bands > 0 and last.error < best.error
     spreads = best.degree > 0  # what no picture shows follows the map, masked or not
-    alone = min(_error(judges, bases[degree].offsets) for degree in MONOMIALS)
-    is_met = best.bands <= 1 and best.error <= LEVEL and not few
-    of_dc = min((one.error for one in tried if one.bands == 1), default=alone)
-    enough = alone * (of_dc / alone) ** (1 / 3)  # a mask's byte takes away what one of the three of DC does
-    if best.bands and not is_met and (others := _with_masks(best, enough, judges, targets)):
-        masked = [attempt(base, f"a mask of degree {base.degree}", 0, best.hold) for base in others]
-        base = others[_least(masked, lambda one: one.degree).degree - 1]
-        masked = [] if few else masked
-        unmasked = {one.bands: one.error for one in tried if not one.masked}
-        masked.append(attempt(base, "with a mask and a residual of 1", 1, best.hold))
-        for bands in BANDS[1:]:
-            pays = LEVEL < masked[-1].error < MORE_PAYS * unmasked.get(masked[-1].bands, 0.0)
-            if pays and bands <= most_bands:
-                masked.append(attempt(masked[-1], f"with a mask and a residual of {bands}", bands, best.hold))
-        best = _least([best, *masked], lambda one: one.size, LEVEL)  # degrees take no bytes, these do
+    if best.bands and (few or best.bands > 1 or best.error > LEVEL):
+        alone = min(tries.error(bases[degree].offsets) for degree in MONOMIALS)
+        best = tries.try_masks(best, alone, most_bands)
     chosen, residual = best.solvers[0], best.residuals[0]
     if few:
         chosen, residual = _solve_whole(solver, best, targets, steps, spreads)
     mask = (chosen.share * 255.0).round().to(torch.uint8) if best.masked else None
-    decided = [(one.name, decibels(one.error)) for one in tried]
-    richer = None if best.masked else richer
-    return chosen, Model(best.degree, best.hold, residual, mask, best.error, decided, sum(taken), richer)
+    decided = [(one.name, decibels(one.error)) for one in tries.tried]
+    richer = (last.residuals[0], last.error) if is_richer and not best.masked else None
+    return chosen, Model(best.degree, best.hold, residual, mask, best.error, decided, tries.steps, richer)
 
 
 def solve_again(
@@ -503,32 +541,6 @@ def _least(attempts: Sequence[_Attempt], size: Callable[[_Attempt], int], floor:
     """The smallest within a twentieth of the least error, or of an error that does not show."""
     least = max(floor, min(one.error for one in attempts))
     return min((one for one in attempts if MORE_PAYS * one.error <= least), key=size)
-
-
-def _with_masks(
-    best: _Attempt, enough: float, judges: Sequence[Judge], targets: Sequence[Tensor]
-) -> list[_Attempt]:
-    """The same change by masks of the trials' own and maps of each degree, what is missing in the residuals;
-    none where the mask that the members' changes ask for leaves more than `enough`.
-    """
-    solvers = [
-        by.guess_mask(change, best.degree > 0) for by, change in zip(best.solvers, best.changes, strict=True)
-    ]
-    guesses = {degree: [by.fit_map(degree, targets)[1] for by in solvers] for degree in MONOMIALS}
-    if min(_error(judges, made) for made in guesses.values()) >= enough:
-        return []
-    solvers, bases = [by.improve_mask(targets) for by in solvers], list[_Attempt]()
-    for degree in MONOMIALS:
-        offsets = [by.fit_map(degree, targets)[1] for by in solvers]
-        residuals = [(change - made)[:, :1] for change, made in zip(best.changes, offsets, strict=True)]
-        bases.append(
-            replace(best, solvers=solvers, degree=degree, offsets=offsets, residuals=residuals, masked=True)
-        )
-    return bases
-
-
-def _error(judges: Sequence[Judge], changes: Sequence[Tensor]) -> float:
-    return sum(judge.error(change) for judge, change in zip(judges, changes, strict=True)) / len(judges)
 
 
 def _inner(a: Tensor, b: Tensor) -> float:

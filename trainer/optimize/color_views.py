@@ -279,7 +279,7 @@ def mask_of_members(colors: Tensor, change: Tensor, weights: Tensor) -> Tensor:
 
     size = change.norm(dim=1)
     typical = ((weights @ size.square()) / weights.sum().clamp_min(1e-30)).sqrt()
-    share = (size / typical.clamp_min(1e-12)).clamp(0.0, 1.0)
+    share: Tensor = (size / typical.clamp_min(1e-12)).clamp(0.0, 1.0)
     for _ in range(_MASK_TURNS):
         full = fit_change(share)
         power = full.square().sum(dim=1).clamp_min(1e-12)
@@ -287,8 +287,7 @@ def mask_of_members(colors: Tensor, change: Tensor, weights: Tensor) -> Tensor:
         order = along.argsort()
         reached = evidence[order].cumsum(0) >= _MASK_WITHIN * evidence.sum()
         share = (along / along[order][reached][0].clamp_min(1e-6)).clamp(0.0, 1.0)
-    result: Tensor = share.float()
-    return result
+    return share.float()
 
 
 @one_thread()

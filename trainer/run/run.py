@@ -268,7 +268,7 @@ def _run_training(
         )
         extra = {"members": region.members, "score": region.score}
         save_trajectory(folder.trajectory, trajectory, extra, plain(record))
-        setup = _keep_solved(setup, record.effort, folder)
+        setup = setup.keep_solved(record.effort)
         with log.stage("final"):
             grown = setup.extend(trajectory.added)
             finals = grown.scene.replace_rows(grown.region.members, end_rows(grown, trajectory))
@@ -281,16 +281,12 @@ def _run_training(
     del edited, train_edits, between  # what is needed of all this is read anew, as it is on disk
     trajectory, _, about = load_trajectory(folder.trajectory)
     record, begun = read_record(about), folder.state.load(NETWORK)
-    setup = _keep_solved(setup, record.effort, folder)
-    return finish_run(folder, setup, trajectory, record, perceptual, log, begun)
-
-
-def _keep_solved(setup: TrainingSetup, effort: Mapping[str, Any], folder: RunFolder) -> TrainingSetup:
-    """Without the training views that a run did not solve for, on disk too."""
-    setup = setup.keep_solved(effort)
-    save_cameras(folder.cameras, [view.camera for view in setup.views], setup.scene.origin)
+    setup = setup.keep_solved(record.effort)
+    result = finish_run(folder, setup, trajectory, record, perceptual, log, begun)
+    # not before: a run that is stopped needs all views to go on
+    save_cameras(folder.cameras, [view.camera for view in setup.views], scene.origin)
     remove_stale_views(folder, [view.camera.name for view in setup.views])
-    return setup
+    return result
 
 
 def _paint(
@@ -362,10 +358,12 @@ def _describe_views(setup: TrainingSetup) -> str:
     """How many views there are, for what, and of how many pixels."""
     cameras = [view.camera for view in setup.views]
     sizes = dict.fromkeys(f"{camera.width}x{camera.height}" for camera in cameras)
-    use = f"{len(setup.train)} views to train on and {len(setup.held_out)} to measure with"
-    if not setup.held_out:
-        use = f"{len(setup.train)} views to train on, by which the edit is measured too"
-    return f"{use}, {', '.join(sizes)} pixels"
+    aside = (
+        f" and {len(setup.held_out)} to measure with"
+        if setup.held_out
+        else ", by which the edit is measured too"
+    )
+    return f"{len(setup.train)} views to train on{aside}, {', '.join(sizes)} pixels"
 
 
 def _render_originals(
@@ -417,7 +415,7 @@ def _edit_views(
     views, spec = setup.views, options.editor.editor
     names = [view.camera.name for view in views]
     made: dict[float, Sequence[Tensor]] = {}
-    on_the_way = names  # views that strengths other than 1 have pictures of
+    on_the_way, known = names, list[float]()  # views of strengths other than 1; strengths that were edited
     approach, trial = Approach("color"), None
 
     def edit(strengths: Sequence[float], views: Sequence[View] = views) -> Pictures:
@@ -431,8 +429,10 @@ def _edit_views(
                 within = [view.with_painted([editor().edit(view, 1.0)]) for view in views]
             made.update(edit_views(editor(), within, new, folder, is_confined, advance, way))
         log.say(f"{spec}: a {approach.kind} edit at strength {', '.join(f'{s:g}' for s in strengths)}")
-        on_the_way = [view.camera.name for view in views]
-        saved = {"strengths": list(made), "on_the_way": on_the_way, **asdict(approach)}
+        if min(strengths) < 1.0:
+            on_the_way = [view.camera.name for view in views]
+        edited = [*dict.fromkeys((*known, *made))]
+        saved = {"strengths": edited, "on_the_way": on_the_way, **asdict(approach)}
         shared = painter.figures if isinstance(painter := editor(), AgreedEditor) else {}
         folder.state.save("edited", {}, saved | {"trial": trial, "shared": shared})
         return made
@@ -465,6 +465,7 @@ def _edit_views(
             return made, approach, trial, between
         except ProgdfError as error:
             made.clear()
+            known = done.values["strengths"]
             log.say(f"the views are edited again: {str(error).partition(';')[0]}")
     painter = editor()
     if isinstance(painter, FolderEditor) and painter.note is not None:
@@ -484,6 +485,8 @@ def _edit_views(
         raise ProgdfError(
             f"{spec} changes none of the views; check the region and what the editor is asked for"
         )
+    if rest := [s for s in known if s not in edited]:
+        edited = edit(rest, [view for view in views if view.camera.name in on_the_way])
     return edited, approach, trial, between
 
 

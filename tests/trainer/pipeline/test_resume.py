@@ -337,3 +337,30 @@ def test_an_edit_that_needs_half_of_the_views_keeps_no_others_and_goes_on_with_t
         train(options)
     train(replace(options, resume=True))
     assert bits(OUT) == expected
+
+
+@pytest.mark.parametrize("where", ["write_finals", "finish_run", "a lost view"])
+def test_such_a_run_stopped_later_or_that_lost_a_picture_goes_on_to_the_same_bits(
+    bear_folder: Path, monkeypatch: pytest.MonkeyPatch, where: str
+) -> None:
+    options = quick_options(bear_folder, views=0, stages=0, image_size=48)
+    options = replace(options, out=OUT, editor=EditorOptions("stripes:#20a040"))
+    train(options)
+    expected = bits(OUT)
+    shutil.rmtree(OUT)
+
+    def stop(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        if where == "a lost view":
+            at_step(patch, 3, lambda: os.kill(os.getpid(), signal.SIGINT))
+        else:
+            patch.setattr(trainer.run.run, where, stop)
+        with pytest.raises(KeyboardInterrupt):
+            train(options)
+    if where == "a lost view":
+        next((OUT / "views/edited").glob("*/orbit_*.png")).unlink()
+    train(replace(options, resume=True))
+    assert bits(OUT) == expected
+    assert ("edited again" in (OUT / "log.txt").read_text(encoding="utf-8")) == (where == "a lost view")
