@@ -88,12 +88,8 @@ class Model:
     def figures(self) -> dict[str, Any]:
         """As report.json has it."""
         tried = {name: round(error, 2) for name, error in self.tried}
-        return {
-            "degree": self.degree,
-            "mask": self.mask is not None,
-            "sh_functions": self.bands,
-            "tried_psnr": tried,
-        }
+        chosen = {"degree": self.degree, "mask": self.mask is not None, "sh_functions": self.bands}
+        return {**chosen, "tried_psnr": tried}
 
     @property
     def line(self) -> str:

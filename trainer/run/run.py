@@ -358,11 +358,8 @@ def _describe_views(setup: TrainingSetup) -> str:
     """How many views there are, for what, and of how many pixels."""
     cameras = [view.camera for view in setup.views]
     sizes = dict.fromkeys(f"{camera.width}x{camera.height}" for camera in cameras)
-    aside = (
-        f" and {len(setup.held_out)} to measure with"
-        if setup.held_out
-        else ", by which the edit is measured too"
-    )
+    others = f" and {len(setup.held_out)} to measure with"
+    aside = others if setup.held_out else ", by which the edit is measured too"
     return f"{len(setup.train)} views to train on{aside}, {', '.join(sizes)} pixels"
 
 
