@@ -216,7 +216,7 @@ class FieldOptions:
     sharpness; about .3 s a step with the network of 6 million)."""
     target_psnr: Annotated[float | None, absent_option("FLOAT", "a tenth of the edit's own error")] = None
     """The field's worst PSNR against the recorded trajectory over the slider, on held-out views, dB, in place
-    of that rule."""
+    of that rule. Lower values make smaller files; train also leaves out more SH of single Gaussians."""
     as_printed: Fixed[bool] = (
         False  # a network sees positions alone, through hard bins of the slider, with no codes
     )

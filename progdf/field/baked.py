@@ -12,11 +12,12 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from progdf.gaussians import ShownInNotebooks, attribute_slices
-from progdf.io.tensors import check_ascent, check_tensor, deflate
+from progdf.io.tensors import check_ascent, check_levels, check_tensor, deflate, inflate
 
 from .neural import NeuralField
 
@@ -271,14 +272,35 @@ class GradeForm:
 
     @cached_property
     def packed_levels(self) -> dict[str, Tensor]:
-        """What there is by member, as a file keeps it: see `deflate`, channel by channel. [B] uint8 each"""
-        packed = {"residual": deflate(self.residual.movedim(2, 1))} if len(self.residual) else {}
+        """What there is by member, as a file keeps it, see `deflate`: which of its functions have levels, and
+        these. [B] uint8 each"""
+        packed = dict[str, Tensor]()
+        if len(self.residual):
+            bases, members, channels = self.residual.shape
+            levels = self.residual.view(bases, members, channels // 3, 3).permute(0, 3, 2, 1)
+            functions = levels.any(dim=0).any(dim=0)
+            bits = torch.from_numpy(np.packbits(functions.numpy()))
+            packed = {"functions": deflate(bits), "residual": deflate(levels[:, :, functions])}
         return packed if self.mask is None else packed | {"mask": deflate(self.mask)}
 
     @property
     def bytes_per_member(self) -> float:
         """Stored bytes for one member; the map is the region's."""
         return sum(map(len, self.packed_levels.values())) / max(1, self.members)
+
+
+def unpack_levels(functions: Tensor, levels: Tensor, bases: int, members: int, channels: int) -> Tensor:
+    """The inverse of `GradeForm.packed_levels`. [B] uint8 each -> [R,M,3b] int8
+
+    Raises:
+        ValueError: they do not fit each other.
+    """
+    check_levels((bases, members, channels))
+    bits = inflate(functions, (-(-channels // 3 * members // 8),), torch.uint8)
+    there = torch.from_numpy(np.unpackbits(bits.numpy(), count=channels // 3 * members)).bool()
+    residual = torch.zeros(bases, 3, len(there), dtype=torch.int8)
+    residual[:, :, there] = inflate(levels, (bases, 3, int(there.sum())), torch.int8)
+    return residual.view(bases, 3, channels // 3, members).permute(0, 3, 2, 1).flatten(2)
 
 
 @dataclass(frozen=True)

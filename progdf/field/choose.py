@@ -45,10 +45,10 @@ ADDED = 0.1
 """Share of the error that an edit has against its editor which its field may add."""
 
 
-def allowed_error(own: float) -> float:
-    """What may be added to an edit's own error, mean square: `ADDED` of it, where it is less than 8 bits show
-    as much as brings both there."""
-    return (1.0 + ADDED) * max(own, LEVEL) - own
+def allowed_error(own: float, added: float = ADDED) -> float:
+    """What may be added to an edit's own error, mean square: this share of it, where it is less than 8 bits
+    show as much as brings both there."""
+    return (1.0 + added) * max(own, LEVEL) - own
 
 
 SAMPLES = 13
@@ -126,6 +126,7 @@ class FieldEvaluator:
         truth: the offsets at any strength, [M,C]; None is straight from snapshot to snapshot
         edited: the same pixels of the editor's own pictures, by the strength on the slider, 1 the last
         target: least PSNR over the slider where there are no such pictures, dB
+        added: share of the edit's error that may be added
     """
 
     def __init__(
@@ -136,14 +137,15 @@ class FieldEvaluator:
         truth: Callable[[float], Tensor] | None = None,
         edited: Mapping[float, Tensor] | None = None,
         target: float = 40.0,
+        added: float = ADDED,
     ) -> None:
         course = truth or (lambda s: interpolate_at(strengths, offsets, s))
-        self._render, self._rule = render, bool(edited)
+        self._render, self._rule, self._added = render, bool(edited), added
         self._nothing = torch.zeros(offsets.shape[1:])
         self._expected = self._pictures(course, sample_strengths())
         self._edited = edited or {1.0: self._pictures(course, [1.0])[0]}
         self._own = self._errors(course)
-        self._allowed = allowed_error(fmean(self._own)) if edited else 10 ** (-target / 10)
+        self._allowed = allowed_error(fmean(self._own), added) if edited else 10 ** (-target / 10)
         own = decibels(fmean(self._own))
         tenth = f"adds at most a tenth to the edit's own error ({own:.1f} dB to the editor)"
         self.wanted = tenth if edited else f"reaches {target:g} dB"
@@ -151,7 +153,7 @@ class FieldEvaluator:
 
     def end_excess(self, end: Tensor) -> float:
         """The error of these offsets at strength 1 as a multiple of what is allowed there. [M,C]"""
-        allowed = allowed_error(self._own[-1]) if self._rule else self._allowed
+        allowed = allowed_error(self._own[-1], self._added) if self._rule else self._allowed
         with torch.no_grad():
             added = _difference(self._render(end), self._edited[max(self._edited)]) + ROUNDING - self._own[-1]
         return added / allowed
@@ -164,7 +166,7 @@ class FieldEvaluator:
         on_the_way = fmean(curve) if self._rule else max(curve)
         excess = max(fmean(found) - fmean(self._own), on_the_way) / self._allowed
         if self._rule:
-            excess = max(excess, (found[-1] - self._own[-1]) / allowed_error(self._own[-1]))
+            excess = max(excess, (found[-1] - self._own[-1]) / allowed_error(self._own[-1], self._added))
         to_editor = decibels(fmean(found)) if self._rule else None
         return Candidate(field, tuple(decibels(e) for e in curve), label, excess, to_editor)
 

@@ -20,14 +20,22 @@ import torch
 from torch import Tensor
 
 from progdf.errors import ProgdfError
-from progdf.field.baked import AttributeBases, BakedField, BakePlan, GradeForm, NeuralForm, SliderRemap
+from progdf.field.baked import (
+    AttributeBases,
+    BakedField,
+    BakePlan,
+    GradeForm,
+    NeuralForm,
+    SliderRemap,
+    unpack_levels,
+)
 from progdf.field.neural import NeuralField, NeuralShape
 from progdf.gaussians import ATTRIBUTES, ZERO, Gaussians, Origin
 from progdf.io.json_values import convert_json, decode_json
 from progdf.io.tensors import check_tensor, inflate
 from progdf.region import Region
 
-FORMAT = 6
+FORMAT = 7
 """The version of the file format."""
 
 MOST_GAUSSIANS = 1 << 26
@@ -197,7 +205,11 @@ def unpack_field(header: FieldHeader, tensors: Mapping[str, Tensor], members: in
         parts = {name: tensors[name] for name in (*_GRADE, "mask") if name in tensors}
         bases, channels = tensors["scale"].shape
         if (levels := tensors.get("residual" + _PACKED)) is not None:  # since format 6
-            parts["residual"] = inflate(levels, (bases, channels, members), torch.int8).movedim(1, 2)
+            functions = tensors.get("functions" + _PACKED)  # since format 7
+            if functions is None:
+                parts["residual"] = inflate(levels, (bases, channels, members), torch.int8).movedim(1, 2)
+            else:
+                parts["residual"] = unpack_levels(functions, levels, bases, members, channels)
         if (levels := tensors.get("mask" + _PACKED)) is not None:
             parts["mask"] = inflate(levels, (members,), torch.uint8)
         grade = GradeForm(header.grade, **parts, remap=SliderRemap(old, new))

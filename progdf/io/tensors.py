@@ -138,15 +138,20 @@ def deflate(levels: Tensor) -> Tensor:
     return torch.from_numpy(np.frombuffer(packed, np.uint8).copy())
 
 
+def check_levels(shape: Sequence[int]) -> int:
+    """How many levels these are. Raises ValueError where a small file asks for memory without bounds."""
+    if (size := math.prod(shape)) > _MOST_LEVELS:
+        raise ValueError(f"{list(shape)} packed levels, more than {_MOST_LEVELS}")
+    return size
+
+
 def inflate(packed: Tensor, shape: Sequence[int], dtype: torch.dtype) -> Tensor:
     """The inverse of `deflate`, never more than that many numbers. [B] uint8 -> [...] int8 or uint8
 
     Raises:
         ValueError: they are not as many.
     """
-    size = math.prod(shape)
-    if size > _MOST_LEVELS:
-        raise ValueError(f"{list(shape)} packed levels, more than {_MOST_LEVELS}")
+    size = check_levels(shape)
     if packed.dtype != torch.uint8 or packed.ndim != 1:
         raise ValueError(f"packed levels are {list(packed.shape)} {packed.dtype}, expected bytes")
     try:

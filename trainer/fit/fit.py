@@ -14,7 +14,7 @@ from torch import Tensor
 
 from progdf.field import BakedField, Candidate, FieldChoice, FieldEvaluator, choose_field
 from progdf.field.baked import GradeForm, NeuralForm
-from progdf.field.choose import MOST_SNAPSHOTS, SAMPLES, pick_candidate
+from progdf.field.choose import ADDED, MOST_SNAPSHOTS, SAMPLES, pick_candidate
 from progdf.field.grade import COARSER, bake_grade, fit_grade, lowest_bands, mapped_bands, rank_limit
 from progdf.field.keyframes import fit_keyframes, keyframe_rows
 from progdf.field.separable import moving_attributes
@@ -31,6 +31,9 @@ from trainer.views.choose import split_held_out
 from trainer.views.view import View
 
 from .evaluate import Evaluator, make_evaluator
+
+THINNED = 0.025
+"""Of what a field may add, what is left to functions that single members do not have, see `thin`."""
 
 _VIEWS = 3
 _BETTER = 0.5  # dB by which the own way has to be nearer: it takes several times the bytes
@@ -180,7 +183,8 @@ def field_evaluator(trajectory: Trajectory, views: Evaluator, target: float | No
     edited = {s: views.count(views.edited[strength]) for s, strength in known}
     course = trajectory.s, trajectory.offsets, views.counted_pixels, trajectory.at
     if target is None:
-        return FieldEvaluator(*course, edited=edited)
+        added = ADDED if trajectory.bands < 2 else ADDED - THINNED
+        return FieldEvaluator(*course, edited=edited, added=added)
     return FieldEvaluator(*course, target=target)
 
 

@@ -18,7 +18,7 @@ for.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -45,7 +45,6 @@ from .color_views import (
     iterate_views,
     mask_of_members,
 )
-from .pgs import TargetStage
 from .ties import Ties
 
 STEPS_OF_OTHERS = 8
@@ -63,7 +62,9 @@ _TRUSTED = 0.1  # of the same: a member of less is rather as its neighbors are
 _HOLDS = (1e-8, 1e-5, 1e-3)  # ridges tried there: a residual goes around all, some way, to its neighbors
 _SHOWS = 0.5  # pixels of a member in each of two pictures, from which on these say what it is
 _SHARES = (1.0, 0.5, 0.2)  # of a step, where the whole of it would run into clamps
-_LOOKS = 3  # steps over which that is taken: a single one may gain nothing in other views
+
+LOOKS = 3
+"""Steps over which that is taken: a single one may gain nothing in other views."""
 
 
 @dataclass(frozen=True)
@@ -77,24 +78,40 @@ class Model:
     error: float  # mean square, of the finished edit in views not solved for: what is finer is not chased
     tried: Sequence[tuple[str, float]]  # what was tried, and its error on views not solved for, dB
     steps: int  # that all of this took
-    # residual and error with another band, where that is better, but by less than a twentieth
-    richer: tuple[Tensor, float] | None = None
+    # with another band, where that is better, but by less than a twentieth. [M,B,3]
+    richer: Tensor | None = None
+    begun: Mapping[float, Tensor] = field(default_factory=dict)  # strength → a residual to begin with there
 
     @property
     def bands(self) -> int:
         """How many bands the residual has."""
         return self.residual.shape[1]
 
+    @property
+    def functions(self) -> float:
+        """How many of these a member has, on average."""
+        return float(self.residual.any(dim=2).float().sum(dim=1).mean()) if self.bands else 0.0
+
     def figures(self) -> dict[str, Any]:
         """As report.json has it."""
         tried = {name: round(error, 2) for name, error in self.tried}
-        chosen = {"degree": self.degree, "mask": self.mask is not None, "sh_functions": self.bands}
+        chosen: dict[str, Any] = {
+            "degree": self.degree,
+            "mask": self.mask is not None,
+            "sh_functions": self.bands,
+        }
+        chosen |= {"functions_per_gaussian": round(self.functions, 2)}
         return {**chosen, "tried_psnr": tried}
 
     @property
     def line(self) -> str:
         """What was chosen and over what, for the log."""
         functions = f"{self.bands} SH function{'s' * (self.bands > 1)}"
+        functions += (
+            f", {self.functions:.1f} of them a Gaussian"
+            if self.bands > 1 and self.functions < self.bands
+            else ""
+        )
         residual = f"and a residual of {functions}" if self.bands else "alone"
         over = ", ".join(f"{name} {error:.1f}" for name, error in self.tried)
         of_color = f"a map of color of degree {self.degree}" if self.degree else "no map"
@@ -148,7 +165,7 @@ class Solver:
     maps: MapFit
     share: Tensor  # how much of a map each member takes, 0..1. [M]
     ties: Ties | None  # None where views are many
-    asked: Tensor  # members whose residual is solved for. [M] bool
+    asked: Tensor  # which members' functions are solved for. [M,b] bool
     held: csr_matrix  # ties among these, as strong as they are to be. [M,M]
 
     def fit_map(self, degree: int, targets: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
@@ -179,7 +196,8 @@ class Solver:
         weights = self.weights[:, 0, 0]
         share = mask_of_members(self.sh[:, 0] * C0 + 0.5, change[:, 0] * C0, weights)
         if self.ties is not None:
-            mean, say = weights @ share / weights.sum(), self.asked * weights / (_TRUSTED * self.typical)
+            mean = weights @ share / weights.sum()
+            say = self.asked[:, 0] * weights / (_TRUSTED * self.typical)
             mean = mean * spreads
             share = mean + self.ties.spread((share - mean)[:, None, None], say, _HOLDS[0] / _TIES)[:, 0, 0]
         return self.with_mask(share.clamp(0.0, 1.0))
@@ -187,8 +205,21 @@ class Solver:
     def improve_mask(self, targets: Sequence[Tensor]) -> Solver:
         """The same with the mask that these pictures of the views ask for, in 255ths."""
         full = map_colors(self.sh, self.maps.solve(1, targets), 1) - self.sh
-        share = torch.where(self.asked, improve_mask(self.views, full, self.share, targets), self.share)
+        share = torch.where(self.asked[:, 0], improve_mask(self.views, full, self.share, targets), self.share)
         return self.with_mask((share * 255.0).round() / 255.0)
+
+    def only(self, residual: Tensor) -> Solver:
+        """The same for residuals that are 0 beyond DC where this one is. [M,b,3]"""
+        asked = self.asked.clone()
+        asked[:, 1 : residual.shape[1]] &= residual[:, 1:].any(dim=2)
+        return replace(self, asked=asked)
+
+    def halve(self, residuals: Sequence[Tensor]) -> list[Tensor]:
+        """Residuals without the half of what they have beyond DC that adds least to the pictures. [M,b,3]"""
+        size = torch.stack([one[:, 1:].square().sum(dim=2) for one in residuals]).sum(dim=0)
+        adds = size * self.weights.diagonal(dim1=1, dim2=2)[:, 1 : 1 + size.shape[1]]
+        kept = adds > adds[adds > 0.0].median()
+        return [torch.cat([one[:, :1], one[:, 1:] * kept[..., None]], dim=1) for one in residuals]
 
     @one_thread()  # sums of members are added in an order that depends on the number of threads
     def residual(
@@ -219,15 +250,16 @@ class Solver:
         ridge = hold * self.typical
         targets = [view.pick(target) for view, target in zip(self.views, targets, strict=True)]
         look = None if judge is None else lambda now: judge.error(add_bands(mapped, now))
-        start = start * self.asked[:, None, None]
+        asked = self.asked[:, : start.shape[1], None]
+        start = start * asked
         residual, first = self._descend(mapped, start, targets, ridge, steps, tell, look, floor)
         if self.ties is None:
             return residual, first
-        weights = self.asked * self.weights[:, 0, 0] / (_TRUSTED * self.typical)
+        weights = self.asked[:, 0] * self.weights[:, 0, 0] / (_TRUSTED * self.typical)
         around = self.ties.spread(residual, weights, hold / _TIES)
-        start = around * self.asked[:, None, None]
+        start = around * asked
         residual, more = self._descend(mapped, start, targets, ridge, steps, tell, look, floor)
-        return torch.where(self.asked[:, None, None], residual, around), first + more
+        return torch.where(asked, residual, around), first + more
 
     def _descend(
         self,
@@ -242,12 +274,13 @@ class Solver:
     ) -> tuple[Tensor, int]:
         """See `residual`; `look`: the judge's error."""
         count, held = start.shape[1], torch.from_numpy(self.held.diagonal()) + max(ridge, 1e-30)
-        curvature = self.weights[:, :count, :count] + held[:, None, None] * torch.eye(count)
-        inverse = torch.linalg.inv(curvature.double()).float() * self.asked[:, None, None]
+        asked = self.asked[:, :count, None] & self.asked[:, None, :count]
+        curvature = self.weights[:, :count, :count] * asked + held[:, None, None] * torch.eye(count)
+        inverse = torch.linalg.inv(curvature.double()).float() * asked
         now, pull = start, self._pull(mapped, start, targets, ridge)
         conditioned = along = inverse @ pull.descent
         best, taken = now, 0
-        looks = [math.inf] * (_LOOKS - 1) + [math.inf if look is None else look(now)]
+        looks = [math.inf] * (LOOKS - 1) + [math.inf if look is None else look(now)]
         while taken < steps:
             length = _inner(pull.descent, along) / max(self._curvature(pull, along, ridge), 1e-30)
             for share in _SHARES:
@@ -266,7 +299,7 @@ class Solver:
                 error = look(now)
                 best = now if error < min(looks) else best
                 looks.append(error)
-                settled = looks[-1 - _LOOKS] - error <= _LOOKS * SETTLED * max(error, floor, LEVEL)
+                settled = looks[-1 - LOOKS] - error <= LOOKS * SETTLED * max(error, floor, LEVEL)
                 if settled or error <= LEVEL:
                     break
             conditioned = inverse @ pull.descent
@@ -278,7 +311,7 @@ class Solver:
     @property
     def typical(self) -> float:
         """The mean weight of the members that are asked."""
-        return float(self.weights[self.asked, 0, 0].mean())
+        return float(self.weights[self.asked[:, 0], 0, 0].mean())
 
     def _hold(self, x: Tensor, ridge: float) -> Tensor:
         """The gradient of half of what a residual costs beside the pixels. [M,b,3] -> [M,b,3]"""
@@ -325,13 +358,14 @@ def make_solver(views: Sequence[ColorView], original: Tensor, ties: Ties | None 
     for view, weight in zip(views, weighed, strict=True):
         bands = view.basis[:, : BANDS[-1]]
         weights = weights + (weight[:, None] * bands)[:, :, None] * bands[:, None]
-    asked = torch.ones_like(original[:, 0], dtype=torch.bool)
+    asked = torch.ones(len(original), weights.shape[1], dtype=torch.bool)
     held = csr_matrix((len(original), len(original)), dtype=np.float32)
     if ties is not None:
         shown = torch.stack(map_threads(lambda view: view.map.gradient(view.counts * ones[:1])[:, 0], views))
         twice = (shown > _SHOWS).sum(dim=0) > 1
-        asked = (ties.clear | twice) & (weights[:, 0, 0] > 0.0)
-        held = ties.of(asked) * np.float32(_TIES * float(weights[asked, 0, 0].mean()))
+        some = (ties.clear | twice) & (weights[:, 0, 0] > 0.0)
+        held = ties.of(some) * np.float32(_TIES * float(weights[some, 0, 0].mean()))
+        asked = some[:, None].expand_as(asked)
     share = original.new_ones(len(original))
     return Solver(views, member_bands(original), weights, fit_maps(views, share), share, ties, asked, held)
 
@@ -468,7 +502,7 @@ def choose_model(
         chosen, residual = _solve_whole(solver, best, targets, steps, spreads)
     mask = (chosen.share * 255.0).round().to(torch.uint8) if best.masked else None
     decided = [(one.name, decibels(one.error)) for one in tries.tried]
-    richer = (last.residuals[0], last.error) if is_richer and not best.masked else None
+    richer = last.residuals[0] if is_richer and not best.masked else None
     return chosen, Model(best.degree, best.hold, residual, mask, best.error, decided, tries.steps, richer)
 
 
@@ -488,33 +522,6 @@ def solve_again(
     if model.bands:
         residual, _ = solver.residual(mapped, residual, targets, model.steps, judge, hold=model.hold)
     return solver, replace(model, residual=residual, error=judge.error(add_bands(mapped, residual)))
-
-
-def enrich(model: Model, solver: Solver, stage: TargetStage, judge: Judge, steps: int) -> Model:
-    """The model with another band where that pays on the way: less than a twentieth at the end can be
-    half of the error at a tenth of the slider, where a map leaves little but what turns with the view.
-
-    Args:
-        model: what the finished edit called for
-        solver: the views
-        stage: a strength on the way
-        judge: of that, views not solved for
-        steps: most steps of conjugate gradients
-    """
-    if model.richer is None:
-        return model
-    mapped, errors = solver.fit_map(model.degree, stage.targets)[1], list[float]()
-    for residual, error in ((model.residual, model.error), model.richer):
-        start = stage.strength * residual
-        made, _ = solver.residual(mapped, start, stage.targets, steps, judge, model.error, model.hold)
-        errors.append(max(error, LEVEL) + max(judge.error(add_bands(mapped, made)), LEVEL))
-    pays = errors[1] < MORE_PAYS * errors[0]
-    decided = (
-        f"with a residual of {model.richer[0].shape[1]}, at {stage.strength:g} too",
-        decibels(errors[1] / 2),
-    )
-    residual, error = model.richer if pays else (model.residual, model.error)
-    return replace(model, residual=residual, error=error, tried=[*model.tried, decided], richer=None)
 
 
 def _solve_whole(

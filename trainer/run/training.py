@@ -23,12 +23,11 @@ from progdf.metrics.image import LEVEL
 from progdf.rasterize.engines import engine_device
 from progdf.scene.bounds import scene_sphere
 from trainer.fit.network import JointTraining, begin_joint_training, save_network
-from trainer.optimize.color_course import STEPS, Course, Target, solve
+from trainer.optimize.color_course import STEPS, Course, Target, settle_bands, solve
 from trainer.optimize.color_solver import (
     Model,
     Solver,
     choose_model,
-    enrich,
     iterations,
     make_solver,
     solve_again,
@@ -167,7 +166,9 @@ def optimize_members(
         KeyboardInterrupt: interrupted; the state is saved.
     """
     if optimization.solver == "colors":
-        plan = plan_colors(optimization, setup, edited, between, options.views, log)
+        plan = plan_colors(
+            optimization, setup, edited, between, options.views, log, options.field.target_psnr
+        )
         return _solve(plan, folder, log)
     scene, members = setup.scene, setup.region.members
     bands = optimization.sh != "off"
@@ -237,6 +238,7 @@ def plan_colors(
     between: Strengths | None,
     options: ViewOptions,
     log: RunLog,
+    target_psnr: float | None = None,
 ) -> ColorPlan:
     """Solve for the finished edit, and decide by that how much is modelled and which strengths come next.
 
@@ -248,6 +250,7 @@ def plan_colors(
         options: whether the views are a handful of pictures, see `surface_ties`, or their number is open:
             then every other one is solved for where nothing that this leaves shows
         log: of the run
+        target_psnr: see `FieldOptions`
     """
     scene, members, count = setup.scene, setup.region.members, len(setup.train)
     original, few = pack(scene[members], with_shN=scene.sh_degree > 0), bool(options.pictures)
@@ -289,22 +292,23 @@ def plan_colors(
             if fewer[1].error <= LEVEL:
                 (solver, model), finished, train = fewer, half, train[::2]
     strengths = [s for s in edited if s < 1.0]
-    if between is not None and model.richer is not None:  # which is decided there
+    if between is not None and (model.bands > 1 or model.richer):  # what its bands are worth is told there
         strengths = strengths or [between.ruler[len(between.ruler) // 2]]
     course = Course(ask(strengths) if strengths else [], finished)
     if between is not None:
         course = replace(course, ruler=between.ruler, look=cache(look), ask=ask)
     with log.stage("model"):
         middle = len(course.targets) // 2 if between is None else 0
-        model = enrich(model, solver, *[*course.targets, finished][middle], most)
+        spare = 0.0 if target_psnr is None else 0.5 * 10 ** (-target_psnr / 10)
+        model = settle_bands(model, solver, [*course.targets[middle : middle + 1], finished], most, spare)
     on = "views that are held out" if held_out else "all views, as none is held out"
     if len(train) < count:
         log.say(f"{len(train)} of {count} views are solved for: all would change nothing that shows")
     log.say(f"{model.line}, on {on if ties is None else 'squares of the pictures that are held out'}")
     if ties is not None:
-        unseen = len(original) - int(solver.asked.sum())
+        unseen = len(original) - int(solver.asked[:, 0].sum())
         log.say(f"{unseen} members that no picture shows follow the map and their own surface")
-    return ColorPlan(original, solver, model, course, most)
+    return ColorPlan(original, solver.only(model.residual), model, course, most)
 
 
 def _stride(setup: TrainingSetup) -> int:

@@ -12,7 +12,15 @@ from torch import Tensor
 
 from progdf.compose.reference import Layer, compose_layers
 from progdf.errors import ProgdfError
-from progdf.field.baked import MONOMIALS, GradeForm, SliderRemap, identity_map, identity_remap, remap_slider
+from progdf.field.baked import (
+    MONOMIALS,
+    GradeForm,
+    SliderRemap,
+    identity_map,
+    identity_remap,
+    remap_slider,
+    unpack_levels,
+)
 from progdf.field.grade import (
     COARSER,
     MOST_COLOR,
@@ -157,6 +165,31 @@ def packed(tmp_path: Path) -> tuple[dict[str, object], dict[str, Tensor], GradeF
     return header_of(content), safetensors.torch.load(content), form
 
 
+def test_a_file_from_before_functions_were_left_out_gives_the_same_grade(
+    packed: tuple[dict[str, object], dict[str, Tensor], GradeForm], tmp_path: Path
+) -> None:
+    header, tensors, form = packed
+    del tensors["functions.packed"]
+    older = tensors | {"residual.packed": deflate(form.residual.movedim(2, 1))}
+    (tmp_path / "older.gdf").write_bytes(signed_gdf(header | {"format": 6}, older))
+    stored = read_gdf(tmp_path / "older.gdf").field.origin
+    assert isinstance(stored, GradeForm)
+    assert torch.equal(stored.residual, form.residual)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1, 1.0])
+def test_functions_that_members_lack_take_no_levels(share: float) -> None:
+    draws = torch.Generator().manual_seed(2)
+    levels = torch.randint(-90, 90, (2, 999, 9, 3), generator=draws, dtype=torch.int8)
+    levels[:, :, 1:] *= torch.rand(999, 8, 1, generator=draws) < share
+    knots, table = torch.tensor([0.0, 1.0]), torch.stack([identity_map(1), some_table(1)])
+    scale, coefficients = torch.ones(2, 27), torch.tensor([[0.0, 0.0], [1.0, 0.5]])
+    form = GradeForm(1, knots, table, levels.flatten(2), scale, coefficients, identity_remap())
+    packed = form.packed_levels
+    assert torch.equal(unpack_levels(packed["functions"], packed["residual"], 2, 999, 27), form.residual)
+    assert form.bytes_per_member < 1.02 * (6 + 48 * share) + 1.0
+
+
 def test_a_file_from_before_levels_were_packed_gives_the_same_grade(
     packed: tuple[dict[str, object], dict[str, Tensor], GradeForm], tmp_path: Path
 ) -> None:
@@ -178,6 +211,9 @@ def test_a_file_from_before_levels_were_packed_gives_the_same_grade(
     [
         {"residual.packed": torch.zeros(20, dtype=torch.uint8)},
         {"residual.packed": deflate(torch.zeros(899, dtype=torch.int8))},
+        {"functions.packed": torch.zeros(20, dtype=torch.uint8)},
+        {"functions.packed": deflate(torch.zeros(18, dtype=torch.uint8))},
+        {"functions.packed": deflate(torch.zeros(19, dtype=torch.uint8))},
         {"residual.packed": deflate(torch.zeros(1 << 22, dtype=torch.int8))},
         {"residual.packed": deflate(torch.zeros(900, dtype=torch.int8)).short()},
         {"mask.packed": deflate(torch.zeros(149, dtype=torch.uint8))},

@@ -19,13 +19,12 @@ from progdf.region import Region
 from progdf.sh import rgb_to_sh0
 from progdf.threads import map_threads
 from tests.helpers.scenes import random_gaussians
-from trainer.optimize.color_course import Course, Target, solve
+from trainer.optimize.color_course import Course, Target, settle_bands, solve
 from trainer.optimize.color_solver import (
     Model,
     Solver,
     add_bands,
     choose_model,
-    enrich,
     make_solver,
 )
 from trainer.optimize.color_views import Judge, color_views
@@ -257,10 +256,35 @@ def test_a_second_band_that_hardly_pays_at_the_end_is_taken_where_it_pays_on_the
     noisy = [image + 0.085 * torch.randn(image.shape, generator=rng) for image in pictures(others, 1.0)]
     solver, model = choose_model(solver, [(solver, Judge(aside, noisy))], pictures(crops, 1.0), 40, 4)
     assert model.bands == 1
-    stage = TargetStage(0.1, pictures(crops, 0.1), 1)
-    richer = enrich(model, solver, stage, Judge(aside, pictures(others, 0.1)), 40)
-    assert richer.bands == bands, richer.line
-    assert enrich(richer, solver, stage, Judge(aside, pictures(others, 0.1)), 40) is richer
+    early = TargetStage(0.1, pictures(crops, 0.1), 1), Judge(aside, pictures(others, 0.1))
+    finished = TargetStage(1.0, pictures(crops, 1.0), 1), Judge(aside, noisy)
+    assert settle_bands(model, solver, [finished], 40, 0.0).bands == 1
+    settled = settle_bands(model, solver, [early, finished], 40, 0.0)
+    assert settled.bands == bands, settled.line
+
+
+@pytest.mark.parametrize(("turning", "spare"), [(0.1, 0.0), (1.0, 0.0), (1.0, 3e-4)])
+def test_only_members_that_need_them_have_functions_beyond_dc(turning: float, spare: float) -> None:
+    scene = dense_ball(1500, bands=3)
+    some = torch.arange(1500) < 1500 * turning
+    edited = replace(scene, shN=scene.shN * (1.0 - 2.0 * some[:, None, None]))
+    crops, original = prepared(scene, orbit(8, 64))
+    others, _ = prepared(scene, orbit(16, 64)[1::2])
+    rows, solver = pack(edited, with_shN=True), make_solver(color_views(crops, original), original)
+    targets, aside = grainy(render_all(crops, rows), 0.01), grainy(render_all(others, rows), 0.01)
+    judge = Judge(color_views(others, original), aside)
+    solver, model = choose_model(solver, [(solver, judge)], targets, 40, 4)
+    thinner = settle_bands(model, solver, [(TargetStage(1.0, targets, 1), judge)], 40, spare)
+    mapped = solver.fit_map(model.degree, targets)[1]
+    errors = [judge.error(add_bands(mapped, one.residual)) for one in (model, thinner)]
+    assert errors[1] * 0.95 <= errors[0] + spare
+    functions = thinner.residual[:, 1:].any(dim=2)
+    share = float(functions[some].float().mean())
+    if turning < 1.0:
+        assert share > 30 * float(functions[~some].float().mean())
+    assert share == 1.0 if turning == 1.0 and not spare else 0.0 < share < 0.5
+    again = solver.only(thinner.residual).residual(mapped, model.residual, targets, 5)[0]
+    assert torch.equal(again[:, 1:].any(dim=2), functions)
 
 
 @pytest.mark.parametrize(
