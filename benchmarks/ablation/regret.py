@@ -7,7 +7,7 @@ them. Every field is measured in views in which nobody trains or chooses, at str
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from itertools import compress
@@ -114,6 +114,7 @@ class Edit:
     setup: TrainingSetup
     seconds: float = 0.0  # of the processor, for what every way needs
     pictures: dict[float, list[Tensor]] = field(default_factory=dict)  # of all views, by strength
+    courses: list[Callable[[float], Tensor]] = field(default_factory=list)  # of all views
     a_strength: float = 0.0  # of the processor, for all views' pictures at one strength
 
     def __post_init__(self) -> None:
@@ -136,7 +137,8 @@ class Edit:
         """All views, as they are kept."""
         if s not in self.pictures:
             began = time.process_time()
-            self.pictures[s] = [quantize_image(self.painter.edit(view, s)) for view in self.setup.views]
+            self.courses = self.courses or [edit_course(self.painter, view) for view in self.setup.views]
+            self.pictures[s] = [quantize_image(edit(s)) for edit in self.courses]
             self.a_strength = time.process_time() - began
         return self.pictures[s]
 

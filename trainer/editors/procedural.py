@@ -19,7 +19,7 @@ from progdf.color.oklab import ColorPath, bend_of, interpolate_colors, path_of
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from trainer.options import EditKind
-from trainer.views.view import BACKGROUND, View, render_colors, render_view, seen_colors
+from trainer.views.view import BACKGROUND, View, region_box, render_colors, render_view, seen_colors
 
 from .base import EditorInput, ImageEditor
 
@@ -67,22 +67,34 @@ class StripesEditor:
     stages: tuple[float, ...] = ()
     is_confined: bool = True
 
-    def paint(self, rgb: Tensor, strength: float) -> Tensor:
+    def paint(self, rgb: Tensor) -> color.Course:
         """The members' colors [M,3] under the paint, which takes most of the old texture's contrast away."""
         plainer = torch.lerp(rgb, self.typical.expand_as(rgb), (_COVER * self.pattern)[:, None])
         under = color.recolor_fully(plainer, self.target, self.typical)
         bend = bend_of(self.typical, self.target, self.path)
-        return interpolate_colors(rgb, under, strength * self.pattern, bend)
+        return lambda strength: interpolate_colors(rgb, under, strength * self.pattern, bend)
 
     def edit(self, view: View, strength: float) -> Tensor:
         """See `ImageEditor.edit`."""
-        if strength == 0.0:
-            return view.image
+        return self.course(view)(strength)
+
+    def course(self, view: View) -> Callable[[float], Tensor]:
+        """`edit` of one view at many strengths, rendered where the region shows."""
         scene, members, camera = self.scene, self.members, view.camera
-        painted = self.paint(seen_colors(scene[members], camera), strength)
-        colors = torch.zeros(len(scene), 3).index_copy(0, members, painted)
-        premultiplied = render_colors(scene, colors, camera, torch.zeros(3))
-        return view.blend((premultiplied / view.mask.clamp_min(1e-4)[..., None]).clamp(0.0, 1.0))
+        paint = self.paint(seen_colors(scene[members], camera))
+        x0, y0, x1, y1 = box = region_box(view.mask, 0, 0.0)
+
+        def edit(strength: float) -> Tensor:
+            if strength == 0.0:
+                return view.image
+            colors, inside = torch.zeros(len(scene), 3), view.inside.clone()
+            colors[members] = paint(strength)
+            drawn = render_colors(scene, colors, camera, torch.zeros(3), box)
+            share = view.mask[y0:y1, x0:x1, None].clamp_min(1e-4)
+            inside[y0:y1, x0:x1] = (drawn / share).clamp(0.0, 1.0)
+            return view.blend(inside)
+
+        return edit
 
 
 @dataclass(frozen=True)
@@ -108,7 +120,9 @@ class RemoveEditor:
 
 def edit_course(editor: ImageEditor, view: View) -> Callable[[float], Tensor]:
     """`editor.edit` of one view at many strengths."""
-    return editor.course(view) if isinstance(editor, ColorEditor) else partial(editor.edit, view)
+    if isinstance(editor, ColorEditor | StripesEditor):
+        return editor.course(view)
+    return partial(editor.edit, view)
 
 
 def recolor(given: EditorInput) -> ColorEditor:

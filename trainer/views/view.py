@@ -104,10 +104,12 @@ def seen_colors(scene: Gaussians, camera: Camera) -> Tensor:
     return shade(min(scene.sh_degree, 3), directions, scene.sh)
 
 
-def render_colors(scene: Gaussians, colors: Tensor, camera: Camera, background: Tensor) -> Tensor:
+def render_colors(
+    scene: Gaussians, colors: Tensor, camera: Camera, background: Tensor, crop: Crop | None = None
+) -> Tensor:
     """The scene in these colors instead of its own, without gradients. [N,3] -> [H,W,3]"""
     with torch.no_grad():
-        return render(scene, camera, background, colors=colors).image
+        return render(scene, camera, background, colors=colors, crop=crop).image
 
 
 def render_view(scene: Gaussians, camera: Camera, background: Tensor) -> Tensor:
@@ -115,10 +117,10 @@ def render_view(scene: Gaussians, camera: Camera, background: Tensor) -> Tensor:
     return render_colors(scene, seen_colors(scene, camera), camera, background)
 
 
-def region_box(mask: Tensor, margin: int = 6) -> Crop:
-    """The smallest box around the pixels that show the region, with a margin, grown to 64 pixels. [H,W]"""
+def region_box(mask: Tensor, margin: int = 6, least: float = 0.5 * _SEEN) -> Crop:
+    """The smallest box around pixels that show more than `least`, with a margin, grown to 64 pixels. [H,W]"""
     height, width = mask.shape
-    visible = mask > 0.5 * _SEEN
+    visible = mask > least
     if not bool(visible.any()):
         return (0, 0, width, height)
     spans = []

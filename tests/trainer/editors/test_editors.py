@@ -87,7 +87,7 @@ def test_stripes_are_painted_on_the_thing_and_so_the_same_from_everywhere() -> N
     editor = make_editor(EditorOptions("stripes:#20a040"), matt, case.region, views)
     assert isinstance(editor, StripesEditor)
     rows = case.region.members
-    painted = editor.paint(sh0_to_rgb(matt.sh0[rows]).clamp_min(0), 1.0)
+    painted = editor.paint(sh0_to_rgb(matt.sh0[rows]).clamp_min(0))(1.0)
     scene = replace(matt, sh0=matt.sh0.index_copy(0, rows, rgb_to_sh0(painted)))
     for view in views:
         expected = render(scene, view.camera).image.clamp(0, 1)
