@@ -38,6 +38,11 @@ class Region:
     def __len__(self) -> int:
         return len(self.members)
 
+    @property
+    def mask(self) -> Tensor:
+        """Which Gaussians of the scene are members. [N] bool"""
+        return torch.zeros_like(self.score, dtype=torch.bool).index_fill(0, self.members, True)
+
 
 def from_mask(name: str, mask: Tensor) -> Region:
     """The region of a boolean mask over the scene. [N] bool"""

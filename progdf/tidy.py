@@ -104,7 +104,7 @@ def tidy(
     mask = torch.zeros(len(scene), dtype=torch.bool)
     for step in steps:
         if step.does != "duplicate":
-            mask[step.region.members] = True
+            mask |= step.region.mask
     region = from_mask(name, mask)
     members, bands = region.members, scene.sh_degree > 0 and any(_turns(step) for step in steps)
     rows, added = pack(scene[members], with_shN=bands), _copies(scene, steps, added)

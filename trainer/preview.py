@@ -22,7 +22,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Literal
 
 import msgspec
 import torch
@@ -35,14 +35,13 @@ from progdf.color.edits import hex_color
 from progdf.color.palette import find_palette
 from progdf.errors import ProgdfError
 from progdf.formats.scene_file import load_scene
-from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf, save_gdf
 from progdf.io.images import write_image
 from progdf.region import Region, whole_scene
 from progdf.scene.regions import parse_region
-from trainer.editors import COLOR_FUNCTIONS, ImageEditor, check_new_editor, make_editor
+from trainer.editors import COLOR_FUNCTIONS, check_new_editor, make_editor
 from trainer.editors.adapters import models_here
-from trainer.editors.base import EditorInput
+from trainer.editors.base import EditorInput, ImageEditor
 from trainer.editors.instruct import InstructEditor, instruct
 from trainer.fit.draft import DraftViews, draft_grade, draft_views
 from trainer.options import EditorOptions, RegionOptions, ViewOptions
@@ -82,17 +81,6 @@ class Request(msgspec.Struct, frozen=True):
     seed: int = 0
 
 
-class _Sight(NamedTuple):
-    """What a request looks at, and from where."""
-
-    region: str
-    background: _Row3
-    viewmat: tuple[_Row4, ...]
-    K: tuple[_Row3, ...]
-    width: int
-    height: int
-
-
 class Answer(msgspec.Struct):
     """The request's number, what was made, and why nothing is; "" where it is."""
 
@@ -114,7 +102,8 @@ class Previewer:
     """
 
     def __init__(self, path: Path, cache: Path) -> None:
-        self._path, self._scene = path, load_scene(path)
+        self.scene = load_scene(path)
+        self._path = path
         self._cache = cache
         self._region = lru_cache(maxsize=4)(self._find_region)
         self._view = lru_cache(maxsize=2)(self._make_view)
@@ -150,7 +139,7 @@ class Previewer:
     def _views(self, request: Request, editor: str) -> DraftViews | None:
         if self._draft[0] != request.region:
             region = self._region(request.region)
-            views = draft_views(ViewOptions(scene=self._path), editor, self._scene, region)
+            views = draft_views(ViewOptions(scene=self._path), editor, self.scene, region)
             self._draft = request.region, views
         return self._draft[1]
 
@@ -160,7 +149,8 @@ class Previewer:
         Raises:
             ProgdfError: region or editor do not work, or the view shows nothing of the region.
         """
-        seen = _Sight(**{name: getattr(request, name) for name in _Sight._fields})
+        # what is looked at, and from where
+        seen = msgspec.structs.replace(request, number=0, out="", editor="", strength=0.0, model="", seed=0)
         view = self._view(seen)
         if not bool((view.mask > 0.0).any()):
             return view.image
@@ -184,26 +174,21 @@ class Previewer:
 
     def _painter(self, request: Request) -> InstructEditor:
         options = EditorOptions(request.editor, model=request.model)
-        what, region = options.editor.partition(":")[2], whole_scene(self._scene)
-        return instruct(EditorInput(what, self._scene, region, (), options))
+        what, region = options.editor.partition(":")[2], whole_scene(self.scene)
+        return instruct(EditorInput(what, self.scene, region, (), options))
 
     def _find_region(self, spec: str) -> Region:
         request = RegionRequest(RegionOptions(spec), ViewOptions(scene=self._path), _no_masks, quiet=True)
-        return parse_region(spec, self._scene, kinds=region_kinds(request))
+        return parse_region(spec, self.scene, kinds=region_kinds(request))
 
-    def _make_view(self, seen: _Sight) -> View:
+    def _make_view(self, seen: Request) -> View:
         K, viewmat = torch.tensor(seen.K), torch.tensor(seen.viewmat)
-        (camera,) = with_near_plane([Camera(viewmat, K, seen.width, seen.height, "view")], self._scene)
-        return make_view(self._scene, self._region(seen.region), camera, torch.tensor(seen.background))
+        (camera,) = with_near_plane([Camera(viewmat, K, seen.width, seen.height, "view")], self.scene)
+        return make_view(self.scene, self._region(seen.region), camera, torch.tensor(seen.background))
 
-    def _make_editor(self, options: EditorOptions, seen: _Sight) -> ImageEditor:
+    def _make_editor(self, options: EditorOptions, seen: Request) -> ImageEditor:
         check_new_editor(options)
-        return make_editor(options, self._scene, self._region(seen.region), [self._view(seen)])
-
-    @property
-    def scene(self) -> Gaussians:
-        """The original."""
-        return self._scene
+        return make_editor(options, self.scene, self._region(seen.region), [self._view(seen)])
 
 
 def serve(argv: Sequence[str]) -> int:

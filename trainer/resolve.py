@@ -37,10 +37,14 @@ from .options import (
     FieldOptions,
     OptimizeOptions,
     Preset,
+    RegionOptions,
     Sharpness,
     TrainOptions,
     check_ranges,
 )
+
+BLANK = TrainOptions(Path(), Path(), RegionOptions(""), EditorOptions(""))
+"""What a command line says that says nothing."""
 
 PERCEPTUAL_WEIGHT: Mapping[EditKind, float] = {"color": 0.1, "style": 0.3, "geometry": 0.3}
 SHARPNESS: Mapping[EditKind, Sharpness] = {"color": "off", "style": "hinge", "geometry": "off"}

@@ -266,9 +266,8 @@ def parse_region(
     for sign, part in split_spec(spec, tuple(known)):
         if sign == "|":
             neighborhood = neighborhood or Neighborhood(scene)
-            mask = np.zeros(len(scene), bool)
-            mask[region.members.numpy()] = True
-            joined = from_mask("", torch.from_numpy(read_step(part)(neighborhood, mask)))
+            mask = read_step(part)(neighborhood, region.mask.numpy())
+            joined = from_mask("", torch.from_numpy(mask))
         else:
             kind, colon, text = part.partition(":")
             if part == "all":

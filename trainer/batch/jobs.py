@@ -19,18 +19,8 @@ from typing import Any
 from progdf.errors import ProgdfError
 from progdf.io.atomic import read_file
 from progdf.io.json_values import convert_json, plain
-from trainer.options import (
-    MOST_STAGES,
-    PRESETS,
-    VIEWS,
-    EditorOptions,
-    RegionOptions,
-    TrainOptions,
-    apply_preset,
-    flat_values,
-    with_values,
-)
-from trainer.resolve import check_name, resolve
+from trainer.options import MOST_STAGES, PRESETS, VIEWS, TrainOptions, apply_preset, flat_values, with_values
+from trainer.resolve import BLANK, check_name, resolve
 
 THREADS = 1
 """Threads of a run where the catalogue gives none: several jobs use the cores better than several threads."""
@@ -53,7 +43,7 @@ class Job:
     def command(self) -> str:
         """The command that does the same alone, to be run in `folder`."""
         options, words = self.options, ["progdf", "train", str(self.options.scene)]
-        default = apply_preset(_blank(Path()), options.preset)
+        default = apply_preset(BLANK, options.preset)
         usual = {name: value for name, _, value in flat_values(replace(default, preset="default"))}
         for name, typed, value in flat_values(options):
             if typed and value != usual[name] and name != "scene":
@@ -167,7 +157,7 @@ def make_options(values: Mapping[str, Any], out: Path) -> TrainOptions:
     for name in ("region", "editor"):
         if not isinstance(values.get(name), str):
             raise ProgdfError(f"{name} is missing")
-    options = _blank(out)
+    options = replace(BLANK, out=out)
     known = [name for name, typed, _ in flat_values(options) if typed and name not in _NO_OPTION]
     _check_keys({k: v for k, v in values.items() if k != "scene"}, known, "it")
     if (preset := values.get("preset", "default")) != "default":
@@ -181,10 +171,6 @@ def make_options(values: Mapping[str, Any], out: Path) -> TrainOptions:
         raise ProgdfError(re.sub(r"^(\w+\.)?(\w+)", r"\2", str(error))) from None
     resolve(options)
     return options
-
-
-def _blank(out: Path) -> TrainOptions:
-    return TrainOptions(Path(), out, RegionOptions(""), EditorOptions(""))
 
 
 @dataclass(frozen=True)

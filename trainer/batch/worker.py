@@ -31,8 +31,9 @@ from progdf.io.images import to_picture
 from progdf.rasterize import render
 from trainer.options import TrainOptions
 from trainer.resolve import resolve
-from trainer.run.run import RunResult, Shared, check_command, select_region, train
-from trainer.store.pretrained import keep_models
+from trainer.run.finish import RunResult
+from trainer.run.run import check_command, select_region, train
+from trainer.store.pretrained import Shared, keep_models
 from trainer.store.run_folder import RunFolder
 from trainer.views.view import BACKGROUND
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import NamedTuple
 
 from progdf.color.edits import parse_grade
 from progdf.errors import ProgdfError
@@ -19,24 +20,31 @@ from .pictures import folder, folder_of, photograph_folders, photographs, pictur
 from .procedural import darken, grade, night, paint_of, recolor, remove, stops_of, stripes, tint
 from .style import check_style, style
 
-Factory = Callable[[EditorInput], ImageEditor]
 
-EDITORS: dict[str, Factory] = {
-    "recolor": recolor,
-    "tint": tint,
-    "stripes": stripes,
-    "darken": darken,
-    "night": night,
-    "grade": grade,
-    "folder": folder,
-    "photographs": photographs,
-    "pictures": pictures,
-    "decal": decal,
-    "style": style,
-    "instruct": instruct,
-    "remove": remove,
+class Family(NamedTuple):
+    """A kind of editor."""
+
+    make: Callable[[EditorInput], ImageEditor]
+    example: str  # how it is written
+    check: Callable[[str], object] | None = None  # of the text after the colon, by itself
+
+
+EDITORS = {
+    "recolor": Family(recolor, "recolor:#3060d0", paint_of),
+    "tint": Family(tint, "tint:#d4af37", paint_of),
+    "stripes": Family(stripes, "stripes:#20a040", paint_of),
+    "darken": Family(darken, "darken:0.7", partial(stops_of, editor="darken")),
+    "night": Family(night, "night", partial(stops_of, editor="night")),
+    "grade": Family(grade, "grade:exposure=0.7", parse_grade),
+    "folder": Family(folder, "folder:DIR", folder_of),
+    "photographs": Family(photographs, "photographs:EDITED,ORIGINALS", photograph_folders),
+    "pictures": Family(pictures, "pictures:A.png,B.png", picture_paths),
+    "decal": Family(decal, "decal:LOGO.png"),
+    "style": Family(style, "style:14", check_style),
+    "instruct": Family(instruct, 'instruct:"turn him into Batman"'),
+    "remove": Family(remove, "remove", lambda what: picture_paths(what) if what else ()),
 }
-"""Kind of editor → its factory."""
+"""Kind of editor → what makes it."""
 
 PER_VIEW = ("folder", "photographs", "style", "instruct")
 """Kinds whose views are edited one by one, so that nothing makes them agree."""
@@ -53,43 +61,13 @@ KIND_UNKNOWN = ("folder", "photographs", "instruct")
 COSTLY_STRENGTHS = ("instruct",)
 """Kinds that paint every strength anew: what a model takes its time for is not done to look around."""
 
-EXAMPLES = (
-    "recolor:#3060d0",
-    "tint:#d4af37",
-    "stripes:#20a040",
-    "darken:0.7",
-    "night",
-    "grade:exposure=0.7",
-    "folder:DIR",
-    "photographs:EDITED,ORIGINALS",
-    "pictures:A.png,B.png",
-    "decal:LOGO.png",
-    "style:14",
-    "remove",
-)
-
-
-CHECKS: dict[str, Callable[[str], object]] = {
-    "recolor": paint_of,
-    "tint": paint_of,
-    "stripes": paint_of,
-    "darken": partial(stops_of, editor="darken"),
-    "night": partial(stops_of, editor="night"),
-    "grade": parse_grade,
-    "folder": folder_of,
-    "photographs": photograph_folders,
-    "pictures": picture_paths,
-    "style": check_style,
-    "remove": lambda what: picture_paths(what) if what else (),
-}
-"""Kind of editor → the check of the text after the colon, by itself."""
-
 
 def check_editor(spec: str) -> tuple[str, str]:
     """Split `KIND:WHAT`; ProgdfError if there is no such kind. Cheap: nothing is read or rendered."""
     kind, _, what = spec.partition(":")
     if kind not in EDITORS:
-        raise ProgdfError(f"unknown editor '{kind}'; use one of {', '.join(EXAMPLES)}")
+        examples = ", ".join(family.example for family in EDITORS.values())
+        raise ProgdfError(f"unknown editor '{kind}'; use one of {examples}")
     return kind, what
 
 
@@ -100,8 +78,8 @@ def check_new_editor(options: EditorOptions) -> None:
         check_instruct(what, options)
     if kind == "decal":
         check_decal(what, options)
-    if kind in CHECKS:
-        CHECKS[kind](what)
+    if (check := EDITORS[kind].check) is not None:
+        check(what)
 
 
 def make_editor(
@@ -109,18 +87,4 @@ def make_editor(
 ) -> ImageEditor:
     """The editor that the options name, for one region and its views; ProgdfError says what is wrong."""
     kind, what = check_editor(options.editor)
-    return EDITORS[kind](EditorInput(what, scene, region, views, options))
-
-
-__all__ = [
-    "COLOR_FUNCTIONS",
-    "COSTLY_STRENGTHS",
-    "EDITORS",
-    "EXTERNAL",
-    "KIND_UNKNOWN",
-    "PER_VIEW",
-    "ImageEditor",
-    "check_editor",
-    "check_new_editor",
-    "make_editor",
-]
+    return EDITORS[kind].make(EditorInput(what, scene, region, views, options))

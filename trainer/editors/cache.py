@@ -10,7 +10,6 @@ A picture is taken again while its note fits. So one that was touched up by hand
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,10 +18,9 @@ import numpy as np
 from torch import Tensor
 
 from progdf.errors import ProgdfError
-from progdf.io.atomic import atomic_write
 from progdf.io.images import read_picture, to_picture, write_image
 from progdf.io.json_values import decode_json
-from trainer.store.run_folder import add_pictures
+from trainer.store.run_folder import add_pictures, from_bytes, to_bytes, write_json
 
 Recipe = Mapping[str, str | int | float | None]
 """All that a painted picture depends on besides the picture that it is painted from."""
@@ -52,7 +50,7 @@ class KeptPictures:
             place: subfolder
         """
         if self.folder is None:
-            return _eight_bits(paint(source))
+            return from_bytes(to_bytes(paint(source)))
         path = self.folder / place / f"{name}.png"
         note = path.with_suffix(".json")
         expected = {"source": digest(source), "editor": dict(recipe)}
@@ -64,22 +62,15 @@ class KeptPictures:
         painted = paint(source)
         note.unlink(missing_ok=True)  # a new picture never lies beside an old note
         write_image(path, painted)
-        with atomic_write(note) as temporary_file:
-            temporary_file.write_text(
-                json.dumps(expected, indent=2, ensure_ascii=False) + "\n", encoding="utf-8"
-            )
+        write_json(note, expected)
         add_pictures(self.folder, [path, note])
-        return _eight_bits(painted)
+        return from_bytes(to_bytes(painted))
 
 
 def digest(image: Tensor) -> str:
     """SHA-256 of a picture as an 8-bit file holds it. [H,W,3]"""
     pixels = np.asarray(to_picture(image))
     return hashlib.sha256(repr(pixels.shape).encode() + pixels.tobytes()).hexdigest()
-
-
-def _eight_bits(image: Tensor) -> Tensor:
-    return (image.clamp(0.0, 1.0) * 255.0).round() / 255.0
 
 
 def _read_note(path: Path) -> object:

@@ -23,6 +23,7 @@ from progdf.io.picture_camera import find_picture_camera
 from progdf.rasterize import Crop
 from trainer.options import EditKind, EditorOptions
 from trainer.store.pretrained import last_model
+from trainer.store.run_folder import from_bytes, to_bytes
 from trainer.views.view import BACKGROUND, View, region_box, render_view, shrink_image
 
 from .adapters import (
@@ -98,8 +99,8 @@ class InstructEditor:
         name = view.camera.name
         if name not in self._renders:
             image = render_view(self.scene, self.frame(view)[1], torch.tensor(BACKGROUND))
-            self._renders[name] = (image.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
-        return self._renders[name].float() / 255.0
+            self._renders[name] = to_bytes(image)
+        return from_bytes(self._renders[name])
 
     def edit(self, view: View, strength: float) -> Tensor:
         """See `ImageEditor.edit`."""
@@ -171,11 +172,11 @@ def instruct(given: EditorInput) -> InstructEditor:
     @cache
     def pipeline() -> MixedSteps:
         # placed anew: what was there before has gone by then
-        def load() -> MixedSteps:
-            return load_pipeline(request, place(request, options.device))
-
-        loaded: MixedSteps = last_model("pipeline", (request, options.device), load)
-        return loaded
+        return last_model(
+            "pipeline",
+            (request, options.device),
+            lambda: load_pipeline(request, place(request, options.device)),
+        )
 
     placement = place(request, options.device)
     return InstructEditor(given.scene, request, placement, pipeline, KeptPictures(options.cache))

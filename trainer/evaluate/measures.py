@@ -74,21 +74,15 @@ def evaluate_run(opened: OpenedRun, perceptual: Perceptual, texts: TextOptions) 
 
 
 def _edited_rows(curves: Mapping[str, ErrorCurve], lpips: str, views: str) -> list[Row]:
-    def ends(values: Mapping[str, tuple[float, ...]]) -> dict[str, float | None]:
-        return {name: found[-1] for name, found in values.items()}
+    def cells(measure: str, part: slice) -> dict[str, float | None]:
+        values = {name: getattr(curve, measure)[part] for name, curve in curves.items()}
+        return {name: sum(some) / len(some) for name, some in values.items()}
 
-    def between(values: Mapping[str, tuple[float, ...]]) -> dict[str, float | None]:
-        return {name: sum(found[:-1]) / len(found[:-1]) for name, found in values.items()}
-
-    measures: tuple[tuple[str, str, dict[str, tuple[float, ...]], int], ...] = (
-        ("psnr", "PSNR, dB", {name: curve.psnr for name, curve in curves.items()}, 1),
-        ("ssim", "SSIM", {name: curve.ssim for name, curve in curves.items()}, 4),
-        ("lpips", lpips, {name: curve.lpips for name, curve in curves.items()}, 4),
-    )
+    measures = (("psnr", "PSNR, dB", 1), ("ssim", "SSIM", 4), ("lpips", lpips, 4))
     inner = len(next(iter(curves.values())).s) - 1
     rows = [
-        Row(f"{name}_end", f"{views} at 1, {text}", ends(values), digits)
-        for name, text, values, digits in measures
+        Row(f"{name}_end", f"{views} at 1, {text}", cells(name, slice(-1, None)), digits)
+        for name, text, digits in measures
     ]
     if not inner:
         return rows
@@ -97,8 +91,8 @@ def _edited_rows(curves: Mapping[str, ErrorCurve], lpips: str, views: str) -> li
     return [
         *rows,
         *(
-            Row(f"{name}_between", f"at {inner} {places} between, {text}", between(values), digits)
-            for name, text, values, digits in measures
+            Row(f"{name}_between", f"at {inner} {places} between, {text}", cells(name, slice(-1)), digits)
+            for name, text, digits in measures
         ),
         Row("psnr_worst", "the worst of all these, PSNR, dB", lowest, 1),
     ]

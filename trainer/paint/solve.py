@@ -8,13 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from progdf.camera import Camera
-from progdf.gaussians import ATTRIBUTES, Gaussians
+from progdf.gaussians import Gaussians, concatenate
 from progdf.rasterize import render
 from progdf.rasterize.engines import ColorMap, Crop, activate, color_map
 from progdf.sh import C0
@@ -27,14 +26,6 @@ _STEPS, _ROUNDS = 40, 3  # of conjugate gradients; between them, colors below bl
 _HELD = 0.05  # of a pixel: how much a row of the scene holds on to its own color
 _RIDGE = 0.02  # the same of a disc, on what was painted there
 _LEAST_BOX = 32  # pixels around the paint in which its colors are solved for
-
-
-def join(scene: Gaussians, added: Gaussians) -> Gaussians:
-    """A scene and rows after its own."""
-    rows: dict[str, Any] = {
-        name: torch.cat([getattr(scene, name), getattr(added, name)]) for name in ATTRIBUTES
-    }
-    return replace(scene, **rows)
 
 
 def box_of(painted: Tensor, camera: Camera) -> Crop:
@@ -61,7 +52,7 @@ def solve_colors(
         added: see `Discs`
         paints: of one thing
     """
-    joined, count = join(scene, added), len(rows)
+    joined, count = concatenate([scene, added]), len(rows)
     free, activated = torch.cat([rows, torch.arange(len(scene), len(joined))]), activate(joined)
     maps, missing, lowest = list[ColorMap](), list[Tensor](), torch.full((len(free), 3), -torch.inf)
     for paint in paints:

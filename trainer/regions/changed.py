@@ -237,7 +237,7 @@ def _vote_on_rim(
     A mask is a pixel or two too wide, and a Gaussian that something changed all but hides shows there alone:
     it would hand its membership on to all that is hidden of its surface.
     """
-    member = torch.zeros_like(inner, dtype=torch.bool).index_fill(0, region.members, True)
+    member = region.mask
     at_rim = evidence.inside - inner > _AT_RIM * evidence.weight
     doubtful = _hidden(evidence) | covered | member & at_rim
     if not bool((member & ~doubtful).any()):

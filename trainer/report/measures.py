@@ -351,8 +351,7 @@ def measure_paint(
         edited: the scene with the edit, rows that it adds last
     """
     scene, members = setup.scene, setup.region.members
-    others = torch.ones(len(scene), dtype=torch.bool).index_fill(0, members, False)
-    without = scene[others.nonzero()[:, 0]]
+    without = scene[~setup.region.mask]
     change = missing = behind = 0.0
     pixels, weights = 0, torch.zeros(len(scene), 2, dtype=torch.float64)
     for view, target, background in zip(setup.train, painted, backgrounds, strict=True):

@@ -27,15 +27,7 @@ from trainer.fit.network import NetworkFit, fit_network
 from trainer.fit.slider_uniformity import equalize_slider
 from trainer.optimize.losses import Perceptual, perceptual_loss
 from trainer.optimize.retime import resolve_slider
-from trainer.options import (
-    EditorOptions,
-    FieldOptions,
-    FitOptions,
-    RegionOptions,
-    TextOptions,
-    TrainOptions,
-    with_values,
-)
+from trainer.options import FieldOptions, FitOptions, TextOptions, with_values
 from trainer.regions.from_pictures import CHANGED
 from trainer.report.measures import (
     PaintTaken,
@@ -47,7 +39,7 @@ from trainer.report.measures import (
     measure_paint,
 )
 from trainer.report.report import report_picture
-from trainer.resolve import check_field_options, use_threads
+from trainer.resolve import BLANK, check_field_options, use_threads
 from trainer.setup import TrainingSetup, whole_views, widen_views
 from trainer.store.progress import RunLog
 from trainer.store.run_folder import RunFolder, read_views, write_json, write_views
@@ -64,7 +56,7 @@ _REPORT_ALONE = (
     *("plan", "time", "memory_mb", "curves", "views", "pictures"),
     *("losses", "trajectory", "effort", "choice"),
 )
-DEFAULTS = plain(TrainOptions(Path(), Path(), RegionOptions(""), EditorOptions("")))
+DEFAULTS = plain(BLANK)
 
 _LPIPS_OVER = (
     "each view's box around all that shows the region or that the editor changes, at least 64 pixels"
@@ -343,9 +335,7 @@ def end_rows(setup: TrainingSetup, trajectory: Trajectory) -> Tensor:
 
 def exactness(scene: Gaussians, gdf: Gdf, end: Tensor) -> tuple[float, float]:
     """Largest difference of a raw number: at s = 1 from the recorded end, and outside the region."""
-    outside = torch.ones(len(scene), dtype=torch.bool)
-    outside[gdf.region.members] = False
-    finished = edited_scene(scene, gdf)
+    outside, finished = ~gdf.region.mask, edited_scene(scene, gdf)
     members = torch.cat([gdf.region.members, torch.arange(len(scene), len(finished))])
     packed = pack(finished[members], with_shN=end.shape[1] > BASE_CHANNELS)
     endpoint = float((packed - end).abs().max())

@@ -17,7 +17,8 @@ from torch import Tensor
 from progdf.gaussians import pack
 from progdf.metrics.image import ROUNDING
 from progdf.scene.bounds import scene_sphere
-from trainer.editors import KIND_UNKNOWN, ImageEditor
+from trainer.editors import KIND_UNKNOWN
+from trainer.editors.base import ImageEditor
 from trainer.fit.evaluate import Evaluator
 from trainer.optimize.groups import GROUP_STEPS, group_stage
 from trainer.optimize.growth import place_seeds, seed_rows

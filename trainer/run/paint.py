@@ -18,7 +18,7 @@ from progdf.compose.reference import edited_scene
 from progdf.errors import ProgdfError
 from progdf.field.baked import interpolate_at
 from progdf.field.separable import course_field, opacity_course
-from progdf.gaussians import BASE_CHANNELS, Gaussians, pack
+from progdf.gaussians import BASE_CHANNELS, Gaussians, concatenate, pack
 from progdf.gdf.file import Gdf, fingerprint
 from progdf.io.images import picture_size
 from progdf.metrics.image import decibels, psnr
@@ -30,7 +30,7 @@ from progdf.terminal import group_digits
 from trainer.editors.decal import DecalEditor
 from trainer.editors.pictures import read_edit
 from trainer.paint.discs import DISC_LOGIT, GROWN, Paint, faint, lay_on, place_discs, project_paint
-from trainer.paint.solve import box_of, join, solve_colors
+from trainer.paint.solve import box_of, solve_colors
 from trainer.store.progress import RunLog
 from trainer.views.view import BACKGROUND, View, crop, make_view, render_view
 
@@ -64,7 +64,7 @@ class Laid:
     @property
     def end(self) -> Gaussians:
         """The scene with the paint, the discs after its own rows."""
-        return join(self.ended, self.added)
+        return concatenate([self.ended, self.added])
 
 
 def lay_discs(scene: Gaussians, paints: Sequence[Paint], gap: float) -> Laid:
@@ -81,13 +81,13 @@ def lay_discs(scene: Gaussians, paints: Sequence[Paint], gap: float) -> Laid:
         fresh = paint
         if len(added):
             colors = torch.cat([torch.zeros(len(scene), 3), torch.ones(len(added), 3)])
-            shown = render(join(cleared, added), paint.camera, (0.0, 0.0, 0.0), colors=colors).image[..., 0]
-            near = ndimage.binary_dilation(
-                (shown > 0.5).numpy(), iterations=GROWN
-            )  # as discs are beside paint
+            both = concatenate([cleared, added])
+            shown = render(both, paint.camera, (0.0, 0.0, 0.0), colors=colors).image[..., 0]
+            # as discs are beside paint
+            near = ndimage.binary_dilation((shown > 0.5).numpy(), iterations=GROWN)
             fresh = replace(paint, drawn=paint.drawn * ~torch.from_numpy(near)[..., None])
         discs = place_discs(scene, fresh, _FLAT, gap, cleared)
-        cleared, added = discs.scene, join(added, discs.added)
+        cleared, added = discs.scene, concatenate([added, discs.added])
         changed[discs.moved] = True
     for paint in paints:
         box = box_of(paint.mask, paint.camera)
@@ -240,7 +240,7 @@ def _even_clock(laid: Laid, paints: Sequence[Paint], steps: Tensor, rise: Tensor
     def look_at(g: float) -> Tensor:
         logits = hidden.logit_opacities + interpolate_at(steps, rise, g)
         moved = laid.scene.replace_rows(laid.rows, start + g * way)
-        now = join(moved, replace(hidden, logit_opacities=logits))
+        now = concatenate([moved, replace(hidden, logit_opacities=logits)])
         return render(now, paint.camera, BACKGROUND, crop=box).image[painted]
 
     first, last = look_at(0.0), look_at(1.0)

@@ -82,7 +82,7 @@ def vanished_share(setup: TrainingSetup, options: TrainOptions) -> float:
         setup: of the changed pictures, in their order
         options: which these are
     """
-    scene, rest = setup.scene, _without(setup)
+    scene, rest = setup.scene, setup.scene[~setup.region.mask]
     change = behind = 0.0
     for view, path in zip(setup.train, options.views.pictures, strict=True):
         target = read_edit(scene, view.camera, view.image, path)
@@ -107,7 +107,7 @@ def remove_region(options: TrainOptions, setup: TrainingSetup, folder: RunFolder
     """
     scene, chosen = setup.scene, len(setup.region)
     setup = replace(setup, region=with_crumbs(scene, setup.region))
-    region, rest = setup.region, _without(setup)
+    region, rest = setup.region, scene[~setup.region.mask]
     if len(region) > chosen:
         log.say(f"{format_count(len(region) - chosen, 'Gaussian')} that would float alone without it go too")
     with log.stage("fill"):
@@ -153,8 +153,7 @@ def remove_region(options: TrainOptions, setup: TrainingSetup, folder: RunFolder
 
 def with_crumbs(scene: Gaussians, region: Region) -> Region:
     """The region, and the floaters that taking it away leaves of its surroundings; see `find_strays`."""
-    mask = torch.ones(len(scene), dtype=torch.bool)
-    mask[region.members] = False
+    mask = ~region.mask
     alone = mask.nonzero()[:, 0][find_strays(scene[mask]).floaters]
     mask[alone[~torch.isin(alone, torch.from_numpy(find_strays(scene).floaters))]] = False
     return from_mask(region.name, ~mask)
@@ -181,12 +180,6 @@ def _write(
     log.say(f"to a render without the region, at its pixels in views not filled from: {said}")
     log.say(f"{result.line}; shadows and reflections stay")
     return result
-
-
-def _without(setup: TrainingSetup) -> Gaussians:
-    mask = torch.ones(len(setup.scene), dtype=torch.bool)
-    mask[setup.region.members] = False
-    return setup.scene[mask]
 
 
 def _painted_views(options: TrainOptions, setup: TrainingSetup) -> tuple[list[View], Mapping[str, Tensor]]:

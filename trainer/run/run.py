@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -62,6 +62,7 @@ from trainer.setup import (
     whole_views,
     widen_views,
 )
+from trainer.store.pretrained import Shared
 from trainer.store.progress import LATER, RunLog
 from trainer.store.run_folder import (
     RunFolder,
@@ -131,26 +132,6 @@ def region_request(
         return open_run_folder(options.out, options.edit).segment_masks
 
     return RegionRequest(options.region, options.views, cache, quiet, say)
-
-
-__all__ = ["RunResult", "Shared", "train"]
-
-_T = TypeVar("_T")
-
-
-class Shared:
-    """The scene, region and views of the last run of a process, for the next run if it has the same ones."""
-
-    def __init__(self) -> None:
-        self._last: dict[str, tuple[object, Any]] = {}
-
-    def get(self, what: str, key: object, make: Callable[[], _T]) -> _T:
-        """What `make` gives, or gave when it was last asked for `what` with an equal key."""
-        if what not in self._last or self._last[what][0] != key:
-            self._last.pop(what, None)  # first, so that two scenes are never in memory
-            self._last[what] = key, make()
-        value: _T = self._last[what][1]
-        return value
 
 
 def train(options: TrainOptions, quiet: bool = False, shared: Shared | None = None) -> RunResult:

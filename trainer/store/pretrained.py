@@ -7,7 +7,7 @@ import json
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -15,23 +15,36 @@ from safetensors import SafetensorError, safe_open
 BROKEN = (OSError, ValueError, RuntimeError, KeyError, TypeError, SafetensorError)
 """What transformers and diffusers raise for a model that is not there, not whole, or another's."""
 
-_models: dict[str, tuple[object, Any]] | None = None  # the last one of each kind, where they are kept
+_T = TypeVar("_T")
+
+
+class Shared:
+    """What was made last in this process, one of each kind, for who asks for the same next."""
+
+    def __init__(self) -> None:
+        self._last: dict[str, tuple[object, Any]] = {}
+
+    def get(self, what: str, key: object, make: Callable[[], _T]) -> _T:
+        """What `make` gives, or gave when it was last asked for `what` with an equal key."""
+        if what not in self._last or self._last[what][0] != key:
+            self._last.pop(what, None)  # first, so that two are never in memory
+            self._last[what] = key, make()
+        value: _T = self._last[what][1]
+        return value
+
+
+_models: Shared | None = None
 
 
 def keep_models() -> None:
     """From now on the last model of each kind stays in memory, for a process that trains many edits."""
     global _models
-    _models = {} if _models is None else _models
+    _models = _models or Shared()
 
 
-def last_model(kind: str, key: object, load: Callable[[], Any]) -> Any:
+def last_model(kind: str, key: object, load: Callable[[], _T]) -> _T:
     """What `load` gives; after `keep_models`, what it gave last for this kind if the key is the same."""
-    if _models is None:
-        return load()
-    if kind not in _models or _models[kind][0] != key:
-        _models.pop(kind, None)  # first, so that two are never in memory
-        _models[kind] = key, load()
-    return _models[kind][1]
+    return load() if _models is None else _models.get(kind, key, load)
 
 
 def folder_of_model(model: str, file: str) -> Path:

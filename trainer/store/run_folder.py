@@ -27,7 +27,7 @@ from progdf.errors import ProgdfError
 from progdf.field.trajectory import FILE_NAME
 from progdf.io.atomic import LOCK, LockedError, atomic_write, hold_lock, is_temporary, remove_abandoned
 from progdf.io.images import read_picture, write_image
-from progdf.io.json_values import decode_json
+from progdf.io.json_values import convert_json, decode_json
 from progdf.threads import map_threads
 
 from .state import StateFolder
@@ -180,7 +180,9 @@ def check_folder(root: Path, edit: Mapping[str, str]) -> RunFolder:
         )
         if not first.startswith(_SIGNATURE):
             raise ProgdfError(f"{root} is neither empty nor a run of progdf train; give --out another folder")
-        earlier = _json_or_nothing(first.removeprefix(_SIGNATURE))
+        earlier: dict[str, Any] = {}
+        with contextlib.suppress(ValueError):
+            earlier = convert_json(decode_json(first.removeprefix(_SIGNATURE)), dict[str, Any])
         for what, value in edit.items():
             if earlier.get(what) != value:
                 raise ProgdfError(
@@ -300,11 +302,3 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Write JSON, whole or not at all."""
     with atomic_write(path) as temporary_file:
         temporary_file.write_text(json.dumps(content, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
-
-
-def _json_or_nothing(text: str) -> dict[str, Any]:
-    try:
-        content = decode_json(text)
-    except ValueError:
-        return {}
-    return content if isinstance(content, dict) else {}

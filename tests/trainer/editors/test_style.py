@@ -168,11 +168,11 @@ def test_killed_between_picture_and_note_it_is_painted_anew(
     class Killed(BaseException):
         pass
 
-    def killed(path: Path) -> None:
+    def killed(path: Path, content: object) -> None:
         raise Killed
 
     with monkeypatch.context() as patched:
-        patched.setattr("trainer.editors.cache.atomic_write", killed)
+        patched.setattr("trainer.editors.cache.write_json", killed)
         with pytest.raises(Killed):
             KeptPictures(tmp_path).picture("v", source, {"style": 2}, lambda picture: 0.5 * picture)
     paint = Counting()

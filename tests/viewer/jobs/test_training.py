@@ -16,8 +16,9 @@ from progdf.io.atomic import state_folder
 from progdf.region import Region
 from tests.helpers.ui_rig import bear
 from trainer.cli import train_options
-from trainer.editors import CHECKS, EDITORS
+from trainer.editors import EDITORS, check_new_editor
 from trainer.editors.style import STYLES as TRAINED_STYLES
+from trainer.options import EditorOptions
 from trainer.store.progress import RunLog
 from trainer.store.run_folder import RunFolder
 from viewer.jobs import training
@@ -214,10 +215,10 @@ def test_what_the_form_asks_for_is_what_the_trainer_takes(kind: str) -> None:
     word, _, what = form(kind).spec.partition(":")
     assert word == kind
     if kind != "grade":  # which changes nothing until a slider is moved
-        CHECKS[kind](what)
+        check_new_editor(EditorOptions(f"{word}:{what}"))
     moved = form(kind, amount=0.98, through_hues=True, grade=(1.0, -0.25, *NEUTRAL[2:]))
     assert not moved.obstacle
-    CHECKS[kind](moved.spec.partition(":")[2])
+    check_new_editor(EditorOptions(moved.spec))
 
 
 def test_a_grade_says_its_palette_only_where_a_color_of_it_moves() -> None:
@@ -226,7 +227,7 @@ def test_a_grade_says_its_palette_only_where_a_color_of_it_moves() -> None:
     assert (still.spec, still.obstacle) == ("grade", STILL)
     moved = form("grade", palette=(("#7eae44", "#3060d0"), colors[1]), curve="0.30:0.20+0.70:0.80")
     assert moved.spec == "grade:#7eae44=#3060d0,#b97a30,curve=0.30:0.20+0.70:0.80"
-    CHECKS["grade"](moved.spec.partition(":")[2])
+    check_new_editor(EditorOptions(moved.spec))
     again = with_settings(NewEdit(), moved.spec)
     assert again is not None
     assert (again.spec, again.palette) == (moved.spec, moved.palette)
@@ -240,7 +241,7 @@ def test_a_grade_says_the_curve_of_a_color_with_what_becomes_of_it() -> None:
     bent = form("grade", palette=(("#7eae44", "#7eae44/0.50:0.30"), ("#b97a30", "#b97a30")))
     assert bent.spec == "grade:#7eae44=#7eae44/0.50:0.30,#b97a30"
     assert not bent.obstacle
-    CHECKS["grade"](bent.spec.partition(":")[2])
+    check_new_editor(EditorOptions(bent.spec))
     again = with_settings(NewEdit(), bent.spec)
     assert again is not None
     assert again.palette == bent.palette
