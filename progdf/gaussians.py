@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from progdf.quaternions import normalize_quats
@@ -56,15 +58,8 @@ class Gaussians(ShownInNotebooks):
 
     def __post_init__(self) -> None:
         n = self.means.shape[0] if self.means.ndim else 0
-        expected: dict[str, tuple[int, ...]] = {
-            "means": (n, 3),
-            "quats": (n, 4),
-            "log_scales": (n, 3),
-            "logit_opacities": (n,),
-            "sh0": (n, 3),
-        }
-        for name, shape in expected.items():
-            actual = tuple(getattr(self, name).shape)
+        for name, width in _WIDTHS.items():
+            actual, shape = tuple(getattr(self, name).shape), (n, width)[: 2 - (name == "logit_opacities")]
             if actual != shape:
                 raise ValueError(
                     f"{name} has shape {list(actual)}, expected {list(shape)} (N={n} from means)"
@@ -139,6 +134,12 @@ def concatenate(parts: Sequence[Gaussians]) -> Gaussians:
     return replace(parts[0], **joined)
 
 
+def from_arrays(arrays: Mapping[str, NDArray[np.floating]], antialiased: bool = False) -> Gaussians:
+    """Gaussians of numpy's arrays by attribute, in their types."""
+    tensors: dict[str, Any] = {n: torch.from_numpy(np.ascontiguousarray(a)) for n, a in arrays.items()}
+    return Gaussians(**tensors, antialiased=antialiased)
+
+
 def attribute_slices(channels: int) -> dict[str, slice]:
     """Where each attribute lies in a packed row of `channels` numbers (14, or 14 + 3K with shN).
 
@@ -158,16 +159,8 @@ def attribute_slices(channels: int) -> dict[str, slice]:
 
 def pack(gaussians: Gaussians, with_shN: bool = False) -> Tensor:
     """Raw parameters side by side, in the order of `attribute_slices`. [N,14] or [N,14+3K]"""
-    columns = [
-        gaussians.means,
-        gaussians.log_scales,
-        gaussians.quats,
-        gaussians.logit_opacities[:, None],
-        gaussians.sh0,
-    ]
-    if with_shN:
-        columns.append(gaussians.shN.flatten(1))
-    return torch.cat(columns, dim=1)
+    parts = [getattr(gaussians, name) for name in (ATTRIBUTES if with_shN else _WIDTHS)]
+    return torch.cat([part.flatten(1) if part.ndim > 1 else part[:, None] for part in parts], dim=1)
 
 
 def unpack(packed: Tensor, shN: Tensor) -> Gaussians:

@@ -64,21 +64,6 @@ def similarity(
     return Motion(moved, size, turned)
 
 
-def remove(scene: Gaussians, region: Region, name: str) -> Gdf:
-    """The region's opacity falls to less than any engine draws; see `tidy`."""
-    return tidy(scene, [Step("remove", region)], name)
-
-
-def transform(scene: Gaussians, region: Region, motion: Motion, name: str) -> Gdf:
-    """The region moves as a whole, its SH bands with it; see `tidy`."""
-    return tidy(scene, [Step("transform", region, motion)], name)
-
-
-def duplicate(scene: Gaussians, region: Region, motion: Motion, name: str) -> Gdf:
-    """A copy of the region appears where the motion takes it; see `tidy`."""
-    return tidy(scene, [Step("duplicate", region, motion)], name)
-
-
 def tidy(
     scene: Gaussians,
     steps: Sequence[Step],

@@ -38,19 +38,26 @@ def _matrices(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor,
 
 def srgb_to_oklab(rgb: Tensor) -> Tensor:
     """Lightness 0..1 and the two opponent axes a, b of sRGB colors. [...,3] -> [...,3]"""
-    linear = torch.where(rgb <= 0.04045, rgb / 12.92, ((rgb.clamp_min(0.04045) + 0.055) / 1.055) ** 2.4)
     to_lms, to_lab, *_ = _matrices(rgb.dtype, rgb.device)
-    lms = linear @ to_lms
+    lms = linear_from_srgb(rgb) @ to_lms
     return (lms.sign() * lms.abs() ** (1 / 3)) @ to_lab
 
 
 def oklab_to_srgb(lab: Tensor) -> Tensor:
     """The inverse of `srgb_to_oklab`; colors that sRGB cannot show leave 0..1. [...,3] -> [...,3]"""
     *_, to_linear, to_lms = _matrices(lab.dtype, lab.device)
-    linear = (lab @ to_lms) ** 3 @ to_linear
-    return torch.where(
-        linear <= 0.0031308, linear * 12.92, 1.055 * linear.clamp_min(0.0031308) ** (1 / 2.4) - 0.055
-    )
+    return srgb_from_linear((lab @ to_lms) ** 3 @ to_linear)
+
+
+def linear_from_srgb(rgb: Tensor) -> Tensor:
+    """sRGB 0..1 as linear light. [...,3] -> [...,3]"""
+    return torch.where(rgb <= 0.04045, rgb / 12.92, ((rgb.clamp_min(0.04045) + 0.055) / 1.055) ** 2.4)
+
+
+def srgb_from_linear(linear: Tensor) -> Tensor:
+    """The inverse of `linear_from_srgb`. [...,3] -> [...,3]"""
+    curved = 1.055 * linear.clamp_min(0.0031308) ** (1 / 2.4) - 0.055
+    return torch.where(linear <= 0.0031308, linear * 12.92, curved)
 
 
 def fit_gamut(lab: Tensor) -> Tensor:

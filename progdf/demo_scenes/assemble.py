@@ -11,14 +11,14 @@ from torch import Tensor
 
 from progdf.camera import Camera
 from progdf.color.edits import parse_color
-from progdf.color.oklab import smoothstep
+from progdf.color.oklab import linear_from_srgb, smoothstep
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians, concatenate
 from progdf.quaternions import matrix_quats
 from progdf.sh import rgb_to_sh0
 from progdf.threads import one_thread
 
-from .light import OUTDOORS, Daylight, develop, irradiance, linear_from_srgb, view_dependent_light
+from .light import OUTDOORS, Daylight, develop, irradiance, view_dependent_light
 from .surface import Part, Samples, sample
 
 _SIDE = 64  # the lattice repeats after this many cells; a power of two

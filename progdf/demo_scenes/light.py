@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from progdf.color.oklab import smoothstep
+from progdf.color.oklab import smoothstep, srgb_from_linear
 
 from .surface import Part
 
@@ -71,15 +71,7 @@ def irradiance(
 
 def develop(linear: Tensor) -> Tensor:
     """Linear light as sRGB with a soft shoulder: highlights bend towards white. [...,3] -> [...,3] in 0..1"""
-    bent = 1 - torch.exp(-linear.clamp_min(0))
-    return torch.where(
-        bent <= 0.0031308, bent * 12.92, 1.055 * bent.clamp_min(0.0031308) ** (1 / 2.4) - 0.055
-    )
-
-
-def linear_from_srgb(rgb: Tensor) -> Tensor:
-    """sRGB 0..1 as linear light. [...,3] -> [...,3]"""
-    return torch.where(rgb <= 0.04045, rgb / 12.92, ((rgb.clamp_min(0.04045) + 0.055) / 1.055) ** 2.4)
+    return srgb_from_linear(1 - torch.exp(-linear.clamp_min(0)))
 
 
 def view_dependent_light(

@@ -7,7 +7,6 @@ smaller components of a quaternion; opacities are bytes; f_rest bytes cover −4
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +15,7 @@ from plyfile import PlyData, PlyElement
 from torch import Tensor
 
 from progdf.errors import ProgdfError
-from progdf.gaussians import ATTRIBUTES, Gaussians
+from progdf.gaussians import ATTRIBUTES, Gaussians, from_arrays
 from progdf.sh import C0
 
 from .ply import ANTIALIASED_COMMENT, PlyFile
@@ -70,14 +69,11 @@ def read_compressed_ply(ply: PlyFile) -> Gaussians:
         "means": _dequantize(ranges, at, _unorm(position, (21, 11, 0), (11, 10, 11)), _XYZ),
         "quats": _quats(rotation),
         "log_scales": _dequantize(ranges, at, _unorm(scale, (21, 11, 0), (11, 10, 11)), _SCALES),
-        "logit_opacities": logits,
+        "logit_opacities": logits.astype(np.float32),
         "sh0": (rgb - 0.5) / C0,
         "shN": higher,
     }
-    tensors: dict[str, Any] = {
-        key: torch.from_numpy(np.ascontiguousarray(v, np.float32)) for key, v in arrays.items()
-    }
-    return Gaussians(**tensors, antialiased=ply.antialiased)
+    return from_arrays(arrays, ply.antialiased)
 
 
 def write_compressed_ply(path: Path, scene: Gaussians) -> None:

@@ -21,7 +21,7 @@ from torch import Tensor
 from progdf.errors import ProgdfError
 from progdf.field.baked import MOST_SIDE, lattice_colors, lattice_side
 from progdf.field.grade import look_up
-from progdf.io.atomic import atomic_write, read_file
+from progdf.io.atomic import read_file, write_file
 
 SUFFIX = ".cube"
 SIDE = 33
@@ -106,5 +106,4 @@ def write_cube(path: str | os.PathLike[str], table: Tensor, title: str) -> None:
     title = re.sub(r'[^ -~]|"', " ", title)
     head = f'TITLE "{title}"\nLUT_3D_SIZE {lattice_side(len(table))}\n'
     rows = (f"{red:.6f} {green:.6f} {blue:.6f}\n" for red, green, blue in table.clamp(0.0, 1.0).tolist())
-    with atomic_write(path) as temporary_file:
-        temporary_file.write_text(head + "".join(rows), encoding="ascii")
+    write_file(path, head + "".join(rows))

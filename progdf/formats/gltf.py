@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import struct
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from progdf.errors import ProgdfError
-from progdf.gaussians import ZERO, Gaussians
+from progdf.gaussians import ZERO, Gaussians, concatenate, from_arrays
 from progdf.io.json_values import convert_json, decode_json
 from progdf.sh import sh0_to_rgb
 
@@ -90,10 +91,9 @@ def write_glb(path: Path, scene: Gaussians) -> None:
         f"{EXTENSION}:SCALE": scene.scales,
         f"{EXTENSION}:OPACITY": scene.opacities[:, None],
     }
-    coefficients = torch.cat([scene.sh0[:, None], scene.shN], dim=1)
     for degree in range(min(MOST_DEGREE, scene.sh_degree) + 1):
         for i in range(2 * degree + 1):
-            columns[f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{i}"] = coefficients[:, degree**2 + i]
+            columns[f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{i}"] = scene.sh[:, degree**2 + i]
     views, accessors, parts, at = list[dict[str, Any]](), list[dict[str, Any]](), list[bytes](), 0
     for name, values in columns.items():
         color, table = name == "COLOR_0", values.detach().cpu().float().numpy()
@@ -159,13 +159,7 @@ def read_glb(path: Path) -> Gaussians:
     if not parts:
         raise ProgdfError(f"{path} holds no Gaussians, which {EXTENSION} stores; give a scene of those")
     bands = min(part.shN.shape[1] for part in parts)
-    columns: dict[str, Any] = {
-        name: torch.cat(
-            [getattr(part, name)[:, :bands] if name == "shN" else getattr(part, name) for part in parts]
-        )
-        for name in ("means", "quats", "log_scales", "logit_opacities", "sh0", "shN")
-    }
-    return Gaussians(**columns)
+    return concatenate([replace(part, shN=part.shN[:, :bands]) for part in parts])
 
 
 def _read_primitive(table: _File, data: memoryview, primitive: _Primitive, mesh: int) -> Gaussians:
@@ -196,8 +190,7 @@ def _read_primitive(table: _File, data: memoryview, primitive: _Primitive, mesh:
             "sh0": column(f"{EXTENSION}:SH_DEGREE_0_COEF_0"),
             "shN": np.stack(rest, axis=1) if rest else np.zeros((len(means), 0, 3), np.float32),
         }
-    columns: dict[str, Any] = {n: torch.from_numpy(np.ascontiguousarray(a)) for n, a in arrays.items()}
-    return Gaussians(**columns)
+    return from_arrays(arrays)
 
 
 def _read_accessor(table: _File, data: memoryview, accessor: _Accessor) -> NDArray[np.float32]:

@@ -13,10 +13,9 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import torch
 
 from progdf.errors import ProgdfError
-from progdf.gaussians import Gaussians
+from progdf.gaussians import Gaussians, from_arrays
 from progdf.io.atomic import read_file
 from progdf.sh import C0
 
@@ -89,10 +88,7 @@ def read_ksplat(path: str | os.PathLike[str]) -> tuple[Gaussians, int]:
     for part in parts:
         part["shN"] = np.pad(part["shN"], ((0, 0), (0, most - part["shN"].shape[1]), (0, 0)))
     arrays = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    tensors: dict[str, Any] = {
-        name: torch.from_numpy(np.ascontiguousarray(v, np.float32)) for name, v in arrays.items()
-    }
-    return Gaussians(**tensors), level
+    return from_arrays(arrays), level
 
 
 def _row_layout(level: int, degree: int) -> np.dtype[np.void]:

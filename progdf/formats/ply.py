@@ -21,7 +21,7 @@ import torch
 from plyfile import PlyData, PlyElement, PlyElementParseError, PlyListProperty, PlyParseError
 
 from progdf.errors import ProgdfError
-from progdf.gaussians import ATTRIBUTES, ZERO, Gaussians
+from progdf.gaussians import ATTRIBUTES, ZERO, Gaussians, from_arrays
 from progdf.io.atomic import atomic_write, check_regular, open_error
 from progdf.quaternions import normalize_quats
 
@@ -398,9 +398,7 @@ def _gaussians(rows: npt.NDArray[np.void], columns: dict[str, tuple[str, ...]]) 
     places = [rows[name] for name in columns["means"]]
     if np.result_type(np.float32, *places) == np.float64:
         arrays["means"] = np.stack(places, axis=1).astype(np.float64)
-    tensors: dict[str, Any] = {key: torch.from_numpy(array) for key, array in arrays.items()}
-    tensors["logit_opacities"] = tensors["logit_opacities"][:, 0]
-    return Gaussians(**tensors)
+    return from_arrays(arrays | {"logit_opacities": arrays["logit_opacities"][:, 0]})
 
 
 def _run(index: list[int]) -> slice | list[int]:

@@ -18,7 +18,6 @@ import zlib
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -199,7 +198,6 @@ def rotate_about_x(scene: Gaussians) -> Gaussians:
 
 def _repair(path: Path, stored: Gaussians, kind: str) -> tuple[Gaussians, LoadReport]:
     scene, counts = repair(stored)
-    repairs: dict[str, Any] = dict(counts)
     report = LoadReport(
         file=scene_name(path),
         file_bytes=_size(path),
@@ -207,7 +205,7 @@ def _repair(path: Path, stored: Gaussians, kind: str) -> tuple[Gaussians, LoadRe
         count=len(scene),
         sh_degree=scene.sh_degree,
         antialiased=scene.antialiased,
-        **repairs,
+        **counts,
     )
     return scene, report
 

@@ -9,10 +9,8 @@ from __future__ import annotations
 import importlib.util
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from progdf.errors import ProgdfError
@@ -79,13 +77,11 @@ def write_usd(path: Path, scenes: Iterable[Gaussians], rate: float = 24.0) -> No
 
 def drawn_values(scene: Gaussians) -> dict[str, NDArray[np.float32]]:
     """What the file stores of a scene: positions, orientations (imaginary first), scales, opacities, SH."""
-    quats = scene.unit_quats[:, [1, 2, 3, 0]]
-    sh = torch.cat([scene.sh0[:, None], scene.shN], dim=1).reshape(-1, 3)
-    columns: dict[str, Any] = {
+    columns = {
         "positions": scene.means,
-        "orientations": quats,
+        "orientations": scene.unit_quats[:, [1, 2, 3, 0]],
         "scales": scene.scales,
         "opacities": scene.opacities,
-        "coefficients": sh,
+        "coefficients": scene.sh.reshape(-1, 3),
     }
     return {name: np.ascontiguousarray(t.detach().cpu().float().numpy()) for name, t in columns.items()}

@@ -22,7 +22,7 @@ from progdf.field.grade import bake_grade, lattice_form, map_alone
 from progdf.formats.cube import SUFFIX as CUBE
 from progdf.formats.cube import read_cube
 from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, ZERO, Gaussians, Origin, ShownInNotebooks, pack
-from progdf.io.atomic import atomic_write, read_file
+from progdf.io.atomic import read_file, write_error, write_file
 from progdf.region import Region, whole_scene
 
 from . import header
@@ -161,12 +161,9 @@ def save_gdf(path: str | os.PathLike[str], gdf: Gdf) -> None:
     )
     content = header.pack_file(head, tensors)
     try:
-        with atomic_write(path) as temporary_file:
-            temporary_file.write_bytes(content)
+        write_file(path, content)
     except OSError as error:
-        raise ProgdfError(
-            f"{path} cannot be written ({error.strerror or error}); choose another place"
-        ) from error
+        raise write_error(path, error) from error
 
 
 def load_gdf(

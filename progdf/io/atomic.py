@@ -75,6 +75,12 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
         temporary_file.unlink(missing_ok=True)
 
 
+def write_file(path: str | os.PathLike[str], content: str | bytes) -> None:
+    """Write a file, text as UTF-8, whole or not at all; see `atomic_write`."""
+    with atomic_write(path) as temporary_file:
+        temporary_file.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
 def temporary_subfolder(folder: Path) -> Path:
     """A new empty folder in `folder`, for what is moved out of it when it is whole; the caller removes it.
 

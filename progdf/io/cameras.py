@@ -25,7 +25,7 @@ from progdf.camera import Camera, Lens
 from progdf.errors import ProgdfError
 from progdf.gaussians import ZERO, Origin
 
-from .atomic import atomic_write, read_file
+from .atomic import read_file, write_file
 from .colmap import find_model, load_model
 from .json_values import convert_json, decode_json
 
@@ -121,7 +121,7 @@ def inria_camera(file: str, index: int, entry: object) -> Camera:
     c2w[:3, 3] = torch.tensor(camera.position, dtype=torch.float64)
     width, height = camera.width, camera.height
     K = _intrinsics(camera.fx, camera.fy, 0.5 * width, 0.5 * height)
-    return _camera(where, _world_to_camera(where, c2w), K, width, height, camera.img_name)
+    return _camera(where, torch.linalg.inv(_rigid(where, c2w)), K, width, height, camera.img_name)
 
 
 def nerfstudio_camera(file: str, index: int, shared: Mapping[str, Any], entry: object, path: Path) -> Camera:
@@ -151,8 +151,8 @@ def nerfstudio_camera(file: str, index: int, shared: Mapping[str, Any], entry: o
     cy = 0.5 * height if frame.cy is None else frame.cy
     c2w = torch.tensor([*frame.transform_matrix[:3], (0.0, 0.0, 0.0, 1.0)], dtype=torch.float64)
     c2w[:, 1:3] *= -1  # OpenGL -> OpenCV
-    K = _intrinsics(focal[0], focal[-1], cx, cy)
-    return _camera(where, _world_to_camera(where, c2w), K, width, height, frame.file_path, lens or None)
+    viewmat, K = torch.linalg.inv(_rigid(where, c2w)), _intrinsics(focal[0], focal[-1], cx, cy)
+    return _camera(where, viewmat, K, width, height, frame.file_path, lens or None)
 
 
 def _image_size(where: str, frame: _Frame, path: Path) -> tuple[float, float]:
@@ -169,11 +169,6 @@ def _image_size(where: str, frame: _Frame, path: Path) -> tuple[float, float]:
             except ProgdfError as error:
                 raise ProgdfError(f"{where} has no image size, and {error}") from None
     raise ProgdfError(f"{where} has no image size; expected w and h")
-
-
-def _world_to_camera(where: str, c2w: Tensor) -> Tensor:
-    viewmat: Tensor = torch.linalg.inv(_rigid(where, c2w))
-    return viewmat
 
 
 def _rigid(where: str, matrix: Tensor) -> Tensor:
@@ -396,8 +391,7 @@ def save_cameras(path: str | os.PathLike[str], cameras: Sequence[Camera], origin
 
     `origin`: of the scene, which the cameras are relative to; the file has them in the world.
     """
-    with atomic_write(path) as temporary_file:
-        temporary_file.write_text(cameras_to_json(cameras, 1, origin), encoding="utf-8")
+    write_file(path, cameras_to_json(cameras, 1, origin))
 
 
 def cameras_to_json(cameras: Sequence[Camera], indent: int | None = None, origin: Origin = ZERO) -> str:

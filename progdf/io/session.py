@@ -115,8 +115,7 @@ def write_session(path: Path, session: SessionFile) -> None:
     text = json.dumps({MARK: VERSION} | plain(session), indent=2, ensure_ascii=False, allow_nan=False)
     # short lists of numbers on one line; a text holds no line break of its own, so none is hit
     text = re.sub(r"\[\n\s+([^\[\]{}\"]*?)\n\s+\]", lambda match: f"[{' '.join(match[1].split())}]", text)
-    with atomic_write(path) as temporary_file:
-        temporary_file.write_text(text + "\n", encoding="utf-8")
+    atomic.write_file(path, text + "\n")
 
 
 def read_session(path: str | os.PathLike[str], kind: type[File]) -> File:

@@ -11,7 +11,7 @@ import pickle
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 import torch
@@ -172,18 +172,14 @@ def _read_weights(path: Path) -> Mapping[str, Any]:
     ) as error:
         raise _format_error(str(error)) from error
     if not isinstance(layers, dict):
-        _refuse(f"it holds a {type(layers).__name__}")
+        raise _format_error(f"it holds a {type(layers).__name__}")
     return layers
 
 
 def _check_array(array: Any, shape: tuple[int, ...]) -> Tensor:
     if not isinstance(array, np.ndarray) or array.dtype != np.float32 or array.shape != shape:
-        _refuse(f"an array is {getattr(array, 'shape', type(array))}, expected {shape}")
+        raise _format_error(f"an array is {getattr(array, 'shape', type(array))}, expected {shape}")
     return torch.from_numpy(array.copy())
-
-
-def _refuse(reason: str) -> NoReturn:
-    raise _format_error(reason)
 
 
 def _format_error(reason: str) -> ProgdfError:

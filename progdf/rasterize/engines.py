@@ -296,15 +296,10 @@ def check_intersections(splats: int, pairs: int) -> None:
 
 
 def _check_shapes(gaussians: ActivatedGaussians) -> None:
-    means, quats, scales, opacities, colors = gaussians.tensors
-    n = means.shape[0] if means.ndim else 0
-    expected = {
-        "means": (means, (n, 3)),
-        "quats": (quats, (n, 4)),
-        "scales": (scales, (n, 3)),
-        "opacities": (opacities, (n,)),
-    }
-    for name, (tensor, shape) in expected.items():
+    colors, n = gaussians.colors, gaussians.means.shape[0] if gaussians.means.ndim else 0
+    expected = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,)}
+    for name, shape in expected.items():
+        tensor = getattr(gaussians, name)
         if tensor.shape != shape:
             raise ValueError(
                 f"{name} has shape {list(tensor.shape)}, expected {list(shape)} (N={n} from means)"

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from progdf.camera import NEAR
 from progdf.gaussians import Gaussians
+from progdf.quaternions import rotate_vectors
 
 _SAMPLE = 100_000
 """Rows that are looked at; a scene with more is sampled evenly."""
@@ -136,8 +137,4 @@ def long_axes(scene: Gaussians) -> Tensor:
 
 
 def _turned_axes(scene: Gaussians, which: Tensor) -> Tensor:
-    axes = torch.eye(3)[which]
-    w, xyz = scene.unit_quats[:, :1], scene.unit_quats[:, 1:]
-    twice = 2 * torch.linalg.cross(xyz, axes)
-    turned: Tensor = axes + w * twice + torch.linalg.cross(xyz, twice)
-    return turned
+    return rotate_vectors(torch.eye(3)[which], scene.unit_quats)

@@ -100,8 +100,7 @@ class Neighborhood:
             return largest
         tree = cKDTree(self._points[rows])
         start, end = self._links(tree, rows, np.arange(len(rows)))
-        pairs = coo_array((np.ones(len(start), bool), (start, end)), shape=(len(rows), len(rows)))
-        part = connected_components(pairs, directed=False)[1]
+        part = join_pairs(start, end, len(rows))
         largest[rows[part == np.bincount(part).argmax()]] = True
         return largest
 
@@ -172,6 +171,13 @@ def grow_along_surface(
     alike = alike_in_color(colors, color, tolerance)
     alike[seeds] = True
     return neighborhood.connected_part(alike, seeds)
+
+
+def join_pairs(start: NDArray[np.integer], end: NDArray[np.integer], count: int) -> NDArray[np.int64]:
+    """Which group each of so many things is in, where a chain of pairs joins those of one. [P], [P] -> [N]"""
+    pairs = coo_array((np.ones(len(start), bool), (start, end)), shape=(count, count))
+    groups: NDArray[np.int64] = connected_components(pairs, directed=False)[1].astype(np.int64)
+    return groups
 
 
 def nearest_rows(points: Tensor, rows: Tensor, k: int, workers: int = 1) -> tuple[Tensor, Tensor]:

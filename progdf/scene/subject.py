@@ -17,6 +17,7 @@ from progdf.camera import Camera, intrinsics, look_at
 from progdf.gaussians import Gaussians
 
 from .bounds import front_direction, has_ceiling, has_long_tail, quantile
+from .neighbors import join_pairs
 
 _SAMPLE = 60_000
 _ENOUGH = 64
@@ -309,12 +310,5 @@ def _connected_cells(boxes: Tensor, span: int) -> Tensor:
     steps = torch.tensor([-1, 0, 1])
     around = boxes[:, None] + ((steps[:, None, None] * span + steps[:, None]) * span + steps).flatten()
     box = torch.searchsorted(boxes, around).clamp_max(len(boxes) - 1)
-    index = torch.arange(len(boxes))
-    near = torch.where(boxes[box] == around, box, index[:, None])
-    thing = index
-    while True:
-        least = thing[near].amin(dim=1)
-        least = least[least]  # halves the way to the first of the thing
-        if torch.equal(least, thing):
-            return thing
-        thing = least
+    cell, side = (boxes[box] == around).nonzero(as_tuple=True)
+    return torch.from_numpy(join_pairs(cell.numpy(), box[cell, side].numpy(), len(boxes)))

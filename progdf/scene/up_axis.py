@@ -17,7 +17,7 @@ from torch import Tensor
 from progdf.camera import Camera
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import fingerprint
-from progdf.io.atomic import atomic_write, state_folder
+from progdf.io.atomic import state_folder, write_file
 from progdf.io.cameras import cameras_beside
 from progdf.io.json_values import decode_json
 
@@ -46,8 +46,7 @@ def remember(scene: Gaussians, up: tuple[float, float, float]) -> None:
     remembered = {name: known for name, known in _read().items() if name != key} | {key: list(up)}
     with contextlib.suppress(OSError):
         _place().parent.mkdir(parents=True, exist_ok=True)
-        with atomic_write(_place()) as temporary_file:
-            temporary_file.write_text(json.dumps(dict([*remembered.items()][-MOST:])), encoding="utf-8")
+        write_file(_place(), json.dumps(dict([*remembered.items()][-MOST:])))
 
 
 def _read() -> dict[str, object]:

@@ -21,7 +21,7 @@ from progdf.rasterize import render
 from progdf.rasterize.engines import ALPHA_MIN
 from progdf.region import Region, from_mask, whole_scene
 from progdf.similarity import Motion
-from progdf.tidy import Step, bake, duplicate, remove, similarity, tidy, transform
+from progdf.tidy import Step, bake, similarity, tidy
 from tests.helpers.scenes import front_camera, orbit_camera, random_gaussians
 
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
@@ -79,7 +79,10 @@ def test_what_is_removed_is_gone_on_white_black_and_checker() -> None:
     scene = checker(scene_of())
     region = left_half(scene)
     region = Region("left", region.members[region.members < COUNT], region.score)
-    removed, without = at(scene, remove(scene, region, "gone"), 1.0), scene[outside(scene, region)]
+    removed, without = (
+        at(scene, tidy(scene, [Step("remove", region)], "gone"), 1.0),
+        scene[outside(scene, region)],
+    )
     for background in (WHITE, BLACK):
         for camera in (front_camera(96, 64, 60.0), orbit_camera(96, 64, azimuth=2.0)):
             there = picture(scene, background, camera)
@@ -92,7 +95,7 @@ def test_what_is_removed_is_gone_on_white_black_and_checker() -> None:
 def test_opacity_falls_linearly_and_ends_where_nothing_is_drawn() -> None:
     scene = scene_of()
     region = left_half(scene)
-    gdf = remove(scene, region, "gone")
+    gdf = tidy(scene, [Step("remove", region)], "gone")
     before = scene.opacities[region.members]
     for s in torch.linspace(0.0, 1.0, 41).tolist():
         sum_share = float(at(scene, gdf, s).opacities[region.members].sum() / before.sum())
@@ -105,9 +108,9 @@ def test_strength_zero_is_the_scene_and_rows_outside_are_never_touched(does: str
     scene = scene_of()
     region, motion = left_half(scene), similarity((0.2, 0.1, 0.0), TURN, 1.3)
     gdf = {
-        "remove": lambda: remove(scene, region, "a"),
-        "transform": lambda: transform(scene, region, motion, "a"),
-        "duplicate": lambda: duplicate(scene, region, motion, "a"),
+        "remove": lambda: tidy(scene, [Step("remove", region)], "a"),
+        "transform": lambda: tidy(scene, [Step("transform", region, motion)], "a"),
+        "duplicate": lambda: tidy(scene, [Step("duplicate", region, motion)], "a"),
     }[does]()
     start, mask = at(scene, gdf, 0.0), outside(scene, region)
     for name in ATTRIBUTES:
@@ -134,7 +137,7 @@ def moved_camera(camera: Camera, center: Tensor, motion: Motion) -> Camera:
 def test_a_thing_and_a_camera_that_move_alike_show_the_same_picture(share: float) -> None:
     scene = scene_of(degree=3)
     motion = similarity((0.4, -0.2, 0.3), TURN)
-    gdf = transform(scene, whole_scene(scene), motion, "moved")
+    gdf = tidy(scene, [Step("transform", whole_scene(scene), motion)], "moved")
     part = Motion(*(share * value for value in vars(motion).values()))
     camera = front_camera(64, 48, 50.0)
     seen = picture(at(scene, gdf, share), BLACK, moved_camera(camera, scene.means.double().mean(0), part))
@@ -145,7 +148,7 @@ def test_a_thing_and_a_camera_that_move_alike_show_the_same_picture(share: float
 def test_a_turn_goes_along_an_arc_even_all_the_way_round() -> None:
     scene = scene_of()
     region = left_half(scene)
-    gdf = transform(scene, region, similarity(turn=(0.0, 2 * math.pi, 0.0)), "round")
+    gdf = tidy(scene, [Step("transform", region, similarity(turn=(0.0, 2 * math.pi, 0.0)))], "round")
     means = scene.means[region.members]
     center = means.mean(dim=0)
     radius = (means - center)[:, [0, 2]].norm(dim=1)
@@ -160,7 +163,7 @@ def test_a_turn_goes_along_an_arc_even_all_the_way_round() -> None:
 def test_a_copy_in_place_is_the_region_twice(degree: int) -> None:
     scene = scene_of(degree)
     region = left_half(scene)
-    gdf = duplicate(scene, region, similarity(), "twice")
+    gdf = tidy(scene, [Step("duplicate", region, similarity())], "twice")
     end = at(scene, gdf, 1.0)
     assert len(end) == len(scene) + len(region)
     for name in ATTRIBUTES:
@@ -175,7 +178,7 @@ def test_a_copy_in_place_is_the_region_twice(degree: int) -> None:
 def test_copies_go_where_the_motion_takes_the_region_itself() -> None:
     scene = scene_of(degree=3)
     region, motion = left_half(scene), similarity((0.2, 0.1, 0.0), TURN, 1.3)
-    copy = duplicate(scene, region, motion, "copy").added
+    copy = tidy(scene, [Step("duplicate", region, motion)], "copy").added
     assert copy is not None
     moved = bake(scene, [Step("transform", region, motion)])[region.members]
     assert torch.equal(copy.means, moved.means)
@@ -200,7 +203,7 @@ def test_what_is_baked_is_the_slider_at_its_end() -> None:
 
 def test_an_edit_that_only_adds_is_a_file_like_any_other(tmp_path: Path) -> None:
     scene = scene_of()
-    gdf = duplicate(scene, left_half(scene), similarity((1.0, 0.0, 0.0)), "copy")
+    gdf = tidy(scene, [Step("duplicate", left_half(scene), similarity((1.0, 0.0, 0.0)))], "copy")
     save_gdf(tmp_path / "copy.gdf", gdf)
     again = load_gdf(tmp_path / "copy.gdf", scene)
     for s in (0.0, 0.4, 1.0):

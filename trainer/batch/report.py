@@ -20,7 +20,7 @@ from rich.live import Live
 from rich.text import Text
 
 from progdf.errors import ProgdfError
-from progdf.io.atomic import atomic_write
+from progdf.io.atomic import write_file
 from progdf.io.json_values import convert_json, decode_json
 from progdf.terminal import escape_text, file_size, format_count, format_duration
 from trainer.store.run_folder import RunFolder
@@ -126,8 +126,7 @@ def write_rows(out: Path, rows: Sequence[Row]) -> None:
     writer = csv.DictWriter(text, [field.name for field in fields(Row)])
     writer.writeheader()
     writer.writerows(asdict(row) for row in rows)
-    with atomic_write(out / CSV) as temporary_file:
-        temporary_file.write_text(text.getvalue(), encoding="utf-8")
+    write_file(out / CSV, text.getvalue())
 
 
 def write_page(out: Path, rows: Sequence[Row], jobs: Sequence[Job]) -> None:
@@ -138,15 +137,9 @@ def write_page(out: Path, rows: Sequence[Row], jobs: Sequence[Job]) -> None:
     embed = len(rows) <= _MOST_EMBEDDED
     by_key = {job.key: job for job in jobs}
     body = "\n".join(_html_row(row, by_key.get(row.job), embed) for row in rows)
-    page = (
-        Path(__file__)
-        .with_name("page.html")
-        .read_text(encoding="utf-8")
-        .replace("{summary}", escape(summary))
-        .replace("{rows}", body)
-    )
-    with atomic_write(out / PAGE) as temporary_file:
-        temporary_file.write_text(page, encoding="utf-8")
+    page = Path(__file__).with_name("page.html").read_text(encoding="utf-8")
+    page = page.replace("{summary}", escape(summary)).replace("{rows}", body)
+    write_file(out / PAGE, page)
 
 
 def _html_row(row: Row, job: Job | None, embed: bool) -> str:

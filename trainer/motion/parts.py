@@ -11,15 +11,12 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import numpy as np
 import torch
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from progdf.scene.neighbors import nearest_rows
+from progdf.scene.neighbors import join_pairs, nearest_rows
 from progdf.similarity import Motion, Parts, move_rows
 from trainer.views.crops import CropScene
 
@@ -80,10 +77,8 @@ def _spacing(points: Tensor) -> float:
 
 def _join_cells(centroids: Tensor, reach: float) -> Tensor:
     """Which cells are joined, by however long a chain of cells within reach of each other. [C,3] -> [C]"""
-    count = len(centroids)
     first, second = cKDTree(centroids.numpy()).query_pairs(reach, output_type="ndarray").T
-    links = coo_matrix((np.ones(len(first), np.bool_), (first, second)), (count, count))
-    return torch.from_numpy(connected_components(links, directed=False)[1]).long()
+    return torch.from_numpy(join_pairs(first, second, len(centroids)))
 
 
 def _join_strays(labels: Tensor, centroids: Tensor, counts: Tensor, least: float) -> Tensor:

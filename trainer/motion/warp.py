@@ -28,6 +28,7 @@ from progdf.quaternions import (
     normalize_quats,
     quat_turns,
     rotate_vectors,
+    rotation_matrices,
     turn_quats,
 )
 from progdf.similarity import (
@@ -207,7 +208,7 @@ def transfer_warp(control: ControlPoints, motion: WarpMotion, other: ControlPoin
 
 def affine_maps(control: ControlPoints, motion: WarpMotion) -> tuple[Tensor, Tensor]:
     """Each control point's own map x → A x + b: A [P,3,3], b [P,3]; differentiable."""
-    affine = _turned_axes(turn_quats(motion.turn)) @ _stretches(motion)
+    affine = rotation_matrices(turn_quats(motion.turn)) @ _stretches(motion)
     return affine, motion.shift + control.points - (affine @ control.points[..., None])[..., 0]
 
 
@@ -220,7 +221,7 @@ def map_members(original: Tensor, control: ControlPoints, motion: WarpMotion) ->
     # not numbers[nearest], whose gradient is summed up by threads in any order
     followed = numbers.index_select(0, control.nearest.flatten()).view(*control.nearest.shape, -1)
     blended = (control.weights[..., None] * followed).sum(dim=1)
-    axes = _turned_axes(normalize_quats(original[:, _QUATS]))
+    axes = rotation_matrices(normalize_quats(original[:, _QUATS]))
     growth = (blended[:, 12:21].reshape(-1, 3, 3) @ axes).norm(dim=1).log()
     turn = torch.nn.functional.normalize(blended[:, 21:], dim=1)
     return MemberMaps(blended[:, :9].reshape(-1, 3, 3), blended[:, 9:12], turn, growth)
@@ -251,12 +252,6 @@ def _stretches(motion: WarpMotion) -> Tensor:
     """exp(S) of each control point. [P,3,3]"""
     stretches: Tensor = torch.linalg.matrix_exp(motion.stretch[:, _SYMMETRIC].reshape(-1, 3, 3))
     return stretches
-
-
-def _turned_axes(quats: Tensor) -> Tensor:
-    """The axes of Gaussians, as columns. Unit quaternions [M,4] -> [M,3,3]"""
-    axes = torch.eye(3).to(quats)
-    return torch.stack([rotate_vectors(axis.expand(len(quats), 3), quats) for axis in axes], dim=2)
 
 
 @dataclass(frozen=True)

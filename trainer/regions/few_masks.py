@@ -10,12 +10,10 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from progdf.gaussians import Gaussians
-from progdf.scene.neighbors import nearest_rows
+from progdf.scene.neighbors import join_pairs, nearest_rows
 from progdf.terminal import format_count
 
 FEW = 8
@@ -116,9 +114,7 @@ def connected_pieces(gaussians: Gaussians) -> np.ndarray:
     linked = apart <= _REACH * max(float(np.median(apart[:, -1])), 1e-12)
     linked |= apart <= _WIDE * (width[:, None] + width[near])
     first, second = torch.arange(count)[:, None].expand_as(near)[linked], near[linked]
-    links = coo_matrix((np.ones(len(first), np.bool_), (first.numpy(), second.numpy())), (count, count))
-    pieces: np.ndarray = connected_components(links, directed=False)[1]
-    return pieces
+    return join_pairs(first.numpy(), second.numpy(), count)
 
 
 def _report(say: Callable[[str], None] | None, count: int, what: str) -> None:

@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn
 
 from progdf.errors import ProgdfError
-from progdf.io.atomic import atomic_write
+from progdf.io.atomic import write_file
 from progdf.terminal import escape_text
 
 from .state import Saved
@@ -248,8 +248,8 @@ class RunLog:
             "loss": word.removeprefix("loss to the edit ") if what == "optimize" else "",
             "seconds": total,
         }
-        with suppress(OSError, ProgdfError), atomic_write(self._progress) as temporary_file:
-            temporary_file.write_text(json.dumps(state, ensure_ascii=False), encoding="utf-8")
+        with suppress(OSError, ProgdfError):
+            write_file(self._progress, json.dumps(state, ensure_ascii=False))
 
     def _total(self) -> float:
         return self._earlier + time.perf_counter() - self._start

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from progdf.errors import ProgdfError
 from progdf.field.trajectory import FILE_NAME
-from progdf.io.atomic import LOCK, LockedError, atomic_write, hold_lock, is_temporary, remove_abandoned
+from progdf.io.atomic import LOCK, LockedError, hold_lock, is_temporary, remove_abandoned, write_file
 from progdf.io.images import read_picture, write_image
 from progdf.io.json_values import convert_json, decode_json
 from progdf.threads import map_threads
@@ -74,8 +74,7 @@ def _is_inside(folder: Path, line: str) -> bool:
 
 
 def _write(folder: Path, lines: Iterable[str]) -> None:
-    with atomic_write(folder / NAME) as temporary_file:
-        temporary_file.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
+    write_file(folder / NAME, "".join(f"{line}\n" for line in lines))
 
 
 _SIGNATURE = "progdf train"
@@ -205,9 +204,7 @@ def open_run_folder(root: Path, edit: Mapping[str, str]) -> RunFolder:
 
 def begin_log(folder: RunFolder, edit: Mapping[str, str]) -> None:
     """A new log.txt; its first line says that the folder is a run, and of which edit."""
-    with atomic_write(folder.log) as temporary_file:
-        line = f"{_SIGNATURE} {json.dumps(dict(edit), ensure_ascii=False)}\n"
-        temporary_file.write_text(line, encoding="utf-8")
+    write_file(folder.log, f"{_SIGNATURE} {json.dumps(dict(edit), ensure_ascii=False)}\n")
 
 
 @contextlib.contextmanager
@@ -300,5 +297,4 @@ def remove_stale_views(folder: RunFolder, names: Sequence[str]) -> None:
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Write JSON, whole or not at all."""
-    with atomic_write(path) as temporary_file:
-        temporary_file.write_text(json.dumps(content, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+    write_file(path, json.dumps(content, indent=2, ensure_ascii=False) + "\n")

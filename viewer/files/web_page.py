@@ -14,7 +14,7 @@ from progdf.compose.reference import compose_layers
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf, fingerprint
-from progdf.io.atomic import atomic_write
+from progdf.io.atomic import write_file
 from progdf.metrics.image import psnr
 from progdf.rasterize import render
 from viewer.camera.view_camera import ViewCamera, bounds_of, to_camera
@@ -67,8 +67,7 @@ def write_page(
     degree = min(options.sh, document.scene.sh_degree)
     packed = pack(document.scene, gdfs, options.quality, degree, stage)
     html = build_page(packed.data, texts)
-    with atomic_write(out) as temporary_file:
-        temporary_file.write_text(html, encoding="utf-8")
+    write_file(out, html)
     error = psnr(picture(packed.scene, document.gdfs, view, STILL, DRAWN_SH[degree]), start)
     size, whole = len(html.encode()), document.scene.sh_degree
     parts = [f"{size / 1e6:.2f} MB", options.quality]

@@ -367,8 +367,7 @@ class EditOrder:
         atomic.make_folder(self.out.parent)
         values = plain(self) | {"scene": str(self.scene)}
         del values["out"]  # it is where the file is
-        with atomic.atomic_write(self._beside(ORDER)) as temporary_file:
-            temporary_file.write_bytes(msgspec.json.format(msgspec.json.encode(values)))
+        atomic.write_file(self._beside(ORDER), msgspec.json.format(msgspec.json.encode(values)))
 
     def discard(self) -> None:
         """Remove a run that was not finished, and what was written down of it.

@@ -13,7 +13,7 @@ import torch
 import viewer
 from progdf.demo_scenes import SKY
 from progdf.errors import ProgdfError
-from progdf.io.atomic import atomic_write, make_folder, read_file, state_folder
+from progdf.io.atomic import make_folder, read_file, state_folder, write_file
 from progdf.io.session import BUNDLE, sha256
 from progdf.scene import up_axis
 from viewer.app.application import Application, Requests, attempt
@@ -131,8 +131,7 @@ class StartActions:
         make_folder(folder)
         copy = folder / Path(bundle).name
         if not copy.exists():
-            with atomic_write(copy) as temporary_file:
-                temporary_file.write_bytes(read_file(Path(bundle)))
+            write_file(copy, read_file(Path(bundle)))
         self._app.open(copy)
 
     def _publish(self) -> None:

@@ -17,7 +17,7 @@ from PIL import Image
 
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
-from progdf.io.atomic import atomic_write, make_folder, read_file
+from progdf.io.atomic import atomic_write, make_folder, read_file, write_file
 from progdf.io.cameras import save_cameras
 from progdf.io.picture_camera import camera_chunk
 from progdf.scene.regions import check_region
@@ -201,14 +201,12 @@ class JobActions:
         Raises:
             ProgdfError: its file cannot be written or read.
         """
-        with atomic_write(order.draft) as temporary_file:
-            temporary_file.write_bytes(read_file(draft))
+        write_file(order.draft, read_file(draft))
         self._edits.add(order.draft, order.name, strength)
 
     def _take_packed(self, order: EditOrder, packed: Path) -> None:
         """What is trained and only measured yet takes the place of the draft's layer."""
-        with atomic_write(order.packed_edit) as temporary_file:
-            temporary_file.write_bytes(read_file(packed))
+        write_file(order.packed_edit, read_file(packed))
         self._edits.finish(order.draft, order.packed_edit)
 
     def _write_anchor(self, form: NewEdit, run: Path) -> str:
