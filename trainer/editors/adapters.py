@@ -6,7 +6,6 @@ Weights are gigabytes: they are read from this machine and never fetched unasked
 from __future__ import annotations
 
 import json
-import logging
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
@@ -21,6 +20,7 @@ from torch import Tensor
 from progdf.errors import ProgdfError
 from progdf.io.images import to_picture
 from trainer.options import Device
+from trainer.store import pretrained
 from trainer.store.pretrained import BROKEN, folder_of_model, gpu_memory, model_device, weights_here
 
 from .mixed_steps import MixedSteps, euler_scheduler
@@ -198,7 +198,7 @@ def adapter_of(model: str) -> tuple[str, Adapter]:
         index = json.loads((pipeline_folder(model) / "model_index.json").read_bytes())
         kind = str(index["_class_name"])
     except BROKEN as error:
-        raise missing_weights(model) from error
+        raise missing_pipeline(model) from error
     if kind not in ADAPTERS:
         raise ProgdfError(f"{model} is a {kind}, which cannot edit pictures here; use one of {_models()}")
     adapter = ADAPTERS[kind]
@@ -253,7 +253,7 @@ def component_sizes(model: str, adapter: Adapter) -> dict[str, int]:
             if (folder / name / "config.json").is_file():
                 sizes[name] = weights_here(folder / name)
     except BROKEN as error:
-        raise missing_weights(model) from error
+        raise missing_pipeline(model) from error
     return sizes
 
 
@@ -329,9 +329,7 @@ def load_pipeline(request: Request, placement: Placement) -> MixedSteps:
     from diffusers.utils import logging as diffusers_logging
     from transformers.utils import logging as transformers_logging
 
-    for speaks in (diffusers_logging, transformers_logging):
-        speaks.set_verbosity(logging.ERROR)
-        speaks.disable_progress_bar()
+    pretrained.keep_quiet(diffusers_logging, transformers_logging)
     adapter, loading = request.adapter, dict(request.adapter.loading)
     if request.quantize == "nf4":
         bits = {"load_in_4bit": True, "bnb_4bit_quant_type": "nf4", "bnb_4bit_compute_dtype": placement.dtype}
@@ -351,7 +349,7 @@ def load_pipeline(request: Request, placement: Placement) -> MixedSteps:
         except torch.OutOfMemoryError:
             raise
         except BROKEN as error:
-            raise missing_weights(request.model) from error
+            raise missing_pipeline(request.model) from error
         pipeline.set_progress_bar_config(disable=True)
         pipeline.scheduler = euler_scheduler(pipeline)
         mixed = MixedSteps(pipeline, adapter.encodes_alone)
@@ -370,22 +368,18 @@ def load_pipeline(request: Request, placement: Placement) -> MixedSteps:
     return mixed
 
 
-def missing_weights(model: str) -> ProgdfError:
-    """What to do where a model is not here, or not whole."""
-    if model.startswith((".", "/", "~")) or Path(model).is_dir():
-        return ProgdfError(
-            f"{model} does not hold a complete diffusers pipeline with safetensors weights; "
-            f"give --model such a folder, or one of {_models()}"
-        )
+def missing_pipeline(model: str) -> ProgdfError:
+    """What to do where a pipeline is not here, or not whole."""
     gated = any(adapter.is_gated and adapter.model == model for adapter in ADAPTERS.values())
     login = (
         f" after accepting its license at https://huggingface.co/{model} and 'hf auth login'" if gated else ""
     )
-    return ProgdfError(
-        f"the weights of {model} are not on this machine or are incomplete; download them with "
-        f"'hf download {model} --include \"*/*\" --include model_index.json'{login}, "
+    download = (
+        f' --include "*/*" --include model_index.json\'{login}, '
         "or give --model the folder of a saved pipeline"
     )
+    of_folder = f"; give --model such a folder, or one of {_models()}"
+    return pretrained.missing_weights(model, "diffusers pipeline", of_folder, download)
 
 
 def _models() -> str:

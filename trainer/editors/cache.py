@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -54,11 +55,9 @@ class KeptPictures:
         path = self.folder / place / f"{name}.png"
         note = path.with_suffix(".json")
         expected = {"source": digest(source), "editor": dict(recipe)}
-        if _read_note(note) == expected:
-            try:
+        with suppress(OSError, ValueError, ProgdfError):  # what is deleted or broken is painted anew
+            if decode_json(note.read_bytes()) == expected:
                 return read_picture(path, size=(source.shape[1], source.shape[0]))
-            except ProgdfError:
-                pass  # it was deleted or broken: painted anew
         painted = paint(source)
         note.unlink(missing_ok=True)  # a new picture never lies beside an old note
         write_image(path, painted)
@@ -71,10 +70,3 @@ def digest(image: Tensor) -> str:
     """SHA-256 of a picture as an 8-bit file holds it. [H,W,3]"""
     pixels = np.asarray(to_picture(image))
     return hashlib.sha256(repr(pixels.shape).encode() + pixels.tobytes()).hexdigest()
-
-
-def _read_note(path: Path) -> object:
-    try:
-        return decode_json(path.read_bytes())
-    except (OSError, ValueError):
-        return None

@@ -17,6 +17,7 @@ from progdf.gaussians import ZERO, Gaussians, Origin
 from progdf.io.cameras import load_cameras
 from progdf.io.images import open_picture
 from progdf.rasterize.engines import render_depth
+from progdf.scene.regions import read_numbers
 from trainer.options import EditKind, EditorOptions
 from trainer.paint.discs import LEAST_ALPHA, OPAQUE, Paint, lay_on, project_paint, sample_image
 from trainer.views.view import BACKGROUND, View, make_view, with_near_plane
@@ -43,11 +44,8 @@ def parse_place(text: str, camera: Camera) -> Place:
         ProgdfError: no such numbers.
     """
     wanted = "--at needs x,y,size or x,y,size,angle in pixels of the camera's picture, or in shares of it"
-    try:
-        numbers = [float(part) for part in text.split(",")]
-    except ValueError:
-        numbers = []
-    if len(numbers) not in (3, 4) or not all(map(math.isfinite, numbers)):
+    numbers = read_numbers(text)
+    if len(numbers) not in (3, 4):
         raise ProgdfError(f"{wanted}, got '{text}'")
     x, y, size, angle = (*numbers, 0.0)[:4]
     if size <= 0:

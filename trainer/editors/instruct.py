@@ -8,7 +8,6 @@ model's, but that of `mixed_steps`.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cache
@@ -21,6 +20,7 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import ZERO, Gaussians
 from progdf.io.picture_camera import find_picture_camera
 from progdf.rasterize import Crop
+from progdf.scene.regions import read_numbers
 from trainer.options import EditKind, EditorOptions
 from trainer.store.pretrained import last_model
 from trainer.store.run_folder import from_bytes, to_bytes
@@ -263,12 +263,8 @@ def parse_guidance(text: str) -> tuple[float | None, float | None]:
     Raises:
         ProgdfError: it is neither one number nor two.
     """
-    words = text.split(",") if text else []
-    try:
-        numbers = [float(word) for word in words]
-    except ValueError:
-        numbers = [math.nan]
-    if len(numbers) > 2 or not all(1 <= number <= 100 for number in numbers):
+    numbers = read_numbers(text)
+    if text and (len(numbers) not in (1, 2) or not all(1 <= number <= 100 for number in numbers)):
         raise ProgdfError(
             f"--guidance must be one or two numbers between 1 and 100, such as 7.5,1.5; got {text}"
         )

@@ -23,7 +23,7 @@ from scipy import ndimage
 from torch import Tensor
 
 from progdf.camera import Camera, undistort
-from progdf.color.edits import typical_color
+from progdf.color.edits import number_of, typical_color
 from progdf.color.oklab import Bend, bend_of, interpolate_colors
 from progdf.errors import ProgdfError
 from progdf.gaussians import ZERO, Gaussians, Origin
@@ -134,10 +134,7 @@ def strengths_of(path: Path) -> dict[float, Path]:
     """Strength → picture: those of its name in subfolders that are named for one, and itself at 1."""
     paths = {1.0: path}
     for child in sorted(path.parent.iterdir()):
-        try:
-            strength = float(child.name)
-        except ValueError:
-            continue
+        strength = number_of(child.name)
         if math.isfinite(strength) and (child / path.name).is_file():
             if not 0.0 < strength < 1.0:
                 raise ProgdfError(
@@ -326,8 +323,6 @@ class FolderEditor:
         """See `ImageEditor.edit`; ProgdfError where the picture is missing, broken or of another shape."""
         if strength == 0.0:
             return view.image
-        if strength not in self.folders:
-            raise ValueError(f"no folder holds strength {strength:g}; there are {list(self.stages)}")
         picture, visible = self._read_undistorted(self.folders[strength], view)
         if self.originals is not None:
             picture = (view.image + picture - self._read_undistorted(self.originals, view)[0]).clamp(0.0, 1.0)
@@ -374,8 +369,8 @@ def folder(given: EditorInput) -> FolderEditor:
 def _make_editor(root: Path, views: Sequence[View], bent: bool = False) -> FolderEditor:
     folders: dict[float, Path] = {}
     for child in sorted(root.iterdir()):
-        strength = _strength(child.name)
-        if child.is_dir() and strength is not None:
+        strength = number_of(child.name)
+        if child.is_dir() and math.isfinite(strength):
             if not 0.0 < strength <= 1.0:
                 raise ProgdfError(f"{child} is named for a strength outside 0..1; name it 0.25, 0.5, … or 1")
             folders[strength] = child
@@ -397,16 +392,13 @@ def photographs(given: EditorInput) -> FolderEditor:
     return replace(_make_editor(edited, given.views, bent=True), originals=originals)
 
 
-def _strength(name: str) -> float | None:
-    try:
-        value = float(name)
-    except ValueError:
-        return None
-    return value if torch.isfinite(torch.tensor(value)) else None
-
-
 def _picture(where: Path, name: str, bent: bool) -> Path:
-    for suffix in SUFFIXES:
-        if (where / f"{name}{suffix}").is_file():
-            return where / f"{name}{suffix}"
-    raise ProgdfError(f"{where} has no picture {name}.png; {_TAKEN if bent else _EDITED}")
+    if (path := picture_named(where, name)) is None:
+        raise ProgdfError(f"{where} has no picture {name}.png; {_TAKEN if bent else _EDITED}")
+    return path
+
+
+def picture_named(folder: Path, name: str) -> Path | None:
+    """The picture of a view in a folder, by the view's name; None where there is none."""
+    paths = (folder / f"{name}{suffix}" for suffix in SUFFIXES)
+    return next((path for path in paths if path.is_file()), None)

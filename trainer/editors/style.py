@@ -72,9 +72,9 @@ def cross_fade(plain: Tensor, painted: Tensor, strength: float) -> Tensor:
     if strength in (0.0, 1.0):
         return painted if strength else plain
     fade = torch.lerp(plain, painted, strength)
-    smooth, target = _smooth(fade), torch.lerp(_contrast(plain), _contrast(painted), strength)
+    coarse, target = smooth(fade), torch.lerp(_contrast(plain), _contrast(painted), strength)
     gain = (target / _contrast(fade).clamp_min(1e-4)).clamp(1.0, 2.0)
-    return (smooth + gain * (fade - smooth)).clamp(0.0, 1.0)
+    return (coarse + gain * (fade - coarse)).clamp(0.0, 1.0)
 
 
 def style_number(what: str) -> int:
@@ -129,7 +129,7 @@ def _paint_size(size: tuple[int, int], longer: int) -> tuple[int, int]:
     return max(_LEAST, round(size[0] * scale)), max(_LEAST, round(size[1] * scale))
 
 
-def _smooth(image: Tensor) -> Tensor:
+def smooth(image: Tensor) -> Tensor:
     """Mean of the pixels around each, fewer at the border. [H,W,3] -> [H,W,3]"""
     stack = image.permute(2, 0, 1)[None]
     return avg_pool2d(stack, _DETAIL, 1, _DETAIL // 2, count_include_pad=False)[0].permute(1, 2, 0)
@@ -137,5 +137,5 @@ def _smooth(image: Tensor) -> Tensor:
 
 def _contrast(image: Tensor) -> Tensor:
     """Local standard deviation, all channels together. [H,W,3] -> [H,W,1]"""
-    variance = (_smooth(image.square()) - _smooth(image).square()).clamp_min(0.0)
+    variance = (smooth(image.square()) - smooth(image).square()).clamp_min(0.0)
     return variance.mean(dim=2, keepdim=True).sqrt()

@@ -16,6 +16,7 @@ from progdf.compose.reference import edited_scene
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.metrics.image import psnr
+from progdf.metrics.slider import visible_change
 from progdf.rasterize.engines import Depth, render_depth
 from trainer.fit.evaluate import Evaluator
 from trainer.optimize.losses import Perceptual
@@ -113,8 +114,8 @@ def outside_change(opened: OpenedRun) -> dict[str, float]:
     original = [crop(view.image, box) for view, box in zip(views, boxes, strict=True)]
     shown = evaluator.pictures(opened.gdf.field.offsets(1.0))
     return {
-        EDITED: _mean_change(original, shown, outside),
-        EDITOR: _mean_change(original, evaluator.edited[1.0], outside),
+        EDITED: visible_change(original, shown, outside),
+        EDITOR: visible_change(original, evaluator.edited[1.0], outside),
     }
 
 
@@ -145,14 +146,6 @@ def _warp(
         both,
         torch.where(alpha > 0.5, depth, 0.0),
     )
-
-
-def _mean_change(before: Sequence[Tensor], after: Sequence[Tensor], where: Sequence[Tensor]) -> float:
-    total = count = 0.0
-    for a, b, pixels in zip(before, after, where, strict=True):
-        total += float((a - b).abs().mean(dim=2)[pixels].double().sum())
-        count += int(pixels.sum())
-    return total / count if count else 0.0
 
 
 _OPAQUE = 0.9  # less shows the background through, which has no depth

@@ -20,9 +20,8 @@ from progdf.metrics.slider import Pictures
 from trainer.fit.evaluate import Evaluator
 from trainer.fit.slider_uniformity import equalize_slider
 from trainer.run.finish import load_evaluator
-from trainer.run.record import FinishedRun, render_run_views, reopen_run
-from trainer.setup import TrainingSetup, widen_views
-from trainer.store.run_folder import read_views
+from trainer.run.record import FinishedRun, render_edited_views, reopen_run
+from trainer.setup import TrainingSetup
 
 SLIDER, KEYFRAMES, FADE = "slider", "2 keyframes", "cross-fade"
 """What is compared: the shipped field; the original and the end with a straight line between, its slider made
@@ -40,11 +39,6 @@ class OpenedRun:
     gdf: Gdf  # the edit as it is shipped
     trajectory: Trajectory  # what was recorded, on the shipped slider
     keyframes: BakedField  # the end alone, see `KEYFRAMES`
-
-    @property
-    def fields(self) -> dict[str, BakedField]:
-        """The shipped field and two keyframes, by name."""
-        return {SLIDER: self.gdf.field, KEYFRAMES: self.keyframes}
 
     def contenders(self) -> dict[str, Pictures]:
         """Slider value -> the held-out views' boxes, of everything that is compared."""
@@ -76,12 +70,9 @@ def open_run(root: Path, scene: Path | None = None) -> OpenedRun:
     except ValueError as error:
         raise ProgdfError(f"{run.folder.report} is damaged ({error}); run progdf fit {root}") from error
     gdf = load_gdf(run.folder.gdf(run.record.plan.name), run.scene)
-    setup = render_run_views(run)
+    setup = render_edited_views(run)
     if not setup.train:
         raise ProgdfError(f"{root} has no views to measure with; train it again")
-    names = [view.camera.name for view in setup.train]
-    edited = {s: read_views(run.folder, "edited", names, s) for s in run.trajectory.strengths}
-    setup = widen_views(setup, edited)
     shown_at = torch.tensor(gdf.field.recorded, dtype=torch.float32)
     if shown_at.shape != run.trajectory.s.shape:
         raise ProgdfError(f"{gdf.name}.gdf is not of the recording beside it; run progdf fit {root}")

@@ -28,7 +28,7 @@ from progdf.scene.scribbles import Rows, Scribbles, rows_under
 from progdf.scene.selection import Surface, base_colors
 from progdf.scene.up_axis import find_up
 from trainer.editors.cache import KeptPictures, Recipe
-from trainer.editors.pictures import SUFFIXES, picture_paths, read_change, rendered_cameras
+from trainer.editors.pictures import picture_named, picture_paths, read_change, rendered_cameras
 from trainer.options import VIEWS, RegionOptions, ViewOptions
 from trainer.store.pretrained import last_model
 from trainer.views.view import (
@@ -56,11 +56,9 @@ def read_masks(folder: Path, cameras: Sequence[Camera], bent: bool = False) -> l
         bent: the masks were drawn over photographs, which the cameras' lenses have bent: straighten them
 
     Raises:
-        ProgdfError: no such folder, not one mask in it, or one that is broken or of other proportions.
+        ProgdfError: not one mask is in it, or one that is broken or of other proportions.
     """
-    if not folder.is_dir():
-        raise ProgdfError(f"{folder} is not a folder; give the one that holds a mask for each view")
-    files = [_file(folder, camera) for camera in cameras]
+    files = [picture_named(folder, camera.name) for camera in cameras]
     if not any(files):
         raise ProgdfError(
             f"{folder} has no mask for any of the {len(cameras)} cameras; "
@@ -68,11 +66,6 @@ def read_masks(folder: Path, cameras: Sequence[Camera], bent: bool = False) -> l
         )
     pairs = zip(files, cameras, strict=True)
     return [None if file is None else _mask(file, camera, bent) for file, camera in pairs]
-
-
-def _file(folder: Path, camera: Camera) -> Path | None:
-    paths = (folder / f"{camera.name}{suffix}" for suffix in SUFFIXES)
-    return next((path for path in paths if path.is_file()), None)
 
 
 def _mask(path: Path, camera: Camera, bent: bool) -> Tensor:

@@ -5,10 +5,8 @@ Together they are what the paper calls LangSAM. Weights are read from this machi
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Protocol
 
 import torch
@@ -17,6 +15,7 @@ from torch import Tensor
 from progdf.errors import ProgdfError
 from progdf.io.images import to_picture
 from trainer.options import DETECTOR, SAM_MODEL, RegionOptions
+from trainer.store import pretrained
 from trainer.store.pretrained import BROKEN, folder_of_model, model_device, weights_here
 
 
@@ -98,9 +97,7 @@ def grounded_sam(options: RegionOptions) -> GroundedSam:
         from transformers.utils import logging as speaks
     except ImportError as error:
         raise _import_failure(error) from error
-    # it warns on stderr of every optional package that it can do without
-    speaks.set_verbosity(logging.ERROR)
-    speaks.disable_progress_bar()
+    pretrained.keep_quiet(speaks)
 
     def load(model: str, kind: str, option: str, usual: str, network: Any, processor: Any) -> tuple[Any, Any]:
         try:
@@ -113,7 +110,7 @@ def grounded_sam(options: RegionOptions) -> GroundedSam:
         except ProgdfError:
             raise
         except BROKEN as error:
-            raise ProgdfError(_missing(model, option)) from error
+            raise _missing(model, option) from error
 
     finder = load(
         options.detector,
@@ -145,7 +142,7 @@ def check_grounded_sam(options: RegionOptions) -> None:
             _check_kind(AutoConfig.from_pretrained(model, local_files_only=True), model, kind, option, usual)
             weights_here(folder_of_model(model, "config.json"))
         except BROKEN as error:
-            raise ProgdfError(_missing(model, option)) from error
+            raise _missing(model, option) from error
 
 
 def _check_kind(config: Any, model: str, kind: str, option: str, usual: str) -> None:
@@ -157,13 +154,9 @@ def _import_failure(error: ImportError) -> ProgdfError:
     return ProgdfError(f"text: needs the package transformers ({error}); pip install progdf-studio[segment]")
 
 
-def _missing(model: str, option: str) -> str:
-    if Path(model).is_dir() or model.startswith((".", "/", "~")):
-        return f"{model} does not hold a complete model with safetensors weights; give {option} such a folder"
-    return (
-        f"the weights of {model} are not on this machine or are incomplete; download them with "
-        f"'hf download {model}', or give {option} the folder of a saved model"
-    )
+def _missing(model: str, option: str) -> ProgdfError:
+    download = f"', or give {option} the folder of a saved model"
+    return pretrained.missing_weights(model, "model", f"; give {option} such a folder", download)
 
 
 SEGMENTERS: Mapping[str, Callable[[RegionOptions], Segmenter]] = {"text": grounded_sam}

@@ -19,17 +19,16 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
 
 from progdf.metrics.image import NO_DIFFERENCE, decibels
 from progdf.rasterize import render
+from trainer.editors.style import smooth
 from trainer.setup import TrainingSetup, shrink_view
 from trainer.views.crops import CropScene
 from trainer.views.view import View
 
 _MOST_UNEXPLAINED = 0.4  # half way between the edits that agree and those that do not, see above
 _MOST_FINE = 0.5  # calm styles leave up to .47, stripes of random phase .55 and more
-_DETAIL = 9  # pixels
 _LEAST_CONTRAST = 0.8  # what is washed out agrees, at less than what it had
 _HARMLESS_DB = 28.0  # what differs by less is not seen, whatever its share of a faint change
 _REMEDIES = {
@@ -47,7 +46,7 @@ class Agreement:
 
     psnr: float  # of the best colors on held-out views, over the pixels that show the region or change, dB
     unexplained: float  # what those colors leave of the change there, as a share of its energy, 0 is best
-    # the same of its fine part, what varies within `_DETAIL` pixels at half size
+    # the same of its fine part, what varies within 9 pixels at half size
     unexplained_fine: float = 0.0
     # fine energy of the pictures over what they had before they were made to agree, where they were
     contrast: float = 1.0
@@ -151,9 +150,7 @@ def measure_agreement(setup: TrainingSetup, train: Sequence[Tensor], held_out: S
 
 def fine_energy(change: Tensor) -> float:
     """Energy of what differs from the mean of the pixels around, of a change of a picture. [H,W,3]"""
-    planes = change.permute(2, 0, 1)[:, None]
-    mean = avg_pool2d(planes, _DETAIL, 1, _DETAIL // 2, count_include_pad=False)
-    return float((planes - mean).square().sum())
+    return float((change - smooth(change)).square().sum())
 
 
 def fit_colors(seen: Sequence[ViewChange], members: int) -> Tensor:

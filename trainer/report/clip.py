@@ -8,7 +8,6 @@ nothing changes, as at s = 0. Weights are gigabytes: they are read from this mac
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +18,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate, normalize, pad
 
 from progdf.errors import ProgdfError
-from trainer.store.pretrained import BROKEN
+from trainer.store.pretrained import BROKEN, keep_quiet, missing_weights
 
 CLIP_MODEL = "openai/clip-vit-large-patch14"
 """The one whose figures are compared in papers."""
@@ -73,19 +72,18 @@ def load_clip(model: str = CLIP_MODEL) -> Clip:
         from transformers.utils import logging as speaks
     except ImportError as error:
         raise ProgdfError(f"CLIP needs the package transformers ({error}); {EXTRA}") from error
-    speaks.set_verbosity(logging.ERROR)
-    speaks.disable_progress_bar()
+    keep_quiet(speaks)
     try:
         config = AutoConfig.from_pretrained(model, local_files_only=True)
     except BROKEN as error:
-        raise ProgdfError(_missing(model)) from error
+        raise missing_weights(model, "CLIP model", "", "'") from error
     if config.model_type != "clip":
         raise ProgdfError(f"{model} is a {config.model_type} model, not CLIP")
     try:
         network = CLIPModel.from_pretrained(model, local_files_only=True, use_safetensors=True)
         tokenizer = AutoTokenizer.from_pretrained(model, local_files_only=True)
     except BROKEN as error:
-        raise ProgdfError(_missing(model)) from error
+        raise missing_weights(model, "CLIP model", "", "'") from error
     return Clip(network.float().eval(), tokenizer, int(config.vision_config.image_size), _name(model))
 
 
@@ -132,12 +130,3 @@ def square_picture(image: Tensor, size: int) -> Tensor:
 
 def _name(model: str) -> str:
     return Path(model).name if Path(model).is_dir() else model
-
-
-def _missing(model: str) -> str:
-    if Path(model).is_dir() or model.startswith((".", "/", "~")):
-        return f"{model} does not hold a complete CLIP model with safetensors weights"
-    return (
-        f"the weights of {model} are not on this machine or are incomplete; download them with "
-        f"'hf download {model}'"
-    )

@@ -13,7 +13,7 @@ from torch import Tensor
 from progdf.compose.added import extend
 from progdf.compose.reference import edited_scene
 from progdf.errors import ProgdfError
-from progdf.field.baked import identity_remap
+from progdf.field.baked import BakedField, identity_remap
 from progdf.field.trajectory import Trajectory, load_trajectory
 from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, Gaussians, pack
 from progdf.gdf.file import Gdf, fingerprint, load_gdf, save_gdf
@@ -27,7 +27,7 @@ from trainer.fit.network import NetworkFit, fit_network
 from trainer.fit.slider_uniformity import equalize_slider
 from trainer.optimize.losses import Perceptual, perceptual_loss
 from trainer.optimize.retime import resolve_slider
-from trainer.options import FieldOptions, FitOptions, TextOptions, with_values
+from trainer.options import FieldOptions, FitOptions, TextOptions, TrainOptions, with_values
 from trainer.regions.from_pictures import CHANGED
 from trainer.report.measures import (
     PaintTaken,
@@ -40,7 +40,7 @@ from trainer.report.measures import (
 )
 from trainer.report.report import report_picture
 from trainer.resolve import BLANK, check_field_options, use_threads
-from trainer.setup import TrainingSetup, whole_views, widen_views
+from trainer.setup import TrainingSetup
 from trainer.store.progress import RunLog
 from trainer.store.run_folder import RunFolder, read_views, write_json, write_views
 from trainer.store.state import Saved
@@ -48,7 +48,7 @@ from trainer.views.crops import only_recolors
 from trainer.views.view import View, render_view
 
 from .paint import sharpen
-from .record import RunRecord, render_run_views, reopen_run
+from .record import RunRecord, render_edited_views, reopen_run
 
 _RANK_VIEWS = 4
 _WEIGHED_EVERY = 2  # of the training views one says how visible the members are
@@ -99,11 +99,11 @@ def finish_run(
         log: of the run
         begun: see `network.fit_network`
     """
-    options, scene, region = record.plan, setup.scene, setup.region
+    options, scene = record.plan, setup.scene
     with log.stage("fit"):
         grown = setup.extend(trajectory.added)
         evaluator = load_evaluator(folder, grown, setup.judging, trajectory)
-        choosing, reporting = evaluator.halves()
+        _, reporting = evaluator.halves()
         fitted, network = _fit(
             options.field, grown, evaluator, trajectory, perceptual, log, folder, begun=begun
         )
@@ -120,20 +120,16 @@ def finish_run(
         clip = clip_curve(evaluator, setup.judging, field, options.texts)
         if clip.reason and options.texts.asked:
             log.say(f"CLIP directional similarity is not measured: {clip.reason}")
-        plan = plain(options)
-        added = None if trajectory.added is None else grown.scene[len(scene) :]
-        given = differences(plan if added is not None else plain(with_values(options, grow=0.0)), DEFAULTS)
-        gdf = Gdf(options.name, region, field, fingerprint(scene), options.editor.editor, given, added=added)
-        cameras = [view.camera for view in setup.train]
-        pictures = dict(zip(options.views.pictures, cameras, strict=False))
+        gdf = _make_gdf(options, setup, field, grown.scene[len(scene) :])
+        pairs = zip(options.views.pictures, setup.train, strict=False)
+        pictures = {path: view.camera for path, view in pairs}
         sharp = sharpen(scene, gdf, pictures, options.region.region != CHANGED, log)
         save_gdf(folder.draft, gdf if sharp is None else sharp)  # a window shows it while it is measured
         with log.looks("measure the edit", expected_measures(trajectory)) as looked:
             judges = replace(evaluator, looked=looked), replace(reporting, looked=looked)
             measured = measure(judges, trajectory, fitted, field, remap, perceptual, clip)
         endpoint, outside = exactness(scene, gdf, end_rows(grown, trajectory))
-        title = f"{options.name}: {options.editor.editor}"
-        shown = evaluator
+        title, shown = f"{options.name}: {options.editor.editor}", evaluator
         if sharp is not None:
             gdf = sharp
             shown = load_evaluator(folder, setup, setup.judging, trajectory, gdf)
@@ -149,21 +145,35 @@ def finish_run(
         measures["field"] |= network.figures()
     report = {
         **measures,
-        "views": {
-            "held_out": bool(setup.held_out),
-            "edit": list(evaluator.names),
-            "field_chosen": list(choosing.names),
-            "field": list(reporting.names),
-            "lpips_over": _LPIPS_OVER,
-        },
+        "views": _view_figures(setup, evaluator),
         "trajectory": _course_figures(shipped, slider, record),
         **_record_figures(record),
         "paint": paint.figures() if paint is not None else None,
         "time": {**(_earlier_seconds(folder) if log.refits else {}), **log.rounded_seconds()},
         "memory_mb": log.peak_mb(),
-        "plan": plan,
+        "plan": plain(options),
     }
     return _write(folder, gdf, report, picture, shipped, setup, paint, log)
+
+
+def _make_gdf(options: TrainOptions, setup: TrainingSetup, field: BakedField, added: Gaussians) -> Gdf:
+    """The edit as it is written, but for its report, and for what is painted finer than the Gaussians."""
+    plan = plain(options if len(added) else with_values(options, grow=0.0))
+    given, scene_print = differences(plan, DEFAULTS), fingerprint(setup.scene)
+    instruction, rows = options.editor.editor, added if len(added) else None
+    return Gdf(options.name, setup.region, field, scene_print, instruction, given, added=rows)
+
+
+def _view_figures(setup: TrainingSetup, evaluator: Evaluator) -> dict[str, Any]:
+    """As report.json has the views that measure the edit, choose its field and measure that."""
+    choosing, reporting = evaluator.halves()
+    return {
+        "held_out": bool(setup.held_out),
+        "edit": list(evaluator.names),
+        "field_chosen": list(choosing.names),
+        "field": list(reporting.names),
+        "lpips_over": _LPIPS_OVER,
+    }
 
 
 def _course_figures(shipped: Trajectory, slider: str, record: RunRecord) -> dict[str, Any]:
@@ -386,12 +396,7 @@ def refit(options: FitOptions, quiet: bool = False) -> RunResult:
     log = RunLog(run.folder.log, quiet, refits=True)
     try:
         with log.stage("views"):
-            setup = render_run_views(run)
-            names = [view.camera.name for view in setup.train]
-            edited = {s: read_views(run.folder, "edited", names, s) for s in run.trajectory.strengths}
-            # what grows beyond the region's boxes is seen as well, or the slider is timed on half of it
-            as_printed = run.record.plan.optimize.as_printed
-            setup = whole_views(setup) if as_printed else widen_views(setup, edited)
+            setup = render_edited_views(run)
         perceptual, warning = perceptual_loss()
         if warning:
             log.say(warning)

@@ -19,8 +19,8 @@ from progdf.io.json_values import convert_json
 from progdf.region import Region
 from trainer.options import EditKind, TrainOptions
 from trainer.resolve import check_name
-from trainer.setup import TrainingSetup
-from trainer.store.run_folder import RunFolder
+from trainer.setup import TrainingSetup, whole_views, widen_views
+from trainer.store.run_folder import RunFolder, read_views
 from trainer.views.view import make_view, with_near_plane
 
 
@@ -126,4 +126,15 @@ def render_run_views(run: FinishedRun) -> TrainingSetup:
         [view for view in views if view.camera.name not in held_out],
         [view for view in views if view.camera.name in held_out],
         background,
+    )
+
+
+def render_edited_views(run: FinishedRun) -> TrainingSetup:
+    """`render_run_views`; the boxes of those trained on hold all that the edit changes, as in training."""
+    setup = render_run_views(run)
+    if run.record.plan.optimize.as_printed:
+        return whole_views(setup)
+    names = [view.camera.name for view in setup.train]
+    return widen_views(
+        setup, {s: read_views(run.folder, "edited", names, s) for s in run.trajectory.strengths}
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import json
+import logging
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -11,6 +12,8 @@ from typing import Any, TypeVar
 
 import torch
 from safetensors import SafetensorError, safe_open
+
+from progdf.errors import ProgdfError
 
 BROKEN = (OSError, ValueError, RuntimeError, KeyError, TypeError, SafetensorError)
 """What transformers and diffusers raise for a model that is not there, not whole, or another's."""
@@ -65,6 +68,29 @@ def folder_of_model(model: str, file: str) -> Path:
     if not isinstance(cached, str):
         raise OSError(f"{model} is not on this machine")
     return Path(cached).parent
+
+
+def missing_weights(model: str, kind: str, of_folder: str, download: str) -> ProgdfError:
+    """What to do where a model is not here, or not whole.
+
+    Args:
+        model: a folder, or an id on the Hugging Face hub
+        kind: of model
+        of_folder, download: how the line ends for a folder; and for an id, after hf download ID
+    """
+    if Path(model).is_dir() or model.startswith((".", "/", "~")):
+        return ProgdfError(f"{model} does not hold a complete {kind} with safetensors weights{of_folder}")
+    return ProgdfError(
+        f"the weights of {model} are not on this machine or are incomplete; download them with "
+        f"'hf download {model}{download}"
+    )
+
+
+def keep_quiet(*speaks: Any) -> None:
+    """Errors alone from libraries, by their logging modules: they warn of every package that is optional."""
+    for module in speaks:
+        module.set_verbosity(logging.ERROR)
+        module.disable_progress_bar()
 
 
 def weights_here(folder: Path) -> int:

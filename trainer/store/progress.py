@@ -186,6 +186,13 @@ class RunLog:
             self._write_progress(what, left, word, done >= total)
             return left
 
+        def advance(done: int, word: str) -> None:
+            nonlocal last
+            left, now = tell(done, word), time.perf_counter()
+            if now - last >= _EVERY_S and done < total:
+                last = now
+                self.say(f"{what} {done}/{total}  {word}  {left:.0f} s left")
+
         if self._bar:
             columns = (
                 SpinnerColumn(),
@@ -201,17 +208,8 @@ class RunLog:
                     progress.update(task, completed=done, word=f"{word}  {tell(done, word):.0f} s left")
 
                 yield move_bar
-            self._took[what] = time.perf_counter() - begun
-            return
-
-        def advance(done: int, word: str) -> None:
-            nonlocal last
-            left, now = tell(done, word), time.perf_counter()
-            if now - last >= _EVERY_S and done < total:
-                last = now
-                self.say(f"{what} {done}/{total}  {word}  {left:.0f} s left")
-
-        yield advance
+        else:
+            yield advance
         self._took[what] = time.perf_counter() - begun
 
     @contextmanager

@@ -25,7 +25,7 @@ from torch import Tensor
 
 from progdf.errors import ProgdfError
 from progdf.field.trajectory import FILE_NAME
-from progdf.io.atomic import LOCK, LockedError, hold_lock, is_temporary, remove_abandoned, write_file
+from progdf.io import atomic
 from progdf.io.images import read_picture, write_image
 from progdf.io.json_values import convert_json, decode_json
 from progdf.threads import map_threads
@@ -74,7 +74,7 @@ def _is_inside(folder: Path, line: str) -> bool:
 
 
 def _write(folder: Path, lines: Iterable[str]) -> None:
-    write_file(folder / NAME, "".join(f"{line}\n" for line in lines))
+    atomic.write_file(folder / NAME, "".join(f"{line}\n" for line in lines))
 
 
 _SIGNATURE = "progdf train"
@@ -169,7 +169,7 @@ def check_folder(root: Path, edit: Mapping[str, str]) -> RunFolder:
         raise ProgdfError(f"{root} is a file; give --out a folder")
     folder = RunFolder(root)
     if root.is_dir() and not all(
-        is_temporary(entry.name) or entry.name == LOCK or entry == folder.segment_masks
+        atomic.is_temporary(entry.name) or entry.name == atomic.LOCK or entry == folder.segment_masks
         for entry in root.iterdir()
     ):
         first = (
@@ -194,17 +194,13 @@ def check_folder(root: Path, edit: Mapping[str, str]) -> RunFolder:
 def open_run_folder(root: Path, edit: Mapping[str, str]) -> RunFolder:
     """Make the run's folder, or take over that of an earlier run of the same edit; see `check_folder`."""
     folder = check_folder(root, edit)
-    try:
-        root.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        reason = error.strerror or error
-        raise ProgdfError(f"{root} cannot be created ({reason}); give --out a writable place") from error
+    atomic.make_folder(root)
     return folder
 
 
 def begin_log(folder: RunFolder, edit: Mapping[str, str]) -> None:
     """A new log.txt; its first line says that the folder is a run, and of which edit."""
-    write_file(folder.log, f"{_SIGNATURE} {json.dumps(dict(edit), ensure_ascii=False)}\n")
+    atomic.write_file(folder.log, f"{_SIGNATURE} {json.dumps(dict(edit), ensure_ascii=False)}\n")
 
 
 @contextlib.contextmanager
@@ -216,8 +212,8 @@ def lock_folder(folder: RunFolder) -> Iterator[None]:
     """
     with contextlib.ExitStack() as held:
         try:
-            held.enter_context(hold_lock(folder.root / LOCK, _LOOK_S))
-        except LockedError:
+            held.enter_context(atomic.hold_lock(folder.root / atomic.LOCK, _LOOK_S))
+        except atomic.LockedError:
             raise ProgdfError(
                 f"{folder.root} is being trained by another process; wait for it, or stop it first"
             ) from None
@@ -227,7 +223,7 @@ def lock_folder(folder: RunFolder) -> Iterator[None]:
 def remove_leftovers(folder: RunFolder) -> None:
     """Delete what a run that was killed was just about to write."""
     for directory, _, _ in os.walk(folder.root):
-        remove_abandoned(Path(directory))
+        atomic.remove_abandoned(Path(directory))
 
 
 def write_views(folder: RunFolder, kind: str, pictures: Mapping[str, Tensor], strength: float = 1.0) -> None:
@@ -297,4 +293,4 @@ def remove_stale_views(folder: RunFolder, names: Sequence[str]) -> None:
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Write JSON, whole or not at all."""
-    write_file(path, json.dumps(content, indent=2, ensure_ascii=False) + "\n")
+    atomic.write_file(path, json.dumps(content, indent=2, ensure_ascii=False) + "\n")

@@ -27,7 +27,7 @@ from tests.helpers.tiny_pipelines import (
 )
 from tests.helpers.trained import quick_options, small, train, write_bear
 from trainer.editors import make_editor
-from trainer.editors.adapters import ADAPTERS, Adapter, default_model, load_pipeline, missing_weights
+from trainer.editors.adapters import ADAPTERS, Adapter, default_model, load_pipeline, missing_pipeline
 from trainer.editors.instruct import InstructEditor, sentence
 from trainer.editors.mixed_steps import MixedSteps, network_steps
 from trainer.options import EditorOptions, TrainOptions, with_values
@@ -182,7 +182,7 @@ def test_what_pipelines_are_asked_is_among_their_keywords(diffusers: None, name:
 
 
 @pytest.mark.parametrize("model", ["timbrooks/instruct-pix2pix", "someone/no-such-model"])
-def test_missing_weights_are_one_line_that_names_what_to_download(
+def test_missing_pipeline_are_one_line_that_names_what_to_download(
     diffusers: None, model: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
@@ -452,7 +452,7 @@ def test_klein_is_the_default_where_it_is_here_and_fits(
     assert default_model() == small_one
 
     def absent(model: str, adapter: Adapter) -> dict[str, int]:
-        raise missing_weights(model)
+        raise missing_pipeline(model)
 
     card(80 * GIB, 80 * GIB)
     monkeypatch.setattr("trainer.editors.adapters.component_sizes", absent)
