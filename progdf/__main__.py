@@ -8,22 +8,17 @@ import importlib
 import io
 import logging
 import os
-import signal
 import sys
 import tempfile
-import threading
 import traceback
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import FrameType
 from typing import NoReturn
 
-from progdf.io.atomic import atomic_write, disk_full
-
 from .errors import ProgdfError, is_out_of_memory
-from .io.atomic import state_folder
-from .terminal import PrintableFormatter, escape_text
+from .io.atomic import disk_full, state_folder, write_file
+from .terminal import ENDINGS, PrintableFormatter, escape_text, handle_signals
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "demo": ("trainer.run.demo:main", "make a scene, train its edits, write previews, open the window"),
@@ -69,7 +64,7 @@ def run_guarded(run: Callable[[Sequence[str]], int], arguments: Sequence[str]) -
         logging.lastResort.setFormatter(PrintableFormatter())
     try:
         _check_current_folder()
-        with _raise_on_signals():
+        with handle_signals(ENDINGS, _interrupt):
             status = run(arguments)
             if sys.stdout is not None:
                 sys.stdout.flush()  # here, where a full disk or a closed pipe can still be reported
@@ -120,8 +115,7 @@ def _save_traceback() -> str:
         path = folder / "crash.txt" if folder.name == "progdf" else folder / f"progdf-crash-{os.getpid()}.txt"
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            with atomic_write(path) as temporary_file:
-                temporary_file.write_text(details, encoding="utf-8", errors="backslashreplace")
+            write_file(path, details.encode(errors="backslashreplace"))
         except (OSError, ProgdfError):
             continue
         return f"please report it with {path}"
@@ -136,27 +130,9 @@ def _check_current_folder() -> None:
         raise ProgdfError("the current folder was removed; change to one that exists") from None
 
 
-@contextmanager
-def _raise_on_signals() -> Iterator[None]:
+def _interrupt(number: int, frame: FrameType | None) -> NoReturn:
     """SIGTERM and a closed terminal end a command as Ctrl-C does, with its files removed and a hint."""
-    names = ("SIGTERM", "SIGHUP")
-    numbers = [getattr(signal, name) for name in names if hasattr(signal, name)]
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def stop(number: int, frame: FrameType | None) -> NoReturn:
-        raise KeyboardInterrupt
-
-    earlier = {number: signal.getsignal(number) for number in numbers}
-    theirs = [number for number, was in earlier.items() if was == signal.SIG_DFL]  # nohup's stays
-    try:
-        for number in theirs:
-            signal.signal(number, stop)
-        yield
-    finally:
-        for number in theirs:
-            signal.signal(number, signal.SIG_DFL)
+    raise KeyboardInterrupt
 
 
 def _open_standard_streams() -> None:

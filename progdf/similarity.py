@@ -77,9 +77,8 @@ def carry_offsets(original: Tensor, offsets: Tensor, parts: Parts, motion: Motio
     Returns:
         Raw-space offsets, differentiable. [M,C]; opacity's and color's are the given ones
     """
-    rows = original[:, GEOMETRY]
-    moved = _move_geometry(rows + offsets[:, GEOMETRY], parts, motion) - rows
-    return torch.cat([moved, carry_look(original, offsets, turn_quats(motion.turn), parts.part)], dim=1)
+    moved = _move_geometry(original[:, GEOMETRY] + offsets[:, GEOMETRY], parts, motion)
+    return offsets_to(moved, original, offsets, turn_quats(motion.turn), parts.part)
 
 
 def local_offsets(original: Tensor, offsets: Tensor, parts: Parts, motion: Motion) -> Tensor:
@@ -94,20 +93,25 @@ def local_offsets(original: Tensor, offsets: Tensor, parts: Parts, motion: Motio
         log_scales - size,
         multiply_quats(back, quats),
     ]
-    moved = torch.cat(local, dim=1) - original[:, GEOMETRY]
-    return torch.cat([moved, carry_look(original, offsets, turns, part)], dim=1)
+    return offsets_to(torch.cat(local, dim=1), original, offsets, turns, part)
 
 
-def carry_look(original: Tensor, offsets: Tensor, turns: Tensor, part: Tensor | None = None) -> Tensor:
-    """Offsets of opacity and color as they are, of higher SH bands turned; see `sh.rotation_change`.
+def offsets_to(
+    geometry: Tensor, original: Tensor, offsets: Tensor, turns: Tensor, part: Tensor | None = None
+) -> Tensor:
+    """Offsets to moved geometry, of opacity and color as they are, of higher SH bands turned. [M,C]
+
+    See `sh.rotation_change`.
 
     Args:
+        geometry: where means, log-scales and quaternions have come. [M,10]
         original, offsets: raw member rows, and offsets within their frames. [M,C]
         turns: unit quaternions, of the members, or of parts. [M,4] or [P,4]
         part: of each member. [M] int64
     """
     bands = offsets[:, _BANDS]
-    return torch.cat([offsets[:, LOOK], bands + band_change(original[:, _BANDS] + bands, turns, part)], dim=1)
+    turned = bands + band_change(original[:, _BANDS] + bands, turns, part)
+    return torch.cat([geometry - original[:, GEOMETRY], offsets[:, LOOK], turned], dim=1)
 
 
 def band_change(bands: Tensor, turns: Tensor, part: Tensor | None = None) -> Tensor:

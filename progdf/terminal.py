@@ -1,9 +1,35 @@
-"""Text for a person at a terminal: numbers and sizes in words, names without control characters."""
+"""Text for a person at a terminal: numbers and sizes in words, names without control characters; and what a
+terminal sends to end a program."""
 
 from __future__ import annotations
 
 import logging
 import math
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+ENDINGS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
+"""Sent by who wants a process to end, and by a terminal that is closed; Windows has no SIGHUP."""
+
+
+@contextmanager
+def handle_signals(
+    signals: tuple[signal.Signals, ...], handler: Callable[[int, FrameType | None], None]
+) -> Iterator[None]:
+    """Python lets only the main thread handle signals; elsewhere the owner of that thread does."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    heeded = [number for number in signals if signal.getsignal(number) != signal.SIG_IGN]  # nohup's stays
+    earlier = {number: signal.signal(number, handler) for number in heeded}
+    try:
+        yield
+    finally:
+        for number, was in earlier.items():
+            signal.signal(number, was)
 
 
 def escape_text(text: str) -> str:

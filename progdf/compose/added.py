@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -18,7 +17,7 @@ from torch.nn.functional import pad
 from progdf.field.baked import GradeForm
 from progdf.field.grade import bake_grade
 from progdf.field.separable import fit_bands
-from progdf.gaussians import ATTRIBUTES, Gaussians, pack
+from progdf.gaussians import Gaussians, concatenate, pack
 from progdf.gdf.file import UNSEEN_LOGIT, Gdf, fingerprint, verify
 from progdf.region import Region, whole_scene
 
@@ -77,16 +76,14 @@ def _grade_all(gdf: Gdf, form: GradeForm, extended: Gaussians) -> Gdf:
 @lru_cache(maxsize=1)  # the same object for the same edits, so that what is known of it stays known
 def _append_rows(scene: Gaussians, added: tuple[Gaussians, ...]) -> Gaussians:
     """The scene and rows that have origins and bands of their own."""
-    columns: dict[str, list[Tensor]] = {name: [getattr(scene, name)] for name in ATTRIBUTES}
-    origin, shape = torch.tensor(scene.origin, dtype=torch.float64), scene.shN.shape[1:]
+    parts, shape = [scene], scene.shN.shape[1:]
+    origin = torch.tensor(scene.origin, dtype=torch.float64)
     for rows in added:
         means = rows.means if rows.origin == scene.origin else (rows.world_means - origin)
         bands = fit_bands(rows.shN.flatten(1), shape.numel()).reshape(len(rows), *shape)
         own = replace(rows, means=means.float(), shN=bands)
-        for name, parts in columns.items():
-            parts.append(getattr(own, name).to(parts[0]))
-    together: dict[str, Any] = {name: torch.cat(parts) for name, parts in columns.items()}
-    return replace(scene, **together)
+        parts.append(own.to(scene.means.device, scene.means.dtype))
+    return concatenate(parts)
 
 
 def remaining_rows(scene: Gaussians, composed: Gaussians) -> Tensor:

@@ -233,14 +233,7 @@ def _convert(source: Path, kind: str, target: Path, to: str) -> str:
     memory, output, seconds = (int(base + each * size) for base, each in (_MEMORY, _OUTPUT, SECONDS))
     words = "convert", kind, str(source.resolve()), to, str(target)
     try:
-        ended = subprocess.run(
-            native_child.command(memory, output, patience * seconds, *words),
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            timeout=2 * patience * seconds,
-            check=False,
-        )
+        ended = native_child.run((memory, output, patience * seconds), 2 * patience * seconds, *words)
     except subprocess.TimeoutExpired:
         return f"did not answer within {2 * patience * seconds} s"
     return _reason(ended.returncode, ended.stderr) if ended.returncode or not target.is_file() else ""

@@ -99,11 +99,8 @@ def _images(folder: Path) -> list[_Image] | None:
     """What pycolmap reads, in a process of its own (see `native_child`); None: nothing that it can."""
     size = sum(file.stat().st_size for file in folder.iterdir())
     memory, seconds = (1 << 30) + 64 * size, 10 + int(2e-6 * size)
-    words = native_child.command(memory, 0, seconds, "cameras", str(folder))
     try:
-        ended = subprocess.run(
-            words, stdin=subprocess.DEVNULL, capture_output=True, timeout=6 * seconds, check=False
-        )
+        ended = native_child.run((memory, 0, seconds), 6 * seconds, "cameras", str(folder))
         return None if ended.returncode else convert_json(decode_json(ended.stdout), list[_Image])
     except (subprocess.TimeoutExpired, ValueError):
         return None

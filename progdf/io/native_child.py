@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import io
 import json
+import subprocess
 import sys
 import zipfile
 from contextlib import suppress
@@ -87,9 +88,16 @@ def _limit(memory: int, output: int, seconds: int) -> None:
             resource.setrlimit(limit, (most, most))
 
 
-def command(memory: int, output: int, seconds: int, *words: str) -> list[str]:
-    """The command line of this script: limits, and what it shall do."""
-    return [sys.executable, "-P", __file__, *map(str, (memory, output, seconds)), *words]
+def run(limits: tuple[int, int, int], timeout: int, *words: str) -> subprocess.CompletedProcess[bytes]:
+    """Run this script: memory, output and seconds of processor time, how long to wait, what it shall do.
+
+    Raises:
+        TimeoutExpired: it did not end.
+    """
+    command = [sys.executable, "-P", __file__, *map(str, limits), *words]
+    return subprocess.run(
+        command, stdin=subprocess.DEVNULL, capture_output=True, timeout=timeout, check=False
+    )
 
 
 if __name__ == "__main__":

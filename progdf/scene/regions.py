@@ -26,10 +26,10 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from PIL import ImageColor
 from torch import Tensor
 
 from progdf.camera import Camera
+from progdf.color.edits import parse_color
 from progdf.color.oklab import srgb_to_oklab
 from progdf.errors import ProgdfError
 from progdf.gaussians import ZERO, Gaussians
@@ -201,8 +201,7 @@ def _oklab(text: str, code: str) -> list[float]:
             f"'{shorten(code)}' in region 'color:{shorten(text)}' is not a color; "
             "write for example color:#903020"
         )
-    rgb = torch.tensor(ImageColor.getrgb(code.strip())[:3]) / 255.0
-    lab: list[float] = srgb_to_oklab(rgb).tolist()
+    lab: list[float] = srgb_to_oklab(parse_color(code)).tolist()
     return lab
 
 

@@ -95,9 +95,7 @@ def find_strays(scene: Gaussians) -> Strays:
 
 def clean(scene: Gaussians, strays: Strays) -> Gaussians:
     """The scene without its strays, in the same order."""
-    keep = np.ones(len(scene), bool)
-    keep[strays.rows] = False
-    return scene[torch.from_numpy(np.flatnonzero(keep))]
+    return scene[torch.from_numpy(np.delete(np.arange(len(scene)), strays.rows))]
 
 
 def picture_difference(before: Gaussians, after: Gaussians) -> tuple[float, float]:

@@ -35,10 +35,10 @@ from progdf.similarity import (
     GEOMETRY,
     Motion,
     Parts,
-    carry_look,
     carry_offsets,
     interpolate_motion,
     local_offsets,
+    offsets_to,
     split_geometry,
 )
 from trainer.views.crops import CropScene
@@ -153,28 +153,24 @@ class MemberMaps:
         Returns:
             Raw-space offsets; opacity's and color's are the given ones. [M,C]
         """
-        rows = original[:, GEOMETRY]
-        means, log_scales, quats = split_geometry(rows + offsets[:, GEOMETRY])
+        means, log_scales, quats = split_geometry(original[:, GEOMETRY] + offsets[:, GEOMETRY])
         moved = [
             (self.matrix @ means[..., None])[..., 0] + self.shift,
             log_scales + self.growth,
             multiply_quats(self.turn, quats),
         ]
-        look = carry_look(original, offsets, self.turn)
-        return torch.cat([torch.cat(moved, dim=1) - rows, look], dim=1)
+        return offsets_to(torch.cat(moved, dim=1), original, offsets, self.turn)
 
     def carry_back(self, original: Tensor, offsets: Tensor) -> Tensor:
         """The inverse of `carry`. [M,C] -> [M,C]"""
-        rows = original[:, GEOMETRY]
-        means, log_scales, quats = split_geometry(rows + offsets[:, GEOMETRY])
+        means, log_scales, quats = split_geometry(original[:, GEOMETRY] + offsets[:, GEOMETRY])
         back = self.turn * self.turn.new_tensor([1.0, -1.0, -1.0, -1.0])
         local = [
             torch.linalg.solve(self.matrix, (means - self.shift)[..., None])[..., 0],
             log_scales - self.growth,
             multiply_quats(back, quats),
         ]
-        look = carry_look(original, offsets, back)
-        return torch.cat([torch.cat(local, dim=1) - rows, look], dim=1)
+        return offsets_to(torch.cat(local, dim=1), original, offsets, back)
 
 
 def rest_warp(control: ControlPoints) -> WarpMotion:

@@ -15,7 +15,6 @@ import os
 import shutil
 import signal
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -33,9 +32,7 @@ from progdf.errors import ProgdfError
 from progdf.io.atomic import atomic_write
 from progdf.io.json_values import convert_json, decode_json
 from progdf.io.tensors import read_tensors, write_tensors
-
-_ENDINGS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
-"""Sent by who wants a process to end, and by a terminal that is closed; Windows has no SIGHUP."""
+from progdf.terminal import ENDINGS, handle_signals
 
 
 @contextmanager
@@ -45,7 +42,7 @@ def interrupt_on_signals() -> Iterator[None]:
     def stop(number: int, frame: FrameType | None) -> NoReturn:
         raise KeyboardInterrupt
 
-    with _handle_signals(_ENDINGS, stop):
+    with handle_signals(ENDINGS, stop):
         yield
 
 
@@ -64,27 +61,10 @@ def defer_signals() -> Iterator[Callable[[], bool]]:
             raise KeyboardInterrupt
         came = True
 
-    with _handle_signals((signal.SIGINT, *_ENDINGS), note):
+    with handle_signals((signal.SIGINT, *ENDINGS), note):
         yield lambda: came
     if came:
         raise KeyboardInterrupt
-
-
-@contextmanager
-def _handle_signals(
-    signals: tuple[signal.Signals, ...], handler: Callable[[int, FrameType | None], None]
-) -> Iterator[None]:
-    """Python lets only the main thread handle signals; elsewhere the owner of that thread does."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    heeded = [number for number in signals if signal.getsignal(number) != signal.SIG_IGN]  # nohup's stays
-    earlier = {number: signal.signal(number, handler) for number in heeded}
-    try:
-        yield
-    finally:
-        for number, was in earlier.items():
-            signal.signal(number, was)
 
 
 SHARE = 0.01
