@@ -48,17 +48,9 @@ from progdf.region import (
 )
 from progdf.terminal import format_count, format_place
 
+from . import selection
 from .neighbors import RIM_PERCENT, Neighborhood, grow_along_surface
-from .selection import (
-    Mask,
-    alike_in_color,
-    base_colors,
-    front_surface,
-    inside_polygon,
-    inside_rectangle,
-    inside_stroke,
-    project_centers,
-)
+from .selection import Mask
 
 TOLERANCE = 0.08
 """How far colors may be from the one that is named where the spec does not say. A click on a black jacket
@@ -82,7 +74,7 @@ def read_part(kind: str, argument: str) -> Selecting:
     if kind == "color":
         code, tolerance = _with_tolerance(kind, argument, 1, "#rrggbb[,tolerance]")
         lab = _oklab(argument, code[0])
-        return lambda scene: alike_in_color(base_colors(scene), lab, tolerance)
+        return lambda scene: selection.alike_in_color(selection.base_colors(scene), lab, tolerance)
     if kind == "flood":
         words, tolerance = _with_tolerance(kind, argument, 3, "x,y,z[,tolerance]")
         x, y, z = _described_numbers(kind, argument, ",".join(words), "x,y,z[,tolerance]")
@@ -132,22 +124,22 @@ def read_step(text: str) -> Callable[[Neighborhood, Mask], Mask]:
 
 
 def _front(scene: Gaussians, camera: Camera) -> Mask:
-    return front_surface(scene, camera, project_centers(scene, camera))
+    return selection.front_surface(scene, camera, selection.project_centers(scene, camera))
 
 
 def _inside(
     kind: str, camera_of: Callable[[Gaussians], Camera], numbers: list[float], scene: Gaussians
 ) -> Mask:
-    points = project_centers(scene, camera_of(scene)).points
+    points = selection.project_centers(scene, camera_of(scene)).points
     if kind == "rectangle":
-        return inside_rectangle(points, numbers[:2], numbers[2:])
+        return selection.inside_rectangle(points, numbers[:2], numbers[2:])
     if kind == "lasso":
-        return inside_polygon(points, np.reshape(numbers, (-1, 2)))
-    return inside_stroke(points, np.reshape(numbers[1:], (-1, 2)), numbers[0])
+        return selection.inside_polygon(points, np.reshape(numbers, (-1, 2)))
+    return selection.inside_stroke(points, np.reshape(numbers[1:], (-1, 2)), numbers[0])
 
 
 def _flood(scene: Gaussians, point: tuple[float, float, float], tolerance: float) -> Mask:
-    neighborhood, colors = Neighborhood(scene), base_colors(scene)
+    neighborhood, colors = Neighborhood(scene), selection.base_colors(scene)
     seed = neighborhood.nearest(tuple(np.subtract(point, scene.origin).tolist()))
     return grow_along_surface(neighborhood, colors, np.array([seed]), colors[seed], tolerance)
 

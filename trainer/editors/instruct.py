@@ -26,18 +26,8 @@ from trainer.store.pretrained import last_model
 from trainer.store.run_folder import from_bytes, to_bytes
 from trainer.views.view import BACKGROUND, View, region_box, render_view, shrink_image
 
-from .adapters import (
-    ADAPTERS,
-    SMALL_MODEL,
-    Placement,
-    Request,
-    adapter_of,
-    default_model,
-    explain_memory,
-    load_pipeline,
-    pipeline_folder,
-    place,
-)
+from . import adapters
+from .adapters import Placement, Request
 from .base import EditorInput
 from .cache import KeptPictures, Recipe
 from .mixed_steps import MixedSteps, network_steps
@@ -154,7 +144,7 @@ class InstructEditor:
             )
         request = self.request
         noise = request.seed if seed is None else seed
-        with explain_memory(request, self.placement):
+        with adapters.explain_memory(request, self.placement):
             painted = self.load().paint(
                 lambda pictures: request.ask(pictures, noise),
                 (picture, *references),
@@ -175,10 +165,10 @@ def instruct(given: EditorInput) -> InstructEditor:
         return last_model(
             "pipeline",
             (request, options.device),
-            lambda: load_pipeline(request, place(request, options.device)),
+            lambda: adapters.load_pipeline(request, adapters.place(request, options.device)),
         )
 
-    placement = place(request, options.device)
+    placement = adapters.place(request, options.device)
     return InstructEditor(given.scene, request, placement, pipeline, KeptPictures(options.cache))
 
 
@@ -190,14 +180,14 @@ def check_instruct(what: str, options: EditorOptions) -> None:
             or the anchor is no picture, has no camera, or is for a model that takes one picture alone.
     """
     request = resolve_request(what, options)
-    place(request, options.device)
+    adapters.place(request, options.device)
     if options.anchor is not None:
         find_picture_camera(options.anchor, origin=ZERO)
         if not request.adapter.references:
             raise ProgdfError(
                 f"{request.model} takes one picture alone and cannot follow --anchor; leave it out, use "
-                f"--model {ADAPTERS['Flux2KleinPipeline'].model}, or train that picture by itself with "
-                f"--editor pictures:{options.anchor}"
+                f"--model {adapters.ADAPTERS['Flux2KleinPipeline'].model}, or train that picture by itself "
+                f"with --editor pictures:{options.anchor}"
             )
 
 
@@ -218,13 +208,13 @@ def resolve_request(what: str, options: EditorOptions) -> Request:
     prompt = sentence(what)
     if not prompt:
         raise ProgdfError('instruct: needs an instruction; write instruct:"turn him into Batman"')
-    model = options.model or default_model()
-    kind, adapter = adapter_of(model)
+    model = options.model or adapters.default_model()
+    kind, adapter = adapters.adapter_of(model)
     guidance, image_guidance = parse_guidance(options.guidance)
     if image_guidance is not None and adapter.image_guidance is None:
         raise ProgdfError(
             f"{model} does not support guidance of the picture; give --guidance one number, "
-            f"or use --model {SMALL_MODEL}"
+            f"or use --model {adapters.SMALL_MODEL}"
         )
     for is_given, option in (
         (guidance is not None and adapter.guidance is None, "--guidance"),
@@ -252,7 +242,7 @@ def unread_words(request: Request) -> str:
         return ""
     from transformers import CLIPTokenizer
 
-    tokenizer = CLIPTokenizer.from_pretrained(pipeline_folder(request.model) / "tokenizer")
+    tokenizer = CLIPTokenizer.from_pretrained(adapters.pipeline_folder(request.model) / "tokenizer")
     tokens = tokenizer(request.prompt)["input_ids"]
     return str(tokenizer.decode(tokens[tokenizer.model_max_length - 1 : -1])).strip()
 

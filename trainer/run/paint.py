@@ -337,13 +337,8 @@ def train_decal(editor: DecalEditor, scene: Gaussians, name: str, log: RunLog | 
     paints = [editor.paint]
     laid = choose_discs(scene, paints, look_around(scene, paints, _TRIAL_TURNS), log)
     gdf = paint_gdf(laid, scene, paints, name, None)
-    return measure_discs(gdf, scene, scene, paints)
-
-
-def measure_discs(gdf: Gdf, scene: Gaussians, base: Gaussians, paints: Sequence[Paint]) -> Painted:
-    """How the edit shows the paint, in its own view and around it."""
     edited, background = edited_scene(scene, gdf), torch.tensor(BACKGROUND)
-    looks = look_around(base, paints[:1], TURNS)
+    looks = look_around(scene, paints, TURNS)
     shown = [render_view(edited, look.camera, background).clamp(0.0, 1.0) for look in looks]
     errors = [
         round(psnr(image, look.expected, look.covered), 2) if bool(look.covered.any()) else None
@@ -351,7 +346,7 @@ def measure_discs(gdf: Gdf, scene: Gaussians, base: Gaussians, paints: Sequence[
     ]
     middle = TURNS.index(0)
     figures = {
-        "pixels": sum(int(paint.mask.sum()) for paint in paints),
+        "pixels": int(paints[0].mask.sum()),
         "added": 0 if gdf.added is None else len(gdf.added),
         "moved": len(gdf.region),
         "own": errors[middle],

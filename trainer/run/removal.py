@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -148,7 +147,16 @@ def remove_region(options: TrainOptions, setup: TrainingSetup, folder: RunFolder
             "plan": plain(recorded_options(options)),
         }
         picture = _sheet(scene, gdf, judging, f"{options.name}: {options.editor.editor}")
-    return _write(options, setup, folder, log, gdf, removed, report, picture)
+    finals = {view.camera.name: render_view(removed, view.camera, setup.background) for view in setup.views}
+    write_views(folder, "final", finals)
+    folder.trajectory.unlink(missing_ok=True)  # of an earlier run that recolored
+    about = {name: report[name] for name in ("edit", "removal")}
+    gdf = replace(gdf, options=differences(report["plan"], DEFAULTS), report=about)
+    result = write_result(folder, gdf, report, picture)
+    said = ", ".join(f"{psnr:.1f} dB on {name}" for name, psnr in errors.items())
+    log.say(f"to a render without the region, at its pixels in views not filled from: {said}")
+    log.say(f"{result.line}; shadows and reflections stay")
+    return result
 
 
 def with_crumbs(scene: Gaussians, region: Region) -> Region:
@@ -157,29 +165,6 @@ def with_crumbs(scene: Gaussians, region: Region) -> Region:
     alone = mask.nonzero()[:, 0][find_strays(scene[mask]).floaters]
     mask[alone[~torch.isin(alone, torch.from_numpy(find_strays(scene).floaters))]] = False
     return from_mask(region.name, ~mask)
-
-
-def _write(
-    options: TrainOptions,
-    setup: TrainingSetup,
-    folder: RunFolder,
-    log: RunLog,
-    gdf: Gdf,
-    removed: Gaussians,
-    report: dict[str, Any],
-    picture: Tensor,
-) -> RunResult:
-    finals = {view.camera.name: render_view(removed, view.camera, setup.background) for view in setup.views}
-    write_views(folder, "final", finals)
-    folder.trajectory.unlink(missing_ok=True)  # of an earlier run that recolored
-    about = {name: report[name] for name in ("edit", "removal")}
-    gdf = replace(gdf, options=differences(report["plan"], DEFAULTS), report=about)
-    result = write_result(folder, gdf, report, picture)
-    edit = report["edit"]["psnr_by_background"]
-    said = ", ".join(f"{psnr:.1f} dB on {name}" for name, psnr in edit.items())
-    log.say(f"to a render without the region, at its pixels in views not filled from: {said}")
-    log.say(f"{result.line}; shadows and reflections stay")
-    return result
 
 
 def _painted_views(options: TrainOptions, setup: TrainingSetup) -> tuple[list[View], Mapping[str, Tensor]]:

@@ -546,7 +546,12 @@ def _record(
         recorded, reason = len(trajectory), ""
         one_end = len(trajectory.strengths) == 1
         if one_end and not optimization.as_printed and options.field.field != "neural":
-            trajectory, reason = _choose_path(trajectory, options, optimization, setup, editor, log)
+            # of pictures made elsewhere the folder may be gone by now, and there is no half; a model was
+            # asked for the end alone
+            painter = None if options.editor.family in (*EXTERNAL, *COSTLY_STRENGTHS) else editor()
+            retimed = partial(retime_trajectory, setup=setup, optimization=optimization, log=log)
+            moves = bool(optimization.group_steps)
+            trajectory, reason = choose_path(trajectory, setup, painter, moves, retimed)
         else:
             trajectory = retime_trajectory(trajectory, setup, optimization, log)
         trajectory = fade_in(trajectory)
@@ -561,19 +566,3 @@ def _record(
         "effort": effort,
         "attribute_worth_db": costs,
     }
-
-
-def _choose_path(
-    trajectory: Trajectory,
-    options: TrainOptions,
-    optimization: OptimizeOptions,
-    setup: TrainingSetup,
-    editor: Callable[[], ImageEditor],
-    log: RunLog,
-) -> tuple[Trajectory, str]:
-    """The way to the only target there was, and why."""
-    # of pictures made elsewhere the folder may be gone by now, and there is no half; a model was asked for
-    # the end alone
-    painter = None if options.editor.family in (*EXTERNAL, *COSTLY_STRENGTHS) else editor()
-    retimed = partial(retime_trajectory, setup=setup, optimization=optimization, log=log)
-    return choose_path(trajectory, setup, painter, bool(optimization.group_steps), retimed)
