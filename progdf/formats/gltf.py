@@ -91,9 +91,10 @@ def write_glb(path: Path, scene: Gaussians) -> None:
         f"{EXTENSION}:SCALE": scene.scales,
         f"{EXTENSION}:OPACITY": scene.opacities[:, None],
     }
+    coefficients = scene.sh
     for degree in range(min(MOST_DEGREE, scene.sh_degree) + 1):
         for i in range(2 * degree + 1):
-            columns[f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{i}"] = scene.sh[:, degree**2 + i]
+            columns[f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{i}"] = coefficients[:, degree**2 + i]
     views, accessors, parts, at = list[dict[str, Any]](), list[dict[str, Any]](), list[bytes](), 0
     for name, values in columns.items():
         color, table = name == "COLOR_0", values.detach().cpu().float().numpy()
