@@ -224,11 +224,8 @@ def place_discs(hole: Hole, like: Gaussians, colors: Tensor) -> Gaussians:
 
 def _split(mask: Tensor, colors: Tensor) -> Tensor:
     """Squares that cover a mask: first row, first column, side, as large as colors and edge allow. [P,3]"""
-    free, depth = (
-        mask.numpy().copy(),
-        ndimage.distance_transform_cdt(np.pad(mask.numpy(), 1), "chessboard")[1:-1, 1:-1],
-    )
-    image, parts = colors.numpy(), []
+    depth = ndimage.distance_transform_cdt(np.pad(mask.numpy(), 1), "chessboard")[1:-1, 1:-1]
+    free, image, parts = mask.numpy().copy(), colors.numpy(), []
     for side in _BLOCKS:
         inner = depth > side // 2  # a large disc reaches beyond its square, and must not beyond the hole
         for row in range(0, mask.shape[0] - side + 1, side):

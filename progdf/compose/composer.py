@@ -391,12 +391,9 @@ def _finish(
                 largest = max(largest, step)
         row = rows[first]
         if rows[first + count - 1] - row == count - 1:
-            new, old, offsets = (
-                after[row : row + count],
-                before[row : row + count],
-                total[first : first + count],
-            )
-            new_run, old_run, own_run = new.reshape(-1), old.reshape(-1), offsets.reshape(-1)
+            new_run = after[row : row + count].reshape(-1)
+            old_run = before[row : row + count].reshape(-1)
+            own_run = total[first : first + count].reshape(-1)
             for j in range(count * width):
                 new_run[j] = old_run[j] + own_run[j]
             continue

@@ -153,15 +153,10 @@ class NeuralField:
         return sum(self.tensors[name].numel() for name in self.shape.weights()) + self.codes.numel()
 
     @property
-    def stored_bytes(self) -> int:
-        """Bytes on disk, names and header left out."""
-        stored = [*self.tensors.values(), self.end, self.codes, self.code_step]
-        return sum(tensor.numel() * tensor.element_size() for tensor in stored)
-
-    @property
     def bytes_per_member(self) -> float:
-        """Bytes on disk for one member, its share of the network included."""
-        return self.stored_bytes / max(1, self.members)
+        """Bytes on disk for one member, its share of the network included, names and header left out."""
+        stored = [*self.tensors.values(), self.end, self.codes, self.code_step]
+        return sum(tensor.numel() * tensor.element_size() for tensor in stored) / max(1, self.members)
 
     def bind(self, rows: Tensor) -> BoundField:
         """The field of these Gaussians. `rows`: their raw values, packed, in the region's order. [M,≥14]"""

@@ -43,11 +43,6 @@ _SECTION_FIELDS = {
 """Types and places in a section's header."""
 
 
-def is_ksplat(start: bytes) -> bool:
-    """Whether a file may begin like this: version 0.1 and later."""
-    return len(start) >= 2 and start[0] == 0 and start[1] >= 1
-
-
 def read_ksplat(path: str | os.PathLike[str]) -> tuple[Gaussians, int]:
     """The scene as stored in the file, and its compression level 0..2.
 
@@ -55,7 +50,7 @@ def read_ksplat(path: str | os.PathLike[str]) -> tuple[Gaussians, int]:
         ProgdfError: it is no .ksplat, or truncated or damaged.
     """
     content = read_file(path)
-    if len(content) < _HEADER or not is_ksplat(content):
+    if len(content) < _HEADER or content[0] != 0 or content[1] < 1:  # version 0.1 and later
         raise ProgdfError(f"{path} is not a .ksplat scene; export it again")
     level = _number(content, 20, "<u2")
     sections = _number(content, 4, "<u4")

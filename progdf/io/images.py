@@ -265,7 +265,8 @@ def contact_sheet(
     large, small = _font(round(1.4 * text)), _font(max(11, round(0.85 * text)))
     left = gap
     if row_labels:
-        left += 4 * gap + max(_label_width(label, font, small) for label in row_labels)
+        parts = [part for label in row_labels for part in enumerate(label.split("\n"))]
+        left += 4 * gap + max(_width(line, small if k else font) for k, line in parts)
     top = gap + (round(2.2 * text) if title else 0)
     grid_top = top + (round(1.6 * text) if column_labels else 0)
     full_width = max(
@@ -302,10 +303,6 @@ def contact_sheet(
 
 def _font(size: int) -> _Font:
     return ImageFont.load_default(size=size)
-
-
-def _label_width(label: str, font: _Font, small: _Font) -> int:
-    return max(_width(line, small if k else font) for k, line in enumerate(label.split("\n")))
 
 
 def _width(line: str, font: _Font) -> int:

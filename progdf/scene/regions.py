@@ -84,10 +84,8 @@ def read_part(kind: str, argument: str) -> Selecting:
         return lambda scene: _front(scene, camera_of(scene))
     form, least, odd = _FORMS[kind]
     where, _, text = argument.rpartition(":")
-    camera_of, numbers = (
-        _camera(kind, where, f"CAMERA:{form}"),
-        _described_numbers(kind, argument, text, f"CAMERA:{form}"),
-    )
+    camera_of = _camera(kind, where, f"CAMERA:{form}")
+    numbers = _described_numbers(kind, argument, text, f"CAMERA:{form}")
     if len(numbers) < least or len(numbers) % 2 != odd or (kind == "rectangle" and len(numbers) > least):
         raise ProgdfError(
             f"region '{kind}:{shorten(argument)}' has {len(numbers)} numbers; write {kind}:CAMERA:{form}"

@@ -144,10 +144,8 @@ def decal(given: EditorInput) -> DecalEditor:
     place = parse_place(options.at, camera)
     if (shrunk := _MOST_SIDE / place.size) < 1.0:
         size = max(1, round(camera.width * shrunk)), max(1, round(camera.height * shrunk))
-        camera, place = (
-            camera.resize(*size),
-            replace(place, x=place.x * shrunk, y=place.y * shrunk, size=_MOST_SIDE),
-        )
+        camera = camera.resize(*size)
+        place = replace(place, x=place.x * shrunk, y=place.y * shrunk, size=_MOST_SIDE)
     (camera,) = with_near_plane([camera], scene)
     view = make_view(scene, region, camera, torch.tensor(BACKGROUND))
     drawn = draw_decal(Path(given.what).expanduser(), place, camera)

@@ -141,10 +141,8 @@ class RunLog:
         took, work = 0.0, 0.0
         for name, seconds in self._took.items() | {(stage, elapsed)}:
             if name not in _EDITOR:
-                took, work = (
-                    took + seconds,
-                    work + self._work.get(name, 0.0) * (share if name == stage else 1.0),
-                )
+                took += seconds
+                work += self._work.get(name, 0.0) * (share if name == stage else 1.0)
         pace = took / work if work else elapsed / max(share * own, 1e-9)
         return (1.0 - share) * ((1.0 - share) * pace * own + elapsed) + pace * ahead
 
