@@ -37,7 +37,6 @@ _CLAMP_ROUNDS = 3  # of the map's least squares, for pixels that are white or bl
 _MAP_RIDGE = 1e-6  # of the diagonal of a map's normal equations, for regions of few colors
 _MAP_HELD = 1e-2  # say of the members' own colors beside the pixels: there a map is held to the affine one
 _SHIFT_HELD = 1e-2  # of that: the affine map is held to the same change of all
-_MASK_TURNS = 8  # of maps and shares by members
 _MASK_WITHIN = 0.98  # of what says what a share is: the largest there is 1, few beyond do not scale it
 _MASK_STEPS, _MASK_SETTLED = 16, 0.01  # at most, of gradients by pixels; of the error, that a step gains
 _MASK_LENGTHS = (4.0, 2.0, 1.0, 0.5, 0.25)  # of a step, in units of a bound of the curvature
@@ -255,9 +254,9 @@ def fit_maps(views: Sequence[ColorView], share: Tensor, most: int = _MOST_PIXELS
 
 
 def mask_of_members(colors: Tensor, change: Tensor, weights: Tensor) -> Tensor:
-    """How much of one affine map each member takes, if its change is to be that, as between stripes.
+    """How much of one affine map each member takes, if its change is to be that, as between stripes: a guess.
 
-    Maps by least squares over the members and their shares of it, in turn. The largest share is 1.
+    The map is that of shares as large as the members' changes; the largest share of it is 1.
 
     Args:
         colors: as they were. [M,3]
@@ -268,25 +267,18 @@ def mask_of_members(colors: Tensor, change: Tensor, weights: Tensor) -> Tensor:
         The shares, 0..1. [M]
     """
     weights, change = weights.double(), change.double()
-    terms = monomials(colors.T.clamp(0.0, MOST_COLOR), 1).double()
-
-    def fit_change(share: Tensor) -> Tensor:
-        design = share * terms
-        normal = (design * weights) @ design.T
-        normal += _MAP_RIDGE * (normal.diagonal() + 1e-12).diag()
-        table: Tensor = torch.linalg.solve(normal, (design * weights) @ change)
-        return terms.T @ table
-
     size = change.norm(dim=1)
     typical = ((weights @ size.square()) / weights.sum().clamp_min(1e-30)).sqrt()
-    share: Tensor = (size / typical.clamp_min(1e-12)).clamp(0.0, 1.0)
-    for _ in range(_MASK_TURNS):
-        full = fit_change(share)
-        power = full.square().sum(dim=1).clamp_min(1e-12)
-        along, evidence = (change * full).sum(dim=1) / power, weights * power
-        order = along.argsort()
-        reached = evidence[order].cumsum(0) >= _MASK_WITHIN * evidence.sum()
-        share = (along / along[order][reached][0].clamp_min(1e-6)).clamp(0.0, 1.0)
+    terms = monomials(colors.T.clamp(0.0, MOST_COLOR), 1).double()
+    design = (size / typical.clamp_min(1e-12)).clamp(0.0, 1.0) * terms
+    normal = (design * weights) @ design.T
+    normal += _MAP_RIDGE * (normal.diagonal() + 1e-12).diag()
+    full: Tensor = terms.T @ torch.linalg.solve(normal, (design * weights) @ change)
+    power = full.square().sum(dim=1).clamp_min(1e-12)
+    along, evidence = (change * full).sum(dim=1) / power, weights * power
+    order = along.argsort()
+    reached = evidence[order].cumsum(0) >= _MASK_WITHIN * evidence.sum()
+    share: Tensor = (along / along[order][reached][0].clamp_min(1e-6)).clamp(0.0, 1.0)
     return share.float()
 
 
