@@ -292,7 +292,7 @@ def plan_colors(
             if fewer[1].error <= LEVEL:
                 (solver, model), finished, train = fewer, half, train[::2]
     strengths = [s for s in edited if s < 1.0]
-    if between is not None and (model.bands > 1 or model.richer):  # what its bands are worth is told there
+    if between is not None and (model.bands > 1 or model.richer is not None):
         strengths = strengths or [between.ruler[len(between.ruler) // 2]]
     course = Course(ask(strengths) if strengths else [], finished)
     if between is not None:
