@@ -90,6 +90,9 @@ def undistort(photograph: Tensor, K: Tensor, lens: Lens) -> tuple[Tensor, Tensor
     return torch.where(visible[..., None], straight, 0.0), visible
 
 
+MOST_SAMPLING = 16.0
+"""Of `Camera.sampling`: Gaussians without any extent are still drawn."""
+
 NEAR = 0.01
 """Camera z at and below which nothing is drawn, world units; as `progdf.rasterize`."""
 
@@ -111,6 +114,8 @@ class Camera:
     lens: Lens | None = None
     # depth at and below which a training draws nothing, world units, see `bounds.near_plane`
     near: float = NEAR
+    # its pixels are samples of a picture so many times as large, whose finer pixels blur Gaussians less
+    sampling: float = 1.0
 
     def __post_init__(self) -> None:
         for name, side in (("viewmat", 4), ("K", 3)):
@@ -124,6 +129,8 @@ class Camera:
         fx, fy = self.K.detach().diagonal()[:2].tolist()
         if fx <= 0 or fy <= 0:
             raise ValueError(f"focal lengths {fx:g}, {fy:g} px; both must be positive")
+        if not 1.0 <= self.sampling <= MOST_SAMPLING:
+            raise ValueError(f"the sampling is {self.sampling:g}; it must be 1 to {MOST_SAMPLING:g}")
 
     @property
     def c2w(self) -> Tensor:

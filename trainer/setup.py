@@ -49,6 +49,10 @@ from .views.view import (
 SIZES = (256, 320, 384)
 """Longer sides that are tried, in pixels."""
 
+SAMPLING = math.sqrt(2.0)
+"""How many times larger pictures an edit of colors is meant for: they are looked at from as large as these to
+twice that (docs/experiments.md, Views)."""
+
 PICTURE_SIZE = 512
 """The longest side at which a changed picture is trained on."""
 
@@ -188,6 +192,7 @@ def make_training_setup(options: ViewOptions, scene: Gaussians, region: Region) 
             fitted = [fit_size(camera, image_size) for camera in given]
         else:
             fitted = region_rig(scene, region, count, image_size, up.direction)
+        fitted = [replace(c, sampling=SAMPLING if options.dense else 1.0) for c in fitted]
         return with_near_plane(name_cameras(fitted), scene)
 
     cameras, views, unresolved = choose_resolution(options, scene, region, cameras_of)

@@ -275,6 +275,7 @@ class Edit:
         camera = self.setup.train[0].camera
         size = max(camera.width, camera.height)
         rig = region_rig(self.scene, self.region, REPORTING, size, self.setup.up.direction)[1:]
+        rig = [replace(one, sampling=camera.sampling) for one in rig]
         cameras = with_near_plane(name_cameras(rig), self.scene)
         views = choose_views(self.scene, self.region, cameras, len(cameras), self.setup.background).views
         edited = {s: [quantize_image(self.painter.edit(view, s)) for view in views] for s in MEASURED}

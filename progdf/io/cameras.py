@@ -63,6 +63,7 @@ class _Own(msgspec.Struct):
     height: _Pixels
     name: Any = ""
     lens: Lens = Lens()
+    sampling: _Number = 1.0
 
 
 class _Inria(msgspec.Struct):
@@ -109,7 +110,8 @@ def own_camera(file: str, index: int, entry: object) -> Camera:
     camera = _read(where, entry, _Own)
     viewmat = _rigid(where, torch.tensor(camera.viewmat, dtype=torch.float64))
     K = torch.tensor(camera.K, dtype=torch.float64)
-    return _camera(where, viewmat, K, camera.width, camera.height, camera.name, camera.lens or None)
+    lens, sampling = camera.lens or None, camera.sampling
+    return _camera(where, viewmat, K, camera.width, camera.height, camera.name, lens, sampling)
 
 
 def inria_camera(file: str, index: int, entry: object) -> Camera:
@@ -191,9 +193,10 @@ def _camera(
     height: float,
     name: object,
     lens: Lens | None = None,
+    sampling: float = 1.0,
 ) -> Camera:
     try:
-        return Camera(viewmat, K.float(), int(width), int(height), str(name), lens)
+        return Camera(viewmat, K.float(), int(width), int(height), str(name), lens, sampling=sampling)
     except ValueError as error:
         raise ProgdfError(f"{where} is broken: {error}") from None
 
@@ -405,6 +408,7 @@ def cameras_to_json(cameras: Sequence[Camera], indent: int | None = None, origin
             "K": camera.K.double().tolist(),
             "viewmat": relative_viewmat(camera.viewmat, (-x, -y, -z)).tolist(),
             **({"lens": asdict(camera.lens)} if camera.lens else {}),
+            **({"sampling": camera.sampling} if camera.sampling != 1.0 else {}),
         }
         for camera in cameras
     ]

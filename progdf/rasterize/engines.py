@@ -109,6 +109,7 @@ class RasterView:
     near: float = 0.01
     sh_degree: int | None = None
     antialiased: bool = False
+    dilation: float = DILATION  # added to the diagonal of the 2D covariance, pixels²
 
     @classmethod
     def of(cls, camera: Camera, gaussians: ActivatedGaussians, crop: Crop | None = None) -> RasterView:
@@ -117,7 +118,7 @@ class RasterView:
         viewmat, K = (matrix.to(gaussians.means.device) for matrix in (camera.viewmat, camera.K))
         return cls(
             viewmat, K, width, height, crop or (0, 0, width, height), camera.near, gaussians.sh_degree,
-            gaussians.antialiased,
+            antialiased=gaussians.antialiased, dilation=DILATION / camera.sampling**2,
         )  # fmt: skip
 
 

@@ -19,7 +19,6 @@ from .engines import (
     ALPHA_MAX,
     ALPHA_MIN,
     ANTIALIAS_FLOOR,
-    DILATION,
     FRUSTUM_MARGIN,
     TRANSMITTANCE_MIN,
     ActivatedGaussians,
@@ -117,7 +116,7 @@ def blend(splats: ReferenceSplats, crop: Crop, background: Tensor) -> tuple[Tens
 
 def project(gaussians: ActivatedGaussians, view: RasterView) -> tuple[ReferenceSplats, RasterInfo]:
     """Project, cull and sort."""
-    dtype = gaussians.means.dtype
+    dtype, dilation = gaussians.means.dtype, view.dilation
     sh_degree = view.sh_degree
     means, quats, scales, opacities, colors, viewmat, K = (
         tensor.double() for tensor in (*gaussians.tensors, view.viewmat, view.K)
@@ -137,16 +136,16 @@ def project(gaussians: ActivatedGaussians, view: RasterView) -> tuple[ReferenceS
     means2d = torch.stack([fx * x / z + cx, fy * y / z + cy], dim=1)
 
     a, b, c, det0 = covariances(points[front], normalize_quats(quats[rows]), scales[rows], view)
-    det = det0 + DILATION * (a + c) + DILATION**2
+    det = det0 + dilation * (a + c) + dilation**2
     opacity = opacities[rows]
     if view.antialiased:
         opacity = opacity * (det0 / det).clamp_min(ANTIALIAS_FLOOR).sqrt()
     whitening = torch.stack(
-        [((c + DILATION) / det).sqrt(), -b / (det * (c + DILATION)).sqrt(), (c + DILATION).rsqrt()], dim=1
+        [((c + dilation) / det).sqrt(), -b / (det * (c + dilation)).sqrt(), (c + dilation).rsqrt()], dim=1
     )
 
     radius = (2.0 * torch.log(opacity.detach() / ALPHA_MIN).clamp_min(0.0)).sqrt()
-    extents = radius[:, None] * torch.stack([a + DILATION, c + DILATION], dim=1).detach().sqrt()
+    extents = radius[:, None] * torch.stack([a + dilation, c + dilation], dim=1).detach().sqrt()
     low, high = (means2d - extents).detach(), (means2d + extents).detach()
     x0, y0, x1, y1 = view.crop
     inside = (high[:, 0] >= x0) & (low[:, 0] <= x1) & (high[:, 1] >= y0) & (low[:, 1] <= y1)

@@ -19,7 +19,7 @@ from progdf.camera import Camera
 from progdf.gaussians import ATTRIBUTES, Gaussians, attribute_slices, unpack
 from progdf.rasterize import ActivatedGaussians, Crop, Rendering, activate, render
 from progdf.rasterize.cpu.forward import TILE_H, TILE_W
-from progdf.rasterize.engines import ColorMap, color_map
+from progdf.rasterize.engines import DILATION, ColorMap, color_map
 from progdf.sh import basis
 from progdf.threads import map_threads, threads
 
@@ -28,7 +28,6 @@ from .view import seen_colors
 _SUPPORT = 2 * 5.55
 """Most squared Mahalanobis distance at which alpha ≥ 1/255: 2 ln 255, rounded up."""
 
-_DILATION = 0.3
 """Pixels² that the rasterizer adds to a projected covariance."""
 
 
@@ -79,7 +78,9 @@ def may_reach(means: Tensor, scales: Tensor, camera: Camera, live: Tensor) -> Te
     # at least as far out as the rasterizer's clamp, which leaves 0.15 of the picture beyond each edge
     most = torch.maximum(K[:2, 2], size - K[:2, 2]) / focal + 0.2 * size / focal
     widened = 1 + slope.abs().minimum(most).square().sum(dim=1)
-    spread = (scales.double().amax(dim=1) * focal.max() / z).square() * widened + _DILATION
+    spread = (
+        scales.double().amax(dim=1) * focal.max() / z
+    ).square() * widened + DILATION / camera.sampling**2
     radius = (_SUPPORT * spread).sqrt() + 1.0
     rows, columns = live.shape
     step, last = K.new_tensor([TILE_W, TILE_H]), K.new_tensor([columns, rows])

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from progdf.rasterize.engines import ANTIALIAS_FLOOR, DILATION
+from progdf.rasterize.engines import ANTIALIAS_FLOOR
 from progdf.sh import _C1, _C2, _C3
 
 from .blend import SUMS
@@ -122,24 +122,24 @@ def shade_backward(
 
 
 @kernel(contract=True, inline=True)
-def _axes_gradient(seen: Footprint, g: tuple[float, ...], antialiased: bool) -> tuple[float, float, Vec, Vec]:
+def _axes_gradient(seen: Footprint, g: tuple[float, ...], camera: Pinhole) -> tuple[float, float, Vec, Vec]:
     """Gradients to the center in pixels (2) and to the 2D axes p0, p1, from Σg and its moments (6)."""
     # g = −dL/dσ; u and v are in units of their own
     e0, e1 = -g[1] * _PER_UNIT, -g[2] * _PER_UNIT
     h00, h01, h11 = -g[3] * _PER_UNIT2, -g[4] * _PER_UNIT2, -g[5] * _PER_UNIT2
-    sigma_y = math.sqrt(seen.c + DILATION)
+    sigma_y = math.sqrt(seen.c + camera.dilation)
     inv_root = 1.0 / (math.sqrt(seen.det) * sigma_y)
     l11, l21, l22 = sigma_y * sigma_y * inv_root, -seen.b * inv_root, 1.0 / sigma_y
     # dL/dM = −L H (LᵀM); the first row of LᵀM is (p1 × (p0 × p1) + ε p0) / root
-    along = blend2(inv_root, cross(seen.p1, seen.normal), DILATION * inv_root, seen.p0)
+    along = blend2(inv_root, cross(seen.p1, seen.normal), camera.dilation * inv_root, seen.p0)
     d0 = blend2(-l11 * h00, along, -l11 * h01 * l22, seen.p1)
     d1 = blend2(-(l21 * h00 + l22 * h01), along, -(l21 * h01 + l22 * h11) * l22, seen.p1)
-    if antialiased:
+    if camera.antialiased:
         # opacity · sqrt(det0 / det): d log = (ddet0 / det0 − ddet / det) / 2, det = det0 + ε (a + c) + ε²
         by_det0 = by_trace = 0.0
         if seen.det0 >= ANTIALIAS_FLOOR * seen.det:
             by_det0 = g[0] * (1.0 / seen.det0 - 1.0 / seen.det)
-            by_trace = -g[0] * DILATION / seen.det
+            by_trace = -g[0] * camera.dilation / seen.det
         d0 = blend2(1.0, d0, by_det0, cross(seen.p1, seen.normal))
         d0 = blend2(1.0, d0, by_trace, seen.p0)
         d1 = blend2(1.0, d1, by_det0, cross(seen.normal, seen.p0))
@@ -249,7 +249,7 @@ def project_backward(
         g = (total[3], total[4], total[5], total[6], total[7], total[8])
         gradients.opacities[i] = g[0] / np.float64(scene.opacities[i])
         seen = footprint(camera, mean, scale, quat_of(scene.quats, i))
-        grad_px, grad_py, d0, d1 = _axes_gradient(seen, g, camera.antialiased)
+        grad_px, grad_py, d0, d1 = _axes_gradient(seen, g, camera)
         _set(gradients.scales, i, blend2(1.0, times(d0, seen.turned0), 1.0, times(d1, seen.turned1)))
         d0, d1 = times(d0, scale), times(d1, scale)
         by_quat = _quat_gradient(seen, d0, d1)

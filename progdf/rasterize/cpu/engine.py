@@ -96,6 +96,7 @@ def make_pinhole(view: RasterView) -> Pinhole:
         grid=(column, row, -(-x1 // TILE_W) - column, -(-y1 // TILE_H) - row),
         degree=-1 if view.sh_degree is None else view.sh_degree,
         antialiased=view.antialiased,
+        dilation=view.dilation,
     )  # fmt: skip
 
 

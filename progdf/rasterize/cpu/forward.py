@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from progdf.rasterize.engines import ALPHA_MIN, ANTIALIAS_FLOOR, DILATION
+from progdf.rasterize.engines import ALPHA_MIN, ANTIALIAS_FLOOR
 from progdf.sh import _C1, _C2, _C3, C0
 
 from .jit import Number, kernel, prefetch
@@ -66,6 +66,7 @@ class Pinhole(NamedTuple):
     grid: tuple[int, int, int, int]  # first tile column and row of the window, and how many there are
     degree: int  # of spherical harmonics, -1 for rgb
     antialiased: bool  # see `progdf.rasterize.render`
+    dilation: float  # added to the diagonal of the 2D covariance, pixels²
 
 
 class Splats(NamedTuple):
@@ -245,7 +246,7 @@ def footprint(camera: Pinhole, mean: Vec, scale: Vec, quat: Quat) -> Footprint:
     return Footprint(
         x, y, inv_z, tan_x, tan_y, tan_x == ratio_x, tan_y == ratio_y, (qw, qx, qy, qz), inv_length, rotation,
         a0, a1, turned0, turned1, p0, p1, a, b, c, normal, det0,
-        det0 + DILATION * (a + c) + DILATION * DILATION,
+        det0 + camera.dilation * (a + c) + camera.dilation * camera.dilation,
     )  # fmt: skip
 
 
@@ -281,8 +282,8 @@ def extents(
     # ln x ≤ x − 1; 1.001: the viewmat's rotation is one only within rounding
     radius2 = 1.001 * (_CUT_RADIUS2 + 2.0 * max(opacity - 1.0, 0.0))
     jx, jy = camera.fx * largest * inv_z, camera.fy * largest * inv_z
-    wide2 = radius2 * (jx * jx * (1.0 + tan_x * tan_x) + DILATION)
-    high2 = radius2 * (jy * jy * (1.0 + tan_y * tan_y) + DILATION)
+    wide2 = radius2 * (jx * jx * (1.0 + tan_x * tan_x) + camera.dilation)
+    high2 = radius2 * (jy * jy * (1.0 + tan_y * tan_y) + camera.dilation)
     return px, py, wide2, high2
 
 
@@ -323,7 +324,7 @@ def project(begin: int, end: int, scene: Scene, camera: Pinhole, splats: Splats,
         opacity = np.float64(scene.opacities[i])
         if camera.antialiased:
             opacity = opacity * math.sqrt(max(ANTIALIAS_FLOOR, seen.det0 / seen.det))
-        sigma_x, sigma_y = math.sqrt(seen.a + DILATION), math.sqrt(seen.c + DILATION)
+        sigma_x, sigma_y = math.sqrt(seen.a + camera.dilation), math.sqrt(seen.c + camera.dilation)
         px, py = camera.fx * seen.x * seen.inv_z + camera.cx, camera.fy * seen.y * seen.inv_z + camera.cy
         r2 = max(0.0, math.log2(opacity * _PER_ALPHA_MIN))
         radius = math.sqrt(r2) * _PER_UNIT

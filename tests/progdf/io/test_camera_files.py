@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -38,6 +39,13 @@ def test_saved_cameras_load_to_the_same_bits(tmp_path: Path) -> None:
         assert torch.equal(found.K, expected.K)
         assert (found.width, found.height, found.name) == (expected.width, expected.height, expected.name)
     assert progdf.load_cameras is load_cameras
+
+
+def test_what_pixels_are_samples_of_is_saved(tmp_path: Path) -> None:
+    cameras = [replace(some_cameras()[0], sampling=sampling) for sampling in (1.0, math.sqrt(2.0))]
+    save_cameras(tmp_path / "c.json", cameras)
+    assert [camera.sampling for camera in load_cameras(tmp_path / "c.json")] == [1.0, math.sqrt(2.0)]
+    assert (tmp_path / "c.json").read_text().count("sampling") == 1
 
 
 def test_one_camera_or_a_bare_list_of_ours_is_read(tmp_path: Path) -> None:

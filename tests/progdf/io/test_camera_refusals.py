@@ -121,6 +121,12 @@ def test_a_saved_camera_that_does_more_than_turn_and_move_is_refused(
     assert "not a rotation" in refusal(load_cameras, written(tmp_path / "one.json", entry))
 
 
+@pytest.mark.parametrize("sampling", [0, -1, 0.5, 17, 1e300, "2", None])
+def test_pixels_of_a_smaller_picture_are_refused(sampling: object, tmp_path: Path) -> None:
+    entry = {"width": 4, "height": 4, "K": torch.eye(3).tolist(), "viewmat": torch.eye(4).tolist()}
+    refusal(load_cameras, written(tmp_path / "one.json", entry | {"sampling": sampling}))
+
+
 def test_a_missing_camera_file_is_one_line(tmp_path: Path) -> None:
     assert "does not exist" in refusal(load_cameras, tmp_path / "nowhere.json")
 

@@ -33,6 +33,16 @@ def test_a_crop_is_the_slice_of_the_whole_picture(engine: str, crop: tuple[int, 
         torch.testing.assert_close(found, expected[y0:y1, x0:x1], atol=rounding, rtol=0.0)
 
 
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("engine", EVERY)
+def test_samples_are_pixels_of_the_larger_picture(engine: str, antialiased: bool) -> None:
+    scene, camera = replace(random_gaussians(200, scale=0.01), antialiased=antialiased), orbit_camera(40, 30)
+    sampled = render(scene, replace(camera, sampling=3.0), engine=engine).image
+    whole = render(scene, camera.resize(120, 90), engine=engine).image[1::3, 1::3]
+    assert float((sampled - render(scene, camera, engine=engine).image).abs().max()) > 0.05
+    torch.testing.assert_close(sampled, whole, atol=2e-5, rtol=0.0)
+
+
 @pytest.mark.parametrize("engine", FAST)
 def test_the_order_of_the_list_does_not_matter_where_depths_differ(engine: str) -> None:
     scene, camera = random_gaussians(300, seed=8), orbit_camera(50, 40)

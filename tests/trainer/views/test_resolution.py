@@ -15,7 +15,7 @@ from tests.helpers.demo_scenes import bear
 from tests.helpers.trained import quick_options
 from trainer.options import MOST_VIEWS, VIEWS, ViewOptions
 from trainer.resolve import resolve
-from trainer.setup import SIZES, choose_resolution
+from trainer.setup import SAMPLING, SIZES, choose_resolution, make_training_setup
 from trainer.views.view import region_rig
 
 
@@ -55,6 +55,14 @@ def test_what_was_typed_is_kept() -> None:
     assert choice(6000, views=7) == (38, 7)
     assert choice(6000, image_size=20) == (20, MOST_VIEWS)
     assert choice(6000, image_size=20, views=7) == (20, 7)
+
+
+@pytest.mark.parametrize(("dense", "sampling"), [(True, SAMPLING), (False, 1.0)])
+def test_an_edit_of_colors_is_meant_for_larger_pictures(dense: bool, sampling: float) -> None:
+    scene = bear(400).gaussians
+    region = Region("all", torch.arange(400), torch.ones(400))
+    setup = make_training_setup(ViewOptions(views=5, dense=dense), scene, region)
+    assert {view.camera.sampling for view in setup.views} == {sampling}
 
 
 def test_what_is_painted_view_by_view_and_a_draft_stay_small() -> None:
