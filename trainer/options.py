@@ -137,9 +137,9 @@ class ViewOptions:
     """How many views are edited, 3 to 96 (the paper's limit); every fifth is held out to measure with. 0: 30,
     or 40 for an edit of colors."""
     image_size: int = 0
-    """Longer side of the views in pixels; 0: 256, or up to 384 for an edit of colors whose members are so
-    dense that most have less than a pixel; 512 for instruct."""
-    dense: Fixed[bool] = True  # dense members get more and larger views; not what is painted one by one
+    """Longer side of the views in pixels; 0: 256, 512 for instruct. Those of an edit of colors serve pictures
+    up to twice as large."""
+    dense: Fixed[bool] = True  # an edit of colors gets more views; not what is painted one by one
     pictures: Fixed[tuple[Path, ...]] = ()  # changed pictures, whose cameras are the views, all to train on
     scene: Fixed[Path | None] = None  # its file, beside which there may be cameras that tell which way is up
 

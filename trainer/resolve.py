@@ -86,7 +86,7 @@ def resolve(options: TrainOptions) -> TrainOptions:
         views=replace(
             options.views,
             views=min(views or QUICK_VIEWS, QUICK_VIEWS) if quick else views,
-            dense=not quick and family not in PER_VIEW,
+            dense=not quick and family not in PER_VIEW and options.optimize.color_solver,
             image_size=options.views.image_size or (INSTRUCT_SIZE if family == "instruct" else 0),
             pictures=pictures,
             scene=options.scene,

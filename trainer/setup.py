@@ -18,7 +18,6 @@ from progdf.gaussians import Gaussians, concatenate
 from progdf.io.cameras import load_cameras
 from progdf.io.images import write_image
 from progdf.io.picture_camera import up_in_picture
-from progdf.rasterize import alpha_weights
 from progdf.rasterize.engines import engine_device
 from progdf.region import Region
 from progdf.scene.bounds import is_surrounding
@@ -46,8 +45,8 @@ from .views.view import (
     with_near_plane,
 )
 
-SIZES = (256, 320, 384)
-"""Longer sides that are tried, in pixels."""
+SIZE = 256
+"""Longer side of the views, in pixels."""
 
 SAMPLING = math.sqrt(2.0)
 """How many times larger pictures an edit of colors is meant for: they are looked at from as large as these to
@@ -55,67 +54,6 @@ twice that (docs/experiments.md, Views)."""
 
 PICTURE_SIZE = 512
 """The longest side at which a changed picture is trained on."""
-
-_WELCOME, _BEARABLE = 0.3, 0.5
-"""Share of unresolved members up to which a size will do, and above which it is said."""
-
-_LOOK, _LOOKS = 96, 4  # pixels of the views in which members are measured, and how many
-
-
-def unresolved_share(
-    scene: Gaussians, region: Region, cameras: Sequence[Camera], image_size: int, views: int
-) -> float:
-    """Share of the visible members that get less than a pixel, in so many views of that size together. 0..1
-
-    Args:
-        scene, region: what is looked at
-        cameras: views of it, of which a few are looked through
-        image_size: longer side in pixels
-        views: how many there will be
-    """
-    weight = torch.zeros(len(region))
-    looks = cameras[:: max(1, len(cameras) // _LOOKS)][:_LOOKS]
-    for camera in looks:
-        small = fit_size(camera, _LOOK)
-        area = (image_size / max(small.width, small.height)) ** 2
-        weights = alpha_weights(scene, small, torch.ones(small.height, small.width))
-        weight += area * weights[region.members, 2]
-    weight *= views / max(1, len(looks))
-    visible = weight > 0
-    return float((weight[visible] < 1.0).float().mean()) if bool(visible.any()) else 0.0
-
-
-def choose_resolution(
-    options: ViewOptions,
-    scene: Gaussians,
-    region: Region,
-    cameras_of: Callable[[int, int], Sequence[Camera]],
-) -> tuple[Sequence[Camera], int, str]:
-    """Cameras, how many of them to choose, and a line where the members are not resolved by these.
-
-    What was typed is kept to. Else edits of colors have more views, and larger ones where members are dense.
-    Why 40 of 320 and not 30 of 384: docs/experiments.md, Views.
-
-    Args:
-        options: see `ViewOptions`
-        scene, region: what they look at
-        cameras_of: longer side in pixels, number of views -> cameras
-    """
-    sizes = SIZES if options.cameras is not None or options.views else SIZES[:-1]
-    tried = [(size, MOST_VIEWS) for size in sizes] if options.dense else [(SIZES[0], VIEWS)]
-    tried = [(options.image_size or size, options.views or views) for size, views in tried]
-    for size, views in tried:
-        cameras = cameras_of(size, views)
-        count = min(views, len(cameras)) * 4 // 5  # every fifth is held out
-        share = unresolved_share(scene, region, cameras, size, count)
-        if share <= _WELCOME:
-            break
-    line = (
-        f"{share:.0%} of the region's visible Gaussians have less than a pixel in all {count} views "
-        f"of {size} pixels: what differs among neighbors is not resolved; give --image-size or --views more"
-    )
-    return cameras, views, line if share > _BEARABLE else ""
-
 
 _PROBES = 3
 
@@ -187,26 +125,23 @@ def make_training_setup(options: ViewOptions, scene: Gaussians, region: Region) 
     if options.cameras is None and is_surrounding(scene, up.direction):
         raise ProgdfError(f"the scene {INSIDE}")
 
-    def cameras_of(image_size: int, count: int) -> list[Camera]:
+    views, size = options.views or (MOST_VIEWS if options.dense else VIEWS), options.image_size or SIZE
+
+    def cameras_of(count: int) -> list[Camera]:
         if options.cameras is not None:
-            fitted = [fit_size(camera, image_size) for camera in given]
+            fitted = [fit_size(camera, size) for camera in given]
         else:
-            fitted = region_rig(scene, region, count, image_size, up.direction)
-        fitted = [replace(c, sampling=SAMPLING if options.dense else 1.0) for c in fitted]
+            fitted = region_rig(scene, region, count, size, up.direction)
+        fitted = [replace(c, sampling=SAMPLING) for c in fitted] if options.dense else fitted
         return with_near_plane(name_cameras(fitted), scene)
 
-    cameras, views, unresolved = choose_resolution(options, scene, region, cameras_of)
     aside = max(1, views // 5 if options.views else min(views // 5, VIEWS // 5))
     if options.cameras is None:
-        size = max(cameras[0].width, cameras[0].height)
-        choice, train, held_out = _rig_views(
-            scene, region, lambda count: cameras_of(size, count), views - aside, aside, background
-        )
+        choice, train, held_out = _rig_views(scene, region, cameras_of, views - aside, aside, background)
     else:
-        choice = choose_views(scene, region, cameras, views, background)
+        choice = choose_views(scene, region, cameras_of(views), views, background)
         train, held_out = split_views(choice, min(aside, max(1, len(choice.views) // 5)))
     notes = [f"up is {up.name}, {up.reason}"]
-    notes += [unresolved] if unresolved else []
     notes += [choice.line()] if len(choice.views) < choice.offered else []
     if any(view.camera.lens for view in choice.views):
         notes.append(

@@ -111,7 +111,9 @@ def test_the_field_tells_where_it_shows_what_was_recorded(folder: Path, done: Ru
 
 
 def test_effort_that_nobody_gives_is_decided_on_the_scene_and_reported(folder: Path, done: RunResult) -> None:
-    free = train(quick_options(folder, "free", stages=0, views=0, image_size=40), quiet=True)
+    free = train(
+        quick_options(folder, "free", stages=0, views=0, image_size=40, editor="darken:0.4"), quiet=True
+    )
     effort, given = free.report["effort"], done.report["effort"]
     assert effort["strengths"] == free.report["trajectory"]["stages"]
     assert effort["strengths"] != given["strengths"]
@@ -306,8 +308,9 @@ def test_bad_input_is_one_line_and_leaves_no_edit(folder: Path, tmp_path: Path, 
 
 def test_an_edit_that_changes_nothing_is_told_before_training(folder: Path, done: RunResult) -> None:
     originals = done.folder.root / "views" / "original"
+    same = {"editor": f"folder:{originals}", "cameras": done.folder.cameras}
     with pytest.raises(ProgdfError, match="changes none of the views; "):
-        train(quick_options(folder, "nothing", editor=f"folder:{originals}", **WHOLE), quiet=True)
+        train(quick_options(folder, "nothing", **same, **WHOLE), quiet=True)
 
 
 def test_fitting_what_is_no_run_is_one_line(tmp_path: Path) -> None:
