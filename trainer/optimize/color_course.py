@@ -92,7 +92,7 @@ def settle_bands(model: Model, solver: Solver, targets: Sequence[Target], steps:
     mapped = [solver.fit_map(model.degree, stage.targets)[1] for stage, _ in targets]
 
     def refine(starts: Sequence[Tensor], most: int) -> tuple[list[Tensor], float]:
-        """The residuals after so many steps, at most as many as are good, and the sum of what they leave."""
+        """The residuals after so many steps, as long as these help where that is all, and what they leave."""
         by, found, left = solver.only(starts[-1]), list[Tensor](), 0.0
         for (stage, judge), made, start in zip(targets, mapped, starts, strict=True):
             if most < steps or stage.strength < 1.0:  # the finished edit is solved for

@@ -37,14 +37,7 @@ from trainer.optimize.color_views import ColorView, Judge, color_views
 from trainer.optimize.groups import Groups, group_path, group_stage, restore_groups
 from trainer.optimize.growth import add_rows, place_seeds, removal_costs, seed_rows
 from trainer.optimize.losses import Losses, Objective, Perceptual, erode, loss_table
-from trainer.optimize.pgs import (
-    OnStep,
-    ParameterSnapshot,
-    PgsState,
-    TargetStage,
-    optimize,
-    pgs_settings,
-)
+from trainer.optimize.pgs import OnStep, ParameterSnapshot, PgsState, TargetStage, optimize, pgs_settings
 from trainer.optimize.retime import drop_jitter, record, resolve_slider, retime
 from trainer.optimize.ties import surface_ties
 from trainer.options import MOST_STAGES, OptimizeOptions, TrainOptions, ViewOptions
