@@ -114,7 +114,8 @@ class Camera:
     lens: Lens | None = None
     # depth at and below which a training draws nothing, world units, see `bounds.near_plane`
     near: float = NEAR
-    # its pixels are samples of a picture so many times as large, whose finer pixels blur Gaussians less
+    # its pixels are samples of a picture so many times as large, whose finer pixels blur Gaussians less; of
+    # trainings: OpenGL draws pictures
     sampling: float = 1.0
 
     def __post_init__(self) -> None:

@@ -15,10 +15,15 @@ from progdf.gaussians import Gaussians
 from progdf.rasterize import ENGINES, ActivatedGaussians, Crop, RasterInfo, Rendering, activate, render
 from progdf.rasterize.engines import engine_device
 from tests.helpers.draws import Draws
-from tests.helpers.scenes import hard_cases
+from tests.helpers.scenes import HardCase, hard_cases, orbit_camera, random_gaussians
 
 INPUTS = ("means", "quats", "scales", "opacities", "colors", "viewmat", "K", "background")
-CASES = hard_cases()
+CASES = hard_cases() | {
+    # of trainings alone: what is on a screen is a picture
+    "samples of a larger picture": HardCase(
+        random_gaussians(200, seed=4, scale=0.01), replace(orbit_camera(), sampling=3.0)
+    )
+}
 
 NEEDS_WARP = pytest.mark.skipif(importlib.util.find_spec("warp") is None, reason="warp-lang is not installed")
 EVERY = [pytest.param(name, marks=NEEDS_WARP if name == "warp" else ()) for name in ENGINES]

@@ -134,11 +134,6 @@ def hard_cases() -> dict[str, HardCase]:
     add("culled ones first", concatenate(behind[:20], plain))
     add("random with SH 3", some)
     add("random in view of an orbit camera", random_gaussians(200, seed=2, sh_degree=2), orbit_camera())
-    add(
-        "samples of a larger picture",
-        random_gaussians(200, seed=4, scale=0.01),
-        replace(orbit_camera(), sampling=3.0),
-    )
     add("many tiles", random_gaussians(150, seed=3, scale=0.15), orbit_camera(150, 70))
 
     add("opacity exactly 1", one_gaussian(opacity=1.0))
