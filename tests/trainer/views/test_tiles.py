@@ -12,7 +12,8 @@ from torch import Tensor
 from progdf.gaussians import Gaussians, pack
 from progdf.rasterize import ActivatedGaussians, render
 from progdf.rasterize.cpu.forward import TILE_H, TILE_W
-from tests.helpers.scenes import front_camera, hard_cases, orbit_camera, random_gaussians
+from tests.helpers.drawn import CASES
+from tests.helpers.scenes import front_camera, orbit_camera, random_gaussians
 from tests.helpers.trained import WHITE, small
 from trainer.views.crops import CropScene, crop_scene, live_pixels, live_tiles, may_reach, render_all
 
@@ -108,12 +109,12 @@ def test_needles_beyond_the_edge_of_an_off_center_picture_are_not_left_out() -> 
 
 
 def _cases() -> dict[str, Callable[[], object]]:
-    return {name: (lambda case=case: case) for name, case in hard_cases().items()}
+    return {name: (lambda case=case: case) for name, case in CASES.items()}
 
 
 @pytest.mark.parametrize("name", sorted(_cases()))
 def test_no_gaussian_that_reaches_a_tile_is_left_out(name: str) -> None:
-    case = hard_cases()[name]
+    case = CASES[name]
     scene, camera = case.gaussians, case.camera
     for row in range(-(-camera.height // TILE_H)):
         for column in range(-(-camera.width // TILE_W)):
