@@ -264,7 +264,7 @@ def relative_viewmat(viewmat: Tensor, origin: Origin) -> Tensor:
 def read_camera(text: str, origin: Origin = ZERO) -> Camera:
     """The camera of `FILE[:INDEX]`, the first one where no index is given; −1 is the last.
 
-    It is relative to `origin`, as of `load_cameras`.
+    It is relative to `origin`, as of `load_cameras`, and sees pictures, whatever a training sampled there.
 
     Raises:
         ProgdfError: the file is missing or holds no cameras, or not that many.
@@ -276,7 +276,7 @@ def read_camera(text: str, origin: Origin = ZERO) -> Camera:
     if not -len(cameras) <= number < len(cameras):
         last = len(cameras) - 1
         raise ProgdfError(f"{path} has no camera {number}; it holds {len(cameras)}, numbered 0 to {last}")
-    return cameras[number]
+    return replace(cameras[number], sampling=1.0)
 
 
 def cameras_beside(path: Path, origin: Origin = ZERO) -> list[Camera]:

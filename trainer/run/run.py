@@ -39,7 +39,7 @@ from trainer.editors.base import ImageEditor
 from trainer.editors.decal import DecalEditor
 from trainer.editors.instruct import InstructEditor
 from trainer.editors.pictures import FolderEditor, picture_cameras
-from trainer.editors.procedural import edit_course
+from trainer.editors.procedural import StripesEditor, edit_course
 from trainer.fit.draft import draft_grade, draft_views
 from trainer.fit.fit import choose_path, drop_idle_attributes
 from trainer.fit.network import PART as NETWORK
@@ -86,7 +86,9 @@ from .removal import is_removal, remove_region
 from .resume import check_exists, decide_resume, explain_stop, load_region, picture_digests
 from .training import Strengths, optimize_members, retime_trajectory
 
-_KEPT_PIXELS = 1_000_000  # of which what no strength changes is kept: up to 80 bytes each
+_KEPT = (
+    1_000_000  # pixels, and painted members, of which what no strength changes is kept: up to 80 bytes each
+)
 
 
 def check_command(options: TrainOptions) -> None:
@@ -399,8 +401,7 @@ def _edit_views(
     def edit(strengths: Sequence[float], views: Sequence[View] = views) -> Pictures:
         nonlocal on_the_way
         new, is_confined = [s for s in strengths if s not in made], confines_edit(editor(), approach.kind)
-        kept = sum(int((view.mask > 0.0).sum()) for view in views) <= _KEPT_PIXELS
-        way = course if kept else partial(edit_course, editor())
+        way = course if _keeps_courses(editor(), setup) else partial(edit_course, editor())
         with log.steps("edit", len(views) * len(new)) as advance:
             within = views
             if options.region.region == CHANGED:  # of paint finer than the Gaussians few are found
@@ -457,15 +458,25 @@ def _edit_views(
     elif not optimization.as_printed and resolve_slider(optimization.slider, strengths) == "even":
         strengths = equalized_strengths(editor(), spec, views, strengths)
     edited = edit(strengths)
-    if all(
-        torch.equal(p, quantize_image(v.image)) for s in edited for p, v in zip(edited[s], views, strict=True)
-    ):
-        raise ProgdfError(
-            f"{spec} changes none of the views; check the region and what the editor is asked for"
-        )
+    _check_change(edited, setup, spec)
     if rest := [s for s in known if s not in edited]:
         edited = edit(rest, [view for view in views if view.camera.name in on_the_way])
     return edited, approach, trial, between
+
+
+def _keeps_courses(editor: ImageEditor, setup: TrainingSetup) -> bool:
+    """Whether there is room for what no strength changes, of all views."""
+    painted = len(setup.region) if isinstance(editor, StripesEditor) else 0
+    return sum(int((view.mask > 0.0).sum()) + painted for view in setup.views) <= _KEPT
+
+
+def _check_change(edited: Pictures, setup: TrainingSetup, spec: str) -> None:
+    """ProgdfError if no view shows an edit."""
+    originals = [quantize_image(view.image) for view in setup.views]
+    if all(torch.equal(*pair) for made in edited.values() for pair in zip(made, originals, strict=True)):
+        raise ProgdfError(
+            f"{spec} changes none of the views; check the region and what the editor is asked for"
+        )
 
 
 def _asks_for_more(options: TrainOptions, optimization: OptimizeOptions) -> bool:

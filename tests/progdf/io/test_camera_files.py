@@ -15,7 +15,7 @@ from PIL import Image
 import progdf
 from progdf.camera import Camera, Lens
 from progdf.errors import ProgdfError
-from progdf.io.cameras import kind_of_cameras, load_cameras, save_cameras
+from progdf.io.cameras import kind_of_cameras, load_cameras, read_camera, save_cameras
 from tests.helpers.camera_tables import inria, nerfstudio, some_cameras, written
 from tests.helpers.full_disk import files_up_to
 from tests.helpers.refused import refusal
@@ -46,6 +46,7 @@ def test_what_pixels_are_samples_of_is_saved(tmp_path: Path) -> None:
     save_cameras(tmp_path / "c.json", cameras)
     assert [camera.sampling for camera in load_cameras(tmp_path / "c.json")] == [1.0, math.sqrt(2.0)]
     assert (tmp_path / "c.json").read_text().count("sampling") == 1
+    assert read_camera(f"{tmp_path / 'c.json'}:1").sampling == 1.0, "who looks from there sees a picture"
 
 
 def test_one_camera_or_a_bare_list_of_ours_is_read(tmp_path: Path) -> None:
