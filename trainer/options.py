@@ -48,8 +48,9 @@ MOST_THREADS = 1024
 """More than any machine has: what --threads says at most."""
 LARGEST_SEED = 2**32 - 1
 """What every generator of random numbers takes."""
-VIEWS, MOST_VIEWS = 30, 40
-"""How many views are edited by default, and how many of an edit of colors (see `trainer.views.setup`)."""
+VIEWS, COLOR_VIEWS = 30, (40, 48)
+"""How many views are edited by default, and how many of an edit of colors: where these have up to one band of
+directions, and where they have more (docs/experiments.md, Views)."""
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from progdf.threads import map_threads, threads
 from .editors.base import ImageEditor
 from .editors.pictures import picture_cameras
 from .editors.procedural import ColorEditor, StripesEditor
-from .options import MOST_VIEWS, VIEWS, Kind, ViewOptions
+from .options import COLOR_VIEWS, VIEWS, Kind, ViewOptions
 from .store.progress import Advance
 from .store.run_folder import LazySequence, RunFolder, add_pictures, from_bytes, stored_pictures, to_bytes
 from .views.choose import ViewChoice, choose_views, split_views
@@ -125,7 +125,8 @@ def make_training_setup(options: ViewOptions, scene: Gaussians, region: Region) 
     if options.cameras is None and is_surrounding(scene, up.direction):
         raise ProgdfError(f"the scene {INSIDE}")
 
-    views, size = options.views or (MOST_VIEWS if options.dense else VIEWS), options.image_size or SIZE
+    usual = COLOR_VIEWS[scene.sh_degree > 1] if options.dense else VIEWS
+    views, size = options.views or usual, options.image_size or SIZE
 
     def cameras_of(count: int) -> list[Camera]:
         if options.cameras is not None:

@@ -40,6 +40,7 @@ from .color_views import (
     Judge,
     MapFit,
     add_colors,
+    add_pulls,
     fit_maps,
     improve_mask,
     iterate_views,
@@ -50,8 +51,8 @@ from .ties import Ties
 STEPS_OF_OTHERS = 8
 """Steps of an optimizer that looks at one view at a time which one iteration over all views stands for."""
 
-SETTLED = 0.001
-"""Share of the error in views not solved for that a step takes away at least, for another to follow."""
+SETTLED = 0.01
+"""Share of the error in views not solved for that `LOOKS` steps take away at least, for another to follow."""
 
 BANDS = (1, 4, 9)
 """SH functions of a residual that are tried, each where the one before it was better than less."""
@@ -299,7 +300,7 @@ class Solver:
                 error = look(now)
                 best = now if error < min(looks) else best
                 looks.append(error)
-                settled = looks[-1 - LOOKS] - error <= LOOKS * SETTLED * max(error, floor, LEVEL)
+                settled = looks[-1 - LOOKS] - error <= SETTLED * max(error, floor, LEVEL)
                 if settled or error <= LEVEL:
                     break
             conditioned = inverse @ pull.descent
@@ -334,7 +335,7 @@ class Solver:
         error = _inner(residual, self._hold(residual, ridge))
         looks = iterate_views(look, range(len(self.views)))
         for view, (passed, pull, squared) in zip(self.views, looks, strict=True):
-            descent.addcmul_(view.basis[:, : residual.shape[1], None], pull[:, None])
+            add_pulls(view.basis.numpy(), pull.numpy(), descent.numpy())
             error += squared
             all_passed.append(passed)
         return _Pull(descent, error, drawn, all_passed)

@@ -31,7 +31,7 @@ from trainer.views.crops import CropScene
 _AT_ONCE = 8  # views, whose results are there at the same time
 _SQUARES = 6  # of a view's longer side, every other one of which is in one of its halves
 _COVERED = 0.05  # the region's weight in a pixel that shows it
-_MOST_PIXELS = 250_000  # for the some twenty coefficients of the map; of more, evenly spread ones
+_MOST_PIXELS = 60_000  # for the some twenty coefficients of the map; of more, evenly spread ones
 _PART = 1 << 14  # of these, that a thread has at a time
 _CLAMP_ROUNDS = 3  # of the map's least squares, for pixels that are white or black anyway
 _MAP_RIDGE = 1e-6  # of the diagonal of a map's normal equations, for regions of few colors
@@ -130,6 +130,15 @@ def add_colors(basis: Array, offsets: Array, colors: Array) -> None:
         for c in range(3):
             for b in range(offsets.shape[1]):
                 colors[m, c] += basis[m, b] * offsets[m, b, c]
+
+
+@kernel(contract=True, cache=True)
+def add_pulls(basis: Array, pull: Array, offsets: Array) -> None:
+    """offsets += basis · pull, `add_colors` the other way round. [M,B], [M,3], [M,b,3] float32"""
+    for m in range(len(pull)):
+        for b in range(offsets.shape[1]):
+            for c in range(3):
+                offsets[m, b, c] += basis[m, b] * pull[m, c]
 
 
 def color_view(crop: CropScene, original: Tensor, bands: int, pixels: Tensor) -> ColorView:

@@ -20,6 +20,7 @@ from progdf.gdf.file import Gdf, fingerprint, load_gdf, save_gdf
 from progdf.io.images import write_image
 from progdf.io.json_values import convert_json, decode_json, plain
 from progdf.terminal import file_size, format_count
+from progdf.threads import map_threads
 from trainer.editors.pictures import picture_background
 from trainer.fit.evaluate import Evaluator, make_evaluator
 from trainer.fit.fit import Fitted, evaluate_field, expected_looks, fit_field, fit_grades, visibility
@@ -240,11 +241,14 @@ def _fit(
 
 def write_finals(setup: TrainingSetup, edited: Gaussians, folder: RunFolder, log: RunLog) -> None:
     """The finished edit's views."""
-    finals = {}
     with log.looks("picture the edit", len(setup.views)) as looked:
-        for view in setup.views:
-            finals[view.camera.name] = render_view(edited, view.camera, setup.background)
+
+        def draw(view: View) -> tuple[str, Tensor]:
+            picture = render_view(edited, view.camera, setup.background)
             looked()
+            return view.camera.name, picture
+
+        finals = dict(map_threads(draw, setup.views))
     write_views(folder, "final", finals)
 
 

@@ -112,7 +112,9 @@ PART = "training"
 _TIMED_VIEWS = 4  # in which the slider is timed; 8 or all at full size time it no better
 
 
-_ENOUGH = 12  # pixels for each number of a color that is solved for
+# pixels for each number of a color that is solved for: twice as many take a twelfth of the error away if all
+# of these are noise, and a twentieth as measured (docs/experiments.md, Pixels)
+_ENOUGH = 5
 
 
 Way = Callable[[OnStep], Iterator[ParameterSnapshot]]
@@ -305,10 +307,10 @@ def plan_colors(
 
 
 def _stride(setup: TrainingSetup) -> int:
-    """Of how many pixels of the training views one is solved for, see `color_views`: half of them say as much
-    to some hundredths of a dB (docs/experiments.md, Pixels), a quarter where many show each member."""
+    """Of how many pixels of the training views one is solved for, see `color_views`: as few as leave enough."""
     numbers = min(9, (setup.scene.sh_degree + 1) ** 2) * len(setup.region)  # of a channel, at most
-    return 4 if sum(int((view.mask > 0.0).sum()) for view in setup.train) >= 4 * _ENOUGH * numbers else 2
+    shown = sum(int((view.mask > 0.0).sum()) for view in setup.train)
+    return next((every for every in (4, 2) if shown >= every * _ENOUGH * numbers), 1)
 
 
 def _solve(plan: ColorPlan, folder: StateFolder, log: RunLog) -> Optimized:
