@@ -307,7 +307,7 @@ def plan_colors(
 
 
 def _stride(setup: TrainingSetup) -> int:
-    """Of how many pixels of the training views one is solved for, see `color_views`: as few as leave enough."""
+    """Of how many of the views' pixels one is solved for, see `color_views`: as few as leave enough."""
     numbers = min(9, (setup.scene.sh_degree + 1) ** 2) * len(setup.region)  # of a channel, at most
     shown = sum(int((view.mask > 0.0).sum()) for view in setup.train)
     return next((every for every in (4, 2) if shown >= every * _ENOUGH * numbers), 1)
