@@ -249,7 +249,7 @@ def plan_colors(
     """
     scene, members, count = setup.scene, setup.region.members, len(setup.train)
     original, few = pack(scene[members], with_shN=scene.sh_degree > 0), bool(options.pictures)
-    every, most = 1 if few else _stride(setup), iterations(optimization.steps)
+    every, most = 1 if few else pixel_stride(setup), iterations(optimization.steps)
     held_out = split_held_out(setup.held_out)[0] if len(edited[1.0]) > count else []
     train, judging = setup.train, held_out or setup.train
 
@@ -306,7 +306,7 @@ def plan_colors(
     return ColorPlan(original, solver.only(model.residual), model, course, most)
 
 
-def _stride(setup: TrainingSetup) -> int:
+def pixel_stride(setup: TrainingSetup) -> int:
     """Of how many of the views' pixels one is solved for, see `color_views`: as few as leave enough."""
     numbers = min(9, (setup.scene.sh_degree + 1) ** 2) * len(setup.region)  # of a channel, at most
     shown = sum(int((view.mask > 0.0).sum()) for view in setup.train)

@@ -344,7 +344,7 @@ def test_strengths_are_asked_for_where_those_that_are_solved_for_say_too_little(
 def test_steps_end_where_other_views_gain_little_and_go_on_where_members_are_dense(
     members: int, size: int, most: int
 ) -> None:
-    """A few of 60 steps for members of many pixels each; nearly all of 40 for members smaller than a pixel."""
+    """A few of 60 steps for members of many pixels each; nearly all of 40 for those smaller than a pixel."""
     scene = dense_ball(members)
     side = scene.means[:, :1] > 0
     edited = replace(scene, sh0=torch.where(side, scene.sh0.flip(1), scene.sh0 + 0.3))

@@ -13,18 +13,21 @@ from tests.helpers.demo_scenes import bear
 from tests.helpers.trained import quick_options
 from trainer.options import ViewOptions
 from trainer.resolve import resolve
+from trainer.run.training import pixel_stride
 from trainer.setup import SAMPLING, SIZE, TrainingSetup, make_training_setup
 
 
-def setup_of(**said: object) -> TrainingSetup:
-    """The views that the bear gets, if so much is said."""
-    scene = bear(400).gaussians
-    region = Region("all", torch.arange(400), torch.ones(400))
+def setup_of(count: int = 400, bands: int = 3, **said: object) -> TrainingSetup:
+    """The views that the bear gets, if so much is said, of so many SH functions beyond DC."""
+    scene = bear(count).gaussians
+    scene = replace(scene, shN=torch.zeros(count, bands, 3))
+    region = Region("all", torch.arange(count), torch.ones(count))
     return make_training_setup(replace(ViewOptions(), **said), scene, region)  # type: ignore[arg-type]
 
 
 def test_an_edit_of_colors_has_more_views_and_what_was_typed_is_kept() -> None:
     assert [len(setup_of(dense=dense).train) for dense in (True, False)] == [34, 24]
+    assert [len(setup_of(bands=bands).train) for bands in (0, 8)] == [34, 42]
     assert len(setup_of(views=7).train) == 6
     sizes = [setup_of(views=5, image_size=size).train[0].camera.width for size in (0, 40)]
     assert sizes == [SIZE, 40]
@@ -42,3 +45,16 @@ def test_what_is_painted_view_by_view_a_draft_and_the_papers_way_are_as_they_loo
         for more in ({}, {"quick": True}, {"editor": "style:14"}, {"color_solver": False})
     ]
     assert [plan.views.dense for plan in plans] == [True, False, False, False]
+
+
+@pytest.mark.parametrize(
+    ("members", "bands", "every"), [(4000, 0, 1), (2000, 0, 2), (500, 0, 4), (500, 3, 2)]
+)
+def test_fewer_pixels_are_solved_for_where_many_show_each_number(
+    members: int, bands: int, every: int
+) -> None:
+    setup = setup_of(members, bands, views=5, image_size=160)
+    assert pixel_stride(setup) == every
+    shown = sum(int((view.mask > 0.0).sum()) for view in setup.train) / members / (1 + bands)
+    assert every == 1 or shown / every >= 5.0
+    assert every == 4 or shown / (2 * every) < 5.0
