@@ -182,9 +182,10 @@ def stripe_frame(points: Tensor) -> tuple[Tensor, float, float]:
 
 def region_color(views: Sequence[View]) -> Tensor:
     """The region's typical color over all views, so that each view's edit is one function. [3]"""
+    pairs = [(view, view.mask > 0.0) for view in views]
     return color.typical_color(
-        torch.cat([view.inside.reshape(-1, 3) for view in views]),
-        torch.cat([view.mask.reshape(-1) for view in views]),
+        torch.cat([view.inside[shown] for view, shown in pairs]),
+        torch.cat([view.mask[shown] for view, shown in pairs]),
     )
 
 
