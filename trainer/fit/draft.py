@@ -28,7 +28,6 @@ from progdf.region import Region
 from progdf.scene.bounds import is_surrounding
 from progdf.scene.up_axis import find_up
 from progdf.sh import basis
-from progdf.threads import map_threads
 from trainer.editors import COLOR_FUNCTIONS, make_editor
 from trainer.editors.procedural import edit_course
 from trainer.optimize.color_views import MORE_PAYS, ColorView, MapFit, fit_maps
@@ -96,7 +95,7 @@ def draft_views(options: ViewOptions, editor: str, scene: Gaussians, region: Reg
     began, looked, views = time.process_time(), list[tuple[View, ColorView]](), None
     for number in range(_ROUNDS):
         added = with_near_plane(cameras[number::_ROUNDS], scene)
-        looked += map_threads(partial(_look, scene, region), added)
+        looked += [_look(scene, region, camera) for camera in added]
         last, fitted = views, [look for i, look in enumerate(looked) if i % _VIEWS != _VIEWS // 2]
         parts = _sample(fitted, _FITTED), _sample(looked[_VIEWS // 2 :: _VIEWS], _JUDGED)
         if not all(len(part.maps.design) for part in parts):
