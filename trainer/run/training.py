@@ -33,7 +33,7 @@ from trainer.optimize.color_solver import (
     solve_again,
     split_solver,
 )
-from trainer.optimize.color_views import ColorView, Judge, color_views
+from trainer.optimize.color_views import MORE_PAYS, ColorView, Judge, color_views
 from trainer.optimize.groups import Groups, group_path, group_stage, restore_groups
 from trainer.optimize.growth import add_rows, place_seeds, removal_costs, seed_rows
 from trainer.optimize.losses import Losses, Objective, Perceptual, erode, loss_table
@@ -112,9 +112,9 @@ PART = "training"
 _TIMED_VIEWS = 4  # in which the slider is timed; 8 or all at full size time it no better
 
 
-# pixels for each number of a color that is solved for: twice as many take a twelfth of the error away if all
-# of these are noise, and a twentieth as measured (docs/experiments.md, Pixels)
-_ENOUGH = 5
+# pixels for each number that is solved for: q of these add 1/q to the error if all else is noise, and of more
+# than 9 twice as many take less than a twentieth of it away (docs/experiments.md, Pixels)
+_ENOUGH = (MORE_PAYS - 0.5) / (1.0 - MORE_PAYS)
 
 
 Way = Callable[[OnStep], Iterator[ParameterSnapshot]]
@@ -308,7 +308,8 @@ def plan_colors(
 
 def pixel_stride(setup: TrainingSetup) -> int:
     """Of how many of the views' pixels one is solved for, see `color_views`: as few as leave enough."""
-    numbers = min(9, (setup.scene.sh_degree + 1) ** 2) * len(setup.region)  # of a channel, at most
+    degree = min(2, setup.scene.sh_degree)  # of a residual
+    numbers = (degree + 1) * (degree + 2) // 2 * len(setup.region)  # that half of the sphere tells apart
     shown = sum(int((view.mask > 0.0).sum()) for view in setup.train)
     return next((every for every in (4, 2) if shown >= every * _ENOUGH * numbers), 1)
 
