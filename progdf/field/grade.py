@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample, pad
 
-from progdf.gaussians import BASE_CHANNELS, attribute_slices
+from progdf.gaussians import BASE_CHANNELS
 from progdf.sh import C0, basis
 
 from .baked import (
@@ -41,6 +41,7 @@ from .separable import fit_course
 MOST_COLOR = 1.5
 """Colors above this, which no screen shows, are mapped as this."""
 
+_FIRST_BAND = BASE_CHANNELS - 3  # column of a packed row, see `attribute_slices`; the others follow
 _DIRECTIONS = 32  # in which a member's color is mapped; twice the functions of three bands
 _CHUNK = 1 << 11  # members at once
 MOST_RESIDUALS = MOST_RANK // 2
@@ -132,23 +133,12 @@ def _map_chunk(sh: Tensor, table: Tensor, degree: int) -> Tensor:
 
 def member_bands(rows: Tensor) -> Tensor:
     """The bands of packed rows that are drawn. [M,14+3K] -> [M,B,3]"""
-    slices = attribute_slices(rows.shape[1])
-    bands = [rows[:, slices["sh0"]].reshape(-1, 1, 3)]
-    if "shN" in slices:
-        higher = rows[:, slices["shN"]].reshape(len(rows), -1, 3)
-        bands.append(higher[:, :15])
-    return torch.cat(bands, dim=1)
+    return rows[:, _FIRST_BAND:].reshape(len(rows), -1, 3)[:, :16].contiguous()
 
 
 def band_offsets(change: Tensor, channels: int) -> Tensor:
     """A change of the lowest bands as packed offsets. [M,B,3] -> [M,channels]"""
-    slices = attribute_slices(channels)
-    offsets = change.new_zeros(len(change), channels)
-    offsets[:, slices["sh0"]] = change[:, 0]
-    if change.shape[1] > 1:
-        first = slices["shN"].start
-        offsets[:, first : first + 3 * (change.shape[1] - 1)] = change[:, 1:].flatten(1)
-    return offsets
+    return pad(change.flatten(1), (_FIRST_BAND, channels - _FIRST_BAND - 3 * change.shape[1]))
 
 
 def mapped_bands(degree: int, table: Tensor, rows: Tensor, share: Tensor) -> Tensor:
@@ -156,16 +146,6 @@ def mapped_bands(degree: int, table: Tensor, rows: Tensor, share: Tensor) -> Ten
     sh = member_bands(rows)
     changes = [share[:, None] * (map_colors(sh, at_knot, degree) - sh).flatten(1) for at_knot in table]
     return torch.stack(changes)
-
-
-def lowest_bands(offsets: Tensor, bands: int) -> Tensor:
-    """The columns of the lowest bands of packed offsets. [...,C] -> [...,3·bands]"""
-    slices = attribute_slices(offsets.shape[-1])
-    columns = list(range(*slices["sh0"].indices(offsets.shape[-1])))[: 3 * bands]
-    if bands > 1:
-        first = slices["shN"].start
-        columns += range(first, first + 3 * (bands - 1))
-    return offsets[..., columns]
 
 
 def bake_grade(form: GradeForm, rows: Tensor, mapped: Tensor | None = None) -> BakedField:
@@ -240,7 +220,7 @@ def map_share(field: BakedField) -> Tensor:
 def map_at(form: GradeForm, s: float) -> Tensor:
     """The map of a grade at strength `s` of the slider. [K,3]"""
     right, share = _segment(form, s)
-    return form.table[right] if share == 1.0 else torch.lerp(form.table[right - 1], form.table[right], share)
+    return torch.lerp(form.table[right - 1], form.table[right], share)
 
 
 def _segment(form: GradeForm, s: float) -> Segment:

@@ -15,7 +15,7 @@ from torch import Tensor
 from progdf.field import BakedField, Candidate, FieldChoice, FieldEvaluator, choose_field
 from progdf.field.baked import GradeForm, NeuralForm
 from progdf.field.choose import ADDED, MOST_SNAPSHOTS, SAMPLES, pick_candidate
-from progdf.field.grade import COARSER, bake_grade, fit_grade, lowest_bands, mapped_bands, rank_limit
+from progdf.field.grade import COARSER, bake_grade, fit_grade, mapped_bands, member_bands, rank_limit
 from progdf.field.keyframes import fit_keyframes, keyframe_rows
 from progdf.field.separable import moving_attributes
 from progdf.field.trajectory import Trajectory
@@ -144,8 +144,8 @@ def fit_grades(
     mask, share = trajectory.mask, torch.ones(len(rows))
     share = share if mask is None else mask.float() / 255.0
     mapped = mapped_bands(degree, table, rows, share)
-    course = torch.stack([lowest_bands(trajectory.node(i), trajectory.bands) for i in range(len(table))])
-    course -= mapped[:, :, : 3 * trajectory.bands]
+    lowest = [member_bands(trajectory.node(i))[:, : trajectory.bands] for i in range(len(table))]
+    course = torch.stack(lowest).flatten(2) - mapped[:, :, : 3 * trajectory.bands]
     evaluator = field_evaluator(trajectory, choosing, options.target_psnr)
     tried, smallest = list[Candidate](), math.inf
 

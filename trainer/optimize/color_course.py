@@ -70,7 +70,7 @@ class Course:
         """All strengths, ascending, and what `solve` yielded of each, counted anew."""
         pairs = zip([*(stage.strength for stage, _ in self.targets), 1.0], made, strict=True)
         strengths, recordings = zip(*sorted(pairs, key=lambda pair: pair[0]), strict=True)
-        return list(strengths), [replace(one, step=i + 1, stage=i) for i, one in enumerate(recordings)]
+        return list(strengths), [replace(one, step=i + 1) for i, one in enumerate(recordings)]
 
 
 def settle_bands(model: Model, solver: Solver, targets: Sequence[Target], steps: int, spare: float) -> Model:
@@ -190,9 +190,7 @@ def solve(
         state.means.add({"l2": l2, "left": left_over})
         state.step, state.recorded = state.step + 1, state.recorded + 1
         state.stage, state.local = state.stage + 1, 0
-        return ParameterSnapshot(
-            state.step, state.stage - 1, True, state.average.clone(), state.means.read(), table
-        )
+        return ParameterSnapshot(state.step, True, state.average.clone(), state.means.read(), table)
 
     for index in range(min(state.stage, len(course.targets))):
         learn(index)

@@ -31,7 +31,7 @@ from trainer.motion.warp import (
 )
 from trainer.views.crops import CropScene, render_all
 
-from .pgs import TargetStage, visible_way
+from .pgs import ParameterSnapshot, TargetStage, visible_way
 
 GROUP_STEPS = 120
 """Steps of the group stage per strength, where parts are moved as wholes."""
@@ -193,7 +193,7 @@ def bend_groups(
 
 def group_path(
     original: Tensor, groups: Groups, ends: Sequence[Tensor], steps: Sequence[int], count: int
-) -> list[tuple[int, int, bool, Tensor]]:
+) -> list[ParameterSnapshot]:
     """Recordings through the stages' ends: parts move as wholes, what bends within them bends evenly.
 
     Args:
@@ -204,19 +204,20 @@ def group_path(
         count: recordings over all stages, about
 
     Returns:
-        (step, stage, ends_stage, offsets [M,C] float16) in order, as `retime.record` takes them
+        In order, in half precision, without means
     """
     placement, own, begun = groups.rest, torch.zeros_like(original), 0
     ends = [end.to(original.device) for end in ends]
     each = max(2, count // len(ends))
     placements = []
-    for stage, (end, step, after) in enumerate(zip(ends, steps, groups.placements, strict=True)):
+    for end, step, after in zip(ends, steps, groups.placements, strict=True):
         next_own = after.carry_back(original, end)
         for i in range(1, each):
             share = i / each
             halfway = between(placement, after, share)
             offsets = halfway.carry(original, torch.lerp(own, next_own, share))
-            placements.append((begun + round(share * (step - begun)), stage, False, offsets.half().cpu()))
-        placements.append((step, stage, True, end.half().cpu()))
+            done = begun + round(share * (step - begun))
+            placements.append(ParameterSnapshot(done, False, offsets.half().cpu(), {}))
+        placements.append(ParameterSnapshot(step, True, end.half().cpu(), {}))
         placement, own, begun = after, next_own, step
     return placements

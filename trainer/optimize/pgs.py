@@ -283,7 +283,6 @@ class ParameterSnapshot:
     """One recording: the running mean of the parameters, as offsets from the original."""
 
     step: int  # steps done, over all stages
-    stage: int  # index of the stage
     ends_stage: bool  # whether it is the last of its stage
     offsets: Tensor  # raw-space offsets of the members as placed. [M,C] float32
     # since the last recording: each loss term, weighted, over the steps that paid for it, and "left", the L1
@@ -369,7 +368,7 @@ def optimize(
                 if last or settings.every or _mean_distance(pictures, state.pictures) >= spacing:
                     state.pictures = pictures
                     state.recorded += 1
-                    yield ParameterSnapshot(state.step, index, last, offsets.clone(), state.means.read())
+                    yield ParameterSnapshot(state.step, last, offsets.clone(), state.means.read())
             if on_step is not None:
                 on_step(state.step, state.running)
         state.stage, state.local = index + 1, 0

@@ -18,6 +18,8 @@ from progdf.field.baked import interpolate, interpolate_at
 from progdf.field.trajectory import Trajectory
 from trainer.options import Slider
 
+from .pgs import ParameterSnapshot
+
 _LEAST_GAP = 1e-4  # slider values of neighboring recordings stay apart by this
 
 
@@ -28,20 +30,17 @@ def resolve_slider(slider: Slider, strengths: Sequence[float]) -> Slider:
     return "stages" if len(strengths) > 1 else "even"
 
 
-def record(
-    snapshots: Sequence[tuple[int, int, bool, Tensor]], end: Tensor, strengths: Sequence[float]
-) -> Trajectory:
+def record(snapshots: Sequence[ParameterSnapshot], end: Tensor, strengths: Sequence[float]) -> Trajectory:
     """Build a trajectory, its slider values still even in time.
 
     Args:
-        snapshots: (step, stage, ends_stage, offsets [M,C] float16) in order; the original is added before
-            them
+        snapshots: in order, in half precision; the original is added before them
         end: the last offsets in full precision. [M,C] float32
         strengths: what the editor was asked for, of each stage
     """
-    offsets = torch.stack([torch.zeros_like(snapshots[0][3]), *(offset for *_, offset in snapshots)])
-    steps = torch.tensor([0, *(step for step, *_ in snapshots)])
-    ends = tuple(i + 1 for i, (_, _, last, _) in enumerate(snapshots) if last)
+    offsets = torch.stack([torch.zeros_like(snapshots[0].offsets), *(one.offsets for one in snapshots)])
+    steps = torch.tensor([0, *(one.step for one in snapshots)])
+    ends = tuple(i + 1 for i, one in enumerate(snapshots) if one.ends_stage)
     s = steps.float() / float(steps[-1])
     return Trajectory(s, offsets, end, steps, ends, tuple(strengths))
 

@@ -7,9 +7,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from itertools import pairwise
-from typing import Any
+from typing import Any, TypedDict
 
-import msgspec
 import torch
 from torch import Tensor
 
@@ -50,11 +49,10 @@ from trainer.views.crops import CropScene, crop_scene, moving_attributes, only_r
 from trainer.views.view import View, crop
 
 
-class _RecordingValues(msgspec.Struct):
-    """What is saved of a recording beside its offsets."""
+class _RecordingValues(TypedDict):
+    """What is saved of a recording beside its tensors."""
 
     step: int
-    stage: int
     ends_stage: bool
     means: dict[str, float]
 
@@ -82,7 +80,7 @@ class Recordings:
         """How many there are; those that came since the last time are saved first."""
         for index in range(self._written, len(self.made)):
             snapshot = self.made[index]
-            values = {name: getattr(snapshot, name) for name in ("step", "stage", "ends_stage", "means")}
+            values = {name: getattr(snapshot, name) for name in _RecordingValues.__annotations__}
             tensors = {"offsets": snapshot.offsets}
             tensors |= {} if snapshot.table is None else {"table": snapshot.table}
             self._folder.save_later("recordings", tensors, values, index)
@@ -103,7 +101,7 @@ class Recordings:
         table = None if self._model is None else saved.tensors["table"]
         if self._model is not None and table is not None:
             check_tensor("table", table, (MONOMIALS[max(1, self._model.degree)], 3), torch.float32)
-        return ParameterSnapshot(values.step, values.stage, values.ends_stage, offsets, values.means, table)
+        return ParameterSnapshot(**values, offsets=offsets, table=table)
 
 
 PART = "training"
@@ -198,7 +196,7 @@ def optimize_members(
         )
     made = _record_way(way, sum(stage.steps for stage in stages), state, recordings, joint, folder, log)
     end = stages[-1].place(state.average).cpu().clone()
-    snapshots = [(one.step, one.stage, one.ends_stage, one.offsets[:own]) for one in made]
+    snapshots = [replace(one, offsets=one.offsets[:own]) for one in made]
     if groups is not None:
         ends = [one for one in made if one.ends_stage]
         offsets = [*(one.offsets.float() for one in ends[:-1]), end]
@@ -322,8 +320,7 @@ def _solve(plan: ColorPlan, folder: StateFolder, log: RunLog) -> Optimized:
     most = MOST_STAGES if course.ruler else len(course.targets) + 1
     made = _record_way(way, most, state, recordings, None, folder, log)
     strengths, made = course.sort_recordings(made)
-    snapshots = [(one.step, one.stage, one.ends_stage, one.offsets) for one in made]
-    trajectory = record(snapshots, course.finished[0].place(state.average).cpu().clone(), strengths)
+    trajectory = record(made, course.finished[0].place(state.average).cpu().clone(), strengths)
     maps = torch.stack([one.table for one in made if one.table is not None])
     taken = [int(one.means[STEPS]) for one in made if STEPS in one.means]
     rows = [(one.step, {name: mean for name, mean in one.means.items() if name != STEPS}) for one in made]
@@ -337,11 +334,13 @@ def _solve(plan: ColorPlan, folder: StateFolder, log: RunLog) -> Optimized:
 
 
 def _stages(optimization: OptimizeOptions, setup: TrainingSetup, edited: Pictures) -> list[TargetStage]:
-    """The strengths to optimize towards, and the steps that each gets."""
+    """The strengths to optimize towards, and the steps that each gets: the last, which is looked at most,
+    twice as many."""
     steps = max(optimization.steps, len(edited) + 1)  # each stage is to have one
+    marks = [*(steps * i // (len(edited) + 1) for i in range(len(edited))), steps]
     return [
-        TargetStage(s, boxed_pictures(pictures, setup.train, optimization.engine), steps)
-        for (s, pictures), steps in zip(edited.items(), _steps_by_stage(steps, len(edited)), strict=True)
+        TargetStage(s, boxed_pictures(pictures, setup.train, optimization.engine), end - begin)
+        for (s, pictures), (begin, end) in zip(edited.items(), pairwise(marks), strict=True)
     ]
 
 
@@ -478,9 +477,3 @@ def retime_trajectory(
     if not optimization.as_printed and trajectory.maps is None:
         trajectory, pictures = drop_jitter(trajectory, pictures)
     return retime(trajectory, pictures, resolve_slider(optimization.slider, trajectory.strengths))
-
-
-def _steps_by_stage(steps: int, stages: int) -> list[int]:
-    """Steps per stage, adding up to `steps`; the last, which is looked at most, has twice as many."""
-    marks = [steps * i // (stages + 1) for i in range(stages)]
-    return [b - a for a, b in pairwise([*marks, steps])]

@@ -28,14 +28,13 @@ from progdf.field.grade import (
     band_offsets,
     fit_grade,
     lattice_form,
-    lowest_bands,
     map_colors,
     mapped_bands,
     member_bands,
     monomials,
 )
 from progdf.formats.cube import read_cube, write_cube
-from progdf.gaussians import Gaussians, pack
+from progdf.gaussians import Gaussians, attribute_slices, pack
 from progdf.gdf.file import apply_grade, load_gdf, read_gdf, save_gdf
 from progdf.io.tensors import deflate
 from progdf.region import from_mask, whole_scene
@@ -281,7 +280,7 @@ def test_the_way_between_the_knots_is_that_of_the_map_and_its_residual() -> None
     field = bake_grade(form, rows)
     wanted = mapped_bands(2, form.table, rows, form.share)
     wanted[:, :, :12] += torch.einsum("sr,rmc->smc", form.coefficients, form.residual * form.scale[:, None])
-    found = lowest_bands(torch.stack([field.offsets(float(s)) for s in KNOTS]), 9)
+    found = torch.stack([member_bands(field.offsets(float(s))).flatten(1) for s in KNOTS])
     error = float((found - wanted).square().mean().sqrt() / wanted.square().mean().sqrt())
     assert error < 0.01
 
@@ -314,11 +313,17 @@ def test_what_few_members_need_more_than_the_rest_does_not_take_their_levels() -
     assert float((found[3:] - course[1, 3:]).abs().max()) < 0.001
 
 
-def test_the_residual_of_two_bands_is_read_from_its_columns() -> None:
-    offsets = torch.arange(2 * 5 * 38.0).reshape(2, 5, 38)
-    bands = torch.stack([member_bands(some) for some in offsets])
-    assert torch.equal(lowest_bands(offsets, 4), bands[:, :, :4].flatten(2))
-    assert lowest_bands(offsets, 0).shape == (2, 5, 0)
+@pytest.mark.parametrize("sh_degree", [0, 1, 2, 3, 4])
+def test_the_bands_that_are_drawn_are_read_from_their_columns_and_written_there(sh_degree: int) -> None:
+    scene = random_gaussians(40, sh_degree=sh_degree)
+    rows = pack(scene, with_shN=sh_degree > 0)
+    bands, columns = member_bands(rows), attribute_slices(rows.shape[1])
+    assert torch.equal(bands, scene.sh[:, :16])
+    for count in {1, bands.shape[1]}:
+        offsets = band_offsets(bands[:, :count], rows.shape[1])
+        assert torch.equal(offsets[:, columns["sh0"]], scene.sh0)
+        assert torch.equal(member_bands(offsets)[:, :count], bands[:, :count])
+        assert int(offsets.any(dim=0).sum()) == 3 * count
 
 
 def test_a_slider_that_is_laid_anew_is_kept_by_the_file(tmp_path: Path) -> None:

@@ -204,8 +204,8 @@ def test_the_ways_ends_are_exact_and_between_them_a_bend_is_a_lesser_bend() -> N
     groups = group_stage(rows, crops, boxes, steps=60)
     end = groups.warps[0].carry(rows, torch.zeros_like(rows))
     path = group_path(rows, groups, [end], [10], 8)
-    assert torch.equal(path[-1][3], end.half())
+    assert torch.equal(path[-1].offsets, end.half())
     truth = pack(bent(case).apply(case.scene, case.region.members, 0.5)[case.region.members], with_shN=True)
-    (half,) = (offsets.float() for step, _, _, offsets in path if step == 5)
+    (half,) = (one.offsets.float() for one in path if one.step == 5)
     own, line = ((rows + x - truth)[:, MEANS].norm(dim=1).mean() for x in (half, 0.5 * end))
     assert float(own) < float(line) + 1e-3

@@ -218,15 +218,15 @@ def test_on_the_way_a_part_keeps_its_shape_and_the_ends_are_exact() -> None:
     nothing = torch.zeros_like(rows)
     ends = [carry_offsets(rows, nothing, parts, motion) for motion in motions]
     found = group_path(rows, Groups(parts, motions), ends, [30, 90], 8)
-    assert [(step, stage, last) for step, stage, last, _ in found if last] == [(30, 0, True), (90, 1, True)]
+    assert [one.step for one in found if one.ends_stage] == [30, 90]
     assert len(found) == 8
-    assert [step for step, *_ in found] == sorted(step for step, *_ in found)
+    assert [one.step for one in found] == sorted(one.step for one in found)
+    for one, end in zip((one for one in found if one.ends_stage), ends, strict=True):
+        assert torch.equal(one.offsets, end.half())
     own = [torch.cdist(rows[parts.part == k, :3], rows[parts.part == k, :3]) for k in range(2)]
-    for _, stage, last, offsets in found:
-        if last:
-            assert torch.equal(offsets, ends[stage].half())
+    for one in found:
         for k in range(2):
-            now = (rows + offsets.float())[parts.part == k, :3]
+            now = (rows + one.offsets.float())[parts.part == k, :3]
             ratio = torch.cdist(now, now)[own[k] > 0.1] / own[k][own[k] > 0.1]
             assert float(ratio.max() / ratio.min()) < 1.03  # half precision; a straight way would shrink it
 

@@ -20,6 +20,7 @@ from progdf.field.trajectory import (
     save_trajectory,
 )
 from progdf.io.tensors import write_tensors
+from trainer.optimize.pgs import ParameterSnapshot
 from trainer.optimize.retime import record, retime, select_recordings, smooth_course, straight_recordings
 from trainer.options import Slider
 
@@ -35,7 +36,7 @@ def along(progress: list[float], stage_ends: list[int] | None = None, noise: flo
     for i, share in enumerate(progress):
         last = i + 1 in ends
         jitter = 0.0 if last else noise * torch.randn(3, CHANNELS, generator=random)
-        snapshots.append((i + 1, 0, last, (share * end + jitter).half()))
+        snapshots.append(ParameterSnapshot(i + 1, last, (share * end + jitter).half(), {}))
     return record(snapshots, end, [(k + 1) / len(ends) for k in range(len(ends))])
 
 
@@ -121,7 +122,7 @@ def test_a_smooth_course_meets_its_stages_and_what_is_cubic_between(strengths: t
     def table(s: float) -> Tensor:
         return identity_map(2) + s * (1.0 - 0.4 * s) * torch.ones(10, 3)
 
-    snapshots = [(i + 1, i, True, offsets(s).half()) for i, s in enumerate(strengths)]
+    snapshots = [ParameterSnapshot(i + 1, True, offsets(s).half(), {}) for i, s in enumerate(strengths)]
     maps = torch.stack([table(s) for s in strengths])
     recorded = replace(record(snapshots, offsets(1.0), strengths), maps=maps, bands=1)
     course = smooth_course(recorded)
@@ -141,7 +142,7 @@ def test_a_smooth_course_meets_its_stages_and_what_is_cubic_between(strengths: t
 def test_beside_a_jump_the_course_does_not_ring(jump: int) -> None:
     strengths = [(i + 1) / 8 for i in range(8)]
     values = torch.tensor([0.0, *(float(i + 1 >= jump) for i in range(8))])[:, None].expand(-1, CHANNELS)
-    snapshots = [(i + 1, i, True, values[i + 1].expand(3, -1).half()) for i in range(8)]
+    snapshots = [ParameterSnapshot(i + 1, True, values[i + 1].expand(3, -1).half(), {}) for i in range(8)]
     maps = torch.stack([identity_map(1) + value[0] for value in values[1:]])
     recorded = replace(record(snapshots, values[-1].expand(3, -1), strengths), maps=maps, bands=1)
     course = smooth_course(recorded)
@@ -181,7 +182,7 @@ def test_a_recording_that_is_a_detour_is_left_out_and_stage_ends_stay() -> None:
 def test_a_gentle_curve_keeps_its_recordings() -> None:
     angle = torch.linspace(0, 1.2, 12)
     way = torch.stack([angle.sin(), 1 - angle.cos()], dim=1)[:, None, :].repeat(1, 3, 7)
-    snapshots = [(i, 0, i == 11, way[i].half()) for i in range(1, 12)]
+    snapshots = [ParameterSnapshot(i, i == 11, way[i].half(), {}) for i in range(1, 12)]
     curve = record(snapshots, way[-1], [1.0])
     assert len(straight_recordings(curve, shown(curve), detour=0.1)) > 6
 
