@@ -86,7 +86,7 @@ def _rows(path: Path, edit: str) -> list[tuple[str, ...]]:
         ties = surface_ties(scene, region.members, [view.camera for view in large])
         solver = make_solver(color_views(crops, original), original, ties)
         targets = [crop(picture, view.box) for view, picture in zip(large, edited, strict=True)]
-        trials = split_solver(solver, original, targets)
+        trials = split_solver(solver, targets)
         solver, model = choose_model(solver, trials, targets, STEPS, 1)
         change = add_bands(solver.fit_map(model.degree, targets)[1], model.residual)
         offsets = band_offsets(change, original.shape[1])

@@ -34,7 +34,7 @@ from trainer.fit.fit import fit_grades, visibility
 from trainer.fit.slider_uniformity import equalized_strengths, strength_ruler
 from trainer.optimize.color_course import STEPS as TAKEN
 from trainer.optimize.color_course import solve
-from trainer.optimize.color_solver import Model, add_bands, make_solver
+from trainer.optimize.color_solver import Model, add_bands, iterations, make_solver
 from trainer.optimize.color_views import color_views
 from trainer.optimize.pgs import ParameterSnapshot, PgsState
 from trainer.optimize.retime import smooth_course
@@ -170,26 +170,19 @@ class Edit:
         whole, waited, began = edit([1.0], self.setup.views), 0.0, time.process_time()
         between = Strengths(strength_ruler(self.painter, self.editor, self.setup.views), edit, look)
         with TemporaryDirectory() as folder, closing(RunLog(Path(folder) / "log.txt", quiet=True)) as log:
-            plan = plan_colors(OptimizeOptions(), self.setup, whole, between, ViewOptions(), log)
+            options = OptimizeOptions(), self.setup, whole, between, ViewOptions(), log
+            solver, model, course = plan_colors(*options)
         made = list[ParameterSnapshot]()
-        for snapshot in solve(
-            self.original,
-            plan.solver,
-            plan.model,
-            plan.course,
-            made,
-            PgsState(self.original),
-            lambda step, left: None,
-            plan.steps,
-        ):
+        state, most = PgsState(self.original), iterations(OptimizeOptions().steps)
+        for snapshot in solve(solver, model, course, made, state, lambda step, left: None, most):
             made.append(snapshot)
         spent = time.process_time() - began - waited - self.seconds  # it prepared the views for itself
-        strengths, made = plan.course.sort_recordings(made)
+        strengths, made = course.sort_recordings(made)
         steps = ", ".join(f"{snapshot.means.get(TAKEN, 0):.0f}" for snapshot in made)
         at = ", ".join(f"{s:g}" for s in strengths)
         tables = [snapshot.table for snapshot in made if snapshot.table is not None]
-        model, offsets = plan.model, [snapshot.offsets for snapshot in made]
-        views = len(self.setup.held_out) + len(plan.solver.views)
+        offsets = [snapshot.offsets for snapshot in made]
+        views = len(self.setup.held_out) + len(solver.views)
         spent -= (1.0 - views / len(self.setup.views)) * (len(made) - 1) * self.a_strength  # not asked for
         name = f"automatic: {views} views, {len(strengths)} strengths, {model.bands} SH"
         result = self.measure(name, judge, strengths, model.bands, tables, offsets, spent, model.mask)

@@ -77,7 +77,7 @@ def edit_few(scene: Gaussians, members: Tensor, crops: list[CropScene], targets:
     original = pack(scene[members], with_shN=scene.sh_degree > 0)
     ties = surface_ties(scene, members, [some.camera for some in crops])
     solver = make_solver(color_views(crops, original), original, ties)
-    solver, model = choose_model(solver, split_solver(solver, original, targets), targets, 100, 1)
+    solver, model = choose_model(solver, split_solver(solver, targets), targets, 100, 1)
     return add_bands(solver.fit_map(model.degree, targets)[1], model.residual)
 
 

@@ -124,7 +124,6 @@ def settle_bands(model: Model, solver: Solver, targets: Sequence[Target], steps:
 
 
 def solve(
-    original: Tensor,
     solver: Solver,
     model: Model,
     course: Course,
@@ -138,7 +137,6 @@ def solve(
     Each begins between the solutions of its neighbors.
 
     Args:
-        original: raw member rows, packed. [M,C]
         solver: the views
         model: how much is modelled
         course: strengths, changed in place
@@ -167,7 +165,7 @@ def solve(
     def solve_target(target: Target) -> ParameterSnapshot:
         stage, judge = target
         table, mapped = solver.fit_map(model.degree, stage.targets)
-        offsets = mapped
+        offsets, means = mapped, dict[str, float]()
         if model.bands:
             left = max(s for s in residuals if s < stage.strength)
             right = min(s for s in residuals if s >= stage.strength)
@@ -177,27 +175,22 @@ def solve(
             residual, taken = solver.residual(
                 mapped, start, stage.targets, steps, judge, model.error, model.hold, told
             )
-            state.means.add({STEPS: taken})
-            offsets = add_bands(mapped, residual)
+            offsets, means[STEPS] = add_bands(mapped, residual), taken
         left_over = finished.mean(offsets, 1.0)
         if not math.isfinite(left_over) or not bool(offsets.isfinite().all()):
             raise FloatingPointError(f"the loss is {left_over} at step {state.step}")
-        with torch.no_grad():
-            state.moved.copy_(band_offsets(offsets, original.shape[1]))
-        state.average.copy_(state.moved.detach())
-        state.running = left_over
-        l2 = Judge(solver.views, stage.targets).error(offsets)
-        state.means.add({"l2": l2, "left": left_over})
-        state.step, state.recorded = state.step + 1, state.recorded + 1
-        state.stage, state.local = state.stage + 1, 0
-        return ParameterSnapshot(state.step, True, state.average.clone(), state.means.read(), table)
+        moved = band_offsets(offsets, solver.original.shape[1])
+        for rows in (state.moved, state.average):
+            rows.detach().copy_(moved)
+        state.step, state.stage, state.running = state.step + 1, state.stage + 1, left_over
+        means |= {"l2": Judge(solver.views, stage.targets).error(offsets), "left": left_over}
+        return ParameterSnapshot(state.step, True, moved, means, table)
 
     for index in range(min(state.stage, len(course.targets))):
         learn(index)
-    while state.stage < len(course.targets) or (state.stage == len(course.targets) and course.extend(known)):
-        yield solve_target(course.targets[state.stage])
-        learn(state.stage - 1)
-        on_step(state.step, state.running)
-    if state.stage == len(course.targets):
-        yield solve_target(course.finished)
+    while state.stage <= len(course.targets):
+        ends = state.stage == len(course.targets) and not course.extend(known)
+        yield solve_target(course.finished if ends else course.targets[state.stage])
+        if not ends:
+            learn(state.stage - 1)
         on_step(state.step, state.running)

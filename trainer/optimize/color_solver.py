@@ -20,6 +20,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -95,24 +96,20 @@ class Model:
 
     def figures(self) -> dict[str, Any]:
         """As report.json has it."""
-        tried = {name: round(error, 2) for name, error in self.tried}
-        chosen: dict[str, Any] = {
+        return {
             "degree": self.degree,
             "mask": self.mask is not None,
             "sh_functions": self.bands,
+            "functions_per_gaussian": round(self.functions, 2),
+            "tried_psnr": {name: round(error, 2) for name, error in self.tried},
         }
-        chosen |= {"functions_per_gaussian": round(self.functions, 2)}
-        return {**chosen, "tried_psnr": tried}
 
     @property
     def line(self) -> str:
         """What was chosen and over what, for the log."""
         functions = f"{self.bands} SH function{'s' * (self.bands > 1)}"
-        functions += (
-            f", {self.functions:.1f} of them a Gaussian"
-            if self.bands > 1 and self.functions < self.bands
-            else ""
-        )
+        if self.bands > 1 and self.functions < self.bands:
+            functions += f", {self.functions:.1f} of them a Gaussian"
         residual = f"and a residual of {functions}" if self.bands else "alone"
         over = ", ".join(f"{name} {error:.1f}" for name, error in self.tried)
         of_color = f"a map of color of degree {self.degree}" if self.degree else "no map"
@@ -159,7 +156,7 @@ class Solver:
     """All training views of a run."""
 
     views: Sequence[ColorView]  # see `ColorView`
-    sh: Tensor  # the members' own. [M,B,3]
+    original: Tensor  # raw member rows, packed. [M,C]
     # bound of the curvature among each member's lowest bands: Σ w·m over the pixels, m its own weight, times
     # the products of the basis. [M,b,b]
     weights: Tensor
@@ -168,6 +165,11 @@ class Solver:
     ties: Ties | None  # None where views are many
     asked: Tensor  # which members' functions are solved for. [M,b] bool
     held: csr_matrix  # ties among these, as strong as they are to be. [M,M]
+
+    @cached_property
+    def sh(self) -> Tensor:
+        """The members' own. [M,B,3]"""
+        return member_bands(self.original)
 
     def fit_map(self, degree: int, targets: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
         """The map that comes nearest to these pictures, of degree 0 the identity, and what the members take
@@ -178,10 +180,6 @@ class Solver:
     def map_offsets(self, degree: int, table: Tensor) -> Tensor:
         """What the members take of a map. [K,3] -> [M,B,3]"""
         return self.share[:, None, None] * (map_colors(self.sh, table, max(1, degree)) - self.sh)
-
-    def offsets(self, model: Model, targets: Sequence[Tensor]) -> Tensor:
-        """All that a model adds for the finished edit. [M,B,3]"""
-        return add_bands(self.fit_map(model.degree, targets)[1], model.residual)
 
     def with_mask(self, share: Tensor) -> Solver:
         """The same with a mask. [M] 0..1"""
@@ -368,13 +366,16 @@ def make_solver(views: Sequence[ColorView], original: Tensor, ties: Ties | None 
         held = ties.of(some) * np.float32(_TIES * float(weights[some, 0, 0].mean()))
         asked = some[:, None].expand_as(asked)
     share = original.new_ones(len(original))
-    return Solver(views, member_bands(original), weights, fit_maps(views, share), share, ties, asked, held)
+    return Solver(views, original, weights, fit_maps(views, share), share, ties, asked, held)
 
 
-def split_solver(solver: Solver, original: Tensor, targets: Sequence[Tensor]) -> list[tuple[Solver, Judge]]:
+def split_solver(solver: Solver, targets: Sequence[Tensor]) -> list[tuple[Solver, Judge]]:
     """Two trials for `choose_model` where no view is held out: some squares of all views, and the others."""
     folds = tuple(zip(*(view.halves() for view in solver.views), strict=True))
-    return [(make_solver(folds[i], original, solver.ties), Judge(folds[1 - i], targets)) for i in (0, 1)]
+    return [
+        (make_solver(some, solver.original, solver.ties), Judge(others, targets))
+        for some, others in (folds, folds[::-1])
+    ]
 
 
 @dataclass
@@ -387,9 +388,8 @@ class _Trials:
     tried: list[_Attempt] = field(default_factory=list)
     steps: int = 0  # that all of these took
 
-    def start(self, degree: int) -> _Attempt:
+    def start(self, degree: int, solvers: Sequence[Solver]) -> _Attempt:
         """A map alone, not judged."""
-        solvers = [by for by, _ in self.trials]
         offsets = [by.fit_map(degree, self.targets)[1] for by in solvers]
         return _Attempt("", math.inf, solvers, degree, offsets, [made[:, :0] for made in offsets], _RIDGE)
 
@@ -439,15 +439,13 @@ class _Trials:
             by.guess_mask(change, best.degree > 0)
             for by, change in zip(best.solvers, best.changes, strict=True)
         ]
-        guesses = [[by.fit_map(degree, self.targets)[1] for by in solvers] for degree in MONOMIALS]
-        if min(map(self.error, guesses)) >= enough:
+        if min(self.error(self.start(degree, solvers).offsets) for degree in MONOMIALS) >= enough:
             return []
         solvers = [by.improve_mask(self.targets) for by in solvers]
-        bases, masked = list[_Attempt](), replace(best, solvers=solvers, masked=True)
-        for degree in MONOMIALS:
-            offsets = [by.fit_map(degree, self.targets)[1] for by in solvers]
-            residuals = [(change - made)[:, :1] for change, made in zip(best.changes, offsets, strict=True)]
-            bases.append(replace(masked, degree=degree, offsets=offsets, residuals=residuals))
+        changes, bases = best.changes, [self.start(degree, solvers) for degree in MONOMIALS]
+        for i, base in enumerate(bases):
+            missing = [(change - made)[:, :1] for change, made in zip(changes, base.offsets, strict=True)]
+            bases[i] = replace(base, residuals=missing, masked=True)
         return bases
 
 
@@ -473,7 +471,7 @@ def choose_model(
     """
     tries, few = _Trials(trials, targets, steps), solver.ties is not None
     most_bands = min(most_bands, 1 if few else solver.sh.shape[1])
-    bases = {degree: tries.start(degree) for degree in (0, *MONOMIALS)}
+    bases = {degree: tries.start(degree, [by for by, _ in trials]) for degree in (0, *MONOMIALS)}
     # of what no picture shows a map is a guess: where it is the worse one for most that is shown, for less
     # than about half of that is painted, there is none
     left = [

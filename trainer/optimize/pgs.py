@@ -32,7 +32,7 @@ from .losses import Moment, Objective, TermMeans, l1, total_loss
 EPSILON = 0.1
 """Of the root mean square of an attribute's gradient: Adam's ε where it is raised."""
 
-_COUNTS = ("step", "stage", "local", "recorded")
+_COUNTS = ("step", "stage", "local")
 _ROWS = ("moved", "previous", "average", "first", "second")
 
 
@@ -42,7 +42,6 @@ class _StateValues(msgspec.Struct):
     step: int
     stage: int
     local: int
-    recorded: int
     running: float | None
     means: dict[str, tuple[float, int]]
     queue: list[int]
@@ -63,7 +62,6 @@ class PgsState:
         pictures: the probes at the last recording. [h,w,3] each; empty before the first step
         step: steps done
         stage, local: index of the stage, and steps done in it
-        recorded: how many recordings were made
         running: running mean of the L1 distance from the finished edit; NaN before the first step
         means: loss terms since the last recording
     """
@@ -74,7 +72,7 @@ class PgsState:
         self.average = torch.zeros_like(rows)
         self.first, self.second = torch.zeros_like(rows), torch.zeros_like(rows)
         self.pictures: Sequence[Tensor] = ()
-        self.step = self.stage = self.local = self.recorded = 0
+        self.step = self.stage = self.local = 0
         self.running = math.nan
         self.means = TermMeans()
         self._order = torch.Generator().manual_seed(seed)
@@ -367,7 +365,6 @@ def optimize(
                 pictures = render_all(probes, original + offsets, moving)
                 if last or settings.every or _mean_distance(pictures, state.pictures) >= spacing:
                     state.pictures = pictures
-                    state.recorded += 1
                     yield ParameterSnapshot(state.step, last, offsets.clone(), state.means.read())
             if on_step is not None:
                 on_step(state.step, state.running)

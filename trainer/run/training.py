@@ -162,7 +162,7 @@ def optimize_members(
         plan = plan_colors(
             optimization, setup, edited, between, options.views, log, options.field.target_psnr
         )
-        return _solve(plan, folder, log)
+        return _solve(*plan, iterations(optimization.steps), folder, log)
     scene, members = setup.scene, setup.region.members
     bands = optimization.sh != "off"
     engine, device = optimization.engine, engine_device(optimization.engine)
@@ -213,17 +213,6 @@ def optimize_members(
     return trajectory, loss_table([(one.step, one.means) for one in made]), effort
 
 
-@dataclass(frozen=True)
-class ColorPlan:
-    """What there is to solve for."""
-
-    original: Tensor  # raw member rows. [M,C]
-    solver: Solver
-    model: Model
-    course: Course
-    steps: int  # at most, of conjugate gradients
-
-
 def plan_colors(
     optimization: OptimizeOptions,
     setup: TrainingSetup,
@@ -232,7 +221,7 @@ def plan_colors(
     options: ViewOptions,
     log: RunLog,
     target_psnr: float | None = None,
-) -> ColorPlan:
+) -> tuple[Solver, Model, Course]:
     """Solve for the finished edit, and decide by that how much is modelled and which strengths come next.
 
     Args:
@@ -277,7 +266,7 @@ def plan_colors(
     with log.stage("model"):
         finished, solver = target(1.0, edited[1.0]), make_solver(drawn, original, ties)
         targets = finished[0].targets
-        trials = [(solver, finished[1])] if ties is None else split_solver(solver, original, targets)
+        trials = [(solver, finished[1])] if ties is None else split_solver(solver, targets)
         solver, model = choose_model(solver, trials, targets, most, 1 if optimization.sh == "off" else 9)
         if model.error <= LEVEL and held_out and between is not None and not options.views:
             half = replace(finished[0], targets=targets[::2]), finished[1]
@@ -301,7 +290,7 @@ def plan_colors(
     if ties is not None:
         unseen = len(original) - int(solver.asked[:, 0].sum())
         log.say(f"{unseen} members that no picture shows follow the map and their own surface")
-    return ColorPlan(original, solver.only(model.residual), model, course, most)
+    return solver.only(model.residual), model, course
 
 
 def pixel_stride(setup: TrainingSetup) -> int:
@@ -312,23 +301,22 @@ def pixel_stride(setup: TrainingSetup) -> int:
     return next((every for every in (4, 2) if shown >= every * _ENOUGH * numbers), 1)
 
 
-def _solve(plan: ColorPlan, folder: StateFolder, log: RunLog) -> Optimized:
+def _solve(
+    solver: Solver, model: Model, course: Course, most_steps: int, folder: StateFolder, log: RunLog
+) -> Optimized:
     """All views at once, for colors alone."""
-    model, course, state = plan.model, plan.course, PgsState(plan.original)
-    recordings = Recordings(folder, plan.original.shape, model)
-    way = partial(solve, plan.original, plan.solver, model, course, recordings.made, state, steps=plan.steps)
+    state, recordings = PgsState(solver.original), Recordings(folder, solver.original.shape, model)
+    way = partial(solve, solver, model, course, recordings.made, state, steps=most_steps)
     most = MOST_STAGES if course.ruler else len(course.targets) + 1
     made = _record_way(way, most, state, recordings, None, folder, log)
     strengths, made = course.sort_recordings(made)
-    trajectory = record(made, course.finished[0].place(state.average).cpu().clone(), strengths)
+    trajectory = record(made, state.average, strengths)
     maps = torch.stack([one.table for one in made if one.table is not None])
     taken = [int(one.means[STEPS]) for one in made if STEPS in one.means]
     rows = [(one.step, {name: mean for name, mean in one.means.items() if name != STEPS}) for one in made]
-    steps = (
-        f"in {', '.join(map(str, taken))} steps, of {plan.steps} each at most" if taken else "by maps alone"
-    )
-    log.say(f"{len(strengths)} strengths {steps}")
-    effort = {"strengths": strengths, STEPS: taken, "most_steps": plan.steps, "views": len(plan.solver.views)}
+    steps = f"in {', '.join(map(str, taken))} steps, of {most_steps} each at most"
+    log.say(f"{len(strengths)} strengths {steps if taken else 'by maps alone'}")
+    effort = {"strengths": strengths, STEPS: taken, "most_steps": most_steps, "views": len(solver.views)}
     trajectory = replace(trajectory, maps=maps, bands=model.bands, mask=model.mask)
     return trajectory, loss_table(rows), effort | model.figures()
 

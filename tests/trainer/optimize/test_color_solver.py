@@ -75,7 +75,6 @@ def model_of(solver: Solver, targets: list[Tensor], steps: int = 40, bands: int 
 
 
 def solve_all(
-    original: Tensor,
     solver: Solver,
     model: Model,
     stages: list[TargetStage],
@@ -87,7 +86,7 @@ def solve_all(
     """The recordings, in half precision as a run has them; all views say when a stage is done."""
     targets = [(stage, Judge(solver.views, stage.targets)) for stage in stages]
     course, made = Course(targets[:-1], targets[-1]), [] if made is None else made
-    for snapshot in solve(original, solver, model, course, made, state, on_step, steps):
+    for snapshot in solve(solver, model, course, made, state, on_step, steps):
         made.append(replace(snapshot, offsets=snapshot.offsets.half()))
     return made
 
@@ -98,7 +97,7 @@ def solved(scene: Gaussians, edited: Gaussians, cameras: list[Camera], steps: in
     targets = render_all(crops, pack(edited, with_shN=scene.sh_degree > 0))
     solver = make_solver(color_views(crops, original), original)
     stages, model = [TargetStage(1.0, targets, 1)], model_of(solver, targets, steps)
-    return solve_all(original, solver, model, stages, PgsState(original), steps)[-1].offsets
+    return solve_all(solver, model, stages, PgsState(original), steps)[-1].offsets
 
 
 def psnr(scene: Gaussians, edited: Gaussians, offsets: Tensor, cameras: list[Camera]) -> float:
@@ -137,7 +136,7 @@ def test_of_some_pixels_each_view_looks_at_others_and_the_edit_is_as_good() -> N
     targets, solver = render_all(crops, pack(edited, False)), make_solver(views, original)
     model = model_of(solver, targets, 40)
     stages = [TargetStage(1.0, targets, 1)]
-    offsets = solve_all(original, solver, model, stages, PgsState(original), 40)[-1].offsets
+    offsets = solve_all(solver, model, stages, PgsState(original), 40)[-1].offsets
     assert psnr(scene, edited, offsets, cameras) > 45.0
 
 
@@ -323,7 +322,7 @@ def test_strengths_are_asked_for_where_those_that_are_solved_for_say_too_little(
     _, model = choose_model(solver, [(solver, look(1.0))], pictures(crops, 1.0), 40, 1)
     course, made, state = course_of([]), list[ParameterSnapshot](), PgsState(original)
     rounds[:] = [0]
-    for snapshot in solve(original, solver, model, course, made, state, lambda step, left: None, 40):
+    for snapshot in solve(solver, model, course, made, state, lambda step, left: None, 40):
         made.append(replace(snapshot, offsets=snapshot.offsets.half()))
     found = [stage.strength for stage, _ in course.targets]
     assert asked <= set(found), found
@@ -334,7 +333,7 @@ def test_strengths_are_asked_for_where_those_that_are_solved_for_say_too_little(
         asked_by_then = found[: min(end for end in ends if end >= at)]
         again, kept, known = PgsState(original), made[:at], course_of(asked_by_then)
         again.step, again.stage, again.running = at, at, kept[-1].means["left"]
-        for snapshot in solve(original, solver, model, known, kept, again, lambda step, left: None, 40):
+        for snapshot in solve(solver, model, known, kept, again, lambda step, left: None, 40):
             kept.append(replace(snapshot, offsets=snapshot.offsets.half()))
         assert [stage.strength for stage, _ in known.targets] == found
         assert torch.equal(again.moved, state.moved)
@@ -388,7 +387,7 @@ def test_what_was_stopped_goes_on_to_the_same_bits() -> None:
     model = model_of(solver, list(stages[-1].targets))
     assert model.bands == 1
     whole = PgsState(original)
-    solve_all(original, solver, model, stages, whole, 20)
+    solve_all(solver, model, stages, whole, 20)
     for at in (1, 2):  # between two rounds of a stage, and at its end
         stopped, again, calls, made = PgsState(original), PgsState(original), [0], list[ParameterSnapshot]()
 
@@ -398,11 +397,11 @@ def test_what_was_stopped_goes_on_to_the_same_bits() -> None:
                 raise KeyboardInterrupt
 
         with pytest.raises(KeyboardInterrupt):
-            solve_all(original, solver, model, stages, stopped, 20, stop, made)
+            solve_all(solver, model, stages, stopped, 20, stop, made)
         again.restore(stopped.capture_state())
         assert again.step == at
         assert len(made) == at
-        solve_all(original, solver, model, stages, again, 20, made=made)
+        solve_all(solver, model, stages, again, 20, made=made)
         assert torch.equal(again.moved, whole.moved)
         assert again.step == whole.step == 3
 
@@ -451,7 +450,7 @@ def test_one_thread_and_two_solve_to_the_same_bits() -> None:
         set_threads(threads)
         solver, state = make_solver(color_views(crops, original), original), PgsState(original)
         stages, model = [TargetStage(1.0, targets, 1)], model_of(solver, targets, 6)
-        solve_all(original, solver, model, stages, state, 6)
+        solve_all(solver, model, stages, state, 6)
         ends.append(state.moved.detach())
     set_threads(None)
     assert bool(ends[0].any())
@@ -466,7 +465,7 @@ def test_a_target_that_is_not_finite_stops_before_the_step() -> None:
     model = model_of(solver, pictures)
     broken = [TargetStage(1.0, [torch.full_like(picture, torch.nan) for picture in pictures], 1)]
     with pytest.raises(FloatingPointError, match="the loss is nan at step 0"):
-        solve_all(original, solver, model, broken, state, 20)
+        solve_all(solver, model, broken, state, 20)
     assert not bool(state.moved.any())
 
 
@@ -498,7 +497,7 @@ def test_hard_regions_give_finite_offsets_and_their_pictures(case: str) -> None:
     solver = make_solver(color_views(crops, original), original)
     model = model_of(solver, targets)
     stages, state = [TargetStage(1.0, targets, 1)], PgsState(original)
-    solve_all(original, solver, model, stages, state, 40)
+    solve_all(solver, model, stages, state, 40)
     moved = state.moved.detach()
     assert bool(moved.isfinite().all())
     assert float(moved.abs().max()) < 1e3
