@@ -101,19 +101,17 @@ def recolor_fully(rgb: Tensor, target: Tensor, reference: Tensor) -> Tensor:
     return fit_gamut(torch.stack([lightness, chroma * torch.cos(hue), chroma * torch.sin(hue)], dim=-1))
 
 
-def tint_course(
-    rgb: Tensor, target: Tensor, reference: Tensor, path: ColorPath = "bowed", share: float = 0.7
-) -> Course:
-    """Wash with a color: lightness stays, hue and chroma go `share` of the way to the target's.
+def tint_course(rgb: Tensor, target: Tensor, reference: Tensor, path: ColorPath = "bowed") -> Course:
+    """Wash with a color: lightness stays, hue and chroma go most of the way to the target's.
 
     See `recolor_course` for the arguments; here `reference` decides nothing but the bend.
     """
     bend = bend_of(_as_tensor(reference, rgb), _as_tensor(target, rgb), path)
-    return color_course(rgb, tint_fully(rgb, target, share), bend)
+    return color_course(rgb, tint_fully(rgb, target), bend)
 
 
-def tint_fully(rgb: Tensor, target: Tensor, share: float) -> Tensor:
-    """The end of a `tint_course`. [...,3] -> [...,3] 0..1"""
+def tint_fully(rgb: Tensor, target: Tensor, share: float = 0.7) -> Tensor:
+    """The end of a `tint_course`; `share`: how far hue and chroma go. [...,3] -> [...,3] 0..1"""
     lab, goal = srgb_to_oklab(rgb.clamp(0, 1)), srgb_to_oklab(_as_tensor(target, rgb))
     lightness = lab[..., :1]
     fade = torch.minimum(
@@ -281,8 +279,7 @@ def stripe_pattern(points: Tensor, axis: Tensor, period: float, phase: float = 0
     Returns:
         0 (between) to 1 (in a stripe). [...]
     """
-    along = points @ (axis / axis.norm()).to(points) / period + phase
-    return stripe_profile(along)
+    return stripe_profile(points @ (axis / axis.norm()).to(points) / period + phase)
 
 
 def stripe_profile(turns: Tensor, width: float = 0.5, softness: float = 0.08) -> Tensor:

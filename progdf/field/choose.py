@@ -217,7 +217,6 @@ def choose_field(
     weights: Tensor | None = None,
     kind: Kind = "separable",
     evaluator: FieldEvaluator | None = None,
-    recorded: Sequence[float] | None = None,
 ) -> FieldChoice:
     """The smallest field that serves.
 
@@ -228,7 +227,6 @@ def choose_field(
         weights: how much an error of each number shows: visibility [M] or [M,C]; None is evenly
         kind: "lossless" is every snapshot, whatever it takes
         evaluator: decides in the end, best on views that `render` does not show; None decides by `render`
-        recorded: strengths for the slider's ticks; `strengths` when None
 
     Returns:
         The choice; where nothing serves, the best there is, with `met` false.
@@ -239,12 +237,12 @@ def choose_field(
     check_trajectory(strengths, offsets)
     evaluator = evaluator or FieldEvaluator(strengths, offsets, render)
     if kind == "lossless":
-        everything = fit_lossless(strengths, offsets, recorded)
+        everything = fit_lossless(strengths, offsets)
         candidate = evaluator.candidate(everything, f"all {len(strengths)} snapshots")
         return FieldChoice(candidate, candidate.excess <= 1.0, (candidate,), "nothing is left out")
     spread = channel_weights(weights, offsets.shape[1], offsets.shape[2])
     seen = render_trajectories(offsets, spread, render, store_ends(offsets, evaluator))
-    return pick_candidate(_grow_fields(seen, strengths, evaluator, recorded), evaluator.wanted)
+    return pick_candidate(_grow_fields(seen, strengths, evaluator), evaluator.wanted)
 
 
 def pick_candidate(tried: Sequence[Candidate], wanted: str) -> FieldChoice:
@@ -289,19 +287,14 @@ def store_ends(offsets: Tensor, evaluator: FieldEvaluator) -> Ends:
     return {name: kinds[name][k] for name, k in chosen.items() if k < len(kinds[name])}
 
 
-def _grow_fields(
-    seen: RenderedTrajectories,
-    strengths: Tensor,
-    evaluator: FieldEvaluator,
-    recorded: Sequence[float] | None,
-) -> list[Candidate]:
+def _grow_fields(seen: RenderedTrajectories, strengths: Tensor, evaluator: FieldEvaluator) -> list[Candidate]:
     """Separable fields along the path of growing ranks, in ever longer steps until one serves and back by
     halves."""
     path, tried = grow_ranks(seen), dict[int, Candidate]()
 
     def serves(i: int) -> bool:
         if i not in tried:
-            tried[i] = _separable(seen, strengths, path[i], evaluator, recorded)
+            tried[i] = _separable(seen, strengths, path[i], evaluator)
         return tried[i].excess <= 1.0
 
     reach, last = 0, len(path) - 1
@@ -312,19 +305,14 @@ def _grow_fields(
 
 
 def _separable(
-    seen: RenderedTrajectories,
-    strengths: Tensor,
-    ranks: Mapping[str, int],
-    evaluator: FieldEvaluator,
-    recorded: Sequence[float] | None,
+    seen: RenderedTrajectories, strengths: Tensor, ranks: Mapping[str, int], evaluator: FieldEvaluator
 ) -> Candidate:
     """The field of these ranks: pictures choose the bases or, where these do not serve, numbers if better.
 
     Pictures are the better guide but for parts that move far, where straightening an attribute changes more
     than a sum of effects can say.
     """
-    ticks = tuple(strengths.tolist() if recorded is None else recorded)
-    candidates = []
+    candidates, ticks = [], tuple(strengths.tolist())
     for modes in (seen.modes, {n: principal_modes(c.gram) for n, c in seen.trajectories.items()}):
         attributes = {
             name: store_attribute(trajectory, modes[name][:, : ranks[name]])

@@ -236,9 +236,7 @@ def mapped_lattice(form: GradeForm, s: float, side: int) -> Tensor:
 def lattice_form(table: Tensor) -> GradeForm:
     """The grade of a lattice, for no members: the straight way to the colors of the table. [K,3]"""
     ends = torch.stack([lattice_colors(lattice_side(len(table))), table])
-    none = torch.zeros(0, 0, 0, dtype=torch.int8)
-    knots = torch.tensor([0.0, 1.0])
-    return GradeForm(LATTICE, knots, ends, none, torch.zeros(0, 0), torch.zeros(2, 0), identity_remap())
+    return fit_grade(torch.tensor([0.0, 1.0]), LATTICE, ends, torch.zeros(2, 0, 0), 0, torch.zeros(0))
 
 
 def map_alone(form: GradeForm, members: int) -> GradeForm:

@@ -50,17 +50,13 @@ _EVENED = 6  # every such one of them decides how fast the slider goes
 
 @dataclass(frozen=True)
 class _Pixels:
-    """Pixels of some views, and what a map makes of them."""
+    """Pixels of some views."""
 
     row: View  # as one row of a picture, which an editor edits as any
-    maps: MapFit
+    maps: MapFit  # what a map makes of that
     views: Sequence[ColorView]
     places: Sequence[Tensor]  # which pixels of each view these are. [p] int64
     seen: Tensor  # which of the region's members show in any of them. [m] int64
-
-    def picture(self, table: Tensor) -> Tensor:
-        """The row under a map. [K,3] -> [P,3] 0..1"""
-        return self.maps.picture(table).clamp(0.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -152,7 +148,7 @@ def _gains(last: DraftViews, views: DraftViews, spec: str) -> bool:
     editor = make_editor(EditorOptions(spec), views.scene, views.region, rows)
     expected = editor.edit(views.judged.row, 1.0)
     tables = [some.fitted.maps.solve(2, [editor.edit(some.fitted.row, 1.0)]) for some in (last, views)]
-    before, after = (_error(views.judged.picture(table), expected) for table in tables)
+    before, after = (_error(views.judged.maps.picture(table), expected) for table in tables)
     return after < _SETTLED * before
 
 
@@ -181,7 +177,7 @@ def draft_grade(views: DraftViews, options: EditorOptions, name: str) -> Gdf | N
     strengths = equalized_strengths(editor, options.editor, [_thin(fitted.row)], plain)
     targets, expected = ([edit(s) for s in strengths] for edit in courses)
     ends = {degree: fitted.maps.solve(degree, targets[-1:]) for degree in MONOMIALS}
-    errors = {degree: _error(judged.picture(end), expected[-1]) for degree, end in ends.items()}
+    errors = {degree: _error(judged.maps.picture(end), expected[-1]) for degree, end in ends.items()}
     degree = min(d for d in errors if MORE_PAYS * errors[d] <= min(errors.values()))
     error = _drawn_error(views, ends[degree], degree, expected[-1])
     carried = CARRIED * _error(judged.row.image[0], expected[-1]) + ROUNDING
@@ -213,7 +209,7 @@ def _knots(judged: _Pixels, table: Tensor, expected: Sequence[Tensor]) -> int:
         left, share = strengths // every * every, (strengths % every) / every
         right = (left + every).clamp_max(len(table) - 1)
         course = torch.lerp(table[left], table[right], share[:, None, None])
-        return sum(_error(judged.picture(t), e) for t, e in zip(course[1:], expected, strict=True))
+        return sum(_error(judged.maps.picture(t), e) for t, e in zip(course[1:], expected, strict=True))
 
     least = error(1)
     return next(every for every in (8, 4, 2, 1) if MORE_PAYS * error(every) <= least)

@@ -118,7 +118,6 @@ def fit_field(
         weights,
         "separable" if options.field == "auto" else options.field,
         field_evaluator(trajectory, choosing, options.target_psnr),
-        trajectory.s.tolist(),
     )
     return _measure_choice(choice, trajectory, reporting)
 
@@ -155,7 +154,7 @@ def fit_grades(
         if form.bytes_per_member > smallest:
             return False
         release_memory()
-        field = replace(bake_grade(form, rows, mapped), recorded=tuple(trajectory.s.tolist()))
+        field = bake_grade(form, rows, mapped)
         if index and evaluator.end_excess(field.offsets(1.0)) > 1.0:  # one look instead of twenty
             return True
         candidate = evaluator.candidate(field, form.label)
@@ -179,8 +178,7 @@ def fit_grades(
 def field_evaluator(trajectory: Trajectory, views: Evaluator, target: float | None) -> FieldEvaluator:
     """What decides whether a field serves: the editor's own pictures of these views, at the strengths of
     which there are some; or a target in dB."""
-    known = [(s, strength) for s, strength in trajectory.stage_strengths if strength in views.edited]
-    edited = {s: views.count(views.edited[strength]) for s, strength in known}
+    edited = {s: views.count(views.edited[e]) for s, e in trajectory.stage_strengths if e in views.edited}
     course = trajectory.s, trajectory.offsets, views.counted_pixels, trajectory.at
     if target is None:
         added = ADDED if trajectory.bands < 2 else ADDED - THINNED

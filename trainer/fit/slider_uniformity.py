@@ -11,7 +11,7 @@ The slider.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from itertools import accumulate, pairwise
 
 import torch
@@ -107,25 +107,17 @@ def equalize_slider(
     moving = list(field.attributes)
     small = probe_views(setup, _FIELD_VIEWS, still=not set(moving) & set(GEOMETRY))
     rows = pack(setup.scene[setup.region.members], with_shN=field.channels > BASE_CHANNELS)
-    done = 0
 
     def picture_at(s: float) -> Tensor:
-        nonlocal done
-        done += 1
-        advance(done, "strengths")
+        looked()
         return torch.cat([p.flatten() for p in render_all(small, rows + field.offsets(s), moving)])
 
-    with (
-        nullcontext(_ignore_progress)
-        if log is None
-        else log.steps("even the slider", _LOOKS * (STEPS * _FINE + 1)) as advance
-    ):
+    counter: AbstractContextManager[Callable[[], None]] = nullcontext(lambda: None)
+    if log is not None:
+        counter = log.looks("even the slider", _LOOKS * (STEPS * _FINE + 1))
+    with counter as looked:
         remap = equalizing_remap(picture_at)
     return remap_slider(field, remap), remap
-
-
-def _ignore_progress(done: int, word: str) -> None:
-    pass
 
 
 def equalizing_remap(seen: Callable[[float], Tensor]) -> SliderRemap:

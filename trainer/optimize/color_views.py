@@ -141,16 +141,11 @@ def add_pulls(basis: Array, pull: Array, offsets: Array) -> None:
                 offsets[m, b, c] += basis[m, b] * pull[m, c]
 
 
-def color_view(crop: CropScene, original: Tensor, bands: int, pixels: Tensor) -> ColorView:
-    """Prepare a view.
-
-    Args:
-        crop: its box
-        original: raw member rows [M,14+]
-        bands: how many may change, DC among them
-        pixels: which of the box's are looked at, row by row, ascending. [P] int64
-    """
-    camera = crop.camera
+def color_view(crop: CropScene, original: Tensor, every: int, index: int) -> ColorView:
+    """One of `color_views`, of which it is the `index`th."""
+    camera, (height, width) = crop.camera, crop.size
+    place = torch.arange(width) + every // 2 * torch.arange(height)[:, None] + index
+    pixels = (place % every == 0).flatten().nonzero()[:, 0]
     members = unpack(original, crop.member_shN)
     directions = torch.nn.functional.normalize(members.means - camera.position, dim=1)
     weights = basis(min(members.sh_degree, 3), directions)
@@ -158,24 +153,20 @@ def color_view(crop: CropScene, original: Tensor, bands: int, pixels: Tensor) ->
     weighed = color_map(crop.gaussians, camera, crop.box, crop.rows, crop.engine, pixels)
     others = crop.original().flatten(0, 1)[pixels] - weighed.picture(colors.clamp_min(0.0))
     counts = torch.ones_like(others[:, :1], dtype=torch.bool)
-    return ColorView(weighed, others, weights[:, :bands].contiguous(), colors, crop.size, pixels, counts)
+    weights = weights[:, : member_bands(original[:1]).shape[1]].contiguous()
+    return ColorView(weighed, others, weights, colors, crop.size, pixels, counts)
 
 
 def color_views(crops: Sequence[CropScene], original: Tensor, every: int = 1) -> list[ColorView]:
     """All views, with all bands that are drawn. Each crop is looked at once, and not needed any more.
 
-    `every`: of so many pixels one is looked at, in each view others: 1, 2 or 4.
+    Args:
+        crops: their boxes
+        original: raw member rows [M,14+]
+        every: of so many pixels one is looked at, in each view others: 1, 2 or 4
     """
-    bands = member_bands(original).shape[1]
-
-    def make(index: int) -> ColorView:
-        crop = crops[index]
-        height, width = crop.size
-        place = torch.arange(width) + every // 2 * torch.arange(height)[:, None] + index
-        return color_view(crop, original, bands, (place % every == 0).flatten().nonzero()[:, 0])
-
-    views = map_threads(make, range(len(crops)))
-    alike = bands == 1  # from everywhere
+    views = map_threads(lambda i: color_view(crops[i], original, every, i), range(len(crops)))
+    alike = views[0].basis.shape[1] == 1  # from everywhere
     return [replace(v, basis=views[0].basis, original=views[0].original) for v in views] if alike else views
 
 
@@ -190,9 +181,9 @@ class MapFit:
     held: Tensor  # the same of the members', hidden or not, as far as they count. [20,20] float64
 
     def picture(self, table: Tensor) -> Tensor:
-        """What the pixels show under a map, unclamped. [K,3] -> [P,3]"""
+        """What the pixels show under a map. [K,3] -> [P,3] 0..1"""
         change = table - pad(identity_map(1), (0, 0, 0, len(table) - MONOMIALS[1])).to(table)
-        return self.original + self.design[:, : len(table)] @ change
+        return (self.original + self.design[:, : len(table)] @ change).clamp(0.0, 1.0)
 
     @one_thread()
     def solve(self, degree: int, targets: Sequence[Tensor]) -> Tensor:
@@ -324,16 +315,14 @@ def improve_mask(
     curvature = curvature + _MASK_RIDGE * curvature.mean() + 1e-12
     descent, error = look(share)
     for _ in range(_MASK_STEPS):
+        before = error
         for length in _MASK_LENGTHS:
             ahead = (share + length * descent / curvature).clamp(0.0, 1.0)
             next_descent, next_error = look(ahead)
             if next_error < error:
+                share, descent, error = ahead, next_descent, next_error
                 break
-        else:
-            break
-        gained = (error - next_error) / error
-        share, descent, error = ahead, next_descent, next_error
-        if gained < _MASK_SETTLED:
+        if before - error < _MASK_SETTLED * before:
             break
     return share
 

@@ -175,12 +175,6 @@ def straight_recordings(
     return nodes
 
 
-def drop_jitter(trajectory: Trajectory, pictures: Sequence[Tensor]) -> tuple[Trajectory, list[Tensor]]:
-    """What `straight_recordings` leaves, and its pictures."""
-    nodes = straight_recordings(trajectory, pictures)
-    return select_recordings(trajectory, nodes), [pictures[i] for i in nodes]
-
-
 def select_recordings(trajectory: Trajectory, nodes: Sequence[int]) -> Trajectory:
     """These recordings alone; ascending, both ends and the stages' ends among them."""
     rows = torch.tensor(nodes)
