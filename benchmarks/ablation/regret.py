@@ -31,7 +31,7 @@ from trainer.editors.base import ImageEditor
 from trainer.editors.procedural import edit_course
 from trainer.fit.evaluate import Evaluator, make_evaluator
 from trainer.fit.fit import fit_grades, visibility
-from trainer.fit.slider_uniformity import equalized_strengths, strength_ruler
+from trainer.fit.slider_uniformity import equalized_strengths
 from trainer.optimize.color_course import STEPS as TAKEN
 from trainer.optimize.color_course import solve
 from trainer.optimize.color_solver import Model, add_bands, iterations, make_solver
@@ -168,7 +168,7 @@ class Edit:
             return [quantize_image(courses[view.camera.name](s)) for view in views]
 
         whole, waited, began = edit([1.0], self.setup.views), 0.0, time.process_time()
-        between = Strengths(strength_ruler(self.painter, self.editor, self.setup.views), edit, look)
+        between = Strengths(edit, look)
         with TemporaryDirectory() as folder, closing(RunLog(Path(folder) / "log.txt", quiet=True)) as log:
             options = OptimizeOptions(), self.setup, whole, between, ViewOptions(), log
             solver, model, course = plan_colors(*options)

@@ -38,7 +38,6 @@ from trainer.views.view import View
 STEPS = 20
 """Equal steps that a user makes over the whole slider."""
 
-_MARKS = 16  # of the ruler on which further strengths of a course lie
 _ASKED_VIEWS, _FIELD_VIEWS = 3, 6
 _COSTLY_STEPS = 8  # of the anchor view, where each picture costs a model's work
 _FINE = 2  # a step may begin at so many places per step
@@ -87,12 +86,6 @@ def equalized_strengths(
     rounded = (*(round(float(s), 3) for s in at[:-1]), 1.0)
     rises = all(b - a > 5e-4 for a, b in zip((0.0, *rounded), rounded, strict=False))
     return rounded if rises else plain
-
-
-def strength_ruler(editor: ImageEditor, spec: str, views: Sequence[View]) -> tuple[float, ...]:
-    """Strengths from 0 to 1 that are evenly visible apart, 2^n + 1 of them; see `equalized_strengths`."""
-    plain = tuple((i + 1) / _MARKS for i in range(_MARKS))
-    return 0.0, *equalized_strengths(editor, spec, views, plain)
 
 
 def equalize_slider(

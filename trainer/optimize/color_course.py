@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from bisect import bisect_left
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -23,6 +22,8 @@ from .retime import smooth_weights
 STEPS = "steps"
 """Of a recording's means: the steps that it took."""
 
+_FINEST = 1 / 16  # of the way between two strengths: there are none in between
+
 Target = tuple[TargetStage, Judge]
 """A strength's pictures, and views not solved for that say when these are met."""
 
@@ -33,9 +34,7 @@ class Course:
 
     targets: list[Target]  # in this order, the finished edit after them
     finished: Target
-    # where further ones may be: evenly visible apart, from 0 to 1, 2^n + 1 of them; none: there are no others
-    ruler: Sequence[float] = ()
-    look: Callable[[float], Judge] | None = None
+    look: Callable[[float], Judge] | None = None  # any other; None: there are none
     ask: Callable[[Sequence[float]], Sequence[Target]] | None = None
 
     def extend(self, known: Mapping[float, tuple[Tensor, float]]) -> bool:
@@ -52,15 +51,14 @@ class Course:
         offsets, asked = torch.stack([known[s][0] for s in at]), list[float]()
         missed = [max(known[s][1], LEVEL) for s in at]
         places, weights = smooth_weights(at, offsets)
-        for i, (begin, end) in enumerate(pairwise(bisect_left(self.ruler, s) for s in at)):
-            width = (end - begin) / (len(self.ruler) - 1)
-            if end - begin < 2:
+        for i, (begin, end) in enumerate(pairwise(at)):
+            if end - begin <= _FINEST:
                 continue
             smooth = torch.tensordot(weights[2 * i + 1].float(), offsets, 1)
             error = max(self.look(float(places[2 * i + 1])).error(smooth), LEVEL)
             expected = (0.5 * math.sqrt(missed[i]) * (i > 0) + 0.5 * math.sqrt(missed[i + 1])) ** 2
-            if width * math.log(error / max(expected, LEVEL)) > -math.log(MORE_PAYS):
-                asked.append(self.ruler[(begin + end) // 2])
+            if (end - begin) * math.log(error / max(expected, LEVEL)) > -math.log(MORE_PAYS):
+                asked.append((begin + end) / 2)
         self.targets += self.ask(asked) if asked else ()
         return bool(asked)
 

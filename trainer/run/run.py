@@ -43,7 +43,7 @@ from trainer.editors.procedural import StripesEditor, edit_course
 from trainer.fit.draft import draft_grade, draft_views
 from trainer.fit.fit import choose_path, drop_idle_attributes
 from trainer.fit.network import PART as NETWORK
-from trainer.fit.slider_uniformity import equalized_strengths, strength_ruler
+from trainer.fit.slider_uniformity import equalized_strengths
 from trainer.optimize.growth import fade_in
 from trainer.optimize.losses import Perceptual, describe_loss, perceptual_loss
 from trainer.optimize.retime import resolve_slider, smooth_course
@@ -388,7 +388,7 @@ def _edit_views(
     editor: Callable[[], ImageEditor],
     folder: RunFolder,
     log: RunLog,
-) -> tuple[Pictures, Approach, dict[str, Any] | None, Callable[[], Strengths | None]]:
+) -> tuple[Pictures, Approach, dict[str, Any] | None, Strengths | None]:
     """What the editor makes of all views, by strength, read where it is on disk; how to train towards it;
     what a trial found of that; and what makes more strengths, where a course may call for them.
     """
@@ -427,9 +427,8 @@ def _edit_views(
         return [quantize_image(picture) for picture in pictures]
 
     def between() -> Strengths | None:
-        if not _asks_for_more(options, resolve_approach(options, approach)):
-            return None
-        return Strengths(strength_ruler(editor(), spec, views), edit, look)
+        more = _asks_for_more(options, resolve_approach(options, approach))
+        return Strengths(edit, look) if more else None
 
     done = folder.state.load("edited")
     if done is not None:
@@ -441,7 +440,7 @@ def _edit_views(
             trial = done.values["trial"]
             log.say("the edited views are on disk")
             log.expect(expected_work(setup, resolve_approach(options, approach), len(made)))
-            return made, approach, trial, between
+            return made, approach, trial, between()
         except ProgdfError as error:
             made.clear()
             known = done.values["strengths"]
@@ -461,7 +460,7 @@ def _edit_views(
     _check_change(edited, setup, spec)
     if rest := [s for s in known if s not in edited]:
         edited = edit(rest, [view for view in views if view.camera.name in on_the_way])
-    return edited, approach, trial, between
+    return edited, approach, trial, between()
 
 
 def _keeps_courses(editor: ImageEditor, setup: TrainingSetup) -> bool:
@@ -529,7 +528,7 @@ def _record(
     optimization: OptimizeOptions,
     setup: TrainingSetup,
     edited: Pictures,
-    between: Callable[[], Strengths | None],
+    between: Strengths | None,
     editor: Callable[[], ImageEditor],
     perceptual: Perceptual,
     folder: RunFolder,
@@ -542,7 +541,7 @@ def _record(
         log.say(f"--group-steps: without effect on this {optimization.kind} edit, whose loss is {objective}")
     with log.stage("optimize"):
         trajectory, losses, effort = optimize_members(
-            options, optimization, setup, edited, perceptual, folder.state, log, between()
+            options, optimization, setup, edited, perceptual, folder.state, log, between
         )
     setup = setup.keep_solved(effort).extend(trajectory.added)
     with log.stage("retime"):

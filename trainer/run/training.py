@@ -133,7 +133,6 @@ effort that was decided on, as report.json has it."""
 class Strengths:
     """Strengths that are edited when it is known that they are called for."""
 
-    ruler: Sequence[float]  # see `Course.ruler`
     edit: Callable[[Sequence[float], Sequence[View]], Pictures]  # some views, which stay on disk
     look: Callable[[float, Sequence[View]], Sequence[Tensor]]  # some views, as they would be
 
@@ -281,10 +280,10 @@ def plan_colors(
                 (solver, model), finished, train = fewer, half, train[::2]
     strengths = [s for s in edited if s < 1.0]
     if between is not None and (model.bands > 1 or model.richer is not None):
-        strengths = strengths or [between.ruler[len(between.ruler) // 2]]
+        strengths = strengths or [0.5]
     course = Course(ask(strengths) if strengths else [], finished)
     if between is not None:
-        course = replace(course, ruler=between.ruler, look=cache(look), ask=ask)
+        course = replace(course, look=cache(look), ask=ask)
     with log.stage("model"):
         middle = len(course.targets) // 2 if between is None else 0
         spare = 0.0 if target_psnr is None else 0.5 * 10 ** (-target_psnr / 10)
@@ -313,7 +312,7 @@ def _solve(
     """All views at once, for colors alone."""
     state, recordings = PgsState(solver.original), Recordings(folder, solver.original.shape, model)
     way = partial(solve, solver, model, course, recordings.made, state, steps=most_steps)
-    most = MOST_STAGES if course.ruler else len(course.targets) + 1
+    most = len(course.targets) + 1 if course.look is None else MOST_STAGES
     made = _record_way(way, most, state, recordings, None, folder, log)
     strengths, made = course.sort_recordings(made)
     trajectory = record(made, state.average, strengths)

@@ -317,7 +317,7 @@ def test_strengths_are_asked_for_where_those_that_are_solved_for_say_too_little(
         return [(TargetStage(s, pictures(crops, s), 1), look(s)) for s in strengths]
 
     def course_of(asked: Sequence[float]) -> Course:
-        return Course(ask(asked), ask([1.0])[0], torch.linspace(0, 1, 9).tolist(), look, ask)
+        return Course(ask(asked), ask([1.0])[0], look, ask)
 
     _, model = choose_model(solver, [(solver, look(1.0))], pictures(crops, 1.0), 40, 1)
     course, made, state = course_of([]), list[ParameterSnapshot](), PgsState(original)
