@@ -39,8 +39,6 @@ from .separable import (
     store_attribute,
 )
 
-Kind = Literal["separable", "lossless"]
-
 ADDED = 0.1
 """Share of the error that an edit has against its editor which its field may add."""
 
@@ -65,9 +63,6 @@ MOST_SNAPSHOTS = 40
 
 UNSEEN = 0.1
 """Say of the bare numbers beside the pictures, for members that these views do not show."""
-
-Modes = Mapping[str, Tensor]
-"""By attribute, as `separable.principal_modes` gives them."""
 
 Ends = Mapping[str, tuple[Tensor, Tensor]]
 """By attribute, as `separable.quantize_bases` gives them; one that is not named is in float32."""
@@ -215,7 +210,7 @@ def choose_field(
     offsets: Tensor,
     render: Render,
     weights: Tensor | None = None,
-    kind: Kind = "separable",
+    kind: Literal["separable", "lossless"] = "separable",
     evaluator: FieldEvaluator | None = None,
 ) -> FieldChoice:
     """The smallest field that serves.
@@ -277,10 +272,9 @@ def store_ends(offsets: Tensor, evaluator: FieldEvaluator) -> Ends:
         return sum(END_TYPES[k].itemsize * (moving[n].stop - moving[n].start) for n, k in chosen.items())
 
     now = excess(chosen)
-    while now > 1.0:
-        larger = [{**chosen, name: k + 1} for name, k in chosen.items() if k + 1 < len(END_TYPES)]
-        if not larger:
-            break
+    while now > 1.0 and (
+        larger := [{**chosen, name: k + 1} for name, k in chosen.items() if k + 1 < len(END_TYPES)]
+    ):
         gains = [(now - excess(c)) / (size(c) - size(chosen)) for c in larger]
         chosen = larger[gains.index(max(gains))]
         now = excess(chosen)
@@ -332,19 +326,10 @@ def grow_ranks(seen: RenderedTrajectories) -> list[dict[str, int]]:
     ranks = dict.fromkeys(seen.trajectories, 0)
     path = [dict(ranks)]
     now = float(seen.mse(ranks).mean())
-    while now > 0:
-        best: tuple[float, str, float] | None = None
-        for name, width in widths.items():
-            if ranks[name] >= seen.modes[name].shape[1]:
-                continue
-            then = float(seen.mse({**ranks, name: ranks[name] + 1}).mean())
-            gain = math.log(now / max(then, 1e-30)) / width
-            if best is None or gain > best[0]:
-                best = (gain, name, then)
-        if best is None or now < 1e-10:  # 100 dB
-            break
-        _, name, now = best
-        ranks[name] += 1
+    while now >= 1e-10 and (growing := [n for n in ranks if ranks[n] < seen.modes[n].shape[1]]):  # 100 dB
+        then = {n: float(seen.mse({**ranks, n: ranks[n] + 1}).mean()) for n in growing}
+        name = max(growing, key=lambda n: math.log(now / max(then[n], 1e-30)) / widths[n])
+        ranks[name], now = ranks[name] + 1, then[name]
         path.append(dict(ranks))
     return path
 
@@ -359,8 +344,8 @@ class RenderedTrajectories:
     channels: int  # width of a packed row
 
     @cached_property
-    def modes(self) -> Modes:
-        """Each attribute's best bases."""
+    def modes(self) -> Mapping[str, Tensor]:
+        """Each attribute's best bases, as `separable.principal_modes` gives them."""
         modes = {}
         for i, (name, trajectory) in enumerate(self.trajectories.items()):
             seen = self.gram[i, :, i]
@@ -404,7 +389,8 @@ def render_trajectories(
     if not attributes or snapshots < 3:
         gram = torch.zeros(len(attributes), snapshots, len(attributes), snapshots, dtype=torch.float64)
         return RenderedTrajectories(trajectories, gram, 1, offsets.shape[2])
-    looked = _rendered_snapshots(snapshots)
+    count = min(snapshots, MOST_SNAPSHOTS)
+    looked = [round(i * (snapshots - 1) / (count - 1)) for i in range(count)]  # even, both ends among them
     changes: list[list[Tensor]] = [[] for _ in attributes]
     with torch.no_grad():
         for t in looked[1:-1]:
@@ -420,13 +406,6 @@ def render_trajectories(
     products = (rows @ rows.T).double().reshape(len(attributes), len(looked), len(attributes), len(looked))
     gram = torch.einsum("ts,asbu,vu->atbv", spread, products, spread)
     return RenderedTrajectories(trajectories, gram, max(1, rows.shape[1]), offsets.shape[2])
-
-
-def _rendered_snapshots(snapshots: int) -> list[int]:
-    """Snapshots that are rendered, even and both ends among them."""
-    if snapshots <= MOST_SNAPSHOTS:
-        return list(range(snapshots))
-    return [round(i * (snapshots - 1) / (MOST_SNAPSHOTS - 1)) for i in range(MOST_SNAPSHOTS)]
 
 
 def _interpolation_weights(looked: Sequence[int], snapshots: int) -> Tensor:

@@ -301,8 +301,6 @@ def drop_idle_attributes(
     # a grade is of all bands that the scene has, whether or not its map moves them
     if trajectory.maps is None and "shN" in slices and not bool(end[:, slices["shN"]].any()):
         offsets, end = offsets[:, :, :BASE_CHANNELS].clone(), end[:, :BASE_CHANNELS].clone()
-    if end is trajectory.end:
-        return trajectory, costs
     return replace(trajectory, offsets=offsets, end=end), costs
 
 

@@ -195,9 +195,8 @@ class Solver:
         weights = self.weights[:, 0, 0]
         share = mask_of_members(self.sh[:, 0] * C0 + 0.5, change[:, 0] * C0, weights)
         if self.ties is not None:
-            mean = weights @ share / weights.sum()
+            mean = weights @ share / weights.sum() * spreads
             say = self.asked[:, 0] * weights / (_TRUSTED * self.typical)
-            mean = mean * spreads
             share = mean + self.ties.spread((share - mean)[:, None, None], say, _HOLDS[0] / _TIES)[:, 0, 0]
         return self.with_mask(share.clamp(0.0, 1.0))
 
