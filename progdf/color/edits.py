@@ -80,9 +80,8 @@ def recolor_course(rgb: Tensor, target: Tensor, reference: Tensor, path: ColorPa
         reference: the region's own color, see `typical_color`. [3]
         path: see `bend_of`
     """
-    typical = _as_tensor(reference, rgb)
-    bend = bend_of(typical, _as_tensor(target, rgb), path)
-    return color_course(rgb, recolor_fully(rgb, target, typical), bend)
+    bend = bend_of(_as_tensor(reference, rgb), _as_tensor(target, rgb), path)
+    return color_course(rgb, recolor_fully(rgb, target, reference), bend)
 
 
 def recolor_fully(rgb: Tensor, target: Tensor, reference: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ basis 0 decodes to, without any rounding: in float32 the recorded end, in intege
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -224,7 +224,7 @@ class GradeForm:
     residual: Tensor  # bases of the lowest B bands, as stored. [R,M,3B] int8
     scale: Tensor  # what one unit of them is worth. [R,3B] float32
     coefficients: Tensor  # of the bases at each knot; 0 at the first. [S,R] float32
-    remap: SliderRemap  # from these knots to the slider
+    remap: SliderRemap = field(default_factory=identity_remap)  # from these knots to the slider
     mask: Tensor | None = None  # how much of the map each member takes, in 255ths; None: all. [M] uint8
 
     def __post_init__(self) -> None:

@@ -30,7 +30,6 @@ from .baked import (
     Segment,
     find_segment,
     identity_map,
-    identity_remap,
     interpolate,
     lattice_colors,
     lattice_side,
@@ -286,16 +285,7 @@ def fit_grade(
     normal = (columns @ columns.T).double()
     coefficients = (rows @ columns.T).double() @ torch.linalg.pinv(normal, rtol=1e-9, hermitian=True)
     coefficients[0] = 0.0
-    return GradeForm(
-        degree,
-        knots.float(),
-        table.float(),
-        levels,
-        scale,
-        coefficients.float(),
-        identity_remap(),
-        mask,
-    )
+    return GradeForm(degree, knots.float(), table.float(), levels, scale, coefficients.float(), mask=mask)
 
 
 def rank_limit(course: Tensor) -> int:

@@ -122,10 +122,8 @@ def retime(
         knots, pins = [0, len(trajectory) - 1], [0.0, 1.0]
     s = torch.zeros(len(trajectory), dtype=torch.float64)
     chords = _chords(pictures)
-    segments = [
-        (slice(a, b + 1), low, high)
-        for a, b, low, high in zip(knots, knots[1:], pins, pins[1:], strict=False)
-    ]
+    spans = zip(pairwise(knots), pairwise(pins), strict=True)
+    segments = [(slice(a, b + 1), low, high) for (a, b), (low, high) in spans]
     for nodes, low, high in segments:
         s[nodes] = _place_between(low, high, _cumulative(chords[nodes.start : nodes.stop - 1]))
     for _ in range(passes - 1):

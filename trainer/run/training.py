@@ -79,16 +79,15 @@ class Recordings:
     def add(self, snapshot: ParameterSnapshot) -> None:
         """Keep one."""
         release_memory()
-        table = None if snapshot.table is None else snapshot.table.cpu()
-        self.made.append(replace(snapshot, offsets=snapshot.offsets.half().cpu(), table=table))
+        self.made.append(replace(snapshot, offsets=snapshot.offsets.half().cpu()))
 
     def capture_state(self) -> Saved:
         """How many there are; those that came since the last time are saved first."""
         for index in range(self._written, len(self.made)):
             snapshot = self.made[index]
             values = {name: getattr(snapshot, name) for name in _RecordingValues.__annotations__}
-            tensors = {"offsets": snapshot.offsets}
-            tensors |= {} if snapshot.table is None else {"table": snapshot.table}
+            parts = {"offsets": snapshot.offsets, "table": snapshot.table}
+            tensors = {name: part for name, part in parts.items() if part is not None}
             self._folder.save_later("recordings", tensors, values, index)
         self._written = len(self.made)
         return Saved({}, {"count": self._written})
@@ -104,10 +103,10 @@ class Recordings:
     def _read(self, saved: Saved) -> ParameterSnapshot:
         values, offsets = convert_json(saved.values, _RecordingValues), saved.tensors["offsets"]
         check_tensor("offsets", offsets, self._shape, torch.float16)
-        table = None if self._model is None else saved.tensors["table"]
-        if self._model is not None and table is not None:
-            check_tensor("table", table, (MONOMIALS[max(1, self._model.degree)], 3), torch.float32)
-        return ParameterSnapshot(**values, offsets=offsets, table=table)
+        if self._model is not None:
+            numbers = MONOMIALS[max(1, self._model.degree)]
+            check_tensor("table", saved.tensors["table"], (numbers, 3), torch.float32)
+        return ParameterSnapshot(**values, offsets=offsets, table=saved.tensors.get("table"))
 
 
 PART = "training"
@@ -120,9 +119,6 @@ _TIMED_VIEWS = 4  # in which the slider is timed; 8 or all at full size time it 
 # than 9 twice as many take less than a twentieth of it away (docs/experiments.md, Pixels)
 _ENOUGH = (MORE_PAYS - 0.5) / (1.0 - MORE_PAYS)
 
-
-Way = Callable[[OnStep], Iterator[ParameterSnapshot]]
-"""Optimizes from the state on, and yields recordings."""
 
 Optimized = tuple[Trajectory, Losses, Mapping[str, Any]]
 """The trajectory, even in time; mean of every loss term, and what is left to the edit, per recording; the
@@ -169,7 +165,6 @@ def optimize_members(
         )
         return _solve(*plan, iterations(optimization.steps), folder, log)
     scene, members = setup.scene, setup.region.members
-    bands = optimization.sh != "off"
     engine, device = optimization.engine, engine_device(optimization.engine)
     if engine == "warp":
         card = torch.cuda.get_device_name(device) if device.type == "cuda" else "the CPU, in place of a card"
@@ -182,7 +177,7 @@ def optimize_members(
         groups = _groups(optimization, original, crops, stages, folder, log)
         stages = groups.to_stages(original, crops, stages)
     extent = 2.0 * scene_sphere(scene[members])[1] if groups is None else groups.extent
-    settings = pgs_settings(optimization, bands, original.shape[1], extent, len(stages))
+    settings = pgs_settings(optimization, optimization.sh != "off", original.shape[1], extent, len(stages))
     own, seeds = len(members), _seeds(setup, optimization, edited, folder) if optimization.grow else None
     if seeds is not None:
         setup, settings = setup.extend(seeds), replace(settings, ramp=0.0)
@@ -344,7 +339,7 @@ def _crops(setup: TrainingSetup, still: bool, engine: str) -> list[CropScene]:
 
 
 def _record_way(
-    way: Way,
+    way: Callable[[OnStep], Iterator[ParameterSnapshot]],
     steps: int,
     state: PgsState,
     recordings: Recordings,
@@ -353,6 +348,8 @@ def _record_way(
     log: RunLog,
 ) -> Sequence[ParameterSnapshot]:
     """Go the way to its end, from the saved state on, and a jointly trained network with it.
+
+    `way`: optimizes from the state on, and yields recordings
 
     Returns:
         All recordings.

@@ -183,7 +183,7 @@ def test_functions_that_members_lack_take_no_levels(share: float) -> None:
     levels[:, :, 1:] *= torch.rand(999, 8, 1, generator=draws) < share
     knots, table = torch.tensor([0.0, 1.0]), torch.stack([identity_map(1), some_table(1)])
     scale, coefficients = torch.ones(2, 27), torch.tensor([[0.0, 0.0], [1.0, 0.5]])
-    form = GradeForm(1, knots, table, levels.flatten(2), scale, coefficients, identity_remap())
+    form = GradeForm(1, knots, table, levels.flatten(2), scale, coefficients)
     packed = form.packed_levels
     assert torch.equal(unpack_levels(packed["functions"], packed["residual"], 2, 999, 27), form.residual)
     assert form.bytes_per_member < 1.02 * (6 + 48 * share) + 1.0
