@@ -235,15 +235,18 @@ def mapped_lattice(form: GradeForm, s: float, side: int) -> Tensor:
 def lattice_form(table: Tensor) -> GradeForm:
     """The grade of a lattice, for no members: the straight way to the colors of the table. [K,3]"""
     ends = torch.stack([lattice_colors(lattice_side(len(table))), table])
-    return fit_grade(torch.tensor([0.0, 1.0]), LATTICE, ends, torch.zeros(2, 0, 0), 0, torch.zeros(0))
+    return map_form(torch.tensor([0.0, 1.0]), LATTICE, ends, 0)
 
 
 def map_alone(form: GradeForm, members: int) -> GradeForm:
     """The map of a grade alone, for so many members of any scene."""
+    return replace(map_form(form.knots, form.degree, form.table, members), remap=form.remap)
+
+
+def map_form(knots: Tensor, degree: int, table: Tensor, members: int) -> GradeForm:
+    """A grade that is a map alone. [S], [S,K,3]"""
     none = torch.zeros(0, members, 0, dtype=torch.int8)
-    return replace(
-        form, residual=none, scale=torch.zeros(0, 0), coefficients=form.coefficients[:, :0], mask=None
-    )
+    return GradeForm(degree, knots, table, none, torch.zeros(0, 0), torch.zeros(len(knots), 0))
 
 
 def fit_grade(

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from progdf.camera import Camera
 from progdf.field.baked import MONOMIALS, BakedField, identity_map
-from progdf.field.grade import fit_grade, map_colors, member_bands
+from progdf.field.grade import map_colors, map_form, member_bands
 from progdf.gaussians import BASE_CHANNELS, Gaussians, pack
 from progdf.gdf.file import Gdf, fingerprint
 from progdf.io.cameras import load_cameras
@@ -187,8 +187,7 @@ def draft_grade(views: DraftViews, options: EditorOptions, name: str) -> Gdf | N
     table = torch.stack([identity_map(degree), *(solve([target]) for target in targets)])
     every = _knots(judged, table, expected)
     knots, table = torch.tensor((0.0, *plain))[::every], table[::every]
-    members = len(views.region)
-    form = fit_grade(knots, degree, table, torch.zeros(len(knots), members, 0), 0, torch.ones(members))
+    form = map_form(knots, degree, table, len(views.region))
     channels = BASE_CHANNELS + 3 * views.scene.shN.shape[1]
     field = BakedField("grade", torch.tensor([0.0, 1.0]), {}, channels, tuple(knots.tolist()), form)
     about = {"draft": {"degree": degree, "psnr": round(decibels(error), 2)}}

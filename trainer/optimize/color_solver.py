@@ -471,13 +471,14 @@ def choose_model(
     tries, few = _Trials(trials, targets, steps), solver.ties is not None
     most_bands = min(most_bands, 1 if few else solver.sh.shape[1])
     bases = {degree: tries.start(degree, [by for by, _ in trials]) for degree in (0, *MONOMIALS)}
+
+    def miss(degree: int) -> float:
+        pairs = zip(trials, bases[degree].offsets, strict=True)
+        return sum(judge.mean(made, 1.0) for (_, judge), made in pairs)
+
     # of what no picture shows a map is a guess: where it is the worse one for most that is shown, for less
     # than about half of that is painted, there is none
-    left = [
-        sum(judge.mean(made, 1.0) for (_, judge), made in zip(trials, base.offsets, strict=True))
-        for base in bases.values()
-    ]
-    degrees = (0,) if few and left[0] <= min(left[1:]) else MONOMIALS
+    degrees = (0,) if few and miss(0) <= min(map(miss, MONOMIALS)) else MONOMIALS
     names = {degree: f"map of degree {degree}" if degree else "no map" for degree in degrees}
     hold = _HOLDS[0] if few else _RIDGE
     by_degree = [tries.attempt(bases[degree], name, int(few), hold) for degree, name in names.items()]
