@@ -33,7 +33,7 @@ from progdf.field import (
 )
 from progdf.field.baked import MONOMIALS, BakedField, identity_map
 from progdf.field.choose import Field
-from progdf.field.grade import bake_grade, band_offsets, fit_grade, mapped_bands
+from progdf.field.grade import bake_grade, band_offsets, fit_grade, map_form, mapped_bands
 from progdf.field.neural_fit import NeuralFit, train_network
 from progdf.field.separable import moving_attributes
 from progdf.gaussians import ATTRIBUTES, Gaussians, attribute_slices, pack
@@ -145,7 +145,8 @@ def color_forms(name: str, edit: Edit) -> list[Form]:
         solver = plain if mask is None else plain.with_mask(mask.float() / 255.0)
         maps = [solver.fit_map(degree, edit.targets(s)) for s in strengths]
         table = torch.stack([identity_map(degree), *(table for table, _ in maps)])
-        mapped = mapped_bands(degree, table, edit.original, solver.share)
+        alone = replace(map_form(knots, degree, table, len(edit.original)), mask=mask)
+        mapped = mapped_bands(alone, edit.original)
         bands = max(1, model.bands)
         zero = torch.zeros(len(edit.original), bands, 3)
         own = [

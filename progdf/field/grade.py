@@ -140,10 +140,10 @@ def band_offsets(change: Tensor, channels: int) -> Tensor:
     return pad(change.flatten(1), (_FIRST_BAND, channels - _FIRST_BAND - 3 * change.shape[1]))
 
 
-def mapped_bands(degree: int, table: Tensor, rows: Tensor, share: Tensor) -> Tensor:
-    """What the map adds to the members' bands at each knot. [S,K,3], [M,14+3K], [M] -> [S,M,3B]"""
-    sh = member_bands(rows)
-    changes = [share[:, None] * (map_colors(sh, at_knot, degree) - sh).flatten(1) for at_knot in table]
+def mapped_bands(form: GradeForm, rows: Tensor) -> Tensor:
+    """What the map adds to the members' bands at each knot. [M,14+3K] -> [S,M,3B]"""
+    sh, share = member_bands(rows), form.share[:, None]
+    changes = [share * (map_colors(sh, at_knot, form.degree) - sh).flatten(1) for at_knot in form.table]
     return torch.stack(changes)
 
 
@@ -161,7 +161,7 @@ def bake_grade(form: GradeForm, rows: Tensor, mapped: Tensor | None = None) -> B
     width = form.residual.shape[2]
     if len(rows) != form.members or width // 3 > member_bands(rows).shape[1]:
         raise ValueError(f"a grade of {form.members} members for {len(rows)} of {rows.shape[1]} numbers")
-    course = mapped_bands(form.degree, form.table, rows, form.share) if mapped is None else mapped.clone()
+    course = mapped_bands(form, rows) if mapped is None else mapped.clone()
     if len(form.residual):
         course[:, :, :width] += torch.einsum(
             "sr,rmc->smc", form.coefficients, form.residual * form.scale[:, None]

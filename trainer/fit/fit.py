@@ -15,7 +15,15 @@ from torch import Tensor
 from progdf.field import BakedField, Candidate, FieldChoice, FieldEvaluator, choose_field
 from progdf.field.baked import GradeForm, NeuralForm
 from progdf.field.choose import ADDED, MOST_SNAPSHOTS, SAMPLES, pick_candidate
-from progdf.field.grade import COARSER, bake_grade, fit_grade, mapped_bands, member_bands, rank_limit
+from progdf.field.grade import (
+    COARSER,
+    bake_grade,
+    fit_grade,
+    map_form,
+    mapped_bands,
+    member_bands,
+    rank_limit,
+)
 from progdf.field.keyframes import fit_keyframes, keyframe_rows
 from progdf.field.separable import moving_attributes
 from progdf.field.trajectory import Trajectory
@@ -140,9 +148,8 @@ def fit_grades(
         choosing, reporting, weights, options: see `fit_field`
     """
     degree, table = trajectory.map_course
-    mask, share = trajectory.mask, torch.ones(len(rows))
-    share = share if mask is None else mask.float() / 255.0
-    mapped = mapped_bands(degree, table, rows, share)
+    alone = replace(map_form(trajectory.s, degree, table, len(rows)), mask=trajectory.mask)
+    mapped = mapped_bands(alone, rows)
     lowest = [member_bands(trajectory.node(i))[:, : trajectory.bands] for i in range(len(table))]
     course = torch.stack(lowest).flatten(2) - mapped[:, :, : 3 * trajectory.bands]
     evaluator = field_evaluator(trajectory, choosing, options.target_psnr)
@@ -150,7 +157,7 @@ def fit_grades(
 
     def fails(rank: int, index: int = 0) -> bool:
         nonlocal smallest
-        form = fit_grade(trajectory.s, degree, table, course, rank, weights, mask, COARSER[index])
+        form = fit_grade(trajectory.s, degree, table, course, rank, weights, alone.mask, COARSER[index])
         if form.bytes_per_member > smallest:
             return False
         release_memory()

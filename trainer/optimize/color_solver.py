@@ -528,12 +528,11 @@ def _solve_whole(
 ) -> tuple[Solver, Tensor]:
     """What the trials solved for a part of the pixels, with all of them: the solver with its mask, and the
     residual. [M,1,3]"""
-    total, begin = torch.stack(best.changes).mean(dim=0), torch.zeros_like(best.residuals[0])
+    total = torch.stack(best.changes).mean(dim=0)
     if best.masked:
         solver = solver.guess_mask(total, spreads).improve_mask(targets)
     made = solver.fit_map(best.degree, targets)[1]
-    if best.masked:
-        begin = (total - made)[:, :1]
+    begin = (total - made)[:, :1] if best.masked else torch.zeros_like(best.residuals[0])
     judge = Judge(solver.views, targets)
     residual, _ = solver.residual(made, begin, targets, steps, judge, best.error, best.hold)
     return solver, residual

@@ -214,9 +214,8 @@ class MapFit:
             clamped = ((image >= 1.0) & (target >= 1.0)) | ((image <= 0.0) & (target <= 0.0))
             return (design.T @ (torch.where(clamped, image, target) - original)).double()
 
-        parts = list(
-            zip(*(torch.split(rows, _PART) for rows in (design, self.original, target)), strict=True)
-        )
+        split = (torch.split(rows, _PART) for rows in (design, self.original, target))
+        parts = list(zip(*split, strict=True))
         for _ in range(_CLAMP_ROUNDS):
             right = torch.stack(map_threads(project, parts)).sum(dim=0) + pull
             change = torch.linalg.solve(normal, right).float()

@@ -108,12 +108,11 @@ def retime(
         trajectory: recordings with any slider values
         pictures: what is seen of each, any fixed shape; between two recordings it is taken to go straight
         slider: "stages": even change between the stages' pinned strengths; "even": over the whole slider,
-            nothing pinned; "time": the optimizer's steps
+            nothing pinned; "time": the optimizer's steps; "auto": see `resolve_slider`
         passes: how often to repeat
         samples: chords over the whole slider; a pinned segment has its share, at least 3
     """
-    if slider == "auto":
-        raise ValueError("'auto' is not resolved; see resolve_slider")
+    slider = resolve_slider(slider, trajectory.strengths)
     if slider == "time":
         return replace(trajectory, s=_place_between(0.0, 1.0, trajectory.steps.double()).float())
     if slider == "stages":

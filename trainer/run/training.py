@@ -37,13 +37,7 @@ from trainer.optimize.groups import Groups, group_path, group_stage, restore_gro
 from trainer.optimize.growth import add_rows, place_seeds, removal_costs, seed_rows
 from trainer.optimize.losses import Losses, Objective, Perceptual, erode, loss_table
 from trainer.optimize.pgs import OnStep, ParameterSnapshot, PgsState, TargetStage, optimize, pgs_settings
-from trainer.optimize.retime import (
-    record,
-    resolve_slider,
-    retime,
-    select_recordings,
-    straight_recordings,
-)
+from trainer.optimize.retime import record, retime, select_recordings, straight_recordings
 from trainer.optimize.ties import surface_ties
 from trainer.options import MOST_STAGES, OptimizeOptions, TrainOptions, ViewOptions
 from trainer.setup import Pictures, TrainingSetup, boxed_pictures, probe_views
@@ -467,4 +461,4 @@ def retime_trajectory(
     if not optimization.as_printed and trajectory.maps is None:
         nodes = straight_recordings(trajectory, pictures)
         trajectory, pictures = select_recordings(trajectory, nodes), [pictures[i] for i in nodes]
-    return retime(trajectory, pictures, resolve_slider(optimization.slider, trajectory.strengths))
+    return retime(trajectory, pictures, optimization.slider)

@@ -278,7 +278,7 @@ def test_the_way_between_the_knots_is_that_of_the_map_and_its_residual() -> None
     rows = pack(random_gaussians(500, sh_degree=2), with_shN=True)
     form = some_form(rows, bands=4)
     field = bake_grade(form, rows)
-    wanted = mapped_bands(2, form.table, rows, form.share)
+    wanted = mapped_bands(form, rows)
     wanted[:, :, :12] += torch.einsum("sr,rmc->smc", form.coefficients, form.residual * form.scale[:, None])
     found = torch.stack([member_bands(field.offsets(float(s))).flatten(1) for s in KNOTS])
     error = float((found - wanted).square().mean().sqrt() / wanted.square().mean().sqrt())
