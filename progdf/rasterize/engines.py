@@ -129,7 +129,7 @@ class ColorMap(Protocol):
     """
 
     def picture(self, colors: Tensor) -> Tensor:
-        """Σ αT·c of every pixel, on black. [M,3] -> [h,w,3] or [P,3]"""
+        """Σ αT·c of every pixel, on black, of any number of channels. [M,C] -> [h,w,C] or [P,C]"""
         ...
 
     def gradient(self, image: Tensor) -> Tensor:

@@ -82,8 +82,12 @@ class DrawnColors:
 
     def picture(self, colors: Tensor) -> Tensor:
         """See `ColorMap`."""
-        every = colors.new_zeros(self.count, 3).index_copy(0, self.rows, colors)
-        image = self.draw(replace(self.splats, colors=every[self.splats.rows].to(self.splats.colors)))
+        channels = colors.shape[1]
+        every = colors.new_zeros(self.count, channels + -channels % 3)
+        every[:, :channels] = every[:, :channels].index_copy(0, self.rows, colors)
+        drawn: tuple[Tensor, ...] = torch.split(every[self.splats.rows].to(self.splats.colors), 3, dim=1)
+        images = [self.draw(replace(self.splats, colors=part)) for part in drawn]
+        image = torch.cat(images, dim=2)[..., :channels]
         return image if self.pixels is None else image.flatten(0, 1)[self.pixels]
 
     def gradient(self, image: Tensor) -> Tensor:

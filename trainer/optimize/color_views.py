@@ -235,10 +235,9 @@ def fit_maps(views: Sequence[ColorView], share: Tensor, most: int = _MOST_PIXELS
     def lay_out(index: int) -> tuple[Tensor, Tensor, Tensor]:
         view, some = views[index], pixels[index]
         terms = monomials(view.original.T.clamp(0.0, MOST_COLOR), 3)
-        planes: tuple[Tensor, ...] = torch.split(torch.arange(21) % 20, 3)
-        shown = torch.cat([view.map.picture((share * terms[rows]).T)[some] for rows in planes], dim=1)
+        shown = view.map.picture((share * terms).T)[some]
         original = view.picture(view.original.clamp_min(0.0))[some]
-        return shown[:, :20], original, (terms @ terms.T).double()
+        return shown, original, (terms @ terms.T).double()
 
     covered = map_threads(lambda view: view.own_pixels.nonzero()[:, 0], views)
     stride = max(1, -(-sum(map(len, covered)) // most))

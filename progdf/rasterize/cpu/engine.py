@@ -276,9 +276,10 @@ class ListedWeights:
 
     def picture(self, colors: Tensor) -> Tensor:
         """See `ColorMap`."""
-        image = np.zeros((math.prod(self.size), 3), np.float32)
-        add_images(self.runs, to_float32(colors).numpy(), image)
-        return torch.from_numpy(image).view(*self.size, 3)
+        image = np.zeros((math.prod(self.size), colors.shape[1]), np.float32)
+        add = add_images if colors.shape[1] == 3 else add_channels
+        add(self.runs, to_float32(colors).numpy(), image)
+        return torch.from_numpy(image).view(*self.size, -1)
 
     def gradient(self, image: Tensor) -> Tensor:
         """See `ColorMap`."""
@@ -334,6 +335,20 @@ def add_images(runs: Runs, colors: Array, image: Array) -> None:
             image[p, 0] += w * red
             image[p, 1] += w * green
             image[p, 2] += w * blue
+
+
+@kernel(fast=True, cache=True)
+def add_channels(runs: Runs, values: Array, image: Array) -> None:
+    """`add_images` of any number of channels; 20 at once take a third of the time of 3 and 3 of them."""
+    end = np.uint64(0)
+    for run in range(runs.rows.size):
+        row, begin = runs.rows[run], end
+        end = begin + np.uint64(runs.counts[run])
+        first = np.uint64(runs.firsts[run])
+        for k in range(begin, end):
+            p, w = first + np.uint64(runs.pixels[k]), runs.weights[k]
+            for c in range(values.shape[1]):
+                image[p, c] += w * values[row, c]
 
 
 @kernel(fast=True, cache=True)

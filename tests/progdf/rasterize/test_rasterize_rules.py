@@ -132,6 +132,19 @@ def test_a_color_map_draws_its_rows_and_its_gradient_is_the_transpose(engine: st
     assert float(forth) == pytest.approx(float(back), rel=1e-6)
 
 
+@pytest.mark.parametrize("channels", [1, 2, 4, 20])
+@pytest.mark.parametrize("engine", EVERY)
+def test_a_color_map_draws_any_number_of_channels(engine: str, channels: int) -> None:
+    scene, camera, window = random_gaussians(300, seed=11), orbit_camera(90, 61), (21, 13, 70, 44)
+    rows, pixels = torch.arange(0, 300, 2), torch.arange(31 * 49)[1::3]
+    weighed = color_map(activate(scene), camera, window, rows, engine, pixels)
+    values = torch.rand(150, channels, generator=torch.Generator().manual_seed(5))
+    picture = weighed.picture(values)
+    for c in range(channels):
+        alone = weighed.picture(values[:, c : c + 1].expand(-1, 3))
+        torch.testing.assert_close(picture[:, c], alone[:, 0], rtol=0, atol=1e-6)
+
+
 @pytest.mark.parametrize("engine", EVERY)
 def test_a_color_map_of_some_pixels_is_that_of_all_where_they_are(engine: str) -> None:
     scene, camera, window = random_gaussians(300, seed=11), orbit_camera(90, 61), (21, 13, 70, 44)
