@@ -275,7 +275,7 @@ def plan_colors(
         course = replace(course, look=cache(look), ask=ask)
     with log.stage("model"):
         middle = len(course.targets) // 2 if between is None else 0
-        spare = 0.0 if target_psnr is None else 0.5 * 10 ** (-target_psnr / 10)
+        spare = 0.0 if target_psnr is None else 10 ** (-target_psnr / 10)
         model = settle_bands(model, solver, [*course.targets[middle : middle + 1], finished], most, spare)
     on = "views that are held out" if held_out else "all views, as none is held out"
     if len(train) < count:
