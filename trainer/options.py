@@ -136,7 +136,7 @@ class ViewOptions:
     """The axis of the scene that is up. auto: from the cameras, else from the ground, else −y."""
     views: int = 0
     """How many views are edited, 3 to 96 (the paper's limit); every fifth is held out to measure with. 0: 30,
-    or 40 for an edit of colors."""
+    for an edit of colors 40, or 48 where Gaussians look different from all sides."""
     image_size: int = 0
     """Longer side of the views in pixels; 0: 256, 512 for instruct. Those of an edit of colors serve pictures
     up to twice as large."""
