@@ -24,6 +24,7 @@ from trainer.options import MOST_THREADS, TrainOptions, flat_values
 from trainer.resolve import count_threads, recorded_options, resolve
 from trainer.store.run_folder import RunFolder, begin_log, remove_leftovers
 
+_VERSION = 2  # of how a run goes on from what it has saved; 2: strengths lie half way between others
 _SWITCHES = (
     "NUMBA_CPU_FEATURES", "MKL_ENABLE_INSTRUCTIONS", "MKL_CBWR", "OPENBLAS_CORETYPE", "ONEDNN_MAX_CPU_ISA",
 )  # fmt: skip
@@ -80,6 +81,8 @@ def decide_resume(folder: RunFolder, options: TrainOptions, region: Region, coun
     remove_leftovers(folder)
     now = _identity(plan, threads)
     if resume and saved is not None:
+        if saved.version != now.version:
+            raise ProgdfError(f"another version of progdf began {folder.root}; train again in another folder")
         remedy = "give --resume the run's own options, or train again in another folder"
         _check_plan(folder, saved.plan, plan, remedy)
         for what in ("scene", "cameras"):
@@ -167,6 +170,7 @@ class _Identity(msgspec.Struct):
     torch: str
     pictures: dict[str, str]
     processor: str
+    version: int = 1  # see `_VERSION`
 
 
 def _identity(plan: TrainOptions, threads: int) -> _Identity:
@@ -179,6 +183,7 @@ def _identity(plan: TrainOptions, threads: int) -> _Identity:
         str(torch.__version__),
         picture_digests(plan),
         processor_kind(),
+        _VERSION,
     )
 
 

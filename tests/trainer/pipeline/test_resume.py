@@ -134,6 +134,16 @@ def test_resuming_with_another_scene_under_the_same_name_is_refused(bear_folder:
 
 
 @pytest.mark.usefixtures("stopped")
+def test_a_run_that_another_version_began_is_not_resumed(bear_folder: Path) -> None:
+    about = OUT / "state" / "run.json"
+    told = json.loads(about.read_text(encoding="utf-8"))
+    del told["version"]
+    about.write_text(json.dumps(told), encoding="utf-8")
+    with pytest.raises(ProgdfError, match="another version of progdf began run; train again"):
+        train(replace(small_run(bear_folder), resume=True), quiet=True)
+
+
+@pytest.mark.usefixtures("stopped")
 def test_a_resumed_run_keeps_to_the_threads_it_began_with(bear_folder: Path, uninterrupted: Path) -> None:
     assert "1 threads, as the run began with" in gone_on(bear_folder, uninterrupted, threads=2)
     assert torch.get_num_threads() == 1
