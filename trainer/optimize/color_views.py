@@ -31,7 +31,7 @@ from trainer.views.crops import CropScene
 _AT_ONCE = 8  # views, whose results are there at the same time
 _SQUARES = 6  # of a view's longer side, every other one of which is in one of its halves
 _COVERED = 0.05  # the region's weight in a pixel that shows it
-_MOST_PIXELS = 60_000  # for the some twenty coefficients of the map; of more, evenly spread ones
+_MOST_PIXELS = 60_000  # that a map is fitted to, of more evenly spread ones (docs/experiments.md, Pixels)
 _PART = 1 << 14  # of these, that a thread has at a time
 _CLAMP_ROUNDS = 3  # of the map's least squares, for pixels that are white or black anyway
 _MAP_RIDGE = 1e-6  # of the diagonal of a map's normal equations, for regions of few colors

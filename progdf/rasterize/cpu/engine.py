@@ -339,7 +339,8 @@ def add_images(runs: Runs, colors: Array, image: Array) -> None:
 
 @kernel(fast=True, cache=True)
 def add_channels(runs: Runs, values: Array, image: Array) -> None:
-    """`add_images` of any number of channels; 20 at once take a third of the time of 3 and 3 of them."""
+    """`add_images` of any number of channels: 20 at once take a third of the time of 3 and 3 of them, 3 alone
+    half as long again."""
     end = np.uint64(0)
     for run in range(runs.rows.size):
         row, begin = runs.rows[run], end
