@@ -26,9 +26,11 @@ from torch import Tensor
 from progdf.camera import Camera, intrinsics
 from progdf.gaussians import Gaussians, pack
 from progdf.rasterize import reference, render, set_threads
-from progdf.rasterize.engines import ActivatedGaussians, RasterView, engine_device
+from progdf.rasterize.cpu.engine import ListedWeights
+from progdf.rasterize.engines import ActivatedGaussians, RasterView, color_map, engine_device
 from progdf.sh import C0
 from progdf.terminal import group_digits
+from trainer.optimize.color_views import LOST
 from trainer.optimize.losses import Objective, perceptual_loss
 from trainer.optimize.pgs import PgsSettings, TargetStage, learning_rates, optimize
 from trainer.options import OptimizeOptions
@@ -251,7 +253,57 @@ def tables() -> list[Table]:
         "tiles of torch are the easy opponent: OpenSplat's CPU engine, in one run with an earlier engine of "
         "ours, took 4.5 to 8.9 times as long as that, its gradients of quats and scales being wrong."
     )
-    return [Table.of("rasterize", "CPU rasterizer", rows, note)]
+    return [Table.of("rasterize", "CPU rasterizer", rows, note), list_table(CASES)]
+
+
+def list_table(cases: Sequence[RasterCase], rounds: int = 9) -> Table:
+    """What edits of colors are solved with: a view as lists of weights, with and without what hardly shows.
+
+    Args:
+        cases: what is looked at, every Gaussian with its weights
+        rounds: of which medians are taken; the two take turns
+    """
+    rows = []
+    for case in cases:
+        inputs, camera = cloud(case)
+        window, every = (0, 0, camera.width, camera.height), torch.arange(case.count)
+        times: dict[float, list[tuple[float, float]]] = {0.0: [], LOST: []}
+        pictures, entries = dict[float, Tensor](), dict[float, int]()
+        with _threads(1, 1):
+            for _ in range(rounds + 1):
+                for lost, some in times.items():
+                    begin = time.process_time()
+                    weighed = color_map(inputs, camera, window, every, lost=lost)
+                    listed = time.process_time()
+                    weighed.gradient(picture := weighed.picture(inputs.colors))
+                    some.append((1e3 * (listed - begin), 1e3 * (time.process_time() - listed)))
+                    assert isinstance(weighed, ListedWeights)
+                    pictures[lost], entries[lost] = picture, len(weighed.runs.weights)
+        listing, looking = (
+            [f"{statistics.median(taken[k] for taken in some[1:]):.1f}" for some in times.values()]
+            for k in (0, 1)
+        )
+        away = float((pictures[LOST] - pictures[0.0]).abs().max())
+        left_out = f"{1.0 - entries[LOST] / entries[0.0]:.0%}"
+        size = group_digits(case.count), f"{case.size}²"
+        rows.append((*size, left_out, *listing, *looking, f"{away:.4f}", f"{LOST:.4f}"))
+    columns = (
+        "Gaussians",
+        "pixels",
+        "weights left out",
+        "listed, of the processor (ms)",
+        "without these",
+        "picture and gradient, of the processor (ms)",
+        "without these ",
+        "largest difference",
+        "its bound",
+    )
+    note = (
+        "A view as a function of colors, for edits of colors. Weights that in a pixel come to less than half "
+        "of one of 255 levels, all together, are left out where such edits are solved for; the run is judged "
+        "by whole pictures. In scenes: docs/experiments.md, Weights that hardly show."
+    )
+    return Table("lists", "A view as lists of weights", columns, tuple(rows), note)
 
 
 def warp_tables(cases: Sequence[RasterCase] | None = None, rounds: int = 5) -> list[Table]:

@@ -5,10 +5,9 @@ from __future__ import annotations
 from .bake import bake_network
 from .baked import AttributeBases, BakedField, NeuralForm
 from .choose import Candidate, FieldChoice, FieldEvaluator, choose_field
-from .keyframes import fit_keyframes, fit_lossless
 from .neural import NeuralField
 from .neural_fit import NeuralSettings
-from .separable import fit_separable
+from .separable import fit_keyframes, fit_separable
 
 __all__ = [
     "AttributeBases",
@@ -22,6 +21,5 @@ __all__ = [
     "bake_network",
     "choose_field",
     "fit_keyframes",
-    "fit_lossless",
     "fit_separable",
 ]

@@ -26,13 +26,13 @@ from progdf.metrics.image import LEVEL, ROUNDING, decibels
 from progdf.threads import map_threads
 
 from .baked import END_TYPES, BakedField, interpolate_at
-from .keyframes import fit_lossless
 from .separable import (
     AttributeTrajectory,
     channel_weights,
     check_trajectory,
     decode_bases,
     fit_amplitude,
+    fit_keyframes,
     moving_attributes,
     principal_modes,
     quantize_bases,
@@ -232,7 +232,7 @@ def choose_field(
     check_trajectory(strengths, offsets)
     evaluator = evaluator or FieldEvaluator(strengths, offsets, render)
     if kind == "lossless":
-        everything = fit_lossless(strengths, offsets)
+        everything = fit_keyframes(strengths, offsets, len(strengths))
         candidate = evaluator.candidate(everything, f"all {len(strengths)} snapshots")
         return FieldChoice(candidate, candidate.excess <= 1.0, (candidate,), "nothing is left out")
     spread = channel_weights(weights, offsets.shape[1], offsets.shape[2])

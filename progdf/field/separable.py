@@ -8,7 +8,8 @@ coefficients are solved again for the bases as stored.
 a_k(s) is linear between the snapshots; a cubic gains nothing with as many as a run records
 (docs/experiments.md, Separable fields).
 
-`course_field` writes down an edit whose whole course is known, with nothing to train.
+`course_field` writes down an edit whose whole course is known, with nothing to train. The baseline is
+snapshots and lines between them; all of them are the recording bit for bit.
 """
 
 from __future__ import annotations
@@ -281,3 +282,43 @@ def opacity_course(start: Tensor, end: Tensor) -> tuple[Tensor, Tensor]:
     offsets = (opacity.logit() - start.double()).float()
     offsets[0], offsets[-1] = 0.0, end.float() - start.float()
     return knots.float(), offsets
+
+
+def keyframe_rows(strengths: Tensor, count: int) -> list[int]:
+    """The snapshots that `fit_keyframes` keeps, ascending. [T]"""
+    even = torch.linspace(0, 1, count, dtype=strengths.dtype)
+    nearest = (strengths[:, None] - even).abs().argmin(dim=0)
+    return sorted({*(nearest if count < len(strengths) else torch.arange(len(strengths))).tolist()})
+
+
+def fit_keyframes(
+    strengths: Tensor, offsets: Tensor, count: int, recorded: Sequence[float] | None = None
+) -> BakedField:
+    """Keep the `count` snapshots nearest to even strengths (even visible change in a re-timed trajectory)
+    bit for bit: in half precision where that holds them, as it does recordings.
+
+    Args:
+        strengths: of the snapshots, ascending from 0 to 1. [T]
+        offsets: raw offsets of the members; the first row is 0, the last the recorded end. [T,M,C] float32
+        count: snapshots kept, both ends among them, ≥ 2; as many as there are or more keeps all
+        recorded: strengths for the slider's ticks; `strengths` when None
+
+    Returns:
+        A field with those snapshots as knots; attributes that never move are absent.
+
+    Raises:
+        ValueError: no trajectory, or fewer than 2 snapshots asked for.
+    """
+    check_trajectory(strengths, offsets)
+    if count < 2:
+        raise ValueError(f"{count} keyframes, expected at least 2")
+    rows = keyframe_rows(strengths, count)
+    table = torch.eye(len(rows))[:, [-1, *range(1, len(rows) - 1)]]
+    attributes, kept = {}, offsets[rows[1:-1]]
+    inner = kept.half() if torch.equal(kept.half().float(), kept) else kept
+    for name, columns in moving_attributes(offsets).items():
+        full = offsets[-1, :, columns].contiguous()
+        units = torch.ones(1 + len(inner), full.shape[1])  # of another size they would round it
+        attributes[name] = AttributeBases(full, inner[:, :, columns], units, table.clone())
+    ticks = strengths.tolist() if recorded is None else recorded
+    return BakedField("keyframes", strengths[rows].float(), attributes, offsets.shape[2], tuple(ticks))

@@ -151,8 +151,9 @@ class RasterEngine(Protocol):
         ...
 
     def color_map(
-        self, gaussians: ActivatedGaussians, view: RasterView, rows: Tensor, pixels: Tensor | None
-    ) -> ColorMap:
+        self, gaussians: ActivatedGaussians, view: RasterView, rows: Tensor, pixels: Tensor | None,
+        lost: float,
+    ) -> ColorMap:  # fmt: skip
         """See `color_map`; colors are not read."""
         ...
 
@@ -268,6 +269,7 @@ def color_map(
     rows: Tensor,
     engine: str = "cpu",
     pixels: Tensor | None = None,
+    lost: float = 0.0,
 ) -> ColorMap:
     """What some Gaussians weigh in a window of a view, as `render` draws it.
 
@@ -278,9 +280,10 @@ def color_map(
         rows: which of the N Gaussians, distinct. [M] int64
         engine: a key of `ENGINES`
         pixels: which of the window's alone, numbered row by row, ascending; None: all. [P] int64
+        lost: of each pixel's weights, in all, what may be left out where that is faster
     """
     black = gaussians._replace(colors=torch.zeros_like(gaussians.means))
-    return get_engine(engine).color_map(black, RasterView.of(camera, black, crop), rows, pixels)
+    return get_engine(engine).color_map(black, RasterView.of(camera, black, crop), rows, pixels, lost)
 
 
 def check_intersections(splats: int, pairs: int) -> None:

@@ -60,9 +60,9 @@ def of_rows(gaussians: ActivatedGaussians, rows: Tensor | None) -> ActivatedGaus
 
 
 def color_map(
-    gaussians: ActivatedGaussians, view: RasterView, rows: Tensor, pixels: Tensor | None
+    gaussians: ActivatedGaussians, view: RasterView, rows: Tensor, pixels: Tensor | None, lost: float
 ) -> ColorMap:
-    """See `progdf.rasterize.color_map`."""
+    """See `progdf.rasterize.engines.color_map`; nothing is left out."""
     with torch.no_grad():
         splats, _ = project(gaussians, view)
     black = splats.colors.new_zeros(3)
@@ -83,8 +83,8 @@ class DrawnColors:
     def picture(self, colors: Tensor) -> Tensor:
         """See `ColorMap`."""
         channels = colors.shape[1]
-        every = colors.new_zeros(self.count, channels + -channels % 3)
-        every[:, :channels] = every[:, :channels].index_copy(0, self.rows, colors)
+        threes = torch.nn.functional.pad(colors, (0, -channels % 3))
+        every = threes.new_zeros(self.count, threes.shape[1]).index_copy(0, self.rows, threes)
         drawn: tuple[Tensor, ...] = torch.split(every[self.splats.rows].to(self.splats.colors), 3, dim=1)
         images = [self.draw(replace(self.splats, colors=part)) for part in drawn]
         image = torch.cat(images, dim=2)[..., :channels]

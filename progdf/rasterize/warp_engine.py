@@ -257,9 +257,9 @@ def rasterize(
 
 
 def color_map(
-    gaussians: ActivatedGaussians, view: RasterView, rows: Tensor, pixels: Tensor | None
+    gaussians: ActivatedGaussians, view: RasterView, rows: Tensor, pixels: Tensor | None, lost: float
 ) -> ColorMap:
-    """See `progdf.rasterize.color_map`."""
+    """See `progdf.rasterize.engines.color_map`; nothing is left out."""
     with torch.no_grad():
         splats, info = project(gaussians.each(Tensor.double), view)
     lists, wanted = list_tiles(splats, view.crop), is_listed(splats, info, rows)

@@ -24,8 +24,7 @@ from progdf.field.grade import (
     member_bands,
     rank_limit,
 )
-from progdf.field.keyframes import fit_keyframes, keyframe_rows
-from progdf.field.separable import moving_attributes
+from progdf.field.separable import fit_keyframes, keyframe_rows, moving_attributes
 from progdf.field.trajectory import Trajectory
 from progdf.gaussians import BASE_CHANNELS, Gaussians, attribute_slices
 from progdf.rasterize import alpha_weights

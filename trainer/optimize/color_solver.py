@@ -313,8 +313,6 @@ class Solver:
 
     def _hold(self, x: Tensor, ridge: float) -> Tensor:
         """The gradient of half of what a residual costs beside the pixels. [M,b,3] -> [M,b,3]"""
-        if self.ties is None:
-            return ridge * x
         return ridge * x + torch.from_numpy(self.held @ x.flatten(1).numpy()).view_as(x)
 
     def _pull(self, mapped: Tensor, residual: Tensor, targets: Sequence[Tensor], ridge: float) -> _Pull:

@@ -42,6 +42,9 @@ _MASK_STEPS, _MASK_SETTLED = 16, 0.01  # at most, of gradients by pixels; of the
 _MASK_LENGTHS = (4.0, 2.0, 1.0, 0.5, 0.25)  # of a step, in units of a bound of the curvature
 _MASK_RIDGE = 0.01  # of a typical curvature, for members that hardly show
 
+LOST = 0.5 / 255.0
+"""Of a pixel's weights, in all, what is left out: no color that this has would show in 8 bits."""
+
 MORE_PAYS = 0.95
 """Share of the error that a larger model must leave at most, to be worth its bytes."""
 
@@ -150,7 +153,7 @@ def color_view(crop: CropScene, original: Tensor, every: int, index: int) -> Col
     directions = torch.nn.functional.normalize(members.means - camera.position, dim=1)
     weights = basis(min(members.sh_degree, 3), directions)
     colors = (weights[..., None] * members.sh[:, : weights.shape[1]]).sum(dim=1) + 0.5
-    weighed = color_map(crop.gaussians, camera, crop.box, crop.rows, crop.engine, pixels)
+    weighed = color_map(crop.gaussians, camera, crop.box, crop.rows, crop.engine, pixels, LOST)
     others = crop.original().flatten(0, 1)[pixels] - weighed.picture(colors.clamp_min(0.0))
     counts = torch.ones_like(others[:, :1], dtype=torch.bool)
     weights = weights[:, : member_bands(original[:1]).shape[1]].contiguous()

@@ -30,7 +30,7 @@ import torch
 from progdf.color.edits import GRADE_RANGES, hex_color, parse_color, parse_grade
 from progdf.color.palette import are_alike
 from progdf.errors import ProgdfError
-from progdf.field.keyframes import fit_lossless
+from progdf.field.separable import fit_keyframes
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf, fingerprint
 from progdf.io import atomic
@@ -423,7 +423,7 @@ class EditOrder:
             if len(region.score) != len(scene) or len(offsets) != len(region):
                 return None
             stages = torch.stack([torch.zeros_like(offsets), offsets])
-            field = fit_lossless(torch.tensor([0.0, 1.0]), stages)
+            field = fit_keyframes(torch.tensor([0.0, 1.0]), stages, 2)
             return Gdf(self.name, region, field, fingerprint(scene), self.editor)
         except (OSError, ValueError, KeyError, ProgdfError):
             return None

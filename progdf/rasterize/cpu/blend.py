@@ -457,6 +457,14 @@ class Runs(NamedTuple):
     weights: Array  # αT of each entry. [E] float32
 
 
+class Listed(NamedTuple):
+    """What is listed of a view."""
+
+    rows: Array  # of each Gaussian in the lists, −1: none. [N] int32
+    places: Array  # of each of the window's pixels, likewise. [h·w] int32
+    lost: Number  # of a pixel's weights, in all, what may be left out. float32
+
+
 @kernel(fast=True, inline=True)
 def _add_weights(state: Array, batch: Array, splat: Number, out: Array) -> None:
     """Blend one splat's transmittance into a tile and add its weights to `out`.
@@ -525,7 +533,7 @@ def accumulate_weights(
 
 @kernel(contract=True, inline=True)
 def _list_tile(
-    tile: int, splats: Splats, rows: Array, places: Array, camera: Pinhole, members: Array, through: Array,
+    tile: int, splats: Splats, listed: Listed, camera: Pinhole, members: Array, state: Array,
     run: int, entry: int, out: Runs,
 ) -> tuple[int, int]:  # fmt: skip
     """One tile's runs and entries, written from `run` and `entry` on, as far as there is room; how far."""
@@ -533,7 +541,8 @@ def _list_tile(
     left, right = max(0, camera.window[0] - x), min(TILE_W, camera.window[2] - x)
     top, bottom = max(0, camera.window[1] - y), min(TILE_H, camera.window[3] - y)
     width = camera.window[2] - camera.window[0]
-    through[: TILE_H * TILE_W] = ONE
+    through, spare = state[: TILE_H * TILE_W], state[TILE_H * TILE_W : 2 * TILE_H * TILE_W]
+    through[:], spare[:] = ONE, listed.lost  # of what may still be left out
     for s in members:
         shape = splats.shapes[s]
         mx, my = shape[MX] - x - 0.5, shape[MY] - y - 0.5
@@ -551,7 +560,7 @@ def _list_tile(
             stop = min(math.floor(center + half) + 1, right)
             for j in range(start, stop):
                 before = through[i * TILE_W + j]
-                if before < 0.0:  # the pixel is done
+                if before <= spare[i * TILE_W + j]:  # the pixel is done, or nothing of it is needed
                     continue
                 u = shape[L11] * (j - center)
                 alpha = min(np.exp2(np.float32(remaining - u * u) + _LOG2_ALPHA_MIN), MOST)
@@ -560,17 +569,19 @@ def _list_tile(
                     through[i * TILE_W + j] = -before
                     continue
                 through[i * TILE_W + j] = after
-                if rows[s] < 0:
+                if listed.rows[s] < 0:
                     continue
-                pixel = places[(y - camera.window[1] + i) * width + x - camera.window[0] + j]
-                if pixel >= 0:
+                pixel = listed.places[(y - camera.window[1] + i) * width + x - camera.window[0] + j]
+                if EIGHT * alpha * before <= spare[i * TILE_W + j]:  # little of what may be left out
+                    spare[i * TILE_W + j] -= alpha * before
+                elif pixel >= 0:
                     if entry < out.weights.size:
                         base = pixel if entry == begun else base
                         out.pixels[entry] = pixel - base
                         out.weights[entry] = alpha * before
                     entry += 1
         if entry > begun:
-            out.rows[run], out.counts[run], out.firsts[run] = rows[s], entry - begun, base
+            out.rows[run], out.counts[run], out.firsts[run] = listed.rows[s], entry - begun, base
             run += 1
     return run, entry
 
@@ -578,17 +589,12 @@ def _list_tile(
 @kernel(cache=True)
 def list_weights(
     begin: int, end: int, scratch: TileScratch, splats: Splats, lists: TileLists, camera: Pinhole,
-    rows: Array, places: Array, out: Runs,
+    listed: Listed, out: Runs,
 ) -> tuple[int, int]:  # fmt: skip
     """List what the splats weigh in tiles begin … end − 1: how many runs, and entries, which may be more than
-    there was room for.
-
-    Args:
-        rows, places: of each Gaussian and pixel in the lists, −1: not listed. [N], [h·w] int32
-        out: room for a run of each splat in each of the tiles, and for some entries
-    """
+    there was room for; for a run of each splat in each of the tiles there is."""
     run = entry = 0
     for tile in range(begin, end):
         own = lists.members[lists.starts[tile] : lists.starts[tile + 1]]
-        run, entry = _list_tile(tile, splats, rows, places, camera, own, scratch.state, run, entry, out)
+        run, entry = _list_tile(tile, splats, listed, camera, own, scratch.state, run, entry, out)
     return run, entry

@@ -31,6 +31,7 @@ from .backward import new_scratch as new_backward_scratch
 from .blend import (
     SUMS,
     WEIGHT_SUMS,
+    Listed,
     Picture,
     Runs,
     accumulate_weights,
@@ -289,7 +290,7 @@ class ListedWeights:
 
 
 def color_map(
-    gaussians: ActivatedGaussians, view: RasterView, rows: Tensor, pixels: Tensor | None
+    gaussians: ActivatedGaussians, view: RasterView, rows: Tensor, pixels: Tensor | None, lost: float
 ) -> ListedWeights:
     """See `progdf.rasterize.engines.color_map`."""
     pinhole, (x0, y0, x1, y1) = make_pinhole(view), view.crop
@@ -297,8 +298,9 @@ def color_map(
     chosen = np.arange(window) if pixels is None else pixels.numpy()
     places = np.full(window, -1, np.int32)
     places[chosen] = np.arange(len(chosen), dtype=np.int32)
-    listed = np.full(len(gaussians.means), -1, np.int32)
-    listed[rows.numpy()] = np.arange(len(rows), dtype=np.int32)
+    row_of = np.full(len(gaussians.means), -1, np.int32)
+    row_of[rows.numpy()] = np.arange(len(rows), dtype=np.int32)
+    listed = Listed(row_of, places, np.float32(lost))
     splats, lists = bin_view(gaussians, pinhole)
     index = np.dtype(np.uint16 if TILE_H * (x1 - x0) < 1 << 16 else np.uint32)
 
@@ -307,7 +309,7 @@ def color_map(
         entry = ENTRY_ROOM * most
         while entry > room:
             room, out = entry, _new_runs(most, entry, index)
-            run, entry = list_weights(begin, end, new_scratch(), splats, lists, pinhole, listed, places, out)
+            run, entry = list_weights(begin, end, new_scratch(), splats, lists, pinhole, listed, out)
         return [*(part[:run].copy() for part in out[:3]), *(part[:entry].copy() for part in out[3:])]
 
     parts = _share(list_tiles, len(lists.starts) - 1, _LEAST_TILES, _MOST_TILES)

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from progdf.rasterize import ActivatedGaussians, activate, alpha_weights, render
+from progdf.rasterize.cpu.engine import ListedWeights
 from progdf.rasterize.engines import color_map
 from tests.helpers.drawn import CASES, EVERY, FAST, draw, drawn_case
 from tests.helpers.scenes import concatenate, front_camera, one_gaussian, orbit_camera, random_gaussians
@@ -155,6 +156,24 @@ def test_a_color_map_of_some_pixels_is_that_of_all_where_they_are(engine: str) -
     everywhere = torch.zeros(31 * 49, 3).index_copy(0, pixels, seen).view(31, 49, 3)
     torch.testing.assert_close(some.picture(colors), whole.picture(colors).flatten(0, 1)[pixels])
     torch.testing.assert_close(some.gradient(seen), whole.gradient(everywhere))
+
+
+@pytest.mark.parametrize("lost", [0.0, 0.5 / 255.0, 0.3])
+def test_a_color_map_leaves_out_no_more_than_it_may(lost: float) -> None:
+    scene, camera, window = random_gaussians(3000, seed=11), orbit_camera(90, 61), (21, 13, 70, 44)
+    rows = torch.arange(0, 3000, 2)  # the others only hide what is behind them
+    all_of_it = color_map(activate(scene), camera, window, rows)
+    listed = color_map(activate(scene), camera, window, rows, lost=lost)
+    assert isinstance(listed, ListedWeights)
+    assert isinstance(all_of_it, ListedWeights)
+    left_out = all_of_it.picture(torch.ones(1500, 1)) - listed.picture(torch.ones(1500, 1))
+    assert float(left_out.min()) > -1e-6
+    assert float(left_out.max()) <= lost + 1e-6
+    some, every = len(listed.runs.weights), len(all_of_it.runs.weights)
+    assert some < 0.9 * every if lost else some == every
+    values = torch.rand(1500, 3, generator=torch.Generator().manual_seed(5))
+    away = (all_of_it.picture(values) - listed.picture(values)).abs().max()
+    assert float(away) <= lost + 1e-6
 
 
 def test_a_color_map_lets_go_of_what_it_was_made_of() -> None:
