@@ -17,6 +17,7 @@ import torch
 
 from progdf.errors import ProgdfError
 from progdf.io.atomic import is_portable
+from progdf.io.cameras import kind_of_cameras
 from progdf.metrics.image import NO_DIFFERENCE
 from progdf.rasterize import set_threads
 from progdf.rasterize.engines import choose_engine
@@ -85,6 +86,7 @@ def resolve(options: TrainOptions) -> TrainOptions:
         editor=replace(options.editor, seed=options.seed, model=model),
         views=replace(
             options.views,
+            cameras=options.views.cameras or (_own_cameras(Path(what)) if family == "folder" else None),
             views=min(views or QUICK_VIEWS, QUICK_VIEWS) if quick else views,
             dense=not quick and family not in PER_VIEW and options.optimize.color_solver,
             image_size=options.views.image_size or (INSTRUCT_SIZE if family == "instruct" else 0),
@@ -102,6 +104,12 @@ def resolve(options: TrainOptions) -> TrainOptions:
         field=replace(options.field, draft=quick, seed=options.seed),
         texts=replace(texts, asked=bool(texts.text_before or texts.text_after)),
     )
+
+
+def _own_cameras(folder: Path) -> Path | None:
+    """The cameras that a run or `progdf views` wrote beside the pictures in a folder."""
+    beside = (place / "cameras.json" for place in (folder, *folder.absolute().parents[:2]))
+    return next((path for path in beside if path.is_file() and kind_of_cameras(path) == "own"), None)
 
 
 def recorded_options(options: TrainOptions) -> TrainOptions:
@@ -192,14 +200,11 @@ def check_name(name: str) -> str:
     Raises:
         ProgdfError: it cannot.
     """
-    if not name or name.startswith(".") or not name.isprintable() or {"/", "\\"} & set(name):
+    plain = bool(name) and name.isprintable() and not (name.startswith(".") or {"/", "\\"} & set(name))
+    if not plain or not is_portable(name):
+        why = ", as Windows cannot have a file of that name" if plain else ""
         raise ProgdfError(
-            f"'{name}' is not a valid layer name; choose one with --name, for example --name shirt"
-        )
-    if not is_portable(name):
-        raise ProgdfError(
-            f"'{name}' is not a valid layer name, as Windows cannot have a file of that name; "
-            "choose one with --name, for example --name shirt"
+            f"'{name}' is not a valid layer name{why}; choose one with --name, for example --name shirt"
         )
     if len(f"{name}.gdf".encode()) > _LONGEST_NAME:
         raise ProgdfError(f"the name '{name[:20]}…' is too long for a file; choose another one with --name")

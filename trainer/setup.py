@@ -27,7 +27,7 @@ from progdf.threads import map_threads, threads
 from .editors.base import ImageEditor
 from .editors.pictures import picture_cameras
 from .editors.procedural import ColorEditor, StripesEditor
-from .options import COLOR_VIEWS, VIEWS, Kind, ViewOptions
+from .options import COLOR_VIEWS, ELEVATIONS, VIEWS, Kind, ViewOptions
 from .store.progress import Advance
 from .store.run_folder import LazySequence, RunFolder, add_pictures, from_bytes, stored_pictures, to_bytes
 from .views.choose import ViewChoice, choose_views, split_views
@@ -132,7 +132,7 @@ def make_training_setup(options: ViewOptions, scene: Gaussians, region: Region) 
         if options.cameras is not None:
             fitted = [fit_size(camera, size) for camera in given]
         else:
-            fitted = region_rig(scene, region, count, size, up.direction)
+            fitted = region_rig(scene, region, count, size, up.direction, ELEVATIONS[options.dense])
         fitted = [replace(c, sampling=SAMPLING) for c in fitted] if options.dense else fitted
         return with_near_plane(name_cameras(fitted), scene)
 

@@ -249,10 +249,6 @@ def plan_colors(
         made = between.edit(strengths, [*train, *setup.held_out]) if between is not None else edited
         return [target(s, made[s]) for s in strengths]
 
-    def look(s: float) -> Judge:
-        assert between is not None
-        return judge(between.look(s, judging))
-
     with log.stage("weights"):
         drawn = draw(train)
         aside = draw(held_out) if held_out else drawn
@@ -272,7 +268,7 @@ def plan_colors(
         strengths = strengths or [0.5]
     course = Course(ask(strengths) if strengths else [], finished)
     if between is not None:
-        course = replace(course, look=cache(look), ask=ask)
+        course = replace(course, look=cache(lambda s: judge(between.look(s, judging))), ask=ask)
     with log.stage("model"):
         middle = len(course.targets) // 2 if between is None else 0
         spare = 0.0 if target_psnr is None else 10 ** (-target_psnr / 10)

@@ -141,8 +141,9 @@ _PLASTIC = 1.324718
 
 
 def region_rig(
-    scene: Gaussians, region: Region, count: int, image_size: int, up: Tensor | None = None
-) -> list[Camera]:
+    scene: Gaussians, region: Region, count: int, image_size: int, up: Tensor | None = None,
+    elevations: tuple[float, float] = (5.0, 60.0),
+) -> list[Camera]:  # fmt: skip
     """The orbit rig of the scene, aimed at the region and zoomed in on it.
 
     The cameras stand where those of the whole scene would, so nothing new comes between them and the region.
@@ -155,10 +156,11 @@ def region_rig(
         count: how many, ≥ 1
         image_size: both sides in pixels
         up: world direction that is up, [3]; None guesses it
+        elevations: see `orbit_rig`
     """
     up = guess_up(scene) if up is None else up
     center, radius = region_sphere(scene, region)
-    rig = orbit_rig(scene, count, image_size, image_size, up=up)
+    rig = orbit_rig(scene, count, image_size, image_size, up=up, elevations=elevations)
     shares = (0.8 - 0.3 * ((0.5 + i / _PLASTIC) % 1.0) for i in range(count))
     return [frame_sphere(camera, center, radius, next(shares), up) for camera in rig]
 

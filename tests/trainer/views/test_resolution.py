@@ -8,10 +8,12 @@ from pathlib import Path
 import pytest
 import torch
 
+from progdf.io.cameras import save_cameras
 from progdf.region import Region
+from progdf.scene.orbit_rig import orbit_rig
 from tests.helpers.demo_scenes import bear
 from tests.helpers.trained import quick_options
-from trainer.options import ViewOptions
+from trainer.options import EditorOptions, ViewOptions
 from trainer.resolve import resolve
 from trainer.run.training import pixel_stride
 from trainer.setup import SAMPLING, SIZE, TrainingSetup, make_training_setup
@@ -37,6 +39,34 @@ def test_an_edit_of_colors_has_more_views_and_what_was_typed_is_kept() -> None:
 def test_an_edit_of_colors_is_meant_for_larger_pictures(dense: bool, sampling: float) -> None:
     setup = setup_of(views=5, dense=dense)
     assert {view.camera.sampling for view in setup.views} == {sampling}
+
+
+@pytest.mark.parametrize(("dense", "lowest", "highest"), [(True, 0.0, 89.0), (False, 5.0, 60.0)])
+def test_an_edit_of_colors_is_looked_at_from_all_over_the_horizon(
+    dense: bool, lowest: float, highest: float
+) -> None:
+    setup = setup_of(views=60, dense=dense, up="+y")
+    ahead = torch.stack([view.camera.viewmat[2, :3] for view in setup.views])
+    rises = -ahead[:, 1].asin().rad2deg()
+    assert lowest - 0.1 <= float(rises.min()) <= lowest + 2.0
+    # even in area: of 60 views the highest is at 80°
+    assert highest - 10.0 <= float(rises.max()) <= highest + 0.1
+
+
+@pytest.mark.parametrize("beside", ["", "views", "views/edited"])
+def test_pictures_of_a_run_are_of_its_own_cameras(tmp_path: Path, beside: str) -> None:
+    pictures, given = tmp_path / "views" / "edited", tmp_path / "others.json"
+    pictures.mkdir(parents=True)
+    options = quick_options(tmp_path, editor=f"folder:{pictures}")
+    assert resolve(options).views.cameras is None
+    path = tmp_path / beside / "cameras.json"
+    path.write_text("[]", encoding="utf-8")  # of some other program
+    assert resolve(options).views.cameras is None
+    save_cameras(path, orbit_rig(bear(400).gaussians, 3, 20, 20))
+    assert resolve(options).views.cameras == path
+    assert resolve(replace(options, editor=EditorOptions("recolor:#f00"))).views.cameras is None
+    said = replace(options, views=replace(options.views, cameras=given))
+    assert resolve(said).views.cameras == given
 
 
 def test_what_is_painted_view_by_view_a_draft_and_the_papers_way_are_as_they_look() -> None:
