@@ -303,6 +303,7 @@ def run_regret(options: RegretOptions) -> Table:
     edit = begin_edit(scene, region, options.editor)
     camera = edit.setup.train[0].camera
     judge = edit.judge()
+    edit.automatic(judge)  # what is loaded at the first use is not counted
     model, _, line, automatic = edit.automatic(judge)
     print_line(line)
     results = [automatic]
