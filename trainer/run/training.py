@@ -235,7 +235,7 @@ def plan_colors(
     train, judging = setup.train, held_out or setup.train
 
     def draw(views: Sequence[View]) -> list[ColorView]:
-        make = partial(crop_scene, scene, members, background=setup.background, still=True)
+        make = partial(crop_scene, scene, members, background=setup.background)
         return color_views(LazySequence(views, lambda v: make(v.camera, v.box)), original, every)
 
     def judge(pictures: Sequence[Tensor]) -> Judge:
