@@ -263,9 +263,7 @@ def plan_colors(
             fewer = solve_again(model, make_solver(drawn[::2], original), targets[::2], half[1])
             if fewer[1].error <= LEVEL:
                 (solver, model), finished, train = fewer, half, train[::2]
-    strengths = [s for s in edited if s < 1.0]
-    if between is not None and (model.bands > 1 or model.richer is not None):
-        strengths = strengths or [0.5]
+    strengths = [s for s in edited if s < 1.0] or [0.5] * (between is not None)
     course = Course(ask(strengths) if strengths else [], finished)
     if between is not None:
         course = replace(course, look=cache(lambda s: judge(between.look(s, judging))), ask=ask)

@@ -236,6 +236,13 @@ def test_every_view_is_kept_before_and_after(done: RunResult) -> None:
         assert picture.width > 600
 
 
+def test_half_of_an_edit_is_solved_for_even_where_it_lies_on_a_straight_way(folder: Path) -> None:
+    """What bends both ways does so there as well."""
+    options = quick_options(folder, "straight", editor="grade:exposure=0.2", stages=0, views=6)
+    strengths = train(options, quiet=True).report["effort"]["strengths"]
+    assert strengths == [0.5, 1.0]
+
+
 def test_the_kept_pictures_of_a_run_are_a_folder_that_can_be_trained_from(
     folder: Path, done: RunResult
 ) -> None:
