@@ -292,9 +292,9 @@ def list_table(cases: Sequence[RasterCase], rounds: int = 9) -> Table:
         "pixels",
         "weights left out",
         "listed, of the processor (ms)",
-        "without these",
+        "listed without these (ms)",
         "picture and gradient, of the processor (ms)",
-        "without these ",
+        "picture and gradient without these (ms)",
         "largest difference",
         "its bound",
     )

@@ -592,7 +592,7 @@ def list_weights(
     listed: Listed, out: Runs,
 ) -> tuple[int, int]:  # fmt: skip
     """List what the splats weigh in tiles begin … end − 1: how many runs, and entries, which may be more than
-    there was room for; for a run of each splat in each of the tiles there is."""
+    there was room for; for runs there always is."""
     run = entry = 0
     for tile in range(begin, end):
         own = lists.members[lists.starts[tile] : lists.starts[tile + 1]]

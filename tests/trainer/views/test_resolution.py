@@ -42,7 +42,7 @@ def test_an_edit_of_colors_is_meant_for_larger_pictures(dense: bool, sampling: f
 
 
 @pytest.mark.parametrize(("dense", "lowest", "highest"), [(True, 0.0, 89.0), (False, 5.0, 60.0)])
-def test_an_edit_of_colors_is_looked_at_from_all_over_the_horizon(
+def test_an_edit_of_colors_is_looked_at_from_level_and_from_above(
     dense: bool, lowest: float, highest: float
 ) -> None:
     setup = setup_of(views=60, dense=dense, up="+y")
