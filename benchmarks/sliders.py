@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from statistics import fmean
 from typing import Any, Literal
@@ -37,7 +38,7 @@ from trainer.report.report import stack_plots, thumbnail
 from trainer.resolve import resolve, use_threads
 from trainer.run.demo import Effort, write_scene
 from trainer.run.resume import find_run
-from trainer.setup import make_training_setup
+from trainer.setup import make_training_setup, take_glances
 from trainer.store.run_folder import write_json
 from trainer.views.view import crop, render_view
 
@@ -232,8 +233,9 @@ def _truth(case: SliderCase, opened: OpenedRun, scene: DemoScene) -> Pictures:
     setup = opened.setup
     boxes = [shown.box for shown in opened.evaluator.crops]
     if case.editor:
-        views = setup.views
-        editor = make_editor(EditorOptions(case.editor), setup.scene, setup.region, views)
+        options = EditorOptions(case.editor)
+        glances = partial(take_glances, opened.run.record.plan.views, setup.scene, setup.region)
+        editor = make_editor(options, setup.scene, setup.region, setup.views, glances)
 
         def pictures(s: float) -> list[Tensor]:
             return [editor.edit(view, s) for view in setup.judging]

@@ -51,9 +51,6 @@ LARGEST_SEED = 2**32 - 1
 VIEWS, COLOR_VIEWS = 30, (40, 48)
 """How many views are edited by default, and how many of an edit of colors: where these have up to one band of
 directions, and where they have more (docs/experiments.md, Views)."""
-ELEVATIONS = (5.0, 60.0), (0.0, 89.0)
-"""Of a rig's views, degrees above the horizon; and of those of an edit of colors, which stand all over that
-half of the sphere (docs/experiments.md, Views)."""
 
 
 @dataclass(frozen=True)

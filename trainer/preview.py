@@ -20,7 +20,7 @@ import tempfile
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -46,6 +46,7 @@ from trainer.editors.instruct import InstructEditor, instruct
 from trainer.fit.draft import DraftViews, draft_grade, draft_views
 from trainer.options import EditorOptions, RegionOptions, ViewOptions
 from trainer.regions.from_pictures import RegionRequest, region_kinds
+from trainer.setup import take_glances
 from trainer.views.view import View, make_view, with_near_plane
 
 _Row3 = tuple[float, float, float]
@@ -120,7 +121,7 @@ class Previewer:
         check_new_editor(options)
         if options.family not in COLOR_FUNCTIONS:
             return None
-        views = self._views(request, request.editor)
+        views = self._views(request)
         return None if views is None else draft_grade(views, options, options.family)
 
     def palette(self, request: Request) -> list[str]:
@@ -129,17 +130,17 @@ class Previewer:
         Raises:
             ProgdfError: the region does not work.
         """
-        views = self._views(request, "grade:exposure=0.5")
+        views = self._views(request)
         if views is None:
             return []
         row = views.fitted.row
         colors = find_palette(row.inside.reshape(-1, 3), row.mask.reshape(-1))
         return [hex_color(color) for color in colors.tolist()]
 
-    def _views(self, request: Request, editor: str) -> DraftViews | None:
+    def _views(self, request: Request) -> DraftViews | None:
         if self._draft[0] != request.region:
             region = self._region(request.region)
-            views = draft_views(ViewOptions(scene=self._path), editor, self.scene, region)
+            views = draft_views(ViewOptions(scene=self._path), self.scene, region)
             self._draft = request.region, views
         return self._draft[1]
 
@@ -188,7 +189,9 @@ class Previewer:
 
     def _make_editor(self, options: EditorOptions, seen: Request) -> ImageEditor:
         check_new_editor(options)
-        return make_editor(options, self.scene, self._region(seen.region), [self._view(seen)])
+        region = self._region(seen.region)
+        glances = partial(take_glances, ViewOptions(scene=self._path), self.scene, region)
+        return make_editor(options, self.scene, region, [self._view(seen)], glances)
 
 
 def serve(argv: Sequence[str]) -> int:

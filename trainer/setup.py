@@ -21,23 +21,26 @@ from progdf.io.picture_camera import up_in_picture
 from progdf.rasterize.engines import engine_device
 from progdf.region import Region
 from progdf.scene.bounds import is_surrounding
+from progdf.scene.orbit_rig import ELEVATIONS, HALF_SPHERE
 from progdf.scene.up_axis import UpAxis, find_up, up_from_json
 from progdf.threads import map_threads, threads
 
 from .editors.base import ImageEditor
 from .editors.pictures import picture_cameras
 from .editors.procedural import ColorEditor, StripesEditor
-from .options import COLOR_VIEWS, ELEVATIONS, VIEWS, Kind, ViewOptions
+from .options import COLOR_VIEWS, VIEWS, Kind, ViewOptions
 from .store.progress import Advance
 from .store.run_folder import LazySequence, RunFolder, add_pictures, from_bytes, stored_pictures, to_bytes
-from .views.choose import ViewChoice, choose_views, split_views
+from .views.choose import ViewChoice, choose_views, in_frame, sample_members, split_views
 from .views.crops import CropScene, crop_scene
 from .views.view import (
     BACKGROUND,
     INSIDE,
+    Glance,
     View,
     crop,
     fit_size,
+    glances,
     make_view,
     name_cameras,
     region_rig,
@@ -56,6 +59,10 @@ PICTURE_SIZE = 512
 """The longest side at which a changed picture is trained on."""
 
 _PROBES = 3
+_GLANCES, _GLANCE_SIZE = 8, 192
+"""Of a large scene fewer, so that a draft of a million Gaussians takes seconds; up to 24 make none better by
+.1 dB, and smaller ones mix colors, and the region's own with them."""
+_GLANCED = 3_000_000  # Gaussians are looked at in all of them
 
 Pictures = Mapping[float, Sequence[Tensor]]
 """Strength → whole edited pictures, one per view. [H,W,3] each"""
@@ -132,7 +139,8 @@ def make_training_setup(options: ViewOptions, scene: Gaussians, region: Region) 
         if options.cameras is not None:
             fitted = [fit_size(camera, size) for camera in given]
         else:
-            fitted = region_rig(scene, region, count, size, up.direction, ELEVATIONS[options.dense])
+            elevations = HALF_SPHERE if options.dense else ELEVATIONS
+            fitted = region_rig(scene, region, count, size, up.direction, elevations)
         fitted = [replace(c, sampling=SAMPLING) for c in fitted] if options.dense else fitted
         return with_near_plane(name_cameras(fitted), scene)
 
@@ -150,6 +158,27 @@ def make_training_setup(options: ViewOptions, scene: Gaussians, region: Region) 
             "edited copies of photographs go in with --editor photographs:EDITED,ORIGINALS"
         )
     return TrainingSetup(scene, region, train, held_out, background, notes, up)
+
+
+def take_glances(options: ViewOptions, scene: Gaussians, region: Region) -> list[Glance]:
+    """The region from all around, however many views it is edited in and however large these are.
+
+    The first few of the given cameras' that show it, spread over their list, or a rig's; none where the scene
+    is one to stand inside and has no cameras.
+    """
+    given = [] if options.cameras is None else load_cameras(options.cameras, scene.origin)
+    up = find_up(scene, given, options.up, options.scene).direction
+    count = max(3, min(_GLANCES, _GLANCED // len(scene)))
+    if given:
+        spread = sorted(range(len(given)), key=lambda i: math.sqrt(2.0) * i % 1.0)
+        places = scene.means[sample_members(scene, region)]
+        spread.sort(key=lambda i: not bool(in_frame(places, given[i]).any()))  # those first that may show it
+        cameras = [fit_size(given[i], _GLANCE_SIZE) for i in spread]
+    elif is_surrounding(scene, up):
+        return []
+    else:
+        cameras = region_rig(scene, region, count, _GLANCE_SIZE, up, HALF_SPHERE)
+    return glances(scene, region, with_near_plane(cameras, scene), count)
 
 
 def _rig_views(
@@ -195,10 +224,8 @@ def _picture_setup(
     """The views of changed pictures. All are trained on: what one shows no other may."""
     background, size = torch.tensor(BACKGROUND), options.image_size or PICTURE_SIZE
     cameras = [fit_size(camera, size) for camera in picture_cameras(options.pictures, given, scene.origin)]
-    views = [
-        make_view(scene, region, camera, background)
-        for camera in with_near_plane(name_cameras(cameras), scene)
-    ]
+    cameras = with_near_plane(name_cameras(cameras), scene)
+    views = [make_view(scene, region, camera, background) for camera in cameras]
     for view, path in zip(views, options.pictures, strict=True):
         if not bool((view.mask > 0).any()):
             raise ProgdfError(f"{path} does not show the region '{region.name}'; leave it out")
@@ -235,24 +262,20 @@ def edit_views(
         advance: progress
         course: the editor's way of a view, see `edit_course`
     """
-    paths = {
-        strength: [folder.view("edited", v.camera.name, strength) for v in views] for strength in strengths
-    }
 
     def edit(request: Sequence[tuple[float, int]]) -> list[Tensor]:
         made = []
         for strength, i in request:
             whole = course(views[i])(strength)
             made.append(to_bytes(views[i].confine(whole) if is_confined else whole))
-            write_image(paths[strength][i], from_bytes(made[-1]))
+            write_image(folder.view("edited", views[i].camera.name, strength), from_bytes(made[-1]))
         return made
 
-    add_pictures(folder.views, [path for some in paths.values() for path in some])
+    add_pictures(folder.views, [folder.view("edited", v.camera.name, s) for s in strengths for v in views])
     edited: dict[float, list[Tensor]] = {strength: [] for strength in strengths}
     together = isinstance(editor, ColorEditor | StripesEditor)  # the others have a network, or use all cores
-    requests = [[(strength, i)] for strength in strengths for i in range(len(views))]
-    if together and strengths:
-        requests = [[(strength, i) for strength in strengths] for i in range(len(views))]
+    groups = [strengths] if together and strengths else [[strength] for strength in strengths]
+    requests = [[(strength, i) for strength in group] for group in groups for i in range(len(views))]
     with ThreadPoolExecutor(threads()) as pool:
         made = pool.map(edit, requests) if together else map(edit, requests)
         try:

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import compress
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -41,7 +42,14 @@ from trainer.optimize.retime import smooth_course
 from trainer.options import EditorOptions, FieldOptions, OptimizeOptions, ViewOptions
 from trainer.resolve import use_threads
 from trainer.run.training import Strengths, plan_colors
-from trainer.setup import Pictures, TrainingSetup, make_training_setup, quantize_image, widen_views
+from trainer.setup import (
+    Pictures,
+    TrainingSetup,
+    make_training_setup,
+    quantize_image,
+    take_glances,
+    widen_views,
+)
 from trainer.store.progress import RunLog
 from trainer.views.choose import choose_views, split_held_out
 from trainer.views.crops import CropScene, crop_scene
@@ -287,7 +295,9 @@ class Edit:
 def begin_edit(scene: Gaussians, region: Region, editor: str) -> Edit:
     """From the views that a run takes by itself."""
     setup = make_training_setup(ViewOptions(), scene, region)
-    return Edit(scene, region, editor, make_editor(EditorOptions(editor), scene, region, setup.views), setup)
+    glances = partial(take_glances, ViewOptions(), scene, region)
+    painter = make_editor(EditorOptions(editor), scene, region, setup.views, glances)
+    return Edit(scene, region, editor, painter, setup)
 
 
 def run_regret(options: RegretOptions) -> Table:

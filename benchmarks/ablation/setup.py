@@ -6,6 +6,7 @@ import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TypeVar
 
 from torch import Tensor
@@ -25,6 +26,7 @@ from trainer.setup import (
     confines_edit,
     editor_strengths,
     quantize_image,
+    take_glances,
     widen_views,
 )
 from trainer.store.run_folder import read_views
@@ -134,7 +136,8 @@ def editor_pictures(
         strengths: at which, or at how many, these equally far apart
     """
     options = replace(run.record.plan.editor, cache=run.folder.paintings)
-    editor = make_editor(options, run.scene, run.region, all_views)
+    glances = partial(take_glances, run.record.plan.views, run.scene, run.region)
+    editor = make_editor(options, run.scene, run.region, all_views, glances)
     is_confined = confines_edit(editor, run.record.kind)
 
     def picture(view: View, strength: float) -> Tensor:

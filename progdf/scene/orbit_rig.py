@@ -21,6 +21,9 @@ _log = logging.getLogger(__name__)
 _GOLDEN = (math.sqrt(5) - 1) / 2
 
 
+ELEVATIONS, HALF_SPHERE = (5.0, 60.0), (0.0, 89.0)
+"""Degrees above the horizon: where one mostly looks from, and all over that half of the sphere."""
+
 _RIG_FOV = math.radians(60)
 """Field of view at which a distance of 2.2 radii leaves a margin of a tenth: sin 30° is 1.1 / 2.2."""
 
@@ -32,7 +35,7 @@ def orbit_rig(
     height: int,
     fov_y: float = _RIG_FOV,
     up: Tensor | None = None,
-    elevations: tuple[float, float] = (5.0, 60.0),
+    elevations: tuple[float, float] = ELEVATIONS,
     distance: float = 2.2,
 ) -> list[Camera]:
     """Cameras all around a scene that has none, in order of azimuth.

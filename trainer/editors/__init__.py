@@ -11,7 +11,7 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.region import Region
 from trainer.options import EditorOptions
-from trainer.views.view import View
+from trainer.views.view import Glance, View
 
 from .base import EditorInput, ImageEditor
 from .decal import check_decal, decal
@@ -83,8 +83,9 @@ def check_new_editor(options: EditorOptions) -> None:
 
 
 def make_editor(
-    options: EditorOptions, scene: Gaussians, region: Region, views: Sequence[View]
-) -> ImageEditor:
-    """The editor that the options name, for one region and its views; ProgdfError says what is wrong."""
+    options: EditorOptions, scene: Gaussians, region: Region, views: Sequence[View],
+    glances: Callable[[], Sequence[Glance]] = list,
+) -> ImageEditor:  # fmt: skip
+    """The editor that the options name, see `EditorInput`; ProgdfError says what is wrong."""
     kind, what = check_editor(options.editor)
-    return EDITORS[kind].make(EditorInput(what, scene, region, views, options))
+    return EDITORS[kind].make(EditorInput(what, scene, region, views, options, glances))

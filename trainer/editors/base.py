@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -11,7 +11,7 @@ from torch import Tensor
 from progdf.gaussians import Gaussians
 from progdf.region import Region
 from trainer.options import EditKind, EditorOptions
-from trainer.views.view import View
+from trainer.views.view import Glance, View
 
 
 @dataclass(frozen=True)
@@ -23,6 +23,8 @@ class EditorInput:
     region: Region
     views: Sequence[View]
     options: EditorOptions
+    # the region at a glance, the same whatever its views; where there are none its color is that of the views
+    glances: Callable[[], Sequence[Glance]] = list
 
 
 class ImageEditor(Protocol):

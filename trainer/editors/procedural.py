@@ -7,7 +7,8 @@ They edit the region's own color, unmixed from what shares a pixel with it, and 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -27,21 +28,30 @@ _COVER = 0.75  # of the old contrast is lost under a stripe
 _STRIPES = 7  # across the longest side of the region
 
 
-@dataclass(frozen=True)
-class ColorEditor:
-    """A function of color and strength, applied to each pixel's share of the region."""
+class ProceduralEditor(ABC):
+    """An `ImageEditor` of colors, at any strength."""
 
-    change: Callable[[Tensor], color.Course]
     kind: EditKind = "color"
     stages: tuple[float, ...] = ()
-    is_confined: bool = True
+    is_confined = True
+
+    @abstractmethod
+    def course(self, view: View) -> Callable[[float], Tensor]:
+        """`edit` of one view at many strengths, which share most of the work."""
 
     def edit(self, view: View, strength: float) -> Tensor:
         """See `ImageEditor.edit`."""
         return self.course(view)(strength)
 
+
+@dataclass(frozen=True)
+class ColorEditor(ProceduralEditor):
+    """A function of color and strength, applied to each pixel's share of the region."""
+
+    change: Callable[[Tensor], color.Course]
+
     def course(self, view: View) -> Callable[[float], Tensor]:
-        """`edit` of one view at many strengths, which share most of the work."""
+        """See `ProceduralEditor`."""
         visible = view.mask > 0
         change = self.change(view.inside[visible])
 
@@ -54,7 +64,7 @@ class ColorEditor:
 
 
 @dataclass(frozen=True)
-class StripesEditor:
+class StripesEditor(ProceduralEditor):
     """A pattern painted on the Gaussians themselves and rendered: the same stripes from everywhere."""
 
     scene: Gaussians  # the original
@@ -63,9 +73,6 @@ class StripesEditor:
     target: Tensor  # color of the stripes, sRGB 0..1. [3]
     typical: Tensor  # color of the region, sRGB 0..1. [3]
     path: ColorPath = "bowed"  # see `bend_of`
-    kind: EditKind = "color"
-    stages: tuple[float, ...] = ()
-    is_confined: bool = True
 
     def paint(self, rgb: Tensor) -> color.Course:
         """The members' colors [M,3] under the paint, which takes most of the old texture's contrast away."""
@@ -74,12 +81,8 @@ class StripesEditor:
         bend = bend_of(self.typical, self.target, self.path)
         return lambda strength: interpolate_colors(rgb, under, strength * self.pattern, bend)
 
-    def edit(self, view: View, strength: float) -> Tensor:
-        """See `ImageEditor.edit`."""
-        return self.course(view)(strength)
-
     def course(self, view: View) -> Callable[[float], Tensor]:
-        """`edit` of one view at many strengths, rendered where the region shows."""
+        """See `ProceduralEditor`; rendered where the region shows."""
         scene, members, camera = self.scene, self.members, view.camera
         paint = self.paint(seen_colors(scene[members], camera))
         x0, y0, x1, y1 = box = region_box(view.mask, 0, 0.0)
@@ -98,42 +101,42 @@ class StripesEditor:
 
 
 @dataclass(frozen=True)
-class RemoveEditor:
+class RemoveEditor(ProceduralEditor):
     """Opacity of the region falls to nothing, and what is behind appears; holes are not closed."""
 
     scene: Gaussians  # the original
     members: Tensor  # rows of the region. [M] int64
     background: Tensor  # rgb. [3]
-    kind: EditKind = "geometry"
-    stages: tuple[float, ...] = ()
-    is_confined: bool = True
+    kind = "geometry"
 
-    def edit(self, view: View, strength: float) -> Tensor:
-        """See `ImageEditor.edit`."""
-        if strength == 0.0:
-            return view.image
-        opacities = self.scene.opacities
-        opacities[self.members] *= 1.0 - strength
-        faded = replace(self.scene, logit_opacities=opacities.logit())
-        return render_view(faded, view.camera, self.background).clamp(0.0, 1.0)
+    def course(self, view: View) -> Callable[[float], Tensor]:
+        """See `ProceduralEditor`."""
+
+        def edit(strength: float) -> Tensor:
+            if strength == 0.0:
+                return view.image
+            opacities = self.scene.opacities
+            opacities[self.members] *= 1.0 - strength
+            faded = replace(self.scene, logit_opacities=opacities.logit())
+            return render_view(faded, view.camera, self.background).clamp(0.0, 1.0)
+
+        return edit
 
 
 def edit_course(editor: ImageEditor, view: View) -> Callable[[float], Tensor]:
     """`editor.edit` of one view at many strengths."""
-    if isinstance(editor, ColorEditor | StripesEditor):
-        return editor.course(view)
-    return partial(editor.edit, view)
+    return editor.course(view) if isinstance(editor, ProceduralEditor) else partial(editor.edit, view)
 
 
 def recolor(given: EditorInput) -> ColorEditor:
     """`recolor:#rrggbb[,path=hue]`: another color, the shading kept."""
-    (target, path), typical = paint_of(given.what), region_color(given.views)
+    (target, path), typical = paint_of(given.what), region_color(given)
     return ColorEditor(lambda rgb: color.recolor_course(rgb, target, typical, path))
 
 
 def tint(given: EditorInput) -> ColorEditor:
     """`tint:#rrggbb[,path=hue]`: a wash of color, lightness kept."""
-    (target, path), typical = paint_of(given.what), region_color(given.views)
+    (target, path), typical = paint_of(given.what), region_color(given)
     return ColorEditor(lambda rgb: color.tint_course(rgb, target, typical, path))
 
 
@@ -162,7 +165,7 @@ def stripes(given: EditorInput) -> StripesEditor:
     points = given.scene.means[members]
     axis, period, phase = stripe_frame(points)
     pattern = color.stripe_pattern(points, axis, period, phase)
-    return StripesEditor(given.scene, members, pattern, target, region_color(given.views), path)
+    return StripesEditor(given.scene, members, pattern, target, region_color(given), path)
 
 
 def remove(given: EditorInput) -> RemoveEditor:
@@ -180,12 +183,12 @@ def stripe_frame(points: Tensor) -> tuple[Tensor, float, float]:
     return axis, period, 0.5 - float(low[longest]) / period
 
 
-def region_color(views: Sequence[View]) -> Tensor:
-    """The region's typical color over all views, so that each view's edit is one function. [3]"""
-    pairs = [(view, view.mask > 0.0) for view in views]
+def region_color(given: EditorInput) -> Tensor:
+    """The region's typical color: an edit is one function of color, whichever views it is asked in. [3]"""
+    pairs = [(seen, seen.mask > 0.0) for seen in given.glances() or given.views]
     return color.typical_color(
-        torch.cat([view.inside[shown] for view, shown in pairs]),
-        torch.cat([view.mask[shown] for view, shown in pairs]),
+        torch.cat([seen.inside[shown] for seen, shown in pairs]),
+        torch.cat([seen.mask[shown] for seen, shown in pairs]),
     )
 
 

@@ -7,7 +7,6 @@ Gaussians need beside it. Whether the map carries the edit is measured on views 
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -15,37 +14,25 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from progdf.camera import Camera
 from progdf.field.baked import MONOMIALS, BakedField, identity_map
 from progdf.field.grade import map_colors, map_form, member_bands
 from progdf.gaussians import BASE_CHANNELS, Gaussians, pack
 from progdf.gdf.file import Gdf, fingerprint
-from progdf.io.cameras import load_cameras
 from progdf.metrics.image import ROUNDING, decibels
-from progdf.rasterize import activate, render
-from progdf.rasterize.engines import color_map
 from progdf.region import Region
-from progdf.scene.bounds import is_surrounding
-from progdf.scene.up_axis import find_up
-from progdf.sh import basis
 from trainer.editors import COLOR_FUNCTIONS, make_editor
 from trainer.editors.procedural import edit_course
 from trainer.optimize.color_views import MORE_PAYS, ColorView, MapFit, fit_maps
 from trainer.options import MOST_STAGES, EditorOptions, ViewOptions
-from trainer.views.view import BACKGROUND, View, fit_size, region_rig, with_near_plane
+from trainer.setup import take_glances
+from trainer.views.view import BACKGROUND, Glance, View, render_view
 
 from .slider_uniformity import equalized_strengths
 
 CARRIED = 0.1
 """Of what an edit changes, mean square: a grade that leaves more does not carry it."""
 
-_SIZE = 192  # pixels of a view; smaller ones mix colors, and the region's typical color with them
-_ROUNDS, _VIEWS = 5, 3  # most rounds of new views, and views of a round, of which one is not fitted to
-_SECONDS = 0.5  # of the processor, after which no round follows
-_SETTLED = 0.99  # of the error: what the views of a round must get it below, for another round to follow
-_EVERY = 5  # which of its pixels, along the rows, are looked at
 _FITTED, _JUDGED = 1500, 500  # pixels that represent those of all views; a map has 60 numbers at most
-_EVENED = 6  # every such one of them decides how fast the slider goes
 
 
 @dataclass(frozen=True)
@@ -65,64 +52,39 @@ class DraftViews:
 
     scene: Gaussians
     region: Region
+    glances: Sequence[Glance]
     fitted: _Pixels
     judged: _Pixels  # of views that nothing is fitted to
 
 
-def draft_views(options: ViewOptions, editor: str, scene: Gaussians, region: Region) -> DraftViews | None:
-    """A few small views; more of them as long as these take a hundredth of the error away.
-
-    None where nothing is to be seen: no view shows the region, or the scene is one to stand inside.
+def draft_views(options: ViewOptions, scene: Gaussians, region: Region) -> DraftViews | None:
+    """The region at a glance; None where fewer than two show it, or the scene is one to stand inside.
 
     Args:
         options: see `ViewOptions`
-        editor: whose error decides how many there are
         scene: the original
         region: what is edited
     """
-    given = [] if options.cameras is None else load_cameras(options.cameras, scene.origin)
-    up = find_up(scene, given, options.up, options.scene).direction
-    if given:
-        cameras = [fit_size(c, _SIZE) for c in given[:: -(-len(given) // (_ROUNDS * _VIEWS))]]
-    elif is_surrounding(scene, up):
+    glances = take_glances(options, scene, region)
+    looked = [_look(scene, region, one) for one in glances]
+    parts = [[look for i, look in enumerate(looked) if (i % 3 == 1) is aside] for aside in (False, True)]
+    samples = [_sample(part, most) for part, most in zip(parts, (_FITTED, _JUDGED), strict=True) if part]
+    if len(samples) < 2 or not all(len(sample.maps.design) for sample in samples):
         return None
-    else:
-        cameras = region_rig(scene, region, _ROUNDS * _VIEWS, _SIZE, up)
-    began, looked, views = time.process_time(), list[tuple[View, ColorView]](), None
-    for number in range(_ROUNDS):
-        added = with_near_plane(cameras[number::_ROUNDS], scene)
-        looked += [_look(scene, region, camera) for camera in added]
-        last, fitted = views, [look for i, look in enumerate(looked) if i % _VIEWS != _VIEWS // 2]
-        parts = _sample(fitted, _FITTED), _sample(looked[_VIEWS // 2 :: _VIEWS], _JUDGED)
-        if not all(len(part.maps.design) for part in parts):
-            return None
-        views = DraftViews(scene, region, *parts)
-        settled = last is not None and not _gains(last, views, editor)
-        if settled or time.process_time() - began > _SECONDS:
-            break
-    return views
+    return DraftViews(scene, region, glances, *samples)
 
 
-def _look(scene: Gaussians, region: Region, camera: Camera) -> tuple[View, ColorView]:
-    """`make_view` and `color_view` of some pixels, as one row, of which each Gaussian is projected twice at
-    most."""
-    members, background = region.members, torch.tensor(BACKGROUND)
-    weights = basis(min(scene.sh_degree, 3), torch.nn.functional.normalize(scene.means - camera.position))
-    colors = torch.einsum("nb,nbc->nc", weights, scene.sh[:, : weights.shape[1]]) + 0.5
-    pixels, shown = torch.arange(camera.width * camera.height)[::_EVERY], colors[members]
-    count, activated = len(pixels), activate(scene, colors.clamp_min(0.0))
-    weighed = color_map(activated, camera, (0, 0, camera.width, camera.height), members, pixels=pixels)
-    share = weighed.picture(torch.ones(len(members), 3))[..., :1]
-    drawn = weighed.picture(shown.clamp_min(0.0))
-    others = (1.0 - share) * background
-    if len(members) < len(scene):
-        with torch.no_grad():
-            others = render(activated, camera, background).image.flatten(0, 1)[pixels] - drawn
-    image, mask = (others + drawn).clamp(0.0, 1.0), share[:, 0].clamp(0.0, 1.0)
-    inside = (drawn / share.clamp_min(1e-4)).clamp(0.0, 1.0)
-    view = View(camera, image[None], mask[None], inside[None], (0, 0, count, 1))
-    row, counts = torch.arange(count), torch.ones_like(share, dtype=torch.bool)
-    return view, ColorView(weighed, others, weights[members], shown, (1, count), row, counts)
+def _look(scene: Gaussians, region: Region, glance: Glance) -> tuple[View, ColorView]:
+    """A glance as views of one row."""
+    background = torch.tensor(BACKGROUND)
+    drawn = glance.map.picture(glance.colors.clamp_min(0.0))
+    others = (1.0 - glance.mask[:, None]) * background
+    if len(region) < len(scene):
+        others = render_view(scene, glance.camera, background).flatten(0, 1)[glance.pixels] - drawn
+    image, count = (others + drawn).clamp(0.0, 1.0), len(drawn)
+    view = View(glance.camera, image[None], glance.mask[None], glance.inside[None], (0, 0, count, 1))
+    row, counts = torch.arange(count), torch.ones_like(image[:, :1], dtype=torch.bool)
+    return view, ColorView(glance.map, others, glance.basis, glance.colors, (1, count), row, counts)
 
 
 def _sample(looked: Sequence[tuple[View, ColorView]], most: int) -> _Pixels:
@@ -135,21 +97,9 @@ def _sample(looked: Sequence[tuple[View, ColorView]], most: int) -> _Pixels:
 
     image, mask, inside = (gather([getattr(v, n) for v, _ in looked]) for n in ("image", "mask", "inside"))
     row = View(looked[0][0].camera, image, mask, inside, (0, 0, image.shape[1], 1))
-    weights = torch.zeros(len(views[0].original))
-    for view, places in zip(views, maps.pixels, strict=True):
-        weights += view.map.gradient(torch.zeros_like(view.others).index_fill_(0, places, 1.0))[:, 0]
-    seen = weights.nonzero()[:, 0]
+    weights = [view.map.gradient(torch.ones_like(view.others))[:, 0] for view in views]
+    seen = torch.stack(weights).sum(dim=0).nonzero()[:, 0]
     return _Pixels(row, replace(maps, pixels=[torch.arange(image.shape[1])]), views, maps.pixels, seen)
-
-
-def _gains(last: DraftViews, views: DraftViews, spec: str) -> bool:
-    """Whether more views have made a map better in those that neither was fitted to."""
-    rows = [views.fitted.row, views.judged.row]
-    editor = make_editor(EditorOptions(spec), views.scene, views.region, rows)
-    expected = editor.edit(views.judged.row, 1.0)
-    tables = [some.fitted.maps.solve(2, [editor.edit(some.fitted.row, 1.0)]) for some in (last, views)]
-    before, after = (_error(views.judged.maps.picture(table), expected) for table in tables)
-    return after < _SETTLED * before
 
 
 def _error(picture: Tensor, expected: Tensor) -> float:
@@ -171,10 +121,10 @@ def draft_grade(views: DraftViews, options: EditorOptions, name: str) -> Gdf | N
     if options.family not in COLOR_FUNCTIONS:
         return None
     fitted, judged = views.fitted, views.judged
-    editor = make_editor(options, views.scene, views.region, [fitted.row, judged.row])
-    courses = [edit_course(editor, row) for row in (fitted.row, judged.row)]
+    editor = make_editor(options, views.scene, views.region, (), lambda: views.glances)
+    courses = [edit_course(editor, some.row) for some in (fitted, judged)]
     plain = tuple((i + 1) / MOST_STAGES for i in range(MOST_STAGES))
-    strengths = equalized_strengths(editor, options.editor, [_thin(fitted.row)], plain)
+    strengths = equalized_strengths(editor, options.editor, [fitted.row], plain)
     targets, expected = ([edit(s) for s in strengths] for edit in courses)
     ends = {degree: fitted.maps.solve(degree, targets[-1:]) for degree in MONOMIALS}
     errors = {degree: _error(judged.maps.picture(end), expected[-1]) for degree, end in ends.items()}
@@ -192,12 +142,6 @@ def draft_grade(views: DraftViews, options: EditorOptions, name: str) -> Gdf | N
     field = BakedField("grade", torch.tensor([0.0, 1.0]), {}, channels, tuple(knots.tolist()), form)
     about = {"draft": {"degree": degree, "psnr": round(decibels(error), 2)}}
     return Gdf(name, views.region, field, fingerprint(views.scene), options.editor, report=about)
-
-
-def _thin(row: View) -> View:
-    """A part of the pixels."""
-    image, mask, inside = (part[:, ::_EVENED] for part in (row.image, row.mask, row.inside))
-    return replace(row, image=image, mask=mask, inside=inside)
 
 
 def _knots(judged: _Pixels, table: Tensor, expected: Sequence[Tensor]) -> int:

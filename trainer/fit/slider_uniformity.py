@@ -47,10 +47,7 @@ _JUMP = 0.7  # of the change in one step of an editor's strength: no strength be
 
 
 def equalized_strengths(
-    editor: ImageEditor,
-    spec: str,
-    views: Sequence[View],
-    plain: tuple[float, ...],
+    editor: ImageEditor, spec: str, views: Sequence[View], plain: tuple[float, ...]
 ) -> tuple[float, ...]:
     """Strengths at which the editor's own pictures are as far along as `plain` says, the last 1.
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import TypeVar
 
 import numpy as np
@@ -235,12 +235,16 @@ def fit_maps(views: Sequence[ColorView], share: Tensor, most: int = _MOST_PIXELS
         most: pixels that the maps are fitted to
     """
 
+    @lru_cache(maxsize=1)
+    def expand(colors: Tensor) -> tuple[Tensor, Tensor]:
+        terms = monomials(colors.T.clamp(0.0, MOST_COLOR), 3)
+        return (share * terms).T.contiguous(), (terms @ terms.T).double()
+
     def lay_out(index: int) -> tuple[Tensor, Tensor, Tensor]:
         view, some = views[index], pixels[index]
-        terms = monomials(view.original.T.clamp(0.0, MOST_COLOR), 3)
-        shown = view.map.picture((share * terms).T)[some]
+        terms, members = expand(view.original)
         original = view.picture(view.original.clamp_min(0.0))[some]
-        return shown, original, (terms @ terms.T).double()
+        return view.map.picture(terms)[some], original, members
 
     covered = map_threads(lambda view: view.own_pixels.nonzero()[:, 0], views)
     stride = max(1, -(-sum(map(len, covered)) // most))

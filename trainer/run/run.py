@@ -59,6 +59,7 @@ from trainer.setup import (
     editor_strengths,
     make_training_setup,
     quantize_image,
+    take_glances,
     whole_views,
     widen_views,
 )
@@ -325,7 +326,7 @@ def _write_draft(
         return
     folder.draft.unlink(missing_ok=True)
     began = time.perf_counter()
-    views = draft_views(options.views, options.editor.editor, scene, region)
+    views = draft_views(options.views, scene, region)
     draft = draft_grade(views, options.editor, options.name) if views is not None else None
     if draft is None:
         log.say("no draft: one map of color does not carry this edit")
@@ -365,7 +366,8 @@ def _render_originals(
 def _make_editor(options: TrainOptions, setup: TrainingSetup, folder: RunFolder, log: RunLog) -> ImageEditor:
     """The run's one editor; where a model paints, with views that agree."""
     settings = replace(options.editor, cache=folder.paintings)
-    editor = make_editor(settings, setup.scene, setup.region, setup.views)
+    glances = partial(take_glances, options.views, setup.scene, setup.region)
+    editor = make_editor(settings, setup.scene, setup.region, setup.views, glances)
     if not isinstance(editor, InstructEditor):
         return editor
     log.say(editor.note)

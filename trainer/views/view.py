@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -14,12 +15,14 @@ from torch.nn.functional import interpolate
 from progdf.camera import Camera, intrinsics, look_at
 from progdf.gaussians import Gaussians
 from progdf.io.atomic import is_portable
-from progdf.rasterize import Crop, render
+from progdf.rasterize import Crop, activate, render
+from progdf.rasterize.engines import ColorMap, color_map
 from progdf.region import Region
 from progdf.scene.bounds import near_plane, scene_sphere
 from progdf.scene.orbit_rig import orbit_rig
 from progdf.scene.up_axis import guess_up
-from progdf.sh import shade
+from progdf.sh import basis, shade
+from progdf.threads import map_threads
 
 BACKGROUND = (1.0, 1.0, 1.0)
 
@@ -34,6 +37,7 @@ INSIDE = (
 _LEAST_BOX = 64  # LPIPS needs that many pixels on each side
 _SEEN = 0.05  # a pixel shows the region where the members' weight is above this
 _LONGEST_NAME = 60  # characters, of four bytes at most: file systems take 255 bytes with what comes after
+_GLANCED = 23  # one of so many pixels is looked at, along the rows
 _CHANGED = 0.05  # a pixel is changed where a channel differs by more than this
 
 
@@ -117,6 +121,42 @@ def render_view(scene: Gaussians, camera: Camera, background: Tensor) -> Tensor:
     return render_colors(scene, seen_colors(scene, camera), camera, background)
 
 
+class Glance(NamedTuple):
+    """Some pixels of a small picture of the region."""
+
+    camera: Camera
+    pixels: Tensor  # which these are, row by row. [P] int64
+    map: ColorMap  # colors of the members not below 0 -> what these pixels show of them
+    basis: Tensor  # weight of each band in each member's color from there. [M,B]
+    colors: Tensor  # the members', unclamped. [M,3]
+    mask: Tensor  # see `View`. [P]
+    inside: Tensor  # see `View`. [P,3]
+
+
+def glances(scene: Gaussians, region: Region, cameras: Sequence[Camera], count: int) -> list[Glance]:
+    """Some of what cameras show of the region, one pixel of so many: of the first few that show any."""
+    activated, members = activate(scene, torch.zeros_like(scene.means)), scene[region.members]
+    degree, sh, seen = min(scene.sh_degree, 3), members.sh, list[Glance]()
+
+    def shine(camera: Camera) -> tuple[Tensor, Tensor]:
+        weights = basis(degree, torch.nn.functional.normalize(members.means - camera.position))
+        return weights, torch.einsum("nb,nbc->nc", weights, sh[:, : weights.shape[1]]) + 0.5
+
+    def look(camera: Camera) -> Glance:
+        box, pixels = (0, 0, camera.width, camera.height), torch.arange(camera.width * camera.height)
+        weighed = color_map(activated, camera, box, region.members, pixels=pixels[::_GLANCED])
+        weights, colors = shine(camera) if degree else plain
+        mask = weighed.picture(torch.ones_like(colors))[:, 0].clamp(0.0, 1.0)
+        inside = (weighed.picture(colors.clamp_min(0.0)) / mask.clamp_min(1e-4)[:, None]).clamp(0.0, 1.0)
+        return Glance(camera, pixels[::_GLANCED], weighed, weights, colors, mask, inside)
+
+    plain = shine(cameras[0])
+    while cameras and len(seen) < count:
+        some, cameras = cameras[: count - len(seen)], cameras[count - len(seen) :]
+        seen += [one for one in map_threads(look, some) if bool(one.mask.any())]
+    return seen
+
+
 def region_box(mask: Tensor, margin: int = 6, least: float = 0.5 * _SEEN) -> Crop:
     """The smallest box around pixels that show more than `least`, with a margin, grown to 64 pixels. [H,W]"""
     height, width = mask.shape
@@ -182,7 +222,7 @@ def frame_sphere(camera: Camera, center: Tensor, radius: float, share: float, up
     return replace(camera, viewmat=aimed, K=intrinsics(fov, side, side), width=side, height=side)
 
 
-def with_near_plane(cameras: Sequence[Camera], scene: Gaussians) -> list[Camera]:
+def with_near_plane(cameras: Iterable[Camera], scene: Gaussians) -> list[Camera]:
     """The cameras with a near plane for the size of the scene: a tiny one would vanish before a fixed one."""
     near = near_plane(scene_sphere(scene)[1])
     return [replace(camera, near=near) for camera in cameras]

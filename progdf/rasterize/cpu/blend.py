@@ -56,20 +56,18 @@ SUMS = 9
 
 PLANE = np.uint64(TILE_W * TILE_H + WIDTH)
 """A tile's state is planes of this many float32 in one buffer. Pixels are worked on in groups of eight, from
-the first of a row that a splat covers; the surplus is masked, and in a tile's last row it is the padding of
-the plane."""
+the first of a row that a splat covers; the surplus is masked, in a tile's last row it is padding."""
 
 LOG2_ALPHA_MIN = math.log2(ALPHA_MIN)
 
-# 2^x on [-1, 0], exact at 0, largest relative error 2.0e-9 before rounding (fitted by reweighted least
-# squares)
-_POLYNOMIAL = (
+# 2^x on [-1, 0], exact at 0, largest relative error 2.0e-9 before rounding: reweighted least squares
+_E1, _E2, _E3, _E4, _E5, _E6 = map(np.float32, (
     0.6931470643273044, 0.240224367820186, 0.05549075707783424, 0.009579179674631904, 0.0012747482964304813,
     0.00010902322854050052,
-)  # fmt: skip
+))  # fmt: skip
 
 BATCH = 32
-"""Splats whose spans are found at once: the pixel loops then branch on numbers that are long known."""
+"""Splats whose spans are found at once: the pixel loops branch on numbers that are long known."""
 
 BEGIN, START, STOP, U_PEAK, V, TOP = (np.uint64(TILE_H * field) for field in range(6))
 """Fields of a splat's spans, one number a row of the tile: first column from the tile's left edge; that and
@@ -87,7 +85,6 @@ LEAST: Number = np.float32(TRANSMITTANCE_MIN)
 ZERO: Number = np.float32(0.0)
 ONE: Number = np.float32(1.0)
 EIGHT: Number = np.float32(WIDTH)
-_E1, _E2, _E3, _E4, _E5, _E6 = (np.float32(factor) for factor in _POLYNOMIAL)
 # planes of the forward pass's state: transmittance (negative: the pixel is done), rgb, index in the tile's
 # list of the last contributor (-1: none; float32 holds it exactly up to 2^24)
 _R, _G, _B, _LAST = (PLANE * np.uint64(k) for k in (1, 2, 3, 4))
@@ -106,8 +103,8 @@ class TileScratch(NamedTuple):
 
 def new_scratch() -> TileScratch:
     """Room for six planes and a batch."""
-    batch = np.empty(BATCH * int(SPLAT), np.float32)
-    return TileScratch(np.empty(6 * int(PLANE), np.float32), batch, np.empty(4, np.int64))
+    state, batch = np.empty(6 * int(PLANE), np.float32), np.empty(BATCH * int(SPLAT), np.float32)
+    return TileScratch(state, batch, np.empty(4, np.int64))
 
 
 @kernel(fast=True, inline=True)
@@ -541,8 +538,12 @@ def _list_tile(
     left, right = max(0, camera.window[0] - x), min(TILE_W, camera.window[2] - x)
     top, bottom = max(0, camera.window[1] - y), min(TILE_H, camera.window[3] - y)
     width = camera.window[2] - camera.window[0]
+    corner = (y - camera.window[1]) * width + x - camera.window[0]
     through, spare = state[: TILE_H * TILE_W], state[TILE_H * TILE_W : 2 * TILE_H * TILE_W]
-    through[:], spare[:] = ONE, listed.lost  # of what may still be left out
+    through[:], spare[:] = ZERO, listed.lost  # of what may still be left out
+    for i in range(top, bottom):
+        for j in range(left, right):
+            through[i * TILE_W + j] = ONE if listed.places[corner + i * width + j] >= 0 else ZERO
     for s in members:
         shape = splats.shapes[s]
         mx, my = shape[MX] - x - 0.5, shape[MY] - y - 0.5
@@ -569,13 +570,11 @@ def _list_tile(
                     through[i * TILE_W + j] = -before
                     continue
                 through[i * TILE_W + j] = after
-                if listed.rows[s] < 0:
-                    continue
-                pixel = listed.places[(y - camera.window[1] + i) * width + x - camera.window[0] + j]
-                if EIGHT * alpha * before <= spare[i * TILE_W + j]:  # little of what may be left out
-                    spare[i * TILE_W + j] -= alpha * before
-                elif pixel >= 0:
+                if listed.rows[s] >= 0 and EIGHT * alpha * before <= spare[i * TILE_W + j]:
+                    spare[i * TILE_W + j] -= alpha * before  # little of what may be left out
+                elif listed.rows[s] >= 0:
                     if entry < out.weights.size:
+                        pixel = listed.places[corner + i * width + j]
                         base = pixel if entry == begun else base
                         out.pixels[entry] = pixel - base
                         out.weights[entry] = alpha * before
@@ -591,8 +590,7 @@ def list_weights(
     begin: int, end: int, scratch: TileScratch, splats: Splats, lists: TileLists, camera: Pinhole,
     listed: Listed, out: Runs,
 ) -> tuple[int, int]:  # fmt: skip
-    """List what the splats weigh in tiles begin … end − 1: how many runs, and entries, which may be more than
-    there was room for; for runs there always is."""
+    """List what the splats weigh in tiles begin … end − 1: how many runs, and entries, as if all had room."""
     run = entry = 0
     for tile in range(begin, end):
         own = lists.members[lists.starts[tile] : lists.starts[tile + 1]]

@@ -103,8 +103,6 @@ def make_pinhole(view: RasterView) -> Pinhole:
 
 def to_float32(tensor: Tensor) -> Tensor:
     """As the kernels want it."""
-    if tensor.dtype is torch.float32 and tensor.is_cpu and tensor.is_contiguous():
-        return tensor
     return tensor.to("cpu", torch.float32).contiguous()
 
 

@@ -39,7 +39,8 @@ def short_fits() -> Iterator[None]:
 def train_jointly(folder: Path, out: str, resume: bool = False) -> RunResult:
     """A short run whose network sees positions and is trained beside the members."""
     settings = {"steps": 60, "stages": 2, "views": 5, "image_size": 56, "field": "neural", "name": "joint"}
-    options = quick_options(folder, out, **settings, as_printed=True, resume=resume)
+    bending = "recolor:#30a050"  # unlike the way between two keyframes
+    options = quick_options(folder, out, **settings, editor=bending, as_printed=True, resume=resume)
     return trainer.run.run.train(options, quiet=True)
 
 

@@ -27,9 +27,7 @@ from trainer.views.view import render_view
 @cache
 def views() -> DraftViews:
     case = small("body")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(draft, "_SECONDS", float("inf"))
-        found = draft_views(ViewOptions(), "recolor:#3060d0", case.scene, case.region)
+    found = draft_views(ViewOptions(), case.scene, case.region)
     assert found is not None
     return found
 
@@ -86,13 +84,13 @@ def test_a_grade_by_hand_is_live_however_little_a_map_carries_it(monkeypatch: py
 def test_a_region_that_no_view_shows_has_no_draft() -> None:
     case = small("body")
     hidden = replace(case.scene, logit_opacities=torch.full_like(case.scene.logit_opacities, -30.0))
-    assert draft_views(ViewOptions(), "night", hidden, case.region) is None
+    assert draft_views(ViewOptions(), hidden, case.region) is None
 
 
 def test_a_scene_to_stand_inside_has_no_draft_without_cameras() -> None:
     scene = room(SMALLEST_ROOM).gaussians
     region = from_mask("all", torch.ones(len(scene), dtype=torch.bool))
-    assert draft_views(ViewOptions(), "night", scene, region) is None
+    assert draft_views(ViewOptions(), scene, region) is None
 
 
 def test_no_further_strengths_are_no_pictures(tmp_path: Path) -> None:

@@ -12,11 +12,11 @@ from progdf.io.cameras import save_cameras
 from progdf.region import Region
 from progdf.scene.orbit_rig import orbit_rig
 from tests.helpers.demo_scenes import bear
-from tests.helpers.trained import quick_options
+from tests.helpers.trained import quick_options, train, write_bear
 from trainer.options import EditorOptions, ViewOptions
 from trainer.resolve import resolve
 from trainer.run.training import pixel_stride
-from trainer.setup import SAMPLING, SIZE, TrainingSetup, make_training_setup
+from trainer.setup import SAMPLING, SIZE, TrainingSetup, make_training_setup, take_glances
 
 
 def setup_of(count: int = 400, bands: int = 3, **said: object) -> TrainingSetup:
@@ -51,6 +51,32 @@ def test_an_edit_of_colors_is_looked_at_from_level_and_from_above(
     assert lowest - 0.1 <= float(rises.min()) <= lowest + 2.0
     # even in area: of 60 views the highest is at 80°
     assert highest - 10.0 <= float(rises.max()) <= highest + 0.1
+
+
+@pytest.mark.parametrize("editor", ["recolor:#3060d0", "stripes:#20a040"])
+def test_a_picture_is_the_same_whatever_other_views_there_are(tmp_path: Path, editor: str) -> None:
+    write_bear(tmp_path)
+    save_cameras(tmp_path / "cameras.json", [camera.resize(64, 48) for camera in bear(1500).cameras])
+    made = []
+    for count in (3, 8):
+        given = {"cameras": tmp_path / "cameras.json", "views": count, "editor": editor}
+        train(quick_options(tmp_path, f"of {count}", **given))
+        edited = (tmp_path / f"of {count}" / "views" / "edited").glob("*.png")
+        made.append({path.name: path.read_bytes() for path in edited})
+    shared = made[0].keys() & made[1].keys()
+    assert shared
+    assert all(made[0][name] == made[1][name] for name in shared)
+
+
+def test_a_region_is_looked_at_by_cameras_that_show_it(tmp_path: Path) -> None:
+    demo = bear(1500)
+    region = Region("body", demo.members("body"), torch.ones(len(demo.members("body"))))
+    away = [replace(c, viewmat=torch.diag(torch.tensor([-1.0, 1, -1, 1])) @ c.viewmat) for c in demo.cameras]
+    save_cameras(tmp_path / "cameras.json", [*away, *demo.cameras[:4], *away])
+    seen = take_glances(ViewOptions(tmp_path / "cameras.json"), demo.gaussians, region)
+    assert len(seen) == 4
+    assert all(bool(one.mask.any()) for one in seen)
+    assert len(take_glances(ViewOptions(), demo.gaussians, region)) == 8
 
 
 @pytest.mark.parametrize("beside", ["", "views", "views/edited"])
