@@ -376,4 +376,4 @@ def test_the_timeline_in_use(screenshot: Callable[[str, np.ndarray], None]) -> N
         hand.drag(at(hand, 5), at(hand, 12))
         hand.move(500.0, 300.0)
         hand.frame(3)
-        screenshot("ui_timeline", hand.image()[-60:, : WINDOW[0] - round(panel.WIDTH_PX)])
+        screenshot("ui_timeline", hand.image()[-240:, : WINDOW[0] - round(panel.WIDTH_PX)])
