@@ -55,7 +55,7 @@ _RANK_VIEWS = 4
 _WEIGHED_EVERY = 2  # of the training views one says how visible the members are
 _REPORT_ALONE = (
     *("plan", "time", "memory_mb", "curves", "views", "pictures"),
-    *("losses", "trajectory", "effort", "choice"),
+    *("losses", "trajectory", "effort", "choice", "baselines", "between"),
 )
 DEFAULTS = plain(BLANK)
 
