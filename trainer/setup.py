@@ -40,7 +40,7 @@ from .views.view import (
     View,
     crop,
     fit_size,
-    glances,
+    make_glances,
     make_view,
     name_cameras,
     region_rig,
@@ -62,7 +62,7 @@ _PROBES = 3
 _GLANCES, _GLANCE_SIZE = 8, 192
 """Of a large scene fewer, so that a draft of a million Gaussians takes seconds; up to 24 make none better by
 .1 dB, and smaller ones mix colors, and the region's own with them."""
-_GLANCED = 3_000_000  # Gaussians are looked at in all of them
+_DRAWN = 3_000_000  # Gaussians, in all of them
 
 Pictures = Mapping[float, Sequence[Tensor]]
 """Strength → whole edited pictures, one per view. [H,W,3] each"""
@@ -168,7 +168,7 @@ def take_glances(options: ViewOptions, scene: Gaussians, region: Region) -> list
     """
     given = [] if options.cameras is None else load_cameras(options.cameras, scene.origin)
     up = find_up(scene, given, options.up, options.scene).direction
-    count = max(3, min(_GLANCES, _GLANCED // len(scene)))
+    count = max(3, min(_GLANCES, _DRAWN // len(scene)))
     if given:
         spread = sorted(range(len(given)), key=lambda i: math.sqrt(2.0) * i % 1.0)
         places = scene.means[sample_members(scene, region)]
@@ -178,7 +178,7 @@ def take_glances(options: ViewOptions, scene: Gaussians, region: Region) -> list
         return []
     else:
         cameras = region_rig(scene, region, count, _GLANCE_SIZE, up, HALF_SPHERE)
-    return glances(scene, region, with_near_plane(cameras, scene), count)
+    return make_glances(scene, region, with_near_plane(cameras, scene), count)
 
 
 def _rig_views(

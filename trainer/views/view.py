@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import unicodedata
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -37,7 +37,7 @@ INSIDE = (
 _LEAST_BOX = 64  # LPIPS needs that many pixels on each side
 _SEEN = 0.05  # a pixel shows the region where the members' weight is above this
 _LONGEST_NAME = 60  # characters, of four bytes at most: file systems take 255 bytes with what comes after
-_GLANCED = 23  # one of so many pixels is looked at, along the rows
+_EVERY = 23  # one of so many pixels is looked at, along the rows
 _CHANGED = 0.05  # a pixel is changed where a channel differs by more than this
 
 
@@ -133,24 +133,24 @@ class Glance(NamedTuple):
     inside: Tensor  # see `View`. [P,3]
 
 
-def glances(scene: Gaussians, region: Region, cameras: Sequence[Camera], count: int) -> list[Glance]:
-    """Some of what cameras show of the region, one pixel of so many: of the first few that show any."""
+def make_glances(scene: Gaussians, region: Region, cameras: Sequence[Camera], count: int) -> list[Glance]:
+    """What the first `count` cameras that show the region see of it, in one pixel of so many."""
     activated, members = activate(scene, torch.zeros_like(scene.means)), scene[region.members]
     degree, sh, seen = min(scene.sh_degree, 3), members.sh, list[Glance]()
 
-    def shine(camera: Camera) -> tuple[Tensor, Tensor]:
+    def color_from(camera: Camera) -> tuple[Tensor, Tensor]:
         weights = basis(degree, torch.nn.functional.normalize(members.means - camera.position))
         return weights, torch.einsum("nb,nbc->nc", weights, sh[:, : weights.shape[1]]) + 0.5
 
     def look(camera: Camera) -> Glance:
         box, pixels = (0, 0, camera.width, camera.height), torch.arange(camera.width * camera.height)
-        weighed = color_map(activated, camera, box, region.members, pixels=pixels[::_GLANCED])
-        weights, colors = shine(camera) if degree else plain
+        weighed = color_map(activated, camera, box, region.members, pixels=pixels[::_EVERY])
+        weights, colors = color_from(camera) if degree else plain
         mask = weighed.picture(torch.ones_like(colors))[:, 0].clamp(0.0, 1.0)
         inside = (weighed.picture(colors.clamp_min(0.0)) / mask.clamp_min(1e-4)[:, None]).clamp(0.0, 1.0)
-        return Glance(camera, pixels[::_GLANCED], weighed, weights, colors, mask, inside)
+        return Glance(camera, pixels[::_EVERY], weighed, weights, colors, mask, inside)
 
-    plain = shine(cameras[0])
+    plain = color_from(cameras[0])
     while cameras and len(seen) < count:
         some, cameras = cameras[: count - len(seen)], cameras[count - len(seen) :]
         seen += [one for one in map_threads(look, some) if bool(one.mask.any())]
@@ -222,7 +222,7 @@ def frame_sphere(camera: Camera, center: Tensor, radius: float, share: float, up
     return replace(camera, viewmat=aimed, K=intrinsics(fov, side, side), width=side, height=side)
 
 
-def with_near_plane(cameras: Iterable[Camera], scene: Gaussians) -> list[Camera]:
+def with_near_plane(cameras: Sequence[Camera], scene: Gaussians) -> list[Camera]:
     """The cameras with a near plane for the size of the scene: a tiny one would vanish before a fixed one."""
     near = near_plane(scene_sphere(scene)[1])
     return [replace(camera, near=near) for camera in cameras]
