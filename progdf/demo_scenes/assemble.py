@@ -165,8 +165,7 @@ def assemble(
     """Exactly `size` Gaussians on the visible surfaces of `parts`, and their labels [N] uint8; seeded."""
     random = torch.Generator().manual_seed(seed)
     table = lattice(seed)
-    pieces: list[Gaussians] = []
-    labels: list[Tensor] = []
+    pieces, labels = list[Gaussians](), list[Tensor]()
     with one_thread():  # hundreds of small tensor operations
         counts, shares = _budget(parts, size)
         for part, count, share in zip(parts, counts, shares, strict=True):

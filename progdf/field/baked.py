@@ -261,11 +261,9 @@ class GradeForm:
     @property
     def label(self) -> str:
         """What it is, as in "grade of degree 2, a mask, 2 bases of DC"."""
-        bases, parts = (
-            len(self.residual),
-            {12: "two bands", 27: "three bands"}.get(self.residual.shape[2], "DC"),
-        )
-        beside = f"{bases} bas{'is' if bases == 1 else 'es'} of {parts}" if bases else "no residual"
+        bases, parts = len(self.residual), {12: "two bands", 27: "three bands"}
+        of = parts.get(self.residual.shape[2], "DC")
+        beside = f"{bases} bas{'is' if bases == 1 else 'es'} of {of}" if bases else "no residual"
         beside = beside if self.mask is None else f"a mask, {beside}"
         side = 0 if self.degree else lattice_side(self.table.shape[1])
         return f"grade of {f'degree {self.degree}' if self.degree else f'{side}³ colors'}, {beside}"
@@ -339,9 +337,7 @@ class BakedField(ShownInNotebooks):
     @property
     def bytes_per_member(self) -> float:
         """Bytes on disk for one member of the region."""
-        if self.origin is not None:
-            return self.origin.bytes_per_member
-        return self.baked_bytes_per_member
+        return self.baked_bytes_per_member if self.origin is None else self.origin.bytes_per_member
 
     @property
     def baked_bytes_per_member(self) -> float:

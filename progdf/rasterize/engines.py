@@ -227,10 +227,9 @@ def render(
             `grad_rows` are given although the camera wants gradients, which need all rows.
         ProgdfError: more (Gaussian, tile) pairs than memory should hold.
     """
-    if isinstance(gaussians, Gaussians):
-        activated = activate(gaussians, colors)
-    else:
-        activated = gaussians if colors is None else gaussians._replace(colors=colors)
+    activated = activate(gaussians, colors) if isinstance(gaussians, Gaussians) else gaussians
+    if colors is not None:
+        activated = activated._replace(colors=colors)
     _check_shapes(activated)
     _check_crop(crop, camera)
     if grad_rows is not None and (camera.viewmat.requires_grad or camera.K.requires_grad):

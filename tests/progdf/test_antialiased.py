@@ -120,7 +120,7 @@ def test_training_views_show_what_is_drawn(stack: Stack) -> None:
     torch.testing.assert_close(view.image, expected, rtol=0.0, atol=2e-6)
     for still in (False, True):
         crop = crop_scene(scene, region.members, camera, (0, 0, *SIZE), WHITE, still)
-        image, _ = crop.render(pack(scene))
+        image = crop.render(pack(scene))
         torch.testing.assert_close(image, expected, rtol=0.0, atol=2e-6)
 
 

@@ -317,8 +317,8 @@ class RenderedLoss:
         """See `PictureLoss`. [M,C], [M,C] -> []"""
         crop = self.crops[view]
         with torch.no_grad():
-            expected, _ = crop.render(self.rows + recorded, self.moving)
-        image, _ = crop.render(self.rows + found, self.moving)
+            expected = crop.render(self.rows + recorded, self.moving)
+        image = crop.render(self.rows + found, self.moving)
         predicted = l1(image, expected) + self.perceptual(image, expected)
         return predicted + sharpness(image, expected, "paper")
 

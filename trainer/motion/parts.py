@@ -172,7 +172,7 @@ def mean_distance(crops: Sequence[CropScene], rows: Tensor, targets: Sequence[Te
 
 def view_distance(scene: CropScene, rows: Tensor, target: Tensor, wide: bool = False) -> Tensor:
     """L1 at full sharpness and blurred, or blurred widely only: so a part feels where it does not lie yet."""
-    image, _ = scene.render(rows, _MOVING)
+    image = scene.render(rows, _MOVING)
     difference = image - target
     loss = difference.new_zeros(()) if wide else difference.abs().mean()
     longer = max(scene.size)

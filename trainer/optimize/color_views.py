@@ -154,7 +154,7 @@ def color_view(crop: CropScene, original: Tensor, every: int, index: int) -> Col
     weights = basis(min(members.sh_degree, 3), directions)
     colors = (weights[..., None] * members.sh[:, : weights.shape[1]]).sum(dim=1) + 0.5
     weighed = color_map(crop.gaussians, camera, crop.box, crop.rows, crop.engine, pixels, LOST)
-    others = crop.original().flatten(0, 1)[pixels] - weighed.picture(colors.clamp_min(0.0))
+    others = crop.original.flatten(0, 1)[pixels] - weighed.picture(colors.clamp_min(0.0))
     counts = torch.ones_like(others[:, :1], dtype=torch.bool)
     weights = weights[:, : member_bands(original[:1]).shape[1]].contiguous()
     return ColorView(weighed, others, weights, colors, crop.size, pixels, counts)

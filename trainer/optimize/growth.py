@@ -178,7 +178,7 @@ def removal_costs(crops: Sequence[CropScene], rows: Tensor, targets: Sequence[Te
     slope, curvature = rows.new_zeros(len(rows)), rows.new_zeros(len(rows))
     for crop, target in zip(crops, targets, strict=True):
         leaf = rows.clone().requires_grad_()
-        image = crop.render(leaf)[0]
+        image = crop.render(leaf)
         signs = torch.randint(2, image.shape, generator=draw).to(image) * 2 - 1
         (along,) = torch.autograd.grad(image, leaf, (image - target).detach(), retain_graph=True)
         (drawn,) = torch.autograd.grad(image, leaf, signs)

@@ -351,7 +351,7 @@ def optimize(
             share = (state.local + 1) / max(1.0, settings.ramp * stage.steps)
             target = stage.targets[view]
             target = target if share >= 1.0 else torch.lerp(before[view], target, share)
-            image, _ = crops[view].render(original + stage.place(state.moved), moving)
+            image = crops[view].render(original + stage.place(state.moved), moving)
             moment = Moment(
                 image, target, view, state.step, state.local, share >= 1.0, state.moved, state.previous
             )

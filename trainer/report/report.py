@@ -100,7 +100,7 @@ def editor_strip(evaluator: Evaluator, columns: Columns, width: int = _THUMBNAIL
     """What the editor makes of the best view; gray where it was not asked."""
     best = best_view(evaluator)
     blank = torch.full((*evaluator.crops[best].size, 3), 0.94)
-    original = evaluator.crops[best].original().clamp(0, 1)
+    original = evaluator.crops[best].original.clamp(0, 1)
     edited = [original, *(blank if at is None else evaluator.edited[at][best] for _, at in columns[1:])]
     return [thumbnail(image, width) for image in edited]
 

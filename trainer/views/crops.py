@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import torch
@@ -17,7 +17,7 @@ from torch import Tensor
 
 from progdf.camera import Camera
 from progdf.gaussians import ATTRIBUTES, Gaussians, attribute_slices, unpack
-from progdf.rasterize import ActivatedGaussians, Crop, Rendering, activate, render
+from progdf.rasterize import ActivatedGaussians, Crop, activate, render
 from progdf.rasterize.cpu.forward import TILE_H, TILE_W
 from progdf.rasterize.engines import DILATION, ColorMap, color_map
 from progdf.sh import basis
@@ -107,9 +107,8 @@ class CropScene:
     rows: Tensor  # where the members are among them, in the region's order. [M] int64
     member_shN: Tensor  # higher SH bands of the members in the original. [M,K,3]
     background: Tensor  # what shows through. [3]
-    # pixels that are drawn [h,w,1] bool, and the original picture [h,w,3], which the others are; None where
-    # all are drawn
-    cached: tuple[Tensor, Tensor] | None = None
+    original: Tensor  # the unedited picture, not clamped. [h,w,3]
+    live: Tensor | None = None  # pixels that are drawn, others are the original's; None: all. [h,w,1] bool
     still: bool = False  # nothing but the members' colors ever differs
     engine: str = "cpu"  # that draws, on the device of the Gaussians
 
@@ -118,12 +117,7 @@ class CropScene:
         """Height and width of the box in pixels."""
         return self.box[3] - self.box[1], self.box[2] - self.box[0]
 
-    def original(self) -> Tensor:
-        """The box of the unedited view, not clamped. [h,w,3]"""
-        image = self._draw(self.gaussians).image
-        return image if self.cached is None else torch.where(self.cached[0], image, self.cached[1])
-
-    def render(self, packed: Tensor, moving: Collection[str] = ATTRIBUTES) -> tuple[Tensor, Tensor]:
+    def render(self, packed: Tensor, moving: Collection[str] = ATTRIBUTES) -> Tensor:
         """The box with these raw values in the region's rows, differentiable in them.
 
         Args:
@@ -131,13 +125,13 @@ class CropScene:
             moving: attributes whose values differ from the original's; the others are not looked at
 
         Returns:
-            image [h,w,3], 0..1 (see `clamp_towards`); transmittance [h,w]
+            The image, 0..1 (see `clamp_towards`). [h,w,3]
         """
         members = unpack(packed.to(self.background.device), self.member_shN)
         weights = self._still_weights if self.still else self._weights(members.means)
         colors = clamp_towards((weights * members.sh[:, : weights.shape[1]]).sum(dim=1) + 0.5, 0.0, math.inf)
         if self.still and not colors.requires_grad:
-            weighed, others, transmittance = self._linear
+            weighed, others = self._linear
             image = others + weighed.picture(colors)
         else:
             new = {"colors": colors}
@@ -149,11 +143,14 @@ class CropScene:
                 new["scales"] = members.scales
             if "logit_opacities" in moving:
                 new["opacities"] = members.opacities
-            image, transmittance, _ = self._draw(self.with_members(new))
-        if self.cached is not None:
-            live, original = self.cached
-            image = torch.where(live, image, original)
-        return clamp_towards(image, 0.0, 1.0), transmittance
+            shown, rows = self.with_members(new), self.rows
+            drawn = render(
+                shown, self.camera, self.background, crop=self.box, grad_rows=rows, engine=self.engine
+            )
+            image = drawn.image
+        if self.live is not None:
+            image = torch.where(self.live, image, self.original)
+        return clamp_towards(image, 0.0, 1.0)
 
     def _weights(self, means: Tensor) -> Tensor:
         """What each band weighs in the members' colors from here. [M,3] -> [M,B,1]
@@ -168,22 +165,16 @@ class CropScene:
         return self._weights(self.gaussians.means[self.rows])
 
     @cached_property
-    def _linear(self) -> tuple[ColorMap, Tensor, Tensor]:
-        """While nothing moves: what each member weighs in each pixel, what all others show, transmittance."""
+    def _linear(self) -> tuple[ColorMap, Tensor]:
+        """While nothing moves: what each member weighs in each pixel, and what all others show."""
         weighed = color_map(self.gaussians, self.camera, self.box, self.rows, self.engine)
-        image, transmittance, _ = self._draw(self.gaussians)
-        return weighed, image - weighed.picture(self.gaussians.colors[self.rows]), transmittance
+        return weighed, self.original - weighed.picture(self.gaussians.colors[self.rows])
 
     def with_members(self, new: Mapping[str, Tensor]) -> ActivatedGaussians:
         """The box's Gaussians with other activated values of the members, by name. [M,...] each"""
         old = self.gaussians._asdict()
         return self.gaussians._replace(
             **{name: old[name].index_copy(0, self.rows, values) for name, values in new.items()}
-        )
-
-    def _draw(self, gaussians: ActivatedGaussians) -> Rendering:
-        return render(
-            gaussians, self.camera, self.background, crop=self.box, grad_rows=self.rows, engine=self.engine
         )
 
 
@@ -208,46 +199,36 @@ def crop_scene(
         camera: the whole view
         box: the pixels that are rendered
         background: rgb. [3]
-        still: nothing but colors will move, so only the tiles that show a member are drawn, see `tiles`, and
-            without gradients a linear map of the members' colors; transmittance is right in these only
+        still: nothing but colors will move, so only the tiles that show a member are drawn (`live_tiles`), and
+            without gradients a linear map of the members' colors
         engine: that draws
     """
     device = scene.means.device
     members, camera, background = members.to(device), camera.to(device), background.to(device)
     activated = activate(scene, seen_colors(scene, camera))
-    visible = render(activated, camera, background, crop=box, engine=engine).info.visible.clone()
-    visible[members] = True  # a member that is out of sight now may come into it
-    index = visible.nonzero()[:, 0]
-    crop_of_all = CropScene(
+    member = torch.zeros_like(activated.opacities, dtype=torch.bool).index_fill(0, members, True)
+    drawn = render(activated, camera, background, crop=box, engine=engine)
+    index, live = (drawn.info.visible | member).nonzero()[:, 0], None  # one out of sight may come into it
+    gaussians = activated.select(index)
+    if still:
+        white = member[index, None].to(gaussians.colors).expand(-1, 3).contiguous()
+        share = render(gaussians, camera, torch.zeros_like(background), colors=white, crop=box, engine=engine)
+        tiles = live_tiles(share.image[..., 0] > 0.0, box)
+        if not bool((pixels := live_pixels(tiles, box)).all()):
+            reachable = may_reach(gaussians.means, gaussians.scales, camera, tiles)
+            kept = (reachable | member[index]).nonzero()[:, 0]
+            live, index, gaussians = pixels[..., None], index[kept], gaussians.select(kept)
+    return CropScene(
         camera,
         box,
-        activated.select(index),
-        torch.searchsorted(index, members),
-        scene.shN[members],
-        background,
+        gaussians,
+        rows=torch.searchsorted(index, members),
+        member_shN=scene.shN[members],
+        background=background,
+        original=drawn.image,
+        live=live,
+        still=still,
         engine=engine,
-    )
-    return _keep_live_tiles(replace(crop_of_all, still=True)) if still else crop_of_all
-
-
-def _keep_live_tiles(view: CropScene) -> CropScene:
-    """The view with all that no member contributes to taken from the original picture."""
-    gaussians = view.gaussians
-    member = torch.zeros_like(gaussians.opacities)
-    member[view.rows] = 1.0
-    white = gaussians._replace(colors=member[:, None].expand(-1, 3).contiguous())
-    share = replace(view, background=torch.zeros_like(view.background))._draw(white).image
-    live = live_tiles((share > 0).any(dim=2), view.box)
-    if bool(live_pixels(live, view.box).all()):
-        return view
-    reachable = may_reach(gaussians.means, gaussians.scales, view.camera, live)
-    reachable[view.rows] = True
-    index = reachable.nonzero()[:, 0]
-    return replace(
-        view,
-        gaussians=gaussians.select(index),
-        rows=torch.searchsorted(index, view.rows),
-        cached=(live_pixels(live, view.box)[..., None], view.original()),
     )
 
 
@@ -258,8 +239,8 @@ def render_all(
     with torch.no_grad():
         if len(crops) > 1 and threads() > 1 and all(crop.still for crop in crops):
             # a thread of the pool has gradients of its own to forget
-            return map_threads(lambda crop: crop.render(packed, moving)[0].detach(), crops)
-        return [crop.render(packed, moving)[0] for crop in crops]
+            return map_threads(lambda crop: crop.render(packed, moving).detach(), crops)
+        return [crop.render(packed, moving) for crop in crops]
 
 
 def only_recolors(offsets: Tensor) -> bool:

@@ -62,7 +62,7 @@ _CHUNKS = 4  # for each thread: tiles take unequally long
 _MOST_TILES, _MOST_GAUSSIANS = 24, 32 * BLOCK  # of a chunk: a picture that is dropped stops between two
 TILE_ROOM = 8  # tiles of a Gaussian that there is room for; where chunks have more, these are listed twice
 ENTRY_ROOM = 16  # and pixels that a Gaussian weighs in of a tile
-_ALL = np.empty(0, np.bool_)
+_ALL = np.empty(0, np.bool_)  # rows get gradients
 
 
 def rasterize(
@@ -184,7 +184,6 @@ class _Rasterize(torch.autograd.Function):
         splats, lists = _project_and_bin(scene, camera, with_gradient)
         share_tiles(blend, camera, splats, lists, camera, background, out, out.last)
         projected[:] = splats.means2d, splats.depths, splats.visible
-        ctx.set_materialize_grads(False)
         ctx.forward_pass = camera, grad_rows, scene, background, splats, lists, out
         results = torch.from_numpy(out.image), torch.from_numpy(out.transmittance)
         ctx.save_for_backward(*tensors, results[1])
@@ -195,8 +194,10 @@ class _Rasterize(torch.autograd.Function):
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         camera, grad_rows, scene, background, splats, lists, out = ctx.forward_pass
         viewmat, K = ctx.saved_tensors[6:8]  # and that none of them has been changed since is checked
-        by_out = Picture(_array(grads[0], out.image), _array(grads[1], out.transmittance), out.last)
-        grad_mask = _gradient_mask(len(scene.means), grad_rows)
+        by_image, by_transmittance = (np.ascontiguousarray(grad.numpy()) for grad in grads)
+        by_out, grad_mask = Picture(by_image, by_transmittance, out.last), _ALL
+        if grad_rows is not None:
+            grad_mask = np.bincount(grad_rows.numpy(force=True), minlength=len(scene.means)) > 0
         gradients = Scene(*(np.empty(array.shape, np.float32) for array in scene))
         sums = np.empty((len(lists.members), SUMS), np.float32)
 
@@ -214,7 +215,8 @@ class _Rasterize(torch.autograd.Function):
         if camera.degree < 0:
             results[4] = torch.from_numpy(gradients.colors.reshape(-1, 3))
         by_background, by_viewmat, by_K = ctx.needs_input_grad[8:]
-        results.append(_background_gradient(out.transmittance, by_out.image) if by_background else None)
+        through = (by_image * out.transmittance[..., None]).sum(axis=(0, 1), dtype=np.float64)
+        results.append(torch.from_numpy(through.astype(np.float32)) if by_background else None)
         results += _camera_gradients(by_camera, viewmat, K) if by_viewmat or by_K else (None, None)
         return None, None, None, *results
 
@@ -226,31 +228,12 @@ def _new_picture(camera: Pinhole, with_last: bool) -> Picture:
     return Picture(np.empty((*size, 3), np.float32), np.empty(size, np.float32), last)
 
 
-def _array(gradient: Tensor | None, like: Array) -> Array:
-    """A gradient; None is zero."""
-    return np.zeros_like(like) if gradient is None else np.ascontiguousarray(gradient.numpy())
-
-
 def _camera_gradients(parts: Array, viewmat: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
     camera = parts.sum(axis=0)
     by_viewmat, by_K = np.zeros((4, 4)), np.zeros((3, 3))
     by_viewmat[:3] = camera[:12].reshape(3, 4)
     by_K[0, 0], by_K[1, 1], by_K[0, 2], by_K[1, 2] = camera[12:]
     return torch.from_numpy(by_viewmat).to(viewmat), torch.from_numpy(by_K).to(K)
-
-
-def _gradient_mask(count: int, grad_rows: Tensor | None) -> Array:
-    """Which rows get gradients; [0] where all do. [N] bool"""
-    if grad_rows is None:
-        return _ALL
-    grad_mask = np.zeros(count, np.bool_)
-    grad_mask[grad_rows.numpy(force=True)] = True
-    return grad_mask
-
-
-def _background_gradient(transmittance: Array, grad_image: Array) -> Tensor:
-    per_channel = (grad_image * transmittance[..., None]).astype(np.float64).sum(axis=(0, 1))
-    return torch.from_numpy(per_channel.astype(np.float32))
 
 
 def alpha_weights(gaussians: ActivatedGaussians, view: RasterView, mask: Tensor) -> Tensor:

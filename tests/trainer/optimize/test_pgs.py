@@ -83,10 +83,10 @@ def test_a_crop_equals_the_composed_scene_rendered_whole() -> None:
     random = torch.Generator().manual_seed(0)
     rows = rows + 0.05 * torch.randn(rows.shape, generator=random)
     prepared = crop_scene(case.scene, case.region.members, view.camera, view.box, WHITE)
-    image, _ = prepared.render(rows)
+    image = prepared.render(rows)
     whole = render(case.scene.replace_rows(case.region.members, rows), view.camera).image.clamp(0, 1)
     assert torch.allclose(image, crop(whole, view.box), atol=1e-5)
-    assert torch.allclose(prepared.original().clamp(0, 1), crop(view.image, view.box), atol=1e-6)
+    assert torch.allclose(prepared.original.clamp(0, 1), crop(view.image, view.box), atol=1e-6)
 
 
 def test_geometry_edits_have_rates_for_everything_and_scale_with_the_size_of_the_region() -> None:

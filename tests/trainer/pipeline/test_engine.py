@@ -143,7 +143,7 @@ def test_no_step_moves_anything_to_the_card_or_back(case: Small, card: Card, kin
     crops = [
         crop_scene(scene, case.region.members, v.camera, v.box, WHITE, engine="warp") for v in case.views
     ]
-    targets = [crop_.original().clamp(0.0, 1.0).flip(2) for crop_ in crops]
+    targets = [crop_.original.clamp(0.0, 1.0).flip(2) for crop_ in crops]
     objective = Objective(perceptual_loss()[0], OptimizeOptions(perceptual_weight=0.3, sharpness="hinge"))
     rates = learning_rates(kind, original.shape[1], 1.0)
     for steps in (1, 1, 2):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 
+from progdf.gaussians import pack
 from tests.helpers.trained import WHITE, small
 from tests.trainer.views.test_tiles import COLORS, recolored
 from trainer.views.crops import crop_scene, only_recolors, render_all
@@ -34,8 +35,10 @@ def test_a_still_view_has_the_original_where_no_member_shows_too() -> None:
             crop_scene(case.scene, case.region.members, view.camera, box, WHITE, still)
             for still in (True, False)
         )
-        assert still.cached is not None
-        assert float((still.original() - whole.original()).abs().max()) < 2e-6
+        assert still.live is not None
+        assert torch.equal(still.original, whole.original)
+        unedited = still.render(pack(case.scene[case.region.members]))
+        assert float((unedited - whole.original.clamp(0, 1)).abs().max()) < 2e-6
 
 
 def test_what_moves_is_not_only_recolored() -> None:

@@ -22,7 +22,7 @@ COLORS = ("sh0", "shN")
 
 def picture_and_gradient(view: CropScene, rows: Tensor) -> tuple[Tensor, Tensor]:
     packed = rows.clone().requires_grad_()
-    image, _ = view.render(packed, COLORS)
+    image = view.render(packed, COLORS)
     weights = torch.rand(image.shape, generator=torch.Generator().manual_seed(0))
     (image * weights).sum().backward()  # type: ignore[no-untyped-call]
     assert packed.grad is not None
