@@ -199,7 +199,7 @@ def crop_scene(
         camera: the whole view
         box: the pixels that are rendered
         background: rgb. [3]
-        still: nothing but colors will move, so only the tiles that show a member are drawn (`live_tiles`), and
+        still: nothing but colors will move, so only tiles that show a member are drawn (`live_tiles`), and
             without gradients a linear map of the members' colors
         engine: that draws
     """
