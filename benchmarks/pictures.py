@@ -86,8 +86,8 @@ def _rows(path: Path, edit: str) -> list[tuple[str, ...]]:
         ties = surface_ties(scene, region.members, [view.camera for view in large])
         solver = make_solver(color_views(crops, original), original, ties)
         targets = [crop(picture, view.box) for view, picture in zip(large, edited, strict=True)]
-        trials = split_solver(solver, targets)
-        solver, model = choose_model(solver, trials, targets, STEPS, 1)
+        trial = split_solver(solver, targets)
+        solver, model = choose_model(solver, trial, targets, STEPS, 1)
         change = add_bands(solver.fit_map(model.degree, targets)[1], model.residual)
         offsets = band_offsets(change, original.shape[1])
         took = time.process_time() - began

@@ -123,22 +123,22 @@ class _Attempt:
 
     name: str
     error: float
-    solvers: Sequence[Solver]  # of each trial, with the mask
+    solver: Solver  # with the mask
     degree: int
-    offsets: Sequence[Tensor]  # of each trial, what its map adds. [M,B,3]
-    residuals: Sequence[Tensor]  # [M,b,3]
+    offsets: Tensor  # what its map adds. [M,B,3]
+    residual: Tensor  # [M,b,3]
     hold: float  # see `Model.hold`
     masked: bool = False
 
     @property
     def bands(self) -> int:
         """See `Model.bands`."""
-        return self.residuals[0].shape[1]
+        return self.residual.shape[1]
 
     @property
-    def changes(self) -> list[Tensor]:
+    def change(self) -> Tensor:
         """What map and residual add. [M,B,3]"""
-        return [add_bands(made, one) for made, one in zip(self.offsets, self.residuals, strict=True)]
+        return add_bands(self.offsets, self.residual)
 
 
 @dataclass(frozen=True)
@@ -366,47 +366,38 @@ def make_solver(views: Sequence[ColorView], original: Tensor, ties: Ties | None 
     return Solver(views, original, weights, fit_maps(views, share), share, ties, asked, held)
 
 
-def split_solver(solver: Solver, targets: Sequence[Tensor]) -> list[tuple[Solver, Judge]]:
-    """Two trials for `choose_model` where no view is held out: some squares of all views, and the others."""
-    folds = tuple(zip(*(view.halves() for view in solver.views), strict=True))
-    return [
-        (make_solver(some, solver.original, solver.ties), Judge(others, targets))
-        for some, others in (folds, folds[::-1])
-    ]
+def split_solver(solver: Solver, targets: Sequence[Tensor]) -> tuple[Solver, Judge]:
+    """A trial for `choose_model` where no view is held out: some squares of all views, and the others."""
+    some, others = zip(*(view.halves() for view in solver.views), strict=True)
+    return make_solver(some, solver.original, solver.ties), Judge(others, targets)
 
 
 @dataclass
 class _Trials:
-    """What is tried, on views or pixels that the solvers do not know."""
+    """What is tried, on views or pixels that the solver does not know."""
 
-    trials: Sequence[tuple[Solver, Judge]]
-    targets: Sequence[Tensor]  # the finished edit in the solvers' views
+    solver: Solver
+    judge: Judge
+    targets: Sequence[Tensor]  # the finished edit in the solver's views
     most_steps: int  # of conjugate gradients for a residual
     tried: list[_Attempt] = field(default_factory=list)
     steps: int = 0  # that all of these took
 
-    def start(self, degree: int, solvers: Sequence[Solver]) -> _Attempt:
+    def start(self, degree: int, solver: Solver) -> _Attempt:
         """A map alone, not judged."""
-        offsets = [by.fit_map(degree, self.targets)[1] for by in solvers]
-        return _Attempt("", math.inf, solvers, degree, offsets, [made[:, :0] for made in offsets], _RIDGE)
-
-    def error(self, changes: Sequence[Tensor]) -> float:
-        """Mean over the trials of what changes leave. [M,B,3] each"""
-        return sum(by.error(made) for (_, by), made in zip(self.trials, changes, strict=True)) / len(changes)
+        offsets = solver.fit_map(degree, self.targets)[1]
+        return _Attempt("", math.inf, solver, degree, offsets, offsets[:, :0], _RIDGE)
 
     def attempt(self, base: _Attempt, name: str, bands: int, hold: float) -> _Attempt:
         """With a residual that begins where that of `base` ended."""
-        residuals = [pad(one[:, :bands], (0, 0, 0, max(0, bands - base.bands))) for one in base.residuals]
+        residual = pad(base.residual[:, :bands], (0, 0, 0, max(0, bands - base.bands)))
         if bands:
-            each = zip(base.solvers, self.trials, base.offsets, residuals, strict=True)
-            found = [
-                by.residual(made, one, self.targets, self.most_steps, judge, hold=hold)
-                for by, (_, judge), made, one in each
-            ]
-            residuals = [residual for residual, _ in found]
-            self.steps += max(taken for _, taken in found)
-        made = replace(base, name=name, residuals=residuals, hold=hold)
-        self.tried.append(replace(made, error=self.error(made.changes)))
+            residual, taken = base.solver.residual(
+                base.offsets, residual, self.targets, self.most_steps, self.judge, hold=hold
+            )
+            self.steps += taken
+        made = replace(base, name=name, residual=residual, hold=hold)
+        self.tried.append(replace(made, error=self.judge.error(made.change)))
         return self.tried[-1]
 
     def try_masks(self, best: _Attempt, alone: float, most_bands: int) -> _Attempt:
@@ -420,7 +411,7 @@ class _Trials:
             return best
         masked = [self.attempt(base, f"a mask of degree {base.degree}", 0, best.hold) for base in others]
         base = others[_least(masked, lambda one: one.degree).degree - 1]
-        masked = masked if self.trials[0][0].ties is None else []  # of a few pictures no mask alone
+        masked = masked if self.solver.ties is None else []  # of a few pictures no mask alone
         for bands in (bands for bands in BANDS if bands <= most_bands):
             base = self.attempt(base, f"with a mask and a residual of {bands}", bands, best.hold)
             masked.append(base)
@@ -432,23 +423,17 @@ class _Trials:
     def _with_masks(self, best: _Attempt, enough: float) -> list[_Attempt]:
         """The same change by masks of the trials' own and maps of each degree, what is missing in the
         residuals; none where the mask that the members' changes ask for leaves more than `enough`."""
-        solvers = [
-            by.guess_mask(change, best.degree > 0)
-            for by, change in zip(best.solvers, best.changes, strict=True)
-        ]
-        if min(self.error(self.start(degree, solvers).offsets) for degree in MONOMIALS) >= enough:
+        solver = best.solver.guess_mask(best.change, best.degree > 0)
+        if min(self.judge.error(self.start(degree, solver).offsets) for degree in MONOMIALS) >= enough:
             return []
-        solvers = [by.improve_mask(self.targets) for by in solvers]
-        changes, bases = best.changes, [self.start(degree, solvers) for degree in MONOMIALS]
-        for i, base in enumerate(bases):
-            missing = [(change - made)[:, :1] for change, made in zip(changes, base.offsets, strict=True)]
-            bases[i] = replace(base, residuals=missing, masked=True)
-        return bases
+        solver = solver.improve_mask(self.targets)
+        bases = [self.start(degree, solver) for degree in MONOMIALS]
+        return [replace(b, residual=(best.change - b.offsets)[:, :1], masked=True) for b in bases]
 
 
 def choose_model(
     solver: Solver,
-    trials: Sequence[tuple[Solver, Judge]],
+    trial: tuple[Solver, Judge],
     targets: Sequence[Tensor],
     steps: int,
     most_bands: int,
@@ -461,22 +446,18 @@ def choose_model(
 
     Args:
         solver: the views
-        trials: solvers to try it with, and views or pixels that these do not know; see `split_solver`
+        trial: a solver to try it with, and views or pixels that it does not know; see `split_solver`
         targets: the finished edit in the solver's views
         steps: most steps of conjugate gradients for a residual
         most_bands: SH functions that a residual may have: 1, 4 or 9
     """
-    tries, few = _Trials(trials, targets, steps), solver.ties is not None
+    tries, few = _Trials(*trial, targets, steps), solver.ties is not None
     most_bands = min(most_bands, 1 if few else solver.sh.shape[1])
-    bases = {degree: tries.start(degree, [by for by, _ in trials]) for degree in (0, *MONOMIALS)}
-
-    def miss(degree: int) -> float:
-        pairs = zip(trials, bases[degree].offsets, strict=True)
-        return sum(judge.mean(made, 1.0) for (_, judge), made in pairs)
-
+    bases = {degree: tries.start(degree, tries.solver) for degree in (0, *MONOMIALS)}
+    missed = {degree: tries.judge.mean(base.offsets, 1.0) for degree, base in bases.items()}
     # of what no picture shows a map is a guess: where it is the worse one for most that is shown, for less
     # than about half of that is painted, there is none
-    degrees = (0,) if few and miss(0) <= min(map(miss, MONOMIALS)) else MONOMIALS
+    degrees = (0,) if few and missed[0] <= min(missed.values()) else MONOMIALS
     names = {degree: f"map of degree {degree}" if degree else "no map" for degree in degrees}
     hold = _HOLDS[0] if few else _RIDGE
     by_degree = [tries.attempt(bases[degree], name, int(few), hold) for degree, name in names.items()]
@@ -492,14 +473,14 @@ def choose_model(
     is_richer = last.bands > best.bands > 0 and last.error < best.error
     spreads = best.degree > 0  # what no picture shows follows the map, masked or not
     if best.bands and (few or best.bands > 1 or best.error > LEVEL):
-        alone = min(tries.error(bases[degree].offsets) for degree in MONOMIALS)
+        alone = min(tries.judge.error(bases[degree].offsets) for degree in MONOMIALS)
         best = tries.try_masks(best, alone, most_bands)
-    chosen, residual = best.solvers[0], best.residuals[0]
+    chosen, residual = best.solver, best.residual
     if few:
         chosen, residual = _solve_whole(solver, best, targets, steps, spreads)
     mask = (chosen.share * 255.0).round().to(torch.uint8) if best.masked else None
     decided = [(one.name, decibels(one.error)) for one in tries.tried]
-    richer = last.residuals[0] if is_richer and not best.masked else None
+    richer = last.residual if is_richer and not best.masked else None
     return chosen, Model(best.degree, best.hold, residual, mask, best.error, decided, tries.steps, richer)
 
 
@@ -526,11 +507,10 @@ def _solve_whole(
 ) -> tuple[Solver, Tensor]:
     """What the trials solved for a part of the pixels, with all of them: the solver with its mask, and the
     residual. [M,1,3]"""
-    total = torch.stack(best.changes).mean(dim=0)
     if best.masked:
-        solver = solver.guess_mask(total, spreads).improve_mask(targets)
+        solver = solver.guess_mask(best.change, spreads).improve_mask(targets)
     made = solver.fit_map(best.degree, targets)[1]
-    begin = (total - made)[:, :1] if best.masked else torch.zeros_like(best.residuals[0])
+    begin = (best.change - made)[:, :1] if best.masked else torch.zeros_like(best.residual)
     judge = Judge(solver.views, targets)
     residual, _ = solver.residual(made, begin, targets, steps, judge, best.error, best.hold)
     return solver, residual

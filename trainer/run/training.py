@@ -256,8 +256,8 @@ def plan_colors(
     with log.stage("model"):
         finished, solver = target(1.0, edited[1.0]), make_solver(drawn, original, ties)
         targets = finished[0].targets
-        trials = [(solver, finished[1])] if ties is None else split_solver(solver, targets)
-        solver, model = choose_model(solver, trials, targets, most, 1 if optimization.sh == "off" else 9)
+        trial = (solver, finished[1]) if ties is None else split_solver(solver, targets)
+        solver, model = choose_model(solver, trial, targets, most, 1 if optimization.sh == "off" else 9)
         if model.error <= LEVEL and held_out and between is not None and not options.views:
             half = replace(finished[0], targets=targets[::2]), finished[1]
             fewer = solve_again(model, make_solver(drawn[::2], original), targets[::2], half[1])

@@ -71,7 +71,7 @@ def grainy(pictures: list[Tensor], sigma: float) -> list[Tensor]:
 
 
 def model_of(solver: Solver, targets: list[Tensor], steps: int = 40, bands: int = 4) -> Model:
-    return choose_model(solver, [(solver, Judge(solver.views, targets))], targets, steps, bands)[1]
+    return choose_model(solver, (solver, Judge(solver.views, targets)), targets, steps, bands)[1]
 
 
 def solve_all(
@@ -196,7 +196,7 @@ def test_what_some_members_get_and_others_do_not_is_a_mask(profile: str) -> None
     targets, aside = (render_all(some, pack(edited, with_shN=True)) for some in (crops, others))
     solver = make_solver(color_views(crops, original), original)
     judge = Judge(color_views(others, original), aside)
-    solver, model = choose_model(solver, [(solver, judge)], targets, 40, 4)
+    solver, model = choose_model(solver, (solver, judge), targets, 40, 4)
     assert (model.degree, model.mask is None) == (1, False), model.line
     seen = solver.weights[:, 0, 0] > 0.2 * solver.typical
     alike = torch.corrcoef(torch.stack([model.mask.float()[seen], share[seen]]))[0, 1]
@@ -222,7 +222,7 @@ def test_a_pattern_of_many_colors_gets_a_residual_and_only_as_many_bands_as_pay(
             for some in (crops, others)
         )
         judge = Judge(color_views(others, original), aside)
-        return choose_model(solver, [(solver, judge)], targets, 40, most)[1].bands
+        return choose_model(solver, (solver, judge), targets, 40, most)[1].bands
 
     solver = make_solver(color_views(crops, original), original)
     assert bands_of(edited) == 1
@@ -252,7 +252,7 @@ def test_a_second_band_that_hardly_pays_at_the_end_is_taken_where_it_pays_on_the
     # what no residual can show hides at the end what a band is worth
     rng = torch.Generator().manual_seed(0)
     noisy = [image + 0.085 * torch.randn(image.shape, generator=rng) for image in pictures(others, 1.0)]
-    solver, model = choose_model(solver, [(solver, Judge(aside, noisy))], pictures(crops, 1.0), 40, 4)
+    solver, model = choose_model(solver, (solver, Judge(aside, noisy)), pictures(crops, 1.0), 40, 4)
     assert model.bands == 1
     early = TargetStage(0.1, pictures(crops, 0.1), 1), Judge(aside, pictures(others, 0.1))
     finished = TargetStage(1.0, pictures(crops, 1.0), 1), Judge(aside, noisy)
@@ -271,7 +271,7 @@ def test_only_members_that_need_them_have_functions_beyond_dc(turning: float, sp
     rows, solver = pack(edited, with_shN=True), make_solver(color_views(crops, original), original)
     targets, aside = grainy(render_all(crops, rows), 0.01), grainy(render_all(others, rows), 0.01)
     judge = Judge(color_views(others, original), aside)
-    solver, model = choose_model(solver, [(solver, judge)], targets, 40, 4)
+    solver, model = choose_model(solver, (solver, judge), targets, 40, 4)
     thinner = settle_bands(model, solver, [(TargetStage(1.0, targets, 1), judge)], 40, spare)
     mapped = solver.fit_map(model.degree, targets)[1]
     errors = [judge.error(add_bands(mapped, one.residual)) for one in (model, thinner)]
@@ -319,7 +319,7 @@ def test_strengths_are_asked_for_where_those_that_are_solved_for_say_too_little(
     def course_of(asked: Sequence[float]) -> Course:
         return Course(ask(asked), ask([1.0])[0], look, ask)
 
-    _, model = choose_model(solver, [(solver, look(1.0))], pictures(crops, 1.0), 40, 1)
+    _, model = choose_model(solver, (solver, look(1.0)), pictures(crops, 1.0), 40, 1)
     course, made, state = course_of([]), list[ParameterSnapshot](), PgsState(original)
     rounds[:] = [0]
     for snapshot in solve(solver, model, course, made, state, lambda step, left: None, 40):
