@@ -40,7 +40,7 @@ from trainer.views.view import View
 from .evaluate import Evaluator, make_evaluator
 
 THINNED = 0.025
-"""Of what a field may add, what is left to functions that single members do not have, see `settle_bands`."""
+"""Of what a field may add, what is left to functions that single members do not have, see `thin_model`."""
 
 _VIEWS = 3
 _BETTER = 0.5  # dB by which the own way has to be nearer: it takes several times the bytes

@@ -71,12 +71,10 @@ class Course:
         return list(strengths), [replace(one, step=i + 1) for i, one in enumerate(recordings)]
 
 
-def settle_bands(model: Model, solver: Solver, targets: Sequence[Target], steps: int, spare: float) -> Model:
-    """The model with the bands that pay at other strengths too, and of them only what members need.
+def thin_model(model: Model, solver: Solver, targets: Sequence[Target], steps: int, spare: float) -> Model:
+    """The model with only those functions beyond DC that members need at these strengths.
 
-    Less than a twentieth at the end can be half of the error at a tenth of the slider, where a map leaves
-    little but what turns with the view: there another band is tried. Then each time the half of the members'
-    functions beyond DC goes that adds least to the pictures, and what is left is solved for anew.
+    Each time the half goes that adds least to the pictures, and what is left is solved for anew.
 
     Args:
         model: what the finished edit called for
@@ -85,7 +83,7 @@ def settle_bands(model: Model, solver: Solver, targets: Sequence[Target], steps:
         steps: most steps of conjugate gradients
         spare: mean squared error that fewer functions may add beside a twentieth
     """
-    if model.bands < 2 and model.richer is None:
+    if model.bands < 2:
         return model
     mapped = [solver.fit_map(model.degree, stage.targets)[1] for stage, _ in targets]
 
@@ -105,10 +103,6 @@ def settle_bands(model: Model, solver: Solver, targets: Sequence[Target], steps:
 
     best, least = refine(scale(model.residual), steps)
     tried, on_the_way = list(model.tried), ", on the way too" if len(targets) > 1 else ""
-    if model.richer is not None:
-        richer, error = refine(scale(model.richer), steps)
-        tried.append((f"with a residual of {richer[0].shape[1]}{on_the_way}", decibels(error / len(targets))))
-        best, least = (richer, error) if error < MORE_PAYS * least else (best, least)
     thinner, error = best, least
     while error * MORE_PAYS <= least + len(targets) * spare:
         best, least = thinner, min(least, error)
@@ -118,7 +112,7 @@ def settle_bands(model: Model, solver: Solver, targets: Sequence[Target], steps:
         left = float(thinner[-1].any(dim=2).float().sum(dim=1).mean())
         tried.append((f"{left:.1f} of these a Gaussian{on_the_way}", decibels(error / len(targets))))
     begun = {stage.strength: one for (stage, _), one in zip(targets, best, strict=True)}
-    return replace(model, residual=best[-1], begun=begun, tried=tried, richer=None)
+    return replace(model, residual=best[-1], begun=begun, tried=tried)
 
 
 def solve(

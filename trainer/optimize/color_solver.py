@@ -62,8 +62,8 @@ _RIDGE = 0.002  # of a typical member's weight: holds the residual of what hardl
 _TIES = 0.001  # of a typical member's weight: ties neighbors, where views are few
 _TRUSTED = 0.1  # of the same: a member of less is rather as its neighbors are
 _HOLDS = (1e-8, 1e-5, 1e-3)  # ridges tried there: a residual goes around all, some way, to its neighbors
-_SHOWS = 0.5  # pixels of a member in each of two pictures, from which on these say what it is
 _SHARES = (1.0, 0.5, 0.2)  # of a step, where the whole of it would run into clamps
+_SHOWS = 0.5  # pixels of a member in each of two pictures, from which on these say what it is
 
 LOOKS = 3
 """Steps over which that is taken: a single one may gain nothing in other views."""
@@ -80,8 +80,6 @@ class Model:
     error: float  # mean square, of the finished edit in views not solved for: what is finer is not chased
     tried: Sequence[tuple[str, float]]  # what was tried, and its error on views not solved for, dB
     steps: int  # that all of this took
-    # with another band, where that is better, but by less than a twentieth. [M,B,3]
-    richer: Tensor | None = None
     begun: Mapping[float, Tensor] = field(default_factory=dict)  # strength → a residual to begin with there
 
     @property
@@ -459,18 +457,16 @@ def choose_model(
     # than about half of that is painted, there is none
     degrees = (0,) if few and missed[0] <= min(missed.values()) else MONOMIALS
     names = {degree: f"map of degree {degree}" if degree else "no map" for degree in degrees}
-    hold = _HOLDS[0] if few else _RIDGE
-    by_degree = [tries.attempt(bases[degree], name, int(few), hold) for degree, name in names.items()]
+    by_degree = [tries.attempt(bases[degree], name, 0, _RIDGE) for degree, name in names.items()]
     best = last = _least(by_degree, lambda one: one.degree)
     sizes = [(bands, _RIDGE) for bands in BANDS if bands <= most_bands]
-    for bands, hold in [(1, hold) for hold in _HOLDS[1:]] if few else sizes:
+    for bands, hold in [(1, hold) for hold in _HOLDS] if few else sizes:
         name = f"residual held by {hold:g}" if few else f"with a residual of {bands}"
         last = tries.attempt(last, name, bands, hold)
         if last.error >= best.error and not few:
             break
-        if max(last.error, LEVEL) < MORE_PAYS * best.error:
+        if max(last.error, LEVEL) < MORE_PAYS * best.error or (few and not best.bands):
             best = last
-    is_richer = last.bands > best.bands > 0 and last.error < best.error
     spreads = best.degree > 0  # what no picture shows follows the map, masked or not
     if best.bands and (few or best.bands > 1 or best.error > LEVEL):
         alone = min(tries.judge.error(bases[degree].offsets) for degree in MONOMIALS)
@@ -480,8 +476,7 @@ def choose_model(
         chosen, residual = _solve_whole(solver, best, targets, steps, spreads)
     mask = (chosen.share * 255.0).round().to(torch.uint8) if best.masked else None
     decided = [(one.name, decibels(one.error)) for one in tries.tried]
-    richer = last.residual if is_richer and not best.masked else None
-    return chosen, Model(best.degree, best.hold, residual, mask, best.error, decided, tries.steps, richer)
+    return chosen, Model(best.degree, best.hold, residual, mask, best.error, decided, tries.steps)
 
 
 def solve_again(

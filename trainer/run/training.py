@@ -22,7 +22,7 @@ from progdf.metrics.image import LEVEL
 from progdf.rasterize.engines import engine_device
 from progdf.scene.bounds import scene_sphere
 from trainer.fit.network import JointTraining, begin_joint_training, save_network
-from trainer.optimize.color_course import STEPS, Course, Target, settle_bands, solve
+from trainer.optimize.color_course import STEPS, Course, Target, solve, thin_model
 from trainer.optimize.color_solver import (
     Model,
     Solver,
@@ -270,7 +270,7 @@ def plan_colors(
     with log.stage("model"):
         middle = len(course.targets) // 2 if between is None else 0
         spare = 0.0 if target_psnr is None else 10 ** (-target_psnr / 10)
-        model = settle_bands(model, solver, [*course.targets[middle : middle + 1], finished], most, spare)
+        model = thin_model(model, solver, [*course.targets[middle : middle + 1], finished], most, spare)
     on = "views that are held out" if held_out else "all views, as none is held out"
     if len(train) < count:
         log.say(f"{len(train)} of {count} views are solved for: all would change nothing that shows")

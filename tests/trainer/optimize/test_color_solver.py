@@ -18,7 +18,7 @@ from progdf.rasterize.engines import color_map
 from progdf.sh import rgb_to_sh0
 from progdf.threads import map_threads
 from tests.helpers.scenes import random_gaussians
-from trainer.optimize.color_course import Course, Target, settle_bands, solve
+from trainer.optimize.color_course import Course, Target, solve, thin_model
 from trainer.optimize.color_solver import (
     Model,
     Solver,
@@ -231,36 +231,6 @@ def test_a_pattern_of_many_colors_gets_a_residual_and_only_as_many_bands_as_pay(
     assert bands_of(turned, most=1) == 1
 
 
-@pytest.mark.parametrize(("turns", "bands"), [(2.0, 4), (0.0, 1)])
-def test_a_second_band_that_hardly_pays_at_the_end_is_taken_where_it_pays_on_the_way(
-    turns: float, bands: int
-) -> None:
-    scene = dense_ball(1500, bands=3)
-    side = (scene.means[:, :1] > 0).float()
-    moved = (
-        scene.sh0 + side * torch.tensor([[1.0, -0.8, 0.3]]) + (1 - side) * torch.tensor([[-0.7, 0.2, 0.9]])
-    )
-    shN = scene.shN * (1.0 - turns * side[..., None])
-    crops, original = prepared(scene, orbit(8, 64))
-    others, _ = prepared(scene, orbit(11, 64)[8:])
-    solver, aside = make_solver(color_views(crops, original), original), color_views(others, original)
-
-    def pictures(some: list[CropScene], s: float) -> list[Tensor]:
-        edited = replace(scene, sh0=torch.lerp(scene.sh0, moved, s), shN=shN)
-        return render_all(some, pack(edited, with_shN=True))
-
-    # what no residual can show hides at the end what a band is worth
-    rng = torch.Generator().manual_seed(0)
-    noisy = [image + 0.085 * torch.randn(image.shape, generator=rng) for image in pictures(others, 1.0)]
-    solver, model = choose_model(solver, (solver, Judge(aside, noisy)), pictures(crops, 1.0), 40, 4)
-    assert model.bands == 1
-    early = TargetStage(0.1, pictures(crops, 0.1), 1), Judge(aside, pictures(others, 0.1))
-    finished = TargetStage(1.0, pictures(crops, 1.0), 1), Judge(aside, noisy)
-    assert settle_bands(model, solver, [finished], 40, 0.0).bands == 1
-    settled = settle_bands(model, solver, [early, finished], 40, 0.0)
-    assert settled.bands == bands, settled.line
-
-
 @pytest.mark.parametrize(("turning", "spare"), [(0.1, 0.0), (1.0, 0.0), (1.0, 3e-4)])
 def test_only_members_that_need_them_have_functions_beyond_dc(turning: float, spare: float) -> None:
     scene = dense_ball(1500, bands=3)
@@ -272,7 +242,7 @@ def test_only_members_that_need_them_have_functions_beyond_dc(turning: float, sp
     targets, aside = grainy(render_all(crops, rows), 0.01), grainy(render_all(others, rows), 0.01)
     judge = Judge(color_views(others, original), aside)
     solver, model = choose_model(solver, (solver, judge), targets, 40, 4)
-    thinner = settle_bands(model, solver, [(TargetStage(1.0, targets, 1), judge)], 40, spare)
+    thinner = thin_model(model, solver, [(TargetStage(1.0, targets, 1), judge)], 40, spare)
     mapped = solver.fit_map(model.degree, targets)[1]
     errors = [judge.error(add_bands(mapped, one.residual)) for one in (model, thinner)]
     assert errors[1] * 0.95 <= errors[0] + spare

@@ -7,7 +7,6 @@ import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -25,7 +24,6 @@ from progdf.gdf.file import load_gdf, read_gdf
 from tests.helpers.trained import quick_options, train
 from trainer import cli
 from trainer.evaluate.command import evaluate
-from trainer.optimize.color_solver import Model, Solver, choose_model
 from trainer.options import EvaluateOptions, FitOptions, TrainOptions, with_values
 from trainer.report.plots import LINES, draw_plot
 from trainer.resolve import resolve
@@ -127,24 +125,6 @@ def test_effort_that_nobody_gives_is_decided_on_the_scene_and_reported(folder: P
     how = "in " if effort["steps"] else "by maps alone"
     assert f"{len(effort['strengths'])} strengths {how}" in free.folder.log.read_text()
     assert free.report["edit"]["psnr_to_views"] > 32.0
-
-
-@pytest.mark.parametrize("more", [{}, {"target_psnr": 30.0}])
-def test_another_band_that_hardly_pays_at_the_end_is_tried_on_the_way(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, more: dict[str, float]
-) -> None:
-    def choose(*arguments: Any) -> tuple[Solver, Model]:
-        solver, model = choose_model(*arguments)
-        richer = 0.01 * torch.ones(len(solver.sh), 4, 3)
-        return solver, replace(model, residual=richer[:, :1], mask=None, richer=richer)
-
-    monkeypatch.setattr("trainer.run.training.choose_model", choose)
-    options = quick_options(folder, f"richer{len(more)}", stages=0, views=8, image_size=40, **more)
-    result = train(options, quiet=True)
-    tried = result.report["effort"]["tried_psnr"]
-    assert any(name.startswith("with a residual of 4, on the way too") for name in tried)
-    chosen = result.report["effort"]
-    assert 1.0 <= chosen["functions_per_gaussian"] <= chosen["sh_functions"]
 
 
 def test_with_stages_the_slider_is_the_editors_own_strength(folder: Path) -> None:
