@@ -62,8 +62,8 @@ _RIDGE = 0.002  # of a typical member's weight: holds the residual of what hardl
 _TIES = 0.001  # of a typical member's weight: ties neighbors, where views are few
 _TRUSTED = 0.1  # of the same: a member of less is rather as its neighbors are
 _HOLDS = (1e-8, 1e-5, 1e-3)  # ridges tried there: a residual goes around all, some way, to its neighbors
-_SHARES = (1.0, 0.5, 0.2)  # of a step, where the whole of it would run into clamps
 _SHOWS = 0.5  # pixels of a member in each of two pictures, from which on these say what it is
+_SHARES = (1.0, 0.5, 0.2)  # of a step, where the whole of it would run into clamps
 
 LOOKS = 3
 """Steps over which that is taken: a single one may gain nothing in other views."""
@@ -419,7 +419,7 @@ class _Trials:
         return _least([best, *masked], lambda one: 3 * one.bands + one.masked, LEVEL)
 
     def _with_masks(self, best: _Attempt, enough: float) -> list[_Attempt]:
-        """The same change by masks of the trials' own and maps of each degree, what is missing in the
+        """The same change by a mask and maps of each degree, what is missing in their
         residuals; none where the mask that the members' changes ask for leaves more than `enough`."""
         solver = best.solver.guess_mask(best.change, best.degree > 0)
         if min(self.judge.error(self.start(degree, solver).offsets) for degree in MONOMIALS) >= enough:
@@ -500,7 +500,7 @@ def solve_again(
 def _solve_whole(
     solver: Solver, best: _Attempt, targets: Sequence[Tensor], steps: int, spreads: bool
 ) -> tuple[Solver, Tensor]:
-    """What the trials solved for a part of the pixels, with all of them: the solver with its mask, and the
+    """What the trial solved for a part of the pixels, with all of them: the solver with its mask, and the
     residual. [M,1,3]"""
     if best.masked:
         solver = solver.guess_mask(best.change, spreads).improve_mask(targets)

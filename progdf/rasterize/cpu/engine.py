@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -62,7 +62,7 @@ _CHUNKS = 4  # for each thread: tiles take unequally long
 _MOST_TILES, _MOST_GAUSSIANS = 24, 32 * BLOCK  # of a chunk: a picture that is dropped stops between two
 TILE_ROOM = 8  # tiles of a Gaussian that there is room for; where chunks have more, these are listed twice
 ENTRY_ROOM = 16  # and pixels that a Gaussian weighs in of a tile
-_ALL = np.empty(0, np.bool_)  # rows get gradients
+_ALL = np.empty(0, np.bool_)  # which rows get gradients, where all do
 
 
 def rasterize(
@@ -215,8 +215,8 @@ class _Rasterize(torch.autograd.Function):
         if camera.degree < 0:
             results[4] = torch.from_numpy(gradients.colors.reshape(-1, 3))
         by_background, by_viewmat, by_K = ctx.needs_input_grad[8:]
-        through = (by_image * out.transmittance[..., None]).sum(axis=(0, 1), dtype=np.float64)
-        results.append(torch.from_numpy(through.astype(np.float32)) if by_background else None)
+        through = partial(np.einsum, "hwc,hw->c", by_image, out.transmittance, dtype=np.float64)
+        results.append(torch.from_numpy(through().astype(np.float32)) if by_background else None)
         results += _camera_gradients(by_camera, viewmat, K) if by_viewmat or by_K else (None, None)
         return None, None, None, *results
 

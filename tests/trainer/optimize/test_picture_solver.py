@@ -9,9 +9,10 @@ from torch import Tensor
 
 from progdf.camera import Camera, intrinsics, look_at
 from progdf.gaussians import ATTRIBUTES, Gaussians, pack
+from progdf.metrics.image import decibels
 from progdf.sh import C0, rgb_to_sh0
 from tests.helpers.trained import edit_few
-from trainer.optimize.color_solver import make_solver
+from trainer.optimize.color_solver import choose_model, make_solver, split_solver
 from trainer.optimize.color_views import color_views
 from trainer.optimize.ties import Ties, surface_graph
 from trainer.views.crops import crop_scene
@@ -81,6 +82,24 @@ def test_what_lies_beside_the_picture_follows_a_fill() -> None:
     change = change_of(scene, camera, painted)
     corner = (scene.means[:, :2].abs() > 0.9).all(dim=1)
     assert float((change[corner] - torch.tensor([-0.4, -0.25, -0.1])).abs().max()) < 0.05
+
+
+def test_a_few_pictures_choose_the_degree_of_the_map_by_maps_alone() -> None:
+    rng, camera = torch.Generator().manual_seed(0), ahead(0.3)
+    gray = 0.4 + 0.2 * torch.rand(SIDE * SIDE, 1, generator=rng).expand(-1, 3)
+    scene = replace(wall(0.0, torch.zeros(3)), sh0=rgb_to_sh0(gray).clone())
+    painted = [render_view(scene, camera, WHITE).clamp(0, 1) * 0.9]
+    painted[0][:, 48:] *= 0.5  # which a residual says better than any map
+    crops = [crop_scene(scene, torch.arange(len(scene)), camera, (0, 0, 96, 96), WHITE, True)]
+    original, nobody = pack(scene, with_shN=False), torch.zeros(len(scene), dtype=torch.bool)
+    solver = make_solver(color_views(crops, original), original, Ties(surface_graph(scene, nobody), ~nobody))
+    by, judge = split_solver(solver, painted)
+    _, model = choose_model(solver, (by, judge), painted, 20, 1)
+    found = dict(model.tried)
+    assert found["residual held by 1e-08"] > found["map of degree 3"] + 1.0
+    for degree in (1, 2, 3):
+        assert found[f"map of degree {degree}"] == decibels(judge.error(by.fit_map(degree, painted)[1]))
+    assert model.bands == 1
 
 
 def test_what_lies_beside_the_picture_takes_the_nearest_of_two_paints() -> None:
