@@ -45,7 +45,7 @@ _DIRECTIONS = 32  # in which a member's color is mapped; twice the functions of 
 _CHUNK = 1 << 11  # members at once
 MOST_RESIDUALS = MOST_RANK // 2
 """Bases of a residual that are tried, each in up to two."""
-COARSER = tuple(2.0 ** (i / 4) for i in range(-4, 13))
+COARSER = tuple(2.0 ** (i / 8) for i in range(-8, 25))
 """Steps of a residual's levels that are tried; with 1 nearly all members take 8 bits."""
 _WITHIN = 0.999  # share of the members that do: few must not take the levels of all
 
