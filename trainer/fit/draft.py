@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import torch
 from torch import Tensor
@@ -122,40 +121,23 @@ def draft_grade(views: DraftViews, options: EditorOptions, name: str) -> Gdf | N
         return None
     fitted, judged = views.fitted, views.judged
     editor = make_editor(options, views.scene, views.region, (), lambda: views.glances)
-    courses = [edit_course(editor, some.row) for some in (fitted, judged)]
     plain = tuple((i + 1) / MOST_STAGES for i in range(MOST_STAGES))
     strengths = equalized_strengths(editor, options.editor, [fitted.row], plain)
-    targets, expected = ([edit(s) for s in strengths] for edit in courses)
+    targets, expected = list(map(edit_course(editor, fitted.row), strengths)), editor.edit(judged.row, 1.0)
     ends = {degree: fitted.maps.solve(degree, targets[-1:]) for degree in MONOMIALS}
-    errors = {degree: _error(judged.maps.picture(end), expected[-1]) for degree, end in ends.items()}
+    errors = {degree: _error(judged.maps.picture(end), expected) for degree, end in ends.items()}
     degree = min(d for d in errors if MORE_PAYS * errors[d] <= min(errors.values()))
-    error = _drawn_error(views, ends[degree], degree, expected[-1])
-    carried = CARRIED * _error(judged.row.image[0], expected[-1]) + ROUNDING
+    error = _drawn_error(views, ends[degree], degree, expected)
+    carried = CARRIED * _error(judged.row.image[0], expected) + ROUNDING
     if error > carried and options.family != "grade":  # by hand one judges what one sees
         return None
-    solve = partial(fitted.maps.solve, degree)
-    table = torch.stack([identity_map(degree), *(solve([target]) for target in targets)])
-    every = _knots(judged, table, expected)
-    knots, table = torch.tensor((0.0, *plain))[::every], table[::every]
+    maps = [fitted.maps.solve(degree, [target]) for target in targets]
+    knots, table = torch.tensor((0.0, *plain)), torch.stack([identity_map(degree), *maps])
     form = map_form(knots, degree, table, len(views.region))
     channels = BASE_CHANNELS + 3 * views.scene.shN.shape[1]
     field = BakedField("grade", torch.tensor([0.0, 1.0]), {}, channels, tuple(knots.tolist()), form)
     about = {"draft": {"degree": degree, "psnr": round(decibels(error), 2)}}
     return Gdf(name, views.region, field, fingerprint(views.scene), options.editor, report=about)
-
-
-def _knots(judged: _Pixels, table: Tensor, expected: Sequence[Tensor]) -> int:
-    """Every which of the maps is enough: those between take at most a twentieth away. [S,K,3]"""
-    strengths = torch.arange(len(table))
-
-    def error(every: int) -> float:
-        left, share = strengths // every * every, (strengths % every) / every
-        right = (left + every).clamp_max(len(table) - 1)
-        course = torch.lerp(table[left], table[right], share[:, None, None])
-        return sum(_error(judged.maps.picture(t), e) for t, e in zip(course[1:], expected, strict=True))
-
-    least = error(1)
-    return next(every for every in (8, 4, 2, 1) if MORE_PAYS * error(every) <= least)
 
 
 def _drawn_error(views: DraftViews, table: Tensor, degree: int, expected: Tensor) -> float:
