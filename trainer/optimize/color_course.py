@@ -10,11 +10,12 @@ from itertools import pairwise
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from progdf.field.grade import band_offsets, member_bands
 from progdf.metrics.image import LEVEL, decibels
 
-from .color_solver import LOOKS, Model, Solver, add_bands
+from .color_solver import BANDS, LOOKS, Model, Solver, add_bands
 from .color_views import MORE_PAYS, Judge
 from .pgs import OnStep, ParameterSnapshot, PgsState, TargetStage
 from .retime import smooth_weights
@@ -72,9 +73,10 @@ class Course:
 
 
 def thin_model(model: Model, solver: Solver, targets: Sequence[Target], steps: int, spare: float) -> Model:
-    """The model with only those functions beyond DC that members need at these strengths.
+    """The model with the functions beyond DC that members need at these strengths, and only those.
 
-    Each time the half goes that adds least to the pictures, and what is left is solved for anew.
+    Where the end shows no error, another band is tried for the way. Then each time the half goes that adds
+    least to the pictures, and what is left is solved for anew.
 
     Args:
         model: what the finished edit called for
@@ -83,26 +85,30 @@ def thin_model(model: Model, solver: Solver, targets: Sequence[Target], steps: i
         steps: most steps of conjugate gradients
         spare: mean squared error that fewer functions may add beside a twentieth
     """
-    if model.bands < 2:
+    more = (count for count in BANDS if model.bands < count <= solver.asked.shape[1])
+    richer = next(more, 0) if model.error <= LEVEL else 0
+    if not model.bands or max(model.bands, richer) < 2:
         return model
     mapped = [solver.fit_map(model.degree, stage.targets)[1] for stage, _ in targets]
 
     def refine(starts: Sequence[Tensor], most: int) -> tuple[list[Tensor], float]:
         """The residuals after so many steps, as long as these help where that is all, and what they leave."""
-        by, found, left = solver.only(starts[-1]), list[Tensor](), 0.0
+        by = solver if most == steps else solver.only(starts[-1])
+        found, left = list[Tensor](), 0.0
         for (stage, judge), made, start in zip(targets, mapped, starts, strict=True):
-            if most < steps or stage.strength < 1.0:  # the finished edit is solved for
+            if start.shape[1] > model.bands or most < steps or stage.strength < 1.0:  # else it is solved for
                 asked = None if most < steps else judge
                 start, _ = by.residual(made, start, stage.targets, most, asked, model.error, model.hold)
             found.append(start)
             left += max(judge.error(add_bands(made, start)), LEVEL)
         return found, left
 
-    def scale(residual: Tensor) -> list[Tensor]:
-        return [stage.strength * residual for stage, _ in targets]
-
-    best, least = refine(scale(model.residual), steps)
+    best, least = refine([stage.strength * model.residual for stage, _ in targets], steps)
     tried, on_the_way = list(model.tried), ", on the way too" if len(targets) > 1 else ""
+    if richer:
+        found, error = refine([pad(one, (0, 0, 0, richer - model.bands)) for one in best], steps)
+        tried.append((f"with a residual of {richer}{on_the_way}", decibels(error / len(targets))))
+        best, least = (found, error) if error < MORE_PAYS * least else (best, least)
     thinner, error = best, least
     while error * MORE_PAYS <= least + len(targets) * spare:
         best, least = thinner, min(least, error)

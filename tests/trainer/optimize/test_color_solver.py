@@ -13,6 +13,7 @@ from torch import Tensor
 
 from progdf.camera import Camera, intrinsics, look_at
 from progdf.gaussians import Gaussians, pack
+from progdf.metrics.image import LEVEL
 from progdf.rasterize import activate, alpha_weights, render, set_threads
 from progdf.rasterize.engines import color_map
 from progdf.sh import rgb_to_sh0
@@ -253,6 +254,26 @@ def test_only_members_that_need_them_have_functions_beyond_dc(turning: float, sp
     assert share == 1.0 if turning == 1.0 and not spare else 0.0 < share < 0.5
     again = solver.only(thinner.residual).residual(mapped, model.residual, targets, 5)[0]
     assert torch.equal(again[:, 1:].any(dim=2), functions)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_where_the_end_shows_no_error_another_band_is_tried_for_the_way(turned: bool) -> None:
+    scene = dense_ball(1000, bands=3)
+    draws = 0.3 * torch.randn(1000, 3, generator=torch.Generator().manual_seed(9))
+    (crops, original), (others, _) = (prepared(scene, c) for c in (orbit(8, 64), orbit(16, 64)[1::2]))
+    solver, aside = make_solver(color_views(crops, original), original), color_views(others, original)
+
+    def target(s: float, shn: Tensor) -> Target:
+        rows = pack(replace(scene, sh0=scene.sh0 + s * draws, shN=shn), with_shN=True)
+        return TargetStage(s, render_all(crops, rows), 1), Judge(aside, render_all(others, rows))
+
+    end, half = target(1.0, scene.shN), target(0.5, -scene.shN if turned else scene.shN)
+    solver, model = choose_model(solver, (solver, end[1]), end[0].targets, 40, 4)
+    assert model.bands == 1
+    assert model.error <= LEVEL
+    thinner = thin_model(model, solver, [half, end], 40, 0.0)
+    assert thinner.bands == (4 if turned else 1)
+    assert "with a residual of 4, on the way too" in thinner.line
 
 
 @pytest.mark.parametrize(
