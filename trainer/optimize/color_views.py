@@ -32,7 +32,6 @@ _AT_ONCE = 8  # views, whose results are there at the same time
 _SQUARES = 6  # of a view's longer side, every other one of which is in one of its halves
 _COVERED = 0.05  # the region's weight in a pixel that shows it
 _MOST_PIXELS = 60_000  # that a map is fitted to, of more evenly spread ones (docs/experiments.md, Pixels)
-_PART = 1 << 14  # of these, that a thread has at a time
 _CLAMP_ROUNDS = 3  # of the map's least squares, for pixels that are white or black anyway
 _MAP_RIDGE = 1e-6  # of the diagonal of a map's normal equations, for regions of few colors
 _MAP_HELD = 1e-2  # say of the members' own colors beside the pixels: there a map is held to the affine one
@@ -177,16 +176,16 @@ def color_views(crops: Sequence[CropScene], original: Tensor, every: int = 1) ->
 class MapFit:
     """The views' pixels as monomials of the region's drawn colors: a map's picture is linear in them."""
 
-    design: Tensor  # what each pixel shows of every monomial. [P,20] float32
-    original: Tensor  # what it showed before the edit, unclamped. [P,3]
+    design: Tensor  # what each pixel shows of every monomial. [P,20] float64
+    original: Tensor  # what it showed before the edit, unclamped. [P,3] float64
     pixels: Sequence[Tensor]  # which of each view's box these are, one view after another. [p] int64
     normal: Tensor  # products of all pixels' monomials. [20,20] float64
     held: Tensor  # the same of the members', hidden or not, as far as they count. [20,20] float64
 
     def picture(self, table: Tensor) -> Tensor:
         """What the pixels show under a map. [K,3] -> [P,3] 0..1"""
-        change = table - pad(identity_map(1), (0, 0, 0, len(table) - MONOMIALS[1])).to(table)
-        return (self.original + self.design[:, : len(table)] @ change).clamp(0.0, 1.0)
+        change = (table - pad(identity_map(1), (0, 0, 0, len(table) - MONOMIALS[1]))).double()
+        return (self.original + self.design[:, : len(table)] @ change).clamp(0.0, 1.0).float()
 
     @one_thread()
     def solve(self, degree: int, targets: Sequence[Tensor]) -> Tensor:
@@ -197,31 +196,22 @@ class MapFit:
         that one to the same change of all.
         """
         pixels = [image.reshape(-1, 3)[p] for image, p in zip(targets, self.pixels, strict=True)]
-        change = self._change(MONOMIALS[degree], torch.cat(pixels))
-        return identity_map(degree).to(change) + change
+        return identity_map(degree) + self._change(MONOMIALS[degree], torch.cat(pixels)).float()
 
     def _change(self, count: int, target: Tensor) -> Tensor:
         """What is added to the identity's first coefficients: 1, 4, 10 or 20. [P,3] -> [count,3]"""
-        design = self.design[:, :count].contiguous()
-        normal, pull = self.normal[:count, :count], self.normal.new_zeros(count, 3)
+        design, normal = self.design[:, :count], self.normal[:count, :count]
+        change = pull = design.new_zeros(count, 3)
         if count > 1:
-            coarse = self._change(4 if count > 4 else 1, target).double()
+            coarse = self._change(4 if count > 4 else 1, target)
             held = self.held[:count, :count] * (1.0 if count > 4 else _SHIFT_HELD)
             normal, pull = normal + held, held[:, : len(coarse)] @ coarse
         normal = normal + _MAP_RIDGE * (normal.diagonal() + 1e-12).diag()
-        change = design.new_zeros(count, 3)
-
-        def project(part: tuple[Tensor, Tensor, Tensor]) -> Tensor:
-            design, original, target = part
-            image = original + design @ change
-            clamped = ((image >= 1.0) & (target >= 1.0)) | ((image <= 0.0) & (target <= 0.0))
-            return (design.T @ (torch.where(clamped, image, target) - original)).double()
-
-        split = (torch.split(rows, _PART) for rows in (design, self.original, target))
-        parts = list(zip(*split, strict=True))
         for _ in range(_CLAMP_ROUNDS):
-            right = torch.stack(map_threads(project, parts)).sum(dim=0) + pull
-            change = torch.linalg.solve(normal, right).float()
+            image = self.original + design @ change
+            clamped = ((image >= 1.0) & (target >= 1.0)) | ((image <= 0.0) & (target <= 0.0))
+            missing = torch.where(clamped, image, target) - self.original
+            change = torch.linalg.solve(normal, design.T @ missing + pull)
         return change
 
 
@@ -250,12 +240,11 @@ def fit_maps(views: Sequence[ColorView], share: Tensor, most: int = _MOST_PIXELS
     stride = max(1, -(-sum(map(len, covered)) // most))
     pixels = [some[::stride].clone() for some in covered]
     laid = map_threads(lay_out, range(len(views)))
-    design, original = (torch.cat([one[i] for one in laid]) for i in (0, 1))
+    design, original = (torch.cat([one[i] for one in laid]).double() for i in (0, 1))
     members = torch.stack([one[2] for one in laid]).sum(dim=0)
-    wide = design.double()
     say = _MAP_HELD * len(design) / max(1, len(views) * len(views[0].original))
     pixels = [view.pixels[some] for view, some in zip(views, pixels, strict=True)]
-    return MapFit(design, original, pixels, wide.T @ wide, say * members)
+    return MapFit(design, original, pixels, design.T @ design, say * members)
 
 
 def mask_of_members(colors: Tensor, change: Tensor, weights: Tensor) -> Tensor:
