@@ -14,7 +14,8 @@ from progdf.color import edits as color
 from progdf.demo_scenes.assemble import DemoScene
 from progdf.errors import ProgdfError
 from progdf.gaussians import ATTRIBUTES, Gaussians
-from progdf.sh import rgb_to_sh0, sh0_to_rgb
+from progdf.quaternions import multiply_quats, rotate_vectors, turn_quats
+from progdf.sh import rgb_to_sh0, rotation_change, sh0_to_rgb
 
 Change = Callable[[Gaussians, float], Gaussians]
 """The members before the edit and a strength in (0, 1] -> the members at that strength."""
@@ -105,25 +106,26 @@ def scale_edit(factor: float, pivots: Tensor, shift: Tensor | None = None) -> An
 
 
 def swing_edit(degrees: float, axis: Tensor, pivots: Tensor) -> AnalyticEdit:
-    """Turn by `degrees` about `axis` [3] through the nearest of `pivots` [P,3]: centers run on circles."""
+    """Turn by `degrees` about `axis` [3] through the nearest of `pivots` [P,3]: centers run on circles, and
+    what is seen of a member turns with it."""
 
     def change(part: Gaussians, strength: float) -> Gaussians:
-        half = math.radians(degrees * strength) / 2
-        vector = math.sin(half) * axis.to(part.means) / axis.norm()
-        scalar = math.cos(half)
-        arm = part.means - _nearest(part.means, pivots)
-        twice = 2 * torch.linalg.cross(vector.expand_as(arm), arm)
-        moved = part.means + scalar * twice + torch.linalg.cross(vector.expand_as(arm), twice)
-        w, xyz = part.quats[:, :1], part.quats[:, 1:]
-        turned_w = scalar * w - (xyz @ vector)[:, None]
-        turned_xyz = scalar * xyz + w * vector + torch.linalg.cross(vector.expand_as(xyz), xyz)
-        return replace(part, means=moved, quats=torch.cat([turned_w, turned_xyz], dim=1))
+        turn = math.radians(degrees * strength) * axis.to(part.means) / axis.norm()
+        quats = turn_quats(turn.expand_as(part.means))
+        center = _nearest(part.means, pivots)
+        return replace(
+            part,
+            means=center + rotate_vectors(part.means - center, quats),
+            quats=multiply_quats(quats, part.quats),
+            shN=part.shN + rotation_change(part.shN, quats),
+        )
 
     return AnalyticEdit("swing", change)
 
 
 def warp_edit(name: str, warp: Warp) -> AnalyticEdit:
-    """A bent space: centers go where the warp takes them, covariances follow its Jacobian: Σ' = J Σ Jᵀ."""
+    """A bent space: centers go where the warp takes them, covariances follow its Jacobian, Σ' = J Σ Jᵀ, and
+    what is seen of a member follows the Jacobian's rotation."""
 
     def change(part: Gaussians, strength: float) -> Gaussians:
         points = part.means.double()
@@ -132,16 +134,20 @@ def warp_edit(name: str, warp: Warp) -> AnalyticEdit:
             for axis in torch.eye(3, dtype=torch.float64)
         ]
         axes = Rotation.from_quat(part.unit_quats.double().numpy(), scalar_first=True).as_matrix()
-        shape = torch.stack(columns, dim=2) @ (torch.from_numpy(axes) * part.scales.double()[:, None, :])
+        jacobian = torch.stack(columns, dim=2)
+        shape = jacobian @ (torch.from_numpy(axes) * part.scales.double()[:, None, :])
         # the covariance is shape · shapeᵀ, whose axes are the left singular vectors
         turned, scales, _ = torch.linalg.svd(shape)
         turned = turned * torch.where(torch.linalg.det(turned) < 0, -1.0, 1.0)[:, None, None]
         quats = Rotation.from_matrix(turned.numpy()).as_quat(scalar_first=True)
+        left, _, right = torch.linalg.svd(jacobian)
+        polar = Rotation.from_matrix((left @ right).numpy())
         return replace(
             part,
             means=warp(points, strength).to(part.means),
             quats=torch.from_numpy(quats).to(part.quats),
             log_scales=scales.clamp_min(1e-12).log().to(part.log_scales),
+            shN=part.shN + rotation_change(part.shN, torch.from_numpy(polar.as_quat(scalar_first=True))),
         )
 
     return AnalyticEdit(name, change)
