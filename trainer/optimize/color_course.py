@@ -85,7 +85,7 @@ def thin_model(model: Model, solver: Solver, targets: Sequence[Target], steps: i
         steps: most steps of conjugate gradients
         spare: mean squared error that fewer functions may add beside a twentieth
     """
-    more = (count for count in BANDS if model.bands < count <= solver.asked.shape[1])
+    more = (count for count in BANDS if model.bands < count <= model.most_bands)
     richer = next(more, 0) if model.error <= LEVEL else 0
     if not model.bands or max(model.bands, richer) < 2:
         return model
@@ -93,8 +93,7 @@ def thin_model(model: Model, solver: Solver, targets: Sequence[Target], steps: i
 
     def refine(starts: Sequence[Tensor], most: int) -> tuple[list[Tensor], float]:
         """The residuals after so many steps, as long as these help where that is all, and what they leave."""
-        by = solver if most == steps else solver.only(starts[-1])
-        found, left = list[Tensor](), 0.0
+        by, found, left = solver if most == steps else solver.only(starts[-1]), list[Tensor](), 0.0
         for (stage, judge), made, start in zip(targets, mapped, starts, strict=True):
             if start.shape[1] > model.bands or most < steps or stage.strength < 1.0:  # else it is solved for
                 asked = None if most < steps else judge

@@ -80,6 +80,7 @@ class Model:
     error: float  # mean square, of the finished edit in views not solved for: what is finer is not chased
     tried: Sequence[tuple[str, float]]  # what was tried, and its error on views not solved for, dB
     steps: int  # that all of this took
+    most_bands: int  # see `choose_model`; of few pictures 1
     begun: Mapping[float, Tensor] = field(default_factory=dict)  # strength → a residual to begin with there
 
     @property
@@ -475,8 +476,8 @@ def choose_model(
     if few:
         chosen, residual = _solve_whole(solver, best, targets, steps, spreads)
     mask = (chosen.share * 255.0).round().to(torch.uint8) if best.masked else None
-    decided = [(one.name, decibels(one.error)) for one in tries.tried]
-    return chosen, Model(best.degree, best.hold, residual, mask, best.error, decided, tries.steps)
+    tried = [(one.name, decibels(one.error)) for one in tries.tried]
+    return chosen, Model(best.degree, best.hold, residual, mask, best.error, tried, tries.steps, most_bands)
 
 
 def solve_again(

@@ -140,7 +140,7 @@ def test_a_damaged_state_is_one_line(bear_folder: Path, part: str) -> None:
 
 def test_a_recording_with_a_map_of_another_degree_is_no_recording_of_the_run(tmp_path: Path) -> None:
     offsets, no_mask = torch.zeros(3, 12), torch.zeros(3, 0, 3)
-    models = [Model(degree, 1.0, no_mask, None, 0.1, 1.0, ()) for degree in (1, 2)]
+    models = [Model(degree, 1.0, no_mask, None, 0.1, [], 1, 1) for degree in (1, 2)]
     made = ParameterSnapshot(4, True, offsets, {"left": 0.5}, identity_map(1))
     before, after = (Recordings(StateFolder(tmp_path), offsets.shape, model) for model in models)
     before.add(made)
