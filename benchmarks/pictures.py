@@ -9,15 +9,18 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 
 import torch
+from torch.nn.functional import normalize
 
 from progdf.errors import ProgdfError
 from progdf.field.grade import band_offsets
 from progdf.formats.scene_file import load_scene
 from progdf.gaussians import pack
 from progdf.metrics.image import decibels
+from progdf.region import from_mask
 from progdf.scene.regions import parse_region
 from progdf.scene.up_axis import find_up
 from trainer.editors import make_editor
@@ -39,14 +42,24 @@ from trainer.views.view import (
 
 from .table import Table, mean_worst
 
-EDITS = ("stripes:#20a040", "recolor:#3060d0")
-RIG, SIZE, LARGE, NEAR, STEPS = 36, 256, 512, 45.0, 100
-GIVEN = ((0,), (9,), (27,), (0, 18), (0, 9, 18, 27))
+EDITS = (
+    ("stripes:#20a040", "all"),
+    ("recolor:#3060d0", "all"),
+    ("recolor:#3060d0", "right half"),
+    ("recolor:#3060d0", "upper half"),
+)
+"""And the part of the region that is painted."""
+
+RIG, SIZE, LARGE, STEPS = 36, 256, 512, 100
+GIVEN = ((0,), (9,), (0, 18), (0, 9, 18, 27))
 """Numbers of the rig's pictures: the front is 0."""
+
+DEGREES = (0, 30, 75, 120, 180)
 
 NOTE = (
     f"A rig of {RIG} cameras around the region; the pictures given are of {LARGE} pixels, the others, of "
-    f"{SIZE}, judge: PSNR over the pixels that show the region, mean / worst; the solver's processor time."
+    f"{SIZE}, judge: PSNR over the pixels that show the region, by degrees from the nearest picture given, "
+    "mean / worst; the solver's processor time."
 )
 
 
@@ -58,28 +71,34 @@ def tables(scenes: Sequence[Path] = ()) -> list[Table]:
     """
     if not scenes:
         raise ProgdfError("pictures need a scene; name one with --scenes")
-    rows = [row for path in scenes for edit in EDITS for row in _rows(path, edit)]
-    columns = ("scene, edit", "pictures", f"up to {NEAR:.0f}° away, dB", "farther", "all others", "s")
+    rows = [row for path in scenes for edit, part in EDITS for row in _rows(path, edit, part)]
+    degrees = (f"{begin + (begin > 0)}-{end}°, dB" for begin, end in pairwise(DEGREES))
+    columns = ("scene, edit", "pictures", *degrees, "s")
     return [Table("pictures", "One picture and a few", columns, tuple(rows), NOTE)]
 
 
-def _rows(path: Path, edit: str) -> list[tuple[str, ...]]:
+def _rows(path: Path, edit: str, part: str) -> list[tuple[str, ...]]:
     scene = load_scene(path)
     labels = path.with_name(f"{path.stem}_labels.npy")
     region = parse_region(f"labels:{labels}:1" if labels.is_file() else "all", scene)
     up, background = find_up(scene, (), "auto").direction, torch.tensor(BACKGROUND)
     cameras = with_near_plane(name_cameras(region_rig(scene, region, RIG, SIZE, up)), scene)
     views = [make_view(scene, region, camera, background) for camera in cameras]
-    editor = make_editor(EditorOptions(edit), scene, region, views)
     center = scene.means[region.members].mean(dim=0)
-    toward = torch.stack([camera.position - center for camera in cameras])
-    toward = toward / toward.norm(dim=1, keepdim=True)
+    toward = normalize(torch.stack([camera.position - center for camera in cameras]), dim=1)
+    sides = {"right half": torch.linalg.cross(up, toward[0]), "upper half": up}
+    side = (scene.means - center) @ sides.get(part, up) > (0.0 if part in sides else -math.inf)
+    painted = from_mask(part, region.mask & side)
+    canvases = [make_view(scene, painted, camera, background) for camera in cameras]
+    editor = make_editor(EditorOptions(edit), scene, painted, canvases)
     original = pack(scene[region.members], with_shN=scene.sh_degree > 0)
-    truth = [editor.edit(view, 1.0) for view in views]
+    truth = [editor.edit(view, 1.0) for view in canvases]
     rows = []
     for given in GIVEN:
-        large = [make_view(scene, region, cameras[i].resize(LARGE, LARGE), background) for i in given]
+        lenses = [cameras[i].resize(LARGE, LARGE) for i in given]
+        large = [make_view(scene, painted, lens, background) for lens in lenses]
         edited = [quantize_image(editor.edit(view, 1.0)) for view in large]
+        large = [make_view(scene, region, lens, background) for lens in lenses]
         large = [view.widen([picture]) for view, picture in zip(large, edited, strict=True)]
         began = time.process_time()
         crops = [crop_scene(scene, region.members, v.camera, v.box, background, True) for v in large]
@@ -92,18 +111,15 @@ def _rows(path: Path, edit: str) -> list[tuple[str, ...]]:
         offsets = band_offsets(change, original.shape[1])
         took = time.process_time() - began
         found = scene.replace_rows(region.members, original + offsets)
-        near: list[float] = []
-        far: list[float] = []
+        found_by: dict[int, list[float]] = {end: [] for end in DEGREES[1:]}
         for i, view in enumerate(views):
             counts = view.mask > 0.05
             if i in given or not bool(counts.any()):
                 continue
             shown = render_view(found, view.camera, background).clamp(0.0, 1.0)
             error = decibels(float((shown - truth[i])[counts].square().mean()))
-            cosine = max(float(toward[i] @ toward[k]) for k in given)
-            (near if cosine >= math.cos(math.radians(NEAR)) else far).append(error)
-        numbers = ", ".join(str(i) for i in given)
-        rows.append(
-            (f"{path.stem}, {edit}", numbers, *map(mean_worst, (near, far, near + far)), f"{took:.1f}")
-        )
+            off = math.degrees(math.acos(min(1.0, max(float(toward[i] @ toward[k]) for k in given))))
+            found_by[next(end for end in DEGREES[1:] if off <= end)].append(error)
+        numbers, what = ", ".join(str(i) for i in given), edit if part == "all" else f"{edit}, {part}"
+        rows.append((f"{path.stem}, {what}", numbers, *map(mean_worst, found_by.values()), f"{took:.1f}"))
     return rows

@@ -127,7 +127,7 @@ class _Attempt:
     offsets: Tensor  # what its map adds. [M,B,3]
     residual: Tensor  # [M,b,3]
     hold: float  # see `Model.hold`
-    masked: bool = False
+    mask_hold: float = 0.0  # how strongly what no picture shows of its mask is held; 0: no mask
 
     @property
     def bands(self) -> int:
@@ -184,19 +184,20 @@ class Solver:
         """The same with a mask. [M] 0..1"""
         return replace(self, maps=fit_maps(self.views, share), share=share)
 
-    def guess_mask(self, change: Tensor, spreads: bool) -> Solver:
+    def guess_mask(self, change: Tensor, spreads: bool, hold: float) -> Solver:
         """The same with the mask that the members' changes ask for.
 
         Args:
             change: a guess. [M,B,3]
             spreads: whether what no picture shows takes as much of the map as most, else none
+            hold: how strongly it is held to that, see `_HOLDS`
         """
         weights = self.weights[:, 0, 0]
         share = mask_of_members(self.sh[:, 0] * C0 + 0.5, change[:, 0] * C0, weights)
         if self.ties is not None:
             mean = weights @ share / weights.sum() * spreads
             say = self.asked[:, 0] * weights / (_TRUSTED * self.typical)
-            share = mean + self.ties.spread((share - mean)[:, None, None], say, _HOLDS[0] / _TIES)[:, 0, 0]
+            share = mean + self.ties.spread((share - mean)[:, None, None], say, hold / _TIES)[:, 0, 0]
         return self.with_mask(share.clamp(0.0, 1.0))
 
     def improve_mask(self, targets: Sequence[Tensor]) -> Solver:
@@ -248,14 +249,12 @@ class Solver:
         targets = [view.pick(target) for view, target in zip(self.views, targets, strict=True)]
         look = None if judge is None else lambda now: judge.error(add_bands(mapped, now))
         asked = self.asked[:, : start.shape[1], None]
-        start = start * asked
-        residual, first = self._descend(mapped, start, targets, ridge, steps, tell, look, floor)
+        residual, first = self._descend(mapped, start * asked, targets, ridge, steps, tell, look, floor)
         if self.ties is None:
             return residual, first
         weights = self.asked[:, 0] * self.weights[:, 0, 0] / (_TRUSTED * self.typical)
         around = self.ties.spread(residual, weights, hold / _TIES)
-        start = around * asked
-        residual, more = self._descend(mapped, start, targets, ridge, steps, tell, look, floor)
+        residual, more = self._descend(mapped, around * asked, targets, ridge, steps, tell, look, floor)
         return torch.where(asked, residual, around), first + more
 
     def _descend(
@@ -379,13 +378,16 @@ class _Trials:
     judge: Judge
     targets: Sequence[Tensor]  # the finished edit in the solver's views
     most_steps: int  # of conjugate gradients for a residual
+    few: bool  # whether views are few
+    residuals: Sequence[tuple[str, int, float]]  # that are tried: name, functions and hold
     tried: list[_Attempt] = field(default_factory=list)
     steps: int = 0  # that all of these took
 
     def start(self, degree: int, solver: Solver) -> _Attempt:
         """A map alone, not judged."""
         offsets = solver.fit_map(degree, self.targets)[1]
-        return _Attempt("", math.inf, solver, degree, offsets, offsets[:, :0], _RIDGE)
+        name = f"map of degree {degree}" if degree else "no map"
+        return _Attempt(name, math.inf, solver, degree, offsets, offsets[:, :0], _RIDGE)
 
     def attempt(self, base: _Attempt, name: str, bands: int, hold: float) -> _Attempt:
         """With a residual that begins where that of `base` ended."""
@@ -399,35 +401,35 @@ class _Trials:
         self.tried.append(replace(made, error=self.judge.error(made.change)))
         return self.tried[-1]
 
-    def try_masks(self, best: _Attempt, alone: float, most_bands: int) -> _Attempt:
-        """The best with a mask, where one pays: band for band beside what there is without.
+    def try_masks(self, best: _Attempt, alone: float) -> _Attempt:
+        """The best with a mask, where one pays: residual for residual beside what there is without.
+
+        Of a few pictures a mask goes all around what they do not show, or to its neighbors, whatever its
+        residual does there.
 
         `alone`: what maps alone leave
         """
         without = {one.bands: one.error for one in sorted(self.tried, key=lambda one: -one.error)}
         enough = alone * (without.get(1, alone) / alone) ** (1 / 3)  # what one of the three bytes of DC does
-        if not (others := self._with_masks(best, enough)):
-            return best
-        masked = [self.attempt(base, f"a mask of degree {base.degree}", 0, best.hold) for base in others]
-        base = others[_least(masked, lambda one: one.degree).degree - 1]
-        masked = masked if self.solver.ties is None else []  # of a few pictures no mask alone
-        for bands in (bands for bands in BANDS if bands <= most_bands):
-            base = self.attempt(base, f"with a mask and a residual of {bands}", bands, best.hold)
-            masked.append(base)
-            if not LEVEL < base.error < MORE_PAYS * without.get(bands, 0.0):
-                break
+        tried = [best]
+        for hold in (_HOLDS[0], _HOLDS[-1]) if self.few else (_RIDGE,):
+            solver = best.solver.guess_mask(best.change, best.degree > 0, hold)
+            if min(self.judge.error(self.start(degree, solver).offsets) for degree in MONOMIALS) >= enough:
+                continue
+            solver = solver.improve_mask(self.targets)
+            bases = [replace(self.start(degree, solver), mask_hold=hold) for degree in MONOMIALS]
+            masked = [self.attempt(base, f"a mask of degree {base.degree}", 0, best.hold) for base in bases]
+            base = bases[_least(masked, lambda one: one.degree).degree - 1]
+            base = replace(base, residual=(best.change - base.offsets)[:, :1])
+            tried += [] if self.few else masked  # of a few pictures no mask alone
+            for name, bands, held in self.residuals:
+                base = self.attempt(base, f"with a mask and {name}", bands, held)
+                tried.append(base)
+                if not self.few and not LEVEL < base.error < MORE_PAYS * without.get(bands, 0.0):
+                    break
         # by the bytes of a member, of one basis: degrees take none
-        return _least([best, *masked], lambda one: 3 * one.bands + one.masked, LEVEL)
-
-    def _with_masks(self, best: _Attempt, enough: float) -> list[_Attempt]:
-        """The same change by a mask and maps of each degree, what is missing in their
-        residuals; none where the mask that the members' changes ask for leaves more than `enough`."""
-        solver = best.solver.guess_mask(best.change, best.degree > 0)
-        if min(self.judge.error(self.start(degree, solver).offsets) for degree in MONOMIALS) >= enough:
-            return []
-        solver = solver.improve_mask(self.targets)
-        bases = [self.start(degree, solver) for degree in MONOMIALS]
-        return [replace(b, residual=(best.change - b.offsets)[:, :1], masked=True) for b in bases]
+        size = (lambda one: one.error) if self.few else (lambda one: 3 * one.bands + (one.mask_hold > 0.0))
+        return _least(tried, size, LEVEL)
 
 
 def choose_model(
@@ -441,7 +443,7 @@ def choose_model(
     and the solver with its mask.
 
     Of a few pictures there is always a residual, or what single members got would not be in the edit; how far
-    it travels is all the way, unless less takes away a twentieth.
+    it travels is all the way, unless less takes away a twentieth. With a mask it is what leaves least.
 
     Args:
         solver: the views
@@ -450,20 +452,20 @@ def choose_model(
         steps: most steps of conjugate gradients for a residual
         most_bands: SH functions that a residual may have: 1, 4 or 9
     """
-    tries, few = _Trials(*trial, targets, steps), solver.ties is not None
+    few = solver.ties is not None
     most_bands = min(most_bands, 1 if few else solver.sh.shape[1])
+    sizes = [(f"a residual of {bands}", bands, _RIDGE) for bands in BANDS if bands <= most_bands]
+    held = [(f"a residual held by {hold:g}", 1, hold) for hold in _HOLDS]
+    tries = _Trials(*trial, targets, steps, few, held if few else sizes)
     bases = {degree: tries.start(degree, tries.solver) for degree in (0, *MONOMIALS)}
     missed = {degree: tries.judge.mean(base.offsets, 1.0) for degree, base in bases.items()}
     # of what no picture shows a map is a guess: where it is the worse one for most that is shown, for less
     # than about half of that is painted, there is none
     degrees = (0,) if few and missed[0] <= min(missed.values()) else MONOMIALS
-    names = {degree: f"map of degree {degree}" if degree else "no map" for degree in degrees}
-    by_degree = [tries.attempt(bases[degree], name, 0, _RIDGE) for degree, name in names.items()]
+    by_degree = [tries.attempt(bases[degree], bases[degree].name, 0, _RIDGE) for degree in degrees]
     best = last = _least(by_degree, lambda one: one.degree)
-    sizes = [(bands, _RIDGE) for bands in BANDS if bands <= most_bands]
-    for bands, hold in [(1, hold) for hold in _HOLDS] if few else sizes:
-        name = f"residual held by {hold:g}" if few else f"with a residual of {bands}"
-        last = tries.attempt(last, name, bands, hold)
+    for name, bands, hold in tries.residuals:
+        last = tries.attempt(last, f"with {name}", bands, hold)
         if last.error >= best.error and not few:
             break
         if max(last.error, LEVEL) < MORE_PAYS * best.error or (few and not best.bands):
@@ -471,11 +473,11 @@ def choose_model(
     spreads = best.degree > 0  # what no picture shows follows the map, masked or not
     if best.bands and (few or best.bands > 1 or best.error > LEVEL):
         alone = min(tries.judge.error(bases[degree].offsets) for degree in MONOMIALS)
-        best = tries.try_masks(best, alone, most_bands)
+        best = tries.try_masks(best, alone)
     chosen, residual = best.solver, best.residual
     if few:
         chosen, residual = _solve_whole(solver, best, targets, steps, spreads)
-    mask = (chosen.share * 255.0).round().to(torch.uint8) if best.masked else None
+    mask = (chosen.share * 255.0).round().to(torch.uint8) if best.mask_hold else None
     tried = [(one.name, decibels(one.error)) for one in tries.tried]
     return chosen, Model(best.degree, best.hold, residual, mask, best.error, tried, tries.steps, most_bands)
 
@@ -503,16 +505,16 @@ def _solve_whole(
 ) -> tuple[Solver, Tensor]:
     """What the trial solved for a part of the pixels, with all of them: the solver with its mask, and the
     residual. [M,1,3]"""
-    if best.masked:
-        solver = solver.guess_mask(best.change, spreads).improve_mask(targets)
+    if best.mask_hold:
+        solver = solver.guess_mask(best.change, spreads, best.mask_hold).improve_mask(targets)
     made = solver.fit_map(best.degree, targets)[1]
-    begin = (best.change - made)[:, :1] if best.masked else torch.zeros_like(best.residual)
+    begin = (best.change - made)[:, :1] if best.mask_hold else torch.zeros_like(best.residual)
     judge = Judge(solver.views, targets)
     residual, _ = solver.residual(made, begin, targets, steps, judge, best.error, best.hold)
     return solver, residual
 
 
-def _least(attempts: Sequence[_Attempt], size: Callable[[_Attempt], int], floor: float = 0.0) -> _Attempt:
+def _least(attempts: Sequence[_Attempt], size: Callable[[_Attempt], float], floor: float = 0.0) -> _Attempt:
     """The smallest within a twentieth of the least error, or of an error that does not show."""
     least = max(floor, min(one.error for one in attempts))
     return min((one for one in attempts if MORE_PAYS * one.error <= least), key=size)

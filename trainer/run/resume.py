@@ -24,7 +24,7 @@ from trainer.options import MOST_THREADS, TrainOptions, flat_values
 from trainer.resolve import count_threads, recorded_options, resolve
 from trainer.store.run_folder import RunFolder, begin_log, remove_leftovers
 
-_VERSION = 6  # of how a run goes on from what it has saved; 6: another band may be solved for on the way
+_VERSION = 7  # of how a run goes on from what it has saved; 7: few pictures choose how their mask is held
 _SWITCHES = (
     "NUMBA_CPU_FEATURES", "MKL_ENABLE_INSTRUCTIONS", "MKL_CBWR", "OPENBLAS_CORETYPE", "ONEDNN_MAX_CPU_ISA",
 )  # fmt: skip

@@ -264,9 +264,8 @@ def plan_colors(
             if fewer[1].error <= LEVEL:
                 (solver, model), finished, train = fewer, half, train[::2]
     strengths = [s for s in edited if s < 1.0] or [0.5] * (between is not None)
-    course = Course(ask(strengths) if strengths else [], finished)
-    if between is not None:
-        course = replace(course, look=cache(lambda s: judge(between.look(s, judging))), ask=ask)
+    look = None if between is None else cache(lambda s: judge(between.look(s, judging)))
+    course = Course(ask(strengths), finished, look, ask)
     with log.stage("model"):
         middle = len(course.targets) // 2 if between is None else 0
         spare = 0.0 if target_psnr is None else 10 ** (-target_psnr / 10)

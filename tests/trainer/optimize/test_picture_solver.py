@@ -96,7 +96,7 @@ def test_a_few_pictures_choose_the_degree_of_the_map_by_maps_alone() -> None:
     by, judge = split_solver(solver, painted)
     _, model = choose_model(solver, (by, judge), painted, 20, 1)
     found = dict(model.tried)
-    assert found["residual held by 1e-08"] > found["map of degree 3"] + 1.0
+    assert found["with a residual held by 1e-08"] > found["map of degree 3"] + 1.0
     for degree in (1, 2, 3):
         assert found[f"map of degree {degree}"] == decibels(judge.error(by.fit_map(degree, painted)[1]))
     assert model.bands == 1
@@ -115,3 +115,26 @@ def test_what_lies_beside_the_picture_takes_the_nearest_of_two_paints() -> None:
         found = colors[side].mean(dim=0)
         assert float(found[channel] - found[2 - channel]) > 0.15  # of .7, where the other paint is far
         assert abs(float(found[1]) - 0.2) < 0.03  # of both paints
+
+
+def test_a_half_goes_on_beyond_the_picture_but_a_pattern_does_not() -> None:
+    scene, camera = wall(0.0, torch.zeros(3)), ahead(0.3)
+    right, down = (camera.viewmat[i, :3] @ scene.means.T for i in (0, 1))
+    gray = 0.4 + 0.2 * torch.rand(len(scene), generator=torch.Generator().manual_seed(0))
+    scene = replace(scene, sh0=rgb_to_sh0(gray[:, None].expand(-1, 3)).clone())
+    paint = torch.tensor([0.2, 0.3, 0.6])
+
+    def taken(masked: Tensor) -> Tensor:
+        """How much of the paint each member takes, of a picture where these have all of it. [M]"""
+        colors = gray[:, None] + masked[:, None] * (paint - 0.5 * gray[:, None])
+        truth = replace(scene, sh0=rgb_to_sh0(colors).clone())
+        change = change_of(scene, camera, render_view(truth, camera, WHITE).clamp(0, 1))
+        return change.sum(dim=1) / (paint - 0.5 * gray[:, None]).sum(dim=1)
+
+    half = taken((right > 0.0).float())
+    for side, least, most in ((right > 0.8, 0.8, 1.0), (right < -0.8, 0.0, 0.2)):
+        assert least < float(half[side].mean()) < most
+        assert float(half[side].std()) < 0.1
+    stripes = taken(((down * 12.0).floor() % 2.0 == 0.0).float())
+    assert 0.35 < float(stripes[right.abs() > 0.8].mean()) < 0.65
+    assert float(stripes[right.abs() > 0.8].std()) < 0.1
