@@ -470,13 +470,12 @@ def choose_model(
             break
         if max(last.error, LEVEL) < MORE_PAYS * best.error or (few and not best.bands):
             best = last
-    spreads = best.degree > 0  # what no picture shows follows the map, masked or not
     if best.bands and (few or best.bands > 1 or best.error > LEVEL):
         alone = min(tries.judge.error(bases[degree].offsets) for degree in MONOMIALS)
         best = tries.try_masks(best, alone)
     chosen, residual = best.solver, best.residual
-    if few:
-        chosen, residual = _solve_whole(solver, best, targets, steps, spreads)
+    if few:  # what no picture shows follows the map, masked or not
+        chosen, residual = _solve_whole(solver, best, targets, steps, degrees != (0,))
     mask = (chosen.share * 255.0).round().to(torch.uint8) if best.mask_hold else None
     tried = [(one.name, decibels(one.error)) for one in tries.tried]
     return chosen, Model(best.degree, best.hold, residual, mask, best.error, tried, tries.steps, most_bands)
@@ -510,8 +509,7 @@ def _solve_whole(
     made = solver.fit_map(best.degree, targets)[1]
     begin = (best.change - made)[:, :1] if best.mask_hold else torch.zeros_like(best.residual)
     judge = Judge(solver.views, targets)
-    residual, _ = solver.residual(made, begin, targets, steps, judge, best.error, best.hold)
-    return solver, residual
+    return solver, solver.residual(made, begin, targets, steps, judge, best.error, best.hold)[0]
 
 
 def _least(attempts: Sequence[_Attempt], size: Callable[[_Attempt], float], floor: float = 0.0) -> _Attempt:

@@ -74,10 +74,9 @@ class ColorView:
         return self.others + self.map.picture(colors)
 
     @cached_property
-    def own_pixels(self) -> Tensor:
-        """Which of its pixels show the members and count. [P] bool"""
-        share = self.map.picture(torch.ones_like(self.original))[:, 0]
-        return (share > _COVERED) & self.counts[:, 0]
+    def share(self) -> Tensor:
+        """How much of each pixel the members are, 0 where it does not count. [P,1] 0..1"""
+        return self.map.picture(torch.ones_like(self.original))[:, :1] * self.counts
 
     def pick(self, image: Tensor) -> Tensor:
         """The pixels of the box. [h,w,3] -> [P,3]"""
@@ -96,9 +95,9 @@ class ColorView:
         return self.map.gradient(missing), passed, squared
 
     def error(self, offsets: Tensor, target: Tensor, power: float) -> float:
-        """Sum of differences to some power, of colors 0..1. [M,b,3], [P,3]"""
+        """Sum of differences to some power, of colors 0..1, as far as the members show. [M,b,3], [P,3]"""
         image = self.picture(self.colors(offsets)).clamp(0.0, 1.0)
-        return float(((image - target) * self.counts).abs().pow(power).sum())
+        return float(((image - target).abs().pow(power) * self.share).sum())
 
     def halves(self) -> tuple[ColorView, ColorView]:
         """The view with every other square of its pixels, and with the others."""
@@ -236,7 +235,7 @@ def fit_maps(views: Sequence[ColorView], share: Tensor, most: int = _MOST_PIXELS
         original = view.picture(view.original.clamp_min(0.0))[some]
         return view.map.picture(terms)[some], original, members
 
-    covered = map_threads(lambda view: view.own_pixels.nonzero()[:, 0], views)
+    covered = map_threads(lambda view: (view.share[:, 0] > _COVERED).nonzero()[:, 0], views)
     stride = max(1, -(-sum(map(len, covered)) // most))
     pixels = [some[::stride].clone() for some in covered]
     laid = map_threads(lay_out, range(len(views)))
@@ -337,9 +336,9 @@ class Judge:
         return ROUNDING + self.mean(offsets, 2.0)
 
     def mean(self, offsets: Tensor, power: float) -> float:
-        """Mean difference to some power, of the pixels that show the members. [M,B,3]"""
+        """Mean difference to some power, of the pixels as far as they show the members. [M,B,3]"""
         total = sum(map_threads(lambda pair: pair[0].error(offsets, pair[1], power), self._pairs))
-        return total / max(1, 3 * sum(int(view.own_pixels.sum()) for view in self.views))
+        return total / max(1.0, 3.0 * sum(float(view.share.sum()) for view in self.views))
 
 
 def iterate_views(work: Callable[[_A], _B], items: Sequence[_A]) -> Iterator[_B]:

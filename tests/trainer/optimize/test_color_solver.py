@@ -240,7 +240,7 @@ def test_only_members_that_need_them_have_functions_beyond_dc(turning: float, sp
     crops, original = prepared(scene, orbit(8, 64))
     others, _ = prepared(scene, orbit(16, 64)[1::2])
     rows, solver = pack(edited, with_shN=True), make_solver(color_views(crops, original), original)
-    targets, aside = grainy(render_all(crops, rows), 0.01), grainy(render_all(others, rows), 0.01)
+    targets, aside = grainy(render_all(crops, rows), 0.0125), grainy(render_all(others, rows), 0.0125)
     judge = Judge(color_views(others, original), aside)
     solver, model = choose_model(solver, (solver, judge), targets, 40, 4)
     thinner = thin_model(model, solver, [(TargetStage(1.0, targets, 1), judge)], 40, spare)

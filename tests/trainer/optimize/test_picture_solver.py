@@ -13,7 +13,7 @@ from progdf.metrics.image import decibels
 from progdf.sh import C0, rgb_to_sh0
 from tests.helpers.trained import edit_few
 from trainer.optimize.color_solver import choose_model, make_solver, split_solver
-from trainer.optimize.color_views import color_views
+from trainer.optimize.color_views import Judge, color_views
 from trainer.optimize.ties import Ties, surface_graph
 from trainer.views.crops import crop_scene
 from trainer.views.view import render_view
@@ -138,3 +138,16 @@ def test_a_half_goes_on_beyond_the_picture_but_a_pattern_does_not() -> None:
     stripes = taken(((down * 12.0).floor() % 2.0 == 0.0).float())
     assert 0.35 < float(stripes[right.abs() > 0.8].mean()) < 0.65
     assert float(stripes[right.abs() > 0.8].std()) < 0.1
+
+
+def test_what_the_members_do_not_show_is_no_error_of_theirs() -> None:
+    scene, camera = wall(0.0, torch.tensor([0.8, 0.5, 0.2])), ahead()
+    members = (scene.means[:, 0] < 0.0).nonzero()[:, 0]
+    crops = [crop_scene(scene, members, camera, (0, 0, 96, 96), WHITE, True)]
+    original = pack(scene[members], with_shN=False)
+    views, same = color_views(crops, original), render_view(scene, camera, WHITE)
+    still, share = torch.zeros(len(members), 1, 3), views[0].share.view(96, 96, 1)
+    assert Judge(views, [same]).mean(still, 1.0) < 1e-3
+    assert Judge(views, [same.where(share > 0.0, torch.zeros(3))]).mean(still, 1.0) < 1e-3
+    black = Judge(views, [torch.zeros_like(same)]).mean(still, 1.0)
+    assert abs(black - 0.5) < 0.05  # the mean of the wall's color
