@@ -411,16 +411,17 @@ class _Trials:
         """
         without = {one.bands: one.error for one in sorted(self.tried, key=lambda one: -one.error)}
         enough = alone * (without.get(1, alone) / alone) ** (1 / 3)  # what one of the three bytes of DC does
-        tried = [best]
+        # a mask asks what a residual that goes all around says of each member
+        tried, guess = [best], (self.tried[-len(_HOLDS)] if self.few else best).change
         for hold in (_HOLDS[0], _HOLDS[-1]) if self.few else (_RIDGE,):
-            solver = best.solver.guess_mask(best.change, best.degree > 0, hold)
+            solver = best.solver.guess_mask(guess, best.degree > 0, hold)
             if min(self.judge.error(self.start(degree, solver).offsets) for degree in MONOMIALS) >= enough:
                 continue
             solver = solver.improve_mask(self.targets)
             bases = [replace(self.start(degree, solver), mask_hold=hold) for degree in MONOMIALS]
             masked = [self.attempt(base, f"a mask of degree {base.degree}", 0, best.hold) for base in bases]
             base = bases[_least(masked, lambda one: one.degree).degree - 1]
-            base = replace(base, residual=(best.change - base.offsets)[:, :1])
+            base = replace(base, residual=(guess - base.offsets)[:, :1])
             tried += [] if self.few else masked  # of a few pictures no mask alone
             for name, bands, held in self.residuals:
                 base = self.attempt(base, f"with a mask and {name}", bands, held)
@@ -443,7 +444,7 @@ def choose_model(
     and the solver with its mask.
 
     Of a few pictures there is always a residual, or what single members got would not be in the edit; how far
-    it travels is all the way, unless less takes away a twentieth. With a mask it is what leaves least.
+    it travels, with a mask and without, is what leaves least; if all leave as much, to its neighbors.
 
     Args:
         solver: the views
@@ -468,8 +469,10 @@ def choose_model(
         last = tries.attempt(last, f"with {name}", bands, hold)
         if last.error >= best.error and not few:
             break
-        if max(last.error, LEVEL) < MORE_PAYS * best.error or (few and not best.bands):
+        if max(last.error, LEVEL) < MORE_PAYS * best.error:
             best = last
+    if few:
+        best = min(tries.tried[-len(held) :], key=lambda one: (one.error, -one.hold))
     if best.bands and (few or best.bands > 1 or best.error > LEVEL):
         alone = min(tries.judge.error(bases[degree].offsets) for degree in MONOMIALS)
         best = tries.try_masks(best, alone)

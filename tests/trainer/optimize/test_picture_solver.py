@@ -140,6 +140,17 @@ def test_a_half_goes_on_beyond_the_picture_but_a_pattern_does_not() -> None:
     assert float(stripes[right.abs() > 0.8].std()) < 0.1
 
 
+def test_a_residual_that_says_nothing_of_other_pixels_stays_with_its_neighbors() -> None:
+    scene, camera = wall(0.0, torch.tensor([0.8, 0.5, 0.2])), ahead(0.3)
+    crops = [crop_scene(scene, torch.arange(len(scene)), camera, (0, 0, 96, 96), WHITE, True)]
+    original, nobody = pack(scene, with_shN=False), torch.zeros(len(scene), dtype=torch.bool)
+    solver = make_solver(color_views(crops, original), original, Ties(surface_graph(scene, nobody), ~nobody))
+    fill, two_paints = torch.full((96, 96, 3), 0.3), torch.eye(3)[torch.arange(96) // 48].expand(96, 96, 3)
+    for paint, near in ((fill, True), (two_paints.contiguous(), False)):
+        _, model = choose_model(solver, split_solver(solver, [paint]), [paint], 20, 1)
+        assert (model.hold == 1e-3) is near
+
+
 def test_what_the_members_do_not_show_is_no_error_of_theirs() -> None:
     scene, camera = wall(0.0, torch.tensor([0.8, 0.5, 0.2])), ahead()
     members = (scene.means[:, 0] < 0.0).nonzero()[:, 0]
