@@ -265,44 +265,46 @@ def sharpen(
         log: of the run
     """
     end = edited_scene(scene, recolored)
-    paints, light = list[Paint](), torch.zeros(len(scene), 2)
+    paints, light, background = list[Paint](), torch.zeros(len(scene), 2), torch.tensor(BACKGROUND)
     for path, camera in pictures.items():
-        view = make_view(
-            scene, recolored.region, camera.resize(*picture_size(path)), torch.tensor(BACKGROUND)
-        )
+        view = make_view(scene, recolored.region, camera.resize(*picture_size(path)), background)
         target = read_edit(scene, view.camera, view.image, path)
         target = (view if is_named else view.with_painted([target])).confine(target)
         paint, changed = _missed_paint(end, view, target)
         light += torch.stack(
-            [alpha_weights(scene, paint.camera, mask)[:, 0] for mask in (paint.mask, changed)], dim=1
+            [alpha_weights(scene, view.camera, m)[:, 0] for m in (paint.mask, changed)], dim=1
         )
         paints += [paint] if bool(paint.mask.any()) else []
     if not paints:
         return None
     members = recolored.region.members
-    # what is painted sharp goes back to what it was, for that is what lies between the discs
     left = 1.0 - light[members, 0] / light[members, 1].clamp_min(1e-6)
     rows = pack(scene[members], with_shN=recolored.field.channels > BASE_CHANNELS)
-    base = scene.replace_rows(members, rows + left[:, None] * recolored.field.offsets(1.0))
+    back = scene.replace_rows(members, rows + left[:, None] * recolored.field.offsets(1.0))
+    # what is painted sharp goes back to what it was where that is better beside the paint, as between letters
+    base = min((end, back), key=lambda one: sum(_error_beside(one, paint) for paint in paints))
     looks = look_around(base, paints, _TRIAL_TURNS)
     try:
         laid = choose_discs(base, paints, looks, log)
     except ProgdfError:
         return None
-    own = [look for look in looks if not look.degrees]
-    sides = [look for look in looks if look.degrees]
-    errors = [[_error(one, some) for one in (end, laid.end)] for some in (own, sides)]
+    parts = [[look for look in looks if (look.degrees != 0) is aside] for aside in (False, True)]
+    errors = [[_error(one, some) for one in (end, laid.end)] for some in parts]
     keeps = errors[0][1] < errors[0][0] and errors[1][1] <= errors[1][0]
     own_db, side_db = ([round(decibels(error), 1) for error in pair] for pair in errors)
-    pixels, discs = (
-        group_digits(n) for n in (sum(int(paint.mask.sum()) for paint in paints), len(laid.added))
-    )
+    pixels, discs = group_digits(sum(int(one.mask.sum()) for one in paints)), group_digits(len(laid.added))
     log.say(
         f"{pixels} painted pixels are finer than the Gaussians: {discs} discs for them have {own_db[1]} dB "
         f"where recoloring has {own_db[0]}, from their sides {side_db[1]} where it has {side_db[0]}: "
         + ("they are added" if keeps else "none is added")
     )
     return paint_gdf(laid, scene, paints, recolored.name, recolored) if keeps else None
+
+
+def _error_beside(finished: Gaussians, paint: Paint) -> float:
+    """Sum of squared differences from the picture, but for what is painted sharp."""
+    shown = render_view(finished, paint.camera, torch.tensor(BACKGROUND)).clamp(0.0, 1.0)
+    return float((shown - paint.picture)[~paint.mask].square().sum())
 
 
 def _missed_paint(end: Gaussians, view: View, target: Tensor) -> tuple[Paint, Tensor]:

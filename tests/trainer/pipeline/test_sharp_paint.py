@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -23,7 +24,7 @@ from trainer.evaluate.command import evaluate
 from trainer.options import EditorOptions, EvaluateOptions, RegionOptions, TrainOptions, with_values
 from trainer.paint.discs import lay_on, place_discs, project_paint
 from trainer.run.finish import RunResult
-from trainer.run.paint import lay_discs, orbit
+from trainer.run.paint import Laid, choose_discs, lay_discs, orbit
 from trainer.views.view import BACKGROUND, render_view
 
 
@@ -85,6 +86,34 @@ def test_a_run_that_is_stopped_at_its_discs_goes_on_to_the_same_bits(
             train(again, quiet=True)
     resumed = train(replace(again, resume=True), quiet=True)
     assert resumed.gdf.read_bytes() == lettered.gdf.read_bytes()
+
+
+@pytest.mark.parametrize("fills", [True, False])
+def test_below_discs_a_fill_stays_and_what_lies_between_letters_goes_back(
+    place: Path, fills: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is better beside the sharp paint in its own picture; from aside one sees what lies below it."""
+    bases = list[Gaussians]()
+
+    def choose(base: Gaussians, *rest: Any) -> Laid:
+        bases.append(base)
+        return choose_discs(base, *rest)
+
+    monkeypatch.setattr("trainer.run.paint.choose_discs", choose)
+    scene = load_ply(place / "wall.ply")
+    image = letters(scene).picture
+    if fills:
+        rows, columns = torch.meshgrid(*(torch.arange(n) for n in image.shape[:2]), indexing="ij")
+        image = torch.where(
+            (columns > 50 + rows // 8 % 2 * 8)[..., None], 0.3 * picture(scene), picture(scene)
+        )
+    name = "fill" if fills else "letters"
+    done = train(options(place, save(place, f"{name}_below", image), f"{name}_below"), quiet=True)
+    monkeypatch.setattr("trainer.run.finish.sharpen", lambda *_: None)
+    plain = train(options(place, place / f"{name}_below.png", f"{name}_plain"), quiet=True)
+    assert load_gdf(done.gdf, scene).added is not None
+    recolored = compose_layers(scene, [Layer(load_gdf(plain.gdf, scene), 1.0)])
+    assert (float((bases[0].sh0 - recolored.sh0).abs().max()) < 1e-4) is fills
 
 
 def test_a_change_that_recoloring_meets_adds_nothing(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
