@@ -46,7 +46,7 @@ MOST_LINES = 600
 
 # What a package may hold: modules, and lines of code (no blank, comment, docstring or import). A feature
 # says in its commit what it adds and what it replaces; these only fall.
-BUDGETS = {"progdf": (82, 11266), "trainer": (71, 10620), "viewer": (74, 12406)}
+BUDGETS = {"progdf": (82, 11266), "trainer": (71, 10619), "viewer": (74, 12406)}
 MOST_IMPORTS = 0.073  # of all lines
 MOST_SCRIPT_LINES = 1271  # of the JavaScript of the web page, counted alike
 MOST_FUNCTION_LINES = 80

@@ -113,7 +113,8 @@ class Model:
         over = ", ".join(f"{name} {error:.1f}" for name, error in self.tried)
         of_color = f"a map of color of degree {self.degree}" if self.degree else "no map"
         of_color += "" if self.mask is None else ", a mask of it"
-        return f"{of_color} {residual}, the least within a twentieth; dB: {over}"
+        rule = "what leaves least" if self.hold in _HOLDS else "the least within a twentieth"
+        return f"{of_color} {residual}, {rule}; dB: {over}"
 
 
 @dataclass(frozen=True)

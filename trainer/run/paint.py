@@ -271,9 +271,7 @@ def sharpen(
         target = read_edit(scene, view.camera, view.image, path)
         target = (view if is_named else view.with_painted([target])).confine(target)
         paint, changed = _missed_paint(end, view, target)
-        light += torch.stack(
-            [alpha_weights(scene, view.camera, m)[:, 0] for m in (paint.mask, changed)], dim=1
-        )
+        light += torch.stack([alpha_weights(scene, view.camera, m)[:, 0] for m in (paint.mask, changed)], 1)
         paints += [paint] if bool(paint.mask.any()) else []
     if not paints:
         return None
