@@ -44,9 +44,7 @@ ORDER = {
 MOST_FILES = 14
 MOST_LINES = 600
 
-# What a package may hold: modules, and lines of code (no blank, comment, docstring or import). A feature
-# says in its commit what it adds and what it replaces; these only fall.
-BUDGETS = {"progdf": (82, 11266), "trainer": (71, 10619), "viewer": (74, 12406)}
+MEASURED = ("progdf", "trainer", "viewer")
 MOST_IMPORTS = 0.073  # of all lines
 MOST_SCRIPT_LINES = 1271  # of the JavaScript of the web page, counted alike
 MOST_FUNCTION_LINES = 80
@@ -324,17 +322,10 @@ def test_the_script_of_the_page_keeps_its_budget() -> None:
 
 @pytest.fixture(scope="module")
 def measured() -> dict[str, list[Module]]:
-    return {package: modules(package) for package in BUDGETS}
+    return {package: modules(package) for package in MEASURED}
 
 
-def test_packages_keep_their_budgets(measured: dict[str, list[Module]]) -> None:
-    sizes = {name: (len(group), sum(module.code for module in group)) for name, group in measured.items()}
-    over = {
-        name: size
-        for name, size in sizes.items()
-        if any(a > b for a, b in zip(size, BUDGETS[name], strict=True))
-    }
-    assert not over, f"modules, lines of code: {over}; the budgets are {BUDGETS}"
+def test_imports_are_a_small_share_of_all_lines(measured: dict[str, list[Module]]) -> None:
     lines = sum(module.lines for group in measured.values() for module in group)
     imports = sum(module.imports for group in measured.values() for module in group)
     assert imports <= MOST_IMPORTS * lines, f"{imports / lines:.1%} of all lines are imports"
@@ -379,7 +370,7 @@ def test_functions_are_verbs_or_nouns_never_bare_participles(measured: dict[str,
 
 
 def test_the_documented_tree_is_that_of_the_modules() -> None:
-    page = (ROOT / "docs" / "contributing.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "modules.md").read_text(encoding="utf-8")
     assert page == with_tree(page), "run python -m tests.helpers.sizes --tree"
 
 

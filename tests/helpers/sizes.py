@@ -1,6 +1,6 @@
 """How large the packages are, and the tree of their modules.
 
-`python -m tests.helpers.sizes` prints the table, `--tree` puts the tree into docs/contributing.md.
+`python -m tests.helpers.sizes` prints the table, `--tree` writes the tree into docs/modules.md.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from statistics import median
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("progdf", "trainer", "viewer")
-PAGE = ROOT / "docs" / "contributing.md"
+PAGE = ROOT / "docs" / "modules.md"
 BEGIN, END = "<!-- tree -->\n", "<!-- end tree -->\n"
 _NO_CODE = (
     tokenize.COMMENT,

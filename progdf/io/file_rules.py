@@ -1,0 +1,64 @@
+"""Rules for reading files that other programs wrote.
+
+1. A field that changes the result is honored, or the file is refused by naming that field. Harmless unknown
+   fields are listed by `progdf info`.
+2. "Damaged" is only said of a file that breaks its own format. A format, version or feature that is not
+   supported is named, with a way to convert the file.
+3. An error names the file that is at fault.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Collection, Iterable, Mapping
+
+from progdf.errors import ProgdfError
+
+
+def unsupported_error(path: str | os.PathLike[str], feature: str, remedy: str) -> ProgdfError:
+    """Return the error for a valid file with a feature that is not supported.
+
+    Args:
+        path: the file at fault
+        feature: the feature by the format's own name, such as "mesh compression (EXT_meshopt_compression)"
+        remedy: an imperative phrase, such as "convert it with `splat-transform in.sog out.ply`"
+    """
+    return ProgdfError(f"{os.fspath(path)} uses {feature}, which is not supported; {remedy}")
+
+
+def damage_error(path: str | os.PathLike[str], detail: str) -> ProgdfError:
+    """Return the error for a file that breaks its own format.
+
+    Args:
+        path: the file at fault
+        detail: the violated rule and what was found, such as "row 12 ends after 3 of 14 numbers"
+    """
+    return ProgdfError(f"{os.fspath(path)} is damaged: {detail}; copy or export it again")
+
+
+def check_fields(
+    path: str | os.PathLike[str],
+    present: Iterable[str],
+    honored: Collection[str],
+    refused: Mapping[str, str],
+    remedy: str,
+) -> tuple[str, ...]:
+    """Return the fields that a reader ignores, in the order of the file.
+
+    Args:
+        path: the file that holds the fields
+        present: names of the fields in the file
+        honored: fields that the reader uses, or whose value it has checked
+        refused: fields that change geometry, color or cameras and are not supported → their meaning
+        remedy: an imperative phrase for the error of a refused field
+
+    Raises:
+        ProgdfError: a refused field is present.
+    """
+    ignored = []
+    for name in present:
+        if name in refused:
+            raise unsupported_error(path, f"'{name}' ({refused[name]})", remedy)
+        if name not in honored:
+            ignored.append(name)
+    return tuple(ignored)
