@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import importlib.util
 import os
-import pickle
 import shutil
 import signal
 import subprocess
@@ -30,6 +29,7 @@ from progdf.io.json_values import decode_json
 from progdf.terminal import escape_text
 
 from . import gltf, usd
+from .checkpoint import read_checkpoint
 from .compressed_ply import is_compressed, morton_order, read_compressed_ply, write_compressed_ply
 from .ksplat import read_ksplat
 from .ply import load_ply_with_report, read_header, save_ply, save_ply_checked
@@ -70,7 +70,7 @@ def scene_format(path: str | os.PathLike[str]) -> str | None:
         return "glb"
     if start[:4] == b"NGSP" or (start[:2] == b"\x1f\x8b" and _inflate(start)[:4] == b"NGSP"):
         return "spz"
-    if suffix in ("ckpt", "pt") and start[:2] == b"PK":
+    if suffix in ("ckpt", "pt", "pth") and start[:2] == b"PK":
         return "ckpt"
     if start[:4] == b"PK\x03\x04":
         return "sog" if _sog_meta(path) is not None else None
@@ -120,7 +120,8 @@ def load_scene_with_report(path: str | os.PathLike[str]) -> tuple[Gaussians, Loa
     if kind == "glb":
         return _repair(path, rotate_about_x(gltf.read_glb(path)), ".glb, turned from y up to y down")
     if kind == "ckpt":
-        return _repair(path, read_checkpoint(path), "checkpoint of a training")
+        checkpoint = read_checkpoint(path)
+        return _repair(path, checkpoint.scene, "checkpoint of a training", checkpoint.ignored)
     scene, report = _through_gaussforge(path, kind)
     description, antialiased = f".{kind}", False
     if kind == "spz":
@@ -140,49 +141,6 @@ def load_scene_with_report(path: str | os.PathLike[str]) -> tuple[Gaussians, Loa
     return replace(scene, antialiased=antialiased), report
 
 
-def read_checkpoint(path: Path) -> Gaussians:
-    """The Gaussians of a gsplat (.pt) or nerfstudio (.ckpt) training, as stored; weights alone are read.
-
-    Raises:
-        ProgdfError: it holds anything but weights, or no Gaussians.
-    """
-    try:
-        table = torch.load(path, map_location="cpu", weights_only=True)
-        table = table.get("splats", table.get("pipeline", table))
-        columns = {
-            name.rpartition(".")[2]: tensor.float() for name, tensor in table.items() if _is_part(name)
-        }
-        rest = columns.get("shN", columns.get("features_rest"))
-        base = columns.get("sh0", columns.get("features_dc"))
-        if rest is None or base is None:
-            raise KeyError("colors")
-        base, rest = base.reshape(-1, 3), rest.reshape(len(rest), -1, 3)
-        if "features_dc" in columns and not rest.shape[1]:  # splatfacto without bands keeps logits of rgb
-            base = sh.rgb_to_sh0(base.sigmoid())
-        return Gaussians(
-            columns["means"],
-            columns["quats"],
-            columns["scales"],
-            columns["opacities"].reshape(-1),
-            base,
-            rest,
-        )
-    except (pickle.UnpicklingError, EOFError):
-        reason = "it holds more than weights, which is not loaded"
-    except (RuntimeError, OSError, ValueError):  # of its archive and of the shapes
-        reason = "it is damaged"
-    except (KeyError, AttributeError, TypeError):
-        reason = "it holds no means, quats, scales, opacities and colors"
-    raise ProgdfError(
-        f"{path} is no checkpoint of Gaussians from gsplat or nerfstudio: {reason}; export a .ply"
-    )
-
-
-def _is_part(name: str) -> bool:
-    """Whether it is a tensor of the Gaussians, and not one of their optimizer or of another model."""
-    return "." not in name or name.startswith("_model.gauss_params.")
-
-
 def rotate_about_x(scene: Gaussians) -> Gaussians:
     """The scene after half a turn about x: y up and z towards the viewer become y down and z away from it."""
     turn = torch.tensor([1.0, -1.0, -1.0])
@@ -196,7 +154,17 @@ def rotate_about_x(scene: Gaussians) -> Gaussians:
     )
 
 
-def _repair(path: Path, stored: Gaussians, kind: str) -> tuple[Gaussians, LoadReport]:
+def _repair(
+    path: Path, stored: Gaussians, kind: str, ignored: tuple[str, ...] = ()
+) -> tuple[Gaussians, LoadReport]:
+    """Return the scene as it can be used, and the report of its file.
+
+    Args:
+        path: the file
+        stored: N Gaussians as they were read, means in the world
+        kind: the format, for a person
+        ignored: names of fields that the reader does not use
+    """
     scene, counts = repair(stored)
     report = LoadReport(
         file=scene_name(path),
@@ -205,6 +173,7 @@ def _repair(path: Path, stored: Gaussians, kind: str) -> tuple[Gaussians, LoadRe
         count=len(scene),
         sh_degree=scene.sh_degree,
         antialiased=scene.antialiased,
+        ignored_properties=ignored,
         **counts,
     )
     return scene, report
