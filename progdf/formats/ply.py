@@ -23,6 +23,7 @@ from plyfile import PlyData, PlyElement, PlyElementParseError, PlyListProperty, 
 from progdf.errors import ProgdfError
 from progdf.gaussians import ATTRIBUTES, ZERO, Gaussians, from_arrays
 from progdf.io.atomic import atomic_write, check_regular, open_error
+from progdf.io.file_rules import unsupported_error
 from progdf.quaternions import normalize_quats
 
 from .repair import LoadReport, repair
@@ -103,9 +104,8 @@ class PlyFile:
     def _check_lists(self, element: PlyElement, is_needed: bool) -> None:
         name, lists = element.name, _has_lists(element)
         if lists and is_needed:
-            raise ProgdfError(
-                f"{self.path} has a list among its {name} properties; export it as a plain 3DGS .ply"
-            )
+            feature = f"a list among its {name} properties"
+            raise unsupported_error(self.path, feature, "export it as a plain 3DGS .ply")
         if lists and self.counts[name] * len(element.properties) > _MOST_LISTS:
             raise ProgdfError(
                 f"{self.path} has {self.counts[name]} rows of lists, '{name}', before its vertices; "

@@ -447,7 +447,10 @@ class Evil:
 def test_a_checkpoint_runs_nothing_and_what_is_none_is_one_line(tmp_path: Path) -> None:
     whole = checkpoints(scene_of(1))["gsplat.pt"]
     cases = {
-        "code.pt": ({"splats": Evil(tmp_path / "touched")}, "more than weights (it would run pathlib"),
+        "code.pt": (
+            {"splats": Evil(tmp_path / "touched")},
+            "more than weights (it would run __builtin__.getattr",
+        ),
         "other.ckpt": ({"pipeline": {"_model.field.weight": torch.zeros(3)}}, "it holds no means"),
         "list.pt": ([1, 2], "it holds no means"),
         "shape.pt": ({"splats": whole["splats"] | {"means": torch.zeros(5, 2)}}, "'means' of shape 5×2"),  # type: ignore[index]
