@@ -153,7 +153,7 @@ def kind_of(path: str | os.PathLike[str]) -> str:
         return "gdf"
     if scene_format(path) is not None:
         return "scene"
-    if start.lstrip()[:1] == b"{" and f'"{session_file.MARK}"'.encode() in start:
+    if session_file.is_session(start):
         return "session"
     if start.lstrip()[:1] in (b"{", b"[") or start.startswith(b"\x89PNG"):
         return "cameras"

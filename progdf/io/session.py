@@ -11,8 +11,6 @@
 Paths are relative to the session's folder (absolute where they share no folder with it, as on another
 Windows drive), hashes are of whole files. What `view` and `snapshots` hold is the viewer's. Nothing in the
 file is ever executed; a file that changed since, a newer version and an unknown key are refused in one line.
-
-A bundle, NAME.progdf.zip, is a session and the files that it names, side by side, to hand to somebody else.
 """
 
 from __future__ import annotations
@@ -21,9 +19,6 @@ import hashlib
 import json
 import os
 import re
-import shutil
-import tempfile
-import zipfile
 from functools import lru_cache
 from pathlib import Path, PureWindowsPath
 from typing import Any, TypeVar
@@ -33,15 +28,13 @@ import msgspec
 from progdf.errors import ProgdfError
 
 from . import atomic
-from .atomic import atomic_write, check_regular, is_portable, open_error, read_file, temporary_subfolder
+from .atomic import check_regular, open_error, read_file
 from .json_values import convert_json, decode_json, plain
 
 VERSION = 1
 MARK = "progdf_session"
 """The first key of every session file, which identifies its kind."""
 SUFFIX = ".session.json"
-BUNDLE = ".progdf.zip"
-_MOST_FILES, _MOST_INFLATED = 1000, 200  # of a bundle: files, and times as large as it is
 _LARGEST = 64 << 20  # bytes; a session is a few kilobytes, painted strengths a few megabytes
 
 
@@ -77,6 +70,15 @@ class SessionFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 File = TypeVar("File", bound=SessionFile)
+
+
+def is_session(start: bytes) -> bool:
+    """Return True if a file that starts with these bytes claims to be a session.
+
+    Args:
+        start: the first 64 bytes, or more
+    """
+    return start.lstrip()[:1] == b"{" and f'"{MARK}"'.encode() in start
 
 
 def relative_name(path: Path, folder: Path) -> str:
@@ -172,90 +174,6 @@ def verify_files(path: Path, session: SessionFile) -> tuple[Path, tuple[Path, ..
             )
         files.append(file)
     return files[0], tuple(files[1:])
-
-
-def write_bundle(path: Path, source: Path) -> int:
-    """Put a session and all that it needs into one file; how many files that are.
-
-    Args:
-        path: NAME.progdf.zip
-        source: the session, saved; scene and edits are as it names them
-
-    Raises:
-        ProgdfError: see `verify_files`; or the scene is an unpacked .sog, which is many files.
-    """
-    session = read_session(source, SessionFile)
-    scene, edits = verify_files(source, session)
-    if scene.name.lower() == "meta.json":
-        raise ProgdfError(f"{scene.parent} is an unpacked .sog; export the scene as a .ply first")
-    names: dict[Path, str] = {}
-    for file in (scene, *edits):
-        taken, free = {name.lower() for name in names.values()}, atomic.numbered_names(file.stem, file.suffix)
-        names.setdefault(file, next(name for name in free if name.lower() not in taken))
-    view = session.view
-    for region in view.get("selection", {}).get("regions", ()):
-        region["path"] = PureWindowsPath(region["path"]).name
-    placed = msgspec.structs.replace(
-        session,
-        scene=msgspec.structs.replace(session.scene, file=names[scene]),
-        edits=tuple(
-            msgspec.structs.replace(ref, file=names[file])
-            for ref, file in zip(session.edits, edits, strict=True)
-        ),
-    )
-    title = path.name.removesuffix(BUNDLE)
-    with tempfile.TemporaryDirectory(prefix="progdf-") as folder, atomic_write(path) as written:
-        inner = Path(folder) / f"{title}{SUFFIX}"
-        write_session(inner, placed)
-        with zipfile.ZipFile(written, "w", zipfile.ZIP_DEFLATED) as archive:
-            for file, name in {inner: inner.name, **names}.items():
-                archive.write(file, name)
-    return 1 + len(names)
-
-
-def unpack_bundle(path: Path) -> Path:
-    """The session of a bundle, unpacked into the folder NAME.progdf beside it; where it was, that is opened.
-
-    Nothing is written outside that folder, and it appears whole or not at all.
-
-    Raises:
-        ProgdfError: it is damaged or no bundle, the folder holds something else, or cannot be written.
-    """
-    folder = path.resolve().with_name(path.name.removesuffix(".zip"))
-    mark = folder / ".bundle.sha256"
-    if folder.is_dir() and not (mark.is_file() and mark.read_text(encoding="utf-8") == sha256(path)):
-        raise ProgdfError(f"{folder} is there and is not what {path.name} unpacks to; move it elsewhere")
-    if not folder.is_dir():
-        try:
-            _unpack(path, folder)
-        except (zipfile.BadZipFile, zipfile.LargeZipFile, NotImplementedError, ValueError, EOFError) as error:
-            raise ProgdfError(f"{path.name} is no bundle ({error}); copy or export it again") from None
-        except OSError as error:
-            raise open_error(path, error) from None
-    return next(folder.glob(f"*{SUFFIX}"))
-
-
-def _unpack(path: Path, folder: Path) -> None:
-    check_regular(path)
-    with zipfile.ZipFile(path) as archive:
-        files = archive.infolist()
-        sessions = [file for file in files if file.filename.endswith(SUFFIX)]
-        if len(sessions) != 1 or len(files) > _MOST_FILES:
-            raise ValueError(f"it holds {len(sessions)} sessions in {len(files)} files")
-        for file in files:
-            if not is_portable(file.filename) or file.filename.startswith("."):
-                raise ValueError(f"it names {file.filename!r:.80}, which is no plain file")
-        if sum(file.file_size for file in files) > _MOST_INFLATED * max(path.stat().st_size, 1 << 20):
-            raise ValueError("it would be unpacked to far more than it can hold")
-        made = temporary_subfolder(folder.parent)
-        try:
-            for file in files:
-                with archive.open(file) as inner, (made / file.filename).open("xb") as out:
-                    shutil.copyfileobj(inner, out)
-            (made / ".bundle.sha256").write_text(sha256(path), encoding="utf-8")
-            made.rename(folder)
-        finally:
-            shutil.rmtree(made, ignore_errors=True)
 
 
 def sha256(path: Path) -> str:

@@ -176,6 +176,7 @@ def inputs(folder: Path, reader: str) -> dict[str, tuple[str, Callable[[Path], A
 
 
 READERS = (
+    "bundles",
     "ply",
     "gdf",
     "session",

@@ -9,6 +9,7 @@ import os
 import random
 import shutil
 import signal
+import zipfile
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -20,7 +21,9 @@ import pytest
 from PIL import Image
 
 from progdf.formats.scene_file import load_scene
+from progdf.io.bundle import unpack_bundle
 from progdf.io.cameras import load_cameras, save_cameras
+from progdf.io.session import SessionFile, read_session
 from progdf.rasterize.cpu import jit
 from progdf.scene.regions import parse_region
 from tests.helpers.fuzz_changes import Change, changed_bytes, changed_json, changed_parts
@@ -63,6 +66,7 @@ def more_inputs(folder: Path, reader: str) -> dict[str, Reader]:
     """The one of these readers that is asked for, as `fuzz.inputs` has it; none, if it is another's."""
     makers: dict[str, Callable[[Path], Reader]] = {
         **{kind: partial(_converted, kind) for kind in ("spz", "splat", "sog", "ksplat", "compressed")},
+        "bundles": _bundles,
         "colmap": _colmap,
         "masks": _masks,
         "labels": partial(_numbers, "labels:{}:1"),
@@ -89,6 +93,46 @@ def _converted(kind: str, folder: Path) -> Reader:
             assert bool(tensor.isfinite().all())
 
     return f"x{good.suffix}", read, [changed_bytes(good.read_bytes())]
+
+
+def _bundles(folder: Path) -> Reader:
+    """Bundles with damaged bytes, and folders of earlier openings with damaged or other files."""
+    session = b'{"progdf_session": 1, "scene": {"file": "a.ply", "sha256": ""}}' + b" " * 400
+    contents = []
+    methods = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA)
+    for method in methods:
+        with zipfile.ZipFile(folder / "good.zip", "w", method) as archive:
+            archive.writestr("a.session.json", session)
+            archive.writestr("a.ply", random.Random(1).randbytes(600))
+        contents.append((folder / "good.zip").read_bytes())
+    unpacked = folder / "x.progdf"
+
+    def change(rng: random.Random, path: Path) -> None:
+        shutil.rmtree(unpacked, ignore_errors=True)
+        content = rng.choice(contents)
+        if rng.random() < 0.7:
+            changed_bytes(content)(rng, path)
+            return
+        path.write_bytes(contents[rng.randrange(2)])
+        unpack_bundle(path)
+        file = rng.choice(sorted(unpacked.iterdir()))
+        kind = rng.randrange(4)
+        if kind == 0:
+            file.write_bytes(rng.randbytes(64))
+        elif kind == 1:
+            file.rename(unpacked / rng.choice(["b.session.json", "b.json", "b", "a.autosave.session.json"]))
+        elif kind == 2:
+            file.unlink()
+        else:
+            file.unlink()
+            file.mkdir()
+
+    def read(path: Path) -> None:
+        opened = unpack_bundle(path)
+        assert opened.parent == unpacked
+        read_session(opened, SessionFile)
+
+    return "x.progdf.zip", read, [change]
 
 
 def _colmap(folder: Path) -> Reader:

@@ -16,9 +16,9 @@ from progdf.camera import Camera
 from progdf.cli.info import kind_of
 from progdf.errors import ProgdfError
 from progdf.gdf.file import Gdf, fingerprint, load_gdf
+from progdf.io.bundle import BUNDLE, unpack_bundle
 from progdf.io.cameras import load_cameras
 from progdf.io.picture_camera import edits_in_picture, find_picture_camera
-from progdf.io.session import BUNDLE, unpack_bundle
 from progdf.region import Region, from_mask
 from progdf.threads import all_threads
 from viewer.camera.view_camera import ViewCamera, first_camera, from_camera, to_camera

@@ -17,7 +17,7 @@ from progdf.color.edits import parse_color
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
-from progdf.io.session import BUNDLE, unpack_bundle
+from progdf.io.bundle import BUNDLE, unpack_bundle
 from progdf.region import Region
 from progdf.scene import UpChoice
 from progdf.scene.regions import check_region, parse_region

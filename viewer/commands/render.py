@@ -27,9 +27,9 @@ from progdf.formats.cube import SUFFIX as CUBE
 from progdf.gaussians import ZERO, Gaussians
 from progdf.gdf.file import Gdf
 from progdf.io.atomic import atomic_write, check_not_an_input
+from progdf.io.bundle import BUNDLE, write_bundle
 from progdf.io.cameras import read_camera
 from progdf.io.picture_camera import camera_chunk
-from progdf.io.session import BUNDLE, write_bundle
 from progdf.metrics.image import NO_DIFFERENCE
 from progdf.scene.strays import picture_difference
 from progdf.terminal import file_size, format_count, print_line

@@ -12,7 +12,7 @@ import pytest
 
 from progdf.__main__ import main
 from progdf.errors import ProgdfError
-from progdf.io.session import unpack_bundle, write_bundle
+from progdf.io.bundle import unpack_bundle, write_bundle
 from tests.helpers.null_app import null_app
 from tests.helpers.sessions import bear_files, full_view, opened_document, saved_session
 from tests.helpers.ui_rig import bear
@@ -117,14 +117,12 @@ def test_nothing_is_written_outside_its_folder(bundle: Path, name: str) -> None:
     assert not list(bundle.parents[1].rglob("*evil*"))
 
 
-def test_what_is_no_bundle_is_one_line_and_leaves_nothing(
-    bundle: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_bundle_is_one_line_and_leaves_nothing(bundle: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = bundle.read_bytes()
     for content, said in (
         (b"", "is no bundle"),
-        (whole[: len(whole) // 2], "is no bundle"),
-        (whole[:2000] + bytes(500) + whole[2500:], "is no bundle"),
+        (whole[: len(whole) // 2], "is damaged"),
+        (whole[:2000] + bytes(500) + whole[2500:], "is damaged"),
     ):
         bundle.write_bytes(content)
         with pytest.raises(ProgdfError, match=said) as caught:
@@ -135,7 +133,7 @@ def test_what_is_no_bundle_is_one_line_and_leaves_nothing(
     rewritten(bundle, lambda files: files.update({"b.session.json": b"{}"}))
     with pytest.raises(ProgdfError, match="it holds 2 sessions"):
         unpack_bundle(bundle)
-    monkeypatch.setattr("progdf.io.session._MOST_INFLATED", 1)
+    monkeypatch.setattr("progdf.io.bundle.MAX_EXPANSION", 1)
     rewritten(bundle, lambda files: files.update({"b.session.json": bytes(3 << 20)}))
     rewritten(bundle, lambda files: files.update({"zeros.ply": files.pop("b.session.json")}))
     with pytest.raises(ProgdfError, match="far more than it can hold"):

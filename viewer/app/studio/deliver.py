@@ -10,7 +10,7 @@ from pathlib import Path
 from progdf import __version__
 from progdf.errors import ProgdfError
 from progdf.formats.scene_file import WRITTEN
-from progdf.io.session import BUNDLE
+from progdf.io.bundle import BUNDLE
 from viewer.app.application import Application, Requests, failure_line
 from viewer.files import exports, session
 from viewer.files.user_files import parse_path

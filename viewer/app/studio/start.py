@@ -14,7 +14,8 @@ import viewer
 from progdf.demo_scenes import SKY
 from progdf.errors import ProgdfError
 from progdf.io.atomic import make_folder, read_file, state_folder, write_file
-from progdf.io.session import BUNDLE, sha256
+from progdf.io.bundle import BUNDLE
+from progdf.io.session import sha256
 from progdf.scene import up_axis
 from viewer.app.application import Application, Requests, attempt
 from viewer.app.file_actions import EditActions

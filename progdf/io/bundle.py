@@ -1,0 +1,276 @@
+"""Bundles: NAME.progdf.zip, a session and the files that it names, side by side, to hand to somebody else.
+
+A bundle unpacks into the folder NAME.progdf beside it, once. Its members are stored or deflated. Encryption
+and other compression methods are refused by name, as their size cannot be bounded before they are unpacked.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import struct
+import tempfile
+import zipfile
+import zlib
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path, PureWindowsPath
+
+import msgspec
+
+from progdf.errors import ProgdfError
+
+from .atomic import (
+    atomic_write,
+    check_regular,
+    is_portable,
+    numbered_names,
+    open_error,
+    read_file,
+    temporary_subfolder,
+    write_error,
+)
+from .file_rules import damage_error, unsupported_error
+from .session import SUFFIX, SessionFile, is_session, read_session, sha256, verify_files, write_session
+
+BUNDLE = ".progdf.zip"
+MAX_FILES = 1000  # members of a bundle
+MAX_EXPANSION = 200  # unpacked size / size of the bundle; a bundle below 1 MB counts as 1 MB
+_HASH_FILE = ".bundle.sha256"  # in the unpacked folder: the hash of its bundle, hexadecimal
+_REMEDY = "zip its files again, without a password and with deflate"
+_READ_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+_METHODS = {
+    1: "shrink",
+    6: "implode",
+    9: "deflate64",
+    12: "bzip2",
+    14: "lzma",
+    93: "zstd",
+    95: "xz",
+    98: "ppmd",
+}
+_ENCRYPTED = 0x1  # bit of a member's flags
+_START_BYTES = 64  # enough for `is_session`
+_CHUNK_BYTES = 1 << 20
+_ZIP_ERRORS = (
+    zipfile.BadZipFile,
+    zipfile.LargeZipFile,
+    zlib.error,
+    struct.error,
+    EOFError,
+    OSError,  # a seek to a negative offset
+    OverflowError,
+    ValueError,
+)
+
+
+def write_bundle(path: Path, source: Path) -> int:
+    """Put a session and all files that it needs into one file.
+
+    Args:
+        path: NAME.progdf.zip
+        source: the session, saved
+
+    Returns:
+        The number of files in the bundle.
+
+    Raises:
+        ProgdfError: see `verify_files`; or the scene is an unpacked .sog, which is many files.
+    """
+    session = read_session(source, SessionFile)
+    scene, edits = verify_files(source, session)
+    if scene.name.lower() == "meta.json":
+        raise ProgdfError(f"{scene.parent} is an unpacked .sog; export the scene as a .ply first")
+    names = _member_names((scene, *edits))
+    for region in session.view.get("selection", {}).get("regions", ()):
+        region["path"] = PureWindowsPath(region["path"]).name
+    placed = msgspec.structs.replace(
+        session,
+        scene=msgspec.structs.replace(session.scene, file=names[scene]),
+        edits=tuple(
+            msgspec.structs.replace(ref, file=names[file])
+            for ref, file in zip(session.edits, edits, strict=True)
+        ),
+    )
+    title = path.name.removesuffix(BUNDLE)
+    with tempfile.TemporaryDirectory(prefix="progdf-") as folder, atomic_write(path) as written:
+        inner = Path(folder) / f"{title}{SUFFIX}"
+        write_session(inner, placed)
+        with zipfile.ZipFile(written, "w", zipfile.ZIP_DEFLATED) as archive:
+            for file, name in {inner: inner.name, **names}.items():
+                archive.write(file, name)
+    return 1 + len(names)
+
+
+def _member_names(files: Sequence[Path]) -> dict[Path, str]:
+    """Return a different name for each different file, alike in upper and lower case."""
+    names: dict[Path, str] = {}
+    for file in files:
+        taken = {name.lower() for name in names.values()}
+        free = numbered_names(file.stem, file.suffix)
+        names.setdefault(file, next(name for name in free if name.lower() not in taken))
+    return names
+
+
+def unpack_bundle(path: Path) -> Path:
+    """Return the session of a bundle, unpacked into the folder NAME.progdf beside it.
+
+    A bundle that is already unpacked is not unpacked again. The session is always the bundle's own: autosaves
+    and other sessions in the folder are never opened instead. A session that was renamed but not changed is
+    found. If the session is gone, it is written again.
+
+    Nothing is written outside that folder, which appears whole or not at all.
+
+    Raises:
+        ProgdfError: the file is damaged, no bundle or uses an unsupported feature of .zip; or the folder
+            holds something else or cannot be written.
+    """
+    folder = path.resolve().with_name(path.name.removesuffix(".zip"))
+    with _open_archive(path) as archive:
+        members = _check_members(path, archive)
+        session = _find_session(path, archive, members)
+        if not os.path.lexists(folder):
+            _unpack(path, archive, members, folder)
+        elif not _is_unpacked(path, folder):
+            raise ProgdfError(f"{folder} is there and is not what {path.name} unpacks to; move it elsewhere")
+        opened = folder / session.filename
+        if opened.is_file():
+            return opened
+        renamed = _find_copy(folder, session)
+        if renamed is not None:
+            return renamed
+        with atomic_write(opened) as written, written.open("wb") as out:
+            out.writelines(_read_chunks(path, archive, session))
+        return opened
+
+
+@contextmanager
+def _open_archive(path: Path) -> Iterator[zipfile.ZipFile]:
+    """Open a bundle as a .zip archive.
+
+    Raises:
+        ProgdfError: the file cannot be read, is no .zip archive, or is damaged.
+    """
+    check_regular(path)
+    try:
+        file = path.open("rb")
+    except (OSError, ValueError) as error:
+        raise open_error(path, error) from error
+    with file:
+        if file.read(2) != b"PK":
+            raise ProgdfError(f"{path} is no bundle: it is no .zip archive; copy or export it again")
+        try:
+            archive = zipfile.ZipFile(file)
+        except NotImplementedError as error:  # a later version of the format
+            raise unsupported_error(path, f"a later .zip format ({error})", _REMEDY) from None
+        except _ZIP_ERRORS as error:
+            raise damage_error(path, str(error) or type(error).__name__) from None
+        with archive:
+            yield archive
+
+
+def _check_members(path: Path, archive: zipfile.ZipFile) -> list[zipfile.ZipInfo]:
+    """Return the members of a bundle, each a plain file that can be unpacked within the limits.
+
+    Raises:
+        ProgdfError: a name is no plain file's or appears twice, a member is encrypted or compressed by
+            another method than deflate, or the members are too many or too large.
+    """
+    members = archive.infolist()
+    if len(members) > MAX_FILES:
+        raise ProgdfError(f"{path} is no bundle: it holds {len(members)} files; the most are {MAX_FILES}")
+    names = set[str]()
+    for member in members:
+        name = member.filename
+        if not is_portable(name) or name.startswith(".") or not name.isprintable():
+            raise ProgdfError(
+                f"{path} is no bundle: it names {name!r:.80}, which is no plain file; export it again"
+            )
+        if name.casefold() in names:
+            raise damage_error(path, f"it holds {name!r:.80} twice")
+        names.add(name.casefold())
+        if member.flag_bits & _ENCRYPTED:
+            raise unsupported_error(path, f"encryption ({name!r:.80})", _REMEDY)
+        if member.compress_type not in _READ_METHODS:
+            method = _METHODS.get(member.compress_type, f"method {member.compress_type}")
+            raise unsupported_error(path, f"the compression {method} ({name!r:.80})", _REMEDY)
+    unpacked = sum(member.file_size for member in members)
+    if unpacked > MAX_EXPANSION * max(path.stat().st_size, 1 << 20):
+        raise ProgdfError(
+            f"{path} is no bundle: it would be unpacked to far more than it can hold; export it again"
+        )
+    return members
+
+
+def _find_session(
+    path: Path, archive: zipfile.ZipFile, members: Sequence[zipfile.ZipInfo]
+) -> zipfile.ZipInfo:
+    """Return the only session among the members: by its name, or by its content if no name fits.
+
+    Raises:
+        ProgdfError: there is none, or more than one.
+    """
+    sessions = [member for member in members if member.filename.lower().endswith(SUFFIX)]
+    if not sessions:
+        for member in members:
+            start = next(_read_chunks(path, archive, member), b"")
+            if is_session(start[:_START_BYTES]):
+                sessions.append(member)
+    if len(sessions) != 1:
+        names = ", ".join(repr(member.filename) for member in sessions)
+        found = f"it holds {len(sessions)} sessions in {len(members)} files"
+        named = f" ({names:.80})" if names else ""
+        raise ProgdfError(f"{path} is no bundle: {found}{named}; keep one session in it")
+    return sessions[0]
+
+
+def _is_unpacked(path: Path, folder: Path) -> bool:
+    """Return True if a folder was unpacked from exactly this bundle."""
+    hash_file = folder / _HASH_FILE
+    return hash_file.is_file() and read_file(hash_file, 65) == sha256(path).encode()
+
+
+def _find_copy(folder: Path, session: zipfile.ZipInfo) -> Path | None:
+    """Return a file of the folder with the content of a bundle's session, under another name."""
+    for file in sorted(folder.glob("*.json")):
+        if not file.is_file() or file.stat().st_size != session.file_size:
+            continue
+        if zlib.crc32(read_file(file)) == session.CRC:
+            return file
+    return None
+
+
+def _unpack(path: Path, archive: zipfile.ZipFile, members: Sequence[zipfile.ZipInfo], folder: Path) -> None:
+    """Write the members into a folder, which appears when all are written.
+
+    Raises:
+        ProgdfError: a member is damaged, or the folder cannot be written.
+    """
+    try:
+        temporary = temporary_subfolder(folder.parent)
+        try:
+            for member in members:
+                with (temporary / member.filename).open("xb") as out:
+                    out.writelines(_read_chunks(path, archive, member))
+            (temporary / _HASH_FILE).write_bytes(sha256(path).encode())
+            temporary.rename(folder)
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
+    except OSError as error:
+        raise write_error(folder, error) from error
+
+
+def _read_chunks(path: Path, archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> Iterator[bytes]:
+    """Yield the content of a member in pieces of at most 1 MB.
+
+    Raises:
+        ProgdfError: the member is damaged, or uses an unsupported feature of .zip.
+    """
+    try:
+        with archive.open(member) as inner:
+            while chunk := inner.read(_CHUNK_BYTES):
+                yield chunk
+    except NotImplementedError as error:
+        raise unsupported_error(path, f"a feature of .zip ({error})", _REMEDY) from None
+    except _ZIP_ERRORS as error:
+        raise damage_error(path, f"{member.filename:.80}: {error or type(error).__name__}") from None
