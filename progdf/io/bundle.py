@@ -20,16 +20,7 @@ import msgspec
 
 from progdf.errors import ProgdfError
 
-from .atomic import (
-    atomic_write,
-    check_regular,
-    is_portable,
-    numbered_names,
-    open_error,
-    read_file,
-    temporary_subfolder,
-    write_error,
-)
+from . import atomic
 from .file_rules import damage_error, unsupported_error
 from .session import SUFFIX, SessionFile, is_session, read_session, sha256, verify_files, write_session
 
@@ -93,7 +84,7 @@ def write_bundle(path: Path, source: Path) -> int:
         ),
     )
     title = path.name.removesuffix(BUNDLE)
-    with tempfile.TemporaryDirectory(prefix="progdf-") as folder, atomic_write(path) as written:
+    with tempfile.TemporaryDirectory(prefix="progdf-") as folder, atomic.atomic_write(path) as written:
         inner = Path(folder) / f"{title}{SUFFIX}"
         write_session(inner, placed)
         with zipfile.ZipFile(written, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -107,7 +98,7 @@ def _member_names(files: Sequence[Path]) -> dict[Path, str]:
     names: dict[Path, str] = {}
     for file in files:
         taken = {name.lower() for name in names.values()}
-        free = numbered_names(file.stem, file.suffix)
+        free = atomic.numbered_names(file.stem, file.suffix)
         names.setdefault(file, next(name for name in free if name.lower() not in taken))
     return names
 
@@ -139,7 +130,7 @@ def unpack_bundle(path: Path) -> Path:
         renamed = _find_copy(folder, session)
         if renamed is not None:
             return renamed
-        with atomic_write(opened) as written, written.open("wb") as out:
+        with atomic.atomic_write(opened) as written, written.open("wb") as out:
             out.writelines(_read_chunks(path, archive, session))
         return opened
 
@@ -151,11 +142,11 @@ def _open_archive(path: Path) -> Iterator[zipfile.ZipFile]:
     Raises:
         ProgdfError: the file cannot be read, is no .zip archive, or is damaged.
     """
-    check_regular(path)
+    atomic.check_regular(path)
     try:
         file = path.open("rb")
     except (OSError, ValueError) as error:
-        raise open_error(path, error) from error
+        raise atomic.open_error(path, error) from error
     with file:
         if file.read(2) != b"PK":
             raise ProgdfError(f"{path} is no bundle: it is no .zip archive; copy or export it again")
@@ -182,7 +173,7 @@ def _check_members(path: Path, archive: zipfile.ZipFile) -> list[zipfile.ZipInfo
     names = set[str]()
     for member in members:
         name = member.filename
-        if not is_portable(name) or name.startswith(".") or not name.isprintable():
+        if not atomic.is_portable(name) or name.startswith(".") or not name.isprintable():
             raise ProgdfError(
                 f"{path} is no bundle: it names {name!r:.80}, which is no plain file; export it again"
             )
@@ -227,7 +218,7 @@ def _find_session(
 def _is_unpacked(path: Path, folder: Path) -> bool:
     """Return True if a folder was unpacked from exactly this bundle."""
     hash_file = folder / _HASH_FILE
-    return hash_file.is_file() and read_file(hash_file, 65) == sha256(path).encode()
+    return hash_file.is_file() and atomic.read_file(hash_file, 65) == sha256(path).encode()
 
 
 def _find_copy(folder: Path, session: zipfile.ZipInfo) -> Path | None:
@@ -235,7 +226,7 @@ def _find_copy(folder: Path, session: zipfile.ZipInfo) -> Path | None:
     for file in sorted(folder.glob("*.json")):
         if not file.is_file() or file.stat().st_size != session.file_size:
             continue
-        if zlib.crc32(read_file(file)) == session.CRC:
+        if zlib.crc32(atomic.read_file(file)) == session.CRC:
             return file
     return None
 
@@ -247,7 +238,7 @@ def _unpack(path: Path, archive: zipfile.ZipFile, members: Sequence[zipfile.ZipI
         ProgdfError: a member is damaged, or the folder cannot be written.
     """
     try:
-        temporary = temporary_subfolder(folder.parent)
+        temporary = atomic.temporary_subfolder(folder.parent)
         try:
             for member in members:
                 with (temporary / member.filename).open("xb") as out:
@@ -257,7 +248,7 @@ def _unpack(path: Path, archive: zipfile.ZipFile, members: Sequence[zipfile.ZipI
         finally:
             shutil.rmtree(temporary, ignore_errors=True)
     except OSError as error:
-        raise write_error(folder, error) from error
+        raise atomic.write_error(folder, error) from error
 
 
 def _read_chunks(path: Path, archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> Iterator[bytes]:
