@@ -8,6 +8,7 @@ import importlib
 import io
 import logging
 import os
+import signal
 import sys
 import tempfile
 import traceback
@@ -64,7 +65,7 @@ def run_guarded(run: Callable[[Sequence[str]], int], arguments: Sequence[str]) -
         logging.lastResort.setFormatter(PrintableFormatter())
     try:
         _check_current_folder()
-        with handle_signals(ENDINGS, _interrupt):
+        with handle_signals((signal.SIGINT, *ENDINGS), _interrupt):
             status = run(arguments)
             if sys.stdout is not None:
                 sys.stdout.flush()  # here, where a full disk or a closed pipe can still be reported
@@ -131,7 +132,7 @@ def _check_current_folder() -> None:
 
 
 def _interrupt(number: int, frame: FrameType | None) -> NoReturn:
-    """SIGTERM and a closed terminal end a command as Ctrl-C does, with its files removed and a hint."""
+    """Raise KeyboardInterrupt: SIGTERM and a closed terminal end a command as Ctrl+C does, with a hint."""
     raise KeyboardInterrupt
 
 

@@ -3,33 +3,104 @@ terminal sends to end a program."""
 
 from __future__ import annotations
 
+import _thread
 import logging
 import math
 import signal
+import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
+from queue import SimpleQueue
 from types import FrameType
 
 ENDINGS = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
 """Sent by who wants a process to end, and by a terminal that is closed; Windows has no SIGHUP."""
 
 
+REDELIVERY_DELAY_S = 0.02  # long enough for the callback that lost a signal to return
+
+_lost_signals = SimpleQueue[int]()  # a queue whose `put` is safe inside weakref callbacks
+
+
+@dataclass
+class _Delivery:
+    """State of the signals of the main thread."""
+
+    number: int = signal.SIGINT  # the latest signal
+    depth: int = 0  # open blocks of `handle_signals`; outside of them nothing is sent again
+    thread: threading.Thread | None = None  # runs `_send_lost_signals`
+
+
+_delivery = _Delivery()
+
+
 @contextmanager
 def handle_signals(
     signals: tuple[signal.Signals, ...], handler: Callable[[int, FrameType | None], None]
 ) -> Iterator[None]:
-    """Python lets only the main thread handle signals; elsewhere the owner of that thread does."""
+    """Handle signals meanwhile; ignored ones stay ignored, as under nohup.
+
+    Python ignores an exception that leaves a weakref callback, a `__del__` or a ctypes callback. A
+    KeyboardInterrupt that is lost in this way is noted by `sys.unraisablehook`, and its signal is sent again.
+
+    Python lets only the main thread handle signals; in other threads nothing is changed.
+
+    Args:
+        signals: the signals to handle
+        handler: called with the signal's number and the interrupted frame; may raise KeyboardInterrupt
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    heeded = [number for number in signals if signal.getsignal(number) != signal.SIG_IGN]  # nohup's stays
-    earlier = {number: signal.signal(number, handler) for number in heeded}
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        _delivery.number = number
+        if frame is not None and frame.f_code is note_lost_interrupt.__code__:
+            _lost_signals.put(number)  # an exception here would be lost, too
+            return
+        handler(number, frame)
+
+    def note_lost_interrupt(unraisable: sys.UnraisableHookArgs) -> None:
+        if unraisable.exc_type is not KeyboardInterrupt:
+            earlier_hook(unraisable)
+            return
+        _lost_signals.put(_delivery.number)
+
+    if _delivery.thread is None or not _delivery.thread.is_alive():  # none, or of a parent process
+        _delivery.thread = threading.Thread(target=_send_lost_signals, daemon=True)
+        _delivery.thread.start()
+    earlier_hook = sys.unraisablehook
+    sys.unraisablehook = note_lost_interrupt
+    _delivery.depth += 1
+    heeded = [number for number in signals if signal.getsignal(number) != signal.SIG_IGN]
+    earlier = {number: signal.signal(number, handle) for number in heeded}
     try:
         yield
     finally:
+        _delivery.depth -= 1
         for number, was in earlier.items():
             signal.signal(number, was)
+        sys.unraisablehook = earlier_hook
+
+
+def _send_lost_signals() -> None:
+    """Send each lost signal again, once the callback that lost it has had time to return."""
+    while True:
+        number = _lost_signals.get()
+        time.sleep(REDELIVERY_DELAY_S)
+        if _delivery.depth:
+            signal_main_thread(number)
+
+
+def signal_main_thread(number: int = signal.SIGINT) -> None:
+    """Send a signal to the main thread, which wakes it where it waits (not on Windows)."""
+    if sys.platform == "win32":
+        _thread.interrupt_main(number)
+    else:
+        signal.pthread_kill(threading.main_thread().ident or 0, number)
 
 
 def escape_text(text: str) -> str:

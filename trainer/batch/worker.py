@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import _thread
 import os
 import pickle
 import socket
@@ -29,6 +28,7 @@ from progdf.io.atomic import LOCK, atomic_write, hold_lock, is_locked
 from progdf.io.cameras import load_cameras
 from progdf.io.images import to_picture
 from progdf.rasterize import render
+from progdf.terminal import signal_main_thread
 from trainer.options import TrainOptions
 from trainer.resolve import resolve
 from trainer.run.finish import RunResult
@@ -165,7 +165,7 @@ def serve() -> None:
             while True:
                 queue.put(pickle.load(tasks))
         queue.put(None)
-        _thread.interrupt_main()  # nobody waits for what runs: save the state
+        signal_main_thread()  # the batch has ended: save the state of the running job
 
     threading.Thread(target=read, daemon=True).start()
     with suppress(KeyboardInterrupt, BrokenPipeError):

@@ -37,12 +37,12 @@ from progdf.terminal import ENDINGS, handle_signals
 
 @contextmanager
 def interrupt_on_signals() -> Iterator[None]:
-    """SIGTERM and SIGHUP are a KeyboardInterrupt too, so that all end in the same way."""
+    """Raise KeyboardInterrupt at SIGTERM and SIGHUP too, so that all three end a run in the same way."""
 
     def stop(number: int, frame: FrameType | None) -> NoReturn:
         raise KeyboardInterrupt
 
-    with handle_signals(ENDINGS, stop):
+    with handle_signals((signal.SIGINT, *ENDINGS), stop):
         yield
 
 

@@ -7,7 +7,6 @@ other end, however that ended. One that talks reads its input itself, and ends w
 
 from __future__ import annotations
 
-import _thread
 import contextlib
 import os
 import signal
@@ -21,6 +20,8 @@ from pathlib import Path
 from typing import IO, Annotated, Any
 
 from msgspec import Meta
+
+from progdf.terminal import signal_main_thread
 
 GRACE_S = 8.0
 """After which a child that was asked to stop is killed: it may be saving its state."""
@@ -158,14 +159,11 @@ def main() -> int:
 
 
 def _watch_parent() -> None:
-    """Wait until nobody holds the other end any more; then stop as by Ctrl+C."""
+    """Wait until the other end is closed; then stop as by Ctrl+C."""
     with contextlib.suppress(OSError):
         while os.read(0, 4096):
             pass
-    if sys.platform != "win32":
-        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)  # wakes it where it waits
-    else:
-        _thread.interrupt_main()
+    signal_main_thread()
 
 
 if __name__ == "__main__":
