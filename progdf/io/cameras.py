@@ -28,6 +28,7 @@ from progdf.gaussians import ZERO, Origin
 from .atomic import read_file, write_file
 from .colmap import find_model, load_model
 from .json_values import convert_json, decode_json
+from .picture_files import find_picture, without_common_folder
 
 _T = TypeVar("_T")
 
@@ -43,8 +44,6 @@ _PINHOLES = (
     "PERSPECTIVE",
 )
 """Camera models that are a pinhole behind a lens whose numbers we know."""
-
-_IMAGE_SUFFIXES = ("", ".png", ".jpg", ".jpeg")
 
 _Number = Annotated[float, msgspec.Meta(gt=-3e38, lt=3e38)]  # finite in float32
 _Pixels = Annotated[float, msgspec.Meta(ge=1, le=1_000_000, multiple_of=1)]
@@ -163,13 +162,14 @@ def _image_size(where: str, frame: _Frame, path: Path) -> tuple[float, float]:
         return frame.w, frame.h
     from .images import picture_size  # Pillow, which files with sizes do without
 
-    for suffix in _IMAGE_SUFFIXES:
-        picture = path.parent / (str(frame.file_path) + suffix)
-        if os.path.isfile(picture):  # pathlib's raises where a name is too long
-            try:
-                return picture_size(picture, calibrated=True)
-            except ProgdfError as error:
-                raise ProgdfError(f"{where} has no image size, and {error}") from None
+    picture: Path | None = path.parent / str(frame.file_path)
+    try:
+        if not os.path.isfile(picture):  # pathlib's raises where a name is too long
+            picture = find_picture(path.parent, str(frame.file_path))
+        if picture is not None:
+            return picture_size(picture, calibrated=True)
+    except ProgdfError as error:
+        raise ProgdfError(f"{where} has no image size, and {error}") from None
     raise ProgdfError(f"{where} has no image size; expected w and h")
 
 
@@ -363,7 +363,9 @@ def _carried_camera(path: str | os.PathLike[str]) -> Camera | None:
 def _from_content(name: str, content: Any, path: Path) -> list[Camera]:
     match content:
         case {"frames": list() as frames}:
-            return [nerfstudio_camera(name, i, content, frame, path) for i, frame in enumerate(frames)]
+            cameras = [nerfstudio_camera(name, i, content, frame, path) for i, frame in enumerate(frames)]
+            names = without_common_folder([camera.name for camera in cameras])
+            return [replace(camera, name=own) for camera, own in zip(cameras, names, strict=True)]
         case {"cameras": list() as entries}:
             return [own_camera(name, i, entry) for i, entry in enumerate(entries)]
         case {"viewmat": _}:

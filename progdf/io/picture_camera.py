@@ -11,7 +11,7 @@ import json
 import os
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 from PIL.PngImagePlugin import PngInfo
 
@@ -22,6 +22,7 @@ from progdf.gaussians import ZERO, Origin
 from .cameras import PICTURE_KEY, camera_in_picture, cameras_to_json, load_cameras
 from .images import picture_text
 from .json_values import decode_json
+from .picture_files import name_key, split_path
 
 UP_KEY = "progdf:up"
 EDITS_KEY = "progdf:edits"
@@ -88,7 +89,7 @@ def find_picture_camera(
             raise ProgdfError(f"{beside} holds {len(cameras)} cameras; keep the one of {path.name}")
         camera = cameras[0]
     if camera is None:
-        named = [camera for camera in given if _stem(camera.name) == path.stem]
+        named = _named_cameras(path, given)
         if len(named) > 1:
             raise ProgdfError(f"{len(named)} cameras are named {path.stem}; give {beside.name} beside {path}")
         if not named:
@@ -100,8 +101,19 @@ def find_picture_camera(
     return replace(camera, name=path.stem, lens=None)  # what was rendered is straight
 
 
-def _stem(name: str) -> str:
-    """The name of a camera, which may be a path and have a picture's ending."""
-    last = PurePosixPath(name).name
-    stem, dot, suffix = last.rpartition(".")
-    return stem if dot and suffix.lower() in ("png", "jpg", "jpeg", "webp") else last
+def _named_cameras(path: Path, cameras: Sequence[Camera]) -> list[Camera]:
+    """Return the cameras named as a picture; of several those whose folders are the picture's too."""
+    parts = [name_key(part) for part in split_path(path.absolute().as_posix())]
+    named = []
+    longest = 1
+    for camera in cameras:
+        own = [name_key(part) for part in split_path(camera.name)]
+        if not own or own[-1] != parts[-1]:
+            continue
+        shared = len(own) if parts[-len(own) :] == own else 1
+        if shared > longest:
+            named = []
+            longest = shared
+        if shared == longest:
+            named.append(camera)
+    return named

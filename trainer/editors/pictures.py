@@ -29,6 +29,7 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import ZERO, Gaussians, Origin
 from progdf.io.images import picture_size, read_picture, save_as
 from progdf.io.picture_camera import find_picture_camera
+from progdf.io.picture_files import PictureFolder, find_picture, name_key, split_path
 from progdf.rasterize import render
 from trainer.options import EditKind
 from trainer.views.view import BACKGROUND, View, seen_colors, shrink_image
@@ -135,12 +136,16 @@ def strengths_of(path: Path) -> dict[float, Path]:
     paths = {1.0: path}
     for child in sorted(path.parent.iterdir()):
         strength = number_of(child.name)
-        if math.isfinite(strength) and (child / path.name).is_file():
-            if not 0.0 < strength < 1.0:
-                raise ProgdfError(
-                    f"{child} is named for a strength that is not between 0 and 1; name it 0.25, 0.5, …"
-                )
-            paths[strength] = child / path.name
+        if not math.isfinite(strength):
+            continue
+        picture = find_picture(child, path.name)
+        if picture is None:
+            continue
+        if not 0.0 < strength < 1.0:
+            raise ProgdfError(
+                f"{child} is named for a strength that is not between 0 and 1; name it 0.25, 0.5, …"
+            )
+        paths[strength] = picture
     return paths
 
 
@@ -293,21 +298,20 @@ def move_image(image: np.ndarray, shift: tuple[int, int]) -> np.ndarray:
 
 _EDITED = "put the edited copies of RUN/views/original/*.png there, under the same names"
 _TAKEN = "put the photographs there, under the names that the cameras have"
-SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 
 
 @dataclass(frozen=True)
 class FolderEditor:
     """Reads edited views from one folder per strength."""
 
-    folders: dict[float, Path]  # strength → folder
+    folders: Mapping[float, PictureFolder]  # strength → folder
     stages: tuple[float, ...]  # the strengths, ascending
     kind: EditKind = "style"
     is_confined: bool = False
     bent: bool = False  # the pictures were taken through the views' lenses and are to be straightened
     # where the unedited photographs lie, if the views are to be changed as these were; else the pictures are
     # taken as they are
-    originals: Path | None = None
+    originals: PictureFolder | None = None
 
     @property
     def note(self) -> str | None:
@@ -328,11 +332,11 @@ class FolderEditor:
             picture = (view.image + picture - self._read_undistorted(self.originals, view)[0]).clamp(0.0, 1.0)
         return torch.where(visible[..., None], picture, view.image)
 
-    def _read_undistorted(self, where: Path, view: View) -> tuple[Tensor, Tensor]:
-        """A picture at its view's size, straight, and which of its pixels were taken. [H,W,3], [H,W] bool"""
+    def _read_undistorted(self, pictures: PictureFolder, view: View) -> tuple[Tensor, Tensor]:
+        """Return a picture at its view's size, straight, and the pixels it covers. [H,W,3], [H,W] bool"""
         camera = view.camera
-        path, size = _picture(where, camera.name, self.bent), (camera.width, camera.height)
-        picture = read_picture(path, size, calibrated=self.bent)
+        path = pictures.require(camera.name, _advice(self.bent))
+        picture = read_picture(path, (camera.width, camera.height), calibrated=self.bent)
         if not self.bent or camera.lens is None:
             return picture, torch.ones_like(picture[..., 0], dtype=torch.bool)
         return undistort(picture, camera.K, camera.lens)
@@ -367,38 +371,46 @@ def folder(given: EditorInput) -> FolderEditor:
 
 
 def _make_editor(root: Path, views: Sequence[View], bent: bool = False) -> FolderEditor:
-    folders: dict[float, Path] = {}
+    """Return the editor of a folder, after every view's picture was found.
+
+    A subfolder named by a number holds a strength, unless views are named after it: `1/IMG.png`.
+    """
+    names = [view.camera.name for view in views]
+    view_folders = {name_key(split_path(name)[0]) for name in names if "/" in name}
+    paths: dict[float, Path] = {}
     for child in sorted(root.iterdir()):
         strength = number_of(child.name)
-        if child.is_dir() and math.isfinite(strength):
-            if not 0.0 < strength <= 1.0:
-                raise ProgdfError(f"{child} is named for a strength outside 0..1; name it 0.25, 0.5, … or 1")
-            folders[strength] = child
-    if 1.0 not in folders:
-        folders[1.0] = root
-    editor = FolderEditor(folders, tuple(sorted(folders)), bent=bent)
-    for strength in editor.stages:
-        for view in views:
-            _picture(folders[strength], view.camera.name, bent)
-    return editor
+        if not child.is_dir() or not math.isfinite(strength) or name_key(child.name) in view_folders:
+            continue
+        if not 0.0 < strength <= 1.0:
+            raise ProgdfError(f"{child} is named for a strength outside 0..1; name it 0.25, 0.5, … or 1")
+        paths[strength] = child
+    paths.setdefault(1.0, root)
+    folders = {strength: _check_pictures(path, names, bent) for strength, path in paths.items()}
+    return FolderEditor(folders, tuple(sorted(folders)), bent=bent)
 
 
 def photographs(given: EditorInput) -> FolderEditor:
     """`photographs:EDITED,ORIGINALS` or `photographs:EDITED`: see the module's head."""
     edited, originals = photograph_folders(given.what)
-    if originals is not None:
-        for view in given.views:
-            _picture(originals, view.camera.name, bent=True)
-    return replace(_make_editor(edited, given.views, bent=True), originals=originals)
+    editor = _make_editor(edited, given.views, bent=True)
+    if originals is None:
+        return editor
+    names = [view.camera.name for view in given.views]
+    return replace(editor, originals=_check_pictures(originals, names, bent=True))
 
 
-def _picture(where: Path, name: str, bent: bool) -> Path:
-    if (path := picture_named(where, name)) is None:
-        raise ProgdfError(f"{where} has no picture {name}.png; {_TAKEN if bent else _EDITED}")
-    return path
+def _check_pictures(folder: Path, names: Sequence[str], bent: bool) -> PictureFolder:
+    """Return a folder that has a picture of every view.
+
+    Raises:
+        ProgdfError: a picture is missing, or two have the name of one view.
+    """
+    pictures = PictureFolder(folder, names)
+    for name in names:
+        pictures.require(name, _advice(bent))
+    return pictures
 
 
-def picture_named(folder: Path, name: str) -> Path | None:
-    """The picture of a view in a folder, by the view's name; None where there is none."""
-    paths = (folder / f"{name}{suffix}" for suffix in SUFFIXES)
-    return next((path for path in paths if path.is_file()), None)
+def _advice(bent: bool) -> str:
+    return _TAKEN if bent else _EDITED

@@ -20,6 +20,7 @@ from progdf.gaussians import ZERO, Gaussians, Origin
 from progdf.io.cameras import load_cameras, save_cameras
 from progdf.io.images import flatten_onto, open_picture
 from progdf.io.picture_camera import edits_in_picture
+from progdf.io.picture_files import PictureFolder
 from progdf.region import Region, from_mask
 from progdf.scene.bounds import is_surrounding
 from progdf.scene.orbit_rig import orbit_rig
@@ -28,7 +29,7 @@ from progdf.scene.scribbles import Rows, Scribbles, rows_under
 from progdf.scene.selection import Surface, base_colors
 from progdf.scene.up_axis import find_up
 from trainer.editors.cache import KeptPictures, Recipe
-from trainer.editors.pictures import picture_named, picture_paths, read_change, rendered_cameras
+from trainer.editors.pictures import picture_paths, read_change, rendered_cameras
 from trainer.options import VIEWS, RegionOptions, ViewOptions
 from trainer.store.pretrained import last_model
 from trainer.views.view import (
@@ -48,18 +49,21 @@ from .segment import SEGMENTER_CHECKS, SEGMENTERS, Segmenter
 
 
 def read_masks(folder: Path, cameras: Sequence[Camera], bent: bool = False) -> list[Tensor | None]:
-    """The mask of every camera, scaled to its size, [H,W] float32 0..1 each; None where there is none.
+    """Return the mask of every camera, scaled to its size; None where there is none. [H,W] float32 0..1
 
     Args:
-        folder: see the module's head
+        folder: holds the masks, see `PictureFolder`
         cameras: with the names of their views
         bent: the masks were drawn over photographs, which the cameras' lenses have bent: straighten them
 
     Raises:
-        ProgdfError: not one mask is in it, or one that is broken or of other proportions.
+        ProgdfError: the folder has no mask, or two of one view, or one is broken or of other proportions.
     """
-    files = [picture_named(folder, camera.name) for camera in cameras]
+    pictures = PictureFolder(folder, [camera.name for camera in cameras])
+    files = [pictures.find(camera.name) for camera in cameras]
     if not any(files):
+        for camera in cameras:
+            pictures.check_unread(camera.name)
         raise ProgdfError(
             f"{folder} has no mask for any of the {len(cameras)} cameras; "
             f"name each as its view, as {cameras[0].name}.png"

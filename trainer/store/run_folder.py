@@ -56,7 +56,9 @@ def remove_pictures_but_of(folder: Path, views: Collection[str]) -> None:
     entries = []
     for line in read_list(folder):
         path = folder / line
-        if path.stem in views or not _is_inside(folder, line):
+        parts = (*PurePosixPath(line).parent.parts, path.stem)
+        tails = ("/".join(parts[first:]) for first in range(len(parts)))
+        if any(tail in views for tail in tails) or not _is_inside(folder, line):
             entries.append(line)
         elif os.path.isfile(path):  # pathlib's raises where a name is too long
             path.unlink()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -14,7 +13,7 @@ from torch.nn.functional import interpolate
 
 from progdf.camera import Camera, intrinsics, look_at
 from progdf.gaussians import Gaussians
-from progdf.io.atomic import is_portable
+from progdf.io.picture_files import name_twin, view_name
 from progdf.rasterize import Crop, activate, render
 from progdf.rasterize.engines import ColorMap, color_map
 from progdf.region import Region
@@ -36,7 +35,6 @@ INSIDE = (
 
 _LEAST_BOX = 64  # LPIPS needs that many pixels on each side
 _SEEN = 0.05  # a pixel shows the region where the members' weight is above this
-_LONGEST_NAME = 60  # characters, of four bytes at most: file systems take 255 bytes with what comes after
 _EVERY = 23  # one of so many pixels is looked at, along the rows
 _CHANGED = 0.05  # a pixel is changed where a channel differs by more than this
 
@@ -237,20 +235,16 @@ def fit_size(camera: Camera, image_size: int) -> Camera:
 
 
 def name_cameras(cameras: Sequence[Camera]) -> list[Camera]:
-    """The cameras with names that can be file names on any system, and differ in more than case there."""
+    """Return the cameras with names that are relative paths and safe on every system (`view_name`).
+
+    Names differ in more than case. A camera whose name is taken, or leaves no safe name, becomes `view_NNN`.
+    """
     taken: set[str] = set()
     result = []
     for i, camera in enumerate(cameras):
-        name = "".join(c if c.isalnum() or c in "-_." else "_" for c in camera.name.rsplit("/", 1)[-1])
-        name = name.rsplit(".", 1)[0] if name.lower().endswith((".png", ".jpg", ".jpeg")) else name
-        name = name[:_LONGEST_NAME]
-        if not name.strip("._") or not is_portable(name) or _twin(name) in taken:
+        name = view_name(camera.name)
+        if name is None or name_twin(name) in taken:
             name = f"view_{i:03d}"
-        taken.add(_twin(name))
+        taken.add(name_twin(name))
         result.append(replace(camera, name=name))
     return result
-
-
-def _twin(name: str) -> str:
-    """Equal for names that Windows or macOS take for one."""
-    return unicodedata.normalize("NFC", name).casefold()

@@ -19,6 +19,7 @@ from progdf.gdf.file import Gdf, fingerprint, load_gdf
 from progdf.io.bundle import BUNDLE, unpack_bundle
 from progdf.io.cameras import load_cameras
 from progdf.io.picture_camera import edits_in_picture, find_picture_camera
+from progdf.io.picture_files import ENDINGS
 from progdf.region import Region, from_mask
 from progdf.threads import all_threads
 from viewer.camera.view_camera import ViewCamera, first_camera, from_camera, to_camera
@@ -39,9 +40,6 @@ from . import dialogs
 from .application import Application, Requests, attempt, error_details, failure_line, log_error
 from .decal import Decal, is_decal
 from .main_view import MainView
-
-PICTURES = (".png", ".jpg", ".jpeg", ".webp")
-"""Endings of what `edit_picture` takes."""
 
 
 def look_through(main_view: MainView, path: Path) -> None:
@@ -268,7 +266,7 @@ class FileActions:
 
         def open_kind() -> None:
             file = unpack_bundle(path) if path.name.endswith(BUNDLE) else path
-            picture = file.suffix.lower() in PICTURES
+            picture = file.suffix.lower() in ENDINGS
             self._open(file, "picture" if picture else kind_of(file))
 
         attempt(self._app.main_view, open_kind)

@@ -118,7 +118,7 @@ def test_a_camera_model_may_be_missing_or_written_in_small_letters(model: str | 
     cameras = some_cameras()
     found = load_cameras(written(tmp_path / "t.json", nerfstudio(cameras, camera_model=model)))
     assert_same_views(found, cameras)
-    assert found[0].name == f"images/{cameras[0].name}.png"
+    assert found[0].name == f"{cameras[0].name}.png"
 
 
 def test_the_image_size_is_taken_from_the_picture_where_the_file_has_none(tmp_path: Path) -> None:

@@ -137,6 +137,23 @@ def test_a_folder_of_edited_views_comes_back_as_it_was_saved(tmp_path: Path) -> 
         assert torch.equal(editor.edit(view, 0.0), view.image)
 
 
+@pytest.mark.parametrize("kind", ["folder", "photographs"])
+def test_edited_views_are_found_in_subfolders_in_any_case_and_format(tmp_path: Path, kind: str) -> None:
+    case = small(count=3)
+    names = ("cam0/1", "1/IMG_2", "0_5/3")
+    files = ("cam0/1.TIF", "1/IMG_2.PNG", "0.5/3.bmp")
+    views = []
+    for view, name, file in zip(case.views[:3], names, files, strict=True):
+        (tmp_path / file).parent.mkdir()
+        Image.new("RGB", (view.camera.width, view.camera.height), "red").save(tmp_path / file)
+        views.append(replace(view, camera=replace(view.camera, name=name)))
+    editor = make_editor(EditorOptions(f"{kind}:{tmp_path}"), case.scene, case.region, views)
+    assert editor.stages == (1.0,)
+    for view in views:
+        red = torch.tensor([1.0, 0.0, 0.0]).expand_as(view.image)
+        assert torch.equal(editor.edit(view, 1.0), red)
+
+
 def test_a_larger_edited_view_is_scaled_and_transparency_is_white(tmp_path: Path) -> None:
     case = small(count=3)
     for view in case.views:

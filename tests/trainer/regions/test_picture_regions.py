@@ -18,6 +18,7 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.io.cameras import load_cameras, save_cameras
 from progdf.io.images import write_image
+from progdf.io.picture_files import PictureFolder
 from progdf.region import Region
 from progdf.scene.orbit_rig import orbit_rig
 from progdf.scene.regions import parse_region
@@ -144,10 +145,10 @@ def test_pictures_that_are_stored_turned_are_turned_and_photographs_of_known_cam
         read_masks(tmp_path, [camera], bent=True)
     black = torch.zeros(SIZE, SIZE, 3)
     view = View(camera, black, mask, black, (0, 0, SIZE, SIZE))
-    turned = FolderEditor({1.0: tmp_path}, (1.0,)).edit(view, 1.0)
+    turned = FolderEditor({1.0: PictureFolder(tmp_path)}, (1.0,)).edit(view, 1.0)
     assert torch.equal(turned[..., 0], mask)
     with pytest.raises(ProgdfError, match=r"stored turned \(EXIF orientation 3\)"):
-        FolderEditor({1.0: tmp_path}, (1.0,), bent=True).edit(view, 1.0)
+        FolderEditor({1.0: PictureFolder(tmp_path)}, (1.0,), bent=True).edit(view, 1.0)
 
 
 def test_masks_that_do_not_fit_are_one_line(masks: Path, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -141,6 +142,23 @@ def test_masks_drawn_over_the_views_are_the_region_that_train_takes(
     found = parse_region(f"masks:{out}", demo.gaussians, kinds=region_kinds(settings))
     both = torch.isin(found.members, bear_itself).sum()
     assert int(both) > 0.85 * max(len(found), len(bear_itself))
+
+
+def test_views_of_cameras_in_subfolders_are_written_into_subfolders(
+    demo: DemoScene, scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rig = orbit_rig(demo.gaussians, 4, 64, 64)
+    names = ("images/cam0/1.JPG", "images/cam1/1.JPG", "images/../../../cam0/2.JPG", "images/cam1/2.JPG")
+    save_cameras(tmp_path / "c.json", [replace(c, name=n) for c, n in zip(rig, names, strict=True)])
+    out = tmp_path / "v"
+    said(capsys, "views", scene, "--out", out, "--cameras", tmp_path / "c.json")
+    written = sorted(path.relative_to(out / "original").as_posix() for path in out.rglob("*.png"))
+    assert written == [f"images/cam{i}/{j}.png" for i in (0, 1) for j in (1, 2)]
+    for name in ("cam0", "cam1"):
+        (out / name).mkdir()
+        Image.new("L", (64, 64), 255).save(out / name / "1.JPG.png")
+    request = RegionRequest(RegionOptions("masks"), ViewOptions(), lambda: tmp_path)
+    assert len(parse_region(f"masks:{out}", demo.gaussians, kinds=region_kinds(request)))
 
 
 def test_views_overwrite_no_folder_of_views(
