@@ -104,7 +104,7 @@ def find_picture_camera(
 def _named_cameras(path: Path, cameras: Sequence[Camera]) -> list[Camera]:
     """Return the cameras named as a picture; of several those whose folders are the picture's too."""
     parts = [name_key(part) for part in split_path(path.absolute().as_posix())]
-    named = []
+    named: list[Camera] = []
     longest = 1
     for camera in cameras:
         own = [name_key(part) for part in split_path(camera.name)]

@@ -57,11 +57,13 @@ def split_path(name: str) -> tuple[str, ...]:
 
 def without_common_folder(names: Sequence[str]) -> list[str]:
     """Return paths relative to the folder that all of them share, as nerfstudio writes its renders."""
-    folders = [name.replace("\\", "/").split("/")[:-1] for name in names]
-    if not folders:
-        return []
-    shared = os.path.commonprefix(folders)
-    return ["/".join(name.replace("\\", "/").split("/")[len(shared) :]) for name in names]
+    parts = [name.replace("\\", "/").split("/") for name in names]
+    shared = 0
+    for level in zip(*(path[:-1] for path in parts), strict=False):
+        if len(set(level)) > 1:
+            break
+        shared += 1
+    return ["/".join(path[shared:]) for path in parts]
 
 
 def view_name(name: str) -> str | None:

@@ -72,7 +72,7 @@ def test_a_flat_picture_of_two_views_is_of_neither(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "name, expected",
+    ("name", "expected"),
     [
         ("cam0/1.jpg", "cam0/1"),
         ("./train/r_0", "train/r_0"),
