@@ -1,8 +1,8 @@
 """Names of views, and the search for their pictures in a folder.
 
-A view is named by the path of its photograph, without ending: `cam0/IMG_0001`. Its pictures may have any case
-and any ending in `ENDINGS`. They lie at the same path below the given folder, or further up where the rest of
-the path names one view only: `IMG_0001.JPG`. COLMAP's masks keep the photograph's ending: `IMG_0001.JPG.png`.
+A view is named by the path of its photograph, without ending: cam0/IMG. Its pictures may have any case and any
+ending in `ENDINGS`. They lie at the same path below the given folder, or without the first folders where the
+rest of the path names one view only: IMG.JPG. COLMAP's masks keep the photograph's ending: IMG.JPG.png.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _MAX_PATH = 120  # characters of a whole view name: Windows allows 260 with the 
 
 
 def without_ending(name: str) -> str:
-    """Return a file name without its picture ending; of `a.jpg.png`, which COLMAP names a mask, `a`."""
+    """Return a file name without its picture ending, also of a.jpg.png, as COLMAP names masks."""
     for _ in range(2):
         stem, dot, ending = name.rpartition(".")
         if not stem or f"{dot}{ending}".lower() not in ENDINGS:
