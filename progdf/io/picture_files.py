@@ -1,8 +1,8 @@
 """Names of views, and the search for their pictures in a folder.
 
 A view is named by the path of its photograph, without ending: cam0/IMG. Its pictures may have any case and
-any ending in `ENDINGS`. They lie at the same path below the given folder, or without the first folders where the
-rest of the path names one view only: IMG.JPG. COLMAP's masks keep the photograph's ending: IMG.JPG.png.
+any ending in `ENDINGS`. They lie at the same path below the given folder, or without the first folders where
+the rest of the path names one view only: IMG.JPG. COLMAP's masks keep the photograph's ending: IMG.JPG.png.
 """
 
 from __future__ import annotations
