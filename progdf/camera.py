@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import astuple, dataclass, replace
 
 import torch
@@ -97,15 +98,22 @@ NEAR = 0.01
 """Camera z at and below which nothing is drawn, world units; as `progdf.rasterize`."""
 
 
+RIGID_TOLERANCE = 4e-4
+"""Largest entry of R Rᵀ − I, R the rotation of a viewmat: the margin of `rasterize.cpu.forward.extents`."""
+
+_OBLIQUE_TOLERANCE = 1e-6  # of intrinsics that are not read, as a share of the focal length
+
+
 @dataclass(frozen=True)
 class Camera:
     """A pinhole camera.
 
     Raises:
-        ValueError: a shape is wrong, a size or focal length is not positive, a number is not finite.
+        ValueError: a shape is wrong, a size or focal length is not positive, a number is not finite, the
+            viewmat is no rotation and translation, or K has oblique axes.
     """
 
-    viewmat: Tensor  # world → camera. [4,4] float32, column vectors
+    viewmat: Tensor  # world → camera, a rotation and a translation. [4,4] float32, column vectors
     K: Tensor  # intrinsics in pixels, [[fx,0,cx],[0,fy,cy],[0,0,1]]. [3,3] float32
     width: int  # image width in pixels, ≥ 1
     height: int  # image height in pixels, ≥ 1
@@ -119,6 +127,7 @@ class Camera:
     sampling: float = 1.0
 
     def __post_init__(self) -> None:
+        """Check every field; the engines rely on it."""
         for name, side in (("viewmat", 4), ("K", 3)):
             shape = list(getattr(self, name).shape)
             if shape != [side, side]:
@@ -127,11 +136,12 @@ class Camera:
                 raise ValueError(f"{name} has a number that is not finite")
         if self.width < 1 or self.height < 1:
             raise ValueError(f"the image is {self.width}x{self.height} pixels; both must be at least 1")
-        fx, fy = self.K.detach().diagonal()[:2].tolist()
-        if fx <= 0 or fy <= 0:
-            raise ValueError(f"focal lengths {fx:g}, {fy:g} px; both must be positive")
         if not 1.0 <= self.sampling <= MOST_SAMPLING:
             raise ValueError(f"the sampling is {self.sampling:g}; it must be 1 to {MOST_SAMPLING:g}")
+        _check_intrinsics(self.K.tolist())
+        fault = rigid_fault(self.viewmat)
+        if fault:
+            raise ValueError(f"the viewmat {fault}; it must be a rotation and a translation")
 
     @property
     def c2w(self) -> Tensor:
@@ -152,6 +162,51 @@ class Camera:
         """The same view in another image size; the intrinsics scale with each axis."""
         scale = torch.tensor([[width / self.width], [height / self.height], [1.0]], dtype=self.K.dtype)
         return replace(self, K=self.K * scale, width=width, height=height)
+
+
+def rigid_fault(matrix: Tensor, tolerance: float = RIGID_TOLERANCE) -> str:
+    """Return how a matrix differs from a rotation and a translation, such as "scales by 1.7"; or "".
+
+    Args:
+        matrix: column vectors, every number finite. [4,4]
+        tolerance: largest accepted entry of R Rᵀ − I
+    """
+    rows = matrix.tolist()  # plain numbers: a window makes a camera for every frame
+    if rows[3] != [0.0, 0.0, 0.0, 1.0]:
+        return f"has the last row {rows[3]}"
+    x, y, z = (row[:3] for row in rows[:3])
+    square = [_dot(a, b) for a, b in ((x, x), (y, y), (z, z), (x, y), (y, z), (z, x))]
+    mean = sum(square[:3]) / 3
+    if _largest_error(square, 1.0) > tolerance:
+        if mean > 0 and _largest_error(square, mean) <= tolerance * mean:
+            return f"scales by {math.sqrt(mean):.4g}"
+        return f"stretches or shears (R Rᵀ is off by {_largest_error(square, 1.0):.2g})"
+    return "mirrors" if _dot(x, _cross(y, z)) < 0 else ""
+
+
+def _largest_error(square: Sequence[float], diagonal: float) -> float:
+    """Return the largest difference of R Rᵀ (three diagonal entries, three others) from a diagonal matrix."""
+    return max(*(abs(entry - diagonal) for entry in square[:3]), *(abs(entry) for entry in square[3:]))
+
+
+def _dot(a: Sequence[float], b: Sequence[float]) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _cross(a: Sequence[float], b: Sequence[float]) -> tuple[float, float, float]:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+def _check_intrinsics(K: list[list[float]]) -> None:
+    """Raise ValueError for focal lengths that are not positive, and for entries that no engine reads."""
+    fx, fy = K[0][0], K[1][1]
+    if fx <= 0 or fy <= 0:
+        raise ValueError(f"focal lengths {fx:g}, {fy:g} px; both must be positive")
+    limit = _OBLIQUE_TOLERANCE * max(fx, fy)
+    if abs(K[0][1]) > limit or abs(K[1][0]) > limit:
+        raise ValueError(f"K has oblique axes ({K[0][1]:g}, {K[1][0]:g}); pixels must be rectangles")
+    if K[2] != [0.0, 0.0, 1.0]:
+        raise ValueError(f"K has the last row {K[2]}; it must be [0, 0, 1]")
 
 
 def look_at(eye: Tensor, target: Tensor, up: Tensor) -> Tensor:

@@ -72,7 +72,8 @@ def test_a_picture_that_was_begun_is_the_one_that_is_drawn_unless_something_chan
             pass
         for shown in (begun, *views):
             np.testing.assert_array_equal(engine.image(shown, SIZE), afresh.image(shown, SIZE))
-            engine.prepare(shown, replace(camera, viewmat=camera.viewmat + 0.01))  # which nobody asks for
+            moved = camera.viewmat + 0.01 * torch.eye(4)[:, 2:3] @ torch.eye(4)[3:]  # never drawn
+            engine.prepare(shown, replace(camera, viewmat=moved))
 
 
 def test_a_random_session_of_sliders_gives_the_bits_of_whole_pictures(stack: Stack) -> None:
