@@ -1,4 +1,4 @@
-"""`progdf info FILE`: the contents of a scene, an edit, a session or a camera file."""
+"""`progdf info FILE`: the contents of a scene, an edit, a session, or a file or folder of cameras."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from progdf.gaussians import ZERO, Gaussians
 from progdf.gdf.file import read_gdf
 from progdf.io import session as session_file
 from progdf.io.atomic import read_file
-from progdf.io.cameras import load_cameras
+from progdf.io.cameras import holds_cameras, load_cameras, load_cameras_with_report
 from progdf.scene import UpChoice
 from progdf.scene.bounds import is_surrounding, scene_sphere
 from progdf.scene.strays import find_strays
@@ -29,6 +29,8 @@ from progdf.scene.up_axis import UpAxis, find_up
 from progdf.terminal import file_size, format_count, format_place, group_digits, print_line
 
 from .options import absent_option, parse_options
+
+_BOM = b"\xef\xbb\xbf"  # begins UTF-8 text that Windows programs write
 
 
 @dataclass(frozen=True)
@@ -110,9 +112,10 @@ def _box(corners: tuple[float, ...]) -> str:
 
 @dataclass(frozen=True)
 class InfoOptions:
-    """Show the contents of a scene, a .gdf edit, a session or a camera file. Nothing is written.
+    """Show the contents of a scene, a .gdf edit, a session or cameras. Nothing is written.
 
-    Of a scene, also what had to be repaired to load it, and its strays; of an edit, its error report.
+    Of a scene, also what had to be repaired to load it, and its strays; of an edit, its error report; of
+    cameras, the fields that are ignored.
     """
 
     file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
@@ -148,7 +151,9 @@ def kind_of(path: str | os.PathLike[str]) -> str:
         ProgdfError: it cannot be read, or is nothing we know.
     """
     path = scene_file(path)
-    start = read_file(path, 64)
+    if holds_cameras(path):
+        return "cameras"
+    start = read_file(path, 64).removeprefix(_BOM)
     if start[8:9] == b"{" and int.from_bytes(start[:8], "little") < 1 << 32:
         return "gdf"
     if scene_format(path) is not None:
@@ -236,11 +241,17 @@ def _describe_field(field: BakedField) -> str:
 
 
 def _camera_lines(path: Path) -> Iterator[str]:
-    cameras = load_cameras(path, ZERO)
-    yield f"{path.name}: {format_count(len(cameras), 'camera')}"
+    cameras, report = load_cameras_with_report(path, ZERO)
+    yield f"{path.resolve().name}: {format_count(len(cameras), 'camera')}"
+    yield from report.notes
     sizes = sorted({(camera.width, camera.height) for camera in cameras})
     more = f" and {len(sizes) - 4} other sizes" if len(sizes) > 4 else ""
     yield "images: " + ", ".join(f"{width}x{height}" for width, height in sizes[:4]) + more + " pixels"
+    bent = sum(camera.lens is not None for camera in cameras)
+    if bent:
+        yield f"lens: {bent} of {len(cameras)} cameras have one; photographs are straightened"
+    if report.ignored:
+        yield f"ignored: {', '.join(map(_short_text, report.ignored))}"
 
 
 _DESCRIBE = {

@@ -1,16 +1,20 @@
-"""Cameras of a COLMAP sparse model, binary or text, read with pycolmap (`pip install progdf-studio[colmap]`).
+"""Cameras of a COLMAP sparse model.
 
-Only the cameras are wanted. The 3D points, which are most of a model and are often left out when one is
-passed on, are not read: pycolmap gets the other files beside an empty list of points.
+The text form is read here, as its image names may contain blanks, which pycolmap cuts off. The binary form
+is read by pycolmap (`pip install progdf-studio[colmap]`). Only cameras are read: the 3D points, which are
+most of a model and are often left out when one is passed on, are not. pycolmap gets an empty list of them.
 """
 
 from __future__ import annotations
 
 import importlib.util
+import math
+import re
 import shutil
 import subprocess
 import tempfile
-from dataclasses import replace
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import msgspec
@@ -18,131 +22,344 @@ import torch
 
 from progdf.camera import Camera, Lens
 from progdf.errors import ProgdfError
+from progdf.quaternions import rotation_matrices
+from progdf.terminal import format_count
 
 from . import native_child
-from .atomic import open_error
+from .atomic import open_error, read_file
+from .camera_json import make_camera, make_intrinsics, make_rigid, portable_name
+from .file_rules import damage_error, unsupported_error
 from .json_values import convert_json, decode_json
 
 _NEEDED = ("cameras", "images")
 _OPTIONAL = ("rigs", "frames")
-"""Written since COLMAP 3.12; older models have a rig of one camera per image."""
+"""Binary files since COLMAP 3.12; without them each image has a rig of its own. images.txt has all poses."""
 
-_PLACES = ("", "sparse/0", "sparse", "0", "colmap/sparse/0")
-"""Where a model is looked for in the folder that is named."""
+_PLACES = ("sparse", "", "colmap/sparse")
+"""Folders in a project that hold a model, or several in subfolders 0, 1, …"""
 
-_LENSES = {
-    "SIMPLE_PINHOLE": (),
-    "PINHOLE": (),
-    "SIMPLE_RADIAL": ("k1",),
-    "RADIAL": ("k1", "k2"),
-    "OPENCV": ("k1", "k2", "p1", "p2"),
-    "FULL_OPENCV": ("k1", "k2", "p1", "p2", "k3"),
+_PARAMETERS = {
+    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
+    "PINHOLE": ("fx", "fy", "cx", "cy"),
+    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
+    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
+    "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
+    "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
 }
-"""Camera models that are a pinhole behind a lens → what their parameters after the principal point mean."""
+"""Camera models that are a pinhole behind a lens → their parameters."""
+
+_LENS = ("k1", "k2", "p1", "p2", "k3")
+_UNKNOWN_LENS = ("k4", "k5", "k6")
+
+_REMEDY = "run `colmap image_undistorter` and give its sparse folder"
+
+_IMAGE_FIELDS = 10  # IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME; the name is the rest of the line
+_CAMERA_FIELDS = 4  # CAMERA_ID MODEL WIDTH HEIGHT, then the parameters
+_MAX_SIDE = 1_000_000  # pixels
+_MAX_NORM_ERROR = 1e-2  # of a quaternion's squared length
+_IMAGE_COUNT = re.compile(rb"#\s*Number of images:\s*(\d{1,18})\b")
+_NUMERIC = b"0123456789+-.eE \t"
+
+
+@dataclass(frozen=True)
+class ColmapModel:
+    """A sparse model in one of its two forms."""
+
+    folder: Path
+    suffix: str  # .bin or .txt
+    note: str = ""  # one line if it was chosen among several
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """All files that are read."""
+        names = (*_NEEDED, *_OPTIONAL) if self.suffix == ".bin" else _NEEDED
+        paths = [self.folder / f"{name}{self.suffix}" for name in names]
+        return tuple(path for path in paths if path.stem in _NEEDED or path.is_file())
 
 
 class _Image(msgspec.Struct):
-    """A registered image: world → camera, OpenCV axes, pixel centers at +0.5, as ours."""
+    """A registered image."""
 
     name: str
-    pose: list[list[float]]
-    K: list[list[float]]
+    pose: list[list[float]]  # world → camera, OpenCV axes, pixel centers at +0.5, as ours. [3,4]
     width: int
     height: int
     model: str
     params: list[float]
 
 
-def find_model(folder: Path) -> Path | None:
-    """The sparse model in a folder: itself, sparse/0, sparse, 0 or colmap/sparse/0; None where none is."""
-    for name in _PLACES:
-        if _suffix(folder / name):
-            return folder / name
-    return None
+@dataclass(frozen=True)
+class _TextCamera:
+    """A line of cameras.txt."""
+
+    model: str
+    width: int
+    height: int
+    params: list[float]
 
 
-def load_model(model: Path) -> list[Camera]:
-    """The registered images of a sparse model as float64 cameras of the world, in the order of their names.
+def open_model(folder: Path, suffix: str = "") -> ColmapModel | None:
+    """Return the model that lies in a folder itself, binary if both forms are there; None without one.
 
     Args:
-        model: the folder with cameras.bin and images.bin, or .txt
-
-    Raises:
-        ProgdfError: pycolmap is not installed, a file is broken, a camera is no pinhole behind a lens that
-            we know, or no image is registered.
+        suffix: .bin or .txt to look for one form alone
     """
-    if importlib.util.find_spec("pycolmap") is None:
-        raise ProgdfError(
-            f"{model} is a COLMAP model, which needs pycolmap; pip install 'progdf-studio[colmap]'"
-        )
-    suffix = _suffix(model)
-    with tempfile.TemporaryDirectory() as folder:
-        try:
-            for name in (*_NEEDED, *_OPTIONAL):
-                source = model / f"{name}{suffix}"
-                if name in _NEEDED or source.is_file():
-                    shutil.copyfile(source, Path(folder, source.name))
-        except OSError as error:
-            raise open_error(error.filename or model, error) from None
-        Path(folder, f"points3D{suffix}").write_bytes(bytes(8) if suffix == ".bin" else b"")
-        images = _images(Path(folder))
-    if images is None:
-        raise ProgdfError(
-            f"{model} is a broken COLMAP model; export cameras{suffix} and images{suffix} again"
-        )
-    if not images:
-        raise ProgdfError(f"{model} has no registered image; it needs at least one")
-    return [_camera(model, image) for image in sorted(images, key=lambda image: image.name)]
-
-
-def _images(folder: Path) -> list[_Image] | None:
-    """What pycolmap reads, in a process of its own (see `native_child`); None: nothing that it can."""
-    size = sum(file.stat().st_size for file in folder.iterdir())
-    memory, seconds = (1 << 30) + 64 * size, 10 + int(2e-6 * size)
-    try:
-        ended = native_child.run((memory, 0, seconds), 6 * seconds, "cameras", str(folder))
-        return None if ended.returncode else convert_json(decode_json(ended.stdout), list[_Image])
-    except (subprocess.TimeoutExpired, ValueError):
-        return None
-
-
-def _suffix(model: Path) -> str | None:
-    for suffix in (".bin", ".txt"):
-        if all((model / f"{name}{suffix}").is_file() for name in _NEEDED):
-            return suffix
+    for kind in (suffix,) if suffix else (".bin", ".txt"):
+        if all((folder / f"{name}{kind}").is_file() for name in _NEEDED):
+            return ColmapModel(folder, kind)
     return None
 
 
-def _camera(model: Path, image: _Image) -> Camera:
-    where = f"image {image.name} of {model}"
-    lens = _lens(where, image)
-    viewmat = torch.eye(4, dtype=torch.float64)
+def find_model(folder: Path) -> ColmapModel | None:
+    """Return the model of a folder: itself, or the largest in sparse, in the folder or in colmap/sparse."""
+    model = open_model(folder)
+    if model is not None:
+        return _with_larger_sibling(model)
+    for name in _PLACES:
+        models = _models_in(folder / name)
+        if models:
+            return _choose_largest(models)
+    return None
+
+
+def _models_in(folder: Path) -> list[ColmapModel]:
+    """Return the models in subfolders 0, 1, …, or else the one in the folder itself."""
     try:
-        viewmat[:3] = torch.tensor(image.pose, dtype=torch.float64)
-        K = torch.tensor(image.K, dtype=torch.float64)
-        camera = Camera(viewmat, K.float(), image.width, image.height, image.name)
-    except ValueError as error:
-        raise ProgdfError(f"{where} is broken: {error}") from None
-    rotation = viewmat[:3, :3]
-    if not float((rotation @ rotation.T - torch.eye(3, dtype=torch.float64)).abs().max()) < 1e-3:
-        raise ProgdfError(f"{where} has an invalid rotation; export the model again")
-    return replace(camera, lens=lens)
+        numbers = sorted(
+            (int(path.name), path.name) for path in folder.iterdir() if re.fullmatch(r"[0-9]{1,9}", path.name)
+        )
+    except OSError:
+        return []
+    found = [open_model(folder / name) for _, name in numbers]
+    models = [model for model in found if model is not None]
+    own = open_model(folder)
+    return models or ([own] if own is not None else [])
 
 
-def _lens(where: str, image: _Image) -> Lens | None:
-    kind = image.model
-    if kind not in _LENSES:
+def _with_larger_sibling(model: ColmapModel) -> ColmapModel:
+    """Return a model that was named by its number, with a note if another one beside it has more images."""
+    if re.fullmatch(r"[0-9]{1,9}", model.folder.name) is None:
+        return model
+    count = _count_images(model)
+    larger = [other for other in _models_in(model.folder.parent) if _count_images(other) > count]
+    if not larger:
+        return model
+    best = max(larger, key=_count_images)
+    images = format_count(count, "image")
+    note = f"{model.folder} has {images}; {best.folder} beside it has {_count_images(best)}"
+    return replace(model, note=note)
+
+
+def _choose_largest(models: list[ColmapModel]) -> ColmapModel:
+    """Return the model with the most images, the first of equal ones."""
+    if len(models) == 1:
+        return models[0]
+    counts = [_count_images(model) for model in models]
+    largest = counts.index(max(counts))
+    others = [
+        f"{model.folder.name} has {count}"
+        for i, (model, count) in enumerate(zip(models, counts, strict=True))
+        if i != largest
+    ]
+    chosen = models[largest]
+    note = (
+        f"{chosen.folder} is used, the largest of {len(models)} COLMAP models: "
+        f"{format_count(counts[largest], 'image')}, "
+        f"{', '.join(others)}"
+    )
+    return replace(chosen, note=note)
+
+
+def _count_images(model: ColmapModel) -> int:
+    """Return how many images a model states, without a check of them."""
+    if model.suffix == ".bin":
+        return int.from_bytes(read_file(model.folder / "images.bin", 8), "little")
+    return sum(1 for _ in _image_lines(read_file(model.folder / "images.txt")))
+
+
+def load_model(model: ColmapModel) -> list[Camera]:
+    """Return the registered images of a model as float64 cameras of the world, in the order of their names.
+
+    Raises:
+        ProgdfError: a file is damaged, a camera is no pinhole behind a lens that we know, no image is
+            registered, or pycolmap, which the binary form needs, is not installed.
+    """
+    images = _read_binary(model) if model.suffix == ".bin" else _read_text(model)
+    if not images:
+        raise ProgdfError(f"{model.folder} has no registered image; it needs at least one")
+    return [_make_camera(model.folder, image) for image in sorted(images, key=lambda image: image.name)]
+
+
+def _make_camera(folder: Path, image: _Image) -> Camera:
+    where = f"image {image.name} of {folder}"
+    names = _PARAMETERS.get(image.model)
+    if names is None:
+        raise unsupported_error(where, f"the camera model {image.model}", _REMEDY)
+    if len(image.params) != len(names):
+        numbers = f"{len(image.params)} parameters of a {image.model} camera, which has {len(names)}"
+        raise ProgdfError(f"{where} has {numbers}; export the model again")
+    if not (1 <= image.width <= _MAX_SIDE and 1 <= image.height <= _MAX_SIDE):
+        raise ProgdfError(f"{where} has {image.width}x{image.height} pixels; export the model again")
+    values = dict(zip(names, image.params, strict=True))
+    for name in _UNKNOWN_LENS:
+        if values.get(name):
+            raise unsupported_error(where, f"{name} of the camera model {image.model}", _REMEDY)
+    fx = values.get("fx", values.get("f", 0.0))
+    K = make_intrinsics(fx, values.get("fy", fx), values["cx"], values["cy"])
+    lens = Lens(**{name: values[name] for name in _LENS if name in values})
+    viewmat = torch.eye(4, dtype=torch.float64)
+    viewmat[:3] = torch.tensor(image.pose, dtype=torch.float64)
+    if not bool(viewmat.isfinite().all()):
+        raise ProgdfError(f"{where} has a pose that is not finite; export the model again")
+    viewmat = make_rigid(where, viewmat)
+    return make_camera(
+        where, viewmat, K, (image.width, image.height), portable_name(image.name), lens or None
+    )
+
+
+def _read_binary(model: ColmapModel) -> list[_Image]:
+    """Return the images as pycolmap reads them, in a process of its own (see `native_child`)."""
+    if importlib.util.find_spec("pycolmap") is None:
         raise ProgdfError(
-            f"{where} has the camera model {kind}; only pinhole cameras can be used: "
-            "run colmap image_undistorter and give its sparse folder"
+            f"{model.folder} is a binary COLMAP model, which needs pycolmap; pip install "
+            "'progdf-studio[colmap]', or run `colmap model_converter --output_type TXT`"
         )
-    first = 3 if kind.startswith("SIMPLE") or kind == "RADIAL" else 4
-    numbers = [float(number) for number in image.params[first:]]
-    names = _LENSES[kind]
-    if any(numbers[len(names) :]):
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            for source in model.files:
+                shutil.copyfile(source, Path(folder, source.name))
+        except OSError as error:
+            raise open_error(error.filename or model.folder, error) from None
+        Path(folder, "points3D.bin").write_bytes(bytes(8))
+        size = sum(file.stat().st_size for file in Path(folder).iterdir())
+        memory = (1 << 30) + 64 * size
+        seconds = 10 + int(2e-6 * size)
+        try:
+            ended = native_child.run((memory, 0, seconds), 6 * seconds, "cameras", folder)
+            if ended.returncode == 0:
+                return convert_json(decode_json(ended.stdout), list[_Image])
+        except (subprocess.TimeoutExpired, ValueError):
+            pass
+    raise ProgdfError(
+        f"pycolmap cannot read {model.folder / 'cameras.bin'} and images.bin; copy or export them again, "
+        "or run `colmap model_converter --output_type TXT`"
+    )
+
+
+def _read_text(model: ColmapModel) -> list[_Image]:
+    """Return the images of cameras.txt and images.txt."""
+    cameras = _read_text_cameras(model.folder / "cameras.txt")
+    path = model.folder / "images.txt"
+    content = read_file(path)
+    images: dict[int, _Image] = {}
+    for number, line in _image_lines(content):
+        fields = _decode(path, number, line).split(None, _IMAGE_FIELDS - 1)
+        if len(fields) < _IMAGE_FIELDS:
+            raise damage_error(path, f"line {number} has {len(fields)} of {_IMAGE_FIELDS} fields of an image")
+        image_id = _whole(path, number, fields[0])
+        camera_id = _whole(path, number, fields[8])
+        if image_id in images:
+            raise damage_error(path, f"line {number} repeats the image {image_id}")
+        if camera_id not in cameras:
+            raise damage_error(
+                path, f"line {number} names the camera {camera_id}, which is not in cameras.txt"
+            )
+        camera = cameras[camera_id]
+        pose = _pose(path, number, [_finite(path, number, field) for field in fields[1:8]])
+        name = fields[9].rstrip()
+        images[image_id] = _Image(name, pose, camera.width, camera.height, camera.model, camera.params)
+    _check_header(path, content, len(images))
+    return list(images.values())
+
+
+def _read_text_cameras(path: Path) -> dict[int, _TextCamera]:
+    cameras = {}
+    for number, line in enumerate(_lines(read_file(path)), 1):
+        if not line.strip() or line.lstrip().startswith(b"#"):
+            continue
+        fields = _decode(path, number, line).split()
+        if len(fields) < _CAMERA_FIELDS:
+            raise damage_error(
+                path, f"line {number} has {len(fields)} of {_CAMERA_FIELDS} fields of a camera"
+            )
+        camera_id = _whole(path, number, fields[0])
+        if camera_id in cameras:
+            raise damage_error(path, f"line {number} repeats the camera {camera_id}")
+        width = _whole(path, number, fields[2])
+        height = _whole(path, number, fields[3])
+        params = [_finite(path, number, field) for field in fields[_CAMERA_FIELDS:]]
+        cameras[camera_id] = _TextCamera(fields[1], width, height, params)
+    return cameras
+
+
+def _image_lines(content: bytes) -> Iterator[tuple[int, bytes]]:
+    """Yield line number and line of every image in images.txt.
+
+    A line of 2D points follows each image; it may be blank, and some writers leave it out.
+    """
+    points_may_follow = False
+    for number, line in enumerate(_lines(content), 1):
+        bare = line.strip()
+        if bare.startswith(b"#"):
+            continue
+        if not bare or (points_may_follow and _is_points(bare)):
+            points_may_follow = False
+            continue
+        yield number, line
+        points_may_follow = True
+
+
+def _lines(content: bytes) -> list[bytes]:
+    return content.removeprefix(b"\xef\xbb\xbf").splitlines()
+
+
+def _is_points(line: bytes) -> bool:
+    """Return whether a line is a list of 2D points, X Y POINT3D_ID each: no image line has such a form."""
+    return not line.translate(None, _NUMERIC) and len(line.split()) % 3 == 0
+
+
+def _check_header(path: Path, content: bytes, count: int) -> None:
+    """Raise ProgdfError if the header counts more images than the file lists.
+
+    A header that counts fewer is a template that the writer copied.
+    """
+    stated = _IMAGE_COUNT.search(content)
+    if stated is not None and int(stated[1]) > count:
         raise ProgdfError(
-            f"{where} has a lens with k4, k5 or k6, which cannot be undistorted here; "
-            "run colmap image_undistorter and give its sparse folder"
+            f"{path} lists {count} of the {int(stated[1])} images that its header counts; export it again, "
+            "or correct the header"
         )
-    lens = Lens(**dict(zip(names, numbers, strict=False)))
-    return lens or None
+
+
+def _decode(path: Path, number: int, line: bytes) -> str:
+    try:
+        return line.decode("utf-8")
+    except UnicodeDecodeError:
+        raise unsupported_error(
+            path, f"a text encoding other than UTF-8 (line {number})", "save it as UTF-8"
+        ) from None
+
+
+def _whole(path: Path, number: int, field: str) -> int:
+    if re.fullmatch(r"[0-9]{1,18}", field, re.ASCII) is None:
+        raise damage_error(path, f"line {number} has {field!r:.40} in place of a whole number")
+    return int(field)
+
+
+def _finite(path: Path, number: int, field: str) -> float:
+    try:
+        value = float(field)
+    except ValueError:
+        value = math.nan
+    if not abs(value) < 3e38:  # finite in float32
+        raise damage_error(path, f"line {number} has {field!r:.40} in place of a number")
+    return value
+
+
+def _pose(path: Path, number: int, values: list[float]) -> list[list[float]]:
+    """Return world → camera from a quaternion wxyz and a translation. [7] -> [3,4]"""
+    quat = torch.tensor([values[:4]], dtype=torch.float64)
+    if not abs(float(quat.square().sum()) - 1.0) < _MAX_NORM_ERROR:
+        raise damage_error(path, f"line {number} has a quaternion of length {float(quat.norm()):.4g}, not 1")
+    rotation = rotation_matrices(quat / quat.norm())[0].tolist()
+    return [[*row, shift] for row, shift in zip(rotation, values[4:], strict=True)]

@@ -62,7 +62,6 @@ def _cameras(folder: str) -> None:
         {
             "name": image.name,
             "pose": image.cam_from_world().matrix().tolist(),
-            "K": image.camera.calibration_matrix().tolist(),
             "width": image.camera.width,
             "height": image.camera.height,
             "model": image.camera.model.name,

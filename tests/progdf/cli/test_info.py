@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +17,8 @@ from progdf.gaussians import Gaussians
 from progdf.io.cameras import save_cameras
 from progdf.scene.orbit_rig import orbit_rig
 from progdf.terminal import format_count
+from tests.helpers.camera_tables import nerfstudio, some_cameras
+from tests.helpers.colmap_text import write_text_model
 from tests.helpers.scenes import random_gaussians
 from tests.helpers.stacks import bear_stack
 
@@ -137,6 +140,29 @@ def test_info_of_an_edit_tells_its_scene_region_field_and_errors(
     assert any(line.endswith(", 5 knots; ends and bases: sh0 float32 + 1") for line in lines)
     assert {"option: steps 600", "option: slider even"} <= set(lines)
     assert {"report: field.psnr_worst 46.91", "report: edit.clip_direction not measured"} <= set(lines)
+
+
+def test_info_lists_the_ignored_fields_of_cameras(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    content = nerfstudio(some_cameras(), aabb_scale=16, k1=0.1)
+    content["frames"][1] |= {"sharpness": 20.5, "k1": 0.0}
+    path = tmp_path / "transforms.json"
+    path.write_bytes(b"\xef\xbb\xbf" + json.dumps(content).encode())  # as Windows programs begin a text
+    assert lines_of(capsys, "info", str(path)) == [
+        "transforms.json: 4 cameras",
+        "images: 320x200 pixels",
+        "lens: 3 of 4 cameras have one; photographs are straightened",
+        "ignored: aabb_scale, sharpness",
+    ]
+
+
+def test_info_shows_a_folder_of_cameras(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_text_model(tmp_path / "sparse" / "0", ["a.jpg"])
+    large = write_text_model(tmp_path / "sparse" / "1", ["a.jpg", "b c.jpg"])
+    note = f"{large} is used, the largest of 2 COLMAP models: 2 images, 0 has 1"
+    expected = [f"{tmp_path.name}: 2 cameras", note, "images: 640x480 pixels"]
+    assert lines_of(capsys, "info", str(tmp_path)) == expected
+    assert lines_of(capsys, "info", str(large / "images.txt"))[0] == "images.txt: 2 cameras"
+    assert "is a folder" in error_of(capsys, "info", str(tmp_path / "sparse" / ".." / ".."))
 
 
 def test_cameras_and_up_are_for_scenes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -15,7 +15,13 @@ from PIL import Image
 import progdf
 from progdf.camera import Camera, Lens
 from progdf.errors import ProgdfError
-from progdf.io.cameras import kind_of_cameras, load_cameras, read_camera, save_cameras
+from progdf.io.cameras import (
+    kind_of_cameras,
+    load_cameras,
+    load_cameras_with_report,
+    read_camera,
+    save_cameras,
+)
 from tests.helpers.camera_tables import inria, nerfstudio, some_cameras, written
 from tests.helpers.full_disk import files_up_to
 from tests.helpers.refused import refusal
@@ -71,6 +77,33 @@ def test_inria_focal_lengths_belong_to_their_axes(tmp_path: Path) -> None:
     assert K.tolist() == [[200, 0, 160], [0, 300, 100], [0, 0, 1]]
 
 
+def test_inria_principal_point_and_lens_are_used(tmp_path: Path) -> None:
+    entries = inria(some_cameras())
+    entries[0] |= {
+        "cx": 100.0,
+        "cy": 120.0,
+        "k1": 0.1,
+        "camera_model": "OPENCV",
+        "scale": 1.0,
+        "trans": [0, 0],
+    }
+    entries[1] |= {"cx": 90.5, "img_name": "left\\b"}
+    first, second, *_ = load_cameras(written(tmp_path / "cameras.json", entries))
+    assert first.K[:2, 2].tolist() == [100.0, 120.0]
+    assert first.lens == Lens(k1=0.1)
+    assert second.K[:2, 2].tolist() == [90.5, 100.0]
+    assert (second.name, second.lens) == ("left/b", None)
+
+
+def test_inria_fields_of_view_stand_in_for_focal_lengths(tmp_path: Path) -> None:
+    cameras = some_cameras()
+    entries = inria(cameras)
+    for entry in entries:
+        entry["FoVx"] = 2 * math.atan(160 / entry.pop("fx"))
+        entry["FoVy"] = 2 * math.atan(100 / entry.pop("fy"))
+    assert_same_views(load_cameras(written(tmp_path / "cameras.json", entries)), cameras)
+
+
 def test_nerfstudio_transforms_are_read(tmp_path: Path) -> None:
     cameras = some_cameras()
     assert_same_views(load_cameras(written(tmp_path / "t.json", nerfstudio(cameras))), cameras)
@@ -113,6 +146,46 @@ def test_what_is_said_of_one_axis_alone_holds_for_both(
     assert (float(K[0, 0]), float(K[1, 1])) == pytest.approx(focal, rel=1e-6)
 
 
+def test_a_frames_own_angle_goes_before_the_files_length(tmp_path: Path) -> None:
+    content = nerfstudio(some_cameras())
+    content["frames"][1]["camera_angle_x"] = 2 * math.atan(160 / 123)
+    cameras = load_cameras(written(tmp_path / "t.json", content))
+    assert cameras[1].K.diagonal().tolist() == pytest.approx([123.0, 123.0, 1.0])
+    assert_same_views(cameras[:1], some_cameras()[:1])
+
+
+def test_fields_of_view_in_degrees_are_read(tmp_path: Path) -> None:
+    angle = math.degrees(2 * math.atan(160 / 250))
+    content = nerfstudio(some_cameras(), fl_x=None, fl_y=None, x_fov=angle)
+    K = load_cameras(written(tmp_path / "t.json", content))[0].K
+    assert (float(K[0, 0]), float(K[1, 1])) == pytest.approx((250, 250), rel=1e-6)
+
+
+def test_lens_fields_that_are_switched_off_change_nothing(tmp_path: Path) -> None:
+    off = {"is_fisheye": False, "k4": 0.0, "rolling_shutter": [0, 0, 0], "camera_type": "perspective"}
+    cameras = some_cameras()
+    assert_same_views(load_cameras(written(tmp_path / "t.json", nerfstudio(cameras, **off))), cameras)
+
+
+def test_ignored_fields_are_reported_once_in_order(tmp_path: Path) -> None:
+    content = nerfstudio(some_cameras(), aabb_scale=4, applied_scale=0.5)
+    content["frames"][0]["sharpness"] = 30.0
+    content["frames"][1]["mask_path"] = "masks/a.png"
+    _, report = load_cameras_with_report(written(tmp_path / "t.json", content))
+    assert set(report.ignored) == {"aabb_scale", "applied_scale", "sharpness", "mask_path"}
+    assert report.ignored[:3] == ("aabb_scale", "applied_scale", "sharpness")
+
+
+def test_rounded_matrices_are_made_rotations(tmp_path: Path) -> None:
+    content = nerfstudio(some_cameras())
+    for frame in content["frames"]:
+        frame["transform_matrix"] = [[round(x, 3) for x in row] for row in frame["transform_matrix"]]
+    for camera in load_cameras(written(tmp_path / "t.json", content)):
+        rotation = camera.viewmat[:3, :3].double()
+        error = (rotation @ rotation.T - torch.eye(3, dtype=torch.float64)).abs().max()
+        assert float(error) < 1e-6
+
+
 @pytest.mark.parametrize("model", [None, "opencv", "Simple_Pinhole"])
 def test_a_camera_model_may_be_missing_or_written_in_small_letters(model: str | None, tmp_path: Path) -> None:
     cameras = some_cameras()
@@ -130,6 +203,18 @@ def test_the_image_size_is_taken_from_the_picture_where_the_file_has_none(tmp_pa
         Image.new("RGB", (320, 200)).save(tmp_path / "images" / f"{camera.name}.png")
         frame["file_path"] = f"./images/{camera.name}"  # synthetic NeRF scenes leave the suffix off
     assert_same_views(load_cameras(written(tmp_path / "t.json", content)), cameras)
+
+
+def test_windows_paths_name_the_same_picture(tmp_path: Path) -> None:
+    cameras = some_cameras()
+    content = nerfstudio(cameras, w=None, h=None)
+    (tmp_path / "images").mkdir()
+    for camera, frame in zip(cameras, content["frames"], strict=True):
+        Image.new("RGB", (320, 200)).save(tmp_path / "images" / f"{camera.name}.png")
+        frame["file_path"] = f"images\\{camera.name}.png"
+    found = load_cameras(written(tmp_path / "t.json", content))
+    assert_same_views(found, cameras)
+    assert [camera.name for camera in found] == [f"{camera.name}.png" for camera in cameras]
 
 
 def test_distortion_is_kept_as_the_cameras_lens_and_not_ignored(tmp_path: Path) -> None:

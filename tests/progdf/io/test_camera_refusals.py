@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
+from torch import Tensor
 
 from progdf.errors import ProgdfError
 from progdf.io.cameras import load_cameras
@@ -38,6 +40,95 @@ def test_distortion_of_a_kind_that_programs_read_differently_is_refused(tmp_path
         assert "undistort" in refusal(
             load_cameras, written(tmp_path / "t.json", nerfstudio(some_cameras(), **{key: 0.01}))
         )
+
+
+LENSES = {  # as nerfstudio, instant-ngp and others write them
+    "is_fisheye": True,
+    "camera_model": "OPENCV_FISHEYE",
+    "camera_type": "fisheye",
+    "ftheta_p0": 0.1,
+    "latlong": True,
+    "equirectangular": True,
+    "orthographic": True,
+    "rolling_shutter": [0.0, 0.0, 0.03, 0.0],
+    "transform_matrix_start": [[1, 0, 0, 0]],
+    "distortion_params": [0.1, 0, 0, 0, 0, 0],
+    "xi": 0.9,
+    "b1": 0.3,
+    "intrinsic_matrix": [[1]],
+    "from_na": True,
+}
+
+
+@pytest.mark.parametrize("field", LENSES)
+@pytest.mark.parametrize("place", ["file", "frame"])
+def test_other_lenses_are_refused_by_name(tmp_path: Path, field: str, place: str) -> None:
+    content = nerfstudio(some_cameras())
+    (content if place == "file" else content["frames"][2])[field] = LENSES[field]
+    message = refusal(load_cameras, written(tmp_path / "t.json", content))
+    assert message.startswith("frame 0 of " if place == "file" else "frame 2 of ")
+    assert (LENSES[field] if field.startswith("camera_") else f"'{field}'") in message
+    assert "which is not supported; " in message
+
+
+@pytest.mark.parametrize("model", ["EQUIRECTANGULAR", "ORTHOPHOTO", "VR180_L", "FISHEYE624", "FOV", 7])
+def test_other_camera_models_are_refused_by_name(tmp_path: Path, model: object) -> None:
+    path = written(tmp_path / "t.json", nerfstudio(some_cameras(), camera_model=model))
+    assert f"the camera model {model}, which is not supported" in refusal(load_cameras, path)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("is_fisheye", True), ("scale", 2.0), ("trans", [0.0, 0.0, 1.0]), ("k4", 0.1), ("skew", 0.2)],
+)
+def test_inria_fields_that_change_the_camera_are_refused(tmp_path: Path, field: str, value: object) -> None:
+    entries = inria(some_cameras())
+    entries[1][field] = value
+    message = refusal(load_cameras, written(tmp_path / "cameras.json", entries))
+    assert message.startswith("camera 1 of ")
+    assert f"'{field}'" in message
+
+
+def test_an_inria_camera_without_focal_length_is_refused(tmp_path: Path) -> None:
+    entries = inria(some_cameras())
+    for key in ("fx", "fy"):
+        del entries[0][key]
+    assert "no focal length" in refusal(load_cameras, written(tmp_path / "cameras.json", entries))
+
+
+def scaled(factor: float) -> Tensor:
+    return torch.diag(torch.tensor([factor, factor, factor, 1.0]))
+
+
+SHEAR = torch.eye(4) + 0.1 * torch.eye(4)[:, :1] @ torch.eye(4)[1:2]
+STRANGE = {  # what a matrix in front of a viewmat does, and the fault that is named
+    "scaled": (scaled(1.7), "scales by 1.7"),
+    "scaled a little": (scaled(1.001), "scales by 1.001"),
+    "mirrored": (torch.diag(torch.tensor([-1.0, 1.0, 1.0, 1.0])), "mirrors"),
+    "turned inside out": (scaled(-1.0), "mirrors"),
+    "stretched": (torch.diag(torch.tensor([1.0, 1.7, 1.0, 1.0])), "stretches or shears"),
+    "sheared": (SHEAR, "stretches or shears"),
+    "collapsed": (scaled(0.0), "stretches or shears"),
+    "scaled by the last row": (torch.diag(torch.tensor([1.0, 1.0, 1.0, 1.7])), "has the last row"),
+}
+
+
+@pytest.mark.parametrize("case", STRANGE)
+def test_a_viewmat_must_be_a_rotation_and_a_translation(case: str) -> None:
+    matrix, fault = STRANGE[case]
+    camera = some_cameras()[0]
+    with pytest.raises(ValueError, match=rf"the viewmat {fault}.*; it must be a rotation and a translation"):
+        replace(camera, viewmat=matrix @ camera.viewmat)
+
+
+def test_intrinsics_must_have_no_entries_that_nothing_reads() -> None:
+    camera = some_cameras()[0]
+    oblique = camera.K.clone()
+    oblique[0, 1] = 3.0
+    with pytest.raises(ValueError, match="K has oblique axes"):
+        replace(camera, K=oblique)
+    with pytest.raises(ValueError, match="K has the last row"):
+        replace(camera, K=2.0 * camera.K)
 
 
 Change = Callable[[dict[str, Any]], object]
