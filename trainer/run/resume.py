@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +16,8 @@ import numba
 import torch
 
 from progdf.errors import ProgdfError
-from progdf.io.atomic import disk_full
+from progdf.io.atomic import check_regular, disk_full, open_error
+from progdf.io.cameras import camera_files
 from progdf.io.json_values import convert_json, decode_json, plain
 from progdf.region import Region
 from trainer.editors.pictures import picture_paths, strengths_of
@@ -28,6 +29,7 @@ _VERSION = 7  # of how a run goes on from what it has saved; 7: few pictures cho
 _SWITCHES = (
     "NUMBA_CPU_FEATURES", "MKL_ENABLE_INSTRUCTIONS", "MKL_CBWR", "OPENBLAS_CORETYPE", "ONEDNN_MAX_CPU_ISA",
 )  # fmt: skip
+_SOG_SUFFIXES = (".json", ".webp")  # of the files of an unpacked .sog
 
 REGION = "region"
 """Of the saved state: members and score."""
@@ -85,13 +87,11 @@ def decide_resume(folder: RunFolder, options: TrainOptions, region: Region, coun
             raise ProgdfError(f"another version of progdf began {folder.root}; train again in another folder")
         remedy = "give --resume the run's own options, or train again in another folder"
         _check_plan(folder, saved.plan, plan, remedy)
-        for what in ("scene", "cameras"):
-            if getattr(saved, what) != getattr(now, what):
-                raise ProgdfError(
-                    f"the {what} has changed since {folder.root} was started; restore it and continue "
-                    "with --resume, or train again in another folder"
-                )
         remedy = "restore it and continue with --resume, or train again in another folder"
+        if saved.scene != now.scene:
+            raise ProgdfError(f"the scene has changed since {folder.root} was started; {remedy}")
+        if saved.cameras != now.cameras:
+            raise ProgdfError(f"{plan.views.cameras} has changed since {folder.root} was started; {remedy}")
         _check_pictures(folder, saved.pictures, now.pictures, remedy)
         with folder.state.restore_part(REGION):
             if len(region.score) != count:
@@ -132,7 +132,7 @@ def find_run(options: TrainOptions) -> Literal["nothing", "stopped", "finished"]
 
 @contextmanager
 def explain_stop(folder: RunFolder) -> Iterator[None]:
-    """Say in one line what is left of a stopped run and how to go on."""
+    """Raise errors that stop a run again, in one line that names the file at fault and how to go on."""
     try:
         yield
     except KeyboardInterrupt:
@@ -140,13 +140,20 @@ def explain_stop(folder: RunFolder) -> Iterator[None]:
             f"what is done is kept in {folder.root}; give the same command with --resume to go on"
         ) from None
     except (OSError, ProgdfError) as error:
-        if disk_full(error):
-            trouble = f"the disk of {folder.root} is full; free some space"
+        full = disk_full(error)
+        if full is not None:
+            trouble = f"the disk of {_file_of(full) or folder.root} is full; free some space"
         elif isinstance(error, OSError):
-            trouble = f"{folder.root} cannot be written ({error.strerror or error}); make it writable"
+            file = _file_of(error) or f"a file of {folder.root}"
+            trouble = f"{file} cannot be read or written ({error.strerror or error}); check its permissions"
         else:
             raise
         raise ProgdfError(f"{trouble}, then continue with --resume") from error
+
+
+def _file_of(error: OSError) -> str:
+    """Return the file that a system error names; "" if it names none, as after a write to an open file."""
+    return os.fsdecode(error.filename) if isinstance(error.filename, (str, bytes, os.PathLike)) else ""
 
 
 @contextmanager
@@ -177,8 +184,8 @@ def _identity(plan: TrainOptions, threads: int) -> _Identity:
     cameras = plan.views.cameras
     return _Identity(
         plan,
-        _digest(plan.scene),
-        _digest(cameras) if cameras else None,
+        _scene_digest(plan.scene),
+        _camera_digest(cameras) if cameras else None,
         threads,
         str(torch.__version__),
         picture_digests(plan),
@@ -271,6 +278,29 @@ def _saved_step(folder: RunFolder) -> int:
         return int(saved.values["pgs"]["step"])
 
 
+def _scene_digest(path: Path) -> str:
+    """Return the hash of a scene file; of an unpacked .sog it covers the names and bytes of all its files."""
+    if not path.is_dir():
+        return _digest(path)
+    return _joint_digest(file for file in path.iterdir() if file.suffix in _SOG_SUFFIXES)
+
+
+def _camera_digest(path: Path) -> str:
+    """Return the hash of a camera file; of a folder it covers the names and bytes of the files read."""
+    files = camera_files(path)
+    return _digest(path) if files == (path,) else _joint_digest(files)
+
+
+def _joint_digest(files: Iterable[Path]) -> str:
+    """Return the hash of the names and bytes of several files, in the order of their names."""
+    parts = [f"{file.name} {_digest(file)}\n" for file in sorted(files)]
+    return hashlib.sha256("".join(parts).encode(errors="surrogateescape")).hexdigest()
+
+
 def _digest(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    check_regular(path)
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise open_error(path, error) from error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import random
@@ -19,14 +20,18 @@ from progdf.errors import ProgdfError
 from progdf.formats.ply import load_ply
 from progdf.gaussians import ZERO
 from progdf.gdf.file import load_gdf
-from progdf.io.cameras import load_cameras
+from progdf.io.cameras import load_cameras, save_cameras
+from progdf.region import Region
+from tests.helpers.colmap_text import write_text_model
+from tests.helpers.demo_scenes import bear
 from tests.helpers.growth import write_growth
 from tests.helpers.stopped import OUT, bits, small_run
 from tests.helpers.stopped_runs import NEVER, at_step, gone_on, killed, saved_step, words
 from tests.helpers.trained import quick_options, train
 from trainer.options import EditorOptions
 from trainer.run import training
-from trainer.run.resume import find_run, processor_kind
+from trainer.run.resume import decide_resume, explain_stop, find_run, picture_digests, processor_kind
+from trainer.store.run_folder import RunFolder, open_run_folder
 from trainer.store.state import StateFolder
 
 pytest_plugins = ["tests.helpers.stopped_runs"]
@@ -131,6 +136,61 @@ def test_resuming_with_another_scene_under_the_same_name_is_refused(bear_folder:
     about.write_text(json.dumps({**told, "scene": "another"}), encoding="utf-8")
     with pytest.raises(ProgdfError, match="the scene has changed since run was started; "):
         train(replace(small_run(bear_folder), resume=True), quiet=True)
+
+
+@pytest.mark.parametrize("change", ["another pose", "another size", "a larger model"])
+def test_resuming_notices_a_changed_camera_folder(bear_folder: Path, change: str) -> None:
+    cameras = Path("colmap")
+    names = [f"{i} a.jpg" for i in range(8)]
+    model = write_text_model(cameras / "sparse" / "0", names)
+    images = (model / "images.txt").read_text(encoding="utf-8")
+    options = small_run(bear_folder, cameras=cameras)
+    folder = open_run_folder(OUT, options.edit)
+    region = Region("part", torch.arange(4), torch.ones(9))
+    begun = decide_resume(folder, options, region, 9)
+    assert begun.does == "start"
+    again = replace(options, resume=True)
+    assert decide_resume(folder, again, region, 9).does == "go on"
+    if change == "another pose":
+        (model / "images.txt").write_text(images.replace(" 8 1 ", " 9 1 "), encoding="utf-8")
+    elif change == "another size":
+        path = model / "cameras.txt"
+        path.write_text(path.read_text(encoding="utf-8").replace("640", "641"), encoding="utf-8")
+    else:
+        write_text_model(cameras / "sparse" / "1", [*names, "more.jpg"])
+    with pytest.raises(ProgdfError, match="colmap has changed since run was started; restore it"):
+        decide_resume(folder, again, region, 9)
+
+
+def test_cameras_in_a_folder_are_trained_with(bear_folder: Path) -> None:
+    demo = bear(1500)
+    Path("data").mkdir()
+    save_cameras(Path("data", "cameras.json"), demo.cameras)
+    done = train(small_run(bear_folder, cameras=Path("data")), quiet=True)
+    assert done.gdf.is_file()
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (IsADirectoryError(errno.EISDIR, "Is a directory", "sparse/0"), "sparse/0 cannot be read or written"),
+        (FileNotFoundError(errno.ENOENT, "No such file", b"a.png"), "a.png cannot be read or written"),
+        (OSError(errno.EIO, "Input/output error"), "a file of run cannot be read or written"),
+        (OSError(errno.ENOSPC, "No space left", "/tmp/x"), "the disk of /tmp/x is full"),
+        (OSError(errno.ENOSPC, "No space left"), "the disk of run is full"),
+    ],
+)
+def test_a_system_error_is_blamed_on_the_file_that_it_names(error: OSError, said: str) -> None:
+    with pytest.raises(ProgdfError) as caught, explain_stop(RunFolder(OUT)):
+        raise error
+    assert str(caught.value).startswith(said)
+    assert str(caught.value).endswith("then continue with --resume")
+
+
+def test_a_missing_picture_is_named_not_the_run(bear_folder: Path) -> None:
+    options = small_run(bear_folder, editor="decal:logo.png")
+    with pytest.raises(ProgdfError, match=r"^logo\.png does not exist; "):
+        picture_digests(options)
 
 
 @pytest.mark.usefixtures("stopped")
