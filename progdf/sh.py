@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import cache
 
 import torch
 from torch import Tensor
 
 from progdf.quaternions import rotate_vectors
+
+Signs = tuple[float, float, float]
+"""Factors ±1 of x, y and z."""
 
 C0 = 0.28209479177387814
 _C1 = 0.4886025119029199
@@ -24,6 +28,7 @@ _C3 = (
 )
 
 _SAMPLES = 20  # directions, at least as many as basis functions
+_FIT_DIRECTIONS = 96  # directions over which `map_colors` fits
 _CHUNK = 1 << 14  # Gaussians that are turned at once
 
 
@@ -106,12 +111,55 @@ def rotation_change(shN: Tensor, quats: Tensor, part: Tensor | None = None) -> T
     return torch.cat([matrices @ shN[:, :count], change[:, count:]], dim=1)
 
 
-def rotate_about_x(shN: Tensor) -> Tensor:
-    """Higher bands after half a turn about x, bit for bit but for signs. [N,K,3]"""
+def half_turn(shN: Tensor, signs: Signs) -> Tensor:
+    """Return the higher bands after half a turn about an axis, bit for bit but for signs.
+
+    Args:
+        shN: bands 1 to d. [N,K,3]
+        signs: factors of x, y and z; (1, −1, −1) is half a turn about x
+    """
     degree = math.isqrt(shN.shape[1] + 1) - 1
-    # a basis function of order m changes its sign with y for m < 0, and with z for l + m odd
-    signs = [(-1.0) ** (l + m + (m < 0)) for l in range(1, degree + 1) for m in range(-l, l + 1)]
-    return shN * torch.tensor(signs)[:, None]
+    x, y, z = signs
+    factors = []
+    for l in range(1, degree + 1):
+        for m in range(-l, l + 1):
+            # odd in y: m < 0; odd in z: l + m odd; odd in x: m odd and ≥ 0, or m even and < 0
+            odd_x = (m % 2 == 1) != (m < 0)
+            sign_x = x if odd_x else 1.0
+            sign_y = y if m < 0 else 1.0
+            sign_z = z if (l + m) % 2 else 1.0
+            factors.append(sign_x * sign_y * sign_z)
+    return shN * torch.tensor(factors, dtype=shN.dtype)[:, None]
+
+
+def map_colors(sh: Tensor, function: Callable[[Tensor], Tensor]) -> Tensor:
+    """Return the SH whose colors are a function of the colors of other SH.
+
+    Exact for band 0 alone. Otherwise the least-squares fit over evenly spread directions, as a function of a
+    band-limited color is not band-limited.
+
+    Args:
+        sh: all bands. [N,K+1,3]
+        function: maps colors ≥ 0 to colors, elementwise. [...,3] -> [...,3]
+    """
+    if sh.shape[1] == 1:
+        return rgb_to_sh0(function(sh0_to_rgb(sh.double()).clamp_min(0.0))).to(sh.dtype)
+    degree = math.isqrt(sh.shape[1]) - 1
+    values = basis(degree, spread_directions(_FIT_DIRECTIONS))
+    inverse = torch.linalg.pinv(values)
+    fitted = []
+    for chunk in torch.split(sh, _CHUNK):
+        colors = (values @ chunk.double() + 0.5).clamp_min(0.0)
+        fitted.append((inverse @ (function(colors) - 0.5)).to(sh.dtype))
+    return torch.cat(fitted)
+
+
+def spread_directions(count: int) -> Tensor:
+    """Return unit vectors on a Fibonacci lattice. [count,3] float64"""
+    z = 1.0 - (2.0 * torch.arange(count, dtype=torch.float64) + 1.0) / count
+    angle = torch.arange(count, dtype=torch.float64) * math.pi * (3.0 - math.sqrt(5.0))
+    radius = (1.0 - z * z).sqrt()
+    return torch.stack([radius * angle.cos(), radius * angle.sin(), z], dim=1)
 
 
 def _wigner_change(degree: int, quats: Tensor) -> Tensor:
@@ -126,8 +174,5 @@ def _wigner_change(degree: int, quats: Tensor) -> Tensor:
 @cache
 def _samples(degree: int, device: torch.device) -> tuple[Tensor, Tensor]:
     """Directions, and the bands from the colors seen along them. [J,3], [K,J] float64"""
-    z = 1.0 - (2.0 * torch.arange(_SAMPLES, dtype=torch.float64) + 1.0) / _SAMPLES
-    angle = torch.arange(_SAMPLES, dtype=torch.float64) * math.pi * (3.0 - math.sqrt(5.0))
-    radius = (1.0 - z * z).sqrt()
-    directions = torch.stack([radius * angle.cos(), radius * angle.sin(), z], dim=1)
+    directions = spread_directions(_SAMPLES)
     return directions.to(device), torch.linalg.pinv(basis(degree, directions))[1:].to(device)

@@ -1,214 +1,487 @@
-"""Gaussians in a binary glTF file (.glb), as the ratified extension KHR_gaussian_splatting stores them.
+"""Gaussians in glTF files, by the ratified extension KHR_gaussian_splatting.
 
-Points with attributes: linear scales and opacities, quaternions xyzw, a column for each SH coefficient, y up
-and z towards the viewer. Programs that do not know the extension show a cloud of colored points.
+A primitive of points has linear scales and opacities, quaternions xyzw and a column for each SH coefficient.
+Programs that do not know the extension show a cloud of colored points.
 https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos/KHR_gaussian_splatting
+
+Axes: the extension only requires y up. Files are written and read in glTF's own axes LUF (x left, y up, z
+forward), as splat-transform, PlayCanvas and Cesium do. A file in other axes names them in `asset.extras`.
 """
 
 from __future__ import annotations
 
 import json
 import struct
-from dataclasses import replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import msgspec
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from progdf import sh
+from progdf.color.oklab import linear_from_srgb, srgb_from_linear
 from progdf.errors import ProgdfError
 from progdf.gaussians import ZERO, Gaussians, concatenate, from_arrays
-from progdf.io.json_values import convert_json, decode_json
-from progdf.sh import sh0_to_rgb
+from progdf.io.file_rules import check_fields, damage_error, unsupported_error
+from progdf.quaternions import multiply_quats
+from progdf.terminal import escape_text
+
+from .axes import AXES, Axes, convert_axes
+from .gltf_file import (
+    BINARY_CHUNK,
+    BYTE,
+    FLOAT,
+    JSON_CHUNK,
+    MAGIC,
+    REFUSED,
+    SIZES,
+    GltfFile,
+    Primitive,
+    entry,
+)
+from .gltf_nodes import VISIBILITY, Placement, find_placements, placement_similarity
 
 EXTENSION = "KHR_gaussian_splatting"
-MAGIC = b"glTF"
-MOST_DEGREE = 3
+MAX_DEGREE = 3
 
-_FLOAT, _BYTE = 5126, 5121
-_TYPES = {5120: "i1", _BYTE: "u1", 5122: "<i2", 5123: "<u2", _FLOAT: "<f4"}
-_SIZES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
-_JSON, _BIN = 0x4E4F534A, 0x004E4942
+SRGB = "srgb_rec709_display"
+LINEAR = "lin_rec709_display"
+_SPZ = ("KHR_gaussian_splatting_compression_spz_2", "KHR_gaussian_splatting_compression_spz")
+_HONORED = (EXTENSION, *_SPZ, VISIBILITY, "KHR_mesh_quantization")
+_IRRELEVANT = (
+    "KHR_materials_",
+    "EXT_materials_",
+    "KHR_texture_",
+    "EXT_texture_",
+    "KHR_lights_",
+    "EXT_lights_",
+)
+"""Extensions of materials and lights: Gaussians have neither."""
 
-_Count = Annotated[int, msgspec.Meta(ge=0)]
+_KINDS = {
+    "POSITION": "VEC3",
+    f"{EXTENSION}:ROTATION": "VEC4",
+    f"{EXTENSION}:SCALE": "VEC3",
+    f"{EXTENSION}:OPACITY": "SCALAR",
+}
+"""Types of the attributes beside the SH coefficients."""
 
+_EXPORT_AGAIN = "export it without that extension"
 
-class _View(msgspec.Struct):
-    byteLength: _Count
-    byteOffset: _Count = 0
-    byteStride: _Count = 0
-    buffer: _Count = 0
+GENERATOR_AXES: tuple[tuple[str, Axes], ...] = (("splat-transform 1.", "RDF"), ("progdf", "RUB"))
+"""Axes of files that do not name them, by the beginning of `asset.generator`: splat-transform wrote those of
+the .ply before version 2, this program at first OpenGL's."""
 
+LOG_SCALE_LIMIT = -1e-6  # linear scales are not negative; splat-transform wrote logarithms before June 2026
 
-class _Accessor(msgspec.Struct):
-    componentType: int
-    count: _Count
-    type: str
-    bufferView: _Count
-    byteOffset: _Count = 0
-    normalized: bool = False
-
-
-class _Primitive(msgspec.Struct):
-    attributes: dict[str, _Count]
-    extensions: dict[str, Any] = {}
-
-
-class _Mesh(msgspec.Struct):
-    primitives: list[_Primitive]
-
-
-class _Node(msgspec.Struct):
-    mesh: _Count | None = None
-    translation: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    rotation: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
-    scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    matrix: tuple[float, ...] | None = None
-    children: list[_Count] = []
+ReadSpz = Callable[[bytes], Gaussians]
+"""Reads the bytes of an .spz in its own axes (RUB)."""
 
 
-class _File(msgspec.Struct):
-    meshes: list[_Mesh]
-    accessors: list[_Accessor]
-    bufferViews: list[_View]
-    nodes: list[_Node] = []
+@dataclass(frozen=True)
+class GltfScene:
+    """The Gaussians of a glTF file."""
+
+    scene: Gaussians  # in the axes of the .ply, means in float64 and in the world
+    facts: tuple[str, ...]  # how the numbers were read, a phrase each
+    ignored: tuple[str, ...]  # parts of the file that were not used
+    file_bytes: int  # of the file and its buffers
 
 
-def write_glb(path: Path, scene: Gaussians) -> None:
-    """Write a scene whose y is up and z towards the viewer, in float32; bands above 3 are left out.
+def write_glb(path: Path, scene: Gaussians, axes: Axes = "LUF") -> None:
+    """Write a scene as float32; SH bands above 3 are left out.
 
     Args:
-        path: the file, which is written over
-        scene: N Gaussians; an origin becomes the node's translation
+        path: the file, which is replaced
+        scene: N ≥ 1 Gaussians in the axes of the .ply; an origin becomes the node's translation
+        axes: axes of the file, LUF or RUB
     """
-    columns: dict[str, Tensor] = {
+    scene = convert_axes(scene, "RDF", axes)
+    views: list[dict[str, Any]] = []
+    accessors: list[dict[str, Any]] = []
+    attributes: dict[str, int] = {}
+    parts: list[bytes] = []
+    start = 0
+    for name, table in _columns(scene).items():
+        rounded = table.dtype == np.uint8
+        accessor: dict[str, Any] = {"bufferView": len(views), "count": len(scene)}
+        accessor["componentType"] = BYTE if rounded else FLOAT
+        accessor["type"] = next(kind for kind, size in SIZES.items() if size == table.shape[1])
+        if rounded:
+            accessor["normalized"] = True
+        if name == "POSITION":
+            accessor |= {"min": table.min(axis=0).tolist(), "max": table.max(axis=0).tolist()}
+        attributes[name] = len(accessors)
+        content = table.tobytes()
+        views.append({"buffer": 0, "byteOffset": start, "byteLength": len(content), "target": 34962})
+        accessors.append(accessor)
+        parts.append(content)
+        start += len(content)
+    look = {"kernel": "ellipse", "colorSpace": SRGB, "projection": "perspective"}
+    look["sortingMethod"] = "cameraDistance"
+    node: dict[str, Any] = {"mesh": 0}
+    if scene.origin != ZERO:
+        node["translation"] = list(scene.origin)
+    tables = {
+        "asset": {"version": "2.0", "generator": "progdf", "extras": {"axes": axes}},
+        "extensionsUsed": [EXTENSION],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [node],
+        "meshes": [{"primitives": [{"attributes": attributes, "mode": 0, "extensions": {EXTENSION: look}}]}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": start}],
+    }
+    text = json.dumps(tables).encode()
+    text += b" " * (-len(text) % 4)
+    with path.open("wb") as file:
+        file.write(MAGIC + struct.pack("<II", 2, 12 + 8 + len(text) + 8 + start))
+        file.write(struct.pack("<II", len(text), JSON_CHUNK) + text)
+        file.write(struct.pack("<II", start, BINARY_CHUNK))
+        file.writelines(parts)
+
+
+def _columns(scene: Gaussians) -> dict[str, NDArray[Any]]:
+    """The attributes of a primitive by name, float32, or bytes for the colors of points. [N,size]"""
+    points = linear_from_srgb(sh.sh0_to_rgb(scene.sh0).clamp(0, 1))  # glTF's vertex colors are linear light
+    tables: dict[str, Tensor] = {
         "POSITION": scene.means,
-        "COLOR_0": torch.cat([sh0_to_rgb(scene.sh0).clamp(0, 1), scene.opacities[:, None]], dim=1),
         f"{EXTENSION}:ROTATION": scene.unit_quats[:, [1, 2, 3, 0]],
         f"{EXTENSION}:SCALE": scene.scales,
         f"{EXTENSION}:OPACITY": scene.opacities[:, None],
     }
     coefficients = scene.sh
-    for degree in range(min(MOST_DEGREE, scene.sh_degree) + 1):
-        for i in range(2 * degree + 1):
-            columns[f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{i}"] = coefficients[:, degree**2 + i]
-    views, accessors, parts, at = list[dict[str, Any]](), list[dict[str, Any]](), list[bytes](), 0
-    for name, values in columns.items():
-        color, table = name == "COLOR_0", values.detach().cpu().float().numpy()
-        content = (table * 255).round().astype("u1").tobytes() if color else table.astype("<f4").tobytes()
-        accessor: dict[str, Any] = {"bufferView": len(views), "count": len(scene)}
-        accessor["componentType"] = _BYTE if color else _FLOAT
-        accessor["type"] = next(kind for kind, size in _SIZES.items() if size == table.shape[1])
-        if color:
-            accessor["normalized"] = True
-        if name == "POSITION":
-            accessor |= {"min": table.min(axis=0).tolist(), "max": table.max(axis=0).tolist()}
-        views.append({"buffer": 0, "byteOffset": at, "byteLength": len(content), "target": 34962})
-        accessors.append(accessor)
-        parts.append(content)
-        at += len(content)
-    look = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective"}
-    primitive = {
-        "attributes": {name: i for i, name in enumerate(columns)},
-        "mode": 0,
-        "extensions": {EXTENSION: {**look, "sortingMethod": "cameraDistance"}},
+    for degree in range(min(MAX_DEGREE, scene.sh_degree) + 1):
+        for i, name in enumerate(_coefficient_names(degree)):
+            tables[name] = coefficients[:, degree**2 + i]
+    columns: dict[str, NDArray[Any]] = {
+        name: table.detach().cpu().float().numpy().astype("<f4") for name, table in tables.items()
     }
-    node = {"mesh": 0} | ({"translation": list(scene.origin)} if scene.origin != ZERO else {})
-    table_of_contents = {
-        "asset": {"version": "2.0", "generator": "progdf"},
-        "extensionsUsed": [EXTENSION],
-        "scene": 0,
-        "scenes": [{"nodes": [0]}],
-        "nodes": [node],
-        "meshes": [{"primitives": [primitive]}],
-        "accessors": accessors,
-        "bufferViews": views,
-        "buffers": [{"byteLength": at}],
-    }
-    text = json.dumps(table_of_contents).encode()
-    text += b" " * (-len(text) % 4)
-    with path.open("wb") as file:
-        file.write(MAGIC + struct.pack("<II", 2, 12 + 8 + len(text) + 8 + at))
-        file.write(struct.pack("<II", len(text), _JSON) + text + struct.pack("<II", at, _BIN))
-        file.writelines(parts)
+    colors = torch.cat([points, scene.opacities[:, None]], dim=1)
+    columns["COLOR_0"] = (colors * 255).round().to(torch.uint8).cpu().numpy()
+    return columns
 
 
-def read_glb(path: Path) -> Gaussians:
-    """The Gaussians of a .glb as stored, in its axes: those of all primitives that have the extension.
+def _coefficient_names(degree: int) -> list[str]:
+    return [f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{i}" for i in range(2 * degree + 1)]
+
+
+def read_gltf(path: Path, read_spz: ReadSpz) -> GltfScene:
+    """Read the Gaussians that the scene of a .glb or .gltf shows, every instance of a mesh once.
+
+    Args:
+        path: the file; a .gltf names the files of its numbers, inside its folder
+        read_spz: reads parts that are compressed as .spz
 
     Raises:
-        ProgdfError: it is broken, holds no Gaussians, or its nodes turn or scale them.
+        ProgdfError: the file is damaged, holds no Gaussians, or has a feature that is not supported.
     """
-    content = path.read_bytes()
-    try:
-        size, kind = struct.unpack_from("<II", content, 12)
-        if content[:4] != MAGIC or kind != _JSON or 20 + size > len(content):
-            raise ValueError("its first part is not the table of contents")
-        table = convert_json(decode_json(content[20 : 20 + size]), _File)
-        data = memoryview(content)[28 + size :]
-        parts = [
-            _read_primitive(table, data, primitive, mesh)
-            for mesh, one in enumerate(table.meshes)
-            for primitive in one.primitives
-            if EXTENSION in primitive.extensions
-        ]
-    except (ValueError, IndexError, KeyError, struct.error) as error:
-        raise ProgdfError(f"{path} cannot be read as .glb: {error}; export it again") from None
+    file = GltfFile(path)
+    _check_required(file)
+    reader = _Reader(file, read_spz)
+    placements = find_placements(file)
+    draws: list[tuple[Placement, int]] = []
+    for placement in placements:
+        mesh = entry(file, file.tables.meshes, placement.mesh, "meshes")
+        for index, primitive in enumerate(mesh.primitives):
+            if _is_splats(primitive):
+                reader.measure(placement.mesh, index)
+                draws.append((placement, index))
+    parts: list[Gaussians] = []
+    for placement, index in draws:
+        similarity = placement_similarity(file, placement)
+        parts.append(_place(reader.read(placement.mesh, index), placement.matrix, *similarity))
     if not parts:
-        raise ProgdfError(f"{path} holds no Gaussians, which {EXTENSION} stores; give a scene of those")
-    bands = min(part.shN.shape[1] for part in parts)
-    return concatenate([replace(part, shN=part.shN[:, :bands]) for part in parts])
-
-
-def _read_primitive(table: _File, data: memoryview, primitive: _Primitive, mesh: int) -> Gaussians:
-    def column(name: str) -> NDArray[np.float32]:
-        if name not in primitive.attributes:
-            raise ValueError(f"it lacks {name}")
-        return _read_accessor(table, data, table.accessors[primitive.attributes[name]])
-
-    nodes, still = [node for node in table.nodes if node.mesh == mesh], _Node()
-    as_they_are = [
-        (node.matrix, node.rotation, node.scale) for node in table.nodes if node.children or node in nodes
-    ]
-    groups = [node.translation for node in table.nodes if node.children]
-    if {*as_they_are} - {(None, still.rotation, still.scale)} or {*groups} - {ZERO} or len(nodes) > 1:
-        raise ValueError("its nodes turn, scale or repeat the Gaussians")
-    shift = np.array(nodes[0].translation if nodes else (0.0, 0.0, 0.0))
-    rest, degree = list[NDArray[np.float32]](), 1
-    while f"{EXTENSION}:SH_DEGREE_{degree}_COEF_0" in primitive.attributes and degree <= MOST_DEGREE:
-        rest += [column(f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{i}") for i in range(2 * degree + 1)]
-        degree += 1
-    means, opacities = column("POSITION"), column(f"{EXTENSION}:OPACITY")[:, 0].astype(np.float64)
-    with np.errstate(divide="ignore", invalid="ignore"):  # 0 and 1 are infinite, and repaired
-        arrays = {
-            "means": means.astype(np.float64) + shift if shift.any() else means,
-            "quats": column(f"{EXTENSION}:ROTATION")[:, [3, 0, 1, 2]],
-            "log_scales": np.log(column(f"{EXTENSION}:SCALE")),
-            "logit_opacities": (np.log(opacities) - np.log1p(-opacities)).astype(np.float32),
-            "sh0": column(f"{EXTENSION}:SH_DEGREE_0_COEF_0"),
-            "shN": np.stack(rest, axis=1) if rest else np.zeros((len(means), 0, 3), np.float32),
-        }
-    return from_arrays(arrays)
-
-
-def _read_accessor(table: _File, data: memoryview, accessor: _Accessor) -> NDArray[np.float32]:
-    """The numbers of an accessor, normalized integers as shares. [count,size]"""
-    view, size = table.bufferViews[accessor.bufferView], _SIZES.get(accessor.type, 0)
-    if accessor.componentType not in _TYPES or not size or view.buffer:
-        raise ValueError(
-            f"an accessor is {accessor.type} of {accessor.componentType}, in buffer {view.buffer}"
+        raise ProgdfError(
+            f"{path} holds no Gaussians: its scene shows nothing of {EXTENSION}; give a scene of Gaussians"
         )
-    dtype = np.dtype(_TYPES[accessor.componentType])
-    stride, first = view.byteStride or size * dtype.itemsize, view.byteOffset + accessor.byteOffset
-    last = first + max(0, accessor.count - 1) * stride + size * dtype.itemsize
-    if not accessor.count or stride < size * dtype.itemsize or last > len(data):
-        raise ValueError("an accessor lies outside its data")
-    values = np.ndarray((accessor.count, size), dtype, data, first, (stride, dtype.itemsize)).astype(
-        np.float32
-    )
-    if accessor.normalized and dtype.kind != "f":
-        values = np.maximum(values / np.iinfo(dtype).max, -1.0)
-    return values
+    scene = _join(file, parts)
+    axes = stored_axes(file)
+    facts = list(reader.facts)
+    if axes != "RDF":
+        facts.insert(0, f"turned from axes {axes} to RDF")
+    ignored = (*reader.ignored, *_ignored_parts(file, placements))
+    return GltfScene(convert_axes(scene, axes, "RDF"), tuple(facts), ignored, file.stored_bytes)
+
+
+def stored_axes(file: GltfFile) -> Axes:
+    """Return the axes of a file: as it says, else as its generator wrote them, else glTF's LUF."""
+    asset = file.tables.asset
+    named = asset.extras.get("axes") if isinstance(asset.extras, dict) else None
+    for axes in AXES:
+        if named == axes:
+            return axes
+    for beginning, axes in GENERATOR_AXES:
+        if asset.generator.startswith(beginning):
+            return axes
+    return "LUF"
+
+
+def _check_required(file: GltfFile) -> None:
+    """Raise ProgdfError: the file requires an extension that is not supported."""
+    for name in file.tables.extensionsRequired:
+        if name not in _HONORED and not name.startswith(_IRRELEVANT):
+            feature = f"the required extension {escape_text(name)[:80]}"
+            raise unsupported_error(file.path, feature, REFUSED.get(name, _EXPORT_AGAIN))
+
+
+def _is_splats(primitive: Primitive) -> bool:
+    """Return whether points are Gaussians: by the extension, or by its attributes if a converter drops it."""
+    return EXTENSION in primitive.extensions or f"{EXTENSION}:SCALE" in primitive.attributes
+
+
+def _ignored_parts(file: GltfFile, placements: list[Placement]) -> Iterator[str]:
+    """Parts of the file that may matter to a person and are not read."""
+    tables = file.tables
+    shown = {placement.mesh for placement in placements}
+    hidden = [
+        index
+        for index, mesh in enumerate(tables.meshes)
+        if index not in shown and any(map(_is_splats, mesh.primitives))
+    ]
+    others = [
+        index
+        for index, mesh in enumerate(tables.meshes)
+        if index in shown and not all(map(_is_splats, mesh.primitives))
+    ]
+    if hidden:
+        yield f"meshes[{hidden[0]}] outside the scene" + (
+            f" and {len(hidden) - 1} more" if hidden[1:] else ""
+        )
+    if others:
+        yield f"triangles of meshes[{others[0]}]" + (f" and {len(others) - 1} more" if others[1:] else "")
+    if tables.animations:
+        yield "animations (the scene at rest is read)"
+    for name in tables.extensionsUsed:
+        if name not in _HONORED:
+            yield escape_text(name)[:80]
+
+
+def _place(part: Gaussians, matrix: NDArray[np.float64], turn: Tensor, factor: float) -> Gaussians:
+    """The Gaussians of a mesh in the world.
+
+    Args:
+        part: N Gaussians in the axes of the mesh, means in float64
+        matrix: mesh to world, a similarity. [4,4]
+        turn, factor: its rotation (unit quaternion [1,4]) and its scale
+    """
+    linear = torch.from_numpy(matrix[:3, :3])
+    placed = replace(part, means=part.means @ linear.T + torch.from_numpy(matrix[:3, 3]))
+    if factor != 1.0:
+        placed = replace(placed, log_scales=placed.log_scales + float(np.log(factor)))
+    if not torch.equal(turn, torch.tensor([[1.0, 0.0, 0.0, 0.0]], dtype=turn.dtype)):
+        quats = multiply_quats(turn, placed.quats.double()).float()
+        bands = placed.shN + sh.rotation_change(placed.shN, turn)
+        placed = replace(placed, quats=quats, shN=bands)
+    return placed
+
+
+def _join(file: GltfFile, parts: list[Gaussians]) -> Gaussians:
+    """All parts as one scene; parts of a lower SH degree get bands of zeros."""
+    if len({part.antialiased for part in parts}) > 1:
+        raise unsupported_error(
+            file.path, "parts with and without antialiasing (SPZ)", "export them as separate scenes"
+        )
+    count = max(part.shN.shape[1] for part in parts)
+    padded = []
+    for part in parts:
+        missing = part.shN.new_zeros(len(part), count - part.shN.shape[1], 3)
+        padded.append(replace(part, shN=torch.cat([part.shN, missing], dim=1)))
+    return concatenate(padded)
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """A checked primitive of N Gaussians, before its numbers are read."""
+
+    name: str  # for errors
+    color_space: str
+    spz: int | None  # buffer view of an .spz, which holds everything
+    columns: dict[str, str]  # attributes to read and their types; SH coefficients last, in their order
+    attributes: dict[str, int]  # accessors by name
+    rows: int  # N; 0 where an .spz knows
+    indices: int | None  # accessor of the rows that are points; None: all
+
+    @property
+    def width(self) -> int:
+        """Numbers of a Gaussian."""
+        return 11 + 3 * (len(self.columns) - len(_KINDS))
+
+
+class _Reader:
+    """Reads each primitive once, however many nodes show it."""
+
+    def __init__(self, file: GltfFile, read_spz: ReadSpz) -> None:
+        self.file = file
+        self.facts: dict[str, None] = {}  # in the order found
+        self.ignored: dict[str, None] = {}
+        self._read_spz = read_spz
+        self._plans: dict[tuple[int, int], _Plan] = {}
+        self._parts: dict[tuple[int, int], Gaussians] = {}
+
+    def measure(self, mesh: int, index: int) -> None:
+        """Count the memory of a primitive that is about to be read once more.
+
+        Raises:
+            ProgdfError: the primitive is damaged or not supported, or the file repeats it too often.
+        """
+        key = (mesh, index)
+        if key not in self._plans:
+            self._plans[key] = self._plan(mesh, index)
+        plan = self._plans[key]
+        rows = plan.rows
+        if plan.indices is not None:
+            rows += self.file.accessor(plan.indices, "SCALAR").count
+        self.file.take(rows, plan.width)
+
+    def read(self, mesh: int, index: int) -> Gaussians:
+        """Return the Gaussians of a measured primitive as stored, means in float64.
+
+        Raises:
+            ProgdfError: numbers lie outside the file, or its .spz cannot be read.
+        """
+        key = (mesh, index)
+        plan = self._plans[key]
+        if key not in self._parts:
+            self._parts[key] = self._read_part(plan)
+        part = self._parts[key]
+        if plan.spz is not None:  # of which nothing was known before
+            self.file.take(len(part), 14 + 3 * part.shN.shape[1])
+        return part
+
+    def _plan(self, mesh: int, index: int) -> _Plan:
+        """Check a primitive, and find its columns."""
+        file = self.file
+        primitive = file.tables.meshes[mesh].primitives[index]
+        name = f"meshes[{mesh}].primitives[{index}]"
+        attributes = primitive.attributes
+        color_space, spz = self._check_look(primitive, name)
+        if spz is not None:
+            rows = 0
+            if "POSITION" in attributes:
+                rows = file.accessor(attributes["POSITION"], "VEC3").count
+            return _Plan(name, color_space, spz, _KINDS, attributes, rows, primitive.indices)
+        degree = 0
+        while degree < MAX_DEGREE and any(n in attributes for n in _coefficient_names(degree + 1)):
+            degree += 1
+        bands = [column for l in range(degree + 1) for column in _coefficient_names(l)]
+        columns = _KINDS | dict.fromkeys(bands, "VEC3")
+        absent = next((column for column in columns if column not in attributes), None)
+        if absent is not None:
+            raise damage_error(file.path, f"{name} lacks {absent}")
+        positions = file.accessor(attributes["POSITION"], "VEC3")
+        if positions.bufferView is None and positions.sparse is None:
+            feature = f"{name} without stored positions, as an unknown extension may hold them"
+            raise unsupported_error(file.path, feature, "export it without compression")
+        for column, kind in columns.items():
+            accessor = file.accessor(attributes[column], kind)
+            if accessor.count != positions.count:
+                counts = f"{positions.count} of POSITION and {accessor.count} of {column}"
+                raise damage_error(file.path, f"{name} has {counts}")
+            if accessor.bufferView is not None:
+                file.view_bytes(accessor.bufferView)  # counts as stored
+        extra = [column for column in attributes if column.startswith(EXTENSION) and column not in columns]
+        self.ignored.update(dict.fromkeys(escape_text(column)[:60] for column in extra))
+        return _Plan(name, color_space, None, columns, attributes, positions.count, primitive.indices)
+
+    def _read_part(self, plan: _Plan) -> Gaussians:
+        """The Gaussians of a primitive in sRGB, its indices applied."""
+        part = self._read_columns(plan) if plan.spz is None else self._read_compressed(plan, plan.spz)
+        if plan.indices is not None:
+            part = part[torch.from_numpy(self.file.read_indices(plan.indices, len(part)))]
+        if plan.color_space == LINEAR:
+            self.facts["colors converted from linear light to sRGB"] = None
+            coefficients = sh.map_colors(part.sh, srgb_from_linear)
+            part = replace(part, sh0=coefficients[:, 0], shN=coefficients[:, 1:])
+        return part
+
+    def _check_look(self, primitive: Primitive, name: str) -> tuple[str, int | None]:
+        """The color space, and the buffer view of an .spz.
+
+        Raises:
+            ProgdfError: the Gaussians are to be drawn in a way that is not supported.
+        """
+        path = self.file.path
+        if primitive.targets:
+            remedy = "export it with the shape applied"
+            raise unsupported_error(path, f"morph targets in {name}", remedy)
+        for extension, remedy in REFUSED.items():
+            if extension in primitive.extensions:
+                raise unsupported_error(path, f"{extension} in {name}", remedy)
+        look = primitive.extensions.get(EXTENSION)
+        if look is None:
+            self.facts[f"{EXTENSION} is absent, colors taken as sRGB"] = None
+            return SRGB, None
+        if not isinstance(look, dict):
+            raise damage_error(path, f"{EXTENSION} of {name} is not an object")
+        known = {
+            "kernel": ("ellipse",),
+            "projection": ("perspective",),
+            "colorSpace": (SRGB, LINEAR),
+            "sortingMethod": ("cameraDistance",),
+        }
+        for field, values in known.items():
+            value = look.get(field, values[0])
+            if value not in values:
+                feature = f"{field} '{escape_text(str(value))[:40]}' in {name}"
+                raise unsupported_error(path, feature, f"export it with {' or '.join(values)}")
+        if "colorSpace" not in look:
+            self.facts["colorSpace is absent, colors taken as sRGB"] = None
+        unknown = check_fields(path, look, (*known, "extensions", "extras"), {}, _EXPORT_AGAIN)
+        self.ignored.update(dict.fromkeys(escape_text(field)[:40] for field in unknown))
+        extensions = look.get("extensions", {})
+        if not isinstance(extensions, dict):
+            raise damage_error(path, f"{EXTENSION}.extensions of {name} is not an object")
+        spz = None
+        for extension, content in extensions.items():
+            if extension not in _SPZ:
+                feature = f"{escape_text(extension)[:80]} in {name}"
+                raise unsupported_error(path, feature, _EXPORT_AGAIN)
+            spz = content.get("bufferView") if isinstance(content, dict) else None
+            if type(spz) is not int or spz < 0:
+                raise damage_error(path, f"{extension} of {name} has no bufferView")
+        return str(look.get("colorSpace", SRGB)), spz
+
+    def _read_columns(self, plan: _Plan) -> Gaussians:
+        """The Gaussians whose columns are accessors."""
+        tables = {
+            name: self.file.read_accessor(plan.attributes[name], kind) for name, kind in plan.columns.items()
+        }
+        coefficients = np.stack([tables[name] for name in plan.columns if name not in _KINDS], axis=1)
+        opacities = tables[f"{EXTENSION}:OPACITY"][:, 0].astype(np.float64)
+        with np.errstate(divide="ignore", invalid="ignore"):  # 0 and 1 become infinite, and are repaired
+            logits = np.log(opacities) - np.log1p(-opacities)
+        return from_arrays(
+            {
+                "means": tables["POSITION"].astype(np.float64),
+                "quats": tables[f"{EXTENSION}:ROTATION"][:, [3, 0, 1, 2]],
+                "log_scales": self._log_scales(tables[f"{EXTENSION}:SCALE"]),
+                "logit_opacities": logits.astype(np.float32),
+                "sh0": coefficients[:, 0],
+                "shN": coefficients[:, 1:],
+            }
+        )
+
+    def _log_scales(self, scales: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Logarithms of stored scales, which are logarithms already if any is negative. [N,3]"""
+        if bool((scales < LOG_SCALE_LIMIT).any()):
+            self.facts["scales stored as logarithms (splat-transform before June 2026)"] = None
+            return scales
+        with np.errstate(divide="ignore"):  # a flat Gaussian becomes infinite, and is repaired
+            return np.log(np.maximum(scales, np.float32(0.0)))
+
+    def _read_compressed(self, plan: _Plan, view: int) -> Gaussians:
+        """The Gaussians of an .spz inside the file; its extension requires glTF's axes LUF of a decoder."""
+        content = bytes(self.file.view_bytes(view))
+        self.facts["compressed as .spz"] = None
+        part = convert_axes(self._read_spz(content), "RUB", "LUF")
+        if plan.rows not in (0, len(part)):
+            counts = f"{plan.rows} Gaussians and its .spz {len(part)}"
+            raise damage_error(self.file.path, f"{plan.name} has {counts}")
+        bands = part.shN[:, : (MAX_DEGREE + 1) ** 2 - 1]
+        return replace(part, means=part.world_means, origin=ZERO, shN=bands)

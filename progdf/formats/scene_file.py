@@ -1,4 +1,4 @@
-"""Scenes in every format that people have: .ply, compressed .ply, .spz, .splat, .ksplat, .sog, .glb, .ckpt.
+"""Scenes in every format that people have: .ply, .spz, .splat, .ksplat, .sog, .glb, .gltf, .ckpt.
 
 Recognized by content, else by name. The code for .spz, .sog and .splat is that of gaussforge, in a process of
 its own (see `native_child`), as native code may crash on a broken file.
@@ -16,6 +16,7 @@ import zipfile
 import zlib
 from collections.abc import Iterable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -29,13 +30,15 @@ from progdf.io.json_values import decode_json
 from progdf.terminal import escape_text
 
 from . import gltf, usd
+from .axes import Axes
 from .checkpoint import read_checkpoint
 from .compressed_ply import is_compressed, morton_order, read_compressed_ply, write_compressed_ply
+from .gltf_file import MAGIC
 from .ksplat import read_ksplat
 from .ply import load_ply_with_report, read_header, save_ply, save_ply_checked
 from .repair import LoadReport, repair
 
-FORMATS = ("ply", "spz", "splat", "ksplat", "sog", "glb", "ckpt")
+FORMATS = ("ply", "spz", "splat", "ksplat", "sog", "glb", "gltf", "ckpt")
 """What a scene may be, by the ending of its name; a compressed .ply is a .ply."""
 
 WRITTEN = (".ply", ".compressed.ply", ".spz", ".sog", ".splat", ".glb", usd.SUFFIX)
@@ -66,7 +69,7 @@ def scene_format(path: str | os.PathLike[str]) -> str | None:
     suffix = path.suffix.lower().lstrip(".")
     if start[:3] == b"ply":
         return "ply"
-    if start[:4] == gltf.MAGIC:
+    if start[:4] == MAGIC:
         return "glb"
     if start[:4] == b"NGSP" or (start[:2] == b"\x1f\x8b" and _inflate(start)[:4] == b"NGSP"):
         return "spz"
@@ -76,6 +79,8 @@ def scene_format(path: str | os.PathLike[str]) -> str | None:
         return "sog" if _sog_meta(path) is not None else None
     if path.name.lower() == SOG_META and start.lstrip()[:1] == b"{":
         return "sog" if _sog_meta(path) is not None else None
+    if suffix == "gltf":
+        return suffix
     if suffix in ("splat", "ksplat"):  # which begin with whatever comes first in the scene
         return suffix
     return suffix if suffix in FORMATS and start.lstrip()[:1] not in (b"{", b"[") else None
@@ -117,8 +122,10 @@ def load_scene_with_report(path: str | os.PathLike[str]) -> tuple[Gaussians, Loa
     if kind == "ksplat":
         scene, level = read_ksplat(path)
         return _repair(path, scene, f".ksplat, level {level}")
-    if kind == "glb":
-        return _repair(path, rotate_about_x(gltf.read_glb(path)), ".glb, turned from y up to y down")
+    if kind in ("glb", "gltf"):
+        found = gltf.read_gltf(path, partial(_read_spz_part, path))
+        scene, report = _repair(path, found.scene, ", ".join([f".{kind}", *found.facts]), found.ignored)
+        return scene, replace(report, file_bytes=found.file_bytes)
     if kind == "ckpt":
         checkpoint = read_checkpoint(path)
         return _repair(path, checkpoint.scene, "checkpoint of a training", checkpoint.ignored)
@@ -142,7 +149,7 @@ def load_scene_with_report(path: str | os.PathLike[str]) -> tuple[Gaussians, Loa
 
 
 def rotate_about_x(scene: Gaussians) -> Gaussians:
-    """The scene after half a turn about x: y up and z towards the viewer become y down and z away from it."""
+    """Return the scene after half a turn about x: y up and z back become y down and z forward."""
     turn = torch.tensor([1.0, -1.0, -1.0])
     x, y, z = scene.origin
     return replace(
@@ -150,7 +157,7 @@ def rotate_about_x(scene: Gaussians) -> Gaussians:
         means=scene.means * turn,
         origin=(x, 0.0 - y, 0.0 - z),
         quats=scene.quats * torch.tensor([1.0, 1.0, -1.0, -1.0]),
-        shN=sh.rotate_about_x(scene.shN),
+        shN=sh.half_turn(scene.shN, (1.0, -1.0, -1.0)),
     )
 
 
@@ -196,6 +203,24 @@ def _through_gaussforge(path: Path, kind: str) -> tuple[Gaussians, LoadReport]:
             raise _read_error(path, kind, "returned no scene") from None
 
 
+def _read_spz_part(path: Path, content: bytes) -> Gaussians:
+    """Read an .spz inside another file, in its own axes (RUB).
+
+    Args:
+        path: the file that holds it, for errors
+        content: the bytes of the .spz
+    """
+    with tempfile.TemporaryDirectory(prefix="progdf-") as folder:
+        part = Path(folder) / "part.spz"
+        part.write_bytes(content)
+        try:
+            _, antialiased = _spz_header(part)
+            scene, _ = _through_gaussforge(part, "spz")
+        except ProgdfError as error:
+            raise ProgdfError(str(error).replace(str(part), f"{path}: its .spz part")) from None
+    return replace(scene, antialiased=antialiased)
+
+
 def _convert(source: Path, kind: str, target: Path, to: str) -> str:
     """A scene file through gaussforge into another format; what went wrong, or nothing."""
     size, patience = _size(source), 1 if to == "ply" else _PATIENCE
@@ -208,19 +233,20 @@ def _convert(source: Path, kind: str, target: Path, to: str) -> str:
     return _reason(ended.returncode, ended.stderr) if ended.returncode or not target.is_file() else ""
 
 
-def save_scene(path: Path, scene: Gaussians) -> None:
+def save_scene(path: Path, scene: Gaussians, glb_axes: Axes = "LUF") -> None:
     """Write a scene in the format that the name asks for; the file appears whole or not at all.
 
     A .ply is exact and is read back and compared. The others are smaller, or are what another program reads:
 
         .compressed.ply   16 bytes a Gaussian and 1 a coefficient; in Morton order, as chunks share a range
-        .spz, .sog        8 bits and less; .spz, .glb and .usdc are turned to y up, as readers expect
+        .spz, .sog        8 bits and less; .spz and .usdc are turned to y up, as readers expect
         .splat            32 bytes, without SH bands
         .glb, .usdc       float32, KHR_gaussian_splatting and ParticleField3DGaussianSplat
 
     Args:
         path: ends in one of `WRITTEN`
         scene: N Gaussians, finite; bands above degree 3 are left out of all but the .ply
+        glb_axes: axes of a .glb, LUF (glTF's own) or RUB (OpenGL's)
 
     Raises:
         ProgdfError: another ending, an absent package, or what cannot be written.
@@ -229,12 +255,12 @@ def save_scene(path: Path, scene: Gaussians) -> None:
     if ending == ".ply":
         save_ply_checked(path, scene)
         return
-    kind, scene = ending[1:], replace(scene, shN=scene.shN[:, : (gltf.MOST_DEGREE + 1) ** 2 - 1])
+    kind, scene = ending[1:], replace(scene, shN=scene.shN[:, : (gltf.MAX_DEGREE + 1) ** 2 - 1])
     with atomic_write(path) as written:
         if kind == "compressed.ply":
             write_compressed_ply(written, scene[morton_order(scene.means)])
         elif kind == "glb":
-            gltf.write_glb(written, rotate_about_x(scene))
+            gltf.write_glb(written, scene, glb_axes)
         elif ending == usd.SUFFIX:
             usd.write_usd(written, [rotate_about_x(scene)])
         else:
@@ -247,13 +273,16 @@ def save_scene(path: Path, scene: Gaussians) -> None:
                 shutil.copyfile(target, written)
 
 
-def save_frames(path: Path, scenes: Iterable[Gaussians], rate: float = 24.0) -> list[Path]:
+def save_frames(
+    path: Path, scenes: Iterable[Gaussians], rate: float = 24.0, glb_axes: Axes = "LUF"
+) -> list[Path]:
     """Write scenes one after the other, see `frame_path`; which files. All appear, or none.
 
     Args:
         path: ends in one of `WRITTEN`
         scenes: N Gaussians each; those of a .usdc have the same rows
         rate: of a .usdc, samples a second
+        glb_axes: as `save_scene`
 
     Raises:
         ProgdfError: as `save_scene`.
@@ -265,7 +294,7 @@ def save_frames(path: Path, scenes: Iterable[Gaussians], rate: float = 24.0) -> 
     paths = list[Path]()
     try:
         for number, scene in enumerate(scenes):
-            save_scene(frame_path(path, number), scene)
+            save_scene(frame_path(path, number), scene, glb_axes)
             paths.append(frame_path(path, number))
     except BaseException:  # also an interrupt
         for half in paths:

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from progdf.quaternions import multiply_quats, normalize_quats, rotate_vectors
-from progdf.sh import rotate_about_x, rotation_change, shade
+from progdf.sh import half_turn, rotation_change, shade
 from tests.helpers.draws import Draws
 
 COUNT = 200
@@ -57,5 +57,7 @@ def test_parts_turn_their_members() -> None:
 
 def test_half_a_turn_about_x_changes_signs_only() -> None:
     half = torch.tensor([[0.0, 1.0, 0.0, 0.0]]).expand(COUNT, 4)
-    torch.testing.assert_close(rotate_about_x(bands(3)), rotate_bands(bands(3), half), rtol=0.0, atol=1e-6)
-    assert torch.equal(rotate_about_x(bands(3)).abs(), bands(3).abs())
+    torch.testing.assert_close(
+        half_turn(bands(3), (1.0, -1.0, -1.0)), rotate_bands(bands(3), half), rtol=0.0, atol=1e-6
+    )
+    assert torch.equal(half_turn(bands(3), (1.0, -1.0, -1.0)).abs(), bands(3).abs())
