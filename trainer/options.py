@@ -246,7 +246,7 @@ class TrainOptions:
     """
 
     scene: tyro.conf.Positional[Path]
-    """The scene: a .ply (also compressed), .spz, .splat, .ksplat or .sog."""
+    """The scene: a .ply (also compressed), .spz, .splat, .ksplat, .sog, .glb or .gltf."""
     out: Path
     """Folder of the run; created if needed."""
     region: RegionOptions

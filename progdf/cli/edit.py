@@ -14,6 +14,7 @@ import tyro
 from tyro.conf import UseAppendAction
 
 from progdf.errors import ProgdfError
+from progdf.formats.axes import GlbAxes
 from progdf.formats.scene_file import load_scene, save_scene, scene_name, written_format
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import save_gdf
@@ -43,7 +44,7 @@ class EditOptions:
     """
 
     scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
-    """a .ply, .spz, .splat, .ksplat or .sog."""
+    """a .ply, .spz, .splat, .ksplat, .sog, .glb or .gltf."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"], metavar="OUT.ply|NAME.gdf")]
     """the .ply file to write; or a .gdf of the scene, whose slider goes from nothing to all of it."""
     clean: Annotated[bool, tyro.conf.FlagCreatePairsOff, absent_option(None)] = False
@@ -59,6 +60,8 @@ class EditOptions:
     """shift the region, world units."""
     duplicate: Annotated[Specs, absent_option("REGION:DX,DY,DZ")] = ()
     """add a copy of the region, shifted, world units."""
+    glb_axes: GlbAxes = "LUF"
+    """axes of a .glb: LUF, glTF's own, as splat-transform writes; or RUB, OpenGL's, as in .spz and .usdc."""
 
 
 def main(argv: Sequence[str]) -> int:
@@ -71,6 +74,8 @@ def main(argv: Sequence[str]) -> int:
         )
     if not makes_edit:
         written_format(options.out)
+    if options.out.suffix.lower() != ".glb" and options.glb_axes != "LUF":
+        raise ProgdfError(f"{options.out} is no .glb; leave out --glb-axes")
     if makes_edit and options.clean:
         raise ProgdfError("--clean has no slider; write a .ply, or leave --clean out")
     check_not_an_input(options.out, [options.scene])
@@ -84,7 +89,7 @@ def main(argv: Sequence[str]) -> int:
     edited = _clean(edited) if options.clean and len(edited) else edited
     if not len(edited):
         raise ProgdfError(f"nothing of {options.scene} would be left; it has no Gaussian that is drawn")
-    save_scene(options.out, edited)
+    save_scene(options.out, edited, options.glb_axes)
     print_line(f"wrote {options.out}: {format_count(len(edited))}")
     if len(edited) < len(scene):
         old, new = shlex.quote(str(options.scene)), shlex.quote(str(options.out))

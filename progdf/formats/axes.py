@@ -17,6 +17,9 @@ from progdf.gaussians import Gaussians
 Axes = Literal["RDF", "RUB", "LUF"]
 """RDF: 3DGS .ply and this program. RUB: OpenGL and .spz. LUF: glTF."""
 
+GlbAxes = Literal["LUF", "RUB"]
+"""Axes of a .glb that is written: those of y up."""
+
 AXES: tuple[Axes, ...] = get_args(Axes)
 
 _SIGNS: dict[Axes, sh.Signs] = {

@@ -66,12 +66,14 @@ def write_bundle(path: Path, source: Path) -> int:
         The number of files in the bundle.
 
     Raises:
-        ProgdfError: see `verify_files`; or the scene is an unpacked .sog, which is many files.
+        ProgdfError: see `verify_files`; or the scene is an unpacked .sog or a .gltf, which are many files.
     """
     session = read_session(source, SessionFile)
     scene, edits = verify_files(source, session)
     if scene.name.lower() == "meta.json":
         raise ProgdfError(f"{scene.parent} is an unpacked .sog; export the scene as a .ply first")
+    if scene.suffix.lower() == ".gltf":
+        raise ProgdfError(f"{scene} keeps numbers in other files; export the scene as a .glb first")
     names = _member_names((scene, *edits))
     for region in session.view.get("selection", {}).get("regions", ()):
         region["path"] = PureWindowsPath(region["path"]).name

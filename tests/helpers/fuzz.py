@@ -193,6 +193,8 @@ READERS = (
     "masks",
     "labels",
     "members",
+    "glb",
+    "gltf",
     *COSTLY,
 )
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import random
+import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -113,6 +114,22 @@ def changed_json(content: bytes) -> Change:
             at = rng.randrange(len(text))
             text = text[:at] + rng.choice(list(JSON_TEXTS.values())) + text[at + 1 :]
         path.write_text(text)
+
+    return change
+
+
+def changed_glb(content: bytes) -> Change:
+    """Return a change of values in the JSON of a .glb, whose lengths fit afterwards."""
+    size = int.from_bytes(content[12:16], "little")
+    change_json = changed_json(content[20 : 20 + size])
+
+    def change(rng: random.Random, path: Path) -> None:
+        change_json(rng, path)
+        text = path.read_bytes()
+        text += b" " * (-len(text) % 4)
+        length = 20 + len(text) + len(content) - 20 - size
+        head = b"glTF" + struct.pack("<IIII", 2, length, len(text), 0x4E4F534A)
+        path.write_bytes(head + text + content[20 + size :])
 
     return change
 

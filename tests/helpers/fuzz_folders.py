@@ -26,7 +26,8 @@ from progdf.io.cameras import load_cameras, save_cameras
 from progdf.io.session import SessionFile, read_session
 from progdf.rasterize.cpu import jit
 from progdf.scene.regions import parse_region
-from tests.helpers.fuzz_changes import Change, changed_bytes, changed_json, changed_parts
+from tests.helpers.fuzz_changes import Change, changed_bytes, changed_glb, changed_json, changed_parts
+from tests.helpers.gltf_files import gltf_with_everything
 from tests.helpers.hostile import NPY_HEADERS
 from tests.helpers.hostile import npy as write_npy
 from tests.helpers.scene_files import write_compressed_ply, write_ksplat, write_scene
@@ -50,7 +51,9 @@ FILES_OF_RUNS = {
 }
 """What is damaged in a run's folder before `progdf train --resume` or `progdf fit` is called on it."""
 
-COSTLY = ("spz", "splat", "sog", "colmap", "kernels", *FILES_OF_RUNS)
+GLTF_READERS = ("glb", "gltf", "spz in glb")
+
+COSTLY = ("spz", "spz in glb", "splat", "sog", "colmap", "kernels", *FILES_OF_RUNS)
 """A second or so for each input."""
 
 KERNEL = """
@@ -67,6 +70,7 @@ def more_inputs(folder: Path, reader: str) -> dict[str, Reader]:
     makers: dict[str, Callable[[Path], Reader]] = {
         **{kind: partial(_converted, kind) for kind in ("spz", "splat", "sog", "ksplat", "compressed")},
         "bundles": _bundles,
+        **{kind: partial(_gltf, kind) for kind in GLTF_READERS},
         "colmap": _colmap,
         "masks": _masks,
         "labels": partial(_numbers, "labels:{}:1"),
@@ -133,6 +137,36 @@ def _bundles(folder: Path) -> Reader:
         read_session(opened, SessionFile)
 
     return "x.progdf.zip", read, [change]
+
+
+def _gltf(kind: str, folder: Path) -> Reader:
+    """A file with nested nodes, instances, sparse rows, indices, linear colors, and perhaps an .spz."""
+    builder = gltf_with_everything()
+    if kind == "spz in glb":
+        write_scene(folder / "good.spz", random_gaussians(20, seed=2, sh_degree=1), 3)
+        view = builder.view((folder / "good.spz").read_bytes())
+        name = "KHR_gaussian_splatting_compression_spz_2"
+        builder.mesh(builder.primitive({}, extensions={name: {"bufferView": view}}))
+        builder.nodes({"mesh": 1}, {"mesh": 1, "scale": [2, 2, 2]}, roots=(0, 1))
+    suffix = ".gltf" if kind == "gltf" else ".glb"
+    good = builder.write(folder / f"good{suffix}", "x.bin" if kind == "gltf" else None)
+    (folder / "x.bin").write_bytes(builder.data)
+    content = good.read_bytes()
+
+    def read(path: Path) -> None:
+        found = load_scene(path)
+        for tensor in (
+            found.means,
+            found.log_scales,
+            found.quats,
+            found.logit_opacities,
+            found.sh0,
+            found.shN,
+        ):
+            assert bool(tensor.isfinite().all())
+
+    of_json = changed_json(content) if kind == "gltf" else changed_glb(content)
+    return f"x{suffix}", read, [of_json, of_json, of_json, changed_bytes(content)]
 
 
 def _colmap(folder: Path) -> Reader:

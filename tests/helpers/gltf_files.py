@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from progdf.gaussians import Gaussians
+from tests.helpers.scenes import random_gaussians
 
 EXTENSION = "KHR_gaussian_splatting"
 LOOK = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
@@ -105,6 +106,27 @@ def one_mesh(scene: Gaussians, node: dict[str, Any] | None = None, **look: Any) 
     builder = GltfBuilder()
     mesh = builder.mesh(builder.primitive(builder.attributes(scene), **look))
     builder.nodes({"mesh": mesh} | (node or {}))
+    return builder
+
+
+def gltf_with_everything() -> GltfBuilder:
+    """Return a file with nested nodes, instances, sparse rows, indices and linear colors."""
+    builder = GltfBuilder()
+    attributes = builder.attributes(random_gaussians(12, seed=1, sh_degree=1))
+    rows = {"bufferView": builder.view(np.array([2, 7], "<u2").tobytes()), "componentType": 5123}
+    values = {"bufferView": builder.view(np.ones((2, 3), "<f4").tobytes())}
+    colors = builder.tables["accessors"][attributes[f"{EXTENSION}:SH_DEGREE_0_COEF_0"]]
+    colors["sparse"] = {"count": 2, "indices": rows, "values": values}
+    linear = builder.primitive(attributes, colorSpace="lin_rec709_display")
+    indexed = builder.primitive(attributes)
+    indexed["indices"] = builder.accessor(np.array([[3], [1]], "<u4"))
+    mesh = builder.mesh(linear, indexed)
+    half = [0.5, 0.5, 0.5, 0.5]
+    builder.nodes(
+        {"children": [1, 2], "rotation": half, "scale": [2, 2, 2], "name": "root"},
+        {"mesh": mesh, "matrix": [0, 1, 0, 0, -1, 0, 0, 0, 0, 0, 1, 0, 1, 2, 3, 1]},
+        {"mesh": mesh, "translation": [1, 0, 0], "extensions": {"KHR_node_visibility": {"visible": True}}},
+    )
     return builder
 
 

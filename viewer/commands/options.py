@@ -15,6 +15,7 @@ from tyro.conf import OmitArgPrefixes
 from progdf.cli.info import kind_of
 from progdf.color.edits import parse_color
 from progdf.errors import ProgdfError
+from progdf.formats.axes import GlbAxes
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
 from progdf.io.bundle import BUNDLE, unpack_bundle
@@ -91,6 +92,8 @@ class ExportOptions:
     time samples."""
     timeline: Switch = False
     """A scene for each frame of the session's timeline; its camera is left out."""
+    glb_axes: GlbAxes = "LUF"
+    """Axes of a .glb: LUF, glTF's own, as splat-transform writes; or RUB, OpenGL's, as in .spz and .usdc."""
     page: OmitArgPrefixes[PageOptions] = PageOptions()
     up: UpChoice = "auto"
     """The axis of the scene that is up in a page; auto: as the edits were trained, else from the ground."""

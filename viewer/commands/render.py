@@ -80,6 +80,8 @@ def export(argv: Sequence[str]) -> int:
         raise ProgdfError(f"--frames takes 2 to {scene_file.MOST_FRAMES} steps, not {options.frames}")
     if ending != PAGE and (options.page, options.up, options.background) != (PageOptions(), "auto", "white"):
         raise ProgdfError(f"{out} is no web page; leave out what only a .html page has")
+    if ending != ".glb" and options.glb_axes != "LUF":
+        raise ProgdfError(f"{out} is no .glb; leave out --glb-axes")
     drawing = options.drawing if ending == PAGE else None
     opened = open_stack(options.stack, drawing, unset=1.0)
     check_not_an_input(out, opened.files)
@@ -97,7 +99,7 @@ def export(argv: Sequence[str]) -> int:
         return _export_frames(options, opened)
     document, strengths = opened.document, describe_strengths(opened.view)
     edited = _compose(opened.document, opened.view)
-    scene_file.save_scene(out, edited)
+    scene_file.save_scene(out, edited, options.glb_axes)
     far = (
         ", x y z as doubles as it is far from 0" if document.scene.origin != ZERO and ending == ".ply" else ""
     )
@@ -132,7 +134,7 @@ def _export_frames(options: ExportOptions, opened: OpenStack) -> int:
         what = "frames of the timeline"
     for number in range(len(steps)):
         check_not_an_input(scene_file.frame_path(out, number), opened.files)
-    paths = scene_file.save_frames(out, scenes, rate)
+    paths = scene_file.save_frames(out, scenes, rate, options.glb_axes)
     ends = f"{paths[0]} to {paths[-1].name}" if len(paths) > 1 else paths[0]
     print_line(f"wrote {ends}: {len(steps)} {what}")
     return 0

@@ -44,7 +44,7 @@ class StackOptions:
     """A scene under a stack of edits."""
 
     scene: Annotated[Path, Positional, word("SCENE", _scene)]
-    """The scene: a .ply, .spz, .splat, .ksplat or .sog; or a session (Ctrl+S), also as --session FILE."""
+    """The scene: a .ply, .spz, .splat, .ksplat, .sog, .glb or .gltf; or a session, also as --session FILE."""
     gdfs: Annotated[tuple[Path, ...], Positional, word("EDIT.gdf", "the scene alone")] = ()
     """Edits of this scene, the lowest layer first; also .cube files, which change colors everywhere."""
     region: Annotated[tuple[str, ...], UseAppendAction, word("NAME=REGION")] = ()

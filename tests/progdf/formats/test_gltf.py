@@ -16,9 +16,11 @@ import pytest
 import torch
 from torch import Tensor
 
+from progdf.__main__ import main
 from progdf.color.oklab import linear_from_srgb, srgb_from_linear
 from progdf.errors import ProgdfError
 from progdf.formats.axes import AXES, Axes, convert_axes
+from progdf.formats.ply import save_ply
 from progdf.formats.scene_file import load_scene, load_scene_with_report, save_scene, scene_format
 from progdf.gaussians import ATTRIBUTES, Gaussians, from_arrays
 from progdf.quaternions import rotation_matrices
@@ -145,6 +147,18 @@ def test_a_glb_keeps_its_place_far_away(tmp_path: Path) -> None:
         assert torch.equal(getattr(found, name), getattr(scene, name)), name
     assert torch.allclose(found.log_scales, scene.log_scales, atol=1e-6)
     assert torch.allclose(found.opacities, scene.opacities, atol=1e-7)
+
+
+def test_edit_writes_the_chosen_axes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    save_ply(Path("a.ply"), small())
+    words = ["edit", "a.ply", "--move", "all:0,0,0", "--glb-axes", "RUB", "-o"]
+    assert main([*words, "b.glb"]) == 0
+    assert b'"axes": "RUB"' in Path("b.glb").read_bytes()
+    assert main([*words, "b.ply"]) == 2
+    assert "b.ply is no .glb; leave out --glb-axes" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("start", AXES)
@@ -567,6 +581,22 @@ def test_buffers_outside_the_file_are_read(
     found, report = load_scene_with_report(path)
     assert_close(convert_axes(found, "RDF", "LUF"), small(1))
     assert report.file_bytes == size
+
+
+def test_info_and_a_picture_take_a_gltf(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    builder = one_mesh(small())
+    path = builder.write(tmp_path / "a.gltf", "a.bin")
+    (tmp_path / "a.bin").write_bytes(builder.data)
+    assert main(["info", str(path)]) == 0
+    assert "a.gltf: 12 Gaussians, SH degree 0, .gltf, turned from axes LUF" in capsys.readouterr().out
+    assert main(["render", str(path), "--size", "16x16", "-o", str(tmp_path / "a.png")]) == 0
+
+
+def test_a_gltf_is_not_bundled(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    builder = one_mesh(small())
+    path = builder.write(tmp_path / "a.gltf", builder.data_uri())
+    assert main(["export", str(path), "-o", str(tmp_path / "a.progdf.zip")]) == 2
+    assert "keeps numbers in other files; export the scene as a .glb" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

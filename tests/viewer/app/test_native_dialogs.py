@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from progdf.formats.scene_file import FORMATS
 from tests.helpers.null_app import null_app, press
 from tests.helpers.ui_rig import bear, first_view, rig
 from viewer.app import dialogs
@@ -50,6 +51,12 @@ class Desktop:
             self.app.draw()
         for _ in range(4):
             self.app.draw()
+
+
+def test_every_scene_format_can_be_chosen() -> None:
+    patterns = dialogs._OPEN[1].split()
+    for ending in FORMATS:
+        assert f"*.{ending}" in patterns
 
 
 @pytest.fixture

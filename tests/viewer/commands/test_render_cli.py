@@ -328,6 +328,15 @@ def test_another_format_says_what_it_costs_and_what_it_changes(
     ), said
 
 
+def test_a_glb_is_exported_in_the_chosen_axes(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+    for axes in ("LUF", "RUB"):
+        assert run("export", "bear.ply", "--glb-axes", axes, "-o", "a.glb") == 0
+        assert "no pixel differs" in capsys.readouterr().out
+        assert f'"axes": "{axes}"'.encode() in Path("a.glb").read_bytes()
+    assert run("export", "bear.ply", "--glb-axes", "RUB", "-o", "a.ply") == 2
+    assert "a.ply is no .glb; leave out --glb-axes" in capsys.readouterr().err
+
+
 def test_frames_go_from_the_original_to_the_strengths(run: Run, stack: Stack) -> None:
     assert (
         run("export", "bear.ply", "scarf.gdf", "--set", "scarf=0.8", "--frames", "3", "-o", "step.ply") == 0
