@@ -48,7 +48,10 @@ _BITS, _INTERPRETATION, _WHITE_IS_ZERO = 258, 262, 0  # tags of TIFF
 
 
 def open_picture(
-    path: str | os.PathLike[str], proportions: tuple[int, int] | None = None, calibrated: bool = False
+    path: str | os.PathLike[str],
+    proportions: tuple[int, int] | None = None,
+    calibrated: bool = False,
+    two_values: bool = False,
 ) -> Image.Image:
     """A picture from a file, upright, in any mode of 8 bits a channel, any size up to `MOST_PIXELS`.
 
@@ -56,6 +59,7 @@ def open_picture(
         path: the file
         proportions: width and height of which it must be a multiple (to 2 %); found out before it is unpacked
         calibrated: it is a photograph of a camera whose pixels are known: what is stored turned is refused
+        two_values: numbers of more than 8 bits that are 0 or one other value become black and white
 
     Raises:
         ProgdfError: it is missing, no picture, too large, of other proportions, or its numbers have no white.
@@ -68,7 +72,7 @@ def open_picture(
         turn = _orientation(picture, loaded=True)
         if calibrated and (stored > 1 or turn > 1):
             raise _orientation_error(path, max(stored, turn))
-        upright = _to_bytes(path, picture)
+        upright = _to_bytes(path, picture, two_values)
         upright = upright.transpose(_TURNS[turn]) if turn in _TURNS else upright.copy()
         _check_proportions(path, upright.size, proportions)
         return upright
@@ -116,16 +120,22 @@ def _orientation_error(path: str | os.PathLike[str], orientation: int) -> Progdf
     )
 
 
-def _to_bytes(path: str | os.PathLike[str], picture: Image.Image) -> Image.Image:
-    """The picture in 8 bits a channel; Pillow's own conversion of 16 cuts all above 255."""
+def _to_bytes(path: str | os.PathLike[str], picture: Image.Image, two_values: bool) -> Image.Image:
+    """Return the picture in 8 bits a channel; Pillow's own conversion of 16 cuts all above 255.
+
+    `two_values`: see `open_picture`
+    """
     if picture.mode in _BYTES:
         return picture
+    if two_values and picture.mode.startswith(("I", "F")):
+        numbers = np.asarray(picture)
+        if set(np.unique(numbers).tolist()) <= {0, numbers.max()}:
+            return Image.fromarray(np.where(numbers > 0, 255, 0).astype(np.uint8))
     # Pillow had a mode of 32 bits for .png files of 16
     if not picture.mode.startswith("I;16") and (picture.mode, picture.format) != ("I", "PNG"):
-        numbers = picture.mode in ("I", "F")
-        kind = (
-            "32-bit or floating-point numbers, which have no white" if numbers else f"{picture.mode} colors"
-        )
+        kind = f"{picture.mode} colors"
+        if picture.mode in ("I", "F"):
+            kind = "32-bit or floating-point numbers, which have no white"
         raise ProgdfError(f"{path} holds {kind}; save it in gray or RGB with 8 or 16 bits per channel")
     stored, tags = np.asarray(picture), getattr(picture, "tag_v2", {})
     shades = np.arange(1 << 16) / ((1 << tags.get(_BITS, (16,))[0]) - 1)
@@ -224,6 +234,82 @@ def read_picture(path: Path, size: tuple[int, int] | None = None, calibrated: bo
     """
     picture = flatten_onto(open_picture(path, size, calibrated), "white", size)
     return torch.from_numpy(np.asarray(picture, dtype=np.float32) / 255.0)
+
+
+_OPAQUE = 128  # of 255
+_BLACK, _WHITE = 26, 229  # of 255: within a tenth of black and of white
+_DRAWN_SHARE = 0.001  # of the opaque pixels: fewer black or white ones are no drawing
+_LABEL_BRIGHTNESS = 32  # of 255: the hue of darker pixels is noise
+_MAX_LABEL_COLORS = 256  # a picture with more colors is no map of labels
+
+
+def read_mask(path: Path, size: tuple[int, int], calibrated: bool = False) -> Tensor:
+    """Return a mask, bright inside and black outside, scaled by area. [H,W] float32 0..1
+
+    The brightest channel of a pixel counts, so that a mask may be red on black. Of two values, 0 and another,
+    the other one is inside, whatever its number. Where transparency varies it is the mask, unless the opaque
+    pixels are drawn in black and white themselves; then both count. Masks are never inverted.
+
+    Args:
+        path: the file
+        size: width and height to scale to
+        calibrated: see `open_picture`
+
+    Raises:
+        ProgdfError: as `open_picture`, or the picture is a map of labels in several colors.
+    """
+    picture = open_picture(path, size, calibrated, two_values=True)
+    alpha = _varying_alpha(picture)
+    if picture.mode not in ("1", "L", "LA"):
+        picture = picture.convert("RGBA").convert("RGB")  # RGBA first, as palettes may be transparent
+    elif picture.mode == "LA":
+        picture = picture.getchannel("L")
+    channels = np.asarray(picture.convert("RGB"))
+    gray: np.ndarray = channels.max(axis=2)
+    if alpha is not None:
+        opaque = gray[alpha >= _OPAQUE]
+        gray = alpha if not _is_drawn(opaque) else np.minimum(gray, alpha)
+    else:
+        _check_labels(path, picture.convert("RGB"))
+    values = np.flatnonzero(np.bincount(gray.ravel(), minlength=256))
+    if len(values) == 2 and values[0] == 0:
+        gray = np.where(gray > 0, 255, 0).astype(np.uint8)
+    mask = Image.fromarray(gray)
+    if mask.size != size:
+        mask = mask.resize(size, Image.Resampling.BOX)
+    return torch.from_numpy(np.asarray(mask, dtype=np.float32) / 255.0)
+
+
+def _varying_alpha(picture: Image.Image) -> np.ndarray | None:
+    """Return the transparency of a picture; None where it has none or it is the same everywhere. [H,W] uint8"""
+    if not picture.has_transparency_data:
+        return None
+    alpha = np.asarray(picture.convert("RGBA").getchannel("A"))
+    return None if alpha.min() == alpha.max() else alpha
+
+
+def _is_drawn(opaque: np.ndarray) -> bool:
+    """Return whether pixels are a drawing in black and white: both occur, and hardly anything else. [P] uint8"""
+    black = float((opaque <= _BLACK).mean()) if len(opaque) else 0.0
+    white = float((opaque >= _WHITE).mean()) if len(opaque) else 0.0
+    return min(black, white) >= _DRAWN_SHARE and black + white >= 0.9
+
+
+def _check_labels(path: Path, picture: Image.Image) -> None:
+    """Raise ProgdfError where an RGB picture has few colors, and among them two hues: a map of labels."""
+    colors = picture.getcolors(_MAX_LABEL_COLORS) or []
+    hues = set()
+    for _, color in colors:
+        brightest = max(color)  # type: ignore[arg-type]
+        if brightest < _LABEL_BRIGHTNESS:
+            continue
+        hues.add(tuple(round(4 * channel / brightest) for channel in color))  # type: ignore[union-attr]
+    hues.discard((4, 4, 4))
+    if len(hues) > 1:
+        raise ProgdfError(
+            f"{path} has {len(hues)} colors beside gray, as a map of labels has; "
+            "save the one thing white on black"
+        )
 
 
 def contact_sheet(

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from PIL import Image
 from rich.progress import track
 from torch import Tensor
 
@@ -18,7 +17,7 @@ from progdf.camera import Camera, undistort
 from progdf.errors import ProgdfError
 from progdf.gaussians import ZERO, Gaussians, Origin
 from progdf.io.cameras import load_cameras, save_cameras
-from progdf.io.images import flatten_onto, open_picture
+from progdf.io.images import read_mask
 from progdf.io.picture_camera import edits_in_picture
 from progdf.io.picture_files import PictureFolder
 from progdf.region import Region, from_mask
@@ -73,11 +72,8 @@ def read_masks(folder: Path, cameras: Sequence[Camera], bent: bool = False) -> l
 
 
 def _mask(path: Path, camera: Camera, bent: bool) -> Tensor:
-    size = (camera.width, camera.height)
-    gray = flatten_onto(open_picture(path, size, calibrated=bent), "black").convert("L")
-    if gray.size != size:
-        gray = gray.resize(size, Image.Resampling.BOX)
-    mask = torch.from_numpy(np.asarray(gray, dtype=np.float32) / 255.0)
+    """Return the mask of a camera at its size, straight. [H,W] float32 0..1"""
+    mask = read_mask(path, (camera.width, camera.height), calibrated=bent)
     if bent and camera.lens:
         return undistort(mask[..., None].expand(-1, -1, 3), camera.K, camera.lens)[0][..., 0]
     return mask
@@ -123,6 +119,10 @@ def region_kinds(request: RegionRequest) -> dict[str, Kind]:
         cameras = _cameras(file, scene)
         masks = read_masks(folder, cameras, bent)
         count = sum(mask is not None for mask in masks)
+        if not any(bool(mask.any()) for mask in masks if mask is not None):
+            raise ProgdfError(
+                f"none of the {count} masks in {folder} has a bright pixel; paint the thing white on black"
+            )
         if request.say is not None and count < len(masks):
             request.say(f"{count} of {len(masks)} cameras have a mask; the others tell nothing")
         return _lift(scene, cameras, masks, f"{kind}:{text}", request)

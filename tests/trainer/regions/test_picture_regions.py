@@ -183,6 +183,9 @@ def test_a_camera_without_a_mask_tells_nothing_and_none_at_all_is_one_line(
 def test_masks_that_select_nothing_tell_the_highest_score(masks: Path, tmp_path: Path) -> None:
     for path in masks.glob("*.png"):
         Image.new("L", (SIZE, SIZE)).save(path)
+    assert "none of the 6 masks" in refusal(f"masks:{masks}", settings(tmp_path))
+    for path in masks.glob("*.png"):
+        Image.fromarray(np.pad(np.full((1, 1), 255, np.uint8), (0, SIZE - 1))).save(path)
     assert "highest score is 0" in refusal(f"masks:{masks}", settings(tmp_path))
 
 
