@@ -163,7 +163,7 @@ def digest_of(shared: AblationSetup, variant: Variant, seed: int, optimization: 
 
 
 def _read_edited(run: FinishedRun, views: Sequence[View], strength: float) -> Sequence[Tensor]:
-    return read_views(run.folder, "edited", [view.camera.name for view in views], strength)
+    return read_views(run.folder, "edited", [view.camera for view in views], strength)
 
 
 def _thin(values: Sequence[_T], count: int) -> list[_T]:

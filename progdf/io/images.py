@@ -281,7 +281,7 @@ def read_mask(path: Path, size: tuple[int, int], calibrated: bool = False) -> Te
 
 
 def _varying_alpha(picture: Image.Image) -> np.ndarray | None:
-    """Return the transparency of a picture; None where it has none or it is the same everywhere. [H,W] uint8"""
+    """Return a picture's transparency, [H,W] uint8; None where it is the same everywhere."""
     if not picture.has_transparency_data:
         return None
     alpha = np.asarray(picture.convert("RGBA").getchannel("A"))
@@ -289,7 +289,7 @@ def _varying_alpha(picture: Image.Image) -> np.ndarray | None:
 
 
 def _is_drawn(opaque: np.ndarray) -> bool:
-    """Return whether pixels are a drawing in black and white: both occur, and hardly anything else. [P] uint8"""
+    """Return whether pixels are a drawing in black and white, with hardly anything else. [P] uint8"""
     black = float((opaque <= _BLACK).mean()) if len(opaque) else 0.0
     white = float((opaque >= _WHITE).mean()) if len(opaque) else 0.0
     return min(black, white) >= _DRAWN_SHARE and black + white >= 0.9

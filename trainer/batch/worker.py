@@ -25,7 +25,6 @@ from progdf.formats.scene_file import load_scene
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import load_gdf
 from progdf.io.atomic import LOCK, atomic_write, hold_lock, is_locked
-from progdf.io.cameras import load_cameras
 from progdf.io.images import to_picture
 from progdf.rasterize import render
 from progdf.terminal import signal_main_thread
@@ -34,7 +33,7 @@ from trainer.resolve import resolve
 from trainer.run.finish import RunResult
 from trainer.run.run import check_command, select_region, train
 from trainer.store.pretrained import Shared, keep_models
-from trainer.store.run_folder import RunFolder
+from trainer.store.run_folder import RunFolder, read_run_cameras
 from trainer.views.view import BACKGROUND
 
 from .jobs import Job
@@ -129,13 +128,14 @@ def _is_begun(folder: RunFolder) -> bool:
 def _write_preview(result: RunResult, scene: Gaussians) -> None:
     """The edit at one half and at 1, from the held-out view that shows most of the region."""
     folder, gdf = result.folder, load_gdf(result.gdf, scene)
-    cameras = {camera.name: camera for camera in load_cameras(folder.cameras, scene.origin)}
+    judging = result.report["views"]["edit"]
+    cameras = {camera.name: camera for camera in read_run_cameras(folder, judging, scene.origin)}
 
     def coverage(name: str) -> float:
         with Image.open(folder.view("mask", name)) as mask:
             return float(np.asarray(mask, dtype=np.float32).mean())
 
-    camera = cameras[max(result.report["views"]["edit"], key=coverage)]
+    camera = cameras[max(judging, key=coverage)]
     scale = _PREVIEW_SIDE / max(camera.width, camera.height)
     small = camera.resize(max(1, round(camera.width * scale)), max(1, round(camera.height * scale)))
     with torch.no_grad():

@@ -70,7 +70,7 @@ def view_consistency(opened: OpenedRun, perceptual: Perceptual) -> Consistency:
     edited = edited_scene(opened.setup.scene, opened.gdf)
     pictures_by_side = {
         EDITED: [render_view(edited, view.camera, background).clamp(0, 1) for view in views],
-        EDITOR: read_views(opened.run.folder, "edited", [view.camera.name for view in views]),
+        EDITOR: read_views(opened.run.folder, "edited", [view.camera for view in views]),
         UNEDITED: [view.image for view in views],
     }
     seen = {

@@ -258,7 +258,7 @@ def _measure_paint(
     """How much of changed pictures is in the edit; None where it was not made of such."""
     if not files:
         return None
-    pictures = read_views(folder, "edited", [view.camera.name for view in setup.train], 1.0)
+    pictures = read_views(folder, "edited", [view.camera for view in setup.train], 1.0)
     backgrounds = [  # a run may be fitted again when its pictures are gone
         picture_background(setup.scene, file, view.camera) if file.is_file() else setup.background
         for file, view in zip(files, setup.train, strict=True)
@@ -331,8 +331,8 @@ def load_evaluator(
     gdf: Gdf | None = None,
 ) -> Evaluator:
     """Some views beside their edited pictures, as the run keeps them; `gdf`: an edit that may add rows."""
-    names = [view.camera.name for view in views]
-    edited = {s: read_views(folder, "edited", names, s) for s in trajectory.strengths}
+    cameras = [view.camera for view in views]
+    edited = {s: read_views(folder, "edited", cameras, s) for s in trajectory.strengths}
     scene, region, channels = setup.scene, setup.region, trajectory.end.shape[1]
     still = only_recolors(trajectory.offsets)
     if gdf is not None and gdf.added is not None:

@@ -14,13 +14,12 @@ from progdf.errors import ProgdfError
 from progdf.field.trajectory import Trajectory, load_trajectory
 from progdf.formats.scene_file import load_scene, scene_file
 from progdf.gaussians import Gaussians
-from progdf.io.cameras import load_cameras
 from progdf.io.json_values import convert_json
 from progdf.region import Region
 from trainer.options import EditKind, TrainOptions
 from trainer.resolve import check_name
 from trainer.setup import TrainingSetup, whole_views, widen_views
-from trainer.store.run_folder import RunFolder, read_views
+from trainer.store.run_folder import RunFolder, read_run_cameras, read_views
 from trainer.views.view import make_view, with_near_plane
 
 
@@ -115,10 +114,15 @@ def reopen_run(root: Path, scene: Path | None = None) -> FinishedRun:
 
 
 def render_run_views(run: FinishedRun) -> TrainingSetup:
-    """The run's views, rendered; their boxes hold the region, not what an edit may show beside it."""
+    """Render the run's views; their boxes hold the region, not what an edit may show beside it.
+
+    Raises:
+        ProgdfError: cameras.json is not of the run's pictures, see `read_run_cameras`.
+    """
     background = torch.tensor(run.record.background)
     held_out = set(run.record.held_out)
-    cameras = with_near_plane(load_cameras(run.folder.cameras, run.scene.origin), run.scene)
+    found = read_run_cameras(run.folder, run.record.held_out, run.scene.origin)
+    cameras = with_near_plane(found, run.scene)
     views = [make_view(run.scene, run.region, camera, background) for camera in cameras]
     return TrainingSetup(
         run.scene,
@@ -134,7 +138,7 @@ def render_edited_views(run: FinishedRun) -> TrainingSetup:
     setup = render_run_views(run)
     if run.record.plan.optimize.as_printed:
         return whole_views(setup)
-    names = [view.camera.name for view in setup.train]
+    cameras = [view.camera for view in setup.train]
     return widen_views(
-        setup, {s: read_views(run.folder, "edited", names, s) for s in run.trajectory.strengths}
+        setup, {s: read_views(run.folder, "edited", cameras, s) for s in run.trajectory.strengths}
     )

@@ -437,7 +437,9 @@ def _edit_views(
         try:
             on_the_way = done.values["on_the_way"]
             for s in done.values["strengths"]:
-                made[s] = read_views(folder, "edited", names if s == 1.0 else on_the_way, s)
+                wanted = set(names if s == 1.0 else on_the_way)
+                cameras = [view.camera for view in views if view.camera.name in wanted]
+                made[s] = read_views(folder, "edited", cameras, s)
             approach = Approach(*(done.values[name] for name in ("kind", "group_steps", "grow")))
             trial = done.values["trial"]
             log.say("the edited views are on disk")

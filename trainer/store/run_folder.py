@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -23,11 +24,16 @@ from typing import Any, TypeVar, overload
 import torch
 from torch import Tensor
 
+from progdf.camera import Camera
+from progdf.color.edits import number_of
 from progdf.errors import ProgdfError
 from progdf.field.trajectory import FILE_NAME
+from progdf.gaussians import Origin
 from progdf.io import atomic
-from progdf.io.images import read_picture, write_image
+from progdf.io.cameras import load_cameras
+from progdf.io.images import picture_size, read_picture, write_image
 from progdf.io.json_values import convert_json, decode_json
+from progdf.io.picture_files import is_view_name
 from progdf.threads import map_threads
 
 from .state import StateFolder
@@ -56,14 +62,22 @@ def remove_pictures_but_of(folder: Path, views: Collection[str]) -> None:
     entries = []
     for line in read_list(folder):
         path = folder / line
-        parts = (*PurePosixPath(line).parent.parts, path.stem)
-        tails = ("/".join(parts[first:]) for first in range(len(parts)))
-        if any(tail in views for tail in tails) or not _is_inside(folder, line):
+        if _is_of_view(line, views) or not _is_inside(folder, line):
             entries.append(line)
         elif os.path.isfile(path):  # pathlib's raises where a name is too long
             path.unlink()
     if read_list(folder) != entries:
         _write(folder, entries)
+
+
+def _is_of_view(line: str, views: Collection[str]) -> bool:
+    """Return whether a listed file is a view's: VIEW.png, KIND/VIEW.png or KIND/0.25/VIEW.png."""
+    path = PurePosixPath(line)
+    parts = (*path.parent.parts, path.stem)
+    folders = 1
+    if len(parts) > 2 and math.isfinite(number_of(parts[1])):
+        folders = 2
+    return any("/".join(parts[first:]) in views for first in range(folders + 1))
 
 
 def _is_inside(folder: Path, line: str) -> bool:
@@ -235,22 +249,67 @@ def write_views(folder: RunFolder, kind: str, pictures: Mapping[str, Tensor], st
     add_pictures(folder.views, paths)
 
 
-def read_views(folder: RunFolder, kind: str, names: Iterable[str], strength: float = 1.0) -> Sequence[Tensor]:
-    """The pictures of the named views, see `stored_pictures`. [H,W,3] each
+def read_views(
+    folder: RunFolder, kind: str, cameras: Iterable[Camera], strength: float = 1.0
+) -> Sequence[Tensor]:
+    """Return the pictures of the cameras' views, see `stored_pictures`. [H,W,3] each
 
     Raises:
-        ProgdfError: one is missing or broken.
+        ProgdfError: a picture is missing, broken, or of another size than its camera.
     """
+    remedy = "train again, with --resume if the run was stopped"
 
-    def read(name: str) -> Tensor:
-        path = folder.view(kind, name, strength)
+    def read(camera: Camera) -> Tensor:
+        path = folder.view(kind, camera.name, strength)
         try:
-            return read_picture(path)
+            picture = read_picture(path)
         except ProgdfError as error:
-            what = "is damaged" if path.is_file() else "is missing"
-            raise ProgdfError(f"{path} {what}; train again, with --resume if the run was stopped") from error
+            fault = "is damaged" if path.is_file() else "is missing"
+            raise ProgdfError(f"{path} {fault}; {remedy}") from error
+        height, width = picture.shape[:2]
+        if (width, height) != (camera.width, camera.height):
+            expected = f"{camera.width}x{camera.height}"
+            raise ProgdfError(f"{path} is {width}x{height} pixels, its view {expected}; {remedy}")
+        return picture
 
-    return stored_pictures(map(read, names))
+    return stored_pictures(map(read, cameras))
+
+
+def read_run_cameras(folder: RunFolder, held_out: Iterable[str], origin: Origin) -> list[Camera]:
+    """Return the cameras of a run's views, after a comparison with the pictures that the run wrote.
+
+    Args:
+        folder: a finished run
+        held_out: names of the views that the edit was not trained on
+        origin: of the scene, which the cameras are relative to
+
+    Raises:
+        ProgdfError: cameras.json is broken, or its views differ from the run's in names, number or size.
+    """
+    cameras = load_cameras(folder.cameras, origin)
+    remedy = f"restore {folder.cameras}, or train again"
+    names = [camera.name for camera in cameras]
+    for name in names:
+        if not is_view_name(name):
+            raise ProgdfError(f"{folder.cameras} has a camera named '{name}', which names no view; {remedy}")
+        if names.count(name) > 1:
+            raise ProgdfError(f"{folder.cameras} has {names.count(name)} cameras named {name}; {remedy}")
+    originals = [PurePosixPath(line) for line in read_list(folder.views) if line.startswith("original/")]
+    written = [path.relative_to("original").with_suffix("").as_posix() for path in originals]
+    for name in (*written, *held_out):
+        if name not in names:
+            raise ProgdfError(f"{folder.cameras} lacks the camera of the run's view {name}; {remedy}")
+    for camera in cameras:
+        path = folder.view("original", camera.name)
+        if not path.is_file():
+            continue
+        width, height = picture_size(path)
+        if (width, height) != (camera.width, camera.height):
+            raise ProgdfError(
+                f"{folder.cameras} has the view {camera.name} with {camera.width}x{camera.height} pixels, "
+                f"{path} has {width}x{height}; {remedy}"
+            )
+    return cameras
 
 
 class LazySequence(Sequence[_T]):

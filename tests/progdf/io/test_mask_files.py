@@ -1,4 +1,4 @@
-"""Masks in the forms in which programs write them: gray, palette, 1 to 32 bits, the shape in color or in alpha."""
+"""Masks in the forms in which programs write them."""
 
 from __future__ import annotations
 

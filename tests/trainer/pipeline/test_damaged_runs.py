@@ -9,12 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from PIL import Image
 from torch import Tensor
 
+from progdf.errors import ProgdfError
 from progdf.field.trajectory import load_trajectory, save_trajectory
 from tests.helpers.refused import refusal
 from tests.helpers.trained import quick_options, train, write_bear
-from trainer.run.record import reopen_run
+from trainer.run.record import render_edited_views, reopen_run
 
 Change = Callable[[dict[str, Any], dict[str, Tensor]], object]
 
@@ -54,3 +56,43 @@ def test_what_a_trajectory_tells_is_checked_before_it_is_used(
     change(about, extra)
     save_trajectory(path, trajectory, extra, about)
     assert "is damaged" in refusal(lambda path: reopen_run(path.parent), path)
+
+
+def change_cameras(root: Path, change: Callable[[list[dict[str, Any]]], object]) -> None:
+    path = root / "cameras.json"
+    content = json.loads(path.read_text())
+    change(content["cameras"])
+    path.write_text(json.dumps(content))
+
+
+CAMERA_CHANGES: dict[str, tuple[Callable[[list[dict[str, Any]]], object], str]] = {
+    "another size": (lambda cameras: cameras[0].update(width=49), "with 49x48 pixels, .*has 48x48"),
+    "a huge size": (lambda cameras: cameras[0].update(height=900_000), "with 48x900000 pixels"),
+    "one less": (lambda cameras: cameras.pop(), "lacks the camera of the run's view"),
+    "one twice": (lambda cameras: cameras.append(cameras[0]), "has 2 cameras named"),
+    "another name": (lambda cameras: cameras[0].update(name="other"), "lacks the camera of the run's view"),
+    "a name that leads elsewhere": (lambda cameras: cameras[0].update(name="../x"), "which names no view"),
+}
+
+
+@pytest.mark.parametrize("name", CAMERA_CHANGES)
+def test_cameras_that_are_not_the_runs_are_refused_by_file(name: str, run: Path, tmp_path: Path) -> None:
+    root = tmp_path / "run"
+    shutil.copytree(run, root)
+    render_edited_views(reopen_run(root))
+    change, message = CAMERA_CHANGES[name]
+    change_cameras(root, change)
+    with pytest.raises(ProgdfError, match=f"{root}/cameras.json .*{message}") as caught:
+        render_edited_views(reopen_run(root))
+    assert "\n" not in str(caught.value)
+
+
+def test_an_edited_view_of_another_size_is_refused_by_file(run: Path, tmp_path: Path) -> None:
+    root = tmp_path / "run"
+    shutil.copytree(run, root)
+    for path in sorted((root / "views" / "edited").glob("*.png")):
+        Image.new("RGB", (40, 48)).save(path)
+    with pytest.raises(
+        ProgdfError, match=r"views/edited/.*\.png is 40x48 pixels, its view 48x48; train"
+    ):
+        render_edited_views(reopen_run(root))

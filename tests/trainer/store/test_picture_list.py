@@ -39,8 +39,10 @@ def test_pictures_in_subfolders_stay_while_their_view_does(tmp_path: Path) -> No
     folder = RunFolder(tmp_path)
     for strength in (0.25, 1.0):
         write_views(folder, "edited", {"cam0/1": PICTURE, "cam1/1": PICTURE}, strength)
-    remove_stale_views(folder, ["cam1/1"])
-    assert files(folder.views) == {"edited/cam1/1.png", "edited/0.25/cam1/1.png", "pictures.txt"}
+    write_views(folder, "edited", {"1": PICTURE})
+    remove_stale_views(folder, ["cam1/1", "1"])
+    kept = {"edited/1.png", "edited/cam1/1.png", "edited/0.25/cam1/1.png"}
+    assert files(folder.views) == {*kept, "pictures.txt"}
 
 
 def test_pictures_of_ones_own_stay_whatever_they_are_called(tmp_path: Path) -> None:
