@@ -92,7 +92,5 @@ def test_an_edited_view_of_another_size_is_refused_by_file(run: Path, tmp_path: 
     shutil.copytree(run, root)
     for path in sorted((root / "views" / "edited").glob("*.png")):
         Image.new("RGB", (40, 48)).save(path)
-    with pytest.raises(
-        ProgdfError, match=r"views/edited/.*\.png is 40x48 pixels, its view 48x48; train"
-    ):
+    with pytest.raises(ProgdfError, match=r"views/edited/.*\.png is 40x48 pixels, its view 48x48; train"):
         render_edited_views(reopen_run(root))
