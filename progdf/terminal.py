@@ -120,6 +120,21 @@ class PrintableFormatter(logging.Formatter):
         return escape_text(super().format(record))
 
 
+@contextmanager
+def notice_when_slow(text: str, seconds: float = 1.0) -> Iterator[None]:
+    """Print a line to stderr, if that is a terminal, once the block has taken so many seconds."""
+    if not sys.stderr.isatty():
+        yield
+        return
+    notice = threading.Timer(seconds, print, [escape_text(text)], {"file": sys.stderr, "flush": True})
+    notice.daemon = True
+    notice.start()
+    try:
+        yield
+    finally:
+        notice.cancel()
+
+
 def format_count(count: int, noun: str = "Gaussian") -> str:
     """1 as "1 Gaussian", 12345 as "12 345 Gaussians"."""
     return f"{group_digits(count)} {noun}{'' if count == 1 else 's'}"

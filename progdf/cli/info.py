@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
-import torch
+import numpy as np
 import tyro
 
 from progdf.errors import ProgdfError
@@ -26,7 +26,14 @@ from progdf.scene import UpChoice
 from progdf.scene.bounds import is_surrounding, scene_sphere
 from progdf.scene.strays import find_strays
 from progdf.scene.up_axis import UpAxis, find_up
-from progdf.terminal import file_size, format_count, format_place, group_digits, print_line
+from progdf.terminal import (
+    file_size,
+    format_count,
+    format_place,
+    group_digits,
+    notice_when_slow,
+    print_line,
+)
 
 from .options import absent_option, parse_options
 
@@ -95,10 +102,12 @@ def survey(scene: Gaussians, up: UpAxis | None = None) -> Survey:
 
 
 def _corners(scene: Gaussians, left_out: float) -> tuple[float, ...]:
-    """Least x, y, z and largest x, y, z of what is left without a share of the means on each side."""
-    ordered = scene.means.sort(dim=0).values
-    cut = int(left_out * len(ordered))
-    ends = torch.cat([ordered[cut], ordered[len(ordered) - 1 - cut]]).tolist()
+    """Return least x, y, z and largest x, y, z of the means without a share of them on each side."""
+    means = scene.means.numpy()
+    first = int(left_out * len(means))
+    last = len(means) - 1 - first
+    columns = [np.partition(column, (first, last)) for column in means.T]
+    ends = [float(column[row]) for row in (first, last) for column in columns]
     return tuple(at + end for at, end in zip(2 * scene.origin, ends, strict=True))
 
 
@@ -168,11 +177,13 @@ def kind_of(path: str | os.PathLike[str]) -> str:
 
 
 def _scene_lines(path: Path, cameras: Path | None, up: UpChoice) -> Iterator[str]:
+    """Describe a scene: its repairs, its size and place, and its strays."""
     scene, report = load_scene_with_report(path)
     views = [] if cameras is None else load_cameras(cameras, scene.origin)
     yield from report.lines()
     yield from survey(scene, find_up(scene, views, up, path)).lines()
-    strays = find_strays(scene)
+    with notice_when_slow(f"looking for strays among {format_count(len(scene))} …"):
+        strays = find_strays(scene)
     if len(strays.rows):
         clean = f"progdf edit {shlex.quote(str(path))} --clean -o CLEAN.ply leaves them out"
         yield f"strays: {strays.describe()}; {clean}"

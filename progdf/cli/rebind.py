@@ -15,7 +15,6 @@ import numpy as np
 import torch
 import tyro
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from progdf.errors import ProgdfError
 from progdf.field.baked import AttributeBases, BakedField
@@ -25,6 +24,7 @@ from progdf.gaussians import BASE_CHANNELS, Gaussians
 from progdf.gdf.file import Gdf, fingerprint, load_gdf, save_gdf
 from progdf.io.atomic import check_not_an_input
 from progdf.region import Region
+from progdf.scene.point_tree import PointTree
 from progdf.sh import sh0_to_rgb
 from progdf.terminal import print_line
 
@@ -93,11 +93,10 @@ def main(argv: Sequence[str]) -> int:
 
 
 def match_scenes(a: Gaussians, b: Gaussians) -> Match:
-    """The Gaussian of A that each one of B is; both hold at least one."""
+    """Return the Gaussian of A that each one of B is; both hold at least one."""
     k = min(_CANDIDATES, len(a))
     places = b.means.numpy() + np.subtract(b.origin, a.origin)  # relative to A's origin, float64
-    distances, candidates = cKDTree(a.means.numpy()).query(places, k=k, workers=-1)
-    distances, candidates = distances.reshape(len(b), k), candidates.reshape(len(b), k)
+    distances, candidates = PointTree(a.means.numpy(), k).query(places, k)
     sizes = a.scales.amax(dim=1).numpy()
     typical = max(float(np.median(sizes)), 1e-12)
     color = np.abs(_colors(a)[candidates] - _colors(b)[:, None]).max(axis=2)

@@ -1,4 +1,4 @@
-"""Nearest neighbors of points: the one k-nearest-neighbors, through scipy's k-d tree."""
+"""Selections that change by the nearest neighbors of their Gaussians."""
 
 from __future__ import annotations
 
@@ -9,12 +9,11 @@ import torch
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from progdf.gaussians import Gaussians
-from progdf.threads import threads
 
+from .point_tree import PointTree
 from .scribbles import Scribbles
 from .selection import Floats, Mask, alike_in_color, base_colors
 
@@ -23,7 +22,6 @@ _REACH = 3.0  # times how far neighbors commonly are; what is farther is none, a
 _TOUCH = 1.0
 RIM_PERCENT = 35
 _MIDDLE, _DEEP = 0.6, 0.95  # what is held lies as deep as this share of the rim, or of what a thin part has
-_WORTH_THREADS = 2000  # Gaussians of which the neighbors are sought
 
 
 class Neighborhood:
@@ -37,14 +35,14 @@ class Neighborhood:
         self._scene = scene
         self._points = np.nan_to_num(scene.means.numpy().astype(np.float64))
         self._sizes = np.exp(scene.log_scales.numpy().max(axis=1))
-        self._tree = cKDTree(self._points, balanced_tree=False, compact_nodes=False)
+        self._tree = PointTree(self._points, _AROUND + 1)
 
     def grow(self, mask: Mask) -> Mask:
-        """With the nearest neighbors of what is selected. [N]"""
+        """Return the mask with the nearest neighbors of its Gaussians. [N]"""
         near, reached = self._near(np.flatnonzero(mask), _RING)
         grown = mask.copy()
         grown[near[reached]] = True
-        return grown
+        return self._tree.with_copies(grown)
 
     def shrink(self, mask: Mask) -> Mask:
         """Without what has a nearest neighbor that is not selected. [N]"""
@@ -98,48 +96,53 @@ class Neighborhood:
         largest = np.zeros_like(mask)
         if not len(rows):
             return largest
-        tree = cKDTree(self._points[rows])
+        tree = PointTree(self._points[rows], _LINKS + 1)
         start, end = self._links(tree, rows, np.arange(len(rows)))
         part = join_pairs(start, end, len(rows))
         largest[rows[part == np.bincount(part).argmax()]] = True
         return largest
 
     def connected_part(self, mask: Mask, seeds: NDArray[np.int64]) -> Mask:
-        """What of `mask` is connected within it with any of the rows `seeds` that are in it. [N]"""
+        """Return the part of `mask` that is connected within it with any of the rows `seeds` in it. [N]"""
         rows = np.flatnonzero(mask)
         reached = np.zeros(len(rows), bool)
         frontier = np.flatnonzero(np.isin(rows, seeds))
-        if len(frontier):
-            tree = cKDTree(self._points[rows], balanced_tree=False, compact_nodes=False)
+        part = np.zeros_like(mask)
+        if not len(frontier):
+            return part
+        tree = PointTree(self._points[rows], _LINKS + 1)
         while len(frontier):
             reached[frontier] = True
-            end = self._links(tree, rows, frontier)[1]
-            frontier = np.unique(end[~reached[end]])
-        part = np.zeros_like(mask)
+            linked = np.zeros(len(rows), bool)
+            linked[self._links(tree, rows, frontier)[1]] = True
+            frontier = np.flatnonzero(tree.with_copies(linked) & ~reached)
         part[rows[reached]] = True
         return part
 
     def nearest(self, point: tuple[float, float, float]) -> int:
-        """The Gaussian whose center is nearest to a point, world units."""
-        return int(self._tree.query(point)[1])
+        """Return the Gaussian whose center is nearest to a point in world units."""
+        rows = self._tree.query(np.asarray(point)[None], 1)[1]
+        return int(rows[0, 0])
 
     def _near(self, rows: NDArray[np.int64], k: int) -> tuple[NDArray[np.int64], Mask]:
-        """The k nearest others of some Gaussians [M,k], and which of them are within reach [M,k]."""
+        """Return the k nearest others of some Gaussians [M,k], and which of them are within reach [M,k]."""
         k = min(k, len(self._points) - 1)
         if not len(rows) or k < 1:
             return np.zeros((len(rows), 0), np.int64), np.zeros((len(rows), 0), bool)
-        distances, near = self._tree.query(self._points[rows], k + 1, workers=threads())
-        distances, near = distances[:, 1:], near[:, 1:]
+        distances, near = self._tree.query(self._points[rows], k + 1)
+        distances = distances[:, 1:]
+        near = near[:, 1:]
         return near, distances <= _REACH * np.median(distances[:, -1])
 
     def _links(
-        self, tree: cKDTree, rows: NDArray[np.int64], some: NDArray[np.int64]
+        self, tree: PointTree, rows: NDArray[np.int64], some: NDArray[np.int64]
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """The pairs of connected ones in a tree of `rows`, of which `some` begin; all as places in `rows`."""
+        """Return the pairs of touching Gaussians in a tree of `rows` that begin in `some`.
+
+        Both ends of a pair are indices into `rows`, as `some` is.
+        """
         k = min(_LINKS + 1, len(rows))
-        workers = threads() if len(some) > _WORTH_THREADS else 1
-        distances, near = tree.query(self._points[rows[some]], k, workers=workers)
-        distances, near = distances.reshape(len(some), k), near.reshape(len(some), k)
+        distances, near = tree.query(self._points[rows[some]], k)
         sizes = self._sizes[rows]
         touch = distances <= _TOUCH * (sizes[some][:, None] + sizes[near])
         return np.broadcast_to(some[:, None], near.shape)[touch], near[touch]
@@ -148,12 +151,9 @@ class Neighborhood:
 def _distances(
     points: NDArray[np.float64], to: NDArray[np.int64], rows: NDArray[np.int64], most: float
 ) -> NDArray[np.float64]:
-    """From each of some rows to the nearest of others, infinite beyond `most`. [R]"""
-    tree = cKDTree(points[to], balanced_tree=False, compact_nodes=False)
-    found: NDArray[np.float64] = tree.query(
-        points[rows], distance_upper_bound=most, workers=threads() if len(rows) > _WORTH_THREADS else 1
-    )[0]
-    return found
+    """Return the distance from each of some rows to the nearest of others, infinite beyond `most`. [R]"""
+    distances = PointTree(points[to], 1).query(points[rows], 1, within=most)[0]
+    return distances[:, 0]
 
 
 def grow_along_surface(
@@ -181,7 +181,7 @@ def join_pairs(start: NDArray[np.integer], end: NDArray[np.integer], count: int)
 
 
 def nearest_rows(points: Tensor, rows: Tensor, k: int, workers: int = 1) -> tuple[Tensor, Tensor]:
-    """The k nearest other points of some of the points, exactly.
+    """Return the k nearest other points of some of the points, exactly.
 
     Args:
         points: all points, finite. [N,3]
@@ -194,8 +194,7 @@ def nearest_rows(points: Tensor, rows: Tensor, k: int, workers: int = 1) -> tupl
     """
     k = min(k, len(points) - 1)
     places = points.double().numpy()
-    distances, neighbors = cKDTree(places).query(places[rows.numpy()], k + 1, workers=workers)
-    distances, neighbors = distances.reshape(len(rows), k + 1), neighbors.reshape(len(rows), k + 1)
+    distances, neighbors = PointTree(places, k + 1).query(places[rows.numpy()], k + 1, workers=workers)
     dropped = neighbors == rows.numpy()[:, None]
     dropped[~dropped.any(axis=1), -1] = True  # more points than k in its own place, and it is not among them
     others = ~dropped

@@ -15,11 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import coo_array, csr_array
-from scipy.spatial import cKDTree
 
 from progdf.rasterize.cpu.jit import Number, kernel
-from progdf.threads import threads
 
+from .point_tree import PointTree
 from .selection import Floats, Mask, Surface
 
 Rows = NDArray[np.int64]
@@ -74,14 +73,14 @@ def rows_under(painted: Mask, seen: Surface) -> Rows:
 
 
 def likely_steps(points: NDArray[np.floating], colors: Floats) -> csr_array:
-    """How likely each step between neighbors is, the same both ways. [N,N]"""
+    """Return how likely each step between neighbors is, the same both ways. [N,N]"""
     count = len(points)
     k = min(_NEAREST, count - 1)
     if k < 1:
         return csr_array((count, count), dtype=np.float32)
-    tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
-    apart, near = tree.query(points, k + 1, workers=threads())
-    apart, near = apart[:, 1:], near[:, 1:].astype(np.int32)
+    apart, near = PointTree(points, k + 1).query(points, k + 1)
+    apart = apart[:, 1:]
+    near = near[:, 1:].astype(np.int32)
     spacing = np.maximum(np.median(apart, axis=1), 1e-30)
     far = apart * apart / (spacing[:, None] * spacing[near])
     unlike = np.linalg.norm(colors[:, None] - colors[near], axis=2)

@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from progdf.scene.neighbors import join_pairs, nearest_rows
+from progdf.scene.point_tree import PointTree
 from progdf.similarity import Motion, Parts, move_rows
 from trainer.views.crops import CropScene
 
@@ -76,7 +77,10 @@ def _spacing(points: Tensor) -> float:
 
 
 def _join_cells(centroids: Tensor, reach: float) -> Tensor:
-    """Which cells are joined, by however long a chain of cells within reach of each other. [C,3] -> [C]"""
+    """Return the group of each cell: cells within reach of each other share one. [C,3] -> [C]
+
+    No two cells share a place, so the pairs of a cell are bounded by the cells within reach.
+    """
     first, second = cKDTree(centroids.numpy()).query_pairs(reach, output_type="ndarray").T
     return torch.from_numpy(join_pairs(first, second, len(centroids)))
 
@@ -92,7 +96,8 @@ def _join_strays(labels: Tensor, centroids: Tensor, counts: Tensor, least: float
     part = number[part]
     stray, firm = (part >= count).nonzero()[:, 0], (part < count).nonzero()[:, 0]
     if len(stray):
-        part[stray] = part[firm[torch.from_numpy(cKDTree(centroids[firm]).query(centroids[stray])[1])]]
+        nearest = PointTree(centroids[firm].numpy(), 1).query(centroids[stray].numpy(), 1)[1]
+        part[stray] = part[firm[torch.from_numpy(nearest[:, 0])]]
     return part
 
 

@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn.functional import grid_sample, pad
 
@@ -23,6 +22,7 @@ from progdf.gaussians import Gaussians, attribute_slices
 from progdf.gdf.file import ADDED_LOGIT
 from progdf.rasterize.engines import Depth, render_depth
 from progdf.scene.bounds import scene_sphere
+from progdf.scene.point_tree import PointTree
 from progdf.sh import rgb_to_sh0
 from trainer.setup import TrainingSetup
 from trainer.views.crops import CropScene
@@ -70,7 +70,7 @@ def seed_rows(
     rows = len(means) if len(means) > 3 else 0  # fewer have no neighbors to be sized by
     spread = torch.ones(0)
     if rows:
-        near = torch.from_numpy(cKDTree(means.numpy()).query(means.numpy(), 4)[0]).float()
+        near = torch.from_numpy(PointTree(means.numpy(), 4).query(means.numpy(), 4)[0]).float()
         spread = near[:, 1:].square().mean(dim=1).sqrt()
         spread = spread.clamp(spread.quantile(0.1), spread.quantile(0.9)).clamp_min(1e-3 * radius)
     return replace(

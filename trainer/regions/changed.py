@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 import torch
 from scipy import ndimage
-from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn.functional import interpolate
 
@@ -25,6 +24,7 @@ from progdf.gaussians import Gaussians
 from progdf.io.images import save_as
 from progdf.rasterize import alpha_weights
 from progdf.region import Region
+from progdf.scene.point_tree import PointTree
 from progdf.sh import sh0_to_rgb
 from progdf.terminal import format_count
 from trainer.editors.pictures import STEP, STILL, lay_over, move_image, read_change
@@ -201,8 +201,11 @@ def _close_gaps(changed: Tensor) -> Tensor:
 
 
 def _drop_strays(scene: Gaussians, region: Region, evidence: Evidence, inner: Tensor, least: float) -> Region:
-    """The region without connected pieces that show along the rim of what changed, and nowhere else; and
-    without what does not show, and is neither on the surface nor of the color of anything that does."""
+    """Return the region without strays.
+
+    Strays are connected pieces that show along the rim of the change alone, and Gaussians that no picture
+    shows and that have neither the surface nor the color of a visible member.
+    """
     if not len(region):
         return region
     members = scene[region.members]
@@ -215,7 +218,7 @@ def _drop_strays(scene: Gaussians, region: Region, evidence: Evidence, inner: Te
         colors = sh0_to_rgb(members.sh0).numpy()
         shown_colors = colors[kept & ~hidden]
         like = min(len(shown_colors), 1 + int(_FEW * len(shown_colors)))
-        apart = cKDTree(shown_colors).query(colors[hidden], [like])[0][:, 0]
+        apart = PointTree(shown_colors, like).kth_distances(colors[hidden], like)
         likely = region.score[region.members[hidden]] > least + _VOTED
         kept[hidden] &= likely | torch.from_numpy(apart <= _ODD)
     score = region.score.clone()

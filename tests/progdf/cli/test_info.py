@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import json
+import sys
+import threading
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +19,7 @@ from progdf.formats.ply import load_ply, save_ply
 from progdf.gaussians import Gaussians
 from progdf.io.cameras import save_cameras
 from progdf.scene.orbit_rig import orbit_rig
-from progdf.terminal import format_count
+from progdf.terminal import format_count, notice_when_slow
 from tests.helpers.camera_tables import nerfstudio, some_cameras
 from tests.helpers.colmap_text import write_text_model
 from tests.helpers.scenes import random_gaussians
@@ -204,3 +207,41 @@ def test_every_real_file_is_described_or_refused_in_one_line(
             assert status == 2
             assert captured.out == ""
             assert captured.err.count("\n") == 1
+
+
+class Terminal(io.StringIO):
+    """A stderr that is a terminal and knows when a line arrives."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.written = threading.Event()
+
+    def isatty(self) -> bool:
+        return True
+
+    def flush(self) -> None:
+        self.written.set()
+
+
+def test_a_slow_search_is_announced_on_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    with notice_when_slow("looking for strays", seconds=0.0):
+        assert terminal.written.wait(60.0)
+    assert terminal.getvalue() == "looking for strays\n"
+
+
+def test_a_quick_search_prints_no_notice(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    with notice_when_slow("looking for strays", seconds=3600.0):
+        pass
+    timers = [thread for thread in threading.enumerate() if isinstance(thread, threading.Timer)]
+    assert all(timer.finished.is_set() for timer in timers)
+    assert terminal.getvalue() == ""
+
+
+def test_a_slow_search_adds_nothing_to_a_log(capsys: pytest.CaptureFixture[str]) -> None:
+    with notice_when_slow("looking for strays", seconds=0.0):
+        pass
+    assert capsys.readouterr().err == ""

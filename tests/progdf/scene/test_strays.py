@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -14,9 +15,11 @@ from progdf.__main__ import main
 from progdf.formats.ply import load_ply, save_ply
 from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.gdf.file import load_gdf
+from progdf.scene import strays
 from progdf.scene.strays import Strays, clean, find_strays, picture_difference
+from tests.helpers import plain_strays
 from tests.helpers.paths import SHARED_DATA
-from tests.helpers.scenes import concatenate, one_gaussian
+from tests.helpers.scenes import concatenate, one_gaussian, random_gaussians
 from tests.helpers.stacks import bear_stack
 
 ONE_STEP_DB = 20 * np.log10(255)
@@ -116,6 +119,43 @@ def test_what_is_too_transparent_to_be_drawn_changes_no_pixel() -> None:
 def test_few_gaussians_or_many_in_one_place_have_no_strays(count: int) -> None:
     assert find_strays(bear()[:count]).describe() == "none"
     assert find_strays(one_gaussian()[torch.zeros(count, dtype=torch.int64)]).describe() == "none"
+
+
+def crowded() -> Gaussians:
+    """The litter, with a third of the bear's rows at one place."""
+    scene, _ = littered()
+    means = scene.means.clone()
+    means[::3] = scene.means.median(dim=0).values
+    return replace(scene, means=means)
+
+
+@pytest.mark.parametrize("exact", [strays._EXACT, 0])
+@pytest.mark.parametrize("make", [lambda: littered()[0], crowded, bear, lambda: random_gaussians(3000, 1)])
+def test_shortcuts_find_the_strays_of_a_whole_search(
+    make: Callable[[], Gaussians], exact: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(strays, "_EXACT", exact)
+    scene = make()
+    found = find_strays(scene)
+    assert {kind: getattr(found, kind).tolist() for kind in plain_strays.KINDS} == plain_strays.find_strays(
+        scene
+    )
+
+
+def test_a_large_scene_searches_few_neighborhoods(monkeypatch: pytest.MonkeyPatch) -> None:
+    searched = []
+    search = strays._Body._search
+
+    def counted(body: strays._Body, rows: strays.Rows) -> tuple[strays.Floats, strays.Rows]:
+        searched.append(len(rows))
+        return search(body, rows)
+
+    monkeypatch.setattr(strays._Body, "_search", counted)
+    for limit in ("_EXACT", "_SAMPLE", "_LONELY_SAMPLE"):
+        monkeypatch.setattr(strays, limit, 100)
+    scene = concatenate(*[replace(littered()[0], means=littered()[0].means + 50.0 * i) for i in range(5)])
+    assert len(find_strays(scene).rows) == 5 * 23
+    assert sum(searched) < len(scene), "of all rounds together"
 
 
 @pytest.mark.slow
