@@ -148,7 +148,7 @@ def _find_once(scene: Gaussians, drawn: Rows, sizes: Floats, body: _Body, remain
     outside = suspects[body.emptiness(_ends(scene, drawn[suspects])) > max(_fence(usual), np.log(_FAR))]
     every = body.members if len(body.members) <= _EXACT else body.sample(_LONELY_SAMPLE)
     least = max(_fence(body.loneliness(every)), np.log(_FAR))
-    apart = body.untouched()
+    apart = body.find_isolated()
     floaters = apart[body.loneliness(apart) > least]
     return {"giants": outside[giant[outside]], "needles": outside[~giant[outside]], "floaters": floaters}
 
@@ -236,7 +236,7 @@ class _Body:
             lonely.append(np.log(self._spacing_of(some)) - np.log(around))
         return np.concatenate(lonely)
 
-    def untouched(self) -> Rows:
+    def find_isolated(self) -> Rows:
         """Return the members that touch none of the farther half of their neighbors. [M]"""
         rows = self.members[~self._is_enclosed()]
         self._spacing_of(rows)
