@@ -287,6 +287,8 @@ def _join(file: GltfFile, parts: list[Gaussians]) -> Gaussians:
         raise unsupported_error(
             file.path, "parts with and without antialiasing (SPZ)", "export them as separate scenes"
         )
+    if len(parts) == 1:
+        return parts[0]
     count = max(part.shN.shape[1] for part in parts)
     padded = []
     for part in parts:

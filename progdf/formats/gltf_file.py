@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import base64
 import binascii
+import os
 import re
 import struct
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -298,7 +299,8 @@ class GltfFile:
             raise damage_error(
                 self.path, f"{name} replaces {sparse.count} rows, more than its {accessor.count}"
             )
-        indices, replaced = sparse.indices, sparse.values
+        indices = sparse.indices
+        replaced = sparse.values
         if indices.componentType not in _INDEX_TYPES:
             raise damage_error(self.path, f"{name} holds row numbers of type {indices.componentType}")
         index_type = np.dtype(_NUMBER_TYPES[indices.componentType])
@@ -344,13 +346,15 @@ class GltfFile:
         if buffer.uri is None:
             if index or self._binary is None:
                 raise damage_error(self.path, f"buffers[{index}] has neither bytes nor the name of a file")
-            source, data = self.path, self._binary
+            source = self.path
+            data = self._binary
         elif buffer.uri[:5].lower() == "data:":
-            source, data = self.path, self._read_data_uri(buffer.uri, index)
+            source = self.path
+            data = self._read_data_uri(buffer.uri, index)
         else:
             source = self._resolve(buffer.uri, index)
             if source not in self._files:
-                if not source.exists():
+                if not os.path.lexists(source):
                     raise ProgdfError(
                         f"{source} does not exist, which holds numbers of {self.path}; put both in one folder"
                     )
@@ -384,7 +388,8 @@ class GltfFile:
             name = unquote_to_bytes(uri).decode()
         except UnicodeDecodeError:
             name = ""
-        posix, windows = PurePosixPath(name), PureWindowsPath(name)
+        posix = PurePosixPath(name)
+        windows = PureWindowsPath(name)
         outside = posix.is_absolute() or bool(windows.anchor) or ".." in (*posix.parts, *windows.parts)
         if outside or not posix.parts or "\0" in name:
             raise ProgdfError(

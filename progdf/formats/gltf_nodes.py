@@ -131,11 +131,13 @@ def _shape_error(file: GltfFile, placement: Placement) -> ProgdfError:
     while index is not None:
         chain.append(index)
         index = parents.get(index)
-    guilty, matrix = chain[0], placement.matrix
+    guilty = chain[0]
+    matrix = placement.matrix
     for index in reversed(chain):
         local = _local_matrix(file, index, tables.nodes[index])
         if _similarity(local) is None:
-            guilty, matrix = index, local
+            guilty = index
+            matrix = local
             break
     with np.errstate(all="ignore"):
         lengths = np.linalg.norm(matrix[:3, :3], axis=0)

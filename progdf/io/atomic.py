@@ -243,7 +243,7 @@ def open_error(path: str | os.PathLike[str], error: OSError | ValueError) -> Pro
         return ProgdfError(f"{path} cannot be the name of a file; check the name")
     if isinstance(error, FileNotFoundError):
         return ProgdfError(f"{path} does not exist; check the name and the folder")
-    if isinstance(error, IsADirectoryError) or Path(path).is_dir():
+    if isinstance(error, IsADirectoryError) or os.path.isdir(path):
         return ProgdfError(f"{path} is a folder; give the name of a file in it")
     return ProgdfError(f"{path} cannot be read ({error.strerror or error}); check its permissions")
 

@@ -620,12 +620,15 @@ def test_a_gltf_is_not_bundled(tmp_path: Path, capsys: pytest.CaptureFixture[str
         ("none.bin", "none.bin does not exist"),
         (".", "outside its folder"),
         ("folder", "is a folder"),
+        ("9" * 5000, "does not exist"),
+        ("link", "does not exist"),
     ],
 )
 def test_buffers_elsewhere_are_refused(uri: str, said: str, tmp_path: Path) -> None:
     path = one_mesh(small()).write(tmp_path / "a.gltf", uri)
     (tmp_path.parent / "a.bin").write_bytes(b"\0" * 4096)
     (tmp_path / "folder").mkdir()
+    (tmp_path / "link").symlink_to("nowhere")
     with pytest.raises(ProgdfError) as caught:
         load_scene(path)
     assert said in str(caught.value)

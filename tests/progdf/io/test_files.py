@@ -300,3 +300,8 @@ def test_a_link_in_the_place_of_a_lock_is_not_followed(tmp_path: Path) -> None:
     assert not is_locked(tmp_path / LOCK)
     assert (tmp_path / "private").read_text() == "mine"
     assert (tmp_path / "private").stat().st_mode & 0o777 == 0o400
+
+
+def test_a_name_that_is_too_long_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(ProgdfError, match="cannot be read \\(File name too long\\)"):
+        load_scene(tmp_path / ("9" * 5000))
