@@ -5,8 +5,10 @@ from __future__ import annotations
 import logging
 import math
 import pickle
+import re
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -41,6 +43,7 @@ MOST_ATTEMPTS = 4
 _PACE = 40.0  # times what writing a table took pass before it is written again
 _LOOK_S = 2.0  # between two looks at a cluster's cores
 _STOP_S = 20.0  # in which what runs saves its state when all is stopped
+_ANSWER_S = 10.0  # in which a cluster takes a connection; Ray itself retries for many minutes
 _STORE_BYTES = 80 * 2**20  # of Ray's object store, through which only words go
 
 
@@ -128,6 +131,7 @@ class RayPool:
     """
 
     def __init__(self, address: str, cpus: int) -> None:
+        _check_address(address)
         import ray
 
         self._ray, self._references = ray, list[Any]()
@@ -136,10 +140,11 @@ class RayPool:
         where: dict[str, Any] = {"address": address} if address else {**own, "include_dashboard": False}
         try:
             ray.init(log_to_driver=False, logging_level="error", **where)
-        except (ConnectionError, RuntimeError, OSError, ValueError) as error:
+        except Exception as error:  # Ray raises a bare Exception where its start takes too long
             shutil.rmtree(self._folder, ignore_errors=True)
             hint = "; where the cluster asks for a token, RAY_AUTH_MODE=token sends it" if address else ""
-            raise ProgdfError(f"Ray cannot be used ({str(error).splitlines()[0]}){hint}") from error
+            reason = str(error).partition("\n")[0] or type(error).__name__
+            raise ProgdfError(f"Ray cannot be used ({reason}){hint}") from error
         self._looked, self._cpus = 0.0, 0
         machines = [node["Resources"] for node in ray.nodes() if node["Alive"]]
         self._memory = max(machine.get("memory", 0.0) for machine in machines)
@@ -177,6 +182,23 @@ class RayPool:
             self._ray.wait(running, num_returns=len(running), timeout=_STOP_S)
         self._ray.shutdown()
         shutil.rmtree(self._folder, ignore_errors=True)
+
+
+def _check_address(address: str) -> None:
+    """Raise ProgdfError if HOST:PORT takes no connection; other forms of an address are left to Ray."""
+    parts = re.fullmatch(r"([^:/]+):(\d{1,5})", address)
+    if parts is None:
+        return
+    host = parts[1]
+    port = int(parts[2])
+    try:
+        socket.create_connection((host, port), _ANSWER_S).close()
+    except (OSError, OverflowError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise ProgdfError(
+            f"no Ray cluster answers at {address} ({reason}); check the address, "
+            f"or start one with 'ray start --head --port {port}'"
+        ) from None
 
 
 @contextmanager

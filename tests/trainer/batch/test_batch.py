@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -14,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+from progdf.__main__ import main
 from progdf.errors import ProgdfError
 from tests.helpers.trained import quick_options, train, write_bear
 from trainer import cli
@@ -212,6 +214,34 @@ def test_a_row_is_read_back_as_it_was_written(tmp_path: Path) -> None:
     assert list(read_rows(tmp_path).values()) == rows
     write_page(tmp_path, rows, [])
     assert "<script>alert" not in (tmp_path / "batch.html").read_text(encoding="utf-8")
+
+
+def test_a_cluster_that_does_not_answer_is_named(
+    catalogue: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("ray")
+    with socket.socket() as closed:
+        closed.bind(("127.0.0.1", 0))  # a port on which nothing listens
+        address = f"127.0.0.1:{closed.getsockname()[1]}"
+        for host in (address, "no-such-host.invalid:6379", "127.0.0.1:99999"):
+            assert main(["batch", str(catalogue), "--out", str(tmp_path / "runs"), "--address", host]) == 2
+            error = capsys.readouterr().err
+            assert error.startswith(f"progdf: no Ray cluster answers at {host} (")
+            assert error.count("\n") == 1
+
+
+@pytest.mark.slow  # imports Ray
+def test_a_ray_that_does_not_start_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    ray = pytest.importorskip("ray")
+
+    def time_out(**_: object) -> None:
+        raise Exception("The current node timed out during startup.\nMore lines.")
+
+    monkeypatch.setattr(ray, "init", time_out)
+    with pytest.raises(
+        ProgdfError, match=r"^Ray cannot be used \(The current node timed out during startup\.\)$"
+    ):
+        RayPool("", 1)
 
 
 @pytest.fixture
