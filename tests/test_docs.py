@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import io
 import re
-import shlex
 from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
@@ -22,21 +21,14 @@ from progdf.__main__ import main as progdf
 from progdf.compose.reference import Layer, compose_layers
 from progdf.field.baked import END_TYPES
 from progdf.gdf.file import save_gdf
+from tests.helpers.documents import DOCUMENTS as PAGES
+from tests.helpers.documents import blocks, command_examples
 from tests.helpers.edits import curved_field, edit_of, some_rows
+from tests.helpers.paths import ROOT
 from tests.helpers.scenes import ball
 
-ROOT = Path(__file__).parents[1]
-DOCUMENTS = [
-    ROOT / "README.md",
-    *sorted((ROOT / "docs").glob("*.md")),
-    *sorted((ROOT / "benchmarks").rglob("*.md")),
-]
+DOCUMENTS = [*PAGES, *sorted((ROOT / "benchmarks").rglob("*.md"))]
 MOST_README_LINES = 150
-
-
-def blocks(text: str, language: str = "") -> list[str]:
-    """The fenced blocks of one language."""
-    return re.findall(rf"^```{language}\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
 
 
 def anchors(text: str) -> set[str]:
@@ -45,11 +37,10 @@ def anchors(text: str) -> set[str]:
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
-def command_lines(begin: str) -> list[str]:
-    """The command lines in the fenced blocks of the documents that begin like this, comments left out."""
-    lines = [line for path in DOCUMENTS for block in blocks(path.read_text()) for line in block.splitlines()]
-    typed = (line.removeprefix(".venv/bin/") for line in lines)
-    return sorted({shlex.join(shlex.split(line, comments=True)) for line in typed if line.startswith(begin)})
+def examples_of(*words: str) -> list[Any]:
+    """Return the documented command lines that begin with these words, as parameters of a test."""
+    found = [example for example in command_examples() if tuple(example.words[: len(words)]) == words]
+    return [pytest.param(example.words, id=example.title) for example in found]
 
 
 def help_of(run: Callable[[Sequence[str]], int], *command: str) -> str:
@@ -86,27 +77,30 @@ def test_links_lead_to_files_and_headings_that_exist(path: Path) -> None:
             assert heading in anchors(linked.read_text()), f"{path.name} links to {target}"
 
 
-@pytest.mark.parametrize("line", command_lines("progdf "))
-def test_a_documented_command_has_the_options_it_is_given(line: str) -> None:
-    _, command, *arguments = shlex.split(line)
-    if command.startswith("-"):
+@pytest.mark.parametrize("words", examples_of("progdf"))
+def test_a_documented_command_has_the_options_it_is_given(words: list[str]) -> None:
+    command = words[1]
+    if command == "--version":
         return
     assert command in COMMANDS
-    given = {a.partition("=")[0] for a in arguments if re.match(r"--?[a-z]", a)}
-    assert given <= mentioned_options(command), line
+    given = {word.partition("=")[0] for word in words if re.match(r"--?[a-z]", word)}
+    assert given <= mentioned_options(command)
 
 
-@pytest.mark.parametrize("line", command_lines("python -m benchmarks"))
-def test_a_documented_benchmark_has_the_options_it_is_given(line: str) -> None:
-    arguments = shlex.split(line)[3:]
-    command = "benchmarks ablate" if arguments[:1] == ["ablate"] else "benchmarks"
-    assert {a for a in arguments if a.startswith("--")} <= mentioned_options(command), line
-    assert not arguments or arguments[0].startswith("--") or arguments[0] in {*BENCHES, "page", "ablate"}
+@pytest.mark.parametrize("words", examples_of("python", "-m", "benchmarks"))
+def test_a_documented_benchmark_has_the_options_it_is_given(words: list[str]) -> None:
+    name = words[3]
+    own_command = name in ("ablate", "sliders", "regret")
+    command = f"benchmarks {name}" if own_command else "benchmarks"
+    assert {word for word in words if word.startswith("--")} <= mentioned_options(command)
+    assert own_command or name == "page" or name in BENCHES
 
 
-def test_a_documented_target_is_one_of_the_makefile() -> None:
-    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
-    assert {line.split()[1] for line in command_lines("make ")} <= targets
+def test_a_benchmark_that_is_named_in_the_documents_exists() -> None:
+    known = {*BENCHES, "page", "ablate", "sliders", "regret"}
+    for path in DOCUMENTS:
+        named = re.findall(r"`python -m benchmarks (\w+)", path.read_text(encoding="utf-8"))
+        assert set(named) <= known, path.name
 
 
 @pytest.mark.parametrize("command", sorted(COMMANDS))

@@ -44,8 +44,12 @@ class Training:
 
 
 @contextmanager
-def begin_training(scene: Gaussians) -> Iterator[Training]:
-    """A training of `scene` that has come to its first steps.
+def begin_training(scene: Gaussians, *effort: str) -> Iterator[Training]:
+    """Start a training of `scene`, and yield it at its first steps.
+
+    Args:
+        scene: trained in whole
+        effort: further options of `progdf train`, such as `"--views", "5"`
 
     Raises:
         ProgdfError: it does not.
@@ -56,6 +60,7 @@ def begin_training(scene: Gaussians) -> Iterator[Training]:
         words = ["train", str(folder / "scene.ply"), "--out", str(folder / "run"), "--region", "all"]
         # a descent, which does not end before its steps do
         words += ["--editor", "stripes:#20a040", "--preset", "paper", "--field", "auto", "--steps", "100000"]
+        words += effort
         child = Child(words, folder / "log")
         try:
             began = time.monotonic()

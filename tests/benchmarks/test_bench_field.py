@@ -14,6 +14,7 @@ from benchmarks.field import InOklab
 from benchmarks.training import Point, Task, Trained, save_plot, table, tasks
 from progdf.color.oklab import srgb_to_oklab
 from progdf.sh import C0
+from tests.helpers.small_benchmarks import shrink_field
 from trainer.report.plots import LINES
 
 
@@ -43,11 +44,7 @@ def test_a_training_is_timed_beside_its_error_in_views_of_nobodys(small: None, t
 def test_every_form_of_field_is_judged_alike_and_the_shipped_one_is_marked(
     small: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    for name, value in (("STAGES", 2), ("STEPS", 2), ("TARGETS", (30.0,)), ("MOVING", 700), ("SIDE", 48)):
-        monkeypatch.setattr(field, name, value)
-    monkeypatch.setattr(field, "SNAPSHOTS", 5)
-    monkeypatch.setattr(field, "NETWORK", field.NeuralSettings("tiny", steps=3))
-    monkeypatch.setattr(field, "CLOUDS", ((30, 300),))
+    shrink_field(monkeypatch)
     fields, steps = field.tables(plot=tmp_path / "field.png")
     labels = [row[1] for row in fields.rows]
     assert sum(label.startswith("grade of degree") for label in labels) == 9

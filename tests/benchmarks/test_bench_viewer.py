@@ -29,6 +29,7 @@ from progdf.errors import ProgdfError
 from progdf.formats.ply import save_ply
 from progdf.rasterize.screen import fill_screen
 from tests.helpers.demo_scenes import bear
+from tests.helpers.small_benchmarks import SMALL_TRAINING
 from viewer.camera.view_camera import bounds_of, first_camera
 from viewer.render import dynamic_resolution, engine
 from viewer.render.cpu_renderer import CpuRenderer
@@ -87,7 +88,7 @@ def test_frames_are_counted_one_a_turn_and_are_the_same_drawn_afresh(tmp_path: P
 def test_a_scene_in_the_hand_is_timed_beside_the_error_of_its_motion(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(moving, "_SETTLE_S", 0.05)
     ctx = headless_context()
-    with begin_training(bear(600).gaussians) as training:
+    with begin_training(bear(600).gaussians, *SMALL_TRAINING) as training:
         result = moving.measure(ctx, bear(2000).gaussians, training, steps=2, size=(240, 200))
     ctx.release()
     assert len(result.turning) == len(result.beside) == 2

@@ -109,14 +109,21 @@ def grown(offsets: torch.Tensor, knots: torch.Tensor, added: Gaussians) -> dict[
 
 def whole_grade(scene: Gaussians) -> Gdf:
     """Half of the light everywhere; a residual and a mask of single rows."""
-    knots, count = torch.tensor([0.0, 0.5, 1.0]), len(scene)
+    return grade_of(scene, torch.arange(len(scene)), "dark")
+
+
+def grade_of(scene: Gaussians, members: Tensor, name: str) -> Gdf:
+    """Return an edit that halves the light of these rows, with a residual and a mask of single rows."""
+    knots = torch.tensor([0.0, 0.5, 1.0])
+    count = len(members)
     table = torch.stack([identity_map(1) * (1.0 - 0.5 * float(s)) for s in knots])
     course = torch.zeros(3, count, 3)
     course[1:] = 0.1 * Draws(4).uniform(2, count, 3)
     mask = torch.full((count,), 255, dtype=torch.uint8)
     mask[::3] = 230
     form = fit_grade(knots, 1, table, course, 1, torch.ones(count), mask)
-    return edit_of(scene, torch.arange(count), bake_grade(form, pack(scene, with_shN=True)), "dark")
+    field = bake_grade(form, pack(scene[members], with_shN=True))
+    return edit_of(scene, members, field, name)
 
 
 def some_rows(scene: Gaussians, count: int, seed: int = 0) -> Tensor:

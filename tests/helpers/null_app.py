@@ -15,19 +15,28 @@ from viewer.ui.keys import Keys, Press
 
 
 @contextmanager
-def null_app(document: Document, view: ViewState, folder: Path) -> Iterator[App]:
-    """The application on `document`, after its first frame; what it remembers goes to `folder`."""
-    from viewer.ui.splash import Splash
-    from viewer.ui.window import Window, glfw
+def null_platform() -> Iterator[None]:
+    """Give glfw a platform without a screen for the next window; skip the test where there is none."""
+    from viewer.ui.window import glfw
 
     glfw.init_hint(glfw.PLATFORM, glfw.PLATFORM_NULL)
     if not glfw.init():
         pytest.skip("glfw has no null platform here")
     glfw.window_hint(glfw.CONTEXT_CREATION_API, glfw.EGL_CONTEXT_API)
     try:
-        window = Window(Splash("test", (900, 640)))
+        yield
     finally:
         glfw.init_hint(glfw.PLATFORM, glfw.ANY_PLATFORM)
+
+
+@contextmanager
+def null_app(document: Document, view: ViewState, folder: Path) -> Iterator[App]:
+    """Open the application on `document` and draw its first frame; its memory goes to `folder`."""
+    from viewer.ui.splash import Splash
+    from viewer.ui.window import Window
+
+    with null_platform():
+        window = Window(Splash("test", (900, 640)))
     app = App(window, document, view)
     app.draw()
     yield app

@@ -17,9 +17,10 @@ from progdf.io.cameras import save_cameras
 from progdf.quaternions import rotation_matrices
 from progdf.scene.orbit_rig import orbit_rig
 from tests.helpers.camera_tables import nerfstudio, some_cameras, written
+from tests.helpers.documents import blocks
 from tests.helpers.edits import curved_field, edit_of, some_rows
+from tests.helpers.paths import ROOT
 from tests.helpers.scenes import random_gaussians
-from tests.test_docs import ROOT, blocks
 
 PAGE = (ROOT / "docs" / "recipes.md").read_text(encoding="utf-8")
 

@@ -1,0 +1,112 @@
+"""Benchmarks on scenes and with repetitions that are small enough for a test; all else is as it ships."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from benchmarks import edits as run_edits
+from benchmarks import field, rasterizer, sliders, training, warps
+from benchmarks.ablation import regret, setup
+from benchmarks.rasterizer import RasterCase
+from benchmarks.viewer import frames, moving, popping, scenes, slider, window
+from benchmarks.viewer.slider import SliderCase
+from benchmarks.viewer.training import begin_training
+from progdf.field import NeuralSettings
+from tests.helpers import demo_scenes, drawn
+from trainer.options import ViewOptions
+from trainer.run.demo import Effort
+
+PICTURE = (240, 200)  # pixels
+SMALL_TRAINING = ("--views", "5", "--image-size", "48")
+
+
+def shrink_benchmarks(patch: pytest.MonkeyPatch) -> None:
+    """Make every benchmark take seconds."""
+    _shrink_training(patch)
+    _shrink_viewer(patch)
+    _shrink_rasterizer(patch)
+
+
+def shrink_field(patch: pytest.MonkeyPatch) -> None:
+    """Make `python -m benchmarks field` take seconds."""
+    patch.setattr(training, "BEAR", 700)
+    patch.setattr(regret, "ViewOptions", partial(ViewOptions, views=8, image_size=48))
+    patch.setattr(field, "STEPS", 2)
+    patch.setattr(field, "TARGETS", (30.0,))
+    patch.setattr(field, "MOVING", 700)
+    patch.setattr(field, "SIDE", 48)
+    patch.setattr(field, "SNAPSHOTS", 5)
+    patch.setattr(field, "NETWORK", NeuralSettings("tiny", steps=3))
+    patch.setattr(field, "CLOUDS", ((30, 300),))
+
+
+def _shrink_training(patch: pytest.MonkeyPatch) -> None:
+    shrink_field(patch)
+    patch.setattr(training, "WAYS", ("--quick --views 5 --image-size 48 --stages 2 --threads 1",))
+    patch.setattr(run_edits, "VALUES", 3)
+    patch.setattr(run_edits, "ASKED", 2)
+    patch.setattr(warps, "STEPS", 32)
+    patch.setattr(warps, "VIEWS", 5)
+    patch.setattr(warps, "SIZE", 48)
+    patch.setattr(warps, "_BEAR", 700)
+    patch.setattr(regret, "STAGES", (2,))
+    patch.setattr(regret, "STEPS", (2,))
+    patch.setattr(regret, "BANDS", (0, 1))
+    patch.setattr(regret, "VIEWS", (6,))
+    patch.setattr(setup, "QUICK_STEPS", 4)
+    patch.setattr(setup, "QUICK_STAGES", 2)
+    patch.setattr(setup, "QUICK_VIEWS", 4)
+    blue = next(case for case in sliders.CASES if case.name == "blue scarf")
+    small = partial(
+        sliders.run_suite,
+        cases=(blue,),
+        sizes={"bear": 1000, "room": 1000},
+        effort=Effort(views=4, image_size=48, steps=16),
+    )
+    patch.setattr(sliders, "run_suite", small)
+
+
+def _shrink_viewer(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(scenes, "SIZES", (600, 800))
+    patch.setattr(slider, "CASES", (SliderCase(100, True),))
+    patch.setattr(slider, "rows", partial(slider.rows, steps=2, size=PICTURE))
+    patch.setattr(frames, "measure_turning", partial(frames.measure_turning, steps=2, size=PICTURE))
+    patch.setattr(frames, "measure_starts", _measure_one_start(frames.measure_starts))
+    patch.setattr(moving, "MILLION", 3000)
+    patch.setattr(moving, "TRAINED", 600)
+    patch.setattr(moving, "begin_training", lambda scene: begin_training(scene, *SMALL_TRAINING))
+    patch.setattr(moving, "_SETTLE_S", 0.05)
+    patch.setattr(moving, "measure", partial(moving.measure, steps=2, size=PICTURE))
+    patch.setattr(popping, "FRAMES", 3)
+    patch.setattr(popping, "room", lambda count: demo_scenes.room(1000))
+    patch.setattr(popping, "film", partial(popping.film, size=PICTURE))
+    patch.setattr(window, "SETTLED_S", 0.2)
+    patch.setattr(window, "MEMBERS", 100)
+    patch.setattr(window, "idle", partial(window.idle, wall_s=0.2))
+
+
+def _measure_one_start(measure: Callable[..., frames.Start]) -> Callable[..., frames.Start]:
+    """Return a `measure_starts` that opens a window for its first scene alone; each takes some seconds."""
+    starts: list[frames.Start] = []
+
+    def measure_once(path: Path, way: str) -> frames.Start:
+        if not starts:
+            starts.append(measure(path, way, times=1, size=(460, 400)))
+        return starts[0]
+
+    return measure_once
+
+
+def _shrink_rasterizer(patch: pytest.MonkeyPatch) -> None:
+    cases = (RasterCase(60, 32), RasterCase(90, 40, baseline=False))
+    patch.setattr(rasterizer, "CASES", cases)
+    patch.setattr(rasterizer, "WARP_CASES", cases[:1])
+    patch.setattr(rasterizer, "STEP_CASE", RasterCase(60, 40))
+    patch.setattr(rasterizer, "measure", partial(rasterizer.measure, rounds=1, torch_rounds=1))
+    patch.setattr(rasterizer, "list_table", partial(rasterizer.list_table, rounds=1))
+    hard = {name: drawn.CASES[name] for name in ("no gaussians", "equal depths")}
+    patch.setattr(drawn, "CASES", hard)
