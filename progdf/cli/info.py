@@ -16,6 +16,7 @@ import tyro
 from progdf.errors import ProgdfError
 from progdf.field.baked import BakedField, GradeForm
 from progdf.formats.cube import SUFFIX as CUBE
+from progdf.formats.ply_view import stored_view
 from progdf.formats.scene_file import load_scene_with_report, scene_file, scene_format
 from progdf.gaussians import ZERO, Gaussians
 from progdf.gdf.file import read_gdf
@@ -182,6 +183,8 @@ def _scene_lines(path: Path, cameras: Path | None, up: UpChoice) -> Iterator[str
     views = [] if cameras is None else load_cameras(cameras, scene.origin)
     yield from report.lines()
     yield from survey(scene, find_up(scene, views, up, path)).lines()
+    if (camera := stored_view(path, scene.origin).camera) is not None:
+        yield f"camera: the file stores one of {camera.width}x{camera.height} pixels, which is the first view"
     with notice_when_slow(f"looking for strays among {format_count(len(scene))} …"):
         strays = find_strays(scene)
     if len(strays.rows):

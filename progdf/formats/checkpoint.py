@@ -23,10 +23,11 @@ from torch import Tensor
 from progdf import sh
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
-from progdf.io.atomic import open_error
-from progdf.io.file_rules import check_fields, damage_error, unsupported_error
+from progdf.io.atomic import open_error, read_file
+from progdf.io.file_rules import check_fields, damage_error, unsupported_error, variant_fields
 
 LARGEST_PICKLE = 16 << 20  # bytes; the pickle of a training has some 100 kB
+LEGACY_MAGIC = b"\x80\x02"  # a pickle of protocol 2, where newer files begin with a zip archive
 DEEPEST_TABLE = 4  # levels of nested tables that are searched for tensors
 RESAVE = "load it with torch and save dense float tensors with torch.save"
 EXPORT = (
@@ -73,12 +74,6 @@ _COLOR_MODULE = re.compile(
 )
 """Networks and tables that a training applies to the colors, by words of their names."""
 
-_REFUSED_TENSORS = {
-    "features": "appearance features of gsplat's `app_opt`, which a network turns into colors",
-    "colors": "colors before the appearance network of gsplat's `app_opt`",
-    "appearance_features": "appearance features, which a network turns into colors",
-}
-
 
 @dataclass(frozen=True)
 class Checkpoint:
@@ -112,8 +107,8 @@ def read_checkpoint(path: Path) -> Checkpoint:
             raise unsupported_error(path, f"two tensors '{column}' (one is '{name}')", EXPORT)
         columns[column] = tensor
         has_logit_colors |= parts[0] == "features_dc"
-    refused = dict(_REFUSED_TENSORS)
-    refused |= {name: "colors that a training corrects" for name in others if _COLOR_MODULE.search(name)}
+    refused = variant_fields(others)
+    refused |= {name: "corrections of colors" for name in others if _COLOR_MODULE.search(name)}
     honored = {name for name in others if name in _TRAINING_STATE}
     ignored = check_fields(path, others, honored, refused, EXPORT)
     missing = [name for name in ("means", "quats", "scales", "opacities", "sh0") if name not in columns]
@@ -215,6 +210,8 @@ def _load_weights(path: Path) -> Any:
 
 def _read_pickle(path: Path) -> bytes:
     """Return the pickle of torch's archive, once its entries are uncompressed and fit into the file."""
+    if read_file(path, 2) == LEGACY_MAGIC:
+        raise unsupported_error(path, "the archive format of torch before 1.6", RESAVE)
     try:
         with zipfile.ZipFile(path) as archive:
             entries = archive.infolist()

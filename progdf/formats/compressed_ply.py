@@ -18,7 +18,7 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import ATTRIBUTES, Gaussians, from_arrays
 from progdf.sh import C0
 
-from .ply import ANTIALIASED_COMMENT, PlyFile
+from .ply_file import ANTIALIASED_COMMENT, PlyFile
 
 _CHUNK = 256
 _MORTON_BITS = 21  # of each axis: three fit a word

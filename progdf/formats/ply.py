@@ -1,220 +1,36 @@
 """3DGS .ply <-> Gaussians.
 
 The file's own words: x y z, f_dc_0..2, f_rest_* (channel-major), opacity (logit), scale_0..2 (log), rot_0..3
-(wxyz). Anything else is reported and not used. Rows are never dropped, as labels and .gdf files count on
-their indices: an unusable row becomes an invisible Gaussian (see `progdf.formats.repair`).
+(wxyz). Some variants are converted (see `read_ply`), some are refused (see `variant_fields`), and the rest is
+reported and not used. Rows are never dropped, as labels and .gdf files count on their indices: an unusable
+row becomes an invisible Gaussian (see `progdf.formats.repair`).
 """
 
 from __future__ import annotations
 
-import io
-import itertools
 import os
-import re
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
-from plyfile import PlyData, PlyElement, PlyElementParseError, PlyListProperty, PlyParseError
+from plyfile import PlyData, PlyElement
+from torch import Tensor
 
+from progdf.color.oklab import srgb_from_linear
 from progdf.errors import ProgdfError
 from progdf.gaussians import ATTRIBUTES, ZERO, Gaussians, from_arrays
-from progdf.io.atomic import atomic_write, check_regular, open_error
-from progdf.io.file_rules import unsupported_error
+from progdf.io.atomic import atomic_write
+from progdf.io.file_rules import PLAIN_GAUSSIANS, check_fields, unsupported_error, variant_fields
 from progdf.quaternions import normalize_quats
+from progdf.sh import map_colors, rgb_to_sh0
 
+from .ply_file import ANTIALIASED_COMMENT, PlyFile, read_header
+from .ply_view import CAMERA_ELEMENTS, check_frames, has_linear_colors, read_view
 from .repair import LoadReport, repair
-
-ANTIALIASED_COMMENT = "SplatRenderMode: mip"
-"""What the header of a scene says that was trained with Mip-Splatting's 2D filter (Brush's words)."""
-
-_RENDERING = {
-    "splatrendermode: mip": True,
-    "splatrendermode: default": False,
-    "antialiased 1": True,
-    "antialiased 0": False,
-}
-"""The comments that tell it, Brush's and Postshot's, in lower case; the last one counts."""
-
-_MAX_HEADER_BYTES = 1 << 20
-"""A header that has not ended by then is no header."""
-
-_MOST_LISTS = 200_000
-"""Values of list rows before the vertices, which plyfile reads one by one in about two seconds."""
-
-_SKIPPED = ("comment", "obj_info")
-_ELEMENT = re.compile(r"(element\s+\S+\s+)(\d{1,19})")
-_END = re.compile(rb"^end_header[ \t]*\r?\n", re.MULTILINE)
-_FOREIGN = (
-    (b"version https://git-lfs", "is a Git LFS pointer, not the file itself; run `git lfs pull` to fetch it"),
-    (b"\x1f\x8b", "is gzip data, but no .spz scene; unpack it first"),
-    (b"PK\x03\x04", "is a zip archive, but no .sog scene; unpack it first"),
-    (b"<", "is a web page or XML, not a .ply; download the file itself"),
-)
-
-
-@dataclass(frozen=True)
-class PlyFile:
-    """A .ply file of which the header is read and checked."""
-
-    path: Path  # the file
-    layout: PlyData  # its format and elements, without rows
-    counts: dict[str, int]  # rows of each element, by name; they fit into the file
-    header: tuple[str, ...]  # its lines before end_header, comments empty
-    length: int  # bytes of the header
-    size: int  # bytes of the file
-    antialiased: bool  # a comment says that the scene was trained with Mip-Splatting's 2D filter
-
-    def columns(self, element: str) -> dict[str, str]:
-        """numpy's type of each property that is no list, by name; of an element that is not there nothing."""
-        properties = self.layout[element].properties if element in self.layout else ()
-        return {p.name: p.val_dtype for p in properties if not isinstance(p, PlyListProperty)}
-
-    def rows(self, *names: str) -> tuple[list[npt.NDArray[np.void]], int]:
-        """The rows of elements, of a binary file memory-mapped, and the bytes behind the file's last row.
-
-        The latter are 0 where lists follow, whose length nobody knows.
-
-        Raises:
-            ProgdfError: a row up to the last of the elements is not what the header says.
-        """
-        elements = self.layout.elements
-        last = 1 + max(i for i, element in enumerate(elements) if element.name in names)
-        for element in elements[:last]:
-            self._check_lists(element, element.name in names)
-        try:
-            with np.errstate(over="ignore"):
-                rows, after = self._text_rows(last) if self.layout.text else self._binary_rows(last)
-        except OSError as error:
-            raise open_error(self.path, error) from None
-        except (PlyElementParseError, ValueError, OverflowError, MemoryError) as error:
-            row = re.search(r"at row \d+", str(error))
-            what = f"has too many or too few numbers, or no number, {row[0] if row else 'in a row'}"
-            if isinstance(error, PlyElementParseError):
-                what = f"ends within element '{error.element.name}'"
-            raise ProgdfError(
-                f"{self.path} {what}; it is truncated or damaged: copy or export it again"
-            ) from None
-        lists_follow = any(_has_lists(element) for element in elements[last:])
-        return [rows[name] for name in names], 0 if lists_follow else after
-
-    def _check_lists(self, element: PlyElement, is_needed: bool) -> None:
-        name, lists = element.name, _has_lists(element)
-        if lists and is_needed:
-            feature = f"a list among its {name} properties"
-            raise unsupported_error(self.path, feature, "export it as a plain 3DGS .ply")
-        if lists and self.counts[name] * len(element.properties) > _MOST_LISTS:
-            raise ProgdfError(
-                f"{self.path} has {self.counts[name]} rows of lists, '{name}', before its vertices; "
-                "export it with the vertices first"
-            )
-
-    def _binary_rows(self, last: int) -> tuple[dict[str, npt.NDArray[np.void]], int]:
-        with _Stream(self, last) as stream:
-            rows = {element.name: element.data for element in PlyData.read(stream)}
-            following = self.layout.elements[last:]
-            bytes_after = sum(self.counts[element.name] * _row_bytes(element) for element in following)
-            return rows, self.size - stream.tell() - bytes_after
-
-    def _text_rows(self, last: int) -> tuple[dict[str, npt.NDArray[np.void]], int]:
-        """By numpy, which reads text many times as fast as plyfile."""
-        rows = {}
-        with self.path.open("rb") as file:
-            file.seek(self.length)
-            for i, element in enumerate(self.layout):
-                lines = list(itertools.islice(file, self.counts[element.name]))
-                if i >= last:
-                    continue
-                if len(lines) < self.counts[element.name]:
-                    raise PlyElementParseError("early end-of-file", element)
-                if not _has_lists(element):
-                    rows[element.name] = np.loadtxt(lines, element.dtype(), comments=None, ndmin=1)
-                    if len(rows[element.name]) < len(lines):
-                        raise ValueError("an empty row")
-            return rows, len(file.read().strip())
-
-
-class _Stream(io.FileIO):
-    """The file as plyfile is given it: a header of its first elements alone, then what is behind its own."""
-
-    def __init__(self, ply: PlyFile, elements: int) -> None:
-        super().__init__(ply.path)
-        self.seek(ply.length)
-        starts = [i for i, line in enumerate(ply.header) if line.startswith("element")]
-        head = ply.header[: (*starts, None)[elements]]
-        self._head = io.BytesIO("\n".join([*head, "end_header", ""]).encode("ascii"))
-
-    def read(self, size: int | None = -1) -> bytes:
-        return self._head.read(size) or super().read(size)
-
-
-def read_header(path: str | os.PathLike[str]) -> PlyFile:
-    """A .ply file, its header read and every element's count checked: its rows must fit into the file.
-
-    Raises:
-        ProgdfError: not a .ply, a broken header, or one that declares more than the file holds.
-    """
-    check_regular(path)
-    try:
-        with Path(path).open("rb") as file:
-            start, size = file.read(_MAX_HEADER_BYTES), os.fstat(file.fileno()).st_size
-    except OSError as error:
-        raise open_error(path, error) from None
-    if not start:
-        raise ProgdfError(f"{path} is empty (0 bytes); copy or download it again")
-    if start[:32].split(b"\n")[0].strip() != b"ply":
-        plain = "is not a .ply file; its first line should be 'ply'"
-        what = next((what for magic, what in _FOREIGN if start.startswith(magic)), plain)
-        raise ProgdfError(f"{path} {what}")
-    end = _END.search(start)
-    if end is None:
-        raise ProgdfError(f"{path} has a header without 'end_header'; the file is truncated or not a .ply")
-    text = start[: end.start()].decode("ascii", "replace").encode("ascii", "replace").decode()
-    lines = [" ".join(line.split()) for line in text.split("\n")[:-1]]
-    renderings = [_RENDERING.get(line[8:].lower()) for line in lines if line.startswith("comment ")]
-    header = ["comment" if line.startswith(_SKIPPED) or not line else line for line in lines]
-    counts = [match for line in header if (match := _ELEMENT.fullmatch(line))]
-    empty = [_ELEMENT.sub(r"\g<1>0", line) for line in header]
-    try:
-        layout = PlyData.read(io.BytesIO("\n".join([*empty, "end_header", ""]).encode()))
-    except (PlyParseError, ValueError, OverflowError, MemoryError) as error:
-        raise ProgdfError(f"{path} has a broken header: {str(error)[:100]}; export it again") from None
-    rows = {element.name: int(match[2]) for element, match in zip(layout, counts, strict=False)}
-    if len(rows) < len(layout.elements):
-        raise ProgdfError(f"{path} has a broken header: counts are digits; export it again")
-    antialiased = next((known for known in reversed(renderings) if known is not None), False)
-    ply = PlyFile(Path(path), layout, rows, tuple(header), end.end(), size, antialiased)
-    _check_counts(ply)
-    return ply
-
-
-def _check_counts(ply: PlyFile) -> None:
-    remaining = ply.size - ply.length
-    for element in ply.layout:
-        # an ascii value takes at least a digit and a separator; the file's last separator may be missing
-        text, count = ply.layout.text, ply.counts[element.name]
-        least = 2 * len(element.properties) if text else _row_bytes(element)
-        if count * least > remaining + text:
-            what = "Gaussians" if element.name == "vertex" else f"rows of '{element.name}'"
-            raise ProgdfError(
-                f"{ply.path} declares {count} {what} of {'at least ' if text else ''}{least} bytes but "
-                f"has room for {max(remaining, 0) // least}, so it is truncated or its header is wrong; "
-                f"copy or export it again"
-            )
-        remaining -= count * least
-
-
-def _has_lists(element: PlyElement) -> bool:
-    return any(isinstance(column, PlyListProperty) for column in element.properties)
-
-
-def _row_bytes(element: PlyElement) -> int:
-    """Bytes of a binary row, or of one with empty lists."""
-    return sum(np.dtype(getattr(p, "len_dtype", p.val_dtype)).itemsize for p in element.properties)
-
 
 Floats = npt.NDArray[np.float32]
 
@@ -227,6 +43,11 @@ GEOMETRY = {
 }
 """The columns of each attribute that every 3DGS .ply has."""
 _NORMALS = ("nx", "ny", "nz")
+_RGB_NAMES = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
+"""Colors of a .ply without f_dc, such as nerfstudio's `--ply-color-mode rgb`; the first that is there."""
+_RGB_TYPES = {"u1", "u2", "f4", "f8"}
+RGB_MARGIN = 0.5  # floats this far outside 0 to 1 are of another range
+FILTER_3D = "filter_3D"  # property of Mip-Splatting and Gaussian Opacity Fields
 _BLOCK_ROWS = 4096
 """1 MB of SH3 rows: taken apart while they are in the second-level cache."""
 _SH_REST = (0, 9, 24, 45, 72)
@@ -247,25 +68,110 @@ def load_ply(path: str | os.PathLike[str]) -> Gaussians:
 
 
 def load_ply_with_report(path: str | os.PathLike[str]) -> tuple[Gaussians, LoadReport]:
-    """As `load_ply`, with the report of what the file held and what was repaired."""
+    """Return what `load_ply` returns, and the report of the file's content and of its repairs."""
     ply = read_header(path)
-    sh_count = _check_properties(ply)
-    columns = {**GEOMETRY, "shN": tuple(f"f_rest_{i}" for i in range(sh_count))}
-    (rows,), trailing = ply.rows("vertex")
-    scene, counts = repair(replace(_gaussians(rows, columns), antialiased=ply.antialiased))
-    used = {column for names in columns.values() for column in names}
+    stored, content = read_ply(ply)
+    scene, counts = repair(stored)
     order = {"<": " little-endian", ">": " big-endian"}[ply.layout.byte_order] if not ply.layout.text else ""
-    return scene, LoadReport(
+    report = LoadReport(
         file=Path(path).name,
         file_bytes=ply.size,
         format=f"binary{order}" if order else "ascii",
         count=len(scene),
         sh_degree=scene.sh_degree,
-        antialiased=ply.antialiased,
-        ignored_properties=tuple(p for p in ply.columns("vertex") if p not in used and p not in _NORMALS),
-        ignored_elements=tuple((name, count) for name, count in ply.counts.items() if name != "vertex"),
-        trailing_bytes=trailing,
+        antialiased=scene.antialiased,
+        **content,
         **counts,
+    )
+    return scene, report
+
+
+def read_ply(ply: PlyFile) -> tuple[Gaussians, dict[str, Any]]:
+    """Return the Gaussians of a 3DGS .ply as stored, before repairs, and fields of their `LoadReport`.
+
+    Colors are those of `f_dc`, or RGB of a .ply without it. Mip-Splatting's `filter_3D` is fused.
+
+    Raises:
+        ProgdfError: no 3DGS .ply, or a property or element that is not supported.
+    """
+    ignored = _check_variants(ply)
+    columns = _find_columns(ply)
+    check_frames(ply)
+    is_linear = has_linear_colors(ply)
+    (rows,), trailing = ply.rows("vertex")
+    scene = replace(_gaussians(rows, columns), antialiased=ply.antialiased)
+    used = {column for names in columns.values() for column in names}
+    conversions = []
+    if columns["sh0"] != GEOMETRY["sh0"]:
+        scene = replace(scene, sh0=_rgb_to_sh0(ply, columns["sh0"], scene.sh0))
+        conversions.append(f"{', '.join(columns['sh0'])} to SH degree 0")
+    if is_linear:
+        coefficients = map_colors(scene.sh, srgb_from_linear)
+        scene = replace(scene, sh0=coefficients[:, 0], shN=coefficients[:, 1:])
+        conversions.append("linear RGB (color_space 1) to sRGB")
+    if FILTER_3D in ply.columns("vertex"):
+        scene = _fuse_filter(scene, torch.from_numpy(rows[FILTER_3D].astype(np.float64)))
+        used.add(FILTER_3D)
+        conversions.append("Mip-Splatting's filter_3D, fused into scales and opacities")
+    view = read_view(ply)
+    used_elements = {"vertex", *(CAMERA_ELEMENTS if view.camera is not None else ())}
+    used_elements |= {"color_space"} if "color_space" in ply.counts else set()
+    return scene, {
+        "conversions": tuple(conversions),
+        "ignored_properties": tuple(name for name in ignored if name not in used and name not in _NORMALS),
+        "ignored_elements": tuple(item for item in ply.counts.items() if item[0] not in used_elements),
+        "ignored_comments": view.unknown_comments,
+        "trailing_bytes": trailing,
+    }
+
+
+def _check_variants(ply: PlyFile) -> tuple[str, ...]:
+    """Return the vertex properties, once none of them belongs to a variant of 3DGS that is not supported."""
+    present = ply.columns("vertex")
+    is_scene = bool({"opacity", "scale_0", "rot_0"} & set(present))
+    refused = variant_fields(present) if is_scene else {}
+    return check_fields(ply.path, present, (), refused, PLAIN_GAUSSIANS)
+
+
+def _rgb_to_sh0(ply: PlyFile, names: tuple[str, ...], values: Tensor) -> Tensor:
+    """Return SH band 0 of RGB: bytes, 16-bit integers or floats from 0 to 1. [N,3] -> [N,3]
+
+    Raises:
+        ProgdfError: floats far outside 0 to 1, whose range is unknown.
+    """
+    dtype = np.dtype(ply.columns("vertex")[names[0]])
+    if dtype.kind == "f":
+        numbers = values[values.isfinite()]
+        low, high = (float(edge) for edge in numbers.aminmax()) if len(numbers) else (0.0, 1.0)
+        if low < -RGB_MARGIN or high > 1.0 + RGB_MARGIN:
+            feature = f"'{names[0]}' as floats from {low:.4g} to {high:.4g} (0 to 1 is expected)"
+            remedy = "write colors as bytes, as floats from 0 to 1, or as f_dc_0..2"
+            raise unsupported_error(ply.path, feature, remedy)
+        return rgb_to_sh0(values)
+    return rgb_to_sh0(values / float(np.iinfo(dtype).max))
+
+
+def _fuse_filter(scene: Gaussians, sizes: Tensor) -> Gaussians:
+    """Return the scene with Mip-Splatting's 3D smoothing filter applied (Yu et al. 2024, eq. 7).
+
+    Convolution with a Gaussian of standard deviation f gives the variances s² + f². It multiplies the opacity
+    by the root of the ratio of the determinants.
+
+    Args:
+        scene: N Gaussians as stored
+        sizes: standard deviation of the filter, world units. [N] float64
+    """
+    log_scales = scene.log_scales.double()
+    fused = 0.5 * torch.logaddexp(2 * log_scales, 2 * sizes.abs().log()[:, None])
+    shrink = (log_scales - fused).sum(dim=1)
+    shrink = torch.where(fused.isneginf().any(dim=1), 0.0, shrink)  # a flat Gaussian without a filter
+    log_opacities = torch.nn.functional.logsigmoid(scene.logit_opacities.double()) + shrink
+    logits = log_opacities - (-torch.expm1(log_opacities)).log()
+    unchanged = sizes == 0
+    return replace(
+        scene,
+        log_scales=torch.where(unchanged[:, None], scene.log_scales, fused.float()),
+        logit_opacities=torch.where(unchanged, scene.logit_opacities, logits.float()),
     )
 
 
@@ -335,13 +241,20 @@ def save_ply_checked(path: str | os.PathLike[str], scene: Gaussians) -> None:
                 )
 
 
-def _check_properties(ply: PlyFile) -> int:
-    """The number of f_rest properties, once every property that 3DGS needs is known to be there."""
+def _find_columns(ply: PlyFile) -> dict[str, tuple[str, ...]]:
+    """Return the columns of each attribute, once every property that 3DGS needs is known to be there.
+
+    Raises:
+        ProgdfError: a property is missing, or the file holds no Gaussians.
+    """
     if "vertex" not in ply.counts:
         known = "" if "chunk" in ply.counts else "; it is not a 3DGS .ply"
         raise ProgdfError(f"{ply.path} has no element 'vertex'{known}")
     present = ply.columns("vertex")
-    missing = [column for names in GEOMETRY.values() for column in names if column not in present]
+    columns = dict(GEOMETRY)
+    if not any(name in present for name in GEOMETRY["sh0"]):
+        columns["sh0"] = next((names for names in _RGB_NAMES if _are_colors(present, names)), GEOMETRY["sh0"])
+    missing = [column for names in columns.values() for column in names if column not in present]
     if missing:
         raise ProgdfError(f"{ply.path} {_describe(ply, missing)}")
     sh_count = sum(column.startswith("f_rest_") for column in present)
@@ -351,9 +264,17 @@ def _check_properties(ply: PlyFile) -> int:
             f"{ply.path} has {sh_count} f_rest properties{f' without {absent}' if absent else ''}; "
             f"expected 0, 9, 24, 45 or 72: export it again"
         )
+    if sh_count and columns["sh0"] != GEOMETRY["sh0"]:
+        raise ProgdfError(f"{ply.path} has f_rest properties without f_dc_0, f_dc_1, f_dc_2; export it again")
     if not ply.counts["vertex"]:
         raise ProgdfError(f"{ply.path} holds 0 Gaussians; a scene needs at least one: export it again")
-    return sh_count
+    return {**columns, "shN": tuple(f"f_rest_{i}" for i in range(sh_count))}
+
+
+def _are_colors(present: Mapping[str, str], names: tuple[str, ...]) -> bool:
+    """Return whether three properties are there and of one type that RGB is stored in."""
+    types = {np.dtype(present[name]).str[1:] for name in names if name in present}
+    return all(name in present for name in names) and len(types) == 1 and types <= _RGB_TYPES
 
 
 def _describe(ply: PlyFile, missing: list[str]) -> str:

@@ -175,10 +175,6 @@ def _within(tensor: Tensor, least: float, most: float) -> bool:
 
 _log = logging.getLogger(__name__)
 
-_EXPLAINED = {
-    "filter_3D": "filter_3D (Mip-Splatting's: fuse it into the scales and opacities for the exact look)"
-}
-
 
 @dataclass(frozen=True)
 class LoadReport:
@@ -208,7 +204,9 @@ class LoadReport:
     scaled_quats: int = 0  # quaternions that were not of unit length and were divided by it
     ignored_properties: tuple[str, ...] = ()  # vertex properties that 3DGS does not have
     ignored_elements: tuple[tuple[str, int], ...] = ()  # tables other than vertex, with their row counts
+    ignored_comments: tuple[str, ...] = ()  # comments about the up axis: no axis, or several
     trailing_bytes: int = 0  # bytes after the last row
+    conversions: tuple[str, ...] = ()  # fields of other conventions that were converted, a phrase each
 
     @property
     def repairs(self) -> tuple[str, ...]:
@@ -252,8 +250,10 @@ class LoadReport:
         """One phrase for each part of the file that was not used."""
         phrases = []
         if self.ignored_properties:
-            phrases.append(f"properties {', '.join(_EXPLAINED.get(p, p) for p in self.ignored_properties)}")
+            phrases.append(f"properties {', '.join(self.ignored_properties)}")
         phrases += [f"element '{name}' ({format_count(rows, 'row')})" for name, rows in self.ignored_elements]
+        for comment in self.ignored_comments:
+            phrases.append(f"comment '{comment}', which is not used as an up axis")
         if self.trailing_bytes:
             phrases.append(f"{format_count(self.trailing_bytes, 'byte')} after the last row")
         return tuple(phrases)
@@ -272,6 +272,7 @@ class LoadReport:
             sh += " (band 4 is kept, and not shown)"
         lines = [
             f"{self.file}: {format_count(self.count)}, {sh}, {self.format}, {file_size(self.file_bytes)}",
+            *(f"converted: {phrase}" for phrase in self.conversions),
             *(f"ignored: {phrase}" for phrase in self.ignored_parts),
         ]
         if self.antialiased:

@@ -14,28 +14,32 @@ import subprocess
 import tempfile
 import zipfile
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 import torch
 
 from progdf import sh
 from progdf.errors import ProgdfError
-from progdf.gaussians import Gaussians
+from progdf.gaussians import Gaussians, concatenate
 from progdf.io import native_child
 from progdf.io.atomic import atomic_write, read_file
 from progdf.io.json_values import decode_json
+from progdf.io.part_files import part_files
 from progdf.terminal import escape_text
 
 from . import gltf, usd
 from .axes import Axes
-from .checkpoint import read_checkpoint
+from .checkpoint import LEGACY_MAGIC, read_checkpoint
 from .compressed_ply import is_compressed, morton_order, read_compressed_ply, write_compressed_ply
 from .gltf_file import MAGIC
 from .ksplat import read_ksplat
-from .ply import load_ply_with_report, read_header, save_ply, save_ply_checked
+from .ply import load_ply_with_report, read_ply, save_ply, save_ply_checked
+from .ply_file import read_header
 from .repair import LoadReport, repair
 
 FORMATS = ("ply", "spz", "splat", "ksplat", "sog", "glb", "gltf", "ckpt")
@@ -49,6 +53,9 @@ MOST_FRAMES = 1000
 
 SOG_META = "meta.json"
 """The file that represents an unpacked .sog: its folder's table of images."""
+
+CHECKPOINT = "checkpoint of a training"
+"""The format of .pt and .ckpt files in reports."""
 
 _MOST_META = 1 << 20
 """Bytes of its table, which has some 20 kB; parsed, JSON takes thirty times as much."""
@@ -73,7 +80,7 @@ def scene_format(path: str | os.PathLike[str]) -> str | None:
         return "glb"
     if start[:4] == b"NGSP" or (start[:2] == b"\x1f\x8b" and _inflate(start)[:4] == b"NGSP"):
         return "spz"
-    if suffix in ("ckpt", "pt", "pth") and start[:2] == b"PK":
+    if suffix in ("ckpt", "pt", "pth") and start[:2] in (b"PK", LEGACY_MAGIC):
         return "ckpt"
     if start[:4] == b"PK\x03\x04":
         return "sog" if _sog_meta(path) is not None else None
@@ -113,6 +120,9 @@ def load_scene(path: str | os.PathLike[str]) -> Gaussians:
 def load_scene_with_report(path: str | os.PathLike[str]) -> tuple[Gaussians, LoadReport]:
     """As `load_scene`, with the report of what the file held and what was repaired."""
     path = scene_file(path)
+    parts = part_files(path)
+    if len(parts) > 1:
+        return _load_parts(path, parts)
     kind = scene_format(path)
     if kind == "ply" or kind is None:
         ply = read_header(path)  # which knows best what is wrong with a file that is no .ply
@@ -124,11 +134,11 @@ def load_scene_with_report(path: str | os.PathLike[str]) -> tuple[Gaussians, Loa
         return _repair(path, scene, f".ksplat, level {level}")
     if kind in ("glb", "gltf"):
         found = gltf.read_gltf(path, partial(_read_spz_part, path))
-        scene, report = _repair(path, found.scene, ", ".join([f".{kind}", *found.facts]), found.ignored)
-        return scene, replace(report, file_bytes=found.file_bytes)
+        content = {"ignored_properties": found.ignored, "file_bytes": found.file_bytes}
+        return _repair(path, found.scene, ", ".join([f".{kind}", *found.facts]), content)
     if kind == "ckpt":
         checkpoint = read_checkpoint(path)
-        return _repair(path, checkpoint.scene, "checkpoint of a training", checkpoint.ignored)
+        return _repair(path, checkpoint.scene, CHECKPOINT, {"ignored_properties": checkpoint.ignored})
     scene, report = _through_gaussforge(path, kind)
     description, antialiased = f".{kind}", False
     if kind == "spz":
@@ -161,8 +171,42 @@ def rotate_about_x(scene: Gaussians) -> Gaussians:
     )
 
 
+def _load_parts(path: Path, parts: Sequence[Path]) -> tuple[Gaussians, LoadReport]:
+    """Join the files of a training on several GPUs, in the order of the GPUs.
+
+    Args:
+        path: one of the parts
+        parts: all of them
+
+    Raises:
+        ProgdfError: a part cannot be read, or is of another training step or SH degree than the first.
+    """
+    is_checkpoint = scene_format(path) == "ckpt"
+    scenes: list[Gaussians] = []
+    traits: list[tuple[object, ...]] = []
+    ignored: dict[str, None] = {}
+    for part in parts:
+        if is_checkpoint:
+            checkpoint = read_checkpoint(part)
+            scene, step, names = checkpoint.scene, checkpoint.step, checkpoint.ignored
+        else:
+            scene, stored = read_ply(read_header(part))
+            step, names = None, stored["ignored_properties"]
+        scenes.append(scene)
+        traits.append((step, scene.sh_degree, scene.antialiased))
+        ignored |= dict.fromkeys(names)
+        if traits[-1] != traits[0]:
+            raise ProgdfError(
+                f"{part} does not belong to {parts[0].name}: they differ in training step, SH degree or "
+                "antialiasing; put the parts of one training into one folder"
+            )
+    format_name = CHECKPOINT if is_checkpoint else ".ply"
+    content = {"ignored_properties": tuple(ignored), "file_bytes": sum(_size(part) for part in parts)}
+    return _repair(path, concatenate(scenes), f"{format_name} in {len(parts)} parts, one per GPU", content)
+
+
 def _repair(
-    path: Path, stored: Gaussians, kind: str, ignored: tuple[str, ...] = ()
+    path: Path, stored: Gaussians, kind: str, content: Mapping[str, Any] = MappingProxyType({})
 ) -> tuple[Gaussians, LoadReport]:
     """Return the scene as it can be used, and the report of its file.
 
@@ -170,18 +214,17 @@ def _repair(
         path: the file
         stored: N Gaussians as they were read, means in the world
         kind: the format, for a person
-        ignored: names of fields that the reader does not use
+        content: further fields of the report
     """
     scene, counts = repair(stored)
+    fields = {"file_bytes": _size(path), **content, **counts}
     report = LoadReport(
         file=scene_name(path),
-        file_bytes=_size(path),
         format=kind,
         count=len(scene),
         sh_degree=scene.sh_degree,
         antialiased=scene.antialiased,
-        ignored_properties=ignored,
-        **counts,
+        **fields,
     )
     return scene, report
 

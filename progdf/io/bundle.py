@@ -22,6 +22,7 @@ from progdf.errors import ProgdfError
 
 from . import atomic
 from .file_rules import damage_error, unsupported_error
+from .part_files import part_files
 from .session import SUFFIX, SessionFile, is_session, read_session, sha256, verify_files, write_session
 
 BUNDLE = ".progdf.zip"
@@ -66,7 +67,7 @@ def write_bundle(path: Path, source: Path) -> int:
         The number of files in the bundle.
 
     Raises:
-        ProgdfError: see `verify_files`; or the scene is an unpacked .sog or a .gltf, which are many files.
+        ProgdfError: see `verify_files`; or the scene is many files, as an unpacked .sog or a .gltf is.
     """
     session = read_session(source, SessionFile)
     scene, edits = verify_files(source, session)
@@ -74,6 +75,8 @@ def write_bundle(path: Path, source: Path) -> int:
         raise ProgdfError(f"{scene.parent} is an unpacked .sog; export the scene as a .ply first")
     if scene.suffix.lower() == ".gltf":
         raise ProgdfError(f"{scene} keeps numbers in other files; export the scene as a .glb first")
+    if len(part_files(scene)) > 1:
+        raise ProgdfError(f"{scene} is one of several parts of a scene; export the scene as a .ply first")
     names = _member_names((scene, *edits))
     for region in session.view.get("selection", {}).get("regions", ()):
         region["path"] = PureWindowsPath(region["path"]).name

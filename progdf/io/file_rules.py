@@ -10,6 +10,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Collection, Iterable, Mapping
 
 from progdf.errors import ProgdfError
@@ -62,3 +63,32 @@ def check_fields(
         if name not in honored:
             ignored.append(name)
     return tuple(ignored)
+
+
+_VARIANTS = {
+    r"trbf_(center|scale)|motion(_\d+)?|omega(_\d+)?|f_t_\d+": "motion over time (SpacetimeGaussians)",
+    r"t|times?|t_scale|scales?_t|mu_t|cov_t_\d+|velocity(_\d+)?|v[xyz]|durations?": "time (4D Gaussians)",
+    r"rot_r_\d+|rot_([4-9]|\d\d+)": "rotations in four dimensions",
+    r"scale_([3-9]|\d\d+)|f_offset_\d+|f_anchor_feat_\d+|anchor_\w+": "anchors of Scaffold-GS",
+    r"betas?|sb_params(_\d+)?": "kernel shapes of Deformable Beta Splatting",
+    r"shape": "kernel shapes of generalized exponential splatting",
+    r"f_dc_([3-9]|\d\d+)": "more than three color channels",
+    r"f_asg_\d+|roughness|metallic|(base_color|albedo|specular|brdf|incidents)_\w+": "reflectance",
+    r"appearance_\w+|features|colors": "colors that depend on an appearance network, as gsplat's `app_opt`",
+}
+"""Fields of 3DGS variants that change geometry, color or time: pattern of a whole name → meaning.
+
+.ply files and checkpoints share the table, as trainers export tensors under their own names.
+"""
+
+PLAIN_GAUSSIANS = "export plain 3D Gaussians from the program that trained it"
+
+
+def variant_fields(names: Iterable[str]) -> dict[str, str]:
+    """Return the names that belong to a 3DGS variant that is not supported, with their meanings."""
+    meanings = {}
+    for name in names:
+        for pattern, meaning in _VARIANTS.items():
+            if re.fullmatch(pattern, name):
+                meanings[name] = meaning
+    return meanings

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from progdf.camera import Camera
+from progdf.formats.ply_view import PlyView, stored_view
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import fingerprint
 from progdf.io.atomic import state_folder, write_file
@@ -135,13 +136,19 @@ def direction_name(direction: Tensor) -> str:
 def find_up(
     scene: Gaussians, cameras: Sequence[Camera] = (), choice: str = "auto", path: Path | None = None
 ) -> UpAxis:
-    """The world direction that is up.
+    """Return the world direction that is up. The first of these decides:
+
+    1. `choice`, unless it is "auto"
+    2. the mean up of `cameras`, if they agree, as people hold cameras level
+    3. the user's choice for this scene in an earlier session
+    4. the header of the scene's .ply, then the camera stored in it
+    5. cameras next to the file
+    6. the shape of the scene
 
     Args:
         scene: N Gaussians
-        cameras: given with the scene; people hold them level, so their mean up is the scene's, if they agree
-        choice: an axis decides all; "auto" leaves it to the cameras, to what was chosen for this scene before
-            (`known_ups`), to cameras beside its file, and to the scene's shape
+        cameras: requested together with the scene
+        choice: one of `AXES`, or "auto"
         path: the scene's file
     """
     if choice != "auto":
@@ -150,6 +157,11 @@ def find_up(
         return UpAxis(up, "as the cameras are held")
     if (chosen := find(scene)) is not None:
         return UpAxis(chosen, "as was chosen for this scene before")
+    view = PlyView() if path is None else stored_view(path, scene.origin)
+    if view.up is not None:
+        return UpAxis(_snap(view.up, _LEVEL), f"as the comment '{view.up_comment}' in the file says")
+    if view.camera is not None and (up := _held_up([view.camera])) is not None:
+        return UpAxis(up, "as the camera stored in the file is held")
     beside = (
         []
         if path is None

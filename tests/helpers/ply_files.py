@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -87,3 +88,27 @@ def with_extra(name: str, code: str, place: int) -> Callable[[dict[str, np.ndarr
         return dict(items)
 
     return add
+
+
+def sharp_elements(count: int, **changes: Any) -> list[PlyElement]:
+    """The elements that Apple's SHARP writes after its vertices, for a photo of 640 by 480 pixels.
+
+    `changes`: other numbers by the name of their element; `renamed` names one whose property is renamed.
+    """
+    renamed = changes.pop("renamed", "")
+    contents: dict[str, tuple[Any, str]] = {
+        "extrinsic": (np.eye(4).ravel(), "f4"),
+        "intrinsic": ([512.0, 0.0, 320.0, 0.0, 512.0, 240.0, 0.0, 0.0, 1.0], "f4"),
+        "image_size": ([640, 480], "u4"),
+        "frame": ([1, count], "i4"),
+        "disparity": ([0.3, 0.4], "f4"),
+        "color_space": ([0], "u1"),
+        "version": ([1, 5, 0], "u1"),
+    }
+    elements = []
+    for name, (numbers, code) in contents.items():
+        values = np.asarray(changes.get(name, numbers))
+        table = np.empty(len(values), [("other" if name == renamed else name, code)])
+        table[table.dtype.names[0]] = values.astype(code)
+        elements.append(PlyElement.describe(table, name))
+    return elements

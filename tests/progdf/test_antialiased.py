@@ -11,7 +11,8 @@ import torch
 
 from progdf.__main__ import main
 from progdf.compose.reference import Layer, compose_layers
-from progdf.formats.ply import load_ply, load_ply_with_report, read_header, save_ply
+from progdf.formats.ply import load_ply, load_ply_with_report, save_ply
+from progdf.formats.ply_file import read_header
 from progdf.gaussians import Gaussians, pack
 from progdf.rasterize import alpha_weights, render
 from progdf.region import Region

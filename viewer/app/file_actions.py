@@ -407,7 +407,8 @@ class FileActions:
     def _open_scene(self, path: Path) -> None:
         def load() -> tuple[Document, ViewCamera]:
             opened = documents.load(path)
-            return opened, first_camera(opened.scene, up=opened.detected_up.direction)
+            up = opened.detected_up.direction
+            return opened, first_camera(opened.scene, up=up, stored=opened.stored_camera)
 
         opened, camera = self._app.wait_for(load, f"Opening {path.name} …")
         self._app.open_document(opened, on_another_scene(self._app.main_view.work.view, camera))

@@ -310,10 +310,12 @@ def first_camera(
     aspect: float = 1.5,
     fov_y: float = 45.0,
     up: Vec3 | None = None,
+    stored: Camera | None = None,
 ) -> ViewCamera:
-    """What one sees first: what the scene is about, upright, from the front and a little above.
+    """Return the first view: the view of the camera stored in the file, or of the scene's subject.
 
-    A room is met inside, from a wall or a corner, with at least `INSIDE_FOV` degrees.
+    The subject is upright, seen from the front and a little above. The camera of a room is inside, at a wall
+    or a corner, with a field of view of at least `INSIDE_FOV` degrees.
 
     Args:
         scene: the original
@@ -321,11 +323,17 @@ def first_camera(
         aspect: width / height of the picture
         fov_y: vertical field of view, degrees
         up: unit vector; None asks the cameras and the scene
+        stored: the camera in the scene's file (`progdf.formats.ply_view`), whose picture fits into the view
     """
     up = find_scene_up(scene, cameras=cameras).direction if up is None else up
     camera, axis = ViewCamera(up=up, azimuth=20.0, fov_y=fov_y), torch.tensor(up)
     if not len(scene):
         return frame(camera, Bounds(), aspect)
+    if stored is not None:
+        view = from_camera(camera, stored, bounds_of(scene))
+        half_width = stored.width / (2.0 * float(stored.K[0, 0]))
+        half_height = max(math.tan(math.radians(view.fov_y) / 2.0), half_width / aspect)
+        return replace(view, fov_y=min(2.0 * math.degrees(math.atan(half_height)), 179.0))
     if is_room(scene, axis):
         eye_at, target = (tuple(at.tolist()) for at in standpoint(scene, axis))
         return look_from(replace(camera, fov_y=max(fov_y, INSIDE_FOV)), eye_at, target)

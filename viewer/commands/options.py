@@ -189,7 +189,9 @@ def open_view(stack: StackOptions, drawing: DrawingOptions) -> tuple[session.Win
     opened = open_stack(stack, drawing)
     state = opened.view
     if opened.session is None:
-        state = replace(state, grid=True, camera=first_camera(opened.document.scene, up=opened.up))
+        stored = opened.document.stored_camera
+        camera = first_camera(opened.document.scene, up=opened.up, stored=stored)
+        state = replace(state, grid=True, camera=camera)
     return session.WindowSession(opened.document, state, opened.snapshots, opened.warning), opened.session
 
 

@@ -88,7 +88,9 @@ def export(argv: Sequence[str]) -> int:
     if ending == PAGE:
         view = opened.view
         if opened.session is None:
-            view = replace(view, camera=view_camera.first_camera(opened.document.original, up=opened.up))
+            document = opened.document
+            camera = view_camera.first_camera(document.original, up=opened.up, stored=document.stored_camera)
+            view = replace(view, camera=camera)
         print_line(write_page(out, opened.document, view, opened.snapshots, options.page))
         return 0
     if ending == CUBE:
@@ -198,7 +200,8 @@ def render(argv: Sequence[str]) -> int:
     if options.alpha and (view.compare.mode != "off" or one_moves or films):
         raise ProgdfError("--alpha goes with a single picture; leave out comparisons, sheets and films")
     saved = None if opened.session is None else view.camera
-    camera = choose_camera(options.viewpoint, scene, gdfs, saved, opened.up)
+    stored = opened.document.stored_camera
+    camera = choose_camera(options.viewpoint, scene, gdfs, saved, opened.up, stored)
     swept = _swept_layers(options, opened)
     if films:
         seen = options.viewpoint
@@ -402,8 +405,9 @@ def choose_camera(
     gdfs: Sequence[Gdf],
     saved: ViewCamera | None,
     up: Vec3 | None = None,
+    stored: Camera | None = None,
 ) -> Camera:
-    """The camera that was asked for; that of the session (`saved`); or one that frames the scene.
+    """Return the requested camera, or the session's, or the one stored in the scene's file, or a frame of it.
 
     Args:
         viewpoint: what was asked for
@@ -411,6 +415,7 @@ def choose_camera(
         gdfs: its edits, which --frame may name
         saved: of a session
         up: unit vector that is up in the scene; None finds it
+        stored: in the scene's file
 
     Raises:
         ProgdfError: options that contradict each other or name nothing.
@@ -425,7 +430,7 @@ def choose_camera(
         return camera if size is None else fit_camera(camera, size)
     width, height = size or DEFAULT_SIZE
     aspect = width / height
-    view = saved or view_camera.first_camera(scene, aspect=aspect, up=up)
+    view = saved or view_camera.first_camera(scene, aspect=aspect, up=up, stored=stored)
     if viewpoint.orbit is not None:
         view = parse_orbit(viewpoint.orbit, view)
     if viewpoint.frame is not None or (viewpoint.orbit is not None and saved is None):

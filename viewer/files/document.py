@@ -11,8 +11,10 @@ from typing import TypeVar
 
 import torch
 
+from progdf.camera import Camera
 from progdf.compose.added import extend
 from progdf.errors import ProgdfError
+from progdf.formats.ply_view import stored_view
 from progdf.formats.scene_file import load_scene, scene_file, scene_name
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf, load_gdf
@@ -65,6 +67,11 @@ class Document:
         """Which way is up, as the scene and its edits tell."""
         return find_scene_up(self.original, self.edits, path=self.path)
 
+    @cached_property
+    def stored_camera(self) -> Camera | None:
+        """The camera stored in the scene's file, which gives the first view."""
+        return None if self.path is None else stored_view(self.path, self.original.origin).camera
+
     def facts(self) -> SceneFacts:
         """What the panel and the camera need to know of it."""
         scene, added = self.scene, [gdf.members - len(gdf.region) for gdf in self.edits]
@@ -81,7 +88,8 @@ class Document:
             neighborhood=neighborhood,
             scribbles=_once(lambda: neighborhood().scribbles),
             home=lambda camera, aspect: replace(
-                first_camera(self.original, (), aspect, camera.fov_y, camera.up), mode=camera.mode
+                first_camera(self.original, (), aspect, camera.fov_y, camera.up, stored=self.stored_camera),
+                mode=camera.mode,
             ),
         )
 

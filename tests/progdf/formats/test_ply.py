@@ -43,7 +43,7 @@ VARIANTS: dict[str, tuple[Callable[[dict[str, np.ndarray]], dict[str, np.ndarray
     "reversed columns": (lambda c: dict(reversed(c.items())), {}),
     "int at the end": (with_extra("segment", "i4", 99), {}),
     "uchar in the middle": (with_extra("red", "u1", 4), {}),
-    "float in the middle of f_rest": (with_extra("filter_3D", "f4", 20), {}),
+    "float in the middle of f_rest": (with_extra("confidence", "f4", 20), {}),
     "element before": (dict, {"before": [camera_element()]}),
     "element after": (dict, {"after": [camera_element()]}),
     "lists before": (dict, {"before": [face_element()]}),

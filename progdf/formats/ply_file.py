@@ -1,0 +1,216 @@
+"""The container of .ply files: header, elements and rows, whatever they mean.
+
+Every count in a header is checked against the size of the file before a row is read.
+"""
+
+from __future__ import annotations
+
+import io
+import itertools
+import os
+import re
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+from plyfile import PlyData, PlyElement, PlyElementParseError, PlyListProperty, PlyParseError
+
+from progdf.errors import ProgdfError
+from progdf.io.atomic import check_regular, open_error
+from progdf.io.file_rules import unsupported_error
+
+ANTIALIASED_COMMENT = "SplatRenderMode: mip"
+"""What the header of a scene says that was trained with Mip-Splatting's 2D filter (Brush's words)."""
+
+_RENDERING = {
+    "splatrendermode: mip": True,
+    "splatrendermode: default": False,
+    "antialiased 1": True,
+    "antialiased 0": False,
+}
+"""The comments that tell it, Brush's and Postshot's, in lower case; the last one counts."""
+
+_MAX_HEADER_BYTES = 1 << 20
+"""A header that has not ended by then is no header."""
+
+_MOST_LISTS = 200_000
+"""Values of list rows before the vertices, which plyfile reads one by one in about two seconds."""
+
+_LONGEST_COMMENT = 200  # characters that are kept
+
+_SKIPPED = ("comment", "obj_info")
+_ELEMENT = re.compile(r"(element\s+\S+\s+)(\d{1,19})")
+_END = re.compile(rb"^end_header[ \t]*\r?\n", re.MULTILINE)
+_FOREIGN = (
+    (b"version https://git-lfs", "is a Git LFS pointer, not the file itself; run `git lfs pull` to fetch it"),
+    (b"\x1f\x8b", "is gzip data, but no .spz scene; unpack it first"),
+    (b"PK\x03\x04", "is a zip archive, but no .sog scene; unpack it first"),
+    (b"<", "is a web page or XML, not a .ply; download the file itself"),
+)
+
+
+@dataclass(frozen=True)
+class PlyFile:
+    """A .ply file of which the header is read and checked."""
+
+    path: Path  # the file
+    layout: PlyData  # its format and elements, without rows
+    counts: dict[str, int]  # rows of each element, by name; they fit into the file
+    header: tuple[str, ...]  # its lines before end_header, comments empty
+    length: int  # bytes of the header
+    size: int  # bytes of the file
+    antialiased: bool  # a comment says that the scene was trained with Mip-Splatting's 2D filter
+    comments: tuple[
+        str, ...
+    ] = ()  # of its comment and obj_info lines, in order; printable ASCII, single spaces
+
+    def columns(self, element: str) -> dict[str, str]:
+        """numpy's type of each property that is no list, by name; of an element that is not there nothing."""
+        properties = self.layout[element].properties if element in self.layout else ()
+        return {p.name: p.val_dtype for p in properties if not isinstance(p, PlyListProperty)}
+
+    def rows(self, *names: str) -> tuple[list[npt.NDArray[np.void]], int]:
+        """The rows of elements, of a binary file memory-mapped, and the bytes behind the file's last row.
+
+        The latter are 0 where lists follow, whose length nobody knows.
+
+        Raises:
+            ProgdfError: a row up to the last of the elements is not what the header says.
+        """
+        elements = self.layout.elements
+        last = 1 + max(i for i, element in enumerate(elements) if element.name in names)
+        for element in elements[:last]:
+            self._check_lists(element, element.name in names)
+        try:
+            with np.errstate(over="ignore"):
+                rows, after = self._text_rows(last, names) if self.layout.text else self._binary_rows(last)
+        except OSError as error:
+            raise open_error(self.path, error) from None
+        except (PlyElementParseError, ValueError, OverflowError, MemoryError) as error:
+            row = re.search(r"at row \d+", str(error))
+            what = f"has too many or too few numbers, or no number, {row[0] if row else 'in a row'}"
+            if isinstance(error, PlyElementParseError):
+                what = f"ends within element '{error.element.name}'"
+            raise ProgdfError(
+                f"{self.path} {what}; it is truncated or damaged: copy or export it again"
+            ) from None
+        lists_follow = any(_has_lists(element) for element in elements[last:])
+        return [rows[name] for name in names], 0 if lists_follow else after
+
+    def _check_lists(self, element: PlyElement, is_needed: bool) -> None:
+        name, lists = element.name, _has_lists(element)
+        if lists and is_needed:
+            feature = f"a list among its {name} properties"
+            raise unsupported_error(self.path, feature, "export it as a plain 3DGS .ply")
+        if lists and self.counts[name] * len(element.properties) > _MOST_LISTS:
+            raise ProgdfError(
+                f"{self.path} has {self.counts[name]} rows of lists, '{name}', before its vertices; "
+                "export it with the vertices first"
+            )
+
+    def _binary_rows(self, last: int) -> tuple[dict[str, npt.NDArray[np.void]], int]:
+        with _Stream(self, last) as stream:
+            rows = {element.name: element.data for element in PlyData.read(stream)}
+            following = self.layout.elements[last:]
+            bytes_after = sum(self.counts[element.name] * _row_bytes(element) for element in following)
+            return rows, self.size - stream.tell() - bytes_after
+
+    def _text_rows(self, last: int, names: Collection[str]) -> tuple[dict[str, npt.NDArray[np.void]], int]:
+        """Parse the named elements by numpy, which reads text many times as fast as plyfile."""
+        rows = {}
+        with self.path.open("rb") as file:
+            file.seek(self.length)
+            for i, element in enumerate(self.layout):
+                lines = list(itertools.islice(file, self.counts[element.name]))
+                if i >= last:
+                    continue
+                if len(lines) < self.counts[element.name]:
+                    raise PlyElementParseError("early end-of-file", element)
+                if element.name in names:
+                    rows[element.name] = np.loadtxt(lines, element.dtype(), comments=None, ndmin=1)
+                    if len(rows[element.name]) < len(lines):
+                        raise ValueError("an empty row")
+            return rows, len(file.read().strip())
+
+
+class _Stream(io.FileIO):
+    """The file as plyfile is given it: a header of its first elements alone, then what is behind its own."""
+
+    def __init__(self, ply: PlyFile, elements: int) -> None:
+        super().__init__(ply.path)
+        self.seek(ply.length)
+        starts = [i for i, line in enumerate(ply.header) if line.startswith("element")]
+        head = ply.header[: (*starts, None)[elements]]
+        self._head = io.BytesIO("\n".join([*head, "end_header", ""]).encode("ascii"))
+
+    def read(self, size: int | None = -1) -> bytes:
+        return self._head.read(size) or super().read(size)
+
+
+def read_header(path: str | os.PathLike[str]) -> PlyFile:
+    """A .ply file, its header read and every element's count checked: its rows must fit into the file.
+
+    Raises:
+        ProgdfError: not a .ply, a broken header, or one that declares more than the file holds.
+    """
+    check_regular(path)
+    try:
+        with Path(path).open("rb") as file:
+            start, size = file.read(_MAX_HEADER_BYTES), os.fstat(file.fileno()).st_size
+    except OSError as error:
+        raise open_error(path, error) from None
+    if not start:
+        raise ProgdfError(f"{path} is empty (0 bytes); copy or download it again")
+    if start[:32].split(b"\n")[0].strip() != b"ply":
+        plain = "is not a .ply file; its first line should be 'ply'"
+        what = next((what for magic, what in _FOREIGN if start.startswith(magic)), plain)
+        raise ProgdfError(f"{path} {what}")
+    end = _END.search(start)
+    if end is None:
+        raise ProgdfError(f"{path} has a header without 'end_header'; the file is truncated or not a .ply")
+    text = start[: end.start()].decode("ascii", "replace").encode("ascii", "replace").decode()
+    lines = [" ".join(line.split()) for line in text.split("\n")[:-1]]
+    renderings = [_RENDERING.get(line[8:].lower()) for line in lines if line.startswith("comment ")]
+    header = ["comment" if line.startswith(_SKIPPED) or not line else line for line in lines]
+    counts = [match for line in header if (match := _ELEMENT.fullmatch(line))]
+    empty = [_ELEMENT.sub(r"\g<1>0", line) for line in header]
+    try:
+        layout = PlyData.read(io.BytesIO("\n".join([*empty, "end_header", ""]).encode()))
+    except (PlyParseError, ValueError, OverflowError, MemoryError) as error:
+        raise ProgdfError(f"{path} has a broken header: {str(error)[:100]}; export it again") from None
+    rows = {element.name: int(match[2]) for element, match in zip(layout, counts, strict=False)}
+    if len(rows) < len(layout.elements):
+        raise ProgdfError(f"{path} has a broken header: counts are digits; export it again")
+    antialiased = next((known for known in reversed(renderings) if known is not None), False)
+    texts = [line.partition(" ")[2] for line in lines if line.startswith(_SKIPPED)]
+    comments = tuple(re.sub(r"[^ -~]", "?", text[:_LONGEST_COMMENT]) for text in texts)
+    ply = PlyFile(Path(path), layout, rows, tuple(header), end.end(), size, antialiased, comments)
+    _check_counts(ply)
+    return ply
+
+
+def _check_counts(ply: PlyFile) -> None:
+    remaining = ply.size - ply.length
+    for element in ply.layout:
+        # an ascii value takes at least a digit and a separator; the file's last separator may be missing
+        text, count = ply.layout.text, ply.counts[element.name]
+        least = 2 * len(element.properties) if text else _row_bytes(element)
+        if count * least > remaining + text:
+            what = "Gaussians" if element.name == "vertex" else f"rows of '{element.name}'"
+            raise ProgdfError(
+                f"{ply.path} declares {count} {what} of {'at least ' if text else ''}{least} bytes but "
+                f"has room for {max(remaining, 0) // least}, so it is truncated or its header is wrong; "
+                f"copy or export it again"
+            )
+        remaining -= count * least
+
+
+def _has_lists(element: PlyElement) -> bool:
+    return any(isinstance(column, PlyListProperty) for column in element.properties)
+
+
+def _row_bytes(element: PlyElement) -> int:
+    """Bytes of a binary row, or of one with empty lists."""
+    return sum(np.dtype(getattr(p, "len_dtype", p.val_dtype)).itemsize for p in element.properties)

@@ -1,0 +1,74 @@
+"""Scenes that a training on several GPUs divides into one file per GPU."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from progdf.errors import ProgdfError
+
+from .file_rules import unsupported_error
+
+_RANK = re.compile(r"(?P<head>.*[_-]rank)(?P<part>\d{1,4})(?P<tail>\.(?:pt|pth|ckpt))", re.I | re.S)
+"""gsplat: ckpt_29999_rank0.pt. The name does not tell how many ranks there are."""
+
+_RANK_OF = re.compile(r"(?P<head>.*_rk)(?P<part>\d{1,4})(?P<tail>_ws(?P<count>\d{1,4})\.ply)", re.I | re.S)
+"""Grendel-GS: point_cloud_rk0_ws4.ply. `ws` is the world size."""
+
+_PART_OF = re.compile(
+    r"(?:.*[_\-. ])?(?:part|shard|chunk|rank)[_\-. ]?(\d{1,5})[_\-. ]?of[_\-. ]?(\d{1,5})(?:[_\-. ].*)?"
+    r"|.*[_\-. ](\d{5})-of-(\d{5})(?:[_\-. ].*)?",
+    re.I | re.S,
+)
+"""room_part_1_of_3.ply and room-00001-of-00003.ply: divided by a user or an unknown program."""
+
+_GSPLAT_STEP = re.compile(r"ckpt_(\d{1,9})_rank", re.I)
+
+
+def part_files(path: Path) -> list[Path]:
+    """Return the files that together hold the scene of a file, in the order of their numbers.
+
+    Raises:
+        ProgdfError: one of the files is missing, or the name says that it is a part but not by whose rule.
+    """
+    match = _RANK.fullmatch(path.name) or _RANK_OF.fullmatch(path.name)
+    if match is None:
+        _refuse_numbered_part(path)
+        return [path]
+    head, tail = match["head"], match["tail"]
+    ranks = _numbers_between(path.parent, head, tail) | {int(match["part"])}
+    declared = match.groupdict().get("count")
+    count = int(declared) if declared else max(ranks) + 1
+    if step := _GSPLAT_STEP.fullmatch(head):
+        stem = f"train_step{int(step[1]):04d}_rank"  # gsplat writes a report per rank beside the checkpoints
+        reports = _numbers_between(path.parent.parent / "stats", stem, ".json")
+        count = max(count, 1 + max(reports, default=0))
+    missing = [path.with_name(f"{head}{rank}{tail}") for rank in range(count) if rank not in ranks]
+    if missing:
+        names = ", ".join(file.name for file in missing[:4])
+        more = f" and {len(missing) - 4} more" if len(missing) > 4 else ""
+        raise ProgdfError(
+            f"{path} is one of {count} parts of a scene, a file per GPU of its training, and {names}{more} "
+            "is missing; put all parts into one folder"
+        )
+    return [path.with_name(f"{head}{rank}{tail}") for rank in range(count)]
+
+
+def _numbers_between(folder: Path, head: str, tail: str) -> set[int]:
+    """Return the numbers in the names HEAD<number>TAIL of a folder; none where there is no such folder."""
+    pattern = re.compile(re.escape(head) + r"(0|[1-9]\d{0,3})" + re.escape(tail))
+    try:
+        matches = [pattern.fullmatch(file.name) for file in folder.iterdir()]
+    except OSError:
+        return set()
+    return {int(match[1]) for match in matches if match}
+
+
+def _refuse_numbered_part(path: Path) -> None:
+    match = _PART_OF.fullmatch(path.stem)
+    if match is None:
+        return
+    part, count = (int(number) for number in match.groups() if number is not None)
+    if count > 1:
+        remedy = "join the parts with `splat-transform PART… out.ply`, or rename this one to open it alone"
+        raise unsupported_error(path, f"a name for part {part} of {count}", remedy)
