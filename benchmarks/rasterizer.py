@@ -401,9 +401,11 @@ def _step_time(case: RasterCase, steps: int) -> float:
 
 
 def hard_tables() -> list[Table]:
-    """What every engine must survive: the largest differences of the fast engines from the reference."""
+    """Draw every hard case: the largest differences of the fast engines from the reference."""
+    from tests.helpers.camera_tables import REFUSED_VIEWMATS
     from tests.helpers.drawn import CASES as HARD
-    from tests.helpers.drawn import drawn_case, relative_errors
+    from tests.helpers.drawn import drawn_case, image_error, relative_errors
+    from tests.helpers.scenes import front_camera
 
     rows = []
     engines = ("cpu", "warp") if find_spec("warp") else ("cpu",)
@@ -415,18 +417,32 @@ def hard_tables() -> list[Table]:
             errors = relative_errors(fast, plain)
             worst = max(errors, key=lambda name: errors[name])
             where = f" ({worst})" if errors[worst] else ""
-            row += [f"{float((fast.image - plain.image).abs().max()):.1e}", f"{errors[worst]:.1e}{where}"]
+            row += [f"{image_error(fast, plain):.1e}", f"{errors[worst]:.1e}{where}"]
         rows.append(tuple(row))
+    for name, (change, _) in REFUSED_VIEWMATS.items():
+        outcome = _camera_outcome(front_camera(), change)
+        rows.append((f"viewmat {name}", "–", outcome, *["–"] * (2 * len(engines) - 1)))
     figures = [
         f"{engine}: {figure}" for engine in engines for figure in ("image error", "worst gradient error")
     ]
     columns = ("case", "Gaussians", *figures)
     note = (
         "The engines in float32 against the reference in float64, warp on its CPU device: largest "
-        "difference of a color; of a gradient over the largest, of the input named. The cases are those of "
-        "`tests/progdf/rasterize/test_rasterize.py`, which fails beyond its tolerances."
+        "difference of a color, over the brightest if that is above 1; of a gradient over the largest, of "
+        "the input named. The cases are those of `tests/progdf/rasterize/test_rasterize.py`, which fails "
+        "beyond its tolerances. A camera whose viewmat is no rotation and translation is refused where it "
+        "is made, as engines rely on it."
     )
     return [Table("hard", f"{len(rows)} hard cases", columns, tuple(rows), note)]
+
+
+def _camera_outcome(camera: Camera, change: Tensor) -> str:
+    """Return what happens to a camera whose viewmat is changed: drawn, or refused and why."""
+    try:
+        replace(camera, viewmat=change @ camera.viewmat)
+    except ValueError as error:
+        return f"refused: {str(error).partition(';')[0]}"
+    return "drawn"
 
 
 def _spread(times: list[float]) -> str:

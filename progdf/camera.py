@@ -173,7 +173,8 @@ def rigid_fault(matrix: Tensor, tolerance: float = RIGID_TOLERANCE) -> str:
     """
     rows = matrix.tolist()  # plain numbers: a window makes a camera for every frame
     if rows[3] != [0.0, 0.0, 0.0, 1.0]:
-        return f"has the last row {rows[3]}"
+        last = ", ".join(f"{entry:g}" for entry in rows[3])
+        return f"has the last row [{last}]"
     x, y, z = (row[:3] for row in rows[:3])
     square = [_dot(a, b) for a, b in ((x, x), (y, y), (z, z), (x, y), (y, z), (z, x))]
     mean = sum(square[:3]) / 3

@@ -7,6 +7,7 @@ import pytest
 from benchmarks import rasterizer as bench_rasterize
 from benchmarks.rasterizer import RasterCase, hard_tables, measure, tables, warp_tables
 from tests.helpers import drawn
+from tests.helpers.camera_tables import REFUSED_VIEWMATS
 from tests.helpers.drawn import NEEDS_WARP
 
 
@@ -31,9 +32,14 @@ def test_every_hard_case_has_a_row_with_its_largest_errors(monkeypatch: pytest.M
     some = {name: drawn.CASES[name] for name in ("no gaussians", "equal depths", "NaN in means")}
     monkeypatch.setattr(drawn, "CASES", some)
     (table,) = hard_tables()
-    assert [row[0] for row in table.rows] == list(some)
-    assert table.title == "3 hard cases"
-    assert all(float(row[2]) <= 2e-6 and float(row[3].split()[0]) <= 2e-5 for row in table.rows)
+    drawn_rows = table.rows[:3]
+    assert [row[0] for row in drawn_rows] == list(some)
+    assert table.title == f"{3 + len(REFUSED_VIEWMATS)} hard cases"
+    assert all(float(row[2]) <= 2e-6 and float(row[3].split()[0]) <= 2e-5 for row in drawn_rows)
+    refused = {row[0]: row[2] for row in table.rows[3:]}
+    assert refused["viewmat scaled by 1.7"] == "refused: the viewmat scales by 1.7"
+    assert refused["viewmat mirrored"] == "refused: the viewmat mirrors"
+    assert all(len(row) == len(table.columns) for row in table.rows)
     assert float(table.rows[1][2]) > 0.0
 
 

@@ -1,4 +1,4 @@
-"""The camera files of other programs, as tables to write."""
+"""The camera files of other programs, as tables to write, and viewmats that no camera may have."""
 
 from __future__ import annotations
 
@@ -7,10 +7,32 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from progdf.camera import Camera
 from progdf.scene.orbit_rig import orbit_rig
 from tests.helpers.scenes import ball
+
+
+def _axes(x: float, y: float, z: float, last: float = 1.0) -> Tensor:
+    return torch.diag(torch.tensor([x, y, z, last]))
+
+
+_SHEAR = torch.tensor(
+    [[1.0, 0.1, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+)
+
+REFUSED_VIEWMATS = {
+    "scaled by 1.7": (_axes(1.7, 1.7, 1.7), "scales by 1.7"),
+    "scaled by 1.001": (_axes(1.001, 1.001, 1.001), "scales by 1.001"),
+    "mirrored": (_axes(-1.0, 1.0, 1.0), "mirrors"),
+    "turned inside out": (_axes(-1.0, -1.0, -1.0), "mirrors"),
+    "stretched": (_axes(1.0, 1.7, 1.0), "stretches or shears"),
+    "sheared": (_SHEAR, "stretches or shears"),
+    "collapsed": (_axes(0.0, 0.0, 0.0), "stretches or shears"),
+    "scaled by its last row": (_axes(1.0, 1.0, 1.0, 1.7), "has the last row"),
+}
+"""What is multiplied to a good viewmat from the left → the change, and the fault that is named."""
 
 
 def some_cameras() -> list[Camera]:

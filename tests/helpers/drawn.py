@@ -81,6 +81,14 @@ def drawn_case(name: str, engine: str) -> Drawn:
     return draw(case.gaussians, case.camera, engine)
 
 
+def image_error(found: Drawn, expected: Drawn) -> float:
+    """Return the largest difference of a color, over the brightest color if that is above 1."""
+    if not expected.image.numel():
+        return 0.0
+    difference = (found.image - expected.image).abs().max()
+    return float(difference / expected.image.abs().max().clamp_min(1.0))
+
+
 def relative_errors(found: Drawn, expected: Drawn) -> dict[str, float]:
     """Largest gradient error over the largest gradient, by input; below 1e-6 a gradient counts as zero."""
     errors = {}

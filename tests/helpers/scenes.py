@@ -195,6 +195,19 @@ def hard_cases() -> dict[str, HardCase]:
     flat = plain.means.clone()
     flat[:, 2] = 3.0
     add("equal depths", replace(plain, means=flat))
+    add("depths one ulp apart", replace(plain, means=_one_ulp_apart(flat)))
+    turned = orbit_camera(azimuth=1.1, elevation=0.7)
+    facing = (_one_ulp_apart(flat).double() - turned.viewmat[:3, 3].double()) @ turned.viewmat[
+        :3, :3
+    ].double()
+    add("depths one ulp apart, turned camera", replace(plain, means=facing.float()), turned)
+    for factor in (100.0, 1e4):
+        add(f"HDR colors up to {factor:g}", replace(some, sh0=_hdr_sh0(some.sh0, factor)))
+    around = random_gaussians(200, seed=6, spread=2.0, scale=0.1, sh_degree=3)
+    for degrees in (120.0, 170.0):
+        add(f"field of view of {degrees:g} degrees, inside", around, _camera_of_angle(degrees))
+    distant = replace(plain, means=plain.means + torch.tensor([0.0, 0.0, 300.0]))
+    add("field of view of 0.5 degrees", distant, _camera_of_angle(0.5))
     for width, height in ((1, 1), (17, 5), (33, 9), (64, 16)):
         add(f"image {width}x{height}", plain, front_camera(width, height, focal=0.75 * width))
     tiny = replace(plain, log_scales=plain.log_scales - 3.0)
@@ -202,6 +215,26 @@ def hard_cases() -> dict[str, HardCase]:
     add("antialias with points", replace(one_gaussian(scales=(0.0, 0.0, 0.0)), antialiased=True))
     add("antialias with large splats", replace(plain, antialiased=True))
     return cases
+
+
+def _camera_of_angle(degrees: float) -> Camera:
+    """Return a front camera with this horizontal field of view."""
+    return front_camera(focal=20.0 / math.tan(math.radians(degrees) / 2))
+
+
+def _one_ulp_apart(means: Tensor) -> Tensor:
+    """Return means whose depths, in a drawn order, follow each other as closely as float32 allows. [N,3]"""
+    count = len(means)
+    near = means[0, 2].view(torch.int32)
+    order = Draws(7).order(count).to(torch.int32)
+    depths = (near + order).view(torch.float32)
+    return torch.cat([means[:, :2], depths[:, None]], dim=1)
+
+
+def _hdr_sh0(sh0: Tensor, largest: float) -> Tensor:
+    """Return DC coefficients with the same colors times factors from 1 to `largest`. [N,3]"""
+    factors = torch.logspace(0.0, math.log10(largest), len(sh0))
+    return sh0.abs() * factors[Draws(8).order(len(sh0))][:, None]
 
 
 def _stack(layer: Gaussians, count: int) -> Gaussians:

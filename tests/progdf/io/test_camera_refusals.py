@@ -13,11 +13,10 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
-from torch import Tensor
 
 from progdf.errors import ProgdfError
 from progdf.io.cameras import load_cameras
-from tests.helpers.camera_tables import inria, nerfstudio, some_cameras, written
+from tests.helpers.camera_tables import REFUSED_VIEWMATS, inria, nerfstudio, some_cameras, written
 from tests.helpers.refused import refusal
 
 
@@ -96,29 +95,12 @@ def test_an_inria_camera_without_focal_length_is_refused(tmp_path: Path) -> None
     assert "no focal length" in refusal(load_cameras, written(tmp_path / "cameras.json", entries))
 
 
-def scaled(factor: float) -> Tensor:
-    return torch.diag(torch.tensor([factor, factor, factor, 1.0]))
-
-
-SHEAR = torch.eye(4) + 0.1 * torch.eye(4)[:, :1] @ torch.eye(4)[1:2]
-STRANGE = {  # what a matrix in front of a viewmat does, and the fault that is named
-    "scaled": (scaled(1.7), "scales by 1.7"),
-    "scaled a little": (scaled(1.001), "scales by 1.001"),
-    "mirrored": (torch.diag(torch.tensor([-1.0, 1.0, 1.0, 1.0])), "mirrors"),
-    "turned inside out": (scaled(-1.0), "mirrors"),
-    "stretched": (torch.diag(torch.tensor([1.0, 1.7, 1.0, 1.0])), "stretches or shears"),
-    "sheared": (SHEAR, "stretches or shears"),
-    "collapsed": (scaled(0.0), "stretches or shears"),
-    "scaled by the last row": (torch.diag(torch.tensor([1.0, 1.0, 1.0, 1.7])), "has the last row"),
-}
-
-
-@pytest.mark.parametrize("case", STRANGE)
+@pytest.mark.parametrize("case", REFUSED_VIEWMATS)
 def test_a_viewmat_must_be_a_rotation_and_a_translation(case: str) -> None:
-    matrix, fault = STRANGE[case]
+    change, fault = REFUSED_VIEWMATS[case]
     camera = some_cameras()[0]
     with pytest.raises(ValueError, match=rf"the viewmat {fault}.*; it must be a rotation and a translation"):
-        replace(camera, viewmat=matrix @ camera.viewmat)
+        replace(camera, viewmat=change @ camera.viewmat)
 
 
 def test_intrinsics_must_have_no_entries_that_nothing_reads() -> None:
