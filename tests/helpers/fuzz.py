@@ -195,6 +195,7 @@ READERS = (
     "members",
     "glb",
     "gltf",
+    "colmap text",
     *COSTLY,
 )
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
-import json
 import os
 import random
 import shutil
@@ -71,7 +70,8 @@ def more_inputs(folder: Path, reader: str) -> dict[str, Reader]:
         **{kind: partial(_converted, kind) for kind in ("spz", "splat", "sog", "ksplat", "compressed")},
         "bundles": _bundles,
         **{kind: partial(_gltf, kind) for kind in GLTF_READERS},
-        "colmap": _colmap,
+        "colmap": partial(_colmap, False),
+        "colmap text": partial(_colmap, True),
         "masks": _masks,
         "labels": partial(_numbers, "labels:{}:1"),
         "members": partial(_numbers, "file:{}"),
@@ -169,26 +169,28 @@ def _gltf(kind: str, folder: Path) -> Reader:
     return f"x{suffix}", read, [of_json, of_json, of_json, changed_bytes(content)]
 
 
-def _colmap(folder: Path) -> Reader:
+def _colmap(text: bool, folder: Path) -> Reader:
+    """A COLMAP model with one damaged file."""
     from tests.progdf.io.test_colmap import views, write_model
 
-    models = {text: write_model(folder / f"m{text}", views(), text=text) for text in (False, True)}
-    files = [(text, path.name) for text, model in models.items() for path in sorted(model.iterdir())]
+    good = write_model(folder / "good", views(), text=text)
+    names = ["cameras.txt", "images.txt"] if text else [path.name for path in sorted(good.iterdir())]
 
     def change(rng: random.Random, path: Path) -> None:
-        text, name = rng.choice(files)
-        changed_bytes((models[text] / name).read_bytes())(rng, path)
-        where = json.dumps([text, name]).encode()
+        name = rng.choice(names)
+        changed_bytes((good / name).read_bytes())(rng, path)
+        where = name.encode()
         path.write_bytes(len(where).to_bytes(2, "little") + where + path.read_bytes())
 
     def read(path: Path) -> None:
         content = path.read_bytes()
         end = 2 + int.from_bytes(content[:2], "little")
-        text, name = json.loads(content[2:end])
+        name = content[2:end].decode()
         shutil.rmtree(folder / "m", ignore_errors=True)
-        shutil.copytree(models[text], folder / "m")
+        shutil.copytree(good, folder / "m")
         (folder / "m" / name).write_bytes(content[end:])
-        load_cameras(folder / "m")
+        for camera in load_cameras(folder / "m"):
+            assert bool(camera.viewmat.isfinite().all())
 
     return "x.colmap", read, [change]
 
