@@ -62,7 +62,7 @@ class RenderOptions:
     viewpoint: OmitArgPrefixes[ViewpointOptions] = ViewpointOptions()
     drawing: OmitArgPrefixes[DrawingOptions] = DrawingOptions()
     alpha: Switch = False
-    """A transparent background, in a .png."""
+    """A transparent background, in a .png; of a film in a .webp or a folder."""
     sweep: Annotated[str | None, word("NAME|all", "a still picture")] = None
     """Move this edit's slider from 0 to 1 and back, or of all in turn: an animation."""
     turntable: Annotated[str | None, word("SECONDS", "a still picture")] = None

@@ -13,7 +13,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
 from progdf.camera import Camera
@@ -197,8 +196,8 @@ def render(argv: Sequence[str]) -> int:
     check_not_an_input(options.out, opened.files)
     scene, gdfs, view = opened.document.scene, opened.document.gdfs, opened.view
     view = replace(view, compare=_comparison(options, view.compare))
-    if options.alpha and (view.compare.mode != "off" or one_moves or films):
-        raise ProgdfError("--alpha goes with a single picture; leave out comparisons, sheets and films")
+    if options.alpha and (view.compare.mode != "off" or options.sheet is not None):
+        raise ProgdfError("--alpha goes with a picture or a film; leave out comparisons and sheets")
     saved = None if opened.session is None else view.camera
     stored = opened.document.stored_camera
     camera = choose_camera(options.viewpoint, scene, gdfs, saved, opened.up, stored)
@@ -211,7 +210,7 @@ def render(argv: Sequence[str]) -> int:
         if moves and (seen.camera or seen.orbit or seen.frame):
             raise ProgdfError("--timeline moves the camera; leave out --camera, --orbit and --frame")
         with _engine(scene, gdfs, options) as engine:
-            print_line(film.write(options.out, keys, view, camera, engine, _say_frames()))
+            print_line(film.write(options.out, keys, view, camera, engine, _say_frames(), options.alpha))
         return 0
     with _engine(scene, gdfs, options) as engine:
         comparison = ""
@@ -247,7 +246,7 @@ def _render_still(
     """One picture, compared as `view` asks; gives what to say about the comparison."""
     origin = opened.document.scene.origin
     if options.alpha:
-        picture = Image.fromarray(transparent_image(engine, view, camera))
+        picture = Image.fromarray(film.transparent_image(engine, view, camera))
         with atomic_write(options.out) as temporary_file:
             picture.save(temporary_file, pnginfo=camera_chunk(camera, visible_edits(view), origin, opened.up))
         return ""
@@ -365,33 +364,18 @@ def _say_frames() -> film.Advance:
 
 
 def _check_output(options: RenderOptions) -> None:
-    """Whether the file's name fits what goes into it."""
+    """Check that the file's name fits its content."""
     suffix = options.out.suffix.lower()
     given = [name for name in ONE_OF if getattr(options, name) not in (None, False)]
     if len(given) > 1:
         raise ProgdfError(f"--{given[0]} and --{given[1]} cannot be combined; give only one of them")
     if options.sweep is not None or options.turntable is not None or options.timeline:
-        film.check_output(options.out)
+        film.check_output(options.out, options.alpha)
     elif suffix in film.ANIMATIONS:
         raise ProgdfError(f"{options.out} holds an animation; say what moves: --sweep NAME or --turntable 4")
     elif suffix != ".png":
         raise ProgdfError(f"{options.out} is not a .png file; pictures are written as .png")
     film.check_encoder(options.out)
-
-
-def transparent_image(engine: ViewEngine, view: ViewState, camera: Camera) -> NDArray[np.uint8]:
-    """The view with its coverage as alpha, colors not multiplied by it. [H,W,4]"""
-    black = engine.image(replace(view, background=(0.0, 0.0, 0.0)), camera=camera).copy()
-    white = engine.image(replace(view, background=(1.0, 1.0, 1.0)), camera=camera)
-    return unmix(black, white)
-
-
-def unmix(black: NDArray[np.float32], white: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Color and alpha of what gives these two pictures on black and on white. [H,W,3] twice -> [H,W,4]"""
-    alpha = np.clip(1.0 - (white - black).mean(axis=-1, keepdims=True), 0.0, 1.0)
-    color = np.clip(black / np.maximum(alpha, 1e-6), 0.0, 1.0)
-    rgba: NDArray[np.uint8] = np.round(255.0 * np.concatenate([color, alpha], axis=-1)).astype(np.uint8)
-    return rgba
 
 
 def describe_strengths(view: ViewState) -> str:

@@ -1,4 +1,4 @@
-"""Pictures of moving sliders: animations, films of a timeline, contact sheets of one slider and of two."""
+"""Pictures of moving sliders: animations, films of a timeline, contact sheets of one slider or two."""
 
 from __future__ import annotations
 
@@ -27,15 +27,47 @@ from viewer.state.view_state import Timeline, ViewState
 Pixels = NDArray[np.uint8]
 Draw = Callable[[ViewState], NDArray[np.float32]]
 
+VIDEO = ".mp4"
+_VIDEO_COLORS = {
+    "colorspace": "bt709",
+    "color_primaries": "bt709",
+    "color_trc": "iec61966-2-1",
+    "color_range": "tv",
+}
+"""Tags that tell a player how colors are encoded: matrix and primaries of HD video, the curve of sRGB."""
+_VIDEO_FILTER = (
+    "scale=out_color_matrix=bt709:out_range=tv:flags=accurate_rnd+full_chroma_int,format=yuv420p,"
+    "setparams=colorspace=bt709:color_primaries=bt709:color_trc=iec61966-2-1:range=tv"
+)
+"""Converts to these colors. Newer encoders take the tags from the frames, older ones from their options."""
+
 _WEBP_QUALITY = 85  # of 100: no block is seen in a still
 _PALETTE_REACH = 8  # levels: Pillow looks up the nearest color of a palette in steps of 4
-ANIMATIONS = (".gif", ".webp", ".mp4")
+ANIMATIONS = (".gif", ".webp", VIDEO)
+_OPAQUE = (".gif", VIDEO)  # a .gif has no partial transparency
 SHEET_STRENGTHS = (0.0, 0.25, 0.5, 0.75, 1.0)
 
 
 def to_pixels(image: NDArray[np.float32]) -> Pixels:
-    """0..1 to 0..255, rounded; what is brighter or darker is cut off."""
+    """Return an image of 0..1 as 0..255, rounded; values beyond are clipped."""
     return np.round(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8)
+
+
+def transparent_image(engine: ViewEngine, view: ViewState, camera: Camera) -> Pixels:
+    """Return the view with its coverage as alpha, the colors not multiplied by it. [H,W,4]"""
+    black = engine.image(replace(view, background=(0.0, 0.0, 0.0)), camera=camera).copy()
+    white = engine.image(replace(view, background=(1.0, 1.0, 1.0)), camera=camera)
+    return unmix(black, white)
+
+
+def unmix(black: NDArray[np.float32], white: NDArray[np.float32]) -> Pixels:
+    """Return the color and alpha of a picture by its renders on black and on white.
+
+    [H,W,3] twice -> [H,W,4]
+    """
+    alpha = np.clip(1.0 - (white - black).mean(axis=-1, keepdims=True), 0.0, 1.0)
+    color = np.clip(black / np.maximum(alpha, 1e-6), 0.0, 1.0)
+    return to_pixels(np.concatenate([color, alpha], axis=-1))
 
 
 def with_strengths(view: ViewState, strengths: dict[str, float]) -> ViewState:
@@ -63,13 +95,13 @@ def contact_sheet(names: Sequence[str], draw: Draw, view: ViewState) -> Pixels:
 
 
 def write_film(path: Path, frames: Iterable[Pixels], frames_per_second: int) -> None:
-    """Frames as they come, each for the same time: .gif or .webp, endless, or .mp4.
+    """Write frames as they come, each for the same time: .gif or .webp, endless, or .mp4.
 
-    A .gif counts in hundredths of a second, so its frames take turns in being a little longer and shorter; no
-    frame is shorter than 2, as programs slow such down.
+    Frames are [H,W,3], of a .webp also [H,W,4]. A .gif counts in hundredths of a second, so its frames take
+    turns in being a little longer and shorter. No frame is shorter than 2, as programs slow such down.
     """
-    if path.suffix.lower() == ".mp4":
-        _encode_mp4(path, frames, frames_per_second)
+    if path.suffix.lower() == VIDEO:
+        _encode_video(path, frames, frames_per_second)
         return
     prepared = _prepare(path, frames)
     ends = [round(100 * (i + 1) / frames_per_second) for i in range(len(prepared))]
@@ -147,15 +179,23 @@ def _with_exact_background(picture: Image.Image, indexed: Image.Image) -> Image.
 
 
 def check_encoder(path: Path) -> None:
-    """Raises ProgdfError where an .mp4 is wanted and the package that encodes it is not installed."""
-    if path.suffix.lower() == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
+    """Raise ProgdfError for an .mp4 if the package that encodes it is not installed."""
+    if path.suffix.lower() == VIDEO and importlib.util.find_spec("imageio_ffmpeg") is None:
         raise ProgdfError(f"{path} needs a video encoder; pip install progdf-studio[video], or write a .gif")
 
 
-def _encode_mp4(path: Path, frames: Iterable[Pixels], frames_per_second: int) -> None:
-    """H.264, frame by frame, so that a long film needs no memory."""
+def film_size(out: Path, camera: Camera) -> tuple[int, int]:
+    """Return width and height of the film's frames in pixels; those of an .mp4 are even."""
+    if out.suffix.lower() != VIDEO:
+        return camera.width, camera.height
+    return camera.width + camera.width % 2, camera.height + camera.height % 2
+
+
+def _encode_video(path: Path, frames: Iterable[Pixels], frames_per_second: int) -> None:
+    """Encode H.264 frame by frame, so that a long film needs no memory."""
     import imageio_ffmpeg  # an extra, see check_encoder
 
+    tags = [word for tag, value in _VIDEO_COLORS.items() for word in (f"-{tag}", value)]
     writer = None
     for frame in frames:
         even = np.pad(frame, ((0, frame.shape[0] % 2), (0, frame.shape[1] % 2), (0, 0)), mode="edge")
@@ -166,6 +206,7 @@ def _encode_mp4(path: Path, frames: Iterable[Pixels], frames_per_second: int) ->
                 fps=frames_per_second,
                 quality=8,
                 macro_block_size=2,
+                output_params=["-vf", _VIDEO_FILTER, *tags],
             )
             writer.send(None)
         writer.send(np.ascontiguousarray(even))
@@ -176,19 +217,29 @@ def _encode_mp4(path: Path, frames: Iterable[Pixels], frames_per_second: int) ->
 Advance = Callable[[int, int], None]
 
 
-def check_output(out: Path) -> None:
-    """Raises ProgdfError where `out` is neither a film nor a place for a folder of frames."""
+def check_output(out: Path, alpha: bool = False) -> None:
+    """Raise ProgdfError if `out` is no film, holds no transparency, or is no place for a folder of frames."""
     suffix = out.suffix.lower()
     if suffix not in (*ANIMATIONS, ""):
         raise ProgdfError(f"{out} cannot hold a film; write a .gif, a .webp, an .mp4 or a folder of frames")
+    if alpha and suffix in _OPAQUE:
+        raise ProgdfError(
+            f"{out} cannot hold a transparent background; write a .webp or a folder of frames, "
+            "or leave out --alpha"
+        )
     if not suffix:
         check_sequence(out)
 
 
 def frames(
-    keys: Timeline, view: ViewState, still: Camera, engine: ViewEngine, numbers: Iterable[int]
+    keys: Timeline,
+    view: ViewState,
+    still: Camera,
+    engine: ViewEngine,
+    numbers: Iterable[int],
+    alpha: bool = False,
 ) -> Iterator[Pixels]:
-    """The pictures of some frames. [H,W,3] each
+    """Draw some frames. [H,W,3] each, [H,W,4] with alpha
 
     Args:
         keys: the keys
@@ -196,12 +247,16 @@ def frames(
         still: gives the size, and the camera where no key has one
         engine: draws
         numbers: of the frames
+        alpha: a transparent background
     """
     for frame in numbers:
         state = timeline.state_at(keys, frame, view)
         moving = timeline.camera_at(keys, frame) is not None
         camera = to_camera(state.camera, still.width, still.height) if moving else still
-        yield to_pixels(engine.image(state, camera=camera))
+        if alpha:
+            yield transparent_image(engine, state, camera)
+        else:
+            yield to_pixels(engine.image(state, camera=camera))
 
 
 def sheet_frames(keys: Timeline, count: int) -> list[int]:
@@ -217,27 +272,35 @@ def write(
     still: Camera,
     engine: ViewEngine,
     advance: Advance | None = None,
+    alpha: bool = False,
 ) -> str:
     """Write the film: .gif, .webp, .mp4, or a folder of .png files.
 
-    `advance` hears how many frames of how many are drawn.
+    Args:
+        out: the file or folder
+        keys, view, still, engine: see `frames`
+        advance: receives how many frames of how many are drawn
+        alpha: a transparent background
 
     Returns:
-        A line that tells what was written.
+        A line for the person that names the film, its frames and their size.
 
     Raises:
         ProgdfError: see `check_output`.
     """
-    size = f"{still.width}x{still.height}"
-    check_output(out)
-    total = sum(1 for _ in timeline.film_frames(keys))
-    drawn = _count_frames(frames(keys, view, still, engine, timeline.film_frames(keys)), total, advance)
+    check_output(out, alpha)
+    numbers = [*timeline.film_frames(keys)]
+    total = len(numbers)
+    drawn = _count_frames(frames(keys, view, still, engine, numbers, alpha), total, advance)
     if out.suffix:
         with atomic_write(out) as temporary_file:
             write_film(temporary_file, drawn, keys.fps)
     else:
         write_sequence(out, drawn)
-    return f"wrote {out} ({total} frames of {size}, {keys.fps} a second, drawn by {engine.draws_with})"
+    width, height = film_size(out, still)
+    return (
+        f"wrote {out} ({total} frames of {width}x{height}, {keys.fps} a second, drawn by {engine.draws_with})"
+    )
 
 
 def _count_frames(drawn: Iterable[Pixels], total: int, advance: Advance | None) -> Iterator[Pixels]:

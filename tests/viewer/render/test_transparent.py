@@ -10,7 +10,7 @@ from PIL import Image
 
 from progdf.__main__ import main
 from tests.helpers.ui_rig import bear
-from viewer.commands.render import unmix
+from viewer.pictures.film import unmix
 
 
 def test_color_and_coverage_are_found_from_black_and_white() -> None:
@@ -41,7 +41,7 @@ def test_the_command_writes_a_picture_that_can_be_laid_over_another(tmp_path: Pa
     assert np.abs(difference).max() <= 2
 
 
-def test_only_a_single_picture_can_be_transparent(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_comparisons_cannot_be_transparent(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene = bear().save(tmp_path)[0]
     assert main(["render", str(scene), "-o", str(tmp_path / "a.png"), "--alpha", "--split"]) == 2
-    assert "--alpha goes with a single picture" in capsys.readouterr().err
+    assert "--alpha goes with a picture or a film" in capsys.readouterr().err
