@@ -54,6 +54,22 @@ def test_comments_marks_and_the_line_ends_of_any_system_do_not_count(tmp_path: P
     assert torch.equal(read_cube(written(tmp_path, text)), identity_map(LATTICE, 8))
 
 
+@pytest.mark.parametrize("ends", ["\n", "\r\n", "\r"])
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_tables_of_any_system_are_read(tmp_path: Path, ends: str, encoding: str) -> None:
+    lines = (
+        'TITLE "late # sun"',
+        "# by hand, höhe",
+        "LUT_3D_SIZE\t2",
+        "",
+        "\tDOMAIN_MIN\t0 0 0",
+        *(f"\t{row}\t# a color".replace(" ", "\t", 2) for row in ROWS.splitlines()),
+        "# the end",
+    )
+    text = ends.join(lines)
+    assert torch.equal(read_cube(written(tmp_path, text.encode(encoding))), identity_map(LATTICE, 8))
+
+
 def test_red_is_the_fastest_of_the_rows() -> None:
     assert lattice_colors(3)[1].tolist() == [0.5, 0.0, 0.0]
     assert lattice_colors(3)[9].tolist() == [0.0, 0.0, 0.5]
@@ -66,6 +82,11 @@ def test_a_table_of_another_domain_is_looked_up_where_its_colors_are(tmp_path: P
     table = read_cube(written(tmp_path, f"LUT_3D_SIZE 2\nDOMAIN_MIN -1 0 0\nDOMAIN_MAX 1 2 1\n{ROWS}"))
     expected = lattice_colors(65) * torch.tensor([0.5, 0.5, 1.0]) + torch.tensor([0.5, 0.0, 0.0])
     torch.testing.assert_close(table, expected, atol=1e-6, rtol=0)
+
+
+def test_an_input_range_is_the_domain_of_all_channels(tmp_path: Path) -> None:
+    table = read_cube(written(tmp_path, f"LUT_3D_SIZE 2\nLUT_3D_INPUT_RANGE -1 3\n{ROWS}"))
+    torch.testing.assert_close(table, (lattice_colors(65) + 1.0) / 4.0, atol=1e-6, rtol=0)
 
 
 def test_a_color_is_mapped_as_the_eight_points_around_it_say() -> None:
@@ -103,7 +124,14 @@ BROKEN = {
     "huge": ("LUT_3D_SIZE 1000000000\n", "says LUT_3D_SIZE 1e.09; a size of 2 to 129"),
     "infinite": ("LUT_3D_SIZE inf\n", "is followed by 'inf'"),
     "half": (f"LUT_3D_SIZE 2.5\n{ROWS}", "says LUT_3D_SIZE 2.5"),
-    "1D": ("LUT_1D_SIZE 2\n0 0 0\n1 1 1\n", "a line 'LUT_1D_SIZE 2'"),
+    "1D": ("LUT_1D_SIZE 2\n0 0 0\n1 1 1\n", r"uses 'LUT_1D_SIZE' \(a table of one dimension\)"),
+    "shaper": (f"LUT_1D_SIZE 2\nLUT_3D_SIZE 2\n0 0 0\n1 1 1\n{ROWS}", "uses 'LUT_1D_SIZE'"),
+    "1D range": (f"LUT_1D_INPUT_RANGE 0 2\nLUT_3D_SIZE 2\n{ROWS}", "uses 'LUT_1D_INPUT_RANGE'"),
+    "video": (f"LUT_3D_SIZE 2\nLUT_IN_VIDEO_RANGE\n{ROWS}", "uses 'LUT_IN_VIDEO_RANGE'"),
+    "two domains": (
+        f"LUT_3D_SIZE 2\nDOMAIN_MAX 2 2 2\nLUT_3D_INPUT_RANGE 0 1\n{ROWS}",
+        "remove the wrong one",
+    ),
     "twice": (f"LUT_3D_SIZE 2\nLUT_3D_SIZE 2\n{ROWS}", "a line 'LUT_3D_SIZE 2'"),
     "missing": (f"LUT_3D_SIZE 2\n{ROWS[:-10]}", "row|holds"),
     "more": (f"LUT_3D_SIZE 2\n{ROWS}0 0 0\n", "holds 9 rows of 3 numbers, LUT_3D_SIZE 2 needs 8 of 3"),

@@ -40,9 +40,8 @@ def ffmpeg(*arguments: object) -> subprocess.CompletedProcess[bytes]:
 
 def video_tags(path: Path) -> dict[str, str]:
     """What a video says of its colors, and its size."""
-    facts = re.search(
-        r"yuv420p\((\w+), ([\w-]+)(?:/([\w-]+)/([\w-]+))?[^)]*\), (\d+x\d+)", ffmpeg("-i", path).stderr.decode()
-    )
+    colors = r"(\w+), ([\w-]+)(?:/([\w-]+)/([\w-]+))?"
+    facts = re.search(rf"yuv420p\({colors}[^)]*\), (\d+x\d+)", ffmpeg("-i", path).stderr.decode())
     assert facts is not None, "the colors have no tags"
     color_range, matrix, primaries, curve, size = facts.groups()
     return {
