@@ -96,7 +96,7 @@ def scene_format(path: str | os.PathLike[str]) -> str | None:
 def scene_file(path: str | os.PathLike[str]) -> Path:
     """The file that a scene is read from: of an unpacked .sog's folder its meta.json."""
     path = Path(path)
-    return path / SOG_META if (path / SOG_META).is_file() else path
+    return path / SOG_META if os.path.isfile(path / SOG_META) else path
 
 
 def scene_name(path: Path) -> str:
