@@ -354,12 +354,13 @@ class GltfFile:
         else:
             source = self._resolve(buffer.uri, index)
             if source not in self._files:
-                if not os.path.lexists(source):
+                if not os.path.exists(source):
                     raise ProgdfError(
                         f"{source} does not exist, which holds numbers of {self.path}; put both in one folder"
                     )
                 wanted = max(other.byteLength for other in self.tables.buffers if other.uri == buffer.uri)
-                self._files[source] = memoryview(read_file(source, wanted))
+                size = os.path.getsize(source)  # reading allocates all that is asked for
+                self._files[source] = memoryview(read_file(source, min(wanted, size)))
                 self.stored_bytes += len(self._files[source])
             data = self._files[source]
         if len(data) < buffer.byteLength:

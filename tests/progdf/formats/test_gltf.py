@@ -774,6 +774,20 @@ def test_a_few_instances_are_no_bomb(tmp_path: Path) -> None:
     assert len(load_scene(builder.write(tmp_path / "a.glb"))) == 20_000
 
 
+def test_a_buffer_is_bounded_by_its_file(tmp_path: Path) -> None:
+    path = one_mesh(small()).write(tmp_path / "a.gltf", "a.bin")
+    tables = json.loads(path.read_text())
+    tables["buffers"][0]["byteLength"] = 1 << 40
+    path.write_text(json.dumps(tables))
+    (tmp_path / "a.bin").write_bytes(b"\0" * 9)
+    tracemalloc.start()
+    said = refusal(lambda _: load_scene(path), tmp_path / "a.bin")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert "it has 9 of 1099511627776 bytes" in said
+    assert peak < 16 << 20
+
+
 def test_the_json_is_bounded_too(tmp_path: Path) -> None:
     (tmp_path / "a.gltf").write_text("[" + "[]," * 2_100_000 + "0]")
     assert "values in its JSON" in refusal(load_scene, tmp_path / "a.gltf")
