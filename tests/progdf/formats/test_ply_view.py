@@ -164,10 +164,8 @@ def test_broken_stored_cameras_are_listed_and_not_used(case: str, text: bool, tm
 def test_linear_colors_become_srgb(tmp_path: Path) -> None:
     plain = load_ply(sharp(tmp_path / "a.ply"))
     found, report = load_ply_with_report(sharp(tmp_path / "b.ply", color_space=np.array([1])))
-    linear = sh0_to_rgb(plain.sh0).double()
-    expected = torch.where(
-        linear <= 0.0031308, 12.92 * linear, 1.055 * linear.clamp_min(0) ** (1 / 2.4) - 0.055
-    )
+    linear = sh0_to_rgb(plain.sh0).double().clamp_min(0)
+    expected = torch.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
     torch.testing.assert_close(sh0_to_rgb(found.sh0).double(), expected, atol=1e-5, rtol=0.0)
     assert report.conversions == ("linear RGB (color_space 1) to sRGB",)
 
