@@ -27,7 +27,7 @@ from progdf import sh
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians, concatenate
 from progdf.io import native_child
-from progdf.io.atomic import atomic_write, read_file
+from progdf.io.atomic import atomic_write, read_file, write_files_together
 from progdf.io.json_values import decode_json
 from progdf.io.part_files import part_files
 from progdf.terminal import escape_text
@@ -319,13 +319,18 @@ def save_scene(path: Path, scene: Gaussians, glb_axes: Axes = "LUF") -> None:
 def save_frames(
     path: Path, scenes: Iterable[Gaussians], rate: float = 24.0, glb_axes: Axes = "LUF"
 ) -> list[Path]:
-    """Write scenes one after the other, see `frame_path`; which files. All appear, or none.
+    """Write scenes one after the other, see `frame_path`; all appear or none.
+
+    Earlier frames of the same names are replaced when all are written, see `write_files_together`.
 
     Args:
         path: ends in one of `WRITTEN`
         scenes: N Gaussians each; those of a .usdc have the same rows
         rate: of a .usdc, samples a second
         glb_axes: as `save_scene`
+
+    Returns:
+        The files, in the order of the scenes.
 
     Raises:
         ProgdfError: as `save_scene`.
@@ -334,15 +339,14 @@ def save_frames(
         with atomic_write(path) as written:
             usd.write_usd(written, map(rotate_about_x, scenes), rate)
         return [path]
-    paths = list[Path]()
-    try:
+    if not path.parent.is_dir():
+        raise ProgdfError(f"the folder {path.parent} does not exist; create it first")
+    paths = []
+    with write_files_together(path.parent) as folder:
         for number, scene in enumerate(scenes):
-            save_scene(frame_path(path, number), scene, glb_axes)
-            paths.append(frame_path(path, number))
-    except BaseException:  # also an interrupt
-        for half in paths:
-            half.unlink(missing_ok=True)
-        raise
+            frame = frame_path(path, number)
+            save_scene(folder / frame.name, scene, glb_axes)
+            paths.append(frame)
     return paths
 
 

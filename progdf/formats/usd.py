@@ -6,7 +6,9 @@ change are stored once; every sample has the same rows, also those that draw not
 
 from __future__ import annotations
 
+import errno
 import importlib.util
+import os
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -30,9 +32,28 @@ def write_usd(path: Path, scenes: Iterable[Gaussians], rate: float = 24.0) -> No
 
     Raises:
         ProgdfError: the package usd-core is not installed.
+        OSError: the file cannot be written.
     """
     if importlib.util.find_spec("pxr") is None:
         raise ProgdfError(".usdc needs the package usd-core; pip install progdf-studio[usd]")
+    from pxr import Tf
+
+    try:
+        _write_stage(path, scenes, rate)
+    except Tf.ErrorException as error:
+        raise _system_error(str(error)) from None
+
+
+def _system_error(message: str) -> OSError:
+    """Return the system's error behind one of the USD library's, which keeps its text alone."""
+    for code in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EACCES, errno.EROFS, errno.ENOENT):
+        if os.strerror(code) in message:
+            return OSError(code, os.strerror(code))
+    return OSError(errno.EIO, f"the USD library reports {' '.join(message.split()):.200}")
+
+
+def _write_stage(path: Path, scenes: Iterable[Gaussians], rate: float) -> None:
+    """Write the scenes; see `write_usd`."""
     from pxr import Gf, Usd, UsdGeom, UsdVol, Vt
 
     stage = Usd.Stage.CreateNew(str(path))

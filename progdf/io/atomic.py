@@ -26,6 +26,7 @@ _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 _HOST = f"{zlib.crc32(platform.node().encode()):08x}"
 _TEMPORARY = re.compile(r"\.progdf-(?P<host>[0-9a-f]{8})-(?P<process>\d{1,9})-\w{8}(\..*)?", re.DOTALL)
+_COMPLETE = ".complete"  # ending of a folder of `write_files_together` whose files only have to be moved
 _A_DAY = 86400.0
 _DEVICE = re.compile(r"(con|prn|aux|nul|conin\$|conout\$|(com|lpt)[0-9¹²³]) *(\..*)?", re.I | re.S)
 _IN_USE = (5, 32)  # ERROR_ACCESS_DENIED, ERROR_SHARING_VIOLATION
@@ -94,6 +95,91 @@ def temporary_subfolder(folder: Path) -> Path:
     return made
 
 
+@contextmanager
+def write_files_together(folder: Path) -> Iterator[Path]:
+    """Yield an empty temporary folder; at a good end its files move to the same places in `folder`.
+
+    Files of the same names are replaced, others stay. A link is replaced, not followed.
+
+    Guarantee: if the block raises, or the process ends within it, `folder` is as before; after the block all
+    files are new. A folder that did not exist appears by one rename. In an existing folder one rename marks
+    the set as complete, and from there on it only moves forward. One interrupt does not stop the moves. If
+    the process is killed between two of them, single files are old or new, each of them whole, until the next
+    write of this program in `folder` moves the rest.
+
+    Raises:
+        ProgdfError: the folder cannot be made or written, or a folder has the place of a file.
+    """
+    is_new = not folder.is_dir()
+    home = folder.absolute().parent if is_new else folder
+    if not home.is_dir():
+        raise ProgdfError(f"the folder {home} does not exist; create it first")
+    try:
+        temporary = temporary_subfolder(home)
+    except OSError as error:
+        raise write_error(folder, error) from error
+    complete = temporary.with_name(temporary.name + _COMPLETE)
+    try:
+        yield temporary
+        if is_new:
+            temporary.rename(folder)
+            return
+        for path in _files_below(temporary):
+            _match_target(path, folder / path.relative_to(temporary))
+        temporary.rename(complete)
+    except (OSError, ProgdfError) as error:
+        full = disk_full(error)
+        if full is None and isinstance(error, ProgdfError):
+            raise ProgdfError(str(error).replace(str(temporary), str(folder))) from error
+        raise write_error(folder, full or error) from error
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+        if complete.is_dir():
+            _finish_moves(complete)
+
+
+def _finish_moves(complete: Path) -> None:
+    """Move a complete set to its places, also if an interrupt comes meanwhile.
+
+    Raises:
+        ProgdfError: a file cannot be replaced.
+    """
+    try:
+        _move_complete(complete)
+    except OSError as error:
+        raise write_error(complete.parent, error) from error
+    except BaseException:
+        _move_complete(complete)
+        raise
+
+
+def _files_below(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.rglob("*") if not path.is_dir())
+
+
+def _match_target(path: Path, target: Path) -> None:
+    """Give a new file the permissions of the file that it will replace.
+
+    Raises:
+        ProgdfError: the target is no file.
+    """
+    if target.is_symlink() or not target.exists():
+        return
+    if not target.is_file():
+        raise ProgdfError(f"{target} is no file; choose another name")
+    with suppress(OSError):  # a file system without permissions
+        path.chmod(target.stat().st_mode & 0o777)
+
+
+def _move_complete(complete: Path) -> None:
+    """Move the files of a complete set to their places beside it, as far as they are not there yet."""
+    for path in _files_below(complete):
+        target = complete.parent / path.relative_to(complete)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        replace_file(path, target)
+    shutil.rmtree(complete, ignore_errors=True)
+
+
 def _temporary_path(folder: Path, suffix: str = "") -> Path:
     remove_abandoned(folder)
     return folder / f".progdf-{_HOST}-{os.getpid()}-{secrets.token_hex(4)}{suffix}"
@@ -155,14 +241,20 @@ def is_temporary(name: str) -> bool:
 
 
 def remove_abandoned(folder: Path) -> None:
-    """Remove what killed processes left in a folder; of other machines and on Windows, what is a day old."""
+    """Remove temporary files of killed processes from a folder, and finish their complete sets.
+
+    Those of other machines, and all on Windows, have to be a day old.
+    """
     with suppress(OSError), os.scandir(folder) as entries:
         for entry in entries:
             name = _TEMPORARY.fullmatch(entry.name)
             with suppress(OSError):
                 if name is None or entry.is_symlink() or _is_in_use(name, entry):
                     continue
-                if entry.is_dir():
+                if entry.is_dir() and entry.name.endswith(_COMPLETE):
+                    if is_owned(Path(entry.path)):
+                        _move_complete(Path(entry.path))
+                elif entry.is_dir():
                     shutil.rmtree(entry.path, ignore_errors=True)
                 elif entry.is_file():
                     os.unlink(entry.path)
@@ -199,6 +291,8 @@ def make_folder(path: str | os.PathLike[str]) -> None:
         Path(path).mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise write_error(path, error) from error
+    except RecursionError:
+        raise ProgdfError(f"{path} is too deep; choose another folder") from None
 
 
 def write_error(path: str | os.PathLike[str], error: OSError) -> ProgdfError:
@@ -327,6 +421,11 @@ def temporary_folder() -> Path:
     """One of the user's own where temporary files are, for who has no home or may not write there."""
     who = str(os.getuid()) if hasattr(os, "getuid") else getpass.getuser()
     return Path(tempfile.gettempdir()) / f"progdf-{who}"
+
+
+def is_owned(path: Path) -> bool:
+    """Return True if a file or folder, not followed if it is a link, belongs to the user."""
+    return sys.platform == "win32" or path.lstat().st_uid == os.getuid()
 
 
 def is_private(folder: Path) -> bool:

@@ -15,6 +15,7 @@ from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.formats.scene_file import load_scene
 from progdf.gaussians import Gaussians
+from progdf.io.atomic import make_folder, write_files_together
 from progdf.io.cameras import load_cameras, read_camera, save_cameras
 from progdf.io.images import write_image
 from progdf.io.tensors import save_npy
@@ -151,9 +152,12 @@ def write(options: WriteViewsOptions) -> str:
     if len(cameras) > options.views:
         choice = choose_views(scene, region or whole_scene(scene), cameras, options.views, background)
         cameras = [view.camera for view in choice.views]
-    for camera in cameras:
-        write_image(out / "original" / f"{camera.name}.png", render_view(scene, camera, background))
-    save_cameras(out / "cameras.json", cameras, scene.origin)
+    make_folder(out.absolute().parent)
+    with write_files_together(out) as folder:
+        for camera in cameras:
+            picture = render_view(scene, camera, background)
+            write_image(folder / "original" / f"{camera.name}.png", picture)
+        save_cameras(folder / "cameras.json", cameras, scene.origin)
     return (
         f"wrote {len(cameras)} views to {out / 'original'}; draw masks (white on black) as "
         f"{out}/NAME.png for some of them, then progdf train {options.scene} "

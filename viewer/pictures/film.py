@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import os
-import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +17,7 @@ from PIL import Image
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.io import images
-from progdf.io.atomic import atomic_write, is_temporary, temporary_subfolder, write_error
+from progdf.io.atomic import atomic_write, is_temporary, remove_abandoned, write_error, write_files_together
 from viewer.camera.view_camera import to_camera
 from viewer.render.engine import ViewEngine
 from viewer.state import timeline
@@ -110,34 +109,20 @@ def write_film(path: Path, frames: Iterable[Pixels], frames_per_second: int) -> 
 
 
 def write_sequence(folder: Path, frames: Iterable[Pixels]) -> None:
-    """Frames as frame_0000.png, frame_0001.png, …: they appear when all are written.
+    """Write frames as frame_0000.png, frame_0001.png, …: all appear or none, see `write_files_together`.
 
     Raises:
         ProgdfError: see `check_sequence`; or the place cannot be written, or is full.
     """
     check_sequence(folder)
-    there = folder.is_dir()
-    try:  # within a folder that is there, which may be a link, a mounted disk or where one stands
-        home = folder if there else folder.absolute().parent
-        drawn = temporary_subfolder(home)
-    except OSError as error:
-        raise write_error(folder, error) from None
-    try:
+    with write_files_together(folder) as temporary:
         for number, frame in enumerate(frames):
-            Image.fromarray(frame).save(drawn / f"frame_{number:04d}.png")
-        if there:
-            for path in sorted(drawn.iterdir()):
-                path.rename(folder / path.name)
-        else:
-            drawn.rename(folder)
-    except OSError as error:
-        raise write_error(folder, error) from error
-    finally:
-        shutil.rmtree(drawn, ignore_errors=True)
+            Image.fromarray(frame).save(temporary / f"frame_{number:04d}.png")
 
 
 def check_sequence(folder: Path) -> None:
-    """Raises ProgdfError where no folder of frames can be made: its place is taken, or its parent missing."""
+    """Raise ProgdfError if no folder of frames can be made: its place is taken, or its parent is missing."""
+    remove_abandoned(folder)
     try:
         taken = os.path.lexists(folder) and (
             not folder.is_dir() or not all(is_temporary(path.name) for path in folder.iterdir())
