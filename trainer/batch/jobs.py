@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import difflib
 import itertools
+import math
 import re
 import shlex
 import tomllib
@@ -19,6 +20,7 @@ from typing import Any
 from progdf.errors import ProgdfError
 from progdf.io.atomic import read_file
 from progdf.io.json_values import convert_json, plain
+from progdf.terminal import group_digits
 from trainer.options import MOST_STAGES, PRESETS, VIEWS, TrainOptions, apply_preset, flat_values, with_values
 from trainer.resolve import BLANK, check_name, resolve
 
@@ -26,7 +28,7 @@ THREADS = 1
 """Threads of a run where the catalogue gives none: several jobs use the cores better than several threads."""
 
 _MOST_BYTES = 1 << 24  # of a catalogue
-_MOST_JOBS = 100_000
+MAX_JOBS = 100_000
 _LIST_OF = {"scenes": "[[scenes]]", "edits": "[[scenes.edits]]"}
 _NO_OPTION = ("out", "resume", "scene", "name")  # a catalogue has other ways to say these
 
@@ -76,8 +78,6 @@ def read_catalogue(path: Path, out: Path) -> tuple[list[Job], list[str]]:
                 jobs.append(Job(key, make_options(values, out.absolute() / key), folder))
             except ProgdfError as error:
                 faults.append(f"{key}: {error}")
-            if len(jobs) > _MOST_JOBS:
-                raise ProgdfError(f"more than {_MOST_JOBS} jobs; split the catalogue")
     except ProgdfError as error:
         return [], [f"{path}: {error}"]
     counts = Counter(job.key.casefold() for job in jobs)  # some file systems take A and a for one
@@ -97,6 +97,7 @@ def _entries(table: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
     for name, values in sweep.items():
         if not isinstance(values, list) or not values:
             raise ProgdfError(f"[sweep] {name} must be a list of values")
+    _check_count(_tables(table, "scenes"), sweep)
     for scene in _tables(table, "scenes"):
         if not isinstance(scene.get("path"), str):
             raise ProgdfError("each of [[scenes]] needs a path")
@@ -111,6 +112,20 @@ def _entries(table: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
                 suffix = "".join(f",{key}={_file_word(value)}" for key, value in point.items())
                 run_name = check_name(edit["name"] + suffix)
                 yield f"{scene_name}/{run_name}", {"scene": path, **defaults, **own, **point}
+
+
+def _check_count(scenes: Sequence[Mapping[str, Any]], sweep: Mapping[str, Sequence[Any]]) -> None:
+    """Raise ProgdfError if the catalogue has more jobs than a batch takes; nothing is built yet."""
+    edits = sum(len(_tables(scene, "edits")) for scene in scenes)
+    values = {name: len(points) for name, points in sweep.items()}
+    count = edits * math.prod(values.values())
+    if count <= MAX_JOBS:
+        return
+    factors = [f"{group_digits(edits)} edits", *(f"{size} of {name}" for name, size in values.items())]
+    raise ProgdfError(
+        f"{group_digits(count)} jobs ({' × '.join(factors)}), the most are {group_digits(MAX_JOBS)}; "
+        "split the catalogue"
+    )
 
 
 def _table(table: Mapping[str, Any], key: str) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, fields
 from html import escape
 from pathlib import Path
-from typing import Any, Literal, TextIO
+from typing import Annotated, Literal, TextIO
 
 import msgspec
 from rich.console import Console
@@ -20,8 +20,8 @@ from rich.live import Live
 from rich.text import Text
 
 from progdf.errors import ProgdfError
-from progdf.io.atomic import write_file
-from progdf.io.json_values import convert_json, decode_json
+from progdf.io.atomic import read_file, write_file
+from progdf.io.json_values import convert_json, decode_json, plain
 from progdf.terminal import escape_text, file_size, format_count, format_duration
 from trainer.store.run_folder import RunFolder
 
@@ -69,37 +69,121 @@ class Row:
         return f"{self.job}: {end}{file_size(self.bytes or 0)}, {self.seconds or 0:.0f} s"
 
 
+@dataclass(frozen=True)
+class SliderCurve:
+    """Pictures along the slider, measured against the editor's."""
+
+    s: tuple[float, ...] = ()  # slider values
+    psnr: tuple[float, ...] = ()  # dB, as many
+
+
+@dataclass(frozen=True)
+class EditorCurves:
+    """Curves against the editor's pictures."""
+
+    slider: SliderCurve = SliderCurve()  # of the shipped field
+
+
+@dataclass(frozen=True)
+class Curves:
+    """Curves of a report."""
+
+    against_editor: EditorCurves = EditorCurves()
+
+
+@dataclass(frozen=True)
+class EditFigures:
+    """Figures of the finished edit."""
+
+    psnr_to_views: float | None = None  # to the editor's pictures on held-out views, dB
+
+
+@dataclass(frozen=True)
+class FileFigures:
+    """Figures of the .gdf file."""
+
+    bytes: int | None = None
+    bytes_per_gaussian: float | None = None
+
+
+@dataclass(frozen=True)
+class TimeFigures:
+    """Durations of a run, seconds."""
+
+    total: float | None = None  # over all its sessions
+
+
+@dataclass(frozen=True)
+class RunReport:
+    """The parts of a run's report.json that a batch shows; all of them may be absent."""
+
+    edit: EditFigures = EditFigures()
+    file: FileFigures = FileFigures()
+    time: TimeFigures = TimeFigures()
+    memory_mb: int | None = None  # peak
+    curves: Curves = Curves()
+
+    @property
+    def course(self) -> list[tuple[float, float]]:
+        """Pairs of a slider value and the PSNR to the editor's pictures there, dB."""
+        curve = self.curves.against_editor.slider
+        return list(zip(curve.s, curve.psnr, strict=False))
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How far a run is; the trainer writes it to RUN/state/progress.json."""
+
+    share: Annotated[float, msgspec.Meta(ge=0.0, le=1.0)] = 0.0  # of its whole time
+    label: str = ""  # the present stage
+    loss: str = ""
+    seconds: Annotated[float, msgspec.Meta(ge=0.0, le=1e9)] = 0.0  # spent on the run, in all its sessions
+
+
 def finished_row(job: Job) -> Row:
-    """The row of a run that is finished, from what its folder tells."""
-    report, root = read_report(job), job.options.out
+    """Return the row of a finished run, from its folder.
+
+    Raises:
+        ProgdfError: its report.json is damaged.
+    """
+    report = read_report(job)
+    root = job.options.out
     return Row(
         job.key,
         "done",
-        psnr_end=report.get("edit", {}).get("psnr_to_views"),
-        psnr_between=min((psnr for s, psnr in slider_course(report) if s < 1), default=None),
-        bytes=report.get("file", {}).get("bytes"),
-        bytes_per_gaussian=report.get("file", {}).get("bytes_per_gaussian"),
-        seconds=report.get("time", {}).get("total"),
-        memory_mb=report.get("memory_mb"),
+        psnr_end=report.edit.psnr_to_views,
+        psnr_between=min((psnr for s, psnr in report.course if s < 1), default=None),
+        bytes=report.file.bytes,
+        bytes_per_gaussian=report.file.bytes_per_gaussian,
+        seconds=report.time.total,
+        memory_mb=report.memory_mb,
         folder_bytes=sum(path.stat().st_size for path in root.rglob("*") if path.is_file()),
     )
 
 
-def read_report(job: Job) -> dict[str, Any]:
-    """A run's report.json; empty where it is absent or broken."""
-    return _read_table(RunFolder(job.options.out).report)
+def read_report(job: Job) -> RunReport:
+    """Return the parts of a run's report.json that a batch shows.
+
+    Raises:
+        ProgdfError: it cannot be read, or is damaged.
+    """
+    path = RunFolder(job.options.out).report
+    try:
+        return convert_json(decode_json(read_file(path)), RunReport)
+    except ProgdfError:
+        raise
+    except ValueError as error:
+        raise ProgdfError(
+            f"{path} is damaged ({error}); remove {job.options.out} to train it again"
+        ) from None
 
 
-def _read_table(path: Path) -> dict[str, Any]:
+def _read_progress(job: Job) -> Progress:
+    """Return how far a job is; a file that is absent or damaged counts as the beginning."""
     with suppress(OSError, ValueError):
-        return convert_json(decode_json(path.read_bytes()), dict[str, Any])
-    return {}
-
-
-def slider_course(report: Mapping[str, Any]) -> list[tuple[float, float]]:
-    """Slider value and PSNR to the editor's pictures there, dB."""
-    curve = report.get("curves", {}).get("against_editor", {}).get("slider", {})
-    return list(zip(curve.get("s", []), curve.get("psnr", []), strict=False))
+        path = RunFolder(job.options.out).progress
+        return convert_json(decode_json(path.read_bytes()), Progress)
+    return Progress()
 
 
 def read_rows(out: Path) -> dict[str, Row]:
@@ -149,7 +233,7 @@ def _html_row(row: Row, job: Job | None, embed: bool) -> str:
         f"<td>{escape(scene)}</td><td>{_link(row, name)}</td>",
         _number(row.psnr_end, 1),
         _number(row.psnr_between, 1),
-        f"<td>{_sparkline(slider_course(read_report(job))) if job and row.status == 'done' else ''}</td>",
+        f"<td>{_course_picture(row, job)}</td>",
         _number(row.bytes, 0, file_size(row.bytes) if row.bytes else ""),
         _number(row.cpu_seconds, 0),
         f'<td class="{escape(row.status)}">{escape(row.status)}'
@@ -182,6 +266,15 @@ def _picture(row: Row, job: Job | None, embed: bool) -> str:
         content = (job.options.out / PREVIEW).read_bytes()
         source = f"data:image/jpeg;base64,{base64.b64encode(content).decode()}"
     return f'<img loading="lazy" alt="at one half and at 1" src="{source}">'
+
+
+def _course_picture(row: Row, job: Job | None) -> str:
+    """Return the curve of a finished job; nothing if its report is damaged or was removed meanwhile."""
+    if job is None or row.status != "done":
+        return ""
+    with suppress(ProgdfError):
+        return _sparkline(read_report(job).course)
+    return ""
 
 
 def _sparkline(course: Sequence[tuple[float, float]]) -> str:
@@ -244,12 +337,10 @@ class Screen:
         if not live and (self._events is None or time.monotonic() - self._told < _EVENT_S):
             return
         self._told = time.monotonic()
-        states = {
-            key: _read_table(RunFolder(self._jobs[key].options.out).progress) for key in running[:_LINES]
-        }
+        states = {key: _read_progress(self._jobs[key]) for key in running[:_LINES]}
         remaining = self._remaining(running)
         ended, failed = len(self._rows), sum(row.status == "failed" for row in self._rows)
-        self.event("progress", running=states, ended=ended, failed=failed, seconds_left=remaining)
+        self.event("progress", running=plain(states), ended=ended, failed=failed, seconds_left=remaining)
         if live:
             lines = [f"  {key:<40} {_state(state)}" for key, state in states.items()]
             time_left = f", about {format_duration(remaining)} left" if remaining else ""
@@ -283,7 +374,8 @@ class Screen:
         return sum(ended.values()) / expected * ahead / self._workers
 
 
-def _state(state: Mapping[str, Any]) -> str:
-    share, seconds = state.get("share", 0.0), state.get("seconds", 0.0)
-    time_left = f"{format_duration(seconds / share * (1 - share))} left" if share > 0.1 else ""
-    return f"{share:4.0%} {state.get('label', ''):<20} {time_left}"
+def _state(state: Progress) -> str:
+    time_left = ""
+    if state.share > 0.1:
+        time_left = f"{format_duration(state.seconds / state.share * (1 - state.share))} left"
+    return f"{state.share:4.0%} {state.label:<20} {time_left}"

@@ -17,7 +17,7 @@ from collections import deque
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import chdir, contextmanager, redirect_stdout, suppress
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from fnmatch import fnmatchcase
 from functools import partial
 from importlib.util import find_spec
@@ -30,6 +30,7 @@ from progdf.terminal import escape_text, file_size, format_count, format_duratio
 from trainer.options import BatchOptions, check_ranges
 from trainer.resolve import count_threads
 from trainer.run.resume import find_run
+from trainer.store.state import defer_signals
 
 from .jobs import Cost, Job, estimate_cost, read_catalogue
 from .report import SOME_FAILED, Row, Screen, finished_row, read_rows, write_page, write_rows
@@ -350,7 +351,10 @@ def batch(options: BatchOptions) -> int:
     selected = [job for job in jobs if _is_selected(job, options.only)]
     if not selected and not faults:
         raise ProgdfError("no job matches; --dry-run lists them")
-    kept = {job.key for job in selected if _is_finished(job)}
+    finished = [job for job in jobs if _is_finished(job)]
+    kept = {job.key for job in finished}
+    found = _found_rows(finished, rows)
+    faults += [f"{row.job}: {row.reason}" for row in found.values() if row.status == "failed"]
     pending = [job for job in selected if job.key not in kept]
     threads = max((count_threads(job.options.threads) for job in pending), default=1)
     stdout = sys.stdout
@@ -378,15 +382,16 @@ def batch(options: BatchOptions) -> int:
         tasks = [train_task(job, costs[job.key].memory) for job in healthy]
         rows |= {f.key: Row(f.key, "failed", f.fault) for f in findings.values() if f.fault}
         rows |= {job.key: Row(job.key, "waiting") for job in healthy}
-        for job in jobs:
-            if job.key not in rows and _is_finished(job):  # a run of train's, or one whose row was lost
-                rows[job.key] = finished_row(job)
+        rows |= found
         seconds = {key: cost.seconds for key, cost in costs.items()}
         by_key = {job.key: job for job in healthy}
         screen = Screen(by_key, seconds, pool.capacity(threads), stdout if options.json else None)
         screen.say(
             f"{format_count(len(tasks), 'job')} on {pool.name}, {format_count(threads, 'thread')} each"
         )
+        for job in selected:
+            if job.key in found:
+                screen.event("end", **asdict(found[job.key]))
         make_folder(options.out)
         try:
             with hold_lock(options.out / LOCK):
@@ -427,9 +432,10 @@ def _run_batch(
     try:
         write()
         for row in run_jobs(tasks, pool, tell, lambda running: screen.tick([task.key for task in running])):
-            rows[row.job] = row
-            screen.end(row)
-            write(time.monotonic())
+            with defer_signals():  # an interrupted session has told of each row that it wrote
+                rows[row.job] = row
+                screen.end(row)
+                write(time.monotonic())
     except KeyboardInterrupt:
         again = "--resume" if options.resume else "--resume added"
         raise KeyboardInterrupt(
@@ -450,6 +456,24 @@ def _is_finished(job: Job) -> bool:
             return find_run(job.options) == "finished"
         except ProgdfError:  # a broken run: training it says what is wrong
             return False
+
+
+def _found_rows(finished: Sequence[Job], rows: Mapping[str, Row]) -> dict[str, Row]:
+    """Return the rows of finished runs that the table does not have, or not as done, by key.
+
+    They are runs of `progdf train`, or ended just when the earlier session was interrupted. The row of a run
+    whose report is damaged says so, whatever the table has.
+    """
+    found = {}
+    for job in finished:
+        known = rows.get(job.key)
+        try:
+            row = finished_row(job)
+        except ProgdfError as error:
+            row = Row(job.key, "failed", str(error))
+        if known is None or known.status != "done" or row.status != "done":
+            found[job.key] = row
+    return found
 
 
 def _disk_faults(out: Path, costs: Mapping[str, Cost]) -> list[str]:

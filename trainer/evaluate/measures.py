@@ -132,8 +132,9 @@ def _clip_rows(opened: OpenedRun, texts: TextOptions) -> list[Row]:
 
 
 def _cost_rows(opened: OpenedRun) -> list[Row]:
-    time, memory = opened.report.get("time", {}), opened.report.get("memory_mb")
-    gdf, seconds = opened.gdf, time.get("total")
+    gdf = opened.gdf
+    memory = opened.figures.memory_mb
+    seconds = opened.figures.time.total
     sizes: dict[str, float | None] = {
         SLIDER: gdf.field.bytes_per_member,
         KEYFRAMES: opened.keyframes.bytes_per_member,

@@ -29,11 +29,35 @@ even as ours; the pictures of both ends, blended in sRGB."""
 
 
 @dataclass(frozen=True)
+class RunTime:
+    """Durations of a run, seconds."""
+
+    total: float | None = None  # over all its sessions
+
+
+@dataclass(frozen=True)
+class RunTrajectory:
+    """The trajectory of a run."""
+
+    slider: str = ""  # "even" or "linear"
+
+
+@dataclass(frozen=True)
+class RunFigures:
+    """The parts of a run's report.json that an evaluation needs; all of them may be absent."""
+
+    time: RunTime = RunTime()
+    memory_mb: float | None = None  # peak
+    trajectory: RunTrajectory = RunTrajectory()
+
+
+@dataclass(frozen=True)
 class OpenedRun:
     """What is measured."""
 
     run: FinishedRun  # see `FinishedRun`
     report: Mapping[str, Any]  # its report.json
+    figures: RunFigures  # the checked parts of it
     setup: TrainingSetup  # its views; the boxes of the training views hold what the edit changes
     evaluator: Evaluator  # its judging views, beside what the editor made of them
     gdf: Gdf  # the edit as it is shipped
@@ -65,6 +89,7 @@ def open_run(root: Path, scene: Path | None = None) -> OpenedRun:
     run = reopen_run(root, scene)
     try:
         report = convert_json(decode_json(run.folder.report.read_bytes()), dict[str, Any])
+        figures = convert_json(report, RunFigures)
     except FileNotFoundError:
         raise ProgdfError(f"{root} holds no report.json; give a folder that progdf train finished") from None
     except ValueError as error:
@@ -80,11 +105,14 @@ def open_run(root: Path, scene: Path | None = None) -> OpenedRun:
     evaluator = load_evaluator(run.folder, setup, setup.judging, run.trajectory, gdf)
     extended, (gdf,) = extend(run.scene, [gdf])
     setup = replace(setup, scene=extended, region=gdf.region)
-    return OpenedRun(run, report, setup, evaluator, gdf, trajectory, _two_keyframes(gdf, setup, report))
+    two_keyframes = _two_keyframes(gdf, setup, figures)
+    return OpenedRun(run, report, figures, setup, evaluator, gdf, trajectory, two_keyframes)
 
 
-def _two_keyframes(gdf: Gdf, setup: TrainingSetup, report: Mapping[str, Any]) -> BakedField:
+def _two_keyframes(gdf: Gdf, setup: TrainingSetup, figures: RunFigures) -> BakedField:
+    """Return the field of the end alone, its slider made even if the run's is."""
     end = gdf.field.offsets(1.0)
-    field = fit_keyframes(torch.tensor([0.0, 1.0]), torch.stack([torch.zeros_like(end), end]), 2)
-    even = report.get("trajectory", {}).get("slider") == "even"
-    return equalize_slider(field, setup)[0] if even else field
+    straight = fit_keyframes(torch.tensor([0.0, 1.0]), torch.stack([torch.zeros_like(end), end]), 2)
+    if figures.trajectory.slider == "even":
+        return equalize_slider(straight, setup)[0]
+    return straight

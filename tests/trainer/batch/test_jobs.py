@@ -125,3 +125,24 @@ def test_more_members_views_and_pixels_are_expected_to_take_more(tmp_path: Path)
         assert cost.seconds > few.seconds
         assert cost.memory > few.memory
         assert cost.disk > few.disk
+
+
+def test_too_many_jobs_are_counted_before_one_is_built(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def build(*_: object) -> None:
+        raise AssertionError("a job is built")
+
+    monkeypatch.setattr("trainer.batch.jobs.make_options", build)
+    sweep = f"\n[sweep]\nseed = {[*range(400)]}\nsteps = {[*range(400, 557)]}"
+    jobs, (fault,) = read(tmp_path, SHOES + sweep)
+    assert not jobs
+    assert "188 400 jobs (3 edits × 400 of seed × 157 of steps), the most are 100 000" in fault
+
+
+def test_number_of_jobs_beyond_all_is_one_line(tmp_path: Path) -> None:
+    names = ("seed", "steps", "views", "stages", "threads", "image-size")
+    sweep = "\n[sweep]\n" + "\n".join(f"{name} = {[1] * 1000}" for name in names)
+    jobs, (fault,) = read(tmp_path, SHOES + sweep)
+    assert not jobs
+    assert "3 000 000 000 000 000 000 jobs" in fault
