@@ -13,13 +13,14 @@ import sys
 import tempfile
 import traceback
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 from types import FrameType
 from typing import NoReturn
 
 from .errors import ProgdfError, is_out_of_memory
 from .io.atomic import disk_full, state_folder, write_file
-from .terminal import ENDINGS, PrintableFormatter, escape_text, handle_signals
+from .terminal import ENDINGS, PrintableFormatter, elide, escape_text, handle_signals
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "demo": ("trainer.run.demo:main", "make a scene, train its edits, write previews, open the window"),
@@ -65,27 +66,60 @@ def run_guarded(run: Callable[[Sequence[str]], int], arguments: Sequence[str]) -
         logging.lastResort.setFormatter(PrintableFormatter())
     try:
         _check_current_folder()
+        _check_arguments(arguments)
         with handle_signals((signal.SIGINT, *ENDINGS), _interrupt):
-            status = run(arguments)
-            if sys.stdout is not None:
-                sys.stdout.flush()  # here, where a full disk or a closed pipe can still be reported
+            try:
+                status = run(arguments)
+            except SystemExit as leaving:  # --help
+                status = leaving.code if isinstance(leaving.code, int) else 0
+            sys.stdout.flush()  # here, where a full disk or a closed pipe can still be reported
             return status
-    except ProgdfError as error:
-        return _report_failure(str(error))
-    except BrokenPipeError:  # `progdf info … | head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
-    except OSError as error:
+    except BaseException as error:
+        status, line = _describe_failure(error)
+        if line:
+            _report_failure(line)
+        return status
+    finally:
+        _drop_unwritable_output()
+
+
+def _describe_failure(error: BaseException) -> tuple[int, str]:
+    """Return the exit status and the line for an exception; the line is empty if there is nothing to say."""
+    if isinstance(error, ProgdfError):
+        return 2, str(error)
+    if isinstance(error, BrokenPipeError):  # `progdf info … | head`
+        return 0, ""
+    if isinstance(error, KeyboardInterrupt):
+        return 130, f"interrupted; {error}" if str(error) else "interrupted"
+    if not isinstance(error, Exception):
+        raise error
+    if is_out_of_memory(error):
+        return 2, "out of memory; close other programs or use a smaller scene"
+    if isinstance(error, UnicodeEncodeError) and error.reason == "surrogates not allowed":
+        return 2, f"{error.object!r:.80} is not UTF-8, and cannot be written into a file; rename it"
+    if isinstance(error, OSError):
         where = f"{error.filename}: " if error.filename else ""
-        right = "; the disk takes no more, free some space" if disk_full(error) else ""
-        return _report_failure(f"{where}{error.strerror or error}{right}")
-    except KeyboardInterrupt as interrupt:
-        return _report_failure(f"interrupted{'; ' + str(interrupt) if str(interrupt) else ''}", 130)
-    except Exception as error:
-        if is_out_of_memory(error):
-            return _report_failure("out of memory; close other programs or use a smaller scene")
-        message = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
-        return _report_failure(f"internal error in progdf ({message[:200]}); {_save_traceback()}", 70)
+        remedy = "; the disk takes no more, free some space" if disk_full(error) else ""
+        return 2, f"{where}{error.strerror or error}{remedy}"
+    message = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+    return 70, f"internal error in progdf ({message[:200]}); {_save_traceback()}"
+
+
+def _drop_unwritable_output() -> None:
+    """Lead streams that cannot be written into nothing; Python would fail again when it ends."""
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except (OSError, ValueError):  # ValueError: it is closed
+            with suppress(OSError, ValueError):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
+def _check_arguments(arguments: Sequence[str]) -> None:
+    """Raise ProgdfError if an argument holds a NUL, which neither a file name nor a text option can have."""
+    for argument in arguments:
+        if "\0" in argument:
+            raise ProgdfError(f"the argument {argument!r:.80} holds a NUL character; leave it out")
 
 
 def _run(arguments: Sequence[str]) -> int:
@@ -104,9 +138,9 @@ def _run(arguments: Sequence[str]) -> int:
     return int(getattr(importlib.import_module(module), function)(arguments[1:]) or 0)
 
 
-def _report_failure(line: str, status: int = 2) -> int:
-    print(f"progdf: {escape_text(' '.join(line.split()))}", file=sys.stderr)
-    return status
+def _report_failure(line: str) -> None:
+    with suppress(OSError):  # standard error is full or closed
+        print(f"progdf: {elide(escape_text(' '.join(line.split())))}", file=sys.stderr, flush=True)
 
 
 def _save_traceback() -> str:

@@ -2,28 +2,51 @@
 
 from __future__ import annotations
 
+import errno
 import re
 from itertools import takewhile
 
-from .terminal import escape_text
+from .terminal import elide, escape_text
 
 
 class ProgdfError(ValueError):
     """Something the user can mend: a broken file, a wrong option, two files that do not belong together.
 
-    The message is one line, `WHAT IS WRONG; WHAT WOULD BE RIGHT`, whatever names in files hold. Commands
-    print it and exit with status 2.
+    The message is one line, `WHAT IS WRONG; WHAT WOULD BE RIGHT`, whatever names in files hold; see `elide`
+    for long values. Commands print it and exit with status 2.
     """
 
     def __str__(self) -> str:
-        return escape_text(" ".join(super().__str__().split()))
+        return elide(escape_text(" ".join(super().__str__().split())))
 
 
-def is_out_of_memory(error: Exception) -> bool:
-    """Whether memory ran out; torch raises a RuntimeError of its allocator's."""
-    message = str(error) if isinstance(error, RuntimeError) else ""
-    words = ("allocate memory", "not enough memory", "out of memory")
-    return isinstance(error, MemoryError) or any(word in message for word in words)
+def is_out_of_memory(error: BaseException) -> bool:
+    """Return True if memory ran out, also behind another error that it caused.
+
+    Torch raises a RuntimeError of its allocator, the system an OSError, and its linker an ImportError for a
+    library that cannot be mapped. Threads cannot start without memory for their stacks.
+    """
+    if isinstance(error, MemoryError):
+        return True
+    if isinstance(error, OSError) and error.errno == errno.ENOMEM:
+        return True
+    message = str(error).lower()
+    if isinstance(error, _MEMORY_ERRORS) and any(words in message for words in _MEMORY_MESSAGES):
+        return True
+    cause = error.__cause__
+    if cause is None and not error.__suppress_context__:
+        cause = error.__context__
+    return cause is not None and is_out_of_memory(cause)
+
+
+_MEMORY_ERRORS = (RuntimeError, ImportError, OSError)
+_MEMORY_MESSAGES = (
+    "allocate memory",
+    "not enough memory",
+    "out of memory",
+    "failed to map segment",
+    "can't start new thread",
+)
 
 
 _NAMES = "demo|train|batch|region|views|fit|evaluate|view|render|rebind|edit|export|info"

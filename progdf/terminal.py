@@ -6,6 +6,8 @@ from __future__ import annotations
 import _thread
 import logging
 import math
+import os
+import re
 import signal
 import sys
 import threading
@@ -106,6 +108,42 @@ def signal_main_thread(number: int = signal.SIGINT) -> None:
 def escape_text(text: str) -> str:
     """The text on one line, with its escape (\\x1b, \\n) for what is nothing to look at."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
+def shorten(text: str, length: int = 80) -> str:
+    """Return a text as a message repeats it, its middle left out if it is longer than `length`."""
+    if len(text) <= length:
+        return text
+    head = length * 5 // 8
+    tail = length - 1 - head
+    return f"{text[:head]}…{text[-tail:]}"
+
+
+def elide(message: str) -> str:
+    """Return a message without the middle of very long values.
+
+    Paths that exist, or whose folder exists, stay whole, so that they can be found.
+    """
+    clauses = _LONG_WORD.sub(_shorten_word, message).split("; ")
+    return "; ".join(
+        shorten(clause, MAX_CLAUSE) if len(clause) > MAX_CLAUSE else clause for clause in clauses
+    )
+
+
+MAX_CLAUSE = 600  # characters of a part of a message between semicolons
+_MAX_PATH = 300  # characters of a word with a path separator
+_LONG_WORD = re.compile(r"[^\s'\"]{81,}")
+
+
+def _shorten_word(match: re.Match[str]) -> str:
+    word = match[0].rstrip(":;,.)")
+    rest = match[0][len(word) :]
+    folder = os.path.dirname(word)
+    if len(word) <= _MAX_PATH and folder:
+        return match[0]
+    if os.path.lexists(word) or (folder and os.path.isdir(folder)):
+        return match[0]
+    return shorten(word) + rest
 
 
 def print_line(line: str) -> None:

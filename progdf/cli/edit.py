@@ -19,11 +19,12 @@ from progdf.formats.scene_file import load_scene, save_scene, scene_name, writte
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import save_gdf
 from progdf.io.atomic import check_not_an_input
+from progdf.io.json_values import check_text
 from progdf.metrics.image import NO_DIFFERENCE
-from progdf.scene.regions import check_region, parse_region, read_numbers, shorten
+from progdf.scene.regions import check_region, parse_region, read_numbers
 from progdf.scene.strays import clean, find_strays, picture_difference
 from progdf.similarity import Motion
-from progdf.terminal import format_count, group_digits, print_line
+from progdf.terminal import format_count, group_digits, print_line, shorten
 from progdf.tidy import Deed, Step, bake, similarity, tidy
 
 from .options import absent_option, parse_options
@@ -79,6 +80,8 @@ def main(argv: Sequence[str]) -> int:
     if makes_edit and options.clean:
         raise ProgdfError("--clean has no slider; write a .ply, or leave --clean out")
     check_not_an_input(options.out, [options.scene])
+    if makes_edit:
+        check_text(f"{options.out.stem} {_instruction(options)}", "an edit")
     scene = load_scene(options.scene)
     steps = [make(scene) for make in makers]
     if makes_edit:
@@ -101,18 +104,21 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _write_edit(options: EditOptions, scene: Gaussians, steps: Sequence[Step]) -> int:
-    words = [
-        f"--{name} {spec}"
-        for name in ("delete", "scale", "rotate", "move", "duplicate")
-        for spec in getattr(options, name)
-    ]
-    gdf = tidy(scene, steps, options.out.stem, "edit " + " ".join(words))
+    gdf = tidy(scene, steps, options.out.stem, _instruction(options))
     save_gdf(options.out, gdf)
     print_line("; ".join(_describe(step) for step in steps))
     print_line(
         f"wrote {options.out}: an edit with a slider; see it with progdf view {options.scene} {options.out}"
     )
     return 0
+
+
+def _instruction(options: EditOptions) -> str:
+    """Return the options of the steps as typed, which the edit records."""
+    words = ["edit"]
+    for name in ("delete", "scale", "rotate", "move", "duplicate"):
+        words += [f"--{name} {spec}" for spec in getattr(options, name)]
+    return " ".join(words)
 
 
 def _describe(step: Step) -> str:

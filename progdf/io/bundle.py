@@ -88,7 +88,7 @@ def write_bundle(path: Path, source: Path) -> int:
             for ref, file in zip(session.edits, edits, strict=True)
         ),
     )
-    title = path.name.removesuffix(BUNDLE)
+    title = _plain_name(path.name.removesuffix(BUNDLE))
     with tempfile.TemporaryDirectory(prefix="progdf-") as folder, atomic.atomic_write(path) as written:
         inner = Path(folder) / f"{title}{SUFFIX}"
         write_session(inner, placed)
@@ -103,9 +103,16 @@ def _member_names(files: Sequence[Path]) -> dict[Path, str]:
     names: dict[Path, str] = {}
     for file in files:
         taken = {name.lower() for name in names.values()}
-        free = atomic.numbered_names(file.stem, file.suffix)
+        free = atomic.numbered_names(_plain_name(file.stem), file.suffix)
         names.setdefault(file, next(name for name in free if name.lower() not in taken))
     return names
+
+
+def _plain_name(name: str) -> str:
+    """Return a name that a bundle may hold: some systems have names that others cannot have."""
+    plain = "".join("-" if c in '<>:"/\\|?*' or not c.isprintable() else c for c in name)
+    plain = plain.lstrip(".").rstrip(". ")
+    return plain if plain and atomic.is_portable(plain) else f"file-{plain}"
 
 
 def unpack_bundle(path: Path) -> Path:

@@ -79,6 +79,23 @@ def read_json(path: Path, kind: type[_T]) -> _T:
         raise ProgdfError(f"{path} is damaged ({error}); delete it") from None
 
 
+def check_text(text: str, holder: str) -> str:
+    """Return a text that JSON can hold; names of files and arguments may be other bytes.
+
+    Args:
+        text: a text, in which bytes that are not UTF-8 are surrogate escapes
+        holder: the thing that is to hold it, such as "a session"
+
+    Raises:
+        ProgdfError: the text is not UTF-8.
+    """
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        raise ProgdfError(f"{holder} cannot hold {text!r:.80}: it is not UTF-8; rename it") from None
+    return text
+
+
 def one_of(names: Sequence[str]) -> msgspec.Meta:
     """What the type of a text declares that is one of a few names."""
     return msgspec.Meta(pattern=rf"^({'|'.join(names)})\Z")

@@ -29,7 +29,7 @@ from progdf.errors import ProgdfError
 
 from . import atomic
 from .atomic import check_regular, open_error, read_file
-from .json_values import convert_json, decode_json, plain
+from .json_values import check_text, convert_json, decode_json, plain
 
 VERSION = 1
 MARK = "progdf_session"
@@ -92,10 +92,7 @@ def relative_name(path: Path, folder: Path) -> str:
         name = os.path.relpath(resolved, folder.resolve())
     except ValueError:  # another drive
         name = str(resolved)
-    try:
-        name.encode()
-    except UnicodeEncodeError:
-        raise ProgdfError(f"a session cannot hold the file name {name}: it is not UTF-8; rename it") from None
+    check_text(name, "a session")
     return Path(name).as_posix()
 
 

@@ -46,7 +46,7 @@ from progdf.region import (
     union,
     whole_scene,
 )
-from progdf.terminal import format_count, format_place
+from progdf.terminal import format_count, format_place, shorten
 
 from . import selection
 from .neighbors import RIM_PERCENT, Neighborhood, grow_along_surface
@@ -178,11 +178,6 @@ def read_numbers(text: str) -> list[float]:
     except ValueError:
         return []
     return numbers if all(abs(number) <= LARGEST for number in numbers) else []
-
-
-def shorten(text: str) -> str:
-    """What somebody typed, as a message repeats it."""
-    return text if len(text) <= 80 else f"{text[:79]}…"
 
 
 def _oklab(text: str, code: str) -> list[float]:

@@ -20,7 +20,7 @@ from progdf.gdf.file import save_gdf
 from progdf.io.atomic import read_file
 from progdf.io.cameras import load_cameras, save_cameras
 from progdf.io.images import contact_sheet, read_picture
-from progdf.io.json_values import plain
+from progdf.io.json_values import check_text, plain
 from progdf.io.picture_camera import find_picture_camera
 from progdf.rasterize.engines import get_engine
 from progdf.region import Region
@@ -47,7 +47,7 @@ from trainer.fit.slider_uniformity import equalized_strengths
 from trainer.optimize.growth import fade_in
 from trainer.optimize.losses import Perceptual, describe_loss, perceptual_loss
 from trainer.optimize.retime import resolve_slider, smooth_course
-from trainer.options import EditKind, OptimizeOptions, TrainOptions
+from trainer.options import EditKind, OptimizeOptions, TrainOptions, flat_values
 from trainer.regions.from_pictures import CHANGED, RegionRequest, region_checks, region_kinds
 from trainer.report.agreement import measure_agreement
 from trainer.resolve import recorded_options, resolve, use_threads
@@ -101,8 +101,12 @@ def check_command(options: TrainOptions) -> None:
         options: resolved
 
     Raises:
-        ProgdfError: the folder is taken, the editor or the segmenter cannot run, or a file is not there.
+        ProgdfError: the folder is taken, the editor or the segmenter cannot run, a file is not there, or a
+            text that the run records is not UTF-8.
     """
+    for name, _, value in flat_values(recorded_options(options)):
+        for part in value if isinstance(value, tuple) else (value,):
+            check_text(str(part), f"the record of --{name.replace('_', '-')}")
     get_engine(options.optimize.engine)
     check_editor(options.editor.editor)
     folder, views = check_folder(options.out, options.edit), options.views

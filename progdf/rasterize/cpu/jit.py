@@ -25,7 +25,7 @@ from typing import Any, TypeVar
 
 from filelock import FileLock
 
-from progdf.errors import ProgdfError
+from progdf.errors import ProgdfError, is_out_of_memory
 from progdf.io.atomic import cache_folder, is_private, temporary_folder
 
 try:
@@ -36,6 +36,8 @@ try:
     from numba.core.typing.templates import AbstractTemplate, builtin_registry, signature
     from numba.extending import intrinsic, lower_builtin, models, register_model
 except Exception as error:  # it reads its settings on import, and raises whatever is wrong with them
+    if is_out_of_memory(error):
+        raise
     raise ProgdfError(
         f"numba cannot be loaded ({type(error).__name__}: {error}); check the variables NUMBA_…, and "
         ".numba_config.yaml in the current folder"
