@@ -8,6 +8,7 @@ A tensor is copied once its numbers are known to fit into the file.
 
 from __future__ import annotations
 
+import errno
 import io
 import pickletools
 import re
@@ -223,9 +224,9 @@ def _read_pickle(path: Path) -> bytes:
             }
     except ProgdfError:
         raise
-    except OSError as error:
-        raise open_error(path, error) from None
-    except (zipfile.BadZipFile, ValueError, RuntimeError, NotImplementedError, EOFError) as error:
+    except (zipfile.BadZipFile, ValueError, RuntimeError, NotImplementedError, EOFError, OSError) as error:
+        if isinstance(error, OSError) and error.errno != errno.EINVAL:  # EINVAL: an offset before the file
+            raise open_error(path, error) from None
         raise damage_error(path, f"its archive cannot be read ({str(error)[:80]})") from None
     if contents.get("byteorder", b"little") != b"little":
         raise unsupported_error(path, "big-endian numbers", RESAVE)

@@ -36,6 +36,7 @@ from progdf.io.tensors import open_npy
 from tests.helpers.edits import curved_field, edit_of, some_rows
 from tests.helpers.fuzz_changes import Change, changed_bytes, changed_gdf, changed_json, changed_parts
 from tests.helpers.fuzz_folders import COSTLY, more_inputs
+from tests.helpers.fuzz_trainers import trainer_inputs
 from tests.helpers.ply_files import camera_element, face_element, scene_of, write
 from tests.helpers.ply_files import table_of as columns_of
 from tests.helpers.scenes import orbit_camera, random_gaussians
@@ -144,6 +145,7 @@ def inputs(folder: Path, reader: str) -> dict[str, tuple[str, Callable[[Path], A
     part = read(folder / "state" / "part.safetensors")
     return {
         **more_inputs(folder, reader),
+        **trainer_inputs(folder, reader),
         "ply": ("x.ply", load_ply, plys),
         "gdf": ("x.gdf", read_gdf, [changed_gdf(gdf), changed_gdf(gdf), changed_bytes(gdf)]),
         "session": ("s/x.session.json", use_session, both(read(saved))),
@@ -196,6 +198,8 @@ READERS = (
     "glb",
     "gltf",
     "colmap text",
+    "checkpoints",
+    "plys of trainers",
     *COSTLY,
 )
 
