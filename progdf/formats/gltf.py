@@ -87,7 +87,8 @@ class GltfScene:
     """The Gaussians of a glTF file."""
 
     scene: Gaussians  # in the axes of the .ply, means in float64 and in the world
-    facts: tuple[str, ...]  # how the numbers were read, a phrase each
+    storage: tuple[str, ...]  # axes and compression, a phrase each
+    conversions: tuple[str, ...]  # numbers of other conventions that were converted, a phrase each
     ignored: tuple[str, ...]  # parts of the file that were not used
     file_bytes: int  # of the file and its buffers
 
@@ -202,11 +203,12 @@ def read_gltf(path: Path, read_spz: ReadSpz) -> GltfScene:
         )
     scene = _join(file, parts)
     axes = stored_axes(file)
-    facts = list(reader.facts)
+    storage = ["compressed as .spz"] if reader.has_spz else []
     if axes != "RDF":
-        facts.insert(0, f"turned from axes {axes} to RDF")
+        storage.append(f"turned from axes {axes} to RDF")
     ignored = (*reader.ignored, *_ignored_parts(file, placements))
-    return GltfScene(convert_axes(scene, axes, "RDF"), tuple(facts), ignored, file.stored_bytes)
+    turned = convert_axes(scene, axes, "RDF")
+    return GltfScene(turned, tuple(storage), tuple(reader.conversions), ignored, file.stored_bytes)
 
 
 def stored_axes(file: GltfFile) -> Axes:
@@ -320,7 +322,8 @@ class _Reader:
 
     def __init__(self, file: GltfFile, read_spz: ReadSpz) -> None:
         self.file = file
-        self.facts: dict[str, None] = {}  # in the order found
+        self.has_spz = False
+        self.conversions: dict[str, None] = {}  # in the order found
         self.ignored: dict[str, None] = {}
         self._read_spz = read_spz
         self._plans: dict[tuple[int, int], _Plan] = {}
@@ -397,7 +400,7 @@ class _Reader:
         if plan.indices is not None:
             part = part[torch.from_numpy(self.file.read_indices(plan.indices, len(part)))]
         if plan.color_space == LINEAR:
-            self.facts["colors converted from linear light to sRGB"] = None
+            self.conversions[f"linear light ({LINEAR}) to sRGB"] = None
             coefficients = sh.map_colors(part.sh, srgb_from_linear)
             part = replace(part, sh0=coefficients[:, 0], shN=coefficients[:, 1:])
         return part
@@ -417,7 +420,7 @@ class _Reader:
                 raise unsupported_error(path, f"{extension} in {name}", remedy)
         look = primitive.extensions.get(EXTENSION)
         if look is None:
-            self.facts[f"{EXTENSION} is absent, colors taken as sRGB"] = None
+            self.conversions[f"colors taken as sRGB, as {EXTENSION} is absent"] = None
             return SRGB, None
         if not isinstance(look, dict):
             raise damage_error(path, f"{EXTENSION} of {name} is not an object")
@@ -433,7 +436,7 @@ class _Reader:
                 feature = f"{field} '{escape_text(str(value))[:40]}' in {name}"
                 raise unsupported_error(path, feature, f"export it with {' or '.join(values)}")
         if "colorSpace" not in look:
-            self.facts["colorSpace is absent, colors taken as sRGB"] = None
+            self.conversions["colors taken as sRGB, as colorSpace is absent"] = None
         unknown = check_fields(path, look, (*known, "extensions", "extras"), {}, _EXPORT_AGAIN)
         self.ignored.update(dict.fromkeys(escape_text(field)[:40] for field in unknown))
         extensions = look.get("extensions", {})
@@ -472,7 +475,7 @@ class _Reader:
     def _log_scales(self, scales: NDArray[np.float32]) -> NDArray[np.float32]:
         """Logarithms of stored scales, which are logarithms already if any is negative. [N,3]"""
         if bool((scales < LOG_SCALE_LIMIT).any()):
-            self.facts["scales stored as logarithms (splat-transform before June 2026)"] = None
+            self.conversions["negative scales taken as logarithms (splat-transform before June 2026)"] = None
             return scales
         with np.errstate(divide="ignore"):  # a flat Gaussian becomes infinite, and is repaired
             return np.log(np.maximum(scales, np.float32(0.0)))
@@ -480,7 +483,7 @@ class _Reader:
     def _read_compressed(self, plan: _Plan, view: int) -> Gaussians:
         """The Gaussians of an .spz inside the file; its extension requires glTF's axes LUF of a decoder."""
         content = bytes(self.file.view_bytes(view))
-        self.facts["compressed as .spz"] = None
+        self.has_spz = True
         part = convert_axes(self._read_spz(content), "RUB", "LUF")
         if plan.rows not in (0, len(part)):
             counts = f"{plan.rows} Gaussians and its .spz {len(part)}"

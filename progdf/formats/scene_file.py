@@ -134,8 +134,12 @@ def load_scene_with_report(path: str | os.PathLike[str]) -> tuple[Gaussians, Loa
         return _repair(path, scene, f".ksplat, level {level}")
     if kind in ("glb", "gltf"):
         found = gltf.read_gltf(path, partial(_read_spz_part, path))
-        content = {"ignored_properties": found.ignored, "file_bytes": found.file_bytes}
-        return _repair(path, found.scene, ", ".join([f".{kind}", *found.facts]), content)
+        content = {
+            "file_bytes": found.file_bytes,
+            "conversions": found.conversions,
+            "ignored_properties": found.ignored,
+        }
+        return _repair(path, found.scene, ", ".join([f".{kind}", *found.storage]), content)
     if kind == "ckpt":
         checkpoint = read_checkpoint(path)
         return _repair(path, checkpoint.scene, CHECKPOINT, {"ignored_properties": checkpoint.ignored})
