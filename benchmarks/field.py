@@ -44,7 +44,7 @@ from progdf.sh import C0
 from progdf.threads import threads
 from trainer.optimize.color_solver import add_bands, make_solver
 
-from .ablation.regret import MEASURED, REPORTING, Edit
+from .ablation.regret import MEASURED, REPORTING, RegretEdit
 from .analytic_edits import bear_edits
 from .courses import edit_of, known_edit, milliseconds, processor_milliseconds
 from .table import Table, Wall
@@ -56,7 +56,7 @@ STEPS, RANKS = 12, (0, 1, 2)
 TARGETS = (40.0, 50.0, 60.0)
 """What separable fields are to reach, worst PSNR to the recording, dB."""
 
-MOST = 10_000
+MAX_MEMBERS = 10_000
 """Members; the forms of more would take ten minutes."""
 
 NETWORK, PAPERS = NeuralSettings("tiny", steps=1000), NeuralSettings("paper", "position")
@@ -109,14 +109,14 @@ def tables(scenes: Sequence[Path] = (), plot: Path | None = None) -> list[Table]
 
     Args:
         scenes: edited as `python -m benchmarks training` does, after its bear, but for those of more than
-            `MOST` members
+            `MAX_MEMBERS` members
         plot: also draw the errors into this PNG file
     """
     forms = list[Form]()
     with tempfile.TemporaryDirectory() as name:
         for task in tasks(Path(name), scenes):
             edit = edit_of_task(task)
-            if len(edit.region) <= MOST:
+            if len(edit.region) <= MAX_MEMBERS:
                 forms += color_forms(f"{task.scene.stem}, {task.editor}", edit)
     forms += moved_forms()
     if plot is not None:
@@ -128,7 +128,7 @@ def tables(scenes: Sequence[Path] = (), plot: Path | None = None) -> list[Table]
     return [field_table(forms), _compose_table()]
 
 
-def color_forms(name: str, edit: Edit) -> list[Form]:
+def color_forms(name: str, edit: RegretEdit) -> list[Form]:
     """Every form of field of an edit of colors."""
     judge, forms = edit.judge(), list[Form]()
 

@@ -67,7 +67,7 @@ NOTE = (
 
 
 @dataclass(frozen=True)
-class Trained:
+class TrainedNetwork:
     """One network of one edit."""
 
     network: NeuralField  # as it is stored
@@ -147,7 +147,7 @@ def _rows(run: Path, course: KnownEdit) -> list[dict[str, str]]:
     return rows
 
 
-def _trained(run: Path, name: str, settings: NeuralSettings, course: KnownEdit) -> Trained:
+def _trained(run: Path, name: str, settings: NeuralSettings, course: KnownEdit) -> TrainedNetwork:
     """The network of that name, from the run's folder or trained now."""
     path = run / "networks" / f"{name.replace(', ', '-').replace(' ', '-')}.gdf"
     before, members = pack(course.scene[course.members]), len(course.members)
@@ -156,7 +156,7 @@ def _trained(run: Path, name: str, settings: NeuralSettings, course: KnownEdit) 
     if not path.is_file():
         if (each := _step_seconds(course, settings)) * settings.steps > LONGEST:
             fit = _begin(course, settings)
-            return Trained(fit.field(), bake_network(fit.field(), before), 0, each * settings.steps)
+            return TrainedNetwork(fit.field(), bake_network(fit.field(), before), 0, each * settings.steps)
         begin = time.process_time()
         fit = _begin(course, settings)
         train_network(fit, course.strengths, course.offsets, settings.steps)
@@ -166,7 +166,7 @@ def _trained(run: Path, name: str, settings: NeuralSettings, course: KnownEdit) 
         save_gdf(path, replace(made, name=name, report=took))
     kept = load_gdf(path, course.scene)
     assert isinstance(kept.field.origin, NeuralForm)
-    return Trained(kept.field.origin.network, kept.field, kept.report["steps"], kept.report["seconds"])
+    return TrainedNetwork(kept.field.origin.network, kept.field, kept.report["steps"], kept.report["seconds"])
 
 
 def _begin(course: KnownEdit, settings: NeuralSettings) -> NeuralFit:

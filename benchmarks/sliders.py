@@ -25,13 +25,13 @@ from progdf.io.images import contact_sheet, to_picture, write_image
 from progdf.metrics.slider import Pictures
 from progdf.scene.regions import parse_region
 from progdf.terminal import print_line
-from trainer.batch.jobs import Job
+from trainer.batch.jobs import BatchJob
 from trainer.batch.run import run
 from trainer.editors import make_editor
 from trainer.evaluate.measures import markdown_table
 from trainer.evaluate.opened import FADE, KEYFRAMES, SLIDER, OpenedRun, open_run
 from trainer.optimize.losses import Perceptual, perceptual_loss
-from trainer.options import EditorOptions, OptimizeOptions, RegionOptions, TrainOptions, ViewOptions
+from trainer.options import EditorOptions, OptimizeOptions, RegionOptions, TrainingViewOptions, TrainOptions
 from trainer.report.measures import ErrorCurve, picture_courses
 from trainer.report.plots import Plot
 from trainer.report.report import stack_plots, thumbnail
@@ -95,7 +95,7 @@ def run_sliders(options: SliderOptions) -> list[CaseResult]:
 
 
 @dataclass(frozen=True)
-class SliderCase:
+class KnownEdit:
     """One edit."""
 
     name: str  # of the edit; of an analytic one as `bear_edits` names it
@@ -111,16 +111,16 @@ class SliderCase:
 
 _COAT = ("body", "head", "ears", "arms", "legs")
 CASES = (
-    SliderCase("blue scarf", "bear", ("scarf",), "recolor:#2356c7"),
-    SliderCase("gold coat", "bear", _COAT, "recolor:#d89a12"),
-    SliderCase("tinted coat", "bear", _COAT, "tint:#4f6fd8"),
-    SliderCase("striped body", "bear", ("body", "arms"), "stripes:#2b62c9"),
-    SliderCase("night", "bear", (*_COAT, "scarf", "plinth", "grass"), "night"),
-    SliderCase("blue rug", "room", ("rug",), "recolor:#3a55b4"),
-    SliderCase("big ears", "bear", ("ears",)),
-    SliderCase("tilted ears", "bear", ("ears",)),
-    SliderCase("long ears", "bear", ("ears",)),
-    SliderCase("bent ears", "bear", ("ears",)),
+    KnownEdit("blue scarf", "bear", ("scarf",), "recolor:#2356c7"),
+    KnownEdit("gold coat", "bear", _COAT, "recolor:#d89a12"),
+    KnownEdit("tinted coat", "bear", _COAT, "tint:#4f6fd8"),
+    KnownEdit("striped body", "bear", ("body", "arms"), "stripes:#2b62c9"),
+    KnownEdit("night", "bear", (*_COAT, "scarf", "plinth", "grass"), "night"),
+    KnownEdit("blue rug", "room", ("rug",), "recolor:#3a55b4"),
+    KnownEdit("big ears", "bear", ("ears",)),
+    KnownEdit("tilted ears", "bear", ("ears",)),
+    KnownEdit("long ears", "bear", ("ears",)),
+    KnownEdit("bent ears", "bear", ("ears",)),
 )
 
 
@@ -128,7 +128,7 @@ CASES = (
 class CaseResult:
     """One edit's figures."""
 
-    case: SliderCase  # the edit
+    case: KnownEdit  # the edit
     members: int  # how many Gaussians it may change
     bytes_per_member: float  # of the shipped field
     seconds: float | None  # of the run, as its report tells
@@ -142,7 +142,7 @@ def run_suite(
     perceptual: Perceptual,
     threads: int = 1,
     told: Callable[[str], None] = lambda line: None,
-    cases: Sequence[SliderCase] = CASES,
+    cases: Sequence[KnownEdit] = CASES,
     sizes: Mapping[str, int] = SIZES,
     effort: Effort = EFFORT,
 ) -> list[CaseResult]:
@@ -169,7 +169,7 @@ def run_suite(
             scenes[case.scene] = replace(scene, gaussians=load_ply(folder / case.scene / "scene.ply"))
         options = replace(_train_options(folder, case, scenes[case.scene], effort), threads=threads)
         _prepare_truth(folder, case, scenes[case.scene], options)
-        jobs.append(Job(case.name, options))
+        jobs.append(BatchJob(case.name, options))
     for row in run(jobs):
         told(row.line)
         if row.status != "done":
@@ -177,7 +177,7 @@ def run_suite(
     return [_judge_case(folder, case, scenes[case.scene], perceptual) for case in cases]
 
 
-def _prepare_truth(folder: Path, case: SliderCase, scene: DemoScene, options: TrainOptions) -> None:
+def _prepare_truth(folder: Path, case: KnownEdit, scene: DemoScene, options: TrainOptions) -> None:
     """Pictures of an analytic edit, unless a run has had them."""
     truth_folder = folder / "truth" / case.folder
     if not case.editor:
@@ -186,7 +186,7 @@ def _prepare_truth(folder: Path, case: SliderCase, scene: DemoScene, options: Tr
             _write_truth(truth_folder, resolve(options), scene.gaussians, _analytic(case, scene))
 
 
-def _judge_case(folder: Path, case: SliderCase, scene: DemoScene, perceptual: Perceptual) -> CaseResult:
+def _judge_case(folder: Path, case: KnownEdit, scene: DemoScene, perceptual: Perceptual) -> CaseResult:
     opened = open_run(folder / case.folder)
     truth, contenders = _truth(case, opened, scene), opened.contenders()
     curves = picture_courses(opened.evaluator, contenders, STRENGTHS, truth, perceptual)
@@ -198,7 +198,7 @@ def _judge_case(folder: Path, case: SliderCase, scene: DemoScene, perceptual: Pe
     return CaseResult(case, len(opened.gdf.region), field.bytes_per_member, seconds, curves, strips)
 
 
-def _train_options(folder: Path, case: SliderCase, scene: DemoScene, effort: Effort) -> TrainOptions:
+def _train_options(folder: Path, case: KnownEdit, scene: DemoScene, effort: Effort) -> TrainOptions:
     at = folder / case.scene
     ids = ",".join(str(scene.label_names.index(part)) for part in case.parts)
     cameras = at / "cameras.json" if case.scene == "room" else None  # one stands inside it
@@ -207,13 +207,13 @@ def _train_options(folder: Path, case: SliderCase, scene: DemoScene, effort: Eff
         out=folder / case.folder,
         region=RegionOptions(f"labels:{at / 'labels.npy'}:{ids}"),
         editor=EditorOptions(case.editor or f"folder:{folder / 'truth' / case.folder}"),
-        views=ViewOptions(cameras, views=effort.views, image_size=effort.image_size),
+        views=TrainingViewOptions(cameras, views=effort.views, image_size=effort.image_size),
         # of a folder as many stages as it holds; the slider's value is the editor's strength
         optimize=OptimizeOptions(effort.steps, stages=ASKED if case.editor else 0, slider="stages"),
     )
 
 
-def _analytic(case: SliderCase, scene: DemoScene) -> AnalyticEdit:
+def _analytic(case: KnownEdit, scene: DemoScene) -> AnalyticEdit:
     return bear_edits(scene)[case.name][0]
 
 
@@ -228,7 +228,7 @@ def _write_truth(folder: Path, options: TrainOptions, scene: Gaussians, edit: An
             write_image(folder / f"{strength:g}" / f"{view.camera.name}.png", picture)
 
 
-def _truth(case: SliderCase, opened: OpenedRun, scene: DemoScene) -> Pictures:
+def _truth(case: KnownEdit, opened: OpenedRun, scene: DemoScene) -> Pictures:
     """The held-out views' boxes as they should be at any strength."""
     setup = opened.setup
     boxes = [shown.box for shown in opened.evaluator.crops]

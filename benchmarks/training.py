@@ -32,7 +32,7 @@ from progdf.scene.regions import parse_region
 from trainer.fit.evaluate import Evaluator
 from trainer.report.plots import GRID, INK, LINES, PAPER
 
-from .ablation.regret import MEASURED, REPORTING, Edit, begin_edit
+from .ablation.regret import MEASURED, REPORTING, RegretEdit, begin_edit
 from .table import Table, Wall
 
 WAYS = ("", "--quick", "--steps 40", "--views 12", "--stages 4", "--preset paper --field auto --quick")
@@ -48,7 +48,7 @@ STRIPES, BLUE, TINT = "stripes:#20a040", "recolor:#3060d0", "tint:#c08040"
 
 
 @dataclass(frozen=True)
-class Task:
+class TrainingTask:
     """What is edited, as `progdf train` has it."""
 
     scene: Path
@@ -57,7 +57,7 @@ class Task:
 
 
 @dataclass(frozen=True)
-class Trained:
+class TimedEdit:
     """One run."""
 
     way: str  # one of `WAYS`
@@ -67,26 +67,30 @@ class Trained:
     bytes: float  # of the field by member
 
 
-def tasks(folder: Path, scenes: Sequence[Path] = ()) -> list[Task]:
+def tasks(folder: Path, scenes: Sequence[Path] = ()) -> list[TrainingTask]:
     """The bear, made in a folder, and each given scene, whose labels are in NAME_labels.npy beside it."""
     scene, labels = bear(BEAR), folder / "bear_labels.npy"
     save_ply(folder / "bear.ply", scene.gaussians)
     np.save(labels, scene.labels.numpy())
-    made = [Task(folder / "bear.ply", f"labels:{labels}:{scene.label_names.index('scarf')}", STRIPES)]
+    made = [TrainingTask(folder / "bear.ply", f"labels:{labels}:{scene.label_names.index('scarf')}", STRIPES)]
     for path in scenes:
         labels = path.with_name(f"{path.stem}_labels.npy")
-        made.append(Task(path, f"labels:{labels}:1", BLUE) if labels.is_file() else Task(path, "all", TINT))
+        made.append(
+            TrainingTask(path, f"labels:{labels}:1", BLUE)
+            if labels.is_file()
+            else TrainingTask(path, "all", TINT)
+        )
     return made
 
 
-def edit_of_task(task: Task) -> Edit:
+def edit_of_task(task: TrainingTask) -> RegretEdit:
     """With the views, the pictures and the judge that it takes."""
     scene = load_scene(task.scene)
     region = parse_region(task.region, scene)
     return begin_edit(scene, region, task.editor)
 
 
-def train(task: Task, scene: Gaussians, judge: Evaluator, way: str, out: Path) -> Trained:
+def train(task: TrainingTask, scene: Gaussians, judge: Evaluator, way: str, out: Path) -> TimedEdit:
     """Train one way, and judge what was written.
 
     Raises:
@@ -102,7 +106,7 @@ def train(task: Task, scene: Gaussians, judge: Evaluator, way: str, out: Path) -
     spent = after.children_user + after.children_system - before.children_user - before.children_system
     field = load_gdf(next(out.glob("*.gdf")), scene).field
     psnrs = [judge.psnr(judge.pictures(field.offsets(s)), judge.edited[s]) for s in MEASURED]
-    return Trained(way, seconds, spent, tuple(psnrs), field.bytes_per_member)
+    return TimedEdit(way, seconds, spent, tuple(psnrs), field.bytes_per_member)
 
 
 def tables(scenes: Sequence[Path] = (), plot: Path | None = None) -> list[Table]:
@@ -113,7 +117,7 @@ def tables(scenes: Sequence[Path] = (), plot: Path | None = None) -> list[Table]
         plot: also draw the errors over the processor's time into this PNG file
     """
     with tempfile.TemporaryDirectory() as name:
-        found: dict[Task, list[Trained]] = {}
+        found: dict[TrainingTask, list[TimedEdit]] = {}
         for task in tasks(Path(name), scenes):
             edit = edit_of_task(task)
             judge = edit.judge()
@@ -130,7 +134,7 @@ def tables(scenes: Sequence[Path] = (), plot: Path | None = None) -> list[Table]
     return [table(found)]
 
 
-def table(found: Mapping[Task, Sequence[Trained]]) -> Table:
+def table(found: Mapping[TrainingTask, Sequence[TimedEdit]]) -> Table:
     """A row a run."""
     rows, strengths = [], ", ".join(f"{s:g}" for s in MEASURED[:-1])
     for task, runs in found.items():

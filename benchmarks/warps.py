@@ -26,7 +26,7 @@ from trainer.fit.evaluate import Evaluator, make_evaluator
 from trainer.optimize.groups import GROUP_STEPS, Groups, group_stage
 from trainer.optimize.losses import Objective, erode, perceptual_loss
 from trainer.optimize.pgs import TargetStage, optimize, pgs_settings
-from trainer.options import EditorOptions, OptimizeOptions, RegionOptions, TrainOptions, ViewOptions
+from trainer.options import EditorOptions, OptimizeOptions, RegionOptions, TrainingViewOptions, TrainOptions
 from trainer.resolve import resolve, resolve_kind
 from trainer.run.kinds import Approach, approaches, try_approaches
 from trainer.setup import TrainingSetup, make_training_setup, probe_views, quantize_image, widen_views
@@ -65,7 +65,7 @@ def tables(scenes: Sequence[Path] = ()) -> list[Table]:
             Path("run"),
             RegionOptions("all"),
             EditorOptions("folder:edited"),
-            views=ViewOptions(views=VIEWS, image_size=SIZE),
+            views=TrainingViewOptions(views=VIEWS, image_size=SIZE),
             optimize=OptimizeOptions(STEPS),
         )
     )

@@ -1,4 +1,4 @@
-"""Every dotted name and file name in backticks, in docstrings, comments and documents, exists."""
+"""Names and file names in backticks, in docstrings, comments and documents, exist."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import ast
 import importlib.util
 import re
 from collections import defaultdict
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 
 import pytest
@@ -21,7 +21,11 @@ DOCUMENTS = [
 SOURCE_SUFFIXES = {"py", "md", "glsl", "vert", "frag"}
 PLACEHOLDERS = {"NAME", "DIR", "OUT", "SCENE", "VIEW", "PART", "PROMPT", "VERTEX", "FRAGMENT", "A", "V", "I"}
 
+FOREIGN_NAMES = {"JoyImageEditPlusPipeline", "prange", "data_offsets", "RayJob"}
+"""Names of diffusers, numba, safetensors and Ray that documents mention."""
+
 QUOTED = re.compile(r"`([A-Za-z_]\w*(?:[./]\w+)+)`")
+SINGLE = re.compile(r"(?<![`\w])`([A-Za-z_]\w*)`(?!`)")
 
 
 class Tree:
@@ -78,6 +82,18 @@ class Tree:
                         return True
         return False
 
+    @cached_property
+    def single_names(self) -> set[str]:
+        """Every name that code defines or uses, and every word of its strings and options."""
+        names = {word for text in self.strings for word in re.findall(r"\w+", text) if len(text) < 200}
+        for source in self.sources.values():
+            for node in ast.walk(ast.parse(source)):
+                for field in ("id", "attr", "arg", "name", "module"):
+                    value = getattr(node, field, None)
+                    if isinstance(value, str):
+                        names |= set(value.split("."))
+        return names
+
     def is_key(self, name: str) -> bool:
         """Whether a file of ours is called so, or holds a key or tensor of that name."""
         return name in self.strings or "." + name.rpartition(".")[2] in self.strings
@@ -121,6 +137,8 @@ def unresolved(text: str, code: str = "") -> list[str]:
                 known = any(parts[1] in names for names in tree().attributes.values())  # a variable's field
         if not known:
             missing.append(name)
+    known_names = tree().single_names | FOREIGN_NAMES
+    missing += [name for name in SINGLE.findall(text) if name not in known_names and not is_foreign(name)]
     return missing
 
 
@@ -142,4 +160,5 @@ def test_what_docstrings_and_comments_name_exists(package: str) -> None:
 def test_a_name_that_is_gone_is_seen() -> None:
     text = "`progdf.compose.nothing_here` `Layer.nothing_here` `nowhere.py` `gone/file.py` `paint.gone`"
     assert unresolved(text) == re.findall(r"[\w./]+", text)
+    assert unresolved("`no_such" + "_name`") == ["no_such" + "_name"]
     assert unresolved("`Layer.strength` `progdf.compose.composer.Composer` `compose/layers.py`") == []

@@ -126,7 +126,7 @@ class EditorOptions:
 
 
 @dataclass(frozen=True)
-class ViewOptions:
+class TrainingViewOptions:
     """Which views are edited."""
 
     cameras: Annotated[Path | None, absent_option("PATH", "a rig that looks at the region")] = None
@@ -256,7 +256,7 @@ class TrainOptions:
     readings that work. In Python: trainer.options.apply_preset."""
     name: Annotated[str, absent_option("STR", "the folder's name")] = ""
     """Name of the layer and of the .gdf file; the folder's name if empty."""
-    views: ViewOptions = ViewOptions()
+    views: TrainingViewOptions = TrainingViewOptions()
     optimize: OptimizeOptions = OptimizeOptions()
     field: FieldOptions = FieldOptions()
     texts: TextOptions = TextOptions()

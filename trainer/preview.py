@@ -44,7 +44,7 @@ from trainer.editors.adapters import models_here
 from trainer.editors.base import EditorInput, ImageEditor
 from trainer.editors.instruct import InstructEditor, instruct
 from trainer.fit.draft import DraftViews, draft_grade, draft_views
-from trainer.options import EditorOptions, RegionOptions, ViewOptions
+from trainer.options import EditorOptions, RegionOptions, TrainingViewOptions
 from trainer.regions.from_pictures import RegionRequest, region_kinds
 from trainer.setup import take_glances
 from trainer.views.view import View, make_view, with_near_plane
@@ -62,7 +62,7 @@ class PreviewOptions:
     """The scene."""
 
 
-class Request(msgspec.Struct, frozen=True):
+class PreviewRequest(msgspec.Struct, frozen=True):
     """An edit that is to be seen: where its picture goes, what is edited how, and from where one looks.
 
     `viewmat` is relative to the origin of the scene, which window and child load alike.
@@ -82,7 +82,7 @@ class Request(msgspec.Struct, frozen=True):
     seed: int = 0
 
 
-class Answer(msgspec.Struct):
+class PreviewAnswer(msgspec.Struct):
     """The request's number, what was made, and why nothing is; "" where it is."""
 
     number: int
@@ -111,7 +111,7 @@ class Previewer:
         self._editor = lru_cache(maxsize=2)(self._make_editor)
         self._draft: tuple[str, DraftViews | None] = "", None  # the last one's region, and its views
 
-    def grade(self, request: Request) -> Gdf | None:
+    def grade(self, request: PreviewRequest) -> Gdf | None:
         """A grade alone of the edit; None where none carries it.
 
         Raises:
@@ -124,7 +124,7 @@ class Previewer:
         views = self._views(request)
         return None if views is None else draft_grade(views, options, options.family)
 
-    def palette(self, request: Request) -> list[str]:
+    def palette(self, request: PreviewRequest) -> list[str]:
         """The main colors of the region as it is seen, #rrggbb; none where nothing of it is.
 
         Raises:
@@ -137,14 +137,14 @@ class Previewer:
         colors = find_palette(row.inside.reshape(-1, 3), row.mask.reshape(-1))
         return [hex_color(color) for color in colors.tolist()]
 
-    def _views(self, request: Request) -> DraftViews | None:
+    def _views(self, request: PreviewRequest) -> DraftViews | None:
         if self._draft[0] != request.region:
             region = self._region(request.region)
-            views = draft_views(ViewOptions(scene=self._path), self.scene, region)
+            views = draft_views(TrainingViewOptions(scene=self._path), self.scene, region)
             self._draft = request.region, views
         return self._draft[1]
 
-    def picture(self, request: Request) -> Tensor:
+    def picture(self, request: PreviewRequest) -> Tensor:
         """The view as the editor makes it. [H,W,3] 0..1
 
         Raises:
@@ -160,7 +160,7 @@ class Previewer:
         )
         return self._editor(options, seen).edit(view, request.strength)
 
-    def note(self, request: Request) -> str:
+    def note(self, request: PreviewRequest) -> str:
         """What would paint a sentence, where, and what that takes.
 
         Raises:
@@ -168,29 +168,31 @@ class Previewer:
         """
         return self._painter(request).note
 
-    def follows(self, request: Request) -> bool:
+    def follows(self, request: PreviewRequest) -> bool:
         """Whether what is painted is a sentence, by a model that can follow a picture."""
         painted = EditorOptions(request.editor).family == "instruct"
         return painted and self._painter(request).references > 0
 
-    def _painter(self, request: Request) -> InstructEditor:
+    def _painter(self, request: PreviewRequest) -> InstructEditor:
         options = EditorOptions(request.editor, model=request.model)
         what, region = options.editor.partition(":")[2], whole_scene(self.scene)
         return instruct(EditorInput(what, self.scene, region, (), options))
 
     def _find_region(self, spec: str) -> Region:
-        request = RegionRequest(RegionOptions(spec), ViewOptions(scene=self._path), _no_masks, quiet=True)
+        request = RegionRequest(
+            RegionOptions(spec), TrainingViewOptions(scene=self._path), _no_masks, quiet=True
+        )
         return parse_region(spec, self.scene, kinds=region_kinds(request))
 
-    def _make_view(self, seen: Request) -> View:
+    def _make_view(self, seen: PreviewRequest) -> View:
         K, viewmat = torch.tensor(seen.K), torch.tensor(seen.viewmat)
         (camera,) = with_near_plane([Camera(viewmat, K, seen.width, seen.height, "view")], self.scene)
         return make_view(self.scene, self._region(seen.region), camera, torch.tensor(seen.background))
 
-    def _make_editor(self, options: EditorOptions, seen: Request) -> ImageEditor:
+    def _make_editor(self, options: EditorOptions, seen: PreviewRequest) -> ImageEditor:
         check_new_editor(options)
         region = self._region(seen.region)
-        glances = partial(take_glances, ViewOptions(scene=self._path), self.scene, region)
+        glances = partial(take_glances, TrainingViewOptions(scene=self._path), self.scene, region)
         return make_editor(options, self.scene, region, [self._view(seen)], glances)
 
 
@@ -207,26 +209,28 @@ def serve(argv: Sequence[str]) -> int:
     return 0
 
 
-def answer(previewer: Previewer, line: str) -> Answer:
+def answer(previewer: Previewer, line: str) -> PreviewAnswer:
     """Write what a line asks for; what went wrong is in the answer."""
     try:
-        request = msgspec.json.decode(line, type=Request)
+        request = msgspec.json.decode(line, type=PreviewRequest)
     except msgspec.MsgspecError as error:
-        return Answer(-1, f"the request cannot be read: {error}")
+        return PreviewAnswer(-1, f"the request cannot be read: {error}")
     try:
         if request.editor == "grade":
-            return Answer(request.number, made="palette", palette=previewer.palette(request))
+            return PreviewAnswer(request.number, made="palette", palette=previewer.palette(request))
         if (draft := previewer.grade(request)) is not None:
             save_gdf(Path(request.out).with_suffix(".gdf"), draft)
             about = draft.report["draft"]
-            return Answer(request.number, made="grade", note=f"{about['psnr']:.0f} dB to the exact colors")
+            return PreviewAnswer(
+                request.number, made="grade", note=f"{about['psnr']:.0f} dB to the exact colors"
+            )
         if request.seed < 0:
-            return Answer(request.number, "", "note", previewer.note(request), models_here())
+            return PreviewAnswer(request.number, "", "note", previewer.note(request), models_here())
         write_image(Path(request.out), previewer.picture(request))
-        return Answer(request.number, follows=previewer.follows(request))
+        return PreviewAnswer(request.number, follows=previewer.follows(request))
     except (ProgdfError, OSError) as error:
         models = models_here() if request.editor.startswith("instruct:") else []  # others to choose from
-        return Answer(request.number, " ".join(str(error).split()), models=models)
+        return PreviewAnswer(request.number, " ".join(str(error).split()), models=models)
 
 
 def _read_lines(lines: queue.SimpleQueue[str]) -> None:

@@ -28,7 +28,7 @@ from progdf.threads import map_threads, threads
 from .editors.base import ImageEditor
 from .editors.pictures import picture_cameras
 from .editors.procedural import ColorEditor, StripesEditor
-from .options import COLOR_VIEWS, VIEWS, Kind, ViewOptions
+from .options import COLOR_VIEWS, VIEWS, Kind, TrainingViewOptions
 from .store.progress import Advance
 from .store.run_folder import LazySequence, RunFolder, add_pictures, from_bytes, stored_pictures, to_bytes
 from .views.choose import ViewChoice, choose_views, in_frame, sample_members, split_views
@@ -115,7 +115,7 @@ class TrainingSetup:
         return f"{len(self.held_out)} held-out views" if len(self.held_out) > 1 else "one held-out view alone"
 
 
-def make_training_setup(options: ViewOptions, scene: Gaussians, region: Region) -> TrainingSetup:
+def make_training_setup(options: TrainingViewOptions, scene: Gaussians, region: Region) -> TrainingSetup:
     """The views: those of changed pictures; else the best of the given cameras, or of a rig that looks at the
     region.
 
@@ -160,7 +160,7 @@ def make_training_setup(options: ViewOptions, scene: Gaussians, region: Region) 
     return TrainingSetup(scene, region, train, held_out, background, notes, up)
 
 
-def take_glances(options: ViewOptions, scene: Gaussians, region: Region) -> list[Glance]:
+def take_glances(options: TrainingViewOptions, scene: Gaussians, region: Region) -> list[Glance]:
     """The region from all around, however many views it is edited in and however large these are.
 
     The first few of the given cameras' that show it, spread over their list, or a rig's; none where the scene
@@ -219,7 +219,7 @@ def _up_of_pictures(paths: Sequence[Path]) -> UpAxis | None:
 
 
 def _picture_setup(
-    options: ViewOptions, scene: Gaussians, region: Region, given: Sequence[Camera], up: UpAxis
+    options: TrainingViewOptions, scene: Gaussians, region: Region, given: Sequence[Camera], up: UpAxis
 ) -> TrainingSetup:
     """The views of changed pictures. All are trained on: what one shows no other may."""
     background, size = torch.tensor(BACKGROUND), options.image_size or PICTURE_SIZE

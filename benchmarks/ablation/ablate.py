@@ -41,7 +41,7 @@ from .judge import fit_variant, with_figures
 from .options import AblateOptions
 from .plot import plot_ablations
 from .setup import AblationSetup, digest_of, edit_at_equal_strengths, make_ablation_setup, run_plan
-from .table import Ablation, Outcome, Row, row_line, sheet_of, table_of
+from .table import Ablation, Outcome, VariantRow, row_line, sheet_of, table_of
 from .variants import EQUAL, Variant, choose_variants, differing_variants, is_seeded
 
 _WIDTH = 176  # of a picture in the sheet, pixels
@@ -121,7 +121,7 @@ def _ablate_run(root: Path, options: AblateOptions, quiet: bool) -> Ablation:
                     ) from None
                 outcome = _load_outcome(home, variant, seed, shared)
                 assert outcome is not None
-                log.say(f"{home.name}: {outcome.failed or row_line(Row([outcome]))}")
+                log.say(f"{home.name}: {outcome.failed or row_line(VariantRow([outcome]))}")
             for state in root.glob("*/state"):
                 StateFolder(state).end()
             return _publish(root, variants, shared)
@@ -255,14 +255,14 @@ def _load_outcome(folder: Path, variant: Variant, seed: int, shared: AblationSet
         return None
 
 
-def _load_row(root: Path, variant: Variant, shared: AblationSetup) -> Row | None:
+def _load_row(root: Path, variant: Variant, shared: AblationSetup) -> VariantRow | None:
     """The seeds of a variant that are done, from the run's own on; None where that is not."""
     outcomes: list[Outcome] = []
     while (
         found := _load_outcome(_home(root, variant.name, len(outcomes)), variant, len(outcomes), shared)
     ) is not None:
         outcomes.append(found)
-    return Row(outcomes) if outcomes else None
+    return VariantRow(outcomes) if outcomes else None
 
 
 def _publish(root: Path, variants: Sequence[Variant], shared: AblationSetup) -> Ablation:

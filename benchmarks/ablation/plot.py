@@ -16,7 +16,7 @@ from torch import Tensor
 
 from trainer.report.plots import GRID, INK, LINES, PALE, PAPER
 
-from .table import FIGURES, Ablation, Figure, Row, rows_by_name
+from .table import FIGURES, Ablation, Figure, VariantRow, rows_by_name
 
 SHOWN = ("end", "between", "even", "s")
 """Figures that have a panel, by their short names."""
@@ -31,7 +31,7 @@ class _Line:
 
     name: str  # of the variant
     of: str  # of the one that it differs from
-    rows: Sequence[Row | None]  # of each run; None where it makes no difference there
+    rows: Sequence[VariantRow | None]  # of each run; None where it makes no difference there
 
 
 def plot_ablations(ablations: Sequence[Ablation]) -> Tensor:

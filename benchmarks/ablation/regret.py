@@ -39,7 +39,7 @@ from trainer.optimize.color_solver import Model, add_bands, iterations, make_sol
 from trainer.optimize.color_views import color_views
 from trainer.optimize.pgs import ParameterSnapshot, PgsState
 from trainer.optimize.retime import smooth_course
-from trainer.options import EditorOptions, FieldOptions, OptimizeOptions, ViewOptions
+from trainer.options import EditorOptions, FieldOptions, OptimizeOptions, TrainingViewOptions
 from trainer.resolve import use_threads
 from trainer.run.training import Strengths, plan_colors
 from trainer.setup import (
@@ -112,7 +112,7 @@ class Result:
 
 
 @dataclass
-class Edit:
+class RegretEdit:
     """An edit from one set of views, its pictures and solutions made once."""
 
     scene: Gaussians
@@ -178,7 +178,7 @@ class Edit:
         whole, waited, began = edit([1.0], self.setup.views), 0.0, time.process_time()
         between = Strengths(edit, look)
         with TemporaryDirectory() as folder, closing(RunLog(Path(folder) / "log.txt", quiet=True)) as log:
-            options = OptimizeOptions(), self.setup, whole, between, ViewOptions(), log
+            options = OptimizeOptions(), self.setup, whole, between, TrainingViewOptions(), log
             solver, model, course = plan_colors(*options)
         made = list[ParameterSnapshot]()
         state, most = PgsState(self.original), iterations(OptimizeOptions().steps)
@@ -292,12 +292,12 @@ class Edit:
         return [crop_scene(self.scene, members, v.camera, v.box, background, True) for v in views]
 
 
-def begin_edit(scene: Gaussians, region: Region, editor: str) -> Edit:
+def begin_edit(scene: Gaussians, region: Region, editor: str) -> RegretEdit:
     """From the views that a run takes by itself."""
-    setup = make_training_setup(ViewOptions(), scene, region)
-    glances = partial(take_glances, ViewOptions(), scene, region)
+    setup = make_training_setup(TrainingViewOptions(), scene, region)
+    glances = partial(take_glances, TrainingViewOptions(), scene, region)
     painter = make_editor(EditorOptions(editor), scene, region, setup.views, glances)
-    return Edit(scene, region, editor, painter, setup)
+    return RegretEdit(scene, region, editor, painter, setup)
 
 
 def run_regret(options: RegretOptions) -> Table:
@@ -326,8 +326,8 @@ def run_regret(options: RegretOptions) -> Table:
     used = max(results[1:], key=lambda result: result.mean).name.split()[-2]
     for views in VIEWS:
         size = max(camera.width, camera.height)
-        others = make_training_setup(ViewOptions(views=views, image_size=size), scene, region)
-        other = Edit(scene, region, options.editor, edit.painter, others)
+        others = make_training_setup(TrainingViewOptions(views=views, image_size=size), scene, region)
+        other = RegretEdit(scene, region, options.editor, edit.painter, others)
         for result in other.sweep(judge, model.degree, int(used), STEPS[-2], STAGES[:1], model.mask):
             print_line(" | ".join(result.cells))
             results.append(result)

@@ -47,7 +47,7 @@ class Outcome:
 
 
 @dataclass(frozen=True)
-class Row:
+class VariantRow:
     """A variant of one run."""
 
     outcomes: Sequence[Outcome]  # with each seed, at least one
@@ -75,7 +75,7 @@ class Ablation:
     name: str  # of the run
     title: str  # one line
     note: str  # what was measured, one line
-    rows: Sequence[Row]  # in order
+    rows: Sequence[VariantRow]  # in order
     perceptual: str  # name of the distance, LPIPS or what stands in for it
 
 
@@ -88,7 +88,7 @@ class Figure:
     digits: int  # behind the point
     of: Callable[[Outcome], float | None]  # reads it
 
-    def text(self, row: Row, spread: bool = True) -> str:
+    def text(self, row: VariantRow, spread: bool = True) -> str:
         """The mean over the seeds, and ± its standard deviation where there are several."""
         values = row.values(self.of)
         if not values:
@@ -109,7 +109,7 @@ FIGURES = (
 )
 
 
-def rows_by_name(ablations: Sequence[Ablation]) -> Iterator[tuple[Outcome, list[Row | None]]]:
+def rows_by_name(ablations: Sequence[Ablation]) -> Iterator[tuple[Outcome, list[VariantRow | None]]]:
     """Every variant that any run has, in order, with its row of each run."""
     names = list(dict.fromkeys(row.first.name for ablation in ablations for row in ablation.rows))
     order = max((ablation.rows for ablation in ablations), key=len, default=())
@@ -163,7 +163,7 @@ def print_table(ablation: Ablation) -> None:
 
 def sheet_of(
     editor: Sequence[Tensor],
-    rows: Sequence[Row],
+    rows: Sequence[VariantRow],
     strips: Mapping[str, Sequence[Tensor]],
     columns: Columns,
     title: str,
@@ -188,7 +188,7 @@ def sheet_of(
     )
 
 
-def row_line(row: Row) -> str:
+def row_line(row: VariantRow) -> str:
     """In short: the two figures that say most: how good the end is, how good the way."""
     end, way = (figure.text(row, spread=False) for figure in FIGURES[:2])
     return f"end {end}" + (f", between {way}" if way != "–" else "") + " dB"

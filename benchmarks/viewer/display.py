@@ -59,7 +59,7 @@ class Opened:
 
     process: subprocess.Popen[str]  # runs `benchmarks.viewer.watched`
     environment: dict[str, str]  # with the display
-    figures: dict[str, Any] = field(default_factory=dict)  # what was said so far (see `bench_watched`)
+    figures: dict[str, Any] = field(default_factory=dict)  # what was said so far (see `watched`)
     name: str = ""
 
     def listen(self) -> None:

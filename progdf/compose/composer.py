@@ -88,7 +88,7 @@ class _Plan(NamedTuple):
     parts: Mapping[int, tuple[Rows, Rows]]  # by edit: members among the rows, and where they are. [m] each
 
 
-class _Part(NamedTuple):
+class _LayerSlice(NamedTuple):
     """A layer's members among a range of rows."""
 
     layer: Layer
@@ -203,7 +203,13 @@ class Composer:
         return largest
 
     def _rewrite(
-        self, rows: Rows, parts: Sequence[_Part], names: Sequence[str], blend: str, first: int, last: int
+        self,
+        rows: Rows,
+        parts: Sequence[_LayerSlice],
+        names: Sequence[str],
+        blend: str,
+        first: int,
+        last: int,
     ) -> float:
         """Write these attributes of rows first to last; the largest squared step of a center."""
         rows, parts = rows[first:last], [_between(part, first, last) for part in parts]
@@ -228,10 +234,10 @@ class Composer:
             largest = max(largest, moved)
         return largest
 
-    def _part(self, plan: _Plan, edit: int, layer: Layer) -> _Part:
+    def _part(self, plan: _Plan, edit: int, layer: Layer) -> _LayerSlice:
         weights = _NOTHING if layer.weights is None else layer.weights.detach().float().numpy()
         segment = find_segment(layer.gdf.field.knots, layer.strength)
-        return _Part(layer, edit, segment, *plan.parts[edit], weights)
+        return _LayerSlice(layer, edit, segment, *plan.parts[edit], weights)
 
     def _plan(self, changed: frozenset[int]) -> _Plan:
         """All members of these edits, and what others share rows with them."""
@@ -271,7 +277,7 @@ class Composer:
             ) from None
 
 
-def _between(part: _Part, first: int, last: int) -> _Part:
+def _between(part: _LayerSlice, first: int, last: int) -> _LayerSlice:
     """What of a part lies in rows first to last, counted from the first."""
     begin, end = np.searchsorted(part.at, (first, last))
     if (first, begin, end) == (0, 0, len(part.at)):
@@ -279,7 +285,7 @@ def _between(part: _Part, first: int, last: int) -> _Part:
     return part._replace(members=part.members[begin:end], at=part.at[begin:end] - first)
 
 
-def _weight_sum(parts: Sequence[_Part], kind: str, count: int) -> Floats:
+def _weight_sum(parts: Sequence[_LayerSlice], kind: str, count: int) -> Floats:
     """max(1, Σ m s) over the layers that make a kind of change; empty where it is 1 everywhere. [U]"""
     parts = [part for part in parts if kind in part.layer.kinds]
     # a little below 1: sums in float32 may round up to where they count

@@ -125,7 +125,7 @@ def compose_layers(scene: Gaussians, layers: Sequence[Layer], blend: str = "norm
       Gaussian add up to no more than 1.
     - "sum": Σ m g Δ(s).
     - "over": in the order given, Δ ← Δ · (1 − m s c min(1, |g|)) + m g Δ(s), where c is how much the layer
-      itself changes of that kind, see `progdf.compose.reference`; the last layer lies on top, and what it
+      itself changes of that kind, 0 to 1 (`coverage`); the last layer lies on top, and what it
       leaves alone shows the layers below.
 
     - "adjust": as "over", but a grade (see `progdf.field.grade`) hides nothing: it maps the colors that the
@@ -202,7 +202,7 @@ def changed_rows(
 
 
 @dataclass(frozen=True)
-class _Part:
+class _LayerMembers:
     """A layer's members of weight ≠ 0, m in number."""
 
     layer: Layer  # the layer
@@ -226,7 +226,7 @@ class _Part:
         return attribute in self.layer.gdf.field.attributes and self.layer.gain(attribute) != 0
 
 
-def _adjusted_colors(scene: Gaussians, rows: Tensor, parts: Sequence[_Part]) -> dict[str, Tensor]:
+def _adjusted_colors(scene: Gaussians, rows: Tensor, parts: Sequence[_LayerMembers]) -> dict[str, Tensor]:
     """The sums of the color attributes under "adjust". [U,c] each"""
     moved = {name for part in parts for name in _COLORS if part.moves(name)}
     old = {name: getattr(scene, name)[rows].float().flatten(1) for name in _COLORS if name in moved}
@@ -255,7 +255,7 @@ def _adjusted_colors(scene: Gaussians, rows: Tensor, parts: Sequence[_Part]) -> 
 
 def _parts(
     scene: Gaussians, layers: Sequence[Layer], blend: str, covers: Coverage
-) -> tuple[Tensor, list[_Part]]:
+) -> tuple[Tensor, list[_LayerMembers]]:
     """The sorted rows of the scene that change, [U] int64, and each layer's part in them."""
     chosen: list[tuple[Tensor | slice, Tensor]] = []  # members and their weights
     for layer in layers:
@@ -268,7 +268,7 @@ def _parts(
     if len(reached) > 1:
         position[rows] = torch.arange(len(rows))
     return rows, [
-        _Part(
+        _LayerMembers(
             layer,
             members,
             _ALL if len(layer_rows) == len(rows) else position[layer_rows],

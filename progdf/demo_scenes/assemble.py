@@ -86,7 +86,7 @@ BARE = Pelt()
 
 
 @dataclass(frozen=True)
-class Paint:
+class SurfacePaint:
     """What a surface looks like before light falls on it."""
 
     color: Tensor  # sRGB 0..1. [N,3]
@@ -99,12 +99,12 @@ class Paint:
     glows: bool = False  # whether `color` is what is seen, whatever light there is
 
 
-Painter = Callable[[Part, Samples, Tensor], Paint]
+Painter = Callable[[Part, Samples, Tensor], SurfacePaint]
 """The paint of a part at its samples; the tensor is the noise's table."""
 
 
 def bumps(points: Tensor, table: Tensor, frequency: float, height: float) -> Tensor:
-    """A relief of noise, see `Paint.relief`. [N,3] -> [N,3]"""
+    """A relief of noise, see `SurfacePaint.relief`. [N,3] -> [N,3]"""
     offsets = torch.tensor([[0.0, 0.0, 0.0], [5.2, 1.3, 8.1], [2.7, 9.4, 4.6]])
     return height * torch.stack([noise(points + offset, table, frequency, 2) for offset in offsets], dim=1)
 
@@ -222,7 +222,12 @@ def _sample_visible(
 
 
 def _make_gaussians(
-    parts: Sequence[Part], part: Part, at: Samples, coat: Paint, daylight: Daylight, random: torch.Generator
+    parts: Sequence[Part],
+    part: Part,
+    at: Samples,
+    coat: SurfacePaint,
+    daylight: Daylight,
+    random: torch.Generator,
 ) -> Gaussians:
     """Light and shape the painted Gaussians of one part."""
     n = len(at)
@@ -241,7 +246,7 @@ def _make_gaussians(
 
 
 def _place_gaussians(
-    at: Samples, coat: Paint, stands: Tensor, random: torch.Generator
+    at: Samples, coat: SurfacePaint, stands: Tensor, random: torch.Generator
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Flat Gaussians on the surface, hairs and blades standing out of it. -> means, quats, log_scales"""
     n, pelt = len(at), coat.pelt

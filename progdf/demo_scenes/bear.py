@@ -14,7 +14,7 @@ from progdf.color.edits import parse_color, recolor_fully, stripe_profile, typic
 from progdf.color.oklab import smoothstep
 from progdf.errors import ProgdfError
 
-from .assemble import DemoScene, Paint, Pelt, assemble, bumps, flat, mix, mix_colors, noise, swirl
+from .assemble import DemoScene, Pelt, SurfacePaint, assemble, bumps, flat, mix, mix_colors, noise, swirl
 from .surface import Part, Samples, ball, dome, ring
 
 FUR = ("body", "tail", "head", "muzzle", "ear", "arm", "leg", "foot")
@@ -28,7 +28,7 @@ _TURF = Pelt(
 )
 
 
-def paint_bear(part: Part, at: Samples, table: Tensor) -> Paint:
+def paint_bear(part: Part, at: Samples, table: Tensor) -> SurfacePaint:
     """The paint of a part at its samples; `table` is the noise's."""
     if part.name in FUR:
         return _fur(part, at, table)
@@ -40,15 +40,15 @@ def paint_bear(part: Part, at: Samples, table: Tensor) -> Paint:
         return _lawn(at, table)
     if part.name == "pad":
         color = mix_colors("#d59a78", "#f0c4a2", 0.5 + 0.5 * noise(at.points, table, 22.0, 2))
-        return Paint(color, bumps(at.points, table, 25.0, 0.2), 0.12, 0.03)
+        return SurfacePaint(color, bumps(at.points, table, 25.0, 0.2), 0.12, 0.03)
     if part.name == "glint":
-        return Paint(flat("#ffffff", at.points), torch.zeros_like(at.points), glows=True)
+        return SurfacePaint(flat("#ffffff", at.points), torch.zeros_like(at.points), glows=True)
     if part.name == "mouth":
-        return Paint(flat("#2b1710", at.points), torch.zeros_like(at.points), gloss=0.02)
+        return SurfacePaint(flat("#2b1710", at.points), torch.zeros_like(at.points), gloss=0.02)
     return _glass(part, at)
 
 
-def _fur(part: Part, at: Samples, table: Tensor) -> Paint:
+def _fur(part: Part, at: Samples, table: Tensor) -> SurfacePaint:
     p = at.points
     patches = noise(p, table, 3.0, 2)
     tufts = noise(p * torch.tensor([1.0, 0.45, 1.0]), table, 17.0, 2)
@@ -73,10 +73,10 @@ def _fur(part: Part, at: Samples, table: Tensor) -> Paint:
             brown, mix_colors("#55301a", "#8a5228", 0.5 + 0.5 * tufts), 0.35 * smoothstep(patches, 0.1, 0.5)
         )
     down = swirl(p, table, (0.0, -1.0, 0.0))
-    return Paint(color, bumps(p, table, 15.0, 0.34), 0.17, 0.02, down, _COAT)
+    return SurfacePaint(color, bumps(p, table, 15.0, 0.34), 0.17, 0.02, down, _COAT)
 
 
-def _wool(part: Part, at: Samples, table: Tensor) -> Paint:
+def _wool(part: Part, at: Samples, table: Tensor) -> SurfacePaint:
     p = at.points
     if part.name == "scarf":
         along = torch.atan2(at.local[:, 0], at.local[:, 2]) / (2 * math.pi)
@@ -92,10 +92,10 @@ def _wool(part: Part, at: Samples, table: Tensor) -> Paint:
     # along the stripes, which keeps their edges crisp
     forth = torch.stack([at.local[:, 2], torch.zeros(len(p)), -at.local[:, 0]], dim=1) @ part.matrix.T
     around = torch.linalg.cross(at.normals, forth) if part.name == "scarf" else part.matrix[:, 0].expand_as(p)
-    return Paint(color, bumps(p, table, 22.0, 0.22), 0.09, 0.02, around, _KNIT)
+    return SurfacePaint(color, bumps(p, table, 22.0, 0.22), 0.09, 0.02, around, _KNIT)
 
 
-def _stone(at: Samples, table: Tensor) -> Paint:
+def _stone(at: Samples, table: Tensor) -> SurfacePaint:
     p = at.points
     grain = noise(p, table, 4.0, 4)
     speckle = noise(p, table, 45.0)
@@ -106,26 +106,26 @@ def _stone(at: Samples, table: Tensor) -> Paint:
     low = smoothstep(-p[:, 1], 0.10, 0.30) + smoothstep(grain, 0.25, 0.5) * level
     moss = mix_colors("#4c5a2a", "#7a8a3c", 0.5 + 0.5 * noise(p, table, 20.0))
     color = mix(color, moss, 0.55 * low.clamp(0, 1) * smoothstep(noise(p, table, 5.0, 2), -0.25, 0.3))
-    return Paint(color, bumps(p, table, 7.0, 0.30), gloss=0.05)
+    return SurfacePaint(color, bumps(p, table, 7.0, 0.30), gloss=0.05)
 
 
-def _lawn(at: Samples, table: Tensor) -> Paint:
+def _lawn(at: Samples, table: Tensor) -> SurfacePaint:
     p = at.points
     meadow = noise(p, table, 0.9, 3)
     detail = noise(p, table, 9.0, 2)
     color = mix_colors("#2f5a1b", "#7fae3a", 0.45 + 0.6 * meadow + 0.35 * detail)
     up = swirl(p, table, (0.0, 1.0, 0.0))
-    return Paint(color, bumps(p, table, 6.0, 0.35), 0.06, 0.0, up, _TURF)
+    return SurfacePaint(color, bumps(p, table, 6.0, 0.35), 0.06, 0.0, up, _TURF)
 
 
-def _glass(part: Part, at: Samples) -> Paint:
+def _glass(part: Part, at: Samples) -> SurfacePaint:
     """Eyes and nose: nearly black; the nose mirrors the sky a little."""
     p = at.points
     color = flat("#17100d" if part.name == "eye" else "#1d1412", p)
     if part.name == "nose":
         shine = at.local @ torch.tensor([-0.252, 0.806, 0.554])
         color = mix(color, flat("#cfc9c6", p), 0.7 * smoothstep(shine, 0.90, 0.985))
-    return Paint(color, torch.zeros_like(p), gloss=0.12)
+    return SurfacePaint(color, torch.zeros_like(p), gloss=0.12)
 
 
 LABELS = ("body", "head", "ears", "arms", "legs", "scarf", "plinth", "grass")

@@ -12,7 +12,7 @@ from progdf.camera import Camera, intrinsics, look_at
 from progdf.color.oklab import smoothstep
 from progdf.errors import ProgdfError
 
-from .assemble import DemoScene, Paint, Pelt, assemble, bumps, flat, mix, mix_colors, noise
+from .assemble import DemoScene, Pelt, SurfacePaint, assemble, bumps, flat, mix, mix_colors, noise
 from .bear import Triple, ellipsoid
 from .light import KEY, Daylight
 from .surface import Part, Samples, lathe, panel
@@ -22,7 +22,7 @@ _BOARD = Pelt(flat=(0.80, 0.70, 0.10), unruly=0.0)
 _PETALS = ("#e8537a", "#f2b632", "#f4f0e6", "#c04a8c", "#f07f4f")
 
 
-def paint(part: Part, at: Samples, table: Tensor) -> Paint:
+def paint(part: Part, at: Samples, table: Tensor) -> SurfacePaint:
     """The paint of a part at its samples; `table` is the noise's."""
     coat = _PAINTERS[part.name](part, at, table)
     if part.shape.profile is None:  # along the edges, which keeps them straight
@@ -30,7 +30,7 @@ def paint(part: Part, at: Samples, table: Tensor) -> Paint:
     return coat
 
 
-def _planks(part: Part, at: Samples, table: Tensor) -> Paint:
+def _planks(part: Part, at: Samples, table: Tensor) -> SurfacePaint:
     p = at.points
     plank = (p[:, 0] / 0.22).floor()
     along = p[:, 2] / 1.3 + 0.37 * plank
@@ -40,24 +40,26 @@ def _planks(part: Part, at: Samples, table: Tensor) -> Paint:
     color = mix_colors("#7c4e2a", "#cf9a5f", 0.5 + 0.35 * tone + 0.35 * grain)
     side, end = _edge(p[:, 0] / 0.22) * 0.22, _edge(along) * 1.3
     gap = 1 - smoothstep(side, 0.002, 0.008) * smoothstep(end, 0.002, 0.008)
-    return Paint(mix(color, flat("#3a2314", p), 0.8 * gap), bumps(p, table, 6.0, 0.05), gloss=0.06)
+    return SurfacePaint(mix(color, flat("#3a2314", p), 0.8 * gap), bumps(p, table, 6.0, 0.05), gloss=0.06)
 
 
-def _wall(part: Part, at: Samples, table: Tensor) -> Paint:
+def _wall(part: Part, at: Samples, table: Tensor) -> SurfacePaint:
     p = at.points
     color = mix_colors("#9fc0b4", "#c3dccd", 0.5 + 0.5 * noise(p, table, 3.0, 3))
     across = p[:, 2] if float(part.matrix[0, 1].abs()) > 0.5 else p[:, 0]
     stripe = smoothstep(_edge(across / 0.25 + 0.5), 0.18, 0.22)
     color = mix(color, mix_colors("#e4e6d2", "#f8f6e4", 0.5 + 0.5 * noise(p, table, 3.0, 3)), stripe)
     board = smoothstep(0.14 - p[:, 1], -0.004, 0.004)
-    return Paint(mix(color, flat("#f1ece0", p), board), bumps(p, table, 9.0, 0.06))
+    return SurfacePaint(mix(color, flat("#f1ece0", p), board), bumps(p, table, 9.0, 0.06))
 
 
-def _ceiling(part: Part, at: Samples, table: Tensor) -> Paint:
-    return Paint(mix_colors("#ddd8cc", "#f2eee4", 0.5 + 0.5 * noise(at.points, table, 2.0, 2)), 0 * at.points)
+def _ceiling(part: Part, at: Samples, table: Tensor) -> SurfacePaint:
+    return SurfacePaint(
+        mix_colors("#ddd8cc", "#f2eee4", 0.5 + 0.5 * noise(at.points, table, 2.0, 2)), 0 * at.points
+    )
 
 
-def _window(part: Part, at: Samples, table: Tensor) -> Paint:
+def _window(part: Part, at: Samples, table: Tensor) -> SurfacePaint:
     up, across = at.local[:, 0], at.local[:, 2]
     clouds = smoothstep(noise(at.points, table, 3.5, 3), -0.05, 0.45)
     sky = mix(mix_colors("#cfe4f7", "#6da7e0", 0.5 + 0.5 * up), flat("#ffffff", at.points), clouds)
@@ -65,10 +67,12 @@ def _window(part: Part, at: Samples, table: Tensor) -> Paint:
     color = mix(sky, mix_colors("#4f7f3a", "#93b85a", 0.5 + noise(at.points, table, 9.0)), hills)
     frame = torch.maximum(up.abs(), across.abs()) > 0.93
     bars = torch.minimum(up.abs(), across.abs()) < 0.035
-    return Paint(mix(color, flat("#fbf8f0", at.points), (frame | bars).float()), 0 * at.points, glows=True)
+    return SurfacePaint(
+        mix(color, flat("#fbf8f0", at.points), (frame | bars).float()), 0 * at.points, glows=True
+    )
 
 
-def _picture(part: Part, at: Samples, table: Tensor) -> Paint:
+def _picture(part: Part, at: Samples, table: Tensor) -> SurfacePaint:
     p, x, y = at.points, at.local[:, 0], -at.local[:, 2]
     sky = mix_colors("#f6a54a", "#4a5fae", 0.5 + 0.75 * y)
     sun = smoothstep(0.22 - torch.hypot((x - 0.3) * 1.38, y - 0.12), -0.02, 0.02)
@@ -83,16 +87,18 @@ def _picture(part: Part, at: Samples, table: Tensor) -> Paint:
     mount = (torch.maximum((x.abs() - 0.80) * 1.38, y.abs() - 0.74) > 0).float()
     color = mix(color, flat("#f5f1e6", p), mount)
     frame = (torch.maximum((x.abs() - 0.93) * 1.38, y.abs() - 0.905) > 0).float()
-    return Paint(mix(color, flat("#5b3a20", p), frame), 0 * p, gloss=0.03)
+    return SurfacePaint(mix(color, flat("#5b3a20", p), frame), 0 * p, gloss=0.03)
 
 
-def _wood(part: Part, at: Samples, table: Tensor) -> Paint:
+def _wood(part: Part, at: Samples, table: Tensor) -> SurfacePaint:
     p = at.points
     rings = noise(p * torch.tensor([0.35, 0.35, 2.2]), table, 11.0, 3)
-    return Paint(mix_colors("#5d351a", "#a86a37", 0.5 + 0.65 * rings), bumps(p, table, 9.0, 0.06), gloss=0.10)
+    return SurfacePaint(
+        mix_colors("#5d351a", "#a86a37", 0.5 + 0.65 * rings), bumps(p, table, 9.0, 0.06), gloss=0.10
+    )
 
 
-def _rug(part: Part, at: Samples, table: Tensor) -> Paint:
+def _rug(part: Part, at: Samples, table: Tensor) -> SurfacePaint:
     p = at.points
     radius = torch.hypot(at.local[:, 0], at.local[:, 2])
     angle = torch.atan2(at.local[:, 2], at.local[:, 0])
@@ -105,57 +111,59 @@ def _rug(part: Part, at: Samples, table: Tensor) -> Paint:
     color = mix(color, cream, torch.maximum(star, bands))
     blue = smoothstep(0.05 - (radius - 0.68).abs(), -0.008, 0.008)
     color = mix(color, mix_colors("#27496d", "#3b6a96", 0.5 + 0.5 * noise(p, table, 20.0)), blue)
-    return Paint(color, bumps(p, table, 30.0, 0.25), velvet=0.05, pelt=_SHAG)
+    return SurfacePaint(color, bumps(p, table, 30.0, 0.25), velvet=0.05, pelt=_SHAG)
 
 
-def _vase(part: Part, at: Samples, table: Tensor) -> Paint:
+def _vase(part: Part, at: Samples, table: Tensor) -> SurfacePaint:
     y = at.local[:, 1]
     color = mix_colors("#e9eef2", "#ffffff", 0.5 + 0.5 * noise(at.points, table, 6.0))
     angle = torch.atan2(at.local[:, 2], at.local[:, 0])
     wave = smoothstep(0.035 - (y - 0.17 - 0.025 * (6 * angle).sin()).abs(), -0.005, 0.005)
     upper, lower = 0.008 - (y - 0.25).abs(), 0.012 - (y - 0.05).abs()
     bands = smoothstep(upper, -0.003, 0.003) + smoothstep(lower, -0.003, 0.003)
-    return Paint(
+    return SurfacePaint(
         mix(color, flat("#1d4e9e", at.points), torch.maximum(wave, bands)), 0 * at.points, gloss=0.14
     )
 
 
-def _flower(part: Part, at: Samples, table: Tensor) -> Paint:
+def _flower(part: Part, at: Samples, table: Tensor) -> SurfacePaint:
     kind = int(float(part.center.sum()) * 1000) % len(_PETALS)
     color = mix_colors(_PETALS[kind], "#ffffff", 0.15 + 0.25 * noise(at.points, table, 30.0))
     heart = smoothstep(at.local[:, 1], 0.80, 0.92)
-    return Paint(
+    return SurfacePaint(
         mix(color, flat("#6b4a12", at.points), heart), bumps(at.points, table, 35.0, 0.45), velvet=0.08
     )
 
 
-def _stem(part: Part, at: Samples, table: Tensor) -> Paint:
-    return Paint(flat("#4f8a3a", at.points), 0 * at.points)
+def _stem(part: Part, at: Samples, table: Tensor) -> SurfacePaint:
+    return SurfacePaint(flat("#4f8a3a", at.points), 0 * at.points)
 
 
-def _metal(part: Part, at: Samples, table: Tensor) -> Paint:
-    return Paint(flat("#8a7448", at.points), 0 * at.points, gloss=0.22)
+def _metal(part: Part, at: Samples, table: Tensor) -> SurfacePaint:
+    return SurfacePaint(flat("#8a7448", at.points), 0 * at.points, gloss=0.22)
 
 
-def _shade(part: Part, at: Samples, table: Tensor) -> Paint:
+def _shade(part: Part, at: Samples, table: Tensor) -> SurfacePaint:
     bright = 1 - (at.local[:, 1] - 0.14).abs() / 0.3
     weave = 0.06 * noise(at.points * torch.tensor([1.0, 0.1, 1.0]), table, 60.0)
-    return Paint(mix_colors("#d99a4e", "#fff3cf", 0.15 + 0.8 * bright + weave), 0 * at.points, glows=True)
+    return SurfacePaint(
+        mix_colors("#d99a4e", "#fff3cf", 0.15 + 0.8 * bright + weave), 0 * at.points, glows=True
+    )
 
 
-def _cushion(part: Part, at: Samples, table: Tensor) -> Paint:
+def _cushion(part: Part, at: Samples, table: Tensor) -> SurfacePaint:
     p = at.points
     angle = torch.atan2(at.local[:, 2], at.local[:, 0])
     seams = 1 - smoothstep(_edge(angle / (math.pi / 4)), 0.03, 0.08)
     color = mix_colors("#1f6f78", "#3aa3a8", 0.5 + 0.5 * noise(p, table, 30.0, 2))
-    return Paint(mix(color, flat("#124a52", p), 0.7 * seams), bumps(p, table, 30.0, 0.2), velvet=0.10)
+    return SurfacePaint(mix(color, flat("#124a52", p), 0.7 * seams), bumps(p, table, 30.0, 0.2), velvet=0.10)
 
 
-def _ball(part: Part, at: Samples, table: Tensor) -> Paint:
+def _ball(part: Part, at: Samples, table: Tensor) -> SurfacePaint:
     slice_ = torch.remainder((torch.atan2(at.local[:, 2], at.local[:, 0]) / (math.pi / 3)).floor(), 3).long()
     colors = torch.cat([flat(c, at.points[:1]) for c in ("#e23b34", "#f7f4ea", "#2c6fd1")])
     cap = smoothstep(at.local[:, 1].abs(), 0.93, 0.95)
-    return Paint(mix(colors[slice_], flat("#f7c531", at.points), cap), 0 * at.points, gloss=0.12)
+    return SurfacePaint(mix(colors[slice_], flat("#f7c531", at.points), cap), 0 * at.points, gloss=0.12)
 
 
 def _edge(turns: Tensor) -> Tensor:

@@ -212,7 +212,7 @@ def add_weights_kernel(
 
 
 @dataclass(frozen=True)
-class TileLists:
+class DeviceTileLists:
     """The splats of a window's tiles, nearest first; tiles are aligned to the full image, row by row."""
 
     starts: Tensor  # first of each tile in `members`, and how many there are. [T+1] int32
@@ -221,7 +221,7 @@ class TileLists:
     counts: Tensor  # tiles of each splat. [V] int64
 
 
-def list_tiles(splats: ReferenceSplats, crop: Crop) -> TileLists:
+def list_tiles(splats: ReferenceSplats, crop: Crop) -> DeviceTileLists:
     """Sort the splats into the tiles that their boxes meet."""
     x0, y0, x1, y1 = crop
     left, top = x0 // TILE, y0 // TILE
@@ -242,7 +242,7 @@ def list_tiles(splats: ReferenceSplats, crop: Crop) -> TileLists:
     column, row = low[owners, 0] + at % wide - left, low[owners, 1] + at // wide - top
     tiles, slots = (row * columns + column).int().sort(stable=True)
     starts = pad(torch.bincount(tiles, minlength=columns * rows).cumsum(0), (1, 0))
-    return TileLists(starts.int(), owners[slots].int(), slots, counts)
+    return DeviceTileLists(starts.int(), owners[slots].int(), slots, counts)
 
 
 def rasterize(
@@ -285,7 +285,7 @@ def is_listed(splats: ReferenceSplats, info: RasterInfo, rows: Tensor | None) ->
 
 
 def blend(
-    splats: ReferenceSplats, lists: TileLists, crop: Crop, wanted: Tensor | None
+    splats: ReferenceSplats, lists: DeviceTileLists, crop: Crop, wanted: Tensor | None
 ) -> tuple[Tensor, Tensor]:
     """Blend projected Gaussians on black; differentiable in those that are wanted.
 
@@ -302,7 +302,7 @@ def blend(
 class _Blend(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, splats: ReferenceSplats, lists: TileLists, crop: Crop, wanted: Tensor | None,
+        ctx: Any, splats: ReferenceSplats, lists: DeviceTileLists, crop: Crop, wanted: Tensor | None,
         *leaves: Tensor,
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
         arrays = splat_arrays(splats)
@@ -342,7 +342,9 @@ def splat_arrays(splats: ReferenceSplats) -> tuple[Tensor, Tensor, Tensor]:
     return boxes, shapes, torch.cat([colors, opacities[:, None]], dim=1).float()
 
 
-def _blend(arrays: Sequence[Tensor], lists: TileLists, crop: Crop) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _blend(
+    arrays: Sequence[Tensor], lists: DeviceTileLists, crop: Crop
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Image on black [h·w,3], transmittance [h·w]; last [h·w] and deepest [T], see `blend_kernel`."""
     pixels = (crop[3] - crop[1]) * (crop[2] - crop[0])
     image, transmittance = arrays[0].new_empty(pixels, 3), arrays[0].new_empty(pixels)
@@ -352,12 +354,12 @@ def _blend(arrays: Sequence[Tensor], lists: TileLists, crop: Crop) -> tuple[Tens
     return image, transmittance, last, deepest
 
 
-def _add_slots(sums: Tensor, lists: TileLists) -> Tensor:
+def _add_slots(sums: Tensor, lists: DeviceTileLists) -> Tensor:
     """What each splat's intersections add up to, in their fixed order. [I,C] -> [V,C]"""
     return torch.segment_reduce(sums, "sum", lengths=lists.counts, unsafe=True)
 
 
-def _launch(kernel: Any, lists: TileLists, crop: Crop, tensors: Sequence[Tensor]) -> None:
+def _launch(kernel: Any, lists: DeviceTileLists, crop: Crop, tensors: Sequence[Tensor]) -> None:
     """Run a kernel with a block for each tile of the window, on torch's stream."""
     device = lists.starts.device
     with _launching:

@@ -25,11 +25,11 @@ from progdf.io.json_values import decode_json
 from . import Axis
 from .bounds import drop_background, front_direction, long_axes, normals_of, scene_sphere
 
-MOST = 200
+MAX_REMEMBERED = 200
 """Scenes that are remembered; the oldest go."""
 
 
-def find(scene: Gaussians) -> Tensor | None:
+def find_chosen_up(scene: Gaussians) -> Tensor | None:
     """What was chosen for a scene, [3] unit length; None where nothing was."""
     known = _read()
     numbers = known.get(fingerprint(scene).means_sha256) if known else None
@@ -41,13 +41,13 @@ def find(scene: Gaussians) -> Tensor | None:
     return up / up.norm() if usable else None
 
 
-def remember(scene: Gaussians, up: tuple[float, float, float]) -> None:
+def remember_chosen_up(scene: Gaussians, up: tuple[float, float, float]) -> None:
     """Keep what was chosen for a scene; what cannot be written is not remembered."""
     key = fingerprint(scene).means_sha256
     remembered = {name: known for name, known in _read().items() if name != key} | {key: list(up)}
     with contextlib.suppress(OSError):
         _place().parent.mkdir(parents=True, exist_ok=True)
-        write_file(_place(), json.dumps(dict([*remembered.items()][-MOST:])))
+        write_file(_place(), json.dumps(dict([*remembered.items()][-MAX_REMEMBERED:])))
 
 
 def _read() -> dict[str, object]:
@@ -155,7 +155,7 @@ def find_up(
         return UpAxis(axis_direction(choice), "as --up says")
     if (up := _held_up(cameras)) is not None:
         return UpAxis(up, "as the cameras are held")
-    if (chosen := find(scene)) is not None:
+    if (chosen := find_chosen_up(scene)) is not None:
         return UpAxis(chosen, "as was chosen for this scene before")
     view = PlyView() if path is None else stored_view(path, scene.origin)
     if view.up is not None:

@@ -17,7 +17,7 @@ from benchmarks.__main__ import ablate as ablate_command
 from benchmarks.ablation.ablate import ablate
 from benchmarks.ablation.options import AblateOptions
 from benchmarks.ablation.setup import run_plan
-from benchmarks.ablation.table import Ablation, Outcome, Row, table_of
+from benchmarks.ablation.table import Ablation, Outcome, VariantRow, table_of
 from benchmarks.ablation.variants import (
     _BY_NAME,
     VARIANTS,
@@ -265,7 +265,7 @@ def test_the_command_prints_a_table_that_fits_a_terminal(
 
 
 def test_a_failure_has_dashes_for_figures_and_its_reason_below() -> None:
-    rows = [Row([Outcome("paper", "as printed", "base", failed="the loss is nan")])]
+    rows = [VariantRow([Outcome("paper", "as printed", "base", failed="the loss is nan")])]
     table = table_of([Ablation("robot", "title", "note", rows, "LPIPS")], "title")
     assert set(table.rows[0][4:]) == {"–"}
     assert len(table.rows[0]) == len(table.columns)

@@ -11,7 +11,7 @@ from PIL import Image
 
 from benchmarks import field, training
 from benchmarks.field import InOklab
-from benchmarks.training import Point, Task, Trained, save_plot, table, tasks
+from benchmarks.training import Point, TimedEdit, TrainingTask, save_plot, table, tasks
 from progdf.color.oklab import srgb_to_oklab
 from progdf.sh import C0
 from tests.helpers.small_benchmarks import shrink_field
@@ -79,14 +79,14 @@ def test_a_scene_is_recolored_where_labels_lie_beside_it_and_else_tinted(small: 
     bear, *given = tasks(tmp_path, [robot, guitar])
     assert bear.scene.is_file()
     assert given == [
-        Task(robot, f"labels:{tmp_path}/robot_labels.npy:1", training.BLUE),
-        Task(guitar, "all", training.TINT),
+        TrainingTask(robot, f"labels:{tmp_path}/robot_labels.npy:1", training.BLUE),
+        TrainingTask(guitar, "all", training.TINT),
     ]
 
 
 def test_the_training_table_names_the_worst_strength_between() -> None:
-    runs = [Trained("", 9.6, 12.3, (31.0, 30.0, 33.0, 34.0, 35.0), 6.0)]
-    (row,) = table({Task(Path("a.ply"), "all", "tint:#c08040"): runs}).rows
+    runs = [TimedEdit("", 9.6, 12.3, (31.0, 30.0, 33.0, 34.0, 35.0), 6.0)]
+    (row,) = table({TrainingTask(Path("a.ply"), "all", "tint:#c08040"): runs}).rows
     assert row == ("a, tint:#c08040", "(default)", "35.0", "30.0", "31.0 30.0 33.0 34.0", "12", "10", "6")
 
 

@@ -32,7 +32,7 @@ from tests.helpers.hostile import npy as write_npy
 from tests.helpers.scene_files import write_compressed_ply, write_ksplat, write_scene
 from tests.helpers.scenes import orbit_camera, random_gaussians
 from tests.helpers.trained import quick_options, train, write_bear
-from trainer.options import FitOptions, RegionOptions, TrainOptions, ViewOptions
+from trainer.options import FitOptions, RegionOptions, TrainingViewOptions, TrainOptions
 from trainer.regions.from_pictures import RegionRequest, region_kinds
 from trainer.run.finish import refit
 from trainer.store.state import PeriodicSave
@@ -203,7 +203,10 @@ def _masks(folder: Path) -> Reader:
     for i in range(3):
         Image.fromarray(mask).save(folder / "masks" / f"v{i}.png")
     settings = RegionRequest(
-        RegionOptions("masks"), ViewOptions(folder / "cameras.json"), lambda: folder / "cache", quiet=True
+        RegionOptions("masks"),
+        TrainingViewOptions(folder / "cameras.json"),
+        lambda: folder / "cache",
+        quiet=True,
     )
 
     def read(path: Path) -> None:

@@ -10,7 +10,7 @@ from progdf.camera import Camera, intrinsics, look_at
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import Gdf
 from progdf.rasterize import render
-from trainer.paint.discs import Paint, lay_on
+from trainer.paint.discs import PaintedView, lay_on
 from trainer.run.paint import Laid, lay_discs, paint_gdf
 from trainer.views.view import BACKGROUND
 
@@ -47,7 +47,7 @@ def picture(scene: Gaussians) -> torch.Tensor:
     return render(scene, CAMERA, BACKGROUND).image.clamp(0.0, 1.0)
 
 
-def letters(scene: Gaussians) -> Paint:
+def letters(scene: Gaussians) -> PaintedView:
     """Bars of five pixels in dark blue, as wide as what is between them, in the middle of the wall."""
     painted = torch.zeros(SIDE, SIDE, dtype=torch.bool)
     for left in range(45, 85, 10):
@@ -55,12 +55,12 @@ def letters(scene: Gaussians) -> Paint:
     return paint_on(scene, painted)
 
 
-def paint_on(scene: Gaussians, painted: torch.Tensor) -> Paint:
+def paint_on(scene: Gaussians, painted: torch.Tensor) -> PaintedView:
     """These pixels in dark blue. [H,W] bool"""
     drawn = painted[..., None] * torch.tensor([0.1, 0.15, 0.5, 1.0])
-    return Paint(CAMERA, lay_on(picture(scene), drawn), drawn)
+    return PaintedView(CAMERA, lay_on(picture(scene), drawn), drawn)
 
 
-def edit_of(scene: Gaussians, paint: Paint) -> tuple[Gdf, Laid]:
+def edit_of(scene: Gaussians, paint: PaintedView) -> tuple[Gdf, Laid]:
     laid = lay_discs(scene, [paint], 4.0)
     return paint_gdf(laid, scene, [paint], "letters", None), laid

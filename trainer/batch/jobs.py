@@ -1,6 +1,6 @@
 """What a batch is to do: jobs from a catalogue, what is wrong with them, and what they will take.
 
-A job is an ordinary run: `cd FOLDER; progdf train …` writes the same bytes (`Job.command`).
+A job is an ordinary run: `cd FOLDER; progdf train …` writes the same bytes (`BatchJob.command`).
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _NO_OPTION = ("out", "resume", "scene", "name")  # a catalogue has other ways to
 
 
 @dataclass(frozen=True)
-class Job:
+class BatchJob:
     """One run of a batch."""
 
     key: str  # SCENE/NAME, by which reports and --only call it
@@ -54,7 +54,7 @@ class Job:
         return shlex.join(words)
 
 
-def read_catalogue(path: Path, out: Path) -> tuple[list[Job], list[str]]:
+def read_catalogue(path: Path, out: Path) -> tuple[list[BatchJob], list[str]]:
     """The jobs of a catalogue, and what is wrong with it, a line each.
 
     Args:
@@ -71,11 +71,11 @@ def read_catalogue(path: Path, out: Path) -> tuple[list[Job], list[str]]:
         table = tomllib.loads(content.decode())
     except (ValueError, RecursionError) as error:
         raise ProgdfError(f"{path} is not a TOML file ({error})") from None
-    folder, jobs, faults = path.resolve().parent, list[Job](), list[str]()
+    folder, jobs, faults = path.resolve().parent, list[BatchJob](), list[str]()
     try:
         for key, values in _entries(table):
             try:
-                jobs.append(Job(key, make_options(values, out.absolute() / key), folder))
+                jobs.append(BatchJob(key, make_options(values, out.absolute() / key), folder))
             except ProgdfError as error:
                 faults.append(f"{key}: {error}")
     except ProgdfError as error:

@@ -25,7 +25,7 @@ from progdf.io.json_values import convert_json, decode_json, plain
 from progdf.terminal import escape_text, file_size, format_count, format_duration
 from trainer.store.run_folder import RunFolder
 
-from .jobs import Job
+from .jobs import BatchJob
 
 Status = Literal["done", "failed", "stopped", "memory", "waiting"]
 
@@ -42,7 +42,7 @@ _MOST_EMBEDDED = 1000  # pictures in the page itself, some 15 kB each; beyond, i
 
 
 @dataclass(frozen=True)
-class Row:
+class JobRow:
     """How a job ended: one line of batch.csv and batch.html."""
 
     job: str  # its key
@@ -140,7 +140,7 @@ class Progress:
     seconds: Annotated[float, msgspec.Meta(ge=0.0, le=1e9)] = 0.0  # spent on the run, in all its sessions
 
 
-def finished_row(job: Job) -> Row:
+def finished_row(job: BatchJob) -> JobRow:
     """Return the row of a finished run, from its folder.
 
     Raises:
@@ -148,7 +148,7 @@ def finished_row(job: Job) -> Row:
     """
     report = read_report(job)
     root = job.options.out
-    return Row(
+    return JobRow(
         job.key,
         "done",
         psnr_end=report.edit.psnr_to_views,
@@ -161,7 +161,7 @@ def finished_row(job: Job) -> Row:
     )
 
 
-def read_report(job: Job) -> RunReport:
+def read_report(job: BatchJob) -> RunReport:
     """Return the parts of a run's report.json that a batch shows.
 
     Raises:
@@ -178,7 +178,7 @@ def read_report(job: Job) -> RunReport:
         ) from None
 
 
-def _read_progress(job: Job) -> Progress:
+def _read_progress(job: BatchJob) -> Progress:
     """Return how far a job is; a file that is absent or damaged counts as the beginning."""
     with suppress(OSError, ValueError):
         path = RunFolder(job.options.out).progress
@@ -186,7 +186,7 @@ def _read_progress(job: Job) -> Progress:
     return Progress()
 
 
-def read_rows(out: Path) -> dict[str, Row]:
+def read_rows(out: Path) -> dict[str, JobRow]:
     """The rows of an earlier session by job; none where there was none.
 
     Raises:
@@ -198,22 +198,22 @@ def read_rows(out: Path) -> dict[str, Row]:
     try:
         records = csv.DictReader(path.read_text(encoding="utf-8").splitlines())
         given = [{key: value for key, value in record.items() if value} for record in records]
-        rows = [msgspec.convert(values, Row, strict=False) for values in given]
+        rows = [msgspec.convert(values, JobRow, strict=False) for values in given]
     except (ValueError, TypeError, csv.Error) as error:
         raise ProgdfError(f"{path} is damaged ({error}); delete it, the runs are not lost") from None
     return {row.job: row for row in rows}
 
 
-def write_rows(out: Path, rows: Sequence[Row]) -> None:
+def write_rows(out: Path, rows: Sequence[JobRow]) -> None:
     """Write batch.csv, whole or not at all."""
     text = io.StringIO()
-    writer = csv.DictWriter(text, [field.name for field in fields(Row)])
+    writer = csv.DictWriter(text, [field.name for field in fields(JobRow)])
     writer.writeheader()
     writer.writerows(asdict(row) for row in rows)
     write_file(out / CSV, text.getvalue())
 
 
-def write_page(out: Path, rows: Sequence[Row], jobs: Sequence[Job]) -> None:
+def write_page(out: Path, rows: Sequence[JobRow], jobs: Sequence[BatchJob]) -> None:
     """Write batch.html: one file that fetches nothing but, where jobs are many, its folder's pictures."""
     done = sum(row.status == "done" for row in rows)
     failed = sum(row.status == "failed" for row in rows)
@@ -226,7 +226,7 @@ def write_page(out: Path, rows: Sequence[Row], jobs: Sequence[Job]) -> None:
     write_file(out / PAGE, page)
 
 
-def _html_row(row: Row, job: Job | None, embed: bool) -> str:
+def _html_row(row: JobRow, job: BatchJob | None, embed: bool) -> str:
     scene, _, name = row.job.rpartition("/")
     cells = [
         f'<td class="p">{_picture(row, job, embed)}</td>',
@@ -248,17 +248,17 @@ def _number(value: float | None, digits: int, text: str = "") -> str:
     return f'<td class="n" data-v="{value}">{escape(text or f"{value:.{digits}f}")}</td>'
 
 
-def _link(row: Row, name: str) -> str:
+def _link(row: JobRow, name: str) -> str:
     if row.status != "done":
         return escape(name)
     return f'<a href="{_address(row, "report.png")}">{escape(name)}</a>'
 
 
-def _address(row: Row, file: str) -> str:
+def _address(row: JobRow, file: str) -> str:
     return escape(f"{row.job}/{file}".replace("%", "%25").replace("#", "%23").replace("?", "%3F"), True)
 
 
-def _picture(row: Row, job: Job | None, embed: bool) -> str:
+def _picture(row: JobRow, job: BatchJob | None, embed: bool) -> str:
     if job is None or not (job.options.out / PREVIEW).is_file():
         return ""
     source = _address(row, PREVIEW)
@@ -268,7 +268,7 @@ def _picture(row: Row, job: Job | None, embed: bool) -> str:
     return f'<img loading="lazy" alt="at one half and at 1" src="{source}">'
 
 
-def _course_picture(row: Row, job: Job | None) -> str:
+def _course_picture(row: JobRow, job: BatchJob | None) -> str:
     """Return the curve of a finished job; nothing if its report is damaged or was removed meanwhile."""
     if job is None or row.status != "done":
         return ""
@@ -305,7 +305,7 @@ class Screen:
 
     def __init__(
         self,
-        jobs: Mapping[str, Job],
+        jobs: Mapping[str, BatchJob],
         seconds: Mapping[str, float],
         workers: int,
         events: TextIO | None = None,
@@ -313,7 +313,7 @@ class Screen:
         self._jobs, self._seconds, self._workers, self._events = jobs, seconds, workers, events
         self._console = Console(stderr=True, highlight=False, quiet=events is not None)
         self._live = Live(console=self._console, auto_refresh=False, transient=True)
-        self._rows: list[Row] = []
+        self._rows: list[JobRow] = []
         self._begun, self._told = time.monotonic(), 0.0
 
     def say(self, line: str) -> None:
@@ -325,7 +325,7 @@ class Screen:
         if self._events is not None:
             print(json.dumps({"event": name, **values}, ensure_ascii=False), file=self._events, flush=True)
 
-    def end(self, row: Row) -> None:
+    def end(self, row: JobRow) -> None:
         """A job ended."""
         self._rows.append(row)
         self.event("end", **asdict(row))
@@ -348,7 +348,7 @@ class Screen:
             self._live.start()
             self._live.update(Text("\n".join(map(escape_text, lines))), refresh=True)
 
-    def total(self, rows: Sequence[Row], out: Path) -> int:
+    def total(self, rows: Sequence[JobRow], out: Path) -> int:
         """What became of all that was asked for; the exit status."""
         statuses, seconds = [row.status for row in rows], time.monotonic() - self._begun
         done, failed = statuses.count("done"), statuses.count("failed")

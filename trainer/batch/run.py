@@ -32,8 +32,8 @@ from trainer.resolve import count_threads
 from trainer.run.resume import find_run
 from trainer.store.state import defer_signals
 
-from .jobs import Cost, Job, estimate_cost, read_catalogue
-from .report import SOME_FAILED, Row, Screen, finished_row, read_rows, write_page, write_rows
+from .jobs import BatchJob, Cost, estimate_cost, read_catalogue
+from .report import SOME_FAILED, JobRow, Screen, finished_row, read_rows, write_page, write_rows
 from .worker import Finding, Lost, inspect_scene, run_job
 
 _log = logging.getLogger(__name__)
@@ -277,14 +277,14 @@ def _result(future: Future[Any]) -> Any:
         kind = type(error).__name__
         return Lost(f"its worker ended ({kind})", from_memory=kind == "OutOfMemoryError")
     result = future.result()
-    if isinstance(result, Row) and result.status == "memory":
+    if isinstance(result, JobRow) and result.status == "memory":
         return Lost(result.reason, from_memory=True)
     return result
 
 
-def inspect(jobs: Sequence[Job], pool: Pool) -> dict[str, Finding]:
+def inspect(jobs: Sequence[BatchJob], pool: Pool) -> dict[str, Finding]:
     """Look at all jobs, scene by scene: what is wrong with each before anything starts, by key."""
-    scenes: dict[tuple[Path, Path], list[Job]] = {}
+    scenes: dict[tuple[Path, Path], list[BatchJob]] = {}
     for job in jobs:
         scenes.setdefault((job.folder, job.options.scene), []).append(job)
     findings = list[Finding]()
@@ -302,21 +302,21 @@ def run_jobs(
     pool: Pool,
     tell: Callable[[str, Task, str], None] = lambda event, task, reason: None,
     tick: Callable[[Sequence[Task]], None] = lambda running: None,
-) -> Iterator[Row]:
+) -> Iterator[JobRow]:
     """`run_tasks` for tasks of `train_task`; every job's row as it ends."""
     for task, result in run_tasks(tasks, pool, tell, tick):
         if isinstance(result, Lost):
-            result = Row(task.key, "failed", result.reason)
+            result = JobRow(task.key, "failed", result.reason)
         yield replace(result, attempts=task.attempt)
 
 
-def train_task(job: Job, memory: int = 0) -> Task:
+def train_task(job: BatchJob, memory: int = 0) -> Task:
     """A job as a task; memory in bytes, 0: unknown."""
     gpu = job.options.editor.family == "instruct" or "text:" in job.options.region.region
     return Task(run_job, job, job.key, count_threads(job.options.threads), memory, gpu)
 
 
-def run(jobs: Sequence[Job], workers: int = 0, address: str = "") -> Iterator[Row]:
+def run(jobs: Sequence[BatchJob], workers: int = 0, address: str = "") -> Iterator[JobRow]:
     """Train jobs side by side; for Python programs. Nothing is looked at before the start, see `inspect`.
 
     Args:
@@ -380,8 +380,8 @@ def batch(options: BatchOptions) -> int:
         if options.dry_run:
             return 0
         tasks = [train_task(job, costs[job.key].memory) for job in healthy]
-        rows |= {f.key: Row(f.key, "failed", f.fault) for f in findings.values() if f.fault}
-        rows |= {job.key: Row(job.key, "waiting") for job in healthy}
+        rows |= {f.key: JobRow(f.key, "failed", f.fault) for f in findings.values() if f.fault}
+        rows |= {job.key: JobRow(job.key, "waiting") for job in healthy}
         rows |= found
         seconds = {key: cost.seconds for key, cost in costs.items()}
         by_key = {job.key: job for job in healthy}
@@ -405,9 +405,9 @@ def batch(options: BatchOptions) -> int:
 
 def _run_batch(
     options: BatchOptions,
-    jobs: Sequence[Job],
+    jobs: Sequence[BatchJob],
     tasks: Sequence[Task],
-    rows: dict[str, Row],
+    rows: dict[str, JobRow],
     pool: Pool,
     screen: Screen,
 ) -> None:
@@ -418,7 +418,7 @@ def _run_batch(
         if event == "retry":
             screen.say(f"{task.key}: {reason}; it is begun again and goes on where it was")
 
-    writers: list[Callable[[Path, Sequence[Row]], None]] = [write_rows, partial(write_page, jobs=jobs)]
+    writers: list[Callable[[Path, Sequence[JobRow]], None]] = [write_rows, partial(write_page, jobs=jobs)]
     due = [0.0, 0.0]  # a row that is not written is found again in its run
 
     def write(now: float = math.inf) -> None:
@@ -446,11 +446,11 @@ def _run_batch(
         write()
 
 
-def _is_selected(job: Job, only: str) -> bool:
+def _is_selected(job: BatchJob, only: str) -> bool:
     return not only or any(fnmatchcase(text, only) for text in (job.key, job.key.rpartition("/")[2]))
 
 
-def _is_finished(job: Job) -> bool:
+def _is_finished(job: BatchJob) -> bool:
     with chdir(job.folder):
         try:
             return find_run(job.options) == "finished"
@@ -458,7 +458,7 @@ def _is_finished(job: Job) -> bool:
             return False
 
 
-def _found_rows(finished: Sequence[Job], rows: Mapping[str, Row]) -> dict[str, Row]:
+def _found_rows(finished: Sequence[BatchJob], rows: Mapping[str, Row]) -> dict[str, Row]:
     """Return the rows of finished runs that the table does not have, or not as done, by key.
 
     They are runs of `progdf train`, or ended just when the earlier session was interrupted. The row of a run
@@ -470,7 +470,7 @@ def _found_rows(finished: Sequence[Job], rows: Mapping[str, Row]) -> dict[str, R
         try:
             row = finished_row(job)
         except ProgdfError as error:
-            row = Row(job.key, "failed", str(error))
+            row = JobRow(job.key, "failed", str(error))
         if known is None or known.status != "done" or row.status != "done":
             found[job.key] = row
     return found
@@ -487,7 +487,9 @@ def _disk_faults(out: Path, costs: Mapping[str, Cost]) -> list[str]:
     return [f"{out}: the runs will take about {file_size(needed)}, and {file_size(free)} are free"]
 
 
-def _print_plan(jobs: Sequence[Job], kept: Collection[str], costs: Mapping[str, Cost], workers: int) -> None:
+def _print_plan(
+    jobs: Sequence[BatchJob], kept: Collection[str], costs: Mapping[str, Cost], workers: int
+) -> None:
     """The jobs as commands, and what all of them will take."""
     for job in jobs:
         state = "finished" if job.key in kept else "" if job.key in costs else "cannot be trained"

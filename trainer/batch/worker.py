@@ -36,8 +36,8 @@ from trainer.store.pretrained import Shared, keep_models
 from trainer.store.run_folder import RunFolder, read_run_cameras
 from trainer.views.view import BACKGROUND
 
-from .jobs import Job
-from .report import PREVIEW, Row, Status, finished_row
+from .jobs import BatchJob
+from .report import PREVIEW, JobRow, Status, finished_row
 
 _PREVIEW_SIDE = 144
 _LOCK_WAIT_S = 600.0  # a lost node's worker may still be writing
@@ -60,7 +60,7 @@ def _shared_parts() -> Shared:
     return Shared()
 
 
-def inspect_scene(jobs: Sequence[Job]) -> list[Finding]:
+def inspect_scene(jobs: Sequence[BatchJob]) -> list[Finding]:
     """Look at everything that jobs of one scene name, as far as it can be seen without training."""
     findings = []
     for job in jobs:
@@ -72,7 +72,7 @@ def inspect_scene(jobs: Sequence[Job]) -> list[Finding]:
     return findings
 
 
-def _inspect(job: Job) -> Finding:
+def _inspect(job: BatchJob) -> Finding:
     options = resolve(job.options)
     check_command(replace(options, resume=_is_begun(RunFolder(options.out))))
     scene = _scene(options)
@@ -86,7 +86,7 @@ def _scene(options: TrainOptions) -> Gaussians:
     return _shared_parts().get("scene", options.scene.resolve(), lambda: load_scene(options.scene))
 
 
-def run_job(job: Job) -> Row:
+def run_job(job: BatchJob) -> JobRow:
     """Train a job in this process, or go on with it where it was stopped; a finished one is left as it is."""
     begun, cpu_begun = time.perf_counter(), time.process_time()
     try:
@@ -94,12 +94,12 @@ def run_job(job: Job) -> Row:
             _train(job)
             row = finished_row(job)
     except KeyboardInterrupt as interrupt:
-        row = Row(job.key, "stopped", str(interrupt))
+        row = JobRow(job.key, "stopped", str(interrupt))
     except (ProgdfError, OSError) as error:
-        row = Row(job.key, "failed", str(error))
+        row = JobRow(job.key, "failed", str(error))
     except Exception as error:
         status: Status = "memory" if is_out_of_memory(error) else "failed"
-        row = Row(job.key, status, f"{type(error).__name__}: {error}")
+        row = JobRow(job.key, status, f"{type(error).__name__}: {error}")
     return replace(
         row,
         reason=" ".join(row.reason.split()),
@@ -109,7 +109,7 @@ def run_job(job: Job) -> Row:
     )
 
 
-def _train(job: Job) -> None:
+def _train(job: BatchJob) -> None:
     with suppress(OSError):  # Linux: the peak that report.json tells is this job's, not that of those before
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
     options, folder = job.options, RunFolder(job.options.out)

@@ -133,7 +133,7 @@ ADAPTERS: dict[str, Adapter] = {
 
 
 @dataclass(frozen=True)
-class Request:
+class PipelineRequest:
     """One sentence for one model, nothing left open."""
 
     prompt: str
@@ -258,7 +258,7 @@ def component_sizes(model: str, adapter: Adapter) -> dict[str, int]:
 
 
 @dataclass(frozen=True)
-class Placement:
+class DevicePlan:
     """Where a pipeline runs, and what that takes."""
 
     device: str
@@ -276,7 +276,7 @@ class Placement:
         return f"on {self.device} in {dtype}, {how}: about {_gb(self.need)} needed, {_gb(self.free)} free"
 
 
-def place(request: Request, device: Device) -> Placement:
+def place(request: PipelineRequest, device: Device) -> DevicePlan:
     """Where and how its pipeline will run.
 
     Raises:
@@ -297,17 +297,17 @@ def place(request: Request, device: Device) -> Placement:
             )
         if request.quantize != "off":
             raise ProgdfError("--quantize nf4 needs a graphics card; leave it out")
-        return Placement("cpu", torch.float32 if adapter.is_stable else torch.bfloat16)
+        return DevicePlan("cpu", torch.float32 if adapter.is_stable else torch.bfloat16)
     memory = gpu_memory()
     assert memory is not None
     whole, in_turn = memory_need(adapter, sizes, request.quantize, request.size)
     is_half = adapter.is_stable or not torch.cuda.is_bf16_supported(including_emulation=False)
     dtype, is_tight = torch.float16 if is_half else torch.bfloat16, memory[0] < whole
-    return Placement("cuda", dtype, is_tight, in_turn if is_tight else whole, memory[0])
+    return DevicePlan("cuda", dtype, is_tight, in_turn if is_tight else whole, memory[0])
 
 
 @contextmanager
-def explain_memory(request: Request, placement: Placement) -> Iterator[None]:
+def explain_memory(request: PipelineRequest, placement: DevicePlan) -> Iterator[None]:
     """Say in one line that a card's memory ran out, and what to try."""
     try:
         yield
@@ -319,7 +319,7 @@ def explain_memory(request: Request, placement: Placement) -> Iterator[None]:
         ) from error
 
 
-def load_pipeline(request: Request, placement: Placement) -> MixedSteps:
+def load_pipeline(request: PipelineRequest, placement: DevicePlan) -> MixedSteps:
     """Its pipeline with its weights, from this machine only, where it runs.
 
     Raises:

@@ -19,7 +19,7 @@ from progdf.io.images import open_picture
 from progdf.rasterize.engines import render_depth
 from progdf.scene.regions import read_numbers
 from trainer.options import EditKind, EditorOptions
-from trainer.paint.discs import LEAST_ALPHA, OPAQUE, Paint, lay_on, project_paint, sample_image
+from trainer.paint.discs import LEAST_ALPHA, OPAQUE, PaintedView, lay_on, project_paint, sample_image
 from trainer.views.view import BACKGROUND, View, make_view, with_near_plane
 
 from .base import EditorInput
@@ -28,7 +28,7 @@ _MOST_SIDE = 512  # pixels of a decal's longer side: of a larger one the view is
 
 
 @dataclass(frozen=True)
-class Place:
+class DecalPlacement:
     """Where a decal lies in a picture."""
 
     x: float  # of its center, pixels
@@ -37,7 +37,7 @@ class Place:
     angle: float  # degrees, counterclockwise
 
 
-def parse_place(text: str, camera: Camera) -> Place:
+def parse_place(text: str, camera: Camera) -> DecalPlacement:
     """`x,y,size[,angle]` in pixels of the camera's picture, or x, y and size in shares of its sides, 0..1.
 
     Raises:
@@ -59,7 +59,7 @@ def parse_place(text: str, camera: Camera) -> Place:
         raise ProgdfError(
             f"--at {text} lies outside the camera's picture of {camera.width}x{camera.height} pixels"
         )
-    return Place(x, y, size, angle)
+    return DecalPlacement(x, y, size, angle)
 
 
 def decal_camera(path: Path | None, origin: Origin = ZERO) -> Camera:
@@ -93,7 +93,7 @@ def _open_decal(path: Path) -> Image.Image:
     return picture
 
 
-def draw_decal(path: Path, place: Place, camera: Camera) -> Tensor:
+def draw_decal(path: Path, place: DecalPlacement, camera: Camera) -> Tensor:
     """The decal as it lies in the camera's picture, colors times alpha, and alpha. [H,W,4] 0..1"""
     picture = _open_decal(path)
     scale = place.size / max(picture.size)
@@ -121,9 +121,9 @@ class DecalEditor:
     is_confined: bool = False
 
     @property
-    def paint(self) -> Paint:
+    def paint(self) -> PaintedView:
         """What its own view shall show."""
-        return Paint(self.view.camera, self.edit(self.view, 1.0), self.drawn)
+        return PaintedView(self.view.camera, self.edit(self.view, 1.0), self.drawn)
 
     def edit(self, view: View, strength: float) -> Tensor:
         """See `ImageEditor.edit`."""

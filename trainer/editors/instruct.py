@@ -27,7 +27,7 @@ from trainer.store.run_folder import from_bytes, to_bytes
 from trainer.views.view import BACKGROUND, View, region_box, render_view, shrink_image
 
 from . import adapters
-from .adapters import Placement, Request
+from .adapters import DevicePlan, PipelineRequest
 from .base import EditorInput
 from .cache import KeptPictures, Recipe
 from .mixed_steps import MixedSteps, network_steps
@@ -40,8 +40,8 @@ class InstructEditor:
     """Edits pictures as a sentence says, and paints one as told: of a view, what is around the region."""
 
     scene: Gaussians
-    request: Request
-    placement: Placement
+    request: PipelineRequest
+    placement: DevicePlan
     load: Callable[[], MixedSteps]  # the pipeline, when it is first needed
     kept: KeptPictures  # where its answers are kept, at their own size
     stages: tuple[float, ...] = ()
@@ -199,7 +199,7 @@ def sentence(what: str) -> str:
     return words
 
 
-def resolve_request(what: str, options: EditorOptions) -> Request:
+def resolve_request(what: str, options: EditorOptions) -> PipelineRequest:
     """The options, with the model's own values where nothing was said.
 
     Raises:
@@ -222,7 +222,7 @@ def resolve_request(what: str, options: EditorOptions) -> Request:
     ):
         if is_given:
             raise ProgdfError(f"{option} does not apply to {model}, which has its own; leave it out")
-    return Request(
+    return PipelineRequest(
         prompt,
         model,
         kind,
@@ -236,7 +236,7 @@ def resolve_request(what: str, options: EditorOptions) -> Request:
     )
 
 
-def unread_words(request: Request) -> str:
+def unread_words(request: PipelineRequest) -> str:
     """The end of a sentence that is longer than CLIP's 77 tokens, where CLIP is all that reads it."""
     if not request.adapter.is_stable:
         return ""

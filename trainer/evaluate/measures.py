@@ -20,7 +20,7 @@ from .opened import FADE, KEYFRAMES, SLIDER, OpenedRun
 
 
 @dataclass(frozen=True)
-class Row:
+class MeasureRow:
     """One line of the table."""
 
     name: str  # in evaluation.json
@@ -34,7 +34,7 @@ class Row:
 class Evaluation:
     """What was measured."""
 
-    rows: tuple[Row, ...]  # the table
+    rows: tuple[MeasureRow, ...]  # the table
     # against the editor's own pictures at the slider values that it was asked for, by what is shown
     curves: Mapping[str, ErrorCurve]
     paths: Mapping[str, SliderPath]  # the slider in equal steps, by what is shown
@@ -66,14 +66,14 @@ def evaluate_run(opened: OpenedRun, perceptual: Perceptual, texts: TextOptions) 
         *_edited_rows(curves, lpips, views[min(len(opened.setup.held_out), 2)]),
         *_path_rows(paths, lpips),
         *_consistency_rows(consistency, lpips),
-        Row("outside", "outside the region, mean change, of 255", outside),
+        MeasureRow("outside", "outside the region, mean change, of 255", outside),
         *_clip_rows(opened, texts),
         *_cost_rows(opened),
     )
     return Evaluation(rows, curves, paths, consistency, perceptual.name)
 
 
-def _edited_rows(curves: Mapping[str, ErrorCurve], lpips: str, views: str) -> list[Row]:
+def _edited_rows(curves: Mapping[str, ErrorCurve], lpips: str, views: str) -> list[MeasureRow]:
     def cells(measure: str, part: slice) -> dict[str, float | None]:
         values = {name: getattr(curve, measure)[part] for name, curve in curves.items()}
         return {name: sum(some) / len(some) for name, some in values.items()}
@@ -81,7 +81,7 @@ def _edited_rows(curves: Mapping[str, ErrorCurve], lpips: str, views: str) -> li
     measures = (("psnr", "PSNR, dB", 1), ("ssim", "SSIM", 4), ("lpips", lpips, 4))
     inner = len(next(iter(curves.values())).s) - 1
     rows = [
-        Row(f"{name}_end", f"{views} at 1, {text}", cells(name, slice(-1, None)), digits)
+        MeasureRow(f"{name}_end", f"{views} at 1, {text}", cells(name, slice(-1, None)), digits)
         for name, text, digits in measures
     ]
     if not inner:
@@ -91,47 +91,55 @@ def _edited_rows(curves: Mapping[str, ErrorCurve], lpips: str, views: str) -> li
     return [
         *rows,
         *(
-            Row(f"{name}_between", f"at {inner} {places} between, {text}", cells(name, slice(-1)), digits)
+            MeasureRow(
+                f"{name}_between", f"at {inner} {places} between, {text}", cells(name, slice(-1)), digits
+            )
             for name, text, digits in measures
         ),
-        Row("psnr_worst", "the worst of all these, PSNR, dB", lowest, 1),
+        MeasureRow("psnr_worst", "the worst of all these, PSNR, dB", lowest, 1),
     ]
 
 
-def _path_rows(paths: Mapping[str, SliderPath], lpips: str) -> list[Row]:
+def _path_rows(paths: Mapping[str, SliderPath], lpips: str) -> list[MeasureRow]:
     def of(value: str) -> dict[str, float | None]:
         numbers = {name: float(getattr(path, value)) for name, path in paths.items()}
         return {name: None if math.isnan(number) else number for name, number in numbers.items()}
 
     return [
-        Row("evenness", "20 equal steps: evenness, least over largest change", of("evenness"), 2),
-        Row("monotone", "steps that lead away from the original, share", of("monotone"), 2),
-        Row("neighbors_mean", f"{lpips} of neighbors, mean", of("mean"), 4),
-        Row("neighbors_largest", f"{lpips} of neighbors, largest", of("largest"), 4),
-        Row("sum_over_ends", f"Σ {lpips} of neighbors / {lpips} of the ends", of("sum_over_ends")),
-        Row("triangle_excess", "the same of their roots (1: straight)", of("triangle_excess"), 2),
+        MeasureRow("evenness", "20 equal steps: evenness, least over largest change", of("evenness"), 2),
+        MeasureRow("monotone", "steps that lead away from the original, share", of("monotone"), 2),
+        MeasureRow("neighbors_mean", f"{lpips} of neighbors, mean", of("mean"), 4),
+        MeasureRow("neighbors_largest", f"{lpips} of neighbors, largest", of("largest"), 4),
+        MeasureRow("sum_over_ends", f"Σ {lpips} of neighbors / {lpips} of the ends", of("sum_over_ends")),
+        MeasureRow("triangle_excess", "the same of their roots (1: straight)", of("triangle_excess"), 2),
     ]
 
 
-def _consistency_rows(consistency: Consistency, lpips: str) -> list[Row]:
+def _consistency_rows(consistency: Consistency, lpips: str) -> list[MeasureRow]:
     missing = "" if consistency.pairs else "no other view sees enough of what a held-out one does"
     return [
-        Row("warped_lpips", f"one view warped onto another, {lpips}", dict(consistency.lpips), 3, missing),
-        Row("warped_psnr", "one view warped onto another, PSNR, dB", dict(consistency.psnr), 1, missing),
+        MeasureRow(
+            "warped_lpips", f"one view warped onto another, {lpips}", dict(consistency.lpips), 3, missing
+        ),
+        MeasureRow(
+            "warped_psnr", "one view warped onto another, PSNR, dB", dict(consistency.psnr), 1, missing
+        ),
     ]
 
 
-def _clip_rows(opened: OpenedRun, texts: TextOptions) -> list[Row]:
+def _clip_rows(opened: OpenedRun, texts: TextOptions) -> list[MeasureRow]:
     course = clip_curve(opened.evaluator, opened.setup.judging, opened.gdf.field, texts)
     along, missing = clip_consistency(opened)
     direction = course.similarity[-1] if course.similarity else None
     return [
-        Row("clip_direction", "CLIP direction similarity at 1", {SLIDER: direction}, 3, course.reason),
-        Row("clip_consistency", "CLIP direction consistency along a path", {SLIDER: along}, 3, missing),
+        MeasureRow("clip_direction", "CLIP direction similarity at 1", {SLIDER: direction}, 3, course.reason),
+        MeasureRow(
+            "clip_consistency", "CLIP direction consistency along a path", {SLIDER: along}, 3, missing
+        ),
     ]
 
 
-def _cost_rows(opened: OpenedRun) -> list[Row]:
+def _cost_rows(opened: OpenedRun) -> list[MeasureRow]:
     gdf = opened.gdf
     memory = opened.figures.memory_mb
     seconds = opened.figures.time.total
@@ -140,9 +148,9 @@ def _cost_rows(opened: OpenedRun) -> list[Row]:
         KEYFRAMES: opened.keyframes.bytes_per_member,
     }
     return [
-        Row("bytes_per_member", f"bytes for each of {len(gdf.region)} members", sizes, 0),
-        Row("seconds", "run, s", {SLIDER: seconds}, 0, "" if seconds else "report.json does not say"),
-        Row(
+        MeasureRow("bytes_per_member", f"bytes for each of {len(gdf.region)} members", sizes, 0),
+        MeasureRow("seconds", "run, s", {SLIDER: seconds}, 0, "" if seconds else "report.json does not say"),
+        MeasureRow(
             "memory_mb", "peak memory, MB", {SLIDER: memory}, 0, "" if memory else "report.json does not say"
         ),
     ]
@@ -237,11 +245,11 @@ def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join([*lines, *("| " + " | ".join(row) + " |" for row in rows)])
 
 
-def _cell(row: Row, column: str) -> str:
+def _cell(row: MeasureRow, column: str) -> str:
     value = row.cells.get(column)
     return "" if value is None else f"{value:.{row.digits}f}"
 
 
-def _round_row(row: Row) -> dict[str, float | None]:
+def _round_row(row: MeasureRow) -> dict[str, float | None]:
     digits = row.digits + 2
     return {name: None if value is None else round(value, digits) for name, value in row.cells.items()}

@@ -22,7 +22,7 @@ from progdf.region import Region
 from trainer.editors import COLOR_FUNCTIONS, make_editor
 from trainer.editors.procedural import edit_course
 from trainer.optimize.color_views import MORE_PAYS, ColorView, MapFit, fit_maps
-from trainer.options import MOST_STAGES, EditorOptions, ViewOptions
+from trainer.options import MOST_STAGES, EditorOptions, TrainingViewOptions
 from trainer.setup import take_glances
 from trainer.views.view import BACKGROUND, Glance, View, render_view
 
@@ -56,11 +56,11 @@ class DraftViews:
     judged: _Pixels  # of views that nothing is fitted to
 
 
-def draft_views(options: ViewOptions, scene: Gaussians, region: Region) -> DraftViews | None:
+def draft_views(options: TrainingViewOptions, scene: Gaussians, region: Region) -> DraftViews | None:
     """The region at a glance; None where fewer than two show it, or the scene is one to stand inside.
 
     Args:
-        options: see `ViewOptions`
+        options: see `TrainingViewOptions`
         scene: the original
         region: what is edited
     """

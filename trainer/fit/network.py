@@ -34,7 +34,7 @@ from trainer.views.crops import CropScene, crop_scene, render_all
 from .evaluate import Evaluator
 from .fit import visibility
 
-MOST = 64
+MAX_SNAPSHOTS = 64
 """Snapshots that a bank keeps; of more, those go that differ least in time from their neighbors."""
 
 
@@ -46,7 +46,7 @@ class MemoryBank:
         most: how many to keep, the original and the newest always, ≥ 3
     """
 
-    def __init__(self, members: int, channels: int, most: int = MOST) -> None:
+    def __init__(self, members: int, channels: int, most: int = MAX_SNAPSHOTS) -> None:
         self._strengths = [0.0]
         self._offsets = [torch.zeros(members, channels, dtype=torch.float16)]
         self._most = most

@@ -351,7 +351,7 @@ def disagreement(control: ControlPoints, motion: WarpMotion) -> Tensor:
     return error.square().sum(dim=1).mean() / control.spacing**2
 
 
-class Placement(Protocol):
+class RegionMotion(Protocol):
     """A motion of all members of a region."""
 
     def carry(self, original: Tensor, offsets: Tensor) -> Tensor:
@@ -375,11 +375,11 @@ class PartsPlacement:
     motion: Motion
 
     def carry(self, original: Tensor, offsets: Tensor) -> Tensor:
-        """See `Placement`."""
+        """See `RegionMotion`."""
         return carry_offsets(original, offsets, self.parts, self.motion)
 
     def carry_back(self, original: Tensor, offsets: Tensor) -> Tensor:
-        """See `Placement`."""
+        """See `RegionMotion`."""
         return local_offsets(original, offsets, self.parts, self.motion)
 
     def lines(self) -> list[str]:
@@ -402,11 +402,11 @@ class WarpPlacement:
     motion: WarpMotion
 
     def carry(self, original: Tensor, offsets: Tensor) -> Tensor:
-        """See `Placement`."""
+        """See `RegionMotion`."""
         return map_members(original, self.control, self.motion).carry(original, offsets)
 
     def carry_back(self, original: Tensor, offsets: Tensor) -> Tensor:
-        """See `Placement`."""
+        """See `RegionMotion`."""
         return map_members(original, self.control, self.motion).carry_back(original, offsets)
 
     def lines(self) -> list[str]:
@@ -420,7 +420,7 @@ class WarpPlacement:
         ]
 
 
-def between(a: Placement, b: Placement, share: float) -> Placement:
+def between(a: RegionMotion, b: RegionMotion, share: float) -> RegionMotion:
     """On the way from one placement to another of the same kind."""
     if isinstance(a, PartsPlacement) and isinstance(b, PartsPlacement):
         return PartsPlacement(a.parts, interpolate_motion(a.motion, b.motion, share))

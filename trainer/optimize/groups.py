@@ -21,7 +21,7 @@ from progdf.similarity import Motion, Parts, make_parts
 from trainer.motion.parts import GroupSearch, OnStep, connected_parts
 from trainer.motion.warp import (
     PartsPlacement,
-    Placement,
+    RegionMotion,
     WarpMotion,
     WarpPlacement,
     WarpSearch,
@@ -60,12 +60,12 @@ class Groups:
         return _EXTENT * float(self.parts.sizes.mean())
 
     @property
-    def placements(self) -> tuple[Placement, ...]:
+    def placements(self) -> tuple[RegionMotion, ...]:
         """Where each stage ends."""
         return self.warps or tuple(PartsPlacement(self.parts, motion) for motion in self.motions)
 
     @property
-    def rest(self) -> Placement:
+    def rest(self) -> RegionMotion:
         """Where the first stage begins."""
         if self.warps:
             return WarpPlacement(self.warps[0].control, rest_warp(self.warps[0].control))

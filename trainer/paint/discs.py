@@ -60,7 +60,7 @@ _NEWTON = 8  # steps of finding what a pixel shows
 
 
 @dataclass(frozen=True)
-class Paint:
+class PaintedView:
     """What one view shall show."""
 
     camera: Camera
@@ -83,13 +83,13 @@ class Discs:
 
 
 def place_discs(
-    scene: Gaussians, paint: Paint, flat: float, gap: float, cleared: Gaussians | None = None
+    scene: Gaussians, paint: PaintedView, flat: float, gap: float, cleared: Gaussians | None = None
 ) -> Discs:
     """Discs for what is painted where the picture is opaque, and a little around it.
 
     Args:
         scene: the original
-        paint: see `Paint`
+        paint: see `PaintedView`
         flat: root mean square of color, 0..1, that one disc may be off in its pixels
         gap: pixels between a disc and what is moved behind it, which is wide and seen from the sides too
         cleared: the scene as other paint has moved it

@@ -20,7 +20,7 @@ from progdf.sh import C0
 from progdf.threads import one_thread
 from trainer.views.view import BACKGROUND, crop, seen_colors
 
-from .discs import Paint
+from .discs import PaintedView
 
 _STEPS, _ROUNDS = 40, 3  # of conjugate gradients; between them, colors below black are set to it
 _HELD = 0.05  # of a pixel: how much a row of the scene holds on to its own color
@@ -42,7 +42,7 @@ def box_of(painted: Tensor, camera: Camera) -> Crop:
 
 
 def solve_colors(
-    scene: Gaussians, rows: Tensor, added: Gaussians, paints: Sequence[Paint]
+    scene: Gaussians, rows: Tensor, added: Gaussians, paints: Sequence[PaintedView]
 ) -> tuple[Gaussians, Gaussians]:
     """Scene and added rows with the colors whose pictures come closest to what was painted, all together.
 

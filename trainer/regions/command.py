@@ -26,7 +26,13 @@ from progdf.scene.regions import parse_region
 from progdf.scene.subject import fit_camera
 from progdf.scene.up_axis import find_up
 from progdf.terminal import format_count, group_digits
-from trainer.options import RegionOptions, ShowRegionOptions, ViewOptions, WriteViewsOptions, check_ranges
+from trainer.options import (
+    RegionOptions,
+    ShowRegionOptions,
+    TrainingViewOptions,
+    WriteViewsOptions,
+    check_ranges,
+)
 from trainer.views.choose import choose_views
 from trainer.views.view import (
     BACKGROUND,
@@ -68,7 +74,7 @@ def show(options: ShowRegionOptions) -> list[str]:
     lines: list[str] = []
     with tempfile.TemporaryDirectory() as folder:
         masks = RegionOptions(options.spec, options.lift_rule, options.lift_threshold)
-        views = ViewOptions(options.cameras, options.up, scene=options.scene)
+        views = TrainingViewOptions(options.cameras, options.up, scene=options.scene)
         request = RegionRequest(masks, views, lambda: Path(folder), say=lines.append)
         region = parse_region(options.spec, scene, kinds=region_kinds(request), say=lines.append)
     if suffix == ".npy":
@@ -136,7 +142,7 @@ def write(options: WriteViewsOptions) -> str:
     up = find_up(scene, given, options.up, options.scene).direction
     region = None
     if options.region is not None:
-        views = ViewOptions(options.cameras, options.up, options.views, scene=options.scene)
+        views = TrainingViewOptions(options.cameras, options.up, options.views, scene=options.scene)
         request = RegionRequest(RegionOptions(options.region), views, lambda: out / "segmented")
         region = parse_region(options.region, scene, kinds=region_kinds(request))
     if given:

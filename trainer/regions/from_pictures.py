@@ -29,7 +29,7 @@ from progdf.scene.selection import Surface, base_colors
 from progdf.scene.up_axis import find_up
 from trainer.editors.cache import KeptPictures, Recipe
 from trainer.editors.pictures import picture_paths, read_change, rendered_cameras
-from trainer.options import VIEWS, RegionOptions, ViewOptions
+from trainer.options import VIEWS, RegionOptions, TrainingViewOptions
 from trainer.store.pretrained import last_model
 from trainer.views.view import (
     BACKGROUND,
@@ -90,7 +90,7 @@ class RegionRequest:
     """What pictures are to tell of a region, and where those that are made for it go."""
 
     options: RegionOptions
-    views: ViewOptions  # as many pictures are segmented, at most; without cameras, as many again from nearer
+    views: TrainingViewOptions  # limits the segmented images; without cameras, as many closer views are added
     cache: Callable[[], Path]  # makes, and names, the folder in which segmented pictures are kept
     quiet: bool = False  # no progress on the screen
     say: Callable[[str], None] | None = None  # hears in a line each what became of the masks

@@ -37,8 +37,8 @@ from trainer.options import (
     EditorOptions,
     OptimizeOptions,
     RegionOptions,
+    TrainingViewOptions,
     TrainOptions,
-    ViewOptions,
     check_ranges,
 )
 from trainer.store.state import StateFolder
@@ -275,7 +275,7 @@ def _train_options(options: DemoOptions, show: Show, scene: DemoScene, edit: Dem
         out=folder / edit.name,
         region=RegionOptions("changed" if painted else f"labels:{folder / 'labels.npy'}:{ids}"),
         editor=EditorOptions(f"pictures:{folder / f'{edit.name}.png'}" if painted else edit.editor),
-        views=ViewOptions(
+        views=TrainingViewOptions(
             cameras=folder / "cameras.json" if show.inside else None,
             views=effort.views,
             image_size=0 if painted and not options.quick else effort.image_size,

@@ -164,7 +164,7 @@ def approaches(options: TrainOptions, setup: TrainingSetup, edited: Sequence[Ten
     Args:
         options: resolved
         setup: the training views
-        edited: the finished edit of each, not is_confined. [H,W,3]
+        edited: the full edit of each view, not confined to the region. [H,W,3]
     """
     optimize = options.optimize
     groups = GROUP_STEPS if optimize.group_steps is None else optimize.group_steps
@@ -198,7 +198,7 @@ def try_approaches(
     Args:
         options: of the run
         setup: scene, region and training views
-        edited: the finished edit of each training view, not is_confined. [H,W,3]
+        edited: the full edit of each training view, not confined to the region. [H,W,3]
         ways: see `approaches`
         advance: progress: ways tried
 

@@ -29,7 +29,7 @@ from progdf.region import Region
 from progdf.terminal import group_digits
 from trainer.editors.decal import DecalEditor
 from trainer.editors.pictures import read_edit
-from trainer.paint.discs import DISC_LOGIT, GROWN, Paint, faint, lay_on, place_discs, project_paint
+from trainer.paint.discs import DISC_LOGIT, GROWN, PaintedView, faint, lay_on, place_discs, project_paint
 from trainer.paint.solve import box_of, solve_colors
 from trainer.store.progress import RunLog
 from trainer.views.view import BACKGROUND, View, crop, make_view, render_view
@@ -67,7 +67,7 @@ class Laid:
         return concatenate([self.ended, self.added])
 
 
-def lay_discs(scene: Gaussians, paints: Sequence[Paint], gap: float) -> Laid:
+def lay_discs(scene: Gaussians, paints: Sequence[PaintedView], gap: float) -> Laid:
     """Discs for what is painted: of each picture where none of those before it is seen.
 
     Args:
@@ -103,7 +103,7 @@ def lay_discs(scene: Gaussians, paints: Sequence[Paint], gap: float) -> Laid:
 
 
 @dataclass(frozen=True)
-class Look:
+class PaintView:
     """A view around the paint, and what of it counts."""
 
     camera: Camera
@@ -113,7 +113,7 @@ class Look:
     around: Tensor  # and the ring beside it. [H,W] bool
 
 
-def look_around(scene: Gaussians, paints: Sequence[Paint], degrees: Sequence[float]) -> list[Look]:
+def look_around(scene: Gaussians, paints: Sequence[PaintedView], degrees: Sequence[float]) -> list[PaintView]:
     """What the views of paint, turned about it, shall show.
 
     Args:
@@ -135,11 +135,11 @@ def look_around(scene: Gaussians, paints: Sequence[Paint], degrees: Sequence[flo
             else:
                 expected, covered = paint.picture, paint.mask
             grown = ndimage.binary_dilation(covered.numpy(), iterations=RING)
-            looks.append(Look(camera, angle, expected, covered, torch.from_numpy(grown) & ~covered))
+            looks.append(PaintView(camera, angle, expected, covered, torch.from_numpy(grown) & ~covered))
     return looks
 
 
-def _error(finished: Gaussians, looks: Sequence[Look]) -> float:
+def _error(finished: Gaussians, looks: Sequence[PaintView]) -> float:
     """Mean square of color at and around the paint, over all looks."""
     error = pixels = 0.0
     for look in looks:
@@ -154,7 +154,7 @@ def _error(finished: Gaussians, looks: Sequence[Look]) -> float:
 
 
 def choose_discs(
-    scene: Gaussians, paints: Sequence[Paint], looks: Sequence[Look], log: RunLog | None
+    scene: Gaussians, paints: Sequence[PaintedView], looks: Sequence[PaintView], log: RunLog | None
 ) -> Laid:
     """Discs with the gap that comes closest to the paint, in its own views and from the sides.
 
@@ -183,7 +183,9 @@ def choose_discs(
     return best[1]
 
 
-def paint_gdf(laid: Laid, scene: Gaussians, paints: Sequence[Paint], name: str, recolored: Gdf | None) -> Gdf:
+def paint_gdf(
+    laid: Laid, scene: Gaussians, paints: Sequence[PaintedView], name: str, recolored: Gdf | None
+) -> Gdf:
     """The edit that ends in discs; what shows of them is linear in the strength.
 
     Args:
@@ -230,7 +232,7 @@ def _shares(recolored: Gdf, members: Tensor, end: Tensor, knots: Tensor) -> Tens
     return courses
 
 
-def _even_clock(laid: Laid, paints: Sequence[Paint], steps: Tensor, rise: Tensor) -> Tensor:
+def _even_clock(laid: Laid, paints: Sequence[PaintedView], steps: Tensor, rise: Tensor) -> Tensor:
     """Strengths at which the knots of a straight course come, so that what shows is linear in them. [S]"""
     paint = paints[0]
     box = box_of(paint.mask, paint.camera)
@@ -265,7 +267,7 @@ def sharpen(
         log: of the run
     """
     end = edited_scene(scene, recolored)
-    paints, light, background = list[Paint](), torch.zeros(len(scene), 2), torch.tensor(BACKGROUND)
+    paints, light, background = list[PaintedView](), torch.zeros(len(scene), 2), torch.tensor(BACKGROUND)
     for path, camera in pictures.items():
         view = make_view(scene, recolored.region, camera.resize(*picture_size(path)), background)
         target = read_edit(scene, view.camera, view.image, path)
@@ -299,20 +301,20 @@ def sharpen(
     return paint_gdf(laid, scene, paints, recolored.name, recolored) if keeps else None
 
 
-def _error_beside(finished: Gaussians, paint: Paint) -> float:
+def _error_beside(finished: Gaussians, paint: PaintedView) -> float:
     """Sum of squared differences from the picture, but for what is painted sharp."""
     shown = render_view(finished, paint.camera, torch.tensor(BACKGROUND)).clamp(0.0, 1.0)
     return float((shown - paint.picture)[~paint.mask].square().sum())
 
 
-def _missed_paint(end: Gaussians, view: View, target: Tensor) -> tuple[Paint, Tensor]:
+def _missed_paint(end: Gaussians, view: View, target: Tensor) -> tuple[PaintedView, Tensor]:
     """What a recolor misses of a picture, and all that was painted. [H,W] bool"""
     changed = (target - view.image).abs().amax(dim=2) > _ROUNDED
     shown = render_view(end, view.camera, torch.tensor(BACKGROUND)).clamp(0.0, 1.0)
     rough = ndimage.gaussian_filter((target - shown).square().mean(dim=2).numpy(), _WINDOW) > _ALIKE**2
     sharp = changed & torch.from_numpy(ndimage.binary_dilation(rough, iterations=GROWN))
     drawn = torch.cat([target, torch.ones_like(target[..., :1])], dim=2) * sharp[..., None]
-    return Paint(view.camera, target, drawn), changed
+    return PaintedView(view.camera, target, drawn), changed
 
 
 @dataclass(frozen=True)
@@ -356,7 +358,7 @@ def train_decal(editor: DecalEditor, scene: Gaussians, name: str, log: RunLog | 
     return Painted(gdf, figures, [look.expected for look in looks], shown)
 
 
-def _pivot(scene: Gaussians, paint: Paint) -> Tensor:
+def _pivot(scene: Gaussians, paint: PaintedView) -> Tensor:
     """The point of the surface under the painted pixel that is nearest to the middle of all. [3]"""
     camera, pixels = paint.camera, paint.mask.nonzero()
     row, column = pixels[int((pixels - pixels.float().mean(dim=0)).norm(dim=1).argmin())].tolist()

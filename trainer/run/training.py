@@ -39,7 +39,7 @@ from trainer.optimize.losses import Losses, Objective, Perceptual, erode, loss_t
 from trainer.optimize.pgs import OnStep, ParameterSnapshot, PgsState, TargetStage, optimize, pgs_settings
 from trainer.optimize.retime import record, retime, select_recordings, straight_recordings
 from trainer.optimize.ties import surface_ties
-from trainer.options import MOST_STAGES, OptimizeOptions, TrainOptions, ViewOptions
+from trainer.options import MOST_STAGES, OptimizeOptions, TrainingViewOptions, TrainOptions
 from trainer.setup import Pictures, TrainingSetup, boxed_pictures, probe_views
 from trainer.store.progress import RunLog, release_memory
 from trainer.store.run_folder import LazySequence
@@ -212,7 +212,7 @@ def plan_colors(
     setup: TrainingSetup,
     edited: Pictures,
     between: Strengths | None,
-    options: ViewOptions,
+    options: TrainingViewOptions,
     log: RunLog,
     target_psnr: float | None = None,
 ) -> tuple[Solver, Model, Course]:

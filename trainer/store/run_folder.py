@@ -38,20 +38,20 @@ from progdf.threads import map_threads
 
 from .state import StateFolder
 
-NAME = "pictures.txt"
+PICTURES_LIST = "pictures.txt"
 
 
-def read_list(folder: Path) -> list[str]:
+def read_pictures_list(folder: Path) -> list[str]:
     """The lines of the folder's list."""
     try:
-        return (folder / NAME).read_text(encoding="utf-8").splitlines()
+        return (folder / PICTURES_LIST).read_text(encoding="utf-8").splitlines()
     except (OSError, ValueError):
         return []
 
 
 def add_pictures(folder: Path, paths: Iterable[Path]) -> None:
     """Put files in the folder on its list."""
-    lines = read_list(folder)
+    lines = read_pictures_list(folder)
     new = dict.fromkeys(path.relative_to(folder).as_posix() for path in paths)
     if added := [line for line in new if line not in set(lines)]:
         _write(folder, [*lines, *added])
@@ -60,13 +60,13 @@ def add_pictures(folder: Path, paths: Iterable[Path]) -> None:
 def remove_pictures_but_of(folder: Path, views: Collection[str]) -> None:
     """Delete the listed files that are not of one of these views; nothing behind a link is touched."""
     entries = []
-    for line in read_list(folder):
+    for line in read_pictures_list(folder):
         path = folder / line
         if _is_of_view(line, views) or not _is_inside(folder, line):
             entries.append(line)
         elif os.path.isfile(path):  # pathlib's raises where a name is too long
             path.unlink()
-    if read_list(folder) != entries:
+    if read_pictures_list(folder) != entries:
         _write(folder, entries)
 
 
@@ -90,7 +90,7 @@ def _is_inside(folder: Path, line: str) -> bool:
 
 
 def _write(folder: Path, lines: Iterable[str]) -> None:
-    atomic.write_file(folder / NAME, "".join(f"{line}\n" for line in lines))
+    atomic.write_file(folder / PICTURES_LIST, "".join(f"{line}\n" for line in lines))
 
 
 _SIGNATURE = "progdf train"

@@ -41,7 +41,7 @@ _LEAST_COVER = 0.25
 
 
 @dataclass(frozen=True)
-class Shown:
+class Visibility:
     """What each of V cameras shows of S members: how well [V,S] 0..1, and from where (unit vectors from the
     member to the eye) [V,S,3]; `reach` is the angle in radians at which another direction is another side."""
 
@@ -61,7 +61,7 @@ class ViewChoice:
     """The views an edit works on."""
 
     views: tuple[View, ...]  # in the order of the cameras' list
-    shown: Shown  # what each of them shows
+    shown: Visibility  # what each of them shows
     offered: int  # how many cameras there were
     unseeing: int  # how many of them do not see the region
     scant: int  # how many show less than a quarter of what the median view shows
@@ -101,7 +101,7 @@ def choose_views(
     most = _MOST_LOOKED_THROUGH * count
     if len(looked) > most:
         toward = _toward(places, [cameras[i] for i in looked])
-        looked = [looked[k] for k in _greedy(Shown(framed[looked].float(), toward, _reach(most)), most)]
+        looked = [looked[k] for k in _greedy(Visibility(framed[looked].float(), toward, _reach(most)), most)]
     cover, weights = _measure_visibility(scene, region, rows, [cameras[i] for i in looked])
     seeing = cover > 0
     if not bool(seeing.any()):
@@ -112,11 +112,11 @@ def choose_views(
     enough = cover >= _LEAST_COVER * cover[seeing].median()
     good = enough.nonzero()[:, 0].tolist()
     toward = _toward(places, [cameras[looked[k]] for k in good])
-    visibility = Shown(_relative_visibility(weights[good]), toward, _reach(count))
+    visibility = Visibility(_relative_visibility(weights[good]), toward, _reach(count))
     taken = _greedy(visibility, count) if len(good) > count else list(range(len(good)))
     return ViewChoice(
         tuple(map_threads(lambda k: make_view(scene, region, cameras[looked[good[k]]], background), taken)),
-        Shown(visibility.visible[taken], visibility.toward[taken], visibility.reach),
+        Visibility(visibility.visible[taken], visibility.toward[taken], visibility.reach),
         len(cameras),
         int((~framed.any(dim=1)).sum()) + int((~seeing).sum()),
         int((seeing & ~enough).sum()),
@@ -141,7 +141,7 @@ def split_views(choice: ViewChoice, held_out: int) -> tuple[list[View], list[Vie
     return [view for i, view in enumerate(views) if i not in chosen], [views[i] for i in chosen]
 
 
-def _greedy(visibility: Shown, count: int) -> list[int]:
+def _greedy(visibility: Visibility, count: int) -> list[int]:
     """The cameras that add most, one after the other, in the order of the list; ties by that order."""
     served = torch.zeros_like(visibility.visible)
     left = torch.ones(len(served), dtype=torch.bool)

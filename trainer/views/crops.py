@@ -26,9 +26,7 @@ from progdf.threads import map_threads, threads
 from .view import seen_colors
 
 _SUPPORT = 2 * 5.55
-"""Most squared Mahalanobis distance at which alpha ≥ 1/255: 2 ln 255, rounded up."""
-
-"""Pixels² that the rasterizer adds to a projected covariance."""
+"""Largest squared Mahalanobis distance at which alpha ≥ 1/255: 2 ln 255, rounded up."""
 
 
 def live_tiles(contributes: Tensor, box: Crop) -> Tensor:

@@ -108,14 +108,14 @@ _REQUESTS = {
 
 
 @dataclass(frozen=True)
-class Answer:
+class DialogResult:
     """The dialog as it is now, None once it is over, and the requests that come of it."""
 
     dialog: Dialog | None
     requests: tuple[str, ...] = ()
 
 
-def draw(dialog: Dialog, pressed: Sequence[str], ui: UiContext, area: Area) -> Answer:
+def draw(dialog: Dialog, pressed: Sequence[str], ui: UiContext, area: Area) -> DialogResult:
     """Draw the question and take its answer.
 
     Args:
@@ -133,7 +133,7 @@ def draw(dialog: Dialog, pressed: Sequence[str], ui: UiContext, area: Area) -> A
     imgui.push_style_var(imgui.StyleVar_.window_rounding, 6.0 * ui.scale)
     imgui.push_style_var(imgui.StyleVar_.window_padding, (16.0 * ui.scale, 14.0 * ui.scale))
     imgui.push_style_color(imgui.Col_.modal_window_dim_bg, (0.0, 0.0, 0.0, 0.45))
-    answer = Answer(dialog)
+    answer = DialogResult(dialog)
     if imgui.begin_popup_modal(_POPUP, None, flags_of_popup)[0]:
         context, at_button = imgui.get_current_context(), not imgui.get_io().want_text_input
         if context.nav_cursor_visible and at_button and context.nav_id not in (0, imgui.get_id("##path")):
@@ -147,14 +147,14 @@ def draw(dialog: Dialog, pressed: Sequence[str], ui: UiContext, area: Area) -> A
     return answer
 
 
-def _content(dialog: Dialog, pressed: Sequence[str], ui: UiContext, bottom: float) -> Answer:
+def _content(dialog: Dialog, pressed: Sequence[str], ui: UiContext, bottom: float) -> DialogResult:
     """`bottom`: where the question has to end, window pixels"""
     with imgui_ctx.push_font(ui.fonts.bold, 0.0):
         imgui.text(TITLES[dialog.kind])
     wrapped_text(_HINTS[dialog.kind].format(escape_text(Path(dialog.text).name)), PALETTE.dim)
     imgui.dummy((0.0, 2.0 * ui.scale))
     if "Escape" in pressed:
-        return Answer(None)
+        return DialogResult(None)
     if dialog.chosen and dialog.kind in _DELIVERS:
         dialog = replace(dialog, text=dialog.chosen, chosen="")  # there may be more to choose
     if dialog.chosen:
@@ -181,7 +181,7 @@ def _content(dialog: Dialog, pressed: Sequence[str], ui: UiContext, bottom: floa
         browse = imgui.button("…", (more, 0.0))
     tip("Browse with the system file dialog (Ctrl+B)")
     if browse or ("Ctrl+B" in pressed and not dialog.choosing):
-        return Answer(dialog, ("browse",))
+        return DialogResult(dialog, ("browse",))
     if dialog.notice:
         small(dialog.notice, PALETTE.warning)
     if dialog.error:
@@ -194,11 +194,11 @@ def _content(dialog: Dialog, pressed: Sequence[str], ui: UiContext, bottom: floa
     name, _ = _SUBMIT[dialog.kind]
     button = _buttons((name, "Cancel"), ui)
     if button == "Cancel":
-        return Answer(None)
+        return DialogResult(None)
     path = text.strip().strip("\"'")
     if path and (button == name or "Enter" in pressed):
         return _submit(dialog, path)
-    return Answer(dialog)
+    return DialogResult(dialog)
 
 
 def _is_new(kind: str) -> bool:
@@ -209,10 +209,10 @@ def _is_new(kind: str) -> bool:
     return bool(changed or imgui.is_window_appearing())
 
 
-def _submit(dialog: Dialog, path: str) -> Answer:
+def _submit(dialog: Dialog, path: str) -> DialogResult:
     """The file that was asked for; the question stays where the file may not serve."""
     stays = replace(dialog, text=path, chosen="") if dialog.kind in ("save", *_DELIVERS) else None
-    return Answer(stays, (_SUBMIT[dialog.kind][1].format(path=path, then=dialog.then),))
+    return DialogResult(stays, (_SUBMIT[dialog.kind][1].format(path=path, then=dialog.then),))
 
 
 def _pressed_button(choices: Sequence[_Button], pressed: Sequence[str], ui: UiContext) -> str:
@@ -222,15 +222,15 @@ def _pressed_button(choices: Sequence[_Button], pressed: Sequence[str], ui: UiCo
     return button or next(by_key, "")
 
 
-def _answer(dialog: Dialog, button: str) -> Answer:
+def _answer(dialog: Dialog, button: str) -> DialogResult:
     """What follows from a button of a question without a path field."""
     if not button:
-        return Answer(dialog)
+        return DialogResult(dialog)
     if button == "Rename…":
-        return Answer(Dialog("save", dialog.text, dialog.then))
+        return DialogResult(Dialog("save", dialog.text, dialog.then))
     requests = _REQUESTS.get((dialog.kind, button), ())
     stays = dialog if button == "Replace" else None  # until it is written
-    return Answer(stays, tuple(each.format(path=dialog.text, then=dialog.then) for each in requests))
+    return DialogResult(stays, tuple(each.format(path=dialog.text, then=dialog.then) for each in requests))
 
 
 def _log(path: Path, bottom: float, ui: UiContext) -> None:

@@ -116,7 +116,7 @@ class Named(Protocol):
 
 @dataclass(frozen=True)
 class OpenStack:
-    """What was opened, and how it shall drawing."""
+    """The opened scene and edits, and how to draw them."""
 
     document: Document
     view: ViewState  # of a scene without the camera, which is for the command to choose

@@ -34,7 +34,7 @@ SHOWN_SH = 15
 
 
 @dataclass(frozen=True)
-class Place:
+class TextureSlot:
     """Where an attribute lies: the texture, its first component there, and how many."""
 
     texture: str
@@ -43,12 +43,12 @@ class Place:
 
 
 PLACES = {
-    "means": Place("mean_logit", 0, 3),
-    "logit_opacities": Place("mean_logit", 3, 1),
-    "log_scales": Place("log_scale", 0, 3),
-    "quats": Place("quat", 0, 4),
-    "sh0": Place("sh0", 0, 3),
-    "shN": Place("shN", 0, 3),
+    "means": TextureSlot("mean_logit", 0, 3),
+    "logit_opacities": TextureSlot("mean_logit", 3, 1),
+    "log_scales": TextureSlot("log_scale", 0, 3),
+    "quats": TextureSlot("quat", 0, 4),
+    "sh0": TextureSlot("sh0", 0, 3),
+    "shN": TextureSlot("shN", 0, 3),
 }
 """Attribute -> its place in each of its texels."""
 

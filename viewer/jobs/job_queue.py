@@ -115,7 +115,7 @@ class Delivery:
 
 
 @dataclass(frozen=True)
-class Job:
+class QueuedTask:
     """A task in the queue, as its card shows it."""
 
     number: int  # what requests call it by
@@ -147,7 +147,7 @@ class JobQueue:
     """Does what is asked for. `close` it: what runs then is stopped, and training can be resumed."""
 
     def __init__(self) -> None:
-        self.jobs: tuple[Job, ...] = ()
+        self.jobs: tuple[QueuedTask, ...] = ()
         self._numbers = itertools.count(1)
         self._children: dict[int, Child] = {}
         self._began: dict[int, float] = {}
@@ -160,11 +160,11 @@ class JobQueue:
         """For files that commands read and write; gone with the window."""
         return Path(self._folder.name)
 
-    def busy(self, kind: type = object) -> Job | None:
+    def busy(self, kind: type = object) -> QueuedTask | None:
         """The first job of this kind of task that runs, or waits to."""
         return next((job for job in self.jobs if job.busy and isinstance(job.task, kind)), None)
 
-    def job(self, number: int) -> Job:
+    def job(self, number: int) -> QueuedTask:
         """The job of that number.
 
         Raises:
@@ -181,7 +181,7 @@ class JobQueue:
         Raises:
             ProgdfError: its folder cannot be written to.
         """
-        job = Job(next(self._numbers), task)
+        job = QueuedTask(next(self._numbers), task)
         self._lock(job)
         try:
             task.save()
@@ -194,7 +194,9 @@ class JobQueue:
     def add_stopped(self, order: EditOrder) -> None:
         """Show a run that was stopped another day, unless it is there, or another process has it."""
         if not order.is_locked and all(job.task.out != order.out for job in self.jobs):
-            job = Job(next(self._numbers), order, "stopped", order.read_progress(Progress()), resumes=True)
+            job = QueuedTask(
+                next(self._numbers), order, "stopped", order.read_progress(Progress()), resumes=True
+            )
             self.jobs = (*self.jobs, job)
 
     def resume(self, number: int) -> None:
@@ -243,9 +245,9 @@ class JobQueue:
         """Take a job that has ended off the list; its files stay."""
         self.jobs = tuple(job for job in self.jobs if job.number != number)
 
-    def poll(self) -> list[Job]:
+    def poll(self) -> list[QueuedTask]:
         """Look at the jobs and start those whose turn it is; those that have just ended, well or not."""
-        ended: list[Job | None] = []
+        ended: list[QueuedTask | None] = []
         looks = time.monotonic() >= self._look_at
         if looks:
             self._look_at = time.monotonic() + LOOK_S
@@ -280,14 +282,14 @@ class JobQueue:
             self._unlock(job)
         self._folder.cleanup()
 
-    def _follow(self, job: Job) -> None:
+    def _follow(self, job: QueuedTask) -> None:
         progress, now = job.task.read_progress(job.progress), time.monotonic()
         if progress.share == job.began_at:  # it is still starting, which takes as long as it takes
             self._began[job.number] = now
         seconds = now - self._began[job.number]
         self._change(replace(job, progress=progress, seconds=seconds))
 
-    def _start(self, job: Job) -> Job | None:
+    def _start(self, job: QueuedTask) -> QueuedTask | None:
         """Start a job; what became of it where that cannot be."""
         try:
             self._children[job.number] = Child(job.task.arguments(job.resumes), job.task.log)
@@ -300,7 +302,7 @@ class JobQueue:
         self._change(replace(job, status="running", progress=progress, began_at=progress.share, seconds=0.0))
         return None
 
-    def _end(self, job: Job, child: Child, status: int) -> Job:
+    def _end(self, job: QueuedTask, child: Child, status: int) -> QueuedTask:
         self._children.pop(job.number).close()
         begun = job.task.is_begun
         if begun or job.status != "stopping":  # else it is discarded first
@@ -317,22 +319,22 @@ class JobQueue:
         error = without_commands(child.error()) or f"the command ended with status {status}"
         return self._change(replace(job, status="failed", error=error, resumes=begun))
 
-    def _change(self, job: Job) -> Job:
+    def _change(self, job: QueuedTask) -> QueuedTask:
         self.jobs = tuple(job if old.number == job.number else old for old in self.jobs)
         return job
 
-    def _drop(self, job: Job) -> None:
+    def _drop(self, job: QueuedTask) -> None:
         """Raises ProgdfError where it cannot be removed."""
         job.task.discard()
         self._unlock(job)
         self.dismiss(job.number)
 
-    def _lock(self, job: Job) -> None:
+    def _lock(self, job: QueuedTask) -> None:
         """Keep other windows from the run. Raises ProgdfError where one has it."""
         with ExitStack() as locks:
             locks.enter_context(job.task.lock())
             self._locks[job.number] = locks.pop_all()
 
-    def _unlock(self, job: Job) -> None:
+    def _unlock(self, job: QueuedTask) -> None:
         if locks := self._locks.pop(job.number, None):
             locks.close()

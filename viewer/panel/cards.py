@@ -71,7 +71,7 @@ def draw_search(work: Workspace, ui: UiContext) -> str:
 
 
 def selection_height(chosen: Sequence[int], ui: UiContext) -> float:
-    """Of `selection`, window pixels; 0 where it is not shown."""
+    """Return the height of `draw_selection` in window pixels; 0 if it is hidden."""
     if len(chosen) < 2:
         return 0.0
     spacing = imgui.get_style().item_spacing.y

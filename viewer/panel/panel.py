@@ -19,7 +19,7 @@ from viewer.ui.context import BEHIND, FIXED, PALETTE, SMALL_PX, Icon, UiContext,
 
 from . import card, cards, new_edit_form, snapshot_cards, training_cards
 
-NAME = "main menu"
+MENU_ID = "main menu"
 MOST_PX = 360.0
 _MENU = ("", "save", "save_as", "take_view", "hide_strays", "", "palette", "help", "about", "quit")
 _MOST_RECENT = 6
@@ -33,7 +33,7 @@ def _menu_button(recent: Sequence[Path], side: float, ui: UiContext, actions: li
         (widgets.elide(escape_text(path.name), room), f"open_file:{path}", escape_text(str(path)))
         for path in recent[:_MOST_RECENT]
     ]
-    widgets.more_button(NAME, ("open", *files, *_MENU), ui, actions, Icon.BARS, side)
+    widgets.more_button(MENU_ID, ("open", *files, *_MENU), ui, actions, Icon.BARS, side)
     widgets.tip("Menu")
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from imgui_bundle import imgui, imgui_ctx
 
 from progdf.terminal import format_duration
-from viewer.jobs.job_queue import Delivery, Job
+from viewer.jobs.job_queue import Delivery, QueuedTask
 from viewer.jobs.training import EditOrder
 from viewer.ui.context import PALETTE, SMALL_PX, Icon, Rgba, UiContext, u32
 from viewer.ui.widgets import card, elide, menu_items, right_edge, small, tip, wrapped_text
@@ -18,7 +18,7 @@ _ITEMS = (("Show log…", "run_log", ""), ("Discard…", "ask_discard", ""))
 _UNWRITTEN = "Nothing is written"
 
 
-def height(jobs: Sequence[Job], ui: UiContext) -> float:
+def height(jobs: Sequence[QueuedTask], ui: UiContext) -> float:
     """Of the strip and, where it is open, the cards over it; window pixels."""
     if not _visible_jobs(jobs):
         return 0.0
@@ -27,7 +27,7 @@ def height(jobs: Sequence[Job], ui: UiContext) -> float:
     return (STRIP_PX + 1.0) * ui.scale + imgui.get_style().item_spacing.y * (1 + bool(cards)) + cards
 
 
-def draw(jobs: Sequence[Job], ui: UiContext, actions: list[str]) -> None:
+def draw(jobs: Sequence[QueuedTask], ui: UiContext, actions: list[str]) -> None:
     """The strip, and over it one card a job while it is open; a failure opens it."""
     listed, storage = _visible_jobs(jobs), imgui.get_state_storage()
     if not listed:
@@ -59,16 +59,16 @@ def draw(jobs: Sequence[Job], ui: UiContext, actions: list[str]) -> None:
 _OPEN, _TALL = "jobs are open", "height of the jobs"
 
 
-def _visible_jobs(jobs: Sequence[Job]) -> list[Job]:
+def _visible_jobs(jobs: Sequence[QueuedTask]) -> list[QueuedTask]:
     """Those that have a card: a trained edit is a layer, and needs none."""
     return [job for job in jobs if job.status != "done" or job.warning or isinstance(job.task, Delivery)]
 
 
-def _is_failed(job: Job) -> bool:
+def _is_failed(job: QueuedTask) -> bool:
     return job.status == "failed" or bool(job.warning)
 
 
-def _strip(jobs: Sequence[Job], is_open: bool, ui: UiContext) -> bool:
+def _strip(jobs: Sequence[QueuedTask], is_open: bool, ui: UiContext) -> bool:
     """One line: the job that matters most, and how many more there are; True when it was pressed."""
     order = ("failed", "running", "stopping", "done")
     job = min(jobs, key=lambda job: order.index(job.status) if job.status in order else len(order))
@@ -92,7 +92,7 @@ def _strip(jobs: Sequence[Job], is_open: bool, ui: UiContext) -> bool:
     return bool(pressed)
 
 
-def _card(job: Job, ui: UiContext) -> list[str]:
+def _card(job: QueuedTask, ui: UiContext) -> list[str]:
     """Name and status, how far it is, what it does, buttons; and a menu of what cannot be undone."""
     task, failed, word = job.task, _is_failed(job), _status(job)
     with card("card", PALETTE.card, ui):
@@ -115,7 +115,7 @@ def _card(job: Job, ui: UiContext) -> list[str]:
         return [f"{action}:{job.number}" for action in actions]
 
 
-def _status(job: Job) -> str:
+def _status(job: QueuedTask) -> str:
     if job.status == "running":
         return f"{100 * job.progress.share:.0f} %" if job.progress.share else ""
     return job.status.capitalize()
@@ -132,7 +132,7 @@ def _bar(share: float, color: Rgba, ui: UiContext) -> None:
             imgui.get_window_draw_list().add_rect_filled((x, y), end, u32(ink), tall / 2)
 
 
-def _foot(job: Job, right: float, menu: bool, ui: UiContext) -> list[str]:
+def _foot(job: QueuedTask, right: float, menu: bool, ui: UiContext) -> list[str]:
     """What it does, or why it failed; at the right its buttons."""
     offered = _BUTTONS.get((job.status, isinstance(job.task, EditOrder)), ())
     buttons = (*offered, *[(Icon.MENU, _MENU, "Log, discard (right-click)")] * menu)
@@ -159,7 +159,7 @@ def _foot(job: Job, right: float, menu: bool, ui: UiContext) -> list[str]:
     return actions
 
 
-def _status_text(job: Job) -> str:
+def _status_text(job: QueuedTask) -> str:
     progress = job.progress
     match job.status:
         case "running":

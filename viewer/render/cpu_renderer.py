@@ -22,7 +22,7 @@ from progdf.threads import stopped_by
 from viewer.camera.view_camera import Vec3
 from viewer.gl.present import ScreenCopy
 
-from .dynamic_resolution import LiveScene, Shown
+from .dynamic_resolution import DrawnView, LiveScene
 from .gl_renderer import Image, Size, require_picture
 from .ground_grid import CLEAR, Lines
 
@@ -37,13 +37,13 @@ class _Kept:
 
     image: Image
     through: Image
-    shown: Shown
+    shown: DrawnView
 
 
 class _Begun:
     """A picture that is being made by another thread, band by band."""
 
-    def __init__(self, gaussians: ActivatedGaussians, shown: Shown) -> None:
+    def __init__(self, gaussians: ActivatedGaussians, shown: DrawnView) -> None:
         size, self.stop = (shown.camera.height, shown.camera.width), threading.Event()
         self.picture = _Kept(np.empty((*size, 3), np.float32), np.empty(size, np.float32), shown)
         self.bands: list[tuple[int, int]] = []  # that are done: first row, and one past the last
@@ -107,7 +107,7 @@ class CpuRenderer:
         """Make the picture; `order` is not used, the rasterizer sorts by itself. With more `pixels` than one
         it has fewer Gaussians."""
         begun, self.begun_ms, picture = self._begun, 0.0, None
-        shown = Shown(camera, background, pixels)
+        shown = DrawnView(camera, background, pixels)
         if pixels > 1:
             picture = self._scene.draw_fewer(lambda fewer: _draw(fewer, shown), camera, pixels)
         elif begun is not None and begun.picture.shown == shown:
@@ -121,7 +121,7 @@ class CpuRenderer:
 
     def prepare(self, camera: Camera, background: Vec3) -> bool:
         """See `GlRenderer.prepare`."""
-        shown, kept = Shown(camera, background), None if self._changed else self._kept
+        shown, kept = DrawnView(camera, background), None if self._changed else self._kept
         if kept is not None and kept.shown == shown:
             return True
         if self._begun is None or self._begun.picture.shown != shown:
@@ -178,7 +178,7 @@ class CpuRenderer:
             return False
         return self._coarse(begun.picture.shown) is not None
 
-    def _coarse(self, full: Shown) -> _Kept | None:
+    def _coarse(self, full: DrawnView) -> _Kept | None:
         """The last picture, if that is `full` in fewer pixels."""
         kept = self._kept
         return None if kept is None or self._changed or not kept.shown.is_coarse(full) else kept
@@ -190,7 +190,7 @@ class CpuRenderer:
             self._copy.release()
 
 
-def _draw(gaussians: ActivatedGaussians, shown: Shown, crop: Crop | None = None) -> tuple[Image, Image]:
+def _draw(gaussians: ActivatedGaussians, shown: DrawnView, crop: Crop | None = None) -> tuple[Image, Image]:
     """The picture and what shines through it."""
     with torch.no_grad():
         rendered = render(gaussians, shown.camera, shown.background, crop=crop)

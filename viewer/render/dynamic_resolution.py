@@ -157,7 +157,7 @@ class FrameTimings:
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
+class DrawnView:
     """What a picture shows of a scene."""
 
     camera: Camera
@@ -165,13 +165,13 @@ class Shown:
     pixels: int = 1  # of the picture in full that one of its pixels covers, each way
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Shown) and self.pixels == other.pixels and self._has(other)
+        return isinstance(other, DrawnView) and self.pixels == other.pixels and self._has(other)
 
-    def is_coarse(self, full: Shown) -> bool:
+    def is_coarse(self, full: DrawnView) -> bool:
         """Whether it is `full`, in fewer pixels."""
         return self.pixels > full.pixels and self._has(full)
 
-    def _has(self, full: Shown) -> bool:
+    def _has(self, full: DrawnView) -> bool:
         mine, pixels = self.camera.resize(full.camera.width, full.camera.height), self.pixels // full.pixels
         return (
             (self.background, self.camera.width, self.camera.height)

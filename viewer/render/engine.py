@@ -27,7 +27,7 @@ from viewer.state.paint import layer_of
 from viewer.state.view_state import ViewState
 
 from .cpu_renderer import CpuRenderer
-from .dynamic_resolution import FrameTimings, Shown, drawn_size
+from .dynamic_resolution import DrawnView, FrameTimings, drawn_size
 from .gl_renderer import GlRenderer, Image, back_to_front, is_software
 from .ground_grid import GroundPlane, Lines, grid_lines, ground_plane
 from .highlight import Highlight, highlight_colors
@@ -48,7 +48,7 @@ class _Picture:
     """What decides the picture."""
 
     edits: _Edits
-    shown: Shown
+    shown: DrawnView
     highlight: Highlight | None
 
 
@@ -102,7 +102,7 @@ class ViewEngine:
 
     def needs_draw(self, view: ViewState, size: tuple[int, int], camera: Camera | None = None) -> bool:
         """Whether `view` at `size` (width, height in pixels) is another picture than the last one."""
-        shown = Shown(camera or to_camera(view.camera, *size), view.background)
+        shown = DrawnView(camera or to_camera(view.camera, *size), view.background)
         return _Picture(_edits(view), shown, _with_hidden(self.highlight, view)) != self._picture
 
     def draw(
@@ -187,7 +187,7 @@ class ViewEngine:
         up = view.camera.up
         if self._ground is None or self._ground[0] != up:
             self._ground = up, ground_plane(self.scene, up)
-        seen = up, Shown(camera, view.background)
+        seen = up, DrawnView(camera, view.background)
         if self._grid is None or self._grid[0] != seen:
             self._grid = seen, grid_lines(self._ground[1], camera, view.background)
         return self._grid[1]
@@ -197,7 +197,7 @@ class ViewEngine:
     ) -> FrameTimings:
         """Do what lies between the last picture and this one."""
         highlight = _with_hidden(highlight, view)
-        target = _Picture(_edits(view), Shown(camera, view.background), highlight)
+        target = _Picture(_edits(view), DrawnView(camera, view.background), highlight)
         if target == self._picture:
             return FrameTimings(drawn=self.timings.drawn)
         compose_ms, upload_ms, changed = self._compose(target.edits)

@@ -20,7 +20,7 @@ from viewer.camera.view_camera import Vec3
 from viewer.gl.present import Presenter
 from viewer.gl.splats import GridPass, SplatRenderer
 
-from .dynamic_resolution import LiveScene, Shown
+from .dynamic_resolution import DrawnView, LiveScene
 from .ground_grid import Lines
 
 Image = NDArray[np.float32]
@@ -50,7 +50,7 @@ class GlRenderer:
         self._moving: tuple[LiveScene, SplatRenderer] | None = None  # what is drawn while something moves
         self._presenter = Presenter(ctx)
         self._picture: moderngl.Texture | None = None
-        self._shown: Shown | None = None  # by it, unless Gaussians have changed since
+        self._shown: DrawnView | None = None  # by it, unless Gaussians have changed since
         self._grid: GridPass | None = None
 
     def upload(self, scene: Gaussians) -> None:
@@ -87,7 +87,7 @@ class GlRenderer:
             order: farthest first, from `back_to_front`
             pixels: of the picture at rest that one of this one stands for, each way
         """
-        last, self._shown = self._shown, Shown(camera, background, pixels)
+        last, self._shown = self._shown, DrawnView(camera, background, pixels)
         coarse = self.pixels() if last is not None and last.is_coarse(self._shown) else None
         self._picture = self._draw_fewer(camera, background, pixels) if pixels > 1 else None
         if self._picture is None:

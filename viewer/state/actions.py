@@ -165,7 +165,7 @@ def _home(workspace: Workspace, facts: SceneFacts, aspect: float) -> Workspace:
 
 
 def _look(workspace: Workspace, name: str) -> Workspace:
-    """From a side, or an end of an axis, see `named_views`."""
+    """Look from a named side or along an axis, see `viewer.camera.views.NAMED_VIEWS`."""
     return with_camera(workspace, look_at_view(workspace.view.camera, name))
 
 

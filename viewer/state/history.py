@@ -30,7 +30,7 @@ class Edit:
 
 
 @dataclass(frozen=True)
-class Look:
+class ViewSettings:
     """How the scene is looked at, as a person sets it."""
 
     up: Vec3 = ViewCamera.up
@@ -48,7 +48,7 @@ class HistoryEntry:
     """What one entry brings back."""
 
     edit: Edit  # the part of the state
-    look: Look = Look()  # as a person set it last
+    look: ViewSettings = ViewSettings()  # as a person set it last
     snapshots: tuple[Any, ...] = ()  # those there were, see snapshots.py, which is built on this module
 
 
@@ -60,7 +60,7 @@ class History:
     present: HistoryEntry
     past: tuple[HistoryEntry, ...] = ()
     future: tuple[HistoryEntry, ...] = ()
-    seen: Look = Look()
+    seen: ViewSettings = ViewSettings()
 
 
 def edit_of(state: ViewState) -> Edit:
@@ -71,8 +71,10 @@ def _edit_values(part: ViewState | Edit) -> dict[str, Any]:
     return {field.name: getattr(part, field.name) for field in fields(Edit)}
 
 
-def look_of(state: ViewState) -> Look:
-    return Look(state.camera.up, state.camera.fov_y, **{name: getattr(state, name) for name in _OF_VIEW})
+def look_of(state: ViewState) -> ViewSettings:
+    return ViewSettings(
+        state.camera.up, state.camera.fov_y, **{name: getattr(state, name) for name in _OF_VIEW}
+    )
 
 
 def begin(state: ViewState, snapshots: tuple[Any, ...] = ()) -> History:
@@ -148,10 +150,12 @@ def go_to(history: History, index: int) -> History:
     return History(steps[index], steps[:index], steps[index + 1 :], look)
 
 
-def _take_changes(look: Look, before: Look, after: Look) -> Look:
+def _take_changes(look: ViewSettings, before: ViewSettings, after: ViewSettings) -> ViewSettings:
     """The look with what is different after than before."""
     names = [
-        field.name for field in fields(Look) if getattr(before, field.name) != getattr(after, field.name)
+        field.name
+        for field in fields(ViewSettings)
+        if getattr(before, field.name) != getattr(after, field.name)
     ]
     changes: dict[str, Any] = {name: getattr(after, name) for name in names}
     return replace(look, **changes) if changes else look
@@ -199,7 +203,7 @@ _OF_VIEW = {
     "safe_frame": "safe frame",
     "dynamic_resolution": "dynamic resolution",
 }
-"""Of `Look`, what stands in the view itself."""
+"""Of `ViewSettings`, what stands in the view itself."""
 _OF_LOOKS = {"up": "up axis", "fov_y": "field of view", **_OF_VIEW}
 
 

@@ -13,7 +13,7 @@ from .layers import LONGEST_NAME
 from .selection import SelectionState
 from .view_state import SnapshotPair, Timeline, ViewState
 
-MOST = 200
+MAX_SNAPSHOTS = 200
 ORIGINAL = "original"
 """The name of the first."""
 
@@ -37,10 +37,10 @@ class SnapshotSides:
 
 
 def take(snapshots: Sequence[SliderSnapshot], view: ViewState) -> tuple[SliderSnapshot, ...]:
-    """One more, of `view`; as they were where the last one is the same, or there are `MOST`."""
+    """One more, of `view`; as they were where the last one is the same, or there are `MAX_SNAPSHOTS`."""
     new = SliderSnapshot(_name(snapshots), _sliders(view), view.camera)
     same = snapshots and replace(snapshots[-1], name=new.name) == new
-    return tuple(snapshots) if same or len(snapshots) >= MOST else (*snapshots, new)
+    return tuple(snapshots) if same or len(snapshots) >= MAX_SNAPSHOTS else (*snapshots, new)
 
 
 def remove(snapshots: Sequence[SliderSnapshot], index: int) -> tuple[SliderSnapshot, ...]:
@@ -52,7 +52,7 @@ def rename(snapshots: Sequence[SliderSnapshot], index: int, name: str) -> tuple[
     """One under another name, on one line, with a number where it is taken; no name changes nothing."""
     name = " ".join(name.split())[:LONGEST_NAME] or snapshots[index].name
     taken = {ORIGINAL, *(other.name for i, other in enumerate(snapshots) if i != index)}
-    free = next(n for n in (name, *(f"{name}-{i}" for i in range(2, MOST + 3))) if n not in taken)
+    free = next(n for n in (name, *(f"{name}-{i}" for i in range(2, MAX_SNAPSHOTS + 3))) if n not in taken)
     return (*snapshots[:index], replace(snapshots[index], name=free), *snapshots[index + 1 :])
 
 
@@ -108,4 +108,4 @@ def _sliders(view: ViewState) -> history.Edit:
 
 def _name(snapshots: Sequence[SliderSnapshot]) -> str:
     taken_names = {snapshot.name for snapshot in snapshots}
-    return next(str(n) for n in range(1, MOST + 2) if str(n) not in taken_names)
+    return next(str(n) for n in range(1, MAX_SNAPSHOTS + 2) if str(n) not in taken_names)

@@ -1,7 +1,7 @@
-"""What the window knows besides the picture's state, and every action on it as a pure function.
+"""State of the window besides the drawn view, as frozen data, with the functions that change single parts of it.
 
-Keys, panel buttons and tests all go through `perform`; what only the window itself can do (write a file, go
-full screen) is left in `requests` for it.
+`viewer.state.actions.perform` applies actions. Work that only the window can do (write a file, go full screen) is
+appended to `Workspace.requests`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from progdf.scene.selection import Mask
 from progdf.terminal import escape_text
 from viewer.camera.view_camera import Bounds, Fit, ViewCamera, keep_camera
 from viewer.camera.views import Glide, glide_on
-from viewer.jobs.job_queue import DeliverOptions, Job
+from viewer.jobs.job_queue import DeliverOptions, QueuedTask
 from viewer.jobs.training import NewEdit
 
 from . import history, timeline
@@ -149,7 +149,7 @@ class Workspace:
     form_open: bool = False  # whether it is shown
     form_opening: bool = False  # it was opened and has no keyboard yet
     # what is being trained, exported and rendered, or waits for that, as the window last looked
-    jobs: tuple[Job, ...] = ()
+    jobs: tuple[QueuedTask, ...] = ()
     before: bool = False  # the original is shown, until its key is pressed again or a slider moves
     glide: Glide | None = None  # the camera on its way to a view that was asked for, or None
     layout: Layout = Layout()  # of the window

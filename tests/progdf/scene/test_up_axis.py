@@ -23,7 +23,7 @@ from progdf.scene.up_axis import AXES, axis_direction, direction_name, find_up, 
 from tests.helpers.demo_scenes import bear, room
 from tests.helpers.scenes import ball, high_chair, random_gaussians, turned, upright_turn
 from tests.helpers.stacks import bear_stack
-from trainer.options import ViewOptions
+from trainer.options import TrainingViewOptions
 from trainer.setup import make_training_setup
 from viewer.camera.view_camera import first_camera
 from viewer.commands.options import RenderOptions, open_stack
@@ -99,7 +99,7 @@ def test_a_training_from_a_picture_has_the_up_axis_of_the_window_that_it_is_from
     camera = orbit_rig(scene, 1, 32, 32)[0]
     image = Image.new("RGB", (32, 32))
     image.save(tmp_path / "a.png", pnginfo=camera_chunk(camera, up=(0.0, 0.0, 1.0)))
-    settings = ViewOptions(pictures=(tmp_path / "a.png",))
+    settings = TrainingViewOptions(pictures=(tmp_path / "a.png",))
     setup = make_training_setup(settings, scene, parse_region("all", scene))
     assert setup.up is not None
     assert setup.up.name == "+z"

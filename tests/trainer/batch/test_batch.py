@@ -19,8 +19,8 @@ from progdf.__main__ import main
 from progdf.errors import ProgdfError
 from tests.helpers.trained import quick_options, train, write_bear
 from trainer import cli
-from trainer.batch.jobs import Job, read_catalogue
-from trainer.batch.report import Row, read_rows
+from trainer.batch.jobs import BatchJob, read_catalogue
+from trainer.batch.report import JobRow, read_rows
 from trainer.batch.run import LocalPool, RayPool, Task, run, run_jobs, train_task
 
 BEARS = """
@@ -83,7 +83,7 @@ def kill_workers() -> None:
                 os.kill(pid, signal.SIGKILL)
 
 
-def ends(tasks: list[Task], pool: LocalPool | RayPool, **more: object) -> dict[str, Row]:
+def ends(tasks: list[Task], pool: LocalPool | RayPool, **more: object) -> dict[str, JobRow]:
     return {row.job: row for row in run_jobs(tasks, pool, **more)}  # type: ignore[arg-type]
 
 
@@ -166,7 +166,7 @@ def test_a_job_that_always_dies_fails_and_the_others_are_done(tmp_path: Path) ->
     write_bear(tmp_path)
     pool = LocalPool()
     try:
-        task = train_task(Job("one", quick_options(tmp_path)))
+        task = train_task(BatchJob("one", quick_options(tmp_path)))
         (outcome,) = run_jobs([task], pool, tick=lambda running: kill_workers())
     finally:
         pool.stop()
@@ -207,8 +207,8 @@ def test_a_row_is_read_back_as_it_was_written(tmp_path: Path) -> None:
     from trainer.batch.report import write_page, write_rows
 
     rows = [
-        Row('a,"b"/c', "failed", "it; <script>alert(1)</script>", attempts=4),
-        Row("d/e", "done", psnr_end=30.25),
+        JobRow('a,"b"/c', "failed", "it; <script>alert(1)</script>", attempts=4),
+        JobRow("d/e", "done", psnr_end=30.25),
     ]
     write_rows(tmp_path, rows)
     assert list(read_rows(tmp_path).values()) == rows
@@ -290,7 +290,7 @@ def test_on_a_cluster_a_lost_machine_s_job_goes_on_elsewhere(
 def test_programs_train_jobs_side_by_side(tmp_path: Path) -> None:
     write_bear(tmp_path)
     sizes: dict[str, object] = {"views": 4, "image_size": 48, "steps": 24, "stages": 2}
-    jobs = [Job(part, quick_options(tmp_path, part, part, **sizes)) for part in ("scarf", "ears")]
+    jobs = [BatchJob(part, quick_options(tmp_path, part, part, **sizes)) for part in ("scarf", "ears")]
     assert {(row.job, row.status) for row in run(jobs, workers=2)} == {
         ("scarf", "done"),
         ("ears", "done"),

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from progdf.errors import ProgdfError
-from trainer.batch.jobs import Job, estimate_cost, read_catalogue
+from trainer.batch.jobs import BatchJob, estimate_cost, read_catalogue
 from trainer.cli import train_options
 from trainer.resolve import resolve
 
@@ -38,7 +38,7 @@ views = 20
 """
 
 
-def read(folder: Path, text: str) -> tuple[list[Job], list[str]]:
+def read(folder: Path, text: str) -> tuple[list[BatchJob], list[str]]:
     (folder / "catalogue.toml").write_text(text, encoding="utf-8")
     return read_catalogue(folder / "catalogue.toml", folder / "runs")
 

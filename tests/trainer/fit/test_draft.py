@@ -18,7 +18,7 @@ from tests.helpers.trained import WHITE, masked_psnr, small
 from trainer.editors import make_editor
 from trainer.fit import draft
 from trainer.fit.draft import DraftViews, draft_grade, draft_views
-from trainer.options import EditorOptions, ViewOptions
+from trainer.options import EditorOptions, TrainingViewOptions
 from trainer.setup import edit_views
 from trainer.store.run_folder import RunFolder
 from trainer.views.view import render_view
@@ -27,7 +27,7 @@ from trainer.views.view import render_view
 @cache
 def views() -> DraftViews:
     case = small("body")
-    found = draft_views(ViewOptions(), case.scene, case.region)
+    found = draft_views(TrainingViewOptions(), case.scene, case.region)
     assert found is not None
     return found
 
@@ -84,13 +84,13 @@ def test_a_grade_by_hand_is_live_however_little_a_map_carries_it(monkeypatch: py
 def test_a_region_that_no_view_shows_has_no_draft() -> None:
     case = small("body")
     hidden = replace(case.scene, logit_opacities=torch.full_like(case.scene.logit_opacities, -30.0))
-    assert draft_views(ViewOptions(), hidden, case.region) is None
+    assert draft_views(TrainingViewOptions(), hidden, case.region) is None
 
 
 def test_a_scene_to_stand_inside_has_no_draft_without_cameras() -> None:
     scene = room(SMALLEST_ROOM).gaussians
     region = from_mask("all", torch.ones(len(scene), dtype=torch.bool))
-    assert draft_views(ViewOptions(), scene, region) is None
+    assert draft_views(TrainingViewOptions(), scene, region) is None
 
 
 def test_no_further_strengths_are_no_pictures(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from progdf.scene.regions import parse_region
 from tests.helpers.ply_files import moved_columns, write
 from tests.helpers.trained import quick_options, train
 from trainer.editors.pictures import picture_cameras
-from trainer.options import RegionOptions, ViewOptions, WriteViewsOptions, with_values
+from trainer.options import RegionOptions, TrainingViewOptions, WriteViewsOptions, with_values
 from trainer.regions import command
 from trainer.regions.from_pictures import RegionRequest, region_kinds
 from trainer.run.record import render_run_views, reopen_run
@@ -84,7 +84,7 @@ def test_masks_over_views_of_a_far_scene_find_their_region(folder: Path, runs: d
         mask = (picture.mean(dim=2) < 0.5).float()[..., None].expand(-1, -1, 3)
         to_picture(mask).save(folder / "drawn" / path.name)
     settings = RegionRequest(
-        RegionOptions("masks"), ViewOptions(scene=folder / "far.ply"), lambda: folder, True
+        RegionOptions("masks"), TrainingViewOptions(scene=folder / "far.ply"), lambda: folder, True
     )
     found = parse_region(f"masks:{folder / 'drawn'}", scene, kinds=region_kinds(settings))
     assert 0 < len(found) < len(scene)
@@ -101,6 +101,8 @@ def test_a_changed_picture_of_a_far_scene_tells_what_was_changed(
     to_picture(changed).save(path, pnginfo=camera_chunk(view.camera, origin=scene.origin))
     (camera,) = picture_cameras([path], (), scene.origin)
     assert torch.allclose(camera.viewmat, view.camera.viewmat, atol=1e-6)
-    settings = RegionRequest(RegionOptions("changed"), ViewOptions(pictures=(path,)), lambda: folder, True)
+    settings = RegionRequest(
+        RegionOptions("changed"), TrainingViewOptions(pictures=(path,)), lambda: folder, True
+    )
     found = parse_region("changed", scene, kinds=region_kinds(settings))
     assert 0 < len(found) < len(scene) // 2

@@ -21,7 +21,7 @@ from progdf.scene.regions import parse_region
 from tests.helpers.trained import quick_options, train
 from trainer.editors import make_editor
 from trainer.evaluate.command import evaluate
-from trainer.options import EditorOptions, EvaluateOptions, ViewOptions, with_values
+from trainer.options import EditorOptions, EvaluateOptions, TrainingViewOptions, with_values
 from trainer.report.measures import PaintTaken, measure_paint
 from trainer.run.run import RunResult
 from trainer.setup import make_training_setup
@@ -34,7 +34,7 @@ SPEC = "recolor:#3060d0"
 def views(folder: Path) -> tuple[View, ...]:
     """Views of the bear's region, the first of which is the picture's."""
     scene, region = bear(folder)
-    setup = make_training_setup(ViewOptions(views=12, image_size=96), scene, region)
+    setup = make_training_setup(TrainingViewOptions(views=12, image_size=96), scene, region)
     return tuple(setup.views)
 
 
@@ -95,7 +95,7 @@ def test_painting_a_thing_away_is_said_to_remove_nothing(
     folder: Path, background: tuple[float, float, float], all_of_it: bool
 ) -> None:
     scene, region = bear(folder)
-    setup = make_training_setup(ViewOptions(views=6, image_size=96), scene, region)
+    setup = make_training_setup(TrainingViewOptions(views=6, image_size=96), scene, region)
     others = torch.ones(len(scene), dtype=torch.bool).index_fill(0, region.members, False)
     # all of it: with what the members hide, which are then less than was painted away
     left = scene[:0] if all_of_it else scene[others.nonzero()[:, 0]]
@@ -120,7 +120,7 @@ def test_a_thing_painted_in_a_color_of_its_own_is_not_told_as_removed(
     folder: Path, color: tuple[float, float, float]
 ) -> None:
     scene, region = bear(folder)
-    setup = make_training_setup(ViewOptions(views=6, image_size=96), scene, region)
+    setup = make_training_setup(TrainingViewOptions(views=6, image_size=96), scene, region)
     painted = [
         torch.where(view.mask[..., None] > 0.5, torch.tensor(color), view.image) for view in setup.train
     ]
@@ -129,7 +129,7 @@ def test_a_thing_painted_in_a_color_of_its_own_is_not_told_as_removed(
 
 def test_what_saving_does_beside_the_members_is_not_counted_as_painted(folder: Path) -> None:
     scene, region = bear(folder)
-    setup = make_training_setup(ViewOptions(views=6, image_size=96), scene, region)
+    setup = make_training_setup(TrainingViewOptions(views=6, image_size=96), scene, region)
     noise = torch.rand(96, 96, 3, generator=torch.Generator().manual_seed(0)) * 0.04
     saved = [torch.where(view.mask[..., None] > 0.5, view.image, view.image - noise) for view in setup.train]
     assert measure_paint(setup, saved, [setup.background] * len(saved), scene).pixels == 0
@@ -190,4 +190,4 @@ def test_a_picture_that_does_not_show_the_region_is_one_line(folder: Path, pictu
     away = Region("nothing there", region.members, region.score)
     far = replace(scene, means=scene.means + 1e4)
     with pytest.raises(ProgdfError, match="does not show the region 'nothing there'; leave it out"):
-        make_training_setup(ViewOptions(pictures=(picture,)), far, away)
+        make_training_setup(TrainingViewOptions(pictures=(picture,)), far, away)

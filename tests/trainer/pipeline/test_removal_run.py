@@ -30,8 +30,8 @@ from trainer.options import (
     EditorOptions,
     EvaluateOptions,
     RegionOptions,
+    TrainingViewOptions,
     TrainOptions,
-    ViewOptions,
     with_values,
 )
 from trainer.run.removal import on_backgrounds, with_crumbs
@@ -89,7 +89,11 @@ def case(hole: float = 0.27) -> tuple[Gaussians, Gaussians, TrainingSetup]:
     """The post on the table, the table alone, and views of them."""
     scene = concatenate([table(hole), post()])
     region = from_mask("post", torch.arange(len(scene)) >= len(table(hole)))
-    return scene, table(hole), make_training_setup(ViewOptions(views=12, image_size=96), scene, region)
+    return (
+        scene,
+        table(hole),
+        make_training_setup(TrainingViewOptions(views=12, image_size=96), scene, region),
+    )
 
 
 def test_a_membrane_continues_a_plane_and_ends_evenly_at_the_edge() -> None:
@@ -144,7 +148,7 @@ def test_flat_parts_of_a_hole_take_few_rows(fine: bool) -> None:
 def test_a_thing_before_an_empty_background_leaves_nothing_to_fill() -> None:
     scene, rest, _ = case()
     region = from_mask("table", torch.arange(len(scene)) < len(rest))
-    setup = make_training_setup(ViewOptions(views=12, image_size=96), scene, region)
+    setup = make_training_setup(TrainingViewOptions(views=12, image_size=96), scene, region)
     assert fill_holes(scene, post(), setup.train).rows is None
     solid, whole, around = case(-1.0)
     assert fill_holes(solid, whole, around.train).rows is None  # no hole

@@ -26,8 +26,8 @@ from trainer.options import (
     Kind,
     OptimizeOptions,
     RegionOptions,
+    TrainingViewOptions,
     TrainOptions,
-    ViewOptions,
 )
 from trainer.views.view import region_rig, render_view, with_near_plane
 
@@ -63,7 +63,7 @@ def trained(folder: Path, scene: Gaussians, members: Tensor, editor: str, kind: 
         folder / "edit",
         RegionOptions(f"labels:{folder / 'labels.npy'}:1"),
         EditorOptions(editor),
-        views=ViewOptions(views=6, image_size=64),
+        views=TrainingViewOptions(views=6, image_size=64),
         optimize=OptimizeOptions(steps=40, stages=2, kind=kind),
         field=FieldOptions("separable"),
         threads=1,

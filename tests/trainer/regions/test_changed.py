@@ -25,7 +25,7 @@ from tests.helpers.scenes import random_gaussians
 from tests.helpers.trained import edit_few, small
 from trainer.editors import make_editor
 from trainer.editors.pictures import read_change
-from trainer.options import EditorOptions, RegionOptions, ViewOptions
+from trainer.options import EditorOptions, RegionOptions, TrainingViewOptions
 from trainer.regions.changed import find_change
 from trainer.regions.from_pictures import RegionRequest, region_checks, region_kinds
 from trainer.views.crops import crop_scene
@@ -33,7 +33,9 @@ from trainer.views.view import crop, make_view, render_view
 
 
 def settings(pictures: list[Path], folder: Path) -> RegionRequest:
-    return RegionRequest(RegionOptions("changed"), ViewOptions(pictures=tuple(pictures)), lambda: folder)
+    return RegionRequest(
+        RegionOptions("changed"), TrainingViewOptions(pictures=tuple(pictures)), lambda: folder
+    )
 
 
 @pytest.fixture(scope="module")

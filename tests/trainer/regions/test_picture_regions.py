@@ -26,7 +26,7 @@ from tests.helpers.demo_scenes import bear
 from tests.helpers.tiny_segmenters import tiny_detector, tiny_sam
 from tests.helpers.trained import label_mask, quick_options, train, write_bear
 from trainer.editors.pictures import FolderEditor
-from trainer.options import RegionOptions, ViewOptions, with_values
+from trainer.options import RegionOptions, TrainingViewOptions, with_values
 from trainer.regions.from_pictures import RegionRequest, read_masks, region_kinds
 from trainer.regions.segment import SEGMENTERS, normalize_prompt
 from trainer.views.view import View
@@ -58,7 +58,7 @@ def settings(
     options: RegionOptions | None = None,
     say: Callable[[str], None] | None = None,
 ) -> RegionRequest:
-    views = ViewOptions(cameras, views=VIEWS)
+    views = TrainingViewOptions(cameras, views=VIEWS)
     return RegionRequest(options or RegionOptions(""), views, lambda: tmp_path / "segmented", True, say)
 
 
@@ -240,7 +240,9 @@ def test_sentences_join_with_other_kinds_of_region(reddish: Asked, tmp_path: Pat
 
 def test_given_cameras_are_thinned_out_evenly(reddish: Asked, tmp_path: Path) -> None:
     save_cameras(tmp_path / "many.json", orbit_rig(SCENE, 20, SIZE, SIZE))
-    region_of("text:scarf", replace(settings(tmp_path), views=ViewOptions(tmp_path / "many.json", views=4)))
+    region_of(
+        "text:scarf", replace(settings(tmp_path), views=TrainingViewOptions(tmp_path / "many.json", views=4))
+    )
     kept = sorted(path.stem for path in (tmp_path / "segmented" / "scarf").glob("*.png"))
     assert kept == ["orbit_002", "orbit_007", "orbit_012", "orbit_017"]
 

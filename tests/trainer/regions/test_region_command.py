@@ -21,7 +21,7 @@ from progdf.scene.orbit_rig import orbit_rig
 from progdf.scene.regions import parse_region
 from progdf.terminal import format_count
 from tests.helpers.demo_scenes import bear
-from trainer.options import RegionOptions, ViewOptions
+from trainer.options import RegionOptions, TrainingViewOptions
 from trainer.regions.command import picture
 from trainer.regions.from_pictures import RegionRequest, region_kinds
 
@@ -138,7 +138,9 @@ def test_masks_drawn_over_the_views_are_the_region_that_train_takes(
             assert original.size == (96, 96)
         seen = render_colors(demo.gaussians, member, camera, torch.zeros(3))[..., 0] > 0.5
         Image.fromarray((255 * seen.numpy()).astype(np.uint8)).save(out / f"{camera.name}.png")
-    settings = RegionRequest(RegionOptions("masks"), ViewOptions(out / "cameras.json"), lambda: tmp_path)
+    settings = RegionRequest(
+        RegionOptions("masks"), TrainingViewOptions(out / "cameras.json"), lambda: tmp_path
+    )
     found = parse_region(f"masks:{out}", demo.gaussians, kinds=region_kinds(settings))
     both = torch.isin(found.members, bear_itself).sum()
     assert int(both) > 0.85 * max(len(found), len(bear_itself))

@@ -13,7 +13,7 @@ from progdf.region import Region
 from progdf.scene.orbit_rig import orbit_rig
 from tests.helpers.demo_scenes import bear
 from tests.helpers.trained import quick_options, train, write_bear
-from trainer.options import EditorOptions, ViewOptions
+from trainer.options import EditorOptions, TrainingViewOptions
 from trainer.resolve import resolve
 from trainer.run.training import pixel_stride
 from trainer.setup import SAMPLING, SIZE, TrainingSetup, make_training_setup, take_glances
@@ -24,7 +24,7 @@ def setup_of(count: int = 400, bands: int = 3, **said: object) -> TrainingSetup:
     scene = bear(count).gaussians
     scene = replace(scene, shN=torch.zeros(count, bands, 3))
     region = Region("all", torch.arange(count), torch.ones(count))
-    return make_training_setup(replace(ViewOptions(), **said), scene, region)  # type: ignore[arg-type]
+    return make_training_setup(replace(TrainingViewOptions(), **said), scene, region)  # type: ignore[arg-type]
 
 
 def test_an_edit_of_colors_has_more_views_and_what_was_typed_is_kept() -> None:
@@ -73,10 +73,10 @@ def test_a_region_is_looked_at_by_cameras_that_show_it(tmp_path: Path) -> None:
     region = Region("body", demo.members("body"), torch.ones(len(demo.members("body"))))
     away = [replace(c, viewmat=torch.diag(torch.tensor([-1.0, 1, -1, 1])) @ c.viewmat) for c in demo.cameras]
     save_cameras(tmp_path / "cameras.json", [*away, *demo.cameras[:4], *away])
-    seen = take_glances(ViewOptions(tmp_path / "cameras.json"), demo.gaussians, region)
+    seen = take_glances(TrainingViewOptions(tmp_path / "cameras.json"), demo.gaussians, region)
     assert len(seen) == 4
     assert all(bool(one.mask.any()) for one in seen)
-    assert len(take_glances(ViewOptions(), demo.gaussians, region)) == 8
+    assert len(take_glances(TrainingViewOptions(), demo.gaussians, region)) == 8
 
 
 @pytest.mark.parametrize("beside", ["", "views", "views/edited"])

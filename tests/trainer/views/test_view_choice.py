@@ -20,11 +20,11 @@ from progdf.region import from_mask
 from tests.helpers.demo_scenes import room
 from tests.helpers.scenes import concatenate, front_camera, one_gaussian, orbit_camera, random_gaussians
 from tests.helpers.trained import WHITE, Small, small
-from trainer.options import ViewOptions
+from trainer.options import TrainingViewOptions
 from trainer.setup import make_training_setup
 from trainer.views.choose import (
-    Shown,
     ViewChoice,
+    Visibility,
     choose_views,
     in_frame,
     sample_members,
@@ -162,7 +162,7 @@ def test_views_from_within_show_every_wall() -> None:
 def test_a_scene_to_stand_inside_asks_for_its_cameras(tmp_path: Path) -> None:
     demo = room(1500)
     save_ply(tmp_path / "room.ply", demo.gaussians)
-    settings = ViewOptions(views=6, image_size=48)
+    settings = TrainingViewOptions(views=6, image_size=48)
     region = from_mask("rug", torch.isin(torch.arange(1500), demo.members("rug")))
     with pytest.raises(ProgdfError, match="--cameras") as told:
         make_training_setup(settings, demo.gaussians, region)
@@ -178,7 +178,7 @@ def picked(visible: Tensor, held_out: int) -> list[int]:
     """Which of the views are held out that show so much of some members, all from one side. [V,S]"""
     views = tuple(replace(small().views[0], box=(i, 0, 64, 64)) for i in range(len(visible)))
     toward = torch.tensor([0.0, 0.0, 1.0]).expand(*visible.shape, 3)
-    train, held = split_views(ViewChoice(views, Shown(visible, toward, 1.0), len(views), 0, 0), held_out)
+    train, held = split_views(ViewChoice(views, Visibility(visible, toward, 1.0), len(views), 0, 0), held_out)
     assert [view.box[0] for view in train] == [
         i for i in range(len(views)) if i not in {v.box[0] for v in held}
     ]
@@ -286,7 +286,7 @@ def test_a_rig_is_as_large_as_the_views_that_are_asked_for_and_larger_where_some
     """Every camera of an even rig: the best of a larger one crowd where the region shows most, and one that
     is taken out of it leaves a gap."""
     case = small("head")
-    settings = ViewOptions(views=10, image_size=48)
+    settings = TrainingViewOptions(views=10, image_size=48)
     setup = make_training_setup(settings, case.scene, case.region)
     assert [view.camera.name for view in setup.train] == [f"orbit_{i:03d}" for i in range(8)]
     assert [view.camera.name for view in setup.held_out] == ["between_000", "between_004"]

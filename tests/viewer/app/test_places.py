@@ -14,7 +14,7 @@ from tests.helpers.null_app import null_app, press
 from tests.helpers.sessions import bear_files, opened_document
 from tests.helpers.stacks import many_edits
 from tests.helpers.ui_rig import HEAD, Rig, bear, first_view, rig
-from viewer.jobs.job_queue import Delivery, Job
+from viewer.jobs.job_queue import Delivery, QueuedTask
 from viewer.panel import card, panel, tools
 from viewer.state import selection
 from viewer.state.selection import SelectionState
@@ -164,13 +164,13 @@ def test_jobs_are_one_line_that_opens_and_a_failure_opens_it_once(hand: Rig) -> 
             "jobs" in w.name and "/card_" in w.name and w.active for w in imgui.get_current_context().windows
         )
 
-    hand.main_view.work = replace(hand.main_view.work, jobs=(Job(1, film, "running"),))
+    hand.main_view.work = replace(hand.main_view.work, jobs=(QueuedTask(1, film, "running"),))
     assert cards() == 0
     hand.click(*strip)
     assert cards() == 1
     hand.click(*strip)
     assert cards() == 0
-    hand.main_view.work = replace(hand.main_view.work, jobs=(Job(1, film, "failed", error="no room"),))
+    hand.main_view.work = replace(hand.main_view.work, jobs=(QueuedTask(1, film, "failed", error="no room"),))
     assert cards() == 1
     hand.click(*strip)
     assert cards() == 0, "what was seen does not open it again"

@@ -15,7 +15,7 @@ from viewer.app.studio.pages import StartFile
 from viewer.app.studio.start import EXAMPLE_TITLES
 from viewer.files.document import empty
 from viewer.jobs.child import Progress
-from viewer.jobs.job_queue import DeliverOptions, Delivery, Job
+from viewer.jobs.job_queue import DeliverOptions, Delivery, QueuedTask
 from viewer.jobs.training import TYPED, EditOrder, NewEdit
 from viewer.render.engine import ViewEngine
 from viewer.render.gl_renderer import headless_context
@@ -72,19 +72,19 @@ def test_the_form_of_a_new_edit(screenshot: Compare) -> None:
 
 def test_the_cards_of_runs_and_a_film(screenshot: Compare) -> None:
     order = EditOrder(Path("bear.ply"), Path("/scenes/bear.edits/blue"), "blue", "all", "recolor:#3060d0")
-    running = Job(1, order, "running", Progress(0.45, "Training", "0.0114"), 20.0)
+    running = QueuedTask(1, order, "running", Progress(0.45, "Training", "0.0114"), 20.0)
     line = "region 'sphere:99,99,99,1' holds no Gaussian"
     jobs = (
         running,
-        Job(2, replace(order, name="gold")),
-        Job(3, replace(order, name="night"), "stopped", Progress(0.6)),
-        Job(4, replace(order, name="nowhere"), "failed", error=line),
+        QueuedTask(2, replace(order, name="gold")),
+        QueuedTask(3, replace(order, name="night"), "stopped", Progress(0.6)),
+        QueuedTask(4, replace(order, name="nowhere"), "failed", error=line),
     )
     film = Delivery("Rendering film.mp4", Path("/scenes/film.mp4"), (), Path("film.log"), Path("bear.ply"))
     frames = Progress(30 / 96, "frame 30 of 96")
     with rig(first_view(bear(), 0.7), SMALLEST) as hand:
         hand.main_view.work = replace(
-            hand.main_view.work, jobs=(*jobs, Job(5, film, "running", frames, 10.0))
+            hand.main_view.work, jobs=(*jobs, QueuedTask(5, film, "running", frames, 10.0))
         )
         hand.settle()
         hand.frame(3)
@@ -102,7 +102,7 @@ def test_the_question_about_a_film(screenshot: Compare) -> None:
 def test_the_buttons_of_the_second_failure_are_whole(screenshot: Compare) -> None:
     film = Delivery("Rendering film.mp4", Path("/scenes/film.mp4"), (), Path("film.log"), Path("bear.ply"))
     line = "no frame could be written: the disk takes no more, free some space"
-    jobs = tuple(Job(number, replace(film), "failed", error=line) for number in (1, 2))
+    jobs = tuple(QueuedTask(number, replace(film), "failed", error=line) for number in (1, 2))
     with rig(first_view(bear(), 0.7), LEAST) as hand:
         for count in (1, 2):
             hand.main_view.work = replace(hand.main_view.work, jobs=jobs[:count])
@@ -120,14 +120,14 @@ def test_the_buttons_of_the_second_failure_are_whole(screenshot: Compare) -> Non
 
 def test_a_second_click_where_stop_was_goes_on(software_gpu: None) -> None:
     order = EditOrder(Path("bear.ply"), Path("/scenes/bear.edits/blue"), "blue", "all", "recolor:#3060d0")
-    running = Job(1, order, "running", Progress(0.45, "Training", "0.0114"), 20.0)
+    running = QueuedTask(1, order, "running", Progress(0.45, "Training", "0.0114"), 20.0)
     with rig(first_view(bear(), 0.7), SMALLEST) as hand:
         hand.main_view.work = replace(hand.main_view.work, jobs=(running,))
         hand.settle()
         hand.click(SMALLEST[0] - 150.0, SMALLEST[1] - 55.0)  # the strip, which opens
         hand.settle()
 
-        def asked(job: Job, x: float, y: float) -> tuple[str, ...]:
+        def asked(job: QueuedTask, x: float, y: float) -> tuple[str, ...]:
             hand.main_view.work = replace(hand.main_view.work, jobs=(job,))
             hand.settle()
             hand.click(x, y)

@@ -18,7 +18,7 @@ from tests.helpers.count import Count
 from tests.helpers.demo_scenes import bear
 from viewer.jobs import child, job_queue, training
 from viewer.jobs.child import Progress
-from viewer.jobs.job_queue import LOOK_S, Delivery, Job, JobQueue
+from viewer.jobs.job_queue import LOOK_S, Delivery, JobQueue, QueuedTask
 from viewer.jobs.training import EditOrder
 
 PATIENCE_S = 600.0
@@ -86,7 +86,7 @@ def order(scene: Path, name: str, region: str = "all") -> EditOrder:
     return EditOrder(scene, out, name, region, "tint:#3060d0", quick=True, threads=1)
 
 
-def wait(queue: JobQueue, until: str = "") -> list[Job]:
+def wait(queue: JobQueue, until: str = "") -> list[QueuedTask]:
     """What has ended once nothing is busy, or one job says that it does `until`."""
     ended, begun = [], time.monotonic()
     while queue.busy() and time.monotonic() - begun < PATIENCE_S:
@@ -244,7 +244,7 @@ def test_deliveries_go_on_beside_a_training_and_leave_nothing_when_they_are_stop
 
 def test_time_left_is_said_once_something_is_done() -> None:
     order = EditOrder(Path("a.ply"), Path("out"), "a", "all", "night")
-    half = replace(Job(1, order, "running"), progress=Progress(0.5), seconds=20.0)
+    half = replace(QueuedTask(1, order, "running"), progress=Progress(0.5), seconds=20.0)
     assert half.seconds_left == 20.0
     resumed = replace(half, began_at=0.4)
     assert abs((resumed.seconds_left or 0.0) - 100.0) < 1e-6

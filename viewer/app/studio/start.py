@@ -188,7 +188,7 @@ class UpActions:
         if document.path is None:
             return
         if self._looked and up != before:
-            up_axis.remember(document.scene, up)
+            up_axis.remember_chosen_up(document.scene, up)
         guess = not (self._looked or session or document.detected_up.certain)
         if guess and up == document.detected_up.direction and main_view.work.message is None:
             name = up_axis.direction_name(torch.tensor(up)).upper().replace("-", "−")

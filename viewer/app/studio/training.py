@@ -26,7 +26,7 @@ from viewer.app.application import Application, Requests, attempt, failure_line
 from viewer.app.file_actions import EditActions
 from viewer.files import exports
 from viewer.jobs import training
-from viewer.jobs.job_queue import Delivery, Job, JobQueue
+from viewer.jobs.job_queue import Delivery, JobQueue, QueuedTask
 from viewer.jobs.training import ALL, CHANGED, SELECTION, TYPED, EditOrder, NewEdit
 from viewer.state.selection import NOBODY, SUFFIX, NamedRegion, add_region, free_name
 from viewer.state.view_state import LayerState
@@ -267,7 +267,7 @@ class JobActions:
         else:
             self.queue.discard(job.number)
 
-    def _end(self, job: Job) -> None:
+    def _end(self, job: QueuedTask) -> None:
         """A job has ended: a new edit comes on top, else a line says what became of it."""
         task, main_view = job.task, self._app.main_view
         if job.status == "done" and not job.warning and isinstance(task, EditOrder):
