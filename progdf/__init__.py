@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import sys
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -41,7 +42,6 @@ _MODULES = {
     "Gaussians": "progdf.gaussians",
     "Gdf": "progdf.gdf.file",
     "Layer": "progdf.compose.layers",
-    "Widget": "viewer.widget",  # by name alone, as the table of commands names its packages; not of `__all__`
     "compose_layers": "progdf.compose.reference",
     "load_cameras": "progdf.io.cameras",
     "load_gdf": "progdf.gdf.file",
@@ -54,8 +54,39 @@ _MODULES = {
 }
 
 
+_NOTEBOOK_CARDS = (
+    ("progdf.gaussians", "Gaussians"),
+    ("progdf.field.baked", "BakedField"),
+    ("progdf.gdf.file", "Gdf"),
+)
+"""Module and class of each type that a notebook shows as a card."""
+
+
 def __getattr__(name: str) -> Any:
-    """A public name, imported when it is first asked for: `progdf --help` does not wait for torch."""
+    """Import a public name on first use, so that `progdf --help` does not wait for torch."""
+    if name == "Widget":
+        raise AttributeError("progdf.Widget is now viewer.Widget; write `from viewer import Widget`")
     if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(_MODULES[name]), name)
+
+
+def _notebook_card(shown: Any) -> str:
+    """Return the HTML card of a scene, a field or an edit."""
+    from progdf.summary import to_html
+
+    return to_html(shown)
+
+
+def _register_notebook_cards() -> None:
+    """Tell a running IPython how to show scenes, fields and edits."""
+    ipython = sys.modules.get("IPython")
+    shell = getattr(ipython, "get_ipython", lambda: None)()
+    if shell is None:
+        return
+    html = shell.display_formatter.formatters["text/html"]
+    for module, name in _NOTEBOOK_CARDS:
+        html.for_type_by_name(module, name, _notebook_card)
+
+
+_register_notebook_cards()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -29,15 +28,8 @@ Origin = tuple[float, float, float]
 ZERO: Origin = (0.0, 0.0, 0.0)
 
 
-class ShownInNotebooks:
-    """What a notebook shows as a card, see `progdf.summary`; that lies above, so it is looked up by name."""
-
-    def _repr_html_(self) -> str:
-        return str(importlib.import_module("progdf.summary").to_html(self))
-
-
 @dataclass(frozen=True)
-class Gaussians(ShownInNotebooks):
+class Gaussians:
     """N Gaussians as raw tensors; activate with `scales`, `opacities`, `unit_quats`.
 
     Raises:

@@ -1,4 +1,4 @@
-"""The page in a cell of a notebook: `progdf.Widget`, by anywidget (`pip install progdf-studio[jupyter]`)."""
+"""The page in a cell of a notebook: `viewer.Widget`, by anywidget (`pip install progdf-studio[jupyter]`)."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ try:
     import anywidget
     import traitlets
 except ImportError as error:
-    raise ProgdfError("progdf.Widget needs anywidget; pip install 'progdf-studio[jupyter]'") from error
+    raise ProgdfError("viewer.Widget needs anywidget; pip install 'progdf-studio[jupyter]'") from error
 
 _STILL = 720, 480
 

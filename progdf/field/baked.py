@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from progdf.gaussians import ShownInNotebooks, attribute_slices
+from progdf.gaussians import attribute_slices
 from progdf.io.tensors import check_ascent, check_levels, check_tensor, deflate, inflate
 
 from .neural import NeuralField
@@ -302,7 +302,7 @@ def unpack_levels(functions: Tensor, levels: Tensor, bases: int, members: int, c
 
 
 @dataclass(frozen=True)
-class BakedField(ShownInNotebooks):
+class BakedField:
     """A field ready to run, for the members it was made for."""
 
     kind: str  # "grade", "separable", "keyframes" or "neural"

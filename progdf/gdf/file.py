@@ -21,7 +21,7 @@ from progdf.field.baked import BakedField, GradeForm, NeuralForm
 from progdf.field.grade import bake_grade, lattice_form, map_alone
 from progdf.formats.cube import SUFFIX as CUBE
 from progdf.formats.cube import read_cube
-from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, ZERO, Gaussians, Origin, ShownInNotebooks, pack
+from progdf.gaussians import ATTRIBUTES, BASE_CHANNELS, ZERO, Gaussians, Origin, pack
 from progdf.io.atomic import read_file, write_error, write_file
 from progdf.region import Region, whole_scene
 
@@ -44,7 +44,7 @@ ADDED_LOGIT = -6.0
 
 
 @dataclass(frozen=True)
-class Gdf(ShownInNotebooks):
+class Gdf:
     """One region's edit. Raises ValueError where region, field and scene differ in their Gaussians."""
 
     name: str  # the layer's, e.g. "shirt"

@@ -6,6 +6,8 @@ import base64
 import html
 import io
 import re
+import subprocess
+import sys
 import time
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -20,10 +22,12 @@ from progdf.field.baked import lattice_colors
 from progdf.formats.cube import write_cube
 from progdf.gaussians import Gaussians, concatenate
 from progdf.gdf.file import Gdf, read_gdf
+from progdf.summary import to_html
 from tests.helpers.demo_scenes import bear
 from tests.helpers.edits import curved_field, edit_of, growing, some_rows
 from tests.helpers.scenes import random_gaussians
 
+ROOT = Path(__file__).parents[2]
 HOSTILE = "</div><script>alert(1)</script><img src=x onerror='alert(2)'>"
 
 
@@ -55,7 +59,7 @@ def shirt(scene: Gaussians, name: str = "shirt") -> Gdf:
 
 def test_a_scene_shows_itself_from_the_front_with_its_size() -> None:
     scene = bear(1500).gaussians
-    card = scene._repr_html_()
+    card = to_html(scene)
     assert Tags(card).words == ["1 500 Gaussians", "SH degree 1", "138.0 kB in memory"]
     pixels = still(card)
     assert pixels.shape == (200, 300, 4)
@@ -68,9 +72,9 @@ def test_a_scene_shows_itself_from_the_front_with_its_size() -> None:
 
 def test_a_large_scene_takes_no_time_and_no_room() -> None:
     scene = concatenate([bear(6000).gaussians] * 20)
-    scene._repr_html_()
+    to_html(scene)
     began = time.process_time()
-    card = scene._repr_html_()
+    card = to_html(scene)
     assert time.process_time() - began < 2.0
     assert len(card) < 40_000
 
@@ -78,20 +82,20 @@ def test_a_large_scene_takes_no_time_and_no_room() -> None:
 def test_an_edit_and_its_field_show_their_course_and_their_size() -> None:
     edit = shirt(random_gaussians(300, seed=3, sh_degree=1))
     for shown in (edit, edit.field):
-        card = shown._repr_html_()
+        card = to_html(shown)
         assert card.count("<polyline") == 3, "geometry, opacity and color"
         assert card.count("v5") == len(edit.field.recorded)
         assert "separable field" in card
-    assert Tags(edit._repr_html_()).words[3] == "shirt"
-    assert "50 members of 300 Gaussians" in edit._repr_html_()
-    assert "7 rows added" in growing(random_gaussians(300, seed=3), torch.arange(20), 7, 1)._repr_html_()
+    assert Tags(to_html(edit)).words[3] == "shirt"
+    assert "50 members of 300 Gaussians" in to_html(edit)
+    assert "7 rows added" in to_html(growing(random_gaussians(300, seed=3), torch.arange(20), 7, 1))
 
 
 def test_texts_of_a_stranger_are_texts() -> None:
     edit = replace(
         shirt(random_gaussians(100, seed=3), HOSTILE), instruction=HOSTILE + "\x1b[2J" + "x" * 10_000
     )
-    card = edit._repr_html_()
+    card = to_html(edit)
     tags = Tags(card)
     assert set(tags.names) == {"div", "b", "svg", "path", "polyline", "text"}
     assert HOSTILE[:59] + "…" in tags.words
@@ -110,12 +114,27 @@ def test_what_cannot_be_drawn_is_left_out(broken: str) -> None:
         "grad": lambda: replace(scene, means=scene.means.clone().requires_grad_()),
         "one": lambda: scene[:1],
     }[broken]()
-    assert f"{len(scene)} Gaussian" in scene._repr_html_()
-    assert ("src=" in scene._repr_html_()) == (broken in ("double", "grad", "one"))
+    assert f"{len(scene)} Gaussian" in to_html(scene)
+    assert ("src=" in to_html(scene)) == (broken in ("double", "grad", "one"))
 
 
 def test_an_edit_that_is_not_baked_says_so(tmp_path: Path) -> None:
     write_cube(tmp_path / "warm.cube", lattice_colors(2), "warm")
-    card = read_gdf(tmp_path / "warm.cube")._repr_html_()
+    card = to_html(read_gdf(tmp_path / "warm.cube"))
     assert "not baked" in card
     assert "<svg" not in card
+
+
+NOTEBOOK = """
+from IPython.core.interactiveshell import InteractiveShell
+shell = InteractiveShell.instance()
+from progdf.demo_scenes import bear
+scene = bear(500).gaussians
+data, _ = shell.display_formatter.format(scene)
+print("500 Gaussians" in data["text/html"])
+"""
+
+
+def test_ipython_shows_a_scene_as_its_card() -> None:
+    run = subprocess.run([sys.executable, "-c", NOTEBOOK], capture_output=True, text=True, cwd=ROOT)
+    assert run.stdout.strip() == "True", run.stderr

@@ -1,7 +1,7 @@
-"""State of the window besides the drawn view, as frozen data, with the functions that change single parts of it.
+"""State of the window besides the drawn view, as frozen data, and functions that change single parts of it.
 
-`viewer.state.actions.perform` applies actions. Work that only the window can do (write a file, go full screen) is
-appended to `Workspace.requests`.
+`viewer.state.actions.perform` applies actions. Work that only the window can do (write a file, go full
+screen) is appended to `Workspace.requests`.
 """
 
 from __future__ import annotations

@@ -21,6 +21,7 @@ import torch
 from PIL import Image
 
 import progdf
+import viewer
 from progdf.compose.layers import Layer
 from progdf.errors import ProgdfError
 from tests.helpers.ui_rig import bear
@@ -379,4 +380,9 @@ def test_without_the_extra_one_line_names_it(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.delitem(sys.modules, "viewer.widget")
     monkeypatch.setitem(sys.modules, "anywidget", None)
     with pytest.raises(ProgdfError, match=re.escape("pip install 'progdf-studio[jupyter]'")):
+        _ = viewer.Widget
+
+
+def test_the_old_name_of_the_widget_says_the_new_one() -> None:
+    with pytest.raises(AttributeError, match="`from viewer import Widget`"):
         _ = progdf.Widget
