@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import re
+import runpy
 from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
@@ -166,3 +167,10 @@ def test_the_documented_reader_reads_what_is_written(tmp_path: Path, end_type: t
             before, after = getattr(scene, name)[members], getattr(edited, name)[members]
             found = before.numpy() + reader["offsets"](tensors, name, strength).reshape(before.shape)
             np.testing.assert_allclose(found, after.numpy(), atol=1e-6)
+
+
+def test_figures_of_the_readme_are_those_of_their_pages() -> None:
+    figures = runpy.run_path(str(ROOT / "assets" / "figures.py"))
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert text.count("<!-- figure ") >= 5
+    assert figures["with_figures"](text) == text, "run python assets/figures.py"
