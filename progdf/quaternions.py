@@ -7,10 +7,10 @@ from torch import Tensor
 
 
 def normalize_quats(quats: Tensor) -> Tensor:
-    """Unit quaternions; a length under 1e-12 of the type's range gives the identity. [N,4] -> [N,4]"""
+    """Normalize quaternions; zero or non-finite ones become the identity. [N,4] -> [N,4]"""
     largest = quats.abs().amax(dim=-1, keepdim=True)
     usable = (largest > 0) & largest.isfinite()
-    # dividing by the largest component first keeps 1e-30 and 1e30 from under- and overflowing when squared
+    # divide by the largest component first, so that the squares of 1e-30 and 1e30 stay in range
     safe = torch.where(usable, quats / torch.where(usable, largest, torch.ones_like(largest)), 0.0)
     identity = torch.zeros_like(quats)
     identity[..., 0] = 1.0
@@ -19,28 +19,28 @@ def normalize_quats(quats: Tensor) -> Tensor:
 
 
 def multiply_quats(a: Tensor, b: Tensor) -> Tensor:
-    """Hamilton's product, wxyz. [M,4], [M,4] -> [M,4]"""
+    """Return the Hamilton product of quaternions wxyz. [M,4], [M,4] -> [M,4]"""
     w = a[:, :1] * b[:, :1] - (a[:, 1:] * b[:, 1:]).sum(dim=1, keepdim=True)
     xyz = a[:, :1] * b[:, 1:] + b[:, :1] * a[:, 1:] + torch.linalg.cross(a[:, 1:], b[:, 1:])
     return torch.cat([w, xyz], dim=1)
 
 
 def rotate_vectors(vectors: Tensor, quats: Tensor) -> Tensor:
-    """Vectors turned by unit quaternions. [...,3], [...,4] -> [...,3]"""
+    """Rotate vectors by unit quaternions. [...,3], [...,4] -> [...,3]"""
     axis = quats[..., 1:]
     twice = 2.0 * torch.linalg.cross(axis, vectors)
-    turned: Tensor = vectors + quats[..., :1] * twice + torch.linalg.cross(axis, twice)
-    return turned
+    rotated: Tensor = vectors + quats[..., :1] * twice + torch.linalg.cross(axis, twice)
+    return rotated
 
 
 def turn_quats(turn: Tensor) -> Tensor:
-    """Unit quaternion wxyz of a rotation vector, smooth at zero. [P,3] -> [P,4]"""
+    """Convert rotation vectors to unit quaternions wxyz; smooth at zero. [P,3] -> [P,4]"""
     half = 0.5 * (turn.square().sum(dim=1, keepdim=True) + 1e-12).sqrt()
     return torch.cat([half.cos(), 0.5 * turn * half.sin() / half], dim=1)
 
 
 def quat_turns(quats: Tensor) -> Tensor:
-    """Rotation vectors, of at most half a turn, of unit quaternions. [P,4] -> [P,3]"""
+    """Convert unit quaternions to rotation vectors of at most 180°. [P,4] -> [P,3]"""
     quats = torch.where(quats[:, :1] < 0, -quats, quats)
     sine = quats[:, 1:].norm(dim=1, keepdim=True)
     angle = 2.0 * torch.atan2(sine, quats[:, :1])
@@ -48,7 +48,7 @@ def quat_turns(quats: Tensor) -> Tensor:
 
 
 def rotation_matrices(unit_quats: Tensor) -> Tensor:
-    """Rotation matrices of unit quaternions wxyz. [N,4] -> [N,3,3]"""
+    """Convert unit quaternions wxyz to rotation matrices. [N,4] -> [N,3,3]"""
     w, x, y, z = unit_quats.unbind(1)
     entries = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
@@ -59,7 +59,7 @@ def rotation_matrices(unit_quats: Tensor) -> Tensor:
 
 
 def matrix_quats(matrices: Tensor) -> Tensor:
-    """Unit quaternions of rotation matrices, by the largest of the four components. [N,3,3] -> [N,4]"""
+    """Convert rotation matrices to unit quaternions, from the largest of the four components. [N,3,3] -> [N,4]"""
     m = matrices
     x, y, z = m[:, 0, 0], m[:, 1, 1], m[:, 2, 2]
     a, b, c = m[:, 2, 1], m[:, 0, 2], m[:, 1, 0]
@@ -79,8 +79,8 @@ def matrix_quats(matrices: Tensor) -> Tensor:
 
 
 def matrix_turns(matrices: Tensor) -> Tensor:
-    """Rotation vectors of rotation matrices; no gradient. [P,3,3] -> [P,3]"""
-    from scipy.spatial.transform import Rotation  # half a second that nothing else here needs
+    """Convert rotation matrices to rotation vectors, without a gradient. [P,3,3] -> [P,3]"""
+    from scipy.spatial.transform import Rotation  # takes 0.5 s to import; only this function needs it
 
     turns = Rotation.from_matrix(matrices.detach().double().cpu().numpy()).as_rotvec()
     return torch.from_numpy(turns).to(matrices)

@@ -1,1 +1,1 @@
-"""How far apart are two pictures, and how does a slider feel?"""
+"""Image errors, and statistics of a slider."""

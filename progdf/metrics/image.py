@@ -1,4 +1,4 @@
-"""Errors between images: PSNR and SSIM; see also `progdf.metrics.lpips` and `progdf.metrics.slider`."""
+"""Image errors PSNR and SSIM; see also `progdf.metrics.lpips` and `progdf.metrics.slider`."""
 
 from __future__ import annotations
 
@@ -8,34 +8,37 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d
 
-WINDOW, SIGMA = 11, 1.5
-"""SSIM's Gaussian window in pixels (Wang et al. 2004)."""
+WINDOW = 11
+SIGMA = 1.5
+"""Side and standard deviation of SSIM's Gaussian window in pixels (Wang et al. 2004)."""
 
 NO_DIFFERENCE = 99.0
-"""PSNR, dB, that stands for pictures which do not differ."""
+"""PSNR in dB reported for equal images, instead of infinity."""
 
 ROUNDING = 1 / 255**2 / 12
-"""Mean squared error of a picture of 8 bits."""
+"""Mean squared rounding error of an 8-bit image, range 0 to 1."""
 
 LEVEL = 1 / 255**2
-"""Mean squared error of pictures a level of 8 bits apart, as rounding may leave two that agree: no screen
-shows less for certain."""
+"""Mean squared error of two images that differ by one 8-bit level everywhere.
+
+Rounding alone can cause it, so smaller errors are not certain to be visible on a screen.
+"""
 
 
 def decibels(mse: float) -> float:
-    """PSNR of a mean squared error of images of range 0..1, at most `NO_DIFFERENCE`, dB."""
+    """Return the PSNR in dB of a mean squared error (images of range 0 to 1), at most `NO_DIFFERENCE`."""
     return NO_DIFFERENCE if mse <= 0 else min(NO_DIFFERENCE, -10 * math.log10(mse))
 
 
 def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
-    """Peak signal-to-noise ratio for images of range 0..1, dB; infinite where nothing differs.
+    """Return the peak signal-to-noise ratio in dB; infinite for equal images.
 
     Args:
-        image, target: the same shape. [H,W,3] or [...]
-        mask: what counts, bool or weights 0..1; broadcast over the colors. [H,W]
+        image, target: range 0 to 1, the same shape. [H,W,3] or [...]
+        mask: pixel weights, bool or 0 to 1, broadcast over the colors. [H,W]
 
     Raises:
-        ValueError: shapes differ, or the mask counts nothing.
+        ValueError: the shapes differ, or all weights are 0.
     """
     _check_pair(image, target)
     squares = (image.detach().double() - target.detach().double()).square()
@@ -48,30 +51,30 @@ def psnr(image: Tensor, target: Tensor, mask: Tensor | None = None) -> float:
 
 
 def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Structural similarity (Wang et al. 2004): Gaussian window 11 px, σ 1.5, range 1, per color;
-    differentiable.
+    """Return the structural similarity (Wang et al. 2004) with an 11 px Gaussian window; differentiable.
 
     Args:
-        image, target: range 0..1. [H,W,C]
-        mask: pixels over which the map is averaged, bool or weights; None is all whose window lies in the
-            image, or, in images smaller than the window, all. [H,W]
+        image, target: range 0 to 1. [H,W,C]
+        mask: weights of the average over pixels, bool or 0 to 1. None averages the pixels whose window lies
+            inside the image, or all pixels of an image smaller than the window. [H,W]
 
     Returns:
-        Mean similarity, at most 1. []
+        Mean similarity over colors and pixels, at most 1. []
 
     Raises:
-        ValueError: shapes differ, or the mask counts nothing.
+        ValueError: the shapes differ, or all weights are 0.
     """
     _check_pair(image, target)
     x, y = (v.movedim(-1, 0) for v in (image, target))
-    # beyond the border the window is cut off and its weights scaled back to a sum of 1
-    share = _blur(torch.ones_like(x[:1]))
+    # at the border the window is cut off and its weights are normalized to a sum of 1
+    weight_sums = _blur(torch.ones_like(x[:1]))
     planes = torch.cat([x, y, x * x, y * y, x * y])
-    mean_x, mean_y, square_x, square_y, product = (_blur(planes) / share).chunk(5)
+    mean_x, mean_y, square_x, square_y, product = (_blur(planes) / weight_sums).chunk(5)
     var_x = (square_x - mean_x * mean_x).clamp(min=0)
     var_y = (square_y - mean_y * mean_y).clamp(min=0)
     covariance = product - mean_x * mean_y
-    c1, c2 = 0.01**2, 0.03**2
+    c1 = 0.01**2
+    c2 = 0.03**2
     similarity = (2 * mean_x * mean_y + c1) * (2 * covariance + c2)
     similarity = similarity / ((mean_x * mean_x + mean_y * mean_y + c1) * (var_x + var_y + c2))
     per_pixel = similarity.mean(dim=0)
@@ -85,12 +88,13 @@ def ssim(image: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
 
 
 def _blur(planes: Tensor) -> Tensor:
-    """Weighted sums over the window, zero beyond the border. [C,H,W]"""
+    """Return weighted sums over the window, with zeros beyond the border. [C,H,W]"""
     offsets = torch.arange(WINDOW, dtype=planes.dtype, device=planes.device) - WINDOW // 2
     kernel = torch.exp(-offsets.square() / (2 * SIGMA**2))
-    kernel, count = kernel / kernel.sum(), len(planes)
+    kernel = kernel / kernel.sum()
+    count = len(planes)
     across = kernel.expand(count, 1, 1, -1).contiguous()
-    # planes as groups: as a batch of pictures they take ten times as long
+    # planes as groups: a batch of images would take ten times as long
     rows = conv2d(planes[None], across, padding=(0, WINDOW // 2), groups=count)
     return conv2d(rows, across.transpose(2, 3), padding=(WINDOW // 2, 0), groups=count)[0]
 

