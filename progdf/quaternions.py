@@ -59,7 +59,7 @@ def rotation_matrices(unit_quats: Tensor) -> Tensor:
 
 
 def matrix_quats(matrices: Tensor) -> Tensor:
-    """Convert rotation matrices to unit quaternions, from the largest of the four components. [N,3,3] -> [N,4]"""
+    """Convert rotation matrices to unit quaternions, by the largest component. [N,3,3] -> [N,4]"""
     m = matrices
     x, y, z = m[:, 0, 0], m[:, 1, 1], m[:, 2, 2]
     a, b, c = m[:, 2, 1], m[:, 0, 2], m[:, 1, 0]

@@ -1,4 +1,4 @@
-"""Statistics of a slider's visible steps: monotonicity, uniformity and the largest jump (docs/method.md 7)."""
+"""Statistics of a slider's visible steps: monotone, uniform, without jumps (docs/method.md 7)."""
 
 from __future__ import annotations
 

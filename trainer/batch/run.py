@@ -458,7 +458,7 @@ def _is_finished(job: BatchJob) -> bool:
             return False
 
 
-def _found_rows(finished: Sequence[BatchJob], rows: Mapping[str, Row]) -> dict[str, Row]:
+def _found_rows(finished: Sequence[BatchJob], rows: Mapping[str, JobRow]) -> dict[str, JobRow]:
     """Return the rows of finished runs that the table does not have, or not as done, by key.
 
     They are runs of `progdf train`, or ended just when the earlier session was interrupted. The row of a run

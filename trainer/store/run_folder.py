@@ -294,7 +294,9 @@ def read_run_cameras(folder: RunFolder, held_out: Iterable[str], origin: Origin)
             raise ProgdfError(f"{folder.cameras} has a camera named '{name}', which names no view; {remedy}")
         if names.count(name) > 1:
             raise ProgdfError(f"{folder.cameras} has {names.count(name)} cameras named {name}; {remedy}")
-    originals = [PurePosixPath(line) for line in read_list(folder.views) if line.startswith("original/")]
+    originals = [
+        PurePosixPath(line) for line in read_pictures_list(folder.views) if line.startswith("original/")
+    ]
     written = [path.relative_to("original").with_suffix("").as_posix() for path in originals]
     for name in (*written, *held_out):
         if name not in names:

@@ -159,7 +159,7 @@ def test_views_of_cameras_in_subfolders_are_written_into_subfolders(
     for name in ("cam0", "cam1"):
         (out / name).mkdir()
         Image.new("L", (64, 64), 255).save(out / name / "1.JPG.png")
-    request = RegionRequest(RegionOptions("masks"), ViewOptions(), lambda: tmp_path)
+    request = RegionRequest(RegionOptions("masks"), TrainingViewOptions(), lambda: tmp_path)
     assert len(parse_region(f"masks:{out}", demo.gaussians, kinds=region_kinds(request)))
 
 
