@@ -16,7 +16,7 @@ from PIL import Image
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from progdf.cli.edit import main as edit
 from progdf.demo_scenes import DemoScene
-from progdf.formats.compressed_ply import morton_order, write_compressed_ply
+from progdf.formats.packed.compressed_ply import morton_order, write_compressed_ply
 from progdf.formats.scene_file import load_scene
 from progdf.gdf.header import pack_file, unpack_file
 from progdf.io.cameras import load_cameras

@@ -92,8 +92,9 @@ def main(argv: Sequence[str]) -> int:
     edited = _clean(edited) if options.clean and len(edited) else edited
     if not len(edited):
         raise ProgdfError(f"nothing of {options.scene} would be left; it has no Gaussian that is drawn")
-    save_scene(options.out, edited, options.glb_axes)
-    print_line(f"wrote {options.out}: {format_count(len(edited))}")
+    read_back = save_scene(options.out, edited, options.glb_axes)
+    notes = () if read_back is None else read_back.notes
+    print_line("; ".join([f"wrote {options.out}: {format_count(len(edited))}", *notes]))
     if len(edited) < len(scene):
         old, new = shlex.quote(str(options.scene)), shlex.quote(str(options.out))
         print_line(

@@ -71,7 +71,7 @@ def load_ply_with_report(path: str | os.PathLike[str]) -> tuple[Gaussians, LoadR
     """Return what `load_ply` returns, and the report of the file's content and of its repairs."""
     ply = read_header(path)
     stored, content = read_ply(ply)
-    scene, counts = repair(stored)
+    scene, counts = repair(stored, path)
     order = {"<": " little-endian", ">": " big-endian"}[ply.layout.byte_order] if not ply.layout.text else ""
     report = LoadReport(
         file=Path(path).name,

@@ -21,6 +21,8 @@ from progdf.errors import ProgdfError
 from progdf.io.atomic import check_regular, open_error
 from progdf.io.file_rules import unsupported_error
 
+from .containers import GZIP, START_BYTES, ZIP, check_foreign
+
 ANTIALIASED_COMMENT = "SplatRenderMode: mip"
 """What the header of a scene says that was trained with Mip-Splatting's 2D filter (Brush's words)."""
 
@@ -43,12 +45,6 @@ _LONGEST_COMMENT = 200  # characters that are kept
 _SKIPPED = ("comment", "obj_info")
 _ELEMENT = re.compile(r"(element\s+\S+\s+)(\d{1,19})")
 _END = re.compile(rb"^end_header[ \t]*\r?\n", re.MULTILINE)
-_FOREIGN = (
-    (b"version https://git-lfs", "is a Git LFS pointer, not the file itself; run `git lfs pull` to fetch it"),
-    (b"\x1f\x8b", "is gzip data, but no .spz scene; unpack it first"),
-    (b"PK\x03\x04", "is a zip archive, but no .sog scene; unpack it first"),
-    (b"<", "is a web page or XML, not a .ply; download the file itself"),
-)
 
 
 @dataclass(frozen=True)
@@ -161,12 +157,12 @@ def read_header(path: str | os.PathLike[str]) -> PlyFile:
             start, size = file.read(_MAX_HEADER_BYTES), os.fstat(file.fileno()).st_size
     except OSError as error:
         raise open_error(path, error) from None
-    if not start:
-        raise ProgdfError(f"{path} is empty (0 bytes); copy or download it again")
     if start[:32].split(b"\n")[0].strip() != b"ply":
-        plain = "is not a .ply file; its first line should be 'ply'"
-        what = next((what for magic, what in _FOREIGN if start.startswith(magic)), plain)
-        raise ProgdfError(f"{path} {what}")
+        check_foreign(path, start[:START_BYTES])
+        if start.startswith((GZIP, ZIP)):
+            kind = "gzip data" if start.startswith(GZIP) else "a zip archive"
+            raise ProgdfError(f"{path} is {kind}, not a .ply; open it with load_scene, or unpack it")
+        raise ProgdfError(f"{path} is not a .ply file; its first line should be 'ply'")
     end = _END.search(start)
     if end is None:
         raise ProgdfError(f"{path} has a header without 'end_header'; the file is truncated or not a .ply")

@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import logging
 import math
+import os
 from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from progdf.errors import ProgdfError
 from progdf.gaussians import ZERO, Gaussians, Origin
 from progdf.quaternions import normalize_quats
 from progdf.terminal import file_size, format_count, group_digits
@@ -38,15 +40,53 @@ UNIT_TOLERANCE = 1e-6
 """A quaternion this close to unit length is left alone, so that a saved scene loads bit for bit."""
 
 
-def repair(scene: Gaussians) -> tuple[Gaussians, dict[str, Any]]:
-    """The scene as it can be used, and what that took, by fields of `LoadReport`.
+def repair(scene: Gaussians, path: str | os.PathLike[str]) -> tuple[Gaussians, dict[str, Any]]:
+    """Return a scene that can be drawn, and the counts of repairs by fields of `LoadReport`.
 
-    Means in the world, of either floating type, become float32 relative to an origin; unusable numbers are
+    Means in the world, of either floating type, become float32 relative to an origin. Unusable numbers are
     replaced, quaternions get unit length. Tensors that need nothing are passed on, not copied.
+
+    Args:
+        scene: N Gaussians as stored
+        path: their file, for the error
+
+    Raises:
+        ProgdfError: no Gaussian is usable.
     """
     near, moved = _move_to_origin(scene)
     repaired, counts = _replace_unusable(near)
+    if counts.get("hidden") == len(scene):
+        reasons = ", ".join(_unusable_reasons(scene))
+        raise ProgdfError(f"{path} holds no usable Gaussian: {reasons}; export the scene again")
     return repaired, {**moved, **counts}
+
+
+def _unusable_reasons(scene: Gaussians) -> list[str]:
+    """Return phrases for the unusable attributes, such as "700 of 700 Gaussians have a NaN scale"."""
+    finite = torch.finfo(torch.float32).max
+    limits = {
+        "position": (scene.means, -LARGEST_MEAN, LARGEST_MEAN),
+        "scale": (scene.log_scales, -torch.inf, LARGEST_LOG_SCALE),
+        "rotation": (scene.quats, -finite, finite),
+        "opacity": (scene.logit_opacities[:, None], -torch.inf, torch.inf),
+        "color": (scene.sh0, -finite, finite),
+    }
+    total = format_count(len(scene))
+    reasons = []
+    for name, (values, low, high) in limits.items():
+        has_nan = values.isnan().any(dim=1)
+        has_infinity = values.isinf().any(dim=1) & ~has_nan
+        is_outside = ~((values >= low) & (values <= high)).all(dim=1)
+        kinds = {
+            "NaN": has_nan,
+            "infinite": is_outside & has_infinity,
+            "far too large": is_outside & ~has_nan & ~has_infinity,
+        }
+        for kind, rows in kinds.items():
+            if count := int(rows.sum()):
+                article = "an" if kind == "infinite" else "a"
+                reasons.append(f"{group_digits(count)} of {total} have {article} {kind} {name}")
+    return reasons
 
 
 def find_origin(means: Tensor, log_scales: Tensor) -> Origin:

@@ -1,19 +1,20 @@
 """Scenes in every format that people have: .ply, .spz, .splat, .ksplat, .sog, .glb, .gltf, .ckpt.
 
-Recognized by content, else by name. The code for .spz, .sog and .splat is that of gaussforge, in a process of
-its own (see `native_child`), as native code may crash on a broken file.
+A scene is recognized by its content, else by its name, also inside a .zip or .gz. The library gaussforge
+reads .spz, and writes .spz, .splat and .sog. It runs in a process of its own (see `native_child`),
+because native code may crash on a broken file.
 """
 
 from __future__ import annotations
 
+import gzip
 import importlib.util
+import logging
 import os
 import shutil
 import signal
 import subprocess
 import tempfile
-import zipfile
-import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -25,67 +26,88 @@ import torch
 
 from progdf import sh
 from progdf.errors import ProgdfError
-from progdf.gaussians import Gaussians, concatenate
+from progdf.gaussians import ZERO, Gaussians, concatenate
 from progdf.io import native_child
 from progdf.io.atomic import atomic_write, read_file, write_files_together
-from progdf.io.json_values import decode_json
+from progdf.io.file_rules import damage_error, unsupported_error
 from progdf.io.part_files import part_files
+from progdf.metrics.readback import FLOAT_ROUNDING, ReadBack, check_finite, compare
 from progdf.terminal import escape_text
 
 from . import gltf, usd
 from .axes import Axes
 from .checkpoint import LEGACY_MAGIC, read_checkpoint
-from .compressed_ply import is_compressed, morton_order, read_compressed_ply, write_compressed_ply
+from .containers import GZIP, START_BYTES, ZIP, check_foreign, inflate_start, unpacked_scene
 from .gltf_file import MAGIC
-from .ksplat import read_ksplat
+from .packed.compressed_ply import (
+    is_compressed,
+    morton_order,
+    position_steps,
+    read_compressed_ply,
+    write_compressed_ply,
+)
+from .packed.ksplat import read_ksplat, read_splat
+from .packed.sog import META as SOG_META
+from .packed.sog import read_sog, read_table, scene_bytes
 from .ply import load_ply_with_report, read_ply, save_ply, save_ply_checked
 from .ply_file import read_header
 from .repair import LoadReport, repair
 
-FORMATS = ("ply", "spz", "splat", "ksplat", "sog", "glb", "gltf", "ckpt")
-"""What a scene may be, by the ending of its name; a compressed .ply is a .ply."""
+CONTAINERS = ("zip", "gz")
+"""Archives that are read if they hold one scene."""
+
+FORMATS = ("ply", "spz", "splat", "ksplat", "sog", "glb", "gltf", "ckpt", *CONTAINERS)
+"""Formats of a scene, by the ending of its name; a compressed .ply is a .ply."""
 
 WRITTEN = (".ply", ".compressed.ply", ".spz", ".sog", ".splat", ".glb", usd.SUFFIX)
-"""What `save_scene` writes, by the ending of the name."""
+"""Formats that `save_scene` writes, by the ending of the name."""
 
 MOST_FRAMES = 1000
-"""Of `save_frames`, which numbers files with three digits."""
+"""Largest number of scenes for `save_frames`, which numbers files with three digits."""
 
-SOG_META = "meta.json"
-"""The file that represents an unpacked .sog: its folder's table of images."""
+SPZ_BITS = 12
+"""Fractional bits of a position in an .spz, where the scene reaches no farther than ±2048."""
 
 CHECKPOINT = "checkpoint of a training"
-"""The format of .pt and .ckpt files in reports."""
+"""The format of .pt, .pth and .ckpt in a report."""
 
-_MOST_META = 1 << 20
-"""Bytes of its table, which has some 20 kB; parsed, JSON takes thirty times as much."""
+_SPZ_MAX = 2**23 - 1  # of a position in steps of 2^-bits
+_SPZ_VERSIONS = (1, 2, 3, 4)
+_SPZ_LAST_GZIP = b"\3"  # the last version that is gzip data
+_SPZ_ANTIALIASED, _SPZ_EXTENDED = 1, 2  # flags
+_SPZ_MAX_DEGREE = 4
 _MEMORY, _OUTPUT, SECONDS = (1 << 30, 64), (64 << 20, 64), (60, 2e-6)
-"""What a reader of another's making gets: so much, and so much for each byte of its file."""
+"""Limits of the process that reads a foreign file: a base, and more for each byte of the file."""
 _PATIENCE = 30
 """Times as long for writing our own scenes: clustering the bands of a million for an .sog takes minutes."""
 
+_log = logging.getLogger(__name__)
+
 
 def scene_format(path: str | os.PathLike[str]) -> str | None:
-    """One of `FORMATS`, by content, or by name where the content says nothing; None: it is no scene.
+    """Return one of `FORMATS` by content, or by name where the content does not tell; None for no scene.
 
     Raises:
         ProgdfError: it cannot be read.
     """
     path = scene_file(path)
-    start = read_file(path, 64)
+    start = read_file(path, START_BYTES)
     suffix = path.suffix.lower().lstrip(".")
     if start[:3] == b"ply":
         return "ply"
     if start[:4] == MAGIC:
         return "glb"
-    if start[:4] == b"NGSP" or (start[:2] == b"\x1f\x8b" and _inflate(start)[:4] == b"NGSP"):
+    if start[:4] == b"NGSP":
         return "spz"
+    if start[:2] == GZIP:
+        header = inflate_start(start, 8)  # of an .spz up to version 3; a later one is plain
+        return "spz" if header[:4] == b"NGSP" and header[4:5] <= _SPZ_LAST_GZIP else "gz"
     if suffix in ("ckpt", "pt", "pth") and start[:2] in (b"PK", LEGACY_MAGIC):
         return "ckpt"
-    if start[:4] == b"PK\x03\x04":
-        return "sog" if _sog_meta(path) is not None else None
+    if start[:4] == ZIP:
+        return "sog" if suffix == "sog" or read_table(path) is not None else "zip"
     if path.name.lower() == SOG_META and start.lstrip()[:1] == b"{":
-        return "sog" if _sog_meta(path) is not None else None
+        return "sog" if read_table(path) is not None else None
     if suffix == "gltf":
         return suffix
     if suffix in ("splat", "ksplat"):  # which begin with whatever comes first in the scene
@@ -94,13 +116,13 @@ def scene_format(path: str | os.PathLike[str]) -> str | None:
 
 
 def scene_file(path: str | os.PathLike[str]) -> Path:
-    """The file that a scene is read from: of an unpacked .sog's folder its meta.json."""
+    """Return the file that a scene is read from: of an unpacked .sog's folder its meta.json."""
     path = Path(path)
     return path / SOG_META if os.path.isfile(path / SOG_META) else path
 
 
 def scene_name(path: Path) -> str:
-    """What a scene is called: its file's name, of an unpacked .sog its folder's."""
+    """Return the name of a scene: its file's name, of an unpacked .sog its folder's."""
     return path.parent.name if path.name.lower() == SOG_META else path.name
 
 
@@ -118,17 +140,45 @@ def load_scene(path: str | os.PathLike[str]) -> Gaussians:
 
 
 def load_scene_with_report(path: str | os.PathLike[str]) -> tuple[Gaussians, LoadReport]:
-    """As `load_scene`, with the report of what the file held and what was repaired."""
+    """Return the scene as `load_scene` does, with the report of the file's content and its repairs."""
     path = scene_file(path)
     parts = part_files(path)
     if len(parts) > 1:
         return _load_parts(path, parts)
     kind = scene_format(path)
+    if kind not in CONTAINERS:
+        return _load(path, kind)
+    with unpacked_scene(path) as inner:
+        inner_kind = scene_format(inner)
+        if inner_kind in CONTAINERS:
+            raise ProgdfError(f"{inner} is an archive too; unpack both and give the scene inside")
+        scene, report = _load(inner, inner_kind)
+    description = f"{report.format}, in a .{kind}"
+    return scene, replace(report, file=path.name, file_bytes=path.stat().st_size, format=description)
+
+
+def _load(path: Path, kind: str | None) -> tuple[Gaussians, LoadReport]:
+    """Return the scene of a file that is no archive, and the report.
+
+    Args:
+        path: the file
+        kind: one of `FORMATS`; None lets the reader of .ply tell the reason
+    """
+    start = read_file(path, START_BYTES)
+    is_table = kind == "gltf" or path.name.lower() == SOG_META
+    if not (is_table and start.lstrip()[:1] in (b"{", b"[")):
+        check_foreign(path, start)
+    if kind == "sog":
+        sog = read_sog(path)
+        return _repair(path, sog.gaussians, f".sog {sog.version}", {"ignored_properties": sog.ignored})
     if kind == "ply" or kind is None:
-        ply = read_header(path)  # which knows best what is wrong with a file that is no .ply
+        ply = read_header(path)
         if not is_compressed(ply):
             return load_ply_with_report(path)
-        return _repair(path, read_compressed_ply(ply), "compressed .ply")
+        scene, ignored = read_compressed_ply(ply)
+        return _repair(path, scene, "compressed .ply", {"ignored_properties": ignored})
+    if kind == "splat":
+        return _repair(path, read_splat(path), ".splat")
     if kind == "ksplat":
         scene, level = read_ksplat(path)
         return _repair(path, scene, f".ksplat, level {level}")
@@ -143,23 +193,13 @@ def load_scene_with_report(path: str | os.PathLike[str]) -> tuple[Gaussians, Loa
     if kind == "ckpt":
         checkpoint = read_checkpoint(path)
         return _repair(path, checkpoint.scene, CHECKPOINT, {"ignored_properties": checkpoint.ignored})
-    scene, report = _through_gaussforge(path, kind)
-    description, antialiased = f".{kind}", False
-    if kind == "spz":
-        version, antialiased = _spz_header(path)
-        scene, description = rotate_about_x(scene), f".spz {version}, turned from y up to y down"
-    elif kind == "sog":
-        meta = _sog_meta(path) or {}
-        antialiased = meta.get("model") == "antialiased" or meta.get("antialias") is True
-    report = replace(
-        report,
-        file=scene_name(path),
-        file_bytes=_size(path),
-        format=description,
-        antialiased=antialiased,
-        origin=scene.origin,
+    version, flags = _check_spz(path)
+    antialiased = bool(flags & _SPZ_ANTIALIASED)
+    content = {"ignored_properties": ("extensions",) if flags & _SPZ_EXTENDED else ()}
+    scene = rotate_about_x(replace(_through_gaussforge(path, "spz"), antialiased=antialiased))
+    return _repair(
+        path, scene, f".spz {version}, turned from y up to y down", {"ignored_properties": ignored}
     )
-    return replace(scene, antialiased=antialiased), report
 
 
 def rotate_about_x(scene: Gaussians) -> Gaussians:
@@ -205,23 +245,26 @@ def _load_parts(path: Path, parts: Sequence[Path]) -> tuple[Gaussians, LoadRepor
                 "antialiasing; put the parts of one training into one folder"
             )
     format_name = CHECKPOINT if is_checkpoint else ".ply"
-    content = {"ignored_properties": tuple(ignored), "file_bytes": sum(_size(part) for part in parts)}
+    content = {"ignored_properties": tuple(ignored), "file_bytes": sum(scene_bytes(part) for part in parts)}
     return _repair(path, concatenate(scenes), f"{format_name} in {len(parts)} parts, one per GPU", content)
 
 
 def _repair(
     path: Path, stored: Gaussians, kind: str, content: Mapping[str, Any] = MappingProxyType({})
 ) -> tuple[Gaussians, LoadReport]:
-    """Return the scene as it can be used, and the report of its file.
+    """Return a scene that can be drawn, and the report.
 
     Args:
-        path: the file
-        stored: N Gaussians as they were read, means in the world
+        path: the scene's file
+        stored: N Gaussians as stored, means in the world
         kind: the format, for a person
         content: further fields of the report
+
+    Raises:
+        ProgdfError: no Gaussian is usable.
     """
-    scene, counts = repair(stored)
-    fields = {"file_bytes": _size(path), **content, **counts}
+    scene, counts = repair(stored, path)
+    fields = {"file_bytes": scene_bytes(path), **content, **counts}
     report = LoadReport(
         file=scene_name(path),
         format=kind,
@@ -233,8 +276,8 @@ def _repair(
     return scene, report
 
 
-def _through_gaussforge(path: Path, kind: str) -> tuple[Gaussians, LoadReport]:
-    """The scene as gaussforge reads it, repaired, in the axes of the file.
+def _through_gaussforge(path: Path, kind: str) -> Gaussians:
+    """Return the scene as gaussforge reads it, as stored, in the axes of the file.
 
     Raises:
         ProgdfError: gaussforge is not installed, cannot read the file, crashes on it or takes too long.
@@ -245,7 +288,7 @@ def _through_gaussforge(path: Path, kind: str) -> tuple[Gaussians, LoadReport]:
         if reason := _convert(path, kind, target, "ply"):
             raise _read_error(path, kind, reason)
         try:
-            return load_ply_with_report(target)
+            return read_ply(read_header(target))[0]
         except ProgdfError:
             raise _read_error(path, kind, "returned no scene") from None
 
@@ -261,16 +304,16 @@ def _read_spz_part(path: Path, content: bytes) -> Gaussians:
         part = Path(folder) / "part.spz"
         part.write_bytes(content)
         try:
-            _, antialiased = _spz_header(part)
-            scene, _ = _through_gaussforge(part, "spz")
+            _, flags = _check_spz(part)
+            scene = _through_gaussforge(part, "spz")
         except ProgdfError as error:
             raise ProgdfError(str(error).replace(str(part), f"{path}: its .spz part")) from None
-    return replace(scene, antialiased=antialiased)
+    return replace(scene, antialiased=bool(flags & _SPZ_ANTIALIASED))
 
 
 def _convert(source: Path, kind: str, target: Path, to: str) -> str:
-    """A scene file through gaussforge into another format; what went wrong, or nothing."""
-    size, patience = _size(source), 1 if to == "ply" else _PATIENCE
+    """Convert a scene file with gaussforge; return the reason for a failure, or an empty text."""
+    size, patience = scene_bytes(source), 1 if to == "ply" else _PATIENCE
     memory, output, seconds = (int(base + each * size) for base, each in (_MEMORY, _OUTPUT, SECONDS))
     words = "convert", kind, str(source.resolve()), to, str(target)
     try:
@@ -280,12 +323,13 @@ def _convert(source: Path, kind: str, target: Path, to: str) -> str:
     return _reason(ended.returncode, ended.stderr) if ended.returncode or not target.is_file() else ""
 
 
-def save_scene(path: Path, scene: Gaussians, glb_axes: Axes = "LUF") -> None:
-    """Write a scene in the format that the name asks for; the file appears whole or not at all.
+def save_scene(path: Path, scene: Gaussians, glb_axes: Axes = "LUF") -> ReadBack | None:
+    """Write a scene in the format of the name's ending; the file appears whole or not at all.
 
-    A .ply is exact and is read back and compared. The others are smaller, or are what another program reads:
+    The file is read back and compared before it appears. A .ply is exact. The others are smaller, or serve
+    other programs:
 
-        .compressed.ply   16 bytes a Gaussian and 1 a coefficient; in Morton order, as chunks share a range
+        .compressed.ply   16 bytes per Gaussian, 1 per coefficient; in Morton order, as chunks share a range
         .spz, .sog        8 bits and less; .spz and .usdc are turned to y up, as readers expect
         .splat            32 bytes, without SH bands
         .glb, .usdc       float32, KHR_gaussian_splatting and ParticleField3DGaussianSplat
@@ -295,29 +339,110 @@ def save_scene(path: Path, scene: Gaussians, glb_axes: Axes = "LUF") -> None:
         scene: N Gaussians, finite; bands above degree 3 are left out of all but the .ply
         glb_axes: axes of a .glb, LUF (glTF's own) or RUB (OpenGL's)
 
+    Returns:
+        The scene as a reader gets it, and the differences. None for .ply, which is exact, and for .usdc,
+        which is not read.
+
     Raises:
-        ProgdfError: another ending, an absent package, or what cannot be written.
+        ProgdfError: another ending, an absent package, or a position that the format cannot hold.
     """
     ending = written_format(path)
     if ending == ".ply":
         save_ply_checked(path, scene)
-        return
-    kind, scene = ending[1:], replace(scene, shN=scene.shN[:, : (gltf.MAX_DEGREE + 1) ** 2 - 1])
+        return None
+    check_finite(path, scene)
+    kept = replace(scene, shN=scene.shN[:, : (gltf.MAX_DEGREE + 1) ** 2 - 1])
+    if ending == ".compressed.ply":
+        kept = kept[morton_order(kept.means)]
     with atomic_write(path) as written:
-        if kind == "compressed.ply":
-            write_compressed_ply(written, scene[morton_order(scene.means)])
-        elif kind == "glb":
-            gltf.write_glb(written, scene, glb_axes)
+        if ending == ".compressed.ply":
+            write_compressed_ply(written, kept)
+        elif ending == ".glb":
+            gltf.write_glb(written, kept, glb_axes)
         elif ending == usd.SUFFIX:
-            usd.write_usd(written, [rotate_about_x(scene)])
+            usd.write_usd(written, [rotate_about_x(kept)])
+            return None
         else:
-            _require_gaussforge(path, kind)
-            with tempfile.TemporaryDirectory(prefix="progdf-") as folder:
-                source, target = Path(folder) / "scene.ply", Path(folder) / f"scene.{kind}"
-                save_ply(source, rotate_about_x(scene) if kind == "spz" else scene)
-                if reason := _convert(source, "ply", target, kind):
-                    raise ProgdfError(f"{path} was not written: the writer of .{kind} {reason}")
-                shutil.copyfile(target, written)
+            _write_with_gaussforge(path, written, kept, ending[1:])
+        try:
+            read = load_scene_with_report(written)[0]
+        except ProgdfError as error:
+            reason = str(error).replace(str(written), "the new file")
+            raise ProgdfError(f"{path} was not written: {reason}") from None
+        return compare(path, kept, read, _position_bounds(ending, kept), ending != ".sog")
+
+
+def _write_with_gaussforge(path: Path, written: Path, scene: Gaussians, kind: str) -> None:
+    """Write a scene as .spz, .sog or .splat.
+
+    The library reads no doubles, so positions are float32. It always uses 12 fractional bits for an .spz. A
+    scene that reaches farther is scaled by a power of two, and the header gets the number of bits afterwards.
+
+    Args:
+        path: the file's name, for errors
+        written: the file to write
+        scene: N Gaussians, finite
+        kind: "spz", "sog" or "splat"
+    """
+    _require_gaussforge(path, kind)
+    bits = SPZ_BITS
+    if kind == "spz":
+        bits = _spz_bits(scene)
+        if bits < 0:
+            raise _range_error(path, scene)
+        scene = rotate_about_x(scene)
+    means = (scene.world_means * 2.0 ** (bits - SPZ_BITS)).float()
+    with tempfile.TemporaryDirectory(prefix="progdf-") as folder:
+        source, target = Path(folder) / "scene.ply", Path(folder) / f"scene.{kind}"
+        save_ply(source, replace(scene, means=means, origin=ZERO))
+        if reason := _convert(source, "ply", target, kind):
+            raise ProgdfError(f"{path} was not written: the writer of .{kind} {reason}; write a .ply")
+        if kind == "spz":
+            content = bytearray(gzip.decompress(target.read_bytes()))
+            content[13] = bits
+            content[14] |= _SPZ_ANTIALIASED if scene.antialiased else 0
+            written.write_bytes(gzip.compress(content, mtime=0))
+        else:
+            shutil.copyfile(target, written)
+
+
+def _spz_bits(scene: Gaussians) -> int:
+    """Return the fractional bits with which all positions fit into 24 bits; negative where none do."""
+    farthest = float(scene.world_means.abs().max())
+    bits = SPZ_BITS
+    while bits >= 0 and farthest * 2.0**bits > _SPZ_MAX:
+        bits -= 1
+    return bits
+
+
+def _range_error(path: Path, scene: Gaussians) -> ProgdfError:
+    """Return the error for a scene that reaches farther than an .spz."""
+    means = scene.world_means
+    row, axis = divmod(int(means.abs().argmax()), 3)
+    return ProgdfError(
+        f"{path} was not written: {'xyz'[axis]} of Gaussian {row} is {float(means[row, axis]):.7g}, "
+        f"and an .spz holds ±{_SPZ_MAX}; write a .ply, or a scene nearer to 0"
+    )
+
+
+def _position_bounds(ending: str, scene: Gaussians) -> torch.Tensor:
+    """Return the largest rounding of each coordinate in a format, world units. [N,3] float64
+
+    Args:
+        ending: one of `WRITTEN` that is read back
+        scene: the scene in the order of the file, or of any order for .sog
+    """
+    means = scene.world_means
+    rounding = means.abs() * FLOAT_ROUNDING + torch.finfo(torch.float32).tiny
+    if ending == ".spz":
+        return rounding + 0.5 * 2.0 ** -_spz_bits(scene)
+    if ending == ".sog":
+        logs = means.abs().log1p() * means.sign()
+        step = (logs.amax(dim=0) - logs.amin(dim=0)) / 65535
+        return rounding * 4 + (1 + means.abs()) * (1.01 * step).expm1()
+    if ending == ".compressed.ply":
+        return rounding + 0.5 * position_steps(scene)
+    return rounding
 
 
 def save_frames(
@@ -325,12 +450,13 @@ def save_frames(
 ) -> list[Path]:
     """Write scenes one after the other, see `frame_path`; all appear or none.
 
-    Earlier frames of the same names are replaced when all are written, see `write_files_together`.
+    Earlier frames of the same names are replaced when all are written, see `write_files_together`. Attributes
+    that the format does not hold are logged as a warning, for the first scene that loses them.
 
     Args:
         path: ends in one of `WRITTEN`
         scenes: N Gaussians each; those of a .usdc have the same rows
-        rate: of a .usdc, samples a second
+        rate: samples per second of a .usdc
         glb_axes: as `save_scene`
 
     Returns:
@@ -346,11 +472,15 @@ def save_frames(
     if not path.parent.is_dir():
         raise ProgdfError(f"the folder {path.parent} does not exist; create it first")
     paths = []
+    has_warned = False
     with write_files_together(path.parent) as folder:
         for number, scene in enumerate(scenes):
             frame = frame_path(path, number)
-            save_scene(folder / frame.name, scene, glb_axes)
+            found = save_scene(folder / frame.name, scene, glb_axes)
             paths.append(frame)
+            if found is not None and found.notes and not has_warned:
+                _log.warning("%s: %s", frame, "; ".join(found.notes))
+                has_warned = True
     return paths
 
 
@@ -393,60 +523,34 @@ def _reason(status: int, stderr: bytes) -> str:
 
 
 def _read_error(path: Path, kind: str, why: str) -> ProgdfError:
+    """Return the error for a file that gaussforge did not read.
+
+    Args:
+        path: the file
+        kind: its format
+        why: "said: …" of its own error, or the way in which its process ended
+    """
+    if why.startswith(("said", "returned")):
+        return damage_error(path, f"the reader of .{kind} {why}")
     return ProgdfError(
-        f"{path} cannot be read as .{kind}: its reader {why}; it is damaged: copy or export it again"
+        f"{path} cannot be read as .{kind}: its reader {why}; export it again, as .ply if possible"
     )
 
 
-def _size(path: Path) -> int:
-    """Bytes of the scene: of an unpacked .sog those of its folder's files."""
-    if path.name.lower() != SOG_META:
-        return path.stat().st_size
-    return sum(
-        file.stat().st_size for file in path.parent.iterdir() if file.is_file() and not file.is_symlink()
-    )
-
-
-def _inflate(start: bytes) -> bytes:
-    """What the beginning of a gzip file holds, at most 16 bytes of it."""
-    try:
-        return zlib.decompressobj(wbits=31).decompress(start, 16)
-    except zlib.error:
-        return b""
-
-
-def _spz_header(path: Path) -> tuple[int, bool]:
-    """The version of an .spz, and whether it was trained with Mip-Splatting's 2D filter."""
-    with path.open("rb") as file:
-        start = file.read(4096)
-    head = start if start[:4] == b"NGSP" else _inflate(start)
-    if len(head) < 16:
-        raise _read_error(path, "spz", "found no header")
-    return int.from_bytes(head[4:8], "little"), bool(head[14] & 1)
-
-
-def _sog_meta(path: Path) -> dict[str, object] | None:
-    """The table of an .sog, bundled or not; None: it is none.
+def _check_spz(path: Path) -> tuple[int, int]:
+    """Return the version of an .spz, and its flags.
 
     Raises:
-        ProgdfError: the table is larger than any.
+        ProgdfError: the version or the SH degree is not supported, or the header is damaged.
     """
-    try:
-        if path.name.lower() == SOG_META:
-            content = read_file(path, _MOST_META + 1)
-        else:
-            with zipfile.ZipFile(path) as bundle:
-                if bundle.getinfo(SOG_META).compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-                    return None  # zipfile unpacks others whole, however little of them is read
-                with bundle.open(SOG_META) as file:
-                    content = file.read(_MOST_META + 1)
-        table = decode_json(content) if len(content) <= _MOST_META else None
-    except (OSError, KeyError, ValueError, RuntimeError, zipfile.BadZipFile, zlib.error):
-        return None
-    if len(content) > _MOST_META:
-        raise ProgdfError(
-            f"{path} holds a {SOG_META} of more than {_MOST_META >> 20} MB, an .sog's has some kB; "
-            "it is damaged: copy or export it again"
-        )
-    known = isinstance(table, dict) and "means" in table and "quats" in table
-    return table if known else None
+    start = read_file(path, 4096)
+    header = start if start[:4] == b"NGSP" else inflate_start(start, 16)
+    if header[:4] != b"NGSP" or len(header) < 16:
+        raise damage_error(path, "an .spz begins with 'NGSP', plain or as gzip data, and this file does not")
+    version, degree = int.from_bytes(header[4:8], "little"), header[12]
+    remedy = "export it as .ply, or as .spz version 3"
+    if version not in _SPZ_VERSIONS:
+        raise unsupported_error(path, f".spz version {version}", remedy)
+    if degree > _SPZ_MAX_DEGREE:
+        raise unsupported_error(path, f"SH degree {degree}", remedy)
+    return version, header[14]

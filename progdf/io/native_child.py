@@ -11,11 +11,9 @@ take seconds. What is wrong is one line on stderr, exit 3.
 
 from __future__ import annotations
 
-import io
 import json
 import subprocess
 import sys
-import zipfile
 from contextlib import suppress
 from pathlib import Path
 
@@ -25,32 +23,10 @@ def _convert(kind: str, source: str, to: str, target: str) -> None:
     import gaussforge
 
     path = Path(source)
-    content = _bundle(path) if path.name.lower() == "meta.json" else path.read_bytes()
-    converted = gaussforge.GaussForge().convert(content, kind, to)
+    converted = gaussforge.GaussForge().convert(path.read_bytes(), kind, to)
     if "data" not in converted:
         raise ValueError(str(converted.get("error", "it gives no scene")))
     Path(target).write_bytes(converted["data"])
-
-
-def _bundle(meta: Path) -> bytes:
-    """An unpacked .sog as the archive that it would be: meta.json and the images that it names.
-
-    Raises:
-        ValueError: an image is no regular file of the folder: a pipe is waited for, a link may lead out.
-    """
-    table = json.loads(meta.read_bytes())
-    named = [name for part in table.values() if isinstance(part, dict) for name in part.get("files", ())]
-    archive = io.BytesIO()
-    with zipfile.ZipFile(archive, "w") as out:
-        out.writestr("meta.json", meta.read_bytes())
-        for name in dict.fromkeys(map(str, named)):
-            if Path(name).name != name:
-                raise ValueError("meta.json names images outside its folder")
-            image = meta.parent / name
-            if image.is_symlink() or not image.is_file():
-                raise ValueError(f"{name} is missing, a link or no regular file")
-            out.writestr(name, image.read_bytes())
-    return archive.getvalue()
 
 
 def _cameras(folder: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gzip
 import importlib.util
 import os
 import random
@@ -19,6 +20,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from progdf.formats.ply import save_ply
 from progdf.formats.scene_file import load_scene
 from progdf.io.bundle import unpack_bundle
 from progdf.io.cameras import load_cameras, save_cameras
@@ -29,7 +31,7 @@ from tests.helpers.fuzz_changes import Change, changed_bytes, changed_glb, chang
 from tests.helpers.gltf_files import gltf_with_everything
 from tests.helpers.hostile import NPY_HEADERS
 from tests.helpers.hostile import npy as write_npy
-from tests.helpers.scene_files import write_compressed_ply, write_ksplat, write_scene
+from tests.helpers.scene_files import write_compressed_ply, write_ksplat, write_scene, write_sog1, write_zip
 from tests.helpers.scenes import orbit_camera, random_gaussians
 from tests.helpers.trained import quick_options, train, write_bear
 from trainer.options import FitOptions, RegionOptions, TrainingViewOptions, TrainOptions
@@ -52,7 +54,10 @@ FILES_OF_RUNS = {
 
 GLTF_READERS = ("glb", "gltf", "spz in glb")
 
-COSTLY = ("spz", "spz in glb", "splat", "sog", "colmap", "kernels", *FILES_OF_RUNS)
+CONVERTED = ("spz", "splat", "sog", "sog1", "ksplat", "compressed", "zip", "gz")
+"""Scenes in files of one kind, of which bytes are changed."""
+
+COSTLY = ("spz", "spz in glb", "colmap", "kernels", *FILES_OF_RUNS)
 """A second or so for each input."""
 
 KERNEL = """
@@ -67,7 +72,8 @@ def twice(number):
 def more_inputs(folder: Path, reader: str) -> dict[str, Reader]:
     """The one of these readers that is asked for, as `fuzz.inputs` has it; none, if it is another's."""
     makers: dict[str, Callable[[Path], Reader]] = {
-        **{kind: partial(_converted, kind) for kind in ("spz", "splat", "sog", "ksplat", "compressed")},
+        **{kind: partial(_converted, kind) for kind in CONVERTED},
+        **{kind: partial(_sog_folder, kind) for kind in ("sog1 table", "sog1 image")},
         "bundles": _bundles,
         **{kind: partial(_gltf, kind) for kind in GLTF_READERS},
         "colmap": partial(_colmap, False),
@@ -83,11 +89,21 @@ def more_inputs(folder: Path, reader: str) -> dict[str, Reader]:
 
 def _converted(kind: str, folder: Path) -> Reader:
     scene = random_gaussians(60, seed=2, sh_degree=1 if kind in ("spz", "ksplat") else 0)
-    good = folder / f"good.{'ply' if kind == 'compressed' else kind}"
+    ending = {"compressed": "ply", "sog1": "sog", "gz": "ply.gz"}.get(kind, kind)
+    good = folder / f"good.{ending}"
     if kind == "compressed":
         write_compressed_ply(good, scene)
     elif kind == "ksplat":
         write_ksplat(good, scene, level=1)
+    elif kind == "sog1":
+        write_sog1(good, random_gaussians(60, seed=2, sh_degree=1))
+    elif kind in ("zip", "gz"):
+        save_ply(folder / "plain.ply", scene)
+        content = (folder / "plain.ply").read_bytes()
+        if kind == "gz":
+            good.write_bytes(gzip.compress(content))
+        else:
+            write_zip(good, {"a/scene.ply": content, "b.txt": b"x"})
     else:
         write_scene(good, scene)
 
@@ -96,7 +112,28 @@ def _converted(kind: str, folder: Path) -> Reader:
         for tensor in (found.means, found.log_scales, found.quats, found.logit_opacities, found.sh0):
             assert bool(tensor.isfinite().all())
 
-    return f"x{good.suffix}", read, [changed_bytes(good.read_bytes())]
+    return f"x.{ending}", read, [changed_bytes(good.read_bytes())]
+
+
+def _sog_folder(kind: str, folder: Path) -> Reader:
+    """An unpacked SOG of version 1: other values in its table, or damage in one of its images."""
+    unpacked = write_sog1(folder / "robot", random_gaussians(60, seed=2, sh_degree=1))
+    images = {path.name: path.read_bytes() for path in sorted(unpacked.glob("*.webp"))}
+
+    def change_image(rng: random.Random, path: Path) -> None:
+        for name, content in images.items():
+            (unpacked / name).write_bytes(content)
+        name = rng.choice(list(images))
+        changed_bytes(images[name])(rng, unpacked / name)
+        path.write_bytes((unpacked / name).read_bytes())
+
+    def read(_: Path) -> None:
+        found = load_scene(unpacked)
+        assert bool(found.means.isfinite().all())
+
+    if kind == "sog1 image":
+        return "x.webp", read, [change_image]
+    return "robot/meta.json", read, [changed_json((unpacked / "meta.json").read_bytes())]
 
 
 def _bundles(folder: Path) -> Reader:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import io
+import json
 import struct
+import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from progdf.formats.ply import save_ply
 from progdf.formats.scene_file import rotate_about_x
@@ -69,6 +73,75 @@ def write_compressed_ply(path: Path, scene: Gaussians, comment: str = "", colors
     content += np.stack(chunks).astype("<f4").tobytes() + np.stack(words, axis=1).astype("<u4").tobytes()
     path.write_bytes(content + np.clip((rest / 8 + 0.5) * 256, 0, 255).astype(np.uint8).tobytes())
     return path
+
+
+def write_sog1(path: Path, scene: Gaussians) -> Path:
+    """Write SOG version 1, a zip archive or, without an ending, a folder; each SH row is a palette row.
+
+    The scene has at most 256 Gaussians.
+    """
+    count = len(scene)
+    side = -(-count // 16)
+    tables = {
+        "means": scene.means.sign() * scene.means.abs().log1p(),
+        "scales": scene.log_scales,
+        "sh0": torch.cat([scene.sh0, scene.logit_opacities[:, None]], dim=1),
+    }
+    meta: dict[str, dict[str, object]] = {}
+    images: dict[str, np.ndarray] = {}
+    for name, values in tables.items():
+        table = values.double().numpy()
+        low, high = table.min(axis=0), table.max(axis=0)
+        most = 65535 if name == "means" else 255
+        levels = np.round((table - low) / np.maximum(high - low, 1e-9) * most).astype(np.int64)
+        parts = {"means_l": levels & 255, "means_u": levels >> 8} if name == "means" else {name: levels}
+        images |= parts
+        files = [f"{part}.webp" for part in parts]
+        meta[name] = {"shape": [*table.shape], "mins": low.tolist(), "maxs": high.tolist(), "files": files}
+    quats = scene.unit_quats.numpy()
+    largest = np.abs(quats).argmax(axis=1)
+    quats = quats * np.sign(np.take_along_axis(quats, largest[:, None], 1))
+    others = np.stack([np.delete(q, index) for q, index in zip(quats, largest, strict=True)])
+    levels = np.round((others / np.sqrt(2) + 0.5) * 255).astype(np.int64)
+    images["quats"] = np.concatenate([levels, 252 + largest[:, None]], axis=1)
+    meta["quats"] = {"shape": [count, 4], "encoding": "quaternion_packed", "files": ["quats.webp"]}
+    pixels = {name: _grid(values, (side, 16)) for name, values in images.items()}
+    if functions := scene.shN.shape[1]:
+        low, high = float(scene.shN.min()), float(scene.shN.max())
+        levels = np.round((scene.shN.numpy() - low) / (high - low) * 255).astype(np.int64)
+        labels = np.stack([np.arange(count) & 255, np.arange(count) >> 8, np.zeros(count, np.int64)], axis=1)
+        rows = -(-count // 64)
+        pixels["shN_centroids"] = _grid(levels.reshape(-1, 3), (rows, 64 * functions))
+        pixels["shN_labels"] = _grid(labels, (side, 16))
+        files = ["shN_centroids.webp", "shN_labels.webp"]
+        shape = [count, 3 * functions]
+        meta["shN"] = {"shape": shape, "mins": low, "maxs": high, "quantization": 8, "files": files}
+    contents = {"meta.json": json.dumps(meta).encode()}
+    for name, image in pixels.items():
+        stream = io.BytesIO()
+        Image.fromarray(image).save(stream, "WEBP", lossless=True, exact=True)
+        contents[f"{name}.webp"] = stream.getvalue()
+    if path.suffix:
+        return write_zip(path, contents)
+    path.mkdir()
+    for name, content in contents.items():
+        (path / name).write_bytes(content)
+    return path
+
+
+def write_zip(path: Path, contents: dict[str, bytes], compression: int = zipfile.ZIP_DEFLATED) -> Path:
+    """Write a zip archive of files by their names."""
+    with zipfile.ZipFile(path, "w", compression) as archive:
+        for name, content in contents.items():
+            archive.writestr(name, content)
+    return path
+
+
+def _grid(values: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    """Return rows of channels as an image, padded with zeros. [N,C] -> [H,W,C] uint8"""
+    image = np.zeros((shape[0] * shape[1], values.shape[1]), np.uint8)
+    image[: len(values)] = values
+    return image.reshape(*shape, -1)
 
 
 def write_ksplat(path: Path, scene: Gaussians, level: int, per_bucket: int = 32, block: float = 20.0) -> Path:

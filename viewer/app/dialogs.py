@@ -279,7 +279,7 @@ POLL_S = 0.05
 
 _OPEN = [
     "Scenes, edits, sessions, cameras",
-    "*.ply *.spz *.splat *.ksplat *.sog *.glb *.gltf *.ckpt *.gdf *.cube *.json",
+    "*.ply *.spz *.splat *.ksplat *.sog *.glb *.gltf *.ckpt *.zip *.gz *.gdf *.cube *.json",
     "All files",
     "*",
 ]

@@ -30,6 +30,7 @@ from progdf.io.bundle import BUNDLE, write_bundle
 from progdf.io.cameras import read_camera
 from progdf.io.picture_camera import camera_chunk
 from progdf.metrics.image import NO_DIFFERENCE
+from progdf.metrics.readback import ReadBack
 from progdf.scene.strays import picture_difference
 from progdf.terminal import file_size, format_count, print_line
 from progdf.threads import one_thread
@@ -100,11 +101,11 @@ def export(argv: Sequence[str]) -> int:
         return _export_frames(options, opened)
     document, strengths = opened.document, describe_strengths(opened.view)
     edited = _compose(opened.document, opened.view)
-    scene_file.save_scene(out, edited, options.glb_axes)
+    read_back = scene_file.save_scene(out, edited, options.glb_axes)
     far = (
         ", x y z as doubles as it is far from 0" if document.scene.origin != ZERO and ending == ".ply" else ""
     )
-    how = "read back and compared" if ending == ".ply" else _describe_loss(out, edited)
+    how = "read back and compared" if ending == ".ply" else _describe_loss(out, edited, read_back)
     print_line(f"wrote {out}: {format_count(len(edited))}, {strengths}{far}; {how}")
     kind = "ply" if document.path is None else scene_file.scene_format(document.path)
     if ending == ".ply" and kind != "ply":
@@ -147,14 +148,25 @@ def _compose(document: Document, view: ViewState, share: float = 1.0, whole: boo
     return edited if whole else edited[remaining_rows(document.original, edited)]
 
 
-def _describe_loss(out: Path, edited: Gaussians) -> str:
-    """What a format of fewer bits or bands has changed, in pictures of what is read back."""
+def _describe_loss(out: Path, edited: Gaussians, read_back: ReadBack | None) -> str:
+    """Return the size of a written scene, and its largest shift and picture error when it is read back.
+
+    Args:
+        out: the file
+        edited: the scene that was written
+        read_back: the scene in the file; None for a .usdc, which is not read
+    """
     size = f"{file_size(out.stat().st_size)}, {out.stat().st_size / len(edited):.1f} bytes each"
-    if out.suffix.lower() == usd.SUFFIX:
+    if read_back is None:
         return f"{size}, exact float32"
-    mean, worst = picture_difference(edited, scene_file.load_scene_with_report(out)[0])
-    shown = "no pixel differs" if mean == NO_DIFFERENCE else f"{mean:.1f} dB to it, {worst:.1f} at worst"
-    return f"{size}; read back: {shown}"
+    shift = "positions exact"
+    if read_back.position_error:
+        shift = f"positions within {read_back.position_error:.2g}"
+    mean, worst = picture_difference(edited, read_back.scene)
+    pictures = f"{mean:.1f} dB to it, {worst:.1f} at worst"
+    if mean == NO_DIFFERENCE:
+        pictures = "no pixel differs"
+    return "; ".join([size, f"read back: {shift}, {pictures}", *read_back.notes])
 
 
 def _export_bundle(out: Path, opened: OpenStack) -> int:

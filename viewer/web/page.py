@@ -34,7 +34,7 @@ from progdf.errors import ProgdfError
 from progdf.field.baked import AttributeBases, GradeForm
 from progdf.field.grade import sphere
 from progdf.field.separable import quantize_bases
-from progdf.formats.compressed_ply import morton_order
+from progdf.formats.packed.compressed_ply import morton_order
 from progdf.gaussians import ATTRIBUTES, Gaussians
 from progdf.gdf.file import UNSEEN_LOGIT, Gdf
 from progdf.io.images import to_picture

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
+import gzip
 import json
-import os
 import subprocess
 import sys
-import tracemalloc
 import zipfile
 from collections.abc import Callable
 from dataclasses import replace
@@ -20,7 +19,7 @@ from progdf.__main__ import main
 from progdf.cli.info import kind_of
 from progdf.errors import ProgdfError
 from progdf.formats import scene_file as formats
-from progdf.formats.ply import load_ply
+from progdf.formats.ply import load_ply, save_ply
 from progdf.formats.scene_file import (
     load_scene,
     load_scene_with_report,
@@ -36,7 +35,7 @@ from progdf.quaternions import rotation_matrices
 from progdf.rasterize import render
 from progdf.sh import rgb_to_sh0, sh0_to_rgb, shade
 from tests.helpers.refused import refusal
-from tests.helpers.scene_files import write_compressed_ply, write_ksplat, write_scene
+from tests.helpers.scene_files import write_compressed_ply, write_ksplat, write_scene, write_sog1, write_zip
 from tests.helpers.scenes import orbit_camera, random_gaussians
 
 Write = Callable[[Path, Gaussians], Path]
@@ -61,6 +60,20 @@ def saved(path: Path, scene: Gaussians) -> Path:
     return path
 
 
+def zipped(path: Path, scene: Gaussians) -> Path:
+    """As Luma exports it: a .ply in a zip archive."""
+    save_ply(path.with_suffix(".ply"), scene)
+    content = path.with_suffix(".ply").read_bytes()
+    return write_zip(path, {"luma/scene.ply": content, "__MACOSX/luma/._scene.ply": b"x", ".DS_Store": b"x"})
+
+
+def gzipped(path: Path, scene: Gaussians) -> Path:
+    """A scene with .gz behind its name."""
+    write_scene(path.with_suffix(""), scene)
+    path.write_bytes(gzip.compress(path.with_suffix("").read_bytes()))
+    return path
+
+
 WRITERS: dict[str, tuple[Write, str, int]] = {
     "compressed": (write_compressed_ply, "scene.ply", 3),
     "compressed, older": (
@@ -76,6 +89,9 @@ WRITERS: dict[str, tuple[Write, str, int]] = {
     "spz 3": (lambda path, scene: write_scene(path, scene, 3), "scene.spz", 2),
     "spz 4": (lambda path, scene: write_scene(path, scene, 4), "scene.spz", 3),
     "sog": (write_scene, "scene.sog", 3),
+    "sog 1": (write_sog1, "scene.sog", 2),
+    "zip": (zipped, "scene.zip", 3),
+    "gz": (gzipped, "scene.splat.gz", 0),
     "saved compressed": (saved, "scene.compressed.ply", 3),
     "saved splat": (saved, "scene.splat", 0),
     "saved spz": (saved, "scene.spz", 3),
@@ -85,10 +101,10 @@ WRITERS: dict[str, tuple[Write, str, int]] = {
 """How each is written, its name, and the degree of its spherical harmonics."""
 
 MEANS = {"compressed": 4e-3, "compressed, older": 4e-3, "ksplat 1": 4e-4, "ksplat 2": 4e-4}
-MEANS |= {"spz 2": 2e-4, "spz 3": 2e-4, "spz 4": 2e-4, "sog": 1e-3}
+MEANS |= {"sog 1": 1e-4, "spz 2": 2e-4, "spz 3": 2e-4, "spz 4": 2e-4, "sog": 1e-3}
 """Largest error of a center: half a step of each format over a cloud about 7 wide; the others keep floats."""
 SH = {"compressed": 0.017, "ksplat 1": 5e-4, "ksplat 2": 6e-3, "spz 2": 0.07, "spz 3": 0.07, "spz 4": 0.07}
-SH |= {"sog": 0.03}
+SH |= {"sog": 0.03, "sog 1": 0.01}
 for saved_one in ("compressed", "spz", "sog"):
     MEANS[f"saved {saved_one}"] = MEANS.get(saved_one, 2e-4)
     SH[f"saved {saved_one}"] = SH.get(saved_one, 0.07)
@@ -98,7 +114,7 @@ for saved_one in ("compressed", "spz", "sog"):
 @pytest.mark.parametrize("name", WRITERS)
 def test_every_format_gives_the_scene_that_was_written(name: str, tmp_path: Path) -> None:
     writer, file, degree = WRITERS[name]
-    scene = scene_of(degree)
+    scene = scene_of(degree, 200)
     path = writer(tmp_path / file, scene)
     assert kind_of(path) == "scene"
     found, report = load_scene_with_report(path)
@@ -110,7 +126,8 @@ def test_every_format_gives_the_scene_that_was_written(name: str, tmp_path: Path
         scene = scene[nearest]
     assert float((found.means - scene.means).abs().max()) <= MEANS.get(name, 0.0)
     assert float((found.log_scales - scene.log_scales).abs().max()) <= 0.033  # SPZ: half of 1/16
-    assert float((found.opacities - scene.opacities).abs().max()) <= 1.01 / 255
+    # SOG 1 keeps a byte of the logit
+    assert float((found.opacities - scene.opacities).abs().max()) <= (0.01 if name == "sog 1" else 1.01 / 255)
     assert float((found.sh0 - scene.sh0).abs().max()) <= 0.0142  # a byte of 0..1 truncated, of band 0
     angles = (found.quats * scene.quats).sum(dim=1).abs().clamp(max=1.0).acos() * 2
     # SPZ 2 keeps x, y, z as bytes, which w near 0 is worked out from
@@ -143,68 +160,6 @@ def test_half_a_turn_about_x_turns_what_is_seen() -> None:
     shapes, shapes_before = frames @ frames.mT, expected @ expected.mT
     torch.testing.assert_close(shapes, shapes_before * turn * turn[:, None])
     assert torch.equal(turned.means, scene.means * turn)
-
-
-def test_an_unpacked_sog_opens_by_its_folder_and_by_its_table(tmp_path: Path) -> None:
-    bundle = write_scene(tmp_path / "scene.sog", scene_of(1))
-    folder = tmp_path / "robot"
-    with zipfile.ZipFile(bundle) as archive:
-        archive.extractall(folder)
-    expected = load_scene(bundle)
-    for path in (folder, folder / "meta.json"):
-        assert kind_of(path) == "scene"
-        scene, report = load_scene_with_report(path)
-        assert torch.equal(scene.means, expected.means)
-        assert report.file == "robot"
-    assert main(["info", str(folder)]) == 0
-
-
-def test_a_sog_that_names_files_elsewhere_is_refused(tmp_path: Path) -> None:
-    with zipfile.ZipFile(write_scene(tmp_path / "scene.sog", scene_of())) as archive:
-        archive.extractall(tmp_path / "robot")
-    meta = tmp_path / "robot" / "meta.json"
-    table = json.loads(meta.read_text())
-    table["quats"]["files"] = ["../../secret.webp"]
-    meta.write_text(json.dumps(table))
-    assert "names images outside its folder" in refusal(load_scene, meta)
-
-
-@pytest.mark.parametrize("kind", ["link", "pipe", "folder", "missing"])
-def test_an_image_of_a_sog_that_is_no_regular_file_is_refused_at_once(kind: str, tmp_path: Path) -> None:
-    with zipfile.ZipFile(write_scene(tmp_path / "scene.sog", scene_of())) as archive:
-        archive.extractall(tmp_path / "robot")
-    image = tmp_path / "robot" / "quats.webp"
-    image.rename(tmp_path / "outside.webp")
-    if kind == "link":
-        image.symlink_to(tmp_path / "outside.webp")
-    elif kind == "pipe":
-        os.mkfifo(image)
-    elif kind == "folder":
-        image.mkdir()
-    assert "quats.webp is missing, a link or no regular file" in refusal(load_scene, tmp_path / "robot")
-
-
-@pytest.mark.parametrize("packed", [zipfile.ZIP_DEFLATED, zipfile.ZIP_LZMA, None])
-def test_the_table_of_a_sog_is_bounded_before_it_is_parsed(packed: int | None, tmp_path: Path) -> None:
-    """15 kB that unpack to 16 MB, also where the archive says that they are 2."""
-    content = b'{"means": {}, "quats": [' + b"0," * 7_999_900 + b"0]}"
-    path = tmp_path / ("meta.json" if packed is None else "a.sog")
-    if packed is None:
-        path.write_bytes(content)
-    else:
-        with zipfile.ZipFile(path, "w", packed) as archive:
-            archive.writestr("meta.json", content)
-        path.write_bytes(path.read_bytes().replace(len(content).to_bytes(4, "little"), b"\2\0\0\0"))
-    tracemalloc.start()
-    refusal(load_scene, path)
-    most = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert most < 8 << 20
-
-
-def test_a_table_of_a_sog_that_is_too_large_is_told(tmp_path: Path) -> None:
-    (tmp_path / "meta.json").write_text('{"means": {}, "quats": "' + "a" * (1 << 20) + '"}')
-    assert "a meta.json of more than 1 MB" in refusal(load_scene, tmp_path / "meta.json")
 
 
 def test_saturated_opacities_are_clamped_and_counted(tmp_path: Path) -> None:
@@ -256,7 +211,7 @@ def test_info_and_export_say_what_the_scene_was(tmp_path: Path, capsys: pytest.C
 def test_a_reader_that_crashes_hangs_or_is_missing_is_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path = write_scene(tmp_path / "a.splat", scene_of())
+    path = write_scene(tmp_path / "a.spz", scene_of())
     script = tmp_path / "child.py"
     monkeypatch.setattr(native_child, "__file__", str(script))
     monkeypatch.setattr(formats, "SECONDS", (1, 0.0))

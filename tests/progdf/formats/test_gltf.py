@@ -711,7 +711,7 @@ def test_a_damaged_file_is_one_line_in_words_of_gltf(change: Change, said: str, 
         (b"glTF" + struct.pack("<IIII", 2, 99, 0, 0), "it has 20 of 99 bytes"),
         (b"glTF" + struct.pack("<IIII", 2, 20, 9, 0x4E4F534A), "not the whole JSON"),
         (b"glTF" + struct.pack("<IIII", 2, 22, 2, 0x4E4F534A) + b"{}", "names no version"),
-        (b"gltf", "does not begin with glTF"),
+        (b"gltf\2\0\0\0", "does not begin with glTF"),
     ],
 )
 def test_a_broken_container_is_one_line(content: bytes, said: str, tmp_path: Path) -> None:

@@ -190,7 +190,8 @@ def test_other_kinds_of_file_are_called_by_their_name(tmp_path: Path) -> None:
     assert "compressed" in refusal(load_ply, write(path, packed))
     for content, said in (
         (b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345678\n", "git lfs pull"),
-        (b"hello\n", "not a .ply"),
+        (b"hello\n", "text file"),
+        (b"\1\2\3\4\n", "not a .ply"),
         (b"", "0 bytes"),
         (b"\x1f\x8b\x08\x00", "gzip"),
         (b"PK\x03\x04", "zip"),

@@ -12,6 +12,7 @@ from progdf.formats.ply import load_ply, load_ply_with_report
 from progdf.formats.repair import INVISIBLE_LOGIT, OPAQUE_LOGIT, LoadReport
 from progdf.gaussians import ATTRIBUTES, Gaussians
 from tests.helpers.ply_files import COUNT, assert_same, camera_element, scene_of, table_of, with_extra, write
+from tests.helpers.refused import refusal
 
 
 def damaged(tmp_path: Path, changes: dict[str, tuple[int, float]]) -> tuple[Gaussians, LoadReport]:
@@ -84,9 +85,36 @@ def test_an_exactly_flat_gaussian_stays_visible(tmp_path: Path) -> None:
 
 def test_repairs_are_logged_by_load_ply(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     columns = table_of(scene_of())
-    columns["x"] = np.full(COUNT, np.nan, np.float32)
-    load_ply(write(tmp_path / "all_bad.ply", columns))
-    assert "50 Gaussians made invisible" in caplog.text
+    columns["x"][1:] = np.nan
+    load_ply(write(tmp_path / "most_bad.ply", columns))
+    assert "49 Gaussians made invisible" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("column", "value", "reason"),
+    [
+        ("scale_0", np.nan, "50 of 50 Gaussians have a NaN scale"),
+        ("x", np.inf, "50 of 50 Gaussians have an infinite position"),
+        ("scale_1", 90.0, "50 of 50 Gaussians have a far too large scale"),
+        ("opacity", np.nan, "50 of 50 Gaussians have a NaN opacity"),
+        ("rot_3", np.nan, "50 of 50 Gaussians have a NaN rotation"),
+        ("f_dc_2", -np.inf, "50 of 50 Gaussians have an infinite color"),
+    ],
+)
+def test_scene_without_a_usable_row_is_refused(
+    column: str, value: float, reason: str, tmp_path: Path
+) -> None:
+    columns = table_of(scene_of())
+    columns[column] = np.full(COUNT, value, np.float32)
+    assert reason in refusal(load_ply, write(tmp_path / "a.ply", columns))
+
+
+def test_unusable_rows_for_two_reasons_are_both_named(tmp_path: Path) -> None:
+    columns = table_of(scene_of())
+    columns["x"][:20] = np.nan
+    columns["opacity"][20:] = np.nan
+    message = refusal(load_ply, write(tmp_path / "a.ply", columns))
+    assert "20 of 50 Gaussians have a NaN position, 30 of 50 Gaussians have a NaN opacity" in message
 
 
 def test_the_report_names_what_was_ignored(tmp_path: Path) -> None:

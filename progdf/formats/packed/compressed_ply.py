@@ -15,12 +15,13 @@ from plyfile import PlyData, PlyElement
 from torch import Tensor
 
 from progdf.errors import ProgdfError
+from progdf.formats.ply_file import ANTIALIASED_COMMENT, PlyFile
 from progdf.gaussians import ATTRIBUTES, Gaussians, from_arrays
+from progdf.io.file_rules import damage_error, unsupported_error
 from progdf.sh import C0
 
-from .ply_file import ANTIALIASED_COMMENT, PlyFile
-
 _CHUNK = 256
+_CONVERT = "convert it with `splat-transform in.ply out.compressed.ply`"
 _MORTON_BITS = 21  # of each axis: three fit a word
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _XYZ, _SCALES, _RGB = ("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b")
@@ -34,27 +35,37 @@ def is_compressed(ply: PlyFile) -> bool:
     return "packed_position" in ply.columns("vertex")
 
 
-def read_compressed_ply(ply: PlyFile) -> Gaussians:
-    """The scene as stored in the file; opacities of 0 and 1 give infinite logits, to be repaired.
+def read_compressed_ply(ply: PlyFile) -> tuple[Gaussians, tuple[str, ...]]:
+    """Return the scene as stored, and the properties of its Gaussians that are not used.
+
+    Opacities of 0 and 1 give infinite logits, which are to be repaired.
 
     Raises:
-        ProgdfError: a table is missing or does not fit the others.
+        ProgdfError: a table is missing or does not fit the others, or a feature is not supported.
     """
     name, count, counts = ply.path, ply.counts["vertex"], ply.counts
     if ply.layout.text:
-        raise ProgdfError(f"{name} is a compressed .ply of an unknown kind; export it as a plain 3DGS .ply")
+        raise unsupported_error(name, "packed Gaussians as text (format ascii)", _CONVERT)
     if not count:
         raise ProgdfError(f"{name} holds 0 Gaussians; a scene needs at least one: export it again")
-    if counts.get("chunk") != -(-count // _CHUNK):
-        raise ProgdfError(f"{name} is a compressed .ply without its chunks; export it again")
+    chunks = -(-count // _CHUNK)
+    if counts.get("chunk") != chunks:
+        found = counts.get("chunk", 0)
+        raise damage_error(name, f"{count} packed Gaussians need {chunks} chunks, and it has {found}")
     vertex, chunk, sh = (ply.columns(element) for element in ("vertex", "chunk", "sh"))
-    if "sh" in counts and (counts["sh"] != count or len(sh) not in _SH_REST):
-        raise ProgdfError(f"{name} has an element 'sh' that does not fit its Gaussians; export it again")
+    if "sh" in counts and counts["sh"] != count:
+        raise damage_error(name, f"the element 'sh' has {counts['sh']} rows for {count} Gaussians")
+    if len(sh) not in _SH_REST:
+        raise unsupported_error(name, f"{len(sh)} SH coefficients (0, 9, 24 or 45 are)", _CONVERT)
+    if wide := next((column for column, kind in sh.items() if kind != "u1"), None):
+        raise unsupported_error(name, f"'{wide}' of another type than uchar", _CONVERT)
     ranged = [_XYZ, _SCALES, *([_RGB] if "min_r" in chunk else [])]
     needed = [f"{edge}_{name}" for names in ranged for name in names for edge in ("min", "max")]
-    missing = [n for n in needed if n not in chunk] + [n for n in _PACKED if vertex.get(n) != "u4"]
+    missing = [n for n in needed if n not in chunk] + [n for n in _PACKED if n not in vertex]
     if missing:
-        raise ProgdfError(f"{name} is a compressed .ply without {missing[0]}; export it again")
+        raise damage_error(name, f"a compressed .ply has {missing[0]}, and this one lacks it")
+    if other := next((column for column in _PACKED if vertex[column] != "u4"), None):
+        raise unsupported_error(name, f"'{other}' of another type than uint", _CONVERT)
     (ranges, packed, *bands), _ = ply.rows("chunk", "vertex", *(["sh"] if sh else []))
     at = np.arange(count) // _CHUNK
     position, rotation, scale, color = (packed[column].astype(np.uint32) for column in _PACKED)
@@ -73,7 +84,8 @@ def read_compressed_ply(ply: PlyFile) -> Gaussians:
         "sh0": (rgb - 0.5) / C0,
         "shN": higher,
     }
-    return from_arrays(arrays, ply.antialiased)
+    ignored = tuple(column for column in vertex if column not in _PACKED)
+    return from_arrays(arrays, ply.antialiased), ignored
 
 
 def write_compressed_ply(path: Path, scene: Gaussians) -> None:
@@ -125,6 +137,20 @@ def write_compressed_ply(path: Path, scene: Gaussians) -> None:
         elements.append(PlyElement.describe(rows, "sh"))
     comments = [ANTIALIASED_COMMENT] if scene.antialiased else []
     PlyData(elements, byte_order="<", comments=comments).write(str(path))
+
+
+def position_steps(scene: Gaussians) -> Tensor:
+    """Return the distance of neighboring values of each coordinate in a file. [N,3] float64
+
+    Args:
+        scene: N Gaussians in the order of the file
+    """
+    means = scene.world_means.float().double()
+    steps = torch.tensor([2.0**11 - 1, 2.0**10 - 1, 2.0**11 - 1], dtype=torch.float64)
+    parts = [means[start : start + _CHUNK] for start in range(0, len(scene), _CHUNK)]
+    spans = [part.amax(dim=0) - part.amin(dim=0) for part in parts]
+    rows: Tensor = torch.stack(spans).repeat_interleave(_CHUNK, dim=0)[: len(scene)] / steps
+    return rows
 
 
 def morton_order(means: Tensor) -> Tensor:
@@ -188,7 +214,9 @@ def _higher_bands(name: Path, rows: npt.NDArray[np.void], count: int) -> Floats:
     names = [f"f_rest_{i}" for i in range(count)]
     absent = next((column for column in names if column not in (rows.dtype.names or ())), None)
     if absent:
-        raise ProgdfError(f"{name} is a compressed .ply that lacks {absent}; export it again")
+        raise damage_error(
+            name, f"{count} SH coefficients are f_rest_0 to f_rest_{count - 1}, {absent} is missing"
+        )
     values = np.stack([rows[column] for column in names], axis=1).astype(np.float32)
     share = np.where(values == 0, 0.0, np.where(values == 255, 1.0, (values + 0.5) / 256.0))
     return ((share - 0.5) * 8.0).reshape(len(rows), 3, -1).transpose(0, 2, 1).astype(np.float32)

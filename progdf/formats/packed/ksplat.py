@@ -1,8 +1,11 @@
-""".ksplat (the format of GaussianSplats3D) → Gaussians.
+""".splat (antimatter15's viewer) and .ksplat (GaussianSplats3D) → Gaussians.
 
-A header of 4096 bytes, one of 1024 for each section, then the sections: buckets' centers and rows. Level 0
-keeps float32; levels 1 and 2 keep positions as shares of their bucket, and half floats, SH of level 2 as
-bytes. Colors and opacities are bytes; SH stands band by band, channel-major within a band.
+A .splat is rows of 32 bytes without a header: float32 positions and linear scales, then bytes of color,
+opacity and rotation.
+
+A .ksplat is a header of 4096 bytes, one of 1024 for each section, then the sections: the centers of buckets,
+and rows. Level 0 keeps float32. Levels 1 and 2 keep positions as shares of their bucket, and half floats. SH
+of level 2 are bytes. Colors and opacities are bytes. SH stands band by band, channel-major within a band.
 """
 
 from __future__ import annotations
@@ -17,11 +20,14 @@ import numpy.typing as npt
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians, from_arrays
 from progdf.io.atomic import read_file
+from progdf.io.file_rules import damage_error, unsupported_error
 from progdf.sh import C0
 
 _HEADER, _SECTION = 4096, 1024
+_CONVERT = "convert it with `splat-transform in.ksplat out.ply`"
 _SH_REST = (0, 9, 24, 45)
 _SH_TYPES = ("<f4", "<f2", "u1")
+_SPLAT_ROW = np.dtype([("xyz", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
 _LEAST_SCALE = 2e-9
 """In place of a scale of 0, whose logarithm is not finite; see `repair.FLAT_LOG_SCALE`."""
 
@@ -43,19 +49,47 @@ _SECTION_FIELDS = {
 """Types and places in a section's header."""
 
 
-def read_ksplat(path: str | os.PathLike[str]) -> tuple[Gaussians, int]:
-    """The scene as stored in the file, and its compression level 0..2.
+def read_splat(path: str | os.PathLike[str]) -> Gaussians:
+    """Return the scene as stored in a .splat file.
+
+    Opacities of 0 and 1 give infinite logits, which are to be repaired.
 
     Raises:
-        ProgdfError: it is no .ksplat, or truncated or damaged.
+        ProgdfError: its size is no multiple of 32 bytes.
     """
     content = read_file(path)
-    if len(content) < _HEADER or content[0] != 0 or content[1] < 1:  # version 0.1 and later
-        raise ProgdfError(f"{path} is not a .ksplat scene; export it again")
+    if len(content) % _SPLAT_ROW.itemsize:
+        raise damage_error(path, f"a .splat has rows of 32 bytes, the file has {len(content)} bytes")
+    rows = np.frombuffer(content, _SPLAT_ROW)
+    sh0, logits = _decode_colors(rows["rgba"])
+    arrays = {
+        "means": rows["xyz"].astype(np.float32),
+        "quats": (rows["quat"].astype(np.float32) - 128.0) / 128.0,
+        "log_scales": _logs(rows["scale"].astype(np.float32)),
+        "logit_opacities": logits,
+        "sh0": sh0,
+        "shN": np.zeros((len(rows), 0, 3), np.float32),
+    }
+    return from_arrays(arrays)
+
+
+def read_ksplat(path: str | os.PathLike[str]) -> tuple[Gaussians, int]:
+    """Return the scene as stored in the file, and its compression level, 0 to 2.
+
+    Raises:
+        ProgdfError: the version, the level or the SH degree is not supported, or the file is damaged.
+    """
+    content = read_file(path)
+    if len(content) < _HEADER:
+        raise damage_error(path, f"the header of a .ksplat has {_HEADER} bytes, the file {len(content)}")
+    if content[0] != 0 or content[1] < 1:
+        raise unsupported_error(path, f".ksplat version {content[0]}.{content[1]}", _CONVERT)
     level = _number(content, 20, "<u2")
     sections = _number(content, 4, "<u4")
-    if level > 2 or _HEADER + sections * _SECTION > len(content):
-        raise _damage_error(path)
+    if level > 2:
+        raise unsupported_error(path, f"compression level {level} (0, 1 and 2 are)", _CONVERT)
+    if _HEADER + sections * _SECTION > len(content):
+        raise damage_error(path, f"it ends within the headers of its {sections} sections")
     low, high = (float(np.frombuffer(content, "<f4", 1, at)[0]) for at in (36, 40))
     sh_range = (low or -1.5, high or 1.5)
     at, parts = _HEADER + sections * _SECTION, []
@@ -65,20 +99,25 @@ def read_ksplat(path: str | os.PathLike[str]) -> tuple[Gaussians, int]:
         if not section["rows"] and not section["most_rows"]:
             continue
         if section["degree"] > 3:
-            raise _damage_error(path)
+            raise unsupported_error(path, f"SH degree {section['degree']}", _CONVERT)
         row = _row_layout(level, section["degree"])
         centers_at = at + 4 * section["partial_buckets"]
         rows_at = centers_at + section["bucket_bytes"] * section["buckets"]
         end = rows_at + row.itemsize * section["most_rows"]
-        if end > len(content) or section["rows"] > section["most_rows"]:
-            raise _damage_error(path)
+        if end > len(content):
+            raise damage_error(path, f"a section ends at byte {end}, the file has {len(content)}")
+        if section["rows"] > section["most_rows"]:
+            raise damage_error(path, f"a section of {section['most_rows']} rows claims {section['rows']}")
         rows = np.frombuffer(content, row, section["rows"], rows_at)
         centers = _centers(path, content, section, at, centers_at) if level else None
         parts.append(_unpack(rows, section, centers, level, sh_range))
         at = end
     count = sum(len(part["means"]) for part in parts)
-    if not count or count != _number(content, 16, "<u4"):
-        raise _damage_error(path)
+    declared = _number(content, 16, "<u4")
+    if count != declared:
+        raise damage_error(path, f"it declares {declared} Gaussians, its sections hold {count}")
+    if not count:
+        raise ProgdfError(f"{path} holds 0 Gaussians; a scene needs at least one: export it again")
     most = max(part["shN"].shape[1] for part in parts)
     for part in parts:
         part["shN"] = np.pad(part["shN"], ((0, 0), (0, most - part["shN"].shape[1]), (0, 0)))
@@ -103,24 +142,36 @@ def _unpack(
     if centers is not None:
         quantum = section["quantum"] or 32767
         means = np.asarray((means - quantum) * (section["block"] / 2 / quantum) + centers, np.float32)
-    scales = rows["scale"].astype(np.float32)
-    share = rows["rgba"].astype(np.float32) / 255
+    sh0, logits = _decode_colors(rows["rgba"])
     sh = rows["sh"].astype(np.float32).reshape(len(rows), -1)
     if level == 2:
         sh = np.asarray(sh_range[0] + sh / 255 * (sh_range[1] - sh_range[0]), np.float32)
     bands = [sh[:, 3 * (l * l - 1) : 3 * ((l + 1) ** 2 - 1)] for l in range(1, section["degree"] + 1)]
     higher = [band.reshape(len(rows), 3, -1).transpose(0, 2, 1) for band in bands]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        logits = np.log(share[:, 3]) - np.log1p(-share[:, 3])
-        log_scales = np.log(np.where(scales == 0, np.float32(_LEAST_SCALE), scales))
     return {
         "means": means,
         "quats": rows["quat"].astype(np.float32),
-        "log_scales": log_scales,
+        "log_scales": _logs(rows["scale"].astype(np.float32)),
         "logit_opacities": logits,
-        "sh0": (share[:, :3] - 0.5) / np.float32(C0),
+        "sh0": sh0,
         "shN": np.concatenate([np.zeros((len(rows), 0, 3), np.float32), *higher], axis=1),
     }
+
+
+def _decode_colors(rgba: npt.NDArray[np.uint8]) -> tuple[Floats, Floats]:
+    """Return SH band 0 and the logits of opacity from bytes. [N,4] -> [N,3] and [N]"""
+    shares = rgba.astype(np.float32) / 255
+    with np.errstate(divide="ignore"):
+        logits = np.log(shares[:, 3]) - np.log1p(-shares[:, 3])
+    sh0 = (shares[:, :3] - 0.5) / np.float32(C0)
+    return np.asarray(sh0, np.float32), logits
+
+
+def _logs(scales: Floats) -> Floats:
+    """Return log-scales; a scale of 0 becomes a very thin one, a negative one NaN."""
+    with np.errstate(invalid="ignore"):
+        logs: Floats = np.log(np.where(scales == 0, np.float32(_LEAST_SCALE), scales))
+    return logs
 
 
 def _centers(
@@ -134,7 +185,7 @@ def _centers(
     later = section["full_buckets"] + np.searchsorted(ends[1:], index, side="right")
     bucket = np.where(index < full_rows, index // max(section["bucket_size"], 1), later)
     if section["bucket_bytes"] < 12 or (len(index) and int(bucket.max()) >= section["buckets"]):
-        raise _damage_error(path)
+        raise damage_error(path, "a row lies in a bucket that is not there")
     kind = np.dtype({"names": ["xyz"], "formats": [("<f4", 3)], "itemsize": section["bucket_bytes"]})
     centers: Floats = np.frombuffer(content, kind, section["buckets"], centers_at)["xyz"][bucket]
     return centers
@@ -142,7 +193,3 @@ def _centers(
 
 def _number(content: bytes, at: int, kind: str) -> int:
     return int(np.frombuffer(content, kind, 1, at)[0])
-
-
-def _damage_error(path: str | os.PathLike[str]) -> ProgdfError:
-    return ProgdfError(f"{path} is a .ksplat that is truncated or damaged; copy or export it again")

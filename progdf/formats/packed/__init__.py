@@ -1,0 +1,1 @@
+"""Scenes in quantized formats: compressed .ply, .splat, .ksplat and SOG."""
