@@ -197,9 +197,7 @@ def _load(path: Path, kind: str | None) -> tuple[Gaussians, LoadReport]:
     antialiased = bool(flags & _SPZ_ANTIALIASED)
     content = {"ignored_properties": ("extensions",) if flags & _SPZ_EXTENDED else ()}
     scene = rotate_about_x(replace(_through_gaussforge(path, "spz"), antialiased=antialiased))
-    return _repair(
-        path, scene, f".spz {version}, turned from y up to y down", {"ignored_properties": ignored}
-    )
+    return _repair(path, scene, f".spz {version}, turned from y up to y down", content)
 
 
 def rotate_about_x(scene: Gaussians) -> Gaussians:
