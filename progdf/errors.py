@@ -1,4 +1,4 @@
-"""The one kind of error that a person at the keyboard can mend."""
+"""User-facing errors, and checks of the arguments of public functions."""
 
 from __future__ import annotations
 
@@ -10,14 +10,29 @@ from .terminal import elide, escape_text
 
 
 class ProgdfError(ValueError):
-    """Something the user can mend: a broken file, a wrong option, two files that do not belong together.
+    """Error that the user can correct: a broken file, a wrong option, two files that do not belong together.
 
-    The message is one line, `WHAT IS WRONG; WHAT WOULD BE RIGHT`, whatever names in files hold; see `elide`
-    for long values. Commands print it and exit with status 2.
+    The message is one line, `PROBLEM; REMEDY`, even if names in files hold line breaks; `elide` shortens long
+    values. Commands print it and exit with status 2.
     """
 
     def __str__(self) -> str:
         return elide(escape_text(" ".join(super().__str__().split())))
+
+
+def check_first_argument(call: str, value: object, kind: type | tuple[type, ...]) -> None:
+    """Check the type of a public function's first argument.
+
+    Args:
+        call: the function with its arguments, such as "save_scene(path, scene)"
+        value: the first argument
+        kind: its type
+
+    Raises:
+        TypeError: the value has another type, for example since the arguments are swapped.
+    """
+    if not isinstance(value, kind):
+        raise TypeError(f"the first argument is of type {type(value).__name__}; call {call}")
 
 
 def is_out_of_memory(error: BaseException) -> bool:

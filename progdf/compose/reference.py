@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from progdf.color.oklab import smoothstep
+from progdf.errors import check_first_argument
 from progdf.field.baked import BakedField, GradeForm
 from progdf.field.grade import adjust_colors, map_share
 from progdf.gaussians import ATTRIBUTES, Gaussians
@@ -151,6 +152,7 @@ def compose_layers(scene: Gaussians, layers: Sequence[Layer], blend: str = "norm
         ProgdfError: an edit belongs to another scene, a strength is not a number, the blend rule is unknown.
         ValueError: weights do not fit.
     """
+    check_first_argument("compose_layers(scene, layers)", scene, Gaussians)
     edits = {id(layer.gdf): layer.gdf for layer in layers}
     scene, extended = extend(scene, list(edits.values()))
     edits = dict(zip(edits, extended, strict=True))

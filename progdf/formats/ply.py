@@ -21,7 +21,7 @@ from plyfile import PlyData, PlyElement
 from torch import Tensor
 
 from progdf.color.oklab import srgb_from_linear
-from progdf.errors import ProgdfError
+from progdf.errors import ProgdfError, check_first_argument
 from progdf.gaussians import ATTRIBUTES, ZERO, Gaussians, from_arrays
 from progdf.io.atomic import atomic_write
 from progdf.io.file_rules import PLAIN_GAUSSIANS, check_fields, unsupported_error, variant_fields
@@ -62,6 +62,7 @@ def load_ply(path: str | os.PathLike[str]) -> Gaussians:
     Raises:
         ProgdfError: the file is missing, broken, holds no Gaussians, or is no 3DGS .ply.
     """
+    check_first_argument("load_ply(path)", path, (str, os.PathLike))
     scene, report = load_ply_with_report(path)
     report.log()
     return scene
@@ -184,6 +185,7 @@ def save_ply(path: str | os.PathLike[str], scene: Gaussians) -> None:
     Raises:
         ProgdfError: the scene is empty or holds a NaN or an infinity, or the folder does not exist.
     """
+    check_first_argument("save_ply(path, scene)", path, (str, os.PathLike))
     if not len(scene):
         raise ProgdfError(f"{path} was not written: the scene has no Gaussians; a .ply needs at least one")
     for key in ATTRIBUTES:

@@ -25,7 +25,7 @@ from typing import Any
 import torch
 
 from progdf import sh
-from progdf.errors import ProgdfError
+from progdf.errors import ProgdfError, check_first_argument
 from progdf.gaussians import ZERO, Gaussians, concatenate
 from progdf.io import native_child
 from progdf.io.atomic import atomic_write, read_file, write_files_together
@@ -134,6 +134,7 @@ def load_scene(path: str | os.PathLike[str]) -> Gaussians:
     Raises:
         ProgdfError: the file is missing, broken or no scene, or its reader is not installed.
     """
+    check_first_argument("load_scene(path)", path, (str, os.PathLike))
     scene, report = load_scene_with_report(path)
     report.log()
     return scene
@@ -344,6 +345,7 @@ def save_scene(path: Path, scene: Gaussians, glb_axes: Axes = "LUF") -> ReadBack
     Raises:
         ProgdfError: another ending, an absent package, or a position that the format cannot hold.
     """
+    check_first_argument("save_scene(path, scene)", path, (str, os.PathLike))
     ending = written_format(path)
     if ending == ".ply":
         save_ply_checked(path, scene)

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.utils.weak import WeakIdKeyDictionary
 
-from progdf.errors import ProgdfError
+from progdf.errors import ProgdfError, check_first_argument
 from progdf.field.bake import bake_form, rows_hash
 from progdf.field.baked import BakedField, GradeForm, NeuralForm
 from progdf.field.grade import bake_grade, lattice_form, map_alone
@@ -142,6 +142,7 @@ def save_gdf(path: str | os.PathLike[str], gdf: Gdf) -> None:
         ValueError: a number of the field is not finite.
         TypeError: options or report hold something JSON cannot.
     """
+    check_first_argument("save_gdf(path, gdf)", path, (str, os.PathLike))
     field, tensors = header.pack_field(gdf.field)
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     tensors |= header.pack_region(gdf.region) | header.pack_added(gdf.added)
@@ -185,6 +186,7 @@ def load_gdf(
         ProgdfError: see `read_gdf`, `apply_grade`; or it was made for another scene; or it is to be baked and
             no scene is given.
     """
+    check_first_argument("load_gdf(path, scene)", path, (str, os.PathLike))
     gdf, name = read_gdf(path), Path(path).name
     if scene is not None:
         region = place(gdf)

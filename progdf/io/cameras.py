@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from progdf.camera import Camera
-from progdf.errors import ProgdfError
+from progdf.errors import ProgdfError, check_first_argument
 from progdf.gaussians import ZERO, Origin
 
 from .atomic import read_file, write_file
@@ -76,6 +76,7 @@ def load_cameras(path: str | os.PathLike[str], origin: Origin = ZERO) -> list[Ca
         ProgdfError: nothing of that name, none of these kinds, several of them in one folder, a broken
             camera, or one that is no pinhole behind a lens with k1, k2, k3, p1, p2 (fisheye, k4 and more).
     """
+    check_first_argument("load_cameras(path)", path, (str, os.PathLike))
     cameras, report = load_cameras_with_report(path, origin)
     for note in report.notes:
         _warn_once(note)

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from progdf.camera import Camera
-from progdf.errors import ProgdfError
+from progdf.errors import ProgdfError, check_first_argument
 from progdf.gaussians import Gaussians
 from progdf.sh import rgb_to_sh0
 
@@ -227,6 +227,7 @@ def render(
             `grad_rows` are given although the camera wants gradients, which need all rows.
         ProgdfError: more (Gaussian, tile) pairs than memory should hold.
     """
+    check_first_argument("render(scene, camera)", gaussians, (Gaussians, ActivatedGaussians))
     activated = activate(gaussians, colors) if isinstance(gaussians, Gaussians) else gaussians
     if colors is not None:
         activated = activated._replace(colors=colors)

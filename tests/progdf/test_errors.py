@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -12,6 +12,8 @@ import pytest
 import progdf
 from progdf.__main__ import COMMANDS
 from progdf.errors import without_commands
+from progdf.gaussians import Gaussians
+from tests.helpers.scenes import random_gaussians
 
 ROOT = Path(progdf.__file__).resolve().parents[1]
 TYPED = re.compile(rf"(?<![\w/.-])--[a-z]|pip install|hf download|progdf ({'|'.join(COMMANDS)})\b")
@@ -61,3 +63,24 @@ def test_no_error_of_ours_has_a_command_line_in_the_window() -> None:
 )
 def test_what_is_wrong_stays_and_what_one_can_do_by_hand(error: str, shown: str) -> None:
     assert without_commands(error) == shown
+
+
+@pytest.mark.parametrize(
+    ("call", "expected"),
+    [
+        (lambda scene, path: progdf.save_scene(scene, path), "save_scene(path, scene)"),
+        (lambda scene, path: progdf.save_ply(scene, path), "save_ply(path, scene)"),
+        (lambda scene, path: progdf.load_scene(scene), "load_scene(path)"),
+        (lambda scene, path: progdf.load_ply(scene), "load_ply(path)"),
+        (lambda scene, path: progdf.load_gdf(scene, path), "load_gdf(path, scene)"),
+        (lambda scene, path: progdf.save_gdf(scene, path), "save_gdf(path, gdf)"),
+        (lambda scene, path: progdf.load_cameras(scene), "load_cameras(path)"),
+        (lambda scene, path: progdf.compose_layers([], scene), "compose_layers(scene, layers)"),
+        (lambda scene, path: progdf.render(path, scene), "render(scene, camera)"),
+    ],
+)
+def test_swapped_arguments_name_the_right_call(
+    call: Callable[[Gaussians, Path], object], expected: str, tmp_path: Path
+) -> None:
+    with pytest.raises(TypeError, match=re.escape(expected)):
+        call(random_gaussians(3, seed=1), tmp_path / "scene.ply")
