@@ -224,7 +224,8 @@ class _Body:
         near = self.members[nearest[:, 0]]
         reach = np.maximum(self._spacing_of(near), self._extents[near])
         empty: Floats = np.log(np.maximum(distances[:, 0], 1e-30)) - np.log(reach)
-        return empty.reshape(len(ends), 4).max(axis=1)
+        largest: Floats = empty.reshape(len(ends), 4).max(axis=1)
+        return largest
 
     def loneliness(self, rows: Rows) -> Floats:
         """Return the log of how much farther the neighbors of some members are than theirs. [M] -> [M]"""
@@ -277,7 +278,8 @@ class _Body:
             reach = self._extents[some, None] + self._extents[near[:, half:]]
             self._spacing[some] = distances[:, -1]
             self._touches[some] = (distances[:, half:] <= reach).any(axis=1)
-        return np.maximum(self._spacing[rows], 1e-30)
+        spacing: Floats = np.maximum(self._spacing[rows], 1e-30)
+        return spacing
 
     def _search(self, rows: Rows) -> tuple[Floats, Rows]:
         """Return the distances and rows of the neighbors of some members. [M] -> [M,16] each"""
