@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import ctypes
-import importlib.util
 import math
-import os
-import sys
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, wait
-from pathlib import Path
 from typing import Any, TypeVar
 
 import moderngl
@@ -19,14 +15,8 @@ from PIL import Image, ImageDraw, ImageFont
 from progdf.errors import ProgdfError
 from viewer.gl.programs import load_program
 
-_BUNDLE = Path(getattr(importlib.util.find_spec("imgui_bundle"), "origin", "")).parent
-_GLFW = _BUNDLE / {"darwin": "libglfw.3.dylib", "win32": "glfw3.dll"}.get(sys.platform, "libglfw.so.3")
-if _GLFW.exists():  # what imgui was built with, as its import would have it: there is one window of them both
-    os.environ.setdefault("PYGLFW_LIBRARY", str(_GLFW))
-
-# isort: split
-
-import glfw  # noqa: E402
+from .glfw_library import BUNDLE, glfw
+from .placement import keep_on_screen
 
 _Made = TypeVar("_Made")
 
@@ -36,7 +26,7 @@ PANEL, FIELD, TEXT, ACCENT = 0x1E2024, 0x383C43, 0xDEE1E6, 0x5A9CF0
 """Colors of the palette, 0xRRGGBB."""
 _INKS = [f"#{color:06x}" for color in (PANEL, FIELD, TEXT, ACCENT)]
 TEXT_PX = 15.0
-FONTS = _BUNDLE / "assets" / "fonts"
+FONTS = BUNDLE / "assets" / "fonts"
 REGULAR = FONTS / "Roboto" / "Roboto-Regular.ttf"
 AFTER_S, EVERY_S = 0.15, 0.1
 """How long one waits before a splash is shown, and between two frames of it."""
@@ -48,6 +38,7 @@ _HINTS = (
     (glfw.OPENGL_PROFILE, glfw.OPENGL_CORE_PROFILE),
     (glfw.OPENGL_FORWARD_COMPAT, True),
     (glfw.SCALE_TO_MONITOR, True),
+    (glfw.VISIBLE, False),  # until it lies on the screen
     (glfw.DEPTH_BITS, 0),
     (glfw.STENCIL_BITS, 0),
 )
@@ -58,7 +49,7 @@ class Splash:
 
     Args:
         title: in the title bar
-        size: width and height at 1×
+        size: width and height at 1×; less where the screen is smaller
 
     Raises:
         ProgdfError: there is no display, or no OpenGL 3.3 on it.
@@ -75,7 +66,8 @@ class Splash:
         if not self.handle:
             glfw.terminate()
             raise _no_window("no window with OpenGL 3.3 can be opened here", errors)
-        glfw.set_window_size_limits(self.handle, *LEAST, glfw.DONT_CARE, glfw.DONT_CARE)
+        keep_on_screen(self.handle, LEAST)
+        glfw.show_window(self.handle)
         glfw.make_context_current(self.handle)
         glfw.swap_interval(1)
         # through glfw's own loader, so that GLX, EGL, WGL and Cocoa all do

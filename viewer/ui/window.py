@@ -15,14 +15,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from .splash import Splash  # first: it says which library glfw loads
-
-# isort: split
-
-import glfw
 from imgui_bundle import imgui
 
+from .glfw_library import glfw
 from .keys import FLY_KEYS, Keys, Press, end_frame_here, has_pending_input, next_event_id
+from .placement import Box, Frame, fit_box, window_box, window_frame, work_areas
+from .splash import LEAST, Splash
 
 LONGEST_S = 0.3
 """Between the two presses of a double click, as imgui has it."""
@@ -100,7 +98,7 @@ class Window:
         self._pressed: list[Press] = []
         self._down: dict[int, str] = {}  # names of the keys that are down
         self._chorded: set[int] = set()  # those of them that went down with Ctrl, and do not fly without it
-        self._windowed: tuple[int, int, int, int] | None = None
+        self._windowed: tuple[Box, Frame] | None = None  # of the window before it filled the screen
         self._clicks = DoubleClicks()
         self._heard_until = time.perf_counter()  # when it last stopped listening, to draw
         self._unheard_s = 0.0  # how long it had not listened when it last began to
@@ -187,16 +185,19 @@ class Window:
         return int(width), int(height)
 
     @property
-    def density(self) -> float:
-        """Pixels of the framebuffer per design pixel."""
-        return max(float(glfw.get_window_content_scale(self.handle)[0]), 0.5)
-
-    @property
     def ui_scale(self) -> float:
-        """Window coordinates per design pixel: the screen's density, less what the coordinates hide of it."""
+        """Window coordinates per design pixel, at least 0.5.
+
+        It is the scale of the screen, except the part that the coordinates hide, and less where the window is
+        smaller than `LEAST` at that scale, so that all tools stay in reach.
+        """
+        pixels = self.pixels[0]
+        if not pixels:
+            return 1.0
+        width, height = glfw.get_window_size(self.handle)
         content = float(glfw.get_window_content_scale(self.handle)[0])
-        pixels, coordinates = self.pixels[0], int(glfw.get_window_size(self.handle)[0])
-        return max(content * coordinates / pixels, 0.5) if pixels else 1.0
+        fitting = min(width / LEAST[0], height / LEAST[1])
+        return max(min(content * width / pixels, fitting), 0.5)
 
     def take_keys(self) -> Keys:
         """What the keyboard did since the last call."""
@@ -234,14 +235,17 @@ class Window:
         glfw.set_window_title(self.handle, title)
 
     def toggle_full_screen(self) -> None:
+        """Fill the primary monitor, or go back to the earlier place, as far as it is still on a screen."""
         if self._windowed is not None:
             no_monitor: Any = None
-            glfw.set_window_monitor(self.handle, no_monitor, *self._windowed, glfw.DONT_CARE)
+            box = fit_box(*self._windowed, work_areas())
+            place = (box.x, box.y, box.width, box.height)
+            glfw.set_window_monitor(self.handle, no_monitor, *place, glfw.DONT_CARE)
             self._windowed = None
             return
         monitor = glfw.get_primary_monitor()
         if monitor:
-            self._windowed = (*glfw.get_window_pos(self.handle), *glfw.get_window_size(self.handle))
+            self._windowed = (window_box(self.handle), window_frame(self.handle))
             mode = glfw.get_video_mode(monitor)
             glfw.set_window_monitor(
                 self.handle, monitor, 0, 0, mode.size.width, mode.size.height, mode.refresh_rate
