@@ -271,7 +271,7 @@ def test_the_test_of_what_is_started_sees_each_way(code: str) -> None:
 ORIGIN_AT = {
     "load_cameras": 1,
     "read_camera": 1,
-    "cameras_beside": 1,
+    "load_cameras_with_report": 1,
     "camera_in_picture": 1,
     "save_cameras": 2,
     "cameras_to_json": 2,

@@ -76,5 +76,6 @@ def views(argv: Sequence[str]) -> int:
     options = parse_options(WriteViewsOptions, argv, "progdf views")
     from .regions.command import write
 
-    print_line(write(options))
+    for line in write(options):
+        print_line(line)
     return 0

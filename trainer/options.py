@@ -132,6 +132,8 @@ class TrainingViewOptions:
     cameras: Annotated[Path | None, absent_option("PATH", "a rig that looks at the region")] = None
     """cameras.json, transforms.json or the folder of a COLMAP model; without it, a rig that looks at
     the region."""
+    cameras_anyway: bool = False
+    """Use --cameras although most of them do not show the scene, as those of another frame do not."""
     up: UpChoice = "auto"
     """The axis of the scene that is up. auto: from the cameras, else from the ground, else −y."""
     views: int = 0
@@ -392,6 +394,8 @@ class ShowRegionOptions:
     """picture.png, in which the region is tinted and the rest is pale; or members.npy, its rows (int64)."""
     cameras: Annotated[Path | None, absent_option("PATH", "none")] = None
     """masks: their cameras, where DIR holds none; text: views in which to look for it."""
+    cameras_anyway: bool = False
+    """Use --cameras although most of them do not show the scene, as those of another frame do not."""
     camera: Annotated[str | None, absent_option("FILE[:INDEX]", "four sides")] = None
     """Look through a camera of this file, the first where no INDEX is given; without it the picture shows
     four sides."""
@@ -419,6 +423,8 @@ class WriteViewsOptions:
     """Folder for original/NAME.png and cameras.json."""
     cameras: Annotated[Path | None, absent_option("PATH", "a rig around the scene")] = None
     """cameras.json, transforms.json or the folder of a COLMAP model; without it, a rig around the scene."""
+    cameras_anyway: bool = False
+    """Use --cameras although most of them do not show the scene, as those of another frame do not."""
     region: Annotated[str | None, absent_option("STR", "the whole scene")] = None
     """The rig looks at this region instead of the whole scene."""
     views: int = 12

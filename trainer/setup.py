@@ -15,7 +15,6 @@ from torch import Tensor
 from progdf.camera import Camera
 from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians, concatenate
-from progdf.io.cameras import load_cameras
 from progdf.io.images import write_image
 from progdf.io.picture_camera import up_in_picture
 from progdf.rasterize.engines import engine_device
@@ -31,7 +30,14 @@ from .editors.procedural import ColorEditor, StripesEditor
 from .options import COLOR_VIEWS, VIEWS, Kind, TrainingViewOptions
 from .store.progress import Advance
 from .store.run_folder import LazySequence, RunFolder, add_pictures, from_bytes, stored_pictures, to_bytes
-from .views.choose import ViewChoice, choose_views, in_frame, sample_members, split_views
+from .views.choose import (
+    ViewChoice,
+    choose_views,
+    in_frame,
+    load_given_cameras,
+    sample_members,
+    split_views,
+)
 from .views.crops import CropScene, crop_scene
 from .views.view import (
     BACKGROUND,
@@ -123,12 +129,14 @@ def make_training_setup(options: TrainingViewOptions, scene: Gaussians, region: 
         ProgdfError: no camera sees the region, or none are given and the scene is one to stand inside.
     """
     background = torch.tensor(BACKGROUND)
-    given = [] if options.cameras is None else load_cameras(options.cameras, scene.origin)
+    found = load_given_cameras(options, scene)
+    given = found.cameras
     up = find_up(scene, given, options.up, options.scene)
     if options.pictures:
         if options.up == "auto" and (pictured_up := _up_of_pictures(options.pictures)) is not None:
             up = pictured_up
-        return _picture_setup(options, scene, region, given, up)
+        setup = _picture_setup(options, scene, region, given, up)
+        return replace(setup, notes=[*found.notes, *setup.notes])
     if options.cameras is None and is_surrounding(scene, up.direction):
         raise ProgdfError(f"the scene {INSIDE}")
 
@@ -150,7 +158,7 @@ def make_training_setup(options: TrainingViewOptions, scene: Gaussians, region: 
     else:
         choice = choose_views(scene, region, cameras_of(views), views, background)
         train, held_out = split_views(choice, min(aside, max(1, len(choice.views) // 5)))
-    notes = [f"up is {up.name}, {up.reason}"]
+    notes = [*found.notes, f"up is {up.name}, {up.reason}"]
     notes += [choice.line()] if len(choice.views) < choice.offered else []
     if any(view.camera.lens for view in choice.views):
         notes.append(
@@ -166,7 +174,7 @@ def take_glances(options: TrainingViewOptions, scene: Gaussians, region: Region)
     The first few of the given cameras' that show it, spread over their list, or a rig's; none where the scene
     is one to stand inside and has no cameras.
     """
-    given = [] if options.cameras is None else load_cameras(options.cameras, scene.origin)
+    given = load_given_cameras(options, scene).cameras
     up = find_up(scene, given, options.up, options.scene).direction
     count = max(3, min(_GLANCES, _DRAWN // len(scene)))
     if given:

@@ -22,9 +22,10 @@ from progdf.gaussians import ZERO, Gaussians
 from progdf.gdf.file import read_gdf
 from progdf.io import session as session_file
 from progdf.io.atomic import read_file
-from progdf.io.cameras import holds_cameras, load_cameras, load_cameras_with_report
+from progdf.io.cameras import holds_cameras, load_cameras_with_report
 from progdf.scene import UpChoice
 from progdf.scene.bounds import is_surrounding, scene_sphere
+from progdf.scene.scene_cameras import SceneCameras, load_scene_cameras
 from progdf.scene.strays import find_strays
 from progdf.scene.up_axis import UpAxis, find_up
 from progdf.terminal import (
@@ -180,9 +181,12 @@ def kind_of(path: str | os.PathLike[str]) -> str:
 def _scene_lines(path: Path, cameras: Path | None, up: UpChoice) -> Iterator[str]:
     """Describe a scene: its repairs, its size and place, and its strays."""
     scene, report = load_scene_with_report(path)
-    views = [] if cameras is None else load_cameras(cameras, scene.origin)
+    found = SceneCameras([])
+    if cameras is not None:
+        found = load_scene_cameras(cameras, scene, path, anyway=True)
     yield from report.lines()
-    yield from survey(scene, find_up(scene, views, up, path)).lines()
+    yield from found.notes
+    yield from survey(scene, find_up(scene, found.cameras, up, path)).lines()
     if (camera := stored_view(path, scene.origin).camera) is not None:
         yield f"camera: the file stores one of {camera.width}x{camera.height} pixels, which is the first view"
     with notice_when_slow(f"looking for strays among {format_count(len(scene))} …"):

@@ -77,7 +77,8 @@ _NERFSTUDIO_REFUSED = {
 }
 _NERFSTUDIO_HONORED = frozenset(
     ("frames", "transform_matrix", "file_path", "w", "h", "fl_x", "fl_y", "camera_angle_x", "camera_angle_y",
-     "x_fov", "y_fov", "cx", "cy", "k1", "k2", "k3", "p1", "p2", "camera_model", "camera_type")
+     "x_fov", "y_fov", "cx", "cy", "k1", "k2", "k3", "p1", "p2", "camera_model", "camera_type",
+     "applied_transform", "applied_scale")
 )  # fmt: skip
 
 _INRIA_REFUSED = {
@@ -220,6 +221,24 @@ def read_nerfstudio_camera(
     viewmat = torch.linalg.inv(make_rigid(where, c2w))
     K = make_intrinsics(*focal, *_principal_point(size, frame.cx, frame.cy))
     return make_camera(where, viewmat, K, size, name, lens or None), ignored
+
+
+class _Applied(msgspec.Struct):
+    """The way from the dataset's world to the frame of a transforms.json."""
+
+    applied_transform: Annotated[list[_Row4], msgspec.Meta(min_length=3, max_length=4)] | None = None
+    applied_scale: Annotated[float, msgspec.Meta(gt=0, lt=3e38)] = 1.0
+
+
+def read_applied_transform(file: str, content: object) -> Tensor:
+    """Return the similarity from the dataset's world to the frame of a transforms.json. [4,4] float64"""
+    applied = _read(file, content, _Applied)
+    matrix = torch.eye(4, dtype=torch.float64)
+    if applied.applied_transform is not None:
+        matrix[:3] = torch.tensor(applied.applied_transform[:3], dtype=torch.float64)
+    matrix = make_rigid(f"applied_transform of {file}", matrix).clone()
+    matrix[:3] *= applied.applied_scale
+    return matrix
 
 
 def _read(where: str, entry: object, kind: type[_T]) -> _T:

@@ -25,7 +25,12 @@ from progdf.errors import ProgdfError, check_first_argument
 from progdf.gaussians import ZERO, Origin
 
 from .atomic import read_file, write_file
-from .camera_json import read_inria_camera, read_nerfstudio_camera, read_own_camera
+from .camera_json import (
+    read_applied_transform,
+    read_inria_camera,
+    read_nerfstudio_camera,
+    read_own_camera,
+)
 from .colmap import ColmapModel, find_model, load_model, open_model
 from .json_values import decode_json
 from .picture_files import without_common_folder
@@ -47,6 +52,9 @@ class CameraReport:
 
     notes: tuple[str, ...]  # one line each, such as the choice among several COLMAP models
     ignored: tuple[str, ...]  # fields of the file that are not read
+    # way from the world of the dataset to the file's, which `applied_transform` of a transforms.json tells;
+    # None: the cameras were saved by this program, in the frame of a scene. [4,4] float64
+    dataset: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -78,6 +86,12 @@ def load_cameras(path: str | os.PathLike[str], origin: Origin = ZERO) -> list[Ca
     """
     check_first_argument("load_cameras(path)", path, (str, os.PathLike))
     cameras, report = load_cameras_with_report(path, origin)
+    log_cameras(path, cameras, report)
+    return cameras
+
+
+def log_cameras(path: str | os.PathLike[str], cameras: Sequence[Camera], report: CameraReport) -> None:
+    """Log the remarks on how cameras were read."""
     for note in report.notes:
         _warn_once(note)
     bent = sum(camera.lens is not None for camera in cameras)
@@ -86,7 +100,6 @@ def load_cameras(path: str | os.PathLike[str], origin: Origin = ZERO) -> list[Ca
             "%s: %d of %d cameras have a lens that bends photographs; what is drawn is straight",
             path, bent, len(cameras),
         )  # fmt: skip
-    return cameras
 
 
 def load_cameras_with_report(
@@ -157,20 +170,12 @@ def read_camera(text: str, origin: Origin = ZERO) -> Camera:
     return replace(cameras[number], sampling=1.0)
 
 
-def cameras_beside(path: Path, origin: Origin = ZERO) -> list[Camera]:
-    """The cameras in a scene's folder or, of an Inria model's point_cloud/iteration_N, in the model's.
-
-    They are relative to `origin`, as of `load_cameras`. None where there are none, or they cannot be told
-    apart or read.
-    """
+def beside_folder(path: Path) -> Path:
+    """Return the folder that may have a scene's cameras: its own, or an Inria model's of iteration_N."""
     folder = path.resolve().parent
     if folder.name.startswith("iteration_") and folder.parent.name == "point_cloud":
-        folder = folder.parent.parent
-    try:
-        cameras, _ = _read_source(_search_folder(folder))
-        return [_enter(camera, origin, os.fspath(folder)) for camera in cameras]
-    except (ProgdfError, OSError):
-        return []
+        return folder.parent.parent
+    return folder
 
 
 def _find_source(path: str | os.PathLike[str]) -> _Source:
@@ -209,7 +214,7 @@ def _read_source(source: _Source) -> tuple[list[Camera], CameraReport]:
     """Return the cameras in the world, in float64, and the report."""
     if source.model is not None:
         notes = (source.model.note,) if source.model.note else ()
-        return load_model(source.model), CameraReport(notes, ())
+        return load_model(source.model), CameraReport(notes, (), torch.eye(4, dtype=torch.float64))
     path = source.file
     name = os.fspath(path)
     data = read_file(path)
@@ -225,7 +230,17 @@ def _read_source(source: _Source) -> tuple[list[Camera], CameraReport]:
             f"{name} is not JSON ({error}); give a cameras.json, a transforms.json or a file of saved cameras"
         ) from None
     cameras, ignored = _from_content(name, content, path)
-    return cameras, CameraReport((), ignored)
+    return cameras, CameraReport((), ignored, _dataset_frame(name, content))
+
+
+def _dataset_frame(name: str, content: Any) -> Tensor | None:
+    """Return `CameraReport.dataset` of a camera file's JSON value."""
+    match content:
+        case {"frames": list()}:
+            return read_applied_transform(name, content)
+        case [{"rotation": _, "position": _}, *_]:
+            return torch.eye(4, dtype=torch.float64)
+    return None
 
 
 def camera_in_picture(path: str | os.PathLike[str], origin: Origin = ZERO) -> Camera | None:

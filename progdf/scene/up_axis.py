@@ -19,11 +19,11 @@ from progdf.formats.ply_view import PlyView, stored_view
 from progdf.gaussians import Gaussians
 from progdf.gdf.file import fingerprint
 from progdf.io.atomic import state_folder, write_file
-from progdf.io.cameras import cameras_beside
 from progdf.io.json_values import decode_json
 
 from . import Axis
-from .bounds import drop_background, front_direction, long_axes, normals_of, scene_sphere
+from .bounds import drop_background, front_direction, long_axes, normals_of
+from .scene_cameras import scene_cameras_beside
 
 MAX_REMEMBERED = 200
 """Scenes that are remembered; the oldest go."""
@@ -162,11 +162,7 @@ def find_up(
         return UpAxis(_snap(view.up, _LEVEL), f"as the comment '{view.up_comment}' in the file says")
     if view.camera is not None and (up := _held_up([view.camera])) is not None:
         return UpAxis(up, "as the camera stored in the file is held")
-    beside = (
-        []
-        if path is None
-        else [camera for camera in cameras_beside(path, scene.origin) if _sees(camera, scene)]
-    )
+    beside = [] if path is None or not len(scene) else scene_cameras_beside(path, scene)
     if (up := _held_up(beside)) is not None:
         return UpAxis(up, f"as the {len(beside)} cameras beside the scene's file are held")
     return _weigh(scene)
@@ -183,13 +179,6 @@ def _held_up(cameras: Sequence[Camera]) -> Tensor | None:
         return None
     mean = torch.stack([-camera.viewmat[1, :3] for camera in cameras]).mean(dim=0)
     return _snap(torch.nn.functional.normalize(mean, dim=0), _LEVEL) if float(mean.norm()) > 0.5 else None
-
-
-def _sees(camera: Camera, scene: Gaussians) -> bool:
-    """Whether the scene's middle is in the picture, as where cameras belong to it."""
-    center = camera.viewmat[:3, :3] @ scene_sphere(scene)[0] + camera.viewmat[:3, 3]
-    x, y, depth = (float(c) for c in camera.K @ center)
-    return depth > 0 and 0 <= x <= camera.width * depth and 0 <= y <= camera.height * depth
 
 
 def _snap(direction: Tensor, cosine: float) -> Tensor:

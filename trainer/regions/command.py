@@ -16,7 +16,7 @@ from progdf.errors import ProgdfError
 from progdf.formats.scene_file import load_scene
 from progdf.gaussians import Gaussians
 from progdf.io.atomic import make_folder, write_files_together
-from progdf.io.cameras import load_cameras, read_camera, save_cameras
+from progdf.io.cameras import read_camera, save_cameras
 from progdf.io.images import write_image
 from progdf.io.tensors import save_npy
 from progdf.region import Region, whole_scene
@@ -33,7 +33,7 @@ from trainer.options import (
     WriteViewsOptions,
     check_ranges,
 )
-from trainer.views.choose import choose_views
+from trainer.views.choose import choose_views, load_given_cameras
 from trainer.views.view import (
     BACKGROUND,
     INSIDE,
@@ -74,14 +74,17 @@ def show(options: ShowRegionOptions) -> list[str]:
     lines: list[str] = []
     with tempfile.TemporaryDirectory() as folder:
         masks = RegionOptions(options.spec, options.lift_rule, options.lift_threshold)
-        views = TrainingViewOptions(options.cameras, options.up, scene=options.scene)
+        views = TrainingViewOptions(
+            options.cameras, options.cameras_anyway, options.up, scene=options.scene
+        )
         request = RegionRequest(masks, views, lambda: Path(folder), say=lines.append)
         region = parse_region(options.spec, scene, kinds=region_kinds(request), say=lines.append)
     if suffix == ".npy":
         save_npy(options.out, region.members.numpy())
     else:
-        given = [] if options.cameras is None else load_cameras(options.cameras, scene.origin)
-        up = find_up(scene, given, options.up, options.scene).direction
+        found = load_given_cameras(views, scene)
+        lines += found.notes
+        up = find_up(scene, found.cameras, options.up, options.scene).direction
         cameras = with_near_plane(_cameras(options, scene, up, size), scene)
         write_image(options.out, _sheet([picture(scene, region, camera) for camera in cameras]))
     share = 100 * len(region) / max(1, len(scene))
@@ -127,8 +130,8 @@ def _size(text: str) -> tuple[int, int]:
     return int(width), int(height)
 
 
-def write(options: WriteViewsOptions) -> str:
-    """Write OUT/original/NAME.png and OUT/cameras.json; what to do with them, in a line.
+def write(options: WriteViewsOptions) -> list[str]:
+    """Write OUT/original/NAME.png and OUT/cameras.json; return lines that say so and name the next step.
 
     Raises:
         ProgdfError: scene, cameras or region that do not work, or a folder that has such cameras already.
@@ -138,11 +141,14 @@ def write(options: WriteViewsOptions) -> str:
     if (out / "cameras.json").exists() or (out.exists() and not out.is_dir()):
         raise ProgdfError(f"{out / 'cameras.json'} already exists; give --out another folder")
     scene = load_scene(options.scene)
-    given = [] if options.cameras is None else load_cameras(options.cameras, scene.origin)
+    views = TrainingViewOptions(
+        options.cameras, options.cameras_anyway, options.up, options.views, scene=options.scene
+    )
+    found = load_given_cameras(views, scene)
+    given = found.cameras
     up = find_up(scene, given, options.up, options.scene).direction
     region = None
     if options.region is not None:
-        views = TrainingViewOptions(options.cameras, options.up, options.views, scene=options.scene)
         request = RegionRequest(RegionOptions(options.region), views, lambda: out / "segmented")
         region = parse_region(options.region, scene, kinds=region_kinds(request))
     if given:
@@ -164,8 +170,9 @@ def write(options: WriteViewsOptions) -> str:
             picture = render_view(scene, camera, background)
             write_image(folder / "original" / f"{camera.name}.png", picture)
         save_cameras(folder / "cameras.json", cameras, scene.origin)
-    return (
+    next_step = (
         f"wrote {len(cameras)} views to {out / 'original'}; draw masks (white on black) as "
         f"{out}/NAME.png for some of them, then progdf train {options.scene} "
         f"--cameras {out / 'cameras.json'} --region masks:{out} …"
     )
+    return [*found.notes, next_step]

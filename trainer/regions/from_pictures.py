@@ -15,7 +15,7 @@ from torch import Tensor
 
 from progdf.camera import Camera, undistort
 from progdf.errors import ProgdfError
-from progdf.gaussians import ZERO, Gaussians, Origin
+from progdf.gaussians import ZERO, Gaussians
 from progdf.io.cameras import load_cameras, save_cameras
 from progdf.io.images import read_mask
 from progdf.io.picture_camera import edits_in_picture
@@ -31,6 +31,7 @@ from trainer.editors.cache import KeptPictures, Recipe
 from trainer.editors.pictures import picture_paths, read_change, rendered_cameras
 from trainer.options import VIEWS, RegionOptions, TrainingViewOptions
 from trainer.store.pretrained import last_model
+from trainer.views.choose import load_given_cameras
 from trainer.views.view import (
     BACKGROUND,
     INSIDE,
@@ -116,7 +117,7 @@ def region_kinds(request: RegionRequest) -> dict[str, Kind]:
     def from_folder(text: str, scene: Gaussians, bent: bool) -> Region:
         kind = "photomasks" if bent else "masks"
         folder, file = _mask_folder(kind, text, request)
-        cameras = _cameras(file, scene)
+        cameras = _cameras(file, scene, request)
         masks = read_masks(folder, cameras, bent)
         count = sum(mask is not None for mask in masks)
         if not any(bool(mask.any()) for mask in masks if mask is not None):
@@ -151,7 +152,7 @@ def region_kinds(request: RegionRequest) -> dict[str, Kind]:
         "scribbles": lambda text, scene: _scribbles_region(text, scene, request),
         CHANGED: lambda text, scene: changed_region(
             scene,
-            *_changed_pictures(text, request, scene.origin),
+            *_changed_pictures(text, request, scene),
             request.options.lift_threshold,
             request.say,
         ),
@@ -169,13 +170,13 @@ def region_checks(request: RegionRequest) -> dict[str, Check]:
         "masks": lambda text: load_cameras(_mask_folder("masks", text, request)[1], ZERO),
         "photomasks": lambda text: load_cameras(_mask_folder("photomasks", text, request)[1], ZERO),
         "text": of_text,
-        "scribbles": lambda text: _scribble_pictures(text, request, ZERO),
-        CHANGED: lambda text: _changed_pictures(text, request, ZERO),
+        "scribbles": lambda text: _scribble_pictures(text, request),
+        CHANGED: lambda text: _changed_pictures(text, request),
     }
 
 
 def _changed_pictures(
-    text: str, request: RegionRequest, origin: Origin
+    text: str, request: RegionRequest, scene: Gaussians | None = None
 ) -> tuple[Sequence[Path], Sequence[Camera]]:
     """The pictures of `changed:A.png,B.png`, by default those of the editor, and their cameras."""
     paths = picture_paths(text) if text else request.views.pictures
@@ -189,15 +190,20 @@ def _changed_pictures(
                 f"{path} was taken with edits on ({edits}), which would count as changed; take the view "
                 "without them, or name the region with --region"
             )
-    return paths, _taken_from(paths, request, origin)
+    return paths, _taken_from(paths, request, scene)
 
 
-def _taken_from(paths: Sequence[Path], request: RegionRequest, origin: Origin) -> list[Camera]:
-    given = [] if request.views.cameras is None else load_cameras(request.views.cameras, origin)
-    return rendered_cameras(paths, given, origin)
+def _taken_from(paths: Sequence[Path], request: RegionRequest, scene: Gaussians | None) -> list[Camera]:
+    """Return the cameras of rendered pictures; without a scene they are not brought into its frame."""
+    if scene is not None:
+        return rendered_cameras(paths, load_given_cameras(request.views, scene).cameras, scene.origin)
+    given = [] if request.views.cameras is None else load_cameras(request.views.cameras, ZERO)
+    return rendered_cameras(paths, given, ZERO)
 
 
-def _scribble_pictures(text: str, request: RegionRequest, origin: Origin) -> tuple[list[Path], list[Camera]]:
+def _scribble_pictures(
+    text: str, request: RegionRequest, scene: Gaussians | None = None
+) -> tuple[list[Path], list[Camera]]:
     """The pictures of `scribbles:A.png,B.png`, and their cameras."""
     if not text:
         raise ProgdfError(
@@ -205,13 +211,13 @@ def _scribble_pictures(text: str, request: RegionRequest, origin: Origin) -> tup
             "write scribbles:A.png,B.png"
         )
     paths = list(picture_paths(text))
-    return paths, _taken_from(paths, request, origin)
+    return paths, _taken_from(paths, request, scene)
 
 
 def _scribbles_region(text: str, scene: Gaussians, request: RegionRequest) -> Region:
     """The thing under green strokes, and not under red ones."""
     rows: dict[str, list[Rows]] = {"green": [], "red": []}
-    for path, camera in zip(*_scribble_pictures(text, request, scene.origin), strict=True):
+    for path, camera in zip(*_scribble_pictures(text, request, scene), strict=True):
         original, picture = read_change(scene, path, camera)
         seen = Surface(scene, replace(camera.resize(picture.shape[1], picture.shape[0]), lens=None))
         stroke = (picture - original).abs().amax(dim=-1) > _STROKE
@@ -323,7 +329,7 @@ def _segment(
 def _segmented_cameras(scene: Gaussians, request: RegionRequest) -> list[Camera]:
     """The given cameras, evenly thinned out, or a rig around the scene."""
     if request.views.cameras is not None:
-        offered = _cameras(request.views.cameras, scene)
+        offered = _cameras(request.views.cameras, scene, request)
         count = min(request.count, len(offered))
         taken = [offered[(2 * i + 1) * len(offered) // (2 * count)] for i in range(count)]
         return [replace(fit_size(camera, LIFTED_AT), lens=None) for camera in taken]
@@ -339,8 +345,10 @@ def _near_cameras(scene: Gaussians, region: Region, request: RegionRequest) -> l
     return [replace(camera, name=f"near_{i:03d}") for i, camera in enumerate(rig)]
 
 
-def _cameras(path: Path, scene: Gaussians) -> list[Camera]:
-    return name_cameras(load_cameras(path, scene.origin))
+def _cameras(path: Path, scene: Gaussians, request: RegionRequest) -> list[Camera]:
+    """Return the cameras of a file in the scene's frame, named as views."""
+    found = load_given_cameras(replace(request.views, cameras=path), scene)
+    return name_cameras(found.cameras)
 
 
 def _slug(prompt: str) -> str:

@@ -21,7 +21,10 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.rasterize import alpha_weights
 from progdf.region import Region
+from progdf.scene.scene_cameras import TRANSFORMS_FILE, SceneCameras, load_scene_cameras
+from progdf.scene.up_axis import find_up
 from progdf.threads import map_threads
+from trainer.options import TrainingViewOptions
 
 from .view import View, fit_size, make_view
 
@@ -36,8 +39,34 @@ _LOOK = 96
 _MOST_LOOKED_THROUGH = 4
 """Times as many cameras as are wanted are looked through; of more, the best spread ones are taken unseen."""
 
+_MAX_TILT = 45.0  # degrees between the up of cameras and of their scene: people hold cameras level
+
 _LEAST_COVER = 0.25
 """Of what the median view shows of the region; a view that shows less is left out."""
+
+
+def load_given_cameras(options: TrainingViewOptions, scene: Gaussians) -> SceneCameras:
+    """Return the cameras of --cameras in the scene's frame, none if it is not given.
+
+    A note tells where their mean up is more than 45° off the scene's, if its shape leaves no doubt.
+
+    Raises:
+        ProgdfError: see `load_scene_cameras`.
+    """
+    if options.cameras is None:
+        return SceneCameras([])
+    found = load_scene_cameras(options.cameras, scene, options.scene, options.cameras_anyway)
+    held = find_up(scene, found.cameras)
+    shape = find_up(scene)
+    tilt = math.degrees(math.acos(max(-1.0, min(1.0, float(held.direction @ shape.direction)))))
+    if options.cameras_anyway or not shape.certain or tilt <= _MAX_TILT:
+        return found
+    note = (
+        f"warning: the cameras are tilted by {tilt:.0f}° "
+        f"({held.name} is up in them, {shape.name} in the scene); if the views are too, the cameras are of "
+        f"another frame: put nerfstudio's {TRANSFORMS_FILE} beside the scene, or give others"
+    )
+    return SceneCameras(found.cameras, (*found.notes, note))
 
 
 @dataclass(frozen=True)

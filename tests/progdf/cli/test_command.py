@@ -257,9 +257,8 @@ def test_settings_that_numba_does_not_work_with_are_one_line(monkeypatch: pytest
 def test_control_characters_of_own_arguments_are_escaped(
     words: list[str], writer: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def wrote(options: WriteViewsOptions | ShowRegionOptions) -> str | list[str]:
-        said = f"wrote {options.out}"
-        return said if isinstance(options, WriteViewsOptions) else [said]
+    def wrote(options: WriteViewsOptions | ShowRegionOptions) -> list[str]:
+        return [f"wrote {options.out}"]
 
     monkeypatch.setattr(writer, wrote)
     assert main([*words, "a\x1b[2J\n.png"]) == 0

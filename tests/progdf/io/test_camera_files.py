@@ -168,12 +168,12 @@ def test_lens_fields_that_are_switched_off_change_nothing(tmp_path: Path) -> Non
 
 
 def test_ignored_fields_are_reported_once_in_order(tmp_path: Path) -> None:
-    content = nerfstudio(some_cameras(), aabb_scale=4, applied_scale=0.5)
+    content = nerfstudio(some_cameras(), aabb_scale=4, offset=0.5)
     content["frames"][0]["sharpness"] = 30.0
     content["frames"][1]["mask_path"] = "masks/a.png"
     _, report = load_cameras_with_report(written(tmp_path / "t.json", content))
-    assert set(report.ignored) == {"aabb_scale", "applied_scale", "sharpness", "mask_path"}
-    assert report.ignored[:3] == ("aabb_scale", "applied_scale", "sharpness")
+    assert set(report.ignored) == {"aabb_scale", "offset", "sharpness", "mask_path"}
+    assert report.ignored[:3] == ("aabb_scale", "offset", "sharpness")
 
 
 def test_rounded_matrices_are_made_rotations(tmp_path: Path) -> None:

@@ -17,7 +17,8 @@ from progdf.formats.ply import save_ply
 from progdf.gaussians import Gaussians
 from progdf.io.cameras import save_cameras
 from progdf.region import from_mask
-from tests.helpers.demo_scenes import room
+from progdf.scene.orbit_rig import orbit_rig
+from tests.helpers.demo_scenes import bear, room
 from tests.helpers.scenes import concatenate, front_camera, one_gaussian, orbit_camera, random_gaussians
 from tests.helpers.trained import WHITE, Small, small
 from trainer.options import TrainingViewOptions
@@ -27,6 +28,7 @@ from trainer.views.choose import (
     Visibility,
     choose_views,
     in_frame,
+    load_given_cameras,
     sample_members,
     split_held_out,
     split_views,
@@ -306,3 +308,12 @@ def test_a_rig_is_as_large_as_the_views_that_are_asked_for_and_larger_where_some
     offered = re.fullmatch(r"\d of (\d+) cameras; \d+ do not see the region.*", hidden.notes[-1])
     assert offered is not None, hidden.notes
     assert int(offered[1]) > 8, "a larger rig"
+
+
+def test_cameras_tilted_against_the_scene_are_told(tmp_path: Path) -> None:
+    scene = bear(3000).gaussians
+    for up, told in (("y", False), ("x", True)):
+        direction = torch.tensor([float(axis == up) for axis in "xyz"])
+        save_cameras(tmp_path / "c.json", orbit_rig(scene, 8, 48, 48, up=direction))
+        found = load_given_cameras(ViewOptions(tmp_path / "c.json"), scene)
+        assert any("cameras are tilted by 9" in note for note in found.notes) == told

@@ -1,0 +1,283 @@
+"""Cameras of a scene: brought into its frame, and checked against it.
+
+nerfstudio trains in a frame of its own. `dataparser_transforms.json` has the way there, for a point of the
+dataset's world: x' = scale · (R x + t). Camera poses are turned by R, and their centers go the way of points.
+A transforms.json may be in a third frame (`applied_transform`). nerfstudio writes the way from the dataset's
+world; older files have the one from transforms.json. Its frame has z up, which tells the two apart.
+
+The check renders the scene small through some cameras. A camera shows the scene if it covers at least as much
+of the picture as a square of a 16th of its sides. At least half of the cameras must show the scene; or, where
+cameras look at other parts of a larger capture, three must show it large.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import torch
+from torch import Tensor
+
+from progdf.camera import Camera
+from progdf.errors import ProgdfError
+from progdf.gaussians import Gaussians, Origin
+from progdf.io.atomic import read_file
+from progdf.io.camera_json import make_rigid
+from progdf.io.cameras import (
+    beside_folder,
+    load_cameras_with_report,
+    log_cameras,
+    relative_viewmat,
+)
+from progdf.io.file_rules import damage_error
+from progdf.io.json_values import convert_json, decode_json
+from progdf.rasterize import render
+from progdf.scene.bounds import near_plane, scene_sphere
+from progdf.threads import map_threads
+
+_log = logging.getLogger(__name__)
+
+TRANSFORMS_FILE = "dataparser_transforms.json"
+_CHECKPOINTS = "nerfstudio_models"  # nerfstudio's folder of checkpoints; the file lies beside it
+
+_LOOK_PX = 96  # longer side of the pictures of the check
+_FIRST_COUNT, _MAX_COUNT = 8, 48  # cameras to look through; the others only if the first do not decide
+_SHOWS_SHARE = 1 / 256  # of the picture: 16 x 16 of 256 x 256 pixels, which a view of a training has
+_LARGE_SHARE = 0.1  # of the picture: the scene is what the camera looks at
+_LARGE_COUNT = 3  # cameras: the least that a training takes
+
+_Number = Annotated[float, msgspec.Meta(gt=-3e38, lt=3e38)]
+_Row = tuple[_Number, _Number, _Number, _Number]
+
+
+class _Transforms(msgspec.Struct):
+    """dataparser_transforms.json."""
+
+    transform: Annotated[list[_Row], msgspec.Meta(min_length=3, max_length=4)]
+    scale: Annotated[float, msgspec.Meta(gt=0, lt=3e38)]
+
+
+@dataclass(frozen=True)
+class SceneCameras:
+    """Cameras in a scene's frame."""
+
+    cameras: list[Camera]
+    notes: tuple[str, ...] = ()  # one line each: the frame that was chosen
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """The shares of their pictures, 0 to 1, in which some of the cameras show a scene."""
+
+    shares: tuple[float, ...]
+
+    @property
+    def showing(self) -> int:
+        """The number of cameras that show the scene."""
+        return sum(share >= _SHOWS_SHARE for share in self.shares)
+
+    @property
+    def fits(self) -> bool:
+        """Whether the cameras are probably of the scene's frame."""
+        count = len(self.shares)
+        large = sum(share >= _LARGE_SHARE for share in self.shares)
+        return self.showing > 0 and (2 * self.showing >= count or large >= _LARGE_COUNT)
+
+
+def load_scene_cameras(
+    path: Path, scene: Gaussians, scene_file: Path | None = None, anyway: bool = False
+) -> SceneCameras:
+    """Return the cameras of a file or folder in the frame of a scene.
+
+    Frames are tried in this order: nerfstudio's, where a dataparser_transforms.json lies beside the scene or
+    the cameras; the file's; and, of a transforms.json with an applied_transform, the dataset's before it. The
+    first one counts in which the cameras show the scene. Cameras that this program saved are in the scene's.
+
+    Args:
+        path: see `progdf.io.cameras.load_cameras`
+        scene: the scene; the cameras are relative to its origin
+        scene_file: the scene's file, if there is one
+        anyway: take the first frame without a check
+
+    Raises:
+        ProgdfError: as `load_cameras`; a broken dataparser_transforms.json; or the scene is visible from no
+            frame.
+    """
+    cameras, report = load_cameras_with_report(path, scene.origin)
+    log_cameras(path, cameras, report)
+    file = None if report.dataset is None else _find_transforms(path, scene_file)
+    candidates = _candidates(path, cameras, scene.origin, report.dataset, file)
+    if anyway or not len(scene):
+        return candidates[0]
+    coverages = []
+    for candidate in candidates:
+        coverage = measure_coverage(scene, candidate.cameras)
+        if coverage.fits:
+            return candidate
+        coverages.append(coverage)
+    is_foreign = report.dataset is not None and file is None
+    raise _mismatch_error(path, scene, candidates[0].cameras, scene_file, coverages[0], is_foreign)
+
+
+def scene_cameras_beside(path: Path, scene: Gaussians) -> list[Camera]:
+    """Return the cameras beside a scene's file that have its middle in their picture, in its frame.
+
+    Cameras that all look past it are logged. They cost no render, as they only tell the axis that is up.
+    """
+    try:
+        cameras = load_scene_cameras(beside_folder(path), scene, path, anyway=True).cameras
+    except (ProgdfError, OSError):
+        return []
+    facing = [camera for camera in cameras if _has_middle(camera, scene)]
+    if not facing:
+        _warn_once(f"the {len(cameras)} cameras beside {path} look past the scene; they are not used")
+    return facing
+
+
+def _has_middle(camera: Camera, scene: Gaussians) -> bool:
+    """Return whether the scene's middle is in a camera's picture."""
+    center = camera.viewmat[:3, :3] @ scene_sphere(scene)[0] + camera.viewmat[:3, 3]
+    x, y, depth = (float(c) for c in camera.K @ center)
+    return depth > 0 and 0 <= x <= camera.width * depth and 0 <= y <= camera.height * depth
+
+
+@cache
+def _warn_once(line: str) -> None:
+    _log.warning("%s", line)
+
+
+def measure_coverage(scene: Gaussians, cameras: Sequence[Camera]) -> Coverage:
+    """Return the shares of their pictures in which cameras show a scene, of up to 48 spread over the list."""
+    spread = sorted(range(len(cameras)), key=lambda i: math.sqrt(2.0) * i % 1.0)[:_MAX_COUNT]
+    near = near_plane(scene_sphere(scene)[1])
+
+    def look(index: int) -> float:
+        camera = cameras[index]
+        scale = min(1.0, _LOOK_PX / max(camera.width, camera.height))
+        width = max(1, round(camera.width * scale))
+        height = max(1, round(camera.height * scale))
+        small = replace(camera.resize(width, height), near=near, lens=None)
+        with torch.no_grad():
+            transmittance = render(scene, small, (0.0, 0.0, 0.0)).transmittance
+        return 1.0 - float(transmittance.mean())
+
+    shares = map_threads(look, spread[:_FIRST_COUNT])
+    coverage = Coverage(tuple(shares))
+    if coverage.fits or len(spread) <= _FIRST_COUNT:
+        return coverage
+    return Coverage((*shares, *map_threads(look, spread[_FIRST_COUNT:])))
+
+
+def _candidates(
+    path: Path, cameras: list[Camera], origin: Origin, dataset: Tensor | None, file: Path | None
+) -> list[SceneCameras]:
+    """Return the cameras in the frames that the scene may be in, likeliest first.
+
+    Args:
+        path: the cameras' file or folder
+        cameras: as the file has them, relative to `origin`
+        origin: of the scene
+        dataset: see `CameraReport.dataset`
+        file: the dataparser_transforms.json, if there is one
+    """
+    is_applied = dataset is not None and not torch.equal(dataset, torch.eye(4, dtype=torch.float64))
+    found = []
+    if file is not None and dataset is not None:
+        rigid, scale = _read_transforms(file)
+        applied_scale = float(dataset[:3, :3].det() ** (1 / 3))
+        applied = dataset.clone()
+        applied[:3] /= applied_scale
+        ways = [rigid @ torch.linalg.inv(applied)]
+        if is_applied:
+            ways.append(rigid)
+        ways.sort(key=lambda way: -_upright(cameras, way))
+        note = f"cameras: moved into nerfstudio's frame by {file}"
+        for way in ways:
+            way[:3] *= scale / applied_scale
+            found.append(SceneCameras([_move(camera, way, origin) for camera in cameras], (note,)))
+    note = f"cameras: {file} is not applied, as the scene is not visible with it"
+    found.append(SceneCameras(cameras, () if file is None else (note,)))
+    if is_applied and dataset is not None:
+        note = f"cameras: the applied_transform of {path} is taken back, as the scene was made before it"
+        way = torch.linalg.inv(dataset)
+        found.append(SceneCameras([_move(camera, way, origin) for camera in cameras], (note,)))
+    return found
+
+
+def _upright(cameras: Sequence[Camera], way: Tensor) -> float:
+    """Return how far the cameras' mean up is +z after a turn, -1 to 1; 0.1 % of difference is none."""
+    up = torch.stack([-camera.viewmat[1, :3] for camera in cameras]).double().mean(dim=0)
+    return round(float((way[:3, :3] @ torch.nn.functional.normalize(up, dim=0))[2]), 3)
+
+
+def _find_transforms(path: Path, scene_file: Path | None) -> Path | None:
+    """Return the dataparser_transforms.json beside a scene, or else beside its cameras."""
+    folders = [path if path.is_dir() else path.parent]
+    if scene_file is not None:
+        folder = scene_file.absolute().parent
+        folders = [folder, *folders]
+        if folder.name == _CHECKPOINTS:
+            folders = [folder.parent, *folders]
+    return next(
+        (folder / TRANSFORMS_FILE for folder in folders if (folder / TRANSFORMS_FILE).is_file()), None
+    )
+
+
+def _read_transforms(file: Path) -> tuple[Tensor, float]:
+    """Return a turn and a move, [4,4] float64, and the scale that follows them.
+
+    Raises:
+        ProgdfError: the file is damaged, or its transform is no rotation and translation.
+    """
+    try:
+        content = convert_json(decode_json(read_file(file)), _Transforms)
+    except ValueError as error:
+        raise damage_error(file, str(error)) from None
+    matrix = torch.tensor([*content.transform[:3], (0.0, 0.0, 0.0, 1.0)], dtype=torch.float64)
+    return make_rigid(os.fspath(file), matrix), content.scale
+
+
+def _move(camera: Camera, way: Tensor, origin: Origin) -> Camera:
+    """Return a camera after a similarity of the world. The camera is relative to an origin. [4,4] float64"""
+    x, y, z = origin
+    pose = way @ torch.linalg.inv(relative_viewmat(camera.viewmat, (-x, -y, -z)))
+    pose[:3, :3] /= way[:3, :3].det() ** (1 / 3)
+    viewmat = relative_viewmat(torch.linalg.inv(pose), origin)
+    return replace(camera, viewmat=viewmat.float())
+
+
+def _mismatch_error(
+    path: Path,
+    scene: Gaussians,
+    cameras: Sequence[Camera],
+    scene_file: Path | None,
+    coverage: Coverage,
+    is_foreign: bool,
+) -> ProgdfError:
+    """Return the error for cameras that do not show a scene, with the likely cause."""
+    name = "the scene" if scene_file is None else str(scene_file)
+    center, radius = scene_sphere(scene)
+    in_camera = torch.stack([camera.viewmat[:3, :3] @ center + camera.viewmat[:3, 3] for camera in cameras])
+    distance = float(in_camera.norm(dim=1).median())
+    behind = int((in_camera[:, 2] < 0).sum())
+    cause = f"their median distance is {distance:.3g}, the scene's radius {radius:.3g}"
+    if 2 * behind > len(cameras):
+        cause = f"the scene is behind {behind} of {len(cameras)}, as with other camera axes"
+    remedy = "give cameras of the scene's frame"
+    if is_foreign:
+        remedy = (
+            f"put nerfstudio's {TRANSFORMS_FILE} beside a scene that it trained, or give cameras of its frame"
+        )
+    return ProgdfError(
+        f"{path} is not of the frame of {name}: "
+        f"{coverage.showing} of {len(coverage.shares)} cameras show it, "
+        f"in {100 * max(coverage.shares):.2g} % of a picture at most ({cause}); "
+        f"{remedy}, or add --cameras-anyway"
+    )
