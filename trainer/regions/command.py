@@ -74,9 +74,7 @@ def show(options: ShowRegionOptions) -> list[str]:
     lines: list[str] = []
     with tempfile.TemporaryDirectory() as folder:
         masks = RegionOptions(options.spec, options.lift_rule, options.lift_threshold)
-        views = TrainingViewOptions(
-            options.cameras, options.cameras_anyway, options.up, scene=options.scene
-        )
+        views = TrainingViewOptions(options.cameras, options.cameras_anyway, options.up, scene=options.scene)
         request = RegionRequest(masks, views, lambda: Path(folder), say=lines.append)
         region = parse_region(options.spec, scene, kinds=region_kinds(request), say=lines.append)
     if suffix == ".npy":

@@ -315,5 +315,5 @@ def test_cameras_tilted_against_the_scene_are_told(tmp_path: Path) -> None:
     for up, told in (("y", False), ("x", True)):
         direction = torch.tensor([float(axis == up) for axis in "xyz"])
         save_cameras(tmp_path / "c.json", orbit_rig(scene, 8, 48, 48, up=direction))
-        found = load_given_cameras(ViewOptions(tmp_path / "c.json"), scene)
+        found = load_given_cameras(TrainingViewOptions(tmp_path / "c.json"), scene)
         assert any("cameras are tilted by 9" in note for note in found.notes) == told
