@@ -21,6 +21,7 @@ from progdf.metrics.image import decibels
 from progdf.quaternions import rotation_matrices
 from progdf.rasterize.engines import render
 from progdf.terminal import format_count, group_digits
+from progdf.threads import map_threads
 
 from .orbit_rig import orbit_rig
 from .point_tree import PointTree
@@ -250,7 +251,8 @@ class _Body:
         """
         order = self._tree.order
         enclosed = np.zeros(len(order), bool)
-        for start in range(0, len(order), _BLOCK):
+
+        def compare(start: int) -> None:
             first = max(start - _WINDOW, 0)
             block = order[first : start + _BLOCK + _WINDOW]
             rows = self.members[block]
@@ -264,6 +266,8 @@ class _Body:
                 count[:-step] += away <= squares[:-step]
             inner = slice(start - first, start - first + _BLOCK)
             enclosed[block[inner]] = count[inner] > self._neighbors // 2
+
+        map_threads(compare, range(0, len(order), _BLOCK))
         return enclosed
 
     def _spacing_of(self, rows: Rows) -> Floats:
