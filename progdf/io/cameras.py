@@ -125,7 +125,7 @@ def camera_files(path: str | os.PathLike[str]) -> tuple[Path, ...]:
 def holds_cameras(path: str | os.PathLike[str]) -> bool:
     """Return whether a folder has cameras, or a file is of a COLMAP model; other files are not looked at."""
     file = Path(path)
-    if file.is_dir():
+    if os.path.isdir(file):
         return bool(_sources_in(file))
     return _find_source(file).model is not None
 
@@ -181,7 +181,7 @@ def beside_folder(path: Path) -> Path:
 def _find_source(path: str | os.PathLike[str]) -> _Source:
     """Return the file or model that a path stands for; a file of a model stands for the model of its form."""
     file = Path(path)
-    if file.is_dir():
+    if os.path.isdir(file):
         return _search_folder(file)
     if file.name in _MODEL_FILES:
         return _Source(file, open_model(file.parent, file.suffix))

@@ -41,6 +41,11 @@ def test_distortion_of_a_kind_that_programs_read_differently_is_refused(tmp_path
         )
 
 
+def test_a_camera_file_name_that_is_too_long_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(ProgdfError, match="cannot be read \\(File name too long\\)"):
+        load_cameras(tmp_path / ("9" * 5000))
+
+
 LENSES = {  # as nerfstudio, instant-ngp and others write them
     "is_fisheye": True,
     "camera_model": "OPENCV_FISHEYE",
