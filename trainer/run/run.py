@@ -75,6 +75,7 @@ from trainer.store.run_folder import (
     write_views,
 )
 from trainer.store.state import interrupt_on_signals
+from trainer.views.choose import load_given_cameras
 from trainer.views.crops import only_recolors
 from trainer.views.view import BACKGROUND, View, fit_size, make_view, with_near_plane
 
@@ -191,14 +192,15 @@ def train(options: TrainOptions, quiet: bool = False, shared: Shared | None = No
 def select_region(
     options: TrainOptions, scene: Gaussians, quiet: bool, shared: Shared
 ) -> tuple[Region, list[str]]:
-    """The region that resolved options name, and what is to be said of it, a line each.
+    """Return the region that resolved options name, and lines for the log.
 
     Raises:
-        ProgdfError: see `parse_region`.
+        ProgdfError: see `parse_region`; or the cameras do not show the scene.
     """
 
     def select() -> tuple[Region, list[str]]:
         notes = list[str]()
+        load_given_cameras(options.views, scene)  # refused before a folder is made
         kinds = region_kinds(region_request(options, quiet, notes.append))
         return parse_region(options.region.region, scene, options.name, kinds, notes.append), notes
 

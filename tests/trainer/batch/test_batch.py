@@ -17,6 +17,8 @@ import pytest
 
 from progdf.__main__ import main
 from progdf.errors import ProgdfError
+from progdf.io.cameras import save_cameras
+from tests.helpers.scenes import orbit_camera
 from tests.helpers.trained import quick_options, train, write_bear
 from trainer import cli
 from trainer.batch.jobs import BatchJob, read_catalogue
@@ -123,15 +125,24 @@ def test_everything_is_checked_before_anything_starts(
     text = catalogue.read_text(encoding="utf-8").replace("recolor:#3060d0", "recolour:#3060d0")
     text = text.replace("darken:.5", "pictures:absent.png")
     text += '\n[[scenes.edits]]\nname="empty"\nregion="sphere:900,0,0,1"\neditor="night"'
+    text += '\n[[scenes.edits]]\nname="far"\nregion="all"\neditor="night"\ncameras="far.json"'
     text += '\n[[scenes]]\npath="broken.ply"\n[[scenes.edits]]\nname="a"\nregion="all"\neditor="night"'
+    save_cameras(catalogue.parent / "far.json", [orbit_camera()], (500.0, 0.0, 0.0))
     (catalogue.parent / "broken.ply").write_bytes(b"ply\nnothing")
     (catalogue.parent / "faulty.toml").write_text(text, encoding="utf-8")
     out = tmp_path / "runs"
     assert cli.batch([str(catalogue.parent / "faulty.toml"), "--out", str(out), "--workers", "1"]) == 2
     lines = capsys.readouterr().err.splitlines()
     faults = [line for line in lines if line.startswith("progdf: ")]
-    assert len(faults) == 4
-    for words in ("unknown editor 'recolour'", "absent.png", "holds no Gaussian", "broken.ply"):
+    assert len(faults) == 5
+    expected = (
+        "unknown editor 'recolour'",
+        "absent.png",
+        "holds no Gaussian",
+        "far.json is not",
+        "broken.ply",
+    )
+    for words in expected:
         assert any(words in line for line in faults), faults
     assert not out.exists()
 
