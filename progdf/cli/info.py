@@ -15,6 +15,7 @@ import tyro
 
 from progdf.errors import ProgdfError
 from progdf.field.baked import BakedField, GradeForm
+from progdf.formats.containers import check_foreign
 from progdf.formats.cube import SUFFIX as CUBE
 from progdf.formats.ply_view import stored_view
 from progdf.formats.scene_file import load_scene_with_report, scene_file, scene_format
@@ -175,6 +176,7 @@ def kind_of(path: str | os.PathLike[str]) -> str:
         return "cameras"
     if path.suffix.lower() in (".gdf", CUBE):
         return "gdf"  # its reader knows best what is wrong
+    check_foreign(path, start)
     raise ProgdfError(f"{path} is not a file progdf knows; give a scene, a .gdf edit or a camera file")
 
 

@@ -12,6 +12,7 @@ import errno
 import io
 import pickletools
 import re
+import warnings
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -26,6 +27,8 @@ from progdf.errors import ProgdfError
 from progdf.gaussians import Gaussians
 from progdf.io.atomic import open_error, read_file
 from progdf.io.file_rules import check_fields, damage_error, unsupported_error, variant_fields
+
+from .containers import START_BYTES, check_foreign
 
 LARGEST_PICKLE = 16 << 20  # bytes; the pickle of a training has some 100 kB
 LEGACY_MAGIC = b"\x80\x02"  # a pickle of protocol 2, where newer files begin with a zip archive
@@ -201,7 +204,8 @@ def _load_weights(path: Path) -> Any:
     """
     _check_pickle(path, _read_pickle(path))
     try:
-        return torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+        with warnings.catch_warnings(action="ignore"):  # torch warns of pickles that it then refuses
+            return torch.load(path, map_location="cpu", weights_only=True, mmap=True)
     except OSError as error:
         raise open_error(path, error) from None
     except Exception as error:  # torch raises errors of many types for a pickle that does not add up
@@ -211,8 +215,12 @@ def _load_weights(path: Path) -> Any:
 
 def _read_pickle(path: Path) -> bytes:
     """Return the pickle of torch's archive, once its entries are uncompressed and fit into the file."""
-    if read_file(path, 2) == LEGACY_MAGIC:
+    start = read_file(path, START_BYTES)
+    if start.startswith(LEGACY_MAGIC):
         raise unsupported_error(path, "the archive format of torch before 1.6", RESAVE)
+    if not start.startswith(b"PK"):
+        check_foreign(path, start)
+        raise ProgdfError(f"{path} is no checkpoint of torch, which is a zip archive; {EXPORT}")
     try:
         with zipfile.ZipFile(path) as archive:
             entries = archive.infolist()

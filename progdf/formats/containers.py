@@ -56,9 +56,15 @@ _FOREIGN = (
     (b"PXR-USDC", "is a USD file, which is written but not read", "give the scene as .ply"),
     (b"#usda", "is a USD file, which is not read", "give the scene as .ply"),
     (b"\x93NUMPY", "is a NumPy array, not a scene", "give the scene as .ply"),
+    (
+        b"PAR1",
+        "is a Parquet table, as taichi_3d_gaussian_splatting writes",
+        "convert it with its parquet_to_ply.py",
+    ),
     (b"%PDF", "is a PDF document, not a scene", "give the scene as .ply"),
     (b"BLENDER", "is a Blender file, not a scene", "export the Gaussians from it as .ply"),
 )
+_MAX_SAFETENSORS_HEADER = 100_000_000  # bytes, the limit of the format
 _HTML = (b"<!doctype", b"<html", b"<head", b"<body", b"<!--")
 _TEXT = frozenset(b"\t\n\r\f" + bytes(range(32, 127)))
 _LEAST_TEXT = 4  # a shorter file is called by no kind
@@ -95,6 +101,8 @@ def _foreign_kind(start: bytes) -> str:
         return f"is {kind}, not a scene; {_TRAIN}"
     if start[:3] == b"BZh" and start[4:10] == b"1AY&SY":
         return f"is a bzip2 archive; {_UNPACK}"
+    if start[8:10] == b'{"' and int.from_bytes(start[:8], "little") < _MAX_SAFETENSORS_HEADER:
+        return "is a safetensors file, but no scene; export a .ply with the program that wrote it"
     if start[257:262] == b"ustar":
         return f"is a tar archive; {_UNPACK}"
     text = start.removeprefix(b"\xef\xbb\xbf").lstrip()

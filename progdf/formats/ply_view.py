@@ -44,7 +44,7 @@ _BRUSH = "exported from brush"
 
 @dataclass(frozen=True)
 class PlyView:
-    """How a .ply says that its scene is to be viewed."""
+    """The up axis and the camera that a .ply stores."""
 
     up: Tensor | None = None  # in the world, unit length. [3] float32
     up_comment: str = ""  # the comment that says so
@@ -53,7 +53,7 @@ class PlyView:
 
 
 def stored_view(path: Path, origin: Origin = ZERO) -> PlyView:
-    """Return how a scene's file says that the scene is to be viewed; nothing for files other than .ply.
+    """Return the up axis and the camera in a scene's file; neither for files other than .ply.
 
     Args:
         path: the scene's file

@@ -36,7 +36,7 @@ from progdf.terminal import escape_text
 
 from . import gltf, usd
 from .axes import Axes
-from .checkpoint import LEGACY_MAGIC, read_checkpoint
+from .checkpoint import read_checkpoint
 from .containers import GZIP, START_BYTES, ZIP, check_foreign, inflate_start, unpacked_scene
 from .gltf_file import MAGIC
 from .packed.compressed_ply import (
@@ -67,6 +67,8 @@ MOST_FRAMES = 1000
 
 SPZ_BITS = 12
 """Fractional bits of a position in an .spz, where the scene reaches no farther than ±2048."""
+
+CHECKPOINT_SUFFIXES = ("ckpt", "pt", "pth")
 
 CHECKPOINT = "checkpoint of a training"
 """The format of .pt, .pth and .ckpt in a report."""
@@ -102,7 +104,7 @@ def scene_format(path: str | os.PathLike[str]) -> str | None:
     if start[:2] == GZIP:
         header = inflate_start(start, 8)  # of an .spz up to version 3; a later one is plain
         return "spz" if header[:4] == b"NGSP" and header[4:5] <= _SPZ_LAST_GZIP else "gz"
-    if suffix in ("ckpt", "pt", "pth") and start[:2] in (b"PK", LEGACY_MAGIC):
+    if suffix in CHECKPOINT_SUFFIXES:
         return "ckpt"
     if start[:4] == ZIP:
         return "sog" if suffix == "sog" or read_table(path) is not None else "zip"

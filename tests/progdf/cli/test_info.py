@@ -182,7 +182,7 @@ def test_cameras_and_up_are_for_scenes(tmp_path: Path, capsys: pytest.CaptureFix
 
 def test_info_of_anything_else_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "picture.jpg").write_bytes(b"\xff\xd8\xff\xe0")
-    assert "is not a file progdf knows" in error_of(capsys, "info", str(tmp_path / "picture.jpg"))
+    assert "is a picture (JPEG), not a scene" in error_of(capsys, "info", str(tmp_path / "picture.jpg"))
     Image.new("RGB", (4, 4)).save(tmp_path / "picture.png")
     assert "carries no camera" in error_of(capsys, "info", str(tmp_path / "picture.png"))
     (tmp_path / "a.gdf").write_bytes(b"")

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from progdf.__main__ import main
+from progdf.cli.info import describe
 from progdf.formats.scene_file import load_scene, load_scene_with_report
 from progdf.gaussians import ATTRIBUTES, Gaussians
 from tests.helpers.checkpoints import gsplat_tensors, nerfstudio_tensors, save_gsplat
@@ -166,6 +167,34 @@ def test_archives_that_torch_does_not_write_are_named(tmp_path: Path) -> None:
     assert "torch before 1.6" in refusal(load_scene, tmp_path / "d.pt")
 
 
+FOREIGN = {
+    "LFS pointer": (b"version https://git-lfs.github.com/spec/v1\noid sha256:aa\n", "is a Git LFS pointer"),
+    "web page": (b"<html></html>", "is a web page"),
+    "empty": (b"", "is empty"),
+    "text": (b"hello", "is a text file"),
+    "noise": (b"\xff\x81" * 40, "is no checkpoint of torch"),
+    "Parquet": (b"PAR1" + b"a" * 40, "is a Parquet table"),
+    "safetensors": (b"\x40\0\0\0\0\0\0\0" + b'{"means": {}}', "is a safetensors file, but no scene"),
+}
+
+
+@pytest.mark.parametrize("kind", FOREIGN)
+@pytest.mark.parametrize("name", ["a.ckpt", "a.pt", "a.pth"])
+def test_files_that_are_no_checkpoints_are_named(kind: str, name: str, tmp_path: Path) -> None:
+    content, named = FOREIGN[kind]
+    (tmp_path / name).write_bytes(content)
+    message = refusal(load_scene, tmp_path / name)
+    assert named in message
+    assert "damaged" not in message
+
+
+def test_a_table_of_taichi_is_named_with_its_converter(tmp_path: Path) -> None:
+    path = tmp_path / "scene_29999.parquet"
+    path.write_bytes(b"PAR1" + b"a" * 40)
+    assert "parquet_to_ply.py" in refusal(load_scene, path)
+    assert "parquet_to_ply.py" in refusal(describe, path)
+
+
 COLOR_FIELDS = {
     "gsplat's app_opt": ({"splats": {"features": torch.zeros(12, 32)}}, "'features'"),
     "its colors": ({"splats": {"colors": torch.zeros(12, 3)}}, "'colors'"),
@@ -247,6 +276,15 @@ def test_ranks_of_different_trainings_are_not_joined(tmp_path: Path) -> None:
     assert f"{second} does not belong to {first.name}" in refusal(load_scene, second)
     save_gsplat(second, scene_of(2, 11), step=29999)
     assert f"{second} does not belong to {first.name}" in refusal(load_scene, second)
+
+
+def test_one_of_several_parts_does_not_go_into_a_bundle(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _, first, _ = two_ranks(tmp_path)
+    assert main(["export", str(first), "-o", str(tmp_path / "a.progdf.zip")]) == 2
+    assert "one of several parts of a scene; export the scene as a .ply" in capsys.readouterr().err
+    assert not (tmp_path / "a.progdf.zip").exists()
 
 
 def test_parts_of_grendel_are_joined(tmp_path: Path) -> None:

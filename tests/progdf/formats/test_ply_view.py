@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,13 +16,14 @@ from progdf.cli.info import describe
 from progdf.color.oklab import srgb_from_linear
 from progdf.formats.ply import load_ply, load_ply_with_report, save_ply
 from progdf.formats.ply_view import stored_view
+from progdf.io.cameras import read_camera
 from progdf.scene.up_axis import find_up
 from progdf.sh import map_colors, sh0_to_rgb
 from tests.helpers.ply_files import scene_of, sharp_elements, table_of, write
 from tests.helpers.refused import refusal
 from tests.helpers.scenes import ball
 from viewer.camera.view_camera import eye, first_camera, to_camera
-from viewer.commands.options import StackOptions, open_stack
+from viewer.commands.options import DrawingOptions, StackOptions, open_stack, open_view
 from viewer.files.document import load
 
 
@@ -122,6 +124,18 @@ def test_the_stored_camera_gives_the_first_view(text: bool, tmp_path: Path) -> N
     camera = to_camera(view, 640, 480)
     torch.testing.assert_close(camera.viewmat, torch.eye(4), atol=1e-6, rtol=0.0)
     assert "camera: the file stores one of 640x480 pixels, which is the first view" in list(describe(path))
+
+
+def test_render_and_the_window_begin_at_the_stored_camera(tmp_path: Path) -> None:
+    path = sharp(tmp_path / "a.ply")
+    assert main(["render", str(path), "--size", "64x48", "-o", str(tmp_path / "a.png")]) == 0
+    rendered = read_camera(str(tmp_path / "a.png"))
+    torch.testing.assert_close(rendered.viewmat, torch.eye(4), atol=1e-5, rtol=0.0)
+    assert float(rendered.K[0, 0]) == pytest.approx(51.2)
+    window, _ = open_view(StackOptions(scene=path), DrawingOptions())
+    assert eye(window.view.camera) == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
+    home = window.document.facts().home(replace(window.view.camera, azimuth=70.0), 4 / 3)
+    assert eye(home) == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
 
 
 def test_a_tall_window_shows_the_whole_stored_picture(tmp_path: Path) -> None:
