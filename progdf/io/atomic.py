@@ -127,13 +127,13 @@ def write_files_together(folder: Path) -> Iterator[Path]:
         for path in _files_below(temporary):
             _match_target(path, folder / path.relative_to(temporary))
         temporary.rename(complete)
+    except OSError as error:
+        raise write_error(folder, error) from error
     except ProgdfError as error:
         full = disk_full(error)
-        if full is None:
-            raise ProgdfError(str(error).replace(str(temporary), str(folder))) from error
-        raise write_error(folder, full) from error
-    except OSError as error:
-        raise write_error(folder, disk_full(error) or error) from error
+        if full is not None:
+            raise write_error(folder, full) from full
+        raise ProgdfError(str(error).replace(str(temporary), str(folder))) from error
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
         if complete.is_dir():

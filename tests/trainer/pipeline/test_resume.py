@@ -8,8 +8,10 @@ import os
 import random
 import shutil
 import signal
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -324,7 +326,7 @@ def test_a_run_that_moves_parts_goes_on_to_the_same_bits(
 
 
 @pytest.mark.slow  # a plain run is killed wherever it writes in every run of the tests
-def test_a_run_that_decides_on_its_effort_goes_on_to_the_same_bits(
+def test_run_that_decides_on_its_strengths_resumes_to_the_same_bits(
     bear_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Stopped while the views are edited at the strengths that were decided on, then between two of them."""
@@ -332,22 +334,24 @@ def test_a_run_that_decides_on_its_effort_goes_on_to_the_same_bits(
     options = small_run(bear_folder, field="auto", **free)
     monkeypatch.setattr(trainer.run.run, "finish_run", lambda *_: None)
     train(options, quiet=True)
-    expected, strengths = (OUT / "trajectory.safetensors").read_bytes(), 0
+    expected = (OUT / "trajectory.safetensors").read_bytes()
     shutil.rmtree(OUT)
     monkeypatch.setattr("trainer.store.state.SAVE_EVERY", 0.0)
+    requested: list[list[float]] = []
 
-    def edit_views(*given: object, made: object = trainer.run.run.edit_views) -> object:
-        nonlocal strengths
-        strengths += len(given[2])  # type: ignore[arg-type]
-        if strengths == 1:
-            return made(*given)  # type: ignore[operator]
-        raise KeyboardInterrupt
+    def edit_views(*given: Any, made: Callable[..., object] = trainer.run.run.edit_views) -> object:
+        requested.append(list(given[2]))
+        if len(requested) == 3:
+            raise KeyboardInterrupt
+        return made(*given)
 
     with monkeypatch.context() as patch:
         patch.setattr(trainer.run.run, "edit_views", edit_views)
         with pytest.raises(KeyboardInterrupt):
             train(options, quiet=True)
-    assert strengths > 2
+    # the finished edit and the middle come first; how they differ decides on the others
+    assert requested[:2] == [[1.0], [0.5]]
+    assert len(requested[2]) > 1
     with monkeypatch.context() as patch:
         at_step(patch, 2, lambda: os.kill(os.getpid(), signal.SIGINT))
         with pytest.raises(KeyboardInterrupt):
