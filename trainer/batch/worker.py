@@ -161,14 +161,16 @@ def serve() -> None:
     queue = SimpleQueue[Any]()
 
     def read() -> None:
-        with suppress(EOFError):
-            while True:
-                queue.put(pickle.load(tasks))
-        queue.put(None)
-        signal_main_thread()  # the batch has ended: save the state of the running job
+        try:
+            with suppress(EOFError):
+                while True:
+                    queue.put(pickle.load(tasks))
+        finally:  # the batch has ended, or sends tasks of another version: save the state of the running job
+            signal_main_thread()
+            queue.put(None)  # where the signal is ignored
 
-    threading.Thread(target=read, daemon=True).start()
     with suppress(KeyboardInterrupt, BrokenPipeError):
+        threading.Thread(target=read, daemon=True).start()
         while (task := queue.get()) is not None:
             function, argument = task
             try:

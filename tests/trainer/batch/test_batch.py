@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -24,6 +25,8 @@ from trainer import cli
 from trainer.batch.jobs import BatchJob, read_catalogue
 from trainer.batch.report import JobRow, read_rows
 from trainer.batch.run import LocalPool, RayPool, Task, run, run_jobs, train_task
+
+CLUSTER_ATTEMPTS = 3
 
 BEARS = """
 [defaults]
@@ -259,18 +262,35 @@ def test_a_ray_that_does_not_start_is_one_line(monkeypatch: pytest.MonkeyPatch) 
 def cluster() -> Iterator[object]:
     """Two simulated machines of one core each."""
     pytest.importorskip("ray")
-    from ray.cluster_utils import Cluster
-
-    made = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "object_store_memory": 80 * 2**20})
+    made = start_cluster()
     yield made
     made.shutdown()
+
+
+def start_cluster() -> Any:
+    """Start the head of a cluster; Ray itself gives up after 30 seconds, too little on a busy machine."""
+    from ray.cluster_utils import Cluster
+
+    arguments = {"num_cpus": 1, "object_store_memory": 80 * 2**20}
+    for _ in range(CLUSTER_ATTEMPTS - 1):
+        with contextlib.suppress(Exception):  # Ray raises no other type
+            return Cluster(initialize_head=True, head_node_args=arguments)
+    return Cluster(initialize_head=True, head_node_args=arguments)
+
+
+def add_machine(cluster: Any) -> Any:
+    """Add a machine to a cluster, see `start_cluster`."""
+    for _ in range(CLUSTER_ATTEMPTS - 1):
+        with contextlib.suppress(Exception):
+            return cluster.add_node(num_cpus=1, object_store_memory=80 * 2**20)
+    return cluster.add_node(num_cpus=1, object_store_memory=80 * 2**20)
 
 
 @pytest.mark.slow  # a quarter of a minute, most of it Ray's own start
 def test_on_a_cluster_a_lost_machine_s_job_goes_on_elsewhere(
     catalogue: Path, singly: dict[str, bytes], tmp_path: Path, cluster: object
 ) -> None:
-    second = cluster.add_node(num_cpus=1, object_store_memory=80 * 2**20)  # type: ignore[attr-defined]
+    second = add_machine(cluster)
     jobs, _ = read_catalogue(catalogue, tmp_path / "runs")
     retried: list[str] = []
     began: dict[str, int] = {}
@@ -312,7 +332,7 @@ def test_programs_train_jobs_side_by_side(tmp_path: Path) -> None:
 def test_twelve_jobs_survive_a_killed_worker_a_lost_machine_and_ctrl_c(
     catalogue: Path, tmp_path: Path, cluster: object
 ) -> None:
-    second = cluster.add_node(num_cpus=1, object_store_memory=80 * 2**20)  # type: ignore[attr-defined]
+    second = add_machine(cluster)
     text = catalogue.read_text(encoding="utf-8") + "\n[sweep]\nsteps = [200, 400]\nseed = [0, 1, 2]\n"
     (catalogue.parent / "twelve.toml").write_text(text, encoding="utf-8")
     out = tmp_path / "runs"

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -131,8 +133,6 @@ def test_page_is_written_whatever_a_report_holds(tmp_path: Path, content: str) -
 def test_damaged_progress_counts_as_the_beginning(
     finished: list[str], tmp_path: Path, content: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    import sys
-
     from trainer.batch.report import Screen
 
     (job,), _ = read_catalogue(Path(finished[0]), tmp_path)
@@ -144,3 +144,12 @@ def test_damaged_progress_counts_as_the_beginning(
     screen.tick([job.key])
     (event,) = events_of(capsys)
     assert event["running"] == {job.key: {"share": 0.0, "label": "", "loss": "", "seconds": 0.0}}
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals")
+@pytest.mark.parametrize("content", [b"", b"no task", b"ctrainer.batch.jobs\nAbsent\n."])
+def test_worker_that_cannot_read_its_tasks_ends(content: bytes) -> None:
+    words = [sys.executable, "-P", "-c", "from trainer.batch.worker import serve; serve()"]
+    worker = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert worker.communicate(content, timeout=300)[0] == b""
+    assert worker.returncode == 0
