@@ -1,1 +1,1 @@
-"""The window and what happens in it."""
+"""Application window: main view, tools, dialogs, file actions and the studio."""

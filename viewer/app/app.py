@@ -1,4 +1,4 @@
-"""The application: a window, the main view in it, its loop, and the files dropped on it."""
+"""Application object: a window, its main view, its event loop, and the files dropped on it."""
 
 from __future__ import annotations
 
@@ -42,23 +42,23 @@ from .tidy import StrayActions, TidyActions
 _Made = TypeVar("_Made")
 
 SAY_AGAIN_S = 10.0
-"""Until what still fails in each frame is said again."""
+"""Seconds until an error that repeats in every frame is shown again."""
 RETRY_S = 1.0
-"""Until the next look at what raised at the last one."""
+"""Seconds until the next poll of a part whose last poll raised an error."""
 
 
 Opened = tuple[WindowSession, Path | None]
-"""The scene, its edits and what to show first, and the session's file."""
+"""Scene with its edits and initial view, and the session's file."""
 
 
 @one_thread()
 def run(splash: Splash, opens: Callable[[], Opened], draw: str = "auto") -> int:
-    """Stay in the window until it is asked to close; where reading takes its time, the splash says so.
+    """Run the window until it is closed; show the splash while files are read.
 
     Args:
         splash: the window
-        opens: reads what to show, in another thread
-        draw: what draws, see `ViewEngine`
+        opens: reads the scene to show, in another thread
+        draw: renderer, see `ViewEngine`
 
     Returns:
         The exit status, 0.
@@ -85,7 +85,7 @@ def run(splash: Splash, opens: Callable[[], Opened], draw: str = "auto") -> int:
 
 
 def _draw_once() -> None:
-    """A small picture, for which the kernels are loaded, or compiled the first time on a machine."""
+    """Draw a small picture, which loads the kernels, or compiles them the first time on a machine."""
     corners = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3)
     quats, none = torch.eye(4)[:1].expand(8, 4), corners[:, None, :][:, :0]
     scene = Gaussians(corners, quats, corners - 2.0, corners[:, 0], corners, none)
@@ -93,7 +93,7 @@ def _draw_once() -> None:
 
 
 class App:
-    """One window with its main view and engine; `file_actions` sees to its files."""
+    """Window with its main view and engine. Its `file_actions` handle the files."""
 
     def __init__(
         self,
@@ -134,11 +134,12 @@ class App:
         self.requests["full_screen"] = lambda _: window.toggle_full_screen()
         self.requests["quit"] = lambda _: None if self.jobs.holds_window() else self.file_actions.leave()
         self.is_closed = False
-        self._waits = False  # a splash is shown
+        self._waits = False  # a splash is visible
         self._title = ""
         self._layout = user_files.read_layout()
         self.main_view.work = replace(self.main_view.work, layout=self._layout)
-        self._failures: dict[str, tuple[int, float]] = {}  # by place: in which frame last, and when said
+        # by place: frame number of the last failure, time of its last message
+        self._failures: dict[str, tuple[int, float]] = {}
         self.main_view.report = self.report
         self.dropped: list[Path] = []
         self.failure: BaseException | None = None
@@ -146,7 +147,7 @@ class App:
         window.listen(self.main_view.wake, self._queue_dropped, self._redraw)
 
     def close(self) -> None:
-        with ExitStack() as parts:  # each is closed, whatever another one raises
+        with ExitStack() as parts:  # every part is closed, even if another one raises
             for close in (self.engine.release, self.main_view.close, imgui.backends.glfw_shutdown):
                 parts.callback(close)
             parts.callback(self.main_view.ui.make_current)
@@ -156,7 +157,7 @@ class App:
             self._keep_picture()
 
     def bind_keys(self) -> None:
-        """The keys that the person gave to commands; what is wrong with them is a line, and in the log."""
+        """Bind the keys that the user assigned to commands. Errors are shown in a message and logged."""
         bind({})
         with self._guard():
             if problems := bind(user_files.read_keys()):
@@ -166,8 +167,10 @@ class App:
                 self.main_view.show_message(text, error=True)
 
     def report(self, error: Exception) -> None:
-        """What a part of the loop raised becomes a message; a mistake of ours is logged too, and what is
-        unsaved into its recovery file at once."""
+        """Show an error raised by a part of the loop as a message.
+
+        An internal error is also logged, and unsaved work is written to its recovery file at once.
+        """
         where = repr(
             (type(error), [(at.filename, at.lineno) for at in traceback.extract_tb(error.__traceback__)])
         )
@@ -176,7 +179,7 @@ class App:
         goes_on = frame - before <= 1 and now - told_at < SAY_AGAIN_S
         self._failures[where] = frame, told_at if goes_on else now
         if goes_on:
-            return  # what fails in each frame asks for no further one
+            return  # an error that repeats in every frame requests no further frame
         line, details = error_line(error), ""
         if not line:
             details = error_details(error)
@@ -194,11 +197,12 @@ class App:
             self.report(error)
 
     def loop(self) -> None:
-        """Draw while something changes, sleep while nothing does."""
+        """Draw frames while something changes; otherwise wait for events."""
         while not self.is_closed:
             waits = [wait for wait in self._wait_times() if wait is not None]
             with self._guard():
-                if not self.main_view.opening:  # else events wait in the window system, and no letter is lost
+                # while it opens, events stay in the window system's queue, and no typed letter is lost
+                if not self.main_view.opening:
                     self.window.wait(min(waits, default=None))
             if self.failure is not None:
                 raise self.failure
@@ -215,7 +219,7 @@ class App:
             self.file_actions.on_close()
 
     def draw(self) -> None:
-        """One frame of the latest state; nothing while the window is minimized."""
+        """Draw one frame of the latest state; do nothing while the window is minimized."""
         if 0 in self.window.pixels:
             self.main_view.rest()
             return
@@ -233,14 +237,14 @@ class App:
             self.handle(request)
 
     def handle(self, request: str) -> None:
-        """Do what only the window can, of `requests`."""
+        """Perform one of `requests`, which need the whole window."""
         name, _, argument = request.partition(":")
         with self._guard():
             attempt(self.main_view, lambda: self.requests[name](argument))
 
     def _wait_times(self) -> tuple[float | None, ...]:
-        """How long the next look at each part may take, seconds; None is for ever."""
-        # first: what was chosen, or trained, wakes the main view
+        """Return the seconds until each part must be polled again; None means never."""
+        # first, because a chosen file or a finished training wakes the main view
         parts = (self.jobs, self.preview, self.start, self.strays)
         looks = [self._look(part.poll) for part in parts]
         return (
@@ -274,14 +278,14 @@ class App:
         return paths
 
     def open(self, path: Path) -> None:
-        """A dropped or chosen file, by what it is."""
+        """Open a dropped or chosen file according to its content."""
         self.file_actions.open(path)
 
     def wait_for(self, work: Callable[[], _Made], text: str) -> _Made:
-        """What it makes in another thread; meanwhile the window says so.
+        """Run `work` in another thread, show `text` in the window meanwhile, and return the result.
 
         Raises:
-            Exception: what `work` raises.
+            Exception: any error of `work`.
         """
 
         def listen() -> None:
@@ -289,7 +293,7 @@ class App:
             self.main_view.ui.make_current()
             self.window.new_frame()
             imgui.backends.opengl3_new_frame()
-            imgui.new_frame()  # what is typed and clicked at the splash is nobody's
+            imgui.new_frame()  # keys and clicks on the splash have no effect
             imgui.end_frame()
 
         self._waits = True
@@ -304,11 +308,11 @@ class App:
     def show(
         self, document: Document, live: tuple[Gdf, ...] = (), layers: tuple[LayerState, ...] = ()
     ) -> None:
-        """Draw the same scene with other edits from now on; the state is the caller's to change.
+        """Draw the same scene with other edits from now on. The caller updates the state.
 
         Args:
-            live: what is being trained of its edits
-            layers: that show them on top
+            live: edits in training
+            layers: layers that show these edits on top
         """
         facts = self.main_view.facts if document is self.document else document.facts()
         engine = self._engine(document, live)
@@ -319,9 +323,9 @@ class App:
     def open_document(
         self, document: Document, view: ViewState, snapshots: tuple[SliderSnapshot, ...] = ()
     ) -> None:
-        """Another scene takes the place of the open one, and what belonged to that one goes with it.
+        """Replace the open scene by another, together with everything that depends on it.
 
-        What is trained or written for it goes on in the background. Where anything fails, all is as it was.
+        Training and exports of the old scene go on in the background. If anything fails, nothing changes.
         """
         facts, engine = document.facts(), self._engine(document)
         self._keep_picture()
@@ -334,13 +338,15 @@ class App:
             part.leave_scene()
 
     def _keep_picture(self) -> None:
-        """For the start page, of what is on screen."""
+        """Store a picture of the current view for the start page."""
         view = self.main_view.work.view
         self.start.keep_picture(self.engine, view, self.document.path, self.file_actions.path)
 
     def _rename(self) -> None:
-        """The title bar says what is open, and with a dot that there are unsaved changes; a new layout is
-        remembered."""
+        """Update the title bar and store a changed layout.
+
+        The title names the open session or scene; a dot marks unsaved changes.
+        """
         path, main_view = self.file_actions.path, self.main_view
         name = escape_text(path.name.removesuffix(".session.json")) if path else ""
         if name != main_view.work.session:
@@ -359,7 +365,7 @@ class App:
         return ViewEngine(self.context, shown.scene, shown.gdfs, self._draw)
 
     def leave(self) -> None:
-        """Close the window, without a question."""
+        """Close the window without a question."""
         self.window.ask_to_close()
         self.is_closed = True
 

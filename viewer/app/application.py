@@ -1,4 +1,5 @@
-"""What the parts of the application need of it, and how failures are put: as a message, and in the log."""
+"""Application interface for the parts of the window, and the reporting of failures as messages and in the
+log."""
 
 from __future__ import annotations
 
@@ -26,43 +27,43 @@ _Made = TypeVar("_Made")
 
 
 class Application(Protocol):
-    """The application as its parts see it, which it imports: they cannot import it in turn."""
+    """Interface of the application for its parts, which cannot import it without an import cycle."""
 
     document: Document
     main_view: MainView
 
     def open(self, path: Path) -> None:
-        """A file, by what it is."""
+        """Open a file according to its content."""
 
     def wait_for(self, work: Callable[[], _Made], text: str) -> _Made:
-        """What it makes in another thread; meanwhile the window says so."""
+        """Run `work` in another thread, show `text` in the window meanwhile, and return the result."""
 
     def show(
         self, document: Document, live: tuple[Gdf, ...] = (), layers: tuple[LayerState, ...] = ()
     ) -> None:
-        """Draw the same scene with other edits from now on, with what is being trained on top."""
+        """Draw the same scene with other edits from now on, with the edits in training on top."""
 
     def open_document(
         self, document: Document, view: ViewState, snapshots: tuple[SliderSnapshot, ...] = ()
     ) -> None:
-        """Another scene takes the place of the open one."""
+        """Replace the open scene by another."""
 
     def leave(self) -> None:
-        """Close the window, without a question."""
+        """Close the window without a question."""
 
 
 Requests = dict[str, Callable[[str], object]]
-"""What a part of the application does when asked: by the request's name, with what follows its colon."""
+"""Actions of one part of the application: request name to function of the text after the request's colon."""
 
 
 def attempt(main_view: MainView, act: Callable[[], object]) -> None:
-    """Do it; what goes wrong is a line in the window."""
+    """Run an action; show a failure as a message in the window."""
     if error := failure_line(act):
         main_view.show_message(error, error=True)
 
 
 def failure_line(act: Callable[[], object]) -> str:
-    """Do it; what went wrong, in one line, "" for nothing. Mistakes of ours go on."""
+    """Run an action and return its failure in one line, "" for success. Internal errors are raised."""
     try:
         act()
     except (ProgdfError, OSError) as error:
@@ -71,7 +72,7 @@ def failure_line(act: Callable[[], object]) -> str:
 
 
 def error_line(error: Exception) -> str:
-    """An error that the person can mend, in one line of no commands; "" for a mistake of ours."""
+    """Return a user-facing error in one line without commands; "" for an internal error."""
     if isinstance(error, ProgdfError):
         return without_commands(str(error))
     if isinstance(error, OSError):
@@ -80,15 +81,15 @@ def error_line(error: Exception) -> str:
 
 
 def error_details(error: Exception) -> str:
-    """A mistake of ours with all that a report of it needs."""
+    """Return an internal error with everything that a bug report needs."""
     system = f"progdf {__version__}, Python {platform.python_version()}, {platform.platform()}"
     return f"{system}\n\n{''.join(traceback.format_exception(error))}"
 
 
 def log_error(details: str) -> None:
-    """Add it to window.log in the folder of the program's state, which keeps the last 1-2 MB."""
+    """Append the details to window.log in the program's state folder, which keeps the last 1 to 2 MB."""
     folder = state_folder()
-    with suppress(OSError):  # where no log can be written, the message still has the details
+    with suppress(OSError):  # if the log cannot be written, the message still has the details
         folder.mkdir(parents=True, exist_ok=True)
         file = RotatingFileHandler(
             folder / LOG, maxBytes=1 << 20, backupCount=1, encoding="utf-8", errors="backslashreplace"

@@ -1,4 +1,4 @@
-"""The picture in the window: drawn when it is another than the last one, coarsely while it moves."""
+"""Picture in the window: drawn when the view changes, at a lower resolution during interactive rendering."""
 
 from __future__ import annotations
 
@@ -30,20 +30,24 @@ from viewer.state.workspace import Pointed, Workspace, original
 from viewer.ui.context import PALETTE
 
 SIZE = (168, 126)
-"""Pixels of a small picture."""
+"""Width and height of a thumbnail, in pixels."""
 
 
 class Thumbnails:
-    """Small pictures on show. `ctx`: where textures live"""
+    """Thumbnails as GL textures. `ctx`: the GL context of the textures"""
 
     def __init__(self, ctx: moderngl.Context) -> None:
         self._ctx = ctx
         self._made: dict[object, moderngl.Texture] = {}
 
     def update(self, draws: Mapping[object, Callable[[], Pixels]]) -> tuple[tuple[int, ...], bool]:
-        """Texture names, 0 where one is not drawn yet, and whether any is missing.
+        """Draw at most one missing thumbnail, so that a session with many stays responsive.
 
-        One is drawn a call, so that a session of many does not stop the hand. `draws`: by what decides it
+        Args:
+            draws: functions that draw a thumbnail, by a key of everything that it depends on
+
+        Returns:
+            Texture names, 0 for one that is not drawn yet; True if any is still missing.
         """
         for key in [key for key in self._made if key not in draws]:
             self._made.pop(key).release()
@@ -59,26 +63,26 @@ class Thumbnails:
 
 
 class Canvas:
-    """The splats on screen, and the small pictures of the snapshots.
+    """Rendered splats on screen, and the thumbnails of snapshots and edits.
 
     Args:
         context: the GL context of the engine
-        engine: draws them; stays the caller's
-        last: the canvas of the same scene under other edits; its picture stays until there is one of these
+        engine: draws the splats; owned by the caller
+        last: the canvas of the same scene with other edits; its picture stays until the first new one
     """
 
     def __init__(self, context: moderngl.Context, engine: ViewEngine, last: Canvas | None = None) -> None:
         self.comparer = Comparer(engine, context)
         self._thumbnails = Thumbnails(context)
         self.timings = dynamic_resolution.FrameTimings()
-        """Of the picture on screen."""
+        """Timings of the picture on screen."""
         self.pictures_drawn = 0
-        """How many pictures were drawn."""
+        """Number of pictures drawn."""
         self._resolution = dynamic_resolution.first_known(len(engine.scene), engine.draws_with)
-        self._last: tuple[object, object] = ((), ())  # what was shown last: camera and size, edits
-        self._sliding = False  # the mouse holds what moves the edits
-        self._awaited: object = None  # what is being made while the last picture stays on screen
-        self._begun: tuple[ViewState, tuple[int, int]] | None = None  # what was not done yet
+        self._last: tuple[object, object] = ((), ())  # last drawn: camera and size, edits
+        self._sliding = False  # the current drag changes the edits
+        self._awaited: object = None  # key of the picture being drawn while the last one stays on screen
+        self._begun: tuple[ViewState, tuple[int, int]] | None = None  # view and size of an unfinished picture
         self._follows = last is not None and engine.follow(last.comparer.engine)
         if last is not None and self._follows:
             self._resolution, self._last = last._resolution, last._last
@@ -94,17 +98,17 @@ class Canvas:
         pointed: Pointed | None = None,
         live: bool = False,
     ) -> None:
-        """Show `view` in the lower left `size` pixels of `screen`.
+        """Draw `view` into the lower left `size` pixels of `screen`.
 
         Args:
-            focus: the layer whose painted weights are shown while the brush is out, or None
-            pointed: what the panel is asked about
-            live: an edit that is being made is on top, and is what one looks at
-            dragging: the mouse holds something, so that more will follow
+            focus: the layer whose painted weights are visible while the brush is active, or None
+            pointed: the item of the panel under the pointer
+            live: an edit in training or preview is on top
+            dragging: the mouse drags something, so that more frames will follow
             now: seconds on the main view's clock
 
         Raises:
-            ProgdfError: a layer of `view` means nothing.
+            ProgdfError: a layer of `view` is invalid.
         """
         screen.use()
         screen.clear(*PALETTE.panel)
@@ -138,35 +142,35 @@ class Canvas:
 
     @property
     def pixels(self) -> int:
-        """Of the window that one pixel of the picture fills, each way; more than 1 while it is coarse."""
+        """Window pixels per picture pixel, each way; more than 1 during interactive rendering."""
         return self._resolution.pixels
 
     def next_frame_delay(self, now: float) -> float | None:
-        """Seconds until the picture has to be drawn in full; None where it is."""
+        """Return the seconds until the picture must be drawn at full resolution; None if it already is."""
         return dynamic_resolution.next_frame_delay(self._resolution, now)
 
     def awaits_picture(self) -> bool:
-        """Whether a picture is being made of which there is nothing new to show yet."""
+        """Return True if a picture is being drawn and there is no new part to show yet."""
         if self._begun is None or self.comparer.prepare(*self._begun):
             return False
         return not self.comparer.engine.renderer.has_parts
 
     def image(self, view: ViewState, size: tuple[int, int]) -> Image:
-        """The picture as an array, in full; see `Comparer.image`. [H,W,3]"""
+        """Return the picture at full resolution; see `Comparer.image`. [H,W,3]"""
         return self.comparer.image(view, size)
 
     def save(self, folder: Path, title: str, view: ViewState, size: tuple[int, int]) -> str:
-        """Write the picture of a view, with the camera from which it was taken; a line that tells where.
+        """Write the picture of a view with its camera; return a line with the path.
 
         Args:
-            folder: where; the file's name begins with `title`
+            folder: target folder; the file's name begins with `title`
 
         Raises:
             ProgdfError: see `exports.picture`.
         """
         image = self.image(view, size)
         pixels = draw_labels(image, view.compare, self.comparer.labels(view))
-        if view.compare.mode != "off":  # which is no view that could be edited and trained on
+        if view.compare.mode != "off":  # a comparison cannot be edited and trained on
             return f"Saved {exports.picture(folder, title, pixels)}"
         camera = to_camera(view.camera, image.shape[1], image.shape[0])
         origin = self.comparer.engine.scene.origin
@@ -174,7 +178,8 @@ class Canvas:
         return f"Saved {exports.picture(folder, title, pixels, chunk)}"
 
     def save_original(self, folder: Path, title: str, view: ViewState, size: tuple[int, int]) -> Path:
-        """Write the picture of all of the scene without its edits, for a program that changes pictures.
+        """Write the picture of the whole scene without edits, to be edited in another program; return its
+        path.
 
         Raises:
             ProgdfError: see `exports.picture`.
@@ -186,10 +191,11 @@ class Canvas:
         return exports.picture(folder, title, to_pixels(self.image(view, size)), chunk)
 
     def thumbnails(self, work: Workspace, rows: Sequence[LayerRow]) -> tuple[Pictures, bool]:
-        """Of the snapshots, that of the original first, and of the edits; whether one is missing."""
+        """Return the thumbnails of the snapshots, the original first, and of the edits; True if any is
+        missing."""
         snapshots = with_original(work.snapshots, work.view) if work.snapshots else ()
         draws: dict[object, Callable[[], Pixels]] = {
-            # the original has no edit, however its layers are active
+            # the original has no edit, whichever of its layers are active
             (i, snapshot.edit if i else None, snapshot.camera): partial(
                 self._draw_snapshot, i, snapshot, work.view
             )
@@ -205,10 +211,10 @@ class Canvas:
         try:
             many = len(engine.scene) >= dynamic_resolution.MANY
             return to_pixels(engine.image(target, SIZE, pixels=2 if many else 1))
-        except ProgdfError:  # an edit that is not open
+        except ProgdfError:  # the edit is not open
             return np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
 
     def release(self) -> None:
-        """Give back all but the engine."""
+        """Free everything but the engine."""
         self.comparer.release()
         self._thumbnails.release()

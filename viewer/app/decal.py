@@ -1,4 +1,5 @@
-"""A picture with transparency in the hand: it follows the pointer over the scene until it is laid on."""
+"""Decal: a picture with transparency that follows the pointer over the scene until it is placed on the
+surface."""
 
 from __future__ import annotations
 
@@ -17,26 +18,26 @@ from viewer.camera.view_camera import to_camera
 from viewer.ui import overlay
 from viewer.ui.pointer import PointerContext
 
-_LARGEST = 1024  # pixels of the longer side of what is shown of it
-_FIRST = 0.25  # of the picture's height, that its longer side takes at first
-_STEP, _TURN = 1.08, 5.0  # of a notch of the wheel: times the size, degrees
-_SIZES = (8.0, 8192.0)  # window pixels
+_LARGEST = 1024  # maximum longer side of the picture shown on screen, pixels
+_FIRST = 0.25  # initial longer side, as a fraction of the view's height
+_STEP, _TURN = 1.08, 5.0  # per notch of the wheel: size factor, rotation in degrees
+_SIZES = (8.0, 8192.0)  # minimum and maximum, window pixels
 _HINT = "Wheel sizes, Shift+wheel turns; click or Enter lays it on, Esc puts it away"
 
 
 @dataclass(frozen=True)
 class Decal:
-    """The picture and how it lies in the window."""
+    """Picture and its placement in the window."""
 
     path: Path
     texture: moderngl.Texture
-    size: float = 0.0  # of its longer side, window pixels; 0 before the first frame
+    size: float = 0.0  # longer side, window pixels; 0 before the first frame
     angle: float = 0.0  # degrees, counterclockwise
-    at: tuple[float, float] | None = None  # its center, window pixels; None before the first frame
+    at: tuple[float, float] | None = None  # center, window pixels; None before the first frame
 
     @staticmethod
     def take(context: moderngl.Context, path: Path) -> Decal:
-        """Take a picture into the hand.
+        """Load a picture as a decal.
 
         Raises:
             ProgdfError: it cannot be read.
@@ -48,12 +49,13 @@ class Decal:
         return Decal(path, texture)
 
     def draw(self, pointer: PointerContext) -> tuple[Decal, str]:
-        """The picture after this frame's mouse, and the request that this led to, "" for none."""
+        """Draw the decal; return it after this frame's mouse input, and its request, "" for none."""
         io, area = imgui.get_io(), pointer.area
         inside = 0.0 <= io.mouse_pos.x < area.width and 0.0 <= io.mouse_pos.y < area.height
         over = inside and not io.want_capture_mouse
         size, angle = self.size or _FIRST * area.height, self.angle
-        notches = (io.mouse_wheel or io.mouse_wheel_h) if over else 0.0  # with Shift some systems turn it
+        # some systems turn the wheel sideways with Shift
+        notches = (io.mouse_wheel or io.mouse_wheel_h) if over else 0.0
         if notches and io.key_shift:
             angle += math.copysign(_TURN, notches)
         elif notches:
@@ -67,7 +69,7 @@ class Decal:
 
     @property
     def corners(self) -> list[tuple[float, float]]:
-        """Its corners in the window, clockwise from the upper left of the picture."""
+        """Corners in the window, clockwise from the upper left of the picture."""
         scale, (x0, y0) = self.size / max(self.texture.size), self.at or (0.0, 0.0)
         across, down = (scale * side / 2 for side in self.texture.size)
         cosine, sine = math.cos(math.radians(self.angle)), math.sin(math.radians(self.angle))
@@ -77,7 +79,7 @@ class Decal:
         ]
 
     def place(self, pointer: PointerContext) -> tuple[Camera, str]:
-        """The camera from which it is laid on, and `progdf train --at`."""
+        """Return the camera from which the decal is placed, and the value of `progdf train --at`."""
         camera = to_camera(pointer.shown.camera, *pointer.size)
         density, (x, y) = camera.height / pointer.area.height, self.at or (0.0, 0.0)
         numbers = (density * x, density * y, density * self.size, self.angle)
@@ -85,12 +87,12 @@ class Decal:
 
     @property
     def takes_mouse(self) -> bool:
-        """Whether the mouse is its own: all but the buttons that move the camera."""
+        """True if the decal takes the mouse, that is, no button that moves the camera is pressed."""
         return not any(imgui.is_mouse_down(button) or imgui.is_mouse_released(button) for button in (1, 2))
 
 
 def is_decal(path: Path) -> bool:
-    """Whether a picture has anything transparent, and something that is not."""
+    """Return True if a picture has both transparent and visible pixels."""
     with Image.open(path) as picture:
         if "A" not in picture.getbands() and "transparency" not in picture.info:
             return False

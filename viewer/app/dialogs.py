@@ -1,7 +1,8 @@
-"""Questions over the picture: where to save, what to open, what becomes of unsaved changes.
+"""Dialogs over the picture: where to save, which file to open, how to handle unsaved changes.
 
-All of it goes by keys too: Enter takes the marked button, Escape leaves all as it was. Where to save is asked
-until it is saved: the file actions takes that question away.
+All dialogs work by keys: Enter presses the marked button, Escape changes nothing. The save dialog stays until
+the
+file is saved; then the file actions close it.
 """
 
 from __future__ import annotations
@@ -72,13 +73,13 @@ _SUBMIT = {
     "render_picture": ("Render", "deliver:render_picture"),
     "render_film": ("Render", "deliver:render_film"),
 }
-"""The button of each question that has a path field, and what it asks for."""
+"""Button and request of each dialog that has a path field."""
 _DELIVERS = ("export", "export_page", "render_picture", "render_film")
 
 
 @dataclass(frozen=True)
 class _Button:
-    """A button of a question without a path field; `keys` press it too."""
+    """Button of a dialog without a path field; `keys` press it too."""
 
     name: str
     keys: tuple[str, ...] = ()
@@ -104,23 +105,23 @@ _REQUESTS = {
     ("restore", "Restore"): ("restore_autosave:{path}",),
     ("restore", "Discard"): ("discard_autosave:{path}",),
 }
-"""What the buttons ask for that do more than to close the question."""
+"""Requests of the buttons that do more than close the dialog."""
 
 
 @dataclass(frozen=True)
 class DialogResult:
-    """The dialog as it is now, None once it is over, and the requests that come of it."""
+    """Dialog after this frame, None once it is closed, and the resulting requests."""
 
     dialog: Dialog | None
     requests: tuple[str, ...] = ()
 
 
 def draw(dialog: Dialog, pressed: Sequence[str], ui: UiContext, area: Area) -> DialogResult:
-    """Draw the question and take its answer.
+    """Draw the dialog and take its answer.
 
     Args:
-        pressed: chords that went down in this frame
-        area: the picture; the question is in its upper part
+        pressed: chords pressed in this frame
+        area: the picture; the dialog is in its upper part
     """
     if not imgui.is_popup_open(_POPUP):
         imgui.open_popup(_POPUP)
@@ -137,7 +138,7 @@ def draw(dialog: Dialog, pressed: Sequence[str], ui: UiContext, area: Area) -> D
     if imgui.begin_popup_modal(_POPUP, None, flags_of_popup)[0]:
         context, at_button = imgui.get_current_context(), not imgui.get_io().want_text_input
         if context.nav_cursor_visible and at_button and context.nav_id not in (0, imgui.get_id("##path")):
-            pressed = [chord for chord in pressed if chord != "Enter"]  # it is of what has the keyboard
+            pressed = [chord for chord in pressed if chord != "Enter"]  # the focused item takes it
         answer = _content(dialog, pressed, ui, area.height - margin)
         if answer.dialog is None:
             imgui.close_current_popup()
@@ -148,7 +149,7 @@ def draw(dialog: Dialog, pressed: Sequence[str], ui: UiContext, area: Area) -> D
 
 
 def _content(dialog: Dialog, pressed: Sequence[str], ui: UiContext, bottom: float) -> DialogResult:
-    """`bottom`: where the question has to end, window pixels"""
+    """Draw the content of a dialog. `bottom`: its maximum lower edge, window pixels"""
     with imgui_ctx.push_font(ui.fonts.bold, 0.0):
         imgui.text(TITLES[dialog.kind])
     wrapped_text(_HINTS[dialog.kind].format(escape_text(Path(dialog.text).name)), PALETTE.dim)
@@ -156,7 +157,7 @@ def _content(dialog: Dialog, pressed: Sequence[str], ui: UiContext, bottom: floa
     if "Escape" in pressed:
         return DialogResult(None)
     if dialog.chosen and dialog.kind in _DELIVERS:
-        dialog = replace(dialog, text=dialog.chosen, chosen="")  # there may be more to choose
+        dialog = replace(dialog, text=dialog.chosen, chosen="")  # there may be more options to choose
     if dialog.chosen:
         return _submit(dialog, dialog.chosen)
     if dialog.kind in _CHOICES:
@@ -168,13 +169,13 @@ def _content(dialog: Dialog, pressed: Sequence[str], ui: UiContext, bottom: floa
             imgui.dummy((0.0, 2.0 * ui.scale))
         return _answer(dialog, _pressed_button(_CHOICES[dialog.kind], pressed, ui))
     if _is_new(dialog.kind) or (dialog.error and not imgui.is_any_item_active()):
-        imgui.set_keyboard_focus_here()  # Enter lets go of the field, and the path is to be corrected
+        imgui.set_keyboard_focus_here()  # Enter removes the focus, and the path needs a correction
     more, gap = 36.0 * ui.scale, 6.0 * ui.scale
     imgui.set_next_item_width(-more - gap)
     flags = 0 if dialog.error else imgui.InputTextFlags_.auto_select_all.value
     escaped = escape_text(dialog.text)
     _, text = imgui.input_text("##path", escaped, flags)
-    text = dialog.text if text == escaped else text  # a name that is not UTF-8 stays the file's own
+    text = dialog.text if text == escaped else text  # a name that is not UTF-8 stays unchanged
     dialog = replace(dialog, text=text)
     imgui.same_line(0.0, gap)
     with inert(dialog.choosing):
@@ -202,7 +203,7 @@ def _content(dialog: Dialog, pressed: Sequence[str], ui: UiContext, bottom: floa
 
 
 def _is_new(kind: str) -> bool:
-    """Whether this question was not asked in the last frame; another one may have been, in the same popup."""
+    """Return True if this dialog was not open in the last frame; another may have used the same popup."""
     storage, slot, number = imgui.get_state_storage(), int(imgui.get_id("kind")), 1 + [*TITLES].index(kind)
     changed = storage.get_int(slot) != number
     storage.set_int(slot, number)
@@ -210,31 +211,31 @@ def _is_new(kind: str) -> bool:
 
 
 def _submit(dialog: Dialog, path: str) -> DialogResult:
-    """The file that was asked for; the question stays where the file may not serve."""
+    """Request the file; the dialog stays open if the file may be rejected."""
     stays = replace(dialog, text=path, chosen="") if dialog.kind in ("save", *_DELIVERS) else None
     return DialogResult(stays, (_SUBMIT[dialog.kind][1].format(path=path, then=dialog.then),))
 
 
 def _pressed_button(choices: Sequence[_Button], pressed: Sequence[str], ui: UiContext) -> str:
-    """The name of the button that was pressed, by the mouse or a key; "" for none."""
+    """Return the name of the button pressed by mouse or key; "" for none."""
     button = _buttons([choice.name for choice in choices], ui)
     by_key = (choice.name for choice in choices if any(key in pressed for key in choice.keys))
     return button or next(by_key, "")
 
 
 def _answer(dialog: Dialog, button: str) -> DialogResult:
-    """What follows from a button of a question without a path field."""
+    """Return the result of a button of a dialog without a path field."""
     if not button:
         return DialogResult(dialog)
     if button == "Rename…":
         return DialogResult(Dialog("save", dialog.text, dialog.then))
     requests = _REQUESTS.get((dialog.kind, button), ())
-    stays = dialog if button == "Replace" else None  # until it is written
+    stays = dialog if button == "Replace" else None  # until the file is written
     return DialogResult(stays, tuple(each.format(path=dialog.text, then=dialog.then) for each in requests))
 
 
 def _log(path: Path, bottom: float, ui: UiContext) -> None:
-    """The end of what a run said."""
+    """Draw the end of a run's log."""
     try:
         text = path.read_text("utf-8", "replace")[-_LOG_CHARACTERS:]
     except OSError as error:
@@ -252,12 +253,12 @@ def _log(path: Path, bottom: float, ui: UiContext) -> None:
 
 
 def _escape_lines(text: str) -> str:
-    """Text whose lines stay lines."""
+    """Escape each line of a text and keep its line breaks."""
     return "\n".join(escape_text(line) for line in text.splitlines())
 
 
 def _buttons(names: Sequence[str], ui: UiContext) -> str | None:
-    """Buttons at the right, the first one marked; the name of the pressed one."""
+    """Draw buttons at the right, the first one marked; return the name of the pressed one."""
     wide, gap = 92.0 * ui.scale, 8.0 * ui.scale
     start = imgui.get_content_region_avail().x - len(names) * wide - (len(names) - 1) * gap
     imgui.set_cursor_pos_x(imgui.get_cursor_pos_x() + max(start, 0.0))
@@ -271,11 +272,15 @@ def _buttons(names: Sequence[str], ui: UiContext) -> str | None:
 
 
 PROGRAMS = ("zenity", "kdialog", "qarma", "matedialog")
-"""Any of them shows a dialog on Linux. Without one the library answers as if the person had canceled, so it
-is looked for here; the path field always stays."""
+"""Programs that show a file dialog on Linux; one is enough.
+
+Without one the dialog library answers as if the user had canceled, so it is looked for here. The path field
+is
+always available.
+"""
 
 POLL_S = 0.05
-"""How often to look whether the person has chosen."""
+"""Seconds between two polls of the system file dialog."""
 
 _OPEN = [
     "Scenes, edits, sessions, cameras",
@@ -287,30 +292,32 @@ _SAVE = ["Sessions", "*.json", "All files", "*"]
 
 
 def obstacle() -> str:
-    """Why no dialog can be shown, in one line; "" where one can."""
+    """Return the reason why no system file dialog can be shown, in one line; "" if one can."""
     if sys.platform in ("win32", "darwin") or any(shutil.which(program) for program in PROGRAMS):
         return ""
     return f"No file dialog is installed ({PROGRAMS[0]} or {PROGRAMS[1]}); type the path"
 
 
 class Browser:
-    """The dialog of the desktop beside a question of ours, one at a time. `close` it before it is dropped:
-    the library would wait for the person."""
+    """System file dialog next to one of our dialogs, one at a time.
+
+    `close` it before dropping it: otherwise the library waits for the user.
+    """
 
     def __init__(self) -> None:
         self._dialog: dialogs.open_file | dialogs.save_file | None = None
 
     @property
     def on_screen(self) -> bool:
-        """Whether a dialog is shown, and worth another look after `POLL_S`."""
+        """True if a system dialog is open and must be polled after `POLL_S`."""
         return self._dialog is not None
 
     def open(self, dialog: Dialog, near: Path) -> Dialog:
-        """The question while the desktop's dialog is shown, or with the reason why there is none.
+        """Open the system dialog; return our dialog with a notice, or with the reason why there is none.
 
         Args:
-            dialog: one that asks for a path
-            near: a file beside which to begin where none is typed
+            dialog: a dialog with a path field
+            near: a file in whose folder to start if no path is typed
         """
         if missing := obstacle():
             return replace(dialog, notice=missing)
@@ -327,9 +334,9 @@ class Browser:
         )
 
     def poll(self, dialog: Dialog | None) -> Dialog | None:
-        """The question after a look at the dialog: with the file, if one was chosen. Does not wait."""
+        """Return our dialog after a poll of the system dialog, with the chosen file if any. Does not wait."""
         if self._dialog is None or dialog is None or not dialog.choosing:
-            self.close()  # the question was answered without it
+            self.close()  # the dialog was answered without it
             return dialog
         if not self._dialog.ready(0):
             return dialog
@@ -339,7 +346,7 @@ class Browser:
         return replace(dialog, choosing=False, notice="", chosen=path)
 
     def close(self) -> None:
-        """Take the dialog away, answered or not."""
+        """Close the system dialog, answered or not."""
         if self._dialog is not None and not self._dialog.ready(0):
             self._dialog.kill()
         self._dialog = None

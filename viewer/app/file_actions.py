@@ -1,6 +1,7 @@
-"""Files of the window: opened and dropped ones by their content, the session, its autosave, recent files.
+"""File actions of the window: open and dropped files by their content, the session, its autosave, recent
+files.
 
-Everything that goes wrong here is one line in the window; the work stays as it was.
+Every failure becomes one line in the window, and the work stays unchanged.
 """
 
 from __future__ import annotations
@@ -43,17 +44,17 @@ from .main_view import MainView
 
 
 def look_through(main_view: MainView, path: Path) -> None:
-    """Take the first camera of a file.
+    """Move the view to the first camera of a file.
 
     Raises:
-        ProgdfError: it holds none.
+        ProgdfError: the file holds no camera.
     """
     _take_camera(main_view, load_cameras(path, main_view.facts.origin)[0])
     main_view.show_message(f"Looking through the first camera of {path.name}")
 
 
 def edit_picture(main_view: MainView, path: Path) -> None:
-    """Put a picture that was changed into the form of a new edit, and look from where it was taken.
+    """Put an edited picture into the form of a new edit, and move the view to its camera.
 
     Raises:
         ProgdfError: it is no picture, its camera is not found, or it was taken with edits on.
@@ -74,7 +75,7 @@ def _take_camera(main_view: MainView, camera: Camera) -> None:
 
 
 def keep_camera(app: Application, session: Path | None) -> None:
-    """Add the view on screen to the cameras kept beside the session, or the scene.
+    """Add the view on screen to the cameras stored next to the session, or next to the scene.
 
     Raises:
         ProgdfError: see `exports.camera`.
@@ -87,7 +88,7 @@ def keep_camera(app: Application, session: Path | None) -> None:
 
 
 class EditActions:
-    """Changes of the stack that undo takes back.
+    """Changes of the layer stack that can be undone.
 
     Args:
         app: the window
@@ -97,11 +98,16 @@ class EditActions:
         self._app = app
 
     def add(self, path: Path, name: str = "", strength: float = 1.0, deselect: bool = False) -> None:
-        """An edit on top, see `add_layer`; a grade of another scene or of none goes on what is selected, and
-        with nothing selected everywhere. `name`: the layer's, "" for the edit's
+        """Add an edit on top, see `add_layer`.
+
+        A grade of another scene, or of none, is applied to the selection, or everywhere if nothing is
+        selected.
+
+        Args:
+            name: name of the layer, "" for the edit's name
 
         Raises:
-            ProgdfError: the file is missing or broken, or no grade, and was made for another scene.
+            ProgdfError: the file is missing or broken, or it is no grade and was made for another scene.
         """
         before, scene = self._app.main_view.work.view, self._app.document.original
         selected = selection.unpack(before.selection.members, len(scene)).copy()
@@ -114,9 +120,10 @@ class EditActions:
         self._apply(view, len(view.layers) - 1)
 
     def finish(self, draft: Path, path: Path) -> bool:
-        """The trained edit in place of its draft, in every layer and entry of the history; whether one shows.
+        """Replace a draft by its trained edit in every layer and history entry; return True if a layer uses
+        it.
 
-        Nothing of the state changes: strength, gains, paint, order, selection and undo are as they were.
+        The state does not change: strength, gains, paint, order, selection and undo history stay.
 
         Raises:
             ProgdfError: as for `add`.
@@ -135,14 +142,14 @@ class EditActions:
         return any(layer.gdf in drafts for layer in view.layers)
 
     def duplicate(self, index: int) -> None:
-        """A copy of a layer above it, with an edit of its own: the timeline and undo tell edits apart."""
+        """Add a copy of a layer above it, with its own edit, as the timeline and undo distinguish edits."""
         document, view = self._app.document, self._app.main_view.work.view
         gdf = view.layers[index].gdf
         path = document.gdf_paths[gdf] if gdf < len(document.gdf_paths) else None
         self._apply(duplicate_layer(view, index, self._open(document.edits[gdf], path)), index + 1)
 
     def replace(self, layer: str, path: str) -> None:
-        """Another edit in a layer's place; a grade of another scene or of none takes the layer's region.
+        """Replace a layer's edit; a grade of another scene, or of none, takes the layer's region.
 
         Raises:
             ProgdfError: as for `add`.
@@ -152,10 +159,10 @@ class EditActions:
         self._apply(replace_edit(view, index, self._open(gdf, file), gdf.name), index)
 
     def layer(self, index: str) -> int:
-        """The layer that a request is about: the focused one where none is named.
+        """Return the layer of a request: the given index, or the focused layer for "".
 
         Raises:
-            ProgdfError: there is none.
+            ProgdfError: there is no such layer.
         """
         work = self._app.main_view.work
         chosen = int(index) if index else work.focus
@@ -164,7 +171,7 @@ class EditActions:
         return chosen
 
     def _load(self, path: Path, region: Region) -> Gdf:
-        """An edit of the scene, or the grade of another on a region."""
+        """Load an edit of the scene, or a grade of another scene applied to a region."""
         scene = self._app.document.original
 
         def place(stored: Gdf) -> Region | None:
@@ -177,7 +184,7 @@ class EditActions:
         return gdf
 
     def _open(self, gdf: Gdf, path: Path | None) -> int:
-        """Have one more edit open; its index."""
+        """Open one more edit and return its index."""
         document = self._app.document
         renamed = replace(gdf, name=document.free_name(gdf.name))
         known = path is not None and len(document.gdf_paths) == len(document.edits)
@@ -186,24 +193,24 @@ class EditActions:
         return len(document.edits)
 
     def _apply(self, view: ViewState, focus: int) -> None:
-        """The changed stack, and the layer that it is about."""
+        """Set the changed stack and focus one layer."""
         main_view = self._app.main_view
         main_view.change(view)
         main_view.work = focus_layer(main_view.work, focus)
 
 
 class FileActions:
-    """Opens, saves and asks, for one window.
+    """File dialogs, opening and saving for one window.
 
     Args:
         app: the window
-        path: the session's file, None before it has one
+        path: the session's file; None before it has one
     """
 
     def __init__(self, app: Application, path: Path | None = None) -> None:
         self._app, self.path = app, path
         self.session_autosave = SessionAutosave()
-        self._put_off: set[Path] = set()  # autosaves that were found and are to be decided about later
+        self._put_off: set[Path] = set()  # autosaves that the user decides about later
         self._browser = dialogs.Browser()
         self._edits = EditActions(app)
         opened = app.document
@@ -211,9 +218,13 @@ class FileActions:
 
     @property
     def requests(self) -> Requests:
-        """`save:THEN` and `save_as:THEN` ask for THEN afterwards; `save_to`, `overwrite`, `open_file`,
-        `restore_autosave` and `discard_autosave` name a file, `duplicate` and `replace` a layer's index, the
-        focused one's without; `browse` shows the desktop's own dialog beside the question that is open."""
+        """Requests for files.
+
+        `save:THEN` and `save_as:THEN` request THEN afterwards. `save_to`, `overwrite`, `open_file`,
+        `restore_autosave` and `discard_autosave` name a file. `duplicate` and `replace` take a layer's index,
+        or use the
+        focused layer. `browse` shows the system file dialog next to the open dialog.
+        """
         ask, edits = self._app.main_view.ask, self._edits
         return {
             "save": lambda then: self._save_where(then, ask=False),
@@ -237,17 +248,17 @@ class FileActions:
         }
 
     def _open_keys(self, _: str) -> None:
-        """The file of keys in the program that the desktop has for it, with all there are in it at first."""
+        """Write a file with all key bindings, if none exists, and open it in the desktop's program for it."""
         keys = {action: command.keys.split() for action, command in COMMANDS.items()}
         path = write_keys(keys)
         webbrowser.open(path.as_uri())
         self._app.main_view.show_message(f"Keys are read from {path} when the window opens")
 
     def poll_dialog(self) -> float | None:
-        """Look whether a file was chosen in the desktop's own dialog, and take it.
+        """Poll the system file dialog, and take a chosen file.
 
         Returns:
-            Seconds until it has to be called again; None if no such dialog is on screen.
+            Seconds until the next call; None if no system dialog is open.
         """
         main_view = self._app.main_view
         dialog = self._browser.poll(main_view.work.dialog)
@@ -257,12 +268,16 @@ class FileActions:
 
     @property
     def has_unsaved(self) -> bool:
-        """Whether something would be lost that a session could keep."""
+        """True if there are unsaved changes that a session can store."""
         return self._app.document.path is not None and workspace.has_unsaved(self._app.main_view.work)
 
     def open(self, path: Path) -> None:
-        """A file by what it is: scenes and sessions replace all, an edit comes on top, a camera is taken, a
-        changed picture goes into the form of a new edit."""
+        """Open a file according to its content.
+
+        Scenes and sessions replace everything, an edit becomes the top layer, a camera moves the view, and an
+        edited
+        picture goes into the form of a new edit.
+        """
 
         def open_kind() -> None:
             file = unpack_bundle(path) if path.name.endswith(BUNDLE) else path
@@ -272,7 +287,7 @@ class FileActions:
         attempt(self._app.main_view, open_kind)
 
     def save(self, path: Path) -> None:
-        """Save the session there from now on.
+        """Save the session to `path`, which becomes its file.
 
         Raises:
             ProgdfError: see `session.save`.
@@ -293,13 +308,13 @@ class FileActions:
         main_view.show_message(f"Saved {path.resolve()}")
 
     def autosave(self, now: float) -> float | None:
-        """Write unsaved work beside the session once it is old enough.
+        """Write unsaved work next to the session once it is old enough.
 
         Args:
-            now: seconds of any clock that does not go back
+            now: seconds of any monotonic clock
 
         Returns:
-            Seconds until it has to be called again; None if nothing waits.
+            Seconds until the next call; None if nothing waits.
         """
         if not self.has_unsaved:
             self.session_autosave.stop()
@@ -313,23 +328,23 @@ class FileActions:
         return wait or None
 
     def keep_work(self) -> str:
-        """Write unsaved work beside the session at once; a line that tells what became of it."""
+        """Write unsaved work next to the session at once; return a line that reports the result."""
         try:
             if not self.has_unsaved:
                 return "nothing was unsaved"
             unsaved = workspace.worth_saving(self._app.main_view.work)
             path = self.session_autosave.write(unsaved, self._autosave_base, self._write)
             return f"unsaved work is kept in {path}"
-        except Exception as error:  # what is wrong may be the work itself
+        except Exception as error:  # the work itself may be invalid
             log_error(error_details(error))
             return f"unsaved work could not be kept ({error}); save it under another name"
 
     def on_close(self) -> None:
-        """The window closes, and nothing is lost: the autosave has done its work."""
+        """Remove the autosave when the window closes, as no work is unsaved."""
         self.session_autosave.drop()
 
     def release(self) -> None:
-        """Take away what of the desktop's is still on screen."""
+        """Close the system file dialog, if it is still open."""
         self._browser.close()
 
     def _open(self, path: Path, kind: str) -> None:
@@ -378,24 +393,24 @@ class FileActions:
             return
         main_view.work = replace(main_view.work, saved=None)
         discarded = session.is_discarded(path)
-        # what was never saved, or was discarded, never takes the place of a session unasked
+        # work that was never saved, or was discarded, never replaces a session without a question
         self.path = saved if saved.is_file() and not discarded else None
         if not discarded:
             self.session_autosave.continue_from(path)
             main_view.show_message(f"Restored the unsaved work of {saved.name}")
 
     def offer_autosave(self) -> None:
-        """Ask what becomes of work that was left unsaved the last time, of the latest first."""
+        """Ask about the latest autosave of an earlier window, if there is any."""
         if self._app.document.path is None:
             return
         paths = session.find_autosaves(self._session_name(), numbered=self.path is None)
         new = [path for path in paths if path != self.session_autosave.path and path not in self._put_off]
         if new:
-            self._put_off.add(new[0])  # if it is not decided now
+            self._put_off.add(new[0])  # in case the user does not decide now
             self._app.main_view.ask(Dialog("restore", str(new[0])))
 
     def _discard(self, _: str) -> None:
-        """Unsaved work is given up; its autosave stays under another name."""
+        """Discard unsaved work; its autosave stays under another name."""
         self._app.main_view.work = workspace.mark_saved(self._app.main_view.work)
         self.session_autosave.discard()
 
@@ -433,7 +448,7 @@ class FileActions:
         self._app.main_view.change(replace(view, selection=renamed))
 
     def _claim_regions(self, path: Path) -> None:
-        """Regions whose files a session there would not be given back get new ones beside it."""
+        """Assign new files next to a session at `path` to regions whose files it could not load."""
         main_view, scene = self._app.main_view, self._app.document.path
         view = main_view.work.view
         if scene is not None and view.selection.regions:
@@ -454,10 +469,14 @@ class FileActions:
         self._save_to(str(self.path), then)
 
     def _save_to(self, path: str, then: str | None = None, overwrite: bool = False) -> None:
-        """Save there, then do what was put off (None: for the question that is open); where that fails, ask
-        for another place and say why.
+        """Save to `path`, then perform the postponed request. On failure, ask for another path and show the
+        error.
 
-        A file that is not this session's own is replaced only where the person says so.
+        A file that is not this session's own is replaced only after confirmation.
+
+        Args:
+            then: the postponed request; None takes that of the open dialog
+            overwrite: the user has confirmed the replacement
         """
         main_view, dialog = self._app.main_view, self._app.main_view.work.dialog
         then = (dialog.then if dialog else "") if then is None else then
@@ -476,14 +495,14 @@ class FileActions:
             main_view.ask(Dialog("save", path, then, error=error))
 
     def _browse(self, _: str) -> None:
-        """The desktop's own dialog beside the question that is open."""
+        """Open the system file dialog next to the open dialog."""
         main_view = self._app.main_view
         if main_view.work.dialog is not None:
             near = self.path or self._app.document.path or Path("file")
             main_view.ask(self._browser.open(main_view.work.dialog, near))
 
     def leave(self) -> None:
-        """Close the window, after a question where something is unsaved."""
+        """Close the window, after a question if there are unsaved changes."""
         if self.has_unsaved:
             self._app.main_view.ask(self._closing_question("quit"))
         else:
@@ -493,11 +512,11 @@ class FileActions:
         return Dialog("leave", str(self._autosave_base()), then)
 
     def _session_name(self) -> Path:
-        """The session's file, or what it is called where it never had one."""
+        """Return the session's file, or its default name if it has none."""
         return self.path or session.default_path(self._app.document)
 
     def _autosave_base(self) -> Path:
-        """The session's file; where it never had one, a name that nothing has."""
+        """Return the session's file, or an unused name if it has none."""
         return self.path or session.free_session(self._session_name(), self.session_autosave.path)
 
     def _remember(self, *paths: Path) -> tuple[Path, ...]:

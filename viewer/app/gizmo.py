@@ -1,4 +1,4 @@
-"""Handles in the picture by which a selection is moved, turned and scaled (ImGuizmo)."""
+"""Handles in the picture that move, rotate and scale a selection (ImGuizmo)."""
 
 from __future__ import annotations
 
@@ -22,19 +22,20 @@ _HANDLES = _OPERATION(_OPERATION.translate | _OPERATION.rotate | _OPERATION.scal
 
 @dataclass(frozen=True)
 class Gizmo:
-    """Handles about what is being moved."""
+    """Handles around the selection being moved."""
 
     does: Literal["transform", "duplicate"]
-    center: tuple[float, float, float]  # of what is moved, where the handles begin
-    # from where it was to where it is, about its center; the world's axes. [4,4]
+    center: tuple[float, float, float]  # center of the selection, where the handles start
+    # from the original to the current place, about the center; world axes. [4,4]
     matrix: NDArray[np.float64]
-    using: bool = False  # the mouse holds a handle
+    using: bool = False  # the mouse drags a handle
 
     def draw(self, pointer: PointerContext) -> tuple[Gizmo, str]:
-        """The handles after this frame's mouse, and the request that this led to, "" for none."""
+        """Draw the handles; return them after this frame's mouse input, and the resulting request, "" for
+        none."""
         size = pointer.size
         camera = to_camera(pointer.shown.camera, *size)
-        flip = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL looks against z
+        flip = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenGL looks along −z
         view = flip @ camera.viewmat.double().numpy()
         place = np.eye(4)
         place[:3, 3] = self.center
@@ -52,7 +53,7 @@ class Gizmo:
 
     @property
     def step(self) -> tuple[list[float], list[float], float]:
-        """The shift, the turn (axis times radians) and the growth of what is moved."""
+        """Translation, rotation (axis times radians) and scale of the selection."""
         linear = self.matrix[:3, :3]
         grown = max(abs(float(np.linalg.det(linear))) ** (1 / 3), 1e-6)
         turn = Rotation.from_matrix(linear / grown).as_rotvec()
@@ -60,12 +61,12 @@ class Gizmo:
 
     @property
     def is_moved(self) -> bool:
-        """Whether anything is elsewhere than it was."""
+        """True if the selection is not at its original place."""
         return not np.allclose(self.matrix, np.eye(4), atol=1e-9)
 
     @property
     def takes_mouse(self) -> bool:
-        """Whether the mouse is on a handle, or holds one."""
+        """True if the mouse is over a handle or drags one."""
         return self.using or bool(im_guizmo.is_over())
 
 
@@ -74,7 +75,7 @@ def _columns(matrix: NDArray[np.float64]) -> im_guizmo.Matrix16:
 
 
 def _projection(fov_y: float, aspect: float, near: float) -> NDArray[np.float64]:
-    """OpenGL's, of a camera of so many degrees."""
+    """Return OpenGL's projection matrix for a vertical field of view in degrees."""
     tall, far = 1.0 / math.tan(math.radians(fov_y) / 2), 1e5 * near
     projection = np.zeros((4, 4))
     projection[0, 0], projection[1, 1] = tall / aspect, tall
@@ -84,7 +85,7 @@ def _projection(fov_y: float, aspect: float, near: float) -> NDArray[np.float64]
 
 
 def _buttons(gizmo: Gizmo, pointer: PointerContext) -> str:
-    """At the top of the picture: what can be done with what was moved."""
+    """Draw the buttons that keep or cancel the change at the top of the picture."""
     scale = pointer.ui.scale
     at = (pointer.area.width / 2, 14.0 * scale)
     with plate("placing", at, pointer.ui, (0.5, 0.0)):

@@ -1,4 +1,4 @@
-"""What is drawn around and over the picture in a frame, and what becomes of the workspace by it."""
+"""Panels and overlays of one frame: each function draws a part and returns the new workspace."""
 
 from __future__ import annotations
 
@@ -43,33 +43,34 @@ MOUSE_HELP = (
 
 _MAC = (("Cmd", "Is Ctrl here; both work"),)
 
-_ROW, _BETWEEN = 1.24, 0.7  # in sizes of the small text: from row to row, and above a heading
+_ROW, _BETWEEN = 1.24, 0.7  # in sizes of the small text: row pitch, and space above a heading
 COLUMN_PX, _MARGIN_PX = 248.0, 14.0  # at 1×
 MOST_COLUMNS = 4
 
 
 @dataclass(frozen=True)
 class Topic:
-    """A heading, and under it what does what."""
+    """Heading with rows of keys and their effects."""
 
     name: str
     rows: tuple[tuple[str, str], ...]
 
     @property
     def height(self) -> float:
-        """With its heading, in rows."""
+        """Height with the heading, in rows."""
         return len(self.rows) + 1 + _BETWEEN / _ROW
 
 
 def topics() -> tuple[Topic, ...]:
-    """Everything that can be done, each once."""
+    """Return all commands by topic, each once."""
     mouse = Topic("Mouse", MOUSE_HELP + (_MAC if sys.platform == "darwin" else ()))
     return mouse, *(Topic(name, tuple(dict.fromkeys(_lines(commands)))) for name, commands in TOPICS.items())
 
 
 def _lines(commands: Sequence[Command]) -> Iterator[tuple[str, str]]:
-    """Keys and text of each row; a key with Shift beside the same one is only spoken of in the text."""
-    shown = False  # the command is in the row before it
+    """Yield the keys and text of each row. A key with Shift next to the same plain key is only named in the
+    text."""
+    shown = False  # the row before this one includes the command
     for command, following in zip_longest(commands, commands[1:]):
         keys, joins = chords(command.action), following is not None and following.row == JOINED
         changed = is_changed(command) or (joins and is_changed(following))
@@ -83,14 +84,15 @@ def _lines(commands: Sequence[Command]) -> Iterator[tuple[str, str]]:
 
 
 def columns(topics: Sequence[Topic], count: int) -> list[list[Topic]]:
-    """The topics in their order in at most `count` columns, the longest as short as it can be."""
+    """Distribute the topics, in order, over at most `count` columns with the lowest possible height."""
     spans = ((i, j) for i in range(len(topics)) for j in range(i + 1, len(topics) + 1))
     heights = {sum(topic.height for topic in topics[i:j]) for i, j in spans}
     return next(packed for height in sorted(heights) if len(packed := _pack(topics, height)) <= count)
 
 
 def draw_keys(room: imgui.ImVec2, ui: UiContext) -> None:
-    """The list of keys in the middle of a `room` at the upper left; it scrolls where it is longer."""
+    """Draw the list of keys centered in `room`, which starts at the upper left. A list that is too long
+    scrolls."""
     margin, wide = _MARGIN_PX * ui.scale, COLUMN_PX * ui.scale
     packed = columns(topics(), max(1, min(MOST_COLUMNS, int((room.x - 2 * margin) / wide))))
     tall = max(sum(topic.height for topic in column) for column in packed) * _ROW * SMALL_PX * ui.scale
@@ -116,11 +118,11 @@ def draw_keys(room: imgui.ImVec2, ui: UiContext) -> None:
 def draw_lists(
     work: Workspace, pointer: PointerContext, offered: Sequence[str], pressed: Sequence[str]
 ) -> Workspace:
-    """The list of all commands, where it was asked for.
+    """Draw the undo history and the command palette, if they are open.
 
     Args:
-        offered: its actions
-        pressed: chords that went down in this frame
+        offered: actions listed in the palette
+        pressed: chords pressed in this frame
     """
     if work.history is not None:
         work, chosen = draw_history(work, pointer.ui)
@@ -134,16 +136,16 @@ def draw_lists(
 
 
 PALETTE_PX, ROWS = 460.0, 12
-"""Width of the list of commands at 1×, and how many it shows at once."""
+"""Width of the command palette at 1×, in pixels, and its number of visible rows."""
 
 
 def draw_palette(
     work: Workspace, offered: Sequence[str], pressed: Sequence[str], ui: UiContext, area: overlay.Area
 ) -> tuple[Workspace, str]:
-    """A field and under it the commands that are called like that, the best first.
+    """Draw a search field and below it the matching commands, the best match first.
 
     Returns:
-        The workspace; the action that was chosen, "" for none.
+        The workspace; the chosen action, "" for none.
     """
     if work.palette == -1:
         imgui.open_popup("commands")
@@ -180,7 +182,7 @@ def draw_palette(
 
 
 def _command_row(command: Command, chosen: bool, ui: UiContext) -> bool:
-    """Name, what it does, and its key at the right; whether it was clicked."""
+    """Draw the command's name, description and key; return True if it was clicked."""
     x, y = imgui.get_cursor_screen_pos()
     wide, tall = imgui.get_content_region_avail().x, imgui.get_frame_height()
     pressed = imgui.invisible_button(command.action, (wide, tall))
@@ -226,7 +228,7 @@ def _heading(name: str, ui: UiContext) -> None:
 
 
 def _pack(topics: Sequence[Topic], height: float) -> list[list[Topic]]:
-    """Columns of at most this height, filled one after the other; too long a topic stands alone."""
+    """Fill columns of at most this height one after the other; a longer topic gets its own column."""
     packed: list[list[Topic]] = []
     for topic in topics:
         if packed and sum(t.height for t in (*packed[-1], topic)) <= height:
@@ -245,10 +247,10 @@ def panels(
     reveal: bool,
     compared: tuple[Labels, bool],
 ) -> Workspace:
-    """The panel, the tools and, where it is shown, the timeline. Arguments as of `panel.draw`.
+    """Draw the panel, the tools and, if open, the timeline. Further arguments as in `panel.draw`.
 
     Args:
-        compared: the words of the comparison on screen, and whether the original is shown
+        compared: labels of the comparison on screen, and whether the original is visible
     """
     actions: list[str] = []
     area, ui = pointer.area, pointer.ui
@@ -269,18 +271,21 @@ def panels(
 def draw_pill(
     work: Workspace, pointer: PointerContext, compared: tuple[Labels, bool], foot: float
 ) -> tuple[Workspace, list[str]]:
-    """What is compared with what, where there is anything to compare; what was asked for.
+    """Draw the comparison bar, if there is anything to compare.
 
     Args:
-        compared: as of `panels`
-        foot: of what lies above it, window pixels
+        compared: as in `panels`
+        foot: lower edge of the bar above, window pixels
+
+    Returns:
+        The workspace; the requested actions.
     """
     words, original = compared
     if not (work.view.layers or original or work.view.compare.mode != "off"):
         return work, []
     scale, wide = pointer.ui.scale, pointer.area.width
     free = wide - (0.0 if foot else tools.view_width(work.view, pointer.area, pointer.ui))
-    middle = min((wide + tools.TOOLBAR_PX * scale) / 2, free - 85.0 * scale)  # half of what it mostly takes
+    middle = min((wide + tools.TOOLBAR_PX * scale) / 2, free - 85.0 * scale)  # half of its usual width
     place = (middle, foot + tools.EDGE_PX * scale)
     work, asked = tools.draw_comparison(work, words, original, place, pointer.ui)
     return work, [asked] * bool(asked)
@@ -294,13 +299,13 @@ def over_picture(
     original: bool,
     at: tuple[float, float] | None,
 ) -> Workspace:
-    """The brush, the comparison, bindings and the message, which leaves when its time is over.
+    """Draw the brush, the comparison, the keys and the message, which disappears after its time.
 
     Args:
-        held: what the mouse holds
-        labels: over the comparison on screen
-        original: it is shown
-        at: where keys moved the pointer
+        held: the active mouse drag
+        labels: labels of the comparison on screen
+        original: the original is visible
+        at: pointer position set by keys
     """
     area, ui, view = pointer.area, pointer.ui, work.view
     io = imgui.get_io()
@@ -334,7 +339,7 @@ def over_picture(
 
 
 def draw_dialog(work: Workspace, pointer: PointerContext, pressed: Sequence[str]) -> Workspace:
-    """The question that is open, if one is; `pressed`: chords that went down in this frame."""
+    """Draw the open dialog, if any; `pressed` holds the chords pressed in this frame."""
     if work.dialog is None:
         return work
     answer = dialogs.draw(work.dialog, pressed, pointer.ui, pointer.area)
@@ -342,7 +347,7 @@ def draw_dialog(work: Workspace, pointer: PointerContext, pressed: Sequence[str]
 
 
 def perform_actions(work: Workspace, actions: Sequence[str], pointer: PointerContext) -> Workspace:
-    """What keys and buttons ask for, see `perform`; an undo says what it took back."""
+    """Perform the actions of keys and buttons, see `perform`. An undo shows the name of the undone change."""
     for action in actions:
         before = work
         work = perform(work, action, pointer.facts, pointer.area.width / pointer.area.height)
@@ -366,17 +371,17 @@ def perform_actions(work: Workspace, actions: Sequence[str], pointer: PointerCon
 
 
 UNDO_S = 2.0
-"""How long it is said what an undo took back."""
+"""Seconds for which the message of an undo stays."""
 _UNDOES = {"undo": ("Undid", history.next_undo), "redo": ("Redid", history.next_redo)}
 _HISTORY_PX = 280.0
 _FLAT = imgui.ChildFlags_.nav_flattened.value
 
 
 def draw_history(work: Workspace, ui: UiContext) -> tuple[Workspace, list[str]]:
-    """The list of what was done, the last of it at the foot, over the panel's buttons for undo.
+    """Draw the undo history above the panel's undo buttons, the latest change at the bottom.
 
     Returns:
-        The workspace; what was chosen.
+        The workspace; the chosen actions.
     """
     if work.history:
         imgui.open_popup("history")

@@ -1,6 +1,8 @@
-"""One window's content: input → workspace → picture → screen. Knows imgui and GL, but no windowing system.
+"""Main view of a window: input → workspace → picture → screen. Uses imgui and GL, but no windowing system.
 
-The window (app.py) and the tests feed imgui's io and call `frame`: a scripted mouse goes a real one's way.
+The window (app.py) and the tests fill imgui's io and call `frame`, so scripted input takes the same path as
+real
+input.
 """
 
 from __future__ import annotations
@@ -50,42 +52,42 @@ from .mouse import KeyPointer, MouseTool
 from .studio import pages
 from .studio.pages import Cover
 
-SETTLE_FRAMES = 3  # imgui takes a frame or two until hovering and layout have followed an event
+SETTLE_FRAMES = 3  # imgui needs a frame or two until hovering and layout follow an event
 LINGER_S = 0.65
-"""Seconds after which a resting mouse gets its tooltip: a little more than imgui's own two delays."""
+"""Seconds until the tooltip of a still mouse opens: a little more than imgui's own two delays."""
 
 
 class FramePacer:
-    """Counts frames, and seconds of rest, since the last event."""
+    """Counter of frames and idle seconds since the last event."""
 
     def __init__(self) -> None:
         self._unsettled = SETTLE_FRAMES
         self._rest_left: float | None = LINGER_S  # None: the tooltip has had its frames
 
     def wake(self) -> None:
-        """Something happened."""
+        """Restart the counters after an event."""
         self._unsettled, self._rest_left = SETTLE_FRAMES, LINGER_S
 
     def rest(self) -> None:
-        """Nothing can be drawn, as the window is minimized."""
+        """Stop requesting frames while the window is minimized."""
         self._unsettled, self._rest_left = 0, None
 
     def step(self, seconds: float) -> None:
-        """A frame begins, so long after the last one."""
+        """Begin a frame, `seconds` after the last one."""
         if self._unsettled > 0:
             self._unsettled -= 1
         elif self._rest_left is not None:
             self._rest_left -= seconds
             if self._rest_left <= 0.0:
-                # imgui counts the delay up in this frame, opens the tooltip unseen in the next one to measure
-                # it, and shows it in the one after
+                # imgui advances the delay in this frame, opens the tooltip invisibly in the next one to
+                # measure it, and shows it in the one after
                 self._unsettled, self._rest_left = SETTLE_FRAMES, None
 
     def next_frame_delay(self, others: Sequence[float]) -> float | None:
-        """Seconds until the next frame is due without an event, or None: none is.
+        """Return the seconds until the next frame is due without an event; None if none is due.
 
         Args:
-            others: seconds until something else wants a frame
+            others: seconds until other parts need a frame
         """
         if self._unsettled > 0:
             return 0.0
@@ -93,19 +95,19 @@ class FramePacer:
         return min(waits, default=None)
 
 
-FLIGHT_S = 1 / 60  # between frames while flying
+FLIGHT_S = 1 / 60  # seconds between frames while flying
 
 
 class MainView:
-    """Draws frames of one engine into the framebuffer it is given.
+    """Window content that draws frames of one engine into a given framebuffer.
 
     Args:
         context: the GL context of the engine
         engine: draws the picture
-        facts: of the open scene
-        view: what to show first
+        facts: data of the open scene
+        view: initial view
         scale: window pixels per design pixel (see UiContext)
-        pictures: folder into which saved pictures go
+        pictures: folder for saved pictures
     """
 
     def __init__(
@@ -119,26 +121,27 @@ class MainView:
     ) -> None:
         self.context, self.engine, self.facts, self.pictures = context, engine, facts, pictures
         self.canvas = Canvas(context, engine)
-        self.recent: tuple[Path, ...] = ()  # files opened before, for the dialogs
-        # of the start page: files opened before, and examples
+        self.recent: tuple[Path, ...] = ()  # recently opened files, for the dialogs
+        # for the start page: recently opened files, and examples
         self.start_files: tuple[Sequence[pages.StartFile], Sequence[pages.StartFile]] = (), ()
-        self.cover: Cover | None = None  # what lies over the picture
-        self.preview = PreviewState()  # of the picture of a new edit
-        self.live: tuple[LayerState, ...] = ()  # what is being trained, on top of the stack
-        self.report: Callable[[Exception], None] = self._report  # told of what a part of a frame raises
-        self.gizmo: Gizmo | Decal | None = None  # what is being moved, or laid on the scene
+        self.cover: Cover | None = None  # image drawn over the picture
+        self.preview = PreviewState()  # state of the preview of a new edit
+        self.live: tuple[LayerState, ...] = ()  # edits in training, on top of the layer stack
+        self.report: Callable[[Exception], None] = self._report  # receives the errors of a part of a frame
+        self.gizmo: Gizmo | Decal | None = None  # handles of a selection being moved, or a decal being placed
         self.surfaces = Surfaces()
         self.ui = UiContext(scale)
         imgui.backends.opengl3_init("#version 330")
         self.work = workspace.new_workspace(view)
-        self.frames = 0  # all that were drawn
+        self.frames = 0  # number of frames drawn
         self._tool = MouseTool()
         self.pointed = KeyPointer()
-        self._revealed = (self.work.focus, False)  # the layer that the panel shows, and whether it has a bar
-        self._keys = NO_KEYS  # of the present frame
-        self._held = False  # something of the interface in the last frame, by the mouse or the keyboard
-        self._popups = 0, 0  # how many were open as the last frame began, and this one
-        self._half = 0  # of two pictures side by side, the one that the mouse is in
+        # the layer shown in the panel, and whether several are selected
+        self._revealed = (self.work.focus, False)
+        self._keys = NO_KEYS  # keys of the current frame
+        self._held = False  # an item of the interface was active in the last frame, by mouse or keyboard
+        self._popups = 0, 0  # number of open popups at the start of the last frame and of this one
+        self._half = 0  # of two pictures side by side, the one under the mouse: 0 left, 1 right
         self._clock = 0.0
         self._pending = PendingKeys()
         self._resting = False
@@ -146,12 +149,12 @@ class MainView:
         self.wake = self._pace.wake
 
     def rest(self) -> None:
-        """Nothing can be drawn until the next frame, as the window is minimized."""
+        """Stop drawing until the next frame, as the window is minimized."""
         self._pace.rest()
         self._resting = True
 
     def close(self) -> None:
-        """Free what the main view made; the engine and the context are the caller's."""
+        """Free the resources of the main view; the caller owns the engine and the context."""
         self.ui.make_current()
         imgui.backends.opengl3_shutdown()
         self.ui.close()
@@ -162,7 +165,7 @@ class MainView:
         """Draw with another engine from now on (the scene or its edits have changed).
 
         Args:
-            live: layers of what is being trained; the engine has their edits after those of the facts
+            live: layers of the edits in training; in the engine these edits follow those of the facts
         """
         self.canvas.release()
         self.surfaces.drop()
@@ -171,19 +174,20 @@ class MainView:
         self.wake()
 
     def change(self, view: ViewState) -> None:
-        """A new state from outside the window; what it edits can be undone."""
+        """Set a new state from outside the window; changes of edits can be undone."""
         self.work = workspace.record_undo(replace(self.work, view=view))
         self.wake()
 
     def restart(self, view: ViewState, snapshots: tuple[SliderSnapshot, ...] = ()) -> None:
-        """A new state and snapshots, with nothing to undo, nothing in the hand or over the picture."""
+        """Set a new state and snapshots, with an empty undo history, no active drag and nothing over the
+        picture."""
         self.work = replace(workspace.new_workspace(view, snapshots), layout=self.work.layout)
         self._tool = MouseTool()
         self.cover, self.preview, self.gizmo = None, PreviewState(), None
         self.wake()
 
     def next_frame_delay(self) -> float | None:
-        """Seconds the window may wait for an event before the next `frame`; None: for ever."""
+        """Return the seconds that the window may wait for an event before the next frame; None: no limit."""
         self.ui.make_current()
         if not self._resting and (has_pending_input() or self.opening):
             return 0.0
@@ -198,24 +202,28 @@ class MainView:
         return self._pace.next_frame_delay(waits if film is None else [*waits, film])
 
     def is_due(self) -> bool:
-        """Whether a frame would show anything new; not if it could only look for a picture that is not done:
-        where the processor draws the window too, that takes the time from it."""
+        """Return True if a frame would show anything new.
+
+        A frame that could only poll an unfinished picture does not count: where the processor also draws the
+        window,
+        it would slow that picture down.
+        """
         return self.next_frame_delay() == 0.0 or not self.canvas.awaits_picture()
 
     def show_message(
         self, text: str, error: bool = False, details: str = "", button: tuple[str, str] = ("", "")
     ) -> None:
-        """Show one line at the bottom of the picture for a while, with a button: its name and its action."""
+        """Show one line at the bottom of the picture for a while, with a button (name and action)."""
         self.work = workspace.with_message(self.work, text, self._clock, error, details, button=button)
         self.wake()
 
     def frame(self, screen: moderngl.Framebuffer, seconds: float, keys: Keys = NO_KEYS) -> None:
-        """Handle the input that imgui's io holds, and draw.
+        """Handle the input in imgui's io, and draw.
 
         Args:
-            screen: where to draw
-            seconds: since the last frame
-            keys: what the keyboard did
+            screen: the framebuffer to draw into
+            seconds: time since the last frame
+            keys: keyboard input of this frame
         """
         self.ui.make_current()
         imgui.get_io().delta_time = max(seconds, 1e-5)
@@ -242,13 +250,13 @@ class MainView:
         return self.ui.guard(self.report)
 
     def _report(self, error: Exception) -> None:
-        """Without an application: what the person can mend is a message, mistakes of ours go on."""
+        """Handle an error without an application: show user-facing errors, raise internal ones."""
         if not isinstance(error, ProgdfError):
             raise error
         self.show_message(str(error), error=True)
 
     def _update(self, keys: Keys, seconds: float) -> None:
-        """The workspace after what the person did."""
+        """Update the workspace from the user's input."""
         before = self.work
         self._keys = self._pending.take(keys)
         self._handle_input(seconds)
@@ -273,16 +281,16 @@ class MainView:
 
     @property
     def at_start(self) -> bool:
-        """Whether nothing is open, so that the start page is shown."""
+        """True if nothing is open, so that the start page is visible."""
         return not self.facts.title
 
     @property
     def opening(self) -> bool:
-        """Whether a text field was asked for and has no keyboard yet: what is typed now would be lost."""
+        """True if a text field is about to get the keyboard: text typed now would be lost."""
         return not self._resting and self._pending.opening
 
     def _area(self) -> overlay.Area:
-        """The part of the window that shows the picture."""
+        """Return the part of the window that shows the picture."""
         display = imgui.get_io().display_size
         wide = panel.width(self.work.layout, self.ui) if self.work.view.panel and not self.at_start else 0.0
         return overlay.Area(max(display.x - wide, 1.0), max(display.y, 1.0))
@@ -304,7 +312,8 @@ class MainView:
         for action in requested_actions(self._keys):
             if self.at_start and action not in pages.COMMANDS:
                 continue
-            if not asks or action == "window_picture":  # which shows what is open, and changes nothing
+            # window_picture saves the open window and changes nothing
+            if not asks or action == "window_picture":
                 self._perform(action)
         if self.at_start:
             for action in pages.draw_start_page(*self.start_files, self.ui):
@@ -326,13 +335,13 @@ class MainView:
                 )
             self._revealed = self.work.focus, several
         held = self._tool.drag is None and self._move_gizmo()
-        if not off and not held:  # else the right button has said all it was pressed for
-            tool, pointer, self._tool = self._tool, self._pointer(), MouseTool()  # put down if it raises
+        if not off and not held:  # else the right button was only pressed to cancel the drag
+            tool, pointer, self._tool = self._tool, self._pointer(), MouseTool()  # dropped if it raises
             with self._guard():
                 self._tool, self.work = mouse.handle_mouse(tool, self.work, pointer)
 
     def _point_by_keys(self, asks: bool) -> None:
-        """Keys move the pointer of what is in the hand."""
+        """Move the pointer of the active tool by keys."""
         work, decal = self.work, isinstance(self.gizmo, Decal)
         picks = work.form_open and work.form.picks
         if decal or picks or work.view.select.tool or work.view.brush.active:
@@ -346,8 +355,13 @@ class MainView:
             self.pointed = KeyPointer()
 
     def _follow_keyboard(self, asks: bool) -> None:
-        """A part of the window that has the keyboard takes all keys but F1 to F12 and those with Ctrl, until
-        a click or Escape; `asks`: something lies over it."""
+        """Restrict the keys while a part of the window has the keyboard.
+
+        That part takes all keys but F1 to F12 and those with Ctrl, until a click or Escape.
+
+        Args:
+            asks: a dialog or menu lies over the part
+        """
         if self.work.keyboard and not asks:
             pressed = {press.chord for press in self._keys.pressed}
             leaves = "Escape" in pressed and not self._held
@@ -365,7 +379,7 @@ class MainView:
         self.ui.focused = self.ui.focused if self.work.keyboard else ""
 
     def _move_gizmo(self) -> bool:
-        """Handles, or a decal, follow the mouse; whether it is theirs."""
+        """Move the handles or the decal with the mouse; return True if they take the mouse."""
         if self.gizmo is None:
             return False
         pressed, keep = [press.chord for press in self._keys.pressed], "lay_decal"
@@ -382,19 +396,20 @@ class MainView:
 
     @property
     def decal_place(self) -> tuple[Path, Camera, str] | None:
-        """The decal in the hand, from where it is laid on, and where in that picture."""
+        """File of the decal being placed, the camera from which it is placed, and its position in that
+        picture."""
         if not isinstance(self.gizmo, Decal):
             return None
         return self.gizmo.path, *self.gizmo.place(self._pointer())
 
     def _takes_keys(self) -> bool:
-        """Whether a question, a list, a menu or the form takes all keys, or Escape has just closed one."""
+        """Return True if a dialog, list, menu or form takes all keys, or Escape has just closed one."""
         self._popups = self._popups[1], len(imgui.get_current_context().open_popup_stack)
         form = self.work.form_open and new_edit_form.has_keyboard()
         return self.work.dialog is not None or max(self._popups) > 0 or form
 
     def _cancel_drag(self) -> None:
-        """What is dragged goes back to where it was, and nothing is held any more."""
+        """Restore the state from before the drag and end the drag."""
         self.work, self._tool = mouse.cancel_drag(self._tool, self.work), MouseTool()
         self.pointed = mouse.let_go(self.pointed)
         imgui.internal.clear_active_id()
@@ -405,7 +420,7 @@ class MainView:
             self.work = interface.perform_actions(self.work, [action], self._pointer())
 
     def _pointer(self) -> PointerContext:
-        """What lies under the mouse."""
+        """Return the context of the pointer: scene, area and displayed view."""
         area = self._area()
         if self._tool.drag is None:
             self._half = int(2 * imgui.get_io().mouse_pos.x >= area.width)
@@ -431,27 +446,27 @@ class MainView:
             return sides.right
         for layer in self.live:
             view = add_layer(view, layer.gdf, layer.name, layer.strength)
-        moved = self.work.form_open or self.gizmo is not None  # by a form or handles, not trained behind it
+        moved = self.work.form_open or self.gizmo is not None  # the live edit is theirs, not from training
         if self.live and moved and self._tool.gesture is None:
             view = replace(view, select=replace(view.select, tool=""))
         return view
 
     def _frame(self) -> overlay.Area | None:
-        """The size of the safe frame; none while something lies over the picture."""
+        """Return the size of the safe frame; None while an image lies over the picture."""
         area, covered = self._area(), timeline_bar.height(self.work, self._area(), self.ui)
         return None if self.cover is not None else overlay.safe_frame(self.work.view, area, covered)
 
     def _is_held(self) -> bool:
-        """Whether the user holds something that moves the picture, or a film plays."""
+        """Return True if the user's input or a playing film moves the picture."""
         if self._tool.drag is not None or imgui.is_any_item_active() or imgui.get_io().mouse_wheel:
             return True
         moves = self.work.player.playing or self.work.glide is not None
         return moves or is_flying(self._keys) or is_repeating(self._keys)
 
     def _draw_overlays(self) -> None:
-        """What is drawn over the picture; where some of it goes away, another frame follows."""
+        """Draw the overlays of the picture; request another frame if one of them disappears."""
         pointer, before = self._pointer(), self.work
-        over = max(self._popups) > 1  # a list over the question takes its keys
+        over = max(self._popups) > 1  # a list over the dialog takes its keys
         pressed = [] if over else [press.chord for press in self._keys.pressed]
         with self._guard():
             self.work = interface.draw_dialog(self.work, pointer, pressed)
@@ -473,26 +488,26 @@ class MainView:
 
     @property
     def picture_size(self) -> tuple[int, int]:
-        """Width and height in pixels of the picture on screen."""
+        """Width and height of the picture on screen, in pixels."""
         return self._pointer().size
 
     def ask(self, dialog: Dialog) -> None:
-        """Open a question over the picture."""
+        """Open a dialog over the picture."""
         self.work = replace(self.work, dialog=dialog)
         self.wake()
 
     def request(self, request: str) -> None:
-        """One more thing for the window to do, after the next frame."""
+        """Add a request that the window performs after the next frame."""
         self.work = replace(self.work, requests=(*self.work.requests, request))
         self.wake()
 
     def take_requests(self) -> tuple[str, ...]:
-        """What the window shall do now; asked for once each."""
+        """Return the pending requests of the window and clear them."""
         requests, self.work = self.work.requests, replace(self.work, requests=())
         return requests
 
     def _save_files(self, screen: moderngl.Framebuffer) -> None:
-        """Serve the requests for files that the main view can make by itself."""
+        """Serve the requests for files that need only the main view."""
         served = [request for request in self.work.requests if request in exports.REQUESTS]
         unserved = tuple(request for request in self.work.requests if request not in served)
         self.work = replace(self.work, requests=unserved)

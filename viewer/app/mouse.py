@@ -1,4 +1,4 @@
-"""The mouse on the picture: drags of the camera, the divider and the brush, clicks that pick."""
+"""Mouse input on the picture: drags of camera, divider and brush, and clicks that pick."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ from viewer.ui.pointer import PointerContext
 from . import select_tool
 from .select_tool import Click, Gesture, Strokes
 
-REACH_PX = 8.0  # at 1×: so near to the divider the mouse grips it
+REACH_PX = 8.0  # at 1×: the mouse grips the divider within this distance
 DIVIDER = "divider"
-"""The name of its drag, beside those of `keys.DRAGS`."""
+"""Name of the divider's drag, in addition to those of `keys.DRAGS`."""
 
 
 def place_divider(view: ViewState, divider: float) -> ViewState:
-    """The divider at this share of the picture's width, held to 0..1."""
+    """Place the divider at this fraction of the picture's width, clamped to 0 to 1."""
     return replace(view, compare=replace(view.compare, divider=max(0.0, min(1.0, divider))))
 
 
 def draw_comparison(view: ViewState, area: Area, held: bool, ui: UiContext) -> None:
-    """The divider; `held`: the mouse holds it, or is over it."""
+    """Draw the divider; `held`: the mouse drags it or is over it."""
     if view.compare.mode == "split":
         _divider(view.compare.divider, area, held, ui)
         _knob(round(view.compare.divider * area.width), area.height / 2, held, ui)
@@ -54,7 +54,7 @@ def _divider(share: float, area: Area, held: bool, ui: UiContext) -> None:
 
 
 def _knob(x: float, y: float, held: bool, ui: UiContext) -> None:
-    """A round grip with an arrow to either side."""
+    """Draw a round grip with an arrow on either side."""
     s, canvas = ui.scale, imgui.get_background_draw_list()
     ink = u32(PALETTE.accent if held else PALETTE.handle)
     canvas.add_circle_filled((x, y), 12.0 * s, u32(PALETTE.scrim))
@@ -68,29 +68,29 @@ def _knob(x: float, y: float, held: bool, ui: UiContext) -> None:
         )
 
 
-CLICK_PX = 3.0  # a press that moves no further, at 1×, is a click
+CLICK_PX = 3.0  # at 1×: a press that moves no further is a click
 
 
 @dataclass(frozen=True)
 class MouseTool:
-    """What the mouse holds."""
+    """Active mouse drag and gesture."""
 
-    # one of `keys.DRAGS`, `DIVIDER`, `PAINT_DRAG`, `SELECT_DRAG` or `AXES_DRAG`; None while it holds nothing
+    # one of `keys.DRAGS`, `DIVIDER`, `PAINT_DRAG`, `SELECT_DRAG` or `AXES_DRAG`; None without a drag
     drag: str | None = None
     stroke: Stroke | None = None  # of the brush, from its first drag on
-    gesture: Gesture | None = None  # of the tool that selects; of a polygon also between its clicks
-    # the last of a tool that selects by one, while it follows the tool's tolerance
+    gesture: Gesture | None = None  # of a selection tool; for a polygon also between its clicks
+    # the last click of a tool that selects by one click, while it follows the tool's tolerance
     click: Click | None = None
-    strokes: tuple[Strokes, ...] = ()  # that a tool spreads, as they became more
-    divider: float = 0.5  # where that of a split stood when it was gripped, share of the picture's width
-    axis: str = ""  # the end of an axis that was pressed, of `AXES`, or another part of the axes
-    # of the tools that select and paint, as they were before a button was pressed
+    strokes: tuple[Strokes, ...] = ()  # strokes that a tool spreads, one entry per change
+    divider: float = 0.5  # divider before the drag, fraction of the picture's width
+    axis: str = ""  # the pressed end of an axis, of `AXES`, or another part of the axes
+    # settings of the selection tool and the brush before a button was pressed
     settings: tuple[SelectTool, Brush] | None = None
 
 
 @dataclass(frozen=True)
 class KeyPointer:
-    """The pointer of a tool as keys move it."""
+    """Pointer of a tool when it is moved by keys."""
 
     at: tuple[float, float] | None = None  # in the window; None while the mouse moves it
     down: bool = False  # keys pressed the button
@@ -99,10 +99,13 @@ class KeyPointer:
 def point_by_keys(
     held: KeyPointer, keys: Keys, pointer: PointerContext, clicks: bool
 ) -> tuple[KeyPointer, Keys]:
-    """Keys move the pointer and press its button, and imgui hears of it as of the mouse; others go on.
+    """Move the pointer and press its button by keys; imgui receives them as mouse events.
 
     Args:
-        clicks: what is in the hand needs no more than a click, by which it is let go
+        clicks: the active tool needs only a click, which is released at once
+
+    Returns:
+        The pointer, and the unused keys.
     """
     io, area, at, down = imgui.get_io(), pointer.area, held.at, held.down
     if (
@@ -130,14 +133,14 @@ def point_by_keys(
 
 
 def let_go(held: KeyPointer) -> KeyPointer:
-    """The button that keys pressed goes up."""
+    """Release the button that keys pressed."""
     if held.down:
         imgui.get_io().add_mouse_button_event(0, False)
     return replace(held, down=False)
 
 
 def handle_mouse(tool: MouseTool, work: Workspace, pointer: PointerContext) -> tuple[MouseTool, Workspace]:
-    """What the mouse did in this frame, as imgui's io has it."""
+    """Handle the mouse input of this frame from imgui's io."""
     io = imgui.get_io()
     tool, work = _drag(tool, work, pointer)
     click, work = select_tool.adjust(tool.click, work, pointer)
@@ -183,8 +186,12 @@ def handle_mouse(tool: MouseTool, work: Workspace, pointer: PointerContext) -> t
 
 
 def cancel_drag(tool: MouseTool, work: Workspace) -> Workspace:
-    """What is dragged goes back to where it was; undo knows where, but for the settings of the tools and the
-    divider, which are no edits."""
+    """Restore the state from before the drag.
+
+    Edits come back from the undo history. Settings of the tools and the divider are no edits and come back
+    from
+    `tool`.
+    """
     work = workspace.cancel_drag(work)
     if tool.settings is not None:
         select, brush_settings = tool.settings
@@ -195,7 +202,7 @@ def cancel_drag(tool: MouseTool, work: Workspace) -> Workspace:
 
 
 def grips_divider(tool: MouseTool, view: ViewState, pointer: PointerContext) -> bool:
-    """Whether the divider of a split is in the tool, or under it."""
+    """Return True if the divider of a split is dragged or under the mouse."""
     if tool.drag is not None:
         return tool.drag == DIVIDER
     mouse, area = imgui.get_io().mouse_pos, pointer.area
@@ -205,7 +212,7 @@ def grips_divider(tool: MouseTool, view: ViewState, pointer: PointerContext) -> 
 
 
 def _drag(tool: MouseTool, work: Workspace, pointer: PointerContext) -> tuple[MouseTool, Workspace]:
-    """What is held follows the mouse."""
+    """Apply this frame's mouse movement to the active drag."""
     io, scale = imgui.get_io(), pointer.ui.scale
     dx, dy = io.mouse_delta.x / scale, io.mouse_delta.y / scale
     if tool.drag == DIVIDER:
@@ -222,16 +229,16 @@ def _drag(tool: MouseTool, work: Workspace, pointer: PointerContext) -> tuple[Mo
         turned = controls.orbit(camera, dx, dy) if _has_traveled(pointer.ui) else camera
         return tool, workspace.with_camera(work, turned)
     if tool.drag and (dx or dy):
-        # also where the button went up within this frame: a slow frame must not lose the end of a drag
+        # also if the button went up within this frame: a slow frame must not lose the end of a drag
         height, radius = pointer.scale * pointer.area.height / scale, pointer.facts.bounds.radius
-        lens = pointer.shown.camera.fov_y  # wider than its own around a safe frame
+        lens = pointer.shown.camera.fov_y  # a safe frame widens the view beyond the camera's own angle
         camera = controls.drag(replace(work.view.camera, fov_y=lens), tool.drag, dx, dy, height, radius)
         return tool, workspace.with_camera(work, replace(camera, fov_y=work.view.camera.fov_y))
     return tool, work
 
 
 def _begin_stroke(tool: MouseTool, work: Workspace, pointer: PointerContext) -> tuple[MouseTool, Workspace]:
-    """The brush comes down on the focused layer, or says why it cannot."""
+    """Begin a brush stroke on the focused layer, or show why it cannot be painted."""
     reason = tools.paint_obstacle(work.view, work.focus)
     if reason or work.focus is None:
         return tool, workspace.with_message(work, f"Cannot paint: {reason}", pointer.now, error=True)
@@ -243,7 +250,7 @@ def _begin_stroke(tool: MouseTool, work: Workspace, pointer: PointerContext) -> 
 
 
 def _paint(tool: MouseTool, work: Workspace, pointer: PointerContext) -> tuple[MouseTool, Workspace]:
-    """The brush moves to the cursor; what it has painted so far is shown at once."""
+    """Extend the brush stroke to the cursor and show the result at once."""
     view, focus = work.view, work.focus
     if tool.stroke is None or focus is None:
         return tool, work
@@ -254,13 +261,13 @@ def _paint(tool: MouseTool, work: Workspace, pointer: PointerContext) -> tuple[M
 
 
 def _has_traveled(ui: UiContext) -> bool:
-    """Whether the left button moved between its press and its release, by more than a tremor."""
+    """Return True if the left button moved further than `CLICK_PX` since its press."""
     way = imgui.get_mouse_drag_delta(0, CLICK_PX * ui.scale)
     return bool(way.x or way.y)
 
 
 def _look_along(work: Workspace, axis: str) -> Workspace:
-    """A click on an end of an axis: seen from there."""
+    """Look from the clicked end of an axis."""
     camera = work.view.camera
     if axis not in AXES:
         return work
@@ -268,7 +275,7 @@ def _look_along(work: Workspace, axis: str) -> Workspace:
 
 
 def _focus_picked_layer(work: Workspace, pointer: PointerContext) -> Workspace:
-    """A click on the picture: the layer there, if there is one, is focused."""
+    """Focus the layer at a click on the picture, if there is any."""
     engine, view = pointer.engine, pointer.shown
     camera = pointer.camera(view.camera)
     seen = seen_at(pointer.scene, camera, *pointer.cursor, engine.near)
@@ -277,7 +284,7 @@ def _focus_picked_layer(work: Workspace, pointer: PointerContext) -> Workspace:
 
 
 def _pick_pivot(camera: ViewCamera, pointer: PointerContext) -> ViewCamera:
-    """A double click: what lies under the cursor becomes the pivot."""
+    """Set the pivot to the surface at a double click."""
     engine = pointer.engine
     point = surface_point(pointer.scene, pointer.camera(pointer.shown.camera), *pointer.cursor, engine.near)
     return camera if point is None else controls.pivot_on(camera, point, pointer.facts.bounds.radius)

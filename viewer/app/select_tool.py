@@ -1,4 +1,4 @@
-"""The tools that select in the picture: gestures of the mouse, what they select, and how they are drawn."""
+"""Selection tools in the picture: mouse gestures, their selected Gaussians, and their drawing."""
 
 from __future__ import annotations
 
@@ -36,68 +36,68 @@ from viewer.ui.context import PALETTE, UiContext, u32
 from viewer.ui.keys import Keys
 from viewer.ui.pointer import PointerContext
 
-_STROKE_PX, _MOST_PLACES, _MOST_DOTS = 4.0, 16, 300  # at 1×: half a stroke's width; places looked at; dots
-_SEEDS = 0.1  # of a pixel's color that a Gaussian gives to be a seed
+_STROKE_PX, _MOST_PLACES, _MOST_DOTS = 4.0, 16, 300  # at 1×: half a stroke's width; sampled places; dots
+_SEEDS = 0.1  # a seed contributes at least this fraction of a pixel's color
 
 Point = tuple[float, float]
 
 
 @dataclass(frozen=True)
 class Brushed:
-    """What a brush can reach, and what it has touched."""
+    """Gaussians that a brush can reach, and those it has touched."""
 
     centers: Centers  # of all Gaussians
-    reachable: Mask  # those that are not behind others, or all. [N]
+    reachable: Mask  # Gaussians that are not occluded, or all. [N]
     touched: Mask  # so far. [N]
 
 
 @dataclass(frozen=True)
 class Gesture:
-    """A selection under way."""
+    """Selection gesture in progress."""
 
     tool: str  # of `SELECT_TOOLS`
     mode: str  # of `SELECT_MODES`
-    before: bytes  # what was selected when it began, packed
-    path: tuple[Point, ...]  # where the hand has been, pixels of the picture; the corners of a polygon
+    before: bytes  # selection before the gesture, packed
+    path: tuple[Point, ...]  # pointer positions, pixels of the picture; the corners of a polygon
     brushed: Brushed | None = None  # of a brush
     center: Vec3 | None = None  # of a sphere, world units
-    scale: float = 0.0  # world units per pixel there
+    scale: float = 0.0  # world units per pixel at the center
 
     @property
     def radius(self) -> float:
-        """Of a sphere, world units."""
+        """Radius of a sphere, world units."""
         return self.scale * float(np.hypot(*np.subtract(self.path[-1], self.path[0])))
 
 
 @dataclass(frozen=True)
 class Strokes:
-    """What was drawn on a thing and beside it."""
+    """Scribbles on an object and next to it."""
 
-    on: Rows  # of the Gaussians under strokes on it
-    beside: Rows  # under those beside it
-    after: bytes  # what was selected by them, packed
+    on: Rows  # Gaussians under strokes on the object
+    beside: Rows  # Gaussians under strokes next to it
+    after: bytes  # selection that resulted, packed
 
 
 @dataclass(frozen=True)
 class Click:
-    """A click of "flood" or "color", which follows its tolerance until something else is selected."""
+    """Click of "flood" or "color", which follows its tolerance until something else is selected."""
 
-    tool: str  # of the two
+    tool: str  # "flood" or "color"
     mode: str  # of `SELECT_MODES`
-    before: bytes  # what was selected when it came, packed
+    before: bytes  # selection before the click, packed
     at: Point  # pixels of the picture
-    surface: Surface  # of the scene on screen then
-    options: tuple[float, bool]  # tolerance and depth by which it last selected
-    after: bytes  # what was selected by that, packed
-    recorded: bytes  # what undo knows of it, packed
+    surface: Surface  # surface of the scene on screen at the click
+    options: tuple[float, bool]  # tolerance and depth of the last selection
+    after: bytes  # selection that resulted, packed
+    recorded: bytes  # selection in the undo history, packed
 
 
 def begin(tool: str, mode: str, before: bytes, at: Point, surface: Surface, through: bool) -> Gesture | None:
-    """What begins where the mouse was pressed; None for a sphere on the background.
+    """Return the gesture that starts at the pressed position; None for a sphere on the background.
 
     Args:
-        surface: of the scene on screen
-        through: also what lies behind the front surface
+        surface: surface of the scene on screen
+        through: also select occluded Gaussians
     """
     gesture = Gesture(tool, mode, before, (at,))
     if tool in ("brush", "scribble"):
@@ -116,10 +116,10 @@ def begin(tool: str, mode: str, before: bytes, at: Point, surface: Surface, thro
 
 
 def extend(gesture: Gesture, at: Point, radius: float) -> Gesture:
-    """With the hand at another place.
+    """Return the gesture after a move of the pointer.
 
     Args:
-        radius: of a brush, pixels of the picture
+        radius: radius of a brush, pixels of the picture
     """
     if gesture.tool in ("box", "sphere"):
         return replace(gesture, path=(gesture.path[0], at))
@@ -131,7 +131,7 @@ def extend(gesture: Gesture, at: Point, radius: float) -> Gesture:
 
 
 def rows_inside(gesture: Gesture, surface: Surface, through: bool) -> Mask:
-    """What the gesture selects as it is. Arguments as of `begin`. [N]"""
+    """Return the Gaussians that the gesture selects now. Arguments as in `begin`. [N]"""
     if gesture.brushed is not None:
         return gesture.brushed.touched
     if gesture.center is not None:
@@ -145,7 +145,7 @@ def rows_inside(gesture: Gesture, surface: Surface, through: bool) -> Mask:
 
 
 def pick_color(work: Workspace, pointer: PointerContext) -> Workspace:
-    """The color that the original has under the mouse goes into the palette of the form."""
+    """Add the original's color under the mouse to the palette of the form."""
     scene = pointer.engine.gaussians(original(pointer.shown))
     seen = seen_at(scene, pointer.camera(pointer.shown.camera), *pointer.cursor)
     if seen is None:
@@ -163,7 +163,8 @@ def rows_at_click(
     through: bool,
     neighborhood: Callable[[], Neighborhood],
 ) -> Mask | None:
-    """What a click of "flood" or "color" selects; None on the background. Arguments as of `begin`. [N]"""
+    """Return the Gaussians that "flood" or "color" selects; None on the background. Arguments as in `begin`.
+    [N]"""
     seen = seen_at(surface.scene, surface.camera, *at)
     if seen is None:
         return None
@@ -178,21 +179,21 @@ def rows_at_click(
 
 
 def _seeds(seen: Seen) -> np.ndarray:
-    """The Gaussians that make most of what one sees at a pixel."""
+    """Return the Gaussians that contribute most to the color of a pixel."""
     return seen.rows[seen.shares >= min(_SEEDS, float(seen.shares.max()))]
 
 
 SELECT_DRAG = "select"
-"""What a left drag does while a tool selects, beside those of `keys.DRAGS`."""
+"""Name of the left drag while a selection tool is active, in addition to those of `keys.DRAGS`."""
 
-_TRAVEL_PX = 3.0  # at 1×: what moves no further is a click
-_CLOSE_PX = 9.0  # at 1×: a click so near to a polygon's first corner closes it
+_TRAVEL_PX = 3.0  # at 1×: a press that moves no further is a click
+_CLOSE_PX = 9.0  # at 1×: a click within this distance of a polygon's first corner closes it
 
 Held = tuple[Gesture | None, Workspace]
 
 
 def mode(chosen: str) -> str:
-    """What is done with what was selected before: Shift adds, Ctrl takes away, both keep what is in both."""
+    """Return the mode that combines with the old selection: Shift adds, Ctrl subtracts, both intersect."""
     io = imgui.get_io()
     if io.key_shift:
         return "intersect" if io.key_ctrl else "add"
@@ -200,7 +201,7 @@ def mode(chosen: str) -> str:
 
 
 def press(gesture: Gesture | None, work: Workspace, pointer: PointerContext) -> Held:
-    """The left button went down over the picture."""
+    """Handle a press of the left button over the picture."""
     view, tool = work.view, work.view.select
     at = pointer.cursor
     if gesture is not None and gesture.tool == "polygon" == tool.tool:
@@ -212,11 +213,11 @@ def press(gesture: Gesture | None, work: Workspace, pointer: PointerContext) -> 
 
 
 CLICKED = ("flood", "color", "polygon")
-"""Tools that need no more than clicks."""
+"""Tools that need only clicks."""
 
 
 def click(work: Workspace, pointer: PointerContext) -> tuple[Click, Workspace]:
-    """The left button went down over the picture, with a tool that selects what is like that."""
+    """Select similar Gaussians at a click of the left button over the picture."""
     tool, before = work.view.select, work.view.selection.members
     made = Click(
         tool.tool, mode(tool.mode), before, pointer.cursor, pointer.surface, (0.0, False), before, before
@@ -226,9 +227,9 @@ def click(work: Workspace, pointer: PointerContext) -> tuple[Click, Workspace]:
 
 
 def adjust(click: Click | None, work: Workspace, pointer: PointerContext) -> tuple[Click | None, Workspace]:
-    """The last click again where its tolerance or depth is another, as one change for undo.
+    """Repeat the last click if its tolerance or depth has changed, merged into one change for undo.
 
-    None where something else was selected since, or the tool is another.
+    Returns None as the click if the tool or the selection has changed since.
     """
     tool = work.view.select
     if click is None or (tool.tool, work.view.selection.members) != (click.tool, click.after):
@@ -243,7 +244,7 @@ def adjust(click: Click | None, work: Workspace, pointer: PointerContext) -> tup
 
 
 def _click(click: Click, work: Workspace, pointer: PointerContext) -> tuple[Click, Workspace]:
-    """What a click selects by the tool as it is now."""
+    """Select by a click with the tool's current options."""
     options = work.view.select.tolerance, work.view.select.through
     mask = rows_at_click(click.tool, click.at, click.surface, *options, pointer.facts.neighborhood)
     if mask is not None:
@@ -252,7 +253,7 @@ def _click(click: Click, work: Workspace, pointer: PointerContext) -> tuple[Clic
 
 
 def follow(gesture: Gesture, work: Workspace, pointer: PointerContext) -> Held:
-    """The mouse is elsewhere with the button down; brush and sphere select at once."""
+    """Extend the gesture while the button is down; brush and sphere select at once."""
     if gesture.tool == "polygon":
         return gesture, work
     density = imgui.get_io().display_framebuffer_scale.x * pointer.ui.scale
@@ -264,12 +265,13 @@ def follow(gesture: Gesture, work: Workspace, pointer: PointerContext) -> Held:
 
 
 def release(gesture: Gesture, work: Workspace, pointer: PointerContext) -> Held:
-    """The left button went up; a polygon waits for its next corner."""
+    """Handle the release of the left button; a polygon waits for its next corner."""
     return (gesture, work) if gesture.tool == "polygon" else finish(gesture, work, pointer)
 
 
 def finish(gesture: Gesture, work: Workspace, pointer: PointerContext) -> Held:
-    """The gesture is over. A click in place of a shape selects nothing, and adds or takes away nothing."""
+    """Finish the gesture. A click in place of a shape deselects in mode "new" and changes nothing in the
+    others."""
     if gesture.tool not in ("box", "lasso", "polygon"):
         return None, work
     low, high = map(min, zip(*gesture.path, strict=True)), map(max, zip(*gesture.path, strict=True))
@@ -282,22 +284,22 @@ def finish(gesture: Gesture, work: Workspace, pointer: PointerContext) -> Held:
 def spread(
     strokes: tuple[Strokes, ...], gesture: Gesture, work: Workspace, pointer: PointerContext
 ) -> tuple[tuple[Strokes, ...], Workspace]:
-    """A stroke is over: what belongs to those on the thing rather than to those beside it is selected.
+    """Finish a scribble: select the Gaussians closer to the strokes on the object than to those next to it.
 
-    Strokes count until something else is selected, and again where undo goes back to what they selected.
+    Strokes count until something else is selected, and again if undo restores their selection.
     """
     on, beside = strokes_of(strokes, work) or (np.zeros(0, np.int64),) * 2
     touched = np.zeros(0, np.int64) if gesture.brushed is None else np.flatnonzero(gesture.brushed.touched)
     path = gesture.path[:: len(gesture.path) // _MOST_PLACES + 1]
     places = (seen_at(pointer.surface.scene, pointer.surface.camera, *at) for at in path)
-    # large ones show where their centers are not
+    # large Gaussians are visible where their centers are not
     rows = np.concatenate([touched, *(_seeds(seen) for seen in places if seen is not None)])
     if gesture.mode == "subtract":
         beside = np.union1d(beside, rows)
     else:
         on = np.union1d(on, rows)
     mask = np.zeros(pointer.facts.count, bool)
-    mask[on] = True  # all that is known without a stroke beside the thing
+    mask[on] = True  # the only known Gaussians before a stroke next to the object
     if len(on) and len(beside):
         mask = pointer.facts.scribbles().select(on, beside)
     work = _with(work, selection.select(work.view.selection, mask))
@@ -305,7 +307,7 @@ def spread(
 
 
 def strokes_of(strokes: tuple[Strokes, ...], work: Workspace) -> tuple[Rows, Rows] | None:
-    """The rows on the thing and beside it that made the present selection; None where none did."""
+    """Return the rows, on the object and next to it, of the strokes that led to the selection, or None."""
     made = (each for each in reversed(strokes) if each.after == work.view.selection.members)
     return next(((each.on, each.beside) for each in made), None)
 
@@ -313,7 +315,7 @@ def strokes_of(strokes: tuple[Strokes, ...], work: Workspace) -> tuple[Rows, Row
 def take_keys(
     gesture: Gesture | None, work: Workspace, pointer: PointerContext, keys: Keys
 ) -> tuple[Gesture | None, Workspace, Keys]:
-    """A polygon under way takes Enter, which closes it, and Escape, which drops it; others go on."""
+    """Handle Enter, which closes a polygon in progress, and Escape, which drops it; return unused keys."""
     pressed = [press.chord for press in keys.pressed]
     if gesture is None or gesture.tool != "polygon" or imgui.get_io().want_text_input:
         return gesture, work, keys
@@ -328,7 +330,7 @@ def take_keys(
 
 
 def _is_near(gesture: Gesture, pointer: PointerContext) -> bool:
-    """Whether the cursor is on the first corner of a polygon."""
+    """Return True if the cursor is on the first corner of a polygon."""
     (x, y), (cx, cy) = gesture.path[0], pointer.cursor
     reach = _CLOSE_PX * pointer.ui.scale * imgui.get_io().display_framebuffer_scale.x
     return len(gesture.path) > 2 and (x - cx) ** 2 + (y - cy) ** 2 <= reach * reach
@@ -351,7 +353,7 @@ _HALO, _LINE = 3.0, 1.25  # widths at 1×
 
 
 def draw_strokes(strokes: tuple[Strokes, ...], work: Workspace, pointer: PointerContext) -> None:
-    """Dots where strokes went, green on the thing and red beside it, from wherever one looks."""
+    """Draw the strokes as dots, green on the object and red next to it, from any camera."""
     rows = strokes_of(strokes, work) if work.view.select.tool == "scribble" else None
     if rows is None:
         return
@@ -366,10 +368,10 @@ def draw_strokes(strokes: tuple[Strokes, ...], work: Workspace, pointer: Pointer
 
 
 def draw_gesture(gesture: Gesture | None, view: ViewState, ui: UiContext, left: int = 0) -> None:
-    """Draw it, in window coordinates; the ring of the brush also between its strokes.
+    """Draw the gesture in window coordinates; the ring of the brush also between its strokes.
 
     Args:
-        left: the column in framebuffer pixels at which the picture begins
+        left: first column of the picture, framebuffer pixels
     """
     io, mouse = imgui.get_io(), imgui.get_mouse_pos()
     over = not io.want_capture_mouse

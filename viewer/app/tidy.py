@@ -1,4 +1,4 @@
-"""What is done by hand: a selection removed, moved, copied, each a layer with a slider; and strays hidden."""
+"""Manual edits: a selection is removed, moved or copied, each as a layer with a slider; strays are hidden."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _INSTRUCTIONS = {"remove": "remove", "transform": "move", "duplicate": "copy"}
 
 
 class TidyActions:
-    """Layers of what is done to the selection by hand.
+    """Layers that remove, move or copy the selection.
 
     Args:
         app: the window
@@ -43,12 +43,12 @@ class TidyActions:
     def __init__(self, app: Application) -> None:
         self._app = app
         self._edits = EditActions(app)
-        self._region: Region | None = None  # that is being moved
-        self._folder = Path()  # of new edits
+        self._region: Region | None = None  # the region being moved
+        self._folder = Path()  # folder of new edits
 
     @property
     def requests(self) -> Requests:
-        """What is done to the selection, and with what is moved."""
+        """Requests for the selection and for the handles that move it."""
         return {
             "remove_selected": lambda _: self._begin("remove"),
             "move_selected": lambda _: self._begin("transform"),
@@ -59,7 +59,7 @@ class TidyActions:
         }
 
     def leave_scene(self) -> None:
-        """Another scene is open."""
+        """Drop the handles when another scene opens."""
         self._region, self._app.main_view.gizmo = None, None
 
     def _begin(self, does: str) -> None:
@@ -85,7 +85,7 @@ class TidyActions:
         return [Step(gizmo.does, self._region, similarity(*gizmo.step))]
 
     def _place(self, _: str) -> None:
-        """Show what is moved where the handles are."""
+        """Show the moved selection at the place of the handles."""
         if steps := self._steps():
             document = self._app.document
             gdf = tidy(document.original, steps, _NAMES[steps[0].does])
@@ -109,7 +109,7 @@ class TidyActions:
         self._app.main_view.wake()
 
     def _add(self, does: str, steps: Sequence[Step]) -> None:
-        """Write the edit, and have it as a layer on top."""
+        """Write the edit and add it as a layer on top."""
         document = self._app.document
         make_folder(self._folder)
         name = document.free_name(_NAMES[does])
@@ -120,7 +120,9 @@ class TidyActions:
 
 
 class StrayActions:
-    """Hides what a capture left where nothing is, when it is asked to. `close` it with the window.
+    """Search for strays, which are then hidden, on request. `close` it with the window.
+
+    Strays are Gaussians that a capture leaves outside the scene's surfaces.
 
     Args:
         app: the window
@@ -130,33 +132,33 @@ class StrayActions:
         self._app = app
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="strays")
         self._search: Future[tuple[Strays, float]] | None = None
-        self._scene: Gaussians | None = None  # that is searched
+        self._scene: Gaussians | None = None  # the scene being searched
 
     @property
     def requests(self) -> Requests:
-        """What there is to ask of it."""
+        """Requests for strays."""
         return {"hide_strays": self._begin}
 
     def _begin(self, _: str) -> None:
-        """Begin to look for strays, which takes seconds."""
+        """Start the search for strays, which takes seconds."""
         if self._search is None:
             self._scene = self._app.document.original
             self._search = self._worker.submit(_search, self._scene)
             self._app.main_view.show_message("Looking for strays …")
 
     def poll(self) -> float | None:
-        """Hide what was found; seconds until the next look, None for ever."""
+        """Hide the strays found; return the seconds until the next poll, None for never."""
         if self._search is None:
             return None
         if not self._search.done():
             return _POLL_S
         search, self._search = self._search, None
-        if self._scene is self._app.document.original:  # else another one was opened meanwhile
+        if self._scene is self._app.document.original:  # else another scene was opened meanwhile
             self._hide(*search.result())
         return None
 
     def close(self) -> None:
-        """Nobody waits for what is still looked for."""
+        """Cancel a search that is still running."""
         self._worker.shutdown(wait=False, cancel_futures=True)
 
     def _hide(self, strays: Strays, db: float) -> None:
