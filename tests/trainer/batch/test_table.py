@@ -14,8 +14,8 @@ from progdf.errors import ProgdfError
 from tests.helpers.hostile import JSON_TEXTS
 from tests.helpers.trained import write_bear
 from trainer import cli
-from trainer.batch.jobs import Job, read_catalogue
-from trainer.batch.report import Row, read_report, read_rows, write_page, write_rows
+from trainer.batch.jobs import BatchJob, read_catalogue
+from trainer.batch.report import JobRow, read_report, read_rows, write_page, write_rows
 from trainer.options import EditorOptions, RegionOptions, TrainOptions
 
 CATALOGUE = """
@@ -57,7 +57,7 @@ def events_of(capsys: pytest.CaptureFixture[str]) -> list[dict[str, Any]]:
 def test_run_that_ended_unseen_is_done_when_resumed(
     finished: list[str], status: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    write_rows(out_of(finished), [Row("bear/all", status)])
+    write_rows(out_of(finished), [JobRow("bear/all", status)])
     assert cli.batch([*finished, "--json"]) == 0
     events = events_of(capsys)
     assert [(event["event"], event.get("job")) for event in events] == [("end", "bear/all"), ("total", None)]
@@ -119,10 +119,10 @@ def test_damaged_report_is_one_line_when_resumed(
 @pytest.mark.parametrize("content", [*JSON_TEXTS.values(), "[]", "5", "", '{"curves": 5}'])
 def test_page_is_written_whatever_a_report_holds(tmp_path: Path, content: str) -> None:
     options = TrainOptions(Path("a.ply"), tmp_path / "a" / "b", RegionOptions("all"), EditorOptions("night"))
-    job = Job("a/b", options)
+    job = BatchJob("a/b", options)
     options.out.mkdir(parents=True)
     (options.out / "report.json").write_text(content, encoding="utf-8")
-    write_page(tmp_path, [Row("a/b", "done")], [job])
+    write_page(tmp_path, [JobRow("a/b", "done")], [job])
     with pytest.raises(ProgdfError, match=r"report\.json is damaged"):
         read_report(job)
 
