@@ -17,7 +17,7 @@ from benchmarks.viewer.slider import SliderCase
 from benchmarks.viewer.training import begin_training
 from progdf.field import NeuralSettings
 from tests.helpers import demo_scenes, drawn
-from trainer.options import ViewOptions
+from trainer.options import TrainingViewOptions
 from trainer.run.demo import Effort
 
 PICTURE = (240, 200)  # pixels
@@ -34,7 +34,7 @@ def shrink_benchmarks(patch: pytest.MonkeyPatch) -> None:
 def shrink_field(patch: pytest.MonkeyPatch) -> None:
     """Make `python -m benchmarks field` take seconds."""
     patch.setattr(training, "BEAR", 700)
-    patch.setattr(regret, "ViewOptions", partial(ViewOptions, views=8, image_size=48))
+    patch.setattr(regret, "TrainingViewOptions", partial(TrainingViewOptions, views=8, image_size=48))
     patch.setattr(field, "STEPS", 2)
     patch.setattr(field, "TARGETS", (30.0,))
     patch.setattr(field, "MOVING", 700)
