@@ -79,9 +79,7 @@ def test_a_full_disk_says_what_to_do(
 
 @pytest.mark.parametrize("command", sorted(COMMANDS))
 def test_every_command_explains_itself(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as stop:
-        raise SystemExit(main([command, "--help"]))
-    assert stop.value.code in (0, None)
+    assert main([command, "--help"]) == 0
     assert "usage" in capsys.readouterr().out.lower()
 
 

@@ -17,6 +17,7 @@ from progdf.errors import ProgdfError
 from progdf.field.baked import GradeForm, identity_map, lattice_colors
 from progdf.field.grade import bake_grade, fit_grade, lattice_form, map_colors
 from progdf.formats import scene_file
+from progdf.formats.axes import Axes
 from progdf.formats.cube import read_cube, write_cube
 from progdf.formats.ply import load_ply
 from progdf.gaussians import ATTRIBUTES, Gaussians, pack
@@ -241,10 +242,10 @@ def test_frames_replace_no_file_that_is_read_and_half_of_them_are_none(
     assert "same_001.ply is one of the files to read" in capsys.readouterr().err
     whole = scene_file.save_scene
 
-    def full(path: Path, scene: Gaussians) -> None:
+    def full(path: Path, scene: Gaussians, axes: Axes) -> None:
         if path.name == "film_003.ply":
             raise ProgdfError(f"{path} cannot be written: no space left on device")
-        whole(path, scene)
+        whole(path, scene, axes)
 
     monkeypatch.setattr(scene_file, "save_scene", full)
     assert run("export", *given, "-o", "film.ply") == 2
@@ -294,8 +295,7 @@ def test_a_session_without_keys_cannot_be_filmed(here: Path, capsys: pytest.Capt
 
 @pytest.mark.parametrize("command", ["view", "render", "export"])
 def test_help_says_what_happens_without_an_option(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main([command, "--help"])
+    assert main([command, "--help"]) == 0
     text = capsys.readouterr().out
     assert [trace for trace in ("None", "False", "(default: )", "STR", "PATH") if trace in text] == []
     assert "--set NAME=S" in text
