@@ -237,7 +237,7 @@ def fit_size(camera: Camera, image_size: int) -> Camera:
 def name_cameras(cameras: Sequence[Camera]) -> list[Camera]:
     """Return the cameras with names that are relative paths and safe on every system (`view_name`).
 
-    Names differ in more than case. A camera whose name is taken, or leaves no safe name, becomes view_000, view_001, ….
+    Names differ in more than case. A name that is taken or not safe becomes view_000, view_001, ….
     """
     taken: set[str] = set()
     result = []
