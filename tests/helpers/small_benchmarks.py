@@ -11,6 +11,7 @@ import pytest
 from benchmarks import edits as run_edits
 from benchmarks import field, rasterizer, sliders, training, warps
 from benchmarks.ablation import regret, setup
+from benchmarks.analytic_edits import column_warps
 from benchmarks.rasterizer import RasterCase
 from benchmarks.viewer import frames, moving, popping, scenes, slider, window
 from benchmarks.viewer.slider import SliderCase
@@ -53,8 +54,11 @@ def _shrink_training(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(warps, "VIEWS", 5)
     patch.setattr(warps, "SIZE", 48)
     patch.setattr(warps, "_BEAR", 700)
+    patch.setattr(warps, "_STYLE", "tint:#c08040")
+    patch.setattr(warps, "GROUP_STEPS", 10)
+    patch.setattr(warps, "column_warps", lambda *given: dict([*column_warps(*given).items()][:1]))
     patch.setattr(regret, "STAGES", (2,))
-    patch.setattr(regret, "STEPS", (2,))
+    patch.setattr(regret, "STEPS", (2, 3))
     patch.setattr(regret, "BANDS", (0, 1))
     patch.setattr(regret, "VIEWS", (6,))
     patch.setattr(setup, "QUICK_STEPS", 4)
@@ -65,7 +69,7 @@ def _shrink_training(patch: pytest.MonkeyPatch) -> None:
         sliders.run_suite,
         cases=(blue,),
         sizes={"bear": 1000, "room": 1000},
-        effort=Effort(views=4, image_size=48, steps=16),
+        effort=Effort(views=4, image_size=48, steps=32),
     )
     patch.setattr(sliders, "run_suite", small)
 
