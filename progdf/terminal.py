@@ -100,7 +100,7 @@ def _send_lost_signals() -> None:
 def signal_main_thread(number: int = signal.SIGINT) -> None:
     """Send a signal to the main thread, which wakes it where it waits (not on Windows)."""
     if sys.platform == "win32":
-        _thread.interrupt_main(number)
+        _thread.interrupt_main(signal.Signals(number))
     else:
         signal.pthread_kill(threading.main_thread().ident or 0, number)
 

@@ -121,6 +121,11 @@ class TrainingSetup:
         return f"{len(self.held_out)} held-out views" if len(self.held_out) > 1 else "one held-out view alone"
 
 
+def check_given_cameras(options: TrainingViewOptions, scene: Gaussians) -> None:
+    """Raise ProgdfError if the cameras of --cameras do not show the scene."""
+    load_given_cameras(options, scene)
+
+
 def make_training_setup(options: TrainingViewOptions, scene: Gaussians, region: Region) -> TrainingSetup:
     """The views: those of changed pictures; else the best of the given cameras, or of a rig that looks at the
     region.

@@ -54,6 +54,7 @@ from trainer.resolve import recorded_options, resolve, use_threads
 from trainer.setup import (
     Pictures,
     TrainingSetup,
+    check_given_cameras,
     confines_edit,
     edit_views,
     editor_strengths,
@@ -75,7 +76,6 @@ from trainer.store.run_folder import (
     write_views,
 )
 from trainer.store.state import interrupt_on_signals
-from trainer.views.choose import load_given_cameras
 from trainer.views.crops import only_recolors
 from trainer.views.view import BACKGROUND, View, fit_size, make_view, with_near_plane
 
@@ -200,7 +200,7 @@ def select_region(
 
     def select() -> tuple[Region, list[str]]:
         notes = list[str]()
-        load_given_cameras(options.views, scene)  # refused before a folder is made
+        check_given_cameras(options.views, scene)  # refused before a folder is made
         kinds = region_kinds(region_request(options, quiet, notes.append))
         return parse_region(options.region.region, scene, options.name, kinds, notes.append), notes
 
