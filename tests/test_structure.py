@@ -47,6 +47,7 @@ MOST_LINES = 600
 MEASURED = ("progdf", "trainer", "viewer")
 # Tables of module names as text, which are imported on first use.
 LAZY_TABLES = ("progdf/__init__.py", "progdf/__main__.py", "progdf/rasterize/engines.py")
+MOST_IMPORTS = 0.073  # of all lines
 MAX_FILE_IMPORTS = 55  # import statements of one file; this ceiling only falls, to 25
 MOST_SCRIPT_LINES = 1271  # of the JavaScript of the web page, counted alike
 MOST_FUNCTION_LINES = 80
@@ -340,6 +341,12 @@ def test_the_script_of_the_page_keeps_its_budget() -> None:
 @pytest.fixture(scope="module")
 def measured() -> dict[str, list[Module]]:
     return {package: modules(package) for package in MEASURED}
+
+
+def test_imports_are_a_small_share_of_all_lines(measured: dict[str, list[Module]]) -> None:
+    lines = sum(module.lines for group in measured.values() for module in group)
+    imports = sum(module.imports for group in measured.values() for module in group)
+    assert imports <= MOST_IMPORTS * lines, f"{imports / lines:.1%} of all lines are imports"
 
 
 def test_no_file_imports_more_than_one_can_keep_in_mind(measured: dict[str, list[Module]]) -> None:
