@@ -110,7 +110,8 @@ def write(name: str, scene: Path, edits: Sequence[Path], background: Vec3, film:
 def main(folder: Path) -> None:
     """All examples."""
     for name in SIZES:
-        edits, scene = train(name, folder / name), folder / name / f"{name}.compressed.ply"
+        edits = train(name, folder / name)
+        scene = folder / name / f"{name}.compressed.ply"
         background = demo.SHOWS[name].make(2000, 0).background
         write(name, scene, edits, background)
         if name == "bear":

@@ -55,7 +55,8 @@ def run(*words: str | Path) -> None:
 def train(folder: Path, scene: str, name: str, editor: str) -> None:
     """An edit of SCENE.ply in the rows of SCENE.npy, unless it is there."""
     if not (folder / f"{name}.gdf").exists():
-        region, out = f"file:{folder / scene}.npy", folder / "runs" / name
+        region = f"file:{folder / scene}.npy"
+        out = folder / "runs" / name
         words = "--region", region, "--editor", editor, "--cameras", folder / f"{scene}.json", *QUICK
         run("train", folder / f"{scene}.ply", "--out", out, *words)
         (out / f"{name}.gdf").rename(folder / f"{name}.gdf")
@@ -93,7 +94,8 @@ def main() -> int:
         folder = asked.work or Path(temporary)
         folder.mkdir(parents=True, exist_ok=True)
         prepare(folder)
-        pictures, names = [draw(folder, words) for words in STACKS.values()], list(STACKS)
+        pictures = [draw(folder, words) for words in STACKS.values()]
+        names = list(STACKS)
         rows = range(0, len(names), COLUMNS)
         sheet = contact_sheet(
             [pictures[i : i + COLUMNS] for i in rows], notes=[names[i : i + COLUMNS] for i in rows]

@@ -25,7 +25,9 @@ from viewer.state import selection
 from viewer.state.view_state import LayerState, ViewState
 
 SIZE = (1280, 800)
-COLORS, PANEL_COLORS = 144, 96  # so that a file stays below 250 kB
+# so that a file stays below 250 kB
+COLORS = 144
+PANEL_COLORS = 96
 
 
 def layers(hand: Rig) -> None:
@@ -167,7 +169,8 @@ class _Opened:
     """What the rig needs of a scene and its edits."""
 
     def __init__(self, scene: object, gdfs: tuple[Gdf, ...]) -> None:
-        self.scene, self.gdfs = scene, gdfs
+        self.scene = scene
+        self.gdfs = gdfs
 
 
 if __name__ == "__main__":

@@ -132,7 +132,8 @@ def main(argv: Sequence[str]) -> int:
                 raise
             print(f"{name} is not measured: {error}\n", file=sys.stderr)
             continue
-        before, busy = busy, busy_share()
+        before = busy
+        busy = busy_share()
         taken = [options.scenes] if options.scenes and name in shown else []
         words = " ".join([name, *(f"--scenes {' '.join(path.name for path in paths)}" for paths in taken)])
         made = [_stated(table, f"`{COMMAND} {words}`", max(before, busy)) for table in bare]
@@ -156,7 +157,8 @@ def _stated(table: Table, command: str, busy: float) -> Table:
     """With what made it; and without wall times where others used the cores."""
     bare = table.without_wall()
     if busy > BUSY and bare != table:
-        table, share = bare, f"{100 * busy:.0f} %"
+        table = bare
+        share = f"{100 * busy:.0f} %"
         command += f"; others used {share} of the cores, so wall times and what depends on them are left out"
     return replace(table, note=f"{table.note} Made by {command}; {today()}.".strip())
 

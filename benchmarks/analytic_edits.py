@@ -233,7 +233,8 @@ def _with_color(part: Gaussians, rgb: Tensor, share: float | Tensor) -> Gaussian
     return replace(part, sh0=rgb_to_sh0(rgb), shN=part.shN + share * (highlight - part.shN))
 
 
-_FACTOR, _DEGREES = 1.35, 40.0
+_FACTOR = 1.35
+_DEGREES = 40.0
 
 
 def stretch_warp(base: Tensor, up: Tensor, factor: float) -> Warp:
@@ -257,9 +258,11 @@ def bend_warp(base: Tensor, up: Tensor, towards: Tensor, length: float, degrees:
 
     def warp(points: Tensor, strength: float) -> Tensor:
         curvature = math.radians(degrees) * strength / length
-        axis, side = up.to(points), towards.to(points)
+        axis = up.to(points)
+        side = towards.to(points)
         arm = points - base.to(points)
-        height, out = arm @ axis, arm @ side
+        height = arm @ axis
+        out = arm @ side
         above = height.clamp_min(0.0)  # below its base the column stays straight
         angle = curvature * above
         radius = 1 / curvature - out

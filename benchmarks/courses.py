@@ -57,7 +57,9 @@ def known_edit(
 
     strengths = torch.linspace(0, 1, snapshots)
     offsets = torch.stack([truth(float(s)) for s in strengths])
-    seen, choosing, unseen = cameras[::11][:3], cameras[8::10][:2], cameras[5::10][:2]
+    seen = cameras[::11][:3]
+    choosing = cameras[8::10][:2]
+    unseen = cameras[5::10][:2]
     shown, decides = (_changed_pixels(scene, members, offsets, views) for views in (unseen, choosing))
     judge, chooser = (FieldEvaluator(strengths, offsets, render, truth) for render in (shown, decides))
     visible = sum(

@@ -31,7 +31,8 @@ from trainer.views.view import View, crop, make_view
 from .ablation.setup import editor_pictures
 from .table import Table, mean_worst
 
-RAISED, ZOOM = (30.0, -15.0), 3.0
+RAISED = (30.0, -15.0)
+ZOOM = 3.0
 """Degrees of elevation that far views stand above and below a held-out one; how near the third comes."""
 
 VALUES = 101
@@ -88,7 +89,8 @@ def edit_table(opened: Sequence[OpenedRun]) -> Table:
             min(range(len(strength)), key=lambda i, q=q: abs(list(strength)[i] - q))  # type: ignore[misc]
             for q in (0.25, 0.5, 0.75)
         ]
-        between, size = len(strength) > 1, run.gdf.field.bytes_per_member
+        between = len(strength) > 1
+        size = run.gdf.field.bytes_per_member
         rows.append(
             {
                 "edit": _title(run),
@@ -114,7 +116,8 @@ def slider_table(opened: Sequence[OpenedRun]) -> Table:
         _, reporting = run.evaluator.halves()
         inner = [i / (VALUES - 1) for i in range(1, VALUES - 1)]
         few = sample_strengths()
-        ours, plain = run.report["field"], run.report["baselines"][COMPARED]
+        ours = run.report["field"]
+        plain = run.report["baselines"][COMPARED]
         far = far_evaluator(run)
         rows.append(
             {
@@ -161,7 +164,9 @@ def _editor_pictures(run: OpenedRun, views: Sequence[View], strengths: Sequence[
 
 def far_evaluator(run: OpenedRun) -> Evaluator:
     """Views from elsewhere, beside the editor's pictures of them where it can make any."""
-    scene, region, setup = run.setup.scene, run.setup.region, run.setup
+    scene = run.setup.scene
+    region = run.setup.region
+    setup = run.setup
     _, reporting = split_held_out(setup.judging)
     center = scene.means[region.members].mean(dim=0)
     up = setup.up.direction if setup.up is not None else torch.tensor([0.0, 1.0, 0.0])
@@ -211,7 +216,8 @@ def _from_elsewhere(run: OpenedRun, far: Evaluator) -> dict[str, str]:
         asked = run.trajectory.stage_strengths
         return [far.psnr(far.pictures(field.offsets(s)), far.edited[strength]) for s, strength in asked]
 
-    ours, plain = errors(run.gdf.field), errors(run.keyframes)
+    ours = errors(run.gdf.field)
+    plain = errors(run.keyframes)
     figures = f"{ours[-1]:.1f}", mean_worst(ours[:-1]), mean_worst(plain[:-1])
     return dict(zip(headings, figures, strict=True))
 

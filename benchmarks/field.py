@@ -50,7 +50,8 @@ from .courses import edit_of, known_edit, milliseconds, processor_milliseconds
 from .table import Table, Wall
 from .training import Point, edit_of_task, save_plot, tasks
 
-STEPS, RANKS = 12, (0, 1, 2)
+STEPS = 12
+RANKS = (0, 1, 2)
 """Even strengths at most; steps of conjugate gradients of a residual at each; its ranks."""
 
 TARGETS = (40.0, 50.0, 60.0)
@@ -59,10 +60,14 @@ TARGETS = (40.0, 50.0, 60.0)
 MAX_MEMBERS = 10_000
 """Members; the forms of more would take ten minutes."""
 
-NETWORK, PAPERS = NeuralSettings("tiny", steps=1000), NeuralSettings("paper", "position")
+NETWORK = NeuralSettings("tiny", steps=1000)
+PAPERS = NeuralSettings("paper", "position")
 """One that is trained, and the paper's, which is timed untrained."""
 
-MOVED, MOVING, SIDE, SNAPSHOTS = "big ears", 12_000, 160, 33
+MOVED = "big ears"
+MOVING = 12_000
+SIDE = 160
+SNAPSHOTS = 33
 """The motion, of a bear of so many Gaussians; in views of so many pixels; recordings."""
 
 CLOUDS = ((3_000, 30_000), (30_000, 100_000), (100_000, 100_000))
@@ -95,7 +100,8 @@ class InOklab:
         columns = attribute_slices(self.end.shape[1])["sh0"]
         before = self.start[:, columns] * C0 + 0.5
         after = before + self.end[:, columns] * C0
-        shown, finished = before.clamp(0.0, 1.0), after.clamp(0.0, 1.0)
+        shown = before.clamp(0.0, 1.0)
+        finished = after.clamp(0.0, 1.0)
         lab = torch.lerp(srgb_to_oklab(shown), srgb_to_oklab(finished), s)
         # what no screen shows lies beside, on its own straight line
         beyond = torch.lerp(before - shown, after - finished, s)
@@ -139,7 +145,8 @@ def color_forms(name: str, edit: RegretEdit) -> list[Form]:
 
     model, strengths, _, automatic = edit.automatic(judge)
     knots = torch.tensor([0.0, *strengths])
-    plain, recording = make_solver(edit.drawn, edit.original), torch.zeros(0)
+    plain = make_solver(edit.drawn, edit.original)
+    recording = torch.zeros(0)
     for degree, mask in [(d, mask) for mask in dict.fromkeys((None, model.mask)) for d in MONOMIALS]:
         began = time.process_time()
         solver = plain if mask is None else plain.with_mask(mask.float() / 255.0)
@@ -313,8 +320,10 @@ def _compose_table() -> Table:
 
 
 def _compose_row(scene: Gaussians, edit: Gdf, single: Gdf) -> dict[str, str]:
-    composer, alone = Composer(scene, [edit]), Composer(scene, [single])
-    rows, knots = pack(scene[edit.region.members]), torch.tensor([0.0, 1.0])
+    composer = Composer(scene, [edit])
+    alone = Composer(scene, [single])
+    rows = pack(scene[edit.region.members])
+    knots = torch.tensor([0.0, 1.0])
     ends = torch.stack([edit.field.offsets(s) for s in (0.0, 1.0)])
     asked = trained_network(rows, knots, ends, torch.ones(len(rows)), PAPERS, 0).bind(rows)
     # bases, the original and the last centers are read, row numbers too, 14 numbers written

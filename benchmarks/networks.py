@@ -124,7 +124,8 @@ def _rows(run: Path, course: KnownEdit) -> list[dict[str, str]]:
     for name, field in baked.items():
         network = networks.get(name)
         trained = network is None or network.steps > 0
-        step, composed = ms.get(name), ms[f"{name}, baked"]
+        step = ms.get(name)
+        composed = ms[f"{name}, baked"]
         count = network.network.parameters if network else stored_numbers(field)
         rows.append(
             {
@@ -150,7 +151,8 @@ def _rows(run: Path, course: KnownEdit) -> list[dict[str, str]]:
 def _trained(run: Path, name: str, settings: NeuralSettings, course: KnownEdit) -> TrainedNetwork:
     """The network of that name, from the run's folder or trained now."""
     path = run / "networks" / f"{name.replace(', ', '-').replace(' ', '-')}.gdf"
-    before, members = pack(course.scene[course.members]), len(course.members)
+    before = pack(course.scene[course.members])
+    members = len(course.members)
     effort = settings.resolve()
     settings = replace(effort, batch=min(effort.batch, members))
     if not path.is_file():
@@ -171,7 +173,8 @@ def _trained(run: Path, name: str, settings: NeuralSettings, course: KnownEdit) 
 
 def _begin(course: KnownEdit, settings: NeuralSettings) -> NeuralFit:
     before = pack(course.scene[course.members])
-    moving, channels = tuple(moving_attributes(course.offsets)), course.offsets.shape[2]
+    moving = tuple(moving_attributes(course.offsets))
+    channels = course.offsets.shape[2]
     fit = NeuralFit(before, channels, moving, settings, course.weights)
     fit.scale_to(course.offsets, rendered_importance(course.offsets, course.look))
     return fit

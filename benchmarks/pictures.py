@@ -50,7 +50,10 @@ EDITS = (
 )
 """And the part of the region that is painted."""
 
-RIG, SIZE, LARGE, STEPS = 36, 256, 512, 100
+RIG = 36
+SIZE = 256
+LARGE = 512
+STEPS = 100
 GIVEN = ((0,), (9,), (0, 18), (0, 9, 18, 27))
 """Numbers of the rig's pictures: the front is 0."""
 
@@ -81,7 +84,8 @@ def _rows(path: Path, edit: str, part: str) -> list[tuple[str, ...]]:
     scene = load_scene(path)
     labels = path.with_name(f"{path.stem}_labels.npy")
     region = parse_region(f"labels:{labels}:1" if labels.is_file() else "all", scene)
-    up, background = find_up(scene, (), "auto").direction, torch.tensor(BACKGROUND)
+    up = find_up(scene, (), "auto").direction
+    background = torch.tensor(BACKGROUND)
     cameras = with_near_plane(name_cameras(region_rig(scene, region, RIG, SIZE, up)), scene)
     views = [make_view(scene, region, camera, background) for camera in cameras]
     center = scene.means[region.members].mean(dim=0)
@@ -120,6 +124,7 @@ def _rows(path: Path, edit: str, part: str) -> list[tuple[str, ...]]:
             error = decibels(float((shown - truth[i])[counts].square().mean()))
             off = math.degrees(math.acos(min(1.0, max(float(toward[i] @ toward[k]) for k in given))))
             found_by[next(end for end in DEGREES[1:] if off <= end)].append(error)
-        numbers, what = ", ".join(str(i) for i in given), edit if part == "all" else f"{edit}, {part}"
+        numbers = ", ".join(str(i) for i in given)
+        what = edit if part == "all" else f"{edit}, {part}"
         rows.append((f"{path.stem}, {what}", numbers, *map(mean_worst, found_by.values()), f"{took:.1f}"))
     return rows

@@ -266,9 +266,11 @@ def list_table(cases: Sequence[RasterCase], rounds: int = 9) -> Table:
     rows = []
     for case in cases:
         inputs, camera = cloud(case)
-        window, every = (0, 0, camera.width, camera.height), torch.arange(case.count)
+        window = (0, 0, camera.width, camera.height)
+        every = torch.arange(case.count)
         times: dict[float, list[tuple[float, float]]] = {0.0: [], LOST: []}
-        pictures, entries = dict[float, Tensor](), dict[float, int]()
+        pictures = dict[float, Tensor]()
+        entries = dict[float, int]()
         with _threads(1, 1):
             for _ in range(rounds + 1):
                 for lost, some in times.items():
@@ -391,7 +393,8 @@ def _step_time(case: RasterCase, steps: int) -> float:
     options = OptimizeOptions(perceptual_weight=0.3, sharpness="off")
     settings = PgsSettings(learning_rates("style", rows.shape[1], 1.0), ramp=0.0, reach=0.0)
     ends: list[float] = []
-    stages, objective = [TargetStage(1.0, [target], steps)], Objective(perceptual_loss()[0], options)
+    stages = [TargetStage(1.0, [target], steps)]
+    objective = Objective(perceptual_loss()[0], options)
     for _ in optimize(
         rows, [crop], [], stages, objective, settings,
         on_step=lambda step, left: ends.append(time.perf_counter()),

@@ -12,7 +12,8 @@ from trainer.views.choose import split_held_out
 
 from .courses import KnownEdit
 
-LOOKED, JUDGED = 3, 2
+LOOKED = 3
+JUDGED = 2
 """Training views that ranks are grown on; held-out views that choose, and as many others that judge."""
 
 
@@ -23,7 +24,8 @@ def recorded_edit(root: Path) -> KnownEdit:
         ProgdfError: the folder is no finished run, or its scene is gone or another.
     """
     run = reopen_run(root)
-    setup, trajectory = render_run_views(run), run.trajectory
+    setup = render_run_views(run)
+    trajectory = run.trajectory
     few = setup.train[:: max(1, len(setup.train) // LOOKED)][:LOOKED]
     choosing, reporting = split_held_out(setup.judging)
     look, chooser, judge = (

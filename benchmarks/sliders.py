@@ -188,7 +188,8 @@ def _prepare_truth(folder: Path, case: KnownEdit, scene: DemoScene, options: Tra
 
 def _judge_case(folder: Path, case: KnownEdit, scene: DemoScene, perceptual: Perceptual) -> CaseResult:
     opened = open_run(folder / case.folder)
-    truth, contenders = _truth(case, opened, scene), opened.contenders()
+    truth = _truth(case, opened, scene)
+    contenders = opened.contenders()
     curves = picture_courses(opened.evaluator, contenders, STRENGTHS, truth, perceptual)
     best = max(range(len(opened.evaluator.pixels)), key=lambda k: int(opened.evaluator.pixels[k].sum()))
     shown = {"truth": truth, **contenders}
@@ -241,7 +242,8 @@ def _truth(case: KnownEdit, opened: OpenedRun, scene: DemoScene) -> Pictures:
             return [editor.edit(view, s) for view in setup.judging]
 
     else:
-        edit, members = _analytic(case, scene), setup.region.members
+        edit = _analytic(case, scene)
+        members = setup.region.members
 
         def pictures(s: float) -> list[Tensor]:
             edited = edit.apply(setup.scene, members, s)
@@ -325,6 +327,7 @@ def _square(image: Tensor) -> Tensor:
     height, width = image.shape[:2]
     side = max(height, width)
     page = image.new_ones(side, side, 3)
-    top, left = (side - height) // 2, (side - width) // 2
+    top = (side - height) // 2
+    left = (side - width) // 2
     page[top : top + height, left : left + width] = image
     return page

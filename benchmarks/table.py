@@ -14,12 +14,14 @@ from importlib.metadata import version
 from pathlib import Path
 from statistics import fmean
 
-BEGIN, END = "<!-- bench {name} -->", "<!-- end {name} -->"
+BEGIN = "<!-- bench {name} -->"
+END = "<!-- end {name} -->"
 
 BUSY = 0.05
 """Share of the cores above which others make wall times worthless."""
 
-_SPIN_S, _LOOKS = 0.3, 3
+_SPIN_S = 0.3
+_LOOKS = 3
 
 
 class Wall(str):
@@ -72,7 +74,8 @@ def busy_share() -> float:
     block = bytes(1 << 20)  # hashed without Python's lock
 
     def spin(_: int) -> float:
-        began, used = time.perf_counter(), time.thread_time()
+        began = time.perf_counter()
+        used = time.thread_time()
         while time.perf_counter() - began < _SPIN_S:
             hashlib.sha256(block)
         return (time.thread_time() - used) / (time.perf_counter() - began)
@@ -108,7 +111,8 @@ def put_tables(text: str, tables: Sequence[Table]) -> str:
     """`text` with every table placed between its markers, and the machine's line; a table without markers is
     left out."""
     for name, filled in [("machine", machine()), *((table.name, table.markdown()) for table in tables)]:
-        begin, end = BEGIN.format(name=name), END.format(name=name)
+        begin = BEGIN.format(name=name)
+        end = END.format(name=name)
         if begin in text and end in text:
             head, rest = text.split(begin, 1)
             tail = rest.split(end, 1)[1]

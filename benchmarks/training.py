@@ -43,7 +43,9 @@ BEAR = 12_000
 
 _MARKS = "os^DvPX*<>"  # of a plot's kinds
 
-STRIPES, BLUE, TINT = "stripes:#20a040", "recolor:#3060d0", "tint:#c08040"
+STRIPES = "stripes:#20a040"
+BLUE = "recolor:#3060d0"
+TINT = "tint:#c08040"
 """What is done to the scarf, to what is labeled 1 in a given scene, and to all of one without labels."""
 
 
@@ -69,7 +71,8 @@ class TimedEdit:
 
 def tasks(folder: Path, scenes: Sequence[Path] = ()) -> list[TrainingTask]:
     """The bear, made in a folder, and each given scene, whose labels are in NAME_labels.npy beside it."""
-    scene, labels = bear(BEAR), folder / "bear_labels.npy"
+    scene = bear(BEAR)
+    labels = folder / "bear_labels.npy"
     save_ply(folder / "bear.ply", scene.gaussians)
     np.save(labels, scene.labels.numpy())
     made = [TrainingTask(folder / "bear.ply", f"labels:{labels}:{scene.label_names.index('scarf')}", STRIPES)]
@@ -98,9 +101,11 @@ def train(task: TrainingTask, scene: Gaussians, judge: Evaluator, way: str, out:
     """
     words = [str(task.scene), "--region", task.region, "--editor", task.editor, "--slider", "stages"]
     command = [sys.executable, "-P", "-m", "progdf", "train", *words, *way.split(), "--out", str(out)]
-    began, before = time.perf_counter(), os.times()
+    began = time.perf_counter()
+    before = os.times()
     run = subprocess.run(command, capture_output=True, text=True, check=False)
-    seconds, after = time.perf_counter() - began, os.times()
+    seconds = time.perf_counter() - began
+    after = os.times()
     if run.returncode:
         raise ProgdfError(f"{' '.join(command[3:])}: {run.stderr.strip()}")
     spent = after.children_user + after.children_system - before.children_user - before.children_system
@@ -136,7 +141,8 @@ def tables(scenes: Sequence[Path] = (), plot: Path | None = None) -> list[Table]
 
 def table(found: Mapping[TrainingTask, Sequence[TimedEdit]]) -> Table:
     """A row a run."""
-    rows, strengths = [], ", ".join(f"{s:g}" for s in MEASURED[:-1])
+    rows = []
+    strengths = ", ".join(f"{s:g}" for s in MEASURED[:-1])
     for task, runs in found.items():
         for run in runs:
             between = " ".join(f"{psnr:.1f}" for psnr in run.psnrs[:-1])
@@ -197,14 +203,16 @@ def save_plot(panels: Mapping[str, Sequence[Point]], across: str, path: Path) ->
             axes.set_xlim(-0.2, 1.5 * most)
         for point in points:
             index = kinds.index(point.kind)
-            color, mark = _shade(LINES[index % len(LINES)]), _MARKS[index % len(_MARKS)]
+            color = _shade(LINES[index % len(LINES)])
+            mark = _MARKS[index % len(_MARKS)]
             axes.plot([point.x] * 2, [point.psnrs[-1], min(point.psnrs[:-1])], color=color, linewidth=1)
             axes.plot(point.x, point.psnrs[-1], mark, color=color, markersize=5, zorder=3)
             if point.chosen:
                 axes.plot(point.x, point.psnrs[-1], "o", mfc="none", mec=_shade(INK), markersize=11)
     handles = []
     for index, kind in enumerate(kinds):
-        color, mark = _shade(LINES[index % len(LINES)]), _MARKS[index % len(_MARKS)]
+        color = _shade(LINES[index % len(LINES)])
+        mark = _MARKS[index % len(_MARKS)]
         handles.append(Line2D([], [], color=color, marker=mark, linewidth=0, label=kind))
     if any(point.chosen for points in panels.values() for point in points):
         handles.append(Line2D([], [], mfc="none", mec=_shade(INK), marker="o", linewidth=0, label="chosen"))

@@ -36,7 +36,9 @@ from trainer.views.view import View, crop
 from .analytic_edits import AnalyticEdit, column_warps, smile_warp
 from .table import Table
 
-STEPS, VIEWS, SIZE = 240, 15, 160
+STEPS = 240
+VIEWS = 15
+SIZE = 160
 _BEAR = 6000
 _STYLE = "style:14"
 _ROBOT = 1, 2, 3  # labels of the robot and its hands
@@ -155,7 +157,8 @@ def _train(
     stages = [TargetStage(1.0, targets, STEPS)]
     extent = 2.0 * scene_sphere(setup.scene[setup.region.members])[1]
     if groups is not None:
-        stages, extent = groups.to_stages(original, crops, stages), groups.extent
+        stages = groups.to_stages(original, crops, stages)
+        extent = groups.extent
     settings = pgs_settings(optimization, True, original.shape[1], extent, 1)
     inside = [erode(crop(view.mask, view.box)) for view in setup.train]
     objective = Objective(perceptual_loss()[0], optimization, inside)
@@ -170,7 +173,8 @@ def _psnr(judge: Evaluator, offsets: Tensor) -> str:
 def _bear_cases(options: TrainOptions) -> list[WarpCase]:
     demo = bear(_BEAR)
     scene = demo.gaussians
-    head, body = demo.members("head"), demo.members("body")
+    head = demo.members("head")
+    body = demo.members("body")
     corners = torch.tensor([[0.11, 1.305, 0.56], [-0.11, 1.305, 0.56]])
     columns = column_warps(scene.means[body], demo.up)
     found = [_case(options, f"bear's body: {name}", scene, body, edit) for name, edit in columns.items()]

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-_WIDEST, _RADII = 4.0, 4096
+_WIDEST = 4.0
+_RADII = 4096
 """Up to which r (76°) and at how many places the lens is checked for folding back."""
 
 
@@ -41,7 +42,8 @@ class Lens:
 
     def distort(self, rays: Tensor) -> Tensor:
         """Where rays through (x, y) at z = 1 meet the sensor, in the same units. [...,2] -> [...,2]"""
-        x, y = rays[..., 0], rays[..., 1]
+        x = rays[..., 0]
+        y = rays[..., 1]
         square = x * x + y * y
         radial = 1 + square * (self.k1 + square * (self.k2 + square * self.k3))
         return torch.stack(
@@ -200,7 +202,8 @@ def _cross(a: Sequence[float], b: Sequence[float]) -> tuple[float, float, float]
 
 def _check_intrinsics(K: list[list[float]]) -> None:
     """Raise ValueError for focal lengths that are not positive, and for entries that no engine reads."""
-    fx, fy = K[0][0], K[1][1]
+    fx = K[0][0]
+    fy = K[1][1]
     if fx <= 0 or fy <= 0:
         raise ValueError(f"focal lengths {fx:g}, {fy:g} px; both must be positive")
     limit = _OBLIQUE_TOLERANCE * max(fx, fy)

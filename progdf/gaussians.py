@@ -51,7 +51,8 @@ class Gaussians:
     def __post_init__(self) -> None:
         n = self.means.shape[0] if self.means.ndim else 0
         for name, width in _WIDTHS.items():
-            actual, shape = tuple(getattr(self, name).shape), (n, width)[: 2 - (name == "logit_opacities")]
+            actual = tuple(getattr(self, name).shape)
+            shape = (n, width)[: 2 - (name == "logit_opacities")]
             if actual != shape:
                 raise ValueError(
                     f"{name} has shape {list(actual)}, expected {list(shape)} (N={n} from means)"

@@ -61,9 +61,15 @@ def rotation_matrices(unit_quats: Tensor) -> Tensor:
 def matrix_quats(matrices: Tensor) -> Tensor:
     """Convert rotation matrices to unit quaternions, by the largest component. [N,3,3] -> [N,4]"""
     m = matrices
-    x, y, z = m[:, 0, 0], m[:, 1, 1], m[:, 2, 2]
-    a, b, c = m[:, 2, 1], m[:, 0, 2], m[:, 1, 0]
-    d, e, f = m[:, 1, 2], m[:, 2, 0], m[:, 0, 1]
+    x = m[:, 0, 0]
+    y = m[:, 1, 1]
+    z = m[:, 2, 2]
+    a = m[:, 2, 1]
+    b = m[:, 0, 2]
+    c = m[:, 1, 0]
+    d = m[:, 1, 2]
+    e = m[:, 2, 0]
+    f = m[:, 0, 1]
     candidates = torch.stack(
         [
             torch.stack([1 + x + y + z, a - d, b - e, c - f], 1),

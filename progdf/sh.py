@@ -59,7 +59,9 @@ def basis(degree: int, directions: Tensor) -> Tensor:
     if degree >= 1:
         values += [-_C1 * y, _C1 * z, -_C1 * x]
     if degree >= 2:
-        xx, yy, zz = x * x, y * y, z * z
+        xx = x * x
+        yy = y * y
+        zz = z * z
         values += [
             _C2[0] * x * y,
             _C2[1] * y * z,

@@ -85,7 +85,8 @@ def local_offsets(original: Tensor, offsets: Tensor, parts: Parts, motion: Motio
     """The inverse of `carry_offsets`. [M,C] -> [M,C]"""
     part = parts.part
     means, log_scales, quats = split_geometry(original[:, GEOMETRY] + offsets[:, GEOMETRY])
-    turns, size = turn_quats(-motion.turn), motion.log_scale[part, None]
+    turns = turn_quats(-motion.turn)
+    size = motion.log_scale[part, None]
     back = turns[part]
     arm = means - parts.centers[part] - motion.shift[part]
     local = [
@@ -123,7 +124,8 @@ def _move_geometry(rows: Tensor, parts: Parts, motion: Motion) -> Tensor:
     """Means, log-scales and quaternions where the motion takes them. [M,≥10] -> [M,10]"""
     part = parts.part
     means, log_scales, quats = split_geometry(rows)
-    turn, size = turn_quats(motion.turn)[part], motion.log_scale[part, None]
+    turn = turn_quats(motion.turn)[part]
+    size = motion.log_scale[part, None]
     arm = means - parts.centers[part]
     means = parts.centers[part] + motion.shift[part] + size.exp() * rotate_vectors(arm, turn)
     return torch.cat([means, log_scales + size, multiply_quats(turn, quats)], dim=1)

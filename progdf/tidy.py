@@ -91,9 +91,12 @@ def tidy(
         if step.does != "duplicate":
             mask |= step.region.mask
     region = from_mask(name, mask)
-    members, bands = region.members, scene.sh_degree > 0 and any(_turns(step) for step in steps)
-    rows, added = pack(scene[members], with_shN=bands), _copies(scene, steps, added)
-    start, end = rows[:, _OPACITY], _end_logits(scene, steps)[members]
+    members = region.members
+    bands = scene.sh_degree > 0 and any(_turns(step) for step in steps)
+    rows = pack(scene[members], with_shN=bands)
+    added = _copies(scene, steps, added)
+    start = rows[:, _OPACITY]
+    end = _end_logits(scene, steps)[members]
     if added is not None:
         end = torch.cat([end, added.logit_opacities])
         added = replace(added, logit_opacities=torch.full_like(added.logit_opacities, ADDED_LOGIT))

@@ -84,7 +84,8 @@ def compiled_kernels(tmp_path_factory: pytest.TempPathFactory) -> None:
     worker = os.environ.get("PYTEST_XDIST_WORKER")
     if worker is None:
         return
-    shared, count = tmp_path_factory.getbasetemp().parent, len(PARTS)
+    shared = tmp_path_factory.getbasetemp().parent
+    count = len(PARTS)
     for part in range(count):
         mine = (part + int(worker.removeprefix("gw"))) % count
         ready = shared / f"kernels.{mine}.ready"
@@ -176,7 +177,8 @@ def software_gpu() -> None:
         context = headless_context()
     except ProgdfError as error:
         pytest.skip(str(error))
-    name, software = context.info["GL_RENDERER"], is_software(context)
+    name = context.info["GL_RENDERER"]
+    software = is_software(context)
     context.release()
     if not software:
         pytest.skip(f"goldens were drawn by llvmpipe, here is {name}")

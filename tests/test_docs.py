@@ -164,7 +164,8 @@ def test_the_documented_reader_reads_what_is_written(tmp_path: Path, end_type: t
     for strength in (0.0, 0.37, 1.0):
         edited = compose_layers(scene, [Layer(gdf, strength)])
         for name in header["field"]["attributes"]:
-            before, after = getattr(scene, name)[members], getattr(edited, name)[members]
+            before = getattr(scene, name)[members]
+            after = getattr(edited, name)[members]
             found = before.numpy() + reader["offsets"](tensors, name, strength).reshape(before.shape)
             np.testing.assert_allclose(found, after.numpy(), atol=1e-6)
 

@@ -73,7 +73,8 @@ class Tree:
         if len(parts) == 2 and parts[1] in self.attributes.get(parts[0], ()):
             return True
         for cut in range(len(parts), 0, -1):
-            stem, rest = ".".join(parts[:cut]), parts[cut:]
+            stem = ".".join(parts[:cut])
+            rest = parts[cut:]
             for module, names in self.modules.items():
                 if module == stem or module.endswith("." + stem):
                     if not rest or (len(rest) == 1 and rest[0] in names):

@@ -55,7 +55,9 @@ def test_trainings_of_the_window_start_stop_resume_and_die_without_what_windows_
 def test_a_file_that_somebody_has_open_is_replaced_once_he_closes_it(
     times: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path, real, calls = tmp_path / "a.txt", os.replace, 0
+    path = tmp_path / "a.txt"
+    real = os.replace
+    calls = 0
 
     def replace(source: Path, target: Path) -> None:
         nonlocal calls

@@ -31,7 +31,9 @@ _OPAQUE = 0.9  # alpha from which a rim is taken as it is, and share of a rim th
 _THERE = 0.05  # of the region's weight: its soft edge is part of what it hid
 _BLOCKS = (8, 4, 2, 1)  # pixels of a disc's side, where color allows
 _SAME = 2 / 255  # by which colors within a disc may differ
-_WIDTH, _THICKNESS, _LOGIT = 0.7, 0.1, 5.0  # of a side; of that; of the opacity
+_WIDTH = 0.7  # of a side
+_THICKNESS = 0.1  # of that
+_LOGIT = 5.0  # of the opacity
 _STEEPEST = 0.3  # least cosine by which a disc is lengthened
 _LEAST = 0.01  # of the region's pixels: a smaller hole in a view is the rim's own raggedness
 _MOST_VIEWS = 12
@@ -81,21 +83,25 @@ def fill_holes(
     given = pictures or {}
     seen = [(view.camera, _front(scene, view.camera), view.mask > 0.5) for view in views]
     holes = [find_hole(rest, view, seen) for view in views]
-    before, filled, discs = sum(hole.pixels for hole in holes), rest, list[Gaussians]()
+    before = sum(hole.pixels for hole in holes)
+    filled = rest
+    discs = list[Gaussians]()
     worth = [_LEAST * float((view.mask > _THERE).sum()) for view in views]
     left = {i for i, hole in enumerate(holes) if hole.pixels > worth[i]}
     while left and len(discs) < _MOST_VIEWS:
         # a given picture's own view goes first: there its colors are known
         best = max(left, key=lambda i: (views[i].camera.name in given, holes[i].pixels, -i))
         rows = place_discs(holes[best], rest, given.get(views[best].camera.name, holes[best].colors))
-        trial, pairs = concatenate([filled, rows]), zip(views, holes, strict=True)
+        trial = concatenate([filled, rows])
+        pairs = zip(views, holes, strict=True)
         closed = [find_hole(trial, view, seen) if old.pixels else old for view, old in pairs]
         gain = sum(hole.pixels for hole in holes) - sum(hole.pixels for hole in closed)
         left.discard(best)
         # discs that stand elsewhere than the surface open as much in other views as they close
         if 2 * gain > holes[best].pixels:
             discs.append(rows)
-            filled, holes = trial, closed
+            filled = trial
+            holes = closed
             left = {i for i in left if holes[i].pixels > worth[i]}
     after = sum(hole.pixels for hole in holes)
     return Fill(concatenate(discs) if discs else None, len(discs), before, after)
@@ -121,7 +127,8 @@ def find_hole(rest: Gaussians, view: View, seen: Sequence[Front]) -> Hole:
     mask = _find_pieces(unknown, known[..., 1])
     surface = membrane(known, mask)
     alpha = surface[..., 1].clamp_min(1e-6)[..., None]
-    inverse, colors = (surface / alpha)[..., 0], (surface / alpha)[..., 2:].clamp(0.0, 1.0)
+    inverse = (surface / alpha)[..., 0]
+    colors = (surface / alpha)[..., 2:].clamp(0.0, 1.0)
     mask[mask.clone()] = _unseen(_unproject(camera, mask.nonzero(), inverse[mask]), seen, camera)
     return Hole(camera, mask, inverse, colors)
 
@@ -151,22 +158,27 @@ def membrane(values: Tensor, unknown: Tensor) -> Tensor:
     Returns:
         [H,W,C]; known values are as given
     """
-    mask, known = unknown.numpy(), values.double().numpy()
+    mask = unknown.numpy()
+    known = values.double().numpy()
     index = np.full(mask.shape, -1)
     index[mask] = np.arange(mask.sum())
     count = int(mask.sum())
     # what no known pixel reaches is 0: a surface that nobody has seen
-    diagonal, right = np.full(count, 1e-9), np.zeros((count, known.shape[2]))
-    rows, columns = [], []
+    diagonal = np.full(count, 1e-9)
+    right = np.zeros((count, known.shape[2]))
+    rows = []
+    columns = []
     for axis, step in ((0, 1), (0, -1), (1, 1), (1, -1)):
-        neighbor, inside = np.roll(index, step, axis), np.ones(mask.shape, bool)
+        neighbor = np.roll(index, step, axis)
+        inside = np.ones(mask.shape, bool)
         inside[(0 if step > 0 else -1,) if axis == 0 else (slice(None), 0 if step > 0 else -1)] = False
         here = mask & inside
         diagonal[index[here]] += 1
         right[index[here & (neighbor < 0)]] += np.roll(known, step, axis)[here & (neighbor < 0)]
         rows.append(index[here & (neighbor >= 0)])
         columns.append(neighbor[here & (neighbor >= 0)])
-    i, j = np.concatenate([*rows, np.arange(count)]), np.concatenate([*columns, np.arange(count)])
+    i = np.concatenate([*rows, np.arange(count)])
+    j = np.concatenate([*columns, np.arange(count)])
     entries = np.concatenate([-np.ones(len(i) - count), diagonal])
     result = known.copy()
     result[mask] = splu(coo_matrix((entries, (i, j)), (count, count)).tocsc()).solve(right)
@@ -183,12 +195,14 @@ def place_discs(hole: Hole, like: Gaussians, colors: Tensor) -> Gaussians:
     """
     parts = _split(hole.mask, colors)
     y, x, side = parts.double().unbind(1)
-    camera, middle = hole.camera, (parts[:, :2] + parts[:, 2:] // 2).long()
+    camera = hole.camera
+    middle = (parts[:, :2] + parts[:, 2:] // 2).long()
     fx, fy, cx, cy = (float(camera.K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     rows, columns = middle.unbind(1)
     down, across = torch.gradient(hole.inverse_depth.double())
     place = torch.stack([(x + side / 2 - cx) / fx, (y + side / 2 - cy) / fy, torch.ones_like(x)], dim=1)
-    a, b = across[rows, columns] * fx, down[rows, columns] * fy
+    a = across[rows, columns] * fx
+    b = down[rows, columns] * fy
     # at the middle of the disc, which of an even side lies between pixels
     half = side / 2 - (parts[:, 2] // 2).double() - 0.5
     inverse = hole.inverse_depth.double()[rows, columns] + half * (a / fx + b / fy)
@@ -225,7 +239,9 @@ def place_discs(hole: Hole, like: Gaussians, colors: Tensor) -> Gaussians:
 def _split(mask: Tensor, colors: Tensor) -> Tensor:
     """Squares that cover a mask: first row, first column, side, as large as colors and edge allow. [P,3]"""
     depth = ndimage.distance_transform_cdt(np.pad(mask.numpy(), 1), "chessboard")[1:-1, 1:-1]
-    free, image, parts = mask.numpy().copy(), colors.numpy(), []
+    free = mask.numpy().copy()
+    image = colors.numpy()
+    parts = []
     for side in _BLOCKS:
         inner = depth > side // 2  # a large disc reaches beyond its square, and must not beyond the hole
         for row in range(0, mask.shape[0] - side + 1, side):
@@ -265,7 +281,8 @@ def _unseen(points: Tensor, seen: Sequence[Front], own: Camera) -> Tensor:
     for camera, front, region in seen:
         placed = points @ camera.viewmat[:3, :3].double().T + camera.viewmat[:3, 3].double()
         x, y, w = (placed @ camera.K.double().T).unbind(1)
-        column, row = (x / w).floor(), (y / w).floor()
+        column = (x / w).floor()
+        row = (y / w).floor()
         framed = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
         index = (framed & (w > camera.near)).nonzero()[:, 0]
         at = row[index].long(), column[index].long()

@@ -38,7 +38,8 @@ Removal = Literal["auto", "never", "always"]
 Device = Literal["auto", "cpu"]
 Engine = Literal["auto", "cpu", "warp"]
 
-DETECTOR, SAM_MODEL = "IDEA-Research/grounding-dino-tiny", "facebook/sam-vit-base"
+DETECTOR = "IDEA-Research/grounding-dino-tiny"
+SAM_MODEL = "facebook/sam-vit-base"
 FieldKind = Literal["auto", "separable", "lossless", "neural"]
 
 MOST_STAGES = 8
@@ -48,7 +49,8 @@ MOST_THREADS = 1024
 """More than any machine has: what --threads says at most."""
 LARGEST_SEED = 2**32 - 1
 """What every generator of random numbers takes."""
-VIEWS, COLOR_VIEWS = 30, (40, 48)
+VIEWS = 30
+COLOR_VIEWS = (40, 48)
 """How many views are edited by default, and how many of an edit of colors: where these have up to one band of
 directions, and where they have more (docs/experiments.md, Views)."""
 

@@ -175,7 +175,8 @@ class Previewer:
 
     def _painter(self, request: PreviewRequest) -> InstructEditor:
         options = EditorOptions(request.editor, model=request.model)
-        what, region = options.editor.partition(":")[2], whole_scene(self.scene)
+        what = options.editor.partition(":")[2]
+        region = whole_scene(self.scene)
         return instruct(EditorInput(what, self.scene, region, (), options))
 
     def _find_region(self, spec: str) -> Region:
@@ -185,7 +186,8 @@ class Previewer:
         return parse_region(spec, self.scene, kinds=region_kinds(request))
 
     def _make_view(self, seen: PreviewRequest) -> View:
-        K, viewmat = torch.tensor(seen.K), torch.tensor(seen.viewmat)
+        K = torch.tensor(seen.K)
+        viewmat = torch.tensor(seen.viewmat)
         (camera,) = with_near_plane([Camera(viewmat, K, seen.width, seen.height, "view")], self.scene)
         return make_view(self.scene, self._region(seen.region), camera, torch.tensor(seen.background))
 

@@ -56,7 +56,9 @@ COSTLY_STAGES: Mapping[EditKind, int] = {"color": 4, "style": 4, "geometry": 1}
 STAGE_STEPS = 40
 """A stage needs so many: with fewer each view is seen once or twice, and the next target is there before this
 one is met. `QUICK_STAGES` are asked for then (docs/experiments.md, Stages)."""
-QUICK_STEPS, QUICK_STAGES, QUICK_VIEWS = 240, 4, 12
+QUICK_STEPS = 240
+QUICK_STAGES = 4
+QUICK_VIEWS = 12
 _MOST_STEPS = 1_000_000  # hours on any machine
 _LONGEST_NAME = 255  # bytes that every file system takes
 _SMALLEST_VIEW = 32  # pixels of a view's longer side
@@ -72,7 +74,9 @@ def resolve(options: TrainOptions) -> TrainOptions:
         ProgdfError: one makes no sense.
     """
     check_options(options)
-    quick, optimize, views = options.quick, options.optimize, options.views.views
+    quick = options.quick
+    optimize = options.optimize
+    views = options.views.views
     family, _, what = options.editor.editor.partition(":")
     stages = min(optimize.stages, QUICK_STAGES) if quick else optimize.stages
     texts = options.texts
@@ -142,7 +146,8 @@ def resolve_kind(
         and not optimize.as_printed
     )
     costly = options.editor.family in COSTLY_STRENGTHS
-    weight, most = optimize.perceptual_weight, (COSTLY_STAGES if costly else STAGES)[kind]
+    weight = optimize.perceptual_weight
+    most = (COSTLY_STAGES if costly else STAGES)[kind]
     return replace(
         optimize,
         kind=kind,
@@ -164,7 +169,9 @@ def check_options(options: TrainOptions) -> None:
     Raises:
         ProgdfError: a number out of its range, or an option that the editor or the field does not know.
     """
-    region, editor, optimize = options.region, options.editor, options.optimize
+    region = options.region
+    editor = options.editor
+    optimize = options.optimize
     check_ranges(
         ("--views", options.views.views or VIEWS, 3, 96),
         ("--image-size", options.views.image_size or _SMALLEST_VIEW, _SMALLEST_VIEW, 2048),
@@ -180,7 +187,8 @@ def check_options(options: TrainOptions) -> None:
     )
     stages = optimize.stages or MOST_STAGES
     if not 4 * stages <= optimize.steps <= _MOST_STEPS:
-        least, most = 4 * stages, _MOST_STEPS
+        least = 4 * stages
+        most = _MOST_STEPS
         raise ProgdfError(
             f"--steps must be between {least} and {most} for {stages} stages, got {optimize.steps}"
         )

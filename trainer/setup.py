@@ -65,7 +65,8 @@ PICTURE_SIZE = 512
 """The longest side at which a changed picture is trained on."""
 
 _PROBES = 3
-_GLANCES, _GLANCE_SIZE = 8, 192
+_GLANCES = 8
+_GLANCE_SIZE = 192
 """Of a large scene fewer, so that a draft of a million Gaussians takes seconds; up to 24 make none better by
 .1 dB, and smaller ones mix colors, and the region's own with them."""
 _DRAWN = 3_000_000  # Gaussians, in all of them
@@ -146,7 +147,8 @@ def make_training_setup(options: TrainingViewOptions, scene: Gaussians, region: 
         raise ProgdfError(f"the scene {INSIDE}")
 
     usual = COLOR_VIEWS[scene.sh_degree > 1] if options.dense else VIEWS
-    views, size = options.views or usual, options.image_size or SIZE
+    views = options.views or usual
+    size = options.image_size or SIZE
 
     def cameras_of(count: int) -> list[Camera]:
         if options.cameras is not None:
@@ -215,7 +217,8 @@ def _rig_views(
     if len(choice.views) < count:
         cameras = rig(min(-(-count * count // len(choice.views)), count + count // 2))
         choice = choose_views(scene, region, cameras, count, background)
-    train, places = list(choice.views), {camera.name: i for i, camera in enumerate(cameras)}
+    train = list(choice.views)
+    places = {camera.name: i for i, camera in enumerate(cameras)}
     between = rig(2 * len(cameras))[1::2]
     following = (places[train[k * len(train) // aside].camera.name] for k in range(aside))
     others = [replace(between[i], name=f"between_{i:03d}") for i in sorted({*following})]
@@ -235,7 +238,8 @@ def _picture_setup(
     options: TrainingViewOptions, scene: Gaussians, region: Region, given: Sequence[Camera], up: UpAxis
 ) -> TrainingSetup:
     """The views of changed pictures. All are trained on: what one shows no other may."""
-    background, size = torch.tensor(BACKGROUND), options.image_size or PICTURE_SIZE
+    background = torch.tensor(BACKGROUND)
+    size = options.image_size or PICTURE_SIZE
     cameras = [fit_size(camera, size) for camera in picture_cameras(options.pictures, given, scene.origin)]
     cameras = with_near_plane(name_cameras(cameras), scene)
     views = [make_view(scene, region, camera, background) for camera in cameras]
@@ -306,7 +310,8 @@ def boxed_pictures(
     pictures: Sequence[Tensor], views: Sequence[View], engine: str = "cpu"
 ) -> Sequence[Tensor]:
     """What the views' boxes hold of their whole pictures, on the engine's device. [h,w,3] each"""
-    device, pairs = engine_device(engine), zip(pictures, views, strict=False)
+    device = engine_device(engine)
+    pairs = zip(pictures, views, strict=False)
     return stored_pictures(crop(picture, view.box).to(device) for picture, view in pairs)
 
 
@@ -328,9 +333,11 @@ def shrink_view(
 ) -> tuple[CropScene, Callable[[Tensor], Tensor], Tensor]:
     """A view with a smaller camera: what is rendered of it, how its pictures come to that, and how much of
     each pixel counts, as the region's or edited. [H,W,3] -> [h,w,1]"""
-    across, down = camera.width / view.camera.width, camera.height / view.camera.height
+    across = camera.width / view.camera.width
+    down = camera.height / view.camera.height
     x0, y0, x1, y1 = view.box
-    right, bottom = min(camera.width, math.ceil(x1 * across)), min(camera.height, math.ceil(y1 * down))
+    right = min(camera.width, math.ceil(x1 * across))
+    bottom = min(camera.height, math.ceil(y1 * down))
     box = (math.floor(x0 * across), math.floor(y0 * down), right, bottom)
 
     def shrink(picture: Tensor) -> Tensor:

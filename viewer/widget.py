@@ -45,7 +45,8 @@ class Values(dict[str, Any]):
 
     def __init__(self, values: Mapping[str, Any], widget: Widget, trait: str) -> None:
         super().__init__(values)
-        self._widget, self._trait = widget, trait
+        self._widget = widget
+        self._trait = trait
 
     def __setitem__(self, name: str, value: Any) -> None:
         self.update({name: value})
@@ -110,7 +111,8 @@ class Widget(anywidget.AnyWidget):
             height: px
         """
         stack = _stack(scene, layers, blend)
-        original, edits = _drawable(scene), tuple[Gdf, ...]()
+        original = _drawable(scene)
+        edits = tuple[Gdf, ...]()
         for layer in stack:
             name = Document("", original, edits).free_name(layer.gdf.name)
             edits = (*edits, replace(layer.gdf, name=name))

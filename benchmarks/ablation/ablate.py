@@ -92,7 +92,8 @@ def check_options(options: AblateOptions) -> None:
 def _ablate_run(root: Path, options: AblateOptions, quiet: bool) -> Ablation:
     """The variants of one run."""
     run = reopen_run(root, options.scene)
-    own, kind = run_plan(run), run.record.kind
+    own = run_plan(run)
+    kind = run.record.kind
     variants = differing_variants(own, kind, len(run.trajectory.strengths), run.scene.sh_degree)
     wanted = [
         (variant, seed)
@@ -158,7 +159,8 @@ def _run_variant(root: Path, variant: Variant, seed: int, shared: AblationSetup,
         log.close()
     outcome = replace(outcome, seconds=round(_processor_seconds(state), 2))
     outcome = with_figures(outcome, field, shared, asked, perceptual_loss()[0])
-    region, scene = shared.run.region, shared.run.scene
+    region = shared.run.region
+    scene = shared.run.scene
     told = plain(replace(plan, name=variant.name))
     gdf = Gdf(variant.name, region, field, fingerprint(scene), plan.editor.editor, told)
     save_gdf(folder / f"{variant.name}.gdf", gdf)
@@ -214,7 +216,9 @@ def _targets(variant: Variant, plan: TrainOptions, shared: AblationSetup) -> Pic
 def _count_processor_seconds(state: StateFolder) -> Iterator[None]:
     """Keep beside a state what processor time it took, all sessions together; a look at what is done takes
     none."""
-    saved, begun, done = state.load("processor"), time.process_time(), False
+    saved = state.load("processor")
+    begun = time.process_time()
+    done = False
     try:
         yield
         done = True
@@ -268,7 +272,9 @@ def _load_row(root: Path, variant: Variant, shared: AblationSetup) -> VariantRow
 def _publish(root: Path, variants: Sequence[Variant], shared: AblationSetup) -> Ablation:
     """Table and picture of all that is done."""
     rows = [row for variant in variants if (row := _load_row(root, variant, shared)) is not None]
-    plan, setup, evaluator = shared.plan, shared.setup, shared.evaluator
+    plan = shared.plan
+    setup = shared.setup
+    evaluator = shared.evaluator
     size = setup.held_out[0].camera
     note = (
         f"{plan.editor.editor}, {plan.optimize.steps} steps in {len(shared.edited)} stages, "

@@ -44,7 +44,9 @@ def fit_variant(
     evaluator, seen = shared.evaluators(trajectory.offsets)
     remap, (choosing, reporting) = identity_remap(), evaluator.halves()
     if plan.field.field == "neural":
-        setup, weights, begun = shared.setup, shared.weights, state.load(NETWORK)
+        setup = shared.setup
+        weights = shared.weights
+        begun = state.load(NETWORK)
         field = fit_network(
             trajectory, setup, seen, reporting, weights, plan.field, perceptual, log, begun=begun
         ).field

@@ -22,7 +22,10 @@ SHOWN = ("end", "between", "even", "s")
 """Figures that have a panel, by their short names."""
 
 _DPI = 100
-_ROW, _HEAD, _WIDTH = 0.21, 1.0, 12.0  # inches
+# inches
+_ROW = 0.21
+_HEAD = 1.0
+_WIDTH = 12.0
 
 
 @dataclass(frozen=True)
@@ -67,7 +70,8 @@ def _draw_panel(panel: Axes, figure: Figure, lines: Sequence[_Line], runs: Seque
         panel.xaxis.set_major_formatter("{x:g}")
         panel.xaxis.set_minor_locator(NullLocator())
     for run, name in enumerate(runs):
-        color, shift = _hex(LINES[run % len(LINES)]), 0.16 * (2 * run - len(runs) + 1)
+        color = _hex(LINES[run % len(LINES)])
+        shift = 0.16 * (2 * run - len(runs) + 1)
         found = {
             line.name: values
             for line in lines

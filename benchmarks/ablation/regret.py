@@ -59,7 +59,10 @@ from ..table import Table
 
 MEASURED = (0.12, 0.38, 0.64, 0.88, 1.0)
 """Strengths at which the editor is asked for what it means."""
-STAGES, STEPS, BANDS, VIEWS = (8, 4, 2), (5, 12, 24), (0, 1, 4, 9), (20, 30, 60)
+STAGES = (8, 4, 2)
+STEPS = (5, 12, 24)
+BANDS = (0, 1, 4, 9)
+VIEWS = (20, 30, 60)
 """What is swept: even strengths; steps of conjugate gradients for each, where nothing ends them before; SH
 functions of the residual; other numbers of views than a run's own, with what was best for those."""
 REPORTING = 13
@@ -166,7 +169,8 @@ class RegretEdit:
 
         def edit(strengths: Sequence[float], views: Sequence[View]) -> Pictures:
             nonlocal waited
-            began, chosen = time.process_time(), {view.camera.name for view in views}
+            began = time.process_time()
+            chosen = {view.camera.name for view in views}
             kept = [view.camera.name in chosen for view in self.setup.views]
             made = {s: list(compress(self.picture(s), kept)) for s in strengths}
             waited += time.process_time() - began
@@ -181,7 +185,8 @@ class RegretEdit:
             options = OptimizeOptions(), self.setup, whole, between, TrainingViewOptions(), log
             solver, model, course = plan_colors(*options)
         made = list[ParameterSnapshot]()
-        state, most = PgsState(self.original), iterations(OptimizeOptions().steps)
+        state = PgsState(self.original)
+        most = iterations(OptimizeOptions().steps)
         for snapshot in solve(solver, model, course, made, state, lambda step, left: None, most):
             made.append(snapshot)
         spent = time.process_time() - began - waited - self.seconds  # it prepared the views for itself
@@ -207,20 +212,24 @@ class RegretEdit:
     ) -> Iterator[Result]:
         """Some strengths and steps."""
         began = time.process_time()
-        solver, last = make_solver(self.drawn, self.original), None
+        solver = make_solver(self.drawn, self.original)
+        last = None
         solver = solver if mask is None else solver.with_mask(mask.float() / 255.0)
         once = time.process_time() - began
         every = self.strengths(stages[0])
         for s in (1.0, *every[:-1]):
-            targets, began = self.targets(s), time.process_time()
+            targets = self.targets(s)
+            began = time.process_time()
             table, mapped = solver.fit_map(degree, targets)
-            spent, done = time.process_time() - began, 0
+            spent = time.process_time() - began
+            done = 0
             now = torch.zeros(len(mapped), bands, 3) if last is None else s * last
             for steps in (steps for steps in STEPS if steps <= most):
                 began = time.process_time()
                 if bands:
                     now, _ = solver.residual(mapped, now, targets, steps - done)
-                spent, done = spent + time.process_time() - began, steps
+                spent = spent + time.process_time() - began
+                done = steps
                 self.solved[degree, bands, s, steps] = table, add_bands(mapped, now), spent
             last = now if last is None else last
         for count in stages:
@@ -288,7 +297,8 @@ class RegretEdit:
         return make_evaluator(self.scene, self.region, views, edited, self.setup.background, channels, True)
 
     def _crops(self, views: Sequence[View]) -> list[CropScene]:
-        members, background = self.region.members, self.setup.background
+        members = self.region.members
+        background = self.setup.background
         return [crop_scene(self.scene, members, v.camera, v.box, background, True) for v in views]
 
 

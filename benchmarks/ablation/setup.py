@@ -80,7 +80,8 @@ def make_ablation_setup(run: FinishedRun, plan: TrainOptions, kind: EditKind, qu
     Raises:
         ProgdfError: an edited view is gone.
     """
-    setup, strengths = render_run_views(run), run.trajectory.strengths
+    setup = render_run_views(run)
+    strengths = run.trajectory.strengths
     if quick:
         strengths = tuple(_thin(strengths, QUICK_STAGES))
         train = _thin(setup.train, max(2, QUICK_VIEWS - len(setup.held_out)))

@@ -127,7 +127,8 @@ def table_of(ablations: Sequence[Ablation], title: str) -> Table:
     perceptual = ablations[0].perceptual
     columns = ("variant", "differs from", "by", "seeds", *headings)
     columns = tuple(perceptual if column == "LPIPS" else column for column in columns)
-    rows, failures = [], []
+    rows = []
+    failures = []
     for about, found in rows_by_name(ablations):
         cells = ["<br>".join("–" if row is None else figure.text(row) for row in found) for figure in FIGURES]
         seeds = dict.fromkeys(str(len(row.outcomes)) for row in found if row is not None)

@@ -25,8 +25,12 @@ from trainer.optimize.retime import resolve_slider
 from trainer.options import PRESETS, EditKind, FieldOptions, OptimizeOptions, TrainOptions
 from trainer.resolve import resolve_kind
 
-BASE, LINEAR, EQUAL = "base", "2-keyframes", "equal-strengths"
-DESCENT, PAPER, PAPER_PGS = "descent", "paper", "paper-pgs"
+BASE = "base"
+LINEAR = "2-keyframes"
+EQUAL = "equal-strengths"
+DESCENT = "descent"
+PAPER = "paper"
+PAPER_PGS = "paper-pgs"
 
 Resolved = tuple[OptimizeOptions, FieldOptions | None, tuple[tuple[str, object], ...]]
 """All that decides a variant's bits, but for what all variants of a run share."""
@@ -116,7 +120,8 @@ def _other(name: str, what: str, part: str, value: object, of: str = BASE) -> Va
     return Variant(name, what, {f"optimize.{part}": value}, of)
 
 
-_PGS, _EPSILON = "trainer.optimize.pgs", "trainer.optimize.pgs.EPSILON"
+_PGS = "trainer.optimize.pgs"
+_EPSILON = "trainer.optimize.pgs.EPSILON"
 
 
 _LOSSES = "trainer.optimize.losses"

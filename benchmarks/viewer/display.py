@@ -19,7 +19,8 @@ from progdf.errors import ProgdfError
 
 PATIENCE_S = 120.0
 PROGRAMS = ("Xvfb", "xdotool")
-_FIRST_DISPLAY, _DISPLAYS = 1000, 50_000
+_FIRST_DISPLAY = 1000
+_DISPLAYS = 50_000
 
 
 def missing_tools() -> str:

@@ -37,8 +37,13 @@ from . import display as bench_display
 from .mouse import SIZE, Mouse
 from .scenes import COPIES, WAYS, copies, scenes_of
 
-WARM_UP, STEPS, STARTS, KEPT = 2, 20, 3, 4
-LEAST, TURN_S, STARTS_S = 3, 20.0, 30.0
+WARM_UP = 2
+STEPS = 20
+STARTS = 3
+KEPT = 4
+LEAST = 3
+TURN_S = 20.0
+STARTS_S = 30.0
 """Slow frames and starts are as many as fit into so many seconds, and at least so many frames."""
 
 MOST_COPIED = 1_000_000
@@ -209,7 +214,8 @@ def coarse_table(turnings: Sequence[Turning], renderer: str) -> Table:
     """What a picture costs that is coarse while it moves, beside its error moving and at rest."""
     rows = []
     for result in turnings:
-        full, coarse = np.median(result.frames_ms), np.median(result.coarse_ms)
+        full = np.median(result.frames_ms)
+        coarse = np.median(result.coarse_ms)
         rows.append(
             {
                 "Gaussians": group_digits(result.count),
@@ -285,7 +291,8 @@ def affordable_steps(steps: int, one_s: float) -> int:
 
 def _draw_anew(mouse: Mouse, view: ViewState) -> NDArray[np.uint8]:
     """The picture of `view` in full, by an engine that has drawn nothing before."""
-    main_view, engine = mouse.main_view, mouse.engine
+    main_view = mouse.main_view
+    engine = mouse.engine
     new = ViewEngine(main_view.context, engine.scene, (), engine.draws_with)
     main_view.set_engine(new, main_view.facts)
     main_view.change(replace(view, dynamic_resolution="off"))
@@ -304,7 +311,8 @@ def _at_rest(mouse: Mouse) -> int:
     if mouse.main_view.canvas.pixels == 1:
         raise AssertionError("the picture in motion was not coarse")
     mouse.wait_sharp()
-    rested, view = mouse.picture(), mouse.main_view.work.view
+    rested = mouse.picture()
+    view = mouse.main_view.work.view
     mouse.release()
     mouse.settle()
     return int(np.abs(rested.astype(int) - _draw_anew(mouse, view)).max())

@@ -26,8 +26,11 @@ from viewer.state.view_state import ViewState
 SIZE = (640, 480)
 """Of the picture; the panel stands beside it."""
 
-_STEP_S, _POLL_S = 1.0 / 60.0, 0.02
-_INSET, _FIRST = 12 + 10 + 7, 131.0  # the panel's layout at 1×
+_STEP_S = 1.0 / 60.0
+_POLL_S = 0.02
+# the panel's layout at 1×
+_INSET = 12 + 10 + 7
+_FIRST = 131.0
 
 
 def slider_at(width: float, layer: int, strength: float) -> tuple[float, float]:
@@ -55,7 +58,8 @@ class Mouse:
         view: ViewState,
         size: tuple[int, int] = SIZE,
     ) -> None:
-        self.engine, self.size = engine, size
+        self.engine = engine
+        self.size = size
         self.processor_ms = 0.0  # that the last frame took of all cores together
         self.pixels = (size[0] + round(panel.WIDTH_PX), size[1])
         self._ctx = ctx
@@ -81,7 +85,8 @@ class Mouse:
             seconds: that have passed on the main view's clock since the last one
             event: whether something has happened; else time alone brings this frame
         """
-        began, used = time.perf_counter(), time.process_time()
+        began = time.perf_counter()
+        used = time.process_time()
         if event:
             self.main_view.wake()
         self.main_view.frame(self._screen, seconds)

@@ -35,10 +35,17 @@ from .mouse import Mouse
 from .scenes import copies, scenes_of
 from .training import Training, begin_training
 
-SIZE, STEPS, TURN_PX, WARM_UP = (980, 800), 60, 10.0, 3
-MILLION, JUDGED, TRAINED = 1_000_000, 6, 24_000
+SIZE = (980, 800)
+STEPS = 60
+TURN_PX = 10.0
+WARM_UP = 3
+MILLION = 1_000_000
+JUDGED = 6
+TRAINED = 24_000
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
-_POLL_S, _SETTLE_S, _LONGEST_S = 0.02, 3.0, 20.0
+_POLL_S = 0.02
+_SETTLE_S = 3.0
+_LONGEST_S = 20.0
 _UNDER_WAY_S = 0.2  # a training that goes on has its threads at work
 
 
@@ -98,13 +105,18 @@ def measure(
         mouse.grip_picture()
         mouse.turn(TURN_PX)
         mouse.wait_sharp()  # the hand's first rest, which tells how fine is fine enough
-        turning, processor, beside, db, luminance = [], [], [], math.inf, 0.0
+        turning = []
+        processor = []
+        beside = []
+        db = math.inf
+        luminance = 0.0
         for step in range(-WARM_UP, steps):
             turning.append(mouse.turn(TURN_PX))
             processor.append(mouse.processor_ms)
             if step >= 0 and step % max(steps // JUDGED, 1) == 0:
                 error, apart = _compare(mouse, scene)
-                db, luminance = min(db, error), max(luminance, apart, key=abs)
+                db = min(db, error)
+                luminance = max(luminance, apart, key=abs)
                 with training.runs():
                     time.sleep(_UNDER_WAY_S)
                     mouse.turn(TURN_PX)
@@ -112,21 +124,24 @@ def measure(
                 mouse.turn(TURN_PX)
         began = time.perf_counter()
         meanwhile = _rest(mouse, began - 1e-3 * turning[-1], until_sharp=True)
-        sharp, full = 1e3 * (time.perf_counter() - began), mouse.main_view.canvas.timings.total_ms
+        sharp = 1e3 * (time.perf_counter() - began)
+        full = mouse.main_view.canvas.timings.total_ms
         mouse.release()
         mouse.frame(seconds=1.0)
         click = max(mouse.press(), mouse.release(), mouse.frame(), _rest(mouse, time.perf_counter()))
         held = mouse.main_view.work.view
         mouse.main_view.change(replace(held, select=replace(held.select, tool="lasso")))
         _rest(mouse, time.perf_counter())
-        middle, reach = (size[0] / 2, size[1] / 2), 0.25 * min(size)
+        middle = (size[0] / 2, size[1] / 2)
+        reach = 0.25 * min(size)
         mouse.move(middle[0], middle[1] - reach)
         mouse.press()
         for turn in np.linspace(0.0, 2.0 * np.pi, 40):
             mouse.move(middle[0] + reach * np.sin(turn), middle[1] - reach * np.cos(turn))
         lasso = max(mouse.release(), _rest(mouse, time.perf_counter()))
     engine.release()
-    turned, used = tuple(turning[WARM_UP:]), float(np.median(processor[WARM_UP:]))
+    turned = tuple(turning[WARM_UP:])
+    used = float(np.median(processor[WARM_UP:]))
     return Moving(
         count=len(scene),
         turning=turned,
@@ -190,7 +205,8 @@ def _pyramid(mouse: Mouse) -> tuple[float, float]:
     those of the scene that is drawn."""
     mouse.wait_pyramid()
     assert isinstance(mouse.engine.renderer, CpuRenderer)
-    drawn, began = mouse.engine.renderer._scene.drawn, time.process_time()
+    drawn = mouse.engine.renderer._scene.drawn
+    began = time.process_time()
     nodes = Pyramid(drawn).nodes
     seconds = time.process_time() - began
     arrays = nodes.means, nodes.shapes, nodes.order
@@ -204,13 +220,15 @@ def _rest(mouse: Mouse, last: float, until_sharp: bool = False) -> float:
     Args:
         last: when the last frame began
     """
-    began, longest = time.perf_counter(), 0.0
+    began = time.perf_counter()
+    longest = 0.0
     while time.perf_counter() - began < (_LONGEST_S if until_sharp else _SETTLE_S):
         if until_sharp and mouse.main_view.canvas.pixels == 1:
             break
         if mouse.main_view.is_due():
             now = time.perf_counter()
-            longest, last = max(longest, mouse.frame(seconds=now - last, event=not until_sharp)), now
+            longest = max(longest, mouse.frame(seconds=now - last, event=not until_sharp))
+            last = now
         wait = mouse.main_view.next_frame_delay()
         time.sleep(_POLL_S if wait is None else min(wait, _POLL_S))
     return longest

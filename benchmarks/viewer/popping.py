@@ -28,11 +28,16 @@ from viewer.render.dynamic_resolution import BUDGETS, COARSE, drawn_size
 
 from .scenes import copies, scenes_of
 
-SIZE, FRAMES, RESTS, BLOCK = (980, 800), 40, 4, 16
-TURN, STEP = 1.0, 0.004
+SIZE = (980, 800)
+FRAMES = 40
+RESTS = 4
+BLOCK = 16
+TURN = 1.0
+STEP = 0.004
 """Degrees of a frame, and what it goes ahead, of the scene's radius."""
 
-WHITE, NO_ORDER = (1.0, 1.0, 1.0), np.zeros(0, np.uint32)
+WHITE = (1.0, 1.0, 1.0)
+NO_ORDER = np.zeros(0, np.uint32)
 
 
 @dataclass(frozen=True)
@@ -56,7 +61,8 @@ def tables(scenes: Sequence[Path] = ()) -> list[Table]:
     Args:
         scenes: .ply files that take the place of the bears
     """
-    opened, inside = scenes_of(scenes), room(200_000).gaussians
+    opened = scenes_of(scenes)
+    inside = room(200_000).gaussians
     paths = [("an orbit", scene, turning) for scene in (*opened, copies(opened[-1], 8))]
     paths += [("turning in the room", inside, spinning), ("a walk through the room", inside, walking)]
     films = [film(title, scene, list(path(first_camera(scene), scene))) for title, scene, path in paths]
@@ -88,7 +94,8 @@ def film(title: str, scene: Gaussians, views: Sequence[ViewCamera], size: tuple[
     """Draw a film three times; the moving picture is as fine as it is found to need to be in this scene."""
     renderer, near = CpuRenderer(), near_plane(bounds_of(scene).radius)
     renderer.upload(scene)
-    live, pyramid = renderer._scene, renderer._scene.begin_pyramid().result()
+    live = renderer._scene
+    pyramid = renderer._scene.begin_pyramid().result()
 
     def draw(camera: Camera, pixels: int) -> NDArray[np.float32]:
         renderer.draw(replace(camera, near=near), WHITE, NO_ORDER, pixels)
@@ -98,13 +105,21 @@ def film(title: str, scene: Gaussians, views: Sequence[ViewCamera], size: tuple[
 
     small = drawn_size(size, COARSE)
     for _ in range(RESTS):
-        live._budget, live._finest = BUDGETS[2], live._enough
+        live._budget = BUDGETS[2]
+        live._finest = live._enough
         draw(to_camera(views[0], *small), COARSE)
         draw(to_camera(views[0], *size), 1)
-    limit, last = live._enough, list[NDArray[np.float32]]()
-    means, blocks, halved, worst = [], [], [], 0.0
+    limit = live._enough
+    last = list[NDArray[np.float32]]()
+    means = []
+    blocks = []
+    halved = []
+    worst = 0.0
     for view in views:
-        live._budget, live._finest, pyramid.limit = BUDGETS[2], limit, limit  # whatever frames take
+        # whatever frames take
+        live._budget = BUDGETS[2]
+        live._finest = limit
+        pyramid.limit = limit
         moving = draw(to_camera(view, *small), COARSE)
         frames = [draw(to_camera(view, *size), 1), moving, draw(to_camera(view, *small), 1)]
         worst = max(worst, float(np.square(frames[0] - moving).mean()))
@@ -132,7 +147,8 @@ def film(title: str, scene: Gaussians, views: Sequence[ViewCamera], size: tuple[
 
 def _blocks(change: NDArray[np.float32]) -> NDArray[np.float32]:
     """The means of blocks. [H,W,3] -> [rows,columns]"""
-    rows, columns = change.shape[0] // BLOCK, change.shape[1] // BLOCK
+    rows = change.shape[0] // BLOCK
+    columns = change.shape[1] // BLOCK
     whole = change[: rows * BLOCK, : columns * BLOCK].mean(2)
     means: NDArray[np.float32] = whole.reshape(rows, BLOCK, columns, BLOCK).mean((1, 3))
     return means

@@ -30,7 +30,9 @@ WAYS = {"gl": "OpenGL", "cpu": "CPU"}
 """Of drawing, of `engine.DRAWS`, and what tables call them."""
 
 RANKS = 3
-_SHIFT, _JITTER = 0.003, 0.002  # of the scene's radius
+# of the scene's radius
+_SHIFT = 0.003
+_JITTER = 0.002
 
 
 def scenes_of(paths: Sequence[Path] = ()) -> list[Gaussians]:

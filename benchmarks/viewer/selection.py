@@ -19,7 +19,8 @@ from viewer.state import selection
 
 from .scenes import copies, scenes_of
 
-SIZE, TIMES = (980, 800), 5
+SIZE = (980, 800)
+TIMES = 5
 CORNERS = 400
 """Of the lasso: as many as a hand leaves in a few seconds."""
 

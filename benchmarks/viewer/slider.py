@@ -31,7 +31,8 @@ from viewer.state.view_state import LayerState, ViewState
 from .mouse import SIZE, Mouse, slider_at
 from .scenes import WAYS, edit_for, scenes_of
 
-WARM_UP, STEPS = 2, 24
+WARM_UP = 2
+STEPS = 24
 PARTS = "compose", "upload", "sort", "draw"
 
 

@@ -16,7 +16,8 @@ from progdf.formats.ply import save_ply
 from progdf.gaussians import Gaussians
 from viewer.jobs.child import Child
 
-_STARTED, _POLL_S = "optimize ", 0.2
+_STARTED = "optimize "
+_POLL_S = 0.2
 _LONGEST_S = 600.0  # a busy machine takes minutes to import what a training needs
 
 

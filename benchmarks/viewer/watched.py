@@ -36,7 +36,8 @@ def main(arguments: list[str]) -> int:
         """Tells when its first picture is on the screen, and takes the time of sliders."""
 
         def draw(self) -> None:
-            before, arrived = self.main_view.work.view.layers, time.perf_counter()
+            before = self.main_view.work.view.layers
+            arrived = time.perf_counter()
             super().draw()
             layers = self.main_view.work.view.layers
             if [layer.strength for layer in layers] != [layer.strength for layer in before]:
@@ -55,7 +56,8 @@ def main(arguments: list[str]) -> int:
                 if not stays:
                     self.leave()
 
-    real, opened = application.App, splash.Splash
+    real = application.App
+    opened = splash.Splash
     application.App = Watched  # type: ignore[misc]
     splash.Splash = partial(opened, size=(int(size[0]), int(size[1])))  # type: ignore[assignment, misc]
     try:
@@ -63,7 +65,9 @@ def main(arguments: list[str]) -> int:
     except KeyboardInterrupt:
         return 0
     finally:
-        application.App, splash.Splash = real, opened  # type: ignore[misc]
+        # type: ignore[misc]
+        application.App = real
+        splash.Splash = opened
         if watched and stays:
             shown = watched[0].main_view
             _say(

@@ -26,9 +26,11 @@ from .display import Opened
 from .mouse import slider_at
 from .scenes import edit_for, scenes_of
 
-IDLE_S, DRAG_S = 10.0, 60.0
+IDLE_S = 10.0
+DRAG_S = 60.0
 MEMBERS = 3_000
-SETTLED_S, _LONGEST_S = 1.5, 60.0
+SETTLED_S = 1.5
+_LONGEST_S = 60.0
 _SWEEP = 40
 """Steps of the mouse from one end of the slider to the other; one about every 1/60 s."""
 
@@ -56,7 +58,8 @@ class Dragging:
         """MB a minute over the second half, since what fills at the start is no leak: the median of the
         slopes between all samples, which one odd sample does not move."""
         half = len(self.seconds) // 2
-        times, memory = np.array(self.seconds[half:]), np.array(self.memory_mb[half:])
+        times = np.array(self.seconds[half:])
+        memory = np.array(self.memory_mb[half:])
         later, sooner = np.tril_indices(len(times), -1)
         slopes = (memory[later] - memory[sooner]) / (times[later] - times[sooner])
         return 60.0 * float(np.median(slopes)) if len(slopes) else 0.0
@@ -148,11 +151,13 @@ def _window(scene: Gaussians) -> Iterator[Opened]:
 
 def _rested(opened: Opened, state: str, wall_s: float) -> Idle:
     """Wait until it has come to rest, then watch it."""
-    end, before = time.monotonic() + _LONGEST_S, -1.0
+    end = time.monotonic() + _LONGEST_S
+    before = -1.0
     while (now := opened.processor_s()) != before and time.monotonic() < end:
         before = now
         time.sleep(SETTLED_S)
-    used, began = opened.processor_s(), time.monotonic()
+    used = opened.processor_s()
+    began = time.monotonic()
     time.sleep(wall_s)
     return Idle(state, opened.processor_s() - used, time.monotonic() - began)
 

@@ -31,7 +31,8 @@ from .options import absent_option, parse_options
 
 Specs = Annotated[tuple[str, ...], UseAppendAction]
 
-MOST_DEGREES, MOST_SCALE = 360.0, 1000.0
+MOST_DEGREES = 360.0
+MOST_SCALE = 1000.0
 
 
 @dataclass(frozen=True)
@@ -68,7 +69,8 @@ class EditOptions:
 def main(argv: Sequence[str]) -> int:
     """Do what is asked for and write it. Raises ProgdfError where that is nothing, or would leave nothing."""
     options = parse_options(EditOptions, argv, "progdf edit")
-    makes_edit, makers = options.out.suffix.lower() == ".gdf", _read_steps(options)
+    makes_edit = options.out.suffix.lower() == ".gdf"
+    makers = _read_steps(options)
     if not options.clean and not makers:
         raise ProgdfError(
             "nothing was asked for; say what to do with the scene, for example --clean or --delete REGION"
@@ -96,7 +98,8 @@ def main(argv: Sequence[str]) -> int:
     notes = () if read_back is None else read_back.notes
     print_line("; ".join([f"wrote {options.out}: {format_count(len(edited))}", *notes]))
     if len(edited) < len(scene):
-        old, new = shlex.quote(str(options.scene)), shlex.quote(str(options.out))
+        old = shlex.quote(str(options.scene))
+        new = shlex.quote(str(options.out))
         print_line(
             f"rows have new numbers: labels and edits of {scene_name(options.scene)} no longer fit; "
             f"an edit is carried over by progdf rebind EDIT.gdf --from {old} --to {new} -o NEW.gdf"
@@ -170,7 +173,8 @@ def _factor(text: str) -> Motion | None:
 def _turn(text: str) -> Motion | None:
     axis, _, degrees = text.rpartition(",")
     named = {"x": "1,0,0", "y": "0,1,0", "z": "0,0,1"}
-    direction, angle = read_numbers(named.get(axis.strip().lower(), axis)), read_numbers(degrees)
+    direction = read_numbers(named.get(axis.strip().lower(), axis))
+    angle = read_numbers(degrees)
     if len(direction) != 3 or not any(direction) or len(angle) != 1 or abs(angle[0]) > MOST_DEGREES:
         return None
     unit = torch.nn.functional.normalize(torch.tensor(direction, dtype=torch.float64), dim=0)

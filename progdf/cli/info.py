@@ -200,14 +200,17 @@ def _scene_lines(path: Path, cameras: Path | None, up: UpChoice) -> Iterator[str
 
 def _edit_lines(path: Path) -> Iterator[str]:
     gdf = read_gdf(path)
-    size, members, count = path.stat().st_size, gdf.members, gdf.scene.count
+    size = path.stat().st_size
+    members = gdf.members
+    count = gdf.scene.count
     yield f"{path.name}: the edit '{gdf.name}', {file_size(size)}"
     if gdf.instruction:
         yield f"asked for: {gdf.instruction}"
     sizes = ""
     if count:
         yield f"scene: {format_count(count)}, fingerprint {gdf.scene.means_sha256[:12]}"
-        region, added = len(gdf.region), members - len(gdf.region)
+        region = len(gdf.region)
+        added = members - len(gdf.region)
         yield f"region: {gdf.region.name}, {format_count(region)} ({region / max(1, count):.1%})"
         if added:
             yield f"adds: {format_count(added)}, none of which shows at strength 0"

@@ -72,7 +72,8 @@ def main(argv: Sequence[str]) -> int:
     if options.out.suffix.lower() != ".gdf":
         raise ProgdfError(f"{options.out} is not a .gdf file; give the edit a name that ends in .gdf")
     check_not_an_input(options.out, [options.edit, options.source, options.target])
-    a, b = load_scene(options.source), load_scene(options.target)
+    a = load_scene(options.source)
+    b = load_scene(options.target)
     gdf = load_gdf(options.edit, a, scene_name(options.source))
     match = match_scenes(a, b)
     print_line(
@@ -128,14 +129,17 @@ def rebind_edit(gdf: Gdf, a: Gaussians, b: Gaussians, match: Match) -> Gdf:
     mine = np.flatnonzero(members[index] == match.rows)
     if not len(mine):
         raise ProgdfError(f"no member of {gdf.name} is in the other scene; give the same scene")
-    rows, of_a = torch.from_numpy(mine), torch.from_numpy(match.rows)
+    rows = torch.from_numpy(mine)
+    of_a = torch.from_numpy(match.rows)
     source = torch.cat([torch.from_numpy(index[mine]), torch.arange(len(members), gdf.members)])
     # q and −q are one rotation, but not with the same offset
     flipped = torch.zeros(len(source), dtype=torch.bool)
     flipped[: len(rows)] = (a.quats[of_a[rows]] * b.quats[rows]).sum(dim=1) < 0
     attributes = {}
     for name, bases in gdf.field.attributes.items():
-        full, basis, step = bases.end_offset[source], bases.residual_basis[:, source], bases.scale
+        full = bases.end_offset[source]
+        basis = bases.residual_basis[:, source]
+        step = bases.scale
         if name == "quats":
             full = torch.where(flipped[:, None], -full, full)
             basis = torch.where(flipped[None, :, None], -basis, basis)

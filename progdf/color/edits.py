@@ -111,7 +111,8 @@ def tint_course(rgb: Tensor, target: Tensor, reference: Tensor, path: ColorPath 
 
 def tint_fully(rgb: Tensor, target: Tensor, share: float = 0.7) -> Tensor:
     """The end of a `tint_course`; `share`: how far hue and chroma go. [...,3] -> [...,3] 0..1"""
-    lab, goal = srgb_to_oklab(rgb.clamp(0, 1)), srgb_to_oklab(_as_tensor(target, rgb))
+    lab = srgb_to_oklab(rgb.clamp(0, 1))
+    goal = srgb_to_oklab(_as_tensor(target, rgb))
     lightness = lab[..., :1]
     fade = torch.minimum(
         lightness / goal[0].clamp_min(0.02), (1 - lightness) / (1 - goal[0]).clamp_min(0.02)

@@ -66,12 +66,14 @@ def fit_gamut(lab: Tensor) -> Tensor:
     outside = (rgb - 0.5).abs().amax(dim=-1) > 0.5 + _GAMUT_SLACK
     if bool(outside.any()):
         beyond = lab[outside]
-        low, high = torch.zeros_like(beyond[:, :1]), torch.ones_like(beyond[:, :1])
+        low = torch.zeros_like(beyond[:, :1])
+        high = torch.ones_like(beyond[:, :1])
         for _ in range(10):  # to a thousandth of the chroma
             middle = 0.5 * (low + high)
             tried = oklab_to_srgb(torch.cat([beyond[:, :1], middle * beyond[:, 1:]], dim=1))
             fits = (tried - 0.5).abs().amax(dim=1, keepdim=True) <= 0.5 + _GAMUT_SLACK
-            low, high = torch.where(fits, middle, low), torch.where(fits, high, middle)
+            low = torch.where(fits, middle, low)
+            high = torch.where(fits, high, middle)
         rgb[outside] = oklab_to_srgb(torch.cat([beyond[:, :1], low * beyond[:, 1:]], dim=1))
     return rgb.clamp(0, 1)
 
@@ -118,7 +120,8 @@ def bend_of(reference: Tensor, target: Tensor, path: ColorPath = "bowed") -> Ben
     if path in ("straight", "srgb"):
         return replace(STRAIGHT, fade=path == "srgb")
     start, end = (hue_of(srgb_to_oklab(color.clamp(0, 1))) for color in (reference, target))
-    short, to_green = _wrap(end - start), _wrap(_GREEN - start)
+    short = _wrap(end - start)
+    to_green = _wrap(_GREEN - start)
     over_green = bool(to_green * short > 0) and bool(to_green.abs() <= short.abs())
     opposite, green, bow, whole, none = {
         "bowed": (170.0, False, 0.4, 15.0, 60.0),

@@ -26,8 +26,11 @@ CLOSEST = 0.02
 _LIGHTNESS = 0.5  # how much a difference of lightness counts: shading is not another color
 _WHITE = 0.15  # of lightness below white: where a color begins to stay
 # width of the kernel: share of the distance of the sources, the least, and with one source
-_WIDTH, _NARROWEST, _ALONE = 0.5, 0.04, 0.08
-_ROUNDS, _CELL = 20, 0.04  # of k-means; side of the cells in which colors are counted
+_WIDTH = 0.5
+_NARROWEST = 0.04
+_ALONE = 0.08
+_ROUNDS = 20  # of k-means
+_CELL = 0.04  # side of the cells in which colors are counted
 _LEAST_SHARE = 0.003  # of what is seen, for a color to be a main one
 _STEPS = 1024  # of a curve, linear between
 
@@ -46,7 +49,8 @@ def find_palette(rgb: Tensor, weights: Tensor, count: int = COLORS) -> Tensor:
         [k,3] sRGB, k ≤ `count`; [0,3] where nothing is seen.
     """
     seen = weights > 0
-    colors, weights = _kernel_space(srgb_to_oklab(rgb[seen].clamp(0, 1)).double()), weights[seen].double()
+    colors = _kernel_space(srgb_to_oklab(rgb[seen].clamp(0, 1)).double())
+    weights = weights[seen].double()
     if not len(colors):
         return rgb.new_zeros(0, 3)
     cells, own = torch.unique((colors / _CELL).round(), dim=0, return_inverse=True)
@@ -86,8 +90,10 @@ def shift_palette(lab: Tensor, sources: Tensor, targets: Tensor, curves: Sequenc
     Args:
         curves: of the lightness of what has become of each source; none at all, or k
     """
-    places, colors = _kernel_space(sources.double()), _kernel_space(lab.reshape(-1, 3).double())
-    apart, away = torch.cdist(places, places), torch.cdist(colors, places)
+    places = _kernel_space(sources.double())
+    colors = _kernel_space(lab.reshape(-1, 3).double())
+    apart = torch.cdist(places, places)
+    away = torch.cdist(colors, places)
     width = _ALONE
     if len(places) > 1:
         nearest = (apart + torch.eye(len(places)) * apart.max()).amin(dim=1)
@@ -100,8 +106,10 @@ def shift_palette(lab: Tensor, sources: Tensor, targets: Tensor, curves: Sequenc
     weights = (kernel(away) @ torch.linalg.inv(kernel(apart))).clamp_min(0.0)
     if len(places) > 1:
         weights = weights / weights.sum(dim=1, keepdim=True)
-    lightness, own = lab.reshape(-1, 3)[:, :1].double(), sources[:, 0].double()
-    dark, bright = lightness / own.clamp_min(1e-3), (1 - lightness) / (1 - own).clamp(1e-3, _WHITE)
+    lightness = lab.reshape(-1, 3)[:, :1].double()
+    own = sources[:, 0].double()
+    dark = lightness / own.clamp_min(1e-3)
+    bright = (1 - lightness) / (1 - own).clamp(1e-3, _WHITE)
     fade = torch.minimum(dark, bright)
     moved = (weights * fade.clamp(0, 1)) @ (targets - sources).double()
     shifted: Tensor = lab + moved.to(lab).reshape(lab.shape)

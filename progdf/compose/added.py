@@ -43,7 +43,9 @@ def extend(scene: Gaussians, gdfs: Sequence[Gdf]) -> tuple[Gaussians, tuple[Gdf,
     if not added:
         return scene, tuple(gdfs)
     extended = _append_rows(scene, added)
-    total, scene_print, first = len(extended), fingerprint(extended), len(scene)
+    total = len(extended)
+    scene_print = fingerprint(extended)
+    first = len(scene)
     moved = []
     for gdf in gdfs:
         form = gdf.field.origin
@@ -63,7 +65,8 @@ def extend(scene: Gaussians, gdfs: Sequence[Gdf]) -> tuple[Gaussians, tuple[Gdf,
 
 def _grade_all(gdf: Gdf, form: GradeForm, extended: Gaussians) -> Gdf:
     """A grade of the whole scene on what other edits add as well: no residual there, and the mean mask."""
-    more, mask = len(extended) - form.members, form.mask
+    more = len(extended) - form.members
+    mask = form.mask
     if mask is not None:
         mask = pad(mask, (0, more), value=round(float(mask.float().mean())))
     form = replace(form, residual=pad(form.residual, (0, 0, 0, more)), mask=mask)
@@ -76,7 +79,8 @@ def _grade_all(gdf: Gdf, form: GradeForm, extended: Gaussians) -> Gdf:
 @lru_cache(maxsize=1)  # the same object for the same edits, so that what is known of it stays known
 def _append_rows(scene: Gaussians, added: tuple[Gaussians, ...]) -> Gaussians:
     """The scene and rows that have origins and bands of their own."""
-    parts, shape = [scene], scene.shN.shape[1:]
+    parts = [scene]
+    shape = scene.shN.shape[1:]
     origin = torch.tensor(scene.origin, dtype=torch.float64)
     for rows in added:
         means = rows.means if rows.origin == scene.origin else (rows.world_means - origin)

@@ -112,7 +112,8 @@ class Composer:
 
     def __init__(self, scene: Gaussians, gdfs: Sequence[Gdf]) -> None:
         scene, extended = extend(scene, gdfs)
-        self._scene, self._gdfs = scene, extended
+        self._scene = scene
+        self._gdfs = extended
         self._given = tuple(gdfs)  # alive, so that no other edit gets the id of one
         self._index = {id(gdf): i for edits in (gdfs, extended) for i, gdf in enumerate(edits)}
         self._members = [gdf.region.members.numpy() for gdf in extended]
@@ -152,7 +153,8 @@ class Composer:
         edits = [(self._edit_of(layer.gdf), layer) for layer in layers if layer.active]
         stack = [(edit, replace(layer, gdf=self._gdfs[edit])) for edit, layer in edits]
         self._check_weights([layer for _, layer in stack])
-        before, self._effects = self._effects, effects_of(stack, blend)
+        before = self._effects
+        self._effects = effects_of(stack, blend)
         changed = changed_edits(before, self._effects)
         if not changed:
             return Change(np.zeros(0, np.int64), (), 0.0)
@@ -212,7 +214,8 @@ class Composer:
         last: int,
     ) -> float:
         """Write these attributes of rows first to last; the largest squared step of a center."""
-        rows, parts = rows[first:last], [_between(part, first, last) for part in parts]
+        rows = rows[first:last]
+        parts = [_between(part, first, last) for part in parts]
         kinds = {KINDS[name] for name in names} if blend == "normalized" else ()
         weight_sums = {kind: _weight_sum(parts, kind, len(rows)) for kind in kinds}
         largest = 0.0
@@ -220,14 +223,16 @@ class Composer:
             after = self._after[name]
             total = np.full((len(rows), after.shape[1]), -0.0, np.float32)  # adding to −0 leaves every bit
             for part in parts:
-                bases, gain = self._bases[part.edit].get(name), part.layer.gain(name)
+                bases = self._bases[part.edit].get(name)
+                gain = part.layer.gain(name)
                 if bases is None or gain == 0:
                     continue
                 used, factors = bases.factors(part.segment)
                 covered = self._coverage_of(part.edit)[KINDS[name]].numpy() if blend in ORDERED else _NOTHING
                 hidden = np.float32(part.layer.clamped_strength) * np.float32(min(abs(gain), 1.0))
                 selection = part.at, part.members, part.weights
-                stored, scale = (bases.end, bases.residual), np.float32(gain)
+                stored = (bases.end, bases.residual)
+                scale = np.float32(gain)
                 _add_offsets(total, selection, stored, used, factors, scale, hidden, covered)
             weight_sum = weight_sums.get(KINDS[name], _NOTHING)
             moved = _finish(after, self._before[name], rows, total, weight_sum, name == "means")
@@ -320,17 +325,20 @@ def _add_offsets(
         hidden, covered: the share of lower layers that is hidden at c = 1, and c [M], empty: 0
     """
     (at, members, weights), (end, residual_levels) = part, stored
-    one, width = np.float32(1.0), total.shape[1]
+    one = np.float32(1.0)
+    width = total.shape[1]
     offsets = np.zeros(_BLOCK * width, np.float32)  # of a block of members: they stay in the first cache
     tiles = np.empty((len(factors), _BLOCK * width), np.float32)
     for k in range(len(factors)):
         for i in range(min(_BLOCK, len(at))):
             for c in range(width):
                 tiles[k, i * width + c] = factors[k, c]
-    ends, sums = end.reshape(-1), total.reshape(-1)
+    ends = end.reshape(-1)
+    sums = total.reshape(-1)
     for first in range(0, len(at), _BLOCK):
         count = min(_BLOCK, len(at) - first)
-        low, row = members[first], at[first]
+        low = members[first]
+        row = at[first]
         if members[first + count - 1] - low == count - 1:  # one run: along memory
             for k in range(len(factors)):
                 tile = tiles[k]
@@ -358,7 +366,9 @@ def _add_offsets(
                 run[j] += gain * offsets[j]
             continue
         for i in range(count):
-            row, member, weight = at[first + i], members[first + i], one
+            row = at[first + i]
+            member = members[first + i]
+            weight = one
             if len(weights):
                 weight = weights[member]
                 if weight == 0.0:
@@ -381,7 +391,8 @@ def _finish(
         total: the sums; overwritten. [U,c]
         weight_sum: at least 1, empty: all 1. [U]
     """
-    largest, width = np.float32(0.0), total.shape[1]
+    largest = np.float32(0.0)
+    width = total.shape[1]
     for first in range(0, len(rows), _BLOCK):
         count = min(_BLOCK, len(rows) - first)
         if len(weight_sum):
@@ -390,7 +401,8 @@ def _finish(
                     total[i, c] /= weight_sum[i]
         if measure:
             for i in range(first, first + count):
-                row, step = rows[i], np.float32(0.0)
+                row = rows[i]
+                step = np.float32(0.0)
                 for c in range(3):
                     moved = before[row, c] + total[i, c] - after[row, c]
                     step += moved * moved

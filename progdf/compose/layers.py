@@ -102,7 +102,8 @@ def check_weights(layer: Layer) -> None:
     """The part of `check_layers` that looks at one layer's weights."""
     if layer.weights is None:
         return
-    shape, members = list(layer.weights.shape), len(layer.gdf.region)
+    shape = list(layer.weights.shape)
+    members = len(layer.gdf.region)
     if shape != [members]:
         raise ValueError(f"weights of {layer.gdf.name} has shape {shape}, expected [{members}]")
     if members and not (float(layer.weights.min()) >= 0.0 and float(layer.weights.max()) <= 1.0):

@@ -26,7 +26,9 @@ from .layers import BLENDS, KINDS, ORDERED, Gains, Layer, check_layers
 
 _COLOR = 0.1  # of sRGB's 0..1: a change that is plain to see
 _OPACITY = 0.2  # of 0..1
-_MOVE, _GROWTH, _TURN = 0.05, 0.4, 0.4  # of the region's size; of a log-scale; of a quaternion's length
+_MOVE = 0.05  # of the region's size
+_GROWTH = 0.4  # of a log-scale
+_TURN = 0.4  # of a quaternion's length
 _SHARE_OF_LARGEST = 0.5
 _MOST = 100_000  # members by which the largest change is judged
 
@@ -49,7 +51,8 @@ def coverage(scene: Gaussians, gdf: Gdf) -> Mapping[str, Tensor]:
     Returns:
         Kind, see `layers.KINDS` -> c, 0..1; of a grade also "map" -> see `map_share`. [M] float32
     """
-    members, field = gdf.region.members, gdf.field
+    members = gdf.region.members
+    field = gdf.field
     sizes = {
         "color": (_color_change(field), _COLOR),
         "opacity": (_opacity_change(scene, members, field), _OPACITY),
@@ -216,7 +219,9 @@ class _LayerMembers:
 
     def add(self, total: Tensor, name: str, hides: bool) -> None:
         """Add its offsets of one attribute to the sums. [U,c]"""
-        weight, gain, below = self.weights[:, None], self.layer.gain(name), total[self.rows]
+        weight = self.weights[:, None]
+        gain = self.layer.gain(name)
+        below = total[self.rows]
         if hides:
             hidden = torch.tensor(self.layer.clamped_strength) * torch.tensor(min(abs(gain), 1.0))
             below = below * (1 - weight * hidden * self.coverage[KINDS[name]][self.members, None])
@@ -235,7 +240,8 @@ def _adjusted_colors(scene: Gaussians, rows: Tensor, parts: Sequence[_LayerMembe
     total = {name: torch.full_like(values, NEGATIVE_ZERO) for name, values in old.items()}
     touched = torch.zeros(len(rows), dtype=torch.bool)
     for part in parts:
-        form, names = part.layer.gdf.field.origin, [name for name in old if part.moves(name)]
+        form = part.layer.gdf.field.origin
+        names = [name for name in old if part.moves(name)]
         before = {name: total[name][part.rows].clone() for name in names}
         for name in names:
             part.add(total[name], name, hides=True)
@@ -247,7 +253,8 @@ def _adjusted_colors(scene: Gaussians, rows: Tensor, parts: Sequence[_LayerMembe
             factor = part.weights[here, None, None] * part.layer.gain("sh0")
             share = part.coverage["map"][members, None]
             for name, bands in zip(names, (change[:, :1], change[:, 1:]), strict=False):
-                sums, new = total[name][part.rows], before[name][here]
+                sums = total[name][part.rows]
+                new = before[name][here]
                 new[:, : 3 * bands.shape[1]] += (factor * bands).flatten(1)
                 sums[here] = torch.lerp(sums[here], new, share)
                 total[name][part.rows] = sums

@@ -43,12 +43,14 @@ def noise(points: Tensor, table: Tensor, frequency: float, octaves: int = 1) -> 
         [N]
     """
     total = torch.zeros(points.shape[0])
-    height, span = 1.0, 0.0
+    height = 1.0
+    span = 0.0
     for octave in range(octaves):
         # the shift keeps the lattice planes of the octaves, and the part's planes of symmetry, apart
         total += height * _value_noise(points * frequency + 17.31 * (octave + 1), table)
         span += height
-        height, frequency = height / 2, frequency * 2
+        height = height / 2
+        frequency = frequency * 2
     return total / span
 
 
@@ -165,7 +167,8 @@ def assemble(
     """Exactly `size` Gaussians on the visible surfaces of `parts`, and their labels [N] uint8; seeded."""
     random = torch.Generator().manual_seed(seed)
     table = lattice(seed)
-    pieces, labels = list[Gaussians](), list[Tensor]()
+    pieces = list[Gaussians]()
+    labels = list[Tensor]()
     with one_thread():  # hundreds of small tensor operations
         counts, shares = _budget(parts, size)
         for part, count, share in zip(parts, counts, shares, strict=True):
@@ -177,7 +180,8 @@ def assemble(
 
 def _budget(parts: Sequence[Part], size: int) -> tuple[list[int], list[float]]:
     """How many Gaussians each part gets, adding up to `size`, and the share of its surface that shows."""
-    wishes, shares = [], []
+    wishes = []
+    shares = []
     for part in parts:
         probes = sample(part, _PROBES)
         share = float(_is_outside(parts, part, probes).float().mean())
@@ -249,8 +253,10 @@ def _place_gaussians(
     at: Samples, coat: SurfacePaint, stands: Tensor, random: torch.Generator
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Flat Gaussians on the surface, hairs and blades standing out of it. -> means, quats, log_scales"""
-    n, pelt = len(at), coat.pelt
-    h, up = at.spacing[:, None], stands[:, None]
+    n = len(at)
+    pelt = coat.pelt
+    h = at.spacing[:, None]
+    up = stands[:, None]
     flow = torch.zeros(n, 3) if coat.flow is None else coat.flow
     flow = flow + max(pelt.unruly, 1e-3) * torch.randn(n, 3, generator=random)
     along = flow - (flow * at.normals).sum(1, keepdim=True) * at.normals

@@ -80,10 +80,12 @@ def _wool(part: Part, at: Samples, table: Tensor) -> SurfacePaint:
     p = at.points
     if part.name == "scarf":
         along = torch.atan2(at.local[:, 0], at.local[:, 2]) / (2 * math.pi)
-        turns, ribs = 13 * along, 150 * along
+        turns = 13 * along
+        ribs = 150 * along
     else:
         along = at.local[:, 1] * torch.linalg.svdvals(part.matrix)[0]
-        turns, ribs = along / (0.30 if part.name == "knot" else 0.135), along / 0.0145
+        turns = along / (0.30 if part.name == "knot" else 0.135)
+        ribs = along / 0.0145
     red = stripe_profile(turns, width=0.52, softness=0.05)
     color = mix(mix_colors("#e9dfcc", "#fffaf0", 0.6 + 0.4 * noise(p, table, 25.0)), flat("#c8102e", p), red)
     knit = (ribs * 2 * math.pi).sin() * smoothstep(0.013 - at.spacing, 0.0, 0.006)
@@ -137,10 +139,14 @@ def rotation_matrix(degrees: Triple) -> Tensor:
     """Rotation about x, then y, then z, in degrees. [3,3]"""
     matrix = torch.eye(3)
     for axis, angle in enumerate(degrees):
-        c, s = math.cos(math.radians(angle)), math.sin(math.radians(angle))
+        c = math.cos(math.radians(angle))
+        s = math.sin(math.radians(angle))
         one = torch.eye(3)
         i, j = [(1, 2), (2, 0), (0, 1)][axis]
-        one[i, i], one[j, j], one[i, j], one[j, i] = c, c, -s, s
+        one[i, i] = c
+        one[j, j] = c
+        one[i, j] = -s
+        one[j, i] = s
         matrix = one @ matrix
     return matrix
 
@@ -262,7 +268,8 @@ def bear_parts() -> list[Part]:
     ]
 
 
-_CREAM, _CHARCOAL = "#ece6dc", "#3a3638"
+_CREAM = "#ece6dc"
+_CHARCOAL = "#3a3638"
 _DARK = 0.36  # fur is brighter; nose and mouth are not
 
 # Where in space, how wide and tall in world units, and how far it leans, in radians.
@@ -309,7 +316,8 @@ def _ellipse(
     rows, columns = torch.meshgrid(
         torch.arange(camera.height) + 0.5, torch.arange(camera.width) + 0.5, indexing="ij"
     )
-    right, down = (columns - at[0]) * depth / camera.K[0, 0], (rows - at[1]) * depth / camera.K[1, 1]
+    right = (columns - at[0]) * depth / camera.K[0, 0]
+    down = (rows - at[1]) * depth / camera.K[1, 1]
     along = (right * math.cos(turn) + down * math.sin(turn)) / radii[0]
     across = (down * math.cos(turn) - right * math.sin(turn)) / radii[1]
     return ((1 - torch.hypot(along, across)) / 0.12 + 0.5).clamp(0, 1)

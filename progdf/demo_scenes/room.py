@@ -38,7 +38,8 @@ def _planks(part: Part, at: Samples, table: Tensor) -> SurfacePaint:
     tone = noise(board + 0.5, table, 1.7)
     grain = noise(p * torch.tensor([1.0, 1.0, 0.07]) + 0.3 * board, table, 26.0, 2)
     color = mix_colors("#7c4e2a", "#cf9a5f", 0.5 + 0.35 * tone + 0.35 * grain)
-    side, end = _edge(p[:, 0] / 0.22) * 0.22, _edge(along) * 1.3
+    side = _edge(p[:, 0] / 0.22) * 0.22
+    end = _edge(along) * 1.3
     gap = 1 - smoothstep(side, 0.002, 0.008) * smoothstep(end, 0.002, 0.008)
     return SurfacePaint(mix(color, flat("#3a2314", p), 0.8 * gap), bumps(p, table, 6.0, 0.05), gloss=0.06)
 
@@ -60,7 +61,8 @@ def _ceiling(part: Part, at: Samples, table: Tensor) -> SurfacePaint:
 
 
 def _window(part: Part, at: Samples, table: Tensor) -> SurfacePaint:
-    up, across = at.local[:, 0], at.local[:, 2]
+    up = at.local[:, 0]
+    across = at.local[:, 2]
     clouds = smoothstep(noise(at.points, table, 3.5, 3), -0.05, 0.45)
     sky = mix(mix_colors("#cfe4f7", "#6da7e0", 0.5 + 0.5 * up), flat("#ffffff", at.points), clouds)
     hills = smoothstep(-0.45 + 0.22 * noise(at.points, table, 2.2, 2) - up, -0.03, 0.03)
@@ -73,7 +75,9 @@ def _window(part: Part, at: Samples, table: Tensor) -> SurfacePaint:
 
 
 def _picture(part: Part, at: Samples, table: Tensor) -> SurfacePaint:
-    p, x, y = at.points, at.local[:, 0], -at.local[:, 2]
+    p = at.points
+    x = at.local[:, 0]
+    y = -at.local[:, 2]
     sky = mix_colors("#f6a54a", "#4a5fae", 0.5 + 0.75 * y)
     sun = smoothstep(0.22 - torch.hypot((x - 0.3) * 1.38, y - 0.12), -0.02, 0.02)
     color = mix(sky, flat("#fff0b8", p), sun)
@@ -119,7 +123,8 @@ def _vase(part: Part, at: Samples, table: Tensor) -> SurfacePaint:
     color = mix_colors("#e9eef2", "#ffffff", 0.5 + 0.5 * noise(at.points, table, 6.0))
     angle = torch.atan2(at.local[:, 2], at.local[:, 0])
     wave = smoothstep(0.035 - (y - 0.17 - 0.025 * (6 * angle).sin()).abs(), -0.005, 0.005)
-    upper, lower = 0.008 - (y - 0.25).abs(), 0.012 - (y - 0.05).abs()
+    upper = 0.008 - (y - 0.25).abs()
+    lower = 0.012 - (y - 0.05).abs()
     bands = smoothstep(upper, -0.003, 0.003) + smoothstep(lower, -0.003, 0.003)
     return SurfacePaint(
         mix(color, flat("#1d4e9e", at.points), torch.maximum(wave, bands)), 0 * at.points, gloss=0.14
@@ -193,7 +198,8 @@ LABELS = ("floor", "walls", "ceiling", "rug", "table", "vase", "lamp", "stool", 
 SMALLEST_ROOM = 1000
 """Fewer Gaussians than this are no room."""
 
-_HALF, _HEIGHT = 2.0, 2.5
+_HALF = 2.0
+_HEIGHT = 2.5
 _WINDOW = ((1.45, 0.72), (0.75, 0.62))  # middle and half size along y and along z, in the wall at −x
 
 
@@ -225,7 +231,9 @@ def room_parts() -> list[Part]:
 def _shell() -> list[Part]:
     """Floor, ceiling and walls, and what hangs on them and lies there."""
     (window_y, window_z), (tall, wide) = _WINDOW
-    x, y, z = (_HALF, 0.0, 0.0), (0.0, _HEIGHT / 2, 0.0), (0.0, 0.0, _HALF)
+    x = (_HALF, 0.0, 0.0)
+    y = (0.0, _HEIGHT / 2, 0.0)
+    z = (0.0, 0.0, _HALF)
     pane = (-_HALF + 0.015, window_y, window_z)
     return [
         _flat("floor", "floor", (0, 0, 0), x, z, (0, 1, 0), 0.8),

@@ -87,7 +87,8 @@ def lathe(radii: Sequence[float], heights: Sequence[float]) -> Shape:
     curve = torch.lerp(outline[index], outline[index + 1], ((places - at[index]) / lengths[index])[:, None])
     rising, radius = torch.tensor(heights).flip(0), torch.tensor(radii).flip(0)
 
-    middle, half = (heights[0] + heights[-1]) / 2, (heights[0] - heights[-1]) / 2
+    middle = (heights[0] + heights[-1]) / 2
+    half = (heights[0] - heights[-1]) / 2
 
     def width(local: Tensor) -> Tensor:
         above = torch.searchsorted(rising, local[:, 1].contiguous()).clamp(1, len(rising) - 1)
@@ -234,8 +235,10 @@ def _sample_panel(part: Part, count: int) -> Samples:
 
 def _area_element(matrix: Tensor, spot: Tensor, step: Tensor, angle: Tensor) -> Tensor:
     """World area of a profile step turned by one radian about y. [...,2], [...,2], [...] -> [...]"""
-    cos, sin = angle.cos(), angle.sin()
-    across, radius = step[..., 0], spot[..., 0]
+    cos = angle.cos()
+    sin = angle.sin()
+    across = step[..., 0]
+    radius = spot[..., 0]
     along = torch.stack([across * cos, step[..., 1] + 0 * cos, across * sin], dim=-1) @ matrix.T
     around = torch.stack([-radius * sin, 0 * radius * sin, radius * cos], dim=-1) @ matrix.T
     area: Tensor = torch.linalg.cross(along, around).norm(dim=-1)

@@ -24,7 +24,8 @@ from .separable import fit_amplitude, fit_separable, moving_attributes, principa
 TOLERANCE = 0.01
 """Root mean square error of the factoring, as a share of the trajectory's own root mean square."""
 
-_PER_BIN, _FEW_PER_BIN = 4, 2
+_PER_BIN = 4
+_FEW_PER_BIN = 2
 _LARGE = 100_000  # numbers in a network beyond which fewer nodes are asked for, as loading waits for them
 _JUMP = 1e-5  # width of the edge between two hard bins
 
@@ -35,7 +36,8 @@ def bake_form(form: NeuralForm, rows: Tensor) -> BakedField:
     Raises:
         ValueError: not as many Gaussians, or a number of the network is not usable.
     """
-    network, plan = form.network, form.plan
+    network = form.network
+    plan = form.plan
     trajectory = pinned_trajectory(network.bind(rows), full_end(network), plan)
     baked = fit_separable(plan.knots, trajectory, plan.ranks, recorded=network.recorded)
     return replace(baked, kind="neural", origin=form)
@@ -71,7 +73,8 @@ def bake_network(
         render: of some views; None leaves the error in decibels out
         tolerance: see `TOLERANCE`
     """
-    field, end = network.bind(rows), full_end(network)
+    field = network.bind(rows)
+    end = full_end(network)
     large = network.parameters - network.codes.numel() > _LARGE
     nodes = bake_nodes(network.shape.bins, network.shape.hard, _FEW_PER_BIN if large else _PER_BIN)
     plan = BakePlan(nodes, {}, _end_corrections(field, end, nodes, truth))
@@ -150,7 +153,8 @@ def _end_corrections(
                 truth(float(s))[:, columns] - a[:, columns] for s, a in zip(nodes, offsets, strict=True)
             ]
             share = torch.tensor([float((e.double() * least).sum()) / power for e in errors])
-        share[0], share[-1] = 0.0, 1.0
+        share[0] = 0.0
+        share[-1] = 1.0
         corrections[name] = share.float()
     return corrections
 

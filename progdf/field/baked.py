@@ -38,7 +38,8 @@ def find_segment(knots: Tensor, x: float) -> Segment:
     """
     places = knots.numpy()  # for one place a tenth of the time that torch takes
     right = min(max(int(places.searchsorted(places.dtype.type(x))), 1), len(places) - 1)
-    low, high = float(places[right - 1]), float(places[right])
+    low = float(places[right - 1])
+    high = float(places[right])
     return Segment(right, (x - low) / (high - low))
 
 
@@ -60,7 +61,8 @@ BASIS_TYPES = (torch.int8, torch.float16, torch.float32)
 END_TYPES = (torch.int8, torch.int16, torch.float32)
 """How basis 0 may be stored, from the smallest."""
 
-MOST_KNOTS, MOST_RANK = 257, 16
+MOST_KNOTS = 257
+MOST_RANK = 16
 """Of a network that is baked."""
 
 _NEAR = 1 / 80
@@ -230,7 +232,8 @@ class GradeForm:
     def __post_init__(self) -> None:
         if self.degree not in (LATTICE, *MONOMIALS) or self.table.ndim != 3:
             raise ValueError(f"a grade of degree {self.degree}, expected 0 to 3")
-        knots, numbers = len(self.knots), MONOMIALS.get(self.degree, self.table.shape[1])
+        knots = len(self.knots)
+        numbers = MONOMIALS.get(self.degree, self.table.shape[1])
         check_tensor("residual", self.residual, (None, None, None), torch.int8)
         ranks, members, channels = self.residual.shape
         check_tensor("table", self.table, (knots, numbers, 3), torch.float32)
@@ -261,7 +264,8 @@ class GradeForm:
     @property
     def label(self) -> str:
         """What it is, as in "grade of degree 2, a mask, 2 bases of DC"."""
-        bases, parts = len(self.residual), {12: "two bands", 27: "three bands"}
+        bases = len(self.residual)
+        parts = {12: "two bands", 27: "three bands"}
         of = parts.get(self.residual.shape[2], "DC")
         beside = f"{bases} bas{'is' if bases == 1 else 'es'} of {of}" if bases else "no residual"
         beside = beside if self.mask is None else f"a mask, {beside}"
@@ -362,7 +366,8 @@ class BakedField:
     def attribute_offsets(self, name: str, s: float) -> Tensor:
         """Raw offsets of one attribute at strength `s`; exactly 0 at 0, `end` at 1. [M,c] float32"""
         bases = self.attributes[name]
-        weights, factors = self.coefficients(name, s).tolist(), self.factors(name, s)
+        weights = self.coefficients(name, s).tolist()
+        factors = self.factors(name, s)
         if not any(weights):
             return torch.zeros(bases.end_offset.shape)
         total = factors[0] * bases.end_offset.float()

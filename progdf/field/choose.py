@@ -254,7 +254,8 @@ def store_ends(offsets: Tensor, evaluator: FieldEvaluator) -> Ends:
     """Each attribute's end in integers: all in the smallest, then the one that shows most per byte in larger
     ones, until what they decode to serves. [T,M,C]
     """
-    moving, end = moving_attributes(offsets), offsets[-1]
+    moving = moving_attributes(offsets)
+    end = offsets[-1]
     kinds = {
         name: [quantize_bases(end[None, :, columns], kind) for kind in END_TYPES[:-1]]
         for name, columns in moving.items()
@@ -291,7 +292,8 @@ def _grow_fields(seen: RenderedTrajectories, strengths: Tensor, evaluator: Field
             tried[i] = _separable(seen, strengths, path[i], evaluator)
         return tried[i].excess <= 1.0
 
-    reach, last = 0, len(path) - 1
+    reach = 0
+    last = len(path) - 1
     while not serves(reach) and reach < last:
         reach = min(2 * reach + 1, last)
     bisect_left(range(reach), True, lo=reach // 2, key=serves)
@@ -306,7 +308,8 @@ def _separable(
     Pictures are the better guide but for parts that move far, where straightening an attribute changes more
     than a sum of effects can say.
     """
-    candidates, ticks = [], tuple(strengths.tolist())
+    candidates = []
+    ticks = tuple(strengths.tolist())
     for modes in (seen.modes, {n: principal_modes(c.gram) for n, c in seen.trajectories.items()}):
         attributes = {
             name: store_attribute(trajectory, modes[name][:, : ranks[name]])
@@ -376,7 +379,8 @@ def render_trajectories(
         render: called (1 + A)·(T − 2) times at most, where T counts no more than `MOST_SNAPSHOTS`
         ends: as they are stored; the last row of the offsets becomes what they decode to
     """
-    attributes, ends = moving_attributes(offsets), ends or {}
+    attributes = moving_attributes(offsets)
+    ends = ends or {}
     if ends:
         offsets = offsets.clone()
         for name, stored in ends.items():
@@ -415,5 +419,6 @@ def _interpolation_weights(looked: Sequence[int], snapshots: int) -> Tensor:
     for column, (a, b) in enumerate(pairwise(looked)):
         inner = torch.arange(a + 1, b)
         share = (inner - a).double() / (b - a)
-        shares[inner, column], shares[inner, column + 1] = 1.0 - share, share
+        shares[inner, column] = 1.0 - share
+        shares[inner, column + 1] = share
     return shares

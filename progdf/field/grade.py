@@ -68,7 +68,8 @@ def monomials(colors: Tensor, degree: int) -> Tensor:
 def sphere(degree: int, device: torch.device) -> tuple[Tensor, Tensor]:
     """Values of the bands in even directions of the sphere, and their least squares. [D,B], [B,D] float32"""
     index = torch.arange(_DIRECTIONS, dtype=torch.float64) + 0.5
-    z, angle = 1 - 2 * index / _DIRECTIONS, math.pi * (1 + math.sqrt(5)) * index
+    z = 1 - 2 * index / _DIRECTIONS
+    angle = math.pi * (1 + math.sqrt(5)) * index
     radius = (1 - z * z).sqrt()
     values = basis(degree, torch.stack([radius * angle.cos(), radius * angle.sin(), z], dim=1))
     return values.float().to(device), torch.linalg.pinv(values).float().to(device)
@@ -124,7 +125,8 @@ def _map_chunk(sh: Tensor, table: Tensor, degree: int) -> Tensor:
     mapped = map_drawn(colors, table, degree)
     made = sh + (mapped - colors.clamp_min(0.0)) @ inverse.T
     clamped = (colors.amin(dim=2) < 0.0) | (mapped.amin(dim=2) < 0.0)
-    some, target = made[clamped], mapped[clamped]
+    some = made[clamped]
+    target = mapped[clamped]
     now = some @ values.T + 0.5
     made[clamped] += (target - now).masked_fill_((target <= 0.0) & (now <= 0.0), 0.0) @ inverse.T
     return made
@@ -142,7 +144,8 @@ def band_offsets(change: Tensor, channels: int) -> Tensor:
 
 def mapped_bands(form: GradeForm, rows: Tensor) -> Tensor:
     """What the map adds to the members' bands at each knot. [M,14+3K] -> [S,M,3B]"""
-    sh, share = member_bands(rows), form.share[:, None]
+    sh = member_bands(rows)
+    share = form.share[:, None]
     changes = [share * (map_colors(sh, at_knot, form.degree) - sh).flatten(1) for at_knot in form.table]
     return torch.stack(changes)
 
@@ -204,7 +207,8 @@ def map_share(field: BakedField) -> Tensor:
 
     Where the residual undoes the map, as between stripes, or does as much again, it is 0.
     """
-    form, moved = field.origin, field.attributes
+    form = field.origin
+    moved = field.attributes
     ends = [moved[name].end for name in ("sh0", "shN") if name in moved]
     if not isinstance(form, GradeForm) or not len(form.residual) or not ends:
         return torch.ones(field.members)

@@ -83,7 +83,8 @@ class NeuralShape:
     @property
     def outputs(self) -> dict[str, slice]:
         """Where each attribute lies in the network's output."""
-        outputs, start = {}, 0
+        outputs = {}
+        start = 0
         for name in self.attributes:
             width = attribute_slices(self.channels)[name]
             outputs[name] = slice(start, start + width.stop - width.start)
@@ -172,7 +173,8 @@ class BoundField:
     def __init__(
         self, field: NeuralField, weights: Mapping[str, Tensor], codes: Tensor, rows: Tensor
     ) -> None:
-        self.shape, self.end = field.shape, field.end
+        self.shape = field.shape
+        self.end = field.end
         self.attributes = field.shape.attributes
         self._weights = weights
         with torch.no_grad():

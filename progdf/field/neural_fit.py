@@ -183,7 +183,8 @@ class NeuralFit:
         right = torch.randint(1, len(strengths), rows.shape, generator=self._draws)
         share = torch.rand(rows.shape, generator=self._draws)
         s = torch.lerp(strengths[right - 1], strengths[right], share)
-        low, high = offsets[right - 1, rows].float(), offsets[right, rows].float()
+        low = offsets[right - 1, rows].float()
+        high = offsets[right, rows].float()
         recorded = torch.lerp(low, high, share[:, None])
         errors = (self._answer(rows, s) - recorded[:, self.shape.columns]) / self._frame["spread"]
         return (self._shown[rows, None] * self._importance * errors.square()).sum(dim=1).mean()
@@ -265,7 +266,8 @@ def _place_frame(shape: NeuralShape, rows: Tensor) -> dict[str, Tensor]:
     frame = {name: torch.zeros(size) for name, size in shape.frame().items()}
     extent = torch.tensor(1.0)
     if len(rows):
-        low, high = rows[:, :3].amin(dim=0), rows[:, :3].amax(dim=0)
+        low = rows[:, :3].amin(dim=0)
+        high = rows[:, :3].amax(dim=0)
         frame["center"] = (low + high) / 2
         extent = (high - low).amax() / 2
     frame["extent"] = extent if float(extent) > 1e-12 else torch.tensor(1.0)

@@ -104,7 +104,8 @@ def fit_amplitude(
     amplitude = torch.linspace(0, 1, len(offsets)).double()
     if power > 0:
         amplitude = ((offsets * root).flatten(1) @ end).double() / power
-    amplitude[0], amplitude[-1] = 0.0, 1.0
+    amplitude[0] = 0.0
+    amplitude[-1] = 1.0
     trajectory = AttributeTrajectory(offsets, weights, amplitude.float(), torch.zeros(0), stored)
     rows = trajectory.residual.mul_(root).flatten(1)
     return replace(trajectory, gram=(rows @ rows.T).double())
@@ -122,7 +123,8 @@ def principal_modes(gram: Tensor) -> Tensor:
     """
     # T is small: the T×T Gram matrix holds all there is to know of the left singular vectors
     values, vectors = torch.linalg.eigh(gram)
-    values, vectors = values.flip(0), vectors.flip(1)
+    values = values.flip(0)
+    vectors = vectors.flip(1)
     rank = int((values > 1e-9 * values[0]).sum()) if float(values[0]) > 0 else 0
     modes: Tensor = vectors[:, : min(rank, max(len(gram) - 2, 0))]
     return modes
@@ -314,7 +316,8 @@ def fit_keyframes(
         raise ValueError(f"{count} keyframes, expected at least 2")
     rows = keyframe_rows(strengths, count)
     table = torch.eye(len(rows))[:, [-1, *range(1, len(rows) - 1)]]
-    attributes, kept = {}, offsets[rows[1:-1]]
+    attributes = {}
+    kept = offsets[rows[1:-1]]
     inner = kept.half() if torch.equal(kept.half().float(), kept) else kept
     for name, columns in moving_attributes(offsets).items():
         full = offsets[-1, :, columns].contiguous()

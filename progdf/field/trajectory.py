@@ -133,8 +133,10 @@ def _unpack(tensors: dict[str, Tensor]) -> Trajectory:
         name: tensors.pop(f"added.{name}") for name in ATTRIBUTES if f"added.{name}" in tensors
     }
     s, offsets, end, steps = (tensors.pop(name) for name in ("s", "offsets", "end", "steps"))
-    ends, strengths = tensors.pop("stage_ends"), tensors.pop("strengths")
-    maps, mask = tensors.pop("maps", None), tensors.pop("mask", None)
+    ends = tensors.pop("stage_ends")
+    strengths = tensors.pop("strengths")
+    maps = tensors.pop("maps", None)
+    mask = tensors.pop("mask", None)
     bands = int(tensors.pop("bands", torch.tensor(0)))
     check_tensor("s", s, (None,), torch.float32)
     check_ascent("s", s)

@@ -23,7 +23,8 @@ from progdf.terminal import file_size
 START_BYTES = 512
 """Bytes of a file's start by which it is recognized."""
 
-ZIP, GZIP = b"PK\x03\x04", b"\x1f\x8b"
+ZIP = b"PK\x03\x04"
+GZIP = b"\x1f\x8b"
 _EMPTY_ZIP = b"PK\x05\x06"
 _ENDINGS = (".ply", ".spz", ".splat", ".ksplat", ".sog", ".glb", ".ckpt", ".pt", ".pth")
 _SESSION_ENDING = ".session.json"

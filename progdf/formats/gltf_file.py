@@ -196,7 +196,8 @@ class GltfFile:
         self._decoded_bytes = 0
         self._files: dict[Path, memoryview] = {}
         self._buffers: dict[int, memoryview] = {}
-        text, self._binary = content, None
+        text = content
+        self._binary = None
         if content[:4] == MAGIC:
             text, self._binary = _split_chunks(path, content)
         elif path.suffix.lower() == ".glb":

@@ -228,7 +228,8 @@ def save_ply_checked(path: str | os.PathLike[str], scene: Gaussians) -> None:
         save_ply(temporary_file, scene)
         read = load_ply(temporary_file)
         for name in ATTRIBUTES:
-            written, loaded = getattr(scene, name), getattr(read, name)
+            written = getattr(scene, name)
+            loaded = getattr(read, name)
             if name == "means" and (scene.origin, read.origin) != (ZERO, ZERO):
                 # what moved may have moved the origin, about which each is rounded
                 off = (read.world_means - scene.world_means).abs()

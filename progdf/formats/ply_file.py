@@ -96,7 +96,8 @@ class PlyFile:
         return [rows[name] for name in names], 0 if lists_follow else after
 
     def _check_lists(self, element: PlyElement, is_needed: bool) -> None:
-        name, lists = element.name, _has_lists(element)
+        name = element.name
+        lists = _has_lists(element)
         if lists and is_needed:
             feature = f"a list among its {name} properties"
             raise unsupported_error(self.path, feature, "export it as a plain 3DGS .ply")
@@ -154,7 +155,8 @@ def read_header(path: str | os.PathLike[str]) -> PlyFile:
     check_regular(path)
     try:
         with Path(path).open("rb") as file:
-            start, size = file.read(_MAX_HEADER_BYTES), os.fstat(file.fileno()).st_size
+            start = file.read(_MAX_HEADER_BYTES)
+            size = os.fstat(file.fileno()).st_size
     except OSError as error:
         raise open_error(path, error) from None
     if start[:32].split(b"\n")[0].strip() != b"ply":
@@ -191,7 +193,8 @@ def _check_counts(ply: PlyFile) -> None:
     remaining = ply.size - ply.length
     for element in ply.layout:
         # an ascii value takes at least a digit and a separator; the file's last separator may be missing
-        text, count = ply.layout.text, ply.counts[element.name]
+        text = ply.layout.text
+        count = ply.counts[element.name]
         least = 2 * len(element.properties) if text else _row_bytes(element)
         if count * least > remaining + text:
             what = "Gaussians" if element.name == "vertex" else f"rows of '{element.name}'"

@@ -76,9 +76,13 @@ CHECKPOINT = "checkpoint of a training"
 _SPZ_MAX = 2**23 - 1  # of a position in steps of 2^-bits
 _SPZ_VERSIONS = (1, 2, 3, 4)
 _SPZ_LAST_GZIP = b"\3"  # the last version that is gzip data
-_SPZ_ANTIALIASED, _SPZ_EXTENDED = 1, 2  # flags
+# flags
+_SPZ_ANTIALIASED = 1
+_SPZ_EXTENDED = 2
 _SPZ_MAX_DEGREE = 4
-_MEMORY, _OUTPUT, SECONDS = (1 << 30, 64), (64 << 20, 64), (60, 2e-6)
+_MEMORY = (1 << 30, 64)
+_OUTPUT = (64 << 20, 64)
+SECONDS = (60, 2e-6)
 """Limits of the process that reads a foreign file: a base, and more for each byte of the file."""
 _PATIENCE = 30
 """Times as long for writing our own scenes: clustering the bands of a million for an .sog takes minutes."""
@@ -233,10 +237,13 @@ def _load_parts(path: Path, parts: Sequence[Path]) -> tuple[Gaussians, LoadRepor
     for part in parts:
         if is_checkpoint:
             checkpoint = read_checkpoint(part)
-            scene, step, names = checkpoint.scene, checkpoint.step, checkpoint.ignored
+            scene = checkpoint.scene
+            step = checkpoint.step
+            names = checkpoint.ignored
         else:
             scene, stored = read_ply(read_header(part))
-            step, names = None, stored["ignored_properties"]
+            step = None
+            names = stored["ignored_properties"]
         scenes.append(scene)
         traits.append((step, scene.sh_degree, scene.antialiased))
         ignored |= dict.fromkeys(names)
@@ -314,7 +321,8 @@ def _read_spz_part(path: Path, content: bytes) -> Gaussians:
 
 def _convert(source: Path, kind: str, target: Path, to: str) -> str:
     """Convert a scene file with gaussforge; return the reason for a failure, or an empty text."""
-    size, patience = scene_bytes(source), 1 if to == "ply" else _PATIENCE
+    size = scene_bytes(source)
+    patience = 1 if to == "ply" else _PATIENCE
     memory, output, seconds = (int(base + each * size) for base, each in (_MEMORY, _OUTPUT, SECONDS))
     words = "convert", kind, str(source.resolve()), to, str(target)
     try:
@@ -395,7 +403,8 @@ def _write_with_gaussforge(path: Path, written: Path, scene: Gaussians, kind: st
         scene = rotate_about_x(scene)
     means = (scene.world_means * 2.0 ** (bits - SPZ_BITS)).float()
     with tempfile.TemporaryDirectory(prefix="progdf-") as folder:
-        source, target = Path(folder) / "scene.ply", Path(folder) / f"scene.{kind}"
+        source = Path(folder) / "scene.ply"
+        target = Path(folder) / f"scene.{kind}"
         save_ply(source, replace(scene, means=means, origin=ZERO))
         if reason := _convert(source, "ply", target, kind):
             raise ProgdfError(f"{path} was not written: the writer of .{kind} {reason}; write a .ply")
@@ -549,7 +558,8 @@ def _check_spz(path: Path) -> tuple[int, int]:
     header = start if start[:4] == b"NGSP" else inflate_start(start, 16)
     if header[:4] != b"NGSP" or len(header) < 16:
         raise damage_error(path, "an .spz begins with 'NGSP', plain or as gzip data, and this file does not")
-    version, degree = int.from_bytes(header[4:8], "little"), header[12]
+    version = int.from_bytes(header[4:8], "little")
+    degree = header[12]
     remedy = "export it as .ply, or as .spz version 3"
     if version not in _SPZ_VERSIONS:
         raise unsupported_error(path, f".spz version {version}", remedy)

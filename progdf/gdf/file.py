@@ -187,7 +187,8 @@ def load_gdf(
             no scene is given.
     """
     check_first_argument("load_gdf(path, scene)", path, (str, os.PathLike))
-    gdf, name = read_gdf(path), Path(path).name
+    gdf = read_gdf(path)
+    name = Path(path).name
     if scene is not None:
         region = place(gdf)
         if region is not None or gdf.scene == ANY_SCENE:
@@ -247,7 +248,8 @@ def read_gdf(path: str | os.PathLike[str]) -> Gdf:
     name = Path(path).name
     if Path(path).suffix.lower() == CUBE:
         nobody = Region("any", torch.zeros(0, dtype=torch.int64), torch.zeros(0))
-        ends, form = torch.tensor([0.0, 1.0]), lattice_form(read_cube(path))
+        ends = torch.tensor([0.0, 1.0])
+        form = lattice_form(read_cube(path))
         field = BakedField("grade", ends, {}, BASE_CHANNELS, origin=form)
         return Gdf(Path(path).stem, nobody, field, ANY_SCENE, name)
     head, tensors = header.unpack_file(read_file(path), name)

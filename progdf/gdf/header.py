@@ -125,7 +125,8 @@ def unpack_file(content: bytes, name: str) -> tuple[GdfHeader, dict[str, Tensor]
     damage = ProgdfError(f"{name} is damaged (checksum mismatch); copy it again or make it again")
     try:
         value = decode_json(text)
-        sha256, version = convert_json(value["sha256"], str), convert_json(value["format"], int)
+        sha256 = convert_json(value["sha256"], str)
+        version = convert_json(value["format"], int)
         intact = checksum(text.replace(sha256, ""), tensors) == sha256 and version >= _OLDEST
     except (ValueError, KeyError, TypeError, RuntimeError):
         raise damage from None
@@ -178,7 +179,8 @@ def pack_field(field: BakedField) -> tuple[FieldHeader, dict[str, Tensor]]:
         tensors |= {name + _PACKED: levels for name, levels in form.packed_levels.items()}
         tensors["remap"] = torch.stack([form.remap.old, form.remap.new])
         return msgspec.structs.replace(header, attributes=[], grade=form.degree), tensors
-    network, plan = form.network, form.plan
+    network = form.network
+    plan = form.plan
     tensors = {_NETWORK + name: tensor for name, tensor in network.tensors.items()}
     tensors |= {"knots": plan.knots, "end": network.end}
     tensors |= {_END_CORRECTION + name: share for name, share in plan.end_correction.items()}
@@ -220,7 +222,8 @@ def unpack_field(header: FieldHeader, tensors: Mapping[str, Tensor], members: in
             for name in header.attributes
         }
         return BakedField(header.kind, tensors["knots"], attributes, header.channels, recorded)
-    shape, end = header.network.shape, tensors["end"]
+    shape = header.network.shape
+    end = tensors["end"]
     if shape.channels != header.channels:
         raise ValueError(f"the network has {shape.channels} channels, the field {header.channels}")
     network = NeuralField(

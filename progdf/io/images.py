@@ -20,7 +20,9 @@ from progdf.errors import ProgdfError
 
 from .atomic import atomic_write, check_regular, make_folder
 
-_PAPER, _INK, _PALE_INK = (250, 249, 246), (38, 36, 34), (118, 113, 107)
+_PAPER = (250, 249, 246)
+_INK = (38, 36, 34)
+_PALE_INK = (118, 113, 107)
 _Font = ImageFont.FreeTypeFont | ImageFont.ImageFont
 
 FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "GIF")
@@ -44,7 +46,10 @@ _TURNS = {
 _BYTES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX", "RGBa", "CMYK", "YCbCr", "HSV")
 """Pillow's modes of 8 bits a channel, or less."""
 
-_BITS, _INTERPRETATION, _WHITE_IS_ZERO = 258, 262, 0  # tags of TIFF
+# tags of TIFF
+_BITS = 258
+_INTERPRETATION = 262
+_WHITE_IS_ZERO = 0
 
 
 def open_picture(
@@ -99,7 +104,8 @@ def _upright_size(picture: Image.Image, orientation: int) -> tuple[int, int]:
     """Width and height once it is upright."""
     # Pillow's own size of a .tiff is that of one version as stored, of another upright
     tags = getattr(picture, "tag_v2", {})
-    width, height = int(tags.get(256, picture.width)), int(tags.get(257, picture.height))
+    width = int(tags.get(256, picture.width))
+    height = int(tags.get(257, picture.height))
     return (height, width) if orientation >= 5 else (width, height)
 
 
@@ -137,7 +143,8 @@ def _to_bytes(path: str | os.PathLike[str], picture: Image.Image, two_values: bo
         if picture.mode in ("I", "F"):
             kind = "32-bit or floating-point numbers, which have no white"
         raise ProgdfError(f"{path} holds {kind}; save it in gray or RGB with 8 or 16 bits per channel")
-    stored, tags = np.asarray(picture), getattr(picture, "tag_v2", {})
+    stored = np.asarray(picture)
+    tags = getattr(picture, "tag_v2", {})
     shades = np.arange(1 << 16) / ((1 << tags.get(_BITS, (16,))[0]) - 1)
     if tags.get(_INTERPRETATION) == _WHITE_IS_ZERO:
         shades = 1.0 - shades
@@ -237,7 +244,9 @@ def read_picture(path: Path, size: tuple[int, int] | None = None, calibrated: bo
 
 
 _OPAQUE = 128  # of 255
-_BLACK, _WHITE = 26, 229  # of 255: within a tenth of black and of white
+# of 255: within a tenth of black and of white
+_BLACK = 26
+_WHITE = 229
 _DRAWN_SHARE = 0.001  # of the opaque pixels: fewer black or white ones are no drawing
 _LABEL_BRIGHTNESS = 32  # of 255: the hue of darker pixels is noise
 _MAX_LABEL_COLORS = 256  # a picture with more colors is no map of labels
@@ -347,8 +356,10 @@ def contact_sheet(
             f"{len(column_labels)} column labels for {columns} columns"
         )
     text = max(12, round(height / 18))
-    gap, font = max(4, round(text / 3)), _font(text)
-    large, small = _font(round(1.4 * text)), _font(max(11, round(0.85 * text)))
+    gap = max(4, round(text / 3))
+    font = _font(text)
+    large = _font(round(1.4 * text))
+    small = _font(max(11, round(0.85 * text)))
     left = gap
     if row_labels:
         parts = [part for label in row_labels for part in enumerate(label.split("\n"))]

@@ -35,7 +35,8 @@ def part_files(path: Path) -> list[Path]:
     if match is None:
         _refuse_numbered_part(path)
         return [path]
-    head, tail = match["head"], match["tail"]
+    head = match["head"]
+    tail = match["tail"]
     ranks = _numbers_between(path.parent, head, tail) | {int(match["part"])}
     declared = match.groupdict().get("count")
     count = int(declared) if declared else max(ranks) + 1

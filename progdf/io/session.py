@@ -157,7 +157,8 @@ def verify_files(path: Path, session: SessionFile) -> tuple[Path, tuple[Path, ..
     files = []
     for ref in (session.scene, *session.edits):
         folder = path.resolve().parent
-        file, beside = ref.path(folder), folder / PureWindowsPath(ref.file).name
+        file = ref.path(folder)
+        beside = folder / PureWindowsPath(ref.file).name
         if not os.path.isfile(file) and os.path.isfile(beside):
             file = beside
         if not os.path.isfile(file):  # pathlib's raises where a name is too long

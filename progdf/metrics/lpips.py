@@ -74,7 +74,9 @@ class Lpips:
             ProgdfError: the package is not installed, or its file is not the one expected.
         """
         layers = _read_weights(weights_file())
-        kernels, biases, importance = [], [], []
+        kernels = []
+        biases = []
+        importance = []
         try:
             for i, layer in enumerate(ALEXNET):
                 stored = layers[GROUP][f"Conv_{i}"]

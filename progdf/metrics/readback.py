@@ -78,7 +78,8 @@ def compare(
             f"{path} was not written: {len(read)} of {format_count(len(written))} come back from it; "
             "write a .ply"
         )
-    before, after = written.world_means, read.world_means
+    before = written.world_means
+    after = read.world_means
     rows = torch.arange(len(written))[:, None].expand(-1, 3)
     if not keeps_rows:
         before, rows = before.sort(dim=0)

@@ -39,7 +39,8 @@ def slider_statistics(
         masks: pixels to compare in each view; None compares all. [H,W] bool each
     """
     original = before = pictures(0.0)
-    distances, steps = [0.0], []
+    distances = [0.0]
+    steps = []
     for i in range(1, count + 1):
         now = pictures(i / count)
         distances.append(visible_change(original, now, masks))

@@ -114,7 +114,8 @@ class RasterView:
     @classmethod
     def of(cls, camera: Camera, gaussians: ActivatedGaussians, crop: Crop | None = None) -> RasterView:
         """What `camera` sees of `gaussians`; of its whole image where there is no crop."""
-        width, height = camera.width, camera.height
+        width = camera.width
+        height = camera.height
         viewmat, K = (matrix.to(gaussians.means.device) for matrix in (camera.viewmat, camera.K))
         return cls(
             viewmat, K, width, height, crop or (0, 0, width, height), camera.near, gaussians.sh_degree,
@@ -300,7 +301,8 @@ def check_intersections(splats: int, pairs: int) -> None:
 
 
 def _check_shapes(gaussians: ActivatedGaussians) -> None:
-    colors, n = gaussians.colors, gaussians.means.shape[0] if gaussians.means.ndim else 0
+    colors = gaussians.colors
+    n = gaussians.means.shape[0] if gaussians.means.ndim else 0
     expected = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,)}
     for name, shape in expected.items():
         tensor = getattr(gaussians, name)
@@ -351,6 +353,7 @@ def paint_depth(gaussians: Gaussians, camera: Camera) -> Gaussians:
 
 def depth_of(image: Tensor) -> Depth:
     """What a picture of a scene painted by `paint_depth` shows. [H,W,≥2]"""
-    weighted, alpha = image[..., 0], image[..., 1]
+    weighted = image[..., 0]
+    alpha = image[..., 1]
     drawn = alpha > 0
     return Depth(torch.where(drawn, weighted / torch.where(drawn, alpha, 1.0), 0.0), alpha)

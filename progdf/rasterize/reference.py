@@ -104,7 +104,8 @@ def blend(splats: ReferenceSplats, crop: Crop, background: Tensor) -> tuple[Tens
         image [h,w,3] and transmittance [h,w] of the window, of the splats' type
     """
     x0, y0, x1, y1 = crop
-    left, top = x0 // TILE * TILE, y0 // TILE * TILE
+    left = x0 // TILE * TILE
+    top = y0 // TILE * TILE
     bands = []
     for y in range(top, y1, TILE):
         tiles = []
@@ -120,7 +121,8 @@ def blend(splats: ReferenceSplats, crop: Crop, background: Tensor) -> tuple[Tens
 
 def project(gaussians: ActivatedGaussians, view: RasterView) -> tuple[ReferenceSplats, RasterInfo]:
     """Project, cull and sort."""
-    dtype, dilation = gaussians.means.dtype, view.dilation
+    dtype = gaussians.means.dtype
+    dilation = view.dilation
     sh_degree = view.sh_degree
     means, quats, scales, opacities, colors, viewmat, K = (
         tensor.double() for tensor in (*gaussians.tensors, view.viewmat, view.K)
@@ -130,13 +132,17 @@ def project(gaussians: ActivatedGaussians, view: RasterView) -> tuple[ReferenceS
     usable = usable & opacities.isfinite() & (opacities >= ALPHA_MIN)
     colored = used.isfinite().flatten(1).all(1)
     quats = torch.where(quats.isfinite().all(1, keepdim=True), quats, quats.new_tensor([1.0, 0.0, 0.0, 0.0]))
-    rotation, translation = viewmat[:3, :3], viewmat[:3, 3]
+    rotation = viewmat[:3, :3]
+    translation = viewmat[:3, 3]
     rows = usable.nonzero()[:, 0]
     points = means[rows] @ rotation.T + translation
     front = points[:, 2] > view.near
     rows = rows[front]
     x, y, z = points[front].unbind(1)
-    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    fx = K[0, 0]
+    fy = K[1, 1]
+    cx = K[0, 2]
+    cy = K[1, 2]
     means2d = torch.stack([fx * x / z + cx, fy * y / z + cy], dim=1)
 
     a, b, c, det0 = covariances(points[front], normalize_quats(quats[rows]), scales[rows], view)
@@ -150,7 +156,8 @@ def project(gaussians: ActivatedGaussians, view: RasterView) -> tuple[ReferenceS
 
     radius = (2.0 * torch.log(opacity.detach() / ALPHA_MIN).clamp_min(0.0)).sqrt()
     extents = radius[:, None] * torch.stack([a + dilation, c + dilation], dim=1).detach().sqrt()
-    low, high = (means2d - extents).detach(), (means2d + extents).detach()
+    low = (means2d - extents).detach()
+    high = (means2d + extents).detach()
     x0, y0, x1, y1 = view.crop
     inside = (high[:, 0] >= x0) & (low[:, 0] <= x1) & (high[:, 1] >= y0) & (low[:, 1] <= y1)
     inside = inside & (opacity.detach() >= ALPHA_MIN) & colored[rows]
@@ -184,7 +191,8 @@ def tile_weights(splats: ReferenceSplats, x: int, y: int) -> tuple[Tensor, Tenso
         alphas of the Gaussians that contribute, else 0 [256,n]; weights αT [256,n]; final transmittance
         [256]; the n rows of `splats` that may touch the tile, nearest first [n] int64
     """
-    low, high = splats.means2d - splats.extents, splats.means2d + splats.extents
+    low = splats.means2d - splats.extents
+    high = splats.means2d + splats.extents
     near_x = (high[:, 0] >= x) & (low[:, 0] <= x + TILE)
     near_y = (high[:, 1] >= y) & (low[:, 1] <= y + TILE)
     members = (near_x & near_y).nonzero()[:, 0]
@@ -203,7 +211,9 @@ def tile_weights(splats: ReferenceSplats, x: int, y: int) -> tuple[Tensor, Tenso
 
 def alpha_weights(gaussians: ActivatedGaussians, view: RasterView, mask: Tensor) -> Tensor:
     """See `progdf.rasterize.alpha_weights`."""
-    means, width, height = gaussians.means, view.width, view.height
+    means = gaussians.means
+    width = view.width
+    height = view.height
     splats, _ = project(gaussians, view)
     # two channels, zero beyond the image's edge: the mask, and what is image at all
     mask = mask.to(means)
@@ -230,18 +240,26 @@ def covariances(
     Args:
         points: centers, camera coordinates. [V,3]
     """
-    rotation, K = view.viewmat[:3, :3].double(), view.K.double()
-    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    rotation = view.viewmat[:3, :3].double()
+    K = view.K.double()
+    fx = K[0, 0]
+    fy = K[1, 1]
+    cx = K[0, 2]
+    cy = K[1, 2]
     x, y, z = points.unbind(1)
     # clamp as the original does (Kerbl 2023, computeCov2D): off-screen Gaussians would blow up the Jacobian
-    margin_x, margin_y = FRUSTUM_MARGIN * 0.5 * view.width / fx, FRUSTUM_MARGIN * 0.5 * view.height / fy
+    margin_x = FRUSTUM_MARGIN * 0.5 * view.width / fx
+    margin_y = FRUSTUM_MARGIN * 0.5 * view.height / fy
     tan_x = torch.clamp(x / z, -(cx / fx + margin_x), (view.width - cx) / fx + margin_x)
     tan_y = torch.clamp(y / z, -(cy / fy + margin_y), (view.height - cy) / fy + margin_y)
     axes = rotation_matrices(unit_quats) * scales[:, None, :]
     p0 = ((fx / z)[:, None] * (rotation[0] - tan_x[:, None] * rotation[2]))[:, None] @ axes
     p1 = ((fy / z)[:, None] * (rotation[1] - tan_y[:, None] * rotation[2]))[:, None] @ axes
-    p0, p1 = p0[:, 0], p1[:, 0]
-    a, b, c = (p0 * p0).sum(1), (p0 * p1).sum(1), (p1 * p1).sum(1)
+    p0 = p0[:, 0]
+    p1 = p1[:, 0]
+    a = (p0 * p0).sum(1)
+    b = (p0 * p1).sum(1)
+    c = (p1 * p1).sum(1)
     # ac − b² cancels for needles; the cross product does not
     det0 = torch.linalg.cross(p0, p1).square().sum(1)
     return a, b, c, det0

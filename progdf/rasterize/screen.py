@@ -40,7 +40,8 @@ def fill_screen(image: Array, screen: Array) -> None:
         if (height, width) == (rows, columns):
             _copy(cuts[chunk], cuts[chunk + 1], image, screen)
         else:
-            mixed, line = np.empty(3 * columns + 3, np.float32), np.ones(4 * width, np.float32)
+            mixed = np.empty(3 * columns + 3, np.float32)
+            line = np.ones(4 * width, np.float32)
             _stretch(cuts[chunk], cuts[chunk + 1], image, lefts, shares, screen, mixed, line)
 
     run_chunks(fill, chunks)
@@ -54,9 +55,11 @@ def _byte(value: Number) -> Number:
 @kernel(fast=True, cache=True)
 def _copy(begin: int, end: int, image: Array, screen: Array) -> None:
     """Rows begin … end − 1 of the picture."""
-    height, width = screen.shape[0], screen.shape[1]
+    height = screen.shape[0]
+    width = screen.shape[1]
     for row in range(begin, end):
-        line, out = image[row], screen[height - 1 - row]
+        line = image[row]
+        out = screen[height - 1 - row]
         for column in range(width):
             for k in range(3):
                 out[column, k] = _byte(line[column, k])
@@ -75,17 +78,22 @@ def _stretch(
         mixed: scratch. [3w+3] float32
         line: scratch, ones for the opaque channel. [4W] float32
     """
-    rows, height, count = image.shape[0], screen.shape[0], np.uint64(3 * image.shape[1])
+    rows = image.shape[0]
+    height = screen.shape[0]
+    count = np.uint64(3 * image.shape[1])
     for row in range(begin, end):
         at = min(max((row + 0.5) * rows / height - 0.5, 0.0), rows - 1.0)
-        upper, lower = image[int(at)].reshape(-1), image[min(int(at) + 1, rows - 1)].reshape(-1)
+        upper = image[int(at)].reshape(-1)
+        lower = image[min(int(at) + 1, rows - 1)].reshape(-1)
         share = np.float32(at - int(at))
         for k in range(count):
             mixed[k] = upper[k] + share * (lower[k] - upper[k])
         for k in range(np.uint64(3)):
             mixed[count + k] = mixed[count - np.uint64(3) + k]
         for column in range(np.uint64(screen.shape[1])):
-            first, to, share = np.uint64(3) * np.uint64(lefts[column]), np.uint64(4) * column, shares[column]
+            first = np.uint64(3) * np.uint64(lefts[column])
+            to = np.uint64(4) * column
+            share = shares[column]
             for k in range(first, first + np.uint64(3)):
                 line[to + k - first] = mixed[k] + share * (mixed[k + np.uint64(3)] - mixed[k])
         out = screen[height - 1 - row].reshape(-1)
@@ -105,7 +113,8 @@ def lines_behind(image: Array, transmittance: Array, lines: Array, clear: float)
         clear: radius in that disc within which a line has not begun to fade, < 1
     """
     most = 2 * len(lines) * (max(transmittance.shape) + 1)
-    pixels, before = np.empty((most, 2), np.int32), np.empty((most, 3), np.float32)
+    pixels = np.empty((most, 2), np.int32)
+    before = np.empty((most, 3), np.float32)
     count = _draw_lines(lines, clear, image, transmittance, pixels, before)
     try:
         yield
@@ -121,11 +130,14 @@ def _draw_lines(
     height, width = through.shape
     count = 0
     for i in range(len(lines)):
-        x0, y0 = lines[i, 0], lines[i, 1]
-        dx, dy = lines[i, 2] - x0, lines[i, 3] - y0
+        x0 = lines[i, 0]
+        y0 = lines[i, 1]
+        dx = lines[i, 2] - x0
+        dy = lines[i, 3] - y0
         first, last = _cut(x0, dx, width, 0.0, 1.0)
         first, last = _cut(y0, dy, height, first, last)
-        near, far = 1.0 / lines[i, 4], 1.0 / lines[i, 5]
+        near = 1.0 / lines[i, 4]
+        far = 1.0 / lines[i, 5]
         steep = abs(dy) > abs(dx)
         start, way, extent = (y0, dy, height) if steep else (x0, dx, width)
         if way == 0.0 or not first < last:
@@ -152,7 +164,8 @@ def _draw_lines(
                 share = strength * (beside - low if side == 1 else 1.0 - beside + low) * through[row, column]
                 if not share > 0.0:
                     continue
-                pixels[count, 0], pixels[count, 1] = row, column
+                pixels[count, 0] = row
+                pixels[count, 1] = column
                 for c in range(3):
                     under = image[row, column, c]
                     before[count, c] = under
@@ -166,7 +179,8 @@ def _cut(start: float, way: float, size: float, first: float, last: float) -> tu
     """The part of first..last of a line in which it lies between 0 and `size`."""
     if way == 0.0:
         return (first, last) if 0.0 <= start < size else (0.0, 0.0)
-    a, b = -start / way, (size - start) / way
+    a = -start / way
+    b = (size - start) / way
     return max(first, min(a, b)), min(last, max(a, b))
 
 

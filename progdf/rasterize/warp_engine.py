@@ -78,10 +78,13 @@ def pixel_of(thread: int, window: wp.vec4i) -> wp.vec3i:
 
     Blocks of threads are the window's tiles, row by row.
     """
-    left, top = window[0] // TILE, window[1] // TILE
+    left = window[0] // TILE
+    top = window[1] // TILE
     columns = (window[2] + TILE - 1) // TILE - left
-    tile, place = thread // PIXELS, thread % PIXELS
-    x, y = (left + tile % columns) * TILE + place % TILE, (top + tile // columns) * TILE + place // TILE
+    tile = thread // PIXELS
+    place = thread % PIXELS
+    x = (left + tile % columns) * TILE + place % TILE
+    y = (top + tile // columns) * TILE + place // TILE
     if x < window[0] or y < window[1] or x >= window[2] or y >= window[3]:
         return wp.vec3i(x, y, -1)
     return wp.vec3i(x, y, (y - window[1]) * (window[2] - window[0]) + x - window[0])
@@ -90,11 +93,14 @@ def pixel_of(thread: int, window: wp.vec4i) -> wp.vec3i:
 @_function
 def alpha_at(pixel: wp.vec3i, box: wp.vec4, shape: Any, opacity: float) -> wp.vec3:
     """Alpha before the clamp, 0 below 1/255; u and v, the whitened offset."""
-    x, y = float(pixel[0]) + 0.5, float(pixel[1]) + 0.5
+    x = float(pixel[0]) + 0.5
+    y = float(pixel[1]) + 0.5
     if x < box[0] or y < box[1] or x > box[2] or y > box[3]:  # in float32: most pairs end here
         return wp.vec3(0.0)
-    dx, dy = wp.float64(x) - shape[0], wp.float64(y) - shape[1]
-    u, v = shape[2] * dx + shape[3] * dy, shape[4] * dy
+    dx = wp.float64(x) - shape[0]
+    dy = wp.float64(y) - shape[1]
+    u = shape[2] * dx + shape[3] * dy
+    v = shape[4] * dy
     squared = u * u + v * v
     if squared > shape[5]:
         return wp.vec3(0.0)
@@ -119,7 +125,9 @@ def blend_kernel(
     if p < 0:
         return
     tile = thread // PIXELS
-    rgb, through, final = wp.vec3(0.0), float(1.0), int(-1)
+    rgb = wp.vec3(0.0)
+    through = float(1.0)
+    final = int(-1)
     for index in range(starts[tile], starts[tile + 1]):
         s = members[index]
         color = colors[s]
@@ -149,7 +157,10 @@ def blend_backward_kernel(
     pixel = pixel_of(thread, window)
     p = pixel[2]
     tile = thread // PIXELS
-    g, through, behind, final = wp.vec3(0.0), float(1.0), float(0.0), int(-1)
+    g = wp.vec3(0.0)
+    through = float(1.0)
+    behind = float(0.0)
+    final = int(-1)
     if p >= 0:
         g = by_image[p]
         through = transmittance[p]
@@ -195,7 +206,9 @@ def add_weights_kernel(
     pixel = pixel_of(thread, window)
     p = pixel[2]
     tile = thread // PIXELS
-    inside, through, final = float(0.0), float(1.0), int(-1)
+    inside = float(0.0)
+    through = float(1.0)
+    final = int(-1)
     if p >= 0:
         inside = mask[p]
         final = last[p]
@@ -224,9 +237,12 @@ class DeviceTileLists:
 def list_tiles(splats: ReferenceSplats, crop: Crop) -> DeviceTileLists:
     """Sort the splats into the tiles that their boxes meet."""
     x0, y0, x1, y1 = crop
-    left, top = x0 // TILE, y0 // TILE
-    columns, rows = -(-x1 // TILE) - left, -(-y1 // TILE) - top
-    means2d, extents = splats.means2d.detach(), splats.extents
+    left = x0 // TILE
+    top = y0 // TILE
+    columns = -(-x1 // TILE) - left
+    rows = -(-y1 // TILE) - top
+    means2d = splats.means2d.detach()
+    extents = splats.extents
     window = means2d.new_tensor([[x0, y0], [x1 - 1, y1 - 1]])
     # pixels whose centers lie in the boxes
     first = (means2d - extents - 0.5 - 1e-6).ceil().maximum(window[0])
@@ -239,7 +255,8 @@ def list_tiles(splats: ReferenceSplats, crop: Crop) -> DeviceTileLists:
     owners = torch.arange(len(counts), device=counts.device).repeat_interleave(counts, output_size=total)
     at = torch.arange(total, device=counts.device) - (counts.cumsum(0) - counts)[owners]
     wide = sides[owners, 0]
-    column, row = low[owners, 0] + at % wide - left, low[owners, 1] + at // wide - top
+    column = low[owners, 0] + at % wide - left
+    row = low[owners, 1] + at // wide - top
     tiles, slots = (row * columns + column).int().sort(stable=True)
     starts = pad(torch.bincount(tiles, minlength=columns * rows).cumsum(0), (1, 0))
     return DeviceTileLists(starts.int(), owners[slots].int(), slots, counts)
@@ -274,7 +291,8 @@ def alpha_weights(gaussians: ActivatedGaussians, view: RasterView, mask: Tensor)
     lists = list_tiles(splats, view.crop)
     arrays = splat_arrays(splats)
     _, _, last, deepest = _blend(arrays, lists, view.crop)
-    sums, inside = arrays[0].new_zeros(len(lists.members), 4), mask.to(arrays[0]).flatten()
+    sums = arrays[0].new_zeros(len(lists.members), 4)
+    inside = mask.to(arrays[0]).flatten()
     _launch(add_weights_kernel, lists, view.crop, (*arrays, last, deepest, lists.slots.int(), inside, sums))
     return sums.new_zeros(len(gaussians.means), 4).index_copy(0, splats.rows, _add_slots(sums, lists))
 
@@ -347,7 +365,8 @@ def _blend(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Image on black [h·w,3], transmittance [h·w]; last [h·w] and deepest [T], see `blend_kernel`."""
     pixels = (crop[3] - crop[1]) * (crop[2] - crop[0])
-    image, transmittance = arrays[0].new_empty(pixels, 3), arrays[0].new_empty(pixels)
+    image = arrays[0].new_empty(pixels, 3)
+    transmittance = arrays[0].new_empty(pixels)
     last = torch.empty_like(transmittance, dtype=torch.int32)
     deepest = torch.full_like(lists.starts[1:], -1)
     _launch(blend_kernel, lists, crop, (*arrays, image, transmittance, last, deepest))

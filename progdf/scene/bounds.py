@@ -23,7 +23,8 @@ _LEAST_CELLS = 16
 _ENOUGH = 64
 """Fewer Gaussians tell nothing about the shape of a scene."""
 
-_SOLID, _CORE = 0.1, 2.5
+_SOLID = 0.1
+_CORE = 2.5
 """Haze is less opaque; background lies farther, in median distances from the middle."""
 
 
@@ -91,7 +92,8 @@ def has_ceiling(scene: Gaussians, up: Tensor) -> bool:
     cells = plan_cells(sample, up)
     covered = len(torch.unique(cells))
     slab = 0.06 * (high - low)
-    top, next_to_top = height > high - slab, (height <= high - slab) & (height > high - 2 * slab)
+    top = height > high - slab
+    next_to_top = (height <= high - slab) & (height > high - 2 * slab)
     # thin and dense, as the top of a head is not
     dense = int(top.sum()) >= _DENSER * int(next_to_top.sum())
     ceiling = len(torch.unique(cells[top]))

@@ -17,11 +17,16 @@ from .point_tree import PointTree
 from .scribbles import Scribbles
 from .selection import Floats, Mask, alike_in_color, base_colors
 
-_RING, _AROUND, _LINKS = 8, 24, 8  # neighbors: of a step, of a vote, of a connection
+# neighbors: of a step, of a vote, of a connection
+_RING = 8
+_AROUND = 24
+_LINKS = 8
 _REACH = 3.0  # times how far neighbors commonly are; what is farther is none, also where none is nearer
 _TOUCH = 1.0
 RIM_PERCENT = 35
-_MIDDLE, _DEEP = 0.6, 0.95  # what is held lies as deep as this share of the rim, or of what a thin part has
+# what is held lies as deep as this share of the rim, or of what a thin part has
+_MIDDLE = 0.6
+_DEEP = 0.95
 
 
 class Neighborhood:
@@ -61,7 +66,8 @@ class Neighborhood:
         border[np.flatnonzero(mask)[across.any(axis=1)]] = True
         rows = np.flatnonzero(border)
         near, reached = self._near(rows, _AROUND)
-        votes, voters = (reached & mask[near]).sum(axis=1) + mask[rows], reached.sum(axis=1) + 1
+        votes = (reached & mask[near]).sum(axis=1) + mask[rows]
+        voters = reached.sum(axis=1) + 1
         smoothed = mask.copy()
         smoothed[rows] = 2 * votes > voters
         return smoothed
@@ -80,7 +86,8 @@ class Neighborhood:
         Args:
             percent: width of the rim outside, of the selection's radius; inside it is `_MIDDLE` of that
         """
-        inside, outside = np.flatnonzero(mask), np.flatnonzero(~mask)
+        inside = np.flatnonzero(mask)
+        outside = np.flatnonzero(~mask)
         if not (len(inside) and len(outside)):
             return mask
         radius = float(np.sqrt(self._points[inside].var(axis=0).sum()))

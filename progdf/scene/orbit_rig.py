@@ -21,7 +21,8 @@ _log = logging.getLogger(__name__)
 _GOLDEN = (math.sqrt(5) - 1) / 2
 
 
-ELEVATIONS, HALF_SPHERE = (5.0, 60.0), (0.0, 89.0)
+ELEVATIONS = (5.0, 60.0)
+HALF_SPHERE = (0.0, 89.0)
 """Degrees above the horizon: where one mostly looks from, and all over that half of the sphere."""
 
 _RIG_FOV = math.radians(60)
@@ -75,7 +76,8 @@ def orbit_rig(
     away = distance * radius * math.sin(_RIG_FOV / 2) / math.sin(half)
     ahead = front_direction(up)
     side = torch.linalg.cross(up, ahead)
-    low, high = math.sin(math.radians(lowest)), math.sin(math.radians(highest))
+    low = math.sin(math.radians(lowest))
+    high = math.sin(math.radians(highest))
     cameras = []
     for i in range(count):
         azimuth = 2 * math.pi * i / count

@@ -137,7 +137,8 @@ def _inside(
 
 
 def _flood(scene: Gaussians, point: tuple[float, float, float], tolerance: float) -> Mask:
-    neighborhood, colors = Neighborhood(scene), selection.base_colors(scene)
+    neighborhood = Neighborhood(scene)
+    colors = selection.base_colors(scene)
     seed = neighborhood.nearest(tuple(np.subtract(point, scene.origin).tolist()))
     return grow_along_surface(neighborhood, colors, np.array([seed]), colors[seed], tolerance)
 
@@ -316,7 +317,8 @@ def split_spec(spec: str, kinds: tuple[str, ...]) -> list[tuple[str, str]]:
     """(sign, part) for each part of a spec, the first one with '+'; a step's sign is '|'."""
     words, steps = ("|".join(re.escape(word) for word in some) for some in (kinds, STEPS))
     bare = "|".join(("all", *BARE))
-    part, step = rf"(?:{words}):|(?:{bare})\s*(?:$|[+&|-])", rf"(?:{steps})(?::-?[^\s+&|-]*)?\s*(?:$|[+&|-])"
+    part = rf"(?:{words}):|(?:{bare})\s*(?:$|[+&|-])"
+    step = rf"(?:{steps})(?::-?[^\s+&|-]*)?\s*(?:$|[+&|-])"
     # no blanks before the sign: a pattern that begins with them goes through a run of them from each of them
     pieces = [piece.strip() for piece in re.split(rf"([+&-](?=\s*(?:{part}))|\|(?=\s*{step}))", spec)]
     if not all(pieces[0::2]):
@@ -444,7 +446,8 @@ def _sphere(text: str, scene: Gaussians) -> Region:
 
 
 def _numbers(kind: str, text: str, form: str) -> list[float]:
-    numbers, count = read_numbers(text), form.count(",") + 1
+    numbers = read_numbers(text)
+    count = form.count(",") + 1
     if len(numbers) != count:
         raise ProgdfError(
             f"region '{kind}:{shorten(text)}' is not {count} numbers up to {LARGEST:g}; write {kind}:{form}"

@@ -48,7 +48,8 @@ TRANSFORMS_FILE = "dataparser_transforms.json"
 _CHECKPOINTS = "nerfstudio_models"  # nerfstudio's folder of checkpoints; the file lies beside it
 
 _LOOK_PX = 96  # longer side of the pictures of the check
-_FIRST_COUNT, _MAX_COUNT = 8, 48  # cameras to look through; the others only if the first do not decide
+_FIRST_COUNT = 8  # cameras to look through
+_MAX_COUNT = 48  # the others only if the first do not decide
 _SHOWS_SHARE = 1 / 256  # of the picture: 16 x 16 of 256 x 256 pixels, which a view of a training has
 _LARGE_SHARE = 0.1  # of the picture: the scene is what the camera looks at
 _LARGE_COUNT = 3  # cameras: the least that a training takes

@@ -29,8 +29,10 @@ _WALL = 1e-6  # of a likely step: behind what no walk passes there would be no c
 _HELD = 1e3  # of its steps: how firmly a stroke holds its Gaussians
 _LOOSE = 1e-6  # of its steps: how firmly what no stroke is connected with is held outside
 _ERROR = 1e-3  # of the system's error at the start: less changes no selection
-_SMALLEST, _SHRINKS = 500, 0.7  # rows that are solved at once; a level that has more of its finer one is none
-_DAMPED, _OVER = 0.7, 1.6  # Jacobi; what a coarse correction is too small by (Braess, 1995)
+_SMALLEST = 500  # rows that are solved at once
+_SHRINKS = 0.7  # a level that has more of its finer one is none
+_DAMPED = 0.7  # Jacobi
+_OVER = 1.6  # what a coarse correction is too small by (Braess, 1995)
 _MOST_STEPS = 200
 
 
@@ -56,8 +58,10 @@ class Scribbles:
         Returns:
             [N]; nothing without a stroke on the thing, what is connected with it without one beside it
         """
-        on, beside = np.zeros(self._count, bool), np.zeros(self._count, bool)
-        on[inside], beside[outside] = True, True
+        on = np.zeros(self._count, bool)
+        beside = np.zeros(self._count, bool)
+        on[inside] = True
+        beside[outside] = True
         on, beside = on & ~beside, beside & ~on
         return self._levels.chances(on, beside) > 0.5 if on.any() else on
 
@@ -112,7 +116,8 @@ class _Multigrid:
         targets = [target]
         self._diagonals = [self._steps[0] + held]
         for level in range(len(self._groups)):
-            held, target = self._gather(level, held), self._gather(level, target)
+            held = self._gather(level, held)
+            target = self._gather(level, target)
             self._diagonals.append(self._steps[level + 1] + held)
             targets.append(target)
         rest = self._weights[-1]
@@ -132,7 +137,8 @@ class _Multigrid:
         held = target / self._diagonals[level]
         least = _ERROR * float(np.linalg.norm((target - self._apply(level, held)) / spread))
         residual: Floats = target - self._apply(level, x)
-        direction, before = np.zeros_like(x), np.inf
+        direction = np.zeros_like(x)
+        before = np.inf
         for _ in range(_MOST_STEPS):
             if float(np.linalg.norm(residual / spread)) <= least:
                 break
@@ -173,7 +179,8 @@ def _coarsen(weights: csr_array, groups: NDArray[np.int32] | None) -> tuple[csr_
     """A graph of pairs of nodes, each with its most likely neighbor, and which pair each node is in."""
     pairs, count = _pair(weights.indptr, weights.indices, weights.data)
     edges = weights.tocoo()
-    row, col = pairs[edges.row], pairs[edges.col]
+    row = pairs[edges.row]
+    col = pairs[edges.col]
     across = row != col
     coarse = coo_array((edges.data[across], (row[across], col[across])), shape=(count, count)).tocsr()
     return coarse, pairs if groups is None else pairs[groups]
@@ -188,16 +195,21 @@ def _pair(start: Number, neighbors: Number, weights: Number) -> Number:
     for node in range(count):
         if groups[node] >= 0:
             continue
-        free, likely, other, other_likely = -1, np.float32(0.0), -1, np.float32(0.0)
+        free = -1
+        likely = np.float32(0.0)
+        other = -1
+        other_likely = np.float32(0.0)
         for at in range(start[node], start[node + 1]):
             near = neighbors[at]
             if near == node:
                 continue
             if groups[near] < 0:
                 if weights[at] > likely:
-                    free, likely = near, weights[at]
+                    free = near
+                    likely = weights[at]
             elif weights[at] > other_likely:
-                other, other_likely = near, weights[at]
+                other = near
+                other_likely = weights[at]
         if free < 0 and other >= 0:
             groups[node] = groups[other]
             continue

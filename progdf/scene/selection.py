@@ -31,7 +31,8 @@ MODES = ("new", "add", "subtract", "intersect")
 _COARSE = 4  # the front surface is looked up in a picture so many times smaller
 # Of the depth, and of its own longest axis: what is no further behind the surface still belongs to it. Gloss
 # is made of Gaussians beneath it: with one axis a jacket's lasso has .85 of what one sees, with three .94.
-_BEHIND, _OWN = 0.01, 3.0
+_BEHIND = 0.01
+_OWN = 3.0
 _COVERED = 0.05  # less than this in all counts as background
 _MOST_CELLS = 1024  # a side, of the grid into which a polygon is filled
 
@@ -60,7 +61,8 @@ def combine(mask: Mask, selection: Mask, mode: str) -> Mask:
 
 def project_centers(scene: Gaussians, camera: Camera) -> Centers:
     """Where `camera` sees the centers of a scene's Gaussians."""
-    viewmat, K = camera.viewmat.float().numpy(), camera.K.float().numpy()
+    viewmat = camera.viewmat.float().numpy()
+    K = camera.K.float().numpy()
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         # by columns: a row at a time takes many times as long
         across, down, depths = viewmat[:3, :3] @ scene.means.numpy().T + viewmat[:3, 3:]
@@ -71,8 +73,10 @@ def project_centers(scene: Gaussians, camera: Camera) -> Centers:
 
 def inside_rectangle(points: Floats, corner: ArrayLike, opposite: ArrayLike) -> Mask:
     """The points [N,2] between two opposite corners [2], edges included. [N]"""
-    low, high = np.minimum(corner, opposite), np.maximum(corner, opposite)
-    x, y = points[:, 0], points[:, 1]
+    low = np.minimum(corner, opposite)
+    high = np.maximum(corner, opposite)
+    x = points[:, 0]
+    y = points[:, 1]
     return np.asarray((x >= low[0]) & (x <= high[0]) & (y >= low[1]) & (y <= high[1]))
 
 
@@ -89,7 +93,8 @@ def inside_polygon(points: Floats, corners: ArrayLike) -> Mask:
     mask = np.zeros(len(points), bool)
     if len(outline) < 3:
         return mask
-    low, high = outline.min(0), outline.max(0)
+    low = outline.min(0)
+    high = outline.max(0)
     near = np.flatnonzero(inside_rectangle(points, low, high))
     cell = max(float((high - low).max()) / _MOST_CELLS, 1e-12)
     filled = _fill((outline - low) / cell + 2.0)
@@ -117,7 +122,8 @@ def inside_stroke(points: Floats, path: ArrayLike, radius: float) -> Mask:
     for start, end in pairwise(way if len(way) > 1 else [*way, *way]):
         box = inside_rectangle(points, np.minimum(start, end) - radius, np.maximum(start, end) + radius)
         rows = np.flatnonzero(box)
-        x, y = points[rows, 0] - start[0], points[rows, 1] - start[1]
+        x = points[rows, 0] - start[0]
+        y = points[rows, 1] - start[1]
         dx, dy = end - start
         along = np.clip((x * dx + y * dy) / max(dx * dx + dy * dy, 1e-12), 0.0, 1.0)
         mask[rows] |= (x - along * dx) ** 2 + (y - along * dy) ** 2 <= radius * radius
@@ -160,8 +166,10 @@ def front_surface(
         False also for what is not in front of the camera. [M]
     """
     part = slice(None) if rows is None else rows
-    points, depths = centers.points[part], centers.depths[part]
-    width, height = max(camera.width // _COARSE, 1), max(camera.height // _COARSE, 1)
+    points = centers.points[part]
+    depths = centers.depths[part]
+    width = max(camera.width // _COARSE, 1)
+    height = max(camera.height // _COARSE, 1)
     uv = points / np.array([camera.width / width, camera.height / height], np.float32)
     visible = np.asarray(np.isfinite(uv).all(axis=1))
     if not visible.any():
@@ -190,7 +198,8 @@ class Surface:
     """
 
     def __init__(self, scene: Gaussians, camera: Camera) -> None:
-        self.scene, self.camera = scene, camera
+        self.scene = scene
+        self.camera = camera
         self._lock, self._stop = threading.RLock(), threading.Event()
         self._centers: Centers | None = None
         self._front: Mask | None = None
@@ -219,7 +228,8 @@ class Surface:
 
     def in_front(self, mask: Mask) -> Mask:
         """What of a mask lies on what one sees. [N]"""
-        rows, seen = np.flatnonzero(mask), np.zeros_like(mask)
+        rows = np.flatnonzero(mask)
+        seen = np.zeros_like(mask)
         seen[rows] = self.front(rows)
         return seen
 
@@ -236,7 +246,9 @@ class Surface:
         self._stop.set()
 
 
-_OUTSIDE, _INSIDE, _EDGE = 0, 1, 2
+_OUTSIDE = 0
+_INSIDE = 1
+_EDGE = 2
 
 
 def _fill(outline: NDArray[np.float64]) -> NDArray[np.uint8]:

@@ -43,7 +43,8 @@ _LONELY_SAMPLE = 5_000
 _WINDOW = 16  # rows before and after, in the order of the tree, that are compared at first
 _BLOCK = 20_000  # rows whose windows are compared at once, in the processor's cache
 _CHUNK = 200_000  # searches at once, which take 55 MB
-_VIEWS, _VIEW_PX = 8, 384
+_VIEWS = 8
+_VIEW_PX = 384
 _GRAY = (0.5, 0.5, 0.5)  # a background on which neither black nor white fog is lost
 
 

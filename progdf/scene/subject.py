@@ -31,7 +31,9 @@ _PLAN = 24
 _ABOVE = 0.05
 """Of the plan's half diagonal: so far above the ground begins what stands on it."""
 
-_UNDER, _SHOWN, _COVERED = 0.03, 0.5, 0.6
+_UNDER = 0.03
+_SHOWN = 0.5
+_COVERED = 0.6
 """A ground has no more of the scene under it, shows in no fewer cells of the plan, and what stands on it
 covers no more of them."""
 
@@ -41,7 +43,8 @@ _FEET = 0.01
 _LOOKED_AT = 8_000
 """Gaussians of which is asked what hides them."""
 
-_FREE, _RICHER = 0.2, 1.5
+_FREE = 0.2
+_RICHER = 1.5
 """One stands no nearer to anything than a fifth of the room's half width; and a first picture leaves the
 front where another side shows half as much again."""
 
@@ -69,7 +72,9 @@ def subject_rows(scene: Gaussians, up: Tensor) -> Tensor:
     height, plan = _heights_and_plan(scene.means[rows], up)
     standing = _rows_above_ground(height, plan)
     if standing is not None:
-        rows, height, plan = rows[standing], height[standing], plan[standing]
+        rows = rows[standing]
+        height = height[standing]
+        plan = plan[standing]
     elif len(rows) < len(solid) and not has_long_tail(scene.means[solid]):
         rows = solid  # what is far out is no background, but a guitar's neck
         height, plan = _heights_and_plan(scene.means[rows], up)
@@ -86,7 +91,8 @@ def fit_eye(points: Tensor, radius: float, axes: Tensor, tangents: tuple[float, 
         tangents: of half the angle that is to be filled, along the width and along the height
     """
     right, up, back = (points.double() @ axes.double().T).unbind(1)
-    best, away = [], -math.inf
+    best = []
+    away = -math.inf
     for along, tangent in ((right, tangents[0]), (up, tangents[1])):
         # |along − place| ≤ tangent · (away − back) for every point: two planes, which meet at the eye
         margin = radius * math.sqrt(1 + tangent**2)
@@ -119,7 +125,8 @@ def fit_camera(
     level = math.cos(around) * ahead + math.sin(around) * torch.linalg.cross(up, ahead)
     back = math.cos(above) * level + math.sin(above) * up
     axes = look_at(back, torch.zeros(3), up)[:3, :3] * torch.tensor([[1.0], [-1.0], [-1.0]])
-    subject, tangent = scene[subject_rows(scene, up)], filled * math.tan(0.5 * fov)
+    subject = scene[subject_rows(scene, up)]
+    tangent = filled * math.tan(0.5 * fov)
     radius = 2 * float(subject.log_scales.amax(dim=1).median().exp())
     eye = fit_eye(subject.means, radius, axes, (tangent * size[0] / size[1], tangent)).float()
     return Camera(look_at(eye, eye - back, up), intrinsics(fov, *size), *size)
@@ -142,10 +149,12 @@ def standpoint(scene: Gaussians, up: Tensor) -> tuple[Tensor, Tensor]:
     middle = means.median(dim=0).values
     inside = (means - middle) @ axes.T
     low, high = (torch.stack([quantile(c, q) for c in inside.unbind(1)]) for q in (0.02, 0.98))
-    center, half = 0.5 * (low + high), 0.5 * (high - low)
+    center = 0.5 * (low + high)
+    half = 0.5 * (high - low)
     some = inside[:: -(-len(inside) // _LOOKED_AT)]
     near = _FREE * float(half[:2].min())
-    most, view = -1.0, (center, center + torch.tensor([float(half[0]), 0.0, 0.0]))
+    most = -1.0
+    view = (center, center + torch.tensor([float(half[0]), 0.0, 0.0]))
     for offset in torch.cartesian_prod(*[torch.linspace(-0.75, 0.75, 5)] * 2):
         candidate = center + half * torch.cat([offset, torch.tensor([0.2])])
         free = float((some - candidate).norm(dim=1).min()) > near
@@ -154,7 +163,8 @@ def standpoint(scene: Gaussians, up: Tensor) -> tuple[Tensor, Tensor]:
             back = torch.tensor([math.cos(angle), math.sin(angle), 0.0])
             seen = _visible(some - candidate, back, wide=1.0).sum() / len(some) + float(free)
             if float(seen) > most:
-                most, view = float(seen), (candidate, candidate - float(half[:2].min()) * back)
+                most = float(seen)
+                view = (candidate, candidate - float(half[:2].min()) * back)
     eye, target = view
     return middle + eye @ axes, middle + (target - torch.tensor([0.0, 0.0, 0.1 * float(half[2])])) @ axes
 

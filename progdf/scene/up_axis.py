@@ -203,7 +203,8 @@ def _weigh(scene: Gaussians) -> UpAxis:
         both = [shape.evidence(normal), shape.evidence(-normal)]
         planes = [evidence["ground plane"] for evidence in [*shape_signs, *both]]
         if planes[6] - planes[7] > max(abs(planes[i] - planes[i + 1]) for i in (0, 2, 4)):
-            directions, shape_signs = [*directions, normal, -normal], [*shape_signs, *both]
+            directions = [*directions, normal, -normal]
+            shape_signs = [*shape_signs, *both]
     counted = ["ground plane"] if walled else [*_WEIGHTS]
     terms = []
     for i, direction in enumerate(directions):
@@ -258,10 +259,12 @@ class _Shape:
         """What speaks for a direction, by the names of `_WEIGHTS`. [3]"""
         ahead = front_direction(up)
         side = torch.linalg.cross(up, ahead)
-        height, plan = self.places @ up, self.places @ torch.stack([ahead, side], dim=1)
+        height = self.places @ up
+        plan = self.places @ torch.stack([ahead, side], dim=1)
         order = height.argsort()
         count = len(order)
-        low, high = float(height[order[count // 200]]), float(height[order[-1 - count // 200]])
+        low = float(height[order[count // 200]])
+        high = float(height[order[-1 - count // 200]])
         wide = (_quantiles(plan, 0.995) - _quantiles(plan, 0.005)).clamp_min(1e-6)
         band = 0.04 * max(high - low, 1e-6)
         foot = _extent(plan[height < low + band]) - _extent(plan[height > high - band])
@@ -331,7 +334,8 @@ def _ground_plane(height: Tensor, plan: Tensor, facing: Tensor) -> float:
     """The best slab across a direction: its share of the bulk, of the plan's cells, and how much more of the
     rest lies above it than below, multiplied. [Q], [Q,2] 0..1 -> 0..1
     """
-    slabs, cells = 60, 10
+    slabs = 60
+    cells = 10
     row = ((height + 1.5) / 0.05).long().clamp(0, slabs - 1)
     index = (plan * cells).long().clamp(0, cells - 1)
     cell = (row * cells + index[:, 0]) * cells + index[:, 1]

@@ -97,7 +97,8 @@ def test_a_variant_differs_from_another_in_one_value_of_the_plan(
     """The paper's preset alone differs in many: it is the preset, but for scene, views and steps."""
     own = with_values(options, sh="auto", progressive="decay", perceptual_weight=0.1)
     other = next(one for one in VARIANTS if one.name == variant.of)
-    now, then = plan_values(variant.plan(resolve(own))), plan_values(other.plan(resolve(own)))
+    now = plan_values(variant.plan(resolve(own)))
+    then = plan_values(other.plan(resolve(own)))
     differ = {path for path in now if now[path] != then[path]}
     if variant.name == "paper":
         preset = plan_values(resolve(apply_preset(own, "paper")))
@@ -294,7 +295,9 @@ def test_a_draft_thins_strengths_and_steps_and_keeps_its_figures_apart(
 def test_a_descent_has_other_figures_with_another_seed_and_one_solved_for_has_one_row_for_all(
     options: TrainOptions, tmp_path: Path
 ) -> None:
-    copy, picture, page = tmp_path / "run", tmp_path / "all.png", tmp_path / "page.md"
+    copy = tmp_path / "run"
+    picture = tmp_path / "all.png"
+    page = tmp_path / "page.md"
     shutil.copytree(options.out, copy, ignore=shutil.ignore_patterns("ablation"))
     page.write_text("<!-- bench ablation -->\n<!-- end ablation -->\n", encoding="utf-8")
     only = "base,equal-strengths,descent"

@@ -64,12 +64,14 @@ def test_every_form_of_field_is_judged_alike_and_the_shipped_one_is_marked(
 
 def test_keyframes_in_oklab_have_the_ends_of_raw_ones_and_go_straight_between() -> None:
     rng = torch.Generator().manual_seed(0)
-    start, end = torch.randn(50, 14, generator=rng), torch.randn(50, 14, generator=rng)
+    start = torch.randn(50, 14, generator=rng)
+    end = torch.randn(50, 14, generator=rng)
     # float32 through cubes and cube roots, which are steep at black
     moved = InOklab(start, end, ("sh0",))
     torch.testing.assert_close(moved.offsets(0.0), torch.zeros_like(end), atol=1e-4, rtol=0)
     torch.testing.assert_close(moved.offsets(1.0), end, atol=1e-4, rtol=0)
-    gray, blue = torch.full((1, 14), 0.0), torch.zeros(1, 14)
+    gray = torch.full((1, 14), 0.0)
+    blue = torch.zeros(1, 14)
     blue[0, 11:14] = torch.tensor([-0.3, -0.1, 0.4]) / C0
     half = 0.5 + C0 * InOklab(gray, blue, ("sh0",)).offsets(0.5)[0, 11:14]
     ends = srgb_to_oklab(torch.tensor([[0.5, 0.5, 0.5], [0.2, 0.4, 0.9]]))
@@ -78,7 +80,8 @@ def test_keyframes_in_oklab_have_the_ends_of_raw_ones_and_go_straight_between() 
 
 def test_a_scene_is_recolored_where_labels_lie_beside_it_and_else_tinted(small: None, tmp_path: Path) -> None:
     (tmp_path / "robot_labels.npy").touch()
-    robot, guitar = tmp_path / "robot.ply", tmp_path / "guitar.splat"
+    robot = tmp_path / "robot.ply"
+    guitar = tmp_path / "guitar.splat"
     bear, *given = tasks(tmp_path, [robot, guitar])
     assert bear.scene.is_file()
     assert given == [

@@ -25,7 +25,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_far_views_are_raised_lowered_and_zoomed_and_look_at_the_region() -> None:
-    center, up = torch.tensor([1.0, 2.0, 3.0]), torch.tensor([0.0, 1.0, 0.0])
+    center = torch.tensor([1.0, 2.0, 3.0])
+    up = torch.tensor([0.0, 1.0, 0.0])
     eye = center + torch.tensor([4.0, 0.0, 0.0])
     camera = Camera(look_at(eye, center, up), intrinsics(0.9, 64, 64), 64, 64)
     raised, lowered, zoomed = bench_edits.far_cameras(camera, center, up)

@@ -105,7 +105,8 @@ def test_a_picture_at_rest_is_looked_at_once_it_is_sharp(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """A large scene's sharp picture is made beside the window's work and comes some frames later."""
-    path, asked = tmp_path / "bear.ply", list[int]()
+    path = tmp_path / "bear.ply"
+    asked = list[int]()
     save_ply(path, bear(600).gaussians)
     prepare = CpuRenderer.prepare
 
@@ -135,7 +136,8 @@ def test_a_film_of_moving_pictures_has_what_changes_in_it_alone() -> None:
 
 @pytest.mark.gl
 def test_a_moving_picture_is_compared_as_the_screen_stretches_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    size, drawn = (43, 30), np.random.default_rng(0).random((15, 22, 3), np.float32)
+    size = (43, 30)
+    drawn = np.random.default_rng(0).random((15, 22, 3), np.float32)
     screen = np.zeros((size[1], size[0], 4), np.uint8)
     fill_screen(drawn, screen)
     full = screen[::-1, :, :3].astype(np.float32) / 255
@@ -226,7 +228,8 @@ def test_made_up_scenes_and_edits_are_the_same_every_time_and_as_large_as_they_s
     off = (many.means[600:1200] - scene.means).std() / radius
     assert float(off) == pytest.approx(0.002, rel=0.1)
     assert torch.equal(many.means, copies(scene, 3).means)
-    first, again = edit_for(scene, 70, moves=True), edit_for(scene, 70, moves=True)
+    first = edit_for(scene, 70, moves=True)
+    again = edit_for(scene, 70, moves=True)
     assert len(first.region) == 70
     assert torch.equal(first.field.attributes["means"].end_offset, again.field.attributes["means"].end_offset)
     assert set(edit_for(scene, 70, moves=False).field.attributes) == {"sh0"}

@@ -95,7 +95,8 @@ def test_viser_shows_what_the_slider_says(here: Path, monkeypatch: pytest.Monkey
 
 def test_rerun_records_every_step(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rerun = pytest.importorskip("rerun", reason="pip install rerun-sdk")
-    log, logged = rerun.log, []
+    log = rerun.log
+    logged = []
     monkeypatch.setattr(rerun, "log", lambda *given, **more: (logged.append(given[1]), log(*given, **more)))
     run_python("Rerun")
     assert Path("blue.rrd").stat().st_size > 21 * 60 * 15 * 3

@@ -30,7 +30,8 @@ from trainer.resolve import resolve
 from trainer.setup import make_training_setup
 
 PLAYBOT = Path("playbot_31k.ply")  # in the current folder, as in docs/benchmarks.md
-_EARS, _HANDS = "big ears", (2, 3)
+_EARS = "big ears"
+_HANDS = (2, 3)
 
 
 @dataclass(frozen=True)

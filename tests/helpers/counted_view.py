@@ -15,7 +15,8 @@ from viewer.app.app import App
 def count_turns(path: str) -> None:
     """Keep in the file how often the window's loop has come to draw since it was opened, 8 bytes."""
     file = os.open(path, os.O_RDWR | os.O_CREAT)
-    draw, turns = App.draw, 0
+    draw = App.draw
+    turns = 0
 
     def counted(app: App) -> None:
         nonlocal turns

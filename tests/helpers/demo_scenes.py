@@ -9,7 +9,8 @@ from progdf import demo_scenes
 from progdf.demo_scenes import DemoScene
 from progdf.gaussians import ATTRIBUTES
 
-_bear, _room = cache(demo_scenes.bear), cache(demo_scenes.room)
+_bear = cache(demo_scenes.bear)
+_room = cache(demo_scenes.room)
 
 
 def bear(size: int, seed: int = 0) -> DemoScene:

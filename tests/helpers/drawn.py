@@ -49,7 +49,8 @@ def draw(
     crop: Crop | None = None,
 ) -> Drawn:
     """Drawn where the engine draws: on the card, if there is one and it is warp. Results are the CPU's."""
-    dtype, device = torch.float64 if engine == "reference" else torch.float32, engine_device(engine)
+    dtype = torch.float64 if engine == "reference" else torch.float32
+    device = engine_device(engine)
     background = torch.tensor([0.2, 0.4, 0.6])
     inputs = (*activate(gaussians).tensors, camera.viewmat, camera.K, background)
     leaves = {

@@ -30,7 +30,8 @@ def curved_trajectory(
     """Strengths [T] and offsets [T,M,C] of members that bend away from the straight way in two manners."""
     draws = Draws(seed)
     strengths = torch.linspace(0, 1, snapshots)
-    bend, wave = torch.sin(torch.pi * strengths), torch.sin(2 * torch.pi * strengths)
+    bend = torch.sin(torch.pi * strengths)
+    wave = torch.sin(2 * torch.pi * strengths)
     offsets = torch.zeros(snapshots, members, channels)
     for course, size in ((strengths, 1.0), (bend, 0.5), (wave, 0.2)):
         offsets += course[:, None, None] * size * draws.normal(members, channels)
@@ -92,7 +93,8 @@ def added_rows(count: int, seed: int, bands: int = 1) -> Gaussians:
 
 def growing(scene: Gaussians, members: torch.Tensor, count: int, seed: int, name: str = "hat") -> Gdf:
     """Takes every second member away, and lets so many rows appear that move as they do."""
-    draws, added = Draws(seed), added_rows(count, seed)
+    draws = Draws(seed)
+    added = added_rows(count, seed)
     start = torch.cat([scene.logit_opacities[members], added.logit_opacities])
     end = torch.cat([start[: len(members)], draws.normal(count) + 2.0])
     end[: len(members) : 2] = -8.0

@@ -46,7 +46,8 @@ from trainer.store.state import StateFolder
 from viewer.files import exports, session
 from viewer.state.selection import SelectionState, add_region, select
 
-SECONDS, BYTES = 10, 1 << 30
+SECONDS = 10
+BYTES = 1 << 30
 """What one input may take, at most."""
 
 
@@ -72,7 +73,8 @@ def use_session(path: Path) -> None:
 
     before = others()
     opened = session.open_session(path)
-    state, total = opened.view.selection, len(opened.document.scene)
+    state = opened.view.selection
+    total = len(opened.document.scene)
     for i, region in enumerate(state.regions):
         exports.region_file(region, total)
         state = exports.rename_region(state, i, f"{region.name} {i}", total)
@@ -131,7 +133,8 @@ def inputs(folder: Path, reader: str) -> dict[str, tuple[str, Callable[[Path], A
     state.save("part", {"a": torch.arange(4.0)}, {"pgs": {"step": 3}, "list": [1, 2.5]})
     (folder / "s").mkdir()
     saved = saved_session(bear_files(folder / "s"))
-    opened, table = session.open_session(saved), json.loads(saved.read_text())
+    opened = session.open_session(saved)
+    table = json.loads(saved.read_text())
     mask = np.arange(len(opened.document.scene)) % 3 == 0
     kept = add_region(select(SelectionState(), mask), "third", folder / "s" / "third.region.npy")
     table["view"]["selection"] = plain(replace(kept, hidden=kept.members))
@@ -141,7 +144,8 @@ def inputs(folder: Path, reader: str) -> dict[str, tuple[str, Callable[[Path], A
     def both(content: bytes) -> list[Change]:
         return [changed_json(content), changed_json(content), changed_bytes(content)]
 
-    gdf, parts = read(folder / "a.gdf"), read(folder / "t.safetensors")
+    gdf = read(folder / "a.gdf")
+    parts = read(folder / "t.safetensors")
     part = read(folder / "state" / "part.safetensors")
     return {
         **more_inputs(folder, reader),

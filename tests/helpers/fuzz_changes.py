@@ -84,10 +84,12 @@ def changed_value(rng: random.Random, value: Any) -> Any:
     """A JSON value with one to three places of it replaced, removed or doubled."""
     value = json.loads(json.dumps(value))
     for _ in range(rng.choice([1, 1, 2, 3])):
-        inner, place = None, None
+        inner = None
+        place = None
         found = value
         while isinstance(found, dict | list) and found and rng.random() < 0.8:
-            inner, place = found, rng.choice(list(found) if isinstance(found, dict) else range(len(found)))
+            inner = found
+            place = rng.choice(list(found) if isinstance(found, dict) else range(len(found)))
             found = inner[place]
         other = copy.deepcopy(rng.choice(VALUES))  # which may be put into itself
         if inner is None or place is None:

@@ -302,7 +302,8 @@ def _run(name: str, folder: Path) -> Reader:
     """A run, stopped or finished, of which one file is changed each time."""
     write_bear(folder, 400)
     options = quick_options(folder, views=4, image_size=48, steps=64, stages=2)
-    resumes, file = name.startswith("resume"), FILES_OF_RUNS[name]
+    resumes = name.startswith("resume")
+    file = FILES_OF_RUNS[name]
     _train(options, stops=resumes)
     good = folder / "good"
     options.out.rename(good)

@@ -18,7 +18,9 @@ from trainer.options import TrainOptions
 from trainer.resolve import resolve
 from trainer.setup import make_training_setup
 
-RED, YELLOW, BLUE = (0.85, 0.15, 0.15), (0.95, 0.85, 0.3), (0.1, 0.3, 0.8)
+RED = (0.85, 0.15, 0.15)
+YELLOW = (0.95, 0.85, 0.3)
+BLUE = (0.1, 0.3, 0.8)
 
 
 def balls(scene: Gaussians, means: Tensor, colors: Tensor, size: float) -> Gaussians:
@@ -40,7 +42,8 @@ def things(scene: Gaussians, head: Tensor) -> dict[str, Gaussians]:
     x, _, z = means.median(dim=0).values.tolist()
     top = float(means[:, 1].quantile(0.98))
     radius = 0.75 * float((means[:, 0] - x).abs().quantile(0.9))
-    out, angle = ((torch.arange(900) + 0.5) / 900).sqrt(), math.pi * (3 - math.sqrt(5)) * torch.arange(900)
+    out = ((torch.arange(900) + 0.5) / 900).sqrt()
+    angle = math.pi * (3 - math.sqrt(5)) * torch.arange(900)
     cone = [x + radius * out * angle.cos(), top + radius * (1.1 - 1.2 * out), z + radius * out * angle.sin()]
     striped = torch.where(((1 - out) * 4).long()[:, None] % 2 == 0, torch.tensor(RED), torch.tensor(YELLOW))
     along = torch.linspace(0, 1, 200)

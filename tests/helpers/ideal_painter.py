@@ -86,7 +86,8 @@ class IdealPainter(WholeViews):
         x = torch.from_numpy(noise).float()[shows].flatten()
         painted = start
         for step in range(STEPS):
-            sigma, after = 1 - step / STEPS, 1 - (step + 1) / STEPS
+            sigma = 1 - step / STEPS
+            after = 1 - (step + 1) / STEPS
             misfit = (x - (1 - sigma) * edits).square().sum(dim=1) / (2 * sigma**2)
             finished = torch.softmax(prior - misfit, dim=0) @ edits
             weight = min(1.0, max(0.0, (strength * (1 + softness) - sigma) / softness))

@@ -74,5 +74,6 @@ def smooth_trajectory(places: Tensor) -> tuple[Tensor, Tensor]:
     offsets[:, :, 11:14] = (
         strengths[:, None, None] * wave + torch.sin(torch.pi * strengths)[:, None, None] * bend
     )
-    offsets[0], offsets[-1, :, 11:14] = 0.0, wave
+    offsets[0] = 0.0
+    offsets[-1, :, 11:14] = wave
     return strengths, offsets

@@ -50,7 +50,8 @@ def plain_tree(gaussians: ActivatedGaussians) -> list[Node]:
         for node, rows in enumerate(lists):
             means = gaussians.means[rows]
             axis = int((means.amax(0) - means.amin(0)).argmax())
-            begin, middle = (node * count) >> level, ((2 * node + 1) * count) >> (level + 1)
+            begin = (node * count) >> level
+            middle = ((2 * node + 1) * count) >> (level + 1)
             order = rows[means[:, axis].argsort(stable=True)]
             halves += [order[: middle - begin], order[middle - begin :]]
         lists = halves
@@ -71,7 +72,8 @@ def merge_rows(gaussians: ActivatedGaussians, rows: Tensor) -> Node:
     covariance = between + torch.einsum("n,nij,nkj->ik", share, turned, turned)
     area = float(torch.linalg.eigvalsh(covariance)[1:].clamp_min(0.0).prod().sqrt())
     opacity = float(weights.sum()) / area
-    spread, merged = math.sqrt(float(between.trace())), torch.einsum("n,nkc->kc", share, colors)
+    spread = math.sqrt(float(between.trace()))
+    merged = torch.einsum("n,nkc->kc", share, colors)
     contrast = math.sqrt(float(share @ (colors[:, 0] - merged[0]).square().sum(1)))
     return Node(
         rows, float(weights.sum()), mean, covariance, spread, contrast, opacity,
@@ -116,12 +118,16 @@ class PlainCut:
     def taken(self, picks: list[int]) -> ActivatedGaussians:
         """Picks as they are drawn."""
         means, sigmas, opacities, colors = zip(*map(self._parts, picks), strict=True)
-        mean, colors, opacity = torch.stack(means), torch.stack(colors), torch.tensor(opacities).double()
+        mean = torch.stack(means)
+        colors = torch.stack(colors)
+        opacity = torch.tensor(opacities).double()
         values, vectors = torch.linalg.eigh(torch.stack(sigmas))
         vectors = vectors * torch.linalg.det(vectors)[:, None, None]  # rotations, not mirrors
-        quats, scales = matrix_quats(vectors), values.clamp_min(0.0).sqrt()
+        quats = matrix_quats(vectors)
+        scales = values.clamp_min(0.0).sqrt()
         view = RasterView.of(self._camera, self._gaussians)
-        rotation, translation = self._camera.viewmat[:3, :3].double(), self._camera.viewmat[:3, 3].double()
+        rotation = self._camera.viewmat[:3, :3].double()
+        translation = self._camera.viewmat[:3, 3].double()
         points = mean @ rotation.T + translation
         more = (self._dilation - DILATION) * points[:, 2:] ** 2 / self._focal2
         merged = torch.tensor(picks) >= 0
@@ -184,7 +190,8 @@ class PlainCut:
 
     def _cut(self, index: int, limit: float) -> list[int]:
         """Picks below a node, in no order."""
-        node, near = self._nodes[index], self._camera.near
+        node = self._nodes[index]
+        near = self._camera.near
         largest = float(torch.linalg.eigvalsh(node.covariance)[-1]) ** 0.5
         x, y, z = self._project(node.mean)
         if node.weight <= 0.0 or z + 3.0 * largest < near:
@@ -206,7 +213,8 @@ class PlainCut:
         if loss <= limit or (leaf and self._depths is None):  # a leaf as it is tells the light
             return [index]
         if leaf:
-            means, scales = self._gaussians.means.double(), self._gaussians.scales.double()
+            means = self._gaussians.means.double()
+            scales = self._gaussians.scales.double()
             return [
                 ~row
                 for row in node.rows.tolist()

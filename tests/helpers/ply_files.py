@@ -73,7 +73,8 @@ def camera_element() -> PlyElement:
 
 def face_element() -> PlyElement:
     faces = np.empty(2, [("vertex_indices", "i4", (3,)), ("flag", "u1")])
-    faces["vertex_indices"], faces["flag"] = [[0, 1, 2], [2, 1, 0]], 7
+    faces["vertex_indices"] = [[0, 1, 2], [2, 1, 0]]
+    faces["flag"] = 7
     return PlyElement.describe(faces, "face")
 
 

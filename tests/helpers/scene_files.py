@@ -34,8 +34,10 @@ def write_scene(path: Path, scene: Gaussians, spz_version: int = 4) -> Path:
 def write_compressed_ply(path: Path, scene: Gaussians, comment: str = "", colors: bool = True) -> Path:
     """As SuperSplat writes it; without `colors` as it did before chunks had a range of colors."""
     n = len(scene)
-    places, scales = scene.means.numpy(), scene.log_scales.numpy()
-    rgb, edges = (scene.sh0 * C0 + 0.5).numpy(), [range(i, min(i + 256, n)) for i in range(0, n, 256)]
+    places = scene.means.numpy()
+    scales = scene.log_scales.numpy()
+    rgb = (scene.sh0 * C0 + 0.5).numpy()
+    edges = [range(i, min(i + 256, n)) for i in range(0, n, 256)]
     kinds = [places, scales, rgb] if colors else [places, scales]
     chunks = [np.concatenate([f(v[e], axis=0) for v in kinds for f in (np.min, np.max)]) for e in edges]
     of = np.arange(n) // 256
@@ -91,7 +93,8 @@ def write_sog1(path: Path, scene: Gaussians) -> Path:
     images: dict[str, np.ndarray] = {}
     for name, values in tables.items():
         table = values.double().numpy()
-        low, high = table.min(axis=0), table.max(axis=0)
+        low = table.min(axis=0)
+        high = table.max(axis=0)
         most = 65535 if name == "means" else 255
         levels = np.round((table - low) / np.maximum(high - low, 1e-9) * most).astype(np.int64)
         parts = {"means_l": levels & 255, "means_u": levels >> 8} if name == "means" else {name: levels}
@@ -107,7 +110,8 @@ def write_sog1(path: Path, scene: Gaussians) -> Path:
     meta["quats"] = {"shape": [count, 4], "encoding": "quaternion_packed", "files": ["quats.webp"]}
     pixels = {name: _grid(values, (side, 16)) for name, values in images.items()}
     if functions := scene.shN.shape[1]:
-        low, high = float(scene.shN.min()), float(scene.shN.max())
+        low = float(scene.shN.min())
+        high = float(scene.shN.max())
         levels = np.round((scene.shN.numpy() - low) / (high - low) * 255).astype(np.int64)
         labels = np.stack([np.arange(count) & 255, np.arange(count) >> 8, np.zeros(count, np.int64)], axis=1)
         rows = -(-count // 64)
@@ -146,9 +150,11 @@ def _grid(values: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
 
 def write_ksplat(path: Path, scene: Gaussians, level: int, per_bucket: int = 32, block: float = 20.0) -> Path:
     """As GaussianSplats3D writes it: one section; the last two buckets are partial ones."""
-    n, degree = len(scene), scene.sh_degree
+    n = len(scene)
+    degree = scene.sh_degree
     sizes = [per_bucket, n % per_bucket]
-    full, buckets = n // per_bucket - 1, n // per_bucket + 1
+    full = n // per_bucket - 1
+    buckets = n // per_bucket + 1
     of = np.arange(n) // per_bucket
     places = scene.means.numpy()
     centers = np.stack([places[of == b].mean(0) for b in range(buckets)]).astype("<f4")
@@ -166,7 +172,8 @@ def write_ksplat(path: Path, scene: Gaussians, level: int, per_bucket: int = 32,
         np.round((sh + 1.5) / 3 * 255).clip(0, 255).astype(np.uint8) if level == 2 else sh.astype(kind)
     )
     rows = np.concatenate([np.ascontiguousarray(c).view(np.uint8).reshape(n, -1) for c in columns], axis=1)
-    header, section = bytearray(4096), bytearray(1024)
+    header = bytearray(4096)
+    section = bytearray(1024)
     struct.pack_into("<BB", header, 0, 0, 1)
     struct.pack_into("<II", header, 4, 1, 1)
     struct.pack_into("<IIH", header, 12, n, n, level)

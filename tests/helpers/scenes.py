@@ -50,7 +50,8 @@ def orbit_camera(
     width: int = 40, height: int = 24, azimuth: float = 0.4, elevation: float = 0.3, distance: float = 4.0
 ) -> Camera:
     """A camera on a sphere around the origin (angles in radians, y down); vertical field of view 0.9."""
-    az, el = torch.tensor(azimuth).double(), torch.tensor(elevation).double()
+    az = torch.tensor(azimuth).double()
+    el = torch.tensor(elevation).double()
     eye = distance * torch.stack([az.sin() * el.cos(), -el.sin(), -az.cos() * el.cos()])
     viewmat = look_at(eye, torch.zeros(3), torch.tensor([0.0, -1.0, 0.0]))
     return Camera(viewmat, intrinsics(0.9, width, height), width, height)
@@ -140,7 +141,8 @@ def hard_cases() -> dict[str, HardCase]:
     add("opacity 0", one_gaussian(opacity=0.0))
     on_pixel = (0.5 / 30.0 * 2.0, 0.5 / 30.0 * 2.0, 2.0)  # projects onto a pixel center
     add("opacity exactly 1/255", one_gaussian(mean=on_pixel, opacity=1 / 255))
-    nan, inf = float("nan"), float("inf")
+    nan = float("nan")
+    inf = float("inf")
     for name, value in (("NaN", nan), ("inf", inf), ("-inf", -inf)):
         for attribute in ("means", "log_scales", "quats", "logit_opacities", "sh0"):
             tensor = getattr(plain, attribute).clone()
@@ -164,7 +166,9 @@ def hard_cases() -> dict[str, HardCase]:
         add(f"scale {scale:g} all around", one_gaussian(scales=(scale, scale, scale)))
     add("scale inf", concatenate(one_gaussian(scales=(inf, 0.1, 0.1)), plain), poisoned=(0,))
 
-    c, s = 0.9238795, 0.3826834  # half of 45 degrees
+    # half of 45 degrees
+    c = 0.9238795
+    s = 0.3826834
     diagonal = (c, 0.0, 0.0, s)
     for ratio in (5e3, 1e6):
         add(
@@ -254,7 +258,8 @@ def high_chair(count: int = 4000) -> Gaussians:
     part = draw.integers(0, 3, count)
     x, y, z = draw.uniform(-1.0, 1.0, (3, count))
     side_x, side_z = draw.choice([-1.0, 1.0], (2, count))
-    legs, back = part == 0, part == 2
+    legs = part == 0
+    back = part == 2
     x = np.where(legs, 0.5 * side_x, np.where(back, 0.1 * np.round(3 * x), 0.5 * x))
     z = np.where(legs, 0.5 * side_z, np.where(back, -0.45, 0.5 * z))
     y = np.where(legs, 0.5 * y - 0.5, np.where(back, 0.6 * y + 0.6, 0.02 * y))

@@ -18,7 +18,8 @@ from statistics import median
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("progdf", "trainer", "viewer")
 PAGE = ROOT / "docs" / "modules.md"
-BEGIN, END = "<!-- tree -->\n", "<!-- end tree -->\n"
+BEGIN = "<!-- tree -->\n"
+END = "<!-- end tree -->\n"
 _NO_CODE = (
     tokenize.COMMENT,
     tokenize.NL,
@@ -146,7 +147,8 @@ def tree() -> str:
 
 def with_tree(page: str) -> str:
     """A page with the tree between its markers."""
-    head, tail = page.split(BEGIN)[0], page.split(END)[1]
+    head = page.split(BEGIN)[0]
+    tail = page.split(END)[1]
     return f"{head}{BEGIN}{tree()}{END}{tail}"
 
 

@@ -22,8 +22,11 @@ from viewer.camera.view_camera import ViewCamera, first_camera
 from viewer.state.view_state import LayerState, ViewState
 
 NODES = torch.tensor([0.0, 0.25, 0.5, 0.75, 1.0])
-SCARF, EARS = 0, 1  # a change of color, and one of geometry and color
-GREEN, GOLD = (0.10, 0.62, 0.24), (0.90, 0.66, 0.15)
+# a change of color, and one of geometry and color
+SCARF = 0
+EARS = 1
+GREEN = (0.10, 0.62, 0.24)
+GOLD = (0.90, 0.66, 0.15)
 
 
 @dataclass(frozen=True)
@@ -87,7 +90,8 @@ def bear_stack(size: int = 4000) -> Stack:
     """The scene is the same every time; the recorded strengths are uneven, as in a real run."""
     demo = bear(size)
     scene = demo.gaussians
-    scarf, ears = demo.members("scarf"), demo.members("ears")
+    scarf = demo.members("scarf")
+    ears = demo.members("ears")
     center = scene.means[ears].mean(0)
     return Stack(
         demo,

@@ -53,7 +53,8 @@ def _timeless(report: Mapping[str, object]) -> dict[str, object]:
 
 def _killed_at_file(number: int) -> None:
     """Let this process kill itself at its N-th `os.replace`: before it where N is even, else after it."""
-    put, calls = os.replace, 0
+    put = os.replace
+    calls = 0
 
     def counting(source: str, target: str) -> None:
         nonlocal calls

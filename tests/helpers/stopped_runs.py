@@ -73,7 +73,8 @@ def stopped(interrupted: Path, elsewhere: None) -> None:
 
 def at_step(monkeypatch: pytest.MonkeyPatch, number: int, happens: Callable[[], object]) -> None:
     """Let something happen when the optimizer has done so many steps in this process."""
-    calls, done = 0, PeriodicSave.step_done
+    calls = 0
+    done = PeriodicSave.step_done
 
     def step_done(self: PeriodicSave) -> None:
         nonlocal calls

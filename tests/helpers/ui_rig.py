@@ -23,7 +23,8 @@ from viewer.state.view_state import LayerState, ViewState
 from viewer.ui.keys import NO_KEYS, Keys, Press
 
 STEP_S = 1.0 / 60.0
-HEAD, TRACK = 107.0, 131.0
+HEAD = 107.0
+TRACK = 131.0
 """Heights of the middle of the name, and of the slider, on the top card."""
 BACKGROUND = (0.749, 0.847, 0.945)
 
@@ -57,7 +58,8 @@ class Rig:
     """
 
     def __init__(self, main_view: MainView, points: tuple[int, int], density: float) -> None:
-        self.main_view, self.points = main_view, points
+        self.main_view = main_view
+        self.points = points
         self.pixels = (round(points[0] * density), round(points[1] * density))
         self.screen = main_view.context.simple_framebuffer(self.pixels)
         self._unpainted: imgui.ImDrawData | None = None

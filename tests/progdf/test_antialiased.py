@@ -106,7 +106,8 @@ def test_an_exported_edit_still_says_it(stack: Stack, tmp_path: Path) -> None:
 @pytest.mark.parametrize("engine", EVERY)
 def test_weights_count_what_is_drawn(stack: Stack, engine: str) -> None:
     """Σ w over all Gaussians is the share of a pixel that they cover, with the filter as without."""
-    scene, camera = stack.scene, to_camera(first_camera(stack.scene, stack.demo.cameras), 40, 30)
+    scene = stack.scene
+    camera = to_camera(first_camera(stack.scene, stack.demo.cameras), 40, 30)
     white = replace(scene, sh0=torch.full_like(scene.sh0, 1.7724539), shN=scene.shN[:, :0])
     covered = render(white, camera, (0.0, 0.0, 0.0)).image[..., 0].sum()
     weights = alpha_weights(scene, camera, torch.ones(30, 40), engine=engine)[:, 2].sum()
@@ -114,7 +115,8 @@ def test_weights_count_what_is_drawn(stack: Stack, engine: str) -> None:
 
 
 def test_training_views_show_what_is_drawn(stack: Stack) -> None:
-    scene, camera = stack.scene, to_camera(first_camera(stack.scene, stack.demo.cameras), *SIZE)
+    scene = stack.scene
+    camera = to_camera(first_camera(stack.scene, stack.demo.cameras), *SIZE)
     region = Region("all", torch.arange(len(scene)), torch.ones(len(scene)))
     expected = render(scene, camera, WHITE).image.clamp(0.0, 1.0)
     view = make_view(scene, region, camera, WHITE)

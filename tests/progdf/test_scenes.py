@@ -33,7 +33,8 @@ def _same(a: Gaussians, b: Gaussians) -> bool:
 @pytest.mark.parametrize("size", [scenes.SMALLEST, 401, 5003])
 def test_the_bear_has_exactly_the_size_asked_for_and_leaves_torch_as_it_was(size: int) -> None:
     torch.manual_seed(5)
-    before, threads = torch.get_rng_state(), torch.get_num_threads()
+    before = torch.get_rng_state()
+    threads = torch.get_num_threads()
     scene = scenes.bear(size)
     assert torch.equal(before, torch.get_rng_state())
     assert torch.get_num_threads() == threads
@@ -135,7 +136,8 @@ def test_the_bear_has_no_holes_seen_from_its_cameras(bear: scenes.DemoScene) -> 
 
 
 def test_the_first_camera_sees_the_face(bear: scenes.DemoScene) -> None:
-    front, back = bear.cameras[0], bear.cameras[16]
+    front = bear.cameras[0]
+    back = bear.cameras[16]
     assert float(front.position[2]) > 2
     assert abs(float(front.position[0])) < 1e-4
     assert float(back.position[2]) < -2
@@ -183,7 +185,8 @@ def test_an_analytic_edit_leaves_other_rows_and_strength_zero_alone(
 
 
 def test_growing_doubles_sizes_and_distances_from_the_pivot(bear: scenes.DemoScene) -> None:
-    ears, pivot = bear.members("ears"), torch.tensor([[0.0, 1.0, 0.0]])
+    ears = bear.members("ears")
+    pivot = torch.tensor([[0.0, 1.0, 0.0]])
     edited = analytic_edits.scale_edit(3.0, pivot).apply(bear.gaussians, ears, 0.5)
     before = bear.gaussians[ears]
     assert torch.allclose(edited.means[ears] - pivot, 2 * (before.means - pivot), atol=1e-5)
@@ -191,7 +194,8 @@ def test_growing_doubles_sizes_and_distances_from_the_pivot(bear: scenes.DemoSce
 
 
 def test_swinging_is_a_rigid_turn(bear: scenes.DemoScene) -> None:
-    ears, pivot = bear.members("ears"), torch.tensor([[0.0, 1.0, 0.0]])
+    ears = bear.members("ears")
+    pivot = torch.tensor([[0.0, 1.0, 0.0]])
     edit = analytic_edits.swing_edit(180.0, torch.tensor([0.0, 0.0, 2.0]), pivot)
     half = edit.apply(bear.gaussians, ears, 0.5)[ears]
     arm = bear.gaussians.means[ears] - pivot
@@ -216,7 +220,8 @@ def test_a_deformation_that_is_a_turn_or_a_growth_looks_like_one(bear: scenes.De
 
     def turned(places: torch.Tensor, s: float) -> torch.Tensor:
         x, y, z = (places - pivot).unbind(1)
-        c, d = math.cos(s * math.radians(30)), math.sin(s * math.radians(30))
+        c = math.cos(s * math.radians(30))
+        d = math.sin(s * math.radians(30))
         return pivot + torch.stack([x, c * y - d * z, d * y + c * z], dim=1)
 
     def larger(places: torch.Tensor, s: float) -> torch.Tensor:
@@ -236,8 +241,10 @@ def test_a_deformation_that_is_a_turn_or_a_growth_looks_like_one(bear: scenes.De
 def test_stretching_keeps_what_lies_across_and_bending_keeps_distances_from_the_pivot(
     bear: scenes.DemoScene,
 ) -> None:
-    ears, pivot = bear.members("ears"), torch.tensor([0.0, 1.0, 0.0])
-    up, side = torch.tensor([0.0, 2.0, 0.0]), torch.tensor([1.0, 0.0, 0.0])
+    ears = bear.members("ears")
+    pivot = torch.tensor([0.0, 1.0, 0.0])
+    up = torch.tensor([0.0, 2.0, 0.0])
+    side = torch.tensor([1.0, 0.0, 0.0])
     before = bear.gaussians.means[ears]
     long = analytic_edits.stretch_edit(3.0, up, pivot).apply(bear.gaussians, ears, 0.5).means[ears]
     assert torch.allclose(long[:, [0, 2]], before[:, [0, 2]], atol=1e-6)
@@ -268,7 +275,8 @@ def test_the_pandas_picture_changes_the_coat_and_keeps_face_scarf_and_ground(bea
 
     picture = render(bear.gaussians, camera, bear.background).image.clamp(0, 1)
     painted = scenes.paint_panda(picture, camera, cover)
-    limbs, trunk = cover(("ears", "arms", "legs")) > 0.98, cover(("body",)) > 0.98
+    limbs = cover(("ears", "arms", "legs")) > 0.98
+    trunk = cover(("body",)) > 0.98
     assert float(painted[limbs].mean()) < 0.3
     assert float(picture[limbs].mean()) > 0.4
     assert float(painted[trunk].mean()) > 0.8
@@ -287,7 +295,8 @@ def test_a_strength_outside_its_range_is_refused(bear: scenes.DemoScene, strengt
 
 
 def test_which_of_parts_of_one_size_gets_the_gaussian_that_is_left_does_not_hang_on_rounding() -> None:
-    random, counts = np.random.default_rng(0), set()
+    random = np.random.default_rng(0)
+    counts = set()
     for _ in range(6):
         radii = 0.2 * (1.0 + 1e-7 * random.integers(-2, 3, 3))
         balls = [

@@ -26,7 +26,8 @@ def rotate_bands(shN: torch.Tensor, quats: torch.Tensor) -> torch.Tensor:
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_what_was_seen_along_a_direction_is_seen_along_the_turned_one(degree: int) -> None:
-    quats, shN = turns(), bands(degree)
+    quats = turns()
+    shN = bands(degree)
     sh0 = 2.0 * torch.ones(COUNT, 1, 3)  # so that nothing is clamped at 0
     directions = torch.nn.functional.normalize(Draws(2).normal(COUNT, 3), dim=1)
     before = shade(degree, directions.double(), torch.cat([sh0, shN], dim=1).double())
@@ -36,7 +37,9 @@ def test_what_was_seen_along_a_direction_is_seen_along_the_turned_one(degree: in
 
 
 def test_one_turn_after_another_is_their_product() -> None:
-    first, second, shN = turns(3), turns(4), bands(3)
+    first = turns(3)
+    second = turns(4)
+    shN = bands(3)
     there = rotate_bands(rotate_bands(shN, first), second)
     torch.testing.assert_close(there, rotate_bands(shN, multiply_quats(second, first)), rtol=0.0, atol=2e-6)
 

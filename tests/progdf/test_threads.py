@@ -61,7 +61,8 @@ def test_a_caller_is_not_kept_waiting_by_a_pool_that_is_busy() -> None:
 
 
 def test_an_error_in_any_thread_reaches_the_caller_when_all_are_done() -> None:
-    met, done = threading.Barrier(2, timeout=60), []
+    met = threading.Barrier(2, timeout=60)
+    done = []
 
     def fail(chunk: int) -> None:
         if chunk < 2:
@@ -98,7 +99,8 @@ def test_python_ends_after_threads_have_drawn() -> None:
 @pytest.mark.parametrize("count", [1, 2])
 def test_what_was_cancelled_stops_between_two_chunks(count: int) -> None:
     set_threads(count)
-    stop, done = threading.Event(), []
+    stop = threading.Event()
+    done = []
 
     def one(chunk: int) -> None:
         done.append(chunk)

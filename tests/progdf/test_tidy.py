@@ -24,7 +24,8 @@ from progdf.similarity import Motion
 from progdf.tidy import Step, bake, similarity, tidy
 from tests.helpers.scenes import front_camera, orbit_camera, random_gaussians
 
-BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
+BLACK = (0.0, 0.0, 0.0)
+WHITE = (1.0, 1.0, 1.0)
 TURN = (0.3, -1.1, 0.4)
 ROUNDING = 1 / 255
 """A step of 8 bits: ends are kept in 16 bits of the farthest way, what lies between to a three-hundredth."""
@@ -79,14 +80,13 @@ def test_what_is_removed_is_gone_on_white_black_and_checker() -> None:
     scene = checker(scene_of())
     region = left_half(scene)
     region = Region("left", region.members[region.members < COUNT], region.score)
-    removed, without = (
-        at(scene, tidy(scene, [Step("remove", region)], "gone"), 1.0),
-        scene[outside(scene, region)],
-    )
+    removed = at(scene, tidy(scene, [Step("remove", region)], "gone"), 1.0)
+    without = scene[outside(scene, region)]
     for background in (WHITE, BLACK):
         for camera in (front_camera(96, 64, 60.0), orbit_camera(96, 64, azimuth=2.0)):
             there = picture(scene, background, camera)
-            gone, reference = picture(removed, background, camera), picture(without, background, camera)
+            gone = picture(removed, background, camera)
+            reference = picture(without, background, camera)
             assert float((there - reference).abs().max()) > 0.1
             # the last rows of a tensor are activated by another loop than the others: an ulp
             assert float((gone - reference).abs().max()) < 1e-5
@@ -112,7 +112,8 @@ def test_strength_zero_is_the_scene_and_rows_outside_are_never_touched(does: str
         "transform": lambda: tidy(scene, [Step("transform", region, motion)], "a"),
         "duplicate": lambda: tidy(scene, [Step("duplicate", region, motion)], "a"),
     }[does]()
-    start, mask = at(scene, gdf, 0.0), outside(scene, region)
+    start = at(scene, gdf, 0.0)
+    mask = outside(scene, region)
     for name in ATTRIBUTES:
         assert torch.equal(getattr(start, name)[: len(scene)], getattr(scene, name))
         for s in (0.3, 1.0):
@@ -126,7 +127,8 @@ def moved_camera(camera: Camera, center: Tensor, motion: Motion) -> Camera:
     """The camera that sees what has moved as the given one saw what was there; it must not be scaled."""
     turn = rotation_matrices(turn_quats(motion.turn))[0]
     # x' = c + t + R (x − c), so that x = Rᵀ (x' − c − t) + c
-    back, offset = turn.T, center - turn.T @ (center + motion.shift[0])
+    back = turn.T
+    offset = center - turn.T @ (center + motion.shift[0])
     view = camera.viewmat.double().clone()
     view[:3, 3] = view[:3, :3] @ offset + view[:3, 3]
     view[:3, :3] = view[:3, :3] @ back
@@ -167,7 +169,8 @@ def test_a_copy_in_place_is_the_region_twice(degree: int) -> None:
     end = at(scene, gdf, 1.0)
     assert len(end) == len(scene) + len(region)
     for name in ATTRIBUTES:
-        added, original = getattr(end, name)[len(scene) :], getattr(scene, name)[region.members]
+        added = getattr(end, name)[len(scene) :]
+        original = getattr(scene, name)[region.members]
         assert (
             torch.allclose(added, original, atol=1e-3)
             if name == "logit_opacities"
@@ -177,7 +180,8 @@ def test_a_copy_in_place_is_the_region_twice(degree: int) -> None:
 
 def test_copies_go_where_the_motion_takes_the_region_itself() -> None:
     scene = scene_of(degree=3)
-    region, motion = left_half(scene), similarity((0.2, 0.1, 0.0), TURN, 1.3)
+    region = left_half(scene)
+    motion = similarity((0.2, 0.1, 0.0), TURN, 1.3)
     copy = tidy(scene, [Step("duplicate", region, motion)], "copy").added
     assert copy is not None
     moved = bake(scene, [Step("transform", region, motion)])[region.members]
@@ -194,7 +198,8 @@ def test_what_is_baked_is_the_slider_at_its_end() -> None:
         Step("duplicate", left, similarity((0.0, 0.0, 1.0))),
         Step("remove", low),
     ]
-    end, baked = at(scene, tidy(scene, steps, "all"), 1.0), bake(scene, steps)
+    end = at(scene, tidy(scene, steps, "all"), 1.0)
+    baked = bake(scene, steps)
     drawn = end[end.opacities >= ALPHA_MIN]
     kept = baked[baked.opacities >= ALPHA_MIN]
     assert len(drawn) == len(kept)
@@ -235,7 +240,8 @@ def test_the_command_writes_a_slider(ply: Path, tmp_path: Path) -> None:
     assert main(["edit", str(ply), *arguments, "-o", str(out)]) == 0
     scene = load_ply(ply)
     gdf = load_gdf(out, scene)
-    means, rows = at(scene, gdf, 1.0).means[gdf.region.members], scene.means[gdf.region.members]
+    means = at(scene, gdf, 1.0).means[gdf.region.members]
+    rows = scene.means[gdf.region.members]
     arm = rows - rows.mean(dim=0)
     expected = (
         rows.mean(dim=0) + 2 * torch.stack([arm[:, 2], arm[:, 1], -arm[:, 0]], 1) + torch.tensor([0, -1.0, 0])

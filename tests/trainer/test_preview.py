@@ -107,7 +107,8 @@ def test_what_would_paint_a_sentence_is_said_and_painted_only_when_it_is_asked_f
     for package in ("diffusers", "transformers", "accelerate"):
         pytest.importorskip(package, reason="pip install progdf-studio[diffusion]")
     model = str(tiny_instruct_pix2pix(tmp_path / "pix2pix"))
-    previewer, asked = Previewer(scene, tmp_path / "kept"), {"editor": "instruct:paint it", "model": model}
+    previewer = Previewer(scene, tmp_path / "kept")
+    asked = {"editor": "instruct:paint it", "model": model}
     told = answer(previewer, request(0, tmp_path, seed=-1, **asked))
     assert (told.error, told.made) == ("", "note")
     assert told.note == f"{model} on the CPU in float32; 20 calls of its network a picture"

@@ -44,7 +44,8 @@ class BatchJob:
     @property
     def command(self) -> str:
         """The command that does the same alone, to be run in `folder`."""
-        options, words = self.options, ["progdf", "train", str(self.options.scene)]
+        options = self.options
+        words = ["progdf", "train", str(self.options.scene)]
         default = apply_preset(BLANK, options.preset)
         usual = {name: value for name, _, value in flat_values(replace(default, preset="default"))}
         for name, typed, value in flat_values(options):
@@ -71,7 +72,9 @@ def read_catalogue(path: Path, out: Path) -> tuple[list[BatchJob], list[str]]:
         table = tomllib.loads(content.decode())
     except (ValueError, RecursionError) as error:
         raise ProgdfError(f"{path} is not a TOML file ({error})") from None
-    folder, jobs, faults = path.resolve().parent, list[BatchJob](), list[str]()
+    folder = path.resolve().parent
+    jobs = list[BatchJob]()
+    faults = list[str]()
     try:
         for key, values in _entries(table):
             try:
@@ -93,7 +96,8 @@ def read_catalogue(path: Path, out: Path) -> tuple[list[BatchJob], list[str]]:
 def _entries(table: Mapping[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
     """Key and options of every job, with what the catalogue says for all, for a scene, and by the sweep."""
     _check_keys(table, ("defaults", "scenes", "sweep"), "the catalogue")
-    defaults, sweep = _table(table, "defaults"), _table(table, "sweep")
+    defaults = _table(table, "defaults")
+    sweep = _table(table, "sweep")
     for name, values in sweep.items():
         if not isinstance(values, list) or not values:
             raise ProgdfError(f"[sweep] {name} must be a list of values")
@@ -206,7 +210,8 @@ def estimate_cost(options: TrainOptions, gaussians: int, members: int) -> Cost:
         members: of the region
     """
     options = resolve(options)
-    views, side = options.views.views or VIEWS, options.views.image_size or 256
+    views = options.views.views or VIEWS
+    side = options.views.image_size or 256
     strengths = options.optimize.stages or MOST_STAGES
     pixels = views * side * side
     return Cost(

@@ -32,12 +32,14 @@ Status = Literal["done", "failed", "stopped", "memory", "waiting"]
 SOME_FAILED = 3
 """Exit status."""
 
-CSV, PAGE = "batch.csv", "batch.html"
+CSV = "batch.csv"
+PAGE = "batch.html"
 PREVIEW = "preview.jpg"
 """Of a run's folder: the edit at one half and at 1, side by side."""
 _LINES = 12  # of running jobs on a terminal
 _EVENT_S = 2.0  # between two progress events
-_SPARK_WIDTH, _SPARK_HEIGHT = 96, 28
+_SPARK_WIDTH = 96
+_SPARK_HEIGHT = 28
 _MOST_EMBEDDED = 1000  # pictures in the page itself, some 15 kB each; beyond, it shows those of its folder
 
 
@@ -281,7 +283,8 @@ def _sparkline(course: Sequence[tuple[float, float]]) -> str:
     """PSNR over the slider as a small curve; its height is what this row spans, at least 3 dB."""
     if len(course) < 2:
         return ""
-    low, high = min(p for _, p in course), max(p for _, p in course)
+    low = min(p for _, p in course)
+    high = max(p for _, p in course)
     span = max(high - low, 3.0)
     points = " ".join(
         f"{2 + s * (_SPARK_WIDTH - 4):.1f},{2 + (high - psnr) / span * (_SPARK_HEIGHT - 4):.1f}"
@@ -310,11 +313,15 @@ class Screen:
         workers: int,
         events: TextIO | None = None,
     ) -> None:
-        self._jobs, self._seconds, self._workers, self._events = jobs, seconds, workers, events
+        self._jobs = jobs
+        self._seconds = seconds
+        self._workers = workers
+        self._events = events
         self._console = Console(stderr=True, highlight=False, quiet=events is not None)
         self._live = Live(console=self._console, auto_refresh=False, transient=True)
         self._rows: list[JobRow] = []
-        self._begun, self._told = time.monotonic(), 0.0
+        self._begun = time.monotonic()
+        self._told = 0.0
 
     def say(self, line: str) -> None:
         """One line."""
@@ -339,7 +346,8 @@ class Screen:
         self._told = time.monotonic()
         states = {key: _read_progress(self._jobs[key]) for key in running[:_LINES]}
         remaining = self._remaining(running)
-        ended, failed = len(self._rows), sum(row.status == "failed" for row in self._rows)
+        ended = len(self._rows)
+        failed = sum(row.status == "failed" for row in self._rows)
         self.event("progress", running=plain(states), ended=ended, failed=failed, seconds_left=remaining)
         if live:
             lines = [f"  {key:<40} {_state(state)}" for key, state in states.items()]
@@ -350,8 +358,10 @@ class Screen:
 
     def total(self, rows: Sequence[JobRow], out: Path) -> int:
         """What became of all that was asked for; the exit status."""
-        statuses, seconds = [row.status for row in rows], time.monotonic() - self._begun
-        done, failed = statuses.count("done"), statuses.count("failed")
+        statuses = [row.status for row in rows]
+        seconds = time.monotonic() - self._begun
+        done = statuses.count("done")
+        failed = statuses.count("failed")
         self.event("total", done=done, failed=failed, jobs=len(rows), seconds=seconds)
         self.say(
             f"{done} of {format_count(len(rows), 'job')} done{f', {failed} failed' if failed else ''} "

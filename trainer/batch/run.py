@@ -109,7 +109,8 @@ class LocalPool:
             cast(BinaryIO, self._worker.stdin).flush()
             return pickle.load(cast(BinaryIO, self._worker.stdout))
         except (EOFError, OSError, pickle.UnpicklingError):
-            code, self._worker = self._worker.wait(), None
+            code = self._worker.wait()
+            self._worker = None
             return Lost(f"its worker ended ({signal.Signals(-code).name if code < 0 else f'status {code}'})")
 
     def stop(self) -> None:
@@ -146,7 +147,8 @@ class RayPool:
             hint = "; where the cluster asks for a token, RAY_AUTH_MODE=token sends it" if address else ""
             reason = str(error).partition("\n")[0] or type(error).__name__
             raise ProgdfError(f"Ray cannot be used ({reason}){hint}") from error
-        self._looked, self._cpus = 0.0, 0
+        self._looked = 0.0
+        self._cpus = 0
         machines = [node["Resources"] for node in ray.nodes() if node["Alive"]]
         self._memory = max(machine.get("memory", 0.0) for machine in machines)
         self._has_gpu = any(machine.get("GPU") for machine in machines)
@@ -245,14 +247,16 @@ def run_tasks(
     Yields:
         task and result as they come, `Lost` where a task was given up.
     """
-    waiting, running = deque(tasks), dict[Future[Any], Task]()
+    waiting = deque(tasks)
+    running = dict[Future[Any], Task]()
     while waiting or running:
         while waiting and _may_start(waiting[0], running, pool):
             task = waiting.popleft()
             tell("start", task, "")
             running[pool.submit(task)] = task
         for future in wait(running, 0.5, FIRST_COMPLETED).done:
-            task, result = running.pop(future), _result(future)
+            task = running.pop(future)
+            result = _result(future)
             lost = isinstance(result, Lost) and not (task.alone and result.from_memory)
             if lost and task.attempt < MOST_ATTEMPTS:
                 tell("retry", task, result.reason)
@@ -481,7 +485,8 @@ def _disk_faults(out: Path, costs: Mapping[str, Cost]) -> list[str]:
     folder = out.absolute()
     while not folder.is_dir():
         folder = folder.parent
-    needed, free = sum(cost.disk for cost in costs.values()), shutil.disk_usage(folder).free
+    needed = sum(cost.disk for cost in costs.values())
+    free = shutil.disk_usage(folder).free
     if needed <= free:
         return []
     return [f"{out}: the runs will take about {file_size(needed)}, and {file_size(free)} are free"]

@@ -88,7 +88,8 @@ def _scene(options: TrainOptions) -> Gaussians:
 
 def run_job(job: BatchJob) -> JobRow:
     """Train a job in this process, or go on with it where it was stopped; a finished one is left as it is."""
-    begun, cpu_begun = time.perf_counter(), time.process_time()
+    begun = time.perf_counter()
+    cpu_begun = time.process_time()
     try:
         with chdir(job.folder):
             _train(job)
@@ -112,7 +113,8 @@ def run_job(job: BatchJob) -> JobRow:
 def _train(job: BatchJob) -> None:
     with suppress(OSError):  # Linux: the peak that report.json tells is this job's, not that of those before
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
-    options, folder = job.options, RunFolder(job.options.out)
+    options = job.options
+    folder = RunFolder(job.options.out)
     if is_locked(folder.root / LOCK):
         with hold_lock(folder.root / LOCK, _LOCK_WAIT_S):
             pass

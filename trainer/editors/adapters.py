@@ -25,10 +25,12 @@ from trainer.store.pretrained import BROKEN, folder_of_model, gpu_memory, model_
 
 from .mixed_steps import MixedSteps, euler_scheduler
 
-_MULTIPLE, _LEAST = 32, 64  # pixels: what every pipeline's autoencoder and patches divide; its least side
+_MULTIPLE = 32  # pixels: what every pipeline's autoencoder and patches divide
+_LEAST = 64  # its least side
 _LARGE = 2e9  # parameters from which painting on a CPU takes days
 # bytes beside the weights: FLUX.1-dev takes 36.2 GB at 1024² with its 31.4, klein 20 with its 16
-_WORKING, _WORKING_PER_MEGAPIXEL = 1e9, 3e9
+_WORKING = 1e9
+_WORKING_PER_MEGAPIXEL = 3e9
 _NF4 = 0.55  # bytes a parameter, with its scales
 
 
@@ -282,7 +284,9 @@ def place(request: PipelineRequest, device: Device) -> DevicePlan:
     Raises:
         ProgdfError: weights or a package are not here, or it is too large for a CPU that nobody asked for.
     """
-    model, adapter, sizes = request.model, request.adapter, component_sizes(request.model, request.adapter)
+    model = request.model
+    adapter = request.adapter
+    sizes = component_sizes(request.model, request.adapter)
     if request.quantize == "nf4" and find_spec("bitsandbytes") is None:
         raise ProgdfError(
             "--quantize nf4 needs the package bitsandbytes; pip install progdf-studio[quantize]"
@@ -302,7 +306,8 @@ def place(request: PipelineRequest, device: Device) -> DevicePlan:
     assert memory is not None
     whole, in_turn = memory_need(adapter, sizes, request.quantize, request.size)
     is_half = adapter.is_stable or not torch.cuda.is_bf16_supported(including_emulation=False)
-    dtype, is_tight = torch.float16 if is_half else torch.bfloat16, memory[0] < whole
+    dtype = torch.float16 if is_half else torch.bfloat16
+    is_tight = memory[0] < whole
     return DevicePlan("cuda", dtype, is_tight, in_turn if is_tight else whole, memory[0])
 
 
@@ -330,7 +335,8 @@ def load_pipeline(request: PipelineRequest, placement: DevicePlan) -> MixedSteps
     from transformers.utils import logging as transformers_logging
 
     pretrained.keep_quiet(diffusers_logging, transformers_logging)
-    adapter, loading = request.adapter, dict(request.adapter.loading)
+    adapter = request.adapter
+    loading = dict(request.adapter.loading)
     if request.quantize == "nf4":
         bits = {"load_in_4bit": True, "bnb_4bit_quant_type": "nf4", "bnb_4bit_compute_dtype": placement.dtype}
         large = [name for name in component_sizes(request.model, adapter) if name != "vae"]

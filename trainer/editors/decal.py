@@ -52,7 +52,9 @@ def parse_place(text: str, camera: Camera) -> DecalPlacement:
         raise ProgdfError(f"--at: the size must be more than 0, got {size:g}")
     if max(abs(x), abs(y), size) <= 1.0:
         longer = max(camera.width, camera.height)
-        x, y, size = x * camera.width, y * camera.height, size * longer
+        x = x * camera.width
+        y = y * camera.height
+        size = size * longer
     if not (
         0 <= x <= camera.width and 0 <= y <= camera.height and size <= 16 * (camera.width + camera.height)
     ):
@@ -104,8 +106,10 @@ def draw_decal(path: Path, place: DecalPlacement, camera: Camera) -> Tensor:
     rows, columns = torch.meshgrid(
         torch.arange(camera.height) + 0.5 - place.y, torch.arange(camera.width) + 0.5 - place.x, indexing="ij"
     )
-    cosine, sine = math.cos(math.radians(place.angle)), math.sin(math.radians(place.angle))
-    across, down = columns * cosine - rows * sine, columns * sine + rows * cosine
+    cosine = math.cos(math.radians(place.angle))
+    sine = math.sin(math.radians(place.angle))
+    across = columns * cosine - rows * sine
+    down = columns * sine + rows * cosine
     return sample_image(image, across + 0.5 * width, down + 0.5 * height)
 
 
@@ -139,7 +143,9 @@ def decal(given: EditorInput) -> DecalEditor:
     Raises:
         ProgdfError: the picture, the place or the camera will not do, or nothing lies on the region.
     """
-    scene, region, options = given.scene, given.region, given.options
+    scene = given.scene
+    region = given.region
+    options = given.options
     camera = decal_camera(options.camera, scene.origin)
     place = parse_place(options.at, camera)
     if (shrunk := _MOST_SIDE / place.size) < 1.0:

@@ -63,7 +63,8 @@ class InstructEditor:
     @property
     def note(self) -> str:
         """What will paint, where, and what that takes; for the log."""
-        request, unread = self.request, unread_words(self.request)
+        request = self.request
+        unread = unread_words(self.request)
         line = f"{request.model} {self.placement.line()}; {self.calls((1.0,))} calls of its network a picture"
         return f"{line}; it does not read the end of the sentence: “{unread}”" if unread else line
 
@@ -75,10 +76,13 @@ class InstructEditor:
     def frame(self, view: View) -> tuple[Crop, Camera]:
         """The box of a view that is painted, in its pixels, and the camera that pictures it for the model."""
         x0, y0, x1, y1 = region_box(view.mask, margin=0)
-        across, down = round(_MARGIN / 2 * (x1 - x0)), round(_MARGIN / 2 * (y1 - y0))
+        across = round(_MARGIN / 2 * (x1 - x0))
+        down = round(_MARGIN / 2 * (y1 - y0))
         camera = view.camera
-        x0, x1 = max(0, x0 - across), min(camera.width, x1 + across)
-        y0, y1 = max(0, y0 - down), min(camera.height, y1 + down)
+        x0 = max(0, x0 - across)
+        x1 = min(camera.width, x1 + across)
+        y0 = max(0, y0 - down)
+        y1 = min(camera.height, y1 + down)
         width, height = self.request.adapter.paint_size(x1 - x0, y1 - y0, self.request.size)
         shift = torch.tensor([[0.0, 0.0, x0], [0.0, 0.0, y0], [0.0, 0.0, 0.0]])
         box = replace(camera, K=camera.K - shift, width=x1 - x0, height=y1 - y0)

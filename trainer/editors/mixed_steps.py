@@ -47,7 +47,9 @@ class MixedSteps:
     def __init__(self, pipeline: Any, encodes_alone: bool) -> None:
         self.pipeline = pipeline
         self.calls = 0  # of the network, so far
-        self._strength, self._softness, self._step = 1.0, 1.0, 0
+        self._strength = 1.0
+        self._softness = 1.0
+        self._step = 0
         self._source: Tensor | None = None  # latents that strength 0 ends in, as the pipeline packs them
         self.latents: Tensor | None = None  # of the pictures that the last call was given, as packed
         self._encoding = False
@@ -99,7 +101,9 @@ class MixedSteps:
         return (mixed + (1.0 - strength) * (source - decoded)).clamp(0.0, 1.0)
 
     def _run(self, arguments: Mapping[str, object], strength: float, softness: float) -> Tensor:
-        self._strength, self._softness, self._step = strength, softness, 0
+        self._strength = strength
+        self._softness = softness
+        self._step = 0
         try:
             images: Tensor = self.pipeline(**arguments, output_type="pt").images
         finally:
@@ -163,7 +167,8 @@ class MixedSteps:
         sigma: Tensor = scheduler.sigmas[self._step].to(sample.device)
         if getattr(scheduler.config, "prediction_type", "") == "v_prediction":
             root = (sigma**2 + 1).sqrt()
-            sample, source = sample / root, source * root
+            sample = sample / root
+            source = source * root
         return (sample - source) / sigma
 
 

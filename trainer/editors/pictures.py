@@ -65,7 +65,8 @@ class PicturesEditor:
         given = self.given[view.camera.name]
         if strength in given:
             return given[strength]
-        before, after = max(s for s in given if s < strength), min(s for s in given if s > strength)
+        before = max(s for s in given if s < strength)
+        after = min(s for s in given if s > strength)
         share = (strength - before) / (after - before)
         return interpolate_colors(given[before], given[after], share, self.bends[after])
 
@@ -88,7 +89,8 @@ def pictures(given: EditorInput) -> PicturesEditor:
         | {s: read_edit(given.scene, view.camera, view.image, path) for s, path in some.items()}
         for view, some in zip(given.views, found, strict=True)
     }
-    bends, ways = {}, list(pairwise((0.0, *stages)))
+    bends = {}
+    ways = list(pairwise((0.0, *stages)))
     for before, after in ways:
         first, last = (torch.cat([some[s] for some in images.values()]) for s in (before, after))
         weights = (last - first).norm(dim=2)
@@ -189,7 +191,8 @@ def read_change(scene: Gaussians, path: Path, camera: Camera) -> tuple[Tensor, T
     Raises:
         ProgdfError: it is missing or broken.
     """
-    picture, run = read_picture(path), torch.tensor(BACKGROUND)
+    picture = read_picture(path)
+    run = torch.tensor(BACKGROUND)
     size = (picture.shape[1], picture.shape[0])
     drawn, clear = _draw(scene, camera)
     background = background_of(picture, resize_image(drawn, size), resize_image(clear, size), save_as(path))

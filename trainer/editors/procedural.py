@@ -83,14 +83,17 @@ class StripesEditor(ProceduralEditor):
 
     def course(self, view: View) -> Callable[[float], Tensor]:
         """See `ProceduralEditor`; rendered where the region shows."""
-        scene, members, camera = self.scene, self.members, view.camera
+        scene = self.scene
+        members = self.members
+        camera = view.camera
         paint = self.paint(seen_colors(scene[members], camera))
         x0, y0, x1, y1 = box = region_box(view.mask, 0, 0.0)
 
         def edit(strength: float) -> Tensor:
             if strength == 0.0:
                 return view.image
-            colors, inside = torch.zeros(len(scene), 3), view.inside.clone()
+            colors = torch.zeros(len(scene), 3)
+            inside = view.inside.clone()
             colors[members] = paint(strength)
             drawn = render_colors(scene, colors, camera, torch.zeros(3), box)
             share = view.mask[y0:y1, x0:x1, None].clamp_min(1e-4)

@@ -72,7 +72,8 @@ def cross_fade(plain: Tensor, painted: Tensor, strength: float) -> Tensor:
     if strength in (0.0, 1.0):
         return painted if strength else plain
     fade = torch.lerp(plain, painted, strength)
-    coarse, target = smooth(fade), torch.lerp(_contrast(plain), _contrast(painted), strength)
+    coarse = smooth(fade)
+    target = torch.lerp(_contrast(plain), _contrast(painted), strength)
     gain = (target / _contrast(fade).clamp_min(1e-4)).clamp(1.0, 2.0)
     return (coarse + gain * (fade - coarse)).clamp(0.0, 1.0)
 

@@ -41,7 +41,8 @@ _SPAN = (0.0, 1.0)
 def evaluation_picture(opened: OpenedRun, evaluation: Evaluation) -> Tensor:
     """Thumbnails over curves. -> [H,W,3]"""
     evaluator = opened.evaluator
-    columns, best = columns_of(opened.trajectory.stage_strengths), best_view(evaluator)
+    columns = columns_of(opened.trajectory.stage_strengths)
+    best = best_view(evaluator)
     strips = {
         name: [thumbnail(pictures(s)[best], _THUMBNAIL) for s, _ in columns]
         for name, pictures in opened.contenders().items()
@@ -83,7 +84,8 @@ def _warp_sheet(pair: WarpedPair) -> Tensor:
 
 def _plots(evaluation: Evaluation) -> list[list[Plot]]:
     lpips = "LPIPS" if evaluation.perceptual.startswith("lpips") else evaluation.perceptual
-    curves, paths = evaluation.curves, evaluation.paths
+    curves = evaluation.curves
+    paths = evaluation.paths
     psnr = {name: (curve.s, curve.psnr) for name, curve in curves.items()}
     perceptual = {name: (curve.s, curve.lpips) for name, curve in curves.items()}
     steps = {name: (middles(len(path.steps)), path.steps) for name, path in paths.items()}

@@ -26,7 +26,9 @@ from trainer.views.view import View, crop, make_view, render_view
 
 from .opened import OpenedRun
 
-EDITED, EDITOR, UNEDITED = "slider", "the editor", "unedited"
+EDITED = "slider"
+EDITOR = "the editor"
+UNEDITED = "unedited"
 """Whose pictures are warped: the finished edit's, the editor's own, the original's, which is the floor."""
 
 _LEAST_SHARED = 0.1  # of a view's counted pixels that another must see, or the two are not compared
@@ -64,7 +66,9 @@ def view_consistency(opened: OpenedRun, perceptual: Perceptual) -> Consistency:
     Compared are the pixels that count (see `Evaluator`) and whose surface both views see, before the edit and
     after it; the others are taken from the target, so that they differ in nothing.
     """
-    scene, background, targets = opened.run.scene, opened.setup.background, opened.setup.judging
+    scene = opened.run.scene
+    background = opened.setup.background
+    targets = opened.setup.judging
     names = {view.camera.name for view in targets}
     views = [*targets, *(view for view in opened.setup.train if view.camera.name not in names)]
     edited = edited_scene(opened.setup.scene, opened.gdf)
@@ -88,7 +92,8 @@ def view_consistency(opened: OpenedRun, perceptual: Perceptual) -> Consistency:
             best = pair if best is None or pair.shared > best.shared else best
         if best is not None and best.shared >= _LEAST_SHARED:
             pairs.append(best)
-    lpips, decibels = {}, {}
+    lpips = {}
+    decibels = {}
     for whose in pictures_by_side:
         compared = [pair.pictures[whose] for pair in pairs]
         with torch.no_grad():
@@ -103,7 +108,8 @@ def view_consistency(opened: OpenedRun, perceptual: Perceptual) -> Consistency:
 def outside_change(opened: OpenedRun) -> dict[str, float]:
     """Mean absolute change of the pixels in the held-out boxes that show the region neither before the edit
     nor after it, 0..1: of the finished edit, and of what the editor made."""
-    views, evaluator = opened.setup.judging, opened.evaluator
+    views = opened.setup.judging
+    evaluator = opened.evaluator
     edited = edited_scene(opened.setup.scene, opened.gdf)
     after = [make_view(edited, opened.setup.region, view.camera, opened.setup.background) for view in views]
     boxes = [scene.box for scene in evaluator.crops]
@@ -127,7 +133,8 @@ def _warp(
     source: int,
     target: int,
 ) -> WarpedPair:
-    box, counted = evaluator.crops[target].box, evaluator.pixels[target]
+    box = evaluator.crops[target].box
+    counted = evaluator.pixels[target]
     warped = {w: warp_view(whole[w][source], seen[w][source], seen[w][target]) for w in whole}
     both = counted.clone()
     for _, visible in warped.values():
@@ -179,7 +186,8 @@ def warp_view(image: Tensor, source: SeenDepth, target: SeenDepth) -> tuple[Tens
         The picture as the target sees it, sampled bilinearly [h,w,3]; the pixels whose surface the source
         sees too: both opaque, and the same depth to 2 % [h,w] bool
     """
-    here, there = target.camera, source.camera
+    here = target.camera
+    there = source.camera
     rows, columns = torch.meshgrid(
         torch.arange(here.height) + 0.5, torch.arange(here.width) + 0.5, indexing="ij"
     )
@@ -191,7 +199,8 @@ def warp_view(image: Tensor, source: SeenDepth, target: SeenDepth) -> tuple[Tens
     z = moved[..., 2]
     front = z > there.near
     projected = moved @ there.K.T / torch.where(front, z, 1.0)[..., None]
-    u, v = projected[..., 0], projected[..., 1]
+    u = projected[..., 0]
+    v = projected[..., 1]
     inside = front & (u >= 0.5) & (v >= 0.5) & (u <= there.width - 0.5) & (v <= there.height - 0.5)
     # pixel centers lie at +0.5, as those of `grid_sample` without align_corners do
     grid = torch.stack([2 * u / there.width - 1, 2 * v / there.height - 1], dim=2).clamp(-2, 2)
@@ -199,7 +208,9 @@ def warp_view(image: Tensor, source: SeenDepth, target: SeenDepth) -> tuple[Tens
     sampled = grid_sample(
         planes.permute(2, 0, 1)[None], grid[None], align_corners=False, padding_mode="border"
     )
-    warped, depth, alpha = sampled[0, :3].permute(1, 2, 0), sampled[0, 3], sampled[0, 4]
+    warped = sampled[0, :3].permute(1, 2, 0)
+    depth = sampled[0, 3]
+    alpha = sampled[0, 4]
     both = inside & (target.depth.alpha > _OPAQUE) & (alpha > _OPAQUE)
     return warped, both & ((depth - z).abs() <= _SAME_PLACE * z)
 
@@ -215,7 +226,8 @@ def camera_path(cameras: Sequence[Camera]) -> list[Camera]:
 
     `cameras`: at least one; the path begins at the first
     """
-    left, route = list(cameras[1:]), [cameras[0]]
+    left = list(cameras[1:])
+    route = [cameras[0]]
     while left:
         here = route[-1].position
         nearest = min(range(len(left)), key=lambda i: float((left[i].position - here).norm()))
@@ -265,7 +277,8 @@ def _between(a: Camera, b: Camera, turns: Slerp, share: float) -> Camera:
     rotation = torch.from_numpy(turns(share).as_matrix())
     eye = torch.lerp(a.position.double(), b.position.double(), share)
     viewmat = torch.eye(4, dtype=torch.float64)
-    viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ eye
+    viewmat[:3, :3] = rotation
+    viewmat[:3, 3] = -rotation @ eye
     size = torch.tensor([[b.width], [b.height], [1.0]]) / torch.tensor([[a.width], [a.height], [1.0]])
     K = torch.lerp(a.K, b.K / size, share)
     return replace(a, viewmat=viewmat.float(), K=K)

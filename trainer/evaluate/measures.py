@@ -50,7 +50,8 @@ def evaluate_run(opened: OpenedRun, perceptual: Perceptual, texts: TextOptions) 
         perceptual: LPIPS, or its stand-in
         texts: what CLIP is asked
     """
-    evaluator, contenders = opened.evaluator, opened.contenders()
+    evaluator = opened.evaluator
+    contenders = opened.contenders()
     truth = {s: evaluator.edited[strength] for s, strength in opened.trajectory.stage_strengths}
     curves = picture_courses(evaluator, contenders, tuple(truth), truth.__getitem__, perceptual)
     paths = {name: slider_path(evaluator, pictures, perceptual) for name, pictures in contenders.items()}

@@ -23,7 +23,9 @@ from trainer.run.finish import load_evaluator
 from trainer.run.record import FinishedRun, render_edited_views, reopen_run
 from trainer.setup import TrainingSetup
 
-SLIDER, KEYFRAMES, FADE = "slider", "2 keyframes", "cross-fade"
+SLIDER = "slider"
+KEYFRAMES = "2 keyframes"
+FADE = "cross-fade"
 """What is compared: the shipped field; the original and the end with a straight line between, its slider made
 even as ours; the pictures of both ends, blended in sRGB."""
 
@@ -66,7 +68,8 @@ class OpenedRun:
 
     def contenders(self) -> dict[str, Pictures]:
         """Slider value -> the held-out views' boxes, of everything that is compared."""
-        field, keyframes = self.gdf.field, self.keyframes
+        field = self.gdf.field
+        keyframes = self.keyframes
         first, last = (self.evaluator.pictures(field.offsets(s)) for s in (0.0, 1.0))
 
         def fade(s: float) -> list[Tensor]:

@@ -31,7 +31,8 @@ from .slider_uniformity import equalized_strengths
 CARRIED = 0.1
 """Of what an edit changes, mean square: a grade that leaves more does not carry it."""
 
-_FITTED, _JUDGED = 1500, 500  # pixels that represent those of all views; a map has 60 numbers at most
+_FITTED = 1500  # pixels that represent those of all views
+_JUDGED = 500  # a map has 60 numbers at most
 
 
 @dataclass(frozen=True)
@@ -80,9 +81,11 @@ def _look(scene: Gaussians, region: Region, glance: Glance) -> tuple[View, Color
     others = (1.0 - glance.mask[:, None]) * background
     if len(region) < len(scene):
         others = render_view(scene, glance.camera, background).flatten(0, 1)[glance.pixels] - drawn
-    image, count = (others + drawn).clamp(0.0, 1.0), len(drawn)
+    image = (others + drawn).clamp(0.0, 1.0)
+    count = len(drawn)
     view = View(glance.camera, image[None], glance.mask[None], glance.inside[None], (0, 0, count, 1))
-    row, counts = torch.arange(count), torch.ones_like(image[:, :1], dtype=torch.bool)
+    row = torch.arange(count)
+    counts = torch.ones_like(image[:, :1], dtype=torch.bool)
     return view, ColorView(glance.map, others, glance.basis, glance.colors, (1, count), row, counts)
 
 
@@ -119,11 +122,13 @@ def draft_grade(views: DraftViews, options: EditorOptions, name: str) -> Gdf | N
     """
     if options.family not in COLOR_FUNCTIONS:
         return None
-    fitted, judged = views.fitted, views.judged
+    fitted = views.fitted
+    judged = views.judged
     editor = make_editor(options, views.scene, views.region, (), lambda: views.glances)
     plain = tuple((i + 1) / MOST_STAGES for i in range(MOST_STAGES))
     strengths = equalized_strengths(editor, options.editor, [fitted.row], plain)
-    targets, expected = list(map(edit_course(editor, fitted.row), strengths)), editor.edit(judged.row, 1.0)
+    targets = list(map(edit_course(editor, fitted.row), strengths))
+    expected = editor.edit(judged.row, 1.0)
     ends = {degree: fitted.maps.solve(degree, targets[-1:]) for degree in MONOMIALS}
     errors = {degree: _error(judged.maps.picture(end), expected) for degree, end in ends.items()}
     degree = min(d for d in errors if MORE_PAYS * errors[d] <= min(errors.values()))
@@ -132,7 +137,8 @@ def draft_grade(views: DraftViews, options: EditorOptions, name: str) -> Gdf | N
     if error > carried and options.family != "grade":  # by hand one judges what one sees
         return None
     maps = [fitted.maps.solve(degree, [target]) for target in targets]
-    knots, table = torch.tensor((0.0, *plain)), torch.stack([identity_map(degree), *maps])
+    knots = torch.tensor((0.0, *plain))
+    table = torch.stack([identity_map(degree), *maps])
     form = map_form(knots, degree, table, len(views.region))
     channels = BASE_CHANNELS + 3 * views.scene.shN.shape[1]
     field = BakedField("grade", torch.tensor([0.0, 1.0]), {}, channels, tuple(knots.tolist()), form)
@@ -142,7 +148,8 @@ def draft_grade(views: DraftViews, options: EditorOptions, name: str) -> Gdf | N
 
 def _drawn_error(views: DraftViews, table: Tensor, degree: int, expected: Tensor) -> float:
     """What is left where the map is held as the members' own spherical harmonics, as a scene has it."""
-    judged, seen = views.judged, views.judged.seen
+    judged = views.judged
+    seen = views.judged.seen
     scene = views.scene[views.region.members[seen]]
     sh = member_bands(pack(scene, with_shN=scene.sh_degree > 0))
     offsets = sh.new_zeros(len(views.region), *sh.shape[1:])

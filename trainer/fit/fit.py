@@ -78,7 +78,8 @@ def choose_path(
     def nearest(way: Trajectory) -> float:
         return max(evaluator.psnr(evaluator.pictures(way.at(s)), evaluator.edited[0.5]) for s in _HALFWAY)
 
-    ours, direct = nearest(trajectory), nearest(line)
+    ours = nearest(trajectory)
+    direct = nearest(line)
     why = (
         f"the editor's half is met to {ours:.1f} dB by the recorded way, to {direct:.1f} dB by a straight one"
     )
@@ -152,7 +153,8 @@ def fit_grades(
     lowest = [member_bands(trajectory.node(i))[:, : trajectory.bands] for i in range(len(table))]
     course = torch.stack(lowest).flatten(2) - mapped[:, :, : 3 * trajectory.bands]
     evaluator = field_evaluator(trajectory, choosing, options.target_psnr)
-    tried, smallest = list[Candidate](), math.inf
+    tried = list[Candidate]()
+    smallest = math.inf
 
     def fails(rank: int, index: int = 0) -> bool:
         nonlocal smallest
@@ -168,9 +170,12 @@ def fit_grades(
         smallest = min(smallest, math.inf if tried[-1].excess > 1.0 else form.bytes_per_member)
         return tried[-1].excess > 1.0
 
-    limit, low, fewest = rank_limit(course), 0, 0
+    limit = rank_limit(course)
+    low = 0
+    fewest = 0
     while fails(fewest) and fewest < limit:
-        low, fewest = fewest + 1, min(2 * fewest + 1, limit)
+        low = fewest + 1
+        fewest = min(2 * fewest + 1, limit)
     fewest = bisect_left(range(fewest), True, lo=low, key=lambda rank: not fails(rank))
     for rank in range(max(1, fewest), min(fewest + 1, limit) + 1):
         bisect_left(range(1, len(COARSER)), True, key=partial(fails, rank))
@@ -265,7 +270,8 @@ def visibility(
     """
     total = torch.zeros(len(members))
     for view in views:
-        camera, everywhere = view.camera, torch.ones_like(view.mask)
+        camera = view.camera
+        everywhere = torch.ones_like(view.mask)
         total += alpha_weights(scene, camera, everywhere)[members, 2].float()
         if looked is not None:
             looked()
@@ -287,7 +293,8 @@ def drop_idle_attributes(
         The trajectory (without the higher SH bands' columns if these go; that of a grade as it is), and what
         leaving out each attribute that moves would cost, dB.
     """
-    offsets, end = trajectory.offsets, trajectory.end
+    offsets = trajectory.offsets
+    end = trajectory.end
     costs: dict[str, float] = {}
     slices = attribute_slices(end.shape[1])
     target = evaluator.edited[1.0]
@@ -306,7 +313,8 @@ def drop_idle_attributes(
             end = tried
     # a grade is of all bands that the scene has, whether or not its map moves them
     if trajectory.maps is None and "shN" in slices and not bool(end[:, slices["shN"]].any()):
-        offsets, end = offsets[:, :, :BASE_CHANNELS].clone(), end[:, :BASE_CHANNELS].clone()
+        offsets = offsets[:, :, :BASE_CHANNELS].clone()
+        end = end[:, :BASE_CHANNELS].clone()
     return replace(trajectory, offsets=offsets, end=end), costs
 
 

@@ -101,9 +101,11 @@ class JointTraining:
         self._channels = channels
         self._at = torch.tensor([0.0, *strengths], dtype=torch.float64)
         self._after = torch.tensor([0, *accumulate(steps)], dtype=torch.float64)
-        self._render, self._pictures = render, pictures
+        self._render = render
+        self._pictures = pictures
         self.bank = MemoryBank(fit.members, channels)
-        self._strengths, self._offsets = self.bank.strengths, self.bank.offsets
+        self._strengths = self.bank.strengths
+        self._offsets = self.bank.offsets
 
     def strength(self, step: int) -> float:
         """Where on the slider a step of PGS is for now: even in time within its stage."""
@@ -142,7 +144,8 @@ class JointTraining:
 
     def _keep(self, step: int, offsets: Tensor) -> None:
         self.bank.add(self.strength(step), offsets)
-        self._strengths, self._offsets = self.bank.strengths, self.bank.offsets
+        self._strengths = self.bank.strengths
+        self._offsets = self.bank.offsets
 
 
 PART = "network"
@@ -164,7 +167,8 @@ class NetworkFit:
 
     def figures(self) -> dict[str, Any]:
         """For report.json."""
-        curve, form = self.unbaked, self.field.origin
+        curve = self.unbaked
+        form = self.field.origin
         assert isinstance(form, NeuralForm)
         return {
             "unbaked": {"psnr_mean": round(sum(curve) / len(curve), 2), "psnr_worst": round(min(curve), 2)},
@@ -216,7 +220,8 @@ def begin_joint_training(
             [picture.reshape(-1, 3) for picture in render_all(small, rows + offsets, attributes)]
         )
 
-    strengths, steps = [stage.strength for stage in stages], [stage.steps for stage in stages]
+    strengths = [stage.strength for stage in stages]
+    steps = [stage.steps for stage in stages]
     if resolve_slider(optimize.slider, strengths) == "even":
         strengths = [(i + 1) / len(stages) for i in range(len(stages))]
     fit = NeuralFit(rows, channels, attributes, settings, seen)

@@ -38,7 +38,8 @@ from trainer.views.view import View
 STEPS = 20
 """Equal steps that a user makes over the whole slider."""
 
-_ASKED_VIEWS, _FIELD_VIEWS = 3, 6
+_ASKED_VIEWS = 3
+_FIELD_VIEWS = 6
 _COSTLY_STEPS = 8  # of the anchor view, where each picture costs a model's work
 _FINE = 2  # a step may begin at so many places per step
 _PASSES = 3  # of spreading the strengths; the best of all wins
@@ -123,14 +124,17 @@ def equalizing_remap(seen: Callable[[float], Tensor]) -> SliderRemap:
     even = torch.linspace(0, 1, STEPS * _FINE + 1, dtype=torch.float64)
     places = even
     for _ in range(_LOOKS):
-        looked, pictures = places, [seen(float(s)) for s in places]
-        best, following = -1.0, places
+        looked = places
+        pictures = [seen(float(s)) for s in places]
+        best = -1.0
+        following = places
         for _ in range(_PASSES + 1):
             current = following
             blended = [interpolate_at(looked, pictures, float(s)) for s in current]
             uniformity, following = _spread(current, blended, _FINE)
             if uniformity > best:
-                best, places = uniformity, current
+                best = uniformity
+                places = current
     return SliderRemap(places[::_FINE].contiguous(), even[::_FINE].contiguous())
 
 
@@ -155,5 +159,6 @@ def _spread(places: Tensor, pictures: Sequence[Tensor], reach: int) -> tuple[flo
     way = torch.tensor([0.0, *accumulate(max(p, floor) for p in pace)], dtype=torch.float64)
     even = torch.linspace(0, 1, count + 1, dtype=torch.float64)
     due = interpolate(even, way / way[-1], places)
-    due[0], due[-1] = 0.0, 1.0
+    due[0] = 0.0
+    due[-1] = 1.0
     return min(steps) / max(steps), due

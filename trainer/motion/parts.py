@@ -94,7 +94,8 @@ def _join_strays(labels: Tensor, centroids: Tensor, counts: Tensor, least: float
     number = torch.empty_like(order)
     number[order] = torch.arange(len(order))
     part = number[part]
-    stray, firm = (part >= count).nonzero()[:, 0], (part < count).nonzero()[:, 0]
+    stray = (part >= count).nonzero()[:, 0]
+    firm = (part < count).nonzero()[:, 0]
     if len(stray):
         nearest = PointTree(centroids[firm].numpy(), 1).query(centroids[stray].numpy(), 1)[1]
         part[stray] = part[firm[torch.from_numpy(nearest[:, 0])]]
@@ -129,13 +130,15 @@ class GroupSearch:
         Raises:
             FloatingPointError: the loss is no longer finite.
         """
-        best, least = start, self.distance(targets, start)
+        best = start
+        least = self.distance(targets, start)
         missed = _MISSED * least
         for wide in (False, True):
             motion = self._search(targets, start, wide, on_step)
             distance = self.distance(targets, motion)
             if distance < least:
-                best, least = motion, distance
+                best = motion
+                least = distance
             if least < missed:
                 break
         return best
@@ -216,7 +219,8 @@ def descend(
         FloatingPointError: the loss is no longer finite.
     """
     values = start.detach().clone().requires_grad_()
-    first, second = torch.zeros_like(values), torch.zeros_like(values)
+    first = torch.zeros_like(values)
+    second = torch.zeros_like(values)
     settled = torch.zeros_like(values)
     averaged = max(1, round(_SETTLED * steps))
     order = torch.Generator().manual_seed(seed)

@@ -84,7 +84,10 @@ def make_control_points(means: Tensor, part: Tensor, count: int) -> ControlPoint
         part: connected part of each, see `connected_parts`. [M] int64
         count: control points in all, at most one a member; parts share them by size, at least one each
     """
-    rows, part_of, links, begun = [], [], [], 0
+    rows = []
+    part_of = []
+    links = []
+    begun = 0
     nearest = part.new_zeros(len(means), _NEAREST)
     weights = means.new_zeros(len(means), _NEAREST)
     for index, size in enumerate(torch.bincount(part).tolist()):
@@ -107,7 +110,8 @@ def make_control_points(means: Tensor, part: Tensor, count: int) -> ControlPoint
         rows.append(chosen)
         part_of.append(part.new_full((points,), index))
         begun += points
-    at, pairs = torch.cat(rows), torch.cat(links)
+    at = torch.cat(rows)
+    pairs = torch.cat(links)
     gaps = (means[at[pairs[:, 0]]] - means[at[pairs[:, 1]]]).norm(dim=1)
     alone = (means - means.mean(dim=0)).norm(dim=1)
     spacing = float((gaps if len(gaps) else alone).median())
@@ -182,7 +186,8 @@ def rest_warp(control: ControlPoints) -> WarpMotion:
 def warp_of_parts(control: ControlPoints, parts: Parts, motion: Motion) -> WarpMotion:
     """Every control point does what its part does: exactly the motion of the parts."""
     part = control.part
-    size, turn = motion.log_scale[part, None], motion.turn[part]
+    size = motion.log_scale[part, None]
+    turn = motion.turn[part]
     arm = control.points - parts.centers[part]
     moved = parts.centers[part] + motion.shift[part] + size.exp() * rotate_vectors(arm, turn_quats(turn))
     nothing = torch.zeros_like(size)
@@ -384,7 +389,8 @@ class PartsPlacement:
 
     def lines(self) -> list[str]:
         """Where each part went, in its own sizes."""
-        motion, sizes = self.motion, self.parts.sizes
+        motion = self.motion
+        sizes = self.parts.sizes
         return [
             f"part {index}, {int((self.parts.part == index).sum())} Gaussians: moved by "
             f"{float(motion.shift[index].norm() / sizes[index]):.2f} of its size, turned by "
@@ -412,7 +418,8 @@ class WarpPlacement:
     def lines(self) -> list[str]:
         """How far the control points went, in their spacings."""
         shift = self.motion.shift.norm(dim=1) / self.control.spacing
-        turn, stretch = self.motion.turn.norm(dim=1), self.motion.stretch[:, :3]
+        turn = self.motion.turn.norm(dim=1)
+        stretch = self.motion.stretch[:, :3]
         return [
             f"bent by {len(self.control)} control points: moved by up to {float(shift.max()):.2f} of their "
             f"spacing, turned by up to {math.degrees(float(turn.max())):.0f} degrees, stretched "

@@ -49,7 +49,8 @@ class Course:
         if self.look is None or self.ask is None:
             return False
         at = sorted(known)
-        offsets, asked = torch.stack([known[s][0] for s in at]), list[float]()
+        offsets = torch.stack([known[s][0] for s in at])
+        asked = list[float]()
         missed = [max(known[s][1], LEVEL) for s in at]
         places, weights = smooth_weights(at, offsets)
         for i, (begin, end) in enumerate(pairwise(at)):
@@ -93,7 +94,9 @@ def thin_model(model: Model, solver: Solver, targets: Sequence[Target], steps: i
 
     def refine(starts: Sequence[Tensor], most: int) -> tuple[list[Tensor], float]:
         """The residuals after so many steps, as long as these help where that is all, and what they leave."""
-        by, found, left = solver if most == steps else solver.only(starts[-1]), list[Tensor](), 0.0
+        by = solver if most == steps else solver.only(starts[-1])
+        found = list[Tensor]()
+        left = 0.0
         for (stage, judge), made, start in zip(targets, mapped, starts, strict=True):
             if start.shape[1] > model.bands or most < steps or stage.strength < 1.0:  # else it is solved for
                 asked = None if most < steps else judge
@@ -103,14 +106,17 @@ def thin_model(model: Model, solver: Solver, targets: Sequence[Target], steps: i
         return found, left
 
     best, least = refine([stage.strength * model.residual for stage, _ in targets], steps)
-    tried, on_the_way = list(model.tried), ", on the way too" if len(targets) > 1 else ""
+    tried = list(model.tried)
+    on_the_way = ", on the way too" if len(targets) > 1 else ""
     if richer:
         found, error = refine([pad(one, (0, 0, 0, richer - model.bands)) for one in best], steps)
         tried.append((f"with a residual of {richer}{on_the_way}", decibels(error / len(targets))))
         best, least = (found, error) if error < MORE_PAYS * least else (best, least)
-    thinner, error = best, least
+    thinner = best
+    error = least
     while error * MORE_PAYS <= least + len(targets) * spare:
-        best, least = thinner, min(least, error)
+        best = thinner
+        least = min(least, error)
         if not bool((halved := solver.halve(best))[-1][:, 1:].any()):
             break
         thinner, error = refine(halved, min(LOOKS, steps - 1))
@@ -145,7 +151,8 @@ def solve(
     Raises:
         FloatingPointError: the loss or where it leads is not finite; the state is that of the stage before.
     """
-    finished, judge = Judge(solver.views, course.finished[0].targets), course.finished[1]
+    finished = Judge(solver.views, course.finished[0].targets)
+    judge = course.finished[1]
     _, mapped = solver.fit_map(model.degree, course.finished[0].targets)
     end = add_bands(mapped, model.residual)
     residuals = {0.0: torch.zeros_like(model.residual), **model.begun, 1.0: model.residual}
@@ -162,7 +169,8 @@ def solve(
     def solve_target(target: Target) -> ParameterSnapshot:
         stage, judge = target
         table, mapped = solver.fit_map(model.degree, stage.targets)
-        offsets, means = mapped, dict[str, float]()
+        offsets = mapped
+        means = dict[str, float]()
         if model.bands:
             left = max(s for s in residuals if s < stage.strength)
             right = min(s for s in residuals if s >= stage.strength)
@@ -172,14 +180,17 @@ def solve(
             residual, taken = solver.residual(
                 mapped, start, stage.targets, steps, judge, model.error, model.hold, told
             )
-            offsets, means[STEPS] = add_bands(mapped, residual), taken
+            offsets = add_bands(mapped, residual)
+            means[STEPS] = taken
         left_over = finished.mean(offsets, 1.0)
         if not math.isfinite(left_over) or not bool(offsets.isfinite().all()):
             raise FloatingPointError(f"the loss is {left_over} at step {state.step}")
         moved = band_offsets(offsets, solver.original.shape[1])
         for rows in (state.moved, state.average):
             rows.detach().copy_(moved)
-        state.step, state.stage, state.running = state.step + 1, state.stage + 1, left_over
+        state.step = state.step + 1
+        state.stage = state.stage + 1
+        state.running = left_over
         means |= {"l2": Judge(solver.views, stage.targets).error(offsets), "left": left_over}
         return ParameterSnapshot(state.step, True, moved, means, table)
 

@@ -270,13 +270,16 @@ class Solver:
         floor: float,
     ) -> tuple[Tensor, int]:
         """See `residual`; `look`: the judge's error."""
-        count, held = start.shape[1], torch.from_numpy(self.held.diagonal()) + max(ridge, 1e-30)
+        count = start.shape[1]
+        held = torch.from_numpy(self.held.diagonal()) + max(ridge, 1e-30)
         asked = self.asked[:, :count, None] & self.asked[:, None, :count]
         curvature = self.weights[:, :count, :count] * asked + held[:, None, None] * torch.eye(count)
         inverse = torch.linalg.inv(curvature.double()).float() * asked
-        now, pull = start, self._pull(mapped, start, targets, ridge)
+        now = start
+        pull = self._pull(mapped, start, targets, ridge)
         conditioned = along = inverse @ pull.descent
-        best, taken = now, 0
+        best = now
+        taken = 0
         looks = [math.inf] * (LOOKS - 1) + [math.inf if look is None else look(now)]
         while taken < steps:
             length = _inner(pull.descent, along) / max(self._curvature(pull, along, ridge), 1e-30)
@@ -290,8 +293,11 @@ class Solver:
                     break
                 along = conditioned  # the direction was of other clamps: begin again
                 continue
-            last, power = conditioned, _inner(pull.descent, conditioned)
-            now, pull, taken = ahead, next_pull, taken + 1
+            last = conditioned
+            power = _inner(pull.descent, conditioned)
+            now = ahead
+            pull = next_pull
+            taken = taken + 1
             if look is not None:
                 error = look(now)
                 best = now if error < min(looks) else best
@@ -325,7 +331,8 @@ class Solver:
             np.logical_or(colors.numpy() > 0.0, pull.numpy() > 0.0, out=drawn[index].numpy())
             return passed, pull.mul_(drawn[index]), squared
 
-        descent, all_passed = -self._hold(residual, ridge), list[Tensor]()
+        descent = -self._hold(residual, ridge)
+        all_passed = list[Tensor]()
         error = _inner(residual, self._hold(residual, ridge))
         looks = iterate_views(look, range(len(self.views)))
         for view, (passed, pull, squared) in zip(self.views, looks, strict=True):
@@ -338,7 +345,8 @@ class Solver:
         """Of half the squared error in a direction, where the clamps stay as they are. [M,b,3]"""
 
         def look(index: int) -> float:
-            view, colors = self.views[index], np.zeros(pull.drawn.shape[1:], np.float32)
+            view = self.views[index]
+            colors = np.zeros(pull.drawn.shape[1:], np.float32)
             add_colors(view.basis.numpy(), along.numpy(), colors)
             picture = view.map.picture(torch.from_numpy(colors * pull.drawn[index].numpy()))
             return float((picture * pull.passed[index]).square().sum())
@@ -413,7 +421,8 @@ class _Trials:
         without = {one.bands: one.error for one in sorted(self.tried, key=lambda one: -one.error)}
         enough = alone * (without.get(1, alone) / alone) ** (1 / 3)  # what one of the three bytes of DC does
         # a mask asks what a residual that goes all around says of each member
-        tried, guess = [best], (self.tried[-len(_HOLDS)] if self.few else best).change
+        tried = [best]
+        guess = (self.tried[-len(_HOLDS)] if self.few else best).change
         for hold in (_HOLDS[0], _HOLDS[-1]) if self.few else (_RIDGE,):
             solver = best.solver.guess_mask(guess, best.degree > 0, hold)
             if min(self.judge.error(self.start(degree, solver).offsets) for degree in MONOMIALS) >= enough:
@@ -477,7 +486,8 @@ def choose_model(
     if best.bands and (few or best.bands > 1 or best.error > LEVEL):
         alone = min(tries.judge.error(bases[degree].offsets) for degree in MONOMIALS)
         best = tries.try_masks(best, alone)
-    chosen, residual = best.solver, best.residual
+    chosen = best.solver
+    residual = best.residual
     if few:  # what no picture shows follows the map, masked or not
         chosen, residual = _solve_whole(solver, best, targets, steps, degrees != (0,))
     mask = (chosen.share * 255.0).round().to(torch.uint8) if best.mask_hold else None
@@ -497,7 +507,8 @@ def solve_again(
         judge: views not solved for
     """
     solver = solver if model.mask is None else solver.with_mask(model.mask.float() / 255.0)
-    mapped, residual = solver.fit_map(model.degree, targets)[1], torch.zeros_like(model.residual)
+    mapped = solver.fit_map(model.degree, targets)[1]
+    residual = torch.zeros_like(model.residual)
     if model.bands:
         residual, _ = solver.residual(mapped, residual, targets, model.steps, judge, hold=model.hold)
     return solver, replace(model, residual=residual, error=judge.error(add_bands(mapped, residual)))

@@ -37,7 +37,8 @@ _MAP_RIDGE = 1e-6  # of the diagonal of a map's normal equations, for regions of
 _MAP_HELD = 1e-2  # say of the members' own colors beside the pixels: there a map is held to the affine one
 _SHIFT_HELD = 1e-2  # of that: the affine map is held to the same change of all
 _MASK_WITHIN = 0.98  # of what says what a share is: the largest there is 1, few beyond do not scale it
-_MASK_STEPS, _MASK_SETTLED = 16, 0.01  # at most, of gradients by pixels; of the error, that a step gains
+_MASK_STEPS = 16  # at most, of gradients by pixels
+_MASK_SETTLED = 0.01  # of the error, that a step gains
 _MASK_LENGTHS = (4.0, 2.0, 1.0, 0.5, 0.25)  # of a step, in units of a bound of the curvature
 _MASK_RIDGE = 0.01  # of a typical curvature, for members that hardly show
 
@@ -102,7 +103,8 @@ class ColorView:
     def halves(self) -> tuple[ColorView, ColorView]:
         """The view with every other square of its pixels, and with the others."""
         side = max(1, max(self.size) // _SQUARES)
-        rows, columns = self.pixels // self.size[1] // side, self.pixels % self.size[1] // side
+        rows = self.pixels // self.size[1] // side
+        columns = self.pixels % self.size[1] // side
         even = ((rows + columns) % 2 == 0)[:, None]
         return replace(self, counts=self.counts & even), replace(self, counts=self.counts & ~even)
 
@@ -114,7 +116,8 @@ def _compare(shown: Array, others: Array, target: Array, counts: Array, passed: 
     squared = 0.0
     for p in range(len(shown)):
         for c in range(3):
-            image, wanted = others[p, c] + shown[p, c], target[p, c]
+            image = others[p, c] + shown[p, c]
+            wanted = target[p, c]
             error = np.float64(wanted - min(max(image, np.float32(0.0)), np.float32(1.0)))
             squared += error * error if counts[p] else 0.0
             held = (image <= 0.0 and wanted <= 0.0) or (image >= 1.0 and wanted >= 1.0)
@@ -199,12 +202,14 @@ class MapFit:
 
     def _change(self, count: int, target: Tensor) -> Tensor:
         """What is added to the identity's first coefficients: 1, 4, 10 or 20. [P,3] -> [count,3]"""
-        design, normal = self.design[:, :count], self.normal[:count, :count]
+        design = self.design[:, :count]
+        normal = self.normal[:count, :count]
         change = pull = design.new_zeros(count, 3)
         if count > 1:
             coarse = self._change(4 if count > 4 else 1, target)
             held = self.held[:count, :count] * (1.0 if count > 4 else _SHIFT_HELD)
-            normal, pull = normal + held, held[:, : len(coarse)] @ coarse
+            normal = normal + held
+            pull = held[:, : len(coarse)] @ coarse
         normal = normal + _MAP_RIDGE * (normal.diagonal() + 1e-12).diag()
         for _ in range(_CLAMP_ROUNDS):
             image = self.original + design @ change
@@ -230,7 +235,8 @@ def fit_maps(views: Sequence[ColorView], share: Tensor, most: int = _MOST_PIXELS
         return (share * terms).T.contiguous(), (terms @ terms.T).double()
 
     def lay_out(index: int) -> tuple[Tensor, Tensor, Tensor]:
-        view, some = views[index], pixels[index]
+        view = views[index]
+        some = pixels[index]
         terms, members = expand(view.original)
         original = view.picture(view.original.clamp_min(0.0))[some]
         return view.map.picture(terms)[some], original, members
@@ -259,7 +265,8 @@ def mask_of_members(colors: Tensor, change: Tensor, weights: Tensor) -> Tensor:
     Returns:
         The shares, 0..1. [M]
     """
-    weights, change = weights.double(), change.double()
+    weights = weights.double()
+    change = change.double()
     size = change.norm(dim=1)
     typical = ((weights @ size.square()) / weights.sum().clamp_min(1e-30)).sqrt()
     terms = monomials(colors.T.clamp(0.0, MOST_COLOR), 1).double()
@@ -268,7 +275,8 @@ def mask_of_members(colors: Tensor, change: Tensor, weights: Tensor) -> Tensor:
     normal += _MAP_RIDGE * (normal.diagonal() + 1e-12).diag()
     full: Tensor = terms.T @ torch.linalg.solve(normal, (design * weights) @ change)
     power = full.square().sum(dim=1).clamp_min(1e-12)
-    along, evidence = (change * full).sum(dim=1) / power, weights * power
+    along = (change * full).sum(dim=1) / power
+    evidence = weights * power
     order = along.argsort()
     reached = evidence[order].cumsum(0) >= _MASK_WITHIN * evidence.sum()
     share: Tensor = (along / along[order][reached][0].clamp_min(1e-6)).clamp(0.0, 1.0)
@@ -292,7 +300,8 @@ def improve_mask(
     pairs = list(zip(views, changes, picked, strict=True))
 
     def weigh(pair: tuple[ColorView, Tensor, Tensor]) -> Tensor:
-        view, size = pair[0], pair[1].abs()
+        view = pair[0]
+        size = pair[1].abs()
         return (view.map.gradient(view.map.picture(size) * view.counts) * size).sum(dim=1)
 
     def look(share: Tensor) -> tuple[Tensor, float]:
@@ -313,7 +322,9 @@ def improve_mask(
             ahead = (share + length * descent / curvature).clamp(0.0, 1.0)
             next_descent, next_error = look(ahead)
             if next_error < error:
-                share, descent, error = ahead, next_descent, next_error
+                share = ahead
+                descent = next_descent
+                error = next_error
                 break
         if before - error < _MASK_SETTLED * before:
             break

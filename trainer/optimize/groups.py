@@ -39,7 +39,9 @@ GROUP_STEPS = 120
 # The members' own learning rate is a share of so many part sizes; shorter steps where the parts' motion has
 # left less than `_LEFT` to do, a mean over the pixels that still change, and less than `_REST` of what there
 # was (docs/experiments.md, Parts that move).
-_EXTENT, _LEFT, _REST = 7.0, 0.065, 0.28
+_EXTENT = 7.0
+_LEFT = 0.065
+_REST = 0.28
 
 _WHOLE = 0.1  # share of the distance that parts may leave and still count as moved as wholes
 _BETTER = 0.9  # share of what parts leave that control points may leave: they cost more and hold less
@@ -176,7 +178,8 @@ def bend_groups(
     """
     parts = groups.parts
     bending = WarpSearch(search.original, parts.part, search.crops, search.steps, search.seed)
-    control, motions = bending.levels[-1], list[WarpMotion]()
+    control = bending.levels[-1]
+    motions = list[WarpMotion]()
     for stage, pictures in enumerate(targets):
         done = partial(on_step, stage)
         if stage:
@@ -206,7 +209,9 @@ def group_path(
     Returns:
         In order, in half precision, without means
     """
-    placement, own, begun = groups.rest, torch.zeros_like(original), 0
+    placement = groups.rest
+    own = torch.zeros_like(original)
+    begun = 0
     ends = [end.to(original.device) for end in ends]
     each = max(2, count // len(ends))
     placements = []
@@ -219,5 +224,7 @@ def group_path(
             done = begun + round(share * (step - begun))
             placements.append(ParameterSnapshot(done, False, offsets.half().cpu(), {}))
         placements.append(ParameterSnapshot(step, True, end.half().cpu(), {}))
-        placement, own, begun = after, next_own, step
+        placement = after
+        own = next_own
+        begun = step
     return placements

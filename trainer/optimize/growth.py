@@ -35,7 +35,8 @@ SEED_LOGIT = 2.0
 
 _SIZE = 0.5  # standard deviation of a seed, of the distance to its three neighbors
 _DEPTHS = 256  # along a ray, at most; one for two pixels
-_CLIP, _ALIKE = 0.3, 0.03  # of color: views disagree by no more; a nearer depth is as good as the best
+_CLIP = 0.3  # of color: views disagree by no more
+_ALIKE = 0.03  # a nearer depth is as good as the best
 _LEAST_VIEWS = 3  # that can see a place, beside its own
 _FAINT = 2 / 255  # of color; below, a pixel is as it should be
 
@@ -52,13 +53,17 @@ def seed_rows(
         count: rows, at most
         seed: of the draw
     """
-    scene, cameras, targets = setup.scene, [view.camera for view in views], list(targets)
+    scene = setup.scene
+    cameras = [view.camera for view in views]
+    targets = list(targets)
     errors = [(a - view.image).square().mean(dim=2) for a, view in zip(targets, views, strict=True)]
     errors = [torch.where(error > _FAINT**2, error, 0.0) for error in errors]
     center, radius = scene_sphere(scene[setup.region.members])
     depths = [render_depth(scene, camera) for camera in cameras]
-    total, draw = float(sum(error.sum() for error in errors)), torch.Generator().manual_seed(seed)
-    places, colors = [torch.zeros(0, 3)], [torch.zeros(0, 3)]
+    total = float(sum(error.sum() for error in errors))
+    draw = torch.Generator().manual_seed(seed)
+    places = [torch.zeros(0, 3)]
+    colors = [torch.zeros(0, 3)]
     for i, error in enumerate(errors):
         wrong = min(int(count * float(error.sum()) / max(total, 1e-12)), int((error > 0).sum()))
         if wrong:
@@ -105,7 +110,8 @@ def _place_pixels(
         [n,3], and which of them enough views can see. [n] bool
     """
     camera = cameras[index]
-    v, u = pixels // camera.width, pixels % camera.width
+    v = pixels // camera.width
+    u = pixels % camera.width
     x = (u + 0.5 - camera.K[0, 2]) / camera.K[0, 0]
     rays = torch.stack([x, (v + 0.5 - camera.K[1, 2]) / camera.K[1, 1], torch.ones_like(x)], dim=1)
     middle = float(camera.viewmat[2, :3] @ center + camera.viewmat[2, 3])
@@ -115,12 +121,14 @@ def _place_pixels(
     behind = 2 * float(along[1] - along[0])  # of a surface: what is nearer is on it
     points = (rays[:, None] * along[:, None] - camera.viewmat[:3, 3]) @ camera.viewmat[:3, :3]
     colors = targets[index].flatten(0, 1)[pixels, None]
-    apart, seen = torch.zeros(len(pixels), count), torch.zeros(len(pixels), count)
+    apart = torch.zeros(len(pixels), count)
+    seen = torch.zeros(len(pixels), count)
     for other, target, depth in zip(cameras, targets, depths, strict=True):
         if other is camera:
             continue
         x, y, z = (points @ other.viewmat[:3, :3].T + other.viewmat[:3, 3]).unbind(2)
-        px, py = x / z * other.K[0, 0] + other.K[0, 2], y / z * other.K[1, 1] + other.K[1, 2]
+        px = x / z * other.K[0, 0] + other.K[0, 2]
+        py = y / z * other.K[1, 1] + other.K[1, 2]
         grid = torch.stack([2 * px / other.width - 1, 2 * py / other.height - 1], dim=2)
         planes = torch.cat([target, _surface(depth)[..., None]], dim=2).permute(2, 0, 1)[None]
         *drawn, surface = grid_sample(planes, grid[None].clamp(-2, 2), "nearest", align_corners=False)[0]
@@ -155,8 +163,10 @@ def add_rows(trajectory: Trajectory, rows: Gaussians) -> Trajectory:
     """A recording of the region's members with others, given as they are at strength 1."""
     if not len(rows):
         return trajectory
-    below, logit = (0, 0, 0, len(rows)), attribute_slices(trajectory.end.shape[1])["logit_opacities"]
-    offsets, end = pad(trajectory.offsets, below), pad(trajectory.end, below)
+    below = (0, 0, 0, len(rows))
+    logit = attribute_slices(trajectory.end.shape[1])["logit_opacities"]
+    offsets = pad(trajectory.offsets, below)
+    end = pad(trajectory.end, below)
     end[-len(rows) :, logit] = (rows.logit_opacities - ADDED_LOGIT)[:, None]
     added = replace(rows, logit_opacities=torch.full_like(rows.logit_opacities, ADDED_LOGIT))
     return fade_in(replace(trajectory, offsets=offsets, end=end, added=added))
@@ -174,8 +184,10 @@ def removal_costs(crops: Sequence[CropScene], rows: Tensor, targets: Sequence[Te
         targets: what these views are to show. [h,w,3] each
         seed: of the signs
     """
-    draw, logit = torch.Generator().manual_seed(seed), attribute_slices(rows.shape[1])["logit_opacities"]
-    slope, curvature = rows.new_zeros(len(rows)), rows.new_zeros(len(rows))
+    draw = torch.Generator().manual_seed(seed)
+    logit = attribute_slices(rows.shape[1])["logit_opacities"]
+    slope = rows.new_zeros(len(rows))
+    curvature = rows.new_zeros(len(rows))
     for crop, target in zip(crops, targets, strict=True):
         leaf = rows.clone().requires_grad_()
         image = crop.render(leaf)

@@ -55,7 +55,8 @@ class LpipsLoss:
     def __init__(self, network: Lpips, name: str = "lpips-alex", room: int = 1 << 30) -> None:
         self.name = name
         self._network = network
-        self._room, self._free = room, room
+        self._room = room
+        self._free = room
         self._kept: dict[Hashable, Features] = {}
 
     def __call__(self, image: Tensor, target: Tensor, key: Hashable = None) -> Tensor:
@@ -84,12 +85,14 @@ class GradientL1:
 
     def __call__(self, image: Tensor, target: Tensor, key: Hashable = None) -> Tensor:
         """See `Perceptual`."""
-        a, b = image.permute(2, 0, 1)[None], target.permute(2, 0, 1)[None]
+        a = image.permute(2, 0, 1)[None]
+        b = target.permute(2, 0, 1)[None]
         total = image.new_zeros(())
         for _ in range(2):
             for axis in (2, 3):
                 total = total + (a.diff(dim=axis) - b.diff(dim=axis)).abs().mean()
-            a, b = avg_pool2d(a, 2), avg_pool2d(b, 2)
+            a = avg_pool2d(a, 2)
+            b = avg_pool2d(b, 2)
         return total
 
     def forget(self) -> None:

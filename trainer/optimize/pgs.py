@@ -122,7 +122,8 @@ class PgsState:
             if growth < math.inf:
                 self.moved[:, attribute_slices(len(rates))["log_scales"]].clamp_(max=math.log(growth))
         self.average.lerp_(self.moved.detach(), 1.0 - min(smoothing, (self.step + 1) / (self.step + 10)))
-        self.step, self.local = done, self.local + 1
+        self.step = done
+        self.local = self.local + 1
         self._queue.pop()
 
     def capture_state(self) -> Saved:
@@ -135,13 +136,15 @@ class PgsState:
             tensors["average"] = self.average
         tensors |= {f"picture{i}": picture for i, picture in enumerate(self.pictures)}
         tensors["order"] = self._order.get_state()
-        running, sums = self.running if self.step else None, self.means.sums
+        running = self.running if self.step else None
+        sums = self.means.sums
         counts = {name: getattr(self, name) for name in _COUNTS}
         return Saved(tensors, plain(_StateValues(**counts, running=running, means=sums, queue=self._queue)))
 
     def restore(self, saved: Saved) -> None:
         """See `state.Resumable`."""
-        tensors, values = saved.tensors, convert_json(saved.values, _StateValues)
+        tensors = saved.tensors
+        values = convert_json(saved.values, _StateValues)
         with torch.no_grad():
             for name in _ROWS:
                 same = tensors.get("moved" if name == "average" else name, torch.zeros_like(self.first))
@@ -243,7 +246,8 @@ def pgs_settings(
         extent: size of what moves, world units
         stages: how many strengths there are to optimize towards
     """
-    recolors, printed = options.kind != "geometry", options.as_printed
+    recolors = options.kind != "geometry"
+    printed = options.as_printed
     rates = learning_rates(options.kind if options.rates == "kind" else options.rates, channels, extent)
     if not bands:
         rates[BASE_CHANNELS:] = 0.0
@@ -335,7 +339,8 @@ def optimize(
     Raises:
         FloatingPointError: the loss or its gradient is not finite; the state is that of the step before.
     """
-    slices, rates = attribute_slices(original.shape[1]), settings.rates.to(original.device)
+    slices = attribute_slices(original.shape[1])
+    rates = settings.rates.to(original.device)
     moving = {name for name, columns in slices.items() if bool((settings.rates[columns] > 0).any())}
     state = PgsState(original, settings.seed) if state is None else state
     if not state.step:
@@ -368,7 +373,8 @@ def optimize(
                     yield ParameterSnapshot(state.step, last, offsets.clone(), state.means.read())
             if on_step is not None:
                 on_step(state.step, state.running)
-        state.stage, state.local = index + 1, 0
+        state.stage = index + 1
+        state.local = 0
 
 
 def _step_size(stage: TargetStage, before: Sequence[Tensor], reach: float) -> float:
@@ -398,7 +404,9 @@ def _gradient(objective: Objective, moment: Moment, state: PgsState, finished: T
 
 def visible_way(targets: Sequence[Tensor], before: Sequence[Tensor]) -> tuple[float, float]:
     """Mean change of the pictures, over all pixels and over those that change at all."""
-    total, every, changing = 0.0, 0, 0
+    total = 0.0
+    every = 0
+    changing = 0
     for target, start in zip(targets, before, strict=True):
         change = (target - start).abs()
         total += float(change.sum())

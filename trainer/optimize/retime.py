@@ -58,7 +58,8 @@ def smooth_weights(strengths: Sequence[float], known: Tensor) -> tuple[Tensor, T
     Returns:
         Strengths [2n-1], and weights [2n-1,n] with rows of one 1 at the given strengths; float64
     """
-    nodes, unit = torch.tensor(strengths, dtype=torch.float64), torch.eye(len(strengths), dtype=torch.float64)
+    nodes = torch.tensor(strengths, dtype=torch.float64)
+    unit = torch.eye(len(strengths), dtype=torch.float64)
     places = torch.stack([nodes, nodes + 0.5 * nodes.diff(append=nodes[-1:])], dim=1).flatten()[:-1]
     weights = torch.from_numpy(CubicSpline(nodes.numpy(), unit.numpy())(places.numpy()))
     weights[::2] = unit
@@ -116,9 +117,11 @@ def retime(
     if slider == "time":
         return replace(trajectory, s=_place_between(0.0, 1.0, trajectory.steps.double()).float())
     if slider == "stages":
-        knots, pins = [0, *trajectory.stage_ends], [0.0, *trajectory.strengths]
+        knots = [0, *trajectory.stage_ends]
+        pins = [0.0, *trajectory.strengths]
     else:
-        knots, pins = [0, len(trajectory) - 1], [0.0, 1.0]
+        knots = [0, len(trajectory) - 1]
+        pins = [0.0, 1.0]
     s = torch.zeros(len(trajectory), dtype=torch.float64)
     chords = _chords(pictures)
     spans = zip(pairwise(knots), pairwise(pins), strict=True)

@@ -17,7 +17,8 @@ from trainer.regions.lift import HIDDEN, gather
 from trainer.regions.surface import covered_rows, surface_likeness
 
 _WEAKEST = 5e-3  # of all of a member's ties: most of its neighbors are hardly alike
-_STEPS, _EXACT = 300, 1e-6  # of conjugate gradients from member to member; what they leave
+_STEPS = 300  # of conjugate gradients from member to member
+_EXACT = 1e-6  # what they leave
 
 
 @dataclass(frozen=True)

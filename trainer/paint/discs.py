@@ -42,13 +42,18 @@ GROWN = 2
 """Pixels around the paint that discs show as they are: what is drawn behind them was moved."""
 
 _SIDES = (16, 8, 4, 2, 1)  # of the rectangles of pixels that share a disc
-_SPREAD, _MERGED_SPREAD = 0.28, 0.6  # standard deviation of a disc in its sides: of a pixel, of more
+# standard deviation of a disc in its sides: of a pixel, of more
+_SPREAD = 0.28
+_MERGED_SPREAD = 0.6
 _BLUR = 0.1  # pixels²: what of the engine's blur of .3 counts as a disc's error; colors undo the rest
 _BACK = 0.5  # pixels by which discs lie deeper, as nearer neighbors cover them
 _RELIEF = 1.25  # pixels for 1 of color by which discs lie deeper than darker neighbors, see `_rise_beside`
 _THIN = 0.1  # pixels: the standard deviation across
 _STEEP = 0.3  # cosine below which a disc is turned no further, and one surface ends before another
-_MEDIAN, _SMOOTH, _SAME = 9, 3.0, 4.0  # pixels, of depths; how far both may be apart on one surface
+# pixels, of depths; how far both may be apart on one surface
+_MEDIAN = 9
+_SMOOTH = 3.0
+_SAME = 4.0
 _LEAST_LIGHT = 0.005  # of a pixel, below which what a Gaussian takes before a disc does not matter
 _REACH = 4.0  # standard deviations of the light's depths, within which a Gaussian is of the surface
 _SETTLED = 1e-3  # of the reach: nearer, a row that was moved is behind but for rounding
@@ -94,7 +99,8 @@ def place_discs(
         gap: pixels between a disc and what is moved behind it, which is wide and seen from the sides too
         cleared: the scene as other paint has moved it
     """
-    camera, cleared = paint.camera, scene if cleared is None else cleared
+    camera = paint.camera
+    cleared = scene if cleared is None else cleared
     depth = render_depth(scene, camera)
     opaque = (depth.alpha > OPAQUE).numpy()
     surface, even, pieces = _paint_surface(depth, camera)
@@ -116,7 +122,8 @@ def place_discs(
         rows, factors = _rows_before(cleared, camera, behind, mask, reach, pieces)
         if not len(rows):
             break
-        cleared, moved = _move_back(cleared, camera, rows, factors), moved.index_fill(0, rows, True)
+        cleared = _move_back(cleared, camera, rows, factors)
+        moved = moved.index_fill(0, rows, True)
     return Discs(added, moved.nonzero()[:, 0], cleared)
 
 
@@ -166,9 +173,11 @@ def merge_pixels(
     """
     rows, columns = np.nonzero(mask)
     reach = 3 * _SIDES[0]
-    top, left = max(0, rows.min() - reach), max(0, columns.min() - reach)
+    top = max(0, rows.min() - reach)
+    left = max(0, columns.min() - reach)
     window = slice(top, rows.max() + reach + 1), slice(left, columns.max() + reach + 1)
-    free, image = mask[window].copy(), picture[window].astype(np.float64)
+    free = mask[window].copy()
+    image = picture[window].astype(np.float64)
     cells = list[tuple[float, float, int, int]]()
     for height, width in _shapes():
         fits = free
@@ -195,7 +204,8 @@ def _box_means(values: Array, height: int, width: int) -> Array:
     """Means of the rectangles that begin at each pixel; 0 beyond the rim. [H,W,C] -> [H,W,C]"""
     rows, columns = values.shape[:2]
     sums = np.pad(values, ((1, height), (1, width), (0, 0))).cumsum(axis=0).cumsum(axis=1)
-    low, high = sums[:rows], sums[height : height + rows]
+    low = sums[:rows]
+    high = sums[height : height + rows]
     right = slice(width, width + columns)
     boxes = high[:, right] - low[:, right] - high[:, :columns] + low[:, :columns]
     return cast(Array, boxes / (height * width))
@@ -230,8 +240,10 @@ def _disc_error(image: Array, height: int, width: int) -> Array:
 def _discs(camera: Camera, cells: Array, surface: Array, picture: Tensor) -> tuple[Gaussians, Array]:
     """Discs that fill cells of the picture, on its surface, and their depths. [B,4], [H,W], [H,W,3]"""
     x, y, width, height = cells.T
-    K, c2w = camera.K.double().numpy(), camera.c2w.double().numpy()
-    focal, middle = np.array([K[0, 0], K[1, 1]]), K[:2, 2]
+    K = camera.K.double().numpy()
+    c2w = camera.c2w.double().numpy()
+    focal = np.array([K[0, 0], K[1, 1]])
+    middle = K[:2, 2]
 
     def sample(values: Array) -> Array:
         return cast(Array, ndimage.map_coordinates(values, [y - 0.5, x - 0.5], order=1, mode="nearest"))
@@ -314,7 +326,8 @@ def _rows_before(
     listed = color_map(activate(scene), camera, box, torch.arange(len(scene)))
     if not isinstance(listed, ListedWeights):
         raise TypeError("discs are placed by the CPU engine's lists")
-    runs, axis = listed.runs, camera.viewmat[2]
+    runs = listed.runs
+    axis = camera.viewmat[2]
     depths = (scene.means.double() @ axis[:3].double() + axis[3].double()).numpy()
     owner = np.repeat(runs.rows, runs.counts)
     pixel = np.repeat(runs.firsts.astype(np.int64), runs.counts) + runs.pixels
@@ -393,13 +406,15 @@ def project_paint(scene: Gaussians, own: Camera, drawn: Tensor, camera: Camera) 
     rows, columns = (drawn[..., 3] > 0).nonzero().T.numpy()
     if not len(rows):
         return result
-    left, top = max(0, columns.min() - _MARGIN), max(0, rows.min() - _MARGIN)
+    left = max(0, columns.min() - _MARGIN)
+    top = max(0, rows.min() - _MARGIN)
     window = left, top, min(own.width, columns.max() + _MARGIN + 1), min(own.height, rows.max() + _MARGIN + 1)
     seen = render_depth(scene, own, crop=window)
     surface, _, _ = _paint_surface(seen, own)
     step = max(1, round(math.sqrt(surface.size / _KNOTS)))
     y, x = np.mgrid[: surface.shape[0] : step, : surface.shape[1] : step]
-    K, there = own.K.double().numpy(), camera.K.double().numpy()
+    K = own.K.double().numpy()
+    there = camera.K.double().numpy()
     y, x, z = y + top + 0.5, x + left + 0.5, surface[y, x]
     rays = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], axis=-1)
     turn = (camera.viewmat.double() @ torch.linalg.inv(own.viewmat.double())).numpy()
@@ -440,7 +455,9 @@ def _invert(maps: Array, columns: Array, rows: Array) -> Array:
     Returns:
         [h,w,3]
     """
-    u, v, front = maps[0], maps[1], maps[-1] > 0
+    u = maps[0]
+    v = maps[1]
+    front = maps[-1] > 0
     size = np.array(u.shape)[:, None, None]
     known = np.stack([u[front], v[front], np.ones(front.sum())], axis=1)
     start = np.linalg.lstsq(known, np.stack(np.nonzero(front), axis=1).astype(float), rcond=None)[0]
@@ -448,7 +465,9 @@ def _invert(maps: Array, columns: Array, rows: Array) -> Array:
     for _ in range(_NEWTON):
         at = at.clip(-0.5, size - 0.5)
         u, v, ux, uy, vx, vy = (ndimage.map_coordinates(one, at, order=1, mode="nearest") for one in maps[:6])
-        right, down, area = columns - u, rows - v, ux * vy - uy * vx
+        right = columns - u
+        down = rows - v
+        area = ux * vy - uy * vx
         area = np.where(np.abs(area) > 1e-9, area, 1e-9)
         step = np.stack([ux * down - vx * right, vy * right - uy * down]) / area
         at = at + step.clip(-0.1 * size, 0.1 * size)

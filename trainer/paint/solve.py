@@ -22,7 +22,8 @@ from trainer.views.view import BACKGROUND, crop, seen_colors
 
 from .discs import PaintedView
 
-_STEPS, _ROUNDS = 40, 3  # of conjugate gradients; between them, colors below black are set to it
+_STEPS = 40  # of conjugate gradients
+_ROUNDS = 3  # between them, colors below black are set to it
 _HELD = 0.05  # of a pixel: how much a row of the scene holds on to its own color
 _RIDGE = 0.02  # the same of a disc, on what was painted there
 _LEAST_BOX = 32  # pixels around the paint in which its colors are solved for
@@ -52,11 +53,16 @@ def solve_colors(
         added: see `Discs`
         paints: of one thing
     """
-    joined, count = concatenate([scene, added]), len(rows)
-    free, activated = torch.cat([rows, torch.arange(len(scene), len(joined))]), activate(joined)
-    maps, missing, lowest = list[ColorMap](), list[Tensor](), torch.full((len(free), 3), -torch.inf)
+    joined = concatenate([scene, added])
+    count = len(rows)
+    free = torch.cat([rows, torch.arange(len(scene), len(joined))])
+    activated = activate(joined)
+    maps = list[ColorMap]()
+    missing = list[Tensor]()
+    lowest = torch.full((len(free), 3), -torch.inf)
     for paint in paints:
-        box, colors = box_of(paint.mask, paint.camera), seen_colors(joined, paint.camera)
+        box = box_of(paint.mask, paint.camera)
+        colors = seen_colors(joined, paint.camera)
         shown = render(joined, paint.camera, BACKGROUND, colors=colors, crop=box).image
         maps.append(color_map(activated, paint.camera, box, free))
         missing.append(crop(paint.picture, box) - shown)
@@ -83,7 +89,8 @@ def _least_squares(
     def normal(colors: Tensor) -> Tensor:
         return gradient([weights.picture(colors) for weights in maps]) + held * colors
 
-    right, diagonal = gradient(targets), normal(torch.ones_like(lowest))
+    right = gradient(targets)
+    diagonal = normal(torch.ones_like(lowest))
     colors = torch.zeros_like(lowest)
     for _ in range(_ROUNDS):
         residual = right - normal(colors)
@@ -94,7 +101,8 @@ def _least_squares(
         for _ in range(_STEPS):
             image = normal(direction) * free
             length = power / (direction * image).sum(dim=0).clamp_min(1e-20)
-            colors, residual = colors + length * direction, residual - length * image
+            colors = colors + length * direction
+            residual = residual - length * image
             scaled = residual / diagonal
             now = (residual * scaled).sum(dim=0)
             direction = scaled + now / power.clamp_min(1e-30) * direction

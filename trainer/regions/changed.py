@@ -44,7 +44,8 @@ _CHANGED = (
 )
 _BLOCK = 17  # pixels, a JPEG's block with half the colors, and its middle
 _SOFT = 8  # pixels of a soft rim, where masks are lifted
-_SPECK, _GAP = 2, 5  # pixels: what is narrower is none; what is wider than a gap is not closed
+_SPECK = 2  # pixels: what is narrower is none
+_GAP = 5  # what is wider than a gap is not closed
 _HOLE = 0.002  # of the picture: a smaller hole in what has changed is closed
 _LEAST = 0.5  # of a member's visible share lies where the pictures differ
 _BARELY = 0.5  # clearness: more than half of what shows there is what covers it
@@ -52,7 +53,8 @@ _RIM = 3.0  # pixels that a mask is too wide by, at most, or half of what is thi
 _INNER = 0.1  # of a connected piece's visible share lies within that rim; with less it is a stray
 _AT_RIM = 0.3  # of a member's visible share lies along the rim: its surface decides
 _LITTLE = 1e-3  # of what the largest piece shows there: as good as nothing
-_ODD, _VOTED = 0.06, 0.001  # of color, apart from nearly all that shows; of score, above the least
+_ODD = 0.06  # of color, apart from nearly all that shows
+_VOTED = 0.001  # of score, above the least
 _FEW = 0.01  # of what shows, on the rim perhaps
 
 
@@ -76,7 +78,8 @@ def changed_region(
         ProgdfError: a picture cannot be read, or they differ nowhere.
     """
     cameras = with_near_plane(cameras, scene)
-    masks, small = [], []
+    masks = []
+    small = []
     for path, camera in zip(paths, cameras, strict=True):
         change = find_change(*read_change(scene, path, camera), save_as(path))
         small.append(fit_size(camera.resize(change.shape[1], change.shape[0]), LIFTED_AT))
@@ -85,7 +88,8 @@ def changed_region(
         raise ProgdfError("the pictures differ nowhere from the scene; change them, or name the region")
     least = _LEAST if threshold is None else threshold
     covered = covered_rows(scene, small)
-    evidence, surface_vote = gather(scene, small, masks), SurfaceVote(scene, covered)
+    evidence = gather(scene, small, masks)
+    surface_vote = SurfaceVote(scene, covered)
     covered &= evidence.clearness < _BARELY
     inner = torch.zeros(len(scene), dtype=torch.float64)  # of a member's contribution, what lies off the rims
     for camera, mask in zip(small, masks, strict=True):
@@ -125,7 +129,9 @@ def find_change(
     Returns:
         [H,W] bool
     """
-    a, b, saved = original.numpy(), lay_over(original, picture).numpy(), save(original).numpy()
+    a = original.numpy()
+    b = lay_over(original, picture).numpy()
+    saved = save(original).numpy()
     exact = quantize_image(original).numpy()
     # what saving does within a block of it, and what else came
     bound = np.maximum(_around(np.abs(_smooth(saved - exact))), STEP)
@@ -139,11 +145,13 @@ def find_change(
     bound = np.maximum(bound, _around(np.abs(_smooth(save(torch.from_numpy(laid_on)).numpy() - laid_on))))
     # beside strong paint what differs a little is its soft rim
     scale = max(1.0, max(over.shape[:2]) / LIFTED_AT)
-    rim, speck = 1 + 2 * round(_SOFT * scale), np.ones((round(_SPECK * scale),) * 2)
+    rim = 1 + 2 * round(_SOFT * scale)
+    speck = np.ones((round(_SPECK * scale),) * 2)
     bound = np.maximum(bound, np.minimum(_CHANGED, 0.5 * _around(apart.max(axis=2, keepdims=True), rim)))
     changed = (apart > bound).any(axis=2) & (np.abs(b - exact) > STEP).any(axis=2)
     if _moved_or_noisy(b - saved, a):
-        smooth_a, smooth_b = _smooth(a), _smooth(b)
+        smooth_a = _smooth(a)
+        smooth_b = _smooth(b)
         shifts = [(y, x) for y in range(-_NEAR, _NEAR + 1) for x in range(-_NEAR, _NEAR + 1)]
         apart = np.min([np.abs(move_image(smooth_a, shift) - smooth_b) for shift in shifts], axis=0)
         changed = ndimage.binary_opening((apart > np.maximum(bound, _CHANGED)).any(axis=2), speck)

@@ -53,7 +53,8 @@ _TINTED = 0.55
 _PALE = 0.72
 """The region keeps less than half of its own color; the rest goes so far towards white, without its hue."""
 
-_FOV, _FILLED = math.radians(45.0), 0.9
+_FOV = math.radians(45.0)
+_FILLED = 0.9
 _SIDES = ((20.0, 15.0), (110.0, 15.0), (200.0, 15.0), (290.0, 15.0))
 
 

@@ -19,14 +19,18 @@ from progdf.terminal import format_count
 FEW = 8
 """Masks up to which a region is cleaned; exact ones from 12 views would lose a thin scarf's edge to it."""
 
-_LINKS, _REACH, _WIDE = 8, 2.5, 2.0
+_LINKS = 8
+_REACH = 2.5
+_WIDE = 2.0
 """A member is linked to those of its 8 nearest that are nearer than 2.5 times what is usual for the eighth,
 or whose 2 σ touch its own: flat surfaces are of few, large Gaussians."""
 
 _PIECE = 0.1
 """Of the largest connected surface: smaller ones are strays."""
 
-_AROUND, _FILLED, _ROUNDS = 12, 0.75, 3
+_AROUND = 12
+_FILLED = 0.75
+_ROUNDS = 3
 """A hole is what has three quarters members among its 12 nearest, in up to three rounds."""
 
 
@@ -90,7 +94,8 @@ def find_holes(
         return torch.zeros(0, dtype=torch.int64)
     means = scene.means
     inner = means[member]
-    low, high = inner.amin(dim=0), inner.amax(dim=0)
+    low = inner.amin(dim=0)
+    high = inner.amax(dim=0)
     inside = ((means >= low) & (means <= high)).all(dim=1)
     rows = (inside & ~member & (views_outside < 2)).nonzero()[:, 0]
     if not len(rows):
@@ -113,7 +118,8 @@ def connected_pieces(gaussians: Gaussians) -> np.ndarray:
     width = gaussians.scales.median(dim=1).values
     linked = apart <= _REACH * max(float(np.median(apart[:, -1])), 1e-12)
     linked |= apart <= _WIDE * (width[:, None] + width[near])
-    first, second = torch.arange(count)[:, None].expand_as(near)[linked], near[linked]
+    first = torch.arange(count)[:, None].expand_as(near)[linked]
+    second = near[linked]
     return join_pairs(first.numpy(), second.numpy(), count)
 
 

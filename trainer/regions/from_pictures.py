@@ -139,7 +139,8 @@ def region_kinds(request: RegionRequest) -> dict[str, Kind]:
             # with masks of the bear's body a pixel too wide or too narrow, IoU .93 for .61-.68.
             nearer = _near_cameras(scene, _lift(scene, cameras, nonempty, prompt, request), request)
             masks = [*masks, *_segment(scene, nearer, prompt, folder, request)]
-            cameras, nonempty = [*cameras, *nearer], _masks_with_pixels(masks, prompt, request)
+            cameras = [*cameras, *nearer]
+            nonempty = _masks_with_pixels(masks, prompt, request)
         # with these the folder is one for masks:DIR, of the same region
         telling = [camera for camera, mask in zip(cameras, nonempty, strict=True) if mask is not None]
         save_cameras(folder / "cameras.json", telling, scene.origin)

@@ -24,7 +24,8 @@ THRESHOLDS: dict[LiftRule, float] = {"share": 0.7, "paper": 0.8}
 HIDDEN = 0.06
 """Below this clearness a Gaussian counts as never seen: what shines through tells of what covers it."""
 
-_HALF_HIDDEN, _DOUBTFUL = 0.3, (0.3, 0.7)
+_HALF_HIDDEN = 0.3
+_DOUBTFUL = (0.3, 0.7)
 """Below this clearness and with a share between these, what was seen decides nothing either."""
 
 
@@ -59,7 +60,8 @@ def gather(scene: Gaussians, cameras: Sequence[Camera], masks: Sequence[Tensor])
     """
     sums = torch.zeros(len(scene), 4, dtype=torch.float64)
     mean_weight = torch.zeros(len(scene))
-    views, views_inside = torch.zeros(len(scene)), torch.zeros(len(scene))
+    views = torch.zeros(len(scene))
+    views_inside = torch.zeros(len(scene))
     bare = bare_weight(scene.opacities)
     for camera, mask in zip(cameras, masks, strict=True):
         weights = alpha_weights(scene, camera, mask)

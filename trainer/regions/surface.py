@@ -27,7 +27,8 @@ _AT_ONCE = 1 << 16  # rows, for the memory's sake
 # normals with .905, without the sizes .871, without the planes .957. Colors and distance gain nothing there,
 # but not everywhere do parts differ in size. The first three may be half as large again.
 _NEAR = 8  # the distance to this neighbor is the unit of the next two
-_ALONG, _OFF_PLANE = 2.0, 0.5
+_ALONG = 2.0
+_OFF_PLANE = 0.5
 _TURN = 0.18  # radians between the normals
 _COLOR = 0.16  # sRGB, length of the difference
 _FLOAT32 = 1e-6  # of squares of about 1, summed over a pixel
@@ -51,7 +52,8 @@ class SurfaceVote:
     """
 
     def __init__(self, scene: Gaussians, covered: Tensor | None = None) -> None:
-        self._scene, self._covered = scene, covered
+        self._scene = scene
+        self._covered = covered
         self._known = torch.zeros(len(scene), dtype=torch.bool)
         self._ties = csr_matrix((len(scene), len(scene)), dtype=np.float32)
 
@@ -71,8 +73,10 @@ class SurfaceVote:
             of = np.repeat(rows.numpy(), alike.sum(axis=1))
             self._ties += csr_matrix((likeness.numpy()[alike], (of, near.numpy()[alike])), self._ties.shape)
             self._known[rows] = True
-        open_, vote = undecided.numpy(), (2.0 * member.float() - 1.0).numpy()
-        ties, vote[open_] = self._ties[open_], 0.0
+        open_ = undecided.numpy()
+        vote = (2.0 * member.float() - 1.0).numpy()
+        ties = self._ties[open_]
+        vote[open_] = 0.0
         for _ in range(_ROUNDS):
             vote[open_] = ties @ vote
         return torch.from_numpy(vote[open_])
@@ -98,7 +102,8 @@ def covered_rows(scene: Gaussians, cameras: Sequence[Camera]) -> Tensor:
     Behind is what lies deeper than the surface is thick: farther off what its pixel shows than three standard
     deviations of the centers of that, and of the Gaussian itself, in that direction.
     """
-    covered, uncovered = torch.zeros(len(scene), dtype=torch.bool), torch.zeros(len(scene), dtype=torch.bool)
+    covered = torch.zeros(len(scene), dtype=torch.bool)
+    uncovered = torch.zeros(len(scene), dtype=torch.bool)
     center, radius = scene_sphere(scene)
     means = (scene.means - center) / radius  # of about 1, so that float32 can tell squares apart
     axes = rotation_matrices(scene.unit_quats) * scene.scales[:, None, :] / radius
@@ -107,7 +112,8 @@ def covered_rows(scene: Gaussians, cameras: Sequence[Camera]) -> Tensor:
     for camera in cameras:
         points = scene.means @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
         x, y, depth = (points @ camera.K.T).unbind(1)
-        x, y = (x / depth).floor(), (y / depth).floor()
+        x = (x / depth).floor()
+        y = (y / depth).floor()
         framed = (depth > camera.near) & (x >= 0) & (x < camera.width) & (y >= 0) & (y < camera.height)
         rows = framed.nonzero()[:, 0]
         at = (y[rows].long(), x[rows].long())
@@ -153,7 +159,8 @@ def _off_plane(scene: Gaussians, rows: Tensor, near: Tensor) -> tuple[Tensor, Te
 def _likeness(scene: Gaussians, rows: Tensor, near: Tensor, distances: Tensor) -> Tensor:
     """How likely each neighbor is of the same surface; sums to 1. [Q,k]"""
     unit = distances[:, min(_NEAR, distances.shape[1]) - 1, None].clamp_min(1e-12)
-    colors, sizes = sh0_to_rgb(scene.sh0), scene.log_scales.sort(dim=1).values
+    colors = sh0_to_rgb(scene.sh0)
+    sizes = scene.log_scales.sort(dim=1).values
     off_plane, cosine = _off_plane(scene, rows, near)
     turned = (2 - 2 * cosine).clamp_min(0.0)  # 1 − cos is half the angle squared
     unlike = (

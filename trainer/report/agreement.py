@@ -167,14 +167,16 @@ def fit_colors(seen: Sequence[ViewChange], members: int) -> Tensor:
     for _ in range(_ROUNDS):
         with torch.no_grad():
             rendered = [one.render(direction) for one in seen]
-        length, curve = float(direction.square().sum()), sum(float(p.square().sum()) for p in rendered)
+        length = float(direction.square().sum())
+        curve = sum(float(p.square().sum()) for p in rendered)
         if curve <= 0:
             break
         damping = DAMPING * curve / length if damping is None else damping
         step = float(slope.square().sum()) / (curve + damping * length)
         colors = colors + step * direction
         left = [picture - step * p for picture, p in zip(left, rendered, strict=True)]
-        before, slope = float(slope.square().sum()), gather(left) - damping * colors
+        before = float(slope.square().sum())
+        slope = gather(left) - damping * colors
         direction = slope + float(slope.square().sum()) / before * direction
     return colors
 

@@ -29,7 +29,9 @@ ROUNDING = 1e-5
 """Features of the same input, of unit length, differ by less: a text and itself in one batch by 3e-7, where
 MKL takes another path for the second row. What one sees or reads differs by .01 and more."""
 
-_MEAN, _SPREAD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)  # of CLIP's input
+# of CLIP's input
+_MEAN = (0.48145466, 0.4578275, 0.40821073)
+_SPREAD = (0.26862954, 0.26130258, 0.27577711)
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,8 @@ class Clip:
 
     def pictures(self, images: Sequence[Tensor]) -> Tensor:
         """Features of pictures [H,W,3] of range 0..1, of unit length. [n,D]"""
-        shift, scale = torch.tensor(_MEAN)[:, None, None], torch.tensor(_SPREAD)[:, None, None]
+        shift = torch.tensor(_MEAN)[:, None, None]
+        scale = torch.tensor(_SPREAD)[:, None, None]
         inputs = torch.stack([(square_picture(image, self.size) - shift) / scale for image in images])
         with torch.no_grad():
             return normalize(_features(self.network.get_image_features(pixel_values=inputs)), dim=-1)
@@ -121,7 +124,8 @@ def square_picture(image: Tensor, size: int) -> Tensor:
     """
     height, width = image.shape[:2]
     side = max(height, width)
-    left, top = (side - width) // 2, (side - height) // 2
+    left = (side - width) // 2
+    top = (side - height) // 2
     planes = image.permute(2, 0, 1)[None]
     planes = pad(planes, (left, side - width - left, top, side - height - top), value=1.0)
     scaled = interpolate(planes, size=(size, size), mode="bicubic", align_corners=False, antialias=True)

@@ -227,8 +227,10 @@ def clip_curve(
 
 def figures(measured: Measured, endpoint_error: float, outside_change: float) -> dict[str, Any]:
     """The part of report.json that depends on the field (see docs of the command line)."""
-    fitted, slider = measured.fitted, measured.slider
-    drawn, linear = measured.editor["slider"], measured.editor[COMPARED]
+    fitted = measured.fitted
+    slider = measured.slider
+    drawn = measured.editor["slider"]
+    linear = measured.editor[COMPARED]
     similarity = measured.clip.similarity
     return {
         "field": {
@@ -350,10 +352,12 @@ def measure_paint(
         backgrounds: what shows through the scene in each picture, rgb. [3] each
         edited: the scene with the edit, rows that it adds last
     """
-    scene, members = setup.scene, setup.region.members
+    scene = setup.scene
+    members = setup.region.members
     without = scene[~setup.region.mask]
     change = missing = behind = 0.0
-    pixels, weights = 0, torch.zeros(len(scene), 2, dtype=torch.float64)
+    pixels = 0
+    weights = torch.zeros(len(scene), 2, dtype=torch.float64)
     for view, target, background in zip(setup.train, painted, backgrounds, strict=True):
         energy = (target - view.image).square().sum(dim=2)
         # a JPEG is off by a little all over: elsewhere only what is painted for certain

@@ -12,12 +12,20 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
-PAPER, INK, PALE, GRID = (250, 249, 246), (38, 36, 34), (118, 113, 107), (228, 225, 219)
+PAPER = (250, 249, 246)
+INK = (38, 36, 34)
+PALE = (118, 113, 107)
+GRID = (228, 225, 219)
 LINES = ((34, 84, 180), (214, 96, 36), (60, 150, 90), (150, 70, 160), (196, 158, 28), (70, 160, 180))
 _DASHES = ("-", "--", ":")  # of lines beyond as many as there are colors
 
 _DPI = 100
-_LEFT, _RIGHT, _TOP, _BOTTOM, _LEGEND = 56, 16, 30, 44, 20  # pixels around the axes; a legend's line is below
+# pixels around the axes; a legend's line is below
+_LEFT = 56
+_RIGHT = 16
+_TOP = 30
+_BOTTOM = 44
+_LEGEND = 20
 _MARKED = 20  # lines of at most so many points show them
 _DECADES = 4  # a logarithmic axis shows no more of any line, the least values lie below its floor
 
@@ -54,7 +62,8 @@ def draw_plot(plot: Plot, width: int, height: int) -> Image.Image:
         axes.text(0.5, 0.5, "nothing to show", color=pale, ha="center", transform=axes.transAxes)
         return _image(figure)
     for i, (name, (xs, ys)) in enumerate(lines.items()):
-        color, dash = _shade(LINES[i % len(LINES)]), _DASHES[i // len(LINES) % len(_DASHES)]
+        color = _shade(LINES[i % len(LINES)])
+        dash = _DASHES[i // len(LINES) % len(_DASHES)]
         marker = "o" if len(xs) <= _MARKED else ""
         axes.plot(xs, ys, dash, color=color, linewidth=1.5, marker=marker, markersize=3.5, label=name)
     if all(float(x).is_integer() for xs, _ in lines.values() for x in xs):

@@ -25,7 +25,8 @@ Columns = Sequence[tuple[float, float | None]]
 
 _CLOSE = 1 / 16  # a picture is shown where the editor was asked if that is so near
 _SPAN = (0.0, 1.0)
-_THUMBNAIL, _PLOT_HEIGHT = 240, 270
+_THUMBNAIL = 240
+_PLOT_HEIGHT = 270
 _TERMS = {"left": "L1 to the finished edit", "l1": "L1", "perceptual": "LPIPS"}
 
 
@@ -42,7 +43,8 @@ def report_picture(
         title: one line
         held_out: how many of these views training did not see
     """
-    chosen, linear = measured.shown, measured.fitted.baselines[COMPARED].field
+    chosen = measured.shown
+    linear = measured.fitted.baselines[COMPARED].field
     columns = columns_of(measured.asked)
     sheet = to_picture(
         contact_sheet(
@@ -117,7 +119,8 @@ def thumbnail(image: Tensor, width: int) -> Tensor:
 
 def _error_plots(measured: Measured) -> list[Plot]:
     """Of all fields that were measured against what was recorded; of two against the editor."""
-    fitted, s = measured.fitted, [measured.remap.at(s) for s in sample_strengths()]
+    fitted = measured.fitted
+    s = [measured.remap.at(s) for s in sample_strengths()]
     fields = {fitted.chosen.field.kind: fitted.chosen, **fitted.baselines}
     recorded: dict[str, Points] = {
         f"{_label(name)}, {found.field.bytes_per_member:.0f} B": (s, found.curve)

@@ -52,7 +52,8 @@ _FRONT = 0.8  # of a picture that the region fills where sides are compared
 SIDE = math.radians(60)
 """Angle around the region from which on a view shows another side, which gets an anchor of its own."""
 
-CONSENSUS, SWEEP = 0.4, 0.6
+CONSENSUS = 0.4
+SWEEP = 0.6
 """Strengths away from the render of the fit: at .8 views decide anew, and do not converge."""
 
 SOFTNESS = 0.25
@@ -94,7 +95,8 @@ def register(original: Tensor, picture: Tensor, beside: Tensor) -> Registration:
         original, picture: [H,W,3]
         beside: pixels that should show the same in both. [H,W] bool
     """
-    levels, planes = [], [image.permute(2, 0, 1)[None] for image in (original, picture)]
+    levels = []
+    planes = [image.permute(2, 0, 1)[None] for image in (original, picture)]
     masks = beside.float()[None, None]
     for level in range(6):
         factor = 2**level
@@ -134,7 +136,8 @@ def _step(a: Tensor, b: Tensor, weight: Tensor, parameters: Tensor) -> tuple[Ten
         torch.nn.functional.pad((moved[..., 2:, :] - moved[..., :-2, :]) / 2, (0, 0, 1, 1)),
     ]
     gx, gy = (g[0][:, counts].double() * max(a.shape[2:]) for g in gradients)
-    target, source = a[0][:, counts].double(), moved[0][:, counts].double()
+    target = a[0][:, counts].double()
+    source = moved[0][:, counts].double()
     gain = target.std(dim=1, keepdim=True) / source.std(dim=1, keepdim=True).clamp_min(1e-6)
     gain = gain.clamp(0.5, 2.0)
     residual = target - (source - source.mean(1, keepdim=True)) * gain - target.mean(1, keepdim=True)
@@ -207,7 +210,8 @@ class Easel:
             references, source, strength, softness: see `InstructEditor.paint`
         """
         references, original = references[: self.painter.references], self.painter.original(view)
-        beside, moved = beside_region(self.crop(view, view.mask[..., None])[..., 0]), 0.0
+        beside = beside_region(self.crop(view, view.mask[..., None])[..., 0])
+        moved = 0.0
         for seed in (self.seed, self.seed + 1):
             recipe = {
                 **self.recipe,
@@ -247,7 +251,8 @@ class Fit:
 
     def render(self, camera: Camera) -> Tensor:
         """The scene with these changes. [H,W,3]"""
-        scene, members = self.setup.scene, self.setup.region.members
+        scene = self.setup.scene
+        members = self.setup.region.members
         rows = pack(scene[members], with_shN=scene.sh_degree > 0)
         rows[:, attribute_slices(rows.shape[1])["sh0"]] += self.colors / C0
         edited = scene.replace_rows(members, rows)
@@ -276,7 +281,8 @@ class AgreedEditor:
         painter = self.easel.painter
         fit = self.fit.render(painter.frame(view)[1])
         # from the view at this degree of what all agree on, as free as that: 1 is the last round's picture
-        source, freedom = torch.lerp(painter.original(view), fit, strength), CONSENSUS * strength
+        source = torch.lerp(painter.original(view), fit, strength)
+        freedom = CONSENSUS * strength
         painted, _ = self.easel.paint(view, f"{strength:g}", [fit], source, freedom, SOFTNESS)
         if painted is None:
             return cross_fade(view.image, finished, strength)
@@ -325,7 +331,9 @@ class _Loop:
     def __init__(
         self, easel: Easel, setup: TrainingSetup, advance: Advance, approved: tuple[View, Tensor] | None
     ) -> None:
-        self._easel, self._setup, self._advance = easel, setup, advance
+        self._easel = easel
+        self._setup = setup
+        self._advance = advance
         self._approved = [] if approved is None else [self._change(*approved)]
         self._first = [] if approved is None else [easel.crop(*approved)]  # the anchor, as a reference
         self.pictures: dict[str, Tensor] = {}
@@ -344,10 +352,12 @@ class _Loop:
 
     def follow(self, views: Sequence[View], anchors: int) -> None:
         """Paint each view with two references: what the anchors so far show of it, and the first of them."""
-        members, seen = len(self._setup.region.members), [*self._approved]
+        members = len(self._setup.region.members)
+        seen = [*self._approved]
         fit = Fit(self._setup, fit_colors(seen, members)) if seen else None
         for i, view in enumerate(views):
-            place, name = ANCHOR if i < anchors else "reference", view.camera.name
+            place = ANCHOR if i < anchors else "reference"
+            name = view.camera.name
             references = [self._render(fit, view), *self._first] if fit is not None else []
             self.paint(view, place, references=references)
             if name in self.pictures and (i < anchors or fit is None):
@@ -356,7 +366,8 @@ class _Loop:
 
     def sweep(self, views: Sequence[View]) -> None:
         """Paint each view away from what the views so far, of those trained on, make of the scene."""
-        train, seen = {view.camera.name for view in self._setup.train}, [*self._approved]
+        train = {view.camera.name for view in self._setup.train}
+        seen = [*self._approved]
         for view in views:
             if seen:
                 fit = Fit(self._setup, fit_colors(seen, len(self._setup.region.members)))

@@ -100,7 +100,8 @@ def finish_run(
         log: of the run
         begun: see `network.fit_network`
     """
-    options, scene = record.plan, setup.scene
+    options = record.plan
+    scene = setup.scene
     with log.stage("fit"):
         grown = setup.extend(trajectory.added)
         evaluator = load_evaluator(folder, grown, setup.judging, trajectory)
@@ -110,7 +111,8 @@ def finish_run(
         )
     with log.stage("even"):
         slider = resolve_slider(options.optimize.slider, trajectory.strengths)
-        field, remap = fitted.chosen.field, identity_remap()
+        field = fitted.chosen.field
+        remap = identity_remap()
         if slider == "even":
             field, remap = equalize_slider(field, grown, log)
         if field.attributes:  # its end is what its file says, not what was recorded
@@ -130,7 +132,8 @@ def finish_run(
             judges = replace(evaluator, looked=looked), replace(reporting, looked=looked)
             measured = measure(judges, trajectory, fitted, field, remap, perceptual, clip)
         endpoint, outside = exactness(scene, gdf, end_rows(grown, trajectory))
-        title, shown = f"{options.name}: {options.editor.editor}", evaluator
+        title = f"{options.name}: {options.editor.editor}"
+        shown = evaluator
         if sharp is not None:
             gdf = sharp
             shown = load_evaluator(folder, setup, setup.judging, trajectory, gdf)
@@ -160,8 +163,10 @@ def finish_run(
 def _make_gdf(options: TrainOptions, setup: TrainingSetup, field: BakedField, added: Gaussians) -> Gdf:
     """The edit as it is written, but for its report, and for what is painted finer than the Gaussians."""
     plan = plain(options if len(added) else with_values(options, grow=0.0))
-    given, scene_print = differences(plan, DEFAULTS), fingerprint(setup.scene)
-    instruction, rows = options.editor.editor, added if len(added) else None
+    given = differences(plan, DEFAULTS)
+    scene_print = fingerprint(setup.scene)
+    instruction = options.editor.editor
+    rows = added if len(added) else None
     return Gdf(options.name, setup.region, field, scene_print, instruction, given, added=rows)
 
 
@@ -217,7 +222,8 @@ def _fit(
         log.say("no view is held out: all figures are of the views that were trained on")
     weighing = setup.train[::_WEIGHED_EVERY]
     with log.looks("weigh the members", len(weighing)) as looked:
-        members, scene = setup.region.members, setup.scene
+        members = setup.region.members
+        scene = setup.scene
         if trajectory.added is not None:
             count = len(trajectory.added)
             scene = scene.replace_rows(members[-count:], end_rows(setup, trajectory)[-count:])
@@ -230,7 +236,8 @@ def _fit(
         )
         return evaluate_field(trajectory, reporting, network.field, options.target_psnr), network
     with log.looks("fit the field", expected_looks(trajectory, options.field)) as looked:
-        choosing, reporting = replace(choosing, looked=looked), replace(reporting, looked=looked)
+        choosing = replace(choosing, looked=looked)
+        reporting = replace(reporting, looked=looked)
         if trajectory.maps is not None and options.field == "auto":
             scene = setup.scene[setup.region.members]
             rows = pack(scene, with_shN=scene.sh_degree > 0)
@@ -333,11 +340,15 @@ def load_evaluator(
     """Some views beside their edited pictures, as the run keeps them; `gdf`: an edit that may add rows."""
     cameras = [view.camera for view in views]
     edited = {s: read_views(folder, "edited", cameras, s) for s in trajectory.strengths}
-    scene, region, channels = setup.scene, setup.region, trajectory.end.shape[1]
+    scene = setup.scene
+    region = setup.region
+    channels = trajectory.end.shape[1]
     still = only_recolors(trajectory.offsets)
     if gdf is not None and gdf.added is not None:
         scene, (gdf,) = extend(scene, [gdf])
-        region, channels, still = gdf.region, gdf.field.channels, False
+        region = gdf.region
+        channels = gdf.field.channels
+        still = False
     return make_evaluator(scene, region, views, edited, setup.background, channels, still)
 
 
@@ -349,7 +360,8 @@ def end_rows(setup: TrainingSetup, trajectory: Trajectory) -> Tensor:
 
 def exactness(scene: Gaussians, gdf: Gdf, end: Tensor) -> tuple[float, float]:
     """Largest difference of a raw number: at s = 1 from the recorded end, and outside the region."""
-    outside, finished = ~gdf.region.mask, edited_scene(scene, gdf)
+    outside = ~gdf.region.mask
+    finished = edited_scene(scene, gdf)
     members = torch.cat([gdf.region.members, torch.arange(len(scene), len(finished))])
     packed = pack(finished[members], with_shN=end.shape[1] > BASE_CHANNELS)
     endpoint = float((packed - end).abs().max())
@@ -357,7 +369,8 @@ def exactness(scene: Gaussians, gdf: Gdf, end: Tensor) -> tuple[float, float]:
     for s in (0.3, 1.0):
         edited = edited_scene(scene, gdf, s)
         for name in ATTRIBUTES:
-            before, after = getattr(scene, name)[outside], getattr(edited, name)[: len(scene)][outside]
+            before = getattr(scene, name)[outside]
+            after = getattr(edited, name)[: len(scene)][outside]
             if before.numel() and not torch.equal(before, after):
                 change = max(change, float((after - before).abs().max()))
     return endpoint, change

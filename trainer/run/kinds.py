@@ -33,7 +33,10 @@ from trainer.views.view import View, fit_size
 
 _SIZE = 128  # longer side of the small views, pixels
 _VIEWS = 12  # of those that change most; every third judges
-_MOST_STEPS, _LEAST_STEPS, _SHARE = 60, 24, 1 / 6  # of a trial; share of the run's own
+# of a trial; share of the run's own
+_MOST_STEPS = 60
+_LEAST_STEPS = 24
+_SHARE = 1 / 6
 _AS_GOOD = 0.2  # dB by which training colors alone may be worse than training all: it takes fewer bytes
 _MOVED = 0.8
 """Share of the gain of painting, in dB, from which moving is taken: what moved and is painted looks torn at a
@@ -212,11 +215,14 @@ def try_approaches(
     steps = max(_LEAST_STEPS, min(_MOST_STEPS, round(_SHARE * options.optimize.steps)))
     psnrs: dict[Approach, float] = {}
     for way in ways:
-        grown, small, seeds = setup, plain, 0
+        grown = setup
+        small = plain
+        seeds = 0
         if way.grow:
             views, pictures = zip(*trained, strict=True)
             rows = seed_rows(setup, views, pictures, int(way.grow * len(setup.region)), options.optimize.seed)
-            grown, seeds = setup.extend(rows), len(rows)
+            grown = setup.extend(rows)
+            seeds = len(rows)
             small = _small_views(grown, most)
         psnrs[way] = _try_approach(options, way, grown, seeds, small, steps)
         if advance is not None:
@@ -234,7 +240,9 @@ def _try_approach(
 ) -> float:
     """PSNR in the judging views, dB. `seeds`: how many members, the last, are none of the scene's"""
     taught = small.only([i for i in range(len(small.crops)) if i % 3 != 1])
-    original, crops, targets = small.original, taught.crops, taught.edited[1.0]
+    original = small.original
+    crops = taught.crops
+    targets = taught.edited[1.0]
     stage = TargetStage(1.0, targets, steps)
     if way.group_steps:
         # how far parts get as wholes; what the members add to that takes longer than a trial
@@ -246,7 +254,8 @@ def _try_approach(
         settings = pgs_settings(resolved, True, original.shape[1], extent, 1)
         settings = replace(settings, smoothing=0.9, every=0, snapshots=1)
         if seeds:
-            stage, settings = place_seeds(stage, seeds), replace(settings, ramp=0.0)
+            stage = place_seeds(stage, seeds)
+            settings = replace(settings, ramp=0.0)
         objective = Objective(GradientL1(), OptimizeOptions(perceptual_weight=0.0))
         *_, last = optimize(original, crops, [], [stage], objective, settings)
         end = last.offsets

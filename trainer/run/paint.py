@@ -75,7 +75,8 @@ def lay_discs(scene: Gaussians, paints: Sequence[PaintedView], gap: float) -> La
         paints: of one thing
         gap: see `place_discs`
     """
-    cleared, added = scene, scene[:0]
+    cleared = scene
+    added = scene[:0]
     changed = torch.zeros(len(scene), dtype=torch.bool)
     for paint in paints:
         fresh = paint
@@ -87,7 +88,8 @@ def lay_discs(scene: Gaussians, paints: Sequence[PaintedView], gap: float) -> La
             near = ndimage.binary_dilation((shown > 0.5).numpy(), iterations=GROWN)
             fresh = replace(paint, drawn=paint.drawn * ~torch.from_numpy(near)[..., None])
         discs = place_discs(scene, fresh, _FLAT, gap, cleared)
-        cleared, added = discs.scene, concatenate([added, discs.added])
+        cleared = discs.scene
+        added = concatenate([added, discs.added])
         changed[discs.moved] = True
     for paint in paints:
         box = box_of(paint.mask, paint.camera)
@@ -121,7 +123,8 @@ def look_around(scene: Gaussians, paints: Sequence[PaintedView], degrees: Sequen
         paints: of one thing
         degrees: by which each one's camera is turned; 0 is the picture itself
     """
-    background, looks = torch.tensor(BACKGROUND), []
+    background = torch.tensor(BACKGROUND)
+    looks = []
     for paint in paints:
         pivot = _pivot(scene, paint)
         for angle in degrees:
@@ -131,9 +134,11 @@ def look_around(scene: Gaussians, paints: Sequence[PaintedView], degrees: Sequen
                 covered = torch.zeros(expected.shape[:2], dtype=torch.bool)
                 for other in paints:
                     laid = project_paint(scene, other.camera, other.drawn, camera)
-                    expected, covered = lay_on(expected, laid), covered | (laid[..., 3] > 0)
+                    expected = lay_on(expected, laid)
+                    covered = covered | (laid[..., 3] > 0)
             else:
-                expected, covered = paint.picture, paint.mask
+                expected = paint.picture
+                covered = paint.mask
             grown = ndimage.binary_dilation(covered.numpy(), iterations=RING)
             looks.append(PaintView(camera, angle, expected, covered, torch.from_numpy(grown) & ~covered))
     return looks
@@ -200,11 +205,13 @@ def paint_gdf(
     score[laid.rows] = 1.0
     channels = BASE_CHANNELS if recolored is None else recolored.field.channels
     bands = channels > BASE_CHANNELS
-    base, start = laid.scene, faint(laid.added)
+    base = laid.scene
+    start = faint(laid.added)
     change = pack(laid.ended[members], with_shN=bands) - pack(base[members], with_shN=bands)
     steps, rise = opacity_course(start.logit_opacities, torch.full((len(start),), DISC_LOGIT))
     clock = _even_clock(laid, paints, steps, rise)
-    knots, course = clock, torch.zeros(len(members), channels)
+    knots = clock
+    course = torch.zeros(len(members), channels)
     if recolored is not None:
         knots = torch.unique(torch.cat([clock, recolored.field.knots]))
         course = pack(base[members], with_shN=bands) - pack(scene[members], with_shN=bands)
@@ -223,7 +230,8 @@ def paint_gdf(
 
 def _shares(recolored: Gdf, members: Tensor, end: Tensor, knots: Tensor) -> Tensor:
     """The course of a recolor whose end is `end`, which is a share of its own. [M], [M,C], [S] -> [S,M,C]"""
-    field, inside = recolored.field, torch.searchsorted(members, recolored.region.members)
+    field = recolored.field
+    inside = torch.searchsorted(members, recolored.region.members)
     whole = field.offsets(1.0)
     kept = (end[inside] * whole).sum(dim=1) / whole.square().sum(dim=1).clamp_min(1e-20)
     courses = torch.zeros(len(knots), *end.shape)
@@ -245,7 +253,8 @@ def _even_clock(laid: Laid, paints: Sequence[PaintedView], steps: Tensor, rise: 
         now = concatenate([moved, replace(hidden, logit_opacities=logits)])
         return render(now, paint.camera, BACKGROUND, crop=box).image[painted]
 
-    first, last = look_at(0.0), look_at(1.0)
+    first = look_at(0.0)
+    last = look_at(1.0)
     change = last - first
     at = np.linspace(0.0, 1.0, _LOOKS + 1)
     shares = [float(((look_at(g) - first) * change).sum() / change.square().sum()) for g in at[1:-1]]
@@ -292,7 +301,8 @@ def sharpen(
     errors = [[_error(one, some) for one in (end, laid.end)] for some in parts]
     keeps = errors[0][1] < errors[0][0] and errors[1][1] <= errors[1][0]
     own_db, side_db = ([round(decibels(error), 1) for error in pair] for pair in errors)
-    pixels, discs = group_digits(sum(int(one.mask.sum()) for one in paints)), group_digits(len(laid.added))
+    pixels = group_digits(sum(int(one.mask.sum()) for one in paints))
+    discs = group_digits(len(laid.added))
     log.say(
         f"{pixels} painted pixels are finer than the Gaussians: {discs} discs for them have {own_db[1]} dB "
         f"where recoloring has {own_db[0]}, from their sides {side_db[1]} where it has {side_db[0]}: "
@@ -339,7 +349,8 @@ def train_decal(editor: DecalEditor, scene: Gaussians, name: str, log: RunLog | 
     paints = [editor.paint]
     laid = choose_discs(scene, paints, look_around(scene, paints, _TRIAL_TURNS), log)
     gdf = paint_gdf(laid, scene, paints, name, None)
-    edited, background = edited_scene(scene, gdf), torch.tensor(BACKGROUND)
+    edited = edited_scene(scene, gdf)
+    background = torch.tensor(BACKGROUND)
     looks = look_around(scene, paints, TURNS)
     shown = [render_view(edited, look.camera, background).clamp(0.0, 1.0) for look in looks]
     errors = [
@@ -360,10 +371,12 @@ def train_decal(editor: DecalEditor, scene: Gaussians, name: str, log: RunLog | 
 
 def _pivot(scene: Gaussians, paint: PaintedView) -> Tensor:
     """The point of the surface under the painted pixel that is nearest to the middle of all. [3]"""
-    camera, pixels = paint.camera, paint.mask.nonzero()
+    camera = paint.camera
+    pixels = paint.mask.nonzero()
     row, column = pixels[int((pixels - pixels.float().mean(dim=0)).norm(dim=1).argmin())].tolist()
     depth = render_depth(scene, camera, crop=(column, row, column + 1, row + 1)).depth[0, 0].double()
-    K, c2w = camera.K.double(), camera.c2w.double()
+    K = camera.K.double()
+    c2w = camera.c2w.double()
     ray = torch.stack([(column + 0.5 - K[0, 2]) / K[0, 0], (row + 0.5 - K[1, 2]) / K[1, 1], torch.ones(())])
     return c2w[:3, :3] @ (depth * ray) + c2w[:3, 3]
 
@@ -371,7 +384,8 @@ def _pivot(scene: Gaussians, paint: PaintedView) -> Tensor:
 def orbit(camera: Camera, pivot: Tensor, degrees: float) -> Camera:
     """The camera turned about an axis through a point that is upright in its picture."""
     c2w = camera.c2w.double()
-    axis, half = c2w[:3, 1], 0.5 * math.radians(degrees)
+    axis = c2w[:3, 1]
+    half = 0.5 * math.radians(degrees)
     turn = torch.cat([torch.tensor([math.cos(half)]).double(), math.sin(half) * axis])
     turned = torch.eye(4, dtype=torch.float64)
     turned[:3, :3] = rotate_vectors(c2w[:3, :3].T, turn[None]).T

@@ -92,7 +92,8 @@ def reopen_run(root: Path, scene: Path | None = None) -> FinishedRun:
     trajectory, extra, about = load_trajectory(folder.trajectory)
     try:
         record = read_record(about)
-        members, score = extra["members"], extra["score"]
+        members = extra["members"]
+        score = extra["score"]
         path = scene or record.scene
         if not os.path.isfile(scene_file(path)):
             raise ProgdfError(f"the scene {path} does not exist; give its path with --scene")

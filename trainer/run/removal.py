@@ -81,7 +81,8 @@ def vanished_share(setup: TrainingSetup, options: TrainOptions) -> float:
         setup: of the changed pictures, in their order
         options: which these are
     """
-    scene, rest = setup.scene, setup.scene[~setup.region.mask]
+    scene = setup.scene
+    rest = setup.scene[~setup.region.mask]
     change = behind = 0.0
     for view, path in zip(setup.train, options.views.pictures, strict=True):
         target = read_edit(scene, view.camera, view.image, path)
@@ -104,9 +105,11 @@ def remove_region(options: TrainOptions, setup: TrainingSetup, folder: RunFolder
         folder: of the run
         log: of the run
     """
-    scene, chosen = setup.scene, len(setup.region)
+    scene = setup.scene
+    chosen = len(setup.region)
     setup = replace(setup, region=with_crumbs(scene, setup.region))
-    region, rest = setup.region, scene[~setup.region.mask]
+    region = setup.region
+    rest = scene[~setup.region.mask]
     if len(region) > chosen:
         log.say(f"{format_count(len(region) - chosen, 'Gaussian')} that would float alone without it go too")
     with log.stage("fill"):
@@ -207,7 +210,8 @@ def on_backgrounds(scene: Gaussians, camera: Camera) -> list[Tensor]:
     with torch.no_grad():
         drawn = render(scene, camera, (0.0, 0.0, 0.0))
     side = max(1, max(camera.width, camera.height) // _TILES)
-    rows, columns = torch.arange(camera.height)[:, None] // side, torch.arange(camera.width) // side
+    rows = torch.arange(camera.height)[:, None] // side
+    columns = torch.arange(camera.width) // side
     checker = ((rows + columns) % 2).float()
     shades = (torch.ones_like(checker), torch.zeros_like(checker), checker)
     return [(drawn.image + (drawn.transmittance * shade)[..., None]).clamp(0.0, 1.0) for shade in shades]

@@ -52,7 +52,8 @@ def load_region(out: Path) -> Region | None:
     if saved is None:
         return None
     with state.restore_part(REGION):
-        name, score = saved.values["name"], saved.tensors["score"]
+        name = saved.values["name"]
+        score = saved.tensors["score"]
         if score.dtype != torch.float32 or score.ndim != 1 or not bool(((score >= 0) & (score <= 1)).all()):
             raise ValueError("the score is none")
         if not isinstance(name, str):
@@ -72,8 +73,10 @@ def decide_resume(folder: RunFolder, options: TrainOptions, region: Region, coun
     Raises:
         ProgdfError: a stopped run that would be lost without --resume; with it, another plan than the run's.
     """
-    saved, plan = _saved_identity(folder), recorded_options(options)
-    threads, resume = count_threads(options.threads), options.resume
+    saved = _saved_identity(folder)
+    plan = recorded_options(options)
+    threads = count_threads(options.threads)
+    resume = options.resume
     if resume and saved is None and folder.report.is_file():
         was, pictures = _finished_run(folder)
         again = "leave out --resume to train again"
@@ -119,7 +122,8 @@ def decide_resume(folder: RunFolder, options: TrainOptions, region: Region, coun
 
 def find_run(options: TrainOptions) -> Literal["nothing", "stopped", "finished"]:
     """What a run that resumes would find in the folder, of a run with these very options."""
-    folder, plan = RunFolder(options.out), recorded_options(resolve(options))
+    folder = RunFolder(options.out)
+    plan = recorded_options(resolve(options))
     saved = _saved_identity(folder)
     if saved is None and not folder.report.is_file():
         return "nothing"

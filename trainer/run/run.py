@@ -110,7 +110,8 @@ def check_command(options: TrainOptions) -> None:
             check_text(str(part), f"the record of --{name.replace('_', '-')}")
     get_engine(options.optimize.engine)
     check_editor(options.editor.editor)
-    folder, views = check_folder(options.out, options.edit), options.views
+    folder = check_folder(options.out, options.edit)
+    views = options.views
     if not options.scene.is_dir():  # some formats are folders
         read_file(options.scene, 0)
     if views.cameras is not None and not options.resume:
@@ -158,7 +159,8 @@ def train(options: TrainOptions, quiet: bool = False, shared: Shared | None = No
     check_command(options)
     use_threads(options.threads)
     scene = shared.get("scene", options.scene.resolve(), lambda: load_scene(options.scene))
-    region, notes = load_region(options.out) if options.resume else None, list[str]()
+    region = load_region(options.out) if options.resume else None
+    notes = list[str]()
     if region is None:
         selected, notes = select_region(options, scene, quiet, shared)
         region = replace(selected, name=options.name)
@@ -270,7 +272,8 @@ def _run_training(
         log.say("the trajectory is recorded")
     del edited, train_edits, between  # what is needed of all this is read anew, as it is on disk
     trajectory, _, about = load_trajectory(folder.trajectory)
-    record, begun = read_record(about), folder.state.load(NETWORK)
+    record = read_record(about)
+    begun = folder.state.load(NETWORK)
     setup = setup.keep_solved(record.effort)
     result = finish_run(folder, setup, trajectory, record, perceptual, log, begun)
     # not before: a run that is stopped needs all views to go on
@@ -291,8 +294,10 @@ def _paint(
     with log.stage("fit"):
         painted = train_decal(editor, scene, options.name, log)
     decal = f"decal:{Path(options.editor.editor.partition(':')[2]).name}"
-    figures, name = painted.figures, view.camera.name
-    own, turned = figures["own"], figures["turned"]
+    figures = painted.figures
+    name = view.camera.name
+    own = figures["own"]
+    turned = figures["turned"]
     about = {"edit": {"psnr_to_views": own}, "paint": figures}
     save_cameras(folder.cameras, [view.camera], scene.origin)
     middle = TURNS.index(0)
@@ -377,7 +382,8 @@ def _make_editor(options: TrainOptions, setup: TrainingSetup, folder: RunFolder,
     if not isinstance(editor, InstructEditor):
         return editor
     log.say(editor.note)
-    easel, approved = Easel(editor, editor.recipe, editor.kept, settings.seed), None
+    easel = Easel(editor, editor.recipe, editor.kept, settings.seed)
+    approved = None
     if settings.anchor is not None:
         camera = fit_size(
             find_picture_camera(settings.anchor, origin=setup.scene.origin), editor.request.size
@@ -400,15 +406,18 @@ def _edit_views(
     """What the editor makes of all views, by strength, read where it is on disk; how to train towards it;
     what a trial found of that; and what makes more strengths, where a course may call for them.
     """
-    views, spec = setup.views, options.editor.editor
+    views = setup.views
+    spec = options.editor.editor
     names = [view.camera.name for view in views]
     made: dict[float, Sequence[Tensor]] = {}
     on_the_way, known = names, list[float]()  # views of strengths other than 1; strengths that were edited
-    approach, trial = Approach("color"), None
+    approach = Approach("color")
+    trial = None
 
     def edit(strengths: Sequence[float], views: Sequence[View] = views) -> Pictures:
         nonlocal on_the_way
-        new, is_confined = [s for s in strengths if s not in made], confines_edit(editor(), approach.kind)
+        new = [s for s in strengths if s not in made]
+        is_confined = confines_edit(editor(), approach.kind)
         way = course if _keeps_courses(editor(), setup) else partial(edit_course, editor())
         with log.steps("edit", len(views) * len(new)) as advance:
             within = views
@@ -502,7 +511,8 @@ def expected_work(setup: TrainingSetup, optimization: OptimizeOptions, strengths
         optimization: its options with nothing left open
         strengths: of how many there will be pictures
     """
-    views, train = len(setup.views), len(setup.train)
+    views = len(setup.views)
+    train = len(setup.train)
     work = {name: each * views for name, each in LATER.items()} | {
         "views": views,
         "edit": 0.1 * views * strengths,
@@ -563,7 +573,8 @@ def _record(
             choosing, _ = load_evaluator(folder, setup, setup.judging, trajectory).halves()
             prunes = not optimization.as_printed
             trajectory, costs = drop_idle_attributes(trajectory, choosing, prunes)
-        recorded, reason = len(trajectory), ""
+        recorded = len(trajectory)
+        reason = ""
         one_end = len(trajectory.strengths) == 1
         if one_end and not optimization.as_printed and options.field.field != "neural":
             # of pictures made elsewhere the folder may be gone by now, and there is no half; a model was

@@ -68,7 +68,10 @@ class Recordings:
 
     def __init__(self, folder: StateFolder, shape: torch.Size, model: Model | None) -> None:
         self.made: list[ParameterSnapshot] = []
-        self._folder, self._shape, self._model, self._written = folder, shape, model, 0
+        self._folder = folder
+        self._shape = shape
+        self._model = model
+        self._written = 0
 
     def add(self, snapshot: ParameterSnapshot) -> None:
         """Keep one."""
@@ -95,7 +98,8 @@ class Recordings:
         self.made[:] = [self._read(kept) for kept in recordings if kept]
 
     def _read(self, saved: Saved) -> ParameterSnapshot:
-        values, offsets = convert_json(saved.values, _RecordingValues), saved.tensors["offsets"]
+        values = convert_json(saved.values, _RecordingValues)
+        offsets = saved.tensors["offsets"]
         check_tensor("offsets", offsets, self._shape, torch.float16)
         if self._model is not None:
             numbers = MONOMIALS[max(1, self._model.degree)]
@@ -158,27 +162,33 @@ def optimize_members(
             optimization, setup, edited, between, options.views, log, options.field.target_psnr
         )
         return _solve(*plan, iterations(optimization.steps), folder, log)
-    scene, members = setup.scene, setup.region.members
-    engine, device = optimization.engine, engine_device(optimization.engine)
+    scene = setup.scene
+    members = setup.region.members
+    engine = optimization.engine
+    device = engine_device(optimization.engine)
     if engine == "warp":
         card = torch.cuda.get_device_name(device) if device.type == "cuda" else "the CPU, in place of a card"
         log.say(f"the steps are drawn by warp on {card}")
     original = pack(scene[members], with_shN=scene.sh_degree > 0).to(device)
     still = optimization.kind == "color" and optimization.rates == "kind"
     crops = _crops(setup, still, engine)
-    stages, groups = _stages(optimization, setup, edited), None
+    stages = _stages(optimization, setup, edited)
+    groups = None
     if optimization.group_steps:
         groups = _groups(optimization, original, crops, stages, folder, log)
         stages = groups.to_stages(original, crops, stages)
     extent = 2.0 * scene_sphere(scene[members])[1] if groups is None else groups.extent
     settings = pgs_settings(optimization, optimization.sh != "off", original.shape[1], extent, len(stages))
-    own, seeds = len(members), _seeds(setup, optimization, edited, folder) if optimization.grow else None
+    own = len(members)
+    seeds = _seeds(setup, optimization, edited, folder) if optimization.grow else None
     if seeds is not None:
-        setup, settings = setup.extend(seeds), replace(settings, ramp=0.0)
+        setup = setup.extend(seeds)
+        settings = replace(settings, ramp=0.0)
         original = torch.cat([original, pack(seeds, with_shN=scene.sh_degree > 0).to(device)])
         crops = _crops(setup, still, engine)
         stages = [place_seeds(s, len(seeds)) for s in stages]
-    state, recordings = PgsState(original, settings.seed), Recordings(folder, original.shape, None)
+    state = PgsState(original, settings.seed)
+    recordings = Recordings(folder, original.shape, None)
     inside = [erode(crop(view.mask, view.box)).to(device) for view in setup.train]
     objective = Objective(perceptual, optimization, inside)
     probes = probe_views(setup, engine=engine)
@@ -232,7 +242,8 @@ def plan_colors(
     original, few = pack(scene[members], with_shN=scene.sh_degree > 0), bool(options.pictures)
     every, most = 1 if few else pixel_stride(setup), iterations(optimization.steps)
     held_out = split_held_out(setup.held_out)[0] if len(edited[1.0]) > count else []
-    train, judging = setup.train, held_out or setup.train
+    train = setup.train
+    judging = held_out or setup.train
 
     def draw(views: Sequence[View]) -> list[ColorView]:
         make = partial(crop_scene, scene, members, background=setup.background)
@@ -254,7 +265,8 @@ def plan_colors(
         aside = draw(held_out) if held_out else drawn
         ties = surface_ties(scene, members, [view.camera for view in train]) if few else None
     with log.stage("model"):
-        finished, solver = target(1.0, edited[1.0]), make_solver(drawn, original, ties)
+        finished = target(1.0, edited[1.0])
+        solver = make_solver(drawn, original, ties)
         targets = finished[0].targets
         trial = (solver, finished[1]) if ties is None else split_solver(solver, targets)
         solver, model = choose_model(solver, trial, targets, most, 1 if optimization.sh == "off" else 9)
@@ -292,7 +304,8 @@ def _solve(
     solver: Solver, model: Model, course: Course, most_steps: int, folder: StateFolder, log: RunLog
 ) -> Optimized:
     """All views at once, for colors alone."""
-    state, recordings = PgsState(solver.original), Recordings(folder, solver.original.shape, model)
+    state = PgsState(solver.original)
+    recordings = Recordings(folder, solver.original.shape, model)
     way = partial(solve, solver, model, course, recordings.made, state, steps=most_steps)
     most = len(course.targets) + 1 if course.look is None else MOST_STAGES
     made = _record_way(way, most, state, recordings, None, folder, log)
@@ -320,7 +333,8 @@ def _stages(optimization: OptimizeOptions, setup: TrainingSetup, edited: Picture
 
 
 def _crops(setup: TrainingSetup, still: bool, engine: str) -> list[CropScene]:
-    scene, members = setup.scene.to(engine_device(engine)), setup.region.members
+    scene = setup.scene.to(engine_device(engine))
+    members = setup.region.members
     make = partial(crop_scene, scene, members, background=setup.background, still=still, engine=engine)
     return [make(view.camera, view.box) for view in setup.train]
 
@@ -421,7 +435,8 @@ def _seeds(
     setup: TrainingSetup, optimization: OptimizeOptions, edited: Pictures, folder: StateFolder
 ) -> Gaussians | None:
     """The rows that are added, or what was saved of them; None where there are none."""
-    saved, finished = folder.load("seeds"), edited[max(edited)]
+    saved = folder.load("seeds")
+    finished = edited[max(edited)]
     if saved is None:
         count = int(optimization.grow * len(setup.region))
         seeds = seed_rows(setup, setup.train, finished[: len(setup.train)], count, optimization.seed)
@@ -453,5 +468,6 @@ def retime_trajectory(
             advance(i + 1, "recordings")
     if not optimization.as_printed and trajectory.maps is None:
         nodes = straight_recordings(trajectory, pictures)
-        trajectory, pictures = select_recordings(trajectory, nodes), [pictures[i] for i in nodes]
+        trajectory = select_recordings(trajectory, nodes)
+        pictures = [pictures[i] for i in nodes]
     return retime(trajectory, pictures, optimization.slider)

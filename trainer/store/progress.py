@@ -82,7 +82,9 @@ class RunLog:
         self.seconds: dict[str, float] = {}
         self.refits = refits
         self._earlier = 0.0
-        self._progress, self._written, self._share = progress, 0.0, 0.0
+        self._progress = progress
+        self._written = 0.0
+        self._share = 0.0
         self._work: Mapping[str, float] = {"views": 1.0, "edit": 1.0, "optimize": 5.0, **LATER}
         self._took: dict[str, float] = {}  # seconds of the stages that have ended
         self._running: dict[str, float] = {}
@@ -136,9 +138,11 @@ class RunLog:
             share: of it that is done, 0..1
             elapsed: seconds of it so far
         """
-        own, place = self._work.get(stage, 0.0), list(STAGES).index(stage)
+        own = self._work.get(stage, 0.0)
+        place = list(STAGES).index(stage)
         ahead = sum(work for name, work in self._work.items() if list(STAGES).index(name) > place)
-        took, work = 0.0, 0.0
+        took = 0.0
+        work = 0.0
         for name, seconds in self._took.items() | {(stage, elapsed)}:
             if name not in _EDITOR:
                 took += seconds
@@ -186,7 +190,8 @@ class RunLog:
 
         def advance(done: int, word: str) -> None:
             nonlocal last
-            left, now = tell(done, word), time.perf_counter()
+            left = tell(done, word)
+            now = time.perf_counter()
             if now - last >= _EVERY_S and done < total:
                 last = now
                 self.say(f"{what} {done}/{total}  {word}  {left:.0f} s left")

@@ -318,7 +318,8 @@ class LazySequence(Sequence[_T]):
     """What `make` makes of each of some items, anew at each look: for what is too large to keep."""
 
     def __init__(self, items: Sequence[Any], make: Callable[[Any], _T]) -> None:
-        self._items, self._make = items, make
+        self._items = items
+        self._make = make
 
     def __len__(self) -> int:
         return len(self._items)

@@ -272,7 +272,9 @@ class PeriodicSave:
     ) -> None:
         self.seconds = 0.0  # for which training stood still
         self.saves = 0
-        self._folder, self._part, self._members = folder, part, members
+        self._folder = folder
+        self._part = part
+        self._members = members
         self._every_s = SAVE_EVERY if every_s is None else every_s
         self._last = time.perf_counter()
         self._writing: Future[float] | None = None

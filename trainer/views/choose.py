@@ -165,7 +165,8 @@ def split_views(choice: ViewChoice, held_out: int) -> tuple[list[View], list[Vie
 
     At most a third is held out, which of two is none.
     """
-    views, count = choice.views, min(held_out, len(choice.views) // 3)
+    views = choice.views
+    count = min(held_out, len(choice.views) // 3)
     chosen = _greedy(replace(choice.shown, reach=_reach(count)), count) if count > 0 else []
     return [view for i, view in enumerate(views) if i not in chosen], [views[i] for i in chosen]
 

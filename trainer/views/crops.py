@@ -40,7 +40,8 @@ def live_tiles(contributes: Tensor, box: Crop) -> Tensor:
         [rows, columns] bool; tiles from the image's left top to the box's right bottom
     """
     x0, y0, x1, y1 = box
-    rows, columns = -(-y1 // TILE_H), -(-x1 // TILE_W)
+    rows = -(-y1 // TILE_H)
+    columns = -(-x1 // TILE_W)
     tiles = contributes.new_zeros(rows * TILE_H, columns * TILE_W)
     tiles[y0:y1, x0:x1] = contributes
     return tiles.view(rows, TILE_H, columns, TILE_W).any(dim=3).any(dim=1)
@@ -81,7 +82,8 @@ def may_reach(means: Tensor, scales: Tensor, camera: Camera, live: Tensor) -> Te
     ).square() * widened + DILATION / camera.sampling**2
     radius = (_SUPPORT * spread).sqrt() + 1.0
     rows, columns = live.shape
-    step, last = K.new_tensor([TILE_W, TILE_H]), K.new_tensor([columns, rows])
+    step = K.new_tensor([TILE_W, TILE_H])
+    last = K.new_tensor([columns, rows])
     low = ((center - radius[:, None]) / step).floor().clamp(min=0).minimum(last).nan_to_num(0.0).long()
     high = ((center + radius[:, None]) / step).floor().clamp(min=-1).minimum(last - 1).nan_to_num(
         0.0
@@ -141,7 +143,8 @@ class CropScene:
                 new["scales"] = members.scales
             if "logit_opacities" in moving:
                 new["opacities"] = members.opacities
-            shown, rows = self.with_members(new), self.rows
+            shown = self.with_members(new)
+            rows = self.rows
             drawn = render(
                 shown, self.camera, self.background, crop=self.box, grad_rows=rows, engine=self.engine
             )
@@ -202,11 +205,15 @@ def crop_scene(
         engine: that draws
     """
     device = scene.means.device
-    members, camera, background = members.to(device), camera.to(device), background.to(device)
+    members = members.to(device)
+    camera = camera.to(device)
+    background = background.to(device)
     activated = activate(scene, seen_colors(scene, camera))
     member = torch.zeros_like(activated.opacities, dtype=torch.bool).index_fill(0, members, True)
     drawn = render(activated, camera, background, crop=box, engine=engine)
-    index, live = (drawn.info.visible | member).nonzero()[:, 0], None  # one out of sight may come into it
+    # one out of sight may come into it
+    index = (drawn.info.visible | member).nonzero()[:, 0]
+    live = None
     gaussians = activated.select(index)
     if still:
         white = member[index, None].to(gaussians.colors).expand(-1, 3).contiguous()
@@ -215,7 +222,9 @@ def crop_scene(
         if not bool((pixels := live_pixels(tiles, box)).all()):
             reachable = may_reach(gaussians.means, gaussians.scales, camera, tiles)
             kept = (reachable | member[index]).nonzero()[:, 0]
-            live, index, gaussians = pixels[..., None], index[kept], gaussians.select(kept)
+            live = pixels[..., None]
+            index = index[kept]
+            gaussians = gaussians.select(kept)
     return CropScene(
         camera,
         box,

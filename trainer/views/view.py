@@ -133,7 +133,8 @@ class Glance(NamedTuple):
 
 def make_glances(scene: Gaussians, region: Region, cameras: Sequence[Camera], count: int) -> list[Glance]:
     """What the first `count` cameras that show the region see of it, in one pixel of so many."""
-    activated, members = activate(scene, torch.zeros_like(scene.means)), scene[region.members]
+    activated = activate(scene, torch.zeros_like(scene.means))
+    members = scene[region.members]
     degree, sh, seen = min(scene.sh_degree, 3), members.sh, list[Glance]()
 
     def color_from(camera: Camera) -> tuple[Tensor, Tensor]:
@@ -141,7 +142,8 @@ def make_glances(scene: Gaussians, region: Region, cameras: Sequence[Camera], co
         return weights, torch.einsum("nb,nbc->nc", weights, sh[:, : weights.shape[1]]) + 0.5
 
     def look(camera: Camera) -> Glance:
-        box, pixels = (0, 0, camera.width, camera.height), torch.arange(camera.width * camera.height)
+        box = (0, 0, camera.width, camera.height)
+        pixels = torch.arange(camera.width * camera.height)
         weighed = color_map(activated, camera, box, region.members, pixels=pixels[::_EVERY])
         weights, colors = color_from(camera) if degree else plain
         mask = weighed.picture(torch.ones_like(colors))[:, 0].clamp(0.0, 1.0)
@@ -150,7 +152,8 @@ def make_glances(scene: Gaussians, region: Region, cameras: Sequence[Camera], co
 
     plain = color_from(cameras[0])
     while cameras and len(seen) < count:
-        some, cameras = cameras[: count - len(seen)], cameras[count - len(seen) :]
+        some = cameras[: count - len(seen)]
+        cameras = cameras[count - len(seen) :]
         seen += [one for one in map_threads(look, some) if bool(one.mask.any())]
     return seen
 
@@ -164,11 +167,14 @@ def region_box(mask: Tensor, margin: int = 6, least: float = 0.5 * _SEEN) -> Cro
     spans = []
     for axis, side in ((0, width), (1, height)):
         hit = visible.any(dim=axis).nonzero()[:, 0]
-        low, high = int(hit[0]) - margin, int(hit[-1]) + 1 + margin
+        low = int(hit[0]) - margin
+        high = int(hit[-1]) + 1 + margin
         missing = _LEAST_BOX - (high - low)
         if missing > 0:
-            low, high = low - (missing + 1) // 2, high + missing // 2
-        low, high = max(0, min(low, side - _LEAST_BOX)), min(side, max(high, _LEAST_BOX))
+            low = low - (missing + 1) // 2
+            high = high + missing // 2
+        low = max(0, min(low, side - _LEAST_BOX))
+        high = min(side, max(high, _LEAST_BOX))
         spans.append((low, high))
     (x0, x1), (y0, y1) = spans
     return (x0, y0, x1, y1)
@@ -216,7 +222,8 @@ def frame_sphere(camera: Camera, center: Tensor, radius: float, share: float, up
     """
     distance = float((camera.position - center).norm())
     fov = 2 * math.asin(min(0.7, radius / (share * max(distance, radius))))
-    aimed, side = look_at(camera.position, center, up), min(camera.width, camera.height)
+    aimed = look_at(camera.position, center, up)
+    side = min(camera.width, camera.height)
     return replace(camera, viewmat=aimed, K=intrinsics(fov, side, side), width=side, height=side)
 
 

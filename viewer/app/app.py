@@ -87,7 +87,8 @@ def run(splash: Splash, opens: Callable[[], Opened], draw: str = "auto") -> int:
 def _draw_once() -> None:
     """Draw a small picture, which loads the kernels, or compiles them the first time on a machine."""
     corners = torch.cartesian_prod(*[torch.tensor([-1.0, 1.0])] * 3)
-    quats, none = torch.eye(4)[:1].expand(8, 4), corners[:, None, :][:, :0]
+    quats = torch.eye(4)[:1].expand(8, 4)
+    none = corners[:, None, :][:, :0]
     scene = Gaussians(corners, quats, corners - 2.0, corners[:, 0], corners, none)
     ViewEngine(None, scene).image(ViewState(camera=first_camera(scene)), (32, 24))
 
@@ -103,7 +104,8 @@ class App:
         session: Path | None = None,
         draw: str = "auto",
     ) -> None:
-        self.window, self.document = window, document
+        self.window = window
+        self.document = document
         self.context = window.context
         self._draw = draw
         self.engine = self._engine(document)
@@ -161,7 +163,8 @@ class App:
         bind({})
         with self._guard():
             if problems := bind(user_files.read_keys()):
-                where, more = user_files.keys_file(), len(problems) - 1
+                where = user_files.keys_file()
+                more = len(problems) - 1
                 log_error("\n".join([f"{where}:", *problems]))
                 text = f"{where.name}: {problems[0]}" + (f", and {more} more in {LOG}" if more else "")
                 self.main_view.show_message(text, error=True)
@@ -174,13 +177,15 @@ class App:
         where = repr(
             (type(error), [(at.filename, at.lineno) for at in traceback.extract_tb(error.__traceback__)])
         )
-        frame, now = self.main_view.frames, time.perf_counter()
+        frame = self.main_view.frames
+        now = time.perf_counter()
         before, told_at = self._failures.get(where, (-2, 0.0))
         goes_on = frame - before <= 1 and now - told_at < SAY_AGAIN_S
         self._failures[where] = frame, told_at if goes_on else now
         if goes_on:
             return  # an error that repeats in every frame requests no further frame
-        line, details = error_line(error), ""
+        line = error_line(error)
+        details = ""
         if not line:
             details = error_details(error)
             if before < 0:
@@ -224,7 +229,8 @@ class App:
             self.main_view.rest()
             return
         now = time.perf_counter()
-        seconds, self.last = now - self.last, now
+        seconds = now - self.last
+        self.last = now
         self.main_view.ui.make_current()
         self.main_view.ui.set_scale(self.window.ui_scale * self.main_view.work.layout.zoom)
         self.window.new_frame()
@@ -274,7 +280,8 @@ class App:
         self.main_view.wake()
 
     def take_dropped(self) -> list[Path]:
-        paths, self.dropped = self.dropped, []
+        paths = self.dropped
+        self.dropped = []
         return paths
 
     def open(self, path: Path) -> None:
@@ -317,7 +324,8 @@ class App:
         facts = self.main_view.facts if document is self.document else document.facts()
         engine = self._engine(document, live)
         self.engine.release()
-        self.document, self.engine = document, engine
+        self.document = document
+        self.engine = engine
         self.main_view.set_engine(engine, facts, layers)
 
     def open_document(
@@ -327,10 +335,12 @@ class App:
 
         Training and exports of the old scene go on in the background. If anything fails, nothing changes.
         """
-        facts, engine = document.facts(), self._engine(document)
+        facts = document.facts()
+        engine = self._engine(document)
         self._keep_picture()
         self.engine.release()
-        self.document, self.engine = document, engine
+        self.document = document
+        self.engine = engine
         self.main_view.set_engine(engine, facts)
         self.main_view.restart(view, snapshots)
         self.main_view.pictures = exports.folder_of(document.path)
@@ -347,7 +357,8 @@ class App:
 
         The title names the open session or scene; a dot marks unsaved changes.
         """
-        path, main_view = self.file_actions.path, self.main_view
+        path = self.file_actions.path
+        main_view = self.main_view
         name = escape_text(path.name.removesuffix(".session.json")) if path else ""
         if name != main_view.work.session:
             main_view.work = replace(main_view.work, session=name)

@@ -85,7 +85,8 @@ class Canvas:
         self._begun: tuple[ViewState, tuple[int, int]] | None = None  # view and size of an unfinished picture
         self._follows = last is not None and engine.follow(last.comparer.engine)
         if last is not None and self._follows:
-            self._resolution, self._last = last._resolution, last._last
+            self._resolution = last._resolution
+            self._last = last._last
 
     def draw(
         self,
@@ -112,22 +113,27 @@ class Canvas:
         """
         screen.use()
         screen.clear(*PALETTE.panel)
-        aim, edits = (view.camera, size), (view.layers, view.blend, view.background)
-        turned, slid = aim != self._last[0], edits != self._last[1]
-        self._last, self._sliding = (aim, edits), dragging and (self._sliding or slid)
+        aim = (view.camera, size)
+        edits = (view.layers, view.blend, view.background)
+        turned = aim != self._last[0]
+        slid = edits != self._last[1]
+        self._last = (aim, edits)
+        self._sliding = dragging and (self._sliding or slid)
         mode = "off" if view.compare.mode == "difference" else view.dynamic_resolution
         before = self._resolution
         self._resolution = dynamic_resolution.before_draw(before, mode, dragging, turned, slid, now)
         looks = self._sliding or live
         self.comparer.engine.highlight = highlight.requested_highlight(view, focus, pointed, looks)
         target = aim, edits, self.comparer.engine.highlight
-        has_picture, self._begun = self.pictures_drawn or self._follows, None
+        has_picture = self.pictures_drawn or self._follows
+        self._begun = None
         if mode != "off" and has_picture and dynamic_resolution.takes_long(before, self._resolution):
             moves = turned or (dragging and self._awaited not in (None, target))
             if moves or not self.comparer.prepare(view, size):
                 stays = not moves and before.pixels == 1 and view.compare.mode == "off"
                 self._resolution = dynamic_resolution.wait(self._resolution, now, coarsely=not stays)
-                self._awaited, self._begun = target, None if moves else (view, size)
+                self._awaited = target
+                self._begun = None if moves else (view, size)
                 if stays:
                     self.comparer.engine.show_last(view, screen, size)
                     return
@@ -207,7 +213,8 @@ class Canvas:
 
     def _draw_snapshot(self, index: int, snapshot: SliderSnapshot, view: ViewState) -> Pixels:
         edited = replace(view, layers=()) if index == 0 else restore(view, snapshot)
-        target, engine = replace(edited, camera=snapshot.camera, compare=Comparison()), self.comparer.engine
+        target = replace(edited, camera=snapshot.camera, compare=Comparison())
+        engine = self.comparer.engine
         try:
             many = len(engine.scene) >= dynamic_resolution.MANY
             return to_pixels(engine.image(target, SIZE, pixels=2 if many else 1))

@@ -20,7 +20,9 @@ from viewer.ui.pointer import PointerContext
 
 _LARGEST = 1024  # maximum longer side of the picture shown on screen, pixels
 _FIRST = 0.25  # initial longer side, as a fraction of the view's height
-_STEP, _TURN = 1.08, 5.0  # per notch of the wheel: size factor, rotation in degrees
+# per notch of the wheel: size factor, rotation in degrees
+_STEP = 1.08
+_TURN = 5.0
 _SIZES = (8.0, 8192.0)  # minimum and maximum, window pixels
 _HINT = "Wheel sizes, Shift+wheel turns; click or Enter lays it on, Esc puts it away"
 
@@ -50,10 +52,12 @@ class Decal:
 
     def draw(self, pointer: PointerContext) -> tuple[Decal, str]:
         """Draw the decal; return it after this frame's mouse input, and its request, "" for none."""
-        io, area = imgui.get_io(), pointer.area
+        io = imgui.get_io()
+        area = pointer.area
         inside = 0.0 <= io.mouse_pos.x < area.width and 0.0 <= io.mouse_pos.y < area.height
         over = inside and not io.want_capture_mouse
-        size, angle = self.size or _FIRST * area.height, self.angle
+        size = self.size or _FIRST * area.height
+        angle = self.angle
         # some systems turn the wheel sideways with Shift
         notches = (io.mouse_wheel or io.mouse_wheel_h) if over else 0.0
         if notches and io.key_shift:
@@ -72,7 +76,8 @@ class Decal:
         """Corners in the window, clockwise from the upper left of the picture."""
         scale, (x0, y0) = self.size / max(self.texture.size), self.at or (0.0, 0.0)
         across, down = (scale * side / 2 for side in self.texture.size)
-        cosine, sine = math.cos(math.radians(self.angle)), math.sin(math.radians(self.angle))
+        cosine = math.cos(math.radians(self.angle))
+        sine = math.sin(math.radians(self.angle))
         return [
             (x0 + x * cosine + y * sine, y0 - x * sine + y * cosine)
             for x, y in ((-across, -down), (across, -down), (across, down), (-across, down))

@@ -136,7 +136,8 @@ def draw(dialog: Dialog, pressed: Sequence[str], ui: UiContext, area: Area) -> D
     imgui.push_style_color(imgui.Col_.modal_window_dim_bg, (0.0, 0.0, 0.0, 0.45))
     answer = DialogResult(dialog)
     if imgui.begin_popup_modal(_POPUP, None, flags_of_popup)[0]:
-        context, at_button = imgui.get_current_context(), not imgui.get_io().want_text_input
+        context = imgui.get_current_context()
+        at_button = not imgui.get_io().want_text_input
         if context.nav_cursor_visible and at_button and context.nav_id not in (0, imgui.get_id("##path")):
             pressed = [chord for chord in pressed if chord != "Enter"]  # the focused item takes it
         answer = _content(dialog, pressed, ui, area.height - margin)
@@ -170,7 +171,8 @@ def _content(dialog: Dialog, pressed: Sequence[str], ui: UiContext, bottom: floa
         return _answer(dialog, _pressed_button(_CHOICES[dialog.kind], pressed, ui))
     if _is_new(dialog.kind) or (dialog.error and not imgui.is_any_item_active()):
         imgui.set_keyboard_focus_here()  # Enter removes the focus, and the path needs a correction
-    more, gap = 36.0 * ui.scale, 6.0 * ui.scale
+    more = 36.0 * ui.scale
+    gap = 6.0 * ui.scale
     imgui.set_next_item_width(-more - gap)
     flags = 0 if dialog.error else imgui.InputTextFlags_.auto_select_all.value
     escaped = escape_text(dialog.text)
@@ -204,7 +206,9 @@ def _content(dialog: Dialog, pressed: Sequence[str], ui: UiContext, bottom: floa
 
 def _is_new(kind: str) -> bool:
     """Return True if this dialog was not open in the last frame; another may have used the same popup."""
-    storage, slot, number = imgui.get_state_storage(), int(imgui.get_id("kind")), 1 + [*TITLES].index(kind)
+    storage = imgui.get_state_storage()
+    slot = int(imgui.get_id("kind"))
+    number = 1 + [*TITLES].index(kind)
     changed = storage.get_int(slot) != number
     storage.set_int(slot, number)
     return bool(changed or imgui.is_window_appearing())
@@ -259,7 +263,8 @@ def _escape_lines(text: str) -> str:
 
 def _buttons(names: Sequence[str], ui: UiContext) -> str | None:
     """Draw buttons at the right, the first one marked; return the name of the pressed one."""
-    wide, gap = 92.0 * ui.scale, 8.0 * ui.scale
+    wide = 92.0 * ui.scale
+    gap = 8.0 * ui.scale
     start = imgui.get_content_region_avail().x - len(names) * wide - (len(names) - 1) * gap
     imgui.set_cursor_pos_x(imgui.get_cursor_pos_x() + max(start, 0.0))
     pressed = None

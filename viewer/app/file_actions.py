@@ -109,7 +109,8 @@ class EditActions:
         Raises:
             ProgdfError: the file is missing or broken, or it is no grade and was made for another scene.
         """
-        before, scene = self._app.main_view.work.view, self._app.document.original
+        before = self._app.main_view.work.view
+        scene = self._app.document.original
         selected = selection.unpack(before.selection.members, len(scene)).copy()
         where, mask = ("selection", selected) if selected.any() else ("all", np.ones(len(scene), bool))
         gdf = self._load(path, from_mask(where, torch.from_numpy(mask)))
@@ -128,22 +129,26 @@ class EditActions:
         Raises:
             ProgdfError: as for `add`.
         """
-        document, view = self._app.document, self._app.main_view.work.view
+        document = self._app.document
+        view = self._app.main_view.work.view
         drafts = [i for i, known in enumerate(document.gdf_paths) if known == draft]
         if not drafts:
             return False
         gdf = self._load(path, document.edits[drafts[0]].region)
-        gdfs, paths = list(document.edits), list(document.gdf_paths)
+        gdfs = list(document.edits)
+        paths = list(document.gdf_paths)
         for i in drafts:
             if not torch.equal(gdf.region.members, gdfs[i].region.members):
                 return False
-            gdfs[i], paths[i] = replace(gdf, name=gdfs[i].name), path
+            gdfs[i] = replace(gdf, name=gdfs[i].name)
+            paths[i] = path
         self._app.show(replace(document, edits=tuple(gdfs), gdf_paths=tuple(paths)))
         return any(layer.gdf in drafts for layer in view.layers)
 
     def duplicate(self, index: int) -> None:
         """Add a copy of a layer above it, with its own edit, as the timeline and undo distinguish edits."""
-        document, view = self._app.document, self._app.main_view.work.view
+        document = self._app.document
+        view = self._app.main_view.work.view
         gdf = view.layers[index].gdf
         path = document.gdf_paths[gdf] if gdf < len(document.gdf_paths) else None
         self._apply(duplicate_layer(view, index, self._open(document.edits[gdf], path)), index + 1)
@@ -154,7 +159,9 @@ class EditActions:
         Raises:
             ProgdfError: as for `add`.
         """
-        view, index, file = self._app.main_view.work.view, self.layer(layer), parse_path(path)
+        view = self._app.main_view.work.view
+        index = self.layer(layer)
+        file = parse_path(path)
         gdf = self._load(file, self._app.document.edits[view.layers[index].gdf].region)
         self._apply(replace_edit(view, index, self._open(gdf, file), gdf.name), index)
 
@@ -208,7 +215,8 @@ class FileActions:
     """
 
     def __init__(self, app: Application, path: Path | None = None) -> None:
-        self._app, self.path = app, path
+        self._app = app
+        self.path = path
         self.session_autosave = SessionAutosave()
         self._put_off: set[Path] = set()  # autosaves that the user decides about later
         self._browser = dialogs.Browser()
@@ -225,7 +233,8 @@ class FileActions:
         or use the
         focused layer. `browse` shows the system file dialog next to the open dialog.
         """
-        ask, edits = self._app.main_view.ask, self._edits
+        ask = self._app.main_view.ask
+        edits = self._edits
         return {
             "save": lambda then: self._save_where(then, ask=False),
             "save_as": lambda then: self._save_where(then, ask=True),
@@ -432,24 +441,28 @@ class FileActions:
         self.offer_autosave()
 
     def _keep_region(self, name: str) -> None:
-        main_view, opened = self._app.main_view, self._app.document
+        main_view = self._app.main_view
+        opened = self._app.document
         if self.path is None and opened.path is None:
             raise ProgdfError(f"{opened.title} was not opened from a file; save the scene first")
         folder = (self.path or opened.path or Path()).resolve().parent
-        view, total = main_view.work.view, len(opened.original)
+        view = main_view.work.view
+        total = len(opened.original)
         selection = exports.keep_region(view.selection, name, folder, total)
         main_view.change(replace(view, selection=selection))
         line = f"Region '{selection.regions[-1].name}' saved"
         main_view.show_message(line, button=("New edit", "new_edit"))
 
     def _rename_region(self, index: str, name: str) -> None:
-        view, total = self._app.main_view.work.view, len(self._app.document.original)
+        view = self._app.main_view.work.view
+        total = len(self._app.document.original)
         renamed = exports.rename_region(view.selection, int(index), name, total)
         self._app.main_view.change(replace(view, selection=renamed))
 
     def _claim_regions(self, path: Path) -> None:
         """Assign new files next to a session at `path` to regions whose files it could not load."""
-        main_view, scene = self._app.main_view, self._app.document.path
+        main_view = self._app.main_view
+        scene = self._app.document.path
         view = main_view.work.view
         if scene is not None and view.selection.regions:
             folders = exports.region_folders(path, scene)
@@ -478,7 +491,8 @@ class FileActions:
             then: the postponed request; None takes that of the open dialog
             overwrite: the user has confirmed the replacement
         """
-        main_view, dialog = self._app.main_view, self._app.main_view.work.dialog
+        main_view = self._app.main_view
+        dialog = self._app.main_view.work.dialog
         then = (dialog.then if dialog else "") if then is None else then
 
         def save() -> None:

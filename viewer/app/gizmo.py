@@ -76,9 +76,11 @@ def _columns(matrix: NDArray[np.float64]) -> im_guizmo.Matrix16:
 
 def _projection(fov_y: float, aspect: float, near: float) -> NDArray[np.float64]:
     """Return OpenGL's projection matrix for a vertical field of view in degrees."""
-    tall, far = 1.0 / math.tan(math.radians(fov_y) / 2), 1e5 * near
+    tall = 1.0 / math.tan(math.radians(fov_y) / 2)
+    far = 1e5 * near
     projection = np.zeros((4, 4))
-    projection[0, 0], projection[1, 1] = tall / aspect, tall
+    projection[0, 0] = tall / aspect
+    projection[1, 1] = tall
     projection[2, 2:] = (far + near) / (near - far), 2.0 * far * near / (near - far)
     projection[3, 2] = -1.0
     return projection

@@ -43,8 +43,12 @@ MOUSE_HELP = (
 
 _MAC = (("Cmd", "Is Ctrl here; both work"),)
 
-_ROW, _BETWEEN = 1.24, 0.7  # in sizes of the small text: row pitch, and space above a heading
-COLUMN_PX, _MARGIN_PX = 248.0, 14.0  # at 1×
+# in sizes of the small text: row pitch, and space above a heading
+_ROW = 1.24
+_BETWEEN = 0.7
+# at 1×
+COLUMN_PX = 248.0
+_MARGIN_PX = 14.0
 MOST_COLUMNS = 4
 
 
@@ -72,7 +76,8 @@ def _lines(commands: Sequence[Command]) -> Iterator[tuple[str, str]]:
     text."""
     shown = False  # the row before this one includes the command
     for command, following in zip_longest(commands, commands[1:]):
-        keys, joins = chords(command.action), following is not None and following.row == JOINED
+        keys = chords(command.action)
+        joins = following is not None and following.row == JOINED
         changed = is_changed(command) or (joins and is_changed(following))
         if joins and not changed:
             keys += tuple(k for k in chords(following.action) if k.replace("Shift+", "") not in keys)
@@ -93,7 +98,8 @@ def columns(topics: Sequence[Topic], count: int) -> list[list[Topic]]:
 def draw_keys(room: imgui.ImVec2, ui: UiContext) -> None:
     """Draw the list of keys centered in `room`, which starts at the upper left. A list that is too long
     scrolls."""
-    margin, wide = _MARGIN_PX * ui.scale, COLUMN_PX * ui.scale
+    margin = _MARGIN_PX * ui.scale
+    wide = COLUMN_PX * ui.scale
     packed = columns(topics(), max(1, min(MOST_COLUMNS, int((room.x - 2 * margin) / wide))))
     tall = max(sum(topic.height for topic in column) for column in packed) * _ROW * SMALL_PX * ui.scale
     size = imgui.ImVec2(min(len(packed) * wide + 2 * margin, room.x), min(tall + 2 * margin, room.y))
@@ -107,7 +113,8 @@ def draw_keys(room: imgui.ImVec2, ui: UiContext) -> None:
         "keys", None, FIXED & ~imgui.WindowFlags_.no_scrollbar.value | imgui.WindowFlags_.no_nav.value
     )
     imgui.internal.bring_window_to_display_front(imgui.internal.get_current_window())
-    left, top = imgui.get_cursor_pos_x(), imgui.get_cursor_pos_y()
+    left = imgui.get_cursor_pos_x()
+    top = imgui.get_cursor_pos_y()
     for i, column in enumerate(packed):
         _column(column, left + i * wide, top, ui)
     imgui.end()
@@ -135,7 +142,8 @@ def draw_lists(
     return perform_actions(work, [asked] * bool(asked), pointer)
 
 
-PALETTE_PX, ROWS = 460.0, 12
+PALETTE_PX = 460.0
+ROWS = 12
 """Width of the command palette at 1×, in pixels, and its number of visible rows."""
 
 
@@ -149,18 +157,21 @@ def draw_palette(
     """
     if work.palette == -1:
         imgui.open_popup("commands")
-    wide, row = min(PALETTE_PX * ui.scale, area.width), imgui.get_frame_height()
+    wide = min(PALETTE_PX * ui.scale, area.width)
+    row = imgui.get_frame_height()
     place = (area.width / 2, max(0.12 * area.height, 8.0 * ui.scale))
     imgui.set_next_window_pos(place, 0, (0.5, 0.0))
     imgui.set_next_window_size((wide, 0.0))
-    asked, at = "", work.palette or 0
+    asked = ""
+    at = work.palette or 0
     with menu("commands", ui, imgui.WindowFlags_.no_nav.value) as is_open:
         if not is_open:
             return replace(work, palette=None), ""
         query = search_field("Search all commands", work.query)
         found = find_commands(query, offered)
         moved = 0 if at == -1 else ("Down" in pressed) - ("Up" in pressed)
-        fresh, at = at == -1 or query != work.query, 0 if query != work.query else at + moved
+        fresh = at == -1 or query != work.query
+        at = 0 if query != work.query else at + moved
         at = min(max(at, 0), max(len(found) - 1, 0))
         imgui.push_style_var(imgui.StyleVar_.item_spacing, (0.0, 0.0))
         imgui.begin_child("found", (0.0, row * min(ROWS, max(len(found), 1))))
@@ -184,14 +195,17 @@ def draw_palette(
 def _command_row(command: Command, chosen: bool, ui: UiContext) -> bool:
     """Draw the command's name, description and key; return True if it was clicked."""
     x, y = imgui.get_cursor_screen_pos()
-    wide, tall = imgui.get_content_region_avail().x, imgui.get_frame_height()
+    wide = imgui.get_content_region_avail().x
+    tall = imgui.get_frame_height()
     pressed = imgui.invisible_button(command.action, (wide, tall))
-    canvas, pad = imgui.get_window_draw_list(), 8.0 * ui.scale
+    canvas = imgui.get_window_draw_list()
+    pad = 8.0 * ui.scale
     if chosen or imgui.is_item_hovered():
         ground = u32(PALETTE.accent if chosen else PALETTE.field)
         canvas.add_rect_filled((x, y), (x + wide, y + tall), ground, 4.0 * ui.scale)
     ink, dim = (u32(PALETTE.ink),) * 2 if chosen else (u32(PALETTE.text), u32(PALETTE.dim))
-    top, key = round(y + imgui.get_style().frame_padding.y), shortcut(command.action)
+    top = round(y + imgui.get_style().frame_padding.y)
+    key = shortcut(command.action)
     end = x + wide - pad - imgui.calc_text_size(key).x
     canvas.add_text((round(x + pad), top), ink, command.name)
     canvas.add_text((round(end), top), ink, key)
@@ -253,7 +267,8 @@ def panels(
         compared: labels of the comparison on screen, and whether the original is visible
     """
     actions: list[str] = []
-    area, ui = pointer.area, pointer.ui
+    area = pointer.area
+    ui = pointer.ui
     work = panel.draw(work, pointer.facts, pictures, preview, recent, reveal, ui, actions)
     work = perform_actions(work, actions, pointer)
     if work.player.shown:
@@ -283,7 +298,8 @@ def draw_pill(
     words, original = compared
     if not (work.view.layers or original or work.view.compare.mode != "off"):
         return work, []
-    scale, wide = pointer.ui.scale, pointer.area.width
+    scale = pointer.ui.scale
+    wide = pointer.area.width
     free = wide - (0.0 if foot else tools.view_width(work.view, pointer.area, pointer.ui))
     middle = min((wide + tools.TOOLBAR_PX * scale) / 2, free - 85.0 * scale)  # half of its usual width
     place = (middle, foot + tools.EDGE_PX * scale)
@@ -307,7 +323,9 @@ def over_picture(
         original: the original is visible
         at: pointer position set by keys
     """
-    area, ui, view = pointer.area, pointer.ui, work.view
+    area = pointer.area
+    ui = pointer.ui
+    view = work.view
     io = imgui.get_io()
     on_axes = not io.want_capture_mouse and bool(overlay.axis_under(view, area, ui))
     if view.brush.active and not (io.want_capture_mouse or io.key_alt or on_axes):
@@ -385,11 +403,14 @@ def draw_history(work: Workspace, ui: UiContext) -> tuple[Workspace, list[str]]:
     """
     if work.history:
         imgui.open_popup("history")
-    display, row, asked = imgui.get_io().display_size, imgui.get_text_line_height_with_spacing(), list[str]()
+    display = imgui.get_io().display_size
+    row = imgui.get_text_line_height_with_spacing()
+    asked = list[str]()
     at = (display.x - 12.0 * ui.scale, display.y - 44.0 * ui.scale)
     imgui.set_next_window_pos(at, 0, (1.0, 1.0))
     with menu("history", ui) as is_open:
-        count, now = len(history.entries(work.past)), len(work.past.past)
+        count = len(history.entries(work.past))
+        now = len(work.past.past)
         wide = min(_HISTORY_PX * ui.scale, display.x)
         if is_open and imgui.begin_child("entries", (wide, row * min(count, ROWS)), _FLAT):
             if work.history:
@@ -406,7 +427,8 @@ def draw_history(work: Workspace, ui: UiContext) -> tuple[Workspace, list[str]]:
 
 
 def _history_row(past: history.History, index: int, ui: UiContext) -> bool:
-    now, keep = len(past.past), imgui.SelectableFlags_.no_auto_close_popups.value
+    now = len(past.past)
+    keep = imgui.SelectableFlags_.no_auto_close_popups.value
     name = history.describe_entry(past, index)
     imgui.push_style_color(imgui.Col_.text, PALETTE.faint if index > now else PALETTE.text)
     line = elide(f"{name[:1].upper()}{name[1:]}", 0.9 * _HISTORY_PX * ui.scale)

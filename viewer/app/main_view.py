@@ -66,11 +66,13 @@ class FramePacer:
 
     def wake(self) -> None:
         """Restart the counters after an event."""
-        self._unsettled, self._rest_left = SETTLE_FRAMES, LINGER_S
+        self._unsettled = SETTLE_FRAMES
+        self._rest_left = LINGER_S
 
     def rest(self) -> None:
         """Stop requesting frames while the window is minimized."""
-        self._unsettled, self._rest_left = 0, None
+        self._unsettled = 0
+        self._rest_left = None
 
     def step(self, seconds: float) -> None:
         """Begin a frame, `seconds` after the last one."""
@@ -81,7 +83,8 @@ class FramePacer:
             if self._rest_left <= 0.0:
                 # imgui advances the delay in this frame, opens the tooltip invisibly in the next one to
                 # measure it, and shows it in the one after
-                self._unsettled, self._rest_left = SETTLE_FRAMES, None
+                self._unsettled = SETTLE_FRAMES
+                self._rest_left = None
 
     def next_frame_delay(self, others: Sequence[float]) -> float | None:
         """Return the seconds until the next frame is due without an event; None if none is due.
@@ -119,7 +122,10 @@ class MainView:
         scale: float = 1.0,
         pictures: Path = Path(),
     ) -> None:
-        self.context, self.engine, self.facts, self.pictures = context, engine, facts, pictures
+        self.context = context
+        self.engine = engine
+        self.facts = facts
+        self.pictures = pictures
         self.canvas = Canvas(context, engine)
         self.recent: tuple[Path, ...] = ()  # recently opened files, for the dialogs
         # for the start page: recently opened files, and examples
@@ -169,7 +175,9 @@ class MainView:
         """
         self.canvas.release()
         self.surfaces.drop()
-        self.engine, self.facts, self.live = engine, facts, live
+        self.engine = engine
+        self.facts = facts
+        self.live = live
         self.canvas = Canvas(self.context, engine, self.canvas)
         self.wake()
 
@@ -271,10 +279,12 @@ class MainView:
             self.wake()
 
     def _draw_picture(self, screen: moderngl.Framebuffer) -> None:
-        view, area = self._displayed_view(), self._pointer().size
+        view = self._displayed_view()
+        area = self._pointer().size
         self.canvas.comparer.sides = compare_sides(self.work.snapshots, view)
         pointed = self.work.pointed if view.panel else None
-        held, live = self._is_held(), bool(self.live)
+        held = self._is_held()
+        live = bool(self.live)
         self.canvas.draw(view, screen, area, held, self._clock, self.work.focus, pointed, live)
         if self.canvas.pixels == 1 and not self._is_held():
             self._pointer().look_ahead()
@@ -336,13 +346,17 @@ class MainView:
             self._revealed = self.work.focus, several
         held = self._tool.drag is None and self._move_gizmo()
         if not off and not held:  # else the right button was only pressed to cancel the drag
-            tool, pointer, self._tool = self._tool, self._pointer(), MouseTool()  # dropped if it raises
+            # dropped if it raises
+            tool = self._tool
+            pointer = self._pointer()
+            self._tool = MouseTool()
             with self._guard():
                 self._tool, self.work = mouse.handle_mouse(tool, self.work, pointer)
 
     def _point_by_keys(self, asks: bool) -> None:
         """Move the pointer of the active tool by keys."""
-        work, decal = self.work, isinstance(self.gizmo, Decal)
+        work = self.work
+        decal = isinstance(self.gizmo, Decal)
         picks = work.form_open and work.form.picks
         if decal or picks or work.view.select.tool or work.view.brush.active:
             clicks = decal or picks or work.view.select.tool in select_tool.CLICKED
@@ -382,7 +396,8 @@ class MainView:
         """Move the handles or the decal with the mouse; return True if they take the mouse."""
         if self.gizmo is None:
             return False
-        pressed, keep = [press.chord for press in self._keys.pressed], "lay_decal"
+        pressed = [press.chord for press in self._keys.pressed]
+        keep = "lay_decal"
         if isinstance(self.gizmo, Gizmo):
             keep = "keep_placed"
         self.gizmo, asked = self.gizmo.draw(self._pointer())
@@ -436,7 +451,8 @@ class MainView:
         )
 
     def _displayed_view(self) -> ViewState:
-        view, frame = self.work.view, self._frame()
+        view = self.work.view
+        frame = self._frame()
         if frame is not None:
             view = overlay.fit_to_frame(view, frame, self._area())
         if self.work.before:
@@ -453,7 +469,8 @@ class MainView:
 
     def _frame(self) -> overlay.Area | None:
         """Return the size of the safe frame; None while an image lies over the picture."""
-        area, covered = self._area(), timeline_bar.height(self.work, self._area(), self.ui)
+        area = self._area()
+        covered = timeline_bar.height(self.work, self._area(), self.ui)
         return None if self.cover is not None else overlay.safe_frame(self.work.view, area, covered)
 
     def _is_held(self) -> bool:
@@ -465,7 +482,8 @@ class MainView:
 
     def _draw_overlays(self) -> None:
         """Draw the overlays of the picture; request another frame if one of them disappears."""
-        pointer, before = self._pointer(), self.work
+        pointer = self._pointer()
+        before = self.work
         over = max(self._popups) > 1  # a list over the dialog takes its keys
         pressed = [] if over else [press.chord for press in self._keys.pressed]
         with self._guard():
@@ -503,7 +521,8 @@ class MainView:
 
     def take_requests(self) -> tuple[str, ...]:
         """Return the pending requests of the window and clear them."""
-        requests, self.work = self.work.requests, replace(self.work, requests=())
+        requests = self.work.requests
+        self.work = replace(self.work, requests=())
         return requests
 
     def _save_files(self, screen: moderngl.Framebuffer) -> None:
@@ -516,9 +535,11 @@ class MainView:
                 self.show_message(self._save(request, screen))
 
     def _save(self, request: str, screen: moderngl.Framebuffer) -> str:
-        title, view = self.facts.title, replace(self._displayed_view(), camera=self.work.view.camera)
+        title = self.facts.title
+        view = replace(self._displayed_view(), camera=self.work.view.camera)
         if request == "window_picture":
-            display, density = imgui.get_io().display_size, imgui.get_io().display_framebuffer_scale
+            display = imgui.get_io().display_size
+            density = imgui.get_io().display_framebuffer_scale
             whole = round(display.x * density.x), round(display.y * density.y)
             return f"Saved {exports.picture(self.pictures, title, read_rgb(screen, whole))}"
         if request == "take_view":

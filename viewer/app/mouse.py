@@ -48,14 +48,16 @@ def _divider(share: float, area: Area, held: bool, ui: UiContext) -> None:
     x = round(share * area.width)
     canvas = imgui.get_background_draw_list()
     ink = u32(PALETTE.accent if held else PALETTE.handle)
-    top, bottom = (x, 0.0), (x, area.height)
+    top = (x, 0.0)
+    bottom = (x, area.height)
     canvas.add_line(top, bottom, u32(PALETTE.scrim), 3.0 * ui.scale)
     canvas.add_line(top, bottom, ink, 1.5 * ui.scale)
 
 
 def _knob(x: float, y: float, held: bool, ui: UiContext) -> None:
     """Draw a round grip with an arrow on either side."""
-    s, canvas = ui.scale, imgui.get_background_draw_list()
+    s = ui.scale
+    canvas = imgui.get_background_draw_list()
     ink = u32(PALETTE.accent if held else PALETTE.handle)
     canvas.add_circle_filled((x, y), 12.0 * s, u32(PALETTE.scrim))
     canvas.add_circle((x, y), 12.0 * s, ink, 0, 1.5 * s)
@@ -107,7 +109,10 @@ def point_by_keys(
     Returns:
         The pointer, and the unused keys.
     """
-    io, area, at, down = imgui.get_io(), pointer.area, held.at, held.down
+    io = imgui.get_io()
+    area = pointer.area
+    at = held.at
+    down = held.down
     if (
         at is not None
         and not has_pending_input()
@@ -148,7 +153,8 @@ def handle_mouse(tool: MouseTool, work: Workspace, pointer: PointerContext) -> t
     if imgui.is_mouse_released(0) and tool.drag in ("orbit", "look") and not _has_traveled(pointer.ui):
         work = _focus_picked_layer(work, pointer)
     if tool.drag == select_tool.SELECT_DRAG and imgui.is_mouse_released(0) and tool.gesture is not None:
-        strokes, held = tool.strokes, tool.gesture
+        strokes = tool.strokes
+        held = tool.gesture
         if held.tool == "scribble":
             strokes, work = select_tool.spread(strokes, held, work, pointer)
         gesture, work = select_tool.release(held, work, pointer)
@@ -163,7 +169,8 @@ def handle_mouse(tool: MouseTool, work: Workspace, pointer: PointerContext) -> t
         imgui.set_mouse_cursor(imgui.MouseCursor_.resize_ew.value)
         if imgui.is_mouse_clicked(0):
             return replace(tool, drag=DIVIDER, divider=work.view.compare.divider), work
-    axis, plain = overlay.axis_under(work.view, pointer.area, pointer.ui), not io.key_alt
+    axis = overlay.axis_under(work.view, pointer.area, pointer.ui)
+    plain = not io.key_alt
     if axis and imgui.is_mouse_clicked(0):
         return replace(tool, drag=overlay.AXES_DRAG, axis=axis), work
     if work.form_open and work.form.picks and plain and imgui.is_mouse_clicked(0):
@@ -205,7 +212,8 @@ def grips_divider(tool: MouseTool, view: ViewState, pointer: PointerContext) -> 
     """Return True if the divider of a split is dragged or under the mouse."""
     if tool.drag is not None:
         return tool.drag == DIVIDER
-    mouse, area = imgui.get_io().mouse_pos, pointer.area
+    mouse = imgui.get_io().mouse_pos
+    area = pointer.area
     within = abs(mouse.x - view.compare.divider * area.width) <= REACH_PX * pointer.ui.scale
     over = imgui.get_io().want_capture_mouse or not 0.0 <= mouse.y < area.height
     return view.compare.mode == "split" and within and not over
@@ -213,8 +221,10 @@ def grips_divider(tool: MouseTool, view: ViewState, pointer: PointerContext) -> 
 
 def _drag(tool: MouseTool, work: Workspace, pointer: PointerContext) -> tuple[MouseTool, Workspace]:
     """Apply this frame's mouse movement to the active drag."""
-    io, scale = imgui.get_io(), pointer.ui.scale
-    dx, dy = io.mouse_delta.x / scale, io.mouse_delta.y / scale
+    io = imgui.get_io()
+    scale = pointer.ui.scale
+    dx = io.mouse_delta.x / scale
+    dy = io.mouse_delta.y / scale
     if tool.drag == DIVIDER:
         return tool, replace(work, view=place_divider(work.view, io.mouse_pos.x / pointer.area.width))
     if tool.drag == tools.PAINT_DRAG:
@@ -230,7 +240,8 @@ def _drag(tool: MouseTool, work: Workspace, pointer: PointerContext) -> tuple[Mo
         return tool, workspace.with_camera(work, turned)
     if tool.drag and (dx or dy):
         # also if the button went up within this frame: a slow frame must not lose the end of a drag
-        height, radius = pointer.scale * pointer.area.height / scale, pointer.facts.bounds.radius
+        height = pointer.scale * pointer.area.height / scale
+        radius = pointer.facts.bounds.radius
         lens = pointer.shown.camera.fov_y  # a safe frame widens the view beyond the camera's own angle
         camera = controls.drag(replace(work.view.camera, fov_y=lens), tool.drag, dx, dy, height, radius)
         return tool, workspace.with_camera(work, replace(camera, fov_y=work.view.camera.fov_y))
@@ -242,7 +253,8 @@ def _begin_stroke(tool: MouseTool, work: Workspace, pointer: PointerContext) -> 
     reason = tools.paint_obstacle(work.view, work.focus)
     if reason or work.focus is None:
         return tool, workspace.with_message(work, f"Cannot paint: {reason}", pointer.now, error=True)
-    layer, brush = work.view.layers[work.focus], work.view.brush
+    layer = work.view.layers[work.focus]
+    brush = work.view.brush
     mode = paint.mode_while(brush.mode, modifier())
     gdf = pointer.engine.gdfs[layer.gdf]
     stroke = paint.begin_stroke(layer.paint, gdf, pointer.surface, brush.through, mode)
@@ -251,7 +263,8 @@ def _begin_stroke(tool: MouseTool, work: Workspace, pointer: PointerContext) -> 
 
 def _paint(tool: MouseTool, work: Workspace, pointer: PointerContext) -> tuple[MouseTool, Workspace]:
     """Extend the brush stroke to the cursor and show the result at once."""
-    view, focus = work.view, work.focus
+    view = work.view
+    focus = work.focus
     if tool.stroke is None or focus is None:
         return tool, work
     density = imgui.get_io().display_framebuffer_scale.x * pointer.ui.scale
@@ -276,7 +289,8 @@ def _look_along(work: Workspace, axis: str) -> Workspace:
 
 def _focus_picked_layer(work: Workspace, pointer: PointerContext) -> Workspace:
     """Focus the layer at a click on the picture, if there is any."""
-    engine, view = pointer.engine, pointer.shown
+    engine = pointer.engine
+    view = pointer.shown
     camera = pointer.camera(view.camera)
     seen = seen_at(pointer.scene, camera, *pointer.cursor, engine.near)
     layer = None if seen is None else layer_at(view, engine.gdfs, seen)

@@ -36,7 +36,9 @@ from viewer.ui.context import PALETTE, UiContext, u32
 from viewer.ui.keys import Keys
 from viewer.ui.pointer import PointerContext
 
-_STROKE_PX, _MOST_PLACES, _MOST_DOTS = 4.0, 16, 300  # at 1×: half a stroke's width; sampled places; dots
+_STROKE_PX = 4.0  # at 1×: half a stroke's width
+_MOST_PLACES = 16  # sampled places
+_MOST_DOTS = 300  # dots
 _SEEDS = 0.1  # a seed contributes at least this fraction of a pixel's color
 
 Point = tuple[float, float]
@@ -106,7 +108,8 @@ def begin(tool: str, mode: str, before: bytes, at: Point, surface: Surface, thro
             front = surface.front(np.arange(len(front)))
         return replace(gesture, brushed=Brushed(surface.centers, front, np.zeros(len(front), bool)))
     if tool == "sphere":
-        camera, center = surface.camera, surface_point(surface.scene, surface.camera, *at)
+        camera = surface.camera
+        center = surface_point(surface.scene, surface.camera, *at)
         if center is None:
             return None
         depth = float(camera.viewmat[2, :3] @ torch.tensor(center, dtype=camera.viewmat.dtype))
@@ -202,7 +205,8 @@ def mode(chosen: str) -> str:
 
 def press(gesture: Gesture | None, work: Workspace, pointer: PointerContext) -> Held:
     """Handle a press of the left button over the picture."""
-    view, tool = work.view, work.view.select
+    view = work.view
+    tool = work.view.select
     at = pointer.cursor
     if gesture is not None and gesture.tool == "polygon" == tool.tool:
         if imgui.is_mouse_double_clicked(0) or _is_near(gesture, pointer):
@@ -218,7 +222,8 @@ CLICKED = ("flood", "color", "polygon")
 
 def click(work: Workspace, pointer: PointerContext) -> tuple[Click, Workspace]:
     """Select similar Gaussians at a click of the left button over the picture."""
-    tool, before = work.view.select, work.view.selection.members
+    tool = work.view.select
+    before = work.view.selection.members
     made = Click(
         tool.tool, mode(tool.mode), before, pointer.cursor, pointer.surface, (0.0, False), before, before
     )
@@ -274,7 +279,8 @@ def finish(gesture: Gesture, work: Workspace, pointer: PointerContext) -> Held:
     others."""
     if gesture.tool not in ("box", "lasso", "polygon"):
         return None, work
-    low, high = map(min, zip(*gesture.path, strict=True)), map(max, zip(*gesture.path, strict=True))
+    low = map(min, zip(*gesture.path, strict=True))
+    high = map(max, zip(*gesture.path, strict=True))
     small = max(b - a for a, b in zip(low, high, strict=True)) <= _TRAVEL_PX * pointer.ui.scale
     if not small:
         return None, _apply(gesture, work, _selected_rows(gesture, work, pointer), pointer)
@@ -349,7 +355,9 @@ def _with(work: Workspace, state: selection.SelectionState) -> Workspace:
     return replace(work, view=replace(work.view, selection=state))
 
 
-_HALO, _LINE = 3.0, 1.25  # widths at 1×
+# widths at 1×
+_HALO = 3.0
+_LINE = 1.25
 
 
 def draw_strokes(strokes: tuple[Strokes, ...], work: Workspace, pointer: PointerContext) -> None:
@@ -357,8 +365,10 @@ def draw_strokes(strokes: tuple[Strokes, ...], work: Workspace, pointer: Pointer
     rows = strokes_of(strokes, work) if work.view.select.tool == "scribble" else None
     if rows is None:
         return
-    density, canvas = imgui.get_io().display_framebuffer_scale, imgui.get_background_draw_list()
-    camera, scene = pointer.camera(work.view.camera), pointer.scene
+    density = imgui.get_io().display_framebuffer_scale
+    canvas = imgui.get_background_draw_list()
+    camera = pointer.camera(work.view.camera)
+    scene = pointer.scene
     for some, color in zip(rows, (_ON, _BESIDE), strict=True):
         some = some[:: len(some) // _MOST_DOTS + 1]
         at = project_centers(scene[torch.from_numpy(some)], camera).points
@@ -373,7 +383,8 @@ def draw_gesture(gesture: Gesture | None, view: ViewState, ui: UiContext, left: 
     Args:
         left: first column of the picture, framebuffer pixels
     """
-    io, mouse = imgui.get_io(), imgui.get_mouse_pos()
+    io = imgui.get_io()
+    mouse = imgui.get_mouse_pos()
     over = not io.want_capture_mouse
     if view.select.tool == "brush" and over:
         _circle(mouse, view.select.radius * ui.scale, ui)
@@ -381,14 +392,16 @@ def draw_gesture(gesture: Gesture | None, view: ViewState, ui: UiContext, left: 
         return
     density = io.display_framebuffer_scale
     path = [imgui.ImVec2((x + left) / density.x, y / density.y) for x, y in gesture.path]
-    first, last = path[0], path[-1]
+    first = path[0]
+    last = path[-1]
     if gesture.tool == "box":
         corners = ((last.x, first.y), last, (first.x, last.y))
         _line([first, *corners], True, ui)
     elif gesture.tool == "lasso":
         _line(path, True, ui)
     elif gesture.tool == "scribble":
-        canvas, color = imgui.get_background_draw_list(), _BESIDE if gesture.mode == "subtract" else _ON
+        canvas = imgui.get_background_draw_list()
+        color = _BESIDE if gesture.mode == "subtract" else _ON
         canvas.add_polyline([*path], u32(color), 2 * _STROKE_PX * ui.scale, 0)
     elif gesture.tool == "polygon":
         _line([*path, mouse] if over else path, False, ui)
@@ -419,4 +432,5 @@ def _dot(center: imgui.ImVec2Like, ui: UiContext) -> None:
 
 
 _DARK = (0.0, 0.0, 0.0, 0.5)
-_ON, _BESIDE = (0.30, 0.85, 0.35, 1.0), (0.95, 0.30, 0.25, 1.0)
+_ON = (0.30, 0.85, 0.35, 1.0)
+_BESIDE = (0.95, 0.30, 0.25, 1.0)

@@ -60,10 +60,12 @@ class TidyActions:
 
     def leave_scene(self) -> None:
         """Drop the handles when another scene opens."""
-        self._region, self._app.main_view.gizmo = None, None
+        self._region = None
+        self._app.main_view.gizmo = None
 
     def _begin(self, does: str) -> None:
-        main_view, scene = self._app.main_view, self._app.document.original
+        main_view = self._app.main_view
+        scene = self._app.document.original
         self._folder = edits_folder(self._app.document.file)
         mask = selection.unpack(main_view.work.view.selection.members, len(scene))
         if not mask.any():
@@ -93,7 +95,8 @@ class TidyActions:
             self._app.show(document, (gdf,), live)
 
     def _keep(self, _: str) -> None:
-        gizmo, steps = self._app.main_view.gizmo, self._steps()
+        gizmo = self._app.main_view.gizmo
+        steps = self._steps()
         if isinstance(gizmo, Gizmo) and steps and (gizmo.does == "duplicate" or gizmo.is_moved):
             self._add(steps[0].does, steps)
         self._end()
@@ -105,7 +108,8 @@ class TidyActions:
             self._app.show(self._app.document)
 
     def _end(self) -> None:
-        self._region, self._app.main_view.gizmo = None, None
+        self._region = None
+        self._app.main_view.gizmo = None
         self._app.main_view.wake()
 
     def _add(self, does: str, steps: Sequence[Step]) -> None:
@@ -152,7 +156,8 @@ class StrayActions:
             return None
         if not self._search.done():
             return _POLL_S
-        search, self._search = self._search, None
+        search = self._search
+        self._search = None
         if self._scene is self._app.document.original:  # else another scene was opened meanwhile
             self._hide(*search.result())
         return None
@@ -162,11 +167,13 @@ class StrayActions:
         self._worker.shutdown(wait=False, cancel_futures=True)
 
     def _hide(self, strays: Strays, db: float) -> None:
-        main_view, count = self._app.main_view, len(self._app.document.scene)
+        main_view = self._app.main_view
+        count = len(self._app.document.scene)
         if not len(strays.rows):
             main_view.show_message("There are no strays")
             return
-        view, mask = main_view.work.view, np.zeros(count, bool)
+        view = main_view.work.view
+        mask = np.zeros(count, bool)
         mask[strays.rows] = True
         main_view.change(replace(view, selection=selection.hide(view.selection, mask)))
         change = "no pixel differs" if db >= NO_DIFFERENCE else f"{db:.1f} dB to the pictures before"

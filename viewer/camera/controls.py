@@ -15,7 +15,9 @@ DEGREES_PER_PIXEL = 0.3
 ZOOM_PER_STEP = 0.12  # of the distance, per wheel step
 DOLLY_PER_PIXEL = 0.005
 FLY_RADII_PER_SECOND = 0.6
-CLOSEST, WIDEST = 1e-4, 1e4  # of the scene's radius: how near to and far from the pivot the eye goes
+# of the scene's radius: how near to and far from the pivot the eye goes
+CLOSEST = 1e-4
+WIDEST = 1e4
 
 
 def orbit(camera: ViewCamera, dx: float, dy: float) -> ViewCamera:

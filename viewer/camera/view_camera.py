@@ -130,7 +130,9 @@ def add_scaled(origin: Vec3, *steps: tuple[float, Vec3]) -> Vec3:
     """origin + Σ length · direction"""
     x, y, z = origin
     for length, direction in steps:
-        x, y, z = x + length * direction[0], y + length * direction[1], z + length * direction[2]
+        x = x + length * direction[0]
+        y = y + length * direction[1]
+        z = z + length * direction[2]
     return x, y, z
 
 
@@ -156,9 +158,12 @@ def axes(camera: ViewCamera) -> Axes:
     up = unit(camera.up, (0.0, 1.0, 0.0))
     ahead = front(up)
     side = cross(up, ahead)
-    azimuth, elevation = math.radians(camera.azimuth), math.radians(camera.elevation)
-    cos_a, sin_a = math.cos(azimuth), math.sin(azimuth)
-    cos_e, sin_e = math.cos(elevation), math.sin(elevation)
+    azimuth = math.radians(camera.azimuth)
+    elevation = math.radians(camera.elevation)
+    cos_a = math.cos(azimuth)
+    sin_a = math.sin(azimuth)
+    cos_e = math.cos(elevation)
+    sin_e = math.sin(elevation)
     level = add_scaled((0.0, 0.0, 0.0), (cos_a, ahead), (sin_a, side))
     zero = (0.0, 0.0, 0.0)
     return Axes(
@@ -175,8 +180,10 @@ def eye(camera: ViewCamera) -> Vec3:
 
 def to_camera(camera: ViewCamera, width: int, height: int) -> Camera:
     """The pinhole camera of a picture of this size in pixels (a zero-sized window counts as one pixel)."""
-    width, height = max(width, 1), max(height, 1)
-    picture, position = axes(camera), eye(camera)
+    width = max(width, 1)
+    height = max(height, 1)
+    picture = axes(camera)
+    position = eye(camera)
     rows = np.array([picture.right, picture.up, picture.back], dtype=np.float64)
     rows[1:] *= -1.0  # OpenCV axes: y down, z forward
     viewmat = np.eye(4)
@@ -202,7 +209,8 @@ def widen(camera: ViewCamera, scale: float) -> ViewCamera:
 
 def half_camera(camera: Camera) -> Camera:
     """The same view in a picture of half the width: the square in its middle stays in sight."""
-    width, shrink = max(camera.width // 2, 1), half_scale(camera.width, camera.height)
+    width = max(camera.width // 2, 1)
+    shrink = half_scale(camera.width, camera.height)
     K = camera.K.clone()
     K[:2] *= shrink
     K[0, 2] += 0.5 * (width - shrink * camera.width)
@@ -326,7 +334,8 @@ def first_camera(
         stored: the camera in the scene's file (`progdf.formats.ply_view`), whose picture fits into the view
     """
     up = find_scene_up(scene, cameras=cameras).direction if up is None else up
-    camera, axis = ViewCamera(up=up, azimuth=20.0, fov_y=fov_y), torch.tensor(up)
+    camera = ViewCamera(up=up, azimuth=20.0, fov_y=fov_y)
+    axis = torch.tensor(up)
     if not len(scene):
         return frame(camera, Bounds(), aspect)
     if stored is not None:

@@ -36,7 +36,8 @@ def value_between(points: Sequence[Point], frame: float) -> float:
     if easing == "linear":
         return start + share * (end - start)
     span = points[i + 1][0] - points[i][0]
-    leave, come = _slope(points, i) * span, _slope(points, i + 1) * span
+    leave = _slope(points, i) * span
+    come = _slope(points, i + 1) * span
     eased = share * share * (3.0 - 2.0 * share)
     bend = share * (1.0 - share) * ((1.0 - share) * leave - share * come)
     reached = start + eased * (end - start) + bend
@@ -123,10 +124,12 @@ def _slope(points: Sequence[Point], i: int) -> float:
     if not 0 < i < len(points) - 1 or points[i - 1][1] != "smooth" or points[i][1] != "smooth":
         return 0.0
     (a, _, x), (b, _, y), (c, _, z) = points[i - 1 : i + 2]
-    into, out = (y - x) / (b - a), (z - y) / (c - b)
+    into = (y - x) / (b - a)
+    out = (z - y) / (c - b)
     if into * out <= 0.0:
         return 0.0
-    left, right = 2 * (c - b) + (b - a), (c - b) + 2 * (b - a)
+    left = 2 * (c - b) + (b - a)
+    right = (c - b) + 2 * (b - a)
     return (left + right) / (left / into + right / out)  # Fritsch and Butland's mean: never overshoots
 
 

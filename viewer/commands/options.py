@@ -223,7 +223,8 @@ def _open_session(stack: StackOptions, drawing: DrawingOptions | None) -> OpenSt
                 raise ProgdfError(
                     f"{what} with the session {stack.scene.name}, which already sets it; leave it out"
                 )
-    saved, up = session.open_session(stack.scene), drawing.up if drawing else "auto"
+    saved = session.open_session(stack.scene)
+    up = drawing.up if drawing else "auto"
     opened = OpenStack(saved.document, saved.view, stack.scene, saved.snapshots, up, saved.warning)
     settings = [
         f"{opened.layer(name)}{equals}{s}" for name, equals, s in (t.rpartition("=") for t in stack.set)

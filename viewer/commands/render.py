@@ -62,7 +62,8 @@ from .stack_options import parse
 
 DEFAULT_SIZE = (640, 480)
 _SAY_EVERY_S = 0.5
-_LONGEST_S, _SWEEP_S = 120.0, 2.0  # of a turntable; of a slider there and back
+_LONGEST_S = 120.0  # of a turntable
+_SWEEP_S = 2.0  # of a slider there and back
 ONE_OF = ("sweep", "sheet", "split", "difference", "timeline", "turntable")
 """Options that each say what the picture is."""
 
@@ -99,7 +100,8 @@ def export(argv: Sequence[str]) -> int:
         return _export_bundle(out, opened)
     if several:
         return _export_frames(options, opened)
-    document, strengths = opened.document, describe_strengths(opened.view)
+    document = opened.document
+    strengths = describe_strengths(opened.view)
     edited = _compose(opened.document, opened.view)
     read_back = scene_file.save_scene(out, edited, options.glb_axes)
     far = (
@@ -115,7 +117,9 @@ def export(argv: Sequence[str]) -> int:
 
 def _export_frames(options: ExportOptions, opened: OpenStack) -> int:
     """Numbered files, or the time samples of one: steps up to the strengths, or frames of a timeline."""
-    out, document, rate = options.out, opened.document, float(Timeline().fps)
+    out = options.out
+    document = opened.document
+    rate = float(Timeline().fps)
     whole = scene_file.written_format(out) == usd.SUFFIX
     if not options.timeline:
         steps = np.linspace(0.0, 1.0, options.frames or 0).tolist()
@@ -125,7 +129,8 @@ def _export_frames(options: ExportOptions, opened: OpenStack) -> int:
         keys = _keys(opened)
         if not any(key.strengths for key in keys.keys):
             raise ProgdfError("--timeline: it moves no slider, so all frames would be alike")
-        steps, rate = [*timeline.film_frames(keys)], float(keys.fps)
+        steps = [*timeline.film_frames(keys)]
+        rate = float(keys.fps)
         if options.frames is not None:
             steps = film.sheet_frames(keys, options.frames)
             rate *= (len(steps) - 1) / keys.length  # it lasts as long
@@ -206,7 +211,9 @@ def render(argv: Sequence[str]) -> int:
     one_moves = options.sweep is not None or options.sheet is not None
     opened = open_stack(options.stack, options.drawing, 0.0 if one_moves else 1.0)
     check_not_an_input(options.out, opened.files)
-    scene, gdfs, view = opened.document.scene, opened.document.gdfs, opened.view
+    scene = opened.document.scene
+    gdfs = opened.document.gdfs
+    view = opened.view
     view = replace(view, compare=_comparison(options, view.compare))
     if options.alpha and (view.compare.mode != "off" or options.sheet is not None):
         raise ProgdfError("--alpha goes with a picture or a film; leave out comparisons and sheets")

@@ -119,7 +119,8 @@ def _once(make: Callable[[], _Made]) -> Callable[[], _Made]:
 def empty() -> Document:
     """No document yet: one splat that nothing shows, and no title."""
     row = torch.zeros(1, 3)
-    none, logit = row[:, None, :][:, :0], torch.tensor([-20.0])
+    none = row[:, None, :][:, :0]
+    logit = torch.tensor([-20.0])
     return Document("", Gaussians(row, torch.eye(4)[:1], row - 5.0, logit, row, none))
 
 

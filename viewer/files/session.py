@@ -91,7 +91,8 @@ def save(path: Path, session: WindowSession) -> None:
     """
     if session.document.path is None or len(session.document.gdf_paths) != len(session.document.edits):
         raise ProgdfError(f"{session.document.title} was not opened from files; save the scene first")
-    scene, session = session.document.path, prune(session)
+    scene = session.document.path
+    session = prune(session)
     view, snapshots = _move(session.view, session.snapshots, session.document.scene.origin)
     if not path.parent.is_dir():
         raise ProgdfError(f"the folder {path.parent} does not exist; create it first")
@@ -133,7 +134,8 @@ def open_session(path: Path) -> WindowSession:
     x, y, z = opened.scene.origin
     view, snapshots = _move(file.view, file.snapshots, (-x, -y, -z))
     check_selection(view.selection, len(opened.scene))
-    named, folder = view.selection.regions, path.resolve().parent
+    named = view.selection.regions
+    folder = path.resolve().parent
     view = _with_region_paths(view, lambda region: Path(os.path.normpath(folder / region)))
     for layer in (*view.layers, *(layer for s in snapshots for layer in s.edit.layers)):
         gdf = opened.gdfs[layer.gdf]
@@ -211,7 +213,8 @@ def default_path(opened: Document) -> Path:
 
 def prune(session: WindowSession) -> WindowSession:
     """Without the edits that no layer shows any more, in the view or in a snapshot."""
-    view, snapshots = session.view, session.snapshots
+    view = session.view
+    snapshots = session.snapshots
     stacks = (view.layers, *(s.edit.layers for s in snapshots))
     used = sorted({layer.gdf for layers in stacks for layer in layers})
     places = {gdf: i for i, gdf in enumerate(used)}
@@ -231,7 +234,8 @@ def prune(session: WindowSession) -> WindowSession:
 
     if opened.scene is not opened.original:  # masks of the rows that the file's own edits bring
         added = [opened.gdfs[gdf] for gdf in used if opened.edits[gdf].added is not None]
-        count, members = len(opened.original), [gdf.region.members.numpy() for gdf in added]
+        count = len(opened.original)
+        members = [gdf.region.members.numpy() for gdf in added]
         rows = np.concatenate([np.arange(count), *(own[own >= count] for own in members)])
         view = replace(view, selection=take_rows(view.selection, len(opened.scene), rows))
         session = replace(session, view=view)
@@ -303,7 +307,8 @@ class SessionAutosave:
 
     def write(self, work: object, beside: Callable[[], Path], save: Callable[[Path], None]) -> Path:
         """Write it at once; the file. Arguments as of `wait`."""
-        self._due, self._work = None, work
+        self._due = None
+        self._work = work
         if self.path is None:
             self.path = next(path for path in _numbered_paths(beside(), "autosave") if not path.exists())
         save(self.path)
@@ -315,17 +320,24 @@ class SessionAutosave:
 
     def continue_from(self, path: Path) -> None:
         """The work of an autosave was opened: the file is this window's from now on."""
-        self.path, self._due, self._work = path, None, None
+        self.path = path
+        self._due = None
+        self._work = None
 
     def drop(self) -> None:
         """Delete the file: its work is saved."""
         if self.path is not None:
             self.path.unlink(missing_ok=True)
-        self.path, self._due, self._work = None, None, None
+        self.path = None
+        self._due = None
+        self._work = None
 
     def discard(self) -> Path | None:
         """Put the file aside; where it went, None where there is none."""
-        path, self.path, self._due, self._work = self.path, None, None, None
+        path = self.path
+        self.path = None
+        self._due = None
+        self._work = None
         return put_aside(path) if path is not None and path.exists() else None
 
 

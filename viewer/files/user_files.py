@@ -74,7 +74,8 @@ def _remember(name: str, text: str) -> None:
 
 def describe_age(seconds: float) -> str:
     """ "just now", "5 min ago", "3 h ago", "yesterday", "12 days ago", "4 months ago"."""
-    minutes, days = int(seconds / 60.0), int(seconds / 86_400.0)
+    minutes = int(seconds / 60.0)
+    days = int(seconds / 86_400.0)
     if days:
         return "yesterday" if days == 1 else f"{days} days ago" if days < 60 else f"{days // 30} months ago"
     return "just now" if minutes < 2 else f"{minutes} min ago" if minutes < 90 else f"{minutes // 60} h ago"

@@ -61,7 +61,8 @@ def write_page(
         ProgdfError: an option names a layer that is not there, or the page cannot be written.
     """
     stage, edits = first_state(document, view, kept, options)
-    gdfs, title = [document.gdfs[i] for i in edits], options.title or Path(document.title).stem
+    gdfs = [document.gdfs[i] for i in edits]
+    title = options.title or Path(document.title).stem
     start = picture(document.scene, document.gdfs, view, STILL)
     texts = PageTexts(title, options.credit, view.background, start)
     degree = min(options.sh, document.scene.sh_degree)
@@ -69,7 +70,8 @@ def write_page(
     html = build_page(packed.data, texts)
     write_file(out, html)
     error = psnr(picture(packed.scene, document.gdfs, view, STILL, DRAWN_SH[degree]), start)
-    size, whole = len(html.encode()), document.scene.sh_degree
+    size = len(html.encode())
+    whole = document.scene.sh_degree
     parts = [f"{size / 1e6:.2f} MB", options.quality]
     parts += [f"SH of degree {degree} of {whole}"] if degree < whole else []
     parts += [f"{error:.1f} dB to the scene"] if error < _EXACT_DB else []
@@ -168,7 +170,8 @@ def _film(film: Timeline, edits: Sequence[int]) -> dict[str, Any] | None:
         return None
     frames = []
     for frame in range(film.length + 1):
-        camera, strengths = timeline.camera_at(film, frame), timeline.strengths_at(film, frame)
+        camera = timeline.camera_at(film, frame)
+        strengths = timeline.strengths_at(film, frame)
         moved = [(edits.index(gdf), s) for gdf, s in strengths.items() if gdf in edits]
         frames.append({"strengths": moved, "camera": None if camera is None else camera_json(camera)})
     return {

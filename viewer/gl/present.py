@@ -37,11 +37,13 @@ class Presenter:
         self.ctx.enable_only(moderngl.NOTHING)
         picture.use(0)
         if size == picture.size:
-            self._program["picture"], self._program["left"] = 0, left
+            self._program["picture"] = 0
+            self._program["left"] = left
             self._vao.render(moderngl.TRIANGLES, vertices=3)
         else:
             picture.filter = (moderngl.LINEAR, moderngl.LINEAR)
-            self._stretch["picture"], self._stretch["shown_size"] = 0, size
+            self._stretch["picture"] = 0
+            self._stretch["shown_size"] = size
             self._stretch["left"] = left
             self._stretch_vao.render(moderngl.TRIANGLES, vertices=3)
 
@@ -60,7 +62,9 @@ class ScreenCopy:
     """
 
     def __init__(self, ctx: moderngl.Context, size: tuple[int, int], left: int) -> None:
-        self.ctx, self.size, self.left = ctx, size, left
+        self.ctx = ctx
+        self.size = size
+        self.left = left
         self._texture = ctx.texture((left + size[0], size[1]), 4)
         self._framebuffer = ctx.framebuffer([self._texture])
         self._screen = np.empty((size[1], size[0], 4), np.uint8)

@@ -125,7 +125,8 @@ class SplatTextures:
             memory = memory[..., texel.component : texel.component + texel.components]
             # whole runs: gathering the changed rows alone takes several times longer
             for first, last in runs:
-                begin, end = first * SPLATS_PER_ROW, min(last * SPLATS_PER_ROW, self.count)
+                begin = first * SPLATS_PER_ROW
+                end = min(last * SPLATS_PER_ROW, self.count)
                 memory[begin:end] = numbers[begin:end]
             if texel.texture not in dirty:
                 dirty.append(texel.texture)

@@ -84,7 +84,8 @@ class SplatRenderer:
         Args:
             activated: its logits are opacities, which may be more than 1
         """
-        count, coefficients = len(scene), min(int(scene.shN.shape[1]), SHOWN_SH)
+        count = len(scene)
+        coefficients = min(int(scene.shN.shape[1]), SHOWN_SH)
         size = (count, coefficients)
         scene_textures = self._scene
         if scene_textures is None or (scene_textures.count, scene_textures.sh_coefficients) != size:
@@ -92,7 +93,8 @@ class SplatRenderer:
             self._scene = SplatTextures(self.ctx, count, coefficients)
             self._buffers = self._make_buffers(max(count, 1))
         self._drawn = 0
-        self._antialiased, self._activated = scene.antialiased, activated
+        self._antialiased = scene.antialiased
+        self._activated = activated
         return self.textures.write(scene)
 
     def update(self, scene: Gaussians, attributes: Iterable[str], rows: NDArray[np.int64]) -> int:
@@ -243,7 +245,9 @@ class GridPass:
         ways = (moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA, moderngl.ZERO, moderngl.ONE)
         self._ctx.blend_func = ways  # type: ignore[assignment]  # its annotation forgets that alpha has its own
         picture.use(0)
-        self._program["picture"], self._program["shown_size"], self._program["left"] = 0, size, left
+        self._program["picture"] = 0
+        self._program["shown_size"] = size
+        self._program["left"] = left
         self._vao.render(moderngl.TRIANGLE_STRIP, vertices=4, instances=len(lines))
 
     def release(self) -> None:

@@ -36,7 +36,8 @@ SIDES = (720, 1080, 1440, 2160)
 FPS = (12, 24, 25, 30, 60)
 
 
-ALL_SLIDERS, TURNTABLE = "\0sliders", "\0turntable"
+ALL_SLIDERS = "\0sliders"
+TURNTABLE = "\0turntable"
 """Films of no layer's own, in `DeliverOptions.moves`."""
 
 
@@ -283,7 +284,8 @@ class JobQueue:
         self._folder.cleanup()
 
     def _follow(self, job: QueuedTask) -> None:
-        progress, now = job.task.read_progress(job.progress), time.monotonic()
+        progress = job.task.read_progress(job.progress)
+        now = time.monotonic()
         if progress.share == job.began_at:  # it is still starting, which takes as long as it takes
             self._began[job.number] = now
         seconds = now - self._began[job.number]

@@ -40,20 +40,27 @@ from progdf.region import Region
 
 from .child import Progress
 
-ORDER, LOG, WINDOW_LOCK = ".train.json", ".train.log", ".train.lock"
-DRAFT, PACKED = ".draft.gdf", ".packed.gdf"
+ORDER = ".train.json"
+LOG = ".train.log"
+WINDOW_LOCK = ".train.lock"
+DRAFT = ".draft.gdf"
+PACKED = ".packed.gdf"
 
 Setting = Literal["color", "amount", "grade", "style", "sentence", "folder", "pictures"]
 """What an editor is asked besides its kind."""
 
-ALL, SELECTION, TYPED, CHANGED = "all", "selection", "typed", "changed"
+ALL = "all"
+SELECTION = "selection"
+TYPED = "typed"
+CHANGED = "changed"
 """Regions without a name: the whole scene, what is selected, what is typed, where pictures were changed."""
 
 STYLES = 26
 BEST_STYLES = (14, 23, 20, 7, 12, 0)
 """Of `style:N`, those that are most alike from all sides; they are offered first."""
 STYLE_ORDER = (*BEST_STYLES, *(i for i in range(STYLES) if i not in BEST_STYLES))
-SHEET_PX, SHEET_COLUMNS = (96, 72), 6
+SHEET_PX = (96, 72)
+SHEET_COLUMNS = 6
 """Of the sheet of all paintings: pixels of one, and how many lie side by side; in their order."""
 
 
@@ -197,7 +204,8 @@ def parse_curve(text: str) -> list[Point]:
 
 def with_editor(form: NewEdit, editor: int) -> NewEdit:
     """The form with another editor; a few changed pictures know their own region."""
-    region, finds = form.region, EDITORS[editor].kind == "pictures"
+    region = form.region
+    finds = EDITORS[editor].kind == "pictures"
     if finds and region == ALL:
         region = CHANGED
     elif not finds and region == CHANGED:

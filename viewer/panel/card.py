@@ -81,9 +81,13 @@ def _gain(layer: LayerState, kind: str, moves: bool, active: bool, ui: UiContext
     return layer if new == value else with_slider_value(layer, kind, new)
 
 
-TOGGLE_PX, THUMBNAIL_PX = 20.0, 24.0
+TOGGLE_PX = 20.0
+THUMBNAIL_PX = 24.0
 CARD_PX = 66.0  # a whole card with what is between two, at 1×
-COMPACT_PX, SLIDER_PX, SLIM_PX = 7.0, 92.0, 16.0  # a compact row: its padding, its slider's width and height
+# a compact row: its padding, its slider's width and height
+COMPACT_PX = 7.0
+SLIDER_PX = 92.0
+SLIM_PX = 16.0
 _MENU = "menu of a layer"
 _MENU_ITEMS = (
     *("rename", "duplicate", "replace", "again", "", "remove", ""),
@@ -122,18 +126,24 @@ def draw_card(
         rows: one per .gdf, indexed by `LayerState.gdf`
         texture: GL name of the edit's thumbnail, 0 before it is drawn
     """
-    scale, p, compact = ui.scale, PALETTE, is_compact(work)
-    layer, focused = work.view.layers[index], work.focus == index
+    scale = ui.scale
+    p = PALETTE
+    compact = is_compact(work)
+    layer = work.view.layers[index]
+    focused = work.focus == index
     selected = focused or layer.gdf in work.selected
-    row, most = rows[layer.gdf], largest_strength(work.view)
+    row = rows[layer.gdf]
+    most = largest_strength(work.view)
     imgui.push_id(index)
     canvas = imgui.get_window_draw_list()
     clip = canvas.get_clip_rect_min(), canvas.get_clip_rect_max()
-    color, padding = p.card_focused if selected else p.card, (COMPACT_PX, 0.0) if compact else (10.0, 6.0)
+    color = p.card_focused if selected else p.card
+    padding = (COMPACT_PX, 0.0) if compact else (10.0, 6.0)
     with card("card", color, ui, padding=padding):
         right = right_edge()
         work, touch = _head(work, index, row, active, texture, ui, actions)
-        number_at, layer = imgui.get_item_rect_min(), work.view.layers[index]
+        number_at = imgui.get_item_rect_min()
+        layer = work.view.layers[index]
         if compact:
             imgui.same_line(right - SLIDER_PX * scale - _number_width(layer, compact) - 6.0 * scale)
             imgui.set_cursor_pos_y(
@@ -166,7 +176,8 @@ def draw_card(
                 imgui.dummy((0.0, 2.0 * scale))
         over = imgui.is_window_hovered(imgui.HoveredFlags_.allow_when_blocked_by_active_item.value)
         press = _press(touch.named) if over and imgui.is_mouse_clicked(imgui.MouseButton_.left.value) else ""
-        several, alone = len(work.selected) if selected else 0, imgui.get_id("alone")
+        several = len(work.selected) if selected else 0
+        alone = imgui.get_id("alone")
         if press:  # one of several may be dragged with the others: a click makes it the only one as it ends
             imgui.get_state_storage().set_bool(alone, press == "one" and several > 1)
             press = "keep" if press == "one" and several > 1 else press
@@ -235,7 +246,8 @@ def _group_menu(state: ViewState, layer: LayerState, ui: UiContext, actions: lis
 
 def _focus_bar(clip: tuple[imgui.ImVec2, imgui.ImVec2], color: Rgba, scale: float) -> None:
     """A stripe along the left edge of the card that is being drawn, in the panel's clip."""
-    canvas, corner = imgui.get_window_draw_list(), imgui.get_window_pos()
+    canvas = imgui.get_window_draw_list()
+    corner = imgui.get_window_pos()
     edge = (corner.x + 3 * scale, corner.y + imgui.get_window_size().y)
     canvas.push_clip_rect(*clip, False)
     canvas.add_rect_filled(corner, edge, u32(color), 3 * scale)
@@ -247,8 +259,11 @@ def _head(
 ) -> tuple[Workspace, CardTouch]:
     """Eye, thumbnail, name, toggles, and last the place of the number, which is drawn when the slider has its
     value."""
-    scale, compact, layer = ui.scale, is_compact(work), work.view.layers[index]
-    right, gap = right_edge(), 4.0 * scale
+    scale = ui.scale
+    compact = is_compact(work)
+    layer = work.view.layers[index]
+    right = right_edge()
+    gap = 4.0 * scale
     if icon_button("eye", Icon.SHOWN if layer.enabled else Icon.HIDDEN, ui, dim=not active):
         if imgui.get_io().key_alt:
             work = replace(work, view=toggle_solo(work.view, index))
@@ -281,9 +296,12 @@ def _head(
 
 def _toggles(work: Workspace, index: int, over: bool, ui: UiContext, actions: list[str]) -> None:
     """Menu, brush, details, lock and solo; of the last two what is on, where the mouse is elsewhere."""
-    view, layer, side = work.view, work.view.layers[index], TOGGLE_PX * ui.scale
+    view = work.view
+    layer = work.view.layers[index]
+    side = TOGGLE_PX * ui.scale
     lock = Icon.LOCKED if layer.locked else Icon.UNLOCKED
-    painting, unfolded = view.brush.active and work.focus == index, layer.gdf in view.unfolded
+    painting = view.brush.active and work.focus == index
+    unfolded = layer.gdf in view.unfolded
     buttons = (
         ("menu", Icon.MENU, False),
         ("brush", Icon.BRUSH, painting),
@@ -377,13 +395,16 @@ def _name(
             work = replace(work, renaming=None, view=rename_layer(work.view, index, text))
         return work, CardTouch()
     x, y = imgui.get_cursor_screen_pos()
-    size, nav = (max(room, 1.0), imgui.get_frame_height()), imgui.ButtonFlags_.enable_nav
+    size = (max(room, 1.0), imgui.get_frame_height())
+    nav = imgui.ButtonFlags_.enable_nav
     imgui.invisible_button("name", size, nav.value)
     if is_entered():
         return work, CardTouch(touched=True)
-    gesture, named = grip(ui), imgui.is_item_active()
+    gesture = grip(ui)
+    named = imgui.is_item_active()
     at = (x, y + imgui.get_style().frame_padding.y)
-    color, compact = PALETTE.text if active else PALETTE.dim, is_compact(work)
+    color = PALETTE.text if active else PALETTE.dim
+    compact = is_compact(work)
     marks = f"{Icon.LOCKED} " * (layer.locked and compact) + f"{Icon.SOLO} " * (layer.solo and compact)
     imgui.get_window_draw_list().add_text(at, u32(color), elide(marks + layer.name, room))
     if imgui.is_item_hovered(imgui.HoveredFlags_.for_tooltip.value):

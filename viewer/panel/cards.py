@@ -55,7 +55,8 @@ def draw_search(work: Workspace, ui: UiContext) -> str:
     """The field of the search, where there are many layers; what is typed."""
     if not (len(work.view.layers) > UNSEARCHED or work.searching or work.search):
         return work.search
-    side, gap = imgui.get_frame_height(), 4.0 * ui.scale
+    side = imgui.get_frame_height()
+    gap = 4.0 * ui.scale
     imgui.set_next_item_width(imgui.get_content_region_avail().x - bool(work.search) * (side + gap))
     if work.searching:
         imgui.set_keyboard_focus_here()
@@ -91,7 +92,8 @@ def draw_selection(state: ViewState, chosen: Sequence[int], ui: UiContext, actio
     more_button("of layers", _BUTTONS, ui, actions)
     tip("Group, reset")
     imgui.pop_style_var()
-    value, most = master_strength(state, chosen), largest_strength(state)
+    value = master_strength(state, chosen)
+    most = largest_strength(state)
     number = imgui.calc_text_size(f"{value:.3f}").x
     with inert(all(state.layers[i].locked for i in chosen)):
         at = imgui.get_cursor_screen_pos()
@@ -119,7 +121,8 @@ def draw_group(
 
     What was asked for goes into `actions`.
     """
-    scale, folded = ui.scale, group.name in state.collapsed
+    scale = ui.scale
+    folded = group.name in state.collapsed
     with imgui_ctx.push_id(f"group {group.name}"), imgui_ctx.begin_group():
         right = right_edge() - COMPACT_PX * scale
         arrow = Icon.FOLDED if folded else Icon.UNFOLDED
@@ -216,7 +219,8 @@ def draw_heading(work: Workspace, ui: UiContext, actions: list[str]) -> Workspac
     """The heading of the stack: a new edit, and the menu of what is about all layers."""
     right = right_edge()
     work = replace(work, layout=section("Edits", work.layout, ui))
-    side, text = imgui.get_frame_height(), "+ New edit"
+    side = imgui.get_frame_height()
+    text = "+ New edit"
     wide = imgui.calc_text_size(text).x + 2 * imgui.get_style().frame_padding.x
     imgui.same_line(right - wide - (side + 4.0 * ui.scale) * bool(work.view.layers))
     if (imgui.button if work.view.layers else accent_button)(text, (wide, 0.0)):
@@ -279,8 +283,11 @@ def draw(
     texts = [f"{row.region} {row.instruction}" for row in rows]
     # as seen: the top layer, which is the last one, first
     listed = filter_layers(work.view, texts, work.search)[::-1]
-    focus, group = work.focus, ""
-    dragged, gesture = -1, ""  # one of the lines, and what the hand does with it
+    focus = work.focus
+    group = ""
+    # one of the lines, and what the hand does with it
+    dragged = -1
+    gesture = ""
     lines: list[_Row] = []
     visible = {layer.name for layer in visible_layers(work.view)}
     for i in listed:
@@ -296,7 +303,8 @@ def draw(
         group = layer.group
         if group in work.view.collapsed and not work.search:
             continue
-        top, left = imgui.get_cursor_screen_pos().y, imgui.get_cursor_pos_x()
+        top = imgui.get_cursor_screen_pos().y
+        left = imgui.get_cursor_pos_x()
         imgui.set_cursor_pos_x(left + INSET_PX * ui.scale * bool(group))
         work, touch = draw_card(
             work,
@@ -344,7 +352,9 @@ def _drag(
     work: Workspace, focus: int | None, rows: Sequence[_Row], dragged: int, gesture: str, ui: UiContext
 ) -> tuple[ViewState, int | None]:
     """The state and the focused layer after a drag of a row: all selected layers go with one of them."""
-    state, layers, chosen = work.view, rows[dragged].layers, selected_layers(work)
+    state = work.view
+    layers = rows[dragged].layers
+    chosen = selected_layers(work)
     if not rows[dragged].heads and layers[0] in chosen:
         layers = chosen
     y, at, group = _nearest_gap(state, rows, layers, rows[dragged].heads, imgui.get_mouse_pos().y)
@@ -390,7 +400,9 @@ def _show_place(
 ) -> None:
     """A veil over what is dragged and a line where it would lie; near an edge the list scrolls."""
     imgui.set_mouse_cursor(imgui.MouseCursor_.resize_ns)
-    below, canvas = imgui.get_window_draw_list(), imgui.get_foreground_draw_list()  # that is over the cards
+    # that is over the cards
+    below = imgui.get_window_draw_list()
+    canvas = imgui.get_foreground_draw_list()
     canvas.push_clip_rect(below.get_clip_rect_min(), below.get_clip_rect_max())
     left = imgui.get_cursor_screen_pos().x
     right = left + imgui.get_content_region_avail().x
@@ -403,7 +415,9 @@ def _show_place(
         ends = (start, y - ui.scale), (right, y + ui.scale)
         canvas.add_rect_filled(*ends, u32(PALETTE.accent), ui.scale)
     canvas.pop_clip_rect()
-    mouse, margin, step = imgui.get_mouse_pos().y, 24.0 * ui.scale, 6.0 * ui.scale
+    mouse = imgui.get_mouse_pos().y
+    margin = 24.0 * ui.scale
+    step = 6.0 * ui.scale
     if mouse < imgui.get_window_pos().y + margin:
         imgui.set_scroll_y(max(imgui.get_scroll_y() - step, 0.0))
     elif mouse > imgui.get_window_pos().y + imgui.get_window_height() - margin:

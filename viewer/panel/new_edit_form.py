@@ -49,7 +49,9 @@ from viewer.ui.widgets import (
 )
 
 COLUMN_PX = 90.0
-_CURVE_PX, _MOST_POINTS, _LEAST_GAP = 92.0, 6, 0.02
+_CURVE_PX = 92.0
+_MOST_POINTS = 6
+_LEAST_GAP = 0.02
 _GRADES = {
     "exposure": "Stops of light: −1 is half of it, 1 twice as much",
     "temperature": "From blue to amber light",
@@ -71,7 +73,8 @@ def draw(work: Workspace, count: int, preview: PreviewState, ui: UiContext, acti
     if not work.form_open:
         return work
     with card(_NAME, PALETTE.card_focused, ui, nav=True):
-        storage, listed = imgui.get_state_storage(), imgui.get_id("a list is open")
+        storage = imgui.get_state_storage()
+        listed = imgui.get_id("a list is open")
         # else Enter and Escape are the list's
         mine = imgui.is_window_focused() and not storage.get_bool(listed)
         closes = mine and imgui.is_key_pressed(imgui.Key.escape, False)
@@ -89,7 +92,8 @@ def draw(work: Workspace, count: int, preview: PreviewState, ui: UiContext, acti
     return work
 
 
-_NAME, _ENTER = "new edit", (imgui.Key.enter, imgui.Key.keypad_enter)
+_NAME = "new edit"
+_ENTER = (imgui.Key.enter, imgui.Key.keypad_enter)
 
 
 def has_keyboard() -> bool:
@@ -101,7 +105,10 @@ def has_keyboard() -> bool:
 def _content(work: Workspace, count: int, preview: PreviewState, ui: UiContext) -> tuple[NewEdit, str]:
     """The form as the hand leaves it, and what was asked for: "train", "paint_over", "new_edit" to close it,
     or ""."""
-    form, selection, action, right = work.form, work.view.selection, "", right_edge()
+    form = work.form
+    selection = work.view.selection
+    action = ""
+    right = right_edge()
     with imgui_ctx.push_font(ui.fonts.bold, 0.0):
         imgui.align_text_to_frame_padding()
         imgui.text("New edit")
@@ -122,7 +129,8 @@ def _content(work: Workspace, count: int, preview: PreviewState, ui: UiContext) 
         imgui.set_keyboard_focus_here()
     form = replace(form, name=_text_row("Name", form.suggested_name, form.name, column))
     tip("Name of the layer and of its file")
-    qualities, help_ = {True: "Draft", False: "Full"}, "A draft takes a third of the time"
+    qualities = {True: "Draft", False: "Full"}
+    help_ = "A draft takes a third of the time"
     form = replace(form, quick=choice_row("Quality", qualities, form.quick, column, ui, help_))
     form = _preview(form, preview, column, ui)
     error = form.error or missing_package(form.choice)
@@ -171,14 +179,17 @@ def _editor(form: NewEdit, action: str, column: float, ui: UiContext) -> tuple[N
     """The list of editors; first of all what takes this view to another program ("paint_view")."""
     label("Editor", column)
     imgui.set_next_item_width(-1.0)
-    missing, first = ["", *map(missing_package, EDITORS)], COMMANDS["paint_view"]
-    titles, helps = [first.name], [first.help]
+    missing = ["", *map(missing_package, EDITORS)]
+    first = COMMANDS["paint_view"]
+    titles = [first.name]
+    helps = [first.help]
     for editor in EDITORS:
         titles.append(editor.title)
         helps.append(editor.help)
     tips = [reason or help_ for reason, help_ in zip(missing, helps, strict=True)]
     faint = [i for i, reason in enumerate(missing) if reason]
-    now, help_ = form.editor + 1, form.choice.help
+    now = form.editor + 1
+    help_ = form.choice.help
     pressed = drop_down("##editor", form.choice.title, titles, now, ui, help_, tips, faint)
     if pressed is None:
         return form, action
@@ -230,8 +241,10 @@ def _settings(form: NewEdit, preview: PreviewState, column: float, ui: UiContext
 def _palette(form: NewEdit, column: float, ui: UiContext) -> NewEdit:
     """The region's main colors; another one is chosen for any, also for one that is picked in the picture."""
     label("Palette", column)
-    flags, side = imgui.ColorEditFlags_, imgui.get_frame_height()
-    pairs, canvas = list(form.palette), imgui.get_window_draw_list()
+    flags = imgui.ColorEditFlags_
+    side = imgui.get_frame_height()
+    pairs = list(form.palette)
+    canvas = imgui.get_window_draw_list()
     room = right_edge() - side - imgui.get_cursor_pos_x()
     wide = min(room / max(len(pairs), 1) - 2.0 * ui.scale, 34.0 * ui.scale)
     for i, (source, target) in enumerate(pairs):
@@ -243,7 +256,8 @@ def _palette(form: NewEdit, column: float, ui: UiContext) -> NewEdit:
             pairs[i] = source, source
         tip(f"{source} becomes {becomes}; right-click: as it was" if source != target else f"{source} stays")
         if source != target:  # what it was, in a corner
-            low, corner = (x, y + side), u32((*parse_color(source).tolist(), 1.0))
+            low = (x, y + side)
+            corner = u32((*parse_color(source).tolist(), 1.0))
             canvas.add_triangle_filled((x, y + side / 2), low, (x + side / 2, y + side), corner)
         if form.picked == i:
             imgui.open_popup(f"color {i}")
@@ -267,13 +281,16 @@ def _curve(curve: str, column: float, ui: UiContext) -> str:
     By keys Space goes to the next point, behind the last to a new one in the widest gap; arrows move it.
     """
     label("Curve", column)
-    tall, reach = _CURVE_PX * ui.scale, 9.0 * ui.scale
+    tall = _CURVE_PX * ui.scale
+    reach = 9.0 * ui.scale
     x, y = imgui.get_cursor_screen_pos()
     wide = imgui.get_content_region_avail().x
     imgui.invisible_button("curve", (wide, tall), imgui.ButtonFlags_.enable_nav.value)
     tip("Lightness: press for a point and drag it, right-click it to take it away; or Space, arrows, Del")
     keyed = imgui.is_item_focused() and imgui.get_current_context().nav_cursor_visible
-    storage, held, mouse = imgui.get_state_storage(), imgui.get_id("curve/held"), imgui.get_io().mouse_pos
+    storage = imgui.get_state_storage()
+    held = imgui.get_id("curve/held")
+    mouse = imgui.get_io().mouse_pos
     at = (mouse.x - x) / wide, 1.0 - (mouse.y - y) / tall
 
     def apart(point: Point) -> float:
@@ -305,7 +322,8 @@ def _curve(curve: str, column: float, ui: UiContext) -> str:
         high = points[i + 1][0] if i + 1 < len(points) else 1.0
         across = min(max(at[0], low + _LEAST_GAP), high - _LEAST_GAP)
         points[i] = round(across, 2), round(min(max(at[1], 0.0), 1.0), 2)
-    canvas, p = imgui.get_window_draw_list(), PALETTE
+    canvas = imgui.get_window_draw_list()
+    p = PALETTE
     canvas.add_rect_filled(imgui.ImVec2(x, y), imgui.ImVec2(x + wide, y + tall), u32(p.field), 4.0 * ui.scale)
     canvas.add_line(imgui.ImVec2(x, y + tall), imgui.ImVec2(x + wide, y), u32(p.chosen), ui.scale)
     steps = [i / 48 for i in range(49)]
@@ -349,20 +367,24 @@ def _anchor(form: NewEdit, preview: PreviewState, column: float) -> tuple[NewEdi
 def _style(form: NewEdit, preview: PreviewState, ui: UiContext) -> NewEdit:
     """This view in every style, numbers until they are painted; what agrees best from all sides first."""
     small(f"Painting {form.style}", PALETTE.text)
-    gap, canvas = 2.0 * ui.scale, imgui.get_window_draw_list()
+    gap = 2.0 * ui.scale
+    canvas = imgui.get_window_draw_list()
     wide = (imgui.get_content_region_avail().x - (SHEET_COLUMNS - 1) * gap) / SHEET_COLUMNS
-    side, rows = imgui.ImVec2(wide, wide * SHEET_PX[1] / SHEET_PX[0]), -(-len(STYLE_ORDER) // SHEET_COLUMNS)
+    side = imgui.ImVec2(wide, wide * SHEET_PX[1] / SHEET_PX[0])
+    rows = -(-len(STYLE_ORDER) // SHEET_COLUMNS)
     for place, number in enumerate(STYLE_ORDER):
         row, column = divmod(place, SHEET_COLUMNS)
         if column:
             imgui.same_line(0.0, gap)
         if imgui.button(f"{number}##style", side):
             form = replace(form, style=number)
-        low, high = imgui.get_item_rect_min(), imgui.get_item_rect_max()
+        low = imgui.get_item_rect_min()
+        high = imgui.get_item_rect_max()
         if number in preview.styles:
             ends = ((column + i) / SHEET_COLUMNS for i in (0, 1)), ((row + i) / rows for i in (0, 1))
             (left, right), (top, foot) = ends
-            image, white = imgui.ImTextureRef(preview.sheet), u32((1.0, 1.0, 1.0, 1.0))
+            image = imgui.ImTextureRef(preview.sheet)
+            white = u32((1.0, 1.0, 1.0, 1.0))
             canvas.add_image_rounded(image, low, high, (left, top), (right, foot), white, 3.0 * ui.scale)
         if number == form.style:
             canvas.add_rect(low, high, u32(PALETTE.accent), 3.0 * ui.scale, 2.0 * ui.scale)

@@ -75,7 +75,8 @@ def draw(
         ui: fonts and scale
         actions: takes those that were asked for, see `perform`
     """
-    display, wide = imgui.get_io().display_size, width(work.layout, ui)
+    display = imgui.get_io().display_size
+    wide = width(work.layout, ui)
     imgui.set_next_window_pos((display.x - wide, 0.0))
     imgui.set_next_window_size((wide, display.y))
     # the cleared framebuffer is its background: software GL takes a millisecond to fill that once more
@@ -148,7 +149,9 @@ def _title(
     work: Workspace, facts: SceneFacts, recent: Sequence[Path], ui: UiContext, actions: list[str]
 ) -> None:
     """The session's name, after a dot where there are unsaved changes; the scene and its size; the icons."""
-    at, side, scale = imgui.get_cursor_pos(), 24.0 * ui.scale, ui.scale
+    at = imgui.get_cursor_pos()
+    side = 24.0 * ui.scale
+    scale = ui.scale
     room = imgui.get_content_region_avail().x
     text = room - 3 * side - 8.0 * scale
     with imgui_ctx.push_font(ui.fonts.bold, 0.0):
@@ -181,7 +184,8 @@ _ITEMS = (
 
 def _regions(work: Workspace, ui: UiContext, actions: list[str]) -> Workspace:
     """The section "Regions", where there are some: a row for each."""
-    regions, layout = work.view.selection.regions, work.layout
+    regions = work.view.selection.regions
+    layout = work.layout
     if not regions:
         return work
     layout = widgets.section("Regions", layout, ui)
@@ -194,14 +198,16 @@ def _regions(work: Workspace, ui: UiContext, actions: list[str]) -> Workspace:
 
 def _row(index: int, region: NamedRegion, ui: UiContext, actions: list[str]) -> bool:
     """Eye, swatch, name and count; whether the mouse rests on it."""
-    right, scale = widgets.right_edge(), ui.scale
+    right = widgets.right_edge()
+    scale = ui.scale
     icon = Icon.SHOWN if region.visible else Icon.HIDDEN
     if widgets.icon_button("eye", icon, ui, dim=not region.visible):
         actions.append(f"show_region:{index}")
     widgets.tip("Tint this region in the picture")
     imgui.same_line()
     widgets.swatch(region.color, 1.0, False, ui)
-    tall, canvas = imgui.get_frame_height(), imgui.get_window_draw_list()
+    tall = imgui.get_frame_height()
+    canvas = imgui.get_window_draw_list()
     imgui.same_line()
     count = widgets.group_digits(region.count)
     with imgui_ctx.push_font(None, SMALL_PX):
@@ -210,8 +216,10 @@ def _row(index: int, region: NamedRegion, ui: UiContext, actions: list[str]) -> 
     if widgets.name_field(region.name, room, f"rename_region:{index}", actions):
         return False
     x, y = imgui.get_cursor_screen_pos()
-    io, mouse = imgui.get_io(), imgui.MouseButton_
-    size, nav = (max(right - imgui.get_cursor_pos_x(), 1.0), tall), imgui.ButtonFlags_.enable_nav
+    io = imgui.get_io()
+    mouse = imgui.MouseButton_
+    size = (max(right - imgui.get_cursor_pos_x(), 1.0), tall)
+    nav = imgui.ButtonFlags_.enable_nav
     if imgui.invisible_button("select", size, nav.value):
         mode = "add" if io.key_shift else "subtract" if io.key_ctrl else "new"
         actions.append(f"region:{index}:{mode}")
@@ -241,6 +249,7 @@ def _footer(work: Workspace, ui: UiContext, actions: list[str]) -> None:
     steps = [*((name, icon, what) for (name, what), icon in named), ("history", Icon.HISTORY, "")]
     off = [name for name, what in changes.items() if not what]
     widgets.icon_row(steps, ui, actions, 8.0 * ui.scale, off=off)
-    side, gap = imgui.get_frame_height(), 6.0 * ui.scale
+    side = imgui.get_frame_height()
+    gap = 6.0 * ui.scale
     imgui.same_line(right - 3 * side - 2 * gap)
     widgets.icon_row(_FOOT, ui, actions, gap)

@@ -71,9 +71,11 @@ def draw(
         imgui.set_keyboard_focus_here()
         imgui.set_nav_cursor_visible(True)
     imgui.invisible_button(label, (width, height * scale), imgui.ButtonFlags_.enable_nav.value)
-    hovered, pressed = imgui.is_item_hovered(), imgui.is_item_active()
+    hovered = imgui.is_item_hovered()
+    pressed = imgui.is_item_active()
     radius = RADIUS_PX * scale
-    start, span = left + radius, max(width - 2 * radius, 1.0) / most
+    start = left + radius
+    span = max(width - 2 * radius, 1.0) / most
     mouse = imgui.get_io().mouse_pos.x
     if imgui.is_item_focused() and imgui.get_current_context().nav_cursor_visible:
         value = min(most, max(0.0, value + key_step(imgui.Key.left_arrow, imgui.Key.right_arrow)))
@@ -151,7 +153,8 @@ def _paint(
 ) -> None:
     """Draw it; `track`: where 0 is, its top, and the length of a strength of 1, window pixels."""
     canvas, p, (start, top, span), radius = imgui.get_window_draw_list(), PALETTE, track, RADIUS_PX * scale
-    middle, half = top + radius + 1.0 * scale, 2.0 * scale
+    middle = top + radius + 1.0 * scale
+    half = 2.0 * scale
     at = start + value * span
     canvas.add_rect_filled(
         (start - half, middle - half), (start + span * most + half, middle + half), u32(p.field), half

@@ -64,7 +64,8 @@ def draw(work: Workspace, textures: Sequence[int], ui: UiContext, actions: list[
 
 def _pair(cards: _Cards, compared: bool, ui: UiContext, actions: list[str]) -> None:
     """Which two, and whether they are compared."""
-    side, gap = imgui.get_frame_height(), 4.0 * ui.scale
+    side = imgui.get_frame_height()
+    gap = 4.0 * ui.scale
     wide = (imgui.get_content_region_avail().x - side - 2 * gap) / 2
     for slot, chosen in (("a", cards.a), ("b", cards.b)):
         if slot == "b":
@@ -85,7 +86,8 @@ def _pair(cards: _Cards, compared: bool, ui: UiContext, actions: list[str]) -> N
 
 def _card(index: int, cards: _Cards, wide: float, ui: UiContext, actions: list[str]) -> None:
     """One picture with its name, and its menu."""
-    name, badge = cards.names[index], "A" * (index == cards.a) + "B" * (index == cards.b)
+    name = cards.names[index]
+    badge = "A" * (index == cards.a) + "B" * (index == cards.b)
     with imgui_ctx.push_id(index), imgui_ctx.begin_group():
         at = imgui.get_cursor_screen_pos()
         tall = 0.75 * wide
@@ -108,7 +110,8 @@ def _card(index: int, cards: _Cards, wide: float, ui: UiContext, actions: list[s
             widgets.start_naming(not action)
             names = {"name": name, "at": index, "before": index - 1, "after": index + 1}
             actions += [action.format_map(names)] if action else []
-        canvas, end = imgui.get_window_draw_list(), (at.x + wide, at.y + tall)
+        canvas = imgui.get_window_draw_list()
+        end = (at.x + wide, at.y + tall)
         widgets.picture(cards.textures[index], at, end, 4.0 * ui.scale)
         if hovered:
             canvas.add_rect(at, end, u32(PALETTE.accent), 4.0 * ui.scale, 2.0 * ui.scale)
@@ -125,7 +128,9 @@ def _card(index: int, cards: _Cards, wide: float, ui: UiContext, actions: list[s
 
 def _badge(text: str, at: imgui.ImVec2, ui: UiContext) -> None:
     """The letter of a snapshot of the pair, over its picture."""
-    canvas, size, pad = imgui.get_window_draw_list(), imgui.calc_text_size(text), 4.0 * ui.scale
+    canvas = imgui.get_window_draw_list()
+    size = imgui.calc_text_size(text)
+    pad = 4.0 * ui.scale
     corner = imgui.ImVec2(at.x + pad, at.y + pad)
     end = (corner.x + size.x + 2 * pad, corner.y + size.y + 0.5 * pad)
     canvas.add_rect_filled(corner, end, u32(PALETTE.scrim), 3.0 * ui.scale)

@@ -31,12 +31,18 @@ from viewer.ui.context import PALETTE, ROW_COLORS, SMALL_PX, Icon, Rgba, UiConte
 from viewer.ui.overlay import Area
 from viewer.ui.widgets import elide, hint, icon_button, icon_row, inert, is_released, plate, tip
 
-HEIGHT_PX, ROW_PX = 46.0, 33.0  # at 1×: of the bar, and of a second line
-TRACK_PX, _MOST_SHARE = 20.0, 0.35  # of a row of keys; the rows take at most so much of the picture's height
+# at 1×: of the bar, and of a second line
+HEIGHT_PX = 46.0
+ROW_PX = 33.0
+TRACK_PX = 20.0  # of a row of keys
+_MOST_SHARE = 0.35  # the rows take at most so much of the picture's height
 ROOMY_PX = 640.0  # a narrower bar has its settings in a second line
-SETTINGS_PX, BUTTONS_PX = 293.0, 143.0
-_KEY_PX, _GRIP_PX = 5.0, 8.0  # half a key's size; so near to a key the mouse takes it
-_CURVE_PX, _GAP_PX = 3.0, 4.0  # from point to point; under the rows
+SETTINGS_PX = 293.0
+BUTTONS_PX = 143.0
+_KEY_PX = 5.0  # half a key's size
+_GRIP_PX = 8.0  # so near to a key the mouse takes it
+_CURVE_PX = 3.0  # from point to point
+_GAP_PX = 4.0  # under the rows
 _NICE = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
 
 
@@ -90,10 +96,15 @@ def draw(work: Workspace, area: Area, ui: UiContext) -> tuple[str, ...]:
     Returns:
         What was asked for: actions of the workspace.
     """
-    tall, roomy, scale = _bar_height(work, area, ui), _is_wide(area, ui), ui.scale
-    timeline, actions, corner = work.view.timeline, list[str](), (0.0, area.height - tall)
+    tall = _bar_height(work, area, ui)
+    roomy = _is_wide(area, ui)
+    scale = ui.scale
+    timeline = work.view.timeline
+    actions = list[str]()
+    corner = (0.0, area.height - tall)
     with plate("timeline", corner, ui, pad=10.0, size=(area.width, tall)):
-        left, keys = imgui.get_cursor_screen_pos().x, split_keys(timeline)
+        left = imgui.get_cursor_screen_pos().x
+        keys = split_keys(timeline)
         _buttons(timeline, work.player, actions, ui)
         imgui.same_line(BUTTONS_PX * scale + 10.0 * scale)
         settings = SETTINGS_PX * scale if roomy else 0.0
@@ -123,12 +134,14 @@ def label_step(timeline: Timeline, span: float, room: float) -> int:
 
 
 def _buttons(timeline: Timeline, player: Player, actions: list[str], ui: UiContext) -> None:
-    gap, auto = 2.0 * ui.scale, player.auto_key is not None
+    gap = 2.0 * ui.scale
+    auto = player.auto_key is not None
     folds = Icon.UNFOLDED if player.unfolded else Icon.FOLDED
     icon_row((("timeline_rows", folds),), ui, actions)
     imgui.same_line(0.0, gap)
     icon = icons.ICON_FA_PAUSE if player.playing else icons.ICON_FA_PLAY
-    here, can_play = keys_at(timeline, player.frame), len(timeline.keys) > 1
+    here = keys_at(timeline, player.frame)
+    can_play = len(timeline.keys) > 1
     chosen = chosen_keys(timeline, player)
     items = (
         ("play", icon, "" if can_play else "Set at least two keyframes to play"),
@@ -146,7 +159,8 @@ def _buttons(timeline: Timeline, player: Player, actions: list[str], ui: UiConte
 
 
 def _settings(work: Workspace, ruler: _Ruler, actions: list[str]) -> None:
-    timeline, ui = ruler.timeline, ruler.ui
+    timeline = ruler.timeline
+    ui = ruler.ui
     gap = 4.0 * ui.scale
     with inert(not timeline.keys):
         easing = EASINGS[0]
@@ -188,7 +202,8 @@ def _draw_ruler(ruler: _Ruler, wide: float, actions: list[str]) -> None:
     frames: dict[int, list[RowKey]] = {}
     for key in ruler.keys:
         frames.setdefault(key[1], []).append(key)
-    top, tall = imgui.get_cursor_screen_pos().y, imgui.get_frame_height()
+    top = imgui.get_cursor_screen_pos().y
+    tall = imgui.get_frame_height()
     under = _drag("ruler", frames, (max(wide, 1.0), tall), ruler, actions)
     _paint(ruler, frames, top, top + tall - 6.0 * ruler.ui.scale, under)
 
@@ -206,13 +221,18 @@ def _drag(
         The frame of the keys under the mouse, if any are.
     """
     imgui.invisible_button(name, size)
-    io, timeline, player = imgui.get_io(), ruler.timeline, ruler.player
-    mouse, under = io.mouse_pos.x, None
+    io = imgui.get_io()
+    timeline = ruler.timeline
+    player = ruler.player
+    mouse = io.mouse_pos.x
+    under = None
     if imgui.is_item_hovered() or imgui.is_item_active():
         distance, nearest = min(((abs(mouse - ruler.x(f)), f) for f in frames), default=(math.inf, 0))
         under = nearest if distance <= _GRIP_PX * ruler.ui.scale else None
-    storage, to = imgui.get_state_storage(), ruler.frame_at(mouse)
-    held, copies = imgui.get_id(f"{name}/held"), imgui.get_id(f"{name}/copies")
+    storage = imgui.get_state_storage()
+    to = ruler.frame_at(mouse)
+    held = imgui.get_id(f"{name}/held")
+    copies = imgui.get_id(f"{name}/copies")
     if imgui.is_item_activated():
         storage.set_int(held, -1 if under is None else under)
         storage.set_int(copies, int(io.key_ctrl))
@@ -227,7 +247,8 @@ def _drag(
         if origin < 0 and to != ruler.frame:
             actions.append(f"seek:{to}")
         elif origin >= 0 and moved and to != origin:
-            copy, chosen = bool(storage.get_int(copies, 0)), chosen_keys(timeline, player)
+            copy = bool(storage.get_int(copies, 0))
+            chosen = chosen_keys(timeline, player)
             if shift_keys(timeline, chosen, to - origin, copy) is not timeline:
                 actions.append(f"{'clone' if copy else 'move'}_keys:{to - origin}")
                 storage.set_int(held, to)
@@ -246,7 +267,8 @@ def _rows(work: Workspace, ruler: _Ruler, left: float, tall: float, actions: lis
     _row(CAMERA, "Camera", PALETTE.handle, (), ruler, left, False, actions)
     for number, layer in layers:
         focused = work.focus == len(layers) - number
-        color, points = ROW_COLORS[layer.gdf % len(ROW_COLORS)], curves.get(layer.gdf, ())
+        color = ROW_COLORS[layer.gdf % len(ROW_COLORS)]
+        points = curves.get(layer.gdf, ())
         if _row(layer.gdf, layer.name, color, points, ruler, left, focused, actions):
             actions.append(f"focus:{number}")
     imgui.end_child()
@@ -264,8 +286,12 @@ def _row(
     actions: list[str],
 ) -> bool:
     """The name, a button for the key at the playhead, the keys and the curve; True if the name is pressed."""
-    canvas, p, scale, tall = imgui.get_window_draw_list(), PALETTE, ruler.ui.scale, TRACK_PX * ruler.ui.scale
-    top, end = imgui.get_cursor_screen_pos().y, ruler.start + ruler.span + 8.0 * scale
+    canvas = imgui.get_window_draw_list()
+    p = PALETTE
+    scale = ruler.ui.scale
+    tall = TRACK_PX * ruler.ui.scale
+    top = imgui.get_cursor_screen_pos().y
+    end = ruler.start + ruler.span + 8.0 * scale
     with imgui_ctx.push_id(row):
         with imgui_ctx.push_font(None, SMALL_PX):
             names = ruler.start - 8.0 * scale - left - tall
@@ -274,7 +300,8 @@ def _row(
             if focused:
                 corner = (end, top + tall)
                 canvas.add_rect_filled((left, top), corner, u32(p.card_focused), 3.0 * scale)
-            at, ink = (round(left + 6.0 * scale), round(top + 3.0 * scale)), u32(p.text if lit else p.dim)
+            at = (round(left + 6.0 * scale), round(top + 3.0 * scale))
+            ink = u32(p.text if lit else p.dim)
             canvas.add_text(at, ink, elide(name, names - 8.0 * scale))
             imgui.same_line(0.0, 0.0)
             here = (row, ruler.frame) in ruler.keys
@@ -287,7 +314,9 @@ def _row(
         imgui.same_line(0.0, 0.0)
         frames = {frame: [(row, frame)] for r, frame in ruler.keys if r == row}
         under = _drag("keys", frames, (end - ruler.start + 8.0 * scale, tall), ruler, actions)
-    line, low, high = max(1.0, scale), top + tall - 3.0 * scale, top + 3.0 * scale
+    line = max(1.0, scale)
+    low = top + tall - 3.0 * scale
+    high = top + 3.0 * scale
     ends = (ruler.start, low), (ruler.start + ruler.span, low)
     canvas.add_line(*ends, u32(p.line), line)
     if points:
@@ -305,7 +334,8 @@ def _paint_keys(
     ruler: _Ruler, frames: Mapping[int, Sequence[RowKey]], y: float, under: int | None, color: Rgba
 ) -> None:
     """The keys on a line: those chosen, or under the mouse, are white; of a row they are ringed too."""
-    canvas, scale = imgui.get_window_draw_list(), ruler.ui.scale
+    canvas = imgui.get_window_draw_list()
+    scale = ruler.ui.scale
     for frame, keys in frames.items():
         size = (_KEY_PX - 0.5 * (len(frames[frame]) == 1) + (frame == under)) * scale
         chosen = not ruler.player.chosen.isdisjoint(keys)
@@ -316,8 +346,13 @@ def _paint_keys(
 def _paint(
     ruler: _Ruler, frames: Mapping[int, Sequence[RowKey]], top: float, line: float, under: int | None
 ) -> None:
-    timeline, ui, start, span = ruler.timeline, ruler.ui, ruler.start, ruler.span
-    canvas, p, scale = imgui.get_window_draw_list(), PALETTE, ui.scale
+    timeline = ruler.timeline
+    ui = ruler.ui
+    start = ruler.start
+    span = ruler.span
+    canvas = imgui.get_window_draw_list()
+    p = PALETTE
+    scale = ui.scale
     thin = max(1.0, scale)
     canvas.add_line((start, line), (start + span, line), u32(p.faint), thin)
     _paint_numbers(timeline, ruler.frame, start, span, top, line, ui)
@@ -345,7 +380,9 @@ def _paint_numbers(
     timeline: Timeline, frame: int, start: float, span: float, top: float, line: float, ui: UiContext
 ) -> None:
     """Ticks and frame numbers; the playhead's own number in place of those near it."""
-    canvas, p, scale = imgui.get_window_draw_list(), PALETTE, ui.scale
+    canvas = imgui.get_window_draw_list()
+    p = PALETTE
+    scale = ui.scale
     size = 11.0 * scale
     step = label_step(timeline, span, 38.0 * scale)
     fine = label_step(timeline, span, 7.0 * scale)
@@ -356,7 +393,8 @@ def _paint_numbers(
     here = place(timeline, frame, start, span)
     numbers = range(0, timeline.length + 1, step) if timeline.keys else ()
     for number in (*(n for n in numbers if n != frame), frame):
-        x, text = place(timeline, number, start, span), str(number)
+        x = place(timeline, number, start, span)
+        text = str(number)
         if number != frame and -16.0 * scale < x - here < 36.0 * scale:
             continue
         color = u32(p.accent if number == frame else p.dim)

@@ -46,9 +46,13 @@ from viewer.ui.widgets import (
     value_slider,
 )
 
-TOOLBAR_PX, EDGE_PX = 40.0, 8.0  # at 1×: its width; between it and the picture's edges
+TOOLBAR_PX = 40.0  # at 1×: its width
+EDGE_PX = 8.0  # between it and the picture's edges
 NARROW_PX = 560.0  # of a picture whose bar may lie over the axes
-_SIDE_PX, _LEAST_PX, _PAD_PX = 32.0, 22.0, 4.0  # of a button, where the window is low; around the buttons
+# of a button, where the window is low; around the buttons
+_SIDE_PX = 32.0
+_LEAST_PX = 22.0
+_PAD_PX = 4.0
 _TOOLS = (
     (("navigate:orbit", Icon.ORBIT), ("navigate:fly", Icon.FLY)),
     (
@@ -85,7 +89,8 @@ def draw_toolbar(view: ViewState, area: Area, ui: UiContext, actions: list[str])
     tool = f"select_tool:{view.select.tool}" if view.select.tool else "brush" * view.brush.active
     held = tool or f"navigate:{view.camera.mode}"
     off = {"brush": not view.layers, "move_selected": not view.selection.count}
-    count, gap = sum(map(len, _TOOLS)), 6.0 * ui.scale
+    count = sum(map(len, _TOOLS))
+    gap = 6.0 * ui.scale
     room = area.height - 2 * (EDGE_PX + _PAD_PX) * ui.scale - gap * (len(_TOOLS) - 1)
     side = min(max(room / count, _LEAST_PX * ui.scale), _SIDE_PX * ui.scale)
     imgui.push_style_var(imgui.StyleVar_.item_spacing, (0.0, 0.0))
@@ -108,7 +113,9 @@ class _Bar:
     """Lays items one beside the other and breaks the line where the next one would not fit."""
 
     def __init__(self, limit: float, ui: UiContext) -> None:
-        self.limit, self.ui = limit, ui  # window pixels: where the line ends
+        # window pixels: where the line ends
+        self.limit = limit
+        self.ui = ui
 
     def follow(self, wide: float) -> None:
         """What comes next is so wide."""
@@ -161,7 +168,8 @@ def draw_options(work: Workspace, area: Area, ui: UiContext, actions: list[str])
     view = work.view
     if not (view.select.tool or view.brush.active or view.selection.count or view.selection.hidden):
         return work, 0.0
-    left, right = (TOOLBAR_PX + 2 * EDGE_PX) * ui.scale, area.width - EDGE_PX * ui.scale
+    left = (TOOLBAR_PX + 2 * EDGE_PX) * ui.scale
+    right = area.width - EDGE_PX * ui.scale
     narrow = area.width < NARROW_PX * ui.scale  # else it leaves the axes free
     bar = _Bar(right - (0.0 if narrow else view_width(view, area, ui)) - EDGE_PX * ui.scale, ui)
     with plate("options", (left, EDGE_PX * ui.scale), ui):
@@ -183,7 +191,8 @@ def draw_options(work: Workspace, area: Area, ui: UiContext, actions: list[str])
 
 def _selection(view: ViewState, bar: _Bar, actions: list[str]) -> Pointed | None:
     """How much is selected and hidden, and what is done with it; whether the mouse rests on the number."""
-    count, pointed = view.selection.count, None
+    count = view.selection.count
+    pointed = None
     if count or view.select.tool:
         text = f"{group_digits(count)} selected" if count else "Nothing selected"
         bar.follow(imgui.calc_text_size(text).x)
@@ -207,13 +216,15 @@ def _select_options(tool: SelectTool, bar: _Bar) -> SelectTool:
     modes = dict(zip(SELECT_MODES, ("New", "Add", "Subtract", "Intersect"), strict=True))
     help_ = f"What becomes of the present selection.\n{MODES}"
     if tool.tool == "scribble":
-        modes, help_ = {"new": "On it", "subtract": "Beside it"}, "Where the next stroke is. Ctrl: beside it"
+        modes = {"new": "On it", "subtract": "Beside it"}
+        help_ = "Where the next stroke is. Ctrl: beside it"
     tool = replace(tool, mode=bar.segments("mode", modes, tool.mode, help_))
     if tool.tool not in ("sphere", "flood", "scribble"):
         through = bar.segments("depth", _DEPTHS, tool.through, "", "select_through")
         tool = replace(tool, through=through)
     if tool.tool == "brush":
-        ends, help_ = (SMALLEST_PX, LARGEST_PX), f"Brush radius ({_SIZE_KEYS})"
+        ends = (SMALLEST_PX, LARGEST_PX)
+        help_ = f"Brush radius ({_SIZE_KEYS})"
         radius = bar.slider("Radius", tool.radius, ends, SelectTool.radius, help_, "%.0f px")
         tool = replace(tool, radius=radius)
     if tool.tool in ("flood", "color"):
@@ -225,7 +236,8 @@ def _select_options(tool: SelectTool, bar: _Bar) -> SelectTool:
 
 def _save(regions: int, bar: _Bar, actions: list[str]) -> None:
     """The button that keeps the selection, in its place the field for the name."""
-    text, wide = "Save as region…", 128.0 * bar.ui.scale
+    text = "Save as region…"
+    wide = 128.0 * bar.ui.scale
     bar.follow(wide)
     if name_field(f"region-{regions + 1}", wide, "save_region", actions):
         return
@@ -256,15 +268,18 @@ def paint_obstacle(view: ViewState, focus: int | None) -> str:
 
 def _brush_options(view: ViewState, focus: int | None, bar: _Bar, actions: list[str]) -> ViewState:
     """How the brush paints."""
-    brush, modes = view.brush, {"add": "Add", "erase": "Erase", "smooth": "Smooth"}
+    brush = view.brush
+    modes = {"add": "Add", "erase": "Erase", "smooth": "Smooth"}
     help_ = "While painting, Ctrl inverts and Shift smooths"
     brush = replace(brush, mode=bar.segments("mode", modes, brush.mode, help_, "brush_mode"))
-    ends, help_ = (SMALLEST_PX, LARGEST_PX), f"Brush radius ({_SIZE_KEYS})"
+    ends = (SMALLEST_PX, LARGEST_PX)
+    help_ = f"Brush radius ({_SIZE_KEYS})"
     radius = bar.slider("Radius", brush.radius, ends, Brush.radius, help_, "%.0f px")
     help_ = f"Brush softness ({shortcut('brush_softness:-0.1')} and ])"
     softness = bar.slider("Softness", brush.softness, (0.0, 1.0), Brush.softness, help_)
     help_ = "How far one stroke goes; strokes over each other go further"
-    flow, value = bar.slider("Flow", brush.flow, (0.0, 1.0), Brush.flow, help_), brush.value
+    flow = bar.slider("Flow", brush.flow, (0.0, 1.0), Brush.flow, help_)
+    value = brush.value
     if brush.mode == "add":
         value = bar.slider("Value", value, (0.0, 1.0), Brush.value, "The share of the edit that Add paints")
     through = bar.segments("depth", _DEPTHS, brush.through, "", "brush_through")
@@ -285,7 +300,8 @@ def _brush_options(view: ViewState, focus: int | None, bar: _Bar, actions: list[
 
 def _legend(bar: _Bar) -> None:
     """The ramp of the weights with its ends named."""
-    wide, tall = 96.0 * bar.ui.scale, imgui.get_frame_height()
+    wide = 96.0 * bar.ui.scale
+    tall = imgui.get_frame_height()
     bar.follow(wide)
     (left, top), canvas = imgui.get_cursor_screen_pos(), imgui.get_window_draw_list()
     imgui.dummy((wide, tall))
@@ -302,8 +318,10 @@ def _legend(bar: _Bar) -> None:
 
 def draw_ring(view: ViewState, ui: UiContext) -> None:
     """The brush at the cursor: its edge, and inside which its touch is full."""
-    brush, mouse = view.brush, imgui.get_mouse_pos()
-    canvas, radius = imgui.get_background_draw_list(), brush.radius * ui.scale
+    brush = view.brush
+    mouse = imgui.get_mouse_pos()
+    canvas = imgui.get_background_draw_list()
+    radius = brush.radius * ui.scale
     inner = radius * (1.0 - brush.softness)
     for size, alpha in ((radius, 1.0), (inner, 0.45)):
         if size > 2.0 * ui.scale:
@@ -331,7 +349,8 @@ def draw_comparison(
     Returns:
         The changed workspace, and the action that was asked for, "" for none.
     """
-    compare, asked = work.view.compare, ""
+    compare = work.view.compare
+    asked = ""
     on = compare.mode != "off" and not original
     right, _, figure = words.right.partition(" · ")
     figure = words.line if compare.mode == "difference" else figure
@@ -430,7 +449,9 @@ def draw_view(view: ViewState, area: Area, foot: float, ui: UiContext, actions: 
 
 
 def _view_rows(view: ViewState, ui: UiContext, actions: list[str]) -> ViewState:
-    column, wide, camera = COLUMN_PX * ui.scale, 232.0 * ui.scale, view.camera
+    column = COLUMN_PX * ui.scale
+    wide = 232.0 * ui.scale
+    camera = view.camera
     label("Up axis", column)
     current = next((name for name, up in UPS.items() if up == camera.up), "View")
     ups = {**UPS, "View": axes(camera).up}

@@ -12,7 +12,8 @@ from viewer.jobs.training import EditOrder
 from viewer.ui.context import PALETTE, SMALL_PX, Icon, Rgba, UiContext, u32
 from viewer.ui.widgets import card, elide, menu_items, right_edge, small, tip, wrapped_text
 
-BAR_PX, STRIP_PX = 5.0, 28.0
+BAR_PX = 5.0
+STRIP_PX = 28.0
 _MENU = "menu of a training"
 _ITEMS = (("Show log…", "run_log", ""), ("Discard…", "ask_discard", ""))
 _UNWRITTEN = "Nothing is written"
@@ -29,17 +30,21 @@ def height(jobs: Sequence[QueuedTask], ui: UiContext) -> float:
 
 def draw(jobs: Sequence[QueuedTask], ui: UiContext, actions: list[str]) -> None:
     """The strip, and over it one card a job while it is open; a failure opens it."""
-    listed, storage = _visible_jobs(jobs), imgui.get_state_storage()
+    listed = _visible_jobs(jobs)
+    storage = imgui.get_state_storage()
     if not listed:
         return
-    is_open, seen, tall = imgui.get_id(_OPEN), imgui.get_id("seen failure"), imgui.get_id(_TALL)
+    is_open = imgui.get_id(_OPEN)
+    seen = imgui.get_id("seen failure")
+    tall = imgui.get_id(_TALL)
     failed = max((job.number for job in listed if _is_failed(job)), default=0)
     unseen = failed > storage.get_int(seen)
     if unseen:
         storage.set_bool(is_open, True)
     imgui.separator()
     if storage.get_bool(is_open):
-        room, before = 0.5 * imgui.get_window_height(), storage.get_float(tall)
+        room = 0.5 * imgui.get_window_height()
+        before = storage.get_float(tall)
         bar = imgui.WindowFlags_.no_scrollbar.value * (before < room)  # not for a frame while cards grow
         imgui.begin_child("jobs", (0.0, max(min(before, room), 1.0)), 0, bar)
         for job in listed:
@@ -56,7 +61,8 @@ def draw(jobs: Sequence[QueuedTask], ui: UiContext, actions: list[str]) -> None:
         storage.set_bool(is_open, not storage.get_bool(is_open))
 
 
-_OPEN, _TALL = "jobs are open", "height of the jobs"
+_OPEN = "jobs are open"
+_TALL = "height of the jobs"
 
 
 def _visible_jobs(jobs: Sequence[QueuedTask]) -> list[QueuedTask]:
@@ -72,7 +78,9 @@ def _strip(jobs: Sequence[QueuedTask], is_open: bool, ui: UiContext) -> bool:
     """One line: the job that matters most, and how many more there are; True when it was pressed."""
     order = ("failed", "running", "stopping", "done")
     job = min(jobs, key=lambda job: order.index(job.status) if job.status in order else len(order))
-    start, right, tall = imgui.get_cursor_pos(), right_edge(), STRIP_PX * ui.scale
+    start = imgui.get_cursor_pos()
+    right = right_edge()
+    tall = STRIP_PX * ui.scale
     (x, y), dot = imgui.get_cursor_screen_pos(), 4.0 * ui.scale
     pressed = imgui.invisible_button("strip", (imgui.get_content_region_avail().x, tall))
     tip("Show or hide the cards of all jobs")
@@ -81,7 +89,8 @@ def _strip(jobs: Sequence[QueuedTask], is_open: bool, ui: UiContext) -> bool:
     end = (f"+{len(jobs) - 1}   " if len(jobs) > 1 else "") + (Icon.UNFOLDED if is_open else Icon.RAISED)
     left = job.seconds_left
     words = f"{_status(job)}  ·  {format_duration(left)}" if left is not None else _status(job)
-    below, sizes = imgui.get_cursor_pos(), [imgui.calc_text_size(text).x for text in (words, end)]
+    below = imgui.get_cursor_pos()
+    sizes = [imgui.calc_text_size(text).x for text in (words, end)]
     top = start.y + (tall - imgui.get_text_line_height()) / 2
     imgui.set_cursor_pos((start.x + 4 * dot, top))
     imgui.text(elide(job.task.name, right - start.x - sum(sizes) - 8 * dot))
@@ -94,9 +103,12 @@ def _strip(jobs: Sequence[QueuedTask], is_open: bool, ui: UiContext) -> bool:
 
 def _card(job: QueuedTask, ui: UiContext) -> list[str]:
     """Name and status, how far it is, what it does, buttons; and a menu of what cannot be undone."""
-    task, failed, word = job.task, _is_failed(job), _status(job)
+    task = job.task
+    failed = _is_failed(job)
+    word = _status(job)
     with card("card", PALETTE.card, ui):
-        right, wide = right_edge(), imgui.calc_text_size(word).x
+        right = right_edge()
+        wide = imgui.calc_text_size(word).x
         imgui.align_text_to_frame_padding()
         imgui.text(elide(task.name, right - wide - 16.0 * ui.scale))
         about = f"{task.name}\n{task.editor} on {task.region}\n" if isinstance(task, EditOrder) else ""
@@ -124,7 +136,8 @@ def _status(job: QueuedTask) -> str:
 def _bar(share: float, color: Rgba, ui: UiContext) -> None:
     """How far it is."""
     x, y = imgui.get_cursor_screen_pos()
-    wide, tall = imgui.get_content_region_avail().x, BAR_PX * ui.scale
+    wide = imgui.get_content_region_avail().x
+    tall = BAR_PX * ui.scale
     imgui.dummy((wide, tall))
     for reach, ink in ((1.0, PALETTE.field), (share, color)):
         if reach:
@@ -146,7 +159,8 @@ def _foot(job: QueuedTask, right: float, menu: bool, ui: UiContext) -> list[str]
         line = f"For {job.elsewhere}  ·  " * bool(job.elsewhere) + _status_text(job)
         small(line, PALETTE.dim, right - imgui.get_cursor_pos_x() - sum(widths) - 6.0 * ui.scale)
         tip(line)
-    actions, x = [], right - sum(widths)
+    actions = []
+    x = right - sum(widths)
     imgui.push_style_color(imgui.Col_.button, (0.0, 0.0, 0.0, 0.0))
     for (text, action, help_), wide in zip(buttons, widths, strict=True):
         imgui.same_line(x)

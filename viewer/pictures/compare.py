@@ -28,8 +28,10 @@ from viewer.state.view_state import Comparison, ViewState
 
 from .film import Pixels, to_pixels
 
-ORIGINAL, EDITED = "original", "edited"
-_SHADE, _INK = (22, 24, 27), (222, 225, 230)
+ORIGINAL = "original"
+EDITED = "edited"
+_SHADE = (22, 24, 27)
+_INK = (222, 225, 230)
 _PLAIN = str.maketrans({"×": "x", "–": "-"})  # Pillow's own font has no others
 
 
@@ -51,7 +53,8 @@ def labels(compare: Comparison, decibels: float, names: tuple[str, str] | None =
         names: of the snapshots on the two sides; None for the original and the edited
     """
     if math.isinf(decibels):
-        line, figure = "difference: none", " · no difference"
+        line = "difference: none"
+        figure = " · no difference"
     else:
         figure = "" if math.isnan(decibels) else f" · PSNR {decibels:.1f} dB"
         line = f"difference × {compare.amplify:g}{figure}"
@@ -90,7 +93,9 @@ def _tag(draw: ImageDraw.ImageDraw, x: float, side: str, text: str, size: tuple[
     text = text.translate(_PLAIN)
     letters = max(11, round(size[1] / 28))
     font = ImageFont.load_default(size=letters)
-    wide, pad, gap = draw.textlength(text, font), 0.5 * letters, 0.6 * letters
+    wide = draw.textlength(text, font)
+    pad = 0.5 * letters
+    gap = 0.6 * letters
     left = {"r": x - gap - wide - 2 * pad, "l": x + gap, "m": x - wide / 2 - pad}[side]
     if left < 0 or left + wide + 2 * pad > size[0]:
         return
@@ -155,7 +160,8 @@ class Comparer:
 
     def prepare(self, view: ViewState, size: tuple[int, int]) -> bool:
         """Begin in full what was drawn coarsely; whether `draw` now shows it at once."""
-        camera, mode = to_camera(view.camera, *size), view.compare.mode
+        camera = to_camera(view.camera, *size)
+        mode = view.compare.mode
         camera = half_camera(camera) if mode == "beside" else camera
         if not self.engine.prepare(view, camera):
             return False
@@ -209,7 +215,8 @@ class Comparer:
     def _draw_sides(
         self, view: ViewState, framebuffer: moderngl.Framebuffer, size: tuple[int, int], pixels: int
     ) -> FrameTimings:
-        other, its_view = self._second(), self._other_view(view)
+        other = self._second()
+        its_view = self._other_view(view)
         self.psnr = math.nan  # of no use: an edit shall differ
         if view.compare.mode == "beside":
             edited = self.engine.draw(view, framebuffer, size, pixels, half=1)

@@ -26,7 +26,9 @@ from .dynamic_resolution import DrawnView, LiveScene
 from .gl_renderer import Image, Size, require_picture
 from .ground_grid import CLEAR, Lines
 
-BAND, MOST_BANDS, LEAST_ROWS = 300_000, 5, 64
+BAND = 300_000
+MOST_BANDS = 5
+LEAST_ROWS = 64
 """Gaussians for which a picture in full is made in one more band, so that some of it shows early and what
 moves has little to wait for; each band costs a look at all of them. Rows of one, nearly."""
 
@@ -44,7 +46,8 @@ class _Begun:
     """A picture that is being made by another thread, band by band."""
 
     def __init__(self, gaussians: ActivatedGaussians, shown: DrawnView) -> None:
-        size, self.stop = (shown.camera.height, shown.camera.width), threading.Event()
+        size = (shown.camera.height, shown.camera.width)
+        self.stop = threading.Event()
         self.picture = _Kept(np.empty((*size, 3), np.float32), np.empty(size, np.float32), shown)
         self.bands: list[tuple[int, int]] = []  # that are done: first row, and one past the last
         self.drawn = _worker().submit(self._draw, gaussians)
@@ -106,7 +109,9 @@ class CpuRenderer:
     def draw(self, camera: Camera, background: Vec3, order: NDArray[np.uint32], pixels: int = 1) -> None:
         """Make the picture; `order` is not used, the rasterizer sorts by itself. With more `pixels` than one
         it has fewer Gaussians."""
-        begun, self.begun_ms, picture = self._begun, 0.0, None
+        begun = self._begun
+        self.begun_ms = 0.0
+        picture = None
         shown = DrawnView(camera, background, pixels)
         if pixels > 1:
             picture = self._scene.draw_fewer(lambda fewer: _draw(fewer, shown), camera, pixels)
@@ -117,11 +122,14 @@ class CpuRenderer:
         if (coarse := self._coarse(shown)) is not None:
             self._scene.measure(coarse.image, picture[0])
         self._drop()
-        self._kept, self._stale, self._changed = _Kept(*picture, shown), True, False
+        self._kept = _Kept(*picture, shown)
+        self._stale = True
+        self._changed = False
 
     def prepare(self, camera: Camera, background: Vec3) -> bool:
         """See `GlRenderer.prepare`."""
-        shown, kept = DrawnView(camera, background), None if self._changed else self._kept
+        shown = DrawnView(camera, background)
+        kept = None if self._changed else self._kept
         if kept is not None and kept.shown == shown:
             return True
         if self._begun is None or self._begun.picture.shown != shown:
@@ -137,7 +145,9 @@ class CpuRenderer:
     def follow(self, last: object) -> bool:
         """See `GlRenderer.follow`."""
         if isinstance(last, CpuRenderer) and last._kept is not None:
-            self._kept, self._stale, self._changed = last._kept, True, True
+            self._kept = last._kept
+            self._stale = True
+            self._changed = True
         return self._kept is not None
 
     def pixels(self) -> Image:
@@ -149,21 +159,26 @@ class CpuRenderer:
     ) -> None:
         """See `GlRenderer.show`."""
         assert self._ctx is not None, "nothing to show on without a context"
-        picture, begun = require_picture(self._kept), self._begun
+        picture = require_picture(self._kept)
+        begun = self._begun
         if self._copy is None or (self._copy.size, self._copy.left) != (size, left):
             if self._copy is not None:
                 self._copy.release()
-            self._copy, self._stale = ScreenCopy(self._ctx, size, left), True
+            self._copy = ScreenCopy(self._ctx, size, left)
+            self._stale = True
         lines = (
             np.zeros((0, 14), np.float32) if grid is None else grid.view(np.float32).reshape(len(grid), -1)
         )
         if self._stale or grid is not self._grid:
-            self._stale, self._grid, self._bands = False, grid, 0
+            self._stale = False
+            self._grid = grid
+            self._bands = 0
             with lines_behind(picture.image, picture.through, lines, CLEAR):
                 self._copy.write(picture.image)
         while begun is not None and self.has_parts:
             top, end = begun.bands[self._bands]
-            image, through = begun.picture.image[top:end], begun.picture.through[top:end]
+            image = begun.picture.image[top:end]
+            through = begun.picture.through[top:end]
             here = lines * ([picture.shown.pixels] * 4 + [1] * 10) - ([0, top] * 2 + [0] * 10)
             with lines_behind(image, through, here.astype(np.float32), CLEAR):
                 self._copy.write(image, top)

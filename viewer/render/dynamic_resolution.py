@@ -37,7 +37,8 @@ MOVING_MS = 20.0, 27.0
 """What such a picture shall take, some ms less than its frame; with more or less time, the next one has fewer
 or more Gaussians."""
 
-FINE, FINE_ERROR = (0.25, 4.0, 64.0), 9e-4
+FINE = (0.25, 4.0, 64.0)
+FINE_ERROR = 9e-4
 """Least, first and largest limit of what a node may lose, pixels². A picture in motion is fine enough with a
 mean squared error like this, 30.5 dB, so that those which follow it have 30; the limit for it is measured
 where the picture in full follows one."""
@@ -172,7 +173,8 @@ class DrawnView:
         return self.pixels > full.pixels and self._has(full)
 
     def _has(self, full: DrawnView) -> bool:
-        mine, pixels = self.camera.resize(full.camera.width, full.camera.height), self.pixels // full.pixels
+        mine = self.camera.resize(full.camera.width, full.camera.height)
+        pixels = self.pixels // full.pixels
         return (
             (self.background, self.camera.width, self.camera.height)
             == (full.background, *drawn_size((mine.width, mine.height), pixels))
@@ -246,7 +248,8 @@ class LiveScene:
         pyramid = self._pyramid or self.begin_pyramid()
         if not pyramid.done():
             return None
-        started, merged = time.perf_counter(), pyramid.result()
+        started = time.perf_counter()
+        merged = pyramid.result()
         for lacks in (2, 1):
             if len(rows := np.flatnonzero(self._behind == lacks)):
                 merged.refresh(rows, colors_only=lacks == 1)
@@ -288,7 +291,8 @@ class LiveScene:
     def _apply_highlight(self, part: slice) -> None:
         """Mix the highlights into colors that were just written: all bands, as color is linear in them."""
         assert self._highlights is not None, "nothing to highlight with"
-        sh, share = self.drawn.colors.numpy()[part], self._highlights[part, 3:]
+        sh = self.drawn.colors.numpy()[part]
+        share = self._highlights[part, 3:]
         sh *= 1.0 - share[:, :, None]
         sh[:, 0] += share * (self._highlights[part, :3] - 0.5) / C0
 

@@ -77,7 +77,8 @@ class ViewEngine:
             raise ValueError(f"draw is '{draw}', expected one of {', '.join(DRAWS)}")
         if draw == "gl" and ctx is None:
             raise ValueError("draw is 'gl', which needs a context")
-        self.ctx, self.scene = ctx, scene
+        self.ctx = ctx
+        self.scene = scene
         self.gdfs = tuple(gdfs)
         self.draws_with = draws_with(ctx, draw)
         self.timings = FrameTimings()
@@ -122,9 +123,11 @@ class ViewEngine:
         Raises:
             ProgdfError: a layer of `view` means nothing; the last picture stays.
         """
-        camera, left = to_camera(view.camera, *drawn_size(size, pixels)), 0
+        camera = to_camera(view.camera, *drawn_size(size, pixels))
+        left = 0
         if half is not None:
-            camera, size = half_camera(camera), (max(size[0] // 2, 1), size[1])
+            camera = half_camera(camera)
+            size = (max(size[0] // 2, 1), size[1])
             left = half * size[0]
         self.timings = self._update_picture(view, camera, self.highlight, pixels)
         self.renderer.show(framebuffer, size, left, self._grid_lines(view, camera))
@@ -228,7 +231,8 @@ class ViewEngine:
         change = self.composer.update(self._stack(edits), edits.blend or "normalized")
         composed = time.perf_counter()
         self.renderer.update(self.composer.gaussians, change.attributes, change.rows)
-        self._edits, self._picture = edits, None
+        self._edits = edits
+        self._picture = None
         if change.means_moved:
             self._ordered_for = None
         return 1e3 * (composed - started), 1e3 * (time.perf_counter() - composed), len(change.rows)
@@ -237,7 +241,8 @@ class ViewEngine:
         """Bring the highlights up to date, those alone that are others than before; gives the ms it took."""
         if highlight == (self._highlighted and self._highlighted[0]):
             return 0.0
-        started, total = time.perf_counter(), len(self.scene)
+        started = time.perf_counter()
+        total = len(self.scene)
         nothing = Highlight(), np.zeros((total, 4), np.uint8)
         last = (self._highlighted or nothing)[1]
         new = nothing[1] if highlight is None else highlight_colors(highlight, self.gdfs, total)

@@ -55,7 +55,8 @@ class GlRenderer:
 
     def upload(self, scene: Gaussians) -> None:
         """Take a whole scene."""
-        self._scene, self._shown = scene, None
+        self._scene = scene
+        self._shown = None
         self._release_moving()
         self._renderer.upload(scene)
         self._ctx.finish()
@@ -87,7 +88,8 @@ class GlRenderer:
             order: farthest first, from `back_to_front`
             pixels: of the picture at rest that one of this one stands for, each way
         """
-        last, self._shown = self._shown, DrawnView(camera, background, pixels)
+        last = self._shown
+        self._shown = DrawnView(camera, background, pixels)
         coarse = self.pixels() if last is not None and last.is_coarse(self._shown) else None
         self._picture = self._draw_fewer(camera, background, pixels) if pixels > 1 else None
         if self._picture is None:

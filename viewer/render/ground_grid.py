@@ -23,8 +23,12 @@ _CELLS_PER_RADIUS = 5.5
 _EVERY = 10  # lines there is a stronger one
 _NEAREST = 1e-3  # of a cell: what is nearer to the eye is not drawn
 _LOWEST = 0.12  # sine of the elevation below which the lines are too close together to be told apart
-_ALPHA, _STRONG, _AXIS = 0.30, 1.6, 2.2
-_RED, _GREEN, _BLUE = (0.86, 0.20, 0.26), (0.36, 0.62, 0.10), (0.16, 0.44, 0.88)
+_ALPHA = 0.30
+_STRONG = 1.6
+_AXIS = 2.2
+_RED = (0.86, 0.20, 0.26)
+_GREEN = (0.36, 0.62, 0.10)
+_BLUE = (0.16, 0.44, 0.88)
 
 Lines = NDArray[np.void]
 
@@ -42,7 +46,8 @@ class GroundPlane:
 
 def ground_plane(scene: Gaussians, up: Vec3) -> GroundPlane:
     """The ground of a scene in which `up` is up, in squares of 1, 2 or 5 of a power of ten."""
-    bounds, up = bounds_of(scene), unit(up, (0.0, 1.0, 0.0))
+    bounds = bounds_of(scene)
+    up = unit(up, (0.0, 1.0, 0.0))
     height = ground_height(scene, torch.tensor(up)) if len(scene) else 0.0
     ahead = front(up)
     across = cross(up, ahead)
@@ -59,7 +64,8 @@ def grid_lines(plane: GroundPlane, camera: Camera, background: Vec3) -> Lines:
     Args:
         background: of the picture, so that the lines show on it
     """
-    viewmat, K = camera.viewmat.double().numpy(), camera.K.double().numpy()
+    viewmat = camera.viewmat.double().numpy()
+    K = camera.K.double().numpy()
     axes = plane.cell * np.array([plane.across, plane.ahead]) @ viewmat[:3, :3].T
     middle = viewmat[:3, :3] @ np.array(plane.origin) + viewmat[:3, 3] + np.array(plane.middle) @ axes
     steps = np.arange(1 - HALF, HALF, dtype=np.float64)
@@ -69,12 +75,14 @@ def grid_lines(plane: GroundPlane, camera: Camera, background: Vec3) -> Lines:
     numbers = np.concatenate([steps + plane.middle[0], steps + plane.middle[1]])
     starts, ends = (middle + cells[:, at : at + 2] @ axes for at in (0, 2))
     # what lies before the nearest depth is cut off
-    nearest, run = _NEAREST * plane.cell, ends[:, 2] - starts[:, 2]
+    nearest = _NEAREST * plane.cell
+    run = ends[:, 2] - starts[:, 2]
     cut = (nearest - starts[:, 2]) / np.where(run == 0.0, 1.0, run)
     first = np.where(starts[:, 2] < nearest, cut, 0.0)[:, None]
     last = np.where(ends[:, 2] < nearest, cut, 1.0)[:, None]
     in_front = np.maximum(starts[:, 2], ends[:, 2]) > nearest
-    way, drift = ends - starts, cells[:, 2:] - cells[:, :2]
+    way = ends - starts
+    drift = cells[:, 2:] - cells[:, :2]
     lines = np.zeros(len(cells), GRID_LINE)
     for at, share in ((0, first), (1, last)):
         points = starts + share * way

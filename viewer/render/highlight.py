@@ -27,7 +27,9 @@ RAMP = ((0.0, 0x2B3FA8), (0.25, 0x7A35B5), (0.5, 0xC8407A), (0.75, 0xF08A3C), (1
 """Weights and their colors, rgb; lightness rises with the weight, so that also gray tells them apart."""
 
 SELECTED: Color = (1.0, 0.72, 0.05)
-TINT, TRACE, HIDDEN = 140, 45, 255
+TINT = 140
+TRACE = 45
+HIDDEN = 255
 """Shares of 255 that a tint takes, and that of a selection while no tool selects; and the one that means that
 a Gaussian is not drawn at all."""
 

@@ -58,7 +58,8 @@ def surface_point(scene: Gaussians, camera: Camera, x: float, y: float, near: fl
     at = int(opaque[0]) if len(opaque) else int(seen.shares.argmax())
     z = float(seen.depths[at])
     fx, fy, cx, cy = _lens(camera)
-    rotation, translation = camera.viewmat[:3, :3].numpy(), camera.viewmat[:3, 3].numpy()
+    rotation = camera.viewmat[:3, :3].numpy()
+    translation = camera.viewmat[:3, 3].numpy()
     wx, wy, wz = (
         float(v) for v in rotation.T @ (np.array([(x - cx) / fx * z, (y - cy) / fy * z, z]) - translation)
     )
@@ -77,7 +78,8 @@ def layer_at(view: ViewState, gdfs: Sequence[Gdf], seen: Seen) -> int | None:
         A shown layer goes before a hidden one, of equal ones the later; None where no layer has
         `LEAST_SHARE` of the pixel.
     """
-    best, chosen = (False, 0.0), None
+    best = (False, 0.0)
+    chosen = None
     for i, layer in enumerate(view.layers):
         members = gdfs[layer.gdf].region.members.numpy()  # sorted
         if not len(members):
@@ -86,18 +88,21 @@ def layer_at(view: ViewState, gdfs: Sequence[Gdf], seen: Seen) -> int | None:
         share = float(seen.shares[inside].sum())
         ranked = is_visible(view, layer), share
         if share >= LEAST_SHARE and ranked >= best:
-            best, chosen = ranked, i
+            best = ranked
+            chosen = i
     return chosen
 
 
 def seen_at(scene: Gaussians, camera: Camera, x: float, y: float, near: float = 1e-4) -> Seen | None:
     """The Gaussians that one sees at a pixel position, None on the background; as `surface_point`."""
-    rotation, translation = camera.viewmat[:3, :3].numpy(), camera.viewmat[:3, 3].numpy()
+    rotation = camera.viewmat[:3, :3].numpy()
+    translation = camera.viewmat[:3, 3].numpy()
     fx, fy, cx, cy = _lens(camera)
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
         # by columns: a row at a time takes many times as long
         across, down, depth = rotation @ scene.means.numpy().T + translation[:, None]
-        dx, dy = across / depth, down / depth
+        dx = across / depth
+        dy = down / depth
         dx += np.float32((cx - x) / fx)
         dy += np.float32((cy - y) / fy)
         off = dx * dx + dy * dy

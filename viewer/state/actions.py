@@ -62,7 +62,8 @@ def toggle_snapshots(view: ViewState) -> ViewState:
 
 def end_at_edit(before: Workspace, after: Workspace) -> Workspace:
     """No comparison of snapshots any more where layers have changed: one shall see what one does."""
-    was, view = before.view, after.view
+    was = before.view
+    view = after.view
     edited = (view.layers, view.groups, view.blend) != (was.layers, was.groups, was.blend)
     if not edited or view.compare.mode == "off" or view.compare.against != "snapshots":
         return after
@@ -107,7 +108,8 @@ def perform(workspace: Workspace, action: str, facts: SceneFacts, aspect: float 
 
 def _again(workspace: Workspace, index: int, facts: SceneFacts) -> Workspace:
     """The form with the settings of a layer's edit, where an editor of the form made it."""
-    layer, regions = workspace.view.layers[index], workspace.view.selection.regions
+    layer = workspace.view.layers[index]
+    regions = workspace.view.selection.regions
     row = facts.rows[layer.gdf]
     form = with_settings(replace(workspace.form, name=layer.name, error=""), row.instruction)
     if form is None:
@@ -122,7 +124,8 @@ def _again(workspace: Workspace, index: int, facts: SceneFacts) -> Workspace:
 
 def _limit(workspace: Workspace, index: int, facts: SceneFacts) -> Workspace:
     """A layer's paint only where something is selected too."""
-    view, row = workspace.view, facts.rows[workspace.view.layers[index].gdf]
+    view = workspace.view
+    row = facts.rows[workspace.view.layers[index].gdf]
     if not view.selection.count:
         return workspace
     weights = selection.unpack(view.selection.members, facts.count)[row.members].astype(np.float32)
@@ -133,7 +136,8 @@ def _limit(workspace: Workspace, index: int, facts: SceneFacts) -> Workspace:
 
 def _select_painted(workspace: Workspace, index: int, facts: SceneFacts) -> Workspace:
     """What a layer's paint lets through at least half of, all of it where it is not painted."""
-    view, row = workspace.view, facts.rows[workspace.view.layers[index].gdf]
+    view = workspace.view
+    row = facts.rows[workspace.view.layers[index].gdf]
     painted = paint.decode(view.layers[index].paint, row.count, row.from_others)
     mask = np.zeros(facts.count, bool)
     mask[row.members if painted is None else row.members[painted.numpy() >= 0.5]] = True
@@ -146,7 +150,8 @@ OF_EDITS = {"again": _again, "limit_to_selection": _limit, "select_painted": _se
 
 def _frame(workspace: Workspace, facts: SceneFacts, aspect: float) -> Workspace:
     """The selection, the focused layer, or the scene's subject fills the picture; the direction stays."""
-    fit, selected = facts.fit, workspace.view.selection
+    fit = facts.fit
+    selected = workspace.view.selection
     if selected.count:
         mask = selection.unpack(selected.members, facts.count)
         return with_camera(workspace, facts.fit_members(workspace.view.camera, aspect, mask))
@@ -184,7 +189,8 @@ def _select_slider(workspace: Workspace, by: int, facts: SceneFacts) -> Workspac
     """The next slider that the focused layer has; its gains unfold, so that one sees which."""
     if workspace.focus is None:
         return workspace
-    view, gdf = workspace.view, workspace.view.layers[workspace.focus].gdf
+    view = workspace.view
+    gdf = workspace.view.layers[workspace.focus].gdf
     sliders = [slider for slider in SLIDERS if slider in ("strength", *facts.rows[gdf].kinds)]
     at = sliders.index(workspace.active_slider) if workspace.active_slider in sliders else 0
     slider = sliders[(at + by) % len(sliders)]
@@ -237,7 +243,8 @@ def _take_tool(workspace: Workspace, tool: str) -> Workspace:
 def _navigate(workspace: Workspace, mode: str) -> Workspace:
     """Orbit or fly, with no tool in the hand."""
     workspace = _change_brush(workspace, active=False)
-    select, camera = replace(workspace.view.select, tool=""), replace(workspace.view.camera, mode=mode)
+    select = replace(workspace.view.select, tool="")
+    camera = replace(workspace.view.camera, mode=mode)
     return with_camera(replace(workspace, view=replace(workspace.view, select=select)), camera)
 
 
@@ -287,7 +294,8 @@ def _show_all(workspace: Workspace, _: str) -> Workspace:
 def _rename_group(workspace: Workspace, argument: str) -> Workspace:
     """`INDEX:NAME`, of `view.groups`"""
     index, _, name = argument.partition(":")
-    old, view = workspace.view.groups[int(index)].name, workspace.view
+    old = workspace.view.groups[int(index)].name
+    view = workspace.view
     return replace(workspace, view=change_group(view, old, lambda group: replace(group, name=name)))
 
 
@@ -342,8 +350,11 @@ def _restore(workspace: Workspace, index: str) -> Workspace:
 def _name_snapshot(workspace: Workspace, argument: str) -> Workspace:
     """`INDEX:NAME`; the pair that is compared follows."""
     index, _, name = argument.partition(":")
-    old, new = workspace.snapshots, snapshots.rename(workspace.snapshots, int(index) - 1, name)
-    was, now, pair = old[int(index) - 1].name, new[int(index) - 1].name, workspace.view.pair
+    old = workspace.snapshots
+    new = snapshots.rename(workspace.snapshots, int(index) - 1, name)
+    was = old[int(index) - 1].name
+    now = new[int(index) - 1].name
+    pair = workspace.view.pair
     pair = replace(pair, a=now if pair.a == was else pair.a, b=now if pair.b == was else pair.b)
     return replace(workspace, snapshots=new, view=replace(workspace.view, pair=pair))
 
@@ -369,7 +380,8 @@ def _give_keyboard(workspace: Workspace, by: str) -> Workspace:
 
 def _new_edit(workspace: Workspace, _: str) -> Workspace:
     """Open the form of a new edit, of what is selected where something is; or close it."""
-    form, selection = workspace.form, workspace.view.selection
+    form = workspace.form
+    selection = workspace.view.selection
     known = (ALL, TYPED, CHANGED, *(region.name for region in selection.regions))
     if selection.count:
         form = replace(form, region=SELECTION)

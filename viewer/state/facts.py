@@ -25,7 +25,8 @@ THUMBNAIL_SIDE = 48
 MOST_MEMBERS = 20_000
 """Of a larger region every so-manieth Gaussian is drawn, so that a row unfolds in a fraction of a second."""
 
-_GROUND, _NEAR = 56, 0.7  # of a thumbnail: the gray behind it, 0..255; the share of a framing distance
+_GROUND = 56  # of a thumbnail: the gray behind it, 0..255
+_NEAR = 0.7  # the share of a framing distance
 
 
 Thumbnail = Callable[[ViewCamera], NDArray[np.uint8]]
@@ -110,7 +111,8 @@ def _mean_color(scene: Gaussians, gdf: Gdf) -> Rgb:
 def _finished_region(scene: Gaussians, gdf: Gdf) -> Gaussians:
     """The region alone at full strength, of many members every so-manieth."""
     every = max(-(-len(gdf.region.members) // MOST_MEMBERS), 1)
-    region, moved = scene[gdf.region.members[::every]], dict[str, Any]()
+    region = scene[gdf.region.members[::every]]
+    moved = dict[str, Any]()
     for name in gdf.field.attributes:
         old: Tensor = getattr(region, name)
         moved[name] = old + gdf.field.attribute_offsets(name, 1.0)[::every].reshape(old.shape)
@@ -119,7 +121,8 @@ def _finished_region(scene: Gaussians, gdf: Gdf) -> Gaussians:
 
 def draw_thumbnail(scene: Gaussians, gdf: Gdf, camera: ViewCamera) -> NDArray[np.uint8]:
     """The region alone at full strength, from where `camera` looks. [THUMBNAIL_SIDE,THUMBNAIL_SIDE,3]"""
-    side, region = THUMBNAIL_SIDE, _finished_region(scene, gdf)
+    side = THUMBNAIL_SIDE
+    region = _finished_region(scene, gdf)
     if not len(region):
         return np.full((side, side, 3), _GROUND, np.uint8)
     with torch.no_grad():

@@ -88,7 +88,8 @@ def record(history: History, state: ViewState, snapshots: tuple[Any, ...] = ()) 
 
     A gesture that ends where it began leaves no entry.
     """
-    seen, present = look_of(state), history.present
+    seen = look_of(state)
+    present = history.present
     step = HistoryEntry(edit_of(state), _take_changes(present.look, history.seen, seen), snapshots)
     if step == present:
         return history if seen == history.seen else replace(history, seen=seen)
@@ -168,7 +169,8 @@ def apply_edit(state: ViewState, edit: Edit) -> ViewState:
 
 def apply_present(state: ViewState, history: History) -> ViewState:
     """`state` as the present entry has it, seen from where it is; another up axis only rolls it upright."""
-    look, camera = history.seen, state.camera
+    look = history.seen
+    camera = state.camera
     if camera.up != look.up:
         camera = replace(with_up(camera, look.up), up=look.up)
     if camera.fov_y != look.fov_y:
@@ -227,7 +229,8 @@ def _describe_change(before: HistoryEntry, after: HistoryEntry) -> str:
     """The first that is different, of what matters most."""
     old, new = ({layer.gdf: layer for layer in entry.edit.layers} for entry in (before, after))
     if old.keys() != new.keys():
-        added, removed = new.keys() - old.keys(), old.keys() - new.keys()
+        added = new.keys() - old.keys()
+        removed = old.keys() - new.keys()
         names = [new[gdf].name for gdf in added] or [old[gdf].name for gdf in removed]
         done = "replace" if added and removed else "add" if added else "delete"
         return f"{done} {_one_or_many(names)}"

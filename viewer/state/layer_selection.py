@@ -30,7 +30,8 @@ PRESSES = ("one", "keep", "toggle", "range")
 
 def selected_layers(workspace: Workspace) -> tuple[int, ...]:
     """Places of the selected layers in `view.layers`, the lowest first; none where none is focused."""
-    layers, focus = workspace.view.layers, workspace.focus
+    layers = workspace.view.layers
+    focus = workspace.focus
     if focus is None:
         return ()
     return tuple(i for i, layer in enumerate(layers) if i == focus or layer.gdf in workspace.selected)
@@ -45,7 +46,8 @@ def press(workspace: Workspace, argument: str) -> Workspace:
     """
     how, at, listed = argument.split(":")
     index, rows = int(at), [int(i) for i in listed.split(",") if i]
-    layers, focus = workspace.view.layers, workspace.focus
+    layers = workspace.view.layers
+    focus = workspace.focus
     chosen = selected_layers(workspace)
     if how == "range" and focus is not None:
         low, high = sorted((focus, index))
@@ -85,7 +87,8 @@ def set_master(workspace: Workspace, strength: float) -> Workspace:
     Proportions are those before the gesture, so that a drag over 0 and back loses nothing. Layers that were
     all at 0 rise together.
     """
-    chosen, view = selected_layers(workspace), workspace.view
+    chosen = selected_layers(workspace)
+    view = workspace.view
     upper = largest_strength(view)
     strength = min(upper, max(0.0, strength))
     before = {layer.gdf: layer.strength for layer in workspace.past.present.edit.layers}
@@ -117,7 +120,8 @@ def switch_selected(workspace: Workspace, name: str) -> Workspace:
 
 def nudge(workspace: Workspace, by: float) -> Workspace:
     """The slider that the arrow keys move a step further; several strengths in proportion."""
-    chosen, slider = selected_layers(workspace), workspace.active_slider
+    chosen = selected_layers(workspace)
+    slider = workspace.active_slider
     if len(chosen) > 1 and slider == "strength":
         return set_master(workspace, round(master_strength(workspace.view, chosen) + by, 6))
     view = workspace.view
@@ -152,7 +156,8 @@ def remove(workspace: Workspace, index: str) -> Workspace:
     at = int(index) if index else workspace.focus
     if at is None or not 0 <= at < len(workspace.view.layers):
         return workspace
-    view, gone = workspace.view, chosen if at in chosen else (at,)
+    view = workspace.view
+    gone = chosen if at in chosen else (at,)
     for i in reversed(gone):
         view = remove_layer(view, i)
     focus = max(gone[0] - 1, 0) if view.layers else None
@@ -161,7 +166,8 @@ def remove(workspace: Workspace, index: str) -> Workspace:
 
 def group(workspace: Workspace, name: str) -> Workspace:
     """The selected layers as a new group, or at the bottom of the one of this name."""
-    view, chosen = workspace.view, selected_layers(workspace)
+    view = workspace.view
+    chosen = selected_layers(workspace)
     grouped = move_to_group(view, chosen, name) if name else group_layers(view, chosen)
     return _with_focus(workspace, grouped)
 

@@ -138,9 +138,12 @@ def rename_layer(view: ViewState, index: int, text: str) -> ViewState:
 
 def free_name(view: ViewState, name: str) -> str:
     """A name for one more layer, with a number where a layer has it."""
-    taken, free, number = {layer.name for layer in view.layers}, name, 2
+    taken = {layer.name for layer in view.layers}
+    free = name
+    number = 2
     while free in taken:
-        free, number = re.sub(r"-\d+\Z", "", name) + f"-{number}", number + 1
+        free = re.sub(r"-\d+\Z", "", name) + f"-{number}"
+        number = number + 1
     return free
 
 
@@ -219,9 +222,12 @@ def group_layers(view: ViewState, indices: Collection[int], name: str = "Group")
     """A group of these layers, at the place of the topmost; they leave the groups they were in."""
     if not indices:
         return view
-    taken, free, number = {group.name for group in view.groups}, name, 2
+    taken = {group.name for group in view.groups}
+    free = name
+    number = 2
     while free in taken:
-        free, number = f"{name} {number}", number + 1
+        free = f"{name} {number}"
+        number = number + 1
     members = [replace(view.layers[i], group=free) for i in sorted(indices)]
     remaining = [layer for i, layer in enumerate(view.layers) if i not in indices]
     at = sum(i not in indices for i in range(max(indices)))

@@ -117,7 +117,8 @@ def begin_stroke(paint: str, gdf: Gdf, surface: Surface, through: bool, mode: st
     weights = decode(paint, count, gdf.from_others)
     before = np.ones(count, np.float32) if weights is None else weights.numpy()
     members = gdf.region.members.numpy()
-    points, depths = surface.centers.points[members], surface.centers.depths[members]
+    points = surface.centers.points[members]
+    depths = surface.centers.depths[members]
     with np.errstate(divide="ignore", invalid="ignore"):
         places = np.column_stack([points, float(surface.camera.K[0, 0]) * np.log(depths)])
     reachable = np.isfinite(places).all(1)
@@ -188,7 +189,8 @@ def feather(paint: str, points: Floats, width: float, from_others: int = 0) -> s
     weights = decode(paint, len(points), from_others)
     if weights is None:
         return FULL
-    soft, somewhere = weights.numpy().copy(), np.isfinite(points).all(1)
+    soft = weights.numpy().copy()
+    somewhere = np.isfinite(points).all(1)
     soft[somewhere] = near_mean(points[somewhere], soft[somewhere], width)
     return encode(soft)
 

@@ -83,7 +83,8 @@ def unpack(members: bytes, total: int) -> Mask:
     """
     mask = np.zeros(total, bool)
     if members != NOBODY:
-        unpacker, size = zlib.decompressobj(), -(-total // 8)
+        unpacker = zlib.decompressobj()
+        size = -(-total // 8)
         try:
             packed = unpacker.decompress(members, size) if size else b""
         except zlib.error:

@@ -35,7 +35,8 @@ def join_keys(timeline: Timeline, keys: Mapping[RowKey, Keyframe]) -> Timeline:
     joined: dict[tuple[int, str], Keyframe] = {}
     for (_, frame), key in sorted(keys.items(), key=lambda item: item[0]):
         same = joined.get((frame, key.easing), Keyframe(frame, easing=key.easing))
-        strengths, camera = (*same.strengths, *key.strengths), key.camera or same.camera
+        strengths = (*same.strengths, *key.strengths)
+        camera = key.camera or same.camera
         joined[frame, key.easing] = replace(same, strengths=strengths, camera=camera)
     ordered = tuple(sorted(joined.values(), key=lambda key: key.frame))
     return replace(timeline, keys=ordered, length=max((timeline.length, *(key.frame for key in ordered))))
@@ -143,7 +144,8 @@ def state_at(timeline: Timeline, frame: float, view: ViewState, least: int = 1) 
 
     Before the first key and after the last everything rests.
     """
-    camera, strengths = camera_at(timeline, frame, least), strengths_at(timeline, frame, least)
+    camera = camera_at(timeline, frame, least)
+    strengths = strengths_at(timeline, frame, least)
     layers = tuple(
         replace(layer, strength=strengths[layer.gdf])
         if strengths.get(layer.gdf, layer.strength) != layer.strength
@@ -280,7 +282,8 @@ def _choose_keys(view: ViewState, player: Player, names: str) -> tuple[Timeline,
 
 def _move_keys(view: ViewState, player: Player, by: str, copy: bool = False) -> tuple[Timeline, Player]:
     """The chosen ones; the playhead goes with the key at it."""
-    chosen, step = chosen_keys(view.timeline, player), int(by)
+    chosen = chosen_keys(view.timeline, player)
+    step = int(by)
     moved = shift_keys(view.timeline, chosen, step, copy)
     if moved is view.timeline:
         return moved, player
@@ -330,7 +333,8 @@ def _easing(view: ViewState, player: Player, name: str) -> tuple[Timeline, Playe
     """Of the chosen keys, else of those that decide at the playhead; the next one where none is named."""
     if not view.timeline.keys:
         return view.timeline, player
-    chosen, deciding = chosen_keys(view.timeline, player), key_before(view.timeline, player.frame)
+    chosen = chosen_keys(view.timeline, player)
+    deciding = key_before(view.timeline, player.frame)
     now = split_keys(view.timeline)[min(chosen)].easing if chosen else deciding.easing
     name = name or following(EASINGS, now)
     return set_easing(view.timeline, chosen or keys_at(view.timeline, deciding.frame), name), player

@@ -20,13 +20,16 @@ Value = TypeVar("Value")
 OVERSHOOT = 1.2
 """How far a slider goes where overshoot is on: beyond 1 the edit is extrapolated, not learned."""
 BRUSH_MODES = ("add", "erase", "smooth")
-SMALLEST_PX, LARGEST_PX = 4.0, 400.0
+SMALLEST_PX = 4.0
+LARGEST_PX = 400.0
 SELECT_TOOLS = ("box", "lasso", "polygon", "brush", "scribble", "sphere", "flood", "color")
 SELECT_MODES = ("new", "add", "subtract", "intersect")
 COMPARE_MODES = ("off", "beside", "split", "difference")
 AGAINST = ("original", "snapshots")
 MOST_AMPLIFIED = 64.0
-LONGEST, FASTEST = 9999, 120  # frames, frames per second
+# frames, frames per second
+LONGEST = 9999
+FASTEST = 120
 CARD_MODES = ("auto", "full", "compact")
 """`ViewState.cards`: rows of one line where cards would not fit, never, always."""
 FRAMES = ("", *SHAPES)

@@ -30,8 +30,14 @@ from .snapshots import SliderSnapshot
 from .timeline import Player
 from .view_state import Comparison, ViewState
 
-MESSAGE_S, ERROR_S, DETAILS_S = 6.0, 15.0, 120.0  # how long a line stays, and one with details to copy
-LEAST_ZOOM, MOST_ZOOM, NARROWEST_PX, WIDEST_PX = 0.5, 3.0, 280.0, 520.0
+# how long a line stays, and one with details to copy
+MESSAGE_S = 6.0
+ERROR_S = 15.0
+DETAILS_S = 120.0
+LEAST_ZOOM = 0.5
+MOST_ZOOM = 3.0
+NARROWEST_PX = 280.0
+WIDEST_PX = 520.0
 UNSAVED = "• "
 """Before the scene's name where there are unsaved changes."""
 PLACES = ("panel", "tools", "options", "view", "comparison", "timeline")
@@ -158,7 +164,8 @@ class Workspace:
 
 def new_workspace(view: ViewState, snapshots: tuple[SliderSnapshot, ...] = ()) -> Workspace:
     """A workspace on a fresh state; the top layer is focused."""
-    past, focus = history.begin(view, snapshots), len(view.layers) - 1 if view.layers else None
+    past = history.begin(view, snapshots)
+    focus = len(view.layers) - 1 if view.layers else None
     return mark_saved(Workspace(view, past, view.camera, focus, snapshots=snapshots))
 
 
@@ -236,7 +243,8 @@ def advance(workspace: Workspace, seconds: float) -> Workspace:
 
 def loses_strengths(workspace: Workspace, after: ViewState) -> bool:
     """Whether a playhead that leaves its frame takes strengths away that nobody set a key for."""
-    before, frame = workspace.view, workspace.player.frame
+    before = workspace.view
+    frame = workspace.player.frame
     if after.layers == before.layers or history.edit_of(before) != workspace.past.present.edit:
         return False
     return timeline.state_at(before.timeline, frame, before, timeline.LEAST_KEYS).layers != before.layers
@@ -275,7 +283,8 @@ def change_focused(workspace: Workspace, change: Callable[[ViewState, int], View
 
 def with_layers_of(workspace: Workspace, view: ViewState) -> Workspace:
     """Another state; the focus stays on its layer, wherever that has gone."""
-    focus, before = workspace.focus, workspace.view.layers
+    focus = workspace.focus
+    before = workspace.view.layers
     if focus is not None and focus < len(before):
         places = [i for i, layer in enumerate(view.layers) if layer.gdf == before[focus].gdf]
         focus = focus if focus in places else next(iter(places), None)

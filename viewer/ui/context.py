@@ -224,8 +224,10 @@ def _apply_style(scale: float) -> None:
     style.window_border_size = style.child_border_size = style.frame_border_size = 0.0
     style.popup_border_size = 1.0
     style.disabled_alpha = 0.4
-    style.hover_stationary_delay, style.hover_delay_normal = 0.3, 0.5
-    p, col = PALETTE, imgui.Col_
+    style.hover_stationary_delay = 0.3
+    style.hover_delay_normal = 0.5
+    p = PALETTE
+    col = imgui.Col_
     imgui.style_colors_dark()
     for slot, color in {
         col.window_bg: p.panel,

@@ -269,7 +269,8 @@ def bind(changes: Mapping[str, Any]) -> list[str]:
     Args:
         changes: by its action a chord, several or "" for none; a key that was another one's is no longer that
     """
-    problems, changed = list[str](), list[Command]()
+    problems = list[str]()
+    changed = list[Command]()
     given: dict[tuple[str, bool], Command] = {}
     for action, value in changes.items():
         texts = [value] * bool(value) if isinstance(value, str) else value
@@ -344,7 +345,8 @@ def shortcut(action: str) -> str:
 
 def describe(action: str, more: str = "") -> str:
     """A tip: the name with its key, what it does, and what there is to say beside."""
-    command, chord = COMMANDS[action], shortcut(action)
+    command = COMMANDS[action]
+    chord = shortcut(action)
     first = command.name + (f" ({chord})" if chord else "")
     return "\n".join(line for line in (first, command.help, more) if line)
 
@@ -355,7 +357,9 @@ def match(query: str, name: str, beside: str = "") -> int | None:
     Args:
         beside: what is read where the name does not answer
     """
-    sought, text, letters = query.casefold().strip(), name.casefold(), iter(name.casefold())
+    sought = query.casefold().strip()
+    text = name.casefold()
+    letters = iter(name.casefold())
     answers = (
         text.startswith(sought),
         f" {sought}" in text,
@@ -484,7 +488,8 @@ def cancels_drag(keys: Keys, held: bool, drag: str | None) -> bool:
         held: something of the interface was held in the last frame: imgui lets go of it at Escape
         drag: what is held on the picture, see `mouse.MouseTool`; the camera stays where it was turned
     """
-    io, buttons = imgui.get_io(), imgui.MouseButton_
+    io = imgui.get_io()
+    buttons = imgui.MouseButton_
     holds = held or drag not in (None, "look", *DRAGS.values())
     if not holds or io.want_text_input or not imgui.is_mouse_down(buttons.left.value):
         return False
@@ -530,6 +535,7 @@ class PendingKeys:
         opener = next((i for i, press in enumerate(pressed[:count]) if opens_text(press)), None)
         self._frames += 1
         if opener is not None:
-            count, self._opened_at = opener + 1, self._frames
+            count = opener + 1
+            self._opened_at = self._frames
         self._waiting = pressed[count:]
         return replace(keys, pressed=pressed[:count])

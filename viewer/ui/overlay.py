@@ -25,9 +25,11 @@ class Area:
 
 def banner(text: str, area: Area, ui: UiContext) -> None:
     """A word at the top center of the picture."""
-    size, pad = FONT_PX * ui.scale, 8.0 * ui.scale
+    size = FONT_PX * ui.scale
+    pad = 8.0 * ui.scale
     wide = _text_width(text, size, ui)
-    x, y = (area.width - wide) / 2, 14.0 * ui.scale
+    x = (area.width - wide) / 2
+    y = 14.0 * ui.scale
     corners = (x - 1.5 * pad, y - pad / 2), (x + wide + 1.5 * pad, y + size + pad / 2)
     imgui.get_background_draw_list().add_rect_filled(*corners, u32(PALETTE.scrim), 5 * ui.scale)
     _text(x, y, text, size, PALETTE.text, ui)
@@ -62,9 +64,12 @@ def draw_cross(at: tuple[float, float], ui: UiContext) -> None:
 
 def draw_frame(name: str, frame: Area, area: Area, ui: UiContext) -> None:
     """The safe frame as a thin line with its name, and a shade over all that the film leaves out."""
-    canvas, shade = imgui.get_background_draw_list(), u32((*PALETTE.scrim[:3], 0.55))
-    left, top = round((area.width - frame.width) / 2), round((area.height - frame.height) / 2)
-    right, bottom = round(area.width) - left, round(area.height) - top
+    canvas = imgui.get_background_draw_list()
+    shade = u32((*PALETTE.scrim[:3], 0.55))
+    left = round((area.width - frame.width) / 2)
+    top = round((area.height - frame.height) / 2)
+    right = round(area.width) - left
+    bottom = round(area.height) - top
     for corners in (
         (0, 0, area.width, top),
         (0, bottom, area.width, area.height),
@@ -72,10 +77,14 @@ def draw_frame(name: str, frame: Area, area: Area, ui: UiContext) -> None:
         (right, top, area.width, bottom),
     ):
         canvas.add_rect_filled(corners[:2], corners[2:], shade)
-    line, at = u32(PALETTE.handle), ((left, top), (right, bottom))
+    line = u32(PALETTE.handle)
+    at = ((left, top), (right, bottom))
     canvas.add_rect(*at, line, thickness=ui.scale)
-    size, pad = SMALL_PX * ui.scale, 5.0 * ui.scale
-    x, y = right - _text_width(name, size, ui) - 2 * pad, bottom - size - pad  # the tools lie at the left
+    size = SMALL_PX * ui.scale
+    pad = 5.0 * ui.scale
+    # the tools lie at the left
+    x = right - _text_width(name, size, ui) - 2 * pad
+    y = bottom - size - pad
     canvas.add_rect_filled((x, y), at[1], u32(PALETTE.scrim))
     _text(x + pad, y + pad / 2, name, size, PALETTE.text, ui)
 
@@ -125,7 +134,10 @@ def _text(
 AXES_DRAG = "axes"
 """The name of its drag, beside those of `keys.DRAGS`."""
 
-LENGTH_PX, BALL_PX, MARGIN_PX = 34.0, 9.5, 10.0  # at 1×
+# at 1×
+LENGTH_PX = 34.0
+BALL_PX = 9.5
+MARGIN_PX = 10.0
 LETTER_PX = 13.0
 LEAST_PX = 240.0
 """Width of the picture below which there is no room for it."""
@@ -136,8 +148,10 @@ _INKS: dict[str, Rgba] = {
     "Y": (0.42, 0.71, 0.10, 1.0),
     "Z": (0.20, 0.50, 0.94, 1.0),
 }
-_SHADE, _DISC = (0.08, 0.09, 0.10, 0.62), (0.5, 0.5, 0.5, 0.28)
-_DARK, _LIGHT = (0.04, 0.04, 0.05, 1.0), (1.0, 1.0, 1.0, 1.0)
+_SHADE = (0.08, 0.09, 0.10, 0.62)
+_DISC = (0.5, 0.5, 0.5, 0.28)
+_DARK = (0.04, 0.04, 0.05, 1.0)
+_LIGHT = (1.0, 1.0, 1.0, 1.0)
 _AWAY = 0.35  # of an ink that an end has lost where it points away
 
 
@@ -175,8 +189,10 @@ def draw_axes(view: ViewState, area: Area, lit: bool, ui: UiContext) -> None:
         canvas.add_circle_filled((x, y), _REACH_PX * s, u32(_DISC))
     on = axis_under(view, area, ui) if lit else ""
     for end in _ends(view.camera, area, ui):
-        sign, letter = end.name[0], end.name[1]
-        ink, at = _dim(_INKS[letter], end.nearness), (end.x, end.y)
+        sign = end.name[0]
+        letter = end.name[1]
+        ink = _dim(_INKS[letter], end.nearness)
+        at = (end.x, end.y)
         if sign == "+":
             canvas.add_line((x, y), at, u32(_SHADE), 3.5 * s)
             canvas.add_line((x, y), at, u32(ink), 2.0 * s)

@@ -64,7 +64,8 @@ class PointerContext:
     @property
     def cursor(self) -> tuple[float, float]:
         """Where the mouse is, in pixels of the picture."""
-        mouse, density = imgui.get_io().mouse_pos, imgui.get_io().display_framebuffer_scale
+        mouse = imgui.get_io().mouse_pos
+        density = imgui.get_io().display_framebuffer_scale
         return mouse.x * density.x - self.left, mouse.y * density.y
 
     def camera(self, camera: ViewCamera) -> Camera:
@@ -75,7 +76,8 @@ class PointerContext:
     @property
     def scene(self) -> Gaussians:
         """What the picture shows, without what is hidden; valid until another strength is drawn."""
-        scene, hidden = self.engine.gaussians(self.shown), self.shown.selection.hidden
+        scene = self.engine.gaussians(self.shown)
+        hidden = self.shown.selection.hidden
         if hidden == NOBODY:
             return scene
         drawn = torch.from_numpy(np.where(unpack(hidden, len(scene)), np.float32(-np.inf), np.float32(0.0)))
@@ -97,7 +99,8 @@ class PointerContext:
 
     @property
     def _surface_key(self) -> object:
-        camera, view = self.camera(self.shown.camera), self.shown
+        camera = self.camera(self.shown.camera)
+        view = self.shown
         key = camera.viewmat.numpy().tobytes(), camera.K.numpy().tobytes(), camera.width, camera.height
         return self.engine, view.layers, view.blend, view.selection.hidden, key
 

@@ -20,17 +20,23 @@ from .placement import keep_on_screen
 
 _Made = TypeVar("_Made")
 
-SIZE, LEAST = (1280, 800), (640, 400)
+SIZE = (1280, 800)
+LEAST = (640, 400)
 TITLE = "ProGDF Studio"
-PANEL, FIELD, TEXT, ACCENT = 0x1E2024, 0x383C43, 0xDEE1E6, 0x5A9CF0
+PANEL = 0x1E2024
+FIELD = 0x383C43
+TEXT = 0xDEE1E6
+ACCENT = 0x5A9CF0
 """Colors of the palette, 0xRRGGBB."""
 _INKS = [f"#{color:06x}" for color in (PANEL, FIELD, TEXT, ACCENT)]
 TEXT_PX = 15.0
 FONTS = BUNDLE / "assets" / "fonts"
 REGULAR = FONTS / "Roboto" / "Roboto-Regular.ttf"
-AFTER_S, EVERY_S = 0.15, 0.1
+AFTER_S = 0.15
+EVERY_S = 0.1
 """How long one waits before a splash is shown, and between two frames of it."""
-FIRST_S, FIRST_TEXT = 4.0, "(the first time on a machine this takes half a minute)"
+FIRST_S = 4.0
+FIRST_TEXT = "(the first time on a machine this takes half a minute)"
 """What is said of waiting so long."""
 _HINTS = (
     (glfw.CONTEXT_VERSION_MAJOR, 3),
@@ -81,16 +87,19 @@ class Splash:
 
     def draw(self, text: str, seconds: float) -> None:
         """A frame: what is waited for, since how many seconds, and a bar that moves."""
-        size, scale = glfw.get_framebuffer_size(self.handle), glfw.get_window_content_scale(self.handle)[0]
+        size = glfw.get_framebuffer_size(self.handle)
+        scale = glfw.get_window_content_scale(self.handle)[0]
         if 0 not in size:
             self._picture.draw(self.context.screen, size, scale, text, seconds)
             glfw.swap_buffers(self.handle)
 
     def wait(self, work: Future[_Made], text: str, listen: Callable[[], object] = glfw.poll_events) -> _Made:
         """What another thread makes; meanwhile the window hears its events and soon shows a splash."""
-        begun, patience = time.perf_counter(), AFTER_S
+        begun = time.perf_counter()
+        patience = AFTER_S
         while not wait([work], patience).done:
-            patience, seconds = EVERY_S, time.perf_counter() - begun
+            patience = EVERY_S
+            seconds = time.perf_counter() - begun
             listen()
             self.draw(text if seconds < FIRST_S else f"{text} {FIRST_TEXT}", seconds)
         return work.result()
@@ -118,10 +127,14 @@ class SplashPicture:
         panel, field, ink, accent = _INKS
         words = f"{text}  ·  {seconds:.0f} s" if seconds >= 2.0 else text
         font = ImageFont.truetype(REGULAR, TEXT_PX * scale)
-        wide, tall, middle = 240.0 * scale, 4.0 * scale, size[1] // 2
+        wide = 240.0 * scale
+        tall = 4.0 * scale
+        middle = size[1] // 2
         width = min(round(max(font.getlength(words), wide)), size[0])
         image = Image.new("RGBA", (width, middle + round(3.0 * TEXT_PX * scale)), panel)
-        canvas, y, x = ImageDraw.Draw(image), image.height - middle, (width - wide) / 2
+        canvas = ImageDraw.Draw(image)
+        y = image.height - middle
+        x = (width - wide) / 2
         canvas.text((width / 2, y - 1.2 * TEXT_PX * scale), words, ink, font, anchor="mm")
         at = x + 0.7 * wide * (0.5 - 0.5 * math.cos(2.0 * seconds))
         for left, length, color in ((x, wide, field), (at, 0.3 * wide, accent)):
@@ -130,9 +143,11 @@ class SplashPicture:
         self._context.viewport = (0, 0, *size)
         red, green, blue = PANEL.to_bytes(3, "big")
         screen.clear(red / 255, green / 255, blue / 255)
-        picture, left = self._context.texture(image.size, 4, image.tobytes()), (size[0] - width) // 2
+        picture = self._context.texture(image.size, 4, image.tobytes())
+        left = (size[0] - width) // 2
         picture.use(0)
-        self._program["picture"], self._program["left"] = 0, left
+        self._program["picture"] = 0
+        self._program["left"] = left
         self._context.viewport = (left, 0, *image.size)
         self._context.enable_only(moderngl.NOTHING)
         self._vao.render(moderngl.TRIANGLES, vertices=3)

@@ -27,7 +27,9 @@ def section(name: str, layout: Layout, ui: UiContext) -> Layout:
     """The heading of a part of the panel, with an arrow; the layout with it folded or not, as it was left."""
     x, y = imgui.get_cursor_screen_pos()
     with imgui_ctx.push_font(ui.fonts.bold, SMALL_PX):
-        text, tall, step = name.upper(), imgui.get_frame_height(), 16.0 * ui.scale
+        text = name.upper()
+        tall = imgui.get_frame_height()
+        step = 16.0 * ui.scale
         room = (imgui.calc_text_size(text).x + step, tall + 2.0 * ui.scale)
         pressed = imgui.invisible_button(f"section {name}", room, imgui.ButtonFlags_.enable_nav.value)
         color = u32(PALETTE.text if imgui.is_item_hovered() else PALETTE.dim)
@@ -75,7 +77,8 @@ def picture(
     if not texture:
         canvas.add_rect_filled(at, end, u32(PALETTE.card), rounding)
         return
-    corners, white = ((0.0, 0.0), (1.0, 1.0)), u32((1.0, 1.0, 1.0, opacity))
+    corners = ((0.0, 0.0), (1.0, 1.0))
+    white = u32((1.0, 1.0, 1.0, opacity))
     canvas.add_image_rounded(imgui.ImTextureRef(texture), at, end, *corners, white, rounding)
 
 
@@ -161,7 +164,9 @@ def icon_button(
     side = side or imgui.get_frame_height()
     x, y = imgui.get_cursor_screen_pos()
     pressed = bool(imgui.invisible_button(name, (side, side), imgui.ButtonFlags_.enable_nav.value))
-    hovered, canvas, size = imgui.is_item_hovered(), imgui.get_window_draw_list(), imgui.calc_text_size(icon)
+    hovered = imgui.is_item_hovered()
+    canvas = imgui.get_window_draw_list()
+    size = imgui.calc_text_size(icon)
     if hovered or lit:
         ground = u32(PALETTE.chosen if lit else PALETTE.field)
         canvas.add_rect_filled((x, y), (x + side, y + side), ground, 4.0 * ui.scale)
@@ -236,7 +241,8 @@ def menu_item(action: str, on: bool = False, enabled: bool = True, name: str = "
 
 def typed_name(name: str, room: float) -> str | None:
     """The text field of a name; None while it is open, "" where it was left as it was."""
-    storage, slot = imgui.get_state_storage(), int(imgui.get_id("name/focused"))
+    storage = imgui.get_state_storage()
+    slot = int(imgui.get_id("name/focused"))
     if not storage.get_bool(slot):
         imgui.set_keyboard_focus_here()
         storage.set_bool(slot, True)
@@ -347,7 +353,8 @@ def is_entered() -> bool:
 
 def key_step(less: imgui.Key, more: imgui.Key) -> float:
     """How far two arrow keys move the last item, which has the keyboard: as those of the focused layer do."""
-    io, step = imgui.get_io(), 0.0
+    io = imgui.get_io()
+    step = 0.0
     for key, sign in ((less, -1.0), (more, 1.0)):
         imgui.internal.set_key_owner(key, imgui.get_item_id())  # else they would lead to another item
         step += sign * bool(imgui.is_key_pressed(key))
@@ -381,7 +388,8 @@ def value_slider(
     over orders of magnitude is logarithmic. The value is as before, or what the field shows. `wide`: window
     pixels, 0 for the rest of the line
     """
-    logarithmic, context = ends[0] > 0.0, imgui.get_current_context()
+    logarithmic = ends[0] > 0.0
+    context = imgui.get_current_context()
     tabbed = context.nav_activate_flags & imgui.internal.ActivateFlags_.from_tabbing.value
     flags = imgui.SliderFlags_.always_clamp.value
     flags |= imgui.SliderFlags_.logarithmic.value if logarithmic else 0
@@ -394,7 +402,8 @@ def value_slider(
     if tabbed and imgui.is_item_activated():
         imgui.internal.clear_active_id()
     if is_double_clicked():
-        changed, new = True, default
+        changed = True
+        new = default
     first, last, now = (math.log(x) if logarithmic else x for x in (*ends, new if changed else value))
     share = (now - first) / (last - first)
     if imgui.is_item_focused() and context.nav_cursor_visible and not imgui.is_item_active():
@@ -403,12 +412,16 @@ def value_slider(
             moved = first + (share + step) * (last - first)
             moved = math.exp(moved) if logarithmic else moved
             least = value + math.copysign(0.01, step)  # that the field shows
-            changed, new = True, max(moved, least) if step > 0.0 else min(moved, least)
+            changed = True
+            new = max(moved, least) if step > 0.0 else min(moved, least)
             new = min(max(new, ends[0]), ends[1])
     share = min(max(share, 0.0), 1.0)
-    low, high = imgui.get_item_rect_min(), imgui.get_item_rect_max()
-    left, end = (low.x, high.y - 3.0 * ui.scale), (high.x, high.y)
-    canvas, shut = imgui.get_window_draw_list(), (low.x + share * (high.x - low.x), high.y)
+    low = imgui.get_item_rect_min()
+    high = imgui.get_item_rect_max()
+    left = (low.x, high.y - 3.0 * ui.scale)
+    end = (high.x, high.y)
+    canvas = imgui.get_window_draw_list()
+    shut = (low.x + share * (high.x - low.x), high.y)
     canvas.add_rect_filled(left, end, u32(PALETTE.line), 2.0 * ui.scale)
     canvas.add_rect_filled(left, shut, u32(PALETTE.accent), 2.0 * ui.scale)
     return round(new, 2) if changed else value  # unchanged, imgui still rounds to float32
@@ -454,7 +467,8 @@ def choice_row(
 
 def swatch(color: tuple[float, float, float], alpha: float, edge: bool, ui: UiContext) -> None:
     """A small square of a color on the present line; `edge`: with a line around it."""
-    side, tall = 12.0 * ui.scale, imgui.get_frame_height()
+    side = 12.0 * ui.scale
+    tall = imgui.get_frame_height()
     x, y = imgui.get_cursor_screen_pos()
     top = y + (tall - side) / 2
     corners = (x, top), (x + side, top + side)

@@ -58,7 +58,8 @@ class DoubleClicks:
         if self._waiting:
             limit = _ALWAYS_S if self._waiting[0][1] else 0.0
         io = imgui.get_io()
-        io.mouse_double_click_time, io.mouse_single_click_delay = limit, 2.0 * _ALWAYS_S
+        io.mouse_double_click_time = limit
+        io.mouse_single_click_delay = 2.0 * _ALWAYS_S
 
 
 _FLY_KEYS = {name: getattr(glfw, f"KEY_{name}") for name in FLY_KEYS}
@@ -93,7 +94,9 @@ class Window:
     """
 
     def __init__(self, splash: Splash) -> None:
-        self.splash, self.handle, self.context = splash, splash.handle, splash.context
+        self.splash = splash
+        self.handle = splash.handle
+        self.context = splash.context
         self._pointed: tuple[float, float] | None = None
         self._pressed: list[Press] = []
         self._down: dict[int, str] = {}  # names of the keys that are down

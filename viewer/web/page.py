@@ -83,8 +83,10 @@ class Arrays:
         if curve == "log":
             table = np.sign(table) * np.log1p(np.abs(table))
         some = table if len(table) else np.zeros((1, table.shape[1]))
-        low, high = some.min(axis=0), some.max(axis=0)
-        zero, most = (low + high) / 2, LEVELS[kind]
+        low = some.min(axis=0)
+        high = some.max(axis=0)
+        zero = (low + high) / 2
+        most = LEVELS[kind]
         step = np.where(high > low, (high - low) / (2 * most), 1.0)
         levels = np.round((table - zero) / step).astype(f"<{kind}")
         made = zero + step * levels
@@ -138,7 +140,8 @@ def pack(
     place = np.full(len(scene), -1, np.int64)
     place[order] = np.arange(len(order))
     inside = [_ascending(place[gdf.region.members.numpy()]) for gdf in gdfs]
-    arrays, exact = Arrays(), quality == "exact"
+    arrays = Arrays()
+    exact = quality == "exact"
     attributes, made = _scene(arrays, scene, gdfs, order, count, kept, exact)
     overlaps = len(gdfs) > 1 and sum(map(len, inside)) > count
     paints = []
@@ -278,7 +281,8 @@ def _edit(
     overlaps: bool,
 ) -> dict[str, Any]:
     """An edit in the header, and its members in this order."""
-    form, widths = gdf.field.origin, {"shN": 3 * kept}
+    form = gdf.field.origin
+    widths = {"shN": 3 * kept}
     record: dict[str, Any] = {
         "name": gdf.name,
         "recorded": list(gdf.field.recorded),
@@ -303,11 +307,13 @@ def _bases(
     arrays: Arrays, name: str, bases: AttributeBases, order: Tensor, width: int, exact: bool
 ) -> dict[str, Any]:
     """One attribute of an edit, its first `width` channels."""
-    end, scale = bases.end_offset[order, :width], bases.scale[:, :width].clone()
+    end = bases.end_offset[order, :width]
+    scale = bases.scale[:, :width].clone()
     residual = bases.residual_basis[:, order, :width].float()
     if end.dtype == torch.float32 and not exact:
         levels, unit = quantize_bases((end * scale[0])[None], torch.int8 if name == "shN" else torch.int16)
-        end, scale[0] = levels[0], unit[0]
+        end = levels[0]
+        scale[0] = unit[0]
     if bases.residual_basis.dtype == torch.int8:
         residual = bases.residual_basis[:, order, :width]
     elif not exact:
@@ -346,7 +352,8 @@ def _numbers(tensor: Tensor) -> Any:
 MODULES = ("camera", "data", "grade", "compose", "sort", "renderer", "state", "panel", "input", "main")
 """Of `src`, each after those that it imports when it is read; then comes what the page is shown in."""
 STAGES = ("web.vert", "splat.frag", "present.vert", "present.frag", "stretch.frag")
-MAIL, HOST = 25e6, 100e6
+MAIL = 25e6
+HOST = 100e6
 """Bytes: what mail takes, and common hosts."""
 
 _IMPORT = re.compile(r"^import .*?;\n", re.MULTILINE | re.DOTALL)
@@ -397,7 +404,8 @@ class PageTexts:
 
 def build_page(container: bytes, texts: PageTexts) -> str:
     """The page of a container, see `pack`, as a file of its own."""
-    style, code = texts.style, join()
+    style = texts.style
+    code = join()
     parts = {
         "title": html.escape(texts.title),
         "version": __version__,
@@ -440,7 +448,8 @@ def _hash(text: str) -> str:
 
 
 def _with_links(text: str) -> str:
-    parts, at = [], 0
+    parts = []
+    at = 0
     for found in _LINK.finditer(text):
         address = html.escape(found[0])
         parts += [html.escape(text[at : found.start()])]

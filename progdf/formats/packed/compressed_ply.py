@@ -24,7 +24,9 @@ _CHUNK = 256
 _CONVERT = "convert it with `splat-transform in.ply out.compressed.ply`"
 _MORTON_BITS = 21  # of each axis: three fit a word
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
-_XYZ, _SCALES, _RGB = ("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b")
+_XYZ = ("x", "y", "z")
+_SCALES = ("scale_x", "scale_y", "scale_z")
+_RGB = ("r", "g", "b")
 _SH_REST = (0, 9, 24, 45)
 
 Floats = npt.NDArray[np.float32]
@@ -43,7 +45,9 @@ def read_compressed_ply(ply: PlyFile) -> tuple[Gaussians, tuple[str, ...]]:
     Raises:
         ProgdfError: a table is missing or does not fit the others, or a feature is not supported.
     """
-    name, count, counts = ply.path, ply.counts["vertex"], ply.counts
+    name = ply.path
+    count = ply.counts["vertex"]
+    counts = ply.counts
     if ply.layout.text:
         raise unsupported_error(name, "packed Gaussians as text (format ascii)", _CONVERT)
     if not count:
@@ -96,7 +100,8 @@ def write_compressed_ply(path: Path, scene: Gaussians) -> None:
         scene: N Gaussians of degree 3 at most, finite
     """
     arrays: dict[str, Floats] = {name: getattr(scene, name).cpu().numpy() for name in ATTRIBUTES}
-    count, at = len(scene), np.arange(len(scene)) // _CHUNK
+    count = len(scene)
+    at = np.arange(len(scene)) // _CHUNK
     starts = np.arange(0, count, _CHUNK)
     values = {
         _XYZ: scene.world_means.cpu().numpy().astype(np.float32),
@@ -162,7 +167,8 @@ def morton_order(means: Tensor) -> Tensor:
     Returns:
         [N] int64
     """
-    low, span = means.amin(dim=0), (means.amax(dim=0) - means.amin(dim=0)).clamp_min(1e-30)
+    low = means.amin(dim=0)
+    span = (means.amax(dim=0) - means.amin(dim=0)).clamp_min(1e-30)
     cells = ((means - low) / span * (2**_MORTON_BITS - 1)).long()
     code = torch.zeros(len(means), dtype=torch.int64)
     for bit in range(_MORTON_BITS):

@@ -23,7 +23,8 @@ from progdf.io.atomic import read_file
 from progdf.io.file_rules import damage_error, unsupported_error
 from progdf.sh import C0
 
-_HEADER, _SECTION = 4096, 1024
+_HEADER = 4096
+_SECTION = 1024
 _CONVERT = "convert it with `splat-transform in.ksplat out.ply`"
 _SH_REST = (0, 9, 24, 45)
 _SH_TYPES = ("<f4", "<f2", "u1")
@@ -92,7 +93,8 @@ def read_ksplat(path: str | os.PathLike[str]) -> tuple[Gaussians, int]:
         raise damage_error(path, f"it ends within the headers of its {sections} sections")
     low, high = (float(np.frombuffer(content, "<f4", 1, at)[0]) for at in (36, 40))
     sh_range = (low or -1.5, high or 1.5)
-    at, parts = _HEADER + sections * _SECTION, []
+    at = _HEADER + sections * _SECTION
+    parts = []
     for head in range(_HEADER, _HEADER + sections * _SECTION, _SECTION):
         fields = _SECTION_FIELDS.items()
         section = {name: np.frombuffer(content, t, 1, head + o).item() for name, (t, o) in fields}

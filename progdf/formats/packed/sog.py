@@ -140,7 +140,8 @@ def read_sog(path: Path) -> SogScene:
         if meta.version == 1:
             log_scales = _lerp(path, meta.scales, "scales", scales[:, :3] / 255.0)
             base = _lerp(path, meta.sh0, "sh0", colors / 255.0)
-            sh0, logits = base[:, :3], base[:, 3]
+            sh0 = base[:, :3]
+            logits = base[:, 3]
         else:
             log_scales = _codebook(path, meta.scales, "scales")[scales[:, :3]]
             sh0 = _codebook(path, meta.sh0, "sh0")[colors[:, :3]]
@@ -276,7 +277,8 @@ def _higher_bands(path: Path, meta: _Meta, images: list[Bytes], count: int) -> F
     palette, labels = images
     colors = palette[:, :, :3]
     if meta.version == 1:
-        low, high = part.mins, part.maxs
+        low = part.mins
+        high = part.maxs
         if not isinstance(low, float | int) or not isinstance(high, float | int):
             raise damage_error(path, "shN.mins and shN.maxs are no numbers")
         values = low + (high - low) * (colors / 255.0)

@@ -40,7 +40,8 @@ from .jit import kernel
 
 Array = NDArray[Any]
 
-_PER_UNIT, _PER_UNIT2 = 1.0 / UNIT, 1.0 / (UNIT * UNIT)
+_PER_UNIT = 1.0 / UNIT
+_PER_UNIT2 = 1.0 / (UNIT * UNIT)
 
 CAMERA = 16
 """Numbers of the camera's gradient: viewmat rows 0..2 (12), then fx, fy, cx, cy."""
@@ -63,7 +64,9 @@ def fill_basis_gradient(degree: int, x: float, y: float, z: float, slopes: Array
         slopes[7, 0], slopes[7, 2] = _C2[3] * z, _C2[3] * x
         slopes[8, 0], slopes[8, 1] = 2 * _C2[4] * x, -2 * _C2[4] * y
     if degree >= 3:
-        xx, yy, zz = x * x, y * y, z * z
+        xx = x * x
+        yy = y * y
+        zz = z * z
         slopes[9, 0], slopes[9, 1] = 6 * _C3[0] * x * y, 3 * _C3[0] * (xx - yy)
         slopes[10, 0], slopes[10, 1], slopes[10, 2] = _C3[1] * y * z, _C3[1] * x * z, _C3[1] * x * y
         slopes[11, 0] = -2 * _C3[2] * x * y
@@ -125,11 +128,16 @@ def shade_backward(
 def _axes_gradient(seen: Footprint, g: tuple[float, ...], camera: Pinhole) -> tuple[float, float, Vec, Vec]:
     """Gradients to the center in pixels (2) and to the 2D axes p0, p1, from Σg and its moments (6)."""
     # g = −dL/dσ; u and v are in units of their own
-    e0, e1 = -g[1] * _PER_UNIT, -g[2] * _PER_UNIT
-    h00, h01, h11 = -g[3] * _PER_UNIT2, -g[4] * _PER_UNIT2, -g[5] * _PER_UNIT2
+    e0 = -g[1] * _PER_UNIT
+    e1 = -g[2] * _PER_UNIT
+    h00 = -g[3] * _PER_UNIT2
+    h01 = -g[4] * _PER_UNIT2
+    h11 = -g[5] * _PER_UNIT2
     sigma_y = math.sqrt(seen.c + camera.dilation)
     inv_root = 1.0 / (math.sqrt(seen.det) * sigma_y)
-    l11, l21, l22 = sigma_y * sigma_y * inv_root, -seen.b * inv_root, 1.0 / sigma_y
+    l11 = sigma_y * sigma_y * inv_root
+    l21 = -seen.b * inv_root
+    l22 = 1.0 / sigma_y
     # dL/dM = −L H (LᵀM); the first row of LᵀM is (p1 × (p0 × p1) + ε p0) / root
     along = blend2(inv_root, cross(seen.p1, seen.normal), camera.dilation * inv_root, seen.p0)
     d0 = blend2(-l11 * h00, along, -l11 * h01 * l22, seen.p1)
@@ -154,8 +162,12 @@ def _quat_gradient(seen: Footprint, d0: Vec, d1: Vec) -> tuple[float, float, flo
     v0 = blend2(seen.a0[0], d0, seen.a1[0], d1)
     v1 = blend2(seen.a0[1], d0, seen.a1[1], d1)
     v2 = blend2(seen.a0[2], d0, seen.a1[2], d1)
-    sym01, sym02, sym12 = v0[1] + v1[0], v0[2] + v2[0], v1[2] + v2[1]
-    skew01, skew02, skew12 = v1[0] - v0[1], v0[2] - v2[0], v2[1] - v1[2]
+    sym01 = v0[1] + v1[0]
+    sym02 = v0[2] + v2[0]
+    sym12 = v1[2] + v2[1]
+    skew01 = v1[0] - v0[1]
+    skew02 = v0[2] - v2[0]
+    skew12 = v2[1] - v1[2]
     gw = 2.0 * (q1 * skew12 + q2 * skew02 + q3 * skew01)
     gx = 2.0 * (q2 * sym01 + q3 * sym02 + q0 * skew12 - 2.0 * q1 * (v1[1] + v2[2]))
     gy = 2.0 * (q1 * sym01 + q3 * sym12 + q0 * skew02 - 2.0 * q2 * (v0[0] + v2[2]))
@@ -175,13 +187,17 @@ def _point_gradient(
     −(cx + half)/fx; the same for y.
     """
     inv_z = seen.inv_z
-    down_a, down_b = dot(ga, camera.rows[2]), dot(gb, camera.rows[2])
+    down_a = dot(ga, camera.rows[2])
+    down_b = dot(gb, camera.rows[2])
     grad_jx = dot(ga, camera.rows[0]) - seen.tan_x * down_a
     grad_jy = dot(gb, camera.rows[1]) - seen.tan_y * down_b
-    by_tan_x, by_tan_y = inv_z * down_a, inv_z * down_b  # over −fx, −fy
+    # over −fx, −fy
+    by_tan_x = inv_z * down_a
+    by_tan_y = inv_z * down_b
     slope_x = camera.fx * (grad_px - (by_tan_x if seen.free_x else 0.0))
     slope_y = camera.fy * (grad_py - (by_tan_y if seen.free_y else 0.0))
-    by_limit_x, by_limit_y = 0.0 if seen.free_x else by_tan_x, 0.0 if seen.free_y else by_tan_y
+    by_limit_x = 0.0 if seen.free_x else by_tan_x
+    by_limit_y = 0.0 if seen.free_y else by_tan_y
     towards = slope_x * seen.x + slope_y * seen.y + grad_jx * camera.fx + grad_jy * camera.fy
     by_focal = (
         (grad_px * seen.x + grad_jx) * inv_z + by_limit_x * seen.tan_x,
@@ -229,7 +245,8 @@ def project_backward(
     gradients.scales[begin:end] = 0.0
     gradients.opacities[begin:end] = 0.0
     gradients.colors[begin:end] = 0.0
-    eye, total = camera_center(camera), scratch.total
+    eye = camera_center(camera)
+    total = scratch.total
     for i in range(begin, end):
         if offsets[i] == offsets[i + 1] or (grad_mask.size > 0 and not grad_mask[i]):
             continue
@@ -237,8 +254,10 @@ def project_backward(
         for slot in range(offsets[i], offsets[i + 1]):
             for k in range(SUMS):
                 total[k] += sums[slot, k]
-        by_rgb, by_ray = (total[0], total[1], total[2]), (0.0, 0.0, 0.0)
-        mean, scale = vec(scene.means, i), vec(scene.scales, i)
+        by_rgb = (total[0], total[1], total[2])
+        by_ray = (0.0, 0.0, 0.0)
+        mean = vec(scene.means, i)
+        scale = vec(scene.scales, i)
         if camera.degree < 0:
             _set(gradients.colors[i], 0, by_rgb)
         else:
@@ -251,16 +270,20 @@ def project_backward(
         seen = footprint(camera, mean, scale, quat_of(scene.quats, i))
         grad_px, grad_py, d0, d1 = _axes_gradient(seen, g, camera)
         _set(gradients.scales, i, blend2(1.0, times(d0, seen.turned0), 1.0, times(d1, seen.turned1)))
-        d0, d1 = times(d0, scale), times(d1, scale)
+        d0 = times(d0, scale)
+        d1 = times(d1, scale)
         by_quat = _quat_gradient(seen, d0, d1)
         for k in range(4):
             gradients.quats[i, k] = by_quat[k]
         r0, r1, r2 = seen.rotation
-        ga, gb = (dot(r0, d0), dot(r1, d0), dot(r2, d0)), (dot(r0, d1), dot(r1, d1), dot(r2, d1))
+        ga = (dot(r0, d0), dot(r1, d0), dot(r2, d0))
+        gb = (dot(r0, d1), dot(r1, d1), dot(r2, d1))
         point, by_focal, by_center = _point_gradient(camera, seen, grad_px, grad_py, ga, gb)
         _set(gradients.means, i, blend2(1.0, row_times(point, camera.rows), 1.0, by_ray))
-        jx, jy = camera.fx * seen.inv_z, camera.fy * seen.inv_z
-        row0, row1 = blend2(point[0], mean, jx, ga), blend2(point[1], mean, jy, gb)
+        jx = camera.fx * seen.inv_z
+        jy = camera.fy * seen.inv_z
+        row0 = blend2(point[0], mean, jx, ga)
+        row1 = blend2(point[1], mean, jy, gb)
         row2 = blend2(point[2], mean, -1.0, blend2(jx * seen.tan_x, ga, jy * seen.tan_y, gb))
         # and the colors' by the eye, −RᵀT
         row0 = blend2(1.0, row0, camera.shift[0], by_ray)

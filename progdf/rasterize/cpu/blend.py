@@ -103,7 +103,8 @@ class TileScratch(NamedTuple):
 
 def new_scratch() -> TileScratch:
     """Room for six planes and a batch."""
-    state, batch = np.empty(6 * int(PLANE), np.float32), np.empty(BATCH * int(SPLAT), np.float32)
+    state = np.empty(6 * int(PLANE), np.float32)
+    batch = np.empty(BATCH * int(SPLAT), np.float32)
     return TileScratch(state, batch, np.empty(4, np.int64))
 
 
@@ -145,17 +146,23 @@ def find_spans(
         bounds: left, top, right, bottom of what to look at, from (x, y). [4] int64
         batch: out
     """
-    low, high = np.float64(bounds[0]), np.float64(bounds[2])
-    shapes, colors = splats.shapes, splats.colors
+    low = np.float64(bounds[0])
+    high = np.float64(bounds[2])
+    shapes = splats.shapes
+    colors = splats.colors
     for index in range(begin, end):
         prefetch(shapes, members[index])
         prefetch(colors, members[index])
     for index in range(begin, end):
         at = np.uint64(index - begin) * SPLAT
         s = members[index]
-        mx, my = shapes[s, MX] - x - 0.5, shapes[s, MY] - y - 0.5
-        slope, l11 = shapes[s, SLOPE], shapes[s, L11]
-        inv_l11, l22, r2 = shapes[s, INV_L11], shapes[s, L22], shapes[s, R2]
+        mx = shapes[s, MX] - x - 0.5
+        my = shapes[s, MY] - y - 0.5
+        slope = shapes[s, SLOPE]
+        l11 = shapes[s, L11]
+        inv_l11 = shapes[s, INV_L11]
+        l22 = shapes[s, L22]
+        r2 = shapes[s, R2]
         for row in range(np.uint64(TILE_H)):
             dy = np.float64(np.int32(row)) - my
             v = l22 * dy
@@ -167,7 +174,8 @@ def find_spans(
             # counting from the peak keeps u = l11·(column − center) free of cancellation in float32; far
             # peaks (needles, giants) lie where l11 is small
             peak = min(max(np.floor(center + 0.5), -65536.0), 65536.0)
-            start, stop = min(start, high), max(stop, low) if remaining >= 0.0 else low
+            start = min(start, high)
+            stop = max(stop, low) if remaining >= 0.0 else low
             batch[at + BEGIN + row] = start
             batch[at + START + row] = start - peak
             batch[at + STOP + row] = stop - peak
@@ -286,7 +294,8 @@ def blend(
         members = lists.members[lists.starts[tile] : lists.starts[tile + 1]]
         _blend_tile(state, x, y, members, splats, bounds, batch, last)
         tile_bounds(camera, x, y, bounds)  # blending narrowed it
-        left, width = np.uint64(x + bounds[0] - camera.window[0]), np.uint64(bounds[2] - bounds[0])
+        left = np.uint64(x + bounds[0] - camera.window[0])
+        width = np.uint64(bounds[2] - bounds[0])
         for row in range(np.uint64(bounds[1]), np.uint64(bounds[3])):
             i = np.uint64(y - camera.window[1]) + row
             p = row * np.uint64(TILE_W) + np.uint64(bounds[0])
@@ -321,7 +330,9 @@ def _blend_splat_backward(
             alpha = select(raw < MOST, raw, MOST)
             inverse = ONE / (ONE - alpha)
             before = load(state, p) * inverse
-            g0, g1, g2 = load(state, p + _G0), load(state, p + _G1), load(state, p + _G2)
+            g0 = load(state, p + _G0)
+            g1 = load(state, p + _G1)
+            g2 = load(state, p + _G2)
             front = red * g0 + green * g1 + blue * g2
             behind = load(state, p + _BEHIND)
             weight = alpha * before
@@ -332,7 +343,8 @@ def _blend_splat_backward(
             s_r += weight * g0
             s_g += weight * g1
             s_b += weight * g2
-            g_u, g_v = g * u, g * v
+            g_u = g * u
+            g_v = g * v
             s_0 += g
             s_u += g_u
             s_v += g_v
@@ -410,14 +422,16 @@ def blend_backward(
     """
     plane = np.int64(PLANE)
     state, batch, bounds = scratch
-    by_image, by_transmittance = gradients.image, gradients.transmittance
+    by_image = gradients.image
+    by_transmittance = gradients.transmittance
     for tile in range(begin, end):
         x, y = tile_corner(camera, tile)
         state[:plane] = ONE
         state[plane : 5 * plane] = ZERO
         state[5 * plane :] = -ONE
         tile_bounds(camera, x, y, bounds)
-        left, width = np.uint64(x + bounds[0] - camera.window[0]), np.uint64(bounds[2] - bounds[0])
+        left = np.uint64(x + bounds[0] - camera.window[0])
+        width = np.uint64(bounds[2] - bounds[0])
         for row in range(np.uint64(bounds[1]), np.uint64(bounds[3])):
             i = np.uint64(y - camera.window[1]) + row
             p = row * np.uint64(TILE_W) + np.uint64(bounds[0])
@@ -482,7 +496,8 @@ def _add_weights(state: Array, batch: Array, splat: Number, out: Array) -> None:
             covered = offset < stop
             alpha = select(covered, exp2(top - u * u), ZERO)
             alpha = select(alpha < MOST, alpha, MOST)
-            before, mask = load(state, p), load(state, p + PLANE)
+            before = load(state, p)
+            mask = load(state, p + PLANE)
             after = before * (ONE - alpha)
             taken = covered & (after > LEAST)
             weight = select(taken, alpha * before, ZERO)
@@ -535,21 +550,26 @@ def _list_tile(
 ) -> tuple[int, int]:  # fmt: skip
     """One tile's runs and entries, written from `run` and `entry` on, as far as there is room; how far."""
     x, y = tile_corner(camera, tile)
-    left, right = max(0, camera.window[0] - x), min(TILE_W, camera.window[2] - x)
-    top, bottom = max(0, camera.window[1] - y), min(TILE_H, camera.window[3] - y)
+    left = max(0, camera.window[0] - x)
+    right = min(TILE_W, camera.window[2] - x)
+    top = max(0, camera.window[1] - y)
+    bottom = min(TILE_H, camera.window[3] - y)
     width = camera.window[2] - camera.window[0]
     corner = (y - camera.window[1]) * width + x - camera.window[0]
-    through, spare = state[: TILE_H * TILE_W], state[TILE_H * TILE_W : 2 * TILE_H * TILE_W]
+    through = state[: TILE_H * TILE_W]
+    spare = state[TILE_H * TILE_W : 2 * TILE_H * TILE_W]
     through[:], spare[:] = ZERO, listed.lost  # of what may still be left out
     for i in range(top, bottom):
         for j in range(left, right):
             through[i * TILE_W + j] = ONE if listed.places[corner + i * width + j] >= 0 else ZERO
     for s in members:
         shape = splats.shapes[s]
-        mx, my = shape[MX] - x - 0.5, shape[MY] - y - 0.5
+        mx = shape[MX] - x - 0.5
+        my = shape[MY] - y - 0.5
         first = max(math.ceil(my - shape[EXTENT_Y]), top)
         end = min(math.floor(my + shape[EXTENT_Y]) + 1, bottom)
-        begun, base = entry, 0
+        begun = entry
+        base = 0
         for i in range(first, end):
             v = shape[L22] * (i - my)
             remaining = shape[R2] - v * v
@@ -580,7 +600,9 @@ def _list_tile(
                         out.weights[entry] = alpha * before
                     entry += 1
         if entry > begun:
-            out.rows[run], out.counts[run], out.firsts[run] = listed.rows[s], entry - begun, base
+            out.rows[run] = listed.rows[s]
+            out.counts[run] = entry - begun
+            out.firsts[run] = base
             run += 1
     return run, entry
 

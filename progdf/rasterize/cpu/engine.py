@@ -59,7 +59,9 @@ _T = TypeVar("_T")
 
 _LEAST_TILES = 4  # fewer are not worth a call
 _CHUNKS = 4  # for each thread: tiles take unequally long
-_MOST_TILES, _MOST_GAUSSIANS = 24, 32 * BLOCK  # of a chunk: a picture that is dropped stops between two
+# of a chunk: a picture that is dropped stops between two
+_MOST_TILES = 24
+_MOST_GAUSSIANS = 32 * BLOCK
 TILE_ROOM = 8  # tiles of a Gaussian that there is room for; where chunks have more, these are listed twice
 ENTRY_ROOM = 16  # and pixels that a Gaussian weighs in of a tile
 _ALL = np.empty(0, np.bool_)  # which rows get gradients, where all do
@@ -82,10 +84,12 @@ def make_pinhole(view: RasterView) -> Pinhole:
     rotation = view.viewmat.tolist()
     (fx, _, cx), (_, fy, cy), _ = view.K.tolist()
     x0, y0, x1, y1 = view.crop
-    column, row = x0 // TILE_W, y0 // TILE_H
+    column = x0 // TILE_W
+    row = y0 // TILE_H
     # clamp as the original does (Kerbl 2023, computeCov2D): off-screen Gaussians would blow up the Jacobian;
     # limits as in gsplat
-    margin_x, margin_y = FRUSTUM_MARGIN * 0.5 * view.width / fx, FRUSTUM_MARGIN * 0.5 * view.height / fy
+    margin_x = FRUSTUM_MARGIN * 0.5 * view.width / fx
+    margin_y = FRUSTUM_MARGIN * 0.5 * view.height / fy
     return Pinhole(
         rows=(tuple(rotation[0][:3]), tuple(rotation[1][:3]), tuple(rotation[2][:3])),
         shift=(rotation[0][3], rotation[1][3], rotation[2][3]),
@@ -195,7 +199,8 @@ class _Rasterize(torch.autograd.Function):
         camera, grad_rows, scene, background, splats, lists, out = ctx.forward_pass
         viewmat, K = ctx.saved_tensors[6:8]  # and that none of them has been changed since is checked
         by_image, by_transmittance = (np.ascontiguousarray(grad.numpy()) for grad in grads)
-        by_out, grad_mask = Picture(by_image, by_transmittance, out.last), _ALL
+        by_out = Picture(by_image, by_transmittance, out.last)
+        grad_mask = _ALL
         if grad_rows is not None:
             grad_mask = np.bincount(grad_rows.numpy(force=True), minlength=len(scene.means)) > 0
         gradients = Scene(*(np.empty(array.shape, np.float32) for array in scene))
@@ -230,7 +235,8 @@ def _new_picture(camera: Pinhole, with_last: bool) -> Picture:
 
 def _camera_gradients(parts: Array, viewmat: Tensor, K: Tensor) -> tuple[Tensor, Tensor]:
     camera = parts.sum(axis=0)
-    by_viewmat, by_K = np.zeros((4, 4)), np.zeros((3, 3))
+    by_viewmat = np.zeros((4, 4))
+    by_K = np.zeros((3, 3))
     by_viewmat[:3] = camera[:12].reshape(3, 4)
     by_K[0, 0], by_K[1, 1], by_K[0, 2], by_K[1, 2] = camera[12:]
     return torch.from_numpy(by_viewmat).to(viewmat), torch.from_numpy(by_K).to(K)
@@ -286,10 +292,12 @@ def color_map(
     index = np.dtype(np.uint16 if TILE_H * (x1 - x0) < 1 << 16 else np.uint32)
 
     def list_tiles(begin: int, end: int) -> list[Array]:
-        most, room = int(lists.starts[end] - lists.starts[begin]), -1
+        most = int(lists.starts[end] - lists.starts[begin])
+        room = -1
         entry = ENTRY_ROOM * most
         while entry > room:
-            room, out = entry, _new_runs(most, entry, index)
+            room = entry
+            out = _new_runs(most, entry, index)
             run, entry = list_weights(begin, end, new_scratch(), splats, lists, pinhole, listed, out)
         return [*(part[:run].copy() for part in out[:3]), *(part[:entry].copy() for part in out[3:])]
 
@@ -300,7 +308,9 @@ def color_map(
 
 def _new_runs(runs: int, entries: int, index: np.dtype[Any]) -> Runs:
     """Room for them; `index`: of a pixel in its run."""
-    rows, counts, firsts = np.empty(runs, np.int32), np.empty(runs, np.uint16), np.empty(runs, np.int32)
+    rows = np.empty(runs, np.int32)
+    counts = np.empty(runs, np.uint16)
+    firsts = np.empty(runs, np.int32)
     return Runs(rows, counts, firsts, np.empty(entries, index), np.empty(entries, np.float32))
 
 
@@ -309,12 +319,16 @@ def add_images(runs: Runs, colors: Array, image: Array) -> None:
     """image += Σ w·c. colors: [M,3] float32; image: [h·w,3] float32"""
     end = np.uint64(0)
     for run in range(runs.rows.size):
-        row, begin = runs.rows[run], end
+        row = runs.rows[run]
+        begin = end
         end = begin + np.uint64(runs.counts[run])
-        red, green, blue = colors[row, 0], colors[row, 1], colors[row, 2]
+        red = colors[row, 0]
+        green = colors[row, 1]
+        blue = colors[row, 2]
         first = np.uint64(runs.firsts[run])  # unsigned: of signed ones numba asks if they count from the end
         for k in range(begin, end):
-            p, w = first + np.uint64(runs.pixels[k]), runs.weights[k]
+            p = first + np.uint64(runs.pixels[k])
+            w = runs.weights[k]
             image[p, 0] += w * red
             image[p, 1] += w * green
             image[p, 2] += w * blue
@@ -326,11 +340,13 @@ def add_channels(runs: Runs, values: Array, image: Array) -> None:
     half as long again."""
     end = np.uint64(0)
     for run in range(runs.rows.size):
-        row, begin = runs.rows[run], end
+        row = runs.rows[run]
+        begin = end
         end = begin + np.uint64(runs.counts[run])
         first = np.uint64(runs.firsts[run])
         for k in range(begin, end):
-            p, w = first + np.uint64(runs.pixels[k]), runs.weights[k]
+            p = first + np.uint64(runs.pixels[k])
+            w = runs.weights[k]
             for c in range(values.shape[1]):
                 image[p, c] += w * values[row, c]
 
@@ -341,10 +357,12 @@ def add_gradients(runs: Runs, gradient: Array, by_colors: Array) -> None:
     end = np.uint64(0)
     for run in range(runs.rows.size):
         red = green = blue = np.float32(0.0)
-        begin, end = end, end + np.uint64(runs.counts[run])
+        begin = end
+        end = end + np.uint64(runs.counts[run])
         first = np.uint64(runs.firsts[run])
         for k in range(begin, end):
-            p, w = first + np.uint64(runs.pixels[k]), runs.weights[k]
+            p = first + np.uint64(runs.pixels[k])
+            w = runs.weights[k]
             red += w * gradient[p, 0]
             green += w * gradient[p, 1]
             blue += w * gradient[p, 2]

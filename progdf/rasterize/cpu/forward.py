@@ -24,7 +24,8 @@ Array = NDArray[Any]
 Vec = tuple[float, float, float]
 Quat = tuple[float, float, float, float]
 
-TILE_W, TILE_H = 64, 8
+TILE_W = 64
+TILE_H = 8
 """Pixels of a tile. Wide: a row of a tile is what the pixel loops vectorize over."""
 
 _DIGIT = 8  # bits by which depths are sorted at a time; eleven take as long
@@ -36,7 +37,8 @@ MX, MY, SLOPE, L11, INV_L11, L22, R2, EXTENT_Y = range(8)
 UNIT = math.sqrt(0.5 * math.log2(math.e))
 """u and v per standard deviation."""
 
-_PER_UNIT, _PER_ALPHA_MIN = 1.0 / UNIT, 1.0 / ALPHA_MIN
+_PER_UNIT = 1.0 / UNIT
+_PER_ALPHA_MIN = 1.0 / ALPHA_MIN
 _CUT_RADIUS2 = 2.0 * math.log(1.0 / ALPHA_MIN)  # squared Mahalanobis distance where an opaque one ends
 
 
@@ -136,7 +138,9 @@ def row_times(a: Vec, rows: tuple[Vec, Vec, Vec]) -> Vec:
 @kernel(inline=True)
 def view_direction(point: Vec, eye: Vec) -> tuple[float, float, float, float]:
     """Unit vector from the eye to a point, world axes, and 1/distance (zeros at the eye itself)."""
-    x, y, z = point[0] - eye[0], point[1] - eye[1], point[2] - eye[2]
+    x = point[0] - eye[0]
+    y = point[1] - eye[1]
+    z = point[2] - eye[2]
     squared = x * x + y * y + z * z
     inverse = 1.0 / math.sqrt(squared) if squared > 0.0 else 0.0
     return x * inverse, y * inverse, z * inverse, inverse
@@ -151,7 +155,9 @@ def fill_basis(degree: int, x: float, y: float, z: float, basis: Array) -> None:
         basis[2] = _C1 * z
         basis[3] = -_C1 * x
     if degree >= 2:
-        xx, yy, zz = x * x, y * y, z * z
+        xx = x * x
+        yy = y * y
+        zz = z * z
         basis[4] = _C2[0] * x * y
         basis[5] = _C2[1] * y * z
         basis[6] = _C2[2] * (2 * zz - xx - yy)
@@ -227,19 +233,26 @@ def rotation_rows(w: float, x: float, y: float, z: float) -> tuple[Vec, Vec, Vec
 @kernel(contract=True, inline=True)
 def footprint(camera: Pinhole, mean: Vec, scale: Vec, quat: Quat) -> Footprint:
     """Project a Gaussian that is in front of the camera."""
-    x, y = dot(camera.rows[0], mean) + camera.shift[0], dot(camera.rows[1], mean) + camera.shift[1]
+    x = dot(camera.rows[0], mean) + camera.shift[0]
+    y = dot(camera.rows[1], mean) + camera.shift[1]
     inv_z = 1.0 / (dot(camera.rows[2], mean) + camera.shift[2])
-    ratio_x, ratio_y = x * inv_z, y * inv_z
+    ratio_x = x * inv_z
+    ratio_y = y * inv_z
     tan_x = min(max(ratio_x, camera.limits_x[0]), camera.limits_x[1])
     tan_y = min(max(ratio_y, camera.limits_y[0]), camera.limits_y[1])
-    jx, jy = camera.fx * inv_z, camera.fy * inv_z
+    jx = camera.fx * inv_z
+    jy = camera.fy * inv_z
     a0 = blend2(jx, camera.rows[0], -jx * tan_x, camera.rows[2])
     a1 = blend2(jy, camera.rows[1], -jy * tan_y, camera.rows[2])
     qw, qx, qy, qz, inv_length = unit_quat(quat[0], quat[1], quat[2], quat[3])
     rotation = rotation_rows(qw, qx, qy, qz)
-    turned0, turned1 = row_times(a0, rotation), row_times(a1, rotation)
-    p0, p1 = times(turned0, scale), times(turned1, scale)
-    a, b, c = dot(p0, p0), dot(p0, p1), dot(p1, p1)
+    turned0 = row_times(a0, rotation)
+    turned1 = row_times(a1, rotation)
+    p0 = times(turned0, scale)
+    p1 = times(turned1, scale)
+    a = dot(p0, p0)
+    b = dot(p0, p1)
+    c = dot(p1, p1)
     # ac − b² cancels for needles (4 % wrong at 1000 px in float32); the cross product does not
     normal = cross(p0, p1)
     det0 = dot(normal, normal)
@@ -258,7 +271,9 @@ def largest_extents(camera: Pinhole, scene: Scene, i: int) -> tuple[bool, float,
         whether it can be drawn at all; its center in pixels and camera z; the squares of half the sides of a
         box around it in pixels
     """
-    mean, scale, opacity = vec(scene.means, i), vec(scene.scales, i), np.float64(scene.opacities[i])
+    mean = vec(scene.means, i)
+    scale = vec(scene.scales, i)
+    opacity = np.float64(scene.opacities[i])
     z = dot(camera.rows[2], mean) + camera.shift[2]
     total = abs(mean[0]) + abs(mean[1]) + abs(mean[2]) + abs(scale[0]) + abs(scale[1]) + abs(scale[2])
     if not (z > camera.near and opacity >= ALPHA_MIN and total + opacity < np.inf):
@@ -276,12 +291,14 @@ def extents(
     inv_z = 1.0 / z
     tan_x = (dot(camera.rows[0], mean) + camera.shift[0]) * inv_z
     tan_y = (dot(camera.rows[1], mean) + camera.shift[1]) * inv_z
-    px, py = camera.fx * tan_x + camera.cx, camera.fy * tan_y + camera.cy
+    px = camera.fx * tan_x + camera.cx
+    py = camera.fy * tan_y + camera.cy
     tan_x = min(max(tan_x, camera.limits_x[0]), camera.limits_x[1])
     tan_y = min(max(tan_y, camera.limits_y[0]), camera.limits_y[1])
     # ln x ≤ x − 1; 1.001: the viewmat's rotation is one only within rounding
     radius2 = 1.001 * (_CUT_RADIUS2 + 2.0 * max(opacity - 1.0, 0.0))
-    jx, jy = camera.fx * largest * inv_z, camera.fy * largest * inv_z
+    jx = camera.fx * largest * inv_z
+    jy = camera.fy * largest * inv_z
     wide2 = radius2 * (jx * jx * (1.0 + tan_x * tan_x) + camera.dilation)
     high2 = radius2 * (jy * jy * (1.0 + tan_y * tan_y) + camera.dilation)
     return px, py, wide2, high2
@@ -312,23 +329,32 @@ def project(begin: int, end: int, scene: Scene, camera: Pinhole, splats: Splats,
     """
     eye = camera_center(camera)
     window = camera.window
-    x0, y0, x1, y1 = float(window[0]), float(window[1]), float(window[2]), float(window[3])
+    x0 = float(window[0])
+    y0 = float(window[1])
+    x1 = float(window[2])
+    y1 = float(window[3])
     for i in range(begin, end):
         usable, px, py, z, wide2, high2 = largest_extents(camera, scene, i)
-        splats.means2d[i, 0], splats.means2d[i, 1], splats.depths[i] = px, py, z
+        splats.means2d[i, 0] = px
+        splats.means2d[i, 1] = py
+        splats.depths[i] = z
         splats.visible[i] = False
-        out_x, out_y = max(max(x0 - px, px - x1), 0.0), max(max(y0 - py, py - y1), 0.0)
+        out_x = max(max(x0 - px, px - x1), 0.0)
+        out_y = max(max(y0 - py, py - y1), 0.0)
         if not (usable and out_x * out_x <= wide2 and out_y * out_y <= high2):
             continue
         seen = footprint(camera, vec(scene.means, i), vec(scene.scales, i), quat_of(scene.quats, i))
         opacity = np.float64(scene.opacities[i])
         if camera.antialiased:
             opacity = opacity * math.sqrt(max(ANTIALIAS_FLOOR, seen.det0 / seen.det))
-        sigma_x, sigma_y = math.sqrt(seen.a + camera.dilation), math.sqrt(seen.c + camera.dilation)
-        px, py = camera.fx * seen.x * seen.inv_z + camera.cx, camera.fy * seen.y * seen.inv_z + camera.cy
+        sigma_x = math.sqrt(seen.a + camera.dilation)
+        sigma_y = math.sqrt(seen.c + camera.dilation)
+        px = camera.fx * seen.x * seen.inv_z + camera.cx
+        py = camera.fy * seen.y * seen.inv_z + camera.cy
         r2 = max(0.0, math.log2(opacity * _PER_ALPHA_MIN))
         radius = math.sqrt(r2) * _PER_UNIT
-        extent_x, extent_y = radius * sigma_x, radius * sigma_y
+        extent_x = radius * sigma_x
+        extent_y = radius * sigma_y
         in_x = px + extent_x >= x0 and px - extent_x <= x1
         if not (opacity >= ALPHA_MIN and in_x and py + extent_y >= y0 and py - extent_y <= y1):
             continue
@@ -336,15 +362,26 @@ def project(begin: int, end: int, scene: Scene, camera: Pinhole, splats: Splats,
         if not abs(red) + abs(green) + abs(blue) < np.inf:
             continue
         if camera.degree >= 0:
-            red, green, blue = max(0.0, red), max(0.0, green), max(0.0, blue)
+            red = max(0.0, red)
+            green = max(0.0, green)
+            blue = max(0.0, blue)
         splats.visible[i] = True
-        root, inv_sigma_y = math.sqrt(seen.det), 1.0 / sigma_y
-        shape, color = splats.shapes[i], splats.colors[i]
-        shape[MX], shape[MY] = px, py
+        root = math.sqrt(seen.det)
+        inv_sigma_y = 1.0 / sigma_y
+        shape = splats.shapes[i]
+        color = splats.colors[i]
+        shape[MX] = px
+        shape[MY] = py
         shape[SLOPE] = -(seen.b * inv_sigma_y * inv_sigma_y)
-        shape[L11], shape[INV_L11] = UNIT * sigma_y / root, root * inv_sigma_y * _PER_UNIT
-        shape[L22], shape[R2], shape[EXTENT_Y] = UNIT * inv_sigma_y, r2, extent_y
-        color[0], color[1], color[2], color[3] = red, green, blue, opacity
+        shape[L11] = UNIT * sigma_y / root
+        shape[INV_L11] = root * inv_sigma_y * _PER_UNIT
+        shape[L22] = UNIT * inv_sigma_y
+        shape[R2] = r2
+        shape[EXTENT_Y] = extent_y
+        color[0] = red
+        color[1] = green
+        color[2] = blue
+        color[3] = opacity
 
 
 @kernel(contract=True, inline=True)
@@ -357,9 +394,12 @@ def _tile_columns(
     1e-6 px: within a band of rows the support's left edge is farthest out where its leftmost point is, or at
     the band's nearest row. side: dy of that point.
     """
-    low, high = top + 0.5 - shape[MY], bottom + 0.5 - shape[MY]
-    left_at, right_at = min(max(side, low), high), min(max(-side, low), high)
-    v, w = shape[L22] * left_at, shape[L22] * right_at
+    low = top + 0.5 - shape[MY]
+    high = bottom + 0.5 - shape[MY]
+    left_at = min(max(side, low), high)
+    right_at = min(max(-side, low), high)
+    v = shape[L22] * left_at
+    w = shape[L22] * right_at
     outermost = shape[MX] - shape[SLOPE] * left_at - math.sqrt(max(0.0, shape[R2] - v * v)) * shape[INV_L11]
     first = max(np.ceil(outermost - 0.5 - 1e-6), left)
     outermost = shape[MX] - shape[SLOPE] * right_at + math.sqrt(max(0.0, shape[R2] - w * w)) * shape[INV_L11]
@@ -381,14 +421,20 @@ def find_tiles(begin: int, end: int, splats: Splats, camera: Pinhole, tiles: Arr
         how many there are
     """
     window = camera.window
-    x0, y0, x1, y1 = float(window[0]), float(window[1]), float(window[2]), float(window[3])
+    x0 = float(window[0])
+    y0 = float(window[1])
+    x1 = float(window[2])
+    y1 = float(window[3])
     at = 0
     for i in range(begin, end):
         counts[i] = 0
         if not splats.visible[i]:
             continue
         shape = splats.shapes[i]
-        mx, my, high, slope = shape[MX], shape[MY], shape[EXTENT_Y], shape[SLOPE]
+        mx = shape[MX]
+        my = shape[MY]
+        high = shape[EXTENT_Y]
+        slope = shape[SLOPE]
         inclined = slope / (shape[L22] * shape[L22])
         variance = shape[INV_L11] * shape[INV_L11] + slope * inclined
         wide = math.sqrt(shape[R2] * variance)
@@ -399,13 +445,16 @@ def find_tiles(begin: int, end: int, splats: Splats, camera: Pinhole, tiles: Arr
         last = min(np.floor(mx + wide - 0.5 + 1e-6), x1 - 1.0)
         if not (top <= bottom and first <= last):
             continue
-        left, right = int(first) // TILE_W, int(last) // TILE_W + 1
-        narrow, side = right == left + 1, inclined * wide / variance
+        left = int(first) // TILE_W
+        right = int(last) // TILE_W + 1
+        narrow = right == left + 1
+        side = inclined * wide / variance
         before = at
         for row in range(int(top) // TILE_H, int(bottom) // TILE_H + 1):
             if not narrow:
                 edge = float(row * TILE_H)
-                upper, lower = max(top, edge), min(bottom, edge + (TILE_H - 1.0))
+                upper = max(top, edge)
+                lower = min(bottom, edge + (TILE_H - 1.0))
                 left, right = _tile_columns(shape, side, upper, lower, x0, x1)
             base = (row - camera.grid[1]) * camera.grid[2] - camera.grid[0]
             for column in range(left, right):

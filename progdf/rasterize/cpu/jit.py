@@ -220,7 +220,9 @@ class _VectorModel(models.PrimitiveModel):  # type: ignore[misc]
         super().__init__(manager, kind, kind.vector)
 
 
-_vector, _mask, _single = _VectorType("Vector", _FLOATS), _VectorType("Mask", _BOOLS), types.float32
+_vector = _VectorType("Vector", _FLOATS)
+_mask = _VectorType("Mask", _BOOLS)
+_single = types.float32
 
 
 def _broadcast(builder: ir.IRBuilder, value: ir.Value) -> ir.Value:
@@ -329,7 +331,8 @@ def prefetch(typingctx: Any, array: Any, row: Any) -> Any:
 
     def generate(context: Any, builder: ir.IRBuilder, sig: Any, args: Any) -> ir.Value:
         fields = context.make_array(sig.args[0])(context, builder, args[0])
-        byte, number = ir.IntType(8).as_pointer(), ir.IntType(32)
+        byte = ir.IntType(8).as_pointer()
+        number = ir.IntType(32)
         kind = ir.FunctionType(ir.VoidType(), [byte, number, number, number])
         function = cgutils.get_or_insert_function(builder.module, kind, "llvm.prefetch.p0i8")
         offset = builder.mul(builder.extract_value(fields.strides, 0), args[1])

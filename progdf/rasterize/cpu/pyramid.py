@@ -61,7 +61,8 @@ from .jit import Number, kernel, prefetch
 LEAF = 4
 """Gaussians of a leaf at least; fewer cost memory, more lose .7 dB (docs/experiments.md, The viewer)."""
 
-CELL, SLICES = 8, 224
+CELL = 8
+SLICES = 224
 """Side of a cell of the grid in which optical depth is added up, pixels; the slices of its depth from the
 near plane on, sixteen to a factor of two."""
 
@@ -86,7 +87,10 @@ LONGEST, DENSITY, WEIGHT, POINTS, LOSS = range(3, 8)
 drawn; Σ opacity · area of what is below, world units², 0 for nothing; Σ opacity; the spread of its centers,
 world units, times 1 and the summed variances of its colors, in coefficients of band 0."""
 
-SCALES, SPREAD, CONTRAST, COLORS = 4, 7, 8, 9
+SCALES = 4
+SPREAD = 7
+CONTRAST = 8
+COLORS = 9
 """Columns of a node in 16 bits after its rotation, wxyz / 32767: its scales, of the largest / 65535; the
 spreads of centers and of colors (roots of summed variances); and colors, band by band. All but rotation and
 scales are upper halves of float32: errors of .2 %."""
@@ -97,7 +101,9 @@ _BEFORE = 2.0 ** (-1 / 32)  # of a depth: half a slice nearer, so that no surfac
 _TOP = 4  # levels of which each node is a chunk of its own
 _AHEAD = 8  # rows that are fetched before it is their turn: they lie far apart
 _DARK = math.exp(0.5 * DARKEST)  # times the limit, beyond which no darkness brings a loss below it
-_LEAST, _MOST = 1e-30, 1e30  # of a weight
+# of a weight
+_LEAST = 1e-30
+_MOST = 1e30
 _TRIALS = 12  # for a limit
 _REACH = 3.0  # standard deviations of a node that are in front of the near plane, or it is not drawn
 
@@ -129,7 +135,8 @@ class Pyramid:
         order = _sort(self.scene.means, levels)
         total = (2 << levels) - 1
         shapes = np.zeros((total, COLORS + 3 * self.scene.colors.shape[1]), np.uint16)
-        means, quats = np.zeros((total, LOSS + 1), np.float32), shapes[:, :SCALES].view(np.int16)
+        means = np.zeros((total, LOSS + 1), np.float32)
+        quats = shapes[:, :SCALES].view(np.int16)
         self.nodes = Nodes(means, shapes, quats, order, levels)
         self.limit = 1.0  # of what a node may lose, pixels²: where the last search ended
         self.finest = FINEST  # the least one that it ends at
@@ -139,7 +146,8 @@ class Pyramid:
 
     def refresh(self, rows: Array, colors_only: bool) -> None:
         """Merge anew what is above some rows of the scene. rows: [M] int64"""
-        count, levels = len(self.nodes.order), self.nodes.levels
+        count = len(self.nodes.order)
+        levels = self.nodes.levels
         if self._places is None:
             self._places = np.empty(count, np.int32)
             self._places[self.nodes.order] = np.arange(count, dtype=np.int32)
@@ -161,7 +169,8 @@ class Pyramid:
         Returns:
             Gaussians in the colors that this camera sees; rgb [M,3]
         """
-        view, dilation = make_pinhole(RasterView.of(camera, self._gaussians)), DILATION / pixels**2
+        view = make_pinhole(RasterView.of(camera, self._gaussians))
+        dilation = DILATION / pixels**2
         picks = self.cut(view, budget, dilation)
         out = Scene(*(np.empty((len(picks), width), np.float32) for width in (3, 4, 3, 1, 3)))
 
@@ -193,7 +202,8 @@ class Pyramid:
         room = -(-len(self.nodes.order) >> top) + 1
 
         def walk(chunk: int) -> Array:
-            picks, stack = np.empty(room, np.int32), np.empty(64, np.int32)
+            picks = np.empty(room, np.int32)
+            stack = np.empty(64, np.int32)
             root = (1 << top) - 1 + chunk
             return picks[: _walk(root, self.scene, self.nodes, view, limit, dilation, depths, stack, picks)]
 
@@ -225,25 +235,33 @@ def _split(points: Array, order: Array, level: int, first: int, levels: int) -> 
     count = points.shape[0]
     for deeper in range(level, levels):
         for node in range(first << (deeper - level), (first + 1) << (deeper - level)):
-            begin, end = (node * count) >> deeper, ((node + 1) * count) >> deeper
-            axis, widest = 0, np.float32(-1.0)
+            begin = (node * count) >> deeper
+            end = ((node + 1) * count) >> deeper
+            axis = 0
+            widest = np.float32(-1.0)
             for k in range(3):
                 least = most = points[begin, k]
                 for i in range(begin, end):
-                    least, most = min(least, points[i, k]), max(most, points[i, k])
+                    least = min(least, points[i, k])
+                    most = max(most, points[i, k])
                 if most - least > widest:
-                    axis, widest = k, most - least
+                    axis = k
+                    widest = most - least
             _select(points, order, axis, begin, end, ((2 * node + 1) * count) >> (deeper + 1))
 
 
 @kernel()
 def _select(points: Array, order: Array, axis: int, begin: int, end: int, middle: int) -> None:
     """Reorder begin … end − 1 so that none before `middle` is greater than any after it (Hoare's select)."""
-    low, high = begin, end - 1
+    low = begin
+    high = end - 1
     while low < high:
-        a, b, c = points[low, axis], points[(low + high) >> 1, axis], points[high, axis]
+        a = points[low, axis]
+        b = points[(low + high) >> 1, axis]
+        c = points[high, axis]
         pivot = max(min(a, b), min(max(a, b), c))
-        i, j = low, high
+        i = low
+        j = high
         while i <= j:
             while points[i, axis] < pivot:
                 i += 1
@@ -265,7 +283,9 @@ def _select(points: Array, order: Array, axis: int, begin: int, end: int, middle
 
 @kernel(contract=True, inline=True)
 def _two_largest(scale: Vec) -> tuple[float, float]:
-    a, b, c = abs(scale[0]), abs(scale[1]), abs(scale[2])
+    a = abs(scale[0])
+    b = abs(scale[1])
+    c = abs(scale[2])
     return max(a, max(b, c)), max(min(a, b), min(max(a, b), c))
 
 
@@ -277,7 +297,8 @@ def _roots(a: float, b: float, c: float) -> Vec:
 @kernel(contract=True, inline=True)
 def _weight(scene: Scene, i: int) -> float:
     """Opacity times area; 0 for one that cannot be drawn."""
-    mean, opacity = vec(scene.means, i), np.float64(scene.opacities[i])
+    mean = vec(scene.means, i)
+    opacity = np.float64(scene.opacities[i])
     longest, middle = _two_largest(vec(scene.scales, i))
     weight = opacity * longest * middle
     drawn = opacity >= ALPHA_MIN and abs(mean[0]) + abs(mean[1]) + abs(mean[2]) < np.inf and weight < _MOST
@@ -290,12 +311,17 @@ def _merge(
     matrix: Array, quat: Array, colors: Array,
 ) -> None:  # fmt: skip
     """Merge nodes indices[begin … end − 1] of a level of what is right below them; at last, scratch."""
-    means, shapes, count, leaf = nodes.means, nodes.shapes, nodes.order.shape[0], level == nodes.levels
+    means = nodes.means
+    shapes = nodes.shapes
+    count = nodes.order.shape[0]
+    leaf = level == nodes.levels
     for at in range(begin, end):
         me = (1 << level) - 1 + indices[at]
-        first, last = 2 * me + 1, 2 * me + 3
+        first = 2 * me + 1
+        last = 2 * me + 3
         if leaf:
-            first, last = (indices[at] * count) >> level, ((indices[at] + 1) * count) >> level
+            first = (indices[at] * count) >> level
+            last = ((indices[at] + 1) * count) >> level
         total = points = square = x = y = z = between = 0.0
         sound = True
         colors[:] = 0.0
@@ -309,21 +335,26 @@ def _merge(
                 mean = vec(scene.means, i) if leaf else vec(means, i)
                 total += weight
                 points += np.float64(scene.opacities[i] if leaf else means[i, POINTS])
-                x, y, z = x + weight * mean[0], y + weight * mean[1], z + weight * mean[2]
+                x = x + weight * mean[0]
+                y = y + weight * mean[1]
+                z = z + weight * mean[2]
                 square += 0.0 if leaf else weight * _unpack(shapes[i, CONTRAST]) ** 2
                 for band in range(colors.shape[0]):
                     for c in range(3):
                         color = _color(i, leaf, band, c, scene, nodes)
                         colors[band, c] += weight * color
                         square += weight * color * color if band == 0 else 0.0
-        share, mine = 1.0 / max(total, _LEAST), means[me]
+        share = 1.0 / max(total, _LEAST)
+        mine = means[me]
         for band in range(colors.shape[0]):
             for c in range(3):
                 colors[band, c] *= share
                 shapes[me, COLORS + 3 * band + c] = _pack(colors[band, c])
         shapes[me, CONTRAST] = _pack(math.sqrt(max(square * share - dot(colors[0], colors[0]), 0.0)))
         if not colors_only:
-            x, y, z = x * share, y * share, z * share
+            x = x * share
+            y = y * share
+            z = z * share
             matrix[:] = 0.0
             for k in range(first, last):
                 i = nodes.order[k] if leaf else k
@@ -335,7 +366,11 @@ def _merge(
                     between += weight * (dot(off, off) + (0.0 if leaf else _unpack(shapes[i, SPREAD]) ** 2))
             shapes[me, SPREAD] = _pack(math.sqrt(between))
             _diagonalize(matrix, quat)
-            mine[0], mine[1], mine[2], mine[WEIGHT], mine[POINTS] = x, y, z, total, points
+            mine[0] = x
+            mine[1] = y
+            mine[2] = z
+            mine[WEIGHT] = total
+            mine[POINTS] = points
             for k in range(4):
                 nodes.quats[me, k] = np.rint(32767.0 * quat[k])
             sizes = _roots(matrix[0, 0], matrix[1, 1], matrix[2, 2])
@@ -377,7 +412,8 @@ def _part(i: int, is_row: bool, scene: Scene, nodes: Nodes) -> tuple[Vec, Vec, Q
     """Mean, scales and rotation of a row or a node."""
     if is_row:
         return vec(scene.means, i), vec(scene.scales, i), quat_of(scene.quats, i)
-    shape, unit = nodes.shapes[i], nodes.means[i, LONGEST] / 65535.0
+    shape = nodes.shapes[i]
+    unit = nodes.means[i, LONGEST] / 65535.0
     scale = unit * shape[SCALES], unit * shape[SCALES + 1], unit * shape[SCALES + 2]
     return vec(nodes.means, i), scale, quat_of(nodes.quats, i)
 
@@ -405,13 +441,17 @@ def _diagonalize(matrix: Array, quat: Array) -> None:
     Args:
         quat: out, wxyz of the rotation whose columns are the eigenvectors. [4]
     """
-    quat[0], quat[1], quat[2], quat[3] = 1.0, 0.0, 0.0, 0.0
+    quat[0] = 1.0
+    quat[1] = 0.0
+    quat[2] = 0.0
+    quat[3] = 0.0
     for _ in range(8):
         off = matrix[0, 1] ** 2 + matrix[0, 2] ** 2 + matrix[1, 2] ** 2
         if off <= 1e-14 * (matrix[0, 0] ** 2 + matrix[1, 1] ** 2 + matrix[2, 2] ** 2):
             return
         for axis in range(3):
-            p, q = (axis + 1) % 3, (axis + 2) % 3
+            p = (axis + 1) % 3
+            q = (axis + 2) % 3
             if matrix[p, q] == 0.0:
                 continue
             half = (matrix[q, q] - matrix[p, p]) / (2.0 * matrix[p, q])
@@ -420,29 +460,40 @@ def _diagonalize(matrix: Array, quat: Array) -> None:
             sine = tangent * cosine
             matrix[p, p] -= tangent * matrix[p, q]
             matrix[q, q] += tangent * matrix[p, q]
-            to_p, to_q = matrix[axis, p], matrix[axis, q]
+            to_p = matrix[axis, p]
+            to_q = matrix[axis, q]
             matrix[p, q] = matrix[q, p] = 0.0
             matrix[axis, p] = matrix[p, axis] = cosine * to_p - sine * to_q
             matrix[axis, q] = matrix[q, axis] = sine * to_p + cosine * to_q
             turn = math.sqrt(0.5 * (1.0 + cosine))  # cosine of half the angle, about −axis
             lean = -0.5 * sine / turn
-            w, along, at_p, at_q = quat[0], quat[1 + axis], quat[1 + p], quat[1 + q]
-            quat[0], quat[1 + axis] = w * turn - along * lean, along * turn + w * lean
-            quat[1 + p], quat[1 + q] = at_p * turn + at_q * lean, at_q * turn - at_p * lean
+            w = quat[0]
+            along = quat[1 + axis]
+            at_p = quat[1 + p]
+            at_q = quat[1 + q]
+            quat[0] = w * turn - along * lean
+            quat[1 + axis] = along * turn + w * lean
+            quat[1 + p] = at_p * turn + at_q * lean
+            quat[1 + q] = at_q * turn - at_p * lean
 
 
 @kernel(contract=True, inline=True)
 def _cell(x: float, y: float, z: float, corner: int, camera: Pinhole) -> tuple[int, float]:
     """One of the eight cells about pixel (x, y) at depth z: its index in the flat grid, and the point's share
     of it, so that neither jumps as the point moves. corner: 0..7"""
-    columns, rows = -(-camera.window[2] // CELL), -(-camera.window[3] // CELL)
+    columns = -(-camera.window[2] // CELL)
+    rows = -(-camera.window[3] // CELL)
     # of the logarithm of the depth, nearly
     bits: Number = np.float32(z / camera.near).view(np.int32) - _ONE
     across = min(max(x / CELL - 0.5, 0.0), columns - 1.0)
     down = min(max(y / CELL - 0.5, 0.0), rows - 1.0)
     along = min(max(bits * _PER_SLICE - 0.5, 0.0), SLICES - 2.0)
-    column, row, slice_index = int(across), int(down), int(along)
-    a, b, c = corner & 1, corner >> 1 & 1, corner >> 2
+    column = int(across)
+    row = int(down)
+    slice_index = int(along)
+    a = corner & 1
+    b = corner >> 1 & 1
+    c = corner >> 2
     share = abs(1 - a - across + column) * abs(1 - b - down + row) * abs(1 - c - along + slice_index)
     cell = min(row + b, rows - 1) * columns + min(column + a, columns - 1)
     return cell * SLICES + slice_index + c, share
@@ -459,7 +510,8 @@ def _is_outside(camera: Pinhole, x: float, y: float, wide2: float, high2: float)
 @kernel(contract=True, inline=True)
 def _is_inside(camera: Pinhole, x: float, y: float, wide2: float, high2: float) -> bool:
     """Whether the window shows all of such a box."""
-    in_x, in_y = min(x, camera.window[2] - x), min(y, camera.window[3] - y)
+    in_x = min(x, camera.window[2] - x)
+    in_y = min(y, camera.window[3] - y)
     return bool(in_x > 0.0 and in_x * in_x >= wide2 and in_y > 0.0 and in_y * in_y >= high2)
 
 
@@ -476,17 +528,23 @@ def _walk(
         stack: scratch, more than the levels
         picks: out, as in `Pyramid.cut`; how many is given back
     """
-    means, focal, first_leaf = nodes.means, math.sqrt(camera.fx * camera.fy), (1 << nodes.levels) - 1
-    count, top, stack[0] = 0, 1, root
+    means = nodes.means
+    focal = math.sqrt(camera.fx * camera.fy)
+    first_leaf = (1 << nodes.levels) - 1
+    count = 0
+    top = 1
+    stack[0] = root
     while top > 0:
         top -= 1
         i = stack[top]
-        longest, density = np.float64(means[i, LONGEST]), abs(np.float64(means[i, DENSITY]))
+        longest = np.float64(means[i, LONGEST])
+        density = abs(np.float64(means[i, DENSITY]))
         z = dot(camera.rows[2], vec(means, i)) + camera.shift[2]
         reach = _REACH * longest
         if means[i, WEIGHT] <= 0.0 or z - camera.near + reach < 0.0:
             continue
-        loss, inside = np.inf, False
+        loss = np.inf
+        inside = False
         wide = 0.0 if camera.antialiased else dilation * z * z / (focal * focal)
         least = (means[i, WEIGHT] + wide * means[i, POINTS]) / max(longest * longest + wide, _LEAST)
         if z - camera.near > reach and max(density, least) >= ALPHA_MIN:
@@ -506,7 +564,8 @@ def _walk(
             picks[count] = i
             count += 1
         elif i >= first_leaf:
-            leaf, rows = i - first_leaf, nodes.order.shape[0]
+            leaf = i - first_leaf
+            rows = nodes.order.shape[0]
             for k in range((leaf * rows) >> nodes.levels, ((leaf + 1) * rows) >> nodes.levels):
                 picks[count] = ~nodes.order[k]
                 if inside:
@@ -516,7 +575,8 @@ def _walk(
                 if usable and not _is_outside(camera, x, y, wide2, high2):
                     count += 1
         else:
-            stack[top], stack[top + 1] = 2 * i + 1, 2 * i + 2
+            stack[top] = 2 * i + 1
+            stack[top + 1] = 2 * i + 2
             prefetch(means, 4 * i + 3)
             prefetch(means, 4 * i + 5)
             top += 2
@@ -528,7 +588,8 @@ def _add_depths(picks: Array, nodes: Nodes, camera: Pinhole, dilation: float, de
     """Add the optical depth of each node to its cell of the flat grid, in which it fills no more than all."""
     for i in picks:
         density = abs(np.float64(nodes.means[i, DENSITY]))
-        mean, longest = vec(nodes.means, i), np.float64(nodes.means[i, LONGEST])
+        mean = vec(nodes.means, i)
+        longest = np.float64(nodes.means[i, LONGEST])
         z = dot(camera.rows[2], mean) + camera.shift[2]
         x, y, _, _ = extents(camera, mean, z, longest, density)
         inside = 0.0 <= x <= camera.window[2] and 0.0 <= y <= camera.window[3]
@@ -561,7 +622,8 @@ def _take(
     eye = camera_center(camera)
     for at in range(begin, end):
         _fetch(picks[min(at + _AHEAD, end - 1)], scene, nodes, True)
-        merged, i = picks[at] >= 0, max(picks[at], ~picks[at])
+        merged = picks[at] >= 0
+        i = max(picks[at], ~picks[at])
         mean, scale, quat = _part(i, not merged, scene, nodes)
         seen = footprint(camera, mean, scale, quat)
         unit = 1.0 / (camera.fx * camera.fy * seen.inv_z * seen.inv_z)  # world units² of a pixel
@@ -580,7 +642,8 @@ def _take(
         more = (dilation - DILATION) * unit
         a, b, c = scale
         size = _roots(a * a + more, b * b + more, c * c + more)
-        p0, p1 = times(seen.turned0, size), times(seen.turned1, size)
+        p0 = times(seen.turned0, size)
+        p1 = times(seen.turned1, size)
         normal = cross(p0, p1)
         fine = seen.det0 + dilation * (seen.a + seen.c + dilation)
         coarse = dot(normal, normal) + DILATION * (dot(p0, p0) + dot(p1, p1)) + DILATION * DILATION

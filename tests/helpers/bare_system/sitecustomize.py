@@ -98,7 +98,8 @@ def bare() -> None:
     """Take away what Windows lacks."""
     for name in BEFORE:
         importlib.import_module(name)
-    kill, nine = os.kill, signal.SIGKILL
+    kill = os.kill
+    nine = signal.SIGKILL
     for where in (subprocess.Popen,):
         where.kill = where.terminate = lambda self: None if self.poll() is not None else kill(self.pid, nine)  # type: ignore[method-assign]
     for name in ("CREATE_NEW_PROCESS_GROUP", "BELOW_NORMAL_PRIORITY_CLASS", "CREATE_NO_WINDOW"):

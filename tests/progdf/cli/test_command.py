@@ -234,7 +234,8 @@ def test_a_current_folder_that_was_removed_is_one_line(
 
 def test_settings_that_numba_does_not_work_with_are_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     # the module alone, as its package loads torch
-    code, settings = f"import runpy; runpy.run_path({jit.__file__!r})", {"NUMBA_NUM_THREADS": "0"}
+    code = f"import runpy; runpy.run_path({jit.__file__!r})"
+    settings = {"NUMBA_NUM_THREADS": "0"}
     words = [sys.executable, "-c", code]
     ran = subprocess.run(words, capture_output=True, text=True, env=os.environ | settings, cwd=ROOT)
     assert ran.stderr.splitlines()[-1].startswith(

@@ -23,7 +23,8 @@ PAIRS = {
     "pale pink to deep blue": ("#f0d0bc", "#101880"),
 }
 STRENGTHS = torch.linspace(0, 1, 21)
-ORANGE, BLUE = torch.tensor([0.85, 0.45, 0.10]), torch.tensor([0.19, 0.38, 0.82])
+ORANGE = torch.tensor([0.85, 0.45, 0.10])
+BLUE = torch.tensor([0.19, 0.38, 0.82])
 CHROMA_OF_GRAY = 0.01
 BIT = 2 / 255  # two channels that lie closer are as good as equal
 
@@ -112,7 +113,8 @@ def test_hues_near_the_target_take_their_own_short_way(s: float, path: ColorPath
 
 
 def test_the_straight_paths_are_straight_in_oklab_and_in_srgb() -> None:
-    start, end = parse_color("#e0ac88").expand(21, 3), recolor(parse_color("#e0ac88").expand(21, 3), BLUE)
+    start = parse_color("#e0ac88").expand(21, 3)
+    end = recolor(parse_color("#e0ac88").expand(21, 3), BLUE)
     lab, faded = (
         interpolate_colors(start, end, STRENGTHS, bend_of(start[0], BLUE, path))
         for path in ("straight", "srgb")
@@ -124,7 +126,8 @@ def test_the_straight_paths_are_straight_in_oklab_and_in_srgb() -> None:
 
 
 def test_a_straight_and_a_bent_way_have_the_same_lightness() -> None:
-    start, end = parse_color("#e0ac88").expand(21, 3), BLUE.expand(21, 3)
+    start = parse_color("#e0ac88").expand(21, 3)
+    end = BLUE.expand(21, 3)
     lab = srgb_to_oklab(interpolate_colors(start, end, STRENGTHS, bend_of(start[0], BLUE)))
     expected = torch.lerp(srgb_to_oklab(start), srgb_to_oklab(end), STRENGTHS[:, None])
     # colors on the edge of the gamut are known to a thousandth

@@ -25,8 +25,10 @@ def _polar(rgb: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def test_the_typical_color_of_many_pixels_is_the_same_on_any_number_of_threads() -> None:
-    rng, found = torch.Generator().manual_seed(1), list[Tensor]()
-    rgb, weights = torch.rand(1_000_000, 3, generator=rng), torch.rand(1_000_000, generator=rng)
+    rng = torch.Generator().manual_seed(1)
+    found = list[Tensor]()
+    rgb = torch.rand(1_000_000, 3, generator=rng)
+    weights = torch.rand(1_000_000, generator=rng)
     before = torch.get_num_threads()
     for threads in (1, 2, 3, 4):
         torch.set_num_threads(threads)
@@ -124,7 +126,8 @@ def test_each_value_of_a_grade_does_what_its_name_says() -> None:
     def graded(rgb: Tensor, **values: float) -> Tensor:
         return color.grade_fully(rgb, color.ColorGrade(values))
 
-    gray, some = torch.full((1, 3), 0.5), 0.2 + 0.6 * _random()
+    gray = torch.full((1, 3), 0.5)
+    some = 0.2 + 0.6 * _random()
     assert torch.allclose(graded(some), some, atol=1e-3), "neutral values change nothing"
     linear = ((0.5 + 0.055) / 1.055) ** 2.4
     brighter = ((graded(gray, exposure=0.5) + 0.055) / 1.055) ** 2.4

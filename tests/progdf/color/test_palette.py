@@ -31,14 +31,16 @@ def test_a_palette_has_the_large_colors_first_and_a_small_one_that_is_unlike_the
 
 
 def test_a_scarf_is_a_main_color_beside_two_like_greens_of_a_lawn() -> None:
-    pale, dark = color.parse_color("#a4c860"), color.parse_color("#201810")
+    pale = color.parse_color("#a4c860")
+    dark = color.parse_color("#201810")
     rgb = scene({30_000: LAWN, 29_000: pale, 9000: BEAR, 8000: STONE, 7000: dark, 1000: SCARF})
     found = find_palette(rgb, torch.ones(len(rgb)))
     assert (found - SCARF).abs().amax(dim=1).min() < 0.1
 
 
 def test_what_is_not_seen_is_in_no_palette() -> None:
-    rgb, weights = torch.stack([LAWN, SCARF]), torch.tensor([1.0, 0.0])
+    rgb = torch.stack([LAWN, SCARF])
+    weights = torch.tensor([1.0, 0.0])
     assert torch.allclose(find_palette(rgb, weights), LAWN[None], atol=1e-5)
 
 
@@ -92,7 +94,8 @@ def test_a_curve_passes_its_points_and_never_leaves_their_range(
 def test_a_curve_moves_lightness_and_keeps_the_hue() -> None:
     asked = color.ColorGrade(curve=((0.5, 0.35),))
     rgb = torch.stack([LAWN, BEAR])
-    before, after = srgb_to_oklab(rgb), srgb_to_oklab(color.grade_fully(rgb, asked))
+    before = srgb_to_oklab(rgb)
+    after = srgb_to_oklab(color.grade_fully(rgb, asked))
     assert (after[:, 0] < before[:, 0] - 0.05).all()
     hues = [torch.atan2(lab[:, 2], lab[:, 1]) for lab in (before, after)]
     assert torch.allclose(*hues, atol=0.02)
@@ -106,7 +109,8 @@ def test_a_grade_of_palette_and_curve_is_exact_at_strength_0() -> None:
 
 def test_a_curve_of_one_color_bends_what_is_near_it_and_nothing_else() -> None:
     held = tuple((c, c) for c in (LAWN, BEAR, STONE))
-    colors, lightness = torch.stack([LAWN, BEAR, STONE]), srgb_to_oklab(LAWN)[0].item()
+    colors = torch.stack([LAWN, BEAR, STONE])
+    lightness = srgb_to_oklab(LAWN)[0].item()
     darker = color.ColorGrade(palette=held, palette_curves=(((lightness, lightness - 0.2),), (), ()))
     made = srgb_to_oklab(color.grade_fully(colors, darker))
     before = srgb_to_oklab(colors)

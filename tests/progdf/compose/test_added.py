@@ -130,7 +130,8 @@ def test_an_edit_is_carried_over_with_its_added_rows(
     save_gdf(tmp_path / "hat.gdf", hat)
     paths = [f"--from={tmp_path / 'a.ply'}", f"--to={tmp_path / 'b.ply'}"]
     rebind.main([str(tmp_path / "hat.gdf"), *paths, "-o", str(tmp_path / "new.gdf")])
-    a, b = load_ply(tmp_path / "a.ply"), load_ply(tmp_path / "b.ply")
+    a = load_ply(tmp_path / "a.ply")
+    b = load_ply(tmp_path / "b.ply")
     there = compose_layers(b, [Layer(load_gdf(tmp_path / "new.gdf", b), 0.7)])
     here = compose_layers(a, [Layer(hat, 0.7)])
     rows = torch.cat([order, torch.arange(COUNT, COUNT + 25)])
@@ -173,9 +174,12 @@ def test_hostile_files_are_one_line(scene: Gaussians, hat: Gdf, tmp_path: Path, 
     path = tmp_path / "hat.gdf"
     save_gdf(path, hat)
     content = path.read_bytes()
-    tensors, draws, refused = safetensors.torch.load(content), Draws(count), 0
+    tensors = safetensors.torch.load(content)
+    draws = Draws(count)
+    refused = 0
     for _ in range(count):
-        header, parts = header_of(content), dict(tensors)
+        header = header_of(content)
+        parts = dict(tensors)
         for key, value in hostile_changes(draws, tensors).items():
             target: dict[str, object] = header if key in header else parts  # type: ignore[assignment]
             if value is None:
@@ -188,7 +192,8 @@ def test_hostile_files_are_one_line(scene: Gaussians, hat: Gdf, tmp_path: Path, 
             composed = compose_layers(scene, [Layer(load_gdf(path, scene), 0.5)])
             assert all(bool(torch.isfinite(getattr(composed, name)).all()) for name in ATTRIBUTES)
         except ProgdfError as error:
-            line, refused = str(error), refused + 1
+            line = str(error)
+            refused = refused + 1
         assert "\n" not in line
     assert refused > count / 2
 
@@ -240,7 +245,8 @@ def test_a_grade_of_the_whole_scene_reaches_the_rows_that_others_add(
 
 
 def test_an_average_shares_the_kinds_of_change_that_a_layer_makes(scene: Gaussians) -> None:
-    dark, shirt = whole_grade(scene), edit_of(scene, torch.arange(90), curved_field(90, 2), "shirt")
+    dark = whole_grade(scene)
+    shirt = edit_of(scene, torch.arange(90), curved_field(90, 2), "shirt")
     both = compose_layers(scene, [Layer(shirt, 1.0), Layer(dark, 1.0)])
     alone, graded = (compose_layers(scene, [Layer(edit, 1.0)]) for edit in (shirt, dark))
     for name in ("means", "log_scales", "quats", "logit_opacities"):

@@ -135,7 +135,8 @@ def test_normalized_shares_where_strengths_add_up_to_more(scene: Gaussians, shir
     assert len(both) > 10
     summed = change(scene, compose_layers(scene, layers, "sum"))[both]
     shared = change(scene, compose_layers(scene, layers, "normalized"))[both]
-    divisor, colors = torch.ones(summed.shape[1]), attribute_slices(summed.shape[1])["sh0"]
+    divisor = torch.ones(summed.shape[1])
+    colors = attribute_slices(summed.shape[1])["sh0"]
     divisor[colors] = 1.5  # the only kind of change that both make
     assert torch.allclose(shared, summed / divisor, atol=1e-6)
     assert bool((summed[:, :3] != 0).any(dim=1).all())
@@ -470,7 +471,8 @@ def test_adjust_maps_the_colors_that_lie_below(scene: Gaussians, shirt: Gdf, str
     dark = graded(scene, shirt.region.members, 0.6, residual=False)
     below = compose_layers(scene, [Layer(shirt, 1.0)])
     both = compose_layers(scene, [Layer(shirt, 1.0), Layer(dark, strength)], "adjust")
-    rows, table = shirt.region.members, identity_map(1) * (1.0 - 0.6 * strength)
+    rows = shirt.region.members
+    table = identity_map(1) * (1.0 - 0.6 * strength)
     expected = map_colors(below.sh[rows], table, 1)
     torch.testing.assert_close(both.sh[rows], expected, atol=2e-6, rtol=0)
     if strength == 0.0:
@@ -512,7 +514,8 @@ def test_a_grade_that_is_a_pattern_lies_over_what_is_below_as_far_as_its_map_doe
 ) -> None:
     rows = torch.arange(len(scene))
     dark = compose_layers(scene, [Layer(graded(scene, rows, 0.6, residual=False))])
-    knots, table = torch.tensor([0.0, 1.0]), identity_map(1)
+    knots = torch.tensor([0.0, 1.0])
+    table = identity_map(1)
     halfway = table + 0.5 * (torch.tensor([[0.1, 0.3, 0.9]] + [[0.0] * 3] * 3) - table)
     mapped = map_colors(scene.sh, halfway, 1) - scene.sh
     course = torch.zeros(2, len(scene), 12)
@@ -521,8 +524,10 @@ def test_a_grade_that_is_a_pattern_lies_over_what_is_below_as_far_as_its_map_doe
     stripes = edit_of(scene, rows, bake_grade(form, pack(scene, True)), "stripes")
     assert float(coverage(scene, stripes)["map"].mean()) < 0.1, "half of it is undone, the other half doubled"
     layers = [Layer(graded(scene, rows, 0.6, residual=False)), Layer(stripes)]
-    both, alone = compose_layers(scene, layers, "adjust"), compose_layers(scene, [Layer(stripes)])
-    between, far = rows[::2], coverage(scene, stripes)["color"] == 1.0
+    both = compose_layers(scene, layers, "adjust")
+    alone = compose_layers(scene, [Layer(stripes)])
+    between = rows[::2]
+    far = coverage(scene, stripes)["color"] == 1.0
     assert float((both.sh0 - dark.sh0)[between].abs().mean()) < 0.1
     assert torch.allclose(both.sh0[far], alone.sh0[far], atol=0.1)
     assert int(far.sum()) > 50
@@ -565,7 +570,8 @@ def test_the_composer_adjusts_with_grades_of_other_scenes_and_tables_as_compose_
     above = apply_grade(look, scene, from_mask("some", torch.arange(len(scene)) % 2 == 0))
     other = random_gaussians(60, seed=8)
     below = apply_grade(graded(other, torch.arange(60), 0.5), scene, whole_scene(scene))
-    composer, weights = Composer(scene, [shirt, hat, above, below]), torch.linspace(0, 1, len(above.region))
+    composer = Composer(scene, [shirt, hat, above, below])
+    weights = torch.linspace(0, 1, len(above.region))
     for stack in (
         [Layer(shirt, 1.0), Layer(above, 1.0), Layer(hat, 0.7)],
         [Layer(below, 1.0), Layer(shirt, 0.3), Layer(above, 0.6, weights=weights)],

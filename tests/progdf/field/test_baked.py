@@ -32,8 +32,10 @@ def late() -> SliderRemap:
 @settings(max_examples=40, deadline=None)
 @given(st.floats(0.0, 1.0))
 def test_a_dialled_field_shows_at_the_new_strength_what_it_showed_at_the_old(s: float) -> None:
-    field, remap = bent(), late()
-    expected, found = field.offsets(s), remap_slider(field, remap).offsets(remap.at(s))
+    field = bent()
+    remap = late()
+    expected = field.offsets(s)
+    found = remap_slider(field, remap).offsets(remap.at(s))
     assert float((found - expected).abs().max()) < 2e-2 * float(field.offsets(1.0).abs().max())
 
 

@@ -142,7 +142,8 @@ def test_error_falls_with_rank() -> None:
 
 def test_between_snapshots_the_course_is_straight() -> None:
     field = curved_field(30)
-    low, high = float(field.knots[3]), float(field.knots[4])
+    low = float(field.knots[3])
+    high = float(field.knots[4])
     middle = field.offsets(0.25 * low + 0.75 * high)
     assert torch.allclose(middle, 0.25 * field.offsets(low) + 0.75 * field.offsets(high), atol=1e-5)
 
@@ -169,7 +170,8 @@ def test_weights_turn_the_bases_to_what_shows() -> None:
 
 
 def test_a_fit_is_the_same_every_time() -> None:
-    a, b = curved_field(40, seed=7), curved_field(40, seed=7)
+    a = curved_field(40, seed=7)
+    b = curved_field(40, seed=7)
     for name, bases in a.attributes.items():
         assert all(torch.equal(part, getattr(b.attributes[name], key)) for key, part in vars(bases).items())
 
@@ -199,7 +201,8 @@ def test_nodes_must_run_upwards_from_zero_to_one() -> None:
 
 
 def test_attributes_must_have_the_same_members() -> None:
-    field, other = curved_field(5), curved_field(6)
+    field = curved_field(5)
+    other = curved_field(6)
     with pytest.raises(ValueError, match="different numbers of members"):
         replace(field, attributes={**field.attributes, "sh0": other.attributes["sh0"]})
 
@@ -243,7 +246,8 @@ def test_a_target_out_of_reach_is_said_and_the_best_is_kept() -> None:
     rng = torch.Generator().manual_seed(4)
     offsets = torch.randn(33, 40, 14, generator=rng)
     offsets[0] = 0
-    strengths, render = torch.linspace(0, 1, 33), linear_pictures(40, 14)
+    strengths = torch.linspace(0, 1, 33)
+    render = linear_pictures(40, 14)
     evaluator = FieldEvaluator(strengths, offsets, render, target=98.0)
     chosen = choose_field(strengths, offsets, render, evaluator=evaluator)
     assert not chosen.met
@@ -281,7 +285,8 @@ def test_what_an_edit_misses_of_its_editor_decides_how_much_is_stored() -> None:
         evaluator = FieldEvaluator(strengths, offsets, render, edited=edited)
         return choose_field(strengths, offsets, render, evaluator=evaluator)
 
-    rough, fine = choice(0.1), choice(0.001)
+    rough = choice(0.1)
+    fine = choice(0.001)
     assert rough.met
     assert fine.met
     assert rough.best.field.bytes_per_member < fine.best.field.bytes_per_member

@@ -108,7 +108,8 @@ def test_a_linear_map_of_colors_that_are_not_clamped_is_exact_from_everywhere(sh
 
 def test_colors_that_are_clamped_are_nearer_than_their_least_squares() -> None:
     sh = member_bands(pack(random_gaussians(300, sh_degree=2), with_shN=True))
-    table, toward = some_table(1, 0.3), directions()
+    table = some_table(1, 0.3)
+    toward = directions()
     before = drawn(sh, toward)
     assert float((before <= 0.0).float().mean()) > 0.05
     bright = before.clamp_max(MOST_COLOR)
@@ -182,8 +183,10 @@ def test_functions_that_members_lack_take_no_levels(share: float) -> None:
     draws = torch.Generator().manual_seed(2)
     levels = torch.randint(-90, 90, (2, 999, 9, 3), generator=draws, dtype=torch.int8)
     levels[:, :, 1:] *= torch.rand(999, 8, 1, generator=draws) < share
-    knots, table = torch.tensor([0.0, 1.0]), torch.stack([identity_map(1), some_table(1)])
-    scale, coefficients = torch.ones(2, 27), torch.tensor([[0.0, 0.0], [1.0, 0.5]])
+    knots = torch.tensor([0.0, 1.0])
+    table = torch.stack([identity_map(1), some_table(1)])
+    scale = torch.ones(2, 27)
+    coefficients = torch.tensor([[0.0, 0.0], [1.0, 0.5]])
     form = GradeForm(1, knots, table, levels.flatten(2), scale, coefficients)
     packed = form.packed_levels
     assert torch.equal(unpack_levels(packed["functions"], packed["residual"], 2, 999, 27), form.residual)
@@ -319,7 +322,8 @@ def test_what_few_members_need_more_than_the_rest_does_not_take_their_levels() -
 def test_the_bands_that_are_drawn_are_read_from_their_columns_and_written_there(sh_degree: int) -> None:
     scene = random_gaussians(40, sh_degree=sh_degree)
     rows = pack(scene, with_shN=sh_degree > 0)
-    bands, columns = member_bands(rows), attribute_slices(rows.shape[1])
+    bands = member_bands(rows)
+    columns = attribute_slices(rows.shape[1])
     assert torch.equal(bands, scene.sh[:, :16])
     for count in {1, bands.shape[1]}:
         offsets = band_offsets(bands[:, :count], rows.shape[1])
@@ -380,7 +384,8 @@ def some_lattice(side: int = 5) -> GradeForm:
 def test_a_grade_of_another_scene_shows_what_its_map_makes_of_this_one(
     tmp_path: Path, form: str, sh_degree: int
 ) -> None:
-    scene, other = random_gaussians(300, sh_degree=sh_degree), random_gaussians(90, seed=5)
+    scene = random_gaussians(300, sh_degree=sh_degree)
+    other = random_gaussians(90, seed=5)
     rows = pack(other[torch.arange(40)], with_shN=False)
     grade = some_lattice() if form == "lattice" else some_form(rows)
     if form == "lattice":

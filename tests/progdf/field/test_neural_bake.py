@@ -23,7 +23,8 @@ def test_the_ends_of_a_baked_network_are_exact(form: str) -> None:
 
 @pytest.mark.parametrize("form", ["own", "own, hard bins"])
 def test_baking_costs_as_much_as_it_says_and_that_is_little(form: str) -> None:
-    field, bound = baked(form), network(form).bind(rows())
+    field = baked(form)
+    bound = network(form).bind(rows())
     strengths = sample_strengths()
     wrong = sum(float((field.offsets(float(s)) - bound.offsets(float(s))).square().sum()) for s in strengths)
     whole = sum(float(bound.offsets(float(s)).square().sum()) for s in strengths)

@@ -92,7 +92,8 @@ def test_pictures_are_compared_at_a_snapshot_drawn_at_random_never_between_two()
 
 def test_a_loss_of_pictures_takes_the_place_of_the_one_of_offsets() -> None:
     strengths, offsets = curved_trajectory(MEMBERS, moving=("sh0",))
-    fit, pictures = NeuralFit(rows(), 14, ("sh0",), SHORT), Watched()
+    fit = NeuralFit(rows(), 14, ("sh0",), SHORT)
+    pictures = Watched()
     fit.scale_to(offsets)
     loss = fit.step(strengths, offsets, pictures=pictures)
     found, recorded, _ = pictures.asked[0]
@@ -114,7 +115,9 @@ def test_a_fit_goes_on_to_the_same_bits_after_it_was_saved() -> None:
     def new() -> NeuralFit:
         return NeuralFit(rows(), 14, ("sh0",), SHORT)
 
-    whole, first, second = new(), new(), new()
+    whole = new()
+    first = new()
+    second = new()
     for fit in (whole, first):
         fit.scale_to(offsets)
     for _ in range(6):

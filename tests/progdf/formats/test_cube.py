@@ -90,9 +90,11 @@ def test_an_input_range_is_the_domain_of_all_channels(tmp_path: Path) -> None:
 
 
 def test_a_color_is_mapped_as_the_eight_points_around_it_say() -> None:
-    table, draws = some_table(4), torch.Generator().manual_seed(2)
+    table = some_table(4)
+    draws = torch.Generator().manual_seed(2)
     colors = torch.rand(3, 50, generator=draws)
-    cell, share = (3 * colors).floor().clamp_max(2).long(), 3 * colors
+    cell = (3 * colors).floor().clamp_max(2).long()
+    share = 3 * colors
     share = share - cell
     expected = torch.zeros(3, 50)
     for corner in range(8):
@@ -111,7 +113,8 @@ def test_colors_that_no_table_reaches_are_those_at_its_edge() -> None:
 
 
 def test_between_the_ends_a_table_goes_the_straight_way() -> None:
-    form, colors = lattice_form(some_table()), lattice_colors(9)
+    form = lattice_form(some_table())
+    colors = lattice_colors(9)
     ends = [mapped_lattice(form, s, 9) for s in (0.0, 1.0)]
     torch.testing.assert_close(ends[0], colors)
     torch.testing.assert_close(mapped_lattice(form, 0.3, 9), torch.lerp(ends[0], ends[1], 0.3))

@@ -153,11 +153,13 @@ def test_every_format_looks_the_same_from_a_side(name: str, tmp_path: Path) -> N
 def test_half_a_turn_about_x_turns_what_is_seen() -> None:
     """The signs of all bands, against the basis itself: what is seen along d is then seen along d turned."""
     scene = scene_of(3, 50)
-    turned, turn = rotate_about_x(scene), torch.tensor([1.0, -1.0, -1.0])
+    turned = rotate_about_x(scene)
+    turn = torch.tensor([1.0, -1.0, -1.0])
     directions = torch.nn.functional.normalize(scene.sh0, dim=1)
     torch.testing.assert_close(shade(3, directions * turn, turned.sh), shade(3, directions, scene.sh))
     frames, expected = (rotation_matrices(s.quats) * s.scales[:, None] for s in (turned, scene))
-    shapes, shapes_before = frames @ frames.mT, expected @ expected.mT
+    shapes = frames @ frames.mT
+    shapes_before = expected @ expected.mT
     torch.testing.assert_close(shapes, shapes_before * turn * turn[:, None])
     assert torch.equal(turned.means, scene.means * turn)
 
@@ -165,7 +167,8 @@ def test_half_a_turn_about_x_turns_what_is_seen() -> None:
 def test_saturated_opacities_are_clamped_and_counted(tmp_path: Path) -> None:
     scene = replace(scene_of(), logit_opacities=torch.full((300,), 15.0))
     compressed = write_compressed_ply(tmp_path / "a.ply", scene)
-    ksplat, spz = write_ksplat(tmp_path / "a.ksplat", scene, 1), write_scene(tmp_path / "a.spz", scene)
+    ksplat = write_ksplat(tmp_path / "a.ksplat", scene, 1)
+    spz = write_scene(tmp_path / "a.spz", scene)
     for path in (compressed, ksplat, spz):
         found, report = load_scene_with_report(path)
         assert bool(found.logit_opacities.isfinite().all()), path.name
@@ -248,7 +251,8 @@ def test_a_format_without_its_package_is_one_line_that_names_the_extra_and_no_fi
 
 def test_a_reader_gets_no_more_memory_than_a_file_can_need(tmp_path: Path) -> None:
     """A gigabyte asked for beyond the limit is a line, and no gigabyte."""
-    script, here = tmp_path / "greedy.py", "    path = Path(source)\n"
+    script = tmp_path / "greedy.py"
+    here = "    path = Path(source)\n"
     own = Path(native_child.__file__).read_text()
     script.write_text(own.replace(here, f"    bytes(1 << 30)\n{here}"))
     limits = map(str, (1 << 30, 1_000_000, 10))
@@ -299,10 +303,8 @@ def test_usd_has_the_numbers_of_every_step_and_stores_once_what_stays(tmp_path: 
         stored = torch.tensor(np.array(sh.Get(time))).reshape(len(step), -1, 3)
         assert torch.equal(stored, torch.cat([step.sh0[:, None], step.shN], dim=1))
     assert torch.equal(torch.tensor(np.array(prim.GetAttribute("positions").Get())), step.means)
-    real, imaginary = (
-        prim.GetAttribute("orientations").Get()[7].real,
-        prim.GetAttribute("orientations").Get()[7].imaginary,
-    )
+    real = prim.GetAttribute("orientations").Get()[7].real
+    imaginary = prim.GetAttribute("orientations").Get()[7].imaginary
     assert torch.allclose(torch.tensor([real, *imaginary]), step.unit_quats[7])
 
 

@@ -88,7 +88,8 @@ def test_splat_transform_files_give_the_scene_of_the_ply(version: str, tmp_path:
 def test_written_glb_has_the_numbers_of_splat_transform(tmp_path: Path) -> None:
     save_scene(tmp_path / "a.glb", foreign_scene())
     (tmp_path / "b.glb").write_bytes(splat_transform_glb("2.7.1"))
-    ours, theirs = columns_of(tmp_path / "a.glb"), columns_of(tmp_path / "b.glb")
+    ours = columns_of(tmp_path / "a.glb")
+    theirs = columns_of(tmp_path / "b.glb")
     assert ours.keys() == theirs.keys()
     for name, column in ours.items():
         if name == f"{EXTENSION}:ROTATION":
@@ -101,7 +102,8 @@ def columns_of(path: Path) -> dict[str, np.ndarray]:
     """The attributes of the one primitive of a .glb with packed views."""
     content = path.read_bytes()
     size = struct.unpack_from("<I", content, 12)[0]
-    tables, data = json.loads(content[20 : 20 + size]), content[28 + size :]
+    tables = json.loads(content[20 : 20 + size])
+    data = content[28 + size :]
     columns = {}
     for name, index in tables["meshes"][0]["primitives"][0]["attributes"].items():
         entry = tables["accessors"][index]
@@ -350,7 +352,8 @@ def test_the_chosen_scene_is_read(tmp_path: Path) -> None:
 def test_an_identity_matrix_changes_nothing(tmp_path: Path) -> None:
     save_scene(tmp_path / "a.glb", small(3))
     builder = one_mesh(convert_axes(small(3), "RDF", "LUF"), {"matrix": IDENTITY})
-    found, expected = load_scene(builder.write(tmp_path / "b.glb")), load_scene(tmp_path / "a.glb")
+    found = load_scene(builder.write(tmp_path / "b.glb"))
+    expected = load_scene(tmp_path / "a.glb")
     for name in ATTRIBUTES:
         assert torch.equal(getattr(found, name), getattr(expected, name)), name
 

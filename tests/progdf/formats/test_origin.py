@@ -59,7 +59,8 @@ def test_how_near_is_near_goes_with_the_size_of_the_scene() -> None:
 
 
 def test_numbers_that_are_not_finite_do_not_move_the_origin() -> None:
-    means, log_scales = small().means.double() + 1e6, small().log_scales
+    means = small().means.double() + 1e6
+    log_scales = small().log_scales
     origin = find_origin(means, log_scales)
     spoilt = means.clone()
     spoilt[:5], spoilt[5:8] = torch.nan, torch.inf
@@ -136,7 +137,8 @@ def test_floats_far_from_zero_keep_the_fingerprint_that_they_had(tmp_path: Path)
 def test_figures_are_in_the_world(tmp_path: Path) -> None:
     near = load_ply(write(tmp_path / "near.ply", table_of(small())))
     far = load_ply(write(tmp_path / "far.ply", moved_columns(small(), FAR)))
-    a, b = survey(near), survey(far)
+    a = survey(near)
+    b = survey(far)
     assert (b.radius, b.up.name, b.surrounding) == (a.radius, a.up.name, a.surrounding)
     assert np.allclose(np.subtract(b.center, FAR), a.center, rtol=0, atol=1e-9)
     assert np.allclose(np.subtract(b.box, 2 * FAR), a.box, rtol=0, atol=1e-9)

@@ -347,7 +347,8 @@ def test_a_damaged_file_loads_to_finite_numbers_or_is_refused(
     try:
         scene = load_ply(path)
     except ProgdfError as refused:
-        scene, message = None, str(refused)
+        scene = None
+        message = str(refused)
     if scene is None:
         assert "\n" not in message
     else:

@@ -316,7 +316,8 @@ def test_info_of_any_header_is_told_or_refused_in_one_line(
     saved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     content = saved.read_bytes()
-    header, tensors = header_of(content), safetensors.torch.load(content)
+    header = header_of(content)
+    tensors = safetensors.torch.load(content)
     assert main(["info", str(written(tmp_path, signed_gdf(header, tensors)))]) == 0
     others: list[object] = [None, [], {}, "", "means", -1, 0, 1e300, 2**70, True, [[]], {"a": []}]
     for place in list(places(header)):

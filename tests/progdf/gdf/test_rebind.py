@@ -53,7 +53,8 @@ def test_shuffled_rows_get_their_own_offsets_back(stack: Stack) -> None:
 
 
 def test_a_negated_quaternion_turns_the_same_way(stack: Stack) -> None:
-    gdf, scene = stack.gdfs[0], stack.scene
+    gdf = stack.gdfs[0]
+    scene = stack.scene
     bases = gdf.field.attributes["sh0"]
     width = torch.zeros(len(gdf.region), 4)
     turning = replace(

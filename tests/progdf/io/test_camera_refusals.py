@@ -245,7 +245,8 @@ def test_any_value_in_any_place_loads_or_is_refused(
     try:
         cameras = load_cameras(path)
     except ProgdfError as refused:
-        cameras, message = [], str(refused)
+        cameras = []
+        message = str(refused)
         assert len(message.splitlines()) == 1
     for camera in cameras:
         assert bool(camera.viewmat.isfinite().all())

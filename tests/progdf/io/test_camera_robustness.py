@@ -57,10 +57,12 @@ def scaled(scene: Gaussians, factor: float) -> Gaussians:
 def about_x(scene: Gaussians, degrees: float) -> Gaussians:
     """The scene turned around x."""
     half = math.radians(degrees) / 2
-    c, s = math.cos(half), math.sin(half)
+    c = math.cos(half)
+    s = math.sin(half)
     w, x, y, z = scene.quats.unbind(1)
     turned = torch.stack([c * w - s * x, c * x + s * w, c * y - s * z, c * z + s * y], dim=1)
-    cos, sin = math.cos(2 * half), math.sin(2 * half)
+    cos = math.cos(2 * half)
+    sin = math.sin(2 * half)
     x, y, z = scene.means.unbind(1)
     means = torch.stack([x, cos * y - sin * z, sin * y + cos * z], dim=1)
     return replace(scene, means=means, quats=turned)
@@ -99,7 +101,8 @@ def test_a_scene_of_any_size_is_met_with_the_same_picture(
 def test_a_scene_of_any_up_axis_is_met_with_the_same_picture(
     ctx: moderngl.Context, draw: str, degrees: float, up: Vec3
 ) -> None:
-    scene, turned = the_bear(), about_x(the_bear(), degrees)
+    scene = the_bear()
+    turned = about_x(the_bear(), degrees)
     assert first_camera(turned).up == up
     assert agreement(pictured(ctx, turned, draw), pictured(ctx, scene, draw)) > 45.0
 
@@ -125,7 +128,8 @@ def test_as_near_as_the_wheel_goes_the_picture_is_finite_and_the_way_back_is_ope
     ctx: moderngl.Context, draw: str, factor: float
 ) -> None:
     scene = scaled(the_bear(), factor)
-    first, radius = first_camera(scene), bounds_of(scene).radius
+    first = first_camera(scene)
+    radius = bounds_of(scene).radius
     near = controls.zoom(first, 1e6, radius)
     assert 0.0 < near.distance < 1e-3 * radius
     assert np.isfinite(pictured(ctx, scene, draw, near)).all()
@@ -166,7 +170,8 @@ def filled(camera: ViewCamera, shown: Gaussians, aspect: float) -> np.ndarray:
     local = shown.means @ built.viewmat[:3, :3].T + built.viewmat[:3, 3]
     assert bool((local[:, 2] > 0).all())
     across = local[:, :2] / local[:, 2:] * built.K.diagonal()[:2] / built.K[:2, 2]
-    low, high = across.quantile(0.005, dim=0), across.quantile(0.995, dim=0)
+    low = across.quantile(0.005, dim=0)
+    high = across.quantile(0.995, dim=0)
     return torch.stack([-low[0], high[0], -low[1], high[1]]).numpy()
 
 

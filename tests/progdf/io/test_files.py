@@ -82,7 +82,8 @@ def test_whoever_still_reads_the_old_file_keeps_it(tmp_path: Path) -> None:
 
 
 def test_permissions_are_those_of_an_ordinary_file_or_of_the_old_one(tmp_path: Path) -> None:
-    ordinary, old = tmp_path / "ordinary.txt", tmp_path / "old.txt"
+    ordinary = tmp_path / "ordinary.txt"
+    old = tmp_path / "old.txt"
     ordinary.touch()
     old.touch()
     old.chmod(0o640)
@@ -134,7 +135,8 @@ def test_a_place_that_cannot_be_written_to_is_told_by_the_name_that_was_given(
 def test_a_link_stays_a_link_and_what_it_leads_to_is_replaced(tmp_path: Path) -> None:
     (tmp_path / "there").mkdir()
     for name in ("old", "new"):  # the second leads to nothing yet
-        real, link = tmp_path / "there" / f"{name}.txt", tmp_path / f"{name}.txt"
+        real = tmp_path / "there" / f"{name}.txt"
+        link = tmp_path / f"{name}.txt"
         link.symlink_to(Path("there") / real.name)
         if name == "old":
             real.write_text("old")

@@ -12,12 +12,14 @@ from progdf.camera import Lens, undistort
 
 BARREL = Lens(k1=-0.18, k2=0.03, p1=0.004, p2=-0.006, k3=0.002)
 K = torch.tensor([[90.0, 0.0, 63.0], [0.0, 85.0, 49.5], [0.0, 0.0, 1.0]])
-WIDTH, HEIGHT = 128, 96
+WIDTH = 128
+HEIGHT = 96
 
 
 def pattern(rays: Tensor) -> Tensor:
     """A smooth world on the plane z = 1: what color each ray has. [...,2] -> [...,3]"""
-    x, y = rays[..., 0], rays[..., 1]
+    x = rays[..., 0]
+    y = rays[..., 1]
     return 0.5 + 0.4 * torch.stack([torch.sin(7 * x), torch.sin(6 * y), torch.cos(5 * (x + y))], dim=-1)
 
 

@@ -214,7 +214,8 @@ def test_the_transparent_gray_of_16_bits_is_transparent(tmp_path: Path) -> None:
 
 # A turned picture's corners: its upper left is red, its upper right green.
 CORNERS = np.zeros((32, 64, 3), np.uint8)
-CORNERS[:16, :32], CORNERS[:16, 32:] = (255, 0, 0), (0, 255, 0)
+CORNERS[:16, :32] = (255, 0, 0)
+CORNERS[:16, 32:] = (0, 255, 0)
 INVERSE = {**{i: i for i in range(1, 8)}, 6: 8, 8: 6}
 """The turn that takes a turn back."""
 

@@ -47,7 +47,8 @@ def test_the_library_reads_every_type_and_shape(tmp_path: Path, dtype: torch.dty
 
 
 def test_the_order_in_which_things_are_given_changes_no_byte(tmp_path: Path) -> None:
-    tensors, metadata = some(torch.float32), {"format": "1", "about": "2", "sha": "3"}
+    tensors = some(torch.float32)
+    metadata = {"format": "1", "about": "2", "sha": "3"}
     write_tensors(tmp_path / "x", tensors, metadata)
     write_tensors(tmp_path / "y", dict(reversed(tensors.items())), dict(reversed(metadata.items())))
     assert (tmp_path / "x").read_bytes() == (tmp_path / "y").read_bytes()

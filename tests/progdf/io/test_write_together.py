@@ -81,7 +81,8 @@ def test_failed_block_changes_nothing(tmp_path: Path, error: BaseException, exis
 
 
 def test_interrupt_between_moves_ends_with_all_new(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    folder, moved = write_old(tmp_path / "x"), 0
+    folder = write_old(tmp_path / "x")
+    moved = 0
     move = atomic.replace_file
 
     def interrupted(path: Path, target: Path) -> None:

@@ -51,7 +51,8 @@ def test_psnr_of_equal_pictures_is_infinite() -> None:
 
 
 def test_psnr_looks_at_the_mask_only() -> None:
-    image, target = picture(), picture()
+    image = picture()
+    target = picture()
     image[:10] += 0.5
     image[20:] += 0.1
     mask = torch.zeros(48, 40, dtype=torch.bool)
@@ -69,7 +70,8 @@ def test_a_mask_that_counts_nothing_is_refused() -> None:
 
 def window_by_window_ssim(image: Tensor, target: Tensor) -> float:
     """Wang et al. 2004, one window after the other, in float64."""
-    x, y = image.double().numpy(), target.double().numpy()
+    x = image.double().numpy()
+    y = target.double().numpy()
     at = np.arange(11) - 5
     line = np.exp(-(at**2) / (2 * 1.5**2))
     weights = np.outer(line, line) / line.sum() ** 2
@@ -79,8 +81,10 @@ def window_by_window_ssim(image: Tensor, target: Tensor) -> float:
             for c in range(3):
                 a = x[row - 5 : row + 6, column - 5 : column + 6, c]
                 b = y[row - 5 : row + 6, column - 5 : column + 6, c]
-                ma, mb = (weights * a).sum(), (weights * b).sum()
-                va, vb = (weights * (a - ma) ** 2).sum(), (weights * (b - mb) ** 2).sum()
+                ma = (weights * a).sum()
+                mb = (weights * b).sum()
+                va = (weights * (a - ma) ** 2).sum()
+                vb = (weights * (b - mb) ** 2).sum()
                 vab = (weights * (a - ma) * (b - mb)).sum()
                 top = (2 * ma * mb + 1e-4) * (2 * vab + 9e-4)
                 found.append(top / ((ma**2 + mb**2 + 1e-4) * (va + vb + 9e-4)))
@@ -88,7 +92,8 @@ def window_by_window_ssim(image: Tensor, target: Tensor) -> float:
 
 
 def test_ssim_is_that_of_the_paper() -> None:
-    image, target = picture(24, 20), noisy(picture(24, 20), 0.1)
+    image = picture(24, 20)
+    target = noisy(picture(24, 20), 0.1)
     assert float(ssim(image, target)) == pytest.approx(window_by_window_ssim(image, target), abs=1e-4)
 
 
@@ -165,7 +170,8 @@ def numpy_lpips(network: Lpips, image: Tensor, target: Tensor) -> float:
 
 
 def test_lpips_is_that_of_a_network_written_out_in_numpy(network: Lpips) -> None:
-    image, target = picture(67, 80), noisy(picture(67, 80), 0.1)
+    image = picture(67, 80)
+    target = noisy(picture(67, 80), 0.1)
     assert float(network(image, target)) == pytest.approx(numpy_lpips(network, image, target), rel=1e-4)
 
 
@@ -190,7 +196,8 @@ def test_lpips_dislikes_blur_more_than_a_slight_tint_of_the_same_psnr(network: L
 
 
 def test_lpips_with_kept_features_is_the_same(network: Lpips) -> None:
-    image, target = picture(64, 64), picture(64, 64, seed=5)
+    image = picture(64, 64)
+    target = picture(64, 64, seed=5)
     kept = network.features(target)
     assert float(network.distance(network.features(image), kept)) == float(network(image, target))
 
@@ -288,7 +295,8 @@ def test_a_slider_that_changes_nothing_has_no_steps() -> None:
 
 
 def test_visible_change_looks_at_the_mask_only() -> None:
-    a, b = [torch.zeros(4, 4, 3)], [torch.zeros(4, 4, 3)]
+    a = [torch.zeros(4, 4, 3)]
+    b = [torch.zeros(4, 4, 3)]
     b[0][0] = 0.5
     mask = torch.zeros(4, 4, dtype=torch.bool)
     mask[:2] = True

@@ -27,7 +27,8 @@ def _wall(z: float, opacity: float) -> Gaussians:
 def test_depth_is_the_mean_of_what_a_pixel_shows_by_what_each_contributes(engine: str) -> None:
     camera = front_camera()
     found = render_depth(concatenate(_wall(5.0, 0.8), _wall(2.0, 0.5)), camera, engine)
-    near, far = 0.5, 0.5 * 0.8
+    near = 0.5
+    far = 0.5 * 0.8
     expected = (near * 2.0 + far * 5.0) / (near + far)
     torch.testing.assert_close(found.depth, torch.full_like(found.depth, expected), rtol=1e-5, atol=0)
     torch.testing.assert_close(found.alpha, torch.full_like(found.alpha, near + far), rtol=1e-5, atol=0)
@@ -51,8 +52,10 @@ def test_depth_is_drawn_exactly_where_the_picture_is(name: str) -> None:
 
 
 def test_the_depth_of_a_crop_is_that_of_the_picture() -> None:
-    scene, camera = random_gaussians(300, seed=4, sh_degree=1), orbit_camera(90, 60)
-    whole, part = render_depth(scene, camera), render_depth(scene, camera, crop=(20, 10, 71, 43))
+    scene = random_gaussians(300, seed=4, sh_degree=1)
+    camera = orbit_camera(90, 60)
+    whole = render_depth(scene, camera)
+    part = render_depth(scene, camera, crop=(20, 10, 71, 43))
     assert torch.equal(part.depth, whole.depth[10:43, 20:71])
     assert torch.equal(part.alpha, whole.alpha[10:43, 20:71])
 

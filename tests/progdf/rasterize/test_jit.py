@@ -155,7 +155,8 @@ def numbers(seed: int, rows: int = 1) -> Array:
 
 @kernel(fast=True)
 def _arithmetic(a: Array, b: Array, single: Number, out: Array) -> None:
-    x, y = load(a, np.uint64(0)), load(b, np.uint64(0))
+    x = load(a, np.uint64(0))
+    y = load(b, np.uint64(0))
     store(out, np.uint64(0), x + y)
     store(out, np.uint64(8), x - y)
     store(out, np.uint64(16), single * x)
@@ -166,7 +167,8 @@ def _arithmetic(a: Array, b: Array, single: Number, out: Array) -> None:
 
 
 def test_arithmetic_is_lane_by_lane_and_a_single_number_stands_for_eight() -> None:
-    a, b = numbers(0)[0], numbers(1)[0]
+    a = numbers(0)[0]
+    b = numbers(1)[0]
     out = np.zeros(40, np.float32)
     _arithmetic(a, b, np.float32(1.5), out)
     expected = [a + b, a - b, np.float32(1.5) * a, a / b, a + np.float32(1.5)]
@@ -175,7 +177,10 @@ def test_arithmetic_is_lane_by_lane_and_a_single_number_stands_for_eight() -> No
 
 @kernel(fast=True)
 def _comparisons(a: Array, b: Array, out: Array) -> None:
-    x, y, one, zero = load(a, np.uint64(0)), load(b, np.uint64(0)), np.float32(1.0), np.float32(0.0)
+    x = load(a, np.uint64(0))
+    y = load(b, np.uint64(0))
+    one = np.float32(1.0)
+    zero = np.float32(0.0)
     store(out, np.uint64(0), select(x < y, broadcast(one), broadcast(zero)))
     store(out, np.uint64(8), select(x <= y, one, zero))
     store(out, np.uint64(16), select(x > y, one, zero))
@@ -183,7 +188,8 @@ def _comparisons(a: Array, b: Array, out: Array) -> None:
 
 
 def test_comparisons_choose_lane_by_lane_and_tell_less_from_equal() -> None:
-    a, b = numbers(2)[0], numbers(3)[0]
+    a = numbers(2)[0]
+    b = numbers(3)[0]
     b[:3] = a[:3]
     out = np.zeros(32, np.float32)
     _comparisons(a, b, out)
@@ -197,7 +203,8 @@ def _at(source: Array, start: Number, out: Array) -> None:
 
 
 def test_loads_and_stores_begin_at_any_place_and_leave_the_rest_alone() -> None:
-    source, out = np.arange(20, dtype=np.float32), np.full(20, -1, np.float32)
+    source = np.arange(20, dtype=np.float32)
+    out = np.full(20, -1, np.float32)
     _at(source, np.uint64(5), out)
     np.testing.assert_array_equal(out[5:13], np.arange(5, 13) + np.arange(8))
     assert (out[:5] == -1).all()
@@ -218,7 +225,8 @@ def _sums(rows: Array, out: Array) -> None:
 
 
 def test_eight_sums_at_once_are_eight_sums_one_by_one() -> None:
-    rows, out = numbers(4, rows=8), np.zeros(16, np.float32)
+    rows = numbers(4, rows=8)
+    out = np.zeros(16, np.float32)
     _sums(rows, out)
     np.testing.assert_allclose(out[:8], rows.sum(axis=1, dtype=np.float64), rtol=1e-5)
     np.testing.assert_allclose(out[8:], rows.sum(axis=1, dtype=np.float64), rtol=1e-5)
@@ -232,7 +240,8 @@ def _wholes(a: Array, out: Array) -> None:
 
 
 def test_whole_numbers_are_cut_towards_zero_and_scale_by_powers_of_two() -> None:
-    a, out = np.array([-125.5, -3.999, -1, -0.5, 0, 0.5, 3.999, 100], np.float32), np.zeros(16, np.float32)
+    a = np.array([-125.5, -3.999, -1, -0.5, 0, 0.5, 3.999, 100], np.float32)
+    out = np.zeros(16, np.float32)
     _wholes(a, out)
     np.testing.assert_array_equal(out[:8], np.trunc(a))
     np.testing.assert_array_equal(out[8:], 0.75 * 2.0 ** np.trunc(a))

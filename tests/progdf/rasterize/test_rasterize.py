@@ -30,7 +30,8 @@ pytestmark = pytest.mark.usefixtures("two_threads")
 @pytest.mark.parametrize("engine", FAST)
 @pytest.mark.parametrize("name", CASES)
 def test_a_fast_engine_draws_each_hard_case_like_the_reference(name: str, engine: str) -> None:
-    found, expected = drawn_case(name, engine), drawn_case(name, "reference")
+    found = drawn_case(name, engine)
+    expected = drawn_case(name, "reference")
     assert found.image.shape == expected.image.shape
     assert image_error(found, expected) <= 1e-5
     assert float((found.transmittance - expected.transmittance).abs().max()) <= 1e-5
@@ -50,7 +51,8 @@ def test_a_fast_engine_has_the_references_gradients_in_each_hard_case(name: str,
 @pytest.mark.parametrize("engine", EVERY)
 @pytest.mark.parametrize("name", [name for name, case in CASES.items() if case.poisoned])
 def test_a_gaussian_that_is_not_finite_leaves_all_others_untouched(name: str, engine: str) -> None:
-    case, rows = CASES[name], list(CASES[name].poisoned)
+    case = CASES[name]
+    rows = list(CASES[name].poisoned)
     if "quats" in name:
         clean_quats = case.gaussians.quats.clone()
         clean_quats[rows] = torch.tensor([1.0, 0.0, 0.0, 0.0])
@@ -118,7 +120,9 @@ def test_the_reference_has_the_gradients_of_finite_differences() -> None:
 
 @pytest.mark.parametrize("engine", FAST)
 def test_gradients_of_a_crop_match_the_references(engine: str) -> None:
-    scene, camera, crop = random_gaussians(200, seed=5, sh_degree=1), orbit_camera(90, 61), (21, 13, 70, 44)
+    scene = random_gaussians(200, seed=5, sh_degree=1)
+    camera = orbit_camera(90, 61)
+    crop = (21, 13, 70, 44)
     found, expected = (draw(scene, camera, name, crop=crop) for name in (engine, "reference"))
     errors = relative_errors(found, expected)
     assert max(errors.values()) <= 2e-5, errors
@@ -127,7 +131,8 @@ def test_gradients_of_a_crop_match_the_references(engine: str) -> None:
 
 @pytest.mark.parametrize("engine", EVERY)
 def test_only_the_wanted_rows_get_gradients_and_theirs_are_the_full_ones(engine: str) -> None:
-    scene, camera = random_gaussians(200, seed=12, sh_degree=1), orbit_camera(90, 61)
+    scene = random_gaussians(200, seed=12, sh_degree=1)
+    camera = orbit_camera(90, 61)
     rows = torch.arange(3, 200, 7)
     found = []
     for wanted in (None, rows):
@@ -144,7 +149,8 @@ def test_only_the_wanted_rows_get_gradients_and_theirs_are_the_full_ones(engine:
 
 @pytest.mark.parametrize("engine", FAST)
 def test_double_precision_inputs_get_double_precision_gradients(engine: str) -> None:
-    scene, camera = one_gaussian().to(dtype=torch.float64), front_camera()
+    scene = one_gaussian().to(dtype=torch.float64)
+    camera = front_camera()
     means = scene.means.requires_grad_()
     image = render(scene, camera, (0.0, 0.0, 0.0), engine=engine).image
     (image[:, :15] ** 2).sum().backward()
@@ -159,7 +165,8 @@ def test_a_real_scene_matches_the_reference(shared_data: Path, engine: str) -> N
     from progdf.formats.ply import load_ply
 
     scene = load_ply(shared_data / "playbot_8k.ply")
-    low, high = scene.means.quantile(0.1, dim=0), scene.means.quantile(0.9, dim=0)
+    low = scene.means.quantile(0.1, dim=0)
+    high = scene.means.quantile(0.9, dim=0)
     scene = replace(scene, means=(scene.means - (low + high) / 2) / float((high - low).max()) * 2)
     scene = replace(scene, log_scales=scene.log_scales - torch.log((high - low).max() / 2))
     camera = orbit_camera(64, 48, distance=3.0)

@@ -26,7 +26,8 @@ def test_a_crop_is_the_slice_of_the_whole_picture(engine: str, crop: tuple[int, 
     scene = concatenate(
         random_gaussians(150, seed=4), one_gaussian(mean=(2.0, 1.0, -2.5), scales=(1.0, 0.02, 0.5))
     )
-    whole, part = draw(scene, camera, engine), draw(scene, camera, engine, crop=crop)
+    whole = draw(scene, camera, engine)
+    part = draw(scene, camera, engine, crop=crop)
     x0, y0, x1, y1 = crop
     # bit for bit, but for the reference: BLAS may add 151 products in another order, each rounded by 1.1e-16
     rounding = 2e-14 if engine == "reference" else 0.0
@@ -37,7 +38,8 @@ def test_a_crop_is_the_slice_of_the_whole_picture(engine: str, crop: tuple[int, 
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("engine", EVERY)
 def test_samples_are_pixels_of_the_larger_picture(engine: str, antialiased: bool) -> None:
-    scene, camera = replace(random_gaussians(200, scale=0.01), antialiased=antialiased), orbit_camera(40, 30)
+    scene = replace(random_gaussians(200, scale=0.01), antialiased=antialiased)
+    camera = orbit_camera(40, 30)
     sampled = render(scene, replace(camera, sampling=3.0), engine=engine).image
     whole = render(scene, camera.resize(120, 90), engine=engine).image[1::3, 1::3]
     assert float((sampled - render(scene, camera, engine=engine).image).abs().max()) > 0.05
@@ -46,7 +48,8 @@ def test_samples_are_pixels_of_the_larger_picture(engine: str, antialiased: bool
 
 @pytest.mark.parametrize("engine", FAST)
 def test_the_order_of_the_list_does_not_matter_where_depths_differ(engine: str) -> None:
-    scene, camera = random_gaussians(300, seed=8), orbit_camera(50, 40)
+    scene = random_gaussians(300, seed=8)
+    camera = orbit_camera(50, 40)
     activated = activate(scene, scene.sh0.sigmoid())
     shuffle = torch.randperm(300, generator=torch.Generator().manual_seed(1))
     first, second = (render(some, camera, engine=engine) for some in (activated, activated.select(shuffle)))
@@ -55,10 +58,8 @@ def test_the_order_of_the_list_does_not_matter_where_depths_differ(engine: str) 
 
 @pytest.mark.parametrize("engine", EVERY)
 def test_equal_depths_are_drawn_in_the_order_of_the_list(engine: str) -> None:
-    red, green = (
-        one_gaussian(rgb=(1.0, 0.0, 0.0), opacity=0.99),
-        one_gaussian(rgb=(0.0, 1.0, 0.0), opacity=0.99),
-    )
+    red = one_gaussian(rgb=(1.0, 0.0, 0.0), opacity=0.99)
+    green = one_gaussian(rgb=(0.0, 1.0, 0.0), opacity=0.99)
     camera = front_camera()
     center = (camera.height // 2, camera.width // 2)
     assert float(render(concatenate(red, green), camera, engine=engine).image[center][0]) > 0.9
@@ -97,7 +98,8 @@ def test_no_gaussians_leave_the_background(engine: str) -> None:
 
 @pytest.mark.parametrize("engine", FAST)
 def test_mask_weights_match_the_reference_and_the_picture(engine: str) -> None:
-    scene, camera = random_gaussians(200, seed=9), orbit_camera(90, 61)
+    scene = random_gaussians(200, seed=9)
+    camera = orbit_camera(90, 61)
     mask = torch.rand(61, 90, generator=torch.Generator().manual_seed(2)).round()
     found = alpha_weights(scene, camera, mask, engine)
     expected = alpha_weights(scene.to(dtype=torch.float64), camera, mask, engine="reference")
@@ -119,25 +121,32 @@ def test_mask_weights_of_every_hard_case_are_finite(engine: str) -> None:
 
 @pytest.mark.parametrize("engine", EVERY)
 def test_a_color_map_draws_its_rows_and_its_gradient_is_the_transpose(engine: str) -> None:
-    scene, camera, window = random_gaussians(300, seed=11), orbit_camera(90, 61), (21, 13, 70, 44)
+    scene = random_gaussians(300, seed=11)
+    camera = orbit_camera(90, 61)
+    window = (21, 13, 70, 44)
     rng = torch.Generator().manual_seed(5)
     rows = torch.randperm(300, generator=rng)[:120]
-    colors, seen = torch.rand(120, 3, generator=rng), torch.rand(31, 49, 3, generator=rng)
+    colors = torch.rand(120, 3, generator=rng)
+    seen = torch.rand(31, 49, 3, generator=rng)
     activated = activate(scene)
     weighed = color_map(activated, camera, window, rows, engine)
     every = torch.zeros(300, 3).index_copy(0, rows, colors)
     drawn = render(activated, camera, (0.0, 0.0, 0.0), colors=every, crop=window, engine="reference").image
     picture = weighed.picture(colors)
     torch.testing.assert_close(picture, drawn, rtol=0, atol=2e-6)
-    forth, back = (picture.double() * seen).sum(), (colors.double() * weighed.gradient(seen)).sum()
+    forth = (picture.double() * seen).sum()
+    back = (colors.double() * weighed.gradient(seen)).sum()
     assert float(forth) == pytest.approx(float(back), rel=1e-6)
 
 
 @pytest.mark.parametrize("channels", [1, 2, 4, 20])
 @pytest.mark.parametrize("engine", EVERY)
 def test_a_color_map_draws_any_number_of_channels(engine: str, channels: int) -> None:
-    scene, camera, window = random_gaussians(300, seed=11), orbit_camera(90, 61), (21, 13, 70, 44)
-    rows, pixels = torch.arange(0, 300, 2), torch.arange(31 * 49)[1::3]
+    scene = random_gaussians(300, seed=11)
+    camera = orbit_camera(90, 61)
+    window = (21, 13, 70, 44)
+    rows = torch.arange(0, 300, 2)
+    pixels = torch.arange(31 * 49)[1::3]
     weighed = color_map(activate(scene), camera, window, rows, engine, pixels)
     values = torch.rand(150, channels, generator=torch.Generator().manual_seed(5))
     picture = weighed.picture(values)
@@ -148,11 +157,15 @@ def test_a_color_map_draws_any_number_of_channels(engine: str, channels: int) ->
 
 @pytest.mark.parametrize("engine", EVERY)
 def test_a_color_map_of_some_pixels_is_that_of_all_where_they_are(engine: str) -> None:
-    scene, camera, window = random_gaussians(300, seed=11), orbit_camera(90, 61), (21, 13, 70, 44)
-    rows, pixels = torch.arange(0, 300, 2), torch.arange(31 * 49)[1::3]
+    scene = random_gaussians(300, seed=11)
+    camera = orbit_camera(90, 61)
+    window = (21, 13, 70, 44)
+    rows = torch.arange(0, 300, 2)
+    pixels = torch.arange(31 * 49)[1::3]
     whole = color_map(activate(scene), camera, window, rows, engine)
     some = color_map(activate(scene), camera, window, rows, engine, pixels)
-    colors, seen = torch.rand(150, 3), torch.rand(len(pixels), 3)
+    colors = torch.rand(150, 3)
+    seen = torch.rand(len(pixels), 3)
     everywhere = torch.zeros(31 * 49, 3).index_copy(0, pixels, seen).view(31, 49, 3)
     torch.testing.assert_close(some.picture(colors), whole.picture(colors).flatten(0, 1)[pixels])
     torch.testing.assert_close(some.gradient(seen), whole.gradient(everywhere))
@@ -160,7 +173,9 @@ def test_a_color_map_of_some_pixels_is_that_of_all_where_they_are(engine: str) -
 
 @pytest.mark.parametrize("lost", [0.0, 0.5 / 255.0, 0.3])
 def test_a_color_map_leaves_out_no_more_than_it_may(lost: float) -> None:
-    scene, camera, window = random_gaussians(3000, seed=11), orbit_camera(90, 61), (21, 13, 70, 44)
+    scene = random_gaussians(3000, seed=11)
+    camera = orbit_camera(90, 61)
+    window = (21, 13, 70, 44)
     rows = torch.arange(0, 3000, 2)  # the others only hide what is behind them
     all_of_it = color_map(activate(scene), camera, window, rows)
     listed = color_map(activate(scene), camera, window, rows, lost=lost)
@@ -169,7 +184,8 @@ def test_a_color_map_leaves_out_no_more_than_it_may(lost: float) -> None:
     left_out = all_of_it.picture(torch.ones(1500, 1)) - listed.picture(torch.ones(1500, 1))
     assert float(left_out.min()) > -1e-6
     assert float(left_out.max()) <= lost + 1e-6
-    some, every = len(listed.runs.weights), len(all_of_it.runs.weights)
+    some = len(listed.runs.weights)
+    every = len(all_of_it.runs.weights)
     assert some < 0.9 * every if lost else some == every
     values = torch.rand(1500, 3, generator=torch.Generator().manual_seed(5))
     away = (all_of_it.picture(values) - listed.picture(values)).abs().max()
@@ -177,7 +193,8 @@ def test_a_color_map_leaves_out_no_more_than_it_may(lost: float) -> None:
 
 
 def test_a_color_map_lets_go_of_what_it_was_made_of() -> None:
-    scene, camera = activate(random_gaussians(300, seed=11)), orbit_camera(90, 61)
+    scene = activate(random_gaussians(300, seed=11))
+    camera = orbit_camera(90, 61)
     make = partial(color_map, scene, camera, (0, 0, 90, 61), torch.arange(300))
     make()  # loads kernels
     gc.collect()

@@ -25,7 +25,8 @@ def test_bits_do_not_depend_on_the_run_the_number_of_threads_or_the_room_for_til
 ) -> None:
     from progdf.rasterize.cpu import engine
 
-    scene, camera = random_gaussians(4000, seed=6, sh_degree=1), orbit_camera(128, 96)
+    scene = random_gaussians(4000, seed=6, sh_degree=1)
+    camera = orbit_camera(128, 96)
     first = draw(scene, camera, "cpu")
     monkeypatch.setattr(engine, "TILE_ROOM", room)
     for threads in (1, 1, 2, 3, 7, 16):
@@ -56,7 +57,8 @@ def test_two_python_threads_may_draw_at_once(engine: str) -> None:
 
 
 def test_camera_gradients_of_some_rows_only_are_refused() -> None:
-    scene, camera = one_gaussian(), front_camera()
+    scene = one_gaussian()
+    camera = front_camera()
     free = replace(camera, viewmat=camera.viewmat.clone().requires_grad_())
     with pytest.raises(ValueError, match="viewmat or K wants gradients, which need all rows"):
         render(scene, free, grad_rows=torch.tensor([0]))
@@ -107,7 +109,8 @@ def test_rows_that_no_pixel_shows_get_gradients_of_zero_whatever_memory_held(
 
 
 def test_inputs_changed_in_place_before_the_backward_pass_are_noticed() -> None:
-    one, camera = one_gaussian(), front_camera()
+    one = one_gaussian()
+    camera = front_camera()
     means = one.means.clone().requires_grad_()
     image = render(replace(one, means=means), camera).image
     with torch.no_grad():
@@ -117,7 +120,8 @@ def test_inputs_changed_in_place_before_the_backward_pass_are_noticed() -> None:
 
 
 def test_a_picture_for_gradients_has_the_same_bits_as_one_without() -> None:
-    scene, camera = activate(random_gaussians(300, seed=4)), orbit_camera()
+    scene = activate(random_gaussians(300, seed=4))
+    camera = orbit_camera()
     learned = scene._replace(means=scene.means.clone().requires_grad_())
     for plain, other in zip(render(scene, camera)[:2], render(learned, camera)[:2], strict=True):
         assert torch.equal(plain, other.detach())

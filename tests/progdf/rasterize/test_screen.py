@@ -43,7 +43,8 @@ def test_a_line_is_a_pixel_wide_seen_through_and_gone_afterwards_bit_for_bit() -
 
 
 def test_lines_fade_and_those_that_are_nowhere_draw_nothing() -> None:
-    image, through = np.ones((8, 64, 3), np.float32), np.ones((8, 64), np.float32)
+    image = np.ones((8, 64, 3), np.float32)
+    through = np.ones((8, 64), np.float32)
     fading = line(0, 4.5, 64, 4.5)
     fading[8] = 1.0
     with lines_behind(image, through, np.array([fading], np.float32), 0.25):

@@ -20,8 +20,10 @@ ARCHITECTURES = (75, 86, 89, 90)
 
 @NEEDS_WARP
 def test_the_bits_are_the_same_in_every_run() -> None:
-    scene, camera = random_gaussians(1000, seed=6, sh_degree=1), orbit_camera(64, 48)
-    first, second = draw(scene, camera, "warp"), draw(scene, camera, "warp")
+    scene = random_gaussians(1000, seed=6, sh_degree=1)
+    camera = orbit_camera(64, 48)
+    first = draw(scene, camera, "warp")
+    second = draw(scene, camera, "warp")
     assert torch.equal(first.image, second.image)
     for name in INPUTS:
         assert torch.equal(first.gradients[name], second.gradients[name]), name
@@ -33,7 +35,8 @@ def test_a_block_of_threads_adds_up_what_single_threads_do(monkeypatch: pytest.M
     """As on a card: 256 threads of a tile that meet at each sum. Otherwise a CPU runs them one by one."""
     import warp as wp
 
-    scene, camera = random_gaussians(300, seed=6, sh_degree=1), orbit_camera(50, 40)
+    scene = random_gaussians(300, seed=6, sh_degree=1)
+    camera = orbit_camera(50, 40)
     single = draw(scene, camera, "warp")
     monkeypatch.setattr(wp.config, "enable_cpu_blocks", True)
     block = draw(scene, camera, "warp")

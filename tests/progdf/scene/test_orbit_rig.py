@@ -47,7 +47,8 @@ def test_the_rig_surrounds_the_scene_evenly() -> None:
     gaps = azimuths.diff()
     torch.testing.assert_close(gaps, torch.full((39,), 2 * math.pi / 40), atol=0.02, rtol=0)
     heights = (places[:, 1] / places.norm(dim=1)).sort().values
-    low, high = math.sin(math.radians(5)), math.sin(math.radians(60))
+    low = math.sin(math.radians(5))
+    high = math.sin(math.radians(60))
     even = low + (high - low) * (torch.arange(40) + 0.5) / 40
     assert float((heights - even).abs().max()) < 0.05
     every_fifth = places[::5, 1] / places[::5].norm(dim=1)

@@ -385,7 +385,8 @@ def test_a_label_file_of_another_scene_or_kind_is_one_line(scene: Gaussians, tmp
     assert "not a readable .npy" in refusal(f"labels:{path}:1", scene)
     np.save(path, labels)
     whole = path.read_bytes()
-    bracket, leading_zero = whole.replace(b"{'descr': '", b"{'descr': ("), whole.replace(b"|u1", b"|01")
+    bracket = whole.replace(b"{'descr': '", b"{'descr': (")
+    leading_zero = whole.replace(b"|u1", b"|01")
     for content in (b"", b"hello", whole[:40], whole[:-1], bracket, leading_zero):
         path.write_bytes(content)
         refusal(f"labels:{path}:1", scene)
@@ -406,7 +407,8 @@ MASKS = st.lists(st.booleans(), min_size=12, max_size=12).map(torch.tensor)
 
 @given(a=MASKS, b=MASKS)
 def test_set_operations_are_those_of_sets(a: torch.Tensor, b: torch.Tensor) -> None:
-    one, two = from_mask("a", a), from_mask("b", b)
+    one = from_mask("a", a)
+    two = from_mask("b", b)
     for operation, expected in ((union, a | b), (difference, a & ~b)):
         region = operation(one, two)
         assert region.members.tolist() == expected.nonzero()[:, 0].tolist()

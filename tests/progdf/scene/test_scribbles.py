@@ -71,7 +71,8 @@ def test_strokes_take_a_table_that_no_color_takes() -> None:
 
 def test_the_same_scene_moved_turned_and_scaled_is_the_same_selection() -> None:
     made, _ = furnished()
-    points, colors = made.gaussians.means.double(), base_colors(made.gaussians)
+    points = made.gaussians.means.double()
+    colors = base_colors(made.gaussians)
     turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(0)).double())[0]
     moved = (7.0 * points @ turn + torch.tensor([30.0, -4.0, 9.0])).numpy()
     before, after = (Scribbles(at, colors).select(*strokes()) for at in (points.numpy(), moved))
@@ -80,8 +81,10 @@ def test_the_same_scene_moved_turned_and_scaled_is_the_same_selection() -> None:
 
 def test_chances_are_those_of_the_whole_system_solved_exactly() -> None:
     rng = np.random.default_rng(0)
-    points, colors = rng.normal(size=(3000, 3)), rng.random((3000, 3)).astype(np.float32)
-    inside, outside = np.arange(20), np.arange(20, 60)
+    points = rng.normal(size=(3000, 3))
+    colors = rng.random((3000, 3)).astype(np.float32)
+    inside = np.arange(20)
+    outside = np.arange(20, 60)
     steps = likely_steps(points, colors).astype(np.float64)
     free = np.arange(60, 3000)
     matrix = (diags_array(steps.sum(axis=1)) - steps).tocsr()
@@ -120,7 +123,8 @@ def test_a_border_is_where_the_color_changes_however_far_the_strokes() -> None:
     points = np.concatenate([rng.random((4000, 2)), np.zeros((4000, 1))], axis=1)
     red = points[:, 0] < 0.8
     colors = np.where(red[:, None], [0.6, 0.2, 0.1], [0.6, -0.05, 0.1]) + rng.normal(0, 0.02, (4000, 3))
-    inside, outside = np.flatnonzero(points[:, 0] < 0.02), np.flatnonzero(points[:, 0] > 0.98)
+    inside = np.flatnonzero(points[:, 0] < 0.02)
+    outside = np.flatnonzero(points[:, 0] > 0.98)
     for scale in (1.0, 1e-3, 1e3):
         mask = Scribbles(scale * points, colors.astype(np.float32)).select(inside, outside)
         assert iou(mask, red) > 0.98

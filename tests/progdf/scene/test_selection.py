@@ -64,7 +64,8 @@ def camera() -> Camera:
 
 
 def test_centers_are_where_the_camera_sees_them_and_nowhere_behind_it() -> None:
-    scene, seen = random_gaussians(300), orbit_camera(90, 60, distance=1.0)
+    scene = random_gaussians(300)
+    seen = orbit_camera(90, 60, distance=1.0)
     points, depths = project_centers(scene, seen)
     local = scene.means.double() @ seen.viewmat[:3, :3].double().T + seen.viewmat[:3, 3].double()
     image = local @ seen.K.double().T
@@ -115,7 +116,8 @@ def test_a_ball_holds_the_centers_within_its_radius() -> None:
 
 
 def test_modes_are_set_operations() -> None:
-    a, b = np.array([1, 1, 0, 0], bool), np.array([1, 0, 1, 0], bool)
+    a = np.array([1, 1, 0, 0], bool)
+    b = np.array([1, 0, 1, 0], bool)
     results = [combine(a, b, mode).astype(int).tolist() for mode in MODES]
     assert results == [[1, 0, 1, 0], [1, 1, 1, 0], [0, 1, 0, 0], [1, 0, 0, 0]]
 
@@ -140,7 +142,8 @@ def test_the_front_surface_leaves_out_what_another_hides() -> None:
 
 
 def test_asking_about_a_part_of_the_picture_gives_the_same_answer() -> None:
-    scene, seen = random_gaussians(3000, scale=0.08), orbit_camera(160, 120)
+    scene = random_gaussians(3000, scale=0.08)
+    seen = orbit_camera(160, 120)
     centers = project_centers(scene, seen)
     rows = np.flatnonzero(inside_rectangle(centers.points, (40, 30), (100, 90)))
     whole = front_surface(scene, seen, centers)
@@ -152,9 +155,11 @@ def test_asking_about_a_part_of_the_picture_gives_the_same_answer() -> None:
 def test_growing_and_shrinking_move_the_border_by_a_neighbor() -> None:
     scene = sheet(gray())
     near = Neighborhood(scene)
-    x, y = scene.means[:, 0].numpy(), scene.means[:, 1].numpy()
+    x = scene.means[:, 0].numpy()
+    y = scene.means[:, 1].numpy()
     square = (np.abs(x) < 0.5) & (np.abs(y) < 0.5)
-    grown, shrunk = near.grow(square), near.shrink(square)
+    grown = near.grow(square)
+    shrunk = near.shrink(square)
     assert (grown & square).sum() == square.sum() < grown.sum() <= square.sum() + 4 * 12
     assert (shrunk & ~square).sum() == 0 < shrunk.sum() < square.sum()
     assert (near.shrink(grown) == square).mean() > 0.98
@@ -227,7 +232,8 @@ def test_a_flood_stops_at_another_color_and_at_a_gap() -> None:
     colors = gray()
     colors[:200] = torch.tensor([0.8, 0.2, 0.1])  # the upper half
     scene = joined(sheet(colors, 3.0), sheet(colors, 9.0))
-    near, lab = Neighborhood(scene), base_colors(scene)
+    near = Neighborhood(scene)
+    lab = base_colors(scene)
     seed = near.nearest((0.0, -0.5, 3.0))
     assert np.flatnonzero(grow_along_surface(near, lab, np.array([seed]), lab[seed], 0.1)).tolist() == [
         *range(200)
@@ -238,8 +244,10 @@ def test_a_flood_stops_at_another_color_and_at_a_gap() -> None:
 
 
 def test_a_surface_that_was_looked_at_ahead_says_the_same_as_one_that_was_not() -> None:
-    scene, seen = random_gaussians(3000, seed=4), camera()
-    ahead, late = Surface(scene, seen), Surface(scene, seen)
+    scene = random_gaussians(3000, seed=4)
+    seen = camera()
+    ahead = Surface(scene, seen)
+    late = Surface(scene, seen)
     ahead.prepare(colors=True)
     rows = np.arange(0, 3000, 7)
     assert (ahead.front(rows) == late.front(rows)).all()

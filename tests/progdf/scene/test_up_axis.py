@@ -188,7 +188,8 @@ def upright(tmp_path: Path, *arguments: str) -> tuple[float, ...]:
 def test_an_edit_shows_its_scene_upright_without_being_asked(tmp_path: Path) -> None:
     stack = bear_stack(2000)
     scene, scarf, _ = stack.save(tmp_path)
-    plus_y, plus_x = (0.0, 1.0, 0.0), (1.0, 0.0, 0.0)
+    plus_y = (0.0, 1.0, 0.0)
+    plus_x = (1.0, 0.0, 0.0)
     assert upright(tmp_path, str(scene)) == plus_y
     save_gdf(scarf, replace(stack.gdfs[0], report={"up": {"direction": [1.0, 0.0, 0.0], "reason": "told"}}))
     assert upright(tmp_path, str(scene), str(scarf)) == plus_x

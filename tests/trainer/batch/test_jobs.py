@@ -109,7 +109,8 @@ def test_what_is_no_catalogue_is_one_line(tmp_path: Path, text: str) -> None:
     try:
         jobs, faults = read(tmp_path, text)
     except ProgdfError as error:
-        jobs, faults = [], [str(error)]
+        jobs = []
+        faults = [str(error)]
     assert not jobs
     assert len(faults) == 1
 

@@ -286,8 +286,10 @@ def test_a_run_follows_an_anchor_of_any_camera_and_not_another_one_when_it_goes_
     pix2pix: str, tmp_path: Path
 ) -> None:
     klein = str(tiny_flux2_klein(tmp_path / "klein"))
-    demo, _ = bear(900), write_bear(tmp_path, 900)
-    camera, anchor = demo.cameras[1].resize(80, 60), tmp_path / "anchor.png"
+    demo = bear(900)
+    _ = write_bear(tmp_path, 900)
+    camera = demo.cameras[1].resize(80, 60)
+    anchor = tmp_path / "anchor.png"
     painted = render_view(demo.gaussians, camera, torch.ones(3)).clamp(0.0, 1.0).flip(2)
 
     def save(picture: torch.Tensor) -> None:
@@ -347,7 +349,8 @@ def test_parts_that_go_to_the_card_in_turn_paint_the_same_picture(
     tiled = []
     # a tiny autoencoder's tiles would be of 32 pixels
     monkeypatch.setattr(AutoencoderKL, "enable_tiling", lambda self: tiled.append(self))
-    editor, view = editor_of(settings_of(pix2pix)), small().views[0]
+    editor = editor_of(settings_of(pix2pix))
+    view = small().views[0]
     mixed = load_pipeline(editor.request, replace(editor.placement, in_turn=True))
     in_turn = replace(editor, load=lambda: mixed)
     for strength in (0.5, 1.0, 0.5):

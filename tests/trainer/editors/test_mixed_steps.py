@@ -17,7 +17,8 @@ from tests.helpers.tiny_pipelines import PIPELINES, small_megapixels
 from trainer.editors.adapters import ADAPTERS
 from trainer.editors.mixed_steps import MixedSteps, euler_scheduler, network_steps, step_weight
 
-SIDE, STEPS = 64, 4
+SIDE = 64
+STEPS = 4
 KINDS = list(PIPELINES)
 ROUNDING = 1e-5  # of a picture decoded twice; its latents meet to 1e-6
 
@@ -92,7 +93,8 @@ def test_at_strength_zero_every_step_leads_to_the_source(
     kind: str, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     mixed, _ = made(kind, folder)
-    step, last = mixed.pipeline.scheduler.step, []
+    step = mixed.pipeline.scheduler.step
+    last = []
 
     def spied(*args: Any, **kwargs: Any) -> Any:
         made = step(*args, **kwargs)

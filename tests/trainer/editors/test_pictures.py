@@ -62,7 +62,8 @@ def test_a_picture_is_its_view_s_edit(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("color", [[0.0, 0.0, 0.0], [0.1, 0.3, 0.8]])
 def test_a_background_of_another_color_is_found(color: list[float]) -> None:
-    scene, background = ball(), torch.tensor(color)
+    scene = ball()
+    background = torch.tensor(color)
     drawn = render(scene, looking(scene)[0])
     picture = quantize_image(drawn.image + drawn.transmittance[..., None] * (background - 1))
     picture[:12] = torch.tensor([0.9, 0.1, 0.2])  # a quarter of it painted over

@@ -42,7 +42,8 @@ def rows(run: Path, printed: str) -> dict[str, Any]:
 
 def test_figures_that_the_report_has_too_are_the_reports(run: Path, rows: dict[str, Any]) -> None:
     report = json.loads((run / "report.json").read_text())
-    edit, slider = report["edit"], report["slider"]
+    edit = report["edit"]
+    slider = report["slider"]
     assert rows["psnr_end"]["slider"] == pytest.approx(edit["psnr_to_views"], abs=0.01)
     assert rows["ssim_end"]["slider"] == pytest.approx(edit["ssim_to_views"], abs=1e-4)
     assert rows["lpips_end"]["slider"] == pytest.approx(edit["lpips_to_views"], abs=1e-4)

@@ -47,8 +47,10 @@ def _from(x: float, y: float = 0.0) -> Camera:
 
 
 def test_a_view_warped_onto_itself_is_itself() -> None:
-    scene, camera = _wall(4.0, 5.0), _from(0.3)
-    image, seen = _picture(scene, camera), see_depth(_wall(4.0, 5.0), camera)
+    scene = _wall(4.0, 5.0)
+    camera = _from(0.3)
+    image = _picture(scene, camera)
+    seen = see_depth(_wall(4.0, 5.0), camera)
     warped, both = warp_view(image, seen, seen)
     assert bool(both[1:-1, 1:-1].all())
     assert float((warped - image).abs()[1:-1, 1:-1].max()) < 1e-4
@@ -80,8 +82,11 @@ def test_a_plane_warps_exactly_but_for_the_sampling() -> None:
 
 
 def test_a_wall_seen_from_elsewhere_warps_onto_what_is_seen_here() -> None:
-    scene, here, there = _wall(4.0, 5.0), _from(0.0), _from(1.2, 0.4)
-    image, other = _picture(scene, here), _picture(scene, there)
+    scene = _wall(4.0, 5.0)
+    here = _from(0.0)
+    there = _from(1.2, 0.4)
+    image = _picture(scene, here)
+    other = _picture(scene, there)
     warped, both = warp_view(other, see_depth(scene, there), see_depth(scene, here))
     assert float(both.float().mean()) > 0.7
     # which of two overlapping Gaussians lies in front is another from there: colors shift by half of one
@@ -90,9 +95,13 @@ def test_a_wall_seen_from_elsewhere_warps_onto_what_is_seen_here() -> None:
 
 
 def test_what_something_else_covers_in_the_other_view_is_not_seen_by_both() -> None:
-    back, front = _wall(4.0, 6.0), _wall(2.0, 0.4, 30, seed=1)
-    scene, here, there = concatenate(back, front), _from(0.0), _from(1.2)
-    seen_here, seen_there = see_depth(scene, here), see_depth(scene, there)
+    back = _wall(4.0, 6.0)
+    front = _wall(2.0, 0.4, 30, seed=1)
+    scene = concatenate(back, front)
+    here = _from(0.0)
+    there = _from(1.2)
+    seen_here = see_depth(scene, here)
+    seen_there = see_depth(scene, there)
     warped, both = warp_view(_picture(scene, there), seen_there, seen_here)
     image = _picture(scene, here)
     everywhere = torch.ones_like(both)
@@ -103,7 +112,9 @@ def test_what_something_else_covers_in_the_other_view_is_not_seen_by_both() -> N
 
 
 def test_what_lies_outside_the_other_view_or_is_empty_does_not_count() -> None:
-    scene, here, there = _wall(4.0, 1.0), _from(0.0), _from(0.5)
+    scene = _wall(4.0, 1.0)
+    here = _from(0.0)
+    there = _from(0.5)
     seen = see_depth(scene, here)
     _, both = warp_view(_picture(scene, there), see_depth(scene, there), seen)
     assert not bool(both[seen.depth.alpha < 0.9].any())

@@ -109,7 +109,9 @@ def test_what_trains_alongside_goes_on_to_the_same_bits() -> None:
                     along.add(at, found)
             along.step()
 
-    whole, first, second = beside(), beside(), beside()
+    whole = beside()
+    first = beside()
+    second = beside()
     run(whole, 0, 30)
     run(first, 0, 15)
     kept = first.capture_state()
@@ -141,7 +143,8 @@ def test_a_network_trained_alongside_is_finished_and_follows_the_recording(
 def test_an_interrupted_run_finishes_its_network_to_the_same_bits(
     folder: Path, alongside: RunResult, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    step, steps = JointTraining.step, 0
+    step = JointTraining.step
+    steps = 0
 
     def interrupted(self: JointTraining) -> None:
         nonlocal steps

@@ -46,10 +46,12 @@ PALETTE = "grade:#b97a30=#3060d0,#e0c898,curve=0.3:0.25+0.7:0.8"
 
 @pytest.mark.parametrize("spec", ["recolor:#3060d0", "tint:#3060d0", "darken:0.6", "night", GRADE, PALETTE])
 def test_a_draft_shows_an_edit_at_every_strength_as_its_editor_does(spec: str, tmp_path: Path) -> None:
-    case, gdf = small("body"), drafted(spec, tmp_path)
+    case = small("body")
+    gdf = drafted(spec, tmp_path)
     editor = make_editor(EditorOptions(spec), case.scene, case.region, case.views)
     edited = render_view(compose_layers(case.scene, [Layer(gdf, 1.0)]), case.views[0].camera, WHITE)
-    mask, target = case.views[0].mask > 0.05, editor.edit(case.views[0], 1.0)
+    mask = case.views[0].mask > 0.05
+    target = editor.edit(case.views[0], 1.0)
     before = masked_psnr(case.views[0].image, target, mask)
     assert masked_psnr(edited, target, mask) > before + 10.0, "a tenth of the change, as its rule has it"
     shown = [

@@ -48,7 +48,8 @@ def uniformity(dial_of: Tensor) -> float:
 
 
 def test_an_editor_is_asked_for_pictures_that_are_evenly_far_from_each_other() -> None:
-    views, editor = small(count=4).views, Late()
+    views = small(count=4).views
+    editor = Late()
     asked = equalized_strengths(editor, "darken:0.5", views, QUARTERS)
     assert asked == pytest.approx([0.25 ** (1 / 3), 0.5 ** (1 / 3), 0.75 ** (1 / 3), 1.0], abs=0.01)
     pictures = [torch.stack([editor.edit(view, s) for view in views]) for s in (0.0, *asked)]
@@ -57,7 +58,8 @@ def test_an_editor_is_asked_for_pictures_that_are_evenly_far_from_each_other() -
 
 
 def test_a_model_that_takes_its_time_is_asked_nine_strengths_of_one_view() -> None:
-    views, editor = small(count=4).views, Late()
+    views = small(count=4).views
+    editor = Late()
     asked = equalized_strengths(editor, "instruct:make him smile", views, QUARTERS)
     assert asked == pytest.approx([0.25 ** (1 / 3), 0.5 ** (1 / 3), 0.75 ** (1 / 3), 1.0], abs=0.02)
     assert editor.asked == 9
@@ -115,7 +117,8 @@ def test_a_fitted_field_is_as_even_in_views_that_were_not_looked_at() -> None:
     change[:, -3:] = -0.8
     offsets = strengths[:, None, None] ** 2.5 * change
     field = fit_separable(strengths, offsets, {"sh0": 2})
-    train, held_out = case.views[:4], case.views[4:]
+    train = case.views[:4]
+    held_out = case.views[4:]
     setup = TrainingSetup(case.scene, case.region, train, held_out, WHITE)
     even, remap = equalize_slider(field, setup)
     crops = [crop_scene(case.scene, members, view.camera, view.box, WHITE) for view in held_out]

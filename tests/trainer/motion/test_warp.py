@@ -33,7 +33,8 @@ from trainer.optimize.groups import group_path, group_stage, restore_groups
 from trainer.views.crops import CropScene, crop_scene
 from trainer.views.view import crop
 
-UP, SIDE = torch.tensor([0.0, 1.0, 0.0]), torch.tensor([1.0, 0.0, 0.0])
+UP = torch.tensor([0.0, 1.0, 0.0])
+SIDE = torch.tensor([1.0, 0.0, 0.0])
 MEANS = attribute_slices(14)["means"]
 
 
@@ -58,10 +59,8 @@ def some_motion(control: ControlPoints, seed: int = 0, size: float = 0.3) -> War
 def bent(case: Small, degrees: float = 30.0, factor: float = 1.3) -> AnalyticEdit:
     """The body stretched and bent from its feet, which no similarity explains."""
     means = case.scene.means[case.region.members]
-    base, length = (
-        means.mean(dim=0) * (1 - UP) + means.amin(dim=0) * UP,
-        float(means[:, 1].max() - means[:, 1].min()),
-    )
+    base = means.mean(dim=0) * (1 - UP) + means.amin(dim=0) * UP
+    length = float(means[:, 1].max() - means[:, 1].min())
     stretch, bend = stretch_warp(base, UP, factor), bend_warp(base, UP, SIDE, factor * length, degrees)
     return warp_edit("bent", lambda points, strength: bend(stretch(points, strength), strength))
 
@@ -129,7 +128,8 @@ def test_control_points_that_do_what_their_part_does_move_it_as_a_whole() -> Non
         torch.randn(2, 3), torch.tensor([0.3, -0.2]), torch.tensor([[0.5, 0.9, -0.3], [0, 1.2, 0]])
     )
     warp = warp_of_parts(control, parts, motion)
-    moved, expected = warp_rows(rows, control, warp), move_rows(rows, parts, motion)
+    moved = warp_rows(rows, control, warp)
+    expected = move_rows(rows, parts, motion)
     assert torch.allclose(moved[:, :6], expected[:, :6], atol=1e-4)
     turned = (
         torch.nn.functional.normalize(moved[:, 6:10]) * torch.nn.functional.normalize(expected[:, 6:10])
@@ -152,7 +152,8 @@ def test_a_motion_held_at_more_points_stays_what_it_was() -> None:
 
 def test_the_way_between_motions_begins_and_ends_at_them_and_turns_along_the_great_circle() -> None:
     _, control = held()
-    a, b = some_motion(control, 1), some_motion(control, 2)
+    a = some_motion(control, 1)
+    b = some_motion(control, 2)
     for share, expected in ((0.0, a), (1.0, b)):
         found = interpolate_warp(a, b, share)
         assert torch.allclose(found.turn, expected.turn, atol=1e-5)

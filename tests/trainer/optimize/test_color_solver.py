@@ -86,7 +86,8 @@ def solve_all(
 ) -> list[ParameterSnapshot]:
     """The recordings, in half precision as a run has them; all views say when a stage is done."""
     targets = [(stage, Judge(solver.views, stage.targets)) for stage in stages]
-    course, made = Course(targets[:-1], targets[-1]), [] if made is None else made
+    course = Course(targets[:-1], targets[-1])
+    made = [] if made is None else made
     for snapshot in solve(solver, model, course, made, state, on_step, steps):
         made.append(replace(snapshot, offsets=snapshot.offsets.half()))
     return made
@@ -97,7 +98,8 @@ def solved(scene: Gaussians, edited: Gaussians, cameras: list[Camera], steps: in
     crops, original = prepared(scene, cameras)
     targets = render_all(crops, pack(edited, with_shN=scene.sh_degree > 0))
     solver = make_solver(color_views(crops, original), original)
-    stages, model = [TargetStage(1.0, targets, 1)], model_of(solver, targets, steps)
+    stages = [TargetStage(1.0, targets, 1)]
+    model = model_of(solver, targets, steps)
     return solve_all(solver, model, stages, PgsState(original), steps)[-1].offsets
 
 
@@ -111,7 +113,8 @@ def psnr(scene: Gaussians, edited: Gaussians, offsets: Tensor, cameras: list[Cam
 def test_a_color_map_draws_and_differentiates_as_the_rasterizer_does() -> None:
     scene = random_gaussians(400, seed=2)
     scene = replace(scene, means=0.4 * scene.means / scene.means.norm(dim=1).max())
-    camera, window = orbit(3, 80)[1], (7, 3, 77, 61)
+    camera = orbit(3, 80)[1]
+    window = (7, 3, 77, 61)
     rows = torch.arange(0, 400, 3)
     colors = torch.zeros(400, 3)
     colors[rows] = torch.rand(len(rows), 3, generator=torch.Generator().manual_seed(5))
@@ -129,12 +132,14 @@ def test_a_color_map_draws_and_differentiates_as_the_rasterizer_does() -> None:
 
 def test_of_some_pixels_each_view_looks_at_others_and_the_edit_is_as_good() -> None:
     scene = replace(dense_ball(600), sh0=0.5 * torch.rand(600, 3, generator=torch.Generator().manual_seed(7)))
-    edited, cameras = replace(scene, sh0=scene.sh0.flip(1) + 0.3), orbit(8, 64)
+    edited = replace(scene, sh0=scene.sh0.flip(1) + 0.3)
+    cameras = orbit(8, 64)
     crops, original = prepared(scene, cameras)
     views = color_views(crops, original, 4)
     assert len({int(view.pixels[0]) for view in views}) == 4
     assert all(len(view.pixels) == view.size[0] * view.size[1] // 4 for view in views)
-    targets, solver = render_all(crops, pack(edited, False)), make_solver(views, original)
+    targets = render_all(crops, pack(edited, False))
+    solver = make_solver(views, original)
     model = model_of(solver, targets, 40)
     stages = [TargetStage(1.0, targets, 1)]
     offsets = solve_all(solver, model, stages, PgsState(original), 40)[-1].offsets
@@ -239,8 +244,10 @@ def test_only_members_that_need_them_have_functions_beyond_dc(turning: float, sp
     edited = replace(scene, shN=scene.shN * (1.0 - 2.0 * some[:, None, None]))
     crops, original = prepared(scene, orbit(8, 64))
     others, _ = prepared(scene, orbit(16, 64)[1::2])
-    rows, solver = pack(edited, with_shN=True), make_solver(color_views(crops, original), original)
-    targets, aside = grainy(render_all(crops, rows), 0.0125), grainy(render_all(others, rows), 0.0125)
+    rows = pack(edited, with_shN=True)
+    solver = make_solver(color_views(crops, original), original)
+    targets = grainy(render_all(crops, rows), 0.0125)
+    aside = grainy(render_all(others, rows), 0.0125)
     judge = Judge(color_views(others, original), aside)
     solver, model = choose_model(solver, (solver, judge), targets, 40, 4)
     thinner = thin_model(model, solver, [(TargetStage(1.0, targets, 1), judge)], 40, spare)
@@ -261,13 +268,15 @@ def test_where_the_end_shows_no_error_another_band_is_tried_for_the_way(turned: 
     scene = dense_ball(1000, bands=3)
     draws = 0.3 * torch.randn(1000, 3, generator=torch.Generator().manual_seed(9))
     (crops, original), (others, _) = (prepared(scene, c) for c in (orbit(8, 64), orbit(16, 64)[1::2]))
-    solver, aside = make_solver(color_views(crops, original), original), color_views(others, original)
+    solver = make_solver(color_views(crops, original), original)
+    aside = color_views(others, original)
 
     def target(s: float, shn: Tensor) -> Target:
         rows = pack(replace(scene, sh0=scene.sh0 + s * draws, shN=shn), with_shN=True)
         return TargetStage(s, render_all(crops, rows), 1), Judge(aside, render_all(others, rows))
 
-    end, half = target(1.0, scene.shN), target(0.5, -scene.shN if turned else scene.shN)
+    end = target(1.0, scene.shN)
+    half = target(0.5, -scene.shN if turned else scene.shN)
     solver, model = choose_model(solver, (solver, end[1]), end[0].targets, 40, most)
     assert model.bands == 1
     assert model.error <= LEVEL
@@ -292,7 +301,8 @@ def test_strengths_are_asked_for_where_those_that_are_solved_for_say_too_little(
         "late": lambda s: [max(0.0, s - 0.5)] * 3,
     }
     (crops, original), (others, _) = (prepared(scene, c) for c in (orbit(6, 48), orbit(9, 48)[6:]))
-    solver, aside = make_solver(color_views(crops, original), original), color_views(others, original)
+    solver = make_solver(color_views(crops, original), original)
+    aside = color_views(others, original)
 
     def pictures(some: list[CropScene], s: float) -> list[Tensor]:
         moved = replace(scene, sh0=scene.sh0 + side * torch.tensor(courses[bend](s)))
@@ -311,7 +321,9 @@ def test_strengths_are_asked_for_where_those_that_are_solved_for_say_too_little(
         return Course(ask(asked), ask([1.0])[0], look, ask)
 
     _, model = choose_model(solver, (solver, look(1.0)), pictures(crops, 1.0), 40, 1)
-    course, made, state = course_of([]), list[ParameterSnapshot](), PgsState(original)
+    course = course_of([])
+    made = list[ParameterSnapshot]()
+    state = PgsState(original)
     rounds[:] = [0]
     for snapshot in solve(solver, model, course, made, state, lambda step, left: None, 40):
         made.append(replace(snapshot, offsets=snapshot.offsets.half()))
@@ -322,7 +334,9 @@ def test_strengths_are_asked_for_where_those_that_are_solved_for_say_too_little(
     ends = list(rounds)
     for at in range(1, len(found) + 1):
         asked_by_then = found[: min(end for end in ends if end >= at)]
-        again, kept, known = PgsState(original), made[:at], course_of(asked_by_then)
+        again = PgsState(original)
+        kept = made[:at]
+        known = course_of(asked_by_then)
         again.step, again.stage, again.running = at, at, kept[-1].means["left"]
         for snapshot in solve(solver, model, known, kept, again, lambda step, left: None, 40):
             kept.append(replace(snapshot, offsets=snapshot.offsets.half()))
@@ -343,7 +357,8 @@ def test_steps_end_where_other_views_gain_little_and_go_on_where_members_are_den
     aside = grainy(aside, 0.0045)
     solver = make_solver(color_views(crops, original), original)
     _, mapped = solver.fit_map(1, targets)
-    start, judge = torch.zeros(members, 1, 3), Judge(color_views(others, original), aside)
+    start = torch.zeros(members, 1, 3)
+    judge = Judge(color_views(others, original), aside)
     found, taken = solver.residual(mapped, start, targets, most, judge)
     assert taken > 0.9 * most if members == 6000 else taken < most / 2
     further, all_steps = solver.residual(mapped, start, targets, most)
@@ -414,7 +429,8 @@ def test_torch_works_on_one_thread_whoever_gets_a_view() -> None:
 def test_a_view_says_what_its_clamps_pass() -> None:
     """The fused pass over the pixels against the same in torch, with colors and pixels beyond both ends."""
     crops, original = prepared(dense_ball(400), orbit(1, 40))
-    view, rng = color_views(crops, original, 2)[0], torch.Generator().manual_seed(5)
+    view = color_views(crops, original, 2)[0]
+    rng = torch.Generator().manual_seed(5)
     view, _ = replace(view, others=view.others - 0.2).halves()
     colors = 3.0 * torch.rand(400, 3, generator=rng) - 1.0
     target = torch.rand(view.others.shape, generator=rng).sub(0.2).clamp(0.0, 1.0)
@@ -439,8 +455,10 @@ def test_one_thread_and_two_solve_to_the_same_bits() -> None:
     for threads in (1, 2):
         torch.set_num_threads(threads)
         set_threads(threads)
-        solver, state = make_solver(color_views(crops, original), original), PgsState(original)
-        stages, model = [TargetStage(1.0, targets, 1)], model_of(solver, targets, 6)
+        solver = make_solver(color_views(crops, original), original)
+        state = PgsState(original)
+        stages = [TargetStage(1.0, targets, 1)]
+        model = model_of(solver, targets, 6)
         solve_all(solver, model, stages, state, 6)
         ends.append(state.moved.detach())
     set_threads(None)
@@ -452,7 +470,8 @@ def test_a_target_that_is_not_finite_stops_before_the_step() -> None:
     scene = dense_ball(200)
     crops, original = prepared(scene, orbit(2, 40))
     pictures = render_all(crops, original)
-    solver, state = make_solver(color_views(crops, original), original), PgsState(original)
+    solver = make_solver(color_views(crops, original), original)
+    state = PgsState(original)
     model = model_of(solver, pictures)
     broken = [TargetStage(1.0, [torch.full_like(picture, torch.nan) for picture in pictures], 1)]
     with pytest.raises(FloatingPointError, match="the loss is nan at step 0"):
@@ -487,7 +506,8 @@ def test_hard_regions_give_finite_offsets_and_their_pictures(case: str) -> None:
     targets = [torch.lerp(picture, torch.tensor([0.2, 0.3, 0.8]), 0.5) for picture in before]
     solver = make_solver(color_views(crops, original), original)
     model = model_of(solver, targets)
-    stages, state = [TargetStage(1.0, targets, 1)], PgsState(original)
+    stages = [TargetStage(1.0, targets, 1)]
+    state = PgsState(original)
     solve_all(solver, model, stages, state, 40)
     moved = state.moved.detach()
     assert bool(moved.isfinite().all())

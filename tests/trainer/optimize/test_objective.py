@@ -60,14 +60,16 @@ ALL_TERMS = paying(0.3, perceptual_every=1, progressive="decay", sharpness="hing
 
 
 def test_l1_and_the_stand_in_have_the_gradients_of_finite_differences() -> None:
-    image, target = noise(8, 9, 3).requires_grad_(), noise(8, 9, 3, seed=1)
+    image = noise(8, 9, 3).requires_grad_()
+    target = noise(8, 9, 3, seed=1)
     for measure in (l1, GradientL1()):
         assert torch.autograd.gradcheck(lambda x, measure=measure: measure(x, target), image)
 
 
 @pytest.mark.parametrize("form", ["hinge", "paper"])
 def test_sharpness_has_the_gradient_of_finite_differences(form: str) -> None:
-    image, target = 0.5 * noise(8, 9, 3), noise(8, 9, 3, seed=1)
+    image = 0.5 * noise(8, 9, 3)
+    target = noise(8, 9, 3, seed=1)
     inside = noise(8, 9, seed=3) > 0.3
     assert float(sharpness(image, target, "hinge", inside)) > 0, "the hinge is open"
     assert torch.autograd.gradcheck(
@@ -79,7 +81,8 @@ def test_sharpness_has_the_gradient_of_finite_differences(form: str) -> None:
 @pytest.mark.parametrize("grows", [False, True])
 @pytest.mark.parametrize("over", get_args(Over))
 def test_the_progressive_change_has_the_gradient_of_finite_differences(grows: bool, over: Over) -> None:
-    moved, previous = noise(5, 14).requires_grad_(), noise(5, 14, seed=1)
+    moved = noise(5, 14).requires_grad_()
+    previous = noise(5, 14, seed=1)
     assert torch.autograd.gradcheck(lambda x: progressive_change(x, previous, 70, grows, over), moved)
 
 
@@ -92,7 +95,8 @@ def test_lpips_has_the_gradient_of_finite_differences() -> None:
         [x.double() for x in part] for part in (network.kernels, network.biases, network.importance)
     )
     exact = replace(network, kernels=kernels, biases=biases, importance=importance)
-    image, target = noise(32, 32, 3).requires_grad_(), noise(32, 32, 3, seed=1)
+    image = noise(32, 32, 3).requires_grad_()
+    target = noise(32, 32, 3, seed=1)
     measure = LpipsLoss(exact)
     measure(image, target).backward()
     assert image.grad is not None
@@ -153,7 +157,8 @@ def test_the_line_for_the_log_names_what_is_really_used() -> None:
 
 
 def test_the_progressive_change_is_the_printed_sum_or_the_members_mean() -> None:
-    moved, previous = noise(5, 14), noise(5, 14, seed=1)
+    moved = noise(5, 14)
+    previous = noise(5, 14, seed=1)
     squares = (moved - previous).square().sum(dim=1)
     lengths: dict[Over, Tensor] = {"sum": squares.sum(), "mean": squares.mean()}
     for over, length in lengths.items():
@@ -274,7 +279,8 @@ def test_kept_features_have_a_bound_and_values_do_not_depend_on_it(monkeypatch: 
     pictures = [noise(40, 40, 3, seed=seed).float() for seed in range(4)]
     sizes = [sum(x.numel() * 4 for x in network.features(target)) for target in pictures[1:]]
     assert sum(sizes) > 80_000 > sizes[0] + sizes[1]
-    roomy, tight = LpipsLoss(network), LpipsLoss(network, room=80_000)
+    roomy = LpipsLoss(network)
+    tight = LpipsLoss(network, room=80_000)
     features = Count(monkeypatch, Lpips, "features")
 
     def distances(loss: LpipsLoss) -> tuple[list[float], int]:

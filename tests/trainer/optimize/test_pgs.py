@@ -30,7 +30,8 @@ def test_the_members_arrive_at_the_edited_views() -> None:
     edited = case.scene.replace_rows(case.region.members, original + found[-1].offsets)
     editor = make_editor(EditorOptions("recolor:#3060d0"), case.scene, case.region, case.views)
     for view in case.views:
-        target, inside = editor.edit(view, 1.0), view.mask > 0.5
+        target = editor.edit(view, 1.0)
+        inside = view.mask > 0.5
         before = masked_psnr(view.image, target, inside)
         after = masked_psnr(render(edited, view.camera).image.clamp(0, 1), target, inside)
         assert after > 28.0

@@ -37,7 +37,8 @@ def wall(z: float, color: Tensor) -> Gaussians:
 
 def two_walls() -> Gaussians:
     """An orange wall before a gray one, so near that both are in one region."""
-    front, back = wall(0.0, torch.tensor([0.8, 0.5, 0.2])), wall(0.4, torch.tensor([0.5, 0.5, 0.5]))
+    front = wall(0.0, torch.tensor([0.8, 0.5, 0.2]))
+    back = wall(0.4, torch.tensor([0.5, 0.5, 0.5]))
     return Gaussians(**{name: torch.cat([getattr(front, name), getattr(back, name)]) for name in ATTRIBUTES})
 
 
@@ -55,20 +56,24 @@ def change_of(scene: Gaussians, camera: Camera, painted: Tensor) -> Tensor:
 
 
 def test_a_hidden_wall_is_not_painted_with_the_one_before_it() -> None:
-    scene, camera = two_walls(), ahead()
+    scene = two_walls()
+    camera = ahead()
     painted = render_view(scene, camera, WHITE).clamp(0, 1)
     painted[24:72, 24:72] = torch.tensor([0.1, 0.2, 0.9])
     change = change_of(scene, camera, painted)
     middle = (scene.means[:, :2].abs() < 0.4).all(dim=1)
-    front, back = middle & (scene.means[:, 2] == 0.0), middle & (scene.means[:, 2] > 0.0)
+    front = middle & (scene.means[:, 2] == 0.0)
+    back = middle & (scene.means[:, 2] > 0.0)
     assert float(change[front, 2].mean()) > 0.6  # of .7: it is blue
     assert float(change[back].abs().max()) < 0.05
 
 
 def test_what_is_seen_through_others_is_asked_where_a_second_picture_shows_it() -> None:
-    scene, cameras = wall(0.0, torch.zeros(3)), (ahead(), ahead(0.8))
+    scene = wall(0.0, torch.zeros(3))
+    cameras = (ahead(), ahead(0.8))
     crops = [crop_scene(scene, torch.arange(len(scene)), c, (0, 0, 96, 96), WHITE, True) for c in cameras]
-    original, nobody = pack(scene, with_shN=False), torch.zeros(len(scene), dtype=torch.bool)
+    original = pack(scene, with_shN=False)
+    nobody = torch.zeros(len(scene), dtype=torch.bool)
     ties = Ties(surface_graph(scene, nobody), nobody)  # no picture shows any of it clearly
     asked = [make_solver(color_views(crops[:n], original), original, ties).asked for n in (1, 2)]
     assert not bool(asked[0].any())
@@ -85,13 +90,15 @@ def test_what_lies_beside_the_picture_follows_a_fill() -> None:
 
 
 def test_a_few_pictures_choose_the_degree_of_the_map_by_maps_alone() -> None:
-    rng, camera = torch.Generator().manual_seed(0), ahead(0.3)
+    rng = torch.Generator().manual_seed(0)
+    camera = ahead(0.3)
     gray = 0.4 + 0.2 * torch.rand(SIDE * SIDE, 1, generator=rng).expand(-1, 3)
     scene = replace(wall(0.0, torch.zeros(3)), sh0=rgb_to_sh0(gray).clone())
     painted = [render_view(scene, camera, WHITE).clamp(0, 1) * 0.9]
     painted[0][:, 48:] *= 0.5  # which a residual says better than any map
     crops = [crop_scene(scene, torch.arange(len(scene)), camera, (0, 0, 96, 96), WHITE, True)]
-    original, nobody = pack(scene, with_shN=False), torch.zeros(len(scene), dtype=torch.bool)
+    original = pack(scene, with_shN=False)
+    nobody = torch.zeros(len(scene), dtype=torch.bool)
     solver = make_solver(color_views(crops, original), original, Ties(surface_graph(scene, nobody), ~nobody))
     by, judge = split_solver(solver, painted)
     _, model = choose_model(solver, (by, judge), painted, 20, 1)
@@ -103,7 +110,8 @@ def test_a_few_pictures_choose_the_degree_of_the_map_by_maps_alone() -> None:
 
 
 def test_what_lies_beside_the_picture_takes_the_nearest_of_two_paints() -> None:
-    scene, camera = wall(0.0, torch.zeros(3)), ahead(0.3)
+    scene = wall(0.0, torch.zeros(3))
+    camera = ahead(0.3)
     right = camera.viewmat[0, :3] @ scene.means.T  # beyond .5 it is out of sight
     gray = 0.4 + 0.2 * torch.rand(len(scene), generator=torch.Generator().manual_seed(0))
     scene = replace(scene, sh0=rgb_to_sh0(gray[:, None].expand(-1, 3)).clone())
@@ -141,11 +149,14 @@ def test_a_half_goes_on_beyond_the_picture_but_a_pattern_does_not() -> None:
 
 
 def test_a_residual_that_says_nothing_of_other_pixels_stays_with_its_neighbors() -> None:
-    scene, camera = wall(0.0, torch.tensor([0.8, 0.5, 0.2])), ahead(0.3)
+    scene = wall(0.0, torch.tensor([0.8, 0.5, 0.2]))
+    camera = ahead(0.3)
     crops = [crop_scene(scene, torch.arange(len(scene)), camera, (0, 0, 96, 96), WHITE, True)]
-    original, nobody = pack(scene, with_shN=False), torch.zeros(len(scene), dtype=torch.bool)
+    original = pack(scene, with_shN=False)
+    nobody = torch.zeros(len(scene), dtype=torch.bool)
     solver = make_solver(color_views(crops, original), original, Ties(surface_graph(scene, nobody), ~nobody))
-    fill, two_paints = torch.full((96, 96, 3), 0.3), torch.eye(3)[torch.arange(96) // 48].expand(96, 96, 3)
+    fill = torch.full((96, 96, 3), 0.3)
+    two_paints = torch.eye(3)[torch.arange(96) // 48].expand(96, 96, 3)
     for paint, near in ((fill, True), (two_paints.contiguous(), False)):
         _, model = choose_model(solver, split_solver(solver, [paint]), [paint], 20, 1)
         assert (model.hold == 1e-3) is near
@@ -153,12 +164,15 @@ def test_a_residual_that_says_nothing_of_other_pixels_stays_with_its_neighbors()
 
 
 def test_what_the_members_do_not_show_is_no_error_of_theirs() -> None:
-    scene, camera = wall(0.0, torch.tensor([0.8, 0.5, 0.2])), ahead()
+    scene = wall(0.0, torch.tensor([0.8, 0.5, 0.2]))
+    camera = ahead()
     members = (scene.means[:, 0] < 0.0).nonzero()[:, 0]
     crops = [crop_scene(scene, members, camera, (0, 0, 96, 96), WHITE, True)]
     original = pack(scene[members], with_shN=False)
-    views, same = color_views(crops, original), render_view(scene, camera, WHITE)
-    still, share = torch.zeros(len(members), 1, 3), views[0].share.view(96, 96, 1)
+    views = color_views(crops, original)
+    same = render_view(scene, camera, WHITE)
+    still = torch.zeros(len(members), 1, 3)
+    share = views[0].share.view(96, 96, 1)
     assert Judge(views, [same]).mean(still, 1.0) < 1e-3
     assert Judge(views, [same.where(share > 0.0, torch.zeros(3))]).mean(still, 1.0) < 1e-3
     black = Judge(views, [torch.zeros_like(same)]).mean(still, 1.0)

@@ -71,7 +71,8 @@ def test_both_ends_are_exact_although_recordings_are_in_half_precision() -> None
 
 def test_between_two_recordings_the_way_is_straight() -> None:
     trajectory = along([0.5, 1.0])
-    low, high = float(trajectory.s[1]), float(trajectory.s[2])
+    low = float(trajectory.s[1])
+    high = float(trajectory.s[2])
     middle = trajectory.at(0.5 * (low + high))
     assert torch.allclose(middle, 0.5 * (trajectory.node(1) + trajectory.node(2)), atol=1e-6)
 

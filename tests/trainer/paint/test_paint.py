@@ -68,7 +68,8 @@ def test_what_shows_of_paint_is_linear_along_the_slider() -> None:
     scene = wall()
     paint = letters(scene)
     gdf, _ = edit_of(scene, paint)
-    before, change = picture(scene), paint.picture - picture(scene)
+    before = picture(scene)
+    change = paint.picture - picture(scene)
     for s in (0.1, 0.25, 0.5, 0.75, 0.9):
         shown = picture(compose_layers(scene, [Layer(gdf, s)])) - before
         share = (shown * change)[paint.mask].sum() / change[paint.mask].square().sum()

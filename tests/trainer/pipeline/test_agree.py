@@ -61,7 +61,9 @@ class Family:
 
     def nearest(self, render: Callable[[Camera], Tensor]) -> float:
         """PSNR of what is rendered in held-out views to the nearest single edit, dB."""
-        first, errors, count = len(self.setup.train), torch.zeros(len(self.choices[0])), 0
+        first = len(self.setup.train)
+        errors = torch.zeros(len(self.choices[0]))
+        count = 0
         for view, edits in zip(self.setup.held_out, self.choices[first:], strict=True):
             shows = view.mask > 0.05
             errors += (edits[:, shows] - render(view.camera)[shows]).square().flatten(1).sum(dim=1)
@@ -114,7 +116,8 @@ def test_views_that_follow_one_picture_show_one_edit(kind: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["hue", "stripes"])
 def test_an_ideal_editor_is_held_to_one_edit_of_many(kind: str, tmp_path: Path) -> None:
-    sizes, seeds = (24, 20, 6000, 96), range(3)
+    sizes = (24, 20, 6000, 96)
+    seeds = range(3)
     some = family(kind, *sizes)
     together = [some.nearest(agreed(some, some.painter(), tmp_path, seed).fit.render) for seed in seeds]
     alone = [one_by_one(kind, *sizes, seed=seed) for seed in seeds]
@@ -124,14 +127,16 @@ def test_an_ideal_editor_is_held_to_one_edit_of_many(kind: str, tmp_path: Path) 
 
 def test_views_follow_a_picture_that_was_approved_at_every_degree(tmp_path: Path) -> None:
     some = family("stripes", 12, 16, 2000, 56)
-    log, view = RunLog(tmp_path / "log.txt", quiet=True), some.setup.train[0]
+    log = RunLog(tmp_path / "log.txt", quiet=True)
+    view = some.setup.train[0]
     for approved in (2, 7):
         easel = Easel(some.painter(), {}, NOTHING, 0)
         made = agree_views(easel, some.setup, STYLE, log, (view, some.choices[0][approved]))
         for s in (1.0, 0.5):
             off = 0
             for index, one in enumerate(some.setup.train):
-                shows, edits = one.mask > 0.05, torch.lerp(one.image, some.choices[index], s)
+                shows = one.mask > 0.05
+                edits = torch.lerp(one.image, some.choices[index], s)
                 misfits = (edits[:, shows] - made.edit(one, s)[shows]).square().flatten(1).sum(dim=1)
                 off += abs((int(misfits.argmin()) - approved + 6) % 12 - 6)
             assert off < 2 * len(some.setup.train), "three choices off is chance"
@@ -207,7 +212,8 @@ class Clumsy(WholeViews):
 def clumsy(seeds: Sequence[int], folder: Path) -> tuple[AgreedEditor, Clumsy, View, str]:
     setup = setup_of(small("scarf", 2500, 8, 96), 1)
     view = setup.train[3]
-    painter, log = Clumsy(view, 0.09, seeds), folder / "log.txt"
+    painter = Clumsy(view, 0.09, seeds)
+    log = folder / "log.txt"
     made = agree_views(Easel(painter, {}, NOTHING, 5), setup, STYLE, RunLog(log, quiet=True))
     return made, painter, view, log.read_text(encoding="utf-8")
 
@@ -277,7 +283,8 @@ def test_a_loop_that_is_killed_at_any_picture_goes_on_to_the_same_bits(
 ) -> None:
     """With five pictures between two kills each kind of round is once begun, once half done."""
     whole = painted(tmp_path / "whole", made := Counting(references=references))
-    folder, kills = tmp_path / "killed", (made.calls - 1) // each
+    folder = tmp_path / "killed"
+    kills = (made.calls - 1) // each
     for _ in range(kills):
         with pytest.raises(StoppedError):
             painted(folder, Counting(each, references))

@@ -67,7 +67,8 @@ def commands(monkeypatch: pytest.MonkeyPatch, bear: scenes.DemoScene) -> list[Se
     """Replaces the training by a formula and the window by a list of the commands that would open it."""
 
     def train(options: TrainOptions) -> None:
-        plan, out = resolve(options), options.out
+        plan = resolve(options)
+        out = options.out
         edit = next(edit for edit in demo.SHOWS["bear"].edits if edit.name == plan.name == out.name)
         if edit.paint is None:
             region = parse_region(plan.region.region, load_ply(plan.scene), edit.name)

@@ -73,7 +73,8 @@ def test_what_a_row_is_worth_is_close_to_the_error_without_it(spec: str) -> None
         pictures = render_all(crops, rows)
         return sum(0.5 * float((a - b).square().sum()) for a, b in zip(pictures, targets, strict=True))
 
-    exact, chosen = [], range(0, len(rows), 9)
+    exact = []
+    chosen = range(0, len(rows), 9)
     for row in chosen:
         without = rows.clone()
         without[row, LOGIT] = ADDED_LOGIT

@@ -21,9 +21,12 @@ from trainer.resolve import resolve
 from trainer.run.kinds import Approach, Trial, approaches, try_approaches
 from trainer.setup import TrainingSetup
 
-COLOR, STYLE, FREE = Approach("color"), Approach("style"), Approach("geometry")
+COLOR = Approach("color")
+STYLE = Approach("style")
+FREE = Approach("geometry")
 IN_PARTS = Approach("geometry", 120)
-GROWN, GROWN_STYLE = Approach("geometry", grow=0.2), Approach("style", grow=0.2)
+GROWN = Approach("geometry", grow=0.2)
+GROWN_STYLE = Approach("style", grow=0.2)
 
 
 def asked(**more: object) -> TrainOptions:

@@ -79,12 +79,14 @@ def test_the_loss_of_the_field_is_the_printed_sum() -> None:
     """L_GDF = L1 + LPIPS between the renders of Θ0 + GDF(s) and of the snapshot, −(∇²R)² of the former."""
     case = small("body")
     rows = pack(case.scene[case.region.members])
-    height, width = case.views[0].camera.height, case.views[0].camera.width
+    height = case.views[0].camera.height
+    width = case.views[0].camera.width
     crops = [
         crop_scene(case.scene, case.region.members, view.camera, (0, 0, width, height), WHITE)
         for view in case.views[:2]
     ]
-    found, recorded = 0.1 * torch.rand_like(rows), 0.1 * torch.rand_like(rows)
+    found = 0.1 * torch.rand_like(rows)
+    recorded = 0.1 * torch.rand_like(rows)
     loss = RenderedLoss(crops, rows, ATTRIBUTES, GradientL1())
     assert loss.views == 2
     image, expected = (crops[1].render(rows + offsets) for offsets in (found, recorded))

@@ -65,7 +65,8 @@ def test_other_sides_follow_a_fill_from_one_picture(
     edited = compose_layers(scene, [Layer(load_gdf(done.gdf, scene), 1.0)])
     truth = make_editor(EditorOptions(SPEC), scene, region, views)
     for view in views[1:]:
-        shown, counts = render_view(edited, view.camera, torch.ones(3)).clamp(0, 1), view.mask > 0.05
+        shown = render_view(edited, view.camera, torch.ones(3)).clamp(0, 1)
+        counts = view.mask > 0.05
         error = decibels(float((shown - truth.edit(view, 1.0))[counts].square().mean()))
         unedited = decibels(float((view.image - truth.edit(view, 1.0))[counts].square().mean()))
         assert error > unedited + 6.0  # 7.5 at the least when written

@@ -45,9 +45,11 @@ def test_every_preset_is_there_and_the_default_one_changes_nothing() -> None:
 
 @pytest.mark.parametrize("preset", [name for name in PRESETS if name != "default"])
 def test_a_preset_is_its_values_and_no_more(preset: Preset) -> None:
-    plain, found = asked(), asked("--preset", preset)
+    plain = asked()
+    found = asked("--preset", preset)
     for part, values in PRESETS[preset].items():
-        before, after = vars(getattr(plain, part)), vars(getattr(found, part))
+        before = vars(getattr(plain, part))
+        after = vars(getattr(found, part))
         assert after == {**before, **values}
     parts = {part: getattr(plain, part) for part in PRESETS[preset]}
     assert replace(found, preset="default", **parts) == plain

@@ -75,7 +75,8 @@ def table(hole: float) -> Gaussians:
 def post() -> Gaussians:
     """A cylinder that stands on the table, a little wider than the hole."""
     at = torch.arange(2500)
-    angle, height = at * math.pi * (3 - math.sqrt(5)), -0.01 - 0.8 * at / len(at)
+    angle = at * math.pi * (3 - math.sqrt(5))
+    height = -0.01 - 0.8 * at / len(at)
     out = torch.stack([angle.cos(), torch.zeros(len(at)), angle.sin()], dim=1)
     red, yellow = (torch.tensor([[0.9, g, 0.1]]).repeat(len(at), 1) for g in (0.2, 0.5))
     side = splats(torch.stack([0.34 * out[:, 0], height, 0.34 * out[:, 2]], dim=1), out, 0.03, red)
@@ -112,7 +113,8 @@ def test_a_hole_that_nobody_saw_is_closed_as_the_surface_around_it() -> None:
     fill = fill_holes(scene, rest, setup.train)
     assert fill.rows is not None
     assert fill.after < 0.05 * fill.before
-    done, whole = concatenate([rest, fill.rows]), table(-1.0)
+    done = concatenate([rest, fill.rows])
+    whole = table(-1.0)
     for view in setup.held_out:
         hole = find_hole(rest, view, []).mask
         pictures = [render_view(some, view.camera, WHITE).clamp(0, 1) for some in (rest, done, whole)]
@@ -126,7 +128,8 @@ def test_a_hole_that_nobody_saw_is_closed_as_the_surface_around_it() -> None:
 @pytest.mark.parametrize(("depth", "behind_region", "is_hole"), [("inf", False, False), ("1", True, True)])
 def test_where_a_view_saw_through_there_is_no_hole(depth: str, behind_region: bool, is_hole: bool) -> None:
     _, rest, setup = case()
-    view, other = setup.train[0], setup.train[1].camera
+    view = setup.train[0]
+    other = setup.train[1].camera
     front = torch.full((other.height, other.width), float(depth))
     assert find_hole(rest, view, []).pixels > 0
     seen = [(other, front, torch.full(front.shape, behind_region))]

@@ -251,7 +251,8 @@ def test_a_saved_region_that_is_not_of_the_scene_is_one_line(bear_folder: Path, 
     state = StateFolder(OUT / "state")
     saved = state.load("region")
     assert saved is not None
-    members, score = saved.tensors["members"], saved.tensors["score"]
+    members = saved.tensors["members"]
+    score = saved.tensors["score"]
     half = len(score) // 2
     changed = {
         "half the rows": (members[members < half], score[:half]),
@@ -395,7 +396,8 @@ def test_an_edit_that_needs_half_of_the_views_keeps_no_others_and_goes_on_with_t
     options = quick_options(bear_folder, views=0, stages=0, image_size=48)
     options = replace(options, out=OUT, editor=EditorOptions("stripes:#20a040"))
     whole = train(options)
-    effort, names = whole.report["effort"], {path.stem for path in (OUT / "views/original").glob("*.png")}
+    effort = whole.report["effort"]
+    names = {path.stem for path in (OUT / "views/original").glob("*.png")}
     solved = effort["views"]
     assert len(effort["strengths"]) > 2
     assert len(names) == solved + len(whole.report["views"]["edit"])

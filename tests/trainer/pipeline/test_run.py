@@ -114,7 +114,8 @@ def test_effort_that_nobody_gives_is_decided_on_the_scene_and_reported(folder: P
     free = train(
         quick_options(folder, "free", stages=0, views=0, image_size=40, editor="darken:0.4"), quiet=True
     )
-    effort, given = free.report["effort"], done.report["effort"]
+    effort = free.report["effort"]
+    given = done.report["effort"]
     assert effort["strengths"] == free.report["trajectory"]["stages"]
     assert effort["strengths"] != given["strengths"]
     assert len(given["strengths"]) == 4
@@ -141,7 +142,8 @@ def test_strength_zero_is_the_scene_bit_for_bit_and_one_is_what_the_file_says(
     gdf = load_gdf(done.gdf, scene)
     at_zero = compose_layers(scene, [Layer(gdf, 0.0)])
     assert all(torch.equal(getattr(at_zero, name), getattr(scene, name)) for name in ATTRIBUTES)
-    members, end = gdf.region.members, gdf.field.offsets(1.0)
+    members = gdf.region.members
+    end = gdf.field.offsets(1.0)
     with_sh = end.shape[1] > 14
     at_one = compose_layers(scene, [Layer(gdf, 1.0)])
     assert torch.equal(pack(at_one[members], with_shN=with_sh), pack(scene[members], with_shN=with_sh) + end)
@@ -180,12 +182,14 @@ def test_the_report_has_what_others_read_from_it(done: RunResult) -> None:
 
 
 def test_a_field_s_errors_are_reported_on_views_that_its_choice_has_not_seen(done: RunResult) -> None:
-    views, report = done.report["views"], done.report
+    views = done.report["views"]
+    report = done.report
     assert set(views["field_chosen"]) & set(views["field"]) == set()
     assert sorted([*views["field_chosen"], *views["field"]]) == sorted(views["edit"])
     assert "box" in views["lpips_over"]
     run = reopen_run(done.folder.root)
-    trajectory, setup = run.trajectory, render_run_views(run)
+    trajectory = run.trajectory
+    setup = render_run_views(run)
     halves = load_evaluator(run.folder, setup, setup.held_out, trajectory).halves()
     offsets = torch.stack([trajectory.node(i) for i in range(len(trajectory))])
     linear = fit_keyframes(trajectory.s, offsets, 2)
@@ -199,7 +203,8 @@ def test_a_field_s_errors_are_reported_on_views_that_its_choice_has_not_seen(don
 
 
 def test_bytes_per_gaussian_are_given_without_and_with_the_header(done: RunResult) -> None:
-    file, members = done.report["file"], len(read_gdf(done.gdf).region)
+    file = done.report["file"]
+    members = len(read_gdf(done.gdf).region)
     assert file["bytes"] == done.gdf.stat().st_size
     assert file["bytes_per_gaussian"] == pytest.approx(file["bytes"] / members, abs=0.06)
     assert file["bytes_per_gaussian"] > done.report["field"]["bytes_per_gaussian"]
@@ -259,7 +264,8 @@ def test_refitting_changes_the_field_and_nothing_that_was_optimized(brief: RunRe
 def test_an_interrupted_run_leaves_the_earlier_edit_whole(
     folder: Path, brief: RunResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    root, kept = copy_of(brief, tmp_path), brief.gdf.read_bytes()
+    root = copy_of(brief, tmp_path)
+    kept = brief.gdf.read_bytes()
     options = quick_options(folder, out=root, steps=16, stages=2, field="lossless")
 
     def interrupt(*_: object, **__: object) -> None:

@@ -74,7 +74,8 @@ def test_a_disk_that_is_full_from_the_start_is_one_line(
 def test_a_loss_that_is_not_finite_keeps_the_state_before_it(
     bear_folder: Path, uninterrupted: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    calls, true_sum = 0, pgs.total_loss
+    calls = 0
+    true_sum = pgs.total_loss
 
     def poisoned(terms: dict[str, torch.Tensor]) -> torch.Tensor:
         nonlocal calls
@@ -139,7 +140,8 @@ def test_a_damaged_state_is_one_line(bear_folder: Path, part: str) -> None:
 
 
 def test_a_recording_with_a_map_of_another_degree_is_no_recording_of_the_run(tmp_path: Path) -> None:
-    offsets, no_mask = torch.zeros(3, 12), torch.zeros(3, 0, 3)
+    offsets = torch.zeros(3, 12)
+    no_mask = torch.zeros(3, 0, 3)
     models = [Model(degree, 1.0, no_mask, None, 0.1, [], 1, 1) for degree in (1, 2)]
     made = ParameterSnapshot(4, True, offsets, {"left": 0.5}, identity_map(1))
     before, after = (Recordings(StateFolder(tmp_path), offsets.shape, model) for model in models)

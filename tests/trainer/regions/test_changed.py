@@ -54,7 +54,8 @@ def pictures(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 def test_what_was_filled_is_found_again(pictures: list[Path], tmp_path: Path) -> None:
     case = small("body", count=6, image_size=160)
     found = parse_region("changed", case.scene, kinds=region_kinds(settings(pictures, tmp_path)))
-    truth, members = set(case.region.members.tolist()), set(found.members.tolist())
+    truth = set(case.region.members.tolist())
+    members = set(found.members.tolist())
     assert len(truth & members) > 0.4 * len(
         truth | members
     )  # .47 of few, large Gaussians; .94-.99 of the robot's
@@ -204,7 +205,8 @@ def test_what_is_painted_on_a_thin_thing_s_front_does_not_show_from_behind(
     path = tmp_path / "A.png"
     to_picture(painted).save(path, pnginfo=camera_chunk(camera))
     found = parse_region(region, scene, kinds=region_kinds(settings([path], tmp_path)))
-    members, view = found.members, make_view(scene, found, camera, torch.ones(3))
+    members = found.members
+    view = make_view(scene, found, camera, torch.ones(3))
     crops = [crop_scene(scene, members, camera, view.box, torch.ones(3), still=True)]
     offsets = edit_few(scene, members, crops, [crop(painted, view.box)])
     edited = replace(scene, sh0=scene.sh0.index_add(0, members, offsets[:, 0]))

@@ -23,7 +23,8 @@ def grids(*places: tuple[float, int]) -> Gaussians:
 
 def test_what_one_of_two_masks_holds_is_no_member() -> None:
     scene = grids((0.0, 10))
-    views, inside = torch.full((100,), 3.0), torch.full((100,), 2.0)
+    views = torch.full((100,), 3.0)
+    inside = torch.full((100,), 2.0)
     inside[40:60] = 1.0
     said: list[str] = []
     kept = drop_strays(scene, torch.ones(100, dtype=torch.bool), views, inside, said.append)
@@ -52,7 +53,8 @@ def test_two_hands_are_both_kept() -> None:
 def test_a_hole_is_filled_unless_two_views_see_through_it() -> None:
     scene = grids((0.0, 12))
     member = torch.ones(144, dtype=torch.bool)
-    member[65], member[78] = False, False
+    member[65] = False
+    member[78] = False
     outside = torch.zeros(144)
     assert find_holes(scene, member, outside).tolist() == [65, 78]
     outside[78] = 2.0
@@ -63,7 +65,8 @@ def test_a_hole_is_filled_unless_two_views_see_through_it() -> None:
 
 def test_no_member_at_all_stays_none() -> None:
     scene = grids((0.0, 4))
-    nobody, views = torch.zeros(16, dtype=torch.bool), torch.zeros(16)
+    nobody = torch.zeros(16, dtype=torch.bool)
+    views = torch.zeros(16)
     assert not bool(drop_strays(scene, nobody, views, views).any())
     assert not len(find_holes(scene, nobody, views))
 

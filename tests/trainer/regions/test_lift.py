@@ -132,7 +132,8 @@ def test_by_the_papers_rule_the_share_of_pixels_alone_decides(demo: DemoScene, c
 
 
 def test_gray_masks_count_in_part() -> None:
-    scene, camera = wall(3.0), front_camera(64, 64, 64.0)
+    scene = wall(3.0)
+    camera = front_camera(64, 64, 64.0)
     gray = torch.full((64, 64), 0.6)
     assert lift_masks(scene, [camera], [gray]).members.tolist() == []
     assert len(lift_masks(scene, [camera], [gray], threshold=0.55)) == len(scene)
@@ -151,7 +152,8 @@ def test_a_bare_gaussian_is_clear_and_one_behind_a_wall_is_not() -> None:
 
 def test_what_no_view_shows_goes_with_the_surface_it_continues() -> None:
     """Two parallel walls, the rear one red on the left; a screen in front hides the middle of both."""
-    front, rear = wall(3.0), wall(3.03)
+    front = wall(3.0)
+    rear = wall(3.03)
     red = torch.tensor([1.5, -1.5, -1.5])
     rear = replace(rear, sh0=red.expand(len(rear), 3))
     scene = concatenate(front, rear)
@@ -164,7 +166,8 @@ def test_what_no_view_shows_goes_with_the_surface_it_continues() -> None:
 
 def test_a_hidden_gaussian_takes_no_label_from_what_covers_it() -> None:
     """The mask shows the wall in front; what little shines through it of the one behind proves nothing."""
-    cover, behind = wall(3.0, side=31), replace(wall(4.0), sh0=torch.zeros(WALL * WALL, 3))
+    cover = wall(3.0, side=31)
+    behind = replace(wall(4.0), sh0=torch.zeros(WALL * WALL, 3))
     bare = replace(behind, means=behind.means + torch.tensor([WALL * 0.1, 0.0, 0.0]))
     scene = concatenate(cover, behind, bare)
     narrow = front_camera(96, 64, 30.0)

@@ -31,7 +31,8 @@ from trainer.regions.from_pictures import RegionRequest, read_masks, region_kind
 from trainer.regions.segment import SEGMENTERS, normalize_prompt
 from trainer.views.view import View
 
-SIZE, VIEWS = 96, 6
+SIZE = 96
+VIEWS = 6
 DEMO = bear(1500)
 SCENE = DEMO.gaussians
 SCARF = DEMO.labels == DEMO.label_names.index("scarf")
@@ -152,7 +153,8 @@ def test_pictures_that_are_stored_turned_are_turned_and_photographs_of_known_cam
 
 
 def test_masks_that_do_not_fit_are_one_line(masks: Path, tmp_path: Path) -> None:
-    told, given = settings(tmp_path), settings(tmp_path, masks / "cameras.json")
+    told = settings(tmp_path)
+    given = settings(tmp_path, masks / "cameras.json")
     name = six_cameras()[2].name
     assert "needs a folder" in refusal("masks:", told)
     assert "is not a folder" in refusal(f"masks:{tmp_path}/nowhere", given)

@@ -188,9 +188,11 @@ def paint_strokes(view: Path, out: Path, **lines: list[tuple[int, int]]) -> Path
 def test_strokes_painted_on_a_view_are_a_region(
     demo: DemoScene, scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    view, out = tmp_path / "view.png", tmp_path / "rows.npy"
+    view = tmp_path / "view.png"
+    out = tmp_path / "rows.npy"
     said(capsys, "render", scene, "-o", view, "--size", "320x240", "--engine", "cpu")
-    line, beside = [(10, 228), (60, 190), (75, 225)], [(100, 190), (160, 215), (220, 195), (190, 140)]
+    line = [(10, 228), (60, 190), (75, 225)]
+    beside = [(100, 190), (160, 215), (220, 195), (190, 140)]
     strokes = paint_strokes(view, tmp_path / "strokes.png", lime=line, red=beside)
     said(capsys, "region", scene, f"scribbles:{strokes}", "-o", out)
     ground = np.zeros(3000, bool)

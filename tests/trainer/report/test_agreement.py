@@ -48,7 +48,8 @@ def stripes_of_its_own(period: float, seed: int) -> list[Tensor]:
     rng = torch.Generator().manual_seed(seed)
     pictures = []
     for view in body().views:
-        angle, phase = math.pi * float(torch.rand((), generator=rng)), float(torch.rand((), generator=rng))
+        angle = math.pi * float(torch.rand((), generator=rng))
+        phase = float(torch.rand((), generator=rng))
         y, x = torch.meshgrid(
             torch.arange(view.mask.shape[0]), torch.arange(view.mask.shape[1]), indexing="ij"
         )
@@ -149,7 +150,8 @@ def test_the_fit_is_the_damped_least_squares_solution(monkeypatch: pytest.Monkey
     changes = [
         LinearSight(torch.randn(9, 5, generator=rng), torch.randn(9, 3, generator=rng)) for _ in range(2)
     ]
-    A, b = torch.cat([s.matrix for s in changes]), torch.cat([s.change for s in changes])
+    A = torch.cat([s.matrix for s in changes])
+    b = torch.cat([s.change for s in changes])
     slope = A.T @ b
     damping = 0.2 * (A @ slope).square().sum() / slope.square().sum()
     expected = torch.linalg.solve(A.T @ A + damping * torch.eye(5), slope)

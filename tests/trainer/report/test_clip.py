@@ -39,7 +39,8 @@ def _unit(*values: float) -> Tensor:
 
 
 def test_a_picture_that_changes_as_the_words_do_scores_one_and_one_that_does_the_opposite_minus_one() -> None:
-    bear, golden = _unit(1.0, 0.0, 0.2), _unit(0.8, 0.6, 0.2)
+    bear = _unit(1.0, 0.0, 0.2)
+    golden = _unit(0.8, 0.6, 0.2)
     before = _unit(0.1, 0.2, 1.0)
     steps = torch.stack([before + 0.1 * (golden - bear), before - 0.1 * (golden - bear)])
     found = direction(before.expand(2, 3), steps, bear, golden)
@@ -47,7 +48,8 @@ def test_a_picture_that_changes_as_the_words_do_scores_one_and_one_that_does_the
 
 
 def test_a_picture_or_a_text_that_does_not_change_has_no_direction() -> None:
-    a, b = _unit(1.0, 2.0, 3.0), _unit(3.0, 1.0, 0.0)
+    a = _unit(1.0, 2.0, 3.0)
+    b = _unit(3.0, 1.0, 0.0)
     assert direction(a[None], a[None], a, b) == [None]
     assert direction(a[None], b[None], a, a) == [None]
     rounded = a * (1.0 + 2e-7)
@@ -139,7 +141,8 @@ def test_a_run_reports_the_course_over_the_slider_and_a_refit_can_ask_in_other_w
     write_bear(tmp_path)
     options = quick_options(tmp_path, steps=24, stages=2, views=5, text_before="a bear", text_after="blue")
     result = train(options, quiet=True)
-    edit, course = result.report["edit"], result.report["curves"]["clip_direction"]
+    edit = result.report["edit"]
+    course = result.report["curves"]["clip_direction"]
     assert course["s"][0] == 0.0
     assert course["similarity"][0] is None
     assert len(course["similarity"]) == 11

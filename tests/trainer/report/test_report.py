@@ -50,7 +50,8 @@ def _color_count(picture: Image.Image, color: Sequence[int]) -> int:
 
 def test_a_field_that_is_what_it_should_be_has_no_error_in_any_measure() -> None:
     bear = small(count=3)
-    evaluator, field = _judged(bear), _darker(bear)
+    evaluator = _judged(bear)
+    field = _darker(bear)
     truth = {s: evaluator.pictures(field.offsets(s)) for s in (0.3, 0.8)}
     shown = {"slider": evaluator.course(field)}
     found = picture_courses(evaluator, shown, (0.3, 0.8), lambda s: truth[s], GradientL1())["slider"]
@@ -91,7 +92,8 @@ def test_strips_show_the_same_view_at_five_strengths_and_gray_where_the_editor_w
     bear = small(count=3)
     evaluator = _judged(bear)
     columns = columns_of([(1.0, 1.0)])
-    ours, own = strip(evaluator, _darker(bear), columns, 64), editor_strip(evaluator, columns, 64)
+    ours = strip(evaluator, _darker(bear), columns, 64)
+    own = editor_strip(evaluator, columns, 64)
     assert len(ours) == len(own) == 5
     assert {picture.shape for picture in (*ours, *own)} == {ours[0].shape}
     assert torch.equal(ours[0], own[0])
@@ -226,7 +228,8 @@ def test_a_grade_keeps_the_bands_that_its_map_leaves_alone() -> None:
     end = torch.zeros(2, 23)
     end[:, 11] = 1.0
     offsets = torch.stack([torch.zeros(2, 23), end]).half()
-    steps, maps = torch.tensor([0, 1]), identity_map(1)[None]
+    steps = torch.tensor([0, 1])
+    maps = identity_map(1)[None]
     trajectory = Trajectory(torch.tensor([0.0, 1.0]), offsets, end, steps, (1,), (1.0,), maps, 1)
     pixels = [torch.ones(1, 1, dtype=torch.bool)]
     evaluator = Judging(torch.zeros(2, 23), [], pixels, {1.0: [torch.zeros(1, 1, 3)]}, ["a"])

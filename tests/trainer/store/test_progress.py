@@ -40,7 +40,9 @@ def test_the_progress_file_says_how_far_the_whole_run_is(
         ("even the slider", 0.0, 0, "strengths"),
     ):
         with log.steps(stage, 10) as advance:
-            log._written, now = -1.0, now + seconds  # each is written
+            # each is written
+            log._written = -1.0
+            now = now + seconds
             advance(done, word)
         found.append(json.loads((tmp_path / "progress.json").read_text("utf-8")))
     log.close()
@@ -68,7 +70,8 @@ def test_a_run_is_told_from_its_first_tenth_on_within_a_factor_of_two(
     now = 100.0  # before the first stage, whatever that took
     # on a machine of any speed, and one stage takes 1.6 times as long as it usually does
     takes = {stage: pace * work * (1.6 if stage == long else 1.0) for stage, work in WORK.items()}
-    end, worst = now + sum(takes.values()), 1.0
+    end = now + sum(takes.values())
+    worst = 1.0
     with log.stage("views"):
         now += takes["views"]
     for stage in ("edit", "optimize", "measure the edit"):

@@ -81,7 +81,8 @@ def test_a_region_is_looked_at_by_cameras_that_show_it(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("beside", ["", "views", "views/edited"])
 def test_pictures_of_a_run_are_of_its_own_cameras(tmp_path: Path, beside: str) -> None:
-    pictures, given = tmp_path / "views" / "edited", tmp_path / "others.json"
+    pictures = tmp_path / "views" / "edited"
+    given = tmp_path / "others.json"
     pictures.mkdir(parents=True)
     options = quick_options(tmp_path, editor=f"folder:{pictures}")
     assert resolve(options).views.cameras is None

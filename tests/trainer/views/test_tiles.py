@@ -73,7 +73,8 @@ def test_live_tiles_are_those_of_the_full_image() -> None:
     pixels = live_pixels(live, box)
     assert pixels.shape == (20, 70)
     rows, columns = pixels.nonzero().unbind(dim=1)
-    top, left = 18 // TILE_H * TILE_H, 50 // TILE_W * TILE_W
+    top = 18 // TILE_H * TILE_H
+    left = 50 // TILE_W * TILE_W
     assert (int(rows.min()) + 13, int(columns.min()) + 10) == (top, max(left, 10))
     assert (int(rows.max()) + 13, int(columns.max()) + 10) == (top + TILE_H - 1, min(left + TILE_W, 80) - 1)
 
@@ -115,7 +116,8 @@ def _cases() -> dict[str, Callable[[], object]]:
 @pytest.mark.parametrize("name", sorted(_cases()))
 def test_no_gaussian_that_reaches_a_tile_is_left_out(name: str) -> None:
     case = CASES[name]
-    scene, camera = case.gaussians, case.camera
+    scene = case.gaussians
+    camera = case.camera
     for row in range(-(-camera.height // TILE_H)):
         for column in range(-(-camera.width // TILE_W)):
             window = (

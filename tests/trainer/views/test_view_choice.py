@@ -150,7 +150,8 @@ def test_views_from_within_show_every_wall() -> None:
         means, torch.tensor([[1.0, 0, 0, 0]]).expand(n, 4).clone(), torch.full((n, 3), -2.5),
         torch.full((n,), 2.0), torch.zeros(n, 3), torch.zeros(n, 0, 3),
     )  # fmt: skip
-    up, K = torch.tensor([0.0, 1.0, 0.0]), intrinsics(1.2, 64, 64)
+    up = torch.tensor([0.0, 1.0, 0.0])
+    K = intrinsics(1.2, 64, 64)
     targets = [(0.02 * i, 0.0, 1.0) for i in range(30)] + [(1.0, 0, 0.1), (-1.0, 0, 0.1), (0.1, 0, -1.0)]
     cameras = [
         Camera(look_at(torch.tensor([0.0, 0.0, 0.01 * i]), torch.tensor(t), up), K, 64, 64, f"v{i}")

@@ -40,7 +40,8 @@ def test_the_rig_covers_a_small_region_with_pixels() -> None:
     case = small("scarf", size=1500)
     for view in case.views:
         x0, y0, x1, y1 = view.box
-        width, height = view.camera.width, view.camera.height
+        width = view.camera.width
+        height = view.camera.height
         assert max((x1 - x0) / width, (y1 - y0) / height) > 0.4
 
 
@@ -162,7 +163,8 @@ def test_outside_the_region_an_edit_is_put_back_and_from_a_fifth_on_it_is_taken(
 
 def test_a_box_grows_with_a_change_in_one_channel_and_not_with_one_too_small_to_see() -> None:
     view = small().views[0]
-    faint, blue = view.image.clone(), view.image.clone()
+    faint = view.image.clone()
+    blue = view.image.clone()
     faint[0, 0] += 0.04
     blue[0, 0, 2] -= 0.06
     assert view.widen([faint]).box == view.box
@@ -176,7 +178,8 @@ def test_a_view_shows_the_scene_and_of_the_region_its_own_color() -> None:
     )
     scene = replace(scene, shN=0.1 * torch.randn(2, 15, 3, generator=torch.Generator().manual_seed(0)))
     region = from_mask("front", torch.tensor([False, True]))
-    camera, background = front_camera(96, 80, focal=90.0), torch.tensor([0.2, 0.9, 0.4])
+    camera = front_camera(96, 80, focal=90.0)
+    background = torch.tensor([0.2, 0.9, 0.4])
     view = make_view(scene, region, camera, background)
     torch.testing.assert_close(view.image, render(scene, camera, background).image.clamp(0, 1))
     alone = view.mask > 0.05

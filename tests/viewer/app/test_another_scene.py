@@ -35,7 +35,8 @@ OF_THE_WINDOW = {
 
 def all_in_use(view: ViewState, count: int) -> ViewState:
     """With a selection, hidden splats and a region of a scene of `count`, and the brush on."""
-    half, third = np.arange(count) % 2 == 0, np.arange(count) % 3 == 0
+    half = np.arange(count) % 2 == 0
+    third = np.arange(count) % 3 == 0
     region = NamedRegion("half", Path("half.region.npy"), pack(half), int(half.sum()), visible=True)
     chosen = SelectionState(pack(half & ~third), int((half & ~third).sum()), pack(third), (region,))
     return replace(view, selection=chosen, brush=Brush(active=True), unfolded=(0,), overshoot=True)
@@ -92,7 +93,8 @@ def test_another_scene_opens_while_everything_of_the_old_one_is_in_use(
         window.draw()
     imgui.get_io().add_mouse_button_event(0, False)
     press(window, "J", "]", "F", "Ctrl+A", "Ctrl+H", "Alt+H", "Escape")
-    work, fresh = main_view.work, new_workspace(ViewState())
+    work = main_view.work
+    fresh = new_workspace(ViewState())
     selection.check(work.view.selection, 700)
     assert work.view.selection.regions == ()
     assert not work.view.brush.active
@@ -106,7 +108,8 @@ def test_a_scene_that_cannot_be_opened_leaves_the_old_one_as_it_was(
 ) -> None:
     window.main_view.change(all_in_use(window.main_view.work.view, len(bear().scene)))
     window.main_view.work = mark_saved(window.main_view.work)
-    before, engine = window.main_view.work.view, window.engine
+    before = window.main_view.work.view
+    engine = window.engine
 
     def no_engine(*_: object) -> None:
         raise OSError(28, "No space left on device", "half.ply")

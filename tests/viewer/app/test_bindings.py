@@ -32,7 +32,8 @@ def test_every_command_has_a_name_and_with_a_key_a_row_of_its_topic() -> None:
     listed = [row for topic in interface.topics()[1:] for row in topic.rows]
     assert len(listed) == len(set(listed))
     for command in COMMANDS.values():
-        text, keys = command.row or command.name, {key for key, does in listed if does == command.row}
+        text = command.row or command.name
+        keys = {key for key, does in listed if does == command.row}
         assert (text in [does for _, does in listed]) == (bool(command.keys) and text != JOINED), command
         assert not command.listed or keys == {command.listed}
     assert {("Ctrl+G", "Group; Shift ungroups"), ("Ctrl+C, Ctrl+V", "Copy, paste keys")} <= {*listed}
@@ -269,7 +270,8 @@ def test_a_message_stands_below_the_list_also_where_it_takes_several_lines(times
         hand.key("F1")
         hand.main_view.show_message("a line that is long enough to be wrapped " * times)
         hand.frame(3)
-        topics_window, message = shown(hand), imgui.internal.find_window_by_name("message")
+        topics_window = shown(hand)
+        message = imgui.internal.find_window_by_name("message")
         assert topics_window.pos.y + topics_window.size.y <= message.pos.y
         assert times > 4 or topics_window.scroll_max.y == 0.0
 
@@ -304,7 +306,8 @@ def test_on_a_mac_command_does_what_control_does_and_the_list_says_so(
 def test_the_window_asks_for_the_only_context_that_a_mac_gives() -> None:
     from viewer.ui import splash
 
-    asked, glfw = dict(splash._HINTS), splash.glfw
+    asked = dict(splash._HINTS)
+    glfw = splash.glfw
     assert (asked[glfw.CONTEXT_VERSION_MAJOR], asked[glfw.CONTEXT_VERSION_MINOR]) == (3, 3)
     assert asked[glfw.OPENGL_PROFILE] == glfw.OPENGL_CORE_PROFILE
     assert asked[glfw.OPENGL_FORWARD_COMPAT]

@@ -52,7 +52,8 @@ def dragged_and_called_off(
 ) -> None:
     """A drag that is called off half way; the hand goes on and lets go only then."""
     hand.move(*start)
-    before, work = hand.picture(), hand.main_view.work
+    before = hand.picture()
+    work = hand.main_view.work
     hand.press()
     for place in way:
         hand.move(*place)
@@ -70,7 +71,8 @@ def dragged_and_called_off(
 
 @ways
 def test_a_slider_goes_back_to_where_it_was_pressed(hand: Rig, call_off: CallOff) -> None:
-    start, end = hand.slider(0, 0.5), hand.slider(0, 0.9)
+    start = hand.slider(0, 0.5)
+    end = hand.slider(0, 0.9)
     dragged_and_called_off(hand, call_off, start, end)
     dragged_and_called_off(hand, call_off, hand.slider(0, 0.2), end)
     hand.drag(start, end)

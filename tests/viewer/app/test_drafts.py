@@ -40,7 +40,8 @@ class Previews:
     asked = 0
 
     def __init__(self, scene: Path) -> None:
-        self.folder, self._number = scene.parent, 0
+        self.folder = scene.parent
+        self._number = 0
         self._answers: list[preview.Preview] = []
 
     def ask(self, _: str, request: preview._Request, camera: Camera) -> int:
@@ -67,10 +68,13 @@ def window(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[applicat
     monkeypatch.setattr(job_queue, "Child", Trainer)
     monkeypatch.setattr(preview, "PreviewChild", Previews)
     monkeypatch.setattr(preview, "REST_S", 0.0)
-    Trainer.ended, Trainer.line, Trainer.edit = None, "", folder / "edits" / "scarf.gdf"
+    Trainer.ended = None
+    Trainer.line = ""
+    Trainer.edit = folder / "edits" / "scarf.gdf"
     scarf = load_gdf(folder / "edits" / "scarf.gdf", bear().scene)
     save_gdf(tmp_path / "grade.gdf", replace(scarf, report={"draft": {}}))
-    Previews.grade, Previews.asked = tmp_path / "grade.gdf", 0
+    Previews.grade = tmp_path / "grade.gdf"
+    Previews.asked = 0
     with null_app(
         replace(opened_document(folder), edits=(), gdf_paths=()), first_view(bear()), folder
     ) as app:
@@ -118,7 +122,8 @@ def test_a_grade_is_a_live_layer_that_the_form_drives_from_every_side(window: ap
 def test_while_a_color_is_dragged_each_grade_that_comes_is_shown_and_the_newest_asked_next(
     window: application.App, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked, waits = [], []
+    asked = []
+    waits = []
 
     def ask(self: Previews, region: str, request: preview._Request, _: Camera) -> int:
         self._number += 1
@@ -260,7 +265,8 @@ def test_a_sentence_is_painted_when_it_is_asked_for_and_the_edit_follows_that_pi
     assert given == [anchor], "the program that paints pictures has it"
     assert window.main_view.cover.name == "Anchor: make it a statue", "seen until something is saved"
     with Image.open(anchor) as picture:
-        size, chunk = picture.size, PngInfo()
+        size = picture.size
+        chunk = PngInfo()
         for key, text in picture.text.items():
             chunk.add_text(key, text)
     Image.new("RGB", size, (200, 30, 30)).save(anchor, pnginfo=chunk)
@@ -285,7 +291,8 @@ def test_the_trained_edit_takes_the_place_of_its_draft_and_nothing_else_changes(
     weights = paint.encode(np.linspace(0, 1, len(window.document.gdfs[0].region), dtype=np.float32))
     touched = replace(layer(window), strength=0.3, paint=weights, locked=True)
     window.main_view.change(replace(view, layers=(touched,)))
-    past, before = window.main_view.work.past, window.engine.image(window.main_view.work.view, (32, 24))
+    past = window.main_view.work.past
+    before = window.engine.image(window.main_view.work.view, (32, 24))
     assert before.any()
     Trainer.ended = 0
     turn(window)
@@ -302,7 +309,8 @@ def test_the_trained_edit_takes_the_place_of_its_draft_and_nothing_else_changes(
 def test_a_draft_whose_training_ends_badly_stays_until_it_is_deleted(window: application.App) -> None:
     opened(window)
     request(window, "train")
-    Trainer.ended, Trainer.line = 2, "the disk is full"
+    Trainer.ended = 2
+    Trainer.line = "the disk is full"
     turn(window)
     (job,) = window.main_view.work.jobs
     request(window, f"discard_run:{job.number}")

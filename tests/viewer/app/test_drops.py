@@ -72,7 +72,8 @@ def test_a_dropped_table_goes_on_what_is_selected_else_everywhere_and_in_a_layer
     opened.draw()
     layers = opened.main_view.work.view.layers
     assert [layer.name for layer in layers] == ["scarf", "look", "look-2"]
-    total, some = len(opened.document.scene), int(mask.sum())
+    total = len(opened.document.scene)
+    some = int(mask.sum())
     assert [row.count for row in opened.main_view.facts.rows][1:] == [total, some]
     assert [row.region for row in opened.main_view.facts.rows][1:] == ["all", "selection"]
     opened.handle(f"replace_by:0:{tmp_path / 'look.cube'}")

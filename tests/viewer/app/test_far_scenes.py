@@ -51,7 +51,8 @@ def window(tmp_path: Path) -> Iterator[application.App]:
 
 
 def test_a_session_has_its_cameras_in_the_world_and_comes_back(tmp_path: Path) -> None:
-    opened, seen = far_document(tmp_path), view()
+    opened = far_document(tmp_path)
+    seen = view()
     kept = snapshots.take((), seen)
     session.save(tmp_path / "far.session.json", WindowSession(opened, seen, kept))
     text = json.loads((tmp_path / "far.session.json").read_text())

@@ -391,7 +391,8 @@ def test_a_place_that_cannot_be_written_is_asked_for_again_with_what_was_typed(
     by_hand(window, text=typed)
     by_hand(window, imgui.Key.enter)  # the field lets go of the keys
     press(window, "Enter")
-    asked, before = question(window), window.main_view.work.view
+    asked = question(window)
+    before = window.main_view.work.view
     assert asked.text == typed
     assert "gone does not exist" in asked.error
     assert window.file_actions.has_unsaved
@@ -477,7 +478,8 @@ def test_pictures_lie_beside_the_scene_or_among_the_users_and_never_in_the_curre
     tmp_path_factory: pytest.TempPathFactory,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    here, own = tmp_path_factory.mktemp("here"), tmp_path_factory.mktemp("own") / "Pictures"
+    here = tmp_path_factory.mktemp("here")
+    own = tmp_path_factory.mktemp("own") / "Pictures"
     monkeypatch.chdir(here)
     monkeypatch.setattr(exports, "pictures_folder", lambda: own)
     press(window, "F2", "Ctrl+F2", "Shift+F2")

@@ -58,7 +58,8 @@ def test_in_a_part_tab_goes_from_one_to_the_next_and_keys_are_no_shortcuts_but_t
     hand: Rig,
 ) -> None:
     strike(hand, "Tab")
-    before, seen = hand.main_view.work, set()
+    before = hand.main_view.work
+    seen = set()
     for _ in range(20):
         strike(hand, "Tab")
         seen.add(focused())

@@ -61,7 +61,8 @@ def test_a_slow_frame_that_holds_a_whole_drag_still_ends_at_its_last_value(hand:
 
 def test_idle_draws_nothing_and_waits_for_ever(hand: Rig) -> None:
     hand.rest()  # the frames that tooltips get
-    drawn, frames = hand.main_view.canvas.pictures_drawn, hand.main_view.frames
+    drawn = hand.main_view.canvas.pictures_drawn
+    frames = hand.main_view.frames
     assert hand.main_view.next_frame_delay() is None
     assert (hand.main_view.canvas.pictures_drawn, hand.main_view.frames) == (drawn, frames)
 
@@ -135,7 +136,8 @@ def test_messages_leave_by_themselves(hand: Rig) -> None:
 
 
 def test_a_splash_says_what_is_opened_and_since_when_and_that_it_goes_on(hand: Rig) -> None:
-    drawn, images = hand.main_view.canvas.pictures_drawn, []
+    drawn = hand.main_view.canvas.pictures_drawn
+    images = []
     picture = SplashPicture(hand.screen.ctx)
     for seconds in (0.0, 1.0, 5.0):
         picture.draw(hand.screen, hand.pixels, 1.0, "Opening bear.ply …", seconds)
@@ -177,7 +179,8 @@ def test_interface_and_splats_leave_each_others_gl_state_alone(draw: str) -> Non
         hand.key("F1")
         hand.move(*VIEW)
         hand.settle()
-        used, view = hand.image(), hand.main_view.work.view
+        used = hand.image()
+        view = hand.main_view.work.view
     with rig(view, draw=draw) as fresh:
         assert np.array_equal(used[:, :340], fresh.image()[:, :340])
     assert np.array_equal(used[:480, 340:], panel_before), "all but the undo buttons"

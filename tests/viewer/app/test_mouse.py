@@ -114,7 +114,8 @@ def test_backslash_shows_the_original_and_again_the_edit() -> None:
     with rig(first_view(bear(), 0.0, 0.0)) as untouched:
         original = untouched.picture()
     with rig() as hand:
-        edited, words = hand.picture(), hand.image()[:60]
+        edited = hand.picture()
+        words = hand.image()[:60]
         hand.key("\\")
         assert not np.array_equal(hand.image()[:60], words), "the word Original is lit"
         assert np.array_equal(hand.picture(), original)

@@ -107,7 +107,8 @@ def test_the_grid_lies_behind_what_stands_on_it_whatever_draws_and_saved_picture
     tmp_path: Path,
 ) -> None:
     head = selection.select(selection.SelectionState(), np.isin(bear().demo.labels.numpy(), (1, 2)))
-    bare, camera = selection.isolate(head, len(bear().scene)), first_view(bear()).camera
+    bare = selection.isolate(head, len(bear().scene))
+    camera = first_view(bear()).camera
     lined = {}
     for draw in ("cpu", "gl"):
         view = replace(first_view(bear()), selection=bare, camera=replace(camera, elevation=60.0))

@@ -74,7 +74,8 @@ def test_the_bar_over_the_picture_is_there_while_a_tool_or_a_selection_is() -> N
         assert not any(w.name == "options" and w.active for w in imgui.get_current_context().windows)
         for chord in ("L", "J", "B"):
             hand.key(chord)
-            bar, axes = window_at("options"), window_at("view")
+            bar = window_at("options")
+            axes = window_at("view")
             assert bar.size.y < 50.0
             assert bar.pos.x + bar.size.x < axes.pos.x, "it covers neither the axes nor the panel"
             assert window_at("comparison").pos.y >= bar.pos.y + bar.size.y
@@ -108,7 +109,8 @@ def test_six_layers_have_whole_cards_of_two_lines_without_scrolling() -> None:
 
 def test_the_pill_shows_the_original_and_splits_the_picture(hand: Rig) -> None:
     pill = window_at("comparison")
-    y, left = pill.pos.y + 16.0, pill.pos.x
+    y = pill.pos.y + 16.0
+    left = pill.pos.x
     hand.click(left + 30.0, y)
     assert hand.main_view.work.before
     hand.click(left + 110.0, y)

@@ -20,7 +20,8 @@ from viewer.pictures.film import to_pixels
 from viewer.state.view_state import Comparison, ViewState
 from viewer.ui.overlay import Area, safe_frame
 
-WIDE, TALL = Area(720.0, 360.0), Area(300.0, 600.0)
+WIDE = Area(720.0, 360.0)
+TALL = Area(300.0, 600.0)
 
 
 @pytest.mark.parametrize("area", [WIDE, TALL], ids=["wide", "tall"])
@@ -58,8 +59,10 @@ def test_what_lies_inside_is_what_a_film_of_this_shape_shows() -> None:
             view = hand.main_view.work.view
             frame = safe_frame(view, area)
             assert frame is not None
-            wide, tall = round(frame.width), round(frame.height)
-            left, top = round((360 - wide) / 2), round((480 - tall) / 2)
+            wide = round(frame.width)
+            tall = round(frame.height)
+            left = round((360 - wide) / 2)
+            top = round((480 - tall) / 2)
             film = hand.main_view.engine.image(view, (wide, tall))
             seen = hand.picture()[top : top + tall, left : left + wide] / np.float32(255.0)
             # without the line and its name; half a pixel is lost where the frame's height is odd

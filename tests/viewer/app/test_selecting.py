@@ -335,7 +335,9 @@ def test_the_panel_selects_shows_and_keeps_regions() -> None:
     some = selection.select(kept, np.arange(len(mask)) < 100)
     view = replace(first_view(bear(), 0.7, 0.5), selection=some, select=SelectTool("lasso"))
     with rig(view, (1024, 640)) as hand:
-        row, eye, save = (850.0, 265.0), (748.0, 265.0), (130.0, 61.0)
+        row = (850.0, 265.0)
+        eye = (748.0, 265.0)
+        save = (130.0, 61.0)
         hand.modifier(imgui.Key.mod_shift)
         hand.click(*row)
         hand.modifier(imgui.Key.mod_shift, False)

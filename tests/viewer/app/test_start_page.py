@@ -49,7 +49,8 @@ def turn(app: application.App) -> None:
 @pytest.fixture
 def hand() -> Iterator[Rig]:
     """On a page with the examples, in a window of 900x640."""
-    context, document = headless_context(), empty()
+    context = headless_context()
+    document = empty()
     engine = ViewEngine(context, document.scene, (), "cpu")
     main_view = MainView(context, engine, document.facts(), ViewState())
     recent = (StartFile(Path("/scenes/bear.ply")), StartFile(Path("/scenes/gone.ply"), missing=True))
@@ -96,7 +97,9 @@ def test_a_single_click_opens_an_example(hand: Rig) -> None:
 
 
 def test_enter_opens_what_the_arrows_lead_to(hand: Rig) -> None:
-    right, down, enter = imgui.Key.right_arrow, imgui.Key.down_arrow, imgui.Key.enter
+    right = imgui.Key.right_arrow
+    down = imgui.Key.down_arrow
+    enter = imgui.Key.enter
     first, second, _ = EXAMPLE_TITLES
     type_keys(hand, enter)
     assert hand.main_view.take_requests() == (f"example:{first}",), "the first card has the keyboard"

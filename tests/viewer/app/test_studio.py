@@ -75,7 +75,9 @@ class Trainer:
 def window(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[application.App]:
     folder = bear_files(tmp_path)
     monkeypatch.setattr(job_queue, "Child", Trainer)
-    Trainer.ended, Trainer.line, Trainer.edit = None, "", folder / "edits" / "scarf.gdf"
+    Trainer.ended = None
+    Trainer.line = ""
+    Trainer.edit = folder / "edits" / "scarf.gdf"
     with null_app(
         replace(opened_document(folder), edits=(), gdf_paths=()), first_view(bear()), folder
     ) as app:
@@ -115,7 +117,8 @@ def test_an_edit_is_trained_and_comes_as_a_layer_at_full_strength(window: applic
 
 
 def test_what_is_selected_is_the_region_of_a_new_edit(window: application.App) -> None:
-    view, total = window.main_view.work.view, len(window.document.scene)
+    view = window.main_view.work.view
+    total = len(window.document.scene)
     mask = selection.unpack(selection.NOBODY, total).copy()
     mask[[3, 7]] = True
     chosen = selection.select(view.selection, mask)
@@ -132,7 +135,8 @@ def test_what_is_selected_is_the_region_of_a_new_edit(window: application.App) -
 
 def test_another_selection_is_another_file_for_the_preview(window: application.App, tmp_path: Path) -> None:
     """Who makes previews reads a file once: under one name, the second selection showed the first one."""
-    view, total = window.main_view.work.view, len(window.document.scene)
+    view = window.main_view.work.view
+    total = len(window.document.scene)
     specs = []
     for row in (3, 7, 3):
         mask = np.zeros(total, bool)
@@ -158,7 +162,8 @@ def test_what_cannot_be_trained_stands_in_the_form(window: application.App) -> N
 def test_what_is_packed_takes_the_drafts_place_while_it_is_measured(window: application.App) -> None:
     request(window, "train")
     (job,) = window.main_view.work.jobs
-    order, packed = job.task, job.task.out / "draft.gdf"
+    order = job.task
+    packed = job.task.out / "draft.gdf"
     packed.parent.mkdir(parents=True)
     scarf = bear().gdfs[0]
     save_gdf(packed, replace(scarf, instruction="a draft"))
@@ -188,7 +193,8 @@ def test_a_view_is_painted_over_in_another_program_and_each_save_is_shown(
     press(window, "Ctrl+N")
     request(window, "paint_view")
     (path,) = opened
-    form, size = window.main_view.work.form, window.main_view.picture_size
+    form = window.main_view.work.form
+    size = window.main_view.picture_size
     assert (form.choice.kind, form.region, form.pictures) == ("pictures", CHANGED, str(path))
     turn(window)
     assert (window.main_view.cover, window.main_view.preview.text) == (None, PAINT_TEXT)
@@ -227,7 +233,8 @@ def test_a_view_is_painted_over_in_another_program_and_each_save_is_shown(
 
 def test_a_failure_is_one_line_with_its_log(window: application.App) -> None:
     request(window, "train")
-    Trainer.ended, Trainer.line = 2, "the disk is full"
+    Trainer.ended = 2
+    Trainer.line = "the disk is full"
     turn(window)
     (job,) = window.main_view.work.jobs
     assert (job.status, job.error) == ("failed", "the disk is full")
@@ -393,9 +400,11 @@ def test_the_demos_card_counts_its_edits_and_each_is_one_layer_from_its_draft_on
 ) -> None:
     monkeypatch.setattr(job_queue, "Child", Trainer)
     monkeypatch.setattr(job_queue, "LOOK_S", 0.0)
-    Trainer.ended, Trainer.edit = None, None
+    Trainer.ended = None
+    Trainer.edit = None
     made = bear_files(tmp_path)
-    demo, scarf = state_folder() / "demo", state_folder() / "demo" / "scarf"
+    demo = state_folder() / "demo"
+    scarf = state_folder() / "demo" / "scarf"
     with null_app(empty(), ViewState(), tmp_path) as app:
         request(app, "demo")
         (job,) = app.jobs.queue.jobs
@@ -427,7 +436,8 @@ def test_what_runs_for_another_scene_goes_on_and_its_card_says_for_which(
     turn(window)
     job, delivery = window.main_view.work.jobs
     assert (job.status, job.elsewhere, delivery.elsewhere) == ("running", "bear.ply", "bear.ply")
-    Trainer.ended, Trainer.line = 2, "the disk is full"
+    Trainer.ended = 2
+    Trainer.line = "the disk is full"
     turn(window)
     turn(window)
     assert window.main_view.work.jobs == (), "what failed is the scene's"
@@ -443,7 +453,8 @@ def test_an_edit_of_another_scene_is_rebound_from_its_message(
 ) -> None:
     scarf = bear().gdfs[0]
     moved = replace(bear().scene, means=bear().scene.means + 0.001)
-    foreign, out = tmp_path / "foreign.gdf", tmp_path / "foreign-rebound.gdf"
+    foreign = tmp_path / "foreign.gdf"
+    out = tmp_path / "foreign-rebound.gdf"
     save_gdf(foreign, replace(scarf, scene=fingerprint(moved)))
     save_ply(tmp_path / "moved.ply", moved)
     window.open(foreign)
@@ -459,7 +470,8 @@ def test_an_edit_of_another_scene_is_rebound_from_its_message(
     scenes = (f"--from={tmp_path / 'moved.ply'}", f"--to={tmp_path / 'bear.ply'}")
     assert tuple(Trainer.said) == ("rebind", str(foreign), *scenes, f"--out={out}")
     assert main([*Trainer.said]) == 0, "what is queued does it"
-    Trainer.edit, Trainer.ended = None, 0
+    Trainer.edit = None
+    Trainer.ended = 0
     turn(window)
     (layer,) = window.main_view.work.view.layers
     assert layer.name == "scarf"

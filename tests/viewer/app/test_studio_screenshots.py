@@ -30,7 +30,8 @@ pytestmark = [pytest.mark.gl, pytest.mark.usefixtures("software_gpu")]
 
 
 def test_the_start_page_with_files_that_were_open(screenshot: Compare) -> None:
-    context, document = headless_context(), empty()
+    context = headless_context()
+    document = empty()
     engine = ViewEngine(context, document.scene, (), "cpu")
     main_view = MainView(context, engine, document.facts(), ViewState())
     pixels = np.full((252, 336, 3), (96, 120, 150), np.uint8)

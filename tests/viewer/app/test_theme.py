@@ -9,7 +9,9 @@ from viewer.ui.context import PALETTE, Rgba, UiContext
 
 GROUNDS = ("panel", "card", "card_focused", "scrim")
 FIELDS = ("field", "field_hovered")
-TEXT, ICON, TICK = 4.5, 3.0, 4.0
+TEXT = 4.5
+ICON = 3.0
+TICK = 4.0
 """Least contrasts."""
 PAIRS = (
     *[("text", ground, TEXT) for ground in (*GROUNDS, *FIELDS, "field_active", "chosen")],

@@ -43,7 +43,8 @@ def shown(app: App) -> torch.Tensor:
 
 
 def test_what_is_removed_is_a_layer_that_undo_takes_back(app: App, folder: Path) -> None:
-    members, count = bear().demo.members("scarf"), len(bear().scene)
+    members = bear().demo.members("scarf")
+    count = len(bear().scene)
     press(app, "Alt+Delete")
     layer = app.main_view.work.view.layers[-1]
     assert (layer.name, layer.strength) == ("removed", 1.0)
@@ -84,7 +85,8 @@ def test_what_is_moved_follows_the_handles_and_is_kept_or_put_back(app: App) -> 
 def test_a_copy_has_rows_of_its_own_that_are_counted_selected_saved_and_exported(
     app: App, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    members, scene = bear().demo.members("scarf"), bear().scene
+    members = bear().demo.members("scarf")
+    scene = bear().scene
     press(app, "Alt+D", "Enter")
     facts = app.main_view.facts
     assert (facts.count, facts.added) == (len(scene) + len(members), len(members))

@@ -255,7 +255,8 @@ def test_the_real_mouse_paints_undo_takes_the_stroke_away_and_closing_asks_and_s
 
 def scarf_on_screen() -> tuple[float, float]:
     """Where the middle of the scarf is in the first picture."""
-    stack, size = bear(), (WIDTH - round(panel.WIDTH_PX), HEIGHT)
+    stack = bear()
+    size = (WIDTH - round(panel.WIDTH_PX), HEIGHT)
     camera = to_camera(first_camera(stack.scene), *size)
     middle = stack.scene.means[stack.gdfs[0].region.members].mean(0)
     x, y, z = (camera.viewmat[:3, :3] @ middle + camera.viewmat[:3, 3]).tolist()

@@ -32,7 +32,8 @@ Run = Callable[..., int]
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """near.ply and far.ply, the scarf's edit of each, and the same cameras of each."""
-    made, stack = tmp_path_factory.mktemp("far"), bear_stack(800)
+    made = tmp_path_factory.mktemp("far")
+    stack = bear_stack(800)
     for name, origin in (("near", (0.0, 0.0, 0.0)), ("far", FAR)):
         scene = load_ply(write(made / f"{name}.ply", moved_columns(stack.scene, origin)))
         assert scene.origin == origin
@@ -89,7 +90,8 @@ def test_an_edited_far_scene_is_exported_as_doubles(run: Run, capsys: pytest.Cap
     near, far = capsys.readouterr().out.splitlines()
     assert far.endswith("scarf 1, x y z as doubles as it is far from 0; read back and compared")
     assert "doubles" not in near
-    a, b = load_ply("near_edited.ply"), load_ply("far_edited.ply")
+    a = load_ply("near_edited.ply")
+    b = load_ply("far_edited.ply")
     assert torch.allclose(b.means, a.means, rtol=0, atol=1e-9)  # doubles at 2e6 are 2e-10 apart
     assert torch.equal(b.sh0, a.sh0)
     assert b.origin == FAR

@@ -84,12 +84,11 @@ def test_an_exported_session_is_what_the_window_shows(here: Path, blend: str) ->
         shown = replace(view, layers=layers)
         session.save(here / "work.session.json", WindowSession(opened, shown))
         assert run("export", "--session", "work.session.json", "-o", "edited.ply") == 0
-        expected, found = (
-            ViewEngine(None, opened.scene, opened.gdfs).gaussians(shown),
-            load_ply("edited.ply"),
-        )
+        expected = ViewEngine(None, opened.scene, opened.gdfs).gaussians(shown)
+        found = load_ply("edited.ply")
         for name in ATTRIBUTES:
-            was, now = getattr(expected, name), getattr(found, name)
+            was = getattr(expected, name)
+            now = getattr(found, name)
             was = normalize_quats(was) if name == "quats" else was
             assert torch.allclose(now, was, rtol=1e-5, atol=1e-6), name
 
@@ -152,7 +151,8 @@ def test_a_sweep_moves_a_renamed_layer_of_a_session_and_leaves_its_comparison_al
     for name in ("ears", "ears → gold"):
         assert run("render", "work.session.json", "--sheet", name, *SMALL, "-o", "sheet.png") == 0
         sheets.append(np.asarray(Image.open("sheet.png")))
-    first, last = sheets[0][-50:, :64], sheets[0][-50:, -70:-6]
+    first = sheets[0][-50:, :64]
+    last = sheets[0][-50:, -70:-6]
     assert np.abs(first.astype(int) - last).max() > 20, "the slider moves"
     assert sheets[0].shape == sheets[1].shape
 
@@ -317,7 +317,8 @@ def test_a_grade_of_another_scene_goes_on_a_region_of_this_one_and_a_table_every
     here: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     bear().save(here)
-    form, rows = look_of(here), torch.arange(50)
+    form = look_of(here)
+    rows = torch.arange(50)
     np.save("rows.npy", rows.numpy())
     words = ("bear.ply", "table.cube", "look.gdf", "--region", "look=file:rows.npy", "--set", "table=0.5")
     assert run("export", *words, "-o", "edited.ply") == 0
@@ -326,7 +327,8 @@ def test_a_grade_of_another_scene_goes_on_a_region_of_this_one_and_a_table_every
         "look on file:rows.npy: without its residual, which fits the scene it was trained on alone"
     )
     scene = bear().scene
-    edited, sh = load_ply("edited.ply"), scene.sh
+    edited = load_ply("edited.ply")
+    sh = scene.sh
     expected = torch.lerp(sh, map_colors(sh, form.table[1], 0), 0.5)
     expected[rows] = map_colors(expected[rows], identity_map(1) * 0.25, 1)
     assert torch.allclose(edited.sh, expected, atol=2e-5)
@@ -353,7 +355,8 @@ def test_the_colors_of_a_grade_are_written_at_its_strength_and_read_as_the_same_
     for name in ("direct", "again"):
         edit = (*words[1:], "--gain", "look:color=0.5") if name == "direct" else ("look.cube",)
         assert run("export", "bear.ply", *edit, "-o", f"{name}.ply") == 0
-    direct, again = load_ply("direct.ply"), load_ply("again.ply")
+    direct = load_ply("direct.ply")
+    again = load_ply("again.ply")
     within = ((bear().scene.sh0 * C0).abs() < 0.4).all(dim=1)  # beyond 0..1 a table has no say
     assert torch.allclose(direct.sh0[within], again.sh0[within], atol=0.05)
     assert int(within.sum()) > 500

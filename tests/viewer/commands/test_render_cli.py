@@ -89,7 +89,8 @@ def test_both_engines_write_the_same_picture(run: Run) -> None:
 
 
 def test_edits_without_a_strength_are_rendered_at_one(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
-    edits, both = ("bear.ply", "scarf.gdf", "ears.gdf"), ("--set", "scarf=1", "--set", "ears=1")
+    edits = ("bear.ply", "scarf.gdf", "ears.gdf")
+    both = ("--set", "scarf=1", "--set", "ears=1")
     for name, settings in (("none", ()), ("full", both), ("one", both[:2])):
         assert run("render", *edits, *settings, *SMALL, "-o", f"{name}.png") == 0
         assert capsys.readouterr().out.endswith("): scarf 1, ears 1\n")

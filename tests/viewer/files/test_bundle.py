@@ -36,7 +36,8 @@ def bundle(tmp_path: Path) -> Path:
 
 def test_a_bundle_is_the_session_in_a_folder_of_its_own(bundle: Path, tmp_path: Path) -> None:
     (saved,) = (tmp_path / "here").glob("*.session.json")
-    before, after = session.open_session(saved), session.open_session(unpack_bundle(bundle))
+    before = session.open_session(saved)
+    after = session.open_session(unpack_bundle(bundle))
     assert (after.view, after.snapshots) == (before.view, before.snapshots)
     names = {path.name for path in bundle.parent.iterdir()}
     assert names == {"bear.progdf", "bear.progdf.zip"}

@@ -110,7 +110,8 @@ FOREIGN = (
 
 
 def test_a_session_of_a_stranger_writes_and_removes_nothing_outside_of_its_folder(tmp_path: Path) -> None:
-    outside, folder = tmp_path / "outside", tmp_path / "outside" / "in"
+    outside = tmp_path / "outside"
+    folder = tmp_path / "outside" / "in"
     folder.mkdir(parents=True)
     bear_files(folder)
     (folder / "folder.region.npy").mkdir()

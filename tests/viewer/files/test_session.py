@@ -211,7 +211,8 @@ def test_info_tells_what_a_session_holds(saved: Path, capsys: pytest.CaptureFixt
 def test_render_draws_a_session_as_the_window_showed_it(saved: Path, tmp_path: Path) -> None:
     view = replace(full_view(), compare=Comparison())
     session.save(saved, WindowSession(opened_document(saved.parent), view))
-    out, size = tmp_path / "a.png", ("--size", "64x48", "--engine", "cpu")
+    out = tmp_path / "a.png"
+    size = ("--size", "64x48", "--engine", "cpu")
     assert main(["render", "--session", str(saved), *size, "-o", str(out)]) == 0
     from viewer.render.engine import ViewEngine
 
@@ -236,7 +237,8 @@ def test_render_sets_two_snapshots_of_a_session_beside_each_other(
 
 def test_a_session_that_lists_no_layers_shows_the_original(saved: Path, tmp_path: Path) -> None:
     path = spoilt(saved, "view", "layers", value=[])
-    out, size = tmp_path / "a.png", ("--size", "32x24", "--engine", "cpu")
+    out = tmp_path / "a.png"
+    size = ("--size", "32x24", "--engine", "cpu")
     assert main(["render", "--session", str(path), *size, "-o", str(out)]) == 0
     assert out.is_file()
 

@@ -88,7 +88,8 @@ def order(scene: Path, name: str, region: str = "all") -> EditOrder:
 
 def wait(queue: JobQueue, until: str = "") -> list[QueuedTask]:
     """What has ended once nothing is busy, or one job says that it does `until`."""
-    ended, begun = [], time.monotonic()
+    ended = []
+    begun = time.monotonic()
     while queue.busy() and time.monotonic() - begun < PATIENCE_S:
         ended += queue.poll()
         if until and any(job.progress.label == until for job in queue.jobs):
@@ -106,7 +107,8 @@ def test_runs_train_in_turn_and_a_failure_is_one_line(scene: Path, monkeypatch: 
     number = queue.add(order(scene, "blue", "sphere:0,1.9,0,0.6"))
     queue.poll()
     assert [job.status for job in queue.jobs] == ["running", "queued"]
-    shown, begun = Count(monkeypatch, JobQueue, "_change"), time.monotonic()
+    shown = Count(monkeypatch, JobQueue, "_change")
+    begun = time.monotonic()
     failed, done = wait(queue)
     # the training would have half of the processor otherwise: each change is drawn
     assert shown.calls <= (time.monotonic() - begun) / LOOK_S + 4, "its card changes once a second"
@@ -154,7 +156,8 @@ def test_closing_leaves_no_child_and_forgets_what_waits(scene: Path) -> None:
 
 
 def test_what_one_window_trains_another_leaves_alone(stopped: EditOrder) -> None:
-    first, second = window(stopped), window(stopped)
+    first = window(stopped)
+    second = window(stopped)
     first.resume(1)
     assert status(first) == "queued", "it waits, and is the first window's already"
     assert window(stopped).jobs == (), "a window that opens now does not show it"
@@ -188,7 +191,8 @@ def test_a_run_that_a_command_trains_is_left_alone(stopped: EditOrder) -> None:
 
 
 def test_two_windows_never_write_one_log(stopped: EditOrder, scene: Path) -> None:
-    first, second = JobQueue(), JobQueue()
+    first = JobQueue()
+    second = JobQueue()
     asked = order(scene, "red")
     first.add(asked)
     with pytest.raises(LockedError):
@@ -228,7 +232,8 @@ def test_deliveries_go_on_beside_a_training_and_leave_nothing_when_they_are_stop
 ) -> None:
     queue = window(stopped)
     queue.resume(1)
-    out, log = tmp_path / "film.mp4", tmp_path / "film.log"
+    out = tmp_path / "film.mp4"
+    log = tmp_path / "film.log"
     queue.add(Delivery("Rendering film.mp4", out, ("render", f"--out={out}"), log, stopped.scene))
     queue.poll()
     assert [job.status for job in queue.jobs] == ["running", "running"]

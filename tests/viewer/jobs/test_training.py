@@ -99,7 +99,8 @@ def test_a_run_that_was_stopped_is_found_again_and_can_be_discarded(tmp_path: Pa
     ids=lambda content: "a folder" if content is None else ascii(content[:20]),
 )
 def test_a_damaged_file_of_a_run_is_passed_over(tmp_path: Path, damaged: bytes | None) -> None:
-    asked, good = order(tmp_path), order(tmp_path, "gold")
+    asked = order(tmp_path)
+    good = order(tmp_path, "gold")
     for kept in (asked, good):
         kept.save()
         (kept.out / "state").mkdir(parents=True)
@@ -151,7 +152,8 @@ def test_what_cannot_be_removed_is_whole_and_says_so(tmp_path: Path, monkeypatch
 def test_no_order_of_a_stranger_makes_another_folder_a_run(name: str, tmp_path: Path) -> None:
     asked = order(tmp_path)
     asked.save()
-    edits, other = asked.out.parent, tmp_path / "other"
+    edits = asked.out.parent
+    other = tmp_path / "other"
     for folder in (tmp_path, edits, other):
         (folder / "state").mkdir(parents=True)
         (folder / "state" / "run.json").write_text("{}")
@@ -169,7 +171,8 @@ def test_a_finished_edit_is_never_discarded(tmp_path: Path) -> None:
 
 
 def test_the_trainer_s_progress_and_recordings_are_read_as_it_writes_them(tmp_path: Path) -> None:
-    asked, scene = order(tmp_path), bear().scene
+    asked = order(tmp_path)
+    scene = bear().scene
     folder = RunFolder(asked.out)
     assert asked.read_progress(Progress(0.1)) == Progress(0.1)
     assert asked.newest_recording() is None

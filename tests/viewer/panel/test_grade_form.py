@@ -36,7 +36,8 @@ def form(hand: Rig) -> NewEdit:
 
 
 def test_a_press_on_the_curve_makes_a_point_and_drags_it_and_a_right_click_takes_it_away(hand: Rig) -> None:
-    tall, wide = new_edit_form._CURVE_PX, WINDOW[0] - 22.0 - LEFT
+    tall = new_edit_form._CURVE_PX
+    wide = WINDOW[0] - 22.0 - LEFT
     top = 438.0
 
     def place(x: float, y: float) -> tuple[float, float]:
@@ -76,7 +77,8 @@ def test_the_curve_goes_by_keys_alone(hand: Rig) -> None:
 
 
 def test_a_swatch_opens_a_picker_and_a_right_click_takes_the_change_back(hand: Rig) -> None:
-    y, x = 202.0, LEFT + 4.0
+    y = 202.0
+    x = LEFT + 4.0
     moved = ((COLORS[0], "#3060d0"), *FORM.palette[1:])
     hand.main_view.work = replace(hand.main_view.work, form=replace(form(hand), palette=moved))
     hand.frame(2)
@@ -93,7 +95,8 @@ def test_a_click_on_the_picture_takes_its_color_into_the_palette_and_moves_nothi
     before = hand.main_view.work
     hand.main_view.work = replace(before, form=replace(FORM, picks=True))
     hand.frame(2)
-    x, y = (WINDOW[0] - panel.WIDTH_PX) / 2, 0.33 * WINDOW[1]
+    x = (WINDOW[0] - panel.WIDTH_PX) / 2
+    y = 0.33 * WINDOW[1]
     shown = hand.picture()[round(y), round(x)] / 255
     hand.click(x, y)
     hand.frame(2)

@@ -100,7 +100,8 @@ def hand(request: pytest.FixtureRequest) -> Iterator[Hand]:
 
 
 LEFT = SIZE[0] - panel.WIDTH_PX
-START, SPAN = LEFT + 12 + 10 + 7, panel.WIDTH_PX - 2 * (12 + 10 + 7)
+START = LEFT + 12 + 10 + 7
+SPAN = panel.WIDTH_PX - 2 * (12 + 10 + 7)
 TRACKS = (TRACK + card.CARD_PX, TRACK)  # heights of the two sliders' tracks: the last layer lies on top
 EYES = (HEAD + card.CARD_PX, HEAD)
 

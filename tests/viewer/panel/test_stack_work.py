@@ -19,8 +19,12 @@ from viewer.state.view_state import LayerGroup
 pytestmark = pytest.mark.gl
 SIZE = (1024, 800)
 LEFT = SIZE[0] - panel.WIDTH_PX
-TOP, STEP = 132.0, 28.0  # the middle of the first compact row, and from row to row
-NAME, TRACK, SPAN = LEFT + 90.0, LEFT + 166.5, 78.0
+# the middle of the first compact row, and from row to row
+TOP = 132.0
+STEP = 28.0
+NAME = LEFT + 90.0
+TRACK = LEFT + 166.5
+SPAN = 78.0
 MASTER = (LEFT + 12.0 + 7.0, 740.0, 219.0)  # where its track begins, and how long it is
 
 
@@ -67,8 +71,10 @@ def test_twenty_layers_in_800_px_are_rows_whose_strengths_move_together(
         hand.click(NAME, row(0))
         click_with(hand, imgui.Key.mod_shift, NAME, row(19))
         assert len(selected(hand)) == 20
-        entries, start = len(hand.main_view.work.past.past), (MASTER[0] + 0.5 * MASTER[2], MASTER[1])
-        composed, drawn = Count(monkeypatch, Composer, "update"), hand.main_view.canvas.pictures_drawn
+        entries = len(hand.main_view.work.past.past)
+        start = (MASTER[0] + 0.5 * MASTER[2], MASTER[1])
+        composed = Count(monkeypatch, Composer, "update")
+        drawn = hand.main_view.canvas.pictures_drawn
         hand.move(*start)
         hand.press()
         for share in (0.45, 0.3, 0.6, 0.8):
@@ -89,7 +95,8 @@ def test_twenty_layers_in_800_px_are_rows_whose_strengths_move_together(
         hand.click(TRACK + 0.7 * SPAN, row(3))
         assert len(selected(hand)) == 2, "a slider moves alone and leaves the selection"
         assert hand.strengths[3] == pytest.approx(0.7, abs=0.01)
-        entries, names = len(hand.main_view.work.past.past), order(hand)
+        entries = len(hand.main_view.work.past.past)
+        names = order(hand)
         hand.drag((NAME, row(3)), (NAME, row(18) + 0.6 * STEP))
         assert order(hand)[-4:] == [EDITS[0], EDITS[3], EDITS[18], EDITS[19]], "all that are selected"
         assert selected(hand) == [EDITS[0], EDITS[3]]
@@ -174,7 +181,9 @@ def test_a_member_of_the_last_group_is_dragged_to_its_end_or_below_it() -> None:
     members = {i: replace(layer, group="ends") for i, layer in enumerate(view.layers[:3])}
     grouped = replace(view, layers=(*members.values(), *view.layers[3:]), groups=(LayerGroup("ends"),))
     with rig(grouped, SIZE, stack=stack) as hand:
-        second, last = TOP + STEP * 11, TOP + STEP * 12  # a row for the group lies above them
+        # a row for the group lies above them
+        second = TOP + STEP * 11
+        last = TOP + STEP * 12
         hand.drag((NAME, second), (NAME, last + 0.5 * STEP))
         assert order(hand)[:3] == [EDITS[1], EDITS[0], EDITS[2]]
         assert all(layer.group for layer in hand.main_view.work.view.layers[:3]), "to the group's end"

@@ -110,7 +110,8 @@ def test_space_plays_at_the_films_pace_and_again_pauses_and_then_idle_is_idle(ha
     assert waits is not None
     assert 0.0 < waits <= 1 / 24, "it sleeps until the next frame of the film, not less"
     hand.key("Space")
-    paused, drawn = hand.main_view.work.player.frame, hand.main_view.canvas.pictures_drawn
+    paused = hand.main_view.work.player.frame
+    drawn = hand.main_view.canvas.pictures_drawn
     hand.frame(60)
     assert (hand.main_view.work.player.frame, hand.main_view.canvas.pictures_drawn) == (paused, drawn)
     assert hand.main_view.next_frame_delay() is None
@@ -119,7 +120,8 @@ def test_space_plays_at_the_films_pace_and_again_pauses_and_then_idle_is_idle(ha
 
 def test_a_frame_between_two_of_the_film_draws_no_splats(hand: Rig) -> None:
     hand.key("Space")
-    drawn, frame = hand.main_view.canvas.pictures_drawn, hand.main_view.work.player.frame
+    drawn = hand.main_view.canvas.pictures_drawn
+    frame = hand.main_view.work.player.frame
     hand.frame(60)
     assert hand.main_view.canvas.pictures_drawn - drawn <= (hand.main_view.work.player.frame - frame) % 41 + 1
 
@@ -133,7 +135,8 @@ def test_commas_and_periods_step_and_with_shift_jump_from_key_to_key(hand: Rig) 
 
 
 def test_the_bars_buttons_do_what_they_say(hand: Rig) -> None:
-    y, gap = WINDOW[1] - 24.0, 27.0
+    y = WINDOW[1] - 24.0
+    gap = 27.0
     hand.drag(at(hand, 30), at(hand, 30))
     for x, expected in ((22.0 + 2 * gap, [0, 20, 30]), (22.0 + 3 * gap, [0, 20])):
         hand.move(x, y)
@@ -207,7 +210,8 @@ def test_auto_key_keys_only_the_slider_that_is_dragged(hand: Rig) -> None:
 def test_the_bar_and_the_film_agree_on_the_number_of_frames(
     hand: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real, shown = imgui.drag_int, {}
+    real = imgui.drag_int
+    shown = {}
     monkeypatch.setattr(imgui, "drag_int", lambda *a: shown.update({a[0]: a[1]}) or real(*a))
     hand.frame()
     assert shown["##length"] == len(list(timeline.film_frames(hand.main_view.work.view.timeline))) == 41
@@ -241,7 +245,8 @@ def test_render_makes_the_frames_of_a_session_that_the_window_showed(hand: Rig, 
     assert main([*command, "-o", str(tmp_path / "again")]) == 0
     names = sorted(path.name for path in (tmp_path / "shown").iterdir())
     assert names == [f"frame_{i:04d}.png" for i in range(41)]
-    shown, again = tmp_path / "shown", tmp_path / "again"
+    shown = tmp_path / "shown"
+    again = tmp_path / "again"
     assert all((shown / n).read_bytes() == (again / n).read_bytes() for n in names)
     for frame in (0, 13, 20):
         state = timeline.state_at(view.timeline, frame, view)

@@ -54,7 +54,8 @@ def test_shift_y_shows_the_original_left_and_the_edited_right_of_the_divider(dra
 @pytest.mark.gl
 def test_the_divider_follows_the_hand_and_draws_no_splats(hand: Rig) -> None:
     hand.key("Shift+Y")
-    before, drawn = hand.main_view.work.view.camera, hand.main_view.canvas.pictures_drawn
+    before = hand.main_view.work.view.camera
+    drawn = hand.main_view.canvas.pictures_drawn
     hand.drag((170.0, 300.0), (100.0, 310.0))
     assert hand.main_view.work.view.compare.divider == pytest.approx(100 / 340)
     assert (hand.main_view.work.view.camera, hand.main_view.canvas.pictures_drawn) == (before, drawn)
@@ -131,7 +132,8 @@ def test_backslash_shows_the_whole_original_over_any_comparison(hand: Rig) -> No
 @pytest.mark.gl
 def test_at_a_difference_left_and_come_back_to_after_a_slider_moved_the_new_one_is_shown(hand: Rig) -> None:
     hand.key("Alt+Y")
-    before, psnr_before = hand.picture(), hand.main_view.canvas.comparer.psnr
+    before = hand.picture()
+    psnr_before = hand.main_view.canvas.comparer.psnr
     hand.key("Shift+Y")
     for _ in range(5):
         hand.key("2")  # the lower layer, the scarf
@@ -229,7 +231,8 @@ def rendered(*options: str) -> np.ndarray:
 
 
 def test_render_writes_a_split_at_the_share_that_was_said(folder: Path) -> None:
-    edited, original = rendered(), rendered("--set", "scarf=0")
+    edited = rendered()
+    original = rendered("--set", "scarf=0")
     picture = rendered("--split", "0.25")
     assert np.array_equal(picture[26:, :21], original[26:, :21])
     assert np.array_equal(picture[26:, 28:], edited[26:, 28:])
@@ -243,7 +246,8 @@ def test_render_splits_in_the_middle_where_no_share_is_said(folder: Path) -> Non
 def test_render_writes_a_difference_and_says_the_psnr(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    edited, original = rendered(), rendered("--set", "scarf=0")
+    edited = rendered()
+    original = rendered("--set", "scarf=0")
     picture = rendered("--difference", "2")
     expected = np.minimum(2 * np.abs(edited - original), 255)
     assert np.abs(picture[26:] - expected[26:]).max() <= 2

@@ -154,7 +154,8 @@ def test_a_moving_picture_follows_sliders_and_highlights(
     target = replace(target, selection=replace(target.selection, hidden=pack(hidden.numpy())))
     slid.highlight = afresh.highlight = Highlight(region=1)
     slid.image(view_of(stack, 0.3, 0.6), SIZE)  # what is not drawn in motion is carried over later
-    after, expected = moving(slid, target), moving(afresh, target)
+    after = moving(slid, target)
+    expected = moving(afresh, target)
     assert float(np.abs(after - before).mean()) > 1e-2
     assert psnr(torch.from_numpy(after), torch.from_numpy(expected)) > 45.0
     live = slid.renderer._scene if isinstance(slid.renderer, CpuRenderer) else slid.renderer._moving[0]
@@ -170,7 +171,8 @@ def test_a_moving_picture_that_is_fine_enough_becomes_finer_only_if_that_is_quic
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     scene = bear(6000).gaussians
-    live, camera = dynamic_resolution.LiveScene(scene), to_camera(first_camera(scene), *SIZE)
+    live = dynamic_resolution.LiveScene(scene)
+    camera = to_camera(first_camera(scene), *SIZE)
     pyramid = live.begin_pyramid().result()
     monkeypatch.setattr(dynamic_resolution, "FINE_MS", (0.0, 0.0))
     slow = [live.draw_fewer(lambda fewer: len(fewer.means), camera, 2) for _ in range(3)]
@@ -219,8 +221,10 @@ def test_only_the_same_view_in_full_tells_how_good_a_moving_picture_was(
 ) -> None:
     engine, view = ViewEngine(ctx, stack.scene, stack.gdfs, draw), view_of(stack, 0.1, 0.6)
     turned = replace(view, camera=replace(view.camera, azimuth=view.camera.azimuth + 30.0))
-    slid, black = view_of(stack, 0.9, 0.6), replace(view, background=(0.0, 0.0, 0.0))
-    framebuffer, first = ctx.simple_framebuffer(SIZE), dynamic_resolution.FINE[1]
+    slid = view_of(stack, 0.9, 0.6)
+    black = replace(view, background=(0.0, 0.0, 0.0))
+    framebuffer = ctx.simple_framebuffer(SIZE)
+    first = dynamic_resolution.FINE[1]
 
     def rest(moving: ViewState, rested: ViewState, grown: int = 0) -> float:
         engine.draw(moving, framebuffer, SIZE, pixels=2)
@@ -250,7 +254,8 @@ def test_what_is_done_of_a_picture_shows_before_the_rest(
 ) -> None:
     monkeypatch.setattr(cpu_renderer, "BAND", len(stack.scene) // 2)
     monkeypatch.setattr(cpu_renderer, "LEAST_ROWS", 40)
-    screen, view = ctx.framebuffer([ctx.texture(SIZE, 4)]), view_of(stack, 0.2, 0.6)
+    screen = ctx.framebuffer([ctx.texture(SIZE, 4)])
+    view = view_of(stack, 0.2, 0.6)
     view = replace(view, grid=True)
     engine = ViewEngine(ctx, stack.scene, stack.gdfs, draw="cpu")
     engine.draw(view, screen, SIZE)

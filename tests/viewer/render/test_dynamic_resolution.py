@@ -190,7 +190,8 @@ def test_a_picture_that_takes_long_is_made_beside_the_windows_work(
         hand.main_view.wake()
         assert hand.main_view.is_due(), "but what comes in is seen at once"
     settle_sharply(hand)
-    old, new = hand.picture(), hand.main_view.engine
+    old = hand.picture()
+    new = hand.main_view.engine
     other = ViewEngine(hand.main_view.context, new.scene, (), "cpu")
     hand.main_view.set_engine(other, hand.main_view.facts)
     with not_done(hand, monkeypatch):

@@ -80,7 +80,8 @@ def test_hard_cases_look_the_same(draw: Draw, name: str) -> None:
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.usefixtures("without_early_stop")
 def test_opengl_draws_the_depth_of_hard_cases_like_the_reference(renderer: SplatRenderer, name: str) -> None:
-    scene, camera = CASES[name].gaussians, CASES[name].camera
+    scene = CASES[name].gaussians
+    camera = CASES[name].camera
     renderer.upload(paint_depth(scene, camera))
     renderer.set_order(back_to_front(scene.means.numpy(), camera))
     found = depth_of(torch.from_numpy(read(renderer.draw(camera, (0.0, 0.0, 0.0))).copy()))
@@ -108,7 +109,8 @@ def test_the_bear_looks_the_same_as_on_the_cpu(draw: Draw) -> None:
 def test_a_real_scene_looks_the_same_as_on_the_cpu(draw: Draw, shared_data: Path) -> None:
     scene = load_ply(shared_data / "playbot_31k.ply")
     for camera in orbit_rig(scene, 2, 400, 300):
-        image, expected = draw(scene, camera), render(scene, camera, WHITE).image.numpy()
+        image = draw(scene, camera)
+        expected = render(scene, camera, WHITE).image.numpy()
         assert psnr(image, expected) >= 70.0
         assert float(np.abs(image - expected).max()) <= 0.0101, "more than the early stop explains"
 
@@ -139,7 +141,8 @@ def test_a_needle_of_thousands_of_pixels_keeps_its_width(draw: Draw, length: flo
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.usefixtures("without_early_stop")
 def test_every_band_of_spherical_harmonics_is_shown(draw: Draw, degree: int) -> None:
-    scene, camera = random_gaussians(300, seed=degree, sh_degree=degree), orbit_camera(80, 60)
+    scene = random_gaussians(300, seed=degree, sh_degree=degree)
+    camera = orbit_camera(80, 60)
     scene = replace(scene, shN=3.0 * scene.shN)
     expected = render(scene, camera, WHITE, engine="reference").image.numpy()
     assert psnr(draw(scene, camera), expected) >= 110.0
@@ -147,7 +150,8 @@ def test_every_band_of_spherical_harmonics_is_shown(draw: Draw, degree: int) -> 
 
 @pytest.mark.usefixtures("without_early_stop")
 def test_bands_above_the_third_ride_along_unseen(draw: Draw) -> None:
-    scene, camera = random_gaussians(50, sh_degree=3), orbit_camera()
+    scene = random_gaussians(50, sh_degree=3)
+    camera = orbit_camera()
     extended = replace(scene, shN=torch.cat([scene.shN, torch.ones(50, 9, 3)], dim=1))
     assert np.array_equal(draw(extended, camera), draw(scene, camera))
 
@@ -198,7 +202,8 @@ def test_the_sorting_is_the_reverse_of_depth_then_index() -> None:
 
 
 def test_a_smaller_scene_after_a_larger_one_leaves_nothing_of_it(draw: Draw) -> None:
-    small, large = random_gaussians(20, seed=3), random_gaussians(3000, seed=4)
+    small = random_gaussians(20, seed=3)
+    large = random_gaussians(3000, seed=4)
     camera = orbit_camera()
     alone = draw(small, camera)
     draw(large, camera)

@@ -52,7 +52,8 @@ def highlighted(scene: Gaussians, shade: Highlight) -> Gaussians:
         / 255.0
     )
     share = over[:, 3:]
-    sh0, shN = scene.sh0.clone(), scene.shN.clone()
+    sh0 = scene.sh0.clone()
+    shN = scene.shN.clone()
     sh0[members] = (1 - share) * sh0[members] + share * (over[:, :3] - 0.5) / C0
     shN[members] = (1 - share)[:, :, None] * shN[members]
     return replace(scene, sh0=sh0, shN=shN)
@@ -68,7 +69,8 @@ def test_the_ramp_rises_in_lightness_and_ends_in_its_named_colors() -> None:
 
 
 def test_a_thin_tint_leaves_what_has_all_of_the_edit_as_it_is() -> None:
-    members, total = bear().gdfs[SCARF].region.members.numpy(), len(bear().scene)
+    members = bear().gdfs[SCARF].region.members.numpy()
+    total = len(bear().scene)
     colors, tint = (
         highlight.highlight_colors(Highlight(SCARF, half_painted(), thin=thin), bear().gdfs, total)[members]
         for thin in (False, True)
@@ -136,7 +138,8 @@ def test_a_session_of_painting_and_sliding_leaves_nothing_behind(ctx: moderngl.C
 def test_what_is_hidden_is_as_if_it_was_not_there_also_in_saved_pictures(
     ctx: moderngl.Context, draw: str
 ) -> None:
-    scene, mask = bear().scene, np.arange(len(bear().scene)) % 3 == 0
+    scene = bear().scene
+    mask = np.arange(len(bear().scene)) % 3 == 0
     engine = ViewEngine(ctx, scene, bear().gdfs, draw)
     clean = shown(engine, view(0.6), ctx).copy()
     some = replace(view(0.6), selection=selection.hide(SelectionState(), mask))
@@ -255,7 +258,8 @@ def test_the_mouse_on_the_small_picture_of_a_layer_shows_its_region() -> None:
     scarf = bear().gdfs[0]
     stack = Stack(bear().demo, (scarf, replace(scarf, name="frost")))
     with rig(first_view(stack, 0.5, 0.5), (700, 640), stack=stack) as hand:
-        before, saved = hand.picture().astype(int), hand.main_view.work.past
+        before = hand.picture().astype(int)
+        saved = hand.main_view.work.past
         hand.move(700 - 300 + 52, HEAD)
         hand.pause(1.0)
         hand.frame(2)

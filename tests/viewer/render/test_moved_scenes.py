@@ -93,23 +93,27 @@ def test_its_pictures_do_not_change(moved: Moved, cameras: list[Camera], draw: o
 
 
 def test_its_depth_does_not_change(moved: Moved, cameras: list[Camera]) -> None:
-    far, near = render_depth(moved.far, moved.cameras(cameras)[0]), render_depth(moved.near, cameras[0])
+    far = render_depth(moved.far, moved.cameras(cameras)[0])
+    near = render_depth(moved.near, cameras[0])
     assert torch.allclose(far.depth, near.depth, atol=1e-4)
 
 
 def test_its_up_its_rig_and_its_subject_do_not_change(moved: Moved) -> None:
-    near, far = moved.near, moved.far
+    near = moved.near
+    far = moved.far
     up = find_up(near)
     assert (find_up(far).name, find_up(far).reason) == (up.name, up.reason)
     assert torch.equal(subject_rows(far, up.direction), subject_rows(near, up.direction))
-    radius, by = survey(near).radius, moved.by - far.origin
+    radius = survey(near).radius
+    by = moved.by - far.origin
     for a, b in zip(orbit_rig(near, 5, 64, 64), orbit_rig(far, 5, 64, 64), strict=True):
         assert torch.allclose(a.viewmat[:3, :3], b.viewmat[:3, :3], atol=1e-6)
         assert np.abs((b.position - a.position).numpy() - by).max() < 1e-5 * radius
 
 
 def test_its_first_view_does_not_change(moved: Moved) -> None:
-    near, far = first_camera(moved.near), first_camera(moved.far)
+    near = first_camera(moved.near)
+    far = first_camera(moved.far)
     x, y, z = (moved.by - moved.far.origin).tolist()
     assert np.allclose(far.pivot, move_camera(near, (x, y, z)).pivot, atol=1e-4)
     assert np.allclose(

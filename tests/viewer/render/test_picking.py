@@ -83,8 +83,10 @@ def test_rows_that_are_not_numbers_are_passed_over() -> None:
 def test_something_is_picked_exactly_where_the_rasterizer_draws_something(
     seed: int, x: float, y: float
 ) -> None:
-    camera, scene = orbit_camera(), random_gaussians(60, seed)
-    x, y = int(x) + 0.5, int(y) + 0.5
+    camera = orbit_camera()
+    scene = random_gaussians(60, seed)
+    x = int(x) + 0.5
+    y = int(y) + 0.5
     picked = surface_point(scene, camera, x, y)
     transmittance = render(scene, camera, engine="reference").transmittance
     covered = 1.0 - float(transmittance[int(y), int(x)])

@@ -26,7 +26,8 @@ def test_color_and_coverage_are_found_from_black_and_white() -> None:
 
 def test_the_command_writes_a_picture_that_can_be_laid_over_another(tmp_path: Path) -> None:
     scene = bear().save(tmp_path)[0]
-    over, opaque = tmp_path / "over.png", tmp_path / "opaque.png"
+    over = tmp_path / "over.png"
+    opaque = tmp_path / "opaque.png"
     words = ["--size", "64x48", "--engine", "cpu", "--background", "#204060"]
     assert main(["render", str(scene), "-o", str(over), "--alpha", *words]) == 0
     assert main(["render", str(scene), "-o", str(opaque), *words]) == 0

@@ -124,7 +124,8 @@ def test_undo_and_redo_say_what_they_take_back(words: str) -> None:
 
 
 def test_one_goes_to_any_entry_and_those_after_it_stay_until_something_is_done() -> None:
-    work, changes = new_workspace(PLAIN), ("ground grid", "strength of ears", "safe frame", "blend rule")
+    work = new_workspace(PLAIN)
+    changes = ("ground grid", "strength of ears", "safe frame", "blend rule")
     for words in changes:
         work = recorded(work, CHANGES[words](work.view))
     last = work.view

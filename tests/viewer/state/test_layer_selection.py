@@ -71,7 +71,8 @@ def test_presses_select_one_toggle_and_take_what_lies_between() -> None:
 
 def test_the_master_keeps_proportions_through_zero_within_a_gesture_and_is_one_undo_entry() -> None:
     work = press(six(0.0, 0.0, 0.0, 0.2, 0.4, 0.8), "range", "d")
-    entries, before = len(work.past.past), work.view
+    entries = len(work.past.past)
+    before = work.view
     moved = work
     for strength in (0.4, 0.0, 0.6):
         moved = perform(moved, f"master:{strength}", FACTS)

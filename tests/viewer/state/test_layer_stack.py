@@ -93,7 +93,8 @@ def type_name(hand: Rig, text: str, end: imgui.Key = imgui.Key.enter) -> None:
 
 
 def test_the_number_shows_what_the_slider_says_in_the_same_frame(hand: Rig) -> None:
-    top, left = round(HEAD + row(0)) - 12, POINTS[0] - 80
+    top = round(HEAD + row(0)) - 12
+    left = POINTS[0] - 80
     hand.move(*hand.slider(0, 0.5))
     hand.press()
     before = hand.image()[top : top + 24, left:]
@@ -342,7 +343,8 @@ def test_rows_know_what_they_share_and_what_their_gains_scale() -> None:
 
 
 def test_a_large_region_is_pictured_by_a_part_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    made, camera = bear(), ViewCamera()
+    made = bear()
+    camera = ViewCamera()
     whole = facts.draw_thumbnail(made.scene, made.gdfs[0], camera).astype(float)
     monkeypatch.setattr(facts, "MOST_MEMBERS", len(made.gdfs[0].region) // 2)
     part = facts.draw_thumbnail(made.scene, made.gdfs[0], camera).astype(float)
@@ -351,7 +353,8 @@ def test_a_large_region_is_pictured_by_a_part_of_it(monkeypatch: pytest.MonkeyPa
 
 @pytest.fixture(scope="module")
 def saved(tmp_path_factory: pytest.TempPathFactory) -> tuple[Stack, Path]:
-    made, folder = bear_stack(800), tmp_path_factory.mktemp("layers")
+    made = bear_stack(800)
+    folder = tmp_path_factory.mktemp("layers")
     made.save(folder)
     return made, folder
 
@@ -426,7 +429,8 @@ def test_the_top_of_the_list_lies_on_top(hand: Rig) -> None:
 
 
 def test_a_layer_is_deleted_from_its_menu_and_undo_brings_it_back(hand: Rig) -> None:
-    before, picture = hand.main_view.work.view, hand.picture()
+    before = hand.main_view.work.view
+    picture = hand.picture()
     menu(hand, 1, 4)
     assert names(hand) == ["scarf"]
     assert hand.main_view.work.focus == 0

@@ -17,7 +17,8 @@ from viewer.state.selection import NamedRegion
 from viewer.state.workspace import SceneFacts, Workspace
 
 pytestmark = pytest.mark.gl
-SCARF, EARS = 0, 1
+SCARF = 0
+EARS = 1
 
 
 @pytest.fixture(scope="module")
@@ -68,10 +69,12 @@ def test_again_leaves_alone_what_no_editor_of_the_form_has_made(hand: Rig) -> No
 
 
 def test_a_layer_is_limited_to_what_is_selected_and_again_to_less(hand: Rig) -> None:
-    facts, work = hand.main_view.facts, hand.main_view.work
+    facts = hand.main_view.facts
+    work = hand.main_view.work
     row = facts.rows[SCARF]
     assert perform(work, f"limit_to_selection:{SCARF}", facts) == work, "nothing is selected"
-    half, third = row.members[::2], row.members[::3]
+    half = row.members[::2]
+    third = row.members[::3]
     work = perform(selecting(work, half, facts.count), f"limit_to_selection:{SCARF}", facts)
     weights = paint.decode(work.view.layers[SCARF].paint, row.count)
     assert weights is not None
@@ -84,7 +87,8 @@ def test_a_layer_is_limited_to_what_is_selected_and_again_to_less(hand: Rig) -> 
 
 
 def test_what_a_layer_shows_is_selected_by_its_paint(hand: Rig) -> None:
-    facts, work = hand.main_view.facts, hand.main_view.work
+    facts = hand.main_view.facts
+    work = hand.main_view.work
     row = facts.rows[SCARF]
 
     def selected(work: Workspace) -> list[int]:

@@ -51,7 +51,8 @@ def camera_of(hand: Rig) -> Camera:
 
 
 def scarf_on_screen(hand: Rig) -> tuple[float, float]:
-    camera, members = camera_of(hand), bear().gdfs[0].region.members
+    camera = camera_of(hand)
+    members = bear().gdfs[0].region.members
     x, y, z = (camera.viewmat[:3, :3] @ bear().scene.means[members].mean(0) + camera.viewmat[:3, 3]).tolist()
     return float(camera.K[0, 0] * x / z + camera.K[0, 2]), float(camera.K[1, 1] * y / z + camera.K[1, 2])
 
@@ -169,7 +170,8 @@ def test_smoothing_leaves_what_the_brush_has_not_touched_and_keeps_even_weights(
 
 def test_a_mean_of_neighbors_stays_within_them_and_does_not_depend_on_where_cells_begin() -> None:
     rng = np.random.default_rng(0)
-    points, values = rng.normal(size=(4000, 3)).astype(np.float32), rng.random(4000).astype(np.float32)
+    points = rng.normal(size=(4000, 3)).astype(np.float32)
+    values = rng.random(4000).astype(np.float32)
     means = [near_mean(points + np.float32(shift), values, 0.5) for shift in (0.0, 0.13, 0.31)]
     for mean in means:
         assert values.min() <= mean.min() <= mean.max() <= values.max()
@@ -225,7 +227,8 @@ def test_shift_held_at_the_press_smooths_for_one_stroke(hand: Rig) -> None:
 
 
 def test_the_front_brush_leaves_what_lies_behind_and_the_other_does_not(hand: Rig) -> None:
-    gdf, scene = bear().gdfs[0], bear().scene
+    gdf = bear().gdfs[0]
+    scene = bear().scene
     surface = Surface(scene, camera_of(hand))
     front = paint.begin_stroke(paint.FULL, gdf, surface, through=False)
     through = paint.begin_stroke(paint.FULL, gdf, surface, through=True)
@@ -238,7 +241,8 @@ def test_the_front_brush_leaves_what_lies_behind_and_the_other_does_not(hand: Ri
 
 
 def test_a_stroke_on_the_picture_takes_the_edit_away_there_as_one_undo_entry(hand: Rig) -> None:
-    camera, before = hand.main_view.work.view.camera, hand.picture()
+    camera = hand.main_view.work.view.camera
+    before = hand.picture()
     x, y = scarf_on_screen(hand)
     hand.drag((x - 15, y), (x + 15, y))
     assert hand.main_view.work.view.camera == camera, "the left button paints"

@@ -59,7 +59,8 @@ def test_a_mask_that_does_not_fit_is_refused(members: bytes) -> None:
 @pytest.mark.parametrize("total", [0, 1, 8, 9, 1000, 1999])
 def test_a_mask_has_no_row_that_was_added_since_and_none_that_is_gone(total: int) -> None:
     rng = np.random.default_rng(3)
-    mask, kept = rng.random(1000) < 0.5, np.flatnonzero(rng.random(1000) < 0.3)
+    mask = rng.random(1000) < 0.5
+    kept = np.flatnonzero(rng.random(1000) < 0.3)
     expected = np.zeros(total, bool)
     expected[:1000] = mask[:total]
     assert np.array_equal(selection.unpack(selection.pack(mask), total), expected)

@@ -14,7 +14,10 @@ from viewer.app import app as application
 from viewer.state import snapshots, workspace
 from viewer.state.actions import perform
 
-CARD, RENAME, DELETE = 316.0, 332.0, 436.0  # a snapshot at 874, and in its menu
+# a snapshot at 874, and in its menu
+CARD = 316.0
+RENAME = 332.0
+DELETE = 436.0
 
 
 def test_snapshots_are_one_undo_entry_to_go_back_to_and_begin_with_the_original() -> None:
@@ -76,7 +79,8 @@ def test_a_click_on_a_small_picture_goes_back_to_its_snapshot_and_its_menu_delet
             hand.key(chord)
         hand.rest()
         assert hand.main_view.next_frame_delay() is None, "the small pictures are there"
-        entries, drawn = len(hand.main_view.work.past.past), hand.image()[291:341, 745:1005]
+        entries = len(hand.main_view.work.past.past)
+        drawn = hand.image()[291:341, 745:1005]
         assert len(np.unique(drawn.reshape(-1, 3), axis=0)) > 500, "pictures, not empty cards"
         hand.move(874.0, CARD)
         hand.press()
@@ -121,7 +125,8 @@ def test_two_snapshots_are_compared_until_something_is_edited() -> None:
         hand.key("1")
         hand.key("Shift+Left")
         hand.key("Shift+F5")
-        seen, middle = hand.picture(), round(0.5 * 724)
+        seen = hand.picture()
+        middle = round(0.5 * 724)
         assert np.array_equal(*(beside_line(p, middle)[0] for p in (seen, warm)))
         assert np.array_equal(*(beside_line(p, middle)[1] for p in (seen, gold)))
         said = hand.main_view.canvas.comparer.labels(hand.main_view.work.view)

@@ -18,14 +18,16 @@ from trainer.store.state import PeriodicSave, Saved, StateFolder
 def test_the_optimizer_goes_on_from_any_step_to_the_same_bits(tmp_path: Path) -> None:
     case = small("body")
     wanted = course(case, steps=6)
-    straight, original = list(optimize(*wanted)), wanted[0]
+    straight = list(optimize(*wanted))
+    original = wanted[0]
     folder = StateFolder(tmp_path / "state")
     folder.begin({})
 
     class Stop(Exception):  # noqa: N818
         pass
 
-    state, made = PgsState(original), []
+    state = PgsState(original)
+    made = []
     for _ in range(20):  # stopped after every step, every time restored into another state
 
         def on_step(step: int, left: float) -> None:

@@ -117,7 +117,8 @@ def test_between_any_two_up_axes_the_picture_turns_along_one_arc(
         ViewCamera(up=there, azimuth=azimuth, elevation=elevation),
     )
     found = views.camera_between([(0, "linear", cameras[0]), (20, "linear", cameras[1])], frame)
-    picture, ends = axes(found), [axes(camera) for camera in cameras]
+    picture = axes(found)
+    ends = [axes(camera) for camera in cameras]
     assert bool(to_camera(found, 64, 48).viewmat.isfinite().all())
     assert math.dist(cross(picture.right, picture.up), picture.back) < 1e-6
 
@@ -174,7 +175,8 @@ def test_a_film_goes_there_once_or_there_and_back_without_doubling_its_ends() ->
 @pytest.mark.parametrize("ping_pong", [False, True])
 def test_playing_shows_the_films_frames_in_their_order_at_its_pace(ping_pong: bool) -> None:
     made = replace(two_keys(length=3), ping_pong=ping_pong, fps=10)
-    player, seen = Player(playing=True), [0]
+    player = Player(playing=True)
+    seen = [0]
     for _ in range(11):
         player = timeline.advance(player, made, 0.1 + 1e-9)
         seen.append(player.frame)
@@ -210,7 +212,8 @@ def test_sliders_go_in_turn_and_back_and_the_others_stay() -> None:
 
 def test_a_slow_frame_skips_frames_of_the_film_and_keeps_its_pace() -> None:
     made = replace(two_keys(length=20), fps=10)
-    fast, slow = Player(playing=True), Player(playing=True)
+    fast = Player(playing=True)
+    slow = Player(playing=True)
     for _ in range(47):
         fast = timeline.advance(fast, made, 0.0155)
     slow = timeline.advance(slow, made, 47 * 0.0155)

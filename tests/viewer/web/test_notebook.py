@@ -130,7 +130,8 @@ def test_the_notebook_runs_in_jupyterlab_and_its_sliders_go_both_ways(
     assert psnr(second, snapshot()) >= 50
 
     widget.locator("#fold").click()
-    light, color = picture(tab), "([panel]) => getComputedStyle(panel).color"
+    light = picture(tab)
+    color = "([panel]) => getComputedStyle(panel).color"
     ink = widget.locator("#panel").evaluate_all(color)
     tab.evaluate("jupyterapp.commands.execute('apputils:change-theme', {theme: 'JupyterLab Dark'})")
     tab.wait_for_function("document.body.dataset.jpThemeLight === 'false'")
@@ -144,7 +145,8 @@ def test_the_notebook_runs_in_jupyterlab_and_its_sliders_go_both_ways(
     tab.keyboard.press("ArrowRight")
     assert float(python("print(widget.strengths['scarf'])")) == pytest.approx(0.51, abs=0.02)
 
-    cells, active = tab.evaluate("jupyterapp.shell.currentWidget.content.widgets.length"), tab.evaluate(CELL)
+    cells = tab.evaluate("jupyterapp.shell.currentWidget.content.widgets.length")
+    active = tab.evaluate(CELL)
     for key in ("d", "d", "b", "ArrowDown", "p"):
         tab.keyboard.press(key)
     assert tab.evaluate("jupyterapp.shell.currentWidget.content.widgets.length") == cells

@@ -110,11 +110,13 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
 def grade_form(members: int, degree: int, bands: int, seed: int) -> GradeForm:
     """A map that bends colors, with a residual, a mask and a slider of its own."""
     draws = Draws(seed)
-    knots, same = torch.tensor([0.0, 0.5, 1.0]), identity_map(2) if degree else lattice_colors(5)
+    knots = torch.tensor([0.0, 0.5, 1.0])
+    same = identity_map(2) if degree else lattice_colors(5)
     bent = same + 0.3 * draws.normal(*same.shape)
     table = torch.stack([same, same + 0.4 * (bent - same), bent])
     if not degree:
-        knots, table = knots[::2], table[::2]
+        knots = knots[::2]
+        table = table[::2]
     coefficients = torch.linspace(0, 1, len(knots))[:, None]
     residual = (draws.normal(1, members, 3 * bands) * 40).clamp(-127, 127).to(torch.int8)
     ends = (
@@ -259,7 +261,8 @@ def test_the_mouse_turns_slides_and_zooms_and_sets_the_pivot(
     open_page: Any, bear_page: tuple[Path, Stack]
 ) -> None:
     opened = ready(open_page(bear_page[0]))
-    mouse, start = opened.tab.mouse, opened.camera()
+    mouse = opened.tab.mouse
+    start = opened.camera()
     mouse.move(100, 150)
     mouse.down()
     mouse.move(160, 170, steps=3)
@@ -280,7 +283,8 @@ def test_the_mouse_turns_slides_and_zooms_and_sets_the_pivot(
     before = opened.tab.evaluate("progdf.camera.pivot")
     mouse.dblclick(SIZE[0] / 2, SIZE[1] / 2)
     opened.wait(f"!progdf.glide && progdf.camera.pivot[0] !== {before[0]}")
-    pivot, scene = np.array(opened.camera()["pivot"]), bear_page[1].scene
+    pivot = np.array(opened.camera()["pivot"])
+    scene = bear_page[1].scene
     assert np.abs(pivot - before).max() > 1e-3
     # on the bear's surface: the nearest Gaussians are as near as neighbors are
     assert float((scene.means - torch.tensor(pivot)).norm(dim=1).min()) < 0.1
@@ -319,7 +323,8 @@ def test_the_rule_of_the_session_shows_and_another_one_is_taken(open_page: Any, 
     view = replace(view, blend="over")
     write_page(tmp_path / "page.html", document, view, (), PageOptions(quality="exact"))
     opened = ready(open_page(tmp_path / "page.html"))
-    order, choice = page_order(opened, scene), opened.tab.get_by_label("Blend rule")
+    order = page_order(opened, scene)
+    choice = opened.tab.get_by_label("Blend rule")
     opened.slide([0.8, 0.8])
     opened.picture()
     choice.focus()
@@ -408,7 +413,8 @@ def test_a_page_keeps_the_numbers_of_members_only(open_page: Any, tmp_path: Path
     session = opened.tab.context.new_cdp_session(opened.tab)
     session.send("HeapProfiler.collectGarbage")
     used = session.send("Runtime.getHeapUsage")["backingStorageSize"]
-    before, levels = 2 * 2500 * 59 * 4, 2500 * 59 * (4 + 2)  # with what they become; the edit's end and bases
+    before = 2 * 2500 * 59 * 4  # with what they become
+    levels = 2500 * 59 * (4 + 2)  # the edit's end and bases
     assert used < before + levels + 2.5e6, "what came is 2.4 MB more"
 
 
@@ -501,7 +507,8 @@ def in_page(opened: Opened, expression: str, *values: Any) -> Any:
 
 
 def test_a_film_is_that_of_the_window(open_page: Any, tmp_path: Path) -> None:
-    draws, view = Draws(3), full_view()
+    draws = Draws(3)
+    view = full_view()
     keys = tuple(
         Keyframe(
             frame,
@@ -532,7 +539,8 @@ def test_a_film_is_that_of_the_window(open_page: Any, tmp_path: Path) -> None:
 
 def test_a_snapshot_is_what_the_window_has(open_page: Any, tmp_path: Path) -> None:
     stack, view = many_edits(bear(), 4)
-    draws, kept = Draws(8), ()
+    draws = Draws(8)
+    kept = ()
     for _ in range(6):
         alone, off, master = draws.uniform(3).tolist()
         layers = tuple(

@@ -150,7 +150,8 @@ def test_a_value_set_in_python_shows_what_the_cpu_engine_draws(show: Any) -> Non
     cells.frames()
     pictures = []
     for strengths, camera in (({}, {}), ({"scarf": 1.0}, {}), ({"ears": 0.3}, {"azimuth": 60.0})):
-        widget.strengths, widget.camera = strengths, camera
+        widget.strengths = strengths
+        widget.camera = camera
         cells.receive("strengths", widget.strengths)
         cells.receive("camera", widget.camera)
         pictures.append(cells.picture())
@@ -171,7 +172,8 @@ def test_a_drag_is_sent_to_python_once_a_frame(show: Any) -> None:
     widget = bear_widget(0.5, 0.5)
     cells = show(widget)
     slider = cells.tab.get_by_role("slider", name="ears")
-    box, mouse = slider.bounding_box(), cells.tab.mouse
+    box = slider.bounding_box()
+    mouse = cells.tab.mouse
     mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
     mouse.down()
     mouse.move(box["x"] + box["width"] + 20, box["y"] + 8, steps=5)
@@ -252,7 +254,8 @@ def test_keys_and_the_wheel_are_the_notebooks_outside_and_ours_inside(show: Any)
         "document.body.style.height = '3000px'"
     )
     assert "click, then scroll to zoom" in cells.tab.get_by_text("Drag to turn").inner_text()
-    edited, keyboard = cells.picture(), cells.tab.keyboard
+    edited = cells.picture()
+    keyboard = cells.tab.keyboard
     cells.tab.mouse.move(200, 150)
     cells.tab.mouse.wheel(0, 60)
     cells.tab.wait_for_function("scrollY === 60")
@@ -295,7 +298,8 @@ def test_the_page_of_a_widget_has_its_strengths_and_camera(tmp_path: Path) -> No
 
 
 def test_each_way_to_set_a_part_moves_it() -> None:
-    widget, told = bear_widget(0.0, 0.0), list[Any]()
+    widget = bear_widget(0.0, 0.0)
+    told = list[Any]()
     widget.observe(lambda change: told.append(dict(change.new)), ["strengths", "camera"])
     widget.strengths["ears"] = 0.5
     widget.strengths |= {"ears": np.float32(0.25)}
@@ -307,7 +311,8 @@ def test_each_way_to_set_a_part_moves_it() -> None:
 
 
 def test_a_scene_that_is_being_trained_is_shown_as_it_is() -> None:
-    scene, gdfs = bear().scene, bear().gdfs
+    scene = bear().scene
+    gdfs = bear().gdfs
     trained = replace(scene.to(dtype=torch.float64), means=scene.means.clone().requires_grad_())
     shown, expected = (np.asarray(Widget(each, gdfs).snapshot(96, 64)) for each in (trained, scene))
     assert (shown == expected).all()
@@ -333,7 +338,8 @@ def test_values_that_are_none_stop_no_widget(show: Any) -> None:
 def test_what_cannot_be_is_one_clear_line(tmp_path: Path) -> None:
     scene, (scarf, ears) = bear().scene, bear().gdfs
     widget = Widget(scene, [scarf, ears])
-    known, camera = {**widget.strengths}, {**widget.camera}
+    known = {**widget.strengths}
+    camera = {**widget.camera}
 
     def bad_trait(name: str, value: object) -> Any:
         return lambda: setattr(widget, name, value)

@@ -33,7 +33,8 @@ class DeliverActions:
     """
 
     def __init__(self, app: Application, queue: JobQueue) -> None:
-        self._app, self._queue = app, queue
+        self._app = app
+        self._queue = queue
         self._options: dict[str, DeliverOptions] = {}  # the last of each kind, for the next
 
     @property
@@ -57,8 +58,10 @@ class DeliverActions:
             main_view.wake()
 
     def _ask(self, name: str, _: str) -> None:
-        path, main_view = self._app.document.file, self._app.main_view
-        view, focus = main_view.work.view, main_view.work.focus
+        path = self._app.document.file
+        main_view = self._app.main_view
+        view = main_view.work.view
+        focus = main_view.work.focus
         options = self._options.get(name, DeliverOptions())
         if name == "render_film":
             keys = ("timeline",) if len(view.timeline.keys) > 1 else ()
@@ -75,20 +78,23 @@ class DeliverActions:
             width, height = picture_size(min(options.width, options.height), view.safe_frame)
             options = replace(options, width=width, height=height)
         suffix = options.format if name == "render_film" else SUFFIXES[name]
-        folder, written = exports.folder_of(path), self._written()
+        folder = exports.folder_of(path)
+        written = self._written()
         free = free_path(folder, f"{path.stem}_edited", suffix, lambda out: out.exists() or out in written)
         main_view.ask(Dialog(name, str(free), options=options))
 
     def _rebind(self, file: str, source: str) -> None:
         """Queue what carries an edit of the scene at `source` over to the one that is open."""
-        edit, scene = Path(file), self._app.document.file.resolve()
+        edit = Path(file)
+        scene = self._app.document.file.resolve()
         out = free_path(edit.parent, f"{edit.stem}-rebound", edit.suffix)
         words = ("rebind", str(edit), f"--from={parse_path(source)}", f"--to={scene}", f"--out={out}")
         log = self._queue.folder / f"rebind{len(list(self._queue.folder.iterdir()))}.log"
         self._queue.add(Delivery(f"Rebinding {edit.name}", out, words, log, scene))
 
     def _start(self, kind: str, dialog: Dialog) -> None:
-        out, options = parse_path(dialog.text).resolve(), dialog.options or DeliverOptions()
+        out = parse_path(dialog.text).resolve()
+        options = dialog.options or DeliverOptions()
         suffix = options.format if kind == "render_film" else SUFFIXES[kind]
         named = kind == "export" and out.name.lower().endswith((*WRITTEN, BUNDLE))
         if suffix and not named and out.suffix.lower() != suffix:
@@ -100,7 +106,8 @@ class DeliverActions:
         exists = f"{out.name} exists; give another name, or press again to replace it"
         if out.exists() and dialog.error != exists:
             raise ProgdfError(exists)
-        document, view = self._app.document, replace(self._app.main_view.work.view, compare=Comparison())
+        document = self._app.document
+        view = replace(self._app.main_view.work.view, compare=Comparison())
         if kind == "render_film" and options.moves != "timeline":
             view = _film(view, options)
         elif kind == "render_film":

@@ -33,10 +33,16 @@ from viewer.ui.widgets import (
 
 COMMANDS = ("open", "demo", "quit", "full_screen", "window_picture", "help", "palette", "unfocus", "about")
 """Those that mean something here."""
-CARD_PX, GAP_PX, MARGIN_PX, SIDE_PX = 168.0, 16.0, 28.0, 264.0
-WIDEST_PX, NARROW_PX = 1140.0, 760.0
+CARD_PX = 168.0
+GAP_PX = 16.0
+MARGIN_PX = 28.0
+SIDE_PX = 264.0
+WIDEST_PX = 1140.0
+NARROW_PX = 760.0
 """Of the whole page, at 1×; below the second its left part stands above the right one."""
-_TEXT_PX, _HEADING_PX, _TITLE_TALL_PX = 44.0, 32.0, 44.0  # two lines below a picture; a heading; the title
+_TEXT_PX = 44.0  # two lines below a picture
+_HEADING_PX = 32.0  # a heading
+_TITLE_TALL_PX = 44.0  # the title
 _NO_NAV = imgui.ItemFlags_.no_nav.value
 DROP_TEXT = "Drop a scene or a session"
 
@@ -57,16 +63,19 @@ class StartFile:
 
 def draw_start_page(recent: Sequence[StartFile], examples: Sequence[StartFile], ui: UiContext) -> list[str]:
     """The page, over the whole window; the actions that were asked for."""
-    display, scale = imgui.get_io().display_size, ui.scale
+    display = imgui.get_io().display_size
+    scale = ui.scale
     imgui.set_next_window_pos((0.0, 0.0))
     imgui.set_next_window_size(display)
     imgui.begin("start page", None, FIXED | BEHIND)
     wide = min(display.x - 2 * MARGIN_PX * scale, WIDEST_PX * scale)
     narrow = wide < NARROW_PX * scale
-    left, side = (display.x - wide) / 2, wide if narrow else SIDE_PX * scale
+    left = (display.x - wide) / 2
+    side = wide if narrow else SIDE_PX * scale
     right = left if narrow else left + side + 3 * GAP_PX * scale
     room = wide - (right - left)
-    thirds, small_card = _columns(room, 3, ui), _columns(room, max(int(room // (CARD_PX * scale)), 1), ui)
+    thirds = _columns(room, 3, ui)
+    small_card = _columns(room, max(int(room // (CARD_PX * scale)), 1), ui)
     rows = -(-len(recent) // max(int(room // (CARD_PX * scale)), 1))
     shown = (0.75 * thirds + (_TEXT_PX + _HEADING_PX) * scale) * bool(examples)
     tall = shown + rows * (0.75 * small_card + (_TEXT_PX + GAP_PX) * scale)
@@ -95,7 +104,9 @@ def _columns(room: float, count: int, ui: UiContext) -> float:
 def _head(wide: float, tall: float, ui: UiContext) -> list[str]:
     """The program's name, and what opens a file of one's own: a field to drop it on, so tall, or for 0 a
     line; and the demo."""
-    scale, actions, flat = ui.scale, [], not tall
+    scale = ui.scale
+    actions = []
+    flat = not tall
     begin = imgui.get_cursor_pos()
     with imgui_ctx.push_font(ui.fonts.bold, 26.0):
         imgui.text("ProGDF Studio")
@@ -103,9 +114,13 @@ def _head(wide: float, tall: float, ui: UiContext) -> list[str]:
     with imgui_ctx.push_font(None, SMALL_PX):
         imgui.set_cursor_pos_y(imgui.get_cursor_pos_y() + 11.0 * scale)
         imgui.text_disabled(__version__)
-    x, y = begin.x, begin.y + _TITLE_TALL_PX * scale
-    button, frame = imgui.ImVec2(136.0 * scale, 34.0 * scale), imgui.ImVec2(wide, tall or 58.0 * scale)
-    text, side = imgui.calc_text_size(DROP_TEXT), (frame.y - button.y) / 2  # of a line: the margin around it
+    x = begin.x
+    y = begin.y + _TITLE_TALL_PX * scale
+    button = imgui.ImVec2(136.0 * scale, 34.0 * scale)
+    frame = imgui.ImVec2(wide, tall or 58.0 * scale)
+    # of a line: the margin around it
+    text = imgui.calc_text_size(DROP_TEXT)
+    side = (frame.y - button.y) / 2
     middle = x + (frame.x - button.x) / 2, y + frame.y / 2
     imgui.set_cursor_pos(
         (x + button.x + 2 * side, y + (frame.y - text.y) / 2)
@@ -133,7 +148,8 @@ def _head(wide: float, tall: float, ui: UiContext) -> list[str]:
 
 def _grid(files: Sequence[StartFile], wide: float, room: float, own: bool, ui: UiContext) -> list[str]:
     """Cards of so many pixels; what was asked for. `own`: they can be taken off the page"""
-    actions, gap = list[str](), GAP_PX * ui.scale
+    actions = list[str]()
+    gap = GAP_PX * ui.scale
     across = max(int((room + gap + 1.0) // (wide + gap)), 1)
     for i, file in enumerate(files):
         if i % across:
@@ -145,10 +161,14 @@ def _grid(files: Sequence[StartFile], wide: float, room: float, own: bool, ui: U
 
 def _card(file: StartFile, wide: float, own: bool, ui: UiContext) -> list[str]:
     """A picture and two lines; a click, Enter or the cross in its corner ask for something."""
-    tall, rounding, scale = 0.75 * wide, 5.0 * ui.scale, ui.scale
+    tall = 0.75 * wide
+    rounding = 5.0 * ui.scale
+    scale = ui.scale
     imgui.begin_group()
-    at, asked = imgui.get_cursor_screen_pos(), list[str]()
-    storage, known = imgui.get_state_storage(), int(imgui.internal.get_current_window().id_)
+    at = imgui.get_cursor_screen_pos()
+    asked = list[str]()
+    storage = imgui.get_state_storage()
+    known = int(imgui.internal.get_current_window().id_)
     if not storage.get_bool(known):  # the first of all has the keyboard
         storage.set_bool(known, True)
         imgui.set_keyboard_focus_here()
@@ -163,14 +183,16 @@ def _card(file: StartFile, wide: float, own: bool, ui: UiContext) -> list[str]:
         asked = [f"forget_file:{file.path}"]
     path = escape_text(str(file.path))
     tip(f"{path} is not there any more: open it from where it is now" if file.missing else path)
-    canvas, end = imgui.get_window_draw_list(), imgui.ImVec2(at.x + wide, at.y + tall)
+    canvas = imgui.get_window_draw_list()
+    end = imgui.ImVec2(at.x + wide, at.y + tall)
     picture(file.texture, at, end, rounding, 0.3 if file.missing else 1.0)
     if not file.texture:
         size = imgui.calc_text_size(Icon.PICTURE)
         middle = (round(at.x + (wide - size.x) / 2), round(at.y + (tall - size.y) / 2))
         canvas.add_text(middle, u32(PALETTE.field_hovered), Icon.PICTURE)
     if own and (file.missing or imgui.is_mouse_hovering_rect(at, end)):
-        below, side = imgui.get_cursor_screen_pos(), imgui.get_frame_height()
+        below = imgui.get_cursor_screen_pos()
+        side = imgui.get_frame_height()
         corner = imgui.ImVec2(end.x - side - 4.0 * scale, at.y + 4.0 * scale)
         edge = (corner.x + side, corner.y + side)
         canvas.add_rect_filled(corner, edge, u32(PALETTE.scrim), rounding)
@@ -199,15 +221,21 @@ def folder_name(path: Path) -> str:
 
 def _dashed_frame(size: imgui.ImVec2, ui: UiContext) -> None:
     """Files may be dropped anywhere, and this says so."""
-    scale, dash = ui.scale, 7.0 * ui.scale
+    scale = ui.scale
+    dash = 7.0 * ui.scale
     x, y = imgui.get_cursor_screen_pos()
     imgui.dummy(size)
-    x, y, wide, tall = x + scale, y + scale, size.x - 2 * scale, size.y - 2 * scale
-    canvas, ink = imgui.get_window_draw_list(), u32(PALETTE.field_hovered)
+    x = x + scale
+    y = y + scale
+    wide = size.x - 2 * scale
+    tall = size.y - 2 * scale
+    canvas = imgui.get_window_draw_list()
+    ink = u32(PALETTE.field_hovered)
     sides = ((x, y, wide, 1, 0), (x, y + tall, wide, 1, 0), (x, y, tall, 0, 1), (x + wide, y, tall, 0, 1))
     for left, top, length, dx, dy in sides:
         for i in range(int(length / (2 * dash)) + 1):
-            low, high = 2 * i * dash, min((2 * i + 1) * dash, length)
+            low = 2 * i * dash
+            high = min((2 * i + 1) * dash, length)
             begin = (left + dx * low, top + dy * low)
             end = (left + dx * high, top + dy * high)
             canvas.add_line(begin, end, ink, 1.5 * scale)
@@ -274,7 +302,8 @@ def draw_fields(kind: str, path: str, options: DeliverOptions, ui: UiContext) ->
 def _size_fields(options: DeliverOptions, column: float, ui: UiContext) -> DeliverOptions:
     """Width and height, typed, or one of the usual ones."""
     label("Size", column)
-    gap, room = 6.0 * ui.scale, imgui.get_content_region_avail().x
+    gap = 6.0 * ui.scale
+    room = imgui.get_content_region_avail().x
     imgui.set_next_item_width(0.22 * room)
     _, width = imgui.input_int("##width", options.width, 0)
     imgui.same_line(0.0, gap)
@@ -284,7 +313,8 @@ def _size_fields(options: DeliverOptions, column: float, ui: UiContext) -> Deliv
     _, height = imgui.input_int("##height", options.height, 0)
     imgui.same_line(0.0, 2 * gap)
     size = min(max(width, 1), LARGEST_SIDE), min(max(height, 1), LARGEST_SIDE)
-    shapes, side = tuple(SHAPES), min(size)
+    shapes = tuple(SHAPES)
+    side = min(size)
     shape = next((name for name in shapes if picture_size(side, name) == size), None)
     high = choice("size", {side: f"{side}p" for side in SIDES}, side if shape else None, ui)
     if high is not None:

@@ -41,7 +41,8 @@ from .pages import Cover
 
 LONGEST_SIDE = 960
 """Pixels of a picture; larger windows show it enlarged."""
-REST_S, POLL_S = 0.12, 0.04
+REST_S = 0.12
+POLL_S = 0.04
 """The camera rests so long before a picture is asked for; between two looks for it."""
 WATCH_S = 0.5
 """Between two looks at a picture that another program changes."""
@@ -191,11 +192,15 @@ class PreviewActions:
     def __init__(
         self, app: Application, context: moderngl.Context, region: Callable[[NewEdit, Path], str]
     ) -> None:
-        self._app, self._context, self._region = app, context, region
+        self._app = app
+        self._context = context
+        self._region = region
         self._child: PreviewChild | None = None
         self._texture: moderngl.Texture | None = None
         self._sent: _Request | None = None
-        self._number, self._outstanding = 0, False  # of what was sent, and whether there is no answer yet
+        # of what was sent, and whether there is no answer yet
+        self._number = 0
+        self._outstanding = False
         self._seen: _Request | None = None  # at the last look
         self._seen_at = self._used_at = 0.0
         self._broken = False  # it cannot be started, or has ended by itself
@@ -222,7 +227,9 @@ class PreviewActions:
         if self._painting is not None and self._is_painting(self._painting):
             self._end_live()
             return self._follow(self._painting)
-        now, scene, request = time.monotonic(), self._app.document.path, self._request()
+        now = time.monotonic()
+        scene = self._app.document.path
+        request = self._request()
         if request is None or scene is None:
             self._show("", None)
             self._end_live()
@@ -251,7 +258,8 @@ class PreviewActions:
             moved = (
                 self._seen is None or request.camera != self._seen.camera or request.size != self._seen.size
             )
-            self._seen, self._seen_at = request, now if moved else now - REST_S
+            self._seen = request
+            self._seen_at = now if moved else now - REST_S
         # one at a time: what moves on while it is made is asked for next, and each answer is shown
         if request != self._sent and not self._outstanding and now - self._seen_at >= REST_S:
             self._send(request, self._child)
@@ -265,9 +273,11 @@ class PreviewActions:
         Raises:
             ProgdfError: the scene has no file, or the picture cannot be written.
         """
-        main_view, scene = self._app.main_view, self._app.document.file
+        main_view = self._app.main_view
+        scene = self._app.document.file
         self._end_live()
-        camera, size = main_view.work.view.camera, main_view.picture_size
+        camera = main_view.work.view.camera
+        size = main_view.picture_size
         folder = training.edits_folder(scene)
         make_folder(folder)
         path = main_view.canvas.save_original(folder, scene.stem, main_view.work.view, size)
@@ -295,7 +305,8 @@ class PreviewActions:
 
     def _is_painting(self, painted: PaintedView) -> bool:
         """Whether the form is about the picture that is painted."""
-        work, path = self._app.main_view.work, str(painted.path)
+        work = self._app.main_view.work
+        path = str(painted.path)
         of_form = path in work.form.pictures.split(", ") or path == work.form.anchor
         return work.form_open and work.view.panel and of_form
 
@@ -338,7 +349,9 @@ class PreviewActions:
     def leave_scene(self) -> None:
         """The child is for a scene that is not open any more."""
         self._end()
-        self._grade, self._painting, self._palette_of = None, None, ""
+        self._grade = None
+        self._painting = None
+        self._palette_of = ""
         self._broken = False
 
     def close(self) -> None:
@@ -351,8 +364,10 @@ class PreviewActions:
 
     def _request(self) -> _Request | None:
         """What the form and the view ask for; None for no picture."""
-        work, size = self._app.main_view.work, self._app.main_view.picture_size
-        form, view = work.form, work.view
+        work = self._app.main_view.work
+        size = self._app.main_view.picture_size
+        form = work.form
+        view = work.view
         of_sentence = form.choice.setting == "sentence"
         pictured = (form.preview and form.choice.pictured) or of_sentence
         if not (work.form_open and view.panel and pictured) or form.obstacle not in ("", STILL):
@@ -381,7 +396,8 @@ class PreviewActions:
             self._show(error_line(error), None, failed=True)
             return
         self._number = child.ask(region, request, to_camera(request.camera, width, height))
-        self._outstanding, self._region_sent = True, region
+        self._outstanding = True
+        self._region_sent = region
         cover = self._app.main_view.cover
         in_place = cover is not None and (cover.camera, cover.size) == (request.camera, request.size)
         text = "Looking for models …" if request.seed < 0 else "Drawing …"
@@ -398,11 +414,13 @@ class PreviewActions:
         if missing is not None:
             painted = replace(view, editor=f"style:{missing}")
             self._number = child.ask(self._region_sent, painted, to_camera(view.camera, *SHEET_PX))
-            self._tile, self._outstanding = missing, True
+            self._tile = missing
+            self._outstanding = True
 
     def _take_painting(self, pixels: NDArray[np.uint8] | None) -> None:
         """A picture for the sheet; None where that style could not be painted."""
-        style, self._tile = self._tile, -1
+        style = self._tile
+        self._tile = -1
         self._tiles |= {style}
         if pixels is None:
             return
@@ -435,7 +453,8 @@ class PreviewActions:
         elif self._sent is None or self._sent.kind != now.kind:
             return
         elif answer.made == "palette":
-            self._palette_of, work = self._sent.region, self._app.main_view.work
+            self._palette_of = self._sent.region
+            work = self._app.main_view.work
             if all(source == target for source, target in work.form.palette):
                 form = replace(work.form, palette=tuple((color, color) for color in answer.palette))
                 self._app.main_view.work = replace(work, form=form)
@@ -451,14 +470,17 @@ class PreviewActions:
             kind, _, what = self._sent.editor.partition(":")
             title = next(choice.title for choice in EDITORS if choice.kind == kind)
             self._end_live()
-            name, text = f"Preview: {title} at {self._sent.strength:.2f}", ""
+            name = f"Preview: {title} at {self._sent.strength:.2f}"
+            text = ""
             self._painted = None
             if kind == "instruct":
-                name, text = f"Anchor: {what}", "The edit will follow this picture"
+                name = f"Anchor: {what}"
+                text = "The edit will follow this picture"
                 if answer.follows:
                     self._painted = self._sent, answer.pixels
                 else:
-                    name, text = f"Example: {what}", "An example: this model cannot follow a picture"
+                    name = f"Example: {what}"
+                    text = "An example: this model cannot follow a picture"
             texture = self._upload(answer.pixels)
             self._show(text, Cover(texture, self._sent.camera, self._sent.size, name))
             self._app.main_view.wake()
@@ -467,9 +489,11 @@ class PreviewActions:
         """The grade as a layer on top, at the form's strength."""
         if self._grade is None:
             return
-        main_view, document = self._app.main_view, self._app.document
+        main_view = self._app.main_view
+        document = self._app.document
         layers = main_view.work.view.layers
-        name, solo = main_view.work.form.layer_name, any(layer.solo for layer in layers)
+        name = main_view.work.form.layer_name
+        solo = any(layer.solo for layer in layers)
         strength = main_view.work.form.strength
         live = (LayerState(len(document.gdfs), name, strength, solo=solo),)
         if not main_view.live:
@@ -503,11 +527,15 @@ class PreviewActions:
         sheet = 0 if self._sheet is None else int(self._sheet.glo)
         state = PreviewState(text, failed, self._outstanding, painted, known, sheet, self._drawn)
         if (main_view.cover, main_view.preview) != (cover, state):
-            main_view.cover, main_view.preview = cover, state
+            main_view.cover = cover
+            main_view.preview = state
             main_view.wake()
 
     def _end(self) -> None:
         if self._child is not None:
             self._child.close()
             self._child = None
-        self._sent, self._seen, self._outstanding, self._tile = None, None, False, -1
+        self._sent = None
+        self._seen = None
+        self._outstanding = False
+        self._tile = -1

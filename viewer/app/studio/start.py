@@ -53,7 +53,9 @@ class StartActions:
     """
 
     def __init__(self, app: Application, context: moderngl.Context, queue: JobQueue) -> None:
-        self._app, self._context, self._queue = app, context, queue
+        self._app = app
+        self._context = context
+        self._queue = queue
         self._textures: dict[Path, moderngl.Texture | None] = {}
         self._demo: Path | None = None  # its folder while it is being made
         self._edits = EditActions(app)
@@ -111,15 +113,19 @@ class StartActions:
 
     def _start_demo(self, _: str) -> None:
         folder = (state_folder() / "demo").resolve()
-        self._demo, self._added = folder, {}
-        words, log = ("demo", "--quick", "--no-window", f"--out={folder}"), self._queue.folder / "demo.log"
+        self._demo = folder
+        self._added = {}
+        words = ("demo", "--quick", "--no-window", f"--out={folder}")
+        log = self._queue.folder / "demo.log"
         self._queue.add(Delivery("Demo: four edits", folder, words, log, folder / "scene.ply"))
         self._app.main_view.show_message("Making the demo's scene …")
 
     def _show_edit(self, folder: Path) -> None:
         """An edit of the demo: its draft, in place of that what is packed, and at last the finished file."""
-        draft, result = folder / "draft.gdf", folder / f"{folder.name}.gdf"
-        path, before = result if result.is_file() else draft, self._added.get(folder)
+        draft = folder / "draft.gdf"
+        result = folder / f"{folder.name}.gdf"
+        path = result if result.is_file() else draft
+        before = self._added.get(folder)
         now = path, path.stat().st_mtime_ns
         if now != before:
             self._added[folder] = now
@@ -142,7 +148,8 @@ class StartActions:
             return
         recent = []
         for path in user_files.read_recent(missing=True):
-            used, missing = user_files.thumbnail_time(path), not path.is_file()
+            used = user_files.thumbnail_time(path)
+            missing = not path.is_file()
             age = user_files.describe_age(time.time() - used) if used else ""
             line = "  ·  ".join(filter(None, ("Moved?" if missing else age, folder_name(path))))
             recent.append(StartFile(path, self._texture(path), line=line, missing=missing))
@@ -181,9 +188,11 @@ class UpActions:
         Args:
             session: that is open, which knows
         """
-        main_view, document = self._app.main_view, self._app.document
+        main_view = self._app.main_view
+        document = self._app.document
         # what a person sets, also by undo; not where a film, a picture or a snapshot leads the camera
-        up, before = main_view.work.past.present.look.up, self._up
+        up = main_view.work.past.present.look.up
+        before = self._up
         self._up = up
         if document.path is None:
             return

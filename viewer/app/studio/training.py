@@ -67,7 +67,10 @@ class JobActions:
         anchor: Callable[[NewEdit], tuple[NDArray[np.uint8], Camera] | None] = lambda _: None,
         follow: Callable[[Path], None] = lambda _: None,
     ) -> None:
-        self._app, self._draft, self._anchor, self._follow = app, draft, anchor, follow
+        self._app = app
+        self._draft = draft
+        self._anchor = anchor
+        self._follow = follow
         self._edits = EditActions(app)
         self.queue = JobQueue()
         self._scene: Path | None = None
@@ -145,10 +148,12 @@ class JobActions:
     def _enqueue(self, form: NewEdit) -> None:
         scene = self._app.document.file
         out = training.free_run(training.edits_folder(scene), form.layer_name)
-        region, threads = self.region_spec(form, out.parent, out.name), training.spare_threads()
+        region = self.region_spec(form, out.parent, out.name)
+        threads = training.spare_threads()
         model = anchor = ""
         if form.choice.setting == "sentence":
-            model, anchor = form.model, self._write_anchor(form, out)
+            model = form.model
+            anchor = self._write_anchor(form, out)
         order = EditOrder(
             scene.resolve(),
             out,
@@ -166,14 +171,17 @@ class JobActions:
         if form.region == SELECTION:  # it becomes a region: its highlight would hide what is trained
             main_view = self._app.main_view
             view = main_view.work.view
-            name, path = free_name(view.selection, out.name), out.with_name(f"{out.name}{SUFFIX}")
+            name = free_name(view.selection, out.name)
+            path = out.with_name(f"{out.name}{SUFFIX}")
             selection = replace(add_region(view.selection, name, path), members=NOBODY, count=0)
             main_view.change(replace(view, selection=selection))
 
     def _lay_decal(self, _: str) -> None:
         """The decal in the hand goes into the queue, as it lies in the picture."""
-        main_view, scene = self._app.main_view, self._app.document.path
-        placed, main_view.gizmo = main_view.decal_place, None
+        main_view = self._app.main_view
+        scene = self._app.document.path
+        placed = main_view.decal_place
+        main_view.gizmo = None
         if placed is None or scene is None:
             return
         path, camera, at = placed
@@ -227,7 +235,8 @@ class JobActions:
 
     def _paint_over(self, _: str) -> None:
         """Write the picture where any program can change it, and follow that file from now on."""
-        main_view, scene = self._app.main_view, self._app.document.file
+        main_view = self._app.main_view
+        scene = self._app.document.file
         form = main_view.work.form
         run = training.free_run(training.edits_folder(scene), form.layer_name)
         if path := self._write_anchor(form, run):
@@ -248,7 +257,8 @@ class JobActions:
             spec = form.typed_region.strip()
             check_region(spec, {kind: lambda _: None for kind in _KINDS})
             return spec
-        selection, total = self._app.main_view.work.view.selection, len(self._app.document.original)
+        selection = self._app.main_view.work.view.selection
+        total = len(self._app.document.original)
         region = {region.name: region for region in selection.regions}.get(form.region)
         if form.region != SELECTION and region is None:
             raise ProgdfError(f"there is no region {form.region} any more; choose another one")
@@ -269,7 +279,8 @@ class JobActions:
 
     def _end(self, job: QueuedTask) -> None:
         """A job has ended: a new edit comes on top, else a line says what became of it."""
-        task, main_view = job.task, self._app.main_view
+        task = job.task
+        main_view = self._app.main_view
         if job.status == "done" and not job.warning and isinstance(task, EditOrder):
             self.queue.dismiss(job.number)
         if job.status == "failed" and not main_view.work.view.panel:  # else its card says so
@@ -295,7 +306,8 @@ class JobActions:
 
     def leave_scene(self) -> None:
         """There is another scene; what is trained for this one goes on, and its card says for which."""
-        self._followed, self._live = False, None
+        self._followed = False
+        self._live = None
 
     def _follow_document(self) -> None:
         """Runs of the scene that were stopped another day come back."""
@@ -316,7 +328,8 @@ class JobActions:
         order = next((task for task in orders if isinstance(task, EditOrder)), None)
         if order is None or order.scene != self._scene or now < self._live_due:
             return
-        live, packed = self._app.main_view.live, order.out / "draft.gdf"
+        live = self._app.main_view.live
+        packed = order.out / "draft.gdf"
         layers = {order.draft, order.packed_edit}.intersection(self._app.document.gdf_paths)
         if order.draft in layers and is_newer(packed, order.draft):
             attempt(self._app.main_view, partial(self._take_packed, order, packed))
@@ -328,11 +341,13 @@ class JobActions:
         recording = order.newest_recording()
         if recording is None or recording == self._live:
             return
-        begun, document = time.monotonic(), self._app.document
+        begun = time.monotonic()
+        document = self._app.document
         if (edit := order.recorded_edit(recording, document.original)) is not None:
             layer = LayerState(len(document.gdfs), f"{edit.name} (training)", 1.0)
             self._app.show(document, (edit,), (layer,))
-            self._live, self._live_layers = recording, (layer,)
+            self._live = recording
+            self._live_layers = (layer,)
         cost = time.monotonic() - begun
         self._live_due = now + max(LIVE_EVERY_S, cost / LIVE_SHARE)
 
