@@ -93,7 +93,7 @@ def undistort(photograph: Tensor, K: Tensor, lens: Lens) -> tuple[Tensor, Tensor
     return torch.where(visible[..., None], straight, 0.0), visible
 
 
-MOST_SAMPLING = 16.0
+MAX_SAMPLING = 16.0
 """Of `Camera.sampling`: Gaussians without any extent are still drawn."""
 
 NEAR = 0.01
@@ -138,8 +138,8 @@ class Camera:
                 raise ValueError(f"{name} has a number that is not finite")
         if self.width < 1 or self.height < 1:
             raise ValueError(f"the image is {self.width}x{self.height} pixels; both must be at least 1")
-        if not 1.0 <= self.sampling <= MOST_SAMPLING:
-            raise ValueError(f"the sampling is {self.sampling:g}; it must be 1 to {MOST_SAMPLING:g}")
+        if not 1.0 <= self.sampling <= MAX_SAMPLING:
+            raise ValueError(f"the sampling is {self.sampling:g}; it must be 1 to {MAX_SAMPLING:g}")
         _check_intrinsics(self.K.tolist())
         fault = rigid_fault(self.viewmat)
         if fault:

@@ -20,7 +20,7 @@ import torch
 _A = TypeVar("_A")
 _T = TypeVar("_T")
 
-MOST_THREADS = torch.get_num_threads()
+MAX_THREADS = torch.get_num_threads()
 
 _thread_count: int | None = None
 _local = threading.local()
@@ -29,7 +29,7 @@ _local = threading.local()
 @contextmanager
 def _torch_threads(count: int) -> Iterator[None]:
     before = torch.get_num_threads()
-    torch.set_num_threads(count or MOST_THREADS)
+    torch.set_num_threads(count or MAX_THREADS)
     try:
         yield
     finally:

@@ -41,18 +41,18 @@ ORDER = {
         recorded_runs viewer field edits networks sliders warps pictures __main__""",
 }
 
-MOST_FILES = 14
-MOST_LINES = 600
+MAX_FILES = 14
+MAX_LINES = 600
 
 MEASURED = ("progdf", "trainer", "viewer")
 # Tables of module names as text, which are imported on first use.
 LAZY_TABLES = ("progdf/__init__.py", "progdf/__main__.py", "progdf/rasterize/engines.py")
-MOST_IMPORTS = 0.073  # of all lines
+MAX_IMPORTS = 0.073  # of all lines
 MAX_FILE_IMPORTS = 55  # import statements of one file; this ceiling only falls, to 25
-MOST_SCRIPT_LINES = 1271  # of the JavaScript of the web page, counted alike
-MOST_FUNCTION_LINES = 80
-MOST_POSITIONAL = 8
-LEAST_LINES = 80  # of a module that one other imports alone; it is a section of that one
+MAX_SCRIPT_LINES = 1271  # of the JavaScript of the web page, counted alike
+MAX_FUNCTION_LINES = 80
+MAX_POSITIONAL = 8
+MIN_LINES = 80  # of a module that one other imports alone; it is a section of that one
 
 # What looks like a section of its only importer and is none: entry points.
 SMALL = {"progdf.__main__"}
@@ -311,14 +311,14 @@ def test_no_folder_holds_more_files_than_one_can_take_in(sources: dict[Path, str
     filled = [path for path, source in sources.items() if len(parse(source).body) > 1]
     files = Counter(path.parent.as_posix() for path in filled)
     shaders = Counter(path.parent.as_posix() for path in (ROOT / "shaders").rglob("*.*"))
-    full = sorted(folder for folder, count in (files + shaders).items() if count > MOST_FILES)
-    assert not full, f"more than {MOST_FILES} files: {full}"
+    full = sorted(folder for folder, count in (files + shaders).items() if count > MAX_FILES)
+    assert not full, f"more than {MAX_FILES} files: {full}"
 
 
 def test_no_file_is_longer_than_one_reads_in_a_sitting(sources: dict[Path, str]) -> None:
     lengths = {path.as_posix(): source.count("\n") for path, source in sources.items()}
-    long = sorted(name for name, lines in lengths.items() if lines > MOST_LINES)
-    assert not long, f"more than {MOST_LINES} lines: {long}"
+    long = sorted(name for name, lines in lengths.items() if lines > MAX_LINES)
+    assert not long, f"more than {MAX_LINES} lines: {long}"
 
 
 def test_the_page_knows_nothing_of_the_window(sources: dict[Path, str]) -> None:
@@ -334,7 +334,7 @@ def test_the_script_of_the_page_keeps_its_budget() -> None:
     files = sorted((ROOT / "viewer" / "web" / "src").glob("*.js"))
     lines = [line.strip() for file in files for line in file.read_text(encoding="utf-8").splitlines()]
     code = [line for line in lines if line and not line.startswith(("//", "import "))]
-    assert 0 < len(code) <= MOST_SCRIPT_LINES
+    assert 0 < len(code) <= MAX_SCRIPT_LINES
     assert max(map(len, lines)) <= 130
 
 
@@ -346,7 +346,7 @@ def measured() -> dict[str, list[Module]]:
 def test_imports_are_a_small_share_of_all_lines(measured: dict[str, list[Module]]) -> None:
     lines = sum(module.lines for group in measured.values() for module in group)
     imports = sum(module.imports for group in measured.values() for module in group)
-    assert imports <= MOST_IMPORTS * lines, f"{imports / lines:.1%} of all lines are imports"
+    assert imports <= MAX_IMPORTS * lines, f"{imports / lines:.1%} of all lines are imports"
 
 
 def test_no_file_imports_more_than_one_can_keep_in_mind(measured: dict[str, list[Module]]) -> None:
@@ -366,14 +366,14 @@ def test_a_small_module_that_one_other_imports_is_a_section_of_it(measured: dict
     alone = {
         name: users
         for name, users in importers(everything).items()
-        if len(users) == 1 and everything[name].lines < LEAST_LINES and name not in SMALL
+        if len(users) == 1 and everything[name].lines < MIN_LINES and name not in SMALL
     }
     assert not alone, "\n".join(f"{name} belongs into {next(iter(users))}" for name, users in alone.items())
 
 
 def test_functions_fit_on_a_screen(measured: dict[str, list[Module]]) -> None:
     sizes = [size for group in measured.values() for module in group for size in functions(module)]
-    assert not [where for size, where in sizes if size > MOST_FUNCTION_LINES]
+    assert not [where for size, where in sizes if size > MAX_FUNCTION_LINES]
 
 
 def test_calls_say_by_name_what_many_arguments_are(measured: dict[str, list[Module]]) -> None:
@@ -383,7 +383,7 @@ def test_calls_say_by_name_what_many_arguments_are(measured: dict[str, list[Modu
     plain = [
         (size, where) for size, where in wide if "rasterize/cpu" not in where and "check_ranges" not in where
     ]
-    assert not [where for size, where in plain if size > MOST_POSITIONAL]
+    assert not [where for size, where in plain if size > MAX_POSITIONAL]
 
 
 def test_functions_are_verbs_or_nouns_never_bare_participles(measured: dict[str, list[Module]]) -> None:

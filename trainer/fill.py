@@ -35,8 +35,8 @@ _WIDTH = 0.7  # of a side
 _THICKNESS = 0.1  # of that
 _LOGIT = 5.0  # of the opacity
 _STEEPEST = 0.3  # least cosine by which a disc is lengthened
-_LEAST = 0.01  # of the region's pixels: a smaller hole in a view is the rim's own raggedness
-_MOST_VIEWS = 12
+_MINIMUM = 0.01  # of the region's pixels: a smaller hole in a view is the rim's own raggedness
+_MAX_VIEWS = 12
 _REACH = 4.0  # pixels
 
 
@@ -86,9 +86,9 @@ def fill_holes(
     before = sum(hole.pixels for hole in holes)
     filled = rest
     discs = list[Gaussians]()
-    worth = [_LEAST * float((view.mask > _THERE).sum()) for view in views]
+    worth = [_MINIMUM * float((view.mask > _THERE).sum()) for view in views]
     left = {i for i, hole in enumerate(holes) if hole.pixels > worth[i]}
-    while left and len(discs) < _MOST_VIEWS:
+    while left and len(discs) < _MAX_VIEWS:
         # a given picture's own view goes first: there its colors are known
         best = max(left, key=lambda i: (views[i].camera.name in given, holes[i].pixels, -i))
         rows = place_discs(holes[best], rest, given.get(views[best].camera.name, holes[best].colors))

@@ -42,10 +42,10 @@ DETECTOR = "IDEA-Research/grounding-dino-tiny"
 SAM_MODEL = "facebook/sam-vit-base"
 FieldKind = Literal["auto", "separable", "lossless", "neural"]
 
-MOST_STAGES = 8
+MAX_STAGES = 8
 """Strengths that an editor with a strength control is asked for if nobody says how many, at most."""
 
-MOST_THREADS = 1024
+MAX_THREADS = 1024
 """More than any machine has: what --threads says at most."""
 LARGEST_SEED = 2**32 - 1
 """What every generator of random numbers takes."""

@@ -29,8 +29,8 @@ from trainer.options import EditKind
 
 from .options import (
     LARGEST_SEED,
-    MOST_STAGES,
-    MOST_THREADS,
+    MAX_STAGES,
+    MAX_THREADS,
     PRESETS,
     VIEWS,
     EditorOptions,
@@ -49,7 +49,7 @@ BLANK = TrainOptions(Path(), Path(), RegionOptions(""), EditorOptions(""))
 
 PERCEPTUAL_WEIGHT: Mapping[EditKind, float] = {"color": 0.1, "style": 0.3, "geometry": 0.3}
 SHARPNESS: Mapping[EditKind, Sharpness] = {"color": "off", "style": "hinge", "geometry": "off"}
-STAGES: Mapping[EditKind, int] = {"color": MOST_STAGES, "style": 1, "geometry": MOST_STAGES}
+STAGES: Mapping[EditKind, int] = {"color": MAX_STAGES, "style": 1, "geometry": MAX_STAGES}
 COSTLY_STAGES: Mapping[EditKind, int] = {"color": 4, "style": 4, "geometry": 1}
 """Of what paints each strength anew; where things move its pictures between show two of them."""
 
@@ -59,7 +59,7 @@ one is met. `QUICK_STAGES` are asked for then (docs/experiments.md, Stages)."""
 QUICK_STEPS = 240
 QUICK_STAGES = 4
 QUICK_VIEWS = 12
-_MOST_STEPS = 1_000_000  # hours on any machine
+_MAX_STEPS = 1_000_000  # hours on any machine
 _LONGEST_NAME = 255  # bytes that every file system takes
 _SMALLEST_VIEW = 32  # pixels of a view's longer side
 
@@ -179,16 +179,16 @@ def check_options(options: TrainOptions) -> None:
         ("--group-steps", optimize.group_steps, 0, 10_000),
         ("--grow", optimize.grow, 0, 1),
         ("--seed", options.seed, 0, LARGEST_SEED),
-        ("--threads", options.threads, 0, MOST_THREADS),
+        ("--threads", options.threads, 0, MAX_THREADS),
         ("--edit-steps", editor.edit_steps, 1, 1000),
         ("--edit-size", editor.edit_size, 32, 4096),
         ("--lift-threshold", region.lift_threshold, 0, 1),
         ("--box-threshold", region.box_threshold, 0, 1),
     )
-    stages = optimize.stages or MOST_STAGES
-    if not 4 * stages <= optimize.steps <= _MOST_STEPS:
+    stages = optimize.stages or MAX_STAGES
+    if not 4 * stages <= optimize.steps <= _MAX_STEPS:
         least = 4 * stages
-        most = _MOST_STEPS
+        most = _MAX_STEPS
         raise ProgdfError(
             f"--steps must be between {least} and {most} for {stages} stages, got {optimize.steps}"
         )
@@ -280,7 +280,7 @@ def count_threads(threads: int) -> int:
     Raises:
         ProgdfError: fewer than none, or more than any machine has.
     """
-    if not 0 <= threads <= MOST_THREADS:
-        raise ProgdfError(f"--threads must be between 0 and {MOST_THREADS}, got {threads}")
+    if not 0 <= threads <= MAX_THREADS:
+        raise ProgdfError(f"--threads must be between 0 and {MAX_THREADS}, got {threads}")
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return threads or cores

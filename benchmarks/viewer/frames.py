@@ -41,12 +41,12 @@ WARM_UP = 2
 STEPS = 20
 STARTS = 3
 KEPT = 4
-LEAST = 3
+MIN_STEPS = 3
 TURN_S = 20.0
 STARTS_S = 30.0
 """Slow frames and starts are as many as fit into so many seconds, and at least so many frames."""
 
-MOST_COPIED = 1_000_000
+MAX_COPIED = 1_000_000
 """Gaussians beyond which the largest scene is not laid over itself."""
 
 TURN_PX = 10.0
@@ -87,13 +87,13 @@ def tables(scenes: Sequence[Path] = ()) -> list[Table]:
 
     Args:
         scenes: .ply files that take the place of the bears; the largest is also laid over itself four times
-            unless that makes more than `MOST_COPIED` Gaussians
+            unless that makes more than `MAX_COPIED` Gaussians
 
     Raises:
         ProgdfError: there is no OpenGL here, or a file is broken.
     """
     opened = scenes_of(scenes)
-    if COPIES * len(opened[-1]) <= MOST_COPIED:
+    if COPIES * len(opened[-1]) <= MAX_COPIED:
         opened.append(copies(opened[-1]))
     ctx = headless_context()
     try:
@@ -285,8 +285,8 @@ def _turn(mice: Mapping[str, Mouse], steps: int) -> dict[str, _Turned]:
 
 
 def affordable_steps(steps: int, one_s: float) -> int:
-    """How many of `steps` fit into `TURN_S` if one takes so many seconds; at least `LEAST` of them."""
-    return min(steps, max(LEAST, int(TURN_S / max(one_s, 1e-9))))
+    """How many of `steps` fit into `TURN_S` if one takes so many seconds; at least `MIN_STEPS` of them."""
+    return min(steps, max(MIN_STEPS, int(TURN_S / max(one_s, 1e-9))))
 
 
 def _draw_anew(mouse: Mouse, view: ViewState) -> NDArray[np.uint8]:

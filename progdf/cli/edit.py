@@ -31,8 +31,8 @@ from .options import absent_option, parse_options
 
 Specs = Annotated[tuple[str, ...], UseAppendAction]
 
-MOST_DEGREES = 360.0
-MOST_SCALE = 1000.0
+MAX_DEGREES = 360.0
+MAX_SCALE = 1000.0
 
 
 @dataclass(frozen=True)
@@ -165,7 +165,7 @@ def _shift(text: str) -> Motion | None:
 
 def _factor(text: str) -> Motion | None:
     numbers = read_numbers(text)
-    if len(numbers) != 1 or not 1 / MOST_SCALE <= numbers[0] <= MOST_SCALE:
+    if len(numbers) != 1 or not 1 / MAX_SCALE <= numbers[0] <= MAX_SCALE:
         return None
     return similarity(scale=numbers[0])
 
@@ -175,7 +175,7 @@ def _turn(text: str) -> Motion | None:
     named = {"x": "1,0,0", "y": "0,1,0", "z": "0,0,1"}
     direction = read_numbers(named.get(axis.strip().lower(), axis))
     angle = read_numbers(degrees)
-    if len(direction) != 3 or not any(direction) or len(angle) != 1 or abs(angle[0]) > MOST_DEGREES:
+    if len(direction) != 3 or not any(direction) or len(angle) != 1 or abs(angle[0]) > MAX_DEGREES:
         return None
     unit = torch.nn.functional.normalize(torch.tensor(direction, dtype=torch.float64), dim=0)
     return similarity(turn=(math.radians(angle[0]) * unit).tolist())

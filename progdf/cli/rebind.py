@@ -31,7 +31,7 @@ from progdf.terminal import print_line
 from .options import parse_options
 
 _CANDIDATES = 8
-_LEAST_MATCHED = 0.9
+_MIN_MATCHED = 0.9
 """Share of B's Gaussians that must be found in A: fewer, and it is another scene."""
 
 _COLOR = 0.1
@@ -80,12 +80,12 @@ def main(argv: Sequence[str]) -> int:
         f"matched: {match.matched:.1%} of {scene_name(options.target)}, {match.once:.1%} one to one; "
         f"distance {match.median:.3g} (95 %: {match.p95:.3g}) of the median Gaussian's size"
     )
-    if match.matched < _LEAST_MATCHED:
-        turned = match_scenes(a, rotate_about_x(b)).matched >= _LEAST_MATCHED
+    if match.matched < _MIN_MATCHED:
+        turned = match_scenes(a, rotate_about_x(b)).matched >= _MIN_MATCHED
         why = "is that scene after half a turn about x" if turned else "is another scene"
         raise ProgdfError(
             f"{options.target} {why}: {match.matched:.0%} of its Gaussians are found in {options.source}, "
-            f"{_LEAST_MATCHED:.0%} are needed; give the same scene"
+            f"{_MIN_MATCHED:.0%} are needed; give the same scene"
         )
     rebound = rebind_edit(gdf, a, b, match)
     save_gdf(options.out, rebound)

@@ -36,7 +36,7 @@ from .palette import Curve, are_alike, bend_lightness, less_light, shift_palette
 Course = Callable[[Strength], Tensor]
 """Some colors [...,3] at a strength."""
 
-_LEAST_CHROMA = 0.015  # of a target that has a hue
+_MIN_CHROMA = 0.015  # of a target that has a hue
 _CAST = 0.1  # of lightness: the chroma of white under the bluest and the most amber light
 _MIDDLE = 0.5646  # lightness of 18 % gray, which contrast leaves where it is
 _LARGEST_GAIN = 3.0  # a dark part that becomes bright is lifted instead of amplifying its noise further
@@ -96,7 +96,7 @@ def recolor_fully(rgb: Tensor, target: Tensor, reference: Tensor) -> Tensor:
     lightness = _relight(lab[..., 0], ref_l.clamp(0.02, 0.98), new_l.clamp(0.02, 0.98))
     # chroma in proportion to lightness is the same surface in less light; towards white the gamut narrows it
     chroma = new_c * (lightness / new_l.clamp_min(0.02)).clamp(0, 1)
-    hue = torch.atan2(new_b, new_a) if new_c >= _LEAST_CHROMA else hue_of(lab)
+    hue = torch.atan2(new_b, new_a) if new_c >= _MIN_CHROMA else hue_of(lab)
     return fit_gamut(torch.stack([lightness, chroma * torch.cos(hue), chroma * torch.sin(hue)], dim=-1))
 
 
@@ -201,15 +201,15 @@ def parse_grade(what: str) -> ColorGrade:
             values[name] = number_of(number)
             if not low <= values[name] <= high:
                 raise ProgdfError(f"in grade:{what:.80} {name} is '{number:.40}'; write {low:g} to {high:g}")
-    if len(pairs) > MOST_PAIRS:
-        raise ProgdfError(f"grade:{what:.80} has {len(pairs)} colors; the most are {MOST_PAIRS}")
+    if len(pairs) > MAX_PAIRS:
+        raise ProgdfError(f"grade:{what:.80} has {len(pairs)} colors; the most are {MAX_PAIRS}")
     asked = ColorGrade(values, tuple(pairs), tuple(curves), curve)
     if asked.is_neutral:
         raise ProgdfError(f"grade:{what:.80} changes nothing; write, for example, grade:exposure=0.7")
     return asked
 
 
-MOST_PAIRS = 16
+MAX_PAIRS = 16
 """Colors that a grade moves or holds."""
 
 

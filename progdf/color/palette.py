@@ -31,7 +31,7 @@ _NARROWEST = 0.04
 _ALONE = 0.08
 _ROUNDS = 20  # of k-means
 _CELL = 0.04  # side of the cells in which colors are counted
-_LEAST_SHARE = 0.003  # of what is seen, for a color to be a main one
+_MIN_SHARE = 0.003  # of what is seen, for a color to be a main one
 _STEPS = 1024  # of a curve, linear between
 
 Curve = tuple[tuple[float, float], ...]
@@ -72,7 +72,7 @@ def find_palette(rgb: Tensor, weights: Tensor, count: int = COLORS) -> Tensor:
     kept: list[int] = []
     for i in covered.argsort(descending=True).tolist():
         apart = all(float((centers[i] - centers[j]).norm()) >= 2 * CLOSEST for j in kept)
-        if apart and float(covered[i]) >= _LEAST_SHARE * float(shares.sum()):
+        if apart and float(covered[i]) >= _MIN_SHARE * float(shares.sum()):
             kept.append(i)
     return oklab_to_srgb(centers[kept] / _kernel_space(centers.new_ones(3))).clamp(0, 1).to(rgb)
 

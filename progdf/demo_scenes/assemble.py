@@ -133,7 +133,7 @@ def mix(under: Tensor, over: Tensor, share: Tensor) -> Tensor:
 
 
 _PROBES = 600
-_MOST_DRAWN = 10_000  # per Gaussian kept; a part of which less shows is misplaced
+_MAX_DRAWN = 10_000  # per Gaussian kept; a part of which less shows is misplaced
 
 
 @dataclass(frozen=True)
@@ -218,7 +218,7 @@ def _sample_visible(
         rows = _is_outside(parts, part, at).nonzero()[:, 0]
         if len(rows) >= count:
             break
-        if drawn > _MOST_DRAWN * count:
+        if drawn > _MAX_DRAWN * count:
             raise ValueError(f"{part.name} at {part.center.tolist()} lies inside other parts; move it")
         drawn = max(drawn + 1, math.ceil(1.01 * drawn * count / max(len(rows), 1)))
     chosen = torch.randperm(len(rows), generator=random)[:count].sort().values

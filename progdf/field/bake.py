@@ -16,7 +16,7 @@ from torch import Tensor
 from progdf.gaussians import BASE_CHANNELS
 from progdf.metrics.image import decibels
 
-from .baked import MOST_RANK, BakedField, BakePlan, NeuralForm, interpolate_at
+from .baked import MAX_RANK, BakedField, BakePlan, NeuralForm, interpolate_at
 from .choose import Field, Render, sample_strengths
 from .neural import NeuralField
 from .separable import fit_amplitude, fit_separable, moving_attributes, principal_modes
@@ -164,5 +164,5 @@ def _ranks(trajectory: Tensor, tolerance: float) -> dict[str, int]:
     ranks = {}
     for name, columns in moving_attributes(trajectory).items():
         fitted = fit_amplitude(trajectory[:, :, columns], torch.ones_like(trajectory[0, :, columns]))
-        ranks[name] = min(fitted.needed_rank(tolerance), MOST_RANK, principal_modes(fitted.gram).shape[1])
+        ranks[name] = min(fitted.needed_rank(tolerance), MAX_RANK, principal_modes(fitted.gram).shape[1])
     return ranks

@@ -61,8 +61,8 @@ BASIS_TYPES = (torch.int8, torch.float16, torch.float32)
 END_TYPES = (torch.int8, torch.int16, torch.float32)
 """How basis 0 may be stored, from the smallest."""
 
-MOST_KNOTS = 257
-MOST_RANK = 16
+MAX_KNOTS = 257
+MAX_RANK = 16
 """Of a network that is baked."""
 
 _NEAR = 1 / 80
@@ -118,11 +118,11 @@ class BakePlan:
     end_correction: Mapping[str, Tensor]
 
     def __post_init__(self) -> None:
-        if self.knots.ndim != 1 or not 2 <= len(self.knots) <= MOST_KNOTS:
-            raise ValueError(f"a bake at knots {list(self.knots.shape)}, expected 2 to {MOST_KNOTS}")
+        if self.knots.ndim != 1 or not 2 <= len(self.knots) <= MAX_KNOTS:
+            raise ValueError(f"a bake at knots {list(self.knots.shape)}, expected 2 to {MAX_KNOTS}")
         for name, rank in self.ranks.items():
-            if not 0 <= rank <= MOST_RANK:
-                raise ValueError(f"a bake of {name} with {rank} bases, expected 0 to {MOST_RANK}")
+            if not 0 <= rank <= MAX_RANK:
+                raise ValueError(f"a bake of {name} with {rank} bases, expected 0 to {MAX_RANK}")
         for name, share in self.end_correction.items():
             check_tensor(f"the end correction of {name}", share, self.knots.shape, torch.float32)
 
@@ -188,7 +188,7 @@ MONOMIALS = {1: 4, 2: 10, 3: 20}
 
 LATTICE = 0
 """In place of a degree: the map is given at the points of a cube of colors, as a .cube file has it."""
-MOST_SIDE = 129
+MAX_SIDE = 129
 """Points along an edge of a lattice; the largest that color programs write has 65."""
 
 
@@ -200,10 +200,10 @@ def lattice_colors(side: int) -> Tensor:
 
 
 def lattice_side(points: int) -> int:
-    """Points along an edge of a lattice of so many. Raises ValueError: no cube of 2 to `MOST_SIDE`."""
+    """Points along an edge of a lattice of so many. Raises ValueError: no cube of 2 to `MAX_SIDE`."""
     side: int = round(points ** (1 / 3))
-    if side**3 != points or not 2 <= side <= MOST_SIDE:
-        raise ValueError(f"a lattice of {points} colors, expected a cube of 2 to {MOST_SIDE}")
+    if side**3 != points or not 2 <= side <= MAX_SIDE:
+        raise ValueError(f"a lattice of {points} colors, expected a cube of 2 to {MAX_SIDE}")
     return side
 
 
@@ -240,8 +240,8 @@ class GradeForm:
         check_tensor("coefficients", self.coefficients, (knots, ranks), torch.float32)
         check_tensor("scale", self.scale, (ranks, channels), torch.float32)
         check_ascent("knots", self.knots)
-        if ranks > MOST_RANK or (self.degree == LATTICE and knots > 2):
-            raise ValueError(f"{ranks} bases at {knots} knots; the most are {MOST_RANK}, and 2 of a lattice")
+        if ranks > MAX_RANK or (self.degree == LATTICE and knots > 2):
+            raise ValueError(f"{ranks} bases at {knots} knots; the most are {MAX_RANK}, and 2 of a lattice")
         if channels not in (0, 3, 12, 27, 48):
             raise ValueError(f"residual has {channels} channels, expected whole bands")
         if self.mask is not None:

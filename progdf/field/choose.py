@@ -55,10 +55,10 @@ SAMPLES = 13
 Render = Callable[[Tensor], Tensor]
 """Offsets of the members -> the pixels that count, of some views side by side. [M,C] -> [P,3]"""
 
-MOST_PIXELS = 40_000
+MAX_PIXELS = 40_000
 """Pixels kept of each render; of more, evenly spread ones."""
 
-MOST_SNAPSHOTS = 40
+MAX_FITTED_SNAPSHOTS = 40
 """Snapshots that are rendered; between two of them changes are taken to go straight."""
 
 UNSEEN = 0.1
@@ -376,7 +376,7 @@ def render_trajectories(
     Args:
         offsets: [T,M,C] float32, the first row 0
         weights: how much an error of each number shows, ≥ 0. [M,C]
-        render: called (1 + A)·(T − 2) times at most, where T counts no more than `MOST_SNAPSHOTS`
+        render: called (1 + A)·(T − 2) times at most, where T counts no more than `MAX_FITTED_SNAPSHOTS`
         ends: as they are stored; the last row of the offsets becomes what they decode to
     """
     attributes = moving_attributes(offsets)
@@ -393,13 +393,13 @@ def render_trajectories(
     if not attributes or snapshots < 3:
         gram = torch.zeros(len(attributes), snapshots, len(attributes), snapshots, dtype=torch.float64)
         return RenderedTrajectories(trajectories, gram, 1, offsets.shape[2])
-    count = min(snapshots, MOST_SNAPSHOTS)
+    count = min(snapshots, MAX_FITTED_SNAPSHOTS)
     looked = [round(i * (snapshots - 1) / (count - 1)) for i in range(count)]  # even, both ends among them
     changes: list[list[Tensor]] = [[] for _ in attributes]
     with torch.no_grad():
         for t in looked[1:-1]:
             pixels = render(offsets[t])
-            stride = max(1, -(-len(pixels) // MOST_PIXELS))
+            stride = max(1, -(-len(pixels) // MAX_PIXELS))
             for i, (name, columns) in enumerate(attributes.items()):
                 straight = offsets[t].clone()
                 straight[:, columns] = trajectories[name].amplitude[t] * offsets[-1, :, columns]

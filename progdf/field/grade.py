@@ -24,7 +24,7 @@ from progdf.sh import C0, basis
 
 from .baked import (
     LATTICE,
-    MOST_RANK,
+    MAX_RANK,
     BakedField,
     GradeForm,
     Segment,
@@ -37,13 +37,13 @@ from .baked import (
 )
 from .separable import fit_course
 
-MOST_COLOR = 1.5
+MAX_COLOR = 1.5
 """Colors above this, which no screen shows, are mapped as this."""
 
 _FIRST_BAND = BASE_CHANNELS - 3  # column of a packed row, see `attribute_slices`; the others follow
 _DIRECTIONS = 32  # in which a member's color is mapped; twice the functions of three bands
 _CHUNK = 1 << 11  # members at once
-MOST_RESIDUALS = MOST_RANK // 2
+MAX_RESIDUALS = MAX_RANK // 2
 """Bases of a residual that are tried, each in up to two."""
 COARSER = tuple(2.0 ** (i / 8) for i in range(-8, 25))
 """Steps of a residual's levels that are tried; with 1 nearly all members take 8 bits."""
@@ -103,11 +103,11 @@ def map_colors(sh: Tensor, table: Tensor, degree: int) -> Tensor:
 
 
 def map_drawn(colors: Tensor, table: Tensor, degree: int) -> Tensor:
-    """What the map makes of colors; of a polynomial, what is above `MOST_COLOR` stays. [3,...] -> [3,...]"""
+    """What the map makes of colors; of a polynomial, what is above `MAX_COLOR` stays. [3,...] -> [3,...]"""
     if degree == LATTICE:
         return look_up(colors.clamp(0.0, 1.0), table)
-    terms = monomials(colors.clamp(0.0, MOST_COLOR), degree).flatten(1)
-    return (table.T @ terms).reshape(colors.shape) + (colors - MOST_COLOR).clamp_min(0.0)
+    terms = monomials(colors.clamp(0.0, MAX_COLOR), degree).flatten(1)
+    return (table.T @ terms).reshape(colors.shape) + (colors - MAX_COLOR).clamp_min(0.0)
 
 
 def look_up(colors: Tensor, table: Tensor) -> Tensor:
@@ -297,4 +297,4 @@ def fit_grade(
 
 def rank_limit(course: Tensor) -> int:
     """The most bases that say anything of a residual's course. [S,M,3b]"""
-    return min(len(course) - 1, MOST_RESIDUALS) if bool(course.any()) else 0
+    return min(len(course) - 1, MAX_RESIDUALS) if bool(course.any()) else 0

@@ -234,7 +234,7 @@ def _fit_attribute(offsets: Tensor, weights: Tensor, rank: int, basis_type: torc
 
 
 _COURSE_TOLERANCE = 0.003  # root mean square that factoring may cost, as a share of the course's own
-_MOST_COURSE_RANK = 8
+_MAX_COURSE_RANK = 8
 _OPACITY_KNOTS = (0.0, 0.002, 0.005, 0.01, 0.02, 0.04, 0.07, 0.11, 0.17, 0.25, 0.35)
 """Where a logit bends most when an opacity rises from nothing; mirrored for one that falls to it."""
 
@@ -265,7 +265,7 @@ def fit_course(offsets: Tensor, stored: tuple[Tensor, Tensor] | None = None) -> 
     `stored`: what its last row was decoded from, see `quantize_bases`.
     """
     fitted = fit_amplitude(offsets, torch.ones_like(offsets[0]), stored)
-    rank = min(fitted.needed_rank(_COURSE_TOLERANCE), _MOST_COURSE_RANK)
+    rank = min(fitted.needed_rank(_COURSE_TOLERANCE), _MAX_COURSE_RANK)
     return store_attribute(fitted, principal_modes(fitted.gram)[:, :rank])
 
 

@@ -68,7 +68,7 @@ _FOREIGN = (
 _MAX_SAFETENSORS_HEADER = 100_000_000  # bytes, the limit of the format
 _HTML = (b"<!doctype", b"<html", b"<head", b"<body", b"<!--")
 _TEXT = frozenset(b"\t\n\r\f" + bytes(range(32, 127)))
-_LEAST_TEXT = 4  # a shorter file is called by no kind
+_MIN_TEXT = 4  # a shorter file is called by no kind
 _SCENE_MAGIC = (b"ply", b"glTF", b"NGSP")
 
 
@@ -111,7 +111,7 @@ def _foreign_kind(start: bytes) -> str:
         return f"is a web page, not a scene; {_DOWNLOAD}"
     if text.startswith(b"<?xml"):
         return f"is XML, not a scene; {_DOWNLOAD}"
-    if len(text) < _LEAST_TEXT or text.startswith(_SCENE_MAGIC) or not _TEXT.issuperset(text):
+    if len(text) < _MIN_TEXT or text.startswith(_SCENE_MAGIC) or not _TEXT.issuperset(text):
         return ""
     if text[:1] in (b"{", b"["):
         if b'"lodLevels"' in text:

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from progdf.errors import ProgdfError
-from progdf.field.baked import MOST_SIDE, lattice_colors, lattice_side
+from progdf.field.baked import MAX_SIDE, lattice_colors, lattice_side
 from progdf.field.grade import look_up
 from progdf.io.atomic import read_file, write_file
 from progdf.io.file_rules import check_fields
@@ -30,7 +30,7 @@ SUFFIX = ".cube"
 SIDE = 33
 """Points along an edge of what is written; all color programs read it."""
 
-_LARGEST = 80 << 20  # bytes; `MOST_SIDE`³ rows of usual length take 60 MB
+_LARGEST = 80 << 20  # bytes; `MAX_SIDE`³ rows of usual length take 60 MB
 _FARTHEST = 100.0  # a color beyond is none
 _KEYWORDS = {"LUT_3D_SIZE": 1, "DOMAIN_MIN": 3, "DOMAIN_MAX": 3, "LUT_3D_INPUT_RANGE": 2}
 """How many numbers each is followed by."""
@@ -63,8 +63,8 @@ def read_cube(path: str | os.PathLike[str]) -> Tensor:
     if "LUT_3D_SIZE" not in said:
         raise ProgdfError(f"{name} is not a .cube file of a 3D table: it has no LUT_3D_SIZE before its rows")
     (size,) = said["LUT_3D_SIZE"]
-    if not (2 <= size <= MOST_SIDE and size == int(size)):
-        raise ProgdfError(f"{name} says LUT_3D_SIZE {size:g}; a size of 2 to {MOST_SIDE} can be read")
+    if not (2 <= size <= MAX_SIDE and size == int(size)):
+        raise ProgdfError(f"{name} says LUT_3D_SIZE {size:g}; a size of 2 to {MAX_SIDE} can be read")
     count = int(size) ** 3
     try:
         numbers = np.loadtxt(io.StringIO(rows or "0 0 0"), ndmin=2)

@@ -37,7 +37,7 @@ _RENDERING = {
 _MAX_HEADER_BYTES = 1 << 20
 """A header that has not ended by then is no header."""
 
-_MOST_LISTS = 200_000
+_MAX_LISTS = 200_000
 """Values of list rows before the vertices, which plyfile reads one by one in about two seconds."""
 
 _LONGEST_COMMENT = 200  # characters that are kept
@@ -101,7 +101,7 @@ class PlyFile:
         if lists and is_needed:
             feature = f"a list among its {name} properties"
             raise unsupported_error(self.path, feature, "export it as a plain 3DGS .ply")
-        if lists and self.counts[name] * len(element.properties) > _MOST_LISTS:
+        if lists and self.counts[name] * len(element.properties) > _MAX_LISTS:
             raise ProgdfError(
                 f"{self.path} has {self.counts[name]} rows of lists, '{name}', before its vertices; "
                 "export it with the vertices first"

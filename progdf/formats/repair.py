@@ -32,7 +32,7 @@ OPAQUE_LOGIT = 15.0
 INVISIBLE_LOGIT = -30.0
 """In place of −inf: opacity 1e-13, far under the 1/255 that every rasterizer skips."""
 
-LEAST_QUAT = 1e-6
+MIN_QUAT = 1e-6
 _SAMPLE = 10_000
 """Rows that the origin is found from, an even sample: its median is off by 1 % of the extent."""
 
@@ -144,7 +144,7 @@ def _replace_unusable(scene: Gaussians) -> tuple[Gaussians, dict[str, int]]:
         return replace(scene, quats=quats), counts
 
     flat = scene.log_scales == -torch.inf
-    zero_quats = scene.quats.abs().amax(dim=1) < LEAST_QUAT
+    zero_quats = scene.quats.abs().amax(dim=1) < MIN_QUAT
     opaque = scene.logit_opacities == torch.inf
     transparent = scene.logit_opacities == -torch.inf
     bad = {
@@ -188,7 +188,7 @@ def _unit(quats: Tensor) -> tuple[Tensor, Tensor]:
     """Quaternions of unit length, and the length each was divided by: exactly 1 if left alone. [N]"""
     lengths = quats.norm(dim=1)
     lengths = torch.where((lengths - 1).abs() <= UNIT_TOLERANCE, 1.0, lengths)
-    ordinary = (lengths > LEAST_QUAT) & lengths.isfinite()
+    ordinary = (lengths > MIN_QUAT) & lengths.isfinite()
     unit = quats / lengths[:, None]
     if not bool(ordinary.all()):
         unit[~ordinary] = normalize_quats(quats[~ordinary])
@@ -200,7 +200,7 @@ def _is_clean(scene: Gaussians, lengths: Tensor) -> bool:
     return (
         _within(scene.means, -LARGEST_MEAN, LARGEST_MEAN)
         and _within(scene.log_scales, -torch.inf, LARGEST_LOG_SCALE)
-        and bool((lengths > LEAST_QUAT).all() and lengths.isfinite().all())
+        and bool((lengths > MIN_QUAT).all() and lengths.isfinite().all())
         and all(_within(t, -torch.inf, torch.inf) for t in (scene.logit_opacities, scene.sh0, scene.shN))
     )
 

@@ -62,7 +62,7 @@ FORMATS = ("ply", "spz", "splat", "ksplat", "sog", "glb", "gltf", "ckpt", *CONTA
 WRITTEN = (".ply", ".compressed.ply", ".spz", ".sog", ".splat", ".glb", usd.SUFFIX)
 """Formats that `save_scene` writes, by the ending of the name."""
 
-MOST_FRAMES = 1000
+MAX_FRAMES = 1000
 """Largest number of scenes for `save_frames`, which numbers files with three digits."""
 
 SPZ_BITS = 12

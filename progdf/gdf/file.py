@@ -262,7 +262,7 @@ def read_gdf(path: str | os.PathLike[str]) -> Gdf:
 def _unpack(head: header.GdfHeader, tensors: Mapping[str, Tensor]) -> Gdf:
     if broken := _infinite(tensors):
         raise ValueError(f"{broken} has a number that is not finite")
-    if not 0 <= head.scene.count <= header.MOST_GAUSSIANS or head.members > head.scene.count:
+    if not 0 <= head.scene.count <= header.MAX_GAUSSIANS or head.members > head.scene.count:
         raise ValueError(f"{head.members} members of a scene of {head.scene.count} Gaussians")
     field = header.unpack_field(head.field, tensors, head.members)
     _check_reach(field)

@@ -38,10 +38,10 @@ from progdf.region import Region
 FORMAT = 7
 """The version of the file format."""
 
-MOST_GAUSSIANS = 1 << 26
+MAX_GAUSSIANS = 1 << 26
 """A header that claims a larger scene is not believed: the score would take gigabytes."""
 
-_MOST_HEADER = 1 << 24  # bytes; a report takes a few kB, and JSON of 100 MB could become a gigabyte
+_MAX_HEADER = 1 << 24  # bytes; a report takes a few kB, and JSON of 100 MB could become a gigabyte
 _METADATA = "progdf"  # the one key: the library writes several in an order that differs from run to run
 _PARTS = ("end_offset", "residual_basis", "scale", "coefficients")  # of `AttributeBases`
 _GRADE = ("knots", "table", "residual", "scale", "coefficients")  # of `GradeForm`
@@ -111,7 +111,7 @@ def unpack_file(content: bytes, name: str) -> tuple[GdfHeader, dict[str, Tensor]
         ProgdfError: it is no .gdf, from a newer version, truncated, damaged or inconsistent.
     """
     size = int.from_bytes(content[:8], "little")
-    if not 2 <= size <= _MOST_HEADER or content[8:9] != b"{":
+    if not 2 <= size <= _MAX_HEADER or content[8:9] != b"{":
         raise ProgdfError(f"{name} is not a .gdf file; give one that progdf train or progdf fit has written")
     try:
         tensors: dict[str, Tensor] = safetensors.torch.load(content)

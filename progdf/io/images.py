@@ -28,7 +28,7 @@ _Font = ImageFont.FreeTypeFont | ImageFont.ImageFont
 FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "GIF")
 """Pictures that are read; others of Pillow's many formats are programs, or need one."""
 
-MOST_PIXELS = 1 << 26
+MAX_PIXELS = 1 << 26
 """67 million, more than cameras have: a picture of a few kilobytes can claim billions."""
 
 
@@ -58,7 +58,7 @@ def open_picture(
     calibrated: bool = False,
     two_values: bool = False,
 ) -> Image.Image:
-    """A picture from a file, upright, in any mode of 8 bits a channel, any size up to `MOST_PIXELS`.
+    """A picture from a file, upright, in any mode of 8 bits a channel, any size up to `MAX_PIXELS`.
 
     Args:
         path: the file
@@ -195,7 +195,7 @@ def _open(path: str | os.PathLike[str]) -> Iterator[Image.Image]:
             warnings.simplefilter("ignore", UserWarning)
             with Image.open(path, formats=FORMATS) as opened:
                 width, height = opened.size
-                if width * height > MOST_PIXELS:
+                if width * height > MAX_PIXELS:
                     raise ProgdfError(f"{path} has {width}x{height} pixels, too many; scale it down")
                 yield opened
     except ProgdfError:

@@ -18,7 +18,7 @@ from .atomic import read_file
 DEEPEST = 64
 """Lists and tables in one another that a file may have: what walks through them never runs out of stack."""
 
-_MOST_BYTES = 1 << 20  # of the files that programs keep for themselves
+_MAX_BYTES = 1 << 20  # of the files that programs keep for themselves
 _LONGEST_INT = 18  # digits; what is longer is a float, as in most languages
 
 _T = TypeVar("_T")
@@ -70,9 +70,9 @@ def read_json(path: Path, kind: type[_T]) -> _T:
     Raises:
         ProgdfError: it is missing, no file, damaged or larger than any of them; one line.
     """
-    content = read_file(path, _MOST_BYTES + 1)
+    content = read_file(path, _MAX_BYTES + 1)
     try:
-        if len(content) > _MOST_BYTES:
+        if len(content) > _MAX_BYTES:
             raise ValueError("it is too large")
         return convert_json(decode_json(content), kind)
     except ValueError as error:

@@ -30,7 +30,7 @@ METADATA = "progdf"
 """The one key of a file's metadata."""
 
 _CHECKSUM = "crc32"
-_MOST_LEVELS = 1 << 30  # that a file of a megabyte could ask memory for
+_MAX_LEVELS = 1 << 30  # that a file of a megabyte could ask memory for
 _TYPES = {
     torch.float64: "F64",
     torch.int64: "I64",
@@ -140,8 +140,8 @@ def deflate(levels: Tensor) -> Tensor:
 
 def check_levels(shape: Sequence[int]) -> int:
     """How many levels these are. Raises ValueError where a small file asks for memory without bounds."""
-    if (size := math.prod(shape)) > _MOST_LEVELS:
-        raise ValueError(f"{list(shape)} packed levels, more than {_MOST_LEVELS}")
+    if (size := math.prod(shape)) > _MAX_LEVELS:
+        raise ValueError(f"{list(shape)} packed levels, more than {_MAX_LEVELS}")
     return size
 
 

@@ -53,7 +53,7 @@ ENGINES = {
 }
 """Engine name -> module that is a `RasterEngine`, imported when first used."""
 
-MOST_INTERSECTIONS = 100_000_000
+MAX_INTERSECTIONS = 100_000_000
 """(Gaussian, tile) pairs beyond which a view is refused: 1.2 GB forward, 3.6 GB more backward."""
 
 _DRAWN_SH = 16  # coefficients that a picture shows; one that is not finite hides its Gaussian
@@ -288,14 +288,14 @@ def color_map(
 
 
 def check_intersections(splats: int, pairs: int) -> None:
-    """Refuse a view of more than `MOST_INTERSECTIONS` (Gaussian, tile) pairs.
+    """Refuse a view of more than `MAX_INTERSECTIONS` (Gaussian, tile) pairs.
 
     Raises:
         ProgdfError: it has more.
     """
-    if pairs > MOST_INTERSECTIONS:
+    if pairs > MAX_INTERSECTIONS:
         raise ProgdfError(
-            f"{splats} Gaussians meet {pairs} tiles of the image, more than {MOST_INTERSECTIONS}; draw a "
+            f"{splats} Gaussians meet {pairs} tiles of the image, more than {MAX_INTERSECTIONS}; draw a "
             "smaller image or a crop, or take giant Gaussians out of the scene"
         )
 

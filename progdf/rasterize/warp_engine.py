@@ -46,8 +46,8 @@ TILE = 16
 """Pixels of a tile's side."""
 
 PIXELS = wp.constant(TILE * TILE)
-MOST = wp.constant(ALPHA_MAX)
-LEAST = wp.constant(TRANSMITTANCE_MIN)
+ALPHA_LIMIT = wp.constant(ALPHA_MAX)
+TRANSMITTANCE_LIMIT = wp.constant(TRANSMITTANCE_MIN)
 
 SUMS = 9
 """Numbers of one intersection: gradient of the color (3); with g = alpha · dL/dalpha: Σg, Σg·u, Σg·v, Σg·u²,
@@ -131,10 +131,10 @@ def blend_kernel(
     for index in range(starts[tile], starts[tile + 1]):
         s = members[index]
         color = colors[s]
-        alpha = wp.min(alpha_at(pixel, boxes[s], shapes[s], color[3])[0], MOST)
+        alpha = wp.min(alpha_at(pixel, boxes[s], shapes[s], color[3])[0], ALPHA_LIMIT)
         if alpha > 0.0:
             after = through * (1.0 - alpha)
-            if after <= LEAST:
+            if after <= TRANSMITTANCE_LIMIT:
                 break
             rgb += (alpha * through) * wp.vec3(color[0], color[1], color[2])
             through = after
@@ -176,13 +176,13 @@ def blend_backward_kernel(
             color = colors[s]
             seen = alpha_at(pixel, boxes[s], shapes[s], color[3])
             if seen[0] > 0.0:
-                alpha = wp.min(seen[0], MOST)
+                alpha = wp.min(seen[0], ALPHA_LIMIT)
                 inverse = 1.0 / (1.0 - alpha)
                 front = color[0] * g[0] + color[1] * g[1] + color[2] * g[2]
                 through *= inverse
                 weight = alpha * through
                 by_alpha = alpha * (through * front - behind * inverse)
-                if seen[0] > MOST:
+                if seen[0] > ALPHA_LIMIT:
                     by_alpha = float(0.0)
                 behind += weight * front
                 first = wp.vec3(1.0, seen[1], seen[2])
@@ -216,7 +216,7 @@ def add_weights_kernel(
         s = members[index]
         row = wp.vec4(0.0)
         if index <= final:
-            alpha = wp.min(alpha_at(pixel, boxes[s], shapes[s], colors[s][3])[0], MOST)
+            alpha = wp.min(alpha_at(pixel, boxes[s], shapes[s], colors[s][3])[0], ALPHA_LIMIT)
             if alpha > 0.0:
                 weight = alpha * through
                 through *= 1.0 - alpha

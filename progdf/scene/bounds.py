@@ -19,7 +19,7 @@ _LONG_TAIL = 5.0
 _CEILING_COVER = 0.8
 _DENSER = 2.0
 """Times as many Gaussians as under it has a ceiling: five where a room's walls go on below, one in a head."""
-_LEAST_CELLS = 16
+_MIN_CELLS = 16
 _ENOUGH = 64
 """Fewer Gaussians tell nothing about the shape of a scene."""
 
@@ -97,7 +97,7 @@ def has_ceiling(scene: Gaussians, up: Tensor) -> bool:
     # thin and dense, as the top of a head is not
     dense = int(top.sum()) >= _DENSER * int(next_to_top.sum())
     ceiling = len(torch.unique(cells[top]))
-    return dense and covered >= _LEAST_CELLS and ceiling >= _CEILING_COVER * covered
+    return dense and covered >= _MIN_CELLS and ceiling >= _CEILING_COVER * covered
 
 
 def plan_cells(scene: Gaussians, up: Tensor, per_side: int = 8) -> Tensor:

@@ -56,7 +56,7 @@ TOLERANCE = 0.08
 """How far colors may be from the one that is named where the spec does not say. A click on a black jacket
 takes the leather, and at .1 the hair too."""
 
-MOST_TIMES = 100
+MAX_TIMES = 100
 
 LARGEST = 1e18
 """Of numbers in a region, on either side of 0: the squares of a few of them still are float32."""
@@ -107,10 +107,10 @@ def read_step(text: str) -> Callable[[Neighborhood, Mask], Mask]:
     count = int(times) if re.fullmatch(r"[0-9]{1,9}", times) else 1 if not times else 0
     if name == "refine" and 1 <= count <= 100:
         return lambda neighborhood, mask: neighborhood.refine(mask, count if times else RIM_PERCENT)
-    if name not in STEPS or not 1 <= count <= (1 if name == "largest" else MOST_TIMES):
+    if name not in STEPS or not 1 <= count <= (1 if name == "largest" else MAX_TIMES):
         raise ProgdfError(
             f"'{shorten(text)}' is no step of a region; write grow, shrink or smooth:TIMES, "
-            f"at most {MOST_TIMES}, refine:PERCENT, or largest"
+            f"at most {MAX_TIMES}, refine:PERCENT, or largest"
         )
 
     def step(neighborhood: Neighborhood, mask: Mask) -> Mask:

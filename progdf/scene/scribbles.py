@@ -33,7 +33,7 @@ _SMALLEST = 500  # rows that are solved at once
 _SHRINKS = 0.7  # a level that has more of its finer one is none
 _DAMPED = 0.7  # Jacobi
 _OVER = 1.6  # what a coarse correction is too small by (Braess, 1995)
-_MOST_STEPS = 200
+_MAX_STEPS = 200
 
 
 class Scribbles:
@@ -139,7 +139,7 @@ class _Multigrid:
         residual: Floats = target - self._apply(level, x)
         direction = np.zeros_like(x)
         before = np.inf
-        for _ in range(_MOST_STEPS):
+        for _ in range(_MAX_STEPS):
             if float(np.linalg.norm(residual / spread)) <= least:
                 break
             correction = self._cycle(level, residual)

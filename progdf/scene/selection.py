@@ -34,7 +34,7 @@ _COARSE = 4  # the front surface is looked up in a picture so many times smaller
 _BEHIND = 0.01
 _OWN = 3.0
 _COVERED = 0.05  # less than this in all counts as background
-_MOST_CELLS = 1024  # a side, of the grid into which a polygon is filled
+_MAX_CELLS = 1024  # a side, of the grid into which a polygon is filled
 
 
 class Centers(NamedTuple):
@@ -96,7 +96,7 @@ def inside_polygon(points: Floats, corners: ArrayLike) -> Mask:
     low = outline.min(0)
     high = outline.max(0)
     near = np.flatnonzero(inside_rectangle(points, low, high))
-    cell = max(float((high - low).max()) / _MOST_CELLS, 1e-12)
+    cell = max(float((high - low).max()) / _MAX_CELLS, 1e-12)
     filled = _fill((outline - low) / cell + 2.0)
     column, row = (
         (points[near, axis] * np.float32(1.0 / cell) + np.float32(2.0 - low[axis] / cell)).astype(np.int32)

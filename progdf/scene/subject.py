@@ -49,7 +49,7 @@ _RICHER = 1.5
 front where another side shows half as much again."""
 
 _ACROSS = 32
-_LEAST = 0.06
+_MINIMUM = 0.06
 """Of the cells of the largest thing: what fills fewer is a tuft or a stray. The toy robot's hands fill .11 of
 its body's, the largest tuft of its ground .03."""
 
@@ -312,7 +312,7 @@ def _rows_of_large_things(places: Tensor) -> Tensor:
     boxes, box = torch.unique((keys[:, 0] * span + keys[:, 1]) * span + keys[:, 2], return_inverse=True)
     thing = _connected_cells(boxes, span)
     size = torch.zeros(len(boxes)).index_add(0, thing, torch.ones(len(boxes)))
-    return (size[thing] >= _LEAST * size.max())[box]
+    return (size[thing] >= _MINIMUM * size.max())[box]
 
 
 def _connected_cells(boxes: Tensor, span: int) -> Tensor:

@@ -155,7 +155,7 @@ def test_a_moving_picture_is_compared_as_the_screen_stretches_it(monkeypatch: py
 def test_slow_frames_are_repeated_as_often_as_there_is_time_for() -> None:
     assert bench_frames.affordable_steps(20, 0.05) == 20
     assert bench_frames.affordable_steps(20, bench_frames.TURN_S / 7.5) == 7
-    assert bench_frames.affordable_steps(20, 1e4) == bench_frames.LEAST
+    assert bench_frames.affordable_steps(20, 1e4) == bench_frames.MIN_STEPS
     assert bench_frames.affordable_steps(2, 1e4) == 2
 
 
@@ -170,7 +170,7 @@ def test_slow_turns_end_early_and_still_have_their_pictures(
     turnings = bench_frames.measure_turning(ctx, path, steps=20, size=SIZE)
     ctx.release()
     for turning in turnings:
-        assert len(turning.frames_ms) == len(turning.coarse_ms) == bench_frames.LEAST
+        assert len(turning.frames_ms) == len(turning.coarse_ms) == bench_frames.MIN_STEPS
         assert turning.checked >= 1
 
 

@@ -21,13 +21,13 @@ from progdf.errors import ProgdfError
 from progdf.io.atomic import read_file
 from progdf.io.json_values import convert_json, plain
 from progdf.terminal import group_digits
-from trainer.options import MOST_STAGES, PRESETS, VIEWS, TrainOptions, apply_preset, flat_values, with_values
+from trainer.options import MAX_STAGES, PRESETS, VIEWS, TrainOptions, apply_preset, flat_values, with_values
 from trainer.resolve import BLANK, check_name, resolve
 
 THREADS = 1
 """Threads of a run where the catalogue gives none: several jobs use the cores better than several threads."""
 
-_MOST_BYTES = 1 << 24  # of a catalogue
+_MAX_BYTES = 1 << 24  # of a catalogue
 MAX_JOBS = 100_000
 _LIST_OF = {"scenes": "[[scenes]]", "edits": "[[scenes.edits]]"}
 _NO_OPTION = ("out", "resume", "scene", "name")  # a catalogue has other ways to say these
@@ -66,8 +66,8 @@ def read_catalogue(path: Path, out: Path) -> tuple[list[BatchJob], list[str]]:
         ProgdfError: the file cannot be read, or is no TOML.
     """
     try:
-        content = read_file(path, _MOST_BYTES + 1)
-        if len(content) > _MOST_BYTES:
+        content = read_file(path, _MAX_BYTES + 1)
+        if len(content) > _MAX_BYTES:
             raise ProgdfError(f"{path} is larger than any catalogue")
         table = tomllib.loads(content.decode())
     except (ValueError, RecursionError) as error:
@@ -212,7 +212,7 @@ def estimate_cost(options: TrainOptions, gaussians: int, members: int) -> Cost:
     options = resolve(options)
     views = options.views.views or VIEWS
     side = options.views.image_size or 256
-    strengths = options.optimize.stages or MOST_STAGES
+    strengths = options.optimize.stages or MAX_STAGES
     pixels = views * side * side
     return Cost(
         seconds=3 + 1.3e-6 * pixels * strengths + 1.7e-4 * members,

@@ -40,7 +40,7 @@ _LINES = 12  # of running jobs on a terminal
 _EVENT_S = 2.0  # between two progress events
 _SPARK_WIDTH = 96
 _SPARK_HEIGHT = 28
-_MOST_EMBEDDED = 1000  # pictures in the page itself, some 15 kB each; beyond, it shows those of its folder
+_MAX_EMBEDDED = 1000  # pictures in the page itself, some 15 kB each; beyond, it shows those of its folder
 
 
 @dataclass(frozen=True)
@@ -220,7 +220,7 @@ def write_page(out: Path, rows: Sequence[JobRow], jobs: Sequence[BatchJob]) -> N
     done = sum(row.status == "done" for row in rows)
     failed = sum(row.status == "failed" for row in rows)
     summary = f"{done} of {len(rows)} done" + (f", {failed} failed" if failed else "")
-    embed = len(rows) <= _MOST_EMBEDDED
+    embed = len(rows) <= _MAX_EMBEDDED
     by_key = {job.key: job for job in jobs}
     body = "\n".join(_html_row(row, by_key.get(row.job), embed) for row in rows)
     page = Path(__file__).with_name("page.html").read_text(encoding="utf-8")

@@ -38,7 +38,7 @@ from .worker import Finding, Lost, inspect_scene, run_job
 
 _log = logging.getLogger(__name__)
 
-MOST_ATTEMPTS = 4
+MAX_ATTEMPTS = 4
 """How often a job is begun whose worker, node or machine was lost."""
 
 _PACE = 40.0  # times what writing a table took pass before it is written again
@@ -258,7 +258,7 @@ def run_tasks(
             task = running.pop(future)
             result = _result(future)
             lost = isinstance(result, Lost) and not (task.alone and result.from_memory)
-            if lost and task.attempt < MOST_ATTEMPTS:
+            if lost and task.attempt < MAX_ATTEMPTS:
                 tell("retry", task, result.reason)
                 # who dies a second time may have been ended by the system for its memory
                 alone = result.from_memory or task.attempt > 1

@@ -26,7 +26,7 @@ from trainer.store.pretrained import BROKEN, folder_of_model, gpu_memory, model_
 from .mixed_steps import MixedSteps, euler_scheduler
 
 _MULTIPLE = 32  # pixels: what every pipeline's autoencoder and patches divide
-_LEAST = 64  # its least side
+_MINIMUM = 64  # its least side
 _LARGE = 2e9  # parameters from which painting on a CPU takes days
 # bytes beside the weights: FLUX.1-dev takes 36.2 GB at 1024² with its 31.4, klein 20 with its 16
 _WORKING = 1e9
@@ -65,8 +65,8 @@ class Adapter:
         ratio = width / height
         for _ in range(4):
             wide = (size * size * ratio) ** 0.5
-            sides = [max(_LEAST, round(side / _MULTIPLE) * _MULTIPLE) for side in (wide, wide / ratio)]
-            while not self.is_fixed and sides[0] * sides[1] > size * size and max(sides) > _LEAST:
+            sides = [max(_MINIMUM, round(side / _MULTIPLE) * _MULTIPLE) for side in (wide, wide / ratio)]
+            while not self.is_fixed and sides[0] * sides[1] > size * size and max(sides) > _MINIMUM:
                 sides[sides.index(max(sides))] -= _MULTIPLE
             ratio = sides[0] / sides[1]
         return sides[0], sides[1]
@@ -362,7 +362,7 @@ def load_pipeline(request: PipelineRequest, placement: DevicePlan) -> MixedSteps
         if adapter.encodes_alone:
             if placement.device != "cpu":  # the encoder is on the card for the sentence alone
                 pipeline.enable_model_cpu_offload(device=placement.device)
-            mixed.encode(request.ask([torch.ones(_LEAST, _LEAST, 3)], request.seed))
+            mixed.encode(request.ask([torch.ones(_MINIMUM, _MINIMUM, 3)], request.seed))
             pipeline.remove_all_hooks()
             for name in [name for name in pipeline.components if name.startswith("text_encoder")]:
                 setattr(pipeline, name, None)

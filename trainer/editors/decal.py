@@ -19,12 +19,12 @@ from progdf.io.images import open_picture
 from progdf.rasterize.engines import render_depth
 from progdf.scene.regions import read_numbers
 from trainer.options import EditKind, EditorOptions
-from trainer.paint.discs import LEAST_ALPHA, OPAQUE, PaintedView, lay_on, project_paint, sample_image
+from trainer.paint.discs import MIN_ALPHA, OPAQUE, PaintedView, lay_on, project_paint, sample_image
 from trainer.views.view import BACKGROUND, View, make_view, with_near_plane
 
 from .base import EditorInput
 
-_MOST_SIDE = 512  # pixels of a decal's longer side: of a larger one the view is shrunk
+_MAX_DECAL_SIDE_PX = 512  # pixels of a decal's longer side: of a larger one the view is shrunk
 
 
 @dataclass(frozen=True)
@@ -148,16 +148,16 @@ def decal(given: EditorInput) -> DecalEditor:
     options = given.options
     camera = decal_camera(options.camera, scene.origin)
     place = parse_place(options.at, camera)
-    if (shrunk := _MOST_SIDE / place.size) < 1.0:
+    if (shrunk := _MAX_DECAL_SIDE_PX / place.size) < 1.0:
         size = max(1, round(camera.width * shrunk)), max(1, round(camera.height * shrunk))
         camera = camera.resize(*size)
-        place = replace(place, x=place.x * shrunk, y=place.y * shrunk, size=_MOST_SIDE)
+        place = replace(place, x=place.x * shrunk, y=place.y * shrunk, size=_MAX_DECAL_SIDE_PX)
     (camera,) = with_near_plane([camera], scene)
     view = make_view(scene, region, camera, torch.tensor(BACKGROUND))
     drawn = draw_decal(Path(given.what).expanduser(), place, camera)
     alpha = render_depth(scene, camera).alpha
     drawn = drawn * ((alpha > OPAQUE) & (view.mask > 0.5 * alpha))[..., None]
-    if not bool((drawn[..., 3] > LEAST_ALPHA).any()):
+    if not bool((drawn[..., 3] > MIN_ALPHA).any()):
         raise ProgdfError(
             f"{given.what} does not lie on the region '{region.name}': nothing opaque of it is seen there; "
             "give another place with --at"

@@ -36,10 +36,10 @@ from trainer.views.view import BACKGROUND, View, seen_colors, shrink_image
 
 from .base import EditorInput
 
-MOST_PICTURES = 32
+MAX_PICTURES = 32
 """More are a folder of views: what a handful needs would take long."""
 
-_LEAST_STRENGTHS = 8  # where several are given, those between them counted
+_MIN_STRENGTHS = 8  # where several are given, those between them counted
 STEP = 1 / 255
 """What 8 bits, rounded on another machine, may differ by."""
 
@@ -95,7 +95,7 @@ def pictures(given: EditorInput) -> PicturesEditor:
         first, last = (torch.cat([some[s] for some in images.values()]) for s in (before, after))
         weights = (last - first).norm(dim=2)
         bends[after] = bend_of(typical_color(first, weights), typical_color(last, weights))
-    parts = -(-_LEAST_STRENGTHS // len(stages))
+    parts = -(-_MIN_STRENGTHS // len(stages))
     between = [a + (b - a) * (k + 1) / parts for a, b in ways for k in range(parts - 1)]
     return PicturesEditor(images, bends, tuple(sorted({*between, *stages})) if len(stages) > 1 else ())
 
@@ -125,9 +125,9 @@ def picture_paths(what: str) -> tuple[Path, ...]:
     for stem in stems:
         if stems.count(stem) > 1:
             raise ProgdfError(f"two pictures are named {stem}; name them differently")
-    if len(paths) > MOST_PICTURES:
+    if len(paths) > MAX_PICTURES:
         raise ProgdfError(
-            f"pictures: takes at most {MOST_PICTURES} pictures, not {len(paths)}; "
+            f"pictures: takes at most {MAX_PICTURES} pictures, not {len(paths)}; "
             "give more as folder:DIR, of views that --cameras has"
         )
     return paths

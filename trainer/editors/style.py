@@ -32,7 +32,7 @@ CALM = (14, 23, 20, 7, 12, 0)
 _WHOLE = frozenset((7, 23))  # dark ones with a bright rim around what they paint: it would fall into the box
 
 _DETAIL = 9  # pixels: what varies within them is texture
-_LEAST = 32  # the network's least side
+_MINIMUM = 32  # the network's least side
 
 
 @dataclass(frozen=True)
@@ -126,8 +126,8 @@ def style(given: EditorInput) -> StyleEditor:
 
 def _paint_size(size: tuple[int, int], longer: int) -> tuple[int, int]:
     """Width and height at which to paint: `longer` for the longer side, 32 at least for the shorter."""
-    scale = max(longer / max(size), _LEAST / min(size))
-    return max(_LEAST, round(size[0] * scale)), max(_LEAST, round(size[1] * scale))
+    scale = max(longer / max(size), _MINIMUM / min(size))
+    return max(_MINIMUM, round(size[0] * scale)), max(_MINIMUM, round(size[1] * scale))
 
 
 def smooth(image: Tensor) -> Tensor:

@@ -31,7 +31,7 @@ EDITOR = "the editor"
 UNEDITED = "unedited"
 """Whose pictures are warped: the finished edit's, the editor's own, the original's, which is the floor."""
 
-_LEAST_SHARED = 0.1  # of a view's counted pixels that another must see, or the two are not compared
+_MIN_SHARED = 0.1  # of a view's counted pixels that another must see, or the two are not compared
 _SHOWS = 0.05  # a pixel shows the region where the members' weight is above this
 
 
@@ -90,7 +90,7 @@ def view_consistency(opened: OpenedRun, perceptual: Perceptual) -> Consistency:
                 continue
             pair = _warp(views, opened.evaluator, pictures_by_side, seen, source, target)
             best = pair if best is None or pair.shared > best.shared else best
-        if best is not None and best.shared >= _LEAST_SHARED:
+        if best is not None and best.shared >= _MIN_SHARED:
             pairs.append(best)
     lpips = {}
     decibels = {}

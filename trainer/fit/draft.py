@@ -22,7 +22,7 @@ from progdf.region import Region
 from trainer.editors import COLOR_FUNCTIONS, make_editor
 from trainer.editors.procedural import edit_course
 from trainer.optimize.color_views import MORE_PAYS, ColorView, MapFit, fit_maps
-from trainer.options import MOST_STAGES, EditorOptions, TrainingViewOptions
+from trainer.options import MAX_STAGES, EditorOptions, TrainingViewOptions
 from trainer.setup import take_glances
 from trainer.views.view import BACKGROUND, Glance, View, render_view
 
@@ -125,7 +125,7 @@ def draft_grade(views: DraftViews, options: EditorOptions, name: str) -> Gdf | N
     fitted = views.fitted
     judged = views.judged
     editor = make_editor(options, views.scene, views.region, (), lambda: views.glances)
-    plain = tuple((i + 1) / MOST_STAGES for i in range(MOST_STAGES))
+    plain = tuple((i + 1) / MAX_STAGES for i in range(MAX_STAGES))
     strengths = equalized_strengths(editor, options.editor, [fitted.row], plain)
     targets = list(map(edit_course(editor, fitted.row), strengths))
     expected = editor.edit(judged.row, 1.0)

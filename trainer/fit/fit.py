@@ -14,7 +14,7 @@ from torch import Tensor
 
 from progdf.field import BakedField, Candidate, FieldChoice, FieldEvaluator, choose_field
 from progdf.field.baked import GradeForm, NeuralForm
-from progdf.field.choose import ADDED, MOST_SNAPSHOTS, SAMPLES, pick_candidate
+from progdf.field.choose import ADDED, MAX_FITTED_SNAPSHOTS, SAMPLES, pick_candidate
 from progdf.field.grade import (
     COARSER,
     bake_grade,
@@ -215,7 +215,7 @@ def _measure_choice(choice: FieldChoice, trajectory: Trajectory, reporting: Eval
 
 def expected_looks(trajectory: Trajectory, kind: FieldKind) -> int:
     """About how often `fit_field` looks at its views, for a progress bar."""
-    snapshots = min(len(trajectory), MOST_SNAPSHOTS)
+    snapshots = min(len(trajectory), MAX_FITTED_SNAPSHOTS)
     moving = len(moving_attributes(trajectory.offsets))
     looks = SAMPLES if kind == "lossless" else (1 + moving) * snapshots + 6 * SAMPLES
     return looks + SAMPLES * (3 + len(BASELINES))

@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from progdf.field.baked import MONOMIALS, identity_map
-from progdf.field.grade import MOST_COLOR, member_bands, monomials
+from progdf.field.grade import MAX_COLOR, member_bands, monomials
 from progdf.gaussians import unpack
 from progdf.metrics.image import ROUNDING
 from progdf.rasterize.cpu.engine import Array
@@ -31,7 +31,7 @@ from trainer.views.crops import CropScene
 _AT_ONCE = 8  # views, whose results are there at the same time
 _SQUARES = 6  # of a view's longer side, every other one of which is in one of its halves
 _COVERED = 0.05  # the region's weight in a pixel that shows it
-_MOST_PIXELS = 60_000  # that a map is fitted to, of more evenly spread ones (docs/experiments.md, Pixels)
+_MAX_FIT_PIXELS = 60_000  # that a map is fitted to, of more evenly spread ones (docs/experiments.md, Pixels)
 _CLAMP_ROUNDS = 3  # of the map's least squares, for pixels that are white or black anyway
 _MAP_RIDGE = 1e-6  # of the diagonal of a map's normal equations, for regions of few colors
 _MAP_HELD = 1e-2  # say of the members' own colors beside the pixels: there a map is held to the affine one
@@ -220,7 +220,7 @@ class MapFit:
 
 
 @one_thread()
-def fit_maps(views: Sequence[ColorView], share: Tensor, most: int = _MOST_PIXELS) -> MapFit:
+def fit_maps(views: Sequence[ColorView], share: Tensor, most: int = _MAX_FIT_PIXELS) -> MapFit:
     """Prepare the views for maps of any degree.
 
     Args:
@@ -231,7 +231,7 @@ def fit_maps(views: Sequence[ColorView], share: Tensor, most: int = _MOST_PIXELS
 
     @lru_cache(maxsize=1)
     def expand(colors: Tensor) -> tuple[Tensor, Tensor]:
-        terms = monomials(colors.T.clamp(0.0, MOST_COLOR), 3)
+        terms = monomials(colors.T.clamp(0.0, MAX_COLOR), 3)
         return (share * terms).T.contiguous(), (terms @ terms.T).double()
 
     def lay_out(index: int) -> tuple[Tensor, Tensor, Tensor]:
@@ -269,7 +269,7 @@ def mask_of_members(colors: Tensor, change: Tensor, weights: Tensor) -> Tensor:
     change = change.double()
     size = change.norm(dim=1)
     typical = ((weights @ size.square()) / weights.sum().clamp_min(1e-30)).sqrt()
-    terms = monomials(colors.T.clamp(0.0, MOST_COLOR), 1).double()
+    terms = monomials(colors.T.clamp(0.0, MAX_COLOR), 1).double()
     design = (size / typical.clamp_min(1e-12)).clamp(0.0, 1.0) * terms
     normal = (design * weights) @ design.T
     normal += _MAP_RIDGE * (normal.diagonal() + 1e-12).diag()

@@ -37,7 +37,7 @@ _SIZE = 0.5  # standard deviation of a seed, of the distance to its three neighb
 _DEPTHS = 256  # along a ray, at most; one for two pixels
 _CLIP = 0.3  # of color: views disagree by no more
 _ALIKE = 0.03  # a nearer depth is as good as the best
-_LEAST_VIEWS = 3  # that can see a place, beside its own
+_MIN_VIEWS = 3  # that can see a place, beside its own
 _FAINT = 2 / 255  # of color; below, a pixel is as it should be
 
 
@@ -136,7 +136,7 @@ def _place_pixels(
         apart += sees * (torch.stack(drawn, dim=2) - colors).abs().mean(dim=2).clamp_max(_CLIP)
         seen += sees
     off = apart / seen.clamp_min(1.0)
-    allowed = (seen >= _LEAST_VIEWS) & (along < _surface(depths[index]).flatten()[pixels, None] + behind)
+    allowed = (seen >= _MIN_VIEWS) & (along < _surface(depths[index]).flatten()[pixels, None] + behind)
     off = torch.where(allowed, off, 1.0)
     first = (off <= off.amin(dim=1, keepdim=True) + _ALIKE).float().argmax(dim=1)
     return points[torch.arange(len(pixels)), first], allowed.any(dim=1)

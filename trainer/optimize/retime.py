@@ -20,7 +20,7 @@ from trainer.options import Slider
 
 from .pgs import ParameterSnapshot
 
-_LEAST_GAP = 1e-4  # slider values of neighboring recordings stay apart by this
+_MIN_GAP = 1e-4  # slider values of neighboring recordings stay apart by this
 
 
 def resolve_slider(slider: Slider, strengths: Sequence[float]) -> Slider:
@@ -201,7 +201,7 @@ def _place_between(low: float, high: float, progress: Tensor) -> Tensor:
     """Slider values from `low` to `high`, both exact, strictly ascending as `progress` does. [n] -> [n]"""
     gaps = progress.diff()
     gaps = gaps / float(gaps.sum()) * (high - low)
-    gaps = gaps.clamp_min(min(_LEAST_GAP, 0.5 * (high - low) / len(gaps)))
+    gaps = gaps.clamp_min(min(_MIN_GAP, 0.5 * (high - low) / len(gaps)))
     rising = torch.cat([gaps.new_zeros(1), gaps.cumsum(0)])
     placed = low + (high - low) * rising / rising[-1]
     placed[-1] = high

@@ -36,7 +36,7 @@ OPAQUE = 0.97
 """What a pixel must cover of the background to have a surface."""
 DISC_LOGIT = 4.0
 """The opacity of a disc at strength 1."""
-LEAST_ALPHA = 1 / 255
+MIN_ALPHA = 1 / 255
 """Below it nothing is painted."""
 GROWN = 2
 """Pixels around the paint that discs show as they are: what is drawn behind them was moved."""
@@ -54,7 +54,7 @@ _STEEP = 0.3  # cosine below which a disc is turned no further, and one surface 
 _MEDIAN = 9
 _SMOOTH = 3.0
 _SAME = 4.0
-_LEAST_LIGHT = 0.005  # of a pixel, below which what a Gaussian takes before a disc does not matter
+_MIN_LIGHT = 0.005  # of a pixel, below which what a Gaussian takes before a disc does not matter
 _REACH = 4.0  # standard deviations of the light's depths, within which a Gaussian is of the surface
 _SETTLED = 1e-3  # of the reach: nearer, a row that was moved is behind but for rounding
 _CLEARED = 12  # times, at most, that what lies before the discs is moved behind them
@@ -75,7 +75,7 @@ class PaintedView:
     @property
     def mask(self) -> Tensor:
         """The pixels that were changed. [H,W] bool"""
-        return self.drawn[..., 3] > LEAST_ALPHA
+        return self.drawn[..., 3] > MIN_ALPHA
 
 
 @dataclass(frozen=True)
@@ -334,7 +334,7 @@ def _rows_before(
     window = slice(box[1], box[3]), slice(box[0], box[2])
     piece = pieces[window].reshape(-1)[pixel]
     short = behind[window].reshape(-1)[pixel] - depths[owner]
-    before = mask[window].reshape(-1)[pixel] & (short > _SETTLED * reach) & (runs.weights > _LEAST_LIGHT)
+    before = mask[window].reshape(-1)[pixel] & (short > _SETTLED * reach) & (runs.weights > _MIN_LIGHT)
     before &= (short <= reach) & (piece == _main_pieces(owner, piece, runs.weights, len(scene))[owner])
     needed = np.zeros(len(scene))
     np.maximum.at(needed, owner[before], short[before])

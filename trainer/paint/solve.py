@@ -26,14 +26,14 @@ _STEPS = 40  # of conjugate gradients
 _ROUNDS = 3  # between them, colors below black are set to it
 _HELD = 0.05  # of a pixel: how much a row of the scene holds on to its own color
 _RIDGE = 0.02  # the same of a disc, on what was painted there
-_LEAST_BOX = 32  # pixels around the paint in which its colors are solved for
+_MIN_BOX = 32  # pixels around the paint in which its colors are solved for
 
 
 def box_of(painted: Tensor, camera: Camera) -> Crop:
     """The window around the paint in which moved rows may show: half as large again on each side."""
     rows, columns = painted.nonzero().T
     (top, bottom), (left, right) = ((int(axis.min()), int(axis.max()) + 1) for axis in (rows, columns))
-    margin = _LEAST_BOX + max(bottom - top, right - left) // 2
+    margin = _MIN_BOX + max(bottom - top, right - left) // 2
     return (
         max(0, left - margin),
         max(0, top - margin),

@@ -47,7 +47,7 @@ _SOFT = 8  # pixels of a soft rim, where masks are lifted
 _SPECK = 2  # pixels: what is narrower is none
 _GAP = 5  # what is wider than a gap is not closed
 _HOLE = 0.002  # of the picture: a smaller hole in what has changed is closed
-_LEAST = 0.5  # of a member's visible share lies where the pictures differ
+_MINIMUM = 0.5  # of a member's visible share lies where the pictures differ
 _BARELY = 0.5  # clearness: more than half of what shows there is what covers it
 _RIM = 3.0  # pixels that a mask is too wide by, at most, or half of what is thinner
 _INNER = 0.1  # of a connected piece's visible share lies within that rim; with less it is a stray
@@ -86,7 +86,7 @@ def changed_region(
         masks.append(_close_gaps(_shrink_mask(change, small[-1])))
     if not any(bool(mask.any()) for mask in masks):
         raise ProgdfError("the pictures differ nowhere from the scene; change them, or name the region")
-    least = _LEAST if threshold is None else threshold
+    least = _MINIMUM if threshold is None else threshold
     covered = covered_rows(scene, small)
     evidence = gather(scene, small, masks)
     surface_vote = SurfaceVote(scene, covered)

@@ -27,9 +27,9 @@ from trainer.setup import TrainingSetup, shrink_view
 from trainer.views.crops import CropScene
 from trainer.views.view import View
 
-_MOST_UNEXPLAINED = 0.4  # half way between the edits that agree and those that do not, see above
-_MOST_FINE = 0.5  # calm styles leave up to .47, stripes of random phase .55 and more
-_LEAST_CONTRAST = 0.8  # what is washed out agrees, at less than what it had
+_MAX_UNEXPLAINED = 0.4  # half way between the edits that agree and those that do not, see above
+_MAX_FINE = 0.5  # calm styles leave up to .47, stripes of random phase .55 and more
+_MIN_CONTRAST = 0.8  # what is washed out agrees, at less than what it had
 _HARMLESS_DB = 28.0  # what differs by less is not seen, whatever its share of a faint change
 _REMEDIES = {
     "style": "use a calmer style (14, 23, 20, 7)",
@@ -54,8 +54,8 @@ class Agreement:
     @property
     def agree(self) -> bool:
         """Whether that is what edits that are the same from everywhere leave."""
-        alike = self.unexplained <= _MOST_UNEXPLAINED and self.unexplained_fine <= _MOST_FINE
-        return self.contrast >= _LEAST_CONTRAST and (alike or self.psnr >= _HARMLESS_DB)
+        alike = self.unexplained <= _MAX_UNEXPLAINED and self.unexplained_fine <= _MAX_FINE
+        return self.contrast >= _MIN_CONTRAST and (alike or self.psnr >= _HARMLESS_DB)
 
     def line(self, editor: str, judged_on: str) -> str:
         """One line for the log, with advice where the views disagree.
@@ -69,7 +69,7 @@ class Agreement:
             best = f"the best colors reach {self.psnr:.1f} dB and miss {share}"
             return f"the edited views agree: on {judged_on} {best}"
         remedy = _REMEDIES.get(editor, "mend them")
-        if self.contrast < _LEAST_CONTRAST:
+        if self.contrast < _MIN_CONTRAST:
             return (
                 f"the edited views are washed out: {self.contrast:.0%} of the fine contrast that they had "
                 f"before they were made to agree; {remedy}"

@@ -59,7 +59,7 @@ SWEEP = 0.6
 SOFTNESS = 0.25
 """Share of the painting over which the render is let go of: a decision first, then a free finish."""
 
-MOST_MOVED = 0.05
+MAX_MOVED = 0.05
 """Shift, as a share of the longer side, or zoom, above which an answer is not laid over its view."""
 
 
@@ -231,7 +231,7 @@ class Easel:
             picture = self.kept.picture(view.camera.name, original, recipe, paint, where)
             registration = register(original, picture, beside)
             moved = registration.size
-            if moved <= MOST_MOVED:
+            if moved <= MAX_MOVED:
                 return registration.lay(picture), moved
         return None, moved
 
@@ -445,7 +445,7 @@ def agree_views(
             loop.sweep(views)
         if not any(view.camera.name in loop.pictures for view in setup.train):
             raise ProgdfError(
-                f"the model moves all that it paints by more than {MOST_MOVED:.0%}; use another --model"
+                f"the model moves all that it paints by more than {MAX_MOVED:.0%}; use another --model"
             )
         before = loop.fine_energy()
         for number in range(rounds):

@@ -33,7 +33,7 @@ from progdf.rasterize import render
 from progdf.terminal import print_line
 from trainer.options import (
     LARGEST_SEED,
-    MOST_THREADS,
+    MAX_THREADS,
     EditorOptions,
     OptimizeOptions,
     RegionOptions,
@@ -45,7 +45,7 @@ from trainer.store.state import StateFolder
 
 Paint = Callable[[Tensor, Camera, Callable[[tuple[str, ...]], Tensor]], Tensor]
 STRENGTHS = (0.0, 0.25, 0.5, 0.75, 1.0)
-MOST_GAUSSIANS = 5_000_000
+MAX_GAUSSIANS = 5_000_000
 """As many as large trained scenes have: what --size says at most."""
 _HERO_HEIGHT = 400
 _TURNS = (-4, 3, 6)  # cameras from the one of the picture, 11 degrees each
@@ -176,9 +176,9 @@ def _open_window(command: Sequence[str]) -> int:
 
 def _check(options: DemoOptions) -> None:
     """Raises ProgdfError for a number that cannot be, before anything is made or written."""
-    if options.size is not None and options.size > MOST_GAUSSIANS:
-        raise ProgdfError(f"--size must be at most {MOST_GAUSSIANS}, got {options.size}")
-    check_ranges(("--seed", options.seed, 0, LARGEST_SEED), ("--threads", options.threads, 0, MOST_THREADS))
+    if options.size is not None and options.size > MAX_GAUSSIANS:
+        raise ProgdfError(f"--size must be at most {MAX_GAUSSIANS}, got {options.size}")
+    check_ranges(("--seed", options.seed, 0, LARGEST_SEED), ("--threads", options.threads, 0, MAX_THREADS))
 
 
 def write_scene(folder: Path, scene: DemoScene) -> None:

@@ -34,8 +34,8 @@ from trainer.views.view import View, fit_size
 _SIZE = 128  # longer side of the small views, pixels
 _VIEWS = 12  # of those that change most; every third judges
 # of a trial; share of the run's own
-_MOST_STEPS = 60
-_LEAST_STEPS = 24
+_MAX_STEPS = 60
+_MIN_STEPS = 24
 _SHARE = 1 / 6
 _AS_GOOD = 0.2  # dB by which training colors alone may be worse than training all: it takes fewer bytes
 _MOVED = 0.8
@@ -212,7 +212,7 @@ def try_approaches(
     trained = [pair for i, pair in enumerate(most) if i % 3 != 1]
     plain = _small_views(setup, most)
     unedited = _psnr(plain, torch.zeros_like(plain.original))
-    steps = max(_LEAST_STEPS, min(_MOST_STEPS, round(_SHARE * options.optimize.steps)))
+    steps = max(_MIN_STEPS, min(_MAX_STEPS, round(_SHARE * options.optimize.steps)))
     psnrs: dict[Approach, float] = {}
     for way in ways:
         grown = setup

@@ -43,7 +43,7 @@ _TRIAL_TURNS = (-30, -15, 0, 15, 30)
 _GAPS = (4.0, 1.0)  # pixels between discs and what is moved behind them, which are tried
 _FLAT = 0.015  # root mean square of color that one disc may be off, over its pixels
 _SPOILED = 1 / 255  # of color, by which what was moved shows beside the paint
-_LEAST_SHOWN = 0.5  # pixels of that, from which a row's color may change
+_MIN_SHOWN = 0.5  # pixels of that, from which a row's color may change
 _ALIKE = 0.05  # of color, by which a pixel is told from what was painted
 _ROUNDED = 1.5 / 255  # two images in 8 bits differ by as much
 _WINDOW = 2.0  # pixels over which what is missing is taken together
@@ -98,7 +98,7 @@ def lay_discs(scene: Gaussians, paints: Sequence[PaintedView], gap: float) -> La
         spoiled = torch.zeros_like(paint.mask)
         crop(spoiled, box)[:] = (after - before).abs().amax(dim=2) > _SPOILED
         light = alpha_weights(cleared, paint.camera, spoiled & torch.from_numpy(beside))[:, 0]
-        changed |= light > _LEAST_SHOWN
+        changed |= light > _MIN_SHOWN
     rows = changed.nonzero()[:, 0]
     ended, added = solve_colors(cleared, rows, added, paints)
     return Laid(scene, ended, rows, added, gap)

@@ -21,7 +21,7 @@ from progdf.io.cameras import camera_files
 from progdf.io.json_values import convert_json, decode_json, plain
 from progdf.region import Region
 from trainer.editors.pictures import picture_paths, strengths_of
-from trainer.options import MOST_THREADS, TrainOptions, flat_values
+from trainer.options import MAX_THREADS, TrainOptions, flat_values
 from trainer.resolve import count_threads, recorded_options, resolve
 from trainer.store.run_folder import RunFolder, begin_log, remove_leftovers
 
@@ -177,7 +177,7 @@ class _Identity(msgspec.Struct):
     plan: TrainOptions
     scene: str
     cameras: str | None
-    threads: Annotated[int, msgspec.Meta(ge=1, le=MOST_THREADS)]
+    threads: Annotated[int, msgspec.Meta(ge=1, le=MAX_THREADS)]
     torch: str
     pictures: dict[str, str]
     processor: str

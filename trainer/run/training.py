@@ -39,7 +39,7 @@ from trainer.optimize.losses import Losses, Objective, Perceptual, erode, loss_t
 from trainer.optimize.pgs import OnStep, ParameterSnapshot, PgsState, TargetStage, optimize, pgs_settings
 from trainer.optimize.retime import record, retime, select_recordings, straight_recordings
 from trainer.optimize.ties import surface_ties
-from trainer.options import MOST_STAGES, OptimizeOptions, TrainingViewOptions, TrainOptions
+from trainer.options import MAX_STAGES, OptimizeOptions, TrainingViewOptions, TrainOptions
 from trainer.setup import Pictures, TrainingSetup, boxed_pictures, probe_views
 from trainer.store.progress import RunLog, release_memory
 from trainer.store.run_folder import LazySequence
@@ -307,7 +307,7 @@ def _solve(
     state = PgsState(solver.original)
     recordings = Recordings(folder, solver.original.shape, model)
     way = partial(solve, solver, model, course, recordings.made, state, steps=most_steps)
-    most = len(course.targets) + 1 if course.look is None else MOST_STAGES
+    most = len(course.targets) + 1 if course.look is None else MAX_STAGES
     made = _record_way(way, most, state, recordings, None, folder, log)
     strengths, made = course.sort_recordings(made)
     trajectory = record(made, state.average, strengths)

@@ -36,12 +36,12 @@ _SAMPLES = 256
 _LOOK = 96
 """Longer side in pixels at which cameras are compared."""
 
-_MOST_LOOKED_THROUGH = 4
+_MAX_LOOKED_THROUGH = 4
 """Times as many cameras as are wanted are looked through; of more, the best spread ones are taken unseen."""
 
 _MAX_TILT = 45.0  # degrees between the up of cameras and of their scene: people hold cameras level
 
-_LEAST_COVER = 0.25
+_MIN_COVER = 0.25
 """Of what the median view shows of the region; a view that shows less is left out."""
 
 
@@ -127,7 +127,7 @@ def choose_views(
     places = scene.means[rows]
     framed = torch.stack([in_frame(places, camera) for camera in cameras])
     looked = framed.any(dim=1).nonzero()[:, 0].tolist()
-    most = _MOST_LOOKED_THROUGH * count
+    most = _MAX_LOOKED_THROUGH * count
     if len(looked) > most:
         toward = _toward(places, [cameras[i] for i in looked])
         looked = [looked[k] for k in _greedy(Visibility(framed[looked].float(), toward, _reach(most)), most)]
@@ -138,7 +138,7 @@ def choose_views(
             f"none of the {len(cameras)} cameras sees the region '{region.name}'; "
             "give cameras that look at it with --cameras"
         )
-    enough = cover >= _LEAST_COVER * cover[seeing].median()
+    enough = cover >= _MIN_COVER * cover[seeing].median()
     good = enough.nonzero()[:, 0].tolist()
     toward = _toward(places, [cameras[looked[k]] for k in good])
     visibility = Visibility(_relative_visibility(weights[good]), toward, _reach(count))

@@ -33,7 +33,7 @@ INSIDE = (
 """What is said of such a scene without cameras, after its name."""
 
 
-_LEAST_BOX = 64  # LPIPS needs that many pixels on each side
+_MIN_BOX = 64  # LPIPS needs that many pixels on each side
 _SEEN = 0.05  # a pixel shows the region where the members' weight is above this
 _EVERY = 23  # one of so many pixels is looked at, along the rows
 _CHANGED = 0.05  # a pixel is changed where a channel differs by more than this
@@ -169,12 +169,12 @@ def region_box(mask: Tensor, margin: int = 6, least: float = 0.5 * _SEEN) -> Cro
         hit = visible.any(dim=axis).nonzero()[:, 0]
         low = int(hit[0]) - margin
         high = int(hit[-1]) + 1 + margin
-        missing = _LEAST_BOX - (high - low)
+        missing = _MIN_BOX - (high - low)
         if missing > 0:
             low = low - (missing + 1) // 2
             high = high + missing // 2
-        low = max(0, min(low, side - _LEAST_BOX))
-        high = min(side, max(high, _LEAST_BOX))
+        low = max(0, min(low, side - _MIN_BOX))
+        high = min(side, max(high, _MIN_BOX))
         spans.append((low, high))
     (x0, x1), (y0, y1) = spans
     return (x0, y0, x1, y1)

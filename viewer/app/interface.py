@@ -49,7 +49,7 @@ _BETWEEN = 0.7
 # at 1×
 COLUMN_PX = 248.0
 _MARGIN_PX = 14.0
-MOST_COLUMNS = 4
+MAX_COLUMNS = 4
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ def draw_keys(room: imgui.ImVec2, ui: UiContext) -> None:
     scrolls."""
     margin = _MARGIN_PX * ui.scale
     wide = COLUMN_PX * ui.scale
-    packed = columns(topics(), max(1, min(MOST_COLUMNS, int((room.x - 2 * margin) / wide))))
+    packed = columns(topics(), max(1, min(MAX_COLUMNS, int((room.x - 2 * margin) / wide))))
     tall = max(sum(topic.height for topic in column) for column in packed) * _ROW * SMALL_PX * ui.scale
     size = imgui.ImVec2(min(len(packed) * wide + 2 * margin, room.x), min(tall + 2 * margin, room.y))
     imgui.set_next_window_pos(((room.x - size.x) / 2, (room.y - size.y) / 2))

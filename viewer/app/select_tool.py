@@ -37,8 +37,8 @@ from viewer.ui.keys import Keys
 from viewer.ui.pointer import PointerContext
 
 _STROKE_PX = 4.0  # at 1×: half a stroke's width
-_MOST_PLACES = 16  # sampled places
-_MOST_DOTS = 300  # dots
+_MAX_PLACES = 16  # sampled places
+_MAX_DOTS = 300  # dots
 _SEEDS = 0.1  # a seed contributes at least this fraction of a pixel's color
 
 Point = tuple[float, float]
@@ -296,7 +296,7 @@ def spread(
     """
     on, beside = strokes_of(strokes, work) or (np.zeros(0, np.int64),) * 2
     touched = np.zeros(0, np.int64) if gesture.brushed is None else np.flatnonzero(gesture.brushed.touched)
-    path = gesture.path[:: len(gesture.path) // _MOST_PLACES + 1]
+    path = gesture.path[:: len(gesture.path) // _MAX_PLACES + 1]
     places = (seen_at(pointer.surface.scene, pointer.surface.camera, *at) for at in path)
     # large Gaussians are visible where their centers are not
     rows = np.concatenate([touched, *(_seeds(seen) for seen in places if seen is not None)])
@@ -370,7 +370,7 @@ def draw_strokes(strokes: tuple[Strokes, ...], work: Workspace, pointer: Pointer
     camera = pointer.camera(work.view.camera)
     scene = pointer.scene
     for some, color in zip(rows, (_ON, _BESIDE), strict=True):
-        some = some[:: len(some) // _MOST_DOTS + 1]
+        some = some[:: len(some) // _MAX_DOTS + 1]
         at = project_centers(scene[torch.from_numpy(some)], camera).points
         for x, y in at[np.isfinite(at).all(axis=1)].tolist():
             center = ((x + pointer.left) / density.x, y / density.y)

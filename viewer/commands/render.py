@@ -47,7 +47,7 @@ from viewer.render.gl_renderer import headless_context
 from viewer.state import timeline
 from viewer.state.layers import visible_edits, visible_layers
 from viewer.state.snapshots import compare_sides
-from viewer.state.view_state import MOST_AMPLIFIED, Comparison, Timeline, ViewState
+from viewer.state.view_state import MAX_AMPLIFIED, Comparison, Timeline, ViewState
 
 from .options import (
     ExportOptions,
@@ -77,8 +77,8 @@ def export(argv: Sequence[str]) -> int:
     several = options.frames is not None or options.timeline
     if several and ending in (CUBE, BUNDLE, PAGE):
         raise ProgdfError(f"--frames and --timeline write a scene again and again, which {out.name} is not")
-    if options.frames is not None and not 2 <= options.frames <= scene_file.MOST_FRAMES:
-        raise ProgdfError(f"--frames takes 2 to {scene_file.MOST_FRAMES} steps, not {options.frames}")
+    if options.frames is not None and not 2 <= options.frames <= scene_file.MAX_FRAMES:
+        raise ProgdfError(f"--frames takes 2 to {scene_file.MAX_FRAMES} steps, not {options.frames}")
     if ending != PAGE and (options.page, options.up, options.background) != (PageOptions(), "auto", "white"):
         raise ProgdfError(f"{out} is no web page; leave out what only a .html page has")
     if ending != ".glb" and options.glb_axes != "LUF":
@@ -134,7 +134,7 @@ def _export_frames(options: ExportOptions, opened: OpenStack) -> int:
         if options.frames is not None:
             steps = film.sheet_frames(keys, options.frames)
             rate *= (len(steps) - 1) / keys.length  # it lasts as long
-        if len(steps) > scene_file.MOST_FRAMES:
+        if len(steps) > scene_file.MAX_FRAMES:
             raise ProgdfError(f"--timeline: it has {len(steps)} frames; say how many with --frames N")
         states = (timeline.state_at(keys, frame, opened.view) for frame in steps)
         scenes = (_compose(document, state, 1.0, whole) for state in states)
@@ -296,8 +296,8 @@ def _comparison(options: RenderOptions, saved: Comparison) -> Comparison:
         return Comparison("split", divider=parse_number(options.split, 0.0, 1.0, problem))
     if options.difference is not None:
         amplify = options.difference
-        problem = f"--difference must be between 1 and {MOST_AMPLIFIED:g}, got {amplify}"
-        return Comparison("difference", amplify=parse_number(amplify, 1.0, MOST_AMPLIFIED, problem))
+        problem = f"--difference must be between 1 and {MAX_AMPLIFIED:g}, got {amplify}"
+        return Comparison("difference", amplify=parse_number(amplify, 1.0, MAX_AMPLIFIED, problem))
     return saved
 
 

@@ -2,7 +2,7 @@
 
 - bear.session.json: the session, a `WindowFile`; for a scene that never had one, the name it would get
 - bear.autosave.session.json: its unsaved work; -2, -3 … where others wait for somebody to decide about them
-- bear.discarded.session.json: work that was discarded, the last `MOST_DISCARDED`
+- bear.discarded.session.json: work that was discarded, the last `MAX_DISCARDED`
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ _log = logging.getLogger(__name__)
 AUTOSAVE_S = 20.0
 """Seconds from a change to its autosave."""
 
-MOST_DISCARDED = 3
+MAX_DISCARDED = 3
 _KINDS = "autosave", "discarded"
 
 
@@ -369,14 +369,14 @@ def find_autosaves(session: Path, numbered: bool = False) -> tuple[Path, ...]:
 
 
 def put_aside(path: Path) -> Path:
-    """An autosave as discarded work, in the place of the oldest where there are `MOST_DISCARDED`.
+    """An autosave as discarded work, in the place of the oldest where there are `MAX_DISCARDED`.
 
     Raises:
         OSError: it cannot be moved.
     """
     session = session_of(path) or path
     names = [
-        name for name, _ in zip(_numbered_paths(session, "discarded"), range(MOST_DISCARDED), strict=False)
+        name for name, _ in zip(_numbered_paths(session, "discarded"), range(MAX_DISCARDED), strict=False)
     ]
     free = [name for name in names if not name.exists()]
     to = free[0] if free else min(names, key=lambda name: name.stat().st_mtime)

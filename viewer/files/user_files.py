@@ -24,10 +24,10 @@ from viewer.state.workspace import Layout
 
 from .session import session_of
 
-MOST_RECENT = 12
+MAX_RECENT = 12
 THUMBNAIL_SIZE = (336, 252)
 """Pixels."""
-MOST_THUMBNAILS = 64
+MAX_THUMBNAILS = 64
 """Files in the folder; the oldest go."""
 
 
@@ -41,7 +41,7 @@ def read_recent(missing: bool = False) -> tuple[Path, ...]:
     try:
         lines = (state_folder() / "recent.txt").read_text("utf-8", "surrogateescape").splitlines()
         known = [path for path in map(Path, lines) if is_listed(path)]
-        return tuple(path for path in known if missing or path.is_file())[:MOST_RECENT]
+        return tuple(path for path in known if missing or path.is_file())[:MAX_RECENT]
     except (OSError, ValueError):
         return ()
 
@@ -59,7 +59,7 @@ def forget_recent(path: Path) -> tuple[Path, ...]:
 
 
 def _write_recent(files: Sequence[Path]) -> tuple[Path, ...]:
-    files = files[:MOST_RECENT]
+    files = files[:MAX_RECENT]
     _remember("recent.txt", "".join(f"{path}\n" for path in files))
     return tuple(path for path in files if path.is_file())
 
@@ -134,7 +134,7 @@ def keep_thumbnail(path: Path, pixels: NDArray[np.uint8]) -> None:
         with atomic_write(file) as temporary_file:
             Image.fromarray(pixels).save(temporary_file)
         thumbnails = sorted(file.parent.glob("*.png"), key=lambda path: path.stat().st_mtime)
-        for old in thumbnails[:-MOST_THUMBNAILS]:
+        for old in thumbnails[:-MAX_THUMBNAILS]:
             old.unlink(missing_ok=True)
 
 

@@ -98,7 +98,7 @@ NEUTRAL = tuple(neutral for _, _, neutral in GRADE_RANGES.values())
 """A grade that changes nothing."""
 STILL = "Change a color, the curve or a slider of the grade"
 """An obstacle."""
-MOST_PAIRS = 8
+MAX_PAIRS = 8
 
 
 @dataclass(frozen=True)
@@ -257,9 +257,9 @@ def with_color(form: NewEdit, color: str) -> NewEdit:
     another one for next."""
     known = [parse_color(source) for source, _ in form.palette]
     alike = [i for i, source in enumerate(known) if are_alike(source, parse_color(color))]
-    at = alike[0] if alike else min(len(known), MOST_PAIRS - 1)
+    at = alike[0] if alike else min(len(known), MAX_PAIRS - 1)
     target = form.palette[at][1] if alike and form.palette[at][0] != form.palette[at][1] else color
-    rest = tuple(pair for i, pair in enumerate(form.palette) if i not in alike)[: MOST_PAIRS - 1]
+    rest = tuple(pair for i, pair in enumerate(form.palette) if i not in alike)[: MAX_PAIRS - 1]
     return replace(form, palette=(*rest[:at], (color, target), *rest[at:]), picks=False, picked=at)
 
 

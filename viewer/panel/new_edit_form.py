@@ -50,8 +50,8 @@ from viewer.ui.widgets import (
 
 COLUMN_PX = 90.0
 _CURVE_PX = 92.0
-_MOST_POINTS = 6
-_LEAST_GAP = 0.02
+_MAX_POINTS = 6
+_MIN_GAP = 0.02
 _GRADES = {
     "exposure": "Stops of light: −1 is half of it, 1 twice as much",
     "temperature": "From blue to amber light",
@@ -310,7 +310,7 @@ def _curve(curve: str, column: float, ui: UiContext) -> str:
         points = [point for i, point in enumerate(points) if i != near]
         storage.set_int(held, -1)
     elif imgui.is_item_clicked(0) or goes_on:
-        if near < 0 and len(points) < _MOST_POINTS and all(abs(p[0] - at[0]) > _LEAST_GAP for p in points):
+        if near < 0 and len(points) < _MAX_POINTS and all(abs(p[0] - at[0]) > _MIN_GAP for p in points):
             points = sorted([*points, (round(at[0], 2), round(at[1], 2))])
             near = min(range(len(points)), key=lambda i: apart(points[i]))
         storage.set_int(held, near)
@@ -320,7 +320,7 @@ def _curve(curve: str, column: float, ui: UiContext) -> str:
             at = points[i][0] + by[0], points[i][1] + by[1]
         low = points[i - 1][0] if i else 0.0
         high = points[i + 1][0] if i + 1 < len(points) else 1.0
-        across = min(max(at[0], low + _LEAST_GAP), high - _LEAST_GAP)
+        across = min(max(at[0], low + _MIN_GAP), high - _MIN_GAP)
         points[i] = round(across, 2), round(min(max(at[1], 0.0), 1.0), 2)
     canvas = imgui.get_window_draw_list()
     p = PALETTE

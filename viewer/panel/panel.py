@@ -20,18 +20,18 @@ from viewer.ui.context import BEHIND, FIXED, PALETTE, SMALL_PX, Icon, UiContext,
 from . import card, cards, new_edit_form, snapshot_cards, training_cards
 
 MENU_ID = "main menu"
-MOST_PX = 360.0
+MAX_PX = 360.0
 _MENU = ("", "save", "save_as", "take_view", "hide_strays", "", "palette", "help", "about", "quit")
-_MOST_RECENT = 6
+_MAX_RECENT = 6
 _SHARES = ("export", "export_page", "render_picture", "render_film", "picture")
 
 
 def _menu_button(recent: Sequence[Path], side: float, ui: UiContext, actions: list[str]) -> None:
     """The menu at the right of the present line; `recent`: files opened before, the last one first."""
-    room = MOST_PX * ui.scale
+    room = MAX_PX * ui.scale
     files = [
         (widgets.elide(escape_text(path.name), room), f"open_file:{path}", escape_text(str(path)))
-        for path in recent[:_MOST_RECENT]
+        for path in recent[:_MAX_RECENT]
     ]
     widgets.more_button(MENU_ID, ("open", *files, *_MENU), ui, actions, Icon.BARS, side)
     widgets.tip("Menu")

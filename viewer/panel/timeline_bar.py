@@ -35,7 +35,7 @@ from viewer.ui.widgets import elide, hint, icon_button, icon_row, inert, is_rele
 HEIGHT_PX = 46.0
 ROW_PX = 33.0
 TRACK_PX = 20.0  # of a row of keys
-_MOST_SHARE = 0.35  # the rows take at most so much of the picture's height
+_MAX_SHARE = 0.35  # the rows take at most so much of the picture's height
 ROOMY_PX = 640.0  # a narrower bar has its settings in a second line
 SETTINGS_PX = 293.0
 BUTTONS_PX = 143.0
@@ -85,7 +85,7 @@ def _bar_height(work: Workspace, area: Area, ui: UiContext) -> float:
 
 
 def _rows_height(work: Workspace, area: Area, ui: UiContext) -> float:
-    most = max(2, int(_MOST_SHARE * area.height / (TRACK_PX * ui.scale)))
+    most = max(2, int(_MAX_SHARE * area.height / (TRACK_PX * ui.scale)))
     rows = min(len(work.view.layers) + 1, most) * TRACK_PX
     return (rows + _GAP_PX) * ui.scale if work.player.unfolded else 0.0
 

@@ -14,7 +14,7 @@ from viewer.render import highlight
 from viewer.state.layers import is_visible
 from viewer.state.view_state import (
     LARGEST_PX,
-    MOST_AMPLIFIED,
+    MAX_AMPLIFIED,
     SELECT_MODES,
     SMALLEST_PX,
     Brush,
@@ -51,7 +51,7 @@ EDGE_PX = 8.0  # between it and the picture's edges
 NARROW_PX = 560.0  # of a picture whose bar may lie over the axes
 # of a button, where the window is low; around the buttons
 _SIDE_PX = 32.0
-_LEAST_PX = 22.0
+_MIN_PX = 22.0
 _PAD_PX = 4.0
 _TOOLS = (
     (("navigate:orbit", Icon.ORBIT), ("navigate:fly", Icon.FLY)),
@@ -92,7 +92,7 @@ def draw_toolbar(view: ViewState, area: Area, ui: UiContext, actions: list[str])
     count = sum(map(len, _TOOLS))
     gap = 6.0 * ui.scale
     room = area.height - 2 * (EDGE_PX + _PAD_PX) * ui.scale - gap * (len(_TOOLS) - 1)
-    side = min(max(room / count, _LEAST_PX * ui.scale), _SIDE_PX * ui.scale)
+    side = min(max(room / count, _MIN_PX * ui.scale), _SIDE_PX * ui.scale)
     imgui.push_style_var(imgui.StyleVar_.item_spacing, (0.0, 0.0))
     with plate("tools", (EDGE_PX * ui.scale, EDGE_PX * ui.scale), ui, pad=_PAD_PX):
         for i, group in enumerate(_TOOLS):
@@ -404,7 +404,7 @@ def _choose_comparison(compare: Comparison, snapshots: bool, ui: UiContext) -> C
         if not there:
             tip("There is no snapshot")
     if compare.mode == "difference":
-        ends = 1.0, MOST_AMPLIFIED
+        ends = 1.0, MAX_AMPLIFIED
         times = value_slider("##amplify", compare.amplify, ends, "Gain × %.0f", Comparison.amplify, ui)
         compare = replace(compare, amplify=float(round(times)))
     return compare

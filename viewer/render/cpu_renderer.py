@@ -27,8 +27,8 @@ from .gl_renderer import Image, Size, require_picture
 from .ground_grid import CLEAR, Lines
 
 BAND = 300_000
-MOST_BANDS = 5
-LEAST_ROWS = 64
+MAX_BANDS = 5
+MIN_ROWS = 64
 """Gaussians for which a picture in full is made in one more band, so that some of it shows early and what
 moves has little to wait for; each band costs a look at all of them. Rows of one, nearly."""
 
@@ -55,7 +55,7 @@ class _Begun:
     def _draw(self, gaussians: ActivatedGaussians) -> float:
         """Gives the milliseconds it took."""
         began, (height, width) = time.perf_counter(), self.picture.through.shape
-        count = min(1 + len(gaussians.means) // BAND, MOST_BANDS, -(-height // LEAST_ROWS))
+        count = min(1 + len(gaussians.means) // BAND, MAX_BANDS, -(-height // MIN_ROWS))
         bands = [(height * k // count, height * (k + 1) // count) for k in range(count)]
         with stopped_by(self.stop):
             for top, end in sorted(bands, key=lambda band: abs(sum(band) - height)):  # the middle first

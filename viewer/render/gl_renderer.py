@@ -27,7 +27,7 @@ Image = NDArray[np.float32]
 Size = tuple[int, int]  # width and height, pixels
 
 _ROOM = 1 << 14  # Gaussians that textures grow by
-_LEAST = 1e-30  # of a scale, which has a logarithm
+_MINIMUM = 1e-30  # of a scale, which has a logarithm
 
 T = TypeVar("T")
 
@@ -167,7 +167,7 @@ def _to_raw(fewer: ActivatedGaussians) -> Gaussians:
         torch.nn.functional.pad(tensor, (0, 0) * (tensor.ndim - 1) + (0, room)) for tensor in fewer.tensors
     )
     return Gaussians(
-        means, quats, scales.clamp_min(_LEAST).log(), opacities,
+        means, quats, scales.clamp_min(_MINIMUM).log(), opacities,
         (rgb - 0.5) / C0, rgb.new_zeros(len(rgb), 0, 3),
     )  # fmt: skip
 

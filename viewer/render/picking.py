@@ -25,7 +25,7 @@ from viewer.state.view_state import ViewState
 
 HALF = 0.5
 FAINT = 0.05  # less than this in all counts as background
-LEAST_SHARE = 0.25  # of what one sees at a pixel must be a layer's own before a click there means it
+MIN_SHARE = 0.25  # of what one sees at a pixel must be a layer's own before a click there means it
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ def layer_at(view: ViewState, gdfs: Sequence[Gdf], seen: Seen) -> int | None:
 
     Returns:
         A shown layer goes before a hidden one, of equal ones the later; None where no layer has
-        `LEAST_SHARE` of the pixel.
+        `MIN_SHARE` of the pixel.
     """
     best = (False, 0.0)
     chosen = None
@@ -87,7 +87,7 @@ def layer_at(view: ViewState, gdfs: Sequence[Gdf], seen: Seen) -> int | None:
         inside = members[np.searchsorted(members, seen.rows).clip(max=len(members) - 1)] == seen.rows
         share = float(seen.shares[inside].sum())
         ranked = is_visible(view, layer), share
-        if share >= LEAST_SHARE and ranked >= best:
+        if share >= MIN_SHARE and ranked >= best:
             best = ranked
             chosen = i
     return chosen

@@ -31,8 +31,8 @@ from .layers import (
 )
 from .view_state import BRUSH_MODES, FRAMES, RESOLUTION_MODES, ViewState, following
 from .workspace import (
-    LEAST_ZOOM,
-    MOST_ZOOM,
+    MAX_ZOOM,
+    MIN_ZOOM,
     PLACES,
     SceneFacts,
     Workspace,
@@ -250,7 +250,7 @@ def _navigate(workspace: Workspace, mode: str) -> Workspace:
 
 def _zoom(workspace: Workspace, times: str) -> Workspace:
     """The interface so many times as large; 0 for its first size."""
-    zoom = min(max(round(workspace.layout.zoom * float(times), 3), LEAST_ZOOM), MOST_ZOOM)
+    zoom = min(max(round(workspace.layout.zoom * float(times), 3), MIN_ZOOM), MAX_ZOOM)
     return replace(workspace, layout=replace(workspace.layout, zoom=zoom if float(times) else 1.0))
 
 

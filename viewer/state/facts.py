@@ -22,7 +22,7 @@ from viewer.camera.view_camera import Bounds, Fit, ViewCamera, bounds_of, fit, k
 Rgb = tuple[float, float, float]
 
 THUMBNAIL_SIDE = 48
-MOST_MEMBERS = 20_000
+MAX_COUNTED_MEMBERS = 20_000
 """Of a larger region every so-manieth Gaussian is drawn, so that a row unfolds in a fraction of a second."""
 
 _GROUND = 56  # of a thumbnail: the gray behind it, 0..255
@@ -110,7 +110,7 @@ def _mean_color(scene: Gaussians, gdf: Gdf) -> Rgb:
 
 def _finished_region(scene: Gaussians, gdf: Gdf) -> Gaussians:
     """The region alone at full strength, of many members every so-manieth."""
-    every = max(-(-len(gdf.region.members) // MOST_MEMBERS), 1)
+    every = max(-(-len(gdf.region.members) // MAX_COUNTED_MEMBERS), 1)
     region = scene[gdf.region.members[::every]]
     moved = dict[str, Any]()
     for name in gdf.field.attributes:

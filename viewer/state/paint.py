@@ -195,7 +195,7 @@ def feather(paint: str, points: Floats, width: float, from_others: int = 0) -> s
     return encode(soft)
 
 
-_LEAST = float(np.finfo(np.float64).tiny)  # a corner without a share has no mean, and gives none
+_MINIMUM = float(np.finfo(np.float64).tiny)  # a corner without a share has no mean, and gives none
 
 
 _CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
@@ -230,5 +230,5 @@ def near_mean(points: Floats, values: Floats, width: float) -> Floats:
     corners = np.unique(cells, return_inverse=True)[1].reshape(cells.shape)
     given = np.bincount(corners.ravel(), shares.ravel())[corners]
     total = np.bincount(corners.ravel(), (shares * values[:, None]).ravel())[corners]
-    means: Floats = (shares * (total / np.maximum(given, _LEAST))).sum(1).astype(np.float32)
+    means: Floats = (shares * (total / np.maximum(given, _MINIMUM))).sum(1).astype(np.float32)
     return np.clip(means, values.min(), values.max())

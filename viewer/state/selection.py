@@ -25,7 +25,7 @@ from progdf.scene.selection import Mask, combine
 SUFFIX = ".region.npy"
 """How the file of a region is called after its name."""
 LONGEST_NAME = 60
-MOST_REGIONS = 1000
+MAX_REGIONS = 1000
 """Of a scene: more names than a person tells apart, few enough to draw and to save at once."""
 
 NOBODY = b""
@@ -65,7 +65,7 @@ class SelectionState:
     count: Annotated[int, Meta(ge=0)] = 0  # of these
     hidden: bytes = NOBODY  # packed mask of what is not drawn and cannot be selected
     # in the order of the panel's rows
-    regions: Annotated[tuple[NamedRegion, ...], Meta(max_length=MOST_REGIONS)] = ()
+    regions: Annotated[tuple[NamedRegion, ...], Meta(max_length=MAX_REGIONS)] = ()
 
 
 def pack(mask: Mask) -> bytes:
@@ -187,10 +187,10 @@ def add_region(state: SelectionState, name: str, path: Path) -> SelectionState:
     """With the selection kept as one more region; it stays selected.
 
     Raises:
-        ProgdfError: there are `MOST_REGIONS`.
+        ProgdfError: there are `MAX_REGIONS`.
     """
-    if len(state.regions) >= MOST_REGIONS:
-        raise ProgdfError(f"there are {MOST_REGIONS} regions, the most there can be; delete some first")
+    if len(state.regions) >= MAX_REGIONS:
+        raise ProgdfError(f"there are {MAX_REGIONS} regions, the most there can be; delete some first")
     color = COLORS[len(state.regions) % len(COLORS)]
     region = NamedRegion(name, path, state.members, state.count, color)
     return replace(state, regions=(*state.regions, region))

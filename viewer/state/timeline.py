@@ -180,7 +180,7 @@ def tracks(timeline: Timeline) -> dict[int, list[views.Point]]:
     return found
 
 
-LEAST_KEYS = 2
+MIN_KEYS = 2
 """What fewer keys mention does not move, and the playhead leaves it to the hand."""
 
 
@@ -241,7 +241,7 @@ def perform(view: ViewState, player: Player, action: str) -> tuple[ViewState, Pl
     after = replace(after, frame=max(0, min(after.frame, timeline.length)))
     view = replace(view, timeline=timeline)
     if after.frame != player.frame:
-        view = state_at(timeline, after.frame, view, LEAST_KEYS)
+        view = state_at(timeline, after.frame, view, MIN_KEYS)
     return view, after
 
 

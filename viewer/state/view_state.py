@@ -26,7 +26,7 @@ SELECT_TOOLS = ("box", "lasso", "polygon", "brush", "scribble", "sphere", "flood
 SELECT_MODES = ("new", "add", "subtract", "intersect")
 COMPARE_MODES = ("off", "beside", "split", "difference")
 AGAINST = ("original", "snapshots")
-MOST_AMPLIFIED = 64.0
+MAX_AMPLIFIED = 64.0
 # frames, frames per second
 LONGEST = 9999
 FASTEST = 120
@@ -104,7 +104,7 @@ class Comparison:
     mode: Annotated[str, one_of(COMPARE_MODES)] = "off"  # of `COMPARE_MODES`
     divider: Share = 0.5  # where the edited side of a split begins, share of the picture's width
     # what a difference is multiplied by, 1 to 64
-    amplify: Annotated[float, Meta(ge=1.0, le=MOST_AMPLIFIED)] = 4.0
+    amplify: Annotated[float, Meta(ge=1.0, le=MAX_AMPLIFIED)] = 4.0
     # "original", or "snapshots": A of `ViewState.pair` against its B, whatever the sliders say
     against: Annotated[str, one_of(AGAINST)] = "original"
 

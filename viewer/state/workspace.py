@@ -34,8 +34,8 @@ from .view_state import Comparison, ViewState
 MESSAGE_S = 6.0
 ERROR_S = 15.0
 DETAILS_S = 120.0
-LEAST_ZOOM = 0.5
-MOST_ZOOM = 3.0
+MIN_ZOOM = 0.5
+MAX_ZOOM = 3.0
 NARROWEST_PX = 280.0
 WIDEST_PX = 520.0
 UNSAVED = "• "
@@ -112,7 +112,7 @@ Pointed = tuple[str, int]
 class Layout:
     """How the window is laid out, remembered from one day to the next."""
 
-    zoom: Annotated[float, Meta(ge=LEAST_ZOOM, le=MOST_ZOOM)] = 1.0  # of the interface
+    zoom: Annotated[float, Meta(ge=MIN_ZOOM, le=MAX_ZOOM)] = 1.0  # of the interface
     panel_px: Annotated[float, Meta(ge=NARROWEST_PX, le=WIDEST_PX)] = 300.0  # at 1×: the panel's width
     folded: tuple[str, ...] = ()  # sections of the panel
     reduced_motion: bool = False  # the camera jumps where it would glide
@@ -232,7 +232,7 @@ def advance(workspace: Workspace, seconds: float) -> Workspace:
         return workspace
     view = workspace.view
     player = timeline.advance(workspace.player, view.timeline, seconds)
-    view = timeline.state_at(view.timeline, player.frame, view, timeline.LEAST_KEYS)
+    view = timeline.state_at(view.timeline, player.frame, view, timeline.MIN_KEYS)
     past = history.follow_look(workspace.past, workspace.view, view)
     if loses_strengths(workspace, view):
         past = history.record(past, view, workspace.snapshots)
@@ -247,7 +247,7 @@ def loses_strengths(workspace: Workspace, after: ViewState) -> bool:
     frame = workspace.player.frame
     if after.layers == before.layers or history.edit_of(before) != workspace.past.present.edit:
         return False
-    return timeline.state_at(before.timeline, frame, before, timeline.LEAST_KEYS).layers != before.layers
+    return timeline.state_at(before.timeline, frame, before, timeline.MIN_KEYS).layers != before.layers
 
 
 def with_camera(workspace: Workspace, camera: ViewCamera) -> Workspace:

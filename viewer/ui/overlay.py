@@ -139,7 +139,7 @@ LENGTH_PX = 34.0
 BALL_PX = 9.5
 MARGIN_PX = 10.0
 LETTER_PX = 13.0
-LEAST_PX = 240.0
+MIN_PX = 240.0
 """Width of the picture below which there is no room for it."""
 
 _REACH_PX = LENGTH_PX + BALL_PX + 3.0
@@ -213,7 +213,7 @@ def axes_height(view: ViewState, area: Area, ui: UiContext) -> float:
 
 def _has_axes(view: ViewState, area: Area, ui: UiContext) -> bool:
     """It goes with the panel: F12 leaves nothing but the picture."""
-    return view.axes and view.panel and area.width >= LEAST_PX * ui.scale
+    return view.axes and view.panel and area.width >= MIN_PX * ui.scale
 
 
 def _center(area: Area, ui: UiContext) -> tuple[float, float]:

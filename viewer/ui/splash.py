@@ -21,7 +21,7 @@ from .placement import keep_on_screen
 _Made = TypeVar("_Made")
 
 SIZE = (1280, 800)
-LEAST = (640, 400)
+MINIMUM_SIZE_PX = (640, 400)
 TITLE = "ProGDF Studio"
 PANEL = 0x1E2024
 FIELD = 0x383C43
@@ -72,7 +72,7 @@ class Splash:
         if not self.handle:
             glfw.terminate()
             raise _no_window("no window with OpenGL 3.3 can be opened here", errors)
-        keep_on_screen(self.handle, LEAST)
+        keep_on_screen(self.handle, MINIMUM_SIZE_PX)
         glfw.show_window(self.handle)
         glfw.make_context_current(self.handle)
         glfw.swap_interval(1)

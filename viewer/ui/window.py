@@ -20,7 +20,7 @@ from imgui_bundle import imgui
 from .glfw_library import glfw
 from .keys import FLY_KEYS, Keys, Press, end_frame_here, has_pending_input, next_event_id
 from .placement import Box, Frame, fit_box, window_box, window_frame, work_areas
-from .splash import LEAST, Splash
+from .splash import MINIMUM_SIZE_PX, Splash
 
 LONGEST_S = 0.3
 """Between the two presses of a double click, as imgui has it."""
@@ -192,14 +192,14 @@ class Window:
         """Window coordinates per design pixel, at least 0.5.
 
         It is the scale of the screen, except the part that the coordinates hide, and less where the window is
-        smaller than `LEAST` at that scale, so that all tools stay in reach.
+        smaller than `MINIMUM_SIZE_PX` at that scale, so that all tools stay in reach.
         """
         pixels = self.pixels[0]
         if not pixels:
             return 1.0
         width, height = glfw.get_window_size(self.handle)
         content = float(glfw.get_window_content_scale(self.handle)[0])
-        fitting = min(width / LEAST[0], height / LEAST[1])
+        fitting = min(width / MINIMUM_SIZE_PX[0], height / MINIMUM_SIZE_PX[1])
         return max(min(content * width / pixels, fitting), 0.5)
 
     def take_keys(self) -> Keys:

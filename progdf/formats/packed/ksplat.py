@@ -29,7 +29,7 @@ _CONVERT = "convert it with `splat-transform in.ksplat out.ply`"
 _SH_REST = (0, 9, 24, 45)
 _SH_TYPES = ("<f4", "<f2", "u1")
 _SPLAT_ROW = np.dtype([("xyz", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("quat", "u1", 4)])
-_LEAST_SCALE = 2e-9
+_MIN_SCALE = 2e-9
 """In place of a scale of 0, whose logarithm is not finite; see `repair.FLAT_LOG_SCALE`."""
 
 Floats = npt.NDArray[np.float32]
@@ -172,7 +172,7 @@ def _decode_colors(rgba: npt.NDArray[np.uint8]) -> tuple[Floats, Floats]:
 def _logs(scales: Floats) -> Floats:
     """Return log-scales; a scale of 0 becomes a very thin one, a negative one NaN."""
     with np.errstate(invalid="ignore"):
-        logs: Floats = np.log(np.where(scales == 0, np.float32(_LEAST_SCALE), scales))
+        logs: Floats = np.log(np.where(scales == 0, np.float32(_MIN_SCALE), scales))
     return logs
 
 

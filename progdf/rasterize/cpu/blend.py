@@ -80,8 +80,8 @@ FIRST, END, STEP, RED, GREEN, BLUE = (np.uint64(6 * TILE_H + k) for k in range(6
 SPLAT = np.uint64(64)
 """float32 numbers from one splat's spans to the next one's."""
 
-MOST: Number = np.float32(ALPHA_MAX)
-LEAST: Number = np.float32(TRANSMITTANCE_MIN)
+ALPHA_LIMIT: Number = np.float32(ALPHA_MAX)
+TRANSMITTANCE_LIMIT: Number = np.float32(TRANSMITTANCE_MIN)
 ZERO: Number = np.float32(0.0)
 ONE: Number = np.float32(1.0)
 EIGHT: Number = np.float32(WIDTH)
@@ -225,11 +225,11 @@ def _blend_row(
     while start < stop:
         u = u_peak + step * offset
         alpha = exp2(top - u * u)
-        alpha = select(alpha < MOST, alpha, MOST)
+        alpha = select(alpha < ALPHA_LIMIT, alpha, ALPHA_LIMIT)
         alpha = select(offset < stop, alpha, ZERO)
         before = load(state, p)
         after = before * (ONE - alpha)
-        taken = after > LEAST
+        taken = after > TRANSMITTANCE_LIMIT
         weight = select(taken, alpha * before, ZERO)
         store(state, p, select(taken, after, select(before < ZERO, before, ZERO - before)))
         store(state, p + _R, load(state, p + _R) + weight * red)
@@ -327,7 +327,7 @@ def _blend_splat_backward(
             u = u_peak + step * offset
             covered = (offset < stop) & (index <= load(state, p + _DEEPEST))
             raw = select(covered, exp2(top - u * u), ZERO)
-            alpha = select(raw < MOST, raw, MOST)
+            alpha = select(raw < ALPHA_LIMIT, raw, ALPHA_LIMIT)
             inverse = ONE / (ONE - alpha)
             before = load(state, p) * inverse
             g0 = load(state, p + _G0)
@@ -337,7 +337,7 @@ def _blend_splat_backward(
             behind = load(state, p + _BEHIND)
             weight = alpha * before
             g = alpha * (before * front - behind * inverse)
-            g = select(raw <= MOST, g, ZERO)
+            g = select(raw <= ALPHA_LIMIT, g, ZERO)
             store(state, p, before)
             store(state, p + _BEHIND, behind + weight * front)
             s_r += weight * g0
@@ -371,7 +371,7 @@ def _restore_behind(state: Array, batch: Array, splat: Number, index: Number) ->
             u = u_peak + step * offset
             covered = (offset < stop) & (index <= load(state, p + _DEEPEST))
             alpha = select(covered, exp2(top - u * u), ZERO)
-            alpha = select(alpha < MOST, alpha, MOST)
+            alpha = select(alpha < ALPHA_LIMIT, alpha, ALPHA_LIMIT)
             before = load(state, p) / (ONE - alpha)
             front = red * load(state, p + _G0) + green * load(state, p + _G1) + blue * load(state, p + _G2)
             store(state, p, before)
@@ -495,11 +495,11 @@ def _add_weights(state: Array, batch: Array, splat: Number, out: Array) -> None:
             u = u_peak + step * offset
             covered = offset < stop
             alpha = select(covered, exp2(top - u * u), ZERO)
-            alpha = select(alpha < MOST, alpha, MOST)
+            alpha = select(alpha < ALPHA_LIMIT, alpha, ALPHA_LIMIT)
             before = load(state, p)
             mask = load(state, p + PLANE)
             after = before * (ONE - alpha)
-            taken = covered & (after > LEAST)
+            taken = covered & (after > TRANSMITTANCE_LIMIT)
             weight = select(taken, alpha * before, ZERO)
             done = select(before < ZERO, before, ZERO - before)
             store(state, p, select(covered, select(taken, after, done), before))
@@ -584,9 +584,9 @@ def _list_tile(
                 if before <= spare[i * TILE_W + j]:  # the pixel is done, or nothing of it is needed
                     continue
                 u = shape[L11] * (j - center)
-                alpha = min(np.exp2(np.float32(remaining - u * u) + _LOG2_ALPHA_MIN), MOST)
+                alpha = min(np.exp2(np.float32(remaining - u * u) + _LOG2_ALPHA_MIN), ALPHA_LIMIT)
                 after = before * (ONE - alpha)
-                if after <= LEAST:
+                if after <= TRANSMITTANCE_LIMIT:
                     through[i * TILE_W + j] = -before
                     continue
                 through[i * TILE_W + j] = after

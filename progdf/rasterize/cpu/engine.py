@@ -57,11 +57,11 @@ from .jit import kernel
 Array = NDArray[Any]
 _T = TypeVar("_T")
 
-_LEAST_TILES = 4  # fewer are not worth a call
+_MIN_TILES = 4  # fewer are not worth a call
 _CHUNKS = 4  # for each thread: tiles take unequally long
 # of a chunk: a picture that is dropped stops between two
-_MOST_TILES = 24
-_MOST_GAUSSIANS = 32 * BLOCK
+_MAX_TILES = 24
+_MAX_GAUSSIANS = 32 * BLOCK
 TILE_ROOM = 8  # tiles of a Gaussian that there is room for; where chunks have more, these are listed twice
 ENTRY_ROOM = 16  # and pixels that a Gaussian weighs in of a tile
 _ALL = np.empty(0, np.bool_)  # which rows get gradients, where all do
@@ -120,12 +120,12 @@ def bin_view(gaussians: ActivatedGaussians, camera: Pinhole) -> tuple[Splats, Ti
 def share_tiles(kernel: Any, camera: Pinhole, *arguments: Any) -> None:
     """Run `kernel(begin, end, scratch, *arguments)` so that every tile is one kernel's."""
     tiles = camera.grid[2] * camera.grid[3]
-    _share(lambda begin, end: kernel(begin, end, new_scratch(), *arguments), tiles, _LEAST_TILES, _MOST_TILES)
+    _share(lambda begin, end: kernel(begin, end, new_scratch(), *arguments), tiles, _MIN_TILES, _MAX_TILES)
 
 
 def share_gaussians(kernel: Callable[[int, int], _T], count: int) -> list[_T]:
     """Run `kernel(begin, end)` so that each Gaussian is one kernel's; what they return, in order."""
-    return _share(kernel, count, BLOCK, _MOST_GAUSSIANS)
+    return _share(kernel, count, BLOCK, _MAX_GAUSSIANS)
 
 
 def _share(kernel: Callable[[int, int], _T], count: int, block: int, most: int) -> list[_T]:
@@ -301,7 +301,7 @@ def color_map(
             run, entry = list_weights(begin, end, new_scratch(), splats, lists, pinhole, listed, out)
         return [*(part[:run].copy() for part in out[:3]), *(part[:entry].copy() for part in out[3:])]
 
-    parts = _share(list_tiles, len(lists.starts) - 1, _LEAST_TILES, _MOST_TILES)
+    parts = _share(list_tiles, len(lists.starts) - 1, _MIN_TILES, _MAX_TILES)
     runs = Runs(*map(np.concatenate, zip(*parts, strict=True)))
     return ListedWeights(len(rows), (y1 - y0, x1 - x0) if pixels is None else (len(pixels),), runs)
 

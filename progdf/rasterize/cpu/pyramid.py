@@ -102,7 +102,7 @@ _TOP = 4  # levels of which each node is a chunk of its own
 _AHEAD = 8  # rows that are fetched before it is their turn: they lie far apart
 _DARK = math.exp(0.5 * DARKEST)  # times the limit, beyond which no darkness brings a loss below it
 # of a weight
-_LEAST = 1e-30
+_MINIMUM = 1e-30
 _MOST = 1e30
 _TRIALS = 12  # for a limit
 _REACH = 3.0  # standard deviations of a node that are in front of the near plane, or it is not drawn
@@ -302,7 +302,7 @@ def _weight(scene: Scene, i: int) -> float:
     longest, middle = _two_largest(vec(scene.scales, i))
     weight = opacity * longest * middle
     drawn = opacity >= ALPHA_MIN and abs(mean[0]) + abs(mean[1]) + abs(mean[2]) < np.inf and weight < _MOST
-    return max(weight, _LEAST) if drawn else 0.0
+    return max(weight, _MINIMUM) if drawn else 0.0
 
 
 @kernel(contract=True, cache=True)
@@ -344,7 +344,7 @@ def _merge(
                         color = _color(i, leaf, band, c, scene, nodes)
                         colors[band, c] += weight * color
                         square += weight * color * color if band == 0 else 0.0
-        share = 1.0 / max(total, _LEAST)
+        share = 1.0 / max(total, _MINIMUM)
         mine = means[me]
         for band in range(colors.shape[0]):
             for c in range(3):
@@ -376,8 +376,8 @@ def _merge(
             sizes = _roots(matrix[0, 0], matrix[1, 1], matrix[2, 2])
             mine[LONGEST], middle = _two_largest(sizes)
             for k in range(3):
-                shapes[me, SCALES + k] = np.uint16(np.rint(65535.0 * sizes[k] / max(mine[LONGEST], _LEAST)))
-            density = total / max(mine[LONGEST] * middle, _LEAST)
+                shapes[me, SCALES + k] = np.uint16(np.rint(65535.0 * sizes[k] / max(mine[LONGEST], _MINIMUM)))
+            density = total / max(mine[LONGEST] * middle, _MINIMUM)
             mine[DENSITY] = density if sound else -density
         mine[LOSS] = _unpack(shapes[me, SPREAD]) * (1.0 + _unpack(shapes[me, CONTRAST]) ** 2)
 
@@ -546,7 +546,7 @@ def _walk(
         loss = np.inf
         inside = False
         wide = 0.0 if camera.antialiased else dilation * z * z / (focal * focal)
-        least = (means[i, WEIGHT] + wide * means[i, POINTS]) / max(longest * longest + wide, _LEAST)
+        least = (means[i, WEIGHT] + wide * means[i, POINTS]) / max(longest * longest + wide, _MINIMUM)
         if z - camera.near > reach and max(density, least) >= ALPHA_MIN:
             x, y, wide2, high2 = extents(camera, vec(means, i), z, longest, density)
             if _is_outside(camera, x, y, wide2, high2):
@@ -595,7 +595,7 @@ def _add_depths(picks: Array, nodes: Nodes, camera: Pinhole, dilation: float, de
         inside = 0.0 <= x <= camera.window[2] and 0.0 <= y <= camera.window[3]
         if z > camera.near and density >= ALPHA_MIN and inside:
             nearer = camera.fx * camera.fy / (z * z)
-            middle = nodes.means[i, WEIGHT] / max(density * longest, _LEAST)
+            middle = nodes.means[i, WEIGHT] / max(density * longest, _MINIMUM)
             area = math.sqrt((longest * longest * nearer + dilation) * (middle * middle * nearer + dilation))
             depth = -math.log(1.0 - min(density, ALPHA_MAX)) * min(2.0 * math.pi * area / (CELL * CELL), 1.0)
             for corner in range(8):
@@ -634,7 +634,7 @@ def _take(
                 longest, middle = _two_largest(scale)
                 wide = dilation * unit
                 dilated = math.sqrt((longest * longest + wide) * (middle * middle + wide))
-                opacity = max(opacity, (own[WEIGHT] + wide * own[POINTS]) / max(dilated, _LEAST))
+                opacity = max(opacity, (own[WEIGHT] + wide * own[POINTS]) / max(dilated, _MINIMUM))
             opacity = min(opacity, opacity**CROWD)
         else:
             opacity = float(scene.opacities[i])

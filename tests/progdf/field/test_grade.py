@@ -24,7 +24,7 @@ from progdf.field.baked import (
 )
 from progdf.field.grade import (
     COARSER,
-    MOST_COLOR,
+    MAX_COLOR,
     bake_grade,
     band_offsets,
     fit_grade,
@@ -92,7 +92,7 @@ def test_a_region_without_bands_is_mapped_exactly_as_it_is_drawn(degree: int) ->
     sh = member_bands(pack(random_gaussians(200), with_shN=False))
     table = some_table(degree)
     colors = sh[:, 0] * C0 + 0.5
-    expected = polynomial(colors.clamp(0.0, MOST_COLOR), table, degree) + (colors - MOST_COLOR).clamp_min(0.0)
+    expected = polynomial(colors.clamp(0.0, MAX_COLOR), table, degree) + (colors - MAX_COLOR).clamp_min(0.0)
     found = map_colors(sh, table, degree)[:, 0] * C0 + 0.5
     torch.testing.assert_close(found.clamp_min(0.0), expected.clamp_min(0.0), atol=2e-6, rtol=0)
 
@@ -112,7 +112,7 @@ def test_colors_that_are_clamped_are_nearer_than_their_least_squares() -> None:
     toward = directions()
     before = drawn(sh, toward)
     assert float((before <= 0.0).float().mean()) > 0.05
-    bright = before.clamp_max(MOST_COLOR)
+    bright = before.clamp_max(MAX_COLOR)
     expected = (polynomial(bright, table, 1) + before - bright).clamp_min(0.0)
     values = basis(2, toward)
     plain = torch.stack([torch.linalg.lstsq(values, wanted - 0.5).solution for wanted in expected])

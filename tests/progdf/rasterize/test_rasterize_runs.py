@@ -68,7 +68,7 @@ def test_camera_gradients_of_some_rows_only_are_refused() -> None:
 def test_too_many_intersections_are_refused_in_one_line(monkeypatch: pytest.MonkeyPatch, engine: str) -> None:
     from progdf.rasterize import engines
 
-    monkeypatch.setattr(engines, "MOST_INTERSECTIONS", 100)
+    monkeypatch.setattr(engines, "MAX_INTERSECTIONS", 100)
     with pytest.raises(ProgdfError, match="more than 100; draw a smaller image or a crop") as error:
         render(random_gaussians(200, seed=1), orbit_camera(100, 60), engine=engine)
     assert "\n" not in str(error.value)

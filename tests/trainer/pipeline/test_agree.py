@@ -23,7 +23,7 @@ from trainer.editors.cache import KeptPictures
 from trainer.editors.style import StyleEditor
 from trainer.report.agreement import Agreement, fit_colors, measure_agreement, view_change
 from trainer.run.agree import (
-    MOST_MOVED,
+    MAX_MOVED,
     AgreedEditor,
     Easel,
     Fit,
@@ -241,7 +241,7 @@ def test_a_model_that_moves_everything_is_one_line(tmp_path: Path) -> None:
             return moved(picture, 0.0, 0.0, 0.1)
 
     easel = Easel(Enlarging(setup.train[0], 0.1, ()), {}, NOTHING, 0)
-    with pytest.raises(ProgdfError, match=f"by more than {MOST_MOVED:.0%}; ") as told:
+    with pytest.raises(ProgdfError, match=f"by more than {MAX_MOVED:.0%}; ") as told:
         agree_views(easel, setup, STYLE, RunLog(tmp_path / "log.txt", quiet=True))
     assert "\n" not in str(told.value)
 

@@ -256,7 +256,7 @@ def fits_its_columns(hand: Rig) -> bool:
         + 14.0 * hand.main_view.ui.scale
         + max(imgui.calc_text_size(does).x for topic in column for _, does in topic.rows)
         <= room
-        for column in interface.columns(interface.topics(), interface.MOST_COLUMNS)
+        for column in interface.columns(interface.topics(), interface.MAX_COLUMNS)
     )
     imgui.pop_font()
     imgui.end_frame()

@@ -206,7 +206,7 @@ def test_discarded_work_stays_under_another_name_the_last_three(
     window: application.App, folder: Path
 ) -> None:
     strengths = []
-    for _ in range(session.MOST_DISCARDED + 2):
+    for _ in range(session.MAX_DISCARDED + 2):
         press(window, "Shift+Left")
         left_over_now = folder / "bear.autosave.session.json"
         window.file_actions.autosave(0.0)
@@ -217,9 +217,9 @@ def test_discarded_work_stays_under_another_name_the_last_three(
         window.handle(f"discard_autosave:{left_over_now}")
         window.file_actions.session_autosave = session.SessionAutosave()
     kept = sorted(folder.glob("bear.discarded*"), key=lambda path: path.stat().st_mtime_ns)
-    assert len(kept) == session.MOST_DISCARDED
+    assert len(kept) == session.MAX_DISCARDED
     found = [session.open_session(path).view.layers[-1].strength for path in kept]
-    assert sorted(found) == sorted(strengths[-session.MOST_DISCARDED :])
+    assert sorted(found) == sorted(strengths[-session.MAX_DISCARDED :])
     window.handle("discard")
     window.open(kept[-1])
     assert window.file_actions.path is None, "saving it asks where"

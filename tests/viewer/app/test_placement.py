@@ -13,7 +13,7 @@ from benchmarks.viewer.display import display, missing_tools
 from tests.helpers.null_app import null_platform
 from tests.helpers.paths import ROOT
 from viewer.ui.placement import Box, Frame, fit_box, work_areas
-from viewer.ui.splash import LEAST, SIZE, glfw
+from viewer.ui.splash import MINIMUM_SIZE_PX, SIZE, glfw
 
 HD = Box(0, 0, 1280, 720)
 BESIDE = Box(1280, 0, 1920, 1080)
@@ -98,4 +98,4 @@ def test_the_real_window_is_no_larger_than_the_screen(small_screen: str) -> None
     environment.pop("WAYLAND_DISPLAY", None)
     command = [sys.executable, "-c", OPENED, *map(str, SIZE)]
     ran = subprocess.run(command, env=environment, capture_output=True, text=True, cwd=ROOT, timeout=120.0)
-    assert ran.stdout.splitlines() == ["0 0 600 450 1", f"600 450 {600 / LEAST[0]:.2f}"], ran.stderr
+    assert ran.stdout.splitlines() == ["0 0 600 450 1", f"600 450 {600 / MINIMUM_SIZE_PX[0]:.2f}"], ran.stderr

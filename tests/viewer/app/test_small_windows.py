@@ -34,7 +34,7 @@ def test_every_question_lies_within_the_window_with_many_recent_files(
 ) -> None:
     with rig(first_view(bear(), 0.5, 0.5), points) as hand:
         name = "a_scene_with_a_rather_long_name_indeed"
-        hand.main_view.recent = tuple(Path(f"/scenes/{name}_{i}.ply") for i in range(user_files.MOST_RECENT))
+        hand.main_view.recent = tuple(Path(f"/scenes/{name}_{i}.ply") for i in range(user_files.MAX_RECENT))
         hand.main_view.ask(
             Dialog(kind, f"/scenes/{name}.session.json", error="it cannot be read", notice="type it")
         )

@@ -21,7 +21,7 @@ from viewer.render.engine import ViewEngine
 from viewer.render.gl_renderer import headless_context
 from viewer.state.view_state import ViewState
 from viewer.state.workspace import Dialog
-from viewer.ui.splash import LEAST
+from viewer.ui.splash import MINIMUM_SIZE_PX
 
 Compare = Callable[[str, np.ndarray], None]
 SMALLEST = (1024, 640)
@@ -104,7 +104,7 @@ def test_the_buttons_of_the_second_failure_are_whole(screenshot: Compare) -> Non
     film = Delivery("Rendering film.mp4", Path("/scenes/film.mp4"), (), Path("film.log"), Path("bear.ply"))
     line = "no frame could be written: the disk takes no more, free some space"
     jobs = tuple(QueuedTask(number, replace(film), "failed", error=line) for number in (1, 2))
-    with rig(first_view(bear(), 0.7), LEAST) as hand:
+    with rig(first_view(bear(), 0.7), MINIMUM_SIZE_PX) as hand:
         for count in (1, 2):
             hand.main_view.work = replace(hand.main_view.work, jobs=jobs[:count])
             hand.main_view.wake()
@@ -112,8 +112,8 @@ def test_the_buttons_of_the_second_failure_are_whole(screenshot: Compare) -> Non
         screenshot("ui_failures", hand.image()[:, 330:])
         closes = [
             y
-            for y in range(LEAST[1] - 120, LEAST[1] - 60, 2)
-            if not hand.click(LEAST[0] - 60.0, float(y))
+            for y in range(MINIMUM_SIZE_PX[1] - 120, MINIMUM_SIZE_PX[1] - 60, 2)
+            if not hand.click(MINIMUM_SIZE_PX[0] - 60.0, float(y))
             and hand.main_view.take_requests() == ("close_run:2",)
         ]
         assert closes[-1] - closes[0] >= 12, "one hits it anywhere"

@@ -28,7 +28,7 @@ def test_a_command_draws_on_one_thread_and_reads_edits_on_all(
         seen.append(("draw", torch.get_num_threads()))
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(threads, "MOST_THREADS", 3)
+    monkeypatch.setattr(threads, "MAX_THREADS", 3)
     monkeypatch.setattr(document, "load_gdf", reading)
     monkeypatch.setattr(render.ViewEngine, "image", drawing)
     before = torch.get_num_threads()

@@ -26,7 +26,7 @@ from viewer.jobs.child import Progress
 from viewer.jobs.training import (
     ALL,
     CHANGED,
-    MOST_PAIRS,
+    MAX_PAIRS,
     NEUTRAL,
     STILL,
     STYLES,
@@ -259,7 +259,7 @@ def test_a_picked_color_stands_in_the_palette_in_place_of_one_like_it() -> None:
     assert other.palette == (*colors, ("#c01830", "#c01830"))
     assert other.picked == 2
     many = form("grade", palette=tuple((f"#{i:02x}0000", "#ffffff") for i in range(30, 250, 28)))
-    assert len(with_color(many, "#20c0f0").palette) == MOST_PAIRS
+    assert len(with_color(many, "#20c0f0").palette) == MAX_PAIRS
 
 
 def test_the_trainer_has_as_many_paintings_as_the_form() -> None:

@@ -253,7 +253,7 @@ def test_what_is_done_of_a_picture_shows_before_the_rest(
     ctx: moderngl.Context, stack: Stack, monkeypatch: pytest.MonkeyPatch, done: int
 ) -> None:
     monkeypatch.setattr(cpu_renderer, "BAND", len(stack.scene) // 2)
-    monkeypatch.setattr(cpu_renderer, "LEAST_ROWS", 40)
+    monkeypatch.setattr(cpu_renderer, "MIN_ROWS", 40)
     screen = ctx.framebuffer([ctx.texture(SIZE, 4)])
     view = view_of(stack, 0.2, 0.6)
     view = replace(view, grid=True)

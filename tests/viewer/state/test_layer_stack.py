@@ -346,7 +346,7 @@ def test_a_large_region_is_pictured_by_a_part_of_it(monkeypatch: pytest.MonkeyPa
     made = bear()
     camera = ViewCamera()
     whole = facts.draw_thumbnail(made.scene, made.gdfs[0], camera).astype(float)
-    monkeypatch.setattr(facts, "MOST_MEMBERS", len(made.gdfs[0].region) // 2)
+    monkeypatch.setattr(facts, "MAX_COUNTED_MEMBERS", len(made.gdfs[0].region) // 2)
     part = facts.draw_thumbnail(made.scene, made.gdfs[0], camera).astype(float)
     assert 0.0 < abs(part - whole).mean() < 0.25 * abs(whole - whole[0, 0]).mean()
 
